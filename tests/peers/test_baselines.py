@@ -333,7 +333,11 @@ def test_zemax_is_named_where_it_has_the_figure():
 @pytest.mark.long
 @pytest.mark.parametrize("model", PEERS)
 @pytest.mark.parametrize(
-    "kind", ["opd", "landing", "zernike", "spot", "ee80", "distortion", "vignetting", "defocus", "psf"]
+    "kind",
+    [
+        *("opd", "landing", "zernike", "spot", "distortion", "vignetting", "defocus"),
+        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("ee80", "psf")),
+    ],
 )
 def test_figures_are_as_near_to_the_peers_as_they_say(model, kind):
     peer = Peer(model)

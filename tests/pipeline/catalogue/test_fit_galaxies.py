@@ -66,7 +66,7 @@ def test_without_psf_the_adaptive_moments_of_galsim():
     np.testing.assert_allclose(found, [0.15, -0.2, 2.1, 7.0], rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("profile", ["gaussian", "exponential"])
+@pytest.mark.parametrize("profile", ["gaussian", pytest.param("exponential", marks=pytest.mark.slow)])
 def test_the_minimum_is_that_of_a_brute_force_fit(profile, galaxy, render, psf):
     # Restated in flux, centre, ln size and ellipticity, with numerical derivatives, on a grid of another period.
     period, side = 81, 32

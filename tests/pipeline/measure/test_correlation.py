@@ -174,7 +174,7 @@ def test_patches_leave_the_correlation():
     assert c.error_plus.tobytes() == again.error_plus.tobytes()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_jackknife_of_independent_patches():
     # Each of 25 patches has its own constant ellipticity: the scatter of xi over 200 such fields, inside a patch.
     edge = np.arange(5) * 60.0 * ARCMIN

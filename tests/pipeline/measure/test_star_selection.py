@@ -99,7 +99,7 @@ def test_unusable_stars_and_none_left():
         flag_stars(hit, NOISE).keep()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_model_without_the_flagged_stars():
     # One star in ten with a neighbour: left in, it bends the model; found and left out, only its light is missed.
     ratios = []

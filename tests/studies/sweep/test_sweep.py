@@ -279,6 +279,7 @@ def test_a_wavelength_is_a_parameter(folder):
     assert 0.9 < red / blue < (690 / 560) ** -0.2
 
 
+@pytest.mark.slow
 def test_compensators_are_solved_at_every_point(folder):
     text = SWEEP.replace("metrics:", "compensators: [Camera.dz_um]\nmetrics:").replace(
         "latin_hypercube, points: 14", "grid"

@@ -69,7 +69,7 @@ def write_mosaic(path, e=0.0, count=20, **cards):
     fits.PrimaryHDU(image.astype(np.float32), fits.Header(header)).writeto(path, overwrite=True)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_galaxies_of_a_catalogue_are_measured_where_and_as_it_says(folder):
     rng = np.random.default_rng(6)
     n = 40

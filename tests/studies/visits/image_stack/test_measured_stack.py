@@ -80,7 +80,7 @@ def test_a_small_stack_is_measured(visit_products, small_visits, tmp_path, capsy
     assert (tmp_path / "images" / "images.png").stat().st_size > 10000
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_images_with_too_few_stars_are_kept(visit_products, small_visits, tmp_path, capsys):
     section = small_visits.visits.model_copy(update={"snapshots": (2,)})
     last = small_visits.model_copy(update={"visits": section})
