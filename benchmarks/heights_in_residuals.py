@@ -3,7 +3,8 @@
 Run: python benchmarks/heights_in_residuals.py RUN... [--plot heights_in_residuals.png]
 
 Each RUN is the folder of `pachon run --all`, best with `focal_plane: {heights: lsstcam}`, 60 noise-free and 140
-observed stars a CCD, at best focus or off it (`focal_plane: {moved: {R22: {dz_um: 10}, ...}}` for every raft).
+observed stars a CCD, at best focus or off it (`focal_plane: {moved: {R22: {dz_um: 10}, ...}}` for every raft). A plane
+or a simulated budget shows what heights cost each model.
 Residuals are those of the noise-free PSFs at holdout positions, where no star is, of
 
 - polynomials of order 2 and 4 of e1, e2 and ln size, fitted to the stars of each CCD, weighted by their noise;
@@ -61,7 +62,9 @@ def by_ccd(stars, holdout, ccds, order, heights=None):
 
 
 def slope(dz, left, patch):
-    """Return the slope of a straight line, and its jackknife error over patches."""
+    """Return the slope of a straight line, and its jackknife error over patches; NaN where there are no heights."""
+    if np.ptp(dz) == 0.0:
+        return np.nan, np.nan
 
     def of(rows):
         return np.polyfit(dz[rows], left[rows], 1)[0]
@@ -150,7 +153,8 @@ def main() -> None:
         print(f"  {'':28s} {'ln size [% / um]':>22s} {'e [1e-3 / um]':>22s} {'rms e1, e2, ln size':>30s}")
         edges = np.quantile(dz, np.linspace(0.0, 1.0, _BINS + 1))
         bins = np.clip(np.searchsorted(edges, dz, side="right") - 1, 0, _BINS - 1)
-        centers = [dz[bins == b].mean() for b in range(_BINS)]
+        filled = np.unique(bins)
+        centers = [dz[bins == b].mean() for b in filled]
         for label, values in left.items():
             found = [slope(dz, values[:, i], rafts) for i in range(2)]
             rms = np.sqrt((values[:, 2:] ** 2).mean(axis=0))
@@ -160,7 +164,7 @@ def main() -> None:
                 + " ".join(f"{1e3 * v:9.3f}e-3" for v in rms)
             )
             for row in range(2):
-                mean, error = np.transpose([by_raft(values[bins == b, row], rafts[bins == b]) for b in range(_BINS)])
+                mean, error = np.transpose([by_raft(values[bins == b, row], rafts[bins == b]) for b in filled])
                 axes[row, column].errorbar(centers, mean, error, marker="o", markersize=4, capsize=2, label=label)
         axes[0, column].set(title=folder.name, ylabel="residual of the size [%]")
         axes[1, column].set(xlabel="height within the CCD [um]", ylabel="residual of e along its change [1e-3]")
