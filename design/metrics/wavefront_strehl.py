@@ -6,6 +6,8 @@ import numpy as np
 
 #: Step of the search in waves of tilt at the rim: a third of that to the first dark ring of a clear pupil, 0.61.
 _STEP = 0.2
+#: Largest tilt [waves] of the search: an image whose brightest point is farther off has a ratio of a few per cent.
+_FARTHEST = 4.0
 #: Steps of Newton's method from the highest place.
 _NEWTON = 5
 #: Step [waves] that ends Newton's method; the ratio goes with its square.
@@ -35,7 +37,7 @@ def brightest_strehl(weight: np.ndarray, pupil: np.ndarray, waves: np.ndarray) -
     field = weight * np.exp(2j * np.pi * waves)
     # Points at a mean distance of sqrt(pi / n) do not represent steeper tilts than half a wave over that distance.
     steepest = 0.5 * np.sqrt(len(waves) / np.pi)
-    count = int(np.ceil(min(float(np.abs(waves).max()), steepest) / _STEP))
+    count = int(np.ceil(min(float(np.abs(waves).max()), steepest, _FARTHEST) / _STEP))
     amplitude = (_powers(pupil[:, 1], count) * field) @ _powers(pupil[:, 0], count).T
     found = amplitude.real**2 + amplitude.imag**2
     row, column = np.unravel_index(int(np.argmax(found)), found.shape)

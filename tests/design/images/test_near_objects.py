@@ -76,3 +76,12 @@ def test_images_are_those_of_huygens_integral(lens, number):
     assert psf.strehl[0] == pytest.approx(strehl, rel=5e-3)
     # Light is even over the entrance pupil there, and over the direction cosines at the image in a wavefront's ratio.
     assert pachon.strehl(lens, **light, from_psf=False).wavefront[0, 0] == pytest.approx(strehl, rel=0.05)
+
+
+def test_large_pixels_hold_the_light(lens):
+    # Spots far larger than an Airy disc set the pixels; samples at their centres sum to 1.21.
+    field = pachon.Request.of(lens).fields[0]
+    psf = pachon.fft_psf(lens, field, lens.default_wavelength, pixels=32, n_pupil=128)
+    finer = pachon.fft_psf(lens, field, lens.default_wavelength, pixels=128, pixel=psf.pixel / 4.0, n_pupil=128)
+    assert psf.inside[0] == pytest.approx(finer.inside[0], abs=5e-3)
+    assert 0.9 < psf.inside[0] < 1.0
