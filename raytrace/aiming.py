@@ -20,13 +20,15 @@ from ..models.surface import Interaction
 from ..models.telescope import Telescope
 from .landing import Landing, derivatives, determinants, find_points, solved
 from .rays import Rays, field_angles, field_direction, object_points, straight_bundles
-from .smooth_pupil import FEWEST, smooth_pupil
+from .smooth_pupil import FEWEST, pupil_nodes, smooth_pupil
 from .trace import trace
 
 #: Step of the differences that the first derivatives come from, in units of the radius of the entrance pupil.
 _DIFFERENCE = 1e-4
 #: Steps in the field angle [rad] by which chief rays are followed from the axis; the second where the first fail.
 _FIELD_STEPS = np.deg2rad((10.0, 1.0))
+#: Fields whose rays are aimed at once, which bounds the memory.
+_FIELDS = 64
 #: Steps by which rays that are not found at once are followed from the chief ray outwards.
 _PUPIL_STEPS = 12
 
@@ -49,7 +51,12 @@ def entrance_points(telescope: Telescope, directions: np.ndarray, wavelength: fl
     if relative.shape[1] < FEWEST:
         return _one_by_one(telescope, stop, directions, wavelength, relative)
     found = np.empty(relative.shape)
-    for i, target in enumerate(relative):
+    # Rays of all fields together: of few rays, what a trace costs is its launch.
+    at_nodes = [
+        _one_by_one(telescope, stop, directions[part], wavelength, pupil_nodes(relative[part]))
+        for part in (slice(i, i + _FIELDS) for i in range(0, len(directions), _FIELDS))
+    ]
+    for i, (target, known) in enumerate(zip(relative, np.concatenate(at_nodes), strict=True)):
         light = directions[i : i + 1]
 
         def at_stop(points: np.ndarray, light: np.ndarray = light) -> np.ndarray:
@@ -58,7 +65,7 @@ def entrance_points(telescope: Telescope, directions: np.ndarray, wavelength: fl
         def search(some: np.ndarray, light: np.ndarray = light) -> np.ndarray:
             return _one_by_one(telescope, stop, light, wavelength, some[None])[0]
 
-        found[i] = smooth_pupil(target, at_stop, search)
+        found[i] = smooth_pupil(target, known, at_stop, search)
     return found
 
 

@@ -25,15 +25,22 @@ _STEPS, _AT_ONCE, _IN_CACHE = 8, 1 << 18, 1 << 10
 PointMap = Callable[[np.ndarray], np.ndarray]
 
 
-def smooth_pupil(target: np.ndarray, stop: PointMap, search: PointMap) -> np.ndarray:
+def pupil_nodes(target: np.ndarray) -> np.ndarray:
+    """Return the points of the stop, in units of its radius, that polynomials for targets [..., n, 2] are fitted to.
+
+    Their shape is [..., n_node, 2].
+    """
+    return np.asarray(_reach(target)[..., None, None] * _nodes())
+
+
+def smooth_pupil(target: np.ndarray, at_nodes: np.ndarray, stop: PointMap, search: PointMap) -> np.ndarray:
     """Return the points [n, 2] of the entrance pupil [m] whose rays reach points of the stop, in units of its radius.
 
-    ``stop`` maps points of the entrance pupil to those of the stop; ``search`` finds points of the entrance pupil one
-    by one. It is taken where polynomials fail: beyond folds of the pupil, and where rays do not arrive.
+    ``at_nodes`` are those of :func:`pupil_nodes`; ``stop`` maps points of the entrance pupil to those of the stop;
+    ``search`` finds points of the entrance pupil one by one. It is taken where polynomials fail: beyond folds of the
+    pupil, and where rays do not arrive.
     """
-    reach = max(1.0, float(np.linalg.norm(target, axis=1).max()))
-    nodes = reach * _nodes()
-    at_nodes = search(nodes)
+    reach, nodes = float(_reach(target)), pupil_nodes(target)
     known = np.isfinite(at_nodes).all(axis=1)
     basis = _basis(nodes[known] / reach)
     if known.sum() < 1.5 * basis.shape[1]:
@@ -78,6 +85,11 @@ def _by_newton(
     # Beyond a fold the map goes the other way round.
     points[~((by_x[:, 0] * by_y[:, 1] - by_x[:, 1] * by_y[:, 0]) * sense > 0.0)] = np.nan
     return points
+
+
+def _reach(target: np.ndarray) -> np.ndarray:
+    """Return the radius of the nodes for targets [..., n, 2], shape [...]."""
+    return np.asarray(np.maximum(1.0, np.linalg.norm(target, axis=-1).max(axis=-1)))
 
 
 def _nodes() -> np.ndarray:

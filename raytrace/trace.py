@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+#: Packets of rays that one thread traces.
+_ONE_THREAD = 32
+
+
 @dataclass(frozen=True)
 class TraceResult(Result):
     """Rays at one surface, in the telescope frame.
@@ -97,7 +101,9 @@ def trace_packets(telescope: Telescope, rays: Rays, n_stored: int, *, threads: i
     start.position = warp_array(to_packets(rays.position.T[None]), lanes)
     start.direction = warp_array(to_packets(rays.direction.T[None]), lanes)
     start.path = warp_array(to_packets(rays.path_length[None]), lanes)
-    launch(trace_rays.suited(packed), count, [packed, warp_array(indices[None]), start, end], threads=threads)
+    # Of few rays, threads cost more than the trace.
+    some = 1 if count <= _ONE_THREAD else threads
+    launch(trace_rays.suited(packed), count, [packed, warp_array(indices[None]), start, end], threads=some)
     return PacketTrace(indices, start, end)
 
 

@@ -60,7 +60,7 @@ def _stated_rims(telescope: Telescope) -> tuple[bool, bool]:
     """
     if not telescope.obstructions and all(s.aperture is None for s in telescope.surfaces):
         return True, True
-    request = Request.of(telescope, (0.0, 0.0), sampling=CHIEF_RAY, threads=1)
+    request = Request.of(telescope, (0.0, 0.0), sampling=CHIEF_RAY, threads=1, one_wavelength=True)
     # Not along the axes, where spider vanes lie.
     angle = (np.arange(_PROBES) + 0.25) * (2.0 * np.pi / _PROBES)
     circle = 0.5 * telescope.pupil_diameter * np.stack([np.cos(angle), np.sin(angle)], axis=-1)

@@ -116,7 +116,11 @@ def ee(
     band=True,
 )
 def mtf(
-    given: Given, pupil_points: Annotated[int, Option(min=16, max=4096, help="Lattice points across the pupil.")] = 256
+    given: Given,
+    pupil_points: Annotated[
+        int | None,
+        Option(min=16, max=4096, help="Lattice points across the pupil; 256 by default, or as many as spots need."),
+    ] = None,
 ) -> Study:
     """Draw the modulation transfer, tangential and sagittal, beside that of a perfect wavefront and of rays alone.
 

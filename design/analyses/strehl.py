@@ -16,6 +16,7 @@ from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
 from ..images.diffraction import fft_psf
+from ..metrics.wavefront_strehl import brightest_strehl
 from .analysis import Analysis, Columns
 
 if TYPE_CHECKING:
@@ -31,7 +32,8 @@ class StrehlRatios(Analysis):
     rms_wavefront : ndarray, shape [n_field, n_wave]
         Root mean square of the wavefront over the lit pupil without piston and tilt [m].
     wavefront : ndarray, shape [n_field, n_wave]
-        Squared modulus of the mean of exp(2 pi i W / wavelength) over the lit pupil, piston and tilt removed.
+        Squared modulus of the mean of exp(2 pi i W / wavelength) over the lit pupil, with the tilt that makes it
+        largest: the brightest point of the image. Light is even over the entrance pupil.
     psf : ndarray, shape [n_field, n_wave]
         Peak of the diffraction image over that of the same lit pupil with a perfect wavefront; NaN where not asked for.
     """
@@ -122,15 +124,15 @@ def strehl(
         bundles = request.bundles(wavelength)
         opd = bundles.opd(telescope.sphere_radius)
         for i, lit in enumerate(bundles.lit):
-            rms[i, w], ratio[i, w] = _without_tilt(opd[i], lit, request, wavelength)
+            rms[i, w], ratio[i, w] = _rms_and_strehl(opd[i], lit, request, wavelength)
         if from_psf:
             how: dict[str, Any] = {"projection": projection, "threads": threads, "pixels": 64}
             peak[:, w] = fft_psf(telescope, request.fields, wavelength, **how).strehl
     return StrehlRatios(request, rms, ratio, peak)
 
 
-def _without_tilt(opd: np.ndarray, lit: np.ndarray, request: Request, wavelength: float) -> tuple[float, float]:
-    """Return rms [m] and Strehl ratio of a wavefront over its lit points, the best plane taken off."""
+def _rms_and_strehl(opd: np.ndarray, lit: np.ndarray, request: Request, wavelength: float) -> tuple[float, float]:
+    """Return rms [m] about the best plane and Strehl ratio of a wavefront over its lit points."""
     if lit.sum() < 3:
         return np.nan, np.nan
     weight = request.pupil.weights[lit] / request.pupil.weights[lit].sum()
@@ -138,5 +140,5 @@ def _without_tilt(opd: np.ndarray, lit: np.ndarray, request: Request, wavelength
     plane = np.stack([np.ones(len(weight)), *request.unit_pupil[lit].T], axis=-1) * root[:, None]
     value = opd[lit] * root
     rest = (value - plane @ np.linalg.lstsq(plane, value, rcond=None)[0]) / root
-    phase = np.exp(2j * np.pi * rest / wavelength)
-    return float(np.sqrt((weight * rest**2).sum())), float(np.abs((weight * phase).sum()) ** 2)
+    peak = brightest_strehl(weight, request.unit_pupil[lit], rest / wavelength)
+    return float(np.sqrt((weight * rest**2).sum())), peak

@@ -225,7 +225,7 @@ class _Plan:
         progress: Callable[[int], None] | None,
     ) -> DiffractionPsf:
         """Return the images of all field points from a function that returns wavelets and their sum."""
-        axis = pixel_axis(self.pixel, self.pixels)
+        axis, finer = pixel_axis(self.pixel, self.pixels), self._samples()
         images, lit, strehl = [], [], []
         for i, center in enumerate(self.spots.reference_point):
             one = self.request.at_fields(slice(i, i + 1))
@@ -234,7 +234,7 @@ class _Plan:
             for wavelength, weight in zip(self.request.wavelengths, self.request.weights, strict=True):
                 wavelets, irradiance = waves(one, float(wavelength), center)
                 found.append((float(weight), wavelets, irradiance))
-                total += weight * irradiance(axis, axis)
+                total += weight * self._on_pixels(irradiance(finer, finer))
                 if progress is not None:
                     progress(1)
             whole = sum(weight * wavelets.lit_fraction for weight, wavelets, _ in found)
@@ -254,6 +254,20 @@ class _Plan:
             plate_scale=self.spots.plate_scale,
             n_pupil=n_pupil,
         )
+
+    def _samples(self) -> np.ndarray:
+        """Return the coordinates of samples of the irradiance [m], a whole number of them across each pixel.
+
+        The pattern has no period below wavelength times focal ratio: samples at that distance sum to the light.
+        """
+        across = int(np.ceil(self.pixel / self.wave_over_range - 1e-9))
+        part = (np.arange(across) + 0.5) / across - 0.5
+        return (pixel_axis(self.pixel, self.pixels)[:, None] + self.pixel * part).ravel()
+
+    def _on_pixels(self, irradiance: np.ndarray) -> np.ndarray:
+        """Return the mean of the samples of each pixel."""
+        across = len(irradiance) // self.pixels
+        return irradiance.reshape(self.pixels, across, self.pixels, across).mean(axis=(1, 3))
 
     def _peak(self, found: Sequence[tuple[float, Wavelets, _Sum]], image: np.ndarray) -> float:
         """Return the highest irradiance of the image [1/m^2]."""

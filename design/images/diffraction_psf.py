@@ -34,8 +34,8 @@ class DiffractionPsf(FieldResult):
     method : {"fft", "huygens"}
         Fourier sum or Huygens' wavelets.
     image : ndarray, shape [n_field, ny, nx]
-        Fraction of the light of the image on each pixel, sampled at its centre; [y, x], y up. The sum is less than 1 by
-        the light outside.
+        Fraction of the light of the image on each pixel, sampled at its centre or, where pixels are larger than
+        wavelength times focal ratio, at several places; [y, x], y up. The sum is less than 1 by the light outside.
     pixel : float
         Distance of pixel centres [m].
     reference_point : ndarray, shape [n_field, 2]

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 #: Panels in a row.
 _MOST = 3
+#: Smallest and largest default number of lattice points across the pupil.
+_FEWEST, _MOST_ACROSS = 256, 2048
 
 
 @dataclass(frozen=True)
@@ -155,7 +157,7 @@ def mtf(
     wavelengths: ArrayLike | None = None,
     *,
     wavelength_weights: ArrayLike | None = None,
-    n_pupil: int = 256,
+    n_pupil: int | None = None,
     projection: str = "zemax",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
@@ -166,8 +168,9 @@ def mtf(
     ----------
     telescope, fields, wavelengths, wavelength_weights, projection, threads
         As in :meth:`pachon.Request.of`.
-    n_pupil : int
-        Lattice points across the pupil at the shortest wavelength, and so about the number of frequencies.
+    n_pupil : int, optional
+        Lattice points across the pupil at the shortest wavelength, and so about the number of frequencies; by default
+        256, or more where the spots need them.
     progress : callable, optional
         Called with the number of pairs of field and wavelength done since the last call.
 
@@ -176,20 +179,21 @@ def mtf(
     DomainError
         If no light passes, or the lattice is too coarse for the spots.
     """
-    n_pupil = require_count(n_pupil, "n_pupil", 16, math.isqrt(MOST))
     request = Request.of(
         telescope, fields, wavelengths, wavelength_weights=wavelength_weights, projection=projection, threads=threads
     )
     principal, diagram = principal_rays_of(request), spot_diagram(request)
-    step = range_of_cosines(principal) / float(request.wavelengths.min()) / int(n_pupil)
+    period = range_of_cosines(principal) / float(request.wavelengths.min())
     reach = spot_reach(diagram)
-    if 2.0 * reach * step > 1.0:
+    needed = int(np.ceil(2.0 * reach * period))
+    across = max(_FEWEST, needed) if n_pupil is None else require_count(n_pupil, "n_pupil", 16, math.isqrt(MOST))
+    if across < needed or (n_pupil is None and across > _MOST_ACROSS):
+        given = f"n_pupil = {across}: too few" if n_pupil is not None else f"more than {_MOST_ACROSS} points are needed"
         raise DomainError(
-            f"n_pupil = {n_pupil}: too few for spots of {2e6 * reach:.4g} um; "
-            f"expected at least {int(np.ceil(2.0 * reach * step * n_pupil))}",
-            key="n_pupil",
+            f"{given} for spots of {2e6 * reach:.4g} um; expected at least {needed}, or smaller spots", key="n_pupil"
         )
-    frequency = np.arange(int(n_pupil) + 1) * step
+    step = period / across
+    frequency = np.arange(across + 1) * step
     angles = tangential_angle(telescope, principal)
     shape = (2, len(request.fields), len(frequency))
     transfer, perfect, rays = np.zeros(shape, complex), np.zeros(shape, complex), np.zeros(shape, complex)

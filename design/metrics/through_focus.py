@@ -25,6 +25,7 @@ from ...wavefront.request import Request
 from ..drawing import FEW, field_colors, finish_axes, legend_below
 from ..result import FieldResult
 from .principal_rays import PARALLEL, principal_rays_of
+from .wavefront_strehl import brightest_strehl
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,8 +48,8 @@ class ThroughFocus(FieldResult):
     rms_wavefront : ndarray, shape [n_field, n_height]
         Root mean square of the wavefront without piston and tilt, in quadrature over the wavelengths [m].
     strehl : ndarray, shape [n_field, n_height]
-        Squared modulus of the mean of exp(2 pi i W / wavelength) over the lit pupil, tilt removed; mean over the
-        wavelengths. It is the Strehl ratio where that is the brightest point, so for small aberrations.
+        Squared modulus of the mean of exp(2 pi i W / wavelength) over the lit pupil, with the tilt that makes it
+        largest: the brightest point of the image. Mean over the wavelengths, each at its own point.
     best_spot : ndarray, shape [n_field]
         Height of the smallest rms radius of each field [m].
     best_wavefront : ndarray, shape [n_field]
@@ -94,7 +95,7 @@ class ThroughFocus(FieldResult):
         panels = [
             (self.rms_radius * 1e6, "rms spot radius [µm]", self.best_spot),
             (waves, f"rms wavefront [waves at {wavelength * 1e9:.4g} nm]", self.best_wavefront),
-            (self.strehl, "Strehl ratio (tilt taken off)", np.full(len(waves), np.nan)),
+            (self.strehl, "Strehl ratio", np.full(len(waves), np.nan)),
         ]
         with styled():
             figure = figure_at(ax, 12.0, 4.4)
@@ -218,8 +219,8 @@ def _wavefronts(request: Request, bundles: list[Bundles], heights: np.ndarray) -
                 scaled = value * np.sqrt(weight)
                 rest = scaled - basis @ (basis.T @ scaled)
                 square[i, k] += fraction * (rest**2).sum()
-                phase = 2.0 * np.pi / bundle.wavelength * rest / np.sqrt(weight)
-                strehl[i, k] += fraction * np.abs((weight * np.exp(1j * phase)).sum()) ** 2
+                waves = rest / np.sqrt(weight) / bundle.wavelength
+                strehl[i, k] += fraction * brightest_strehl(weight, request.unit_pupil[lit], waves)
     return np.sqrt(square), strehl
 
 

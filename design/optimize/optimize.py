@@ -14,7 +14,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, PachonError, shown
 from ...core.threads import one_blas_thread
 from ...core.units import require_count
-from ...models.paraxial import stop_makes_pupil
+from ...models.paraxial import stop_makes_pupil, with_floating_pupil
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
 from ...wavefront.pupil_sampling import PupilSampling
@@ -179,11 +179,19 @@ def optimize(
 
 
 def _as_stated(before: Telescope, after: Telescope) -> Telescope:
-    """Return a telescope that states the diameter of its pupil, which stays, where another size is true no longer."""
+    """Return a telescope whose stated aperture and stop are true again, of the same rays.
+
+    A focal ratio that is true no longer becomes the diameter of the pupil, which stays. Where rays are aimed at the
+    stop, the entrance pupil moves to where the stop is imaged now.
+    """
     data = after.design_data
-    if data.aperture not in ("f_number", "working_f_number") or not stop_makes_pupil(before) or stop_makes_pupil(after):
+    if not stop_makes_pupil(before) or stop_makes_pupil(after):
         return after
-    return after.with_design(aperture="entrance_pupil", aperture_value=after.pupil_diameter)
+    if data.aperture in ("f_number", "working_f_number"):
+        after = after.with_design(aperture="entrance_pupil", aperture_value=after.pupil_diameter)
+    if data.aiming == "off" or np.isfinite(after.object_distance):
+        return after
+    return with_floating_pupil(after)
 
 
 def _solve(

@@ -71,6 +71,14 @@ def test_wide_apertures_leave_the_stated_pupil(tmp_path):
     check_samplings(telescope, (0.0, np.deg2rad(0.3)), 28)
 
 
+def test_several_wavelengths_of_the_file(tmp_path):
+    """Where surfaces stop light, the rim is looked for at one of them."""
+    telescope = paraboloid(tmp_path, "{diameter: 0.4, obscuration: 0.4}", ", circle: 0.5")
+    wave = telescope.default_wavelength
+    several = telescope.with_design(wavelengths=(0.9 * wave, wave))
+    assert all(np.array_equal(a, b) for a, b in zip(pupil_grid(several, 20), pupil_grid(telescope, 20), strict=True))
+
+
 def test_surfaces_that_stop_all_light_of_the_axis_are_no_rim(tmp_path):
     """Off-axis systems are dark at the centre of the field: the pupil is the stated one."""
     telescope = paraboloid(tmp_path, "{diameter: 0.4, obscuration: 0.4}", ", annulus: [0.5, 0.6]")

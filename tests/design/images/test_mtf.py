@@ -123,3 +123,12 @@ def test_what_cannot_be_had_is_an_error(lsst_r, paraboloid):
         mtf(paraboloid(f_number=20.0, shift=5e-3), [[0.0, 0.0]], WAVE, n_pupil=16)
     with pytest.raises(DomainError, match="contrast = 2"):
         mtf(lsst_r, [[0.0, 0.0]], n_pupil=16).frequency_at(2)
+
+
+@pytest.mark.long
+def test_the_lattice_is_as_fine_as_spots_need(paraboloid):
+    # 400 wavelengths times focal ratio of defocus: contrast falls as that of the rays.
+    found = mtf(paraboloid(f_number=20.0, shift=400 * 20.0**2 * WAVE), [[0.0, 0.0]], WAVE)
+    assert len(found.frequency) > 400
+    low = found.frequency < 2e3
+    assert found.tangential[0, low] == pytest.approx(found.geometric_tangential[0, low], abs=0.02)

@@ -117,3 +117,21 @@ def test_the_optimum_is_that_of_lenses_whose_rays_fill_their_own_stop(wide):
     assert found.merits[1] == pytest.approx(at, rel=1e-9)
     # The vertex of the parabola through the three, to what its third order moves it.
     assert abs(0.5 * (below - above) / (below - 2.0 * at + above)) < 1e-2
+
+
+@pytest.mark.long
+def test_an_optimum_keeps_its_stop(wide, tmp_path):
+    """Its pupil moves to where the stop is imaged: a file keeps stop and aiming, and has the rays of the optimum."""
+    where = {"fields": np.deg2rad([[0.0, 0.0], [0.0, 20.0]]), "wavelengths": wide.default_wavelength}
+    names = [s.name for s in wide.surfaces if s.interaction == Interaction.REFRACT and s.shape != Plane()]
+    before = [name for name in names if name < wide.design_data.stop] or names
+    found = pachon.optimize(wide, [f"{before[0]}.curvature"], **where, n_pupil=6, max_steps=3)
+    after = found.telescope
+    assert after.design_data.stop == wide.design_data.stop
+    assert after.design_data.aiming == wide.design_data.aiming
+    assert after.stop_z != wide.stop_z
+    pachon.save_telescope(after, tmp_path / "after.zmx")
+    again = pachon.load_telescope(tmp_path / "after.zmx")
+    assert again.design_data.stop == after.design_data.stop
+    sizes = pachon.spots(again, **where, sampling="gauss", n_pupil=6).rms_radius
+    assert np.sqrt((sizes**2).mean()) == pytest.approx(found.merits[1], rel=1e-6)
