@@ -25,6 +25,7 @@ from ...models.zernike_polynomials import noll_to_nm
 from ...wavefront.aberration import LINEAR_FRACTION, ResidualWavefront
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.chief_rays import fields_at
+from ...wavefront.psf.clear_pupil import only_rings
 from ...wavefront.psf.psf import make_psfs
 from ..measure.shapes import measure_shapes
 from .height_series import HeightSeries, level_plane
@@ -45,6 +46,8 @@ _SAMPLES, _FIELD_DEGREE = 300, 6
 # Heights about the centre [m] between which these derivatives are linear.
 _LEVEL = 8e-6
 _BATCH = 2048
+# Points of a pupil with vanes or plates: e is good to 2e-4, a tenth of what turbulence adds, in a third of the time.
+_LATTICE_POINTS = 6000
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +161,7 @@ class Instrument:
             diffusion=self.diffusion,
             jitter=self.jitter,
             dispersion=self.dispersion,
+            n_pupil=None if only_rings(self.telescope) else _LATTICE_POINTS,
             threads=threads,
         )
         return psfs.image, psfs.pixel_scale
