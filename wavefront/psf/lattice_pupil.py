@@ -22,7 +22,6 @@ import scipy.ndimage
 from ...core.units import require_count
 from ..pupil_optics import PupilOptics
 from .channels import Channels
-from .clear_pupil import SpokePupil
 from .pupil_lattice import PupilLattice
 
 #: Points of the default lattice in a disc: 196 across, for vanes of a few centimetres; and in rings without any.
@@ -41,8 +40,11 @@ _SLOPE = 0.5 * (math.sqrt(5.0) - 1.0)
 _TURN = np.array([[1.0, -_SLOPE], [_SLOPE, 1.0]]) / math.hypot(1.0, _SLOPE)
 # Baselines beyond the longest one that is wanted, for the splines.
 _ROOM = 4
-# Rays that tell the paths at other wavelengths, and the degree of the polynomials through them.
-_SPARSE, _DEGREE = 160, 8
+# Rays that tell the paths at other wavelengths, and the degree of the polynomials through those that are lit; there are
+# at least so many lit rays to a term.
+_SPARSE, _DEGREE, _RAYS_A_TERM = 400, 6, 3
+# Numbers of the terms of whole degrees, the largest first.
+_TERMS = [(d + 1) * (d + 2) // 2 for d in range(_DEGREE, -1, -1)]
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,8 @@ class LatticeTransfer:
         require_count(count, "n_pupil", FEWEST_POINTS)
         spacing = diameter * math.sqrt(math.pi / (4.0 * count))
         lattice = PupilLattice.fill(diameter, obscuration, spacing)
-        return cls(lattice, diameter, obscuration, wavelengths, SpokePupil.fill(diameter, obscuration, _SPARSE).points)
+        coarse = PupilLattice.fill(diameter, obscuration, diameter * math.sqrt(math.pi / (4.0 * _SPARSE)))
+        return cls(lattice, diameter, obscuration, wavelengths, coarse.points)
 
     @property
     def points(self) -> np.ndarray:
@@ -103,15 +106,16 @@ class LatticeTransfer:
             return LatticeRays(optics, np.zeros((n_star, 1, 1)), np.zeros((n_star, 1, 2)))
         few = trace(self.wavelengths, self.sparse)
         terms = self._terms(self.sparse, _DEGREE)
-        path = np.empty((n_star, n_wave, terms.shape[1]))
-        shift = np.empty((n_star, n_wave, 2))
+        path, shift = np.zeros((n_star, n_wave, terms.shape[1])), np.zeros((n_star, n_wave, 2))
         for star in range(n_star):
-            # Rays that missed a surface have no path.
-            found = np.isfinite(few.path[star]).all(axis=0) & np.isfinite(few.displacement[star]).all(axis=(0, 2))
-            change = few.path[star][:, found] - few.path[star][middle, found]
-            path[star] = np.linalg.lstsq(terms[found], change.T, rcond=None)[0].T
-            landed = few.displacement[star][:, found]
-            shift[star] = (landed - landed[middle]).mean(axis=1, dtype=np.float64) if found.any() else 0.0
+            # Dark rays may pass a lens far outside of what is ground.
+            lit = few.lit[star].all(axis=0)
+            count = next((n for n in _TERMS if _RAYS_A_TERM * n <= lit.sum()), 0)
+            if count:
+                change = few.path[star][:, lit] - few.path[star][middle, lit]
+                path[star, :, :count] = np.linalg.lstsq(terms[lit, :count], change.T, rcond=None)[0].T
+                landed = few.displacement[star][:, lit]
+                shift[star] = (landed - landed[middle]).mean(axis=1, dtype=np.float64)
         return LatticeRays(optics, path, shift)
 
     def at(self, rays: LatticeRays, star: int, channels: Channels, k: np.ndarray) -> np.ndarray:
@@ -194,4 +198,4 @@ class LatticeTransfer:
     def _terms(self, points: np.ndarray, degree: int) -> np.ndarray:
         """Return products of Legendre polynomials over the pupil up to a total degree, shape [n, n_term]."""
         x, y = (np.polynomial.legendre.legvander(u, degree) for u in points.T / (0.5 * self.diameter))
-        return np.concatenate([x[:, : degree - j + 1] * y[:, j : j + 1] for j in range(degree + 1)], axis=1)
+        return np.stack([x[:, t - j] * y[:, j] for t in range(degree + 1) for j in range(t + 1)], axis=1)
