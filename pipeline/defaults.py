@@ -28,9 +28,8 @@ from ..models.io.site_file import load_site
 from ..models.media.silicon import WAVELENGTH_RANGE as SILICON_RANGE
 from ..models.site import Site
 from ..models.telescope import Telescope
-from ..wavefront.psf.clear_pupil import check_rings
 from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
-from ..wavefront.psf.long_exposure import PUPIL_POINTS as PUPIL_POINTS_LONG
+from ..wavefront.psf.long_exposure import default_points
 from .alignment_states import ENDINGS as STATE_ENDINGS
 from .alignment_states import in_state
 from .config import BandName, Configuration, ReconstructionConfig
@@ -58,7 +57,6 @@ _OPTICS_ALONE = {"n_pupil": PUPIL_POINTS_STILL, "diffusion_pixels": 0.0}
 _FINE = 4
 # Sides of a stamp [arcsec], 31 pixels of the LSST and 61 fine ones; and fewest pixels.
 _SIDE, _SIDE_ALONE, _FEWEST = 6.2, 3.05, 15
-_ENGINE_DEFAULTS: dict[str, dict[str, float]] = {"long_exposure": {"n_pupil": PUPIL_POINTS_LONG}}
 _T = TypeVar("_T")
 _Model = TypeVar("_Model", bound=BaseModel)
 
@@ -134,7 +132,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
                 config.psf,
                 (_WITH_ATMOSPHERE if atmosphere.enabled else _OPTICS_ALONE)
                 | _stamps(config, telescope, camera)
-                | _ENGINE_DEFAULTS.get(config.psf.engine, {}),
+                | ({"n_pupil": default_points(telescope)} if config.psf.engine == "long_exposure" else {}),
             ),
             "reconstruction": _reconstruction(config.reconstruction, 0.7 if atmosphere.enabled else 0.3),
         }
@@ -277,9 +275,6 @@ def _check(config: Configuration, telescope: Telescope) -> None:
     fit, stars = config.reconstruction, config.stars
     if fit.model == "focal_plane" and not config.atmosphere.enabled:
         raise ConfigError("reconstruction.model = focal_plane: expected atmosphere.enabled = true, whose mean it takes")
-    if fit.model == "focal_plane":
-        with error_context(subject="reconstruction.model = focal_plane"):
-            check_rings(telescope)
     if fit.basis == "pixels" and fit.components is not None:
         raise ConfigError(f"reconstruction.components = {fit.components}: expected null with basis = pixels")
     if fit.interpolation != "polynomial" and fit.weights != "equal":

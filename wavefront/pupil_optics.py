@@ -49,6 +49,11 @@ class PupilOptics:
     fields: np.ndarray  #: [n_star, 2] rad
     wavelengths: np.ndarray  #: [n_wave] m, in vacuum
 
+    def star(self, index: int) -> PupilOptics:
+        """Return the optics of one of the stars."""
+        names = ("displacement", "path", "lit", "jacobian", "reference_points", "reference_cosines", "fields")
+        return replace(self, **{name: getattr(self, name)[index : index + 1] for name in names})
+
     @property
     def exit_cosines(self) -> np.ndarray:
         """Direction cosines of the light at the image along x and y of the detector, shape [n_star, n_pupil, 2].

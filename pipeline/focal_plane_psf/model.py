@@ -98,8 +98,8 @@ class FocalPlanePsf(Result):
         camera: str | Camera | None = None,
         wavelengths: ArrayLike | None = None,
         atmosphere: Atmosphere | None = None,
-        pixel_size: ArrayLike = 10e-6,
-        diffusion: ArrayLike = 4e-6,
+        pixel_size: ArrayLike | None = None,
+        diffusion: ArrayLike | None = None,
         silicon: Silicon | None = None,
         jitter: ArrayLike = 0.0,
         weight_fwhm: ArrayLike | None = None,
@@ -129,9 +129,10 @@ class FocalPlanePsf(Result):
         wavelengths : array_like or Quantity, optional
             Wavelengths [m]; by default five over the telescope's band.
         atmosphere : Atmosphere, optional
-            Its Fried parameter, from which the fit starts, and its outer scale; by default Cerro Pachon's.
-        pixel_size, diffusion : float or Quantity
-            Pixel and rms charge diffusion [m].
+            Its Fried parameter, from which the fit starts, and its outer scale; by default those of the telescope's
+            site, or of Cerro Pachon.
+        pixel_size, diffusion : float or Quantity, optional
+            Pixel and rms charge diffusion [m]; by default the pixel of the camera and 0.4 of it.
         silicon : Silicon, optional
             Silicon of the CCDs; by default light turns into charge at their surface.
         jitter : float or Quantity
@@ -181,6 +182,7 @@ class FocalPlanePsf(Result):
                 telescope,
                 wavelengths,
                 atmosphere,
+                camera=mosaic.camera,
                 pixel_size=pixel_size,
                 diffusion=diffusion,
                 silicon=silicon,

@@ -172,7 +172,7 @@ def fit_static_heights(
     cam = load_camera(known)
     degree = STATIC_DEGREE
     prior = HeightPrior.broad(cam, degree=degree) if budget is None else HeightPrior.from_budget(cam, budget, degree)
-    instrument = Instrument.of(telescope) if instrument is None else instrument
+    instrument = Instrument.of(telescope, camera=cam) if instrument is None else instrument
     heights = np.zeros(prior.n_parameter)
     precision = np.zeros((prior.n_parameter, prior.n_parameter))
     prior.add_to(precision)

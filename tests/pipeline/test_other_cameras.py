@@ -188,7 +188,6 @@ def test_defaults_follow_the_camera(telescope, ccds, pixel, scale):
         ({"ccds": ["R22_S11"]}, "unknown CCD of hsc 'R22_S11'"),
         ({"ccds": ["R22"]}, "unknown CCD of hsc 'R22'"),
         ({"atmosphere": {"screen_size": 256, "screen_length_m": 800}}, "expected at least 391, so that a pupil of 8.2"),
-        ({"reconstruction": {**SMALL["reconstruction"], "model": "focal_plane"}}, "model = focal_plane: .*hsc has"),
         ({"sensor": {"brighter_fatter": "itl"}}, "psf.pixel_um = 15: expected 10"),
         ({"focal_plane": {"heights": "lsstcam"}}, "heights = lsstcam: expected heights of the telescope's camera, hsc"),
     ],

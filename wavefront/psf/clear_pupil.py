@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ...core.errors import DomainError
 from ...core.launch import launch
 from ...core.units import require_count
 from ...core.warp_arrays import warp_array
@@ -80,11 +79,10 @@ def clear_edges(
     """Return the radii of the entrance pupil between which light passes all apertures [m], shape [n_star, n_spoke, 2].
 
     Inner and outer radius are equal where a spoke is dark. On each spoke of direction ``unit`` [n_spoke, 2] the clear
-    part is taken to be one piece, as it is where apertures are discs and rings about the light: spiders, other
-    apertures and obstructions are a :class:`DomainError`. ``direction`` [n_star, 3] is that in which the light travels,
-    the wavelength that in vacuum [m].
+    part is taken to be one piece, as it is where apertures are discs and rings about the light (:func:`only_rings`);
+    all else is passed over. ``direction`` [n_star, 3] is that in which the light travels, the wavelength that in vacuum
+    [m].
     """
-    check_rings(telescope)
     n_star, n_spoke = len(direction), len(unit)
     outer = 0.5 * telescope.pupil_diameter
     radius = np.linspace(telescope.pupil_obscuration * outer, outer, _EDGE_RINGS)
@@ -109,12 +107,6 @@ def clear_edges(
     return edges
 
 
-def check_rings(telescope: Telescope) -> None:
-    """Raise DomainError if anything but discs and rings stops light, which the mean over turbulence expects."""
-    other = [f"the aperture of {s.name}" for s in telescope.surfaces if clear_ring(s.aperture) is None]
-    other += [f"the obstruction {o.name}" for o in telescope.obstructions]
-    if other:
-        raise DomainError(
-            f"engine = 'long_exposure': expected nothing but discs and rings to stop light; {telescope.name} has "
-            f"{other[0]}{f' and {len(other) - 1} more' if other[1:] else ''} (use engine = 'fast' or 'wave')"
-        )
+def only_rings(telescope: Telescope) -> bool:
+    """Return whether nothing but discs and rings stops light."""
+    return not telescope.obstructions and all(clear_ring(s.aperture) is not None for s in telescope.surfaces)

@@ -146,12 +146,14 @@ class PsfEngine(ABC):
             image = stars.draw(shift)
         return RenderedStars(image, stars.lit_fraction, stars.reference_point, offsets)
 
-    def _trace(self, fields: np.ndarray, pupil: np.ndarray, threads: int | None) -> PupilOptics:
+    def _trace(
+        self, fields: np.ndarray, pupil: np.ndarray, threads: int | None, wavelengths: np.ndarray | None = None
+    ) -> PupilOptics:
         given = self._inputs
         optics = given.trace(
             self._telescope,
             fields,
-            self._wavelengths,
+            self._wavelengths if wavelengths is None else wavelengths,
             pupil,
             focal_plane=given.focal_plane,
             projection=given.projection,

@@ -34,10 +34,14 @@ def ray_counts(optics: PupilOptics, pixel_size: float) -> np.ndarray:
 
     ``pixel_size`` is in metres.
     """
-    radii = blur_radii(optics)
+    return np.where(blur_radii(optics) > FAR, wanted_rays(optics, pixel_size), 0)
+
+
+def wanted_rays(optics: PupilOptics, pixel_size: float) -> np.ndarray:
+    """Return the rays that draw each star, shape [n_star] int; ``pixel_size`` is in metres."""
     # Powers of two, so that a batch has few different numbers.
-    count = 2 ** np.ceil(np.log2(_RAYS * np.maximum(radii / pixel_size, 1.0) ** 2))
-    return np.where(radii > FAR, count, 0).astype(np.int64)
+    count = 2 ** np.ceil(np.log2(_RAYS * np.maximum(blur_radii(optics) / pixel_size, 1.0) ** 2))
+    return np.asarray(count, dtype=np.int64)
 
 
 class MeanRaysEngine(FastPsfEngine):
