@@ -140,7 +140,8 @@ def allowances(found: Sequence[Curve], target: float) -> list[Allowance]:
         # Replicas move the whole curve: its relative error over the power is that of the distance.
         last = int(np.flatnonzero(outer)[np.argmax(distance[outer])])
         error = float(curve.error[last] / curve.change[last] / power) if power > 0 else np.nan
-        each.append(Allowance(curve.parameter, float(power), *bounds, error=error))
+        alone, shared = bounds
+        each.append(Allowance(curve.parameter, float(power), alone, shared, error))
     return each
 
 

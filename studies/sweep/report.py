@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from ...core.errors import ProductError
 from ...core.files import make_folder, write_bytes, write_json
-from ...core.page import Picture, render
+from ...core.page import Picture, render, with_digits, with_error
 from ...pipeline.report.report import TEMPLATES
 from . import plots
 from .analysis import Budget, Curve, allowances, budget, curves, rank_correlations, summary
@@ -88,8 +87,8 @@ def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Cu
         # A metric that nothing raises, as xi of a single CCD may be, has no place on logarithmic axes.
         for metric in (m for m in correlated if any(np.any(curve.change > 0) for curve in drawn[m])):
             allowed = allowances(drawn[metric], sweep.xi_target)
-            each = (f"{a.parameter}: {_with_error(a.alone, a.error * a.alone)} alone, "
-                    f"{_with_error(a.shared, a.error * a.shared)} with an equal share"
+            each = (f"{a.parameter}: {with_error(a.alone, a.error * a.alone)} alone, "
+                    f"{with_error(a.shared, a.error * a.shared)} with an equal share"
                     for a in allowed if np.isfinite(a.alone))  # fmt: skip
             title = f"Allowance of each term for {metric} below {sweep.xi_target:g}"
             plot = plots.allowance_plot(drawn[metric], allowed, sweep.xi_target)
@@ -119,7 +118,7 @@ def _budget_text(found: list[Budget]) -> str:
             same = apart < (2.0 * one.together_error if np.isfinite(one.together_error) else 0.1 * abs(one.total))
             texts.append(
                 f"{one.mark}: single effects sum to {with_digits(one.total, one.together_error)}, all at once make "
-                f"{_with_error(one.together, one.together_error)}: "
+                f"{with_error(one.together, one.together_error)}: "
                 + ("they add, as far as this tells." if same else "they do not simply add.")
             )
     return (
@@ -163,18 +162,3 @@ def _rows(table: SweepTable, sweep: SweepFile) -> list[dict[str, str]]:
             | {key: with_digits(value, scatter) for key, value in texts.items()}
         )
     return rows
-
-
-def _with_error(value: float, error: float) -> str:
-    """Return a number with its error, to the second digit of that; to three digits where the error is not known."""
-    if not error > 0.0:
-        return f"{value:.3g}"
-    return f"{with_digits(value, error)} ± {error:.2g}"
-
-
-def with_digits(value: float, error: float) -> str:
-    """Return a number to the second digit of its error; to three digits where the error is not known."""
-    if value == 0.0 or not error > 0.0:
-        return f"{value:.3g}"
-    digits = 2 + math.floor(math.log10(abs(value))) - math.floor(math.log10(error))
-    return f"{value:.{min(max(digits, 1), 9)}g}"

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from pachon.core.page import with_digits
 from pachon.studies.metrics.bare_telescope import BARE
 from pachon.studies.metrics.stars import STARS
 from pachon.studies.sweep.analysis import allowances, curves
 from pachon.studies.sweep.file import read_sweep
-from pachon.studies.sweep.report import with_digits, write_report
+from pachon.studies.sweep.report import write_report
 from pachon.studies.sweep.store import PointResult, SweepStore, create_store
 from pachon.studies.sweep.sweep import numbered_points
 from pachon.studies.sweep.table import described_metric, described_parameter, read_table
