@@ -14,6 +14,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from copy import copy
 from typing import Annotated, Any
 
 import typer
@@ -54,6 +55,28 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )
+#: The files of commands, in the order of the help.
+_GROUPS = (
+    run,
+    images,
+    measure,
+    model,
+    visits,
+    stack_images,
+    donuts,
+    reproduce,
+    diagnostics,
+    study,
+    sweep,
+    baseline,
+    design,
+    tolerance,
+    camera,
+    shim,
+    align,
+    telescope,
+    files,
+)
 _INTERRUPTED = 130
 
 
@@ -61,8 +84,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line with arguments, by default those of the process, and return its exit status."""
     # It reports a cache that it cannot write, and then uses a temporary one.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    given = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        status = app(args=None if arguments is None else list(arguments), prog_name="pachon", standalone_mode=False)
+        status = _app_with(given[0] if given else "")(args=given, prog_name="pachon", standalone_mode=False)
         sys.stdout.flush()
         if status == _INTERRUPTED:
             return _fail("interrupted", _INTERRUPTED)
@@ -83,6 +107,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail("not enough memory; fewer threads or smaller atmosphere.screen_size need less")
     except (KeyboardInterrupt, typer.Abort):
         return _fail("interrupted", _INTERRUPTED)
+
+
+def _app_with(first: str) -> typer.Typer:
+    """Return an app with the command of a name, and with all where there is none.
+
+    Typer builds all commands of an app before it runs one, which takes longer than a short command.
+    """
+    commands = [c for group in _GROUPS for c in group.app.registered_commands if c.name == first]
+    groups = [g for group in _GROUPS for g in group.app.registered_groups if g.name == first]
+    if not commands and not groups:
+        return app
+    one = copy(app)
+    one.registered_commands, one.registered_groups = commands, groups
+    return one
 
 
 def _usage_text(error: Any) -> str:
@@ -114,28 +152,7 @@ def _common(
     del show_version
 
 
-# In the order of the help.
-for _group in (
-    run,
-    images,
-    measure,
-    model,
-    visits,
-    stack_images,
-    donuts,
-    reproduce,
-    diagnostics,
-    study,
-    sweep,
-    baseline,
-    design,
-    tolerance,
-    camera,
-    shim,
-    align,
-    telescope,
-    files,
-):
+for _group in _GROUPS:
     app.add_typer(_group.app)
 
 

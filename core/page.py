@@ -1,8 +1,9 @@
-"""Reports as one HTML file with everything in it, pictures included."""
+"""Reports as one HTML file with everything in it, pictures included, and numbers with the digits that errors allow."""
 
 from __future__ import annotations
 
 import base64
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,3 +41,18 @@ def render(folder: Path, template: str, **content: Any) -> str:
         lstrip_blocks=True,
     )
     return environment.get_template(template).render(**content)
+
+
+def with_error(value: float, error: float) -> str:
+    """Return a number with its error, to the second digit of that; to three digits where the error is not known."""
+    if not error > 0.0:
+        return f"{value:.3g}"
+    return f"{with_digits(value, error)} ± {error:.2g}"
+
+
+def with_digits(value: float, error: float) -> str:
+    """Return a number to the second digit of its error; to three digits where the error is not known."""
+    if value == 0.0 or not error > 0.0:
+        return f"{value:.3g}"
+    digits = 2 + math.floor(math.log10(abs(value))) - math.floor(math.log10(error))
+    return f"{value:.{min(max(digits, 1), 9)}g}"

@@ -111,7 +111,7 @@ def draw_stamps(ax: Axes | Figure | None, images: np.ndarray, pixel: float, titl
             axes.imshow(shown, extent=(-half, half, -half, half), cmap="inferno", vmin=0.0)
             axes.set_title(plain_text(title), fontsize=8.5)
             axes.set_xlabel("x [arcsec]")
-        row[0].set_ylabel("y [arcsec], square root of the light")
+        row[0].set_ylabel("y [arcsec]\nsquare root of the light", fontsize=8)
         return figure
 
 

@@ -279,6 +279,18 @@ def known_keys(model: type[BaseModel]) -> tuple[str, ...]:
     return tuple(keys)
 
 
+def key_description(model: type[BaseModel], key: str) -> str:
+    """Return the description of a key of a model, with dots between sections; empty where there is none."""
+    first, _, rest = key.partition(".")
+    for name, field in model.model_fields.items():
+        if (field.alias or name) == first:
+            section = field.annotation
+            if rest and isinstance(section, type) and issubclass(section, BaseModel):
+                return key_description(section, rest)
+            return "" if rest else field.description or ""
+    return ""
+
+
 def json_text(value: Any) -> str:
     """Return a value as JSON, cut short."""
     return cut_short(json.dumps(value, ensure_ascii=False, default=str))

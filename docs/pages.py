@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import functools
 import importlib
 import inspect
 import io
@@ -141,6 +142,7 @@ def setup(app: object) -> dict[str, bool]:
     app.connect("builder-inited", _write_references)
     app.connect("source-read", _run_example)
     app.connect("autodoc-process-docstring", _attributes_as_parameters, priority=400)
+    app.connect("missing-reference", _public_reference)
     return {"parallel_read_safe": False}
 
 
@@ -150,6 +152,21 @@ def _write_references(app: object) -> None:
     for layer in LAYERS:
         (folder / f"api_{layer or 'galsim'}.md").write_text(api_page(layer), encoding="utf-8")
     (folder / "commands.md").write_text(command_page(), encoding="utf-8")
+
+
+def _public_reference(app: object, environment: object, node: object, content: object) -> object:
+    """Return the link to a public name that a docstring names by its module, as in ``wavefront.opd.wavefront_opd``."""
+    name = node.get("reftarget", "").rpartition(".")[2]
+    if node.get("refdomain") != "py" or f"pachon.{name}" == node["reftarget"] or name not in _all_public():
+        return None
+    domain = environment.get_domain("py")
+    kind = node["reftype"]
+    return domain.resolve_xref(environment, node["refdoc"], app.builder, kind, f"pachon.{name}", node, content)
+
+
+@functools.cache
+def _all_public() -> frozenset[str]:
+    return frozenset(name for names in public_names().values() for name in names)
 
 
 def _attributes_as_parameters(*event: object) -> None:

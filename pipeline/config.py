@@ -98,16 +98,16 @@ class FocalPlaneConfig(Section):
     budget: Literal["simulated", "specification", "flat"] | None = Field(
         None, description="column of Table 1 that the heights are drawn from, or flat; that of the camera by default"
     )
-    global_: Switch = Field(True, alias="global", description="figure of the whole focal plane")
+    global_: Switch = Field(True, alias="global", description="height of the whole focal plane")
     raft: Switch = Field(True, description="height of each raft")
     ccd: Switch = Field(True, description="height of each CCD")
     tilt: Switch = Field(True, description="tilt of each CCD")
     potato_chip: Switch = Field(True, description="waves within each CCD")
-    global_um: NotNegative | None = Field(None, description="peak to valley in place of the budget's [um]")
-    raft_um: NotNegative | None = Field(None, description="peak to valley in place of the budget's [um]")
-    ccd_um: NotNegative | None = Field(None, description="peak to valley in place of the budget's [um]")
-    tilt_urad: NotNegative | None = Field(None, description="peak to valley in place of the budget's [urad]")
-    potato_chip_um: NotNegative | None = Field(None, description="peak to valley in place of the budget's [um]")
+    global_um: NotNegative | None = Field(None, description="the whole plane, peak to valley, not the budget's [um]")
+    raft_um: NotNegative | None = Field(None, description="rafts, peak to valley, not the budget's [um]")
+    ccd_um: NotNegative | None = Field(None, description="CCDs, peak to valley, not the budget's [um]")
+    tilt_urad: NotNegative | None = Field(None, description="tilts of CCDs, peak to valley, not the budget's [urad]")
+    potato_chip_um: NotNegative | None = Field(None, description="waves, peak to valley, not the budget's [um]")
     potato_chip_cycles: tuple[Positive, Positive] | None = Field(
         None, description="fewest and most cycles along a CCD in place of 1 and 2"
     )

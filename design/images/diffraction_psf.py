@@ -193,7 +193,7 @@ def _draw_cuts(panels: Any, psf: DiffractionPsf) -> None:
             row, column = np.unravel_index(int(np.argmax(density)), density.shape)
             cut = density[row] if name == "x" else density[:, column]
             axes.plot(psf.axis * 1e6, cut, color=color, linewidth=1.2, label=psf.field_labels()[i])
-        label = f"{name} on the detector from the middle of the image [µm]"
+        label = f"{name} from the middle of the image [µm]"
         drawing.finish_axes(axes, xlabel=label, xlim=(psf.axis[0] * 1e6, psf.axis[-1] * 1e6), ylim=(0.0, None))
     panels[0].set_ylabel("part of the light per µm²\n(through the brightest pixel)")
     panels[1].legend(loc="upper right")

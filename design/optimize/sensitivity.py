@@ -142,7 +142,7 @@ class Sensitivity(FieldResult):
             modes.xaxis.set_major_locator(MaxNLocator(integer=True))
             modes.grid(True, which="major", linewidth=0.3)
             label = "singular value, each parameter scaled to 1"
-            modes.set(xlabel="mode", ylabel=label, title="independent combinations")
+            modes.set(xlabel="mode", ylabel=label, title="combinations")
             return figure
 
 

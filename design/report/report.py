@@ -87,6 +87,7 @@ def design_report(
         columns=COLUMNS,
         rows=rows,
         first_order=first,
+        middle=request.middle * 1e9,
         fields=[tuple(f) for f in np.rad2deg(request.fields)],
         wavelengths=[float(w) * 1e9 for w in request.wavelengths],
         pictures=pictures,

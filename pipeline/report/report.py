@@ -69,7 +69,7 @@ def _model_words(fit: ReconstructionConfig) -> str:
 
 #: Where the heights come from: none, measured ones or a budget.
 _HEIGHTS = {
-    "none": "All are zero: this camera has no budget of heights, or `flat` is chosen.",
+    "none": "All are zero: this camera has no budget of heights, or flat ones are chosen.",
     "measured": "They are measured ones.",
     "budget": "Steps between CCDs and rafts, tilts and the ripple within a CCD (the potato chip) come from the height "
     "budget, each term from its own random stream.",

@@ -5,7 +5,6 @@ Means over the fields have the weights that the design data state, where the fie
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +16,10 @@ from ...design.metrics.vignetting import vignetting
 from ...design.optimize.merit import Beams, WavefrontMerit
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
+from .metric import Metric, MetricTable
 
+#: Metrics of a telescope without a camera.
+BARE = MetricTable()
 #: Rings of pupil points, pixels of the images of encircled energy, points across the pupil, rays for the throughput.
 _RINGS, _PIXELS, _ACROSS, _RAYS = 6, 96, 192, 4096
 #: Fraction of the light, and contrast.
@@ -39,6 +41,11 @@ class BareScene:
         return Request.of(self.telescope, self.fields, self.wavelengths, n_pupil=_RINGS, threads=self.threads)
 
 
+@BARE.group(
+    "spots",
+    Metric("spot_rms_um", "um", meaning="rms spot radius about the centroid, rms over the fields with their weights"),
+    Metric("spot_worst_um", "um", meaning="rms spot radius about the centroid, largest of the fields"),
+)
 def spots(scene: BareScene) -> dict[str, float]:
     """Return the rms spot radius over the fields, and the largest."""
     request = scene.request
@@ -46,6 +53,10 @@ def spots(scene: BareScene) -> dict[str, float]:
     return {"spot_rms_um": float(np.sqrt(request.field_weights @ radii**2)), "spot_worst_um": float(radii.max())}
 
 
+@BARE.group(
+    "wavefront",
+    Metric("wavefront_rms_nm", "nm", meaning="rms wavefront without piston and tilt, over fields and wavelengths"),
+)
 def wavefront(scene: BareScene) -> dict[str, float]:
     """Return the rms wavefront without piston and tilt, over fields and wavelengths."""
     beams = Beams.of(scene.telescope, scene.fields, scene.wavelengths, n_pupil=_RINGS, threads=scene.threads)
@@ -53,6 +64,13 @@ def wavefront(scene: BareScene) -> dict[str, float]:
     return {"wavefront_rms_nm": float(np.linalg.norm(residuals)) * 1e9}
 
 
+@BARE.group(
+    "ee80",
+    Metric(
+        "ee80_um", "um", meaning="radius of 80 % of the light with diffraction, middle wavelength, mean of the fields"
+    ),
+    Metric("ee80_worst_um", "um", meaning="radius of 80 % of the light with diffraction, largest of the fields"),
+)
 def ee80(scene: BareScene) -> dict[str, float]:
     """Return the radius of 80 % of the light with diffraction at the middle wavelength, mean and largest."""
     energy = encircled_energy(
@@ -62,6 +80,11 @@ def ee80(scene: BareScene) -> dict[str, float]:
     return {"ee80_um": float(scene.request.field_weights @ radii), "ee80_worst_um": float(radii.max())}
 
 
+@BARE.group(
+    "mtf",
+    Metric("mtf50_per_mm", "1/mm", meaning="frequency of contrast 0.5, mean over fields, tangential and sagittal"),
+    Metric("mtf50_worst_per_mm", "1/mm", meaning="frequency of contrast 0.5, least of fields and directions"),
+)
 def transfer(scene: BareScene) -> dict[str, float]:
     """Return the frequency at which the contrast falls to a half, mean and least over fields and two directions."""
     found = mtf(scene.telescope, scene.fields, scene.wavelengths, threads=scene.threads).frequency_at(_CONTRAST) * 1e-3
@@ -69,18 +92,13 @@ def transfer(scene: BareScene) -> dict[str, float]:
     return {"mtf50_per_mm": mean, "mtf50_worst_per_mm": float(found.min())}
 
 
+@BARE.group(
+    "throughput",
+    Metric("throughput_mean", meaning="lit fraction of the pupil, mean over stars or fields"),
+    Metric("throughput_min", meaning="lit fraction of the pupil, least of stars or fields"),
+)
 def throughput(scene: BareScene) -> dict[str, float]:
     """Return mean and minimum of the lit fraction of the pupil over the fields."""
     request = scene.request
     lit = vignetting(scene.telescope, request.fields, request.middle, n_pupil=_RAYS, threads=scene.threads).lit_fraction
     return {"throughput_mean": float(request.field_weights @ lit), "throughput_min": float(lit.min())}
-
-
-#: Groups of metrics by name.
-BARE: dict[str, Callable[[BareScene], dict[str, float]]] = {
-    "spots": spots,
-    "wavefront": wavefront,
-    "ee80": ee80,
-    "mtf": transfer,
-    "throughput": throughput,
-}

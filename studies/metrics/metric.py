@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from .scene import Scene
 
@@ -31,6 +32,7 @@ class Metric:
     reason: str = ""  #: of the tolerance, a key of :data:`REASONS`; empty for metrics without a tolerance
     #: In the unit, or a function of scene and value; for lengths by default ``Scene.length_tolerance``.
     tolerance: float | Callable[[Scene, float], float] | None = None
+    meaning: str = ""  #: definition, as reports and tables state it; a clause without a full stop
 
     def tolerance_of(self, scene: Scene, value: float) -> float:
         """Return the tolerance of a value, in its unit."""
@@ -43,7 +45,7 @@ class Metric:
 class MetricGroup:
     """Metrics that are computed together, from a scene to values by name."""
 
-    compute: Callable[[Scene], dict[str, float]]
+    compute: Callable[[Any], dict[str, float]]
     metrics: tuple[Metric, ...]
 
     def metric(self, name: str) -> Metric:
@@ -56,16 +58,16 @@ class MetricTable(dict[str, MetricGroup]):
 
     def group(
         self, name: str, *metrics: Metric
-    ) -> Callable[[Callable[[Scene], dict[str, float]]], Callable[[Scene], dict[str, float]]]:
-        """Return a decorator that adds a function as a group of metrics."""
+    ) -> Callable[[Callable[[Any], dict[str, float]]], Callable[[Any], dict[str, float]]]:
+        """Return a decorator that adds a function of a scene as a group of metrics."""
 
-        def add(compute: Callable[[Scene], dict[str, float]]) -> Callable[[Scene], dict[str, float]]:
+        def add(compute: Callable[[Any], dict[str, float]]) -> Callable[[Any], dict[str, float]]:
             self[name] = MetricGroup(compute, metrics)
             return compute
 
         return add
 
-    def unit(self, name: str) -> str | None:
-        """Return the unit of a value, or None for names of no metric."""
-        found = (m.unit for group in self.values() for m in group.metrics if name.startswith(m.name))
-        return next(found, None)
+    def metric(self, name: str) -> Metric | None:
+        """Return the metric of a value: of those whose names start its own, the longest; None where there is none."""
+        found = [m for group in self.values() for m in group.metrics if name.startswith(m.name)]
+        return max(found, key=lambda m: len(m.name), default=None)

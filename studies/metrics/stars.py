@@ -36,21 +36,48 @@ _NEIGHBOUR = 1.15
 # Order of the fit of ellipticity within a CCD, for its value at the border.
 _BORDER_ORDER = 2
 
+#: Ranges of separation, and kinds of residuals of ellipticity, in words.
+_PAIRS = {
+    name: f"{low:g} to {high:g} arcmin apart" if low > 0.0 else f"closer than {high:g} arcmin"
+    for name, (low, high) in SEPARATION_RANGES.items()
+}
+_RESIDUALS = {
+    "residual": "of e at the stars: observed - model",
+    "away": "of e at holdout positions: noise-free - model",
+}
 
-@STARS.group("fwhm", Metric("fwhm_arcsec", "arcsec"))
+
+@STARS.group(
+    "fwhm",
+    Metric(
+        "fwhm_arcsec",
+        "arcsec",
+        meaning="effective FWHM of the median star: that of the Gaussian with as many noise-equivalent pixels",
+    ),
+)
 def width(scene: Scene) -> dict[str, float]:
     """Return the effective FWHM of the median star."""
     return {"fwhm_arcsec": effective_fwhm(scene.stars.image, scene.stars.pixel_scale) / ARCSEC}
 
 
-@STARS.group("rms_e", Metric("rms_e"), Metric("mean_e"))
+@STARS.group(
+    "rms_e",
+    Metric("rms_e", meaning="rms of one component of the ellipticity e = (a-b)/(a+b) of the noise-free stars"),
+    Metric("mean_e", meaning="mean modulus of the ellipticity e = (a-b)/(a+b) of the noise-free stars"),
+)
 def ellipticity(scene: Scene) -> dict[str, float]:
     """Return the rms of one component of e, and the mean modulus."""
     e = np.stack([scene.shapes.e1, scene.shapes.e2])
     return {"rms_e": float(np.sqrt(np.nanmean(e**2))), "mean_e": float(np.nanmean(np.hypot(*e)))}
 
 
-@STARS.group("e_rings", Metric("mean_e"))
+@STARS.group(
+    "e_rings",
+    *(
+        Metric(f"mean_e_{low:g}_to_{high:g}_deg", meaning=f"mean_e of the stars {low:g} to {high:g} deg from the axis")
+        for low, high in _RINGS
+    ),
+)
 def ellipticity_of_rings(scene: Scene) -> dict[str, float]:
     """Return the mean modulus of e in rings of field angle."""
     radius = np.rad2deg(np.hypot(*scene.stars.fields.T))
@@ -62,7 +89,13 @@ def ellipticity_of_rings(scene: Scene) -> dict[str, float]:
     return metrics
 
 
-@STARS.group("border_jump", Metric("border_jump_e"))
+@STARS.group(
+    "border_jump",
+    Metric(
+        "border_jump_e",
+        meaning="rms jump of one component of e across borders between CCDs, from a quadratic fit within each",
+    ),
+)
 def border_jump(scene: Scene) -> dict[str, float]:
     """Return the rms jump of one component of e across borders between neighbouring CCDs."""
     camera = scene.camera_experiment.camera
@@ -91,13 +124,25 @@ def border_jump(scene: Scene) -> dict[str, float]:
     return {"border_jump_e": float(np.sqrt(np.nanmean(np.square(jumps))))}
 
 
-@STARS.group("xi_raw", Metric("xi_raw"))
+@STARS.group(
+    "xi_raw",
+    *(
+        Metric(
+            f"xi_raw_{name}", meaning=f"mean ellipticity correlation xi+ of the noise-free stars over pairs {range_}"
+        )
+        for name, range_ in _PAIRS.items()
+    ),
+)
 def correlation(scene: Scene) -> dict[str, float]:
     """Return the mean of xi+ over short and long separations."""
     return {f"xi_raw_{name}": scene.correlation.mean_xi_plus(name) for name in SEPARATION_RANGES}
 
 
-@STARS.group("xi_bins", Metric("xi_plus"), Metric("xi_minus"))
+@STARS.group(
+    "xi_bins",
+    Metric("xi_plus", meaning="ellipticity correlation xi+ of the noise-free stars at that mean separation"),
+    Metric("xi_minus", meaning="ellipticity correlation xi- of the noise-free stars at that mean separation"),
+)
 def correlation_bins(scene: Scene) -> dict[str, float]:
     """Return xi+ and xi- of each bin of separation."""
     found = scene.correlation
@@ -106,7 +151,16 @@ def correlation_bins(scene: Scene) -> dict[str, float]:
     return plus | minus
 
 
-@STARS.group("reconstruction", Metric("xi_residual"), Metric("xi_away"), Metric("rms_residual"))
+@STARS.group(
+    "reconstruction",
+    *(
+        Metric(f"xi_{kind}_{name}", meaning=f"mean xi+ over pairs {range_} of the residuals {_RESIDUALS[kind]}")
+        for kind in _RESIDUALS
+        for name, range_ in _PAIRS.items()
+    ),
+    Metric("rms_residual_at_stars", meaning=f"rms of one component of the residuals {_RESIDUALS['residual']}"),
+    Metric("rms_residual_away", meaning=f"rms of one component of the residuals {_RESIDUALS['away']}"),
+)
 def reconstruction(scene: Scene) -> dict[str, float]:
     """Return the residuals of PSF models of noisy stars, and their correlations."""
     experiment = scene.camera_experiment
@@ -124,7 +178,10 @@ def reconstruction(scene: Scene) -> dict[str, float]:
     return metrics | {key: float(together[key]) for key in ("rms_residual_at_stars", "rms_residual_away")}
 
 
-@STARS.group("ee80", Metric("ee80_arcsec", "arcsec"))
+@STARS.group(
+    "ee80",
+    Metric("ee80_arcsec", "arcsec", meaning="radius of 80 % of the light in the stamp of the mean noise-free star"),
+)
 def ee80(scene: Scene) -> dict[str, float]:
     """Return the radius of 80 % of the light in the stamp of the mean star."""
     mean = scene.stars.image.astype(np.float64).mean(axis=0)
@@ -133,14 +190,28 @@ def ee80(scene: Scene) -> dict[str, float]:
     return {"ee80_arcsec": radius * scene.stars.pixel_scale / ARCSEC}
 
 
-@STARS.group("throughput", Metric("throughput"))
+@STARS.group(
+    "throughput",
+    Metric("throughput_mean", meaning="lit fraction of the pupil, mean over stars or fields"),
+    Metric("throughput_min", meaning="lit fraction of the pupil, least of stars or fields"),
+)
 def lit_fraction(scene: Scene) -> dict[str, float]:
     """Return mean and minimum of the lit fraction of the pupil."""
     light = scene.stars.lit_fraction
     return {"throughput_mean": float(light.mean()), "throughput_min": float(light.min())}
 
 
-@STARS.group("zernikes", *(Metric(f"Z{j}_nm", "nm") for j in _ZERNIKES))
+@STARS.group(
+    "zernikes",
+    *(
+        Metric(
+            f"Z{j}_nm",
+            "nm",
+            meaning=f"annular Zernike term {j} (Noll) of the wavefront without atmosphere, rms over five fields",
+        )
+        for j in _ZERNIKES
+    ),
+)
 def zernikes(scene: Scene) -> dict[str, float]:
     """Return the rms of each wavefront term over five fields, to the edge on either axis."""
     telescope, wavelengths = scene.telescope, scene.camera_experiment.wavelengths

@@ -66,6 +66,8 @@ class Allowance:
     alone: float
     #: The same for an equal fraction of the target for each parameter.
     shared: float
+    #: Relative standard error of both distances; NaN with one replica.
+    error: float
 
 
 def curves(table: SweepTable, sweep: SweepFile, metric: str) -> list[Curve]:
@@ -119,14 +121,15 @@ def budget(table: SweepTable, sweep: SweepFile, metric: str, mark: str) -> Budge
 def allowances(found: Sequence[Curve], target: float) -> list[Allowance]:
     """Return the allowance of each parameter for a growth of the metric up to a target.
 
-    The change is a power of the distance from nominal, fitted to the outer half of the curve, where it is largest.
+    The change is a power of the distance from nominal, fitted to the outer half of the curve, where it is largest. The
+    error is to first order, from that of the change at the farthest point.
     """
     each = []
     for curve in found:
         distance = np.abs(curve.value - curve.nominal)
         outer = (distance >= 0.5 * distance.max()) & (curve.change > 0)
         if outer.sum() < 2 or len(np.unique(distance[outer])) < 2:
-            each.append(Allowance(curve.parameter, np.nan, np.nan, np.nan))
+            each.append(Allowance(curve.parameter, np.nan, np.nan, np.nan, np.nan))
             continue
         power, intercept = np.polyfit(np.log(distance[outer]), np.log(curve.change[outer]), 1)
         bounds = []
@@ -134,7 +137,11 @@ def allowances(found: Sequence[Curve], target: float) -> list[Allowance]:
             reach = float(np.exp((np.log(goal) - intercept) / power)) if power > 0 else np.nan
             # The power law holds near the computed points only.
             bounds.append(reach if reach <= 2.0 * distance.max() else np.nan)
-        each.append(Allowance(curve.parameter, float(power), *bounds))
+        # Replicas move the whole curve: its relative error over the power is that of the distance.
+        last = int(np.flatnonzero(outer)[np.argmax(distance[outer])])
+        error = float(curve.error[last] / curve.change[last] / power) if power > 0 else np.nan
+        alone, shared = bounds
+        each.append(Allowance(curve.parameter, float(power), alone, shared, error))
     return each
 
 
@@ -173,10 +180,11 @@ def summary(table: SweepTable, sweep: SweepFile) -> dict[str, Any]:
                     **added.changes,
                     "sum": added.total,
                     "together": added.together,
+                    "together_error": added.together_error,
                 }
         if sweep.xi_target is not None and metric.startswith("xi"):
             entry["allowance"] = {
-                a.parameter: {"power": a.power, "alone": a.alone, "shared": a.shared}
+                a.parameter: {"power": a.power, "alone": a.alone, "shared": a.shared, "error": a.error}
                 for a in allowances(found, sweep.xi_target)
             }
         metrics[metric] = entry

@@ -60,7 +60,7 @@ def bare_metrics(sweep: SweepFile, parameters: dict[str, Any], folder: Path, thr
     scene = BareScene(telescope, fields, waves, threads)
     metrics: dict[str, float] = {}
     for name in dict.fromkeys(sweep.metrics):
-        metrics |= BARE[name](scene)
+        metrics |= BARE[name].compute(scene)
     return metrics | solved
 
 

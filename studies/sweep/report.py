@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,13 +9,13 @@ import numpy as np
 
 from ...core.errors import ProductError
 from ...core.files import make_folder, write_bytes, write_json
-from ...core.page import Picture, render
+from ...core.page import Picture, render, with_digits, with_error
 from ...pipeline.report.report import TEMPLATES
 from . import plots
 from .analysis import Budget, Curve, allowances, budget, curves, rank_correlations, summary
 from .file import SweepFile
 from .store import SweepStore
-from .table import SweepTable, read_table
+from .table import SweepTable, described_metric, described_parameter, read_table
 
 # Number of metrics with plots of their own; all are in the tornado chart and in the table.
 _SHOWN = 4
@@ -44,6 +43,7 @@ def write_report(store: SweepStore, folder: Path) -> Path:
         pachon=store.about["pachon"],
         points=len(store.points()),
         rows=_rows(table, sweep),
+        parameters={name: described_parameter(name) for name in sweep.parameters},
         problems=[(int(n), p) for n, p in zip(table.number, table.problem, strict=True) if p][:20],
     )
     report = folder / "report.html"
@@ -67,11 +67,14 @@ def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Cu
     text = (
         "Change of each metric from its nominal value over the range of each parameter, others nominal: blue below the "
         "nominal value of the parameter, red above. Vertical strokes are the marks. Error bars: standard error of the "
-        "mean over the replicas, which share their random numbers with the nominal point; none with one replica."
+        "mean over the replicas, which share their random numbers with the nominal point; none with one replica. Grey: "
+        "range of the parameter, in the unit at the end of its name. The last tables define parameters and metrics."
     )
     yield "tornado", Picture("What matters most", plots.tornado_plot(drawn), text)
     for metric in list(drawn)[:_SHOWN]:
-        text = f"{metric} against each parameter, the others nominal; the band is the spread over the replicas."
+        text = (
+            f"{_defined(metric)} Against each parameter, the others nominal; the band is the spread over the replicas."
+        )
         yield f"curves_{metric}", Picture(f"{metric}, one at a time", plots.curves_plot(drawn[metric]), text)
     marks = list(dict.fromkeys(mark for p in sweep.parameters.values() for mark in p.marks))
     correlated = [m for m in drawn if m.startswith("xi")]
@@ -84,12 +87,25 @@ def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Cu
         # A metric that nothing raises, as xi of a single CCD may be, has no place on logarithmic axes.
         for metric in (m for m in correlated if any(np.any(curve.change > 0) for curve in drawn[m])):
             allowed = allowances(drawn[metric], sweep.xi_target)
-            each = (f"{a.parameter}: {a.alone:.3g} alone, {a.shared:.3g} with an equal share" for a in allowed
-                    if np.isfinite(a.alone))  # fmt: skip
+            each = (f"{a.parameter}: {with_error(a.alone, a.error * a.alone)} alone, "
+                    f"{with_error(a.shared, a.error * a.shared)} with an equal share"
+                    for a in allowed if np.isfinite(a.alone))  # fmt: skip
             title = f"Allowance of each term for {metric} below {sweep.xi_target:g}"
             plot = plots.allowance_plot(drawn[metric], allowed, sweep.xi_target)
-            text = "; ".join(each) or "No term reaches the target within twice its range."
+            text = (
+                f"{_defined(metric)} Distance of each parameter from nominal that raises it by the target (diamonds), "
+                "or by an equal share of it, with the standard error over the replicas. Power: exponent of the change "
+                "against the distance. "
+                + ("; ".join(each) or "No term reaches the target within twice its range")
+                + "."
+            )
             yield f"allowance_{metric}", Picture(title, plot, text)
+
+
+def _defined(metric: str) -> str:
+    """Return the definition of a metric as a sentence."""
+    unit, text = described_metric(metric)
+    return f"{metric}: {text}{f' [{unit}]' if unit else ''}." if text else f"{metric}."
 
 
 def _budget_text(found: list[Budget]) -> str:
@@ -100,12 +116,15 @@ def _budget_text(found: list[Budget]) -> str:
             apart = abs(one.together - one.total)
             # Equal within two standard errors, or a tenth for one replica.
             same = apart < (2.0 * one.together_error if np.isfinite(one.together_error) else 0.1 * abs(one.total))
-            error = f" +- {one.together_error:.2g}" if np.isfinite(one.together_error) else ""
             texts.append(
-                f"{one.mark}: single effects sum to {one.total:.3g}, all at once make {one.together:.3g}{error}: "
+                f"{one.mark}: single effects sum to {with_digits(one.total, one.together_error)}, all at once make "
+                f"{with_error(one.together, one.together_error)}: "
                 + ("they add, as far as this tells." if same else "they do not simply add.")
             )
-    return "Independent errors add in their squares, which xi is made of. " + " ".join(texts)
+    return (
+        f"{_defined(found[0].metric)} Its change at each named value of all parameters, one by one and together (grey, "
+        "with the standard error over the replicas). Independent errors add in their squares, which xi is made of. "
+    ) + " ".join(texts)
 
 
 def _random(table: SweepTable, numeric: list[str]) -> Iterator[tuple[str, Picture]]:
@@ -117,7 +136,9 @@ def _random(table: SweepTable, numeric: list[str]) -> Iterator[tuple[str, Pictur
     yield "ranks", Picture("What matters most", plots.correlations_plot(ranks), text)
     for metric in list(ranks)[:_SHOWN]:
         names = sorted(ranks[metric], key=lambda n: -abs(ranks[metric][n][0]))
-        text = f"{metric} of every point; the line joins the medians of eight slices, the band their quartiles."
+        text = (
+            f"{_defined(metric)} Dots are points; the line joins the medians of eight slices, the band their quartiles."
+        )
         yield f"scatter_{metric}", Picture(metric, plots.scatter_plot(table, metric, names), text)
         if len(names) > 1:
             text = f"{metric} over pairs of the parameters that it depends on most."
@@ -136,15 +157,8 @@ def _rows(table: SweepTable, sweep: SweepFile) -> list[dict[str, str]]:
         low, middle, high = (float(f(values)) for f in (np.nanmin, np.nanmedian, np.nanmax))
         texts = {"low": low, "median": middle, "high": high}
         rows.append(
-            {"name": name, "scatter": f"{scatter:.1e}" if scatter > 0.0 else "-"}
+            {"name": name, "unit": described_metric(name).unit, "meaning": described_metric(name).text}
+            | {"scatter": f"{scatter:.1e}" if scatter > 0.0 else "-"}
             | {key: with_digits(value, scatter) for key, value in texts.items()}
         )
     return rows
-
-
-def with_digits(value: float, error: float) -> str:
-    """Return a number to the second digit of its error; to three digits where the error is not known."""
-    if value == 0.0 or not error > 0.0:
-        return f"{value:.3g}"
-    digits = 2 + math.floor(math.log10(abs(value))) - math.floor(math.log10(error))
-    return f"{value:.{min(max(digits, 1), 9)}g}"

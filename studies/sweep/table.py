@@ -16,10 +16,18 @@ from ...core.docstrings import Description
 from ...core.errors import ProductError
 from ...core.products import Columns, described_table
 from ...core.result import Result
+from ...core.schema import key_description
 from ...core.table_files import write_table
+from ...pipeline.config import Configuration
+from ..metrics.bare_telescope import BARE
 from ..metrics.stars import STARS
 from .store import SweepStore, readable_rows
 
+#: Motions in names of parameters.
+_CHANGES = {
+    **{f"d{axis}": f"shift along {axis}" for axis in "xyz"},
+    **{f"r{axis}": f"tilt about {axis}" for axis in "xyz"},
+}
 _UNITS = ("um", "nm", "mm", "m", "urad", "rad", "deg", "arcsec", "s")
 
 
@@ -133,11 +141,31 @@ def _columns(table: SweepTable) -> Columns:
         "number": (table.number, "", "number of the point"),
         "seed": (table.seed, "", "seed of its random numbers"),
     }
-    columns |= {name: (_plain(values), _unit(name), "parameter") for name, values in table.parameters.items()}
-    columns |= {name: (values, STARS.unit(name) or _unit(name), "metric") for name, values in table.metrics.items()}
+    columns |= {name: (_plain(values), *described_parameter(name)) for name, values in table.parameters.items()}
+    columns |= {name: (values, *described_metric(name)) for name, values in table.metrics.items()}
     columns["problem"] = (table.problem, "", "reason why it could not be computed")
     columns["seconds"] = (table.seconds, "s", "time of the computation")
     return columns
+
+
+def described_metric(name: str) -> Description:
+    """Return unit and definition of a metric of a sweep."""
+    metric = STARS.metric(name) or BARE.metric(name)
+    if metric is not None:
+        return Description(metric.unit, metric.meaning)
+    return Description(_unit(name), "motion of the compensator" if name.startswith("solved ") else "")
+
+
+def described_parameter(name: str) -> Description:
+    """Return unit and definition of a parameter of a sweep."""
+    text = key_description(Configuration, name)
+    if not text:
+        # The address of a value of the prescription, or the motion of a part of the camera.
+        body, _, quantity = name.rpartition(".")
+        what, unit = quantity.removesuffix(f"_{_unit(name)}"), _unit(name)
+        text = f"change of {body}: {_CHANGES[what]}" if what in _CHANGES else f"change of {what} of {body}"
+        return Description(unit, text)
+    return Description(_unit(name), text)
 
 
 def _plain(values: np.ndarray) -> np.ndarray:

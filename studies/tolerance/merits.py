@@ -34,6 +34,8 @@ class ToleranceMerit:
         Factor from SI to that unit.
     larger : bool
         Whether larger numbers are better.
+    definition : str
+        What the number is, as reports state it.
     judge : Merit
         Merit with derivatives, which the compensators minimise.
     own : callable, optional
@@ -45,6 +47,7 @@ class ToleranceMerit:
     unit: str
     scale: float
     larger: bool
+    definition: str
     judge: Merit
     own: Callable[[Telescope], float] | None = None
 
@@ -95,9 +98,19 @@ def tolerance_merit(
     weights = None if file.field_weights is None else list(file.field_weights)
     beams = Beams.of(telescope, fields, waves, field_weights=weights, n_pupil=file.rings, threads=1)
     if own is not None:
-        return ToleranceMerit("own", "own merit", "", 1.0, False, SpotMerit(telescope, beams), own)
+        return ToleranceMerit(
+            "own", "own merit", "", 1.0, False, "a function of one's own", SpotMerit(telescope, beams), own
+        )
     if file.merit == "wavefront":
-        return ToleranceMerit("wavefront", "rms wavefront", "nm", 1e9, False, WavefrontMerit(telescope, beams))
+        return ToleranceMerit(
+            "wavefront",
+            "rms wavefront",
+            "nm",
+            1e9,
+            False,
+            "path of the rays without piston and tilt of each field, rms over fields, wavelengths and pupil",
+            WavefrontMerit(telescope, beams),
+        )
     if file.merit == "mtf":
         request = beams.request
         pairs = [(tuple(map(float, f)), float(w)) for f in request.fields for w in request.wavelengths]
@@ -109,8 +122,34 @@ def tolerance_merit(
         each = np.repeat(np.outer(beams.field_weights, request.weights).ravel(), 2) / 2.0
         transfer = _MeanTransfer(operands, each)
         title = f"mean MTF at {file.frequency_per_mm:g} per mm"
-        return ToleranceMerit("mtf", title, "", 1.0, True, WavefrontMerit(telescope, beams), transfer)
+        return ToleranceMerit(
+            "mtf",
+            title,
+            "",
+            1.0,
+            True,
+            "contrast of waves along the field and across it, mean over fields and wavelengths",
+            WavefrontMerit(telescope, beams),
+            transfer,
+        )
     judge = SpotMerit(telescope, beams)
     if file.merit == "ee80":
-        return ToleranceMerit("ee80", "radius of 80 % of the rays", "um", 1e6, False, judge, _EnergyRadius(beams))
-    return ToleranceMerit("spots", "rms spot radius", "um", 1e6, False, judge)
+        return ToleranceMerit(
+            "ee80",
+            "radius of 80 % of the rays",
+            "um",
+            1e6,
+            False,
+            "radius about the centroid of a field that holds 80 % of its rays, rms over the fields",
+            judge,
+            _EnergyRadius(beams),
+        )
+    return ToleranceMerit(
+        "spots",
+        "rms spot radius",
+        "um",
+        1e6,
+        False,
+        "distance of the rays from the centroid of their field, rms over fields, wavelengths and pupil",
+        judge,
+    )

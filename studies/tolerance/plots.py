@@ -42,7 +42,7 @@ def sensitivity_plot(study: ToleranceStudy) -> bytes:
             drawn.errorbar(effect[end], rows + (0.15 if end else -0.15), xerr=error[end], fmt="o", **bars)
         drawn.axvline(0.0, color=GREY, linewidth=0.8)
         drawn.set_xlabel(f"less the mean of the other draws{_unit(study)},\nall tolerances at once")
-        drawn.legend(loc="lower right")
+        drawn.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
         title = f"{len(shown)} of {len(study.tolerances)} tolerances, the costliest on top"
         figure.suptitle(_title(study, title), fontsize="medium")
         return png_bytes(figure)

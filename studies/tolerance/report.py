@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...core.page import Picture, render
+from ...core.page import Picture, render, with_digits, with_error
 from ...core.version import VERSION
 from .file import ToleranceFile
 from .study import ToleranceStudy
 
+#: How the merit of a drawn telescope is found.
+_METHODS = {
+    "traced": "each traced with all its deviations",
+    "linear": "from residuals linear in the deviations",
+    "quadratic": "from a quadratic in the deviations",
+}
 #: Tolerances in the table, the costliest.
 _SHOWN = 50
 
@@ -48,6 +55,9 @@ def tolerance_page(
         summary=summary,
         title=title,
         unit=study.merit.unit,
+        definition=study.merit.definition,
+        method=_METHODS[study.method],
+        found=_drawn(summary),
         pictures=[Picture(name, data, shows) for (name, shows), data in zip(captions, pictures, strict=True)],
         rows=_rows(study),
         left=max(0, len(study.tolerances) - _SHOWN),
@@ -55,6 +65,25 @@ def tolerance_page(
         seed=file.seed,
         pachon=VERSION,
     )
+
+
+def _drawn(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return name and value of the statistics of the drawn telescopes, to the digits that their number allows."""
+    if summary["mean"] is None:
+        return []
+    unit = f" {summary['unit']}" if summary["unit"] else ""
+    count = summary["draws"] - summary["lost"]
+    error = summary["spread"] / math.sqrt(count)
+    rows = [
+        ("mean of the drawn telescopes, and its standard error", with_error(summary["mean"], error) + unit),
+        # Of a normal distribution, that of the standard deviation is smaller by the root of two.
+        ("standard deviation of them", with_digits(summary["spread"], error / math.sqrt(2.0)) + unit),
+    ]
+    for key, value in summary.items():
+        if key.startswith("reached_by_"):
+            text = with_digits(value, error) + unit if math.isfinite(value) else "light is lost"
+            rows.append((f"reached by {key.split('_')[2]} % of them", text))
+    return rows
 
 
 def _rows(study: ToleranceStudy) -> list[tuple[str, ...]]:

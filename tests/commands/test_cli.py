@@ -1,5 +1,6 @@
 """The command line: output streams, exit statuses, and one clear line for every kind of bad input."""
 
+import gc
 import json
 import os
 import re
@@ -13,6 +14,7 @@ import pytest
 
 from pachon.commands import cli
 from pachon.commands.cli import main
+from pachon.commands.design import command as design_command
 from pachon.models.io import prescription
 from pachon.models.io.bundled import BUNDLED
 from pachon.models.io.site_file import DATA
@@ -130,6 +132,23 @@ def test_errors_of_values_in_a_file_name_the_file(capsys, in_folder, command):
     assert line.startswith("pachon: error: mine.yaml: ")
     assert "did you mean R22_S" in line
     assert not (in_folder / "out").exists()
+
+
+def test_only_the_command_that_runs_is_built():
+    names = {command.name for group in cli._GROUPS for command in group.app.registered_commands}
+    assert {"run", "spots", "check", "convert"} < names
+    for name in names:
+        app = cli._app_with(name)
+        assert [command.name for command in app.registered_commands] == [name]
+        assert not app.registered_groups
+    assert [group.name for group in cli._app_with("sweep").registered_groups] == ["sweep"]
+    assert cli._app_with("spts") is cli.app
+
+
+def test_imports_of_design_commands_leave_garbage_collection_on():
+    assert gc.isenabled()
+    design_command._import_needed()
+    assert gc.isenabled()
 
 
 def test_help_loads_nothing_that_computes():

@@ -55,7 +55,9 @@ def test_a_study_is_written_shown_and_resumed(capsys, in_folder, written):
         "yield.png",
     }
     page = (folder / "report.html").read_text()
-    for words in ("L2.dy_um", "size for 10 %", "yield: fraction that meets it", "Image.dz_um"):
+    mean = "mean of the drawn telescopes, and its standard error"
+    merit = "distance of the rays from the centroid of their field"
+    for words in ("L2.dy_um", "size for 10 %", "yield: fraction that meets it", "Image.dz_um", mean, merit):
         assert words in page
     assert page.count('<img src="data:image/png;base64,') == 4
     # Nothing of another file or site.

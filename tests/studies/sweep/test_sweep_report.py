@@ -6,12 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from pachon.studies.sweep.analysis import curves
+from pachon.core.page import with_digits
+from pachon.studies.metrics.bare_telescope import BARE
+from pachon.studies.metrics.stars import STARS
+from pachon.studies.sweep.analysis import allowances, curves
 from pachon.studies.sweep.file import read_sweep
-from pachon.studies.sweep.report import with_digits, write_report
+from pachon.studies.sweep.report import write_report
 from pachon.studies.sweep.store import PointResult, SweepStore, create_store
 from pachon.studies.sweep.sweep import numbered_points
-from pachon.studies.sweep.table import read_table
+from pachon.studies.sweep.table import described_metric, described_parameter, read_table
 
 SWEEP = read_sweep(
     {
@@ -37,9 +40,10 @@ def test_effects_budget_and_allowances_are_those_of_a_sum_of_squares(tmp_path):
         report = write_report(store, tmp_path / "report")
     found = json.loads((report.parent / "summary.json").read_text())["metrics"]["xi_raw_short"]
     assert found["largest_change"] == pytest.approx({"a": 16e-6, "b": 12e-6})
-    assert found["budget_budget"] == pytest.approx({"a": 4e-6, "b": 3e-6, "sum": 7e-6, "together": 7e-6})
+    added = {"a": 4e-6, "b": 3e-6, "sum": 7e-6, "together": 7e-6, "together_error": 0.0}
+    assert found["budget_budget"] == pytest.approx(added)
     for name, factor in (("a", 1e-6), ("b", 3e-6)):
-        expected = {"power": 2.0, "alone": math.sqrt(5e-6 / factor), "shared": math.sqrt(2.5e-6 / factor)}
+        expected = {"power": 2.0, "alone": math.sqrt(5e-6 / factor), "shared": math.sqrt(2.5e-6 / factor), "error": 0.0}
         assert found["allowance"][name] == pytest.approx(expected)
     pictures = {path.name for path in report.parent.glob("*.png")}
     assert pictures == {f"{kind}xi_raw_short.png" for kind in ("curves_", "budget_", "allowance_")} | {"tornado.png"}
@@ -94,6 +98,30 @@ def test_errors_of_effects_are_those_of_the_mean_over_replicas(tmp_path):
     # Of two values, the standard error of the mean is half their difference.
     assert curve.change == pytest.approx(2e-6 * curve.value**2)
     assert curve.error == pytest.approx(1e-6 * curve.value**2)
+    # A change of half its size, of a square, is a quarter of the distance.
+    allowed = allowances([curve], 8e-6)[0]
+    assert (allowed.alone, allowed.error) == pytest.approx((2.0, 0.25))
+
+
+def test_every_metric_and_parameter_is_defined_in_the_report(tmp_path):
+    for name, group in [*STARS.items(), *BARE.items()]:
+        assert all(metric.meaning for metric in group.metrics), name
+    # The longest name that fits: one is the beginning of the other.
+    assert "0.5 to 1 deg from the axis" in described_metric("mean_e_0.5_to_1_deg").text
+    assert described_metric("mean_e").text.startswith("mean modulus")
+    assert described_metric("spot_rms_um").unit == "um"
+    assert described_parameter("focal_plane.raft_um") == ("um", "rafts, peak to valley, not the budget's [um]")
+    assert described_parameter("R22_S11.rx_urad") == ("urad", "change of R22_S11: tilt about x")
+    assert described_parameter("M1.Z5_nm") == ("nm", "change of Z5 of M1")
+    content = {"parameters": {"M2.dz_um": {"nominal": 0, "range": [0, 4]}}, "design": {"points": 3}}
+    sweep = read_sweep(content, "test")
+    create_store(tmp_path / "s.sweep", sweep, points := numbered_points(sweep, Path()), {})
+    with SweepStore(tmp_path / "s.sweep") as store:
+        for p in points:
+            store.write(PointResult(p.number, {"fwhm_arcsec": 0.6 + p.parameters["M2.dz_um"]}, None, 0.1, "here"))
+        page = write_report(store, tmp_path / "report").read_text()
+    for text in ("effective FWHM of the median star", "<td>arcsec</td>", "change of M2: shift along z"):
+        assert text in page
 
 
 def test_digits_are_those_that_the_error_allows():
