@@ -167,7 +167,7 @@ class _Depth:
     def jobs(self, todo: list[tuple[int, int]], tiles: list[tuple[int, int]], rings: int) -> Iterator[dict[str, Any]]:
         """Yield the arguments of :func:`measure_galaxies` for tiles, and then for the rings of all tiles."""
         for tile in todo:
-            key = ("null test", self.stack.visits, *map(natural, tile))
+            key: tuple[str | int, ...] = ("null test", self.stack.visits, *map(natural, tile))
             yield self._job(self.galaxies_in(*_ranges(tile, self.cell)), key)
         galaxies = self.ring_galaxies(tiles, rings)
         shear = SHEAR * _along(len(galaxies))
