@@ -43,6 +43,7 @@ from . import (
     visits,
 )
 from .interrupt import InterruptedRunError
+from .targets import with_checked_targets
 
 # The error of bad arguments is a class of typer or of click, depending on the version of typer.
 _UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
@@ -137,6 +138,7 @@ for _group in (
     files,
 ):
     app.add_typer(_group.app)
+with_checked_targets(app)
 
 
 if __name__ == "__main__":
