@@ -44,6 +44,7 @@ from . import (
     visits,
 )
 from .interrupt import InterruptedRunError
+from .targets import with_checked_targets
 
 # The error of bad arguments is a class of typer or of click, depending on the version of typer.
 _UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
@@ -154,6 +155,7 @@ def _common(
 
 for _group in _GROUPS:
     app.add_typer(_group.app)
+with_checked_targets(app)
 
 
 if __name__ == "__main__":

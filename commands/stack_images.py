@@ -12,6 +12,7 @@ from ..core.errors import PachonError
 from .interrupt import interruptible
 from .options import Json, Quiet, Threads
 from .tables import Rows, print_json
+from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
 
 app = typer.Typer()
 
@@ -32,6 +33,9 @@ def stack_images_command(
     noise: Annotated[bool | None, Option("--noise/--no-noise", help="With noise, or expected images.")] = None,
     measure: Annotated[bool, Option("--measure/--no-measure", help="Measure the galaxies of the stacks.")] = True,
     resume: Annotated[bool, Option("--resume", help="Go on after the visits that are stacked already.")] = False,
+    processes: Processes = None,
+    scheduler: Scheduler = None,
+    workers: DaskWorkers = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -57,10 +61,13 @@ def stack_images_command(
 
     wanted = {"tiles": tiles, "faintest": faintest, "side": side, "noise": noise}
     settings = ImageStackConfig(**{key: value for key, value in wanted.items() if value is not None})
-    with interruptible(quiet, f"finished visits are in {folder}, and --resume goes on from there") as reporter:
-        stack = stack_images(folder, settings, resume=resume, threads=threads, reporter=reporter)
+    with (
+        interruptible(quiet, f"finished visits are in {folder}, and --resume goes on from there") as reporter,
+        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
+    ):
+        stack = stack_images(folder, settings, resume=resume, workers=maker, threads=threads, reporter=reporter)
         try:
-            found = measure_stack(folder, threads=threads, reporter=reporter) if measure else {}
+            found = measure_stack(folder, workers=maker, threads=threads, reporter=reporter) if measure else {}
         except PachonError as error:
             raise error.followed_by(
                 f"the stacked images are kept in {stack.folder}, not all of them measured (--no-measure)"

@@ -12,6 +12,7 @@ from ..core.errors import ConfigError
 from .interrupt import interruptible
 from .options import Ccds, Json, Quiet, Raft, Threads, one_name_list
 from .tables import Rows, print_json
+from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
 
 app = typer.Typer()
 
@@ -43,6 +44,9 @@ def visits_command(
     out: Annotated[Path, Option("--out", "-o", help="Folder of the stacks.")] = Path("pachon_visits"),
     seed: Annotated[int | None, Option(help="Seed of all random numbers.")] = None,
     resume: Annotated[bool, Option("--resume", help="Go on after the visits that are stacked already.")] = False,
+    processes: Processes = None,
+    scheduler: Scheduler = None,
+    workers: DaskWorkers = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -59,7 +63,7 @@ def visits_command(
 
     - `pachon visits --raft R22`: ten visits of the central raft, a minute on two cores
     - `pachon visits --all -n 100 -o full`: 100 visits of 189 CCDs, two hours
-    - `pachon visits --all -n 200 -o full --resume`: a hundred more
+    - `pachon visits --all -n 200 -o full --resume --processes 2`: a hundred more, two visits side by side
     - `pachon visits --rotator random`: the camera turned against the telescope too, by up to 90 degrees
     - `pachon visits -n 2 --roll 0,0 --rotator 0,45`: a telescope that stands still on the sky, its camera turned
     - `pachon visits my_visits.yaml`, where my_visits.yaml may read
@@ -83,8 +87,13 @@ def visits_command(
         visits__rotator_deg=angles_of("--rotator", rotator),
     )
     experiment = settings.experiment(None if config is None else config.parent)
-    with interruptible(quiet, f"finished visits are in {out}, and --resume goes on from there") as reporter:
-        result = stack_visits(settings, out, experiment=experiment, resume=resume, threads=threads, reporter=reporter)
+    with (
+        interruptible(quiet, f"finished visits are in {out}, and --resume goes on from there") as reporter,
+        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
+    ):
+        result = stack_visits(
+            settings, out, experiment=experiment, resume=resume, workers=maker, threads=threads, reporter=reporter
+        )
     if as_json:
         print_json(result.summary)
     elif not quiet:
@@ -123,6 +132,9 @@ def null_test_command(
     tiles: Annotated[int | None, Option(min=1, help="Most tiles of the sky, from the pointing outwards.")] = None,
     rings: Annotated[int, Option(min=10, help="Rings of galaxies for the calibration of the shear.")] = 2000,
     resume: Annotated[bool, Option("--resume", help="Keep the tiles that are finished.")] = False,
+    processes: Processes = None,
+    scheduler: Scheduler = None,
+    workers: DaskWorkers = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -145,8 +157,13 @@ def null_test_command(
     from ..studies.visits.null_test import null_test
 
     hint = f"finished tiles are in {folder}, and --resume goes on from there"
-    with interruptible(quiet, hint) as reporter:
-        results = null_test(folder, tiles=tiles, rings=rings, resume=resume, threads=threads, reporter=reporter)
+    with (
+        interruptible(quiet, hint) as reporter,
+        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
+    ):
+        results = null_test(
+            folder, tiles=tiles, rings=rings, resume=resume, workers=maker, threads=threads, reporter=reporter
+        )
     found = {str(visits): null_metrics(result) for visits, result in results.items()}
     if as_json:
         print_json({"stacks": found})

@@ -21,6 +21,9 @@ import numpy as np
 
 from .errors import PachonError, ProductError, cut_short
 
+# Of the file that tells whether there is room [byte].
+_PROBE = 4096
+
 
 def write_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError) -> None:
     """Write a file whole, or raise `error` with the path and the system's reason and leave nothing behind."""
@@ -37,6 +40,27 @@ def write_new_bytes(path: Path, data: bytes, error: type[PachonError] = ProductE
     except FileExistsError:
         return False
     return True
+
+
+def require_writable(path: Path, *, file: bool = False, error: type[PachonError] = ProductError) -> None:
+    """Raise `error` where neither a file nor a folder of a path can be written, before anything is computed for it.
+
+    A `file` needs a folder that there is; missing folders of other paths can be made.
+
+    The nearest folder that there is gets a temporary file, which is removed: permissions alone do not tell of read-only
+    file systems, quotas and full disks.
+    """
+    try:
+        start = path if path.is_dir() else path.absolute().parent
+        folder = start if file else next(place for place in (start, *start.parents) if place.exists())
+        probe = folder / partial_path(path).name
+        try:
+            probe.write_bytes(bytes(_PROBE))
+        finally:
+            with suppress(OSError):
+                probe.unlink()
+    except (OSError, ValueError) as problem:
+        raise error(f"cannot write {path}: {getattr(problem, 'strerror', None) or problem}") from None
 
 
 def claim_folder(path: Path, content: bytes, *, products: str, check: Callable[[], None]) -> None:

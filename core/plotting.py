@@ -122,8 +122,24 @@ def picture_bytes(figure: Figure, kind: str, dpi: int = _DPI) -> bytes:
     buffer = io.BytesIO()
     # Ticks are made, and take their style, when a figure is drawn.
     with styled():
-        figure.savefig(buffer, format=kind, dpi=dpi, metadata=_NAMELESS[kind])
+        if kind == "png":
+            _draw_once(figure, buffer, dpi)
+        else:
+            figure.savefig(buffer, format=kind, dpi=dpi, metadata=_NAMELESS[kind])
     return buffer.getvalue()
+
+
+def _draw_once(figure: Figure, buffer: io.BytesIO, dpi: int) -> None:
+    """Write a figure as PNG: as ``savefig``, which draws all twice, the first time for the layout alone."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas, before = figure.canvas, figure.dpi
+    try:
+        figure.dpi = dpi
+        FigureCanvasAgg(figure).print_png(buffer, metadata=_NAMELESS["png"])
+    finally:
+        figure.dpi = before
+        figure.set_canvas(canvas)
 
 
 def png_bytes(figure: Figure) -> bytes:

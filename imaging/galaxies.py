@@ -95,13 +95,7 @@ class GalaxySource:
         DomainError
             If the galaxies of a population would be brighter than the sky.
         """
-        given = self.given
-        if given is None:
-            return self._population(faintest).galaxies_in
-        return lambda xi, eta: _brighter(
-            _inside(given, Region.between(xi, eta)) if isinstance(given, Galaxies) else given.galaxies_in(xi, eta),
-            faintest,
-        )
+        return self._population(faintest).galaxies_in if self.given is None else _Given(self.given, faintest)
 
     def _population(self, faintest: float) -> GalaxyPopulation:
         wanted, exposure = self.config, self.exposure
@@ -114,9 +108,19 @@ class GalaxySource:
         return population
 
 
-def _inside(galaxies: Galaxies, region: Region) -> Galaxies:
-    return galaxies.take(np.flatnonzero(region.contains(galaxies.xi, galaxies.eta)))
+@dataclass(frozen=True, eq=False)
+class _Given:
+    """Given galaxies in ranges of xi and eta [rad]; a class, since workers are sent it."""
 
+    galaxies: Galaxies | StampPopulation
+    faintest: float
 
-def _brighter(galaxies: Galaxies | PlantedGalaxies, faintest: float) -> Galaxies | PlantedGalaxies:
-    return galaxies.take(np.flatnonzero(galaxies.magnitude <= faintest))
+    def __call__(self, xi: Any, eta: Any) -> Galaxies | PlantedGalaxies:
+        """Return those in two ranges that are no fainter than the limit."""
+        given = self.galaxies
+        found: Galaxies | PlantedGalaxies
+        if isinstance(given, Galaxies):
+            found = given.take(np.flatnonzero(Region.between(xi, eta).contains(given.xi, given.eta)))
+        else:
+            found = given.galaxies_in(xi, eta)
+        return found.take(np.flatnonzero(found.magnitude <= self.faintest))

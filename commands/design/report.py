@@ -32,14 +32,15 @@ def design_report_command(
     - `pachon design-report my_lens.zmx`
     - `pachon design-report lsst_v3.3_r -o lsst.html --field-deg 0 --field-deg 1.2 --field-deg 1.75 --across-band 3`
     """
-    from ...core.files import write_bytes
+    from ...core.files import require_writable, write_bytes
     from ...design.report.report import STEPS, design_report
 
     given = Given(model, field_deg, wavelength_nm, across_band, lenient=lenient)
     telescope, fields, wavelengths = given.where
+    path = out or Path(f"design_report_{telescope.name}.html")
+    require_writable(path, file=True)
     with interruptible(quiet) as reporter, reporter.stage("design report", STEPS) as stage:
         page = design_report(telescope, fields, wavelengths, threads=threads, progress=stage.advance)
-    path = out or Path(f"design_report_{telescope.name}.html")
     write_bytes(path, page.encode())
     if not quiet:
         print(f"report: {path.resolve()}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -201,20 +202,29 @@ def draw_heights(
 ) -> Any:
     """Draw the heights within limits [mm] as an image, gaps left white; the scale is that of the whole focal plane."""
     bounds = height_range(focal_plane) if bounds is None else bounds
-    left, right, bottom, top = limits
-    step = max(right - left, top - bottom) / samples
-    x = np.arange(left + 0.5 * step, right, step)
-    y = np.arange(bottom + 0.5 * step, top, step)
-    height = focal_plane.height(x[None, :] * 1e-3, y[:, None] * 1e-3) * 1e6
+    height, extent = _height_map(focal_plane, limits, samples)
     return axes.imshow(
         height,
-        extent=(x[0] - 0.5 * step, x[-1] + 0.5 * step, y[0] - 0.5 * step, y[-1] + 0.5 * step),
+        extent=extent,
         cmap="RdBu_r",
         vmin=-bounds,
         vmax=bounds,
         alpha=alpha,
         aspect="equal",
     )
+
+
+@lru_cache(maxsize=1)
+def _height_map(
+    focal_plane: FocalPlane, limits: tuple[float, float, float, float], samples: int
+) -> tuple[np.ndarray, tuple[float, float, float, float]]:
+    """Return heights within limits [um] and the extent of the image; kept, since the panels of a row have the same."""
+    left, right, bottom, top = (float(limit) for limit in limits)
+    step = max(right - left, top - bottom) / samples
+    x = np.arange(left + 0.5 * step, right, step)
+    y = np.arange(bottom + 0.5 * step, top, step)
+    height = focal_plane.height(x[None, :] * 1e-3, y[:, None] * 1e-3) * 1e6
+    return height, (x[0] - 0.5 * step, x[-1] + 0.5 * step, y[0] - 0.5 * step, y[-1] + 0.5 * step)
 
 
 def residual_plot(camera: Camera, columns: Mapping[str, np.ndarray]) -> bytes:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +12,12 @@ import numpy as np
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
 from ...core.files import make_folder, write_bytes, write_json
+from ...core.ordered_jobs import ordered_results
 from ...core.products import Stamp, column, read_fits, table_hdu, write_fits
 from ...core.progress import Reporter
 from ...core.random_streams import natural
 from ...core.units import ARCMIN
+from ...core.workers import MakeWorkers
 from ...imaging.exposure import Exposure
 from ...imaging.galaxies import SkyGalaxies
 from ...pipeline.measure.correlation import Correlation
@@ -37,6 +41,8 @@ REACH = 2.0
 SHEAR = 0.02
 # Orientations of a ring.
 _ORIENTATIONS = 4
+# Rings are measured at each orientation under a shear and its opposite.
+_RING_JOBS = tuple((k, sign) for k in range(_ORIENTATIONS) for sign in (1.0, -1.0))
 
 
 @check_arguments
@@ -46,6 +52,7 @@ def null_test(
     tiles: int | None = None,
     rings: int = 2000,
     resume: bool = False,
+    workers: MakeWorkers | None = None,
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> dict[int, NullTest]:
@@ -53,7 +60,7 @@ def null_test(
 
     Galaxies are those of the configuration of the visits, down to the depth of each stack. The sky is cut into tiles of
     the size of a CCD; each leaves a table of its galaxies. Products are these tables,
-    ``null_test.json`` and two pictures; they have the same bytes on any number of threads.
+    ``null_test.json`` and two pictures; they have the same bytes on any number of threads and by whatever workers.
 
     Parameters
     ----------
@@ -65,6 +72,8 @@ def null_test(
         Rings of galaxies for the calibration of the shear.
     resume : bool
         Keep the tiles that are finished.
+    workers : callable, optional
+        Function that makes the workers that measure the tiles, as in :func:`~pachon.run`; by default this process.
     threads : int, optional
         Number of threads; all processors by default.
     reporter : Reporter, optional
@@ -87,7 +96,7 @@ def null_test(
     reach = REACH * float(cell / np.sqrt(config.visits.places))
     source = config.galaxy_source(experiment, Exposure.of_run(experiment, gain=1.0, pixel_scale=scale))
     make_folder(folder / "galaxies")
-    results = {}
+    found = {}
     for visits in config.kept:
         stamp = Stamp(config.galaxies_digest(experiment, stack=visits), seed)
         stack = PsfStack.read(stack_path(folder, visits), Stamp(config.digest(experiment), seed))
@@ -96,47 +105,37 @@ def null_test(
         chosen = _tiles(stack, cell, config.visits.places)[:tiles]
         if not chosen:
             raise DomainError(f"{folder}: no part of the sky as large as a CCD was seen by half of {visits} visits")
-        parts = []
-        with reporter.stage(f"galaxies in {visits} visits", total=len(chosen)) as stage:
-            for number, (i, j) in enumerate(chosen, start=1):
-                path = folder / "galaxies" / f"visits_{visits:04d}_tile_{i:+03d}_{j:+03d}.fits"
-                if not (resume and _finished(path, stamp)):
-                    measured = measure_galaxies(
-                        stack,
-                        frame.matrix,
-                        galaxies_in(*_ranges((i, j), cell)),
-                        exposure,
-                        seed,
-                        "null test",
-                        visits,
-                        *map(natural, (i, j)),
-                        reach=reach,
-                        threads=threads,
-                    )
-                    write_shapes(path, measured, stamp)
-                # What a resumed test reads, so that both have the same numbers.
-                parts.append(_read(path, stamp))
-                stage.advance()
-                stage.step(path.stem, number, len(chosen))
+        paths = [folder / "galaxies" / f"visits_{visits:04d}_tile_{i:+03d}_{j:+03d}.fits" for i, j in chosen]
+        todo = [
+            (tile, path) for tile, path in zip(chosen, paths, strict=True) if not (resume and _finished(path, stamp))
+        ]
+        depth = _Depth(stack, frame.matrix, exposure, galaxies_in, seed, cell, reach)
+        results = ordered_results(
+            measure_job,
+            [*(path.stem for _, path in todo), *(f"ring {k}, shear {sign:+.0f}" for k, sign in _RING_JOBS)],
+            depth.jobs([tile for tile, _ in todo], chosen, rings),
+            title=f"galaxies in {visits} visits",
+            workers=workers,
+            threads=threads,
+            reporter=reporter,
+        )
+        for _, path in todo:
+            write_shapes(path, next(results), stamp)
+        # What a resumed test reads, so that both have the same numbers.
+        parts = [_read(path, stamp) for path in paths]
         galaxies = GalaxyShapes.joined(parts)
         if (n := int((galaxies.usable & galaxies.true_usable).sum())) < 2:
             text = f"{n} of {len(galaxies)} galaxies to magnitude {faintest:.2f} are usable in {visits} visits"
             raise DomainError(f"{folder}: {text}; expected two or more, of the galaxies of {CONFIG_NAME}")
-        patch = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-        with reporter.stage(f"correlations and shear calibration in {visits} visits"):
-            area = len(chosen) * (cell / ARCMIN) ** 2
-            some = _ring_galaxies(galaxies_in, chosen, cell, rings)
-            results[visits] = NullTest(
-                visits,
-                galaxies,
-                float(galaxies.usable.sum() / area),
-                _correlations(galaxies, patch),
-                _calibration(stack, frame.matrix, some, exposure, seed, reach, threads),
-            )
-    write_json(folder / "null_test.json", {"stacks": {str(n): null_metrics(r) for n, r in results.items()}})
-    write_bytes(folder / "null_test.png", null_test_picture(results))
-    write_bytes(folder / "null_test_density.png", density_picture(results))
-    return results
+        bias = _calibration(frame.matrix, len(depth.ring_galaxies(chosen, rings)), list(results))
+        with reporter.stage(f"correlations in {visits} visits"):
+            patch = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+            density = float(galaxies.usable.sum() / (len(chosen) * (cell / ARCMIN) ** 2))
+            found[visits] = NullTest(visits, galaxies, density, _correlations(galaxies, patch), bias)
+    write_json(folder / "null_test.json", {"stacks": {str(n): null_metrics(r) for n, r in found.items()}})
+    write_bytes(folder / "null_test.png", null_test_picture(found))
+    write_bytes(folder / "null_test_density.png", density_picture(found))
+    return found
 
 
 def _tiles(stack: PsfStack, cell: float, places: int) -> list[tuple[int, int]]:
@@ -153,18 +152,71 @@ def _ranges(tile: tuple[int, int], cell: float) -> list[tuple[float, float]]:
     return [(cell * (k - 0.5), cell * (k + 0.5)) for k in tile]
 
 
-def _ring_galaxies(
-    galaxies_in: SkyGalaxies, tiles: list[tuple[int, int]], cell: float, rings: int
-) -> Galaxies | PlantedGalaxies:
-    """Return galaxies for so many rings, those of the first tiles that have them."""
-    parts = [galaxies_in(*_ranges(tiles[0], cell))]
-    for tile in tiles[1:]:
-        if sum(map(len, parts)) >= rings:
-            break
-        parts.append(galaxies_in(*_ranges(tile, cell)))
-    kind: Any = type(parts[0])
-    galaxies = kind.concatenate(parts)
-    return galaxies.take(np.arange(min(rings, len(galaxies))))
+@dataclass(frozen=True, eq=False)
+class _Depth:
+    """Stack of a number of visits, and the galaxies that are measured in it."""
+
+    stack: PsfStack
+    axes: np.ndarray
+    exposure: Exposure
+    galaxies_in: SkyGalaxies
+    seed: int
+    cell: float
+    reach: float
+
+    def jobs(self, todo: list[tuple[int, int]], tiles: list[tuple[int, int]], rings: int) -> Iterator[dict[str, Any]]:
+        """Yield the arguments of :func:`measure_galaxies` for tiles, and then for the rings of all tiles."""
+        for tile in todo:
+            key: tuple[str | int, ...] = ("null test", self.stack.visits, *map(natural, tile))
+            yield self._job(self.galaxies_in(*_ranges(tile, self.cell)), key)
+        galaxies = self.ring_galaxies(tiles, rings)
+        shear = SHEAR * _along(len(galaxies))
+        for k, sign in _RING_JOBS:
+            rotated = galaxies.rotated(np.pi * k / _ORIENTATIONS)
+            sheared = rotated.sheared(sign * shear.real, sign * shear.imag)
+            yield self._job(sheared, ("shear", self.stack.visits, k))
+
+    def ring_galaxies(self, tiles: list[tuple[int, int]], rings: int) -> Galaxies | PlantedGalaxies:
+        """Return galaxies for so many rings, those of the first tiles that have them."""
+        parts = [self.galaxies_in(*_ranges(tiles[0], self.cell))]
+        for tile in tiles[1:]:
+            if sum(map(len, parts)) >= rings:
+                break
+            parts.append(self.galaxies_in(*_ranges(tile, self.cell)))
+        kind: Any = type(parts[0])
+        galaxies = kind.concatenate(parts)
+        return galaxies.take(np.arange(min(rings, len(galaxies))))
+
+    def _job(self, galaxies: Any, key: tuple[str | int, ...]) -> dict[str, Any]:
+        at = np.stack([galaxies.xi, galaxies.eta], axis=1) @ self.axes.T * self.exposure.pixel_scale
+        return {
+            "stack": self.stack.around(at, 1.001 * self.reach) if len(at) else self.stack,
+            "axes": self.axes,
+            "galaxies": galaxies,
+            "exposure": self.exposure,
+            "seed": self.seed,
+            "key": key,
+            "reach": self.reach,
+        }
+
+
+def measure_job(job: dict[str, Any], threads: int) -> GalaxyShapes:
+    """Measure galaxies as the job of a worker."""
+    return measure_galaxies(
+        job["stack"],
+        job["axes"],
+        job["galaxies"],
+        job["exposure"],
+        job["seed"],
+        *job["key"],
+        reach=job["reach"],
+        threads=threads,
+    )
+
+
+def _along(n: int) -> np.ndarray:
+    """Return the directions of the shear of n galaxies: every other one along x = y."""
+    return np.where(np.arange(n) % 2 == 0, 1.0, 1j)
 
 
 def _correlations(galaxies: GalaxyShapes, patch: np.ndarray) -> dict[str, Correlation]:
@@ -177,31 +229,15 @@ def _correlations(galaxies: GalaxyShapes, patch: np.ndarray) -> dict[str, Correl
     return correlations(galaxies.x, galaxies.y, kinds, patch)
 
 
-def _calibration(
-    stack: PsfStack,
-    axes: np.ndarray,
-    galaxies: Galaxies | PlantedGalaxies,
-    exposure: Exposure,
-    seed: int,
-    reach: float,
-    threads: int | None,
-) -> dict[str, ShearBias]:
-    """Return the biases of the shear from rings of galaxies, each under a shear and its opposite, with one noise."""
-    n = len(galaxies)
-    first = np.arange(n) % 2 == 0
-    shear = SHEAR * np.where(first, 1.0, 1j)
+def _calibration(axes: np.ndarray, n: int, measured: list[GalaxyShapes]) -> dict[str, ShearBias]:
+    """Return the biases of the shear from n rings of galaxies, each under a shear and its opposite, with one noise."""
     along = {kind: np.full((2, n, _ORIENTATIONS), np.nan + 0j) for kind in ("model", "true")}
-    for k in range(_ORIENTATIONS):
-        rotated = galaxies.rotated(np.pi * k / _ORIENTATIONS)
-        for row, sign in enumerate((1.0, -1.0)):
-            sheared = rotated.sheared(sign * shear.real, sign * shear.imag)
-            key = ("shear", exposure.exposures, k)
-            found = measure_galaxies(stack, axes, sheared, exposure, seed, *key, reach=reach, threads=threads)
-            for kind, prefix in (("model", ""), ("true", "true_")):
-                e1, e2, usable = (getattr(found, prefix + name) for name in ("e1", "e2", "usable"))
-                along[kind][row, found.index[usable], k] = (e1 + 1j * e2)[usable]
+    for (k, sign), found in zip(_RING_JOBS, measured, strict=True):
+        for kind, prefix in (("model", ""), ("true", "true_")):
+            e1, e2, usable = (getattr(found, prefix + name) for name in ("e1", "e2", "usable"))
+            along[kind][int(sign < 0.0), found.index[usable], k] = (e1 + 1j * e2)[usable]
     # Ellipticities are along the axes of the stack, the shear along those of the sky.
-    return {kind: shear_bias(e, ellipticity_along(axes, shear)) for kind, e in along.items()}
+    return {kind: shear_bias(e, ellipticity_along(axes, SHEAR * _along(n))) for kind, e in along.items()}
 
 
 def ellipticity_along(axes: np.ndarray, e: np.ndarray) -> np.ndarray:

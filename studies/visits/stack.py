@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -164,6 +164,13 @@ class PsfStack(Result):
 
     def __len__(self) -> int:
         return len(self.xi)
+
+    def around(self, places: np.ndarray, margin: float) -> PsfStack:
+        """Return the points in the rectangle of places [n, 2] along the axes of the stack, with a margin [rad]."""
+        low, high = (f(places, axis=0, initial=start) for f, start in ((np.min, np.inf), (np.max, -np.inf)))
+        at = np.stack([self.x, self.y], axis=1)
+        rows = np.flatnonzero(((at >= low - margin) & (at <= high + margin)).all(axis=1))
+        return replace(self, **{name: getattr(self, name)[rows] for name in (*_COLUMNS, *self._images)})
 
     @check_arguments
     def write_product(self, path: Path, stamp: Stamp) -> None:

@@ -13,17 +13,20 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError, PachonError, ProductError
 from ...core.files import claim_folder, make_folder, write_bytes, write_json
 from ...core.memory import readable
+from ...core.ordered_jobs import ordered_results
 from ...core.products import Stamp, write_ecsv
 from ...core.progress import Reporter
 from ...core.units import ARCSEC
+from ...core.workers import MakeWorkers
 from ...pipeline.config import differences
 from ...pipeline.experiment import Experiment
+from ...pipeline.memory import check_memory
 from ...pipeline.run_folder import CONFIG_NAME, SUMMARY_NAME
 from .config import STACK_STAMP, VisitsConfig, load_visits_configuration
 from .measures import Correlated, correlated, stack_metrics
 from .plan import Visit
 from .plots import correlation_picture, ellipticity_picture
-from .psf_visit import StackFrame, check_rotators, visit_experiment, visit_psfs
+from .psf_visit import StackFrame, VisitPsfs, check_rotators, visit_experiment, visit_psfs
 from .sky_points import SkyPoints, draw_points
 from .stack import PsfStack, PsfSums
 
@@ -65,6 +68,7 @@ def stack_visits(
     *,
     experiment: Experiment | None = None,
     resume: bool = False,
+    workers: MakeWorkers | None = None,
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> StackResult:
@@ -72,8 +76,8 @@ def stack_visits(
 
     Telescope, camera and heights stay; turbulence, residual aberration, noise and roll are each visit's own, and the
     stars of the sky fall where the roll puts them (Jee & Tyson 2011, sec. 6.1). Models are resampled onto the axes of
-    the stack as the true PSFs are. Every product has the same bytes on any number of threads, and after any number of
-    interruptions.
+    the stack as the true PSFs are. Every product has the same bytes on any number of threads, by whatever workers, and
+    after any number of interruptions.
 
     Parameters
     ----------
@@ -85,6 +89,8 @@ def stack_visits(
         Experiment of the configuration, where it is made already.
     resume : bool
         Go on after the visits that the folder has, with more of them than asked for before too.
+    workers : callable, optional
+        Function that makes the workers that compute the visits, as in :func:`~pachon.run`; by default this process.
     threads : int, optional
         Number of threads; all processors by default.
     reporter : Reporter, optional
@@ -115,14 +121,20 @@ def stack_visits(
     if sums.visits:
         reporter.line(f"{sums.visits} of {len(visits)} visits are stacked already")
     scale = pixel_scale_of(frame)
-    for visit in visits[sums.visits :]:
-        reporter.line(f"visit {visit.number + 1} of {len(visits)}, {visit}")
-        try:
-            seen = visit_psfs(
-                visit_experiment(experiment, visit), visit, points, frame, threads=threads, reporter=reporter
-            )
-        except PachonError as error:
-            raise error.within(subject=f"visit {visit.number}") from None
+    due = visits[sums.visits :]
+    # In this process each visit shows its own stages.
+    alone = workers is None
+    results = ordered_results(
+        VisitComputation(points, frame, reporter if alone else None),
+        [f"visit {visit.number}" for visit in due],
+        ((visit_experiment(experiment, visit), visit) for visit in due),
+        title=None if alone else f"{len(due)} visits",
+        workers=workers,
+        threads=threads,
+        check=lambda processes: check_memory(experiment, threads, copies=processes),
+        reporter=reporter,
+    )
+    for visit, seen in zip(due, results, strict=True):
         for name, reason in seen.left_out.items():
             reporter.line(f"visit {visit.number}: CCD {name} is left out, it cannot be modelled: {reason}")
         sums.add(seen)
@@ -136,6 +148,22 @@ def stack_visits(
         found = {n: correlated(stack, cell_of(experiment, frame)) for n, stack in stacks.items()}
     summary = _write_products(folder, config, stamp, visits, stacks, found)
     return StackResult(folder, stacks, found, summary)
+
+
+@dataclass(frozen=True)
+class VisitComputation:
+    """PSFs of visits; a picklable function for every kind of worker, where there is no reporter."""
+
+    points: SkyPoints
+    frame: StackFrame
+    reporter: Reporter | None = None
+
+    def __call__(self, job: tuple[Experiment, Visit], threads: int) -> VisitPsfs:
+        """Compute one visit with its experiment."""
+        experiment, visit = job
+        if self.reporter is not None:
+            self.reporter.line(f"visit {visit.number + 1}, {visit}")
+        return visit_psfs(experiment, visit, self.points, self.frame, threads=threads, reporter=self.reporter)
 
 
 def pixel_scale_of(frame: StackFrame) -> float:

@@ -261,7 +261,7 @@ def test_an_unwritable_folder_is_one_line(capsys, in_folder):
 
 def test_a_folder_under_a_file_is_one_line(capsys, in_folder):
     (in_folder / "file").write_text("")
-    assert "cannot make the folder" in refused(capsys, "run", "--out", "file/run")
+    assert "cannot write file/run: Not a directory" in refused(capsys, "run", "--out", "file/run")
 
 
 def test_a_full_disk_is_one_line(capsys, settings_file, tmp_path, monkeypatch):

@@ -8,9 +8,10 @@ import pytest
 import yaml
 
 from pachon.commands.cli import main
+from pachon.core import files
 
 resource = pytest.importorskip("resource")
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs /proc")]
+pytestmark = pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs /proc")
 
 LENS = str(Path(__file__).parents[2] / "tests/data/zmx/lens1.zmx")
 TOLERANCES = "tolerances: [{name: S1.dz_um, size: 10}]\ndraws: 3\nrings: 2\n"
@@ -100,8 +101,23 @@ def test_a_folder_in_which_nothing_can_be_made(name, here, capsys):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_quota_that_is_used_up(name, here, tmp_path, capsys):
+def test_a_quota_that_is_used_up_before_the_work(name, here, tmp_path, capsys):
+    with files_of_at_most(100):
+        assert "cannot write" in refused(COMMANDS[name], here, tmp_path / "out", capsys)
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_quota_that_is_used_up_when_the_work_is_done(name, here, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(files, "require_writable", lambda *_, **__: None)
     # The first of them compiles kernels, or reads them, and that needs no quota.
     with files_of_at_most(100):
         refused(COMMANDS[name], here, tmp_path / "out", capsys)
     assert not [path for path in tmp_path.rglob("*") if path.is_file() and path.name.endswith(".partial")]
+
+
+def test_a_picture_in_a_folder_that_is_not_there(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("pachon.design.report.report.design_report", pytest.fail)
+    for command in (f"design-report {LENS} --out {{out}}/a.html", f"draw {LENS} --glb {{out}}/a.glb"):
+        assert "No such file or directory" in refused(command, "", tmp_path / "none", capsys)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ....core.errors import PachonError
 from ....core.files import write_bytes, write_json
+from ....core.ordered_jobs import ordered_results
 from ....core.products import Stamp
 from ....core.progress import Reporter
 from ....core.random_streams import natural
 from ....core.units import ARCMIN
+from ....core.workers import MakeWorkers
 from ....imaging.image_file import CcdImage
 from ....pipeline.catalogue.detect import detect_objects
 from ....pipeline.catalogue.fit_galaxies import fit_galaxies
@@ -26,8 +28,9 @@ from ..galaxy_shapes import GalaxyShapes, measure_galaxies
 from ..null_test import REACH, write_shapes
 from ..stack import PsfStack
 from ..visits import cell_of, pixel_scale_of, stack_path
+from .image_stack import ImageStack
 from .picture import stacks_png
-from .stack_images import ImageStack, galaxies_on
+from .stack_images import galaxies_on
 from .tiles import Tile
 from .transfer import broadened, mean_transfer
 
@@ -67,7 +70,11 @@ class MeasuredTile:
 
 
 def measure_stack(
-    folder: Path, *, threads: int | None = None, reporter: Reporter | None = None
+    folder: Path,
+    *,
+    workers: MakeWorkers | None = None,
+    threads: int | None = None,
+    reporter: Reporter | None = None,
 ) -> dict[int, dict[str, Any]]:
     """Detect, select and fit what the stacked images of a folder of visits show.
 
@@ -78,6 +85,8 @@ def measure_stack(
     ----------
     folder : Path
         Folder of :func:`~..visits.stack_visits` and of :func:`.stack_images`.
+    workers : callable, optional
+        Function that makes the workers that measure the tiles, as in :func:`~pachon.run`; by default this process.
     threads : int, optional
         Number of threads; all processors by default.
     reporter : Reporter, optional
@@ -98,26 +107,41 @@ def measure_stack(
     origin = Stamp(stack.visits.digest(stack.experiment), stack.experiment.config.seed)
     images = {visits: stack.image(visits, stack.tiles[0]) for visits in stack.visits.kept}
     write_bytes(stack.folder / "images.png", stacks_png(images))
-    found = {}
-    for visits in stack.visits.kept:
-        psfs = PsfStack.read(stack_path(folder, visits), origin)
-        tiles = []
-        with reporter.stage(f"galaxies in the images of {visits} visits", total=len(stack.tiles)) as stage:
-            for number, tile in enumerate(stack.tiles, start=1):
-                image = stack.image(visits, tile)
-                try:
-                    measured = measure_tile(stack, tile, image, psfs, threads=threads)
-                except PachonError as error:
-                    raise error.within(subject=f"{visits} visits, tile {tile.name}") from None
-                write_shapes(
-                    stack.folder / f"galaxies_{visits:04d}_tile_{tile.name}.fits", measured.galaxies, stack.stamp
-                )
-                tiles.append(measured)
-                stage.advance()
-                stage.step(tile.name, number, len(stack.tiles))
-        found[visits] = tile_metrics(tiles)
+    numbered = [(visits, tile) for visits in stack.visits.kept for tile in stack.tiles]
+
+    def jobs() -> Iterator[tuple[Tile, CcdImage, PsfStack]]:
+        for visits in stack.visits.kept:
+            psfs = PsfStack.read(stack_path(folder, visits), origin)
+            for tile in stack.tiles:
+                yield tile, stack.image(visits, tile), psfs
+
+    results = ordered_results(
+        TileMeasurement(stack),
+        [f"{visits} visits, tile {tile.name}" for visits, tile in numbered],
+        jobs(),
+        title="galaxies in the stacked images",
+        workers=workers,
+        threads=threads,
+        reporter=reporter,
+    )
+    tiles: dict[int, list[MeasuredTile]] = {visits: [] for visits in stack.visits.kept}
+    for (visits, tile), measured in zip(numbered, results, strict=True):
+        write_shapes(stack.folder / f"galaxies_{visits:04d}_tile_{tile.name}.fits", measured.galaxies, stack.stamp)
+        tiles[visits].append(measured)
+    found = {visits: tile_metrics(own) for visits, own in tiles.items()}
     write_json(stack.folder / "images.json", {"stacks": {str(n): metrics for n, metrics in found.items()}})
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class TileMeasurement:
+    """Measurement of tiles; a picklable function for every kind of worker."""
+
+    stack: ImageStack
+
+    def __call__(self, job: tuple[Tile, CcdImage, PsfStack], threads: int) -> MeasuredTile:
+        """Measure one tile."""
+        return measure_tile(self.stack, *job, threads=threads)
 
 
 def measure_tile(

@@ -153,6 +153,13 @@ class TileSums:
         data, variance = np.zeros((2, side, side), dtype=np.float32)
         return cls(0, data, variance, np.zeros((side, side), dtype=np.int16))
 
+    def add(self, visit: TileSums) -> None:
+        """Add those of one visit."""
+        self.data += visit.data
+        self.variance += visit.variance
+        self.count += visit.count
+        self.visits += 1
+
     def stacked(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return image, variance and mask of the mean of the visits times their number, as of one long exposure."""
         known = self.count > 0

@@ -1,5 +1,7 @@
 """Galaxies of a catalogue and of a mosaic in visits: where and how they are, depth, bad input."""
 
+import pickle
+
 import numpy as np
 import pytest
 import yaml
@@ -11,6 +13,8 @@ from pachon.core.units import ARCMIN
 from pachon.pipeline.config import digest
 from pachon.pipeline.run_folder import CONFIG_NAME
 from pachon.studies.visits.config import load_visits_configuration
+from pachon.studies.visits.image_stack.config import ImageStackConfig
+from pachon.studies.visits.image_stack.image_stack import ImageStack
 from pachon.studies.visits.null_test import ellipticity_along, null_test
 from pachon.studies.visits.psf_visit import StackFrame
 from pachon.studies.visits.visits import stack_visits
@@ -70,7 +74,7 @@ def write_mosaic(path, e=0.0, count=20, **cards):
 
 
 @pytest.mark.slow
-def test_galaxies_of_a_catalogue_are_measured_where_and_as_it_says(folder):
+def test_galaxies_of_a_catalogue_are_measured_where_and_as_it_says(folder, backwards):
     rng = np.random.default_rng(6)
     n = 40
     xi, eta = rng.uniform(-5.0, 5.0, (2, n)) * ARCMIN
@@ -101,7 +105,7 @@ def test_galaxies_of_a_catalogue_are_measured_where_and_as_it_says(folder):
     write_catalogue(
         folder / "own.ecsv", xi[:30], eta[:30], **{k: np.broadcast_to(v, n)[:30] for k, v in columns.items()}
     )
-    assert len(null_test(folder, tiles=1, rings=12, resume=True, threads=1)[1].galaxies) == 28
+    assert len(null_test(folder, tiles=1, rings=12, resume=True, workers=backwards)[1].galaxies) == 28
 
 
 @pytest.mark.long
@@ -112,6 +116,11 @@ def test_galaxies_of_a_mosaic_are_planted_and_measured(folder):
     # 20 in 400 arcsec^2, 0.01 of that on a CCD: 335, and five standard deviations of a Poisson number.
     expected = 0.01 * 20 / (20.0 / 60.0) ** 2 * (4096 * 0.2 / 60.0) ** 2
     assert abs(len(galaxies) - expected) < 5.0 * np.sqrt(expected)
+    # As workers are sent them.
+    source = ImageStack.of(folder, ImageStackConfig(faintest=25.0)).sky
+    sent, area = pickle.loads(pickle.dumps(source)), [(-ARCMIN, ARCMIN)] * 2
+    np.testing.assert_array_equal(sent.galaxies(*area).xi, source.galaxies(*area).xi)
+    assert len(sent.galaxies(*area).xi) > 0
     e = (galaxies.true_e1 + 1j * galaxies.true_e2)[galaxies.true_usable]
     # Random angles, of one ellipticity.
     assert np.median(np.abs(e)) == pytest.approx(0.3, abs=0.02)

@@ -167,7 +167,7 @@ def test_the_null_test_of_a_folder(tested):
 
 
 @pytest.mark.slow
-def test_a_null_test_goes_on_to_the_same_bytes(tested, monkeypatch):
+def test_a_null_test_goes_on_to_the_same_bytes_with_other_workers(tested, backwards, monkeypatch):
     _, folder = tested
     monkeypatch.setattr(module, "_FAINTEST_SNR", 100.0)
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
@@ -176,6 +176,8 @@ def test_a_null_test_goes_on_to_the_same_bytes(tested, monkeypatch):
     damaged = sorted((folder / "galaxies").iterdir())[0]
     damaged.write_bytes(damaged.read_bytes()[:4000])
     null_test(folder, tiles=1, rings=40, resume=True, threads=2)
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    null_test(folder, tiles=1, rings=40, workers=backwards)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 

@@ -98,7 +98,7 @@ def files(folder):
 
 
 @pytest.mark.slow
-def test_an_interrupted_stack_ends_with_the_same_bytes(visits_folder, monkeypatch, tmp_path_factory):
+def test_an_interrupted_stack_ends_with_the_same_bytes(visits_folder, backwards, monkeypatch, tmp_path_factory):
     settings = SMALL.model_copy(update={"tiles": 2})
     whole = tmp_path_factory.mktemp("whole")
     (whole / "config.yaml").write_bytes((visits_folder / "config.yaml").read_bytes())
@@ -121,9 +121,22 @@ def test_an_interrupted_stack_ends_with_the_same_bytes(visits_folder, monkeypatc
     stack_images(visits_folder, settings, resume=True, threads=2)
     assert files(visits_folder) == files(whole)
     assert len(files(whole)) == 6
+    others = tmp_path_factory.mktemp("workers")
+    (others / "config.yaml").write_bytes((whole / "config.yaml").read_bytes())
+    stack_images(others, settings, workers=backwards)
+    assert files(others) == files(whole)
     (whole / "images" / "stack_0001_tile_+00_+00.fits").unlink()
     with pytest.raises(ProductError, match=r"no image of 1 visits of tile \+00_\+00, and has gone on"):
         stack_images(whole, settings, resume=True)
+
+
+def test_images_of_several_tiles_are_found_again(visits_folder):
+    settings = SMALL.model_copy(update={"tiles": 2, "noise": False})
+    stack = ImageStack.of(visits_folder, settings)
+    (visits_folder / "images").mkdir()
+    (visits_folder / "images" / "images.yaml").write_text(stack.settings.to_yaml())
+    found = ImageStack.of(visits_folder)
+    assert (found.settings, found.stamp, len(found.tiles)) == (stack.settings, stack.stamp, 2)
 
 
 @pytest.mark.long
