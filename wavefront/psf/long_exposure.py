@@ -32,12 +32,13 @@ import warp as wp
 from ...core.errors import ConfigError, DomainError
 from ...core.launch import launch
 from ...core.warp_arrays import warp_array
-from ..atmosphere.turbulence import coherence, diffraction_otf, structure_function
+from ..atmosphere.turbulence import coherence, structure_function
 from ..pupil_optics import PupilOptics
 from .clear_pupil import SpokePupil, clear_edges
 from .engine import Exposed, PsfEngine, PsfInputs, expose_apart, metric_of
 from .long_exposure_kernels import place_points, sample_pixels, transform_pupils
 from .mean_rays import MeanRaysEngine, ray_counts
+from .pupil_rims import strip_overlap
 from .sample_packets import LANES, samples
 
 #: Pupil points by default: 16 spokes of 5 rings.
@@ -118,11 +119,7 @@ class LongExposureEngine(PsfEngine):
         """Tabulate the filter of the points and strips of the pupil: the atmosphere, and the overlap of strips."""
         # 1.5: to the corner of the grid of frequencies, and some room for a scale that changes over the field
         baseline = np.linspace(0.0, 1.5 * self._reach * self._step.max(), _TABLE_SIZE)
-        # Strips as wide as half the baseline overlap a little: to third order in the baseline, less than 1e-3.
-        ring = np.minimum(baseline, self._width)
-        overlap = diffraction_otf(ring, self._diameter, self._obscuration) / (
-            1.0 - 2.0 * ring / (math.pi * self._width)
-        )
+        overlap = strip_overlap(baseline, self._diameter, self._obscuration)
         table = self._turbulence(baseline) * overlap / len(self._wavelengths)
         # The baseline of frequency k is wavelength / 2 pi |J^T k|.
         self._filter = np.ascontiguousarray(table, dtype=np.float32)
