@@ -21,7 +21,8 @@ from ...raytrace.adjoint.backward_pass import landing_gradient
 from ...raytrace.adjoint.forward_pass import forward_pass
 from ...raytrace.launch import aimed_points
 from ...raytrace.rays import parallel_rays
-from .donut_rays import landing_of, spread_of
+from ...wavefront.psf.pupil_rims import PupilRims
+from .donut_rays import landing_of, rims_of, spread_of
 from .pupil_cells import PupilCells
 
 if TYPE_CHECKING:
@@ -98,6 +99,10 @@ class FreedomRays:
     def spread(self, landing: np.ndarray) -> np.ndarray:
         """Return the spread of the image of each point."""
         return spread_of(self._cells, landing, self._footprint)
+
+    def at_rims(self, rims: PupilRims, landing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the landing points of rims of the telescope as it is believed to be."""
+        return rims_of(self._cells, landing, rims)
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the derivatives at the values of the construction, shape [2, n, n_freedom]."""

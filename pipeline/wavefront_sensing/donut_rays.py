@@ -22,6 +22,7 @@ from ...raytrace.launch import launch_bundles
 from ...raytrace.rays import Rays, RayStatus, parallel_rays
 from ...raytrace.trace import trace
 from ...wavefront.chief_rays import JACOBIAN_STEP
+from ...wavefront.psf.pupil_rims import PupilRims
 from .pupil_cells import PupilCells
 
 #: Step of the differences by which aimed pupil points follow those of the entrance pupil, in units of its radius.
@@ -41,6 +42,9 @@ class LightRays(Protocol):
 
     def spread(self, landing: np.ndarray) -> np.ndarray:
         """Return second moments of the image of each point, beside the footprint of the cells [m^2], [n, 2, 2]."""
+
+    def at_rims(self, rims: PupilRims, landing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where the light of rims lands [m], and its change per metre towards the lit side, both [n, 2]."""
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the derivatives of :meth:`landing` with respect to the unknown wavefront, shape [2, n, n_wave]."""
@@ -128,6 +132,10 @@ class ZernikeRays:
         """Return the spread of the image of each point; see :class:`LightRays`."""
         return spread_of(self._cells, landing, self.footprint)
 
+    def at_rims(self, rims: PupilRims, landing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the landing points of rims; see :class:`LightRays`."""
+        return rims_of(self._cells, landing, rims)
+
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the response at zero coefficients, the same to 1e-3 for all; see :class:`LightRays`."""
         return self._response
@@ -157,6 +165,12 @@ def spread_of(cells: PupilCells, landing: np.ndarray, footprint: np.ndarray) -> 
     """Return the spreads [m^2] of the landing points of one or more wavelengths, one after the other."""
     each = landing.reshape(-1, len(cells), 2)
     return np.concatenate([cells.spread(one, footprint) for one in each])
+
+
+def rims_of(cells: PupilCells, landing: np.ndarray, rims: PupilRims) -> tuple[np.ndarray, np.ndarray]:
+    """Return landing points of rims at the middle wavelength [m], and their change along the normals, both [n, 2]."""
+    each = landing.reshape(-1, len(cells), 2)
+    return cells.at_rims(each[len(each) // 2], rims)
 
 
 def landing_of(telescope: Telescope, rays: Rays) -> np.ndarray:

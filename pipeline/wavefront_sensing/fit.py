@@ -71,6 +71,7 @@ def fit_donuts(
     fwhm: ArrayLike | None = None,
     outer_scale: float = 25.0,
     diffusion: ArrayLike = 0.0,
+    diffraction: bool = False,
     mask: ArrayLike | Sequence[ArrayLike] | None = None,
     saturation: float | None = None,
     n_pupil: int | None = None,
@@ -132,6 +133,9 @@ def fit_donuts(
         Outer scale of the turbulence [m]; infinite for Kolmogorov's.
     diffusion : float or Quantity
         Rms of the charge diffusion along each axis [m], which the seeing takes up by default.
+    diffraction : bool
+        Whether light is diffracted at the rims of the pupil, as that of real stars is: a strip of the image along its
+        rims has less light, so wide as the seeing, which a fit of rays takes for some 50 nm of Z11.
     mask : array_like of bool, as `images`, optional
         True at pixels to leave out.
     saturation : float, optional
@@ -202,6 +206,7 @@ def fit_donuts(
         np.concatenate([np.zeros(len(terms)), precision]),
         focal_plane,
         cells,
+        diffraction,
     )
     joint = degrees_of_freedom is not None or field_indices is not None
     start = instrument.seeing.strength(_START_FWHM)

@@ -14,6 +14,7 @@ from ...raytrace.launch import launch_bundles
 from ...raytrace.rays import RayStatus
 from ...raytrace.trace import trace
 from ...wavefront.chief_rays import image_jacobians
+from ...wavefront.psf.pupil_rims import PupilRims, pupil_rims
 from .donut_rays import ZernikeRays, chief_landing
 from .image_model import ImageGrid
 from .likelihood import Stamp
@@ -59,6 +60,8 @@ class Instrument:
         Heights of the CCDs.
     n_pupil : int or None
         Cells across the pupil; chosen for each image where None.
+    diffraction : bool
+        Whether donuts are diffracted at the rims of the pupil.
     """
 
     telescope: Telescope
@@ -71,6 +74,7 @@ class Instrument:
     precision: np.ndarray
     focal_plane: FocalPlane | None
     n_pupil: int | None
+    diffraction: bool = False
 
     @property
     def middle(self) -> float:
@@ -98,7 +102,8 @@ class Instrument:
         jacobian = image_jacobians(telescope, direction[None], self.middle, 1)[0]
         # Light passes up to half a cell beyond the outermost points.
         diameter = 2.0 * float(np.hypot(*place.T).max()) * (1.0 + 1.0 / _SURVEY)
-        return Light(telescope, direction, diameter, depth, jacobian, movable_rims(telescope, ends))
+        diffracting = pupil_rims(telescope, direction, self.middle) if self.diffraction else None
+        return Light(telescope, direction, diameter, depth, jacobian, movable_rims(telescope, ends), diffracting)
 
     def _with_detector(self, direction: np.ndarray, defocus: float) -> Telescope:
         """Return the telescope with its detector in the tangent plane of the chief ray's CCD, moved by a defocus."""
@@ -163,7 +168,9 @@ class Instrument:
     def stamp(self, light: Light, pixels: Pixels, rays: ZernikeRays, oversampling: int, reach: float = 0.0) -> Stamp:
         """Return a stamp with its model: light within a reach [m] beside it does not wrap around."""
         blur = math.hypot(self.diffusion, pixels.blur * self.pixel)
-        grid = ImageGrid(pixels, self.pixel, self.seeing, light.jacobian, blur, rays.footprint, oversampling, reach)
+        grid = ImageGrid(
+            pixels, self.pixel, self.seeing, light.jacobian, blur, rays.footprint, oversampling, reach, light.pupil_rims
+        )
         return Stamp(pixels.image, pixels.variance, pixels.used, grid, rays)
 
 
@@ -197,6 +204,8 @@ class Light:
         Derivative of the chief ray's landing point by direction cosines [m].
     rims : dict
         Surfaces whose rims stand aside by an unknown amount, with the diameter of the beam there [m].
+    pupil_rims : PupilRims or None
+        Rims of the clear pupil, where they diffract.
     """
 
     telescope: Telescope
@@ -205,6 +214,7 @@ class Light:
     depth: float
     jacobian: np.ndarray
     rims: dict[str, float]
+    pupil_rims: PupilRims | None = None
 
     @property
     def shift_precision(self) -> np.ndarray:

@@ -87,8 +87,9 @@ def model_image(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> np.ndar
 
 
 def _landed(stamp: Stamp, wave: np.ndarray) -> LandedLight:
-    landing = stamp.rays.landing(wave)
-    return LandedLight(landing, stamp.rays.weights(wave), stamp.rays.spread(landing))
+    landing, rims = stamp.rays.landing(wave), stamp.grid.rims
+    at_rims = None if rims is None else stamp.rays.at_rims(rims, landing)
+    return LandedLight(landing, stamp.rays.weights(wave), stamp.rays.spread(landing), at_rims)
 
 
 def pulls(stamp: Stamp, model: np.ndarray) -> np.ndarray:

@@ -19,6 +19,8 @@ from ...models.telescope import Telescope
 from ...raytrace.launch import aimed_points
 from ...raytrace.rays import RayStatus, parallel_rays
 from ...raytrace.trace import trace
+from ...wavefront.psf.pupil_rims import PupilRims
+from ...wavefront.pupil_polynomials import PupilPolynomials
 
 #: Side of the lattice over the diameter of the pupil: light off the axis may cross the plane of the stop just outside.
 _MARGIN = 1.02
@@ -26,8 +28,6 @@ _MARGIN = 1.02
 _CHORDS, _NODES, _DIVISIONS, _PARTS = 8, 5, 3, 4
 #: Points of the rim that the width of an aimed beam is taken from.
 _RIM = 48
-#: Degree of the polynomials that landing points are differentiated by.
-_DEGREE = 8
 
 
 @dataclass(frozen=True)
@@ -61,24 +61,16 @@ class PupilCells:
         return len(self.weights)
 
     @cached_property
-    def _smooth(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Polynomials at the points [n, m], their products [m, m], their derivatives along x and y [1/m], [2, n, m]."""
-        away = self.points - self.center
-        radius = max(float(np.abs(away).max()), self.side)
-        x, y = away.T / radius
-        p, q = np.array([(a, b) for a in range(_DEGREE + 1) for b in range(_DEGREE + 1 - a)]).T
-        powers_x, powers_y = (np.vander(v, _DEGREE + 1, increasing=True) for v in (x, y))
-        values = powers_x[:, p] * powers_y[:, q]
-        along_x = (p / radius) * powers_x[:, np.maximum(p - 1, 0)] * powers_y[:, q]
-        along_y = (q / radius) * powers_x[:, p] * powers_y[:, np.maximum(q - 1, 0)]
-        return values, values.T @ values, np.stack([along_x, along_y])
+    def _smooth(self) -> PupilPolynomials:
+        return PupilPolynomials(self.points, self.center, self.side)
 
     def magnification(self, landing: np.ndarray) -> np.ndarray:
         """Return the derivative of landing points [n, 2] along the pupil, shape [n, 2, 2], by smooth polynomials."""
-        values, products, slopes = self._smooth
-        # Monomials up to the eighth degree: products keep seven digits. Too few points determine some of them.
-        fitted = np.linalg.lstsq(products, values.T @ landing, rcond=1e-13)[0]
-        return np.moveaxis(slopes @ fitted, 0, -1)
+        return self._smooth.derivatives(landing)
+
+    def at_rims(self, landing: np.ndarray, rims: PupilRims) -> tuple[np.ndarray, np.ndarray]:
+        """Return landing points of rims [m], and their change per metre of the pupil along the normals, both [m, 2]."""
+        return rims.landing(self._smooth, landing)
 
     def footprint(self, landing: np.ndarray) -> np.ndarray:
         """Return the sides of the mean image of a cell [m], columns of a matrix [2, 2], from landing points [n, 2]."""

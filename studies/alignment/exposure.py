@@ -63,5 +63,6 @@ def fit(scene: AlignmentScene, images: np.ndarray, threads: int | None = None) -
         noll=NOLL,
         diffusion=_DIFFUSION,
         outer_scale=scene.atmosphere.outer_scale,
+        diffraction=True,
         threads=threads,
     )

@@ -39,13 +39,14 @@ from ...core.errors import ConfigError
 from ...core.launch import launch
 from ...core.warp_arrays import warp_array
 from ...models.telescope import Telescope
-from ..atmosphere.turbulence import coherence, diffraction_otf, structure_function
+from ..atmosphere.turbulence import coherence, structure_function
 from ..pupil_optics import PupilOptics
 from .clear_pupil import SpokePupil, clear_edges, only_rings
 from .engine import Exposed, PsfEngine, PsfInputs, expose_apart, metric_of
 from .lattice_pupil import LATTICE_POINTS, MOST_ACROSS, RINGS_POINTS, LatticeRays, LatticeTransfer
 from .long_exposure_kernels import place_points, sample_pixels, transform_pupils
 from .mean_rays import MeanRaysEngine, ray_counts, wanted_rays
+from .pupil_rims import strip_overlap
 from .sample_packets import LANES, samples
 
 #: Pupil points by default: 16 spokes of 5 rings.
@@ -154,11 +155,7 @@ class LongExposureEngine(PsfEngine):
     def _tabulate_filter(self) -> None:
         """Tabulate the filter of the points and strips of the pupil: the atmosphere, and the overlap of strips."""
         baseline = self._baselines()
-        # Strips as wide as half the baseline overlap a little: to third order in the baseline, less than 1e-3.
-        ring = np.minimum(baseline, self._width)
-        overlap = diffraction_otf(ring, self._diameter, self._obscuration) / (
-            1.0 - 2.0 * ring / (math.pi * self._width)
-        )
+        overlap = strip_overlap(baseline, self._diameter, self._obscuration)
         table = self._turbulence(baseline) * overlap / len(self._wavelengths)
         # The baseline of frequency k is wavelength / 2 pi |J^T k|.
         self._filter = np.ascontiguousarray(table, dtype=np.float32)

@@ -2,8 +2,8 @@
 
 The sums of :mod:`.long_exposure` over few points of the pupil are right where the phase varies slowly from one point to
 the next. Far from focus, a dense bundle of rays is binned as in :mod:`.fast`, and filtered by the mean transfer
-function of the atmosphere and of diffraction. The strips along the rims of the pupil, which that module treats apart,
-are here part of the filter: light diffracted at the rims, some 1e-3 of all, is spread evenly.
+function of the atmosphere. The strips along the rims of the pupil that diffraction takes away are those of
+:mod:`.pupil_rims`; where spiders or apertures of other shapes stop light, theirs are left out.
 """
 
 from __future__ import annotations
@@ -14,11 +14,13 @@ import numpy as np
 
 from ..atmosphere.turbulence import structure_function
 from ..pupil_optics import PupilOptics
+from ..pupil_polynomials import PupilPolynomials
 from ..pupil_sampling import spiral_annulus
 from .engine import PsfInputs
 from .far_from_focus import blur_radii
 from .fast import FastPsfEngine
 from .image_plane import square_transfer
+from .pupil_rims import pupil_rims, strip_overlap
 
 #: Cells of the fine grid per pixel.
 OVERSAMPLING = 4
@@ -27,6 +29,8 @@ OVERSAMPLING = 4
 FAR = 50e-6
 # Rays in the square of the rms radius of the blur: a donut of 1.2 mm is drawn to 6e-4 of its light (rms).
 _RAYS = 70.0
+# Rays that landing points of the rims are found from, and transfer of air and detector below which these are left out.
+_SMOOTH_POINTS, _DARK = 2000, 1e-3
 
 
 def ray_counts(optics: PupilOptics, pixel_size: float) -> np.ndarray:
@@ -53,10 +57,10 @@ class MeanRaysEngine(FastPsfEngine):
 
     def __init__(self, inputs: PsfInputs, rays: int) -> None:
         self._air = inputs.atmosphere
-        super().__init__(replace(inputs, atmosphere=None, n_pupil=rays, oversampling=OVERSAMPLING))
+        super().__init__(replace(inputs, atmosphere=None, n_pupil=rays, oversampling=OVERSAMPLING), far=True)
 
-    def _place_pupil(self, n_pupil: float) -> None:
-        self._points = spiral_annulus(0.5 * self._diameter, self._obscuration, int(n_pupil)).points
+    def _place_pupil(self, n_pupil: int) -> None:
+        self._points = spiral_annulus(0.5 * self._diameter, self._inner, int(self._area * n_pupil)).points
         self._weights = np.ones(len(self._points))
 
     def _make_grid(self) -> None:
@@ -74,6 +78,41 @@ class MeanRaysEngine(FastPsfEngine):
             return np.stack([_shared(*ray, side) for ray in zip(place[star], lit[star], strict=True)])
 
         return np.stack(self._map(share, range(len(place))))
+
+    def _diffraction(self, baseline: np.ndarray) -> np.ndarray:
+        return strip_overlap(baseline, self._diameter, self._obscuration)
+
+    def _transforms(self, deposit: np.ndarray, optics: PupilOptics, light: np.ndarray) -> np.ndarray:
+        spectra = super()._transforms(deposit, optics, light)
+        directions, channels = self._direction(optics.fields), self._channels
+        landing = channels.displacement(optics)
+        kx, ky = np.meshgrid(self._kx, self._ky)
+        some = slice(None, None, max(1, len(self._points) // _SMOOTH_POINTS))
+        smooth = PupilPolynomials(self._points[some], np.zeros(2), 0.0)
+
+        def diffract(star: int) -> None:
+            for channel, wave in enumerate(channels.wave):
+                wavelength, bare = float(self._wavelengths[wave]), landing[star, channel, some].astype(np.float64)
+                if not (np.isfinite(bare).all() and light[star, wave].any()):
+                    continue
+                # Baseline over wavelength: J^T k / 2 pi.
+                jacobian = optics.jacobian[star] * wavelength / (2.0 * np.pi)
+                x, y = (jacobian[0, i] * kx + jacobian[1, i] * ky for i in (0, 1))
+                length = np.hypot(x, y)
+                left = np.interp(length, self._filter_step * np.arange(self._filter.shape[1]), self._filter[wave])
+                bright = np.abs(left * self._detector) > _DARK
+                rims = pupil_rims(self._telescope, directions[star], wavelength)
+                places, inward = rims.landing(smooth, bare)
+                # The deposit has its origin in the first cell.
+                places = places + (self._grid_size // 2) * self._cell
+                k = np.stack([kx[bright], ky[bright]], axis=-1)
+                found = rims.transfer(np.stack([x[bright], y[bright]], axis=-1), k, places, inward)
+                # The detector's filter undoes the share of a cell of the deposit.
+                found *= square_transfer(k[:, 0], k[:, 1], self._cell) ** 2
+                spectra[star, channel][bright] += float(light[star, wave].sum()) * found
+
+        list(self._map(diffract, range(len(spectra))))
+        return spectra
 
     def _rest(self, baseline: np.ndarray) -> np.ndarray | None:
         return None if self._air is None else structure_function(baseline, self._air.r0, self._air.outer_scale)

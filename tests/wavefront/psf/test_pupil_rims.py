@@ -1,0 +1,96 @@
+"""Diffraction of donuts at the rims of the pupil, against the autocorrelation of the pupil's waves."""
+
+import numpy as np
+import pytest
+import scipy.fft
+from scipy.ndimage import shift
+
+import pachon
+from pachon.wavefront.atmosphere.turbulence import coherence, structure_function
+from pachon.wavefront.psf.pupil_rims import PupilRims, pupil_rims
+from pachon.wavefront.psf.psf import make_psfs
+
+LSST = pachon.load_telescope("lsst_v3.3_r")
+WAVE, PIXEL, SIDE = 620e-9, 10e-6, 81
+R0, OUTER_SCALE = 0.12, 25.0
+AIR = pachon.Atmosphere.from_site("cerro_pachon", 1, r0=R0, outer_scale=OUTER_SCALE)
+
+
+@pytest.fixture(scope="module")
+def defocused():
+    return LSST.perturbed("Detector", shift=(0.0, 0.0, 0.6e-3))
+
+
+@pytest.fixture(scope="module")
+def donut(defocused):
+    """Donut on the axis from the autocorrelation of the waves in its pupil, times the mean of turbulence, unit sum."""
+    step, reach = 8e-3, 75  # of the pupil, and baselines up to 0.6 m
+    size = scipy.fft.next_fast_len(1046 + reach)
+    place = (np.arange(size) - size // 2) * step
+    x, y = np.meshgrid(place, place)
+    radius, outer = np.hypot(x, y), 0.5 * LSST.pupil_diameter
+    inner = LSST.pupil_obscuration * outer
+    light = np.clip((outer - radius) / step + 0.5, 0, 1) * np.clip((radius - inner) / step + 0.5, 0, 1)
+    # The path is that of a rotationally symmetric telescope: a polynomial of the square of the radius.
+    along = np.linspace(1.004 * inner, 0.998 * outer, 60)
+    path = pachon.wavefront_opd(defocused, (0.0, 0.0), WAVE, pupil=(along, 0.0 * along)).value
+    fitted = np.polynomial.Polynomial.fit(along**2, path, 10)
+    waves = light * np.exp(2j * np.pi / WAVE * fitted(radius**2))
+    correlated = scipy.fft.ifft2(np.abs(scipy.fft.fft2(waves)) ** 2)
+    lag = np.arange(-reach, reach + 1)
+    transfer = correlated[np.ix_(lag, lag)] / correlated[0, 0].real
+    baseline = step * np.hypot(lag, lag[:, None])
+    transfer = transfer * coherence(structure_function(baseline, R0, OUTER_SCALE), WAVE)
+    focal_length = float(pachon.make_psfs(LSST, [(0, 0)], [WAVE]).pixel_scale)
+    wave = 2.0 * np.pi * step * lag / WAVE * focal_length / PIXEL  # rad/m on the detector
+    pixel = np.sinc(wave * PIXEL / (2.0 * np.pi))
+    turns = np.exp(1j * np.outer((np.arange(SIDE) - SIDE // 2) * PIXEL, wave))
+    image = ((turns * pixel) @ transfer @ (turns * pixel).T).real
+    return image / image.sum()
+
+
+def difference(image, expected):
+    return np.sqrt(((image - expected) ** 2).sum() / (expected**2).sum())
+
+
+@pytest.mark.long
+def test_long_exposure_donuts_are_diffracted_at_their_rims(defocused, donut):
+    image = make_psfs(
+        defocused, [(0.0, 0.0)], [WAVE], atmosphere=AIR, engine="long_exposure", stamp_size=SIDE, diffusion=0.0
+    ).image[0]
+    # Without diffraction, or with one filter for all rays, 4 %: what is left is the third order of the strips' width.
+    assert difference(image / image.sum(), donut) < 0.01
+
+
+@pytest.mark.slow
+def test_fits_with_diffraction_find_no_wavefront_in_it(defocused, donut):
+    options = {"sky_variance": 1e4, "outer_scale": OUTER_SCALE, "n_pupil": 80}
+    plain, right = (
+        pachon.fit_donuts(defocused, [1e8 * donut], [(0.0, 0.0)], WAVE, diffraction=d, **options) for d in (False, True)
+    )
+    # Rays and a wider seeing do not make strips along the rims: 24 nm of Z11, at 0.6 mm.
+    assert np.linalg.norm(plain.zernikes[0]) > 15e-9
+    assert np.linalg.norm(right.zernikes[0]) < 4e-9
+    assert right.chi2[0] < 0.1 * plain.chi2[0]
+
+
+def test_strips_of_a_ring_are_its_transfer_function_to_first_order():
+    rims = pupil_rims(LSST, np.array([0.0, 0.0, -1.0]), WAVE)
+    outer = 0.5 * LSST.pupil_diameter
+    inner = LSST.pupil_obscuration * outer
+    area = np.pi * (outer**2 - inner**2)
+    assert rims.parts.sum() * area == pytest.approx(2.0 * np.pi * (outer + inner), rel=1e-3)
+    # Both circumferences, times the mean of |cos| / 2, over the area: O'Neill's slope at zero.
+    baseline = 0.01 * np.array([[1.0, 0.0], [0.6, 0.8]])
+    nothing = np.zeros((len(rims.points), 2))
+    found = rims.transfer(baseline, np.zeros((2, 2)), nothing, nothing)
+    assert found == pytest.approx(-0.01 * 2.0 * (outer + inner) / area, rel=1e-3)
+    assert (rims.normals * rims.points).sum(axis=1)[: len(rims.points) // 2].min() > 0.0  # the hole first
+
+
+def test_phases_are_those_of_the_middle_of_a_strip():
+    rims = PupilRims(np.array([[4.0, 0.0]]), np.array([[-1.0, 0.0]]), np.array([0.3]))
+    wave, landing, inward = np.array([[2e4, 1e4]]), np.array([[6e-4, 1e-4]]), np.array([[-1.5e-4, 0.0]])
+    found = rims.transfer(np.array([[0.2, 0.1]]), wave, landing, inward)[0]
+    place = landing[0] + 0.25 * 0.2 * inward[0]
+    assert found == pytest.approx(-0.5 * 0.2 * 0.3 * np.exp(-1j * wave[0] @ place), rel=1e-5)
