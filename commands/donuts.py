@@ -65,6 +65,9 @@ def donuts_command(
         str | None, Option(help="Fit degrees of freedom to all donuts: lsst, or a YAML file.")
     ] = None,
     outer_scale_m: Annotated[float, Option(help="Outer scale of the turbulence [m]; inf for Kolmogorov's.")] = 25.0,
+    diffraction: Annotated[
+        bool, Option(help="Diffraction at the rims of the pupil: not in images made of rays alone.")
+    ] = True,
     projection: Projection = "zemax",
     out: Annotated[Path | None, Option("--out", "-o", help="Table: .ecsv, .fits, .csv or .parquet.")] = None,
     picture: Annotated[Path | None, Option(help="Picture of the first six donuts: .png, .pdf or .svg.")] = None,
@@ -129,6 +132,7 @@ def donuts_command(
             degrees_of_freedom=freedoms,
             defocus=np.concatenate(defocus),
             outer_scale=outer_scale_m,
+            diffraction=diffraction,
             saturation=saturation,
             projection=projection,
             threads=threads,

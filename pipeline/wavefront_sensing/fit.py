@@ -134,8 +134,9 @@ def fit_donuts(
     diffusion : float or Quantity
         Rms of the charge diffusion along each axis [m], which the seeing takes up by default.
     diffraction : bool
-        Whether light is diffracted at the rims of the pupil, as that of real stars is: a strip of the image along its
-        rims has less light, so wide as the seeing, which a fit of rays takes for some 50 nm of Z11.
+        Whether light is diffracted at the rims of the pupil, as that of real stars is: it takes light from strips along
+        the rims of the image. A fit of rays takes their lack for 35 to 45 nm of wavefront, most of it Z11 (LSST, 1.5
+        mm, 620 nm, 0.8"), and a wider seeing. Images made of rays alone, without diffraction, have none (the default).
     mask : array_like of bool, as `images`, optional
         True at pixels to leave out.
     saturation : float, optional

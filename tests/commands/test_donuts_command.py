@@ -12,7 +12,7 @@ import pachon
 from pachon.commands.cli import main
 
 FIELD = (0.6, 0.9)
-OPTIONS = ["--defocus-um", "1500", "--pixel-um", "20", "--zernikes", "11", "--higher-order-nm", "0"]
+OPTIONS = ["--defocus-um", "1500", "--pixel-um", "20", "--zernikes", "11", "--higher-order-nm", "0", "--no-diffraction"]
 
 
 @pytest.fixture(scope="module")

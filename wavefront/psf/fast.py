@@ -209,8 +209,8 @@ class FastPsfEngine(PsfEngine):
         if self._inner < self._obscuration:
             # Apertures have the last word where they end the ring; where none does, its inner rim is the pupil's.
             within = np.hypot(*self._points.T) < 0.5 * self._diameter * self._obscuration
-            unbounded = optics.lit[:, :, within].all(axis=2)
-            optics = replace(optics, lit=optics.lit & ~(unbounded[:, :, None] & within))
+            unbounded = np.all(optics.lit[:, :, within], axis=2, keepdims=True)
+            optics = replace(optics, lit=optics.lit & ~(unbounded & within))
         light = optics.lit * self._weights
         deposit = self._deposit(optics, light)
         combined = self._combine(self._transforms(deposit, optics, light), optics, offsets)

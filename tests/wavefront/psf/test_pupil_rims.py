@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 import scipy.fft
-from scipy.ndimage import shift
 
 import pachon
 from pachon.wavefront.atmosphere.turbulence import coherence, structure_function
-from pachon.wavefront.psf.pupil_rims import PupilRims, pupil_rims
 from pachon.wavefront.psf.psf import make_psfs
+from pachon.wavefront.psf.pupil_rims import PupilRims, pupil_rims
 
 LSST = pachon.load_telescope("lsst_v3.3_r")
 WAVE, PIXEL, SIDE = 620e-9, 10e-6, 81

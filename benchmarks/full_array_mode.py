@@ -1,0 +1,126 @@
+"""Full-array mode: the whole camera moved 1.5 mm out of focus, to one side and the other, one donut a CCD.
+
+Run: python benchmarks/full_array_mode.py [CCDs] [sides] [picture.png]
+
+The LSST (r band), off by twice the tolerances of ``pachon align`` in each of fifty degrees of freedom, exposes one star of
+5e6 electrons on each of so many CCDs (189 by default, evenly taken), with the heights of the camera as built, its detector
+1.5 mm behind the focus, and with ``sides`` 2 (the default) in front of it too. All donuts together give the degrees of
+freedom (``fit_donuts(degrees_of_freedom=)``). Printed: the wavefront over the field before and after they are taken off,
+what the covariance of the fit expects, and processor time and memory.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+import pachon
+from pachon.core.files import write_bytes
+from pachon.core.plotting import picture_bytes
+from pachon.studies.alignment.config import AlignConfig
+from pachon.studies.alignment.scene import AlignmentScene
+
+COUNT = int(sys.argv[1]) if len(sys.argv) > 1 else 189
+SIDES = int(sys.argv[2]) if len(sys.argv) > 2 else 2
+PICTURE = sys.argv[3] if len(sys.argv) > 3 else None
+DEFOCUS, ELECTRONS, SKY, READ_NOISE, DIFFUSION = 1.5e-3, 5e6, 300.0, 8.8, 4e-6
+
+
+def main() -> None:
+    scene = AlignmentScene.of(AlignConfig())
+    telescope, freedoms = scene.telescope, scene.freedoms
+    heights = pachon.FocalPlane.as_measured("lsstcam")
+    camera = heights.camera
+    chosen = np.linspace(0, len(camera) - 1, COUNT).round().astype(int)
+    places = np.stack(camera.from_local(chosen, 0.0 * chosen, 0.0 * chosen), axis=-1)
+    fields = pachon.fields_at(telescope, places)
+    state = scene.config.errors.initial * np.random.default_rng(1).standard_normal(len(freedoms))
+    true = freedoms.apply(telescope, state * scene.tolerances)
+    images, defocus = [], []
+    start = time.process_time()
+    for side in (1.0, -1.0)[:SIDES]:
+        moved = true.perturbed("Detector", shift=(0.0, 0.0, side * DEFOCUS))
+        images.append(
+            pachon.draw_donuts(
+                moved,
+                fields,
+                scene.wavelengths,
+                focal_plane=heights,
+                atmosphere=scene.atmosphere,
+                electrons=ELECTRONS,
+                sky=SKY,
+                read_noise=READ_NOISE,
+                diffusion=DIFFUSION,
+                seed=int(side > 0),
+            ).images
+        )
+        defocus.append(np.full(COUNT, side * DEFOCUS))
+    drawn = time.process_time() - start
+    # Twice the tolerances, and as much again: what the prior leaves is 1e-4 of what the donuts say.
+    prior = 2.0 * scene.config.errors.initial * scene.tolerances
+    start = time.process_time()
+    fit = pachon.fit_donuts(
+        telescope,
+        np.concatenate(images),
+        np.tile(fields, (SIDES, 1)),
+        scene.wavelengths,
+        defocus=np.concatenate(defocus),
+        focal_plane=heights,
+        sky_variance=SKY + READ_NOISE**2,
+        diffusion=DIFFUSION,
+        diffraction=True,
+        degrees_of_freedom=freedoms,
+        prior=prior,
+    )
+    fitted = time.process_time() - start
+    found = fit.degrees_of_freedom
+    left = freedoms.apply(telescope, state * scene.tolerances - found.values)
+    expected = scene.expected_wavefront(found.covariance / np.outer(scene.tolerances, scene.tolerances))
+    before, after = (1e9 * scene.quality.means(t).added for t in (true, left))
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print(f"pachon {pachon.__version__}; {fit.usable.sum()} of {SIDES * COUNT} donuts used")
+    print(f"wavefront over the field: {before:.0f} nm rms before, {after:.1f} after ({1e9 * expected:.1f} expected)")
+    print(f"processor time: {drawn:.0f} s for the donuts, {fitted:.0f} s for the fit; memory {memory:.1f} GiB")
+    quality = fit.chi2[fit.usable] / fit.n_pixels[fit.usable]
+    print(f"chi-square a pixel: median {np.median(quality):.3f}, worst {quality.max():.3f}")
+    ratio = found.combinations()[0]
+    print(f"combinations known to better than a sixth of the prior: {(ratio < 1 / 6).sum()} of {len(ratio)}")
+    if PICTURE:
+        write_bytes(Path(PICTURE), picture_bytes(_picture(fields, fit, scene, true), "png"))
+
+
+def _picture(fields: np.ndarray, fit: pachon.DonutFit, scene: AlignmentScene, true: pachon.Telescope):
+    """Draw Z4 to Z8 over the field as found, and found minus true."""
+    from pachon.core.plotting import styled
+
+    with styled():
+        import matplotlib.pyplot as plt
+
+        figure, axes = plt.subplots(2, 5, figsize=(14, 5.6), sharex=True, sharey=True)
+        both = [
+            pachon.wavefront_zernikes(t, fields, scene.wavelength, jmax=28).coefficients[:, fit.noll - 1]
+            for t in (scene.telescope, true)
+        ]
+        truth = 1e9 * (both[1] - both[0])
+        values = 1e9 * fit.zernikes[: len(fields)]
+        x, y = np.rad2deg(fields).T
+        for k in range(5):
+            for row, v in zip(axes, (values[:, k], (values - truth)[:, k]), strict=True):
+                most = float(np.abs(v).max())
+                dots = row[k].scatter(x, y, c=v, s=26, marker="s", cmap="RdBu_r", vmin=-most, vmax=most)
+                figure.colorbar(dots, ax=row[k], shrink=0.8)
+                row[k].set_aspect("equal")
+            axes[0, k].set_title(f"Z{fit.noll[k]} [nm]")
+        axes[0, 0].set_ylabel("found; field y [deg]")
+        axes[1, 0].set_ylabel("found - true; field y [deg]")
+        for axis in axes[1]:
+            axis.set_xlabel("field x [deg]")
+        return figure
+
+
+if __name__ == "__main__":
+    main()
