@@ -28,6 +28,7 @@ from ...media.medium import Medium
 from ...shapes.shape import Plane
 from ...surface import IDENTITY, Interaction, Matrix, Surface, Vector
 from ...telescope import VACUUM, Telescope
+from ..writable import require_met
 from ..zemax.file import Findings
 from . import ROOT
 from .apertures import clear_region
@@ -122,9 +123,19 @@ def _telescope(file: BatoidFile, path: Path) -> Telescope:
         site=extras.site,
         medium_before=first_medium,
         groups=members | {name: group.surfaces for name, group in extras.groups.items()},
+        design_data=extras.design.data(),
         group_frames=frames | {n: (g.pivot, g.rotation) for n, g in extras.groups.items() if g.pivot is not None},
     )
-    return _completed(telescope, system, extras)
+    return _completed(require_met(_with_semi_diameters(telescope, extras)), system, extras)
+
+
+def _with_semi_diameters(telescope: Telescope, extras: Extras) -> Telescope:
+    sizes = extras.semi_diameters
+    if other := set(sizes) - set(telescope.surface_names):
+        raise PrescriptionError(f"pachon.semi_diameters: {sorted(other)[0]!r}: expected the name of a surface")
+    if not sizes:
+        return telescope
+    return replace(telescope, surfaces=tuple(replace(s, semi_diameter=sizes.get(s.name)) for s in telescope.surfaces))
 
 
 def _within(
