@@ -18,6 +18,7 @@ from ....core.schema import Section, Tagged, expected, unknown_key
 from ....core.yaml_reader import as_number
 from ...media.medium import Medium
 from ...rotation import rotation_matrix
+from ..yaml.coatings import CoatingSection
 from ..yaml.design import DesignSection
 from ..yaml.reader import FieldSection, GroupSection, WavelengthsSection
 from ..yaml.values import ROWS, Length, Number, OptionalNameOrFile, OptionalText, PositiveNumber, Text
@@ -155,6 +156,8 @@ class Extras(Section):
     groups: dict[str, GroupSection] = Field(default_factory=dict)
     design: DesignSection = DesignSection()
     semi_diameters: dict[str, Length] = Field(default_factory=dict)
+    coatings: dict[str, CoatingSection] = Field(default_factory=dict)
+    coated: dict[str, Text] = Field(default_factory=dict)
 
 
 class BatoidFile(Section):

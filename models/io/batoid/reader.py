@@ -126,16 +126,25 @@ def _telescope(file: BatoidFile, path: Path) -> Telescope:
         design_data=extras.design.data(),
         group_frames=frames | {n: (g.pivot, g.rotation) for n, g in extras.groups.items() if g.pivot is not None},
     )
-    return _completed(require_met(_with_semi_diameters(telescope, extras)), system, extras)
+    return _completed(require_met(_with_extras(telescope, extras)), system, extras)
 
 
-def _with_semi_diameters(telescope: Telescope, extras: Extras) -> Telescope:
-    sizes = extras.semi_diameters
-    if other := set(sizes) - set(telescope.surface_names):
-        raise PrescriptionError(f"pachon.semi_diameters: {sorted(other)[0]!r}: expected the name of a surface")
-    if not sizes:
-        return telescope
-    return replace(telescope, surfaces=tuple(replace(s, semi_diameter=sizes.get(s.name)) for s in telescope.surfaces))
+def _with_extras(telescope: Telescope, extras: Extras) -> Telescope:
+    """Return the telescope with the semi-diameters and coatings that the section of ours states."""
+    sizes, coated = extras.semi_diameters, extras.coated
+    for key, stated in (("semi_diameters", set(sizes)), ("coated", set(coated))):
+        if other := sorted(stated - set(telescope.surface_names)):
+            raise PrescriptionError(f"{other[0]!r}: expected the name of a surface", key=f"pachon.{key}")
+    coatings = {name: section.made(name) for name, section in extras.coatings.items()}
+    for name, coating in coated.items():
+        if coating not in coatings:
+            wanted = f"one of {', '.join(coatings)}" if coatings else "a section coatings"
+            raise PrescriptionError(f"{coating!r}: expected {wanted}", key=f"pachon.coated.{name}")
+    surfaces = tuple(
+        replace(s, semi_diameter=sizes.get(s.name)).coated(coatings.get(coated.get(s.name, "")))
+        for s in telescope.surfaces
+    )
+    return replace(telescope, surfaces=surfaces) if sizes or coated else telescope
 
 
 def _within(

@@ -18,6 +18,7 @@ from ...rotation import rotation_angles
 from ...surface import Interaction, Surface
 from ...telescope import Telescope
 from ..writable import require_sequential
+from ..yaml.coatings import coating_items, coating_names
 from ..yaml.design import design_items
 from . import ROOT
 from .apertures import obscuration_items
@@ -123,6 +124,7 @@ def _coordinate_system(own: Frame, outer: Frame) -> dict[str, Any]:
 def _extras(t: Telescope, groups: list[str]) -> dict[str, Any]:
     """Return the section of what batoid does not have."""
     low, high = t.band or t.wavelength_range
+    coated = coating_names(t.surfaces)
     frames = {name: t.group_frames[name] for name in groups}
     extras = {
         "description": t.description,
@@ -138,6 +140,8 @@ def _extras(t: Telescope, groups: list[str]) -> dict[str, Any]:
         },
         "design": _plain(design_items(t.design_data)),
         "semi_diameters": {s.name: s.semi_diameter for s in t.surfaces if s.semi_diameter is not None},
+        "coatings": {name: coating_items(coating) for coating, name in coated.items()},
+        "coated": {s.name: coated[s.coating] for s in t.surfaces if s.coating is not None},
     }
     return {key: value for key, value in extras.items() if value}
 
