@@ -200,3 +200,14 @@ def test_the_height_of_a_real_marginal_ray_is_left_out_with_a_warning(tmp_path):
         lens = loaded(tmp_path, SYMMETRIC.replace("MAZH 0 0", "MAZH 0 0.7"))
     assert lens.design_data.solves == ()
     assert lens.design_data.pickups == PICKUPS
+
+
+def test_what_is_not_kept_of_a_zemax_file_is_named(tmp_path):
+    """In either mode: the solutions stand in the file, the relations are lost."""
+    text = SYMMETRIC
+    line = next(one for one in text.splitlines() if one.strip().startswith("CURV") and " 0" in one)
+    changed = text.replace(line, f"  CURV {line.split()[1]} 11 4\n  PPAR 3 1 1 0 0", 1)
+    (tmp_path / "lens.zmx").write_text(changed)
+    words = r"pickups and solves S\d CURV \(f-number\), S\d PPAR: their solutions stand in the file; they are not kept"
+    with pytest.warns(PrescriptionWarning, match=words):
+        pachon.load_telescope(tmp_path / "lens.zmx")
