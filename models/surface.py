@@ -14,6 +14,8 @@ from ..core.arguments import check_arguments
 from ..core.errors import DomainError, PrescriptionError
 from ..core.units import metres, pure_numbers
 from .aperture import Aperture
+from .coating import AnyCoating
+from .layer_stack import LayerStack
 from .media.medium import Medium
 from .shapes.shape import Shape
 
@@ -58,6 +60,8 @@ class Surface:
         Rotation matrix; its columns are the surface's axes in the telescope frame.
     semi_diameter : float, optional
         Radius [m] that the surface is made or drawn to; it stops no light.
+    coating : Coating, CoatingTable or LayerStack, optional
+        Coating, for throughput, illumination and ghosts; rays do not depend on it. Layers are those of lens surfaces.
     """
 
     name: str
@@ -68,6 +72,7 @@ class Surface:
     aperture: Aperture | None = None
     rotation: Matrix = IDENTITY
     semi_diameter: float | None = None
+    coating: AnyCoating | None = None
 
     def __post_init__(self) -> None:
         if len(self.vertex) != 3 or not np.all(np.isfinite(self.vertex)):
@@ -87,6 +92,12 @@ class Surface:
         matrix = np.array(self.rotation, dtype=np.float64)
         matrix.flags.writeable = False
         return matrix
+
+    def coated(self, coating: AnyCoating | None) -> Surface:
+        """Return the surface with a coating, or none; PrescriptionError for layers on what is no lens surface."""
+        if isinstance(coating, LayerStack) and self.interaction != Interaction.REFRACT:
+            raise PrescriptionError("layers are those of lens surfaces; expected a table", key="coating")
+        return replace(self, coating=coating)
 
     def to_local(self, points: ArrayLike) -> np.ndarray:
         """Return points [m], shape (..., 3), of the telescope frame in the surface's own frame."""

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, PrescriptionError, unknown_name
 from ..core.units import broadcast_together, metres, radians
+from .coating import AnyCoating
 from .design_data import DesignData
 from .media.medium import ConstantIndex, Medium, check_wavelength_range, wavelengths_within
 from .obstruction import Obstruction
@@ -212,6 +213,15 @@ class Telescope:
         """
         changed = replace(self.surface(name), shape=shape)
         return replace(self, surfaces=tuple(changed if s.name == name else s for s in self.surfaces))
+
+    def with_coatings(self, coatings: Mapping[str, AnyCoating]) -> Telescope:
+        """Return the telescope with coatings of surfaces by their names, and of no others.
+
+        UnknownNameError if no surface has a name.
+        """
+        for name in coatings:
+            self.surface(name)
+        return replace(self, surfaces=tuple(s.coated(coatings.get(s.name)) for s in self.surfaces))
 
     def with_deformation(self, name: str, deformation: Shape) -> Telescope:
         """Return the telescope with a deformation added to the sag of one surface.

@@ -8,7 +8,6 @@ from .core.errors import PrescriptionWarning as PrescriptionWarning
 from .core.errors import ProductError as ProductError
 from .core.errors import UnknownNameError as UnknownNameError
 from .design.analyses.coatings import Absorption as Absorption
-from .design.analyses.coatings import Coating as Coating
 from .design.analyses.coatings import Coatings as Coatings
 from .design.analyses.color import ChromaticFocus as ChromaticFocus
 from .design.analyses.color import LateralColor as LateralColor
@@ -19,8 +18,6 @@ from .design.analyses.field_curvature import field_curvature as field_curvature
 from .design.analyses.fresnel import fresnel_transmission as fresnel_transmission
 from .design.analyses.illumination import RelativeIllumination as RelativeIllumination
 from .design.analyses.illumination import relative_illumination as relative_illumination
-from .design.analyses.layer_stack import CoatingTable as CoatingTable
-from .design.analyses.layer_stack import LayerStack as LayerStack
 from .design.analyses.ray_fans import OpdFans as OpdFans
 from .design.analyses.ray_fans import RayFans as RayFans
 from .design.analyses.ray_fans import opd_fans as opd_fans
@@ -132,6 +129,7 @@ from .models.camera.height_statistics import height_statistics as height_statist
 from .models.camera.lsst import lsst_camera as lsst_camera
 from .models.camera.sensor_heights import CornerSensor as CornerSensor
 from .models.camera.silicon import Silicon as Silicon
+from .models.coating import Coating as Coating
 from .models.design_data import DesignData as DesignData
 from .models.first_order import ChromaticSums as ChromaticSums
 from .models.first_order import FirstOrder as FirstOrder
@@ -147,6 +145,8 @@ from .models.io.heights.zernike_table import corner_sensors as corner_sensors
 from .models.io.prescription import load_telescope as load_telescope
 from .models.io.prescription import save_telescope as save_telescope
 from .models.io.site_file import load_site as load_site
+from .models.layer_stack import CoatingTable as CoatingTable
+from .models.layer_stack import LayerStack as LayerStack
 from .models.links import Pickup as Pickup
 from .models.links import Solve as Solve
 from .models.media.air import Air as Air

@@ -14,7 +14,7 @@
 The efficiency is the reflectivity of a mirror, the transmission of a lens surface, the quantum efficiency of the
 detector, or the internal transmission of a thickness of a glass; between wavelengths, and angles of incidence from the
 normal on the side of lower index, it is interpolated linearly. Layers are films without absorption on a lens surface,
-from the side of lower index to the glass (:mod:`~pachon.design.analyses.layer_stack`). A
+from the side of lower index to the glass (:mod:`~pachon.models.layer_stack`). A
 file is text of two columns, wavelength [nm] and efficiency, with commas or spaces; its path is relative to this file.
 Glasses have the names that they have in the prescription.
 """
@@ -38,58 +38,10 @@ from ...core.schema import Section, either, expected, one_of
 from ...core.schema import validated as validated_file
 from ...core.units import metres
 from ...core.yaml_reader import read_mapping
+from ...models.coating import AnyCoating, Coating
+from ...models.io.yaml.coatings import CoatingSection
 from ...models.io.yaml.values import Numbers, OptionalText, PositiveNumber, Text
-from ...models.media.medium import wavelengths_within
-from .layer_stack import CoatingTable, LayerStack
-
-
-@check_arguments
-@dataclass(frozen=True)
-class Coating:
-    """Efficiency of a surface against the wavelength, for unpolarised light at any angle.
-
-    Parameters
-    ----------
-    wavelengths : tuple of float, shape (n,)
-        Vacuum wavelengths [m], ascending.
-    efficiencies : tuple of float, shape (n,)
-        Reflectivity or transmission, 0 to 1.
-    name : str
-        Name for messages.
-    """
-
-    wavelengths: tuple[float, ...]
-    efficiencies: tuple[float, ...]
-    name: str = ""
-
-    def __post_init__(self) -> None:
-        waves, values = np.array(self.wavelengths), np.array(self.efficiencies)
-        if len(waves) < 2 or not (np.isfinite(waves).all() and (waves > 0).all() and (np.diff(waves) > 0).all()):
-            raise ConfigError(f"wavelengths of {self.name or 'a coating'}: expected two or more, positive, ascending")
-        if waves.shape != values.shape or not ((values >= 0) & (values <= 1)).all():
-            text = f"expected {len(waves)} numbers from 0 to 1, as many as wavelengths"
-            raise ConfigError(f"efficiency of {self.name or 'a coating'}: {text}")
-
-    @check_arguments
-    def efficiency(self, wavelength: float, cosine: ArrayLike, n1: float, n2: float) -> np.ndarray:
-        """Return the efficiency at a wavelength, the same at all angles of incidence.
-
-        Parameters
-        ----------
-        wavelength : float
-            Vacuum wavelength [m]; a DomainError outside the table.
-        cosine : array_like
-            Cosine of the angle of incidence.
-        n1, n2 : float
-            Refractive indices before and behind.
-        """
-        return np.full(np.shape(cosine), self.at(wavelength))
-
-    def at(self, wavelength: ArrayLike) -> np.ndarray:
-        """Return the efficiency at wavelengths [m]; a DomainError outside the table."""
-        ends = (self.wavelengths[0], self.wavelengths[-1])
-        w = wavelengths_within(wavelength, ends, f"coating {self.name}" if self.name else "the coating")
-        return np.interp(w, self.wavelengths, self.efficiencies)
+from ...models.telescope import Telescope
 
 
 @check_arguments
@@ -131,8 +83,15 @@ class Coatings:
         Internal transmission of glasses.
     """
 
-    surfaces: Mapping[str, Coating | CoatingTable | LayerStack] = field(default_factory=dict)
+    surfaces: Mapping[str, AnyCoating] = field(default_factory=dict)
     glasses: Mapping[str, Absorption] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, telescope: Telescope, given: Coatings | str | os.PathLike[str] | None = None) -> Coatings:
+        """Return the coatings of the surfaces of a telescope, in their place those that are given, or of a file."""
+        known = given if isinstance(given, Coatings) else cls() if given is None else cls.read(given)
+        own = {s.name: s.coating for s in telescope.surfaces if s.coating is not None}
+        return cls({**own, **known.surfaces}, known.glasses)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Coatings:
@@ -171,51 +130,23 @@ class _GlassSection(_TableSection):
     thickness_mm: PositiveNumber
 
 
-class _LayerSection(Section):
-    """One thin film."""
+class _CoatingSection(CoatingSection):
+    """Coating as in prescriptions, or its table in a file."""
 
-    index: PositiveNumber
-    thickness_nm: PositiveNumber
-
-
-class _CoatingSection(Section):
-    """Efficiency against the wavelength, here or in a file; against the angle too; or thin films."""
-
-    wavelength_nm: Numbers = ()
-    efficiency: Numbers | tuple[Numbers, ...] = ()
     file: OptionalText = None
-    angle_deg: Numbers = ()
-    layers: tuple[_LayerSection, ...] = ()
 
     @classmethod
     def check(cls, content: dict[str, Any]) -> None:
-        if "layers" in content:
-            for other in content:
-                if other != "layers":
-                    raise expected("layers alone", other)
+        if "file" not in content or "layers" in content:
+            super().check(content)
             return
         either(content, "file", ("wavelength_nm", "efficiency"))
-        if "angle_deg" in content and "file" in content:
+        if "angle_deg" in content:
             raise expected("file or angle_deg, not both", "angle_deg")
 
-    def coating(self, name: str, folder: Path) -> Coating | CoatingTable | LayerStack:
+    def coating_in(self, name: str, folder: Path) -> AnyCoating:
         """Return the coating; paths of files start from the folder."""
-        if self.layers:
-            return LayerStack(
-                tuple(layer.index for layer in self.layers),
-                tuple(1e-9 * layer.thickness_nm for layer in self.layers),
-                name,
-            )
-        if self.angle_deg:
-            rows = [row if isinstance(row, tuple) else (row,) for row in self.efficiency]
-            waves, angles = (
-                tuple(map(float, v)) for v in (1e-9 * np.array(self.wavelength_nm), np.deg2rad(self.angle_deg))
-            )
-            return CoatingTable(waves, angles, tuple(rows), name)
-        plain = [v for v in self.efficiency if not isinstance(v, tuple)]
-        if len(plain) < len(self.efficiency):
-            raise ConfigError(f"efficiency of {name}: expected numbers; rows of them go with angle_deg")
-        return _plain(self.wavelength_nm, tuple(plain), self.file, name, folder)
+        return self.coating(name) if self.file is None else _plain((), (), self.file, name, folder)
 
 
 class CoatingsFile(Section):
@@ -227,11 +158,11 @@ class CoatingsFile(Section):
 
     def coatings(self, folder: Path) -> Coatings:
         """Return the coatings; paths of files start from the folder."""
-        known: dict[str, Coating | CoatingTable | LayerStack] = {}
+        known: dict[str, AnyCoating] = {}
         glasses = {}
         for name, table in self.coatings_.items():
             with error_context(key=f"coatings.{name}"):
-                known[name] = table.coating(name, folder)
+                known[name] = table.coating_in(name, folder)
         for surface, name in self.surfaces.items():
             if name not in known:
                 raise ConfigError(f"surfaces.{surface} = {name!r}: expected {one_of(known, name)}")

@@ -142,7 +142,8 @@ def relative_illumination(
     request = Request.of(
         telescope, line, wavelength, sampling="spiral", n_pupil=count, projection=projection, threads=threads
     )
-    known = None if coatings is None else coatings_of(telescope, coatings)
+    bare = coatings is None and all(s.coating is None for s in telescope.surfaces)
+    known = None if bare else coatings_of(telescope, coatings)
     # Each field with its own vignetting factors; the axis is not one of the stated fields.
     each = [
         request.at_fields(np.zeros((1, 2))),

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, unknown_name
 from ...core.plotting import BLUE, plain_text
+from ...models.layer_stack import LayerStack
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
 from ...raytrace.pack.surfaces import refractive_indices
@@ -29,7 +30,6 @@ from ..drawing import field_colors, finish_axes
 from .analysis import Analysis, Columns, band_wavelengths
 from .coatings import Coatings
 from .fresnel import fresnel_transmission
-from .layer_stack import LayerStack
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -161,7 +161,7 @@ def throughput(
 
 def coatings_of(telescope: Telescope, coatings: Coatings | str | os.PathLike[str] | None) -> Coatings:
     """Return coatings, or those of a file, that belong to a telescope; errors are those of :func:`throughput`."""
-    known = coatings if isinstance(coatings, Coatings) else Coatings() if coatings is None else Coatings.read(coatings)
+    known = Coatings.of(telescope, coatings)
     names = telescope.surface_names
     glasses = [s.medium_after.name for s in telescope.surfaces if s.medium_after.name]
     for name in known.surfaces:

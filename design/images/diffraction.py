@@ -225,7 +225,7 @@ class _Plan:
         progress: Callable[[int], None] | None,
     ) -> DiffractionPsf:
         """Return the images of all field points from a function that returns wavelets and their sum."""
-        axis, finer = pixel_axis(self.pixel, self.pixels), self._samples()
+        finer = self._samples()
         images, lit, strehl = [], [], []
         for i, center in enumerate(self.spots.reference_point):
             one = self.request.at_fields(slice(i, i + 1))

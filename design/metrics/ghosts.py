@@ -245,7 +245,7 @@ def ghosts(
         threads=threads,
         one_wavelength=True,
     )
-    known = coatings if isinstance(coatings, Coatings) else Coatings() if coatings is None else Coatings.read(coatings)
+    known = Coatings.of(telescope, coatings)
     surfaces = Reflectivities(telescope, reflectivity, detector_reflectivity, known, request.wavelength)
     pairs = ghost_pairs(telescope)
     if not pairs:

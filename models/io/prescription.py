@@ -231,7 +231,7 @@ def prescription_files(
     if format == "batoid":
         from .batoid.writer import telescope_to_batoid
 
-        return {target: telescope_to_batoid(telescope, lenient=lenient)}
+        return {target: telescope_to_batoid(telescope)}
     if format == "optiland":
         from .optiland.writer import telescope_to_optiland
 

@@ -522,6 +522,7 @@ def _methods(m, tel, w, x, y):
         "Telescope.with_rotator": (tel.with_rotator, {"angle": 0.1}),
         "Telescope.with_shape": (tel.with_shape, {"name": "M2", "shape": pachon.Conic(5.0)}),
         "Telescope.with_deformation": (tel.with_deformation, {"name": "M2", "deformation": m.grid}),
+        "Telescope.with_coatings": (tel.with_coatings, {"coatings": {}}),
         "Telescope.surface": (tel.surface, {"name": "M2"}),
         "Telescope.check_wavelength": (tel.check_wavelength, {"wavelength": w}),
         "Telescope.check_field": (tel.check_field, {"tx": [0.0], "ty": [0.0]}),

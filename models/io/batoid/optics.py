@@ -18,8 +18,10 @@ from ....core.schema import Section, Tagged, expected, unknown_key
 from ....core.yaml_reader import as_number
 from ...media.medium import Medium
 from ...rotation import rotation_matrix
+from ..yaml.coatings import CoatingSection
+from ..yaml.design import DesignSection
 from ..yaml.reader import FieldSection, GroupSection, WavelengthsSection
-from ..yaml.values import ROWS, Number, OptionalNameOrFile, OptionalText, PositiveNumber, Text
+from ..yaml.values import ROWS, Length, Number, OptionalNameOrFile, OptionalText, PositiveNumber, Text
 from . import ROOT
 from .apertures import Obscuration
 from .media import AnyMedium
@@ -152,6 +154,10 @@ class Extras(Section):
     camera: OptionalNameOrFile = None
     site: OptionalNameOrFile = None
     groups: dict[str, GroupSection] = Field(default_factory=dict)
+    design: DesignSection = DesignSection()
+    semi_diameters: dict[str, Length] = Field(default_factory=dict)
+    coatings: dict[str, CoatingSection] = Field(default_factory=dict)
+    coated: dict[str, Text] = Field(default_factory=dict)
 
 
 class BatoidFile(Section):

@@ -28,6 +28,7 @@ from ...media.medium import Medium
 from ...shapes.shape import Plane
 from ...surface import IDENTITY, Interaction, Matrix, Surface, Vector
 from ...telescope import VACUUM, Telescope
+from ..writable import require_met
 from ..zemax.file import Findings
 from . import ROOT
 from .apertures import clear_region
@@ -122,9 +123,28 @@ def _telescope(file: BatoidFile, path: Path) -> Telescope:
         site=extras.site,
         medium_before=first_medium,
         groups=members | {name: group.surfaces for name, group in extras.groups.items()},
+        design_data=extras.design.data(),
         group_frames=frames | {n: (g.pivot, g.rotation) for n, g in extras.groups.items() if g.pivot is not None},
     )
-    return _completed(telescope, system, extras)
+    return _completed(require_met(_with_extras(telescope, extras)), system, extras)
+
+
+def _with_extras(telescope: Telescope, extras: Extras) -> Telescope:
+    """Return the telescope with the semi-diameters and coatings that the section of ours states."""
+    sizes, coated = extras.semi_diameters, extras.coated
+    for key, stated in (("semi_diameters", set(sizes)), ("coated", set(coated))):
+        if other := sorted(stated - set(telescope.surface_names)):
+            raise PrescriptionError(f"{other[0]!r}: expected the name of a surface", key=f"pachon.{key}")
+    coatings = {name: section.made(name) for name, section in extras.coatings.items()}
+    for name, coating in coated.items():
+        if coating not in coatings:
+            wanted = f"one of {', '.join(coatings)}" if coatings else "a section coatings"
+            raise PrescriptionError(f"{coating!r}: expected {wanted}", key=f"pachon.coated.{name}")
+    surfaces = tuple(
+        replace(s, semi_diameter=sizes.get(s.name)).coated(coatings.get(coated.get(s.name, "")))
+        for s in telescope.surfaces
+    )
+    return replace(telescope, surfaces=surfaces) if sizes or coated else telescope
 
 
 def _within(

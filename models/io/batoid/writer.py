@@ -17,7 +17,9 @@ from ...media.medium import Medium
 from ...rotation import rotation_angles
 from ...surface import Interaction, Surface
 from ...telescope import Telescope
-from ..writable import report_unheld, require_sequential
+from ..writable import require_sequential
+from ..yaml.coatings import coating_items, coating_names
+from ..yaml.design import design_items
 from . import ROOT
 from .apertures import obscuration_items
 from .media import medium_items
@@ -35,16 +37,14 @@ _TYPES = {
 }
 
 
-def telescope_to_batoid(telescope: Telescope, *, lenient: bool = False) -> str:
+def telescope_to_batoid(telescope: Telescope) -> str:
     """Return the text of a batoid file.
 
-    PrescriptionError, with surface and part, if a part of the telescope has no counterpart in batoid; pickups and
-    solves have none, and are left out with a warning where `lenient`.
+    PrescriptionError, with surface and part, if a part of the telescope has no counterpart in batoid.
     """
     t = telescope
     with error_context(subject=t.name):
         require_sequential(t, "a batoid file")
-        report_unheld((*t.design_data.pickups, *t.design_data.solves), "a batoid file", lenient=lenient)
         if math.isfinite(t.object_distance):
             raise PrescriptionError(f"object_distance = {t.object_distance!r}: a batoid file has no object but the sky")
         nested = _nested_groups(t)
@@ -124,6 +124,7 @@ def _coordinate_system(own: Frame, outer: Frame) -> dict[str, Any]:
 def _extras(t: Telescope, groups: list[str]) -> dict[str, Any]:
     """Return the section of what batoid does not have."""
     low, high = t.band or t.wavelength_range
+    coated = coating_names(t.surfaces)
     frames = {name: t.group_frames[name] for name in groups}
     extras = {
         "description": t.description,
@@ -137,5 +138,18 @@ def _extras(t: Telescope, groups: list[str]) -> dict[str, Any]:
             name: {"surfaces": list(t.groups[name]), "pivot": list(pivot), "rotation": [list(row) for row in axes]}
             for name, (pivot, axes) in frames.items()
         },
+        "design": _plain(design_items(t.design_data)),
+        "semi_diameters": {s.name: s.semi_diameter for s in t.surfaces if s.semi_diameter is not None},
+        "coatings": {name: coating_items(coating) for coating, name in coated.items()},
+        "coated": {s.name: coated[s.coating] for s in t.surfaces if s.coating is not None},
     }
     return {key: value for key, value in extras.items() if value}
+
+
+def _plain(value: Any) -> Any:
+    """Return lists, mappings and numbers as YAML's safe dumper takes them, without marks of units."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return float(value) if isinstance(value, float) else value

@@ -58,9 +58,21 @@ PICKED = {k: k for k in ("THI", "K", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", *
 }
 
 
+#: Length of glass behind a surface over its radius, beyond which that is no radius; rod lenses have 30.
+_LONGEST = 100.0
+
+
+class LacksRadiusModeError(PrescriptionError):
+    """A file without RDM whose surfaces cannot have the curvatures that it states."""
+
+
 def read_codev_file(path: Path, findings: Findings) -> ZemaxFile:
     """Return the parts of a CODE V lens file in the terms of a Zemax file."""
-    return _Translation(path, findings).file()
+    try:
+        return _Translation(path, findings).file()
+    except LacksRadiusModeError as error:
+        findings.report(error, "the surfaces have radii")
+        return _Translation(path, findings, assumed_radii=True).file()
 
 
 def _commands(path: Path) -> Iterator[Record]:
@@ -83,7 +95,8 @@ def _commands(path: Path) -> Iterator[Record]:
 class _Translation:
     """Lines of the same lens in a Zemax file, collected from the commands."""
 
-    def __init__(self, path: Path, findings: Findings) -> None:
+    def __init__(self, path: Path, findings: Findings, *, assumed_radii: bool = False) -> None:
+        self.assumed_radii = assumed_radii
         self.path, self.findings = path, findings
         self.header = Block(str(path))
         self.surfaces: list[Block] = []
@@ -102,7 +115,7 @@ class _Translation:
         # CODE V takes curvatures unless RDM says otherwise, wherever it stands.
         commands = [replace(c, keyword=LONG_NAMES.get(c.keyword, c.keyword)) for c in _commands(self.path)]
         modes = [c.words for c in commands if c.keyword == "RDM"]
-        self.radii = bool(modes) and not (modes[-1] and modes[-1][0].upper().startswith("N"))
+        self.radii = self.assumed_radii or (bool(modes) and not (modes[-1] and modes[-1][0].upper().startswith("N")))
         for command in commands:
             if self.private_waves is not None:
                 self._private(command)
@@ -209,6 +222,7 @@ class _Translation:
 
     def _glass(self, command: Record, name: str, number: int) -> None:
         found = re.fullmatch(r"(\d{3})\.?(\d{3})|(\d{6})\.(\d{6})", name)
+        numbers = re.fullmatch(r"(\d\.\d+):(\d+\.?\d*)", name)
         if name.upper() in ("REFL", "MIRROR"):
             words: tuple[str, ...] = ("MIRROR",)
         elif name.upper() == "AIR":
@@ -217,6 +231,9 @@ class _Translation:
             # A number: the digits of nd - 1, then the Abbe number times ten, each with three digits or six.
             index, abbe = (found[1], found[2]) if found[1] else (found[3], found[4])
             words = (name, "1", "0", repr(1 + float(f"0.{index}")), repr(float(abbe) / 10 ** (len(abbe) - 2)))
+        elif numbers:
+            # Index and Abbe number as they are.
+            words = (name, "1", "0", numbers[1], numbers[2])
         else:
             words = (name.strip("'").split("_")[0],)
         self.surfaces[number].lines.append(replace(command, keyword="GLAS", words=words))
@@ -299,10 +316,16 @@ class _Translation:
         """Refuse a file whose first curved surface would not reach the rim of the pupil: radii that lack RDM."""
         diameter = self.header.number("ENPD", 0.0)
         curvature = next((v["CURV"] for v in self.values[1:] if v["CURV"]), 0.0)
-        if not self.radii and 0.5 * diameter * abs(curvature) > 1.0:
-            raise self.header.problem(
-                f"curvature {curvature:g}: a sphere smaller than the entrance pupil of {diameter:g}; "
-                "expected RDM where surfaces have radii"
+        small = f"the entrance pupil of {diameter:g}" if 0.5 * diameter * abs(curvature) > 1.0 else ""
+        for block, values in zip(self.surfaces[1:], self.values[1:], strict=True):
+            glass = any(line.keyword == "GLAS" and line.words[0] != "MIRROR" for line in block.lines)
+            bend = abs(values["CURV"] * values.get("THI", 0.0))
+            if not small and glass and bend > _LONGEST:
+                small, curvature = f"a hundredth of its glass of {values['THI']:g}", values["CURV"]
+        if small and not self.radii:
+            raise LacksRadiusModeError(
+                f"curvature {curvature:g}: a sphere smaller than {small}; expected RDM where surfaces have radii",
+                file=str(self.path),
             )
 
     def _check_solves(self) -> None:

@@ -34,7 +34,7 @@ def telescope_to_optiland(telescope: Telescope, *, lenient: bool = False) -> str
     t = telescope
     with error_context(subject=t.name):
         require_sequential(t, "a file of optiland")
-        report_unheld((*t.design_data.pickups, *t.design_data.solves), "a file of optiland", lenient=lenient)
+        report_unheld(t, (*t.design_data.pickups, *t.design_data.solves), "a file of optiland", lenient=lenient)
         stop, system = own_stop(t), system_items(t)
         first = -t.surfaces[0].vertex[2]
         before = material_items(t.medium_before)

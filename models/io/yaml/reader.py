@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, Field, create_model
 from ....core.errors import PachonError, PrescriptionError, error_context
 from ....core.schema import Section, Tagged, expected, one_of, validated
 from ....core.yaml_reader import read_mapping
+from ...coating import AnyCoating
 from ...media.medium import Medium
 from ...obstruction import Obstruction
 from ...rotation import rotation_matrix
@@ -19,6 +20,7 @@ from ...surface import IDENTITY, Interaction, Matrix, Surface
 from ...telescope import VACUUM, Telescope
 from ..writable import require_met
 from .apertures import ApertureKeys, ObstructionSection
+from .coatings import CoatingSection
 from .design import DesignSection
 from .media import AnyMedium
 from .shapes import SURFACE_SHAPES, ShapeSection
@@ -64,6 +66,7 @@ class SurfaceKeys(ApertureKeys):
     rotation: Rotation = IDENTITY
     medium: OptionalText = None
     semi_diameter: OptionalLength = None
+    coating: OptionalText = None
 
     @classmethod
     def keys(cls) -> list[str]:
@@ -79,8 +82,14 @@ class SurfaceKeys(ApertureKeys):
         if "tilt" in content and "rotation" in content:
             raise expected("tilt or rotation, not both", "tilt")
 
-    def surface(self, media: dict[str, Medium], medium_before: Medium) -> Surface:
+    def surface(
+        self, media: dict[str, Medium], medium_before: Medium, coatings: dict[str, AnyCoating] | None = None
+    ) -> Surface:
         """Return the surface."""
+        known = coatings or {}
+        if self.coating is not None and self.coating not in known:
+            wanted = one_of(known, self.coating) if known else "a section coatings"
+            raise PrescriptionError(f"coating = {self.coating!r}: expected {wanted}", key="coating")
         assert isinstance(self, ShapeSection)
         return Surface(
             name=self.name,
@@ -91,7 +100,7 @@ class SurfaceKeys(ApertureKeys):
             aperture=self.clear_aperture(),
             rotation=self.rotation if self.tilt is None else _matrix(rotation_matrix(self.tilt)),
             semi_diameter=self.semi_diameter,
-        )
+        ).coated(None if self.coating is None else known[self.coating])
 
 
 def _surface_kind(content: dict[str, Any]) -> str:
@@ -99,8 +108,7 @@ def _surface_kind(content: dict[str, Any]) -> str:
 
 
 _SURFACES: dict[str, type[SurfaceKeys]] = {
-    name: create_model(f"{name}_surface", __base__=(SurfaceKeys, section))  # type: ignore[arg-type]
-    for name, section in SURFACE_SHAPES.items()
+    name: create_model(f"{name}_surface", __base__=(SurfaceKeys, section)) for name, section in SURFACE_SHAPES.items()
 }
 _BY_SHAPE = Tagged.by_value("shape", {name: section for name, section in _SURFACES.items() if name != "sum"})
 
@@ -179,6 +187,7 @@ class Prescription(Section):
     site: OptionalNameOrFile = None
     medium_before: OptionalText = None
     media: Annotated[dict[str, AnyMedium], BeforeValidator(_no_vacuum)] = Field(default_factory=dict)
+    coatings: dict[str, CoatingSection] = Field(default_factory=dict)
     groups: dict[str, Annotated[GroupSection, BeforeValidator(_group)]] = Field(default_factory=dict)
     obstructions: Annotated[tuple[Annotated[Obstruction, _OBSTRUCTION], ...], ROWS] = ()
     surfaces: Annotated[tuple[Annotated[SurfaceKeys, _SURFACE], ...], ROWS]
@@ -193,15 +202,24 @@ class Prescription(Section):
             except PachonError as error:
                 found.append(error.within(key=f"media.{name}"))
                 media[name] = VACUUM
-        for section in self.surfaces:
+        coatings: dict[str, AnyCoating] = {}
+        for name, one in self.coatings.items():
             try:
-                section.surface(media, VACUUM)
+                coatings[name] = one.made(name)
+            except PachonError as error:
+                found.append(error)
+        for section in self.surfaces:
+            if section.coating in self.coatings and section.coating not in coatings:
+                continue
+            try:
+                section.surface(media, VACUUM, coatings)
             except PachonError as error:
                 found.append(error.within(key=f"surfaces[{section.name}]"))
         return found
 
     def telescope(self) -> Telescope:
         """Return the telescope."""
+        coatings = {name: section.made(name) for name, section in self.coatings.items()}
         media: dict[str, Medium] = {"vacuum": VACUUM}
         for name, medium in self.media.items():
             with error_context(key=f"media.{name}"):
@@ -211,7 +229,7 @@ class Prescription(Section):
         for section in self.surfaces:
             with error_context(key=f"surfaces[{section.name}]"):
                 behind = surfaces[-1].medium_after if surfaces else medium_before
-                surfaces.append(section.surface(media, behind))
+                surfaces.append(section.surface(media, behind, coatings))
         return Telescope(
             name=self.name,
             description=self.description,

@@ -7,11 +7,13 @@ import re
 from itertools import count
 from typing import Any
 
+from ...coating import AnyCoating
 from ...media.medium import Medium
 from ...surface import IDENTITY, Surface
 from ...telescope import VACUUM, Telescope
 from ..writable import require_met
 from .apertures import aperture_items, obstruction_items
+from .coatings import coating_items, coating_names
 from .design import design_items
 from .media import medium_items
 from .reader import INTERACTIONS
@@ -27,7 +29,7 @@ def telescope_to_yaml(telescope: Telescope) -> str:
     PrescriptionError if a value is not that of its pickup.
     """
     t = require_met(telescope)
-    names = _medium_names(t)
+    names, coated = _medium_names(t), coating_names(t.surfaces)
     low, high = t.band or t.wavelength_range
     head: dict[str, Any] = {
         "name": t.name,
@@ -54,10 +56,11 @@ def telescope_to_yaml(telescope: Telescope) -> str:
     lists = {
         "design": [(f"  {key}: ", value) for key, value in design_items(t.design_data).items()],
         "media": [(f"  {name}: ", medium_items(medium)) for medium, name in names.items() if medium != VACUUM],
+        "coatings": [(f"  {flow(name)}: ", coating_items(one)) for one, name in coated.items()],
         "groups": [(f"  {flow(name)}: ", _group_items(t, name)) for name in t.groups],
         "obstructions": [("  - ", obstruction_items(obstruction)) for obstruction in t.obstructions],
     }
-    surfaces = [_surface_items(surface, names) for surface in t.surfaces]
+    surfaces = [_surface_items(surface, names, coated) for surface in t.surfaces]
     angles, waves = _found((head, lists, surfaces), Turn), _found((head, lists, surfaces), Wave)
     angle, turned = _in_unit(angles, "deg", "rad")
     wave, shown = _in_unit(waves, "um", "m")
@@ -91,7 +94,7 @@ def _group_items(t: Telescope, name: str) -> Any:
     return {"surfaces": members, "pivot": pivot, "rotation": axes} if framed else members
 
 
-def _surface_items(surface: Surface, names: dict[Medium, str]) -> dict[str, Any]:
+def _surface_items(surface: Surface, names: dict[Medium, str], coated: dict[AnyCoating, str]) -> dict[str, Any]:
     x, y, z = surface.vertex
     shape = shape_items(surface.shape)
     kind = INTERACTION_NAMES[surface.interaction]
@@ -100,6 +103,7 @@ def _surface_items(surface: Surface, names: dict[Medium, str]) -> dict[str, Any]
     items |= {} if surface.rotation == IDENTITY else {"rotation": surface.rotation}
     items |= shape | aperture_items(surface.aperture)
     items |= {} if surface.semi_diameter is None else {"semi_diameter": surface.semi_diameter}
+    items |= {} if surface.coating is None else {"coating": coated[surface.coating]}
     return items | ({"medium": Bare(names[surface.medium_after])} if kind == "refract" else {})
 
 

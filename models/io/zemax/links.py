@@ -1,7 +1,7 @@
 """Pickups and solves of a Zemax file: radius, thickness and glass of another surface, and a paraxial back focus.
 
-``CURV value 4 surface scale``, ``PZUP surface scale offset``, ``GLAS name 2 surface``, ``MAZH height zone``. Others are
-passed over: their solution stands in the file.
+``CURV value 4 surface scale``, ``PZUP surface scale offset``, ``GLAS name 2 surface``, ``MAZH height zone``. Of others
+the solution stands in the file; they are named in a warning.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from ....core.errors import PrescriptionError
 from ...links import Pickup, Solve
 from ...surface import Interaction
 from ...telescope import Telescope
@@ -21,6 +22,23 @@ from .text import number_text
 
 #: Solve types of a curvature and of a glass that take over that of another surface.
 _CURVATURE, _GLASS = 4, 2
+#: Solves of a curvature without a place in a telescope, by their numbers: rays, normals, power, focal ratio...
+_CURVATURE_SOLVES = {
+    2: "marginal ray angle",
+    3: "chief ray angle",
+    5: "marginal ray normal",
+    6: "chief ray normal",
+    7: "aplanatic",
+    8: "element power",
+    9: "concentric with a surface",
+    10: "concentric with a radius",
+    11: "f-number",
+    12: "macro",
+}
+#: Lines of pickups and solves without a place in a telescope; PDIA and PZUP of drawing sizes and thicknesses apart.
+_UNKEPT = frozenset(
+    ("PCUP", "PPAR", "PXDT", "PCOP", "PGLA", "PKUP", "CPKP", "MARG", "CHAZ", "CHAA", "POSI", "COMP", "CURF", "GLCZ")
+)
 #: Lines that pickups of Zemax files stand in, by the quantity; a thickness has one of its own.
 _LINES = {"radius": "CURV", "glass": "GLAS"}
 
@@ -49,9 +67,24 @@ def with_links(
             findings.note(block.problem(text), "it is not kept")
         else:
             solves.append(Solve(names[number], "marginal_height", line.number(0, 0.0) * unit))
+    if unkept := [name for number, block in enumerate(blocks) for name in _unkept(block, number)]:
+        text = f"pickups and solves {', '.join(unkept)}: their solutions stand in the file"
+        findings.note(PrescriptionError(text, file=blocks[0].source), "they are not kept")
     if not (pickups or solves):
         return telescope
     return telescope.with_design(pickups=tuple(pickups), solves=tuple(solves))
+
+
+def _unkept(block: Block, number: int) -> Iterator[str]:
+    """Yield the names of pickups and solves of a surface that a telescope has no place for."""
+    # Coordinate breaks become places of surfaces, whatever their parameters follow.
+    if block.text("TYPE").upper() == "COORDBRK":
+        return
+    curvature = block.last("CURV")
+    kind = 0 if curvature is None else int(curvature.number(1, 0.0))
+    if kind in _CURVATURE_SOLVES:
+        yield f"S{number} CURV ({_CURVATURE_SOLVES[kind]})"
+    yield from dict.fromkeys(f"S{number} {line.keyword}" for line in block.lines if line.keyword in _UNKEPT)
 
 
 def _last_name(names: Mapping[int, str]) -> str:

@@ -106,7 +106,7 @@ def telescope_to_zemax(telescope: Telescope, *, lenient: bool = False) -> tuple[
         blocks[-1].append("DISZ 0")
     left_out = add_link_lines(t, numbered, unit)
     with error_context(subject=t.name):
-        report_unheld(left_out, "a Zemax file", lenient=lenient)
+        report_unheld(t, left_out, "a Zemax file", lenient=lenient)
     for number, block in enumerate(blocks):
         lines += [f"SURF {number}", *(f"  {line}" for line in block)]
     return "\n".join(lines) + "\n", "".join(_catalogue_lines(glasses))

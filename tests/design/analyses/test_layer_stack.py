@@ -8,7 +8,7 @@ import pytest
 import pachon
 from pachon.core.errors import ConfigError, DomainError
 from pachon.design.analyses.coatings import Coatings
-from pachon.design.analyses.layer_stack import CoatingTable, LayerStack
+from pachon.models.layer_stack import CoatingTable, LayerStack
 
 LIGHT, GLASS = 550e-9, 1.5168
 QUARTER = LayerStack((1.38,), (LIGHT / 4 / 1.38,), "mgf2")

@@ -9,7 +9,6 @@ import pachon
 from pachon.core.errors import DomainError, UnknownNameError
 from pachon.design.analyses.coatings import Coatings
 from pachon.design.analyses.fresnel import fresnel_reflectivity, refracted_reflectivity
-from pachon.design.analyses.layer_stack import LayerStack
 from pachon.design.metrics.ghost_paths import (
     GhostTrace,
     Reflectivities,
@@ -17,6 +16,7 @@ from pachon.design.metrics.ghost_paths import (
 )
 from pachon.design.metrics.ghosts import ghosts
 from pachon.models.aperture import Circle
+from pachon.models.layer_stack import LayerStack
 from pachon.models.media.medium import ConstantIndex
 from pachon.models.shapes.shape import Conic, Plane
 from pachon.models.surface import Interaction, Surface

@@ -267,3 +267,31 @@ def test_private_glasses(tmp_path):
 def test_an_object_at_infinity_may_be_written_so(tmp_path):
     telescope = load_telescope(written(tmp_path, TRIPLET.replace("SO    0.0 0.1e14", "SO 0.0 inf")))
     assert telescope == load_telescope(written(tmp_path, TRIPLET))
+
+
+BARE = """EPD 5.0
+WL 587.6
+YAN 0.0 3.0
+SO 0.0 1e10
+S  50.0 5.0  1.5168:64.17
+S  -80.0 45.0
+SI 0.0 0.0
+"""
+
+
+@pytest.mark.parametrize("aperture", ["EPD 5.0", "FNO 4.0"])
+def test_radii_without_rdm_are_read_when_lenient(tmp_path, aperture):
+    (tmp_path / "bare.seq").write_text(BARE.replace("EPD 5.0", aperture))
+    with pytest.raises(PrescriptionError, match=r"curvature 50: a sphere smaller than .*; expected RDM"):
+        load_telescope(tmp_path / "bare.seq")
+    with pytest.warns(PrescriptionWarning, match=r"expected RDM .*; the surfaces have radii"):
+        found = load_telescope(tmp_path / "bare.seq", lenient=True)
+    (tmp_path / "stated.seq").write_text("RDM\n" + BARE.replace("EPD 5.0", aperture))
+    stated = load_telescope(tmp_path / "stated.seq")
+    assert [s.shape for s in found.surfaces] == [s.shape for s in stated.surfaces]
+    # The glass is given by its index and Abbe number.
+    d, f, c = (
+        float(np.squeeze(stated.surfaces[0].medium_after.index(w))) for w in (587.5618e-9, 486.1327e-9, 656.2725e-9)
+    )
+    assert d == pytest.approx(1.5168, abs=1e-9)
+    assert (d - 1.0) / (f - c) == pytest.approx(64.17, rel=1e-6)

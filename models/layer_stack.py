@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.arguments import check_arguments
-from ...core.errors import ConfigError, DomainError
-from ...models.media.medium import wavelengths_within
+from ..core.arguments import check_arguments
+from ..core.errors import ConfigError, DomainError
+from .media.medium import wavelengths_within
 
 
 @check_arguments

@@ -1,0 +1,66 @@
+"""Coating of a surface: efficiency against the wavelength."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..core.arguments import check_arguments
+from ..core.errors import ConfigError
+from .layer_stack import CoatingTable, LayerStack
+from .media.medium import wavelengths_within
+
+
+@check_arguments
+@dataclass(frozen=True)
+class Coating:
+    """Efficiency of a surface against the wavelength, for unpolarised light at any angle.
+
+    Parameters
+    ----------
+    wavelengths : tuple of float, shape (n,)
+        Vacuum wavelengths [m], ascending.
+    efficiencies : tuple of float, shape (n,)
+        Reflectivity or transmission, 0 to 1.
+    name : str
+        Name for messages.
+    """
+
+    wavelengths: tuple[float, ...]
+    efficiencies: tuple[float, ...]
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        waves, values = np.array(self.wavelengths), np.array(self.efficiencies)
+        if len(waves) < 2 or not (np.isfinite(waves).all() and (waves > 0).all() and (np.diff(waves) > 0).all()):
+            raise ConfigError(f"wavelengths of {self.name or 'a coating'}: expected two or more, positive, ascending")
+        if waves.shape != values.shape or not ((values >= 0) & (values <= 1)).all():
+            text = f"expected {len(waves)} numbers from 0 to 1, as many as wavelengths"
+            raise ConfigError(f"efficiency of {self.name or 'a coating'}: {text}")
+
+    @check_arguments
+    def efficiency(self, wavelength: float, cosine: ArrayLike, n1: float, n2: float) -> np.ndarray:
+        """Return the efficiency at a wavelength, the same at all angles of incidence.
+
+        Parameters
+        ----------
+        wavelength : float
+            Vacuum wavelength [m]; a DomainError outside the table.
+        cosine : array_like
+            Cosine of the angle of incidence.
+        n1, n2 : float
+            Refractive indices before and behind.
+        """
+        return np.full(np.shape(cosine), self.at(wavelength))
+
+    def at(self, wavelength: ArrayLike) -> np.ndarray:
+        """Return the efficiency at wavelengths [m]; a DomainError outside the table."""
+        ends = (self.wavelengths[0], self.wavelengths[-1])
+        w = wavelengths_within(wavelength, ends, f"coating {self.name}" if self.name else "the coating")
+        return np.interp(w, self.wavelengths, self.efficiencies)
+
+
+#: Coatings that a surface may have.
+AnyCoating = Coating | CoatingTable | LayerStack
