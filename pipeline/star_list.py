@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -57,14 +57,15 @@ class StarList:
     name : str
         Name of the file.
     stars : dict of str to ndarray
-        x, y [m] on the detector, AB magnitude and temperature [K] (NaN where there is none) of the stars of each CCD,
-        [n, 4], in the order of x, y and magnitude.
+        x, y [m] on the detector and AB magnitude of the stars of each CCD, [n, 3], in the order of x, y and magnitude.
     counts : dict of str to int
         Rows of the table, how many of them were left out, and how many are on the CCDs.
     unused : tuple of str
         Columns of colours of unknown bands in the table, which nothing is made of.
     spectrum : str or None
-        Column that tells the spectra of the stars.
+        Kind of the column that tells the spectra of the stars; None without one.
+    kelvin : dict of str to ndarray
+        Temperatures of the stars of each CCD [K], NaN without a colour, [n]; empty without such a column.
     """
 
     name: str
@@ -72,15 +73,16 @@ class StarList:
     counts: dict[str, int]
     unused: tuple[str, ...] = ()
     spectrum: str | None = None
+    kelvin: dict[str, np.ndarray] = field(default_factory=dict)
 
     def on(self, ccd: str) -> tuple[np.ndarray, np.ndarray]:
         """Return positions on the detector [m], shape [n, 2], and magnitudes of the stars of a CCD."""
-        stars = self.stars.get(ccd, np.zeros((0, 4)))
+        stars = self.stars.get(ccd, np.zeros((0, 3)))
         return stars[:, :2], stars[:, 2]
 
     def temperatures(self, ccd: str) -> np.ndarray | None:
         """Return the temperatures of the stars of a CCD [K], NaN without a colour; None where no star has one."""
-        return None if self.spectrum is None else self.stars.get(ccd, np.zeros((0, 4)))[:, 3]
+        return None if self.spectrum is None else self.kelvin.get(ccd, np.zeros(0))
 
     @property
     def text(self) -> str:
@@ -179,12 +181,14 @@ def place_stars(
     counts["on_the_ccds"] = len(ccd)
     if rows.spectrum is not None:
         counts["without_colour"] = int(np.isnan(kelvin).sum())
-    stars = np.concatenate([places, magnitude[:, None], kelvin[:, None]], axis=1)
+    stars = np.concatenate([places, magnitude[:, None]], axis=1)
     # Noise is drawn star by star: the same stars in another order of rows are the same run.
-    order = np.lexsort((stars[:, 3], stars[:, 2], stars[:, 1], stars[:, 0], ccd))
-    ccd, stars = ccd[order], stars[order]
-    by_ccd = {name: stars[ccd == camera.ccd_index(name)] for name in ccds}
-    return StarList(path.name, by_ccd, counts, rows.unused, rows.spectrum)
+    order = np.lexsort((kelvin, stars[:, 2], stars[:, 1], stars[:, 0], ccd))
+    ccd, stars, kelvin = ccd[order], stars[order], kelvin[order]
+    own = {name: ccd == camera.ccd_index(name) for name in ccds}
+    by_ccd = {name: stars[here] for name, here in own.items()}
+    known = {} if rows.spectrum is None else {name: kelvin[here] for name, here in own.items()}
+    return StarList(path.name, by_ccd, counts, rows.unused, rows.spectrum, known)
 
 
 @dataclass(frozen=True, eq=False)

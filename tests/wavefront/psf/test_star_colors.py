@@ -76,7 +76,7 @@ def test_five_wavelengths_make_the_colour_of_a_star(lsst_r):
         found.append(np.array([shapes.x, shapes.y, shapes.e1, shapes.e2, shapes.size / ARCSEC]))
     five, many = found
     place = five[:2] - many[:2]
-    # The mean of the air's shifts, by the photons of each wavelength; a weight draws the centroid to the brightest part.
+    # The mean of the air's shifts, by the photons of each wavelength; the weight draws centroids to the brightest part.
     photons = pachon.blackbody_photons(kelvin, waves)
     apart = np.hypot(*((photons[1] - photons[0]) @ dispersion / count)) / ARCSEC
     assert apart > 0.03
