@@ -77,8 +77,10 @@ def expose_positions(
     or, with `along`, those of a CCD. They are blackbodies of `temperatures` [K] where these are given. DomainError if
     no light reaches one of them.
     """
-    how = {"room": room, "offsets": offsets, "along": along, "temperatures": temperatures}
-    return _lit(_expose(experiment, positions, threads, progress, **how))
+    stars = _expose(
+        experiment, positions, threads, progress, room=room, offsets=offsets, along=along, temperatures=temperatures
+    )
+    return _lit(stars)
 
 
 def expose_ccd(
@@ -98,9 +100,11 @@ def expose_ccd(
     holdout = expose_centered(experiment, positions.holdout, threads, progress)
     pixel = positions.observed_pixel * (positions.pixel_size / experiment.pixel_size)
     offsets, room = pixel - np.rint(pixel), _SHIFT_ROOM
-    given = {"offsets": offsets, "room": room, "temperatures": positions.temperature}
-    observed = _lit(_expose(experiment, positions.observed, threads, progress, **given))
-    return CcdExposure(name, positions, holdout, observed)
+    kelvin = positions.temperature
+    observed = _expose(
+        experiment, positions.observed, threads, progress, offsets=offsets, room=room, temperatures=kelvin
+    )
+    return CcdExposure(name, positions, holdout, _lit(observed))
 
 
 def expose_centered(
