@@ -246,8 +246,16 @@ def _add_stars(
     if not len(pixels):
         return {"PIXEL": pixels, "MAG": magnitude, "FLUX": magnitude}
     nearest = np.rint(pixels).astype(np.int64)
+    kelvin = provisional.temperature
     stars = expose_positions(
-        experiment, provisional.observed[near], threads, progress, room=STAR_ROOM, offsets=pixels - nearest, along=ccd
+        experiment,
+        provisional.observed[near],
+        threads,
+        progress,
+        room=STAR_ROOM,
+        offsets=pixels - nearest,
+        along=ccd,
+        temperatures=None if kelvin is None else kelvin[near],
     )
     electrons = exposure.electrons(magnitude) * stars.lit_fraction
     corners = nearest - stars.image.shape[1] // 2 - (window.x, window.y)

@@ -177,6 +177,8 @@ from .models.shapes.shape import Sphere as Sphere
 from .models.shapes.shape import Sum as Sum
 from .models.site import Site as Site
 from .models.site import Weather as Weather
+from .models.star_spectrum import blackbody_photons as blackbody_photons
+from .models.star_spectrum import color_temperature as color_temperature
 from .models.starting_designs.lenses import doublet as doublet
 from .models.starting_designs.lenses import singlet as singlet
 from .models.starting_designs.lenses import triplet as triplet

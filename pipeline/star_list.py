@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from ..core.errors import ConfigError, ProductError, error_context
 from ..core.table_files import read_columns
 from ..core.units import metres, pure_numbers, radians
 from ..models.camera.camera import Camera
+from ..models.star_spectrum import COOLEST, HOTTEST, color_temperature
 from ..models.telescope import Telescope
 from ..raytrace.rays import RayStatus, field_direction
 from ..sky.pointing import Pointing
@@ -31,11 +32,18 @@ NAMES: dict[str, tuple[str, ...]] = {
     "x": ("x_m",),
     "y": ("y_m",),
     "mag": ("mag", "{band}", "mag_{band}", "{band}_mag", "{band}mag", "magnitude"),
+    "teff": ("teff", "teff_gspphot", "temperature"),
+    "bp_rp": ("bp_rp", "bp-rp"),
+    "g_r": ("g_r", "g-r"),
+    "g_i": ("g_i", "g-i"),
+    "r_i": ("r_i", "r-i"),
 }
+#: Columns that tell the spectrum of a star, the first that is there counts.
+_SPECTRA = ("teff", "bp_rp", "g_r", "g_i", "r_i")
 #: Pairs of columns that give a place, and the unit of those without one; the first pair that is there counts.
 _PLACES = ((("ra", "dec"), u.deg), (("field_x", "field_y"), u.deg), (("x", "y"), u.m))
-#: Columns of colours, which are not used.
-_COLORS = ("color", "colour", "bp_rp", "g_r", "g_i")
+#: Columns of colours of unknown bands, which are not used.
+_COLORS = ("color", "colour")
 #: Distance of stars from the edge of a CCD [pixel], so that their stamps lie on it (as of drawn ones, rim included).
 RIM = 22
 
@@ -53,24 +61,36 @@ class StarList:
     counts : dict of str to int
         Rows of the table, how many of them were left out, and how many are on the CCDs.
     unused : tuple of str
-        Columns of colours in the table, which nothing is made of.
+        Columns of colours of unknown bands in the table, which nothing is made of.
+    spectrum : str or None
+        Kind of the column that tells the spectra of the stars; None without one.
+    kelvin : dict of str to ndarray
+        Temperatures of the stars of each CCD [K], NaN without a colour, [n]; empty without such a column.
     """
 
     name: str
     stars: dict[str, np.ndarray]
     counts: dict[str, int]
     unused: tuple[str, ...] = ()
+    spectrum: str | None = None
+    kelvin: dict[str, np.ndarray] = field(default_factory=dict)
 
     def on(self, ccd: str) -> tuple[np.ndarray, np.ndarray]:
         """Return positions on the detector [m], shape [n, 2], and magnitudes of the stars of a CCD."""
         stars = self.stars.get(ccd, np.zeros((0, 3)))
         return stars[:, :2], stars[:, 2]
 
+    def temperatures(self, ccd: str) -> np.ndarray | None:
+        """Return the temperatures of the stars of a CCD [K], NaN without a colour; None where no star has one."""
+        return None if self.spectrum is None else self.kelvin.get(ccd, np.zeros(0))
+
     @property
     def text(self) -> str:
         """One line that counts the stars."""
         found = ", ".join(f"{n} {what.replace('_', ' ')}" for what, n in self.counts.items() if n)
-        note = f"; column {', '.join(self.unused)} is not used" if self.unused else ""
+        note = "" if self.spectrum is None else f"; spectra from column {self.spectrum}"
+        if self.unused and self.spectrum is None:
+            note = f"; column {', '.join(self.unused)} is not used: name its bands ({', '.join(_SPECTRA)})"
         return f"{self.name}: {found or 'no stars'}{note}"
 
 
@@ -133,15 +153,15 @@ def place_stars(
         If the file cannot be read, or lacks a column: one line with the names that were looked for.
     """
     rows = _read(path, columns, band)
-    places, magnitude = rows.places, rows.magnitude
+    places, magnitude, kelvin = rows.places, rows.magnitude, rows.temperature
     if rows.kind == "ra" and pointing is None:
         raise ConfigError("right ascension and declination: expected pointing = {ra_deg, dec_deg}", file=path)
     counts = {"stars": len(places)}
 
     def keep(what: str, good: np.ndarray) -> None:
-        nonlocal places, magnitude
+        nonlocal places, magnitude, kelvin
         counts[what] = int((~good).sum())
-        places, magnitude = places[good], magnitude[good]
+        places, magnitude, kelvin = places[good], magnitude[good], kelvin[good]
 
     keep("without_place_or_magnitude", np.isfinite(places).all(axis=1) & np.isfinite(magnitude))
     keep("too_bright", magnitude >= brightest)
@@ -159,12 +179,16 @@ def place_stars(
     keep("on_other_ccds", chosen)
     ccd = ccd[chosen]
     counts["on_the_ccds"] = len(ccd)
+    if rows.spectrum is not None:
+        counts["without_colour"] = int(np.isnan(kelvin).sum())
     stars = np.concatenate([places, magnitude[:, None]], axis=1)
     # Noise is drawn star by star: the same stars in another order of rows are the same run.
-    order = np.lexsort((stars[:, 2], stars[:, 1], stars[:, 0], ccd))
-    ccd, stars = ccd[order], stars[order]
-    by_ccd = {name: stars[ccd == camera.ccd_index(name)] for name in ccds}
-    return StarList(path.name, by_ccd, counts, rows.unused)
+    order = np.lexsort((kelvin, stars[:, 2], stars[:, 1], stars[:, 0], ccd))
+    ccd, stars, kelvin = ccd[order], stars[order], kelvin[order]
+    own = {name: ccd == camera.ccd_index(name) for name in ccds}
+    by_ccd = {name: stars[here] for name, here in own.items()}
+    known = {} if rows.spectrum is None else {name: kelvin[here] for name, here in own.items()}
+    return StarList(path.name, by_ccd, counts, rows.unused, rows.spectrum, known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,6 +198,8 @@ class _Rows:
     kind: str  #: first column of the places: ra, field_x or x
     places: np.ndarray  #: [n, 2], rad or m
     magnitude: np.ndarray
+    temperature: np.ndarray  #: [K], NaN where there is no colour
+    spectrum: str | None  #: column of the colours
     unused: tuple[str, ...]  #: columns of colours
 
 
@@ -190,7 +216,22 @@ def _read(path: Path, columns: dict[str, str], band: str) -> _Rows:
             raise ProductError(f"no column {', '.join(missing)} ({looked}); columns are {', '.join(table) or 'none'}")
         magnitude = _values(table, str(given["mag"]), None)
         places = np.stack([_values(table, str(given[key]), unit) for key in pair], axis=1)
-    return _Rows(pair[0], places, magnitude, tuple(name for name in _COLORS if name in table))
+        for key in _SPECTRA:
+            if key in columns and given[key] is None:
+                raise ProductError(f"no column {columns[key]} ({key}); columns are {', '.join(table)}")
+        spectrum = next((key for key in _SPECTRA if given[key]), None)
+        kelvin = np.full(len(magnitude), np.nan)
+        if spectrum is not None:
+            kelvin = _temperatures(_values(table, str(given[spectrum]), None), spectrum)
+    unused = tuple(name for name in _COLORS if name in table)
+    return _Rows(pair[0], places, magnitude, kelvin, spectrum, unused)
+
+
+def _temperatures(values: np.ndarray, kind: str) -> np.ndarray:
+    """Return the temperatures [K] of a column of temperatures or colours, NaN where a row has none."""
+    found = values if kind == "teff" else color_temperature(values, kind)
+    found = np.where(np.isfinite(found) & (found > 0.0), found, np.nan)
+    return np.clip(found, COOLEST, HOTTEST)
 
 
 def _landings(telescope: Telescope, slopes: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:

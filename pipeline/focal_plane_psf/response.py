@@ -43,8 +43,8 @@ LARGEST_HEIGHT = 25e-6
 _NODES = 5
 # Steps of the differences: wavefront [m] and logarithm of the Fried parameter.
 _WAVEFRONT_STEP, _SEEING_STEP = 0.05e-6, 0.05
-# Stars at which derivatives are computed, and the degree of their dependence on the field.
-_SAMPLES, _FIELD_DEGREE = 300, 6
+# Stars at which derivatives are computed, fewer where they are costly, and the degree of their dependence on the field.
+_SAMPLES, _SAMPLES_LATTICE, _FIELD_DEGREE = 300, 120, 6
 # Heights about the centre [m] between which these derivatives are linear.
 _LEVEL = 8e-6
 _BATCH = 2048
@@ -260,7 +260,8 @@ class ExposureResponse:
     ) -> ExposureResponse:
         """Compute central differences at some of the stars, and fit them over the field."""
         radius = float(np.hypot(*fields.T).max()) or instrument.telescope.field_radius
-        chosen = fields[np.unique(np.linspace(0, len(fields) - 1, min(_SAMPLES, len(fields))).astype(int))]
+        most = _SAMPLES if only_rings(instrument.telescope) else _SAMPLES_LATTICE
+        chosen = fields[np.unique(np.linspace(0, len(fields) - 1, min(most, len(fields))).astype(int))]
         degree = min(_FIELD_DEGREE, max(0, int((np.sqrt(8 * len(chosen) / 3 + 1) - 3) / 2)))
         terms = field_terms(chosen / radius, degree)
         found = []

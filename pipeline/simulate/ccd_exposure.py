@@ -10,6 +10,7 @@ import numpy as np
 from ...core.errors import DomainError
 from ...models.camera.camera import Camera
 from ...models.ideal_telescope import without_aberration
+from ...models.star_spectrum import blackbody_photons
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.engine import center_focal_length
 from ...wavefront.psf.engines import ENGINES
@@ -67,14 +68,19 @@ def expose_positions(
     room: int = 0,
     offsets: np.ndarray | None = None,
     along: str | None = None,
+    temperatures: np.ndarray | None = None,
 ) -> NoiseFreeStars:
     """Make noise-free PSFs at positions on the detector [m], shape [n, 2], of any CCDs.
 
     The position of a star is that of the chief ray of the middle wavelength, at the centre of a pixel, or `offsets`
     [pixel] from it; stamps are larger than those of the run by `room` pixels, and lie along the axes of the focal plane
-    or, with `along`, those of a CCD. DomainError if no light reaches one of them.
+    or, with `along`, those of a CCD. They are blackbodies of `temperatures` [K] where these are given. DomainError if
+    no light reaches one of them.
     """
-    return _lit(_expose(experiment, positions, threads, progress, room=room, offsets=offsets, along=along))
+    stars = _expose(
+        experiment, positions, threads, progress, room=room, offsets=offsets, along=along, temperatures=temperatures
+    )
+    return _lit(stars)
 
 
 def expose_ccd(
@@ -94,8 +100,11 @@ def expose_ccd(
     holdout = expose_centered(experiment, positions.holdout, threads, progress)
     pixel = positions.observed_pixel * (positions.pixel_size / experiment.pixel_size)
     offsets, room = pixel - np.rint(pixel), _SHIFT_ROOM
-    observed = _lit(_expose(experiment, positions.observed, threads, progress, offsets=offsets, room=room))
-    return CcdExposure(name, positions, holdout, observed)
+    kelvin = positions.temperature
+    observed = _expose(
+        experiment, positions.observed, threads, progress, offsets=offsets, room=room, temperatures=kelvin
+    )
+    return CcdExposure(name, positions, holdout, _lit(observed))
 
 
 def expose_centered(
@@ -134,8 +143,12 @@ def _expose(
     offsets: np.ndarray | None = None,
     recenter: Callable[[np.ndarray, float], np.ndarray] | None = None,
     along: str | None = None,
+    temperatures: np.ndarray | None = None,
 ) -> NoiseFreeStars:
-    """Make PSFs at positions on the detector, `offsets` [pixel] from the centre of a pixel, on stamps with `room`."""
+    """Make PSFs at positions on the detector, `offsets` [pixel] from the centre of a pixel, on stamps with `room`.
+
+    Stars are blackbodies of `temperatures` [K]; spectra are flat where they are NaN, and by default.
+    """
     config, wavelengths = experiment.config, experiment.wavelengths
     fields = fields_at(experiment.telescope, positions, wavelengths[len(wavelengths) // 2], threads=threads)
     if along is not None:
@@ -151,6 +164,7 @@ def _expose(
         telescope,
         fields,
         wavelengths,
+        wavelength_weights=None if temperatures is None else blackbody_photons(temperatures, wavelengths),
         focal_plane=experiment.focal_plane if optical else None,
         atmosphere=experiment.atmosphere,
         aberration=experiment.aberration if optical else None,
@@ -226,6 +240,7 @@ def ccd_stars(experiment: Experiment, name: str, width: float, least_light: floa
         observed=positions,
         magnitude=magnitude,
         electrons=electrons(magnitude, band, exposure),
+        temperature=listed.temperatures(name),
         bright=given(config.stars.brightest),
         faint=given(config.stars.faintest),
     )

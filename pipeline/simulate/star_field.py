@@ -32,6 +32,7 @@ class StarField:
     exposure: float  #: [s]
     bright: float  #: magnitude limits of the observed stars
     faint: float
+    temperature: np.ndarray | None = None  #: of the observed stars [K]; NaN, None: flat spectra
     turn: float = 0.0  #: angle of the CCD about its centre, quarter turns left out, from +x towards +y [rad]
 
     @property

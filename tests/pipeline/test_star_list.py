@@ -16,11 +16,12 @@ from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.report.diagnostics import diagnose
 from pachon.pipeline.run import run
 from pachon.pipeline.run_folder import write_ccd
-from pachon.pipeline.simulate.ccd_exposure import ccd_stars
+from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_ccd, expose_positions
 from pachon.pipeline.simulate.ccd_loop import simulate_ccds
 from pachon.pipeline.star_list import RIM, place_stars
 from pachon.studies.psf_choice.plan import make_plan
 from pachon.studies.psf_choice.study import study_experiment
+from pachon.wavefront.psf.psf import make_psfs
 
 CAMERA = pachon.lsst_camera()
 LIGHT = 620e-9
@@ -105,7 +106,9 @@ def test_stars_that_are_left_out_are_counted(tmp_path, telescope):
     offsets = np.array([[0, 0], [0, 0], [0, 0], [np.nan, 0], [rim, 0], [inside, 0], [0.0211, 0], [0, 0]])
     places = center + offsets
     magnitudes = np.ma.masked_invalid([18.0, 16.9, 22.1, 18.0, 18.0, 19.0, 18.0, np.nan])
-    Table({"x_m": places[:, 0], "y_m": places[:, 1], "mag": magnitudes, "g_r": magnitudes}).write(tmp_path / "a.ecsv")
+    Table({"x_m": places[:, 0], "y_m": places[:, 1], "mag": magnitudes, "colour": magnitudes}).write(
+        tmp_path / "a.ecsv"
+    )
     found = placed(tmp_path / "a.ecsv", telescope)
     assert found.counts == {
         "stars": 8,
@@ -118,10 +121,84 @@ def test_stars_that_are_left_out_are_counted(tmp_path, telescope):
         "on_the_ccds": 2,
     }
     assert placed(tmp_path / "a.ecsv", telescope, ccds=CCDS[1:]).counts["on_other_ccds"] == 2
-    assert found.text.endswith("1 off the ccds, 1 at the rim of a ccd, 2 on the ccds; column g_r is not used")
+    note = "column colour is not used: name its bands (teff, bp_rp, g_r, g_i, r_i)"
+    assert found.text.endswith(f"1 off the ccds, 1 at the rim of a ccd, 2 on the ccds; {note}")
     # The other side of the sky, and 3 degrees from the axis, where the design ends at 2.5.
     Table({"ra": [233.1, 53.1], "dec": [27.8, -24.8], "mag": [18.0, 18.0]}).write(tmp_path / "b.ecsv")
     assert placed(tmp_path / "b.ecsv", telescope).counts["outside_the_field"] == 2
+
+
+def test_colours_are_temperatures(tmp_path, telescope, places):
+    colors = np.ma.masked_invalid(np.linspace(-0.3, 1.5, len(places)))
+    colors[4] = np.ma.masked
+    table = Table({"x_m": places[:, 0], "y_m": places[:, 1], "mag": np.full(len(places), 19.0), "G_R": colors})
+    table.write(tmp_path / "a.ecsv")
+    found = placed(tmp_path / "a.ecsv", telescope)
+    assert found.counts["without_colour"] == 1
+    assert found.text.endswith("90 on the ccds, 1 without colour; spectra from column g_r")
+    for i, name in enumerate(CCDS):
+        order = np.argsort(places[i::3, 0])
+        expected = pachon.color_temperature(np.ma.filled(colors[i::3], np.nan)[order], "g_r")
+        np.testing.assert_array_equal(found.temperatures(name), expected)
+    # A temperature counts before a colour; a column may be mapped, and must be there then.
+    table["teff"] = np.linspace(3000.0, 9000.0, len(places))
+    table["mine"] = table["G_R"] + 0.2
+    table.write(tmp_path / "b.ecsv")
+    assert placed(tmp_path / "b.ecsv", telescope).spectrum == "teff"
+    del table["teff"]
+    table.write(tmp_path / "c.ecsv")
+    mapped = placed(tmp_path / "c.ecsv", telescope, columns={"g_r": "mine"})
+    assert (mapped.temperatures(CCDS[0])[-5:] < found.temperatures(CCDS[0])[-5:]).any()
+    with pytest.raises(PachonError, match=r"c.ecsv: no column nothing \(bp_rp\); columns are"):
+        placed(tmp_path / "c.ecsv", telescope, columns={"bp_rp": "nothing"})
+    # Without a colour there are no temperatures.
+    Table({"x_m": [0.0], "y_m": [0.0], "mag": [19.0]}).write(tmp_path / "d.ecsv")
+    assert placed(tmp_path / "d.ecsv", telescope).temperatures("R22_S11") is None
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("telescope", ["lsst_v3.3_r", "decam"])
+def test_colours_of_a_catalogue_are_spectra_in_a_run(tmp_path, telescope):
+    """Observed stars are direct sums over the wavelengths with the star's blackbody; holdout stars stay as they are."""
+    ccd = {"decam": "N4", "lsst_v3.3_r": "R22_S11"}[telescope]
+    camera = pachon.load_camera(pachon.load_telescope(telescope).camera)
+    center = camera.centers[camera.ccd_index(ccd)]
+    x, y = center[:, None] + np.random.default_rng(5).uniform(-0.008, 0.008, (2, 3))
+    Table({"x_m": x, "y_m": y, "mag": np.full(3, 19.0), "teff": [3000.0, np.nan, 15000.0]}).write(tmp_path / "s.ecsv")
+    given = {
+        "telescope": telescope,
+        "ccds": [ccd],
+        "stars": {"catalogue": "s.ecsv", "truth": 15, "brightest": 10, "faintest": 25},
+        "atmosphere": {
+            "exposure_s": 1, "time_step_s": 0.5, "screen_size": 1024, "screen_length_m": 500, "zenith_angle_deg": 45
+        },
+        "psf": {"engine": "fast"},
+    }  # fmt: skip
+    experiment = Experiment.from_config(Configuration.model_validate(given), tmp_path)
+    stars = ccd_stars(experiment, ccd, 3e-6)
+    with experiment.screens(1):
+        found = expose_ccd(experiment, ccd, stars)
+        waves, room = experiment.wavelengths, found.observed.image.shape[1] - experiment.stamp_size
+        plain = expose_positions(experiment, stars.observed, offsets=found.observed.offset, room=room)
+        one_by_one = [
+            make_psfs(
+                experiment.telescope, found.observed.fields, waves, wavelength_weights=np.eye(len(waves))[w],
+                focal_plane=experiment.focal_plane, atmosphere=experiment.atmosphere, dispersion=experiment.dispersion,
+                stamp_size=found.observed.image.shape[1], pixel_size=experiment.pixel_size,
+                diffusion=experiment.diffusion, offsets=found.observed.offset, n_pupil=experiment.config.psf.n_pupil,
+            )
+            for w in range(len(waves))
+        ]  # fmt: skip
+    kelvin = stars.temperature
+    photons = pachon.blackbody_photons(kelvin, waves)
+    light = np.stack([p.inside * p.lit_fraction[:, w] for w, p in enumerate(one_by_one)], axis=1) * photons
+    light /= light.sum(axis=1, keepdims=True)
+    expected = sum(light[:, w, None, None] * p.image for w, p in enumerate(one_by_one))
+    np.testing.assert_allclose(found.observed.image, expected, atol=3e-5 * expected.max())
+    flat = np.isnan(kelvin)
+    np.testing.assert_allclose(found.observed.image[flat], plain.image[flat], atol=1e-6 * expected.max())
+    # In air at 45 degrees a red and a blue star are apart, by 0.02" and more from the flat one's place.
+    assert np.abs(found.observed.image[~flat] - plain.image[~flat]).max() > 0.01 * expected.max()
 
 
 def test_the_order_of_the_rows_does_not_matter(tmp_path, telescope, places, magnitudes):

@@ -72,16 +72,30 @@ class Exposed(NamedTuple):
     reference_point: np.ndarray
 
 
-def expose_apart(
-    kinds: np.ndarray, expose: Callable[[int, np.ndarray, np.ndarray], Exposed], fields: np.ndarray, offsets: np.ndarray
-) -> Exposed:
-    """Carry stars of several kinds [n_star] to the focal plane: ``expose`` takes a kind, its fields and offsets."""
+@dataclass(frozen=True)
+class Stars:
+    """Stars of one batch, before their light is carried anywhere."""
+
+    fields: np.ndarray  #: field angles, [n_star, 2] rad
+    offsets: np.ndarray  #: places of the reference points from the centre of the middle pixel, [n_star, 2] pixels
+    photons: np.ndarray | None = None  #: of each wavelength, of mean 1, [n_star, n_wave]; None where all are 1
+
+    def __len__(self) -> int:
+        return len(self.fields)
+
+    def __getitem__(self, chosen: Any) -> Stars:
+        photons = None if self.photons is None else self.photons[chosen]
+        return Stars(self.fields[chosen], self.offsets[chosen], photons)
+
+
+def expose_apart(kinds: np.ndarray, expose: Callable[[int, Stars], Exposed], stars: Stars) -> Exposed:
+    """Carry stars of several kinds [n_star] to the focal plane: ``expose`` takes a kind and its stars."""
     groups = [np.flatnonzero(kinds == kind) for kind in np.unique(kinds)]
-    parts = [expose(int(kinds[stars[0]]), fields[stars], offsets[stars]) for stars in groups]
+    parts = [expose(int(kinds[chosen[0]]), stars[chosen]) for chosen in groups]
     order = np.argsort(np.concatenate(groups))
 
     def draw(shift: np.ndarray | None) -> np.ndarray:
-        shifts = [None if shift is None else shift[stars] for stars in groups]
+        shifts = [None if shift is None else shift[chosen] for chosen in groups]
         return np.concatenate([part.draw(moved) for part, moved in zip(parts, shifts, strict=True)])[order]
 
     return Exposed(
@@ -126,19 +140,26 @@ class PsfEngine(ABC):
         self.focal_length = center_focal_length(self._telescope, self._wavelengths, inputs.threads, inputs.trace)
 
     @abstractmethod
-    def _expose(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
+    def _expose(self, stars: Stars) -> Exposed:
         """Carry the light of stars to the focal plane."""
 
     def prepare(self, fields: np.ndarray) -> None:  # noqa: B027 - most engines need nothing
         """Make what all stars at field angles [n_star, 2] [rad] share, before the first batch is rendered."""
 
-    def render(self, fields: np.ndarray, offsets: np.ndarray, recenter: Recenter | None = None) -> RenderedStars:
+    def render(
+        self,
+        fields: np.ndarray,
+        offsets: np.ndarray,
+        recenter: Recenter | None = None,
+        photons: np.ndarray | None = None,
+    ) -> RenderedStars:
         """Render one batch of stars at field angles [n_star, 2] [rad].
 
         ``offsets`` [n_star, 2] are the places of the reference points from the centre of the middle pixel [pixels].
-        With ``recenter`` the stars are drawn once more, with their centroids at the centre.
+        With ``recenter`` the stars are drawn once more, with their centroids at the centre. ``photons`` [n_star,
+        n_wave] are the relative numbers of photons of each wavelength, of mean 1; by default all are 1.
         """
-        stars = self._expose(fields, offsets)
+        stars = self._expose(Stars(fields, offsets, photons))
         image = stars.draw(None)
         if recenter is not None:
             shift = recenter(image)

@@ -33,7 +33,7 @@ from ...core.warp_arrays import warp_array
 from ..atmosphere.layer_screens import SLOPE_LAG
 from ..atmosphere.turbulence import coherence, diffraction_otf, slope_variance, structure_function
 from ..pupil_optics import PupilOptics
-from .engine import Exposed, PsfEngine, PsfInputs, expose_apart, metric_of
+from .engine import Exposed, PsfEngine, PsfInputs, Stars, expose_apart, metric_of
 from .far_from_focus import finer_sampling
 from .fast_kernels import combine_wavelengths, deposit_rays
 from .image_plane import square_transfer
@@ -186,34 +186,36 @@ class FastPsfEngine(PsfEngine):
         rows = air.rows_under(self._direction(fields), 0.5 * self._diameter + air.screen_pixel)
         return air.screens("slopes", self._threads, rows).reshape(air.layer_count, -1)
 
-    def _expose(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
-        optics = self._trace(fields, self._points, self._threads)
+    def _expose(self, stars: Stars) -> Exposed:
+        optics = self._trace(stars.fields, self._points, self._threads)
         if self._inputs.n_pupil is None:
             pixel = self._plane.pixel_size
             largest, wanted = RAY_DISTANCE_STILL if self._atmosphere is None else RAY_DISTANCE
             neighbour = 2.0 * self._lattice.spacing / self._diameter
             finer = finer_sampling(optics, neighbour, largest * pixel, wanted * pixel)
             if (finer > 1).any():
-                return expose_apart(finer, self._expose_finer, fields, offsets)
-        return self._expose_traced(optics, offsets)
+                return expose_apart(finer, self._expose_finer, stars)
+        return self._expose_traced(optics, stars)
 
-    def _expose_finer(self, finer: int, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
+    def _expose_finer(self, finer: int, stars: Stars) -> Exposed:
         """Carry stars to the focal plane, with pupil points so many times closer."""
-        return FastPsfEngine(self._inputs, finer, far=finer > 1).expose_as_set(fields, offsets)
+        return FastPsfEngine(self._inputs, finer, far=finer > 1).expose_as_set(stars)
 
-    def expose_as_set(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
+    def expose_as_set(self, stars: Stars) -> Exposed:
         """Carry stars to the focal plane with this engine's own pupil points, however far from focus they are."""
-        return self._expose_traced(self._trace(fields, self._points, self._threads), offsets)
+        return self._expose_traced(self._trace(stars.fields, self._points, self._threads), stars)
 
-    def _expose_traced(self, optics: PupilOptics, offsets: np.ndarray) -> Exposed:
+    def _expose_traced(self, optics: PupilOptics, stars: Stars) -> Exposed:
         if self._inner < self._obscuration:
             # Apertures have the last word where they end the ring; where none does, its inner rim is the pupil's.
             within = np.hypot(*self._points.T) < 0.5 * self._diameter * self._obscuration
             unbounded = np.all(optics.lit[:, :, within], axis=2, keepdims=True)
             optics = replace(optics, lit=optics.lit & ~(unbounded & within))
         light = optics.lit * self._weights
+        if stars.photons is not None:
+            light = light * stars.photons[:, :, None]
         deposit = self._deposit(optics, light)
-        combined = self._combine(self._transforms(deposit, optics, light), optics, offsets)
+        combined = self._combine(self._transforms(deposit, optics, light), optics, stars.offsets)
         # A dark star has no light to divide by.
         total = np.where(optics.lit.any(axis=(1, 2)), light.sum(axis=(1, 2)), 1.0) * len(self._turns.time)
 

@@ -42,7 +42,7 @@ from ...models.telescope import Telescope
 from ..atmosphere.turbulence import coherence, structure_function
 from ..pupil_optics import PupilOptics
 from .clear_pupil import SpokePupil, clear_edges, only_rings
-from .engine import Exposed, PsfEngine, PsfInputs, expose_apart, metric_of
+from .engine import Exposed, PsfEngine, PsfInputs, Stars, expose_apart, metric_of
 from .lattice_pupil import LATTICE_POINTS, MOST_ACROSS, RINGS_POINTS, LatticeRays, LatticeTransfer
 from .long_exposure_kernels import place_points, sample_pixels, transform_pupils
 from .mean_rays import MeanRaysEngine, ray_counts, wanted_rays
@@ -190,60 +190,64 @@ class LongExposureEngine(PsfEngine):
         self._fade_x = (self._channels.weight[:, None, None] * spread).astype(np.float32)
         self._fade_y = spread.astype(np.float32)
 
-    def _expose(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
+    def _expose(self, stars: Stars) -> Exposed:
         if self._general:
-            return self._expose_lattice(fields, offsets)
-        optics = self._trace(fields, self._pupil.points, self._threads)
-        edges = self._edges(fields)
+            return self._expose_lattice(stars)
+        optics = self._trace(stars.fields, self._pupil.points, self._threads)
+        edges = self._edges(stars.fields)
         kinds = np.where(self._lit_fraction(edges) < _LEAST_LIT, _VIGNETTED, _NEAR)
         if self._inputs.n_pupil is None:
             rays = ray_counts(optics, self._plane.pixel_size)
             kinds = np.where(rays > 0, rays, kinds)
         if (kinds == _NEAR).all():
-            return self._expose_near(optics, edges, offsets)
-        return expose_apart(kinds, self._expose_kind, fields, offsets)
+            return self._expose_near(optics, edges, stars)
+        return expose_apart(kinds, self._expose_kind, stars)
 
-    def _expose_kind(self, kind: int, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
+    def _expose_kind(self, kind: int, stars: Stars) -> Exposed:
         """Carry stars to the focal plane: far ones by so many rays, others by strips or by a lattice."""
         if kind == _VIGNETTED:
-            return self._expose_lattice(fields, offsets)
+            return self._expose_lattice(stars)
         if kind == _NEAR:
-            optics = self._trace(fields, self._pupil.points, self._threads)
-            return self._expose_near(optics, self._edges(fields), offsets)
-        return MeanRaysEngine(self._inputs, kind).expose_as_set(fields, offsets)
+            optics = self._trace(stars.fields, self._pupil.points, self._threads)
+            return self._expose_near(optics, self._edges(stars.fields), stars)
+        return MeanRaysEngine(self._inputs, kind).expose_as_set(stars)
 
-    def _expose_lattice(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
+    def _expose_lattice(self, stars: Stars) -> Exposed:
         """Carry stars to the focal plane by lattices as close as each needs, or by rays where that is very close."""
-        rays = self._lattice_rays(self._lattice, fields)
+        rays = self._lattice_rays(self._lattice, stars)
         finer = self._lattice.finer(rays)
         if (finer == 1).all():
-            return self._expose_correlated([(self._lattice, rays)], offsets)
+            return self._expose_correlated([(self._lattice, rays, stars)])
         most = MOST_ACROSS // self._lattice.lattice.size
         kinds = np.where(finer > most, -wanted_rays(rays.optics, self._plane.pixel_size), finer)
 
-        def expose(kind: int, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
+        def expose(kind: int, stars: Stars) -> Exposed:
             if kind < 0:
-                return MeanRaysEngine(self._inputs, -kind).expose_as_set(fields, offsets)
+                return MeanRaysEngine(self._inputs, -kind).expose_as_set(stars)
             lattice = self._lattice.closer(kind)
             few = max(1, self.batch // kind**2)
-            parts = (fields[first : first + few] for first in range(0, len(fields), few))
-            return self._expose_correlated(((lattice, self._lattice_rays(lattice, part)) for part in parts), offsets)
+            parts = (stars[first : first + few] for first in range(0, len(stars), few))
+            return self._expose_correlated((lattice, self._lattice_rays(lattice, part), part) for part in parts)
 
-        return expose_apart(kinds, expose, fields, offsets)
+        return expose_apart(kinds, expose, stars)
 
-    def _lattice_rays(self, lattice: LatticeTransfer, fields: np.ndarray) -> LatticeRays:
-        return lattice.trace(lambda wavelengths, points: self._trace(fields, points, self._threads, wavelengths))
+    def _lattice_rays(self, lattice: LatticeTransfer, stars: Stars) -> LatticeRays:
+        return lattice.trace(lambda wavelengths, points: self._trace(stars.fields, points, self._threads, wavelengths))
 
-    def _expose_correlated(self, parts: Iterable[tuple[LatticeTransfer, LatticeRays]], offsets: np.ndarray) -> Exposed:
+    def _expose_correlated(self, parts: Iterable[tuple[LatticeTransfer, LatticeRays, Stars]]) -> Exposed:
         """Carry the light of lattice points to the focal plane, some stars after the others."""
-        spectra, lit, points = [], [], []
-        for lattice, rays in parts:
-            spectra += self._map(partial(self._correlate, lattice, rays), range(len(rays.optics.lit)))
+        spectra, lit, points, offsets = [], [], [], []
+        for lattice, rays, stars in parts:
+            spectra += self._map(partial(self._correlate, lattice, rays, stars.photons), range(len(stars)))
             lit.append(np.repeat(rays.optics.lit.mean(axis=2), len(self._wavelengths), axis=1))
             points.append(rays.optics.reference_points)
-        return self._sampled(np.stack(spectra), offsets, np.concatenate(lit), np.concatenate(points))
+            offsets.append(stars.offsets)
+        together = (np.concatenate(values) for values in (offsets, lit, points))
+        return self._sampled(np.stack(spectra), *together)
 
-    def _correlate(self, lattice: LatticeTransfer, rays: LatticeRays, star: int) -> np.ndarray:
+    def _correlate(
+        self, lattice: LatticeTransfer, rays: LatticeRays, photons: np.ndarray | None, star: int
+    ) -> np.ndarray:
         """Return the transfer function of a star without the detector, as :func:`transform_pupils` lays it out."""
         n_row = self._detector.shape[1]
         row, column = np.nonzero(self._detector[0].reshape(n_row, -1))
@@ -255,6 +259,8 @@ class LongExposureEngine(PsfEngine):
         air = np.array([np.interp(w * baseline, *table[[0, n]]) for n, w in enumerate(self._wavelengths, 1)])
         filters = (air * np.exp(-1j * (self._dispersion @ along.T)))[channels.wave]
         filters *= channels.weight[:, None] * channels.spread(np.hypot(*k.T))
+        if photons is not None:
+            filters *= photons[star, channels.wave, None]
         total = np.sum(lattice.at(rays, star, channels, k) * filters, axis=0)
         laid = np.zeros((4, n_row, self._detector[0, 0].size), dtype=np.float32)
         laid[0, row, column], laid[2, row, column] = total.real.reshape(2, -1)
@@ -280,12 +286,14 @@ class LongExposureEngine(PsfEngine):
         inner, outer = self._pupil.radius[[0, -1]]
         return self._area(edges) / (math.pi * (outer**2 - inner**2))
 
-    def _expose_near(self, optics: PupilOptics, edges: np.ndarray, offsets: np.ndarray) -> Exposed:
-        spectrum = self._transform(optics, edges, self._area(edges))
+    def _expose_near(self, optics: PupilOptics, edges: np.ndarray, stars: Stars) -> Exposed:
+        spectrum = self._transform(optics, edges, self._area(edges), stars.photons)
         lit_fraction = np.repeat(self._lit_fraction(edges)[:, None], len(self._wavelengths), axis=1)
-        return self._sampled(spectrum, offsets, lit_fraction, optics.reference_points)
+        return self._sampled(spectrum, stars.offsets, lit_fraction, optics.reference_points)
 
-    def _transform(self, optics: PupilOptics, edges: np.ndarray, area: np.ndarray) -> np.ndarray:
+    def _transform(
+        self, optics: PupilOptics, edges: np.ndarray, area: np.ndarray, photons: np.ndarray | None
+    ) -> np.ndarray:
         """Return the transfer functions of stars without the detector, as the kernel lays them out."""
         pupil = self._pupil
         n_star, _, n_point = optics.lit.shape
@@ -333,6 +341,7 @@ class LongExposureEngine(PsfEngine):
                 warp_array(metric_of(optics.jacobian), wp.float32),
                 warp_array(self._filter, wp.float32),
                 warp_array(self._filter_steps, wp.float32),
+                warp_array(np.ones((n_star, n_wave)) if photons is None else photons, wp.float32),
                 warp_array(along_x, samples),
                 warp_array(along_y, wp.float32),
                 warp_array(spectrum, samples),

@@ -203,6 +203,7 @@ def transform_pupils(
     metric: wp.array2d(dtype=wp.float32),
     table: wp.array2d(dtype=wp.float32),
     per_step: wp.array(dtype=wp.float32),
+    photons: wp.array2d(dtype=wp.float32),
     along_x: wp.array4d(dtype=samples),
     along_y: wp.array4d(dtype=wp.float32),
     spectrum: wp.array4d(dtype=samples),
@@ -214,9 +215,10 @@ def transform_pupils(
     Arguments: place, light, cut, lean as ``place_points`` leaves them; fade_x, fade_y [channel, packet]: filters along
     x, with their weights, and along y; wavelength [wave] [m]; rows [packet of columns]: their number; metric [star, 3]:
     xx, xy, yy of jacobian @ jacobian.T; table [wave, sample]: filter against the baseline; per_step [wave]: samples of
-    the table per step of frequency, for a unit Jacobian; along_x [star, packet, depth * n_point + point, 2] and along_y
-    [star, row, depth * n_point + point, 2]: room for cosines and sines, side by side as the sums over points read them;
-    spectrum [star, 4, row, packet]: real and imaginary parts at +n, and at -n.
+    the table per step of frequency, for a unit Jacobian; photons [star, wave], of mean 1; along_x
+    [star, packet, depth * n_point + point, 2] and along_y [star, row, depth * n_point + point, 2]: room for cosines and
+    sines, side by side as the sums over points read them; spectrum [star, 4, row, packet]: real and imaginary parts at
+    +n, and at -n.
     """
     star = first + wp.tid()
     n_wave = wavelength.shape[0]
@@ -316,10 +318,10 @@ def transform_pupils(
                     im = sc - cs
                     re_minus = re_minus + wp.cw_mul(left, re) + wp.cw_mul(phase, im)
                     im_minus = im_minus + wp.cw_mul(left, im) - wp.cw_mul(phase, re)
-                value = filtered(table, wave, per_step[wave], metric, star, number, ky)
+                value = photons[star, wave] * filtered(table, wave, per_step[wave], metric, star, number, ky)
                 spectrum[star, 0, row, packet] = spectrum[star, 0, row, packet] + wp.cw_mul(value, re_plus)
                 spectrum[star, 1, row, packet] = spectrum[star, 1, row, packet] + wp.cw_mul(value, im_plus)
-                value = filtered(table, wave, per_step[wave], metric, star, number, -ky)
+                value = photons[star, wave] * filtered(table, wave, per_step[wave], metric, star, number, -ky)
                 spectrum[star, 2, row, packet] = spectrum[star, 2, row, packet] + wp.cw_mul(value, re_minus)
                 spectrum[star, 3, row, packet] = spectrum[star, 3, row, packet] + wp.cw_mul(value, im_minus)
 

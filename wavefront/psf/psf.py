@@ -88,6 +88,7 @@ def make_psfs(
     fields: ArrayLike,
     wavelengths: ArrayLike,
     *,
+    wavelength_weights: ArrayLike | None = None,
     focal_plane: FocalPlane | None = None,
     atmosphere: Atmosphere | None = None,
     aberration: ResidualWavefront | None = None,
@@ -120,7 +121,10 @@ def make_psfs(
     fields : array_like or Quantity, shape [n_star, 2]
         Field angles [rad], of the light's own travel.
     wavelengths : array_like or Quantity, shape [n_wave]
-        Vacuum wavelengths [m], of equal numbers of photons before the telescope.
+        Vacuum wavelengths [m], of equal numbers of photons before the telescope unless weighted.
+    wavelength_weights : array_like, shape [n_wave] or [n_star, n_wave], optional
+        Relative numbers of photons of each wavelength before the telescope: the spectrum of all stars, or of each, such
+        as :func:`blackbody_photons` gives.
     focal_plane : FocalPlane, optional
         CCD heights; the nominal flat plane by default.
     atmosphere : Atmosphere, optional
@@ -188,6 +192,7 @@ def make_psfs(
     lengths = metres(wavelengths, "wavelengths").reshape(-1)
     if not lengths.size or not (np.isfinite(lengths) & (lengths > 0.0)).all():
         raise DomainError(f"wavelengths = {wavelengths!r}: expected one or more positive lengths in metres")
+    photons = None if wavelength_weights is None else _photons(wavelength_weights, len(angles), len(lengths))
     places = np.zeros((len(angles), 2)) if offsets is None else _table(offsets, "offsets", len(angles))
     shifts = None if dispersion is None else _table(radians(dispersion, "dispersion"), "dispersion", len(lengths))
     plane = ImagePlane(
@@ -222,7 +227,7 @@ def make_psfs(
     maker.prepare(angles)
     for first in range(0, len(angles), maker.batch):
         part = slice(first, min(first + maker.batch, len(angles)))
-        stars = maker.render(angles[part], places[part], centroids)
+        stars = maker.render(angles[part], places[part], centroids, None if photons is None else photons[part])
         inside[part] = stars.image.sum(axis=(1, 2))
         image[part] = stars.image / np.where(inside[part] > 0.0, inside[part], 1.0)[:, None, None]
         lit_fraction[part], reference_point[part] = stars.lit_fraction, stars.reference_point
@@ -248,6 +253,19 @@ def _on_detector(jitter: Any, telescope: Telescope, wavelengths: np.ndarray) -> 
     if not spread >= 0.0:
         raise DomainError(f"jitter = {spread:g}: expected an angle in radians from 0")
     return spread * center_focal_length(telescope, wavelengths) if spread else 0.0
+
+
+def _photons(values: Any, n_star: int, n_wave: int) -> np.ndarray:
+    """Return relative numbers of photons, of mean 1 for each star, shape [n_star, n_wave]."""
+    table = pure_numbers(values, "wavelength_weights")
+    if table.shape not in ((n_wave,), (n_star, n_wave)):
+        raise DomainError(
+            f"wavelength_weights of shape {list(table.shape)}: expected [{n_wave}] or [{n_star}, {n_wave}]"
+        )
+    table = np.array(np.broadcast_to(table, (n_star, n_wave)))
+    if not (np.isfinite(table) & (table >= 0.0)).all() or not table.any(axis=1).all():
+        raise DomainError("wavelength_weights: expected numbers of photons from 0, some of each star above it")
+    return np.asarray(table / table.mean(axis=1, keepdims=True))
 
 
 def _table(values: Any, name: str, count: int | None) -> np.ndarray:

@@ -40,7 +40,7 @@ from ...core.threads import thread_count
 from ...core.warp_arrays import warp_array
 from ..atmosphere.spline import spline_weights
 from ..pupil_optics import PupilOptics
-from .engine import Exposed, PsfEngine, PsfInputs
+from .engine import Exposed, PsfEngine, PsfInputs, Stars
 from .pupil_lattice import PupilLattice
 from .sample_packets import LANES, indices, samples
 from .wave_kernels import Screens, Taps, add_squares, pupil_fields
@@ -117,22 +117,28 @@ class WavePsfEngine(PsfEngine):
             screens.values, screens.size, screens.run = warp_array(values, wp.float32), int(size), run
         return packed
 
-    def _expose(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
-        optics, spectra = zip(*self._map(self._expose_star, fields), strict=True)
+    def _expose(self, stars: Stars) -> Exposed:
+        photons = [None] * len(stars) if stars.photons is None else stars.photons
+        optics, spectra = zip(*self._map(self._expose_star, stars.fields, photons), strict=True)
         area = 0.25 * math.pi * self._diameter**2 * (1.0 - self._obscuration**2)
         lit = np.stack([star.lit[0].sum(axis=1) * self._lattice.spacing**2 / area for star in optics])
 
         def draw(shift: np.ndarray | None) -> np.ndarray:
-            places = offsets if shift is None else offsets - shift
+            places = stars.offsets if shift is None else stars.offsets - shift
             jacobians = [star.jacobian[0] for star in optics]
             return np.stack(self._map(self._sample, spectra, jacobians, places))
 
         return Exposed(draw, lit, np.concatenate([star.reference_points for star in optics]))
 
-    def _expose_star(self, field: np.ndarray) -> tuple[PupilOptics, np.ndarray]:
+    def _expose_star(self, field: np.ndarray, photons: np.ndarray | None) -> tuple[PupilOptics, np.ndarray]:
         """Return the optics of a star and its spectra, the OTF times the transfer function of the detector."""
         optics = self._trace(field[None], self._lattice.points, 1)
-        return optics, self._filtered(self._intensity(field, optics), optics.jacobian[0])
+        spectra = self._filtered(self._intensity(field, optics), optics.jacobian[0])
+        if photons is not None and optics.lit.any():
+            # Wavelengths count by their light, of which the spectra have a sum of 1.
+            lit = optics.lit[0].sum(axis=1)
+            spectra *= (photons * lit.sum() / (photons @ lit))[:, None, None]
+        return optics, spectra
 
     def _intensity(self, field: np.ndarray, optics: PupilOptics) -> np.ndarray:
         """Return the squared field on the focal plane, averaged over time, shape [n_channel, size, size].

@@ -12,7 +12,7 @@ from pachon.models.obstruction import Obstruction
 from pachon.models.shapes.shape import Plane
 from pachon.models.surface import Interaction, Surface
 from pachon.wavefront.atmosphere.turbulence import diffraction_otf, structure_function
-from pachon.wavefront.psf.engine import PsfInputs
+from pachon.wavefront.psf.engine import PsfInputs, Stars
 from pachon.wavefront.psf.image_plane import ImagePlane
 from pachon.wavefront.psf.lattice_pupil import FEWEST_POINTS, LatticeTransfer
 from pachon.wavefront.psf.long_exposure import LongExposureEngine, default_points
@@ -214,13 +214,13 @@ def test_donuts_of_a_telescope_with_vanes():
     telescope, plane = defocused("hsc", 0.5e-3), ImagePlane(51, 15e-6, 5e-6)
     engine = engine_for(telescope, 770e-9, plane)
     field = np.radians([[0.3, 0.2]])
-    assert engine._lattice.finer(engine._lattice_rays(engine._lattice, field)) == [2]
+    assert engine._lattice.finer(engine._lattice_rays(engine._lattice, Stars(field, np.zeros((1, 2))))) == [2]
     image = engine.render(field, np.zeros((1, 2))).image[0]
     expected, _ = brute_force(telescope, field[0], 770e-9, plane, spacing=0.0125, longest=1.2)
     np.testing.assert_allclose(image, expected, atol=2e-3 * expected.max())
     # Dense rays under one filter, which stars still farther out are left to, lose 4 % of the peak along the rims.
     inputs = PsfInputs(telescope, np.array([770e-9]), plane, atmosphere=air(), threads=1)
-    rays = MeanRaysEngine(inputs, 1 << 14).expose_as_set(field, np.zeros((1, 2))).draw(None)[0]
+    rays = MeanRaysEngine(inputs, 1 << 14).expose_as_set(Stars(field, np.zeros((1, 2)))).draw(None)[0]
     np.testing.assert_allclose(image, rays, atol=0.05 * rays.max())
     assert image.sum() == pytest.approx(rays.sum(), rel=2e-3)
 
