@@ -157,11 +157,16 @@ def _reconstruction(fit: ReconstructionConfig, weight_fwhm_arcsec: float) -> Rec
 
 
 def with_paper_model(config: Configuration) -> Configuration:
-    """Return the configuration with the PSF model of Jee & Tyson 2011 for each CCD where it names none."""
+    """Return the configuration with the PSF model of Jee & Tyson 2011 for each CCD where it names none.
+
+    Of few stars it has as many components as they allow.
+    """
     fit = config.reconstruction
     if not _names_no_model(fit):
         return config
-    return config.model_copy(update={"reconstruction": fit.model_copy(update=_PAPER)})
+    components = max(1, min(COMPONENTS, config.stars.truth - 1, config.stars.observed - 1))
+    paper = fit.model_copy(update={**_PAPER, "components": components})
+    return config.model_copy(update={"reconstruction": paper})
 
 
 def _names_no_model(fit: ReconstructionConfig) -> bool:

@@ -128,7 +128,7 @@ def make_baseline(
         )
 
     for rules in (tolerance_rules, limit_rules):
-        check_used(rules, found)
+        check_used(rules, found, left_out)
 
     metrics = {name: stored(name, *each) for name, each in found.items()}
     baseline = Baseline(

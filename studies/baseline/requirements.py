@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from astropy import units as u
@@ -45,8 +45,11 @@ class Rule:
             raise self._error(f"expected a unit that converts to {unit or 'a pure number'}, that of {name}") from None
         return float(f"{converted:.12g}")  # 1e-3 mm are 1.0000000000000002 um
 
-    def unused(self, names: Iterable[str]) -> ConfigError:
-        """Return the error of a rule that no metric follows."""
+    def unused(self, names: Iterable[str], left_out: Mapping[str, str]) -> ConfigError:
+        """Return the error of a rule that no metric follows, with the reason where its kind could not be computed."""
+        kind = self.start.partition(" ")[0]
+        if kind in left_out:
+            return self._error(f"no metrics of kind {kind}: {left_out[kind]}")
         kinds = ", ".join(sorted({name.partition(" ")[0] for name in names}))
         return self._error(f"no metric begins with {self.start!r}; there are {kinds}")
 
@@ -94,9 +97,9 @@ def given_limit(rules: Sequence[Rule], name: str, unit: str) -> Limit | None:
     return Limit(**bounds)
 
 
-def check_used(rules: Sequence[Rule], names: Iterable[str]) -> None:
-    """Raise ConfigError for a rule that applies to none of the names."""
+def check_used(rules: Sequence[Rule], names: Iterable[str], left_out: Mapping[str, str]) -> None:
+    """Raise ConfigError for a rule that applies to none of the names; reasons by kind of metrics not computed."""
     names = tuple(names)
     for rule in rules:
         if not any(rule.applies_to(name) for name in names):
-            raise rule.unused(names)
+            raise rule.unused(names, left_out)

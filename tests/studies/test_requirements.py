@@ -105,7 +105,9 @@ def test_units_and_names_that_do_not_fit_are_named():
     with pytest.raises(
         ConfigError, match=r"^tolerance = 'spt = 1 um': no metric begins with 'spt'; there are opd, spot"
     ):
-        check_used(parse_rules("tolerance", ["opd = 1 nm", "spt = 1 um"]), ["spot a", "opd a", "opd b"])
+        check_used(parse_rules("tolerance", ["opd = 1 nm", "spt = 1 um"]), ["spot a", "opd a", "opd b"], {})
+    with pytest.raises(ConfigError, match=r"^limit = 'psf fwhm < 1 arcsec': no metrics of kind psf: no light"):
+        check_used(parse_rules("limit", ["psf fwhm < 1 arcsec"]), ["spot a"], {"psf": "no light"})
 
 
 # --- what it accepts -----------------------------------------------------------------------------------------------
@@ -229,3 +231,20 @@ def test_commands(tmp_path, monkeypatch, capsys):
     captured = capsys.readouterr()
     assert "0 of" in captured.out
     assert "beyond their limits" in captured.err
+
+
+@pytest.mark.long
+def test_a_lens_file_with_several_wavelengths_has_all_its_metrics_and_limits(tmp_path):
+    """Tolerances of lengths come from the path of one ray, whatever wavelengths the file weighs."""
+    lens = str(Path(__file__).parents[1] / "data" / "zmx" / "lens1.zmx")
+    assert len(load_telescope(lens).design_data.wavelengths) == 3
+    baseline, left_out = make_baseline(
+        lens, tmp_path, fields=np.zeros((1, 2)), tolerances=["landing = 1 um"], limits=["spot rms < 3 um"], threads=1
+    )
+    assert not left_out
+    kinds = {name.split()[0] for name in baseline.figures}
+    assert kinds == {"opd", "landing", "zernike", "spot", "ee80", "distortion", "vignetting"}
+    write_baseline(tmp_path / "b.baseline.json", baseline)
+    check = check_baseline(tmp_path / "b.baseline.json", lens, threads=1)
+    beyond = {name for name, f in baseline.figures.items() if name.startswith("spot rms") and f.value > 3.0}
+    assert {d.name for d in check.causes[BROKEN]} == beyond != set()

@@ -183,3 +183,6 @@ def test_defaults_follow_basis_and_interpolation(tiny):
     pinned = with_paper_model(type(config)())
     assert Experiment.from_config(pinned).config.reconstruction.model_dump(include=set(paper)) == paper
     assert with_paper_model(fresh) is fresh
+    # Twelve PSFs have eleven components about their mean.
+    few = with_paper_model(type(config)(**{"stars": {"truth": 16, "observed": 12}}))
+    assert Experiment.from_config(few).config.reconstruction.components == 11
