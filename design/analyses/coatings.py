@@ -40,7 +40,7 @@ from ...core.units import metres
 from ...core.yaml_reader import read_mapping
 from ...models.io.yaml.values import Numbers, OptionalText, PositiveNumber, Text
 from ...models.media.medium import wavelengths_within
-from .layer_stack import CoatingTable, LayerStack
+from .layer_stack import CoatingTable, LayerStack, checked_cosines
 
 
 @check_arguments
@@ -83,7 +83,7 @@ class Coating:
         n1, n2 : float
             Refractive indices before and behind.
         """
-        return np.full(np.shape(cosine), self.at(wavelength))
+        return np.full(checked_cosines(cosine, n1, n2).shape, self.at(wavelength))
 
     def at(self, wavelength: ArrayLike) -> np.ndarray:
         """Return the efficiency at wavelengths [m]; a DomainError outside the table."""
