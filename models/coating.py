@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError
-from .layer_stack import CoatingTable, LayerStack
+from .layer_stack import CoatingTable, LayerStack, checked_cosines
 from .media.medium import wavelengths_within
 
 
@@ -53,7 +53,7 @@ class Coating:
         n1, n2 : float
             Refractive indices before and behind.
         """
-        return np.full(np.shape(cosine), self.at(wavelength))
+        return np.full(checked_cosines(cosine, n1, n2).shape, self.at(wavelength))
 
     def at(self, wavelength: ArrayLike) -> np.ndarray:
         """Return the efficiency at wavelengths [m]; a DomainError outside the table."""

@@ -21,7 +21,19 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError
+from ..core.units import pure_numbers, require_positive
 from .media.medium import wavelengths_within
+
+#: Largest refractive index that is taken for one.
+_HIGHEST_INDEX = 100.0
+
+
+def checked_cosines(cosine: ArrayLike, n1: float, n2: float) -> np.ndarray:
+    """Return cosines of angles of incidence as an array; DomainError if an index is none of a medium."""
+    for name, index in (("n1", n1), ("n2", n2)):
+        if not 0.0 < index <= _HIGHEST_INDEX:
+            raise DomainError(f"{name} = {index!r}: expected a refractive index above 0, at most {_HIGHEST_INDEX:g}")
+    return pure_numbers(cosine, "cosine")
 
 
 @check_arguments
@@ -72,12 +84,13 @@ class CoatingTable:
         n1, n2 : float
             Refractive indices before and behind.
         """
+        cosines = checked_cosines(cosine, n1, n2)
         ends = (self.wavelengths[0], self.wavelengths[-1])
         w = wavelengths_within(wavelength, ends, f"coating {self.name}" if self.name else "the coating")
         table = np.array(self.efficiencies)
         row = np.array([np.interp(w, self.wavelengths, column) for column in table.T])
         # The angle on the side of lower index.
-        sine = np.sqrt(np.maximum(1.0 - np.asarray(cosine, dtype=np.float64) ** 2, 0.0)) * max(n1 / n2, 1.0)
+        sine = np.sqrt(np.maximum(1.0 - cosines**2, 0.0)) * max(n1 / n2, 1.0)
         with np.errstate(invalid="ignore"):
             return np.interp(np.arcsin(sine), self.angles, row, right=np.nan)
 
@@ -127,11 +140,10 @@ class LayerStack:
         Raises
         ------
         DomainError
-            If an index is not positive.
+            If an index or the wavelength is not positive.
         """
-        if not (n1 > 0 and n2 > 0):
-            raise DomainError(f"n1 = {n1!r}, n2 = {n2!r}: expected positive refractive indices")
-        first = np.asarray(cosine, dtype=np.complex128)
+        require_positive(wavelength, "wavelength", "metres")
+        first = checked_cosines(cosine, n1, n2).astype(np.complex128)
         order = 1 if n1 <= n2 else -1
         films = list(zip(self.indices, self.thicknesses, strict=True))[::order]
         # Beyond the angle of total reflection cosines are imaginary.

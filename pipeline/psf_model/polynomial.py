@@ -11,6 +11,9 @@ from ...core.units import real_array
 
 Extent = tuple[float, float, float, float]
 
+#: Largest position in any unit.
+_LARGEST = 1e50
+
 
 def term_count(order: int) -> int:
     """Return how many terms x^l y^m there are with l + m <= order."""
@@ -54,4 +57,6 @@ def as_positions(positions: Any) -> np.ndarray:
     finite = np.isfinite(points).all(axis=1)
     if not finite.all():
         raise DomainError(f"positions[{finite.argmin()}] is not finite")
+    if points.size and (largest := np.abs(points).max()) > _LARGEST:
+        raise DomainError(f"positions of {largest:g}: expected numbers below {_LARGEST:g}, whose squares are finite")
     return points

@@ -324,5 +324,7 @@ def test_shells_complete_commands_and_options(tmp_path):
         asked = {"_PACHON_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
         done = subprocess.run(command, env=os.environ | asked, capture_output=True, text=True)
         assert done.stdout.split() == [completed]
-    script = subprocess.run([*command, "--show-completion", "bash"], capture_output=True, text=True)
+    # The shell is that of the parent process, whatever started the tests.
+    shown = ["bash", "-c", '"$@"; exit $?', "bash", *command, "--show-completion", "bash"]
+    script = subprocess.run(shown, capture_output=True, text=True)
     assert "complete -o default -F _pachon_completion pachon" in script.stdout

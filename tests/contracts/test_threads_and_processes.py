@@ -40,7 +40,7 @@ CALLS = {
         telescope(), FIELDS, [WAVELENGTH], atmosphere=air(), n_pupil=300, stamp_size=255
     ).image.tobytes(),
     "wavefront_opd": lambda: pachon.wavefront_opd(telescope(), FIELDS[1], WAVELENGTH, grid=256).value.tobytes(),
-    "fft_psf": lambda: pachon.fft_psf(telescope(), [FIELDS[1]], WAVELENGTH).image.tobytes(),
+    "fft_psf": lambda: pachon.fft_psf(telescope(), [FIELDS[1]], WAVELENGTH, pixels=256, n_pupil=64).image.tobytes(),
 }
 
 

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy import units as u
 
 import pachon
-from pachon.core.errors import ConfigError, DomainError
-from pachon.design.analyses.coatings import Coatings
+from pachon.core.errors import ConfigError, DomainError, PachonError
+from pachon.design.analyses.coatings import Coating, Coatings
 from pachon.models.layer_stack import CoatingTable, LayerStack
 
 LIGHT, GLASS = 550e-9, 1.5168
@@ -103,3 +104,20 @@ def test_films_stand_on_lens_surfaces(afocal):
     table = CoatingTable((4e-7, 8e-7), (0.0, 1.0), ((0.9, 0.5), (0.9, 0.5)))
     found = pachon.throughput(afocal(fold=True), [(0.0, 0.0)], 5e-7, coatings=Coatings({"fold": table}), n_pupil=3)
     assert found.value[0, 0] == pytest.approx(0.9, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [({"n2": 0.0}, "n2 = 0.0: expected a refractive index"), ({"n1": 1e300}, r"n1 = 1e\+300: expected a refractive"),
+     ({"cosine": 0.9 * u.m}, "cosine = .*: expected real numbers without a unit"),
+     ({"wavelength": 0.0}, "wavelength|expected")],
+)  # fmt: skip
+def test_wrong_arguments_of_an_efficiency(wrong, text):
+    coatings = (
+        Coating((400e-9, 700e-9), (0.9, 0.9)),
+        CoatingTable((400e-9, 700e-9), (0.0, 1.0), ((0.9, 0.8), (0.9, 0.8))),
+        LayerStack((1.38,), (1e-7,)),
+    )
+    for coating in coatings:
+        with pytest.raises(PachonError, match=text):
+            coating.efficiency(**{"wavelength": 500e-9, "cosine": 0.9, "n1": 1.0, "n2": 1.5} | wrong)
