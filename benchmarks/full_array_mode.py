@@ -3,10 +3,10 @@
 Run: python benchmarks/full_array_mode.py [CCDs] [sides] [picture.png]
 
 The LSST (r band), off by twice the tolerances of ``pachon align`` in each of fifty degrees of freedom, exposes one
-star of 5e6 electrons on each of so many CCDs (all within the field of view by default), with the heights of the camera as built,
-its detector 1.5 mm behind the focus, and with ``sides`` 2 (the default) in front of it too. All donuts together give
-the degrees of freedom (``fit_donuts(degrees_of_freedom=)``). Printed: the wavefront over the field before and after
-they are taken off, what the covariance of the fit expects, and processor time and memory.
+star of 5e6 electrons on each of so many CCDs (all within the field of view by default), with the heights of the camera
+as built, its detector 1.5 mm behind the focus, and with ``sides`` 2 (the default) in front of it too. All donuts
+together give the degrees of freedom (``fit_donuts(degrees_of_freedom=)``). Printed: the wavefront over the field
+before and after they are taken off, what the covariance of the fit expects, and processor time and memory.
 """
 
 from __future__ import annotations
