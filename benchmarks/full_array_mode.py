@@ -2,11 +2,11 @@
 
 Run: python benchmarks/full_array_mode.py [CCDs] [sides] [picture.png]
 
-The LSST (r band), off by twice the tolerances of ``pachon align`` in each of fifty degrees of freedom, exposes one star of
-5e6 electrons on each of so many CCDs (189 by default, evenly taken), with the heights of the camera as built, its detector
-1.5 mm behind the focus, and with ``sides`` 2 (the default) in front of it too. All donuts together give the degrees of
-freedom (``fit_donuts(degrees_of_freedom=)``). Printed: the wavefront over the field before and after they are taken off,
-what the covariance of the fit expects, and processor time and memory.
+The LSST (r band), off by twice the tolerances of ``pachon align`` in each of fifty degrees of freedom, exposes one
+star of 5e6 electrons on each of so many CCDs (all within the field of view by default), with the heights of the camera
+as built, its detector 1.5 mm behind the focus, and with ``sides`` 2 (the default) in front of it too. All donuts
+together give the degrees of freedom (``fit_donuts(degrees_of_freedom=)``). Printed: the wavefront over the field
+before and after they are taken off, what the covariance of the fit expects, and processor time and memory.
 """
 
 from __future__ import annotations
@@ -35,9 +35,12 @@ def main() -> None:
     telescope, freedoms = scene.telescope, scene.freedoms
     heights = pachon.FocalPlane.as_measured("lsstcam")
     camera = heights.camera
-    chosen = np.linspace(0, len(camera) - 1, COUNT).round().astype(int)
-    places = np.stack(camera.from_local(chosen, 0.0 * chosen, 0.0 * chosen), axis=-1)
-    fields = pachon.fields_at(telescope, places)
+    every = np.arange(len(camera))
+    fields = pachon.fields_at(telescope, np.stack(camera.from_local(every, 0.0 * every, 0.0 * every), axis=-1))
+    # Donuts at 1.9 degrees, beyond the field of view, are not modelled well: chi-square 1.2 a pixel.
+    fields = fields[np.hypot(*fields.T) < telescope.field_radius]
+    fields = fields[np.linspace(0, len(fields) - 1, min(COUNT, len(fields))).round().astype(int)]
+    count = len(fields)
     state = scene.config.errors.initial * np.random.default_rng(1).standard_normal(len(freedoms))
     true = freedoms.apply(telescope, state * scene.tolerances)
     images, defocus = [], []
@@ -58,7 +61,7 @@ def main() -> None:
                 seed=int(side > 0),
             ).images
         )
-        defocus.append(np.full(COUNT, side * DEFOCUS))
+        defocus.append(np.full(count, side * DEFOCUS))
     drawn = time.process_time() - start
     # Twice the tolerances, and as much again: what the prior leaves is 1e-4 of what the donuts say.
     prior = 2.0 * scene.config.errors.initial * scene.tolerances
@@ -82,7 +85,7 @@ def main() -> None:
     expected = scene.expected_wavefront(found.covariance / np.outer(scene.tolerances, scene.tolerances))
     before, after = (1e9 * scene.quality.means(t).added for t in (true, left))
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    print(f"pachon {pachon.__version__}; {fit.usable.sum()} of {SIDES * COUNT} donuts used")
+    print(f"pachon {pachon.__version__}; {fit.usable.sum()} of {SIDES * count} donuts used")
     print(f"wavefront over the field: {before:.0f} nm rms before, {after:.1f} after ({1e9 * expected:.1f} expected)")
     print(f"processor time: {drawn:.0f} s for the donuts, {fitted:.0f} s for the fit; memory {memory:.1f} GiB")
     quality = fit.chi2[fit.usable] / fit.n_pixels[fit.usable]
