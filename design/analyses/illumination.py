@@ -140,7 +140,14 @@ def relative_illumination(
     line = field_line(telescope) if fields is None else fields
     require_image(telescope, "a relative illumination")
     request = Request.of(
-        telescope, line, wavelength, sampling="spiral", n_pupil=count, projection=projection, threads=threads
+        telescope,
+        line,
+        wavelength,
+        sampling="spiral",
+        n_pupil=count,
+        projection=projection,
+        threads=threads,
+        one_wavelength=True,
     )
     known = None if coatings is None else coatings_of(telescope, coatings)
     # Each field with its own vignetting factors; the axis is not one of the stated fields.
