@@ -140,7 +140,14 @@ def relative_illumination(
     line = field_line(telescope) if fields is None else fields
     require_image(telescope, "a relative illumination")
     request = Request.of(
-        telescope, line, wavelength, sampling="spiral", n_pupil=count, projection=projection, threads=threads
+        telescope,
+        line,
+        wavelength,
+        sampling="spiral",
+        n_pupil=count,
+        projection=projection,
+        threads=threads,
+        one_wavelength=True,
     )
     bare = coatings is None and all(s.coating is None for s in telescope.surfaces)
     known = None if bare else coatings_of(telescope, coatings)

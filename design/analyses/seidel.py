@@ -120,7 +120,7 @@ def seidel_diagram(
         If no surface acts, one is decentred or tilted, or the wavelength or field is not covered.
     """
     angle = telescope.field_radius if field is None else one_angle(field, "field")
-    request = Request.of(telescope, (0.0, angle), wavelength, sampling=CHIEF_RAY)
+    request = Request.of(telescope, (0.0, angle), wavelength, sampling=CHIEF_RAY, one_wavelength=True)
     sums = seidel_sums(telescope, request.wavelength, angle)
     colors = chromatic_sums(telescope, telescope.band, angle)
     contributions = np.hstack([sums.contributions, colors.contributions])

@@ -131,7 +131,7 @@ class Scene:
     @cached_property
     def length_tolerance(self) -> float:
         """Change of a path or a landing point by rounding [m]."""
-        axis = Request.of(self.telescope, np.zeros((1, 2)), self.telescope.default_wavelength, threads=self.threads)
+        axis = Request.of(self.telescope, np.zeros((1, 2)), threads=self.threads, one_wavelength=True)
         path = axis.bundles(axis.wavelength, self.pupil).chief_path
         if not np.isfinite(path).all():
             raise DomainError("no ray reaches the detector on the axis")
