@@ -14,6 +14,8 @@ from .options import GlassCatalogues, Json, Lenient, Model
 from .tables import Rows, plain_table, print_json, wide_console
 
 app = typer.Typer()
+#: Endings of files whose light travels along +z, ours along -z: their radii have the opposite signs.
+_ALONG_Z = (".zmx", ".zar", ".seq", ".len", ".json", ".roa")
 
 
 @app.command("info")
@@ -64,9 +66,11 @@ def info_command(
     title = ": ".join(filter(None, (description["name"], description["description"])))
     console.print(title, highlight=False)
     console.print(f"source: {description['source']}\n", highlight=False)
-    caption = "In brackets: what a surface is made or drawn to; it stops no light."
     drawn = any(s["clear_m"] is None and s["semi_diameter_m"] for s in description["surfaces"])
-    Rows(surface_columns(description), surface_rows(description), caption if drawn else "", left=2).show()
+    caption = "In brackets: what a surface is made or drawn to; it stops no light. " if drawn else ""
+    if model.lower().endswith(_ALONG_Z):
+        caption += "Radii are positive towards +z, to the object: the file has the opposite signs."
+    Rows(surface_columns(description), surface_rows(description), caption.strip(), left=2).show()
     for line in coefficient_lines(description):
         console.print(line, highlight=False)
     console.print()
@@ -88,7 +92,7 @@ def convert_command(
 ) -> None:
     """Write a telescope in another format: any model as ours, batoid's, Zemax's or optiland's.
 
-    Pickups and solves that the format has no place for are refused, with `--lenient` left out with a warning.
+    Pickups, solves and coatings that the format has no place for are refused, with `--lenient` left out with a warning.
 
     Read are files of Zemax (.zmx, .zar), CODE V (.seq), OSLO (.len), optiland (.json), ray-optics (.roa), and of batoid
     and ours (.yaml). Glasses that a Zemax file needs and the bundled catalogue does not have go to an .agf file beside

@@ -167,14 +167,22 @@ def require_distant_object(telescope: Telescope) -> None:
 def parallel_rays(telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray) -> Rays:
     """Launch plane waves as :func:`straight_bundles`; an object at a finite distance is a DomainError."""
     require_distant_object(telescope)
-    # Components stay contiguous (structure of arrays), as the kernels read them.
-    v = np.ascontiguousarray(directions.T)[:, :, None]
+    # Components stay contiguous (structure of arrays), as the kernels read them; without temporary arrays of all rays,
+    # as memory sets the pace.
+    v = directions.T[:, :, None]
     x, y = np.moveaxis(pupil if pupil.ndim == 3 else pupil[None], -1, 0)
-    points = np.stack([x, y, np.full(x.shape, telescope.stop_z)])
-    back = v[0] * points[0] + v[1] * points[1] + v[2] * points[2] + telescope.launch_distance
+    position, direction = np.empty((2, 3, len(directions), x.shape[1]))
+    back = v[0] * x
+    back += v[1] * y
+    back += v[2] * telescope.stop_z
+    back += telescope.launch_distance
+    for place, point, along in zip(position, (x, y, telescope.stop_z), v, strict=True):
+        np.multiply(along, back, out=place)
+        np.subtract(point, place, out=place)
+    direction[:] = v
     return Rays(
-        position=(points - v * back).reshape(3, -1).T,
-        direction=np.repeat(v, x.shape[1], axis=2).reshape(3, -1).T,
+        position=position.reshape(3, -1).T,
+        direction=direction.reshape(3, -1).T,
         path_length=np.zeros(back.size),
         wavelength=wavelength,
     )

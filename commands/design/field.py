@@ -39,14 +39,18 @@ def distortion(
 def _distortion_rows(result: Any) -> Rows:
     s = result.summary()
     rows = [
-        ("focal length that fits best", f"{s['focal_length_m']:.6f} m"),
-        ("focal length at the axis", f"{s['axis_focal_length_m']:.6f} m"),
+        ("focal length that fits best", _length(s["focal_length_m"])),
+        ("focal length at the axis", _length(s["axis_focal_length_m"])),
         ("largest distortion against the best scale", f"{s['largest_percent']:.4f} %"),
         ("largest distortion against the axis's scale", f"{s['largest_percent_of_axis_scale']:.4f} %"),
         ("largest shift from the best picture", f"{s['largest_shift_um']:.3f} µm"),
         ("rms shift", f"{s['rms_shift_um']:.3f} µm"),
     ]
     return Rows(("metric", "value"), rows, f"{s['telescope']}, {s['wavelength_nm']:g} nm, {len(result.fields)} fields")
+
+
+def _length(metres: float) -> str:
+    return f"{metres:.6f} m" if metres >= 1.0 else f"{1e3 * metres:.5f} mm"
 
 
 @design_command()
