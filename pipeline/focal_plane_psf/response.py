@@ -284,7 +284,13 @@ class ExposureResponse:
                 change = (ends[0] - ends[1]) / width
                 levels.append(np.linalg.lstsq(terms, change, rcond=None)[0])
             found.append(levels)
-        return cls(np.array(found), radius, center)
+        polynomial = np.array(found)
+        if not np.isfinite(polynomial).all():
+            raise DomainError(
+                f"{instrument.telescope.name}: the PSF has no shape where alignment or seeing change a little: expected"
+                " stamps and a weight that hold it, and the telescope that the stars were taken with"
+            )
+        return cls(polynomial, radius, center)
 
     def columns(self, fields: np.ndarray, heights: np.ndarray) -> np.ndarray:
         """Return the derivatives at field angles [rad] and heights [m], shape [n, n_parameter, 3]."""

@@ -125,7 +125,9 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
     }
     pictures = {
         "residuals.png": residual_plot(experiment.camera, {name: values for name, (values, _, _) in columns.items()}),
-        "correlations.png": correlation_plot({kind: correlated[kind] for kind in KINDS}),
+        "correlations.png": correlation_plot(
+            {kind: correlated[kind] for kind in KINDS}, experiment.camera.name == "lsst"
+        ),
         "rho.png": rho_plot(rho),
     }
     for name, (what, content) in tables.items():

@@ -59,8 +59,10 @@ def heights_plot(focal_plane: FocalPlane, used: Sequence[str], field_radius: flo
         draw_field_circle(axes, field_radius * 1e3, "")
         frame_axes(axes, limits)
         framed = f"; framed: the {len(used)} CCD{'s' * (len(used) != 1)} of this run" if used else ""
-        axes.set_title(f"CCD heights{framed}; dashed: edge of the field of view")
-        figure.colorbar(image, ax=axes, fraction=0.045, pad=0.02, label="height along +z, towards the sky [µm]")
+        what = "CCDs, without heights" if is_flat(focal_plane) else "CCD heights"
+        axes.set_title(f"{what}{framed}; dashed: edge of the field of view")
+        if not is_flat(focal_plane):
+            figure.colorbar(image, ax=axes, fraction=0.045, pad=0.02, label="height along +z, towards the sky [µm]")
         return png_bytes(figure)
 
 
@@ -104,7 +106,8 @@ def whiskers_plot(
             frame_axes(axes, limits, x_label=not stacked or i == len(kinds) - 1, y_label=stacked or i == 0)
             axes.set_title(_titled(_TITLES[kind], products, kind, most), loc="left")
             draw_key_whisker(axes, key, scale, 1.0)
-        figure.colorbar(image, ax=list(panels), fraction=0.02, pad=0.01, aspect=30, label="CCD height [µm]")
+        if not is_flat(focal_plane):
+            figure.colorbar(image, ax=list(panels), fraction=0.02, pad=0.01, aspect=30, label="CCD height [µm]")
         return png_bytes(figure)
 
 
@@ -136,7 +139,8 @@ def close_up_plot(products: Sequence[CcdProduct], focal_plane: FocalPlane) -> by
                 title = name + _SHORT_TITLES[kind]
                 axes.set_title(_titled(title, [product], kind, _MOST_WHISKERS) if i == 0 else title, loc="left")
                 draw_key_whisker(axes, key, scale, 1.2)
-        figure.colorbar(image, ax=list(panels.flat), fraction=0.02, pad=0.01, aspect=40, label="CCD height [µm]")
+        if not is_flat(focal_plane):
+            figure.colorbar(image, ax=list(panels.flat), fraction=0.02, pad=0.01, aspect=40, label="CCD height [µm]")
         return png_bytes(figure)
 
 
@@ -181,15 +185,25 @@ def height_range(focal_plane: FocalPlane) -> float:
 
     Where a few heights are more than twice those of 98 % of the area, as at the rims of measured CCDs, those of 98 %.
     """
-    camera = focal_plane.camera
-    nodes = np.linspace(-1.0, 1.0, 9) * (1.0 - 1e-9)
-    uv = np.stack(np.meshgrid(nodes, nodes), axis=-1)
-    xy = camera.from_uv(np.arange(len(camera))[:, None, None], uv)
-    heights = np.abs(focal_plane.height(xy[..., 0], xy[..., 1])) * 1e6
+    heights = _magnitudes(focal_plane)
     largest, usual = float(np.nanmax(heights)), float(np.nanpercentile(heights, 98.0))
     if largest > 2.0 * usual > 0.0:
         largest = usual
     return float(np.ceil(largest)) if largest > 0 else 1.0
+
+
+def is_flat(focal_plane: FocalPlane) -> bool:
+    """Return whether all heights are zero."""
+    return not np.nan_to_num(_magnitudes(focal_plane)).any()
+
+
+def _magnitudes(focal_plane: FocalPlane) -> np.ndarray:
+    """Return heights on a grid over every CCD, sign left off [um]."""
+    camera = focal_plane.camera
+    nodes = np.linspace(-1.0, 1.0, 9) * (1.0 - 1e-9)
+    uv = np.stack(np.meshgrid(nodes, nodes), axis=-1)
+    xy = camera.from_uv(np.arange(len(camera))[:, None, None], uv)
+    return np.abs(focal_plane.height(xy[..., 0], xy[..., 1])) * 1e6
 
 
 def draw_heights(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,8 @@ def draw_pictures(
     config, plane = experiment.config, experiment.focal_plane
     none = plane.terms == () and not (plane.measured.any() or plane.polynomial.any())
     heights = "none" if none else "measured" if config.focal_plane.heights is not None else "budget"
+    # The paper's figures are the LSST's.
+    paper = experiment.camera.name == "lsst"
     radius = experiment.field_radius_on_detector
     close = closest_middle_farthest(products)
     optics, whole = not config.atmosphere.enabled, of_focal_plane(products)
@@ -158,13 +161,13 @@ def draw_pictures(
         Picture(
             "Ellipticity before and after",
             scatter_plot(products),
-            "Left as in the paper: ellipticity of the observed stars, and what is left when the model is subtracted. "
-            "Right: the same for the noise-free PSFs at places where no star was fitted.",
+            "Left, as in Jee & Tyson (2011): ellipticity of the observed stars, and what is left when the model is "
+            "subtracted. Right: the same for the noise-free PSFs at places where no star was fitted.",
             "Fig. 13: residuals (red) far more compact than observed stars (blue), centred on zero.",
         ),
         Picture(
             "Correlation of the ellipticity",
-            correlation_plot({kind: correlated[kind] for kind in CORRELATED}),
+            correlation_plot({kind: correlated[kind] for kind in CORRELATED}, paper),
             "ξ+ and ξ- by TreeCorr; filled symbols are positive, open ones negative. Error bars are "
             f"{errors}, cut off where they would pass zero. {at_stars}; "
             "triangles, away from the stars, apply to galaxies. Where the CCDs lie in a row, long pairs all point "
@@ -197,7 +200,8 @@ def draw_pictures(
             )
         )
     # Single pixels and shapelets look the same whatever the stars are.
-    return [p for p in pictures if fit.basis == "pca" or p.title != OBSERVED_COMPONENTS]
+    shown = [p for p in pictures if fit.basis == "pca" or p.title != OBSERVED_COMPONENTS]
+    return shown if paper else [replace(p, paper="") for p in shown]
 
 
 def closest_middle_farthest(products: Sequence[CcdProduct]) -> list[CcdProduct]:

@@ -64,8 +64,15 @@ def _draw_cloud(axes: Axes, e1: np.ndarray, e2: np.ndarray, color: str, name: st
     axes.plot([], [], "o", color=color, markersize=3.0, label=f"{name}: rms {rms:.2g}")
 
 
-def correlation_plot(correlated: dict[str, Correlation]) -> bytes:
-    """Draw xi+ and xi- against separation (Jee & Tyson 2011, Fig. 14): filled symbols positive, open ones negative."""
+#: xi+ in the paper, by what it is of.
+_PAPER = ((3e-5, "paper: observed"), (1e-8, "paper: residual at the stars"))
+
+
+def correlation_plot(correlated: dict[str, Correlation], paper: bool = True) -> bytes:
+    """Draw xi+ and xi- against separation (Jee & Tyson 2011, Fig. 14): filled symbols positive, open ones negative.
+
+    With ``paper`` lines are at the values of the paper, which are the LSST's.
+    """
     with styled():
         figure = new_figure(11.5, 5.4)
         panels = figure.subplots(1, 2, sharex=True, sharey=True)
@@ -77,7 +84,7 @@ def correlation_plot(correlated: dict[str, Correlation]) -> bytes:
         panels[0].set_ylabel("$|\\xi|$ of the ellipticity")
         low, high = panels[0].get_ylim()
         panels[0].set_ylim(max(low, 1e-10), high * 2)
-        for value, text in ((3e-5, "paper: observed"), (1e-8, "paper: residual at the stars")):
+        for value, text in _PAPER if paper else ():
             if panels[0].get_ylim()[0] < value < panels[0].get_ylim()[1]:
                 panels[0].axhline(value, color="0.45", linewidth=0.8, linestyle=(0, (2, 2)), zorder=0)
                 panels[0].annotate(

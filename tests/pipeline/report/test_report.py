@@ -13,9 +13,13 @@ import pytest
 
 from pachon.core import plotting
 from pachon.core.plotting import new_figure, png_bytes
+from pachon.models.camera.focal_plane import FocalPlane
 from pachon.pipeline.ccd_product import read_product
 from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.measure.correlation import shear_correlation
+from pachon.pipeline.report import focal_plane_plots, statistics_plots
 from pachon.pipeline.report.focal_plane_axes import key_ellipticity, whiskers
+from pachon.pipeline.report.focal_plane_plots import is_flat
 from pachon.pipeline.report.report import build_report, closest_middle_farthest
 from pachon.pipeline.report.tables import percent
 from pachon.wavefront.opd import wavefront_opd
@@ -137,3 +141,29 @@ def test_figures_do_not_depend_on_the_users_matplotlib(lsst_r):
     with matplotlib.rc_context({"font.size": 20.0, "axes.facecolor": "black"}):
         assert png_bytes(opd.plot(fit, "lsst")) == plain
     assert new_figure(2, 2).canvas.manager is None
+
+
+def test_flat_focal_planes_have_no_scale_of_heights(monkeypatch):
+    figures = []
+    monkeypatch.setattr(focal_plane_plots, "png_bytes", lambda figure: figures.append(figure) or b"")
+    for plane in (FocalPlane.flat("hsc"), FocalPlane.from_budget("lsst", seed=1)):
+        assert is_flat(plane) == (plane.camera.name == "hsc")
+        focal_plane_plots.heights_plot(plane, (), 0.3)
+    flat, uneven = figures
+    assert (len(flat.axes), len(uneven.axes)) == (1, 2)
+    assert flat.axes[0].get_title().startswith("CCDs, without heights")
+
+
+def test_lines_of_the_paper_are_for_the_lsst(monkeypatch):
+    """3e-5 and 1e-8 are what Jee & Tyson (2011) find of the LSST; another camera has no such line."""
+    figures = []
+    monkeypatch.setattr(statistics_plots, "png_bytes", lambda figure: figures.append(figure) or b"")
+    rng = np.random.default_rng(1)
+    fields = rng.uniform(-0.01, 0.01, (200, 2))
+    e1, e2 = 0.01 * rng.standard_normal((2, 200))
+    correlation = shear_correlation(*fields.T, e1, e2, min_sep=1e-4, max_sep=1e-2, n_bins=5)
+    for paper in (True, False):
+        statistics_plots.correlation_plot({"truth": correlation}, paper)
+    lines = [[t.get_text() for t in f.axes[0].texts if t.get_text().startswith("paper")] for f in figures]
+    assert lines[0]
+    assert not lines[1]
