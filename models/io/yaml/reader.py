@@ -108,7 +108,8 @@ def _surface_kind(content: dict[str, Any]) -> str:
 
 
 _SURFACES: dict[str, type[SurfaceKeys]] = {
-    name: create_model(f"{name}_surface", __base__=(SurfaceKeys, section)) for name, section in SURFACE_SHAPES.items()
+    name: create_model(f"{name}_surface", __base__=(SurfaceKeys, section))  # type: ignore[arg-type]
+    for name, section in SURFACE_SHAPES.items()
 }
 _BY_SHAPE = Tagged.by_value("shape", {name: section for name, section in _SURFACES.items() if name != "sum"})
 
