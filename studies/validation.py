@@ -156,7 +156,8 @@ def _yaml_file(path: Path) -> Validation:
         return Validation(str(path), "YAML", (error,))
     if "opticalSystem" in content:
         return Validation(str(path), "lens file", tuple(_lens_file(path)))
-    kind = max(KINDS, key=lambda k: len(set(content) & _keys(k)))
+    # Where two kinds have the keys, the one with fewer others.
+    kind = max(KINDS, key=lambda k: (len(set(content) & _keys(k)), -len(_keys(k))))
     if not set(content) & _keys(kind):
         raise ConfigError(f"none of the keys of a {', '.join(k.name for k in KINDS)} is in it", file=path)
     found = _schema_problems(kind, content, path)

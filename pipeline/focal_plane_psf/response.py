@@ -284,7 +284,7 @@ class ExposureResponse:
                 change = (ends[0] - ends[1]) / width
                 levels.append(np.linalg.lstsq(terms, change, rcond=None)[0])
             found.append(levels)
-        polynomial = np.array(found)
+        polynomial: np.ndarray = np.array(found)
         if not np.isfinite(polynomial).all():
             raise DomainError(
                 f"{instrument.telescope.name}: the PSF has no shape where alignment or seeing change a little: expected"

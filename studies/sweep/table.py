@@ -153,7 +153,8 @@ def described_metric(name: str) -> Description:
     metric = STARS.metric(name) or BARE.metric(name)
     if metric is not None:
         return Description(metric.unit, metric.meaning)
-    return Description(_unit(name), "motion of the compensator" if name.startswith("solved ") else "")
+    solved = name.startswith("solved ")
+    return Description(_unit(name), "motion of the compensator" if solved else "metric of another version of pachon")
 
 
 def described_parameter(name: str) -> Description:
