@@ -14,8 +14,9 @@ points, the baselines, and the pixels are sums over these.
 
 Averaged over time, turbulence leaves no OTF at baselines beyond 1.5 m, and of what a short exposure still has there,
 charge diffusion leaves exp(-17) (4 um rms, 620 nm, f = 10.3 m). The grid then needs no padding to twice the pupil: it
-is wider than the pupil by 1.5 m, so that baselines up to there are free of those that wrap around. Without an
-atmosphere, or with too little diffusion, it is padded and holds all baselines.
+is wider than the pupil by 1.5 m, so that baselines up to there are free of those that wrap around. Where diffusion
+leaves more, as of red light and of charge from deep in silicon, it is wider by as much as that takes. Without an
+atmosphere, or without diffusion, it is padded and holds all baselines.
 
 Transforms are those of SciPy in single precision. On 480 to 512 points a side FFTW and MKL take half its time and ducc0
 as much (``benchmarks/fft_libraries.py``); a third of a star's time goes into them, so either would win a sixth. They
@@ -45,7 +46,7 @@ from .pupil_lattice import PupilLattice
 from .sample_packets import LANES, indices, samples
 from .wave_kernels import Screens, Taps, add_squares, pupil_fields
 
-#: Longest baseline [m] of an unpadded grid.
+#: Least of the longest baselines of an unpadded grid [m].
 LONGEST_BASELINE = 1.5
 #: Largest distance of pupil points [m] under an atmosphere: the scale below which turbulence is left out.
 LARGEST_SPACING = 0.02
@@ -54,8 +55,8 @@ LARGEST_SPACING = 0.02
 LARGEST_SPACING_OPTICS = 0.04
 #: Fewest pupil points across the diameter: the rim of a small telescope is as fine as that of a large one.
 FEWEST_ACROSS = 96
-# Largest transfer function of charge diffusion at longer baselines for a grid without padding.
-_NEGLIGIBLE = 1e-4
+# Largest transfer function of charge diffusion at longer baselines than those of a grid, and baselines that are tried.
+_NEGLIGIBLE, _TRIED = 1e-4, 64
 
 
 class WavePsfEngine(PsfEngine):
@@ -80,19 +81,26 @@ class WavePsfEngine(PsfEngine):
             spacing = min(largest, float(self._wavelengths.min()) * self.focal_length / self._plane.side)
         if not (math.isfinite(spacing) and spacing > 0.0):
             raise DomainError(f"pupil_spacing = {spacing!r}: expected a positive length in metres")
-        if padding is None:
-            k = 2.0 * math.pi * LONGEST_BASELINE / (float(self._wavelengths.max()) * self.focal_length)
-            spread = self._channels.of_wavelength(self._channels.spread(np.array([k]))).max()
-            left = float(spread) * math.exp(-0.5 * (k * self._plane.diffusion) ** 2)
-            padding = self._atmosphere is None or left > _NEGLIGIBLE
         diameter = self._diameter
-        longest = diameter if padding else LONGEST_BASELINE
+        longest = diameter
+        if padding is False:
+            longest = LONGEST_BASELINE
+        elif padding is None and self._atmosphere is not None:
+            longest = self._longest_baseline()
         self._lattice = PupilLattice.fill(diameter, self._obscuration, spacing)
         self._packets = -(-self._lattice.size // LANES)
         across = max(math.ceil((diameter + longest) / spacing), self._packets * LANES)
         # Multiples of 4 fill whole packets.
         self._size = 4 * scipy.fft.next_fast_len(-(-across // 4))
         self._reach = min(math.floor(longest / spacing), (self._size - 1) // 2)
+
+    def _longest_baseline(self) -> float:
+        """Return the baseline [m] beyond which charge diffusion leaves next to nothing, at most the diameter."""
+        baseline = np.linspace(min(LONGEST_BASELINE, self._diameter), self._diameter, _TRIED)
+        k = 2.0 * math.pi * baseline / (float(self._wavelengths.max()) * self.focal_length)
+        spread = self._channels.of_wavelength(self._channels.spread(k)).max(axis=0)
+        left = spread * np.exp(-0.5 * (k * self._plane.diffusion) ** 2)
+        return float(baseline[min(np.count_nonzero(left > _NEGLIGIBLE), _TRIED - 1)])
 
     def _take_screens(self) -> None:
         """Take the spline coefficients of the low and the high screens [m], and lay the lattice over them."""

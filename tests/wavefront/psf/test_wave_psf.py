@@ -157,6 +157,20 @@ def test_padding_changes_nothing_that_the_detector_sees(polynomial_pupil):
 
 
 @pytest.mark.long
+def test_a_grid_is_as_wide_as_the_diffusion_demands(polynomial_pupil):
+    """Less diffusion than in blue light near the surface: baselines beyond 1.5 m count, those of the diameter do not."""
+    plane, atmosphere = ImagePlane(31, 10e-6, 2.2e-6), small_atmosphere()
+    narrow, chosen, padded = (
+        WavePsfEngine(polynomial_pupil(defocus=0.5e-6).inputs(ONE_WAVE, plane, atmosphere=atmosphere, **padding))
+        for padding in ({"padding": False}, {}, {"padding": True})
+    )
+    assert narrow._size < chosen._size < 0.75 * padded._size
+    images = [engine.render(*STAR).image for engine in (narrow, chosen, padded)]
+    errors = [np.abs(image - images[2]).max() / images[2].max() for image in images[:2]]
+    assert errors[1] < 3e-6 < errors[0]
+
+
+@pytest.mark.long
 def test_grid_is_padded_where_it_must_be(polynomial_pupil):
     """All baselines are kept without an atmosphere, and where charge diffusion leaves some of the long ones."""
     sharp = ImagePlane(31, 10e-6, 0.5e-6)
