@@ -100,7 +100,8 @@ class WavePsfEngine(PsfEngine):
         k = 2.0 * math.pi * baseline / (float(self._wavelengths.max()) * self.focal_length)
         spread = self._channels.of_wavelength(self._channels.spread(k)).max(axis=0)
         left = spread * np.exp(-0.5 * (k * self._plane.diffusion) ** 2)
-        return float(baseline[min(np.count_nonzero(left > _NEGLIGIBLE), _TRIED - 1)])
+        too_short = int(np.count_nonzero(left > _NEGLIGIBLE))
+        return float(baseline[min(too_short, _TRIED - 1)])
 
     def _take_screens(self) -> None:
         """Take the spline coefficients of the low and the high screens [m], and lay the lattice over them."""
