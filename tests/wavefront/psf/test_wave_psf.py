@@ -158,7 +158,7 @@ def test_padding_changes_nothing_that_the_detector_sees(polynomial_pupil):
 
 @pytest.mark.long
 def test_a_grid_is_as_wide_as_the_diffusion_demands(polynomial_pupil):
-    """Less diffusion than in blue light near the surface: baselines beyond 1.5 m count, those of the diameter do not."""
+    """Less diffusion: baselines beyond 1.5 m count, those of the whole diameter do not."""
     plane, atmosphere = ImagePlane(31, 10e-6, 2.2e-6), small_atmosphere()
     narrow, chosen, padded = (
         WavePsfEngine(polynomial_pupil(defocus=0.5e-6).inputs(ONE_WAVE, plane, atmosphere=atmosphere, **padding))
