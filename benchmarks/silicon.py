@@ -26,7 +26,7 @@ WEIGHT = 0.7 * ARCSEC
 def spectrum(band, temperature, count=5):
     """Wavelengths of equal numbers of photons of a blackbody within a band [m]."""
     wavelength = np.linspace(*band, 2001)
-    photons = wavelength**-4.0 / np.expm1(1.438777e-2 / (wavelength * temperature))
+    photons = pachon.blackbody_photons(temperature, wavelength)[0]
     below = np.concatenate([[0.0], np.cumsum(0.5 * (photons[1:] + photons[:-1]))])
     return np.interp((np.arange(count) + 0.5) / count, below / below[-1], wavelength)
 

@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError
-from .layer_stack import CoatingTable, LayerStack, checked_cosines
-from .media.medium import wavelengths_within
+from .layer_stack import CoatingTable, LayerStack, check_wavelengths, checked_cosines, within_table
 
 
 @check_arguments
@@ -33,11 +32,10 @@ class Coating:
     name: str = ""
 
     def __post_init__(self) -> None:
-        waves, values = np.array(self.wavelengths), np.array(self.efficiencies)
-        if len(waves) < 2 or not (np.isfinite(waves).all() and (waves > 0).all() and (np.diff(waves) > 0).all()):
-            raise ConfigError(f"wavelengths of {self.name or 'a coating'}: expected two or more, positive, ascending")
-        if waves.shape != values.shape or not ((values >= 0) & (values <= 1)).all():
-            text = f"expected {len(waves)} numbers from 0 to 1, as many as wavelengths"
+        check_wavelengths(self.wavelengths, self.name)
+        values, count = np.array(self.efficiencies), len(self.wavelengths)
+        if values.shape != (count,) or not ((values >= 0) & (values <= 1)).all():
+            text = f"expected {count} numbers from 0 to 1, as many as wavelengths"
             raise ConfigError(f"efficiency of {self.name or 'a coating'}: {text}")
 
     @check_arguments
@@ -57,9 +55,7 @@ class Coating:
 
     def at(self, wavelength: ArrayLike) -> np.ndarray:
         """Return the efficiency at wavelengths [m]; a DomainError outside the table."""
-        ends = (self.wavelengths[0], self.wavelengths[-1])
-        w = wavelengths_within(wavelength, ends, f"coating {self.name}" if self.name else "the coating")
-        return np.interp(w, self.wavelengths, self.efficiencies)
+        return np.interp(within_table(wavelength, self.wavelengths, self.name), self.wavelengths, self.efficiencies)
 
 
 #: Coatings that a surface may have.

@@ -36,6 +36,19 @@ def checked_cosines(cosine: ArrayLike, n1: float, n2: float) -> np.ndarray:
     return pure_numbers(cosine, "cosine")
 
 
+def check_wavelengths(wavelengths: tuple[float, ...], name: str) -> None:
+    """Raise a ConfigError unless the wavelengths [m] of a coating's table are two or more, positive and ascending."""
+    waves = np.array(wavelengths)
+    if len(waves) < 2 or not (np.isfinite(waves).all() and (waves > 0).all() and (np.diff(waves) > 0).all()):
+        raise ConfigError(f"wavelengths of {name or 'a coating'}: expected two or more, positive, ascending")
+
+
+def within_table(wavelength: ArrayLike, wavelengths: tuple[float, ...], name: str) -> np.ndarray:
+    """Return wavelengths [m] as an array, or raise a DomainError where one is outside a coating's table."""
+    ends = (wavelengths[0], wavelengths[-1])
+    return wavelengths_within(wavelength, ends, f"coating {name}" if name else "the coating")
+
+
 @check_arguments
 @dataclass(frozen=True)
 class CoatingTable:
@@ -60,15 +73,15 @@ class CoatingTable:
 
     def __post_init__(self) -> None:
         name = self.name or "a coating"
-        waves, angles = np.array(self.wavelengths), np.array(self.angles)
-        if len(waves) < 2 or not (np.isfinite(waves).all() and (waves > 0).all() and (np.diff(waves) > 0).all()):
-            raise ConfigError(f"wavelengths of {name}: expected two or more, positive, ascending")
+        check_wavelengths(self.wavelengths, self.name)
+        angles = np.array(self.angles)
         if len(angles) < 2 or angles[0] != 0 or not ((np.diff(angles) > 0).all() and angles[-1] < 0.5 * np.pi):
             raise ConfigError(f"angles of {name}: expected two or more, from 0, ascending, below 90 degrees")
         rows = [np.array(row) for row in self.efficiencies]
-        shapes = len(rows) == len(waves) and all(row.shape == angles.shape for row in rows)
+        count = len(self.wavelengths)
+        shapes = len(rows) == count and all(row.shape == angles.shape for row in rows)
         if not (shapes and all(((row >= 0) & (row <= 1)).all() for row in rows)):
-            text = f"expected {len(waves)} rows, one a wavelength, of {len(angles)} numbers from 0 to 1, one an angle"
+            text = f"expected {count} rows, one a wavelength, of {len(angles)} numbers from 0 to 1, one an angle"
             raise ConfigError(f"efficiency of {name}: {text}")
 
     @check_arguments
@@ -85,8 +98,7 @@ class CoatingTable:
             Refractive indices before and behind.
         """
         cosines = checked_cosines(cosine, n1, n2)
-        ends = (self.wavelengths[0], self.wavelengths[-1])
-        w = wavelengths_within(wavelength, ends, f"coating {self.name}" if self.name else "the coating")
+        w = within_table(wavelength, self.wavelengths, self.name)
         table = np.array(self.efficiencies)
         row = np.array([np.interp(w, self.wavelengths, column) for column in table.T])
         # The angle on the side of lower index.

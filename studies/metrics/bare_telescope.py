@@ -16,7 +16,7 @@ from ...design.metrics.vignetting import vignetting
 from ...design.optimize.merit import Beams, WavefrontMerit
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
-from .metric import Metric, MetricTable
+from .metric import THROUGHPUT, Metric, MetricTable
 
 #: Metrics of a telescope without a camera.
 BARE = MetricTable()
@@ -92,11 +92,7 @@ def transfer(scene: BareScene) -> dict[str, float]:
     return {"mtf50_per_mm": mean, "mtf50_worst_per_mm": float(found.min())}
 
 
-@BARE.group(
-    "throughput",
-    Metric("throughput_mean", meaning="lit fraction of the pupil, mean over stars or fields"),
-    Metric("throughput_min", meaning="lit fraction of the pupil, least of stars or fields"),
-)
+@BARE.group("throughput", *THROUGHPUT)
 def throughput(scene: BareScene) -> dict[str, float]:
     """Return mean and minimum of the lit fraction of the pupil over the fields."""
     request = scene.request

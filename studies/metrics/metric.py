@@ -71,3 +71,10 @@ class MetricTable(dict[str, MetricGroup]):
         """Return the metric of a value: of those whose names start its own, the longest; None where there is none."""
         found = [m for group in self.values() for m in group.metrics if name.startswith(m.name)]
         return max(found, key=lambda m: len(m.name), default=None)
+
+
+#: Metrics of the light that reaches the detector, of stars and of bare telescopes.
+THROUGHPUT = (
+    Metric("throughput_mean", meaning="lit fraction of the pupil, mean over stars or fields"),
+    Metric("throughput_min", meaning="lit fraction of the pupil, least of stars or fields"),
+)

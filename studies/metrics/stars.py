@@ -22,7 +22,7 @@ from ...pipeline.simulate.ccd_model import model_ccd
 from ...pipeline.simulate.photometry import effective_fwhm
 from ...wavefront.opd import wavefront_opd
 from ...wavefront.zernike import fit_zernikes
-from .metric import Metric, MetricTable
+from .metric import THROUGHPUT, Metric, MetricTable
 from .scene import Scene
 
 #: Metrics of the stars on the CCDs of a configuration.
@@ -190,11 +190,7 @@ def ee80(scene: Scene) -> dict[str, float]:
     return {"ee80_arcsec": radius * scene.stars.pixel_scale / ARCSEC}
 
 
-@STARS.group(
-    "throughput",
-    Metric("throughput_mean", meaning="lit fraction of the pupil, mean over stars or fields"),
-    Metric("throughput_min", meaning="lit fraction of the pupil, least of stars or fields"),
-)
+@STARS.group("throughput", *THROUGHPUT)
 def lit_fraction(scene: Scene) -> dict[str, float]:
     """Return mean and minimum of the lit fraction of the pupil."""
     light = scene.stars.lit_fraction
