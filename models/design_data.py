@@ -171,6 +171,15 @@ def vignetted(points: np.ndarray, factors: np.ndarray) -> np.ndarray:
     return np.stack([x * cos - y * sin, x * sin + y * cos], axis=-1)
 
 
+def unvignetted(points: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Return the pupil points that vignetting factors move to given ones: the inverse of :func:`vignetted`."""
+    decentre, compression, angle = factors[..., None, :2], factors[..., None, 2:4], factors[..., None, 4]
+    x, y = np.moveaxis(points, -1, 0)
+    cos, sin = np.cos(angle), np.sin(angle)
+    back = np.stack([x * cos + y * sin, y * cos - x * sin], axis=-1)
+    return np.asarray((back - decentre) / (1.0 - compression))
+
+
 def _refuse(text: str) -> None:
     raise PrescriptionError(f"design data: {text}")
 

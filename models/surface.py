@@ -101,7 +101,13 @@ class Surface:
 
     def to_local(self, points: ArrayLike) -> np.ndarray:
         """Return points [m], shape (..., 3), of the telescope frame in the surface's own frame."""
-        return (_points(points) - np.array(self.vertex)) @ self.matrix
+        # Added, so that no negative zeros of symmetric systems are left.
+        offset = _points(points) + (0.0 - np.array(self.vertex))
+        return offset if self.rotation == IDENTITY else offset @ self.matrix
+
+    def along(self, directions: np.ndarray) -> np.ndarray:
+        """Return directions, shape (..., 3), of the telescope frame in the surface's own frame."""
+        return directions + 0.0 if self.rotation == IDENTITY else directions @ self.matrix
 
     def to_telescope(self, points: ArrayLike) -> np.ndarray:
         """Return points [m], shape (..., 3), of the surface's own frame in the telescope frame."""

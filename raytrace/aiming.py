@@ -20,6 +20,7 @@ from ..models.surface import Interaction
 from ..models.telescope import Telescope
 from .landing import Landing, derivatives, determinants, find_points, solved
 from .rays import Rays, field_angles, field_direction, object_points, straight_bundles
+from .repeated_trace import RepeatedTrace
 from .smooth_pupil import FEWEST, pupil_nodes, smooth_pupil
 from .trace import trace
 
@@ -69,13 +70,44 @@ def entrance_points(telescope: Telescope, directions: np.ndarray, wavelength: fl
     return found
 
 
+@dataclass(frozen=True, eq=False)
+class AimedPoints:
+    """Points of the entrance pupil that aimed rays cross, a start for those of a telescope like it."""
+
+    points: np.ndarray  #: as :func:`entrance_points` returns them [m]
+    slopes: np.ndarray | None  #: [n_direction * n_pupil, 2, 2] derivatives at the stop; None without search
+
+    @classmethod
+    def of(
+        cls, telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray, points: np.ndarray
+    ) -> AimedPoints:
+        """Return the points that :func:`entrance_points` found for pupil points [m]."""
+        if telescope.design_data.aiming == "off" or pupil.shape[-2] >= FEWEST:
+            return cls(points, None)
+        landing = stop_of(telescope).landing(telescope, np.repeat(directions, pupil.shape[-2], axis=0), wavelength)
+        return cls(points, derivatives(landing, points.reshape(-1, 2), _difference(telescope)))
+
+    def moved(
+        self, telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray
+    ) -> np.ndarray | None:
+        """Return :func:`entrance_points` of another telescope, a little different; None where it is too different."""
+        if self.slopes is None or telescope.design_data.aiming == "off":
+            return None
+        stop, difference = stop_of(telescope), _difference(telescope)
+        target = np.broadcast_to(_at_stop(telescope, stop, pupil), self.points.shape).reshape(-1, 2)
+        landing = stop.landing(telescope, np.repeat(directions, pupil.shape[-2], axis=0), wavelength)
+        found = find_points(landing, self.points.reshape(-1, 2), target, stop.radius, difference, self.slopes)
+        sense = determinants(derivatives(landing, found, difference, target)) * determinants(self.slopes)
+        return found.reshape(self.points.shape) if (sense > 0.0).all() else None
+
+
 def _one_by_one(
     telescope: Telescope, stop: Stop, directions: np.ndarray, wavelength: float, relative: np.ndarray
 ) -> np.ndarray:
     """Return :func:`entrance_points` of pupil points in units of the radius, [n_direction, n_pupil, 2]."""
     n, difference = len(directions), _difference(telescope)
     chief = _chief_points(telescope, stop, directions, wavelength)
-    target = (stop.radius * relative @ stop.axes.T).reshape(-1, 2)
+    target = _turned(stop.radius * relative, stop.axes.T).reshape(-1, 2)
     rays = np.repeat(directions, relative.shape[1], axis=0)
     landing = stop.landing(telescope, rays, wavelength)
     start = np.repeat(chief, relative.shape[1], axis=0)
@@ -107,6 +139,8 @@ def pupil_coordinates(telescope: Telescope, direction: np.ndarray, wavelength: f
 
     The inverse of :func:`entrance_points` for one direction [3]; NaN where a ray does not reach the stop.
     """
+    if telescope.design_data.telecentric:
+        return points - object_points(telescope, direction[None])[:, :2]
     if telescope.design_data.aiming == "off":
         return points
     stop = stop_of(telescope)
@@ -145,14 +179,15 @@ class Stop:
     def relative(self, rays: Rays) -> np.ndarray:
         """Return where rays meet the stop [n, 2], along the axes of the entrance pupil, in units of the radius."""
         landing = self.front.surfaces[-1].to_local(trace(self.front, rays).position)[:, :2]
-        return landing @ self.axes / self.radius
+        return _turned(landing, self.axes) / self.radius
 
     def landing(self, telescope: Telescope, directions: np.ndarray, wavelength: float) -> Landing:
         """Return the function from points of the entrance pupil to the stop for rays of given chief directions."""
+        traced = RepeatedTrace(self.front, wavelength)
 
         def land(points: np.ndarray, which: np.ndarray) -> np.ndarray:
             rays = straight_bundles(telescope, directions[which], wavelength, points[:, None])
-            return self.front.surfaces[-1].to_local(trace(self.front, rays).position)[:, :2]
+            return self.front.surfaces[-1].to_local(traced.positions(rays))[:, :2]
 
         return land
 
@@ -174,7 +209,10 @@ def stop_of(telescope: Telescope) -> Stop:
     rim = 0.5 * telescope.pupil_diameter
     chief = find_points(landing, np.zeros((1, 2)), np.zeros((1, 2)), rim, _difference(telescope))
     # The error of central differences is one of third order, which two steps remove.
-    near, far = (_central(landing, chief, step * rim) for step in (1e-3, 2e-3))
+    steps = rim * np.array([1e-3, 2e-3])
+    away = np.concatenate([step * side for step in steps for side in (np.eye(2), -np.eye(2))])
+    sides = landing(chief + away, np.zeros(8, dtype=int)).reshape(2, 2, 2, 2)
+    near, far = ((plus - minus).T / (2.0 * step) for step, (plus, minus) in zip(steps, sides, strict=True))
     scale = (4.0 * near - far) / 3.0
     if not np.isfinite(scale).all() or determinants(scale[None])[0] == 0.0:
         raise DomainError(f"{telescope.name}: no ray on the axis passes the middle of the stop {data.stop!r}")
@@ -199,6 +237,16 @@ def _front(telescope: Telescope, stop: str) -> Telescope:
     clear = tuple(replace(s, aperture=None) for s in (*surfaces[:-1], last))
     bare: dict[str, Any] = {"groups": {}, "group_frames": {}, "obstructions": (), "design_data": DesignData()}
     return replace(telescope, surfaces=clear, **bare)
+
+
+def _at_stop(telescope: Telescope, stop: Stop, pupil: np.ndarray) -> np.ndarray:
+    """Return the points of the stop [m], along its own axes, that pupil points [m] mean."""
+    return _turned(pupil * (stop.radius / (0.5 * telescope.pupil_diameter)), stop.axes.T)
+
+
+def _turned(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Return the product of points [..., 2] and a small matrix, without the threads of a matrix product."""
+    return points[..., :1] * matrix[0] + points[..., 1:] * matrix[1]
 
 
 def _difference(telescope: Telescope) -> float:
@@ -228,10 +276,3 @@ def _chief_points(telescope: Telescope, stop: Stop, directions: np.ndarray, wave
             points, before = moved, np.where(going[:, None], points, moved)
         found[left] = points
     return found
-
-
-def _central(landing: Landing, point: np.ndarray, step: float) -> np.ndarray:
-    """Return the derivatives [2, 2] at one point by central differences."""
-    one = np.zeros(1, dtype=int)
-    sides = [landing(point + step * axis, one) - landing(point - step * axis, one) for axis in np.eye(2)]
-    return np.concatenate(sides).T / (2.0 * step)

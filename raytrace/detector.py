@@ -39,7 +39,7 @@ def land_on_ccds(
     detector was tilted; positions on the CCDs are that frame's x and y. ``position`` [m] and ``direction``, [n, 3], are
     in the telescope frame; ``index`` is the refractive index before the detector.
     """
-    (x, y, z), (u, v, w) = detector.to_local(position).T, (direction @ detector.matrix).T
+    (x, y, z), (u, v, w) = detector.to_local(position).T, detector.along(direction).T
     ccd = focal_plane.ccd_at(x, y)
     t = _distance(focal_plane, ccd, (x, y, z), (u, v, w), STEPS)
     # A ray that crosses the edge on its last micrometres has left the CCD. (In a gap, index -1, t has no meaning.)

@@ -26,7 +26,7 @@ def imaged(telescope: Telescope, end: TraceResult, wavelength: float) -> TraceRe
     if not telescope.design_data.afocal:
         return end
     detector, index = telescope.surfaces[-1], float(refractive_indices(telescope, wavelength)[-2])
-    place, travel = detector.to_local(end.position), end.direction @ detector.matrix
+    place, travel = detector.to_local(end.position), detector.along(end.direction)
     image = -telescope.sphere_radius * travel / np.abs(travel[:, 2:])
     reach = image - place
     direction = reach / np.linalg.norm(reach, axis=-1)[:, None]

@@ -18,7 +18,14 @@ _STEPS, _HALVINGS = 30, 8
 Landing = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-def find_points(landing: Landing, start: np.ndarray, target: np.ndarray, size: float, difference: float) -> np.ndarray:
+def find_points(
+    landing: Landing,
+    start: np.ndarray,
+    target: np.ndarray,
+    size: float,
+    difference: float,
+    slopes: np.ndarray | None = None,
+) -> np.ndarray:
     """Return the coordinates [n, 2] of rays that land at targets [n, 2]; NaN where the search fails.
 
     Parameters
@@ -33,11 +40,13 @@ def find_points(landing: Landing, start: np.ndarray, target: np.ndarray, size: f
         Length on the landing surface that the accuracy of 1e-12 belongs to.
     difference : float
         Step of the coordinates that the first derivatives are taken over.
+    slopes : ndarray, shape [n, 2, 2], optional
+        First derivatives where they are known, about.
     """
     points, every = start.copy(), np.arange(len(start))
     here = landing(points, every)
     miss = here - target
-    slopes = derivatives(landing, points, difference, here)
+    slopes = derivatives(landing, points, difference, here) if slopes is None else slopes.copy()
     stuck = np.zeros(len(points), dtype=bool)
     for _ in range(_STEPS):
         distance = np.linalg.norm(miss, axis=1)

@@ -62,7 +62,7 @@ def land_on_mesh(
         raise DomainError(f"position, direction have shapes {shapes}: expected [n, 3] twice")
     start_warp()
     p = detector.to_local(position)
-    d = direction @ detector.matrix
+    d = detector.along(direction)
     start = p - (REACH / np.abs(d[:, 2]))[:, None] * d
 
     facets = warp_mesh(mesh.vertices, mesh.faces)

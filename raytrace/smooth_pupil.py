@@ -7,8 +7,11 @@ by one predicts all others so well that one trace to the stop and one step leave
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
+
+from ..core.threads import one_blas_thread
 
 #: Rays of a field from which on this is faster than to find each by itself.
 FEWEST = 1500
@@ -40,12 +43,11 @@ def smooth_pupil(target: np.ndarray, at_nodes: np.ndarray, stop: PointMap, searc
     ``search`` finds points of the entrance pupil one by one. It is taken where polynomials fail: beyond folds of the
     pupil, and where rays do not arrive.
     """
-    reach, nodes = float(_reach(target)), pupil_nodes(target)
-    known = np.isfinite(at_nodes).all(axis=1)
-    basis = _basis(nodes[known] / reach)
-    if known.sum() < 1.5 * basis.shape[1]:
+    reach, known = float(_reach(target)), np.isfinite(at_nodes).all(axis=1)
+    if known.sum() < 1.5 * _TERMS:
         return search(target)
-    coefficients = np.linalg.lstsq(basis, at_nodes[known], rcond=None)[0]
+    basis, inverse = _fit_matrices() if known.all() else _inverted(_basis(_nodes()[known]))
+    coefficients = inverse @ at_nodes[known]
     table = np.concatenate([coefficients, *(_derived(coefficients, axis) / reach for axis in (0, 1))], axis=1)
     sense = np.sign(np.linalg.det(table[0, 2:].reshape(2, 2)))
     # A step leaves the error of its slopes, times the distance: where that is rounding, no trace has to confirm it.
@@ -99,6 +101,17 @@ def _nodes() -> np.ndarray:
     angles = [2.0 * np.pi * np.arange(6 * k) / (6 * k) for k in rings]
     points = [r * np.stack([np.cos(a), np.sin(a)], axis=-1) for r, a in zip(radius, angles, strict=True)]
     return np.concatenate([np.zeros((1, 2)), *points])
+
+
+@lru_cache(maxsize=1)
+def _fit_matrices() -> tuple[np.ndarray, np.ndarray]:
+    """Return the monomials at all nodes, and the matrix from values there to coefficients by least squares."""
+    return _inverted(_basis(_nodes()))
+
+
+def _inverted(basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    with one_blas_thread():
+        return basis, np.linalg.pinv(basis)
 
 
 def _powers() -> list[tuple[int, int]]:

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, shown
 from ..core.units import metres, pure_numbers, radians
-from ..models.design_data import vignetted
+from ..models.design_data import unvignetted, vignetted
 from ..models.telescope import Telescope
+from ..raytrace.aiming import AimedPoints, pupil_coordinates
 from ..raytrace.ideal_lens import imaged
 from ..raytrace.launch import aimed_points
 from ..raytrace.pack.surfaces import refractive_indices
@@ -206,15 +207,25 @@ class Request:
         """
         return aimed_points(self.telescope, self.directions, wavelength, self.vignetted(pupil))
 
-    def own_entrance_points(self, wavelength: float) -> np.ndarray:
-        """Return :meth:`entrance_points` of the pupil points of the request, found once for each wavelength [m]."""
-        known = self._found_points
-        if wavelength not in known:
-            known[wavelength] = self.entrance_points(wavelength, self.pupil.points)
-        return known[wavelength]
+    def entrance_points_of(self, telescope: Telescope, wavelength: float, pupil: np.ndarray) -> np.ndarray:
+        """Return :meth:`entrance_points` of a telescope like that of the request, such as a perturbed one.
+
+        Those of the request's own telescope are found once; they are where the search for others starts.
+        """
+        points = self.vignetted(pupil)
+        key = (wavelength, points.tobytes())
+        if key not in self._aimed:
+            own = aimed_points(self.telescope, self.directions, wavelength, points)
+            self._aimed[key] = AimedPoints.of(self.telescope, self.directions, wavelength, points, own)
+        known = self._aimed[key]
+        if telescope is self.telescope:
+            return known.points
+        points = replace(self, telescope=telescope).vignetted(pupil)
+        moved = known.moved(telescope, self.directions, wavelength, points)
+        return aimed_points(telescope, self.directions, wavelength, points) if moved is None else moved
 
     @cached_property
-    def _found_points(self) -> dict[float, np.ndarray]:
+    def _aimed(self) -> dict[tuple[float, bytes], AimedPoints]:
         return {}
 
     def vignetted(self, pupil: np.ndarray) -> np.ndarray:
@@ -227,16 +238,37 @@ class Request:
         radius = 0.5 * self.telescope.pupil_diameter
         return radius * vignetted(pupil / radius, self.vignetting)
 
+    def pupil_coordinates(self, wavelength: float, entrance: np.ndarray) -> np.ndarray:
+        """Return the pupil points [m] of the only field for points [n, 2] [m] of the plane of the entrance pupil.
+
+        The inverse of :meth:`entrance_points`; NaN where a ray does not reach the stop.
+        """
+        points = pupil_coordinates(self.telescope, self.directions[0], wavelength, entrance)
+        if self.vignetting is None:
+            return points
+        radius = 0.5 * self.telescope.pupil_diameter
+        return radius * unvignetted(points / radius, self.vignetting[0])
+
     @check_arguments
-    def bundles(self, wavelength: float, pupil: np.ndarray | None = None) -> Bundles:
-        """Trace the rays of :meth:`launch` to the detector."""
-        points = self.pupil.points if pupil is None else pupil
+    def bundles(
+        self, wavelength: float, pupil: np.ndarray | None = None, *, entrance: np.ndarray | None = None
+    ) -> Bundles:
+        """Trace the rays of :meth:`launch` to the detector.
+
+        Or those of the only field through points `entrance` [n, 2] [m] of the plane of the entrance pupil, not aimed.
+        """
         # The chief ray is traced as one more point of the pupil.
-        rays = self.launch(wavelength, np.concatenate([points, np.zeros((*points.shape[:-2], 1, 2))], axis=-2))
+        if entrance is None:
+            points = self.pupil.points if pupil is None else pupil
+            rays = self.launch(wavelength, np.concatenate([points, np.zeros((*points.shape[:-2], 1, 2))], axis=-2))
+        else:
+            chief = self.entrance_points(wavelength, np.zeros((1, 2))).reshape(1, 2)
+            through = np.concatenate([entrance, chief])
+            rays = straight_bundles(self.telescope, self.directions, wavelength, through)
         end = imaged(self.telescope, trace(self.telescope, rays, threads=self.threads), wavelength)
         n, detector = len(self.fields), self.telescope.surfaces[-1]
         position = detector.to_local(end.position).reshape(n, -1, 3)
-        direction = (end.direction @ detector.matrix).reshape(n, -1, 3)
+        direction = detector.along(end.direction).reshape(n, -1, 3)
         path, status = end.path_length.reshape(n, -1), end.status.reshape(n, -1)
         return Bundles(
             position=position[:, :-1],

@@ -57,7 +57,7 @@ def _through_ring(
             light = local[None] - surface.to_local(start)[:, None, None]
             slope = (np.hypot(light[..., 0], light[..., 1]) / np.abs(light[..., 2])).max(axis=-1)
         else:
-            light = directions @ surface.matrix
+            light = surface.along(directions)
             slope = (np.hypot(light[:, 0], light[:, 1]) / np.abs(light[:, 2]))[:, None]
         shift = slope * rise + _ROUNDING
     # Written so that a NaN counts as light.

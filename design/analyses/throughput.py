@@ -233,4 +233,4 @@ def _incidence(surface: Surface, result: TraceResult, direction: np.ndarray) -> 
     x, y, _ = surface.to_local(result.position).T
     slope_x, slope_y = surface.shape.gradient(x, y)
     normal = np.stack([-slope_x, -slope_y, np.ones_like(x)], axis=-1) / np.sqrt(1.0 + slope_x**2 + slope_y**2)[:, None]
-    return np.abs(np.einsum("ni,ni->n", direction @ surface.matrix, normal))
+    return np.abs(np.einsum("ni,ni->n", surface.along(direction), normal))

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
+from ...core.threads import one_blas_thread
 from ...core.units import field_label, length, require_count
 from ...models.telescope import Telescope
 from ...raytrace.ideal_lens import require_image
@@ -217,6 +218,7 @@ class _Plan:
             if not (np.isfinite(self.pixel) and self.pixel > 0):
                 raise DomainError(f"pixel = {pixel!r}: expected a positive length in metres")
 
+    @one_blas_thread()
     def image(
         self,
         method: str,

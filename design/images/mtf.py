@@ -232,7 +232,7 @@ def mtf(
 
 def tangential_angle(telescope: Telescope, principal: PrincipalRays) -> np.ndarray:
     """Return the angle from the x axis of the detector to the tangential direction [rad], shape [n_field]."""
-    ends = principal.marginal_direction @ telescope.surfaces[-1].matrix
+    ends = telescope.surfaces[-1].along(principal.marginal_direction)
     across = ends[:, 0, :2] - ends[:, 1, :2]
     return np.arctan2(across[:, 1], across[:, 0])
 

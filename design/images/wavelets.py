@@ -119,26 +119,31 @@ def lattice_wavelets(
     """
     telescope, radius = request.telescope, 0.5 * request.telescope.pupil_diameter
     rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    straight = angle == 0.0
 
+    # Points of the plane of the entrance pupil: where rays are aimed, the stop has to be traced to, not to be hit.
     def rays(points: np.ndarray) -> tuple[Bundles, np.ndarray, np.ndarray]:
-        bundle = request.bundles(wavelength, points)
+        bundle = request.bundles(wavelength, entrance=points)
         opd, cosine = _at_reference(telescope, bundle, center)
-        return bundle, opd, cosine @ rotation
+        return bundle, opd, cosine if straight else cosine @ rotation
 
-    guess = _InverseMap(telescope, rays)
+    def lit_rays(bundle: Bundles, points: np.ndarray) -> np.ndarray:
+        return bundle.lit[0] & _in_annulus(telescope, request.pupil_coordinates(wavelength, points))
+
+    guess = _InverseMap(request, wavelength, rays)
     n = 2 * int(np.ceil(guess.reach / spacing)) + 3
     steps = (np.arange(n) - n // 2) * spacing
     targets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     start, slopes = guess.on_lattice(steps)
-    start = start.reshape(-1, 2)
+    start, slopes = start.reshape(-1, 4), slopes.reshape(-1, 4, 2)
     # A cell reaches half a spacing to all sides; beyond that the polynomials need not hold.
     margin = spacing * guess.metres_per_cosine
-    near = np.flatnonzero(np.hypot(*start.T) <= radius + margin)
-    targets, points = targets[near], start[near]
-    jacobian = slopes.reshape(-1, 2, 2)[near]
+    near = np.flatnonzero(np.hypot(*start.T[2:]) <= radius + margin)
+    targets, points = targets[near], start[near, :2]
+    jacobian, by_cosine = slopes[near, :2], slopes[near, 2:]
     for _ in range(_MOST_TRACES):
         bundle, opd, cosine = rays(points)
-        lit = bundle.lit[0] & _in_annulus(telescope, points)
+        lit = lit_rays(bundle, points)
         off = targets - cosine
         known = np.isfinite(off).all(axis=1)
         if not (lit & known).any():
@@ -151,8 +156,8 @@ def lattice_wavelets(
             f"{field_label(request.fields[0])}: rays could not be aimed at all directions; expected a pupil that the "
             "telescope maps one to one on its image (huygens_psf does without)"
         )
-    cover = _coverage(telescope, rays, points, jacobian, lit, near, n, spacing)
-    cell = np.abs(np.linalg.det(jacobian)) * spacing**2
+    cover = _coverage(lambda some: lit_rays(rays(some)[0], some), points, jacobian, lit, near, n, spacing)
+    cell = np.abs(np.linalg.det(by_cosine)) * spacing**2
     annulus = np.pi * radius**2 * (1.0 - telescope.pupil_obscuration**2)
     energy = np.where(np.isfinite(opd), cell / annulus, 0.0)
     amplitude, path = np.zeros((2, n * n))
@@ -191,13 +196,15 @@ _Trace = Callable[[np.ndarray], tuple[Bundles, np.ndarray, np.ndarray]]
 
 
 class _InverseMap:
-    """Polynomials for the point of the entrance pupil whose ray has given cosines."""
+    """Polynomials for the point of the entrance pupil whose ray has given cosines: in its plane, and as aimed."""
 
-    def __init__(self, telescope: Telescope, rays: _Trace) -> None:
+    def __init__(self, request: Request, wavelength: float, rays: _Trace) -> None:
+        telescope = request.telescope
         radius = 0.5 * telescope.pupil_diameter
         # The outermost ring stands a little beyond the rim, so that nothing has to be extrapolated.
         points = ring_annulus(1.05 * radius, 0.9 * telescope.pupil_obscuration, _RINGS).points
-        bundle, _, cosine = rays(points)
+        entrance = request.entrance_points(wavelength, points).reshape(-1, 2)
+        bundle, _, cosine = rays(entrance)
         lit = bundle.lit[0] & np.isfinite(cosine[:, 0])
         if lit.sum() < 3:
             raise DomainError(f"{telescope.name}: {int(lit.sum())} of {len(lit)} rays arrive; expected a lit pupil")
@@ -211,26 +218,27 @@ class _InverseMap:
             raise DomainError(
                 f"{telescope.name}: {int(known.sum())} of {len(known)} rays arrive; expected most of them"
             )
-        points, cosine = points[known], cosine[known]
+        values, cosine = np.concatenate([entrance, points], axis=1)[known], cosine[known]
         self.reach = float(np.abs(cosine).max())
         first, second = (self._powers(cosine[:, axis]) for axis in (0, 1))
         i, j = np.nonzero(np.add.outer(np.arange(_DEGREE + 1), np.arange(_DEGREE + 1)) <= _DEGREE)
-        self._coefficients = np.zeros((_DEGREE + 1, _DEGREE + 1, 2))
-        self._coefficients[i, j] = np.linalg.lstsq(first[:, i] * second[:, j], points, rcond=None)[0]
+        self._coefficients = np.zeros((_DEGREE + 1, _DEGREE + 1, 4))
+        self._coefficients[i, j] = np.linalg.lstsq(first[:, i] * second[:, j], values, rcond=None)[0]
         #: Change of the pupil point with the cosines, about [m].
         self.metres_per_cosine = float(np.linalg.norm(slope[1:], 2))
 
     def on_lattice(self, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return points of the entrance pupil [m] for a lattice of cosines, and their derivatives by the cosines [m].
 
-        Shapes are [n, n, 2] and [n, n, 2, 2], the second axis of the lattice first.
+        Shapes are [n, n, 4] and [n, n, 4, 2], the second axis of the lattice first: points of the plane of the entrance
+        pupil, and the pupil points that are aimed there.
         """
         plain, derived = self._powers(steps), self._powers(steps, derivative=True)
         slopes = [self._on_lattice(derived, plain), self._on_lattice(plain, derived)]
         return self._on_lattice(plain, plain), np.stack(slopes, axis=-1)
 
     def _on_lattice(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        return np.stack([second @ self._coefficients[..., k].T @ first.T for k in (0, 1)], axis=-1)
+        return np.stack([second @ self._coefficients[..., k].T @ first.T for k in range(4)], axis=-1)
 
     def _powers(self, cosine: np.ndarray, *, derivative: bool = False) -> np.ndarray:
         """Return powers of cosines over their reach, from the zeroth, or their derivatives by the cosines."""
@@ -241,8 +249,7 @@ class _InverseMap:
 
 
 def _coverage(
-    telescope: Telescope,
-    rays: _Trace,
+    is_lit: Callable[[np.ndarray], np.ndarray],
     points: np.ndarray,
     jacobian: np.ndarray,
     lit: np.ndarray,
@@ -262,9 +269,7 @@ def _coverage(
     parts = ((np.arange(_PARTS) + 0.5) / _PARTS - 0.5) * spacing
     inside = np.stack(np.meshgrid(parts, parts), axis=-1).reshape(-1, 2)
     finer = points[mixed][:, None] + np.einsum("nij,pj->npi", jacobian[mixed], inside)
-    bundle, _, _ = rays(finer.reshape(-1, 2))
-    passed = bundle.lit[0] & _in_annulus(telescope, finer.reshape(-1, 2))
-    cover[mixed] = passed.reshape(-1, _PARTS**2).mean(axis=1)
+    cover[mixed] = is_lit(finer.reshape(-1, 2)).reshape(-1, _PARTS**2).mean(axis=1)
     return cover
 
 

@@ -222,4 +222,4 @@ class GhostTrace:
     def _landing(self, first: str, second: str, beam: _Beam) -> GhostLight:
         detector, lit = self._telescope.surfaces[-1], beam.weight > 0.0
         position = detector.to_local(beam.position[lit])[:, :2]
-        return GhostLight(first, second, position, beam.direction[lit] @ detector.matrix, beam.weight[lit])
+        return GhostLight(first, second, position, detector.along(beam.direction[lit]), beam.weight[lit])

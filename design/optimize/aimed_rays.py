@@ -37,13 +37,13 @@ class AimedRays:
         telescope = columns.telescope
         here = request if telescope is request.telescope else replace(request, telescope=telescope)
         #: Points of the plane of the entrance pupil [m], [n_pupil, 2] or [n_field, n_pupil, 2].
-        self.points = here.entrance_points(wavelength, pupil)
-        self._columns, self._directions, self._wavelength = columns, here.directions, wavelength
+        self.points = request.entrance_points_of(telescope, wavelength, pupil)
+        self._columns, self._directions, self._wavelength = columns, request.directions, wavelength
         #: [n, 2, n_parameter] motion of the points with the parameters; None where they stay.
         self.motion = None
         if telescope.design_data.aiming != "off" and columns.parameters:
             relative = here.vignetted(pupil) / (0.5 * telescope.pupil_diameter)
-            relative = np.broadcast_to(relative, (len(here.fields), *pupil.shape)).reshape(-1, 2)
+            relative = np.broadcast_to(relative, (len(request.fields), *pupil.shape)).reshape(-1, 2)
             self.motion = _motion(columns, self.rays, relative)
 
     @cached_property

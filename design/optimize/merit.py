@@ -5,7 +5,7 @@ The rays of a merit are those that are lit at the start; otherwise a merit could
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -63,12 +63,9 @@ class Beams:
 
         Where rays are aimed, they are aimed at the stop of that telescope.
         """
-        if telescope is self.request.telescope or telescope.design_data.aiming == "off":
-            here = self.request
-        else:
-            here = replace(self.request, telescope=telescope)
-        points = here.own_entrance_points(wavelength) if pupil is None else here.entrance_points(wavelength, pupil)
-        return straight_bundles(telescope, here.directions, wavelength, points)
+        at = self.request.pupil.points if pupil is None else pupil
+        points = self.request.entrance_points_of(telescope, wavelength, at)
+        return straight_bundles(telescope, self.request.directions, wavelength, points)
 
     def weights(self, telescope: Telescope) -> np.ndarray:
         """Return the weight of each ray in the mean square, [n_wave, n_field, n_pupil]; zero where it is not lit."""
@@ -156,7 +153,7 @@ class SpotMerit:
 
     def _beyond(self, telescope: Telescope, direction: np.ndarray) -> np.ndarray:
         """Return the shift of the landing points of rays [n, 3] from the detector to the heights [m], [2, n]."""
-        along = direction @ telescope.surfaces[-1].matrix
+        along = telescope.surfaces[-1].along(direction)
         return (along[:, :2] / along[:, 2:]).T * self._heights
 
     def _landing(self, aimed: AimedRays) -> np.ndarray:

@@ -94,7 +94,7 @@ class Instrument:
         if not lit.any():
             raise DomainError("no light passes the telescope")
         detector = telescope.surfaces[-1]
-        place, travel = detector.to_local(end.position[lit])[:, :2], end.direction[lit] @ detector.matrix
+        place, travel = detector.to_local(end.position[lit])[:, :2], detector.along(end.direction[lit])
         slopes = travel[:, :2] / travel[:, 2:]
         place, slopes = (v - v.mean(axis=0) for v in (place, slopes))
         # The rays are closest to each other where the detector moved by this distance would be.
