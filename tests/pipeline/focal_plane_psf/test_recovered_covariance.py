@@ -1,4 +1,4 @@
-"""What is fitted to turbulence alone and to optics alone, against what the tests put in."""
+"""Covariance and heights fitted to turbulence alone and to optics alone, against the input values."""
 
 import numpy as np
 import pytest
