@@ -1,4 +1,4 @@
-"""What moments of in-focus stars would add to the donuts of the active-optics loop, in linear theory.
+"""Gain of the active-optics loop from moments of in-focus stars beside the donuts, in linear theory.
 
 Run: python benchmarks/loop_with_focused_stars.py [stars] [states]
 

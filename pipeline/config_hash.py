@@ -1,4 +1,4 @@
-"""What of a configuration its hash is made of: all that affects products, files by their content."""
+"""Hash of a configuration: all values that affect products, files by their content."""
 
 from __future__ import annotations
 

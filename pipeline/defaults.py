@@ -32,7 +32,7 @@ from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.psf.long_exposure import default_points
 from .alignment_states import ENDINGS as STATE_ENDINGS
 from .alignment_states import in_state
-from .config import BandName, Configuration, ReconstructionConfig
+from .config import BandName, Configuration, PsfConfig, ReconstructionConfig
 from .photometry import band_of, pixel_angle, resolved_photometry
 from .psf_model.fit import COMPONENTS, ORDERS
 from .psf_model.polynomial import term_count
@@ -55,6 +55,9 @@ _SITE = "cerro_pachon"
 _WITH_ATMOSPHERE = {"n_pupil": PUPIL_POINTS, "diffusion_pixels": 0.4}
 _OPTICS_ALONE = {"n_pupil": PUPIL_POINTS_STILL, "diffusion_pixels": 0.0}
 _FINE = 4
+# FWHM of the weight of the moments [arcsec] with and without an atmosphere (Jee & Tyson 2011, sec. 3); where pixels are
+# coarse, so many of them, or the moments would be sums over one or two pixels.
+_WEIGHT, _WEIGHT_ALONE, _WEIGHT_PIXELS = 0.7, 0.3, 2.5
 # Sides of a stamp [arcsec], 31 pixels of the LSST and 61 fine ones; and fewest pixels.
 _SIDE, _SIDE_ALONE, _FEWEST = 6.2, 3.05, 15
 _T = TypeVar("_T")
@@ -113,6 +116,12 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     if wavelengths is None:
         low, high = telescope.band or telescope.wavelength_range
         wavelengths = tuple(round(float(w) * 1e9, 3) for w in np.linspace(low, high, _WAVELENGTHS))
+    psf = _filled(
+        config.psf,
+        (_WITH_ATMOSPHERE if atmosphere.enabled else _OPTICS_ALONE)
+        | _stamps(config, telescope, camera)
+        | ({"n_pupil": default_points(telescope)} if config.psf.engine == "long_exposure" else {}),
+    )
     resolved = config.model_copy(
         update={
             "band": band,
@@ -128,13 +137,8 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
                 atmosphere.model_copy(update={"site": site_name}),
                 {"r0_m": float(site.r0), "outer_scale_m": float(site.outer_scale)},
             ),
-            "psf": _filled(
-                config.psf,
-                (_WITH_ATMOSPHERE if atmosphere.enabled else _OPTICS_ALONE)
-                | _stamps(config, telescope, camera)
-                | ({"n_pupil": default_points(telescope)} if config.psf.engine == "long_exposure" else {}),
-            ),
-            "reconstruction": _reconstruction(config.reconstruction, 0.7 if atmosphere.enabled else 0.3),
+            "psf": psf,
+            "reconstruction": _reconstruction(config.reconstruction, _weight(atmosphere.enabled, psf, telescope)),
         }
     )
     telescope = as_configured(telescope, resolved)
@@ -194,6 +198,16 @@ def _stamps(config: Configuration, telescope: Telescope, camera: Camera) -> dict
         pixels = side * ARCSEC / pixel_angle(telescope, pixel)
         found["stamp"] = max(2 * round(0.5 * (pixels - 1.0)) + 1, _FEWEST)
     return found
+
+
+def _pixel_arcsec(psf: PsfConfig, telescope: Telescope) -> float:
+    return pixel_angle(telescope, given(psf.pixel_um) * 1e-6) / ARCSEC
+
+
+def _weight(enabled: bool, psf: PsfConfig, telescope: Telescope) -> float:
+    """Return the FWHM of the weight of the moments [arcsec]."""
+    least = _WEIGHT_PIXELS * _pixel_arcsec(psf, telescope)
+    return max(_WEIGHT if enabled else _WEIGHT_ALONE, round(least, 3))
 
 
 def as_configured(telescope: Telescope, config: Configuration) -> Telescope:
@@ -278,6 +292,12 @@ def _check(config: Configuration, telescope: Telescope) -> None:
             f" sensor.brighter_fatter = {config.sensor.brighter_fatter} moves"
         )
     fit, stars = config.reconstruction, config.stars
+    pixel = _pixel_arcsec(config.psf, telescope)
+    if not given(fit.weight_fwhm_arcsec) >= pixel:
+        raise ConfigError(
+            f"reconstruction.weight_fwhm_arcsec = {fit.weight_fwhm_arcsec:g}: expected at least {pixel:.3g}, a pixel,"
+            f" and better {_WEIGHT_PIXELS * pixel:.3g}"
+        )
     if fit.model == "focal_plane" and not config.atmosphere.enabled:
         raise ConfigError("reconstruction.model = focal_plane: expected atmosphere.enabled = true, whose mean it takes")
     if fit.basis == "pixels" and fit.components is not None:

@@ -1,4 +1,4 @@
-"""What files can hold: pickups that the values meet, links with a place, telescopes that lens files are made of."""
+"""Checks before writing: pickups that the values meet, links with a place, telescopes that lens files can hold."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from ...core.errors import DomainError
 from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
 from ...core.result import Result
-from ...core.units import length, positive_angle
+from ...core.units import ARCSEC, length, positive_angle
 from ...core.version import CREATOR
 from ...models.camera.camera import Camera
 from ...models.camera.focal_plane import FocalPlane
@@ -167,6 +167,11 @@ class FocalPlanePsf(Result):
         reporter = Reporter(quiet=True) if reporter is None else reporter
         given = stars_of(stars)
         weight = given.weight_fwhm if weight_fwhm is None else positive_angle(weight_fwhm, "weight_fwhm")
+        if given.pixel_scale is not None and weight < given.pixel_scale:
+            raise DomainError(
+                f"weight_fwhm = {weight / ARCSEC:.3g} arcsec: expected at least a pixel of the stamps,"
+                f" {given.pixel_scale / ARCSEC:.3g} arcsec, and better 2.5 of them"
+            )
         mosaic = mosaic_of(given, telescope, focal_plane, camera)
         used = given.usable
         if used.sum() < LEAST_STARS:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from astropy import units as u
+from astropy.io import fits
 from astropy.table import Table
 from numpy.typing import NDArray
 
@@ -136,7 +137,7 @@ class FocalPlaneStars(Result):
         stamps : array, optional
             Images of the stars, [n, ny, nx].
         pixel_scale, weight_fwhm : float
-            Pixel of the stamps, and weight of the moments [rad].
+            Pixel of the stamps, and weight of the moments [rad]; at least a pixel, better 2.5.
 
         Notes
         -----
@@ -202,7 +203,8 @@ class FocalPlaneStars(Result):
             files = sorted(place.glob("ccd_*.fits"))
             if not files:
                 raise ProductError("no products of a run (ccd_*.fits)", file=place)
-            return cls.from_products([read_product(f, holdout_images=False) for f in files], **options)
+            products = [read_product(f, holdout_images=False) for f in files]
+            return cls.from_products(products, **{"weight_fwhm": _weight_of(files[0])} | options)
         require_file(place, ProductError)
         with parsing(place, "cannot be read as a table of stars", ProductError):
             kind = "fits" if place.suffix.lower() in (".fits", ".fit") else "ascii.ecsv"
@@ -227,6 +229,12 @@ class FocalPlaneStars(Result):
             self.weight_fwhm,
             self.pixels,
         )
+
+
+def _weight_of(product: Path) -> float:
+    """Return the weight of the moments in a product of a run [rad]."""
+    with parsing(product, "no weight of the moments, WFWHM", ProductError):
+        return float(fits.getval(product, "WFWHM")) * ARCSEC
 
 
 def photon_noise(

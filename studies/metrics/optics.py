@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...core.errors import DomainError
 from ...design.images.encircled_energy import encircled_energy
 from ...design.metrics.field_zernikes import wavefront_zernikes
 from ...design.metrics.spots import spots
@@ -54,13 +55,22 @@ def landing(scene: Scene) -> dict[str, float]:
 
 @OPTICS.group("zernike", Metric("zernike", "nm", "path"))
 def zernike(scene: Scene) -> dict[str, float]:
-    """Return annular Zernike terms (Noll) of each field at the middle wavelength."""
-    fit = wavefront_zernikes(scene.telescope, scene.fields, scene.middle, jmax=_HIGHEST, threads=scene.threads)
-    return {
-        f"zernike Z{j} field {_pair(place)}": float(row[j - 1]) * 1e9
-        for row, place in zip(fit.coefficients, scene.plan.fields_deg, strict=True)
-        for j in range(4, _HIGHEST + 1)
-    }
+    """Return annular Zernike terms (Noll) at the middle wavelength of each field whose annulus reaches the detector.
+
+    DomainError, the reason at the last field, if none does.
+    """
+    metrics, missed = {}, None
+    for field, place in zip(scene.fields, scene.plan.fields_deg, strict=True):
+        try:
+            fit = wavefront_zernikes(scene.telescope, field[None], scene.middle, jmax=_HIGHEST, threads=scene.threads)
+        except DomainError as error:
+            missed = error
+            continue
+        row = fit.coefficients[0]
+        metrics |= {f"zernike Z{j} field {_pair(place)}": float(row[j - 1]) * 1e9 for j in range(4, _HIGHEST + 1)}
+    if missed is not None and not metrics:
+        raise missed
+    return metrics
 
 
 @OPTICS.group("spot", Metric("spot", "um", "path"))

@@ -31,7 +31,7 @@ def table(tmp_path_factory):
 
 
 def owner(label, function):
-    """What has the docstring of a call: the class of a constructor, or the function."""
+    """Object with the docstring of a call: the class of a constructor, or the function."""
     return getattr(pachon, label, function)
 
 

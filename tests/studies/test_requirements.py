@@ -248,3 +248,15 @@ def test_a_lens_file_with_several_wavelengths_has_all_its_metrics_and_limits(tmp
     check = check_baseline(tmp_path / "b.baseline.json", lens, threads=1)
     beyond = {name for name, f in baseline.figures.items() if name.startswith("spot rms") and f.value > 3.0}
     assert {d.name for d in check.causes[BROKEN]} == beyond != set()
+
+
+@pytest.mark.long
+def test_a_field_whose_annulus_misses_the_detector_loses_its_zernikes_alone(tmp_path):
+    """At the edge of HSC's field some rays of the whole annulus leave the corrector."""
+    baseline, left_out = make_baseline("hsc", tmp_path, fields=np.radians([[0.0, 0.3], [0.0, 0.75]]), threads=1)
+    assert not left_out
+    zernikes = [name for name in baseline.figures if name.startswith("zernike")]
+    assert len(zernikes) == 12
+    assert not any("0.75" in name for name in zernikes)
+    _, left_out = make_baseline("hsc", tmp_path, fields=np.radians([[0.0, 0.75]]), threads=1)
+    assert "rays of the annulus miss the detector" in left_out["zernike"]

@@ -19,6 +19,7 @@ import numpy as np
 import scipy.fft
 import scipy.ndimage
 
+from ...core.threads import one_blas_thread
 from ...core.units import require_count
 from ..pupil_optics import PupilOptics
 from .channels import Channels
@@ -107,15 +108,16 @@ class LatticeTransfer:
         few = trace(self.wavelengths, self.sparse)
         terms = self._terms(self.sparse, _DEGREE)
         path, shift = np.zeros((n_star, n_wave, terms.shape[1])), np.zeros((n_star, n_wave, 2))
-        for star in range(n_star):
-            # Dark rays may pass a lens far outside of what is ground.
-            lit = few.lit[star].all(axis=0)
-            count = next((n for n in _TERMS if _RAYS_A_TERM * n <= lit.sum()), 0)
-            if count:
-                change = few.path[star][:, lit] - few.path[star][middle, lit]
-                path[star, :, :count] = np.linalg.lstsq(terms[lit, :count], change.T, rcond=None)[0].T
-                landed = few.displacement[star][:, lit]
-                shift[star] = (landed - landed[middle]).mean(axis=1, dtype=np.float64)
+        with one_blas_thread():
+            for star in range(n_star):
+                # Dark rays may pass a lens far outside of what is ground.
+                lit = few.lit[star].all(axis=0)
+                count = next((n for n in _TERMS if _RAYS_A_TERM * n <= lit.sum()), 0)
+                if count:
+                    change = few.path[star][:, lit] - few.path[star][middle, lit]
+                    path[star, :, :count] = np.linalg.lstsq(terms[lit, :count], change.T, rcond=None)[0].T
+                    landed = few.displacement[star][:, lit]
+                    shift[star] = (landed - landed[middle]).mean(axis=1, dtype=np.float64)
         return LatticeRays(optics, path, shift)
 
     def at(self, rays: LatticeRays, star: int, channels: Channels, k: np.ndarray) -> np.ndarray:
@@ -169,7 +171,7 @@ class LatticeTransfer:
             # A wavenumber belongs to minus its baseline in the correlation: the conjugate of that at plus.
             baseline = along * wavelength
             where = baseline.T[::-1] / spacing + longest
-            smooth = scipy.ndimage.map_coordinates(samples[channel], where, order=_ORDER, mode="nearest")
+            smooth = scipy.ndimage.map_coordinates(samples[channel], where, order=_ORDER, mode="mirror")
             out[channel] = np.conj(smooth * np.exp(1j * (baseline @ tilts[channel]) - np.hypot(*(fall * baseline).T)))
         return out
 

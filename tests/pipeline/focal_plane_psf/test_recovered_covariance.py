@@ -1,4 +1,4 @@
-"""Fits to turbulence alone, to optics alone and to their sum, against what the tests put in."""
+"""Covariance and heights fitted to turbulence alone, to optics alone and to their sum, against the input values."""
 
 import numpy as np
 import pytest

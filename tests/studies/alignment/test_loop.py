@@ -73,7 +73,7 @@ def test_bytes_do_not_depend_on_threads_or_later_visits(aligned, traced_donuts):
 @pytest.mark.long
 def test_a_killed_loop_goes_on_to_the_same_bytes(traced_donuts, tmp_path, monkeypatch):
     class Killed(BaseException):
-        """What ends a process."""
+        """Stand-in for the end of a process."""
 
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     align(config(visits=2), store=whole)

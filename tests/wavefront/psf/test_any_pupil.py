@@ -1,6 +1,7 @@
 """The long-exposure engine on pupils of any form: vanes, plates, vignetting, no obscuration, small ones."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,24 +23,8 @@ from pachon.wavefront.pupil_optics import trace_pupils
 
 ARCSEC = np.pi / 180 / 3600
 R0, OUTER_SCALE = 0.16, 25.0
-REFRACTOR = """\
-name: refractor
-description: a lens of 10 cm with a hyperbolic face, without aberration on the axis
-source: test
-version: "1"
-units: {length: m, angle: deg, wavelength: um}
-stop: {z: 0.0}
-pupil: {diameter: 0.1, obscuration: 0.0}
-launch_distance: 0.5
-reference_sphere_radius: 0.8
-field: {radius: 1.0, limit: 2.0}
-wavelengths: {range: [0.4, 0.9], default: 0.62}
-media: {glass: {n: 1.5}}
-surfaces:
-  - {name: front, type: refract, shape: plane, z: 0.0, circle: 0.05, medium: glass}
-  - {name: back, type: refract, shape: conic, z: -0.02, radius: 0.4, conic: -2.25, circle: 0.06, medium: vacuum}
-  - {name: Detector, type: detector, shape: plane, z: -0.82, circle: 0.03}
-"""
+#: A lens of 10 cm with a hyperbolic face.
+REFRACTOR = Path(__file__).parents[2] / "data" / "telescopes" / "refractor.yaml"
 
 
 def air(seed=1, **options):
@@ -134,10 +119,9 @@ def closed_form(plane, diameter, obscuration, focal, wavelength, r0, margin=1.25
     return (plane.pixel_size * (k[1] - k[0]) / (2 * np.pi)) ** 2 * (to_pixels @ otf @ to_pixels.T).real
 
 
-def test_a_small_refractor_is_the_closed_product_of_transfer_functions(tmp_path):
+def test_a_small_refractor_is_the_closed_product_of_transfer_functions():
     """An open pupil as wide as the Fried parameter, where no baseline is left out."""
-    (tmp_path / "refractor.yaml").write_text(REFRACTOR)
-    telescope = pachon.load_telescope(tmp_path / "refractor.yaml")
+    telescope = pachon.load_telescope(REFRACTOR)
     plane = ImagePlane(31, 2.4e-6, 0.5e-6)
     image = engine_for(telescope, 620e-9, plane).render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
     expected = closed_form(plane, 0.1, 0.0, 0.8, 620e-9, R0)
