@@ -3,9 +3,10 @@
 Run: python benchmarks/trace_vs_batoid.py [rays]
 
 Three telescopes: the LSST's baseline (conics and even aspheres), Rubin as built (tilted, with Zernike terms on three
-lens surfaces), and the baseline with a bicubic grid of 201 x 201 nodes on M1. pachon on one thread and batoid take
-turns in one process, under the same load; they are timed by processor time, which other work on the machine hardly
-changes. Then pachon on two threads and on one take turns by the clock. The first compilation is timed apart. Ratios are
+lens surfaces), and the baseline with a bicubic grid of 201 x 201 nodes on M1. pachon on one thread, with the arrays of
+an earlier result (``out=``) and without, and batoid take turns in one process, under the same load; each turn is timed
+by processor time, which other work on the machine hardly changes, and by the clock. Then pachon on two threads and on
+one take turns by the clock. The first compilation is timed apart. Ratios are
 of the best times: other work can only add to a time.
 """
 
@@ -36,10 +37,11 @@ def with_grid():
     return telescope, optic.withSurface("M1", batoid.Sum([optic["M1"].surface, grid]))
 
 
-def timed(work, clock=time.perf_counter):
-    start = clock()
+def timed(work):
+    """Return the processor time and the time by the clock [s], and the result."""
+    start, processor = time.perf_counter(), time.process_time()
     result = work()
-    return clock() - start, result
+    return np.array([time.process_time() - processor, time.perf_counter() - start]), result
 
 
 def compare(name, telescope, optic):
@@ -49,25 +51,32 @@ def compare(name, telescope, optic):
     pupil = radius * np.cos(angle), radius * np.sin(angle)
     rays = pachon.launch_rays(telescope, FIELD, WAVELENGTH, pupil)
     few = pachon.launch_rays(telescope, FIELD, WAVELENGTH, ([3.0], [0.0]))
-    first, _ = timed(lambda: pachon.trace(telescope, few, threads=1))
+    first = timed(lambda: pachon.trace(telescope, few, threads=1))[0][1]
 
-    one, theirs, turns, two = [], [], [], []
+    fresh, given, theirs, turns, two = [], [], [], [], []
+    out = pachon.trace(telescope, rays, threads=1)
     for _ in range(ROUNDS):
         peer = batoid.RayVector.fromStop(
             *pupil, optic=optic, wavelength=WAVELENGTH, theta_x=FIELD[0], theta_y=FIELD[1], projection="zemax"
         )
-        theirs.append(timed(lambda peer=peer: optic.trace(peer), time.process_time)[0])
-        seconds, result = timed(lambda: pachon.trace(telescope, rays, threads=1), time.process_time)
-        one.append(seconds)
+        theirs.append(timed(lambda peer=peer: optic.trace(peer))[0])
+        seconds, result = timed(lambda: pachon.trace(telescope, rays, threads=1))
+        fresh.append(seconds)
+        given.append(timed(lambda: pachon.trace(telescope, rays, threads=1, out=out))[0])
     for _ in range(ROUNDS):
-        turns.append(timed(lambda: pachon.trace(telescope, rays, threads=1))[0])
-        two.append(timed(lambda: pachon.trace(telescope, rays, threads=2))[0])
-    ratios = np.array(theirs) / np.array(one)
+        turns.append(timed(lambda: pachon.trace(telescope, rays, threads=1))[0][1])
+        two.append(timed(lambda: pachon.trace(telescope, rays, threads=2))[0][1])
     position = peer.toCoordSys(batoid.CoordSys()).r
     print(f"{name}: first call (kernels compiled or loaded) {first:.2f} s")
-    print(f"  batoid {min(theirs) / RAYS * 1e9:6.0f} ns a ray (median {np.median(theirs) / RAYS * 1e9:.0f})")
-    print(f"  pachon {min(one) / RAYS * 1e9:6.0f} ns a ray (median {np.median(one) / RAYS * 1e9:.0f})")
-    print(f"  ratio  {min(theirs) / min(one):6.1f} (pair by pair {ratios.min():.1f} to {ratios.max():.1f})")
+    for i, clock in enumerate(("processor time", "by the clock")):
+        peers, *ours = (np.array(times)[:, i] for times in (theirs, fresh, given))
+        print(f"  {clock}: batoid {peers.min() / RAYS * 1e9:.0f} ns a ray (median {np.median(peers) / RAYS * 1e9:.0f})")
+        for name, seconds in zip(("fresh arrays", "out="), ours, strict=True):
+            pairs = peers / seconds
+            print(
+                f"    {name}: {seconds.min() / RAYS * 1e9:.0f} ns a ray (median {np.median(seconds) / RAYS * 1e9:.0f}),"
+                f" {peers.min() / seconds.min():.1f} times batoid (pair by pair {pairs.min():.1f} to {pairs.max():.1f})"
+            )
     print(f"  two threads {min(two) / RAYS * 1e9:.0f} ns a ray, {min(turns) / min(two):.2f} times one")
     print(f"  landing points differ by at most {np.nanmax(np.abs(position - result.position)):.1e} m")
 

@@ -67,8 +67,7 @@ def claim_folder(path: Path, content: bytes, *, products: str, check: Callable[[
     """Write the configuration of a run into its folder, or find that the folder is another run's.
 
     Of runs that start together in a new folder one writes the file. To the others, and in an old folder, `check`
-    compares it with theirs and raises where they differ; otherwise it is written again. Temporary files of processes
-    that ended are removed.
+    compares it with theirs and raises where they differ; otherwise it is written again.
 
     Parameters
     ----------
@@ -93,7 +92,6 @@ def claim_folder(path: Path, content: bytes, *, products: str, check: Callable[[
     if not write_new_bytes(path, content):
         check()
         write_bytes(path, content)
-    remove_leftovers(folder)
 
 
 def partial_path(path: Path) -> Path:
@@ -136,7 +134,7 @@ def publish_new(partial: Path, path: Path) -> None:
 def marked_folder(folder: Path) -> Iterator[str]:
     """Put a file of a unique name into a folder, and yield that name: who finds it there sees the same folder.
 
-    The file is a temporary one, which :func:`remove_leftovers` knows.
+    The file is a temporary one, which :func:`make_folder` knows.
     """
     mark = folder / f".{uuid4().hex}.{_owner(os.getpid())}.partial"
     write_bytes(mark, b"")
@@ -157,13 +155,14 @@ def folder_of_worker(folder: Path, mark: str) -> Iterator[Path]:
         yield Path(own)
 
 
-def remove_leftovers(folder: Path) -> None:
+def _remove_leftovers(folder: Path) -> None:
     """Remove the temporary files of processes that ended; those of live ones, and of other machines, stay."""
     for left_over in folder.glob(".*.partial"):
         owner = left_over.name.removesuffix(".partial")
         process = owner.rpartition("-")[2]
         if owner.endswith(f".{_owner(process)}") and process.isdecimal() and not _alive(int(process)):
-            left_over.unlink(missing_ok=True)
+            with suppress(OSError):
+                left_over.unlink()
 
 
 def _owner(process: int | str) -> str:
@@ -227,11 +226,12 @@ def require_file(path: Path, error: type[PachonError]) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder, and those it lies in, where they are not there yet."""
+    """Make a folder and those it lies in, or remove from it the temporary files of processes that ended."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ProductError(f"cannot make the folder {folder}: {error.strerror}") from None
+    _remove_leftovers(folder)
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

@@ -104,11 +104,11 @@ def worker_name() -> str:
 def _begin() -> None:
     """Let Ctrl-C end the process that hands out jobs, not those that do them; these end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    threading.Thread(target=end_with, args=(os.getppid(),), daemon=True).start()
 
 
-def _end_with(parent: int) -> None:
-    """End this process when its parent has gone: one that is killed cannot tell its workers."""
+def end_with(parent: int) -> None:
+    """End this process when its parent has gone: one that is killed cannot tell its workers. It does not return."""
     while os.getppid() == parent:
         time.sleep(PARENT_SECONDS)
     os._exit(1)

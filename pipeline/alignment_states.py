@@ -9,11 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from astropy.table import QTable
 
 from ..core.errors import ConfigError, error_context
 from ..core.files import parsing, read_bytes
-from ..design.parameters.degrees_of_freedom_file import load_degrees_of_freedom
 from ..models.telescope import Telescope
 
 #: Endings of files of states.
@@ -30,6 +28,11 @@ def in_state(telescope: Telescope, path: str, visit: int) -> Telescope:
     UnknownNameError, DomainError
         If a column is no degree of freedom, or a value is not finite or has a unit that does not convert.
     """
+    # Degrees of freedom come with the kernels of derivatives, which take a quarter of a second.
+    from astropy.table import QTable
+
+    from ..design.parameters.degrees_of_freedom_file import load_degrees_of_freedom
+
     file = Path(path)
     text = read_bytes(file, ConfigError)
     with parsing(file, "expected a table of states (ECSV)", ConfigError):

@@ -160,20 +160,14 @@ class ObservedStars(Stars):
 
 
 @dataclass(frozen=True)
-class CcdProduct:
-    """Stars, stamps and PSF models of one CCD."""
+class CcdStars:
+    """Stars of one CCD: their positions and shapes, without images and models of PSFs."""
 
     name: str
     center: tuple[float, float]  #: on the detector [m]
-    pixel_scale: float  #: angle of a stamp's pixel [rad]
-    noise: tuple[float, float]  #: sky and rms noise without light [electrons/pixel]
     holdout: HoldoutStars
     observed: ObservedStars
-    holdout_images: np.ndarray  #: float32 [n, ny, nx], centred, unit sum; empty if not read
-    observed_images: np.ndarray  #: likewise; NaN where a star could not be centred
-    model: PsfModel  #: fitted to the observed stars
-    noise_free_model: PsfModel  #: fitted to the noise-free PSFs
-    rotator: float = 0.0  #: angle of the camera from +x towards +y of the telescope frame [rad]
+    rotator: float = field(default=0.0, kw_only=True)  #: of the camera, from +x towards +y of the telescope frame [rad]
 
     @property
     def of_focal_plane(self) -> bool:
@@ -215,6 +209,23 @@ class CcdProduct:
         if kind == "left_out":
             return stars.e1 - self.observed.leave_one_out_e1, stars.e2 - self.observed.leave_one_out_e2
         return stars.residual_e1, stars.residual_e2
+
+
+@dataclass(frozen=True)
+class CcdProduct(CcdStars):
+    """Stars, stamps and PSF models of one CCD."""
+
+    pixel_scale: float  #: angle of a stamp's pixel [rad]
+    noise: tuple[float, float]  #: sky and rms noise without light [electrons/pixel]
+    holdout_images: np.ndarray  #: float32 [n, ny, nx], centred, unit sum; empty if not read
+    observed_images: np.ndarray  #: likewise; NaN where a star could not be centred
+    model: PsfModel  #: fitted to the observed stars
+    noise_free_model: PsfModel  #: fitted to the noise-free PSFs
+
+    @property
+    def ccd_stars(self) -> CcdStars:
+        """The stars alone, a hundredth of the memory."""
+        return CcdStars(self.name, self.center, self.holdout, self.observed, rotator=self.rotator)
 
 
 def to_detector_axes(field: np.ndarray, rotator: float) -> np.ndarray:

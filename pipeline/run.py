@@ -10,15 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import trimesh
-from trimesh.exchange.gltf import export_glb
-
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.files import write_bytes, write_json
-from ..core.products import write_ecsv
 from ..core.progress import Reporter
+from ..core.second_process import Submit, second_process
 from ..core.threads import thread_count
 from ..core.version import VERSION
 from ..core.workers import MakeWorkers
@@ -29,11 +25,12 @@ from .experiment import Experiment
 from .focal_plane_stage import apply_focal_plane_model, write_focal_plane_model
 from .measure.summary import correlations, run_metrics
 from .memory import check_memory
-from .report.report import build_report, draw_pictures
+from .report.focal_plane_files import write_focal_plane
+from .report.report import build_report
 from .run_folder import SUMMARY_NAME, claim_run, finished_ccds, stamp_of, write_ccd
 from .simulate.ccd_loop import check_catalogue, simulate_ccds
 
-_MESH_CELLS = 16
+REPORT_NAME = "report.html"
 
 
 @dataclass(frozen=True)
@@ -124,28 +121,47 @@ def run(
     # The report of a finished run needs no screens.
     if missing and workers is None:
         check_memory(experiment, threads)
-    claim_run(folder, experiment, resume=resume)
-    if experiment.star_list is not None:
-        reporter.line(experiment.star_list.text)
-    if kept:
-        reporter.line(f"{len(kept)} of {len(names)} CCDs are finished already")
-    failed: dict[str, str] = {}
-    if missing and workers is not None:
-        failed = compute_ccds(experiment, folder, missing, workers, strict=strict, reporter=reporter)
-    elif missing:
-        with experiment.screens(threads, reporter):
-            write = partial(write_ccd, experiment, folder)
-            simulated = simulate_ccds(experiment, write, missing, strict=strict, threads=threads, reporter=reporter)
-            failed = simulated.not_modelled
-    computed = tuple(name for name in missing if name not in failed)
-    if parts > 1:
-        # Other parts may have ended meanwhile.
-        left = [name for name in names if name not in (*kept, *missing)]
-        finished = finished_ccds(folder, experiment, left)
-        waited = tuple(name for name in left if name not in finished)
-        if waited:
-            return RunResult(folder, None, {}, kept, computed, failed, waited)
-    names = tuple(name for name in names if name not in failed)
+    with second_process(threads) as submit:
+        claim_run(folder, experiment, resume=resume)
+        if experiment.star_list is not None:
+            reporter.line(experiment.star_list.text)
+        if kept:
+            reporter.line(f"{len(kept)} of {len(names)} CCDs are finished already")
+        focal_plane = submit(write_focal_plane, experiment, folder)
+        submit(_load_plots)
+        failed: dict[str, str] = {}
+        if missing and workers is not None:
+            failed = compute_ccds(experiment, folder, missing, workers, strict=strict, reporter=reporter)
+        elif missing:
+            with experiment.screens(threads, reporter):
+                write = partial(write_ccd, experiment, folder)
+                simulated = simulate_ccds(experiment, write, missing, strict=strict, threads=threads, reporter=reporter)
+                failed = simulated.not_modelled
+        computed = tuple(name for name in missing if name not in failed)
+        if parts > 1:
+            # Other parts may have ended meanwhile.
+            left = [name for name in names if name not in (*kept, *missing)]
+            finished = finished_ccds(folder, experiment, left)
+            waited = tuple(name for name in left if name not in finished)
+            if waited:
+                return RunResult(folder, None, {}, kept, computed, failed, waited)
+        with reporter.stage("focal plane"):
+            focal_plane()
+        summary = _summarize(experiment, folder, failed, submit, threads, reporter)
+    write_json(folder / "timings.json", _timings(reporter, threads))
+    return RunResult(folder, folder / REPORT_NAME, summary, kept, computed, failed)
+
+
+def _summarize(
+    experiment: Experiment,
+    folder: Path,
+    failed: dict[str, str],
+    submit: Submit,
+    threads: int | None,
+    reporter: Reporter,
+) -> dict[str, Any]:
+    """Write the summary and the report of the CCDs that are finished, all but the failed ones; return the summary."""
+    names = [name for name in experiment.config.ccds or () if name not in failed]
     if not names:
         name, reason = next(iter(failed.items()))
         raise DomainError(f"none of {len(failed)} CCDs can be modelled; CCD {name}: {reason}")
@@ -173,31 +189,17 @@ def run(
         if warnings is not None:
             summary["warnings"] = list(warnings)
         write_json(folder / SUMMARY_NAME, summary)
-    with reporter.stage("focal plane"):
-        _write_focal_plane(experiment, folder)
     with reporter.stage("report"):
-        report = folder / "report.html"
-        pictures = draw_pictures(experiment, products, correlated)
-        write_bytes(report, build_report(experiment, summary, pictures).encode())
-    write_json(folder / "timings.json", _timings(reporter, threads))
-    return RunResult(folder, report, summary, kept, computed, failed)
+        from .report.pictures import draw_pictures  # matplotlib takes half a second
+
+        pictures = draw_pictures(experiment, products, correlated, submit)
+        write_bytes(folder / REPORT_NAME, build_report(experiment, summary, pictures).encode())
+    return summary
 
 
-def _write_focal_plane(experiment: Experiment, folder: Path) -> None:
-    """Write the CCD surfaces as a mesh for any viewer, and heights of CCD centres and corners as a table."""
-    mesh = experiment.focal_plane.to_mesh(_MESH_CELLS)
-    write_bytes(folder / "focal_plane.glb", export_glb(trimesh.Scene(mesh)))
-    table = experiment.focal_plane.to_table(2)
-    write_ecsv(
-        folder / "focal_plane.ecsv",
-        {
-            "ccd": (np.asarray(table["ccd"]), "", "name of the CCD"),
-            "x_mm": (np.round(np.asarray(table["x"]) * 1e3, 6), "mm", "detector x"),
-            "y_mm": (np.round(np.asarray(table["y"]) * 1e3, 6), "mm", "detector y"),
-            "height_um": (np.round(np.asarray(table["z"]) * 1e6, 6), "um", "height along +z, towards the sky"),
-        },
-        {"what": "heights at the corners, edges and centre of each CCD"},
-    )
+def _load_plots() -> None:
+    """Import what draws, half a second, in the process that is to draw."""
+    from .report import pictures  # noqa: F401
 
 
 def _timings(reporter: Reporter, threads: int | None) -> dict[str, Any]:

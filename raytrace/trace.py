@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
 from ..core.arguments import check_arguments
-from ..core.errors import ConfigError
+from ..core.errors import ConfigError, DomainError
 from ..core.launch import launch
 from ..core.plotting import BLUE, axes_at, plain_text, styled
 from ..core.result import Result
@@ -58,6 +58,12 @@ class TraceResult(Result):
     path_length: np.ndarray
     status: np.ndarray
     ccd: np.ndarray | None = None
+    #: The arrays as a kernel writes them, for ``trace(out=)``; None where they are not those of one trace.
+    _packets: Any = field(default=None, kw_only=True, repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled and copied: all but the arrays of the kernel."""
+        return {**self.__dict__, "_packets": None}
 
     def _label(self) -> str:
         return f"{len(self.status)} rays at {self.surface}, {int(self.vignetted.sum())} without light"
@@ -91,13 +97,18 @@ class PacketTrace:
     end: Any  #: RayPackets after each of the last surfaces
 
 
-def trace_packets(telescope: Telescope, rays: Rays, n_stored: int, *, threads: int | None = None) -> PacketTrace:
-    """Trace rays in packets, the last one filled up, and store them at the last ``n_stored`` surfaces."""
+def trace_packets(
+    telescope: Telescope, rays: Rays, n_stored: int, *, threads: int | None = None, out: Any = None
+) -> PacketTrace:
+    """Trace rays in packets, the last one filled up, and store them at the last ``n_stored`` surfaces.
+
+    They are stored in the RayPackets ``out`` where these are given.
+    """
     packed = pack_surfaces(telescope)
     count = packet_count(len(rays))
     indices = refractive_indices(telescope, rays.wavelength)
     # The status of the start is not read.
-    start, end = RayPackets(), ray_packets(n_stored, count)
+    start, end = RayPackets(), ray_packets(n_stored, count) if out is None else out
     start.position = warp_array(to_packets(rays.position.T[None]), lanes)
     start.direction = warp_array(to_packets(rays.direction.T[None]), lanes)
     start.path = warp_array(to_packets(rays.path_length[None]), lanes)
@@ -115,6 +126,7 @@ def trace(
     *,
     focal_plane: FocalPlane | None = None,
     threads: int | None = None,
+    out: TraceResult | None = None,
 ) -> TraceResult: ...
 
 
@@ -137,6 +149,7 @@ def trace(
     *,
     focal_plane: FocalPlane | None = None,
     threads: int | None = None,
+    out: TraceResult | None = None,
 ) -> TraceResult | list[TraceResult]:
     """Trace rays sequentially through all surfaces of a telescope.
 
@@ -153,6 +166,9 @@ def trace(
         ray that lands between two of them has status GAP (or keeps its worse one) and ``ccd`` -1.
     threads : int, optional
         Number of threads; all processors by default. The result does not depend on it.
+    out : TraceResult, optional
+        Result of an earlier trace of as many rays to the last surface, whose arrays are overwritten and are those of
+        the new result: no memory is allocated. Not with ``surfaces="all"`` or a focal plane.
 
     Returns
     -------
@@ -161,21 +177,25 @@ def trace(
     Raises
     ------
     ConfigError
-        If ``surfaces`` is neither "last" nor "all".
+        If ``surfaces`` is neither "last" nor "all", or ``out`` is given with "all" or a focal plane.
     DomainError
-        If the telescope does not cover the wavelength.
+        If the telescope does not cover the wavelength, or ``out`` is no result of as many rays of one trace.
     """
     if surfaces not in ("last", "all"):
         raise ConfigError(f"surfaces = {surfaces!r}: expected 'last' or 'all'")
     n = len(rays)
     every = len(telescope.surfaces) if surfaces == "all" else 1
-    end = trace_packets(telescope, rays, every, threads=threads).end
+    if out is not None:
+        _check_out(out, n, alone=surfaces == "last" and focal_plane is None)
+    stored = None if out is None else out._packets
+    end = trace_packets(telescope, rays, every, threads=threads, out=stored).end
     names = telescope.surface_names if surfaces == "all" else telescope.surface_names[-1:]
     positions, directions = from_packets(end.position, n), from_packets(end.direction, n)
     paths, statuses = from_packets(end.path, n), from_packets(end.status, n)
     # Transposed views, not copies: the rays stay in structure-of-arrays order.
     results = [
-        TraceResult(name, positions[i].T, directions[i].T, paths[i], statuses[i]) for i, name in enumerate(names)
+        TraceResult(name, positions[i].T, directions[i].T, paths[i], statuses[i], _packets=end if every == 1 else None)
+        for i, name in enumerate(names)
     ]
     if focal_plane is not None:
         last = results[-1]
@@ -185,3 +205,13 @@ def trace(
         path = last.path_length + landing.path
         results[-1] = TraceResult(last.surface, landing.position, last.direction, path, status, landing.ccd)
     return results if surfaces == "all" else results[0]
+
+
+def _check_out(out: TraceResult, n: int, *, alone: bool) -> None:
+    """Raise an error unless the arrays of a result can hold those of n rays at the last surface."""
+    if not alone:
+        raise ConfigError('out: expected surfaces = "last", and no focal plane', key="out")
+    if out._packets is None or len(out.status) != n:
+        raise DomainError(
+            f"out = {out!r}: expected the result of an earlier trace of {n} rays to the last surface", key="out"
+        )

@@ -11,15 +11,17 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import PchipInterpolator
 
 from ...core.errors import DomainError
 from ...core.yaml_reader import read_mapping
 from .medium import wavelengths_within
+
+if TYPE_CHECKING:
+    from scipy.interpolate import PchipInterpolator
 
 #: Shortest and longest vacuum wavelength [m]: beyond the longest, silicon is transparent.
 WAVELENGTH_RANGE = (0.3e-6, 1.1e-6)
@@ -107,6 +109,8 @@ def _rajkanan(wavelength: np.ndarray, temperature: float) -> np.ndarray:
 
 @cache
 def _measured() -> _Measured:
+    from scipy.interpolate import PchipInterpolator  # a fifth of a second
+
     content = read_mapping(_DATA)
     wavelength, index, extinction, slope = np.array(content["rows"]).T
     light = wavelength * 1e-9

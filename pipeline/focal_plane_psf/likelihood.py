@@ -17,7 +17,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from scipy.optimize import minimize
 
 from .covariance import CCD_TERMS, COMPONENTS, Covariance, Places, ccd_terms, inverse_of_root
 
@@ -147,6 +146,8 @@ def fit_covariance(
         first[4 * COMPONENTS :] = again[4 * COMPONENTS :]
     first = np.clip(first, *np.transpose(bounds))
     width = np.array([*_WIDTHS * COMPONENTS, *[_VARIANCE_WIDTH] * (n_ccd + 1)])
+    from scipy.optimize import minimize  # a fifth of a second
+
     found = minimize(
         _negative_log_posterior,
         first,

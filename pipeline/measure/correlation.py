@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import treecorr
 from astropy.units import Quantity
 from numpy.typing import ArrayLike
 
@@ -17,6 +16,7 @@ from ...core.result import Result
 from ...core.units import ARCMIN, angle, radians, real_array, require_count
 
 if TYPE_CHECKING:
+    import treecorr
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -249,6 +249,8 @@ def shear_correlation(
         if len(found) < 2:
             raise DomainError(f"patch: all usable stars are of patch {found[0]}, expected at least 2 patches")
         of_stars |= {"patch": number, "npatch": len(found)}
+    import treecorr  # a tenth of a second
+
     catalogs = [treecorr.Catalog(x=px, y=py, g1=g[i], g2=g[i + 1], **of_stars) for i in range(0, len(g), 2)]
     pairs = treecorr.GGCorrelation(min_sep=low, max_sep=high, nbins=n_bins, bin_slop=0.1, brute=exact, verbose=0)
     pairs.process(*catalogs, num_threads=1)

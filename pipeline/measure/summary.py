@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...core.units import ARCMIN, ARCSEC
-from ..ccd_product import CCD_KINDS, CcdProduct, Stars
+from ..ccd_product import CCD_KINDS, CcdProduct, CcdStars, Stars
 from .correlation import SEPARATION_RANGES, Correlation, shear_correlation
 
 #: Ellipticities that are correlated; ``truth`` and ``away`` (noise-free - model) are of the holdout positions.
@@ -20,7 +20,7 @@ SHORTEST_ARCMIN = 0.5
 _BINS_PER_DECADE = 6
 
 
-def correlations(products: Sequence[CcdProduct], kinds: Sequence[str] | None = None) -> dict[str, Correlation]:
+def correlations(products: Sequence[CcdStars], kinds: Sequence[str] | None = None) -> dict[str, Correlation]:
     """Correlate ellipticities and residuals, of :data:`~.KINDS`, over all CCDs (Jee & Tyson 2011, Fig. 14).
 
     By default those of :data:`CORRELATED` and, beside a focal-plane model, the residuals of the CCDs' own models.
@@ -40,12 +40,12 @@ def correlations(products: Sequence[CcdProduct], kinds: Sequence[str] | None = N
     return result
 
 
-def of_focal_plane(products: Sequence[CcdProduct]) -> bool:
+def of_focal_plane(products: Sequence[CcdStars]) -> bool:
     """Return whether the model of all products is one of the whole focal plane."""
     return all(p.of_focal_plane for p in products)
 
 
-def ellipticities(products: Sequence[CcdProduct], kind: str) -> np.ndarray:
+def ellipticities(products: Sequence[CcdStars], kind: str) -> np.ndarray:
     """Return e1 and e2 of one kind on all CCDs, [2, n]."""
     return np.concatenate([p.ellipticity(kind) for p in products], axis=1)
 
@@ -55,7 +55,7 @@ def patches(stars: Sequence[Stars]) -> np.ndarray | None:
     return np.repeat(np.arange(len(stars)), [len(s) for s in stars]) if len(stars) > 1 else None
 
 
-def separation_bins(products: Sequence[CcdProduct]) -> dict[str, Any]:
+def separation_bins(products: Sequence[CcdStars]) -> dict[str, Any]:
     """Return the bins of separation of a run, as arguments: ``min_sep`` and ``max_sep`` [rad], and ``n_bins``."""
     everywhere = np.concatenate(
         [np.stack([s.field_x, s.field_y]) for p in products for s in (p.holdout, p.observed)], axis=1

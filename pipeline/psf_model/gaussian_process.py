@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 
 # Bounds of the correlation length, in units in which the CCD is 2 wide, and of the variance of the middle star's noise
 # over that of the process. The noise keeps the covariance of near stars from being singular.
@@ -91,8 +90,10 @@ def _best_likelihood(
 
 def _best_between(function: Callable[[float], float], grid: np.ndarray, near: int) -> float:
     """Return where a function is largest between the neighbours of a point of a grid, by Brent's method."""
+    from scipy.optimize import minimize_scalar  # a fifth of a second
+
     low, high = np.log(grid[max(near - 1, 0)]), np.log(grid[min(near + 1, len(grid) - 1)])
-    found = scipy.optimize.minimize_scalar(
+    found = minimize_scalar(
         lambda t: -function(float(np.exp(t))), bounds=(low, high), method="bounded", options=_PRECISION
     )
     return float(np.exp(found.x))

@@ -20,13 +20,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 
 from ...core.errors import DomainError
 from .polynomial import term_count
+
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
 
 #: Degree of the trend by default.
 ORDER = 4
@@ -196,10 +199,12 @@ class Posterior:
         away = np.where(kept, (logarithms - self.middle) / self.width, 0.0)
         return float(value + 0.5 * (away @ away)), 0.5 * slope + away / self.width
 
-    def minimize(self, start: np.ndarray, kept: np.ndarray) -> scipy.optimize.OptimizeResult:
+    def minimize(self, start: np.ndarray, kept: np.ndarray) -> OptimizeResult:
         """Return the most probable logarithms from a start, those that are not kept as they were."""
+        from scipy.optimize import minimize  # a fifth of a second
+
         reach = 8.0 * self.width
-        return scipy.optimize.minimize(
+        return minimize(
             self.surprise,
             start,
             args=(kept,),

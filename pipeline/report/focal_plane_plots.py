@@ -15,7 +15,7 @@ from matplotlib.colors import Normalize
 from ...core.plotting import new_figure, png_bytes, styled
 from ...models.camera.camera import Camera
 from ...models.camera.focal_plane import FocalPlane
-from ..ccd_product import CcdProduct, Stars
+from ..ccd_product import CcdStars, Stars
 from ..measure.summary import ellipticities
 from .focal_plane_axes import (
     AWAY,
@@ -67,7 +67,7 @@ def heights_plot(focal_plane: FocalPlane, used: Sequence[str], field_radius: flo
 
 
 def whiskers_plot(
-    products: Sequence[CcdProduct], focal_plane: FocalPlane, field_radius: float, kinds: Sequence[str] | None = None
+    products: Sequence[CcdStars], focal_plane: FocalPlane, field_radius: float, kinds: Sequence[str] | None = None
 ) -> bytes:
     """Draw whiskers over the CCDs of the run, all on one scale, CCD heights faintly behind (Figs. 8, 11, 12).
 
@@ -111,7 +111,7 @@ def whiskers_plot(
         return png_bytes(figure)
 
 
-def close_up_plot(products: Sequence[CcdProduct], focal_plane: FocalPlane) -> bytes:
+def close_up_plot(products: Sequence[CcdStars], focal_plane: FocalPlane) -> bytes:
     """Draw whiskers of some CCDs large, one a row: noise-free, observed, residuals at stars and holdout positions."""
     camera = focal_plane.camera
     kinds = ("truth", "observed", "residual", "away")
@@ -159,7 +159,7 @@ _SHORT_TITLES = {
 _COLORS = {"truth": TRUTH, "observed": OBSERVED, "residual": RESIDUAL, "away": AWAY}
 
 
-def _titled(title: str, products: Sequence[CcdProduct], kind: str, most: int) -> str:
+def _titled(title: str, products: Sequence[CcdStars], kind: str, most: int) -> str:
     """Return a title, with a note where not every star has a whisker."""
     step = max(_step(product.stars(kind), most) for product in products)
     return title if step == 1 else f"{title} (one star in {step})"
@@ -169,13 +169,13 @@ def _step(stars: Stars, most: int) -> int:
     return max(1, -(-len(stars) // most))
 
 
-def _draw_kind(axes: Axes, product: CcdProduct, kind: str, scale: float, width: float, most: int) -> None:
+def _draw_kind(axes: Axes, product: CcdStars, kind: str, scale: float, width: float, most: int) -> None:
     stars = product.stars(kind)
     ends = whiskers(stars.x * 1e3, stars.y * 1e3, *product.ellipticity(kind), scale)
     draw_whiskers(axes, ends[:: _step(stars, most)], _COLORS[kind], width)
 
 
-def _common_key(products: Sequence[CcdProduct]) -> float:
+def _common_key(products: Sequence[CcdStars]) -> float:
     """Return the ellipticity of the key whisker, from noise-free PSFs and observed stars together."""
     return key_ellipticity(np.concatenate([np.hypot(*ellipticities(products, k)) for k in ("truth", "observed")]))
 

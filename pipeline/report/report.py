@@ -3,22 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ...core.page import Picture, render
-from ..ccd_product import CcdProduct
 from ..config import ReconstructionConfig, to_yaml
-from ..defaults import given, noise_free_components
+from ..defaults import given
 from ..experiment import Experiment
-from ..measure.correlation import Correlation
-from ..measure.summary import CORRELATED, of_focal_plane
-from .focal_plane_plots import close_up_plot, heights_plot, whiskers_plot
-from .psf_plots import eigen_psf_plot, spectrum_plot, stamps_plot
-from .statistics_plots import correlation_plot, models_plot, scatter_plot
 from .tables import (
     MODELS_CAPTION,
     MODELS_COLUMNS,
@@ -29,11 +20,8 @@ from .tables import (
     per_ccd,
 )
 
-#: More CCDs than this are shown by their closest to the axis, their middle and their farthest one.
-_CLOSE_UPS = 3
 #: Templates of the reports of runs and sweeps.
 TEMPLATES = Path(__file__).parent / "templates"
-OBSERVED_COMPONENTS = "Eigen-PSFs of the observed stars"
 
 
 def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequence[Picture]) -> str:
@@ -66,147 +54,3 @@ def _model_words(fit: ReconstructionConfig) -> str:
     weights = {"equal": "", "snr": ", weights (S/N)²", "softened": ", weights (S/N)², softened for bright stars"}
     whole = "; ellipticity and size from one model of the whole focal plane" if fit.model == "focal_plane" else ""
     return f"{basis}, {process}polynomials of order {fit.order}{weights[given(fit.weights)]}{whole}"
-
-
-#: Where the heights come from: none, measured ones or a budget.
-_HEIGHTS = {
-    "none": "All are zero: this camera has no budget of heights, or flat ones are chosen.",
-    "measured": "They are measured ones.",
-    "budget": "Steps between CCDs and rafts, tilts and the ripple within a CCD (the potato chip) come from the height "
-    "budget, each term from its own random stream.",
-}
-
-
-def draw_pictures(
-    experiment: Experiment, products: Sequence[CcdProduct], correlated: dict[str, Correlation]
-) -> list[Picture]:
-    """Return the pictures of a run in the order of the report."""
-    config, plane = experiment.config, experiment.focal_plane
-    none = plane.terms == () and not (plane.measured.any() or plane.polynomial.any())
-    heights = "none" if none else "measured" if config.focal_plane.heights is not None else "budget"
-    # The paper's figures are the LSST's.
-    paper = experiment.camera.name == "lsst"
-    radius = experiment.field_radius_on_detector
-    close = closest_middle_farthest(products)
-    optics, whole = not config.atmosphere.enabled, of_focal_plane(products)
-    components = noise_free_components(config)
-    jackknife = all(c.n_patches for c in correlated.values())
-    errors = "by jackknife over the CCDs" if jackknife else "from the scatter of the ellipticities of one CCD alone"
-    fit = config.reconstruction
-    unweighted = fit.interpolation == "polynomial" and fit.weights == "equal"
-    at_stars = (
-        "Residuals at the stars of a CCD sum to zero by construction, so their correlation between CCDs cancels "
-        "whatever the error of the model is"
-        if unweighted and not whole
-        else "Residuals at the stars hold the noise of each star, some of which the model has followed"
-    )
-    pictures = [
-        Picture(
-            "Focal plane",
-            heights_plot(plane, [p.name for p in products], radius),
-            f"Height of every CCD surface over the nominal focal plane, positive towards the sky. {_HEIGHTS[heights]} "
-            "The same surface as a mesh: focal_plane.glb.",
-            "Fig. 7 shows one realisation of "
-            + ("the same budget" if heights == "budget" else "a budget")
-            + " (Table 1), ±10 µm in all.",
-        ),
-        Picture(
-            "Whiskers over the field",
-            whiskers_plot(products, plane, radius),
-            "Each whisker is one star: its length is |e| = (a-b)/(a+b), its direction that of the elongation. All "
-            "panels share one scale, given by the key above their right corner, so lengths can be compared. "
-            + (
-                ""
-                if none
-                else "The pattern follows the heights behind it: whiskers jump where the CCD border is a step. "
-            )
-            + "Residuals at the stars hold the noise of each star itself.",
-            "Fig. 8 (optics alone): |e| above 10 % in most places and near 30 % at the edge of the field, jumping at "
-            "CCD borders."
-            if optics
-            else "Fig. 11 (observed) and Fig. 12 (residual): the pattern of the optics alone (Fig. 8), made rounder by "
-            "the atmosphere, and residuals without visible pattern. The paper compares with the observed stars only.",
-        ),
-        Picture(
-            "Whiskers close up",
-            close_up_plot(close, plane),
-            "The CCD closest to the axis, one half-way out and the farthest one. The last column is the error "
-            "for galaxies: that of the model at places where there was no star to fit.",
-            "The paper notes a small-scale variation even within a CCD, from tilt and potato chip, and so fits "
-            "polynomials CCD by CCD.",
-        ),
-        Picture(
-            "Eigen-PSFs of the noise-free PSFs",
-            eigen_psf_plot(close[0], noise_free=True),
-            f"Mean PSF of one CCD and its first {min(components, 20)} principal components, each with the part of the "
-            "variance along it. Order and signs are fixed, so that runs can be compared.",
-            "Fig. 9: components of 4000 PSFs of the atmosphere alone. The first resemble shapelets; structure gets "
-            "finer with n.",
-        ),
-        Picture(
-            OBSERVED_COMPONENTS,
-            eigen_psf_plot(close[0], noise_free=False),
-            "The same CCD, from the stars that were observed: components beyond the first few are noise.",
-            "The paper keeps 20 components for observed stars too.",
-        ),
-        Picture(
-            "Number of components needed",
-            spectrum_plot(products),
-            "Eigenvalues of every CCD, and the part of the variance that components beyond n hold. Where the "
-            "eigenvalues of the observed stars bend away from those of the noise-free PSFs, noise takes over; the dot "
-            "is the elbow, the point farthest below the straight line from the first eigenvalue to the last.",
-            "The paper finds it by eye and that about 20 components suffice; they should hold over 99 % "
-            "of the variance of the noise-free PSFs.",
-        ),
-        Picture(
-            "Ellipticity before and after",
-            scatter_plot(products),
-            "Left, as in Jee & Tyson (2011): ellipticity of the observed stars, and what is left when the model is "
-            "subtracted. Right: the same for the noise-free PSFs at places where no star was fitted.",
-            "Fig. 13: residuals (red) far more compact than observed stars (blue), centred on zero.",
-        ),
-        Picture(
-            "Correlation of the ellipticity",
-            correlation_plot({kind: correlated[kind] for kind in CORRELATED}, paper),
-            "ξ+ and ξ- by TreeCorr; filled symbols are positive, open ones negative. Error bars are "
-            f"{errors}, cut off where they would pass zero. {at_stars}; "
-            "triangles, away from the stars, apply to galaxies. Where the CCDs lie in a row, long pairs all point "
-            "along it, and an ellipticity common to the field does not average out of ξ-.",
-            "Fig. 14: ξ+ of about 3e-5 before, about 1e-8 after the correction (189 CCDs, at the stars only), below "
-            "1e-7 from 10 arcmin to 3 degrees; ξ- similar.",
-        ),
-        Picture(
-            "Stars",
-            stamps_plot(close),
-            "Observed stamps from the brightest to the faintest star of three CCDs, the model at their places, and "
-            "the difference in units of each pixel's noise: where the model is right to within the star's own noise, "
-            "only that noise is left. A bright star can show more: the noise of fainter stars is in the model."
-            + (" The model here is the CCD's own: that of the focal plane has shapes only." if whole else ""),
-        ),
-    ]
-    if whole:
-        pictures.append(
-            Picture(
-                "Residuals of both models",
-                models_plot(correlated),
-                "ξ+ of the residuals of the two models, fitted to the same stars: of the whole focal plane, which all "
-                "other plots show, and CCD by CCD. Filled symbols are positive, open ones negative."
-                + (
-                    " Residuals at the stars sum to zero over each CCD where it has a model of its own, so their "
-                    "correlation between CCDs cancels whatever the error of that model is."
-                    if unweighted
-                    else ""
-                ),
-            )
-        )
-    # Single pixels and shapelets look the same whatever the stars are.
-    shown = [p for p in pictures if fit.basis == "pca" or p.title != OBSERVED_COMPONENTS]
-    return shown if paper else [replace(p, paper="") for p in shown]
-
-
-def closest_middle_farthest(products: Sequence[CcdProduct]) -> list[CcdProduct]:
-    """Return the CCD closest to the axis, the middle one and the farthest, or all where there are no more."""
-    ordered = sorted(products, key=lambda p: (round(float(np.hypot(*p.center)), 9), p.name))
-    if len(ordered) <= _CLOSE_UPS:
-        return ordered
-    return [ordered[0], ordered[len(ordered) // 2], ordered[-1]]

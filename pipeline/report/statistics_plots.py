@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, png_bytes, styled
-from ..ccd_product import CcdProduct
+from ..ccd_product import CcdStars
 from ..measure.correlation import Correlation
 from ..measure.rho_statistics import RhoStatistics
 from ..measure.summary import ellipticities
@@ -30,7 +30,7 @@ _RHO_STYLES = {
 }
 
 
-def scatter_plot(products: Sequence[CcdProduct]) -> bytes:
+def scatter_plot(products: Sequence[CcdStars]) -> bytes:
     """Draw the ellipticity components before and after the model is subtracted (Jee & Tyson 2011, Fig. 13)."""
     panels = (
         ("at the observed stars", "observed", "observed", "residual"),

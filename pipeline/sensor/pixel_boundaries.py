@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
-from scipy.interpolate import BSpline, PPoly
 from scipy.ndimage import spline_filter1d
 
 #: Pixels by which stamps are continued with the values at their rim, for light that crosses it.
 RIM = 8
 # Pixels by which rows are continued for the spline.
 _BEYOND = 12
-_SPLINE = PPoly.from_spline(BSpline.basis_element(np.arange(-3.0, 4.0)))
-# Polynomial, highest power first, of the basis spline on each of the six intervals of its support.
-_PIECES = _SPLINE.c[:, np.isin(_SPLINE.x[:-1], range(-3, 3))]
 
 
 def with_rim(images: np.ndarray) -> np.ndarray:
@@ -56,7 +54,17 @@ def _collect_along_rows(images: np.ndarray, shift: np.ndarray) -> np.ndarray:
     place = _BEYOND + np.clip(boundary + shift, 0.0, n)
     first = np.floor(place).astype(np.int64)
     fraction = place - first
-    total = slope * place
+    total, pieces = slope * place, _basis_spline()
     for step in range(-2, 4):
-        total += np.polyval(_PIECES[:, 3 - step], fraction) * np.take_along_axis(coefficients, first + step, axis=2)
+        total += np.polyval(pieces[:, 3 - step], fraction) * np.take_along_axis(coefficients, first + step, axis=2)
     return np.diff(total, axis=2)
+
+
+@cache
+def _basis_spline() -> np.ndarray:
+    """Return the polynomial, highest power first, of the basis spline on each of the six intervals of its support."""
+    from scipy.interpolate import BSpline, PPoly  # a fifth of a second
+
+    spline = PPoly.from_spline(BSpline.basis_element(np.arange(-3.0, 4.0)))
+    pieces: np.ndarray = spline.c[:, np.isin(spline.x[:-1], range(-3, 3))]
+    return pieces

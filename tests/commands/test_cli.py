@@ -225,7 +225,7 @@ def test_opd_writes_a_picture_and_prints_its_zernikes(capsys, in_folder):
 
 
 def test_run_prints_its_metrics_and_the_path_of_the_report(capsys, monkeypatch, finished_run, tmp_path):
-    monkeypatch.setattr(run_module, "draw_pictures", lambda *_: [])
+    monkeypatch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
     folder = tmp_path / "copied"
     shutil.copytree(finished_run, folder)
     assert main(["run", str(folder / "config.yaml"), "--out", str(folder), "--resume"]) == 0
@@ -240,7 +240,7 @@ def test_run_prints_its_metrics_and_the_path_of_the_report(capsys, monkeypatch, 
 
 @pytest.mark.long
 def test_json_is_all_that_standard_output_holds(capsys, monkeypatch, settings_file, tmp_path):
-    monkeypatch.setattr(run_module, "draw_pictures", lambda *_: [])
+    monkeypatch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
     out_folder = tmp_path / "out"
     assert main(["run", str(settings_file), "--out", str(out_folder), "--ccds", "R22_S11", "--json", "--quiet"]) == 0
     out, err = capsys.readouterr()

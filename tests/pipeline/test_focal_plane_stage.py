@@ -12,7 +12,6 @@ from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, ProductError, UnknownNameError
 from pachon.core.progress import Reporter
 from pachon.pipeline import focal_plane_stage, run_folder
-from pachon.pipeline import run as run_module
 from pachon.pipeline.ccd_product import CCD_KINDS, KINDS, of_ccd_model, read_product
 from pachon.pipeline.config import to_yaml
 from pachon.pipeline.experiment import Experiment
@@ -20,7 +19,7 @@ from pachon.pipeline.focal_plane_psf.model import FocalPlanePsf
 from pachon.pipeline.focal_plane_stage import FOCAL_PLANE_PSF_NAME, apply_focal_plane_model
 from pachon.pipeline.measure.correlation import shear_correlation
 from pachon.pipeline.measure.summary import correlations, run_metrics, separation_bins
-from pachon.pipeline.report import report as report_module
+from pachon.pipeline.report import pictures as pictures_module
 from pachon.pipeline.report.diagnostics import diagnose
 from pachon.pipeline.report.tables import headline, models_rows
 from pachon.pipeline.run import run
@@ -35,7 +34,7 @@ ADDED = ["CCD_E1", "CCD_E2", "CCD_SIZE", "SIG_E1", "SIG_E2", "SIG_SIZE"]
 
 @pytest.fixture
 def no_report(monkeypatch):
-    monkeypatch.setattr(run_module, "draw_pictures", lambda *_: [])
+    monkeypatch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +42,7 @@ def whole_run(focal_plane_config, tmp_path_factory):
     """The folder of a finished run with the real model; its report has no pictures."""
     folder = tmp_path_factory.mktemp("whole") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_module, "draw_pictures", lambda *_: [])
+        patch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
         run(focal_plane_config(), folder, threads=1)
     return folder
 
@@ -53,7 +52,7 @@ def ccd_run(focal_plane_config, tmp_path_factory):
     """The same run with the models of single CCDs alone."""
     folder = tmp_path_factory.mktemp("single") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_module, "draw_pictures", lambda *_: [])
+        patch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
         run(focal_plane_config(reconstruction__model="ccd"), folder, threads=1)
     return folder
 
@@ -285,7 +284,7 @@ def test_the_report_has_both_residuals_and_the_warnings(focal_plane_config, tmp_
     drawn = {}
 
     def keep(name):
-        real = getattr(report_module, name)
+        real = getattr(pictures_module, name)
 
         def drawing(*arguments):
             drawn[name] = arguments
@@ -294,10 +293,10 @@ def test_the_report_has_both_residuals_and_the_warnings(focal_plane_config, tmp_
         return drawing
 
     for name in ("heights_plot", "whiskers_plot", "close_up_plot", "eigen_psf_plot", "spectrum_plot", "stamps_plot"):
-        monkeypatch.setattr(report_module, name, lambda *_, **__: b"")
+        monkeypatch.setattr(pictures_module, name, lambda *_, **__: b"")
     for name in ("correlation_plot", "models_plot"):
-        monkeypatch.setattr(report_module, name, keep(name))
-    result = run(focal_plane_config(), tmp_path / "out", reporter=Reporter())
+        monkeypatch.setattr(pictures_module, name, keep(name))
+    result = run(focal_plane_config(), tmp_path / "out", threads=1, reporter=Reporter())
     assert "the plane is <flat>\n" in capsys.readouterr().err
     assert list(drawn["correlation_plot"][0]) == ["truth", "observed", "residual", "away"]
     assert set(CCD_KINDS) < set(drawn["models_plot"][0])

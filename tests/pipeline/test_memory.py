@@ -67,7 +67,7 @@ def test_a_run_that_does_not_fit_leaves_nothing_and_a_finished_one_is_reported_a
     assert err.startswith("pachon: error: stars.truth = 14, stars.observed = 12: needs about ")
     assert err.count("\n") == 1
     assert not folder.exists()
-    monkeypatch.setattr(run_module, "draw_pictures", lambda *_: [])
+    monkeypatch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
     monkeypatch.setattr(run_module, "build_report", lambda *_: "")
     shutil.copytree(finished_run, folder)
     assert run_module.run(tiny(), folder, resume=True).computed == ()

@@ -12,7 +12,7 @@ import yaml
 
 from pachon.core import files
 from pachon.core.errors import ConfigError, ProductError
-from pachon.core.files import _owner, remove_leftovers, write_new_bytes
+from pachon.core.files import _owner, make_folder, write_new_bytes
 from pachon.core.workers import Workers
 from pachon.imaging import simulate
 from pachon.imaging.config import ImagesConfig
@@ -164,7 +164,7 @@ def test_temporary_files_of_live_processes_and_other_machines_stay(tmp_path):
     owners = {"live": _owner(os.getpid()), "ended": _owner(ended.pid), "elsewhere": f"another-machine-{ended.pid}"}
     for owner in owners.values():
         (tmp_path / f".ccd.fits.{owner}.partial").write_bytes(b"")
-    remove_leftovers(tmp_path)
+    make_folder(tmp_path)
     assert {n for n, owner in owners.items() if (tmp_path / f".ccd.fits.{owner}.partial").exists()} == {
         "live",
         "elsewhere",

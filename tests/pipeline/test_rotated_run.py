@@ -121,7 +121,7 @@ def test_the_angle_is_a_parameter_of_sweeps(lsst_r, tmp_path):
 @pytest.mark.slow
 def test_a_run_with_a_rotated_camera(tiny, tmp_path, monkeypatch):
     # Drawing the report takes longest, and others test it.
-    monkeypatch.setattr(run_module, "draw_pictures", lambda *_: [])
+    monkeypatch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
     monkeypatch.setattr(run_module, "build_report", lambda *_: "")
     config = with_options(tiny(psf__engine="long_exposure"), **QUARTER)
     run(config, tmp_path / "run", threads=1)

@@ -48,7 +48,7 @@ def copied(finished_run, tmp_path):
 @pytest.fixture
 def no_report(monkeypatch, finished_run):
     """Take the report of the finished run for every other: drawing it takes longest, and others test it."""
-    monkeypatch.setattr(run_module, "draw_pictures", lambda *_: [])
+    monkeypatch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
     monkeypatch.setattr(run_module, "build_report", lambda *_: (finished_run / "report.html").read_text())
 
 
@@ -126,7 +126,8 @@ def test_an_interrupted_run_keeps_the_ccds_that_were_finished(finished_run, tmp_
     monkeypatch.setattr(ccd_loop, "expose_ccd", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run(tiny(), tmp_path / "out")
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["ccd_R22_S11.fits", "config.yaml"]
+    finished = {"ccd_R22_S11.fits", "config.yaml", "focal_plane.ecsv", "focal_plane.glb"}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == finished
     monkeypatch.setattr(ccd_loop, "expose_ccd", real)
     assert run(tiny(), tmp_path / "out", resume=True).kept == ("R22_S11",)
     assert contents(tmp_path / "out") == contents(finished_run)
@@ -187,7 +188,7 @@ def failing_ccd(monkeypatch):
 
 
 def test_a_ccd_that_cannot_be_modelled_is_left_out(finished_run, tmp_path, tiny, failing_ccd, monkeypatch, capsys):
-    monkeypatch.setattr(run_module, "draw_pictures", lambda *_: [])
+    monkeypatch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
     out = tmp_path / "out"
     result = run(tiny(), out, reporter=Reporter())
     assert result.not_modelled == {"R22_S11": failing_ccd}
@@ -224,7 +225,8 @@ def test_strict_ends_at_a_ccd_that_cannot_be_modelled_and_keeps_the_others(
     assert main(command) == 2
     assert capsys.readouterr().err == f"pachon: error: CCD R22_S11: {failing_ccd}\n"
     # The other CCD was on its way.
-    assert sorted(p.name for p in out.iterdir()) == ["ccd_R24_S12.fits", "config.yaml"]
+    finished = {"ccd_R24_S12.fits", "config.yaml", "focal_plane.ecsv", "focal_plane.glb"}
+    assert {p.name for p in out.iterdir()} == finished
     assert (out / "ccd_R24_S12.fits").read_bytes() == (finished_run / "ccd_R24_S12.fits").read_bytes()
 
 

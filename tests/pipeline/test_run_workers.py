@@ -27,7 +27,7 @@ from pachon.pipeline.run import run
 @pytest.fixture(autouse=True)
 def no_report(monkeypatch, finished_run):
     """Take the report of the finished run for every other: drawing it takes longest, and others test it."""
-    monkeypatch.setattr(run_module, "draw_pictures", lambda *_: [])
+    monkeypatch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
     monkeypatch.setattr(run_module, "build_report", lambda *_: (finished_run / "report.html").read_text())
 
 

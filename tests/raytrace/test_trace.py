@@ -1,6 +1,7 @@
 """The ray trace against Zemax, a brute-force NumPy trace and invariants."""
 
 import csv
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -212,6 +213,32 @@ def test_threads_change_no_byte(lsst_r, annulus_points):
     one, three = pachon.trace(lsst_r, rays, threads=1), pachon.trace(lsst_r, rays, threads=3)
     for name in ("position", "direction", "path_length", "status"):
         assert np.array_equal(getattr(one, name), getattr(three, name))
+
+
+@pytest.mark.parametrize("n", [5, LANES, 1000])
+def test_arrays_of_an_earlier_trace_are_used_again(lsst_r, annulus_points, n):
+    rays, others = (pachon.launch_rays(lsst_r, (x, 0.01), 620e-9, annulus_points(n)) for x in (0.02, -0.01))
+    fresh, given = pachon.trace(lsst_r, rays), pachon.trace(lsst_r, others)
+    result = pachon.trace(lsst_r, rays, out=given)
+    for name in ("position", "direction", "path_length", "status"):
+        assert np.array_equal(getattr(result, name), getattr(fresh, name))
+        assert np.shares_memory(getattr(result, name), getattr(given, name))
+    again = pachon.trace(lsst_r, others, out=result)
+    assert np.shares_memory(again.position, given.position)
+    assert np.array_equal(pickle.loads(pickle.dumps(again)).position, again.position)
+
+
+def test_arrays_that_do_not_fit_are_refused(lsst_r, annulus_points):
+    rays, more = (pachon.launch_rays(lsst_r, (0.02, 0.01), 620e-9, annulus_points(n)) for n in (64, 65))
+    last, every = pachon.trace(lsst_r, rays), pachon.trace(lsst_r, rays, surfaces="all")
+    on_ccds = pachon.trace(lsst_r, rays, focal_plane=pachon.FocalPlane.flat("lsst"))
+    for out in (pachon.trace(lsst_r, more), every[-1], on_ccds, pickle.loads(pickle.dumps(last))):
+        with pytest.raises(
+            DomainError, match=r"^out = <TraceResult.*>: expected the result of an earlier trace of 64 rays"
+        ):
+            pachon.trace(lsst_r, rays, out=out)
+    with pytest.raises(ConfigError, match=r'^out: expected surfaces = "last", and no focal plane$'):
+        pachon.trace(lsst_r, rays, surfaces="all", out=last)
 
 
 def test_no_rays_give_an_empty_result(lsst_r):

@@ -18,7 +18,6 @@ from pachon.design.images.encircled_energy import energy_curve
 from pachon.models.ideal_telescope import without_aberration
 from pachon.models.io.prescription import load_telescope
 from pachon.models.io.site_file import load_site
-from pachon.pipeline import run as run_module
 from pachon.pipeline.ccd_product import product_path, read_product
 from pachon.pipeline.run_folder import stamp_of
 from pachon.studies.reproduce import reproduce as module
@@ -64,7 +63,7 @@ def made(tmp_path_factory):
     """All figures at the tiny scale: the bench and the summary; tests only read them."""
     bench = Bench(TINY, tmp_path_factory.mktemp("figures"), threads=2)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_module, "draw_pictures", lambda *_: [])  # of the report of the run, which has its own tests
+        patch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
         # Some hundred galaxies in place of ten thousand.
         patch.setattr("pachon.studies.visits.null_test._FAINTEST_SNR", 60.0)
         patch.setattr("pachon.studies.reproduce.visits._FAINTEST", 25.0)

@@ -18,7 +18,6 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import brentq
 from scipy.special import gamma, j0, kv
 
 from ...core.errors import DomainError
@@ -186,6 +185,8 @@ def long_exposure_fwhm(
         longest = min(longest, diameter)
     b, weight = _gauss_panels(longest, 32)
     otf = long_exposure_otf(b, wavelength, r0, outer_scale, diameter=diameter, obscuration=obscuration) * b * weight
+
+    from scipy.optimize import brentq  # a fifth of a second
 
     def excess(angle: float) -> float:
         return float(np.sum(otf * (j0(wavenumber * b * angle) - 0.5)))

@@ -20,7 +20,8 @@ from pachon.pipeline.measure.correlation import shear_correlation
 from pachon.pipeline.report import focal_plane_plots, statistics_plots
 from pachon.pipeline.report.focal_plane_axes import key_ellipticity, whiskers
 from pachon.pipeline.report.focal_plane_plots import is_flat
-from pachon.pipeline.report.report import build_report, closest_middle_farthest
+from pachon.pipeline.report.pictures import closest_middle_farthest
+from pachon.pipeline.report.report import build_report
 from pachon.pipeline.report.tables import percent
 from pachon.wavefront.opd import wavefront_opd
 from pachon.wavefront.zernike import fit_zernikes

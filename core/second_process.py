@@ -1,0 +1,69 @@
+"""A second process beside this one, for what would otherwise wait for it, such as half of the plots of a report."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import get_context
+from typing import Any
+
+from .errors import ProductError
+from .threads import thread_count
+from .workers import end_with
+
+#: Function that takes a function of a module and its arguments, all picklable, and returns a function that waits for
+#: the result.
+Submit = Callable[..., Callable[[], Any]]
+
+
+@contextmanager
+def second_process(threads: int | None = None) -> Iterator[Submit]:
+    """Yield a function that hands computations to a second process, which does them one after the other.
+
+    The process is a fork of this one, so it starts at once; it ends with the block, or with this process. There is none
+    for one thread, where this process has other threads, whose locks a fork would keep, or outside Linux, whose
+    libraries survive forks: computations are then done in this process, at once. Waiting for a result raises what the
+    computation has raised, or ProductError if the process was killed.
+    """
+    if thread_count(threads) == 1 or threading.active_count() > 1 or sys.platform != "linux":
+        yield _here
+        return
+    pool = ProcessPoolExecutor(1, mp_context=get_context("fork"), initializer=_begin, initargs=(os.getpid(),))
+
+    def submit(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+        future = pool.submit(function, *arguments)
+        return lambda: _result(future)
+
+    try:
+        # A process is started by the first computation.
+        submit(os.getpid)
+        yield submit
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _here(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+    result = function(*arguments)
+    return lambda: result
+
+
+def _result(future: Future[Any]) -> Any:
+    try:
+        return future.result()
+    except BrokenProcessPool:
+        raise ProductError(
+            "the process that draws the report died, killed or short of memory; finished CCDs are kept, go on with"
+            " --resume"
+        ) from None
+
+
+def _begin(parent: int) -> None:
+    """Let Ctrl-C end the first process alone, and end with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=end_with, args=(parent,), daemon=True).start()

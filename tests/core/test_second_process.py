@@ -1,0 +1,81 @@
+"""A second process: its results, errors and end."""
+
+import os
+import signal
+import sys
+import threading
+
+import pytest
+
+from pachon.core.errors import ProductError
+from pachon.core.second_process import second_process
+
+needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="no second process elsewhere")
+
+
+def fails():
+    raise ProductError("no space left", file="a.fits")
+
+
+def dies():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@needs_linux
+def test_computations_are_done_by_one_other_process():
+    with second_process(2) as submit:
+        first, second, product = submit(os.getpid), submit(os.getpid), submit(pow, 2, 10)
+        assert first() == second() != os.getpid()
+        assert product() == 1024
+        other = first()
+    with pytest.raises(ProcessLookupError):
+        os.kill(other, 0)
+
+
+def test_one_thread_has_one_process():
+    with second_process(1) as submit:
+        assert submit(os.getpid)() == os.getpid()
+
+
+def test_a_process_with_other_threads_is_not_forked():
+    end = threading.Event()
+    waiting = threading.Thread(target=end.wait)
+    waiting.start()
+    try:
+        with second_process(2) as submit:
+            assert submit(os.getpid)() == os.getpid()
+    finally:
+        end.set()
+        waiting.join()
+
+
+@needs_linux
+def test_an_error_of_the_other_process_is_raised_where_its_result_is_waited_for():
+    with second_process(2) as submit:
+        result = submit(fails)
+        with pytest.raises(ProductError, match=r"no space left") as found:
+            result()
+    assert str(found.value) == str(ProductError("no space left", file="a.fits"))
+
+
+@needs_linux
+def test_a_killed_process_is_one_clear_line():
+    with second_process(2) as submit:
+        result = submit(dies)
+        with pytest.raises(ProductError, match=r"^the process that draws the report died, killed or short of memory"):
+            result()
+
+
+@needs_linux
+def test_the_other_process_ends_with_a_block_that_fails():
+    found = []
+
+    def interrupted():
+        with second_process(2) as submit:
+            found.append(submit(os.getpid)())
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    with pytest.raises(ProcessLookupError):
+        os.kill(found[0], 0)
