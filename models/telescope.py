@@ -23,7 +23,8 @@ from .design_data import DesignData
 from .media.medium import ConstantIndex, Medium, check_wavelength_range, wavelengths_within
 from .obstruction import Obstruction
 from .rotation import rotation_matrix
-from .shapes.shape import Shape, Sum
+from .shapes.shape import Shape
+from .shapes.sum import Sum
 from .surface import Interaction, Matrix, Surface, Vector, move_frame
 
 VACUUM = ConstantIndex(1.0)

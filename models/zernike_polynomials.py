@@ -126,6 +126,7 @@ def annular_zernike_gradients(jmax: int, x: np.ndarray, y: np.ndarray, obscurati
     return out
 
 
+@lru_cache(maxsize=256)
 def radial_series(m: int, count: int, obscuration: float = 0.0) -> np.ndarray:
     """Return the first ``count`` radial polynomials of azimuthal order m >= 0 as powers of rho^2, shape [count, count].
 
@@ -141,7 +142,9 @@ def radial_series(m: int, count: int, obscuration: float = 0.0) -> np.ndarray:
         series = np.polynomial.legendre.leg2poly([0.0] * degree + [1.0])
         expanded = np.polynomial.Polynomial(series)(node)
         powers[: degree + 1, degree] = expanded.coef
-    return powers @ _radial_coefficients(m, count, float(obscuration))
+    series: np.ndarray = powers @ _radial_coefficients(m, count, float(obscuration))
+    series.flags.writeable = False
+    return series
 
 
 def zernike_monomials(jmax: int) -> np.ndarray:

@@ -8,7 +8,7 @@ two coordinates in the plane of the entrance pupil are found for all rays togeth
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from ..core.errors import DomainError
 from ..core.units import field_label
 from ..models.design_data import DesignData
-from ..models.surface import Interaction
+from ..models.surface import Interaction, Surface
 from ..models.telescope import Telescope
 from .landing import Landing, derivatives, determinants, find_points, solved
 from .rays import Rays, field_angles, field_direction, object_points, straight_bundles
@@ -84,7 +84,7 @@ class AimedPoints:
         """Return the points that :func:`entrance_points` found for pupil points [m]."""
         if telescope.design_data.aiming == "off" or pupil.shape[-2] >= FEWEST:
             return cls(points, None)
-        landing = stop_of(telescope).landing(telescope, np.repeat(directions, pupil.shape[-2], axis=0), wavelength)
+        landing = stop_of(telescope).landing(np.repeat(directions, pupil.shape[-2], axis=0), wavelength)
         return cls(points, derivatives(landing, points.reshape(-1, 2), _difference(telescope)))
 
     def moved(
@@ -95,7 +95,7 @@ class AimedPoints:
             return None
         stop, difference = stop_of(telescope), _difference(telescope)
         target = np.broadcast_to(_at_stop(telescope, stop, pupil), self.points.shape).reshape(-1, 2)
-        landing = stop.landing(telescope, np.repeat(directions, pupil.shape[-2], axis=0), wavelength)
+        landing = stop.landing(np.repeat(directions, pupil.shape[-2], axis=0), wavelength)
         found = find_points(landing, self.points.reshape(-1, 2), target, stop.radius, difference, self.slopes)
         sense = determinants(derivatives(landing, found, difference, target)) * determinants(self.slopes)
         return found.reshape(self.points.shape) if (sense > 0.0).all() else None
@@ -109,10 +109,10 @@ def _one_by_one(
     chief = _chief_points(telescope, stop, directions, wavelength)
     target = _turned(stop.radius * relative, stop.axes.T).reshape(-1, 2)
     rays = np.repeat(directions, relative.shape[1], axis=0)
-    landing = stop.landing(telescope, rays, wavelength)
+    landing = stop.landing(rays, wavelength)
     start = np.repeat(chief, relative.shape[1], axis=0)
     # All rays of a field begin with the derivatives at its chief ray.
-    slopes = derivatives(stop.landing(telescope, directions, wavelength), chief, difference)
+    slopes = derivatives(stop.landing(directions, wavelength), chief, difference)
     first = start + solved(np.repeat(slopes, relative.shape[1], axis=0), target)
     found = find_points(landing, first, target, stop.radius, difference)
     # The sense of the map from the entrance pupil to the stop is that at the chief ray; where it is the other one, the
@@ -160,34 +160,49 @@ def require_aimed(telescope: Telescope, directions: np.ndarray, points: np.ndarr
 
 @dataclass(frozen=True, eq=False)
 class Stop:
-    """The stop of a telescope, with the surfaces in front of it.
+    """The stop of a telescope.
 
     Attributes
     ----------
-    front : Telescope
-        The surfaces up to the stop, none of which stops light.
+    telescope : Telescope
+        The telescope.
     radius : float
         Radius of the stop that pupil coordinates of 1 belong to [m].
     axes : ndarray, shape [2, 2]
         Axes x and y of the entrance pupil, in those of the stop, as columns.
     """
 
-    front: Telescope
+    telescope: Telescope
     radius: float
     axes: np.ndarray
 
+    @cached_property
+    def index(self) -> int:
+        """Index of the surface."""
+        return self.telescope.surface_names.index(str(self.telescope.design_data.stop))
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The surface."""
+        return self.telescope.surfaces[self.index]
+
+    @cached_property
+    def front(self) -> Telescope:
+        """The surfaces up to the stop, none of which stops light."""
+        return _front(self.telescope, self.index)
+
     def relative(self, rays: Rays) -> np.ndarray:
         """Return where rays meet the stop [n, 2], along the axes of the entrance pupil, in units of the radius."""
-        landing = self.front.surfaces[-1].to_local(trace(self.front, rays).position)[:, :2]
+        landing = self.surface.to_local(trace(self.front, rays).position)[:, :2]
         return _turned(landing, self.axes) / self.radius
 
-    def landing(self, telescope: Telescope, directions: np.ndarray, wavelength: float) -> Landing:
+    def landing(self, directions: np.ndarray, wavelength: float) -> Landing:
         """Return the function from points of the entrance pupil to the stop for rays of given chief directions."""
-        traced = RepeatedTrace(self.front, wavelength)
+        traced = RepeatedTrace(self.telescope, wavelength, self.index)
 
         def land(points: np.ndarray, which: np.ndarray) -> np.ndarray:
-            rays = straight_bundles(telescope, directions[which], wavelength, points[:, None])
-            return self.front.surfaces[-1].to_local(traced.positions(rays))[:, :2]
+            rays = straight_bundles(self.telescope, directions[which], wavelength, points[:, None])
+            return self.surface.to_local(traced.positions(rays))[:, :2]
 
         return land
 
@@ -202,10 +217,9 @@ def stop_of(telescope: Telescope) -> Stop:
     data = telescope.design_data
     if data.stop is None:
         raise DomainError(f"{telescope.name}: expected a surface that is the stop (design data: stop)")
-    front = _front(telescope, data.stop)
     axis, light = field_direction(0.0, 0.0)[None], telescope.default_wavelength
-    unscaled = Stop(front, 1.0, np.eye(2))
-    landing = unscaled.landing(telescope, axis, light)
+    unscaled = Stop(telescope, 1.0, np.eye(2))
+    landing = unscaled.landing(axis, light)
     rim = 0.5 * telescope.pupil_diameter
     chief = find_points(landing, np.zeros((1, 2)), np.zeros((1, 2)), rim, _difference(telescope))
     # The error of central differences is one of third order, which two steps remove.
@@ -226,12 +240,12 @@ def stop_of(telescope: Telescope) -> Stop:
         radius = float(np.linalg.norm(scale @ marginal[0]))
     if not np.isfinite(radius):
         raise DomainError(f"{telescope.name}: the marginal ray on the axis does not reach the stop {data.stop!r}")
-    return Stop(front, radius, u @ v)
+    return Stop(telescope, radius, u @ v)
 
 
-def _front(telescope: Telescope, stop: str) -> Telescope:
+def _front(telescope: Telescope, stop: int) -> Telescope:
     """Return the surfaces of a telescope up to its stop, which rays cross as they are, without apertures."""
-    surfaces = telescope.surfaces[: telescope.surface_names.index(stop) + 1]
+    surfaces = telescope.surfaces[: stop + 1]
     before = surfaces[-2].medium_after if len(surfaces) > 1 else telescope.medium_before
     last = replace(surfaces[-1], interaction=Interaction.PASS, medium_after=before)
     clear = tuple(replace(s, aperture=None) for s in (*surfaces[:-1], last))
@@ -267,7 +281,7 @@ def _chief_points(telescope: Telescope, stop: Stop, directions: np.ndarray, wave
             going = (k - 1) * step < angle[left]
             tx, ty = (np.tan(at)[:, None] * along[left])[going].T
             light = field_direction(tx, ty, "gnomonic")
-            landing = stop.landing(telescope, light, wavelength)
+            landing = stop.landing(light, wavelength)
             # Across the beam the pupil moves steadily with the field: go on as in the step before.
             ahead = [np.cos(np.minimum((k - i) * step, angle[left]))[:, None] for i in range(3)]
             guess = ((2.0 * points * ahead[1] - before * ahead[2]) / ahead[0])[going] if k > 1 else points[going]

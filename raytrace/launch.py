@@ -59,7 +59,8 @@ def launch_rays(
     wavelength = check_wavelength(wavelength)
     telescope.check_wavelength(wavelength)
     px, py = pupil_points(pupil)
-    points = np.stack([px.ravel(), py.ravel()], axis=-1)
+    # Transposed, not copied: the components stay contiguous, as the kernels read them.
+    points = np.stack([px.ravel(), py.ravel()]).T
     return launch_bundles(telescope, field_direction(tx, ty, projection)[None], wavelength, points)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
+from ..core.buffers import empty
 from ..core.errors import ConfigError, DomainError
 from ..core.result import Result
 from ..core.units import broadcast_together, metres, radians
@@ -171,8 +172,8 @@ def parallel_rays(telescope: Telescope, directions: np.ndarray, wavelength: floa
     # as memory sets the pace.
     v = directions.T[:, :, None]
     x, y = np.moveaxis(pupil if pupil.ndim == 3 else pupil[None], -1, 0)
-    position, direction = np.empty((2, 3, len(directions), x.shape[1]))
-    back = v[0] * x
+    position, direction = empty((2, 3, len(directions), x.shape[1]))
+    back = np.multiply(v[0], x, out=empty((len(directions), x.shape[1])))
     back += v[1] * y
     back += v[2] * telescope.stop_z
     back += telescope.launch_distance
@@ -180,9 +181,11 @@ def parallel_rays(telescope: Telescope, directions: np.ndarray, wavelength: floa
         np.multiply(along, back, out=place)
         np.subtract(point, place, out=place)
     direction[:] = v
+    path = back.reshape(-1)
+    path[:] = 0.0
     return Rays(
         position=position.reshape(3, -1).T,
         direction=direction.reshape(3, -1).T,
-        path_length=np.zeros(back.size),
+        path_length=path,
         wavelength=wavelength,
     )

@@ -7,44 +7,47 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..core.launch import load_kernels
+from ..core.launch import launch, load_kernels
 from ..core.warp_arrays import warp_array
 from ..models.telescope import Telescope
 from .kernels.packet import LANES, RayPackets, from_packets, lanes, packet_count, ray_packets
 from .kernels.trace import trace_rays
-from .pack.surfaces import pack_surfaces, refractive_indices
+from .pack.surfaces import leading_surfaces, pack_surfaces, refractive_indices
 from .rays import Rays
-from .trace import trace
 
 #: Rays that several threads trace faster than one.
 _MANY = 4096
 
 
 class RepeatedTrace:
-    """Trace of rays of one wavelength [m] to the last surface of a telescope; arrays and launch are made once.
+    """Trace of rays of one wavelength [m] to one surface of a telescope, by its index; arrays are made once.
 
     Of few rays, making them costs twenty times what the rays do. The arrays are those of the object: no two threads may
     use it at once.
     """
 
-    def __init__(self, telescope: Telescope, wavelength: float) -> None:
-        self._telescope = telescope
-        self._packed = pack_surfaces(telescope)
+    def __init__(self, telescope: Telescope, wavelength: float, surface: int) -> None:
+        self._packed = leading_surfaces(pack_surfaces(telescope), surface + 1)
         self._indices = warp_array(refractive_indices(telescope, wavelength)[None])
         self._kernel = trace_rays.suited(self._packed)
         load_kernels(self._kernel)
         self._room = 0
 
     def positions(self, rays: Rays) -> np.ndarray:
-        """Return where rays meet the last surface [m], telescope frame, shape [n, 3]; NaN where they do not."""
+        """Return where rays meet the surface [m], telescope frame, shape [n, 3]; NaN where they do not."""
         n = len(rays)
-        if n > _MANY or n == 0:
-            return trace(self._telescope, rays).position
-        if n > self._room * LANES:
-            self._allocate(packet_count(n))
+        packets = packet_count(n)
+        if packets > self._room:
+            # Searches trace twice as many rays for derivatives.
+            self._allocate(2 * packets)
+        if n == 0:
+            return np.empty((0, 3))
         self._position[:, :n], self._direction[:, :n] = rays.position.T, rays.direction.T
-        self._launch.set_dim(packet_count(n))
-        self._launch.launch()
+        if n > _MANY:
+            launch(self._kernel, packets, [self._packed, self._indices, *self._ends])
+        else:
+            self._launch.set_dim(packets)
+            self._launch.launch()
         return self._landing[:, :n].T.copy()
 
     def _allocate(self, packets: int) -> None:

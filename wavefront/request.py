@@ -262,7 +262,7 @@ class Request:
             points = self.pupil.points if pupil is None else pupil
             rays = self.launch(wavelength, np.concatenate([points, np.zeros((*points.shape[:-2], 1, 2))], axis=-2))
         else:
-            chief = self.entrance_points(wavelength, np.zeros((1, 2))).reshape(1, 2)
+            chief = self.entrance_points_of(self.telescope, wavelength, np.zeros((1, 2))).reshape(1, 2)
             through = np.concatenate([entrance, chief])
             rays = straight_bundles(self.telescope, self.directions, wavelength, through)
         end = imaged(self.telescope, trace(self.telescope, rays, threads=self.threads), wavelength)

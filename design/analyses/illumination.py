@@ -178,9 +178,9 @@ def _projected(request: Request, coatings: Coatings | None) -> tuple[float, floa
     if request.vignetting is not None or telescope.design_data.aiming != "off":
         # The area that an element of the pupil of the request fills in the plane of the entrance pupil.
         step = 0.5 * _STEP * telescope.pupil_diameter
-        moved = [request.entrance_points(wavelength, points + step * s).reshape(-1, 2) for s in steps]
+        around = np.concatenate([points, *(points + step * s for s in steps)])
+        points, *moved = request.entrance_points(wavelength, around).reshape(5, -1, 2)
         element = _determinant(np.array(moved)) / (2.0 * step) ** 2
-        points = request.entrance_points(wavelength, points).reshape(-1, 2)
     # The étendue is that of neighbouring fields through one point of that plane, so rays are not aimed again.
     straight = request.at_fields(request.slopes + _STEP * steps)
     beside = replace(straight, telescope=telescope.with_design(aiming="off"), projection="gnomonic")

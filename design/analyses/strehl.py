@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.plotting import BLUE
+from ...core.threads import one_blas_thread
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
@@ -90,6 +91,7 @@ class StrehlRatios(Analysis):
 
 
 @check_arguments
+@one_blas_thread()
 def strehl(
     telescope: Telescope,
     fields: ArrayLike | None = None,

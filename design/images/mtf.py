@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.plotting import BLUE, RED, figure_at, styled
+from ...core.threads import one_blas_thread
 from ...core.units import MOST, arcseconds, require_count
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
@@ -151,6 +152,7 @@ class Mtf(FieldResult):
 
 
 @check_arguments
+@one_blas_thread()
 def mtf(
     telescope: Telescope,
     fields: ArrayLike | None = None,

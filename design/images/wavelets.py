@@ -141,16 +141,21 @@ def lattice_wavelets(
     near = np.flatnonzero(np.hypot(*start.T[2:]) <= radius + margin)
     targets, points = targets[near], start[near, :2]
     jacobian, by_cosine = slopes[near, :2], slopes[near, 2:]
+    lit, opd = np.empty(len(points), dtype=bool), np.empty(len(points))
+    left = np.arange(len(points))
     for _ in range(_MOST_TRACES):
-        bundle, opd, cosine = rays(points)
-        lit = lit_rays(bundle, points)
-        off = targets - cosine
+        bundle, opd[left], cosine = rays(points[left])
+        lit[left] = lit_rays(bundle, points[left])
+        off = targets[left] - cosine
         known = np.isfinite(off).all(axis=1)
-        if not (lit & known).any():
+        if not lit.any():
             raise DomainError(f"{field_label(request.fields[0])}: no light passes; expected a lit pupil")
-        if np.abs(off[lit & known]).max() <= _AIM * spacing:
+        # Rays that are stopped need not be found, but may be lit where they should have been.
+        away = known & ~(np.abs(off) <= _AIM * spacing).all(axis=1)
+        if not (away & lit[left]).any():
             break
-        points = points + np.einsum("nij,nj->ni", jacobian, np.where(known[:, None], off, 0.0))
+        left, off = left[away], off[away]
+        points[left] += np.einsum("nij,nj->ni", jacobian[left], off)
     else:
         raise DomainError(
             f"{field_label(request.fields[0])}: rays could not be aimed at all directions; expected a pupil that the "

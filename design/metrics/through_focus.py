@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.plotting import figure_at, styled
+from ...core.threads import one_blas_thread
 from ...core.units import field_label, metres
 from ...models.telescope import Telescope
 from ...raytrace.ideal_lens import require_image
@@ -109,6 +110,7 @@ class ThroughFocus(FieldResult):
 
 
 @check_arguments
+@one_blas_thread()
 def through_focus(
     telescope: Telescope,
     fields: ArrayLike | None = None,

@@ -17,9 +17,9 @@ from ...core.errors import PrescriptionError, error_context
 from ...core.schema import Section, Whole, validated
 from ...models.io.grid_file import fits_image
 from ...models.io.yaml.values import Number, PositiveNumber, Text
-from ...models.shapes.freeform import ZernikeSag
 from ...models.shapes.grid import GridSag
 from ...models.shapes.modes import GridModes
+from ...models.shapes.polynomial import ZernikeSag
 from .degrees_of_freedom import DegreeOfFreedom, DegreesOfFreedom, SurfaceDeformation
 
 #: Key by which a file is known as one of bending modes.

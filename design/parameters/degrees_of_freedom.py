@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, PachonError, check_unique, unknown_name
 from ...core.units import pure_numbers
-from ...models.shapes.shape import Shape, Sum
+from ...models.shapes.shape import Shape
+from ...models.shapes.sum import Sum
 from ...models.telescope import Telescope
 from ..optimize.sensitivity import Sensitivity, sensitivity
 from .parameters import Parameter, apply, parse_parameters

@@ -33,8 +33,8 @@ from ...core.yaml_reader import as_number, read_mapping
 from ...models.io.bundled import DATA
 from ...models.io.grid_file import read_grid
 from ...models.io.yaml.values import ROWS, Names, Number, PositiveNumber, Text
-from ...models.shapes.freeform import ZernikeSag
 from ...models.shapes.modes import GridModes
+from ...models.shapes.polynomial import ZernikeSag
 from ...models.shapes.shape import Shape
 from .bending_folder import CHOICE, bending_modes
 from .degrees_of_freedom import DegreeOfFreedom, DegreesOfFreedom, SurfaceDeformation

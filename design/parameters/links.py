@@ -109,6 +109,9 @@ class _Growing:
     parse: Callable[[str], Parameter]
     apply: Callable[[Telescope, Mapping[Parameter, float]], Telescope]
 
+    def __post_init__(self) -> None:
+        self._quantities = [quantity_of(p, self.telescope) for p in self.parameters]
+
     def pick_up(self, pickups: Sequence[Pickup]) -> None:
         """Add the changes of all followers, those of followers of followers too."""
         waiting = list(pickups)
@@ -118,7 +121,7 @@ class _Growing:
             now = [p for p in waiting if p.source not in sources or not any(self._leads(q, p) for q in waiting)]
             for pickup in now:
                 for i in range(len(self.parameters)):
-                    if quantity_of(self.parameters[i], self.telescope) == (pickup.source, pickup.quantity):
+                    if self._quantities[i] == (pickup.source, pickup.quantity):
                         self._follow(pickup, i)
             waiting = [p for p in waiting if p not in now]
 
@@ -161,20 +164,21 @@ class _Growing:
         """Return the thickness that meets a solve with changes other than motions."""
         still = {
             p: float(v)
-            for p, v in zip(self.parameters, values, strict=True)
-            if p.kind != "motion" and quantity_of(p, self.telescope) != (solve.surface, "thickness")
+            for p, v, about in zip(self.parameters, values, self._quantities, strict=True)
+            if p.kind != "motion" and about != (solve.surface, "thickness")
         }
         return solved_thickness(self.apply(self.telescope, still), solve, index)
 
     def _add(self, parameter: Parameter, change: float, rate: np.ndarray) -> None:
         """Add a change to that of the same parameter, where there is one."""
+        about = quantity_of(parameter, self.telescope)
         for i, known in enumerate(self.parameters):
-            same = quantity_of(known, self.telescope) == quantity_of(parameter, self.telescope)
-            if same and known.name == parameter.name:
+            if self._quantities[i] == about and known.name == parameter.name:
                 self.values[i] += change
                 self.rates[i] = self.rates[i] + rate
                 return
         self.parameters.append(parameter)
+        self._quantities.append(about)
         self.values.append(change)
         self.rates.append(rate)
 

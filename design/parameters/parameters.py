@@ -39,7 +39,7 @@ from ...models.surface import Interaction
 from ...models.telescope import Telescope
 from ...models.thickness import front_surface, light_axis, thickness, with_thicknesses
 from .links import Followers, has_links, with_followers
-from .shape_terms import shape_with_term, term_unit
+from .shape_terms import shape_with_term, term_unit, with_changes
 
 _OF_MEDIA = ("n", "abbe")
 MOTIONS = ("dx", "dy", "dz", "rx", "ry", "rz")
@@ -271,13 +271,12 @@ def _apply_alone(telescope: Telescope, values: Mapping[Parameter, float]) -> Tel
     telescope = with_shape_terms(telescope, [p for p, v in zip(parameters, changes, strict=True) if v])
     shapes: dict[str, Shape] = {}
     media: dict[int, Medium] = {}
+    changed_terms: dict[str, list[tuple[str, float]]] = {}
     for parameter, change in zip(parameters, changes, strict=True):
         if not change:
             continue
         if parameter.kind == "shape":
-            shape = shapes.get(parameter.target) or telescope.surface(parameter.target).shape
-            value = shape.parameters[parameter.name] + change
-            shapes[parameter.target] = shape.with_parameter(parameter.name, value)
+            changed_terms.setdefault(parameter.target, []).append((parameter.name, change))
         elif parameter.kind in ("index", "abbe"):
             addition, factor = change, 1.0
             if parameter.kind == "abbe":
@@ -287,6 +286,8 @@ def _apply_alone(telescope: Telescope, values: Mapping[Parameter, float]) -> Tel
                 addition, factor = 0.0, number / (number + change)
             for i in index_surfaces(telescope, parameter.target):
                 media[i] = with_index_change(media.get(i, telescope.surfaces[i].medium_after), addition, factor)
+    for target, terms in changed_terms.items():
+        shapes[target] = with_changes(telescope.surface(target).shape, terms)
     if shapes or media:
         changed = tuple(
             replace(s, shape=shapes.get(s.name, s.shape), medium_after=media.get(i, s.medium_after))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
@@ -10,9 +11,10 @@ import numpy as np
 
 from ...core.errors import DomainError, unknown_name
 from ...models.aperture import Annulus, Circle
-from ...models.shapes.freeform import XYPolynomial, ZernikeSag
 from ...models.shapes.polar_polynomial import PolarPolynomial, from_even_powers, from_monomials, from_zernikes
-from ...models.shapes.shape import EvenAsphere, Rotational, Shape, Sum
+from ...models.shapes.polynomial import XYPolynomial, ZernikeSag
+from ...models.shapes.shape import EvenAsphere, Rotational, Shape
+from ...models.shapes.sum import Sum
 from ...models.surface import Surface
 
 
@@ -89,3 +91,16 @@ def _rims(surface: Surface) -> tuple[float, float]:
     raise DomainError(
         f"surface {surface.name}: expected a round aperture, or a Zernike sag, for the rims of a Zernike term"
     )
+
+
+def with_changes(shape: Shape, changes: Sequence[tuple[str, float]]) -> Shape:
+    """Return a shape with changes of parameters, by name."""
+    together = {}
+    before = shape.parameters
+    for name, change in changes:
+        if name.endswith(("radius", "curvature")):
+            # Two names of one parameter: one change follows the other.
+            shape = shape.with_parameter(name, shape.parameters[name] + change)
+        else:
+            together[name] = before[name] + change
+    return shape.with_parameters(together) if together else shape

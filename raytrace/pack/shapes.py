@@ -11,11 +11,13 @@ import warp as wp
 
 from ...core.errors import PrescriptionError
 from ...core.warp_arrays import warp_array
-from ...models.shapes.freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
+from ...models.shapes.freeform import Biconic, OddAsphere, Toroid
 from ...models.shapes.grid import GridSag
 from ...models.shapes.mesh import MeshSurface
 from ...models.shapes.polar_polynomial import PolarPolynomial, from_even_powers
-from ...models.shapes.shape import Plane, Rotational, Shape, Sum
+from ...models.shapes.polynomial import XYPolynomial, ZernikeSag
+from ...models.shapes.shape import Plane, Rotational, Shape
+from ...models.shapes.sum import Sum
 from ..kernels.shape import BICONIC, GRID, ODD, PART_COLUMNS, POLAR, TOROID, PackedDeformations
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import brentq
@@ -18,6 +19,8 @@ from .merits import ToleranceMerit
 NOMINAL, LOWER, UPPER, INVERSE, DRAW = "nominal", "lower end", "upper end", "inverse", "draw"
 #: Precision of an inverse sensitivity, a binary logarithm, and the largest factor from the tolerance to it.
 _PRECISION, _FARTHEST = 1e-3, 1e4
+#: Half of the range about a predicted inverse sensitivity, a binary logarithm.
+_NARROW = 0.1
 
 
 @dataclass(frozen=True)
@@ -68,26 +71,48 @@ class ToleranceMeasurement:
         """Return deviations [n, n_tolerance] with their compensators behind."""
         return np.concatenate([deviations, self.built.moves(deviations)], axis=1)
 
+    @cached_property
+    def nominal(self) -> float:
+        """Merit as designed, compensated."""
+        return self.at(self.values_of(np.zeros((1, len(self.built.tolerances))))[0])
+
     def _inverse(self, index: int) -> float:
         """Return the size of one tolerance whose worse end costs the loss; NaN where none within reach does.
 
-        Brent's method on the logarithm, between sizes a factor of two apart from the size of the tolerance on.
+        Brent's method on the logarithm, within a narrow range about what the linear residuals predict, or between sizes
+        a factor of two apart from the size of the tolerance on.
         """
-        n = len(self.built.tolerances)
-        nominal = self.at(self.values_of(np.zeros((1, n)))[0])
+        nominal = self.nominal
         allowed = self.loss * abs(nominal)
+        known: dict[float, float] = {}
 
         def excess(power: float) -> float:
-            ends = np.zeros((2, n))
-            ends[:, index] = start * 2.0**power * np.array([-1.0, 1.0])
-            losses = self.merit.loss(np.array([self.at(v) for v in self.values_of(ends)]), nominal)
-            # A telescope that loses its light costs more than any that does not.
-            return float(np.max(np.where(np.isnan(losses), _FARTHEST * allowed, losses))) - allowed
+            if power not in known:
+                ends = np.zeros((2, len(self.built.tolerances)))
+                ends[:, index] = start * 2.0**power * np.array([-1.0, 1.0])
+                losses = self.merit.loss(np.array([self.at(v) for v in self.values_of(ends)]), nominal)
+                # A telescope that loses its light costs more than any that does not.
+                known[power] = float(np.max(np.where(np.isnan(losses), _FARTHEST * allowed, losses))) - allowed
+            return known[power]
 
-        start, low = self.built.tolerances[index].size, 0.0
-        step = 1.0 if excess(low) < 0 else -1.0
-        while (excess(low + step) < 0) == (step > 0):
-            low += step
-            if abs(low) > np.log2(_FARTHEST):
-                return np.nan
-        return start * 2.0 ** float(brentq(excess, *sorted((low, low + step)), xtol=_PRECISION))
+        start = self.built.tolerances[index].size
+        predicted = np.log2(self._predicted(index) / start)
+        low, high = predicted - _NARROW, predicted + _NARROW
+        if not (abs(predicted) < np.log2(_FARTHEST) and excess(low) < 0.0 <= excess(high)):
+            step = 1.0 if excess(0.0) < 0 else -1.0
+            last = 0.0
+            while (excess(last + step) < 0) == (step > 0):
+                last += step
+                if abs(last) > np.log2(_FARTHEST):
+                    return np.nan
+            low, high = sorted((last, last + step))
+        return start * 2.0 ** float(brentq(excess, low, high, xtol=_PRECISION))
+
+    def _predicted(self, index: int) -> float:
+        """Return that size by linear residuals; NaN for merits other than theirs, and where there is none."""
+        fixed, change = self.built.fixed, self.built.left[:, index]
+        square, along = float(change @ change), abs(float(fixed @ change))
+        if self.merit.own is not None or not square > 0.0:
+            return np.nan
+        gain = ((1.0 + self.loss) ** 2 - 1.0) * float(fixed @ fixed)
+        return float((np.sqrt(along**2 + square * gain) - along) / square)

@@ -17,7 +17,7 @@ from ...design.parameters.links import followers
 from ...design.parameters.parameters import Parameter, resolved
 from ...design.parameters.tolerances import Tolerance
 from ...models.media.medium import abbe_number
-from ...models.shapes.freeform import ZernikeSag
+from ...models.shapes.polynomial import ZernikeSag
 from ...models.surface import Interaction
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import noll_to_nm

@@ -13,7 +13,7 @@ from pachon.models.io.grid_file import read_grid
 from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.mesh_file import load_mesh
 from pachon.models.shapes.grid import GridSag
-from pachon.models.shapes.shape import Sum
+from pachon.models.shapes.sum import Sum
 from pachon.pipeline.config import load_configuration
 from pachon.pipeline.measure.star_catalogue import load_stars
 

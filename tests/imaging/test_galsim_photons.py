@@ -16,8 +16,8 @@ from pachon.core.errors import DomainError, UnknownNameError
 from pachon.core.units import ARCSEC
 from pachon.imaging.wcs import ccd_wcs
 from pachon.models.camera.silicon import Silicon
-from pachon.models.shapes.freeform import ZernikeSag
 from pachon.models.shapes.grid import GridSag
+from pachon.models.shapes.polynomial import ZernikeSag
 from pachon.models.surface import Interaction
 from pachon.pipeline.focal_plane_psf.model import FocalPlanePsf
 

@@ -9,7 +9,8 @@ from pachon.models.first_order import first_order, footprints, seidel_sums
 from pachon.models.io.prescription import load_telescope
 from pachon.models.media.medium import ConstantIndex
 from pachon.models.shapes.freeform import Biconic
-from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sum
+from pachon.models.shapes.shape import Conic, EvenAsphere, Plane
+from pachon.models.shapes.sum import Sum
 from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM, Telescope
 

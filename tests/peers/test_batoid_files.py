@@ -11,9 +11,11 @@ import pytest
 import yaml
 
 import pachon
-from pachon.models.shapes.freeform import OddAsphere, XYPolynomial, ZernikeSag
+from pachon.models.shapes.freeform import OddAsphere
 from pachon.models.shapes.grid import GridSag
-from pachon.models.shapes.shape import EvenAsphere, Sum
+from pachon.models.shapes.polynomial import XYPolynomial, ZernikeSag
+from pachon.models.shapes.shape import EvenAsphere
+from pachon.models.shapes.sum import Sum
 
 batoid = pytest.importorskip("batoid")
 

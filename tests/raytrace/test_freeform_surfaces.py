@@ -11,10 +11,12 @@ from scipy.spatial.transform import Rotation
 import pachon
 from pachon.core.launch import FORWARD_OPTIONS, launch, start_warp
 from pachon.models.media.medium import ConstantIndex
-from pachon.models.shapes.freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
+from pachon.models.shapes.freeform import Biconic, OddAsphere, Toroid
 from pachon.models.shapes.grid import GridSag
 from pachon.models.shapes.mesh import MeshSurface
-from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sphere, Sum
+from pachon.models.shapes.polynomial import XYPolynomial, ZernikeSag
+from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sphere
+from pachon.models.shapes.sum import Sum
 from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import Telescope
 from pachon.raytrace.kernels.packet import lanes, to_packets

@@ -10,9 +10,11 @@ import pachon
 from pachon.core.errors import DomainError
 from pachon.models.aperture import Circle, Complement, Rectangle
 from pachon.models.io.prescription import load_telescope, save_telescope
-from pachon.models.shapes.freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
+from pachon.models.shapes.freeform import Biconic, OddAsphere, Toroid
 from pachon.models.shapes.grid import GridSag
-from pachon.models.shapes.shape import Conic, Sum
+from pachon.models.shapes.polynomial import XYPolynomial, ZernikeSag
+from pachon.models.shapes.shape import Conic
+from pachon.models.shapes.sum import Sum
 from pachon.raytrace.rays import field_direction, object_points
 
 DATA = Path(__file__).parents[1] / "data" / "zmx"

@@ -7,8 +7,8 @@ import pytest
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError
-from pachon.models.shapes.freeform import ZernikeSag
 from pachon.models.shapes.mesh import MeshSurface
+from pachon.models.shapes.polynomial import ZernikeSag
 
 # Rounding of 30 m of path, in two orders of the last sums.
 ROUNDING = 1e-13

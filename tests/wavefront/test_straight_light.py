@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import pachon
-from pachon.models.shapes.freeform import ZernikeSag
+from pachon.models.shapes.polynomial import ZernikeSag
 from pachon.models.surface import Interaction
 from pachon.raytrace.rays import RayStatus, object_points
 from pachon.wavefront.straight_light import passing_packets

@@ -26,10 +26,12 @@ from pydantic import Field
 from ....core.errors import PrescriptionError
 from ....core.schema import Count, Parameters, Tagged, WrittenAs, checked, expected, written
 from ....core.yaml_reader import as_number
-from ...shapes.freeform import OddAsphere, XYPolynomial, ZernikeSag
+from ...shapes.freeform import OddAsphere
 from ...shapes.grid import GridSag
 from ...shapes.polar_polynomial import from_zernikes
-from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere, Sum
+from ...shapes.polynomial import XYPolynomial, ZernikeSag
+from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere
+from ...shapes.sum import Sum
 from ..yaml.values import ROWS, Number, Numbers
 
 

@@ -23,8 +23,10 @@ from typing import Any
 import numpy as np
 
 from ....core.errors import PrescriptionError
-from ...shapes.freeform import OddAsphere, Toroid, XYPolynomial, ZernikeSag
-from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere, Sum
+from ...shapes.freeform import OddAsphere, Toroid
+from ...shapes.polynomial import XYPolynomial, ZernikeSag
+from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere
+from ...shapes.sum import Sum
 from ...zernike_polynomials import noll_to_nm
 from ..json_items import JsonObject
 from ..zemax.file import Findings

@@ -32,10 +32,12 @@ from pydantic import AfterValidator, BeforeValidator
 from ....core.errors import PrescriptionError
 from ....core.schema import Parameters, Tagged, WrittenAs, checked, either, expected, written
 from ....core.yaml_reader import as_number
-from ...shapes.freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
+from ...shapes.freeform import Biconic, OddAsphere, Toroid
 from ...shapes.grid import GridSag
 from ...shapes.mesh import MeshSurface
-from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere, Sum
+from ...shapes.polynomial import XYPolynomial, ZernikeSag
+from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere
+from ...shapes.sum import Sum
 from ..grid_file import read_grid
 from .values import (
     ROWS,

@@ -15,9 +15,11 @@ import numpy as np
 
 from ....core.errors import PrescriptionError
 from ...aperture import Aperture, Complement, Intersection, Polygon, Rectangle, Union, Vane
-from ...shapes.freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
+from ...shapes.freeform import Biconic, OddAsphere, Toroid
 from ...shapes.grid import GridSag
-from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere, Sum
+from ...shapes.polynomial import XYPolynomial, ZernikeSag
+from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere
+from ...shapes.sum import Sum
 from ...surface import IDENTITY, Matrix
 from ...zernike_polynomials import noll_to_nm
 

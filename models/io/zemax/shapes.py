@@ -24,9 +24,11 @@ import math
 import numpy as np
 
 from ....core.errors import PrescriptionError
-from ...shapes.freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
+from ...shapes.freeform import Biconic, OddAsphere, Toroid
 from ...shapes.grid import GridSag
-from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere, Sum
+from ...shapes.polynomial import XYPolynomial, ZernikeSag
+from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere
+from ...shapes.sum import Sum
 from ...zernike_polynomials import annular_zernikes
 from .file import Block, Findings
 from .text import number_text

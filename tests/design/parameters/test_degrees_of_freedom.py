@@ -19,9 +19,9 @@ from pachon.design.parameters.degrees_of_freedom_file import load_degrees_of_fre
 from pachon.design.parameters.parameters import apply
 from pachon.design.parameters.thermal import thermal
 from pachon.models.io.grid_file import write_grid
-from pachon.models.shapes.freeform import ZernikeSag
 from pachon.models.shapes.grid import GridSag
 from pachon.models.shapes.modes import GridModes
+from pachon.models.shapes.polynomial import ZernikeSag
 from pachon.models.shapes.shape import EvenAsphere, Plane
 
 ARCSEC = np.deg2rad(1.0 / 3600.0)

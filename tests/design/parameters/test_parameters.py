@@ -13,8 +13,9 @@ from pachon.design.parameters.parameters import (
     with_shape_terms,
 )
 from pachon.design.parameters.shape_terms import term_polynomial, term_unit
-from pachon.models.shapes.freeform import XYPolynomial, ZernikeSag
-from pachon.models.shapes.shape import Conic, EvenAsphere, Sum
+from pachon.models.shapes.polynomial import XYPolynomial, ZernikeSag
+from pachon.models.shapes.shape import Conic, EvenAsphere
+from pachon.models.shapes.sum import Sum
 
 
 @pytest.mark.parametrize(

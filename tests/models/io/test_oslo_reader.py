@@ -11,8 +11,10 @@ from pachon.models.aperture import Circle
 from pachon.models.first_order import first_order
 from pachon.models.io.glass_catalogue import GlassCatalogue
 from pachon.models.rotation import rotation_matrix
-from pachon.models.shapes.freeform import OddAsphere, Toroid, XYPolynomial
-from pachon.models.shapes.shape import Conic, EvenAsphere, Sphere, Sum
+from pachon.models.shapes.freeform import OddAsphere, Toroid
+from pachon.models.shapes.polynomial import XYPolynomial
+from pachon.models.shapes.shape import Conic, EvenAsphere, Sphere
+from pachon.models.shapes.sum import Sum
 from pachon.models.surface import Interaction
 
 DATA = Path(__file__).parents[2] / "data"

@@ -8,10 +8,12 @@ from astropy.io import fits
 from pachon.core.errors import PrescriptionError
 from pachon.models.io.grid_file import read_grid, write_grid
 from pachon.models.io.prescription import load_telescope, save_telescope
-from pachon.models.shapes.freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
+from pachon.models.shapes.freeform import Biconic, OddAsphere, Toroid
 from pachon.models.shapes.grid import GridSag
 from pachon.models.shapes.mesh import MeshSurface
-from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sphere, Sum
+from pachon.models.shapes.polynomial import XYPolynomial, ZernikeSag
+from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sphere
+from pachon.models.shapes.sum import Sum
 from pachon.models.surface import Interaction
 
 GRID = GridSag(np.linspace(-1, 1, 5), np.linspace(-1, 1, 4), np.arange(20.0).reshape(4, 5) * 1e-7)

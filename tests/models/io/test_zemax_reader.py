@@ -17,7 +17,8 @@ from pachon.models.io.glass_catalogue import GlassCatalogue
 from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.shapes.freeform import Biconic, OddAsphere, Toroid
 from pachon.models.shapes.grid import GridSag
-from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sphere, Sum
+from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sphere
+from pachon.models.shapes.sum import Sum
 from pachon.models.surface import IDENTITY, Interaction
 
 DATA = Path(__file__).parents[2] / "data" / "zmx"

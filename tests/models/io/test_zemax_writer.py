@@ -10,8 +10,10 @@ from pachon.models.io.glass_catalogue import GlassCatalogue
 from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.media.medium import ConstantIndex, Sellmeier
 from pachon.models.media.tabulated import TabulatedIndex
-from pachon.models.shapes.freeform import Biconic, XYPolynomial, ZernikeSag
-from pachon.models.shapes.shape import Conic, EvenAsphere, Sum
+from pachon.models.shapes.freeform import Biconic
+from pachon.models.shapes.polynomial import XYPolynomial, ZernikeSag
+from pachon.models.shapes.shape import Conic, EvenAsphere
+from pachon.models.shapes.sum import Sum
 from pachon.models.surface import Interaction
 
 

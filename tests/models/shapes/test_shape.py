@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from pachon.core.errors import PrescriptionError, UnknownNameError
-from pachon.models.shapes.freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
+from pachon.models.shapes.freeform import Biconic, OddAsphere, Toroid
 from pachon.models.shapes.grid import GridSag
-from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sphere, Sum
+from pachon.models.shapes.polynomial import XYPolynomial, ZernikeSag
+from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sphere
+from pachon.models.shapes.sum import Sum
 from pachon.models.zernike_polynomials import annular_zernikes
 
 RNG = np.random.default_rng(7)

@@ -8,8 +8,8 @@ import pytest
 import pachon
 from pachon.core.errors import DomainError
 from pachon.models.aperture import Circle
-from pachon.models.shapes.freeform import ZernikeSag
 from pachon.models.shapes.mesh import MeshSurface
+from pachon.models.shapes.polynomial import ZernikeSag
 from pachon.models.shapes.shape import Conic, Plane
 from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM
