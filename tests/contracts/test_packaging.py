@@ -1,5 +1,6 @@
 """Files beside the package: the source archive is whole, citation and version agree, workflows are valid YAML."""
 
+import re
 import tomllib
 from pathlib import Path
 
@@ -36,3 +37,11 @@ def test_workflows_run_what_is_there():
             assert (ROOT / target).exists(), command
     read_the_docs = yaml.safe_load((ROOT / ".readthedocs.yaml").read_text(encoding="utf-8"))
     assert (ROOT / read_the_docs["sphinx"]["configuration"]).is_file()
+
+
+def test_the_install_page_lists_the_extras():
+    page = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
+    table = page[page.index("## Extras") : page.index("## Without a network")]
+    rows = re.findall(r"^\| (`.+?) \|", table, flags=re.M)[1:]
+    listed = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
+    assert listed == set(PROJECT["project"]["optional-dependencies"])
