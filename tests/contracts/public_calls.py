@@ -344,7 +344,7 @@ def calls(folder):
                          "position": np.array([[0.0, 0.0, -1.0]]), "direction": np.array([[0.0, 0.0, 1.0]])}),
         "launch_rays": (pachon.launch_rays, {"telescope": tel, "field": (0.0, 0.0), "wavelength": w, "pupil": (x, y),
                         "projection": "zemax", "aiming": "off"}),
-        "trace": (pachon.trace, {"telescope": tel, "rays": m.rays, "surfaces": "last", "threads": 1, "out": pachon.trace(tel, m.rays)}),
+        "trace": (pachon.trace, {"telescope": tel, "rays": m.rays, "threads": 1, "out": pachon.trace(tel, m.rays)}),
         "read_galaxies": (pachon.read_galaxies, {"path": m.folder / "none.fits", "pointing": (0.0, 0.0)}),
         "write_galaxies": (pachon.write_galaxies, {"path": m.folder / "galaxies.ecsv", "galaxies": m.galaxies}),
         "draw_galaxies": (pachon.draw_galaxies, {"region": ((-1e-4, 1e-4), (-1e-4, 1e-4)), "faintest": 24.0, "seed": 1,

@@ -7,6 +7,7 @@ import sys
 import time
 
 import pytest
+from drivers import lives
 
 _DRIVER = """
 import os, time
@@ -21,15 +22,6 @@ if __name__ == "__main__":
 """
 
 
-def _lives(process):
-    # A process that ended but whose new parent has not taken notice is a zombie, in state Z.
-    try:
-        with open(f"/proc/{process}/stat") as file:
-            return file.read().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
 @pytest.mark.long
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="processes are looked up in /proc")
 def test_workers_end_after_their_driver_is_killed(tmp_path):
@@ -37,12 +29,12 @@ def test_workers_end_after_their_driver_is_killed(tmp_path):
     driver = subprocess.Popen([sys.executable, "driver.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True,
                               env={**os.environ, "PYTHONPATH": os.getcwd()})  # fmt: skip
     worker = int(driver.stdout.readline())
-    assert _lives(worker)
+    assert lives(worker)
     driver.send_signal(signal.SIGKILL)
     driver.wait()
     driver.stdout.close()
     for _ in range(40):
-        if not _lives(worker):
+        if not lives(worker):
             break
         time.sleep(0.1)
     else:

@@ -1,15 +1,11 @@
 """A run by processes, by a cluster and in parts: the same bytes as one process leaves."""
 
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
 import yaml
+from drivers import kill_a_worker, start, wait_for
 
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, ProductError
@@ -131,16 +127,11 @@ def test_the_mark_of_a_folder_goes_with_its_process(tmp_path):
     assert not any(tmp_path.iterdir())
 
 
-def start(folder, *options):
-    command = [sys.executable, "-m", "pachon", "run", "small.yaml", "--out", "run", *options]
-    return subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True,
-                            env={**os.environ, "PYTHONPATH": os.getcwd()})  # fmt: skip
-
-
-def wait_for_product(folder, driver):
-    while not any((folder / "run").glob("ccd_*.fits")):
-        assert driver.poll() is None, driver.stderr.read()
-        time.sleep(0.02)
+def start_run(folder, *options):
+    """Start a run, and wait for its first product."""
+    driver = start(folder, "run", "small.yaml", "--out", "run", *options)
+    wait_for(lambda: any((folder / "run").glob("ccd_*.fits")), driver)
+    return driver
 
 
 @pytest.fixture
@@ -156,11 +147,8 @@ def reference(settings_file, tmp_path):
 
 @pytest.mark.slow
 def test_processes_of_which_one_is_killed_and_the_run_resumed(reference, tmp_path):
-    driver = start(tmp_path, "--processes", "2")
-    wait_for_product(tmp_path, driver)
-    children = subprocess.run(["pgrep", "-P", str(driver.pid)], capture_output=True, text=True, check=True).stdout
-    # The last of the children are the workers; the first may be the resource tracker of multiprocessing.
-    os.kill(int(children.split()[-1]), signal.SIGKILL)
+    driver = start_run(tmp_path, "--processes", "2")
+    kill_a_worker(driver)
     said = driver.communicate()[1]
     assert driver.returncode == 2
     assert "a worker process died" in said.strip().splitlines()[-1]
@@ -173,8 +161,7 @@ def test_processes_of_which_one_is_killed_and_the_run_resumed(reference, tmp_pat
 
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_leaves_the_same_bytes(reference, tmp_path, cluster):
-    driver = start(tmp_path, "--scheduler", cluster["address"])
-    wait_for_product(tmp_path, driver)
+    driver = start_run(tmp_path, "--scheduler", cluster["address"])
     cluster["workers"][0].kill()
     said = driver.communicate()[1]
     assert driver.returncode == 0, said

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from drivers import children, seconds_that_children_outlive, start, wait_for, workers
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="needs a server of forks")]
 
@@ -130,3 +131,27 @@ def test_a_command_that_is_killed_again_and_again_leaves_the_same_bytes(name, fo
         assert content(out) == expected
         ended += 1
     print(f"{name}: {kills} kills, {ended} commands resumed to their end, {seconds:.1f} s without kills")
+
+
+#: Ways of a command to have processes of its own: workers, or the process that draws half of the report.
+DRIVERS = {
+    "run": ("run", ["--processes", "2"]),
+    "run alone": ("run", ["--threads", "2"]),
+    "sweep": ("sweep", ["--processes", "2"]),
+    "tolerance": ("tolerance", ["--processes", "2"]),
+}
+
+
+@pytest.mark.parametrize("kind", DRIVERS)
+def test_processes_end_with_the_driver_that_is_killed(kind, tmp_path):
+    name, options = DRIVERS[kind]
+    settings, command = COMMANDS[name]
+    (tmp_path / "file.yaml").write_text(yaml.safe_dump(settings))
+    words = [word.format(file="file.yaml") for word in command[: command.index("--out")]]
+    began = children if "--threads" in options else workers
+    rng = np.random.default_rng(5)
+    for turn in range(5):
+        driver = start(tmp_path, *words, "--out", f"turn{turn}.sweep", *options)
+        wait_for(lambda driver=driver: began(driver), driver)
+        time.sleep(rng.uniform(0.0, 1.0))
+        assert seconds_that_children_outlive(driver) < 2.0

@@ -1,12 +1,7 @@
 """Visits by processes and by a cluster, one of which is killed."""
 
-import os
-import signal
-import subprocess
-import sys
-import time
-
 import pytest
+from drivers import kill_a_worker, seconds_that_children_outlive, start, wait_for, workers
 
 from pachon.commands.cli import main
 from pachon.studies.visits.visits import SUMS_NAME, stack_visits
@@ -28,25 +23,15 @@ def settings_and_content(visits_config, tmp_path):
     return path, content(tmp_path / "one")
 
 
-def start(folder, *options):
-    command = [sys.executable, "-m", "pachon", "visits", "visits.yaml", "-o", "visits", *options]
-    return subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True,
-                            env={**os.environ, "PYTHONPATH": os.getcwd()})  # fmt: skip
-
-
-def wait_for_sums(folder, driver):
-    while not (folder / "visits" / SUMS_NAME).exists():
-        assert driver.poll() is None, driver.stderr.read()
-        time.sleep(0.02)
+def start_visits(folder, *options):
+    return start(folder, "visits", "visits.yaml", "-o", "visits", *options)
 
 
 def test_processes_of_which_one_is_killed_and_visits_resumed(settings_and_content, tmp_path):
     path, wanted = settings_and_content
-    driver = start(tmp_path, "--processes", "2")
-    wait_for_sums(tmp_path, driver)
-    children = subprocess.run(["pgrep", "-P", str(driver.pid)], capture_output=True, text=True, check=True).stdout
-    # The last of the children are the workers; the first may be the resource tracker of multiprocessing.
-    os.kill(int(children.split()[-1]), signal.SIGKILL)
+    driver = start_visits(tmp_path, "--processes", "2")
+    wait_for((tmp_path / "visits" / SUMS_NAME).exists, driver)
+    kill_a_worker(driver)
     said = driver.communicate()[1]
     assert driver.returncode == 2
     assert "a worker process died" in said.strip().splitlines()[-1]
@@ -54,10 +39,16 @@ def test_processes_of_which_one_is_killed_and_visits_resumed(settings_and_conten
     assert content(tmp_path / "visits") == wanted
 
 
+def test_workers_end_with_their_driver(settings_and_content, tmp_path):
+    driver = start_visits(tmp_path, "--processes", "2")
+    wait_for(lambda: len(workers(driver)) == 2, driver)
+    assert seconds_that_children_outlive(driver) < 2.0
+
+
 def test_a_cluster_that_loses_a_worker_leaves_the_same_bytes(settings_and_content, tmp_path, cluster):
     _, wanted = settings_and_content
-    driver = start(tmp_path, "--scheduler", cluster["address"])
-    wait_for_sums(tmp_path, driver)
+    driver = start_visits(tmp_path, "--scheduler", cluster["address"])
+    wait_for((tmp_path / "visits" / SUMS_NAME).exists, driver)
     cluster["workers"][0].kill()
     said = driver.communicate()[1]
     assert driver.returncode == 0, said
