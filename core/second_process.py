@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context
+from multiprocessing import current_process, get_context
 from typing import Any
 
 from .errors import ProductError
@@ -27,11 +27,13 @@ def second_process(threads: int | None = None) -> Iterator[Submit]:
     """Yield a function that hands computations to a second process, which does them one after the other.
 
     The process is a fork of this one, so it starts at once; it ends with the block, or with this process. There is none
-    for one thread, where this process has other threads, whose locks a fork would keep, or outside Linux, whose
-    libraries survive forks: computations are then done in this process, at once. Waiting for a result raises what the
-    computation has raised, or ProductError if the process was killed.
+    for one thread, where this process has other threads, whose locks a fork would keep, where it may have no processes
+    of its own, as those of a ``multiprocessing.Pool``, or outside Linux, whose libraries survive forks: computations
+    are then done in this process, at once. Waiting for a result raises what the computation has raised, or ProductError
+    if the process was killed.
     """
-    if thread_count(threads) == 1 or threading.active_count() > 1 or sys.platform != "linux":
+    alone = threading.active_count() == 1 and not current_process().daemon
+    if thread_count(threads) == 1 or not alone or sys.platform != "linux":
         yield _here
         return
     pool = ProcessPoolExecutor(1, mp_context=get_context("fork"), initializer=_begin, initargs=(os.getpid(),))

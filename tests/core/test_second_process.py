@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 import threading
+from multiprocessing import get_context
 
 import pytest
 
@@ -47,6 +48,17 @@ def test_a_process_with_other_threads_is_not_forked():
     finally:
         end.set()
         waiting.join()
+
+
+def in_a_pool(_):
+    with second_process(2) as submit:
+        return submit(os.getpid)() == os.getpid()
+
+
+@needs_linux
+def test_processes_that_may_have_no_others_do_all_themselves():
+    with get_context("fork").Pool(1) as pool:
+        assert pool.map(in_a_pool, [0]) == [True]
 
 
 @needs_linux
