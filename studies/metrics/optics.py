@@ -59,7 +59,8 @@ def zernike(scene: Scene) -> dict[str, float]:
 
     DomainError, the reason at the last field, if none does.
     """
-    metrics, missed = {}, None
+    metrics: dict[str, float] = {}
+    missed: DomainError | None = None
     for field, place in zip(scene.fields, scene.plan.fields_deg, strict=True):
         try:
             fit = wavefront_zernikes(scene.telescope, field[None], scene.middle, jmax=_HIGHEST, threads=scene.threads)
