@@ -77,13 +77,10 @@ def test_bad_input_is_refused_when_the_request_is_made(lsst_r, change, error, wo
         pachon.Request.of(lsst_r, **change)
 
 
-@pytest.mark.parametrize("telecentric", [False, True])
-def test_pupil_coordinates_are_those_that_were_aimed(telecentric):
+def test_pupil_coordinates_are_those_that_were_aimed():
     lens = pachon.load_telescope(DATA / "circular_aperture_example_with_aperture.zmx")
     factors = (0.1, -0.05, 0.3, 0.2, 0.4)
     lens = lens.with_design(aiming="real", fields=((0.1, 0.4),), field_weights=(), vignetting=(factors,))
-    if telecentric:
-        lens = replace(lens, object_distance=1.0).with_design(aiming="off", telecentric=True)
     request = pachon.Request.of(lens)
     points = 0.5 * lens.pupil_diameter * np.array([[0.0, 0.0], [0.9, 0.0], [-0.3, 0.8]])
     entrance = request.entrance_points(lens.default_wavelength, points).reshape(-1, 2)
@@ -97,7 +94,7 @@ def test_perturbed_telescopes_are_aimed_as_if_alone():
     request = pachon.Request.of(lens, n_pupil=3)
     light, pupil = lens.default_wavelength, request.pupil.points
     assert np.array_equal(request.entrance_points_of(lens, light, pupil), request.entrance_points(light, pupil))
-    name = lens.surface_names[0]
+    name = next(s.name for s in lens.surfaces if s.interaction == pachon.Interaction.REFRACT)
     # A tolerance, and a change that no search follows from the design.
     for shift in ((2e-5, -1e-5, 3e-5), (0.0, 0.0, 0.3 * lens.pupil_diameter)):
         moved = lens.perturbed(name, shift=shift, tilt=(1e-3, 0.0, 0.0))
