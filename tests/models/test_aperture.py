@@ -179,7 +179,7 @@ def test_apertures_in_a_file_and_back(tmp_path, keys, expected):
     ("keys", "message"),
     [
         ("circle: 3, aperture: {circle: 4}", "surfaces[a].circle = 3: expected circle or aperture, not both"),
-        ("aperture: {}", "surfaces[a].aperture has nothing: expected one of circle, annulus, ellipse, rectangle, polygon"),
+        ("aperture: {}", "surfaces[a].aperture has nothing: expected one of circle, annulus, ellipse, rectangle"),
         ("obscuration: {disc: 4}", "surfaces[a].obscuration has disc: expected one of circle"),
         ("aperture: {circle: 4, vane: 3}", "surfaces[a].aperture has circle, vane: expected one of"),
         ("aperture: {rectangle: [1, 2], from: [0, 0]}", "unknown key surfaces[a].aperture.from = [0, 0]"),
