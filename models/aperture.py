@@ -1,4 +1,4 @@
-"""Clear apertures of a surface: discs, rings, rectangles, polygons, spider vanes, and their unions and intersections.
+"""Clear apertures of a surface: discs, rings, ellipses, rectangles, polygons, spider vanes, unions, intersections.
 
 An aperture is the region of a surface's own x, y that light passes. The complement of an obstacle is what it leaves
 clear: ``Complement(Circle(1.1))`` for a camera body, ``Complement(Union((vane, vane, vane, vane)))`` for a spider.
@@ -100,6 +100,42 @@ class Annulus(Region):
         dx, dy = _shifted(x, y, self.x, self.y)
         r2 = dx**2 + dy**2
         return (r2 >= self.inner**2) & (r2 < self.outer**2)
+
+
+@check_arguments
+@dataclass(frozen=True)
+class Ellipse(Region):
+    """Ellipse; its rim is outside.
+
+    Parameters
+    ----------
+    semi_x, semi_y : float
+        Semi-axes [m].
+    x, y : float
+        Centre [m].
+    angle : float
+        Angle of the first axis from x towards y [rad].
+    """
+
+    semi_x: float
+    semi_y: float
+    x: float = 0.0
+    y: float = 0.0
+    angle: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require(
+            0 < self.semi_x < np.inf and 0 < self.semi_y < np.inf,
+            f"ellipse = [{self.semi_x!r}, {self.semi_y!r}] m: expected two positive lengths",
+        )
+        _require(
+            np.all(np.isfinite((self.x, self.y, self.angle))),
+            f"ellipse at ({self.x!r}, {self.y!r}) m, {self.angle!r} rad: expected finite centre and angle",
+        )
+
+    def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:  # noqa: D102
+        along, across = _rotated(*_shifted(x, y, self.x, self.y), self.angle)
+        return (along / self.semi_x) ** 2 + (across / self.semi_y) ** 2 < 1.0
 
 
 @check_arguments
@@ -292,7 +328,7 @@ class Complement(Region):
         return np.logical_not(self.part.contains(x, y))
 
 
-Aperture = Circle | Annulus | Rectangle | Vane | Polygon | Union | Intersection | Complement
+Aperture = Circle | Annulus | Ellipse | Rectangle | Vane | Polygon | Union | Intersection | Complement
 
 
 def shifted(aperture: Aperture, x: float, y: float) -> Aperture:

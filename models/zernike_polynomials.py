@@ -142,9 +142,9 @@ def radial_series(m: int, count: int, obscuration: float = 0.0) -> np.ndarray:
         series = np.polynomial.legendre.leg2poly([0.0] * degree + [1.0])
         expanded = np.polynomial.Polynomial(series)(node)
         powers[: degree + 1, degree] = expanded.coef
-    series: np.ndarray = powers @ _radial_coefficients(m, count, float(obscuration))
-    series.flags.writeable = False
-    return series
+    found: np.ndarray = powers @ _radial_coefficients(m, count, float(obscuration))
+    found.flags.writeable = False
+    return found
 
 
 def zernike_monomials(jmax: int) -> np.ndarray:

@@ -114,6 +114,7 @@ from .imaging.wcs import wcs as wcs
 from .models.aperture import Annulus as Annulus
 from .models.aperture import Circle as Circle
 from .models.aperture import Complement as Complement
+from .models.aperture import Ellipse as Ellipse
 from .models.aperture import Intersection as Intersection
 from .models.aperture import Polygon as Polygon
 from .models.aperture import Rectangle as Rectangle

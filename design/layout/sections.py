@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ...models.aperture import Annulus, Aperture, Circle, Complement, Intersection, Polygon, Rectangle, Union
+from ...models.aperture import Annulus, Aperture, Circle, Complement, Ellipse, Intersection, Polygon, Rectangle, Union
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
 from ...raytrace.pack.surfaces import refractive_indices
@@ -93,6 +93,8 @@ def outer_radius(region: Aperture | None) -> float:
         return region.radius + float(np.hypot(region.x, region.y))
     if isinstance(region, Annulus):
         return region.outer + float(np.hypot(region.x, region.y))
+    if isinstance(region, Ellipse):
+        return max(region.semi_x, region.semi_y) + float(np.hypot(region.x, region.y))
     if isinstance(region, Rectangle):
         return float(0.5 * np.hypot(region.width, region.height) + np.hypot(region.x, region.y))
     if isinstance(region, Polygon):

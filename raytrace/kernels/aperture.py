@@ -1,4 +1,4 @@
-"""Vignetting of packets by apertures that set algebra makes of discs, rings, rectangles, vanes and polygons.
+"""Vignetting of packets by apertures that set algebra makes of discs, rings, ellipses, rectangles, vanes and polygons.
 
 Each such aperture is a small programme in postfix order: a region puts a bit on the stack of each lane (1 inside), a
 set operation takes bits from it and puts back its own. The last bit is 1 where light passes.
@@ -23,6 +23,7 @@ OUTLINE = wp.constant(4)
 BOTH = wp.constant(5)
 EITHER = wp.constant(6)
 OUTSIDE = wp.constant(7)
+ELLIPSE = wp.constant(8)
 
 
 @wp.struct
@@ -32,8 +33,8 @@ class PackedApertures:
     ``span`` [surface, 2]: first step of the surface's programme, and the one after its last. ``steps`` [step, 3]: kind,
     and for an outline the first of its edges and the one after its last. ``numbers`` [step, 6]: centre x, y
     [m], cosine and sine of the angle, two sizes: the square of the radius; squares of inner and outer radius; halves of
-    width and height; where a strip begins, and half its width [m]. ``edges`` [edge, 4]: one end x, y [m], y of the
-    other [m], slope dx/dy.
+    width and height; semi-axes; where a strip begins, and half its width [m]. ``edges`` [edge, 4]: one end x, y [m],
+    y of the other [m], slope dx/dy.
     """
 
     span: wp.array2d(dtype=wp.int32)
@@ -94,6 +95,14 @@ def through_aperture(apertures: PackedApertures, s: wp.int32, x: lanes, y: lanes
             for i in range(LANES):
                 reach = wp.where(kind == BOX, a - wp.abs(along[i]), along[i] - a)
                 inside[i] = wp.where(wp.abs(across[i]) < b, wp.where(reach > wp.float64(0.0), 1, 0), 0)
+            stack = put(stack, inside)
+        elif kind == ELLIPSE:
+            cosine = apertures.numbers[step, 2]
+            sine = apertures.numbers[step, 3]
+            along = (cosine * dx + sine * dy) / a
+            across = (cosine * dy - sine * dx) / b
+            for i in range(LANES):
+                inside[i] = wp.where(along[i] * along[i] + across[i] * across[i] < wp.float64(1.0), 1, 0)
             stack = put(stack, inside)
         elif kind == OUTLINE:
             stack = put(

@@ -11,7 +11,18 @@ import warp as wp
 
 from ...core.errors import PrescriptionError
 from ...core.warp_arrays import warp_array
-from ...models.aperture import Annulus, Aperture, Circle, Complement, Intersection, Polygon, Rectangle, Union, Vane
+from ...models.aperture import (
+    Annulus,
+    Aperture,
+    Circle,
+    Complement,
+    Ellipse,
+    Intersection,
+    Polygon,
+    Rectangle,
+    Union,
+    Vane,
+)
 from ..kernels import aperture as kernels
 from ..kernels.aperture import PackedApertures
 
@@ -49,6 +60,8 @@ class _Programme:
             self._step(kernels.DISC, a.x, a.y, 1.0, 0.0, a.radius**2, 0.0)
         elif isinstance(a, Annulus):
             self._step(kernels.RING, a.x, a.y, 1.0, 0.0, a.inner**2, a.outer**2)
+        elif isinstance(a, Ellipse):
+            self._step(kernels.ELLIPSE, a.x, a.y, math.cos(a.angle), math.sin(a.angle), a.semi_x, a.semi_y)
         elif isinstance(a, Rectangle):
             self._step(kernels.BOX, a.x, a.y, math.cos(a.angle), math.sin(a.angle), 0.5 * a.width, 0.5 * a.height)
         elif isinstance(a, Vane):

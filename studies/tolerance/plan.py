@@ -110,7 +110,11 @@ def _common(file: ToleranceFile, telescope: Telescope, elements: tuple[str, ...]
         yield from sections(element, file.elements, plain)
         glasses += [s.name for s in acting if s.name in telescope.groups[element][:-1]]
     for name in glasses:
-        yield from sections(name, file.elements, {"thickness_um": "thickness_um", "index": "n"})
+        yield from sections(name, file.elements, {"thickness_um": "thickness_um"})
+        # Behind a mirror within the glass, as of a Mangin mirror, the index is that of the surface where light entered.
+        if telescope.surface(name).interaction == Interaction.MIRROR:
+            continue
+        yield from sections(name, file.elements, {"index": "n"})
         if np.isfinite(abbe_number(telescope.surface(name).medium_after)):
             yield from sections(name, file.elements, {"abbe_percent": "abbe_percent"})
     for surface in acting[:-1]:

@@ -31,7 +31,7 @@ def test_a_telescope_becomes_a_file_of_batoid_and_back(tmp_path, capsys):
 
 
 def test_lenient_prints_a_line_for_each_thing_left_out(tmp_path, capsys):
-    text = (DATA / "lens1.zmx").read_text(encoding="utf-8").replace("  STOP\n", "  STOP\n  NEWK 3\n  ELAP 1 2\n")
+    text = (DATA / "lens1.zmx").read_text(encoding="utf-8").replace("  STOP\n", "  STOP\n  NEWK 3\n  USAP 1 2\n")
     lens = tmp_path / "lens.zmx"
     lens.write_text(text, encoding="utf-8")
     assert main(["convert", str(lens), str(tmp_path / "lens.yaml")]) == 2

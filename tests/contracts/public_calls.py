@@ -448,6 +448,7 @@ def _methods(m, tel, w, x, y):
         "Annulus": (pachon.Annulus, {"inner": 1.0, "outer": 2.0, "x": 0.0, "y": 0.0}),
         "Circle": (pachon.Circle, {"radius": 1.0, "x": 0.0, "y": 0.0}),
         "Circle.contains": (pachon.Circle(1.0).contains, xy),
+        "Ellipse": (pachon.Ellipse, {"semi_x": 1.0, "semi_y": 2.0, "x": 0.0, "y": 0.0, "angle": 0.0}),
         "Rectangle": (pachon.Rectangle, {"width": 1.0, "height": 2.0, "x": 0.0, "y": 0.0, "angle": 0.0}),
         "Vane": (pachon.Vane, {"width": 1.0, "x": 0.0, "y": 0.0, "angle": 0.0, "both_ways": True}),
         "Polygon": (pachon.Polygon, {"corners": ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))}),

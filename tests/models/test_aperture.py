@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pachon.core.errors import PrescriptionError
-from pachon.models.aperture import Annulus, Circle, Complement, Intersection, Polygon, Rectangle, Union, Vane
+from pachon.models.aperture import Annulus, Circle, Complement, Ellipse, Intersection, Polygon, Rectangle, Union, Vane
 from pachon.models.io.prescription import load_telescope, save_telescope
 
 X, Y = np.random.default_rng(3).uniform(-2.0, 2.0, (2, 20000))
@@ -46,6 +46,17 @@ def test_rectangle_and_vane_are_the_polygons_that_they_draw():
     assert np.array_equal(Vane(0.3, 0.2, -0.5, 2.4).contains(X, Y), winding(one, X, Y))
     both = along(0.2, -0.5, 2.4, [(-10.0, -0.15), (10.0, -0.15), (10.0, 0.15), (-10.0, 0.15)])
     assert np.array_equal(Vane(0.3, 0.2, -0.5, 2.4, both_ways=True).contains(X, Y), winding(both, X, Y))
+
+
+def test_ellipse_is_the_polygon_inscribed_in_it():
+    turns = np.linspace(0.0, 2 * np.pi, 20_000, endpoint=False)
+    along, across = 1.3 * np.cos(turns), 0.5 * np.sin(turns)
+    corners = tuple(zip(0.2 + 0.8 * along - 0.6 * across, -0.3 + 0.6 * along + 0.8 * across, strict=True))
+    ellipse = Ellipse(1.3, 0.5, 0.2, -0.3, np.arctan2(0.6, 0.8))
+    assert np.array_equal(ellipse.contains(X, Y), Polygon(corners).contains(X, Y))
+    assert 0.1 < ellipse.contains(X, Y).mean() < 0.9
+    assert not Ellipse(1.0, 2.0).contains(0.0, 2.0)
+    assert np.array_equal(Ellipse(0.7, 0.7, 0.1, 0.2).contains(X, Y), Circle(0.7, 0.1, 0.2).contains(X, Y))
 
 
 def test_each_region_is_that_of_batoid():
@@ -109,6 +120,8 @@ def test_a_polygon_that_crosses_itself_is_refused(corners):
         (lambda: Polygon(((0.0, 0.0), (1.0, 0.0), (0.0, np.nan))), "expected at least three finite"),
         (lambda: Rectangle(0.0, 1.0), "rectangle = .*: expected two positive lengths"),
         (lambda: Rectangle(1.0, 1.0, angle=np.inf), "expected finite centre and angle"),
+        (lambda: Ellipse(-1.0, 1.0), "ellipse = .*: expected two positive lengths"),
+        (lambda: Ellipse(1.0, 1.0, x=np.nan), "expected finite centre and angle"),
         (lambda: Vane(-0.1), "vane = -0.1 m: expected a positive width"),
         (lambda: Vane(0.1, x=np.nan), "expected finite point and angle"),
         (lambda: Union(()), "union of no parts: expected at least one region"),
@@ -145,6 +158,7 @@ def read(tmp_path, keys):
     [
         ("circle: 300, centre: [10, 20]", Circle(0.3, 0.01, 0.02)),
         ("aperture: {annulus: [100, 300]}", Annulus(0.1, 0.3)),
+        ("aperture: {ellipse: [100, 300], angle: 90}", Ellipse(0.1, 0.3, angle=np.pi / 2)),
         ("aperture: {rectangle: [100, 300], angle: 90}", Rectangle(0.1, 0.3, angle=np.pi / 2)),
         ("aperture: {polygon: [[0, 0], [100, 0], [0, 100]]}", Polygon(((0.0, 0.0), (0.1, 0.0), (0.0, 0.1)))),
         ("obscuration: {circle: 100}", Complement(Circle(0.1))),
@@ -165,7 +179,7 @@ def test_apertures_in_a_file_and_back(tmp_path, keys, expected):
     ("keys", "message"),
     [
         ("circle: 3, aperture: {circle: 4}", "surfaces[a].circle = 3: expected circle or aperture, not both"),
-        ("aperture: {}", "surfaces[a].aperture has nothing: expected one of circle, annulus, rectangle, polygon"),
+        ("aperture: {}", "surfaces[a].aperture has nothing: expected one of circle, annulus, ellipse, rectangle"),
         ("obscuration: {disc: 4}", "surfaces[a].obscuration has disc: expected one of circle"),
         ("aperture: {circle: 4, vane: 3}", "surfaces[a].aperture has circle, vane: expected one of"),
         ("aperture: {rectangle: [1, 2], from: [0, 0]}", "unknown key surfaces[a].aperture.from = [0, 0]"),

@@ -8,7 +8,7 @@ import trimesh
 
 import pachon
 from pachon.core.errors import PrescriptionError, UnknownNameError
-from pachon.models.aperture import Annulus, Circle, Complement, Intersection, Polygon, Rectangle, Union, Vane
+from pachon.models.aperture import Annulus, Circle, Complement, Ellipse, Intersection, Polygon, Rectangle, Union, Vane
 from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.media.medium import ConstantIndex
 from pachon.models.obstruction import Obstruction
@@ -50,7 +50,7 @@ def square(n, seed=1, half=2.0):
 @pytest.mark.parametrize(
     "aperture",
     [
-        BOX, VANE, ROD, OUTLINE,
+        BOX, VANE, ROD, OUTLINE, Ellipse(1.3, 0.5, 0.2, -0.3, 0.6), Complement(Ellipse(0.4, 1.5)),
         Complement(DISC), Complement(RING), Complement(OUTLINE),
         Union((DISC, BOX)), Intersection((DISC, BOX, OUTLINE)),
         Complement(Union((VANE, ROD, Circle(0.4)))),

@@ -18,6 +18,7 @@ from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import Telescope
 from pachon.raytrace.kernels.packet import LANES
 from pachon.raytrace.rays import Rays, RayStatus, field_direction
+from pachon.raytrace.repeated_trace import RepeatedTrace
 
 ZEMAX = Path(__file__).parents[1] / "data" / "zemax"
 PUPIL_RADIUS = 4.18
@@ -325,3 +326,12 @@ def test_unknown_choice_of_surfaces(lsst_r):
 def test_rays_of_different_lengths_are_refused(shapes, named):
     with pytest.raises(DomainError, match=named):
         Rays(*(np.zeros(shape) for shape in shapes), 500e-9)
+
+
+def test_rays_traced_again_and_again_are_those_of_a_trace(lsst_r):
+    traced = RepeatedTrace(lsst_r, 620e-9, 4)
+    angle = np.random.default_rng(1).uniform(0.0, 2 * np.pi, 5000)
+    for n in (40, 1, 0, 300, 5000, 7):
+        rays = pachon.launch_rays(lsst_r, (0.01, 0.02), 620e-9, (4.5 * np.cos(angle[:n]), 3.0 * np.sin(angle[:n])))
+        expected = pachon.trace(lsst_r, rays, "all")[4].position
+        assert np.array_equal(traced.positions(rays), expected, equal_nan=True)

@@ -8,7 +8,7 @@ import pytest
 
 import pachon
 from pachon.core.errors import DomainError
-from pachon.models.aperture import Circle, Complement, Rectangle
+from pachon.models.aperture import Circle, Complement, Ellipse, Rectangle
 from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.shapes.freeform import Biconic, OddAsphere, Toroid
 from pachon.models.shapes.grid import GridSag
@@ -248,8 +248,14 @@ def test_figures_survive_being_written(tmp_path, name):
 
 @pytest.mark.parametrize(
     "aperture",
-    [Complement(Circle(1.5, 0.5, 1.0)), Rectangle(5.0, 6.0, 0.5, -0.2), Complement(Rectangle(1.0, 2.0, 0.5, 1.0))],
-    ids=["obscuration", "rectangle", "rectangular obscuration"],
+    [
+        Complement(Circle(1.5, 0.5, 1.0)),
+        Rectangle(5.0, 6.0, 0.5, -0.2),
+        Complement(Rectangle(1.0, 2.0, 0.5, 1.0)),
+        Ellipse(2.5, 3.0, 0.5, -0.2),
+        Complement(Ellipse(1.0, 2.0, 0.5, 1.0)),
+    ],
+    ids=["obscuration", "rectangle", "rectangular obscuration", "ellipse", "elliptical obscuration"],
 )
 def test_apertures_survive_being_written(tmp_path, aperture):
     telescope = load_telescope("lsst_v3.3_r")

@@ -1,9 +1,14 @@
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from astropy import units as u
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError
+
+DATA = Path(__file__).parents[1] / "data" / "zmx"
 
 
 def test_defaults_are_five_fields_one_wavelength_and_gauss_points(lsst_r):
@@ -70,3 +75,31 @@ def test_rays_and_bundles_are_those_of_its_points(lsst_r):
 def test_bad_input_is_refused_when_the_request_is_made(lsst_r, change, error, words):
     with pytest.raises(error, match=words):
         pachon.Request.of(lsst_r, **change)
+
+
+def test_pupil_coordinates_are_those_that_were_aimed():
+    lens = pachon.load_telescope(DATA / "circular_aperture_example_with_aperture.zmx")
+    factors = (0.1, -0.05, 0.3, 0.2, 0.4)
+    lens = lens.with_design(aiming="real", fields=((0.1, 0.4),), field_weights=(), vignetting=(factors,))
+    request = pachon.Request.of(lens)
+    points = 0.5 * lens.pupil_diameter * np.array([[0.0, 0.0], [0.9, 0.0], [-0.3, 0.8]])
+    entrance = request.entrance_points(lens.default_wavelength, points).reshape(-1, 2)
+    assert np.abs(entrance - points).max() > 0.01 * lens.pupil_diameter
+    again = request.pupil_coordinates(lens.default_wavelength, entrance)
+    assert again == pytest.approx(points, abs=1e-11 * lens.pupil_diameter)
+
+
+def test_perturbed_telescopes_are_aimed_as_if_alone():
+    lens = pachon.load_telescope(DATA / "circular_aperture_example_with_aperture.zmx").with_design(aiming="real")
+    request = pachon.Request.of(lens, n_pupil=3)
+    light, pupil = lens.default_wavelength, request.pupil.points
+    assert np.array_equal(request.entrance_points_of(lens, light, pupil), request.entrance_points(light, pupil))
+    name = next(s.name for s in lens.surfaces if s.interaction == pachon.Interaction.REFRACT)
+    # A tolerance, and a change that no search follows from the design.
+    for shift in ((2e-5, -1e-5, 3e-5), (0.0, 0.0, 0.3 * lens.pupil_diameter)):
+        moved = lens.perturbed(name, shift=shift, tilt=(1e-3, 0.0, 0.0))
+        found = request.entrance_points_of(moved, light, pupil)
+        alone = replace(request, telescope=moved).entrance_points(light, pupil)
+        # Both searches end at 1e-12 of the radius of the stop.
+        assert found == pytest.approx(alone, abs=1e-11 * lens.pupil_diameter)
+        assert np.abs(found - request.entrance_points(light, pupil)).max() > 1e-6 * lens.pupil_diameter

@@ -3,7 +3,7 @@
 Supported commands: RDM, DIM, TITLE, EPD, FNO, NAO, WL, WTW, REF, XAN YAN, XOB YOB, XIM YIM, XRI YRI, WTF, VUX VLX VUY
 VLY, before the surfaces or after them; the surfaces SO S SI (curvature, or with RDM radius; thickness, glass), RDY CUY
 THI GLA, STO, SLB, SPH CON ASP with K and A to G (r^4 to r^16), XDE YDE ZDE ADE BDE CDE with DAR, BEN and REV, CIR (OBS,
-HOL) and REX REY with ADX ADY, pick-ups PIK, private glasses PRV PWL END. ADE and BDE are left-handed, CDE is
+HOL) REX REY and ELX ELY with ADX ADY, pick-ups PIK, private glasses PRV PWL END. ADE and BDE are left-handed, CDE is
 right-handed (CODE V reference manual, "Decentered surfaces"), Zemax's tilts are all right-handed. A glass is a name
 (NBK7_SCHOTT), REFL, or a number (517642). Solves are passed over where their solution stands in the file. Rays are
 aimed at the stop, as CODE V's chief rays are.
@@ -37,6 +37,8 @@ VIGNETTING = ("VUX", "VLX", "VUY", "VLY")
 SYSTEM = frozenset(("RDM", "DIM", "TIT", "WL", "WTW", "WTF", "REF", "PRV", *VIGNETTING, *APERTURES, *FIELDS))
 LONG_NAMES = {"TITLE": "TIT", "STOP": "STO"}
 POWERS = "ABCDEFG"
+#: Numbers of surfaces.
+NUMBERS = {*["THI", "K", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "REX", "REY", "ELX", "ELY", "ADX", "ADY"], *POWERS}
 #: Surfaces that are not read.
 REFUSED = {
     "DIF": "diffractive surfaces", "GRT": "diffractive surfaces", "XTO": "toroids", "YTO": "toroids",
@@ -248,7 +250,7 @@ class _Translation:
         elif key in ("STO", "SLB"):
             keyword = {"STO": "STOP", "SLB": "COMM"}[key]
             block.lines.append(replace(command, keyword=keyword, text=command.text.strip("'\" ")))
-        elif key in ("THI", "K", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "REX", "REY", "ADX", "ADY", *POWERS):
+        elif key in NUMBERS:
             values[key] = command.number(0)
         elif key in ("DAR", "BEN", "REV"):
             values[key] = 1.0
@@ -353,6 +355,8 @@ class _Translation:
                 lines.append(("OBSC", 0.0, values["OBSCURED"]))
             if "REX" in values or "REY" in values:
                 lines.append(("SQAP", values.get("REX", 0.0), values.get("REY", 0.0)))
+            if "ELX" in values or "ELY" in values:
+                lines.append(("ELAP", values.get("ELX", 0.0), values.get("ELY", 0.0)))
             if values.get("ADX") or values.get("ADY"):
                 lines.append(("OBDC", values.get("ADX", 0.0), values.get("ADY", 0.0)))
             distance = "INFINITY" if number == 0 and abs(thickness) >= INFINITE else thickness

@@ -157,8 +157,11 @@ def _aperture_lines(aperture: JsonObject, findings: Findings) -> list[Line]:
         (left, right), (low, high) = ([aperture.number(f"{a}_{end}") for end in ("min", "max")] for a in "xy")
         lines = [("SQAP", 0.5 * (right - left), 0.5 * (high - low))]
         x, y = 0.5 * (left + right), 0.5 * (low + high)
+    elif kind == "EllipticalAperture":
+        lines = [("ELAP", aperture.number("a"), aperture.number("b"))]
+        x, y = aperture.number("offset_x", 0.0), aperture.number("offset_y", 0.0)
     else:
-        known = "RadialAperture, OffsetRadialAperture or RectangularAperture"
+        known = "RadialAperture, OffsetRadialAperture, RectangularAperture or EllipticalAperture"
         findings.report(aperture.problem(f"aperture {kind}: expected {known}"), "taken as none")
         return []
     aperture.report_rest(findings)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ....core.errors import PrescriptionError, error_context
-from ...aperture import Annulus, Aperture, Circle, Complement, Rectangle
+from ...aperture import Annulus, Aperture, Circle, Complement, Ellipse, Rectangle
 from ...surface import Interaction, Surface
 from ...telescope import Telescope
 from ..writable import report_unheld, require_sequential
@@ -140,6 +140,9 @@ def _aperture_items(aperture: Aperture) -> dict[str, Any]:
             for end, sign in (("min", -1), ("max", 1))
         }
         return {"type": "RectangularAperture", **ends}
+    if isinstance(region, Ellipse) and region is aperture and region.angle == 0:
+        sizes = {"a": region.semi_x, "b": region.semi_y, "offset_x": region.x, "offset_y": region.y}
+        return {"type": "EllipticalAperture", **{key: value / MM for key, value in sizes.items()}}
     if isinstance(region, Circle) or (isinstance(region, Annulus) and region is aperture):
         inner, outer = (0.0, region.radius) if isinstance(region, Circle) else (region.inner, region.outer)
         if region is not aperture:
@@ -148,4 +151,6 @@ def _aperture_items(aperture: Aperture) -> dict[str, Any]:
         if region.x or region.y:
             return {"type": "OffsetRadialAperture", **radii, "offset_x": region.x / MM, "offset_y": region.y / MM}
         return {"type": "RadialAperture", **radii}
-    raise PrescriptionError(f"aperture {type(region).__name__}: expected a disc, ring, obscuring disc or rectangle")
+    raise PrescriptionError(
+        f"aperture {type(region).__name__}: expected disc, ring, obscuring disc, ellipse, rectangle"
+    )

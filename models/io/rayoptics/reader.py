@@ -117,11 +117,11 @@ class _Translation:
             x, y = values.number("x_offset", 0.0), values.number("y_offset", 0.0)
             if kind == "Circular":
                 found = [("OBSC" if blocks else "CLAP", 0.0, values.number("radius"))]
-            elif kind == "Rectangular" and not values.number("rotation", 0.0):
+            elif kind in ("Rectangular", "Elliptical") and not values.number("rotation", 0.0):
                 size = values.number("x_half_width"), values.number("y_half_width")
-                found = [("SQOB" if blocks else "SQAP", *size)]
+                found = [(("SQ" if kind == "Rectangular" else "EL") + ("OB" if blocks else "AP"), *size)]
             else:
-                text = f"clear_apertures: {kind}: expected Circular, or Rectangular without rotation"
+                text = f"clear_apertures: {kind}: expected Circular, or Rectangular or Elliptical without rotation"
                 self.findings.report(surface.problem(text), "taken as none")
             found += [("OBDC", x, y)] if found and (x or y) else []
         if len(apertures) > 1:

@@ -6,6 +6,7 @@ regions that block light stand under ``obscuration``. A region is one of:
 ================================================================= ====================================================
 ``{circle: 0.4, centre: [0, 0]}``                                 disc of a radius
 ``{annulus: [0.6, 4.1], centre: [0, 0]}``                         ring of two radii
+``{ellipse: [0.4, 0.3], centre: [0, 0], angle: 45}``              semi-axes along x and y, then rotated
 ``{rectangle: [0.05, 9.6], centre: [0, 0], angle: 45}``           width along x and height along y, then rotated
 ``{polygon: [[0, 0], [1, 0], [0, 1]]}``                           corners in either sense
 ``{vane: 0.05, from: [0.4, 0], angle: 45, both_ways: true}``      strip of a width from a point outwards
@@ -22,7 +23,7 @@ from typing import Annotated, Any
 
 from ....core.errors import PrescriptionError
 from ....core.schema import Parameters, Section, Tagged, WrittenAs, checked, either, expected, problem, written
-from ...aperture import Annulus, Aperture, Circle, Complement, Intersection, Polygon, Rectangle, Union, Vane
+from ...aperture import Annulus, Aperture, Circle, Complement, Ellipse, Intersection, Polygon, Rectangle, Union, Vane
 from ...obstruction import Obstruction
 from .values import (
     ROWS,
@@ -51,7 +52,7 @@ def _region_kind(content: dict[str, Any]) -> str:
 class RegionSection(Parameters):
     """A region of the plane; written without the values that are by default."""
 
-    pairs = ("annulus", "rectangle", "centre", "from")
+    pairs = ("annulus", "ellipse", "rectangle", "centre", "from")
 
     @classmethod
     def written(cls, built: Any) -> dict[str, Any]:  # noqa: D102
@@ -72,6 +73,7 @@ _CENTRE, _ANGLE = (Point, (0.0, 0.0)), (Angle, 0.0)
 REGIONS |= {
     "circle": RegionSection.of(Circle, circle=Length, centre=_CENTRE),
     "annulus": RegionSection.of(Annulus, annulus=Point, centre=_CENTRE),
+    "ellipse": RegionSection.of(Ellipse, ellipse=Point, centre=_CENTRE, angle=_ANGLE),
     "rectangle": RegionSection.of(Rectangle, rectangle=Point, centre=_CENTRE, angle=_ANGLE),
     "polygon": RegionSection.of(Polygon, polygon=_CORNERS),
     "vane": RegionSection.of(Vane, vane=Length, **{"from": _CENTRE}, angle=_ANGLE, both_ways=(Flag, False)),

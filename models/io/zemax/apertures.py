@@ -1,4 +1,4 @@
-"""Apertures of Zemax surfaces: lines CLAP, FLAP, OBSC, SQAP, SQOB and SPID, decentred by OBDC."""
+"""Apertures of Zemax surfaces: lines CLAP, FLAP, OBSC, SQAP, SQOB, ELAP, ELOB and SPID, decentred by OBDC."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from ....core.errors import PrescriptionError
-from ...aperture import Annulus, Aperture, Circle, Complement, Rectangle, Union, Vane
+from ...aperture import Annulus, Aperture, Circle, Complement, Ellipse, Rectangle, Union, Vane
 from .file import Block, Findings
 from .text import number_text
 
@@ -20,7 +20,7 @@ def read_aperture(block: Block, unit: float, findings: Findings) -> Aperture | N
     shift = block.last("OBDC")
     x, y = (shift.number(0) * unit, shift.number(1) * unit) if shift else (0.0, 0.0)
     found: list[Aperture] = []
-    for keyword in ("CLAP", "FLAP", "OBSC", "SQAP", "SQOB", "SPID"):
+    for keyword in ("CLAP", "FLAP", "OBSC", "SQAP", "SQOB", "ELAP", "ELOB", "SPID"):
         line = block.last(keyword)
         if line is None:
             continue
@@ -33,18 +33,21 @@ def read_aperture(block: Block, unit: float, findings: Findings) -> Aperture | N
                 raise line.error("a width and a number of arms")
             turns = (2 * math.pi * arm / int(second) for arm in range(int(second)))
             region = Union(tuple(Vane(first * unit, x, y, turn) for turn in turns))
-        elif keyword in ("SQAP", "SQOB"):
+        elif keyword in ("SQAP", "SQOB", "ELAP", "ELOB"):
             if not (first > 0 and second > 0):
                 raise line.error("two positive half widths")
-            region = Rectangle(2 * first * unit, 2 * second * unit, x, y)
+            if keyword in ("SQAP", "SQOB"):
+                region = Rectangle(2 * first * unit, 2 * second * unit, x, y)
+            else:
+                region = Ellipse(first * unit, second * unit, x, y)
         elif not 0 <= first < second:
             raise line.error("a smallest and a largest radius")
         else:
             region = Annulus(first * unit, second * unit, x, y) if first else Circle(second * unit, x, y)
-        found.append(Complement(region) if keyword in ("OBSC", "SQOB", "SPID") else region)
-    for keyword in ("ELAP", "ELOB", "UDAD", "USAP", "USOB", "UDAP"):
+        found.append(Complement(region) if keyword in ("OBSC", "SQOB", "ELOB", "SPID") else region)
+    for keyword in ("UDAD", "USAP", "USOB", "UDAP"):
         for line in block.all(keyword)[:1]:
-            findings.report(line.problem(f"{line.shown}: elliptical and user-defined apertures are not read"))
+            findings.report(line.problem(f"{line.shown}: user-defined apertures are not read"))
     if len(found) > 1:
         raise block.lines[0].error("one aperture in this surface")
     return found[0] if found else None
@@ -60,13 +63,18 @@ def aperture_lines(aperture: Aperture, unit: float) -> list[str]:
     elif isinstance(region, Rectangle) and region.angle == 0:
         half = f"{number_text(region.width / 2 / unit)} {number_text(region.height / 2 / unit)}"
         lines = [f"{'SQAP' if clear else 'SQOB'} {half} 0"]
+    elif isinstance(region, Ellipse) and region.angle == 0:
+        half = f"{number_text(region.semi_x / unit)} {number_text(region.semi_y / unit)}"
+        lines = [f"{'ELAP' if clear else 'ELOB'} {half} 0"]
     elif isinstance(region, Union) and not clear and _is_spider(region):
         first = region.parts[0]
         assert isinstance(first, Vane)
         lines = [f"SPID {number_text(first.width / unit)} {len(region.parts)} 0"]
         region = Circle(1.0, first.x, first.y)
     else:
-        raise PrescriptionError(f"aperture {type(region).__name__}: expected a disc, ring, rectangle or even spider")
+        raise PrescriptionError(
+            f"aperture {type(region).__name__}: expected disc, ring, ellipse, rectangle or even spider"
+        )
     if region.x or region.y:
         lines.append(f"OBDC {number_text(region.x / unit)} {number_text(region.y / unit)}")
     return lines

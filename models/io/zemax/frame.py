@@ -14,7 +14,7 @@ from typing import cast
 import numpy as np
 
 from ....core.errors import PrescriptionError
-from ...aperture import Aperture, Complement, Intersection, Polygon, Rectangle, Union, Vane
+from ...aperture import Aperture, Complement, Ellipse, Intersection, Polygon, Rectangle, Union, Vane
 from ...shapes.freeform import Biconic, OddAsphere, Toroid
 from ...shapes.grid import GridSag
 from ...shapes.polynomial import XYPolynomial, ZernikeSag
@@ -71,6 +71,6 @@ def rotated_aperture(aperture: Aperture) -> Aperture:
         return Complement(rotated_aperture(aperture.part))
     if isinstance(aperture, Union | Intersection):
         return type(aperture)(tuple(rotated_aperture(part) for part in aperture.parts))
-    if isinstance(aperture, Rectangle | Vane):
+    if isinstance(aperture, Ellipse | Rectangle | Vane):
         aperture = replace(aperture, angle=(math.pi if isinstance(aperture, Vane) else 0.0) - aperture.angle)
     return replace(aperture, x=0.0 - aperture.x)

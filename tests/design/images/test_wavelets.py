@@ -1,5 +1,7 @@
 """Wavelets: aimed rays, light, and what cannot be imaged."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,8 @@ from pachon.design.metrics.spots import spots
 from pachon.design.metrics.vignetting import vignetting
 from pachon.wavefront.pupil_sampling import gauss_annulus, square_annulus
 from pachon.wavefront.request import Request
+
+DATA = Path(__file__).parents[2] / "data" / "zmx"
 
 
 @pytest.mark.parametrize("angle", [(0.0, 0.0), (0.0, 1.75), (-0.9, 1.1)])
@@ -64,3 +68,26 @@ def test_parallel_light_makes_no_image(paraboloid):
     for measure in (fft_psf, mtf):
         with pytest.raises(DomainError, match="focal ratio"):
             measure(telescope, [[0.0, 0.0]])
+
+
+def test_aimed_rays_of_a_field_with_vignetting_factors():
+    lens = pachon.load_telescope(DATA / "circular_aperture_example_with_aperture.zmx")
+    factors = (0.1, -0.05, 0.3, 0.2, 0.4)
+    lens = lens.with_design(aiming="real", fields=((0.0, np.deg2rad(20.0)),), field_weights=(), vignetting=(factors,))
+    wavelength = lens.default_wavelength
+    request = Request.of(lens, sampling=square_annulus(0.5 * lens.pupil_diameter, 0.0, 160), wavelengths=wavelength)
+    center = spots(lens, wavelengths=wavelength).reference_point[0]
+    traced = traced_wavelets(request, wavelength, center)
+    aimed = lattice_wavelets(request, wavelength, center, np.ptp(traced.cosine, axis=0).max() / 160).wavelets
+    # The same light on the same area of directions; squares represent the rim of either kind to some parts in 1000.
+    assert traced.lit_fraction > 0.9
+    assert aimed.lit_fraction == pytest.approx(traced.lit_fraction, rel=3e-3)
+    assert aimed.perfect_peak == pytest.approx(traced.perfect_peak, rel=3e-3)
+    # Rays of like directions have like paths.
+    lit = np.argwhere(aimed.amplitude > 0)[::97]
+    for row, column in lit:
+        away = np.linalg.norm(traced.cosine - aimed.cosine[row, column], axis=-1) + (traced.amplitude == 0)
+        near = np.argsort(away)[:12]
+        plane = np.column_stack([np.ones(12), traced.cosine[near] - aimed.cosine[row, column]])
+        expected = np.linalg.lstsq(plane, traced.opd[near], rcond=None)[0][0]
+        assert aimed.opd[row, column] == pytest.approx(expected, abs=0.02 * np.ptp(traced.opd))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pachon.core.errors import PrescriptionError, PrescriptionWarning
-from pachon.models.aperture import Annulus, Circle, Complement, Rectangle
+from pachon.models.aperture import Annulus, Circle, Complement, Ellipse, Rectangle
 from pachon.models.first_order import first_order
 from pachon.models.io.prescription import load_telescope
 from pachon.models.shapes.shape import EvenAsphere
@@ -129,6 +129,8 @@ def test_apertures(tmp_path):
     assert one.radius == pytest.approx(0.009, rel=1e-15)
     assert two == Rectangle(0.006, 0.008, -0.001, 0.0)
     assert image == Complement(Circle(0.002))
+    oval = load_telescope(written(tmp_path, text.replace("REX 3; REY 4", "ELX 3; ELY 4"))).surfaces[1].aperture
+    assert oval == Ellipse(0.003, 0.004, -0.001, 0.0)
 
 
 def test_surfaces_may_be_named_by_number(tmp_path):

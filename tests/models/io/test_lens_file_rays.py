@@ -181,6 +181,20 @@ def test_written_for_optiland_and_read_again(tmp_path, name):
     assert [s.name for s in again.surfaces] == [s.name for s in telescope.surfaces]
 
 
+def test_an_ellipse_written_for_optiland_and_read_again(tmp_path):
+    telescope = pachon.load_telescope("paul_baker")
+    ellipse = pachon.Ellipse(2.0, 1.5, 0.25, -0.125)
+    surfaces = tuple(replace(s, aperture=ellipse) if i == 0 else s for i, s in enumerate(telescope.surfaces))
+    pachon.save_telescope(replace(telescope, surfaces=surfaces), tmp_path / "written.json")
+    assert pachon.load_telescope(tmp_path / "written.json").surfaces[0].aperture == ellipse
+    optiland = pytest.importorskip("optiland.fileio")
+    optic = optiland.load_optiland_file(str(tmp_path / "written.json"))
+    (peer,) = (s.aperture for s in optic.surfaces if s.aperture is not None)
+    x, y = np.random.default_rng(1).uniform(-2.5, 2.5, (2, 1000))
+    # Its x axis is the other way round, its lengths are millimetres.
+    assert np.array_equal(ellipse.contains(x, y), np.asarray(peer.contains(-1e3 * x, 1e3 * y)))
+
+
 def test_what_optiland_has_not_is_refused(tmp_path):
     for name, expected in (("decam", "decam: surface .*: aperture Union"), ("auxtel", "auxtel: medium air: expect")):
         with pytest.raises(PrescriptionError, match=expected):

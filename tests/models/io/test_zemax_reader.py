@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pachon.core.errors import PachonError, PrescriptionError, PrescriptionWarning
-from pachon.models.aperture import Annulus, Circle, Complement, Rectangle, Union
+from pachon.models.aperture import Annulus, Circle, Complement, Ellipse, Rectangle, Union
 from pachon.models.first_order import first_order
 from pachon.models.io.glass_catalogue import GlassCatalogue
 from pachon.models.io.prescription import load_telescope, save_telescope
@@ -233,6 +233,8 @@ def test_a_grid_has_its_nodes_where_zemax_has_them(tmp_path):
         (["CLAP 0 30 0"], Circle(0.03, 0.0, 0.0)),
         (["CLAP 10 30 0", "OBDC 2 5"], Annulus(0.01, 0.03, -0.002, 0.005)),
         (["OBSC 0 12 0"], Complement(Circle(0.012))),
+        (["ELAP 3 4 0", "OBDC 1 0"], Ellipse(0.003, 0.004, -0.001, 0.0)),
+        (["ELOB 3 4 0"], Complement(Ellipse(0.003, 0.004))),
         (["SQAP 3 4 0", "OBDC 1 0"], Rectangle(0.006, 0.008, -0.001, 0.0)),
         (["SQOB 3 4 0"], Complement(Rectangle(0.006, 0.008))),
         # A floating aperture clips where its semi-diameter is fixed, and not where it is automatic.
@@ -366,7 +368,7 @@ def test_fields_are_angles_or_heights(tmp_path, kind, distance, expected):
             "TYPE STANDARD\n  XDAT 1 3\n  CURV -0.001",
             "surface 2: XDAT 1 3: not understood",
         ),
-        ("  DIAM 50", "  ELAP 3 4\n  DIAM 50", "surface 2: ELAP 3 4: elliptical and user-defined"),
+        ("  DIAM 50", "  USAP 3 4\n  DIAM 50", "surface 2: USAP 3 4: user-defined apertures are not read"),
         ("  DIAM 50", "  NEWK 3 4\n  DIAM 50", "surface 2: NEWK 3 4: this keyword is not understood"),
         ("ENVD 20 1 0", "ENVD 20 1 0\nNEWH 3", "line 7: NEWH 3: this keyword is not understood"),
         ("ENVD 20 1 0", "ENVD 5 0.7 1", "ENVD 5 0.7 1: indices are not adjusted"),
@@ -398,10 +400,10 @@ def test_what_is_not_understood_is_one_line_with_file_surface_and_keyword(tmp_pa
 
 
 def test_lenient_warns_of_each_thing_left_out(tmp_path):
-    text = MIRROR.replace("  DIAM 50", "  NEWK 3 4\n  ELAP 1 2\n  DIAM 50").replace("GCAT", "NEWH 1\nGCAT")
+    text = MIRROR.replace("  DIAM 50", "  NEWK 3 4\n  USAP 1 2\n  DIAM 50").replace("GCAT", "NEWH 1\nGCAT")
     with pytest.warns(PrescriptionWarning) as caught:
         telescope = load_telescope(written(tmp_path, text), lenient=True)
-    assert sorted(str(w.message).split(": ")[1].split()[0] for w in caught) == ["ELAP", "NEWH", "NEWK"]
+    assert sorted(str(w.message).split(": ")[1].split()[0] for w in caught) == ["NEWH", "NEWK", "USAP"]
     assert telescope.surfaces[1].aperture is None
 
 

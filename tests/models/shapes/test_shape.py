@@ -205,3 +205,15 @@ def test_sags_equal_batoids():
         normal = theirs.normal(X, Y)
         slopes = -normal[:, :2] / normal[:, 2:]
         assert np.allclose(np.stack(ours.gradient(X, Y), axis=-1), slopes, rtol=0, atol=1e-13)
+
+
+def test_parameters_changed_together_are_those_changed_one_by_one():
+    shape = Sum((Conic(10.0, -0.3), ZernikeSag((0.0, 1e-7, 2e-7, 3e-7), 4.0, 1.0)))
+    values = {"Z4": 5e-7, "conic": -0.5, "Z1": 1e-8}
+    expected = shape
+    for name, value in values.items():
+        expected = expected.with_parameter(name, value)
+    assert shape.with_parameters(values) == expected
+    assert shape.with_parameters(values) != shape
+    with pytest.raises(UnknownNameError, match="Z9"):
+        shape.with_parameters({"Z4": 1e-7, "Z9": 1e-7})

@@ -143,6 +143,17 @@ def test_groups_and_mirrors(lsst_r):
         assert tilted.surface(name).vertex == pytest.approx(expected.surface(name).vertex, abs=1e-12)
 
 
+def test_a_mirror_within_glass_has_no_index_of_its_own(triplet):
+    """Light of a Mangin mirror is in the glass of its first surface until it leaves."""
+    front, back = triplet.surface("S1"), triplet.surface("S2")
+    mirror = replace(back, interaction=pachon.Interaction.MIRROR, medium_after=front.medium_after)
+    mangin = replace(triplet, surfaces=tuple(mirror if s.name == "S2" else s for s in triplet.surfaces))
+    plan = plan_of(mangin, elements={"index": 1e-4, "abbe_percent": 1.0, "thickness_um": 5})
+    names = {t.name for t in plan.tolerances}
+    assert {"S1.n", "S1.abbe_percent", "S2.thickness_um"} <= names
+    assert not {"S2.n", "S2.abbe_percent"} & names
+
+
 def test_named_degrees_of_freedom(lsst_r):
     content = dict(degrees_of_freedom="lsst", tolerances=[{"name": "M1M3_B3", "size": 0.1}], compensators=["Camera_dz"])
     plan = plan_of(lsst_r, **content)
