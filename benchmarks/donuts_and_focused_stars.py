@@ -25,7 +25,7 @@ from pachon.studies.alignment.scene import AlignmentScene
 
 STARS = int(sys.argv[1]) if len(sys.argv) > 1 else 40
 PICTURE = sys.argv[2] if len(sys.argv) > 2 else None
-ELECTRONS, FOCUSED, SKY, READ_NOISE, DIFFUSION = 5e6, 2e5, 300.0, 8.8, 4e-6
+DEFOCUS, ELECTRONS, FOCUSED, SKY, READ_NOISE, DIFFUSION = 1.5e-3, 5e6, 2e5, 300.0, 8.8, 4e-6
 #: Rms of the degrees of freedom, and standard deviation of their prior [tolerances].
 SIZE, PRIOR = 1.0, 2.0
 
@@ -35,20 +35,22 @@ def main() -> None:
     telescope, freedoms, tolerances = scene.telescope, scene.freedoms, scene.tolerances
     state = SIZE * np.random.default_rng(3).standard_normal(len(freedoms))
     true = freedoms.apply(telescope, state * tolerances)
-    plane = scene.stars.focal_plane
-    science = np.arange(len(pachon.FocalPlane.flat("lsst").camera))
-    over_field = pachon.fields_at(
-        telescope, np.stack(plane.camera.from_local(science, 0.0 * science, 0.0 * science), axis=-1)
-    )
-    over_field = over_field[np.hypot(*over_field.T) < telescope.field_radius]
-    fields = [scene.stars.fields, over_field[np.linspace(0, len(over_field) - 1, STARS).round().astype(int)]]
-    images = []
-    for k, (at, electrons, side) in enumerate(zip(fields, (ELECTRONS, FOCUSED), (181, 41), strict=True)):
+    camera = pachon.FocalPlane.flat("lsst").camera
+    every = np.arange(len(camera))
+    ccds = pachon.fields_at(telescope, np.stack(camera.from_local(every, 0.0 * every, 0.0 * every), axis=-1))
+    ccds = ccds[np.hypot(*ccds.T) < telescope.field_radius]
+    corners, nominal = scene.stars.fields, scene.stars.heights
+    sets = [
+        (corners[nominal > 0.0], DEFOCUS, ELECTRONS, 181),
+        (corners[nominal < 0.0], -DEFOCUS, ELECTRONS, 181),
+        (ccds[np.linspace(0, len(ccds) - 1, STARS).round().astype(int)], 0.0, FOCUSED, 41),
+    ]
+    images, fields, defocus = [], np.concatenate([at for at, *_ in sets]), []
+    for k, (at, height, electrons, side) in enumerate(sets):
         drawn = pachon.draw_donuts(
-            true,
+            true.perturbed("Detector", shift=(0.0, 0.0, height)),
             at,
             scene.wavelengths,
-            focal_plane=plane,
             atmosphere=scene.atmosphere,
             electrons=electrons,
             sky=SKY,
@@ -58,6 +60,7 @@ def main() -> None:
             seed=k,
         )
         images += list(drawn.images)
+        defocus += [height] * len(at)
     known = {}
     before = 1e9 * scene.quality.means(true).added
     print(f"pachon {pachon.__version__}; wavefront over the field before: {before:.0f} nm rms")
@@ -66,9 +69,9 @@ def main() -> None:
         fit = pachon.fit_donuts(
             telescope,
             images[:count],
-            np.concatenate(fields)[:count],
+            fields[:count],
             scene.wavelengths,
-            focal_plane=plane,
+            defocus=defocus[:count],
             sky_variance=SKY + READ_NOISE**2,
             diffusion=DIFFUSION,
             diffraction=True,
