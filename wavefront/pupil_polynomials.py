@@ -45,7 +45,7 @@ class PupilPolynomials:
         return np.moveaxis(self._slopes @ self._fitted(values), 0, -1)
 
     def at(self, points: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return what values [n, 2] are at other points [m, 2], and their derivatives there [m, 2, 2]."""
+        """Return values [n, k] at other points [m, 2], shape [m, k], and their derivatives there, [m, k, 2]."""
         terms, slopes = self._terms(points)
         fitted = self._fitted(values)
         return terms @ fitted, np.moveaxis(slopes @ fitted, 0, -1)

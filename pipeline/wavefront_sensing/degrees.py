@@ -22,8 +22,9 @@ from ...raytrace.adjoint.forward_pass import forward_pass
 from ...raytrace.launch import aimed_points
 from ...raytrace.rays import parallel_rays
 from ...wavefront.psf.pupil_rims import PupilRims
-from .donut_rays import landing_of, rims_of, spread_of
+from .donut_rays import RimsOfCells, landing_of, spread_of
 from .pupil_cells import PupilCells
+from .rim_light import RimsAt
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -78,6 +79,7 @@ class FreedomRays:
 
         landing = [derivatives(float(w), cells.points) for w in wavelengths]
         self._response = np.concatenate(landing, axis=1) - derivatives(middle, self._chief)
+        self._rims = RimsOfCells(cells, self._response)
 
     def landing(self, unknowns: np.ndarray) -> np.ndarray:
         """Return landing points minus that of the chief ray [m], of the telescope with its degrees of freedom."""
@@ -100,9 +102,9 @@ class FreedomRays:
         """Return the spread of the image of each point."""
         return spread_of(self._cells, landing, self._footprint)
 
-    def at_rims(self, rims: PupilRims, landing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the landing points of rims of the telescope as it is believed to be."""
-        return rims_of(self._cells, landing, rims)
+    def at_rims(self, rims: PupilRims, landing: np.ndarray) -> RimsAt:
+        """Return rims of the telescope as it is believed to be on the detector."""
+        return self._rims.at(rims, landing)
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the derivatives at the values of the construction, shape [2, n, n_freedom]."""

@@ -24,6 +24,7 @@ from ...raytrace.trace import trace
 from ...wavefront.chief_rays import JACOBIAN_STEP
 from ...wavefront.psf.pupil_rims import PupilRims
 from .pupil_cells import PupilCells
+from .rim_light import RimsAt
 
 #: Step of the differences by which aimed pupil points follow those of the entrance pupil, in units of its radius.
 _DIFFERENCE = 1e-4
@@ -43,8 +44,8 @@ class LightRays(Protocol):
     def spread(self, landing: np.ndarray) -> np.ndarray:
         """Return second moments of the image of each point, beside the footprint of the cells [m^2], [n, 2, 2]."""
 
-    def at_rims(self, rims: PupilRims, landing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return where the light of rims lands [m], and its change per metre towards the lit side, both [n, 2]."""
+    def at_rims(self, rims: PupilRims, landing: np.ndarray) -> RimsAt:
+        """Return where the light of rims lands for landing points of the light [m]."""
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the derivatives of :meth:`landing` with respect to the unknown wavefront, shape [2, n, n_wave]."""
@@ -87,6 +88,7 @@ class ZernikeRays:
         self._gradients = _gradients(telescope, direction, middle, cells.points, noll)
         self._response = -np.concatenate([self._jacobian_times_gradients(float(w)) for w in wavelengths], axis=1)
         self._last: tuple[np.ndarray, np.ndarray] | None = None
+        self._rims = RimsOfCells(cells, self._response)
         #: Sides of the image of a cell [m], columns of a matrix.
         self.footprint = cells.footprint(self._landing(middle, np.zeros((1, 1, 2)))[0])
 
@@ -132,9 +134,9 @@ class ZernikeRays:
         """Return the spread of the image of each point; see :class:`LightRays`."""
         return spread_of(self._cells, landing, self.footprint)
 
-    def at_rims(self, rims: PupilRims, landing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the landing points of rims; see :class:`LightRays`."""
-        return rims_of(self._cells, landing, rims)
+    def at_rims(self, rims: PupilRims, landing: np.ndarray) -> RimsAt:
+        """Return the rims on the detector; see :class:`LightRays`."""
+        return self._rims.at(rims, landing)
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the response at zero coefficients, the same to 1e-3 for all; see :class:`LightRays`."""
@@ -167,10 +169,32 @@ def spread_of(cells: PupilCells, landing: np.ndarray, footprint: np.ndarray) -> 
     return np.concatenate([cells.spread(one, footprint) for one in each])
 
 
-def rims_of(cells: PupilCells, landing: np.ndarray, rims: PupilRims) -> tuple[np.ndarray, np.ndarray]:
-    """Return landing points of rims at the middle wavelength [m], and their change along the normals, both [n, 2]."""
-    each = landing.reshape(-1, len(cells), 2)
-    return cells.at_rims(each[len(each) // 2], rims)
+class RimsOfCells:
+    """Rims on the detector, from the landing points of the cells of the pupil.
+
+    Parameters
+    ----------
+    cells : PupilCells
+        The cells.
+    response : ndarray, shape [2, n, n_wave]
+        Derivatives of the landing points of the cells, of one or more wavelengths one after the other [m].
+    """
+
+    def __init__(self, cells: PupilCells, response: np.ndarray) -> None:
+        self._cells, self._response = cells, response
+        self._last: tuple[PupilRims, np.ndarray] | None = None
+
+    def at(self, rims: PupilRims, landing: np.ndarray) -> RimsAt:
+        """Return rims at the middle wavelength for landing points of the cells [m], shape [n, 2]."""
+        smooth = self._cells.smooth
+        if self._last is None or self._last[0] is not rims:
+            self._last = rims, np.stack([smooth.at(rims.points, self._middle(one))[0] for one in self._response])
+        return RimsAt(*rims.landing(smooth, self._middle(landing)), self._last[1])
+
+    def _middle(self, values: np.ndarray) -> np.ndarray:
+        """Return values of all wavelengths at the middle one."""
+        each = values.reshape(-1, len(self._cells), values.shape[1])
+        return np.asarray(each[len(each) // 2])
 
 
 def landing_of(telescope: Telescope, rays: Rays) -> np.ndarray:

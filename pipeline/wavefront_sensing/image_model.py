@@ -17,6 +17,7 @@ from scipy.sparse import csc_array
 
 from ...wavefront.psf.image_plane import square_transfer
 from ...wavefront.psf.pupil_rims import PupilRims
+from .rim_light import RimLight, RimsAt
 from .seeing import Seeing
 from .stamps import Pixels
 
@@ -26,9 +27,6 @@ NUISANCES = ("flux", "x", "y", "background", "strength")
 #: Further unknowns where there is a second star: its flux over that of the first, and its offset [pixels].
 COMPANION = ("ratio", "offset_x", "offset_y")
 FLUX, X, Y, BACKGROUND, STRENGTH, RATIO = range(6)
-# Transfer of air and detector below which diffraction is left out, for turbulence of so much of the strength, and
-# distance by which landing points at the rims may move before it is computed again [pixels of the detector].
-_DARK, _SHARPER, _MOVED = 2e-3, 0.9, 0.05
 
 
 @dataclass(frozen=True)
@@ -43,15 +41,14 @@ class LandedLight:
         Fractions of the light.
     spread : ndarray, shape [n, 2, 2]
         Second moments of the image of each point, beside the footprint [m^2].
-    at_rims : tuple of ndarray, shapes [n_rim, 2], or None
-        Landing points of the rims of the pupil [m], and their change per metre towards the lit side; None without
-        diffraction.
+    at_rims : RimsAt or None
+        The rims of the pupil; None without diffraction.
     """
 
     landing: np.ndarray
     weights: np.ndarray
     spread: np.ndarray
-    at_rims: tuple[np.ndarray, np.ndarray] | None = None
+    at_rims: RimsAt | None = None
 
 
 class ImageGrid:
@@ -95,9 +92,7 @@ class ImageGrid:
         self.shape, self.pixel, self.footprint = shape, pixel, footprint
         #: Pixels of the detector along one of the stamp, and the centre of its stamp from that of this one [pixels].
         self.scale, self.offset = float(pixels.side), np.array(pixels.offset)
-        self.oversampling, self.reach, self.rims = oversampling, reach, rims
-        self._side = side
-        self._kept: _RimLight | None = None
+        self.oversampling, self.reach = oversampling, reach
         margin = max(8, math.ceil(reach / pixel))
         self._size = tuple(fft.next_fast_len(oversampling * (n + margin), real=True) for n in shape)
         #: Place of the centre of the stamp on the grid, (y, x) cells.
@@ -108,7 +103,6 @@ class ImageGrid:
         wave = 2.0 * math.pi * oversampling / pixel * np.stack([x, y])  # rad/m
         baseline = np.tensordot(jacobian.T, wave, axes=1) * seeing.wavelength / (2.0 * math.pi)
         self._exponent = seeing.exponent(np.hypot(*baseline))
-        self._wave, self._baseline = wave, baseline
         spline = (np.sinc(x) * np.sinc(y)) ** 4
         cell = np.prod(np.sinc(np.tensordot(footprint.T, wave, axes=1) / (2.0 * math.pi)), axis=0)
         # A cell of the grid holds less light than a pixel.
@@ -119,8 +113,12 @@ class ImageGrid:
             * cell
             / spline
         )
-        #: What the filter has that light of rims has not: the images of cells, and the spline.
-        self._lattice = cell / spline
+        # The filter has the images of cells, and the spline, which light of rims has not.
+        self.rim_light = None if rims is None else RimLight(rims, side, wave, baseline, cell / spline, self._filter)
+
+    def _filter(self, strength: float) -> np.ndarray:
+        """Return the transfer function of air and detector."""
+        return np.asarray(self._detector * np.exp(-self._exponent * strength ** (5.0 / 3.0)))
 
     def places(self, unknowns: np.ndarray, landing: np.ndarray) -> np.ndarray:
         """Return places (x, y) of light [n, 2] that lands about the chief ray [m], in pixels from the centre."""
@@ -243,49 +241,30 @@ class ImageGrid:
         if rates is not None and rates.shape[1]:
             deposits.append(splines[0] @ rates.astype(np.float32))
         spectra = fft.rfft2(np.concatenate(deposits, axis=1).reshape(*self._size, -1), axes=(0, 1))
-        turbulence = np.exp(-self._exponent * unknowns[STRENGTH] ** (5.0 / 3.0))
-        total = self._detector * turbulence
         if light.at_rims is not None:
-            self._diffract(spectra, unknowns, *light.at_rims)
-        spectra *= total.astype(np.float32)[..., None]
+            self._diffract(spectra, unknowns, light.at_rims)
+        spectra *= self._filter(unknowns[STRENGTH]).astype(np.float32)[..., None]
         if len(unknowns) <= RATIO:
             return spectra, None
         turn = np.exp(1j * np.tensordot(unknowns[RATIO + 1 :], self._phase, axes=1))
         return spectra, turn.astype(np.complex64)[..., None]
 
-    def _diffract(self, spectra: np.ndarray, unknowns: np.ndarray, landing: np.ndarray, inward: np.ndarray) -> None:
-        """Add what is diffracted at the rims to the spectra of the star and of its derivatives by x and y."""
-        strength = float(unknowns[STRENGTH])
-        kept = self._kept
-        if kept is None or strength < kept.strength or np.abs(landing - kept.landing).max() > _MOVED * self._side:
-            kept = self._kept = self._at_rims(_SHARPER * strength, landing, inward)
+    def _diffract(self, spectra: np.ndarray, unknowns: np.ndarray, rims: RimsAt) -> None:
+        """Add what is diffracted at the rims to the spectra of the star and of its derivatives by x, y and wave."""
+        light = self.rim_light
+        assert light is not None
+        transfer = light.transfer(float(unknowns[STRENGTH]), rims)
         # Frequencies of the grid count from its first cell.
         middle = np.array(self._middle[::-1]) / self.oversampling
         place = self.places(unknowns, np.zeros(2)) + middle
-        found = kept.transfer * np.exp(-1j * self.pixel * (kept.wave @ place)).astype(np.complex64)
-        spectra[kept.where, 0] += found
-        if spectra.shape[-1] > 1:
-            for axis in (0, 1):
-                spectra[kept.where, 1 + axis] -= 1j * (kept.wave[:, axis] * self.pixel).astype(np.float32) * found
-
-    def _at_rims(self, strength: float, landing: np.ndarray, inward: np.ndarray) -> _RimLight:
-        """Return the transfer function of the rims where air of a strength leaves something of it."""
-        assert self.rims is not None
-        where = np.abs(self._detector * np.exp(-self._exponent * strength ** (5.0 / 3.0))) > _DARK
-        wave = self._wave[:, where].T
-        transfer = self.rims.transfer(self._baseline[:, where].T, wave, landing, inward) / self._lattice[where]
-        return _RimLight(strength, landing, where, wave, transfer.astype(np.complex64))
-
-
-@dataclass(frozen=True)
-class _RimLight:
-    """Transfer function [n_frequency] of the rims of the pupil about the chief ray, at some frequencies of a grid."""
-
-    strength: float
-    landing: np.ndarray
-    where: np.ndarray
-    wave: np.ndarray
-    transfer: np.ndarray
+        turn = np.exp(-1j * self.pixel * (light.wave @ place)).astype(np.complex64)
+        found = transfer * turn
+        spectra[light.where, 0] += found
+        if spectra.shape[-1] == 1:
+            return
+        for axis in (0, 1):
+            spectra[light.where, 1 + axis] -= 1j * (light.wave[:, axis] * self.pixel).astype(np.float32) * found
+        spectra[light.where, 3 : 3 + rims.response.shape[2]] += light.slopes(rims) * turn[:, None]
 
 
 # Cubic B-spline at t - 1 ... t + 2 by powers of t, 0 <= t < 1, and its derivatives with respect to the point's place.

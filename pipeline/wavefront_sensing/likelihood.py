@@ -87,8 +87,8 @@ def model_image(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> np.ndar
 
 
 def _landed(stamp: Stamp, wave: np.ndarray) -> LandedLight:
-    landing, rims = stamp.rays.landing(wave), stamp.grid.rims
-    at_rims = None if rims is None else stamp.rays.at_rims(rims, landing)
+    landing, light = stamp.rays.landing(wave), stamp.grid.rim_light
+    at_rims = None if light is None else stamp.rays.at_rims(light.rims, landing)
     return LandedLight(landing, stamp.rays.weights(wave), stamp.rays.spread(landing), at_rims)
 
 

@@ -19,7 +19,6 @@ from ...models.telescope import Telescope
 from ...raytrace.launch import aimed_points
 from ...raytrace.rays import RayStatus, parallel_rays
 from ...raytrace.trace import trace
-from ...wavefront.psf.pupil_rims import PupilRims
 from ...wavefront.pupil_polynomials import PupilPolynomials
 
 #: Side of the lattice over the diameter of the pupil: light off the axis may cross the plane of the stop just outside.
@@ -61,16 +60,13 @@ class PupilCells:
         return len(self.weights)
 
     @cached_property
-    def _smooth(self) -> PupilPolynomials:
+    def smooth(self) -> PupilPolynomials:
+        """Polynomials through values at the points."""
         return PupilPolynomials(self.points, self.center, self.side)
 
     def magnification(self, landing: np.ndarray) -> np.ndarray:
         """Return the derivative of landing points [n, 2] along the pupil, shape [n, 2, 2], by smooth polynomials."""
-        return self._smooth.derivatives(landing)
-
-    def at_rims(self, landing: np.ndarray, rims: PupilRims) -> tuple[np.ndarray, np.ndarray]:
-        """Return landing points of rims [m], and their change per metre of the pupil along the normals, both [m, 2]."""
-        return rims.landing(self._smooth, landing)
+        return self.smooth.derivatives(landing)
 
     def footprint(self, landing: np.ndarray) -> np.ndarray:
         """Return the sides of the mean image of a cell [m], columns of a matrix [2, 2], from landing points [n, 2]."""

@@ -20,7 +20,6 @@ the r band 0.1 % too wide for a cut-off of 1/r0 and 0.5 % for 1.4/r0 (plain high
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import scipy.fft
@@ -37,6 +36,7 @@ from .engine import Exposed, PsfEngine, PsfInputs, Stars, expose_apart, metric_o
 from .far_from_focus import finer_sampling
 from .fast_kernels import combine_wavelengths, deposit_rays
 from .image_plane import square_transfer
+from .inner_rim import ended_by_apertures, traced_obscuration
 from .pupil_lattice import PupilLattice
 from .sample_packets import LANES, indices, samples, to_packets
 
@@ -54,10 +54,6 @@ OVERSAMPLING, OVERSAMPLING_STILL = 2, 12
 #: Distance on the CCD of the rays of neighbouring pupil points [pixels], with and without an atmosphere, beyond which a
 #: star counts as far from focus and is drawn with more points, and the largest that it then has.
 RAY_DISTANCE, RAY_DISTANCE_STILL = (1.0, 0.25), (0.25, 0.125)
-# Width of the ring within the pupil's inner rim that is traced too far from focus, over the outer radius: off the axis
-# the hole of a mirror stands aside from that of the pupil, which lies in another plane, by 8 mm at 1.64 degrees of the
-# LSST. A fit takes the crescent for 30 nm of astigmatism.
-_WITHIN = 0.01
 # Stars of one batch, fewer where their grids would fill more than this many bytes.
 _BATCH, _BATCH_BYTES = 128, 1 << 25
 # Samples of the filter against the baseline: linear interpolation is then good to 3e-6.
@@ -94,7 +90,7 @@ class FastPsfEngine(PsfEngine):
         super().__init__(inputs)
         self._finer = finer
         #: Inner radius of the points over the outer one, and their area over that of the pupil.
-        self._inner = max(self._obscuration - _WITHIN, 0.0) if far else self._obscuration
+        self._inner = traced_obscuration(self._obscuration) if far else self._obscuration
         self._area = (1.0 - self._inner**2) / (1.0 - self._obscuration**2)
         still, n_pupil, oversampling = inputs.atmosphere is None, inputs.n_pupil, inputs.oversampling
         if n_pupil is None:
@@ -207,10 +203,7 @@ class FastPsfEngine(PsfEngine):
 
     def _expose_traced(self, optics: PupilOptics, stars: Stars) -> Exposed:
         if self._inner < self._obscuration:
-            # Apertures have the last word where they end the ring; where none does, its inner rim is the pupil's.
-            within = np.hypot(*self._points.T) < 0.5 * self._diameter * self._obscuration
-            unbounded = np.all(optics.lit[:, :, within], axis=2, keepdims=True)
-            optics = replace(optics, lit=optics.lit & ~(unbounded & within))
+            optics = ended_by_apertures(optics, self._points, 0.5 * self._diameter * self._obscuration)
         light = optics.lit * self._weights
         if stars.photons is not None:
             light = light * stars.photons[:, :, None]

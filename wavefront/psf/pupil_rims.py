@@ -15,6 +15,7 @@ middle of the strip.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -71,6 +72,35 @@ class PupilRims:
             Change of these places per metre of the pupil along the normals.
         """
         out = np.empty(len(wave), dtype=np.complex64)
+        for piece, _, width, phase in self._strips(baseline, wave, landing, inward):
+            out[piece].real = np.einsum("fn,fn->f", width, np.cos(phase))
+            out[piece].imag = -np.einsum("fn,fn->f", width, np.sin(phase))
+        return out
+
+    def transfer_slopes(
+        self,
+        baseline: np.ndarray,
+        wave: np.ndarray,
+        landing: np.ndarray,
+        inward: np.ndarray,
+        response: np.ndarray,
+    ) -> np.ndarray:
+        """Return derivatives of :meth:`transfer` by unknowns, shape [n_frequency, n_unknown], complex64.
+
+        ``response`` has those of the landing points [m], shape [2, n, n_unknown]. Those of ``inward`` are left out.
+        """
+        out = np.empty((len(wave), response.shape[2]), dtype=np.complex64)
+        moved = response.astype(np.float32)
+        for piece, k, width, phase in self._strips(baseline, wave, landing, inward):
+            cosine, sine = width * np.cos(phase), width * np.sin(phase)
+            out[piece].real = sum(-k[:, i, None] * (sine @ moved[i]) for i in (0, 1))
+            out[piece].imag = sum(-k[:, i, None] * (cosine @ moved[i]) for i in (0, 1))
+        return out
+
+    def _strips(
+        self, baseline: np.ndarray, wave: np.ndarray, landing: np.ndarray, inward: np.ndarray
+    ) -> Iterator[tuple[slice, np.ndarray, np.ndarray, np.ndarray]]:
+        """Yield slices of the frequencies, their wave vectors, and the light and the phase of the strips at these."""
         across, places, steps = (v.T.astype(np.float32) for v in (self.normals, landing, 0.25 * inward))
         parts = (-0.5 * self.parts).astype(np.float32)
         for first in range(0, len(wave), _CHUNK):
@@ -79,9 +109,7 @@ class PupilRims:
             width = np.abs(b @ across)
             phase = k @ places + width * (k @ steps)
             width *= parts
-            out[piece].real = np.einsum("fn,fn->f", width, np.cos(phase))
-            out[piece].imag = -np.einsum("fn,fn->f", width, np.sin(phase))
-        return out
+            yield piece, k, width, phase
 
 
 def strip_overlap(baseline: np.ndarray, diameter: float, obscuration: float) -> np.ndarray:

@@ -42,6 +42,7 @@ from ...core.warp_arrays import warp_array
 from ..atmosphere.spline import spline_weights
 from ..pupil_optics import PupilOptics
 from .engine import Exposed, PsfEngine, PsfInputs, Stars
+from .inner_rim import ended_by_apertures, traced_obscuration
 from .pupil_lattice import PupilLattice
 from .sample_packets import LANES, indices, samples
 from .wave_kernels import Screens, Taps, add_squares, pupil_fields
@@ -87,7 +88,7 @@ class WavePsfEngine(PsfEngine):
             longest = LONGEST_BASELINE
         elif padding is None and self._atmosphere is not None:
             longest = self._longest_baseline()
-        self._lattice = PupilLattice.fill(diameter, self._obscuration, spacing)
+        self._lattice = PupilLattice.fill(diameter, traced_obscuration(self._obscuration), spacing)
         self._packets = -(-self._lattice.size // LANES)
         across = max(math.ceil((diameter + longest) / spacing), self._packets * LANES)
         # Multiples of 4 fill whole packets.
@@ -141,7 +142,9 @@ class WavePsfEngine(PsfEngine):
 
     def _expose_star(self, field: np.ndarray, photons: np.ndarray | None) -> tuple[PupilOptics, np.ndarray]:
         """Return the optics of a star and its spectra, the OTF times the transfer function of the detector."""
-        optics = self._trace(field[None], self._lattice.points, 1)
+        points = self._lattice.points
+        optics = self._trace(field[None], points, 1)
+        optics = ended_by_apertures(optics, points, 0.5 * self._diameter * self._obscuration)
         spectra = self._filtered(self._intensity(field, optics), optics.jacobian[0])
         if photons is not None and optics.lit.any():
             # Wavelengths count by their light, of which the spectra have a sum of 1.

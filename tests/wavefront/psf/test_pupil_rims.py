@@ -73,6 +73,19 @@ def test_fits_with_diffraction_find_no_wavefront_in_it(defocused, donut):
     assert right.chi2[0] < 0.1 * plain.chi2[0]
 
 
+@pytest.mark.slow
+def test_donuts_of_the_wave_engine_have_the_hole_of_the_mirror():
+    """At 1.64 degrees it stands 8 mm aside from the hole of the pupil: 34 nm of Z5 where light ends at that one."""
+    telescope = LSST.perturbed("Detector", shift=(0.0, 0.0, 1.5e-3))
+    fields, options = np.deg2rad([[1.19, 1.13]]), {"diffusion": 15e-6}
+    donut = make_psfs(telescope, fields, [WAVE], engine="wave", stamp_size=141, **options).image
+    fit = pachon.fit_donuts(
+        telescope, 1e7 * donut, fields, WAVE, sky_variance=1e4, diffraction=True, fwhm=0.0, **options
+    )
+    # Fresnel fringes at the rims, without air.
+    assert np.linalg.norm(fit.zernikes[0]) < 10e-9
+
+
 def test_strips_of_a_ring_are_its_transfer_function_to_first_order():
     rims = pupil_rims(LSST, np.array([0.0, 0.0, -1.0]), WAVE)
     outer = 0.5 * LSST.pupil_diameter
@@ -93,3 +106,19 @@ def test_phases_are_those_of_the_middle_of_a_strip():
     found = rims.transfer(np.array([[0.2, 0.1]]), wave, landing, inward)[0]
     place = landing[0] + 0.25 * 0.2 * inward[0]
     assert found == pytest.approx(-0.5 * 0.2 * 0.3 * np.exp(-1j * wave[0] @ place), rel=1e-5)
+
+
+def test_slopes_of_the_transfer_are_central_differences():
+    rims = pupil_rims(LSST, np.array([0.0, 0.0, -1.0]), WAVE)
+    rng = np.random.default_rng(4)
+    count, step = len(rims.points), 3e-7
+    baseline, wave = rng.uniform(-0.3, 0.3, (30, 2)), rng.uniform(-1e5, 1e5, (30, 2))
+    landing, inward = 1.5e-4 * rims.points, 1.5e-4 * rims.normals
+    response = rng.standard_normal((2, count, 3))
+    found = rims.transfer_slopes(baseline, wave, landing, inward, response)
+    for k in range(3):
+        moved = [landing + sign * step * response[:, :, k].T for sign in (1.0, -1.0)]
+        ends = [rims.transfer(baseline, wave, m, inward) for m in moved]
+        expected = (ends[0] - ends[1]) / (2.0 * step)
+        # Single precision, and the third order of the differences: (0.1 rad)^2 / 6 at three sigma.
+        np.testing.assert_allclose(found[:, k], expected, atol=5e-3 * np.abs(expected).max())
