@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
 
 from ...core.plotting import new_figure, png_bytes, styled
 from ...models.camera.camera import Camera
@@ -106,8 +107,7 @@ def whiskers_plot(
             frame_axes(axes, limits, x_label=not stacked or i == len(kinds) - 1, y_label=stacked or i == 0)
             axes.set_title(_titled(_TITLES[kind], products, kind, most), loc="left")
             draw_key_whisker(axes, key, scale, 1.0)
-        if not is_flat(focal_plane):
-            figure.colorbar(image, ax=list(panels), fraction=0.02, pad=0.01, aspect=30, label="CCD height [µm]")
+        _add_height_scale(figure, image, panels, focal_plane, 30)
         return png_bytes(figure)
 
 
@@ -139,9 +139,17 @@ def close_up_plot(products: Sequence[CcdStars], focal_plane: FocalPlane) -> byte
                 title = name + _SHORT_TITLES[kind]
                 axes.set_title(_titled(title, [product], kind, _MOST_WHISKERS) if i == 0 else title, loc="left")
                 draw_key_whisker(axes, key, scale, 1.2)
-        if not is_flat(focal_plane):
-            figure.colorbar(image, ax=list(panels.flat), fraction=0.02, pad=0.01, aspect=40, label="CCD height [µm]")
+        _add_height_scale(figure, image, panels, focal_plane, 40)
         return png_bytes(figure)
+
+
+def _add_height_scale(
+    figure: Figure, image: ScalarMappable, panels: np.ndarray, focal_plane: FocalPlane, aspect: float
+) -> None:
+    """Add the colour scale of the heights behind whiskers to panels, where there are heights."""
+    if not is_flat(focal_plane):
+        label = "CCD height [µm]"
+        figure.colorbar(image, ax=list(panels.flat), fraction=0.02, pad=0.01, aspect=aspect, label=label)
 
 
 _TITLES = {
