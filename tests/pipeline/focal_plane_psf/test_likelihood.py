@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
+import scipy.optimize
 from scipy.stats import multivariate_normal
 
-from pachon.pipeline.focal_plane_psf import likelihood
 from pachon.pipeline.focal_plane_psf.covariance import COMPONENTS, Covariance, Places
 from pachon.pipeline.focal_plane_psf.kriging import on_threads
 from pachon.pipeline.focal_plane_psf.likelihood import blocks_of, fit_covariance, log_likelihood
@@ -44,7 +44,7 @@ def prepared(monkeypatch):
             raise InterruptedError
 
         with monkeypatch.context() as patch:
-            patch.setattr(likelihood, "minimize", catch)
+            patch.setattr(scipy.optimize, "minimize", catch)
             with pytest.raises(InterruptedError):
                 fit_covariance(*args, **options)
         return caught["function"], caught["first"], caught["args"]
