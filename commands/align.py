@@ -39,7 +39,7 @@ def align_command(
     Fifty degrees of freedom are off at first and drift. In each visit the eight halves of the wavefront sensors image a
     star each, through turbulence and with noise; Zernikes are fitted to the donuts, the state is estimated and
     corrected. Tables of visits, states and estimates (ECSV), summary.json, pictures and the configuration go into one
-    folder. A visit takes some four seconds. A loop that was killed goes on by --resume, to the same bytes, and so does
+    folder. A visit takes 4 to 7 s of processor time. A killed loop goes on by --resume, to the same bytes, and so does
     one that is to have more visits.
 
     **Examples**
