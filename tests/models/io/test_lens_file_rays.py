@@ -189,7 +189,7 @@ def test_an_ellipse_written_for_optiland_and_read_again(tmp_path):
     assert pachon.load_telescope(tmp_path / "written.json").surfaces[0].aperture == ellipse
     optiland = pytest.importorskip("optiland.fileio")
     optic = optiland.load_optiland_file(str(tmp_path / "written.json"))
-    (peer,) = (s.aperture for s in optic.surfaces if s.aperture is not None)
+    peer = next(s.aperture for s in optic.surfaces if s.aperture is not None)
     x, y = np.random.default_rng(1).uniform(-2.5, 2.5, (2, 1000))
     # Its x axis is the other way round, its lengths are millimetres.
     assert np.array_equal(ellipse.contains(x, y), np.asarray(peer.contains(-1e3 * x, 1e3 * y)))
