@@ -1,8 +1,6 @@
 """Version of pachon, and the header card that records it."""
 
-from importlib.metadata import version
-
-#: Version of pachon.
-VERSION = version("pachon")
+#: Version of pachon, that of pyproject.toml; reading the metadata of the installed package would take 30 ms.
+VERSION = "0.1.0"
 #: Header card of the program, in every FITS file.
 CREATOR = ("CREATOR", f"pachon {VERSION}", "program and version")

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import yaml
 
+from pachon.core.version import VERSION
+
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 
@@ -20,7 +22,8 @@ def test_the_source_archive_is_whole():
         assert path in listed
 
 
-def test_citation_and_project_agree():
+def test_citation_project_and_package_agree():
+    assert VERSION == PROJECT["project"]["version"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert str(citation["version"]) == PROJECT["project"]["version"]
     assert citation["license"] == PROJECT["project"]["license"]
