@@ -23,7 +23,7 @@ def test_the_source_archive_is_whole():
 
 
 def test_citation_project_and_package_agree():
-    assert VERSION == PROJECT["project"]["version"]
+    assert PROJECT["project"]["version"] == VERSION
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert str(citation["version"]) == PROJECT["project"]["version"]
     assert citation["license"] == PROJECT["project"]["license"]
