@@ -243,11 +243,12 @@ def draw(table: Table, path: Path) -> None:
         axes.loglog(count, table[column], style, label=label)
     further = {n: table[f"predicted_{n}"][-1] for n in BEYOND if n > count[-1]}
     last = [count[-1], *further], [table["predicted"][-1], *further.values()]
-    axes.loglog(*last, "C0:", label="predicted for more exposures like these")
+    if further:
+        axes.loglog(*last, "C0:", label="predicted for more exposures like these")
     count = np.concatenate([count, list(further)])
     axes.axhline(GOAL_UM, color="0.5", linewidth=0.8, label="goal after 100 exposures")
     axes.axhline(table["heights"][0], color="0.5", linewidth=0.8, linestyle="-.", label="heights themselves")
-    axes.set(xlabel="exposures", ylabel="rms [um]", xticks=count, xticklabels=[str(c) for c in count])
+    axes.set(xlabel="exposures", ylabel="rms [um]", xticks=count, xticklabels=[f"{c:g}" for c in count])
     ticks = [0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0, 5.0]
     axes.set(ylim=(0.04, 6.0), yticks=ticks, yticklabels=[f"{v:g}" for v in ticks])
     axes.minorticks_off()
