@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from base64 import b64encode
 from dataclasses import fields, is_dataclass
 from html import escape
 from pathlib import Path
@@ -12,8 +11,8 @@ import numpy as np
 
 from .arguments import check_arguments
 from .docstrings import Description, described
-from .errors import PachonError
 from .files import plain_values
+from .notebook import html_picture
 
 # astropy takes a third of a second to import: only where a table is made.
 if TYPE_CHECKING:
@@ -21,8 +20,6 @@ if TYPE_CHECKING:
 
 #: Rows of a table in HTML, and columns named in a representation.
 _ROWS, _NAMED = 8, 6
-#: Dots per inch of pictures in notebooks.
-_DPI = 72
 
 
 class Result:
@@ -124,12 +121,7 @@ class Result:
         """Return the first rows of the table and the picture, as notebooks show them."""
         parts = [f"<p><b>{type(self).__name__}</b>: {escape(self._label())}</p>", html_table(self.to_table())]
         if plot := getattr(self, "plot", None):
-            try:
-                picture = plot()
-            except PachonError as error:
-                parts.append(f"<p>No picture: {escape(str(error))}</p>")
-            else:
-                parts.append(f'<img style="max-width:100%" src="{_data_url(picture)}" alt="{type(self).__name__}">')
+            parts.append(html_picture(plot, type(self).__name__))
         return "\n".join(parts)
 
 
@@ -174,9 +166,3 @@ def _cell(value: Any) -> str:
         few = np.ravel(value)
         return ", ".join(map(_cell, few[:4])) + (", ..." if len(few) > 4 else "")
     return f"{value:.5g}" if isinstance(value, (float, np.floating)) else str(value)
-
-
-def _data_url(figure: Any) -> str:
-    from .plotting import picture_bytes
-
-    return f"data:image/png;base64,{b64encode(picture_bytes(figure, 'png', _DPI)).decode()}"

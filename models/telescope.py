@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, PrescriptionError, unknown_name
+from ..core.notebook import Pictured
 from ..core.units import broadcast_together, metres, radians
 from .coating import AnyCoating
 from .design_data import DesignData
@@ -34,7 +35,7 @@ _STAYING = {Interaction.MIRROR: "mirror", Interaction.PASS: "baffle", Interactio
 
 @check_arguments
 @dataclass(frozen=True)
-class Telescope:
+class Telescope(Pictured):
     r"""An unfolded optical prescription.
 
     Parameters

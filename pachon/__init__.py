@@ -13,8 +13,11 @@ _folder = _Path(__file__).parent
 if not (_folder / "models").is_dir():
     __path__.append(str(_folder.parent))
 
-from .core import version as _version  # noqa: E402 - found by the line above
+from .core import notebook as _notebook  # noqa: E402 - found by the lines above
+from .core import version as _version  # noqa: E402
 
 __version__ = _version.VERSION
+# Neither telescopes nor cameras may import the layers that draw them.
+_notebook.PICTURES.update(Telescope="design.layout.layout:section", Camera="pipeline.report.camera_plot:camera_plot")
 
 __getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

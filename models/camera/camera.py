@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_unique, unknown_name
+from ...core.notebook import Pictured
 from ...core.units import plane_points
 from .photometry import CameraPhotometry
 
@@ -77,7 +78,7 @@ class CcdFrame:
 
 @check_arguments
 @dataclass(frozen=True, eq=False)
-class Camera:
+class Camera(Pictured):
     """A mosaic of rectangular CCDs, each with its own size and angle, on rafts or without.
 
     Raises
@@ -138,7 +139,8 @@ class Camera:
         self._check_overlap()
 
     def __repr__(self) -> str:
-        rafts = f" on {len(self.raft_names)} rafts" if self.raft_names else ""
+        count = len(self.raft_names)
+        rafts = f" on {count} raft{'s' * (count != 1)}" if count else ""
         return f"<Camera {self.name}: {len(self)} CCDs{rafts}>"
 
     def __len__(self) -> int:
