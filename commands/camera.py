@@ -102,8 +102,7 @@ def _show_camera(camera: Camera, picture: Path | None, kind: str, as_json: bool)
         if picture is None:
             return
     path = Path(f"camera_{camera.name}.png") if picture is None else picture
-    title = f"{camera.name}: {len(camera)} CCDs, pixels of {camera.pixel_size * 1e6:g} um"
-    write_bytes(path, picture_bytes(camera_plot(camera, title), kind))
+    write_bytes(path, picture_bytes(camera_plot(camera), kind))
     if not as_json:
         Rows(CAMERA_COLUMNS, [[str(cell) for cell in row] for row in rows], CAMERA_CAPTION).show()
         print(f"picture: {path.resolve()}")

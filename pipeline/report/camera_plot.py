@@ -1,4 +1,4 @@
-"""Plot of the CCDs of a camera."""
+"""Plot of a camera: its CCDs with their names, on the focal plane."""
 
 from __future__ import annotations
 
@@ -9,22 +9,30 @@ from ...core.plotting import new_figure, plain_text, styled
 from ...models.camera.camera import Camera
 from .focal_plane_axes import ccd_corners, draw_outlines, frame_axes
 
-#: Most CCDs that are named in the plot.
-_NAMED = 30
+# Part of the width of a CCD that its name fills, and width of a letter over its height.
+_FILLED, _LETTER = 0.8, 0.62
+_WIDTH, _HEIGHT = 8.6, 8.2
 
 
 def camera_plot(camera: Camera) -> Figure:
-    """Return a plot of the outlines of the CCDs, named where they are few."""
-    corners = ccd_corners(camera, range(len(camera)))
-    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-    rim = 0.03 * float(np.max(high - low))
+    """Draw the outlines of all CCDs with their names; a dot marks the corner of the first pixel of each."""
+    edge = 1.04e3 * camera.reach
+    indices = range(len(camera))
+    corners = ccd_corners(camera, indices)
+    # Points to a millimetre: the axes are about 0.85 of the figure wide.
+    scale = 0.85 * _WIDTH * 72.0 / (2.0 * edge)
+    width = float(np.ptp(corners[:, :, 0], axis=1).min()) * scale
+    size = min(_FILLED * width / (_LETTER * max(map(len, camera.ccd_names))), 11.0)
     with styled():
-        figure = new_figure(5.4, 5.4)
+        figure = new_figure(_WIDTH, _HEIGHT)
         axes = figure.add_subplot()
-        draw_outlines(axes, camera, range(len(camera)), "0.3", 0.8)
-        if len(camera) <= _NAMED:
-            for name, (x, y) in zip(camera.ccd_names, corners.mean(axis=1), strict=True):
-                axes.text(x, y, plain_text(name), ha="center", va="center", fontsize=7)
-        frame_axes(axes, (low[0] - rim, high[0] + rim, low[1] - rim, high[1] + rim))
-        axes.set_title(plain_text(f"{camera.name}: {len(camera)} CCDs"))
+        draw_outlines(axes, camera, indices, "0.3", 0.8)
+        centers = camera.centers * 1e3
+        for name, center, first in zip(camera.ccd_names, centers, corners[:, 0], strict=True):
+            axes.annotate(name, center, ha="center", va="center", fontsize=size, color="0.15")
+            at = first + 0.06 * (center - first)
+            axes.plot(*at, "o", color="0.3", markersize=max(0.03 * width, 0.6))
+        frame_axes(axes, (-edge, edge, -edge, edge))
+        pixel = f"pixels of {camera.pixel_size * 1e6:g} um"
+        axes.set_title(plain_text(f"{camera.name}: {len(camera)} CCDs, {pixel}; dots: first pixels"))
         return figure
