@@ -92,8 +92,8 @@ def draw(rows: dict[str, list[dict[str, float]]], path: Path) -> None:
         count = [row["stars"] for row in found]
         axes[0].loglog(count, [row["fit"] for row in found], "o-", label=label)
         axes[1].semilogx(count, [row["memory"] for row in found], "o-", label=label)
-    first = rows["with the telescope"][0]
-    axes[0].loglog(count, [first["fit"] * n / count[0] for n in count], ":", color="0.5", label="in proportion")
+    last = rows["with the telescope"][-1]
+    axes[0].loglog(count, [last["fit"] * n / count[-1] for n in count], ":", color="0.5", label="in proportion")
     axes[0].set(xlabel="stars", ylabel="processor time of the fit [s]")
     axes[1].set(xlabel="stars", ylabel="peak memory [GB]", ylim=(0.0, None))
     for each in axes:
