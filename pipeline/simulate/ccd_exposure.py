@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -52,6 +53,7 @@ class CcdExposure:
     positions: StarField  #: with provisional magnitudes
     holdout: NoiseFreeStars  #: each centred on a pixel
     observed: NoiseFreeStars  #: at their sub-pixel positions
+    centered: NoiseFreeStars | None = None  #: the observed stars again, each centred on a pixel, where asked for
 
 
 def holdout_positions(experiment: Experiment, name: str) -> np.ndarray:
@@ -88,23 +90,63 @@ def expose_ccd(
     name: str,
     stars: StarField | None = None,
     *,
+    centered: bool = False,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> CcdExposure:
     """Make the PSFs of the stars of one CCD: nearly all of the work, on all threads.
 
-    `stars` are by default drawn over the CCD. No byte depends on the number of threads; `progress` is called with the
-    number of PSFs made since the last call.
+    `stars` are by default drawn over the CCD. With `centered` the observed ones are drawn once more on the centre of a
+    pixel, which costs next to nothing. No byte of the others depends on that, and none at all on the number of threads;
+    `progress` is called with the number of PSFs made since the last call.
     """
     positions = ccd_stars(experiment, name, PROVISIONAL_FWHM) if stars is None else stars
     holdout = expose_centered(experiment, positions.holdout, threads, progress)
     pixel = positions.observed_pixel * (positions.pixel_size / experiment.pixel_size)
-    offsets, room = pixel - np.rint(pixel), _SHIFT_ROOM
+    offsets = pixel - np.rint(pixel)
     kelvin = positions.temperature
+    if centered:
+        observed, again = _expose_twice(experiment, positions.observed, offsets, threads, progress, temperatures=kelvin)
+        return CcdExposure(name, positions, holdout, _lit(observed), again)
     observed = _expose(
-        experiment, positions.observed, threads, progress, offsets=offsets, room=room, temperatures=kelvin
+        experiment, positions.observed, threads, progress, offsets=offsets, room=_SHIFT_ROOM, temperatures=kelvin
     )
     return CcdExposure(name, positions, holdout, _lit(observed))
+
+
+def _expose_twice(
+    experiment: Experiment,
+    positions: np.ndarray,
+    offsets: np.ndarray,
+    threads: int | None,
+    progress: Callable[[int], None] | None,
+    temperatures: np.ndarray | None,
+) -> tuple[NoiseFreeStars, NoiseFreeStars]:
+    """Make the PSFs of observed stars, with the room of their stamps, and the same on the centre of a pixel."""
+    first: list[np.ndarray] = []
+
+    def kept_centroid(images: np.ndarray, pixel_scale: float) -> np.ndarray:
+        # The engine measures each star where it was drawn first.
+        light = images.sum(axis=(1, 2))
+        first.append((images / np.where(light > 0.0, light, 1.0)[:, None, None]).astype(np.float32))
+        return _centroids(experiment, images, pixel_scale)
+
+    moved = _expose(
+        experiment,
+        positions,
+        threads,
+        progress,
+        room=_SHIFT_ROOM,
+        offsets=offsets,
+        recenter=kept_centroid,
+        temperatures=temperatures,
+    )
+    images = _displaced(experiment, positions - offsets * experiment.pixel_size, np.concatenate(first))
+    rim = _SHIFT_ROOM // 2
+    inner = moved.image[:, rim:-rim, rim:-rim]
+    light = inner.sum(axis=(1, 2), keepdims=True, dtype=np.float64)
+    centered = (inner / np.where(light > 0.0, light, 1.0)).astype(np.float32)
+    return replace(moved, image=images, offset=offsets), replace(moved, image=centered)
 
 
 def expose_centered(
@@ -116,14 +158,16 @@ def expose_centered(
     along: str | None = None,
 ) -> NoiseFreeStars:
     """Make noise-free PSFs as :func:`expose_positions` does, their centroids at the centre of a pixel."""
-
-    def centroid(images: np.ndarray, pixel_scale: float) -> np.ndarray:
-        shapes = measure_shapes(images, pixel_scale, experiment.weight_fwhm)
-        return np.nan_to_num(np.stack([shapes.x, shapes.y], axis=1))
-
     # The engine draws them at the position that compensates their shift by the atmosphere. Resampling, as of observed
     # stars, would leave ringing along rows and columns where an image is not quite band-limited.
-    return _expose(experiment, positions, threads, progress, recenter=centroid, along=along)
+    recenter = partial(_centroids, experiment)
+    return _expose(experiment, positions, threads, progress, recenter=recenter, along=along)
+
+
+def _centroids(experiment: Experiment, images: np.ndarray, pixel_scale: float) -> np.ndarray:
+    """Return centroids (x, y) from the centre of the middle pixel [pixel], shape [n, 2], 0 where there are none."""
+    shapes = measure_shapes(images, pixel_scale, experiment.weight_fwhm)
+    return np.nan_to_num(np.stack([shapes.x, shapes.y], axis=1))
 
 
 def _lit(stars: NoiseFreeStars) -> NoiseFreeStars:

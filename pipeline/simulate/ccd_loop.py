@@ -32,6 +32,7 @@ def simulate_ccds(
     names: Sequence[str] | None = None,
     *,
     fields: Mapping[str, StarField] | None = None,
+    centered: bool = False,
     title: str | None = None,
     strict: bool = True,
     threads: int | None = None,
@@ -42,8 +43,8 @@ def simulate_ccds(
     `model` is any reduction of an exposure, such as :func:`~.model_ccd`. It runs on a thread of its own, one CCD at a
     time, in the order of the CCDs; no byte depends on the number of threads. `names` are by default those of the
     configuration, `fields` are the stars of each CCD, by default drawn over it, and `title` is that of the progress
-    bar. A CCD that cannot be modelled ends the loop with `strict`, after the models under way; otherwise it is reported
-    and left out.
+    bar. With `centered` exposures hold the observed stars centred on a pixel as well. A CCD that cannot be modelled
+    ends the loop with `strict`, after the models under way; otherwise it is reported and left out.
 
     Raises
     ------
@@ -72,7 +73,9 @@ def simulate_ccds(
         for i, name in enumerate(names, start=1):
             try:
                 stars = None if fields is None else fields[name]
-                exposure = expose_ccd(experiment, name, stars=stars, threads=threads, progress=stage.advance)
+                exposure = expose_ccd(
+                    experiment, name, stars=stars, centered=centered, threads=threads, progress=stage.advance
+                )
             except PachonError as error:
                 raise error.within(subject=f"CCD {name}") from None
             due, pending = pending, [(name, modeller.submit(model, exposure))]

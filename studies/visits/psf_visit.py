@@ -13,6 +13,7 @@ from ...core.progress import Reporter
 from ...core.units import ARCSEC
 from ...models.telescope import Telescope
 from ...pipeline.config import with_options
+from ...pipeline.defaults import given
 from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_psf.stars import CcdStars, FocalPlaneStars
 from ...pipeline.focal_plane_stage import fit_focal_plane_model
@@ -147,17 +148,25 @@ def visit_psfs(
         counts = stars.electrons * seen.lit_fraction
         images = collected_images(experiment, seen.image, seen.pixel_scale, counts)
         observation = observe_ccd(experiment, exposure.name, images, seen.pixel_scale, counts, noisy=True)
+        true = np.concatenate([exposure.holdout.image, given(exposure.centered).image])
         if together:
-            return _CcdResult(exposure, observation, counts, exposure.holdout.image, None)
-        width = effective_fwhm(exposure.holdout.image, exposure.holdout.pixel_scale)
+            return _CcdResult(exposure, observation, counts, true, None)
+        width = effective_fwhm(true, seen.pixel_scale)
         dimmed = stars.magnitude - 2.5 * np.log10(seen.lit_fraction)
         snr = signal_to_noise(dimmed, stars.band, config.atmosphere.exposure_s, width)
         model = fit_ccd_model(experiment, observation, stars, snr)
-        return _CcdResult(exposure, observation, counts, exposure.holdout.image, model.at(stars.holdout))
+        return _CcdResult(exposure, observation, counts, true, model.at(_points(stars)))
 
     with experiment.screens(threads, reporter):
         simulated = simulate_ccds(
-            experiment, modelled, list(fields), fields=fields, strict=False, threads=threads, reporter=reporter
+            experiment,
+            modelled,
+            list(fields),
+            fields=fields,
+            centered=True,
+            strict=False,
+            threads=threads,
+            reporter=reporter,
         )
     found = simulated.results
     if not found:
@@ -181,7 +190,7 @@ def visit_psfs(
 def _star_fields(
     experiment: Experiment, visit: Visit, points: SkyPoints, threads: int | None
 ) -> tuple[dict[str, StarField], dict[str, np.ndarray]]:
-    """Return the stars of each CCD and, as its holdout positions, all points on it; and the indices of the latter."""
+    """Return the stars of each CCD and, as its holdout positions, the places on it; and the indices of both."""
     camera, config = experiment.camera, experiment.config
     xy = visit.on_detector(experiment.telescope, points.sky, middle_wavelength(experiment), threads)
     band, seconds = experiment.band, config.atmosphere.exposure_s
@@ -192,8 +201,7 @@ def _star_fields(
     for name in config.ccds or ():
         depth = camera.depth(camera.ccd_index(name), *xy.T)
         stars = np.flatnonzero((depth >= _STAR_MARGIN * camera.pixel_size) & points.star & lit)
-        margin = np.where(points.star, _STAR_MARGIN, _PLACE_MARGIN) * camera.pixel_size
-        here = np.flatnonzero((depth >= margin) & lit)
+        places = np.flatnonzero((depth >= _PLACE_MARGIN * camera.pixel_size) & ~points.star & lit)
         if not len(stars):
             continue
         magnitude = magnitudes_at(points.quantile[stars], bright, faint)
@@ -202,7 +210,7 @@ def _star_fields(
             ccd_name=name,
             bounds=bounds,
             pixel_size=camera.pixel_size,
-            holdout=xy[here],
+            holdout=xy[places],
             observed=xy[stars],
             magnitude=magnitude,
             electrons=electrons(magnitude, band, seconds),
@@ -212,8 +220,13 @@ def _star_fields(
             faint=faint,
             turn=turn,
         )
-        index[name] = here
+        index[name] = np.concatenate([places, stars])
     return fields, index
+
+
+def _points(stars: StarField) -> np.ndarray:
+    """Return the positions of places and of stars, in the order of their indices."""
+    return np.concatenate([stars.holdout, stars.observed])
 
 
 def magnitude_limits(experiment: Experiment) -> tuple[float, float]:
@@ -252,7 +265,7 @@ def _focal_plane_images(
         experiment.weight_fwhm,
     )
     model = fit_focal_plane_model(experiment, stars, ccds=list(found), threads=threads, reporter=reporter)
-    places = {name: result.exposure.positions.holdout for name, result in found.items()}
+    places = {name: _points(result.exposure.positions) for name, result in found.items()}
     names = [name for name, xy in places.items() for _ in range(len(xy))]
     return model.draw(names, *np.concatenate(list(places.values())).T, threads=threads)
 
