@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -15,7 +14,7 @@ from typing import Any
 
 from .errors import ProductError
 from .threads import thread_count
-from .workers import end_with
+from .workers import begin_worker
 
 #: Function that takes a function of a module and its arguments, all picklable, and returns a function that waits for
 #: the result.
@@ -36,7 +35,7 @@ def second_process(threads: int | None = None) -> Iterator[Submit]:
     if thread_count(threads) == 1 or not alone or sys.platform != "linux":
         yield _here
         return
-    pool = ProcessPoolExecutor(1, mp_context=get_context("fork"), initializer=_begin, initargs=(os.getpid(),))
+    pool = ProcessPoolExecutor(1, mp_context=get_context("fork"), initializer=begin_worker, initargs=(os.getpid(),))
 
     def submit(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
         future = pool.submit(function, *arguments)
@@ -60,12 +59,5 @@ def _result(future: Future[Any]) -> Any:
         return future.result()
     except BrokenProcessPool:
         raise ProductError(
-            "the process that draws the report died, killed or short of memory; finished CCDs are kept, go on with"
-            " --resume"
+            "the second process died, killed or short of memory; what was computed is kept, go on with --resume"
         ) from None
-
-
-def _begin(parent: int) -> None:
-    """Let Ctrl-C end the first process alone, and end with it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=end_with, args=(parent,), daemon=True).start()

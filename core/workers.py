@@ -75,7 +75,7 @@ def process_workers(compute: Compute, count: int, threads: int | None = None) ->
         # A fresh interpreter, not a fork: Warp and OpenMP keep threads that a fork would lose. Variables that bound the
         # threads of libraries must be set before a worker imports them.
         with _environment({name: str(each) for name in _THREAD_VARIABLES}):
-            pool = ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_begin)
+            pool = ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=begin_worker)
             waiting: set[Future[Any]] = set()
             try:
                 for job in jobs:
@@ -101,10 +101,10 @@ def worker_name() -> str:
     return f"{os.uname().nodename if hasattr(os, 'uname') else 'machine'}:{os.getpid()}"
 
 
-def _begin() -> None:
-    """Let Ctrl-C end the process that hands out jobs, not those that do them; these end with it."""
+def begin_worker(parent: int | None = None) -> None:
+    """Let Ctrl-C end the process that hands out jobs, not this one, which ends with it; by default its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=end_with, args=(os.getppid(),), daemon=True).start()
+    threading.Thread(target=end_with, args=(parent or os.getppid(),), daemon=True).start()
 
 
 def end_with(parent: int) -> None:

@@ -33,6 +33,17 @@ def _require(condition: Any, problem: str) -> None:
         raise PrescriptionError(problem)
 
 
+def _require_sides(kind: str, first: float, second: float) -> None:
+    _require(
+        0 < first < np.inf and 0 < second < np.inf, f"{kind} = [{first!r}, {second!r}] m: expected two positive lengths"
+    )
+
+
+def _require_place(text: str, x: float, y: float, angle: float, expected: str = "centre") -> None:
+    problem = f"{text} ({x!r}, {y!r}) m, {angle!r} rad: expected finite {expected} and angle"
+    _require(np.all(np.isfinite((x, y, angle))), problem)
+
+
 def _shifted(x: Any, y: Any, centre_x: float, centre_y: float) -> tuple[np.ndarray, np.ndarray]:
     px, py = plane_points(x, y)
     return px - centre_x, py - centre_y
@@ -124,14 +135,8 @@ class Ellipse(Region):
     angle: float = 0.0
 
     def __post_init__(self) -> None:
-        _require(
-            0 < self.semi_x < np.inf and 0 < self.semi_y < np.inf,
-            f"ellipse = [{self.semi_x!r}, {self.semi_y!r}] m: expected two positive lengths",
-        )
-        _require(
-            np.all(np.isfinite((self.x, self.y, self.angle))),
-            f"ellipse at ({self.x!r}, {self.y!r}) m, {self.angle!r} rad: expected finite centre and angle",
-        )
+        _require_sides("ellipse", self.semi_x, self.semi_y)
+        _require_place("ellipse at", self.x, self.y, self.angle)
 
     def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:  # noqa: D102
         along, across = _rotated(*_shifted(x, y, self.x, self.y), self.angle)
@@ -160,14 +165,8 @@ class Rectangle(Region):
     angle: float = 0.0
 
     def __post_init__(self) -> None:
-        _require(
-            0 < self.width < np.inf and 0 < self.height < np.inf,
-            f"rectangle = [{self.width!r}, {self.height!r}] m: expected two positive lengths",
-        )
-        _require(
-            np.all(np.isfinite((self.x, self.y, self.angle))),
-            f"rectangle at ({self.x!r}, {self.y!r}) m, {self.angle!r} rad: expected finite centre and angle",
-        )
+        _require_sides("rectangle", self.width, self.height)
+        _require_place("rectangle at", self.x, self.y, self.angle)
 
     def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:  # noqa: D102
         along, across = _rotated(*_shifted(x, y, self.x, self.y), self.angle)
@@ -199,10 +198,7 @@ class Vane(Region):
 
     def __post_init__(self) -> None:
         _require(0 < self.width < np.inf, f"vane = {self.width!r} m: expected a positive width")
-        _require(
-            np.all(np.isfinite((self.x, self.y, self.angle))),
-            f"vane from ({self.x!r}, {self.y!r}) m, {self.angle!r} rad: expected finite point and angle",
-        )
+        _require_place("vane from", self.x, self.y, self.angle, "point")
 
     def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:  # noqa: D102
         along, across = _rotated(*_shifted(x, y, self.x, self.y), self.angle)

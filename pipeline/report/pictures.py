@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
@@ -34,6 +35,18 @@ _HEIGHTS = {
 }
 
 
+@dataclass(frozen=True)
+class _Planned:
+    """Picture of the report that is not drawn yet."""
+
+    title: str
+    draw: Plot
+    shows: str
+    of_paper: str = ""  #: what the paper shows
+    apart: bool = False  #: drawn by the second process
+    wanted: bool = True
+
+
 def draw_pictures(
     experiment: Experiment, products: Sequence[CcdProduct], correlated: dict[str, Correlation], submit: Submit
 ) -> list[Picture]:
@@ -47,24 +60,6 @@ def draw_pictures(
     fit, radius = config.reconstruction, experiment.field_radius_on_detector
     # Without images and models, stars are soon sent to another process.
     stars, close = [p.ccd_stars for p in products], closest_middle_farthest(products)
-    there: dict[str, Plot] = {
-        "Focal plane": partial(heights_plot, plane, [p.name for p in products], radius),
-        "Whiskers over the field": partial(whiskers_plot, stars, plane, radius),
-        "Whiskers close up": partial(close_up_plot, closest_middle_farthest(stars), plane),
-    }
-    here: dict[str, Plot] = {
-        "Eigen-PSFs of the noise-free PSFs": partial(eigen_psf_plot, close[0], noise_free=True),
-        "Number of components needed": partial(spectrum_plot, products),
-        "Ellipticity before and after": partial(scatter_plot, stars),
-        "Correlation of the ellipticity": partial(correlation_plot, {k: correlated[k] for k in CORRELATED}, paper),
-        "Stars": partial(stamps_plot, close),
-    }
-    # Single pixels and shapelets look the same whatever the stars are.
-    if fit.basis == "pca":
-        here["Eigen-PSFs of the observed stars"] = partial(eigen_psf_plot, close[0], noise_free=False)
-    if whole:
-        here["Residuals of both models"] = partial(models_plot, correlated)
-    drawn = _drawn(there, here, submit)
     components = noise_free_components(config)
     jackknife = all(c.n_patches for c in correlated.values())
     errors = "by jackknife over the CCDs" if jackknife else "from the scatter of the ellipticities of one CCD alone"
@@ -75,17 +70,20 @@ def draw_pictures(
         if unweighted and not whole
         else "Residuals at the stars hold the noise of each star, some of which the model has followed"
     )
-    captions = [
-        (
+    planned = [
+        _Planned(
             "Focal plane",
+            partial(heights_plot, plane, [p.name for p in products], radius),
             f"Height of every CCD surface over the nominal focal plane, positive towards the sky. {_HEIGHTS[heights]} "
             "The same surface as a mesh: focal_plane.glb.",
             "Fig. 7 shows one realisation of "
             + ("the same budget" if heights == "budget" else "a budget")
             + " (Table 1), ±10 µm in all.",
+            apart=True,
         ),
-        (
+        _Planned(
             "Whiskers over the field",
+            partial(whiskers_plot, stars, plane, radius),
             "Each whisker is one star: its length is |e| = (a-b)/(a+b), its direction that of the elongation. All "
             "panels share one scale, given by the key above their right corner, so lengths can be compared. "
             + (
@@ -99,42 +97,52 @@ def draw_pictures(
             if optics
             else "Fig. 11 (observed) and Fig. 12 (residual): the pattern of the optics alone (Fig. 8), made rounder by "
             "the atmosphere, and residuals without visible pattern. The paper compares with the observed stars only.",
+            apart=True,
         ),
-        (
+        _Planned(
             "Whiskers close up",
+            partial(close_up_plot, closest_middle_farthest(stars), plane),
             "The CCD closest to the axis, one half-way out and the farthest one. The last column is the error "
             "for galaxies: that of the model at places where there was no star to fit.",
             "The paper notes a small-scale variation even within a CCD, from tilt and potato chip, and so fits "
             "polynomials CCD by CCD.",
+            apart=True,
         ),
-        (
+        _Planned(
             "Eigen-PSFs of the noise-free PSFs",
+            partial(eigen_psf_plot, close[0], noise_free=True),
             f"Mean PSF of one CCD and its first {min(components, 20)} principal components, each with the part of the "
             "variance along it. Order and signs are fixed, so that runs can be compared.",
             "Fig. 9: components of 4000 PSFs of the atmosphere alone. The first resemble shapelets; structure gets "
             "finer with n.",
         ),
-        (
+        _Planned(
             "Eigen-PSFs of the observed stars",
+            partial(eigen_psf_plot, close[0], noise_free=False),
             "The same CCD, from the stars that were observed: components beyond the first few are noise.",
             "The paper keeps 20 components for observed stars too.",
+            # Single pixels and shapelets look the same whatever the stars are.
+            wanted=fit.basis == "pca",
         ),
-        (
+        _Planned(
             "Number of components needed",
+            partial(spectrum_plot, products),
             "Eigenvalues of every CCD, and the part of the variance that components beyond n hold. Where the "
             "eigenvalues of the observed stars bend away from those of the noise-free PSFs, noise takes over; the dot "
             "is the elbow, the point farthest below the straight line from the first eigenvalue to the last.",
             "The paper finds it by eye and that about 20 components suffice; they should hold over 99 % "
             "of the variance of the noise-free PSFs.",
         ),
-        (
+        _Planned(
             "Ellipticity before and after",
+            partial(scatter_plot, stars),
             "Left, as in Jee & Tyson (2011): ellipticity of the observed stars, and what is left when the model is "
             "subtracted. Right: the same for the noise-free PSFs at places where no star was fitted.",
             "Fig. 13: residuals (red) far more compact than observed stars (blue), centred on zero.",
         ),
-        (
+        _Planned(
             "Correlation of the ellipticity",
+            partial(correlation_plot, {k: correlated[k] for k in CORRELATED}, paper),
             "ξ+ and ξ- by TreeCorr; filled symbols are positive, open ones negative. Error bars are "
             f"{errors}, cut off where they would pass zero. {at_stars}; "
             "triangles, away from the stars, apply to galaxies. Where the CCDs lie in a row, long pairs all point "
@@ -142,16 +150,17 @@ def draw_pictures(
             "Fig. 14: ξ+ of about 3e-5 before, about 1e-8 after the correction (189 CCDs, at the stars only), below "
             "1e-7 from 10 arcmin to 3 degrees; ξ- similar.",
         ),
-        (
+        _Planned(
             "Stars",
+            partial(stamps_plot, close),
             "Observed stamps from the brightest to the faintest star of three CCDs, the model at their places, and "
             "the difference in units of each pixel's noise: where the model is right to within the star's own noise, "
             "only that noise is left. A bright star can show more: the noise of fainter stars is in the model."
             + (" The model here is the CCD's own: that of the focal plane has shapes only." if whole else ""),
-            "",
         ),
-        (
+        _Planned(
             "Residuals of both models",
+            partial(models_plot, correlated),
             "ξ+ of the residuals of the two models, fitted to the same stars: of the whole focal plane, which all "
             "other plots show, and CCD by CCD. Filled symbols are positive, open ones negative."
             + (
@@ -160,21 +169,18 @@ def draw_pictures(
                 if unweighted
                 else ""
             ),
-            "",
+            wanted=whole,
         ),
     ]
-    return [Picture(t, drawn[t], shows, of_paper if paper else "") for t, shows, of_paper in captions if t in drawn]
+    planned = [plot for plot in planned if plot.wanted]
+    elsewhere = submit(_draw_all, [p.draw for p in planned if p.apart])
+    here = iter(_draw_all([p.draw for p in planned if not p.apart]))
+    there = iter(elsewhere())
+    return [Picture(p.title, next(there if p.apart else here), p.shows, p.of_paper if paper else "") for p in planned]
 
 
-def _drawn(there: dict[str, Plot], here: dict[str, Plot], submit: Submit) -> dict[str, bytes]:
-    """Draw plots by title, some by a second process and some by this one."""
-    waiting = submit(_draw_all, there)
-    drawn = _draw_all(here)
-    return drawn | waiting()
-
-
-def _draw_all(plots: dict[str, Plot]) -> dict[str, bytes]:
-    return {title: plot() for title, plot in plots.items()}
+def _draw_all(plots: Sequence[Plot]) -> list[bytes]:
+    return [plot() for plot in plots]
 
 
 def closest_middle_farthest(products: Sequence[_Stars]) -> list[_Stars]:

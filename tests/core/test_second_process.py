@@ -74,7 +74,7 @@ def test_an_error_of_the_other_process_is_raised_where_its_result_is_waited_for(
 def test_a_killed_process_is_one_clear_line():
     with second_process(2) as submit:
         result = submit(dies)
-        with pytest.raises(ProductError, match=r"^the process that draws the report died, killed or short of memory"):
+        with pytest.raises(ProductError, match=r"^the second process died, killed or short of memory"):
             result()
 
 

@@ -9,9 +9,10 @@ from pachon.core.errors import ConfigError, DomainError
 from pachon.pipeline.config import ReconstructionConfig, with_options
 from pachon.pipeline.defaults import with_paper_model
 from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.measure.shapes import measure_shapes
 from pachon.pipeline.measure.star_selection import StarFlag
 from pachon.pipeline.psf_model.checks import snr_weights
-from pachon.pipeline.simulate.ccd_exposure import expose_ccd
+from pachon.pipeline.simulate.ccd_exposure import expose_ccd, expose_centered
 from pachon.pipeline.simulate.ccd_model import model_ccd
 from pachon.pipeline.simulate.ccd_observation import observe_ccd
 
@@ -186,3 +187,15 @@ def test_defaults_follow_basis_and_interpolation(tiny):
     # Twelve PSFs have eleven components about their mean.
     few = with_paper_model(type(config)(**{"stars": {"truth": 16, "observed": 12}}))
     assert Experiment.from_config(few).config.reconstruction.components == 11
+
+
+def test_stars_drawn_again_on_the_centre_of_a_pixel(experiment, exposure):
+    both = expose_ccd(experiment, NAME, centered=True, threads=1)
+    assert np.array_equal(both.observed.image, exposure.observed.image)
+    assert np.array_equal(both.observed.offset, exposure.observed.offset)
+    assert np.array_equal(both.holdout.image, exposure.holdout.image)
+    alone = expose_centered(experiment, exposure.positions.observed, threads=1)
+    shapes = [measure_shapes(s.image, s.pixel_scale, experiment.weight_fwhm) for s in (both.centered, alone)]
+    for name, tolerance in (("e1", 1e-6), ("e2", 1e-6), ("x", 1e-3), ("y", 1e-3)):
+        np.testing.assert_allclose(*(getattr(s, name) for s in shapes), rtol=0, atol=tolerance)
+    np.testing.assert_allclose(both.centered.image, alone.image, rtol=0, atol=5e-4 * alone.image.max())
