@@ -41,6 +41,7 @@ def fit_galaxies(
     psf_images: ArrayLike,
     *,
     half_light_radius: ArrayLike,
+    psf_index: ArrayLike | None = None,
     mask: ArrayLike | NDArray[np.bool_] | None = None,
     segmentation: ArrayLike | None = None,
     max_evaluations: int = 30,
@@ -69,6 +70,8 @@ def fit_galaxies(
     half_light_radius : float or array
         Of the galaxies on the image [pixel], which determines their stamps: :data:`STAMP_RADII` of them to either side.
         NaN, as of an object without flux, for the smallest stamp.
+    psf_index : array of int, optional
+        Index into `psf_images` of each galaxy's PSF, [n]: quicker than an image for each where galaxies share one.
     mask : array, optional
         [ny, nx], not zero for pixels to ignore.
     segmentation : array of int, optional
@@ -103,7 +106,7 @@ def fit_galaxies(
     radius = np.where(np.isnan(radius), 0.5 * STAMP_SIDES[0] / STAMP_RADII, radius)
     if not (np.isfinite(radius).all() and (radius > 0.0).all()):
         raise DomainError("half_light_radius: expected positive, finite numbers of pixels")
-    psfs, templates = _psfs(psf_images, count)
+    psfs, templates = _psfs(psf_images, psf_index, count)
     labels = None if segmentation is None else np.asarray(segmentation)
     if labels is not None and (labels.shape != pixels.shape or labels.dtype.kind not in "iub"):
         raise DomainError(
@@ -139,7 +142,9 @@ def fit_galaxy_stamps(
     variance: ArrayLike,
     psf_images: ArrayLike,
     *,
+    psf_index: ArrayLike | None = None,
     mask: ArrayLike | NDArray[np.bool_] | None = None,
+    start: GalaxyFits | None = None,
     max_evaluations: int = 30,
     tolerance: float = 1e-5,
     threads: int | None = None,
@@ -152,8 +157,13 @@ def fit_galaxy_stamps(
         [n, ny, nx] pixels, background subtracted, and their variance; one variance may stand for all.
     psf_images : array
         [n, m, m], or one for all, [m, m].
+    psf_index : array of int, optional
+        Index into `psf_images` of each galaxy's PSF, [n].
     mask : array, optional
         [n, ny, nx], not zero for pixels to ignore.
+    start : GalaxyFits, optional
+        Earlier fits of the same galaxies, such as with other PSFs, near which to begin; by default moments of the
+        stamps.
 
     Returns
     -------
@@ -168,7 +178,9 @@ def fit_galaxy_stamps(
     options = _options(max_evaluations, tolerance, threads)
     pixels, variances, ignored = check_pixels(stamps, variance, mask, axes="[n, ny, nx]", name="stamps")
     count, ny, nx = pixels.shape
-    psfs, templates = _psfs(psf_images, count)
+    psfs, templates = _psfs(psf_images, psf_index, count)
+    if start is not None and len(start) != count:
+        raise DomainError(f"start: {len(start)} fits of {count} galaxies")
     side = -(-max(ny, nx) // SIDE_STEP) * SIDE_STEP
     below, left = (side - ny) // 2, (side - nx) // 2
     parts, members = [_no_fits()], [np.empty(0, dtype=np.int64)]
@@ -180,11 +192,16 @@ def fit_galaxy_stamps(
         weights[inside][good] = 1.0 / variances[group][good]
         # The centre of a stamp of an odd side is half a pixel from that of an even one.
         offset = np.array([left + 0.5 * (nx - 1), below + 0.5 * (ny - 1)]) - 0.5 * (side - 1)
-        middle, start = np.broadcast_to(-offset, (len(group), 2)), np.zeros((len(group), 2))
+        middle, place = np.broadcast_to(-offset, (len(group), 2)), np.zeros((len(group), 2))
         flags = np.zeros(len(group), dtype=np.int32)
-        parts.append(_fit(data, weights, middle, start, psfs, templates[group], flags, **options))
+        known = None if start is None else _parameters(start)[group]
+        parts.append(_fit(data, weights, middle, place, psfs, templates[group], flags, known, **options))
         members.append(group)
     return joined(parts, members)
+
+
+def _parameters(fits: GalaxyFits) -> np.ndarray:
+    return np.column_stack([fits.flux, fits.x, fits.y, fits.moments])
 
 
 def _fit(
@@ -195,12 +212,16 @@ def _fit(
     psfs: np.ndarray,
     templates: np.ndarray,
     flags: np.ndarray,
+    known: np.ndarray | None = None,
     *,
     max_evaluations: int,
     tolerance: float,
     threads: int | None,
 ) -> GalaxyFits:
-    """Fit stamps [n, side, side] with middles at `middle` and galaxies near `place`, both [n, 2], and add to flags."""
+    """Fit stamps [n, side, side] with middles at `middle` and galaxies near `place`, both [n, 2], and add to flags.
+
+    `known` [n, 6] are parameters of earlier fits.
+    """
     center = place - middle
     side = data.shape[-1]
     used, own = np.unique(templates, return_inverse=True)
@@ -208,11 +229,16 @@ def _fit(
     psf_variance = (0.5 / (np.pi * psfs[used].max(axis=(1, 2))))[own]
     fitter = GaussianStamps(psfs[used], own, data, weight, threads)
     bounds = Bounds(center, _REACH * side, _LEAST_MOMENT * psf_variance, (_MOST_WIDTH * side) ** 2)
+    start = _start(data, weight, center, psf_variance)
+    if known is not None:
+        shifted = np.concatenate([known[:, :1], known[:, 1:3] - middle, known[:, 3:]], axis=1)
+        usable = np.isfinite(shifted).all(axis=1)
+        start[usable] = shifted[usable]
     # Steps are solved by LAPACK, whose result must not depend on its threads.
     with one_blas_thread():
         found = minimize(
             fitter,
-            _start(data, weight, center, psf_variance),
+            start,
             bounds,
             max_evaluations=max_evaluations,
             tolerance=tolerance,
@@ -275,20 +301,29 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
     return result
 
 
-def _psfs(psf_images: ArrayLike, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _psfs(psf_images: ArrayLike, psf_index: ArrayLike | None, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the PSFs [m, side, side] and the index [n] of each galaxy's."""
     psfs = real_array(psf_images, "psf_images: expected real numbers [n, m, m] or [m, m]")
     shared = psfs.ndim == 2
     psfs = psfs[None] if shared else psfs
     if psfs.ndim != 3 or psfs.shape[1] != psfs.shape[2] or psfs.shape[1] % 2 == 0:
         raise DomainError(f"psf_images have shape {psfs.shape}: expected [n, m, m] or [m, m] with an odd m")
-    if not shared and len(psfs) != count:
+    if psf_index is not None:
+        index = np.asarray(psf_index)
+        if index.dtype.kind not in "iu" or index.shape != (count,):
+            text = f"psf_index has shape {index.shape} and type {index.dtype}: expected {count} integers"
+            raise DomainError(text)
+        if count and not (index.min() >= 0 and index.max() < len(psfs)):
+            raise DomainError(f"psf_index: {index.min()} to {index.max()}, expected 0 to {len(psfs) - 1}")
+    elif not shared and len(psfs) != count:
         raise DomainError(f"psf_images: {len(psfs)} for {count} galaxies")
     sums = psfs.sum(axis=(1, 2))
     wrong = ~(np.abs(sums - 1.0) < _PSF_SUM_TOLERANCE)
     if wrong.any():
         i = int(wrong.argmax())
         raise DomainError(f"psf_images[{i}] has a sum of {sums[i]:.6g}: expected 1 within {_PSF_SUM_TOLERANCE:g}")
+    if psf_index is not None:
+        return psfs, index.astype(np.int64)
     return psfs, np.zeros(count, dtype=np.int64) if shared else np.arange(count)
 
 

@@ -114,18 +114,21 @@ def measure_galaxies(
     for side, rows in zip(_SIDES, (on_image <= _LARGE, on_image > _LARGE), strict=True):
         for own in _blocks(np.flatnonzero(rows)):
             size = 2 * side
+            used, index = np.unique(psf[own], return_inverse=True)
             spectra = galaxies.transform(
                 near[own], np.broadcast_to(axes, (len(own), 2, 2)), offset[own], size, threads=threads
             )
-            spectra *= _transforms(stack.true[psf[own]], size)
+            spectra *= _transforms(stack.true[used], size)[index]
             images = fft.irfft2(spectra, s=(size, size), workers=1)[:, side // 2 : -side // 2, side // 2 : -side // 2]
             images *= electrons[own, None, None].astype(np.float32)
             variance = exposure.noise_rms**2
             if exposure.noise:
                 images += np.sqrt(variance + np.maximum(images, 0.0)) * rng.standard_normal(images.shape, np.float32)
             every = np.full(images.shape, variance)
-            by_model = fit_galaxy_stamps(images, every, stack.model[psf[own]], threads=threads)
-            by_true = fit_galaxy_stamps(images, every, stack.true[psf[own]], threads=threads)
+            by_model = fit_galaxy_stamps(images, every, stack.model[used], psf_index=index, threads=threads)
+            by_true = fit_galaxy_stamps(
+                images, every, stack.true[used], psf_index=index, start=by_model, threads=threads
+            )
             found.append((own, by_model, by_true))
     return _shapes(galaxies, near, pixels * exposure.pixel_scale, width, found)
 

@@ -207,6 +207,39 @@ def test_a_psf_for_each_galaxy(render, psf):
     fits = pachon.fit_galaxy_stamps([stamp, np.rot90(stamp)], 1.0, [psf, turned])
     np.testing.assert_allclose(fits.e1, [0.2, -0.2], rtol=0, atol=1e-5)
     np.testing.assert_allclose(fits.e2, [0.1, -0.1], rtol=0, atol=1e-5)
+    both = pachon.fit_galaxy_stamps([stamp, np.rot90(stamp)], 1.0, [turned, psf], psf_index=[1, 0])
+    assert same(both, fits)
+
+
+def test_faint_galaxies_converge(galaxy, psf):
+    # S/N of 8: steps with the Fisher matrix alone took 13.9 models, and left half of the galaxies unfinished after 12.
+    noise = 9.0
+    stamps = with_noise(galaxy, 400, noise, 12)
+    fits = pachon.fit_galaxy_stamps(stamps, noise**2, psf)
+    assert 6.0 < np.median(fits.snr) < 10.0
+    assert (fits.flags & GalaxyFlag.NOT_CONVERGED == 0).all()
+    assert fits.evaluations.mean() < 11.0
+    short = pachon.fit_galaxy_stamps(stamps, noise**2, psf, max_evaluations=12)
+    assert (short.flags & GalaxyFlag.NOT_CONVERGED > 0).mean() < 0.1
+    # The same minima as from many steps more.
+    long = pachon.fit_galaxy_stamps(stamps, noise**2, psf, max_evaluations=300, tolerance=1e-8)
+    both = fits.good & long.good
+    lower = fits.chi2[both] - long.chi2[both]
+    assert np.median(np.abs(lower)) < 1e-6
+    assert np.percentile(np.abs(lower), 98) < 1e-4
+
+
+def test_fits_begin_near_earlier_ones(galaxy, psf):
+    stamps = with_noise(galaxy, 50, 4.0, 13)
+    other = np.rot90(psf).copy()
+    first = pachon.fit_galaxy_stamps(stamps, 16.0, other)
+    cold, warm = (pachon.fit_galaxy_stamps(stamps, 16.0, psf, start=start) for start in (None, first))
+    assert warm.evaluations.sum() < 0.9 * cold.evaluations.sum()
+    both = cold.good & warm.good
+    assert both.mean() > 0.9
+    np.testing.assert_allclose(warm.e1[both], cold.e1[both], rtol=0, atol=1e-4)
+    with pytest.raises(pachon.DomainError, match="start: 50 fits of 3 galaxies"):
+        pachon.fit_galaxy_stamps(stamps[:3], 16.0, psf, start=first)
 
 
 def test_flags(galaxy, psf):
@@ -300,6 +333,8 @@ DOT = np.ones((1, 1))
         ({"psf_images": np.full((3, 3), 0.1)}, r"psf_images\[0\] has a sum of 0.9: expected 1"),
         ({"psf_images": np.full((3, 3), np.nan)}, "has a sum of nan"),
         ({"psf_images": np.ones((2, 1, 1))}, "psf_images: 2 for 1 galaxies"),
+        ({"psf_index": [1]}, "psf_index: 1 to 1, expected 0 to 0"),
+        ({"psf_index": [0.0]}, r"psf_index has shape \(1,\) and type float64: expected 1 integers"),
         ({"max_evaluations": 0}, "max_evaluations = 0"),
         ({"tolerance": -1.0}, "tolerance = -1"),
     ],
