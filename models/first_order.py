@@ -55,7 +55,13 @@ class FirstOrder(Values):
         Area of the entrance pupil less its obscuration [m^2].
     angular_magnification : float
         Slope of the chief ray behind the telescope over that in front of it, both along the light; of an afocal
-        telescope its magnifying power, negative where the image is upside down.
+        telescope its magnifying power, negative where the image is upside down. Infinite in a telecentric object space.
+    image_z : float
+        Height of the paraxial image of the object [m], telescope frame: the focus of an object at infinity.
+    magnification : float
+        Height of that image over that of the object, 0 of one at infinity.
+    working_f_number : float
+        Of the light that makes it, 1/(2 n u): the focal ratio of an object at infinity.
     """
 
     wavelength: float
@@ -70,6 +76,9 @@ class FirstOrder(Values):
     exit_pupil_diameter: float
     effective_area: float
     angular_magnification: float
+    image_z: float
+    magnification: float
+    working_f_number: float
 
     @property
     def arcsec_per_um(self) -> float:
@@ -167,6 +176,9 @@ def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> Fi
         raise DomainError(f"telescope {telescope.name}: expected one with a focus; its power is {power:.3g} 1/m")
     focal_length, to_focus = (math.inf, math.inf) if parallel else (1.0 / power, -h / u)
     to_pupil = -hb / ub if ub != 0 else math.inf
+    slope = _marginal(telescope)
+    seen = _trace(telescope, wavelength, 1.0, section=True, marginal=slope)
+    behind, height = float(seen.u_after[-1, 0]), float(seen.h[-1, 0])
     return FirstOrder(
         wavelength=trace.wavelength,
         focal_length=focal_length,
@@ -177,16 +189,19 @@ def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> Fi
         entrance_pupil_z=telescope.stop_z,
         entrance_pupil_diameter=telescope.pupil_diameter,
         exit_pupil_z=last_z - to_pupil,
-        exit_pupil_diameter=2 * abs(h + u * to_pupil),
+        exit_pupil_diameter=2 * abs(height + behind * to_pupil),
         effective_area=math.pi * radius**2 * (1 - telescope.pupil_obscuration**2),
         # The chief ray has unit slope in front; along an axis that mirrors turn, slopes change their sign with it.
-        angular_magnification=math.copysign(1.0, n) * ub,
+        angular_magnification=math.inf if telescope.design_data.telecentric else math.copysign(1.0, n) * ub,
+        image_z=last_z + height / behind if behind else math.inf,
+        magnification=float(seen.n[0]) * slope / (n * behind) if behind else math.inf,
+        working_f_number=0.5 / abs(n * behind) if behind else math.inf,
     )
 
 
 def footprints(telescope: Telescope, field: float, wavelength: Any = None) -> np.ndarray:
     """Return the paraxial radius [m] of the light of a field angle [rad] on each mirror and lens surface."""
-    return np.abs(_trace(telescope, wavelength, np.tan(field)).h).sum(axis=1)
+    return np.abs(_trace(telescope, wavelength, np.tan(field), marginal=_marginal(telescope)).h).sum(axis=1)
 
 
 @check_arguments
@@ -206,7 +221,7 @@ def seidel_sums(telescope: Telescope, wavelength: ArrayLike | None = None, field
         If no surface acts, one is decentred or tilted, or the wavelength is not covered.
     """
     angle = telescope.field_radius if field is None else field
-    trace = _trace(telescope, wavelength, np.tan(angle))
+    trace = _trace(telescope, wavelength, np.tan(angle), marginal=_marginal(telescope))
     c, n, n2 = trace.curvature, trace.n, trace.n_after
     h, hb = trace.h.T
     u, ub = trace.u.T
@@ -251,7 +266,7 @@ def chromatic_sums(
         raise DomainError(f"wavelengths of shape {ends.shape}: expected the shortest and the longest")
     telescope.check_wavelength(ends)
     angle = telescope.field_radius if field is None else field
-    trace = _trace(telescope, None, np.tan(angle))
+    trace = _trace(telescope, None, np.tan(angle), marginal=_marginal(telescope))
     media = (telescope.medium_before, *(s.medium_after for s in trace.surfaces))
     # Dispersion over index is the same for light that goes back.
     relative = np.array([float(m.index(ends[0]) - m.index(ends[1])) for m in media]) / np.abs(
@@ -268,9 +283,8 @@ def paraxial_rays(telescope: Telescope, surface: str) -> tuple[tuple[float, floa
     Slopes are along the light that enters. The marginal ray comes from the axis of the object through the rim of the
     entrance pupil, the chief ray has the slope of the edge of the field. DomainError as for :func:`first_order`.
     """
-    rim = 0.5 * telescope.pupil_diameter
+    rim, marginal = 0.5 * telescope.pupil_diameter, _marginal(telescope)
     chief = math.tan(telescope.field_radius)
-    marginal = rim / (telescope.object_distance - telescope.stop_z)
     trace = _trace(telescope, None, chief, section=True, marginal=marginal)
     names = telescope.surface_names
     acting = [i for i, s in enumerate(trace.surfaces) if names.index(s.name) <= names.index(surface)]
@@ -282,12 +296,18 @@ def paraxial_rays(telescope: Telescope, surface: str) -> tuple[tuple[float, floa
     return (z, h, u), (z, hb, ub)
 
 
+def _marginal(telescope: Telescope) -> float:
+    """Return the slope of the ray from the axis of the object to the rim of the entrance pupil; 0 from infinity."""
+    return 0.5 * telescope.pupil_diameter / (telescope.object_distance - telescope.stop_z)
+
+
 def _trace(
     telescope: Telescope, wavelength: Any, slope: float, *, section: bool = False, marginal: float = 0.0
 ) -> _Trace:
     """Trace the ray at the rim of the pupil, of slope `marginal`, and one through its centre with a slope.
 
-    Curvatures are means over azimuth, or with ``section`` those in the plane x = 0 (y = 0 where all are flat there).
+    A telecentric chief ray comes from where the slope to the middle of the pupil leads. Curvatures are means over
+    azimuth, or with ``section`` those in the plane x = 0 (y = 0 where all are flat there).
     """
     w = length(telescope.default_wavelength if wavelength is None else wavelength, "wavelength")
     telescope.check_wavelength(w)
@@ -300,7 +320,9 @@ def _trace(
     if section:
         along_x, along_y = -np.array([curvatures_across(s) for s in surfaces]).T
         curvature = along_y if along_y.any() else along_x
-    h, u = np.array([0.5 * telescope.pupil_diameter, 0.0]), np.array([marginal, slope])
+    # In a telecentric object space the chief ray is parallel to the axis, at the height of the object.
+    height = -slope * (telescope.object_distance - telescope.stop_z) if telescope.design_data.telecentric else 0.0
+    h, u = np.array([0.5 * telescope.pupil_diameter, height]), np.array([marginal, 0.0 if height else slope])
     z, index = telescope.stop_z, float(telescope.medium_before.index(w))
     rows = []
     for surface, c in zip(surfaces, curvature, strict=True):

@@ -45,13 +45,21 @@ def spots(
     return compute(*given.where, sampling=sampling, n_pupil=rays, **given.how)
 
 
+def _largest(strehl: Any) -> Any:
+    """Return the largest ratio of each field; NaN where all are too far from focus to be known."""
+    import numpy as np
+
+    known = np.isfinite(strehl)
+    return np.where(known.any(axis=1), np.where(known, strehl, 0.0).max(axis=1), np.nan)
+
+
 @design_command(
     FIELD,
     Column("best for the spot [µm]", "best_focus_spot_um", "+.3f"),
     Column("smallest rms [µm]", "smallest_rms_radius_um", ".3f"),
     Column("best for the wavefront [µm]", "best_focus_wavefront_um", "+.3f"),
     Column("smallest rms [nm]", lambda result: result.rms_wavefront.min(axis=1), ".2f", 1e9),
-    Column("largest Strehl", lambda result: result.strehl.max(axis=1), ".4f"),
+    Column("largest Strehl", lambda result: _largest(result.strehl), ".4f"),
     caption="The spots of all fields together are smallest at {best_focus_common_um:+.3f} µm.",
     band=True,
 )

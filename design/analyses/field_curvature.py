@@ -107,6 +107,7 @@ class FieldCurvature(Analysis):
         for axes, label in zip(panels, (f"focus behind the detector [{unit}]", "distortion [%]"), strict=True):
             axes.axvline(0.0, color="0.5", linewidth=0.7)
             finish_axes(axes, ylim=(0.0, max(float(distance.max()), 1e-9)), xlabel=label)
+        panels[1].locator_params(axis="x", nbins=5)
         panels[0].set_ylabel(field_label)
         panels[0].legend(fontsize=7)
 

@@ -24,6 +24,7 @@ from ...core.plotting import BLUE, GREY, ORANGE
 from ...core.units import require_count
 from ...models.telescope import Telescope
 from ...raytrace.ideal_lens import require_image
+from ...raytrace.rays import object_points
 from ...wavefront.request import Request
 from ..drawing import finish_axes
 from .analysis import Analysis, Columns, field_line
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 
 #: Change of the slopes of the light on either side for the Jacobian.
 _STEP = 1e-4
+#: Neighbours, in these steps.
+_STEPS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 
 @dataclass(frozen=True)
@@ -173,21 +176,9 @@ def _projected(request: Request, coatings: Coatings | None) -> tuple[float, floa
     lit = request.bundles(wavelength).lit[0]
     if not lit.any():
         return 0.0, 0.0
-    steps = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    points, element = sample.points[lit], np.ones(int(lit.sum()))
-    if request.vignetting is not None or telescope.design_data.aiming != "off":
-        # The area that an element of the pupil of the request fills in the plane of the entrance pupil.
-        step = 0.5 * _STEP * telescope.pupil_diameter
-        around = np.concatenate([points, *(points + step * s for s in steps)])
-        points, *moved = request.entrance_points(wavelength, around).reshape(5, -1, 2)
-        element = _determinant(np.array(moved)) / (2.0 * step) ** 2
-    # The étendue is that of neighbouring fields through one point of that plane, so rays are not aimed again.
-    straight = request.at_fields(request.slopes + _STEP * steps)
-    beside = replace(straight, telescope=telescope.with_design(aiming="off"), projection="gnomonic")
-    landing = beside.bundles(wavelength, points).landing()
-    cosines = beside.launch(wavelength, points).direction.reshape(4, -1, 3)[..., :2]
-    # Both over the same change of the field: their ratio is per metre of the detector.
-    ratio = element * _determinant(cosines) / _determinant(landing)
+    points = sample.points[lit]
+    cones = _cones_of_the_object if telescope.design_data.telecentric else _cones_through_the_pupil
+    ratio = cones(request, points)
     if coatings is not None:
         for efficiency in efficiencies(request, coatings, wavelength)[1].values():
             ratio = ratio * efficiency[0, lit]
@@ -197,6 +188,42 @@ def _projected(request: Request, coatings: Coatings | None) -> tuple[float, floa
     fraction = float(sample.weights[lit].sum())
     mean = float(np.average(ratio[known], weights=sample.weights[lit][known])) if known.any() else 0.0
     return area * fraction * mean, fraction
+
+
+def _cones_through_the_pupil(request: Request, points: np.ndarray) -> np.ndarray:
+    """Return the projected solid angle at the detector over the area of the pupil [sr/m^2] at pupil points [n, 2].
+
+    The étendue is that of neighbouring fields through one point of the entrance pupil.
+    """
+    telescope, wavelength, element = request.telescope, request.wavelength, np.ones(len(points))
+    if request.vignetting is not None or telescope.design_data.aiming != "off":
+        # The area that an element of the pupil of the request fills in the plane of the entrance pupil.
+        step = 0.5 * _STEP * telescope.pupil_diameter
+        around = np.concatenate([points, *(points + step * s for s in _STEPS)])
+        points, *moved = request.entrance_points(wavelength, around).reshape(5, -1, 2)
+        element = _determinant(np.array(moved)) / (2.0 * step) ** 2
+    # Rays are not aimed again.
+    straight = request.at_fields(request.slopes + _STEP * _STEPS)
+    beside = replace(straight, telescope=telescope.with_design(aiming="off"), projection="gnomonic")
+    landing = beside.bundles(wavelength, points).landing()
+    cosines = beside.launch(wavelength, points).direction.reshape(4, -1, 3)[..., :2]
+    # Both over the same change of the field: their ratio is per metre of the detector.
+    return np.asarray(element * _determinant(cosines) / _determinant(landing))
+
+
+def _cones_of_the_object(request: Request, points: np.ndarray) -> np.ndarray:
+    """Return the same in a telecentric object space, whose aperture is the same cone at all points of the object.
+
+    The étendue is that of neighbouring points of the object, in one direction.
+    """
+    telescope, wavelength = request.telescope, request.wavelength
+    step = 0.5 * _STEP * telescope.pupil_diameter
+    around = np.concatenate([points + step * s for s in _STEPS])
+    cosines = request.launch(wavelength, around).direction.reshape(4, -1, 3)[..., :2]
+    beside = replace(request.at_fields(request.slopes + _STEP * _STEPS), projection="gnomonic")
+    places = object_points(telescope, beside.directions)[:, None, :2]
+    landing = beside.bundles(wavelength, request.vignetted(points).reshape(-1, 2)).landing()
+    return np.asarray(_determinant(cosines) / (2.0 * step) ** 2 * _determinant(places) / _determinant(landing))
 
 
 def _determinant(values: np.ndarray) -> np.ndarray:

@@ -26,6 +26,8 @@ ABERRATIONS = ("spherical", "coma", "astigmatism", "Petzval", "distortion", "axi
 SYMBOLS = ("W040", "W131", "W222", "W220P", "W311", "W020λ", "W111λ")
 _FACTORS = np.array([1 / 8, 1 / 2, 1 / 2, 1 / 4, 1 / 2, 1 / 2, 1.0])
 _COLORS = ("#1f6fbf", "#c8322b", "#e08a00", "#2a9d6f", "#7a4fb5", "#8c8c8c", "#d7b400")
+#: Surfaces beyond which their names stand upright.
+_CROWDED = 18
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ class SeidelDiagram(Analysis):
 
     @property
     def _size(self) -> tuple[float, float]:
-        return min(max(6.5, 1.2 + 0.75 * (len(self.names) + 1)), 24.0), 4.4
+        return min(max(6.5, 1.2 + 0.75 * (len(self.names) + 1)), 14.0), 4.4
 
     def _table_columns(self) -> Columns:
         columns: Columns = {"surface": (np.array(self.names), "", "mirror or lens surface")}
@@ -92,7 +94,16 @@ class SeidelDiagram(Analysis):
             # The sums would be too small to be visible.
             axes.set_yscale("symlog", linthresh=max(largest / 1000.0, 1e-9))
         names = [*map(plain_text, self.names), "sum"]
-        axes.set_xticks(place, names, rotation=40, ha="right", rotation_mode="anchor", fontsize=7.5)
+        crowded = len(names) > _CROWDED
+        axes.set_xticks(
+            place,
+            names,
+            rotation=90 if crowded else 40,
+            ha="right",
+            va="center" if crowded else "top",
+            rotation_mode="anchor",
+            fontsize=7.5,
+        )
         axes.set(ylabel="wavefront [waves]", xlim=(-0.5, len(everything) - 0.5))
         axes.grid(True, axis="y", color="0.92", linewidth=0.6)
         axes.set_axisbelow(True)

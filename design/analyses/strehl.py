@@ -34,7 +34,8 @@ class StrehlRatios(Analysis):
         Root mean square of the wavefront over the lit pupil without piston and tilt [m].
     wavefront : ndarray, shape [n_field, n_wave]
         Squared modulus of the mean of exp(2 pi i W / wavelength) over the lit pupil, with the tilt that makes it
-        largest: the brightest point of the image. Light is even over the entrance pupil.
+        largest: the brightest point of the image. Light is even over the entrance pupil. NaN where the wavefront is too
+        steep for so many points.
     psf : ndarray, shape [n_field, n_wave]
         Peak of the diffraction image over that of the same lit pupil with a perfect wavefront; NaN where not asked for.
     """

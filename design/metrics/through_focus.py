@@ -50,7 +50,8 @@ class ThroughFocus(FieldResult):
         Root mean square of the wavefront without piston and tilt, in quadrature over the wavelengths [m].
     strehl : ndarray, shape [n_field, n_height]
         Squared modulus of the mean of exp(2 pi i W / wavelength) over the lit pupil, with the tilt that makes it
-        largest: the brightest point of the image. Mean over the wavelengths, each at its own point.
+        largest: the brightest point of the image. Mean over the wavelengths, each at its own point. NaN where the
+        wavefront, far from focus, is too steep for so many points of the pupil.
     best_spot : ndarray, shape [n_field]
         Height of the smallest rms radius of each field [m].
     best_wavefront : ndarray, shape [n_field]

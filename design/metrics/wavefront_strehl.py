@@ -8,6 +8,9 @@ import numpy as np
 _STEP = 0.2
 #: Largest tilt [waves] of the search: an image whose brightest point is farther off has a ratio of a few per cent.
 _FARTHEST = 4.0
+#: Largest range of a wavefront [waves] over the root of the number of points. Beyond it, phases between neighbours
+#: differ by more than half a wave at the rim, and points in a regular pattern add up to ratios that mean nothing.
+_LARGEST = 0.2
 #: Steps of Newton's method from the highest place.
 _NEWTON = 5
 #: Step [waves] that ends Newton's method; the ratio goes with its square.
@@ -32,8 +35,10 @@ def brightest_strehl(weight: np.ndarray, pupil: np.ndarray, waves: np.ndarray) -
     Returns
     -------
     float
-        The ratio; values below about log(n) / n are the noise of n points.
+        The ratio; NaN where the wavefront is too steep for so many points.
     """
+    if np.ptp(waves) > _LARGEST * np.sqrt(len(waves)):
+        return float("nan")
     field = weight * np.exp(2j * np.pi * waves)
     # Points at a mean distance of sqrt(pi / n) do not represent steeper tilts than half a wave over that distance.
     steepest = 0.5 * np.sqrt(len(waves) / np.pi)

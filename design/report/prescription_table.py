@@ -109,6 +109,14 @@ def first_order_rows(telescope: Telescope, wavelength: float) -> list[tuple[str,
             ("back focus", text(optics.back_focus)),
             ("plate scale", f"{abs(optics.plate_scale) / ARCSEC * unit:.6g} arcsec/{name}"),
         ]
+        if math.isfinite(telescope.object_distance):
+            last = [s for s in telescope.surfaces if s.interaction in (Interaction.MIRROR, Interaction.REFRACT)][-1]
+            lens = [
+                ("effective focal length", text(optics.focal_length)),
+                ("magnification", f"{optics.magnification:.8g}"),
+                ("working focal ratio", f"f/{optics.working_f_number:.6g}"),
+                ("paraxial image", f"{text(abs(optics.image_z - last.vertex[2]))} from the last surface"),
+            ]
         if telescope.design_data.afocal:
             lens = [("angular magnification", f"{optics.angular_magnification:.8g}")]
         rows += [

@@ -15,6 +15,7 @@ from ...core.page import Picture, render
 from ...core.plotting import picture_bytes
 from ...core.version import VERSION
 from ...models.telescope import Telescope
+from ...raytrace.rays import object_points
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
 from ..layout.layout import layout
@@ -88,12 +89,23 @@ def design_report(
         rows=rows,
         first_order=first,
         middle=request.middle * 1e9,
-        fields=[tuple(f) for f in np.rad2deg(request.fields)],
+        fields=_field_texts(request),
+        finite=bool(np.isfinite(telescope.object_distance)),
         wavelengths=[float(w) * 1e9 for w in request.wavelengths],
         pictures=pictures,
         problems=problems,
         version=VERSION,
     )
+
+
+def _field_texts(request: Request) -> list[str]:
+    """Return the fields as text: angles, or places on an object at a finite distance."""
+    telescope = request.telescope
+    if np.isinf(telescope.object_distance):
+        return [f"({x:.4g}°, {y:.4g}°)" for x, y in np.rad2deg(request.fields)]
+    name, unit = telescope.length_unit
+    places = object_points(telescope, request.directions)[:, :2] / unit + 0.0
+    return [f"({x:.4g}, {y:.4g}) {name}" for x, y in places]
 
 
 def _semi_diameters(where: Where) -> dict[str, float]:

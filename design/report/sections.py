@@ -107,7 +107,7 @@ SECTIONS = (
     Section(
         "Through focus",
         "Spot radius, wavefront and Strehl ratio against the height of the detector.",
-        lambda w: through_focus(w.telescope, w.fields, w.colors, n_pupil=8, threads=w.threads).plot(),
+        lambda w: through_focus(w.telescope, w.fields, w.colors, n_pupil=12, threads=w.threads).plot(),
     ),
     Section(
         "Field curvature and distortion",

@@ -32,6 +32,9 @@ FIRST_ORDER_KEYS = (
     "exit_pupil_diameter_m",
     "focus_z_m",
     "angular_magnification",
+    "image_z_m",
+    "magnification",
+    "working_f_number",
 )
 
 
@@ -51,11 +54,18 @@ def describe(telescope: Telescope) -> dict[str, Any]:
             "exit_pupil_diameter_m": optics.exit_pupil_diameter,
             "focus_z_m": optics.focus_z,
             "angular_magnification": None,
+            **dict.fromkeys(("image_z_m", "magnification", "working_f_number")),
         }
         if telescope.design_data.afocal:
             # Of an image at infinity there is neither a focus nor a scale of lengths.
             first |= dict.fromkeys(("focal_length_m", "f_number", "plate_scale_arcsec_per_um", "focus_z_m"))
             first["angular_magnification"] = optics.angular_magnification
+        elif math.isfinite(telescope.object_distance):
+            first |= {
+                "image_z_m": optics.image_z,
+                "magnification": optics.magnification,
+                "working_f_number": optics.working_f_number,
+            }
     wavelength = telescope.default_wavelength
     low, high = telescope.band or telescope.wavelength_range
     return {
@@ -187,15 +197,19 @@ def figure_rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     elif d["focal_length_m"] is None:
         lens, image = [("first-order figures", "none: the surfaces do not share one axis, or there is no focus")], []
     else:
-        lens = [
-            ("focal length", length(d["focal_length_m"])),
-            ("focal ratio", f"f/{d['f_number']:.4f}"),
-            ("plate scale", f'{d["plate_scale_arcsec_per_um"]:.6f}"/µm'),
-        ]
-        image = [
-            pupil,
-            ("paraxial focus", f"z = {length(d['focus_z_m'])}"),
-        ]
+        lens, image = [("focal length", length(d["focal_length_m"]))], [pupil]
+        if d["magnification"] is None:
+            lens += [
+                ("focal ratio", f"f/{d['f_number']:.4f}"),
+                ("plate scale", f'{d["plate_scale_arcsec_per_um"]:.6f}"/µm'),
+            ]
+            image.append(("paraxial focus", f"z = {length(d['focus_z_m'])}"))
+        else:
+            lens += [
+                ("magnification", f"{d['magnification']:.7g}"),
+                ("working focal ratio", f"f/{d['working_f_number']:.4f}"),
+            ]
+            image.append(("paraxial image", f"z = {length(d['image_z_m'])}"))
     far = d["object_distance_m"]
     return [
         *lens,

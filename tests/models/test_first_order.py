@@ -232,3 +232,93 @@ def test_a_toroid_has_the_focal_length_of_the_plane_of_zemax():
     c = np.sqrt(0.5)
     turned = replace(mirror, rotation=((c, -c, 0.0), (c, c, 0.0), (0.0, 0.0, 1.0)))
     assert first_order(replace(base, surfaces=(turned,))).focal_length == pytest.approx(0.5 / 3.75, rel=1e-14)
+
+
+def near(system, distance):
+    """Return a system with its object at a distance in front of the stop, on the axis."""
+    rows, stop_z, diameter = SYSTEMS[system]
+    return replace(telescope_of(rows, stop_z=stop_z, diameter=diameter), object_distance=stop_z + distance)
+
+
+def axis_ray(telescope, rows, height):
+    """Trace the ray from the axis of the object through a height in the pupil: where it ends, and its direction."""
+    away = telescope.object_distance - telescope.stop_z
+    direction = np.array([0.0, height, -away]) / np.hypot(height, away)
+    points, v = trace(rows, np.array([[0.0, height, telescope.stop_z]]), direction[None])
+    return points[-1][0], v[0]
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_the_image_of_a_near_object_is_where_close_rays_cross(system):
+    rows, stop_z, diameter = SYSTEMS[system]
+    telescope = near(system, 30.0)
+    figures = first_order(telescope)
+    h, n = 1e-5, 1.2 if system == "catadioptric" else 1.0
+    point, v = axis_ray(telescope, rows, h)
+    slope = abs(v[1] / v[2])
+    assert figures.image_z == pytest.approx(point[2] - point[1] * v[2] / v[1], rel=1e-8)
+    # Lagrange's invariant: the magnification is the ratio of the optical slopes.
+    assert abs(figures.magnification) == pytest.approx(h / 30.0 / (n * slope), rel=1e-8)
+    assert figures.working_f_number == pytest.approx(h / (n * slope * diameter), rel=1e-8)
+    # A chief ray from a height in the object lands where the magnification says, as close to the axis as that is.
+    start = np.array([[0.0, 0.0, stop_z]])
+    direction = np.array([[0.0, -h / 30.0, -1.0]]) / np.hypot(h / 30.0, 1.0)
+    points, chief = trace(rows, start, direction)
+    landed = points[-1][0, 1] + (figures.image_z - points[-1][0, 2]) * chief[0, 1] / chief[0, 2]
+    assert landed == pytest.approx(figures.magnification * h, rel=1e-7)
+
+
+def test_an_object_at_infinity_has_its_image_in_the_focus():
+    rows, stop_z, diameter = SYSTEMS["cassegrain"]
+    figures = first_order(telescope_of(rows, stop_z=stop_z, diameter=diameter))
+    assert figures.image_z == figures.focus_z
+    assert figures.magnification == 0.0
+    assert figures.working_f_number == pytest.approx(abs(figures.f_number), rel=1e-14)
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_spherical_aberration_of_a_near_object_is_that_of_traced_rays(system):
+    rows, _, diameter = SYSTEMS[system]
+    telescope = near(system, 30.0)
+    figures, s1 = first_order(telescope), seidel_sums(telescope).total[0]
+
+    def miss(height):
+        point, v = axis_ray(telescope, rows, height)
+        return point[1] + (figures.image_z - point[2]) * v[1] / v[2]
+
+    # y = S1 r^3 / (2 n u) at the paraxial image; the next term is r^2 smaller and cancels between two rays.
+    rim = 0.5 * diameter
+    coefficients = np.array([miss(rim * r) / r**3 for r in (0.1, 0.2)])
+    found = (4.0 * coefficients[0] - coefficients[1]) / 3.0
+    assert abs(found) == pytest.approx(abs(s1) * figures.working_f_number, rel=1e-4)
+    # It is another one than that of a star.
+    assert abs(seidel_sums(replace(telescope, object_distance=np.inf)).total[0] / s1 - 1.0) > 1e-3
+
+
+def test_a_sphere_images_its_centre_of_curvature_without_aberration():
+    # Stop at the mirror: 1:1 about the stop, so that coma and distortion vanish by symmetry.
+    sphere = telescope_of([(0.0, 4.0, 0.0, None)], stop_z=0.0, diameter=0.4, field=1e-2)
+    sums = seidel_sums(replace(sphere, object_distance=4.0)).total
+    assert np.allclose(sums[[0, 1, 4]], 0.0, atol=1e-18)
+    assert abs(sums[2]) > 1e-6
+    assert first_order(replace(sphere, object_distance=4.0)).magnification == pytest.approx(-1.0, rel=1e-14)
+
+
+def test_in_a_telecentric_object_space_the_exit_pupil_is_the_back_focus():
+    rows, stop_z, diameter = SYSTEMS["lens"]
+    lens = replace(telescope_of(rows, stop_z=stop_z, diameter=diameter, field=0.02), object_distance=stop_z + 3.0)
+    heights = {"fields": ((0.0, 0.0), (0.0, 0.05)), "field_type": "object_height"}
+    telecentric = lens.with_design(aperture="object_na", aperture_value=0.01, stop="s1", telecentric=True, **heights)
+    figures, usual = first_order(telecentric), first_order(lens)
+    assert figures.exit_pupil_z == pytest.approx(figures.focus_z, rel=1e-13)
+    for name in ("focal_length", "image_z", "magnification", "working_f_number"):
+        assert getattr(figures, name) == pytest.approx(getattr(usual, name), rel=1e-13)
+    # Diameter: the cone of the image at the distance of the pupil.
+    away = abs(figures.image_z - figures.exit_pupil_z)
+    assert figures.exit_pupil_diameter == pytest.approx(away / figures.working_f_number, rel=1e-12)
+    # Spherical aberration and Petzval sum do not depend on where the stop is.
+    moved, still = seidel_sums(telecentric).total, seidel_sums(lens).total
+    assert moved[[0, 3]] == pytest.approx(still[[0, 3]], rel=1e-12)
+    # Moving the stop from s to s' adds S1 times the ratio of the change of chief to marginal heights (Welford, 8.5).
+    shift = 0.02 * 3.0 / (0.5 * diameter)
+    assert abs(abs(moved[1] - still[1]) - shift * abs(still[0])) < 1e-3 * shift * abs(still[0])

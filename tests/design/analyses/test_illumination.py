@@ -1,4 +1,5 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ from pachon.models.aperture import Circle
 from pachon.models.design_data import DesignData
 from pachon.raytrace.launch import launch_bundles
 from pachon.raytrace.rays import field_direction
+
+DATA = Path(__file__).parents[2] / "data" / "zmx"
 
 
 def test_a_small_stop_at_the_mirror_gives_the_fourth_power_of_the_cosine(paraboloid):
@@ -46,6 +49,21 @@ STEPS = np.array([[0.0, 0.0], [1e-6, 0.0], [0.0, 1e-6]])
 
 def launched(telescope, slopes, wavelength, rim):
     return launch_bundles(telescope, field_direction(*slopes.T, "gnomonic"), wavelength, rim)
+
+
+def test_parallel_chief_rays_of_a_near_object():
+    # A lens for lithography, telecentric on both sides, whose rays meet to some micrometres: its cone of light itself.
+    telescope = pachon.load_telescope(DATA / "US05831776-1.zmx")
+    assert telescope.design_data.telecentric
+    result = pachon.relative_illumination(telescope, n_pupil=2000)
+    turn = np.linspace(0.0, 2.0 * np.pi, 721)
+    rim = 0.5 * telescope.pupil_diameter * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    request = pachon.Request.of(telescope, result.fields, result.wavelength)
+    directions = pachon.trace(telescope, request.launch(result.wavelength, rim)).direction
+    x, y = directions.reshape(len(result.fields), 721, 3)[..., :2].transpose(2, 0, 1)
+    area = 0.5 * np.abs((x[:, :-1] * y[:, 1:] - x[:, 1:] * y[:, :-1]).sum(axis=1))
+    assert result.solid_angle == pytest.approx(area, rel=1e-3)
+    assert result.relative == pytest.approx(1.0, abs=1e-3)
 
 
 def test_vignetting_counts(paraboloid):

@@ -32,6 +32,22 @@ def test_defocus_in_wavefront_and_strehl_are_the_textbooks(paraboloid):
     assert result.rms_radius[0] == pytest.approx(np.abs(heights) / (2 * f_number) / np.sqrt(2), rel=1e-3)
 
 
+def test_strehl_ratios_are_none_where_the_points_of_the_pupil_are_too_few(paraboloid):
+    # 8 rings hold 3.2 waves; beyond some 4, points in rings would add up to ratios that mean nothing, up to 0.9 here.
+    f_number, wavelength = 20.0, 5e-7
+    rim = np.linspace(0.0, 12.0, 49)
+    heights = rim * wavelength * 8 * f_number**2
+    result = through_focus(paraboloid(2.0, f_number), [[0.0, 0.0]], wavelength, heights, n_pupil=8)
+    finer = through_focus(paraboloid(2.0, f_number), [[0.0, 0.0]], wavelength, heights, n_pupil=32)
+    # At whole numbers of waves the middle is dark, and a ring around it the brightest place.
+    middle = rim % 1.0 != 0.0
+    np.testing.assert_allclose(finer.strehl[0, middle], np.sinc(rim[middle]) ** 2, rtol=0, atol=2e-3)
+    known = rim <= 3.1
+    np.testing.assert_allclose(result.strehl[0, known], finer.strehl[0, known], rtol=0, atol=1e-3)
+    assert np.isnan(result.strehl[0, rim > 3.3]).all()
+    assert np.isfinite(result.rms_wavefront).all()
+
+
 def test_it_is_as_if_the_detector_had_moved(lsst_r):
     fields, height = np.deg2rad([[0.0, 0.4], [1.0, -1.2]]), 2.5e-5
     result = through_focus(lsst_r, fields, 622e-9, [height])

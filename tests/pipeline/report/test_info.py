@@ -1,6 +1,7 @@
 """Description of telescopes that are not centred, and of apertures that are not discs."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,10 +24,26 @@ def test_every_bundled_telescope_can_be_described(name):
     centred = not name.startswith(("rubin", "auxtel"))
     # None of them is afocal.
     assert description["angular_magnification"] is None
-    others = [key for key in FIRST_ORDER_KEYS if key != "angular_magnification"]
+    near = {"image_z_m", "magnification", "working_f_number"}
+    assert not any(description[key] for key in near)
+    others = [key for key in FIRST_ORDER_KEYS if key not in near | {"angular_magnification"}]
     assert all((description[key] is not None) == centred for key in others)
     if centred:
         assert description["focal_length_m"] == first_order(telescope).focal_length
+
+
+def test_a_near_object_has_an_image_and_a_magnification():
+    lens = load_telescope(Path(__file__).parents[2] / "data" / "zmx" / "lens1.zmx")
+    near = replace(lens, object_distance=lens.stop_z + 0.3)
+    optics, description = first_order(near), describe(near)
+    assert description["magnification"] == optics.magnification < 0.0
+    rows = dict(figure_rows(description))
+    assert rows["magnification"] == f"{optics.magnification:.7g}"
+    assert rows["paraxial image"] == f"z = {optics.image_z * 1e3:.7g} mm"
+    assert rows["working focal ratio"] == f"f/{optics.working_f_number:.4f}"
+    # Of an object at infinity there are a plate scale and a focus instead.
+    assert not {"plate scale", "paraxial focus", "focal ratio"} & set(rows)
+    assert {"plate scale", "paraxial focus", "focal ratio"} < set(dict(figure_rows(describe(lens))))
 
 
 def test_apertures_of_every_kind_are_named():
