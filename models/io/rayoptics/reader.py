@@ -8,7 +8,6 @@ the profiles of ``shapes``, their decentres, clear apertures, gaps and media, th
 from __future__ import annotations
 
 from collections.abc import Iterable
-from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from ...rotation import rotation_matrix
 from ..json_items import JsonObject
 from ..zemax.file import Findings, ZemaxFile
 from ..zemax.placed import INFINITE, Line, PlacedSurfaces
+from ..zemax.text import scaled
 from .items import attributes, class_name, named, numbers
 from .media import medium_lines
 from .shapes import profile_lines
@@ -165,8 +165,7 @@ class _Translation:
         weights = (weights + [1.0] * len(lengths))[: len(lengths)]
         self._fields(attributes(optics, "field_of_view"), len(lengths))
         for number, (wave, weight) in enumerate(zip(lengths, weights, strict=True), start=1):
-            # The decimal point is moved: 587.6 is the float 0.5876.
-            head("WAVM", str(number), float(Decimal(repr(wave)).scaleb(-3)), weight)
+            head("WAVM", str(number), scaled(wave, -3), weight)
         head("PWAV", str(waves.whole("reference_wvl") + 1))
 
     def _pupil(self, pupil: JsonObject) -> None:
