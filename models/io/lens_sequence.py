@@ -35,6 +35,8 @@ from .zemax.reader import PUPIL_COMMENT
 MM = 1e-3
 #: Cosine, of the local z axis with the light, below which it is against the sense that the mirrors make.
 _AGAINST = -1e-12
+#: Newton steps to a mirror.
+_STEPS = 20
 
 
 @dataclass(frozen=True)
@@ -242,7 +244,9 @@ def _is_table(medium: Medium) -> bool:
 
 def _surfaces(t: Telescope, stop: str | None, *, along_light: bool) -> tuple[SequenceSurface, ...]:
     """Return the surfaces; the plane of the stop is the first of them where no surface is the stop."""
-    medium, axis, sign = t.medium_before, np.array([0.0, 0.0, 1.0]), 1.0
+    medium, sign = t.medium_before, 1.0
+    # The ray through the middle of the entrance pupil, along the axis.
+    position, direction = HALF_TURN @ [0.0, 0.0, t.stop_z], np.array([0.0, 0.0, 1.0])
     found: list[SequenceSurface] = []
     heights: list[float] = []
     if stop is None:
@@ -253,7 +257,7 @@ def _surfaces(t: Telescope, stop: str | None, *, along_light: bool) -> tuple[Seq
         heights.append(-t.stop_z)
     for surface in t.surfaces:
         axes = HALF_TURN @ surface.matrix @ HALF_TURN + 0.0
-        against = along_light and sign * float(axis @ axes[:, 2]) < _AGAINST
+        against = along_light and sign * float(direction @ axes[:, 2]) < _AGAINST
         surface, axes = _reversed(surface, axes) if against else (surface, axes)
         x, y, z = (float(v) for v in HALF_TURN @ np.array(surface.vertex) + 0.0)
         straight = np.array_equal(axes, np.eye(3))
@@ -278,10 +282,25 @@ def _surfaces(t: Telescope, stop: str | None, *, along_light: bool) -> tuple[Seq
         heights.append(z)
         medium = surface.medium_after
         if surface.interaction == Interaction.MIRROR:
-            axis = axis - 2.0 * float(axis @ axes[:, 2]) * axes[:, 2]
+            position, direction = _reflected(position, direction, found[-1], axes, z)
             sign = -sign
     gaps = [*np.diff(heights).tolist(), 0.0]
     return tuple(replace(s, thickness=gap) for s, gap in zip(found, gaps, strict=True))
+
+
+def _reflected(
+    position: np.ndarray, direction: np.ndarray, mirror: SequenceSurface, axes: np.ndarray, z: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return where a ray meets a mirror and its direction behind it; vertex height `z` and axes are the mirror's."""
+    vertex = np.array([*mirror.decentre, z])
+    place, along = (position - vertex) @ axes, direction @ axes
+    # A ray that misses the mirror, or runs along it, has no direction behind it.
+    with np.errstate(all="ignore"):
+        for _ in range(_STEPS):
+            gradient = np.array([*(-float(v) for v in mirror.shape.gradient(*place[:2])), 1.0])
+            place = place - along * (place[2] - float(mirror.shape.sag(*place[:2]))) / (along @ gradient)
+    normal = gradient / np.linalg.norm(gradient)
+    return vertex + axes @ place, axes @ (along - 2.0 * (along @ normal) * normal)
 
 
 def _reversed(surface: Surface, axes: np.ndarray) -> tuple[Surface, np.ndarray]:

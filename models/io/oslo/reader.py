@@ -3,9 +3,9 @@
 Supported commands: LEN NEW, UNI (mm for each lens unit), EBR, NAO, FNO, NAP, ANG, OBH, GIH, TEM (deg C), PRE (atm), WV,
 WW and these numbered; for surfaces, parted by NXT up to END, NOT (their name), RD, CV, CVX, TH, AP (CHK), AIR, RFL, GLA
 (name, index, indices at the wavelengths, MOD), AST, CC, AD AE AF AG, ASP with ASR, ARA and ASX, DCX DCY DCZ TLA TLB TLC
-with DT, TOX TOY TOZ, GC, RCO and BEN, pick-ups PK CV, TH, GLA, AP, and the solves PY and PU of the axial ray. Sources: OSLO Program Reference and
-Optics Reference (Lambda Research), OSLO User's Guide ("Assignment commands"). The first wavelength is the primary one;
-without AST the first surface is the stop.
+with DT, TOX TOY TOZ, GC, RCO and BEN, pick-ups PK CV, TH, GLA, AP, and the solves PY and PU of the axial ray. Sources:
+OSLO Program Reference and Optics Reference (Lambda Research), OSLO User's Guide ("Assignment commands"). The first
+wavelength is the primary one; without AST the first surface is the stop.
 """
 
 from __future__ import annotations

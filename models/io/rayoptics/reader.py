@@ -25,6 +25,8 @@ UNITS = {"mm": "MM", "cm": "CM", "m": "METER", "in": "IN", "inches": "IN"}
 #: Aperture line of Zemax by space and kind of the pupil; the f-number is that of the image space.
 PUPILS = {("object", "epd"): "ENPD", ("object", "NA"): "OBNA", ("image", "f/#"): "FNUM", ("image", "NA"): "FNUM"}
 FIELDS = {("object", "angle"): 0, ("object", "height"): 1, ("image", "height"): 2}
+#: Millimetres of mercury in an atmosphere.
+MMHG = 760.0
 INTERACTIONS = ("transmit", "reflect", "dummy", "phantom")
 #: Attributes of a surface without effect on the paths of rays.
 IGNORED = ("delta_n", "edge_apertures", "z_type")
@@ -167,6 +169,7 @@ class _Translation:
         for number, (wave, weight) in enumerate(zip(lengths, weights, strict=True), start=1):
             head("WAVM", str(number), scaled(wave, -3), weight)
         head("PWAV", str(waves.whole("reference_wvl") + 1))
+        head("ENVD", system.number("temperature", 20.0), system.number("pressure", MMHG) / MMHG, "0")
 
     def _pupil(self, pupil: JsonObject) -> None:
         space, kind = self._key(pupil)
