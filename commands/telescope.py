@@ -87,14 +87,14 @@ def convert_command(
         Path, Argument(metavar="OUT", help="File to write: .yaml (ours), .zmx, .seq, .len, .json (optiland), .roa.")
     ],
     format: Annotated[
-        str, Option(help="pachon, batoid, zemax, codev, oslo, optiland, rayoptics; by default by the name.")
+        str, Option(help="pachon, batoid, zemax, codev, oslo, optiland or rayoptics; else by the name.")
     ] = "",
     glass_catalogue: GlassCatalogues = None,
     lenient: Lenient = False,
 ) -> None:
     """Write a telescope in another format: ours, batoid's, or that of a lens design program.
 
-    What the format has no place for (pickups, solves, coatings, formulas of glasses, fields of OSLO...) is refused, with
+    What the format has no place for (pickups, solves, coatings, formulas of glasses, fields...) is refused, with
     `--lenient` left out with a warning.
 
     Read and written are files of Zemax (.zmx, read also .zar), CODE V (.seq), OSLO (.len), optiland (.json), ray-optics

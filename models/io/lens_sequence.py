@@ -35,6 +35,8 @@ from .zemax.reader import PUPIL_COMMENT
 MM = 1e-3
 #: Cosine, of the local z axis with the light, below which it is against the sense that the mirrors make.
 _AGAINST = -1e-12
+#: Decimals of thicknesses: a millimetre is taken apart to a femtometre.
+_DECIMALS = 12
 #: Newton steps to a mirror.
 _STEPS = 20
 
@@ -172,6 +174,10 @@ class LensSequence:
         """Stated pressure [atm]."""
         pascal = self.telescope.design_data.pressure
         return None if pascal is None else pascal / STANDARD_ATMOSPHERE
+
+    def thickness(self, surface: SequenceSurface) -> float:
+        """Return the thickness behind a surface in the unit of the file, without the rounding of heights."""
+        return round(surface.thickness / self.unit, _DECIMALS) + 0.0
 
     def leave_out(self, text: str, instead: str) -> None:
         """Raise the error of what the file cannot hold or, if lenient, warn; `instead` is what is written."""

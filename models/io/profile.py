@@ -40,6 +40,11 @@ class Profile:
     terms: tuple[tuple[int, int, float], ...] = ()
     curvature_x: float | None = None
 
+    @property
+    def radius(self) -> float:
+        """Radius of curvature along y to 15 digits [unit], 0 of a plane."""
+        return float(f"{1.0 / self.curvature:.15g}") if self.curvature else 0.0
+
     @classmethod
     def of(cls, shape: Shape, unit: float) -> Profile:
         """Return the profile of a shape [m] for a unit of length [m]; PrescriptionError if it is none of these."""

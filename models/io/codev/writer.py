@@ -49,7 +49,7 @@ def telescope_to_codev(telescope: Telescope, *, lenient: bool = False) -> str:
         lines.append(f"SO 0.0 {distance}{_medium(first.before, words)}")
         for surface in sequence.surfaces:
             with error_context(subject=f"surface {surface.name}"):
-                lines += _surface_lines(surface, unit, words)
+                lines += _surface_lines(sequence, surface, words)
             lines += _aperture_lines(sequence, surface)
     return "\n".join([*lines, "GO"]) + "\n"
 
@@ -115,7 +115,8 @@ def _numbers(values: Sequence[float]) -> str:
     return " ".join(map(number_text, values))
 
 
-def _surface_lines(surface: SequenceSurface, unit: float, words: Mapping[Medium, str]) -> Iterator[str]:
+def _surface_lines(sequence: LensSequence, surface: SequenceSurface, words: Mapping[Medium, str]) -> Iterator[str]:
+    unit = sequence.unit
     profile = Profile.of(surface.shape, unit)
     if profile.odd or profile.terms or profile.curvature_x is not None or any(profile.even[:1]):
         raise PrescriptionError(f"shape: {FILE} is written with conics and even powers from r^4 on")
@@ -124,8 +125,7 @@ def _surface_lines(surface: SequenceSurface, unit: float, words: Mapping[Medium,
         raise PrescriptionError(f"{len(powers)} coefficients: {FILE} has {len(POWERS)}, from r^4 to r^16")
     last = surface.interaction == Interaction.DETECTOR
     medium = " REFL" if surface.interaction == Interaction.MIRROR else _medium(surface.after, words)
-    radius = 1.0 / profile.curvature if profile.curvature else 0.0
-    head = f"{number_text(radius)} {number_text(surface.thickness / unit)}"
+    head = f"{number_text(profile.radius)} {number_text(sequence.thickness(surface))}"
     yield f"SI {head}" if last else f"S {head}{medium}"
     yield f"  SLB '{quoted(surface.name, _FORBIDDEN)}'"
     if surface.stop:

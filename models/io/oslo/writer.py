@@ -26,7 +26,7 @@ FIELDS = {"angle": "ANG", "object_height": "OBH", "paraxial_image_height": "GIH"
 _MOST = 8
 #: Fractions of a field height, and apertures of a surface, that are equal.
 _EQUAL = 1e-9
-_FORBIDDEN = '";/'
+_FORBIDDEN = '"'
 
 
 def telescope_to_oslo(telescope: Telescope, *, lenient: bool = False) -> str:
@@ -49,7 +49,7 @@ def telescope_to_oslo(telescope: Telescope, *, lenient: bool = False) -> str:
         for number, surface in enumerate(surfaces, start=1):
             lines.append(f"NXT // SRF {number}")
             with error_context(subject=f"surface {surface.name}"):
-                lines += [*_surface_lines(surface, number, unit), *_medium_lines(sequence, surface, names)]
+                lines += [*_surface_lines(sequence, surface, number), *_medium_lines(sequence, surface, names)]
             lines += _aperture_lines(sequence, surface)
     waves = [sequence.primary, *(i for i in range(len(sequence.wavelengths)) if i != sequence.primary)]
     lines.append(f"WV {' '.join(number_text(scaled(sequence.wavelengths[i], 6)) for i in waves)}")
@@ -130,11 +130,12 @@ def _medium_lines(
         yield f"GLA {model}{names[medium]} {' '.join(map(number_text, indices))}"
 
 
-def _surface_lines(surface: SequenceSurface, number: int, unit: float) -> Iterator[str]:
+def _surface_lines(sequence: LensSequence, surface: SequenceSurface, number: int) -> Iterator[str]:
+    unit = sequence.unit
     profile = Profile.of(surface.shape, unit)
     yield f'NOT "{quoted(surface.name, _FORBIDDEN)}"'
-    yield f"RD {number_text(1.0 / profile.curvature if profile.curvature else 0.0)}"
-    yield f"TH {number_text(surface.thickness / unit)}"
+    yield f"RD {number_text(profile.radius)}"
+    yield f"TH {number_text(sequence.thickness(surface))}"
     if profile.conic:
         yield f"CC {number_text(profile.conic)}"
     yield from _asphere_lines(profile)

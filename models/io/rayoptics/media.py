@@ -54,7 +54,7 @@ def medium_lines(gap: JsonObject, found: PlacedSurfaces, findings: Findings) -> 
         model = attributes(values, "bdhl_model")
         terms = (model.number("rind0"), *numbers(model, "coefs", 2), model.number("wv0"))
         name = f"MODEL {terms!r}"
-        return found.glass(name, Dispersion("buchdahl", terms, RANGE, name=values.text("label", "")))
+        return found.glass(name, Dispersion("buchdahl", terms, _range(values), name=values.text("label", "")))
     if kind == "InterpolatedMedium":
         waves, indices = numbers(values, "wvls"), numbers(values, "rndx")
         table = sorted(zip((scaled(w, -9) for w in waves), indices, strict=False))
@@ -77,10 +77,7 @@ def _catalogue_glass(medium: JsonObject, values: JsonObject, found: PlacedSurfac
     entry = GlassCatalogue.of_maker(maker)[name] if known else None
     terms = tuple(numbers(values, "coefs")) if "coefs" in values else ()
     formula = FORMULAS.get((maker, len(terms)))
-    limits = getattr(entry, "wavelength_range", RANGE)
-    if RANGE_KEY in values:
-        low, high = values.numbers(RANGE_KEY, 2)
-        limits = scaled(low, -9), scaled(high, -9)
+    limits = _range(values, getattr(entry, "wavelength_range", RANGE))
     if formula is not None:
         own: Medium = (
             Sellmeier(terms[:3], terms[3:], limits, name=name)
@@ -89,6 +86,18 @@ def _catalogue_glass(medium: JsonObject, values: JsonObject, found: PlacedSurfac
         )
         return found.glass(f"{name} ({maker})", own)
     return [("GLAS", name)] if entry is None else found.glass(f"{name} ({maker})", entry)
+
+
+def _range(values: JsonObject, usual: tuple[float, float] = RANGE) -> tuple[float, float]:
+    """Return the range of wavelengths [m] that a medium states, or the usual one."""
+    if RANGE_KEY not in values:
+        return usual
+    low, high = values.numbers(RANGE_KEY, 2)
+    return scaled(low, -9), scaled(high, -9)
+
+
+def _range_items(medium: Sellmeier | Dispersion) -> dict[str, Any]:
+    return {RANGE_KEY: [scaled(v, 9) for v in medium.wavelength_range]}
 
 
 class Media:
@@ -131,7 +140,13 @@ def _formula_items(medium: Medium) -> dict[str, Any] | None:
     if isinstance(medium, Dispersion) and medium.formula == "buchdahl":
         n, first, second, centre = medium.coefficients
         model = {"wv0": centre, "rind0": n, "coefs": array([first, second]), "label": "", "_catalog_name": ""}
-        values = {"label": medium.name, "_catalog_name": "user", "n": n, "v": abbe_number(medium)}
+        values = {
+            "label": medium.name,
+            "_catalog_name": "user",
+            "n": n,
+            "v": abbe_number(medium),
+            **_range_items(medium),
+        }
         return _item("modelglass", "ModelGlass", values | {"bdhl_model": _item("buchdahl", "Buchdahl2", model)})
     if isinstance(medium, Dispersion):
         return _glass_items(medium, "schott" if medium.formula == "sumita" else medium.formula, medium.coefficients)
@@ -149,7 +164,7 @@ def _glass_items(
     own = [m for m in makers if medium.name in GlassCatalogue.of_maker(m)]
     maker = (own or makers)[0]
     values = {"gname": medium.name, "coefs": list(coefficients)}
-    return _item(maker, CLASSES[maker], values | {RANGE_KEY: [scaled(v, 9) for v in medium.wavelength_range]})
+    return _item(maker, CLASSES[maker], values | _range_items(medium))
 
 
 def _item(module: str, kind: str, values: dict[str, Any]) -> dict[str, Any]:

@@ -84,7 +84,7 @@ def _sequence_items(sequence: LensSequence) -> dict[str, Any]:
         own["attributes"]["decenter"] = _decenter_items(surface, unit)
         items.append(own)
         if surface.interaction != Interaction.DETECTOR:
-            gaps.append(_gap(surface.thickness / unit, media.items(surface.after)))
+            gaps.append(_gap(sequence.thickness(surface), media.items(surface.after)))
             directions.append(-directions[-1] if mode == "reflect" else directions[-1])
     values = {
         "ifcs": items,
