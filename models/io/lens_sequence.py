@@ -35,6 +35,8 @@ from .zemax.reader import PUPIL_COMMENT
 MM = 1e-3
 #: Cosine, of the local z axis with the light, below which it is against the sense that the mirrors make.
 _AGAINST = -1e-12
+#: Words that are no names of glasses.
+_WORDS = ("AIR", "REFL", "MIRROR", "MOD")
 #: Decimals of thicknesses: a millimetre is taken apart to a femtometre.
 _DECIMALS = 12
 #: Newton steps to a mirror.
@@ -142,7 +144,7 @@ class LensSequence:
             wavelengths=waves,
             wavelength_weights=data.wavelength_weights or (1.0,) * len(waves),
             field_type=data.field_type if data.fields else "angle",
-            fields=tuple((-x * size + 0.0, y * size) for x, y in fields),
+            fields=tuple((_tidy(-x * size), _tidy(y * size)) for x, y in fields),
             field_weights=data.field_weights or (1.0,) * len(fields),
             vignetting=tuple(map(tuple, vignetting.tolist())),
         )
@@ -210,19 +212,27 @@ class LensSequence:
                 names[medium] = known
                 continue
             own = re.sub(r"[^A-Z0-9]", "", medium.name.upper())[:12]
-            number = len(names) + 1
-            free = own and own[0].isalpha() and own not in names.values() and find_glass(own) is None
-            names[medium] = own if free and own not in ("AIR", "REFL", "MIRROR", "MOD") else f"GLASS{number}"
+            free = own[:1].isalpha() and own not in (*names.values(), *_WORDS)
+            names[medium] = own if free else f"MEDIUM{len(names) + 1}"
             if not isinstance(medium, ConstantIndex) and not _is_table(medium):
                 text = f"glass {medium.name or type(medium).__name__}: {self.file} has no place for its formula"
                 self.leave_out(text, f"written as {table}")
         return names
 
-    def index_table(self, medium: Medium) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Return wavelengths [m] and indices of a medium: its own table, or the indices at the stated wavelengths."""
-        if isinstance(medium, TabulatedIndex) and _is_table(medium):
+    def index_table(
+        self, medium: Medium, entries: int = 0, least: int = 2
+    ) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return wavelengths [m] and indices of a medium: its own table of `least` entries or more, or another one.
+
+        That has the stated wavelengths and up to `entries` in all, from one per cent below them to one above.
+        """
+        if isinstance(medium, TabulatedIndex) and _is_table(medium) and len(medium.wavelengths) >= least:
             return medium.wavelengths, medium.indices
-        return self.wavelengths, tuple(float(medium.index(wave)) for wave in self.wavelengths)
+        low, high = getattr(medium, "wavelength_range", (0.0, math.inf))
+        low, high = max(low, 0.99 * min(self.wavelengths)), min(high, 1.01 * max(self.wavelengths))
+        between = map(_tidy, np.linspace(low, high, max(entries - len(self.wavelengths), 0)).tolist())
+        waves = tuple(sorted({*self.wavelengths, *(w for w in between if low <= w <= high)}))
+        return waves, tuple(float(medium.index(wave)) for wave in waves)
 
 
 def catalogue_name(medium: Medium) -> str | None:
@@ -242,6 +252,11 @@ def maker_of(name: str) -> str | None:
 def quoted(text: str, forbidden: str) -> str:
     """Return a text in one line for a file in which some characters have a meaning; these become spaces."""
     return " ".join("".join(" " if c in forbidden else c for c in text).split())
+
+
+def _tidy(number: float) -> float:
+    """Return a number to 15 digits, without the rounding of its last bits."""
+    return float(f"{number:.15g}") + 0.0
 
 
 def _is_table(medium: Medium) -> bool:

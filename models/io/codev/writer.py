@@ -26,6 +26,10 @@ APERTURES = {"entrance_pupil": "EPD", "f_number": "FNO", "working_f_number": "FN
 FIELDS = {"angle": "AN", "object_height": "OB", "paraxial_image_height": "IM", "real_image_height": "RI"}
 #: Thickness that stands for an object at infinity.
 _FAR = "1e13"
+#: Entries of the table of a private glass at most, as of the wavelengths of a lens.
+_ENTRIES = 21
+#: Numbers in a line.
+_A_LINE = 6
 #: Characters with a meaning in the language.
 _FORBIDDEN = "'\";!&"
 
@@ -39,7 +43,7 @@ def telescope_to_codev(telescope: Telescope, *, lenient: bool = False) -> str:
     # CODE V's chief rays pass the middle of the stop.
     sequence = LensSequence.of(telescope, FILE, tuple(UNITS), aimed="paraxial", lenient=lenient)
     with error_context(subject=telescope.name):
-        names = sequence.glass_names("a private glass of the indices at the stated wavelengths")
+        names = sequence.glass_names("a private glass, a table of indices")
         words = {medium: _glass_word(name) for medium, name in names.items()}
         unit = sequence.unit
         lines = ["RDM;LEN", f"TITLE '{quoted(sequence.title, _FORBIDDEN)}'", f"DIM {UNITS[unit]}"]
@@ -101,10 +105,8 @@ def _private_lines(sequence: LensSequence, words: Mapping[Medium, str]) -> Itera
     for medium, word in words.items():
         if catalogue_name(medium) is not None:
             continue
-        waves, indices = sequence.index_table(medium)
-        if len(waves) == 1:
-            # A table has two entries at least.
-            waves, indices = (0.5 * waves[0], 2.0 * waves[0]), (indices[0],) * 2
+        # From long wavelengths to short ones, as CODE V lists them.
+        waves, indices = (row[::-1] for row in sequence.index_table(medium, _ENTRIES))
         yield "PRV"
         yield f"  PWL {_numbers([scaled(wave, 9) for wave in waves])}"
         yield f"  '{word}' {_numbers(indices)}"
@@ -112,7 +114,9 @@ def _private_lines(sequence: LensSequence, words: Mapping[Medium, str]) -> Itera
 
 
 def _numbers(values: Sequence[float]) -> str:
-    return " ".join(map(number_text, values))
+    """Return numbers, carried on where the line gets long."""
+    rows = [values[i : i + _A_LINE] for i in range(0, len(values), _A_LINE)]
+    return " &\n  ".join(" ".join(map(number_text, row)) for row in rows)
 
 
 def _surface_lines(sequence: LensSequence, surface: SequenceSurface, words: Mapping[Medium, str]) -> Iterator[str]:

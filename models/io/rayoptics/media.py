@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from ....core.errors import PrescriptionError
 from ...media.dispersion import Dispersion
 from ...media.medium import ConstantIndex, Medium, Sellmeier, abbe_number
@@ -38,7 +36,7 @@ CLASSES = {
     "hikari": "HikariGlass",
 }  # fmt: skip
 #: Entries that a table needs for ray-optics' cubic spline, and those that one of a formula has.
-_LEAST_ENTRIES, _ENTRIES = 4, 17
+_LEAST_ENTRIES, _ENTRIES = 4, 21
 _MODULE = "opticalglass"
 
 
@@ -115,15 +113,10 @@ class Media:
 
     def _table_items(self, medium: Medium) -> dict[str, Any]:
         name = medium.name or type(medium).__name__
-        waves, indices = self.sequence.index_table(medium)
-        if not isinstance(medium, TabulatedIndex) or waves != medium.wavelengths or len(waves) < _LEAST_ENTRIES:
+        waves, indices = self.sequence.index_table(medium, _ENTRIES, _LEAST_ENTRIES)
+        if not isinstance(medium, TabulatedIndex) or waves != medium.wavelengths:
             text = f"glass {name}: {self.sequence.file} has no place for its formula"
             self.sequence.leave_out(text, "written as a table of its indices")
-            reach = min(waves) * 0.99, max(waves) * 1.01
-            low, high = getattr(medium, "wavelength_range", None) or reach
-            grid = np.linspace(max(low, reach[0]), min(high, reach[1]), _ENTRIES).tolist()
-            waves = tuple(sorted({*waves, *grid}))
-            indices = tuple(float(medium.index(wave)) for wave in waves)
         table = {"label": name, "_catalog": "", "wvls": [scaled(w, 9) for w in waves], "rndx": list(indices)}
         return _item("opticalmedium", "InterpolatedMedium", table | {"kvals": None, "kvals_wvls": None})
 

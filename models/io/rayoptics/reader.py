@@ -7,6 +7,7 @@ the profiles of ``shapes``, their decentres, clear apertures, gaps and media, th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -182,6 +183,11 @@ class _Translation:
                 pupil.refuse(named(pupil, "value"), "a number other than 0")
             finite = abs(self.distance) < INFINITE
             self.found.head("FNUM", abs(value) if kind == "f/#" else 0.5 / abs(value), str(int(finite)))
+        elif keyword == "OBNA":
+            if class_name(self.gaps[0].child("medium")) != "Air":
+                self.findings.report(pupil.problem("numerical aperture of an object in a medium other than air"))
+            # It is the slope of the marginal ray there.
+            self.found.head("OBNA", math.sin(math.atan(value)))
         else:
             self.found.head(keyword, value)
 

@@ -156,6 +156,11 @@ def _optical_items(sequence: LensSequence) -> dict[str, Any]:
     # Its f-number is that of the image space, at the conjugates of the lens.
     wrong = "f_number" if math.isfinite(sequence.distance) else ""
     kind, value = sequence.stated_aperture([name for name in APERTURES if name != wrong])
+    if kind == "object_na":
+        # Its numerical aperture is the slope of the marginal ray.
+        value = math.tan(
+            math.asin(value / float(sequence.surfaces[0].before.index(sequence.telescope.default_wavelength)))
+        )
     key = ["aperture", *APERTURES[kind]]
     pupil = {"_key": key, "value": value / sequence.unit if kind == "entrance_pupil" else value}
     pupil["pupil_rays"] = [[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]
