@@ -141,10 +141,10 @@ def load_telescope(
 
 
 def prescription_digest(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 of a prescription file and of the files that it names: grids, meshes, glass catalogues.
+    """Return the SHA-256 of a prescription file and of the files that it names.
 
-    The catalogues that the user has configured belong to those of a lens file. That of a file that names no
-    other is the SHA-256 of its bytes.
+    These are grids, meshes, user-defined apertures and glass catalogues. The catalogues that the user has configured
+    belong to those of a lens file. That of a file that names no other is the SHA-256 of its bytes.
 
     Raises
     ------
@@ -157,6 +157,11 @@ def prescription_digest(path: str | os.PathLike[str]) -> str:
         from .user_glasses import user_catalogues
 
         named = [path.with_suffix(".agf").name, *(os.path.abspath(p) for p in user_catalogues())]
+        if path.suffix.lower() == ".zmx":
+            from .zemax.text import read_text
+            from .zemax.user_apertures import named_apertures
+
+            named += [os.path.abspath(p) for p in named_apertures(path, read_text(path))]
     else:
         named = sorted(set(_texts(read_mapping(path, max_bytes=MAX_BYTES))))
     # os.path takes every text, also such as are too long for a name.
