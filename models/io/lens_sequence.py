@@ -16,7 +16,7 @@ import numpy as np
 
 from ...core.errors import PrescriptionError, error_context
 from ..aperture import Aperture, Complement
-from ..design_data import AIMING, DesignData
+from ..design_data import DesignData
 from ..media.air import STANDARD_ATMOSPHERE, ZERO_CELSIUS
 from ..media.medium import ConstantIndex, Medium
 from ..media.tabulated import TabulatedIndex
@@ -122,7 +122,7 @@ class LensSequence:
                 findings.note(PrescriptionError(said), "a plane in front carries the stop and the pupil")
             if own_stop and data.aiming != aimed:
                 said = f"aiming = {data.aiming}: {file} does not state how rays are aimed"
-                findings.note(PrescriptionError(said), f"read back it is {AIMING[AIMING.index(aimed)]}")
+                findings.note(PrescriptionError(said), f"read back it is {aimed}")
             surfaces = _surfaces(t, data.stop if own_stop else None, along_light=along_light)
         aperture = ("entrance_pupil", t.pupil_diameter)
         if own_stop and data.aperture is not None and data.aperture_value is not None:

@@ -160,7 +160,7 @@ def _qcon_powers(block: Block, unit: float, findings: Findings) -> list[float]:
     data = block.table("XDAT")
     line = next(iter(block.all("XDAT")), block.lines[0])
     if data.get(1, 0.0) != 1.0:
-        # u^2 (1 - u^2) sum of a_m Qbfs_m(u^2), u = r / R, over the cosine of the slope of the conic: no polynomial of r.
+        # u^2 (1 - u^2) sum of a_m Qbfs_m(u^2), u = r / R, over the cosine of the slope of the conic: no polynomial.
         text = f"XDAT 1 {data.get(1, 0.0):g}: Q-type asphere of Forbes's Qbfs terms; expected Qcon (1)"
         findings.report(block.problem(text), "taken as its conic")
         return [0.0]
