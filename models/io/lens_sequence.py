@@ -200,15 +200,15 @@ class LensSequence:
         self.leave_out(text, "written as the diameter of the entrance pupil")
         return "entrance_pupil", self.telescope.pupil_diameter
 
-    def glass_names(self, table: str) -> Mapping[Medium, str]:
+    def glass_names(self, table: str, forbidden: str = "") -> Mapping[Medium, str]:
         """Return a name for each medium but air; those of catalogues are theirs, the others are in capitals and new.
 
-        Unless lenient, PrescriptionError for a dispersion that the file has to hold as a table, `table` of its kind.
+        Names of catalogues with a `forbidden` character are not taken. Unless lenient, PrescriptionError for a dispersion that the file has to hold as a table, `table` of its kind.
         """
         names: dict[Medium, str] = {}
         for medium in dict.fromkeys(m for s in self.surfaces for m in (s.before, s.after) if m != VACUUM):
             known = catalogue_name(medium)
-            if known is not None:
+            if known is not None and not set(known) & set(forbidden):
                 names[medium] = known
                 continue
             own = re.sub(r"[^A-Z0-9]", "", medium.name.upper())[:12]

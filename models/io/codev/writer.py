@@ -43,11 +43,11 @@ def telescope_to_codev(telescope: Telescope, *, lenient: bool = False) -> str:
     # CODE V's chief rays pass the middle of the stop.
     sequence = LensSequence.of(telescope, FILE, tuple(UNITS), aimed="paraxial", lenient=lenient)
     with error_context(subject=telescope.name):
-        names = sequence.glass_names("a private glass, a table of indices")
+        names = sequence.glass_names("a private glass, a table of indices", "_")
         words = {medium: _glass_word(name) for medium, name in names.items()}
         unit = sequence.unit
         lines = ["RDM;LEN", f"TITLE '{quoted(sequence.title, _FORBIDDEN)}'", f"DIM {UNITS[unit]}"]
-        lines += [*_system_lines(sequence), *_field_lines(sequence), *_private_lines(sequence, words)]
+        lines += [*_system_lines(sequence), *_field_lines(sequence), *_private_lines(sequence, names)]
         first = sequence.surfaces[0]
         distance = number_text(sequence.distance / unit) if math.isfinite(sequence.distance) else _FAR
         lines.append(f"SO 0.0 {distance}{_medium(first.before, words)}")
@@ -101,15 +101,15 @@ def _field_lines(sequence: LensSequence) -> Iterator[str]:
         yield f"VL{axis} {_numbers([row[2 + place] + row[place] for row in sequence.vignetting])}"
 
 
-def _private_lines(sequence: LensSequence, words: Mapping[Medium, str]) -> Iterator[str]:
-    for medium, word in words.items():
-        if catalogue_name(medium) is not None:
+def _private_lines(sequence: LensSequence, names: Mapping[Medium, str]) -> Iterator[str]:
+    for medium, name in names.items():
+        if name == catalogue_name(medium):
             continue
         # From long wavelengths to short ones, as CODE V lists them.
         waves, indices = (row[::-1] for row in sequence.index_table(medium, _ENTRIES))
         yield "PRV"
         yield f"  PWL {_numbers([scaled(wave, 9) for wave in waves])}"
-        yield f"  '{word}' {_numbers(indices)}"
+        yield f"  '{name}' {_numbers(indices)}"
         yield "END"
 
 

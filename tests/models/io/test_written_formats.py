@@ -12,6 +12,7 @@ import pachon
 from pachon.core.errors import ConfigError, PrescriptionError, PrescriptionWarning
 from pachon.models.aperture import Circle, Complement, Polygon, Rectangle
 from pachon.models.design_data import DesignData
+from pachon.models.io.glass_catalogue import GlassCatalogue
 from pachon.models.io.prescription import WRITTEN
 from pachon.models.media.dispersion import Dispersion
 from pachon.models.media.medium import ConstantIndex, Sellmeier
@@ -272,6 +273,18 @@ def test_glasses_of_no_catalogue(tmp_path, kind, ending):
         assert np.allclose(read.index(between), glass.index(between), rtol=3e-16, atol=0)
     if kind == "table":
         assert read == glass
+
+
+def test_names_of_glasses_in_codev_files(tmp_path):
+    """Without hyphens and with the maker; what stands behind an underscore would be taken for one."""
+    silica, crown = GlassCatalogue.bundled()["F_SILICA"], GlassCatalogue.of_maker("ohara")["S-BSL7"]
+    read = again(with_glass(lens("singlet"), crown), tmp_path / "a.seq")
+    assert "SBSL7_OHARA" in (tmp_path / "a.seq").read_text()
+    assert read.surfaces[0].medium_after == crown
+    with pytest.raises(PrescriptionError, match="glass F_SILICA: a CODE V file has no place for its formula"):
+        again(with_glass(lens("singlet"), silica), tmp_path / "b.seq")
+    read = again(with_glass(lens("singlet"), silica), tmp_path / "b.seq", lenient=True).surfaces[0].medium_after
+    assert (read.name, len(read.wavelengths)) == ("FSILICA", 21)
 
 
 @pytest.mark.parametrize(
