@@ -168,7 +168,7 @@ class LensSequence:
     def celsius(self) -> float | None:
         """Stated temperature [deg C]."""
         kelvin = self.telescope.design_data.temperature
-        # Two decimals of the sum are rounding.
+        # The difference of two numbers near 300 has rounding in its last digits.
         return None if kelvin is None else round(kelvin - ZERO_CELSIUS, 9) + 0.0
 
     @property
@@ -203,7 +203,8 @@ class LensSequence:
     def glass_names(self, table: str, forbidden: str = "") -> Mapping[Medium, str]:
         """Return a name for each medium but air; those of catalogues are theirs, the others are in capitals and new.
 
-        Names of catalogues with a `forbidden` character are not taken. Unless lenient, PrescriptionError for a dispersion that the file has to hold as a table, `table` of its kind.
+        Names of catalogues with a `forbidden` character are not taken. Unless lenient, PrescriptionError for a
+        dispersion that the file has to hold as a table, `table` of its kind.
         """
         names: dict[Medium, str] = {}
         for medium in dict.fromkeys(m for s in self.surfaces for m in (s.before, s.after) if m != VACUUM):
