@@ -84,19 +84,22 @@ def info_command(
 def convert_command(
     model: Model,
     out: Annotated[
-        Path, Argument(metavar="OUT", help="File to write: .yaml (ours), .zmx (Zemax) or .json (optiland).")
+        Path, Argument(metavar="OUT", help="File to write: .yaml (ours), .zmx, .seq, .len, .json (optiland), .roa.")
     ],
-    format: Annotated[str, Option(help="Format: pachon, batoid, zemax or optiland; by default that of the name.")] = "",
+    format: Annotated[
+        str, Option(help="pachon, batoid, zemax, codev, oslo, optiland or rayoptics; else by the name.")
+    ] = "",
     glass_catalogue: GlassCatalogues = None,
     lenient: Lenient = False,
 ) -> None:
-    """Write a telescope in another format: any model as ours, batoid's, Zemax's or optiland's.
+    """Write a telescope in another format: ours, batoid's, or that of a lens design program.
 
-    Pickups, solves and coatings that the format has no place for are refused, with `--lenient` left out with a warning.
+    What the format has no place for (pickups, solves, coatings, formulas of glasses, fields...) is refused, with
+    `--lenient` left out with a warning.
 
-    Read are files of Zemax (.zmx, .zar), CODE V (.seq), OSLO (.len), optiland (.json), ray-optics (.roa), and of batoid
-    and ours (.yaml). Glasses that a Zemax file needs and the bundled catalogue does not have go to an .agf file beside
-    it.
+    Read and written are files of Zemax (.zmx, read also .zar), CODE V (.seq), OSLO (.len), optiland (.json), ray-optics
+    (.roa), and of batoid and ours (.yaml). Glasses that a Zemax file needs and the bundled catalogue does not have go
+    to an .agf file beside it.
 
     **Examples**
 
@@ -104,6 +107,7 @@ def convert_command(
     - `pachon convert lens.zmx lens.yaml --glass-catalogue schott.agf --lenient`
     - `pachon convert lsst_v3.3_r lsst.zmx`
     - `pachon convert doublet.len doublet.json`
+    - `pachon convert lens.zmx lens.roa`
     - `pachon convert lsst_v3.3_r LSST_r.yaml --format batoid`
     """
     from ..models.io.prescription import save_telescope

@@ -50,7 +50,10 @@ if TYPE_CHECKING:
 #: Endings of lens files: Zemax and its archives, CODE V, OSLO, optiland, ray-optics.
 _LENS_FILES = (".zmx", ".zar", ".seq", ".len", ".json", ".roa")
 #: Endings of files that a telescope is written to, and their formats.
-WRITTEN = {".yaml": "pachon", ".yml": "pachon", ".zmx": "zemax", ".json": "optiland"}
+WRITTEN = {
+    ".yaml": "pachon", ".yml": "pachon", ".zmx": "zemax", ".seq": "codev", ".len": "oslo", ".json": "optiland",
+    ".roa": "rayoptics",
+}  # fmt: skip
 #: Endings of files that a telescope is read from.
 ENDINGS = (".yaml", ".yml", *_LENS_FILES)
 
@@ -138,10 +141,10 @@ def load_telescope(
 
 
 def prescription_digest(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 of a prescription file and of the files that it names: grids, meshes, glass catalogues.
+    """Return the SHA-256 of a prescription file and of the files that it names.
 
-    The catalogues that the user has configured belong to those of a lens file. That of a file that names no
-    other is the SHA-256 of its bytes.
+    These are grids, meshes, user-defined apertures and glass catalogues. The catalogues that the user has configured
+    belong to those of a lens file. That of a file that names no other is the SHA-256 of its bytes.
 
     Raises
     ------
@@ -154,6 +157,11 @@ def prescription_digest(path: str | os.PathLike[str]) -> str:
         from .user_glasses import user_catalogues
 
         named = [path.with_suffix(".agf").name, *(os.path.abspath(p) for p in user_catalogues())]
+        if path.suffix.lower() == ".zmx":
+            from .zemax.text import read_text
+            from .zemax.user_apertures import named_apertures
+
+            named += [os.path.abspath(p) for p in named_apertures(path, read_text(path))]
     else:
         named = sorted(set(_texts(read_mapping(path, max_bytes=MAX_BYTES))))
     # os.path takes every text, also such as are too long for a name.
@@ -187,7 +195,7 @@ def _bundled(name: str) -> Telescope:
 def save_telescope(
     telescope: Telescope, path: str | os.PathLike[str], *, format: str = "", lenient: bool = False
 ) -> None:
-    """Write a prescription file: YAML, ours or batoid's, a Zemax lens file or a file of optiland.
+    """Write a prescription file: YAML, ours or batoid's, or a lens file of another program.
 
     Glasses of a Zemax file that the bundled catalogue does not have go to a catalogue (.agf) of the same name beside
     it.
@@ -198,17 +206,18 @@ def save_telescope(
         Prescription to write.
     path : str or path
         File to write; it is replaced as a whole, or left as it was.
-    format : {"", "pachon", "batoid", "zemax", "optiland"}
-        Format; by default Zemax's where the name ends in ``.zmx``, optiland's for ``.json``, else ours.
+    format : {"", "pachon", "batoid", "zemax", "codev", "oslo", "optiland", "rayoptics"}
+        Format; by default that of the ending: Zemax (``.zmx``), CODE V (``.seq``), OSLO (``.len``), optiland
+        (``.json``), ray-optics (``.roa``), else ours.
     lenient : bool
-        Of pickups and solves that the format has no place for: warn, and write the values without them.
+        Of pickups, solves and system data that the format has no place for: warn, and write the file without them.
 
     Raises
     ------
     ConfigError
         If there is no such format.
     PrescriptionError
-        If the name does not end in .yaml, .yml, .zmx or .json, or the file cannot be written or hold the telescope.
+        If the name has none of these endings, or the file cannot be written or hold the telescope.
     """
     for file, text in prescription_files(telescope, path, format=format, lenient=lenient).items():
         write_bytes(file, text.encode(), PrescriptionError)
@@ -219,10 +228,12 @@ def prescription_files(
 ) -> dict[Path, str]:
     """Return the texts of the files that :func:`save_telescope` writes, by their paths; errors are its own."""
     target = Path(path)
+    if target.suffix.lower() == ".zar":
+        raise PrescriptionError("the layout of Zemax archives is not published: save as .zmx", file=target)
     if target.suffix.lower() not in WRITTEN:
         raise PrescriptionError(f"expected a name that ends in {', '.join(WRITTEN)}", file=target)
     format = format or WRITTEN[target.suffix.lower()]
-    check_choice("format", format, ("pachon", "batoid", "zemax", "optiland"))
+    check_choice("format", format, dict.fromkeys(("pachon", "batoid", *WRITTEN.values())))
     if format == "zemax":
         from .zemax.writer import catalogue_path, telescope_to_zemax
 
@@ -232,6 +243,18 @@ def prescription_files(
         from .batoid.writer import telescope_to_batoid
 
         return {target: telescope_to_batoid(telescope)}
+    if format == "codev":
+        from .codev.writer import telescope_to_codev
+
+        return {target: telescope_to_codev(telescope, lenient=lenient)}
+    if format == "oslo":
+        from .oslo.writer import telescope_to_oslo
+
+        return {target: telescope_to_oslo(telescope, lenient=lenient)}
+    if format == "rayoptics":
+        from .rayoptics.writer import telescope_to_rayoptics
+
+        return {target: telescope_to_rayoptics(telescope, lenient=lenient)}
     if format == "optiland":
         from .optiland.writer import telescope_to_optiland
 

@@ -126,7 +126,8 @@ def test_info_cuts_no_column(in_folder, capsys):
 
 def test_a_name_that_cannot_be_read_is_not_written(in_folder, capsys):
     assert main(["convert", LENS, "lens.foo"]) == 2
-    assert capsys.readouterr().err == "pachon: error: lens.foo: expected a name that ends in .yaml, .yml, .zmx, .json\n"
+    endings = ".yaml, .yml, .zmx, .seq, .len, .json, .roa"
+    assert capsys.readouterr().err == f"pachon: error: lens.foo: expected a name that ends in {endings}\n"
     assert not (in_folder / "lens.foo").exists()
 
 

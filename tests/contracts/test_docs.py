@@ -75,7 +75,7 @@ def test_the_page_of_lens_files_runs_on_lenses(tmp_path, monkeypatch):
     )
     for block in BLOCK.findall(PAGES["files.md"]):
         exec(compile(block, "files.md", "exec"), {})
-    assert (tmp_path / "again.json").stat().st_size > 500
+    assert (tmp_path / "again.roa").stat().st_size > 500
 
 
 @pytest.mark.slow

@@ -1,12 +1,12 @@
 """Translate a CODE V lens file (.seq) into the terms of a Zemax file.
 
-Supported commands: RDM, DIM, TITLE, EPD, FNO, NAO, WL, WTW, REF, XAN YAN, XOB YOB, XIM YIM, XRI YRI, WTF, VUX VLX VUY
-VLY, before the surfaces or after them; the surfaces SO S SI (curvature, or with RDM radius; thickness, glass), RDY CUY
-THI GLA, STO, SLB, SPH CON ASP with K and A to G (r^4 to r^16), XDE YDE ZDE ADE BDE CDE with DAR, BEN and REV, CIR (OBS,
-HOL) REX REY and ELX ELY with ADX ADY, pick-ups PIK, private glasses PRV PWL END. ADE and BDE are left-handed, CDE is
-right-handed (CODE V reference manual, "Decentered surfaces"), Zemax's tilts are all right-handed. A glass is a name
-(NBK7_SCHOTT), REFL, or a number (517642). Solves are passed over where their solution stands in the file. Rays are
-aimed at the stop, as CODE V's chief rays are.
+Supported commands: RDM, DIM, TITLE, EPD, FNO, NAO, WL, WTW, REF, TEM (deg C), PRE (mm of mercury), XAN YAN, XOB YOB,
+XIM YIM, XRI YRI, WTF, VUX VLX VUY VLY, before or after the surfaces SO S SI (curvature or radius, thickness, glass),
+RDY CUY THI GLA, STO, SLB, SPH CON ASP with K and A to G (r^4 to r^16), XDE YDE ZDE ADE BDE CDE with DAR, BEN and REV,
+CIR (OBS, HOL, EDG) REX REY and ELX ELY with ADX ADY, pick-ups PIK, private glasses PRV PWL END. ADE and BDE are
+left-handed, CDE is right-handed (CODE V reference manual, "Decentered surfaces"), Zemax's tilts are all right-handed.
+A glass is a name (NBK7_SCHOTT), REFL, or a number (517642). Solves are passed over where their solution is given. Rays
+are aimed at the stop, as CODE V's chief rays are.
 """
 
 from __future__ import annotations
@@ -23,18 +23,22 @@ from ...media.medium import Medium
 from ...media.tabulated import TabulatedIndex
 from ..zemax.file import Block, Findings, ZemaxFile
 from ..zemax.placed import made_record
-from ..zemax.text import Record, read_text
+from ..zemax.text import Record, read_text, scaled
 
 UNITS = {"M": "MM", "MM": "MM", "C": "CM", "CM": "CM", "I": "IN", "IN": "IN"}
 FIELDS = {
     "XAN": ("XFLN", 0), "YAN": ("YFLN", 0), "XOB": ("XFLN", 1), "YOB": ("YFLN", 1),
     "XIM": ("XFLN", 2), "YIM": ("YFLN", 2), "XRI": ("XFLN", 3), "YRI": ("YFLN", 3),
 }  # fmt: skip
-#: System apertures; the f-number is that of the image space at the conjugates of the lens, Zemax's FNUM 1.
-APERTURES = {"EPD": ("ENPD",), "FNO": ("FNUM", "1"), "NAO": ("OBNA",)}
+#: System apertures besides the f-number (FNO), which is that of the image space at the conjugates of the lens.
+APERTURES = {"EPD": "ENPD", "NAO": "OBNA"}
+#: Millimetres of mercury in an atmosphere.
+MMHG = 760.0
 #: Vignetting factors: the parts by which the upper and lower halves of the pupil shrink, along x and y.
 VIGNETTING = ("VUX", "VLX", "VUY", "VLY")
-SYSTEM = frozenset(("RDM", "DIM", "TIT", "WL", "WTW", "WTF", "REF", "PRV", *VIGNETTING, *APERTURES, *FIELDS))
+#: Lists of numbers of the whole system.
+LISTS = ("WTW", "FNO", "TEM", "PRE", *VIGNETTING)
+SYSTEM = frozenset(("RDM", "DIM", "TIT", "WL", "WTF", "REF", "PRV", *LISTS, *APERTURES, *FIELDS))
 LONG_NAMES = {"TITLE": "TIT", "STOP": "STO"}
 POWERS = "ABCDEFG"
 #: Numbers of surfaces.
@@ -48,7 +52,7 @@ REFUSED = {
 #: and drawing.
 _IGNORED = """
 LEN NEW DER INI GO CA CCY THC KC AC BC CC DC EC FC GC HC IC JC ADC BDC CDC XDC YDC ZDC CUM
-UMY SPH CON ASP RDM WTX WTY VIE DRA COM CUX THM GLC TEM PRE CRA
+UMY SPH CON ASP RDM WTX WTY VIE DRA COM CUX THM GLC CRA
 POL CLS WID
 """
 IGNORED = frozenset(_IGNORED.split())
@@ -151,6 +155,11 @@ class _Translation:
             self.surfaces[1].lines.append(made_record(self.path, "surface 1", ("STOP",)))
         # Chief rays pass the middle of the stop.
         self._header_line("RAIM", 0, 1)
+        for f_number in self.lists.get("FNO", [])[:1]:
+            self._header_line("FNUM", f_number, int(abs(self.values[0].get("THI", 0.0)) < INFINITE))
+        if "TEM" in self.lists or "PRE" in self.lists:
+            celsius, pressure = (self.lists.get(key) or [usual] for key, usual in (("TEM", 20.0), ("PRE", MMHG)))
+            self._header_line("ENVD", celsius[0], pressure[0] / MMHG, 0)
         weights = self.lists.get("WTW", [])
         for i, wave in enumerate(self.waves):
             amount = weights[i] if i < len(weights) else 1.0
@@ -194,11 +203,10 @@ class _Translation:
         elif key == "TIT":
             self.header.lines.append(replace(command, keyword="NAME", text=command.text.strip("'\" ")))
         elif key in APERTURES:
-            keyword, *flag = APERTURES[key]
-            add(keyword, command.number(0), *flag)
+            add(APERTURES[key], command.number(0))
         elif key == "WL":
-            self.waves = [command.number(i) / 1e3 for i in range(len(words))]
-        elif key in ("WTW", *VIGNETTING):
+            self.waves = [scaled(command.number(i), -3) for i in range(len(words))]
+        elif key in LISTS:
             self.lists[key] = [command.number(i) for i in range(len(words))]
         elif key == "WTF":
             add("FWGN", *(repr(command.number(i)) for i in range(len(words))))
@@ -262,7 +270,9 @@ class _Translation:
             if kinds[0] not in ("CLR", "OBS", "HOL", "EDG") or kinds[1:]:
                 raise command.error("CIR with one of CLR, OBS, HOL, EDG")
             # An edge is where the glass ends and stops nothing; light that falls into a hole is lost.
-            if kinds[0] != "EDG":
+            if kinds[0] == "EDG":
+                values["EDGE"] = radius
+            else:
                 name = "CLEAR" if kinds[0] == "CLR" else "OBSCURED"
                 if name in values and (kinds[0] == "HOL" or not all(n.isalpha() for n in names)):
                     text = f"{command.shown}: one aperture and one obscuration of a surface are read"
@@ -286,7 +296,7 @@ class _Translation:
             return
         numbers = [command.number(i) for i in range(len(command.words))]
         if command.keyword == "PWL":
-            self.private_waves = tuple(v / 1e9 for v in numbers)
+            self.private_waves = tuple(scaled(v, -9) for v in numbers)
             return
         if len(numbers) != len(self.private_waves):
             raise command.error(f"{len(self.private_waves)} indices, one for each wavelength of PWL")
@@ -353,6 +363,7 @@ class _Translation:
                 lines.append(("CLAP", values.get("OBSCURED", 0.0), values["CLEAR"]))
             elif "OBSCURED" in values:
                 lines.append(("OBSC", 0.0, values["OBSCURED"]))
+            lines += [("DIAM", values["EDGE"])] if "EDGE" in values else []
             if "REX" in values or "REY" in values:
                 lines.append(("SQAP", values.get("REX", 0.0), values.get("REY", 0.0)))
             if "ELX" in values or "ELY" in values:

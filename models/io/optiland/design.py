@@ -7,13 +7,13 @@ a plane of its own for the stop. Fields are in degrees or millimetres, rotated w
 from __future__ import annotations
 
 import math
-from decimal import Decimal
 from typing import Any
 
 from ....core.errors import PrescriptionError
 from ...design_data import DesignData
 from ...paraxial import stop_makes_pupil
 from ...telescope import Telescope
+from ..zemax.text import scaled
 from .reader import APERTURES, FIELD_TYPES
 
 MM = 1e-3
@@ -84,16 +84,13 @@ def _compression(row: tuple[float, float, float, float, float]) -> tuple[float, 
 
 
 def _wavelengths(t: Telescope) -> dict[str, Any]:
-    """Return the stated wavelengths, or the default and the edges of the band.
-
-    The decimal point of a number is moved, so that it loads back equal.
-    """
+    """Return the stated wavelengths, or the default and the edges of the band."""
     data: DesignData = t.design_data
     lengths = list(data.wavelengths or dict.fromkeys([t.default_wavelength, *(t.band or ())]))
     weights = data.wavelength_weights or (1.0,) * len(lengths)
     rows = [
         {
-            "value": float(Decimal(repr(float(length))).scaleb(6)),
+            "value": scaled(length, 6),
             "is_primary": length == t.default_wavelength,
             "unit": "um",
             "weight": weight,

@@ -1,11 +1,11 @@
 """Translate a lens file of OSLO (.len) into the terms of a Zemax file.
 
-Supported commands: LEN NEW, UNI (mm for each lens unit), EBR, NAO, FNO, NAP, ANG, OBH, GIH, WV, WW and these
-numbered; for surfaces, parted by NXT up to END, RD, CV, CVX, TH, AP (CHK), AIR, RFL, GLA (name, index, indices at the
-wavelengths, MOD), AST, CC, AD AE AF AG, ASP with ASR, ARA and ASX, DCX DCY DCZ TLA TLB TLC with DT, TOX TOY TOZ, GC,
-RCO and BEN, pick-ups PK CV, TH, GLA, AP, and the solves PY and PU of the axial ray. Sources: OSLO Program Reference and
-Optics Reference (Lambda Research), OSLO User's Guide ("Assignment commands"). The first wavelength is the primary one;
-without AST the first surface is the stop.
+Supported commands: LEN NEW, UNI (mm for each lens unit), EBR, NAO, FNO, NAP, ANG, OBH, GIH, TEM (deg C), PRE (atm), WV,
+WW and these numbered; for surfaces, parted by NXT up to END, NOT (their name), RD, CV, CVX, TH, AP (CHK), AIR, RFL, GLA
+(name, index, indices at the wavelengths, MOD), AST, CC, AD AE AF AG, ASP with ASR, ARA and ASX, DCX DCY DCZ TLA TLB TLC
+with DT, TOX TOY TOZ, GC, RCO and BEN, pick-ups PK CV, TH, GLA, AP, and the solves PY and PU of the axial ray. Sources:
+OSLO Program Reference and Optics Reference (Lambda Research), OSLO User's Guide ("Assignment commands"). The first
+wavelength is the primary one; without AST the first surface is the stop.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ...media.tabulated import TabulatedIndex
 from ..glass_search import find_glass
 from ..zemax.file import Findings, ZemaxFile
 from ..zemax.placed import Line, PlacedSurfaces, numbered
-from ..zemax.text import Record, read_text
+from ..zemax.text import Record, read_text, scaled
 from .frames import surface_frames
 from .solves import AxialRay
 
@@ -43,7 +43,7 @@ NUMBERS = frozenset(_NUMBERS.split())
 SHAPE = r"CVX|A[DEFG]|AS\d+"
 #: Commands without effect on rays: names, notes, drawing, groups, expansion, coatings, printing.
 _IGNORED = """
-DES NOT LMO LMN LME DRW LDP CBK CALLBACK GPRT TCE ELMDF1 ELMDF2 BDI BDD VX PF TLR COA CTG TEM PRE RDF THF TEX
+DES LMO LMN LME DRW LDP CBK CALLBACK GPRT TCE ELMDF1 ELMDF2 BDI BDD VX PF TLR COA CTG RDF THF TEX
 """
 IGNORED = frozenset(_IGNORED.split())
 #: Surfaces that are not read, where their value is not zero.
@@ -105,6 +105,7 @@ class _Translation:
         self.field: Record | None = None
         self.stop = 1
         self.title = ""
+        self.environment: dict[str, float] = {}
         self.check_apertures = True
 
     def file(self) -> ZemaxFile:
@@ -143,6 +144,10 @@ class _Translation:
             self.aperture = command
         elif key in FIELDS:
             self.field = command
+        elif key in ("TEM", "PRE"):
+            self.environment[key] = command.number(0)
+        elif key == "NOT":
+            current.name = " ".join(command.text.strip('"').split())
         elif key == "UNI":
             self._unit(command)
         elif indexed:
@@ -280,13 +285,16 @@ class _Translation:
         if kind == 1 and math.isinf(self.distance):
             # An object height at infinity stands for its angle.
             kind, largest = 0, math.degrees(math.atan(largest / abs(self.surfaces[0].values.get("TH", math.inf))))
-        head("FTYP", str(kind), "0", str(len(FRACTIONS)), str(len(self.waves)))
-        head("XFLN", *(0.0 for _ in FRACTIONS))
-        head("YFLN", *(fraction * largest for fraction in FRACTIONS))
+        fields = [fraction * largest for fraction in FRACTIONS] if largest else [0.0]
+        head("FTYP", str(kind), "0", str(len(fields)), str(len(self.waves)))
+        head("XFLN", *(0.0 for _ in fields))
+        head("YFLN", *fields)
         for number, wave in enumerate(self.waves, start=1):
             weight = self.weights[number - 1] if number <= len(self.weights) else 1.0
             head("WAVM", str(number), wave, weight)
         head("PWAV", "1")
+        if self.environment:
+            head("ENVD", self.environment.get("TEM", 20.0), self.environment.get("PRE", 1.0), "0")
 
     def _aperture_line(self) -> None:
         command, finite = self.aperture, math.isfinite(self.distance)
@@ -321,6 +329,7 @@ class _Translation:
         for surface, (position, axes) in zip(others, frames, strict=True):
             lines = [*self._shape_lines(surface), *self._glass_lines(surface)]
             lines += [("STOP",)] if surface.number == self.stop else []
+            lines += [("COMM", surface.name)] if surface.name else []
             radius = surface.values.get("AP", 0.0)
             lines += [("DIAM", radius)] if radius else []
             lines += [("CLAP", 0.0, radius)] if radius and surface.checked and self.check_apertures else []
@@ -386,6 +395,6 @@ class _Translation:
             return model_glass(indices[0], 0.0)
         if len(indices) != len(surface.waves):
             raise PrescriptionError(f"expected {len(surface.waves)} indices, one for each wavelength (WV)")
-        table = sorted(zip((w / 1e6 for w in surface.waves), indices, strict=True))
+        table = sorted(zip((scaled(w, -6) for w in surface.waves), indices, strict=True))
         waves, values = zip(*table, strict=True)
         return TabulatedIndex(waves, values, name=name)

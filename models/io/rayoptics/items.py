@@ -2,7 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from ..json_items import JsonObject
+
+
+def instance(module: str, kind: str, values: dict[str, Any]) -> dict[str, Any]:
+    """Return the items of an object of a class of ray-optics, to be written."""
+    return {"__instance_type__": [module, kind], "attributes": values}
+
+
+def array(values: list[float]) -> dict[str, Any]:
+    """Return the items of an array of NumPy, to be written."""
+    return {"__ndarray__": values, "dtype": "float64", "shape": [len(values)]}
 
 
 def attributes(items: JsonObject, key: str | None = None) -> JsonObject:

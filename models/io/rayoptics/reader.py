@@ -7,8 +7,8 @@ the profiles of ``shapes``, their decentres, clear apertures, gaps and media, th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
-from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from ...rotation import rotation_matrix
 from ..json_items import JsonObject
 from ..zemax.file import Findings, ZemaxFile
 from ..zemax.placed import INFINITE, Line, PlacedSurfaces
+from ..zemax.text import scaled
 from .items import attributes, class_name, named, numbers
 from .media import medium_lines
 from .shapes import profile_lines
@@ -25,6 +26,8 @@ UNITS = {"mm": "MM", "cm": "CM", "m": "METER", "in": "IN", "inches": "IN"}
 #: Aperture line of Zemax by space and kind of the pupil; the f-number is that of the image space.
 PUPILS = {("object", "epd"): "ENPD", ("object", "NA"): "OBNA", ("image", "f/#"): "FNUM", ("image", "NA"): "FNUM"}
 FIELDS = {("object", "angle"): 0, ("object", "height"): 1, ("image", "height"): 2}
+#: Millimetres of mercury in an atmosphere.
+MMHG = 760.0
 INTERACTIONS = ("transmit", "reflect", "dummy", "phantom")
 #: Attributes of a surface without effect on the paths of rays.
 IGNORED = ("delta_n", "edge_apertures", "z_type")
@@ -165,9 +168,9 @@ class _Translation:
         weights = (weights + [1.0] * len(lengths))[: len(lengths)]
         self._fields(attributes(optics, "field_of_view"), len(lengths))
         for number, (wave, weight) in enumerate(zip(lengths, weights, strict=True), start=1):
-            # The decimal point is moved: 587.6 is the float 0.5876.
-            head("WAVM", str(number), float(Decimal(repr(wave)).scaleb(-3)), weight)
+            head("WAVM", str(number), scaled(wave, -3), weight)
         head("PWAV", str(waves.whole("reference_wvl") + 1))
+        head("ENVD", system.number("temperature", 20.0), system.number("pressure", MMHG) / MMHG, "0")
 
     def _pupil(self, pupil: JsonObject) -> None:
         space, kind = self._key(pupil)
@@ -180,6 +183,11 @@ class _Translation:
                 pupil.refuse(named(pupil, "value"), "a number other than 0")
             finite = abs(self.distance) < INFINITE
             self.found.head("FNUM", abs(value) if kind == "f/#" else 0.5 / abs(value), str(int(finite)))
+        elif keyword == "OBNA":
+            if class_name(self.gaps[0].child("medium")) != "Air":
+                self.findings.report(pupil.problem("numerical aperture of an object in a medium other than air"))
+            # It is the slope of the marginal ray there.
+            self.found.head("OBNA", math.sin(math.atan(value)))
         else:
             self.found.head(keyword, value)
 

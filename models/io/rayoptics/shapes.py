@@ -9,17 +9,22 @@ RadialPolynomial + ``coefs`` of r, r^2..., or ``coef1``, ``coef2``...; its conic
 
 from __future__ import annotations
 
+from typing import Any
+
+from ....core.errors import PrescriptionError
 from ..json_items import JsonObject
+from ..profile import Profile
 from ..zemax.file import Findings
 from ..zemax.placed import Line, numbered
 from ..zemax.shapes import MOST_ODD
-from .items import attributes, class_name, numbers
+from .items import attributes, class_name, instance, numbers
 
 #: Zemax type, and power of r of each step of the coefficients.
 POLYNOMIALS = {"EvenPolynomial": ("EVENASPH", 2), "RadialPolynomial": ("ODDASPHE", 1)}
 #: Attributes that are copies of others or count them.
 _COPIES = ("max_nonzero_coef", *(f"coef{i}" for i in range(1, 21)), "coefs")
 _MOST_TERMS = 10
+_MODULE = "rayoptics.elem.profiles"
 #: Parameters of Zemax's even aspheres that hold coefficients.
 _PARAMETERS = 8
 
@@ -45,3 +50,19 @@ def profile_lines(profile: JsonObject, findings: Findings) -> list[Line]:
     if step == 1 or not any(terms[_PARAMETERS:]):
         return [("TYPE", name), *head, *numbered("PARM", terms)]
     return [("TYPE", "XASPHERE"), *head, *numbered("XDAT", [float(len(terms)), 1.0, *terms])]
+
+
+def profile_items(profile: Profile) -> dict[str, Any]:
+    """Return the items of a profile; PrescriptionError where ray-optics has none like it."""
+    if profile.terms or profile.curvature_x is not None:
+        raise PrescriptionError("shape: a ray-optics file is written with conics and powers of r")
+    terms = [*(profile.odd or profile.even)]
+    values = {"cv": profile.curvature}
+    if not any(terms):
+        kind = "Conic" if profile.conic else "Spherical"
+        return instance(_MODULE, kind, values | ({"cc": profile.conic} if profile.conic else {}))
+    kind = "RadialPolynomial" if profile.odd else "EvenPolynomial"
+    coefficients = [*terms, *[0.0] * (_MOST_TERMS - len(terms))]
+    return instance(
+        _MODULE, kind, values | {"cc": profile.conic, "coefs": coefficients, "max_nonzero_coef": len(terms)}
+    )

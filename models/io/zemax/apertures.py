@@ -1,4 +1,4 @@
-"""Apertures of Zemax surfaces: lines CLAP, FLAP, OBSC, SQAP, SQOB, ELAP, ELOB and SPID, decentred by OBDC."""
+"""Apertures of Zemax surfaces: lines CLAP, FLAP, OBSC, SQAP, SQOB, ELAP, ELOB, SPID, USAP, USOB, decentred by OBDC."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import math
 import numpy as np
 
 from ....core.errors import PrescriptionError
-from ...aperture import Annulus, Aperture, Circle, Complement, Ellipse, Rectangle, Union, Vane
+from ...aperture import Annulus, Aperture, Circle, Complement, Ellipse, Rectangle, Union, Vane, shifted
 from .file import Block, Findings
 from .text import number_text
+from .user_apertures import read_user_aperture
 
 
 def read_aperture(block: Block, unit: float, findings: Findings) -> Aperture | None:
@@ -47,7 +48,10 @@ def read_aperture(block: Block, unit: float, findings: Findings) -> Aperture | N
         found.append(Complement(region) if keyword in ("OBSC", "SQOB", "ELOB", "SPID") else region)
     for keyword in ("UDAD", "USAP", "USOB", "UDAP"):
         for line in block.all(keyword)[:1]:
-            findings.report(line.problem(f"{line.shown}: user-defined apertures are not read"))
+            try:
+                found.append(shifted(read_user_aperture(line, unit), x, y))
+            except PrescriptionError as error:
+                findings.report(error, "taken as none")
     if len(found) > 1:
         raise block.lines[0].error("one aperture in this surface")
     return found[0] if found else None

@@ -14,6 +14,8 @@ XPOLYNOM  conic + sum of XDAT (2 + i) times x, y, x^2, xy, y^2, x^3... of x / R,
 XASPHERE  conic + sum of XDAT (2 + i) (r / R)^(2 i), R = XDAT 2, XDAT 1 terms
 TILTSURF  the plane x PARM 1 + y PARM 2
 GRID_SAG  as EVENASPH + a grid of nodes (GDAT nx ny dx dy; GARR i sag ...), interpolated by bicubics
+QED_TYPE  conic + (r / R)^4 sum of XDAT (3 + m) Q_(m - 1)((r / R)^2), R = XDAT 3, XDAT 2 terms; Q those of Forbes (Qcon,
+          XDAT 1 is 1): Jacobi polynomials P^(0, 4)(2 x - 1), so an even asphere (2007, Opt. Express 15, 5218)
 ========= ===================================================================================================
 """
 
@@ -35,11 +37,13 @@ from .text import number_text
 
 TYPES = (
     *("STANDARD", "EVENASPH", "ODDASPHE", "BICONICX", "TOROIDAL"),
-    *("SZERNSAG", "XPOLYNOM", "XASPHERE", "TILTSURF", "GRID_SAG"),
+    *("SZERNSAG", "XPOLYNOM", "XASPHERE", "TILTSURF", "GRID_SAG", "QED_TYPE"),
 )
 MOST_TERMS = 1000
 MOST_ODD = 30
 MOST_NODES = 4_000_000
+#: Qcon terms at most: more have powers of r that cancel beyond the twelfth digit.
+MOST_Q = 10
 
 
 def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
@@ -71,13 +75,15 @@ def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
     elif kind == "XASPHERE":
         radius, terms = _extra_data(block, unit)
         parts = _even_asphere(curvature, conic, [a / radius ** (2 * i) for i, a in enumerate(terms, start=1)] or [0.0])
+    elif kind == "QED_TYPE":
+        parts = _even_asphere(curvature, conic, _qcon_powers(block, unit, findings))
     for i, value in sorted(parameters.items()):
         findings.report(block.problem(f"PARM {i} {value:g}: not understood for TYPE {kind}"))
     if kind in ("SZERNSAG", "TOROIDAL", "XPOLYNOM"):
         parts += _expansion(block, kind, unit)
     elif kind == "GRID_SAG":
         parts.append(_grid(block, unit))
-    elif kind != "XASPHERE":
+    elif kind not in ("XASPHERE", "QED_TYPE"):
         for i, value in block.table("XDAT").items():
             if value != 0:
                 findings.report(block.problem(f"XDAT {i} {value:g}: not understood for TYPE {kind}"))
@@ -144,6 +150,31 @@ def _extra_data(block: Block, unit: float) -> tuple[float, list[float]]:
     if count > MOST_TERMS:
         raise line.error(f"at most {MOST_TERMS} terms")
     return radius, [data.get(2 + i, 0.0) * unit for i in range(1, count + 1)]
+
+
+def _qcon_powers(block: Block, unit: float, findings: Findings) -> list[float]:
+    """Return the coefficients of r^2, r^4, r^6... [m] of the Qcon terms of a surface.
+
+    ``Q_m(x)`` is the sum over s of ``(-1)^(m + s) C(m, s) C(m + 4 + s, m) x^s``.
+    """
+    data = block.table("XDAT")
+    line = next(iter(block.all("XDAT")), block.lines[0])
+    if data.get(1, 0.0) != 1.0:
+        # u^2 (1 - u^2) sum of a_m Qbfs_m(u^2), u = r / R, over the cosine of the slope of the conic: no polynomial.
+        text = f"XDAT 1 {data.get(1, 0.0):g}: Q-type asphere of Forbes's Qbfs terms; expected Qcon (1)"
+        findings.report(block.problem(text), "taken as its conic")
+        return [0.0]
+    count, radius = round(data.get(2, 0.0)), data.get(3, 0.0) * unit
+    if not 0 <= count <= MOST_Q:
+        raise line.error(f"up to {MOST_Q} Qcon terms as XDAT 2, not {count}")
+    if count and radius <= 0:
+        raise line.error("a positive normalisation radius as XDAT 3")
+    terms = [data.get(4 + m, 0.0) * unit for m in range(count)]
+    powers = [
+        sum((-1) ** (m + s) * math.comb(m, s) * math.comb(m + 4 + s, m) * terms[m] for m in range(s, count))
+        for s in range(count)
+    ]
+    return [0.0, *(a / radius ** (2 * s + 4) for s, a in enumerate(powers))]
 
 
 def _expansion(block: Block, kind: str, unit: float) -> list[Shape]:

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from decimal import Decimal
 
 from ...paraxial import ParaxialSurfaces, StopImage
 from .design import Fields
 from .file import Block, Findings, ZemaxFile
+from .text import scaled
 
 UNITS = {"MM": 1e-3, "CM": 1e-2, "IN": 0.0254, "INCH": 0.0254, "METER": 1.0, "METERS": 1.0, "M": 1.0}
 #: Field radius [rad] of a file with the axis alone.
@@ -59,8 +59,7 @@ def read_wavelengths(header: Block) -> Wavelengths:
     primary = header.number("PWAV", 1.0)
     if not 1 <= primary <= len(values) or primary != int(primary):
         raise header.problem(f"PWAV {primary:g}: expected 1 to {len(values)}")
-    # The decimal point of the number as written is moved: 0.6328 is the float 632.8e-9.
-    metres = tuple(float(Decimal(repr(v)).scaleb(-6)) for v in values)
+    metres = tuple(scaled(v, -6) for v in values)
     return Wavelengths(metres, tuple(weights), metres[int(primary) - 1])
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 
 from ....core.errors import PrescriptionError, cut_short
@@ -33,6 +34,11 @@ def decoded(raw: bytes, source: str) -> str:
 def number_text(value: float) -> str:
     """Return the shortest text that loads back equal; zero without a minus sign."""
     return repr(float(value) + 0.0)
+
+
+def scaled(number: float, power: int) -> float:
+    """Return a number with its decimal point moved to the right: 0.6328 and -6 are the float 632.8e-9."""
+    return float(Decimal(repr(float(number))).scaleb(power))
 
 
 @dataclass(frozen=True, slots=True)

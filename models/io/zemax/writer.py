@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,7 @@ from .frame import HALF_TURN, rotated_aperture, rotated_shape
 from .links import add_link_lines
 from .reader import PUPIL_COMMENT
 from .shapes import shape_lines
-from .text import number_text
+from .text import number_text, scaled
 
 MM = 1e-3
 #: Names of the units of a file [m].
@@ -141,8 +140,7 @@ def _wavelength_lines(t: Telescope) -> list[str]:
 
 
 def _micrometres(wavelength: float) -> str:
-    # The decimal point of the number as written is moved, so that it loads back equal.
-    return repr(float(Decimal(repr(float(wavelength))).scaleb(6)))
+    return repr(scaled(wavelength, 6))
 
 
 def _break_lines(values: list[float], order: int) -> list[str]:

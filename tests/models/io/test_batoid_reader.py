@@ -198,8 +198,8 @@ def test_what_batoid_cannot_hold_is_refused_by_name(lsst_r, tmp_path, change, me
 
 
 def test_formats_have_names(lsst_r, tmp_path):
-    with pytest.raises(ConfigError, match="format = 'oslo': expected one of pachon, batoid, zemax"):
-        save_telescope(lsst_r, tmp_path / "out.yaml", format="oslo")
+    with pytest.raises(ConfigError, match="format = 'mine': expected one of pachon, batoid, zemax"):
+        save_telescope(lsst_r, tmp_path / "out.yaml", format="mine")
 
 
 def test_groups_that_are_no_neighbours_or_overlap_are_kept_beside(lsst_r, tmp_path):

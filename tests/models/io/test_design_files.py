@@ -224,6 +224,6 @@ def test_a_telescope_built_by_hand_can_be_read_again(tmp_path):
 
 
 def test_a_name_that_could_not_be_read_again_is_not_written(tmp_path):
-    with pytest.raises(PrescriptionError, match=r"x\.foo: expected a name that ends in \.yaml, \.yml, \.zmx, \.json"):
+    with pytest.raises(PrescriptionError, match=r"x\.foo: expected a name that ends in \.yaml, \.yml, \.zmx, \.seq, "):
         save_telescope(load_telescope("paul_baker"), tmp_path / "x.foo")
     assert not (tmp_path / "x.foo").exists()

@@ -368,7 +368,11 @@ def test_fields_are_angles_or_heights(tmp_path, kind, distance, expected):
             "TYPE STANDARD\n  XDAT 1 3\n  CURV -0.001",
             "surface 2: XDAT 1 3: not understood",
         ),
-        ("  DIAM 50", "  USAP 3 4\n  DIAM 50", "surface 2: USAP 3 4: user-defined apertures are not read"),
+        (
+            "  DIAM 50",
+            "  USAP 3 4\n  DIAM 50",
+            "surface 2: USAP 3 4: user-defined apertures are read where USAP or USOB names",
+        ),
         ("  DIAM 50", "  NEWK 3 4\n  DIAM 50", "surface 2: NEWK 3 4: this keyword is not understood"),
         ("ENVD 20 1 0", "ENVD 20 1 0\nNEWH 3", "line 7: NEWH 3: this keyword is not understood"),
         ("ENVD 20 1 0", "ENVD 5 0.7 1", "ENVD 5 0.7 1: indices are not adjusted"),

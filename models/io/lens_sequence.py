@@ -1,0 +1,331 @@
+"""Surfaces and system data of a telescope in the terms of a lens file: light along +z, one axis, a unit of length.
+
+Every surface stands on the axis of the object space, a thickness behind the one before it, decentred and tilted by
+itself; the next one counts from the axis again. Where stop and stated aperture make the telescope's entrance pupil,
+they are written; else a plane of its own in front, whose comment the reader knows, carries the stop.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...core.errors import PrescriptionError, error_context
+from ..aperture import Aperture, Complement
+from ..design_data import DesignData
+from ..media.air import STANDARD_ATMOSPHERE, ZERO_CELSIUS
+from ..media.medium import ConstantIndex, Medium
+from ..media.tabulated import TabulatedIndex
+from ..paraxial import stop_makes_pupil
+from ..rotation import rotation_angles
+from ..shapes.shape import Plane, Shape
+from ..surface import Interaction, Surface
+from ..telescope import VACUUM, Telescope
+from .glass_catalogue import MAKERS, GlassCatalogue
+from .glass_search import find_glass
+from .writable import report_unheld, require_met, require_sequential
+from .zemax.file import Findings
+from .zemax.frame import HALF_TURN, rotated_aperture, rotated_shape
+from .zemax.reader import PUPIL_COMMENT
+
+MM = 1e-3
+#: Cosine, of the local z axis with the light, below which it is against the sense that the mirrors make.
+_AGAINST = -1e-12
+#: Words that are no names of glasses.
+_WORDS = ("AIR", "REFL", "MIRROR", "MOD")
+#: Decimals of thicknesses: a millimetre is taken apart to a femtometre.
+_DECIMALS = 12
+#: Newton steps to a mirror.
+_STEPS = 20
+
+
+@dataclass(frozen=True)
+class SequenceSurface:
+    """A surface of a lens file; lengths in metres, shape and aperture in its own frame with +z along the first light.
+
+    `decentre` is along x and y from the axis [m], `tilt` about x, the new y and the new z, right-handed [rad];
+    `thickness` leads to the next surface along the axis [m]. `before` and `after` are the media on either side.
+    """
+
+    name: str
+    interaction: Interaction
+    shape: Shape
+    aperture: Aperture | None
+    semi_diameter: float | None
+    decentre: tuple[float, float]
+    tilt: tuple[float, float, float]
+    thickness: float
+    before: Medium
+    after: Medium
+    stop: bool = False
+
+    @property
+    def off_axis(self) -> bool:
+        """Whether it is decentred or tilted."""
+        return any(self.decentre) or any(self.tilt)
+
+
+@dataclass(frozen=True)
+class LensSequence:
+    """Surfaces and system data of a telescope as a lens file states them.
+
+    `unit` is that of the file [m], `distance` that of the object from the first surface [m]. Fields are in degrees or
+    metres in the axes of the file, vignetting factors in the same axes; `aperture` is as in
+    :class:`~pachon.models.design_data.DesignData`, for the plane that carries the pupil its diameter.
+    """
+
+    telescope: Telescope
+    file: str
+    findings: Findings
+    unit: float
+    distance: float
+    surfaces: tuple[SequenceSurface, ...]
+    aperture: tuple[str, float]
+    wavelengths: tuple[float, ...]
+    wavelength_weights: tuple[float, ...]
+    field_type: str
+    fields: tuple[tuple[float, float], ...]
+    field_weights: tuple[float, ...]
+    vignetting: tuple[tuple[float, float, float, float, float], ...]
+
+    @classmethod
+    def of(
+        cls,
+        telescope: Telescope,
+        file: str,
+        units: Collection[float],
+        *,
+        aimed: str = "off",
+        lenient: bool = False,
+        along_light: bool = False,
+    ) -> LensSequence:
+        """Return the surfaces and data of a telescope for a kind of `file`, as its name is said in messages.
+
+        `units` are the units of length [m] that it may have, `aimed` is the aiming of its program. With `along_light`
+        local z axes are along the light in front of an even number of mirrors, against it in front of an odd one.
+        PrescriptionError for a telescope that no file of a sequence of surfaces can hold, and unless lenient, which
+        makes it a warning, for links and coatings.
+        """
+        t, data, findings = require_met(telescope), telescope.design_data, Findings(lenient)
+        with error_context(subject=t.name):
+            require_sequential(t, file)
+            if data.telecentric:
+                raise PrescriptionError(f"telecentric object space: {file} has no place for it")
+            report_unheld(t, (*data.pickups, *data.solves), file, lenient=lenient)
+            own_stop = stop_makes_pupil(t)
+            if data.stop is not None and not own_stop:
+                said = f"stop = {data.stop}: with surfaces off the axis it does not make the stated pupil"
+                findings.note(PrescriptionError(said), "a plane in front carries the stop and the pupil")
+            if own_stop and data.aiming != aimed:
+                said = f"aiming = {data.aiming}: {file} does not state how rays are aimed"
+                findings.note(PrescriptionError(said), f"read back it is {aimed}")
+            surfaces = _surfaces(t, data.stop if own_stop else None, along_light=along_light)
+        aperture = ("entrance_pupil", t.pupil_diameter)
+        if own_stop and data.aperture is not None and data.aperture_value is not None:
+            aperture = (data.aperture, data.aperture_value)
+        waves = data.wavelengths or tuple(dict.fromkeys([t.default_wavelength, *(t.band or ())]))
+        fields, size = data.fields, math.degrees(1.0) if data.field_type == "angle" else 1.0
+        if not fields:
+            edge = t.field_radius
+            fields = tuple((0.0, fraction * edge) for fraction in (0.0, 0.7, 1.0))
+        vignetting = np.array(data.vignetting or [(0.0,) * 5] * len(fields)) * (-1.0, 1.0, 1.0, 1.0, -1.0) + 0.0
+        return cls(
+            telescope=t,
+            file=file,
+            findings=findings,
+            unit=data.unit if data != DesignData() and data.unit in units else MM,
+            distance=t.object_distance - (t.surfaces[0].vertex[2] if own_stop else t.stop_z),
+            surfaces=surfaces,
+            aperture=aperture,
+            wavelengths=waves,
+            wavelength_weights=data.wavelength_weights or (1.0,) * len(waves),
+            field_type=data.field_type if data.fields else "angle",
+            fields=tuple((_tidy(-x * size), _tidy(y * size)) for x, y in fields),
+            field_weights=data.field_weights or (1.0,) * len(fields),
+            vignetting=tuple(map(tuple, vignetting.tolist())),
+        )
+
+    @property
+    def pupil_plane(self) -> bool:
+        """Whether a plane of its own in front carries the stop."""
+        return self.surfaces[0].name == PUPIL_COMMENT
+
+    @property
+    def title(self) -> str:
+        """Description of the telescope in one line, or its name."""
+        return " ".join((self.telescope.description or self.telescope.name).split())
+
+    @property
+    def primary(self) -> int:
+        """Place of the primary wavelength."""
+        return self.wavelengths.index(self.telescope.default_wavelength)
+
+    @property
+    def celsius(self) -> float | None:
+        """Stated temperature [deg C]."""
+        kelvin = self.telescope.design_data.temperature
+        # The difference of two numbers near 300 has rounding in its last digits.
+        return None if kelvin is None else round(kelvin - ZERO_CELSIUS, 9) + 0.0
+
+    @property
+    def atmospheres(self) -> float | None:
+        """Stated pressure [atm]."""
+        pascal = self.telescope.design_data.pressure
+        return None if pascal is None else pascal / STANDARD_ATMOSPHERE
+
+    def thickness(self, surface: SequenceSurface) -> float:
+        """Return the thickness behind a surface in the unit of the file, without the rounding of heights."""
+        return round(surface.thickness / self.unit, _DECIMALS) + 0.0
+
+    def leave_out(self, text: str, instead: str) -> None:
+        """Raise the error of what the file cannot hold or, if lenient, warn; `instead` is what is written."""
+        self.findings.report(PrescriptionError(text), instead)
+
+    def leave_out_aperture(self, surface: SequenceSurface, expected: str) -> None:
+        """Raise the error of a surface whose clear aperture the file cannot hold; if lenient, warn."""
+        region = surface.aperture.part if isinstance(surface.aperture, Complement) else surface.aperture
+        kind = f"obscuring {type(region).__name__}" if region is not surface.aperture else type(region).__name__
+        self.leave_out(f"surface {surface.name}: aperture {kind}: {self.file} has {expected}", "left out")
+
+    def stated_aperture(self, kinds: Collection[str]) -> tuple[str, float]:
+        """Return the aperture, of one of some kinds; if lenient the diameter of the entrance pupil [m] for another."""
+        if self.aperture[0] in kinds:
+            return self.aperture
+        known = self.aperture[0].replace("_", " ")
+        text = f"aperture = {known}: {self.file} has no place for it"
+        self.leave_out(text, "written as the diameter of the entrance pupil")
+        return "entrance_pupil", self.telescope.pupil_diameter
+
+    def glass_names(self, table: str, forbidden: str = "") -> Mapping[Medium, str]:
+        """Return a name for each medium but air; those of catalogues are theirs, the others are in capitals and new.
+
+        Names of catalogues with a `forbidden` character are not taken. Unless lenient, PrescriptionError for a
+        dispersion that the file has to hold as a table, `table` of its kind.
+        """
+        names: dict[Medium, str] = {}
+        for medium in dict.fromkeys(m for s in self.surfaces for m in (s.before, s.after) if m != VACUUM):
+            known = catalogue_name(medium)
+            if known is not None and not set(known) & set(forbidden):
+                names[medium] = known
+                continue
+            own = re.sub(r"[^A-Z0-9]", "", medium.name.upper())[:12]
+            free = own[:1].isalpha() and own not in (*names.values(), *_WORDS)
+            names[medium] = own if free else f"MEDIUM{len(names) + 1}"
+            if not isinstance(medium, ConstantIndex) and not _is_table(medium):
+                text = f"glass {medium.name or type(medium).__name__}: {self.file} has no place for its formula"
+                self.leave_out(text, f"written as {table}")
+        return names
+
+    def index_table(
+        self, medium: Medium, entries: int = 0, least: int = 2
+    ) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return wavelengths [m] and indices of a medium: its own table of `least` entries or more, or another one.
+
+        That has the stated wavelengths and up to `entries` in all, from one per cent below them to one above.
+        """
+        if isinstance(medium, TabulatedIndex) and _is_table(medium) and len(medium.wavelengths) >= least:
+            return medium.wavelengths, medium.indices
+        low, high = getattr(medium, "wavelength_range", (0.0, math.inf))
+        low, high = max(low, 0.99 * min(self.wavelengths)), min(high, 1.01 * max(self.wavelengths))
+        between = map(_tidy, np.linspace(low, high, max(entries - len(self.wavelengths), 0)).tolist())
+        waves = tuple(sorted({*self.wavelengths, *(w for w in between if low <= w <= high)}))
+        return waves, tuple(float(medium.index(wave)) for wave in waves)
+
+
+def catalogue_name(medium: Medium) -> str | None:
+    """Return the name under which the reader of lens files finds a medium in the bundled catalogues, or None."""
+    name = medium.name
+    for catalogue in (GlassCatalogue.bundled(), *map(GlassCatalogue.of_maker, MAKERS)):
+        if name in catalogue:
+            return name if find_glass(name) == medium else None
+    return None
+
+
+def maker_of(name: str) -> str | None:
+    """Return the maker whose bundled catalogue has a glass."""
+    return next((maker for maker in MAKERS if name in GlassCatalogue.of_maker(maker)), None)
+
+
+def quoted(text: str, forbidden: str) -> str:
+    """Return a text in one line for a file in which some characters have a meaning; these become spaces."""
+    return " ".join("".join(" " if c in forbidden else c for c in text).split())
+
+
+def _tidy(number: float) -> float:
+    """Return a number to 15 digits, without the rounding of its last bits."""
+    return float(f"{number:.15g}") + 0.0
+
+
+def _is_table(medium: Medium) -> bool:
+    return isinstance(medium, TabulatedIndex) and medium.interpolation == "monotone"
+
+
+def _surfaces(t: Telescope, stop: str | None, *, along_light: bool) -> tuple[SequenceSurface, ...]:
+    """Return the surfaces; the plane of the stop is the first of them where no surface is the stop."""
+    medium, sign = t.medium_before, 1.0
+    # The ray through the middle of the entrance pupil, along the axis.
+    position, direction = HALF_TURN @ [0.0, 0.0, t.stop_z], np.array([0.0, 0.0, 1.0])
+    found: list[SequenceSurface] = []
+    heights: list[float] = []
+    if stop is None:
+        plane = SequenceSurface(
+            PUPIL_COMMENT, Interaction.PASS, Plane(), None, None, (0.0, 0.0), (0.0,) * 3, 0.0, medium, medium, True
+        )
+        found.append(plane)
+        heights.append(-t.stop_z)
+    for surface in t.surfaces:
+        axes = HALF_TURN @ surface.matrix @ HALF_TURN + 0.0
+        against = along_light and sign * float(direction @ axes[:, 2]) < _AGAINST
+        surface, axes = _reversed(surface, axes) if against else (surface, axes)
+        x, y, z = (float(v) for v in HALF_TURN @ np.array(surface.vertex) + 0.0)
+        straight = np.array_equal(axes, np.eye(3))
+        with error_context(subject=f"surface {surface.name}"):
+            if surface.interaction == Interaction.PHASE:
+                raise PrescriptionError("phase screens cannot be written")
+            found.append(
+                SequenceSurface(
+                    name=" ".join(surface.name.split()),
+                    interaction=surface.interaction,
+                    shape=rotated_shape(surface.shape),
+                    aperture=None if surface.aperture is None else rotated_aperture(surface.aperture),
+                    semi_diameter=surface.semi_diameter,
+                    decentre=(x, y),
+                    tilt=(0.0, 0.0, 0.0) if straight else rotation_angles(axes),
+                    thickness=0.0,
+                    before=medium,
+                    after=surface.medium_after,
+                    stop=surface.name == stop,
+                )
+            )
+        heights.append(z)
+        medium = surface.medium_after
+        if surface.interaction == Interaction.MIRROR:
+            position, direction = _reflected(position, direction, found[-1], axes, z)
+            sign = -sign
+    gaps = [*np.diff(heights).tolist(), 0.0]
+    return tuple(replace(s, thickness=gap) for s, gap in zip(found, gaps, strict=True))
+
+
+def _reflected(
+    position: np.ndarray, direction: np.ndarray, mirror: SequenceSurface, axes: np.ndarray, z: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return where a ray meets a mirror and its direction behind it; vertex height `z` and axes are the mirror's."""
+    vertex = np.array([*mirror.decentre, z])
+    place, along = (position - vertex) @ axes, direction @ axes
+    # A ray that misses the mirror, or runs along it, has no direction behind it.
+    with np.errstate(all="ignore"):
+        for _ in range(_STEPS):
+            gradient = np.array([*(-float(v) for v in mirror.shape.gradient(*place[:2])), 1.0])
+            place = place - along * (place[2] - float(mirror.shape.sag(*place[:2]))) / (along @ gradient)
+    normal = gradient / np.linalg.norm(gradient)
+    return vertex + axes @ place, axes @ (along - 2.0 * (along @ normal) * normal)
+
+
+def _reversed(surface: Surface, axes: np.ndarray) -> tuple[Surface, np.ndarray]:
+    """Return the same surface with its own axes rotated by half a turn about its y axis, and these axes."""
+    aperture = None if surface.aperture is None else rotated_aperture(surface.aperture)
+    return replace(surface, shape=rotated_shape(surface.shape), aperture=aperture), axes @ HALF_TURN

@@ -1,0 +1,94 @@
+"""Shapes of surfaces as lens files state them: a conic with a series of powers, a polynomial of x and y, a toroid."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from ...core.errors import PrescriptionError
+from ..shapes.freeform import OddAsphere, Toroid
+from ..shapes.polynomial import XYPolynomial
+from ..shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere
+from ..shapes.sum import Sum
+
+#: Relative difference of binomial coefficients that rounding makes.
+_ROUNDING = 1e-14
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A conic with one of several additions, in one unit of length.
+
+    Attributes
+    ----------
+    curvature, conic : float
+        Curvature along y [1/unit] and conic constant.
+    even : tuple of float
+        Coefficients of r^2, r^4, r^6...
+    odd : tuple of float
+        Coefficients of r, r^2, r^3..., of a shape with odd powers.
+    terms : tuple of (i, j, coefficient)
+        Terms x^i y^j of a polynomial.
+    curvature_x : float, optional
+        Curvature along x [1/unit] of a toroid, whose section in the y, z plane is the conic.
+    """
+
+    curvature: float
+    conic: float
+    even: tuple[float, ...] = ()
+    odd: tuple[float, ...] = ()
+    terms: tuple[tuple[int, int, float], ...] = ()
+    curvature_x: float | None = None
+
+    @property
+    def radius(self) -> float:
+        """Radius of curvature along y to 15 digits [unit], 0 of a plane."""
+        return float(f"{1.0 / self.curvature:.15g}") if self.curvature else 0.0
+
+    @classmethod
+    def of(cls, shape: Shape, unit: float) -> Profile:
+        """Return the profile of a shape [m] for a unit of length [m]; PrescriptionError if it is none of these."""
+        parts = list(shape.parts) if isinstance(shape, Sum) else [shape]
+        even: dict[int, float] = {}
+        terms: list[tuple[int, int, float]] = []
+        base = cls(0.0, 0.0)
+        seen = 0
+        for part in parts:
+            if isinstance(part, XYPolynomial):
+                radial = _radial(part.terms)
+                terms += () if radial is not None else part.terms
+                for power, a in (radial or {}).items():
+                    even[power] = even.get(power, 0.0) + a * unit ** (power - 1)
+            elif isinstance(part, Plane | Sphere | Conic | EvenAsphere):
+                base, seen = cls(part.curvature * unit, part.conic), seen + (not isinstance(part, Plane))
+                for power, a in enumerate(part.coefficients, start=2):
+                    even[2 * power] = even.get(2 * power, 0.0) + a * unit ** (2 * power - 1)
+            elif isinstance(part, OddAsphere):
+                odd = tuple(a * unit ** (power - 1) for power, a in enumerate(part.coefficients, start=1))
+                base, seen = cls(unit / part.radius, part.conic, odd=odd), seen + 1
+            elif isinstance(part, Toroid):
+                base = cls(unit / part.radius_y, part.conic_y, curvature_x=unit / part.radius_x)
+                seen += 1
+            else:
+                raise PrescriptionError(f"shape {type(part).__name__}: expected a conic with powers of r or of x and y")
+        special = bool(base.odd) or base.curvature_x is not None
+        if seen > 1 or (special and (even or terms)) or (any(even.values()) and terms):
+            kinds = ", ".join(type(part).__name__ for part in parts)
+            raise PrescriptionError(f"sum of {kinds}: expected a conic with powers of r, or of x and y")
+        highest = max((power for power, a in even.items() if a), default=0)
+        found = tuple((i, j, a * unit ** (i + j - 1)) for i, j, a in terms)
+        return replace(base, even=tuple(even.get(p, 0.0) for p in range(2, highest + 1, 2)), terms=found)
+
+
+def _radial(terms: tuple[tuple[int, int, float], ...]) -> dict[int, float] | None:
+    """Return the coefficients by power of r of a polynomial of x and y that is one of r^2, None for another."""
+    found = {(i, j): a for i, j, a in terms if a}
+    powers: dict[int, float] = {}
+    expected = 0
+    for n in sorted({(i + j) // 2 for i, j in found}):
+        powers[2 * n] = found.get((2 * n, 0), 0.0)
+        row = {(2 * i, 2 * (n - i)): powers[2 * n] * math.comb(n, i) for i in range(n + 1)}
+        expected += len(row)
+        if n == 0 or any(not math.isclose(found.get(key, 0.0), a, rel_tol=_ROUNDING) for key, a in row.items()):
+            return None
+    return powers if expected == len(found) else None
