@@ -47,7 +47,9 @@ def align_command(
     - `pachon align`: 20 visits, two minutes
     - `pachon align -n 100 --heights lsstcam --believed-heights nominal -o ignored`: sensors as built, taken as nominal
     - `pachon align -n 200 --resume -o ignored`: a hundred visits more
-    - `pachon align my_loop.yaml`, where my_loop.yaml may read
+    - `pachon align my_loop.yaml`
+
+    my_loop.yaml may read
 
         visits: 50
         errors: {initial: 3, gravity: 0.2}

@@ -162,4 +162,6 @@ def attribute_command(
         return
     if not quiet:
         Rows(ATTRIBUTION_COLUMNS, attribution_rows(result.metrics), ATTRIBUTION_CAPTION).show()
+    if result.left_out:
+        print(f"left out of all cases, not to be modelled in one: {', '.join(result.left_out)}")
     print(f"attribution: {out.resolve()}")

@@ -50,7 +50,7 @@ def run_command(
 
     **Examples**
 
-    - `pachon run`: the default, a few minutes on two cores
+    - `pachon run`: the default, under a minute on two cores
     - `pachon run --raft R22 --out central_raft --seed 7`
     - `pachon run --ccds R22_S11,R24_S12 --truth-stars 400`
     - `pachon run pachon_run/config.yaml --out again`: the same bytes

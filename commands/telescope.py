@@ -9,6 +9,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import PrescriptionWarning
+from .imports import import_modules
 from .inputs import load_model, warnings_shown
 from .options import GlassCatalogues, Json, Lenient, Model
 from .tables import Rows, plain_table, print_json, wide_console
@@ -51,6 +52,7 @@ def info_command(
             table.add_row(entry["name"], entry["description"])
         console.print(table)
         return
+    import_modules(("pachon.models.io.prescription", "pachon.pipeline.report.info"))
     from ..pipeline.report.info import (
         coefficient_lines,
         describe,

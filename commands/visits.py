@@ -66,9 +66,14 @@ def visits_command(
     - `pachon visits --all -n 200 -o full --resume --processes 2`: a hundred more, two visits side by side
     - `pachon visits --rotator random`: the camera turned against the telescope too, by up to 90 degrees
     - `pachon visits -n 2 --roll 0,0 --rotator 0,45`: a telescope that stands still on the sky, its camera turned
-    - `pachon visits my_visits.yaml`, where my_visits.yaml may read
+    - `pachon visits my_visits.yaml`
 
-        run: {band: i, active_optics: {residual_um: 0.2}, reconstruction: {model: focal_plane}}
+    my_visits.yaml may read
+
+        run:
+          band: i
+          active_optics: {residual_um: 0.2}
+          reconstruction: {model: focal_plane}
         visits: {count: 30, dither_deg: 0.3}
     """
     from ..pipeline.config import with_options

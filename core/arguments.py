@@ -58,14 +58,15 @@ def check_arguments(target: Target) -> Target:
 
 
 def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any]:
-    parameters = [p for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
-    if all(p.annotation is p.empty for p in parameters):
+    if not set(inspect.get_annotations(function)) - {"return"}:
         return function
 
     @functools.cache
     def checks() -> dict[str, _Check | None]:
-        # At the first call: an annotation may name a class of a module that is imported after this one.
-        return {p.name: _check_of_parameter(function, p.name) for p in parameters}
+        # At the first call: an annotation may name a class of a module that is imported after this one, and many
+        # functions are never called.
+        parameters = inspect.signature(function).parameters.values()
+        return {p.name: _check_of_parameter(function, p.name) for p in parameters if p.kind is not p.VAR_KEYWORD}
 
     @functools.wraps(function)
     def checked(*args: Any, **options: Any) -> Any:

@@ -7,13 +7,11 @@ parameters, and returns a result with ``summary()`` and ``plot()``. Its name and
 
 from __future__ import annotations
 
-import gc
 import inspect
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -21,6 +19,7 @@ import typer
 
 from ...core.errors import PachonError
 from .. import options
+from ..imports import import_modules
 from ..inputs import load_model
 from ..interrupt import interruptible
 from ..tables import Column, Rows, numbers_of, print_json
@@ -153,7 +152,7 @@ def design_command(
 
         def command(picture: Path | None, as_json: bool, **values: Any) -> None:
             kind = options.picture_kind(picture)
-            _import_needed()
+            import_modules(_NEEDED)
             shared = Given(**{f.name: values[f.name] for f in fields(Given) if f.name in values})
             try:
                 found = compute(shared, **{key: values[key] for key in own})
@@ -196,23 +195,6 @@ def _parameters(compute: Callable[..., Any], band: bool, picture: Any) -> tuple[
     kind = inspect.Parameter.KEYWORD_ONLY
     parameters = [inspect.Parameter(key, kind, annotation=a, default=d) for key, (a, d) in taken.items()]
     return parameters, [p.name for p in own]
-
-
-def _import_needed() -> None:
-    """Import the modules that every design command needs, without searches for cyclic garbage.
-
-    Their 200 000 objects stay. Searching them again and again while they are made, and ever after, takes a sixth of the
-    processor time of a short command.
-    """
-    wanted = gc.isenabled()
-    gc.disable()
-    try:
-        for name in _NEEDED:
-            import_module(name)
-        gc.freeze()
-    finally:
-        if wanted:
-            gc.enable()
 
 
 def _deliver(outcome: Outcome, table: Callable[[Any], Rows], path: Path, kind: str, as_json: bool) -> None:

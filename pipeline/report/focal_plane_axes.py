@@ -21,6 +21,8 @@ from ...models.camera.camera import Camera
 TRUTH, OBSERVED, RESIDUAL, AWAY, LEFT_OUT = GREY, BLUE, RED, ORANGE, PURPLE
 #: Residuals of the CCDs' own models, beside those of a focal-plane model.
 CCD_MODEL = GREY
+#: Limits from here on, as fractions of the radius of the field of view, are near its edge; and where they are moved to.
+_NEAR, _MARGIN = 0.65, 1.02
 RESIDUAL_TITLES = {
     "residual": "at the stars: observed - model",
     "left_out": "at stars left out: observed - model",
@@ -40,19 +42,20 @@ def draw_outlines(axes: Axes, camera: Camera, indices: Iterable[int], color: str
     )
 
 
-def draw_field_circle(axes: Axes, radius_mm: float, label: str) -> None:
+def draw_field_circle(axes: Axes, radius_mm: float) -> None:
     """Draw the edge of the field of view."""
     axes.add_patch(Circle((0.0, 0.0), radius_mm, fill=False, edgecolor="0.35", linewidth=0.8, linestyle=(0, (5, 3))))
-    axes.annotate(
-        label,
-        (0.0, -radius_mm),
-        xytext=(0, -3),
-        textcoords="offset points",
-        ha="center",
-        va="top",
-        fontsize=8,
-        color="0.35",
+
+
+def around_field_circle(
+    limits: tuple[float, float, float, float], radius_mm: float
+) -> tuple[float, float, float, float]:
+    """Return limits [mm], of x and then of y, with those that are near the edge of the field of view outside of it."""
+    x_low, x_high, y_low, y_high = (
+        sign * max(sign * limit, _MARGIN * radius_mm) if sign * limit > _NEAR * radius_mm else limit
+        for sign, limit in zip((-1, 1, -1, 1), limits, strict=True)
     )
+    return x_low, x_high, y_low, y_high
 
 
 def whiskers(x: np.ndarray, y: np.ndarray, e1: np.ndarray, e2: np.ndarray, scale: float) -> np.ndarray:

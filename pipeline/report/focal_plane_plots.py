@@ -24,6 +24,7 @@ from .focal_plane_axes import (
     RESIDUAL,
     RESIDUAL_TITLES,
     TRUTH,
+    around_field_circle,
     ccd_corners,
     draw_field_circle,
     draw_key_whisker,
@@ -53,11 +54,11 @@ def heights_plot(focal_plane: FocalPlane, used: Sequence[str], field_radius: flo
         figure = new_figure(8.8, 7.2)
         axes = figure.add_subplot()
         edge = 1.04e3 * camera.reach
-        limits = (-edge, edge, -edge, edge)
+        limits = around_field_circle((-edge, edge, -edge, edge), field_radius * 1e3)
         image = draw_heights(axes, focal_plane, limits, 900)
         draw_outlines(axes, camera, range(len(camera)), "0.55", 0.3)
         draw_outlines(axes, camera, indices, "black", 1.4)
-        draw_field_circle(axes, field_radius * 1e3, "")
+        draw_field_circle(axes, field_radius * 1e3)
         frame_axes(axes, limits)
         framed = f"; framed: the {len(used)} CCD{'s' * (len(used) != 1)} of this run" if used else ""
         what = "CCDs, without heights" if is_flat(focal_plane) else "CCD heights"
@@ -81,11 +82,12 @@ def whiskers_plot(
     pad = 0.25 * half
     corners = ccd_corners(camera, (camera.ccd_index(p.name) for p in products))
     low, high = corners.min(axis=(0, 1)) - pad, corners.max(axis=(0, 1)) + pad
-    limits = (low[0], high[0], low[1], high[1])
+    limits = around_field_circle((low[0], high[0], low[1], high[1]), field_radius * 1e3)
+    sides = limits[1] - limits[0], limits[3] - limits[2]
     key = _common_key(products)
     # The key is a third of the half side of a CCD long, but never too short to be legible.
-    scale = max(0.33 * half, 0.012 * float(max(high - low))) / key
-    across = (high[0] - low[0]) / (high[1] - low[1])
+    scale = max(0.33 * half, 0.012 * max(sides)) / key
+    across = sides[0] / sides[1]
     with styled():
         # Panels go under each other where the CCDs lie in a row or are many, beside each other where they do not.
         stacked = across > 1.6 or len(products) > _MANY
@@ -101,7 +103,7 @@ def whiskers_plot(
         for i, (axes, kind) in enumerate(zip(panels, kinds, strict=True)):
             image = draw_heights(axes, focal_plane, limits, 700, alpha=0.35, bounds=bounds)
             draw_outlines(axes, focal_plane.camera, range(len(focal_plane.camera)), "0.5", 0.5)
-            draw_field_circle(axes, field_radius * 1e3, "")
+            draw_field_circle(axes, field_radius * 1e3)
             for product in products:
                 _draw_kind(axes, product, kind, scale, 0.8 if len(products) <= _MANY else 0.5, most)
             frame_axes(axes, limits, x_label=not stacked or i == len(kinds) - 1, y_label=stacked or i == 0)

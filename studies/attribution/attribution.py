@@ -20,21 +20,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ...core.errors import DomainError
 from ...core.progress import Reporter
-from ...pipeline.ccd_product import CCD_KINDS, CcdProduct
+from ...core.units import ARCSEC
+from ...pipeline.ccd_product import CCD_KINDS, CcdProduct, CcdStars
 from ...pipeline.config import Configuration
 from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_stage import apply_focal_plane_model
 from ...pipeline.measure.correlation import SEPARATION_RANGES, Correlation, jackknife_error
-from ...pipeline.measure.summary import correlations, of_focal_plane, run_metrics
+from ...pipeline.measure.summary import correlations, ellipticities, of_focal_plane, rms
 from ...pipeline.memory import check_memory
 from ...pipeline.simulate.ccd_exposure import CcdExposure
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_model import model_ccd
 from .causes import FULL, NOISE, OPTICS, checked_causes, without
 
-_RMS = ("rms_e_truth", "rms_residual_at_stars", "rms_residual_left_out", "rms_residual_away", "fwhm_arcsec")
-_RMS_CCD = ("rms_residual_at_stars_ccd", "rms_residual_away_ccd")
 _XI = ("truth", "observed", "residual", "away")
 
 
@@ -50,6 +50,7 @@ class Attribution:
 
     metrics: dict[str, dict[str, float]]  #: by case
     correlations: dict[str, dict[str, Correlation]]  #: by case and kind
+    left_out: dict[str, str]  #: reason by CCD that cannot be modelled in some case, and is left out of all
 
 
 def attribute(
@@ -62,26 +63,38 @@ def attribute(
     """Simulate and model the same stars with all causes and without each, by default of all that are on.
 
     The engine ``long_exposure`` averages over all turbulence. It is fast, and ellipticities are effects of optics and
-    heights alone; the atmosphere cannot be switched off.
+    heights alone; the atmosphere cannot be switched off. CCDs that cannot be modelled in one case, such as those of
+    images without turbulence that are narrower than a pixel, are left out of all.
+
+    Raises
+    ------
+    DomainError
+        If no CCD can be modelled in all cases.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
     full = Experiment.from_config(config)
     chosen = checked_causes(full.config, causes)
     check_memory(full, threads)
-    correlated, metrics = {}, {}
-    cases = [FULL, *(c for c in chosen if c != NOISE)]
+    stars: dict[str, dict[str, CcdStars]] = {}
+    left_out: dict[str, str] = {}
     with full.screens(threads, reporter):
-        for case in cases:
+        for case in [FULL, *(c for c in chosen if c != NOISE)]:
             experiment = full if case == FULL else without_cause(full, case)
-            products, noiseless = _products(experiment, case, NOISE in chosen and case == FULL, threads, reporter)
-            for name, found in ((case, products), (NOISE, noiseless)):
-                if found:
-                    correlated[name] = correlations(found, found[0].kinds)
-                    metrics[name] = _metrics(found, correlated[name])
+            found, failed = _stars(experiment, case, NOISE in chosen and case == FULL, threads, reporter)
+            stars |= found
+            left_out |= {name: reason for name, reason in failed.items() if name not in left_out}
+    if not stars[FULL].keys() - left_out:
+        name, reason = next(iter(left_out.items()))
+        raise DomainError(f"{reason}; no CCD can be modelled in all cases", subject=f"CCD {name}")
+    correlated, metrics = {}, {}
     order = (FULL, *chosen)
-    for name in chosen:
-        metrics[name] |= changes(metrics[FULL], metrics[name], correlated[FULL], correlated[name])
-    return Attribution({n: metrics[n] for n in order}, {n: correlated[n] for n in order})
+    for case in order:
+        same = [each for name, each in stars[case].items() if name not in left_out]
+        correlated[case] = correlations(same, same[0].kinds)
+        metrics[case] = _metrics(same, correlated[case])
+    for case in chosen:
+        metrics[case] |= changes(metrics[FULL], metrics[case], correlated[FULL], correlated[case])
+    return Attribution(metrics, correlated, left_out)
 
 
 def without_cause(full: Experiment, cause: str) -> Experiment:
@@ -93,47 +106,36 @@ def without_cause(full: Experiment, cause: str) -> Experiment:
     return replace(experiment, atmosphere_only=cause == OPTICS)
 
 
-def _products(
+def _stars(
     experiment: Experiment, case: str, noiseless: bool, threads: int | None, reporter: Reporter
-) -> tuple[list[CcdProduct], list[CcdProduct]]:
-    """Return the products of all CCDs, and of the same stars without noise."""
-    noisy_or_not = (True, False) if noiseless else (True,)
+) -> tuple[dict[str, dict[str, CcdStars]], dict[str, str]]:
+    """Return the stars by case and CCD, the same without noise too; and the reasons of CCDs that are not modelled."""
+    kinds = {case: True, NOISE: False} if noiseless else {case: True}
     whole = experiment.config.reconstruction.model == "focal_plane"
 
-    def model(exposure: CcdExposure) -> list[CcdProduct]:
+    def model(exposure: CcdExposure) -> list[CcdStars]:
+        products = [model_ccd(experiment, exposure, noisy=noisy) for noisy in kinds.values()]
         # A focal-plane model takes the noise of the stars from their stamps.
-        return [_without_images(model_ccd(experiment, exposure, noisy=noisy), whole) for noisy in noisy_or_not]
+        return [replace(p, holdout_images=p.holdout_images[:0]) if whole else p.ccd_stars for p in products]
 
     title = "everything on" if case == FULL else f"{case} off"
-    models = simulate_ccds(experiment, model, title=title, threads=threads, reporter=reporter).results.values()
-    noisy, noise_free = [m[0] for m in models], [m[1] for m in models if noiseless]
-    if whole:
-        noisy = _of_focal_plane(experiment, noisy, threads, reporter)
-        noise_free = _of_focal_plane(experiment, noise_free, threads, reporter) if noiseless else []
-    return noisy, noise_free
+    done = simulate_ccds(experiment, model, title=title, strict=False, threads=threads, reporter=reporter)
+    found = {kind: {name: each[i] for name, each in done.results.items()} for i, kind in enumerate(kinds)}
+    if whole and done.results:
+        for kind, each in found.items():
+            products = [p for p in each.values() if isinstance(p, CcdProduct)]
+            applied, _ = apply_focal_plane_model(experiment, products, threads=threads, reporter=reporter)
+            found[kind] = {product.name: product.ccd_stars for product in applied}
+    return found, done.not_modelled
 
 
-def _of_focal_plane(
-    experiment: Experiment, products: list[CcdProduct], threads: int | None, reporter: Reporter
-) -> list[CcdProduct]:
-    """Return products with the focal-plane model of all of them, without any stamps."""
-    applied, _ = apply_focal_plane_model(experiment, products, threads=threads, reporter=reporter)
-    return [_without_images(product, keep_stars=False) for product in applied]
-
-
-def _without_images(product: CcdProduct, keep_stars: bool) -> CcdProduct:
-    """Return a product without its stamps, half a gigabyte for 189 CCDs, but for those of the stars where asked."""
-    stars = product.observed_images if keep_stars else product.observed_images[:0]
-    return replace(product, holdout_images=product.holdout_images[:0], observed_images=stars)
-
-
-def _metrics(products: Sequence[CcdProduct], correlated: dict[str, Correlation]) -> dict[str, float]:
-    together = run_metrics(products, correlated)["all"]
-    e = np.concatenate([[p.holdout.e1, p.holdout.e2] for p in products], axis=1)
-    metrics = {"rms_e_truth": float(np.sqrt(np.nanmean(e**2)))}
-    metrics |= {key: float(together[key]) for key in _RMS if key != "rms_e_truth"}
-    if of_focal_plane(products):
-        metrics |= {key: float(together[key]) for key in _RMS_CCD}
+def _metrics(stars: Sequence[CcdStars], correlated: dict[str, Correlation]) -> dict[str, float]:
+    residuals = {"at_stars": "residual", "left_out": "left_out", "away": "away"}
+    if of_focal_plane(stars):
+        residuals |= {"at_stars_ccd": "residual_ccd", "away_ccd": "away_ccd"}
+    metrics = {"rms_e_truth": rms(ellipticities(stars, "truth"))}
+    metrics |= {f"rms_residual_{name}": rms(ellipticities(stars, kind)) for name, kind in residuals.items()}
+    metrics["fwhm_arcsec"] = float(np.nanmedian(np.concatenate([s.holdout.fwhm for s in stars]))) / ARCSEC
     for kind in (k for k in (*_XI, *CCD_KINDS) if k in correlated):
         for name in SEPARATION_RANGES:
             metrics[f"xi_plus_{kind}_{name}"] = correlated[kind].mean_xi_plus(name)

@@ -37,7 +37,7 @@ def write_attribution(result: Attribution, folder: Path, config: Configuration) 
             "correlations.ecsv": ("xi of each case", correlation_columns(xi)),
         },
         {"attribution.png": attribution_plot(result.metrics, result.correlations)},
-        {"attribution.json": {"figures": result.metrics}},
+        {"attribution.json": {"figures": result.metrics, "left_out": result.left_out}},
         stamp_of(Experiment.from_config(config)).meta(),
         config,
         "the case with everything on.",

@@ -21,7 +21,7 @@ _HOW = {
     "snr": (LEFT_OUT, "s", "weights (S/N)$^2$"),
     "softened": (AWAY, "D", "softened weights"),
     "gp": ("#2a8a57", "^", PROCESSES["gp"]),
-    "kriging": ("#7a4fb5", "X", PROCESSES["kriging"]),
+    "kriging": ("#7b4a1e", "X", PROCESSES["kriging"]),
     "no_telescope": ("0.5", "P", FOCAL_PLANE["no_telescope"]),
     "focal_plane": ("#c2307f", "v", FOCAL_PLANE["focal_plane"]),
 }
@@ -104,6 +104,7 @@ def _orders(axes: Axes, result: Study) -> None:
     quiet = [(order, replace(c, snr=NOISE_FREE)) for order, c in cases]
     _line(axes, result, quiet, "rms_e_away", TRUTH, "", "truth - model, stars without noise", _QUIET)
     _log_values(axes)
+    axes.set_xticks(plan.orders)
     axes.set(xlabel="order of the polynomials", ylabel="rms of one component of e")
     axes.set_title(f"order: {base.stars} stars, {_HOW[base.interpolation][2]}", loc="left")
     axes.grid(True, which="major", color="0.9", linewidth=0.6)

@@ -266,7 +266,7 @@ def _field_whiskers_plot(
         axes = figure.add_subplot()
         image = draw_heights(axes, focal_plane, limits, 700, alpha=0.4, bounds=height_range(focal_plane))
         draw_outlines(axes, camera, range(len(camera)), "0.55", 0.4)
-        draw_field_circle(axes, field_radius * 1e3, "")
+        draw_field_circle(axes, field_radius * 1e3)
         draw_whiskers(axes, whiskers(positions[:, 0] * 1e3, positions[:, 1] * 1e3, e.real, e.imag, scale), TRUTH, 0.9)
         frame_axes(axes, limits)
         axes.set_title(title, loc="left")

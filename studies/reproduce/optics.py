@@ -135,7 +135,7 @@ def _layout_plot(
         left.legend(loc="lower right", fontsize=7)
         draw_outlines(right, camera, range(len(camera)), "0.25", 0.6)
         _draw_corner_rafts(right, camera)
-        draw_field_circle(right, field_radius * 1e3, "")
+        draw_field_circle(right, field_radius * 1e3)
         edge = 1.1e3 * camera.reach
         frame_axes(right, (-edge, edge, -edge, edge))
         right.set_title(f"{len(camera)} CCDs; dashed: field of view of 3.5°, {2e3 * field_radius:.0f} mm", loc="left")

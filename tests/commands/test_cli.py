@@ -14,7 +14,7 @@ import pytest
 
 from pachon.commands import cli
 from pachon.commands.cli import main
-from pachon.commands.design import command as design_command
+from pachon.commands.imports import import_modules
 from pachon.models.io import prescription
 from pachon.models.io.bundled import BUNDLED
 from pachon.models.io.site_file import DATA
@@ -145,9 +145,9 @@ def test_only_the_command_that_runs_is_built():
     assert cli._app_with("spts") is cli.app
 
 
-def test_imports_of_design_commands_leave_garbage_collection_on():
+def test_quick_imports_leave_garbage_collection_on():
     assert gc.isenabled()
-    design_command._import_needed()
+    import_modules(["math"])
     assert gc.isenabled()
 
 

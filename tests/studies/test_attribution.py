@@ -6,7 +6,7 @@ from astropy.table import Table
 from scipy.special import j0
 
 from pachon.commands.cli import main
-from pachon.core.errors import ConfigError, UnknownNameError
+from pachon.core.errors import ConfigError, DomainError, UnknownNameError
 from pachon.core.units import ARCSEC
 from pachon.pipeline.ccd_product import CCD_KINDS, KINDS
 from pachon.pipeline.config import load_configuration, with_options
@@ -18,6 +18,7 @@ from pachon.pipeline.measure.summary import correlations
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd
 from pachon.pipeline.simulate.ccd_model import model_ccd
 from pachon.pipeline.simulate.stamps import center_stamps
+from pachon.studies.attribution import attribution
 from pachon.studies.attribution.attribution import attribute, changes, without_cause
 from pachon.studies.attribution.causes import CAUSES, FULL, GROUND_LIFT, NOISE, OPTICS, checked_causes, without
 from pachon.studies.attribution.product import write_attribution
@@ -154,6 +155,23 @@ def test_optics_off_leaves_the_air_alone(tiny):
         image += (j0(2.0 * np.pi * angle[:, None] * r / wavelength) * seen).sum(axis=1) / wavelength**2
     expected = 2.0 * np.interp(0.5, image[::-1] / image[0], angle[::-1]) / ARCSEC
     assert figures[OPTICS]["fwhm_arcsec"] == pytest.approx(expected, rel=0.01)
+
+
+def test_a_ccd_that_one_case_cannot_model_is_left_out_of_all(tiny, monkeypatch):
+    options = {"psf__engine": "long_exposure"}
+    alone = attribute(tiny(**options, ccds=("R22_S11",)), ("diffusion",), threads=1)
+
+    def model_or_fail(experiment, exposure, **how):
+        if experiment.config.psf.diffusion_pixels == 0.0 and exposure.name != "R22_S11":
+            raise DomainError("stamps[3] has no flux left outside its outliers")
+        return model_ccd(experiment, exposure, **how)
+
+    monkeypatch.setattr(attribution, "model_ccd", model_or_fail)
+    found = attribute(tiny(**options, ccds=("R22_S11", "R24_S12")), ("diffusion",), threads=1)
+    assert found.left_out == {"R24_S12": "stamps[3] has no flux left outside its outliers"}
+    assert repr(found.metrics) == repr(alone.metrics)  # NaN are equal
+    with pytest.raises(DomainError, match=r"CCD R24_S12: .* no CCD can be modelled in all cases"):
+        attribute(tiny(**options, ccds=("R24_S12",)), ("diffusion",), threads=1)
 
 
 def test_a_lifted_ground_layer_is_the_same_air(tiny):

@@ -18,7 +18,7 @@ from pachon.pipeline.ccd_product import read_product
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.measure.correlation import shear_correlation
 from pachon.pipeline.report import focal_plane_plots, statistics_plots
-from pachon.pipeline.report.focal_plane_axes import key_ellipticity, whiskers
+from pachon.pipeline.report.focal_plane_axes import around_field_circle, key_ellipticity, whiskers
 from pachon.pipeline.report.focal_plane_plots import is_flat
 from pachon.pipeline.report.pictures import closest_middle_farthest
 from pachon.pipeline.report.report import build_report
@@ -153,6 +153,23 @@ def test_flat_focal_planes_have_no_scale_of_heights(monkeypatch):
     flat, uneven = figures
     assert (len(flat.axes), len(uneven.axes)) == (1, 2)
     assert flat.axes[0].get_title().startswith("CCDs, without heights")
+
+
+def test_edge_of_the_field_is_drawn_whole_beside_ccds_that_reach_it():
+    camera, radius = FocalPlane.flat("hsc").camera, 247.0
+    # At the sides the CCDs of HSC end inside of the edge; above and below they reach beyond.
+    low, high = (
+        1e3 * camera.corners(range(len(camera))).min((0, 1)),
+        1e3 * camera.corners(range(len(camera))).max((0, 1)),
+    )
+    assert max(-low[0], high[0]) < radius < high[1]
+    x_low, x_high, y_low, y_high = around_field_circle((low[0], high[0], low[1], high[1]), radius)
+    assert x_low == -x_high
+    assert radius < x_high < 1.03 * radius
+    assert (y_low, y_high) == (low[1], high[1])
+    # CCDs from the centre to the right edge, and a raft in the middle.
+    assert around_field_circle((-20.0, 230.0, -20.0, 20.0), radius) == (-20.0, x_high, -20.0, 20.0)
+    assert around_field_circle((-60.0, 60.0, -60.0, 60.0), radius) == (-60.0, 60.0, -60.0, 60.0)
 
 
 def test_lines_of_the_paper_are_for_the_lsst(monkeypatch):
