@@ -1,7 +1,7 @@
 """Translate a CODE V lens file (.seq) into the terms of a Zemax file.
 
-Supported commands: RDM, DIM, TITLE, EPD, FNO, NAO, WL, WTW, REF, XAN YAN, XOB YOB, XIM YIM, XRI YRI, WTF, VUX VLX VUY
-VLY, before the surfaces or after them; the surfaces SO S SI (curvature, or with RDM radius; thickness, glass), RDY CUY
+Supported commands: RDM, DIM, TITLE, EPD, FNO, NAO, WL, WTW, REF, AFO, XAN YAN, XOB YOB, XIM YIM, XRI YRI, WTF, VUX VLX
+VUY VLY, before the surfaces or after them; the surfaces SO S SI (curvature, or with RDM radius; thickness, glass), RDY CUY
 THI GLA, STO, SLB, SPH CON ASP with K and A to G (r^4 to r^16), XDE YDE ZDE ADE BDE CDE with DAR, BEN and REV, CIR (OBS,
 HOL) REX REY and ELX ELY with ADX ADY, pick-ups PIK, private glasses PRV PWL END. ADE and BDE are left-handed, CDE is
 right-handed (CODE V reference manual, "Decentered surfaces"), Zemax's tilts are all right-handed. A glass is a name
@@ -34,7 +34,7 @@ FIELDS = {
 APERTURES = {"EPD": ("ENPD",), "FNO": ("FNUM", "1"), "NAO": ("OBNA",)}
 #: Vignetting factors: the parts by which the upper and lower halves of the pupil shrink, along x and y.
 VIGNETTING = ("VUX", "VLX", "VUY", "VLY")
-SYSTEM = frozenset(("RDM", "DIM", "TIT", "WL", "WTW", "WTF", "REF", "PRV", *VIGNETTING, *APERTURES, *FIELDS))
+SYSTEM = frozenset(("RDM", "DIM", "TIT", "WL", "WTW", "WTF", "REF", "AFO", "PRV", *VIGNETTING, *APERTURES, *FIELDS))
 LONG_NAMES = {"TITLE": "TIT", "STOP": "STO"}
 POWERS = "ABCDEFG"
 #: Numbers of surfaces.
@@ -105,6 +105,7 @@ class _Translation:
         self.values: list[dict[str, float]] = []
         self.radii = False
         self.field_type = 0.0
+        self.afocal = False
         self.waves: list[float] = []
         self.lists: dict[str, list[float]] = {}
         self.pick_ups: list[Record] = []
@@ -162,7 +163,7 @@ class _Translation:
                 # The pupil reaches from lower - 1 to 1 - upper.
                 self._header_line(f"VD{axis}N", *(0.5 * (low - up) for up, low in both))
                 self._header_line(f"VC{axis}N", *(0.5 * (low + up) for up, low in both))
-        self._header_line("FTYP", self.field_type, 0, 0, len(self.waves))
+        self._header_line("FTYP", self.field_type, 0, 0, len(self.waves), 0, 0, float(self.afocal))
         return ZemaxFile(self.path, self.header, self._blocks(), Block(str(self.path)), self.private, program="CODE V")
 
     def _header_line(self, keyword: str, *values: float) -> None:
@@ -204,6 +205,8 @@ class _Translation:
             add("FWGN", *(repr(command.number(i)) for i in range(len(words))))
         elif key == "REF":
             add("PWAV", command.integer(0))
+        elif key == "AFO":
+            self.afocal = not (words and words[0].upper().startswith("N"))
         elif key in FIELDS:
             keyword, self.field_type = FIELDS[key]
             add(keyword, *(repr(command.number(i)) for i in range(len(words))))
