@@ -61,7 +61,7 @@ class Bundles:
     def cosines(self) -> np.ndarray:
         """Direction cosines of the rays at the image along x and y, shape [n_field, n_pupil, 2].
 
-        Behind the ideal lens of an afocal telescope, 1 m in front of the image, they are the opposite of the places on it.
+        Behind the ideal lens of an afocal telescope they are the opposite of the places on it, over its focal length.
         """
         return -self.position[..., :2] if self.afocal else self.direction[..., :2]
 

@@ -1,10 +1,10 @@
 """Translate a CODE V lens file (.seq) into the terms of a Zemax file.
 
 Supported commands: RDM, DIM, TITLE, EPD, FNO, NAO, WL, WTW, REF, AFO, XAN YAN, XOB YOB, XIM YIM, XRI YRI, WTF, VUX VLX
-VUY VLY, before the surfaces or after them; the surfaces SO S SI (curvature, or with RDM radius; thickness, glass), RDY CUY
-THI GLA, STO, SLB, SPH CON ASP with K and A to G (r^4 to r^16), XDE YDE ZDE ADE BDE CDE with DAR, BEN and REV, CIR (OBS,
-HOL) REX REY and ELX ELY with ADX ADY, pick-ups PIK, private glasses PRV PWL END. ADE and BDE are left-handed, CDE is
-right-handed (CODE V reference manual, "Decentered surfaces"), Zemax's tilts are all right-handed. A glass is a name
+VUY VLY, before the surfaces or after them; the surfaces SO S SI (curvature, or with RDM radius; thickness, glass), RDY
+CUY THI GLA, STO, SLB, SPH CON ASP with K and A to G (r^4 to r^16), XDE YDE ZDE ADE BDE CDE with DAR, BEN and REV, CIR
+(OBS, HOL) REX REY and ELX ELY with ADX ADY, pick-ups PIK, private glasses PRV PWL END. ADE and BDE are left-handed, CDE
+is right-handed (CODE V reference manual, "Decentered surfaces"), Zemax's tilts are all right-handed. A glass is a name
 (NBK7_SCHOTT), REFL, or a number (517642). Solves are passed over where their solution stands in the file. Rays are
 aimed at the stop, as CODE V's chief rays are.
 """
