@@ -85,7 +85,12 @@ def sensitivity(
     Column("end", "values", ".9g"),
     Column("change", "changes", ".4g"),
     Column("uncertainty", "uncertainty", ".2g"),
-    Column("effect of the change [µm]", lambda result: _optimum(result).step_effects, ".4g", 1e6),
+    Column(
+        lambda s: f"effect of the change [µ{'rad' if 'rms_start_rad' in s else 'm'}]",
+        lambda result: _optimum(result).step_effects,
+        ".4g",
+        1e6,
+    ),
     left=2,
     band=True,
 )

@@ -67,6 +67,16 @@ class Distortion(FieldResult):
         return self.position - self.predicted
 
     @property
+    def largest_shift(self) -> float:
+        """Length of the largest shift [m]."""
+        return float(np.linalg.norm(self.shift, axis=-1).max())
+
+    @property
+    def rms_shift(self) -> float:
+        """Root mean square length of the shifts [m]."""
+        return float(np.sqrt((self.shift**2).sum(axis=-1).mean()))
+
+    @property
     def percent(self) -> np.ndarray:
         """Distortion against the best-fitting scale [percent of the distance from the axis]; NaN on the axis."""
         return self._percent(1.0)
@@ -85,7 +95,6 @@ class Distortion(FieldResult):
 
     def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the fields."""
-        shift = np.linalg.norm(self.shift, axis=-1)
         name = "angular_magnification" if self.in_angles else "focal_length_m"
         return {
             "telescope": self.telescope,
@@ -95,12 +104,7 @@ class Distortion(FieldResult):
             f"axis_{name}": self.axis_focal_length,
             "largest_percent": float(np.nanmax(np.abs(self.percent), initial=0.0)),
             "largest_percent_of_axis_scale": float(np.nanmax(np.abs(self.percent_of_axis_scale), initial=0.0)),
-            **self.on_image(
-                {
-                    "largest_shift_um": float(shift.max()) * 1e6,
-                    "rms_shift_um": float(np.sqrt((shift**2).mean())) * 1e6,
-                }
-            ),
+            **self.on_image({"largest_shift_um": self.largest_shift * 1e6, "rms_shift_um": self.rms_shift * 1e6}),
             **self.field_items(),
             **self.on_image({"position_mm": self.position * 1e3, "predicted_mm": self.predicted * 1e3}),
             "percent": self.percent,
@@ -219,7 +223,7 @@ def _draw_picture(axes: Axes, result: Distortion) -> None:
     from matplotlib.collections import LineCollection
 
     predicted, shift = result.predicted * 1e3, result.shift * 1e3
-    largest = float(np.linalg.norm(shift, axis=-1).max())
+    largest = result.largest_shift * 1e3
     extent = float(np.ptp(predicted, axis=0).max())
     # A round factor that makes the largest shift some 6 % of the picture.
     factor = 10.0 ** np.floor(np.log10(0.06 * extent / max(largest, 1e-12 * extent)))
