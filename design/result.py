@@ -119,6 +119,10 @@ class FieldResult(Result):
         """Return a text with units of lengths on the image, with those of angles where it is at infinity."""
         return angular(text) if self.in_angles else text
 
+    def image_unit(self, unit: str) -> str:
+        """Return a unit of lengths on the image, um or mm, or that of angles where it is at infinity."""
+        return {"um": "urad", "mm": "mrad"}[unit] if self.in_angles else unit
+
     def of_sky(self, items: dict[str, Any]) -> dict[str, Any]:
         """Return entries of a summary that are angles on the sky: nothing where there is none."""
         return items if self.on_sky else {}

@@ -352,11 +352,8 @@ class Telescope(Pictured):
 
     @property
     def sphere_radius(self) -> float:
-        """Radius of reference spheres [m]: `reference_sphere_radius`, or -1 where the image is at infinity.
-
-        That sphere is the one through the ideal lens of 1 m that makes images of afocal telescopes.
-        """
-        return -1.0 if self.design_data.afocal else self.reference_sphere_radius
+        """Radius of reference spheres [m]: `reference_sphere_radius`, infinite where the image is."""
+        return math.inf if self.design_data.afocal else self.reference_sphere_radius
 
     def with_design(self, **changes: Any) -> Telescope:
         """Return the telescope with other :class:`DesignData`, such as ``aiming="real"``.

@@ -1,44 +1,45 @@
-"""Ideal lens behind a telescope whose image is at infinity: directions of its light become places.
+"""Images of telescopes whose light is parallel behind them: directions of the light become places.
 
-The lens of focal length f = 1 m stands in the plane of the detector. Light of the direction (u, v, w), in the frame of
-the detector, comes to the point f (u, v) / abs(w) of its focal plane, from all of the lens in phase. Metres on the
-image are therefore tangents of angles: 1 um is 1 urad. A wavefront refers to a plane wave where its reference sphere is
-the one through the lens, of radius f in front of the image.
+An ideal lens of the focal length f = 1 m takes light of the direction (u, v, w), in the frame of the detector, to the
+point f (u, v) / abs(w) of its focal plane. Metres on the image are therefore tangents of angles: 1 um is 1 urad.
+Wavefronts refer to plane waves (:mod:`pachon.wavefront.reference_sphere`), so that no focal length enters them.
 """
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 
 from ..core.errors import DomainError
 from ..models.telescope import Telescope
-from .pack.surfaces import refractive_indices
 from .trace import TraceResult
 
 
-def imaged(telescope: Telescope, end: TraceResult, wavelength: float) -> TraceResult:
-    """Return rays at the image: those at the detector or, of an afocal telescope, behind the ideal lens.
+def tangents(travel: np.ndarray) -> np.ndarray:
+    """Return the image points x, y [m] of directions [..., 3] in the frame of the detector, shape [..., 2]."""
+    return np.asarray(travel[..., :2] / np.abs(travel[..., 2:]))
 
-    The image plane is drawn at the detector, in the frame of the telescope.
+
+def image_points(telescope: Telescope, end: TraceResult) -> np.ndarray:
+    """Return where rays meet the image [m], telescope frame, shape [n, 3].
+
+    That is the detector or, of an afocal telescope, the image plane of the ideal lens, drawn at the detector.
     """
     if not telescope.design_data.afocal:
-        return end
-    detector, index = telescope.surfaces[-1], float(refractive_indices(telescope, wavelength)[-2])
-    place, travel = detector.to_local(end.position), detector.along(end.direction)
-    image = -telescope.sphere_radius * travel / np.abs(travel[:, 2:])
-    reach = image - place
-    direction = reach / np.linalg.norm(reach, axis=-1)[:, None]
-    # A plane wave meets the middle of the lens as its ray there does: the others are ahead by the place along it.
-    path = end.path_length + index * (np.linalg.norm(image, axis=-1) - (place * travel).sum(axis=-1))
-    image[:, 2] = 0.0
-    return replace(
-        end,
-        position=image @ detector.matrix.T + np.asarray(detector.vertex),
-        direction=direction @ detector.matrix.T,
-        path_length=path,
-    )
+        return end.position
+    detector = telescope.surfaces[-1]
+    image = tangents(detector.along(end.direction))
+    return np.asarray(image @ detector.matrix[:, :2].T + np.asarray(detector.vertex))
+
+
+def image_direction(telescope: Telescope, image: np.ndarray, travel: np.ndarray) -> np.ndarray:
+    """Return the unit vector of the light that an ideal lens takes to an image point [m], telescope frame.
+
+    Of the two sides of the detector it is that to which most of the light travels.
+    """
+    detector = telescope.surfaces[-1]
+    point = detector.to_local(image)
+    point[2] = np.sign(np.nansum(detector.along(travel)[..., 2]))
+    return np.asarray(detector.matrix @ point / np.linalg.norm(point))
 
 
 def require_image(telescope: Telescope, purpose: str) -> None:

@@ -10,7 +10,7 @@ from ..core.errors import DomainError
 from ..core.units import field_label, length, metres
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
-from ..raytrace.ideal_lens import imaged
+from ..raytrace.ideal_lens import image_points
 from ..raytrace.launch import launch_bundles
 from ..raytrace.rays import RayStatus, field_angles, field_direction, require_distant_object
 from ..raytrace.trace import TraceResult, trace
@@ -38,7 +38,7 @@ def chief_rays(
     """
     require_distant_object(telescope)
     rays = launch_bundles(telescope, directions, wavelength, np.zeros((1, 2)))
-    return imaged(telescope, trace(telescope, rays, focal_plane=focal_plane, threads=threads), wavelength)
+    return trace(telescope, rays, focal_plane=focal_plane, threads=threads)
 
 
 def reference_rays(
@@ -53,7 +53,6 @@ def reference_rays(
     """
     rays = request.launch(wavelength, np.zeros((1, 2)))
     end = trace(request.telescope, rays, focal_plane=focal_plane, threads=request.threads)
-    end = imaged(request.telescope, end, wavelength)
     lost = np.isin(end.status, (RayStatus.MISSED, RayStatus.TOTAL_REFLECTION, RayStatus.NOT_CONVERGED))
     if lost.any():
         raise DomainError(f"{field_label(request.fields[lost][0])}: the chief ray does not reach the image{advice}")
@@ -163,7 +162,7 @@ def _by_newton(telescope: Telescope, target: np.ndarray, wavelength: float, thre
 def _landing(telescope: Telescope, directions: np.ndarray, wavelength: float, threads: int | None) -> np.ndarray:
     """Return detector x and y [m] of the landing points of chief rays, shape [n, 2]."""
     end = chief_rays(telescope, directions, wavelength, threads=threads)
-    return telescope.surfaces[-1].to_local(end.position)[:, :2]
+    return telescope.surfaces[-1].to_local(image_points(telescope, end))[:, :2]
 
 
 def _downwards(cosines: np.ndarray) -> np.ndarray:

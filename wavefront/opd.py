@@ -13,16 +13,16 @@ from ..core.units import length
 from ..models.camera.focal_plane import FocalPlane
 from ..models.camera.silicon import Silicon
 from ..models.telescope import Telescope
-from ..raytrace.ideal_lens import imaged
+from ..raytrace.ideal_lens import image_direction, image_points, require_image
 from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import RayStatus, pupil_points
-from ..raytrace.trace import trace
+from ..raytrace.trace import TraceResult, trace
 from .chief_rays import image_jacobians, reference_rays
 from .opd_map import OpdMap, OpdMaps
 from .opd_packets import traced_opds
 from .pupil_grid import pupil_grid
 from .pupil_sampling import CHIEF_RAY
-from .reference_sphere import path_to_sphere
+from .reference_sphere import path_to_plane, path_to_sphere
 from .request import Request
 
 _ADVICE = "; wavefront_opd can do without it, with reference='mean'"
@@ -91,13 +91,14 @@ def wavefront_opd(
     if reference not in ("chief", "mean"):
         raise ConfigError(f"reference = {reference!r}: expected 'chief' or 'mean'")
     x, y, inside = _pupil_points(telescope, pupil, grid)
-    radius = _sphere_radius(telescope, sphere_radius)
+    radius = _sphere_radius(telescope, sphere_radius, focal_plane, silicon)
     request = Request.of(telescope, field, wavelength, sampling=CHIEF_RAY, projection=projection, threads=threads)
     if len(request.fields) != 1:
         raise DomainError(f"field of shape {request.fields.shape}: expected two angles")
     w, index = request.wavelength, refractive_indices(telescope, request.wavelength)[-2]
     rays = request.launch(w, np.stack([x.ravel(), y.ravel()], axis=-1))
-    end = imaged(telescope, trace(telescope, rays, focal_plane=focal_plane, threads=threads), w)
+    end = trace(telescope, rays, focal_plane=focal_plane, threads=threads)
+    landing = image_points(telescope, end)
     lit = inside.ravel() & ((end.status == RayStatus.OK) | (end.status == RayStatus.GAP))
     if reference == "chief":
         sphere = _spheres(request, radius, focal_plane)[0]
@@ -105,8 +106,8 @@ def wavefront_opd(
     else:
         if not lit.any():
             raise DomainError(f"field = {field!r}: no ray reaches the image")
-        center = end.position[lit].mean(axis=0)
-    path = path_to_sphere(end.path_length, index, end.position, end.direction, center, radius)
+        center = landing[lit].mean(axis=0)
+    path = _reference_path(telescope, end, index, center, radius)
     if silicon is not None:
         middle = (0.0, 0.0) if reference == "chief" else (x.ravel()[lit].mean(), y.ravel()[lit].mean())
         path = path - _silicon_opd(request, silicon, x - middle[0], y - middle[1]).ravel()
@@ -121,7 +122,7 @@ def wavefront_opd(
         center=center,
         radius=radius,
         exit_direction=end.direction.reshape(*x.shape, 3),
-        landing=end.position.reshape(*x.shape, 3),
+        landing=landing.reshape(*x.shape, 3),
     )
 
 
@@ -168,7 +169,7 @@ def wavefront_opds(
         lands between the CCDs.
     """
     x, y, inside = _pupil_points(telescope, pupil, grid)
-    radius = _sphere_radius(telescope, sphere_radius)
+    radius = _sphere_radius(telescope, sphere_radius, focal_plane, silicon)
     request = Request.of(telescope, fields, wavelength, sampling=CHIEF_RAY, projection=projection, threads=threads)
     spheres = _spheres(request, radius, focal_plane)
     value = traced_opds(request, x.ravel(), y.ravel(), spheres, radius, progress).reshape(-1, *x.shape)
@@ -207,7 +208,13 @@ def _silicon_opd(request: Request, silicon: Silicon, x: np.ndarray, y: np.ndarra
     return np.asarray(0.5 * shift * (cosines**2).sum(axis=-1)).reshape(-1, *x.shape)
 
 
-def _sphere_radius(telescope: Telescope, sphere_radius: ArrayLike | None) -> float:
+def _sphere_radius(
+    telescope: Telescope, sphere_radius: ArrayLike | None, focal_plane: FocalPlane | None, silicon: Silicon | None
+) -> float:
+    """Return the radius of reference spheres [m]; DomainError where an afocal telescope is given what has no place."""
+    given = {"a sphere_radius": sphere_radius, "a focal plane": focal_plane, "silicon": silicon}
+    for name in (name for name, value in given.items() if value is not None):
+        require_image(telescope, name)
     if sphere_radius is None:
         return telescope.sphere_radius
     radius = length(sphere_radius, "sphere_radius")
@@ -216,8 +223,28 @@ def _sphere_radius(telescope: Telescope, sphere_radius: ArrayLike | None) -> flo
     return radius
 
 
+def _reference_path(
+    telescope: Telescope, end: TraceResult, index: float, center: np.ndarray, radius: float
+) -> np.ndarray:
+    """Return optical paths [m] of rays to the reference sphere about an image point or, if afocal, to a plane."""
+    if not telescope.design_data.afocal:
+        return path_to_sphere(end.path_length, index, end.position, end.direction, center, radius)
+    along = image_direction(telescope, center, end.direction)
+    place = end.position - np.asarray(telescope.surfaces[-1].vertex)
+    return path_to_plane(end.path_length, index, place, end.direction, along)
+
+
 def _spheres(request: Request, radius: float, focal_plane: FocalPlane | None) -> np.ndarray:
-    """Return centres of the reference spheres and optical paths of the chief rays to them [m], shape [n_field, 4]."""
+    """Return centres of the reference spheres and optical paths of the chief rays to them [m], shape [n_field, 4].
+
+    Where the light is parallel, centres are image points, and paths are those to planes through the detector's vertex.
+    """
+    telescope = request.telescope
     chief = reference_rays(request, request.wavelength, focal_plane, advice=_ADVICE)
-    center, index = chief.position, refractive_indices(request.telescope, request.wavelength)[-2]
-    return np.column_stack([center, path_to_sphere(chief.path_length, index, center, chief.direction, center, radius)])
+    center, index = image_points(telescope, chief), refractive_indices(telescope, request.wavelength)[-2]
+    if telescope.design_data.afocal:
+        place = chief.position - np.asarray(telescope.surfaces[-1].vertex)
+        path = path_to_plane(chief.path_length, index, place, chief.direction, chief.direction)
+    else:
+        path = path_to_sphere(chief.path_length, index, center, chief.direction, center, radius)
+    return np.column_stack([center, path])

@@ -38,7 +38,7 @@ def traced_opds(
     """
     telescope, directions = request.telescope, request.directions
     if telescope.design_data.afocal:
-        return _behind_ideal_lens(request, np.stack([x, y], axis=-1), radius, progress)
+        return _plane_wave_opds(request, np.stack([x, y], axis=-1), progress)
     whole = pack_surfaces(telescope)
     stages = [whole]
     stop = next((i for i, s in enumerate(telescope.surfaces) if s.aperture is not None), None)
@@ -93,14 +93,12 @@ def traced_opds(
     return value
 
 
-def _behind_ideal_lens(
-    request: Request, points: np.ndarray, radius: float, progress: Callable[[int], None] | None
-) -> np.ndarray:
-    """Return :func:`traced_opds` of an afocal telescope, to spheres about the images of its chief rays."""
+def _plane_wave_opds(request: Request, points: np.ndarray, progress: Callable[[int], None] | None) -> np.ndarray:
+    """Return :func:`traced_opds` of an afocal telescope, to planes across its chief rays."""
     value = np.empty((len(request.fields), len(points)))
     for i in range(len(value)):
         bundle = request.at_fields(slice(i, i + 1)).bundles(request.wavelength, points)
-        value[i] = np.where(bundle.lit, bundle.opd(radius), np.nan)[0]
+        value[i] = np.where(bundle.lit, bundle.opd(np.inf), np.nan)[0]
         if progress is not None:
             progress(1)
     return value

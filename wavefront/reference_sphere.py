@@ -1,4 +1,4 @@
-"""Reference spheres: optical paths of rays to a sphere about an image point.
+"""Reference spheres: optical paths of rays to a sphere about an image point, or to a plane where light is parallel.
 
 Zemax refers the OPD to the exit pupil. That of the LSST is virtual and lies beyond the focal plane, where chief rays
 still converge towards the axis; therefore paths are those to the sphere beyond the image.
@@ -20,6 +20,30 @@ def path_to_sphere(
     """
     root, along = _root_and_projection(position - center, direction, radius)
     return path + index * (np.copysign(root, radius) - along)
+
+
+def path_to_plane(
+    path: np.ndarray, index: float, position: np.ndarray, direction: np.ndarray, along: np.ndarray
+) -> np.ndarray:
+    """Return the optical path [m] of rays to the plane through the origin across a direction, shape [...].
+
+    Arguments are those of :func:`path_to_sphere`; ``along`` [..., 3] holds unit vectors.
+    """
+    distance = -np.einsum("...i,...i", position, along) / np.einsum("...i,...i", direction, along)
+    return np.asarray(path + index * distance)
+
+
+def plane_distance_derivatives(
+    position: np.ndarray, direction: np.ndarray, along: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the distance [m] along rays to the plane of :func:`path_to_plane`, shape [n], and its derivatives.
+
+    Arguments have the shape [3, n]. Derivatives, shape [3, n] each, are those by the position, by the direction and by
+    ``along`` as free vectors [m].
+    """
+    reach, slope = (position * along).sum(axis=0), (direction * along).sum(axis=0)
+    ratio = reach / slope**2
+    return -reach / slope, -along / slope, ratio * along, ratio * direction - position / slope
 
 
 def sphere_distance_derivatives(

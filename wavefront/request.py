@@ -15,7 +15,6 @@ from ..core.units import metres, pure_numbers, radians
 from ..models.design_data import unvignetted, vignetted
 from ..models.telescope import Telescope
 from ..raytrace.aiming import AimedPoints, pupil_coordinates
-from ..raytrace.ideal_lens import imaged
 from ..raytrace.launch import aimed_points
 from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import Rays, RayStatus, field_direction, straight_bundles
@@ -265,7 +264,7 @@ class Request:
             chief = self.entrance_points_of(self.telescope, wavelength, np.zeros((1, 2))).reshape(1, 2)
             through = np.concatenate([entrance, chief])
             rays = straight_bundles(self.telescope, self.directions, wavelength, through)
-        end = imaged(self.telescope, trace(self.telescope, rays, threads=self.threads), wavelength)
+        end = trace(self.telescope, rays, threads=self.threads)
         n, detector = len(self.fields), self.telescope.surfaces[-1]
         position = detector.to_local(end.position).reshape(n, -1, 3)
         direction = detector.along(end.direction).reshape(n, -1, 3)
@@ -280,6 +279,7 @@ class Request:
             chief_path=path[:, -1],
             index=float(refractive_indices(self.telescope, wavelength)[-2]),
             wavelength=wavelength,
+            afocal=self.telescope.design_data.afocal,
         )
 
     def parts(self) -> Iterator[tuple[slice, Request]]:

@@ -38,13 +38,14 @@ def distortion(
 
 def _distortion_rows(result: Any) -> Rows:
     s = result.summary()
+    scales = ("that fits best", result.focal_length), ("at the axis", result.axis_focal_length)
+    name, shown = ("angular magnification", "{:.6f}".format) if result.in_angles else ("focal length", _length)
     rows = [
-        ("focal length that fits best", _length(s["focal_length_m"])),
-        ("focal length at the axis", _length(s["axis_focal_length_m"])),
+        *((f"{name} {where}", shown(value)) for where, value in scales),
         ("largest distortion against the best scale", f"{s['largest_percent']:.4f} %"),
         ("largest distortion against the axis's scale", f"{s['largest_percent_of_axis_scale']:.4f} %"),
-        ("largest shift from the best picture", f"{s['largest_shift_um']:.3f} µm"),
-        ("rms shift", f"{s['rms_shift_um']:.3f} µm"),
+        ("largest shift from the best picture", result.image_text(f"{1e6 * result.largest_shift:.3f} µm")),
+        ("rms shift", result.image_text(f"{1e6 * result.rms_shift:.3f} µm")),
     ]
     return Rows(("metric", "value"), rows, f"{s['telescope']}, {s['wavelength_nm']:g} nm, {len(result.fields)} fields")
 

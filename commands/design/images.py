@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer import Option
@@ -19,6 +19,16 @@ PupilPoints = Annotated[
 ]
 
 
+def _pixels_text(s: dict[str, Any]) -> str:
+    """Return size and number of the pixels of diffraction images."""
+    pixel, unit = (s["pixel_urad"], "µrad") if "pixel_urad" in s else (s["pixel_um"], "µm")
+    return (
+        f"{s['pixels']} x {s['pixels']} pixels of {pixel:.4g} {unit}; inside: of the light, within the "
+        f"{s['pixels'] * pixel:.4g} {unit} of the image; lit: of the annular pupil. {s['pupil_points']} points "
+        "across the pupil."
+    )
+
+
 @design_command(
     FIELD,
     Column("Strehl", "strehl", ".4f"),
@@ -27,11 +37,7 @@ PupilPoints = Annotated[
     Column("Airy [µm]", "airy_radius_um", ".3f"),
     Column("inside [%]", "light_inside", ".2f", 100.0),
     Column("lit [%]", "lit_fraction", ".2f", 100.0),
-    caption=lambda s: (
-        f"{s['pixels']} x {s['pixels']} pixels of {s['pixel_um']:.4g} µm; inside: of the light, within the "
-        f"{s['pixels'] * s['pixel_um']:.4g} µm of the image; lit: of the annular pupil. {s['pupil_points']} points "
-        "across the pupil."
-    ),
+    caption=_pixels_text,
     band=True,
 )
 def psf(

@@ -85,7 +85,12 @@ def sensitivity(
     Column("end", "values", ".9g"),
     Column("change", "changes", ".4g"),
     Column("uncertainty", "uncertainty", ".2g"),
-    Column("effect of the change [µm]", lambda result: _optimum(result).step_effects, ".4g", 1e6),
+    Column(
+        lambda s: f"effect of the change [µ{'rad' if 'rms_start_rad' in s else 'm'}]",
+        lambda result: _optimum(result).step_effects,
+        ".4g",
+        1e6,
+    ),
     left=2,
     band=True,
 )
@@ -185,11 +190,12 @@ def _optimum(result: Any) -> Any:
 
 def _notes(result: Any) -> list[str]:
     """Return merit and operands before and after, glasses and collinear combinations as lines."""
-    s = result.summary()
-    lines = [f"rms of {s['merit']}: {s['rms_start_m'] * 1e6:.6g} -> {s['rms_end_m'] * 1e6:.6g} µm, {s['steps']} steps"]
+    s, optimum = result.summary(), _optimum(result)
+    unit, (start, end) = "µrad" if optimum.in_angles else "µm", 1e6 * optimum.merits
+    lines = [f"rms of {s['merit']}: {start:.6g} -> {end:.6g} {unit}, {s['steps']} steps"]
     if s["operands"]:
-        both = s["rms_start_with_operands_m"] * 1e6, s["rms_end_with_operands_m"] * 1e6
-        lines.append(f"with operands: {both[0]:.6g} -> {both[1]:.6g} µm")
+        start, end = 1e6 * optimum.history[[0, -1]]
+        lines.append(f"with operands: {start:.6g} -> {end:.6g} {unit}")
     several = len(s["configurations"]) > 1
     for one in s["operands"]:
         unit = "" if one["unit"] == "1" else f" {one['unit']}"

@@ -14,7 +14,6 @@ from ...core.errors import DomainError
 from ...core.plotting import BLUE, GREY, ORANGE, RED
 from ...core.units import pure_numbers
 from ...models.telescope import Telescope
-from ...raytrace.ideal_lens import require_image
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
@@ -60,15 +59,19 @@ class LateralColor(Analysis):
         return {
             **self._field_columns(1),
             "wavelength": (self.wavelengths * 1e9, "nm", "vacuum wavelength"),
-            "shift": (self.shift * 1e6, "um", "shift of the chief ray along the field"),
+            "shift": (self.shift * 1e6, self.image_unit("um"), "shift of the chief ray along the field"),
         }
 
     def _values(self) -> dict[str, Any]:
         return {
             "reference_nm": self.request.middle * 1e9,
-            "shift_um": self.shift * 1e6,
-            "spread_um": self.spread * 1e6,
-            "airy_radius_um": self.airy_radius * 1e6,
+            **self.on_image(
+                {
+                    "shift_um": self.shift * 1e6,
+                    "spread_um": self.spread * 1e6,
+                    "airy_radius_um": self.airy_radius * 1e6,
+                }
+            ),
         }
 
     def _draw(self, panels: Sequence[Axes]) -> None:
@@ -81,7 +84,7 @@ class LateralColor(Analysis):
         airy = self.airy_radius[order] * 1e6
         axes.plot(airy, distance[order], ":", color=GREY, linewidth=1.0, label="Airy disc")
         axes.plot(-airy, distance[order], ":", color=GREY, linewidth=1.0)
-        xlabel = "shift of the chief ray along the field [µm]"
+        xlabel = self.image_text("shift of the chief ray along the field [µm]")
         finish_axes(axes, ylim=(0.0, max(float(distance.max()), 1e-9)), xlabel=xlabel, ylabel=label)
         axes.legend(fontsize=7.5)
 
@@ -172,7 +175,6 @@ def lateral_color(
     DomainError
         If a chief ray does not reach the detector.
     """
-    require_image(telescope, "a lateral colour")
     request = line_request(telescope, fields, band_wavelengths(telescope, wavelengths), projection, threads)
     point = np.zeros((1, 2))
     landing = np.stack([request.bundles(float(w), point).chief_landing() for w in request.wavelengths], axis=1)

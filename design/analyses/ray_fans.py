@@ -13,6 +13,7 @@ from ...core.arguments import check_arguments
 from ...core.plotting import BLUE
 from ...core.units import length, require_count, require_positive
 from ...models.telescope import Telescope
+from ...raytrace.ideal_lens import require_image
 from ...wavefront.bundles import Bundles
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
@@ -243,8 +244,11 @@ def opd_fans(
     DomainError
         If there are too few rays, or the radius is zero or not finite.
     """
-    radius = telescope.sphere_radius if sphere_radius is None else length(sphere_radius, "sphere_radius")
-    require_positive(abs(radius), "sphere_radius", "metres")
+    radius = telescope.sphere_radius
+    if sphere_radius is not None:
+        require_image(telescope, "a sphere_radius")
+        radius = length(sphere_radius, "sphere_radius")
+        require_positive(abs(radius), "sphere_radius", "metres")
     request, pupil, _, bundles = _traced(telescope, fields, wavelengths, n_points, projection, threads)
     value = np.stack([b.opd(radius) for b in bundles], axis=1).reshape(len(request.fields), len(bundles), 2, -1)
     return OpdFans(request, pupil, _lit(bundles), value, radius)

@@ -85,7 +85,7 @@ class SpotMatrix(Analysis):
                 unit,
                 "vacuum wavelength" if nm else "displacement of the detector",
             ),
-            "rms_radius": (self.rms_radius * 1e6, "um", "rms radius of the spot"),
+            "rms_radius": (self.rms_radius * 1e6, self.image_unit("um"), "rms radius of the spot"),
         }
 
     def _values(self) -> dict[str, Any]:
@@ -93,8 +93,7 @@ class SpotMatrix(Analysis):
         return {
             "against": self.against,
             **({"defocus_um": self.columns * 1e6} if focus else {"columns_nm": self.columns * 1e9}),
-            "rms_radius_um": self.rms_radius * 1e6,
-            "airy_radius_um": self.airy_radius * 1e6,
+            **self.on_image({"rms_radius_um": self.rms_radius * 1e6, "airy_radius_um": self.airy_radius * 1e6}),
         }
 
     def _draw(self, panels: Sequence[Axes]) -> None:
@@ -113,14 +112,14 @@ class SpotMatrix(Analysis):
                 axes.plot(*points.T, ".", markersize=1.5, markeredgewidth=0.0, color=color)
             drawing.draw_circle(axes, float(self.airy_radius[i]) * 1e6, color="black")
             drawing.bare_frame(axes, half)
-            axes.set_xlabel(f"{rms[i, c]:.3g} µm rms", fontsize=7, labelpad=1)
+            axes.set_xlabel(self.image_text(f"{rms[i, c]:.3g} µm rms"), fontsize=7, labelpad=1)
             if c == 0:
                 axes.set_ylabel(self.field_labels()[i], fontsize=8.5)
             if i == 0:
                 value = self.columns[c]
                 axes.set_title(f"{value * 1e9:.4g} nm" if self.against == "wavelength" else f"{value * 1e6:+.4g} µm")
         bar = drawing.round_length(0.7 * half)
-        drawing.draw_scale_bar(panels[-n], bar, f"{bar:g} µm")
+        drawing.draw_scale_bar(panels[-n], bar, self.image_text(f"{bar:g} µm"))
 
 
 @check_arguments
@@ -155,7 +154,8 @@ def spot_matrix(
     ConfigError
         If `against` is another word.
     DomainError
-        If the heights are not a list of finite lengths, or given against the wavelength, or the light is parallel.
+        If the heights are not a list of finite lengths, or given against the wavelength, or light without a focus
+        is to be studied against it.
     """
     if against == "wavelength":
         if defocus is not None:
@@ -167,7 +167,8 @@ def spot_matrix(
     )
     bundles = [request.bundles(float(w)) for w in request.wavelengths]
     ratio = principal_rays_of(request).mean_f_number
-    require_focus(telescope, np.nan_to_num(ratio, posinf=np.inf))
+    if against == "focus" or not telescope.design_data.afocal:
+        require_focus(telescope, np.nan_to_num(ratio, posinf=np.inf))
     if against == "wavelength":
         heights = np.zeros(1)
     elif defocus is None:

@@ -21,7 +21,6 @@ from ...core.errors import DomainError, check_choice
 from ...core.threads import one_blas_thread
 from ...core.units import field_label, length, require_count
 from ...models.telescope import Telescope
-from ...raytrace.ideal_lens import require_image
 from ...wavefront.pupil_sampling import PupilSampling, pupil_sampling
 from ...wavefront.request import Request, relative_weights
 from ..metrics.principal_rays import principal_rays_of
@@ -85,7 +84,6 @@ def fft_psf(
     DomainError
         If a number is out of range, no light passes, or the lattice is too coarse for the spots or the image.
     """
-    require_image(telescope, "a diffraction image")
     request = Request.of(
         telescope, fields, wavelengths, wavelength_weights=wavelength_weights, projection=projection, threads=threads
     )
@@ -141,7 +139,6 @@ def huygens_psf(
     :meth:`pachon.Request.of`: by default a square lattice, 160 across. Gauss quadrature needs far fewer points where
     nothing is vignetted.
     """
-    require_image(telescope, "a diffraction image")
     request = Request.of(
         telescope,
         fields,

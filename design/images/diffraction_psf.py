@@ -65,6 +65,7 @@ class DiffractionPsf(FieldResult):
         "plate_scale",
     )
     _images = ("image",)
+    _on_image = ("fwhm", "rms_radius", "airy_radius", "centroid", "reference_point", "plate_scale", "pixel", "axis")
 
     method: str
     image: np.ndarray
@@ -117,19 +118,18 @@ class DiffractionPsf(FieldResult):
             "method": self.method,
             "wavelength_nm": self.wavelengths * 1e9,
             "pupil_points": self.n_pupil,
-            "pixel_um": self.pixel * 1e6,
+            **self.on_image({"pixel_um": self.pixel * 1e6}),
             "pixels": self.image.shape[-1],
             **self.field_items(),
-            "reference_mm": self.reference_point * 1e3,
+            **self.on_image({"reference_mm": self.reference_point * 1e3}),
             "strehl": self.strehl,
-            "fwhm_um": self.fwhm * 1e6,
+            **self.on_image({"fwhm_um": self.fwhm * 1e6}),
             **self.of_sky({"fwhm_arcsec": self.fwhm * arcsec}),
-            "centroid_um": self.centroid * 1e6,
-            "airy_radius_um": self.airy_radius * 1e6,
+            **self.on_image({"centroid_um": self.centroid * 1e6, "airy_radius_um": self.airy_radius * 1e6}),
             **self.of_sky({"airy_radius_arcsec": self.airy_radius * arcsec}),
             "light_inside": self.inside,
             "lit_fraction": self.lit_fraction,
-            **self.of_sky({"plate_scale_arcsec_per_um": arcsec * 1e-6}),
+            **self.on_image(self.of_sky({"plate_scale_arcsec_per_um": arcsec * 1e-6})),
         }
 
     def plot(self, ax: Axes | Figure | None = None) -> Figure:
@@ -193,7 +193,7 @@ def _draw_cuts(panels: Any, psf: DiffractionPsf) -> None:
             row, column = np.unravel_index(int(np.argmax(density)), density.shape)
             cut = density[row] if name == "x" else density[:, column]
             axes.plot(psf.axis * 1e6, cut, color=color, linewidth=1.2, label=psf.field_labels()[i])
-        label = f"{name} from the middle of the image [µm]"
+        label = psf.image_text(f"{name} from the middle of the image [µm]")
         drawing.finish_axes(axes, xlabel=label, xlim=(psf.axis[0] * 1e6, psf.axis[-1] * 1e6), ylim=(0.0, None))
-    panels[0].set_ylabel("part of the light per µm²\n(through the brightest pixel)")
+    panels[0].set_ylabel(psf.image_text("part of the light per µm²\n(through the brightest pixel)"))
     panels[1].legend(loc="upper right")

@@ -15,7 +15,6 @@ from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, ORANGE, RED, figure_at, styled
 from ...core.units import arcseconds, metres, pure_numbers, require_count
 from ...models.telescope import Telescope
-from ...raytrace.ideal_lens import require_image
 from ...wavefront.pupil_sampling import PupilSampling
 from ..drawing import FEW, field_colors, finish_axes, second_scale
 from ..metrics.spots import SpotDiagram, spots
@@ -53,6 +52,8 @@ class EncircledEnergy(FieldResult):
         Angle on the sky over length on the detector [rad/m].
     """
 
+    _on_image = ("radius", "plate_scale")
+
     kind: str
     radius: np.ndarray
     fraction: np.ndarray
@@ -78,10 +79,11 @@ class EncircledEnergy(FieldResult):
             "kind": self.kind,
             "wavelength_nm": self.wavelengths * 1e9,
             **self.field_items(),
-            **{f"{name}_um": value * 1e6 for name, value in radii.items()},
+            **self.on_image({f"{name}_um": value * 1e6 for name, value in radii.items()}),
             **self.of_sky({f"{name}_arcsec": value * arcsec for name, value in radii.items()}),
-            **self.of_sky({"plate_scale_arcsec_per_um": arcsec * 1e-6}),
-            "radius_um": self.radius * 1e6,
+            **self.on_image(
+                self.of_sky({"plate_scale_arcsec_per_um": arcsec * 1e-6}) | {"radius_um": self.radius * 1e6}
+            ),
             "fraction": self.fraction,
         }
 
@@ -143,7 +145,6 @@ def encircled_energy(
         If radii do not ascend, or no light passes.
     """
     check_choice("kind", kind, KINDS)
-    require_image(telescope, "an encircled energy")
     given = None if radii is None else np.atleast_1d(metres(radii, "radii"))
     if given is not None and not (
         given.ndim == 1 and np.isfinite(given).all() and (given >= 0).all() and (np.diff(given) > 0).all()
@@ -267,10 +268,10 @@ def _draw_curves(axes: Axes, result: EncircledEnergy) -> None:
         axes,
         xlim=(0.0, max(edge, 0.25 * result.radius[-1]) * 1e6),
         ylim=(0.0, 1.02),
-        xlabel="radius about the centroid of the rays [µm]",
+        xlabel=result.image_text("radius about the centroid of the rays [µm]"),
         ylabel="fraction of the light within",
     )
-    if result.on_sky:
+    if result.on_sky and not result.in_angles:
         second_scale(axes, float(np.rad2deg(result.plate_scale[0])) * 3600e-6, "arc seconds")
     if few:
         axes.legend(loc="lower right")
@@ -278,7 +279,9 @@ def _draw_curves(axes: Axes, result: EncircledEnergy) -> None:
 
 def _draw_radii(axes: Axes, result: EncircledEnergy) -> None:
     away, distance = result.axis_distances()
-    scale, unit = (arcseconds(result.plate_scale), "arcsec") if result.on_sky else (np.full(len(away), 1e6), "µm")
+    scale, unit = np.full(len(away), 1e6), result.image_text("µm")
+    if result.on_sky and not result.in_angles:
+        scale, unit = arcseconds(result.plate_scale), "arcsec"
     order = np.argsort(away, kind="stable")
     for part, color in ((0.9, ORANGE), (0.8, RED), (0.5, BLUE)):
         radius = (result.radius_holding(part) * scale)[order]

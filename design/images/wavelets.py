@@ -280,6 +280,8 @@ def _coverage(
 
 def _at_reference(telescope: Telescope, bundle: Bundles, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return path differences [m] at a point of the detector, shape [n], and cosines along it there, shape [n, 2]."""
+    if bundle.afocal:
+        return _far_away(bundle, center)
     shape = telescope.surfaces[-1].shape
     point = np.array([*center, float(shape.sag(*center))])
     slopes = np.array([float(v) for v in shape.gradient(*center)])
@@ -294,6 +296,20 @@ def _at_reference(telescope: Telescope, bundle: Bundles, center: np.ndarray) -> 
     chief = path(bundle.chief_path, bundle.chief_position, bundle.chief_direction)
     opd = chief[0] - path(bundle.path[0], bundle.position[0], bundle.direction[0])
     return opd, along(bundle.direction[0]) - along(bundle.chief_direction[0])
+
+
+def _far_away(bundle: Bundles, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return path differences [m] in a direction of tangents `center`, and their derivatives by the tangents [m].
+
+    They are those of Fraunhofer's diffraction at the plane of the detector, where rays of the optical path L stand at
+    X: a plane across the unit vector a of the direction is at the path L - n X.a.
+    """
+    scale = 1.0 / np.sqrt(1.0 + center @ center)
+    along = scale * np.array([*center, np.sign(bundle.chief_direction[0, 2])])
+    reach, chief = bundle.position[0] @ along, bundle.chief_position[0] @ along
+    opd = bundle.chief_path[0] - bundle.path[0] - bundle.index * (chief - reach)
+    places = bundle.position[0, :, :2] - bundle.chief_position[0, :2]
+    return opd, -bundle.index * (scale * places - scale**2 * np.multiply.outer(reach - chief, center))
 
 
 def _in_annulus(telescope: Telescope, points: np.ndarray) -> np.ndarray:

@@ -13,7 +13,6 @@ from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, ORANGE, RED, figure_at, styled
 from ...core.units import field_label
 from ...models.telescope import Telescope
-from ...raytrace.ideal_lens import require_image
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
 from ..drawing import finish_axes
@@ -45,12 +44,15 @@ class Distortion(FieldResult):
     center : ndarray, shape [2]
         Position of the axis in that picture [m].
     focal_length : float
-        Scale of the picture, length on the detector over slope of the light [m/rad].
+        Scale of the picture, length on the detector over slope of the light [m/rad]. Where the image is at infinity it
+        is the size of the angular magnification.
     axis_focal_length : float
         Scale at the axis itself [m/rad].
     """
 
     _table = ("fields", "position", "predicted", "shift", "percent", "percent_of_axis_scale")
+
+    _on_image = ("position", "predicted", "shift")
 
     reference: str
     position: np.ndarray
@@ -63,6 +65,16 @@ class Distortion(FieldResult):
     def shift(self) -> np.ndarray:
         """Landing point minus scaled picture [m], shape [n_field, 2]."""
         return self.position - self.predicted
+
+    @property
+    def largest_shift(self) -> float:
+        """Length of the largest shift [m]."""
+        return float(np.linalg.norm(self.shift, axis=-1).max())
+
+    @property
+    def rms_shift(self) -> float:
+        """Root mean square length of the shifts [m]."""
+        return float(np.sqrt((self.shift**2).sum(axis=-1).mean()))
 
     @property
     def percent(self) -> np.ndarray:
@@ -83,20 +95,18 @@ class Distortion(FieldResult):
 
     def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the fields."""
-        shift = np.linalg.norm(self.shift, axis=-1)
+        name = "angular_magnification" if self.in_angles else "focal_length_m"
         return {
             "telescope": self.telescope,
             "wavelength_nm": self.wavelength * 1e9,
             "reference": self.reference,
-            "focal_length_m": self.focal_length,
-            "axis_focal_length_m": self.axis_focal_length,
+            name: self.focal_length,
+            f"axis_{name}": self.axis_focal_length,
             "largest_percent": float(np.nanmax(np.abs(self.percent), initial=0.0)),
             "largest_percent_of_axis_scale": float(np.nanmax(np.abs(self.percent_of_axis_scale), initial=0.0)),
-            "largest_shift_um": float(shift.max()) * 1e6,
-            "rms_shift_um": float(np.sqrt((shift**2).mean())) * 1e6,
+            **self.on_image({"largest_shift_um": self.largest_shift * 1e6, "rms_shift_um": self.rms_shift * 1e6}),
             **self.field_items(),
-            "position_mm": self.position * 1e3,
-            "predicted_mm": self.predicted * 1e3,
+            **self.on_image({"position_mm": self.position * 1e3, "predicted_mm": self.predicted * 1e3}),
             "percent": self.percent,
             "percent_of_axis_scale": self.percent_of_axis_scale,
         }
@@ -143,7 +153,6 @@ def distortion(
     """
     check_choice("reference", reference, REFERENCES)
     points = field_lattice(telescope, _ACROSS) if fields is None else fields
-    require_image(telescope, "a distortion")
     request = Request.of(
         telescope,
         points,
@@ -214,7 +223,7 @@ def _draw_picture(axes: Axes, result: Distortion) -> None:
     from matplotlib.collections import LineCollection
 
     predicted, shift = result.predicted * 1e3, result.shift * 1e3
-    largest = float(np.linalg.norm(shift, axis=-1).max())
+    largest = result.largest_shift * 1e3
     extent = float(np.ptp(predicted, axis=0).max())
     # A round factor that makes the largest shift some 6 % of the picture.
     factor = 10.0 ** np.floor(np.log10(0.06 * extent / max(largest, 1e-12 * extent)))
@@ -227,9 +236,11 @@ def _draw_picture(axes: Axes, result: Distortion) -> None:
     else:
         axes.plot(*predicted.T, "+", color="0.6")
     axes.plot(*(predicted + factor * shift).T, ".", color=BLUE, markersize=3.0)
-    axes.set(aspect="equal", xlabel="detector x [mm]", ylabel="detector y [mm]")
+    x, y = ("tan x [mrad]", "tan y [mrad]") if result.in_angles else ("detector x [mm]", "detector y [mm]")
+    axes.set(aspect="equal", xlabel=x, ylabel=y)
     axes.autoscale_view()
-    axes.set_title(f"shifts drawn {factor:,.0f} times as long; the largest is {largest * 1e3:.3g} µm", loc="left")
+    text = result.image_text(f"{largest * 1e3:.3g} µm")
+    axes.set_title(f"shifts drawn {factor:,.0f} times as long; the largest is {text}", loc="left")
 
 
 def _neighbours(fields: np.ndarray) -> np.ndarray:
@@ -247,9 +258,10 @@ def _draw_percent(axes: Axes, result: Distortion) -> None:
     radius, distance = result.axis_distances()
     order = np.argsort(radius)
     axes.axhline(0.0, color="0.6", linewidth=0.7)
+    name, unit = ("magnification", "") if result.in_angles else ("f =", " m")
     for percent, color, label in (
-        (result.percent, BLUE, f"scale that fits best, f = {result.focal_length:.5g} m"),
-        (result.percent_of_axis_scale, ORANGE, f"scale at the axis, f = {result.axis_focal_length:.5g} m"),
+        (result.percent, BLUE, f"scale that fits best, {name} {result.focal_length:.5g}{unit}"),
+        (result.percent_of_axis_scale, ORANGE, f"scale at the axis, {name} {result.axis_focal_length:.5g}{unit}"),
     ):
         axes.plot(radius[order], percent[order], ".", color=color, markersize=4.5, label=label)
     worst = float(np.nanmax(np.abs(result.percent)))

@@ -19,7 +19,7 @@ from ...core.errors import DomainError
 from ...core.plotting import BLUE, GREY, ORANGE, figure_at, styled
 from ...core.units import field_label
 from ...models.telescope import Telescope
-from ...raytrace.ideal_lens import imaged
+from ...raytrace.ideal_lens import image_points
 from ...raytrace.launch import launch_bundles
 from ...raytrace.rays import RayStatus, field_direction
 from ...raytrace.trace import trace
@@ -199,7 +199,7 @@ def principal_rays_of(request: Request) -> PrincipalRays:
     through = np.repeat(request.vignetted(np.concatenate([np.zeros((n, 1, 2)), _NEAR * rim, rim], axis=1)), 5, axis=0)
     directions = field_direction(near[:, 0], near[:, 1], "gnomonic")
     end = trace(telescope, launch_bundles(telescope, directions, wavelength, through), threads=request.threads)
-    image = imaged(telescope, end, wavelength).position.reshape(n, 5, 9, 3)
+    image = image_points(telescope, end).reshape(n, 5, 9, 3)
     position, direction = end.position.reshape(n, 5, 9, 3), end.direction.reshape(n, 5, 9, 3)
     chief_position, chief_direction = position[:, 0, 0], direction[:, 0, 0]
     reached = (end.status.reshape(n, 5, 9)[:, :, :5] <= RayStatus.VIGNETTED).all(axis=(1, 2))
@@ -243,11 +243,12 @@ def _focal_ratios(request: Request, axes: np.ndarray) -> np.ndarray:
     """
     weights, unit = request.pupil.weights, request.unit_pupil
     bundles = request.bundles(request.wavelength)
+    cosines = bundles.cosines
     ratios = np.full((len(request.fields), 2), np.nan)
     for i, lit in enumerate(bundles.lit):
         plane = np.stack([np.ones(lit.sum()), *unit[lit].T], axis=-1)
         root = np.sqrt(weights[lit])[:, None]
-        slopes, _, rank, _ = np.linalg.lstsq(plane * root, bundles.direction[i, lit, :2] * root, rcond=None)
+        slopes, _, rank, _ = np.linalg.lstsq(plane * root, cosines[i, lit] * root, rcond=None)
         if rank == 3:
             cone = np.linalg.norm(axes[i] @ slopes[1:], axis=-1)
             with np.errstate(divide="ignore"):

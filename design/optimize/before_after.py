@@ -42,5 +42,5 @@ def draw_before_after(
                 axes.plot(*xy[weight > 0].T, ".", markersize=1.6, markeredgewidth=0.0, color=color)
             bare_frame(axes, half)
             axes.set_title(field_text(shown[i]), fontsize=8)
-            axes.set_xlabel(f"rms {diagram.rms_radius[i] * 1e6:.3g} µm", fontsize=7.5)
-        row[0].set_ylabel(f"{name}, ±{half:.3g} µm", fontsize=7.5)
+            axes.set_xlabel(diagram.image_text(f"rms {diagram.rms_radius[i] * 1e6:.3g} µm"), fontsize=7.5)
+        row[0].set_ylabel(diagram.image_text(f"{name}, ±{half:.3g} µm"), fontsize=7.5)

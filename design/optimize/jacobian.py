@@ -13,7 +13,7 @@ from ...raytrace.adjoint.adjoint_matrix import AdjointMatrix, column_table, poly
 from ...raytrace.adjoint.backward_pass import OutputGradient, backward_pass
 from ...raytrace.adjoint.forward_pass import ForwardPass
 from ...raytrace.adjoint.sphere_adjoint import SPHERE_COLUMNS
-from ...wavefront.reference_sphere import sphere_distance_derivatives
+from ...wavefront.reference_sphere import plane_distance_derivatives, sphere_distance_derivatives
 from ..parameters.links import has_links, without_links
 from ..parameters.parameters import Parameter, apply, index_surfaces, linked, shapes_with_terms, twists
 from ..parameters.shape_terms import term_polynomial
@@ -230,3 +230,17 @@ def sphere_gradient(forward: ForwardPass, center: np.ndarray, radius: float) -> 
     )
     gradient = OutputGradient(n * by_position[None], n * by_direction[None], np.ones(1), index=distance[None])
     return gradient, forward.path_length + n * distance
+
+
+def plane_gradient(forward: ForwardPass, along: np.ndarray) -> tuple[OutputGradient, np.ndarray, np.ndarray]:
+    """Return the gradient of the optical path to planes across directions, one output; the path; its derivatives.
+
+    The planes go through the vertex of the last surface. The directions and the derivatives of the path with respect to
+    them have shape [3, n], telescope frame.
+    """
+    n, vertex = forward.indices[-2], np.array(forward.telescope.surfaces[-1].vertex)[:, None]
+    distance, by_position, by_direction, by_along = plane_distance_derivatives(
+        forward.position - vertex, forward.direction, along
+    )
+    gradient = OutputGradient(n * by_position[None], n * by_direction[None], np.ones(1), index=distance[None])
+    return gradient, forward.path_length + n * distance, n * by_along

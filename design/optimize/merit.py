@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 from ...core.errors import DomainError
 from ...core.units import field_label
 from ...models.telescope import Telescope
-from ...raytrace.adjoint.backward_pass import landing_gradient
+from ...raytrace.adjoint.backward_pass import image_gradient
 from ...raytrace.adjoint.forward_pass import forward_pass
-from ...raytrace.ideal_lens import require_image
+from ...raytrace.ideal_lens import image_points, require_image
 from ...raytrace.rays import Rays, RayStatus, straight_bundles
 from ...raytrace.trace import trace
 from ...wavefront.pupil_sampling import PupilSampling
@@ -52,7 +52,6 @@ class Beams:
 
         Weights of the fields are those that the design data state, where neither fields nor weights are given.
         """
-        require_image(telescope, "a merit of spots or wavefronts")
         count = _RINGS if n_pupil is None and sampling == "gauss" else n_pupil
         request = Request.of(telescope, fields, wavelengths, sampling=sampling, n_pupil=count, **options)
         weights = request.stated_weights if field_weights is None else field_weights
@@ -108,6 +107,8 @@ class SpotMerit:
         self._weights = beams.weights(telescope)
         self._reference = reference
         given = np.zeros(len(beams.request.fields)) if heights is None else np.asarray(heights, dtype=np.float64)
+        if given.any():
+            require_image(telescope, "a height of the image surface")
         if given.shape != (len(beams.request.fields),):
             raise DomainError(
                 f"heights of shape {list(given.shape)}: expected one for each of {len(beams.request.fields)} fields"
@@ -119,12 +120,12 @@ class SpotMerit:
         landing = []
         for wavelength in self._beams.request.wavelengths:
             end = trace(telescope, self._beams.rays(telescope, wavelength), threads=self._beams.request.threads)
-            position = telescope.surfaces[-1].to_local(end.position)[:, :2].T
+            position = telescope.surfaces[-1].to_local(image_points(telescope, end))[:, :2].T
             landing.append(position + self._beyond(telescope, end.direction))
         chief = None
         if self._reference == "chief":
             end = trace(telescope, self._chief_rays(telescope), threads=self._beams.request.threads)
-            chief = telescope.surfaces[-1].to_local(end.position)[:, :2].T[..., None]
+            chief = telescope.surfaces[-1].to_local(image_points(telescope, end))[:, :2].T[..., None]
         return self._reduced(np.array(landing)[..., None], chief).ravel()
 
     def derivatives(self, columns: ParameterColumns) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
@@ -146,7 +147,7 @@ class SpotMerit:
         forward = forward_pass(
             columns.telescope, self._beams.rays(columns.telescope, float(self._beams.request.wavelengths[0]))
         )
-        return columns.size_of_terms(forward, landing_gradient(forward), threads=self._beams.request.threads)
+        return columns.size_of_terms(forward, image_gradient(forward), threads=self._beams.request.threads)
 
     def _chief_rays(self, telescope: Telescope) -> Rays:
         return self._beams.rays(telescope, float(self._beams.request.wavelengths[0]), np.zeros((1, 2)))
@@ -159,8 +160,8 @@ class SpotMerit:
     def _landing(self, aimed: AimedRays) -> np.ndarray:
         """Return landing points and, behind them, their derivatives, shape [2, n, 1 + n_parameter]."""
         forward = aimed.forward(self._beams.request.threads)
-        change = aimed.derivatives(forward, landing_gradient(forward), self._beams.request.threads)
-        return np.concatenate([forward.landing[:2, :, None], change], axis=2)
+        change = aimed.derivatives(forward, image_gradient(forward), self._beams.request.threads)
+        return np.concatenate([forward.image[..., None], change], axis=2)
 
     def _reduced(self, landing: np.ndarray, chief: np.ndarray | None) -> np.ndarray:
         """Return weighted deviations of [n_wave, 2, n_field * n_pupil, k] from the centroid or the chief ray's."""

@@ -124,9 +124,18 @@ class Optimum(Result):
         """Effect of the change of each variable at the solution, rms [m], shape [n_variable]."""
         return np.abs(self.changes) * self.effect
 
+    @property
+    def in_angles(self) -> bool:
+        """Whether the merit is an angle: spots of telescopes whose image is at infinity; radians stand for metres."""
+        return self.merit_name == "spots" and all(t.design_data.afocal for t in self.telescopes)
+
+    @property
+    def _unit(self) -> str:
+        return "rad" if self.in_angles else "m"
+
     def _label(self) -> str:
         start, end = self.history[0], self.history[-1]
-        return f"{self.telescope.name}, {len(self.variables)} variables, rms {start:.4g} -> {end:.4g} m"
+        return f"{self.telescope.name}, {len(self.variables)} variables, rms {start:.4g} -> {end:.4g} {self._unit}"
 
     def _columns(self) -> dict[str, Any]:
         names = {"address": list(self.addresses), "unit": [p.unit or "1" for p in self.variables]}
@@ -138,10 +147,10 @@ class Optimum(Result):
             "telescope": self.telescope.name,
             "configurations": [t.name for t in self.telescopes],
             "merit": self.merit_name,
-            "rms_start_m": self.merits[0],
-            "rms_end_m": self.merits[1],
-            "rms_start_with_operands_m": self.history[0],
-            "rms_end_with_operands_m": self.history[-1],
+            f"rms_start_{self._unit}": self.merits[0],
+            f"rms_end_{self._unit}": self.merits[1],
+            f"rms_start_with_operands_{self._unit}": self.history[0],
+            f"rms_end_with_operands_{self._unit}": self.history[-1],
             "steps": len(self.history) - 1,
             "variables": list(self.addresses),
             "units": [p.unit or "1" for p in self.variables],
@@ -149,7 +158,7 @@ class Optimum(Result):
             "values": self.values,
             "changes": self.changes,
             "uncertainty": self.uncertainty,
-            "effect_m_per_unit": self.effect,
+            f"effect_{self._unit}_per_unit": self.effect,
             "operands": [
                 {
                     "operand": one.operand.label,
@@ -189,9 +198,9 @@ class Optimum(Result):
         steps.xaxis.set_major_locator(MaxNLocator(integer=True))
         steps.grid(True, which="major", linewidth=0.3)
         name = f"rms of {self.merit_name}" + (" and operands" if self.operands else "")
-        steps.set(xlabel="step", ylabel=f"{name} [µm]", title=plain_text(self.telescope.name))
+        steps.set(xlabel="step", ylabel=f"{name} [µ{self._unit}]", title=plain_text(self.telescope.name))
         places = np.arange(len(self.addresses))
         bars.barh(places, self.step_effects * 1e6, color=GREY, height=0.7)
         bars.set_yticks(places, [plain_text(name) for name in self.addresses])
         bars.invert_yaxis()
-        bars.set_xlabel("change of each times its effect, rms [µm]")
+        bars.set_xlabel(f"change of each times its effect, rms [µ{self._unit}]")

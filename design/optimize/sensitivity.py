@@ -16,7 +16,6 @@ from ...core.threads import one_blas_thread
 from ...core.units import field_label, require_count
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import MOST_TERMS, annular_zernikes
-from ...raytrace.ideal_lens import require_image
 from ...raytrace.rays import RayStatus
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
@@ -191,7 +190,6 @@ def sensitivity(
     UnknownNameError, ConfigError
         If an address is unknown.
     """
-    require_image(telescope, "a sensitivity of wavefronts")
     chosen = parse_parameters(parameters, telescope)
     n_zernike = require_count(n_zernike, "n_zernike", 1, MOST_TERMS)
     request = Request.of(

@@ -12,8 +12,7 @@ import numpy as np
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
 from ...models.telescope import Telescope
-from ...raytrace.adjoint.backward_pass import landing_gradient
-from ...raytrace.ideal_lens import require_image
+from ...raytrace.adjoint.backward_pass import image_gradient
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
 from .aimed_rays import AimedRays
@@ -26,12 +25,11 @@ _SMALL_FIELD = 1e-4
 
 def _landing(columns: ParameterColumns, fields: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
     """Return landing points of chief rays of some fields [rad] [m], [2, n], and derivatives [2, n, n_parameter]."""
-    require_image(columns.telescope, "an operand of landing points")
     columns.telescope.check_field(*fields.T)
     request = Request.of(columns.telescope, fields, wavelength, sampling=CHIEF_RAY)
     aimed = AimedRays(columns, request, wavelength, CHIEF_RAY.points)
     forward = aimed.forward()
-    return forward.landing[:2], aimed.derivatives(forward, landing_gradient(forward))
+    return forward.image, aimed.derivatives(forward, image_gradient(forward))
 
 
 def _near_axis() -> np.ndarray:

@@ -13,12 +13,12 @@ import numpy as np
 from ...core.errors import DomainError
 from ...core.threads import thread_count
 from ...core.units import field_label
-from ...raytrace.adjoint.backward_pass import OutputGradient, position_gradient
+from ...raytrace.adjoint.backward_pass import OutputGradient, direction_gradient, position_gradient
 from ...raytrace.adjoint.sphere_adjoint import SphereAdjoint
 from ...raytrace.rays import RayStatus
 from ...wavefront.request import Request
 from .aimed_rays import AimedRays
-from .jacobian import ParameterColumns, sphere_gradient
+from .jacobian import ParameterColumns, plane_gradient, sphere_gradient
 
 Result = TypeVar("Result")
 #: Rays at once, so that their adjoint matrix stays in the cache of the processor until it is summed.
@@ -92,24 +92,33 @@ class FieldWavefronts:
         chief = aimed.forward(threads=1)
         if not chief.arrived.all():
             raise DomainError(f"{field_label(fields[~chief.arrived][0])}: the chief ray does not reach the image")
-        gradient, path = sphere_gradient(chief, chief.position, telescope.reference_sphere_radius)
         self._aimed = AimedRays(columns, request, wavelength, request.pupil.points)
-        self._centers, self._lit_only = chief.position, lit_only
-        self._rays = SphereAdjoint(
-            telescope,
-            request.directions,
-            chief.indices,
-            self._aimed.points,
-            chief.position,
-            path,
-            telescope.reference_sphere_radius,
-            columns.table,
-            columns.intermediate,
-            columns.polynomials,
-            lit_only=lit_only,
-        )
-        # Landing points and paths together, four outputs.
-        axes, zero = position_gradient(chief), np.zeros((3, len(fields)))
+        self._lit_only, self._chief_path = lit_only, chief.path_length
+        self._rays: SphereAdjoint | None = None
+        if telescope.design_data.afocal:
+            # Planes across the chief rays, in place of spheres about their landing points.
+            self._references, axes = chief.direction, direction_gradient(chief)
+            gradient, self._chief_path, by_along = plane_gradient(chief, chief.direction)
+            by_reference = -by_along
+        else:
+            self._references, axes = chief.position, position_gradient(chief)
+            gradient, self._chief_path = sphere_gradient(chief, chief.position, telescope.reference_sphere_radius)
+            by_reference = gradient.position[0]
+            self._rays = SphereAdjoint(
+                telescope,
+                request.directions,
+                chief.indices,
+                self._aimed.points,
+                chief.position,
+                self._chief_path,
+                telescope.reference_sphere_radius,
+                columns.table,
+                columns.intermediate,
+                columns.polynomials,
+                lit_only=lit_only,
+            )
+        # Landing points, or directions, and paths together, four outputs.
+        zero = np.zeros((3, len(fields)))
         both = OutputGradient(
             np.concatenate([axes.position, gradient.position]),
             np.concatenate([axes.direction, gradient.direction]),
@@ -118,7 +127,7 @@ class FieldWavefronts:
         )
         derivatives = aimed.derivatives(chief, both, threads=1)
         self._moved = derivatives[:3].transpose(1, 0, 2)
-        self._piston = derivatives[3] - np.einsum("in,nip->np", gradient.position[0], self._moved)
+        self._piston = derivatives[3] - np.einsum("in,nip->np", by_reference, self._moved)
 
     def map(self, work: Callable[[WavefrontBlock], Result]) -> list[Result]:
         """Return the results of a function of each block, in the order of the fields; blocks run in parallel."""
@@ -134,22 +143,49 @@ class FieldWavefronts:
 
     def block(self, part: slice) -> WavefrontBlock:
         """Return the block of some of the field points, computed on one thread."""
-        matrix, status = self._rays.matrix(part, threads=1)
-        table = self._columns.of_path(matrix)
+        if self._rays is None:
+            table, status = self._to_planes(part)
+        else:
+            matrix, status = self._rays.matrix(part, threads=1)
+            table = self._columns.of_path(matrix)
         lost = status > RayStatus.VIGNETTED
         if lost.any():
             table = np.where(lost, 0.0, table)
         return WavefrontBlock(part, table, status, self._moved[part], self._piston[part], self._by_aim(part, status))
 
+    def _to_planes(self, part: slice) -> tuple[np.ndarray, np.ndarray]:
+        """Return the table of the block of an afocal telescope, and the status of its rays."""
+        aimed = self._aimed.part(self._of_rays(part))
+        forward = aimed.forward(threads=1)
+        along, chief_path = self._references_of(part), np.repeat(self._chief_path[part], self._size[1])
+        gradient, path, by_along = plane_gradient(forward, along)
+        columns = self._columns.adjoints(forward, gradient, threads=1)[0]
+        # Derivatives by the directions stand with the sign of those by landing points.
+        table = np.concatenate([(path - chief_path)[None], -by_along, columns])
+        status = forward.status.reshape(-1, self._size[1])
+        if self._lit_only:
+            table = np.where(forward.status == RayStatus.OK, table, 0.0)
+        return table.reshape(-1, *status.shape), status
+
+    def _of_rays(self, part: slice) -> slice:
+        return slice(part.start * self._size[1], part.stop * self._size[1])
+
+    def _references_of(self, part: slice) -> np.ndarray:
+        """Return the centre of the sphere, or the normal of the plane, of each ray of some fields, shape [3, n]."""
+        return np.repeat(self._references[:, part], self._size[1], axis=1)
+
     def _by_aim(self, part: slice, status: np.ndarray) -> np.ndarray | None:
         """Return the change of wavefronts by the motion of aimed rays, [n_field, n_pupil, n_parameter]."""
         if self._aimed.motion is None:
             return None
-        aimed = self._aimed.part(slice(part.start * self._size[1], part.stop * self._size[1]))
+        aimed = self._aimed.part(self._of_rays(part))
         assert aimed.motion is not None
         forward = aimed.forward(threads=1)
-        centers = np.repeat(self._centers[:, part], self._size[1], axis=1)
-        gradient, _ = sphere_gradient(forward, centers, self._columns.telescope.reference_sphere_radius)
+        if self._rays is None:
+            gradient, *_ = plane_gradient(forward, self._references_of(part))
+        else:
+            radius = self._columns.telescope.reference_sphere_radius
+            gradient, _ = sphere_gradient(forward, self._references_of(part), radius)
         by_points = aimed.by_points(forward, gradient, threads=1)[0]
         change = -np.einsum("na,nap->np", by_points, aimed.motion).reshape(*status.shape, -1)
         dark = status > (RayStatus.OK if self._lit_only else RayStatus.VIGNETTED)

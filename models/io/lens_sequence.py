@@ -102,11 +102,13 @@ class LensSequence:
         aimed: str = "off",
         lenient: bool = False,
         along_light: bool = False,
+        afocal: bool = False,
     ) -> LensSequence:
         """Return the surfaces and data of a telescope for a kind of `file`, as its name is said in messages.
 
         `units` are the units of length [m] that it may have, `aimed` is the aiming of its program. With `along_light`
         local z axes are along the light in front of an even number of mirrors, against it in front of an odd one.
+        With `afocal` it can say that the image is at infinity.
         PrescriptionError for a telescope that no file of a sequence of surfaces can hold, and unless lenient, which
         makes it a warning, for links and coatings.
         """
@@ -115,7 +117,8 @@ class LensSequence:
             require_sequential(t, file)
             if data.telecentric:
                 raise PrescriptionError(f"telecentric object space: {file} has no place for it")
-            report_unheld(t, (*data.pickups, *data.solves), file, lenient=lenient)
+            others = ["afocal"] if data.afocal and not afocal else []
+            report_unheld(t, (*data.pickups, *data.solves), file, lenient=lenient, others=others)
             own_stop = stop_makes_pupil(t)
             if data.stop is not None and not own_stop:
                 said = f"stop = {data.stop}: with surfaces off the axis it does not make the stated pupil"

@@ -24,11 +24,12 @@ def require_sequential(telescope: Telescope, file: str) -> None:
         raise PrescriptionError(f"obstruction {telescope.obstructions[0].name}: {file} cannot hold meshes")
 
 
-def report_unheld(telescope: Telescope, links: Iterable[Pickup | Solve], file: str, *, lenient: bool) -> None:
-    """Raise a PrescriptionError, if lenient a warning, for links, coatings, afocal images: `file` has no place."""
-    others = [f"coating of {s.name}" for s in telescope.surfaces if s.coating is not None]
-    others += ["afocal image space"] if telescope.design_data.afocal else []
-    if names := ", ".join([*(link.address for link in links), *others]):
+def report_unheld(
+    telescope: Telescope, links: Iterable[Pickup | Solve], file: str, *, lenient: bool, others: Iterable[str] = ()
+) -> None:
+    """Raise a PrescriptionError, if lenient a warning, for links, coatings and others without a place in `file`."""
+    coated = [f"coating of {s.name}" for s in telescope.surfaces if s.coating is not None]
+    if names := ", ".join([*(link.address for link in links), *coated, *others]):
         Findings(lenient).report(PrescriptionError(f"{names}: {file} has no place for it"), "left out")
 
 

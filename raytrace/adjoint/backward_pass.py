@@ -41,6 +41,25 @@ def landing_gradient(forward: ForwardPass) -> OutputGradient:
     return OutputGradient(position, np.zeros_like(position), np.zeros(2), own_frame=True)
 
 
+def image_gradient(forward: ForwardPass) -> OutputGradient:
+    """Return the gradient of the image x and y of :attr:`~.ForwardPass.image`: two outputs [m]."""
+    if not forward.telescope.design_data.afocal:
+        return landing_gradient(forward)
+    matrix = forward.telescope.surfaces[-1].matrix
+    u, v, w = matrix.T @ forward.direction
+    # By (u, v, w) of (u, v) / abs(w).
+    zero, one, side = np.zeros_like(w), 1.0 / np.abs(w), np.sign(w)
+    local = np.array([[one, zero, -u * side / w**2], [zero, one, -v * side / w**2]])
+    direction = np.einsum("ij,ojn->oin", matrix, local)
+    return OutputGradient(np.zeros_like(direction), direction, np.zeros(2), own_frame=True)
+
+
+def direction_gradient(forward: ForwardPass) -> OutputGradient:
+    """Return the gradient of the direction behind the last surface in the telescope frame: three outputs."""
+    direction = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, forward.n_rays))
+    return OutputGradient(np.zeros_like(direction), direction, np.zeros(3))
+
+
 def position_gradient(forward: ForwardPass) -> OutputGradient:
     """Return the gradient of the landing point in the telescope frame: three outputs [m]."""
     position = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, forward.n_rays))

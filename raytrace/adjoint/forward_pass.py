@@ -10,6 +10,7 @@ import warp as wp
 from ...core.errors import DomainError
 from ...models.shapes.mesh import MeshSurface
 from ...models.telescope import Telescope
+from ..ideal_lens import tangents
 from ..kernels.packet import from_packets
 from ..rays import Rays, RayStatus
 from ..trace import PacketTrace, trace_packets
@@ -62,6 +63,13 @@ class ForwardPass:
         """Intersections with the last surface in its own frame [m], shape [3, n]."""
         last = self.telescope.surfaces[-1]
         return last.matrix.T @ (self.position - np.array(last.vertex)[:, None])
+
+    @property
+    def image(self) -> np.ndarray:
+        """Image x and y in the frame of the last surface [m], shape [2, n]: landing points, or tangents if afocal."""
+        if not self.telescope.design_data.afocal:
+            return self.landing[:2]
+        return tangents(self.telescope.surfaces[-1].along(self.direction.T)).T
 
 
 def check_differentiable(telescope: Telescope) -> None:

@@ -103,17 +103,18 @@ def ee80(scene: Scene) -> dict[str, float]:
         "distortion largest percent of axis scale",
         "percent",
         "path",
-        lambda s, _: one_digit(100.0 * (s.length_tolerance / _AXIS_SLOPE) / s.distortion["axis_focal_length_m"]),
+        lambda s, _: one_digit(100.0 * (s.length_tolerance / _AXIS_SLOPE) / s.distortion.axis_focal_length),
     ),
     Metric("distortion rms shift", "um", "path"),
 )
 def distortion(scene: Scene) -> dict[str, float]:
     """Return scale and distortion of the chief rays over the field of view."""
+    found = scene.distortion
     return {
-        "distortion focal length": scene.distortion["focal_length_m"],
-        "distortion axis focal length": scene.distortion["axis_focal_length_m"],
-        "distortion largest percent of axis scale": scene.distortion["largest_percent_of_axis_scale"],
-        "distortion rms shift": scene.distortion["rms_shift_um"],
+        "distortion focal length": found.focal_length,
+        "distortion axis focal length": found.axis_focal_length,
+        "distortion largest percent of axis scale": float(np.nanmax(np.abs(found.percent_of_axis_scale), initial=0.0)),
+        "distortion rms shift": found.rms_shift * 1e6,
     }
 
 

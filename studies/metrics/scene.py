@@ -13,7 +13,7 @@ from pydantic import Field
 from ...core.errors import ConfigError, DomainError, unknown_name
 from ...core.schema import Positive, Real, Section
 from ...core.units import ARCMIN
-from ...design.metrics.distortion import distortion
+from ...design.metrics.distortion import Distortion, distortion
 from ...models.telescope import Telescope
 from ...pipeline.ccd_product import to_detector_axes
 from ...pipeline.experiment import Experiment
@@ -138,9 +138,9 @@ class Scene:
         return one_digit(_ROUNDING * float(path[0]))
 
     @cached_property
-    def distortion(self) -> dict[str, float]:
+    def distortion(self) -> Distortion:
         """Scale and distortion over the field of view at the middle wavelength."""
-        return distortion(self.telescope, wavelength=self.middle, threads=self.threads).summary()
+        return distortion(self.telescope, wavelength=self.middle, threads=self.threads)
 
     @property
     def camera_experiment(self) -> Experiment:

@@ -87,7 +87,9 @@ class ToleranceFile(Section):
     field_weights: tuple[NotNegative, ...] | None = Field(None, description="weights of the fields")
     wavelengths_nm: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = Field(None, description="[nm]")
     rings: Count = Field(4, description="rings of pupil points")
-    frequency_per_mm: Positive | None = Field(None, description="spatial frequency of the merit mtf")
+    frequency_per_mm: Positive | None = Field(
+        None, description="spatial frequency of the merit mtf; of afocal telescopes per mrad"
+    )
     surfaces: SurfaceTolerances = SurfaceTolerances()
     elements: ElementTolerances = ElementTolerances()
     gaps: GapTolerances = GapTolerances()

@@ -121,7 +121,7 @@ def tolerance_merit(
         )
         each = np.repeat(np.outer(beams.field_weights, request.weights).ravel(), 2) / 2.0
         transfer = _MeanTransfer(operands, each)
-        title = f"mean MTF at {file.frequency_per_mm:g} per mm"
+        title = f"mean MTF at {file.frequency_per_mm:g} per {'mrad' if telescope.design_data.afocal else 'mm'}"
         return ToleranceMerit(
             "mtf",
             title,
@@ -132,12 +132,12 @@ def tolerance_merit(
             WavefrontMerit(telescope, beams),
             transfer,
         )
-    judge = SpotMerit(telescope, beams)
+    judge, unit = SpotMerit(telescope, beams), "urad" if telescope.design_data.afocal else "um"
     if file.merit == "ee80":
         return ToleranceMerit(
             "ee80",
             "radius of 80 % of the rays",
-            "um",
+            unit,
             1e6,
             False,
             "radius about the centroid of a field that holds 80 % of its rays, rms over the fields",
@@ -147,7 +147,7 @@ def tolerance_merit(
     return ToleranceMerit(
         "spots",
         "rms spot radius",
-        "um",
+        unit,
         1e6,
         False,
         "distance of the rays from the centroid of their field, rms over fields, wavelengths and pupil",

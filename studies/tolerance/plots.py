@@ -128,7 +128,7 @@ def yield_plot(study: ToleranceStudy) -> bytes:
 
 
 def _unit(study: ToleranceStudy) -> str:
-    return f" [{study.merit.unit}]".replace("um", "µm") if study.merit.unit else ""
+    return f" [{study.merit.unit}]".replace("um", "µm").replace("urad", "µrad") if study.merit.unit else ""
 
 
 def _title(study: ToleranceStudy, text: str) -> str:

@@ -120,9 +120,13 @@ def test_what_needs_an_image_is_refused():
     telescope = mersenne()
     for name, call in {
         "a focus": lambda: pachon.through_focus(telescope),
-        "a merit of spots or wavefronts": lambda: pachon.optimize(telescope, ["M2.dz"]),
         "a PSF": lambda: pachon.make_psfs(telescope, [[0.0, 0.0]], [LIGHT]),
-        "a sensitivity of wavefronts": lambda: pachon.sensitivity(telescope, ["M2.dz"]),
+        "a relative illumination": lambda: pachon.relative_illumination(telescope),
+        "a map of ghosts": lambda: pachon.ghosts(telescope),
+        "a sphere_radius": lambda: pachon.wavefront_opd(telescope, (0.0, 0.0), LIGHT, sphere_radius=1.0),
+        "a focal plane": lambda: pachon.wavefront_opd(
+            telescope, (0.0, 0.0), LIGHT, focal_plane=pachon.FocalPlane.flat("lsst")
+        ),
     }.items():
         with pytest.raises(DomainError, match=f"expander is afocal, its light parallel: {name} needs an image"):
             call()

@@ -1,12 +1,12 @@
 """Translate a CODE V lens file (.seq) into the terms of a Zemax file.
 
-Supported commands: RDM, DIM, TITLE, EPD, FNO, NAO, WL, WTW, REF, TEM (deg C), PRE (mm of mercury), XAN YAN, XOB YOB,
-XIM YIM, XRI YRI, WTF, VUX VLX VUY VLY, before or after the surfaces SO S SI (curvature or radius, thickness, glass),
-RDY CUY THI GLA, STO, SLB, SPH CON ASP with K and A to G (r^4 to r^16), XDE YDE ZDE ADE BDE CDE with DAR, BEN and REV,
-CIR (OBS, HOL, EDG) REX REY and ELX ELY with ADX ADY, pick-ups PIK, private glasses PRV PWL END. ADE and BDE are
-left-handed, CDE is right-handed (CODE V reference manual, "Decentered surfaces"), Zemax's tilts are all right-handed.
-A glass is a name (NBK7_SCHOTT), REFL, or a number (517642). Solves are passed over where their solution is given. Rays
-are aimed at the stop, as CODE V's chief rays are.
+Supported commands: RDM, DIM, TITLE, EPD, FNO, NAO, WL, WTW, REF, AFO, TEM (deg C), PRE (mm of mercury), XAN YAN, XOB
+YOB, XIM YIM, XRI YRI, WTF, VUX VLX VUY VLY, before or after the surfaces SO S SI (curvature or radius, thickness,
+glass), RDY CUY THI GLA, STO, SLB, SPH CON ASP with K and A to G (r^4 to r^16), XDE YDE ZDE ADE BDE CDE with DAR, BEN
+and REV, CIR (OBS, HOL, EDG) REX REY and ELX ELY with ADX ADY, pick-ups PIK, private glasses PRV PWL END. ADE and BDE
+are left-handed, CDE is right-handed (CODE V reference manual, "Decentered surfaces"), Zemax's tilts are all right-
+handed. A glass is a name (NBK7_SCHOTT), REFL, or a number (517642). Solves are passed over where their solution is
+given. Rays are aimed at the stop, as CODE V's chief rays are.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MMHG = 760.0
 VIGNETTING = ("VUX", "VLX", "VUY", "VLY")
 #: Lists of numbers of the whole system.
 LISTS = ("WTW", "FNO", "TEM", "PRE", *VIGNETTING)
-SYSTEM = frozenset(("RDM", "DIM", "TIT", "WL", "WTF", "REF", "PRV", *LISTS, *APERTURES, *FIELDS))
+SYSTEM = frozenset(("RDM", "DIM", "TIT", "WL", "WTF", "REF", "AFO", "PRV", *LISTS, *APERTURES, *FIELDS))
 LONG_NAMES = {"TITLE": "TIT", "STOP": "STO"}
 POWERS = "ABCDEFG"
 #: Numbers of surfaces.
@@ -109,6 +109,7 @@ class _Translation:
         self.values: list[dict[str, float]] = []
         self.radii = False
         self.field_type = 0.0
+        self.afocal = False
         self.waves: list[float] = []
         self.lists: dict[str, list[float]] = {}
         self.pick_ups: list[Record] = []
@@ -171,7 +172,7 @@ class _Translation:
                 # The pupil reaches from lower - 1 to 1 - upper.
                 self._header_line(f"VD{axis}N", *(0.5 * (low - up) for up, low in both))
                 self._header_line(f"VC{axis}N", *(0.5 * (low + up) for up, low in both))
-        self._header_line("FTYP", self.field_type, 0, 0, len(self.waves))
+        self._header_line("FTYP", self.field_type, 0, 0, len(self.waves), 0, 0, float(self.afocal))
         return ZemaxFile(self.path, self.header, self._blocks(), Block(str(self.path)), self.private, program="CODE V")
 
     def _header_line(self, keyword: str, *values: float) -> None:
@@ -212,6 +213,8 @@ class _Translation:
             add("FWGN", *(repr(command.number(i)) for i in range(len(words))))
         elif key == "REF":
             add("PWAV", command.integer(0))
+        elif key == "AFO":
+            self.afocal = not (words and words[0].upper().startswith("N"))
         elif key in FIELDS:
             keyword, self.field_type = FIELDS[key]
             add(keyword, *(repr(command.number(i)) for i in range(len(words))))

@@ -41,7 +41,7 @@ def telescope_to_codev(telescope: Telescope, *, lenient: bool = False) -> str:
     coatings and formulas of glasses are left out with a warning.
     """
     # CODE V's chief rays pass the middle of the stop.
-    sequence = LensSequence.of(telescope, FILE, tuple(UNITS), aimed="paraxial", lenient=lenient)
+    sequence = LensSequence.of(telescope, FILE, tuple(UNITS), aimed="paraxial", lenient=lenient, afocal=True)
     with error_context(subject=telescope.name):
         names = sequence.glass_names("a private glass, a table of indices", "_")
         words = {medium: _glass_word(name) for medium, name in names.items()}
@@ -74,6 +74,8 @@ def _system_lines(sequence: LensSequence) -> Iterator[str]:
     yield f"WL {_numbers([scaled(wave, 9) for wave in sequence.wavelengths])}"
     yield f"REF {sequence.primary + 1}"
     yield f"WTW {_numbers(sequence.wavelength_weights)}"
+    if sequence.telescope.design_data.afocal:
+        yield "AFO YES"
     if sequence.celsius is not None:
         yield f"TEM {number_text(sequence.celsius)}"
     if sequence.atmospheres is not None:

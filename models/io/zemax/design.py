@@ -33,6 +33,7 @@ class Fields:
     weights: np.ndarray  #: [n]
     vignetting: np.ndarray  #: [n, 5]
     telecentric: bool
+    afocal: bool  #: whether the image space is afocal
 
     @property
     def largest(self) -> float:
@@ -57,6 +58,7 @@ def read_fields(header: Block) -> Fields:
         weights=_filled(weights, count, 1.0),
         vignetting=np.stack([_filled(column, count, 0.0) for column in factors], axis=-1),
         telecentric=line is not None and line.number(1, 0.0) == 1,
+        afocal=line is not None and line.number(6, 0.0) == 1,
     )
 
 

@@ -157,6 +157,7 @@ class _LensReader:
             temperature=temperature,
             pressure=pressure,
             telecentric=telecentric,
+            afocal=fields.afocal,
         )
 
     def _check_environment(self) -> None:

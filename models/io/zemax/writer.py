@@ -114,13 +114,14 @@ def telescope_to_zemax(telescope: Telescope, *, lenient: bool = False) -> tuple[
 def _field_lines(t: Telescope, unit: float) -> list[str]:
     """Return the lines of the fields: those that are stated, or three from the axis to the edge."""
     data, waves = t.design_data, len(_wavelengths(t))
+    afocal = int(data.afocal)
     if data.fields:
         kind, telecentric = FIELD_TYPES.index(data.field_type), int(data.telecentric)
-        head = [f"FTYP {kind} {telecentric} {len(data.fields)} {waves} 0 0 0"]
+        head = [f"FTYP {kind} {telecentric} {len(data.fields)} {waves} 0 0 {afocal}"]
     else:
         edge = math.degrees(t.field_radius)
         head = [
-            f"FTYP 0 0 3 {waves} 0 0 0",
+            f"FTYP 0 0 3 {waves} 0 0 {afocal}",
             "XFLN 0 0 0",
             f"YFLN 0 {number_text(edge / math.sqrt(2))} {number_text(edge)}",
         ]

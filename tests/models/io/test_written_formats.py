@@ -353,3 +353,16 @@ def test_the_table_of_the_docs_names_the_endings_that_are_written():
     written = {ending for ending, words in table if words.strip().startswith("yes")}
     assert written == set(ENDINGS)
     assert {ending for ending, _ in table} == {*ENDINGS, ".zar"}
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_an_image_at_infinity_is_kept_or_refused_by_name(tmp_path, ending):
+    afocal = lens("triplet").with_design(afocal=True)
+    path = tmp_path / f"afocal{ending}"
+    if ending in (".yaml", ".zmx", ".seq"):
+        assert again(afocal, path).design_data.afocal
+        return
+    with pytest.raises(PrescriptionError, match="afocal: .* has no place"):
+        pachon.save_telescope(afocal, path)
+    assert "afocal" in warnings_of(afocal, path)
+    assert not pachon.load_telescope(path).design_data.afocal
