@@ -51,19 +51,14 @@ REFUSED = {
 #: Commands without effect on rays: names, variables and couplings, weights, solves, whose solution stands in the file,
 #: and drawing.
 _IGNORED = """
-LEN NEW DER INI GO CA CCY THC KC AC BC CC DC EC FC GC HC IC JC ADC BDC CDC XDC YDC ZDC CUM
-UMY SPH CON ASP RDM WTX WTY VIE DRA COM CUX THM GLC CRA
-POL CLS WID
+LEN NEW DER INI GO CA CCY THC KC AC BC CC DC EC FC GC HC IC JC ADC BDC CDC XDC YDC ZDC CUM UMY SPH CON ASP RDM
+WTX WTY VIE DRA COM CUX THM GLC CRA POL CLS WID
 """
 IGNORED = frozenset(_IGNORED.split())
 INFINITE = 1e10
 #: Values of surfaces that other surfaces may pick up, by command.
-PICKED = {k: k for k in ("THI", "K", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", *POWERS)} | {
-    "CUY": "CURV",
-    "RDY": "CURV",
-}
-
-
+PICKED = {k: k for k in ("THI", "K", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", *POWERS)}
+PICKED |= {"CUY": "CURV", "RDY": "CURV"}
 #: Length of glass behind a surface over its radius, beyond which that is no radius; rod lenses have 30.
 _LONGEST = 100.0
 

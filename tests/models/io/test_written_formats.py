@@ -362,7 +362,7 @@ def test_an_image_at_infinity_is_kept_or_refused_by_name(tmp_path, ending):
     if ending in (".yaml", ".zmx", ".seq"):
         assert again(afocal, path).design_data.afocal
         return
-    with pytest.raises(PrescriptionError, match="afocal: .* has no place"):
+    with pytest.raises(PrescriptionError, match=r"afocal: .* has no place"):
         pachon.save_telescope(afocal, path)
     assert "afocal" in warnings_of(afocal, path)
     assert not pachon.load_telescope(path).design_data.afocal
