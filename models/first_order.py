@@ -173,7 +173,10 @@ def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> Fi
     power = -n * u / (abs(float(trace.n[0])) * radius)
     parallel = abs(power) * radius < 1e-9
     if parallel and not telescope.design_data.afocal:
-        raise DomainError(f"telescope {telescope.name}: expected one with a focus; its power is {power:.3g} 1/m")
+        raise DomainError(
+            f"telescope {telescope.name}: expected one with a focus, or afocal: true in its design data; its power is "
+            f"{power:.3g} 1/m"
+        )
     focal_length, to_focus = (math.inf, math.inf) if parallel else (1.0 / power, -h / u)
     to_pupil = -hb / ub if ub != 0 else math.inf
     slope = _marginal(telescope)

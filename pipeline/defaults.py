@@ -28,6 +28,7 @@ from ..models.io.site_file import load_site
 from ..models.media.silicon import WAVELENGTH_RANGE as SILICON_RANGE
 from ..models.site import Site
 from ..models.telescope import Telescope
+from ..raytrace.ideal_lens import require_image
 from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.psf.long_exposure import default_points
 from .alignment_states import ENDINGS as STATE_ENDINGS
@@ -178,7 +179,11 @@ def _names_no_model(fit: ReconstructionConfig) -> bool:
 
 
 def _camera_of(telescope: Telescope, name: str | None) -> Camera:
-    """Return the camera of a name or file, by default that of the telescope; ConfigError where there is none."""
+    """Return the camera of a name or file, by default that of the telescope.
+
+    ConfigError where there is none, DomainError where the telescope is afocal.
+    """
+    require_image(telescope, "a camera")
     found = name or telescope.camera
     if found is None:
         raise ConfigError(

@@ -88,7 +88,7 @@ def fft_psf(
         telescope, fields, wavelengths, wavelength_weights=wavelength_weights, projection=projection, threads=threads
     )
     plan = _Plan(request, pixel, pixels, reference)
-    side = plan.pixel * plan.pixels
+    side, unit = plan.pixel * plan.pixels, "urad" if telescope.design_data.afocal else "um"
     across = n_pupil
     if across is None:
         # The period of the pattern is this number times wavelength / (range of cosines).
@@ -96,7 +96,7 @@ def fft_psf(
         across = max(_FEWEST, needed)
         if across > _MOST:
             raise DomainError(
-                f"pixel = {plan.pixel * 1e6:.4g} um, pixels = {pixels}: the image would need {across} points "
+                f"pixel = {plan.pixel * 1e6:.4g} {unit}, pixels = {pixels}: the image would need {across} points "
                 f"across the pupil; expected at most {_MOST} (a smaller image, or n_pupil)",
                 key="n_pupil",
             )
@@ -104,9 +104,9 @@ def fft_psf(
         across = require_count(across, "n_pupil", 8, _MOST)
     period = across * plan.wave_over_range
     if period < side or period < plan.spread:
-        what = f"an image of {side * 1e6:.4g} um and spots of {plan.spread * 1e6:.4g} um"
+        what = f"an image of {side * 1e6:.4g} {unit} and spots of {plan.spread * 1e6:.4g} {unit}"
         raise DomainError(
-            f"n_pupil = {across}: the pattern repeats after {period * 1e6:.4g} um; expected more points for {what}",
+            f"n_pupil = {across}: the pattern repeats after {period * 1e6:.4g} {unit}; expected more points for {what}",
             key="n_pupil",
         )
 

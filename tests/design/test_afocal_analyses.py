@@ -7,7 +7,7 @@ import pytest
 from scipy.special import j0, j1
 
 import pachon
-from pachon.core.errors import PrescriptionError, PrescriptionWarning
+from pachon.core.errors import DomainError, PrescriptionError, PrescriptionWarning
 from pachon.design.optimize.jacobian import ParameterColumns
 from pachon.design.optimize.merit import Beams, SpotMerit, WavefrontMerit
 from pachon.design.parameters.parameters import parse_parameters
@@ -17,6 +17,9 @@ from pachon.models.media.medium import ConstantIndex
 from pachon.models.shapes.shape import Conic, Plane
 from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM, Telescope
+from pachon.pipeline.config import configuration_of
+from pachon.pipeline.experiment import Experiment
+from pachon.studies.metrics.bare_telescope import BARE, BareScene
 
 LIGHT = 500e-9
 #: Focal lengths of two confocal paraboloids, and width of the beam, in units of their size.
@@ -271,6 +274,17 @@ def test_files_keep_that_the_image_space_is_afocal(tmp_path):
         pachon.save_telescope(telescope, tmp_path / "lens.json")
     with pytest.warns(PrescriptionWarning, match="afocal"):
         pachon.save_telescope(telescope, tmp_path / "lens.json", lenient=True)
+
+
+def test_runs_and_metrics_of_sweeps(tmp_path):
+    pachon.save_telescope(expander(), tmp_path / "expander.yaml")
+    config = configuration_of({"telescope": "expander.yaml", "camera": "comcam"}, "test")
+    with pytest.raises(DomainError, match="expander is afocal, its light parallel: a camera needs an image"):
+        Experiment.from_config(config, tmp_path)
+    scene = BareScene(expander(moved=1e-5), np.zeros((1, 2)), threads=1)
+    # Slopes of defocus, uniform light within the largest.
+    rms = 0.5 * EXIT * 1e-5 / SHORT**2 / np.sqrt(2.0)
+    assert BARE["spots"].compute(scene)["spot_rms_um"] == pytest.approx(1e6 * rms, rel=2e-3)
 
 
 @pytest.mark.parametrize(("line", "afocal"), [("", False), ("AFO YES", True), ("AFO", True), ("AFO NO", False)])
