@@ -138,7 +138,7 @@ def attribute_command(
 
     **Examples**
 
-    - `pachon attribute --raft R22 --average`: seconds
+    - `pachon attribute --raft R22 --average`: 20 seconds
     - `pachon attribute pachon_run/config.yaml --causes ccd,potato_chip,atmosphere --truth-stars 200`
     """
     from ..core.files import make_folder

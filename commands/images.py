@@ -52,7 +52,7 @@ def images_command(
 
     **Examples**
 
-    - `pachon images --ccds R22_S11 --quick`: a first look, within seconds
+    - `pachon images --ccds R22_S11 --quick -o first_look`: the middle of a CCD, within seconds
     - `pachon images --ccds R22_S11`: one whole CCD, a minute on two cores
     - `pachon images --ccds R22_S11 --exposures 400 -o deep`: 400 exposures of 15 s
     - `pachon images --ccds R22_S11 --no-noise --way eigen -o expected`

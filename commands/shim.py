@@ -47,7 +47,7 @@ def shim_command(
     - `pachon shim --heights lsstcam`: rafts of LSSTCam as built, half a minute
     - `pachon shim my_config.yaml --parts ccds --minimise ellipticity`
     - `pachon shim --heights lsstcam --minimise xi`: a smaller correlation of ellipticities over the focal plane
-    - `pachon run pachon_shims/config.yaml`: the run with the shims
+    - `pachon run pachon_shims/config.yaml --out shimmed`: the run with the shims
     """
     from ..core.files import make_folder
     from ..studies.shimming.product import shim_metrics, write_shims

@@ -36,7 +36,7 @@ def sweep_group() -> None:
 
     **Examples**
 
-    - `pachon sweep --example table1_small`: the height budget of Jee & Tyson (2011), Table 1, in minutes
+    - `pachon sweep --example table1_small`: the height budget of Jee & Tyson (2011), Table 1, half a minute
     - `pachon sweep heights.yaml -o heights.sweep`, and after an interruption `--resume`
     - `pachon sweep heights.yaml --scheduler tcp://login1:8786`: on a Dask cluster
     - `pachon sweep status heights.sweep`

@@ -82,7 +82,9 @@ class PachonError(Exception):
             both = ": ".join(part for part in (None if stated else subject, self.subject) if part)
             return type(self)(self.problem, subject=both or None, file=self.file, place=self.place, key=self.key)
         inner = self.file is None and self.subject is None
-        problem = (f"{key}." if key else "") + self.problem if inner else ": ".join(filter(None, (key, str(self))))
+        # A problem that begins with a key goes on with its section, one that begins with a name or a word does not.
+        join = ": " if not inner or self.problem.startswith(("unknown ", "'")) else "."
+        problem = join.join(filter(None, (key, self.problem if inner else str(self))))
         keys = ".".join(filter(None, (key, self.key))) if inner else key
         return type(self)(problem, subject=subject, file=file, place=place, key=keys or None)
 
