@@ -181,7 +181,7 @@ def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> Fi
     to_pupil = -hb / ub if ub != 0 else math.inf
     slope = _marginal(telescope)
     seen = _trace(telescope, wavelength, 1.0, section=True, marginal=slope)
-    behind, height = float(seen.u_after[-1, 0]), float(seen.h[-1, 0])
+    behind, height = 0.0 if parallel and not slope else float(seen.u_after[-1, 0]), float(seen.h[-1, 0])
     return FirstOrder(
         wavelength=trace.wavelength,
         focal_length=focal_length,

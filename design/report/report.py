@@ -91,6 +91,7 @@ def design_report(
         middle=request.middle * 1e9,
         fields=_field_texts(request),
         finite=bool(np.isfinite(telescope.object_distance)),
+        afocal=telescope.design_data.afocal,
         wavelengths=[float(w) * 1e9 for w in request.wavelengths],
         pictures=pictures,
         problems=problems,
