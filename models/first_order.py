@@ -172,14 +172,14 @@ def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> Fi
     n, (h, hb), (u, ub) = float(trace.n_after[-1]), map(float, trace.h[-1]), map(float, trace.u_after[-1])
     power = -n * u / (abs(float(trace.n[0])) * radius)
     parallel = abs(power) * radius < 1e-9
-    if parallel and not telescope.design_data.afocal:
+    slope = _marginal(telescope)
+    if parallel and not slope and not telescope.design_data.afocal:
         raise DomainError(
             f"telescope {telescope.name}: expected one with a focus, or afocal: true in its design data; its power is "
             f"{power:.3g} 1/m"
         )
     focal_length, to_focus = (math.inf, math.inf) if parallel else (1.0 / power, -h / u)
     to_pupil = -hb / ub if ub != 0 else math.inf
-    slope = _marginal(telescope)
     seen = _trace(telescope, wavelength, 1.0, section=True, marginal=slope)
     behind, height = 0.0 if parallel and not slope else float(seen.u_after[-1, 0]), float(seen.h[-1, 0])
     return FirstOrder(

@@ -74,8 +74,8 @@ class Bundles:
         chief = (self.chief_path, self.index, self.chief_position, self.chief_direction)
         rays = (self.path, self.index, self.position, self.direction)
         if self.afocal:
-            along = self.chief_direction
-            return path_to_plane(*chief, along)[:, None] - path_to_plane(*rays, along[:, None])
+            normal = self.chief_direction
+            return path_to_plane(*chief, normal)[:, None] - path_to_plane(*rays, normal[:, None])
         along = (defocus / self.chief_direction[:, 2:]) if defocus else 0.0
         center = self.chief_position + along * self.chief_direction
         return path_to_sphere(*chief, center, radius)[:, None] - path_to_sphere(*rays, center[:, None], radius)

@@ -66,6 +66,8 @@ def describe(telescope: Telescope) -> dict[str, Any]:
                 "magnification": optics.magnification,
                 "working_f_number": optics.working_f_number,
             }
+        # What lies at infinity has no number in JSON.
+        first = {key: value if value is None or math.isfinite(value) else None for key, value in first.items()}
     wavelength = telescope.default_wavelength
     low, high = telescope.band or telescope.wavelength_range
     return {
@@ -189,27 +191,28 @@ def figure_rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     def length(value: float) -> str:
         return f"{value / unit:.7g} {name}"
 
-    pupil = ("exit pupil", "")
+    pupil = ("exit pupil", "at infinity")
     if d["exit_pupil_z_m"] is not None:
         pupil = ("exit pupil", f"{length(d['exit_pupil_diameter_m'])} at z = {length(d['exit_pupil_z_m'])}")
     if d["angular_magnification"] is not None:
         lens, image = [("afocal, angular magnification", f"{d['angular_magnification']:.7g}")], [pupil]
+    elif d["magnification"] is not None:
+        focal = "infinite" if d["focal_length_m"] is None else length(d["focal_length_m"])
+        lens = [
+            ("focal length", focal),
+            ("magnification", f"{d['magnification']:.7g}"),
+            ("working focal ratio", f"f/{d['working_f_number']:.4f}"),
+        ]
+        image = [pupil, ("paraxial image", f"z = {length(d['image_z_m'])}")]
     elif d["focal_length_m"] is None:
         lens, image = [("first-order figures", "none: the surfaces do not share one axis, or there is no focus")], []
     else:
-        lens, image = [("focal length", length(d["focal_length_m"]))], [pupil]
-        if d["magnification"] is None:
-            lens += [
-                ("focal ratio", f"f/{d['f_number']:.4f}"),
-                ("plate scale", f'{d["plate_scale_arcsec_per_um"]:.6f}"/µm'),
-            ]
-            image.append(("paraxial focus", f"z = {length(d['focus_z_m'])}"))
-        else:
-            lens += [
-                ("magnification", f"{d['magnification']:.7g}"),
-                ("working focal ratio", f"f/{d['working_f_number']:.4f}"),
-            ]
-            image.append(("paraxial image", f"z = {length(d['image_z_m'])}"))
+        lens = [
+            ("focal length", length(d["focal_length_m"])),
+            ("focal ratio", f"f/{d['f_number']:.4f}"),
+            ("plate scale", f'{d["plate_scale_arcsec_per_um"]:.6f}"/µm'),
+        ]
+        image = [pupil, ("paraxial focus", f"z = {length(d['focus_z_m'])}")]
     far = d["object_distance_m"]
     return [
         *lens,

@@ -322,3 +322,16 @@ def test_in_a_telecentric_object_space_the_exit_pupil_is_the_back_focus():
     # Moving the stop from s to s' adds S1 times the ratio of the change of chief to marginal heights (Welford, 8.5).
     shift = 0.02 * 3.0 / (0.5 * diameter)
     assert abs(abs(moved[1] - still[1]) - shift * abs(still[0])) < 1e-3 * shift * abs(still[0])
+
+
+def test_a_relay_without_power_has_an_image_and_a_magnification():
+    # Two paraboloids of focal lengths 2 and 1 m with a common focus, the object in the focus of the first: -1/2.
+    rows = [(0.0, 4.0, -1.0, None), (3.0, -2.0, -1.0, None)]
+    relay = replace(telescope_of(rows, stop_z=0.5, diameter=0.1), object_distance=2.0)
+    figures = first_order(relay)
+    assert np.isinf(figures.focal_length)
+    assert figures.magnification == pytest.approx(-0.5, rel=1e-12)
+    # In the focus of the second mirror.
+    assert figures.image_z == pytest.approx(2.0, rel=1e-12)
+    with pytest.raises(DomainError, match="expected one with a focus"):
+        first_order(replace(relay, object_distance=np.inf))

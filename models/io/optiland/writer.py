@@ -34,7 +34,7 @@ def telescope_to_optiland(telescope: Telescope, *, lenient: bool = False) -> str
     t = telescope
     with error_context(subject=t.name):
         require_sequential(t, "a file of optiland")
-        links, others = (*t.design_data.pickups, *t.design_data.solves), ["afocal"] * t.design_data.afocal
+        links, others = (*t.design_data.pickups, *t.design_data.solves), ["afocal"] if t.design_data.afocal else []
         report_unheld(t, links, "a file of optiland", lenient=lenient, others=others)
         stop, system = own_stop(t), system_items(t)
         first = -t.surfaces[0].vertex[2]
