@@ -34,8 +34,9 @@ def telescope_to_optiland(telescope: Telescope, *, lenient: bool = False) -> str
     t = telescope
     with error_context(subject=t.name):
         require_sequential(t, "a file of optiland")
-        links, others = (*t.design_data.pickups, *t.design_data.solves), ["afocal"] if t.design_data.afocal else []
-        report_unheld(t, links, "a file of optiland", lenient=lenient, others=others)
+        data = t.design_data
+        others = ["afocal"] if data.afocal else []
+        report_unheld(t, (*data.pickups, *data.solves), "a file of optiland", lenient=lenient, others=others)
         stop, system = own_stop(t), system_items(t)
         first = -t.surfaces[0].vertex[2]
         before = material_items(t.medium_before)
