@@ -12,6 +12,7 @@ from typer import Argument, Option
 from .interrupt import interruptible
 from .options import Json, Quiet, Threads
 from .tables import print_json, wide_console
+from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
 
 app = typer.Typer()
 
@@ -26,6 +27,9 @@ def reproduce_command(
     ] = "small",
     out: Annotated[Path, Option("--out", "-o", help="Folder of the figures.")] = Path("pachon_figures"),
     seed: Annotated[int, Option(min=0, help="Seed of all random numbers.")] = 1,
+    processes: Processes = None,
+    scheduler: Scheduler = None,
+    workers: DaskWorkers = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -41,11 +45,18 @@ def reproduce_command(
     - `pachon reproduce`: all of them, small
     - `pachon reproduce fig3 table1 --out figures`
     - `pachon reproduce all --scale paper --out paper_figures`
+    - `pachon reproduce fig15 fig16 --scale paper --processes 2`: visits side by side
     """
     from ..studies.reproduce.reproduce import reproduce_at
 
-    with interruptible(quiet, f"finished parts are in {out}, and are used by the next call") as reporter:
-        summary = reproduce_at(figures or ("all",), scale, out, seed=seed, threads=threads, reporter=reporter)
+    hint = f"finished parts are in {out}, and are used by the next call"
+    with (
+        interruptible(quiet, hint) as reporter,
+        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
+    ):
+        summary = reproduce_at(
+            figures or ("all",), scale, out, seed=seed, workers=maker, threads=threads, reporter=reporter
+        )
     if as_json:
         print_json(summary)
     elif not quiet:

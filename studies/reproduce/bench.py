@@ -9,6 +9,7 @@ from typing import Any
 
 from ...core.products import Stamp
 from ...core.progress import Reporter
+from ...core.workers import MakeWorkers
 from ...pipeline.ccd_product import CcdProduct, product_path, read_product
 from ...pipeline.config import Configuration, digest, with_options
 from ...pipeline.experiment import Experiment
@@ -130,14 +131,16 @@ class PipelineRun:
 class Bench:
     """Settings of the figures, and objects that they share, each made at its first use.
 
-    The run of the pipeline is in the sub-folder ``run`` of that of the figures, the visits are in ``visits``. Results
-    do not depend on `threads`.
+    The run of the pipeline is in the sub-folder ``run`` of that of the figures, the visits are in ``visits``. Both, and
+    the galaxies in the stacks, are computed by `workers` where they are given. Results do not depend on them, nor on
+    `threads`.
     """
 
     scale: Scale
     folder: Path
     seed: int = 1
     threads: int | None = None
+    workers: MakeWorkers | None = None
     reporter: Reporter = field(default_factory=lambda: Reporter(quiet=True))
 
     @cached_property
@@ -168,7 +171,14 @@ class Bench:
             "visits__places": places,
         }
         config = with_options(VisitsConfig(), **options)
-        return stack_visits(config, self.folder / "visits", resume=True, threads=self.threads, reporter=self.reporter)
+        return stack_visits(
+            config,
+            self.folder / "visits",
+            resume=True,
+            workers=self.workers,
+            threads=self.threads,
+            reporter=self.reporter,
+        )
 
     @cached_property
     def galaxies(self) -> dict[int, NullTest]:
@@ -178,6 +188,7 @@ class Bench:
             tiles=self.scale.tiles,
             rings=self.scale.rings,
             resume=True,
+            workers=self.workers,
             threads=self.threads,
             reporter=self.reporter,
         )
@@ -198,7 +209,15 @@ class Bench:
         experiment = Experiment.from_config(with_options(Configuration(), **options))
         names = experiment.config.ccds or ()
         if len(finished_ccds(folder, experiment)) < len(names):
-            run(experiment.config, folder, resume=True, strict=True, threads=self.threads, reporter=self.reporter)
+            run(
+                experiment.config,
+                folder,
+                resume=True,
+                strict=True,
+                workers=self.workers,
+                threads=self.threads,
+                reporter=self.reporter,
+            )
         stamp = stamp_of(experiment)
         products = [read_product(product_path(folder, name), stamp, holdout_images=False) for name in names]
         correlated = correlations(products)

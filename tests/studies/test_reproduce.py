@@ -14,6 +14,7 @@ from scipy.special import j1
 
 import pachon
 from pachon.commands.cli import main
+from pachon.core.workers import process_workers
 from pachon.design.images.encircled_energy import energy_curve
 from pachon.models.ideal_telescope import without_aberration
 from pachon.models.io.prescription import load_telescope
@@ -87,6 +88,17 @@ def test_figures_of_visits_are_those_of_their_folder(few_galaxies, tmp_path):
     assert summary["fig17"]["measured"]["usable_per_arcmin2_1"] == pytest.approx(galaxies["1"]["usable_per_arcmin2"])
     assert list(table(bench, "fig18.ecsv")["visits"]) == [1, 2]
     assert summary["fig10"]["measured"]["limit_6000s_mag"] > summary["fig10"]["measured"]["limit_one_exposure_mag"] + 3
+
+
+@pytest.mark.slow
+def test_stacks_by_processes_have_the_bytes_of_one(few_galaxies, tmp_path):
+    folders = [tmp_path / name for name in ("alone", "processes")]
+    for folder, workers in zip(folders, (None, lambda compute: process_workers(compute, 2, 1)), strict=True):
+        reproduce(["fig15", "fig17"], Bench(TINY, folder, threads=1, workers=workers))
+    files = sorted(path.relative_to(folders[0]) for path in folders[0].rglob("*.fits"))
+    assert len(files) >= 4
+    for file in files:
+        assert (folders[0] / file).read_bytes() == (folders[1] / file).read_bytes()
 
 
 def table(bench, name):
