@@ -45,6 +45,11 @@ class Visit:
         return f"roll {np.rad2deg(self.roll):.0f} deg{rotator}"
 
     @property
+    def label(self) -> str:
+        """Name in messages, with the number that ``visits.ecsv`` has."""
+        return f"visit {self.number}"
+
+    @property
     def matrix(self) -> np.ndarray:
         """Rotation of vectors (east, north, towards the common pointing) into (X, Y, towards the visit's), [3, 3].
 

@@ -104,7 +104,7 @@ def check_rotators(experiment: Experiment, visits: Sequence[Visit]) -> None:
     for visit in visits:
         if visit.rotator_deg is not None:
             telescope = visit_telescope(experiment, visit)
-            with error_context(subject=f"visit {visit.number}, rotator {visit.rotator_deg:g} deg"):
+            with error_context(subject=f"{visit.label}, rotator {visit.rotator_deg:g} deg"):
                 check_screens(experiment.config, telescope, experiment.camera, experiment.site)
 
 

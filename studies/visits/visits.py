@@ -126,7 +126,7 @@ def stack_visits(
     alone = workers is None
     results = ordered_results(
         VisitComputation(points, frame, reporter if alone else None),
-        [f"visit {visit.number}" for visit in due],
+        [visit.label for visit in due],
         ((visit_experiment(experiment, visit), visit) for visit in due),
         title=None if alone else f"{len(due)} visits",
         workers=workers,
@@ -135,8 +135,8 @@ def stack_visits(
         reporter=reporter,
     )
     for visit, seen in zip(due, results, strict=True):
-        for name, reason in seen.left_out.items():
-            reporter.line(f"visit {visit.number}: CCD {name} is left out, it cannot be modelled: {reason}")
+        if seen.left_out:
+            reporter.line(f"{visit.label}: {_left_out_line(seen.left_out)}")
         sums.add(seen)
         if sums.visits in config.kept:
             stack = PsfStack.of(sums, points.sky, points.star, frame.matrix, scale, experiment.weight_fwhm)
@@ -162,8 +162,16 @@ class VisitComputation:
         """Compute one visit with its experiment."""
         experiment, visit = job
         if self.reporter is not None:
-            self.reporter.line(f"visit {visit.number + 1}, {visit}")
+            self.reporter.line(f"{visit.label}, {visit}")
         return visit_psfs(experiment, visit, self.points, self.frame, threads=threads, reporter=self.reporter)
+
+
+def _left_out_line(reasons: dict[str, str]) -> str:
+    """Return one line on the CCDs of a visit that cannot be modelled, such as those at the edge of the stars."""
+    (name, reason), *others = reasons.items()
+    if not others:
+        return f"CCD {name} is left out, it cannot be modelled: {reason}"
+    return f"{len(reasons)} CCDs are left out, they cannot be modelled; CCD {name}: {reason}"
 
 
 def pixel_scale_of(frame: StackFrame) -> float:

@@ -95,7 +95,7 @@ def stack_images(
     before = {tile: own.visits for tile, own in sums.items()}
     results = ordered_results(
         VisitImages(stack, reporter if alone else None),
-        [f"visit {visit.number}" for visit in due],
+        [visit.label for visit in due],
         (
             # Tiles written before an interruption may be ahead by a visit.
             (visit, visit_experiment(stack.experiment, visit), wcs, [t for t in sums if before[t] <= visit.number])
@@ -131,7 +131,7 @@ class VisitImages:
         """Draw the CCDs of a visit that touch tiles, and resample them onto the tiles."""
         visit, experiment, wcs, tiles = job
         stack, reporter = self.stack, self.reporter or Reporter(quiet=True)
-        reporter.line(f"visit {visit.number + 1} of {len(stack.plan)}, {visit}")
+        reporter.line(f"{visit.label}, {visit}")
         touched = {name: window_on(tiles, stack.frame, own) for name, own in wcs.items()}
         windows = {name: window for name, window in touched.items() if window is not None}
         exposure, sums = stack.exposure(), {tile: TileSums.empty(tile.side) for tile in tiles}

@@ -17,7 +17,7 @@ from pachon.studies.visits.plan import Visit
 from pachon.studies.visits.psf_visit import StackFrame, visit_experiment, visit_psfs, visit_telescope
 from pachon.studies.visits.sky_points import draw_points
 from pachon.studies.visits.stack import PsfStack
-from pachon.studies.visits.visits import SUMS_NAME, cell_of, stack_path, stack_visits
+from pachon.studies.visits.visits import SUMS_NAME, _left_out_line, cell_of, stack_path, stack_visits
 
 pytestmark = pytest.mark.long
 
@@ -160,6 +160,15 @@ def test_visits_that_see_too_little_end_in_one_line(visits_config, tmp_path):
         stack_visits(
             away.model_copy(update={"visits": config.visits.model_copy(update={"count": 3})}), tmp_path / "away"
         )
+
+
+def test_ccds_that_a_visit_leaves_out_are_one_line():
+    assert _left_out_line({"R01_S01": "8 of 8 stars left"}) == (
+        "CCD R01_S01 is left out, it cannot be modelled: 8 of 8 stars left"
+    )
+    assert _left_out_line({"R01_S01": "8 of 8 stars left", "R03_S01": "no star"}) == (
+        "2 CCDs are left out, they cannot be modelled; CCD R01_S01: 8 of 8 stars left"
+    )
 
 
 def test_the_run_may_be_a_file_and_its_ccds_one_name(tmp_path):
