@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
 
+from ..core.errors import ConfigError
+from .inputs import load_model
 from .interrupt import interruptible
 from .options import Json, Quiet, Threads
 from .tables import Rows, print_json
@@ -15,6 +17,7 @@ from .tables import Rows, print_json
 app = typer.Typer()
 
 _CAPTION = "Completeness and purity of the stars; magnitude at which half of the objects are found; purity of all."
+_MODELS = ("ccd", "focal_plane")
 
 
 @app.command("measure")
@@ -23,7 +26,20 @@ def measure_command(
     out: Annotated[
         Path | None, Option("--out", "-o", help="Folder of the catalogues; by default that of each.")
     ] = None,
-    order: Annotated[int, Option(min=0, max=6, help="Order of the PSF's polynomials over the image.")] = 1,
+    model: Annotated[
+        str, Option(help="PSF model: ccd, one of each image, or focal_plane, one of the stars of all images.")
+    ] = "ccd",
+    telescope: Annotated[
+        str | None,
+        Option(
+            help="Telescope of the focal-plane model: name or file. By default images.yaml beside the images has it."
+        ),
+    ] = None,
+    basis: Annotated[str | None, Option(help="Basis of the CCD's model: pixels (default), pca, shapelets.")] = None,
+    interpolation: Annotated[
+        str | None, Option(help="Between the stars: kriging (default of pixels), polynomial, gp.")
+    ] = None,
+    order: Annotated[int | None, Option(min=0, max=6, help="Order of polynomials over the image.")] = None,
     min_snr: Annotated[float, Option(help="Least S/N of stars.")] = 30.0,
     threads: Threads = None,
     quiet: Quiet = False,
@@ -32,33 +48,45 @@ def measure_command(
     """Detect objects on images, select stars, model the PSF from them, and fit the shapes of galaxies.
 
     Each image.fits leaves image_galaxies.fits, a table with sky positions, magnitudes and ellipticities before the PSF,
-    and image_psf.fits, the PSF model. Simulated images know the truth: completeness and purity are printed.
+    and image_psf.fits, the PSF model of the CCD. With `--model focal_plane` one model of all images of an exposure
+    takes its place: focal_plane_psf.fits. Simulated images know the truth: completeness and purity are printed.
 
     **Examples**
 
     - `pachon measure pachon_images/image_R22_S11.fits`
-    - `pachon measure pachon_images/image_*.fits -o catalogues --order 2`
+    - `pachon measure pachon_images/image_*.fits -o catalogues --basis pca --order 3`: the PSF in the paper's way
+    - `pachon measure pachon_images/image_*.fits -o catalogues --model focal_plane`: optics, heights and turbulence
     """
     from ..core.files import make_folder
     from ..core.table_files import write_table
+    from ..imaging.exposure_psf import fit_exposure_psf
     from ..imaging.image_file import CcdImage
     from ..imaging.measure import measure_image
 
+    if model not in _MODELS:
+        raise ConfigError(f"--model = {model!r}: expected one of {', '.join(_MODELS)}")
+    if model == "ccd" and telescope is not None:
+        raise ConfigError("--telescope: expected with --model focal_plane alone")
     if out is not None:
         make_folder(out)
+    kind: dict[str, Any] = {"basis": basis, "interpolation": interpolation, "order": order}
     found = {}
-    with (
-        interruptible(quiet, "catalogues that are written stay") as reporter,
-        reporter.stage(f"objects of {len(images)} images", total=len(images)) as stage,
-    ):
-        for number, path in enumerate(images, start=1):
-            catalogue = measure_image(CcdImage.read(path), order=order, min_snr=min_snr, threads=threads)
-            folder = path.parent if out is None else out
-            catalogue.psf.write(folder / f"{path.stem}_psf.fits")
-            write_table(folder / f"{path.stem}_galaxies.fits", catalogue.table())
-            found[path.name] = catalogue.metrics()
-            stage.advance()
-            stage.step(path.name, number, len(images))
+    with interruptible(quiet, "catalogues that are written stay") as reporter:
+        psf = None
+        if model == "focal_plane":
+            known = None if telescope is None else load_model(telescope)
+            psf = fit_exposure_psf(images, known, min_snr=min_snr, threads=threads, reporter=reporter)
+            psf.write((images[0].parent if out is None else out) / "focal_plane_psf.fits")
+        with reporter.stage(f"objects of {len(images)} images", total=len(images)) as stage:
+            for number, path in enumerate(images, start=1):
+                catalogue = measure_image(CcdImage.read(path), psf=psf, **kind, min_snr=min_snr, threads=threads)
+                folder = path.parent if out is None else out
+                if psf is None:
+                    catalogue.psf.write(folder / f"{path.stem}_psf.fits")
+                write_table(folder / f"{path.stem}_galaxies.fits", catalogue.table())
+                found[path.name] = catalogue.metrics()
+                stage.advance()
+                stage.step(path.name, number, len(images))
     if as_json:
         print_json({"images": found})
     elif not quiet:
@@ -75,7 +103,4 @@ def measure_command(
             for name, m in found.items()
         ]
         headings = ("image", "objects", "stars", "complete, pure", "half [mag]", "purity", "usable/arcmin²")
-        caption = (
-            "Completeness and purity of the stars; magnitude at which half of the objects are found; purity of all."
-        )
-        Rows(headings, rows, caption).show()
+        Rows(headings, rows, _CAPTION).show()

@@ -83,6 +83,16 @@ class CcdImage(Result):
         """World coordinates as those of astropy."""
         return WCS(self.header)
 
+    @property
+    def gain(self) -> float:
+        """Electrons in an ADU; 1 where the header has no GAIN."""
+        return float(self.header.get("GAIN", 1.0))
+
+    @property
+    def pixel_scale(self) -> float:
+        """Angle of a pixel at the reference point of the world coordinates [rad]."""
+        return float(np.deg2rad(np.sqrt(abs(np.linalg.det(self.wcs.pixel_scale_matrix)))))
+
     @check_arguments
     def write(self, path: str | Path) -> None:
         """Write a FITS file, whole or not at all, with checksums; equal images give equal bytes.

@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from astropy import units as u
 from astropy.table import QTable, Table
 
 from ..core.arguments import check_arguments
-from ..core.errors import PachonError
+from ..core.errors import ConfigError
 from ..core.products import described_table
 from ..core.result import Result
+from ..core.units import ARCMIN
 from ..core.version import VERSION
-from ..pipeline.catalogue.detect import detect_objects
 from ..pipeline.catalogue.fit_galaxies import fit_galaxies
 from ..pipeline.catalogue.galaxy_fits import GalaxyFits, usable_galaxies
 from ..pipeline.catalogue.matching import detection_rates, match_positions
 from ..pipeline.catalogue.objects import DetectedObjects
-from ..pipeline.catalogue.star_locus import StarSelection, select_stars
-from ..pipeline.psf_model.checks import snr_weights
+from ..pipeline.catalogue.star_locus import StarSelection
+from ..pipeline.focal_plane_psf.model import FocalPlanePsf
 from ..pipeline.psf_model.model import PsfModel
-from .exposure import SATURATED
 from .image_file import CcdImage
+from .image_stars import fit_image_psf, objects_and_stars, pixels_of_ccd
 
 #: Largest distance of a detected object from a true one [pixel].
 _MATCH = 3.0
@@ -40,8 +41,8 @@ class ImageCatalogue(Result):
         All detected objects.
     stars : StarSelection
         Selected stars among them.
-    psf : PsfModel
-        Fitted to these stars; positions are pixels of the image.
+    psf : PsfModel or FocalPlanePsf
+        Fitted to these stars, its positions pixels of the image; or the model of all CCDs that was given.
     galaxies : ndarray of int, shape [n]
         Objects that are no selected stars.
     fits : GalaxyFits
@@ -53,7 +54,7 @@ class ImageCatalogue(Result):
     image: CcdImage
     objects: DetectedObjects
     stars: StarSelection
-    psf: PsfModel
+    psf: PsfModel | FocalPlanePsf
     galaxies: np.ndarray
     fits: GalaxyFits
     usable: np.ndarray
@@ -99,8 +100,7 @@ class ImageCatalogue(Result):
     def metrics(self) -> dict[str, Any]:
         """Return numbers of objects and, against the truth of a simulated image, completeness and purity."""
         header, mask = self.image.header, self.image.mask
-        scale = 60.0 * float(np.sqrt(abs(np.linalg.det(self.image.wcs.pixel_scale_matrix))))
-        area = float((mask == 0).sum()) * scale**2
+        area = float((mask == 0).sum()) * (self.image.pixel_scale / ARCMIN) ** 2
         found: dict[str, Any] = {
             "objects": len(self.objects),
             "stars": len(self.stars),
@@ -112,7 +112,7 @@ class ImageCatalogue(Result):
         truth = self.image.objects
         if len(truth.get("X", ())):
             # The truth counts pixels of the CCD, of which the image may be a part.
-            x, y = truth["X"] - header["CCDX0"], truth["Y"] - header["CCDY0"]
+            x, y = np.stack([truth["X"], truth["Y"]]) - pixels_of_ccd(self.image, np.zeros(2))[:, None]
             match = match_positions(self.objects.x, self.objects.y, x, y, _MATCH)
             real = match >= 0
             star = real & np.asarray(truth["STAR"], dtype=bool)[np.maximum(match, 0)]
@@ -131,7 +131,14 @@ class ImageCatalogue(Result):
 
 @check_arguments
 def measure_image(
-    image: CcdImage, *, order: int = 1, min_snr: float = 30.0, threads: int | None = None
+    image: CcdImage,
+    *,
+    psf: FocalPlanePsf | None = None,
+    basis: Literal["pca", "pixels", "shapelets"] | None = None,
+    interpolation: Literal["polynomial", "gp", "kriging"] | None = None,
+    order: int | None = None,
+    min_snr: float = 30.0,
+    threads: int | None = None,
 ) -> ImageCatalogue:
     """Detect objects, select stars, model the PSF from them and fit all other objects.
 
@@ -139,8 +146,12 @@ def measure_image(
     ----------
     image : CcdImage
         Image, such as one of ``pachon images``.
-    order : int
-        Order of the polynomials of all pixels of the PSF, weighted by S/N up to about 100.
+    psf : FocalPlanePsf, optional
+        Model of all CCDs, such as one fitted to :func:`~pachon.focal_plane_stars` of the images of the exposure. By
+        default a model of the CCD is fitted to the stars of the image.
+    basis, interpolation, order : str, str, int, optional
+        Kind of the model of the CCD, as of :meth:`~pachon.PsfModel.fit`: by default every pixel by kriging, which needs
+        no choice; with a `basis` of "pca", and wherever an `order` is given, polynomials as in Jee & Tyson (2011).
     min_snr : float
         Least S/N of stars.
     threads : int, optional
@@ -148,27 +159,28 @@ def measure_image(
 
     Raises
     ------
+    ConfigError
+        If a kind of model is chosen beside a model of all CCDs.
     DomainError
-        If nothing is detected, or there are too few stars for a locus or a model.
+        If nothing is detected, there are too few stars for a locus or a model, or the CCD is none of `psf`.
     """
-    try:
-        objects = detect_objects(image.image, image.variance, image.mask, saturated=SATURATED)
-        stars = select_stars(objects, image.image, mask=image.mask, min_snr=min_snr)
-        stamps = stars.stamps / stars.stamps.sum(axis=(1, 2), keepdims=True)
-        height, width = image.image.shape
-        psf = PsfModel.fit(
-            stamps,
-            stars.positions,
-            basis="pixels",
-            order=order,
-            weights=snr_weights("softened", stars.snr),
-            extent=(-0.5, width - 0.5, -0.5, height - 0.5),
-        )
-    except PachonError as error:
-        raise error.within(subject=f"CCD {image.name}") from None
+    if psf is not None and not (basis is interpolation is order is None):
+        raise ConfigError("basis, interpolation and order are of models of the CCD: expected none beside psf")
+    objects, stars = objects_and_stars(image, min_snr)
     rows = np.setdiff1d(np.arange(len(objects)), stars.index)
     places = np.stack([objects.x[rows], objects.y[rows]], axis=1)
-    psfs = psf.at(places)
+    model: PsfModel | FocalPlanePsf
+    if psf is None:
+        basis = "pixels" if basis is None else basis
+        if interpolation is None:
+            interpolation = "kriging" if basis == "pixels" and order is None else "polynomial"
+        model = own = fit_image_psf(image, stars, basis=basis, interpolation=interpolation, order=order)
+        psfs = own.at(places)
+    else:
+        model = psf
+        # Centroids at the rim may lie outside by a part of a pixel.
+        inside = np.clip(places, -0.5, np.array(image.image.shape[::-1]) - 0.5)
+        psfs = psf.draw(image.name, *(pixels_of_ccd(image, inside).T * u.pix), threads=threads)
     fits = fit_galaxies(
         image.image - objects.background,
         np.where(image.mask == 0, image.variance, 1.0),
@@ -182,4 +194,4 @@ def measure_image(
     )
     radius = np.nan_to_num(objects.half_light_radius[rows])
     usable = usable_galaxies(fits, radius, stars.half_light_radius)
-    return ImageCatalogue(image, objects, stars, psf, rows, fits, usable)
+    return ImageCatalogue(image, objects, stars, model, rows, fits, usable)

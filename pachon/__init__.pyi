@@ -102,6 +102,7 @@ from .imaging.config import load_images_configuration as load_images_configurati
 from .imaging.draw import Window as Window
 from .imaging.exposure import Exposure as Exposure
 from .imaging.image_file import CcdImage as CcdImage
+from .imaging.image_stars import focal_plane_stars as focal_plane_stars
 from .imaging.measure import ImageCatalogue as ImageCatalogue
 from .imaging.measure import measure_image as measure_image
 from .imaging.psf_field import PsfField as PsfField

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
 
 import numpy as np
@@ -32,7 +32,7 @@ class StarCut(IntFlag):
 
     ``FLAGGED``: edge, saturated, blended or masked, or such pixels within the stamp. ``FAINT``: below the least S/N.
     ``SIZE``, ``WIDTH``, ``SHAPE``: half-light radius, FWHM and ellipticity apart from those of the locus.
-    ``NEIGHBOUR``: another object nearby.
+    ``NEIGHBOUR``: another object nearby. ``DEFECT``: a stamp that is not that of a single star.
     """
 
     SELECTED = 0
@@ -42,6 +42,7 @@ class StarCut(IntFlag):
     WIDTH = 8
     SHAPE = 16
     NEIGHBOUR = 32
+    DEFECT = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,22 @@ class StarSelection(Result):
 
     def __len__(self) -> int:
         return len(self.index)
+
+    @check_arguments
+    def without(self, defects: NDArray[np.bool_]) -> StarSelection:
+        """Return the selection without those of its stars that have defects, [k] bool."""
+        if defects.shape != self.index.shape:
+            raise DomainError(f"defects has shape {defects.shape}: expected {self.index.shape}, one for each star")
+        cuts, good = self.cuts.copy(), ~defects
+        cuts[self.index[defects]] |= StarCut.DEFECT
+        return replace(
+            self,
+            index=self.index[good],
+            cuts=cuts,
+            positions=self.positions[good],
+            snr=self.snr[good],
+            stamps=self.stamps[good],
+        )
 
     @check_arguments
     def completeness(self, is_star: ArrayLike | NDArray[np.bool_]) -> float:

@@ -98,15 +98,18 @@ class FocalPlaneStars(Result):
     @classmethod
     @check_arguments
     def of_ccds(
-        cls, ccds: Iterable[CcdStars], pixel_scale: float, weight_fwhm: float = 0.7 * ARCSEC
+        cls, ccds: Iterable[CcdStars], pixel_scale: float, weight_fwhm: float = 0.7 * ARCSEC, *, pixels: bool = False
     ) -> FocalPlaneStars:
-        """Take the used stars of CCDs, whose noise is that of their photons and pixels."""
+        """Take the used stars of CCDs, whose noise is that of their photons and pixels.
+
+        With `pixels` positions are in pixels of the CCDs, in place of metres on the detector.
+        """
         parts = [part.columns() for part in ccds]
         if not any(len(part[0]) for part in parts):
             raise DomainError("no stars: expected products with stars that a PSF model can use")
         names, x, y, values, electrons, level, stamps = (np.concatenate(column) for column in zip(*parts, strict=True))
         noise = photon_noise(stamps, electrons, level, pixel_scale, weight_fwhm)
-        return cls(tuple(names.tolist()), x, y, values, noise, stamps, pixel_scale, weight_fwhm)
+        return cls(tuple(names.tolist()), x, y, values, noise, stamps, pixel_scale, weight_fwhm, pixels)
 
     @classmethod
     @check_arguments

@@ -368,7 +368,22 @@ def calls(folder):
                       "threads": 1}),
         "load_visits_configuration": (pachon.load_visits_configuration, {"path": m.folder / "none.yaml"}),
         "shim": (pachon.shim, {"experiment": m.experiment, "merit": "fwhm", "parts": "rafts", "threads": 1}),
-        "measure_image": (pachon.measure_image, {"image": m.ccd_image, "order": 1, "min_snr": 30.0, "threads": 1}),
+        "measure_image": (
+            pachon.measure_image,
+            {
+                "image": m.ccd_image,
+                "psf": None,
+                "basis": "pixels",
+                "interpolation": "polynomial",
+                "order": 1,
+                "min_snr": 30.0,
+                "threads": 1,
+            },
+        ),
+        "focal_plane_stars": (
+            pachon.focal_plane_stars,
+            {"images": [m.ccd_image], "weight_fwhm": 0.7 / 206265.0, "min_snr": 30.0},
+        ),
         "draw_ccd": (pachon.draw_ccd, {"experiment": m.experiment, "ccd": "none", "galaxies": m.galaxies,
                      "pointing": (0.0, 0.0), "position_angle": 0.0, "threads": 1}),
         "fit_static_heights": (pachon.fit_static_heights, {"exposures": [], "telescope": tel, "steps": 1,

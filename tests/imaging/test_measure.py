@@ -12,11 +12,14 @@ from pachon.core.errors import PachonError
 from pachon.core.units import ARCSEC
 from pachon.imaging.draw import Window
 from pachon.imaging.exposure import Exposure
+from pachon.imaging.exposure_psf import fit_exposure_psf
 from pachon.imaging.image_file import CcdImage
+from pachon.imaging.image_stars import focal_plane_stars, regular_shapes
 from pachon.imaging.measure import measure_image
 from pachon.imaging.scene import draw_ccd
 from pachon.pipeline.catalogue.matching import match_positions
 from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.focal_plane_psf.model import FocalPlanePsf
 from pachon.sky.galaxies import Galaxies
 
 pytestmark = pytest.mark.long
@@ -60,8 +63,50 @@ def test_stars_and_objects_against_the_truth(catalogue):
     assert 1.5 < metrics["star_half_light_radius_pixel"] < 3.0
 
 
-def test_gaussian_galaxies_have_their_own_ellipticity(catalogue, image):
-    truth = image.objects
+@pytest.fixture(scope="module")
+def focal_plane_psf(image):
+    return FocalPlanePsf.fit(focal_plane_stars([image]), camera="lsst", ccds=["R22_S11"], threads=1)
+
+
+@pytest.fixture(scope="module")
+def catalogues(image, catalogue, focal_plane_psf):
+    return {
+        "kriging": catalogue,
+        "paper": measure_image(image, basis="pca", order=1, threads=1),
+        "focal plane": measure_image(image, psf=focal_plane_psf, threads=1),
+    }
+
+
+def test_stars_of_images_have_honest_noise(image, catalogue):
+    stars = focal_plane_stars([image])
+    assert set(stars.ccd) == {"R22_S11"}
+    assert stars.pixels
+    # The image begins at the pixel (1200, 1100) of the CCD.
+    at = {(x + 1200, y + 1100) for x, y in catalogue.stars.positions}
+    assert at >= set(zip(stars.x, stars.y, strict=True))
+    assert len(stars) > 0.9 * len(at)
+    # About a cubic trend stars scatter by their noise: the PSF of a long exposure is smooth on a third of a CCD.
+    u, v = (stars.x - 1900.0) / 700.0, (stars.y - 1750.0) / 700.0
+    terms = np.stack([u**i * v**j for i in range(4) for j in range(4 - i)], axis=1)
+    for values, noise in zip(stars.values.T, stars.noise.T, strict=True):
+        trend = terms @ np.linalg.lstsq(terms / noise[:, None], values / noise, rcond=None)[0]
+        assert 1.4826 * np.median(np.abs(values - trend) / noise) == pytest.approx(1.0, abs=0.25)
+
+
+def test_blends_within_the_stellar_locus_are_no_stars():
+    rng = np.random.default_rng(4)
+    positions, snr = rng.uniform(0.0, 4096.0, (40, 2)), rng.uniform(30.0, 300.0, 40)
+    values = 1e-5 * positions[:, :1] * [1.0, -1.0, 0.5] + rng.normal(size=(40, 3)) * 0.5 / snr[:, None]
+    assert regular_shapes(values, snr, positions).sum() >= 38
+    values[7, 1] += 0.06
+    assert not regular_shapes(values, snr, positions)[7]
+    # Too few to tell.
+    assert regular_shapes(values[:11], snr[:11], positions[:11]).all()
+
+
+@pytest.mark.parametrize("kind", ["kriging", "paper", "focal plane"])
+def test_gaussian_galaxies_have_their_own_ellipticity(catalogues, image, kind):
+    truth, catalogue = image.objects, catalogues[kind]
     rows = catalogue.galaxies
     match = match_positions(catalogue.objects.x[rows], catalogue.objects.y[rows], *on_image(truth), 1.0)
     good = (match >= 0) & catalogue.usable
@@ -95,6 +140,37 @@ def test_the_command_writes_catalogue_and_psf(image, catalogue, tmp_path, capsys
     table = Table.read(tmp_path / "out" / "image_galaxies.fits")
     np.testing.assert_array_equal(table["e1"], catalogue.fits.e1)
     assert fits.getheader(tmp_path / "out" / "image_psf.fits")["SIMPLE"]
+
+
+@pytest.mark.slow
+def test_the_command_fits_one_psf_to_all_images(image, focal_plane_psf, tmp_path, capsys):
+    image.write(tmp_path / "image.fits")
+    command = ["measure", str(tmp_path / "image.fits"), "--model", "focal_plane", "--json", "--quiet"]
+    assert main([*command, "--telescope", "lsst_v3.3_r"]) == 0
+    assert json.loads(capsys.readouterr().out)["images"]["image.fits"]["usable"] > 80
+    found = FocalPlanePsf.read(tmp_path / "focal_plane_psf.fits")
+    assert found.field.optics is not None
+    own = fit_exposure_psf([tmp_path / "image.fits"], found.field.optics.telescope)
+    np.testing.assert_array_equal(own.draw("R22_S11", 0.0, 0.0), found.draw("R22_S11", 0.0, 0.0))
+    assert not (tmp_path / "image_psf.fits").exists()
+
+
+def test_kinds_of_models_that_do_not_go_together(image, focal_plane_psf, tmp_path, capsys):
+    with pytest.raises(PachonError, match="basis, interpolation and order are of models of the CCD"):
+        measure_image(image, psf=focal_plane_psf, order=1)
+    with pytest.raises(PachonError, match="no stars on the images: there are no images"):
+        focal_plane_stars([])
+    image.write(tmp_path / "image.fits")
+    for options, expected in (
+        (("--model", "raft"), "--model = 'raft': expected one of ccd, focal_plane"),
+        (("--telescope", "lsst_v3.3_r"), "--telescope: expected with --model focal_plane alone"),
+        (("--basis", "wavelets"), "basis = 'wavelets'"),
+        (("--model", "focal_plane"), "images.yaml for the focal-plane model; expected a telescope"),
+    ):
+        assert main(["measure", str(tmp_path / "image.fits"), *options]) == 2
+        error = capsys.readouterr().err
+        assert expected in error
+        assert error.count("\n") == 1
 
 
 def test_what_cannot_be_measured(image, tmp_path, capsys):
