@@ -21,7 +21,7 @@ MOST = 1 << 28
 _SLACK = 1.25
 
 
-class _Blocks:
+class _MemoryPool:
     """Blocks of memory that wait to be used again, the oldest first; safe with threads."""
 
     def __init__(self) -> None:
@@ -54,14 +54,14 @@ class _Blocks:
             self._lock.release()
 
 
-_BLOCKS = _Blocks()
+_POOL = _MemoryPool()
 
 
-class _Lent:
+class _PooledMemory:
     """Owner of the memory of one array, which ends with the last view of it."""
 
     def __init__(self, block: np.ndarray, shape: tuple[int, ...], dtype: np.dtype) -> None:
-        self._block, self._blocks = block, _BLOCKS
+        self._block, self._blocks = block, _POOL
         self.__array_interface__: dict[str, Any] = {
             "data": (block.ctypes.data, False),
             "shape": shape,
@@ -77,4 +77,4 @@ def empty(shape: tuple[int, ...], dtype: DTypeLike = np.float64) -> np.ndarray:
     """Return an array of unset values; that of a large one goes back into use with the last view of it."""
     kind = np.dtype(dtype)
     count = math.prod(shape) * kind.itemsize
-    return np.empty(shape, kind) if count < _LEAST else np.asarray(_Lent(_BLOCKS.take(count), shape, kind))
+    return np.empty(shape, kind) if count < _LEAST else np.asarray(_PooledMemory(_POOL.take(count), shape, kind))

@@ -13,7 +13,7 @@ from uuid import uuid4
 
 from .errors import ConfigError, ProductError
 from .version import VERSION
-from .workers import AHEAD, Compute, Workers
+from .workers import JOBS_AHEAD, Compute, Workers
 
 #: Longest wait for an answer of a scheduler [s].
 CONNECT_SECONDS = 20.0
@@ -33,7 +33,7 @@ def dask_workers(compute: Compute, client: Any, *, local: bool = False) -> Worke
         from distributed.scheduler import KilledWorker
 
         source = iter(jobs)
-        ahead = AHEAD * max(1, sum(client.nthreads().values()))
+        ahead = JOBS_AHEAD * max(1, sum(client.nthreads().values()))
         # Own keys: one scheduler may serve several computations, each with a first job.
         batch = uuid4().hex[:8]
 

@@ -96,7 +96,7 @@ def claim_folder(path: Path, content: bytes, *, products: str, check: Callable[[
 
 def partial_path(path: Path) -> Path:
     """Return the temporary path under which this process writes a file."""
-    return path.with_name(f".{path.name}.{_owner(os.getpid())}.partial")
+    return path.with_name(f".{path.name}.{_owning_process(os.getpid())}.partial")
 
 
 def _write(path: Path, data: bytes, error: type[PachonError], publish: Callable[[Path, Path], None]) -> None:
@@ -136,7 +136,7 @@ def marked_folder(folder: Path) -> Iterator[str]:
 
     The file is a temporary one, which :func:`make_folder` knows.
     """
-    mark = folder / f".{uuid4().hex}.{_owner(os.getpid())}.partial"
+    mark = folder / f".{uuid4().hex}.{_owning_process(os.getpid())}.partial"
     write_bytes(mark, b"")
     try:
         yield mark.name
@@ -160,17 +160,17 @@ def _remove_leftovers(folder: Path) -> None:
     for left_over in folder.glob(".*.partial"):
         owner = left_over.name.removesuffix(".partial")
         process = owner.rpartition("-")[2]
-        if owner.endswith(f".{_owner(process)}") and process.isdecimal() and not _alive(int(process)):
+        if owner.endswith(f".{_owning_process(process)}") and process.isdecimal() and not _is_running(int(process)):
             with suppress(OSError):
                 left_over.unlink()
 
 
-def _owner(process: int | str) -> str:
+def _owning_process(process: int | str) -> str:
     """Return the part of the name of temporary files that tells machine and process."""
     return f"{platform.node()}-{process}"
 
 
-def _alive(process: int) -> bool:
+def _is_running(process: int) -> bool:
     if os.name == "nt":
         # There, signal 0 would end the process.
         return True

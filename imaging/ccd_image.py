@@ -14,8 +14,8 @@ from ..core.products import Stamp
 from ..core.progress import Reporter
 from ..core.workers import MakeWorkers
 from ..pipeline.experiment import Experiment
-from ..pipeline.kept_screens import with_kept_screens
 from ..pipeline.memory import check_memory
+from ..pipeline.screen_cache import with_cached_screens
 from .config import ImagesConfig
 from .draw import Window
 from .exposure import Exposure
@@ -57,7 +57,7 @@ class ImageComputation:
 
     def __call__(self, job: ImageJob, threads: int) -> DrawnImage:
         """Draw one CCD."""
-        experiment = with_kept_screens(self.experiment)
+        experiment = with_cached_screens(self.experiment)
         try:
             experiment.make_screens(threads)
             galaxies = galaxies_of(self.config, experiment)

@@ -10,7 +10,7 @@ from .surface import Interaction, Surface
 from .telescope import VACUUM, Telescope
 
 
-def without_aberration(telescope: Telescope, focal_ratio: float = 1000.0) -> Telescope:
+def ideal_telescope(telescope: Telescope, focal_ratio: float = 1000.0) -> Telescope:
     """Return a telescope with the same pupil and no aberration to speak of: one long paraboloid.
 
     At f/N (`focal_ratio`) its coma, 3 theta / (16 N^2), and its astigmatism, theta^2 / (2 N), blur a star at an angle

@@ -18,7 +18,7 @@ from ..models.telescope import Telescope
 ENDINGS = (".ecsv",)
 
 
-def in_state(telescope: Telescope, path: str, visit: int) -> Telescope:
+def with_active_optics_state(telescope: Telescope, path: str, visit: int) -> Telescope:
     """Return a telescope with the state of one visit of a file.
 
     Raises

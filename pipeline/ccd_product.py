@@ -68,7 +68,7 @@ _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
 _REPLACED = frozenset(
     ["MODEL_E1", "MODEL_E2", "MODELSZ", "LOO_E1", "LOO_E2", "SIG_E1", "SIG_E2", "SIG_SIZE", "RES_E1", "RES_E2"]
 )
-_OWN = {"CCD_E1": "MODEL_E1", "CCD_E2": "MODEL_E2", "CCD_SIZE": "MODELSZ"}
+_CCD_COLUMNS = {"CCD_E1": "MODEL_E1", "CCD_E2": "MODEL_E2", "CCD_SIZE": "MODELSZ"}
 
 
 @dataclass(frozen=True)
@@ -255,8 +255,8 @@ def write_product(folder: Path, product: CcdProduct, stamp: Stamp, cards: list[t
     if product.rotator:
         header.append((_ROTATOR_CARD, math.degrees(product.rotator), "[deg] camera, +x towards +y of telescope"))
     hdus = [
-        table_hdu("STARS", _table(product.observed)),
-        table_hdu("TRUTH", _table(product.holdout)),
+        table_hdu("STARS", _stars_table(product.observed)),
+        table_hdu("TRUTH", _stars_table(product.holdout)),
         image_hdu("STAMPS", product.observed_images, "each star centred, of unit sum"),
         image_hdu("TRUTH_PSF", product.holdout_images, "each PSF centred, of unit sum"),
         *product.model.to_hdus(_MODEL),
@@ -273,10 +273,10 @@ def write_focal_plane_columns(folder: Path, product: CcdProduct) -> None:
     path = product_path(folder, product.name)
     hdus = read_fits(path)
     for name, stars in (("STARS", product.observed), ("TRUTH", product.holdout)):
-        before, table = hdus[name], _table(stars)
+        before, table = hdus[name], _stars_table(stars)
         known = before.columns.names
         for key, (_, unit, description) in table.items():
-            source = key if key in known else _OWN.get(key, key)
+            source = key if key in known else _CCD_COLUMNS.get(key, key)
             if key not in _REPLACED:
                 table[key] = (column(before, source), unit, description)
         hdus[name] = table_hdu(name, table)
@@ -299,8 +299,8 @@ def read_product(path: Path, stamp: Stamp | None = None, *, holdout_images: bool
             center=(header["XCENTER"] * 1e-3, header["YCENTER"] * 1e-3),
             pixel_scale=header["PIXSCALE"] * ARCSEC,
             noise=(header["SKY"], header["NOISE"]),
-            holdout=_stars(HoldoutStars, hdus["TRUTH"]),
-            observed=_stars(ObservedStars, hdus["STARS"]),
+            holdout=_stars_from_hdu(HoldoutStars, hdus["TRUTH"]),
+            observed=_stars_from_hdu(ObservedStars, hdus["STARS"]),
             holdout_images=_image(hdus["TRUTH_PSF"])[: None if holdout_images else 0].copy(),
             observed_images=_image(hdus["STAMPS"]),
             model=PsfModel.from_hdus(hdus, _MODEL),
@@ -315,7 +315,7 @@ def _image(hdu: fits.ImageHDU) -> np.ndarray:
     return np.asarray(hdu.data, dtype=np.float32)
 
 
-def _table(stars: Stars) -> dict[str, tuple[np.ndarray, str, str]]:
+def _stars_table(stars: Stars) -> dict[str, tuple[np.ndarray, str, str]]:
     table = {}
     for key, (name, unit, description) in _COLUMNS.items():
         values = getattr(stars, key, None)
@@ -327,7 +327,7 @@ def _table(stars: Stars) -> dict[str, tuple[np.ndarray, str, str]]:
     return table
 
 
-def _stars(kind: type[_StarsKind], hdu: fits.BinTableHDU) -> _StarsKind:
+def _stars_from_hdu(kind: type[_StarsKind], hdu: fits.BinTableHDU) -> _StarsKind:
     values = {}
     for each in fields(kind):
         name, unit, _ = _COLUMNS[each.name]

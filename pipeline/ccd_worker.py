@@ -17,9 +17,9 @@ from ..core.progress import Reporter
 from ..core.workers import MakeWorkers
 from .ccd_product import product_path
 from .experiment import Experiment
-from .kept_screens import with_kept_screens
 from .memory import check_memory
 from .run_folder import write_ccd
+from .screen_cache import with_cached_screens
 from .simulate.ccd_loop import left_out_line, simulate_ccds
 
 
@@ -67,7 +67,7 @@ class CcdComputation:
 
     def _write(self, name: str, folder: Path, threads: int) -> str | None:
         """Write the product of a CCD; or return the reason why it cannot be modelled."""
-        experiment = with_kept_screens(self.experiment)
+        experiment = with_cached_screens(self.experiment)
         experiment.make_screens(threads)
         write = partial(write_ccd, experiment, folder)
         return simulate_ccds(experiment, write, (name,), strict=False, threads=threads).not_modelled.get(name)

@@ -32,7 +32,7 @@ from ..raytrace.ideal_lens import require_image
 from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.psf.long_exposure import default_points
 from .alignment_states import ENDINGS as STATE_ENDINGS
-from .alignment_states import in_state
+from .alignment_states import with_active_optics_state
 from .config import BandName, Configuration, PsfConfig, ReconstructionConfig
 from .photometry import band_of, pixel_angle, resolved_photometry
 from .psf_model.fit import COMPONENTS, ORDERS
@@ -84,30 +84,30 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     name, band = config.telescope, config.band
     if name is None:
         name = f"lsst_v3.3_{band or 'r'}"
-    name = _absolute(name, folder, BUNDLED)
+    name = _absolute_path(name, folder, BUNDLED)
     telescope = load_telescope(name)
     band = band or _band_of(name, telescope)
     camera_name = None
     if config.camera is not None:
-        camera_name = _absolute(config.camera, folder, CAMERAS, CAMERA_ENDINGS)
+        camera_name = _absolute_path(config.camera, folder, CAMERAS, CAMERA_ENDINGS)
     camera = _camera_of(telescope, camera_name)
     atmosphere = config.atmosphere
-    site_name = _absolute(atmosphere.site or telescope.site or _SITE, folder, ())
+    site_name = _absolute_path(atmosphere.site or telescope.site or _SITE, folder, ())
     plane = config.focal_plane
     if plane.heights is not None:
-        heights = _absolute(plane.heights, folder, tuple(AS_MEASURED), HEIGHT_ENDINGS)
+        heights = _absolute_path(plane.heights, folder, tuple(AS_MEASURED), HEIGHT_ENDINGS)
         plane = plane.model_copy(update={"heights": heights})
     elif plane.budget is None:
         plane = plane.model_copy(update={"budget": camera.height_budget})
     active = config.active_optics
     if active.states is not None:
-        active = active.model_copy(update={"states": _absolute(active.states, folder, (), STATE_ENDINGS)})
+        active = active.model_copy(update={"states": _absolute_path(active.states, folder, (), STATE_ENDINGS)})
     site = load_site(site_name)
     stars, light = config.stars, resolved_photometry(config.photometry, telescope, camera, band)
     if stars.catalogue is not None:
         width, seconds, measured = PROVISIONAL_FWHM, atmosphere.exposure_s, band_of(band, light)
-        stars = _filled(
-            stars.model_copy(update={"catalogue": _absolute(stars.catalogue, folder, (), STAR_ENDINGS)}),
+        stars = _with_defaults(
+            stars.model_copy(update={"catalogue": _absolute_path(stars.catalogue, folder, (), STAR_ENDINGS)}),
             {
                 "brightest": round(saturation_magnitude(measured, seconds, width), 3),
                 "faintest": round(limiting_magnitude(stars.snr_min, measured, seconds, width), 3),
@@ -117,10 +117,10 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     if wavelengths is None:
         low, high = telescope.band or telescope.wavelength_range
         wavelengths = tuple(round(float(w) * 1e9, 3) for w in np.linspace(low, high, _WAVELENGTHS))
-    psf = _filled(
+    psf = _with_defaults(
         config.psf,
         (_WITH_ATMOSPHERE if atmosphere.enabled else _OPTICS_ALONE)
-        | _stamps(config, telescope, camera)
+        | _stamp_geometry(config, telescope, camera)
         | ({"n_pupil": default_points(telescope)} if config.psf.engine == "long_exposure" else {}),
     )
     resolved = config.model_copy(
@@ -134,16 +134,18 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
             "stars": stars,
             "focal_plane": plane,
             "active_optics": active,
-            "atmosphere": _filled(
+            "atmosphere": _with_defaults(
                 atmosphere.model_copy(update={"site": site_name}),
                 {"r0_m": float(site.r0), "outer_scale_m": float(site.outer_scale)},
             ),
             "psf": psf,
-            "reconstruction": _reconstruction(config.reconstruction, _weight(atmosphere.enabled, psf, telescope)),
+            "reconstruction": _reconstruction(
+                config.reconstruction, _moment_weight(atmosphere.enabled, psf, telescope)
+            ),
         }
     )
-    telescope = as_configured(telescope, resolved)
-    _check(resolved, telescope)
+    telescope = configured_telescope(telescope, resolved)
+    _check_combinations(resolved, telescope)
     check_screens(resolved, telescope, camera, site)
     return ResolvedConfiguration(resolved, telescope, camera, site)
 
@@ -156,9 +158,9 @@ def _reconstruction(fit: ReconstructionConfig, weight_fwhm_arcsec: float) -> Rec
     """
     if _names_no_model(fit):
         fit = fit.model_copy(update=_KRIGING)
-    fit = _filled(fit, _PAPER | {"weight_fwhm_arcsec": weight_fwhm_arcsec})
+    fit = _with_defaults(fit, _PAPER | {"weight_fwhm_arcsec": weight_fwhm_arcsec})
     components = None if fit.basis == "pixels" else COMPONENTS
-    return _filled(fit, {"components": components, "order": ORDERS[given(fit.interpolation)]})
+    return _with_defaults(fit, {"components": components, "order": ORDERS[given(fit.interpolation)]})
 
 
 def with_paper_model(config: Configuration) -> Configuration:
@@ -194,7 +196,7 @@ def _camera_of(telescope: Telescope, name: str | None) -> Camera:
         return load_camera(found)
 
 
-def _stamps(config: Configuration, telescope: Telescope, camera: Camera) -> dict[str, float]:
+def _stamp_geometry(config: Configuration, telescope: Telescope, camera: Camera) -> dict[str, float]:
     """Return the default pixels [um] and size of stamps, as large on the sky as those of the LSST."""
     side, fine = (_SIDE, 1) if config.atmosphere.enabled else (_SIDE_ALONE, _FINE)
     pixel = camera.pixel_size / fine
@@ -209,19 +211,19 @@ def _pixel_arcsec(psf: PsfConfig, telescope: Telescope) -> float:
     return pixel_angle(telescope, given(psf.pixel_um) * 1e-6) / ARCSEC
 
 
-def _weight(enabled: bool, psf: PsfConfig, telescope: Telescope) -> float:
+def _moment_weight(enabled: bool, psf: PsfConfig, telescope: Telescope) -> float:
     """Return the FWHM of the weight of the moments [arcsec]."""
     least = _WEIGHT_PIXELS * _pixel_arcsec(psf, telescope)
     return max(_WEIGHT if enabled else _WEIGHT_ALONE, round(least, 3))
 
 
-def as_configured(telescope: Telescope, config: Configuration) -> Telescope:
+def configured_telescope(telescope: Telescope, config: Configuration) -> Telescope:
     """Return a telescope with the changes, the state of the visit and the rotator angle of a configuration."""
     telescope = apply_changes(telescope, config.changes)
     states = config.active_optics.states
     if states is not None:
         with error_context(key="active_optics.states"):
-            telescope = in_state(telescope, states, config.atmosphere.epoch)
+            telescope = with_active_optics_state(telescope, states, config.atmosphere.epoch)
     return telescope.with_rotator(math.radians(config.rotator_deg))
 
 
@@ -231,7 +233,7 @@ def noise_free_components(config: Configuration) -> int:
     return min(COMPONENTS, config.stars.truth - 1) if components is None else components
 
 
-def fewest_stars(config: Configuration) -> int:
+def least_star_count(config: Configuration) -> int:
     """Return how many observed stars the PSF model of a resolved configuration needs on a CCD."""
     fit = config.reconstruction
     terms = 0 if fit.interpolation == "kriging" else term_count(fit.order or 0)
@@ -274,7 +276,7 @@ def default_ccds(camera: Camera) -> tuple[str, ...]:
     return tuple(camera.ccd_names[i] for i in np.flatnonzero(row))
 
 
-def _check(config: Configuration, telescope: Telescope) -> None:
+def _check_combinations(config: Configuration, telescope: Telescope) -> None:
     """Check what several values must be together."""
     for i, wavelength in enumerate(given(config.wavelengths_nm)):
         low, high = (1e9 * w for w in telescope.wavelength_range)
@@ -369,7 +371,7 @@ def given(value: _T | None) -> _T:
     return value
 
 
-def _filled(section: _Model, defaults: Mapping[str, object]) -> _Model:
+def _with_defaults(section: _Model, defaults: Mapping[str, object]) -> _Model:
     """Return a section with defaults in place of what was left open."""
     return section.model_copy(update={key: v for key, v in defaults.items() if getattr(section, key) is None})
 
@@ -381,7 +383,7 @@ def _band_of(name: str, telescope: Telescope) -> BandName:
     return bands.get(ending, "r" if telescope.band is None else bands[nearest_band(telescope.band)])
 
 
-def _absolute(name: str, folder: Path | None, bundled: Sequence[str], endings: Sequence[str] = ENDINGS) -> str:
+def _absolute_path(name: str, folder: Path | None, bundled: Sequence[str], endings: Sequence[str] = ENDINGS) -> str:
     """Return a bundled name as it is, and the path of a file as an absolute one."""
     if name in bundled or Path(name).suffix.lower() not in endings:
         return name

@@ -152,7 +152,7 @@ def place_stars(
     ProductError
         If the file cannot be read, or lacks a column: one line with the names that were looked for.
     """
-    rows = _read(path, columns, band)
+    rows = _read_rows(path, columns, band)
     places, magnitude, kelvin = rows.places, rows.magnitude, rows.temperature
     if rows.kind == "ra" and pointing is None:
         raise ConfigError("right ascension and declination: expected pointing = {ra_deg, dec_deg}", file=path)
@@ -169,7 +169,7 @@ def place_stars(
     if rows.kind != "x":
         aim = pointing if rows.kind == "ra" else None
         slopes = np.tan(places) if aim is None else aim.to_slopes(aim.from_celestial(*places.T))
-        places, lands = _landings(telescope, slopes, wavelength)
+        places, lands = _landing_points(telescope, slopes, wavelength)
         keep("outside_the_field", lands)
     keep("off_the_ccds", camera.ccd_at(*places.T) >= 0)
     ccd = camera.ccd_at(*places.T, margin=-RIM * camera.pixel_size)
@@ -203,7 +203,7 @@ class _Rows:
     unused: tuple[str, ...]  #: columns of colours
 
 
-def _read(path: Path, columns: dict[str, str], band: str) -> _Rows:
+def _read_rows(path: Path, columns: dict[str, str], band: str) -> _Rows:
     """Read places and magnitudes of all rows; ProductError if a column is missing or none of numbers."""
     table = read_columns(path)
     with error_context(file=path):
@@ -212,7 +212,7 @@ def _read(path: Path, columns: dict[str, str], band: str) -> _Rows:
         pair, unit = whole[0] if whole else _PLACES[0]
         missing = [key for key in (*pair, "mag") if given[key] is None]
         if missing:
-            looked = "; ".join(f"{key}: {', '.join(_names(key, columns, band))}" for key in missing)
+            looked = "; ".join(f"{key}: {', '.join(_column_names(key, columns, band))}" for key in missing)
             raise ProductError(f"no column {', '.join(missing)} ({looked}); columns are {', '.join(table) or 'none'}")
         magnitude = _values(table, str(given["mag"]), None)
         places = np.stack([_values(table, str(given[key]), unit) for key in pair], axis=1)
@@ -234,7 +234,7 @@ def _temperatures(values: np.ndarray, kind: str) -> np.ndarray:
     return np.clip(found, COOLEST, HOTTEST)
 
 
-def _landings(telescope: Telescope, slopes: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
+def _landing_points(telescope: Telescope, slopes: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
     """Return where chief rays meet the nominal detector [m], shape [n, 2], NaN where none does, and whether they do."""
     with np.errstate(invalid="ignore"):
         inside = np.flatnonzero(np.hypot(*np.arctan(slopes).T) <= telescope.field_limit)
@@ -246,7 +246,7 @@ def _landings(telescope: Telescope, slopes: np.ndarray, wavelength: float) -> tu
     return places, np.isfinite(places[:, 0])
 
 
-def _names(key: str, columns: dict[str, str], band: str) -> tuple[str, ...]:
+def _column_names(key: str, columns: dict[str, str], band: str) -> tuple[str, ...]:
     """Return the names that a column may have, in small letters."""
     if key in columns:
         return (columns[key].lower(),)
@@ -255,7 +255,7 @@ def _names(key: str, columns: dict[str, str], band: str) -> tuple[str, ...]:
 
 def _column(table: dict[str, Any], key: str, columns: dict[str, str], band: str) -> str | None:
     """Return the name of a column in a table, or None."""
-    return next((name for name in _names(key, columns, band) if name in table), None)
+    return next((name for name in _column_names(key, columns, band) if name in table), None)
 
 
 def _values(table: dict[str, Any], name: str, unit: u.UnitBase | None) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...core.errors import DomainError
 from ...models.camera.camera import Camera
-from ...models.ideal_telescope import without_aberration
+from ...models.ideal_telescope import ideal_telescope
 from ...models.star_spectrum import blackbody_photons
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.engine import center_focal_length
@@ -201,7 +201,7 @@ def _expose(
     telescope = experiment.telescope
     optical, magnification = not experiment.atmosphere_only, 1.0
     if not optical:
-        ideal = without_aberration(telescope, _IDEAL_RATIO).with_rotator(experiment.rotator)
+        ideal = ideal_telescope(telescope, _IDEAL_RATIO).with_rotator(experiment.rotator)
         here, there = (center_focal_length(t, wavelengths) for t in (telescope, ideal))
         telescope, magnification = ideal, there / here
     psfs = make_psfs(

@@ -10,7 +10,7 @@ from typing import Generic, TypeVar
 from ...core.errors import DomainError, PachonError, ProductError
 from ...core.progress import Reporter
 from ...core.threads import thread_count
-from ..defaults import fewest_stars
+from ..defaults import least_star_count
 from ..experiment import Experiment
 from .ccd_exposure import CcdExposure, expose_ccd
 from .star_field import StarField
@@ -109,7 +109,7 @@ def check_catalogue(experiment: Experiment, names: Sequence[str], *, strict: boo
 def _short_of_stars(experiment: Experiment, names: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Yield the CCDs on which the catalogue of stars has too few for a PSF model, each with the reason."""
     if experiment.star_list is not None:
-        least = fewest_stars(experiment.config)
+        least = least_star_count(experiment.config)
         for name in names:
             count = experiment.observed_count(name)
             if count < least:

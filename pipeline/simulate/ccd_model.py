@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..ccd_product import CcdProduct, HoldoutStars, ObservedStars
-from ..defaults import fewest_stars, given, noise_free_components
+from ..defaults import given, least_star_count, noise_free_components
 from ..experiment import Experiment
 from ..measure.shapes import Shapes, fwhm, measure_shapes
 from ..measure.star_selection import require_stars
@@ -89,7 +89,7 @@ def fit_ccd_model(
 ) -> PsfModel:
     """Fit the PSF model of the configuration to the observed stars of one CCD, S/N [n], that can be used."""
     fit, used = experiment.config.reconstruction, observation.used
-    require_stars(used, observation.defects, fewest_stars(experiment.config))
+    require_stars(used, observation.defects, least_star_count(experiment.config))
     images = observation.images[used]
     if fit.interpolation != "polynomial":  # a process needs the photons
         images = images * stars.electrons[used, None, None]

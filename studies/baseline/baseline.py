@@ -24,7 +24,7 @@ from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
 from ...pipeline.config import digest, load_configuration, with_options
 from ...pipeline.config_hash import hashed_camera, hashed_heights, hashed_photometry, hashed_states
-from ...pipeline.defaults import as_configured, with_paper_model
+from ...pipeline.defaults import configured_telescope, with_paper_model
 from ...pipeline.experiment import Experiment
 from ..metrics.camera import CAMERA
 from ..metrics.metric import REASONS, Metric, MetricGroup
@@ -267,7 +267,7 @@ def _experiment(configuration: Path, model: str, telescope: Telescope) -> Experi
         # Kriging looks for its covariance in steps that rounding may change; metrics need a model of one solution.
         config = with_options(with_paper_model(base), telescope=model, psf__engine=engine)
         experiment = Experiment.from_config(config, configuration.parent)
-        return replace(experiment, telescope=as_configured(telescope, experiment.config))
+        return replace(experiment, telescope=configured_telescope(telescope, experiment.config))
     except PachonError as error:
         raise ConfigError(f"{configuration}: {error}") from None
 

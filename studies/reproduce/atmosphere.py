@@ -12,7 +12,7 @@ from ...core.plotting import new_figure, png_bytes, styled
 from ...core.products import image_hdu, table_hdu
 from ...core.random_streams import stream
 from ...core.units import ARCMIN, ARCSEC
-from ...models.ideal_telescope import without_aberration
+from ...models.ideal_telescope import ideal_telescope
 from ...pipeline.measure.correlation import Correlation, shear_correlation
 from ...pipeline.measure.shapes import fwhm, measure_shapes
 from ...pipeline.report.focal_plane_axes import TRUTH, draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
@@ -48,7 +48,7 @@ _COLORS = ("#b8b8b8", "#7fa8d1", "#1f6fbf", "#0b2a55")
 def speckles(bench: Bench) -> Reproduced:
     """Expose one star for up to 15 s through turbulence alone, by the wave engine (Fig. 5)."""
     size, length = bench.scale.speckle_screen
-    telescope = without_aberration(bench.optics.telescope)
+    telescope = ideal_telescope(bench.optics.telescope)
     air = Atmosphere.from_site(
         _SITE,
         bench.seed,
@@ -235,7 +235,7 @@ def beginning(air: Atmosphere, exposure: float, time_step: float) -> Atmosphere:
 
 def _atmosphere_ellipticity(bench: Bench, air: Atmosphere, fields: np.ndarray) -> np.ndarray:
     """Return complex ellipticities of stars through the atmosphere alone."""
-    telescope = without_aberration(bench.optics.telescope)
+    telescope = ideal_telescope(bench.optics.telescope)
     pixel = 0.2 * ARCSEC
     psfs = make_psfs(
         telescope,

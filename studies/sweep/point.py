@@ -28,7 +28,7 @@ from ...design.parameters.changes import parse_change
 from ...pipeline.config import Configuration, configuration_of
 from ...pipeline.defaults import resolve
 from ...pipeline.experiment import Experiment
-from ...pipeline.kept_screens import with_kept_screens
+from ...pipeline.screen_cache import with_cached_screens
 from ..metrics.bare_telescope import BARE
 from ..metrics.scene import Scene
 from ..metrics.stars import STARS
@@ -60,7 +60,7 @@ class PointMeasurement:
     def _metrics(self, point: SweepPoint, threads: int) -> dict[str, float]:
         if is_bare(self.sweep, point.parameters, Path(self.folder)):
             return bare_metrics(self.sweep, point.parameters, Path(self.folder), threads)
-        experiment = with_kept_screens(point_experiment(self.sweep, point, Path(self.folder)))
+        experiment = with_cached_screens(point_experiment(self.sweep, point, Path(self.folder)))
         experiment, solved = compensated(experiment, self.sweep.compensators, threads)
         scene = Scene(experiment.telescope, experiment, threads=threads)
         metrics: dict[str, float] = {}

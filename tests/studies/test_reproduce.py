@@ -15,7 +15,7 @@ from scipy.special import j1
 import pachon
 from pachon.commands.cli import main
 from pachon.design.images.encircled_energy import energy_curve
-from pachon.models.ideal_telescope import without_aberration
+from pachon.models.ideal_telescope import ideal_telescope
 from pachon.models.io.prescription import load_telescope
 from pachon.models.io.site_file import load_site
 from pachon.pipeline.ccd_product import product_path, read_product
@@ -136,7 +136,7 @@ def test_rays_of_the_layout_meet_where_the_focal_length_says(made):
 
 
 def test_encircled_energy_of_an_annular_pupil_is_that_of_theory(lsst_r):
-    telescope = without_aberration(lsst_r)
+    telescope = ideal_telescope(lsst_r)
     pixel, wavelength = 0.002 * ARCSEC, 700e-9
     psf = pachon.make_psfs(
         telescope,
@@ -201,7 +201,7 @@ def test_exposures_of_the_speckles_are_nested(made):
         images = hdus["PSF"].data.astype(float)
         times = np.array(hdus["SHAPES"].data["EXPTIME"])
     assert images.sum(axis=(1, 2)) == pytest.approx(np.ones(len(times)), abs=1e-5)
-    telescope = without_aberration(bench.optics.telescope)
+    telescope = ideal_telescope(bench.optics.telescope)
     size, length = TINY.speckle_screen
     air = Atmosphere.from_site(
         "cerro_pachon",

@@ -15,7 +15,7 @@ from ....core.memory import readable, require_bytes
 from ....core.ordered_jobs import ordered_results
 from ....core.progress import Reporter
 from ....core.units import ARCSEC
-from ....core.workers import AHEAD, MakeWorkers
+from ....core.workers import JOBS_AHEAD, MakeWorkers
 from ....imaging.exposure import Exposure
 from ....imaging.image_file import CcdImage, is_whole
 from ....imaging.scene import ellipticities, object_columns, sky_ranges
@@ -248,7 +248,7 @@ def _check_memory(stack: ImageStack, threads: int | None, processes: int) -> Non
     # of visits that workers have sent.
     largest = max(tile_side(stack.experiment.camera), stack.tiles[0].side)
     each = needed_bytes(stack.experiment, threads) + BYTES_PER_PIXEL * largest**2 + sums
-    require_bytes(processes * each + sums * (1 + AHEAD * processes * (processes != 1)), "images")
+    require_bytes(processes * each + sums * (1 + JOBS_AHEAD * processes * (processes != 1)), "images")
 
 
 def _tile_bytes(stack: ImageStack) -> int:
