@@ -170,14 +170,14 @@ class CcdStars:
     rotator: float = field(default=0.0, kw_only=True)  #: of the camera, from +x towards +y of the telescope frame [rad]
 
     @property
-    def of_focal_plane(self) -> bool:
+    def has_focal_plane_model(self) -> bool:
         """Whether ellipticities and sizes of the model are those of a model of the whole focal plane."""
         return self.observed.ccd_e1 is not None
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """Kinds of ellipticity: :data:`KINDS`, and :data:`CCD_KINDS` with a focal-plane model."""
-        return KINDS + CCD_KINDS if self.of_focal_plane else KINDS
+        return KINDS + CCD_KINDS if self.has_focal_plane_model else KINDS
 
     def stars(self, kind: str) -> HoldoutStars | ObservedStars:
         """Return the stars that a kind of ellipticity belongs to; kinds are those of :meth:`ellipticity`."""

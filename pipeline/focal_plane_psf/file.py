@@ -193,7 +193,7 @@ def _optics(about: Mapping[str, Any], part: Any, found: Mapping[str, Any], camer
             wavefront[:, 0], telescope.pupil_diameter, telescope.pupil_obscuration, wavefront[:, 1:].copy()
         ),
         about["seeing"],
-        HeightPrior.broad(camera, degree=about["degree"]),
+        HeightPrior.uninformative(camera, degree=about["degree"]),
         part("PARAMETER_COVARIANCE"),
         ExposureResponse(part("RESPONSE"), about["radius"], about["center"]),
     )

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..measure.shapes import measure_shapes
 from .covariance import Covariance, Places
-from .kriging import neighbourhood, neighbours_of, on_threads
+from .kriging import map_on_threads, neighbourhood, neighbours_of
 from .likelihood import fit_covariance
 from .mosaic import Mosaic
 
@@ -30,7 +30,7 @@ _SMALLEST = 1e-14
 _ROOM = 8
 
 
-def deformed(images: np.ndarray, values: np.ndarray, pixel_scale: float, weight_fwhm: float) -> np.ndarray:
+def with_shapes(images: np.ndarray, values: np.ndarray, pixel_scale: float, weight_fwhm: float) -> np.ndarray:
     """Return images [n, ny, nx] with the shapes e1, e2, ln size [n, 3], centred and of unit sum."""
     ny, nx = images.shape[1:]
     padded = np.pad(images.astype(np.float64), ((0, 0), (_ROOM, _ROOM), (_ROOM, _ROOM)))
@@ -130,7 +130,7 @@ class ResidualImages:
         def covariance(k: int) -> Covariance:
             return fit_covariance(places, coefficients[:, k], noise[:, k], max_iterations=25).covariance
 
-        covariances = tuple(on_threads(covariance, range(keep), threads))
+        covariances = tuple(map_on_threads(covariance, range(keep), threads))
         return cls(mosaic, components.reshape(keep, ny, nx), places, coefficients, noise, covariances)
 
     def at(self, places: Places, threads: int | None = None) -> np.ndarray:
@@ -146,6 +146,6 @@ class ResidualImages:
                 found[:, k] = near.predict(covariance.between(self.places[stars], places[at]))
             return at, found
 
-        for at, found in on_threads(job, np.unique(places.ccd), threads):
+        for at, found in map_on_threads(job, np.unique(places.ccd), threads):
             amount[at] = found
         return np.einsum("nk,kyx->nyx", amount, self.components)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from .covariance import CCD_TERMS, COMPONENTS, Covariance, Places, ccd_terms, inverse_of_root
+from .covariance import CCD_TERMS, COMPONENTS, Covariance, Places, ccd_terms, inverse_from_cholesky
 
 #: Largest number of stars in a block.
 BLOCK = 300
@@ -239,7 +239,7 @@ def _negative_log_likelihood(packed: np.ndarray, blocks: Sequence[_Block]) -> tu
         diagonal = np.diag_indices(len(matrix))
         matrix[diagonal] += variances[-1]
         root = scipy.linalg.cholesky(matrix, lower=True, overwrite_a=True, check_finite=False)
-        inverse = inverse_of_root(root)
+        inverse = inverse_from_cholesky(root)
         solved = inverse @ block.products
         total += 0.5 * float(np.trace(solved)) + float(np.log(root[diagonal]).sum())
         weight = 0.5 * (inverse - solved @ inverse)

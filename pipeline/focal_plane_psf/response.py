@@ -296,12 +296,12 @@ class ExposureResponse:
         """Return the derivatives at field angles [rad] and heights [m], shape [n, n_parameter, 3]."""
         first, second = self._at_levels(fields)
         upper = 0.5 + (heights - self.center) / (2.0 * _LEVEL)
-        return self._with_field(fields, first + upper[:, None, None] * (second - first))
+        return self._expanded_over_field(fields, first + upper[:, None, None] * (second - first))
 
     def height_slopes(self, fields: np.ndarray) -> np.ndarray:
         """Return the derivatives of :meth:`columns` with respect to the height [1/m], shape [n, n_parameter, 3]."""
         first, second = self._at_levels(fields)
-        return self._with_field(fields, (second - first) / (2.0 * _LEVEL))
+        return self._expanded_over_field(fields, (second - first) / (2.0 * _LEVEL))
 
     def _at_levels(self, fields: np.ndarray) -> np.ndarray:
         """Return the derivatives at the two heights, parameters on the axis alone: [level, n, n_term + 1, 3]."""
@@ -309,7 +309,7 @@ class ExposureResponse:
         terms = field_terms(fields / self.radius, degree)
         return np.einsum("nt,pltf->lnpf", terms, self.polynomial)
 
-    def _with_field(self, fields: np.ndarray, own: np.ndarray) -> np.ndarray:
+    def _expanded_over_field(self, fields: np.ndarray, own: np.ndarray) -> np.ndarray:
         """Add the parameters along x and y of the field, whose derivatives are those on the axis times x and y."""
         along, waves = fields / self.radius, own[:, :-1]
         return np.concatenate(

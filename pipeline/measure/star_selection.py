@@ -163,7 +163,7 @@ def flag_stars(
             flags[i] |= StarFlag.COSMIC_RAY
             masks[i] = struck
             residual = np.where(struck, 0.0, residual)
-        if _matched(residual, variance, star) > threshold:
+        if _matched_filter(residual, variance, star) > threshold:
             flags[i] |= StarFlag.NEIGHBOUR
     return Selection(flags, masks)
 
@@ -197,14 +197,14 @@ def _sharp_pixels(residual: np.ndarray, variance: np.ndarray, fraction: float, t
     return sharp | ndimage.binary_dilation(sharp, ones, iterations=-1, mask=bright | sharp)
 
 
-def _matched(residual: np.ndarray, variance: np.ndarray, star: np.ndarray) -> float:
+def _matched_filter(residual: np.ndarray, variance: np.ndarray, star: np.ndarray) -> float:
     """Return the largest significance of a star in the residual."""
-    found = ndimage.correlate(residual, star, mode="constant", origin=_origin(star))
-    error = np.sqrt(ndimage.correlate(variance, star**2, mode="constant", origin=_origin(star)))
+    found = ndimage.correlate(residual, star, mode="constant", origin=_peak_offset(star))
+    error = np.sqrt(ndimage.correlate(variance, star**2, mode="constant", origin=_peak_offset(star)))
     return float((found / error).max())
 
 
-def _origin(star: np.ndarray) -> tuple[int, ...]:
+def _peak_offset(star: np.ndarray) -> tuple[int, ...]:
     """Return the offset of the star's peak from the middle of the stamp, in the convention of SciPy's filters."""
     return tuple(int(p) - n // 2 for p, n in zip(np.unravel_index(star.argmax(), star.shape), star.shape, strict=True))
 

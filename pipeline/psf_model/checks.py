@@ -106,23 +106,23 @@ def check_terms(terms: np.ndarray, order: int, positions: np.ndarray, weights: n
     if n_stars < n_terms:
         raise ConfigError(f"order = {order}: its {n_terms} polynomial terms need as many stars, {n_stars} given")
     if np.linalg.matrix_rank(terms) < n_terms:
-        pair = same_place(positions)
+        pair = coincident_positions(positions)
         twice = f" ({_pair_text(positions, pair)})" if pair else ""
         raise DomainError(
             f"positions: the {n_stars} stars do not determine the {term_count(order)} polynomial terms{twice}"
         )
 
 
-def check_apart(positions: np.ndarray, interpolation: str) -> None:
+def check_distinct_positions(positions: np.ndarray, interpolation: str) -> None:
     """Raise an error for two stars at one position: a noise-free process cannot pass through both."""
-    pair = same_place(positions)
+    pair = coincident_positions(positions)
     if pair:
         raise DomainError(
             f"positions: {_pair_text(positions, pair)}; expected places apart for interpolation = {interpolation!r}"
         )
 
 
-def same_place(positions: np.ndarray) -> tuple[int, int] | None:
+def coincident_positions(positions: np.ndarray) -> tuple[int, int] | None:
     """Return the indices of the first two stars at one position, or None."""
     first: dict[tuple[float, float], int] = {}
     for index, (x, y) in enumerate(positions.tolist()):

@@ -25,7 +25,7 @@ def automatic_orders(n_stars: int) -> list[int]:
     return [order for order in ORDERS if order == 0 or term_count(order) <= _MOST_TERMS * fitted]
 
 
-def choose(
+def choose_by_cross_validation(
     stars: CleanStars,
     terms: np.ndarray,
     shapes: ShapeNoise,

@@ -29,7 +29,7 @@ class CleanStars:
         return CleanStars(self.mean + shift, self.deviations - shift, self.rejected)
 
 
-def clean(
+def cleaned_stars(
     images: np.ndarray,
     masked: np.ndarray,
     terms: np.ndarray,

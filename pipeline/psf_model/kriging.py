@@ -173,7 +173,7 @@ class Posterior:
         """Return the columns, those that are not kept as 0 but for the length."""
         return np.where(kept | (np.arange(len(kept)) == 1), np.exp(logarithms), 0.0)
 
-    def surprise(self, logarithms: np.ndarray, kept: np.ndarray) -> tuple[float, np.ndarray]:
+    def negative_log_posterior(self, logarithms: np.ndarray, kept: np.ndarray) -> tuple[float, np.ndarray]:
         """Return minus the logarithm of the posterior, but for a constant, and its derivatives [n_columns]."""
         kernel = self.kernel(logarithms, kept)
         try:
@@ -205,7 +205,7 @@ class Posterior:
 
         reach = 8.0 * self.width
         return minimize(
-            self.surprise,
+            self.negative_log_posterior,
             start,
             args=(kept,),
             jac=True,

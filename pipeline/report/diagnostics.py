@@ -28,7 +28,7 @@ from ..measure.summary import (
     correlations,
     ellipticities,
     finite_mean,
-    of_focal_plane,
+    has_focal_plane_model,
     patches,
     rms,
     separation_bins,
@@ -108,7 +108,7 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
             # Damage happens to single files; a folder without any that can be read has another reason.
             if strict or len(missing) == len(names):
                 raise
-    residuals = RESIDUALS + CCD_KINDS if of_focal_plane(products) else RESIDUALS
+    residuals = RESIDUALS + CCD_KINDS if has_focal_plane_model(products) else RESIDUALS
     columns = _ccd_columns(products, residuals)
     correlated = correlations(products, products[0].kinds)
     rho = {kind: _rho(products, kind) for kind in ("residual", "away")}
@@ -145,7 +145,7 @@ def _product(folder: Path, name: str, stamp: Stamp, model: str) -> CcdProduct:
     path = product_path(folder, name)
     if path.exists():
         product = read_product(path, stamp, holdout_images=False)
-        if model == "focal_plane" and not product.of_focal_plane:
+        if model == "focal_plane" and not product.has_focal_plane_model:
             raise ProductError(f"CCD {name}: has no focal-plane model yet, which pachon run --resume adds")
         return product
     reason = "has no product yet"
@@ -154,7 +154,7 @@ def _product(folder: Path, name: str, stamp: Stamp, model: str) -> CcdProduct:
     raise ProductError(f"CCD {name}: {reason}")
 
 
-def _growth(stars: Stars) -> np.ndarray:
+def _relative_trace_residual(stars: Stars) -> np.ndarray:
     """Return (T - T of the model)/T, T = Q11 + Q22, [n]."""
     model = trace_of_moments(stars.model_size, stars.model_e1, stars.model_e2)
     result: np.ndarray = 1.0 - model / trace_of_moments(stars.size, stars.e1, stars.e2)
@@ -174,7 +174,7 @@ def _moments(products: Sequence[CcdProduct], kind: str) -> dict[str, float]:
     e = ellipticities(products, kind)
     metrics = {f"mean_e1_{kind}": finite_mean(e[0]), f"mean_e2_{kind}": finite_mean(e[1]), f"rms_e_{kind}": rms(e)}
     if kind in SIZED:
-        growth = np.concatenate([_growth(p.stars(kind)) for p in products])
+        growth = np.concatenate([_relative_trace_residual(p.stars(kind)) for p in products])
         metrics |= {f"mean_dt_{kind}": finite_mean(growth), f"rms_dt_{kind}": rms(growth)}
     return metrics
 

@@ -28,7 +28,7 @@ from ...pipeline.config import Configuration
 from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_stage import apply_focal_plane_model
 from ...pipeline.measure.correlation import SEPARATION_RANGES, Correlation, jackknife_error
-from ...pipeline.measure.summary import correlations, ellipticities, of_focal_plane, rms
+from ...pipeline.measure.summary import correlations, ellipticities, has_focal_plane_model, rms
 from ...pipeline.memory import check_memory
 from ...pipeline.simulate.ccd_exposure import CcdExposure
 from ...pipeline.simulate.ccd_loop import simulate_ccds
@@ -131,7 +131,7 @@ def _stars(
 
 def _metrics(stars: Sequence[CcdStars], correlated: dict[str, Correlation]) -> dict[str, float]:
     residuals = {"at_stars": "residual", "left_out": "left_out", "away": "away"}
-    if of_focal_plane(stars):
+    if has_focal_plane_model(stars):
         residuals |= {"at_stars_ccd": "residual_ccd", "away_ccd": "away_ccd"}
     metrics = {"rms_e_truth": rms(ellipticities(stars, "truth"))}
     metrics |= {f"rms_residual_{name}": rms(ellipticities(stars, kind)) for name, kind in residuals.items()}
