@@ -41,7 +41,7 @@ def land_on_ccds(
     """
     (x, y, z), (u, v, w) = detector.to_local(position).T, detector.along(direction).T
     ccd = focal_plane.ccd_at(x, y)
-    t = _distance(focal_plane, ccd, (x, y, z), (u, v, w), STEPS)
+    t = _distance_to_ccd(focal_plane, ccd, (x, y, z), (u, v, w), STEPS)
     # A ray that crosses the edge on its last micrometres has left the CCD. (In a gap, index -1, t has no meaning.)
     ccd = np.where(focal_plane.ccd_at(x + t * u, y + t * v) == ccd, ccd, -1).astype(np.int32)
     t = np.where(ccd >= 0, t, 0.0)
@@ -67,7 +67,7 @@ def land_bundle(
             here = first + np.flatnonzero(ccd[part] == one)
             (px, py, pz), (u, v, w) = ([component[here] for component in vector] for vector in (position, direction))
             if one >= 0:
-                t[here] = _distance(focal_plane, np.array([one]), (px, py, pz), (u, v, w), BUNDLE_STEPS)
+                t[here] = _distance_to_ccd(focal_plane, np.array([one]), (px, py, pz), (u, v, w), BUNDLE_STEPS)
 
     starts = range(0, len(x), CHUNK)
     if len(starts) == 1:
@@ -80,7 +80,9 @@ def land_bundle(
     return np.where(on_ccd, x, position[0]), np.where(on_ccd, y, position[1]), on_ccd
 
 
-def _distance(focal_plane: FocalPlane, ccd: np.ndarray, position: Triple, direction: Triple, steps: int) -> np.ndarray:
+def _distance_to_ccd(
+    focal_plane: FocalPlane, ccd: np.ndarray, position: Triple, direction: Triple, steps: int
+) -> np.ndarray:
     """Return the distances to the surfaces of CCDs, one for each ray or one for all, in lengths of the direction."""
     (x, y, z), (u, v, w) = position, direction
     frame, t = focal_plane.camera.frame(ccd), np.zeros(len(x))

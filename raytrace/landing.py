@@ -54,7 +54,7 @@ def find_points(
         left = np.flatnonzero((distance > _FOUND * size) & ~stuck & (np.abs(determinants(slopes)) > 0.0))
         if not len(left):
             break
-        step = -solved(slopes[left], miss[left])
+        step = -solve_2x2(slopes[left], miss[left])
         for _ in range(_HALVINGS):
             trial = landing(points[left] + step, left) - target[left]
             astray = ~(np.linalg.norm(trial, axis=1) < distance[left])
@@ -76,7 +76,7 @@ def determinants(matrices: np.ndarray) -> np.ndarray:
     return np.asarray(matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0])
 
 
-def solved(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
+def solve_2x2(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the solutions [n, 2] of linear equations, by Cramer's rule; NaN or infinite where there is none."""
     (a, b), (c, d) = matrices[:, 0].T, matrices[:, 1].T
     x, y = right.T

@@ -74,7 +74,7 @@ class Region:
         return (xi >= self.xi[0]) & (xi < self.xi[1]) & (eta >= self.eta[0]) & (eta < self.eta[1])
 
 
-def arrivals(rng: np.random.Generator, mean: float) -> np.ndarray:
+def poisson_arrivals(rng: np.random.Generator, mean: float) -> np.ndarray:
     """Draw the points of a Poisson process of rate 1 between 0 and `mean`, rising.
 
     Those of a smaller mean are the first of those of a larger one.

@@ -68,7 +68,7 @@ def traced_opds(
             # A stage before the last counts the lit lanes only.
             filled = value[part] if surfaces is whole else value[:0]
             launch(
-                trace_opds.suited(surfaces),
+                trace_opds.variant_for(surfaces),
                 len(work),
                 [
                     surfaces,

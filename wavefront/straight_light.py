@@ -9,7 +9,7 @@ import numpy as np
 from ..models.shapes.mesh import MeshSurface
 from ..models.surface import Interaction, Surface
 from ..models.telescope import Telescope
-from ..raytrace.pack.surfaces import clear_ring
+from ..raytrace.pack.surfaces import clear_annulus
 
 #: Radii and angles at which the sag within an aperture is sampled.
 _RADII, _ANGLES = 257, 32
@@ -31,14 +31,14 @@ def passing_packets(
     for surface in telescope.surfaces:
         heights = _sag_range(surface)
         if heights is not None:
-            through = _through_ring(surface, heights, points, directions, start)
+            through = _packets_through_ring(surface, heights, points, directions, start)
             passing = through if passing is None else passing & through
         if surface.interaction != Interaction.PASS:
             return passing
     return passing
 
 
-def _through_ring(
+def _packets_through_ring(
     surface: Surface, heights: tuple[float, float], points: np.ndarray, directions: np.ndarray, start: np.ndarray
 ) -> np.ndarray:
     """Return which packets of points [n_packet, lanes, 3] [m] on straight rays can pass a ring, [n_field, n_packet].
@@ -46,7 +46,7 @@ def _through_ring(
     A ray lands within the ring at a height between the lowest and the highest sag there. Its distance from the centre
     differs from that of its pupil point by at most its slope times the height between them.
     """
-    ring = clear_ring(surface.aperture)
+    ring = clear_annulus(surface.aperture)
     assert ring is not None
     x, y, inner, outer = ring
     local = surface.to_local(points)
@@ -67,7 +67,7 @@ def _through_ring(
 @lru_cache(maxsize=64)
 def _sag_range(surface: Surface) -> tuple[float, float] | None:
     """Return bounds of the sag within a disc or ring [m]; None where the surface has none."""
-    ring = clear_ring(surface.aperture)
+    ring = clear_annulus(surface.aperture)
     if surface.aperture is None or ring is None:
         return None
     if isinstance(surface.shape, MeshSurface) or surface.interaction == Interaction.PHASE:

@@ -27,7 +27,7 @@ from ...models.zernike_polynomials import noll_to_nm
 from ...wavefront.aberration import LINEAR_FRACTION, ResidualWavefront
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.chief_rays import fields_at
-from ...wavefront.psf.clear_pupil import only_rings
+from ...wavefront.psf.clear_pupil import has_only_annuli
 from ...wavefront.psf.psf import make_psfs
 from ..measure.shapes import measure_shapes
 from .height_series import HeightSeries, level_plane
@@ -180,7 +180,7 @@ class Instrument:
             diffusion=self.diffusion,
             jitter=self.jitter,
             dispersion=self.dispersion,
-            n_pupil=None if only_rings(self.telescope) else points,
+            n_pupil=None if has_only_annuli(self.telescope) else points,
             threads=threads,
         )
         return psfs.image, psfs.pixel_scale
@@ -260,7 +260,7 @@ class ExposureResponse:
     ) -> ExposureResponse:
         """Compute central differences at some of the stars, and fit them over the field."""
         radius = float(np.hypot(*fields.T).max()) or instrument.telescope.field_radius
-        most = _SAMPLES if only_rings(instrument.telescope) else _SAMPLES_LATTICE
+        most = _SAMPLES if has_only_annuli(instrument.telescope) else _SAMPLES_LATTICE
         chosen = fields[np.unique(np.linspace(0, len(fields) - 1, min(most, len(fields))).astype(int))]
         degree = min(_FIELD_DEGREE, max(0, int((np.sqrt(8 * len(chosen) / 3 + 1) - 3) / 2)))
         terms = field_terms(chosen / radius, degree)

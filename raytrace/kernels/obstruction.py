@@ -24,7 +24,7 @@ class PackedObstructions:
 
 
 @wp.func
-def past_obstructions(
+def obstructed_status(
     obstructions: PackedObstructions,
     s: wp.int32,
     x: lanes,

@@ -194,8 +194,11 @@ class LayerScreens(Layers):
                 # Memory of rows that are never made is never touched.
                 screens = np.empty((self.layer_count, size, size), dtype=dtype)[:]
                 screens.setflags(write=False)
-                self._cache[kind], self._cache[_made(kind)] = screens, np.zeros((self.layer_count, size), dtype=bool)
-            screens, made = self._cache[kind], self._cache[_made(kind)]
+                self._cache[kind], self._cache[_rows_key(kind)] = (
+                    screens,
+                    np.zeros((self.layer_count, size), dtype=bool),
+                )
+            screens, made = self._cache[kind], self._cache[_rows_key(kind)]
             base: Any = screens.base
             wanted = np.ones(made.shape, dtype=bool) if rows is None or kind != "slopes" else rows
             lacking = (wanted & ~made).any(axis=1)
@@ -231,7 +234,7 @@ class LayerScreens(Layers):
         return evaluate(make(layer), pixel, x, y)
 
 
-def _made(kind: str) -> str:
+def _rows_key(kind: str) -> str:
     """Return the key of the rows of a kind of screens that are made, bool [n_layer, size]."""
     return f"{kind}: rows"
 

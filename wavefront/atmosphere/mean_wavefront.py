@@ -67,7 +67,7 @@ def mean_wavefront_covariance(
     low, high, count = _FREQUENCIES
     frequency = np.geomspace(low, high, count) / diameter
     angle = np.pi * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
-    transform = _transforms(indices, 0.5 * diameter * frequency, angle, obscuration)
+    transform = _zernike_transforms(indices, 0.5 * diameter * frequency, angle, obscuration)
     plane = frequency[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     # The other half of the plane is the complex conjugate.
     area = 2.0 * (np.log(high / low) / (count - 1)) * (np.pi / _DIRECTIONS) * frequency**2
@@ -93,7 +93,9 @@ def mean_wavefront_covariance(
     return covariance
 
 
-def _transforms(indices: np.ndarray, frequency: np.ndarray, angle: np.ndarray, obscuration: float) -> np.ndarray:
+def _zernike_transforms(
+    indices: np.ndarray, frequency: np.ndarray, angle: np.ndarray, obscuration: float
+) -> np.ndarray:
     """Return means over the annulus of Zernikes times a plane wave, shape [n_frequency, n_angle, n_noll].
 
     Frequencies are in cycles per radius of the pupil.

@@ -25,7 +25,7 @@ _TIME_STEP, _GROUP_STEP, _WAVE_STEP = 0.5 * (5.0**0.5 - 1.0), 2.0**0.5 - 1.0, 0.
 
 
 @dataclass(frozen=True)
-class Turns:
+class DepthSchedule:
     """Which channel of each wavelength the rays of a time step and of a group of pupil points belong to."""
 
     time: np.ndarray  #: index of the moment of each step, rising, [n_step] int
@@ -93,7 +93,7 @@ class Channels:
         weight = self.weight.reshape(n_wave, self.depths)
         return np.asarray(np.einsum("wd,wd...->w...", weight / weight.sum(axis=1, keepdims=True), by_depth))
 
-    def turns(self, n_time: int, n_group: int = 1) -> Turns:
+    def depth_schedule(self, n_time: int, n_group: int = 1) -> DepthSchedule:
         """Share the rays of moments and groups of pupil points among the depths, evenly and without chance."""
         depths = self.depths
         first = depths * np.arange(len(self.wave) // depths)[:, None, None]
@@ -110,4 +110,4 @@ class Channels:
             ends = np.cumsum(weight, axis=1)[:, :-1] / weight.sum(axis=1)[:, None]
             channel = first + (place[:, None] >= ends[:, :, None, None]).sum(axis=1)
         number = np.bincount(channel.ravel(), minlength=len(self.wave))
-        return Turns(time, np.ascontiguousarray(channel, dtype=np.int32), number / (len(time) * n_group))
+        return DepthSchedule(time, np.ascontiguousarray(channel, dtype=np.int32), number / (len(time) * n_group))

@@ -24,7 +24,7 @@ def blur_radii(optics: PupilOptics) -> np.ndarray:
     return np.asarray(np.sqrt(total / np.maximum(optics.lit.sum(axis=(1, 2)), 1)))
 
 
-def finer_sampling(optics: PupilOptics, neighbour: float, largest: float, wanted: float) -> np.ndarray:
+def sampling_refinement(optics: PupilOptics, neighbour: float, largest: float, wanted: float) -> np.ndarray:
     """Return by what power of two the pupil of each star must be sampled more finely, 1 for stars near focus, [n_star].
 
     Parameters

@@ -33,13 +33,13 @@ def unpack(counts: indices, unit: wp.float32):
 
 
 @wp.func
-def own_channel(channel: wp.array3d(dtype=wp.int32), wave: wp.int32, t: wp.int32, packet: wp.int32):
+def single_channel(channel: wp.array3d(dtype=wp.int32), wave: wp.int32, t: wp.int32, packet: wp.int32):
     """Channel of a wavelength that has but one."""
     return wave
 
 
 @wp.func
-def channel_of_turn(channel: wp.array3d(dtype=wp.int32), wave: wp.int32, t: wp.int32, packet: wp.int32):
+def scheduled_channel(channel: wp.array3d(dtype=wp.int32), wave: wp.int32, t: wp.int32, packet: wp.int32):
     """Channel of a wavelength at the turn of a packet."""
     return channel[wave, t, packet]
 
@@ -47,7 +47,7 @@ def channel_of_turn(channel: wp.array3d(dtype=wp.int32), wave: wp.int32, t: wp.i
 @kernel_pair
 def deposit_rays(special: bool, module: wp.Module) -> wp.Kernel:
     """Return the kernel that deposits rays; the special one is that of wavelengths with several channels."""
-    channel_of = channel_of_turn if special else own_channel
+    channel_of = scheduled_channel if special else single_channel
 
     @wp.kernel(module=module)
     def deposit_rays(

@@ -22,7 +22,7 @@ def traced_obscuration(obscuration: float) -> float:
     return max(obscuration - _WITHIN, 0.0)
 
 
-def ended_by_apertures(optics: PupilOptics, points: np.ndarray, inner_radius: float) -> PupilOptics:
+def clipped_by_apertures(optics: PupilOptics, points: np.ndarray, inner_radius: float) -> PupilOptics:
     """Return optics whose lit points [n, 2] end where apertures do; where none does, at an inner radius [m]."""
     within = np.hypot(*points.T) < inner_radius
     unbounded = np.all(optics.lit[:, :, within], axis=2, keepdims=True)

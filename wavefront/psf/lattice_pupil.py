@@ -81,12 +81,12 @@ class LatticeTransfer:
         """Pupil coordinates [m], shape [n_pupil, 2]."""
         return self.lattice.points @ _TURN.T
 
-    def closer(self, finer: int) -> LatticeTransfer:
+    def refined(self, finer: int) -> LatticeTransfer:
         """Return the lattice with points so many times closer."""
         spacing = self.lattice.spacing / finer
         return replace(self, lattice=PupilLattice.fill(self.diameter, self.obscuration, spacing))
 
-    def finer(self, rays: LatticeRays) -> np.ndarray:
+    def refinement(self, rays: LatticeRays) -> np.ndarray:
         """Return how many times closer the points of each star must be, 1 for stars near focus, [n_star] int."""
         optics = rays.optics
         lit = optics.lit[:, 0, :, None]

@@ -38,10 +38,10 @@ def ray_counts(optics: PupilOptics, pixel_size: float) -> np.ndarray:
 
     ``pixel_size`` is in metres.
     """
-    return np.where(blur_radii(optics) > FAR, wanted_rays(optics, pixel_size), 0)
+    return np.where(blur_radii(optics) > FAR, drawing_ray_counts(optics, pixel_size), 0)
 
 
-def wanted_rays(optics: PupilOptics, pixel_size: float) -> np.ndarray:
+def drawing_ray_counts(optics: PupilOptics, pixel_size: float) -> np.ndarray:
     """Return the rays that draw each star, shape [n_star] int; ``pixel_size`` is in metres."""
     # Powers of two, so that a batch has few different numbers.
     count = 2 ** np.ceil(np.log2(_RAYS * np.maximum(blur_radii(optics) / pixel_size, 1.0) ** 2))
@@ -75,7 +75,7 @@ class MeanRaysEngine(FastPsfEngine):
         lit = light[:, channels.wave] * ((place >= 0.0) & (place < side - 1)).all(axis=-1)
 
         def share(star: int) -> np.ndarray:
-            return np.stack([_shared(*ray, side) for ray in zip(place[star], lit[star], strict=True)])
+            return np.stack([_cloud_in_cell(*ray, side) for ray in zip(place[star], lit[star], strict=True)])
 
         return np.stack(self._map(share, range(len(place))))
 
@@ -114,11 +114,11 @@ class MeanRaysEngine(FastPsfEngine):
         list(self._map(diffract, range(len(spectra))))
         return spectra
 
-    def _rest(self, baseline: np.ndarray) -> np.ndarray | None:
+    def _filter_structure(self, baseline: np.ndarray) -> np.ndarray | None:
         return None if self._air is None else structure_function(baseline, self._air.r0, self._air.outer_scale)
 
 
-def _shared(place: np.ndarray, light: np.ndarray, side: int) -> np.ndarray:
+def _cloud_in_cell(place: np.ndarray, light: np.ndarray, side: int) -> np.ndarray:
     """Return light [n] of rays at places [n, 2] in cells, shared linearly among the cells, [side, side] float32."""
     shining = light > 0.0
     place, light = place[shining], light[shining]

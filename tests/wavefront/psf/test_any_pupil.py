@@ -198,7 +198,7 @@ def test_donuts_of_a_telescope_with_vanes():
     telescope, plane = defocused("hsc", 0.5e-3), ImagePlane(51, 15e-6, 5e-6)
     engine = engine_for(telescope, 770e-9, plane)
     field = np.radians([[0.3, 0.2]])
-    assert engine._lattice.finer(engine._lattice_rays(engine._lattice, Stars(field, np.zeros((1, 2))))) == [2]
+    assert engine._lattice.refinement(engine._lattice_rays(engine._lattice, Stars(field, np.zeros((1, 2))))) == [2]
     image = engine.render(field, np.zeros((1, 2))).image[0]
     expected, _ = brute_force(telescope, field[0], 770e-9, plane, spacing=0.0125, longest=1.2)
     np.testing.assert_allclose(image, expected, atol=2e-3 * expected.max())
@@ -228,4 +228,4 @@ def test_points_of_the_lattice_fill_the_ring():
     radius = np.hypot(*transfer.points.T)
     assert radius.min() >= 4.1 * 0.155
     assert radius.max() < 4.1
-    assert transfer.closer(3).lattice.spacing == pytest.approx(transfer.lattice.spacing / 3)
+    assert transfer.refined(3).lattice.spacing == pytest.approx(transfer.lattice.spacing / 3)
