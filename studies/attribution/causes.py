@@ -26,20 +26,20 @@ class Cause:
     problem: Callable[[Configuration], str | None]
 
 
-def _flat(config: Configuration) -> str | None:
+def _flat_heights(config: Configuration) -> str | None:
     return "focal_plane.budget = flat" if config.focal_plane.budget == "flat" else None
 
 
 def _no_heights(config: Configuration) -> str | None:
     if config.focal_plane.heights is not None:
         return None
-    return _flat(config) or (None if config.focal_plane.terms else "all terms of focal_plane are off already")
+    return _flat_heights(config) or (None if config.focal_plane.terms else "all terms of focal_plane are off already")
 
 
 def _no_term(term: str, config: Configuration) -> str | None:
     if config.focal_plane.heights is not None:
         return f"focal_plane.heights = {config.focal_plane.heights}, which has no terms"
-    return _flat(config) or (None if term in config.focal_plane.terms else f"focal_plane.{term} = false")
+    return _flat_heights(config) or (None if term in config.focal_plane.terms else f"focal_plane.{term} = false")
 
 
 def _no_aberration(config: Configuration) -> str | None:

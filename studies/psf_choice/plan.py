@@ -42,7 +42,7 @@ class Case:
         """Number of terms of a polynomial."""
         return term_count(self.order)
 
-    def settled(self) -> Case:
+    def normalised(self) -> Case:
         """Return the case as it is fitted: parameters without effect have one value."""
         if self.interpolation in FOCAL_PLANE:
             return replace(self, basis="moments", order=0, components=3)
@@ -94,7 +94,7 @@ class Plan:
 
         def sweep(**axes: Sequence[object]) -> None:
             for values in product(*axes.values()):
-                found.append(replace(base, **dict(zip(axes, values, strict=True))).settled())  # type: ignore[arg-type]
+                found.append(replace(base, **dict(zip(axes, values, strict=True))).normalised())  # type: ignore[arg-type]
 
         sweep(stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=polynomials, order=self.orders)
         sweep(order=self.orders, components=self.components, interpolation=polynomials)
@@ -143,7 +143,7 @@ def make_plan(
     if draws < 1:
         raise ConfigError(f"draws = {draws}: expected at least 1")
     return Plan(
-        base.settled(),
+        base.normalised(),
         tuple(int(n) for n in values("stars", tuple(stars), base.stars, 2)),
         tuple(int(n) for n in values("orders", tuple(orders), base.order, 0)),
         tuple(int(n) for n in values("components", tuple(components), base.components or COMPONENTS, 1)),

@@ -70,12 +70,14 @@ class Study:
             error = excess.std(ddof=1) / np.sqrt(len(excess)) if len(excess) > 1 else 0.0
             if excess.mean() <= error:
                 as_good.append(case)
-        return min(as_good, key=_complexity)
+        return min(as_good, key=_complexity_key)
 
     def best_order(self, stars: int, interpolation: str) -> Case | None:
         """Return the case of the base's basis, components and S/N with the least :attr:`holdout_square`."""
         sought = replace(self.plan.base, stars=stars, interpolation=interpolation)
-        same = [c for c, f in self.metrics.items() if c == replace(sought, order=c.order).settled() and not f["lost"]]
+        same = [
+            c for c, f in self.metrics.items() if c == replace(sought, order=c.order).normalised() and not f["lost"]
+        ]
         return min(same, key=lambda case: self.holdout_square[case].mean()) if same else None
 
 
@@ -147,7 +149,7 @@ def _fit_key(case: Case) -> tuple[Any, ...]:
     return (case.basis, case.interpolation, case.order, case.stars, 0 if shared else case.components)
 
 
-def _complexity(case: Case) -> tuple[int, int]:
+def _complexity_key(case: Case) -> tuple[int, int]:
     """Return the sort key of a case: focal-plane models last, then the number of free parameters."""
     components = case.components or 10**6
     last = 1 + [*FOCAL_PLANE].index(case.interpolation) if case.interpolation in FOCAL_PLANE else 0

@@ -166,7 +166,7 @@ def ellipticity(bench: Bench) -> Reproduced:
             _SITE, bench.seed, epoch=epoch, exposure=max(_EXPOSURES), screen_size=scale.screen_size
         )
         for time in _EXPOSURES:
-            begun = beginning(air, time, scale.time_step)
+            begun = shortened_exposure(air, time, scale.time_step)
             e_pairs = _atmosphere_ellipticity(bench, begun, pairs)
             correlated[time].append(shear_correlation(pairs[:, 0], pairs[:, 1], e_pairs.real, e_pairs.imag, **_PAIRS))
             mean_e[time].append(float(np.abs(e_pairs).mean()))
@@ -227,7 +227,7 @@ def ellipticity(bench: Bench) -> Reproduced:
     )
 
 
-def beginning(air: Atmosphere, exposure: float, time_step: float) -> Atmosphere:
+def shortened_exposure(air: Atmosphere, exposure: float, time_step: float) -> Atmosphere:
     """Return the beginning of a longer exposure, with the same screens and at least 100 times."""
     count = max(100, round(exposure / time_step))
     return air.at_times((np.arange(count) + 0.5) * (exposure / count), exposure)

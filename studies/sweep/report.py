@@ -59,7 +59,7 @@ def sweep_pictures(table: SweepTable, sweep: SweepFile) -> list[tuple[str, Pictu
     pictures = list(_one_at_a_time(table, sweep, drawn)) if drawn else []
     numeric = [n for n, v in table.parameters.items() if v.dtype.kind in "fi" and len(np.unique(v)) > 2]
     if sweep.design.kind != "one_at_a_time" and len(table) >= _ENOUGH and numeric:
-        pictures += _random(table, numeric)
+        pictures += _random_pictures(table, numeric)
     return pictures
 
 
@@ -127,7 +127,7 @@ def _budget_text(found: list[Budget]) -> str:
     ) + " ".join(texts)
 
 
-def _random(table: SweepTable, numeric: list[str]) -> Iterator[tuple[str, Picture]]:
+def _random_pictures(table: SweepTable, numeric: list[str]) -> Iterator[tuple[str, Picture]]:
     ranks = {metric: rank_correlations(table, metric) for metric in table.metrics}
     ranks = {metric: each for metric, each in ranks.items() if each}
     if not ranks:

@@ -100,7 +100,7 @@ class SweepStore:
         if not path.is_file():
             raise ProductError(f"no such file; expected the store of {kind.article}, such as {kind.maker}", file=path)
         self.path, self.kind = path, kind
-        with self.guarded():
+        with self.sqlite_errors():
             self._connection = sqlite3.connect(path, timeout=30.0)
             about = dict(self._connection.execute("SELECT key, value FROM about"))
         if about.get("format") != str(FORMAT):
@@ -115,24 +115,24 @@ class SweepStore:
 
     def close(self) -> None:
         """Close the file, with the content of the write-ahead log."""
-        with self.guarded():
+        with self.sqlite_errors():
             self._connection.close()
 
     @property
     def sweep(self) -> SweepFile:
         """Sweep of the store."""
-        with self.guarded():
+        with self.sqlite_errors():
             return read_sweep(json.loads(self.about["sweep"]), str(self.path))
 
     def points(self) -> list[SweepPoint]:
         """Return all points in order."""
-        with self.guarded():
+        with self.sqlite_errors():
             rows = self._connection.execute("SELECT number, parameters, seed FROM points ORDER BY number").fetchall()
             return [SweepPoint(number, json.loads(parameters), seed) for number, parameters, seed in rows]
 
     def results(self) -> list[PointResult]:
         """Return the results so far, in the order of the points."""
-        with self.guarded():
+        with self.sqlite_errors():
             rows = self._connection.execute(
                 "SELECT number, metrics, problem, seconds, worker FROM results ORDER BY number"
             ).fetchall()
@@ -140,12 +140,12 @@ class SweepStore:
 
     def finished(self) -> set[int]:
         """Return the numbers of the points with results."""
-        with self.guarded():
+        with self.sqlite_errors():
             return {number for (number,) in self._connection.execute("SELECT number FROM results")}
 
     def forget_problems(self) -> int:
         """Delete results of points that could not be computed, and return their number."""
-        with self.guarded(), self._connection:
+        with self.sqlite_errors(), self._connection:
             return self._connection.execute("DELETE FROM results WHERE problem IS NOT NULL").rowcount
 
     def write(self, result: PointResult) -> None:
@@ -158,11 +158,11 @@ class SweepStore:
             result.worker,
             VERSION,
         )
-        with self.guarded(), self._connection:
+        with self.sqlite_errors(), self._connection:
             self._connection.execute("INSERT OR IGNORE INTO results VALUES (?, ?, ?, ?, ?, ?)", row)
 
     @contextmanager
-    def guarded(self) -> Iterator[None]:
+    def sqlite_errors(self) -> Iterator[None]:
         """Raise a ProductError where the file cannot be read or written, or its content is not that of a store."""
         try:
             yield
@@ -201,7 +201,7 @@ def create_store(
             connection.close()
         publish_new(partial, path)
         # Of a store that was removed; nobody has opened the new one yet.
-        for leftover in _beside(path):
+        for leftover in _sqlite_companions(path):
             leftover.unlink(missing_ok=True)
     except FileExistsError:
         raise store_exists(path) from None
@@ -211,7 +211,7 @@ def create_store(
         raise ProductError(f"cannot write {path}: {error.strerror or error}") from None
     finally:
         with suppress(OSError):
-            for leftover in (partial, *_beside(partial)):
+            for leftover in (partial, *_sqlite_companions(partial)):
                 leftover.unlink(missing_ok=True)
 
 
@@ -270,7 +270,7 @@ def _result(number: int, metrics: str | None, problem: str | None, seconds: floa
     return PointResult(number, values, problem, seconds, worker)
 
 
-def _beside(path: Path) -> Sequence[Path]:
+def _sqlite_companions(path: Path) -> Sequence[Path]:
     """Return the files that SQLite keeps beside a store."""
     return [path.with_name(path.name + ending) for ending in ("-wal", "-shm", "-journal")]
 

@@ -10,7 +10,7 @@ from ...core.plotting import BLUE, GREY, ORANGE, new_figure, png_bytes, styled
 from ...core.units import ARCMIN
 from ...pipeline.report.focal_plane_axes import draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
 from ...pipeline.report.statistics_plots import draw_correlation, log_axes
-from .measures import Correlated
+from .measures import StackCorrelations
 from .null_result import NullTest, amplitude, density_slope, shot_noise
 from .stack import PsfStack
 
@@ -59,7 +59,7 @@ def ellipticity_picture(stacks: Mapping[int, PsfStack]) -> bytes:
         return png_bytes(figure)
 
 
-def correlation_picture(found: Mapping[int, Correlated]) -> bytes:
+def correlation_picture(found: Mapping[int, StackCorrelations]) -> bytes:
     """Draw xi+ of each stack: of the PSF, and of what the model leaves at stars and where no star is (Fig. 16)."""
     with styled():
         figure = new_figure(4.2 * len(found) + 1.0, 4.8)

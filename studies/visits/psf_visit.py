@@ -155,7 +155,7 @@ def visit_psfs(
         dimmed = stars.magnitude - 2.5 * np.log10(seen.lit_fraction)
         snr = signal_to_noise(dimmed, stars.band, config.atmosphere.exposure_s, width)
         model = fit_ccd_model(experiment, observation, stars, snr)
-        return _CcdResult(exposure, observation, counts, true, model.at(_points(stars)))
+        return _CcdResult(exposure, observation, counts, true, model.at(_positions_in_order(stars)))
 
     with experiment.screens(threads, reporter):
         simulated = simulate_ccds(
@@ -224,7 +224,7 @@ def _star_fields(
     return fields, index
 
 
-def _points(stars: StarField) -> np.ndarray:
+def _positions_in_order(stars: StarField) -> np.ndarray:
     """Return the positions of places and of stars, in the order of their indices."""
     return np.concatenate([stars.holdout, stars.observed])
 
@@ -265,7 +265,7 @@ def _focal_plane_images(
         experiment.weight_fwhm,
     )
     model = fit_focal_plane_model(experiment, stars, ccds=list(found), threads=threads, reporter=reporter)
-    places = {name: _points(result.exposure.positions) for name, result in found.items()}
+    places = {name: _positions_in_order(result.exposure.positions) for name, result in found.items()}
     names = [name for name, xy in places.items() for _ in range(len(xy))]
     return model.draw(names, *np.concatenate(list(places.values())).T, threads=threads)
 

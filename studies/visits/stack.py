@@ -61,7 +61,7 @@ class PsfSums:
     @classmethod
     def read(cls, path: Path, stamp: Stamp) -> PsfSums:
         """Read sums; ProductError for those of another configuration, and for a damaged file."""
-        hdus = _read(path, stamp)
+        hdus = _read_table(path, stamp)
         count = np.array(hdus["COUNT"].data, dtype=np.int32)
         return cls(hdus[0].header[VISITS_CARD], count, _image(hdus["TRUE"]), _image(hdus["MODEL"]))
 
@@ -189,7 +189,7 @@ class PsfStack(Result):
     @check_arguments
     def read(cls, path: Path, stamp: Stamp | None = None) -> PsfStack:
         """Read a stack; ProductError for a damaged file and, with a stamp, for one of another configuration."""
-        hdus = _read(path, stamp)
+        hdus = _read_table(path, stamp)
         found = {name: column(hdus["POINTS"], name.upper()) for name in _COLUMNS}
         found = {name: found[name] * scale if scale != 1.0 else found[name] for name, (scale, _, _) in _COLUMNS.items()}
         images = {"true": _image(hdus["TRUE"]), "model": _image(hdus["MODEL"])}
@@ -212,7 +212,7 @@ _COLUMNS = {
 }
 
 
-def _read(path: Path, stamp: Stamp | None) -> fits.HDUList:
+def _read_table(path: Path, stamp: Stamp | None) -> fits.HDUList:
     hdus = read_fits(path)
     if stamp is not None and not stamp.matches(hdus[0].header):
         raise ProductError("was made with another version, configuration or seed", file=path)

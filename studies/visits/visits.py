@@ -23,7 +23,7 @@ from ...pipeline.experiment import Experiment
 from ...pipeline.memory import check_memory
 from ...pipeline.run_folder import CONFIG_NAME, SUMMARY_NAME
 from .config import STACK_STAMP, VisitsConfig, load_visits_configuration
-from .measures import Correlated, correlated, stack_metrics
+from .measures import StackCorrelations, stack_correlations, stack_metrics
 from .plan import Visit
 from .plots import correlation_picture, ellipticity_picture
 from .psf_visit import StackFrame, VisitPsfs, check_rotators, visit_experiment, visit_psfs
@@ -52,7 +52,7 @@ class StackResult:
 
     folder: Path
     stacks: dict[int, PsfStack]
-    correlations: dict[int, Correlated]
+    correlations: dict[int, StackCorrelations]
     summary: dict[str, Any]
 
 
@@ -145,7 +145,7 @@ def stack_visits(
         sums.write(folder / SUMS_NAME, stamp)
     stacks = {n: PsfStack.read(stack_path(folder, n), stamp) for n in config.kept}
     with reporter.stage("correlations"):
-        found = {n: correlated(stack, cell_of(experiment, frame)) for n, stack in stacks.items()}
+        found = {n: stack_correlations(stack, cell_of(experiment, frame)) for n, stack in stacks.items()}
     summary = _write_products(folder, config, stamp, visits, stacks, found)
     return StackResult(folder, stacks, found, summary)
 
@@ -230,7 +230,7 @@ def _write_products(
     stamp: Stamp,
     visits: tuple[Visit, ...],
     stacks: dict[int, PsfStack],
-    found: dict[int, Correlated],
+    found: dict[int, StackCorrelations],
 ) -> dict[str, Any]:
     columns = {
         "visit": (np.array([v.number for v in visits]), "", "number of the visit"),

@@ -21,7 +21,7 @@ from pachon.models.io.site_file import load_site
 from pachon.pipeline.ccd_product import product_path, read_product
 from pachon.pipeline.run_folder import stamp_of
 from pachon.studies.reproduce import reproduce as module
-from pachon.studies.reproduce.atmosphere import beginning
+from pachon.studies.reproduce.atmosphere import shortened_exposure
 from pachon.studies.reproduce.bench import PAPER, SMALL, Bench, Scale
 from pachon.studies.reproduce.focal_plane import optics_ellipticity
 from pachon.studies.reproduce.reproduce import FIGURES, chosen_figures, expected_minutes, reproduce
@@ -233,7 +233,7 @@ def test_exposures_of_the_speckles_are_nested(made):
 
 def test_the_beginning_of_an_exposure_looks_through_the_same_air():
     air = Atmosphere.from_site("cerro_pachon", 1, exposure=60.0, screen_size=512)
-    part = beginning(air, 5.0, 0.1)
+    part = shortened_exposure(air, 5.0, 0.1)
     assert part.times[-1] < 5.0 < part.times[-1] + 0.1
     assert len(part.times) == 100
     assert part.screens("slopes") is air.screens("slopes")

@@ -80,8 +80,8 @@ def clear_edges(
 
     Inner and outer radius are equal where a spoke is dark. On each spoke of direction ``unit`` [n_spoke, 2] the clear
     part is taken to be one piece, as where apertures are discs and rings about the light (:func:`has_only_annuli`);
-    all other apertures are ignored. ``direction`` [n_star, 3] is that in which the light travels, the wavelength that in vacuum
-    [m].
+    all other apertures are ignored. ``direction`` [n_star, 3] is that of the light's travel; the wavelength [m] is that
+    in vacuum.
     """
     n_star, n_spoke = len(direction), len(unit)
     outer = 0.5 * telescope.pupil_diameter

@@ -82,7 +82,7 @@ class ImageStack:
         before = _settings_before(folder)
         if settings is None and before is None:
             raise ProductError(f"{visits_folder}: no images; expected the folder of pachon stack-images")
-        settings = _resolved(settings or before or ImageStackConfig(), before, visits, experiment)
+        settings = _resolved_settings(settings or before or ImageStackConfig(), before, visits, experiment)
         frame = StackFrame.of(experiment, STACK_STAMP)
         source = visits.galaxy_source(experiment, _exposure(experiment, frame))
         galaxies_in = source.down_to(given(settings.faintest))
@@ -143,7 +143,7 @@ def tile_side(camera: Camera) -> int:
     return int(np.ceil(np.sqrt(camera.pixels.prod(axis=1).max())))
 
 
-def _resolved(
+def _resolved_settings(
     settings: ImageStackConfig, before: ImageStackConfig | None, visits: VisitsConfig, experiment: Experiment
 ) -> ImageStackConfig:
     """Return settings without open values, which are first those of the images that there are."""

@@ -245,11 +245,11 @@ def tile_metrics(tiles: list[MeasuredTile]) -> dict[str, Any]:
     ellipticities, of galaxies usable on the image and on the stamp; differences are image minus stamp.
     """
     area = sum(tile.area for tile in tiles)
-    pairs = [_pairs(tile) for tile in tiles]
+    pairs = [_paired_ellipticities(tile) for tile in tiles]
     image, stamp, reference = (np.concatenate([pair[k] for pair in pairs]) for k in range(3))
     difference = image - stamp
-    slopes = [_slope(e, reference) for e in (image, stamp, difference)]
-    lost, faint = (sum(int(_fate(tile)[k]) for tile in tiles) for k in range(2))
+    slopes = [_response_slope(e, reference) for e in (image, stamp, difference)]
+    lost, faint = (sum(int(_loss_counts(tile)[k]) for tile in tiles) for k in range(2))
 
     def density(name: str, flag: str) -> float:
         return sum(int(getattr(getattr(tile, name), flag).sum()) for tile in tiles) / area
@@ -278,7 +278,7 @@ def tile_metrics(tiles: list[MeasuredTile]) -> dict[str, Any]:
     }
 
 
-def _pairs(tile: MeasuredTile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _paired_ellipticities(tile: MeasuredTile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return complex ellipticities on image and stamp, and without noise, of galaxies that are usable on all."""
     n = 1 + max((int(s.index.max(initial=-1)) for s in (tile.stamps, tile.noise_free, tile.galaxies)), default=-1)
     found = []
@@ -292,7 +292,7 @@ def _pairs(tile: MeasuredTile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return image, stamp, reference
 
 
-def _fate(tile: MeasuredTile) -> tuple[int, int]:
+def _loss_counts(tile: MeasuredTile) -> tuple[int, int]:
     """Return how many galaxies usable on stamps have no object on the image, or one that is not usable."""
     wanted = tile.stamps.index[tile.stamps.usable]
     there = np.isin(wanted, tile.galaxies.index)
@@ -300,7 +300,7 @@ def _fate(tile: MeasuredTile) -> tuple[int, int]:
     return int((~there).sum()), int((there & ~good).sum())
 
 
-def _slope(e: np.ndarray, reference: np.ndarray) -> tuple[float | None, float | None]:
+def _response_slope(e: np.ndarray, reference: np.ndarray) -> tuple[float | None, float | None]:
     """Return the slope of ellipticities against reference ones, both components together, and its standard error."""
     if len(e) < 2:
         return None, None

@@ -169,7 +169,7 @@ def _write_image(stack: ImageStack, tile: Tile, sums: TileSums) -> None:
     ):
         header[key] = (value, comment)
     image, variance, mask = sums.stacked()
-    objects = _truth(stack, tile, wcs, exposure)
+    objects = _truth_table(stack, tile, wcs, exposure)
     name = f"tile {tile.name}"
     found = CcdImage(name, image, variance, mask, header, objects, stack.stamp, STACK_MASK_BITS)
     found.write(stack.path(sums.visits, tile))
@@ -182,7 +182,7 @@ def galaxies_on(sky: Sky, tile: Tile, wcs: CcdWcs) -> Any:
     return galaxies.take(np.flatnonzero(tile.inside.contains(pixels)))
 
 
-def _truth(stack: ImageStack, tile: Tile, wcs: CcdWcs, exposure: Exposure) -> dict[str, np.ndarray]:
+def _truth_table(stack: ImageStack, tile: Tile, wcs: CcdWcs, exposure: Exposure) -> dict[str, np.ndarray]:
     """Return the table of the stars and galaxies of a tile; electrons are those of an unvignetted telescope."""
     points = stack.sky.points
     galaxies = galaxies_on(stack.sky, tile, wcs)
