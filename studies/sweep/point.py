@@ -31,6 +31,7 @@ from ...pipeline.experiment import Experiment
 from ...pipeline.screen_cache import with_cached_screens
 from ..metrics.scene import Scene
 from ..metrics.stars import STARS
+from ..metrics.telescope import TELESCOPE_METRICS
 from .compensation import compensated
 from .file import SweepFile
 from .store import PointResult, SweepPoint
