@@ -71,7 +71,7 @@ def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any
     @functools.wraps(function)
     def checked(*args: Any, **options: Any) -> Any:
         known = checks()
-        # Of several values of ``*names`` each has its check.
+        # Each value of ``*names`` is checked on its own.
         places = list(known.items())
         places += places[-1:] * (len(args) - len(places))
         try:
@@ -160,7 +160,7 @@ _PLAIN_CLASSES: dict[Any, tuple[tuple[Any, ...], str]] = {
     os.PathLike: ((os.PathLike,), "a path"),
     Callable: ((Callable,), "a function"),
 }
-#: Whole numbers to Python and NumPy, and to nobody else.
+#: Types that Python and NumPy take for whole numbers, and that are refused here.
 _NO_NUMBERS = (bool, np.timedelta64)
 #: Longest path, and longest name of a file or folder, of common systems [characters].
 _LONGEST_PATH, _LONGEST_NAME = 4096, 255

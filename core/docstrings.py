@@ -1,4 +1,4 @@
-"""Units and meanings of attributes and arguments, as the docstrings state them."""
+"""Units and descriptions of attributes and arguments, read from docstrings."""
 
 from __future__ import annotations
 

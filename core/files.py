@@ -21,7 +21,7 @@ import numpy as np
 
 from .errors import PachonError, ProductError, cut_short
 
-# Of the file that tells whether there is room [byte].
+# Size of the file that probes for free space [byte].
 _PROBE = 4096
 
 
@@ -33,7 +33,7 @@ def write_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError
 def write_new_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError) -> bool:
     """Write a file whole as :func:`write_bytes` does, and return True; or return False where there is one already.
 
-    Of several processes that write the same file at the same time, one gets True.
+    If several processes write the file at the same time, the result is True in one of them.
     """
     try:
         _write(path, data, error, publish_new)
@@ -43,7 +43,7 @@ def write_new_bytes(path: Path, data: bytes, error: type[PachonError] = ProductE
 
 
 def require_writable(path: Path, *, file: bool = False, error: type[PachonError] = ProductError) -> None:
-    """Raise `error` where neither a file nor a folder of a path can be written, before anything is computed for it.
+    """Raise `error` where a path cannot be written, before anything is computed for it.
 
     A `file` needs a folder that there is; missing folders of other paths can be made.
 
@@ -64,10 +64,10 @@ def require_writable(path: Path, *, file: bool = False, error: type[PachonError]
 
 
 def claim_folder(path: Path, content: bytes, *, products: str, check: Callable[[], None]) -> None:
-    """Write the configuration of a run into its folder, or find that the folder is another run's.
+    """Write the configuration of a run into its folder, or check the one that is there.
 
-    Of runs that start together in a new folder one writes the file. To the others, and in an old folder, `check`
-    compares it with theirs and raises where they differ; otherwise it is written again.
+    If several runs start in a new folder together, one of them writes the file. In the others, and in an existing
+    folder, `check` compares it with their own and raises where they differ; otherwise it is written again.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def publish_new(partial: Path, path: Path) -> None:
 
 @contextmanager
 def marked_folder(folder: Path) -> Iterator[str]:
-    """Put a file of a unique name into a folder, and yield that name: who finds it there sees the same folder.
+    """Put a file of a unique name into a folder, and yield the name; processes that find it share the folder.
 
     The file is a temporary one, which :func:`make_folder` knows.
     """
@@ -147,7 +147,7 @@ def marked_folder(folder: Path) -> Iterator[str]:
 
 @contextmanager
 def folder_of_worker(folder: Path, mark: str) -> Iterator[Path]:
-    """Yield a folder where a worker sees its mark (:func:`marked_folder`), and a temporary one where it does not."""
+    """Yield a folder that contains its mark (:func:`marked_folder`), or a temporary one where the mark is missing."""
     if (folder / mark).is_file():
         yield folder
         return

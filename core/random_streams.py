@@ -20,5 +20,5 @@ def stream(seed: int, *key: str | int) -> np.random.Generator:
 
 
 def natural(number: int) -> int:
-    """Return a number of its own, not negative, for each integer, as keys of streams must be."""
+    """Map integers to distinct natural numbers: keys of random streams are not negative."""
     return 2 * abs(number) + (number < 0)

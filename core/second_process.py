@@ -1,4 +1,4 @@
-"""A second process beside this one, for what would otherwise wait for it, such as half of the plots of a report."""
+"""A second process for computations in parallel with this one, such as half of the plots of a report."""
 
 from __future__ import annotations
 

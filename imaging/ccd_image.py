@@ -42,7 +42,7 @@ class DrawnImage:
 
     name: str
     objects: int = 0  #: number of objects on it
-    files: tuple[tuple[str, bytes], ...] = ()  #: names and contents, of a worker that does not see the folder
+    files: tuple[tuple[str, bytes], ...] = ()  #: names and contents, where the worker does not share the folder
     problem: str | None = None  #: one line: the CCD could not be drawn, or a file not be written
 
 
@@ -53,7 +53,7 @@ class ImageComputation:
     config: ImagesConfig
     experiment: Experiment
     folder: Path
-    mark: str  #: file there, which a worker finds that sees the folder
+    mark: str  #: file in the folder, by which workers that share it are told
 
     def __call__(self, job: ImageJob, threads: int) -> DrawnImage:
         """Draw one CCD."""
@@ -63,7 +63,7 @@ class ImageComputation:
             galaxies = galaxies_of(self.config, experiment)
             with folder_of_worker(self.folder, self.mark) as place:
                 objects = draw_image(self.config, experiment, job.name, galaxies, place, threads)
-                # The image last, since it is what a run that goes on looks for.
+                # The image last: a resumed run takes it for the sign of a finished CCD.
                 own = sorted(place.iterdir(), key=lambda path: path.name == image_name(job.name))
                 sent = () if place == self.folder else tuple((path.name, path.read_bytes()) for path in own)
         except PachonError as error:
@@ -145,7 +145,7 @@ def draw_image(
         write_bytes(path.with_suffix(".png"), preview_png(image))
     if config.image.cutouts:
         write_bytes(path.with_name(f"cutouts_{name}.png"), cutouts_png(scene, threads=threads))
-    # Last, since it is what a run that goes on looks for.
+    # Last: a resumed run takes it for the sign of a finished CCD.
     image.write(path)
     return len(scene.objects["ID"])
 

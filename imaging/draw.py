@@ -170,8 +170,8 @@ def draw_galaxies(
 def grid_sizes(electrons: np.ndarray, radius: np.ndarray, profile: np.ndarray, noise: float) -> np.ndarray:
     """Return the size of the grid of each galaxy: the first of :data:`SIZES` that holds its light, [n].
 
-    What lies beyond wraps round, so no light is lost. It is allowed where a de Vaucouleurs galaxy and a star of its
-    electrons are both fainter than a hundredth of the noise.
+    Light beyond the grid wraps around, so none is lost. A size is accepted where a de Vaucouleurs galaxy and a star
+    of the same electrons are both fainter at its rim than a hundredth of the noise.
 
     Parameters
     ----------

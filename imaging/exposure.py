@@ -151,8 +151,8 @@ def expose(
 ) -> ExposedImage:
     """Expose a noise-free scene.
 
-    The sum of Poisson numbers is one, so all exposures are drawn at once. A pixel is clipped where its sum reaches as
-    many full wells; its charge does not bleed.
+    A sum of Poisson variates is a Poisson variate, so all exposures are drawn at once. A pixel saturates where its sum
+    reaches as many full wells; its charge does not bleed.
 
     Parameters
     ----------

@@ -110,7 +110,7 @@ class GalaxySource:
 
 @dataclass(frozen=True, eq=False)
 class _FixedGalaxies:
-    """Given galaxies in ranges of xi and eta [rad]; a class, since workers are sent it."""
+    """Galaxies of a catalogue or mosaic in ranges of xi and eta [rad]; a class, so that workers can unpickle it."""
 
     galaxies: Galaxies | StampPopulation
     faintest: float

@@ -137,7 +137,7 @@ class PsfField:
     def transforms(self, size: int) -> np.ndarray:
         """Return ``rfft2`` of mean and components, centred on pixel ``size // 2``: complex64 [1 + k, size, size//2+1].
 
-        What of a stamp lies beyond the grid wraps round, so that sums are kept.
+        Parts of a stamp beyond the grid wrap around, so that sums are kept.
         """
         images = np.concatenate([self.model.mean[None], self.model.components])
         half = self.stamp // 2

@@ -316,7 +316,7 @@ def wcs(
 def _sip_polynomials(
     places: np.ndarray, sky: np.ndarray, order: int, half: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return linear part, reference pixel from the middle of the CCD, and distortion of a polynomial of an order."""
+    """Fit polynomials of an order; return linear part, reference pixel from the middle of the CCD, and distortion."""
     tables = _fit_polynomials(half * places, sky, order)
     # The reference pixel is the root of the polynomial.
     reference = np.zeros(2)
@@ -331,7 +331,7 @@ def _sip_polynomials(
 
 
 def _reproject(plane: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return places [n, 2] of a tangent plane on another, by the rotation of its axes, and derivatives [n, 2, 2]."""
+    """Reproject points [n, 2] onto another tangent plane, by the rotation of its axes; with derivatives [n, 2, 2]."""
     vectors = np.column_stack([plane, np.ones(len(plane))]) @ turn.T
     found, ahead = vectors[:, :2] / vectors[:, 2:], vectors[:, 2, None, None]
     return found, (turn[:2, :2] - found[:, :, None] * turn[2, :2]) / ahead

@@ -29,7 +29,7 @@ _MM, _DEG, _SEC, _NONE = _Unit("mm", 1e-3), _Unit("deg", np.pi / 180.0), _Unit("
 _MODEL, _NOISE_FREE_MODEL = "PSF", "TRUEPSF"
 #: Ellipticities of a CCD, see :meth:`CcdProduct.ellipticity`.
 KINDS = ("truth", "observed", "residual", "left_out", "away")
-#: Residuals of the CCD's own model, where a model of the whole focal plane has taken its place.
+#: Residuals of the CCD's own model in runs with a focal-plane model.
 CCD_KINDS = ("residual_ccd", "away_ccd")
 #: FITS card that says which model the columns MODEL_E1 and so on are of; only in runs with a focal-plane model.
 MODEL_CARD = "PSFMODEL"
@@ -64,7 +64,7 @@ _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
     "sigma_e2": ("SIG_E2", _NONE, "predicted uncertainty of MODEL_E2"),
     "sigma_size": ("SIG_SIZE", _SEC, "predicted uncertainty of MODELSZ"),
 }
-# What a focal-plane model changes in a table, and what keeps the values that stood there before.
+# Columns that a focal-plane model replaces, and those with the replaced values of the CCD's own model.
 _REPLACED = frozenset(
     ["MODEL_E1", "MODEL_E2", "MODELSZ", "LOO_E1", "LOO_E2", "SIG_E1", "SIG_E2", "SIG_SIZE", "RES_E1", "RES_E2"]
 )
@@ -118,7 +118,7 @@ _StarsKind = TypeVar("_StarsKind", bound=Stars)
 
 
 def of_ccd_model(stars: _StarsKind) -> _StarsKind:
-    """Return stars whose model is the CCD's own: as they are, unless a focal-plane model has taken its place.
+    """Return stars with the CCD's own model in place of a focal-plane model.
 
     Ellipticities of the model fitted without the star stay those of the focal-plane model.
     """
@@ -266,9 +266,9 @@ def write_product(folder: Path, product: CcdProduct, stamp: Stamp, cards: list[t
 
 
 def write_focal_plane_columns(folder: Path, product: CcdProduct) -> None:
-    """Put the focal-plane model of a product into the tables of its file; all else there keeps its bytes.
+    """Write the shapes of the focal-plane model into the tables of a product's file; all other bytes stay.
 
-    The values of the CCD's own model are those in the file, so that any number of times leaves the same bytes.
+    The values of the CCD's own model are read from the file, so that a repetition changes nothing.
     """
     path = product_path(folder, product.name)
     hdus = read_fits(path)

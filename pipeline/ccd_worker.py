@@ -1,7 +1,7 @@
 """CCDs of a run as jobs of workers: processes of this machine, or a cluster.
 
-A worker keeps the screens of its last CCD for the next. It writes products into the folder of the run where it sees
-that folder, and sends them back where it does not.
+A worker keeps the phase screens of its last CCD for the next one. Workers that share the folder of the run write
+products there; others send them back.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class CcdResult:
     """Result of one CCD, as a worker returns it."""
 
     name: str
-    product: bytes | None = None  #: the file, of a worker that does not see the folder of the run
+    product: bytes | None = None  #: the file, where the worker does not share the folder of the run
     not_modelled: str | None = None  #: reason
     problem: str | None = None  #: one line: the CCD could not be exposed, or its product not be written
 
@@ -51,7 +51,7 @@ class CcdComputation:
 
     experiment: Experiment
     folder: Path  #: of the run
-    mark: str  #: file there, which a worker finds that sees the folder
+    mark: str  #: file in the folder, by which workers that share it are told
 
     def __call__(self, job: CcdJob, threads: int) -> CcdResult:
         """Compute one CCD."""
@@ -82,7 +82,7 @@ def compute_ccds(
     strict: bool,
     reporter: Reporter,
 ) -> dict[str, str]:
-    """Have workers write the products of CCDs, and return those that cannot be modelled, each with the reason.
+    """Compute CCDs by workers; return those that cannot be modelled, each with the reason.
 
     Raises
     ------

@@ -39,7 +39,7 @@ _Declination = Annotated[float, BeforeValidator(plain_number), Field(strict=True
 
 
 class StarsConfig(Section):
-    """How many stars stand on a CCD, and how bright they are."""
+    """Numbers and magnitudes of the stars on a CCD, or their catalogue."""
 
     truth: Count = Field(100, description="noise-free PSFs on each CCD, where no observed star is")
     observed: Count = Field(40, description="observed stars on each CCD")
@@ -77,7 +77,7 @@ class PhotometryConfig(Section):
 
 
 class PointingConfig(Section):
-    """Where the telescope looks."""
+    """Pointing of the telescope."""
 
     ra_deg: Real = Field(0.0, description="right ascension of the optical axis [deg]")
     dec_deg: _Declination = Field(0.0, description="declination of the optical axis [deg]")
@@ -196,7 +196,7 @@ class AtmosphereConfig(Section):
 
 
 class PsfConfig(Section):
-    """How point-spread functions are made."""
+    """Engine and stamps of the point-spread functions."""
 
     engine: Literal["fast", "wave", "long_exposure"] = Field(
         "fast", description="fast (geometric and filters), wave (Fourier optics), long_exposure (mean over turbulence)"
@@ -257,7 +257,7 @@ class ReconstructionConfig(Section):
 
 
 class Configuration(Section):
-    """All that decides what a run computes; nothing else does."""
+    """Settings of a run, which determine its products completely."""
 
     band: BandName | None = Field(None, description="filter: u, g, r, i, z or y")
     telescope: str | None = Field(None, description="bundled model (pachon info lists them), or path of a prescription")

@@ -47,7 +47,7 @@ _WAVELENGTHS = 5
 _MODEL_KEYS = ("basis", "components", "interpolation", "weights", "order")
 _KRIGING = {"basis": "pixels", "interpolation": "kriging"}
 _PAPER = {"basis": "pca", "interpolation": "polynomial", "weights": "equal"}
-#: Cameras of so many CCDs are computed whole by default.
+#: Largest number of CCDs of a camera that is computed whole by default.
 _FEW = 9
 #: Site of telescopes that name none.
 _SITE = "cerro_pachon"
@@ -151,10 +151,10 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
 
 
 def _reconstruction(fit: ReconstructionConfig, weight_fwhm_arcsec: float) -> ReconstructionConfig:
-    """Return the section with its defaults: the best model that needs no optics, or the paper's once one key is given.
+    """Return the section with its defaults: kriging of pixels, or the paper's model once one of its keys is given.
 
-    Kriging leaves half as much between the stars (docs/psf_models.md). A choice of basis, components, interpolation,
-    weights or order belongs to the way of Jee & Tyson 2011, which fills the other ones.
+    Kriging halves the residual between the stars (docs/psf_models.md). Where basis, components, interpolation, weights
+    or order are given, the others are those of Jee & Tyson 2011.
     """
     if _names_no_model(fit):
         fit = fit.model_copy(update=_KRIGING)
@@ -166,7 +166,7 @@ def _reconstruction(fit: ReconstructionConfig, weight_fwhm_arcsec: float) -> Rec
 def with_paper_model(config: Configuration) -> Configuration:
     """Return the configuration with the PSF model of Jee & Tyson 2011 for each CCD where it names none.
 
-    Of few stars it has as many components as they allow.
+    With few stars, it has as many components as they determine.
     """
     fit = config.reconstruction
     if not _names_no_model(fit):
@@ -277,7 +277,7 @@ def default_ccds(camera: Camera) -> tuple[str, ...]:
 
 
 def _check_combinations(config: Configuration, telescope: Telescope) -> None:
-    """Check what several values must be together."""
+    """Check combinations of values."""
     for i, wavelength in enumerate(given(config.wavelengths_nm)):
         low, high = (1e9 * w for w in telescope.wavelength_range)
         if not low <= wavelength <= high:

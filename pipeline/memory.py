@@ -33,7 +33,7 @@ def needed_bytes(experiment: Experiment, threads: int | None = None) -> int:
     workers = thread_count(threads) if config.psf.engine == "wave" else 0
     stamps = stars * experiment.stamp_size**2 * _STAMP_BYTES
     of_worker = _WAVE_THREAD + (0 if experiment.silicon is None else _SILICON_THREAD)
-    # Of every CCD the report has the model; one of pixels keeps each star, and its weight under a process.
+    # The report holds the PSF model of every CCD; a model of pixels stores each star, and its weight under a process.
     pixels = config.reconstruction.basis == "pixels"
     models = 16 * len(given(config.ccds)) * config.stars.observed * experiment.stamp_size**2 if pixels else 0
     return max(_REPORT + models, _BASE + screen_bytes(experiment) + workers * of_worker + stamps)

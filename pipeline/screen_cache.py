@@ -1,4 +1,4 @@
-"""Screens that a worker keeps from one job for the next: with 8192 samples a side they take seconds to make."""
+"""Cache of the phase screens in a worker process: screens of 8192 x 8192 samples take seconds to make."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ _cached: list[Atmosphere] = []
 
 
 def with_cached_screens(experiment: Experiment) -> Experiment:
-    """Return an experiment with the screens of the last one in this process, where they are the same.
+    """Return the experiment with the cached screens of this process, where they are the same.
 
-    Those of the last one are freed where they are others. The threads of a worker share one set.
+    Otherwise the cached screens are freed, and those of the experiment take their place. All threads of a worker share
+    one set of screens.
     """
     if experiment.atmosphere is None or not experiment.screen_kinds:
         return experiment

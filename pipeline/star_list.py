@@ -23,7 +23,7 @@ from ..sky.pointing import Pointing
 from ..wavefront.chief_rays import chief_rays
 from .config import Configuration
 
-#: Names that columns have in files, in small letters, the first one first; ``{band}`` is that of the run.
+#: Accepted names of columns, in lower case, in order of preference; ``{band}`` is that of the run.
 NAMES: dict[str, tuple[str, ...]] = {
     "ra": ("ra", "ra_deg", "ra_icrs", "raj2000", "alpha_j2000"),
     "dec": ("dec", "dec_deg", "de_icrs", "decl", "dej2000", "delta_j2000"),
@@ -38,9 +38,9 @@ NAMES: dict[str, tuple[str, ...]] = {
     "g_i": ("g_i", "g-i"),
     "r_i": ("r_i", "r-i"),
 }
-#: Columns that tell the spectrum of a star, the first that is there counts.
+#: Columns with the spectrum of a star; the first one present is used.
 _SPECTRA = ("teff", "bp_rp", "g_r", "g_i", "r_i")
-#: Pairs of columns that give a place, and the unit of those without one; the first pair that is there counts.
+#: Pairs of columns with positions, and their default unit; the first pair present is used.
 _PLACES = ((("ra", "dec"), u.deg), (("field_x", "field_y"), u.deg), (("x", "y"), u.m))
 #: Columns of colours of unknown bands, which are not used.
 _COLORS = ("color", "colour")
@@ -61,9 +61,9 @@ class StarList:
     counts : dict of str to int
         Rows of the table, how many of them were left out, and how many are on the CCDs.
     unused : tuple of str
-        Columns of colours of unknown bands in the table, which nothing is made of.
+        Columns of colours of unknown bands in the table, which are ignored.
     spectrum : str or None
-        Kind of the column that tells the spectra of the stars; None without one.
+        Kind of the column with the spectra of the stars; None without one.
     kelvin : dict of str to ndarray
         Temperatures of the stars of each CCD [K], NaN without a colour, [n]; empty without such a column.
     """

@@ -17,12 +17,12 @@ from .cutouts import cut_out, first_pixel
 from .objects import DetectedObjects
 from .pixel_checks import flagged
 
-# The locus is the fullest interval of half-light radii of this relative width, and has at least so many times the
-# objects that intervals as wide have to either side of it, between these multiples of its radius.
+# The locus is the interval of half-light radii of this relative width with the most objects: at least so many times
+# the objects of equally wide intervals on either side of it, between these multiples of its radius.
 _INTERVAL, _CONTRAST, _SIDE = 0.08, 3.0, (1.15, 1.75)
 # Least width of the locus, relative: the PSF varies over a CCD.
 _LEAST_WIDTH = 0.01
-# Pixels around a stamp that keep what its shift wraps around away from it.
+# Margin of a stamp for the light that its Fourier shift wraps around [pixel].
 _MARGIN = 8
 _MAD_TO_SIGMA = 1.4826
 

@@ -1,8 +1,8 @@
-r"""Covariance of what turbulence adds to a PSF shape, between two positions on the focal plane.
+r"""Covariance of the contribution of turbulence to a PSF shape, between positions on the focal plane.
 
-Turbulence in a layer at height H that is blown by a wind V leaves the same trace in the PSFs of stars that look through
-the same air during an exposure T: of stars up to V T / H apart along the wind, but only D / H across it (D: pupil
-diameter). So the covariance is a sum of a few anisotropic components and a constant, the part that all stars share,
+A turbulent layer at height H, blown by a wind V, affects the PSFs of stars alike whose light crosses the same air
+during an exposure T: of stars up to V T / H apart along the wind, but only D / H across it (D: pupil diameter). So the
+covariance is a sum of a few anisotropic components and a constant, the part common to all stars,
 
 .. math:: C(d) = c + \sum_j a_j e^{-|M_j d|} + \text{(terms of each CCD)},
 

@@ -1,4 +1,4 @@
-"""Prediction of PSF shapes over the focal plane: optics, and a random field of what they leave at the stars."""
+"""Prediction of PSF shapes over the focal plane: optics, and a Gaussian random field of the residuals of the stars."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class ShapeField:
     def _optics_variance(
         self, ccd: int, shape: int, design: np.ndarray, stars: np.ndarray, weights: np.ndarray
     ) -> np.ndarray:
-        """Return the variance due to uncertain optics, less what the stars about a place correct of it."""
+        """Return the variance by uncertain optics that remains after correction by the neighbouring stars."""
         assert self.optics is not None
         assert self.design is not None
         prior, at = self.optics.prior, self.data.places.ccd[stars]
@@ -113,7 +113,7 @@ class ShapeField:
         return np.asarray(((left @ covariance) * left).sum(axis=1))
 
     def leave_one_out_residuals(self, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return shapes minus those predicted from all other stars, and their variances, each of shape [n, 3].
+        """Return shapes minus leave-one-out predictions, and their variances, each of shape [n, 3].
 
         NaN for the farthest stars of a CCD with more stars than a neighbourhood holds.
         """
@@ -135,7 +135,7 @@ class ShapeField:
         return left, variance
 
     def inliers(self, threads: int | None = None) -> np.ndarray:
-        """Return the stars that agree with the others of their block."""
+        """Return the stars within :data:`CLIP_SIGMA` of the prediction from the others of their block, [n] bool."""
         data = self.data
 
         def job(index: np.ndarray) -> np.ndarray:

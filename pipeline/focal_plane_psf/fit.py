@@ -40,8 +40,8 @@ from .response import (
 SHAPES = ("e1", "e2", "ln size")
 # Standard deviation of the wavefront coefficients of an aligned telescope [m].
 _NO_WAVEFRONT = 1e-15
-# Standard deviations of what turbulence adds to the shapes of all stars alike. The mean size is the seeing, which
-# is fitted.
+# Standard deviations of the part of the shapes that turbulence has in common for all stars. The mean size is the
+# seeing, which is fitted.
 _MEAN = (0.02, 0.02, 0.01)
 # Stars of a block of the linear fit.
 _BLOCK = 750
@@ -126,7 +126,7 @@ def _design_columns(terms: np.ndarray, slopes: np.ndarray, columns: np.ndarray) 
 
 
 class ExposureFit:
-    """Gauss-Newton fit of one exposure; :meth:`run` does all of it."""
+    """Gauss-Newton fit of one exposure; :meth:`run` performs all steps."""
 
     def __init__(
         self,
@@ -219,7 +219,7 @@ class ExposureFit:
         return self.data.values - shapes, slopes, columns
 
     def fit_covariances(self, max_iterations: int = 8) -> None:
-        """Fit the covariances of turbulence to what the optics leave, with their uncertainty (one step of EM)."""
+        """Fit the covariances of turbulence to the residuals of the optics, with their uncertainty (one step of EM)."""
         residuals, slopes, columns = self._columns()
 
         def fit(shape: int) -> CovarianceFit:

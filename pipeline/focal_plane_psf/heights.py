@@ -45,7 +45,7 @@ class HeightPrior:
     ccd : ndarray, shape [n_ccd, n_term, n_term]
         Covariance of the coefficients of each CCD [m^2].
     mean : FocalPlane or None
-        Heights about which the prior stands; None for zero, which are those of most cameras.
+        Mean heights of the prior; None for zero, as of most cameras.
     """
 
     camera: Camera
@@ -78,7 +78,7 @@ class HeightPrior:
 
     @classmethod
     def uninformative(cls, camera: Camera, size: float = 10e-6, degree: int = DEGREE) -> HeightPrior:
-        """Return a prior that hardly holds heights [m]: independent coefficients that fall as the degree rises."""
+        """Return a weak prior of heights [m]: independent coefficients that decrease with the degree."""
         total = np.array([i + j for i, j in powers(degree)])
         ccd = np.diag((size / (1.0 + total) ** 2) ** 2)
         own = np.broadcast_to(ccd, (len(camera), *ccd.shape))
@@ -102,7 +102,7 @@ class HeightPrior:
         return round((np.sqrt(8 * self.ccd.shape[1] + 1) - 3) / 2)
 
     def ccd_polynomials(self, places: Places) -> np.ndarray:
-        """Return the terms of each place's own CCD, shape [n, n_term]."""
+        """Return the polynomial terms of each position within its CCD, shape [n, n_term]."""
         return legendre(places.uv, self.degree)
 
     @property

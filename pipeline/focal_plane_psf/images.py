@@ -4,7 +4,7 @@ A change of second moments is a convolution with a narrow Gaussian, of positive 
 
 .. math:: \tilde I(k) \to \tilde I(k) \, e^{-k^T S k / 2},
 
-which is what turbulence does to the image of the optics to lowest order. S is found by Broyden's method, so that the
+to lowest order the effect of turbulence on the image of the optics. S is found by Broyden's method, so that the
 image has the predicted e1, e2 and size.
 """
 
@@ -24,14 +24,14 @@ from .mosaic import Mosaic
 _SHAPES = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 2.0], [1.0, 1.0, 0.0]])
 _STEP = 0.02
 _ITERATIONS = 7
-# Square of a step of the amounts below which it says nothing of the Jacobian.
+# Least square of a step for an update of the Jacobian.
 _SMALLEST = 1e-14
 # Pixels of zeros about a stamp while it is convolved.
 _ROOM = 8
 
 
 def with_shapes(images: np.ndarray, values: np.ndarray, pixel_scale: float, weight_fwhm: float) -> np.ndarray:
-    """Return images [n, ny, nx] with the shapes e1, e2, ln size [n, 3], centred and of unit sum."""
+    """Convolve images [n, ny, nx] to the shapes e1, e2, ln size [n, 3]; the result is centred and of unit sum."""
     ny, nx = images.shape[1:]
     padded = np.pad(images.astype(np.float64), ((0, 0), (_ROOM, _ROOM), (_ROOM, _ROOM)))
     spectrum = np.fft.rfft2(padded)

@@ -27,10 +27,10 @@ _AMPLITUDES, _LENGTHS, _SHEAR = (-14.0, 2.0), (-6.5, 1.0), (-10.0, 10.0)
 # Lengths from which the fit starts, over the extent of the field: 3 and 16 arcmin over 3.5 degrees.
 _START = (0.014, 0.08, 0.3)
 # Widths of the priors about the first guess: of each component (logarithm of the amplitude, of two lengths, shear), and
-# of the logarithms of the variances of the terms of the CCDs and of the nugget. Many stars decide for themselves; the
-# likelihood of some hundred stars in a few streaks has maxima far away.
+# of the logarithms of the variances of the terms of the CCDs and of the nugget. Of many stars the data dominate; the
+# likelihood of some hundred stars in a few streaks has secondary maxima far away.
 _WIDTHS, _VARIANCE_WIDTH = (1.0, 1.0, 1.0, 1.5), 3.0
-# Logarithm of the amplitude of a component over the variance of the values, below which there is none.
+# Logarithm of the amplitude of a component over the variance of the values, below which it counts as absent.
 _VANISHED = -6.0
 #: Variance of what all stars share, over the mean square of the values.
 _CONSTANT = 100.0
@@ -140,7 +140,7 @@ def fit_covariance(
     if start is not None:
         again = _packed(start, power, extent, n_ccd)
         for j in range(COMPONENTS):
-            # A component that vanished in an earlier fit has no gradient to come back by.
+            # A component of zero amplitude has no gradient, and would stay at zero.
             if again[4 * j] > _VANISHED:
                 first[4 * j : 4 * j + 4] = again[4 * j : 4 * j + 4]
         first[4 * COMPONENTS :] = again[4 * COMPONENTS :]
@@ -160,7 +160,7 @@ def fit_covariance(
     at_bounds = tuple(
         name
         for name, value, (low, high) in zip(names, found.x, bounds, strict=True)
-        # A variance that vanishes is an answer, and no sign of a fit that failed.
+        # A variance of zero is a valid result, not a failed fit.
         if value >= high - 1e-9 or (value <= low + 1e-9 and ("length" in name or name == "shear"))
     )
     covariance = _unpacked(found.x, power, extent, constant, n_ccd)

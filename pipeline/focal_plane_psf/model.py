@@ -39,9 +39,9 @@ from .static_heights import StaticHeights
 _BATCH = 512
 # Brightest stars, from which the principal components of the residual stamps are made.
 _PCA_STARS = 2000
-# Variance that is added to the noise of a star, over the stated one, from which the stated noise is called wrong.
+# Fitted excess variance of a star over that of the stated noise, beyond which there is a warning.
 _EXTRA_NOISE = 1.0
-# Reduced chi-squares beyond which the stated noise is called wrong.
+# Range of reduced chi-square outside of which there is a warning.
 _CHI2 = (0.7, 1.4)
 
 
@@ -142,7 +142,7 @@ class FocalPlanePsf(Result):
         dispersion : array_like, shape [n_wave, 2], optional
             Shift of each wavelength by the air [rad].
         budget : str, HeightBudget or None
-            Prior of unknown heights: "simulated", "specification", a budget of one's own, or None, which hardly holds
+            Prior of unknown heights: "simulated", "specification", a budget of one's own, or None for a weak prior
             them.
         alignment_rms : float or Quantity
             Prior rms of the residual wavefront of the exposure [m]: annular Zernike terms 4 to 11, each constant and

@@ -57,7 +57,7 @@ _LATTICE_POINTS, _LATTICE_POINTS_CHANGES = 6000, 3000
 
 @dataclass(frozen=True, eq=False)
 class Instrument:
-    """All that decides the long-exposure PSF of a star at a place and height.
+    """Parameters of the long-exposure PSF of a star at a position and height.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ class Instrument:
 
     @property
     def key(self) -> str:
-        """SHA-256 of all that decides the PSF."""
+        """SHA-256 of all parameters."""
         air = self.atmosphere
         numbers = (air.r0, air.outer_scale, self.pixel_size, self.diffusion, self.jitter, self.weight_fwhm)
         arrays = (self.wavelengths, np.zeros(0) if self.dispersion is None else self.dispersion)

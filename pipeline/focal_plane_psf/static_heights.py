@@ -81,7 +81,7 @@ class StaticHeights(Result):
         return np.sqrt(np.einsum("cii->c", self.covariance))
 
     def prior(self) -> HeightPrior:
-        """Return the prior that these heights are for another exposure."""
+        """Return these heights as the prior for another exposure."""
         return HeightPrior.known(self.focal_plane, self.covariance)
 
     @check_arguments
@@ -149,11 +149,11 @@ def fit_static_heights(
     instrument : Instrument, optional
         Wavelengths, atmosphere and detector; by default those of :meth:`.FocalPlanePsf.fit`.
     budget : str, HeightBudget or None
-        Prior of the heights; None for one that hardly holds them.
+        Prior of the heights; None for a weak one.
     alignment_rms : float
         Prior rms of the residual wavefront of each exposure [m].
     folder : str or path, optional
-        Folder in which the result of each exposure is kept, so that a fit that was stopped goes on.
+        Folder with the result of each exposure, from which an interrupted fit is resumed.
     steps : int
         Gauss-Newton steps.
     map_jobs : callable

@@ -1,4 +1,4 @@
-"""The report of a run: one HTML file with everything in it, pictures included."""
+"""The report of a run as one self-contained HTML file."""
 
 from __future__ import annotations
 

@@ -122,8 +122,8 @@ def displace_stamps(
 ) -> np.ndarray:
     """Return stamps of stars as the displacements distort them.
 
-    The displacement at the middle pixel is left out: it moves the star as a whole, which stamps are not about, and is
-    that of :meth:`Displacement.at`.
+    The displacement at the middle pixel is subtracted: it moves the star as a whole, and is that of
+    :meth:`Displacement.at`.
 
     Parameters
     ----------

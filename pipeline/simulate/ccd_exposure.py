@@ -171,7 +171,7 @@ def _centroids(experiment: Experiment, images: np.ndarray, pixel_scale: float) -
 
 
 def _require_light(stars: NoiseFreeStars) -> NoiseFreeStars:
-    """Return stars, or raise DomainError if no light reaches one of them."""
+    """Return the stars, or raise a DomainError if no light reaches one of them."""
     if not stars.lit_fraction.min() > 0.0:
         raise DomainError("no light reaches some stars: expected a CCD within the field of the telescope")
     return stars
@@ -230,7 +230,7 @@ def _expose(
 
 
 def _with_static_displacements(experiment: Experiment, middles: np.ndarray, images: np.ndarray) -> np.ndarray:
-    """Return stamps as the static effects of the CCDs distort them; `middles` are the centres of their middle pixels.
+    """Apply the static displacements of the CCDs to stamps; `middles` are the positions of their middle pixels.
 
     No star is moved as a whole: stamps are centred on their star.
     """
