@@ -52,7 +52,7 @@ def entrance_points(telescope: Telescope, directions: np.ndarray, wavelength: fl
     if relative.shape[1] < FEWEST:
         return _search_points(telescope, stop, directions, wavelength, relative)
     found = np.empty(relative.shape)
-    # Rays of all fields together: of few rays, what a trace costs is its launch.
+    # Rays of all fields together: with few rays the launch of the kernel takes most of the time.
     at_nodes = [
         _search_points(telescope, stop, directions[part], wavelength, pupil_nodes(relative[part]))
         for part in (slice(i, i + _FIELDS) for i in range(0, len(directions), _FIELDS))

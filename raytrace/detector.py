@@ -1,4 +1,4 @@
-"""The last step of a ray: from the nominal focal surface to the CCD surface at its own height."""
+"""Propagation of rays from the nominal focal surface to the CCD surfaces at their heights."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Triple = tuple[np.ndarray, np.ndarray, np.ndarray]
 STEPS = 3
 #: For many photons two are enough: from 0.1 mm, with curvatures below 0.1 per metre, they leave 1e-20 m.
 BUNDLE_STEPS = 2
-#: Rays that are carried at a time, so that their numbers stay in the cache.
+#: Rays propagated at a time, so that their numbers stay in the cache.
 CHUNK = 8192
 
 
@@ -33,7 +33,7 @@ class Landing:
 def land_on_ccds(
     detector: Surface, focal_plane: FocalPlane, position: np.ndarray, direction: np.ndarray, *, index: float = 1.0
 ) -> Landing:
-    """Carry rays from the nominal detector surface to the CCD surfaces.
+    """Propagate rays from the nominal detector surface to the CCD surfaces.
 
     Heights are measured along the z axis of the detector's own frame, which is the telescope's +z unless the
     detector was tilted; positions on the CCDs are that frame's x and y. ``position`` [m] and ``direction``, [n, 3], are
@@ -51,7 +51,7 @@ def land_on_ccds(
 def land_bundle(
     focal_plane: FocalPlane, position: Triple, direction: Triple, *, threads: int | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Carry rays that land close to one another from the nominal surface to the CCD surfaces.
+    """Propagate rays that land close to one another from the nominal surface to the CCD surfaces.
 
     ``position`` [m], ``direction`` and the returned x, y [m] are in the frame of the detector. Returned too is whether
     there is a CCD; where there is none, x and y are those on the nominal surface. Each CCD is treated on its own, with

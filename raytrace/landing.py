@@ -50,7 +50,7 @@ def find_points(
     stuck = np.zeros(len(points), dtype=bool)
     for _ in range(_STEPS):
         distance = np.linalg.norm(miss, axis=1)
-        # What is NaN is lost: no step leads away from it.
+        # A ray at NaN is lost: no step leads away from it.
         left = np.flatnonzero((distance > _FOUND * size) & ~stuck & (np.abs(determinants(slopes)) > 0.0))
         if not len(left):
             break
@@ -88,7 +88,7 @@ def derivatives(landing: Landing, points: np.ndarray, difference: float, here: n
     """Return the derivatives [n, 2, 2] of landing points by the coordinates, from one-sided differences."""
     every = np.arange(len(points))
     here = landing(points, every) if here is None else here
-    # Both sides in one trace: of few rays, what it costs is its launch.
+    # Both sides in one trace: with few rays the launch of the kernel takes most of the time.
     moved = np.concatenate([points + difference * axis for axis in np.eye(2)])
     beside = landing(moved, np.tile(every, 2)).reshape(2, -1, 2) - here
     return np.moveaxis(beside, 0, -1) / difference

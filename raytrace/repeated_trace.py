@@ -1,4 +1,4 @@
-"""Landing points of few rays that are traced again and again, such as those of a search."""
+"""Repeated traces of few rays, as in a search for their landing points."""
 
 from __future__ import annotations
 

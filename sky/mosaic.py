@@ -194,7 +194,7 @@ class StampTables(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlantedGalaxies:
-    """Stamps of galaxies at places on the sky, as :class:`~pachon.sky.galaxies.Galaxies` to whoever draws them.
+    """Stamps of galaxies at positions on the sky, with the interface of :class:`~pachon.sky.galaxies.Galaxies`.
 
     Attributes
     ----------

@@ -1,6 +1,6 @@
 """Random galaxies with the counts, sizes and shapes of the Hubble Ultra Deep Field in i (F775W).
 
-Figures and their sources, in the order in which a galaxy is made:
+Quantities and their sources, in the order in which a galaxy is made:
 
 counts
     N(< i) = 46 x 10^(0.31 (i - 25)) per square arcminute (LSST Science Book 2009, eq. 3.7): 8800 galaxies to 29.0 in

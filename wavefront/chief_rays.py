@@ -67,7 +67,7 @@ def image_jacobians(
 ) -> np.ndarray:
     """Return d(position on the detector)/d(direction cosines) [m], shape [n, 2, 2], by central differences."""
     steps = JACOBIAN_STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    # One trace for all four neighbours: of few rays, what a trace costs is its launch.
+    # One trace for all four neighbours: with few rays the launch of the kernel takes most of the time.
     cosines = (directions[:, :2] + steps[:, None]).reshape(-1, 2)
     ends = _landing_points(telescope, _downward_directions(cosines), wavelength, threads).reshape(2, 2, -1, 2)
     return np.moveaxis((ends[:, 0] - ends[:, 1]) / (2 * JACOBIAN_STEP), 0, -1)

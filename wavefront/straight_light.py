@@ -1,4 +1,4 @@
-"""Packets of the pupil that apertures on the straight way to the first mirror or lens can let through."""
+"""Packets of pupil points that the apertures before the first mirror or lens can transmit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ROUNDING = 1e-9
 def passing_packets(
     telescope: Telescope, pupil: np.ndarray, directions: np.ndarray, start: np.ndarray
 ) -> np.ndarray | None:
-    """Return which packets can have light behind those apertures, shape [n_field, n_packet].
+    """Return the packets that can have light behind these apertures, bool [n_field, n_packet].
 
     They are the discs and rings up to the first surface that deflects light. ``pupil`` [2, n_packet, lanes]: points on
     the plane of the entrance pupil [m]. ``directions`` [n_field, 3]: unit vectors of light from infinity, or ``start``
@@ -41,7 +41,7 @@ def passing_packets(
 def _packets_through_ring(
     surface: Surface, heights: tuple[float, float], points: np.ndarray, directions: np.ndarray, start: np.ndarray
 ) -> np.ndarray:
-    """Return which packets of points [n_packet, lanes, 3] [m] on straight rays can pass a ring, [n_field, n_packet].
+    """Return the packets of points [n_packet, lanes, 3] [m] whose straight rays can pass a ring, [n_field, n_packet].
 
     A ray lands within the ring at a height between the lowest and the highest sag there. Its distance from the centre
     differs from that of its pupil point by at most its slope times the height between them.

@@ -36,7 +36,7 @@ def obstructed_status(
     t: lanes,
     status: lanes,
 ):
-    """Statuses after the path from (x, y, z) over a distance t to surface ``s``, all in the telescope frame."""
+    """Ray statuses after obstructions on a path of length t from (x, y, z) to surface ``s``, telescope frame."""
     for m in range(obstructions.meshes.shape[0]):
         if obstructions.blocks[s, m] == 1:
             for i in range(LANES):

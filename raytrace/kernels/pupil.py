@@ -22,7 +22,7 @@ wp.set_module_options(FORWARD_OPTIONS)
 def plane_wave_start(
     px: lanes, py: lanes, pz: wp.float64, u: wp.float64, v: wp.float64, w: wp.float64, distance: wp.float64
 ):
-    """Start parallel rays through (px, py, pz) on the plane at -distance along the direction of the light."""
+    """Points of a plane wave front, at -distance along the light from the pupil points (px, py, pz)."""
     back = u * px + v * py + lanes(w * pz + distance)
     return px - u * back, py - v * back, lanes(pz) - w * back
 

@@ -116,7 +116,7 @@ def obstructed_status_at_surface(
     t: lanes,
     status: lanes,
 ):
-    """Statuses after the obstructions over a distance t from a point, given from the vertex of surface ``s``."""
+    """Ray statuses after obstructions on a path of length t from (x, y, z), relative to the vertex of surface ``s``."""
     vertex_x = lanes(surfaces.numbers[s, VERTEX])
     vertex_y = lanes(surfaces.numbers[s, VERTEX + 1])
     vertex_z = lanes(surfaces.numbers[s, VERTEX + 2])

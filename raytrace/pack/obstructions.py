@@ -15,7 +15,7 @@ from .meshes import warp_mesh
 
 
 def obstruction_table(telescope: Telescope) -> np.ndarray:
-    """Return whether each obstruction blocks light on its way to each surface, shape [n_surface, n_obstruction].
+    """Return the obstructions on the path of light to each surface, bool [n_surface, n_obstruction].
 
     Light on its way to a mirror, a lens surface or the detector crosses the baffle planes before it, which go with
     that surface. Space inside a lens, where the medium is not that in front of the telescope, is left out unless an

@@ -101,8 +101,8 @@ def make_baseline(
     Raises
     ------
     PachonError
-        If the telescope or the configuration cannot be read, no metric can be computed, or a tolerance or a limit is
-        that of none.
+        If the telescope or the configuration cannot be read, no metric can be computed, or a tolerance or a limit
+        applies to none of them.
     """
     tolerance_rules, limit_rules = parse_rules("tolerance", tolerances), parse_rules("limit", limits)
     telescope, folder = load_telescope(model), Path(folder)

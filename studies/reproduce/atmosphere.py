@@ -86,7 +86,7 @@ def speckles(bench: Bench) -> Reproduced:
     coarse = _SPECKLE_STAMP // _SPECKLE_BLOCK
     binned = stack.reshape(-1, coarse, _SPECKLE_BLOCK, coarse, _SPECKLE_BLOCK).sum(axis=(2, 4))
     width = fwhm(binned, _SPECKLE_BLOCK * pixel) / ARCSEC
-    # One moment is a heap of speckles, of no width that means anything.
+    # An instantaneous image is a speckle pattern without a meaningful width.
     width[np.array(_TIMES) < 1.0] = np.nan
     shapes = measure_shapes(stack, pixel, _WEIGHT)
     e = shapes.e1 + 1j * shapes.e2
@@ -228,7 +228,7 @@ def ellipticity(bench: Bench) -> Reproduced:
 
 
 def shortened_exposure(air: Atmosphere, exposure: float, time_step: float) -> Atmosphere:
-    """Return the beginning of a longer exposure, with the same screens and at least 100 times."""
+    """Return the first part of an exposure, with the same screens and at least 100 time steps."""
     count = max(100, round(exposure / time_step))
     return air.at_times((np.arange(count) + 0.5) * (exposure / count), exposure)
 

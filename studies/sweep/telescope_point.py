@@ -1,4 +1,4 @@
-"""Points of a sweep over a telescope without a camera: values of the prescription, and metrics of the optics alone.
+"""Points of a sweep over a telescope without a camera: values of its prescription, and metrics of its optics.
 
 The configuration may state `telescope`, `wavelengths_nm` and `changes`; a parameter is one of these keys, or a value of
 the prescription with its unit.
@@ -23,7 +23,7 @@ from ...pipeline.config import Configuration, configuration_of
 from ..metrics.telescope import TELESCOPE_METRICS, TelescopeScene
 from .file import SweepFile
 
-#: Keys of the configuration that a telescope alone has use for.
+#: Keys of the configuration that apply to a telescope without a camera.
 KEYS = ("telescope", "wavelengths_nm", "changes", "seed")
 #: Rings of pupil points for compensators, and relative precision of the mean square radius.
 _RINGS, _TOLERANCE = 4, 1e-9
@@ -65,7 +65,7 @@ def point_metrics(sweep: SweepFile, parameters: dict[str, Any], folder: Path, th
 
 
 def point_telescope(sweep: SweepFile, parameters: dict[str, Any], folder: Path) -> tuple[Telescope, Configuration]:
-    """Return the telescope and the configuration of one point; an error names the key that has no place there."""
+    """Return the telescope and the configuration of one point; other keys are an error."""
     content = deepcopy(sweep.base) if isinstance(sweep.base, dict) else {}
     for name, value in parameters.items():
         if name in KEYS:

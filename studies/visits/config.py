@@ -33,7 +33,7 @@ CENTRAL_RAFT = "R22"
 
 
 class VisitsSection(Section):
-    """How the field is visited, and what is looked at."""
+    """Schedule of the visits, and their stars and stacks."""
 
     count: Count = Field(10, le=100_000, description="number of visits")
     dither_deg: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=0, le=5)] = Field(
@@ -59,7 +59,7 @@ _ANGLES = {key: VisitsSection.model_fields[key].default for key in ("roll_deg", 
 
 
 class VisitsConfig(Section):
-    """All that decides a stack of visits."""
+    """Settings of a stack of visits, which determine its products."""
 
     run: Configuration = Configuration()
     visits: VisitsSection = VisitsSection()
@@ -118,7 +118,7 @@ class VisitsConfig(Section):
         return self.plan_of(self.visits.count, seed)
 
     def plan_of(self, count: int, seed: int) -> tuple[Visit, ...]:
-        """Return the visits, if there were so many of them."""
+        """Return the first `count` visits."""
         visits = self.visits
         try:
             return plan_visits(

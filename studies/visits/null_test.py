@@ -1,4 +1,4 @@
-"""Null test: shear correlation of galaxies that no shear has touched, after any number of visits."""
+"""Null test: shear correlation of unsheared galaxies in stacks of visits."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def null_test(
         )
         for _, path in todo:
             write_shapes(path, next(results), stamp)
-        # What a resumed test reads, so that both have the same numbers.
+        # Read from the files, as by a resumed test, so that both have the same numbers.
         parts = [_read_shapes(path, stamp) for path in paths]
         galaxies = GalaxyShapes.joined(parts)
         if (n := int((galaxies.usable & galaxies.true_usable).sum())) < 2:

@@ -196,7 +196,7 @@ def _star_fields(
     band, seconds = experiment.band, config.atmosphere.exposure_s
     bright, faint = magnitude_limits(experiment)
     fields, index = {}, {}
-    # Beyond its field of view a telescope may have no light, and is not asked for.
+    # Beyond its field of view a telescope may have no light.
     lit = np.hypot(*xy.T) <= experiment.field_radius_on_detector
     for name in config.ccds or ():
         depth = camera.depth(camera.ccd_index(name), *xy.T)
@@ -271,5 +271,5 @@ def _focal_plane_images(
 
 
 def middle_wavelength(experiment: Experiment) -> float:
-    """Return the vacuum wavelength that positions are those of [m]."""
+    """Return the vacuum wavelength to which positions refer [m]."""
     return float(experiment.wavelengths[len(experiment.wavelengths) // 2])

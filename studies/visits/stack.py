@@ -30,7 +30,7 @@ class PsfSums:
     visits : int
         Number of visits.
     count : ndarray of int, shape [n]
-        Visits that saw each point.
+        Visits that cover each point.
     true, model : ndarray of float32, shape [n, size, size]
         Sums of PSFs of unit sum.
     """

@@ -141,7 +141,7 @@ def stack_visits(
         if sums.visits in config.kept:
             stack = PsfStack.of(sums, points.sky, points.star, frame.matrix, scale, experiment.weight_fwhm)
             stack.write_product(stack_path(folder, sums.visits), stamp)
-        # Written last: visits that it counts have left their stack.
+        # Written last, so that all visits that it counts are in the stack.
         sums.write(folder / SUMS_NAME, stamp)
     stacks = {n: PsfStack.read(stack_path(folder, n), stamp) for n in config.kept}
     with reporter.stage("correlations"):
@@ -177,7 +177,7 @@ def cell_of(experiment: Experiment, frame: StackFrame) -> float:
 
 
 def sky_points_of(experiment: Experiment, config: VisitsConfig, frame: StackFrame) -> SkyPoints:
-    """Return stars and places of the sky that the CCDs of a visit can see."""
+    """Return stars and positions of the sky within reach of the CCDs of a visit."""
     camera, names = experiment.camera, experiment.config.ccds or ()
     corners = camera.corners(camera.ccd_index(name) for name in names)
     reach = min(float(np.hypot(*corners.T).max()), experiment.field_radius_on_detector)

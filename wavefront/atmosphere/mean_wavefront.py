@@ -1,4 +1,4 @@
-r"""The wavefront that turbulence leaves in the mean of an exposure: covariances of its Zernikes over the field.
+r"""Covariances over the field of the Zernikes of turbulence, averaged over an exposure.
 
 Layers drift across the pupil, and the mean of the path over an exposure of length T has Zernike coefficients
 
@@ -11,7 +11,7 @@ von Karman spectrum W the covariances of two stars, whose light crosses at a dis
           \, e^{-2 \pi i \nu \cdot d} \, d^2\nu.
 
 At T = 0 these are the coefficients of Noll (1976, J. Opt. Soc. Am. 66, 207); beyond the time in which the wind crosses
-the pupil they fall as 1/T. This is what a single donut cannot tell from the wavefront of the telescope.
+the pupil they fall as 1/T. A single donut cannot separate this wavefront from that of the telescope.
 """
 
 from __future__ import annotations

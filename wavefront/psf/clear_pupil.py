@@ -1,4 +1,4 @@
-"""Rings and spokes over an annular pupil, and the part of each spoke that the apertures leave clear."""
+"""Rings and spokes over an annular pupil, and the clear part of each spoke."""
 
 from __future__ import annotations
 
@@ -108,5 +108,5 @@ def clear_edges(
 
 
 def has_only_annuli(telescope: Telescope) -> bool:
-    """Return whether nothing but discs and rings stops light."""
+    """Return whether all apertures are discs and rings, without obstructions."""
     return not telescope.obstructions and all(clear_annulus(s.aperture) is not None for s in telescope.surfaces)

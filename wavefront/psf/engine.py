@@ -65,7 +65,7 @@ class RenderedStars:
 
 
 class ExposedStars(NamedTuple):
-    """Stars before their pixels: ``draw`` returns the stamps, moved back by a shift [pixels], shape [n_star, 2]."""
+    """Stars on the focal plane; ``draw`` samples their stamps, moved back by a shift [pixels], shape [n_star, 2]."""
 
     draw: Callable[[np.ndarray | None], np.ndarray]
     lit_fraction: np.ndarray
@@ -74,7 +74,7 @@ class ExposedStars(NamedTuple):
 
 @dataclass(frozen=True)
 class Stars:
-    """Stars of one batch, before their light is carried anywhere."""
+    """Stars of one batch."""
 
     fields: np.ndarray  #: field angles, [n_star, 2] rad
     offsets: np.ndarray  #: places of the reference points from the centre of the middle pixel, [n_star, 2] pixels
@@ -89,7 +89,7 @@ class Stars:
 
 
 def expose_by_kind(kinds: np.ndarray, expose: Callable[[int, Stars], ExposedStars], stars: Stars) -> ExposedStars:
-    """Carry stars of several kinds [n_star] to the focal plane: ``expose`` takes a kind and its stars."""
+    """Expose stars of several kinds [n_star], each kind by one call of ``expose`` with the kind and its stars."""
     groups = [np.flatnonzero(kinds == kind) for kind in np.unique(kinds)]
     parts = [expose(int(kinds[chosen[0]]), stars[chosen]) for chosen in groups]
     order = np.argsort(np.concatenate(groups))
@@ -141,10 +141,10 @@ class PsfEngine(ABC):
 
     @abstractmethod
     def _expose(self, stars: Stars) -> ExposedStars:
-        """Carry the light of stars to the focal plane."""
+        """Expose stars on the focal plane."""
 
     def prepare(self, fields: np.ndarray) -> None:  # noqa: B027 - most engines need nothing
-        """Make what all stars at field angles [n_star, 2] [rad] share, before the first batch is rendered."""
+        """Prepare what stars at field angles [n_star, 2] [rad] have in common, before the first batch."""
 
     def render(
         self,

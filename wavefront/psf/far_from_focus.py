@@ -1,4 +1,4 @@
-"""Stars far from focus: how large their images are, and how finely their pupils must be sampled.
+"""Stars far from focus: size of their images, and sampling of their pupils.
 
 A pupil point stands for the light of the pupil around it. In focus all rays land together, and some hundred points are
 enough; 1.5 mm from focus they would make a ring of dots. How far apart the rays of neighbouring points land follows
@@ -25,7 +25,7 @@ def blur_radii(optics: PupilOptics) -> np.ndarray:
 
 
 def sampling_refinement(optics: PupilOptics, neighbour: float, largest: float, wanted: float) -> np.ndarray:
-    """Return by what power of two the pupil of each star must be sampled more finely, 1 for stars near focus, [n_star].
+    """Return the refinement of each star's pupil sampling, a power of two, 1 near focus, [n_star].
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ _TABLE_SIZE = 4096
 
 
 def filter_structure_function(separation: np.ndarray, r0: float, outer_scale: float, cutoff: float) -> np.ndarray:
-    """Return the structure function of the filter, beside rays through the low modes; path squared [m^2], not falling.
+    """Return the structure function of the filter for all but the low modes [m^2]; it never decreases.
 
     Separations are rising baselines in the pupil [m]; the low modes are those up to the cut-off [rad/m].
     """
@@ -145,7 +145,7 @@ class FastPsfEngine(PsfEngine):
         self._ky = 2.0 * math.pi * scipy.fft.fftfreq(self._grid_size, self._cell)
         self._kx = 2.0 * math.pi * scipy.fft.rfftfreq(self._grid_size, self._cell)
         ky = self._ky[:, None]
-        # Binning into cells averaged over a cell already: take that back.
+        # Binning has averaged over a cell already: the filter undoes that.
         detector = self._plane.transfer(self._kx, ky) / square_transfer(self._kx, ky, self._cell)
         self._detector = detector.astype(np.float32)
 
@@ -165,7 +165,7 @@ class FastPsfEngine(PsfEngine):
         return diffraction_otf(baseline, self._diameter, self._obscuration)
 
     def _filter_structure(self, baseline: np.ndarray) -> np.ndarray | None:
-        """Return the structure function of the air beside that of the rays [m^2] at baselines [m], if any."""
+        """Return the structure function of the filter [m^2] at baselines [m]; None without an atmosphere."""
         air = self._atmosphere
         return None if air is None else filter_structure_function(baseline, air.r0, air.outer_scale, air.cutoff)
 
@@ -194,11 +194,11 @@ class FastPsfEngine(PsfEngine):
         return self._expose_traced(optics, stars)
 
     def _expose_refined(self, finer: int, stars: Stars) -> ExposedStars:
-        """Carry stars to the focal plane, with pupil points so many times closer."""
+        """Expose stars with a refined sampling of the pupil."""
         return FastPsfEngine(self._inputs, finer, far=finer > 1).expose_without_refinement(stars)
 
     def expose_without_refinement(self, stars: Stars) -> ExposedStars:
-        """Carry stars to the focal plane with this engine's own pupil points, however far from focus they are."""
+        """Expose stars with this engine's pupil points, however far from focus they are."""
         return self._expose_traced(self._trace(stars.fields, self._points, self._threads), stars)
 
     def _expose_traced(self, optics: PupilOptics, stars: Stars) -> ExposedStars:
@@ -224,7 +224,7 @@ class FastPsfEngine(PsfEngine):
         return ExposedStars(draw, self._area * optics.lit.mean(axis=2), optics.reference_points)
 
     def _transforms(self, deposit: np.ndarray, optics: PupilOptics, light: np.ndarray) -> np.ndarray:
-        """Return the transforms of what was binned, shape [n_star, n_channel, ky, kx]."""
+        """Return the transforms of the binned rays, shape [n_star, n_channel, ky, kx]."""
         # One transform a star, so that its bytes do not depend on its neighbours.
         return np.stack(self._map(scipy.fft.rfft2, deposit))
 

@@ -34,13 +34,13 @@ def unpack(counts: indices, unit: wp.float32):
 
 @wp.func
 def single_channel(channel: wp.array3d(dtype=wp.int32), wave: wp.int32, t: wp.int32, packet: wp.int32):
-    """Channel of a wavelength that has but one."""
+    """Channel of a wavelength that has a single one."""
     return wave
 
 
 @wp.func
 def scheduled_channel(channel: wp.array3d(dtype=wp.int32), wave: wp.int32, t: wp.int32, packet: wp.int32):
-    """Channel of a wavelength at the turn of a packet."""
+    """Channel of a wavelength that the schedule gives to a packet."""
     return channel[wave, t, packet]
 
 

@@ -29,7 +29,7 @@ from .pupil_lattice import PupilLattice
 LATTICE_POINTS, RINGS_POINTS = 30000, 7500
 #: Fewest points that may be asked for.
 FEWEST_POINTS = 500
-#: Most points across the diameter: stars that need more are left to dense rays.
+#: Most points across the diameter: stars that need more are drawn by dense rays.
 MOST_ACROSS = 1024
 # Largest change of the phase of a ray from one point to the next, as the image of its star is wide (rms along an axis):
 # splines then follow the transfer function to 1e-4.
@@ -82,12 +82,12 @@ class LatticeTransfer:
         return self.lattice.points @ _TURN.T
 
     def refined(self, finer: int) -> LatticeTransfer:
-        """Return the lattice with points so many times closer."""
+        """Return the lattice with its spacing divided by a factor."""
         spacing = self.lattice.spacing / finer
         return replace(self, lattice=PupilLattice.fill(self.diameter, self.obscuration, spacing))
 
     def refinement(self, rays: LatticeRays) -> np.ndarray:
-        """Return how many times closer the points of each star must be, 1 for stars near focus, [n_star] int."""
+        """Return the factor by which each star needs a finer lattice, 1 near focus, [n_star] int."""
         optics = rays.optics
         lit = optics.lit[:, 0, :, None]
         landed = np.where(lit, optics.displacement[:, 0], np.float32(0.0))

@@ -23,7 +23,7 @@ Where anything but discs and rings stops light, much of the pupil is vignetted o
 autocorrelation over a lattice of rays takes the place of spokes and strips (:mod:`.lattice_pupil`), at some thirty
 times the cost.
 
-Stars far from focus, donuts, are left to the dense rays of :mod:`.mean_rays`.
+Stars far from focus (donuts) are drawn by the dense rays of :mod:`.mean_rays`.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class LongExposureEngine(PsfEngine):
         # Width of the pupil's ring.
         self._width = 0.5 * self._diameter * (1.0 - self._obscuration)
         given, rings = inputs.n_pupil, has_only_annuli(self._telescope)
-        # Whether strips along the rims are wrong for every star.
+        # Whether every star needs the lattice in place of strips along the rims.
         self._general = not rings or not self._strips_suffice()
         count = given or LATTICE_POINTS
         if rings:
@@ -126,9 +126,9 @@ class LongExposureEngine(PsfEngine):
         return coherence(structure_function(baseline, self._r0, self._outer_scale), self._wavelengths[:, None])
 
     def _transfer_bounds(self, longest: float) -> np.ndarray:
-        """Return the transfer function of atmosphere and detector at each frequency up to a baseline [m], [n_wave, n].
+        """Return the largest transfer of atmosphere and detector at each frequency up to a baseline [m], [n_wave, n].
 
-        Along the axis or the diagonal where it is larger.
+        It is the larger one of those along the axes and the diagonal.
         """
         step = self._step
         count = np.arange(1, math.ceil(longest / step.min()) + 1)
@@ -139,7 +139,7 @@ class LongExposureEngine(PsfEngine):
         return np.asarray(left * self._channels.of_wavelength(self._channels.spread(k)))
 
     def _strips_suffice(self) -> bool:
-        """Return whether next to nothing is left of baselines half as long as the pupil's ring is wide."""
+        """Return whether the transfer is negligible at baselines of half the width of the pupil's annulus."""
         half = 0.5 * self._width
         left = self._transfer_bounds(half)
         last = np.minimum(np.ceil(half / self._step).astype(int), left.shape[1]) - 1
@@ -204,7 +204,7 @@ class LongExposureEngine(PsfEngine):
         return expose_by_kind(kinds, self._expose_kind, stars)
 
     def _expose_kind(self, kind: int, stars: Stars) -> ExposedStars:
-        """Carry stars to the focal plane: far ones by so many rays, others by strips or by a lattice."""
+        """Expose stars of a kind: by strips, by a lattice or, far from focus, by a number of rays."""
         if kind == _VIGNETTED:
             return self._expose_lattice(stars)
         if kind == _NEAR:
@@ -213,7 +213,7 @@ class LongExposureEngine(PsfEngine):
         return MeanRaysEngine(self._inputs, kind).expose_without_refinement(stars)
 
     def _expose_lattice(self, stars: Stars) -> ExposedStars:
-        """Carry stars to the focal plane by lattices as close as each needs, or by rays where that is very close."""
+        """Expose stars by lattices as fine as each needs, or by rays where that is too fine."""
         rays = self._lattice_rays(self._lattice, stars)
         finer = self._lattice.refinement(rays)
         if (finer == 1).all():
@@ -235,7 +235,7 @@ class LongExposureEngine(PsfEngine):
         return lattice.trace(lambda wavelengths, points: self._trace(stars.fields, points, self._threads, wavelengths))
 
     def _expose_autocorrelation(self, parts: Iterable[tuple[LatticeTransfer, LatticeRays, Stars]]) -> ExposedStars:
-        """Carry the light of lattice points to the focal plane, some stars after the others."""
+        """Expose stars by the autocorrelation of their lattices, batch by batch."""
         spectra, lit, points, offsets = [], [], [], []
         for lattice, rays, stars in parts:
             spectra += self._map(

@@ -148,7 +148,7 @@ def pupil_rims(telescope: Telescope, direction: np.ndarray, wavelength: float) -
 
 
 def _annular_apertures_only(telescope: Telescope) -> Telescope:
-    """Return the telescope without what stops light but for discs and rings."""
+    """Return the telescope without obstructions, and without apertures other than discs and rings."""
     surfaces = tuple(
         s if clear_annulus(s.aperture) is not None else replace(s, aperture=None) for s in telescope.surfaces
     )

@@ -105,7 +105,7 @@ class WavePsfEngine(PsfEngine):
         return float(baseline[min(too_short, _TRIED - 1)])
 
     def _load_screens(self) -> None:
-        """Take the spline coefficients of the low and the high screens [m], and lay the lattice over them."""
+        """Load the spline coefficients of the low and the high screens [m], and place the lattice on them."""
         atmosphere = self._atmosphere
         if atmosphere is None:
             self._splines = [np.zeros((1, 1), dtype=np.float32)] * 2

@@ -1,4 +1,4 @@
-"""Stack of the images of many visits: what decides it, and its files."""
+"""Stack of the images of many visits: its settings and its files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _FAINTEST_SNR = 4.0
 
 @dataclass(frozen=True, eq=False)
 class ImageStack:
-    """Stack of images that a folder of visits holds, or will.
+    """Stack of the images of a folder of visits, made or to be made.
 
     Attributes
     ----------

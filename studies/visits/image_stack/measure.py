@@ -76,7 +76,7 @@ def measure_stack(
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> dict[int, dict[str, Any]]:
-    """Detect, select and fit what the stacked images of a folder of visits show.
+    """Detect objects on the stacked images of visits, select stars, and fit galaxies.
 
     Every galaxy is fitted with the PSF of the models of the visits, and with the true one, of the nearest place without
     a star. Products are tables of galaxies, ``images.json`` and ``images.png``.
@@ -293,7 +293,7 @@ def _paired_ellipticities(tile: MeasuredTile) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _loss_counts(tile: MeasuredTile) -> tuple[int, int]:
-    """Return how many galaxies usable on stamps have no object on the image, or one that is not usable."""
+    """Count the galaxies usable on stamps that are not detected, or not usable, on the image."""
     wanted = tile.stamps.index[tile.stamps.usable]
     there = np.isin(wanted, tile.galaxies.index)
     good = np.isin(wanted, tile.galaxies.index[tile.galaxies.usable])

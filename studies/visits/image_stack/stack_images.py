@@ -113,7 +113,7 @@ def stack_images(
             own.add(of_visit)
             if own.visits in stack.visits.kept:
                 _write_image(stack, tile, own)
-            # Written last: visits that it counts have left their image.
+            # Written last, so that all visits that it counts are in the image.
             own.write(stack.sums_path(tile), stack.stamp)
     return stack
 

@@ -1,4 +1,4 @@
-"""Transfer function of the resampling: how much broader stars of stacked images are than PSFs centred on pixels.
+"""Transfer function of the resampling, which broadens stars of stacked images against PSFs centred on pixels.
 
 Cubic convolution of an image at a fraction s of a pixel multiplies its component of frequency k by
 T(k) = sum over j of w_j(s) exp(2 pi i k (j - 1 - s)), w_j being the weights of the four neighbours j = 0 to 3. T is 1
