@@ -151,7 +151,7 @@ def _annotation_check(kind: Any) -> _Check | None:
     return _class_check((origin,), f"{expected}, as of {loader}" if loader else expected)
 
 
-#: Classes of values that plain annotations allow, and what is expected.
+#: Classes of values that plain annotations allow, and their description in messages.
 _PLAIN_CLASSES: dict[Any, tuple[tuple[Any, ...], str]] = {
     bool: ((bool, np.bool_), "True or False"),
     int: ((int, np.integer), "a whole number"),

@@ -199,7 +199,7 @@ def _build(section: Parameters) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class WrittenAs:
-    """Conversion of a value to what a file has, as an annotation."""
+    """Conversion of a value to its form in a file, as an annotation."""
 
     convert: Callable[[Any], Any]
 

@@ -196,7 +196,7 @@ def grid_sizes(electrons: np.ndarray, radius: np.ndarray, profile: np.ndarray, n
 
 
 def add_stamps(image: np.ndarray, stamps: np.ndarray, corners: np.ndarray) -> None:
-    """Add stamps [n, size, size] to an image, the first pixel of each at (x, y) of it, what lies outside cut off."""
+    """Add stamps [n, size, size] to an image, clipped at its edges; the first pixel of each is at (x, y)."""
     low = np.maximum(corners, 0)
     high = np.minimum(corners + stamps.shape[1], image.shape[::-1])
     first, last = low - corners, high - corners

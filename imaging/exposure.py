@@ -22,7 +22,7 @@ from ..pipeline.simulate.photometry import band_named, sky_electrons_per_pixel
 SATURATED = 1
 #: Names of the bits of the mask, by their value.
 MASK_BITS = {SATURATED: "SATURATED"}
-#: Rows of a band of the image that has random numbers of its own.
+#: Rows of a band of the image; each band has its own random stream.
 _ROWS = 128
 
 

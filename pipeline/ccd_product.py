@@ -301,8 +301,8 @@ def read_product(path: Path, stamp: Stamp | None = None, *, holdout_images: bool
             noise=(header["SKY"], header["NOISE"]),
             holdout=_stars_from_hdu(HoldoutStars, hdus["TRUTH"]),
             observed=_stars_from_hdu(ObservedStars, hdus["STARS"]),
-            holdout_images=_image(hdus["TRUTH_PSF"])[: None if holdout_images else 0].copy(),
-            observed_images=_image(hdus["STAMPS"]),
+            holdout_images=_image_from_hdu(hdus["TRUTH_PSF"])[: None if holdout_images else 0].copy(),
+            observed_images=_image_from_hdu(hdus["STAMPS"]),
             model=PsfModel.from_hdus(hdus, _MODEL),
             noise_free_model=PsfModel.from_hdus(hdus, _NOISE_FREE_MODEL),
             rotator=math.radians(header.get(_ROTATOR_CARD, 0.0)),
@@ -311,7 +311,7 @@ def read_product(path: Path, stamp: Stamp | None = None, *, holdout_images: bool
         raise ProductError(f"no product of a CCD ({' '.join(str(error).split())})", file=path) from None
 
 
-def _image(hdu: fits.ImageHDU) -> np.ndarray:
+def _image_from_hdu(hdu: fits.ImageHDU) -> np.ndarray:
     return np.asarray(hdu.data, dtype=np.float32)
 
 

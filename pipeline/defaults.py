@@ -372,7 +372,7 @@ def given(value: _T | None) -> _T:
 
 
 def _with_defaults(section: _Model, defaults: Mapping[str, object]) -> _Model:
-    """Return a section with defaults in place of what was left open."""
+    """Return a section with defaults for its open values."""
     return section.model_copy(update={key: v for key, v in defaults.items() if getattr(section, key) is None})
 
 

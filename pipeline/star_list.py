@@ -207,27 +207,27 @@ def _read_rows(path: Path, columns: dict[str, str], band: str) -> _Rows:
     """Read places and magnitudes of all rows; ProductError if a column is missing or none of numbers."""
     table = read_columns(path)
     with error_context(file=path):
-        given = {key: _column(table, key, columns, band) for key in NAMES}
+        given = {key: _column_name(table, key, columns, band) for key in NAMES}
         whole = [(pair, unit) for pair, unit in _PLACES if all(given[key] for key in pair)]
         pair, unit = whole[0] if whole else _PLACES[0]
         missing = [key for key in (*pair, "mag") if given[key] is None]
         if missing:
             looked = "; ".join(f"{key}: {', '.join(_column_names(key, columns, band))}" for key in missing)
             raise ProductError(f"no column {', '.join(missing)} ({looked}); columns are {', '.join(table) or 'none'}")
-        magnitude = _values(table, str(given["mag"]), None)
-        places = np.stack([_values(table, str(given[key]), unit) for key in pair], axis=1)
+        magnitude = _column_in_unit(table, str(given["mag"]), None)
+        places = np.stack([_column_in_unit(table, str(given[key]), unit) for key in pair], axis=1)
         for key in _SPECTRA:
             if key in columns and given[key] is None:
                 raise ProductError(f"no column {columns[key]} ({key}); columns are {', '.join(table)}")
         spectrum = next((key for key in _SPECTRA if given[key]), None)
         kelvin = np.full(len(magnitude), np.nan)
         if spectrum is not None:
-            kelvin = _temperatures(_values(table, str(given[spectrum]), None), spectrum)
+            kelvin = _star_temperatures(_column_in_unit(table, str(given[spectrum]), None), spectrum)
     unused = tuple(name for name in _COLORS if name in table)
     return _Rows(pair[0], places, magnitude, kelvin, spectrum, unused)
 
 
-def _temperatures(values: np.ndarray, kind: str) -> np.ndarray:
+def _star_temperatures(values: np.ndarray, kind: str) -> np.ndarray:
     """Return the temperatures [K] of a column of temperatures or colours, NaN where a row has none."""
     found = values if kind == "teff" else color_temperature(values, kind)
     found = np.where(np.isfinite(found) & (found > 0.0), found, np.nan)
@@ -253,12 +253,12 @@ def _column_names(key: str, columns: dict[str, str], band: str) -> tuple[str, ..
     return tuple(name.format(band=band) for name in NAMES[key])
 
 
-def _column(table: dict[str, Any], key: str, columns: dict[str, str], band: str) -> str | None:
+def _column_name(table: dict[str, Any], key: str, columns: dict[str, str], band: str) -> str | None:
     """Return the name of a column in a table, or None."""
     return next((name for name in _column_names(key, columns, band) if name in table), None)
 
 
-def _values(table: dict[str, Any], name: str, unit: u.UnitBase | None) -> np.ndarray:
+def _column_in_unit(table: dict[str, Any], name: str, unit: u.UnitBase | None) -> np.ndarray:
     """Return a column in rad or m, or as it is without `unit`, that of a column that has none; NaN where masked."""
     column = table[name]
     if column.ndim != 1:

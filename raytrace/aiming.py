@@ -189,7 +189,7 @@ class Stop:
     @cached_property
     def front(self) -> Telescope:
         """The surfaces up to the stop, none of which stops light."""
-        return _front(self.telescope, self.index)
+        return _front_group(self.telescope, self.index)
 
     def relative(self, rays: Rays) -> np.ndarray:
         """Return where rays meet the stop [n, 2], along the axes of the entrance pupil, in units of the radius."""
@@ -243,8 +243,8 @@ def stop_of(telescope: Telescope) -> Stop:
     return Stop(telescope, radius, u @ v)
 
 
-def _front(telescope: Telescope, stop: int) -> Telescope:
-    """Return the surfaces of a telescope up to its stop, which rays cross as they are, without apertures."""
+def _front_group(telescope: Telescope, stop: int) -> Telescope:
+    """Return a telescope with the surfaces up to its stop, without apertures and obstructions."""
     surfaces = telescope.surfaces[: stop + 1]
     before = surfaces[-2].medium_after if len(surfaces) > 1 else telescope.medium_before
     last = replace(surfaces[-1], interaction=Interaction.PASS, medium_after=before)

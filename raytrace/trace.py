@@ -62,7 +62,7 @@ class TraceResult(Result):
     _packets: Any = field(default=None, kw_only=True, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what is pickled and copied: all but the arrays of the kernel."""
+        """Return the state for pickling and copying, without the arrays of the kernel."""
         return {**self.__dict__, "_packets": None}
 
     def _label(self) -> str:

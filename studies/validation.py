@@ -38,7 +38,7 @@ _YAML, _TABLES = (".yaml", ".yml"), (".csv", ".ecsv", ".fits", ".fit", ".fz", ".
 
 @dataclass(frozen=True)
 class FileKind:
-    """A kind of YAML file: its model, its errors, and what loads it for checks across keys."""
+    """A kind of YAML file: its model, its errors, and its loader for checks across keys."""
 
     name: str
     model: type[BaseModel]
@@ -185,7 +185,7 @@ def _schema_problems(kind: FileKind, content: dict[str, Any], path: Path) -> lis
 
 
 def _lens_file(path: Path) -> list[PachonError]:
-    """Return what a lenient reader warns of, and the error that stops it."""
+    """Return the warnings of a lenient reader, and the error that ends it."""
     return _loading_problems(lambda file: load_telescope(file, lenient=True), path, PrescriptionWarning)
 
 

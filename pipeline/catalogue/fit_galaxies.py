@@ -149,7 +149,7 @@ def fit_galaxy_stamps(
     tolerance: float = 1e-5,
     threads: int | None = None,
 ) -> GalaxyFits:
-    """Fit galaxies on stamps of their own; everything else as :func:`fit_galaxies`.
+    """Fit galaxies on given stamps, otherwise as :func:`fit_galaxies`.
 
     Parameters
     ----------
@@ -194,13 +194,13 @@ def fit_galaxy_stamps(
         offset = np.array([left + 0.5 * (nx - 1), below + 0.5 * (ny - 1)]) - 0.5 * (side - 1)
         middle, place = np.broadcast_to(-offset, (len(group), 2)), np.zeros((len(group), 2))
         flags = np.zeros(len(group), dtype=np.int32)
-        known = None if start is None else _parameters(start)[group]
+        known = None if start is None else _fit_parameters(start)[group]
         parts.append(_fit_stamps(data, weights, middle, place, psfs, templates[group], flags, known, **options))
         members.append(group)
     return joined(parts, members)
 
 
-def _parameters(fits: GalaxyFits) -> np.ndarray:
+def _fit_parameters(fits: GalaxyFits) -> np.ndarray:
     return np.column_stack([fits.flux, fits.x, fits.y, fits.moments])
 
 

@@ -108,12 +108,12 @@ class DetectionRates(Result):
     @property
     def completeness(self) -> np.ndarray:
         """Fraction of the true objects that were detected; NaN where there are none."""
-        return _fraction(self.n_found, self.n_true)
+        return _ratio_or_nan(self.n_found, self.n_true)
 
     @property
     def purity(self) -> np.ndarray:
         """Fraction of the detected objects that are true ones; NaN where there are none."""
-        return _fraction(self.n_real, self.n_detected)
+        return _ratio_or_nan(self.n_real, self.n_detected)
 
 
 @check_arguments
@@ -158,5 +158,5 @@ def detection_rates(
     return DetectionRates(bins, *counts)
 
 
-def _fraction(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
+def _ratio_or_nan(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
     return np.where(whole > 0, part / np.maximum(whole, 1), np.nan)

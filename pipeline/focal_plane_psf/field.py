@@ -46,7 +46,7 @@ class ShapeField:
     design: np.ndarray | None = None
 
     def with_stars(self, which: np.ndarray) -> ShapeField:
-        """Return the field of some of the stars, all else as it is."""
+        """Return the field restricted to some of its stars."""
         data = ShapeData(self.data.places[which], self.data.values[which], self.data.noise[which])
         design = None if self.design is None else self.design[which]
         return ShapeField(self.mosaic, data, self.residuals[which], self.covariances, self.optics, design)

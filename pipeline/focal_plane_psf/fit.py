@@ -324,7 +324,7 @@ class ExposureFit:
         self._log_determinant += float(sum(np.linalg.slogdet(block)[1] for block in own_terms))
 
     def _objective(self, parameters: np.ndarray, precision: np.ndarray) -> float:
-        """Return what the fit minimises."""
+        """Return the objective function of the fit."""
         n = self.prior.n_parameter
         kept = self.heights, self.exposure
         self.heights, self.exposure = parameters[:n], parameters[n:]

@@ -32,7 +32,7 @@ _START = (0.014, 0.08, 0.3)
 _WIDTHS, _VARIANCE_WIDTH = (1.0, 1.0, 1.0, 1.5), 3.0
 # Logarithm of the amplitude of a component over the variance of the values, below which it counts as absent.
 _VANISHED = -6.0
-#: Variance of what all stars share, over the mean square of the values.
+#: Variance of the part common to all stars, over the mean square of the values.
 _CONSTANT = 100.0
 
 
@@ -96,7 +96,7 @@ def fit_covariance(
     places : Places
         Of the stars.
     values : ndarray, shape [n]
-        One shape parameter of each star, less what the optics make.
+        One shape parameter of each star, minus that of the optics.
     noise : ndarray, shape [n]
         Variance of the noise of each.
     spread : callable, optional
@@ -107,7 +107,7 @@ def fit_covariance(
     start : Covariance, optional
         Covariance to start from.
     constant : float, optional
-        Variance of what all stars share; by default so large that it is free.
+        Variance of the part common to all stars; by default so large that it is free.
     blocks : list of ndarray, optional
         Blocks of stars; by default those of :func:`blocks_of`.
     max_iterations : int
@@ -138,7 +138,7 @@ def fit_covariance(
     guess = _first_guess(centred, noise, power, n_ccd)
     first = guess.copy()
     if start is not None:
-        again = _packed(start, power, extent, n_ccd)
+        again = _pack_parameters(start, power, extent, n_ccd)
         for j in range(COMPONENTS):
             # A component of zero amplitude has no gradient, and would stay at zero.
             if again[4 * j] > _VANISHED:
@@ -163,7 +163,7 @@ def fit_covariance(
         # A variance of zero is a valid result, not a failed fit.
         if value >= high - 1e-9 or (value <= low + 1e-9 and ("length" in name or name == "shear"))
     )
-    covariance = _unpacked(found.x, power, extent, constant, n_ccd)
+    covariance = _unpack_parameters(found.x, power, extent, constant, n_ccd)
     count = sum(len(block.fixed) for block in prepared)
     value, _ = _negative_log_likelihood(found.x, prepared)
     return CovarianceFit(covariance, -value - 0.5 * count * np.log(power), at_bounds)
@@ -190,7 +190,7 @@ def _first_guess(values: np.ndarray, noise: np.ndarray, power: float, n_ccd: int
     return np.array(guess + [np.log(0.1 * signal)] * n_ccd + [np.log(0.01)])
 
 
-def _packed(covariance: Covariance, power: float, extent: float, n_ccd: int) -> np.ndarray:
+def _pack_parameters(covariance: Covariance, power: float, extent: float, n_ccd: int) -> np.ndarray:
     packed = []
     with np.errstate(divide="ignore"):
         for amplitude, matrix in zip(covariance.amplitude, covariance.matrix, strict=True):
@@ -199,7 +199,7 @@ def _packed(covariance: Covariance, power: float, extent: float, n_ccd: int) -> 
     return np.array(packed)
 
 
-def _unpacked(packed: np.ndarray, power: float, extent: float, constant: float, n_ccd: int) -> Covariance:
+def _unpack_parameters(packed: np.ndarray, power: float, extent: float, constant: float, n_ccd: int) -> Covariance:
     amplitude, matrix = np.empty(COMPONENTS), np.zeros((COMPONENTS, 2, 2))
     for j in range(COMPONENTS):
         log_amplitude, along, across, shear = packed[4 * j : 4 * j + 4]

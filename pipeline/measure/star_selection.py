@@ -118,7 +118,7 @@ def flag_stars(
     DomainError
         If an argument has the wrong shape or is not positive, or fewer than three stars can be compared.
     """
-    images = _images(stamps)
+    images = _stamp_cube(stamps)
     count = len(images)
     try:
         rms = np.broadcast_to(pure_numbers(noise, "noise"), (count,))
@@ -209,7 +209,7 @@ def _peak_offset(star: np.ndarray) -> tuple[int, ...]:
     return tuple(int(p) - n // 2 for p, n in zip(np.unravel_index(star.argmax(), star.shape), star.shape, strict=True))
 
 
-def _images(stamps: Any) -> np.ndarray:
+def _stamp_cube(stamps: Any) -> np.ndarray:
     """Return the stamps as float64 [n, ny, nx]."""
     images = real_array(stamps, "stamps: expected real numbers [n, ny, nx]")
     if images.ndim != 3 or min(images.shape[1:]) < 5:

@@ -21,7 +21,7 @@ def as_stamps(stamps: Any, masks: Any = None) -> tuple[np.ndarray, np.ndarray]:
         raise DomainError(f"stamps have shape {images.shape}: expected [n, ny, nx] with at least 2 stars")
     bad = np.zeros(images.shape, dtype=bool)
     if masks is not None:
-        bad = _masks(masks, images.shape)
+        bad = _checked_masks(masks, images.shape)
         images = np.where(bad, 0.0, images)
     finite = np.isfinite(images).all(axis=(1, 2))
     if not finite.all():
@@ -33,7 +33,7 @@ def as_stamps(stamps: Any, masks: Any = None) -> tuple[np.ndarray, np.ndarray]:
     return images, bad
 
 
-def _masks(masks: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _checked_masks(masks: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return the masks as bool [n, ny, nx], True where a pixel is not to be used."""
     bad = np.asarray(masks)
     if bad.shape != shape or bad.dtype.kind != "b":

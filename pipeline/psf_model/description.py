@@ -82,7 +82,7 @@ def make_basis(
 
 
 def project(stars: CleanStars, found: Basis, basis: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the projections of stars on a basis of theirs [n_stars, k], and squares of what is left [n_stars]."""
+    """Project stars onto their basis: coefficients [n_stars, k], and residual sums of squares [n_stars]."""
     deviations = stars.deviations
     if basis == "pixels":
         return deviations, np.zeros(len(deviations))

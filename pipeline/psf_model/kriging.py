@@ -137,7 +137,7 @@ def fit_kernel(points: np.ndarray, numbers: np.ndarray, noise: np.ndarray, terms
     degrees = np.arange(1, max(order_of(terms.shape[1]), COLUMNS - 3) + 1)
     expected = np.where(degrees < 3, 1.0 - degrees, 3.0 - 3.0 * degrees)
     posterior = Posterior(
-        _distances(points[chosen], points[chosen]),
+        _pair_distances(points[chosen], points[chosen]),
         numbers[chosen] / np.sqrt(unit),
         (noise[chosen] / unit).mean(axis=1),
         terms[chosen],
@@ -177,7 +177,7 @@ class Posterior:
         """Return minus the logarithm of the posterior, but for a constant, and its derivatives [n_columns]."""
         kernel = self.kernel(logarithms, kept)
         try:
-            root = np.linalg.cholesky(_covariance(kernel, self.distance, self.terms, self.noise))
+            root = np.linalg.cholesky(_kernel_covariance(kernel, self.distance, self.terms, self.noise))
         except np.linalg.LinAlgError:
             return 1e12, np.zeros(len(kept))
         lower = np.tril(scipy.linalg.lapack.dpotri(root, lower=1)[0])
@@ -224,7 +224,7 @@ def krige(
     :func:`predict`; and each value minus its prediction by the others [n, k]. `noise` [n] is in units of the middle
     star's.
     """
-    covariance = _covariance(kernel, _distances(points, points), terms, noise)
+    covariance = _kernel_covariance(kernel, _pair_distances(points, points), terms, noise)
     inverse = scipy.linalg.inv(covariance, check_finite=False)
     weights = inverse @ values
     trend = _trend_variances(kernel, terms.shape[1])[:, None] * (terms.T @ weights)
@@ -243,7 +243,7 @@ def predict(points: np.ndarray, at: np.ndarray, kernel: np.ndarray, weights: np.
     return result
 
 
-def _covariance(kernel: np.ndarray, distance: np.ndarray, terms: np.ndarray, noise: np.ndarray) -> np.ndarray:
+def _kernel_covariance(kernel: np.ndarray, distance: np.ndarray, terms: np.ndarray, noise: np.ndarray) -> np.ndarray:
     variance, length, floor = kernel[:3]
     covariance = variance * np.exp(-distance / length)
     covariance += (terms * _trend_variances(kernel, terms.shape[1])) @ terms.T
@@ -262,5 +262,5 @@ def order_of(count: int) -> int:
     return math.isqrt(8 * count + 1) // 2 - 1
 
 
-def _distances(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _pair_distances(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.hypot(*np.moveaxis(one[:, None] - other, -1, 0))

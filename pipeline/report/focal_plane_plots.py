@@ -173,18 +173,18 @@ _COLORS = {"truth": TRUTH, "observed": OBSERVED, "residual": RESIDUAL, "away": A
 
 def _title_with_count(title: str, products: Sequence[CcdStars], kind: str, most: int) -> str:
     """Return a title, with a note where not every star has a whisker."""
-    step = max(_step(product.stars(kind), most) for product in products)
+    step = max(_whisker_stride(product.stars(kind), most) for product in products)
     return title if step == 1 else f"{title} (one star in {step})"
 
 
-def _step(stars: Stars, most: int) -> int:
+def _whisker_stride(stars: Stars, most: int) -> int:
     return max(1, -(-len(stars) // most))
 
 
 def _draw_kind(axes: Axes, product: CcdStars, kind: str, scale: float, width: float, most: int) -> None:
     stars = product.stars(kind)
     ends = whiskers(stars.x * 1e3, stars.y * 1e3, *product.ellipticity(kind), scale)
-    draw_whiskers(axes, ends[:: _step(stars, most)], _COLORS[kind], width)
+    draw_whiskers(axes, ends[:: _whisker_stride(stars, most)], _COLORS[kind], width)
 
 
 def _common_key(products: Sequence[CcdStars]) -> float:
@@ -266,8 +266,8 @@ def residual_plot(camera: Camera, columns: Mapping[str, np.ndarray]) -> bytes:
     means = np.concatenate([np.hypot(columns[f"mean_e1_{k}"], columns[f"mean_e2_{k}"]) for k in RESIDUAL_TITLES])
     key = key_ellipticity(means)
     scale = 0.35 * camera.shortest_side * 1e3 / key
-    worst = _largest(np.concatenate([columns[f"rms_e_{k}"] for k in RESIDUAL_TITLES]))
-    sizes = _largest(np.abs(np.concatenate([columns[f"mean_dt_{k}"] for k in ("residual", "away")])))
+    worst = _robust_maximum(np.concatenate([columns[f"rms_e_{k}"] for k in RESIDUAL_TITLES]))
+    sizes = _robust_maximum(np.abs(np.concatenate([columns[f"mean_dt_{k}"] for k in ("residual", "away")])))
     with styled():
         figure = new_figure(12.5, min(max(2 * 3.6 / across, 2.6) + 1.4, 9.5))
         rows = figure.subplots(2, 3, squeeze=False)
@@ -305,7 +305,7 @@ def residual_plot(camera: Camera, columns: Mapping[str, np.ndarray]) -> bytes:
         return png_bytes(figure)
 
 
-def _largest(values: np.ndarray) -> float:
+def _robust_maximum(values: np.ndarray) -> float:
     """Return the 98th percentile of finite values, or one where it is zero."""
     finite = values[np.isfinite(values)]
     largest = float(np.quantile(finite, 0.98)) if finite.size else 0.0

@@ -128,7 +128,7 @@ def _degrees(value: float) -> str:
 
 
 def _clear_radii(surface: Surface) -> list[float | None] | None:
-    """Return inner and outer radius [m] of a disc, a ring, or all but a disc (no outer radius); None of all else."""
+    """Return inner and outer radius [m] of a disc, a ring, or the outside of a disc; None for other apertures."""
     aperture = surface.aperture
     if isinstance(aperture, Circle):
         return [0.0, aperture.radius]
@@ -240,7 +240,7 @@ def _link_text(link: dict[str, Any], unit: float, name: str) -> str:
 
 
 def _stated_rows(design: dict[str, Any], unit: float, name: str) -> list[tuple[str, str]]:
-    """Return what the design data state, as text."""
+    """Return the design data as text."""
     rows = []
     if design["aperture"] is not None:
         lengths = design["aperture"] in ("entrance_pupil", "stop")

@@ -42,7 +42,7 @@ class _PendingPicture:
     title: str
     draw: Plot
     shows: str
-    of_paper: str = ""  #: what the paper shows
+    of_paper: str = ""  #: content of the paper's figure
     apart: bool = False  #: drawn by the second process
     wanted: bool = True
 

@@ -61,13 +61,13 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         pixel_scale=holdout.pixel_scale,
         noise=observation.noise,
         holdout=HoldoutStars(
-            **_positions(experiment, positions.holdout, holdout.fields),
-            **_shapes(holdout_shapes, at_holdout),
+            **_position_columns(experiment, positions.holdout, holdout.fields),
+            **_shape_columns(holdout_shapes, at_holdout),
             fwhm=fwhm(holdout.image, holdout.pixel_scale),
         ),
         observed=ObservedStars(
-            **_positions(experiment, stars.observed, observed.fields),
-            **_shapes(observation.shapes, at_stars),
+            **_position_columns(experiment, stars.observed, observed.fields),
+            **_shape_columns(observation.shapes, at_stars),
             magnitude=stars.magnitude,
             electrons=electrons,
             snr=snr,
@@ -106,7 +106,7 @@ def fit_ccd_model(
     )
 
 
-def _positions(experiment: Experiment, positions: np.ndarray, fields: np.ndarray) -> dict[str, np.ndarray]:
+def _position_columns(experiment: Experiment, positions: np.ndarray, fields: np.ndarray) -> dict[str, np.ndarray]:
     """Return positions on the detector and of the sky; celestial ones where the configuration has a pointing."""
     found = {"x": positions[:, 0], "y": positions[:, 1], "field_x": fields[:, 0], "field_y": fields[:, 1]}
     aim = experiment.pointing
@@ -115,7 +115,7 @@ def _positions(experiment: Experiment, positions: np.ndarray, fields: np.ndarray
     return found
 
 
-def _shapes(measured: Shapes, model: Shapes) -> dict[str, np.ndarray]:
+def _shape_columns(measured: Shapes, model: Shapes) -> dict[str, np.ndarray]:
     return {
         "e1": measured.e1,
         "e2": measured.e2,

@@ -80,7 +80,7 @@ def attribute(
     with full.screens(threads, reporter):
         for case in [FULL, *(c for c in chosen if c != NOISE)]:
             experiment = full if case == FULL else without_cause(full, case)
-            found, failed = _stars(experiment, case, NOISE in chosen and case == FULL, threads, reporter)
+            found, failed = _stars_by_case(experiment, case, NOISE in chosen and case == FULL, threads, reporter)
             stars |= found
             left_out |= {name: reason for name, reason in failed.items() if name not in left_out}
     if not stars[FULL].keys() - left_out:
@@ -91,7 +91,7 @@ def attribute(
     for case in order:
         same = [each for name, each in stars[case].items() if name not in left_out]
         correlated[case] = correlations(same, same[0].kinds)
-        metrics[case] = _metrics(same, correlated[case])
+        metrics[case] = _case_metrics(same, correlated[case])
     for case in chosen:
         metrics[case] |= changes(metrics[FULL], metrics[case], correlated[FULL], correlated[case])
     return Attribution(metrics, correlated, left_out)
@@ -106,7 +106,7 @@ def without_cause(full: Experiment, cause: str) -> Experiment:
     return replace(experiment, atmosphere_only=cause == OPTICS)
 
 
-def _stars(
+def _stars_by_case(
     experiment: Experiment, case: str, noiseless: bool, threads: int | None, reporter: Reporter
 ) -> tuple[dict[str, dict[str, CcdStars]], dict[str, str]]:
     """Return the stars by case and CCD, the same without noise too; and the reasons of CCDs that are not modelled."""
@@ -129,7 +129,7 @@ def _stars(
     return found, done.not_modelled
 
 
-def _metrics(stars: Sequence[CcdStars], correlated: dict[str, Correlation]) -> dict[str, float]:
+def _case_metrics(stars: Sequence[CcdStars], correlated: dict[str, Correlation]) -> dict[str, float]:
     residuals = {"at_stars": "residual", "left_out": "left_out", "away": "away"}
     if has_focal_plane_model(stars):
         residuals |= {"at_stars_ccd": "residual_ccd", "away_ccd": "away_ccd"}

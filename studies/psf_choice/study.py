@@ -113,7 +113,7 @@ def study(config: Configuration, plan: Plan, *, threads: int | None = None, repo
                 for _, group in groupby(sorted(wanted, key=_fit_key), key=_fit_key):
                     together = list(group)
                     try:
-                        models = _models(together[-1], experiment, ccds, observed, threads)
+                        models = _models_of_ccds(together[-1], experiment, ccds, observed, threads)
                         for case in together:
                             found = measure_residuals(experiment, case, ccds, observed, models, threads)
                             samples[case].append(found)
@@ -130,7 +130,7 @@ def study(config: Configuration, plan: Plan, *, threads: int | None = None, repo
     return Study(plan, metrics, {case: problems[case] for case in cases if case in problems}, squares)
 
 
-def _models(
+def _models_of_ccds(
     case: Case,
     experiment: Experiment,
     ccds: Sequence[SimulatedCcd],

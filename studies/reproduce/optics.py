@@ -66,8 +66,13 @@ def layout(bench: Bench) -> Reproduced:
         name: (np.concatenate(values), unit, text)
         for name, values, unit, text in (
             ("field_deg", [np.full(p[..., 0].size, a) for a, p in rays.items()], "deg", "field angle along y"),
-            ("ray", [_numbers(p, 0) for p in rays.values()], "", "ray of that field"),
-            ("point", [_numbers(p, 1) for p in rays.values()], "", "0 where it comes in, then surface by surface"),
+            ("ray", [_point_indices(p, 0) for p in rays.values()], "", "ray of that field"),
+            (
+                "point",
+                [_point_indices(p, 1) for p in rays.values()],
+                "",
+                "0 where it comes in, then surface by surface",
+            ),
             ("y_m", [p[..., 0].ravel() for p in rays.values()], "m", "telescope y"),
             ("z_m", [p[..., 1].ravel() for p in rays.values()], "m", "telescope z from the vertex of M1"),
         )
@@ -85,7 +90,7 @@ def layout(bench: Bench) -> Reproduced:
     )
 
 
-def _numbers(paths: np.ndarray, axis: int) -> np.ndarray:
+def _point_indices(paths: np.ndarray, axis: int) -> np.ndarray:
     return np.indices(paths.shape[:2])[axis].ravel()
 
 

@@ -72,7 +72,7 @@ class StateMetrics:
 
 @dataclass(frozen=True, eq=False)
 class Shims(Result):
-    """Motions of the parts of a focal plane, and what they gain.
+    """Motions of the parts of a focal plane, and their gains.
 
     Attributes
     ----------
@@ -179,9 +179,9 @@ def shim(
     fitted, checked, correlations = {}, {}, {}
     with reporter.stage("check with the engine at other places"):
         for state, at in zip(STATES, by_state, strict=True):
-            fitted[state], _ = _metrics(fit, curves.at(at), sky, edges)
+            fitted[state], _ = _state_metrics(fit, curves.at(at), sky, edges)
             values = measured(experiment, planes[state], check, threads)
-            checked[state], correlations[state] = _metrics(check, values, sky_checked, edges)
+            checked[state], correlations[state] = _state_metrics(check, values, sky_checked, edges)
     return Shims(merit, parts, focus, motions, fitted, checked, correlations, planes["focused"], planes["shimmed"])
 
 
@@ -335,7 +335,7 @@ _VALUES: dict[str, Value] = {
 }
 
 
-def _metrics(
+def _state_metrics(
     places: Places, values: np.ndarray, sky: np.ndarray, edges: np.ndarray
 ) -> tuple[StateMetrics, Correlation]:
     """Return means of values [n, 3] at places, and the correlation of their ellipticities."""

@@ -42,7 +42,7 @@ def write_report(store: SweepStore, folder: Path) -> Path:
         pictures=[picture for _, picture in pictures],
         pachon=store.about["pachon"],
         points=len(store.points()),
-        rows=_rows(table, sweep),
+        rows=_metric_rows(table, sweep),
         parameters={name: described_parameter(name) for name in sweep.parameters},
         problems=[(int(n), p) for n, p in zip(table.number, table.problem, strict=True) if p][:20],
     )
@@ -145,7 +145,7 @@ def _random_pictures(table: SweepTable, numeric: list[str]) -> Iterator[tuple[st
             yield f"pairs_{metric}", Picture(f"{metric} over pairs", plots.pairs_plot(table, metric, names), text)
 
 
-def _rows(table: SweepTable, sweep: SweepFile) -> list[dict[str, str]]:
+def _metric_rows(table: SweepTable, sweep: SweepFile) -> list[dict[str, str]]:
     """Return range and median of each metric, and its scatter over the replicas, with the digits that it allows."""
     rows = []
     for name, values in table.metrics.items():

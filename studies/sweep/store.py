@@ -77,8 +77,8 @@ class StoreKind:
     """Words of messages about the store of a study."""
 
     name: str  #: "sweep"
-    maker: str  #: what makes such a store
-    rescue: str  #: what to do about a damaged one
+    maker: str  #: command or function that makes such a store
+    rescue: str  #: remedy for a damaged one
 
     @property
     def article(self) -> str:
@@ -136,7 +136,7 @@ class SweepStore:
             rows = self._connection.execute(
                 "SELECT number, metrics, problem, seconds, worker FROM results ORDER BY number"
             ).fetchall()
-            return [_result(*row) for row in rows]
+            return [_point_result(*row) for row in rows]
 
     def finished(self) -> set[int]:
         """Return the numbers of the points with results."""
@@ -167,9 +167,9 @@ class SweepStore:
         try:
             yield
         except sqlite3.Error as error:
-            raise _problem(self.path, error, self.kind) from None
+            raise _store_error(self.path, error, self.kind) from None
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
-            raise _damaged(self.path, error, self.kind) from None
+            raise _damaged_error(self.path, error, self.kind) from None
 
 
 def create_store(
@@ -206,7 +206,7 @@ def create_store(
     except FileExistsError:
         raise store_exists(path) from None
     except sqlite3.Error as error:
-        raise _problem(path, error, kind) from None
+        raise _store_error(path, error, kind) from None
     except OSError as error:
         raise ProductError(f"cannot write {path}: {error.strerror or error}") from None
     finally:
@@ -252,20 +252,22 @@ def check_same_sweep(store: SweepStore, sweep: StoredStudy) -> None:
 
 def exact_json(value: Any) -> str:
     """Return canonical JSON in which every double keeps all its digits; not-a-number becomes null."""
-    return json.dumps(_finite(value), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return json.dumps(
+        _null_if_not_finite(value), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+    )
 
 
-def _finite(value: Any) -> Any:
+def _null_if_not_finite(value: Any) -> Any:
     if isinstance(value, dict):
-        return {str(k): _finite(v) for k, v in value.items()}
+        return {str(k): _null_if_not_finite(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_finite(v) for v in value]
+        return [_null_if_not_finite(v) for v in value]
     if isinstance(value, float) and value - value != 0.0:
         return None
     return value
 
 
-def _result(number: int, metrics: str | None, problem: str | None, seconds: float, worker: str) -> PointResult:
+def _point_result(number: int, metrics: str | None, problem: str | None, seconds: float, worker: str) -> PointResult:
     values = None if metrics is None else {k: float("nan") if v is None else v for k, v in json.loads(metrics).items()}
     return PointResult(number, values, problem, seconds, worker)
 
@@ -275,7 +277,7 @@ def _sqlite_companions(path: Path) -> Sequence[Path]:
     return [path.with_name(path.name + ending) for ending in ("-wal", "-shm", "-journal")]
 
 
-def _problem(path: Path, error: sqlite3.Error, kind: StoreKind) -> ProductError:
+def _store_error(path: Path, error: sqlite3.Error, kind: StoreKind) -> ProductError:
     """Return an error of SQLite as one line with the remedy."""
     text = str(error)
     if "full" in text or "disk I/O" in text:
@@ -285,10 +287,10 @@ def _problem(path: Path, error: sqlite3.Error, kind: StoreKind) -> ProductError:
     if "locked" in text:
         return ProductError(f"cannot write {path}: {text}; is another {kind.name} writing to it?")
     if "malformed" in text or "not a database" in text or "no such table" in text:
-        return _damaged(path, error, kind)
+        return _damaged_error(path, error, kind)
     return ProductError(text, file=path)
 
 
-def _damaged(path: Path, error: Exception, kind: StoreKind) -> DamagedStoreError:
+def _damaged_error(path: Path, error: Exception, kind: StoreKind) -> DamagedStoreError:
     text = cut_short(" ".join(str(error).split()), 120)
     return DamagedStoreError(f"damaged, or no store of {kind.article} ({text}); {kind.rescue}", file=path)

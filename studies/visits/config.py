@@ -86,12 +86,12 @@ class VisitsConfig(Section):
     def digest(self, experiment: Experiment) -> str:
         """SHA-256 of all settings that affect the PSFs of a visit; galaxies, visits' number and kept stacks do not."""
         visits = self.visits.model_dump(mode="json", exclude={"count", "snapshots"})
-        # Angles that are left as they were before there were these keys leave the products of then usable.
+        # Default angles are left out, so that products from before these keys stay valid.
         visits = {key: value for key, value in visits.items() if key not in _ANGLES or value != _ANGLES[key]}
         return digest({"run": experiment.config_hash, "ccds": experiment.config.ccds, "visits": visits})
 
     def galaxies_digest(self, experiment: Experiment, **content: Any) -> str:
-        """SHA-256 of the visits, of what else decides products, and of galaxies that are not the usual ones."""
+        """SHA-256 of the settings of the visits, of `content`, and of galaxies other than the default ones."""
         own = {} if self.galaxies == GalaxySourceConfig() else {"galaxies": self.galaxies.content()}
         return digest({"visits": self.digest(experiment), **content, **own})
 

@@ -130,7 +130,7 @@ def measure_galaxies(
                 images, every, stack.true[used], psf_index=index, start=by_model, threads=threads
             )
             found.append((own, by_model, by_true))
-    return _shapes(galaxies, near, pixels * exposure.pixel_scale, width, found)
+    return _joined_shapes(galaxies, near, pixels * exposure.pixel_scale, width, found)
 
 
 def _row_blocks(rows: np.ndarray) -> Iterator[np.ndarray]:
@@ -156,7 +156,7 @@ def _half_light_radii(psfs: np.ndarray) -> np.ndarray:
     return np.array([np.interp(0.5, curve, radius) for curve in np.maximum.accumulate(growth, axis=1)])
 
 
-def _shapes(
+def _joined_shapes(
     galaxies: Sources,
     near: np.ndarray,
     positions: np.ndarray,

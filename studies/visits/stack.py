@@ -63,7 +63,7 @@ class PsfSums:
         """Read sums; ProductError for those of another configuration, and for a damaged file."""
         hdus = _read_table(path, stamp)
         count = np.array(hdus["COUNT"].data, dtype=np.int32)
-        return cls(hdus[0].header[VISITS_CARD], count, _image(hdus["TRUE"]), _image(hdus["MODEL"]))
+        return cls(hdus[0].header[VISITS_CARD], count, _image_from_hdu(hdus["TRUE"]), _image_from_hdu(hdus["MODEL"]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +192,7 @@ class PsfStack(Result):
         hdus = _read_table(path, stamp)
         found = {name: column(hdus["POINTS"], name.upper()) for name in _COLUMNS}
         found = {name: found[name] * scale if scale != 1.0 else found[name] for name, (scale, _, _) in _COLUMNS.items()}
-        images = {"true": _image(hdus["TRUE"]), "model": _image(hdus["MODEL"])}
+        images = {"true": _image_from_hdu(hdus["TRUE"]), "model": _image_from_hdu(hdus["MODEL"])}
         return cls(**{"visits": hdus[0].header[VISITS_CARD], **found, **images})
 
 
@@ -221,5 +221,5 @@ def _read_table(path: Path, stamp: Stamp | None) -> fits.HDUList:
     return hdus
 
 
-def _image(hdu: fits.ImageHDU) -> np.ndarray:
+def _image_from_hdu(hdu: fits.ImageHDU) -> np.ndarray:
     return np.array(hdu.data, dtype=np.float32)

@@ -27,7 +27,7 @@ from .pupil_lattice import PupilLattice
 
 #: Points of the default lattice in a disc: 196 across, for vanes of a few centimetres; and in rings without any.
 LATTICE_POINTS, RINGS_POINTS = 30000, 7500
-#: Fewest points that may be asked for.
+#: Fewest points of a lattice.
 FEWEST_POINTS = 500
 #: Most points across the diameter: stars that need more are drawn by dense rays.
 MOST_ACROSS = 1024
@@ -50,7 +50,7 @@ _TERMS = [(d + 1) * (d + 2) // 2 for d in range(_DEGREE, -1, -1)]
 
 @dataclass(frozen=True)
 class LatticeRays:
-    """Rays of stars through a lattice at the middle wavelength, and what differs at the others."""
+    """Rays of stars through a lattice at the middle wavelength, and the differences at the others."""
 
     optics: PupilOptics  #: of the middle wavelength
     path: np.ndarray  #: coefficients of the paths at each wavelength less those [m], [n_star, n_wave, n_term]

@@ -60,7 +60,7 @@ class PupilRims:
         return places, np.einsum("nij,nj->ni", slopes, self.normals)
 
     def transfer(self, baseline: np.ndarray, wave: np.ndarray, landing: np.ndarray, inward: np.ndarray) -> np.ndarray:
-        """Return what diffraction at the rims adds to the transfer function, shape [n_frequency], complex64.
+        """Return the transfer function of diffraction at the rims, shape [n_frequency], complex64.
 
         Parameters
         ----------

@@ -96,7 +96,7 @@ class WavePsfEngine(PsfEngine):
         self._reach = min(math.floor(longest / spacing), (self._size - 1) // 2)
 
     def _longest_baseline(self) -> float:
-        """Return the baseline [m] beyond which charge diffusion leaves next to nothing, at most the diameter."""
+        """Return the baseline [m] beyond which the transfer of charge diffusion is negligible, at most the diameter."""
         baseline = np.linspace(min(LONGEST_BASELINE, self._diameter), self._diameter, _TRIED)
         k = 2.0 * math.pi * baseline / (float(self._wavelengths.max()) * self.focal_length)
         spread = self._channels.of_wavelength(self._channels.spread(k)).max(axis=0)

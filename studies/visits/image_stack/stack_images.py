@@ -242,7 +242,7 @@ def _check_room(stack: ImageStack) -> None:
 
 
 def _check_memory(stack: ImageStack, threads: int | None, processes: int) -> None:
-    """Raise ConfigError where the memory cannot hold the tiles and what so many processes draw."""
+    """Raise ConfigError where memory cannot hold the tiles and the images of so many processes."""
     sums = _tile_bytes(stack) * len(stack.tiles)
     # In each process a CCD that is drawn, or a tile that is written, and the sums of a visit. Here the sums, and those
     # of visits that workers have sent.
