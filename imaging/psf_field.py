@@ -13,10 +13,10 @@ from scipy import fft
 from ..core.arguments import check_arguments
 from ..core.threads import one_blas_thread
 from ..core.units import for_each, pure_numbers
-from ..pipeline.defaults import noise_free_components
 from ..pipeline.experiment import Experiment
 from ..pipeline.psf_model.model import PsfModel
 from ..pipeline.psf_model.polynomial import design_matrix
+from ..pipeline.resolved_values import noise_free_components
 from ..pipeline.simulate.ccd_exposure import expose_positions, holdout_positions
 
 #: Pixels around a CCD that the PSF is extrapolated to, for galaxies whose light reaches the CCD.

@@ -13,9 +13,9 @@ from ..core.progress import Reporter
 from ..core.workers import MakeWorkers
 from ..core.yaml_reader import read_mapping
 from ..pipeline.config import differences
-from ..pipeline.defaults import given
 from ..pipeline.experiment import Experiment
 from ..pipeline.memory import needed_bytes
+from ..pipeline.resolved_values import given
 from .ccd_image import draw_by_workers, draw_image, galaxies_of, image_name, stamp_of, window_of
 from .config import ImagesConfig
 from .image_file import is_whole

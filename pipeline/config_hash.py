@@ -17,8 +17,8 @@ from ..models.io.heights.zernike_table import AS_MEASURED
 from ..models.io.prescription import ENDINGS, prescription_digest
 from .alignment_states import ENDINGS as STATE_ENDINGS
 from .config import Configuration
-from .defaults import given
 from .photometry import band_of
+from .resolved_values import given
 
 #: Keys of catalogues of stars: without a catalogue they are left out, as in hashes from before these keys.
 _CATALOGUE_KEYS = ("catalogue", "columns", "brightest", "faintest")

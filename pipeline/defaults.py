@@ -1,4 +1,4 @@
-"""Defaults of a configuration that depend on telescope, camera and site, and checks across several values."""
+"""Defaults of a configuration that depend on telescope, camera and site."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import numpy as np
 from pydantic import BaseModel
 
 from ..core.errors import ConfigError, error_context
-from ..core.schema import json_text
 from ..core.table_files import ENDINGS as STAR_ENDINGS
 from ..core.units import ARCSEC
 from ..design.parameters.changes import apply_changes
@@ -25,7 +24,6 @@ from ..models.io.heights.file import ENDINGS as HEIGHT_ENDINGS
 from ..models.io.heights.zernike_table import AS_MEASURED
 from ..models.io.prescription import ENDINGS, load_telescope
 from ..models.io.site_file import load_site
-from ..models.media.silicon import WAVELENGTH_RANGE as SILICON_RANGE
 from ..models.site import Site
 from ..models.telescope import Telescope
 from ..raytrace.ideal_lens import require_image
@@ -34,13 +32,12 @@ from ..wavefront.psf.long_exposure import default_points
 from .alignment_states import ENDINGS as STATE_ENDINGS
 from .alignment_states import with_active_optics_state
 from .config import BandName, Configuration, PsfConfig, ReconstructionConfig
+from .config_checks import WEIGHT_PIXELS, check_combinations
 from .photometry import band_of, pixel_angle, resolved_photometry
 from .psf_model.fit import COMPONENTS, ORDERS
-from .psf_model.polynomial import term_count
-from .sensor.brighter_fatter import PIXEL_SIZE as BRIGHTER_FATTER_PIXEL
+from .resolved_values import given
 from .simulate.photometry import PROVISIONAL_FWHM, limiting_magnitude, saturation_magnitude
 from .simulate.screen_cover import check_screens
-from .star_list import NAMES
 
 _WAVELENGTHS = 5
 # Keys of the PSF model of a CCD: where none is given it is _KRIGING, else _PAPER fills the other ones.
@@ -57,11 +54,10 @@ _WITH_ATMOSPHERE = {"n_pupil": PUPIL_POINTS, "diffusion_pixels": 0.4}
 _OPTICS_ALONE = {"n_pupil": PUPIL_POINTS_STILL, "diffusion_pixels": 0.0}
 _FINE = 4
 # FWHM of the weight of the moments [arcsec] with and without an atmosphere (Jee & Tyson 2011, sec. 3); where pixels are
-# coarse, so many of them, or the moments would be sums over one or two pixels.
-_WEIGHT, _WEIGHT_ALONE, _WEIGHT_PIXELS = 0.7, 0.3, 2.5
+# coarse, WEIGHT_PIXELS of them, or the moments would be sums over one or two pixels.
+_WEIGHT, _WEIGHT_ALONE = 0.7, 0.3
 # Sides of a stamp [arcsec], 31 pixels of the LSST and 61 fine ones; and fewest pixels.
 _SIDE, _SIDE_ALONE, _FEWEST = 6.2, 3.05, 15
-_T = TypeVar("_T")
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
@@ -145,7 +141,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
         }
     )
     telescope = configured_telescope(telescope, resolved)
-    _check_combinations(resolved, telescope)
+    check_combinations(resolved, telescope, _pixel_arcsec(resolved.psf, telescope))
     check_screens(resolved, telescope, camera, site)
     return ResolvedConfiguration(resolved, telescope, camera, site)
 
@@ -213,7 +209,7 @@ def _pixel_arcsec(psf: PsfConfig, telescope: Telescope) -> float:
 
 def _moment_weight(enabled: bool, psf: PsfConfig, telescope: Telescope) -> float:
     """Return the FWHM of the weight of the moments [arcsec]."""
-    least = _WEIGHT_PIXELS * _pixel_arcsec(psf, telescope)
+    least = WEIGHT_PIXELS * _pixel_arcsec(psf, telescope)
     return max(_WEIGHT if enabled else _WEIGHT_ALONE, round(least, 3))
 
 
@@ -225,25 +221,6 @@ def configured_telescope(telescope: Telescope, config: Configuration) -> Telesco
         with error_context(key="active_optics.states"):
             telescope = with_active_optics_state(telescope, states, config.atmosphere.epoch)
     return telescope.with_rotator(math.radians(config.rotator_deg))
-
-
-def noise_free_components(config: Configuration) -> int:
-    """Return how many principal components describe the noise-free PSFs of a resolved configuration."""
-    components = config.reconstruction.components
-    return min(COMPONENTS, config.stars.truth - 1) if components is None else components
-
-
-def least_star_count(config: Configuration) -> int:
-    """Return how many observed stars the PSF model of a resolved configuration needs on a CCD."""
-    fit = config.reconstruction
-    terms = 0 if fit.interpolation == "kriging" else term_count(fit.order or 0)
-    return max(1 + (fit.components or 0) if fit.basis == "pca" else 2, terms)
-
-
-def require_drawn_stars(config: Configuration) -> None:
-    """Raise ConfigError if a configuration has a catalogue of stars, where stars must be drawn."""
-    if config.stars.catalogue is not None:
-        raise ConfigError(f"stars.catalogue = {config.stars.catalogue}: expected none, these stars are drawn")
 
 
 def chosen_ccds(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
@@ -274,101 +251,6 @@ def default_ccds(camera: Camera) -> tuple[str, ...]:
     width, height = np.ptp(camera.corners([middle])[0], axis=0)
     row = (np.abs(y - y[middle]) < 0.5 * height) & (x > x[middle] - 1.5 * width)
     return tuple(camera.ccd_names[i] for i in np.flatnonzero(row))
-
-
-def _check_combinations(config: Configuration, telescope: Telescope) -> None:
-    """Check combinations of values."""
-    for i, wavelength in enumerate(given(config.wavelengths_nm)):
-        low, high = (1e9 * w for w in telescope.wavelength_range)
-        if not low <= wavelength <= high:
-            raise ConfigError(
-                f"wavelengths_nm[{i}] = {wavelength:g}: expected {low:g} to {high:g}, which {telescope.name} covers"
-            )
-        low, high = (1e9 * w for w in SILICON_RANGE)
-        if config.detector.silicon and not low <= wavelength <= high:
-            raise ConfigError(
-                f"wavelengths_nm[{i}] = {wavelength:g}: expected {low:g} to {high:g} with detector.silicon = true"
-            )
-    if not config.wavelengths_nm:
-        raise ConfigError("wavelengths_nm = []: expected at least one wavelength in nm")
-    if given(config.psf.stamp) % 2 == 0:
-        raise ConfigError(f"psf.stamp = {config.psf.stamp}: expected an odd number of pixels")
-    if config.sensor.brighter_fatter is not None and config.psf.pixel_um != BRIGHTER_FATTER_PIXEL * 1e6:
-        raise ConfigError(
-            f"psf.pixel_um = {config.psf.pixel_um:g}: expected {BRIGHTER_FATTER_PIXEL * 1e6:g}, whose boundaries"
-            f" sensor.brighter_fatter = {config.sensor.brighter_fatter} moves"
-        )
-    fit, stars = config.reconstruction, config.stars
-    pixel = _pixel_arcsec(config.psf, telescope)
-    if not given(fit.weight_fwhm_arcsec) >= pixel:
-        raise ConfigError(
-            f"reconstruction.weight_fwhm_arcsec = {fit.weight_fwhm_arcsec:g}: expected at least {pixel:.3g}, a pixel,"
-            f" and better {_WEIGHT_PIXELS * pixel:.3g}"
-        )
-    if fit.model == "focal_plane" and not config.atmosphere.enabled:
-        raise ConfigError("reconstruction.model = focal_plane: expected atmosphere.enabled = true, whose mean it takes")
-    if fit.basis == "pixels" and fit.components is not None:
-        raise ConfigError(f"reconstruction.components = {fit.components}: expected null with basis = pixels")
-    if fit.interpolation != "polynomial" and fit.weights != "equal":
-        raise ConfigError(
-            f"reconstruction.weights = {fit.weights}: expected equal with interpolation = {fit.interpolation}"
-        )
-    if stars.catalogue is None:
-        for key in ("columns", "brightest", "faintest"):
-            if getattr(stars, key) not in (None, {}):
-                raise ConfigError(f"stars.{key} = {json_text(getattr(stars, key))}: expected stars.catalogue")
-    else:
-        for key in stars.columns:
-            if key not in NAMES:
-                raise ConfigError(
-                    f"stars.columns.{key} = {json_text(stars.columns[key])}: expected keys of {', '.join(NAMES)}"
-                )
-        if not given(stars.brightest) < given(stars.faintest):
-            raise ConfigError(
-                f"stars.faintest = {stars.faintest:g}: expected more than stars.brightest = {stars.brightest:g}"
-            )
-    for kind in ("truth",) if stars.catalogue else ("observed", "truth"):
-        count = getattr(stars, kind)
-        # The noise-free PSFs are always described by principal components.
-        components = noise_free_components(config) if kind == "truth" else fit.components
-        if components is not None and components > count - 1 and (kind == "truth" or fit.basis == "pca"):
-            raise ConfigError(
-                f"reconstruction.components = {components}: expected at most {count - 1}, one less than "
-                f"stars.{kind} = {count}"
-            )
-        key = "order" if kind == "observed" else "truth_order"
-        terms = term_count(getattr(fit, key))
-        if terms > count and (kind == "truth" or fit.interpolation != "kriging"):
-            raise ConfigError(
-                f"reconstruction.{key} = {getattr(fit, key)}: its {terms} terms need as many stars, "
-                f"stars.{kind} = {count}"
-            )
-    if config.focal_plane.budget == "flat" and config.focal_plane.sizes:
-        raise ConfigError(
-            "focal_plane.budget = flat: expected simulated or specification where sizes of its terms are given"
-        )
-    plane = config.focal_plane
-    if plane.heights is not None and plane.changed:
-        key = plane.changed[0]
-        value = plane.model_dump(by_alias=True)[key]
-        raise ConfigError(
-            f"focal_plane.{key} = {json_text(value)}: expected no budget with measured heights, "
-            f"focal_plane.heights = {plane.heights}"
-        )
-    if config.psf.engine == "long_exposure" and not config.atmosphere.enabled:
-        raise ConfigError("psf.engine = long_exposure: expected atmosphere.enabled = true, whose mean it takes")
-    if config.atmosphere.time_step_s > config.atmosphere.exposure_s:
-        raise ConfigError(
-            f"atmosphere.time_step_s = {config.atmosphere.time_step_s:g}: expected at most the exposure, "
-            f"atmosphere.exposure_s = {config.atmosphere.exposure_s:g}"
-        )
-
-
-def given(value: _T | None) -> _T:
-    """Return a value that a resolved configuration always has."""
-    if value is None:
-        raise ConfigError("the configuration is not resolved")
-    return value
 
 
 def _with_defaults(section: _Model, defaults: Mapping[str, object]) -> _Model:

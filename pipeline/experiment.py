@@ -36,8 +36,9 @@ from ..wavefront.chief_rays import chief_rays
 from ..wavefront.psf.engines import ENGINES
 from .config import Configuration, digest
 from .config_hash import hashed_content
-from .defaults import given, resolve
+from .defaults import resolve
 from .photometry import band_of
+from .resolved_values import given
 from .sensor.displacement import Displacement, EdgeRolloff, TreeRings
 from .simulate.screen_cover import check_samples, corner_fields
 from .star_list import StarList, listed_stars, pointing_of

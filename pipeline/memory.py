@@ -7,8 +7,8 @@ from dataclasses import replace
 from ..core.errors import ConfigError
 from ..core.memory import available_bytes, readable
 from ..core.threads import thread_count
-from .defaults import given
 from .experiment import Experiment
+from .resolved_values import given
 
 # Measured on runs of 0.5 to 2.6 GB (both engines, screens of 512 to 8192, 140 to 8000 stars on a CCD): the estimate is
 # 3 to 18 % above the peak. Python with its libraries and kernels while PSFs are made, and with the pictures of the

@@ -8,8 +8,8 @@ from typing import Any
 
 from ...core.page import Picture, render
 from ..config import ReconstructionConfig, to_yaml
-from ..defaults import given
 from ..experiment import Experiment
+from ..resolved_values import given
 from .tables import (
     MODELS_CAPTION,
     MODELS_COLUMNS,

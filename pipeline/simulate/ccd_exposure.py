@@ -16,9 +16,9 @@ from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.engine import center_focal_length
 from ...wavefront.psf.engines import ENGINES
 from ...wavefront.psf.psf import make_psfs
-from ..defaults import given
 from ..experiment import Experiment
 from ..measure.shapes import measure_shapes
+from ..resolved_values import given
 from ..sensor.displacement import displace_stamps
 from .photometry import PROVISIONAL_FWHM, electrons, limiting_magnitude
 from .star_field import StarField, make_star_field

@@ -10,8 +10,8 @@ from typing import Generic, TypeVar
 from ...core.errors import DomainError, PachonError, ProductError
 from ...core.progress import Reporter
 from ...core.threads import thread_count
-from ..defaults import least_star_count
 from ..experiment import Experiment
+from ..resolved_values import least_star_count
 from .ccd_exposure import CcdExposure, expose_ccd
 from .star_field import StarField
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from ..ccd_product import CcdProduct, HoldoutStars, ObservedStars
-from ..defaults import given, least_star_count, noise_free_components
 from ..experiment import Experiment
 from ..measure.shapes import Shapes, fwhm, measure_shapes
 from ..measure.star_selection import require_stars
 from ..psf_model.checks import snr_weights
 from ..psf_model.model import CLIP_SIGMA, PsfModel
+from ..resolved_values import given, least_star_count, noise_free_components
 from .ccd_exposure import CcdExposure, ccd_stars
 from .ccd_observation import Observation, collected_images, observe_ccd
 from .photometry import effective_fwhm, signal_to_noise

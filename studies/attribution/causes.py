@@ -10,7 +10,7 @@ from typing import Any
 from ...core.errors import ConfigError, unknown_name
 from ...models.io.site_file import load_site
 from ...pipeline.config import Configuration, with_options
-from ...pipeline.defaults import given
+from ...pipeline.resolved_values import given
 
 #: Name of the case with all causes, and of the two causes that are no options of the configuration.
 FULL, NOISE, OPTICS = "full", "noise", "optics"

@@ -9,10 +9,10 @@ from itertools import product
 
 from ...core.errors import ConfigError
 from ...pipeline.config import Configuration
-from ...pipeline.defaults import given
 from ...pipeline.psf_model.basis import BASES
 from ...pipeline.psf_model.fit import COMPONENTS, ORDERS
 from ...pipeline.psf_model.polynomial import term_count
+from ...pipeline.resolved_values import given
 
 #: Weights of the stars in the polynomials, as for :func:`~.snr_weights` (equal in the paper).
 POLYNOMIALS = ("equal", "snr", "softened")

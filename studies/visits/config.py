@@ -23,8 +23,8 @@ from ...imaging.config import GalaxySourceConfig
 from ...imaging.exposure import Exposure
 from ...imaging.galaxies import GalaxySource
 from ...pipeline.config import Configuration, digest, section_yaml, with_options, with_run
-from ...pipeline.defaults import require_drawn_stars
 from ...pipeline.experiment import Experiment
+from ...pipeline.resolved_values import require_drawn_stars
 from .plan import Visit, plan_visits
 
 #: Pixels along a side of the stamps of the stack, and of those of a visit, of which turned axes cut the corners.

@@ -13,10 +13,10 @@ from ...core.progress import Reporter
 from ...core.units import ARCSEC
 from ...models.telescope import Telescope
 from ...pipeline.config import with_options
-from ...pipeline.defaults import given
 from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_psf.stars import CcdStars, FocalPlaneStars
 from ...pipeline.focal_plane_stage import fit_focal_plane_model
+from ...pipeline.resolved_values import given
 from ...pipeline.simulate.ccd_exposure import CcdExposure, ccd_bounds
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_model import fit_ccd_model

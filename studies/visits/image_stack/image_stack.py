@@ -14,8 +14,8 @@ from ....imaging.exposure import Exposure
 from ....imaging.image_file import CcdImage
 from ....imaging.wcs import CcdWcs, ccd_wcs
 from ....models.camera.camera import Camera
-from ....pipeline.defaults import given
 from ....pipeline.experiment import Experiment
+from ....pipeline.resolved_values import given
 from ....pipeline.run_folder import CONFIG_NAME
 from ..config import STACK_STAMP, VisitsConfig, load_visits_configuration
 from ..plan import Visit

@@ -12,8 +12,8 @@ from ....imaging.draw import Window, add_stamps, draw_galaxies
 from ....imaging.exposure import ExposedImage, Exposure, expose
 from ....imaging.psf_field import PsfField, to_pixel
 from ....imaging.scene import STAR_ROOM, galaxies_near
-from ....pipeline.defaults import noise_free_components
 from ....pipeline.experiment import Experiment
+from ....pipeline.resolved_values import noise_free_components
 from ....pipeline.simulate.ccd_exposure import expose_centered, expose_positions
 from ....pipeline.simulate.star_field import magnitudes_at
 from ..plan import Visit
