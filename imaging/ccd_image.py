@@ -13,6 +13,7 @@ from ..core.files import folder_of_worker, marked_folder, write_bytes
 from ..core.products import Stamp
 from ..core.progress import Reporter
 from ..core.workers import MakeWorkers
+from ..pipeline.ccd_worker import CcdJob
 from ..pipeline.experiment import Experiment
 from ..pipeline.memory import check_memory
 from ..pipeline.screen_cache import with_cached_screens
@@ -22,18 +23,6 @@ from .exposure import Exposure
 from .galaxies import GalaxySource, SkyGalaxies
 from .preview import cutouts_png, preview_png
 from .scene import draw_ccd, stamped
-
-
-@dataclass(frozen=True)
-class ImageJob:
-    """A CCD to draw."""
-
-    name: str
-
-    @property
-    def label(self) -> str:
-        """Name in messages."""
-        return f"CCD {self.name}"
 
 
 @dataclass(frozen=True)
@@ -55,7 +44,7 @@ class ImageComputation:
     folder: Path
     mark: str  #: file in the folder, by which workers that share it are told
 
-    def __call__(self, job: ImageJob, threads: int) -> DrawnImage:
+    def __call__(self, job: CcdJob, threads: int) -> DrawnImage:
         """Draw one CCD."""
         experiment = with_cached_screens(self.experiment)
         try:
@@ -91,7 +80,7 @@ def draw_by_workers(
         chosen = workers(ImageComputation(config, experiment, folder.resolve(), mark))
         check_memory(experiment, 1, copies=chosen.processes)
         with reporter.stage(f"images of {len(names)} CCDs, {chosen.description}", len(names)) as stage:
-            for number, drawn in enumerate(chosen.results(ImageJob(name) for name in names), start=1):
+            for number, drawn in enumerate(chosen.results(CcdJob(name) for name in names), start=1):
                 if drawn.problem is not None:
                     raise ProductError(drawn.problem)
                 for name, data in drawn.files:

@@ -20,6 +20,7 @@ from ...core.units import ARCMIN
 from ...core.workers import MakeWorkers
 from ...imaging.exposure import Exposure
 from ...imaging.galaxies import SkyGalaxies
+from ...pipeline.catalogue.shear_calibration import ShearCalibration
 from ...pipeline.measure.correlation import Correlation
 from ...pipeline.run_folder import CONFIG_NAME
 from ...sky.galaxies import Galaxies
@@ -27,7 +28,7 @@ from ...sky.mosaic import PlantedGalaxies
 from .config import STACK_STAMP, load_visits_configuration
 from .galaxy_shapes import GalaxyShapes, measure_galaxies
 from .measures import correlations
-from .null_result import NullTest, ShearBias, null_metrics, shear_bias
+from .null_result import NullTest, null_metrics, shear_bias
 from .plots import density_picture, null_test_picture
 from .psf_visit import StackFrame, stack_limit
 from .stack import PsfStack
@@ -229,7 +230,7 @@ def _correlations(galaxies: GalaxyShapes, patch: np.ndarray) -> dict[str, Correl
     return correlations(galaxies.x, galaxies.y, kinds, patch)
 
 
-def _calibration(axes: np.ndarray, n: int, measured: list[GalaxyShapes]) -> dict[str, ShearBias]:
+def _calibration(axes: np.ndarray, n: int, measured: list[GalaxyShapes]) -> dict[str, ShearCalibration]:
     """Return the biases of the shear from n rings of galaxies, each under a shear and its opposite, with one noise."""
     along = {kind: np.full((2, n, _ORIENTATIONS), np.nan + 0j) for kind in ("model", "true")}
     for (k, sign), found in zip(_RING_JOBS, measured, strict=True):
