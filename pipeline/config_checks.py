@@ -8,7 +8,7 @@ from ..models.media.silicon import WAVELENGTH_RANGE as SILICON_RANGE
 from ..models.telescope import Telescope
 from .config import Configuration, FocalPlaneConfig, StarsConfig
 from .psf_model.polynomial import term_count
-from .resolved_values import given, noise_free_components
+from .resolved_values import noise_free_components, resolved_value
 from .sensor.brighter_fatter import PIXEL_SIZE as BRIGHTER_FATTER_PIXEL
 from .star_list import NAMES
 
@@ -22,7 +22,7 @@ def check_combinations(config: Configuration, telescope: Telescope, pixel_arcsec
     `pixel_arcsec` is the pixel of the stamps.
     """
     _check_wavelengths(config, telescope)
-    if given(config.psf.stamp) % 2 == 0:
+    if resolved_value(config.psf.stamp) % 2 == 0:
         raise ConfigError(f"psf.stamp = {config.psf.stamp}: expected an odd number of pixels")
     if config.sensor.brighter_fatter is not None and config.psf.pixel_um != BRIGHTER_FATTER_PIXEL * 1e6:
         raise ConfigError(
@@ -43,7 +43,7 @@ def check_combinations(config: Configuration, telescope: Telescope, pixel_arcsec
 
 
 def _check_wavelengths(config: Configuration, telescope: Telescope) -> None:
-    for i, wavelength in enumerate(given(config.wavelengths_nm)):
+    for i, wavelength in enumerate(resolved_value(config.wavelengths_nm)):
         low, high = (1e9 * w for w in telescope.wavelength_range)
         if not low <= wavelength <= high:
             raise ConfigError(
@@ -60,7 +60,7 @@ def _check_wavelengths(config: Configuration, telescope: Telescope) -> None:
 
 def _check_reconstruction(config: Configuration, pixel_arcsec: float) -> None:
     fit = config.reconstruction
-    if not given(fit.weight_fwhm_arcsec) >= pixel_arcsec:
+    if not resolved_value(fit.weight_fwhm_arcsec) >= pixel_arcsec:
         raise ConfigError(
             f"reconstruction.weight_fwhm_arcsec = {fit.weight_fwhm_arcsec:g}: expected at least {pixel_arcsec:.3g}, a"
             f" pixel, and better {WEIGHT_PIXELS * pixel_arcsec:.3g}"
@@ -86,7 +86,7 @@ def _check_catalogue(stars: StarsConfig) -> None:
                 raise ConfigError(
                     f"stars.columns.{key} = {json_text(stars.columns[key])}: expected keys of {', '.join(NAMES)}"
                 )
-        if not given(stars.brightest) < given(stars.faintest):
+        if not resolved_value(stars.brightest) < resolved_value(stars.faintest):
             raise ConfigError(
                 f"stars.faintest = {stars.faintest:g}: expected more than stars.brightest = {stars.brightest:g}"
             )

@@ -18,7 +18,7 @@ from ..models.io.prescription import ENDINGS, prescription_digest
 from .alignment_states import ENDINGS as STATE_ENDINGS
 from .config import Configuration
 from .photometry import band_of
-from .resolved_values import given
+from .resolved_values import resolved_value
 
 #: Keys of catalogues of stars: without a catalogue they are left out, as in hashes from before these keys.
 _CATALOGUE_KEYS = ("catalogue", "columns", "brightest", "faintest")
@@ -34,7 +34,7 @@ def hashed_content(config: Configuration) -> dict[str, Any]:
     if not config.detector.silicon:
         # The section has no effect.
         del content["detector"]
-    name = given(config.telescope)
+    name = resolved_value(config.telescope)
     content["telescope"] = name if name in BUNDLED else prescription_digest(name)
     content = hashed_photometry(hashed_camera(content), config)
     content["focal_plane"] = hashed_heights(content["focal_plane"])
@@ -42,7 +42,7 @@ def hashed_content(config: Configuration) -> dict[str, Any]:
     content["stars"] = hashed_stars(content["stars"])
     if config.pointing is None:
         del content["pointing"]
-    content["atmosphere"]["site"] = _name_or_content(given(config.atmosphere.site), ())
+    content["atmosphere"]["site"] = _name_or_content(resolved_value(config.atmosphere.site), ())
     return content
 
 

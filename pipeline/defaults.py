@@ -35,7 +35,7 @@ from .config import BandName, Configuration, PsfConfig, ReconstructionConfig
 from .config_checks import WEIGHT_PIXELS, check_combinations
 from .photometry import band_of, pixel_angle, resolved_photometry
 from .psf_model.fit import COMPONENTS, ORDERS
-from .resolved_values import given
+from .resolved_values import resolved_value
 from .simulate.photometry import PROVISIONAL_FWHM, limiting_magnitude, saturation_magnitude
 from .simulate.screen_cover import check_screens
 
@@ -156,7 +156,7 @@ def _reconstruction(fit: ReconstructionConfig, weight_fwhm_arcsec: float) -> Rec
         fit = fit.model_copy(update=_KRIGING)
     fit = _with_defaults(fit, _PAPER | {"weight_fwhm_arcsec": weight_fwhm_arcsec})
     components = None if fit.basis == "pixels" else COMPONENTS
-    return _with_defaults(fit, {"components": components, "order": ORDERS[given(fit.interpolation)]})
+    return _with_defaults(fit, {"components": components, "order": ORDERS[resolved_value(fit.interpolation)]})
 
 
 def with_paper_model(config: Configuration) -> Configuration:
@@ -204,7 +204,7 @@ def _stamp_geometry(config: Configuration, telescope: Telescope, camera: Camera)
 
 
 def _pixel_arcsec(psf: PsfConfig, telescope: Telescope) -> float:
-    return pixel_angle(telescope, given(psf.pixel_um) * 1e-6) / ARCSEC
+    return pixel_angle(telescope, resolved_value(psf.pixel_um) * 1e-6) / ARCSEC
 
 
 def _moment_weight(enabled: bool, psf: PsfConfig, telescope: Telescope) -> float:

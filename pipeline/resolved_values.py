@@ -12,7 +12,7 @@ from .psf_model.polynomial import term_count
 _T = TypeVar("_T")
 
 
-def given(value: _T | None) -> _T:
+def resolved_value(value: _T | None) -> _T:
     """Return a value that a resolved configuration always has."""
     if value is None:
         raise ConfigError("the configuration is not resolved")

@@ -58,17 +58,17 @@ class HeightPrior:
     def from_budget(cls, camera: Camera, budget: str | HeightBudget = "simulated", degree: int = DEGREE) -> HeightPrior:
         """Return the prior with the covariance of focal planes drawn from a budget of heights."""
         budget = load_budget(budget) if isinstance(budget, str) else budget
-        bare = replace(camera, placement=None)
+        unplaced = replace(camera, placement=None)
         # Seeds far from those that people choose, so that no run is fitted with its own heights.
         seeds = range(2**31, 2**31 + _DRAWS)
         ccd = np.zeros((len(powers(degree)), len(powers(degree))))
         for term in ("ccd", "tilt", "potato_chip"):
-            drawn = [project(FocalPlane.from_budget(bare, seed=s, terms=(term,), budget=budget), degree) for s in seeds]
-            rows = np.concatenate(drawn)
+            planes = [FocalPlane.from_budget(unplaced, seed=s, terms=(term,), budget=budget) for s in seeds]
+            rows = np.concatenate([project_heights(plane, degree) for plane in planes])
             ccd += rows.T @ rows / len(rows)
         # The quadratic's coefficients are normal but for a scale; many more draws are needed than of CCDs.
         planes = [
-            _quadratic_coefficients(FocalPlane.from_budget(bare, seed=s, terms=("global",), budget=budget))
+            _quadratic_coefficients(FocalPlane.from_budget(unplaced, seed=s, terms=("global",), budget=budget))
             for s in range(2**31, 2**31 + 16 * _DRAWS)
         ]
         rows = np.array(planes)
@@ -199,7 +199,7 @@ def legendre(uv: np.ndarray, degree: int) -> np.ndarray:
     return np.stack([along[0][:, i] * along[1][:, j] for i, j in powers(degree)], axis=1)
 
 
-def project(plane: FocalPlane, degree: int) -> np.ndarray:
+def project_heights(plane: FocalPlane, degree: int) -> np.ndarray:
     """Return the coefficients of each CCD that fit its heights best [m], shape [n_ccd, n_term]."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     v, u = (a.ravel() for a in np.meshgrid(nodes, nodes, indexing="ij"))

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from .basis import Basis
-from .description import CleanStars
+from .clean_stars import CleanStars
 from .polynomial import term_count
 from .shape_noise import ShapeNoise
 

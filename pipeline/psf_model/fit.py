@@ -12,8 +12,8 @@ from ...core.threads import one_blas_thread
 from . import gaussian_process, kriging
 from .basis import BASES, Basis
 from .checks import as_extent, as_stamps, as_weights, check_distinct_positions, check_terms
+from .clean_stars import CleanStars, cleaned_stars, make_basis, project_stars
 from .cross_validation import automatic_orders, choose_by_cross_validation
-from .description import CleanStars, cleaned_stars, make_basis, project
 from .polynomial import MOST_ORDER, as_positions, design_matrix, mapped, term_count
 from .shape_noise import ShapeNoise
 
@@ -122,7 +122,7 @@ def fit_fields(
         order = chosen if fixed is None else fixed
         terms = terms[:, : term_count(order)]
         found = basis_of(stars, basis_weights, count)
-        coefficients, unexplained = project(stars, found, basis)
+        coefficients, unexplained = project_stars(stars, found, basis)
         kernel = alpha = None
         mapped_points = mapped(points, span)
         if interpolation == "gp" and shapes is not None:

@@ -18,7 +18,7 @@ from ...wavefront.psf.engines import ENGINES
 from ...wavefront.psf.psf import make_psfs
 from ..experiment import Experiment
 from ..measure.shapes import measure_shapes
-from ..resolved_values import given
+from ..resolved_values import resolved_value
 from ..sensor.displacement import displace_stamps
 from .photometry import PROVISIONAL_FWHM, electrons, limiting_magnitude
 from .star_field import StarField, make_star_field
@@ -285,6 +285,6 @@ def ccd_stars(experiment: Experiment, name: str, width: float, least_light: floa
         magnitude=magnitude,
         electrons=electrons(magnitude, band, exposure),
         temperature=listed.temperatures(name),
-        bright=given(config.stars.brightest),
-        faint=given(config.stars.faintest),
+        bright=resolved_value(config.stars.brightest),
+        faint=resolved_value(config.stars.faintest),
     )

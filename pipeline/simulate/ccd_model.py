@@ -10,7 +10,7 @@ from ..measure.shapes import Shapes, fwhm, measure_shapes
 from ..measure.star_selection import require_stars
 from ..psf_model.checks import snr_weights
 from ..psf_model.model import CLIP_SIGMA, PsfModel
-from ..resolved_values import given, least_star_count, noise_free_components
+from ..resolved_values import least_star_count, noise_free_components, resolved_value
 from .ccd_exposure import CcdExposure, ccd_stars
 from .ccd_observation import Observation, collected_images, observe_ccd
 from .photometry import effective_fwhm, signal_to_noise
@@ -96,9 +96,9 @@ def fit_ccd_model(
     return PsfModel.fit(
         images,
         stars.observed[used],
-        basis=given(fit.basis),
-        interpolation=given(fit.interpolation),
-        weights=snr_weights(given(fit.weights), snr[used]),
+        basis=resolved_value(fit.basis),
+        interpolation=resolved_value(fit.interpolation),
+        weights=snr_weights(resolved_value(fit.weights), snr[used]),
         n_components=fit.components,
         order=fit.order,
         extent=stars.extent,

@@ -10,7 +10,7 @@ from typing import Any
 from ...core.errors import ConfigError, unknown_name
 from ...models.io.site_file import load_site
 from ...pipeline.config import Configuration, with_options
-from ...pipeline.resolved_values import given
+from ...pipeline.resolved_values import resolved_value
 
 #: Name of the case with all causes, and of the two causes that are no options of the configuration.
 FULL, NOISE, OPTICS = "full", "noise", "optics"
@@ -61,7 +61,7 @@ def _no_atmosphere(config: Configuration) -> str | None:
 def _no_ground_layer(config: Configuration) -> str | None:
     if not config.atmosphere.enabled or config.psf.engine == "long_exposure":
         return "no star is imaged through turbulence"
-    if config.atmosphere.ground_lift_m > 0.0 or load_site(given(config.atmosphere.site)).altitudes[0] > 0.0:
+    if config.atmosphere.ground_lift_m > 0.0 or load_site(resolved_value(config.atmosphere.site)).altitudes[0] > 0.0:
         return "no layer is on the ground"
     return None
 

@@ -12,7 +12,7 @@ from ...pipeline.config import Configuration
 from ...pipeline.psf_model.basis import BASES
 from ...pipeline.psf_model.fit import COMPONENTS, ORDERS
 from ...pipeline.psf_model.polynomial import term_count
-from ...pipeline.resolved_values import given
+from ...pipeline.resolved_values import resolved_value
 
 #: Weights of the stars in the polynomials, as for :func:`~.snr_weights` (equal in the paper).
 POLYNOMIALS = ("equal", "snr", "softened")
@@ -128,8 +128,8 @@ def make_plan(
     base = Case(
         config.stars.observed,
         config.stars.snr_min,
-        given(fit.basis),
-        given(fit.interpolation) if fit.interpolation in PROCESSES else given(fit.weights),
+        resolved_value(fit.basis),
+        resolved_value(fit.interpolation) if fit.interpolation in PROCESSES else resolved_value(fit.weights),
         fit.order or 0,
         fit.components or 0,
     )

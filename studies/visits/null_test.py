@@ -15,7 +15,7 @@ from ...core.files import make_folder, write_bytes, write_json
 from ...core.ordered_jobs import ordered_results
 from ...core.products import Stamp, column, read_fits, table_hdu, write_fits
 from ...core.progress import Reporter
-from ...core.random_streams import natural
+from ...core.random_streams import natural_number
 from ...core.units import ARCMIN
 from ...core.workers import MakeWorkers
 from ...imaging.exposure import Exposure
@@ -27,11 +27,11 @@ from ...sky.galaxies import Galaxies
 from ...sky.mosaic import PlantedGalaxies
 from .config import STACK_STAMP, load_visits_configuration
 from .galaxy_shapes import GalaxyShapes, measure_galaxies
-from .measures import correlations
 from .null_result import NullTest, null_metrics, shear_bias
 from .plots import density_picture, null_test_picture
 from .psf_visit import StackFrame, stack_limit
 from .stack import PsfStack
+from .stack_metrics import correlations
 from .visits import cell_of, pixel_scale_of, stack_path
 
 #: S/N of a star as faint as the faintest galaxies that are drawn: fainter ones have no useful ellipticity.
@@ -168,7 +168,7 @@ class _StackMeasurement:
     def jobs(self, todo: list[tuple[int, int]], tiles: list[tuple[int, int]], rings: int) -> Iterator[dict[str, Any]]:
         """Yield the arguments of :func:`measure_galaxies` for tiles, and then for the rings of all tiles."""
         for tile in todo:
-            key: tuple[str | int, ...] = ("null test", self.stack.visits, *map(natural, tile))
+            key: tuple[str | int, ...] = ("null test", self.stack.visits, *map(natural_number, tile))
             yield self._job(self.galaxies_in(*_tile_ranges(tile, self.cell)), key)
         galaxies = self.ring_galaxies(tiles, rings)
         shear = SHEAR * _shear_along_diagonal(len(galaxies))

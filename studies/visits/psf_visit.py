@@ -16,7 +16,7 @@ from ...pipeline.config import with_options
 from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_psf.stars import CcdStars, FocalPlaneStars
 from ...pipeline.focal_plane_stage import fit_focal_plane_model
-from ...pipeline.resolved_values import given
+from ...pipeline.resolved_values import resolved_value
 from ...pipeline.simulate.ccd_exposure import CcdExposure, ccd_bounds
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_model import fit_ccd_model
@@ -148,7 +148,7 @@ def visit_psfs(
         counts = stars.electrons * seen.lit_fraction
         images = collected_images(experiment, seen.image, seen.pixel_scale, counts)
         observation = observe_ccd(experiment, exposure.name, images, seen.pixel_scale, counts, noisy=True)
-        true = np.concatenate([exposure.holdout.image, given(exposure.centered).image])
+        true = np.concatenate([exposure.holdout.image, resolved_value(exposure.centered).image])
         if together:
             return _CcdResult(exposure, observation, counts, true, None)
         width = effective_fwhm(true, seen.pixel_scale)

@@ -45,11 +45,11 @@ class PsfSums:
         """Return the sums of no visit."""
         return cls(0, np.zeros(n, dtype=np.int32), *np.zeros((2, n, size, size), dtype=np.float32))
 
-    def add(self, seen: VisitPsfs) -> None:
+    def add(self, psfs: VisitPsfs) -> None:
         """Add one visit."""
-        self.true[seen.index] += seen.true
-        self.model[seen.index] += seen.model
-        self.count[seen.index] += 1
+        self.true[psfs.index] += psfs.true
+        self.model[psfs.index] += psfs.model
+        self.count[psfs.index] += 1
         self.visits += 1
 
     def write(self, path: Path, stamp: Stamp) -> None:

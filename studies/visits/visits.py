@@ -23,12 +23,12 @@ from ...pipeline.experiment import Experiment
 from ...pipeline.memory import check_memory
 from ...pipeline.run_folder import CONFIG_NAME, SUMMARY_NAME
 from .config import STACK_STAMP, VisitsConfig, load_visits_configuration
-from .measures import StackCorrelations, stack_correlations, stack_metrics
 from .plan import Visit
 from .plots import correlation_picture, ellipticity_picture
 from .psf_visit import StackFrame, VisitPsfs, check_rotators, visit_experiment, visit_psfs
 from .sky_points import SkyPoints, draw_points
 from .stack import PsfStack, PsfSums
+from .stack_metrics import StackCorrelations, stack_correlations, stack_metrics
 
 #: Sums of the visits so far, from which the stack goes on.
 SUMS_NAME = "sums.fits"

@@ -15,7 +15,7 @@ from ....imaging.image_file import CcdImage
 from ....imaging.wcs import CcdWcs, ccd_wcs
 from ....models.camera.camera import Camera
 from ....pipeline.experiment import Experiment
-from ....pipeline.resolved_values import given
+from ....pipeline.resolved_values import resolved_value
 from ....pipeline.run_folder import CONFIG_NAME
 from ..config import STACK_STAMP, VisitsConfig, load_visits_configuration
 from ..plan import Visit
@@ -85,14 +85,14 @@ class ImageStack:
         settings = _resolved_settings(settings or before or ImageStackConfig(), before, visits, experiment)
         frame = StackFrame.of(experiment, STACK_STAMP)
         source = visits.galaxy_source(experiment, _exposure(experiment, frame))
-        galaxies_in = source.down_to(given(settings.faintest))
+        galaxies_in = source.down_to(resolved_value(settings.faintest))
         return cls(
             folder,
             visits,
             settings,
             experiment,
             frame,
-            choose_tiles(experiment, frame, given(settings.side), settings.tiles, visits),
+            choose_tiles(experiment, frame, resolved_value(settings.side), settings.tiles, visits),
             Sky(sky_points_of(experiment, visits, frame), galaxies_in),
             Stamp(visits.galaxies_digest(experiment, images=settings.model_dump(mode="json")), experiment.config.seed),
         )
@@ -116,7 +116,7 @@ class ImageStack:
                 telescope = visit_telescope(self.experiment, visit)
                 own = {
                     name: ccd_wcs(telescope, camera, name, wavelength=wavelength, threads=threads)
-                    for name in given(self.experiment.config.ccds)
+                    for name in resolved_value(self.experiment.config.ccds)
                 }
                 known = {visit.rotator_deg: own}
             yield visit, {name: VisitWcs(ccd, visit) for name, ccd in known[visit.rotator_deg].items()}

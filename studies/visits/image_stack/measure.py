@@ -14,7 +14,7 @@ from ....core.files import write_bytes, write_json
 from ....core.ordered_jobs import ordered_results
 from ....core.products import Stamp
 from ....core.progress import Reporter
-from ....core.random_streams import natural
+from ....core.random_streams import natural_number
 from ....core.units import ARCMIN
 from ....core.workers import MakeWorkers
 from ....imaging.image_file import CcdImage
@@ -208,7 +208,7 @@ def measure_tile(
         true_usable=usable[1],
     )
     true, axes = galaxies_on(stack.sky, tile, tile.wcs(stack.frame)), stack.frame.matrix
-    key: tuple[str | int, ...] = ("images", psfs.visits, natural(tile.column), natural(tile.row))
+    key: tuple[str | int, ...] = ("images", psfs.visits, natural_number(tile.column), natural_number(tile.row))
     options: dict[str, Any] = {"reach": reach, "threads": threads}
     stamps = measure_galaxies(psfs, axes, true, exposure, stack.stamp.seed, *key, **options)
     both = np.intersect1d(galaxies.index[galaxies.usable], stamps.index[stamps.usable])

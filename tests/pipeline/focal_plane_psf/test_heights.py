@@ -8,7 +8,7 @@ from pachon.models.camera.cameras import load_camera
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.camera.height_budget import SIMULATED
 from pachon.pipeline.focal_plane_psf.covariance import Places
-from pachon.pipeline.focal_plane_psf.heights import DEGREE, HeightPrior, legendre, powers, project
+from pachon.pipeline.focal_plane_psf.heights import DEGREE, HeightPrior, legendre, powers, project_heights
 
 NM = 1e-9
 
@@ -116,7 +116,7 @@ def test_projected_coefficients_are_a_polynomial_focal_plane(part, degree):
     flat = FocalPlane.flat(camera)
     plane = replace(flat, surfaces=replace(flat.surfaces, polynomial=coefficients.copy()))
     prior = HeightPrior.uninformative(camera, degree=degree)
-    parameters = np.concatenate([np.zeros(prior.n_common), project(plane, degree).ravel()])
+    parameters = np.concatenate([np.zeros(prior.n_common), project_heights(plane, degree).ravel()])
     assert len(parameters) == prior.n_parameter
     places = random_places(camera, 300, 4)
     u, v = places.uv.T

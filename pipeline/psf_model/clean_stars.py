@@ -81,7 +81,7 @@ def make_basis(
     return shapelets(stars.mean, stars.deviations, count, shape, scale)
 
 
-def project(stars: CleanStars, found: Basis, basis: str) -> tuple[np.ndarray, np.ndarray]:
+def project_stars(stars: CleanStars, found: Basis, basis: str) -> tuple[np.ndarray, np.ndarray]:
     """Project stars onto their basis: coefficients [n_stars, k], and residual sums of squares [n_stars]."""
     deviations = stars.deviations
     if basis == "pixels":

@@ -17,7 +17,7 @@ _RADII, _ANGLES = 257, 32
 _ROUNDING = 1e-9
 
 
-def passing_packets(
+def transmitted_packets(
     telescope: Telescope, pupil: np.ndarray, directions: np.ndarray, start: np.ndarray
 ) -> np.ndarray | None:
     """Return the packets that can have light behind these apertures, bool [n_field, n_packet].
