@@ -63,8 +63,8 @@ class HeightPrior:
         seeds = range(2**31, 2**31 + _DRAWS)
         ccd = np.zeros((len(powers(degree)), len(powers(degree))))
         for term in ("ccd", "tilt", "potato_chip"):
-            planes = [FocalPlane.from_budget(unplaced, seed=s, terms=(term,), budget=budget) for s in seeds]
-            rows = np.concatenate([project_heights(plane, degree) for plane in planes])
+            drawn = [FocalPlane.from_budget(unplaced, seed=s, terms=(term,), budget=budget) for s in seeds]
+            rows = np.concatenate([project_heights(plane, degree) for plane in drawn])
             ccd += rows.T @ rows / len(rows)
         # The quadratic's coefficients are normal but for a scale; many more draws are needed than of CCDs.
         planes = [
