@@ -245,7 +245,7 @@ def json_text(content: Any) -> str:
 
 
 def plain_values(value: Any, digits: int | None = 9) -> Any:
-    """Return a value as JSON holds it: lists for arrays, None for numbers that are not finite, so many digits or all.
+    """Return a value for JSON: lists for arrays, None for numbers that are not finite, rounded to `digits` if given.
 
     Nine digits are enough, and equal on machines whose sums differ in the last bits.
     """

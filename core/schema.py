@@ -338,7 +338,7 @@ def _one_line_error(problem: Mapping[str, Any], content: Any, source: str, error
 
 
 def _value_text(error: type[PachonError], value: Any) -> str:
-    """Return a value cut short: as JSON in configurations, else as Python has it."""
+    """Return a shortened value: as JSON in configurations, else as Python writes it."""
     return json_text(value) if error is ConfigError else cut_short(repr(value))
 
 

@@ -157,7 +157,7 @@ def _single_number(values: np.ndarray, name: str, kind: str) -> float:
 
 
 def broadcast_together(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
-    """Return arrays, which have names, broadcast to one shape."""
+    """Broadcast named arrays to one shape."""
     try:
         return np.broadcast_arrays(*arrays.values())
     except ValueError:

@@ -99,7 +99,7 @@ class PsfField:
     ) -> PsfField:
         """Fit the noise-free PSFs of a run at its holdout positions (``stars.truth``) on one CCD.
 
-        Their reference points are centred and not their centroids, so what turbulence moves is moved in the images too.
+        Reference points are centred, not centroids, so that images contain the displacements by turbulence.
         Components and order are those of the run, 20 and 4 by default; screens must have been made
         (:meth:`~pachon.Experiment.screens`).
         """

@@ -1,4 +1,4 @@
-"""Stars of a user's catalogue at their places on the CCDs of a camera."""
+"""Stars of a user's catalogue at their positions on the CCDs of a camera."""
 
 from __future__ import annotations
 

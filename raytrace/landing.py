@@ -11,7 +11,7 @@ import numpy as np
 
 #: Distance from its target at which a ray is found, and at which it counts as found after the last step [size].
 _FOUND, _NEAR = 1e-12, 1e-9
-#: Steps of the iteration, and halvings of a step that leads astray.
+#: Most steps of the iteration, and most halvings of a step that increases the distance.
 _STEPS, _HALVINGS = 30, 8
 
 #: Function from coordinates [k, 2] and indices of rays [k] to landing points [k, 2]; NaN where a ray does not arrive.

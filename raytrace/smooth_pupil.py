@@ -13,7 +13,7 @@ import numpy as np
 
 from ..core.threads import one_blas_thread
 
-#: Rays of a field from which on this is faster than to find each by itself.
+#: Fewest rays of a field for which this is faster than separate searches.
 FEWEST = 1500
 #: Degree of the polynomials, and rings of the rays that they go through, of six rays more each.
 _DEGREE, _RINGS = 10, 9

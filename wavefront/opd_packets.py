@@ -65,7 +65,7 @@ def traced_opds(
         lit = lit.astype(np.int32)
         for surfaces in stages if passing is None else stages[-1:]:
             work = np.flatnonzero(lit).astype(np.int32)
-            # A stage before the last counts the lit lanes only.
+            # Stages before the last one only count the lit lanes.
             filled = value[part] if surfaces is whole else value[:0]
             launch(
                 trace_opds.variant_for(surfaces),

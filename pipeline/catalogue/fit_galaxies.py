@@ -23,7 +23,7 @@ STAMP_SIDES = (32, 48, 64, 96, 128)
 STAMP_RADII = 4.0
 #: A fit is flagged where a larger fraction of the pixels in the inner half of its stamp is masked.
 MOST_MASKED = 0.25
-# Least eigenvalue of the covariance over the variance of the PSF: the image of a point may be that much sharper.
+# Least eigenvalue of the covariance over the variance of the PSF: noise may make the image of a point sharper.
 _LEAST_MOMENT = -0.25
 # The largest width, and the largest shift, over the side of the stamp.
 _MOST_WIDTH, _REACH = 0.5, 0.25

@@ -28,7 +28,7 @@ _MAD_TO_SIGMA = 1.4826
 
 
 class StarCut(IntFlag):
-    """Reasons why an object is no star to be used; zero for a selected one.
+    """Reasons for the rejection of an object as a star; zero for a selected one.
 
     ``FLAGGED``: edge, saturated, blended or masked, or such pixels within the stamp. ``FAINT``: below the least S/N.
     ``SIZE``, ``WIDTH``, ``SHAPE``: half-light radius, FWHM and ellipticity apart from those of the locus.

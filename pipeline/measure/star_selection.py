@@ -14,8 +14,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.units import pure_numbers, real_array
 
-# How far stars of one CCD may differ from their median: this fraction of the geometric mean of the pixel's value and
-# the peak's, one standard deviation.
+# Standard deviation of the PSF within a CCD, as a fraction of the geometric mean of the pixel's value and the peak's.
 _PSF_CHANGE = 0.05
 # A pixel is sharper than a star can be if it holds so many times more of the light around it than a star's peak does.
 _SHARPER = 1.5

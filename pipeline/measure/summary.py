@@ -15,7 +15,7 @@ from .correlation import SEPARATION_RANGES, Correlation, shear_correlation
 CORRELATED = ("truth", "observed", "residual", "away")
 #: Shape parameters of which a focal-plane model predicts its uncertainty.
 _PREDICTED = ("e1", "e2", "size")
-#: Pairs are counted from here on [arcmin].
+#: Smallest separation of pairs [arcmin].
 SHORTEST_ARCMIN = 0.5
 _BINS_PER_DECADE = 6
 

@@ -13,7 +13,7 @@ from .shape_noise import ShapeNoise
 
 #: Orders from which an automatic choice is made.
 ORDERS = range(5)
-# Parts of the stars that are held out, one after the other; the i-th star is in part i modulo this.
+# Number of folds; the i-th star is in fold i modulo this.
 _FOLDS = 5
 # Most terms of polynomials over the stars that they are fitted to.
 _MOST_TERMS = 0.5

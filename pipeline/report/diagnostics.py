@@ -37,9 +37,9 @@ from ..run_folder import CONFIG_NAME, SUMMARY_NAME, stamp_of
 from .focal_plane_plots import residual_plot
 from .statistics_plots import correlation_plot, rho_plot
 
-#: Residuals: at the stars, of stars left out, away from them.
+#: Residuals: at the stars, leave-one-out, and at holdout positions.
 RESIDUALS = ("residual", "left_out", "away")
-#: Those of them whose size is known too.
+#: Residuals for which sizes are available too.
 SIZED = ("residual", "away", *CCD_KINDS)
 FOLDER_NAME = "diagnostics"
 _MEANINGS = {

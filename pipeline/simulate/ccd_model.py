@@ -18,7 +18,7 @@ from .star_field import StarField
 
 
 def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = True) -> CcdProduct:
-    """Add noise and defects to the stars of one CCD, unless not `noisy`, and model the PSF from them.
+    """Add noise and defects to the stars of one CCD where `noisy`, and model the PSF from them.
 
     Without noise no pixel is rejected: deviations from the mean are the variation of the PSF.
     """

@@ -22,7 +22,7 @@ FOCAL_PLANE = {"no_telescope": "focal plane, no telescope", "focal_plane": "foca
 NOISE_FREE = math.inf
 
 
-#: Interpolations by a process, which have no order here, and their names.
+#: Interpolations by a process, whose order is fixed here, and their names.
 PROCESSES = {"gp": "Gaussian process", "kriging": "kriging"}
 
 

@@ -194,7 +194,7 @@ def _draw_line(
     """Draw a metric of the fitted cases against their values, negative ones as open markers."""
     rows = [(x, found) for x, case in cases if (found := result.metrics.get(case.normalised())) is not None]
     points = np.array([(x, found[key], found.get(f"error_{key}", np.nan)) for x, found in rows]).reshape(-1, 3)
-    # A perfect fit leaves rounding alone, which has no place on the scale.
+    # Residuals of a perfect fit are rounding errors, and are left out.
     x, value, error = points[np.isfinite(points[:, 1]) & (np.abs(points[:, 1]) > 1e-12)].T
     size = np.abs(value)
     axes.plot(x, size, color=color, linestyle=linestyle, linewidth=1.0, marker="", zorder=2)

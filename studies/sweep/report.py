@@ -84,7 +84,7 @@ def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Cu
             picture = Picture(f"Error budget of {metric}", plots.budget_plot(found), _budget_text(found))
             yield f"budget_{metric}", picture
     if sweep.xi_target is not None:
-        # A metric that nothing raises, as xi of a single CCD may be, has no place on logarithmic axes.
+        # A metric that no parameter raises, such as xi of a single CCD, cannot be drawn on logarithmic axes.
         for metric in (m for m in correlated if any(np.any(curve.change > 0) for curve in drawn[m])):
             allowed = allowances(drawn[metric], sweep.xi_target)
             each = (f"{a.parameter}: {with_error(a.alone, a.error * a.alone)} alone, "

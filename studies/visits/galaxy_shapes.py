@@ -93,7 +93,7 @@ def measure_galaxies(
     seed, *key
         Random stream of the noise.
     reach : float
-        Galaxies farther from every place where the PSF is known are left out [rad].
+        Largest distance of galaxies from the nearest position with a known PSF [rad].
     threads : int, optional
         Number of threads; all processors by default. No byte depends on it.
     """

@@ -36,7 +36,7 @@ from .visits import cell_of, pixel_scale_of, stack_path
 
 #: S/N of a star as faint as the faintest galaxies that are drawn: fainter ones have no useful ellipticity.
 _FAINTEST_SNR = 8.0
-#: Galaxies farther from all places with a known PSF than this are left out, over the mean distance of the places.
+#: Largest distance of galaxies from the nearest position with a known PSF, over the mean distance of these.
 REACH = 2.0
 #: Shear of the calibration.
 SHEAR = 0.02

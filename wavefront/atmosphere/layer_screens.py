@@ -75,7 +75,7 @@ class LayerScreens(Layers):
         return self.screen_size, self.screen_length, (0.0, self.cutoff)
 
     def screen_bytes(self, scales: Iterable[str]) -> int:
-        """Return the memory of the screens of some scales, and of the making of the last of them [bytes]."""
+        """Return the memory of the screens of some scales, and the working memory for the last of them [bytes]."""
         grids = [self._band(scale) for scale in scales]
         stored = sum(4 * self.layer_count * size * size for size, _, _ in grids)
         return stored + max((working_bytes(*grid) for grid in grids), default=0)

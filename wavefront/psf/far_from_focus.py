@@ -43,7 +43,7 @@ def sampling_refinement(optics: PupilOptics, neighbour: float, largest: float, w
 
 
 def check_stamp(optics: PupilOptics, plane: ImagePlane) -> None:
-    """Raise a DomainError if a star's rays fall beside its stamp, where an engine would fold or lose their light."""
+    """Raise a DomainError if rays of a star fall beside its stamp, where engines alias or lose light."""
     half = 0.5 * plane.side
     beside = (np.abs(optics.displacement) > half).any(axis=-1) & optics.lit
     lit = optics.lit.sum(axis=(1, 2))

@@ -61,7 +61,7 @@ _NEGLIGIBLE, _TRIED = 1e-4, 64
 
 
 class WavePsfEngine(PsfEngine):
-    """Fourier optics, one star per thread."""
+    """Fourier optics; each thread computes one star at a time."""
 
     name = "wave"
     depths = 3
