@@ -86,11 +86,11 @@ class FastPsfEngine(PsfEngine):
     options = ("n_pupil", "oversampling")
     screens = ("slopes",)
 
-    def __init__(self, inputs: PsfInputs, finer: int = 1, far: bool = False) -> None:
+    def __init__(self, inputs: PsfInputs, refinement: int = 1, far_from_focus: bool = False) -> None:
         super().__init__(inputs)
-        self._refinement = finer
+        self._refinement = refinement
         #: Inner radius of the points over the outer one, and their area over that of the pupil.
-        self._inner = traced_obscuration(self._obscuration) if far else self._obscuration
+        self._inner = traced_obscuration(self._obscuration) if far_from_focus else self._obscuration
         self._area = (1.0 - self._inner**2) / (1.0 - self._obscuration**2)
         still, n_pupil, oversampling = inputs.atmosphere is None, inputs.n_pupil, inputs.oversampling
         if n_pupil is None:
@@ -188,14 +188,14 @@ class FastPsfEngine(PsfEngine):
             pixel = self._plane.pixel_size
             largest, wanted = RAY_DISTANCE_STILL if self._atmosphere is None else RAY_DISTANCE
             neighbour = 2.0 * self._lattice.spacing / self._diameter
-            finer = sampling_refinement(optics, neighbour, largest * pixel, wanted * pixel)
-            if (finer > 1).any():
-                return expose_by_kind(finer, self._expose_refined, stars)
+            refinement = sampling_refinement(optics, neighbour, largest * pixel, wanted * pixel)
+            if (refinement > 1).any():
+                return expose_by_kind(refinement, self._expose_refined, stars)
         return self._expose_traced(optics, stars)
 
-    def _expose_refined(self, finer: int, stars: Stars) -> ExposedStars:
+    def _expose_refined(self, refinement: int, stars: Stars) -> ExposedStars:
         """Expose stars with a refined sampling of the pupil."""
-        return FastPsfEngine(self._inputs, finer, far=finer > 1).expose_without_refinement(stars)
+        return FastPsfEngine(self._inputs, refinement, far_from_focus=refinement > 1).expose_without_refinement(stars)
 
     def expose_without_refinement(self, stars: Stars) -> ExposedStars:
         """Expose stars with this engine's pupil points, however far from focus they are."""

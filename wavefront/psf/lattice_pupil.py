@@ -81,9 +81,9 @@ class LatticeTransfer:
         """Pupil coordinates [m], shape [n_pupil, 2]."""
         return self.lattice.points @ _TURN.T
 
-    def refined(self, finer: int) -> LatticeTransfer:
+    def refined(self, refinement: int) -> LatticeTransfer:
         """Return the lattice with its spacing divided by a factor."""
-        spacing = self.lattice.spacing / finer
+        spacing = self.lattice.spacing / refinement
         return replace(self, lattice=PupilLattice.fill(self.diameter, self.obscuration, spacing))
 
     def refinement(self, rays: LatticeRays) -> np.ndarray:

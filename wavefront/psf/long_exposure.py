@@ -215,11 +215,11 @@ class LongExposureEngine(PsfEngine):
     def _expose_lattice(self, stars: Stars) -> ExposedStars:
         """Expose stars by lattices as fine as each needs, or by rays where that is too fine."""
         rays = self._lattice_rays(self._lattice, stars)
-        finer = self._lattice.refinement(rays)
-        if (finer == 1).all():
+        refinement = self._lattice.refinement(rays)
+        if (refinement == 1).all():
             return self._expose_autocorrelation([(self._lattice, rays, stars)])
         most = MOST_ACROSS // self._lattice.lattice.size
-        kinds = np.where(finer > most, -drawing_ray_counts(rays.optics, self._plane.pixel_size), finer)
+        kinds = np.where(refinement > most, -drawing_ray_counts(rays.optics, self._plane.pixel_size), refinement)
 
         def expose(kind: int, stars: Stars) -> ExposedStars:
             if kind < 0:

@@ -57,7 +57,7 @@ class MeanRaysEngine(FastPsfEngine):
 
     def __init__(self, inputs: PsfInputs, rays: int) -> None:
         self._air = inputs.atmosphere
-        super().__init__(replace(inputs, atmosphere=None, n_pupil=rays, oversampling=OVERSAMPLING), far=True)
+        super().__init__(replace(inputs, atmosphere=None, n_pupil=rays, oversampling=OVERSAMPLING), far_from_focus=True)
 
     def _place_pupil(self, n_pupil: int) -> None:
         self._points = spiral_annulus(0.5 * self._diameter, self._inner, int(self._area * n_pupil)).points
