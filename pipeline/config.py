@@ -39,7 +39,7 @@ _Declination = Annotated[float, BeforeValidator(plain_number), Field(strict=True
 
 
 class StarsConfig(Section):
-    """Numbers and magnitudes of the stars on a CCD, or their catalogue."""
+    """How many stars stand on a CCD, and how bright they are."""
 
     truth: Count = Field(100, description="noise-free PSFs on each CCD, where no observed star is")
     observed: Count = Field(40, description="observed stars on each CCD")
@@ -77,7 +77,7 @@ class PhotometryConfig(Section):
 
 
 class PointingConfig(Section):
-    """Pointing of the telescope."""
+    """Where the telescope looks."""
 
     ra_deg: Real = Field(0.0, description="right ascension of the optical axis [deg]")
     dec_deg: _Declination = Field(0.0, description="declination of the optical axis [deg]")
@@ -196,7 +196,7 @@ class AtmosphereConfig(Section):
 
 
 class PsfConfig(Section):
-    """Engine and stamps of the point-spread functions."""
+    """How point-spread functions are made."""
 
     engine: Literal["fast", "wave", "long_exposure"] = Field(
         "fast", description="fast (geometric and filters), wave (Fourier optics), long_exposure (mean over turbulence)"
