@@ -151,8 +151,8 @@ def test_lattice_and_strips_agree(silicon, monkeypatch):
     dispersion = np.stack([np.linspace(-1e-6, 1e-6, 5), np.zeros(5)], axis=1)
     given = {"dispersion": dispersion, "jitter": 2e-7, "offsets": [[0.3, 0.2]] * 3, "silicon": silicon}
     found = []
-    for rings in (engine_module.only_rings, lambda telescope: False):
-        monkeypatch.setattr(engine_module, "only_rings", rings)
+    for rings in (engine_module.has_only_annuli, lambda telescope: False):
+        monkeypatch.setattr(engine_module, "has_only_annuli", rings)
         found.append(make_psfs(telescope, fields, wavelengths, atmosphere=air(), engine="long_exposure", **given))
     strips, lattice = found
     np.testing.assert_allclose(lattice.image, strips.image, atol=1.5e-3 * strips.image.max())
