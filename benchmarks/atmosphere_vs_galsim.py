@@ -34,7 +34,7 @@ import scipy.fft
 import pachon
 from pachon.core.random_streams import stream
 from pachon.core.units import ARCMIN, ARCSEC
-from pachon.models.ideal_telescope import without_aberration
+from pachon.models.ideal_telescope import ideal_telescope
 from pachon.models.telescope import Telescope
 from pachon.pipeline.measure.shapes import fwhm
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
@@ -49,9 +49,9 @@ EPOCH_STEP = 60.0
 BINS = {"min_sep": 0.5 * ARCMIN, "max_sep": 10.0 * ARCMIN, "n_bins": 6}
 
 
-def ideal_telescope() -> Telescope:
+def long_paraboloid() -> Telescope:
     """Return a telescope with the LSST's pupil and negligible aberration."""
-    return without_aberration(pachon.load_telescope("lsst_v3.3_r"))
+    return ideal_telescope(pachon.load_telescope("lsst_v3.3_r"))
 
 
 def through_screens(atmosphere: Atmosphere, screens: np.ndarray, **changes) -> Atmosphere:
@@ -165,7 +165,7 @@ def through_galsim_screens(atmosphere: Atmosphere, layers: galsim.PhaseScreenLis
 
 def one_seed(seed: int, exposures: int, stars: int, photons: int) -> dict[str, dict[str, np.ndarray]]:
     """Return the statistics of one seed: of "pachon", "galsim", and pachon through GalSim's screens ("shared")."""
-    telescope = ideal_telescope()
+    telescope = long_paraboloid()
     own = Atmosphere.from_site(SITE, seed, screen_size=SIZE, screen_length=LENGTH)
     layers = galsim_layers(own, seed)
     atmospheres = {

@@ -158,7 +158,9 @@ class Kept:
         prior.add_to(matrix)
         scale = 1.0 / np.sqrt(np.diagonal(matrix))
         root = np.linalg.cholesky(matrix * scale[:, None] * scale)
-        own = np.repeat(np.eye(len(prior.camera)), NODES**2, axis=0)[:, :, None] * prior.own_terms(places)[:, None]
+        own = (
+            np.repeat(np.eye(len(prior.camera)), NODES**2, axis=0)[:, :, None] * prior.ccd_polynomials(places)[:, None]
+        )
         terms = np.concatenate([prior.common_terms(places), own.reshape(len(places), -1)], axis=1)
         return without_plane(np.linalg.solve(root, (terms * scale).T).T, places)
 
@@ -200,7 +202,7 @@ def one_row(
     )
     seconds = time.perf_counter() - start
     if budget is None:
-        prior = HeightPrior.broad(camera, degree=STATIC_DEGREE)
+        prior = HeightPrior.uninformative(camera, degree=STATIC_DEGREE)
     else:
         prior = HeightPrior.from_budget(camera, budget, STATIC_DEGREE)
     places = nodes_of(camera)

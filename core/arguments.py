@@ -66,12 +66,12 @@ def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any
         # At the first call: an annotation may name a class of a module that is imported after this one, and many
         # functions are never called.
         parameters = inspect.signature(function).parameters.values()
-        return {p.name: _check_of_parameter(function, p.name) for p in parameters if p.kind is not p.VAR_KEYWORD}
+        return {p.name: _parameter_check(function, p.name) for p in parameters if p.kind is not p.VAR_KEYWORD}
 
     @functools.wraps(function)
     def checked(*args: Any, **options: Any) -> Any:
         known = checks()
-        # Of several values of ``*names`` each has its check.
+        # Each value of ``*names`` is checked on its own.
         places = list(known.items())
         places += places[-1:] * (len(args) - len(places))
         try:
@@ -101,24 +101,24 @@ def _plain_numbers(value: Any, unit: str, name: str) -> Any:
     return in_unit(value, unit, name).tolist()
 
 
-def _check_of_parameter(function: Callable[..., Any], name: str) -> _Check | None:
+def _parameter_check(function: Callable[..., Any], name: str) -> _Check | None:
     """Return the check of a parameter; None where any value will do."""
     if name not in function.__annotations__:
         return None
     holder = types.SimpleNamespace(__annotations__={name: function.__annotations__[name]})
     names = dict(inspect.unwrap(function).__globals__)
     try:
-        return _check_of(typing.get_type_hints(holder, names)[name])
+        return _annotation_check(typing.get_type_hints(holder, names)[name])
     except NameError as missing:
         # Imported for type checkers only: a package, or a class that some callee checks.
         try:
             names[missing.name] = importlib.import_module(str(missing.name))
         except ImportError:
             return None
-        return _check_of(typing.get_type_hints(holder, names)[name])
+        return _annotation_check(typing.get_type_hints(holder, names)[name])
 
 
-def _check_of(kind: Any) -> _Check | None:
+def _annotation_check(kind: Any) -> _Check | None:
     """Return the check of an annotation; None where any value will do."""
     origin = get_origin(kind) or kind
     if origin in (Union, types.UnionType):
@@ -126,33 +126,33 @@ def _check_of(kind: Any) -> _Check | None:
         if str in arms and any(arm is Path or get_origin(arm) is os.PathLike for arm in arms):
             # Names of bundled files, too, are texts that may be paths.
             others = [a for a in arms if a not in (str, Path, type(None)) and get_origin(a) is not os.PathLike]
-            return _either([_path, *filter(None, map(_check_of, others))], type(None) in arms)
-        arrays = [_array] if set(arms) >= _ARRAY_ARMS else []
+            return _union_check([_valid_path, *filter(None, map(_annotation_check, others))], type(None) in arms)
+        arrays = [_real_array] if set(arms) >= _ARRAY_ARMS else []
         others = [a for a in arms if a is not type(None) and not (arrays and a in _ARRAY_ARMS)]
-        checks = [_check_of(arm) for arm in others]
-        return None if None in checks else _either([*arrays, *filter(None, checks)], type(None) in arms)
+        checks = [_annotation_check(arm) for arm in others]
+        return None if None in checks else _union_check([*arrays, *filter(None, checks)], type(None) in arms)
     if origin is Literal:
-        return _word(get_args(kind))
+        return _word_check(get_args(kind))
     if origin in _SEQUENCES:
-        return _sequence(origin, get_args(kind))
+        return _sequence_check(origin, get_args(kind))
     if origin in (Mapping, dict):
-        return _mapping(get_args(kind))
-    if origin in _PLAIN:
-        return _plain(*_PLAIN[origin])
+        return _mapping_check(get_args(kind))
+    if origin in _PLAIN_CLASSES:
+        return _class_check(*_PLAIN_CLASSES[origin])
     if origin is np.ndarray:
-        return _flags if kind == NDArray[np.bool_] else _plain_array
+        return _boolean_array if kind == NDArray[np.bool_] else _unitless_array
     if origin is Path:
-        return lambda name, value: Path(_path(name, value))
+        return lambda name, value: Path(_valid_path(name, value))
     if origin is Any or not inspect.isclass(origin) or getattr(origin, "_is_protocol", False):
         return None
     expected = f"{'an' if origin.__name__[0] in 'AEIO' else 'a'} {origin.__name__}"
     # Names are easily taken for the objects that a function loads by them.
     loader = getattr(origin, "LOADER", "")
-    return _plain((origin,), f"{expected}, as of {loader}" if loader else expected)
+    return _class_check((origin,), f"{expected}, as of {loader}" if loader else expected)
 
 
-#: Classes of values that plain annotations allow, and what is expected.
-_PLAIN: dict[Any, tuple[tuple[Any, ...], str]] = {
+#: Classes of values that plain annotations allow, and their description in messages.
+_PLAIN_CLASSES: dict[Any, tuple[tuple[Any, ...], str]] = {
     bool: ((bool, np.bool_), "True or False"),
     int: ((int, np.integer), "a whole number"),
     float: ((float, int, np.floating, np.integer), "a number"),
@@ -160,14 +160,14 @@ _PLAIN: dict[Any, tuple[tuple[Any, ...], str]] = {
     os.PathLike: ((os.PathLike,), "a path"),
     Callable: ((Callable,), "a function"),
 }
-#: Whole numbers to Python and NumPy, and to nobody else.
+#: Types that Python and NumPy take for whole numbers, and that are refused here.
 _NO_NUMBERS = (bool, np.timedelta64)
 #: Longest path, and longest name of a file or folder, of common systems [characters].
 _LONGEST_PATH, _LONGEST_NAME = 4096, 255
 _SEQUENCES = (tuple, list, Sequence, Iterable)
 
 
-def _plain(accepted: tuple[Any, ...], expected: str) -> _Check:
+def _class_check(accepted: tuple[Any, ...], expected: str) -> _Check:
     numbers = int in accepted
 
     def check(name: str, value: Any) -> Any:
@@ -180,7 +180,7 @@ def _plain(accepted: tuple[Any, ...], expected: str) -> _Check:
     return check
 
 
-def _array(name: str, value: Any) -> Any:
+def _real_array(name: str, value: Any) -> Any:
     if type(value) is float or type(value) is int:
         return value
     numbers = real_numbers(value)
@@ -189,13 +189,13 @@ def _array(name: str, value: Any) -> Any:
     return numbers
 
 
-def _plain_array(name: str, value: Any) -> Any:
+def _unitless_array(name: str, value: Any) -> Any:
     if is_quantity(value):
         raise _MismatchError(name, value, "numbers without a unit")
-    return np.asarray(_array(name, value))
+    return np.asarray(_real_array(name, value))
 
 
-def _flags(name: str, value: Any) -> Any:
+def _boolean_array(name: str, value: Any) -> Any:
     try:
         flags = np.asarray(value).dtype.kind == "b"
     except ValueError:
@@ -205,7 +205,7 @@ def _flags(name: str, value: Any) -> Any:
     return value
 
 
-def _path(name: str, value: Any) -> str | os.PathLike[str]:
+def _valid_path(name: str, value: Any) -> str | os.PathLike[str]:
     if not isinstance(value, (str, os.PathLike)):
         raise _MismatchError(name, value, "a path")
     text = os.fspath(value)
@@ -215,7 +215,7 @@ def _path(name: str, value: Any) -> str | os.PathLike[str]:
     return value
 
 
-def _word(words: tuple[Any, ...]) -> _Check:
+def _word_check(words: tuple[Any, ...]) -> _Check:
     def check(name: str, value: Any) -> Any:
         if not (isinstance(value, str) and value in words):
             raise _MismatchError(name, value, f"one of {', '.join(words)}" if len(words) > 1 else words[0], ConfigError)
@@ -224,7 +224,7 @@ def _word(words: tuple[Any, ...]) -> _Check:
     return check
 
 
-def _either(checks: list[_Check], optional: bool) -> _Check:
+def _union_check(checks: list[_Check], optional: bool) -> _Check:
     def check(name: str, value: Any) -> Any:
         if optional and value is None:
             return None
@@ -244,9 +244,9 @@ def _either(checks: list[_Check], optional: bool) -> _Check:
     return check
 
 
-def _sequence(kind: Any, elements: tuple[Any, ...]) -> _Check:
+def _sequence_check(kind: Any, elements: tuple[Any, ...]) -> _Check:
     fixed = kind is tuple and Ellipsis not in elements
-    checks = [_check_of(element) for element in elements if element is not Ellipsis] or [None]
+    checks = [_annotation_check(element) for element in elements if element is not Ellipsis] or [None]
     expected = f"a sequence of {len(checks)}" if fixed else "a sequence"
     simple = {element for element in elements if element is not Ellipsis}
     simple = simple if kind is tuple and len(simple) == 1 and get_origin(*simple) is None else set()
@@ -279,8 +279,8 @@ def _sequence(kind: Any, elements: tuple[Any, ...]) -> _Check:
     return check
 
 
-def _mapping(kinds: tuple[Any, ...]) -> _Check:
-    check_key, check_value = (_check_of(kind) for kind in kinds) if kinds else (None, None)
+def _mapping_check(kinds: tuple[Any, ...]) -> _Check:
+    check_key, check_value = (_annotation_check(kind) for kind in kinds) if kinds else (None, None)
 
     def check(name: str, value: Any) -> Any:
         if not isinstance(value, Mapping):

@@ -1,7 +1,7 @@
-"""Large arrays whose memory is used again.
+"""Memory pool for large arrays.
 
-The first write to fresh memory costs the system a page fault for every 4 kB, a fifth of the time of a trace. The memory
-of a result that is gone has had them.
+The first write to fresh memory costs a page fault for every 4 kB, a fifth of the time of a trace. Memory of deleted
+arrays is reused without these faults.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-#: Smallest array whose memory is kept [bytes]; the allocator itself keeps that of smaller ones.
+#: Smallest array that uses the pool [bytes]; the allocator reuses the memory of smaller ones itself.
 _LEAST = 1 << 20
-#: Memory that waits to be used again, at most [bytes].
+#: Largest total of the unused blocks [bytes].
 MOST = 1 << 28
-#: A block may be so much larger than the array that it is given to.
+#: Largest size of a block over that of the array that uses it.
 _SLACK = 1.25
 
 
-class _Blocks:
-    """Blocks of memory that wait to be used again, the oldest first; safe with threads."""
+class _MemoryPool:
+    """Unused blocks of memory, oldest first; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -42,8 +42,8 @@ class _Blocks:
         return np.empty(count, dtype=np.uint8)
 
     def give(self, block: np.ndarray) -> None:
-        """Keep a block, and let the oldest go where it is too much."""
-        # A garbage collection may end an array within these lines: such a block is not kept.
+        """Return a block to the pool, and free the oldest ones beyond its limit."""
+        # Garbage collection may delete an array within these lines; its block is then freed.
         if not self._lock.acquire(blocking=False):
             return
         try:
@@ -54,14 +54,14 @@ class _Blocks:
             self._lock.release()
 
 
-_BLOCKS = _Blocks()
+_POOL = _MemoryPool()
 
 
-class _Lent:
-    """Owner of the memory of one array, which ends with the last view of it."""
+class _PooledMemory:
+    """Memory of one array, which returns to the pool with the last view of it."""
 
     def __init__(self, block: np.ndarray, shape: tuple[int, ...], dtype: np.dtype) -> None:
-        self._block, self._blocks = block, _BLOCKS
+        self._block, self._blocks = block, _POOL
         self.__array_interface__: dict[str, Any] = {
             "data": (block.ctypes.data, False),
             "shape": shape,
@@ -74,7 +74,7 @@ class _Lent:
 
 
 def empty(shape: tuple[int, ...], dtype: DTypeLike = np.float64) -> np.ndarray:
-    """Return an array of unset values; that of a large one goes back into use with the last view of it."""
+    """Return an uninitialised array; the memory of a large one comes from the pool."""
     kind = np.dtype(dtype)
     count = math.prod(shape) * kind.itemsize
-    return np.empty(shape, kind) if count < _LEAST else np.asarray(_Lent(_BLOCKS.take(count), shape, kind))
+    return np.empty(shape, kind) if count < _LEAST else np.asarray(_PooledMemory(_POOL.take(count), shape, kind))

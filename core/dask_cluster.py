@@ -13,16 +13,16 @@ from uuid import uuid4
 
 from .errors import ConfigError, ProductError
 from .version import VERSION
-from .workers import AHEAD, Compute, Workers
+from .workers import JOBS_AHEAD, Compute, Workers
 
-#: Longest wait for an answer of a scheduler [s].
+#: Timeout of the connection to a scheduler [s].
 CONNECT_SECONDS = 20.0
 
 
 def dask_workers(compute: Compute, client: Any, *, local: bool = False) -> Workers:
     """Return the workers of a Dask cluster, reached through a ``distributed.Client``; `local` ones are of this machine.
 
-    The jobs of a lost worker are done by another. Without any worker, the results wait until one comes.
+    Jobs of a lost worker are repeated by another one. Without workers, results wait for the first one.
     """
     info = client.scheduler_info()
     count = len(info["workers"])
@@ -33,7 +33,7 @@ def dask_workers(compute: Compute, client: Any, *, local: bool = False) -> Worke
         from distributed.scheduler import KilledWorker
 
         source = iter(jobs)
-        ahead = AHEAD * max(1, sum(client.nthreads().values()))
+        ahead = JOBS_AHEAD * max(1, sum(client.nthreads().values()))
         # Own keys: one scheduler may serve several computations, each with a first job.
         batch = uuid4().hex[:8]
 

@@ -1,4 +1,4 @@
-"""Units and meanings of attributes and arguments, as the docstrings state them."""
+"""Units and descriptions of attributes and arguments, read from docstrings."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def described(kind: Any, name: str) -> Description:
     member = inspect.getattr_static(kind, name, None)
     text = inspect.getdoc(member) if isinstance(member, (property, functools.cached_property)) else None
     if text is None:
-        lists = (_listed(base.__doc__) for base in getattr(kind, "__mro__", [kind]) if base.__doc__)
+        lists = (_documented_entries(base.__doc__) for base in getattr(kind, "__mro__", [kind]) if base.__doc__)
         text = next((entries[name] for entries in lists if name in entries), "")
     return Description(_unit_of(text), _first_sentence(text))
 
 
-def _listed(docstring: str) -> dict[str, str]:
+def _documented_entries(docstring: str) -> dict[str, str]:
     """Return the entries of the sections Attributes and Parameters of a docstring, by name."""
     found = {}
     sections = _SECTION.split(inspect.cleandoc(docstring))

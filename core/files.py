@@ -21,7 +21,7 @@ import numpy as np
 
 from .errors import PachonError, ProductError, cut_short
 
-# Of the file that tells whether there is room [byte].
+# Size of the file that probes for free space [byte].
 _PROBE = 4096
 
 
@@ -33,7 +33,7 @@ def write_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError
 def write_new_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError) -> bool:
     """Write a file whole as :func:`write_bytes` does, and return True; or return False where there is one already.
 
-    Of several processes that write the same file at the same time, one gets True.
+    If several processes write the file at the same time, the result is True in one of them.
     """
     try:
         _write(path, data, error, publish_new)
@@ -43,7 +43,7 @@ def write_new_bytes(path: Path, data: bytes, error: type[PachonError] = ProductE
 
 
 def require_writable(path: Path, *, file: bool = False, error: type[PachonError] = ProductError) -> None:
-    """Raise `error` where neither a file nor a folder of a path can be written, before anything is computed for it.
+    """Raise `error` where a path cannot be written, before anything is computed for it.
 
     A `file` needs a folder that there is; missing folders of other paths can be made.
 
@@ -64,10 +64,10 @@ def require_writable(path: Path, *, file: bool = False, error: type[PachonError]
 
 
 def claim_folder(path: Path, content: bytes, *, products: str, check: Callable[[], None]) -> None:
-    """Write the configuration of a run into its folder, or find that the folder is another run's.
+    """Write the configuration of a run into its folder, or check the one that is there.
 
-    Of runs that start together in a new folder one writes the file. To the others, and in an old folder, `check`
-    compares it with theirs and raises where they differ; otherwise it is written again.
+    If several runs start in a new folder together, one of them writes the file. In the others, and in an existing
+    folder, `check` compares it with their own and raises where they differ; otherwise it is written again.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def claim_folder(path: Path, content: bytes, *, products: str, check: Callable[[
 
 def partial_path(path: Path) -> Path:
     """Return the temporary path under which this process writes a file."""
-    return path.with_name(f".{path.name}.{_owner(os.getpid())}.partial")
+    return path.with_name(f".{path.name}.{_owning_process(os.getpid())}.partial")
 
 
 def _write(path: Path, data: bytes, error: type[PachonError], publish: Callable[[Path, Path], None]) -> None:
@@ -132,11 +132,11 @@ def publish_new(partial: Path, path: Path) -> None:
 
 @contextmanager
 def marked_folder(folder: Path) -> Iterator[str]:
-    """Put a file of a unique name into a folder, and yield that name: who finds it there sees the same folder.
+    """Put a file of a unique name into a folder, and yield the name; processes that find it share the folder.
 
     The file is a temporary one, which :func:`make_folder` knows.
     """
-    mark = folder / f".{uuid4().hex}.{_owner(os.getpid())}.partial"
+    mark = folder / f".{uuid4().hex}.{_owning_process(os.getpid())}.partial"
     write_bytes(mark, b"")
     try:
         yield mark.name
@@ -147,7 +147,7 @@ def marked_folder(folder: Path) -> Iterator[str]:
 
 @contextmanager
 def folder_of_worker(folder: Path, mark: str) -> Iterator[Path]:
-    """Yield a folder where a worker sees its mark (:func:`marked_folder`), and a temporary one where it does not."""
+    """Yield a folder that contains its mark (:func:`marked_folder`), or a temporary one where the mark is missing."""
     if (folder / mark).is_file():
         yield folder
         return
@@ -160,17 +160,17 @@ def _remove_leftovers(folder: Path) -> None:
     for left_over in folder.glob(".*.partial"):
         owner = left_over.name.removesuffix(".partial")
         process = owner.rpartition("-")[2]
-        if owner.endswith(f".{_owner(process)}") and process.isdecimal() and not _alive(int(process)):
+        if owner.endswith(f".{_owning_process(process)}") and process.isdecimal() and not _is_running(int(process)):
             with suppress(OSError):
                 left_over.unlink()
 
 
-def _owner(process: int | str) -> str:
+def _owning_process(process: int | str) -> str:
     """Return the part of the name of temporary files that tells machine and process."""
     return f"{platform.node()}-{process}"
 
 
-def _alive(process: int) -> bool:
+def _is_running(process: int) -> bool:
     if os.name == "nt":
         # There, signal 0 would end the process.
         return True
@@ -245,7 +245,7 @@ def json_text(content: Any) -> str:
 
 
 def plain_values(value: Any, digits: int | None = 9) -> Any:
-    """Return a value as JSON holds it: lists for arrays, None for numbers that are not finite, so many digits or all.
+    """Return a value for JSON: lists for arrays, None for numbers that are not finite, rounded to `digits` if given.
 
     Nine digits are enough, and equal on machines whose sums differ in the last bits.
     """

@@ -13,7 +13,7 @@ from typing import Any
 
 @contextmanager
 def remembered_interrupts() -> Iterator[Callable[[], None]]:
-    """Remember Ctrl-C inside a with block; yields a function that raises KeyboardInterrupt if it was pressed.
+    """Record Ctrl-C inside a with block; yield a function that raises KeyboardInterrupt if it was pressed.
 
     An interrupt raises KeyboardInterrupt at once, as ever. Where that is dropped, in the ``__del__`` of an array, say,
     Python prints a traceback and goes on; here it prints nothing, and the next call of the function raises it again.

@@ -81,7 +81,7 @@ def load_kernels(kernel: wp.Kernel, device: str = "cpu") -> None:
 
 
 def _with_kernel_cache(use: Callable[[], Any]) -> str:
-    """Do what writes compiled kernels, in a temporary folder where theirs cannot be written; return what to tell."""
+    """Call a function that writes compiled kernels, with a temporary cache if necessary; return a warning."""
     try:
         use()
     except OSError as error:

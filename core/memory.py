@@ -19,7 +19,7 @@ def available_bytes(root: Path = Path("/")) -> int | None:
     (containers and batch systems set their limits there), by the files in ``proc`` and ``sys`` under `root`. Cached
     files, which the kernel drops when it must, count as free. None on systems without these files.
     """
-    return min((*_machine(root), *_groups(root)), default=None)
+    return min((*_machine_memory(root), *_control_groups(root)), default=None)
 
 
 def require_bytes(needed: int, what: str) -> None:
@@ -35,14 +35,14 @@ def readable(count: float) -> str:
     return f"{size:.0f} {unit}" if size >= 9.95 else f"{size:.1f} {unit}"
 
 
-def _machine(root: Path) -> Iterator[int]:
+def _machine_memory(root: Path) -> Iterator[int]:
     for line in _lines(root / "proc/meminfo"):
         words = line.split()
         if len(words) > 1 and words[0] == "MemAvailable:" and words[1].isdigit():
             yield 1024 * int(words[1])
 
 
-def _groups(root: Path) -> Iterator[int]:
+def _control_groups(root: Path) -> Iterator[int]:
     for line in _lines(root / "proc/self/cgroup"):
         number, _, rest = line.partition(":")
         controllers, _, path = rest.partition(":")
@@ -56,10 +56,10 @@ def _groups(root: Path) -> Iterator[int]:
         # nothing but the base.
         inner = Path(path.strip().lstrip("/"))
         for folder in (inner, *inner.parents):
-            yield from _left(base / folder, *names)
+            yield from _group_room(base / folder, *names)
 
 
-def _left(folder: Path, limit_name: str, used_name: str, cached_key: str) -> Iterator[int]:
+def _group_room(folder: Path, limit_name: str, used_name: str, cached_key: str) -> Iterator[int]:
     """Return the room left in one group, if it has a limit."""
     limit, used = (next(iter(_lines(folder / name)), "").strip() for name in (limit_name, used_name))
     if limit.isdigit() and used.isdigit():

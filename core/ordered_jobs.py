@@ -1,4 +1,4 @@
-"""Jobs whose results are taken in order, whatever workers compute them: sums over them keep their bytes."""
+"""Results of parallel jobs in the order of the jobs, so that sums over them are reproducible."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reports as one HTML file with everything in it, pictures included, and numbers with the digits that errors allow."""
+"""Reports as one self-contained HTML file, and numbers rounded to the digits that their errors allow."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ def draw_stamps(ax: Axes | Figure | None, images: np.ndarray, pixel: float, titl
 
 
 def picture_bytes(figure: Figure, kind: str, dpi: int = _DPI) -> bytes:
-    """Return a figure as the bytes of a png, pdf or svg file, without the date and the version of what drew it."""
+    """Return a figure as the bytes of a png, pdf or svg file, without date and version of the software."""
     if kind not in _NAMELESS:
         raise ConfigError(f"picture format {kind!r}: expected one of {', '.join(_NAMELESS)}")
     buffer = io.BytesIO()
@@ -143,7 +143,7 @@ def _draw_once(figure: Figure, buffer: io.BytesIO, dpi: int) -> None:
 
 
 def png_bytes(figure: Figure) -> bytes:
-    """Return a figure as PNG, without the date and the version of what drew it."""
+    """Return a figure as PNG, without date and version of the software."""
     return picture_bytes(figure, "png")
 
 

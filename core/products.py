@@ -126,7 +126,7 @@ def table_hdu(name: str, columns: Columns) -> fits.BinTableHDU:
 
 
 def image_hdu(name: str, image: np.ndarray, comment: str) -> fits.ImageHDU:
-    """Return a FITS image in single precision with a comment on what it holds."""
+    """Return a FITS image in single precision with a comment on its content."""
     hdu = fits.ImageHDU(np.asarray(image, dtype=np.float32), name=name)
     hdu.header["COMMENT"] = comment
     return hdu

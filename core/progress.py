@@ -48,18 +48,18 @@ class Stage:
         seconds = time.perf_counter() - self._start
         left = seconds / done * (total - done)
         time_left = f"{left:.0f} s" if left < 100.0 else f"{left / 60.0:.0f} min"
-        rest = f", {_rate(done / seconds)}, about {time_left} left" if done < total else ""
+        rest = f", {_speed_text(done / seconds)}, about {time_left} left" if done < total else ""
         self.line(f"{name} ({done} of {total}{rest})")
 
 
-class _Rate(ProgressColumn):
+class _SpeedColumn(ProgressColumn):
     """Items per second, or per minute where they take long."""
 
     def render(self, task: Task) -> Text:
-        return Text("" if not task.speed else _rate(task.speed), style="progress.data.speed")
+        return Text("" if not task.speed else _speed_text(task.speed), style="progress.data.speed")
 
 
-def _rate(per_second: float) -> str:
+def _speed_text(per_second: float) -> str:
     return f"{per_second:.3g}/s" if per_second >= 0.1 else f"{60.0 * per_second:.3g}/min"
 
 
@@ -96,7 +96,7 @@ class Reporter:
             TextColumn("{task.description}"),
             BarColumn(bar_width=32),
             MofNCompleteColumn(),
-            _Rate(),
+            _SpeedColumn(),
             TimeRemainingColumn(compact=True),
             TimeElapsedColumn(),
         )

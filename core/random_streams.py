@@ -19,6 +19,6 @@ def stream(seed: int, *key: str | int) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(int(seed), spawn_key=words)))
 
 
-def natural(number: int) -> int:
-    """Return a number of its own, not negative, for each integer, as keys of streams must be."""
+def natural_number(number: int) -> int:
+    """Map integers to distinct natural numbers: keys of random streams are not negative."""
     return 2 * abs(number) + (number < 0)

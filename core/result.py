@@ -57,13 +57,13 @@ class Result:
         return {name: getattr(self, name) for name in self._table}
 
     def _meta(self) -> dict[str, Any]:
-        """Return what holds for all rows: the scalars among the fields."""
+        """Return the values common to all rows: the scalars among the fields."""
         assert is_dataclass(self)
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         return {k: v for k, v in values.items() if isinstance(v, (str, int, float, np.number)) and k not in self._table}
 
     def _summary(self) -> dict[str, Any]:
-        """Return the results by name: what holds for all rows, and the median of each column of numbers."""
+        """Return the results by name: values common to all rows, and the median of each column of numbers."""
         table = self.to_table()
         columns = {name: np.asarray(table[name]) for name in table.colnames}
         medians = {
@@ -130,7 +130,7 @@ class Values(Result):
 
     def _label(self) -> str:
         few = [*self._values().items()][:_NAMED]
-        return ", ".join(f"{name} {_cell(value)}" for name, value in few)
+        return ", ".join(f"{name} {_cell_text(value)}" for name, value in few)
 
     def _columns(self) -> dict[str, Any]:
         return {name: [value] for name, value in self._values().items()}
@@ -153,16 +153,16 @@ def html_table(table: QTable, rows: int = _ROWS) -> str:
         unit = getattr(table[name], "unit", None)
         text = f"{name} [{unit}]" if unit else name
         heads.append(f'<th title="{escape(table[name].info.description or "")}">{escape(text)}</th>')
-        cells.append([escape(_cell(value)) for value in table[name][:rows]])
+        cells.append([escape(_cell_text(value)) for value in table[name][:rows]])
     lines = [f"<tr>{''.join(f'<td>{c}</td>' for c in row)}</tr>" for row in zip(*cells, strict=True)]
     more = f"<p>{len(table) - rows} more rows</p>" if len(table) > rows else ""
     body = f"<table><tr>{''.join(heads)}</tr>{''.join(lines)}</table>"
     return f'<div style="overflow-x:auto">{body}</div>{more}'
 
 
-def _cell(value: Any) -> str:
+def _cell_text(value: Any) -> str:
     value = getattr(value, "value", value)
     if np.ndim(value):
         few = np.ravel(value)
-        return ", ".join(map(_cell, few[:4])) + (", ..." if len(few) > 4 else "")
+        return ", ".join(map(_cell_text, few[:4])) + (", ..." if len(few) > 4 else "")
     return f"{value:.5g}" if isinstance(value, (float, np.floating)) else str(value)

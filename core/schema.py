@@ -93,7 +93,7 @@ def validated(
         except ValidationError as problems:
             # A misspelt key is the likelier cause of the other problems, so it goes first.
             first = min(problems.errors(include_url=False), key=lambda p: p["type"] != "unknown_key")
-            found = _in_one_line(first, content, source, error)
+            found = _one_line_error(first, content, source, error)
             if drop is None or first["type"] != "unknown_key":
                 raise found from None
             drop(found)
@@ -115,7 +115,7 @@ def problems_of(
         except ValidationError as problems:
             errors = problems.errors(include_url=False)
             unknown = [p for p in errors if p["type"] == "unknown_key"]
-            found += [_in_one_line(p, content, source, error) for p in unknown or errors]
+            found += [_one_line_error(p, content, source, error) for p in unknown or errors]
             for one in unknown:
                 del one["input"][one["ctx"]["key"]]
             if unknown:
@@ -199,7 +199,7 @@ def _build(section: Parameters) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class WrittenAs:
-    """Conversion of a value to what a file has, as an annotation."""
+    """Conversion of a value to its form in a file, as an annotation."""
 
     convert: Callable[[Any], Any]
 
@@ -312,13 +312,13 @@ _EXPECTED = {
 _LIMITS = {"greater_than": ("gt", "above"), "greater_than_equal": ("ge", "from"), "less_than_equal": ("le", "up to")}
 
 
-def _in_one_line(problem: Mapping[str, Any], content: Any, source: str, error: type[PachonError]) -> PachonError:
+def _one_line_error(problem: Mapping[str, Any], content: Any, source: str, error: type[PachonError]) -> PachonError:
     kind, value, limits = problem["type"], problem["input"], problem.get("ctx", {})
-    path = _dotted([*problem["loc"], *filter(None, [limits.get("key")])], content)
+    path = _key_path([*problem["loc"], *filter(None, [limits.get("key")])], content)
     if kind == "unknown_key":
         key, known = limits["key"], limits["known"]
         hint = nearest(key, known) or f"expected one of {', '.join(known)}"
-        return error(f"unknown key {path} = {_as_in(error, value[key])}: {hint}", file=source, key=path)
+        return error(f"unknown key {path} = {_value_text(error, value[key])}: {hint}", file=source, key=path)
     if kind == "problem":
         return error(f"{path}{limits['text']}", file=source, key=path)
     if limits.get("key"):
@@ -334,11 +334,11 @@ def _in_one_line(problem: Mapping[str, Any], content: Any, source: str, error: t
         text = f"a number {word} {limits[name]:g}"
     else:
         text = _EXPECTED.get(kind, problem["msg"])
-    return error(f"{path} = {_as_in(error, value)}: expected {text}", file=source, key=path)
+    return error(f"{path} = {_value_text(error, value)}: expected {text}", file=source, key=path)
 
 
-def _as_in(error: type[PachonError], value: Any) -> str:
-    """Return a value cut short: as JSON in configurations, else as Python has it."""
+def _value_text(error: type[PachonError], value: Any) -> str:
+    """Return a shortened value: as JSON in configurations, else as Python writes it."""
     return json_text(value) if error is ConfigError else cut_short(repr(value))
 
 
@@ -346,7 +346,7 @@ def _as_in(error: type[PachonError], value: Any) -> str:
 _LABELS = {"layers": "altitude", "shape": "shape"}
 
 
-def _dotted(location: Iterable[int | str], content: Any) -> str:
+def _key_path(location: Iterable[int | str], content: Any) -> str:
     """Return a location as a path of keys: ``surfaces[M1].radius``; tags, in angle brackets, are left out."""
     path = label = ""
     for part in location:

@@ -1,4 +1,4 @@
-"""A second process beside this one, for what would otherwise wait for it, such as half of the plots of a report."""
+"""A second process for computations in parallel with this one, such as half of the plots of a report."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def second_process(threads: int | None = None) -> Iterator[Submit]:
     """
     alone = threading.active_count() == 1 and not current_process().daemon
     if thread_count(threads) == 1 or not alone or sys.platform != "linux":
-        yield _here
+        yield _run_at_once
         return
     pool = ProcessPoolExecutor(1, mp_context=get_context("fork"), initializer=begin_worker, initargs=(os.getpid(),))
 
@@ -49,7 +49,7 @@ def second_process(threads: int | None = None) -> Iterator[Submit]:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _here(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+def _run_at_once(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
     result = function(*arguments)
     return lambda: result
 

@@ -34,7 +34,7 @@ def real_numbers(values: Any) -> Any:
     """
     if type(values) is np.ndarray:
         return values if values.dtype.kind in "iuf" else None
-    if isinstance(values, (tuple, list)) and any(map(_is_apart, values)):
+    if isinstance(values, (tuple, list)) and any(map(_has_unit_or_mask, values)):
         found = [real_numbers(v) for v in values]
         return None if any(v is None for v in found) else found
     if hasattr(values, "mask") and hasattr(values, "filled"):
@@ -50,7 +50,7 @@ def real_numbers(values: Any) -> Any:
     return values if values.dtype.kind in "iuf" else None
 
 
-def _is_apart(value: Any) -> bool:
+def _has_unit_or_mask(value: Any) -> bool:
     """Return whether NumPy would lose unit or mask of a value where it makes one array of several."""
     return isinstance(value, np.ma.MaskedArray) or is_quantity(value)
 
@@ -135,20 +135,20 @@ def metres(value: Any, name: str) -> np.ndarray:
 
 def length(value: Any, name: str) -> float:
     """Return one length in metres; plain numbers are metres already."""
-    return _one(metres(value, name), name, "length")
+    return _single_number(metres(value, name), name, "length")
 
 
 def angle(value: Any, name: str) -> float:
     """Return one angle in radians; plain numbers are radians already."""
-    return _one(radians(value, name), name, "angle")
+    return _single_number(radians(value, name), name, "angle")
 
 
 def one_number(value: Any, name: str) -> float:
     """Return one number without a unit."""
-    return _one(pure_numbers(value, name), name, "number")
+    return _single_number(pure_numbers(value, name), name, "number")
 
 
-def _one(values: np.ndarray, name: str, kind: str) -> float:
+def _single_number(values: np.ndarray, name: str, kind: str) -> float:
     if values.ndim:
         raise DomainError(f"{name} has shape {values.shape}: expected one {kind}")
     if _LARGEST < np.abs(values) < np.inf:
@@ -157,7 +157,7 @@ def _one(values: np.ndarray, name: str, kind: str) -> float:
 
 
 def broadcast_together(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
-    """Return arrays, which have names, broadcast to one shape."""
+    """Broadcast named arrays to one shape."""
     try:
         return np.broadcast_arrays(*arrays.values())
     except ValueError:

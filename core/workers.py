@@ -33,11 +33,11 @@ class Job(Protocol):
 
 #: Picklable function that does one job on a number of threads and returns its result.
 Compute = Callable[[Any, int], Any]
-#: Jobs handed out ahead of the results, to each worker: none waits, and a cluster never holds all jobs.
-AHEAD = 2
+#: Jobs submitted to each worker ahead of its results: no worker idles, and a cluster never holds all jobs.
+JOBS_AHEAD = 2
 #: Variables that bound the threads of libraries.
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-#: Time between two looks of a worker at whether its driver lives [s].
+#: Interval at which a worker checks that its parent process is alive [s].
 PARENT_SECONDS = 0.5
 
 
@@ -80,7 +80,7 @@ def process_workers(compute: Compute, count: int, threads: int | None = None) ->
             try:
                 for job in jobs:
                     waiting.add(pool.submit(compute, job, each))
-                    if len(waiting) >= AHEAD * count:
+                    if len(waiting) >= JOBS_AHEAD * count:
                         done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                         yield from (future.result() for future in done)
                 while waiting:
@@ -102,13 +102,13 @@ def worker_name() -> str:
 
 
 def begin_worker(parent: int | None = None) -> None:
-    """Let Ctrl-C end the process that hands out jobs, not this one, which ends with it; by default its parent."""
+    """Leave Ctrl-C to the process that submits the jobs, by default the parent, and exit with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=end_with, args=(parent or os.getppid(),), daemon=True).start()
+    threading.Thread(target=exit_with_parent, args=(parent or os.getppid(),), daemon=True).start()
 
 
-def end_with(parent: int) -> None:
-    """End this process when its parent has gone: one that is killed cannot tell its workers. It does not return."""
+def exit_with_parent(parent: int) -> None:
+    """Exit once the parent process has ended; a killed parent cannot stop its workers. Never returns."""
     while os.getppid() == parent:
         time.sleep(PARENT_SECONDS)
     os._exit(1)

@@ -150,10 +150,12 @@ def read_mapping(
     except yaml.MarkedYAMLError as problem:
         mark = problem.problem_mark or problem.context_mark
         place = f"line {mark.line + 1}" if mark else None
-        raise error(f"not valid YAML: {_reason(problem.problem or problem.context)}", file=path, place=place) from None
+        raise error(
+            f"not valid YAML: {_short_reason(problem.problem or problem.context)}", file=path, place=place
+        ) from None
     except (yaml.YAMLError, ValueError, ArithmeticError, LookupError, AttributeError) as problem:
         # PyYAML raises the others for values that do not fit their tags.
-        raise error(f"not valid YAML: {_reason(problem)}", file=path) from None
+        raise error(f"not valid YAML: {_short_reason(problem)}", file=path) from None
     if not isinstance(content, dict):
         raise error(f"expected a mapping of keys to values, not {cut_short(repr(content))}", file=path)
     return content
@@ -171,14 +173,14 @@ def line_of(path: Path, key: str) -> int | None:
         return None
     line = None
     for part in re.findall(r"[^.\[\]]+|\[[^\]]*\]", key):
-        found = _child(node, part)
+        found = _child_node(node, part)
         if found is None:
             break
         node, line = found[1], found[0].start_mark.line + 1
     return line
 
 
-def _child(node: Any, part: str) -> tuple[Any, Any] | None:
+def _child_node(node: Any, part: str) -> tuple[Any, Any] | None:
     """Return the node of a key or entry, for its place, and that of its value; None where there is none."""
     if part.startswith("[") and isinstance(node, yaml.SequenceNode):
         label = part[1:-1]
@@ -205,5 +207,5 @@ def as_number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _reason(problem: object) -> str:
+def _short_reason(problem: object) -> str:
     return cut_short(" ".join(str(problem).split()), _MAX_REASON)

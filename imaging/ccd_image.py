@@ -13,9 +13,10 @@ from ..core.files import folder_of_worker, marked_folder, write_bytes
 from ..core.products import Stamp
 from ..core.progress import Reporter
 from ..core.workers import MakeWorkers
+from ..pipeline.ccd_worker import CcdJob
 from ..pipeline.experiment import Experiment
-from ..pipeline.kept_screens import with_kept_screens
 from ..pipeline.memory import check_memory
+from ..pipeline.screen_cache import with_cached_screens
 from .config import ImagesConfig
 from .draw import Window
 from .exposure import Exposure
@@ -25,24 +26,12 @@ from .scene import draw_ccd, stamped
 
 
 @dataclass(frozen=True)
-class ImageJob:
-    """A CCD to draw."""
-
-    name: str
-
-    @property
-    def label(self) -> str:
-        """Name in messages."""
-        return f"CCD {self.name}"
-
-
-@dataclass(frozen=True)
 class DrawnImage:
     """Result of one CCD, as a worker returns it."""
 
     name: str
     objects: int = 0  #: number of objects on it
-    files: tuple[tuple[str, bytes], ...] = ()  #: names and contents, of a worker that does not see the folder
+    files: tuple[tuple[str, bytes], ...] = ()  #: names and contents, where the worker does not share the folder
     problem: str | None = None  #: one line: the CCD could not be drawn, or a file not be written
 
 
@@ -53,17 +42,17 @@ class ImageComputation:
     config: ImagesConfig
     experiment: Experiment
     folder: Path
-    mark: str  #: file there, which a worker finds that sees the folder
+    mark: str  #: file in the folder, by which workers that share it are told
 
-    def __call__(self, job: ImageJob, threads: int) -> DrawnImage:
+    def __call__(self, job: CcdJob, threads: int) -> DrawnImage:
         """Draw one CCD."""
-        experiment = with_kept_screens(self.experiment)
+        experiment = with_cached_screens(self.experiment)
         try:
             experiment.make_screens(threads)
             galaxies = galaxies_of(self.config, experiment)
             with folder_of_worker(self.folder, self.mark) as place:
                 objects = draw_image(self.config, experiment, job.name, galaxies, place, threads)
-                # The image last, since it is what a run that goes on looks for.
+                # The image last: a resumed run takes it for the sign of a finished CCD.
                 own = sorted(place.iterdir(), key=lambda path: path.name == image_name(job.name))
                 sent = () if place == self.folder else tuple((path.name, path.read_bytes()) for path in own)
         except PachonError as error:
@@ -91,7 +80,7 @@ def draw_by_workers(
         chosen = workers(ImageComputation(config, experiment, folder.resolve(), mark))
         check_memory(experiment, 1, copies=chosen.processes)
         with reporter.stage(f"images of {len(names)} CCDs, {chosen.description}", len(names)) as stage:
-            for number, drawn in enumerate(chosen.results(ImageJob(name) for name in names), start=1):
+            for number, drawn in enumerate(chosen.results(CcdJob(name) for name in names), start=1):
                 if drawn.problem is not None:
                     raise ProductError(drawn.problem)
                 for name, data in drawn.files:
@@ -145,7 +134,7 @@ def draw_image(
         write_bytes(path.with_suffix(".png"), preview_png(image))
     if config.image.cutouts:
         write_bytes(path.with_name(f"cutouts_{name}.png"), cutouts_png(scene, threads=threads))
-    # Last, since it is what a run that goes on looks for.
+    # Last: a resumed run takes it for the sign of a finished CCD.
     image.write(path)
     return len(scene.objects["ID"])
 

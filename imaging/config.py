@@ -31,7 +31,7 @@ _FILES = ("catalogue", "mosaic")
 
 
 class GalaxySourceConfig(Section):
-    """Which galaxies there are, to any depth."""
+    """Source of the galaxies: a population, a catalogue or a mosaic."""
 
     brightest: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=10, le=30)] = Field(
         20.0, description="brightest galaxy of the population [AB mag]"
@@ -58,7 +58,7 @@ class GalaxySourceConfig(Section):
         return self.model_copy(update=given)
 
     def content(self) -> dict[str, Any]:
-        """Return what a digest is made of: a file counts by its content."""
+        """Return the content for a digest, with files by their content."""
         content = self.model_dump(mode="json")
         for key in _FILES:
             if content[key] is not None:
@@ -67,7 +67,7 @@ class GalaxySourceConfig(Section):
 
 
 class GalaxiesConfig(GalaxySourceConfig):
-    """Which galaxies images have."""
+    """Source of the galaxies of images, and their magnitude limit."""
 
     faintest: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=15, le=30)] = Field(
         29.0, description="faintest galaxy of the population [AB mag]"
@@ -94,7 +94,7 @@ class ImageConfig(Section):
 
 
 class ImagesConfig(Section):
-    """All that decides images."""
+    """Settings of images, which determine every byte of them."""
 
     run: Configuration = Configuration()
     pointing: PointingConfig = PointingConfig()

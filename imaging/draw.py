@@ -160,18 +160,18 @@ def draw_galaxies(
     check_choice("way", way, WAYS)
     part = Window(0, 0, wcs.shape[1], wcs.shape[0]) if window is None else window
     if way == "direct":
-        return _direct(galaxies, electrons, psf, wcs, part, noise, threads, progress)
+        return _draw_direct(galaxies, electrons, psf, wcs, part, noise, threads, progress)
     margin = psf.stamp // 2 + 1
     wide = part.grown(margin)
-    scene = _direct(galaxies, electrons, None, wcs, wide, noise, threads, progress)
-    return _convolved(scene, psf, wide, threads)[margin:-margin, margin:-margin].copy()
+    scene = _draw_direct(galaxies, electrons, None, wcs, wide, noise, threads, progress)
+    return _convolve_with_psf(scene, psf, wide, threads)[margin:-margin, margin:-margin].copy()
 
 
 def grid_sizes(electrons: np.ndarray, radius: np.ndarray, profile: np.ndarray, noise: float) -> np.ndarray:
     """Return the size of the grid of each galaxy: the first of :data:`SIZES` that holds its light, [n].
 
-    What lies beyond wraps round, so no light is lost. It is allowed where a de Vaucouleurs galaxy and a star of its
-    electrons are both fainter than a hundredth of the noise.
+    Light beyond the grid wraps around, so none is lost. A size is accepted where a de Vaucouleurs galaxy and a star
+    of the same electrons are both fainter at its rim than a hundredth of the noise.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def grid_sizes(electrons: np.ndarray, radius: np.ndarray, profile: np.ndarray, n
 
 
 def add_stamps(image: np.ndarray, stamps: np.ndarray, corners: np.ndarray) -> None:
-    """Add stamps [n, size, size] to an image, the first pixel of each at (x, y) of it, what lies outside cut off."""
+    """Add stamps [n, size, size] to an image, clipped at its edges; the first pixel of each is at (x, y)."""
     low = np.maximum(corners, 0)
     high = np.minimum(corners + stamps.shape[1], image.shape[::-1])
     first, last = low - corners, high - corners
@@ -205,7 +205,7 @@ def add_stamps(image: np.ndarray, stamps: np.ndarray, corners: np.ndarray) -> No
             image[y0:y1, x0:x1] += stamp[b:d, a:c]
 
 
-def _direct(
+def _draw_direct(
     galaxies: Sources,
     electrons: np.ndarray,
     psf: PsfField | None,
@@ -233,7 +233,7 @@ def _direct(
             # Those whose grid touches the window.
             own = np.flatnonzero((sizes == size) & window.contains(pixels, 0.5 * size))
             if len(own):
-                basis = _softening(size)[None] if psf is None else psf.transforms(size)
+                basis = _softening_transform(size)[None] if psf is None else psf.transforms(size)
                 flat = np.ascontiguousarray(basis).view(np.float32).reshape(len(basis), -1)
                 count = max(1, _BLOCK // size**2)
                 yield from ((own[i : i + count], size, flat) for i in range(0, len(own), count))
@@ -258,7 +258,7 @@ def _direct(
     return image
 
 
-def _softening(size: int, centred: bool = True) -> np.ndarray:
+def _softening_transform(size: int, centred: bool = True) -> np.ndarray:
     """Return the transform of the softening Gaussian, complex64 [size, size // 2 + 1], at pixel ``size // 2`` or 0."""
     fy, fx = np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)
     gauss = np.exp(-2.0 * (np.pi * _SOFTENING) ** 2 * (fx**2 + fy**2))
@@ -266,9 +266,9 @@ def _softening(size: int, centred: bool = True) -> np.ndarray:
     return (gauss * shift).astype(np.complex64)
 
 
-def _convolved(scene: np.ndarray, psf: PsfField, window: Window, threads: int | None) -> np.ndarray:
+def _convolve_with_psf(scene: np.ndarray, psf: PsfField, window: Window, threads: int | None) -> np.ndarray:
     """Return a softened scene convolved with the PSF of each place, by overlapping tiles."""
-    basis = psf.transforms(_TILE_GRID) / _softening(_TILE_GRID, centred=False)
+    basis = psf.transforms(_TILE_GRID) / _softening_transform(_TILE_GRID, centred=False)
     nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
     # The grid is longer by what the PSF spreads, half of it on each side of the tile.
     shift = _TILE_GRID // 2
@@ -281,7 +281,7 @@ def _convolved(scene: np.ndarray, psf: PsfField, window: Window, threads: int | 
         places = [0.5 * n * (nodes + 1.0) - 0.5 for n in (width, height)]
         at = np.stack(np.meshgrid(places[0] + x + window.x, places[1] + y + window.y), axis=-1).reshape(-1, 2)
         amplitudes = psf.amplitudes(at).T.reshape(-1, _NODES, _NODES)
-        along_x, along_y = (_interpolation(p, np.arange(n)) for p, n in zip(places, (width, height), strict=True))
+        along_x, along_y = (_lagrange_matrix(p, np.arange(n)) for p, n in zip(places, (width, height), strict=True))
         total = np.zeros((_TILE_GRID, _TILE_GRID // 2 + 1), dtype=np.complex64)
         with one_blas_thread():
             maps = (along_y @ amplitudes @ along_x.T).astype(np.float32)
@@ -299,7 +299,7 @@ def _convolved(scene: np.ndarray, psf: PsfField, window: Window, threads: int | 
     return image
 
 
-def _interpolation(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _lagrange_matrix(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the matrix of the polynomial through values at nodes, evaluated at points (Lagrange)."""
     matrix = np.ones((len(points), len(nodes)))
     for j, node in enumerate(nodes):

@@ -22,7 +22,7 @@ from ..pipeline.simulate.photometry import band_named, sky_electrons_per_pixel
 SATURATED = 1
 #: Names of the bits of the mask, by their value.
 MASK_BITS = {SATURATED: "SATURATED"}
-#: Rows of a band of the image that has random numbers of its own.
+#: Rows of a band of the image; each band has its own random stream.
 _ROWS = 128
 
 
@@ -151,8 +151,8 @@ def expose(
 ) -> ExposedImage:
     """Expose a noise-free scene.
 
-    The sum of Poisson numbers is one, so all exposures are drawn at once. A pixel is clipped where its sum reaches as
-    many full wells; its charge does not bleed.
+    A sum of Poisson variates is a Poisson variate, so all exposures are drawn at once. A pixel saturates where its sum
+    reaches as many full wells; its charge does not bleed.
 
     Parameters
     ----------

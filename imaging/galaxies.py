@@ -95,7 +95,7 @@ class GalaxySource:
         DomainError
             If the galaxies of a population would be brighter than the sky.
         """
-        return self._population(faintest).galaxies_in if self.given is None else _Given(self.given, faintest)
+        return self._population(faintest).galaxies_in if self.given is None else _FixedGalaxies(self.given, faintest)
 
     def _population(self, faintest: float) -> GalaxyPopulation:
         wanted, exposure = self.config, self.exposure
@@ -109,8 +109,8 @@ class GalaxySource:
 
 
 @dataclass(frozen=True, eq=False)
-class _Given:
-    """Given galaxies in ranges of xi and eta [rad]; a class, since workers are sent it."""
+class _FixedGalaxies:
+    """Galaxies of a catalogue or mosaic in ranges of xi and eta [rad]; a class, so that workers can unpickle it."""
 
     galaxies: Galaxies | StampPopulation
     faintest: float

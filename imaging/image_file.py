@@ -121,9 +121,9 @@ class CcdImage(Result):
             stamp = _stamp(primary.header)
             return cls(
                 primary.header["CCD"],
-                _native(image.data),
-                _native(variance.data),
-                _native(mask.data),
+                _native_byte_order(image.data),
+                _native_byte_order(variance.data),
+                _native_byte_order(mask.data),
                 image.header,
                 {key: column(truth, key) for key in OBJECT_COLUMNS},
                 stamp,
@@ -146,5 +146,5 @@ def _stamp(header: Any) -> Stamp | None:
     return Stamp(header["CONFHASH"], header["SEED"], header["CREATOR"].removeprefix("pachon "))
 
 
-def _native(array: np.ndarray) -> np.ndarray:
+def _native_byte_order(array: np.ndarray) -> np.ndarray:
     return array.astype(array.dtype.newbyteorder("="))

@@ -1,4 +1,4 @@
-"""From an image of a CCD to a catalogue of galaxies: objects, stars, the PSF from these stars, fitted galaxies."""
+"""Catalogue of galaxies from an image of a CCD: objects, stars, their PSF model, galaxy fits."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ _SOFT, _TOP = 3.0, 150.0
 
 def preview_png(image: CcdImage) -> bytes:
     """Return a picture of an image, binned to about a thousand pixels, axes in arcsec from its middle."""
-    data = image.image - _level(image)
+    data = image.image - _background_level(image)
     step = -(-max(data.shape) // _MOST)
     ny, nx = (n // step * step for n in data.shape)
     binned = data[:ny, :nx].reshape(ny // step, step, nx // step, step).mean(axis=(1, 3))
@@ -48,13 +48,16 @@ def cutouts_png(scene: CcdScene, *, threads: int | None = None) -> bytes:
         (f"{deep.total_time:g} s", replace(deep, noise=True)),
         ("without noise", replace(deep, noise=False)),
     ]
-    part = _middle(scene)
+    part = _central_window(scene)
     with styled():
         figure = new_figure(10.5, 3.9)
         for axes, (title, exposure) in zip(figure.subplots(1, 3), panels, strict=True):
             image = part.exposed(exposure, threads=threads)
             show_stretched(
-                axes, image.image - _level(image), float(np.sqrt(np.median(image.variance))), pixel_scale_of(image)
+                axes,
+                image.image - _background_level(image),
+                float(np.sqrt(np.median(image.variance))),
+                pixel_scale_of(image),
             )
             axes.set_title(f"{plain_text(scene.name)}, {exposure.band} band, {title}", loc="left")
             if axes.get_subplotspec().is_first_col():
@@ -64,7 +67,7 @@ def cutouts_png(scene: CcdScene, *, threads: int | None = None) -> bytes:
         return png_bytes(figure)
 
 
-def _middle(scene: CcdScene) -> CcdScene:
+def _central_window(scene: CcdScene) -> CcdScene:
     """Return the middle of a scene, as large as a cutout or the scene."""
     side = round(CUTOUT * ARCSEC / scene.exposure.pixel_scale)
     height, width = (min(side, n) for n in scene.electrons.shape)
@@ -73,17 +76,17 @@ def _middle(scene: CcdScene) -> CcdScene:
     return replace(scene, electrons=scene.electrons[y : y + height, x : x + width], window=window)
 
 
-def _level(image: CcdImage) -> float:
+def _background_level(image: CcdImage) -> float:
     """Return the background that is left in an image [ADU]."""
     return 0.0 if image.header["SKYSUB"] else float(image.header["SKY"])
 
 
 def pixel_scale_of(image: CcdImage) -> float:
     """Return the side of a pixel at the reference point [arcsec]."""
-    return float(np.sqrt(abs(np.linalg.det(_cd(image))))) * 3600.0
+    return float(np.sqrt(abs(np.linalg.det(_cd_matrix(image))))) * 3600.0
 
 
-def _cd(image: CcdImage) -> np.ndarray:
+def _cd_matrix(image: CcdImage) -> np.ndarray:
     return np.array([[image.header[f"CD{i}_{j}"] for j in (1, 2)] for i in (1, 2)])
 
 
@@ -99,7 +102,7 @@ def show_stretched(axes: Axes, data: np.ndarray, noise: float, scale: float) -> 
 def draw_compass(axes: Axes, image: CcdImage) -> None:
     """Draw arrows towards north and east in a corner."""
     # Columns of the inverse of CD are the steps in pixels for a step in xi (east) and in eta (north).
-    steps = np.linalg.inv(_cd(image))
+    steps = np.linalg.inv(_cd_matrix(image))
     start, length = np.array([0.88, 0.12]), 0.07
     for label, step in zip("EN", steps.T, strict=True):
         end = start + length * step / np.hypot(*step)

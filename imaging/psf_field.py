@@ -13,10 +13,10 @@ from scipy import fft
 from ..core.arguments import check_arguments
 from ..core.threads import one_blas_thread
 from ..core.units import for_each, pure_numbers
-from ..pipeline.defaults import noise_free_components
 from ..pipeline.experiment import Experiment
 from ..pipeline.psf_model.model import PsfModel
 from ..pipeline.psf_model.polynomial import design_matrix
+from ..pipeline.resolved_values import noise_free_components
 from ..pipeline.simulate.ccd_exposure import expose_positions, holdout_positions
 
 #: Pixels around a CCD that the PSF is extrapolated to, for galaxies whose light reaches the CCD.
@@ -99,7 +99,7 @@ class PsfField:
     ) -> PsfField:
         """Fit the noise-free PSFs of a run at its holdout positions (``stars.truth``) on one CCD.
 
-        Their reference points are centred and not their centroids, so what turbulence moves is moved in the images too.
+        Reference points are centred, not centroids, so that images contain the displacements by turbulence.
         Components and order are those of the run, 20 and 4 by default; screens must have been made
         (:meth:`~pachon.Experiment.screens`).
         """
@@ -137,7 +137,7 @@ class PsfField:
     def transforms(self, size: int) -> np.ndarray:
         """Return ``rfft2`` of mean and components, centred on pixel ``size // 2``: complex64 [1 + k, size, size//2+1].
 
-        What of a stamp lies beyond the grid wraps round, so that sums are kept.
+        Parts of a stamp beyond the grid wrap around, so that sums are kept.
         """
         images = np.concatenate([self.model.mean[None], self.model.components])
         half = self.stamp // 2

@@ -126,7 +126,7 @@ def draw_ccd(
         If the run has no atmosphere, without which PSFs are finer than pixels, or its pixels are not those of the
         camera.
     DomainError
-        If no light reaches the CCD, or the galaxies bury the sky.
+        If no light reaches the CCD, or the galaxies outshine the sky.
     """
     if not callable(galaxies) and not hasattr(galaxies, "transform"):
         raise DomainError(f"galaxies = {shown(galaxies)}: expected Galaxies or a function that gives them")

@@ -13,9 +13,9 @@ from ..core.progress import Reporter
 from ..core.workers import MakeWorkers
 from ..core.yaml_reader import read_mapping
 from ..pipeline.config import differences
-from ..pipeline.defaults import given
 from ..pipeline.experiment import Experiment
 from ..pipeline.memory import needed_bytes
+from ..pipeline.resolved_values import resolved_value
 from .ccd_image import draw_by_workers, draw_image, galaxies_of, image_name, stamp_of, window_of
 from .config import ImagesConfig
 from .image_file import is_whole
@@ -78,7 +78,7 @@ def simulate_images(
     reporter = Reporter(quiet=True) if reporter is None else reporter
     experiment = config.experiment() if experiment is None else experiment
     resolved = config.resolved(experiment)
-    names = given(experiment.config.ccds)
+    names = resolved_value(experiment.config.ccds)
     windows = {name: window_of(config, experiment, name) for name in names}
     galaxies = galaxies_of(config, experiment)
     most = max(window.width * window.height for window in windows.values())

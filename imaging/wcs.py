@@ -85,24 +85,28 @@ class CcdWcs:
     @check_arguments
     def to_sky(self, pixels: ArrayLike) -> np.ndarray:
         """Return (xi, eta) [rad], shape [n, 2], of pixels (x, y), shape [n, 2]."""
-        return _projected(self._on_plane(pixels), self._turn)[0]
+        return _reproject(self._to_tangent_plane(pixels), self._pointing_rotation)[0]
 
     @check_arguments
     def to_pixel(self, sky: ArrayLike) -> np.ndarray:
         """Return pixels (x, y), shape [n, 2], of (xi, eta) [rad], shape [n, 2]."""
         plane = np.atleast_2d(np.asarray(sky, dtype=np.float64))
-        target = _projected(plane, self._turn.T)[0] @ np.linalg.inv(self.cd).T
-        u = target + _values(self.inverse, target)
+        target = _reproject(plane, self._pointing_rotation.T)[0] @ np.linalg.inv(self.cd).T
+        u = target + _evaluate_polynomials(self.inverse, target)
         for _ in range(_NEWTON_STEPS):
-            miss = target - u - _values(self.distortion, u)
-            u = u + np.linalg.solve(self._derivative(u), miss[..., None])[..., 0]
+            miss = target - u - _evaluate_polynomials(self.distortion, u)
+            u = u + np.linalg.solve(self._distortion_jacobian(u), miss[..., None])[..., 0]
         return u + self.reference_pixel
 
     @check_arguments
     def jacobians(self, pixels: ArrayLike) -> np.ndarray:
         """Return d(x, y)/d(xi, eta) [pixel/rad] at pixels, shape [n, 2, 2]."""
         u = np.atleast_2d(np.asarray(pixels, dtype=np.float64)) - self.reference_pixel
-        return np.linalg.inv(_projected(self._on_plane(pixels), self._turn)[1] @ self.cd @ self._derivative(u))
+        return np.linalg.inv(
+            _reproject(self._to_tangent_plane(pixels), self._pointing_rotation)[1]
+            @ self.cd
+            @ self._distortion_jacobian(u)
+        )
 
     @check_arguments
     def to_celestial(self, sky: ArrayLike) -> np.ndarray:
@@ -127,7 +131,7 @@ class CcdWcs:
             for names, tables in ((("A", "B"), self.distortion), (("AP", "BP"), self.inverse)):
                 for name, table in zip(names, tables, strict=True):
                     header[f"{name}_ORDER"] = self.order
-                    for i, j in _terms(self.order):
+                    for i, j in _exponents(self.order):
                         if table[i, j]:
                             header[f"{name}_{i}_{j}"] = float(table[i, j])
         return header
@@ -139,21 +143,23 @@ class CcdWcs:
         wcs.pixel_shape = (self.shape[1] - corner[0], self.shape[0] - corner[1])
         return wcs
 
-    def _on_plane(self, pixels: ArrayLike) -> np.ndarray:
+    def _to_tangent_plane(self, pixels: ArrayLike) -> np.ndarray:
         """Return the places of pixels on the tangent plane about the reference point, shape [n, 2]."""
         u = np.atleast_2d(np.asarray(pixels, dtype=np.float64)) - self.reference_pixel
-        return (u + _values(self.distortion, u)) @ self.cd.T
+        return (u + _evaluate_polynomials(self.distortion, u)) @ self.cd.T
 
     @property
-    def _turn(self) -> np.ndarray:
+    def _pointing_rotation(self) -> np.ndarray:
         """Rotation of vectors (east, north, outwards) at the reference point into those at the pointing, [3, 3]."""
         return Pointing(*self.pointing).axes @ Pointing(*self.reference).axes.T
 
-    def _derivative(self, u: np.ndarray) -> np.ndarray:
+    def _distortion_jacobian(self, u: np.ndarray) -> np.ndarray:
         """Return d(u + distortion)/du, shape [n, 2, 2]."""
         derivative = np.empty((len(u), 2, 2))
         for axis in range(2):
-            derivative[:, :, axis] = _values(np.stack([polyder(t, axis=axis) for t in self.distortion]), u)
+            derivative[:, :, axis] = _evaluate_polynomials(
+                np.stack([polyder(t, axis=axis) for t in self.distortion]), u
+            )
         return derivative + np.eye(2)
 
 
@@ -221,13 +227,13 @@ def ccd_wcs(
         # Chebyshev points: a polynomial through them errs about equally everywhere.
         line = np.cos(np.pi * (np.arange(points) + 0.5) / points) / np.cos(0.5 * np.pi / points)
         places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-        return places, _projected(to_sky(places), to_reference)[0]
+        return places, _reproject(to_sky(places), to_reference)[0]
 
     fit, check = traced(_FIT_POINTS), traced(_CHECK_POINTS)
     for order in range(1, _MOST + 1):
-        linear, reference, distortion = _forward(*fit, order, half)
+        linear, reference, distortion = _sip_polynomials(*fit, order, half)
         u = half * check[0] - reference
-        error = float(np.abs((u + _values(distortion, u)) @ linear.T - check[1]).max())
+        error = float(np.abs((u + _evaluate_polynomials(distortion, u)) @ linear.T - check[1]).max())
         if error < TOLERANCE:
             break
     else:
@@ -238,7 +244,7 @@ def ccd_wcs(
         )
     target = fit[1] @ np.linalg.inv(linear).T
     offset = half * fit[0] - reference - target
-    inverse = _fitted(target, offset, order)
+    inverse = _fit_polynomials(target, offset, order)
     return CcdWcs(
         pointing=center,
         reference=(ra, dec),
@@ -307,61 +313,61 @@ def wcs(
     return fitted.astropy()
 
 
-def _forward(
+def _sip_polynomials(
     places: np.ndarray, sky: np.ndarray, order: int, half: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return linear part, reference pixel from the middle of the CCD, and distortion of a polynomial of an order."""
-    tables = _fitted(half * places, sky, order)
+    """Fit polynomials of an order; return linear part, reference pixel from the middle of the CCD, and distortion."""
+    tables = _fit_polynomials(half * places, sky, order)
     # The reference pixel is the root of the polynomial.
     reference = np.zeros(2)
     for _ in range(20):
-        at = _shifted(tables, reference)
-        reference = reference - np.linalg.solve(_linear(at), at[:, 0, 0])
-    tables = _shifted(tables, reference)
-    linear = _linear(tables)
+        at = _shift_origin(tables, reference)
+        reference = reference - np.linalg.solve(_linear_part(at), at[:, 0, 0])
+    tables = _shift_origin(tables, reference)
+    linear = _linear_part(tables)
     distortion = np.einsum("ab,bij->aij", np.linalg.inv(linear), tables)
     distortion[:, [0, 0, 1], [0, 1, 0]] = 0.0
     return linear, reference, distortion
 
 
-def _projected(plane: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return places [n, 2] of a tangent plane on another, by the rotation of its axes, and derivatives [n, 2, 2]."""
+def _reproject(plane: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Reproject points [n, 2] onto another tangent plane, by the rotation of its axes; with derivatives [n, 2, 2]."""
     vectors = np.column_stack([plane, np.ones(len(plane))]) @ turn.T
     found, ahead = vectors[:, :2] / vectors[:, 2:], vectors[:, 2, None, None]
     return found, (turn[:2, :2] - found[:, :, None] * turn[2, :2]) / ahead
 
 
-def _linear(tables: np.ndarray) -> np.ndarray:
+def _linear_part(tables: np.ndarray) -> np.ndarray:
     """Return the matrix of the linear terms of two polynomials."""
     return np.stack([tables[:, 1, 0], tables[:, 0, 1]], axis=1)
 
 
-def _fitted(points: np.ndarray, values: np.ndarray, order: int) -> np.ndarray:
+def _fit_polynomials(points: np.ndarray, values: np.ndarray, order: int) -> np.ndarray:
     """Return the coefficients [2, order + 1, order + 1] of polynomials through values [n, 2] at points [n, 2]."""
     # Scaled to [-1, 1] for the fit, and then expanded about the origin of the points.
     middle = 0.5 * (points.max(axis=0) + points.min(axis=0))
     scale = 0.5 * np.ptp(points, axis=0).max()
     s, t = ((points - middle) / scale).T
-    terms = _terms(order)
+    terms = _exponents(order)
     found = np.linalg.lstsq(np.stack([s**i * t**j for i, j in terms], axis=1), values, rcond=None)[0]
     tables = np.zeros((2, order + 1, order + 1))
     for (i, j), coefficient in zip(terms, found, strict=True):
         tables[:, i, j] = coefficient / scale ** (i + j)
-    return _shifted(tables, -middle)
+    return _shift_origin(tables, -middle)
 
 
-def _shifted(tables: np.ndarray, shift: np.ndarray) -> np.ndarray:
+def _shift_origin(tables: np.ndarray, shift: np.ndarray) -> np.ndarray:
     """Return the coefficients of polynomials p(u + shift), by the binomial theorem."""
     n = tables.shape[1]
     x, y = (np.array([[comb(i, m) * d ** max(i - m, 0) for m in range(n)] for i in range(n)]) for d in shift)
     return np.einsum("aij,im,jn->amn", tables, x, y)
 
 
-def _values(tables: np.ndarray, u: np.ndarray) -> np.ndarray:
+def _evaluate_polynomials(tables: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Return the values of two polynomials at points, shape [n, 2]."""
     return np.stack([polyval2d(u[:, 0], u[:, 1], table) for table in tables], axis=1)
 
 
-def _terms(order: int) -> list[tuple[int, int]]:
+def _exponents(order: int) -> list[tuple[int, int]]:
     """Return the exponents (i, j) of the terms up to a total order."""
     return [(i, j) for i in range(order + 1) for j in range(order + 1 - i)]

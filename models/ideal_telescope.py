@@ -1,4 +1,4 @@
-"""Telescopes without aberrations, for stars blurred by air and camera alone."""
+"""Ideal telescopes, for stars that are blurred by atmosphere and camera alone."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from .surface import Interaction, Surface
 from .telescope import VACUUM, Telescope
 
 
-def without_aberration(telescope: Telescope, focal_ratio: float = 1000.0) -> Telescope:
-    """Return a telescope with the same pupil and no aberration to speak of: one long paraboloid.
+def ideal_telescope(telescope: Telescope, focal_ratio: float = 1000.0) -> Telescope:
+    """Return a telescope with the same pupil and negligible aberrations: one slow paraboloid.
 
     At f/N (`focal_ratio`) its coma, 3 theta / (16 N^2), and its astigmatism, theta^2 / (2 N), blur a star at an angle
     theta from the axis: at f/1000 by 1e-4 and 9e-4 arcsec 10 arcmin from it, at f/100 000 by 1e-7 and 1e-3 arcsec at

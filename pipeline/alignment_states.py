@@ -1,4 +1,4 @@
-"""States of the telescope in visits, such as the active-optics loop leaves them, from a file.
+"""Degrees of freedom of the telescope in each visit from a file, such as those left by an active-optics loop.
 
 A table (ECSV) with a column ``visit`` and one column a degree of freedom, with units; the entry ``degrees_of_freedom``
 of its metadata names the set, ``lsst`` by default.
@@ -18,8 +18,8 @@ from ..models.telescope import Telescope
 ENDINGS = (".ecsv",)
 
 
-def in_state(telescope: Telescope, path: str, visit: int) -> Telescope:
-    """Return a telescope with the state of one visit of a file.
+def with_active_optics_state(telescope: Telescope, path: str, visit: int) -> Telescope:
+    """Return a telescope perturbed as in one visit of a file.
 
     Raises
     ------

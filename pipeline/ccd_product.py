@@ -29,7 +29,7 @@ _MM, _DEG, _SEC, _NONE = _Unit("mm", 1e-3), _Unit("deg", np.pi / 180.0), _Unit("
 _MODEL, _NOISE_FREE_MODEL = "PSF", "TRUEPSF"
 #: Ellipticities of a CCD, see :meth:`CcdProduct.ellipticity`.
 KINDS = ("truth", "observed", "residual", "left_out", "away")
-#: Residuals of the CCD's own model, where a model of the whole focal plane has taken its place.
+#: Residuals of the CCD's own model in runs with a focal-plane model.
 CCD_KINDS = ("residual_ccd", "away_ccd")
 #: FITS card that says which model the columns MODEL_E1 and so on are of; only in runs with a focal-plane model.
 MODEL_CARD = "PSFMODEL"
@@ -64,11 +64,11 @@ _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
     "sigma_e2": ("SIG_E2", _NONE, "predicted uncertainty of MODEL_E2"),
     "sigma_size": ("SIG_SIZE", _SEC, "predicted uncertainty of MODELSZ"),
 }
-# What a focal-plane model changes in a table, and what keeps the values that stood there before.
+# Columns that a focal-plane model replaces, and those with the replaced values of the CCD's own model.
 _REPLACED = frozenset(
     ["MODEL_E1", "MODEL_E2", "MODELSZ", "LOO_E1", "LOO_E2", "SIG_E1", "SIG_E2", "SIG_SIZE", "RES_E1", "RES_E2"]
 )
-_OWN = {"CCD_E1": "MODEL_E1", "CCD_E2": "MODEL_E2", "CCD_SIZE": "MODELSZ"}
+_CCD_COLUMNS = {"CCD_E1": "MODEL_E1", "CCD_E2": "MODEL_E2", "CCD_SIZE": "MODELSZ"}
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ _StarsKind = TypeVar("_StarsKind", bound=Stars)
 
 
 def of_ccd_model(stars: _StarsKind) -> _StarsKind:
-    """Return stars whose model is the CCD's own: as they are, unless a focal-plane model has taken its place.
+    """Return stars with the CCD's own model in place of a focal-plane model.
 
     Ellipticities of the model fitted without the star stay those of the focal-plane model.
     """
@@ -170,14 +170,14 @@ class CcdStars:
     rotator: float = field(default=0.0, kw_only=True)  #: of the camera, from +x towards +y of the telescope frame [rad]
 
     @property
-    def of_focal_plane(self) -> bool:
+    def has_focal_plane_model(self) -> bool:
         """Whether ellipticities and sizes of the model are those of a model of the whole focal plane."""
         return self.observed.ccd_e1 is not None
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """Kinds of ellipticity: :data:`KINDS`, and :data:`CCD_KINDS` with a focal-plane model."""
-        return KINDS + CCD_KINDS if self.of_focal_plane else KINDS
+        return KINDS + CCD_KINDS if self.has_focal_plane_model else KINDS
 
     def stars(self, kind: str) -> HoldoutStars | ObservedStars:
         """Return the stars that a kind of ellipticity belongs to; kinds are those of :meth:`ellipticity`."""
@@ -255,8 +255,8 @@ def write_product(folder: Path, product: CcdProduct, stamp: Stamp, cards: list[t
     if product.rotator:
         header.append((_ROTATOR_CARD, math.degrees(product.rotator), "[deg] camera, +x towards +y of telescope"))
     hdus = [
-        table_hdu("STARS", _table(product.observed)),
-        table_hdu("TRUTH", _table(product.holdout)),
+        table_hdu("STARS", _stars_table(product.observed)),
+        table_hdu("TRUTH", _stars_table(product.holdout)),
         image_hdu("STAMPS", product.observed_images, "each star centred, of unit sum"),
         image_hdu("TRUTH_PSF", product.holdout_images, "each PSF centred, of unit sum"),
         *product.model.to_hdus(_MODEL),
@@ -266,17 +266,17 @@ def write_product(folder: Path, product: CcdProduct, stamp: Stamp, cards: list[t
 
 
 def write_focal_plane_columns(folder: Path, product: CcdProduct) -> None:
-    """Put the focal-plane model of a product into the tables of its file; all else there keeps its bytes.
+    """Write the shapes of the focal-plane model into the tables of a product's file; all other bytes stay.
 
-    The values of the CCD's own model are those in the file, so that any number of times leaves the same bytes.
+    The values of the CCD's own model are read from the file, so that a repetition changes nothing.
     """
     path = product_path(folder, product.name)
     hdus = read_fits(path)
     for name, stars in (("STARS", product.observed), ("TRUTH", product.holdout)):
-        before, table = hdus[name], _table(stars)
+        before, table = hdus[name], _stars_table(stars)
         known = before.columns.names
         for key, (_, unit, description) in table.items():
-            source = key if key in known else _OWN.get(key, key)
+            source = key if key in known else _CCD_COLUMNS.get(key, key)
             if key not in _REPLACED:
                 table[key] = (column(before, source), unit, description)
         hdus[name] = table_hdu(name, table)
@@ -299,10 +299,10 @@ def read_product(path: Path, stamp: Stamp | None = None, *, holdout_images: bool
             center=(header["XCENTER"] * 1e-3, header["YCENTER"] * 1e-3),
             pixel_scale=header["PIXSCALE"] * ARCSEC,
             noise=(header["SKY"], header["NOISE"]),
-            holdout=_stars(HoldoutStars, hdus["TRUTH"]),
-            observed=_stars(ObservedStars, hdus["STARS"]),
-            holdout_images=_image(hdus["TRUTH_PSF"])[: None if holdout_images else 0].copy(),
-            observed_images=_image(hdus["STAMPS"]),
+            holdout=_stars_from_hdu(HoldoutStars, hdus["TRUTH"]),
+            observed=_stars_from_hdu(ObservedStars, hdus["STARS"]),
+            holdout_images=_image_from_hdu(hdus["TRUTH_PSF"])[: None if holdout_images else 0].copy(),
+            observed_images=_image_from_hdu(hdus["STAMPS"]),
             model=PsfModel.from_hdus(hdus, _MODEL),
             noise_free_model=PsfModel.from_hdus(hdus, _NOISE_FREE_MODEL),
             rotator=math.radians(header.get(_ROTATOR_CARD, 0.0)),
@@ -311,11 +311,11 @@ def read_product(path: Path, stamp: Stamp | None = None, *, holdout_images: bool
         raise ProductError(f"no product of a CCD ({' '.join(str(error).split())})", file=path) from None
 
 
-def _image(hdu: fits.ImageHDU) -> np.ndarray:
+def _image_from_hdu(hdu: fits.ImageHDU) -> np.ndarray:
     return np.asarray(hdu.data, dtype=np.float32)
 
 
-def _table(stars: Stars) -> dict[str, tuple[np.ndarray, str, str]]:
+def _stars_table(stars: Stars) -> dict[str, tuple[np.ndarray, str, str]]:
     table = {}
     for key, (name, unit, description) in _COLUMNS.items():
         values = getattr(stars, key, None)
@@ -327,7 +327,7 @@ def _table(stars: Stars) -> dict[str, tuple[np.ndarray, str, str]]:
     return table
 
 
-def _stars(kind: type[_StarsKind], hdu: fits.BinTableHDU) -> _StarsKind:
+def _stars_from_hdu(kind: type[_StarsKind], hdu: fits.BinTableHDU) -> _StarsKind:
     values = {}
     for each in fields(kind):
         name, unit, _ = _COLUMNS[each.name]

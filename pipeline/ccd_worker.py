@@ -1,7 +1,7 @@
 """CCDs of a run as jobs of workers: processes of this machine, or a cluster.
 
-A worker keeps the screens of its last CCD for the next. It writes products into the folder of the run where it sees
-that folder, and sends them back where it does not.
+A worker keeps the phase screens of its last CCD for the next one. Workers that share the folder of the run write
+products there; others send them back.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from ..core.progress import Reporter
 from ..core.workers import MakeWorkers
 from .ccd_product import product_path
 from .experiment import Experiment
-from .kept_screens import with_kept_screens
 from .memory import check_memory
 from .run_folder import write_ccd
+from .screen_cache import with_cached_screens
 from .simulate.ccd_loop import left_out_line, simulate_ccds
 
 
@@ -40,7 +40,7 @@ class CcdResult:
     """Result of one CCD, as a worker returns it."""
 
     name: str
-    product: bytes | None = None  #: the file, of a worker that does not see the folder of the run
+    product: bytes | None = None  #: the file, where the worker does not share the folder of the run
     not_modelled: str | None = None  #: reason
     problem: str | None = None  #: one line: the CCD could not be exposed, or its product not be written
 
@@ -51,7 +51,7 @@ class CcdComputation:
 
     experiment: Experiment
     folder: Path  #: of the run
-    mark: str  #: file there, which a worker finds that sees the folder
+    mark: str  #: file in the folder, by which workers that share it are told
 
     def __call__(self, job: CcdJob, threads: int) -> CcdResult:
         """Compute one CCD."""
@@ -67,7 +67,7 @@ class CcdComputation:
 
     def _write(self, name: str, folder: Path, threads: int) -> str | None:
         """Write the product of a CCD; or return the reason why it cannot be modelled."""
-        experiment = with_kept_screens(self.experiment)
+        experiment = with_cached_screens(self.experiment)
         experiment.make_screens(threads)
         write = partial(write_ccd, experiment, folder)
         return simulate_ccds(experiment, write, (name,), strict=False, threads=threads).not_modelled.get(name)
@@ -82,7 +82,7 @@ def compute_ccds(
     strict: bool,
     reporter: Reporter,
 ) -> dict[str, str]:
-    """Have workers write the products of CCDs, and return those that cannot be modelled, each with the reason.
+    """Compute CCDs by workers; return those that cannot be modelled, each with the reason.
 
     Raises
     ------

@@ -257,7 +257,7 @@ class ReconstructionConfig(Section):
 
 
 class Configuration(Section):
-    """All that decides what a run computes; nothing else does."""
+    """Settings of a run, which determine its products completely."""
 
     band: BandName | None = Field(None, description="filter: u, g, r, i, z or y")
     telescope: str | None = Field(None, description="bundled model (pachon info lists them), or path of a prescription")

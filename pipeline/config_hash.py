@@ -17,10 +17,10 @@ from ..models.io.heights.zernike_table import AS_MEASURED
 from ..models.io.prescription import ENDINGS, prescription_digest
 from .alignment_states import ENDINGS as STATE_ENDINGS
 from .config import Configuration
-from .defaults import given
 from .photometry import band_of
+from .resolved_values import resolved_value
 
-#: Keys of the stars that a configuration without a catalogue did not have once.
+#: Keys of catalogues of stars: without a catalogue they are left out, as in hashes from before these keys.
 _CATALOGUE_KEYS = ("catalogue", "columns", "brightest", "faintest")
 
 
@@ -32,9 +32,9 @@ def hashed_content(config: Configuration) -> dict[str, Any]:
     content = config.as_dict()
     del content["ccds"]
     if not config.detector.silicon:
-        # Nothing is made of it.
+        # The section has no effect.
         del content["detector"]
-    name = given(config.telescope)
+    name = resolved_value(config.telescope)
     content["telescope"] = name if name in BUNDLED else prescription_digest(name)
     content = hashed_photometry(hashed_camera(content), config)
     content["focal_plane"] = hashed_heights(content["focal_plane"])
@@ -42,7 +42,7 @@ def hashed_content(config: Configuration) -> dict[str, Any]:
     content["stars"] = hashed_stars(content["stars"])
     if config.pointing is None:
         del content["pointing"]
-    content["atmosphere"]["site"] = _name_or_content(given(config.atmosphere.site), ())
+    content["atmosphere"]["site"] = _name_or_content(resolved_value(config.atmosphere.site), ())
     return content
 
 
@@ -71,7 +71,7 @@ def hashed_heights(section: dict[str, Any]) -> dict[str, Any]:
     name = section["heights"]
     if name is None:
         return {key: value for key, value in section.items() if key != "heights"}
-    # Once there was a budget beside measured heights.
+    # Hashes of older versions include a budget beside measured heights.
     return section | {"budget": "simulated", "heights": _name_or_content(name, tuple(AS_MEASURED), HEIGHT_ENDINGS)}
 
 

@@ -1,4 +1,4 @@
-"""Defaults of a configuration that depend on telescope, camera and site, and checks across several values."""
+"""Defaults of a configuration that depend on telescope, camera and site."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import numpy as np
 from pydantic import BaseModel
 
 from ..core.errors import ConfigError, error_context
-from ..core.schema import json_text
 from ..core.table_files import ENDINGS as STAR_ENDINGS
 from ..core.units import ARCSEC
 from ..design.parameters.changes import apply_changes
@@ -25,29 +24,27 @@ from ..models.io.heights.file import ENDINGS as HEIGHT_ENDINGS
 from ..models.io.heights.zernike_table import AS_MEASURED
 from ..models.io.prescription import ENDINGS, load_telescope
 from ..models.io.site_file import load_site
-from ..models.media.silicon import WAVELENGTH_RANGE as SILICON_RANGE
 from ..models.site import Site
 from ..models.telescope import Telescope
 from ..raytrace.ideal_lens import require_image
 from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.psf.long_exposure import default_points
 from .alignment_states import ENDINGS as STATE_ENDINGS
-from .alignment_states import in_state
+from .alignment_states import with_active_optics_state
 from .config import BandName, Configuration, PsfConfig, ReconstructionConfig
+from .config_checks import WEIGHT_PIXELS, check_combinations
 from .photometry import band_of, pixel_angle, resolved_photometry
 from .psf_model.fit import COMPONENTS, ORDERS
-from .psf_model.polynomial import term_count
-from .sensor.brighter_fatter import PIXEL_SIZE as BRIGHTER_FATTER_PIXEL
+from .resolved_values import resolved_value
 from .simulate.photometry import PROVISIONAL_FWHM, limiting_magnitude, saturation_magnitude
 from .simulate.screen_cover import check_screens
-from .star_list import NAMES
 
 _WAVELENGTHS = 5
 # Keys of the PSF model of a CCD: where none is given it is _KRIGING, else _PAPER fills the other ones.
 _MODEL_KEYS = ("basis", "components", "interpolation", "weights", "order")
 _KRIGING = {"basis": "pixels", "interpolation": "kriging"}
 _PAPER = {"basis": "pca", "interpolation": "polynomial", "weights": "equal"}
-#: Cameras of so many CCDs are computed whole by default.
+#: Largest number of CCDs of a camera that is computed whole by default.
 _FEW = 9
 #: Site of telescopes that name none.
 _SITE = "cerro_pachon"
@@ -57,11 +54,10 @@ _WITH_ATMOSPHERE = {"n_pupil": PUPIL_POINTS, "diffusion_pixels": 0.4}
 _OPTICS_ALONE = {"n_pupil": PUPIL_POINTS_STILL, "diffusion_pixels": 0.0}
 _FINE = 4
 # FWHM of the weight of the moments [arcsec] with and without an atmosphere (Jee & Tyson 2011, sec. 3); where pixels are
-# coarse, so many of them, or the moments would be sums over one or two pixels.
-_WEIGHT, _WEIGHT_ALONE, _WEIGHT_PIXELS = 0.7, 0.3, 2.5
+# coarse, WEIGHT_PIXELS of them, or the moments would be sums over one or two pixels.
+_WEIGHT, _WEIGHT_ALONE = 0.7, 0.3
 # Sides of a stamp [arcsec], 31 pixels of the LSST and 61 fine ones; and fewest pixels.
 _SIDE, _SIDE_ALONE, _FEWEST = 6.2, 3.05, 15
-_T = TypeVar("_T")
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
@@ -84,30 +80,30 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     name, band = config.telescope, config.band
     if name is None:
         name = f"lsst_v3.3_{band or 'r'}"
-    name = _absolute(name, folder, BUNDLED)
+    name = _absolute_path(name, folder, BUNDLED)
     telescope = load_telescope(name)
     band = band or _band_of(name, telescope)
     camera_name = None
     if config.camera is not None:
-        camera_name = _absolute(config.camera, folder, CAMERAS, CAMERA_ENDINGS)
+        camera_name = _absolute_path(config.camera, folder, CAMERAS, CAMERA_ENDINGS)
     camera = _camera_of(telescope, camera_name)
     atmosphere = config.atmosphere
-    site_name = _absolute(atmosphere.site or telescope.site or _SITE, folder, ())
+    site_name = _absolute_path(atmosphere.site or telescope.site or _SITE, folder, ())
     plane = config.focal_plane
     if plane.heights is not None:
-        heights = _absolute(plane.heights, folder, tuple(AS_MEASURED), HEIGHT_ENDINGS)
+        heights = _absolute_path(plane.heights, folder, tuple(AS_MEASURED), HEIGHT_ENDINGS)
         plane = plane.model_copy(update={"heights": heights})
     elif plane.budget is None:
         plane = plane.model_copy(update={"budget": camera.height_budget})
     active = config.active_optics
     if active.states is not None:
-        active = active.model_copy(update={"states": _absolute(active.states, folder, (), STATE_ENDINGS)})
+        active = active.model_copy(update={"states": _absolute_path(active.states, folder, (), STATE_ENDINGS)})
     site = load_site(site_name)
     stars, light = config.stars, resolved_photometry(config.photometry, telescope, camera, band)
     if stars.catalogue is not None:
         width, seconds, measured = PROVISIONAL_FWHM, atmosphere.exposure_s, band_of(band, light)
-        stars = _filled(
-            stars.model_copy(update={"catalogue": _absolute(stars.catalogue, folder, (), STAR_ENDINGS)}),
+        stars = _with_defaults(
+            stars.model_copy(update={"catalogue": _absolute_path(stars.catalogue, folder, (), STAR_ENDINGS)}),
             {
                 "brightest": round(saturation_magnitude(measured, seconds, width), 3),
                 "faintest": round(limiting_magnitude(stars.snr_min, measured, seconds, width), 3),
@@ -117,10 +113,10 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     if wavelengths is None:
         low, high = telescope.band or telescope.wavelength_range
         wavelengths = tuple(round(float(w) * 1e9, 3) for w in np.linspace(low, high, _WAVELENGTHS))
-    psf = _filled(
+    psf = _with_defaults(
         config.psf,
         (_WITH_ATMOSPHERE if atmosphere.enabled else _OPTICS_ALONE)
-        | _stamps(config, telescope, camera)
+        | _stamp_geometry(config, telescope, camera)
         | ({"n_pupil": default_points(telescope)} if config.psf.engine == "long_exposure" else {}),
     )
     resolved = config.model_copy(
@@ -134,37 +130,39 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
             "stars": stars,
             "focal_plane": plane,
             "active_optics": active,
-            "atmosphere": _filled(
+            "atmosphere": _with_defaults(
                 atmosphere.model_copy(update={"site": site_name}),
                 {"r0_m": float(site.r0), "outer_scale_m": float(site.outer_scale)},
             ),
             "psf": psf,
-            "reconstruction": _reconstruction(config.reconstruction, _weight(atmosphere.enabled, psf, telescope)),
+            "reconstruction": _reconstruction(
+                config.reconstruction, _moment_weight(atmosphere.enabled, psf, telescope)
+            ),
         }
     )
-    telescope = as_configured(telescope, resolved)
-    _check(resolved, telescope)
+    telescope = configured_telescope(telescope, resolved)
+    check_combinations(resolved, telescope, _pixel_arcsec(resolved.psf, telescope))
     check_screens(resolved, telescope, camera, site)
     return ResolvedConfiguration(resolved, telescope, camera, site)
 
 
 def _reconstruction(fit: ReconstructionConfig, weight_fwhm_arcsec: float) -> ReconstructionConfig:
-    """Return the section with its defaults: the best model that needs no optics, or the paper's once one key is given.
+    """Return the section with its defaults: kriging of pixels, or the paper's model once one of its keys is given.
 
-    Kriging leaves half as much between the stars (docs/psf_models.md). A choice of basis, components, interpolation,
-    weights or order belongs to the way of Jee & Tyson 2011, which fills the other ones.
+    Kriging halves the residual between the stars (docs/psf_models.md). Where basis, components, interpolation, weights
+    or order are given, the others are those of Jee & Tyson 2011.
     """
     if _names_no_model(fit):
         fit = fit.model_copy(update=_KRIGING)
-    fit = _filled(fit, _PAPER | {"weight_fwhm_arcsec": weight_fwhm_arcsec})
+    fit = _with_defaults(fit, _PAPER | {"weight_fwhm_arcsec": weight_fwhm_arcsec})
     components = None if fit.basis == "pixels" else COMPONENTS
-    return _filled(fit, {"components": components, "order": ORDERS[given(fit.interpolation)]})
+    return _with_defaults(fit, {"components": components, "order": ORDERS[resolved_value(fit.interpolation)]})
 
 
 def with_paper_model(config: Configuration) -> Configuration:
     """Return the configuration with the PSF model of Jee & Tyson 2011 for each CCD where it names none.
 
-    Of few stars it has as many components as they allow.
+    With few stars, it has as many components as they determine.
     """
     fit = config.reconstruction
     if not _names_no_model(fit):
@@ -194,7 +192,7 @@ def _camera_of(telescope: Telescope, name: str | None) -> Camera:
         return load_camera(found)
 
 
-def _stamps(config: Configuration, telescope: Telescope, camera: Camera) -> dict[str, float]:
+def _stamp_geometry(config: Configuration, telescope: Telescope, camera: Camera) -> dict[str, float]:
     """Return the default pixels [um] and size of stamps, as large on the sky as those of the LSST."""
     side, fine = (_SIDE, 1) if config.atmosphere.enabled else (_SIDE_ALONE, _FINE)
     pixel = camera.pixel_size / fine
@@ -206,42 +204,23 @@ def _stamps(config: Configuration, telescope: Telescope, camera: Camera) -> dict
 
 
 def _pixel_arcsec(psf: PsfConfig, telescope: Telescope) -> float:
-    return pixel_angle(telescope, given(psf.pixel_um) * 1e-6) / ARCSEC
+    return pixel_angle(telescope, resolved_value(psf.pixel_um) * 1e-6) / ARCSEC
 
 
-def _weight(enabled: bool, psf: PsfConfig, telescope: Telescope) -> float:
+def _moment_weight(enabled: bool, psf: PsfConfig, telescope: Telescope) -> float:
     """Return the FWHM of the weight of the moments [arcsec]."""
-    least = _WEIGHT_PIXELS * _pixel_arcsec(psf, telescope)
+    least = WEIGHT_PIXELS * _pixel_arcsec(psf, telescope)
     return max(_WEIGHT if enabled else _WEIGHT_ALONE, round(least, 3))
 
 
-def as_configured(telescope: Telescope, config: Configuration) -> Telescope:
+def configured_telescope(telescope: Telescope, config: Configuration) -> Telescope:
     """Return a telescope with the changes, the state of the visit and the rotator angle of a configuration."""
     telescope = apply_changes(telescope, config.changes)
     states = config.active_optics.states
     if states is not None:
         with error_context(key="active_optics.states"):
-            telescope = in_state(telescope, states, config.atmosphere.epoch)
+            telescope = with_active_optics_state(telescope, states, config.atmosphere.epoch)
     return telescope.with_rotator(math.radians(config.rotator_deg))
-
-
-def noise_free_components(config: Configuration) -> int:
-    """Return how many principal components describe the noise-free PSFs of a resolved configuration."""
-    components = config.reconstruction.components
-    return min(COMPONENTS, config.stars.truth - 1) if components is None else components
-
-
-def fewest_stars(config: Configuration) -> int:
-    """Return how many observed stars the PSF model of a resolved configuration needs on a CCD."""
-    fit = config.reconstruction
-    terms = 0 if fit.interpolation == "kriging" else term_count(fit.order or 0)
-    return max(1 + (fit.components or 0) if fit.basis == "pca" else 2, terms)
-
-
-def require_drawn_stars(config: Configuration) -> None:
-    """Raise ConfigError if a configuration has a catalogue of stars, where stars must be drawn."""
-    if config.stars.catalogue is not None:
-        raise ConfigError(f"stars.catalogue = {config.stars.catalogue}: expected none, these stars are drawn")
 
 
 def chosen_ccds(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
@@ -274,103 +253,8 @@ def default_ccds(camera: Camera) -> tuple[str, ...]:
     return tuple(camera.ccd_names[i] for i in np.flatnonzero(row))
 
 
-def _check(config: Configuration, telescope: Telescope) -> None:
-    """Check what several values must be together."""
-    for i, wavelength in enumerate(given(config.wavelengths_nm)):
-        low, high = (1e9 * w for w in telescope.wavelength_range)
-        if not low <= wavelength <= high:
-            raise ConfigError(
-                f"wavelengths_nm[{i}] = {wavelength:g}: expected {low:g} to {high:g}, which {telescope.name} covers"
-            )
-        low, high = (1e9 * w for w in SILICON_RANGE)
-        if config.detector.silicon and not low <= wavelength <= high:
-            raise ConfigError(
-                f"wavelengths_nm[{i}] = {wavelength:g}: expected {low:g} to {high:g} with detector.silicon = true"
-            )
-    if not config.wavelengths_nm:
-        raise ConfigError("wavelengths_nm = []: expected at least one wavelength in nm")
-    if given(config.psf.stamp) % 2 == 0:
-        raise ConfigError(f"psf.stamp = {config.psf.stamp}: expected an odd number of pixels")
-    if config.sensor.brighter_fatter is not None and config.psf.pixel_um != BRIGHTER_FATTER_PIXEL * 1e6:
-        raise ConfigError(
-            f"psf.pixel_um = {config.psf.pixel_um:g}: expected {BRIGHTER_FATTER_PIXEL * 1e6:g}, whose boundaries"
-            f" sensor.brighter_fatter = {config.sensor.brighter_fatter} moves"
-        )
-    fit, stars = config.reconstruction, config.stars
-    pixel = _pixel_arcsec(config.psf, telescope)
-    if not given(fit.weight_fwhm_arcsec) >= pixel:
-        raise ConfigError(
-            f"reconstruction.weight_fwhm_arcsec = {fit.weight_fwhm_arcsec:g}: expected at least {pixel:.3g}, a pixel,"
-            f" and better {_WEIGHT_PIXELS * pixel:.3g}"
-        )
-    if fit.model == "focal_plane" and not config.atmosphere.enabled:
-        raise ConfigError("reconstruction.model = focal_plane: expected atmosphere.enabled = true, whose mean it takes")
-    if fit.basis == "pixels" and fit.components is not None:
-        raise ConfigError(f"reconstruction.components = {fit.components}: expected null with basis = pixels")
-    if fit.interpolation != "polynomial" and fit.weights != "equal":
-        raise ConfigError(
-            f"reconstruction.weights = {fit.weights}: expected equal with interpolation = {fit.interpolation}"
-        )
-    if stars.catalogue is None:
-        for key in ("columns", "brightest", "faintest"):
-            if getattr(stars, key) not in (None, {}):
-                raise ConfigError(f"stars.{key} = {json_text(getattr(stars, key))}: expected stars.catalogue")
-    else:
-        for key in stars.columns:
-            if key not in NAMES:
-                raise ConfigError(
-                    f"stars.columns.{key} = {json_text(stars.columns[key])}: expected keys of {', '.join(NAMES)}"
-                )
-        if not given(stars.brightest) < given(stars.faintest):
-            raise ConfigError(
-                f"stars.faintest = {stars.faintest:g}: expected more than stars.brightest = {stars.brightest:g}"
-            )
-    for kind in ("truth",) if stars.catalogue else ("observed", "truth"):
-        count = getattr(stars, kind)
-        # The noise-free PSFs are always described by principal components.
-        components = noise_free_components(config) if kind == "truth" else fit.components
-        if components is not None and components > count - 1 and (kind == "truth" or fit.basis == "pca"):
-            raise ConfigError(
-                f"reconstruction.components = {components}: expected at most {count - 1}, one less than "
-                f"stars.{kind} = {count}"
-            )
-        key = "order" if kind == "observed" else "truth_order"
-        terms = term_count(getattr(fit, key))
-        if terms > count and (kind == "truth" or fit.interpolation != "kriging"):
-            raise ConfigError(
-                f"reconstruction.{key} = {getattr(fit, key)}: its {terms} terms need as many stars, "
-                f"stars.{kind} = {count}"
-            )
-    if config.focal_plane.budget == "flat" and config.focal_plane.sizes:
-        raise ConfigError(
-            "focal_plane.budget = flat: expected simulated or specification where sizes of its terms are given"
-        )
-    plane = config.focal_plane
-    if plane.heights is not None and plane.changed:
-        key = plane.changed[0]
-        value = plane.model_dump(by_alias=True)[key]
-        raise ConfigError(
-            f"focal_plane.{key} = {json_text(value)}: expected no budget with measured heights, "
-            f"focal_plane.heights = {plane.heights}"
-        )
-    if config.psf.engine == "long_exposure" and not config.atmosphere.enabled:
-        raise ConfigError("psf.engine = long_exposure: expected atmosphere.enabled = true, whose mean it takes")
-    if config.atmosphere.time_step_s > config.atmosphere.exposure_s:
-        raise ConfigError(
-            f"atmosphere.time_step_s = {config.atmosphere.time_step_s:g}: expected at most the exposure, "
-            f"atmosphere.exposure_s = {config.atmosphere.exposure_s:g}"
-        )
-
-
-def given(value: _T | None) -> _T:
-    """Return a value that a resolved configuration always has."""
-    if value is None:
-        raise ConfigError("the configuration is not resolved")
-    return value
-
-
-def _filled(section: _Model, defaults: Mapping[str, object]) -> _Model:
-    """Return a section with defaults in place of what was left open."""
+def _with_defaults(section: _Model, defaults: Mapping[str, object]) -> _Model:
+    """Return a section with defaults for its open values."""
     return section.model_copy(update={key: v for key, v in defaults.items() if getattr(section, key) is None})
 
 
@@ -381,7 +265,7 @@ def _band_of(name: str, telescope: Telescope) -> BandName:
     return bands.get(ending, "r" if telescope.band is None else bands[nearest_band(telescope.band)])
 
 
-def _absolute(name: str, folder: Path | None, bundled: Sequence[str], endings: Sequence[str] = ENDINGS) -> str:
+def _absolute_path(name: str, folder: Path | None, bundled: Sequence[str], endings: Sequence[str] = ENDINGS) -> str:
     """Return a bundled name as it is, and the path of a file as an absolute one."""
     if name in bundled or Path(name).suffix.lower() not in endings:
         return name

@@ -36,8 +36,9 @@ from ..wavefront.chief_rays import chief_rays
 from ..wavefront.psf.engines import ENGINES
 from .config import Configuration, digest
 from .config_hash import hashed_content
-from .defaults import given, resolve
+from .defaults import resolve
 from .photometry import band_of
+from .resolved_values import resolved_value
 from .sensor.displacement import Displacement, EdgeRolloff, TreeRings
 from .simulate.screen_cover import check_samples, corner_fields
 from .star_list import StarList, listed_stars, pointing_of
@@ -121,7 +122,7 @@ class Experiment:
     @cached_property
     def band(self) -> Band:
         """Zero point, sky and noise of the camera in the band."""
-        return band_of(given(self.config.band), self.config.photometry)
+        return band_of(resolved_value(self.config.band), self.config.photometry)
 
     @property
     def wavelengths(self) -> np.ndarray:
@@ -131,7 +132,7 @@ class Experiment:
     @property
     def pixel_size(self) -> float:
         """Pixel of the stamps [m]."""
-        return given(self.config.psf.pixel_um) * 1e-6
+        return resolved_value(self.config.psf.pixel_um) * 1e-6
 
     @property
     def pointing(self) -> Pointing | None:
@@ -146,12 +147,12 @@ class Experiment:
     @property
     def stamp_size(self) -> int:
         """Pixels on a side of a stamp."""
-        return given(self.config.psf.stamp)
+        return resolved_value(self.config.psf.stamp)
 
     @property
     def diffusion(self) -> float:
         """Charge diffusion, rms [m]; in silicon that of charge from the surface."""
-        return given(self.config.psf.diffusion_pixels) * self.camera.pixel_size
+        return resolved_value(self.config.psf.diffusion_pixels) * self.camera.pixel_size
 
     @property
     def silicon(self) -> Silicon | None:
@@ -167,7 +168,7 @@ class Experiment:
     @property
     def weight_fwhm(self) -> float:
         """FWHM of the weight of the moments [rad]."""
-        return given(self.config.reconstruction.weight_fwhm_arcsec) * ARCSEC
+        return resolved_value(self.config.reconstruction.weight_fwhm_arcsec) * ARCSEC
 
     @property
     def rotator(self) -> float:
@@ -286,13 +287,13 @@ def _focal_plane(config: Configuration, camera: Camera) -> FocalPlane:
     if plane.heights is not None:
         with error_context(key="focal_plane"):
             focal_plane = measured_focal_plane(plane.heights, camera)
-        for name in given(config.ccds):
+        for name in resolved_value(config.ccds):
             if not focal_plane.measured[camera.ccd_index(name)]:
                 raise ConfigError(f"focal_plane.heights = {plane.heights}: no heights of {name}, one of ccds")
     elif plane.budget == "flat":
         focal_plane = FocalPlane.flat(camera)
     else:
-        budget = replace(load_budget(given(plane.budget)), **plane.sizes)
+        budget = replace(load_budget(resolved_value(plane.budget)), **plane.sizes)
         focal_plane = FocalPlane.from_budget(camera, seed=config.seed, terms=plane.terms, budget=budget)
     for name, motion in plane.moved.items():
         focal_plane = focal_plane.with_moved(

@@ -1,7 +1,7 @@
 """Second stage of a run: a PSF model of the whole focal plane in place of the CCDs' own models.
 
-It reads measured shapes alone, never what a model says, so that it can be repeated: after a run was stopped, or with
-more CCDs, it leaves what one uninterrupted run leaves.
+Its input is measured shapes alone, not those of any model, so that it can be repeated: after an interruption, or with
+more CCDs, products are those of one uninterrupted run.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .focal_plane_psf.static_heights import StaticHeights
 #: Name of the focal-plane model in the folder of a run.
 FOCAL_PLANE_PSF_NAME = "focal_plane_psf.fits"
 _StarsKind = TypeVar("_StarsKind", bound=Stars)
-# Mean wavefront of the air over an exposure of 15 s, common to all stars, rms [m].
+# Mean wavefront of turbulence over an exposure of 15 s, common to all stars, rms [m].
 _AIR_WAVEFRONT = 0.1e-6
 
 
@@ -63,7 +63,7 @@ def apply_focal_plane_model(
         If there are too few stars.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
-    # Stars of an ideal telescope are no reason to fit one.
+    # Stars of an ideal telescope have no optics to fit.
     model = fit_focal_plane_model(
         experiment,
         FocalPlaneStars.from_products(products, experiment.weight_fwhm),
@@ -100,7 +100,7 @@ def fit_focal_plane_model(
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> FocalPlanePsf:
-    """Fit one model to stars of a run, as one who knows its configuration would.
+    """Fit one model to stars of a run, with priors from its configuration.
 
     The size of the residual of the active optics is known, to which the air near the ground adds its mean over the
     exposure.

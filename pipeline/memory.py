@@ -7,8 +7,8 @@ from dataclasses import replace
 from ..core.errors import ConfigError
 from ..core.memory import available_bytes, readable
 from ..core.threads import thread_count
-from .defaults import given
 from .experiment import Experiment
+from .resolved_values import resolved_value
 
 # Measured on runs of 0.5 to 2.6 GB (both engines, screens of 512 to 8192, 140 to 8000 stars on a CCD): the estimate is
 # 3 to 18 % above the peak. Python with its libraries and kernels while PSFs are made, and with the pictures of the
@@ -29,13 +29,13 @@ def screen_bytes(experiment: Experiment) -> int:
 def needed_bytes(experiment: Experiment, threads: int | None = None) -> int:
     """Return an estimate of the peak memory of a run [bytes]."""
     config = experiment.config
-    stars = config.stars.truth + max(map(experiment.observed_count, given(config.ccds)))
+    stars = config.stars.truth + max(map(experiment.observed_count, resolved_value(config.ccds)))
     workers = thread_count(threads) if config.psf.engine == "wave" else 0
     stamps = stars * experiment.stamp_size**2 * _STAMP_BYTES
     of_worker = _WAVE_THREAD + (0 if experiment.silicon is None else _SILICON_THREAD)
-    # Of every CCD the report has the model; one of pixels keeps each star, and its weight under a process.
+    # The report holds the PSF model of every CCD; a model of pixels stores each star, and its weight under a process.
     pixels = config.reconstruction.basis == "pixels"
-    models = 16 * len(given(config.ccds)) * config.stars.observed * experiment.stamp_size**2 if pixels else 0
+    models = 16 * len(resolved_value(config.ccds)) * config.stars.observed * experiment.stamp_size**2 if pixels else 0
     return max(_REPORT + models, _BASE + screen_bytes(experiment) + workers * of_worker + stamps)
 
 
@@ -56,7 +56,7 @@ def check_memory(experiment: Experiment, threads: int | None = None, *, copies: 
     rest = needed - screen_bytes(experiment)
     stars = experiment.config.stars
     if rest > free or experiment.atmosphere is None:
-        most = max(map(experiment.observed_count, given(experiment.config.ccds)))
+        most = max(map(experiment.observed_count, resolved_value(experiment.config.ccds)))
         raise ConfigError(f"stars.truth = {stars.truth}, stars.observed = {most}: {short}")
     smaller = experiment.atmosphere
     while smaller.screen_size > 16 and rest + screen_bytes(replace(experiment, atmosphere=smaller)) > free:

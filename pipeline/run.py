@@ -198,12 +198,12 @@ def _summarize(
 
 
 def _load_plots() -> None:
-    """Import what draws, half a second, in the process that is to draw."""
+    """Import the plotting modules, which takes half a second, in the process that draws."""
     from .report import pictures  # noqa: F401
 
 
 def _timings(reporter: Reporter, threads: int | None) -> dict[str, Any]:
-    """Return times and machine, which differ between runs and so stand in a file of their own."""
+    """Return times and machine, which differ between runs and are therefore in a separate file."""
     return {
         "pachon": VERSION,
         "seconds": reporter.seconds,

@@ -43,7 +43,7 @@ def claim_run(folder: Path, experiment: Experiment, *, resume: bool) -> None:
 
 def _refuse_other(folder: Path, before: Configuration, now: Configuration, resume: bool) -> None:
     old, new = before.as_dict(), now.as_dict()
-    # No CCD depends on the others, so a run may grow; one that shrinks would leave products that nothing counts.
+    # No CCD depends on the others, so CCDs may be added; without one of them its product would be orphaned.
     if resume and set(old["ccds"] or ()) <= set(new["ccds"]):
         del old["ccds"], new["ccds"]
     found = differences(old, new)

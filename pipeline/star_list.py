@@ -1,4 +1,4 @@
-"""Stars of a user's catalogue at their places on the CCDs of a camera."""
+"""Stars of a user's catalogue at their positions on the CCDs of a camera."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ..sky.pointing import Pointing
 from ..wavefront.chief_rays import chief_rays
 from .config import Configuration
 
-#: Names that columns have in files, in small letters, the first one first; ``{band}`` is that of the run.
+#: Accepted names of columns, in lower case, in order of preference; ``{band}`` is that of the run.
 NAMES: dict[str, tuple[str, ...]] = {
     "ra": ("ra", "ra_deg", "ra_icrs", "raj2000", "alpha_j2000"),
     "dec": ("dec", "dec_deg", "de_icrs", "decl", "dej2000", "delta_j2000"),
@@ -38,9 +38,9 @@ NAMES: dict[str, tuple[str, ...]] = {
     "g_i": ("g_i", "g-i"),
     "r_i": ("r_i", "r-i"),
 }
-#: Columns that tell the spectrum of a star, the first that is there counts.
+#: Columns with the spectrum of a star; the first one present is used.
 _SPECTRA = ("teff", "bp_rp", "g_r", "g_i", "r_i")
-#: Pairs of columns that give a place, and the unit of those without one; the first pair that is there counts.
+#: Pairs of columns with positions, and their default unit; the first pair present is used.
 _PLACES = ((("ra", "dec"), u.deg), (("field_x", "field_y"), u.deg), (("x", "y"), u.m))
 #: Columns of colours of unknown bands, which are not used.
 _COLORS = ("color", "colour")
@@ -61,9 +61,9 @@ class StarList:
     counts : dict of str to int
         Rows of the table, how many of them were left out, and how many are on the CCDs.
     unused : tuple of str
-        Columns of colours of unknown bands in the table, which nothing is made of.
+        Columns of colours of unknown bands in the table, which are ignored.
     spectrum : str or None
-        Kind of the column that tells the spectra of the stars; None without one.
+        Kind of the column with the spectra of the stars; None without one.
     kelvin : dict of str to ndarray
         Temperatures of the stars of each CCD [K], NaN without a colour, [n]; empty without such a column.
     """
@@ -152,7 +152,7 @@ def place_stars(
     ProductError
         If the file cannot be read, or lacks a column: one line with the names that were looked for.
     """
-    rows = _read(path, columns, band)
+    rows = _read_rows(path, columns, band)
     places, magnitude, kelvin = rows.places, rows.magnitude, rows.temperature
     if rows.kind == "ra" and pointing is None:
         raise ConfigError("right ascension and declination: expected pointing = {ra_deg, dec_deg}", file=path)
@@ -169,7 +169,7 @@ def place_stars(
     if rows.kind != "x":
         aim = pointing if rows.kind == "ra" else None
         slopes = np.tan(places) if aim is None else aim.to_slopes(aim.from_celestial(*places.T))
-        places, lands = _landings(telescope, slopes, wavelength)
+        places, lands = _landing_points(telescope, slopes, wavelength)
         keep("outside_the_field", lands)
     keep("off_the_ccds", camera.ccd_at(*places.T) >= 0)
     ccd = camera.ccd_at(*places.T, margin=-RIM * camera.pixel_size)
@@ -203,38 +203,38 @@ class _Rows:
     unused: tuple[str, ...]  #: columns of colours
 
 
-def _read(path: Path, columns: dict[str, str], band: str) -> _Rows:
+def _read_rows(path: Path, columns: dict[str, str], band: str) -> _Rows:
     """Read places and magnitudes of all rows; ProductError if a column is missing or none of numbers."""
     table = read_columns(path)
     with error_context(file=path):
-        given = {key: _column(table, key, columns, band) for key in NAMES}
+        given = {key: _column_name(table, key, columns, band) for key in NAMES}
         whole = [(pair, unit) for pair, unit in _PLACES if all(given[key] for key in pair)]
         pair, unit = whole[0] if whole else _PLACES[0]
         missing = [key for key in (*pair, "mag") if given[key] is None]
         if missing:
-            looked = "; ".join(f"{key}: {', '.join(_names(key, columns, band))}" for key in missing)
+            looked = "; ".join(f"{key}: {', '.join(_column_names(key, columns, band))}" for key in missing)
             raise ProductError(f"no column {', '.join(missing)} ({looked}); columns are {', '.join(table) or 'none'}")
-        magnitude = _values(table, str(given["mag"]), None)
-        places = np.stack([_values(table, str(given[key]), unit) for key in pair], axis=1)
+        magnitude = _column_in_unit(table, str(given["mag"]), None)
+        places = np.stack([_column_in_unit(table, str(given[key]), unit) for key in pair], axis=1)
         for key in _SPECTRA:
             if key in columns and given[key] is None:
                 raise ProductError(f"no column {columns[key]} ({key}); columns are {', '.join(table)}")
         spectrum = next((key for key in _SPECTRA if given[key]), None)
         kelvin = np.full(len(magnitude), np.nan)
         if spectrum is not None:
-            kelvin = _temperatures(_values(table, str(given[spectrum]), None), spectrum)
+            kelvin = _star_temperatures(_column_in_unit(table, str(given[spectrum]), None), spectrum)
     unused = tuple(name for name in _COLORS if name in table)
     return _Rows(pair[0], places, magnitude, kelvin, spectrum, unused)
 
 
-def _temperatures(values: np.ndarray, kind: str) -> np.ndarray:
+def _star_temperatures(values: np.ndarray, kind: str) -> np.ndarray:
     """Return the temperatures [K] of a column of temperatures or colours, NaN where a row has none."""
     found = values if kind == "teff" else color_temperature(values, kind)
     found = np.where(np.isfinite(found) & (found > 0.0), found, np.nan)
     return np.clip(found, COOLEST, HOTTEST)
 
 
-def _landings(telescope: Telescope, slopes: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
+def _landing_points(telescope: Telescope, slopes: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
     """Return where chief rays meet the nominal detector [m], shape [n, 2], NaN where none does, and whether they do."""
     with np.errstate(invalid="ignore"):
         inside = np.flatnonzero(np.hypot(*np.arctan(slopes).T) <= telescope.field_limit)
@@ -246,19 +246,19 @@ def _landings(telescope: Telescope, slopes: np.ndarray, wavelength: float) -> tu
     return places, np.isfinite(places[:, 0])
 
 
-def _names(key: str, columns: dict[str, str], band: str) -> tuple[str, ...]:
+def _column_names(key: str, columns: dict[str, str], band: str) -> tuple[str, ...]:
     """Return the names that a column may have, in small letters."""
     if key in columns:
         return (columns[key].lower(),)
     return tuple(name.format(band=band) for name in NAMES[key])
 
 
-def _column(table: dict[str, Any], key: str, columns: dict[str, str], band: str) -> str | None:
+def _column_name(table: dict[str, Any], key: str, columns: dict[str, str], band: str) -> str | None:
     """Return the name of a column in a table, or None."""
-    return next((name for name in _names(key, columns, band) if name in table), None)
+    return next((name for name in _column_names(key, columns, band) if name in table), None)
 
 
-def _values(table: dict[str, Any], name: str, unit: u.UnitBase | None) -> np.ndarray:
+def _column_in_unit(table: dict[str, Any], name: str, unit: u.UnitBase | None) -> np.ndarray:
     """Return a column in rad or m, or as it is without `unit`, that of a column that has none; NaN where masked."""
     column = table[name]
     if column.ndim != 1:

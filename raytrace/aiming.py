@@ -18,7 +18,7 @@ from ..core.units import field_label
 from ..models.design_data import DesignData
 from ..models.surface import Interaction, Surface
 from ..models.telescope import Telescope
-from .landing import Landing, derivatives, determinants, find_points, solved
+from .landing import Landing, derivatives, determinants, find_points, solve_2x2
 from .rays import Rays, field_angles, field_direction, object_points, straight_bundles
 from .repeated_trace import RepeatedTrace
 from .smooth_pupil import FEWEST, pupil_nodes, smooth_pupil
@@ -50,11 +50,11 @@ def entrance_points(telescope: Telescope, directions: np.ndarray, wavelength: fl
     relative = pupil / (0.5 * telescope.pupil_diameter)
     relative = np.broadcast_to(relative, (len(directions), *pupil.shape[-2:]))
     if relative.shape[1] < FEWEST:
-        return _one_by_one(telescope, stop, directions, wavelength, relative)
+        return _search_points(telescope, stop, directions, wavelength, relative)
     found = np.empty(relative.shape)
-    # Rays of all fields together: of few rays, what a trace costs is its launch.
+    # Rays of all fields together: with few rays the launch of the kernel takes most of the time.
     at_nodes = [
-        _one_by_one(telescope, stop, directions[part], wavelength, pupil_nodes(relative[part]))
+        _search_points(telescope, stop, directions[part], wavelength, pupil_nodes(relative[part]))
         for part in (slice(i, i + _FIELDS) for i in range(0, len(directions), _FIELDS))
     ]
     for i, (target, known) in enumerate(zip(relative, np.concatenate(at_nodes), strict=True)):
@@ -64,7 +64,7 @@ def entrance_points(telescope: Telescope, directions: np.ndarray, wavelength: fl
             return stop.relative(straight_bundles(telescope, light, wavelength, points))
 
         def search(some: np.ndarray, light: np.ndarray = light) -> np.ndarray:
-            return _one_by_one(telescope, stop, light, wavelength, some[None])[0]
+            return _search_points(telescope, stop, light, wavelength, some[None])[0]
 
         found[i] = smooth_pupil(target, known, at_stop, search)
     return found
@@ -85,7 +85,7 @@ class AimedPoints:
         if telescope.design_data.aiming == "off" or pupil.shape[-2] >= FEWEST:
             return cls(points, None)
         landing = stop_of(telescope).landing(np.repeat(directions, pupil.shape[-2], axis=0), wavelength)
-        return cls(points, derivatives(landing, points.reshape(-1, 2), _difference(telescope)))
+        return cls(points, derivatives(landing, points.reshape(-1, 2), _central_difference_step(telescope)))
 
     def moved(
         self, telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray
@@ -93,27 +93,27 @@ class AimedPoints:
         """Return :func:`entrance_points` of another telescope, a little different; None where it is too different."""
         if self.slopes is None or telescope.design_data.aiming == "off":
             return None
-        stop, difference = stop_of(telescope), _difference(telescope)
-        target = np.broadcast_to(_at_stop(telescope, stop, pupil), self.points.shape).reshape(-1, 2)
+        stop, difference = stop_of(telescope), _central_difference_step(telescope)
+        target = np.broadcast_to(_stop_coordinates(telescope, stop, pupil), self.points.shape).reshape(-1, 2)
         landing = stop.landing(np.repeat(directions, pupil.shape[-2], axis=0), wavelength)
         found = find_points(landing, self.points.reshape(-1, 2), target, stop.radius, difference, self.slopes)
         sense = determinants(derivatives(landing, found, difference, target)) * determinants(self.slopes)
         return found.reshape(self.points.shape) if (sense > 0.0).all() else None
 
 
-def _one_by_one(
+def _search_points(
     telescope: Telescope, stop: Stop, directions: np.ndarray, wavelength: float, relative: np.ndarray
 ) -> np.ndarray:
     """Return :func:`entrance_points` of pupil points in units of the radius, [n_direction, n_pupil, 2]."""
-    n, difference = len(directions), _difference(telescope)
-    chief = _chief_points(telescope, stop, directions, wavelength)
-    target = _turned(stop.radius * relative, stop.axes.T).reshape(-1, 2)
+    n, difference = len(directions), _central_difference_step(telescope)
+    chief = _chief_ray_points(telescope, stop, directions, wavelength)
+    target = _rotated(stop.radius * relative, stop.axes.T).reshape(-1, 2)
     rays = np.repeat(directions, relative.shape[1], axis=0)
     landing = stop.landing(rays, wavelength)
     start = np.repeat(chief, relative.shape[1], axis=0)
     # All rays of a field begin with the derivatives at its chief ray.
     slopes = derivatives(stop.landing(directions, wavelength), chief, difference)
-    first = start + solved(np.repeat(slopes, relative.shape[1], axis=0), target)
+    first = start + solve_2x2(np.repeat(slopes, relative.shape[1], axis=0), target)
     found = find_points(landing, first, target, stop.radius, difference)
     # The sense of the map from the entrance pupil to the stop is that at the chief ray; where it is the other one, the
     # search came beyond a fold of the pupil, to a second ray through the same point.
@@ -189,12 +189,12 @@ class Stop:
     @cached_property
     def front(self) -> Telescope:
         """The surfaces up to the stop, none of which stops light."""
-        return _front(self.telescope, self.index)
+        return _front_group(self.telescope, self.index)
 
     def relative(self, rays: Rays) -> np.ndarray:
         """Return where rays meet the stop [n, 2], along the axes of the entrance pupil, in units of the radius."""
         landing = self.surface.to_local(trace(self.front, rays).position)[:, :2]
-        return _turned(landing, self.axes) / self.radius
+        return _rotated(landing, self.axes) / self.radius
 
     def landing(self, directions: np.ndarray, wavelength: float) -> Landing:
         """Return the function from points of the entrance pupil to the stop for rays of given chief directions."""
@@ -221,7 +221,7 @@ def stop_of(telescope: Telescope) -> Stop:
     unscaled = Stop(telescope, 1.0, np.eye(2))
     landing = unscaled.landing(axis, light)
     rim = 0.5 * telescope.pupil_diameter
-    chief = find_points(landing, np.zeros((1, 2)), np.zeros((1, 2)), rim, _difference(telescope))
+    chief = find_points(landing, np.zeros((1, 2)), np.zeros((1, 2)), rim, _central_difference_step(telescope))
     # The error of central differences is one of third order, which two steps remove.
     steps = rim * np.array([1e-3, 2e-3])
     away = np.concatenate([step * side for step in steps for side in (np.eye(2), -np.eye(2))])
@@ -243,8 +243,8 @@ def stop_of(telescope: Telescope) -> Stop:
     return Stop(telescope, radius, u @ v)
 
 
-def _front(telescope: Telescope, stop: int) -> Telescope:
-    """Return the surfaces of a telescope up to its stop, which rays cross as they are, without apertures."""
+def _front_group(telescope: Telescope, stop: int) -> Telescope:
+    """Return a telescope with the surfaces up to its stop, without apertures and obstructions."""
     surfaces = telescope.surfaces[: stop + 1]
     before = surfaces[-2].medium_after if len(surfaces) > 1 else telescope.medium_before
     last = replace(surfaces[-1], interaction=Interaction.PASS, medium_after=before)
@@ -253,21 +253,21 @@ def _front(telescope: Telescope, stop: int) -> Telescope:
     return replace(telescope, surfaces=clear, **bare)
 
 
-def _at_stop(telescope: Telescope, stop: Stop, pupil: np.ndarray) -> np.ndarray:
+def _stop_coordinates(telescope: Telescope, stop: Stop, pupil: np.ndarray) -> np.ndarray:
     """Return the points of the stop [m], along its own axes, that pupil points [m] mean."""
-    return _turned(pupil * (stop.radius / (0.5 * telescope.pupil_diameter)), stop.axes.T)
+    return _rotated(pupil * (stop.radius / (0.5 * telescope.pupil_diameter)), stop.axes.T)
 
 
-def _turned(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+def _rotated(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """Return the product of points [..., 2] and a small matrix, without the threads of a matrix product."""
     return points[..., :1] * matrix[0] + points[..., 1:] * matrix[1]
 
 
-def _difference(telescope: Telescope) -> float:
+def _central_difference_step(telescope: Telescope) -> float:
     return _DIFFERENCE * 0.5 * telescope.pupil_diameter
 
 
-def _chief_points(telescope: Telescope, stop: Stop, directions: np.ndarray, wavelength: float) -> np.ndarray:
+def _chief_ray_points(telescope: Telescope, stop: Stop, directions: np.ndarray, wavelength: float) -> np.ndarray:
     """Return the points of the entrance pupil [n, 2] of rays through the middle of the stop, from the axis outwards."""
     slopes = directions[:, :2] / -directions[:, 2:]
     size = np.hypot(*slopes.T)
@@ -286,7 +286,9 @@ def _chief_points(telescope: Telescope, stop: Stop, directions: np.ndarray, wave
             ahead = [np.cos(np.minimum((k - i) * step, angle[left]))[:, None] for i in range(3)]
             guess = ((2.0 * points * ahead[1] - before * ahead[2]) / ahead[0])[going] if k > 1 else points[going]
             moved = points.copy()
-            moved[going] = find_points(landing, guess, np.zeros_like(guess), stop.radius, _difference(telescope))
+            moved[going] = find_points(
+                landing, guess, np.zeros_like(guess), stop.radius, _central_difference_step(telescope)
+            )
             points, before = moved, np.where(going[:, None], points, moved)
         found[left] = points
     return found

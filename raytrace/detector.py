@@ -1,4 +1,4 @@
-"""The last step of a ray: from the nominal focal surface to the CCD surface at its own height."""
+"""Propagation of rays from the nominal focal surface to the CCD surfaces at their heights."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Triple = tuple[np.ndarray, np.ndarray, np.ndarray]
 STEPS = 3
 #: For many photons two are enough: from 0.1 mm, with curvatures below 0.1 per metre, they leave 1e-20 m.
 BUNDLE_STEPS = 2
-#: Rays that are carried at a time, so that their numbers stay in the cache.
+#: Rays propagated at a time, so that their numbers stay in the cache.
 CHUNK = 8192
 
 
@@ -33,7 +33,7 @@ class Landing:
 def land_on_ccds(
     detector: Surface, focal_plane: FocalPlane, position: np.ndarray, direction: np.ndarray, *, index: float = 1.0
 ) -> Landing:
-    """Carry rays from the nominal detector surface to the CCD surfaces.
+    """Propagate rays from the nominal detector surface to the CCD surfaces.
 
     Heights are measured along the z axis of the detector's own frame, which is the telescope's +z unless the
     detector was tilted; positions on the CCDs are that frame's x and y. ``position`` [m] and ``direction``, [n, 3], are
@@ -41,7 +41,7 @@ def land_on_ccds(
     """
     (x, y, z), (u, v, w) = detector.to_local(position).T, detector.along(direction).T
     ccd = focal_plane.ccd_at(x, y)
-    t = _distance(focal_plane, ccd, (x, y, z), (u, v, w), STEPS)
+    t = _distance_to_ccd(focal_plane, ccd, (x, y, z), (u, v, w), STEPS)
     # A ray that crosses the edge on its last micrometres has left the CCD. (In a gap, index -1, t has no meaning.)
     ccd = np.where(focal_plane.ccd_at(x + t * u, y + t * v) == ccd, ccd, -1).astype(np.int32)
     t = np.where(ccd >= 0, t, 0.0)
@@ -51,7 +51,7 @@ def land_on_ccds(
 def land_bundle(
     focal_plane: FocalPlane, position: Triple, direction: Triple, *, threads: int | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Carry rays that land close to one another from the nominal surface to the CCD surfaces.
+    """Propagate rays that land close to one another from the nominal surface to the CCD surfaces.
 
     ``position`` [m], ``direction`` and the returned x, y [m] are in the frame of the detector. Returned too is whether
     there is a CCD; where there is none, x and y are those on the nominal surface. Each CCD is treated on its own, with
@@ -67,7 +67,7 @@ def land_bundle(
             here = first + np.flatnonzero(ccd[part] == one)
             (px, py, pz), (u, v, w) = ([component[here] for component in vector] for vector in (position, direction))
             if one >= 0:
-                t[here] = _distance(focal_plane, np.array([one]), (px, py, pz), (u, v, w), BUNDLE_STEPS)
+                t[here] = _distance_to_ccd(focal_plane, np.array([one]), (px, py, pz), (u, v, w), BUNDLE_STEPS)
 
     starts = range(0, len(x), CHUNK)
     if len(starts) == 1:
@@ -80,7 +80,9 @@ def land_bundle(
     return np.where(on_ccd, x, position[0]), np.where(on_ccd, y, position[1]), on_ccd
 
 
-def _distance(focal_plane: FocalPlane, ccd: np.ndarray, position: Triple, direction: Triple, steps: int) -> np.ndarray:
+def _distance_to_ccd(
+    focal_plane: FocalPlane, ccd: np.ndarray, position: Triple, direction: Triple, steps: int
+) -> np.ndarray:
     """Return the distances to the surfaces of CCDs, one for each ray or one for all, in lengths of the direction."""
     (x, y, z), (u, v, w) = position, direction
     frame, t = focal_plane.camera.frame(ccd), np.zeros(len(x))

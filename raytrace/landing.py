@@ -11,7 +11,7 @@ import numpy as np
 
 #: Distance from its target at which a ray is found, and at which it counts as found after the last step [size].
 _FOUND, _NEAR = 1e-12, 1e-9
-#: Steps of the iteration, and halvings of a step that leads astray.
+#: Most steps of the iteration, and most halvings of a step that increases the distance.
 _STEPS, _HALVINGS = 30, 8
 
 #: Function from coordinates [k, 2] and indices of rays [k] to landing points [k, 2]; NaN where a ray does not arrive.
@@ -50,11 +50,11 @@ def find_points(
     stuck = np.zeros(len(points), dtype=bool)
     for _ in range(_STEPS):
         distance = np.linalg.norm(miss, axis=1)
-        # What is NaN is lost: no step leads away from it.
+        # A ray at NaN is lost: no step leads away from it.
         left = np.flatnonzero((distance > _FOUND * size) & ~stuck & (np.abs(determinants(slopes)) > 0.0))
         if not len(left):
             break
-        step = -solved(slopes[left], miss[left])
+        step = -solve_2x2(slopes[left], miss[left])
         for _ in range(_HALVINGS):
             trial = landing(points[left] + step, left) - target[left]
             astray = ~(np.linalg.norm(trial, axis=1) < distance[left])
@@ -76,7 +76,7 @@ def determinants(matrices: np.ndarray) -> np.ndarray:
     return np.asarray(matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0])
 
 
-def solved(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
+def solve_2x2(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the solutions [n, 2] of linear equations, by Cramer's rule; NaN or infinite where there is none."""
     (a, b), (c, d) = matrices[:, 0].T, matrices[:, 1].T
     x, y = right.T
@@ -88,7 +88,7 @@ def derivatives(landing: Landing, points: np.ndarray, difference: float, here: n
     """Return the derivatives [n, 2, 2] of landing points by the coordinates, from one-sided differences."""
     every = np.arange(len(points))
     here = landing(points, every) if here is None else here
-    # Both sides in one trace: of few rays, what it costs is its launch.
+    # Both sides in one trace: with few rays the launch of the kernel takes most of the time.
     moved = np.concatenate([points + difference * axis for axis in np.eye(2)])
     beside = landing(moved, np.tile(every, 2)).reshape(2, -1, 2) - here
     return np.moveaxis(beside, 0, -1) / difference

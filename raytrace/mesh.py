@@ -37,7 +37,7 @@ class MeshLanding:
 def land_on_mesh(
     detector: Surface, mesh: trimesh.Trimesh, position: np.ndarray, direction: np.ndarray, *, threads: int | None = None
 ) -> MeshLanding:
-    """Carry rays from the nominal detector surface to a mesh given in the detector's own frame.
+    """Propagate rays from the nominal detector surface to a mesh in the detector's frame.
 
     ``wp.Mesh`` works in single precision and only finds the facet of each ray; the intersection with the plane of that
     facet is then computed in double precision.

@@ -89,9 +89,9 @@ def land_photons(
     points = aimed_points(telescope, light, telescope.default_wavelength, np.stack(beam.pupil, axis=-1))
     packets = [warp_array(to_packets(a), lanes) for a in (*beam.offset, *points.reshape(n, 2).T)]
     start = [warp_array(beam.source.ravel()), telescope.stop_z, telescope.launch_distance]
-    indices = warp_array(to_packets(_indices(telescope, beam.wavelength)), lanes)
+    indices = warp_array(to_packets(_media_indices(telescope, beam.wavelength)), lanes)
     inputs = [packed, indices, *packets, *start, ray_packets(), landing, statuses]
-    launch(trace_photons.suited(packed), count, inputs, threads=threads)
+    launch(trace_photons.variant_for(packed), count, inputs, threads=threads)
     x, y, z, u, v, w = from_packets(landing, n)
     lit = from_packets(statuses, n) == RayStatus.OK
     if focal_plane is not None:
@@ -101,7 +101,7 @@ def land_photons(
     return LandedPhotons(x, y, u / depth, v / depth, lit)
 
 
-def _indices(telescope: Telescope, wavelength: np.ndarray) -> np.ndarray:
+def _media_indices(telescope: Telescope, wavelength: np.ndarray) -> np.ndarray:
     """Return the refractive index of each distinct medium at each wavelength [m], [medium, n]."""
     telescope.check_wavelength(wavelength)
     media = distinct_media(telescope)

@@ -1,4 +1,4 @@
-"""Landing points of few rays that are traced again and again, such as those of a search."""
+"""Repeated traces of few rays, as in a search for their landing points."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class RepeatedTrace:
     def __init__(self, telescope: Telescope, wavelength: float, surface: int) -> None:
         self._packed = leading_surfaces(pack_surfaces(telescope), surface + 1)
         self._indices = warp_array(refractive_indices(telescope, wavelength)[None])
-        self._kernel = trace_rays.suited(self._packed)
+        self._kernel = trace_rays.variant_for(self._packed)
         load_kernels(self._kernel)
         self._room = 0
 

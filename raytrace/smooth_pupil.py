@@ -13,7 +13,7 @@ import numpy as np
 
 from ..core.threads import one_blas_thread
 
-#: Rays of a field from which on this is faster than to find each by itself.
+#: Fewest rays of a field for which this is faster than separate searches.
 FEWEST = 1500
 #: Degree of the polynomials, and rings of the rays that they go through, of six rays more each.
 _DEGREE, _RINGS = 10, 9
@@ -33,7 +33,7 @@ def pupil_nodes(target: np.ndarray) -> np.ndarray:
 
     Their shape is [..., n_node, 2].
     """
-    return np.asarray(_reach(target)[..., None, None] * _nodes())
+    return np.asarray(_node_radius(target)[..., None, None] * _disk_nodes())
 
 
 def smooth_pupil(target: np.ndarray, at_nodes: np.ndarray, stop: PointMap, search: PointMap) -> np.ndarray:
@@ -43,12 +43,12 @@ def smooth_pupil(target: np.ndarray, at_nodes: np.ndarray, stop: PointMap, searc
     ``search`` finds points of the entrance pupil one by one. It is taken where polynomials fail: beyond folds of the
     pupil, and where rays do not arrive.
     """
-    reach, known = float(_reach(target)), np.isfinite(at_nodes).all(axis=1)
+    reach, known = float(_node_radius(target)), np.isfinite(at_nodes).all(axis=1)
     if known.sum() < 1.5 * _TERMS:
         return search(target)
-    basis, inverse = _fit_matrices() if known.all() else _inverted(_basis(_nodes()[known]))
+    basis, inverse = _fit_matrices() if known.all() else _least_squares_inverse(_monomials(_disk_nodes()[known]))
     coefficients = inverse @ at_nodes[known]
-    table = np.concatenate([coefficients, *(_derived(coefficients, axis) / reach for axis in (0, 1))], axis=1)
+    table = np.concatenate([coefficients, *(_differentiated(coefficients, axis) / reach for axis in (0, 1))], axis=1)
     sense = np.sign(np.linalg.det(table[0, 2:].reshape(2, 2)))
     # A step leaves the error of its slopes, times the distance: where that is rounding, no trace has to confirm it.
     error = float(np.abs(basis @ coefficients - at_nodes[known]).max() / np.abs(table[0, 2:]).max())
@@ -73,7 +73,7 @@ def _by_newton(
     value = np.empty((len(target), 6))
     for first in range(0, len(target), _IN_CACHE):
         part = slice(first, first + _IN_CACHE)
-        value[part] = _basis(target[part] / reach) @ table
+        value[part] = _monomials(target[part] / reach) @ table
     points, by_x, by_y = value[:, :2].copy(), value[:, 2:4], value[:, 4:]
     left = np.arange(len(target))
     for step in range(_STEPS):
@@ -89,12 +89,12 @@ def _by_newton(
     return points
 
 
-def _reach(target: np.ndarray) -> np.ndarray:
+def _node_radius(target: np.ndarray) -> np.ndarray:
     """Return the radius of the nodes for targets [..., n, 2], shape [...]."""
     return np.asarray(np.maximum(1.0, np.linalg.norm(target, axis=-1).max(axis=-1)))
 
 
-def _nodes() -> np.ndarray:
+def _disk_nodes() -> np.ndarray:
     """Return points of the unit disk, denser towards the rim, shape [n, 2]."""
     rings = np.arange(1, _RINGS + 1)
     radius = np.sin(0.5 * np.pi * rings / _RINGS)
@@ -106,10 +106,10 @@ def _nodes() -> np.ndarray:
 @lru_cache(maxsize=1)
 def _fit_matrices() -> tuple[np.ndarray, np.ndarray]:
     """Return the monomials at all nodes, and the matrix from values there to coefficients by least squares."""
-    return _inverted(_basis(_nodes()))
+    return _least_squares_inverse(_monomials(_disk_nodes()))
 
 
-def _inverted(basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _least_squares_inverse(basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     with one_blas_thread():
         return basis, np.linalg.pinv(basis)
 
@@ -118,7 +118,7 @@ def _powers() -> list[tuple[int, int]]:
     return [(i, degree - i) for degree in range(_DEGREE + 1) for i in range(degree, -1, -1)]
 
 
-def _basis(points: np.ndarray) -> np.ndarray:
+def _monomials(points: np.ndarray) -> np.ndarray:
     """Return the monomials of points, degree by degree, shape [n, n_term]."""
     terms = np.empty((_TERMS, len(points)))
     x, y = np.ascontiguousarray(points.T)
@@ -131,7 +131,7 @@ def _basis(points: np.ndarray) -> np.ndarray:
     return terms.T
 
 
-def _derived(coefficients: np.ndarray, axis: int) -> np.ndarray:
+def _differentiated(coefficients: np.ndarray, axis: int) -> np.ndarray:
     """Return the coefficients of the derivatives of polynomials along an axis."""
     place = {power: k for k, power in enumerate(_powers())}
     out = np.zeros_like(coefficients)

@@ -62,7 +62,7 @@ class TraceResult(Result):
     _packets: Any = field(default=None, kw_only=True, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what is pickled and copied: all but the arrays of the kernel."""
+        """Return the state for pickling and copying, without the arrays of the kernel."""
         return {**self.__dict__, "_packets": None}
 
     def _label(self) -> str:
@@ -114,7 +114,7 @@ def trace_packets(
     start.path = warp_array(to_packets(rays.path_length[None]), lanes)
     # Of few rays, threads cost more than the trace.
     some = 1 if count <= _ONE_THREAD else threads
-    launch(trace_rays.suited(packed), count, [packed, warp_array(indices[None]), start, end], threads=some)
+    launch(trace_rays.variant_for(packed), count, [packed, warp_array(indices[None]), start, end], threads=some)
     return PacketTrace(indices, start, end)
 
 

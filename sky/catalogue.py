@@ -146,7 +146,9 @@ def tangent_plane(ra: Any, dec: Any, pointing: Any) -> tuple[np.ndarray, np.ndar
     return sky[..., 0], sky[..., 1]
 
 
-def _values(columns: dict[str, Any], name: str, unit: u.UnitBase | None = None, default: Any = None) -> np.ndarray:
+def _column_values(
+    columns: dict[str, Any], name: str, unit: u.UnitBase | None = None, default: Any = None
+) -> np.ndarray:
     """Return a column as numbers, in rad where it has a unit of angle; `unit` is that of a column without one."""
     key = next((alias for alias in NAMES.get(name, (name,)) if alias in columns), None)
     if key is None and default is not None:
@@ -175,41 +177,41 @@ def _values(columns: dict[str, Any], name: str, unit: u.UnitBase | None = None, 
 def _from_catalogue(columns: dict[str, Any], pointing: Any) -> Galaxies:
     """Return galaxies of one component from the columns of a catalogue."""
     if "xi" in columns or "eta" in columns:
-        xi, eta = (_values(columns, name, u.rad) for name in ("xi", "eta"))
+        xi, eta = (_column_values(columns, name, u.rad) for name in ("xi", "eta"))
     elif "ra" in columns or "dec" in columns:
-        ra, dec = (_values(columns, name, u.deg) for name in ("ra", "dec"))
+        ra, dec = (_column_values(columns, name, u.deg) for name in ("ra", "dec"))
         if pointing is None:
             raise DomainError("ra, dec: expected pointing=(right ascension, declination)", key="pointing")
         xi, eta = tangent_plane(ra, dec, pointing)
     else:
         found = ", ".join(columns) or "none"
         raise ProductError(f"no columns 'ra' and 'dec', nor 'xi' and 'eta'; columns are {found}", key="ra")
-    magnitude = _values(columns, "mag")
-    radius = _values(columns, "half_light_radius", u.arcsec)
+    magnitude = _column_values(columns, "mag")
+    radius = _column_values(columns, "half_light_radius", u.arcsec)
     if "q" in columns:
-        ratio = _values(columns, "q")
+        ratio = _column_values(columns, "q")
         if not np.all((ratio > 0.0) & (ratio <= 1.0)):
             raise DomainError("column 'q': expected axis ratios above 0, at most 1", key="q")
         # From north towards east is from eta towards xi.
-        e = (1.0 - ratio) / (1.0 + ratio) * np.exp(2j * (0.5 * np.pi - _values(columns, "pa", u.deg)))
+        e = (1.0 - ratio) / (1.0 + ratio) * np.exp(2j * (0.5 * np.pi - _column_values(columns, "pa", u.deg)))
         e1, e2 = e.real, e.imag
     else:
         given = "e1" in columns or "e2" in columns
-        e1, e2 = (_values(columns, name, default=None if given else 0.0) for name in ("e1", "e2"))
-    sersic = _values(columns, "n", default=1.0)
+        e1, e2 = (_column_values(columns, name, default=None if given else 0.0) for name in ("e1", "e2"))
+    sersic = _column_values(columns, "n", default=1.0)
     return Galaxies.single(xi, eta, magnitude, radius, e1=e1, e2=e2, sersic=sersic)
 
 
 def _from_components(columns: dict[str, Any]) -> Galaxies:
     """Return galaxies from the columns of a table of components."""
-    owner = _values(columns, "galaxy")
+    owner = _column_values(columns, "galaxy")
     first = np.flatnonzero(np.diff(owner, prepend=-1.0))
     if not np.array_equal(owner[first], np.arange(len(first))):
         raise DomainError(
             "column 'galaxy': expected 0, 1, 2..., with the components of a galaxy together", key="galaxy"
         )
     values = {
-        name: _values(columns, name, u.rad if unit == "rad" else None)
+        name: _column_values(columns, name, u.rad if unit == "rad" else None)
         for name, (unit, _) in (_PER_GALAXY | _PER_COMPONENT).items()
     }
     values |= {name: values[name][first] for name in _PER_GALAXY}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import DomainError
-from ..core.random_streams import natural, stream
+from ..core.random_streams import natural_number, stream
 from ..core.units import ARCMIN, radians, require_positive
 
 #: Side of a cell [rad].
@@ -28,7 +28,7 @@ class Cell:
 
     def stream(self, seed: int, *purpose: str) -> np.random.Generator:
         """Return the random stream of the cell for one purpose."""
-        return stream(seed, *purpose, natural(self.column), natural(self.row))
+        return stream(seed, *purpose, natural_number(self.column), natural_number(self.row))
 
     def place(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return xi and eta [rad] of places in the cell, given as fractions of its side."""
@@ -74,7 +74,7 @@ class Region:
         return (xi >= self.xi[0]) & (xi < self.xi[1]) & (eta >= self.eta[0]) & (eta < self.eta[1])
 
 
-def arrivals(rng: np.random.Generator, mean: float) -> np.ndarray:
+def poisson_arrivals(rng: np.random.Generator, mean: float) -> np.ndarray:
     """Draw the points of a Poisson process of rate 1 between 0 and `mean`, rising.
 
     Those of a smaller mean are the first of those of a larger one.

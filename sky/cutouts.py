@@ -1,4 +1,4 @@
-"""Galaxies cut out of a mosaic: reading, detection, neighbours, and what is larger than the PSF."""
+"""Galaxies cut out of a mosaic: reading, detection, removal of neighbours, selection by size against the PSF."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..core.units import ARCMIN
 
 #: Connected pixels above the rms of the sky that make an object (Jee & Tyson 2011, sec. 6.2).
 LEAST_AREA = 8
-#: Header keywords of an AB zero point, after the HST's own PHOTFLAM and PHOTPLAM.
+#: Header keywords of an AB zero point, tried after PHOTFLAM and PHOTPLAM of the HST.
 ZERO_POINT_KEYS = ("MAGZPT", "MAGZERO", "MAGZP", "ZEROPNT", "ZEROPT", "ZP", "ABZP")
 #: Signal-to-noise ratio and number of objects that determine the stellar locus.
 LOCUS_SNR, LOCUS_COUNT = 50.0, 8

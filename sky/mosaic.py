@@ -20,7 +20,7 @@ from ..core.result import Result
 from ..core.threads import one_blas_thread
 from ..core.units import ARCMIN, ARCSEC, for_each, positive_angle, radians, require_positive
 from ..core.warp_arrays import warp_array
-from .cells import SIDE, Cell, Region, arrivals
+from .cells import SIDE, Cell, Region, poisson_arrivals
 from .cutouts import Cutouts, cut_galaxies, read_mosaic
 from .galaxies import grid_arguments, reduced_shear
 from .stamp_kernels import transform_stamps
@@ -194,7 +194,7 @@ class StampTables(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlantedGalaxies:
-    """Stamps of galaxies at places on the sky, as :class:`~pachon.sky.galaxies.Galaxies` to whoever draws them.
+    """Stamps of galaxies at positions on the sky, with the interface of :class:`~pachon.sky.galaxies.Galaxies`.
 
     Attributes
     ----------
@@ -254,7 +254,7 @@ class PlantedGalaxies:
 
     def rotated(self, angle: Any, *, positions: bool = False) -> PlantedGalaxies:
         """Return the galaxies rotated from xi towards eta by an angle [rad], as :meth:`Galaxies.rotated`."""
-        return self._distorted(_rotation(for_each(radians(angle, "angle"), len(self), "angle")), positions)
+        return self._distorted(_rotation_matrices(for_each(radians(angle, "angle"), len(self), "angle")), positions)
 
     def _distorted(self, matrix: np.ndarray, positions: bool) -> PlantedGalaxies:
         place = np.stack([self.xi, self.eta], axis=-1)
@@ -328,15 +328,15 @@ class StampPopulation:
         return PlantedGalaxies.concatenate([self._galaxies_of(cell, region) for cell in region.cells()])
 
     def _galaxies_of(self, cell: Cell, region: Region) -> PlantedGalaxies:
-        n = len(arrivals(cell.stream(self.seed, "mosaic", "number"), self.density * (SIDE / ARCMIN) ** 2))
+        n = len(poisson_arrivals(cell.stream(self.seed, "mosaic", "number"), self.density * (SIDE / ARCMIN) ** 2))
         x, y, which, angle = cell.stream(self.seed, "mosaic", "traits").random((n, 4)).T
         xi, eta = cell.place(x, y)
         index = (which * len(self.stamps)).astype(np.int64)
-        planted = PlantedGalaxies(self.stamps, index, xi, eta, _rotation(2.0 * np.pi * angle))
+        planted = PlantedGalaxies(self.stamps, index, xi, eta, _rotation_matrices(2.0 * np.pi * angle))
         return planted.take(region.contains(xi, eta))
 
 
-def _rotation(angle: np.ndarray) -> np.ndarray:
+def _rotation_matrices(angle: np.ndarray) -> np.ndarray:
     """Return matrices that rotate from xi towards eta, [n, 2, 2]."""
     c, s = np.cos(angle), np.sin(angle)
     return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)

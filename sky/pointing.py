@@ -74,21 +74,21 @@ class Pointing:
     @check_arguments
     def to_sky(self, slopes: ArrayLike) -> np.ndarray:
         """Return (xi, eta) [rad] of the sources of light of gnomonic slopes (tx, ty), both shape [n, 2]."""
-        x, y = -_pairs(slopes, "slopes").T
+        x, y = -_angle_pairs(slopes, "slopes").T
         cosine, sine = np.cos(self.position_angle), np.sin(self.position_angle)
         return np.stack([x * cosine + y * sine, y * cosine - x * sine], axis=1)
 
     @check_arguments
     def to_slopes(self, sky: ArrayLike) -> np.ndarray:
         """Return the gnomonic slopes (tx, ty) of the light of sources at (xi, eta) [rad], both shape [n, 2]."""
-        xi, eta = _pairs(sky, "sky").T
+        xi, eta = _angle_pairs(sky, "sky").T
         cosine, sine = np.cos(self.position_angle), np.sin(self.position_angle)
         return np.stack([eta * sine - xi * cosine, -xi * sine - eta * cosine], axis=1)
 
     @check_arguments
     def to_celestial(self, sky: ArrayLike) -> np.ndarray:
         """Return right ascension, from 0 to 2 pi, and declination [rad] of (xi, eta) [rad], both shape [n, 2]."""
-        xi, eta = _pairs(sky, "sky").T
+        xi, eta = _angle_pairs(sky, "sky").T
         along = np.cos(self.dec) - eta * np.sin(self.dec)
         alpha = self.ra + np.arctan2(xi, along)
         delta = np.arctan2(np.sin(self.dec) + eta * np.cos(self.dec), np.hypot(xi, along))
@@ -111,7 +111,7 @@ class Pointing:
         return np.stack([east / depth, north / depth], axis=-1)
 
 
-def _pairs(values: ArrayLike, name: str) -> np.ndarray:
+def _angle_pairs(values: ArrayLike, name: str) -> np.ndarray:
     """Return angles as [n, 2]; one pair may be given as [2]."""
     found = np.atleast_2d(radians(values, name))
     if found.ndim != 2 or found.shape[1] != 2:

@@ -1,6 +1,6 @@
 """Random galaxies with the counts, sizes and shapes of the Hubble Ultra Deep Field in i (F775W).
 
-Figures and their sources, in the order in which a galaxy is made:
+Quantities and their sources, in the order in which a galaxy is made:
 
 counts
     N(< i) = 46 x 10^(0.31 (i - 25)) per square arcminute (LSST Science Book 2009, eq. 3.7): 8800 galaxies to 29.0 in
@@ -41,7 +41,7 @@ from ..core.arguments import check_arguments
 from ..core.errors import DomainError, shown
 from ..core.memory import require_bytes
 from ..core.units import ARCMIN, ARCSEC, radians, require_positive
-from .cells import SIDE, Cell, Region, arrivals
+from .cells import SIDE, Cell, Region, poisson_arrivals
 from .galaxies import Galaxies
 from .morphology import ATTRIBUTES, CLUMP_ATTRIBUTES, MOST_CLUMPS, make_components
 
@@ -117,7 +117,7 @@ class GalaxyPopulation:
         """Return the galaxies of one cell that lie in a region."""
         scale = self.density * (SIDE / ARCMIN) ** 2
         bright = counts(self.brightest)
-        rank = arrivals(cell.stream(self.seed, "galaxies", "magnitude"), self.surface_density * SIDE**2)
+        rank = poisson_arrivals(cell.stream(self.seed, "galaxies", "magnitude"), self.surface_density * SIDE**2)
         magnitude = 25.0 + np.log10((rank / scale + bright) / COUNT) / SLOPE
         n = len(magnitude)
         # One row a galaxy, so that the first rows do not depend on how many follow.

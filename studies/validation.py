@@ -38,7 +38,7 @@ _YAML, _TABLES = (".yaml", ".yml"), (".csv", ".ecsv", ".fits", ".fit", ".fz", ".
 
 @dataclass(frozen=True)
 class FileKind:
-    """A kind of YAML file: its model, its errors, and what loads it for checks across keys."""
+    """A kind of YAML file: its model, its errors, and its loader for checks across keys."""
 
     name: str
     model: type[BaseModel]
@@ -125,7 +125,7 @@ def validate_file(path: str | os.PathLike[str]) -> Validation:
     if ending in ENDINGS:
         return Validation(str(file), "lens file", tuple(_lens_file(file)))
     if ending in _TABLES:
-        return Validation(str(file), "heights", tuple(_caught(FocalPlane.from_file, file, HeightWarning)))
+        return Validation(str(file), "heights", tuple(_loading_problems(FocalPlane.from_file, file, HeightWarning)))
     raise ConfigError(f"expected a file that ends in {', '.join((*ENDINGS, *_TABLES))}", file=file)
 
 
@@ -162,7 +162,7 @@ def _yaml_file(path: Path) -> Validation:
         raise ConfigError(f"none of the keys of a {', '.join(k.name for k in KINDS)} is in it", file=path)
     found = _schema_problems(kind, content, path)
     if not found:
-        found = _caught(kind.load, path, HeightWarning)
+        found = _loading_problems(kind.load, path, HeightWarning)
     return Validation(str(path), kind.name, tuple(_with_line(error, path) for error in found))
 
 
@@ -185,11 +185,11 @@ def _schema_problems(kind: FileKind, content: dict[str, Any], path: Path) -> lis
 
 
 def _lens_file(path: Path) -> list[PachonError]:
-    """Return what a lenient reader warns of, and the error that stops it."""
-    return _caught(lambda file: load_telescope(file, lenient=True), path, PrescriptionWarning)
+    """Return the warnings of a lenient reader, and the error that ends it."""
+    return _loading_problems(lambda file: load_telescope(file, lenient=True), path, PrescriptionWarning)
 
 
-def _caught(load: Callable[[Path], Any], path: Path, warning: type[Warning]) -> list[PachonError]:
+def _loading_problems(load: Callable[[Path], Any], path: Path, warning: type[Warning]) -> list[PachonError]:
     """Return warnings of a kind, and the error that ends the loading of a file."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", warning)

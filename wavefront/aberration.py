@@ -163,12 +163,12 @@ class ResidualWavefront:
         -------
         ndarray, shape [..., n_pupil]
         """
-        return _combined(self.at(slopes), self._basis(annular_zernikes, x, y))
+        return _sum_of_terms(self.at(slopes), self._basis(annular_zernikes, x, y))
 
     def gradient(self, x: ArrayLike, y: ArrayLike, slopes: ArrayLike = (0.0, 0.0)) -> np.ndarray:
         """Return the derivatives of :meth:`opd` along x and y of the pupil [rad], shape [..., n_pupil, 2]."""
         basis = self._basis(annular_zernike_gradients, x, y) / (0.5 * self.pupil_diameter)
-        return _combined(self.at(slopes), np.moveaxis(basis, 1, -1))
+        return _sum_of_terms(self.at(slopes), np.moveaxis(basis, 1, -1))
 
     def _basis(self, terms: Callable[..., np.ndarray], x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the terms or their derivatives from j = 4 on."""
@@ -179,7 +179,7 @@ class ResidualWavefront:
 
 @dataclass(frozen=True, eq=False)
 class StarWavefronts(ResidualWavefront):
-    """An aberration of its own for each star; a field has that of the star nearest to it.
+    """A separate aberration for each star; a field point has that of the nearest star.
 
     Attributes
     ----------
@@ -198,8 +198,8 @@ class StarWavefronts(ResidualWavefront):
         return np.asarray(self.stars[np.argmin((apart**2).sum(axis=-1), axis=-1)])
 
 
-def _combined(coefficients: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Return the sum of the terms, always in the same order: a star's bytes must not depend on its neighbours."""
+def _sum_of_terms(coefficients: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """Sum terms in a fixed order, so that the bytes of a star do not depend on its neighbours."""
     total = np.zeros(coefficients.shape[:-1] + basis.shape[1:])
     extra = (np.newaxis,) * (basis.ndim - 1)
     for j, term in enumerate(basis):

@@ -67,9 +67,9 @@ def image_jacobians(
 ) -> np.ndarray:
     """Return d(position on the detector)/d(direction cosines) [m], shape [n, 2, 2], by central differences."""
     steps = JACOBIAN_STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    # One trace for all four neighbours: of few rays, what a trace costs is its launch.
+    # One trace for all four neighbours: with few rays the launch of the kernel takes most of the time.
     cosines = (directions[:, :2] + steps[:, None]).reshape(-1, 2)
-    ends = _landing(telescope, _downwards(cosines), wavelength, threads).reshape(2, 2, -1, 2)
+    ends = _landing_points(telescope, _downward_directions(cosines), wavelength, threads).reshape(2, 2, -1, 2)
     return np.moveaxis((ends[:, 0] - ends[:, 1]) / (2 * JACOBIAN_STEP), 0, -1)
 
 
@@ -121,7 +121,7 @@ def _by_axis_scale(
 ) -> np.ndarray | None:
     """Return slopes by iteration with the scales of x and y on the axis; None if it fails (rotated detector)."""
     corners = np.array([0.0, JACOBIAN_STEP])
-    origin, corner = _landing(telescope, field_direction(corners, corners, "gnomonic"), wavelength, threads)
+    origin, corner = _landing_points(telescope, field_direction(corners, corners, "gnomonic"), wavelength, threads)
     scale = (corner - origin) / JACOBIAN_STEP
     if not scale.all():
         return None
@@ -129,7 +129,7 @@ def _by_axis_scale(
     # The scale is within a per cent everywhere, so each step gains two digits or more.
     for _ in range(_SCALE_STEPS):
         light = field_direction(slopes[:, 0], slopes[:, 1], "gnomonic")
-        miss = target - _landing(telescope, light, wavelength, threads)
+        miss = target - _landing_points(telescope, light, wavelength, threads)
         slopes = slopes + miss / scale
         if not np.isfinite(miss).all():
             return None
@@ -142,8 +142,8 @@ def _by_newton(telescope: Telescope, target: np.ndarray, wavelength: float, thre
     """Return slopes by Newton's method from the axis, with the Jacobian of each chief ray."""
     cosines = np.zeros_like(target)
     for _ in range(_NEWTON_STEPS):
-        light = _downwards(cosines)
-        miss = target - _landing(telescope, light, wavelength, threads)
+        light = _downward_directions(cosines)
+        miss = target - _landing_points(telescope, light, wavelength, threads)
         jacobian = image_jacobians(telescope, light, wavelength, threads)
         if not (np.isfinite(miss).all() and np.isfinite(jacobian).all()):
             raise DomainError("positions: a point of the detector lies outside the field of the telescope")
@@ -159,13 +159,13 @@ def _by_newton(telescope: Telescope, target: np.ndarray, wavelength: float, thre
     )
 
 
-def _landing(telescope: Telescope, directions: np.ndarray, wavelength: float, threads: int | None) -> np.ndarray:
+def _landing_points(telescope: Telescope, directions: np.ndarray, wavelength: float, threads: int | None) -> np.ndarray:
     """Return detector x and y [m] of the landing points of chief rays, shape [n, 2]."""
     end = chief_rays(telescope, directions, wavelength, threads=threads)
     return telescope.surfaces[-1].to_local(image_points(telescope, end))[:, :2]
 
 
-def _downwards(cosines: np.ndarray) -> np.ndarray:
+def _downward_directions(cosines: np.ndarray) -> np.ndarray:
     """Return the unit vectors towards the primary of given direction cosines x and y, shape [n, 3]."""
     x, y = cosines.T
     with np.errstate(invalid="ignore"):

@@ -10,7 +10,7 @@ from ..core.errors import DomainError
 from ..models.paraxial import stop_image
 from ..models.telescope import Telescope
 from ..raytrace.aiming import entrance_points
-from ..raytrace.landing import derivatives, determinants, find_points, solved
+from ..raytrace.landing import derivatives, determinants, find_points, solve_2x2
 from ..raytrace.rays import field_angles, field_direction, straight_bundles
 from ..raytrace.trace import trace
 
@@ -62,7 +62,7 @@ def _real_slopes(telescope: Telescope) -> np.ndarray:
     origin, scale = landing(axis, np.zeros(1, dtype=int)), derivatives(landing, axis, _SLOPE)[0]
     if not np.isfinite(scale).all() or determinants(scale[None])[0] == 0.0:
         raise DomainError(f"{telescope.name}: image heights as fields: no chief ray on the axis reaches the image")
-    linear = solved(np.repeat(scale[None], len(target), axis=0), target - origin)
+    linear = solve_2x2(np.repeat(scale[None], len(target), axis=0), target - origin)
     slopes = find_points(landing, linear, target, size, _SLOPE)
     lost = np.isnan(slopes).any(axis=1)
     found = linear[lost] * 0.0

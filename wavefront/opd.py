@@ -198,7 +198,7 @@ def _pupil_points(
 
 
 def _silicon_opd(request: Request, silicon: Silicon, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return what silicon adds to the OPD [m], shape [n_field, *x.shape], at pupil coordinates from the reference [m].
+    """Return the OPD by silicon [m], shape [n_field, *x.shape], at pupil coordinates from the reference [m].
 
     The direction cosines of the light are those of the pupil and the Jacobian, good to 1e-4 (:doc:`conventions`).
     """
@@ -211,7 +211,7 @@ def _silicon_opd(request: Request, silicon: Silicon, x: np.ndarray, y: np.ndarra
 def _sphere_radius(
     telescope: Telescope, sphere_radius: ArrayLike | None, focal_plane: FocalPlane | None, silicon: Silicon | None
 ) -> float:
-    """Return the radius of reference spheres [m]; DomainError where an afocal telescope is given what has no place."""
+    """Return the radius of reference spheres [m]; DomainError for arguments that an afocal telescope cannot have."""
     given = {"a sphere_radius": sphere_radius, "a focal plane": focal_plane, "silicon": silicon}
     for name in (name for name, value in given.items() if value is not None):
         require_image(telescope, name)

@@ -10,7 +10,7 @@ import warp as wp
 from ..core.launch import FORWARD_OPTIONS
 from ..raytrace.kernels.kernel_pair import kernel_pair
 from ..raytrace.kernels.packet import LANES, RayPackets, lane_flags, lanes
-from ..raytrace.kernels.pupil import directed, launched
+from ..raytrace.kernels.pupil import direction_from_point, plane_wave_start
 from ..raytrace.kernels.sphere import sphere_distance
 from ..raytrace.kernels.surface import OK, ZERO
 from ..raytrace.kernels.trace import LOOPS, PackedSurfaces
@@ -57,12 +57,12 @@ def trace_opds(special: bool, module: wp.Module) -> wp.Kernel:
         du = lanes(direction[b, 0])
         dv = lanes(direction[b, 1])
         dw = lanes(direction[b, 2])
-        x, y, z = launched(px, py, pupil_z, direction[b, 0], direction[b, 1], direction[b, 2], distance)
+        x, y, z = plane_wave_start(px, py, pupil_z, direction[b, 0], direction[b, 1], direction[b, 2], distance)
         if start.shape[0] > 0:
             x = lanes(start[b, 0])
             y = lanes(start[b, 1])
             z = lanes(start[b, 2])
-            du, dv, dw = directed(px, py, pupil_z, start[b, 0], start[b, 1], start[b, 2])
+            du, dv, dw = direction_from_point(px, py, pupil_z, start[b, 0], start[b, 1], start[b, 2])
         x, y, z, u, v, w, path, status = through_telescope(
             surfaces, indices, 0, x, y, z, du, dv, dw, lanes(ZERO), p, no_rays
         )

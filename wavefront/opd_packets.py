@@ -15,7 +15,7 @@ from ..raytrace.pack.surfaces import leading_surfaces, pack_surfaces, refractive
 from ..raytrace.rays import object_points
 from .opd_kernels import trace_opds
 from .request import Request
-from .straight_light import passing_packets
+from .transmitted_packets import transmitted_packets
 
 #: Rays in one batch: enough that starting a batch does not count, and 0.2 s between two reports of progress.
 _RAYS_AT_ONCE = 1 << 22
@@ -60,15 +60,15 @@ def traced_opds(
     for first in range(0, len(value), step):
         part = slice(first, min(first + step, len(value)))
         pupil = to_packets(points[first].T) if shared is None else shared
-        passing = passing_packets(telescope, pupil, directions[part], start[part])
+        passing = transmitted_packets(telescope, pupil, directions[part], start[part])
         lit = np.ones((part.stop - first) * len(packed_place)) if passing is None else passing.ravel()
         lit = lit.astype(np.int32)
         for surfaces in stages if passing is None else stages[-1:]:
             work = np.flatnonzero(lit).astype(np.int32)
-            # A stage before the last counts the lit lanes only.
+            # Stages before the last one only count the lit lanes.
             filled = value[part] if surfaces is whole else value[:0]
             launch(
-                trace_opds.suited(surfaces),
+                trace_opds.variant_for(surfaces),
                 len(work),
                 [
                     surfaces,

@@ -124,7 +124,7 @@ def trace_pupils(
         kinds = (lanes, lanes, lanes, lane_flags)
         out = [wp.empty((bundles, count), dtype=kind, device="cpu") for kind in kinds]
         launch(
-            trace_pupils_kernel.suited(packed),
+            trace_pupils_kernel.variant_for(packed),
             bundles * count,
             [
                 packed,

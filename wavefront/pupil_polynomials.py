@@ -18,7 +18,7 @@ class PupilPolynomials:
     center : ndarray, shape [2]
         Middle of the pupil [m].
     least : float
-        Least radius by which coordinates are divided [m].
+        Lower bound of the radius that scales coordinates [m].
     """
 
     def __init__(self, points: np.ndarray, center: np.ndarray, least: float) -> None:

@@ -70,7 +70,7 @@ def gauss_annulus(radius: float, obscuration: float, rings: int, spokes: int) ->
     square = 0.5 * (1.0 - obscuration**2) * nodes + 0.5 * (1.0 + obscuration**2)
     # Half a step from the axes: no point lies on a spider vane along them, and both axes stay axes of symmetry.
     angle = (np.arange(spokes) + 0.5) * (2.0 * np.pi / spokes)
-    return PupilSampling(_polar(radius * np.sqrt(square)[:, None], angle), np.repeat(weights, spokes))
+    return PupilSampling(_polar_points(radius * np.sqrt(square)[:, None], angle), np.repeat(weights, spokes))
 
 
 def ring_annulus(radius: float, obscuration: float, rings: int) -> PupilSampling:
@@ -86,7 +86,7 @@ def ring_annulus(radius: float, obscuration: float, rings: int) -> PupilSampling
     # Multiples of six keep the pattern symmetric about both axes.
     counts = np.maximum(6, 6 * np.rint(2.0 * np.pi * middle * rings / (1.0 - obscuration) / 6.0).astype(int))
     points = [
-        _polar(np.array([[radius * r]]), (np.arange(n) + 0.5) * (2.0 * np.pi / n))
+        _polar_points(np.array([[radius * r]]), (np.arange(n) + 0.5) * (2.0 * np.pi / n))
         for r, n in zip(middle, counts, strict=True)
     ]
     return PupilSampling(np.concatenate(points), np.repeat(areas / counts, counts))
@@ -102,7 +102,7 @@ def spiral_annulus(radius: float, obscuration: float, count: int) -> PupilSampli
     k = np.arange(count)
     square = obscuration**2 + (1.0 - obscuration**2) * (k + 0.5) / count
     angle = k * np.pi * (3.0 - np.sqrt(5.0))
-    return PupilSampling(_polar(radius * np.sqrt(square), angle), np.ones(count))
+    return PupilSampling(_polar_points(radius * np.sqrt(square), angle), np.ones(count))
 
 
 def annulus_contains(x: np.ndarray, y: np.ndarray, inner: float, outer: float = 1.0) -> np.ndarray:
@@ -156,7 +156,7 @@ def pupil_sampling(
     return {"rings": ring_annulus, "spiral": spiral_annulus, "square": square_annulus}[sampling](radius, obscuration, n)
 
 
-def _polar(radius: np.ndarray, angle: np.ndarray) -> np.ndarray:
+def _polar_points(radius: np.ndarray, angle: np.ndarray) -> np.ndarray:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1).reshape(-1, 2)
 
 

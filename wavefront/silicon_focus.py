@@ -1,4 +1,4 @@
-"""Where detectors of silicon are in focus."""
+"""Best focus of silicon detectors."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ def detect_objects(
     bits = bits.astype(np.int64)
     require_count(saturated, "saturated", 0, 2**63 - 1)
     pixels, variances, ignored = check_pixels(image, variance, bits & ~np.int64(saturated))
-    options = _options(threshold, min_area, kernel, deblend_levels, deblend_contrast)
+    options = _sep_options(threshold, min_area, kernel, deblend_levels, deblend_contrast)
     if background_size is not None:
         require_count(background_size, "background_size", 1, 2**31 - 1)
     if ignored.all():
@@ -94,7 +94,7 @@ def detect_objects(
     data = np.where(ignored, 0.0, pixels)
     # SEP reads C arrays; masked pixels have any positive variance.
     variances = np.ascontiguousarray(np.where(ignored, 1.0, variances))
-    with _room_for(data.size):
+    with _sep_memory(data.size):
         try:
             level = np.zeros_like(data)
             if background_size is not None:
@@ -107,10 +107,10 @@ def detect_objects(
         raise DomainError(
             f"no objects: expected {min_area} connected pixels above {threshold:g} standard deviations of the noise"
         )
-    return _measured(data, variances, ignored, (bits & saturated) != 0, found, segmentation, level)
+    return _measure_objects(data, variances, ignored, (bits & saturated) != 0, found, segmentation, level)
 
 
-def _options(
+def _sep_options(
     threshold: float, min_area: int, kernel: ArrayLike | None, deblend_levels: int, deblend_contrast: float
 ) -> dict[str, Any]:
     """Return the arguments of SEP's extraction."""
@@ -128,7 +128,7 @@ def _options(
 
 
 @contextmanager
-def _room_for(size: int) -> Iterator[None]:
+def _sep_memory(size: int) -> Iterator[None]:
     """Give SEP room for the objects of an image inside a with block."""
     before = sep.get_extract_pixstack(), sep.get_sub_object_limit()
     sep.set_extract_pixstack(max(before[0], int(_PIXEL_ROOM * size)))
@@ -140,7 +140,7 @@ def _room_for(size: int) -> Iterator[None]:
         sep.set_sub_object_limit(before[1])
 
 
-def _measured(
+def _measure_objects(
     data: np.ndarray,
     variance: np.ndarray,
     ignored: np.ndarray,
@@ -182,7 +182,7 @@ def _measured(
         flux=flux,
         flux_error=flux_error,
         half_light_radius=radius,
-        fwhm=_widths(data, segmentation, x, y),
+        fwhm=_measure_fwhm(data, segmentation, x, y),
         a=a,
         b=b,
         theta=theta,
@@ -194,7 +194,7 @@ def _measured(
     )
 
 
-def _widths(data: np.ndarray, segmentation: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _measure_fwhm(data: np.ndarray, segmentation: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the full widths at half maximum [pixel], with neighbours set to zero; NaN without a positive peak."""
     result = []
     for i in range(0, len(x), _FWHM_BATCH):

@@ -23,7 +23,7 @@ STAMP_SIDES = (32, 48, 64, 96, 128)
 STAMP_RADII = 4.0
 #: A fit is flagged where a larger fraction of the pixels in the inner half of its stamp is masked.
 MOST_MASKED = 0.25
-# Least eigenvalue of the covariance over the variance of the PSF: the image of a point may be that much sharper.
+# Least eigenvalue of the covariance over the variance of the PSF: noise may make the image of a point sharper.
 _LEAST_MOMENT = -0.25
 # The largest width, and the largest shift, over the side of the stamp.
 _MOST_WIDTH, _REACH = 0.5, 0.25
@@ -95,9 +95,9 @@ def fit_galaxies(
         If shapes differ, a pixel that is not masked is not finite or has no positive variance, a position lies outside
         the image, or a PSF has an even side or no unit sum.
     """
-    options = _options(max_evaluations, tolerance, threads)
+    options = _checked_options(max_evaluations, tolerance, threads)
     pixels, variances, ignored = check_pixels(image, variance, mask)
-    places = _positions(x, y, pixels.shape)
+    places = _checked_positions(x, y, pixels.shape)
     count = len(places)
     try:
         radius = np.broadcast_to(pure_numbers(half_light_radius, "half_light_radius"), (count,))
@@ -106,7 +106,7 @@ def fit_galaxies(
     radius = np.where(np.isnan(radius), 0.5 * STAMP_SIDES[0] / STAMP_RADII, radius)
     if not (np.isfinite(radius).all() and (radius > 0.0).all()):
         raise DomainError("half_light_radius: expected positive, finite numbers of pixels")
-    psfs, templates = _psfs(psf_images, psf_index, count)
+    psfs, templates = _checked_psfs(psf_images, psf_index, count)
     labels = None if segmentation is None else np.asarray(segmentation)
     if labels is not None and (labels.shape != pixels.shape or labels.dtype.kind not in "iub"):
         raise DomainError(
@@ -118,8 +118,8 @@ def fit_galaxies(
     choice = np.minimum(wanted, len(STAMP_SIDES) - 1)
     parts, members = [_no_fits()], [np.empty(0, dtype=np.int64)]
     for k, side in enumerate(STAMP_SIDES):
-        batch = _batch(side, psfs.shape[-1])
-        for group in _split(np.flatnonzero(choice == k), batch):
+        batch = _batch_size(side, psfs.shape[-1])
+        for group in _index_chunks(np.flatnonzero(choice == k), batch):
             px, py = places[group].T
             corner = np.stack([first_pixel(px, side), first_pixel(py, side)], axis=1)
             stamps, weights = (cut_out(values, px, py, side, 0.0) for values in (data, weight))
@@ -131,7 +131,7 @@ def fit_galaxies(
             beyond = (corner < 0).any(axis=1) | (corner + side > np.array(pixels.shape[::-1])).any(axis=1)
             flags = np.where(beyond, GalaxyFlag.EDGE, 0)
             flags[wanted[group] == len(STAMP_SIDES)] |= GalaxyFlag.CUT_OFF
-            parts.append(_fit(stamps, weights, middle, places[group], psfs, templates[group], flags, **options))
+            parts.append(_fit_stamps(stamps, weights, middle, places[group], psfs, templates[group], flags, **options))
             members.append(group)
     return joined(parts, members)
 
@@ -149,7 +149,7 @@ def fit_galaxy_stamps(
     tolerance: float = 1e-5,
     threads: int | None = None,
 ) -> GalaxyFits:
-    """Fit galaxies on stamps of their own; everything else as :func:`fit_galaxies`.
+    """Fit galaxies on given stamps, otherwise as :func:`fit_galaxies`.
 
     Parameters
     ----------
@@ -175,16 +175,16 @@ def fit_galaxy_stamps(
     DomainError
         As of :func:`fit_galaxies`.
     """
-    options = _options(max_evaluations, tolerance, threads)
+    options = _checked_options(max_evaluations, tolerance, threads)
     pixels, variances, ignored = check_pixels(stamps, variance, mask, axes="[n, ny, nx]", name="stamps")
     count, ny, nx = pixels.shape
-    psfs, templates = _psfs(psf_images, psf_index, count)
+    psfs, templates = _checked_psfs(psf_images, psf_index, count)
     if start is not None and len(start) != count:
         raise DomainError(f"start: {len(start)} fits of {count} galaxies")
     side = -(-max(ny, nx) // SIDE_STEP) * SIDE_STEP
     below, left = (side - ny) // 2, (side - nx) // 2
     parts, members = [_no_fits()], [np.empty(0, dtype=np.int64)]
-    for group in _split(np.arange(count), _batch(side, psfs.shape[-1])):
+    for group in _index_chunks(np.arange(count), _batch_size(side, psfs.shape[-1])):
         data, weights = np.zeros((2, len(group), side, side))
         inside = np.s_[:, below : below + ny, left : left + nx]
         good = ~ignored[group]
@@ -194,17 +194,17 @@ def fit_galaxy_stamps(
         offset = np.array([left + 0.5 * (nx - 1), below + 0.5 * (ny - 1)]) - 0.5 * (side - 1)
         middle, place = np.broadcast_to(-offset, (len(group), 2)), np.zeros((len(group), 2))
         flags = np.zeros(len(group), dtype=np.int32)
-        known = None if start is None else _parameters(start)[group]
-        parts.append(_fit(data, weights, middle, place, psfs, templates[group], flags, known, **options))
+        known = None if start is None else _fit_parameters(start)[group]
+        parts.append(_fit_stamps(data, weights, middle, place, psfs, templates[group], flags, known, **options))
         members.append(group)
     return joined(parts, members)
 
 
-def _parameters(fits: GalaxyFits) -> np.ndarray:
+def _fit_parameters(fits: GalaxyFits) -> np.ndarray:
     return np.column_stack([fits.flux, fits.x, fits.y, fits.moments])
 
 
-def _fit(
+def _fit_stamps(
     data: np.ndarray,
     weight: np.ndarray,
     middle: np.ndarray,
@@ -229,7 +229,7 @@ def _fit(
     psf_variance = (0.5 / (np.pi * psfs[used].max(axis=(1, 2))))[own]
     fitter = GaussianStamps(psfs[used], own, data, weight, threads)
     bounds = Bounds(center, _REACH * side, _LEAST_MOMENT * psf_variance, (_MOST_WIDTH * side) ** 2)
-    start = _start(data, weight, center, psf_variance)
+    start = _moment_estimates(data, weight, center, psf_variance)
     if known is not None:
         shifted = np.concatenate([known[:, :1], known[:, 1:3] - middle, known[:, 3:]], axis=1)
         usable = np.isfinite(shifted).all(axis=1)
@@ -243,7 +243,7 @@ def _fit(
             max_evaluations=max_evaluations,
             tolerance=tolerance,
         )
-        covariance = _inverse(found.equations.matrix)
+        covariance = _fisher_inverse(found.equations.matrix)
     inner = np.s_[:, side // 4 : side - side // 4, side // 4 : side - side // 4]
     n_pixels = (weight > 0.0).sum(axis=(1, 2))
     flags = flags.astype(np.int32)
@@ -266,7 +266,7 @@ def _fit(
     )
 
 
-def _start(data: np.ndarray, weight: np.ndarray, center: np.ndarray, psf_variance: np.ndarray) -> np.ndarray:
+def _moment_estimates(data: np.ndarray, weight: np.ndarray, center: np.ndarray, psf_variance: np.ndarray) -> np.ndarray:
     """Return approximate parameters [n, 6] from moments under a round Gaussian twice as wide as the PSF."""
     side = data.shape[-1]
     width = 4.0 * psf_variance
@@ -286,7 +286,7 @@ def _start(data: np.ndarray, weight: np.ndarray, center: np.ndarray, psf_varianc
     return np.stack([flux, center[:, 0], center[:, 1], own, np.zeros(len(data)), own], axis=1)
 
 
-def _inverse(matrix: np.ndarray) -> np.ndarray:
+def _fisher_inverse(matrix: np.ndarray) -> np.ndarray:
     """Return the inverses of Fisher matrices [n, 6, 6]; NaN for a singular one."""
     scale = np.sqrt(np.diagonal(matrix, axis1=1, axis2=2))
     known = (scale > 0.0).all(axis=1)
@@ -301,7 +301,7 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
     return result
 
 
-def _psfs(psf_images: ArrayLike, psf_index: ArrayLike | None, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _checked_psfs(psf_images: ArrayLike, psf_index: ArrayLike | None, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the PSFs [m, side, side] and the index [n] of each galaxy's."""
     psfs = real_array(psf_images, "psf_images: expected real numbers [n, m, m] or [m, m]")
     shared = psfs.ndim == 2
@@ -327,7 +327,7 @@ def _psfs(psf_images: ArrayLike, psf_index: ArrayLike | None, count: int) -> tup
     return psfs, np.zeros(count, dtype=np.int64) if shared else np.arange(count)
 
 
-def _options(max_evaluations: int, tolerance: float, threads: int | None) -> dict[str, Any]:
+def _checked_options(max_evaluations: int, tolerance: float, threads: int | None) -> dict[str, Any]:
     """Return the options of the fits."""
     if max_evaluations < 1:
         raise DomainError(f"max_evaluations = {max_evaluations}: expected at least 1")
@@ -338,7 +338,7 @@ def _options(max_evaluations: int, tolerance: float, threads: int | None) -> dic
     }
 
 
-def _positions(x: ArrayLike, y: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+def _checked_positions(x: ArrayLike, y: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     """Return the positions [n, 2]."""
     px, py = (real_array(v, f"{name}: expected real numbers [n]") for v, name in ((x, "x"), (y, "y")))
     if px.ndim != 1 or px.shape != py.shape:
@@ -350,12 +350,12 @@ def _positions(x: ArrayLike, y: ArrayLike, shape: tuple[int, ...]) -> np.ndarray
     return np.stack([px, py], axis=1)
 
 
-def _batch(side: int, psf_side: int) -> int:
+def _batch_size(side: int, psf_side: int) -> int:
     """Return how many galaxies are held at a time."""
     return max(1, _BATCH_NUMBERS // (4 * side**2 + (side + psf_side) ** 2))
 
 
-def _split(indices: np.ndarray, size: int) -> list[np.ndarray]:
+def _index_chunks(indices: np.ndarray, size: int) -> list[np.ndarray]:
     """Return indices in parts of a size."""
     return [indices[i : i + size] for i in range(0, len(indices), size)]
 

@@ -201,12 +201,12 @@ class GalaxyFits(Result):
             "cxy": (self.moments[:, 1], "pix2", "covariance before the PSF"),
             "cyy": (self.moments[:, 2], "pix2", "covariance before the PSF"),
             "chi2_per_pixel": (self.chi2_per_pixel, "", "chi-square over degrees of freedom"),
-            "flags": (self.flags, "", _bits()),
+            "flags": (self.flags, "", _flag_meanings()),
         }
         return described_table(columns, {"what": "PSF-convolved elliptical Gaussian fits", "pachon": VERSION})
 
 
-def _bits() -> str:
+def _flag_meanings() -> str:
     """Return the meaning of the flags in words."""
     return ", ".join(f"{int(flag)} {str(flag.name).lower().replace('_', ' ')}" for flag in GalaxyFlag if flag)
 

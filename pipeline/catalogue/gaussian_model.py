@@ -82,9 +82,11 @@ class GaussianStamps:
         # Light of the galaxy's part of a stamp that the PSF carries over its edge does not come in at the other one.
         self.period = max(self.side + reach // 2, reach) | 1
         self._step = 2.0 * np.pi / self.period
-        self._psf = warp_array(_transforms(psf_images, self.period, self.threads).view(np.float64), wp.vec4d)
-        self._tables = [warp_array(table, pixels) for table in _tables(self.period, self.side)]
-        self._data, self._weight = (warp_array(_packets(values), pixels) for values in (data, weight))
+        self._psf = warp_array(_psf_transforms(psf_images, self.period, self.threads).view(np.float64), wp.vec4d)
+        self._trigonometric_tables = [
+            warp_array(table, pixels) for table in _trigonometric_tables(self.period, self.side)
+        ]
+        self._data, self._weight = (warp_array(_stamp_packets(values), pixels) for values in (data, weight))
 
     def normal_equations(self, params: np.ndarray, which: np.ndarray) -> NormalEquations:
         """Return the normal equations of the galaxies `which` [k] of given parameters [k, 6]."""
@@ -102,10 +104,10 @@ class GaussianStamps:
                 warp_array(which, wp.int32),
                 self._step,
                 warp_array(params),
-                *self._tables,
+                *self._trigonometric_tables,
                 self._data,
                 self._weight,
-                *self._work(blocks),
+                *self._work_arrays(blocks),
                 warp_array(result),
             ],
             threads=self.threads,
@@ -130,16 +132,16 @@ class GaussianStamps:
                 warp_array(self.templates, wp.int32),
                 self._step,
                 warp_array(params),
-                *self._tables,
-                *self._work(count),
+                *self._trigonometric_tables,
+                *self._work_arrays(count),
                 warp_array(images.reshape(count, len(PARAMETERS), side, -1, LANES), pixels),
             ],
             threads=self.threads,
         )
-        natural = np.argsort(_from_center(side))
+        natural = np.argsort(_rows_from_center(side))
         return images[:, :, natural[:, None], natural]
 
-    def _work(self, count: int) -> list[wp.array]:
+    def _work_arrays(self, count: int) -> list[wp.array]:
         """Return the work arrays of `count` items: spectrum, and columns as packets and as numbers."""
         rows = count * ((self.period + 1) // 2)
         columns = np.zeros((rows, len(PARAMETERS), self.side))
@@ -147,25 +149,25 @@ class GaussianStamps:
         return [warp_array(np.zeros((rows, 4)), wp.vec4d), as_packets, warp_array(columns)]
 
 
-def _from_center(side: int) -> np.ndarray:
+def _rows_from_center(side: int) -> np.ndarray:
     """Return the order of rows in the kernels: from the centre upwards, then from the centre downwards."""
     return np.r_[side // 2 : side, side // 2 - 1 : -1 : -1]
 
 
-def _packets(stamps: np.ndarray) -> np.ndarray:
+def _stamp_packets(stamps: np.ndarray) -> np.ndarray:
     """Return stamps [n, side, side] in the order of the kernels, [n, side, packet, LANES]."""
-    order = _from_center(stamps.shape[-1])
+    order = _rows_from_center(stamps.shape[-1])
     return stamps[:, order[:, None], order].reshape(*stamps.shape[:2], -1, LANES)
 
 
 @lru_cache(maxsize=8)
-def _tables(period: int, side: int) -> tuple[np.ndarray, np.ndarray]:
+def _trigonometric_tables(period: int, side: int) -> tuple[np.ndarray, np.ndarray]:
     """Return cosines and sines at frequencies that are not negative and pixels above the centre, as packets."""
     phase = 2.0 * np.pi / period * np.arange((period + 1) // 2)[:, None] * (np.arange(side // 2) + 0.5)
     return tuple(np.ascontiguousarray(f(phase).reshape(len(phase), -1, LANES)) for f in (np.cos, np.sin))  # type: ignore[return-value]
 
 
-def _transforms(psf_images: np.ndarray, period: int, threads: int) -> np.ndarray:
+def _psf_transforms(psf_images: np.ndarray, period: int, threads: int) -> np.ndarray:
     """Return the transforms of PSFs at (kx, ky) and (kx, -ky), [m, kx, ky, 2], weighted for a sum over all frequencies.
 
     The values at kx > 0 count twice, for kx < 0; those at ky = 0 stand in the first of two numbers alone.

@@ -107,7 +107,7 @@ def minimize(
         trial = bounds.project(wanted, active)
         step = trial - params[active]
         at_bounds[active] = (trial != wanted).any(axis=1)
-        change = _dot(_times(matrix[active], step), step)
+        change = _scalar_product(_matrix_vector(matrix[active], step), step)
         signal = params[active, 0] ** 2 * matrix[active, 0, 0] + chi2[active]
         found = stamps.normal_equations(trial, active)
         evaluations[active] += 1
@@ -115,7 +115,7 @@ def minimize(
         kept = active[better]
         params[kept], chi2[kept] = trial[better], found.chi2[better]
         right[kept], matrix[kept] = found.right[better], found.matrix[better]
-        second[active] = _learnt(second[active], matrix[active], step, before - found.right)
+        second[active] = _updated_curvature(second[active], matrix[active], step, before - found.right)
         # A strongly damped step is short without being near the minimum; a short one that is rejected is rounding.
         done = (change <= tolerance**2 * signal) & (damping[active] <= _WEAK_DAMPING)
         damping[active] *= np.where(better, 1.0 / _FACTOR, _FACTOR)
@@ -124,11 +124,11 @@ def minimize(
     return Minimum(params, NormalEquations(chi2, right, matrix), converged, at_bounds, evaluations)
 
 
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _scalar_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.asarray((a * b).sum(axis=1))
 
 
-def _times(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+def _matrix_vector(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
     return np.asarray((matrix * vector[:, None, :]).sum(axis=2))
 
 
@@ -139,41 +139,41 @@ def _best_step(fisher: np.ndarray, second: np.ndarray, right: np.ndarray, dampin
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     damped = np.eye(fisher.shape[1]) * np.where(diagonal > 0.0, damping[:, None], 1.0)[:, None, :]
     safe, whole = (
-        _solved(matrix / (scale[:, :, None] * scale[:, None, :]) + damped, right / scale) / scale
+        _solve_linear(matrix / (scale[:, :, None] * scale[:, None, :]) + damped, right / scale) / scale
         for matrix in (fisher, fisher + second)
     )
-    length, limit = (_dot(_times(fisher, step), step) for step in (whole, safe))
-    good = (_dot(whole, right) > 0.0) & (length <= _LONGEST**2 * limit)
+    length, limit = (_scalar_product(_matrix_vector(fisher, step), step) for step in (whole, safe))
+    good = (_scalar_product(whole, right) > 0.0) & (length <= _LONGEST**2 * limit)
     return np.where(good[:, None], whole, safe)
 
 
-def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+def _solve_linear(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the solutions [n, 6] of linear equations; NaN for singular ones."""
     try:
         return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0])
     except np.linalg.LinAlgError:
         if len(right) == 1:
             return np.full(right.shape, np.nan)
-        return np.concatenate([_solved(matrix[i : i + 1], right[i : i + 1]) for i in range(len(right))])
+        return np.concatenate([_solve_linear(matrix[i : i + 1], right[i : i + 1]) for i in range(len(right))])
 
 
-def _learnt(second: np.ndarray, fisher: np.ndarray, step: np.ndarray, change: np.ndarray) -> np.ndarray:
+def _updated_curvature(second: np.ndarray, fisher: np.ndarray, step: np.ndarray, change: np.ndarray) -> np.ndarray:
     """Return the second-order parts of the curvature [n, 6, 6] after steps and changes of the gradient, both [n, 6].
 
     The smallest change that explains the gradients, of the part made smaller where the last step shows it too large
     (Dennis, Gay & Welsch 1981, eqs. 2.5 and 2.8).
     """
-    beyond = change - _times(fisher, step)
-    known = _dot(_times(second, step), step)
+    beyond = change - _matrix_vector(fisher, step)
+    known = _scalar_product(_matrix_vector(second, step), step)
     with np.errstate(divide="ignore", invalid="ignore"):
-        size = np.where(known != 0.0, np.minimum(1.0, np.abs(_dot(step, beyond) / known)), 1.0)
+        size = np.where(known != 0.0, np.minimum(1.0, np.abs(_scalar_product(step, beyond) / known)), 1.0)
     second = second * size[:, None, None]
-    missed = beyond - _times(second, step)
-    along = np.where((_dot(change, step) > 0.0)[:, None], change, _times(fisher, step))
-    scale = _dot(along, step)
+    missed = beyond - _matrix_vector(second, step)
+    along = np.where((_scalar_product(change, step) > 0.0)[:, None], change, _matrix_vector(fisher, step))
+    scale = _scalar_product(along, step)
     moved = scale > 0.0
     along = along / np.where(moved, scale, 1.0)[:, None]
     cross = missed[:, :, None] * along[:, None, :]
     update = cross + np.swapaxes(cross, 1, 2)
-    update -= _dot(missed, step)[:, None, None] * along[:, :, None] * along[:, None, :]
+    update -= _scalar_product(missed, step)[:, None, None] * along[:, :, None] * along[:, None, :]
     return np.asarray(second + np.where(moved[:, None, None], update, 0.0))

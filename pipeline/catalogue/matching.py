@@ -46,7 +46,7 @@ def match_positions(x: ArrayLike, y: ArrayLike, true_x: ArrayLike, true_y: Array
     found, true = (
         np.stack([real_array(v, f"{name}: expected real numbers [n]").ravel() for v in pair], axis=1)
         if np.shape(pair[0]) == np.shape(pair[1]) and np.ndim(pair[0]) == 1
-        else _differ(name, pair)
+        else _require_equal_shapes(name, pair)
         for name, pair in (("x, y", (x, y)), ("true_x, true_y", (true_x, true_y)))
     )
     for name, places in (("x, y", found), ("true_x, true_y", true)):
@@ -63,7 +63,7 @@ def match_positions(x: ArrayLike, y: ArrayLike, true_x: ArrayLike, true_y: Array
     return np.where(mutual, nearest, -1)
 
 
-def _differ(name: str, pair: tuple[ArrayLike, ArrayLike]) -> np.ndarray:
+def _require_equal_shapes(name: str, pair: tuple[ArrayLike, ArrayLike]) -> np.ndarray:
     raise DomainError(f"{name} have shapes {np.shape(pair[0])} and {np.shape(pair[1])}: expected one length")
 
 
@@ -108,12 +108,12 @@ class DetectionRates(Result):
     @property
     def completeness(self) -> np.ndarray:
         """Fraction of the true objects that were detected; NaN where there are none."""
-        return _fraction(self.n_found, self.n_true)
+        return _ratio_or_nan(self.n_found, self.n_true)
 
     @property
     def purity(self) -> np.ndarray:
         """Fraction of the detected objects that are true ones; NaN where there are none."""
-        return _fraction(self.n_real, self.n_detected)
+        return _ratio_or_nan(self.n_real, self.n_detected)
 
 
 @check_arguments
@@ -158,5 +158,5 @@ def detection_rates(
     return DetectionRates(bins, *counts)
 
 
-def _fraction(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
+def _ratio_or_nan(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
     return np.where(whole > 0, part / np.maximum(whole, 1), np.nan)

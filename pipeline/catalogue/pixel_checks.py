@@ -34,8 +34,10 @@ def check_pixels(
     for other_name, other in (("variance", variances), ("mask", ignored)):
         if other.shape != pixels.shape:
             raise DomainError(f"{other_name} has shape {other.shape}: expected {pixels.shape}, that of the {name}")
-    _require(np.isfinite(pixels) | ignored, name, pixels, "finite")
-    _require((np.isfinite(variances) & (variances > 0.0)) | ignored, "variance", variances, "positive and finite")
+    _require_pixels(np.isfinite(pixels) | ignored, name, pixels, "finite")
+    _require_pixels(
+        (np.isfinite(variances) & (variances > 0.0)) | ignored, "variance", variances, "positive and finite"
+    )
     return pixels, variances, ignored
 
 
@@ -48,7 +50,7 @@ def flagged(mask: ArrayLike | NDArray[np.bool_] | None, shape: tuple[int, ...]) 
     return np.asarray(mask) != 0
 
 
-def _require(good: np.ndarray, name: str, values: np.ndarray, expected: str) -> None:
+def _require_pixels(good: np.ndarray, name: str, values: np.ndarray, expected: str) -> None:
     if not good.all():
         at = tuple(int(i) for i in np.unravel_index(np.argmin(good), good.shape))
         raise DomainError(

@@ -17,18 +17,18 @@ from .cutouts import cut_out, first_pixel
 from .objects import DetectedObjects
 from .pixel_checks import flagged
 
-# The locus is the fullest interval of half-light radii of this relative width, and has at least so many times the
-# objects that intervals as wide have to either side of it, between these multiples of its radius.
+# The locus is the interval of half-light radii of this relative width with the most objects: at least so many times
+# the objects of equally wide intervals on either side of it, between these multiples of its radius.
 _INTERVAL, _CONTRAST, _SIDE = 0.08, 3.0, (1.15, 1.75)
 # Least width of the locus, relative: the PSF varies over a CCD.
 _LEAST_WIDTH = 0.01
-# Pixels around a stamp that keep what its shift wraps around away from it.
+# Margin of a stamp for the light that its Fourier shift wraps around [pixel].
 _MARGIN = 8
 _MAD_TO_SIGMA = 1.4826
 
 
 class StarCut(IntFlag):
-    """Reasons why an object is no star to be used; zero for a selected one.
+    """Reasons for the rejection of an object as a star; zero for a selected one.
 
     ``FLAGGED``: edge, saturated, blended or masked, or such pixels within the stamp. ``FAINT``: below the least S/N.
     ``SIZE``, ``WIDTH``, ``SHAPE``: half-light radius, FWHM and ellipticity apart from those of the locus.
@@ -191,11 +191,11 @@ def select_stars(
     spoilt = cut_out(bad, objects.x, objects.y, size, True).any(axis=(1, 2))
     cuts[(objects.flags != 0) | spoilt | ~np.isfinite(objects.fwhm)] |= StarCut.FLAGGED
     cuts[~(snr >= min_snr)] |= StarCut.FAINT
-    center, width = _locus(radius[(cuts == 0) & (snr >= bright_snr)], min_stars)
+    center, width = _stellar_locus(radius[(cuts == 0) & (snr >= bright_snr)], min_stars)
     noise = 1.0 / np.maximum(snr, 1.0)
     cuts[~(np.abs(radius - center) < n_sigma * np.hypot(width, center * noise))] |= StarCut.SIZE
     locus = (cuts == 0) & (snr >= bright_snr)
-    fwhm = _robust(objects.fwhm[locus])
+    fwhm = _median_and_sigma(objects.fwhm[locus])
     cuts[~(np.abs(objects.fwhm - fwhm[0]) < n_sigma * np.hypot(fwhm[1], fwhm[0] * noise))] |= StarCut.WIDTH
     e1, e2 = (e - np.median(e[locus]) for e in (objects.e1, objects.e2))
     cuts[~(np.hypot(e1, e2) < max_ellipticity)] |= StarCut.SHAPE
@@ -209,18 +209,18 @@ def select_stars(
         width=width,
         positions=np.stack([x, y], axis=1),
         snr=objects.snr[index],
-        stamps=_stamps(np.where(bad, 0.0, pixels - objects.background), x, y, size),
+        stamps=_centered_stamps(np.where(bad, 0.0, pixels - objects.background), x, y, size),
     )
 
 
-def _locus(radius: np.ndarray, least: int) -> tuple[float, float]:
+def _stellar_locus(radius: np.ndarray, least: int) -> tuple[float, float]:
     """Return middle and standard deviation of the stellar locus of half-light radii of bright objects."""
     if len(radius) < least:
         raise DomainError(f"no stellar locus: {len(radius)} bright objects without flags, expected at least {least}")
     ordered = np.sort(radius)
     inside = np.searchsorted(ordered, ordered * (1.0 + _INTERVAL), side="right") - np.arange(len(ordered))
     first, count = int(inside.argmax()), int(inside.max())
-    center, width = _robust(ordered[first : first + count])
+    center, width = _median_and_sigma(ordered[first : first + count])
     nearness = np.abs(np.log(ordered / center))
     beside = (nearness > np.log(_SIDE[0])) & (nearness < np.log(_SIDE[1]))
     galaxies = max((beside & (ordered > center)).sum(), (beside & (ordered < center)).sum())
@@ -232,17 +232,17 @@ def _locus(radius: np.ndarray, least: int) -> tuple[float, float]:
         )
     for _ in range(5):
         near = ordered[np.abs(ordered - center) < min(3.0 * max(width, _LEAST_WIDTH * center), _INTERVAL * center)]
-        center, width = _robust(near)
+        center, width = _median_and_sigma(near)
     return center, max(width, _LEAST_WIDTH * center)
 
 
-def _robust(values: np.ndarray) -> tuple[float, float]:
+def _median_and_sigma(values: np.ndarray) -> tuple[float, float]:
     """Return the median, and the standard deviation by the median absolute deviation."""
     middle = float(np.median(values))
     return middle, _MAD_TO_SIGMA * float(np.median(np.abs(values - middle)))
 
 
-def _stamps(image: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> np.ndarray:
+def _centered_stamps(image: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> np.ndarray:
     """Return stamps with stars shifted to the centre of their middle pixel."""
     side = size + 2 * _MARGIN
     around = cut_out(image, x, y, side, 0.0)

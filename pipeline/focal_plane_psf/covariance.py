@@ -1,8 +1,8 @@
-r"""Covariance of what turbulence adds to a PSF shape, between two positions on the focal plane.
+r"""Covariance of the contribution of turbulence to a PSF shape, between positions on the focal plane.
 
-Turbulence in a layer at height H that is blown by a wind V leaves the same trace in the PSFs of stars that look through
-the same air during an exposure T: of stars up to V T / H apart along the wind, but only D / H across it (D: pupil
-diameter). So the covariance is a sum of a few anisotropic components and a constant, the part that all stars share,
+A turbulent layer at height H, blown by a wind V, affects the PSFs of stars alike whose light crosses the same air
+during an exposure T: of stars up to V T / H apart along the wind, but only D / H across it (D: pupil diameter). So the
+covariance is a sum of a few anisotropic components and a constant, the part common to all stars,
 
 .. math:: C(d) = c + \sum_j a_j e^{-|M_j d|} + \text{(terms of each CCD)},
 
@@ -91,7 +91,7 @@ class Covariance:
         difference = one.xy[:, None] - other.xy
         total = np.full(difference.shape[:2], self.constant)
         for amplitude, matrix in zip(self.amplitude, self.matrix, strict=True):
-            total += amplitude * np.exp(-_length(difference, matrix))
+            total += amplitude * np.exp(-_scaled_distance(difference, matrix))
         if self.ccd.any():
             for variance, term in zip(self.ccd, ccd_terms(one, other), strict=True):
                 total += variance * term
@@ -117,14 +117,14 @@ def ccd_terms(one: Places, other: Places) -> tuple[np.ndarray, np.ndarray, np.nd
     return same, slope, same * np.exp(-np.sqrt(squares) / (2.0 * RIPPLE_LENGTH))
 
 
-def _length(difference: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+def _scaled_distance(difference: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """Return |M d| of differences [..., 2] for an upper triangular M."""
     u = matrix[0, 0] * difference[..., 0] + matrix[0, 1] * difference[..., 1]
     v = matrix[1, 1] * difference[..., 1]
     return np.sqrt(u * u + v * v)
 
 
-def inverse_of_root(root: np.ndarray) -> np.ndarray:
+def inverse_from_cholesky(root: np.ndarray) -> np.ndarray:
     """Return the inverse of a symmetric matrix of given lower Cholesky factor."""
     lower = scipy.linalg.lapack.dpotri(root, lower=1)[0]
     return np.tril(lower) + np.tril(lower, -1).T

@@ -1,4 +1,4 @@
-"""Prediction of PSF shapes over the focal plane: optics, and a random field of what they leave at the stars."""
+"""Prediction of PSF shapes over the focal plane: optics, and a Gaussian random field of the residuals of the stars."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from .covariance import Covariance, Places
 from .fit import ShapeData, columns_acting_on
-from .kriging import Neighbourhood, leave_one_out, neighbourhood, neighbours_of, on_threads
+from .kriging import Neighbourhood, leave_one_out, map_on_threads, neighbourhood, neighbours_of
 from .likelihood import blocks_of
 from .mosaic import Mosaic
 from .optics_part import OpticsPart
@@ -46,7 +46,7 @@ class ShapeField:
     design: np.ndarray | None = None
 
     def with_stars(self, which: np.ndarray) -> ShapeField:
-        """Return the field of some of the stars, all else as it is."""
+        """Return the field restricted to some of its stars."""
         data = ShapeData(self.data.places[which], self.data.values[which], self.data.noise[which])
         design = None if self.design is None else self.design[which]
         return ShapeField(self.mosaic, data, self.residuals[which], self.covariances, self.optics, design)
@@ -77,7 +77,7 @@ class ShapeField:
             return at, change, spread
 
         found = np.empty((len(places), 3)) if variance else None
-        for at, change, spread in on_threads(job, ccds, threads):
+        for at, change, spread in map_on_threads(job, ccds, threads):
             values[at] += change
             if found is not None:
                 found[at] = spread
@@ -93,7 +93,7 @@ class ShapeField:
     def _optics_variance(
         self, ccd: int, shape: int, design: np.ndarray, stars: np.ndarray, weights: np.ndarray
     ) -> np.ndarray:
-        """Return the variance due to uncertain optics, less what the stars about a place correct of it."""
+        """Return the variance by uncertain optics that remains after correction by the neighbouring stars."""
         assert self.optics is not None
         assert self.design is not None
         prior, at = self.optics.prior, self.data.places.ccd[stars]
@@ -112,8 +112,8 @@ class ShapeField:
         covariance = self.optics.covariance[np.ix_(used, used)].astype(np.float64)
         return np.asarray(((left @ covariance) * left).sum(axis=1))
 
-    def left_out(self, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return shapes minus those predicted from all other stars, and their variances, each of shape [n, 3].
+    def leave_one_out_residuals(self, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return shapes minus leave-one-out predictions, and their variances, each of shape [n, 3].
 
         NaN for the farthest stars of a CCD with more stars than a neighbourhood holds.
         """
@@ -130,12 +130,12 @@ class ShapeField:
             )
 
         left, variance = np.full((2, len(self.data), 3), np.nan)
-        for at, difference, spread in on_threads(job, ccds, threads):
+        for at, difference, spread in map_on_threads(job, ccds, threads):
             left[at], variance[at] = difference, spread
         return left, variance
 
-    def agreeing(self, threads: int | None = None) -> np.ndarray:
-        """Return the stars that agree with the others of their block."""
+    def inliers(self, threads: int | None = None) -> np.ndarray:
+        """Return the stars within :data:`CLIP_SIGMA` of the prediction from the others of their block, [n] bool."""
         data = self.data
 
         def job(index: np.ndarray) -> np.ndarray:
@@ -148,7 +148,7 @@ class ShapeField:
 
         blocks = blocks_of(data.places.xy)
         deviation = np.empty((len(data), 3))
-        for index, values in zip(blocks, on_threads(job, blocks, threads), strict=True):
+        for index, values in zip(blocks, map_on_threads(job, blocks, threads), strict=True):
             deviation[index] = values
         typical = np.maximum(1.4826 * np.median(np.abs(deviation), axis=0), 1.0)
         return np.asarray((np.abs(deviation) < CLIP_SIGMA * typical).all(axis=1))

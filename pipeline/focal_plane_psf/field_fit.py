@@ -17,7 +17,7 @@ from ...models.telescope import Telescope
 from .field import ShapeField
 from .fit import SHAPES, ExposureFit, ShapeData
 from .heights import HeightPrior
-from .kriging import on_threads
+from .kriging import map_on_threads
 from .likelihood import CovarianceFit, fit_covariance, log_likelihood
 from .mosaic import Mosaic
 from .optics_part import OpticsPart
@@ -67,7 +67,7 @@ def fit_field(
         return fit_covariance(data.places, values, noise, with_ccds=True, max_iterations=steps)
 
     with reporter.stage("covariance without optics"):
-        statistics: list[CovarianceFit] = on_threads(alone, range(3), threads)
+        statistics: list[CovarianceFit] = map_on_threads(alone, range(3), threads)
     if instrument is None or prior is None:
         bounds = tuple(f"{n} of {SHAPES[i]}" for i, fit in enumerate(statistics) for n in fit.at_bounds)
         return FittedField(
@@ -124,4 +124,6 @@ def height_prior(
         return plane.prior()
     if plane is not None:
         return HeightPrior.known(plane)
-    return HeightPrior.broad(mosaic.camera) if budget is None else HeightPrior.from_budget(mosaic.camera, budget)
+    return (
+        HeightPrior.uninformative(mosaic.camera) if budget is None else HeightPrior.from_budget(mosaic.camera, budget)
+    )

@@ -59,27 +59,27 @@ def model_hdus(model: Any) -> list[fits.ImageHDU | fits.BinTableHDU]:
             about["camera"]["rotation_deg"] = camera.rotation_deg.tolist()
     left = model.leave_one_out
     hdus = [
-        _image("CENTERS", mosaic.centers),
-        _image("POSITION", data.places.xy),
-        _image("STAR_CCD", data.places.ccd),
-        _image("SHAPE", data.values),
-        _image("NOISE", data.noise),
-        _image("RESIDUAL", field.residuals),
-        _image("COVARIANCE", np.stack([_packed(c) for c in field.covariances])),
-        _image("USED", model.used.astype(np.int16)),
-        _image("LEFT_OUT", np.stack([left.e1, left.e2, left.size], axis=1)),
+        _image_hdu("CENTERS", mosaic.centers),
+        _image_hdu("POSITION", data.places.xy),
+        _image_hdu("STAR_CCD", data.places.ccd),
+        _image_hdu("SHAPE", data.values),
+        _image_hdu("NOISE", data.noise),
+        _image_hdu("RESIDUAL", field.residuals),
+        _image_hdu("COVARIANCE", np.stack([_covariance_row(c) for c in field.covariances])),
+        _image_hdu("USED", model.used.astype(np.int16)),
+        _image_hdu("LEFT_OUT", np.stack([left.e1, left.e2, left.size], axis=1)),
     ]
     if model.mean_star is not None:
-        hdus.append(_image("MEAN", model.mean_star))
+        hdus.append(_image_hdu("MEAN", model.mean_star))
     if model.pca is not None:
         pca = model.pca
         hdus += [
-            _image("PCA", pca.components),
-            _image("PCA_POSITION", pca.places.xy),
-            _image("PCA_CCD", pca.places.ccd),
-            _image("PCA_COEFFICIENT", pca.coefficients),
-            _image("PCA_NOISE", pca.noise),
-            _image("PCA_COVARIANCE", np.stack([_packed(c) for c in pca.covariances])),
+            _image_hdu("PCA", pca.components),
+            _image_hdu("PCA_POSITION", pca.places.xy),
+            _image_hdu("PCA_CCD", pca.places.ccd),
+            _image_hdu("PCA_COEFFICIENT", pca.coefficients),
+            _image_hdu("PCA_NOISE", pca.noise),
+            _image_hdu("PCA_COVARIANCE", np.stack([_covariance_row(c) for c in pca.covariances])),
         ]
     if field.optics is not None and field.design is not None:
         optics = field.optics
@@ -94,19 +94,21 @@ def model_hdus(model: Any) -> list[fits.ImageHDU | fits.BinTableHDU]:
         about["radius"], about["center"] = optics.response.radius, optics.response.center
         surfaces = optics.plane.surfaces
         hdus += [
-            _image("WAVELENGTHS", instrument.wavelengths),
-            _image("HEIGHT_CUBIC", surfaces.polynomial),
-            _image("WAVEFRONT", np.column_stack([optics.aberration.coefficients, optics.aberration.field_gradient])),
-            _image("PARAMETER_COVARIANCE", optics.covariance),
-            _image("RESPONSE", optics.response.polynomial),
-            _image("DESIGN", field.design),
+            _image_hdu("WAVELENGTHS", instrument.wavelengths),
+            _image_hdu("HEIGHT_CUBIC", surfaces.polynomial),
+            _image_hdu(
+                "WAVEFRONT", np.column_stack([optics.aberration.coefficients, optics.aberration.field_gradient])
+            ),
+            _image_hdu("PARAMETER_COVARIANCE", optics.covariance),
+            _image_hdu("RESPONSE", optics.response.polynomial),
+            _image_hdu("DESIGN", field.design),
         ]
         if surfaces.grid is not None:
-            hdus.append(_image("HEIGHT_SPLINE", surfaces.grid))
+            hdus.append(_image_hdu("HEIGHT_SPLINE", surfaces.grid))
         if instrument.dispersion is not None:
-            hdus.append(_image("DISPERSION", instrument.dispersion))
+            hdus.append(_image_hdu("DISPERSION", instrument.dispersion))
     text = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
-    return [_image("ABOUT", text, "JSON, one character of UTF-8 a pixel"), *hdus]
+    return [_image_hdu("ABOUT", text, "JSON, one character of UTF-8 a pixel"), *hdus]
 
 
 def model_fields(hdus: Iterable[Any], path: Path) -> Mapping[str, Any]:
@@ -133,26 +135,26 @@ def model_fields(hdus: Iterable[Any], path: Path) -> Mapping[str, Any]:
                 rotation_deg=np.array(known.get("rotation_deg", [0.0])),
             )
         mosaic = Mosaic(tuple(about["ccds"]), part("CENTERS"), about["half_size"], camera)
-        places = _places(mosaic, part("POSITION"), part("STAR_CCD"))
+        places = _places_of(mosaic, part("POSITION"), part("STAR_CCD"))
         pca = None
         if "PCA" in found:
             pca = ResidualImages(
                 mosaic,
                 part("PCA"),
-                _places(mosaic, part("PCA_POSITION"), part("PCA_CCD")),
+                _places_of(mosaic, part("PCA_POSITION"), part("PCA_CCD")),
                 part("PCA_COEFFICIENT"),
                 part("PCA_NOISE"),
-                tuple(_unpacked(row) for row in part("PCA_COVARIANCE")),
+                tuple(_covariance_from_row(row) for row in part("PCA_COVARIANCE")),
             )
         optics = None
         if "telescope" in about and camera is not None:
-            optics = _optics(about, part, found, camera)
+            optics = _optics_part(about, part, found, camera)
         return {
             "field": ShapeField(
                 mosaic,
                 ShapeData(places, part("SHAPE"), part("NOISE")),
                 part("RESIDUAL"),
-                tuple(_unpacked(row) for row in part("COVARIANCE")),
+                tuple(_covariance_from_row(row) for row in part("COVARIANCE")),
                 optics,
                 part("DESIGN") if optics is not None else None,
             ),
@@ -171,9 +173,9 @@ def model_fields(hdus: Iterable[Any], path: Path) -> Mapping[str, Any]:
         raise ProductError(f"no focal-plane PSF model ({error.args[0]} is missing)", file=path) from None
 
 
-def _optics(about: Mapping[str, Any], part: Any, found: Mapping[str, Any], camera: Camera) -> OpticsPart:
+def _optics_part(about: Mapping[str, Any], part: Any, found: Mapping[str, Any], camera: Camera) -> OpticsPart:
     instrument = Instrument.of(
-        _telescope(about["telescope"]),
+        _telescope_from_text(about["telescope"]),
         part("WAVELENGTHS"),
         Atmosphere.from_site("cerro_pachon", seed=0, **about["atmosphere"]),
         **about["instrument"],
@@ -193,35 +195,35 @@ def _optics(about: Mapping[str, Any], part: Any, found: Mapping[str, Any], camer
             wavefront[:, 0], telescope.pupil_diameter, telescope.pupil_obscuration, wavefront[:, 1:].copy()
         ),
         about["seeing"],
-        HeightPrior.broad(camera, degree=about["degree"]),
+        HeightPrior.uninformative(camera, degree=about["degree"]),
         part("PARAMETER_COVARIANCE"),
         ExposureResponse(part("RESPONSE"), about["radius"], about["center"]),
     )
 
 
-def _telescope(text: str) -> Telescope:
+def _telescope_from_text(text: str) -> Telescope:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "telescope.yaml"
         path.write_text(text, encoding="utf-8")
         return read_telescope(path)
 
 
-def _places(mosaic: Mosaic, xy: np.ndarray, ccd: np.ndarray) -> Places:
+def _places_of(mosaic: Mosaic, xy: np.ndarray, ccd: np.ndarray) -> Places:
     return mosaic.at(xy, ccd.astype(np.int64))
 
 
-def _packed(covariance: Covariance) -> np.ndarray:
+def _covariance_row(covariance: Covariance) -> np.ndarray:
     parts = [[covariance.constant], covariance.amplitude, covariance.matrix.ravel(), covariance.ccd]
     return np.concatenate([*parts, [covariance.nugget]])
 
 
-def _unpacked(row: np.ndarray) -> Covariance:
+def _covariance_from_row(row: np.ndarray) -> Covariance:
     n = (len(row) - 5) // 5
     matrix = row[1 + n : 1 + 5 * n].reshape(n, 2, 2)
     return Covariance(float(row[0]), row[1 : 1 + n], matrix, row[1 + 5 * n : 4 + 5 * n], float(row[-1]))
 
 
-def _image(name: str, values: np.ndarray, comment: str | None = None) -> fits.ImageHDU:
+def _image_hdu(name: str, values: np.ndarray, comment: str | None = None) -> fits.ImageHDU:
     hdu = fits.ImageHDU(np.ascontiguousarray(values), name=name)
     if comment:
         hdu.header["COMMENT"] = comment

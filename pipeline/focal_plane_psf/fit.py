@@ -22,9 +22,9 @@ from ...core.progress import Reporter
 from ...core.threads import one_blas_thread
 from ...models.camera.focal_plane import FocalPlane
 from ...wavefront.aberration import ResidualWavefront
-from .covariance import Covariance, Places, inverse_of_root
+from .covariance import Covariance, Places, inverse_from_cholesky
 from .heights import HeightPrior
-from .kriging import on_threads
+from .kriging import map_on_threads
 from .likelihood import CovarianceFit, blocks_of, fit_covariance, log_likelihood
 from .response import (
     LARGEST_HEIGHT,
@@ -40,8 +40,8 @@ from .response import (
 SHAPES = ("e1", "e2", "ln size")
 # Standard deviation of the wavefront coefficients of an aligned telescope [m].
 _NO_WAVEFRONT = 1e-15
-# Standard deviations of what turbulence adds to the shapes of all stars alike. The mean size is the seeing, which
-# is fitted.
+# Standard deviations of the part of the shapes that turbulence has in common for all stars. The mean size is the
+# seeing, which is fitted.
 _MEAN = (0.02, 0.02, 0.01)
 # Stars of a block of the linear fit.
 _BLOCK = 750
@@ -118,7 +118,7 @@ def columns_acting_on(prior: HeightPrior, ccds: np.ndarray) -> np.ndarray:
     return np.concatenate([every[: prior.n_common], *own, every[prior.n_parameter :]])
 
 
-def _design(terms: np.ndarray, slopes: np.ndarray, columns: np.ndarray) -> np.ndarray:
+def _design_columns(terms: np.ndarray, slopes: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Return derivatives of one shape: terms in the height times slopes [n], and the exposure's own columns [n, 25]."""
     design = terms * slopes[:, None]
     design[:, -N_EXPOSURE:] = columns
@@ -126,7 +126,7 @@ def _design(terms: np.ndarray, slopes: np.ndarray, columns: np.ndarray) -> np.nd
 
 
 class ExposureFit:
-    """Gauss-Newton fit of one exposure; :meth:`run` does all of it."""
+    """Gauss-Newton fit of one exposure; :meth:`run` performs all steps."""
 
     def __init__(
         self,
@@ -144,7 +144,7 @@ class ExposureFit:
         self.fields = instrument.fields(data.places.xy, threads)
         self.flat = FocalPlane.flat(prior.camera)
         self.common = prior.common_terms(data.places)
-        self.own = prior.own_terms(data.places)
+        self.own = prior.ccd_polynomials(data.places)
         self.blocks = blocks_of(data.places.xy, _BLOCK)
         self.heights = np.zeros(prior.n_parameter)
         self.exposure = np.zeros(N_EXPOSURE)
@@ -219,13 +219,13 @@ class ExposureFit:
         return self.data.values - shapes, slopes, columns
 
     def fit_covariances(self, max_iterations: int = 8) -> None:
-        """Fit the covariances of turbulence to what the optics leave, with their uncertainty (one step of EM)."""
+        """Fit the covariances of turbulence to the residuals of the optics, with their uncertainty (one step of EM)."""
         residuals, slopes, columns = self._columns()
 
         def fit(shape: int) -> CovarianceFit:
             def spread(index: np.ndarray) -> np.ndarray:
                 used, terms = self._terms(index)
-                design = _design(terms, slopes[index, shape], columns[index, :, shape])
+                design = _design_columns(terms, slopes[index, shape], columns[index, :, shape])
                 assert self.covariance is not None
                 return design @ self.covariance[np.ix_(used, used)] @ design.T
 
@@ -239,7 +239,7 @@ class ExposureFit:
                 max_iterations=max_iterations,
             )
 
-        found: list[CovarianceFit] = on_threads(fit, range(3), self.threads)
+        found: list[CovarianceFit] = map_on_threads(fit, range(3), self.threads)
         self.covariances = [f.covariance for f in found]
         self.at_bounds = tuple(f"{n} of {SHAPES[i]}" for i, f in enumerate(found) for n in f.at_bounds)
 
@@ -265,7 +265,7 @@ class ExposureFit:
             used, terms = self._terms(index)
             matrix, vector = np.zeros((len(used), len(used))), np.zeros(len(used))
             for shape, covariance in enumerate(self.covariances):
-                design = _design(terms, slopes[index, shape], columns[index, :, shape])
+                design = _design_columns(terms, slopes[index, shape], columns[index, :, shape])
                 root = covariance.root(here, self.data.noise[index, shape])
                 both = np.column_stack([design, residuals[index, shape]])
                 white = scipy.linalg.solve_triangular(root, both, lower=True, check_finite=False)
@@ -273,7 +273,7 @@ class ExposureFit:
                 vector += white[:, :-1].T @ white[:, -1]
             return BlockEquations(used, matrix, vector)
 
-        return on_threads(contribution, self.blocks, self.threads)
+        return map_on_threads(contribution, self.blocks, self.threads)
 
     def normal_equations(self) -> NormalEquations:
         """Return the normal equations of a change of all parameters, without priors."""
@@ -313,7 +313,7 @@ class ExposureFit:
             self.heights, self.exposure = now[:n_height], now[n_height:]
         self._log_determinant = 2.0 * float(np.log(np.diagonal(root)).sum() - np.log(scale).sum())
         with one_blas_thread():
-            inverse = inverse_of_root(root)
+            inverse = inverse_from_cholesky(root)
         self.covariance = np.zeros_like(precision)
         self.covariance[within] = inverse * scale[:, None] * scale
         silent = np.setdiff1d(np.arange(len(self.prior.camera)), ccds)
@@ -324,7 +324,7 @@ class ExposureFit:
         self._log_determinant += float(sum(np.linalg.slogdet(block)[1] for block in own_terms))
 
     def _objective(self, parameters: np.ndarray, precision: np.ndarray) -> float:
-        """Return what the fit minimises."""
+        """Return the objective function of the fit."""
         n = self.prior.n_parameter
         kept = self.heights, self.exposure
         self.heights, self.exposure = parameters[:n], parameters[n:]
@@ -340,7 +340,7 @@ class ExposureFit:
                 total += float(white @ white)
             return total
 
-        return sum(on_threads(of_block, self.blocks, self.threads)) + float(parameters @ precision @ parameters)
+        return sum(map_on_threads(of_block, self.blocks, self.threads)) + float(parameters @ precision @ parameters)
 
     def _precision(self) -> np.ndarray:
         n_height = self.prior.n_parameter

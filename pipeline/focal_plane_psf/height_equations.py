@@ -1,4 +1,4 @@
-"""Normal equations of the heights from one exposure, its own parameters marginalised; kept in a file."""
+"""Normal equations of the heights from one exposure, its own parameters marginalised, and their file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ExposureState(NamedTuple):
 
 
 class HeightEquations(NamedTuple):
-    """Normal equations of the heights: a sum over blocks of stars, less what the exposure's own parameters explain."""
+    """Normal equations of the heights: a sum over blocks of stars, with the exposure's own parameters marginalised."""
 
     blocks: list[tuple[np.ndarray, np.ndarray]]  #: parameters of each block [m], and its matrix [m, m]
     factor: np.ndarray  #: [n_height, n_exposure]: ``factor @ factor.T`` is to be subtracted
@@ -61,7 +61,7 @@ class HeightEquations(NamedTuple):
         vector += self.vector
 
     def write(self, path: Path, key: str) -> None:
-        """Write a file, with a key of all that the equations were made of."""
+        """Write a file, with a key of all inputs of the equations."""
         arrays: dict[str, Any] = {"factor": self.factor, "vector": self.vector, "exposure": self.state.exposure}
         for i, (used, part) in enumerate(self.blocks):
             arrays[f"block_used_{i}"] = used

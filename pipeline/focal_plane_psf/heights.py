@@ -45,7 +45,7 @@ class HeightPrior:
     ccd : ndarray, shape [n_ccd, n_term, n_term]
         Covariance of the coefficients of each CCD [m^2].
     mean : FocalPlane or None
-        Heights about which the prior stands; None for zero, which are those of most cameras.
+        Mean heights of the prior; None for zero, as of most cameras.
     """
 
     camera: Camera
@@ -58,31 +58,31 @@ class HeightPrior:
     def from_budget(cls, camera: Camera, budget: str | HeightBudget = "simulated", degree: int = DEGREE) -> HeightPrior:
         """Return the prior with the covariance of focal planes drawn from a budget of heights."""
         budget = load_budget(budget) if isinstance(budget, str) else budget
-        bare = replace(camera, placement=None)
+        unplaced = replace(camera, placement=None)
         # Seeds far from those that people choose, so that no run is fitted with its own heights.
         seeds = range(2**31, 2**31 + _DRAWS)
         ccd = np.zeros((len(powers(degree)), len(powers(degree))))
         for term in ("ccd", "tilt", "potato_chip"):
-            drawn = [project(FocalPlane.from_budget(bare, seed=s, terms=(term,), budget=budget), degree) for s in seeds]
-            rows = np.concatenate(drawn)
+            drawn = [FocalPlane.from_budget(unplaced, seed=s, terms=(term,), budget=budget) for s in seeds]
+            rows = np.concatenate([project_heights(plane, degree) for plane in drawn])
             ccd += rows.T @ rows / len(rows)
         # The quadratic's coefficients are normal but for a scale; many more draws are needed than of CCDs.
         planes = [
-            _global_terms(FocalPlane.from_budget(bare, seed=s, terms=("global",), budget=budget))
+            _quadratic_coefficients(FocalPlane.from_budget(unplaced, seed=s, terms=("global",), budget=budget))
             for s in range(2**31, 2**31 + 16 * _DRAWS)
         ]
         rows = np.array(planes)
         quadratic = rows.T @ rows / len(rows) + _LEAST * np.eye(5)
         own = np.broadcast_to(ccd + _LEAST * np.eye(len(ccd)), (len(camera), *ccd.shape))
-        return cls(camera, quadratic, max(budget.raft_height**2 / 12.0, _LEAST), own, _nominal(camera))
+        return cls(camera, quadratic, max(budget.raft_height**2 / 12.0, _LEAST), own, _nominal_heights(camera))
 
     @classmethod
-    def broad(cls, camera: Camera, size: float = 10e-6, degree: int = DEGREE) -> HeightPrior:
-        """Return a prior that hardly holds heights [m]: independent coefficients that fall as the degree rises."""
+    def uninformative(cls, camera: Camera, size: float = 10e-6, degree: int = DEGREE) -> HeightPrior:
+        """Return a weak prior of heights [m]: independent coefficients that decrease with the degree."""
         total = np.array([i + j for i, j in powers(degree)])
         ccd = np.diag((size / (1.0 + total) ** 2) ** 2)
         own = np.broadcast_to(ccd, (len(camera), *ccd.shape))
-        return cls(camera, size**2 * np.eye(5), size**2, own, _nominal(camera))
+        return cls(camera, size**2 * np.eye(5), size**2, own, _nominal_heights(camera))
 
     @classmethod
     def known(cls, plane: FocalPlane, covariance: np.ndarray | None = None) -> HeightPrior:
@@ -101,8 +101,8 @@ class HeightPrior:
         """Largest total degree of the terms of a CCD."""
         return round((np.sqrt(8 * self.ccd.shape[1] + 1) - 3) / 2)
 
-    def own_terms(self, places: Places) -> np.ndarray:
-        """Return the terms of each place's own CCD, shape [n, n_term]."""
+    def ccd_polynomials(self, places: Places) -> np.ndarray:
+        """Return the polynomial terms of each position within its CCD, shape [n, n_term]."""
         return legendre(places.uv, self.degree)
 
     @property
@@ -132,11 +132,11 @@ class HeightPrior:
     def common_terms(self, places: Places) -> np.ndarray:
         """Return the terms of the focal plane and the rafts at places, shape [n, n_common]."""
         rafts = (self.camera.raft_index[places.ccd][:, None] == np.arange(len(self.camera.raft_names))).astype(float)
-        return np.concatenate([_quadratic(self.camera, places.xy), rafts], axis=1)
+        return np.concatenate([_quadratic_terms(self.camera, places.xy), rafts], axis=1)
 
     def covariance(self, places: Places) -> np.ndarray:
         """Return the prior covariance of the heights at places [m^2], shape [n, n]."""
-        common, own = self.common_terms(places), self.own_terms(places)
+        common, own = self.common_terms(places), self.ccd_polynomials(places)
         total = common[:, :5] @ self.global_covariance @ common[:, :5].T
         total += self.raft * (common[:, 5:] @ common[:, 5:].T)
         for ccd in np.unique(places.ccd):
@@ -167,7 +167,7 @@ class HeightPrior:
         """Return the heights at places [m], shape [n], mean of the prior included."""
         own = parameters[self.n_common :].reshape(len(self.camera), -1)
         change = self.common_terms(places) @ parameters[: self.n_common]
-        change += np.einsum("nk,nk->n", self.own_terms(places), own[places.ccd])
+        change += np.einsum("nk,nk->n", self.ccd_polynomials(places), own[places.ccd])
         return change if self.mean is None else change + self.mean.height(*places.xy.T)
 
     def focal_plane(self, parameters: np.ndarray) -> FocalPlane:
@@ -183,7 +183,7 @@ class HeightPrior:
         return FocalPlane.from_heights(Table({"x": x, "y": y, "z": self.heights(parameters, places)}), camera)
 
 
-def _nominal(camera: Camera) -> FocalPlane | None:
+def _nominal_heights(camera: Camera) -> FocalPlane | None:
     """Return the nominal heights of a camera; None where all are zero."""
     return None if camera.placement is None else FocalPlane.flat(camera)
 
@@ -199,7 +199,7 @@ def legendre(uv: np.ndarray, degree: int) -> np.ndarray:
     return np.stack([along[0][:, i] * along[1][:, j] for i, j in powers(degree)], axis=1)
 
 
-def project(plane: FocalPlane, degree: int) -> np.ndarray:
+def project_heights(plane: FocalPlane, degree: int) -> np.ndarray:
     """Return the coefficients of each CCD that fit its heights best [m], shape [n_ccd, n_term]."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     v, u = (a.ravel() for a in np.meshgrid(nodes, nodes, indexing="ij"))
@@ -209,13 +209,13 @@ def project(plane: FocalPlane, degree: int) -> np.ndarray:
     return plane.height(x, y) @ terms
 
 
-def _quadratic(camera: Camera, xy: np.ndarray) -> np.ndarray:
+def _quadratic_terms(camera: Camera, xy: np.ndarray) -> np.ndarray:
     x, y = (xy / camera.radius).T
     return np.stack([x, y, x * x, x * y, y * y], axis=1)
 
 
-def _global_terms(plane: FocalPlane) -> np.ndarray:
+def _quadratic_coefficients(plane: FocalPlane) -> np.ndarray:
     """Return the five coefficients of a quadratic over the focal plane [m], its mean left out."""
     camera = plane.camera
-    design = np.column_stack([np.ones(len(camera)), _quadratic(camera, camera.centers)])
+    design = np.column_stack([np.ones(len(camera)), _quadratic_terms(camera, camera.centers)])
     return np.linalg.lstsq(design, plane.height(*camera.centers.T), rcond=None)[0][1:]

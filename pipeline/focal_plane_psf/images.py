@@ -4,7 +4,7 @@ A change of second moments is a convolution with a narrow Gaussian, of positive 
 
 .. math:: \tilde I(k) \to \tilde I(k) \, e^{-k^T S k / 2},
 
-which is what turbulence does to the image of the optics to lowest order. S is found by Broyden's method, so that the
+to lowest order the effect of turbulence on the image of the optics. S is found by Broyden's method, so that the
 image has the predicted e1, e2 and size.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from ..measure.shapes import measure_shapes
 from .covariance import Covariance, Places
-from .kriging import neighbourhood, neighbours_of, on_threads
+from .kriging import map_on_threads, neighbourhood, neighbours_of
 from .likelihood import fit_covariance
 from .mosaic import Mosaic
 
@@ -24,14 +24,14 @@ from .mosaic import Mosaic
 _SHAPES = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 2.0], [1.0, 1.0, 0.0]])
 _STEP = 0.02
 _ITERATIONS = 7
-# Square of a step of the amounts below which it says nothing of the Jacobian.
+# Least square of a step for an update of the Jacobian.
 _SMALLEST = 1e-14
 # Pixels of zeros about a stamp while it is convolved.
 _ROOM = 8
 
 
-def deformed(images: np.ndarray, values: np.ndarray, pixel_scale: float, weight_fwhm: float) -> np.ndarray:
-    """Return images [n, ny, nx] with the shapes e1, e2, ln size [n, 3], centred and of unit sum."""
+def with_shapes(images: np.ndarray, values: np.ndarray, pixel_scale: float, weight_fwhm: float) -> np.ndarray:
+    """Convolve images [n, ny, nx] to the shapes e1, e2, ln size [n, 3]; the result is centred and of unit sum."""
     ny, nx = images.shape[1:]
     padded = np.pad(images.astype(np.float64), ((0, 0), (_ROOM, _ROOM), (_ROOM, _ROOM)))
     spectrum = np.fft.rfft2(padded)
@@ -130,7 +130,7 @@ class ResidualImages:
         def covariance(k: int) -> Covariance:
             return fit_covariance(places, coefficients[:, k], noise[:, k], max_iterations=25).covariance
 
-        covariances = tuple(on_threads(covariance, range(keep), threads))
+        covariances = tuple(map_on_threads(covariance, range(keep), threads))
         return cls(mosaic, components.reshape(keep, ny, nx), places, coefficients, noise, covariances)
 
     def at(self, places: Places, threads: int | None = None) -> np.ndarray:
@@ -146,6 +146,6 @@ class ResidualImages:
                 found[:, k] = near.predict(covariance.between(self.places[stars], places[at]))
             return at, found
 
-        for at, found in on_threads(job, np.unique(places.ccd), threads):
+        for at, found in map_on_threads(job, np.unique(places.ccd), threads):
             amount[at] = found
         return np.einsum("nk,kyx->nyx", amount, self.components)

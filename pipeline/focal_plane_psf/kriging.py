@@ -73,7 +73,7 @@ def leave_one_out(near: Neighbourhood) -> tuple[np.ndarray, np.ndarray]:
     return near.alpha / own, 1.0 / own
 
 
-def on_threads(job: Callable[..., Any], items: Iterable[object], threads: int | None) -> list[Any]:
-    """Return results of a job for each item, in order: on all threads, with BLAS on one in each."""
+def map_on_threads(job: Callable[..., Any], items: Iterable[object], threads: int | None) -> list[Any]:
+    """Map a function over items on all threads, with one BLAS thread each; results are in order."""
     with one_blas_thread(), ThreadPoolExecutor(thread_count(threads)) as pool:
         return list(pool.map(job, items))

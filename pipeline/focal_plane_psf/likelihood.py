@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from .covariance import CCD_TERMS, COMPONENTS, Covariance, Places, ccd_terms, inverse_of_root
+from .covariance import CCD_TERMS, COMPONENTS, Covariance, Places, ccd_terms, inverse_from_cholesky
 
 #: Largest number of stars in a block.
 BLOCK = 300
@@ -27,12 +27,12 @@ _AMPLITUDES, _LENGTHS, _SHEAR = (-14.0, 2.0), (-6.5, 1.0), (-10.0, 10.0)
 # Lengths from which the fit starts, over the extent of the field: 3 and 16 arcmin over 3.5 degrees.
 _START = (0.014, 0.08, 0.3)
 # Widths of the priors about the first guess: of each component (logarithm of the amplitude, of two lengths, shear), and
-# of the logarithms of the variances of the terms of the CCDs and of the nugget. Many stars decide for themselves; the
-# likelihood of some hundred stars in a few streaks has maxima far away.
+# of the logarithms of the variances of the terms of the CCDs and of the nugget. Of many stars the data dominate; the
+# likelihood of some hundred stars in a few streaks has secondary maxima far away.
 _WIDTHS, _VARIANCE_WIDTH = (1.0, 1.0, 1.0, 1.5), 3.0
-# Logarithm of the amplitude of a component over the variance of the values, below which there is none.
+# Logarithm of the amplitude of a component over the variance of the values, below which it counts as absent.
 _VANISHED = -6.0
-#: Variance of what all stars share, over the mean square of the values.
+#: Variance of the part common to all stars, over the mean square of the values.
 _CONSTANT = 100.0
 
 
@@ -96,7 +96,7 @@ def fit_covariance(
     places : Places
         Of the stars.
     values : ndarray, shape [n]
-        One shape parameter of each star, less what the optics make.
+        One shape parameter of each star, minus that of the optics.
     noise : ndarray, shape [n]
         Variance of the noise of each.
     spread : callable, optional
@@ -107,7 +107,7 @@ def fit_covariance(
     start : Covariance, optional
         Covariance to start from.
     constant : float, optional
-        Variance of what all stars share; by default so large that it is free.
+        Variance of the part common to all stars; by default so large that it is free.
     blocks : list of ndarray, optional
         Blocks of stars; by default those of :func:`blocks_of`.
     max_iterations : int
@@ -138,9 +138,9 @@ def fit_covariance(
     guess = _first_guess(centred, noise, power, n_ccd)
     first = guess.copy()
     if start is not None:
-        again = _packed(start, power, extent, n_ccd)
+        again = _pack_parameters(start, power, extent, n_ccd)
         for j in range(COMPONENTS):
-            # A component that vanished in an earlier fit has no gradient to come back by.
+            # A component of zero amplitude has no gradient, and would stay at zero.
             if again[4 * j] > _VANISHED:
                 first[4 * j : 4 * j + 4] = again[4 * j : 4 * j + 4]
         first[4 * COMPONENTS :] = again[4 * COMPONENTS :]
@@ -160,10 +160,10 @@ def fit_covariance(
     at_bounds = tuple(
         name
         for name, value, (low, high) in zip(names, found.x, bounds, strict=True)
-        # A variance that vanishes is an answer, and no sign of a fit that failed.
+        # A variance of zero is a valid result, not a failed fit.
         if value >= high - 1e-9 or (value <= low + 1e-9 and ("length" in name or name == "shear"))
     )
-    covariance = _unpacked(found.x, power, extent, constant, n_ccd)
+    covariance = _unpack_parameters(found.x, power, extent, constant, n_ccd)
     count = sum(len(block.fixed) for block in prepared)
     value, _ = _negative_log_likelihood(found.x, prepared)
     return CovarianceFit(covariance, -value - 0.5 * count * np.log(power), at_bounds)
@@ -190,7 +190,7 @@ def _first_guess(values: np.ndarray, noise: np.ndarray, power: float, n_ccd: int
     return np.array(guess + [np.log(0.1 * signal)] * n_ccd + [np.log(0.01)])
 
 
-def _packed(covariance: Covariance, power: float, extent: float, n_ccd: int) -> np.ndarray:
+def _pack_parameters(covariance: Covariance, power: float, extent: float, n_ccd: int) -> np.ndarray:
     packed = []
     with np.errstate(divide="ignore"):
         for amplitude, matrix in zip(covariance.amplitude, covariance.matrix, strict=True):
@@ -199,7 +199,7 @@ def _packed(covariance: Covariance, power: float, extent: float, n_ccd: int) -> 
     return np.array(packed)
 
 
-def _unpacked(packed: np.ndarray, power: float, extent: float, constant: float, n_ccd: int) -> Covariance:
+def _unpack_parameters(packed: np.ndarray, power: float, extent: float, constant: float, n_ccd: int) -> Covariance:
     amplitude, matrix = np.empty(COMPONENTS), np.zeros((COMPONENTS, 2, 2))
     for j in range(COMPONENTS):
         log_amplitude, along, across, shear = packed[4 * j : 4 * j + 4]
@@ -239,7 +239,7 @@ def _negative_log_likelihood(packed: np.ndarray, blocks: Sequence[_Block]) -> tu
         diagonal = np.diag_indices(len(matrix))
         matrix[diagonal] += variances[-1]
         root = scipy.linalg.cholesky(matrix, lower=True, overwrite_a=True, check_finite=False)
-        inverse = inverse_of_root(root)
+        inverse = inverse_from_cholesky(root)
         solved = inverse @ block.products
         total += 0.5 * float(np.trace(solved)) + float(np.log(root[diagonal]).sum())
         weight = 0.5 * (inverse - solved @ inverse)

@@ -29,7 +29,7 @@ from .field import ShapeField
 from .field_fit import LEAST_STARS, FittedField, fit_field, height_prior, mosaic_of
 from .file import model_fields, model_hdus
 from .fit import SHAPES, ShapeData
-from .images import ResidualImages, deformed
+from .images import ResidualImages, with_shapes
 from .mosaic import Mosaic, PsfShapes
 from .response import Instrument
 from .stars import FocalPlaneStars, places_of, stars_of
@@ -39,9 +39,9 @@ from .static_heights import StaticHeights
 _BATCH = 512
 # Brightest stars, from which the principal components of the residual stamps are made.
 _PCA_STARS = 2000
-# Variance that is added to the noise of a star, over the stated one, from which the stated noise is called wrong.
+# Fitted excess variance of a star over that of the stated noise, beyond which there is a warning.
 _EXTRA_NOISE = 1.0
-# Reduced chi-squares beyond which the stated noise is called wrong.
+# Range of reduced chi-square outside of which there is a warning.
 _CHI2 = (0.7, 1.4)
 
 
@@ -142,7 +142,7 @@ class FocalPlanePsf(Result):
         dispersion : array_like, shape [n_wave, 2], optional
             Shift of each wavelength by the air [rad].
         budget : str, HeightBudget or None
-            Prior of unknown heights: "simulated", "specification", a budget of one's own, or None, which hardly holds
+            Prior of unknown heights: "simulated", "specification", a budget of one's own, or None for a weak prior
             them.
         alignment_rms : float or Quantity
             Prior rms of the residual wavefront of the exposure [m]: annular Zernike terms 4 to 11, each constant and
@@ -203,12 +203,12 @@ class FocalPlanePsf(Result):
         fitted = fit_field(mosaic, data, instrument, prior, rms, threads, reporter)
         field = fitted.field
         with reporter.stage("stars against the others"):
-            good = field.agreeing(threads)
+            good = field.inliers(threads)
             if not good.all():
                 # Covariances are hardly changed by a few stars; all else is solved again without them.
                 field = field.with_stars(good)
                 used[np.flatnonzero(used)[~good]] = False
-            left, variance = field.left_out(threads)
+            left, variance = field.leave_one_out_residuals(threads)
         predicted = np.full((len(given), 3), np.nan)
         predicted[used] = field.data.values - left
         chi2 = {name: float(v) for name, v in zip(SHAPES, np.nanmean(left**2 / variance, axis=0), strict=True)}
@@ -218,7 +218,7 @@ class FocalPlanePsf(Result):
             PsfShapes.of_values(predicted),
             chi2,
             fitted.evidence,
-            _remarks(field, chi2, fitted, mosaic.names if ccds is None else ccds),
+            _fit_warnings(field, chi2, fitted, mosaic.names if ccds is None else ccds),
             weight,
             given.pixel_scale,
             stamp_size,
@@ -333,7 +333,7 @@ class FocalPlanePsf(Result):
             base = np.asarray(mean) if optics is None else optics.images(here, threads)
             if self.pca is not None:
                 base = base + self.pca.at(here, threads)
-            images[part] = deformed(
+            images[part] = with_shapes(
                 np.broadcast_to(base, (len(here), *images.shape[1:])), values[part], scale, self.weight_fwhm
             )
         return images
@@ -360,7 +360,7 @@ class FocalPlanePsf(Result):
         return replace(model, pca=pca)
 
 
-def _remarks(
+def _fit_warnings(
     field: ShapeField, chi2: dict[str, float], fitted: FittedField, expected: Sequence[str]
 ) -> tuple[str, ...]:
     """Return remarks on a fit, a line each."""

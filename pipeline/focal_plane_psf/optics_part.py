@@ -74,15 +74,15 @@ class OpticsPart:
         fields = self.instrument.fields(places.xy, threads)
         heights = self.plane.height(*places.xy.T)
         # One-sided: these derivatives serve for the uncertainty alone.
-        slopes = (self._lifted(fields, threads) - shapes) / _STEP
+        slopes = (self._shapes_at_step(fields, threads) - shapes) / _STEP
         return self.design_of(places, slopes, self.response.columns(fields, heights))
 
     def design_of(self, places: Places, slopes: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Return the same from derivatives [n, 3] with respect to height and columns [n, 25, 3] of the exposure."""
-        terms = np.concatenate([self.prior.common_terms(places), self.prior.own_terms(places)], axis=1)
+        terms = np.concatenate([self.prior.common_terms(places), self.prior.ccd_polynomials(places)], axis=1)
         return np.concatenate([terms[:, :, None] * slopes[:, None], columns], axis=1)
 
-    def _lifted(self, fields: np.ndarray, threads: int | None) -> np.ndarray:
+    def _shapes_at_step(self, fields: np.ndarray, threads: int | None) -> np.ndarray:
         surfaces = self.plane.surfaces
         polynomial = surfaces.polynomial.copy()
         polynomial[:, 0] += _STEP

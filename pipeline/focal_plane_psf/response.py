@@ -27,7 +27,7 @@ from ...models.zernike_polynomials import noll_to_nm
 from ...wavefront.aberration import LINEAR_FRACTION, ResidualWavefront
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.chief_rays import fields_at
-from ...wavefront.psf.clear_pupil import only_rings
+from ...wavefront.psf.clear_pupil import has_only_annuli
 from ...wavefront.psf.psf import make_psfs
 from ..measure.shapes import measure_shapes
 from .height_series import HeightSeries, level_plane
@@ -57,7 +57,7 @@ _LATTICE_POINTS, _LATTICE_POINTS_CHANGES = 6000, 3000
 
 @dataclass(frozen=True, eq=False)
 class Instrument:
-    """All that decides the long-exposure PSF of a star at a place and height.
+    """Parameters of the long-exposure PSF of a star at a position and height.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ class Instrument:
 
     @property
     def key(self) -> str:
-        """SHA-256 of all that decides the PSF."""
+        """SHA-256 of all parameters."""
         air = self.atmosphere
         numbers = (air.r0, air.outer_scale, self.pixel_size, self.diffusion, self.jitter, self.weight_fwhm)
         arrays = (self.wavelengths, np.zeros(0) if self.dispersion is None else self.dispersion)
@@ -180,7 +180,7 @@ class Instrument:
             diffusion=self.diffusion,
             jitter=self.jitter,
             dispersion=self.dispersion,
-            n_pupil=None if only_rings(self.telescope) else points,
+            n_pupil=None if has_only_annuli(self.telescope) else points,
             threads=threads,
         )
         return psfs.image, psfs.pixel_scale
@@ -260,7 +260,7 @@ class ExposureResponse:
     ) -> ExposureResponse:
         """Compute central differences at some of the stars, and fit them over the field."""
         radius = float(np.hypot(*fields.T).max()) or instrument.telescope.field_radius
-        most = _SAMPLES if only_rings(instrument.telescope) else _SAMPLES_LATTICE
+        most = _SAMPLES if has_only_annuli(instrument.telescope) else _SAMPLES_LATTICE
         chosen = fields[np.unique(np.linspace(0, len(fields) - 1, min(most, len(fields))).astype(int))]
         degree = min(_FIELD_DEGREE, max(0, int((np.sqrt(8 * len(chosen) / 3 + 1) - 3) / 2)))
         terms = field_terms(chosen / radius, degree)
@@ -296,12 +296,12 @@ class ExposureResponse:
         """Return the derivatives at field angles [rad] and heights [m], shape [n, n_parameter, 3]."""
         first, second = self._at_levels(fields)
         upper = 0.5 + (heights - self.center) / (2.0 * _LEVEL)
-        return self._with_field(fields, first + upper[:, None, None] * (second - first))
+        return self._expanded_over_field(fields, first + upper[:, None, None] * (second - first))
 
     def height_slopes(self, fields: np.ndarray) -> np.ndarray:
         """Return the derivatives of :meth:`columns` with respect to the height [1/m], shape [n, n_parameter, 3]."""
         first, second = self._at_levels(fields)
-        return self._with_field(fields, (second - first) / (2.0 * _LEVEL))
+        return self._expanded_over_field(fields, (second - first) / (2.0 * _LEVEL))
 
     def _at_levels(self, fields: np.ndarray) -> np.ndarray:
         """Return the derivatives at the two heights, parameters on the axis alone: [level, n, n_term + 1, 3]."""
@@ -309,7 +309,7 @@ class ExposureResponse:
         terms = field_terms(fields / self.radius, degree)
         return np.einsum("nt,pltf->lnpf", terms, self.polynomial)
 
-    def _with_field(self, fields: np.ndarray, own: np.ndarray) -> np.ndarray:
+    def _expanded_over_field(self, fields: np.ndarray, own: np.ndarray) -> np.ndarray:
         """Add the parameters along x and y of the field, whose derivatives are those on the axis times x and y."""
         along, waves = fields / self.radius, own[:, :-1]
         return np.concatenate(

@@ -171,7 +171,7 @@ class FocalPlaneStars(Result):
         if "e1" in columns:
             size = _quantity(columns, "size", u.rad)
             with np.errstate(divide="ignore", invalid="ignore"):
-                values = _stacked(
+                values = _concatenated(
                     {"e1": _quantity(columns, "e1"), "e2": _quantity(columns, "e2"), "size": np.log(size)}
                 )
         elif cube is not None:
@@ -186,7 +186,7 @@ class FocalPlaneStars(Result):
             with np.errstate(divide="ignore"):
                 noise = per_snr / snr[:, None]
         else:
-            noise = _stacked({f"{n}_noise": _quantity(columns, f"{n}_noise") for n in ("e1", "e2", "size")})
+            noise = _concatenated({f"{n}_noise": _quantity(columns, f"{n}_noise") for n in ("e1", "e2", "size")})
         stars = cls(tuple(names), x, y, values, noise, cube, pixel_scale, weight_fwhm, bool(in_pixels))
         lengths = {"ccd": len(names), "x": len(x), "y": len(y), "shapes": len(values), "noise": len(noise)}
         if len(set(lengths.values())) > 1:
@@ -207,7 +207,7 @@ class FocalPlaneStars(Result):
             if not files:
                 raise ProductError("no products of a run (ccd_*.fits)", file=place)
             products = [read_product(f, holdout_images=False) for f in files]
-            return cls.from_products(products, **{"weight_fwhm": _weight_of(files[0])} | options)
+            return cls.from_products(products, **{"weight_fwhm": _product_weight_fwhm(files[0])} | options)
         require_file(place, ProductError)
         with parsing(place, "cannot be read as a table of stars", ProductError):
             kind = "fits" if place.suffix.lower() in (".fits", ".fit") else "ascii.ecsv"
@@ -234,7 +234,7 @@ class FocalPlaneStars(Result):
         )
 
 
-def _weight_of(product: Path) -> float:
+def _product_weight_fwhm(product: Path) -> float:
     """Return the weight of the moments in a product of a run [rad]."""
     with parsing(product, "no weight of the moments, WFWHM", ProductError):
         return float(fits.getval(product, "WFWHM")) * ARCSEC
@@ -303,7 +303,7 @@ def stars_of(stars: Any) -> FocalPlaneStars:
     return FocalPlaneStars.from_table(stars)
 
 
-def _stacked(columns: dict[str, np.ndarray]) -> np.ndarray:
+def _concatenated(columns: dict[str, np.ndarray]) -> np.ndarray:
     """Return columns of one length side by side."""
     lengths = {name: len(values) for name, values in columns.items()}
     if len(set(lengths.values())) > 1:

@@ -33,7 +33,7 @@ from ...models.camera.ccd_surfaces import CcdSurfaces
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import HeightBudget
 from ...models.telescope import Telescope
-from .covariance import inverse_of_root
+from .covariance import inverse_from_cholesky
 from .fit import ExposureFit, ShapeData
 from .height_equations import ExposureState, HeightEquations
 from .heights import STATIC_DEGREE, HeightPrior
@@ -81,7 +81,7 @@ class StaticHeights(Result):
         return np.sqrt(np.einsum("cii->c", self.covariance))
 
     def prior(self) -> HeightPrior:
-        """Return the prior that these heights are for another exposure."""
+        """Return these heights as the prior for another exposure."""
         return HeightPrior.known(self.focal_plane, self.covariance)
 
     @check_arguments
@@ -89,9 +89,11 @@ class StaticHeights(Result):
         """Write a FITS file."""
         surfaces = self.focal_plane.surfaces
         hdus = [
-            _float64("POLYNOMIAL", surfaces.polynomial, "[m] cubic of each CCD"),
-            _float64("GRID", surfaces.grid if surfaces.grid is not None else np.zeros((0, 0, 0)), "[m] B-splines"),
-            _float64("COVARIANCE", self.covariance, "[m2] of the Legendre coefficients of each CCD"),
+            _image_float64("POLYNOMIAL", surfaces.polynomial, "[m] cubic of each CCD"),
+            _image_float64(
+                "GRID", surfaces.grid if surfaces.grid is not None else np.zeros((0, 0, 0)), "[m] B-splines"
+            ),
+            _image_float64("COVARIANCE", self.covariance, "[m2] of the Legendre coefficients of each CCD"),
         ]
         cards = [
             ("CAMERA", self.camera.name, "name of the camera"),
@@ -106,15 +108,15 @@ class StaticHeights(Result):
         hdus = read_fits(Path(path))
         try:
             known = load_camera(hdus[0].header["CAMERA"] if camera is None else camera)
-            grid = _array(hdus["GRID"])
+            grid = _hdu_array(hdus["GRID"])
             surfaces = CcdSurfaces(
                 known.half_sizes,
-                _array(hdus["POLYNOMIAL"]),
+                _hdu_array(hdus["POLYNOMIAL"]),
                 np.zeros((len(known), 2, 4)),
                 grid if grid.size else None,
             )
             plane = FocalPlane(known, surfaces, np.ones(len(known), dtype=bool))
-            return cls(plane, _array(hdus["COVARIANCE"]), int(hdus[0].header["NEXPOSE"]))
+            return cls(plane, _hdu_array(hdus["COVARIANCE"]), int(hdus[0].header["NEXPOSE"]))
         except KeyError as error:
             raise ProductError(f"no product with heights ({' '.join(str(error).split())})", file=path) from None
 
@@ -147,11 +149,11 @@ def fit_static_heights(
     instrument : Instrument, optional
         Wavelengths, atmosphere and detector; by default those of :meth:`.FocalPlanePsf.fit`.
     budget : str, HeightBudget or None
-        Prior of the heights; None for one that hardly holds them.
+        Prior of the heights; None for a weak one.
     alignment_rms : float
         Prior rms of the residual wavefront of each exposure [m].
     folder : str or path, optional
-        Folder in which the result of each exposure is kept, so that a fit that was stopped goes on.
+        Folder with the result of each exposure, from which an interrupted fit is resumed.
     steps : int
         Gauss-Newton steps.
     map_jobs : callable
@@ -171,7 +173,11 @@ def fit_static_heights(
         raise DomainError(f"camera: {telescope.name} names none, expected one with the heights of its CCDs")
     cam = load_camera(known)
     degree = STATIC_DEGREE
-    prior = HeightPrior.broad(cam, degree=degree) if budget is None else HeightPrior.from_budget(cam, budget, degree)
+    prior = (
+        HeightPrior.uninformative(cam, degree=degree)
+        if budget is None
+        else HeightPrior.from_budget(cam, budget, degree)
+    )
     instrument = Instrument.of(telescope, camera=cam) if instrument is None else instrument
     heights = np.zeros(prior.n_parameter)
     precision = np.zeros((prior.n_parameter, prior.n_parameter))
@@ -179,7 +185,7 @@ def fit_static_heights(
     covariance = None
     states: list[ExposureState | None] = [None] * len(exposures)
     for step in range(max(1, steps)):
-        job = _Job(instrument, prior, alignment_rms, heights, None if folder is None else Path(folder), threads)
+        job = _ExposureJob(instrument, prior, alignment_rms, heights, None if folder is None else Path(folder), threads)
         matrix, vector = precision.copy(), -precision @ heights
         with reporter.stage(f"heights, step {step + 1} of {steps}", total=len(exposures)) as stage:
             jobs = [(step, i, exposure, states[i]) for i, exposure in enumerate(exposures)]
@@ -195,12 +201,12 @@ def fit_static_heights(
     assert covariance is not None
     root, scale = covariance
     with one_blas_thread():
-        full = inverse_of_root(root) * scale[:, None] * scale
+        full = inverse_from_cholesky(root) * scale[:, None] * scale
         return StaticHeights(prior.focal_plane(heights), prior.per_ccd(full), len(exposures))
 
 
 @dataclass(frozen=True, eq=False)
-class _Job:
+class _ExposureJob:
     """Normal equations of one exposure about heights, its own parameters marginalised."""
 
     instrument: Instrument
@@ -247,13 +253,13 @@ class _Job:
         return digest.hexdigest()
 
 
-def _float64(name: str, values: np.ndarray, comment: str) -> fits.ImageHDU:
+def _image_float64(name: str, values: np.ndarray, comment: str) -> fits.ImageHDU:
     hdu = fits.ImageHDU(np.asarray(values, dtype=np.float64), name=name)
     hdu.header["COMMENT"] = comment
     return hdu
 
 
-def _array(hdu: fits.ImageHDU) -> np.ndarray:
+def _hdu_array(hdu: fits.ImageHDU) -> np.ndarray:
     if hdu.data is None:
         return np.zeros((0, 0, 0))
     return np.asarray(hdu.data, dtype=np.float64)

@@ -259,7 +259,7 @@ def shear_correlation(
         left, leave_one_out_pairs = np.empty((2, 0, n_bins)), np.empty((0, n_bins))
         errors = np.sqrt(np.stack([pairs.varxip, pairs.varxim]))
     else:
-        left, leave_one_out_pairs = _without_each(pairs, len(found))
+        left, leave_one_out_pairs = _leave_one_out_correlations(pairs, len(found))
         errors = np.stack([jackknife_error(values) for values in left])
     return Correlation(
         r=np.where(empty, pairs.rnom, pairs.meanr),
@@ -282,7 +282,7 @@ def jackknife_error(left: np.ndarray) -> np.ndarray:
     return np.asarray(np.sqrt((1.0 - 1.0 / len(left)) * scatter))
 
 
-def _without_each(pairs: treecorr.GGCorrelation, n_patches: int) -> tuple[np.ndarray, np.ndarray]:
+def _leave_one_out_correlations(pairs: treecorr.GGCorrelation, n_patches: int) -> tuple[np.ndarray, np.ndarray]:
     """Return xi+ and xi- without each patch in turn, [2, n_patches, n_bins], and the pairs [n_patches, n_bins] left.
 
     NaN where no pair is left. TreeCorr adds up the pairs of patches anew without each of them, which takes the third

@@ -129,7 +129,7 @@ def measure_shapes(
     DomainError
         If an argument has the wrong shape or is not positive.
     """
-    stack = _stack(images)
+    stack = _stamp_cube(images)
     scale = positive_angle(pixel_scale, "pixel_scale")
     sigma = positive_angle(weight_fwhm, "weight_fwhm") / np.sqrt(8.0 * np.log(2.0)) / scale
     if max_iterations < 1:
@@ -172,7 +172,7 @@ def fwhm(images: Any, pixel_scale: Any, *, upsampling: int = 8) -> np.ndarray:
     pixel_scale : float or Quantity
         Side of a pixel [rad].
     """
-    stack = _stack(images)
+    stack = _stamp_cube(images)
     scale = positive_angle(pixel_scale, "pixel_scale")
     if upsampling < 2:
         raise DomainError(f"upsampling = {upsampling}: expected at least 2")
@@ -183,7 +183,7 @@ def fwhm(images: Any, pixel_scale: Any, *, upsampling: int = 8) -> np.ndarray:
             if not np.all(np.isfinite(image)):
                 continue
             fine = _upsampled_core(image, upsampling)
-            peak = _peak(fine)
+            peak = _interpolated_peak(fine)
             if peak > 0.0:
                 result[i] = 2.0 * np.sqrt(_area_above(fine, 0.5 * peak) / np.pi) / upsampling * scale
     return result
@@ -289,7 +289,7 @@ def _newton_step(first: np.ndarray, second: np.ndarray, sigma: float) -> np.ndar
 
 
 @lru_cache(maxsize=8)
-def _interpolation(count: int, factor: int) -> np.ndarray:
+def _sinc_matrix(count: int, factor: int) -> np.ndarray:
     """Return the matrix of the band-limited function through `count` pixels at steps of 1/factor, from pixel 0 on.
 
     Shape [count factor, count]: the periodic sinc, whose highest frequency stands for both its signs if count is even.
@@ -309,11 +309,11 @@ def _upsampled_core(image: np.ndarray, factor: int) -> np.ndarray:
     for count, lit in zip(image.shape, (bright.any(axis=1), bright.any(axis=0)), strict=True):
         first, *_, last = np.flatnonzero(lit)[[0, -1]]
         span = slice(max(first - 2, 0) * factor, min(last + 3, count) * factor)
-        to_fine.append(_interpolation(count, factor)[span])
+        to_fine.append(_sinc_matrix(count, factor)[span])
     return to_fine[0] @ image @ to_fine[1].T
 
 
-def _peak(fine: np.ndarray) -> float:
+def _interpolated_peak(fine: np.ndarray) -> float:
     """Return the maximum of the paraboloid through the highest pixel and its neighbours."""
     j, i = np.unravel_index(np.argmax(fine), fine.shape)
     ny, nx = fine.shape
@@ -337,7 +337,7 @@ def _area_above(fine: np.ndarray, level: float) -> float:
     return float(covered.sum())
 
 
-def _stack(images: Any) -> np.ndarray:
+def _stamp_cube(images: Any) -> np.ndarray:
     """Return the images as an array [n, ny, nx]."""
     numbers = real_numbers(images)
     array = np.empty(0) if numbers is None or hasattr(numbers, "unit") else np.asarray(numbers)

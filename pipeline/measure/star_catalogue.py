@@ -74,7 +74,7 @@ def load_stars(
     data = read_bytes(path, ProductError)
     hdus: fits.HDUList | None = None
     if data.startswith(b"SIMPLE"):
-        hdus = _fits(path, data)
+        hdus = _read_fits_parts(path, data)
         tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU) and not isinstance(hdu, fits.CompImageHDU)]
         if not tables:
             raise ProductError(
@@ -82,19 +82,19 @@ def load_stars(
             )
         with parsing(path, "damaged or not FITS", ProductError):
             # SExtractor's LDAC files have a table of the image's header before that of the objects.
-            table = next((t for t in tables if _known_as(x, t.columns.names)), tables[0])
+            table = next((t for t in tables if _find_column(x, t.columns.names)), tables[0])
             columns = {name: np.asarray(table.data[name]) for name in table.columns.names}
     elif data.lstrip().startswith(b"# %ECSV"):
-        columns = _ecsv(path, data)
+        columns = _read_ecsv_columns(path, data)
     else:
         raise ProductError("neither FITS nor ECSV, expected a table of stars", file=path)
 
     cube = None
     if images is not None:
-        cube = _first_cube(_fits(Path(images), read_bytes(Path(images), ProductError)))
+        cube = _first_cube(_read_fits_parts(Path(images), read_bytes(Path(images), ProductError)))
         if cube is None:
             raise ProductError("has no image of three axes, expected the stamps [n, ny, nx]", file=images)
-    x, y, stamp = (_known_as(name, columns) or name for name in (x, y, stamp))
+    x, y, stamp = (_find_column(name, columns) or name for name in (x, y, stamp))
     names = {name.lower(): name for name in columns}
     if cube is None and stamp.lower() not in names and hdus is not None:
         cube = _first_cube(hdus)
@@ -106,20 +106,20 @@ def load_stars(
             f"{path}: no column {', '.join(map(repr, missing))}{also}; its columns are {', '.join(columns) or 'none'}"
             + "; stamps are images [n, ny, nx], as SExtractor's VIGNET" * (stamp in missing)
         )
-    positions = np.stack([_numbers(path, name, columns[names[name.lower()]], 1) for name in (x, y)], axis=1)
-    stamps = _numbers(path, stamp, columns[names[stamp.lower()]], 3) if cube is None else cube
+    positions = np.stack([_checked_column(path, name, columns[names[name.lower()]], 1) for name in (x, y)], axis=1)
+    stamps = _checked_column(path, stamp, columns[names[stamp.lower()]], 3) if cube is None else cube
     if len(stamps) != len(positions):
         raise ProductError(f"{len(positions)} stars in the table, {len(stamps)} stamps in the images", file=path)
     return StarCutouts(np.where(stamps < _MASKED, np.nan, stamps), positions)
 
 
-def _known_as(name: str, columns: Iterable[str]) -> str | None:
+def _find_column(name: str, columns: Iterable[str]) -> str | None:
     """Return the column of a name, or of another one that programs have for it; None without one."""
     names = {column.lower(): column for column in columns}
     return next((names[other] for other in (name.lower(), *OTHER_NAMES.get(name, ())) if other in names), None)
 
 
-def _fits(path: Path, data: bytes) -> fits.HDUList:
+def _read_fits_parts(path: Path, data: bytes) -> fits.HDUList:
     """Return the parts of a FITS file in memory; the warning that it is cut short is an error, others are dropped."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -133,7 +133,7 @@ def _fits(path: Path, data: bytes) -> fits.HDUList:
     return hdus
 
 
-def _ecsv(path: Path, data: bytes) -> dict[str, np.ndarray]:
+def _read_ecsv_columns(path: Path, data: bytes) -> dict[str, np.ndarray]:
     """Return the columns of an ECSV table; values left empty are NaN."""
     with parsing(path, "damaged or no ECSV table", ProductError):
         table = Table.read(data.decode().splitlines(), format="ascii.ecsv")
@@ -154,7 +154,7 @@ def _first_cube(hdus: fits.HDUList) -> np.ndarray | None:
     return None
 
 
-def _numbers(path: Path, name: str, values: Any, axes: int) -> np.ndarray:
+def _checked_column(path: Path, name: str, values: Any, axes: int) -> np.ndarray:
     """Return a column as float64 in the machine's byte order, with the axes it must have."""
     array = np.asarray(values)
     if array.dtype.kind not in "fiu" or array.ndim != axes:

@@ -14,8 +14,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.units import pure_numbers, real_array
 
-# How far stars of one CCD may differ from their median: this fraction of the geometric mean of the pixel's value and
-# the peak's, one standard deviation.
+# Standard deviation of the PSF within a CCD, as a fraction of the geometric mean of the pixel's value and the peak's.
 _PSF_CHANGE = 0.05
 # A pixel is sharper than a star can be if it holds so many times more of the light around it than a star's peak does.
 _SHARPER = 1.5
@@ -118,7 +117,7 @@ def flag_stars(
     DomainError
         If an argument has the wrong shape or is not positive, or fewer than three stars can be compared.
     """
-    images = _images(stamps)
+    images = _stamp_cube(stamps)
     count = len(images)
     try:
         rms = np.broadcast_to(pure_numbers(noise, "noise"), (count,))
@@ -163,7 +162,7 @@ def flag_stars(
             flags[i] |= StarFlag.COSMIC_RAY
             masks[i] = struck
             residual = np.where(struck, 0.0, residual)
-        if _matched(residual, variance, star) > threshold:
+        if _matched_filter(residual, variance, star) > threshold:
             flags[i] |= StarFlag.NEIGHBOUR
     return Selection(flags, masks)
 
@@ -197,19 +196,19 @@ def _sharp_pixels(residual: np.ndarray, variance: np.ndarray, fraction: float, t
     return sharp | ndimage.binary_dilation(sharp, ones, iterations=-1, mask=bright | sharp)
 
 
-def _matched(residual: np.ndarray, variance: np.ndarray, star: np.ndarray) -> float:
+def _matched_filter(residual: np.ndarray, variance: np.ndarray, star: np.ndarray) -> float:
     """Return the largest significance of a star in the residual."""
-    found = ndimage.correlate(residual, star, mode="constant", origin=_origin(star))
-    error = np.sqrt(ndimage.correlate(variance, star**2, mode="constant", origin=_origin(star)))
+    found = ndimage.correlate(residual, star, mode="constant", origin=_peak_offset(star))
+    error = np.sqrt(ndimage.correlate(variance, star**2, mode="constant", origin=_peak_offset(star)))
     return float((found / error).max())
 
 
-def _origin(star: np.ndarray) -> tuple[int, ...]:
+def _peak_offset(star: np.ndarray) -> tuple[int, ...]:
     """Return the offset of the star's peak from the middle of the stamp, in the convention of SciPy's filters."""
     return tuple(int(p) - n // 2 for p, n in zip(np.unravel_index(star.argmax(), star.shape), star.shape, strict=True))
 
 
-def _images(stamps: Any) -> np.ndarray:
+def _stamp_cube(stamps: Any) -> np.ndarray:
     """Return the stamps as float64 [n, ny, nx]."""
     images = real_array(stamps, "stamps: expected real numbers [n, ny, nx]")
     if images.ndim != 3 or min(images.shape[1:]) < 5:

@@ -15,7 +15,7 @@ from .correlation import SEPARATION_RANGES, Correlation, shear_correlation
 CORRELATED = ("truth", "observed", "residual", "away")
 #: Shape parameters of which a focal-plane model predicts its uncertainty.
 _PREDICTED = ("e1", "e2", "size")
-#: Pairs are counted from here on [arcmin].
+#: Smallest separation of pairs [arcmin].
 SHORTEST_ARCMIN = 0.5
 _BINS_PER_DECADE = 6
 
@@ -31,7 +31,7 @@ def correlations(products: Sequence[CcdStars], kinds: Sequence[str] | None = Non
     """
     bins = separation_bins(products)
     if kinds is None:
-        kinds = CORRELATED + CCD_KINDS if of_focal_plane(products) else CORRELATED
+        kinds = CORRELATED + CCD_KINDS if has_focal_plane_model(products) else CORRELATED
     result = {}
     for kind in kinds:
         stars = [p.stars(kind) for p in products]
@@ -40,9 +40,9 @@ def correlations(products: Sequence[CcdStars], kinds: Sequence[str] | None = Non
     return result
 
 
-def of_focal_plane(products: Sequence[CcdStars]) -> bool:
+def has_focal_plane_model(products: Sequence[CcdStars]) -> bool:
     """Return whether the model of all products is one of the whole focal plane."""
-    return all(p.of_focal_plane for p in products)
+    return all(p.has_focal_plane_model for p in products)
 
 
 def ellipticities(products: Sequence[CcdStars], kind: str) -> np.ndarray:
@@ -114,7 +114,7 @@ def _common_metrics(products: Sequence[CcdProduct]) -> dict[str, Any]:
     """Return the metrics of which a run has the same as each of its CCDs."""
     residuals = {"at_stars": "residual", "left_out": "left_out", "away": "away"}
     chi2 = {}
-    if of_focal_plane(products):
+    if has_focal_plane_model(products):
         residuals |= {"at_stars_ccd": "residual_ccd", "away_ccd": "away_ccd"}
         chi2 = {f"chi2_away_{key}": _chi2_away(products, key) for key in _PREDICTED}
     return {

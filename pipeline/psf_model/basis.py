@@ -15,7 +15,7 @@ from ...core.errors import ConfigError
 BASES = ("pca", "pixels", "shapelets")
 # Scales of shapelets tried first, over the rms width of the mean star, before the best is refined.
 _SCALES = np.geomspace(0.4, 1.6, 13)
-# Most components that the scale is chosen for: with many, any scale will do, and the first of them should do best.
+# Most components for the choice of the scale: with many, the residual hardly depends on it.
 _FOR_SCALE = 20
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 

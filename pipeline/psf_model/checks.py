@@ -21,7 +21,7 @@ def as_stamps(stamps: Any, masks: Any = None) -> tuple[np.ndarray, np.ndarray]:
         raise DomainError(f"stamps have shape {images.shape}: expected [n, ny, nx] with at least 2 stars")
     bad = np.zeros(images.shape, dtype=bool)
     if masks is not None:
-        bad = _masks(masks, images.shape)
+        bad = _checked_masks(masks, images.shape)
         images = np.where(bad, 0.0, images)
     finite = np.isfinite(images).all(axis=(1, 2))
     if not finite.all():
@@ -33,7 +33,7 @@ def as_stamps(stamps: Any, masks: Any = None) -> tuple[np.ndarray, np.ndarray]:
     return images, bad
 
 
-def _masks(masks: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _checked_masks(masks: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return the masks as bool [n, ny, nx], True where a pixel is not to be used."""
     bad = np.asarray(masks)
     if bad.shape != shape or bad.dtype.kind != "b":
@@ -106,23 +106,23 @@ def check_terms(terms: np.ndarray, order: int, positions: np.ndarray, weights: n
     if n_stars < n_terms:
         raise ConfigError(f"order = {order}: its {n_terms} polynomial terms need as many stars, {n_stars} given")
     if np.linalg.matrix_rank(terms) < n_terms:
-        pair = same_place(positions)
+        pair = coincident_positions(positions)
         twice = f" ({_pair_text(positions, pair)})" if pair else ""
         raise DomainError(
             f"positions: the {n_stars} stars do not determine the {term_count(order)} polynomial terms{twice}"
         )
 
 
-def check_apart(positions: np.ndarray, interpolation: str) -> None:
+def check_distinct_positions(positions: np.ndarray, interpolation: str) -> None:
     """Raise an error for two stars at one position: a noise-free process cannot pass through both."""
-    pair = same_place(positions)
+    pair = coincident_positions(positions)
     if pair:
         raise DomainError(
             f"positions: {_pair_text(positions, pair)}; expected places apart for interpolation = {interpolation!r}"
         )
 
 
-def same_place(positions: np.ndarray) -> tuple[int, int] | None:
+def coincident_positions(positions: np.ndarray) -> tuple[int, int] | None:
     """Return the indices of the first two stars at one position, or None."""
     first: dict[tuple[float, float], int] = {}
     for index, (x, y) in enumerate(positions.tolist()):

@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from .basis import Basis
-from .description import CleanStars
+from .clean_stars import CleanStars
 from .polynomial import term_count
 from .shape_noise import ShapeNoise
 
 #: Orders from which an automatic choice is made.
 ORDERS = range(5)
-# Parts of the stars that are held out, one after the other; the i-th star is in part i modulo this.
+# Number of folds; the i-th star is in fold i modulo this.
 _FOLDS = 5
 # Most terms of polynomials over the stars that they are fitted to.
 _MOST_TERMS = 0.5
@@ -25,7 +25,7 @@ def automatic_orders(n_stars: int) -> list[int]:
     return [order for order in ORDERS if order == 0 or term_count(order) <= _MOST_TERMS * fitted]
 
 
-def choose(
+def choose_by_cross_validation(
     stars: CleanStars,
     terms: np.ndarray,
     shapes: ShapeNoise,

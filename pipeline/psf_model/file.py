@@ -64,11 +64,11 @@ def model_fields(hdus: Iterable[Any], name: str) -> dict[str, Any]:
         basis = mean.header.get("BASIS", "pca")
         if basis not in BASES:
             raise ProductError(f"PSF model {name!r}: BASIS = {basis!r}, expected one of {', '.join(BASES)}")
-        polynomial, image = _native(part("POLY").data), _native(mean.data)
+        polynomial, image = _native_float64(part("POLY").data), _native_float64(mean.data)
         if basis == "pixels":
             components = identity(image.size).reshape(image.size, *image.shape)
         else:
-            components = _native(part("EIGEN").data)
+            components = _native_float64(part("EIGEN").data)
         k = len(components)
         extent = tuple(float(v) for v in part("EXTENT").data)
         kernel = found.get(f"{name}_KERNEL".upper())
@@ -76,19 +76,19 @@ def model_fields(hdus: Iterable[Any], name: str) -> dict[str, Any]:
         fields = {
             "mean": image,
             "components": components,
-            "coefficients": _native(stars["coefficient"]).reshape(len(stars), -1),
+            "coefficients": _native_float64(stars["coefficient"]).reshape(len(stars), -1),
             "polynomial": polynomial,
-            "eigenvalues": _native(part("SPECTRUM").data["eigenvalue"]),
-            "positions": _native(stars["position"]),
+            "eigenvalues": _native_float64(part("SPECTRUM").data["eigenvalue"]),
+            "positions": _native_float64(stars["position"]),
             "order": int(mean.header["ORDER"]),
             "extent": extent,
-            "unexplained": _native(stars["unexplained"]),
+            "unexplained": _native_float64(stars["unexplained"]),
             "rejected": np.asarray(stars["rejected"], dtype=np.int64),
             "basis": basis,
             "scale": float(mean.header.get("SCALE", np.nan)),
-            "weights": _native(stars["weight"]) if "weight" in columns else None,
-            "kernel": _native(kernel.data) if kernel is not None else None,
-            "alpha": _native(stars["pull"]).reshape(len(stars), -1) if kernel is not None else None,
+            "weights": _native_float64(stars["weight"]) if "weight" in columns else None,
+            "kernel": _native_float64(kernel.data) if kernel is not None else None,
+            "alpha": _native_float64(stars["pull"]).reshape(len(stars), -1) if kernel is not None else None,
         }
     except KeyError as error:
         raise ProductError(f"no PSF model {name!r} in the FITS file: {error.args[0]} is missing") from error
@@ -97,6 +97,6 @@ def model_fields(hdus: Iterable[Any], name: str) -> dict[str, Any]:
     return fields
 
 
-def _native(array: Any) -> np.ndarray:
+def _native_float64(array: Any) -> np.ndarray:
     """Return FITS numbers as float64 in the machine's own byte order."""
     return np.asarray(array, dtype=np.float64).copy()

@@ -11,9 +11,9 @@ from ...core.errors import ConfigError, DomainError
 from ...core.threads import one_blas_thread
 from . import gaussian_process, kriging
 from .basis import BASES, Basis
-from .checks import as_extent, as_stamps, as_weights, check_apart, check_terms
-from .cross_validation import automatic_orders, choose
-from .description import CleanStars, clean, make_basis, project
+from .checks import as_extent, as_stamps, as_weights, check_distinct_positions, check_terms
+from .clean_stars import CleanStars, cleaned_stars, make_basis, project_stars
+from .cross_validation import automatic_orders, choose_by_cross_validation
 from .polynomial import MOST_ORDER, as_positions, design_matrix, mapped, term_count
 from .shape_noise import ShapeNoise
 
@@ -77,7 +77,7 @@ def fit_fields(
             )
         if order == "auto":
             raise ConfigError(f"order = 'auto': expected a number or None with interpolation = {interpolation!r}")
-        check_apart(points, interpolation)
+        check_distinct_positions(points, interpolation)
     if gain is not None and not (np.isfinite(gain) and gain > 0.0):
         raise ConfigError(f"gain = {gain}: expected a number of electrons above 0, or None for no photon noise")
     fixed = None if order == "auto" else int(ORDERS[interpolation] if order is None else order)
@@ -95,7 +95,7 @@ def fit_fields(
             check_terms(terms[:, : term_count(needed)], needed, points, star_weights)
         # Few stars would follow their own outliers under a high order.
         smooth = _SMOOTH_ORDER if interpolation == "kriging" or fixed is None else fixed
-        stars = clean(
+        stars = cleaned_stars(
             images,
             bad,
             terms[:, : term_count(smooth)],
@@ -109,11 +109,11 @@ def fit_fields(
 
         shapes = None
         if by_noise or automatic:
-            shapes = ShapeNoise.of(images, stars.deviations, stars.mean.reshape(ny, nx), _gain(images, gain))
+            shapes = ShapeNoise.of(images, stars.deviations, stars.mean.reshape(ny, nx), _checked_gain(images, gain))
         chosen = min(orders[-1], _SMOOTH_ORDER) if interpolation == "gp" else orders[-1]
         if shapes is not None and automatic:
             counts = np.arange(1, count + 1) if n_components == "auto" else np.array([count])
-            chosen, count = choose(stars, terms, shapes, orders, counts, basis_of, star_weights)
+            chosen, count = choose_by_cross_validation(stars, terms, shapes, orders, counts, basis_of, star_weights)
         basis_weights = None
         if shapes is not None and by_noise:
             basis_weights = shapes.star_weights(stars.deviations, terms[:, : term_count(chosen)])
@@ -122,7 +122,7 @@ def fit_fields(
         order = chosen if fixed is None else fixed
         terms = terms[:, : term_count(order)]
         found = basis_of(stars, basis_weights, count)
-        coefficients, unexplained = project(stars, found, basis)
+        coefficients, unexplained = project_stars(stars, found, basis)
         kernel = alpha = None
         mapped_points = mapped(points, span)
         if interpolation == "gp" and shapes is not None:
@@ -162,7 +162,7 @@ def fit_fields(
         )
 
 
-def _gain(images: np.ndarray, gain: float | None) -> float | None:
+def _checked_gain(images: np.ndarray, gain: float | None) -> float | None:
     """Return the gain; None for stamps that are not in electrons, whose photon noise is unknown."""
     return gain if gain is not None and np.median(images.sum(axis=(1, 2))) * gain >= kriging.FEWEST_ELECTRONS else None
 

@@ -34,7 +34,7 @@ def fit_kernels(
     result[:, 1] = 1.0
     groups = [np.arange(values.shape[1])] if shared else [np.array([k]) for k in range(values.shape[1])]
     largest = np.abs(values / root).max(initial=0.0)
-    squares = _squares(points, points)
+    squares = _squared_distances(points, points)
 
     def spectrum(length: float) -> tuple[np.ndarray, np.ndarray]:
         """Return eigenvalues and eigenvectors of the correlation of values over the roots of their noise."""
@@ -48,7 +48,7 @@ def fit_kernels(
         own = rest[:, group] / np.sqrt(power)
         tried = [_likelihood(each, own, _RATIOS_TRIED)[0] for each in spectra]
         i, j = np.unravel_index(np.argmax(tried), np.shape(tried))
-        length = _best_between(partial(_best_likelihood, spectrum, own, int(j)), _LENGTHS_TRIED, int(i))
+        length = _refined_maximum(partial(_best_likelihood, spectrum, own, int(j)), _LENGTHS_TRIED, int(i))
         _, ratio = _best_ratio(spectrum(length), own, int(j))
         variance = power * float(_likelihood(spectrum(length), own, np.array([ratio]))[1][0])
         result[group] = (variance, length, variance * ratio)
@@ -77,7 +77,7 @@ def _best_ratio(spectrum: tuple[np.ndarray, np.ndarray], values: np.ndarray, nea
     def likelihood(ratio: float) -> float:
         return float(_likelihood(spectrum, values, np.array([ratio]))[0][0])
 
-    ratio = _best_between(likelihood, _RATIOS_TRIED, near)
+    ratio = _refined_maximum(likelihood, _RATIOS_TRIED, near)
     return likelihood(ratio), ratio
 
 
@@ -88,7 +88,7 @@ def _best_likelihood(
     return _best_ratio(spectrum(length), values, near)[0]
 
 
-def _best_between(function: Callable[[float], float], grid: np.ndarray, near: int) -> float:
+def _refined_maximum(function: Callable[[float], float], grid: np.ndarray, near: int) -> float:
     """Return where a function is largest between the neighbours of a point of a grid, by Brent's method."""
     from scipy.optimize import minimize_scalar  # a fifth of a second
 
@@ -110,7 +110,7 @@ def krige(
     """
     trend = np.zeros((terms.shape[1], values.shape[1]))
     weights, left_out = np.zeros(values.shape), np.zeros(values.shape)
-    squares = _squares(points, points)
+    squares = _squared_distances(points, points)
     for kernel in np.unique(kernels, axis=0):
         group = (kernels == kernel).all(axis=1)
         variance, length, of_middle = kernel
@@ -148,6 +148,6 @@ def predict(points: np.ndarray, at: np.ndarray, kernels: np.ndarray, weights: np
     return result
 
 
-def _squares(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _squared_distances(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return the squared distances, [n, m]."""
     return ((one[:, None] - other) ** 2).sum(axis=2)

@@ -1,4 +1,4 @@
-r"""Kriging with the noise of each star: how smooth the PSF is over the CCD is learnt from the stars themselves.
+r"""Kriging with the noise of each star, and a covariance over the CCD that is fitted to the stars themselves.
 
 Every pixel of the stamps is interpolated by one linear rule, the best one for a Gaussian field with the covariance
 
@@ -9,8 +9,8 @@ of an exponential process, such as turbulence leaves, and a polynomial trend, wh
 shrunk to nothing where the stars show none; those of degree 3 and 4 are left out unless the stars show them.
 :math:`N_i` is the noise of star i, from the scatter of its outer pixels and its photons; :math:`g` what is left. What
 counts is the shape, so :math:`s, L, t_d, g` are those of the largest posterior probability of three numbers of each
-star, linear in its pixels: the two components of the ellipticity and the size. Most pixels have no signal, and would
-say little. Nothing is left to choose: on fields that the polynomials of a CCD describe this comes near to the best of
+star, linear in its pixels: the two components of the ellipticity and the size. Most pixels have no signal, and hardly
+constrain it. Nothing is left to choose: on fields that the polynomials of a CCD describe this comes near to the best of
 them, with the best weights, and on turbulent ones it is better (docs/psf_models.md).
 
 Variances are in units of the noise of the middle star.
@@ -36,14 +36,14 @@ ORDER = 4
 #: Fewest columns of the kernel: variance and length of the process, noise that all stars have, variances of the
 #: trend's terms of degree 1 and 2, and so on to its order. Lengths where the extent is 2 wide.
 COLUMNS = 5
-# Mean and standard deviation of the logarithms of these before the stars are seen: wide but for the length, which
+# Prior mean and standard deviation of the logarithms of these: wide but for the length, which
 # forty stars hardly determine. Variances of the trend fall with the degree: nothing is expected of degrees 3 and 4, so
 # that they cost nothing where the stars show nothing.
 _PRIOR = np.array([(-5.0, 3.0), (math.log(0.7), 0.7), (-6.0, 2.0)])
 _TREND_WIDTH = 4.0
 # A degree of the trend above the second is kept if the posterior's logarithm falls by this much without it: of the
-# prior of such a variance about a seventh, e^-2, lies where noise alone may put a maximum. The process is always kept:
-# air leaves one, and forty stars of S/N 30 predict others worse by 3 % where it is left out.
+# prior of such a variance about a seventh, e^-2, lies where noise alone may put a maximum. The process always stays:
+# turbulence causes one, and forty stars of S/N 30 predict others worse by 3 % without it.
 _EVIDENCE = 2.0
 _FIRST_OPTIONAL_DEGREE = 3
 # Where the search starts: nearly all trend of degree 2, nearly all process, all trend of every degree. The logarithms
@@ -137,7 +137,7 @@ def fit_kernel(points: np.ndarray, numbers: np.ndarray, noise: np.ndarray, terms
     degrees = np.arange(1, max(order_of(terms.shape[1]), COLUMNS - 3) + 1)
     expected = np.where(degrees < 3, 1.0 - degrees, 3.0 - 3.0 * degrees)
     posterior = Posterior(
-        _distances(points[chosen], points[chosen]),
+        _pair_distances(points[chosen], points[chosen]),
         numbers[chosen] / np.sqrt(unit),
         (noise[chosen] / unit).mean(axis=1),
         terms[chosen],
@@ -173,11 +173,11 @@ class Posterior:
         """Return the columns, those that are not kept as 0 but for the length."""
         return np.where(kept | (np.arange(len(kept)) == 1), np.exp(logarithms), 0.0)
 
-    def surprise(self, logarithms: np.ndarray, kept: np.ndarray) -> tuple[float, np.ndarray]:
+    def negative_log_posterior(self, logarithms: np.ndarray, kept: np.ndarray) -> tuple[float, np.ndarray]:
         """Return minus the logarithm of the posterior, but for a constant, and its derivatives [n_columns]."""
         kernel = self.kernel(logarithms, kept)
         try:
-            root = np.linalg.cholesky(_covariance(kernel, self.distance, self.terms, self.noise))
+            root = np.linalg.cholesky(_kernel_covariance(kernel, self.distance, self.terms, self.noise))
         except np.linalg.LinAlgError:
             return 1e12, np.zeros(len(kept))
         lower = np.tril(scipy.linalg.lapack.dpotri(root, lower=1)[0])
@@ -205,7 +205,7 @@ class Posterior:
 
         reach = 8.0 * self.width
         return minimize(
-            self.surprise,
+            self.negative_log_posterior,
             start,
             args=(kept,),
             jac=True,
@@ -224,7 +224,7 @@ def krige(
     :func:`predict`; and each value minus its prediction by the others [n, k]. `noise` [n] is in units of the middle
     star's.
     """
-    covariance = _covariance(kernel, _distances(points, points), terms, noise)
+    covariance = _kernel_covariance(kernel, _pair_distances(points, points), terms, noise)
     inverse = scipy.linalg.inv(covariance, check_finite=False)
     weights = inverse @ values
     trend = _trend_variances(kernel, terms.shape[1])[:, None] * (terms.T @ weights)
@@ -243,7 +243,7 @@ def predict(points: np.ndarray, at: np.ndarray, kernel: np.ndarray, weights: np.
     return result
 
 
-def _covariance(kernel: np.ndarray, distance: np.ndarray, terms: np.ndarray, noise: np.ndarray) -> np.ndarray:
+def _kernel_covariance(kernel: np.ndarray, distance: np.ndarray, terms: np.ndarray, noise: np.ndarray) -> np.ndarray:
     variance, length, floor = kernel[:3]
     covariance = variance * np.exp(-distance / length)
     covariance += (terms * _trend_variances(kernel, terms.shape[1])) @ terms.T
@@ -262,5 +262,5 @@ def order_of(count: int) -> int:
     return math.isqrt(8 * count + 1) // 2 - 1
 
 
-def _distances(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _pair_distances(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.hypot(*np.moveaxis(one[:, None] - other, -1, 0))

@@ -6,7 +6,7 @@ import numpy as np
 
 from ...core.errors import DomainError
 
-# Passes end when no pixel changes by more of the brightest pixel than this.
+# Passes end when no pixel changes by more than this fraction of the brightest pixel.
 _CONVERGED = 1e-12
 _MOST_PASSES = 100
 # Stars in which a pixel is masked are predicted only along the directions that the others determine: an eigenvalue of

@@ -287,7 +287,7 @@ class PsfModel(PicturedModel):
 
     @check_arguments
     def truncated(self, n_components: int) -> PsfModel:
-        """Return the model with its first components only, what the others held counted as unexplained.
+        """Return the model with its first components only; the others count as unexplained.
 
         Raises
         ------

@@ -19,7 +19,7 @@ def find_outliers(images: np.ndarray, clip_sigma: float, max_iterations: int) ->
     A pixel's deviation is compared with `clip_sigma` times three standard deviations in quadrature: that of the pixel
     over the stars, that of the star over its pixels, and an allowance for the PSF's change within the CCD. The first is
     taken from the 80th percentile, which unlike the median includes the few stars in the corners, where the PSF differs
-    most; three times the one from the median is its upper bound, should more than a fifth of the stars be hit in that
+    most; three times the one from the median is its upper bound, should more than a fifth of the stars be bad in that
     pixel. Mean and fluxes come from the pixels not rejected, and all pixels are compared anew until nothing changes.
     Stars are scaled to the mean by least squares: the sum over a thousand pixels of sky noise would be off by far more
     than the star's own noise.

@@ -1,4 +1,4 @@
-"""Three numbers of each star that its shape depends on, with their noise, and what they say about a model.
+"""Shape numbers of the stars with their noise, and the variance that a model leaves of them.
 
 Stars differ in S/N by a factor of a hundred, and most pixels have no signal: residuals of all pixels of all stars are
 the noise of the faint ones, whatever the model is. So models are compared by three shape numbers

@@ -28,7 +28,7 @@ from ..measure.summary import (
     correlations,
     ellipticities,
     finite_mean,
-    of_focal_plane,
+    has_focal_plane_model,
     patches,
     rms,
     separation_bins,
@@ -37,9 +37,9 @@ from ..run_folder import CONFIG_NAME, SUMMARY_NAME, stamp_of
 from .focal_plane_plots import residual_plot
 from .statistics_plots import correlation_plot, rho_plot
 
-#: Residuals: at the stars, of stars left out, away from them.
+#: Residuals: at the stars, leave-one-out, and at holdout positions.
 RESIDUALS = ("residual", "left_out", "away")
-#: Those of them whose size is known too.
+#: Residuals for which sizes are available too.
 SIZED = ("residual", "away", *CCD_KINDS)
 FOLDER_NAME = "diagnostics"
 _MEANINGS = {
@@ -102,17 +102,17 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
     products, missing = [], {}
     for name in names:
         try:
-            products.append(_product(folder, name, stamp, config.reconstruction.model))
+            products.append(_read_product_or_reason(folder, name, stamp, config.reconstruction.model))
         except ProductError as error:
             missing[name] = str(error)
             # Damage happens to single files; a folder without any that can be read has another reason.
             if strict or len(missing) == len(names):
                 raise
-    residuals = RESIDUALS + CCD_KINDS if of_focal_plane(products) else RESIDUALS
+    residuals = RESIDUALS + CCD_KINDS if has_focal_plane_model(products) else RESIDUALS
     columns = _ccd_columns(products, residuals)
     correlated = correlations(products, products[0].kinds)
-    rho = {kind: _rho(products, kind) for kind in ("residual", "away")}
-    overall = _overall(products, residuals, correlated)
+    rho = {kind: _rho_statistics(products, kind) for kind in ("residual", "away")}
+    overall = _overall_metrics(products, residuals, correlated)
 
     out = folder / FOLDER_NAME if out is None else out
     make_folder(out)
@@ -140,12 +140,12 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
     return result
 
 
-def _product(folder: Path, name: str, stamp: Stamp, model: str) -> CcdProduct:
+def _read_product_or_reason(folder: Path, name: str, stamp: Stamp, model: str) -> CcdProduct:
     """Return the product of a CCD, or raise the reason for its absence from the summary of the run."""
     path = product_path(folder, name)
     if path.exists():
         product = read_product(path, stamp, holdout_images=False)
-        if model == "focal_plane" and not product.of_focal_plane:
+        if model == "focal_plane" and not product.has_focal_plane_model:
             raise ProductError(f"CCD {name}: has no focal-plane model yet, which pachon run --resume adds")
         return product
     reason = "has no product yet"
@@ -154,14 +154,14 @@ def _product(folder: Path, name: str, stamp: Stamp, model: str) -> CcdProduct:
     raise ProductError(f"CCD {name}: {reason}")
 
 
-def _growth(stars: Stars) -> np.ndarray:
+def _relative_trace_residual(stars: Stars) -> np.ndarray:
     """Return (T - T of the model)/T, T = Q11 + Q22, [n]."""
     model = trace_of_moments(stars.model_size, stars.model_e1, stars.model_e2)
     result: np.ndarray = 1.0 - model / trace_of_moments(stars.size, stars.e1, stars.e2)
     return result
 
 
-def _rho(products: Sequence[CcdProduct], kind: str) -> RhoStatistics:
+def _rho_statistics(products: Sequence[CcdProduct], kind: str) -> RhoStatistics:
     stars = [p.stars(kind) for p in products]
     x, y = np.concatenate([p.sky_positions(kind) for p in products], axis=1)
     keys = ("e1", "e2", "size", "model_e1", "model_e2", "model_size")
@@ -169,12 +169,12 @@ def _rho(products: Sequence[CcdProduct], kind: str) -> RhoStatistics:
     return rho_statistics(x, y, *columns, patch=patches(stars), **separation_bins(products))
 
 
-def _moments(products: Sequence[CcdProduct], kind: str) -> dict[str, float]:
+def _residual_moments(products: Sequence[CcdProduct], kind: str) -> dict[str, float]:
     """Return means and rms of the residuals of some CCDs together."""
     e = ellipticities(products, kind)
     metrics = {f"mean_e1_{kind}": finite_mean(e[0]), f"mean_e2_{kind}": finite_mean(e[1]), f"rms_e_{kind}": rms(e)}
     if kind in SIZED:
-        growth = np.concatenate([_growth(p.stars(kind)) for p in products])
+        growth = np.concatenate([_relative_trace_residual(p.stars(kind)) for p in products])
         metrics |= {f"mean_dt_{kind}": finite_mean(growth), f"rms_dt_{kind}": rms(growth)}
     return metrics
 
@@ -189,7 +189,7 @@ def _ccd_columns(products: Sequence[CcdProduct], residuals: Sequence[str]) -> di
         "truth_psfs": (np.array([len(p.holdout) for p in products]), "", "places where the PSF is known"),
     }
     for kind in residuals:
-        rows = [_moments([p], kind) for p in products]
+        rows = [_residual_moments([p], kind) for p in products]
         for key in rows[0]:
             what = key.partition("_")[0]
             of = "(T - T model)/T" if "_dt_" in key else "e1" if "_e1_" in key else "e2" if "_e2_" in key else "e1, e2"
@@ -198,7 +198,7 @@ def _ccd_columns(products: Sequence[CcdProduct], residuals: Sequence[str]) -> di
     return columns
 
 
-def _overall(
+def _overall_metrics(
     products: Sequence[CcdProduct], residuals: Sequence[str], correlated: Mapping[str, Correlation]
 ) -> dict[str, Any]:
     metrics: dict[str, Any] = {
@@ -207,7 +207,7 @@ def _overall(
         "truth_psfs": sum(len(p.holdout) for p in products),
     }
     for kind in residuals:
-        metrics |= _moments(products, kind)
+        metrics |= _residual_moments(products, kind)
     for kind, correlation in correlated.items():
         r = correlation.r_arcmin
         inside = np.flatnonzero(correlation.within("long") & (correlation.n_pairs > 0))

@@ -107,7 +107,7 @@ def whiskers_plot(
             for product in products:
                 _draw_kind(axes, product, kind, scale, 0.8 if len(products) <= _MANY else 0.5, most)
             frame_axes(axes, limits, x_label=not stacked or i == len(kinds) - 1, y_label=stacked or i == 0)
-            axes.set_title(_titled(_TITLES[kind], products, kind, most), loc="left")
+            axes.set_title(_title_with_count(_TITLES[kind], products, kind, most), loc="left")
             draw_key_whisker(axes, key, scale, 1.0)
         _add_height_scale(figure, image, panels, focal_plane, 30)
         return png_bytes(figure)
@@ -139,7 +139,9 @@ def close_up_plot(products: Sequence[CcdStars], focal_plane: FocalPlane) -> byte
                 frame_axes(axes, limits, x_label=last == 0, y_label=i == 0)
                 name = f"{product.name}: " if i == 0 else ""
                 title = name + _SHORT_TITLES[kind]
-                axes.set_title(_titled(title, [product], kind, _MOST_WHISKERS) if i == 0 else title, loc="left")
+                axes.set_title(
+                    _title_with_count(title, [product], kind, _MOST_WHISKERS) if i == 0 else title, loc="left"
+                )
                 draw_key_whisker(axes, key, scale, 1.2)
         _add_height_scale(figure, image, panels, focal_plane, 40)
         return png_bytes(figure)
@@ -169,20 +171,20 @@ _SHORT_TITLES = {
 _COLORS = {"truth": TRUTH, "observed": OBSERVED, "residual": RESIDUAL, "away": AWAY}
 
 
-def _titled(title: str, products: Sequence[CcdStars], kind: str, most: int) -> str:
+def _title_with_count(title: str, products: Sequence[CcdStars], kind: str, most: int) -> str:
     """Return a title, with a note where not every star has a whisker."""
-    step = max(_step(product.stars(kind), most) for product in products)
+    step = max(_whisker_stride(product.stars(kind), most) for product in products)
     return title if step == 1 else f"{title} (one star in {step})"
 
 
-def _step(stars: Stars, most: int) -> int:
+def _whisker_stride(stars: Stars, most: int) -> int:
     return max(1, -(-len(stars) // most))
 
 
 def _draw_kind(axes: Axes, product: CcdStars, kind: str, scale: float, width: float, most: int) -> None:
     stars = product.stars(kind)
     ends = whiskers(stars.x * 1e3, stars.y * 1e3, *product.ellipticity(kind), scale)
-    draw_whiskers(axes, ends[:: _step(stars, most)], _COLORS[kind], width)
+    draw_whiskers(axes, ends[:: _whisker_stride(stars, most)], _COLORS[kind], width)
 
 
 def _common_key(products: Sequence[CcdStars]) -> float:
@@ -195,7 +197,7 @@ def height_range(focal_plane: FocalPlane) -> float:
 
     Where a few heights are more than twice those of 98 % of the area, as at the rims of measured CCDs, those of 98 %.
     """
-    heights = _magnitudes(focal_plane)
+    heights = _absolute_heights(focal_plane)
     largest, usual = float(np.nanmax(heights)), float(np.nanpercentile(heights, 98.0))
     if largest > 2.0 * usual > 0.0:
         largest = usual
@@ -204,10 +206,10 @@ def height_range(focal_plane: FocalPlane) -> float:
 
 def is_flat(focal_plane: FocalPlane) -> bool:
     """Return whether all heights are zero."""
-    return not np.nan_to_num(_magnitudes(focal_plane)).any()
+    return not np.nan_to_num(_absolute_heights(focal_plane)).any()
 
 
-def _magnitudes(focal_plane: FocalPlane) -> np.ndarray:
+def _absolute_heights(focal_plane: FocalPlane) -> np.ndarray:
     """Return heights on a grid over every CCD, sign left off [um]."""
     camera = focal_plane.camera
     nodes = np.linspace(-1.0, 1.0, 9) * (1.0 - 1e-9)
@@ -264,8 +266,8 @@ def residual_plot(camera: Camera, columns: Mapping[str, np.ndarray]) -> bytes:
     means = np.concatenate([np.hypot(columns[f"mean_e1_{k}"], columns[f"mean_e2_{k}"]) for k in RESIDUAL_TITLES])
     key = key_ellipticity(means)
     scale = 0.35 * camera.shortest_side * 1e3 / key
-    worst = _largest(np.concatenate([columns[f"rms_e_{k}"] for k in RESIDUAL_TITLES]))
-    sizes = _largest(np.abs(np.concatenate([columns[f"mean_dt_{k}"] for k in ("residual", "away")])))
+    worst = _robust_maximum(np.concatenate([columns[f"rms_e_{k}"] for k in RESIDUAL_TITLES]))
+    sizes = _robust_maximum(np.abs(np.concatenate([columns[f"mean_dt_{k}"] for k in ("residual", "away")])))
     with styled():
         figure = new_figure(12.5, min(max(2 * 3.6 / across, 2.6) + 1.4, 9.5))
         rows = figure.subplots(2, 3, squeeze=False)
@@ -303,7 +305,7 @@ def residual_plot(camera: Camera, columns: Mapping[str, np.ndarray]) -> bytes:
         return png_bytes(figure)
 
 
-def _largest(values: np.ndarray) -> float:
+def _robust_maximum(values: np.ndarray) -> float:
     """Return the 98th percentile of finite values, or one where it is zero."""
     finite = values[np.isfinite(values)]
     largest = float(np.quantile(finite, 0.98)) if finite.size else 0.0

@@ -90,13 +90,13 @@ def describe(telescope: Telescope) -> dict[str, Any]:
         "length_unit": telescope.length_unit[0],
         "design": asdict(telescope.design_data),
         "surfaces": [
-            _row(surface, following, wavelength)
+            _surface_entry(surface, following, wavelength)
             for surface, following in zip_longest(telescope.surfaces, telescope.surfaces[1:])
         ],
     }
 
 
-def _row(surface: Surface, following: Surface | None, wavelength: float) -> dict[str, Any]:
+def _surface_entry(surface: Surface, following: Surface | None, wavelength: float) -> dict[str, Any]:
     shape, medium = surface.shape, surface.medium_after
     curvature = shape.curvature
     x, y, z = surface.vertex
@@ -117,7 +117,7 @@ def _row(surface: Surface, following: Surface | None, wavelength: float) -> dict
         "tilted": not np.array_equal(surface.matrix, np.eye(3)),
         "index_after": float(medium.index(wavelength)),
         "medium_after": "" if isinstance(medium, ConstantIndex) else "glass",
-        "clear_m": _clear(surface),
+        "clear_m": _clear_radii(surface),
         "aperture": flow(aperture_items(surface.aperture), _degrees)[1:-1],
     }
 
@@ -127,8 +127,8 @@ def _degrees(value: float) -> str:
     return f"{math.degrees(value) if isinstance(value, Turn) else value:g}"
 
 
-def _clear(surface: Surface) -> list[float | None] | None:
-    """Return inner and outer radius [m] of a disc, a ring, or all but a disc (no outer radius); None of all else."""
+def _clear_radii(surface: Surface) -> list[float | None] | None:
+    """Return inner and outer radius [m] of a disc, a ring, or the outside of a disc; None for other apertures."""
     aperture = surface.aperture
     if isinstance(aperture, Circle):
         return [0.0, aperture.radius]
@@ -240,7 +240,7 @@ def _link_text(link: dict[str, Any], unit: float, name: str) -> str:
 
 
 def _stated_rows(design: dict[str, Any], unit: float, name: str) -> list[tuple[str, str]]:
-    """Return what the design data state, as text."""
+    """Return the design data as text."""
     rows = []
     if design["aperture"] is not None:
         lengths = design["aperture"] in ("entrance_pupil", "stop")

@@ -12,10 +12,10 @@ import numpy as np
 from ...core.page import Picture
 from ...core.second_process import Submit
 from ..ccd_product import CcdProduct, CcdStars
-from ..defaults import noise_free_components
 from ..experiment import Experiment
 from ..measure.correlation import Correlation
-from ..measure.summary import CORRELATED, of_focal_plane
+from ..measure.summary import CORRELATED, has_focal_plane_model
+from ..resolved_values import noise_free_components
 from .focal_plane_plots import close_up_plot, heights_plot, whiskers_plot
 from .psf_plots import eigen_psf_plot, spectrum_plot, stamps_plot
 from .statistics_plots import correlation_plot, models_plot, scatter_plot
@@ -36,13 +36,13 @@ _HEIGHTS = {
 
 
 @dataclass(frozen=True)
-class _Planned:
+class _PendingPicture:
     """Picture of the report that is not drawn yet."""
 
     title: str
     draw: Plot
     shows: str
-    of_paper: str = ""  #: what the paper shows
+    of_paper: str = ""  #: content of the paper's figure
     apart: bool = False  #: drawn by the second process
     wanted: bool = True
 
@@ -56,7 +56,7 @@ def draw_pictures(
     heights = "none" if none else "measured" if config.focal_plane.heights is not None else "budget"
     # The paper's figures are the LSST's.
     paper = experiment.camera.name == "lsst"
-    optics, whole = not config.atmosphere.enabled, of_focal_plane(products)
+    optics, whole = not config.atmosphere.enabled, has_focal_plane_model(products)
     fit, radius = config.reconstruction, experiment.field_radius_on_detector
     # Without images and models, stars are soon sent to another process.
     stars, close = [p.ccd_stars for p in products], closest_middle_farthest(products)
@@ -71,7 +71,7 @@ def draw_pictures(
         else "Residuals at the stars hold the noise of each star, some of which the model has followed"
     )
     planned = [
-        _Planned(
+        _PendingPicture(
             "Focal plane",
             partial(heights_plot, plane, [p.name for p in products], radius),
             f"Height of every CCD surface over the nominal focal plane, positive towards the sky. {_HEIGHTS[heights]} "
@@ -81,7 +81,7 @@ def draw_pictures(
             + " (Table 1), ±10 µm in all.",
             apart=True,
         ),
-        _Planned(
+        _PendingPicture(
             "Whiskers over the field",
             partial(whiskers_plot, stars, plane, radius),
             "Each whisker is one star: its length is |e| = (a-b)/(a+b), its direction that of the elongation. All "
@@ -99,7 +99,7 @@ def draw_pictures(
             "the atmosphere, and residuals without visible pattern. The paper compares with the observed stars only.",
             apart=True,
         ),
-        _Planned(
+        _PendingPicture(
             "Whiskers close up",
             partial(close_up_plot, closest_middle_farthest(stars), plane),
             "The CCD closest to the axis, one half-way out and the farthest one. The last column is the error "
@@ -108,7 +108,7 @@ def draw_pictures(
             "polynomials CCD by CCD.",
             apart=True,
         ),
-        _Planned(
+        _PendingPicture(
             "Eigen-PSFs of the noise-free PSFs",
             partial(eigen_psf_plot, close[0], noise_free=True),
             f"Mean PSF of one CCD and its first {min(components, 20)} principal components, each with the part of the "
@@ -116,7 +116,7 @@ def draw_pictures(
             "Fig. 9: components of 4000 PSFs of the atmosphere alone. The first resemble shapelets; structure gets "
             "finer with n.",
         ),
-        _Planned(
+        _PendingPicture(
             "Eigen-PSFs of the observed stars",
             partial(eigen_psf_plot, close[0], noise_free=False),
             "The same CCD, from the stars that were observed: components beyond the first few are noise.",
@@ -124,7 +124,7 @@ def draw_pictures(
             # Single pixels and shapelets look the same whatever the stars are.
             wanted=fit.basis == "pca",
         ),
-        _Planned(
+        _PendingPicture(
             "Number of components needed",
             partial(spectrum_plot, products),
             "Eigenvalues of every CCD, and the part of the variance that components beyond n hold. Where the "
@@ -133,14 +133,14 @@ def draw_pictures(
             "The paper finds it by eye and that about 20 components suffice; they should hold over 99 % "
             "of the variance of the noise-free PSFs.",
         ),
-        _Planned(
+        _PendingPicture(
             "Ellipticity before and after",
             partial(scatter_plot, stars),
             "Left, as in Jee & Tyson (2011): ellipticity of the observed stars, and what is left when the model is "
             "subtracted. Right: the same for the noise-free PSFs at places where no star was fitted.",
             "Fig. 13: residuals (red) far more compact than observed stars (blue), centred on zero.",
         ),
-        _Planned(
+        _PendingPicture(
             "Correlation of the ellipticity",
             partial(correlation_plot, {k: correlated[k] for k in CORRELATED}, paper),
             "ξ+ and ξ- by TreeCorr; filled symbols are positive, open ones negative. Error bars are "
@@ -150,7 +150,7 @@ def draw_pictures(
             "Fig. 14: ξ+ of about 3e-5 before, about 1e-8 after the correction (189 CCDs, at the stars only), below "
             "1e-7 from 10 arcmin to 3 degrees; ξ- similar.",
         ),
-        _Planned(
+        _PendingPicture(
             "Stars",
             partial(stamps_plot, close),
             "Observed stamps from the brightest to the faintest star of three CCDs, the model at their places, and "
@@ -158,7 +158,7 @@ def draw_pictures(
             "only that noise is left. A bright star can show more: the noise of fainter stars is in the model."
             + (" The model here is the CCD's own: that of the focal plane has shapes only." if whole else ""),
         ),
-        _Planned(
+        _PendingPicture(
             "Residuals of both models",
             partial(models_plot, correlated),
             "ξ+ of the residuals of the two models, fitted to the same stars: of the whole focal plane, which all "

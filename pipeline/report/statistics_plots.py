@@ -64,7 +64,7 @@ def _draw_cloud(axes: Axes, e1: np.ndarray, e2: np.ndarray, color: str, name: st
     axes.plot([], [], "o", color=color, markersize=3.0, label=f"{name}: rms {rms:.2g}")
 
 
-#: xi+ in the paper, by what it is of.
+#: xi+ in the paper, by kind of ellipticity.
 _PAPER = ((3e-5, "paper: observed"), (1e-8, "paper: residual at the stars"))
 
 

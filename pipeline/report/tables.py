@@ -132,10 +132,10 @@ def per_ccd(summary: dict[str, Any]) -> list[tuple[str, ...]]:
             name,
             f"{f['field_deg']:.2f}",
             f"{f['fwhm_arcsec']:.3f}",
-            _bare_percent(f["mean_e_truth"]),
-            _bare_percent(f["rms_residual_at_stars"]),
-            _bare_percent(f["rms_residual_left_out"]),
-            _bare_percent(f["rms_residual_away"]),
+            _percent_number(f["mean_e_truth"]),
+            _percent_number(f["rms_residual_at_stars"]),
+            _percent_number(f["rms_residual_left_out"]),
+            _percent_number(f["rms_residual_away"]),
             percent(f["truth_variance_in_components"]).removesuffix(" %"),
             f"{f['kink_observed']}, {f['kink_truth']}",
             f"{f['stars_used']} of {f['stars']}",
@@ -213,7 +213,7 @@ def attribution_rows(metrics: dict[str, dict[str, float]]) -> list[tuple[str, ..
     return [
         (
             "nothing" if case == "full" else case,
-            *(_bare_percent(each[k]) for k in ("rms_e_truth", "rms_residual_at_stars", "rms_residual_away")),
+            *(_percent_number(each[k]) for k in ("rms_e_truth", "rms_residual_at_stars", "rms_residual_away")),
             _power(each["xi_plus_truth_short"]),
             _power(each["xi_plus_truth_long"]),
             change(each),
@@ -230,12 +230,12 @@ def percent(fraction: float) -> str:
     return f"{100 * fraction:.2f} %" if fraction < 0.99985 else "> 99.98 %"
 
 
-def _bare_percent(value: float) -> str:
+def _percent_number(value: float) -> str:
     return f"{100 * value:.2f}"
 
 
 def _percent(value: float) -> str:
-    return f"{_bare_percent(value)} %"
+    return f"{_percent_number(value)} %"
 
 
 def _power(value: float) -> str:

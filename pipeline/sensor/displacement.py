@@ -102,14 +102,14 @@ class EdgeRolloff(Displacement):
 
     def at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the displacement, as :meth:`Displacement.at` says."""
-        place = self._turned(np.stack(plane_points(x, y), axis=-1), -self.turn)
+        place = self._rotated(np.stack(plane_points(x, y), axis=-1), -self.turn)
         # Beyond an edge, where the rim of a stamp may lie, it stays that of the edge.
         upper, lower = (np.maximum(self.half_size - sign * place, 0.0) for sign in (1.0, -1.0))
         moved = self.amplitude * (np.exp(-upper / self.length) - np.exp(-lower / self.length))
-        return self._turned(moved, self.turn)
+        return self._rotated(moved, self.turn)
 
     @staticmethod
-    def _turned(vectors: np.ndarray, angle: float) -> np.ndarray:
+    def _rotated(vectors: np.ndarray, angle: float) -> np.ndarray:
         if angle == 0.0:
             return vectors
         cosine, sine = np.cos(angle), np.sin(angle)
@@ -122,8 +122,8 @@ def displace_stamps(
 ) -> np.ndarray:
     """Return stamps of stars as the displacements distort them.
 
-    The displacement at the middle pixel is left out: it moves the star as a whole, which stamps are not about, and is
-    that of :meth:`Displacement.at`.
+    The displacement at the middle pixel is subtracted: it moves the star as a whole, and is that of
+    :meth:`Displacement.at`.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ def displace_stamps(
         pixel_size * (np.arange(size) - size // 2)[None] + place[:, None]
         for size, place in zip(images.shape[:0:-1], places.T, strict=True)
     )
-    wide_x, wide_y = _continued(x, pixel_size), _continued(y, pixel_size)
+    wide_x, wide_y = _extended_centers(x, pixel_size), _extended_centers(y, pixel_size)
     half = 0.5 * pixel_size
     boundary_x, boundary_y = (np.concatenate([v - half, v[:, -1:] + half], axis=1) for v in (wide_x, wide_y))
     shift_x = shift_y = np.zeros(1)
@@ -169,7 +169,7 @@ def displace_stamps(
     return without_rim(collect(padded, shift_x / pixel_size, shift_y / pixel_size))
 
 
-def _continued(centers: np.ndarray, pixel_size: float) -> np.ndarray:
+def _extended_centers(centers: np.ndarray, pixel_size: float) -> np.ndarray:
     """Return pixel centres [n, size] with those of the rim."""
     beyond = pixel_size * np.arange(1, RIM + 1)
     return np.concatenate([centers[:, :1] - beyond[::-1], centers, centers[:, -1:] + beyond], axis=1)

@@ -10,15 +10,15 @@ import numpy as np
 
 from ...core.errors import DomainError
 from ...models.camera.camera import Camera
-from ...models.ideal_telescope import without_aberration
+from ...models.ideal_telescope import ideal_telescope
 from ...models.star_spectrum import blackbody_photons
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.engine import center_focal_length
 from ...wavefront.psf.engines import ENGINES
 from ...wavefront.psf.psf import make_psfs
-from ..defaults import given
 from ..experiment import Experiment
 from ..measure.shapes import measure_shapes
+from ..resolved_values import resolved_value
 from ..sensor.displacement import displace_stamps
 from .photometry import PROVISIONAL_FWHM, electrons, limiting_magnitude
 from .star_field import StarField, make_star_field
@@ -82,7 +82,7 @@ def expose_positions(
     stars = _expose(
         experiment, positions, threads, progress, room=room, offsets=offsets, along=along, temperatures=temperatures
     )
-    return _lit(stars)
+    return _require_light(stars)
 
 
 def expose_ccd(
@@ -107,11 +107,11 @@ def expose_ccd(
     kelvin = positions.temperature
     if centered:
         observed, again = _expose_twice(experiment, positions.observed, offsets, threads, progress, temperatures=kelvin)
-        return CcdExposure(name, positions, holdout, _lit(observed), again)
+        return CcdExposure(name, positions, holdout, _require_light(observed), again)
     observed = _expose(
         experiment, positions.observed, threads, progress, offsets=offsets, room=_SHIFT_ROOM, temperatures=kelvin
     )
-    return CcdExposure(name, positions, holdout, _lit(observed))
+    return CcdExposure(name, positions, holdout, _require_light(observed))
 
 
 def _expose_twice(
@@ -141,7 +141,7 @@ def _expose_twice(
         recenter=kept_centroid,
         temperatures=temperatures,
     )
-    images = _displaced(experiment, positions - offsets * experiment.pixel_size, np.concatenate(first))
+    images = _with_static_displacements(experiment, positions - offsets * experiment.pixel_size, np.concatenate(first))
     rim = _SHIFT_ROOM // 2
     inner = moved.image[:, rim:-rim, rim:-rim]
     light = inner.sum(axis=(1, 2), keepdims=True, dtype=np.float64)
@@ -170,8 +170,8 @@ def _centroids(experiment: Experiment, images: np.ndarray, pixel_scale: float) -
     return np.nan_to_num(np.stack([shapes.x, shapes.y], axis=1))
 
 
-def _lit(stars: NoiseFreeStars) -> NoiseFreeStars:
-    """Return stars, or raise DomainError if no light reaches one of them."""
+def _require_light(stars: NoiseFreeStars) -> NoiseFreeStars:
+    """Return the stars, or raise a DomainError if no light reaches one of them."""
     if not stars.lit_fraction.min() > 0.0:
         raise DomainError("no light reaches some stars: expected a CCD within the field of the telescope")
     return stars
@@ -201,7 +201,7 @@ def _expose(
     telescope = experiment.telescope
     optical, magnification = not experiment.atmosphere_only, 1.0
     if not optical:
-        ideal = without_aberration(telescope, _IDEAL_RATIO).with_rotator(experiment.rotator)
+        ideal = ideal_telescope(telescope, _IDEAL_RATIO).with_rotator(experiment.rotator)
         here, there = (center_focal_length(t, wavelengths) for t in (telescope, ideal))
         telescope, magnification = ideal, there / here
     psfs = make_psfs(
@@ -225,12 +225,12 @@ def _expose(
         threads=threads,
         progress=progress,
     )
-    image = _displaced(experiment, positions - psfs.offset * experiment.pixel_size, psfs.image)
+    image = _with_static_displacements(experiment, positions - psfs.offset * experiment.pixel_size, psfs.image)
     return NoiseFreeStars(image, float(psfs.pixel_scale), fields, psfs.lit_fraction.mean(axis=1), psfs.offset)
 
 
-def _displaced(experiment: Experiment, middles: np.ndarray, images: np.ndarray) -> np.ndarray:
-    """Return stamps as the static effects of the CCDs distort them; `middles` are the centres of their middle pixels.
+def _with_static_displacements(experiment: Experiment, middles: np.ndarray, images: np.ndarray) -> np.ndarray:
+    """Apply the static displacements of the CCDs to stamps; `middles` are the positions of their middle pixels.
 
     No star is moved as a whole: stamps are centred on their star.
     """
@@ -285,6 +285,6 @@ def ccd_stars(experiment: Experiment, name: str, width: float, least_light: floa
         magnitude=magnitude,
         electrons=electrons(magnitude, band, exposure),
         temperature=listed.temperatures(name),
-        bright=given(config.stars.brightest),
-        faint=given(config.stars.faintest),
+        bright=resolved_value(config.stars.brightest),
+        faint=resolved_value(config.stars.faintest),
     )

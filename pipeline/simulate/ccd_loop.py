@@ -10,8 +10,8 @@ from typing import Generic, TypeVar
 from ...core.errors import DomainError, PachonError, ProductError
 from ...core.progress import Reporter
 from ...core.threads import thread_count
-from ..defaults import fewest_stars
 from ..experiment import Experiment
+from ..resolved_values import least_star_count
 from .ccd_exposure import CcdExposure, expose_ccd
 from .star_field import StarField
 
@@ -59,7 +59,7 @@ def simulate_ccds(
     if fields is None:
         if strict:
             check_catalogue(experiment, names, strict=True)
-        for name, reason in _short_of_stars(experiment, names):
+        for name, reason in _ccds_short_of_stars(experiment, names):
             simulated.not_modelled[name] = reason
             reporter.line(left_out_line(name, reason))
         names = [name for name in names if name not in simulated.not_modelled]
@@ -100,16 +100,16 @@ def check_catalogue(experiment: Experiment, names: Sequence[str], *, strict: boo
 
     Nothing is checked where stars are drawn.
     """
-    short = dict(_short_of_stars(experiment, names))
+    short = dict(_ccds_short_of_stars(experiment, names))
     if short and (strict or len(short) == len(names)):
         name, reason = next(iter(short.items()))
         raise DomainError(reason, subject=f"CCD {name}")
 
 
-def _short_of_stars(experiment: Experiment, names: Sequence[str]) -> Iterator[tuple[str, str]]:
+def _ccds_short_of_stars(experiment: Experiment, names: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Yield the CCDs on which the catalogue of stars has too few for a PSF model, each with the reason."""
     if experiment.star_list is not None:
-        least = fewest_stars(experiment.config)
+        least = least_star_count(experiment.config)
         for name in names:
             count = experiment.observed_count(name)
             if count < least:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from ..ccd_product import CcdProduct, HoldoutStars, ObservedStars
-from ..defaults import fewest_stars, given, noise_free_components
 from ..experiment import Experiment
 from ..measure.shapes import Shapes, fwhm, measure_shapes
 from ..measure.star_selection import require_stars
 from ..psf_model.checks import snr_weights
 from ..psf_model.model import CLIP_SIGMA, PsfModel
+from ..resolved_values import least_star_count, noise_free_components, resolved_value
 from .ccd_exposure import CcdExposure, ccd_stars
 from .ccd_observation import Observation, collected_images, observe_ccd
 from .photometry import effective_fwhm, signal_to_noise
@@ -18,7 +18,7 @@ from .star_field import StarField
 
 
 def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = True) -> CcdProduct:
-    """Add noise and defects to the stars of one CCD, unless not `noisy`, and model the PSF from them.
+    """Add noise and defects to the stars of one CCD where `noisy`, and model the PSF from them.
 
     Without noise no pixel is rejected: deviations from the mean are the variation of the PSF.
     """
@@ -61,13 +61,13 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         pixel_scale=holdout.pixel_scale,
         noise=observation.noise,
         holdout=HoldoutStars(
-            **_positions(experiment, positions.holdout, holdout.fields),
-            **_shapes(holdout_shapes, at_holdout),
+            **_position_columns(experiment, positions.holdout, holdout.fields),
+            **_shape_columns(holdout_shapes, at_holdout),
             fwhm=fwhm(holdout.image, holdout.pixel_scale),
         ),
         observed=ObservedStars(
-            **_positions(experiment, stars.observed, observed.fields),
-            **_shapes(observation.shapes, at_stars),
+            **_position_columns(experiment, stars.observed, observed.fields),
+            **_shape_columns(observation.shapes, at_stars),
             magnitude=stars.magnitude,
             electrons=electrons,
             snr=snr,
@@ -89,16 +89,16 @@ def fit_ccd_model(
 ) -> PsfModel:
     """Fit the PSF model of the configuration to the observed stars of one CCD, S/N [n], that can be used."""
     fit, used = experiment.config.reconstruction, observation.used
-    require_stars(used, observation.defects, fewest_stars(experiment.config))
+    require_stars(used, observation.defects, least_star_count(experiment.config))
     images = observation.images[used]
     if fit.interpolation != "polynomial":  # a process needs the photons
         images = images * stars.electrons[used, None, None]
     return PsfModel.fit(
         images,
         stars.observed[used],
-        basis=given(fit.basis),
-        interpolation=given(fit.interpolation),
-        weights=snr_weights(given(fit.weights), snr[used]),
+        basis=resolved_value(fit.basis),
+        interpolation=resolved_value(fit.interpolation),
+        weights=snr_weights(resolved_value(fit.weights), snr[used]),
         n_components=fit.components,
         order=fit.order,
         extent=stars.extent,
@@ -106,7 +106,7 @@ def fit_ccd_model(
     )
 
 
-def _positions(experiment: Experiment, positions: np.ndarray, fields: np.ndarray) -> dict[str, np.ndarray]:
+def _position_columns(experiment: Experiment, positions: np.ndarray, fields: np.ndarray) -> dict[str, np.ndarray]:
     """Return positions on the detector and of the sky; celestial ones where the configuration has a pointing."""
     found = {"x": positions[:, 0], "y": positions[:, 1], "field_x": fields[:, 0], "field_y": fields[:, 1]}
     aim = experiment.pointing
@@ -115,7 +115,7 @@ def _positions(experiment: Experiment, positions: np.ndarray, fields: np.ndarray
     return found
 
 
-def _shapes(measured: Shapes, model: Shapes) -> dict[str, np.ndarray]:
+def _shape_columns(measured: Shapes, model: Shapes) -> dict[str, np.ndarray]:
     return {
         "e1": measured.e1,
         "e2": measured.e2,

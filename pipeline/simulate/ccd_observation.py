@@ -77,7 +77,7 @@ def _with_defects(
     stars = experiment.config.stars
     if not (stars.neighbours or stars.cosmic_rays or stars.saturated):
         return stamps, None
-    full_well = _full_well(stamps, stars.saturated)
+    full_well = _saturation_level(stamps, stars.saturated)
     defective, _ = add_defects(
         stamps,
         images,
@@ -89,7 +89,7 @@ def _with_defects(
     return defective, full_well
 
 
-def _full_well(stamps: np.ndarray, fraction: float) -> float | None:
+def _saturation_level(stamps: np.ndarray, fraction: float) -> float | None:
     """Return the level [electrons] that the peaks of a fraction of the stars exceed; None where that is no star."""
     peaks = np.sort(stamps.max(axis=(1, 2)))
     count = round(fraction * len(peaks))

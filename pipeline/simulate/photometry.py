@@ -64,7 +64,7 @@ def sky_electrons_per_pixel(
     """
     band = band_named(band)
     exposure = require_positive(exposure, "exposure", "seconds")
-    area = (_pixel(band, pixel_scale) / ARCSEC) ** 2
+    area = (_pixel_side(band, pixel_scale) / ARCSEC) ** 2
     brightness = band.dark_sky if sky is None else float(sky)
     return float(exposure * area * 10.0 ** (0.4 * (band.zero_point + band.extinction - brightness)))
 
@@ -136,7 +136,7 @@ def saturation_magnitude(
     """
     sigma = positive_angle(fwhm, "fwhm") / np.sqrt(8.0 * np.log(2.0))
     band = band_named(band)
-    pixel = _pixel(band, pixel_scale)
+    pixel = _pixel_side(band, pixel_scale)
     background = sky_electrons_per_pixel(band, exposure, pixel, sky=sky)
     well = require_positive(band.full_well if full_well is None else full_well, "full_well", "electrons")
     room = well - background
@@ -150,9 +150,9 @@ def _footprint_variance(band: str | Band, exposure: float, fwhm: Any, pixel_scal
     """Return the variance of sky and instrument under a star [e-^2]."""
     band = band_named(band)
     background = sky_electrons_per_pixel(band, exposure, pixel_scale, sky=sky)
-    return effective_pixels(fwhm, _pixel(band, pixel_scale)) * (background + instrument_noise(band, exposure) ** 2)
+    return effective_pixels(fwhm, _pixel_side(band, pixel_scale)) * (background + instrument_noise(band, exposure) ** 2)
 
 
-def _pixel(band: Band, pixel_scale: Any) -> float:
+def _pixel_side(band: Band, pixel_scale: Any) -> float:
     """Return the side of a pixel [rad], by default that of the camera."""
     return band.pixel_scale if pixel_scale is None else positive_angle(pixel_scale, "pixel_scale")

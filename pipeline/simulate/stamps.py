@@ -44,7 +44,7 @@ def observe_stamps(
     DomainError
         If an argument is negative, not finite or of the wrong shape.
     """
-    images = _images(psf_images, "psf_images")
+    images = _stamp_cube(psf_images, "psf_images")
     finite = np.isfinite(images).all(axis=(1, 2))
     if not finite.all():
         raise DomainError(f"psf_images[{finite.argmin()}] has pixels that are not finite")
@@ -93,7 +93,7 @@ def center_stamps(images: Any, x: Any, y: Any, size: int = 31, *, normalize: boo
     DomainError
         If the size is not odd or the image is smaller than the stamp.
     """
-    stack = _images(images, "images")
+    stack = _stamp_cube(images, "images")
     count, ny, nx = stack.shape
     if size < 1 or size % 2 == 0:
         raise DomainError(f"size = {size}: expected an odd number of pixels")
@@ -111,14 +111,14 @@ def center_stamps(images: Any, x: Any, y: Any, size: int = 31, *, normalize: boo
     for i, image in enumerate(stack):
         if not np.all(np.isfinite(offsets[i])):
             continue
-        stamp = _shift(image, *(middle - offsets[i]))[rows, columns]
+        stamp = _fourier_shift(image, *(middle - offsets[i]))[rows, columns]
         total = stamp.sum() if normalize else 1.0
         if total > 0.0:
             result[i] = stamp / total
     return result
 
 
-def _shift(image: np.ndarray, dx: float, dy: float) -> np.ndarray:
+def _fourier_shift(image: np.ndarray, dx: float, dy: float) -> np.ndarray:
     """Return the band-limited image moved by (dx, dy) pixels.
 
     The highest frequency of an even grid stands for both its signs, so its phase is the mean of the two, a cosine.
@@ -133,7 +133,7 @@ def _shift(image: np.ndarray, dx: float, dy: float) -> np.ndarray:
     return fft.irfft2(fft.rfft2(image) * phase_y[:, None] * phase_x, s=(ny, nx))
 
 
-def _images(images: Any, name: str) -> np.ndarray:
+def _stamp_cube(images: Any, name: str) -> np.ndarray:
     """Return the images as a float64 array [n, ny, nx]."""
     array = real_array(images, f"{name}: expected real numbers [n, ny, nx]")
     if array.ndim == 2:

@@ -39,7 +39,7 @@ class StarField:
     def extent(self) -> tuple[float, float, float, float]:
         """(xmin, xmax, ymin, ymax) that hold all of the CCD [m]."""
         xmin, xmax, ymin, ymax = self.bounds
-        corners = _turned(np.array([(x, y) for x in (xmin, xmax) for y in (ymin, ymax)]), self.bounds, self.turn)
+        corners = _rotated(np.array([(x, y) for x in (xmin, xmax) for y in (ymin, ymax)]), self.bounds, self.turn)
         (x0, y0), (x1, y1) = corners.min(axis=0), corners.max(axis=0)
         return float(x0), float(x1), float(y0), float(y1)
 
@@ -54,7 +54,7 @@ class StarField:
         Rows are those that lie along x of the focal plane, but for `turn`.
         """
         corner = np.array([self.bounds[0], self.bounds[2]])
-        along = _turned(np.asarray(positions, dtype=np.float64), self.bounds, -self.turn)
+        along = _rotated(np.asarray(positions, dtype=np.float64), self.bounds, -self.turn)
         return (along - corner) / self.pixel_size - 0.5
 
 
@@ -101,7 +101,7 @@ def make_star_field(
         Angle by which the CCD is turned about the centre of `bounds`, from +x towards +y [rad].
     """
     band = photometry.band_named(band)
-    edges = _edges(bounds)
+    edges = _edges_in_metres(bounds)
     pixel = require_positive(metres(pixel_size, "pixel_size"), "pixel_size", "metres")
     for name, count in (("n_holdout", n_holdout), ("n_observed", n_observed), ("margin", margin)):
         if count < 0:
@@ -120,8 +120,8 @@ def make_star_field(
         ccd_name=ccd_name,
         bounds=edges,
         pixel_size=pixel,
-        holdout=_turned(_uniform(seed, ccd_name, "truth", n_holdout, edges), edges, turn),
-        observed=_turned(_uniform(seed, ccd_name, "observed", n_observed, inner), edges, turn),
+        holdout=_rotated(_uniform_positions(seed, ccd_name, "truth", n_holdout, edges), edges, turn),
+        observed=_rotated(_uniform_positions(seed, ccd_name, "observed", n_observed, inner), edges, turn),
         magnitude=magnitude,
         electrons=photometry.electrons(magnitude, band, exposure),
         band=band,
@@ -146,7 +146,9 @@ def magnitudes_at(quantile: np.ndarray, bright: float, faint: float) -> np.ndarr
     return bright + np.log10(1.0 + quantile * span) / COUNT_SLOPE
 
 
-def _uniform(seed: int, ccd_name: str, kind: str, count: int, edges: tuple[float, float, float, float]) -> np.ndarray:
+def _uniform_positions(
+    seed: int, ccd_name: str, kind: str, count: int, edges: tuple[float, float, float, float]
+) -> np.ndarray:
     """Draw positions evenly over a rectangle, x and y from streams of their own."""
     return np.stack(
         [
@@ -158,7 +160,7 @@ def _uniform(seed: int, ccd_name: str, kind: str, count: int, edges: tuple[float
     )
 
 
-def _turned(positions: np.ndarray, bounds: tuple[float, float, float, float], turn: float) -> np.ndarray:
+def _rotated(positions: np.ndarray, bounds: tuple[float, float, float, float], turn: float) -> np.ndarray:
     """Return positions [n, 2] turned about the centre of a rectangle."""
     if turn == 0.0:
         return positions
@@ -167,7 +169,7 @@ def _turned(positions: np.ndarray, bounds: tuple[float, float, float, float], tu
     return center + (positions - center) @ np.array([[cosine, sine], [-sine, cosine]])
 
 
-def _edges(bounds: Any) -> tuple[float, float, float, float]:
+def _edges_in_metres(bounds: Any) -> tuple[float, float, float, float]:
     """Return the bounds as four floats in metres."""
     values = metres(bounds, "bounds")
     if values.shape != (4,) or not np.all(np.isfinite(values)) or values[0] >= values[1] or values[2] >= values[3]:

@@ -88,7 +88,7 @@ def backward_pass(
     matrix = wp.empty((outputs, column_count(columns, polynomials), count), dtype=lanes, device="cpu")
     at_start = wp.empty((outputs if start else 0, 6, count), dtype=lanes, device="cpu")
     launch(
-        backward_rays.suited(packed),
+        backward_rays.variant_for(packed),
         outputs * count,
         [
             packed,

@@ -83,7 +83,7 @@ class SphereAdjoint:
         status = wp.empty(count, dtype=lane_flags, device="cpu")
         rays = ray_packets(1, parts), ray_packets(self._n_surface, parts)
         inputs = [*self._inputs, fields.start, parts, *rays, matrix, status]
-        launch(sphere_paths.suited(self._inputs[0]), parts, inputs, threads=threads)
+        launch(sphere_paths.variant_for(self._inputs[0]), parts, inputs, threads=threads)
 
         def as_rays(values: wp.array) -> np.ndarray:
             return values.numpy().reshape(*values.shape[:-1], n_fields, self._n_packets * LANES)[..., : self._n_pupil]

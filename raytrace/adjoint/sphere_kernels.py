@@ -10,7 +10,7 @@ import warp as wp
 from ...core.launch import FORWARD_OPTIONS
 from ..kernels.kernel_pair import kernel_pair
 from ..kernels.packet import LANES, RayPackets, lane_flags, lanes
-from ..kernels.pupil import directed, launched
+from ..kernels.pupil import direction_from_point, plane_wave_start
 from ..kernels.sphere import sphere_distance
 from ..kernels.surface import OK, ONE, ZERO
 from ..kernels.trace import LOOPS, PackedSurfaces, statuses
@@ -75,12 +75,12 @@ def sphere_paths(special: bool, module: wp.Module) -> wp.Kernel:
             dw = lanes(fields[f, 2])
             at_x = pupil[own, 0, q]
             at_y = pupil[own, 1, q]
-            px, py, pz = launched(at_x, at_y, pupil_z, fields[f, 0], fields[f, 1], fields[f, 2], distance)
+            px, py, pz = plane_wave_start(at_x, at_y, pupil_z, fields[f, 0], fields[f, 1], fields[f, 2], distance)
             if objects.shape[0] > 0:
                 px = lanes(objects[f, 0])
                 py = lanes(objects[f, 1])
                 pz = lanes(objects[f, 2])
-                du, dv, dw = directed(at_x, at_y, pupil_z, objects[f, 0], objects[f, 1], objects[f, 2])
+                du, dv, dw = direction_from_point(at_x, at_y, pupil_z, objects[f, 0], objects[f, 1], objects[f, 2])
             start.position[0, 0, item] = px
             start.position[0, 1, item] = py
             start.position[0, 2, item] = pz

@@ -44,7 +44,7 @@ class PackedApertures:
 
 
 @wp.func
-def put(stack: lane_flags, inside: lane_flags):
+def push_bit(stack: lane_flags, inside: lane_flags):
     """Put a bit on the stack of each lane."""
     for i in range(LANES):
         stack[i] = (stack[i] << 1) | inside[i]
@@ -81,12 +81,12 @@ def through_aperture(apertures: PackedApertures, s: wp.int32, x: lanes, y: lanes
         if kind == DISC:
             for i in range(LANES):
                 inside[i] = wp.where(dx[i] * dx[i] + dy[i] * dy[i] < a, 1, 0)
-            stack = put(stack, inside)
+            stack = push_bit(stack, inside)
         elif kind == RING:
             for i in range(LANES):
                 r2 = dx[i] * dx[i] + dy[i] * dy[i]
                 inside[i] = wp.where(r2 >= a, wp.where(r2 < b, 1, 0), 0)
-            stack = put(stack, inside)
+            stack = push_bit(stack, inside)
         elif kind == BOX or kind == STRIP:
             cosine = apertures.numbers[step, 2]
             sine = apertures.numbers[step, 3]
@@ -95,7 +95,7 @@ def through_aperture(apertures: PackedApertures, s: wp.int32, x: lanes, y: lanes
             for i in range(LANES):
                 reach = wp.where(kind == BOX, a - wp.abs(along[i]), along[i] - a)
                 inside[i] = wp.where(wp.abs(across[i]) < b, wp.where(reach > wp.float64(0.0), 1, 0), 0)
-            stack = put(stack, inside)
+            stack = push_bit(stack, inside)
         elif kind == ELLIPSE:
             cosine = apertures.numbers[step, 2]
             sine = apertures.numbers[step, 3]
@@ -103,9 +103,9 @@ def through_aperture(apertures: PackedApertures, s: wp.int32, x: lanes, y: lanes
             across = (cosine * dy - sine * dx) / b
             for i in range(LANES):
                 inside[i] = wp.where(along[i] * along[i] + across[i] * across[i] < wp.float64(1.0), 1, 0)
-            stack = put(stack, inside)
+            stack = push_bit(stack, inside)
         elif kind == OUTLINE:
-            stack = put(
+            stack = push_bit(
                 stack, within_outline(apertures.edges, apertures.steps[step, 1], apertures.steps[step, 2], x, y)
             )
         elif kind == BOTH:

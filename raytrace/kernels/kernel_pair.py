@@ -21,7 +21,7 @@ class KernelPair:
     plain: wp.Kernel
     special: wp.Kernel
 
-    def suited(self, surfaces: Any) -> wp.Kernel:
+    def variant_for(self, surfaces: Any) -> wp.Kernel:
         """Return the variant for a telescope's ``PackedSurfaces``."""
         return self.special if surfaces.special else self.plain
 

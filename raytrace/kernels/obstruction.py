@@ -24,7 +24,7 @@ class PackedObstructions:
 
 
 @wp.func
-def past_obstructions(
+def obstructed_status(
     obstructions: PackedObstructions,
     s: wp.int32,
     x: lanes,
@@ -36,7 +36,7 @@ def past_obstructions(
     t: lanes,
     status: lanes,
 ):
-    """Statuses after the path from (x, y, z) over a distance t to surface ``s``, all in the telescope frame."""
+    """Ray statuses after obstructions on a path of length t from (x, y, z) to surface ``s``, telescope frame."""
     for m in range(obstructions.meshes.shape[0]):
         if obstructions.blocks[s, m] == 1:
             for i in range(LANES):

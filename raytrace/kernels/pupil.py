@@ -19,14 +19,16 @@ wp.set_module_options(FORWARD_OPTIONS)
 
 
 @wp.func
-def launched(px: lanes, py: lanes, pz: wp.float64, u: wp.float64, v: wp.float64, w: wp.float64, distance: wp.float64):
-    """Start parallel rays through (px, py, pz) on the plane at -distance along the direction of the light."""
+def plane_wave_start(
+    px: lanes, py: lanes, pz: wp.float64, u: wp.float64, v: wp.float64, w: wp.float64, distance: wp.float64
+):
+    """Points of a plane wave front, at -distance along the light from the pupil points (px, py, pz)."""
     back = u * px + v * py + lanes(w * pz + distance)
     return px - u * back, py - v * back, lanes(pz) - w * back
 
 
 @wp.func
-def directed(px: lanes, py: lanes, pz: wp.float64, x: wp.float64, y: wp.float64, z: wp.float64):
+def direction_from_point(px: lanes, py: lanes, pz: wp.float64, x: wp.float64, y: wp.float64, z: wp.float64):
     """Return the directions of light from the point (x, y, z) of an object through (px, py, pz)."""
     du = px - lanes(x)
     dv = py - lanes(y)
@@ -75,7 +77,7 @@ def trace_pupils(special: bool, module: wp.Module) -> wp.Kernel:
         du = direction[b, 0]
         dv = direction[b, 1]
         dw = direction[b, 2]
-        x, y, z = launched(pupil[0, p], pupil[1, p], pupil_z, du, dv, dw, distance)
+        x, y, z = plane_wave_start(pupil[0, p], pupil[1, p], pupil_z, du, dv, dw, distance)
         x, y, z, u, v, w, path, status = through_telescope(
             surfaces, indices, row, x, y, z, lanes(du), lanes(dv), lanes(dw), lanes(ZERO), p, no_rays
         )

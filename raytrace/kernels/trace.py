@@ -14,7 +14,7 @@ from ...core.launch import FORWARD_OPTIONS
 from .aperture import PackedApertures, through_aperture
 from .kernel_pair import kernel_pair
 from .mesh import PackedMeshes, mesh_distance
-from .obstruction import PackedObstructions, past_obstructions
+from .obstruction import PackedObstructions, obstructed_status
 from .packet import LANES, RayPackets, components, lane_flags, lanes
 from .shape import PackedDeformations, deformed_distance, through_screen
 from .surface import (
@@ -104,7 +104,7 @@ def to_telescope(surfaces: PackedSurfaces, s: wp.int32, x: lanes, y: lanes, z: l
 
 
 @wp.func
-def past_obstacles(
+def obstructed_status_at_surface(
     surfaces: PackedSurfaces,
     s: wp.int32,
     x: lanes,
@@ -116,11 +116,11 @@ def past_obstacles(
     t: lanes,
     status: lanes,
 ):
-    """Statuses after the obstructions over a distance t from a point, given from the vertex of surface ``s``."""
+    """Ray statuses after obstructions on a path of length t from (x, y, z), relative to the vertex of surface ``s``."""
     vertex_x = lanes(surfaces.numbers[s, VERTEX])
     vertex_y = lanes(surfaces.numbers[s, VERTEX + 1])
     vertex_z = lanes(surfaces.numbers[s, VERTEX + 2])
-    return past_obstructions(surfaces.obstructions, s, x + vertex_x, y + vertex_y, z + vertex_z, u, v, w, t, status)
+    return obstructed_status(surfaces.obstructions, s, x + vertex_x, y + vertex_y, z + vertex_z, u, v, w, t, status)
 
 
 @wp.func
@@ -208,9 +208,9 @@ def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
                     if rotated == 1:
                         sx, sy, sz = to_telescope(surfaces, s, x, y, z)
                         su, sv, sw = to_telescope(surfaces, s, u, v, w)
-                        status = past_obstacles(surfaces, s, sx, sy, sz, su, sv, sw, t, status)
+                        status = obstructed_status_at_surface(surfaces, s, sx, sy, sz, su, sv, sw, t, status)
                     else:
-                        status = past_obstacles(surfaces, s, x, y, z, u, v, w, t, status)
+                        status = obstructed_status_at_surface(surfaces, s, x, y, z, u, v, w, t, status)
 
             x = x + wp.cw_mul(t, u)
             y = y + wp.cw_mul(t, v)

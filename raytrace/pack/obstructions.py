@@ -14,8 +14,8 @@ from ..kernels.obstruction import PackedObstructions
 from .meshes import warp_mesh
 
 
-def blocked_ways(telescope: Telescope) -> np.ndarray:
-    """Return whether each obstruction blocks light on its way to each surface, shape [n_surface, n_obstruction].
+def obstruction_table(telescope: Telescope) -> np.ndarray:
+    """Return the obstructions on the path of light to each surface, bool [n_surface, n_obstruction].
 
     Light on its way to a mirror, a lens surface or the detector crosses the baffle planes before it, which go with
     that surface. Space inside a lens, where the medium is not that in front of the telescope, is left out unless an
@@ -45,5 +45,5 @@ def pack_obstructions(telescope: Telescope, device: str = "cpu") -> Any:
     packed.meshes = warp_array([mesh.id for mesh in meshes], wp.uint64, device=device)
     # Kernels refer to meshes by number only: the array of numbers owns the meshes.
     packed.meshes.meshes = meshes
-    packed.blocks = warp_array(blocked_ways(telescope), wp.int32, device=device)
+    packed.blocks = warp_array(obstruction_table(telescope), wp.int32, device=device)
     return packed

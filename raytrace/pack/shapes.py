@@ -38,7 +38,7 @@ def split_shape(shape: Shape, *, screen: bool = False) -> SplitShape:
         return SplitShape(shape, (), shape.curvature)
     if isinstance(shape, MeshSurface) and not screen:
         return SplitShape(Plane(), (), 0.0)
-    parts = list(_flat(shape))
+    parts = list(_flattened_terms(shape))
     base: Rotational = Plane()
     if not screen:
         for i, part in enumerate(parts):
@@ -51,10 +51,10 @@ def split_shape(shape: Shape, *, screen: bool = False) -> SplitShape:
     return SplitShape(base, rest, first)
 
 
-def _flat(shape: Shape) -> Sequence[Shape]:
+def _flattened_terms(shape: Shape) -> Sequence[Shape]:
     """Return the terms of a sum, of sums within it too; an odd asphere comes after its own conic."""
     if isinstance(shape, Sum):
-        return [one for part in shape.parts for one in _flat(part)]
+        return [one for part in shape.parts for one in _flattened_terms(part)]
     return [shape.base, shape] if isinstance(shape, OddAsphere) else [shape]
 
 
@@ -69,7 +69,7 @@ def pack_deformations(shapes: Sequence[SplitShape], device: str = "cpu") -> Any:
     offset = 0
     for row, shape in enumerate(shapes):
         span[row, 0] = len(rows)
-        for kind, sizes, own in _parts(shape.parts):
+        for kind, sizes, own in _encoded_parts(shape.parts):
             rows.append([kind, offset, *sizes])
             numbers.append(own)
             offset += len(own)
@@ -82,7 +82,7 @@ def pack_deformations(shapes: Sequence[SplitShape], device: str = "cpu") -> Any:
     return packed
 
 
-def _parts(shapes: Sequence[Shape]) -> list[tuple[int, tuple[int, int], np.ndarray]]:
+def _encoded_parts(shapes: Sequence[Shape]) -> list[tuple[int, tuple[int, int], np.ndarray]]:
     """Return the kind, two whole numbers and the numbers of each part; all polynomials make one part."""
     found: list[tuple[int, tuple[int, int], np.ndarray]] = []
     polynomial: PolarPolynomial | None = None
@@ -101,7 +101,7 @@ def _parts(shapes: Sequence[Shape]) -> list[tuple[int, tuple[int, int], np.ndarr
             add(from_even_powers(shape.coefficients[1::2], first=2))
         elif isinstance(shape, Rotational):
             add(from_even_powers(shape.coefficients))
-            found.append(_conic(shape))
+            found.append(_encoded_conic(shape))
         elif isinstance(shape, Biconic):
             c = np.array([1.0 / shape.radius_x, 1.0 / shape.radius_y])
             k = np.array([1.0 + shape.conic_x, 1.0 + shape.conic_y])
@@ -116,16 +116,16 @@ def _parts(shapes: Sequence[Shape]) -> list[tuple[int, tuple[int, int], np.ndarr
         else:
             raise PrescriptionError(f"shape {type(shape).__name__}: expected one that can be part of a sum or a map")
     if polynomial is not None and np.any(polynomial.terms):
-        found.insert(0, _polar(polynomial))
+        found.insert(0, _encoded_polynomial(polynomial))
     return found
 
 
-def _conic(shape: Rotational) -> tuple[int, tuple[int, int], np.ndarray]:
+def _encoded_conic(shape: Rotational) -> tuple[int, tuple[int, int], np.ndarray]:
     c, p = shape.curvature, (1.0 + shape.conic) * shape.curvature**2
     return int(BICONIC), (0, 0), np.array([c, c, p, p])
 
 
-def _polar(polynomial: PolarPolynomial) -> tuple[int, tuple[int, int], np.ndarray]:
+def _encoded_polynomial(polynomial: PolarPolynomial) -> tuple[int, tuple[int, int], np.ndarray]:
     degree, order = polynomial.degree, polynomial.order
     numbers: list[float] = []
     terms = np.zeros((degree + 1, degree // 2 + 1), dtype=np.complex128)

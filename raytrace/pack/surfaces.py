@@ -19,11 +19,11 @@ from ..kernels.surface import FAR
 from ..kernels.trace import DEFORMED, INTERACTION, KINDS, NUMBERS, OBSTRUCTED, PHASE, STOPPED, PackedSurfaces
 from .apertures import pack_apertures
 from .meshes import pack_meshes
-from .obstructions import blocked_ways, pack_obstructions
+from .obstructions import obstruction_table, pack_obstructions
 from .shapes import pack_deformations, split_shape
 
 
-def clear_ring(aperture: Aperture | None) -> tuple[float, float, float, float] | None:
+def clear_annulus(aperture: Aperture | None) -> tuple[float, float, float, float] | None:
     """Return centre x, y, inner and outer radius [m] of a clear region; None where it is neither a disc nor a ring."""
     if aperture is None:
         return (0.0, 0.0, 0.0, np.inf)
@@ -46,7 +46,7 @@ def pack_surfaces(telescope: Telescope, device: str = "cpu") -> Any:
     kinds = np.empty((len(surfaces), KINDS), dtype=np.int32)
     shapes = [split_shape(s.shape, screen=s.interaction == Interaction.PHASE) for s in surfaces]
     coefficients = np.zeros((len(surfaces), max([1, *(len(shape.base.coefficients) for shape in shapes)])))
-    blocked = blocked_ways(telescope)
+    blocked = obstruction_table(telescope)
     general: list[Aperture | None] = []
     media = list(distinct_media(telescope))
     before = telescope.medium_before
@@ -54,7 +54,7 @@ def pack_surfaces(telescope: Telescope, device: str = "cpu") -> Any:
         base, terms = shapes[row].base, shapes[row].base.coefficients
         rotated = not np.array_equal(s.matrix, np.eye(3))
         coefficients[row, : len(terms)] = terms
-        ring = clear_ring(s.aperture)
+        ring = clear_annulus(s.aperture)
         general.append(s.aperture if ring is None else None)
         stopped = 2 if ring is None else int(s.aperture is not None)
         frame = (*s.vertex, *s.matrix.ravel())
@@ -103,9 +103,9 @@ def refractive_indices(telescope: Telescope, wavelength: float) -> np.ndarray:
     """Return the index before the first surface and after each, [n_surface + 1]: [-2] is that before the detector."""
     telescope.check_wavelength(wavelength)
     media = [telescope.medium_before, *(s.medium_after for s in telescope.surfaces)]
-    return np.array([_index(medium, float(wavelength)) for medium in media], dtype=np.float64)
+    return np.array([_medium_index(medium, float(wavelength)) for medium in media], dtype=np.float64)
 
 
 @lru_cache(maxsize=256)
-def _index(medium: Medium, wavelength: float) -> float:
+def _medium_index(medium: Medium, wavelength: float) -> float:
     return float(medium.index(wavelength))

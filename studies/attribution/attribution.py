@@ -8,7 +8,7 @@ A telescope without aberrations cannot be traced over the CCD heights. With the 
 on the sky are therefore imaged by a paraboloid so long that design, heights and residuals of the active optics have no
 effect. The effect of the design is that of the optics less that of the heights.
 
-The ground layer holds most of the turbulence. At exactly 0 m all stars of the field have the same part of it in front
+The ground layer holds most of the turbulence. At exactly 0 m the light of all stars crosses the same part of it at
 of them at any time, and one ellipticity in common. Its case lifts the layer with the same turbulence, so far that stars
 have no more of it in common than of the next layer.
 """
@@ -28,7 +28,7 @@ from ...pipeline.config import Configuration
 from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_stage import apply_focal_plane_model
 from ...pipeline.measure.correlation import SEPARATION_RANGES, Correlation, jackknife_error
-from ...pipeline.measure.summary import correlations, ellipticities, of_focal_plane, rms
+from ...pipeline.measure.summary import correlations, ellipticities, has_focal_plane_model, rms
 from ...pipeline.memory import check_memory
 from ...pipeline.simulate.ccd_exposure import CcdExposure
 from ...pipeline.simulate.ccd_loop import simulate_ccds
@@ -80,7 +80,7 @@ def attribute(
     with full.screens(threads, reporter):
         for case in [FULL, *(c for c in chosen if c != NOISE)]:
             experiment = full if case == FULL else without_cause(full, case)
-            found, failed = _stars(experiment, case, NOISE in chosen and case == FULL, threads, reporter)
+            found, failed = _stars_by_case(experiment, case, NOISE in chosen and case == FULL, threads, reporter)
             stars |= found
             left_out |= {name: reason for name, reason in failed.items() if name not in left_out}
     if not stars[FULL].keys() - left_out:
@@ -91,7 +91,7 @@ def attribute(
     for case in order:
         same = [each for name, each in stars[case].items() if name not in left_out]
         correlated[case] = correlations(same, same[0].kinds)
-        metrics[case] = _metrics(same, correlated[case])
+        metrics[case] = _case_metrics(same, correlated[case])
     for case in chosen:
         metrics[case] |= changes(metrics[FULL], metrics[case], correlated[FULL], correlated[case])
     return Attribution(metrics, correlated, left_out)
@@ -106,7 +106,7 @@ def without_cause(full: Experiment, cause: str) -> Experiment:
     return replace(experiment, atmosphere_only=cause == OPTICS)
 
 
-def _stars(
+def _stars_by_case(
     experiment: Experiment, case: str, noiseless: bool, threads: int | None, reporter: Reporter
 ) -> tuple[dict[str, dict[str, CcdStars]], dict[str, str]]:
     """Return the stars by case and CCD, the same without noise too; and the reasons of CCDs that are not modelled."""
@@ -129,9 +129,9 @@ def _stars(
     return found, done.not_modelled
 
 
-def _metrics(stars: Sequence[CcdStars], correlated: dict[str, Correlation]) -> dict[str, float]:
+def _case_metrics(stars: Sequence[CcdStars], correlated: dict[str, Correlation]) -> dict[str, float]:
     residuals = {"at_stars": "residual", "left_out": "left_out", "away": "away"}
-    if of_focal_plane(stars):
+    if has_focal_plane_model(stars):
         residuals |= {"at_stars_ccd": "residual_ccd", "away_ccd": "away_ccd"}
     metrics = {"rms_e_truth": rms(ellipticities(stars, "truth"))}
     metrics |= {f"rms_residual_{name}": rms(ellipticities(stars, kind)) for name, kind in residuals.items()}

@@ -10,7 +10,7 @@ from typing import Any
 from ...core.errors import ConfigError, unknown_name
 from ...models.io.site_file import load_site
 from ...pipeline.config import Configuration, with_options
-from ...pipeline.defaults import given
+from ...pipeline.resolved_values import resolved_value
 
 #: Name of the case with all causes, and of the two causes that are no options of the configuration.
 FULL, NOISE, OPTICS = "full", "noise", "optics"
@@ -26,20 +26,20 @@ class Cause:
     problem: Callable[[Configuration], str | None]
 
 
-def _flat(config: Configuration) -> str | None:
+def _flat_heights(config: Configuration) -> str | None:
     return "focal_plane.budget = flat" if config.focal_plane.budget == "flat" else None
 
 
 def _no_heights(config: Configuration) -> str | None:
     if config.focal_plane.heights is not None:
         return None
-    return _flat(config) or (None if config.focal_plane.terms else "all terms of focal_plane are off already")
+    return _flat_heights(config) or (None if config.focal_plane.terms else "all terms of focal_plane are off already")
 
 
 def _no_term(term: str, config: Configuration) -> str | None:
     if config.focal_plane.heights is not None:
         return f"focal_plane.heights = {config.focal_plane.heights}, which has no terms"
-    return _flat(config) or (None if term in config.focal_plane.terms else f"focal_plane.{term} = false")
+    return _flat_heights(config) or (None if term in config.focal_plane.terms else f"focal_plane.{term} = false")
 
 
 def _no_aberration(config: Configuration) -> str | None:
@@ -61,7 +61,7 @@ def _no_atmosphere(config: Configuration) -> str | None:
 def _no_ground_layer(config: Configuration) -> str | None:
     if not config.atmosphere.enabled or config.psf.engine == "long_exposure":
         return "no star is imaged through turbulence"
-    if config.atmosphere.ground_lift_m > 0.0 or load_site(given(config.atmosphere.site)).altitudes[0] > 0.0:
+    if config.atmosphere.ground_lift_m > 0.0 or load_site(resolved_value(config.atmosphere.site)).altitudes[0] > 0.0:
         return "no layer is on the ground"
     return None
 

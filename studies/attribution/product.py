@@ -28,7 +28,7 @@ def write_attribution(result: Attribution, folder: Path, config: Configuration) 
     columns = {"off": (np.array(list(result.metrics)), "", "cause that is switched off, or full")}
     for key in keys:
         values = np.array([case.get(key, np.nan) for case in result.metrics.values()])
-        columns[key] = (values, "arcsec" if key.endswith("arcsec") else "", _meaning(key))
+        columns[key] = (values, "arcsec" if key.endswith("arcsec") else "", _metric_description(key))
     xi = {f"{case} {kind}": c for case, each in result.correlations.items() for kind, c in each.items()}
     return write_products(
         folder,
@@ -44,10 +44,10 @@ def write_attribution(result: Attribution, folder: Path, config: Configuration) 
     )
 
 
-def _meaning(key: str) -> str:
+def _metric_description(key: str) -> str:
     for start, words in (("change_", "full case less this one: "), ("error_", "jackknife error of the change: ")):
         if key.startswith(start):
-            return words + _meaning(key.removeprefix(start))
+            return words + _metric_description(key.removeprefix(start))
     if key.startswith("xi_plus_"):
         low, high = SEPARATION_RANGES[key.rpartition("_")[2]]
         kind = key.removeprefix("xi_plus_").rpartition("_")[0].replace("_ccd", " of the CCDs' own models")

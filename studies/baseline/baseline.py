@@ -24,7 +24,7 @@ from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
 from ...pipeline.config import digest, load_configuration, with_options
 from ...pipeline.config_hash import hashed_camera, hashed_heights, hashed_photometry, hashed_states
-from ...pipeline.defaults import as_configured, with_paper_model
+from ...pipeline.defaults import configured_telescope, with_paper_model
 from ...pipeline.experiment import Experiment
 from ..metrics.camera import CAMERA
 from ..metrics.metric import REASONS, Metric, MetricGroup
@@ -101,16 +101,16 @@ def make_baseline(
     Raises
     ------
     PachonError
-        If the telescope or the configuration cannot be read, no metric can be computed, or a tolerance or a limit is
-        that of none.
+        If the telescope or the configuration cannot be read, no metric can be computed, or a tolerance or a limit
+        applies to none of them.
     """
     tolerance_rules, limit_rules = parse_rules("tolerance", tolerances), parse_rules("limit", limits)
     telescope, folder = load_telescope(model), Path(folder)
     configuration = None if configuration is None else Path(configuration)
-    experiment = None if configuration is None else _experiment(configuration, _absolute(model, Path()), telescope)
+    experiment = None if configuration is None else _experiment(configuration, _absolute_path(model, Path()), telescope)
     plan = make_plan(telescope, experiment, fields, wavelengths, ccds, pupil)
     scene = Scene(telescope if experiment is None else experiment.telescope, experiment, plan, threads)
-    found, left_out = _measured(scene, OPTICS if experiment is None else {**OPTICS, **CAMERA}, progress)
+    found, left_out = _measured_metrics(scene, OPTICS if experiment is None else {**OPTICS, **CAMERA}, progress)
     if not found:
         raise ConfigError(f"{model}: no metric can be computed ({next(iter(left_out.values()))})")
 
@@ -132,9 +132,9 @@ def make_baseline(
 
     metrics = {name: stored(name, *each) for name, each in found.items()}
     baseline = Baseline(
-        **_stamps(telescope, experiment),
-        model=_relative(model, folder, BUNDLED),
-        configuration=None if configuration is None else _relative(str(configuration), folder, ()),
+        **_input_stamps(telescope, experiment),
+        model=_relative_path(model, folder, BUNDLED),
+        configuration=None if configuration is None else _relative_path(str(configuration), folder, ()),
         plan=plan,
         reasons={key: text for key, text in REASONS.items() if any(m.reason == key for m in metrics.values())},
         figures=metrics,
@@ -171,11 +171,11 @@ def check_baseline(
     """
     path = Path(path)
     baseline = read_baseline(path)
-    name, telescope, experiment = _subject(path, baseline, model, configuration)
+    name, telescope, experiment = _checked_telescope(path, baseline, model, configuration)
     scene = Scene(telescope if experiment is None else experiment.telescope, experiment, baseline.plan, threads)
     stored = {key.partition(" ")[0] for key in baseline.figures}
     groups = {group: each for group, each in {**OPTICS, **CAMERA}.items() if group in stored}
-    found, problems = _measured(scene, groups, progress)
+    found, problems = _measured_metrics(scene, groups, progress)
 
     def deviation(key: str, metric: BaselineMetric) -> Deviation:
         now = found[key][0] if key in found else None
@@ -184,9 +184,9 @@ def check_baseline(
         return Deviation(key, metric.unit, metric.value, metric.tolerance, now, against, problem, limit)
 
     deviations = sorted((deviation(*item) for item in baseline.figures.items()), key=lambda d: (-d.ratio, d.name))
-    now = _stamps(telescope, experiment)
+    now = _input_stamps(telescope, experiment)
     changed = tuple(name for name, key in _STAMPS.items() if now[key] != getattr(baseline, key))
-    return BaselineCheck(str(path), name, tuple(deviations), _notes(baseline, changed), changed)
+    return BaselineCheck(str(path), name, tuple(deviations), _input_changes(baseline, changed), changed)
 
 
 def updated_baseline(
@@ -205,11 +205,11 @@ def updated_baseline(
             raise ConfigError(f"figures.{d.name}: {d.problem}; remove its line, or save the baseline anew", file=path)
         update = {"value": rounded(d.found, d.tolerance), "checked_against": None}
         metrics[d.name] = metrics[d.name].model_copy(update=update)
-    _, telescope, experiment = _subject(path, baseline, None, None)
-    return baseline.model_copy(update={**_stamps(telescope, experiment), "figures": metrics}), check
+    _, telescope, experiment = _checked_telescope(path, baseline, None, None)
+    return baseline.model_copy(update={**_input_stamps(telescope, experiment), "figures": metrics}), check
 
 
-def _measured(
+def _measured_metrics(
     scene: Scene, groups: Mapping[str, MetricGroup], progress: Callable[[int], None] | None
 ) -> tuple[dict[str, tuple[float, float, Metric]], dict[str, str]]:
     """Return finite values, tolerances and metrics by name, and the problems of groups that fail."""
@@ -232,19 +232,19 @@ def prescription_hash(telescope: Telescope) -> str:
     return hashlib.sha256(telescope_to_yaml(telescope).encode()).hexdigest()
 
 
-def _subject(
+def _checked_telescope(
     path: Path,
     baseline: Baseline,
     model: str | os.PathLike[str] | Telescope | None,
     configuration: str | os.PathLike[str] | None,
 ) -> tuple[str, Telescope, Experiment | None]:
     """Return the name of the telescope to check, itself, and the experiment with it."""
-    own = _absolute(baseline.model, path.parent)
+    own = _absolute_path(baseline.model, path.parent)
     if isinstance(model, Telescope):
         name, source, telescope = model.name, own, model
     else:
         name = baseline.model if model is None else os.fspath(model)
-        source = own if model is None else _absolute(name, Path())
+        source = own if model is None else _absolute_path(name, Path())
         try:
             telescope = load_telescope(source)
         except PachonError as error:
@@ -267,12 +267,12 @@ def _experiment(configuration: Path, model: str, telescope: Telescope) -> Experi
         # Kriging looks for its covariance in steps that rounding may change; metrics need a model of one solution.
         config = with_options(with_paper_model(base), telescope=model, psf__engine=engine)
         experiment = Experiment.from_config(config, configuration.parent)
-        return replace(experiment, telescope=as_configured(telescope, experiment.config))
+        return replace(experiment, telescope=configured_telescope(telescope, experiment.config))
     except PachonError as error:
         raise ConfigError(f"{configuration}: {error}") from None
 
 
-def _stamps(telescope: Telescope, experiment: Experiment | None) -> dict[str, Any]:
+def _input_stamps(telescope: Telescope, experiment: Experiment | None) -> dict[str, Any]:
     """Return version and hashes of telescope and configuration."""
     hashed = None
     if experiment is not None:
@@ -287,7 +287,7 @@ def _stamps(telescope: Telescope, experiment: Experiment | None) -> dict[str, An
     return {"pachon": VERSION, "model_sha256": prescription_hash(telescope), "configuration_sha256": hashed}
 
 
-def _notes(baseline: Baseline, changed: Sequence[str]) -> tuple[str, ...]:
+def _input_changes(baseline: Baseline, changed: Sequence[str]) -> tuple[str, ...]:
     """Return a line for each input that has changed."""
     return tuple(
         f"pachon: {baseline.pachon} -> {VERSION}"
@@ -297,11 +297,11 @@ def _notes(baseline: Baseline, changed: Sequence[str]) -> tuple[str, ...]:
     )
 
 
-def _absolute(name: str, folder: Path) -> str:
+def _absolute_path(name: str, folder: Path) -> str:
     """Return a bundled name as it is, and the path of a file as an absolute one."""
     return name if name in BUNDLED else str((folder / name).resolve())
 
 
-def _relative(name: str, folder: Path, bundled: Sequence[str]) -> str:
+def _relative_path(name: str, folder: Path, bundled: Sequence[str]) -> str:
     """Return a bundled name as it is, and the path of a file relative to a folder."""
     return name if name in bundled else Path(os.path.relpath(Path(name).resolve(), folder.resolve())).as_posix()

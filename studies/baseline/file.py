@@ -111,7 +111,7 @@ def baseline_text(baseline: Baseline) -> str:
     """Return the file's text."""
     content = baseline.model_dump(mode="json", exclude={"figures"})
     content["version"] = VERSIONS[any(metric.limit is not None for metric in baseline.figures.values())]
-    lines = [f" {_json(key)}: {_block(value)}," for key, value in content.items() if value is not None]
+    lines = [f" {_json(key)}: {_json_block(value)}," for key, value in content.items() if value is not None]
     figures = [
         f"  {_json(name)}: {_json(baseline.figures[name].model_dump(mode='json', exclude_none=True))}"
         for name in sorted(baseline.figures)
@@ -128,7 +128,7 @@ def _json(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False, allow_nan=False)
 
 
-def _block(value: Any) -> str:
+def _json_block(value: Any) -> str:
     """Return JSON of one line, of a mapping one line for each key."""
     if not isinstance(value, dict):
         return _json(value)

@@ -1,4 +1,4 @@
-"""Metrics of a focal plane behind its telescope: CCD heights, defocus, PSFs and their reconstruction."""
+"""Metrics of a focal plane with its telescope: CCD heights, defocus, PSFs and their reconstruction."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def opd(scene: Scene) -> dict[str, float]:
         for wavelength, nm in zip(scene.wavelengths, scene.plan.wavelengths_nm, strict=True):
             opd = wavefront_opd(scene.telescope, tuple(field), wavelength, tuple(scene.pupil.T), threads=scene.threads)
             for value, point in zip(opd.value, scene.plan.pupil, strict=True):
-                metrics[f"opd {nm:g} nm field {_pair(place)} pupil {_pair(point)}"] = float(value) * 1e9
+                metrics[f"opd {nm:g} nm field {_pair_text(place)} pupil {_pair_text(point)}"] = float(value) * 1e9
     return metrics
 
 
@@ -46,7 +46,7 @@ def landing(scene: Scene) -> dict[str, float]:
     bundles = request.bundles(scene.middle, scene.pupil)
     points = np.concatenate([bundles.chief_landing()[:, None], bundles.landing()], axis=1) * 1e3
     return {
-        f"landing {axis} field {_pair(place)} pupil {_pair(point)}": float(value)
+        f"landing {axis} field {_pair_text(place)} pupil {_pair_text(point)}": float(value)
         for rays, place in zip(points, scene.plan.fields_deg, strict=True)
         for ray, point in zip(rays, ((0.0, 0.0), *scene.plan.pupil), strict=True)
         for axis, value in zip("xy", ray, strict=True)
@@ -68,7 +68,7 @@ def zernike(scene: Scene) -> dict[str, float]:
             missed = error
             continue
         row = fit.coefficients[0]
-        metrics |= {f"zernike Z{j} field {_pair(place)}": float(row[j - 1]) * 1e9 for j in range(4, _HIGHEST + 1)}
+        metrics |= {f"zernike Z{j} field {_pair_text(place)}": float(row[j - 1]) * 1e9 for j in range(4, _HIGHEST + 1)}
     if missed is not None and not metrics:
         raise missed
     return metrics
@@ -81,7 +81,7 @@ def spot(scene: Scene) -> dict[str, float]:
     for wavelength, nm in zip(scene.wavelengths, scene.plan.wavelengths_nm, strict=True):
         radii = spots(scene.telescope, scene.fields, wavelength, threads=scene.threads).rms_radius * 1e6
         for value, place in zip(radii, scene.plan.fields_deg, strict=True):
-            metrics[f"spot rms {nm:g} nm field {_pair(place)}"] = float(value)
+            metrics[f"spot rms {nm:g} nm field {_pair_text(place)}"] = float(value)
     return metrics
 
 
@@ -92,7 +92,7 @@ def ee80(scene: Scene) -> dict[str, float]:
         scene.telescope, scene.fields, scene.middle, pixels=_EE_PIXELS, n_pupil=_EE_POINTS, threads=scene.threads
     )
     radii = energy.radius_holding(0.8) * 1e6
-    return {f"ee80 field {_pair(p)}": float(v) for v, p in zip(radii, scene.plan.fields_deg, strict=True)}
+    return {f"ee80 field {_pair_text(p)}": float(v) for v, p in zip(radii, scene.plan.fields_deg, strict=True)}
 
 
 @OPTICS.group(
@@ -123,10 +123,10 @@ def lit_fraction(scene: Scene) -> dict[str, float]:
     """Return the fraction of the pupil that lights the detector at the middle wavelength."""
     found = vignetting(scene.telescope, scene.fields, scene.middle, n_pupil=_VIGNETTING_RAYS, threads=scene.threads)
     return {
-        f"vignetting lit fraction field {_pair(place)}": float(value)
+        f"vignetting lit fraction field {_pair_text(place)}": float(value)
         for value, place in zip(found.lit_fraction, scene.plan.fields_deg, strict=True)
     }
 
 
-def _pair(values: tuple[float, float]) -> str:
+def _pair_text(values: tuple[float, float]) -> str:
     return f"({values[0]:g}, {values[1]:g})"

@@ -23,7 +23,7 @@ from ...pipeline.measure.summary import SHORTEST_ARCMIN
 from ...pipeline.simulate.ccd_exposure import NoiseFreeStars, expose_positions, holdout_positions
 from ...wavefront.request import Request, field_points, wavelength_points
 
-#: Fields of a plan, in units of the field's radius; no symmetry of the telescope leaves all of them as they are.
+#: Fields of a plan, in units of the field's radius: not symmetric under any symmetry of a telescope.
 _FIELDS = ((0.0, 0.0), (0.0, 0.5), (0.7, 0.0), (-0.5, 0.6), (0.0, 1.0))
 #: Points of the pupil: place between inner and outer rim, and angle [deg].
 _PUPIL = ((0.95, 20.0), (0.6, 140.0), (0.9, 260.0), (0.1, 340.0))
@@ -55,7 +55,7 @@ def make_plan(
     ccds: Sequence[str] | None = None,
     pupil: Sequence[tuple[float, float]] | None = None,
 ) -> Plan:
-    """Return a plan, with defaults for what is not given: see :func:`~pachon.studies.baseline.baseline.make_baseline`.
+    """Return a plan with its defaults; arguments are those of :func:`~pachon.studies.baseline.baseline.make_baseline`.
 
     A ConfigError says that CCDs need a configuration, for the focal plane that they lie in.
     """

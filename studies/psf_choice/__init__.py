@@ -1,1 +1,1 @@
-"""How many stars, which order, components and basis serve a PSF model best."""
+"""Choice of a PSF model: number of stars, order, components, basis."""

@@ -26,7 +26,7 @@ def fit_focal_plane(
 ) -> FocalPlanePsf:
     """Fit the focal-plane model of a case to the first stars of each CCD, all CCDs together."""
     stars = FocalPlaneStars.of_ccds(
-        [_stars(case, *pair) for pair in zip(ccds, observed, strict=True)],
+        [_stars_of_ccd(case, *pair) for pair in zip(ccds, observed, strict=True)],
         ccds[0].exposure.observed.pixel_scale,
         experiment.weight_fwhm,
     )
@@ -36,7 +36,7 @@ def fit_focal_plane(
     )
 
 
-def _stars(case: Case, ccd: SimulatedCcd, observed: ObservedCcd) -> CcdStars:
+def _stars_of_ccd(case: Case, ccd: SimulatedCcd, observed: ObservedCcd) -> CcdStars:
     found, electrons = observed.observation, np.minimum(observed.electrons, _ELECTRONS)
     x, y = ccd.exposure.positions.observed.T
     name, used = ccd.exposure.name, used_stars(case, observed)

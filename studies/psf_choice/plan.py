@@ -9,10 +9,10 @@ from itertools import product
 
 from ...core.errors import ConfigError
 from ...pipeline.config import Configuration
-from ...pipeline.defaults import given
 from ...pipeline.psf_model.basis import BASES
 from ...pipeline.psf_model.fit import COMPONENTS, ORDERS
 from ...pipeline.psf_model.polynomial import term_count
+from ...pipeline.resolved_values import resolved_value
 
 #: Weights of the stars in the polynomials, as for :func:`~.snr_weights` (equal in the paper).
 POLYNOMIALS = ("equal", "snr", "softened")
@@ -22,7 +22,7 @@ FOCAL_PLANE = {"no_telescope": "focal plane, no telescope", "focal_plane": "foca
 NOISE_FREE = math.inf
 
 
-#: Interpolations by a process, which have no order here, and their names.
+#: Interpolations by a process, whose order is fixed here, and their names.
 PROCESSES = {"gp": "Gaussian process", "kriging": "kriging"}
 
 
@@ -42,7 +42,7 @@ class Case:
         """Number of terms of a polynomial."""
         return term_count(self.order)
 
-    def settled(self) -> Case:
+    def normalised(self) -> Case:
         """Return the case as it is fitted: parameters without effect have one value."""
         if self.interpolation in FOCAL_PLANE:
             return replace(self, basis="moments", order=0, components=3)
@@ -94,7 +94,7 @@ class Plan:
 
         def sweep(**axes: Sequence[object]) -> None:
             for values in product(*axes.values()):
-                found.append(replace(base, **dict(zip(axes, values, strict=True))).settled())  # type: ignore[arg-type]
+                found.append(replace(base, **dict(zip(axes, values, strict=True))).normalised())  # type: ignore[arg-type]
 
         sweep(stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=polynomials, order=self.orders)
         sweep(order=self.orders, components=self.components, interpolation=polynomials)
@@ -128,8 +128,8 @@ def make_plan(
     base = Case(
         config.stars.observed,
         config.stars.snr_min,
-        given(fit.basis),
-        given(fit.interpolation) if fit.interpolation in PROCESSES else given(fit.weights),
+        resolved_value(fit.basis),
+        resolved_value(fit.interpolation) if fit.interpolation in PROCESSES else resolved_value(fit.weights),
         fit.order or 0,
         fit.components or 0,
     )
@@ -143,7 +143,7 @@ def make_plan(
     if draws < 1:
         raise ConfigError(f"draws = {draws}: expected at least 1")
     return Plan(
-        base.settled(),
+        base.normalised(),
         tuple(int(n) for n in values("stars", tuple(stars), base.stars, 2)),
         tuple(int(n) for n in values("orders", tuple(orders), base.order, 0)),
         tuple(int(n) for n in values("components", tuple(components), base.components or COMPONENTS, 1)),

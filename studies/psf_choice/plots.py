@@ -42,14 +42,14 @@ def stars_plot(result: Study) -> bytes:
         for axes, how in zip(panels, POLYNOMIALS, strict=True):
             for order, color in zip(plan.orders, colors, strict=True):
                 cases = [(n, replace(plan.base, stars=n, order=order, interpolation=how)) for n in plan.stars]
-                _line(axes, result, cases, "rms_e_away", color, "o", f"order {order}")
-                _line(axes, result, cases, "noise_law_away", color, "", None, (0, (4, 2)))
+                _draw_line(axes, result, cases, "rms_e_away", color, "o", f"order {order}")
+                _draw_line(axes, result, cases, "noise_law_away", color, "", None, (0, (4, 2)))
                 if how == "equal":
                     quiet = [(n, replace(c, snr=NOISE_FREE)) for n, c in cases]
-                    _line(axes, result, quiet, "rms_e_away", color, "", None, _QUIET)
-            _log(axes, plan.stars, "stars of a CCD", _HOW[how][2])
+                    _draw_line(axes, result, quiet, "rms_e_away", color, "", None, _QUIET)
+            _logarithmic_axes(axes, plan.stars, "stars of a CCD", _HOW[how][2])
         panels[0].set_ylabel(_RMS)
-        _limit(panels[0], result)
+        _limit_axis(panels[0], result)
         panels[0].plot([], [], color="0.4", linestyle=(0, (4, 2)), linewidth=0.9, label="noise alone, in theory")
         panels[0].plot([], [], color="0.4", linestyle=_QUIET, linewidth=0.9, label="stars without noise")
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=8)
@@ -63,10 +63,10 @@ def choices_plot(result: Study) -> bytes:
     with styled():
         figure = new_figure(17.0, 9.0)
         panels = figure.subplots(2, 4)
-        _orders(panels[0, 0], result)
-        _components(panels[0, 1], result)
-        _bases(panels[0, 2], result)
-        _snrs(panels[0, 3], result)
+        _draw_orders(panels[0, 0], result)
+        _draw_components(panels[0, 1], result)
+        _draw_bases(panels[0, 2], result)
+        _draw_snrs(panels[0, 3], result)
         for axes, key, what in (
             (panels[1, 0], "rms_e_away", _RMS),
             (panels[1, 1], "rms_size_away", "rms of the relative size, no star"),
@@ -75,14 +75,20 @@ def choices_plot(result: Study) -> bytes:
                 color, marker, label = _HOW[how]
                 best = [(n, c) for n in plan.stars if (c := result.best_order(n, how))]
                 text = f"{label}, best order" if how in POLYNOMIALS else label
-                _line(axes, result, best, key, color, marker, text)
+                _draw_line(axes, result, best, key, color, marker, text)
             paper = [(n, replace(base, stars=n)) for n in plan.stars]
-            _line(axes, result, paper, key, TRUTH, "x", f"{_HOW[base.interpolation][2]}, order {base.order}")
-            _log(axes, plan.stars, "stars of a CCD", "interpolation" + (": size" if "size" in key else ": e"))
+            _draw_line(axes, result, paper, key, TRUTH, "x", f"{_HOW[base.interpolation][2]}, order {base.order}")
+            _logarithmic_axes(
+                axes, plan.stars, "stars of a CCD", "interpolation" + (": size" if "size" in key else ": e")
+            )
             axes.set_ylabel(what)
-        _limit(panels[1, 0], result)
-        _shared(panels[1, 2], result, "mean_e", "rms over CCDs of their mean of e", "what a CCD has in common")
-        _shared(panels[1, 3], result, "xi_plus", "$|\\xi_+|$, 10' to 3 deg; open: negative", "correlation between CCDs")
+        _limit_axis(panels[1, 0], result)
+        _draw_common_residuals(
+            panels[1, 2], result, "mean_e", "rms over CCDs of their mean of e", "what a CCD has in common"
+        )
+        _draw_common_residuals(
+            panels[1, 3], result, "xi_plus", "$|\\xi_+|$, 10' to 3 deg; open: negative", "correlation between CCDs"
+        )
         for axes in panels.flat:
             # Room for the legend above the curves, on a logarithmic scale.
             low, high = axes.get_ylim()
@@ -91,7 +97,7 @@ def choices_plot(result: Study) -> bytes:
         return png_bytes(figure)
 
 
-def _orders(axes: Axes, result: Study) -> None:
+def _draw_orders(axes: Axes, result: Study) -> None:
     """Draw the residual at the stars and at the holdout positions against the order."""
     plan, base = result.plan, result.plan.base
     cases = [(order, replace(base, order=order)) for order in plan.orders]
@@ -99,10 +105,10 @@ def _orders(axes: Axes, result: Study) -> None:
         ("at_stars", RESIDUAL, "D", "observed", "at the stars"),
         ("away", AWAY, "^", "truth", "no star"),
     ):
-        _line(axes, result, cases, f"rms_e_{kind}", color, marker, f"{what} - model, {where}")
-        _line(axes, result, cases, f"noise_law_{kind}", color, "", f"noise alone, {where}, in theory", (0, (4, 2)))
+        _draw_line(axes, result, cases, f"rms_e_{kind}", color, marker, f"{what} - model, {where}")
+        _draw_line(axes, result, cases, f"noise_law_{kind}", color, "", f"noise alone, {where}, in theory", (0, (4, 2)))
     quiet = [(order, replace(c, snr=NOISE_FREE)) for order, c in cases]
-    _line(axes, result, quiet, "rms_e_away", TRUTH, "", "truth - model, stars without noise", _QUIET)
+    _draw_line(axes, result, quiet, "rms_e_away", TRUTH, "", "truth - model, stars without noise", _QUIET)
     _log_values(axes)
     axes.set_xticks(plan.orders)
     axes.set(xlabel="order of the polynomials", ylabel="rms of one component of e")
@@ -110,23 +116,23 @@ def _orders(axes: Axes, result: Study) -> None:
     axes.grid(True, which="major", color="0.9", linewidth=0.6)
 
 
-def _components(axes: Axes, result: Study) -> None:
+def _draw_components(axes: Axes, result: Study) -> None:
     plan, base = result.plan, result.plan.base
-    _against(axes, result, "components", plan.components)
+    _draw_against(axes, result, "components", plan.components)
     quiet = [(k, replace(base, components=k, snr=NOISE_FREE)) for k in plan.components]
-    _line(axes, result, quiet, "rms_e_away", TRUTH, "", f"order {base.order}, stars without noise", _QUIET)
-    _log(axes, plan.components, "components", f"components: {base.stars} stars")
+    _draw_line(axes, result, quiet, "rms_e_away", TRUTH, "", f"order {base.order}, stars without noise", _QUIET)
+    _logarithmic_axes(axes, plan.components, "components", f"components: {base.stars} stars")
     axes.set_ylabel(_RMS)
 
 
-def _snrs(axes: Axes, result: Study) -> None:
+def _draw_snrs(axes: Axes, result: Study) -> None:
     plan, base = result.plan, result.plan.base
-    _against(axes, result, "snr", plan.snrs)
-    _log(axes, plan.snrs, "S/N of the faintest star", f"S/N: {base.stars} stars")
+    _draw_against(axes, result, "snr", plan.snrs)
+    _logarithmic_axes(axes, plan.snrs, "S/N of the faintest star", f"S/N: {base.stars} stars")
     axes.set_ylabel(_RMS)
 
 
-def _against(axes: Axes, result: Study, key: str, values: Sequence[float]) -> None:
+def _draw_against(axes: Axes, result: Study, key: str, values: Sequence[float]) -> None:
     """Draw the residual against one property of the cases, for each interpolation at the base's and the best order."""
     base = result.plan.base
     for how in (*POLYNOMIALS, *result.plan.without_polynomials):
@@ -136,23 +142,23 @@ def _against(axes: Axes, result: Study, key: str, values: Sequence[float]) -> No
             way = replace(base, order=order, interpolation=how)
             cases = [(v, replace(way, **{key: v})) for v in values]  # type: ignore[arg-type]
             text = f"{label}, order {order}" if how in POLYNOMIALS else label
-            _line(axes, result, cases, "rms_e_away", color, marker, text, line)
+            _draw_line(axes, result, cases, "rms_e_away", color, marker, text, line)
 
 
-def _bases(axes: Axes, result: Study) -> None:
+def _draw_bases(axes: Axes, result: Study) -> None:
     plan, base = result.plan, result.plan.base
     for basis in BASES:
         color, marker = _BASIS[basis]
         cases = [(n, replace(base, basis=basis, stars=n)) for n in plan.stars]
-        _line(axes, result, cases, "rms_e_away", color, marker, basis)
+        _draw_line(axes, result, cases, "rms_e_away", color, marker, basis)
         quiet = [(n, replace(c, snr=NOISE_FREE)) for n, c in cases]
-        _line(axes, result, quiet, "rms_e_away", color, "", f"{basis}, stars without noise", _QUIET)
-    _log(axes, plan.stars, "stars of a CCD", f"basis: {_HOW[base.interpolation][2]}, order {base.order}")
+        _draw_line(axes, result, quiet, "rms_e_away", color, "", f"{basis}, stars without noise", _QUIET)
+    _logarithmic_axes(axes, plan.stars, "stars of a CCD", f"basis: {_HOW[base.interpolation][2]}, order {base.order}")
     axes.set_ylabel(_RMS)
-    _limit(axes, result)
+    _limit_axis(axes, result)
 
 
-def _shared(axes: Axes, result: Study, key: str, label: str, title: str) -> None:
+def _draw_common_residuals(axes: Axes, result: Study, key: str, label: str, title: str) -> None:
     """Draw residuals in common to a CCD, or to several, at the stars and at the holdout positions."""
     plan, base = result.plan, result.plan.base
     other = result.best_order(base.stars, "softened")
@@ -165,8 +171,8 @@ def _shared(axes: Axes, result: Study, key: str, label: str, title: str) -> None
         cases = [(n, replace(way, stars=n)) for n in plan.stars]
         for kind, color, marker, where in (("at_stars", RESIDUAL, "D", "at the stars"), ("away", AWAY, "^", "no star")):
             ending = "_long" if key == "xi_plus" else ""
-            _line(axes, result, cases, f"{key}_{kind}{ending}", color, marker, f"{where}: {name}", line)
-    _log(axes, plan.stars, "stars of a CCD", title)
+            _draw_line(axes, result, cases, f"{key}_{kind}{ending}", color, marker, f"{where}: {name}", line)
+    _logarithmic_axes(axes, plan.stars, "stars of a CCD", title)
     axes.set_ylabel(label)
 
 
@@ -175,7 +181,7 @@ def _best_order(result: Study, how: str) -> int:
     return result.plan.base.order if best is None else best.order
 
 
-def _line(
+def _draw_line(
     axes: Axes,
     result: Study,
     cases: Iterable[tuple[float, Case]],
@@ -186,9 +192,9 @@ def _line(
     linestyle: Any = "-",
 ) -> None:
     """Draw a metric of the fitted cases against their values, negative ones as open markers."""
-    rows = [(x, found) for x, case in cases if (found := result.metrics.get(case.settled())) is not None]
+    rows = [(x, found) for x, case in cases if (found := result.metrics.get(case.normalised())) is not None]
     points = np.array([(x, found[key], found.get(f"error_{key}", np.nan)) for x, found in rows]).reshape(-1, 3)
-    # A perfect fit leaves rounding alone, which has no place on the scale.
+    # Residuals of a perfect fit are rounding errors, and are left out.
     x, value, error = points[np.isfinite(points[:, 1]) & (np.abs(points[:, 1]) > 1e-12)].T
     size = np.abs(value)
     axes.plot(x, size, color=color, linestyle=linestyle, linewidth=1.0, marker="", zorder=2)
@@ -204,7 +210,7 @@ def _line(
     axes.plot([], [], color=color, linestyle=linestyle, linewidth=1.0, marker=marker, markersize=4.0, label=label)
 
 
-def _log(axes: Axes, ticks: Sequence[float], label: str, title: str) -> None:
+def _logarithmic_axes(axes: Axes, ticks: Sequence[float], label: str, title: str) -> None:
     axes.set_xscale("log")
     _log_values(axes)
     axes.set_xticks(ticks, [f"{t:g}" for t in ticks])
@@ -221,7 +227,7 @@ def _log_values(axes: Axes) -> None:
         axes.set_ylim(1e-4, 1e-1)  # nothing to draw, of which no limits can be made
 
 
-def _limit(axes: Axes, result: Study) -> None:
+def _limit_axis(axes: Axes, result: Study) -> None:
     base = result.metrics.get(result.plan.base)
     low, high = axes.get_ylim()
     if base is not None:

@@ -40,16 +40,16 @@ def study_summary(result: Study) -> dict[str, Any]:
     }
     together = [best for how in FOCAL_PLANE if (best := result.best_order(plan.base.stars, how))]
     return {
-        "base": _described(result, plan.base),
-        "recommended": None if chosen is None else _described(result, chosen),
-        **({"focal_plane": [_described(result, case) for case in together]} if plan.focal_plane else {}),
+        "base": _case_entry(result, plan.base),
+        "recommended": None if chosen is None else _case_entry(result, chosen),
+        **({"focal_plane": [_case_entry(result, case) for case in together]} if plan.focal_plane else {}),
         "best_order": orders,
         "fitted": len(result.metrics),
         "not_fitted": {f"{case.stars} stars, S/N {case.snr:g}, {case}": why for case, why in result.problems.items()},
     }
 
 
-def _described(result: Study, case: Case) -> dict[str, Any]:
+def _case_entry(result: Study, case: Case) -> dict[str, Any]:
     return {**vars(case), "figures": result.metrics.get(case)}
 
 
@@ -67,15 +67,15 @@ def study_columns(result: Study) -> Columns:
     columns = {key: (np.array([getattr(c, key) for c in cases]), "", what) for key, what in about.items()}
     for key in next(iter(result.metrics.values()), {}):
         values: list[Mapping[str, float]] = [result.metrics.get(case, {}) for case in cases]
-        columns[key] = (np.array([v.get(key, np.nan) for v in values]), "", _meaning(key))
+        columns[key] = (np.array([v.get(key, np.nan) for v in values]), "", _metric_description(key))
     problems = np.array([result.problems.get(case, "") for case in cases])
     columns["problem"] = (problems, "", "why it could not be fitted")
     return columns
 
 
-def _meaning(key: str) -> str:
+def _metric_description(key: str) -> str:
     if key.startswith("error_"):
-        return "standard error over the CCDs: " + _meaning(key.removeprefix("error_"))
+        return "standard error over the CCDs: " + _metric_description(key.removeprefix("error_"))
     where = "observed - model, at the stars" if "at_stars" in key else "truth - model, where no star is"
     what = {
         "rms_e": "rms of one component of e",

@@ -51,14 +51,14 @@ def simulate(experiment: Experiment, threads: int | None, reporter: Reporter) ->
 
     def measured(exposure: CcdExposure) -> SimulatedCcd:
         holdout = measure_shapes(exposure.holdout.image, exposure.holdout.pixel_scale, experiment.weight_fwhm)
-        return SimulatedCcd(exposure, holdout, _look_at(experiment, exposure, exposure.observed.image))
+        return SimulatedCcd(exposure, holdout, _centered_and_measured(experiment, exposure, exposure.observed.image))
 
     with experiment.screens(threads, reporter):
         simulated = simulate_ccds(experiment, measured, title="stars", threads=threads, reporter=reporter)
     return list(simulated.results.values())
 
 
-def _look_at(experiment: Experiment, exposure: CcdExposure, images: np.ndarray) -> Observation:
+def _centered_and_measured(experiment: Experiment, exposure: CcdExposure, images: np.ndarray) -> Observation:
     """Centre and measure images of the stars of a CCD, noise included."""
     scale = exposure.observed.pixel_scale
     return observe_ccd(experiment, exposure.name, images, scale, exposure.positions.electrons, noisy=False)
@@ -95,7 +95,7 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
     electrons = stars.electrons * light
     collected = collected_images(experiment, exposed.image, exposed.pixel_scale, electrons)
     images = observe_stamps(collected, electrons, sky, instrument_noise(places.band, places.exposure), rng)
-    found = _look_at(experiment, ccd.exposure, images)
+    found = _centered_and_measured(experiment, ccd.exposure, images)
     snr = signal_to_noise(stars.magnitude - 2.5 * np.log10(light), places.band, places.exposure, width)
     # The noise of e is proportional to 1/(S/N); the factor is that of all stars together.
     noise = np.stack([found.shapes.e1 - ccd.noise_free.shapes.e1, found.shapes.e2 - ccd.noise_free.shapes.e2])

@@ -18,11 +18,11 @@ import numpy as np
 from ...core.errors import ConfigError, DomainError, PachonError
 from ...core.progress import Reporter
 from ...pipeline.config import Configuration, with_options
-from ...pipeline.defaults import require_drawn_stars
 from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_psf.model import FocalPlanePsf
 from ...pipeline.memory import check_memory
 from ...pipeline.psf_model.model import PsfModel
+from ...pipeline.resolved_values import require_drawn_stars
 from .focal_plane import fit_focal_plane
 from .plan import FOCAL_PLANE, NOISE_FREE, PROCESSES, Case, Plan
 from .residuals import Residuals, case_metrics, measure_residuals
@@ -70,12 +70,14 @@ class Study:
             error = excess.std(ddof=1) / np.sqrt(len(excess)) if len(excess) > 1 else 0.0
             if excess.mean() <= error:
                 as_good.append(case)
-        return min(as_good, key=_complexity)
+        return min(as_good, key=_complexity_key)
 
     def best_order(self, stars: int, interpolation: str) -> Case | None:
         """Return the case of the base's basis, components and S/N with the least :attr:`holdout_square`."""
         sought = replace(self.plan.base, stars=stars, interpolation=interpolation)
-        same = [c for c, f in self.metrics.items() if c == replace(sought, order=c.order).settled() and not f["lost"]]
+        same = [
+            c for c, f in self.metrics.items() if c == replace(sought, order=c.order).normalised() and not f["lost"]
+        ]
         return min(same, key=lambda case: self.holdout_square[case].mean()) if same else None
 
 
@@ -111,7 +113,7 @@ def study(config: Configuration, plan: Plan, *, threads: int | None = None, repo
                 for _, group in groupby(sorted(wanted, key=_fit_key), key=_fit_key):
                     together = list(group)
                     try:
-                        models = _models(together[-1], experiment, ccds, observed, threads)
+                        models = _models_of_ccds(together[-1], experiment, ccds, observed, threads)
                         for case in together:
                             found = measure_residuals(experiment, case, ccds, observed, models, threads)
                             samples[case].append(found)
@@ -128,7 +130,7 @@ def study(config: Configuration, plan: Plan, *, threads: int | None = None, repo
     return Study(plan, metrics, {case: problems[case] for case in cases if case in problems}, squares)
 
 
-def _models(
+def _models_of_ccds(
     case: Case,
     experiment: Experiment,
     ccds: Sequence[SimulatedCcd],
@@ -147,7 +149,7 @@ def _fit_key(case: Case) -> tuple[Any, ...]:
     return (case.basis, case.interpolation, case.order, case.stars, 0 if shared else case.components)
 
 
-def _complexity(case: Case) -> tuple[int, int]:
+def _complexity_key(case: Case) -> tuple[int, int]:
     """Return the sort key of a case: focal-plane models last, then the number of free parameters."""
     components = case.components or 10**6
     last = 1 + [*FOCAL_PLANE].index(case.interpolation) if case.interpolation in FOCAL_PLANE else 0

@@ -12,7 +12,7 @@ from ...core.plotting import new_figure, png_bytes, styled
 from ...core.products import image_hdu, table_hdu
 from ...core.random_streams import stream
 from ...core.units import ARCMIN, ARCSEC
-from ...models.ideal_telescope import without_aberration
+from ...models.ideal_telescope import ideal_telescope
 from ...pipeline.measure.correlation import Correlation, shear_correlation
 from ...pipeline.measure.shapes import fwhm, measure_shapes
 from ...pipeline.report.focal_plane_axes import TRUTH, draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
@@ -48,7 +48,7 @@ _COLORS = ("#b8b8b8", "#7fa8d1", "#1f6fbf", "#0b2a55")
 def speckles(bench: Bench) -> Reproduced:
     """Expose one star for up to 15 s through turbulence alone, by the wave engine (Fig. 5)."""
     size, length = bench.scale.speckle_screen
-    telescope = without_aberration(bench.optics.telescope)
+    telescope = ideal_telescope(bench.optics.telescope)
     air = Atmosphere.from_site(
         _SITE,
         bench.seed,
@@ -86,7 +86,7 @@ def speckles(bench: Bench) -> Reproduced:
     coarse = _SPECKLE_STAMP // _SPECKLE_BLOCK
     binned = stack.reshape(-1, coarse, _SPECKLE_BLOCK, coarse, _SPECKLE_BLOCK).sum(axis=(2, 4))
     width = fwhm(binned, _SPECKLE_BLOCK * pixel) / ARCSEC
-    # One moment is a heap of speckles, of no width that means anything.
+    # An instantaneous image is a speckle pattern without a meaningful width.
     width[np.array(_TIMES) < 1.0] = np.nan
     shapes = measure_shapes(stack, pixel, _WEIGHT)
     e = shapes.e1 + 1j * shapes.e2
@@ -166,7 +166,7 @@ def ellipticity(bench: Bench) -> Reproduced:
             _SITE, bench.seed, epoch=epoch, exposure=max(_EXPOSURES), screen_size=scale.screen_size
         )
         for time in _EXPOSURES:
-            begun = beginning(air, time, scale.time_step)
+            begun = shortened_exposure(air, time, scale.time_step)
             e_pairs = _atmosphere_ellipticity(bench, begun, pairs)
             correlated[time].append(shear_correlation(pairs[:, 0], pairs[:, 1], e_pairs.real, e_pairs.imag, **_PAIRS))
             mean_e[time].append(float(np.abs(e_pairs).mean()))
@@ -227,15 +227,15 @@ def ellipticity(bench: Bench) -> Reproduced:
     )
 
 
-def beginning(air: Atmosphere, exposure: float, time_step: float) -> Atmosphere:
-    """Return the beginning of a longer exposure, with the same screens and at least 100 times."""
+def shortened_exposure(air: Atmosphere, exposure: float, time_step: float) -> Atmosphere:
+    """Return the first part of an exposure, with the same screens and at least 100 time steps."""
     count = max(100, round(exposure / time_step))
     return air.at_times((np.arange(count) + 0.5) * (exposure / count), exposure)
 
 
 def _atmosphere_ellipticity(bench: Bench, air: Atmosphere, fields: np.ndarray) -> np.ndarray:
     """Return complex ellipticities of stars through the atmosphere alone."""
-    telescope = without_aberration(bench.optics.telescope)
+    telescope = ideal_telescope(bench.optics.telescope)
     pixel = 0.2 * ARCSEC
     psfs = make_psfs(
         telescope,

@@ -170,7 +170,7 @@ def _budget_plot(rows: Sequence[str], values: Mapping[str, np.ndarray], units: S
 def whiskers_of_optics(bench: Bench) -> Reproduced:
     """Measure ellipticities over the whole focal plane without an atmosphere (Fig. 8), by the wave engine."""
     plane, camera = bench.optics.focal_plane, bench.optics.camera
-    here, across, within = _borders(camera, bench.scale.borders)
+    here, across, within = _border_points(camera, bench.scale.borders)
     grid = _ccd_grid(camera, bench.scale.optics_grid)
     e = optics_ellipticity(bench, np.concatenate([grid, here, across, within]))
     e, *pairs = np.split(e, np.cumsum([len(grid), len(here), len(across)]))
@@ -238,7 +238,7 @@ def _ccd_grid(camera: Camera, per_side: int) -> np.ndarray:
     return camera.from_uv(np.arange(len(camera))[:, None], uv).reshape(-1, 2)
 
 
-def _borders(camera: Camera, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _border_points(camera: Camera, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return points left of borders between CCDs, 1.5 mm away across them, and as far away within the CCD [m]."""
     centers = camera.centers
     # Gaps are narrowest within a raft; only where aberrations are strong do heights show.

@@ -50,7 +50,7 @@ _COLORS = ("black", "#7fa8d1", "#1f6fbf", "#0b2a55", RESIDUAL)
 def layout(bench: Bench) -> Reproduced:
     """Draw the telescope in section with traced rays, and the CCD mosaic (Fig. 1)."""
     telescope, camera = bench.optics.telescope, bench.optics.camera
-    profiles = {surface.name: _profile(surface) for surface in telescope.surfaces}
+    profiles = {surface.name: _section_profile(surface) for surface in telescope.surfaces}
     rays = {angle: _ray_paths(telescope, angle) for angle in _LAYOUT_FIELDS}
     paraxial = first_order(telescope)
     scale = abs(paraxial.arcsec_per_um)
@@ -66,8 +66,13 @@ def layout(bench: Bench) -> Reproduced:
         name: (np.concatenate(values), unit, text)
         for name, values, unit, text in (
             ("field_deg", [np.full(p[..., 0].size, a) for a, p in rays.items()], "deg", "field angle along y"),
-            ("ray", [_numbers(p, 0) for p in rays.values()], "", "ray of that field"),
-            ("point", [_numbers(p, 1) for p in rays.values()], "", "0 where it comes in, then surface by surface"),
+            ("ray", [_point_indices(p, 0) for p in rays.values()], "", "ray of that field"),
+            (
+                "point",
+                [_point_indices(p, 1) for p in rays.values()],
+                "",
+                "0 where it comes in, then surface by surface",
+            ),
             ("y_m", [p[..., 0].ravel() for p in rays.values()], "m", "telescope y"),
             ("z_m", [p[..., 1].ravel() for p in rays.values()], "m", "telescope z from the vertex of M1"),
         )
@@ -85,11 +90,11 @@ def layout(bench: Bench) -> Reproduced:
     )
 
 
-def _numbers(paths: np.ndarray, axis: int) -> np.ndarray:
+def _point_indices(paths: np.ndarray, axis: int) -> np.ndarray:
     return np.indices(paths.shape[:2])[axis].ravel()
 
 
-def _profile(surface: Surface) -> np.ndarray:
+def _section_profile(surface: Surface) -> np.ndarray:
     """Return points (y, z) of a surface in section [m], from rim to rim, with NaN in a central hole."""
     return surface_section(surface, outer_radius(surface.aperture) if surface.aperture else _DETECTOR)[:, 1:]
 

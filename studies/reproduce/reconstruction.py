@@ -84,7 +84,7 @@ def whiskers_of_stars(bench: Bench) -> Reproduced:
     made = bench.pipeline
     e = np.concatenate([np.hypot(p.holdout.e1, p.holdout.e2) for p in made.products])
     mean, largest = float(np.nanmean(e)), float(np.nanmax(e))
-    alike, ratio = _against_optics(bench)
+    alike, ratio = _comparison_with_optics(bench)
     png = whiskers_plot(made.products, made.experiment.focal_plane, bench.optics.field_radius_on_detector, ("truth",))
     return Reproduced(
         {"": png},
@@ -103,7 +103,7 @@ def whiskers_of_stars(bench: Bench) -> Reproduced:
     )
 
 
-def _against_optics(bench: Bench) -> tuple[float, float]:
+def _comparison_with_optics(bench: Bench) -> tuple[float, float]:
     """Return correlation and rms ratio of the pattern with that of the optics alone."""
     products = bench.pipeline.products
     each = min(_COMPARED, max(1, _MOST_COMPARED // len(products)))

@@ -88,7 +88,7 @@ def image_of_the_sky(bench: Bench) -> Reproduced:
     of_visits=True,
 )
 def stacked_ellipticities(bench: Bench) -> Reproduced:
-    """Show the ellipticities of one visit, of the stack, and what models leave (Fig. 15)."""
+    """Show the ellipticities of one visit, of the stack, and of the residuals of models (Fig. 15)."""
     result = bench.stack
     stacks, first, last = result.summary["stacks"], min(result.stacks), max(result.stacks)
     one, many = stacks[str(first)], stacks[str(last)]

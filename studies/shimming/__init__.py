@@ -1,1 +1,1 @@
-"""Shims: motions of rafts or CCDs that make the images of a focal plane sharper."""
+"""Shims: motions of rafts or CCDs that improve the images over a focal plane."""

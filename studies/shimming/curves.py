@@ -19,7 +19,7 @@ _NODES = 9
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Places on CCDs, with shares of the area."""
+    """Positions on CCDs, with fractions of the area."""
 
     ccd: np.ndarray  #: index of the CCD, [n]
     offset: np.ndarray  #: x, y from its centre along its own axes [m], [n, 2]

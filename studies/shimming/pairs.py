@@ -1,6 +1,6 @@
 r"""Correlation of the ellipticities of places as a differentiable sum over their pairs.
 
-With ellipticities e and shares of the area w of n places, xi+ of a bin of separations is the mean over its pairs
+With ellipticities e and fractions of the area w at n positions, xi+ of a bin of separations is the mean over its pairs
 
 .. math:: \xi_b = \frac{\sum_{ij \in b} w_i w_j \, e_i \cdot e_j}{\sum_{ij \in b} w_i w_j},
 

@@ -72,7 +72,7 @@ class StateMetrics:
 
 @dataclass(frozen=True, eq=False)
 class Shims(Result):
-    """Motions of the parts of a focal plane, and what they gain.
+    """Motions of the parts of a focal plane, and their gains.
 
     Attributes
     ----------
@@ -155,43 +155,43 @@ def shim(
             lost = ~np.isfinite(curves.coefficients).all(axis=(0, 2))
             some = plane.names[fit.ccd[np.flatnonzero(lost)[0]]]
             raise DomainError(f"{some}: the PSF has no width or shape within {1e6 * curves.reach:.0f} um of focus")
-    sky, sky_checked = (_sky(experiment, places, threads) for places in (fit, check))
-    edges = _edges(plane, np.concatenate([fit.position, check.position]), np.concatenate([sky, sky_checked]))
+    sky, sky_checked = (_field_angles(experiment, places, threads) for places in (fit, check))
+    edges = _separation_bins(plane, np.concatenate([fit.position, check.position]), np.concatenate([sky, sky_checked]))
     pairs = PairSum.of(sky, fit.weight, edges) if merit == "xi" else None
     whole = [(np.zeros(2), np.arange(len(fit.ccd)))]
     with reporter.stage("motions"):
-        (focus,) = _best(curves, fit, heights, whole, merit, pairs)
-        (level,) = _best(curves, fit, np.zeros_like(heights), whole, merit, pairs)
-        focused = heights + _lift(focus, fit.position)
-        named = _parts(plane, fit, parts)
-        best = _best(curves, fit, focused, [part[1:] for part in named], merit, pairs)
+        (focus,) = _best_motions(curves, fit, heights, whole, merit, pairs)
+        (level,) = _best_motions(curves, fit, np.zeros_like(heights), whole, merit, pairs)
+        focused = heights + _height_change(focus, fit.position)
+        named = _parts_with_places(plane, fit, parts)
+        best = _best_motions(curves, fit, focused, [part[1:] for part in named], merit, pairs)
     motions = {part[0]: motion for part, motion in zip(named, best, strict=True)}
     shimmed = focused.copy()
     for name, center, rows in named:
-        shimmed[rows] += _lift(motions[name], fit.position[rows] - center)
+        shimmed[rows] += _height_change(motions[name], fit.position[rows] - center)
     planes = {
         "as built": plane,
         "focused": moved_whole(plane, focus),
         "shimmed": moved_parts(moved_whole(plane, focus), motions),
         "plane": moved_whole(FocalPlane.flat(plane.camera), level),
     }
-    by_state = (heights, focused, shimmed, _lift(level, fit.position))
+    by_state = (heights, focused, shimmed, _height_change(level, fit.position))
     fitted, checked, correlations = {}, {}, {}
     with reporter.stage("check with the engine at other places"):
         for state, at in zip(STATES, by_state, strict=True):
-            fitted[state], _ = _metrics(fit, curves.at(at), sky, edges)
+            fitted[state], _ = _state_metrics(fit, curves.at(at), sky, edges)
             values = measured(experiment, planes[state], check, threads)
-            checked[state], correlations[state] = _metrics(check, values, sky_checked, edges)
+            checked[state], correlations[state] = _state_metrics(check, values, sky_checked, edges)
     return Shims(merit, parts, focus, motions, fitted, checked, correlations, planes["focused"], planes["shimmed"])
 
 
-def _sky(experiment: Experiment, places: Places, threads: int | None) -> np.ndarray:
+def _field_angles(experiment: Experiment, places: Places, threads: int | None) -> np.ndarray:
     """Return the field angles of places [rad], shape [n, 2]."""
     middle = experiment.wavelengths[len(experiment.wavelengths) // 2]
     return fields_at(experiment.telescope, places.position, middle, threads=threads)
 
 
-def _edges(plane: FocalPlane, positions: np.ndarray, sky: np.ndarray) -> np.ndarray:
+def _separation_bins(plane: FocalPlane, positions: np.ndarray, sky: np.ndarray) -> np.ndarray:
     """Return the edges of the bins of separation of places at positions [m] and field angles [rad]."""
     longest = float(np.hypot(*np.ptp(sky, axis=0)))
     scale = longest / float(np.hypot(*np.ptp(positions, axis=0)))
@@ -207,7 +207,7 @@ def whole_as_rafts(plane: FocalPlane, motion: Motion) -> dict[str, Motion]:
     """Return the motions of rafts, and of CCDs without one, that move the focal plane as a whole, about its origin."""
     camera = plane.camera
     centers = {name: camera.centers[list(members)].mean(axis=0) for name, members in camera.parts.items()}
-    return {raft: Motion(float(_lift(motion, at)), motion.rx, motion.ry) for raft, at in centers.items()}
+    return {raft: Motion(float(_height_change(motion, at)), motion.rx, motion.ry) for raft, at in centers.items()}
 
 
 def moved_parts(plane: FocalPlane, motions: Mapping[str, Motion]) -> FocalPlane:
@@ -229,7 +229,7 @@ def shimmed_configuration(config: Configuration, shims: Shims) -> Configuration:
     return config.model_copy(update={"focal_plane": config.focal_plane.model_copy(update={"moved": moved})})
 
 
-def _parts(plane: FocalPlane, places: Places, parts: str) -> Sequence[tuple[str, np.ndarray, np.ndarray]]:
+def _parts_with_places(plane: FocalPlane, places: Places, parts: str) -> Sequence[tuple[str, np.ndarray, np.ndarray]]:
     """Return name, centre [m] and rows of the places of each part that has some."""
     camera = plane.camera
     if parts == "ccds":
@@ -244,12 +244,12 @@ def _parts(plane: FocalPlane, places: Places, parts: str) -> Sequence[tuple[str,
     return [(camera.raft_names[i], center, np.flatnonzero(raft == i)) for i, center in centers.items()]
 
 
-def _lift(motion: Motion, position: np.ndarray) -> np.ndarray:
+def _height_change(motion: Motion, position: np.ndarray) -> np.ndarray:
     """Return the change of height [m] at positions about the centre of a motion [m], shape [..., 2]."""
     return motion.dz + position[..., 1] * np.tan(motion.rx) - position[..., 0] * np.tan(motion.ry)
 
 
-def _best(
+def _best_motions(
     curves: HeightSeries,
     places: Places,
     heights: np.ndarray,
@@ -260,7 +260,7 @@ def _best(
     """Return the motions of parts, given by centre and rows of their places, that minimise the merit function."""
     separate = merit if pairs is None else "ellipticity"
     found = np.concatenate(
-        [_minimum(curves, places, heights, [part], _VALUES[separate], np.zeros(3)) for part in parts]
+        [_minimise_merit(curves, places, heights, [part], _VALUES[separate], np.zeros(3)) for part in parts]
     )
     if pairs is not None:
 
@@ -272,11 +272,11 @@ def _best(
 
         rows = np.concatenate([rows for _, rows in parts])
         order = np.argsort(rows)
-        found = _minimum(curves, places, heights, parts, value, found)
-    return [_motion(x, places.position[rows] - center) for x, (center, rows) in zip(found, parts, strict=True)]
+        found = _minimise_merit(curves, places, heights, parts, value, found)
+    return [_motion_of_terms(x, places.position[rows] - center) for x, (center, rows) in zip(found, parts, strict=True)]
 
 
-def _minimum(
+def _minimise_merit(
     curves: HeightSeries,
     places: Places,
     heights: np.ndarray,
@@ -288,7 +288,7 @@ def _minimum(
     rows = np.concatenate([rows for _, rows in parts])
     part = np.repeat(np.arange(len(parts)), [len(rows) for _, rows in parts])
     some, weight, before = curves.chosen(rows), places.weight[rows], heights[rows]
-    design = np.concatenate([_design(places.position[rows] - center) for center, rows in parts]) * _UNIT
+    design = np.concatenate([_motion_terms(places.position[rows] - center) for center, rows in parts]) * _UNIT
 
     def merit_function(motion: np.ndarray) -> tuple[float, np.ndarray]:
         new = before + np.einsum("nk,nk->n", design, motion.reshape(-1, 3)[part])
@@ -305,24 +305,24 @@ def _minimum(
     return np.asarray(found.x).reshape(-1, 3)
 
 
-def _design(position: np.ndarray) -> np.ndarray:
+def _motion_terms(position: np.ndarray) -> np.ndarray:
     """Return the lift of places at positions about the centre of a part [n, 2] by piston and two tilts, [n, 3]."""
     x, y = position.T / np.abs(position).max()
     return np.stack([np.ones_like(x), y, -x], axis=1)
 
 
-def _motion(lifts: np.ndarray, position: np.ndarray) -> Motion:
-    """Return the motion of piston and tilts as :func:`_minimum` has them, of a part with places at these positions."""
+def _motion_of_terms(lifts: np.ndarray, position: np.ndarray) -> Motion:
+    """Return the motion of a part with places at these positions, from its piston and tilts in units of `_UNIT`."""
     dz, rx, ry = lifts * _UNIT
     arm = np.abs(position).max()
     return Motion(float(dz), float(np.arctan(rx / arm)), float(np.arctan(ry / arm)))
 
 
-def _width(values: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _width_merit(values: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return values[:, 0], slopes[:, 0]
 
 
-def _square_ellipticity(values: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _ellipticity_merit(values: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     # In units of 1e-3, so that the minimiser has numbers of order one.
     e, change = 1e3 * values[:, 1:], 1e3 * slopes[:, 1:]
     return (e**2).sum(axis=1), 2.0 * (e * change).sum(axis=1)
@@ -330,12 +330,12 @@ def _square_ellipticity(values: np.ndarray, slopes: np.ndarray) -> tuple[np.ndar
 
 #: Merits that are means over places.
 _VALUES: dict[str, Value] = {
-    "fwhm": _width,
-    "ellipticity": _square_ellipticity,
+    "fwhm": _width_merit,
+    "ellipticity": _ellipticity_merit,
 }
 
 
-def _metrics(
+def _state_metrics(
     places: Places, values: np.ndarray, sky: np.ndarray, edges: np.ndarray
 ) -> tuple[StateMetrics, Correlation]:
     """Return means of values [n, 3] at places, and the correlation of their ellipticities."""

@@ -75,7 +75,7 @@ def curves(table: SweepTable, sweep: SweepFile, metric: str) -> list[Curve]:
     found = []
     nominal = {name: p.nominal for name, p in sweep.parameters.items()}
     for name, parameter in sweep.parameters.items():
-        if not _numeric(table, name):
+        if not _is_numeric(table, name):
             continue
         others = [n for n in table.parameters if n != name and n in nominal]
         alone = np.ones(len(table), dtype=bool)
@@ -110,8 +110,8 @@ def budget(table: SweepTable, sweep: SweepFile, metric: str, mark: str) -> Budge
     nominal = {name: p.nominal for name, p in sweep.parameters.items()}
     changes = []
     for seed in np.unique(table.seed):
-        with_all = _at(table, {**nominal, **marked}, seed, metric)
-        without = _at(table, nominal, seed, metric)
+        with_all = _metric_at(table, {**nominal, **marked}, seed, metric)
+        without = _metric_at(table, nominal, seed, metric)
         changes.append(with_all - without)
     together, _, error = (float(v[0]) for v in _over_replicas(np.array(changes)[:, None]))
     ordered = dict(sorted(alone.items(), key=lambda item: -abs(item[1])))
@@ -150,7 +150,7 @@ def rank_correlations(table: SweepTable, metric: str) -> dict[str, tuple[float, 
     found = {}
     good = np.isfinite(table.metrics[metric])
     for name in table.parameters:
-        if not _numeric(table, name) or good.sum() < 4:
+        if not _is_numeric(table, name) or good.sum() < 4:
             continue
         values = table.parameters[name][good].astype(float)
         if np.ptp(values) == 0.0 or np.ptp(table.metrics[metric][good]) == 0.0:
@@ -197,7 +197,7 @@ def summary(table: SweepTable, sweep: SweepFile) -> dict[str, Any]:
     }
 
 
-def _numeric(table: SweepTable, name: str) -> bool:
+def _is_numeric(table: SweepTable, name: str) -> bool:
     return all(isinstance(v, (int, float, np.number)) and not isinstance(v, bool) for v in table.parameters[name])
 
 
@@ -211,7 +211,7 @@ def _over_replicas(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarr
         return mean, spread, spread / np.sqrt(count)
 
 
-def _at(table: SweepTable, point: dict[str, Any], seed: int, metric: str) -> float:
+def _metric_at(table: SweepTable, point: dict[str, Any], seed: int, metric: str) -> float:
     """Return the metric of one point; NaN where it was not computed."""
     here = table.seed == seed
     for name, value in point.items():

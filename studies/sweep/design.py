@@ -37,9 +37,9 @@ def design_points(sweep: SweepFile) -> list[Point]:
     if design.kind == "one_at_a_time":
         return _one_at_a_time(sweep)
     if design.kind == "grid":
-        levels = [_levels(p, design) for p in sweep.parameters.values()]
+        levels = [_parameter_values(p, design) for p in sweep.parameters.values()]
         return [dict(zip(names, values, strict=True)) for values in itertools.product(*levels)]
-    cube = _cube(design, len(names))
+    cube = _unit_cube(design, len(names))
     columns = [_quantiles(p, u) for p, u in zip(sweep.parameters.values(), cube.T, strict=True)]
     return [dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True)]
 
@@ -62,7 +62,7 @@ def _one_at_a_time(sweep: SweepFile) -> list[Point]:
     nominal = {name: p.nominal for name, p in parameters.items()}
     points = [nominal]
     for name, parameter in parameters.items():
-        levels = _levels(parameter, sweep.design)
+        levels = _parameter_values(parameter, sweep.design)
         extra = [v for v in parameter.marks.values() if v not in levels]
         values = [*levels, *dict.fromkeys(extra)]
         if extra:
@@ -75,7 +75,7 @@ def _one_at_a_time(sweep: SweepFile) -> list[Point]:
     return points
 
 
-def _levels(parameter: SweptParameter, design: Design) -> list[Any]:
+def _parameter_values(parameter: SweptParameter, design: Design) -> list[Any]:
     """Return the values of one parameter on a grid or one at a time."""
     count = parameter.points or design.points
     if parameter.values is not None:
@@ -86,7 +86,7 @@ def _levels(parameter: SweptParameter, design: Design) -> list[Any]:
     return [float(v) for v in mean + sigma * np.linspace(-_SIGMAS, _SIGMAS, count)]
 
 
-def _cube(design: Design, dimensions: int) -> np.ndarray:
+def _unit_cube(design: Design, dimensions: int) -> np.ndarray:
     """Return points of the open unit cube, [points, dimensions]."""
     rng = stream(design.seed, "sweep", design.kind)
     if design.kind == "monte_carlo":

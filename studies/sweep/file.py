@@ -114,9 +114,9 @@ class SweepFile(Section):
                 named.append(content.get(key) if isinstance(content, dict) else None)
         for name in _FILE_PARAMETERS - {"telescope"}:
             named += self._values(name)
-        contents = {path: hashlib.sha256(file.read_bytes()).hexdigest() for path, file in self._existing(named)}
+        contents = {path: hashlib.sha256(file.read_bytes()).hexdigest() for path, file in self._existing_files(named)}
         telescopes = [telescope, *self._values("telescope")]
-        contents |= {path: prescription_digest(str(file)) for path, file in self._existing(telescopes)}
+        contents |= {path: prescription_digest(str(file)) for path, file in self._existing_files(telescopes)}
         # A key that is not given leaves the digests of older sweeps as they were.
         left_out = {"fields_deg"} if self.fields_deg is None else set()
         return digest({"sweep": self.model_dump(mode="json", exclude=left_out), "files": contents})
@@ -126,7 +126,7 @@ class SweepFile(Section):
         parameter = self.parameters.get(name)
         return [] if parameter is None else [parameter.nominal, *(parameter.values or ())]
 
-    def _existing(self, names: Iterable[Any]) -> Iterator[tuple[str, Path]]:
+    def _existing_files(self, names: Iterable[Any]) -> Iterator[tuple[str, Path]]:
         """Yield those names that are paths of files, from the folder of the sweep on, and the files."""
         for name in names:
             if isinstance(name, str) and (self._folder / name).is_file():

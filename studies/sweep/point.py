@@ -7,7 +7,7 @@ A parameter is
 - a value of the prescription with its unit: ``M2.dz_um``, ``Camera.rx_urad``, ``M1.Z5_nm``, ``M1.radius_m``; see
   :mod:`pachon.design.parameters.parameters`.
 
-A telescope without a camera has metrics of the optics alone: see :mod:`pachon.studies.sweep.bare_point`.
+A telescope without a camera has metrics of the optics alone: see :mod:`pachon.studies.sweep.telescope_point`.
 
 Random numbers are common to all points of a replica. Heights keep their pattern when a term grows, stars their
 positions, turbulence and wind their course. A difference between two points is then an effect of their parameters.
@@ -28,14 +28,14 @@ from ...design.parameters.changes import parse_change
 from ...pipeline.config import Configuration, configuration_of
 from ...pipeline.defaults import resolve
 from ...pipeline.experiment import Experiment
-from ...pipeline.kept_screens import with_kept_screens
-from ..metrics.bare_telescope import BARE
+from ...pipeline.screen_cache import with_cached_screens
 from ..metrics.scene import Scene
 from ..metrics.stars import STARS
-from .bare_point import bare_metrics, check_bare_sweep, is_bare
+from ..metrics.telescope import TELESCOPE_METRICS
 from .compensation import compensated
 from .file import SweepFile
 from .store import PointResult, SweepPoint
+from .telescope_point import check_telescope_sweep, has_no_camera, point_metrics
 
 _MOTIONS = ("dz_um", "rx_urad", "ry_urad")
 
@@ -58,9 +58,9 @@ class PointMeasurement:
         return PointResult(point.number, metrics, problem, time.perf_counter() - start, worker_name())
 
     def _metrics(self, point: SweepPoint, threads: int) -> dict[str, float]:
-        if is_bare(self.sweep, point.parameters, Path(self.folder)):
-            return bare_metrics(self.sweep, point.parameters, Path(self.folder), threads)
-        experiment = with_kept_screens(point_experiment(self.sweep, point, Path(self.folder)))
+        if has_no_camera(self.sweep, point.parameters, Path(self.folder)):
+            return point_metrics(self.sweep, point.parameters, Path(self.folder), threads)
+        experiment = with_cached_screens(point_experiment(self.sweep, point, Path(self.folder)))
         experiment, solved = compensated(experiment, self.sweep.compensators, threads)
         scene = Scene(experiment.telescope, experiment, threads=threads)
         metrics: dict[str, float] = {}
@@ -83,7 +83,7 @@ def point_configuration(sweep: SweepFile, parameters: dict[str, Any], seed: int,
         if name in keys:
             # One wavelength is the whole band, and one CCD all there is.
             alone = name in ("wavelengths_nm", "ccds")
-            _set(content, name.split("."), [value] if alone else value)
+            _set_value(content, name.split("."), [value] if alone else value)
         elif section in sections or not quantity:
             raise unknown_name("parameter", name, keys)
         else:
@@ -92,9 +92,9 @@ def point_configuration(sweep: SweepFile, parameters: dict[str, Any], seed: int,
     for name, value in changes.items():
         body, _, quantity = name.partition(".")
         if camera is None or body not in (*camera.raft_names, *camera.ccd_names):
-            _set(content, ["changes", name], value)
+            _set_value(content, ["changes", name], value)
         elif quantity in _MOTIONS:
-            _set(content, ["focal_plane", "moved", body, quantity], value)
+            _set_value(content, ["focal_plane", "moved", body, quantity], value)
         else:
             raise unknown_name(f"motion of {body}", quantity, _MOTIONS)
     return configuration_of(content, f"sweep {sweep.name}")
@@ -109,17 +109,17 @@ def check_sweep(sweep: SweepFile, points: list[SweepPoint], folder: Path) -> Non
     """Check names and values, on the first point and the extremes of each parameter."""
     if not points:
         raise ConfigError(f"sweep {sweep.name}: no points to compute")
-    bare = is_bare(sweep, points[0].parameters, folder)
+    camera_free = has_no_camera(sweep, points[0].parameters, folder)
     if not sweep.metrics:
-        raise ConfigError(f"metrics = []: expected some of {', '.join(BARE if bare else STARS)}")
-    if sweep.fields_deg is not None and not bare:
+        raise ConfigError(f"metrics = []: expected some of {', '.join(TELESCOPE_METRICS if camera_free else STARS)}")
+    if sweep.fields_deg is not None and not camera_free:
         raise ConfigError("fields_deg: expected for a telescope without a camera alone")
     for name in sweep.metrics:
-        if not bare and name not in STARS:
+        if not camera_free and name not in STARS:
             raise unknown_name("metric", name, STARS)
     tried: set[int] = {points[0].number}
-    if bare:
-        check_bare_sweep(sweep, points[0].parameters, folder)
+    if camera_free:
+        check_telescope_sweep(sweep, points[0].parameters, folder)
     else:
         telescope = point_experiment(sweep, points[0], folder).telescope
         for name in sweep.compensators:
@@ -129,13 +129,13 @@ def check_sweep(sweep: SweepFile, points: list[SweepPoint], folder: Path) -> Non
         for point in (ordered[0], ordered[-1]):
             if point.number not in tried:
                 tried.add(point.number)
-                if bare:
-                    check_bare_sweep(sweep, point.parameters, folder)
+                if camera_free:
+                    check_telescope_sweep(sweep, point.parameters, folder)
                 else:
                     point_experiment(sweep, point, folder)
 
 
-def _set(content: dict[str, Any], path: list[str], value: Any) -> None:
+def _set_value(content: dict[str, Any], path: list[str], value: Any) -> None:
     for part in path[:-1]:
         content = content.setdefault(part, {})
     content[path[-1]] = value

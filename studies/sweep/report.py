@@ -42,7 +42,7 @@ def write_report(store: SweepStore, folder: Path) -> Path:
         pictures=[picture for _, picture in pictures],
         pachon=store.about["pachon"],
         points=len(store.points()),
-        rows=_rows(table, sweep),
+        rows=_metric_rows(table, sweep),
         parameters={name: described_parameter(name) for name in sweep.parameters},
         problems=[(int(n), p) for n, p in zip(table.number, table.problem, strict=True) if p][:20],
     )
@@ -59,7 +59,7 @@ def sweep_pictures(table: SweepTable, sweep: SweepFile) -> list[tuple[str, Pictu
     pictures = list(_one_at_a_time(table, sweep, drawn)) if drawn else []
     numeric = [n for n, v in table.parameters.items() if v.dtype.kind in "fi" and len(np.unique(v)) > 2]
     if sweep.design.kind != "one_at_a_time" and len(table) >= _ENOUGH and numeric:
-        pictures += _random(table, numeric)
+        pictures += _random_pictures(table, numeric)
     return pictures
 
 
@@ -84,7 +84,7 @@ def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Cu
             picture = Picture(f"Error budget of {metric}", plots.budget_plot(found), _budget_text(found))
             yield f"budget_{metric}", picture
     if sweep.xi_target is not None:
-        # A metric that nothing raises, as xi of a single CCD may be, has no place on logarithmic axes.
+        # A metric that no parameter raises, such as xi of a single CCD, cannot be drawn on logarithmic axes.
         for metric in (m for m in correlated if any(np.any(curve.change > 0) for curve in drawn[m])):
             allowed = allowances(drawn[metric], sweep.xi_target)
             each = (f"{a.parameter}: {with_error(a.alone, a.error * a.alone)} alone, "
@@ -127,7 +127,7 @@ def _budget_text(found: list[Budget]) -> str:
     ) + " ".join(texts)
 
 
-def _random(table: SweepTable, numeric: list[str]) -> Iterator[tuple[str, Picture]]:
+def _random_pictures(table: SweepTable, numeric: list[str]) -> Iterator[tuple[str, Picture]]:
     ranks = {metric: rank_correlations(table, metric) for metric in table.metrics}
     ranks = {metric: each for metric, each in ranks.items() if each}
     if not ranks:
@@ -145,7 +145,7 @@ def _random(table: SweepTable, numeric: list[str]) -> Iterator[tuple[str, Pictur
             yield f"pairs_{metric}", Picture(f"{metric} over pairs", plots.pairs_plot(table, metric, names), text)
 
 
-def _rows(table: SweepTable, sweep: SweepFile) -> list[dict[str, str]]:
+def _metric_rows(table: SweepTable, sweep: SweepFile) -> list[dict[str, str]]:
     """Return range and median of each metric, and its scatter over the replicas, with the digits that it allows."""
     rows = []
     for name, values in table.metrics.items():

@@ -77,8 +77,8 @@ class StoreKind:
     """Words of messages about the store of a study."""
 
     name: str  #: "sweep"
-    maker: str  #: what makes such a store
-    rescue: str  #: what to do about a damaged one
+    maker: str  #: command or function that makes such a store
+    rescue: str  #: remedy for a damaged one
 
     @property
     def article(self) -> str:
@@ -100,7 +100,7 @@ class SweepStore:
         if not path.is_file():
             raise ProductError(f"no such file; expected the store of {kind.article}, such as {kind.maker}", file=path)
         self.path, self.kind = path, kind
-        with self.guarded():
+        with self.sqlite_errors():
             self._connection = sqlite3.connect(path, timeout=30.0)
             about = dict(self._connection.execute("SELECT key, value FROM about"))
         if about.get("format") != str(FORMAT):
@@ -115,37 +115,37 @@ class SweepStore:
 
     def close(self) -> None:
         """Close the file, with the content of the write-ahead log."""
-        with self.guarded():
+        with self.sqlite_errors():
             self._connection.close()
 
     @property
     def sweep(self) -> SweepFile:
         """Sweep of the store."""
-        with self.guarded():
+        with self.sqlite_errors():
             return read_sweep(json.loads(self.about["sweep"]), str(self.path))
 
     def points(self) -> list[SweepPoint]:
         """Return all points in order."""
-        with self.guarded():
+        with self.sqlite_errors():
             rows = self._connection.execute("SELECT number, parameters, seed FROM points ORDER BY number").fetchall()
             return [SweepPoint(number, json.loads(parameters), seed) for number, parameters, seed in rows]
 
     def results(self) -> list[PointResult]:
         """Return the results so far, in the order of the points."""
-        with self.guarded():
+        with self.sqlite_errors():
             rows = self._connection.execute(
                 "SELECT number, metrics, problem, seconds, worker FROM results ORDER BY number"
             ).fetchall()
-            return [_result(*row) for row in rows]
+            return [_point_result(*row) for row in rows]
 
     def finished(self) -> set[int]:
         """Return the numbers of the points with results."""
-        with self.guarded():
+        with self.sqlite_errors():
             return {number for (number,) in self._connection.execute("SELECT number FROM results")}
 
     def forget_problems(self) -> int:
         """Delete results of points that could not be computed, and return their number."""
-        with self.guarded(), self._connection:
+        with self.sqlite_errors(), self._connection:
             return self._connection.execute("DELETE FROM results WHERE problem IS NOT NULL").rowcount
 
     def write(self, result: PointResult) -> None:
@@ -158,18 +158,18 @@ class SweepStore:
             result.worker,
             VERSION,
         )
-        with self.guarded(), self._connection:
+        with self.sqlite_errors(), self._connection:
             self._connection.execute("INSERT OR IGNORE INTO results VALUES (?, ?, ?, ?, ?, ?)", row)
 
     @contextmanager
-    def guarded(self) -> Iterator[None]:
+    def sqlite_errors(self) -> Iterator[None]:
         """Raise a ProductError where the file cannot be read or written, or its content is not that of a store."""
         try:
             yield
         except sqlite3.Error as error:
-            raise _problem(self.path, error, self.kind) from None
+            raise _store_error(self.path, error, self.kind) from None
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
-            raise _damaged(self.path, error, self.kind) from None
+            raise _damaged_error(self.path, error, self.kind) from None
 
 
 def create_store(
@@ -201,17 +201,17 @@ def create_store(
             connection.close()
         publish_new(partial, path)
         # Of a store that was removed; nobody has opened the new one yet.
-        for leftover in _beside(path):
+        for leftover in _sqlite_companions(path):
             leftover.unlink(missing_ok=True)
     except FileExistsError:
         raise store_exists(path) from None
     except sqlite3.Error as error:
-        raise _problem(path, error, kind) from None
+        raise _store_error(path, error, kind) from None
     except OSError as error:
         raise ProductError(f"cannot write {path}: {error.strerror or error}") from None
     finally:
         with suppress(OSError):
-            for leftover in (partial, *_beside(partial)):
+            for leftover in (partial, *_sqlite_companions(partial)):
                 leftover.unlink(missing_ok=True)
 
 
@@ -252,30 +252,32 @@ def check_same_sweep(store: SweepStore, sweep: StoredStudy) -> None:
 
 def exact_json(value: Any) -> str:
     """Return canonical JSON in which every double keeps all its digits; not-a-number becomes null."""
-    return json.dumps(_finite(value), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return json.dumps(
+        _null_if_not_finite(value), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+    )
 
 
-def _finite(value: Any) -> Any:
+def _null_if_not_finite(value: Any) -> Any:
     if isinstance(value, dict):
-        return {str(k): _finite(v) for k, v in value.items()}
+        return {str(k): _null_if_not_finite(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_finite(v) for v in value]
+        return [_null_if_not_finite(v) for v in value]
     if isinstance(value, float) and value - value != 0.0:
         return None
     return value
 
 
-def _result(number: int, metrics: str | None, problem: str | None, seconds: float, worker: str) -> PointResult:
+def _point_result(number: int, metrics: str | None, problem: str | None, seconds: float, worker: str) -> PointResult:
     values = None if metrics is None else {k: float("nan") if v is None else v for k, v in json.loads(metrics).items()}
     return PointResult(number, values, problem, seconds, worker)
 
 
-def _beside(path: Path) -> Sequence[Path]:
+def _sqlite_companions(path: Path) -> Sequence[Path]:
     """Return the files that SQLite keeps beside a store."""
     return [path.with_name(path.name + ending) for ending in ("-wal", "-shm", "-journal")]
 
 
-def _problem(path: Path, error: sqlite3.Error, kind: StoreKind) -> ProductError:
+def _store_error(path: Path, error: sqlite3.Error, kind: StoreKind) -> ProductError:
     """Return an error of SQLite as one line with the remedy."""
     text = str(error)
     if "full" in text or "disk I/O" in text:
@@ -285,10 +287,10 @@ def _problem(path: Path, error: sqlite3.Error, kind: StoreKind) -> ProductError:
     if "locked" in text:
         return ProductError(f"cannot write {path}: {text}; is another {kind.name} writing to it?")
     if "malformed" in text or "not a database" in text or "no such table" in text:
-        return _damaged(path, error, kind)
+        return _damaged_error(path, error, kind)
     return ProductError(text, file=path)
 
 
-def _damaged(path: Path, error: Exception, kind: StoreKind) -> DamagedStoreError:
+def _damaged_error(path: Path, error: Exception, kind: StoreKind) -> DamagedStoreError:
     text = cut_short(" ".join(str(error).split()), 120)
     return DamagedStoreError(f"damaged, or no store of {kind.article} ({text}); {kind.rescue}", file=path)

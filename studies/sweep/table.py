@@ -19,8 +19,8 @@ from ...core.result import Result
 from ...core.schema import key_description
 from ...core.table_files import write_table
 from ...pipeline.config import Configuration
-from ..metrics.bare_telescope import BARE
 from ..metrics.stars import STARS
+from ..metrics.telescope import TELESCOPE_METRICS
 from .store import SweepStore, readable_rows
 
 #: Motions in names of parameters.
@@ -87,7 +87,7 @@ def load_sweep_table(path: str | os.PathLike[str]) -> SweepTable:
 
 def read_table(store: SweepStore) -> SweepTable:
     """Return the table of a store, in the order of the points."""
-    with store.guarded():
+    with store.sqlite_errors():
         points = {p.number: p for p in store.points()}
         results = store.results()
         rows = [points[r.number] for r in results]
@@ -141,7 +141,7 @@ def _columns(table: SweepTable) -> Columns:
         "number": (table.number, "", "number of the point"),
         "seed": (table.seed, "", "seed of its random numbers"),
     }
-    columns |= {name: (_plain(values), *described_parameter(name)) for name, values in table.parameters.items()}
+    columns |= {name: (_plain_column(values), *described_parameter(name)) for name, values in table.parameters.items()}
     columns |= {name: (values, *described_metric(name)) for name, values in table.metrics.items()}
     columns["problem"] = (table.problem, "", "reason why it could not be computed")
     columns["seconds"] = (table.seconds, "s", "time of the computation")
@@ -150,7 +150,7 @@ def _columns(table: SweepTable) -> Columns:
 
 def described_metric(name: str) -> Description:
     """Return unit and definition of a metric of a sweep."""
-    metric = STARS.metric(name) or BARE.metric(name)
+    metric = STARS.metric(name) or TELESCOPE_METRICS.metric(name)
     if metric is not None:
         return Description(metric.unit, metric.meaning)
     solved = name.startswith("solved ")
@@ -169,7 +169,7 @@ def described_parameter(name: str) -> Description:
     return Description(_unit(name), text)
 
 
-def _plain(values: np.ndarray) -> np.ndarray:
+def _plain_column(values: np.ndarray) -> np.ndarray:
     """Return a column as numbers or as text; parameters without a value at a point become NaN or empty."""
     if values.dtype.kind != "O":
         return values

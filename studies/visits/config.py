@@ -23,8 +23,8 @@ from ...imaging.config import GalaxySourceConfig
 from ...imaging.exposure import Exposure
 from ...imaging.galaxies import GalaxySource
 from ...pipeline.config import Configuration, digest, section_yaml, with_options, with_run
-from ...pipeline.defaults import require_drawn_stars
 from ...pipeline.experiment import Experiment
+from ...pipeline.resolved_values import require_drawn_stars
 from .plan import Visit, plan_visits
 
 #: Pixels along a side of the stamps of the stack, and of those of a visit, of which turned axes cut the corners.
@@ -33,7 +33,7 @@ CENTRAL_RAFT = "R22"
 
 
 class VisitsSection(Section):
-    """How the field is visited, and what is looked at."""
+    """Schedule of the visits, and their stars and stacks."""
 
     count: Count = Field(10, le=100_000, description="number of visits")
     dither_deg: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=0, le=5)] = Field(
@@ -59,7 +59,7 @@ _ANGLES = {key: VisitsSection.model_fields[key].default for key in ("roll_deg", 
 
 
 class VisitsConfig(Section):
-    """All that decides a stack of visits."""
+    """Settings of a stack of visits, which determine its products."""
 
     run: Configuration = Configuration()
     visits: VisitsSection = VisitsSection()
@@ -86,12 +86,12 @@ class VisitsConfig(Section):
     def digest(self, experiment: Experiment) -> str:
         """SHA-256 of all settings that affect the PSFs of a visit; galaxies, visits' number and kept stacks do not."""
         visits = self.visits.model_dump(mode="json", exclude={"count", "snapshots"})
-        # Angles that are left as they were before there were these keys leave the products of then usable.
+        # Default angles are left out, so that products from before these keys stay valid.
         visits = {key: value for key, value in visits.items() if key not in _ANGLES or value != _ANGLES[key]}
         return digest({"run": experiment.config_hash, "ccds": experiment.config.ccds, "visits": visits})
 
     def galaxies_digest(self, experiment: Experiment, **content: Any) -> str:
-        """SHA-256 of the visits, of what else decides products, and of galaxies that are not the usual ones."""
+        """SHA-256 of the settings of the visits, of `content`, and of galaxies other than the default ones."""
         own = {} if self.galaxies == GalaxySourceConfig() else {"galaxies": self.galaxies.content()}
         return digest({"visits": self.digest(experiment), **content, **own})
 
@@ -118,7 +118,7 @@ class VisitsConfig(Section):
         return self.plan_of(self.visits.count, seed)
 
     def plan_of(self, count: int, seed: int) -> tuple[Visit, ...]:
-        """Return the visits, if there were so many of them."""
+        """Return the first `count` visits."""
         visits = self.visits
         try:
             return plan_visits(

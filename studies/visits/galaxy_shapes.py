@@ -93,7 +93,7 @@ def measure_galaxies(
     seed, *key
         Random stream of the noise.
     reach : float
-        Galaxies farther from every place where the PSF is known are left out [rad].
+        Largest distance of galaxies from the nearest position with a known PSF [rad].
     threads : int, optional
         Number of threads; all processors by default. No byte depends on it.
     """
@@ -103,7 +103,7 @@ def measure_galaxies(
     distance, nearest = tree.query(pixels * exposure.pixel_scale, distance_upper_bound=reach)
     near = np.flatnonzero(np.isfinite(distance))
     psf = places[nearest[near]]
-    widths = _half_light(stack.true[places])
+    widths = _half_light_radii(stack.true[places])
     width = widths[nearest[near]]
     on_image = np.hypot(galaxies.radius[near] / exposure.pixel_scale, width)
     electrons = exposure.electrons(galaxies.magnitude[near])
@@ -112,13 +112,13 @@ def measure_galaxies(
     found: list[tuple[np.ndarray, GalaxyFits, GalaxyFits]] = []
     rng = stream(seed, *key)
     for side, rows in zip(_SIDES, (on_image <= _LARGE, on_image > _LARGE), strict=True):
-        for own in _blocks(np.flatnonzero(rows)):
+        for own in _row_blocks(np.flatnonzero(rows)):
             size = 2 * side
             used, index = np.unique(psf[own], return_inverse=True)
             spectra = galaxies.transform(
                 near[own], np.broadcast_to(axes, (len(own), 2, 2)), offset[own], size, threads=threads
             )
-            spectra *= _transforms(stack.true[used], size)[index]
+            spectra *= _psf_transforms(stack.true[used], size)[index]
             images = fft.irfft2(spectra, s=(size, size), workers=1)[:, side // 2 : -side // 2, side // 2 : -side // 2]
             images *= electrons[own, None, None].astype(np.float32)
             variance = exposure.noise_rms**2
@@ -130,14 +130,14 @@ def measure_galaxies(
                 images, every, stack.true[used], psf_index=index, start=by_model, threads=threads
             )
             found.append((own, by_model, by_true))
-    return _shapes(galaxies, near, pixels * exposure.pixel_scale, width, found)
+    return _joined_shapes(galaxies, near, pixels * exposure.pixel_scale, width, found)
 
 
-def _blocks(rows: np.ndarray) -> Iterator[np.ndarray]:
+def _row_blocks(rows: np.ndarray) -> Iterator[np.ndarray]:
     return (rows[i : i + _BLOCK] for i in range(0, len(rows), _BLOCK))
 
 
-def _transforms(psfs: np.ndarray, size: int) -> np.ndarray:
+def _psf_transforms(psfs: np.ndarray, size: int) -> np.ndarray:
     """Return the transforms of PSFs [n, m, m] centred on pixel ``size // 2``, complex64 [n, size, size // 2 + 1]."""
     wide = np.zeros((len(psfs), size, size), dtype=np.float32)
     first = size // 2 - psfs.shape[1] // 2
@@ -145,7 +145,7 @@ def _transforms(psfs: np.ndarray, size: int) -> np.ndarray:
     return fft.rfft2(wide, workers=1)
 
 
-def _half_light(psfs: np.ndarray) -> np.ndarray:
+def _half_light_radii(psfs: np.ndarray) -> np.ndarray:
     """Return half-light radii of PSFs of unit sum from their growth curves [pixel]."""
     half = psfs.shape[1] // 2
     y, x = np.mgrid[-half : half + 1, -half : half + 1]
@@ -156,7 +156,7 @@ def _half_light(psfs: np.ndarray) -> np.ndarray:
     return np.array([np.interp(0.5, curve, radius) for curve in np.maximum.accumulate(growth, axis=1)])
 
 
-def _shapes(
+def _joined_shapes(
     galaxies: Sources,
     near: np.ndarray,
     positions: np.ndarray,

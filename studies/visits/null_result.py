@@ -7,32 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from ...pipeline.catalogue.shear_calibration import ShearCalibration
 from ...pipeline.measure.correlation import Correlation
 from .galaxy_shapes import GalaxyShapes
 
 
-@dataclass(frozen=True)
-class ShearBias:
-    """Measured shear as a function of the true one, (1 + m) g + c, of both components.
-
-    Attributes
-    ----------
-    m, m_error : ndarray, shape [2]
-        Multiplicative bias of g1 and g2 and its standard error.
-    c, c_error : ndarray, shape [2]
-        Additive bias and its standard error.
-    n_rings : int
-        Rings of galaxies used.
-    """
-
-    m: np.ndarray
-    m_error: np.ndarray
-    c: np.ndarray
-    c_error: np.ndarray
-    n_rings: int
-
-
-def shear_bias(e: np.ndarray, shear: np.ndarray) -> ShearBias:
+def shear_bias(e: np.ndarray, shear: np.ndarray) -> ShearCalibration:
     """Return the bias from galaxies under a shear and its opposite, with the same noise (Pujol et al. 2019).
 
     Shapes and noise cancel in the difference of the two, and so hardly add to the error of m.
@@ -57,7 +37,7 @@ def shear_bias(e: np.ndarray, shear: np.ndarray) -> ShearBias:
         ends = [(v.mean(), v.std(ddof=1) / np.sqrt(len(v))) if len(v) > 1 else (np.nan, np.nan) for v in (response, c)]
         biases.append((ends[0][0] - 1.0, ends[0][1], *ends[1]))
     m, m_error, c, c_error = np.array(biases).T
-    return ShearBias(m, m_error, c, c_error, int(whole.sum()))
+    return ShearCalibration(m, m_error, c, c_error, int(whole.sum()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +55,7 @@ class NullTest:
     correlations : dict of str to Correlation
         ``model``: ellipticities measured with the PSF of the models; ``true``: with the true PSF; ``difference``: of
         the two, of galaxies that are usable with either.
-    calibration : dict of str to ShearBias
+    calibration : dict of str to ShearCalibration
         Biases of the shear with the PSF of the models and the true one.
     """
 
@@ -83,7 +63,7 @@ class NullTest:
     galaxies: GalaxyShapes
     density: float
     correlations: dict[str, Correlation]
-    calibration: dict[str, ShearBias]
+    calibration: dict[str, ShearCalibration]
 
 
 def null_metrics(result: NullTest) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Null test: shear correlation of galaxies that no shear has touched, after any number of visits."""
+"""Null test: shear correlation of unsheared galaxies in stacks of visits."""
 
 from __future__ import annotations
 
@@ -15,27 +15,28 @@ from ...core.files import make_folder, write_bytes, write_json
 from ...core.ordered_jobs import ordered_results
 from ...core.products import Stamp, column, read_fits, table_hdu, write_fits
 from ...core.progress import Reporter
-from ...core.random_streams import natural
+from ...core.random_streams import natural_number
 from ...core.units import ARCMIN
 from ...core.workers import MakeWorkers
 from ...imaging.exposure import Exposure
 from ...imaging.galaxies import SkyGalaxies
+from ...pipeline.catalogue.shear_calibration import ShearCalibration
 from ...pipeline.measure.correlation import Correlation
 from ...pipeline.run_folder import CONFIG_NAME
 from ...sky.galaxies import Galaxies
 from ...sky.mosaic import PlantedGalaxies
 from .config import STACK_STAMP, load_visits_configuration
 from .galaxy_shapes import GalaxyShapes, measure_galaxies
-from .measures import correlations
-from .null_result import NullTest, ShearBias, null_metrics, shear_bias
+from .null_result import NullTest, null_metrics, shear_bias
 from .plots import density_picture, null_test_picture
 from .psf_visit import StackFrame, stack_limit
 from .stack import PsfStack
+from .stack_metrics import correlations
 from .visits import cell_of, pixel_scale_of, stack_path
 
 #: S/N of a star as faint as the faintest galaxies that are drawn: fainter ones have no useful ellipticity.
 _FAINTEST_SNR = 8.0
-#: Galaxies farther from all places with a known PSF than this are left out, over the mean distance of the places.
+#: Largest distance of galaxies from the nearest position with a known PSF, over the mean distance of these.
 REACH = 2.0
 #: Shear of the calibration.
 SHEAR = 0.02
@@ -102,14 +103,14 @@ def null_test(
         stack = PsfStack.read(stack_path(folder, visits), Stamp(config.digest(experiment), seed))
         exposure = Exposure.of_run(experiment, visits, gain=1.0, pixel_scale=scale)
         galaxies_in = source.down_to(faintest := stack_limit(experiment, _FAINTEST_SNR, visits))
-        chosen = _tiles(stack, cell, config.visits.places)[:tiles]
+        chosen = _covered_tiles(stack, cell, config.visits.places)[:tiles]
         if not chosen:
             raise DomainError(f"{folder}: no part of the sky as large as a CCD was seen by half of {visits} visits")
         paths = [folder / "galaxies" / f"visits_{visits:04d}_tile_{i:+03d}_{j:+03d}.fits" for i, j in chosen]
         todo = [
-            (tile, path) for tile, path in zip(chosen, paths, strict=True) if not (resume and _finished(path, stamp))
+            (tile, path) for tile, path in zip(chosen, paths, strict=True) if not (resume and _is_finished(path, stamp))
         ]
-        depth = _Depth(stack, frame.matrix, exposure, galaxies_in, seed, cell, reach)
+        depth = _StackMeasurement(stack, frame.matrix, exposure, galaxies_in, seed, cell, reach)
         results = ordered_results(
             measure_job,
             [*(path.stem for _, path in todo), *(f"ring {k}, shear {sign:+.0f}" for k, sign in _RING_JOBS)],
@@ -121,8 +122,8 @@ def null_test(
         )
         for _, path in todo:
             write_shapes(path, next(results), stamp)
-        # What a resumed test reads, so that both have the same numbers.
-        parts = [_read(path, stamp) for path in paths]
+        # Read from the files, as by a resumed test, so that both have the same numbers.
+        parts = [_read_shapes(path, stamp) for path in paths]
         galaxies = GalaxyShapes.joined(parts)
         if (n := int((galaxies.usable & galaxies.true_usable).sum())) < 2:
             text = f"{n} of {len(galaxies)} galaxies to magnitude {faintest:.2f} are usable in {visits} visits"
@@ -138,7 +139,7 @@ def null_test(
     return found
 
 
-def _tiles(stack: PsfStack, cell: float, places: int) -> list[tuple[int, int]]:
+def _covered_tiles(stack: PsfStack, cell: float, places: int) -> list[tuple[int, int]]:
     """Return the tiles in which at least three quarters of the places are known, from the pointing outwards."""
     own = ~stack.star
     corner = np.floor(np.stack([stack.xi, stack.eta], axis=1)[own] / cell + 0.5).astype(int)
@@ -147,13 +148,13 @@ def _tiles(stack: PsfStack, cell: float, places: int) -> list[tuple[int, int]]:
     return sorted(known, key=lambda tile: (tile[0] ** 2 + tile[1] ** 2, tile))
 
 
-def _ranges(tile: tuple[int, int], cell: float) -> list[tuple[float, float]]:
+def _tile_ranges(tile: tuple[int, int], cell: float) -> list[tuple[float, float]]:
     """Return the ranges of xi and eta of a tile [rad]."""
     return [(cell * (k - 0.5), cell * (k + 0.5)) for k in tile]
 
 
 @dataclass(frozen=True, eq=False)
-class _Depth:
+class _StackMeasurement:
     """Stack of a number of visits, and the galaxies that are measured in it."""
 
     stack: PsfStack
@@ -167,10 +168,10 @@ class _Depth:
     def jobs(self, todo: list[tuple[int, int]], tiles: list[tuple[int, int]], rings: int) -> Iterator[dict[str, Any]]:
         """Yield the arguments of :func:`measure_galaxies` for tiles, and then for the rings of all tiles."""
         for tile in todo:
-            key: tuple[str | int, ...] = ("null test", self.stack.visits, *map(natural, tile))
-            yield self._job(self.galaxies_in(*_ranges(tile, self.cell)), key)
+            key: tuple[str | int, ...] = ("null test", self.stack.visits, *map(natural_number, tile))
+            yield self._job(self.galaxies_in(*_tile_ranges(tile, self.cell)), key)
         galaxies = self.ring_galaxies(tiles, rings)
-        shear = SHEAR * _along(len(galaxies))
+        shear = SHEAR * _shear_along_diagonal(len(galaxies))
         for k, sign in _RING_JOBS:
             rotated = galaxies.rotated(np.pi * k / _ORIENTATIONS)
             sheared = rotated.sheared(sign * shear.real, sign * shear.imag)
@@ -178,11 +179,11 @@ class _Depth:
 
     def ring_galaxies(self, tiles: list[tuple[int, int]], rings: int) -> Galaxies | PlantedGalaxies:
         """Return galaxies for so many rings, those of the first tiles that have them."""
-        parts = [self.galaxies_in(*_ranges(tiles[0], self.cell))]
+        parts = [self.galaxies_in(*_tile_ranges(tiles[0], self.cell))]
         for tile in tiles[1:]:
             if sum(map(len, parts)) >= rings:
                 break
-            parts.append(self.galaxies_in(*_ranges(tile, self.cell)))
+            parts.append(self.galaxies_in(*_tile_ranges(tile, self.cell)))
         kind: Any = type(parts[0])
         galaxies = kind.concatenate(parts)
         return galaxies.take(np.arange(min(rings, len(galaxies))))
@@ -214,7 +215,7 @@ def measure_job(job: dict[str, Any], threads: int) -> GalaxyShapes:
     )
 
 
-def _along(n: int) -> np.ndarray:
+def _shear_along_diagonal(n: int) -> np.ndarray:
     """Return the directions of the shear of n galaxies: every other one along x = y."""
     return np.where(np.arange(n) % 2 == 0, 1.0, 1j)
 
@@ -229,7 +230,7 @@ def _correlations(galaxies: GalaxyShapes, patch: np.ndarray) -> dict[str, Correl
     return correlations(galaxies.x, galaxies.y, kinds, patch)
 
 
-def _calibration(axes: np.ndarray, n: int, measured: list[GalaxyShapes]) -> dict[str, ShearBias]:
+def _calibration(axes: np.ndarray, n: int, measured: list[GalaxyShapes]) -> dict[str, ShearCalibration]:
     """Return the biases of the shear from n rings of galaxies, each under a shear and its opposite, with one noise."""
     along = {kind: np.full((2, n, _ORIENTATIONS), np.nan + 0j) for kind in ("model", "true")}
     for (k, sign), found in zip(_RING_JOBS, measured, strict=True):
@@ -237,7 +238,7 @@ def _calibration(axes: np.ndarray, n: int, measured: list[GalaxyShapes]) -> dict
             e1, e2, usable = (getattr(found, prefix + name) for name in ("e1", "e2", "usable"))
             along[kind][int(sign < 0.0), found.index[usable], k] = (e1 + 1j * e2)[usable]
     # Ellipticities are along the axes of the stack, the shear along those of the sky.
-    return {kind: shear_bias(e, ellipticity_along(axes, SHEAR * _along(n))) for kind, e in along.items()}
+    return {kind: shear_bias(e, ellipticity_along(axes, SHEAR * _shear_along_diagonal(n))) for kind, e in along.items()}
 
 
 def ellipticity_along(axes: np.ndarray, e: np.ndarray) -> np.ndarray:
@@ -270,7 +271,7 @@ def write_shapes(path: Path, galaxies: GalaxyShapes, stamp: Stamp) -> None:
     write_fits(path, [table_hdu("GALAXIES", columns)], stamp, [])
 
 
-def _read(path: Path, stamp: Stamp) -> GalaxyShapes:
+def _read_shapes(path: Path, stamp: Stamp) -> GalaxyShapes:
     """Return the galaxies of a finished tile; ProductError for a damaged one or one of another configuration."""
     hdus = read_fits(path)
     if not stamp.matches(hdus[0].header):
@@ -279,9 +280,9 @@ def _read(path: Path, stamp: Stamp) -> GalaxyShapes:
     return GalaxyShapes(**{n: v * _COLUMNS[n][0] if _COLUMNS[n][0] != 1.0 else v for n, v in found.items()})
 
 
-def _finished(path: Path, stamp: Stamp) -> bool:
+def _is_finished(path: Path, stamp: Stamp) -> bool:
     try:
-        _read(path, stamp)
+        _read_shapes(path, stamp)
     except ProductError:
         return False
     return True

@@ -10,9 +10,9 @@ from ...core.plotting import BLUE, GREY, ORANGE, new_figure, png_bytes, styled
 from ...core.units import ARCMIN
 from ...pipeline.report.focal_plane_axes import draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
 from ...pipeline.report.statistics_plots import draw_correlation, log_axes
-from .measures import Correlated
 from .null_result import NullTest, amplitude, density_slope, shot_noise
 from .stack import PsfStack
+from .stack_metrics import StackCorrelations
 
 _STYLES = {
     "psf": (BLUE, "o", "PSF"),
@@ -29,7 +29,7 @@ _MOST = 2500
 
 
 def ellipticity_picture(stacks: Mapping[int, PsfStack]) -> bytes:
-    """Draw whiskers of the PSF of the first and the last stack, and of what the model leaves of the last (Fig. 15)."""
+    """Draw whiskers of the PSF of the first and the last stack, and of the residual in the last (Fig. 15)."""
     first, last = stacks[min(stacks)], stacks[max(stacks)]
     panels = [(first, "PSF", first.e1, first.e2)] if first is not last else []
     panels += [
@@ -59,8 +59,8 @@ def ellipticity_picture(stacks: Mapping[int, PsfStack]) -> bytes:
         return png_bytes(figure)
 
 
-def correlation_picture(found: Mapping[int, Correlated]) -> bytes:
-    """Draw xi+ of each stack: of the PSF, and of what the model leaves at stars and where no star is (Fig. 16)."""
+def correlation_picture(found: Mapping[int, StackCorrelations]) -> bytes:
+    """Draw xi+ of each stack: of the PSF, and of the residuals at stars and between them (Fig. 16)."""
     with styled():
         figure = new_figure(4.2 * len(found) + 1.0, 4.8)
         panels = figure.subplots(1, len(found), sharex=True, sharey=True, squeeze=False)[0]
@@ -77,7 +77,7 @@ def correlation_picture(found: Mapping[int, Correlated]) -> bytes:
 
 
 def null_test_picture(results: Mapping[int, NullTest]) -> bytes:
-    """Draw xi+ of galaxies that are not sheared, and what the PSF models add to it (Fig. 17)."""
+    """Draw xi+ of unsheared galaxies, and the contribution of the PSF models to it (Fig. 17)."""
     with styled():
         figure = new_figure(4.2 * len(results) + 1.0, 4.8)
         panels = figure.subplots(1, len(results), sharex=True, sharey=True, squeeze=False)[0]

@@ -13,10 +13,10 @@ from ...core.progress import Reporter
 from ...core.units import ARCSEC
 from ...models.telescope import Telescope
 from ...pipeline.config import with_options
-from ...pipeline.defaults import given
 from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_psf.stars import CcdStars, FocalPlaneStars
 from ...pipeline.focal_plane_stage import fit_focal_plane_model
+from ...pipeline.resolved_values import resolved_value
 from ...pipeline.simulate.ccd_exposure import CcdExposure, ccd_bounds
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_model import fit_ccd_model
@@ -148,14 +148,14 @@ def visit_psfs(
         counts = stars.electrons * seen.lit_fraction
         images = collected_images(experiment, seen.image, seen.pixel_scale, counts)
         observation = observe_ccd(experiment, exposure.name, images, seen.pixel_scale, counts, noisy=True)
-        true = np.concatenate([exposure.holdout.image, given(exposure.centered).image])
+        true = np.concatenate([exposure.holdout.image, resolved_value(exposure.centered).image])
         if together:
             return _CcdResult(exposure, observation, counts, true, None)
         width = effective_fwhm(true, seen.pixel_scale)
         dimmed = stars.magnitude - 2.5 * np.log10(seen.lit_fraction)
         snr = signal_to_noise(dimmed, stars.band, config.atmosphere.exposure_s, width)
         model = fit_ccd_model(experiment, observation, stars, snr)
-        return _CcdResult(exposure, observation, counts, true, model.at(_points(stars)))
+        return _CcdResult(exposure, observation, counts, true, model.at(_positions_in_order(stars)))
 
     with experiment.screens(threads, reporter):
         simulated = simulate_ccds(
@@ -196,7 +196,7 @@ def _star_fields(
     band, seconds = experiment.band, config.atmosphere.exposure_s
     bright, faint = magnitude_limits(experiment)
     fields, index = {}, {}
-    # Beyond its field of view a telescope may have no light, and is not asked for.
+    # Beyond its field of view a telescope may have no light.
     lit = np.hypot(*xy.T) <= experiment.field_radius_on_detector
     for name in config.ccds or ():
         depth = camera.depth(camera.ccd_index(name), *xy.T)
@@ -224,7 +224,7 @@ def _star_fields(
     return fields, index
 
 
-def _points(stars: StarField) -> np.ndarray:
+def _positions_in_order(stars: StarField) -> np.ndarray:
     """Return the positions of places and of stars, in the order of their indices."""
     return np.concatenate([stars.holdout, stars.observed])
 
@@ -265,11 +265,11 @@ def _focal_plane_images(
         experiment.weight_fwhm,
     )
     model = fit_focal_plane_model(experiment, stars, ccds=list(found), threads=threads, reporter=reporter)
-    places = {name: _points(result.exposure.positions) for name, result in found.items()}
+    places = {name: _positions_in_order(result.exposure.positions) for name, result in found.items()}
     names = [name for name, xy in places.items() for _ in range(len(xy))]
     return model.draw(names, *np.concatenate(list(places.values())).T, threads=threads)
 
 
 def middle_wavelength(experiment: Experiment) -> float:
-    """Return the vacuum wavelength that positions are those of [m]."""
+    """Return the vacuum wavelength to which positions refer [m]."""
     return float(experiment.wavelengths[len(experiment.wavelengths) // 2])

@@ -1,4 +1,4 @@
-"""Bicubic resampling of stamps onto a common frame, as of the images that they are the PSFs of."""
+"""Bicubic resampling of PSF stamps onto a common frame, as of images."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def draw_points(seed: int, radius: float, cell: float, stars: int, places: int) 
     for i in range(-reach, reach + 1):
         for j in range(-reach, reach + 1):
             for kind, count in (("stars", stars), ("places", places)):
-                rng = stream(seed, "sky", kind, _natural(i), _natural(j))
+                rng = stream(seed, "sky", kind, _stream_number(i), _stream_number(j))
                 draw = rng.random((count, 3))
                 sky.append(cell * (np.array([i, j]) - 0.5 + draw[:, :2]))
                 star.append(np.full(count, kind == "stars"))
@@ -50,6 +50,6 @@ def draw_points(seed: int, radius: float, cell: float, stars: int, places: int) 
     return SkyPoints(points[inside], is_star[inside], counts[inside])
 
 
-def _natural(number: int) -> int:
+def _stream_number(number: int) -> int:
     """Return an own natural number for each integer: keys of random streams are not negative."""
     return 2 * number if number >= 0 else -2 * number - 1

@@ -30,7 +30,7 @@ class PsfSums:
     visits : int
         Number of visits.
     count : ndarray of int, shape [n]
-        Visits that saw each point.
+        Visits that cover each point.
     true, model : ndarray of float32, shape [n, size, size]
         Sums of PSFs of unit sum.
     """
@@ -45,11 +45,11 @@ class PsfSums:
         """Return the sums of no visit."""
         return cls(0, np.zeros(n, dtype=np.int32), *np.zeros((2, n, size, size), dtype=np.float32))
 
-    def add(self, seen: VisitPsfs) -> None:
+    def add(self, psfs: VisitPsfs) -> None:
         """Add one visit."""
-        self.true[seen.index] += seen.true
-        self.model[seen.index] += seen.model
-        self.count[seen.index] += 1
+        self.true[psfs.index] += psfs.true
+        self.model[psfs.index] += psfs.model
+        self.count[psfs.index] += 1
         self.visits += 1
 
     def write(self, path: Path, stamp: Stamp) -> None:
@@ -61,9 +61,9 @@ class PsfSums:
     @classmethod
     def read(cls, path: Path, stamp: Stamp) -> PsfSums:
         """Read sums; ProductError for those of another configuration, and for a damaged file."""
-        hdus = _read(path, stamp)
+        hdus = _read_table(path, stamp)
         count = np.array(hdus["COUNT"].data, dtype=np.int32)
-        return cls(hdus[0].header[VISITS_CARD], count, _image(hdus["TRUE"]), _image(hdus["MODEL"]))
+        return cls(hdus[0].header[VISITS_CARD], count, _image_from_hdu(hdus["TRUE"]), _image_from_hdu(hdus["MODEL"]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,10 +189,10 @@ class PsfStack(Result):
     @check_arguments
     def read(cls, path: Path, stamp: Stamp | None = None) -> PsfStack:
         """Read a stack; ProductError for a damaged file and, with a stamp, for one of another configuration."""
-        hdus = _read(path, stamp)
+        hdus = _read_table(path, stamp)
         found = {name: column(hdus["POINTS"], name.upper()) for name in _COLUMNS}
         found = {name: found[name] * scale if scale != 1.0 else found[name] for name, (scale, _, _) in _COLUMNS.items()}
-        images = {"true": _image(hdus["TRUE"]), "model": _image(hdus["MODEL"])}
+        images = {"true": _image_from_hdu(hdus["TRUE"]), "model": _image_from_hdu(hdus["MODEL"])}
         return cls(**{"visits": hdus[0].header[VISITS_CARD], **found, **images})
 
 
@@ -212,7 +212,7 @@ _COLUMNS = {
 }
 
 
-def _read(path: Path, stamp: Stamp | None) -> fits.HDUList:
+def _read_table(path: Path, stamp: Stamp | None) -> fits.HDUList:
     hdus = read_fits(path)
     if stamp is not None and not stamp.matches(hdus[0].header):
         raise ProductError("was made with another version, configuration or seed", file=path)
@@ -221,5 +221,5 @@ def _read(path: Path, stamp: Stamp | None) -> fits.HDUList:
     return hdus
 
 
-def _image(hdu: fits.ImageHDU) -> np.ndarray:
+def _image_from_hdu(hdu: fits.ImageHDU) -> np.ndarray:
     return np.array(hdu.data, dtype=np.float32)

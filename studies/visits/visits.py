@@ -23,12 +23,12 @@ from ...pipeline.experiment import Experiment
 from ...pipeline.memory import check_memory
 from ...pipeline.run_folder import CONFIG_NAME, SUMMARY_NAME
 from .config import STACK_STAMP, VisitsConfig, load_visits_configuration
-from .measures import Correlated, correlated, stack_metrics
 from .plan import Visit
 from .plots import correlation_picture, ellipticity_picture
 from .psf_visit import StackFrame, VisitPsfs, check_rotators, visit_experiment, visit_psfs
 from .sky_points import SkyPoints, draw_points
 from .stack import PsfStack, PsfSums
+from .stack_metrics import StackCorrelations, stack_correlations, stack_metrics
 
 #: Sums of the visits so far, from which the stack goes on.
 SUMS_NAME = "sums.fits"
@@ -52,7 +52,7 @@ class StackResult:
 
     folder: Path
     stacks: dict[int, PsfStack]
-    correlations: dict[int, Correlated]
+    correlations: dict[int, StackCorrelations]
     summary: dict[str, Any]
 
 
@@ -141,11 +141,11 @@ def stack_visits(
         if sums.visits in config.kept:
             stack = PsfStack.of(sums, points.sky, points.star, frame.matrix, scale, experiment.weight_fwhm)
             stack.write_product(stack_path(folder, sums.visits), stamp)
-        # Written last: visits that it counts have left their stack.
+        # Written last, so that all visits that it counts are in the stack.
         sums.write(folder / SUMS_NAME, stamp)
     stacks = {n: PsfStack.read(stack_path(folder, n), stamp) for n in config.kept}
     with reporter.stage("correlations"):
-        found = {n: correlated(stack, cell_of(experiment, frame)) for n, stack in stacks.items()}
+        found = {n: stack_correlations(stack, cell_of(experiment, frame)) for n, stack in stacks.items()}
     summary = _write_products(folder, config, stamp, visits, stacks, found)
     return StackResult(folder, stacks, found, summary)
 
@@ -185,7 +185,7 @@ def cell_of(experiment: Experiment, frame: StackFrame) -> float:
 
 
 def sky_points_of(experiment: Experiment, config: VisitsConfig, frame: StackFrame) -> SkyPoints:
-    """Return stars and places of the sky that the CCDs of a visit can see."""
+    """Return stars and positions of the sky within reach of the CCDs of a visit."""
     camera, names = experiment.camera, experiment.config.ccds or ()
     corners = camera.corners(camera.ccd_index(name) for name in names)
     reach = min(float(np.hypot(*corners.T).max()), experiment.field_radius_on_detector)
@@ -238,7 +238,7 @@ def _write_products(
     stamp: Stamp,
     visits: tuple[Visit, ...],
     stacks: dict[int, PsfStack],
-    found: dict[int, Correlated],
+    found: dict[int, StackCorrelations],
 ) -> dict[str, Any]:
     columns = {
         "visit": (np.array([v.number for v in visits]), "", "number of the visit"),

@@ -27,7 +27,7 @@ from pachon.imaging.image_file import OBJECT_COLUMNS
 from pachon.models.io.bundled import DATA
 from pachon.models.io.grid_file import read_grid, write_grid
 from pachon.models.mesh_file import load_mesh
-from pachon.pipeline.alignment_states import in_state
+from pachon.pipeline.alignment_states import with_active_optics_state
 from pachon.pipeline.star_list import place_stars
 from pachon.pipeline.wavefront_sensing.stamp_files import read_stamps
 from pachon.sky.cutouts import read_mosaic
@@ -279,7 +279,7 @@ def _cases(folder):
         "image_stack": (".yaml", b"tiles: 2\nside: 128\n", load_image_stack_configuration),
         "coatings": (".yaml", COATINGS, pachon.Coatings.read),
         "states": (".ecsv", _text(STATES, "ascii.ecsv"),
-                   lambda p: in_state(pachon.load_telescope("lsst_v3.3_r"), str(p), 3)),
+                   lambda p: with_active_optics_state(pachon.load_telescope("lsst_v3.3_r"), str(p), 3)),
         "donuts": (".fits", _donuts(), _use_donuts),
         "donut_table": (".csv", b"field_x,field_y,defocus_um\n0.1,0.2,1500\n0.3,0.4,-1500\n", _use_donut_table),
         "store": (".sweep", _written(_store, ".sweep", folder), _use_store),

@@ -13,8 +13,8 @@ COUNT = 1 << 18  #: float64 numbers of 2 MB
 @pytest.fixture(autouse=True)
 def blocks(monkeypatch):
     """No blocks yet."""
-    monkeypatch.setattr(buffers, "_BLOCKS", buffers._Blocks())
-    return lambda: buffers._BLOCKS
+    monkeypatch.setattr(buffers, "_POOL", buffers._MemoryPool())
+    return lambda: buffers._POOL
 
 
 def test_memory_is_used_again_once_the_last_view_is_gone():

@@ -19,7 +19,7 @@ from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM, Telescope
 from pachon.pipeline.config import configuration_of
 from pachon.pipeline.experiment import Experiment
-from pachon.studies.metrics.bare_telescope import BARE, BareScene
+from pachon.studies.metrics.telescope import TELESCOPE_METRICS, TelescopeScene
 
 LIGHT = 500e-9
 #: Focal lengths of two confocal paraboloids, and width of the beam, in units of their size.
@@ -281,10 +281,10 @@ def test_runs_and_metrics_of_sweeps(tmp_path):
     config = configuration_of({"telescope": "expander.yaml", "camera": "comcam"}, "test")
     with pytest.raises(DomainError, match="expander is afocal, its light parallel: a camera needs an image"):
         Experiment.from_config(config, tmp_path)
-    scene = BareScene(expander(moved=1e-5), np.zeros((1, 2)), threads=1)
+    scene = TelescopeScene(expander(moved=1e-5), np.zeros((1, 2)), threads=1)
     # Slopes of defocus, uniform light within the largest.
     rms = 0.5 * EXIT * 1e-5 / SHORT**2 / np.sqrt(2.0)
-    assert BARE["spots"].compute(scene)["spot_rms_um"] == pytest.approx(1e6 * rms, rel=2e-3)
+    assert TELESCOPE_METRICS["spots"].compute(scene)["spot_rms_um"] == pytest.approx(1e6 * rms, rel=2e-3)
 
 
 @pytest.mark.parametrize(("line", "afocal"), [("", False), ("AFO YES", True), ("AFO", True), ("AFO NO", False)])

@@ -7,7 +7,8 @@ import pytest
 import pachon
 from pachon.core.errors import ProductError
 from pachon.core.workers import Workers, serial_worker
-from pachon.imaging.ccd_image import ImageComputation, ImageJob, image_name
+from pachon.imaging.ccd_image import ImageComputation, image_name
+from pachon.pipeline.ccd_worker import CcdJob
 
 SETTINGS = {
     "run": {
@@ -36,7 +37,7 @@ def test_workers_write_the_bytes_of_one_process(tmp_path):
     assert shared.computed == alone.computed
     # A worker that does not see the folder sends its files.
     computation = ImageComputation(config, config.experiment(), tmp_path / "three", "no mark")
-    drawn = computation(ImageJob("R22_S12"), 1)
+    drawn = computation(CcdJob("R22_S12"), 1)
     assert dict(drawn.files) == {k: v for k, v in contents(tmp_path / "one").items() if "R22_S12" in k}
     assert drawn.files[-1][0] == image_name("R22_S12")
     lost = replace(drawn, problem="CCD R22_S12: nothing")

@@ -108,10 +108,10 @@ def test_the_order_is_the_lowest_that_is_good_enough(lsst_r):
 
 
 def test_a_telescope_without_distortion_needs_no_sip(lsst_r):
-    from pachon.models.ideal_telescope import without_aberration
+    from pachon.models.ideal_telescope import ideal_telescope
 
     # A long paraboloid: its distortion of a tangent projection is below a milliarcsecond on a small CCD on the axis.
-    ideal = without_aberration(lsst_r, 1e5)
+    ideal = ideal_telescope(lsst_r, 1e5)
     small = pachon.Camera(
         "small", ("A_0",), ("A",), np.array([0]), np.zeros((1, 2)), np.array([512, 512]), 10e-6 * 1e5 / 1.23
     )

@@ -117,7 +117,7 @@ def test_all_else_in_a_product_keeps_its_bytes(whole_run, ccd_run):
                     assert one.header.tostring() == other.header.tostring()
                     assert one.data.tobytes() == other.data.tobytes()
         # Checksums hold.
-        assert read_product(whole_run / f"ccd_{name}.fits").of_focal_plane
+        assert read_product(whole_run / f"ccd_{name}.fits").has_focal_plane_model
 
 
 def test_default_runs_have_no_more_columns(finished_run):
@@ -249,7 +249,7 @@ def test_stars_of_an_ideal_telescope_have_no_telescope_to_fit(products, focal_pl
     experiment = replace(Experiment.from_config(focal_plane_config()), atmosphere_only=True)
     applied, model = apply_focal_plane_model(experiment, products, threads=1)
     assert model.heights is None
-    assert applied[0].of_focal_plane
+    assert applied[0].has_focal_plane_model
 
 
 @pytest.mark.long

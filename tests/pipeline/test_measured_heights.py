@@ -11,7 +11,7 @@ from pachon.pipeline.config import Configuration, load_configuration, to_yaml, w
 from pachon.pipeline.config_hash import hashed_heights
 from pachon.pipeline.experiment import Experiment
 from pachon.studies.attribution.causes import checked_causes, without
-from pachon.studies.baseline.baseline import _stamps
+from pachon.studies.baseline.baseline import _input_stamps
 from pachon.studies.sweep.file import load_sweep
 from pachon.studies.sweep.point import point_experiment
 from pachon.studies.sweep.sweep import numbered_points
@@ -70,7 +70,7 @@ def test_a_file_lies_beside_the_configuration_and_counts_by_its_content(tmp_path
         experiment = Experiment.from_config(load_configuration(path), path.parent)
         assert experiment.focal_plane.height(0.0, 0.0) == pytest.approx(height * 1e-6, abs=1e-18)
         hashes.append(experiment.config_hash)
-        stamps.append(_stamps(experiment.telescope, experiment)["configuration_sha256"])
+        stamps.append(_input_stamps(experiment.telescope, experiment)["configuration_sha256"])
     assert hashes[0] == hashes[1] != hashes[2]
     assert stamps[0] == stamps[1] != stamps[2]
 

@@ -12,7 +12,7 @@ import yaml
 
 from pachon.core import files
 from pachon.core.errors import ConfigError, ProductError
-from pachon.core.files import _owner, make_folder, write_new_bytes
+from pachon.core.files import _owning_process, make_folder, write_new_bytes
 from pachon.core.workers import Workers
 from pachon.imaging import simulate
 from pachon.imaging.config import ImagesConfig
@@ -161,7 +161,11 @@ def test_products_without_their_configuration_are_refused(tmp_path):
 def test_temporary_files_of_live_processes_and_other_machines_stay(tmp_path):
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
-    owners = {"live": _owner(os.getpid()), "ended": _owner(ended.pid), "elsewhere": f"another-machine-{ended.pid}"}
+    owners = {
+        "live": _owning_process(os.getpid()),
+        "ended": _owning_process(ended.pid),
+        "elsewhere": f"another-machine-{ended.pid}",
+    }
     for owner in owners.values():
         (tmp_path / f".ccd.fits.{owner}.partial").write_bytes(b"")
     make_folder(tmp_path)

@@ -10,7 +10,7 @@ import pytest
 
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, PachonError, ProductError
-from pachon.core.files import _owner
+from pachon.core.files import _owning_process
 from pachon.core.progress import Reporter
 from pachon.pipeline import run as run_module
 from pachon.pipeline import run_folder
@@ -82,7 +82,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(finished_run, copied, 
     # As a kill leaves it: one CCD done, a part of the next, nothing after that.
     for name in ("ccd_R24_S12.fits", "summary.json", "report.html"):
         (copied / name).unlink()
-    (copied / f".ccd_R24_S12.fits.{_owner(ended_process())}.partial").write_bytes(b"SIMPLE")
+    (copied / f".ccd_R24_S12.fits.{_owning_process(ended_process())}.partial").write_bytes(b"SIMPLE")
     done = []
     real = ccd_loop.expose_ccd
     monkeypatch.setattr(ccd_loop, "expose_ccd", lambda e, name, **k: done.append(name) or real(e, name, **k))

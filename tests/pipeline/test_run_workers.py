@@ -15,9 +15,9 @@ from pachon.pipeline import memory, run_folder
 from pachon.pipeline import run as run_module
 from pachon.pipeline.ccd_worker import CcdComputation, CcdJob
 from pachon.pipeline.experiment import Experiment
-from pachon.pipeline.kept_screens import with_kept_screens
 from pachon.pipeline.memory import check_memory
 from pachon.pipeline.run import run
+from pachon.pipeline.screen_cache import with_cached_screens
 
 
 @pytest.fixture(autouse=True)
@@ -110,7 +110,7 @@ def test_processes_that_do_not_fit_into_memory_are_refused(tiny, monkeypatch):
 
 def test_screens_are_kept_where_they_are_the_same_and_freed_where_not(tiny):
     def kept(**changed):
-        return with_kept_screens(Experiment.from_config(tiny(**changed))).atmosphere
+        return with_cached_screens(Experiment.from_config(tiny(**changed))).atmosphere
 
     one, same = kept(), kept(ccds=("R24_S12",), atmosphere__exposure_s=1.0)
     screens = one.screens("slopes")

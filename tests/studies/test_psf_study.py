@@ -198,7 +198,7 @@ def test_plan_of_a_configuration(tiny):
     assert (plan.stars, plan.orders, plan.components, plan.snrs) == ((6, 12, 24), (0, 1, 2), (4, 8), (30.0, 100.0))
     cases = plan.cases()
     assert len(set(cases)) == len(cases)
-    assert all(case == case.settled() for case in cases)
+    assert all(case == case.normalised() for case in cases)
     assert {c.basis for c in cases} == {"pca", "pixels", "shapelets"}
     assert all(c.components < c.stars for c in cases if c.basis == "pca")
     other = tiny(reconstruction__basis="pixels", reconstruction__components=None, reconstruction__weights="softened")
@@ -234,8 +234,8 @@ def test_a_case_is_what_its_parts_give(small, tiny):
     ccds = simulate(experiment, 2, Reporter(quiet=True))  # and two threads change nothing
     for case in (plan.base, replace(plan.base, stars=6, interpolation="snr"), replace(plan.base, basis="pixels")):
         # Principal components of one fit are truncated, by rounding those of a fit of fewer.
-        for key, value in _figures(experiment, case.settled(), ccds, 2).items():
-            assert result.metrics[case.settled()][key] == pytest.approx(value, rel=1e-6, nan_ok=True), key
+        for key, value in _figures(experiment, case.normalised(), ccds, 2).items():
+            assert result.metrics[case.normalised()][key] == pytest.approx(value, rel=1e-6, nan_ok=True), key
 
 
 def test_stars_with_defects_are_refused(tiny):

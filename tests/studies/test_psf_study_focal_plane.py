@@ -123,7 +123,10 @@ def test_files_and_table_have_the_model(small, tmp_path, settings_file, capsys, 
 def test_stated_noise_is_the_scatter_of_the_draws(focal_plane_config):
     config = focal_plane_config()
     experiment = study_experiment(config, make_plan(config, stars=(40,)))
-    ccds, case = simulate(experiment, 1, Reporter(quiet=True)), Case(40, 60.0, interpolation="no_telescope").settled()
+    ccds, case = (
+        simulate(experiment, 1, Reporter(quiet=True)),
+        Case(40, 60.0, interpolation="no_telescope").normalised(),
+    )
     draws = [[observe(experiment, ccd, 60.0, k) for ccd in ccds] for k in range(20)]
     stated, names = [], [ccd.exposure.name for ccd in ccds]
 
@@ -171,7 +174,7 @@ def test_optics_leave_less_than_polynomials(focal_plane_config):
 
 def test_focal_plane_models_are_recommended_last():
     base = Case(40, order=1, components=20)
-    without, whole = (replace(base, interpolation=how).settled() for how in FOCAL_PLANE)
+    without, whole = (replace(base, interpolation=how).normalised() for how in FOCAL_PLANE)
     plan = Plan(base, (40,), (1,), (20,), (30.0,), focal_plane=True)
     scatter = np.array([1.0, -1.0, 1.0, -1.0])
 

@@ -16,13 +16,13 @@ import pachon
 from pachon.commands.cli import main
 from pachon.core.workers import process_workers
 from pachon.design.images.encircled_energy import energy_curve
-from pachon.models.ideal_telescope import without_aberration
+from pachon.models.ideal_telescope import ideal_telescope
 from pachon.models.io.prescription import load_telescope
 from pachon.models.io.site_file import load_site
 from pachon.pipeline.ccd_product import product_path, read_product
 from pachon.pipeline.run_folder import stamp_of
 from pachon.studies.reproduce import reproduce as module
-from pachon.studies.reproduce.atmosphere import beginning
+from pachon.studies.reproduce.atmosphere import shortened_exposure
 from pachon.studies.reproduce.bench import PAPER, SMALL, Bench, Scale
 from pachon.studies.reproduce.focal_plane import optics_ellipticity
 from pachon.studies.reproduce.reproduce import FIGURES, chosen_figures, expected_minutes, reproduce
@@ -148,7 +148,7 @@ def test_rays_of_the_layout_meet_where_the_focal_length_says(made):
 
 
 def test_encircled_energy_of_an_annular_pupil_is_that_of_theory(lsst_r):
-    telescope = without_aberration(lsst_r)
+    telescope = ideal_telescope(lsst_r)
     pixel, wavelength = 0.002 * ARCSEC, 700e-9
     psf = pachon.make_psfs(
         telescope,
@@ -213,7 +213,7 @@ def test_exposures_of_the_speckles_are_nested(made):
         images = hdus["PSF"].data.astype(float)
         times = np.array(hdus["SHAPES"].data["EXPTIME"])
     assert images.sum(axis=(1, 2)) == pytest.approx(np.ones(len(times)), abs=1e-5)
-    telescope = without_aberration(bench.optics.telescope)
+    telescope = ideal_telescope(bench.optics.telescope)
     size, length = TINY.speckle_screen
     air = Atmosphere.from_site(
         "cerro_pachon",
@@ -245,7 +245,7 @@ def test_exposures_of_the_speckles_are_nested(made):
 
 def test_the_beginning_of_an_exposure_looks_through_the_same_air():
     air = Atmosphere.from_site("cerro_pachon", 1, exposure=60.0, screen_size=512)
-    part = beginning(air, 5.0, 0.1)
+    part = shortened_exposure(air, 5.0, 0.1)
     assert part.times[-1] < 5.0 < part.times[-1] + 0.1
     assert len(part.times) == 100
     assert part.screens("slopes") is air.screens("slopes")

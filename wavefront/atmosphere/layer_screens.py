@@ -75,7 +75,7 @@ class LayerScreens(Layers):
         return self.screen_size, self.screen_length, (0.0, self.cutoff)
 
     def screen_bytes(self, scales: Iterable[str]) -> int:
-        """Return the memory of the screens of some scales, and of the making of the last of them [bytes]."""
+        """Return the memory of the screens of some scales, and the working memory for the last of them [bytes]."""
         grids = [self._band(scale) for scale in scales]
         stored = sum(4 * self.layer_count * size * size for size, _, _ in grids)
         return stored + max((working_bytes(*grid) for grid in grids), default=0)
@@ -194,8 +194,11 @@ class LayerScreens(Layers):
                 # Memory of rows that are never made is never touched.
                 screens = np.empty((self.layer_count, size, size), dtype=dtype)[:]
                 screens.setflags(write=False)
-                self._cache[kind], self._cache[_made(kind)] = screens, np.zeros((self.layer_count, size), dtype=bool)
-            screens, made = self._cache[kind], self._cache[_made(kind)]
+                self._cache[kind], self._cache[_rows_key(kind)] = (
+                    screens,
+                    np.zeros((self.layer_count, size), dtype=bool),
+                )
+            screens, made = self._cache[kind], self._cache[_rows_key(kind)]
             base: Any = screens.base
             wanted = np.ones(made.shape, dtype=bool) if rows is None or kind != "slopes" else rows
             lacking = (wanted & ~made).any(axis=1)
@@ -231,7 +234,7 @@ class LayerScreens(Layers):
         return evaluate(make(layer), pixel, x, y)
 
 
-def _made(kind: str) -> str:
+def _rows_key(kind: str) -> str:
     """Return the key of the rows of a kind of screens that are made, bool [n_layer, size]."""
     return f"{kind}: rows"
 

@@ -1,4 +1,4 @@
-r"""The wavefront that turbulence leaves in the mean of an exposure: covariances of its Zernikes over the field.
+r"""Covariances over the field of the Zernikes of turbulence, averaged over an exposure.
 
 Layers drift across the pupil, and the mean of the path over an exposure of length T has Zernike coefficients
 
@@ -11,7 +11,7 @@ von Karman spectrum W the covariances of two stars, whose light crosses at a dis
           \, e^{-2 \pi i \nu \cdot d} \, d^2\nu.
 
 At T = 0 these are the coefficients of Noll (1976, J. Opt. Soc. Am. 66, 207); beyond the time in which the wind crosses
-the pupil they fall as 1/T. This is what a single donut cannot tell from the wavefront of the telescope.
+the pupil they fall as 1/T. A single donut cannot separate this wavefront from that of the telescope.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def mean_wavefront_covariance(
     low, high, count = _FREQUENCIES
     frequency = np.geomspace(low, high, count) / diameter
     angle = np.pi * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
-    transform = _transforms(indices, 0.5 * diameter * frequency, angle, obscuration)
+    transform = _zernike_transforms(indices, 0.5 * diameter * frequency, angle, obscuration)
     plane = frequency[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     # The other half of the plane is the complex conjugate.
     area = 2.0 * (np.log(high / low) / (count - 1)) * (np.pi / _DIRECTIONS) * frequency**2
@@ -93,7 +93,9 @@ def mean_wavefront_covariance(
     return covariance
 
 
-def _transforms(indices: np.ndarray, frequency: np.ndarray, angle: np.ndarray, obscuration: float) -> np.ndarray:
+def _zernike_transforms(
+    indices: np.ndarray, frequency: np.ndarray, angle: np.ndarray, obscuration: float
+) -> np.ndarray:
     """Return means over the annulus of Zernikes times a plane wave, shape [n_frequency, n_angle, n_noll].
 
     Frequencies are in cycles per radius of the pupil.

@@ -32,14 +32,14 @@ _ROW_BLOCK = 128
 
 def working_bytes(size: int, length: float, band: tuple[float, float]) -> int:
     """Return the approximate working memory for one screen, beside the screen itself [bytes]."""
-    reach = _reach(size, length, band)
+    reach = _largest_mode(size, length, band)
     modes = (reach + 1) * (2 * reach + 1)
     # First the modes in complex64 with their amplitudes, twice, and which are in the band; then the modes and their
     # columns, of which slopes have the most.
     return max(17 * modes, 9 * modes + 8 * (2 * reach + 1) * size)
 
 
-def _reach(size: int, length: float, band: tuple[float, float]) -> int:
+def _largest_mode(size: int, length: float, band: tuple[float, float]) -> int:
     """Return the largest index along an axis of the modes of a band."""
     nyquist = (size - 1) // 2
     return min(nyquist, math.floor(band[1] / (2.0 * math.pi / length))) if math.isfinite(band[1]) else nyquist
@@ -91,7 +91,7 @@ def draw_modes(
     length = require_positive(length, "length", "metres")
     if size < 4:
         raise DomainError(f"size = {size!r}: expected at least 4 samples on a side")
-    reach = _reach(size, length, band)
+    reach = _largest_mode(size, length, band)
     j = np.arange(-reach, reach + 1, dtype=np.float64)
     amplitude = np.empty((reach + 1, 2 * reach + 1), dtype=np.float32)
     inside = np.empty(amplitude.shape, dtype=bool)

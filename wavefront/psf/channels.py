@@ -14,7 +14,7 @@ import numpy as np
 from ...models.camera.silicon import Silicon
 from ..pupil_optics import PupilOptics
 
-# Fewest time steps over which conversion depths take turns; of fewer, each is computed at every depth.
+# Fewest time steps over which conversion depths alternate; with fewer, each is computed at every depth.
 _FEW_STEPS = 128
 # Smallest transfer function of charge diffusion: products of smaller ones would be denormal, which takes processors ten
 # times as long as zero.
@@ -25,8 +25,8 @@ _TIME_STEP, _GROUP_STEP, _WAVE_STEP = 0.5 * (5.0**0.5 - 1.0), 2.0**0.5 - 1.0, 0.
 
 
 @dataclass(frozen=True)
-class Turns:
-    """Which channel of each wavelength the rays of a time step and of a group of pupil points belong to."""
+class DepthSchedule:
+    """Channel of each wavelength to which the rays of a time step and of a group of pupil points belong."""
 
     time: np.ndarray  #: index of the moment of each step, rising, [n_step] int
     channel: np.ndarray  #: [n_wave, n_step, n_group] int
@@ -35,7 +35,7 @@ class Turns:
 
 @dataclass(frozen=True)
 class Channels:
-    """Parts of the light whose images add up, as many of each wavelength, in the order of the wavelengths."""
+    """Parts of the light whose images add up: equally many of each wavelength, in the order of the wavelengths."""
 
     wave: np.ndarray  #: index of the wavelength, [n_channel] int
     weight: np.ndarray  #: part of the light of the wavelength that turns into charge there, [n_channel]
@@ -93,8 +93,8 @@ class Channels:
         weight = self.weight.reshape(n_wave, self.depths)
         return np.asarray(np.einsum("wd,wd...->w...", weight / weight.sum(axis=1, keepdims=True), by_depth))
 
-    def turns(self, n_time: int, n_group: int = 1) -> Turns:
-        """Share the rays of moments and groups of pupil points among the depths, evenly and without chance."""
+    def depth_schedule(self, n_time: int, n_group: int = 1) -> DepthSchedule:
+        """Assign rays of time steps and groups of pupil points to the depths, evenly and deterministically."""
         depths = self.depths
         first = depths * np.arange(len(self.wave) // depths)[:, None, None]
         if n_time < _FEW_STEPS:
@@ -103,11 +103,11 @@ class Channels:
             channel = np.broadcast_to(first + depth, (len(first), len(time), n_group))
         else:
             time = np.arange(n_time)
-            # Wavelengths have other turns: what one depth has too much of the air's motion is not that of all.
+            # Each wavelength has its own order, so that depths do not share an excess of some image motion.
             wave = _WAVE_STEP * np.arange(len(first))
             place = np.add.outer(wave, np.add.outer(_TIME_STEP * time, _GROUP_STEP * np.arange(n_group))) % 1.0
             weight = self.weight.reshape(-1, depths)
             ends = np.cumsum(weight, axis=1)[:, :-1] / weight.sum(axis=1)[:, None]
             channel = first + (place[:, None] >= ends[:, :, None, None]).sum(axis=1)
         number = np.bincount(channel.ravel(), minlength=len(self.wave))
-        return Turns(time, np.ascontiguousarray(channel, dtype=np.int32), number / (len(time) * n_group))
+        return DepthSchedule(time, np.ascontiguousarray(channel, dtype=np.int32), number / (len(time) * n_group))

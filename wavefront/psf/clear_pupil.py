@@ -1,4 +1,4 @@
-"""Rings and spokes over an annular pupil, and the part of each spoke that the apertures leave clear."""
+"""Rings and spokes over an annular pupil, and the clear part of each spoke."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ...core.units import require_count
 from ...core.warp_arrays import warp_array
 from ...models.telescope import Telescope
 from ...raytrace.launch import launch_bundles
-from ...raytrace.pack.surfaces import clear_ring, pack_surfaces
+from ...raytrace.pack.surfaces import clear_annulus, pack_surfaces
 from ...raytrace.trace import trace_packets
 from .clear_pupil_kernels import find_edges
 
@@ -79,9 +79,9 @@ def clear_edges(
     """Return the radii of the entrance pupil between which light passes all apertures [m], shape [n_star, n_spoke, 2].
 
     Inner and outer radius are equal where a spoke is dark. On each spoke of direction ``unit`` [n_spoke, 2] the clear
-    part is taken to be one piece, as it is where apertures are discs and rings about the light (:func:`only_rings`);
-    all else is passed over. ``direction`` [n_star, 3] is that in which the light travels, the wavelength that in vacuum
-    [m].
+    part is taken to be one piece, as where apertures are discs and rings about the light (:func:`has_only_annuli`);
+    all other apertures are ignored. ``direction`` [n_star, 3] is that of the light's travel; the wavelength [m] is that
+    in vacuum.
     """
     n_star, n_spoke = len(direction), len(unit)
     outer = 0.5 * telescope.pupil_diameter
@@ -107,6 +107,6 @@ def clear_edges(
     return edges
 
 
-def only_rings(telescope: Telescope) -> bool:
-    """Return whether nothing but discs and rings stops light."""
-    return not telescope.obstructions and all(clear_ring(s.aperture) is not None for s in telescope.surfaces)
+def has_only_annuli(telescope: Telescope) -> bool:
+    """Return whether all apertures are discs and rings, without obstructions."""
+    return not telescope.obstructions and all(clear_annulus(s.aperture) is not None for s in telescope.surfaces)

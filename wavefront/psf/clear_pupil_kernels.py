@@ -42,9 +42,9 @@ def within(a: wp.float64, b: wp.float64, c: wp.float64, square: wp.float64):
         inner = slope * slope - wp.float64(4.0) * curvature * start
         if inner > zero:
             # The two roots without the difference of near-equal numbers.
-            far = -half * (slope + wp.where(slope < zero, -wp.sqrt(inner), wp.sqrt(inner)))
-            one = far / curvature
-            other = wp.where(far == zero, zero, start / far)
+            scaled_root = -half * (slope + wp.where(slope < zero, -wp.sqrt(inner), wp.sqrt(inner)))
+            one = scaled_root / curvature
+            other = wp.where(scaled_root == zero, zero, start / scaled_root)
             low = wp.clamp(wp.min(one, other), zero, two)
             high = wp.clamp(wp.max(one, other), zero, two)
     elif curvature <= zero:

@@ -64,8 +64,8 @@ class RenderedStars:
     offset: np.ndarray  #: place (x, y) of that point from the centre of the middle pixel, [n_star, 2] pixels
 
 
-class Exposed(NamedTuple):
-    """Stars before their pixels: ``draw`` returns the stamps, moved back by a shift [pixels], shape [n_star, 2]."""
+class ExposedStars(NamedTuple):
+    """Stars on the focal plane; ``draw`` samples their stamps, moved back by a shift [pixels], shape [n_star, 2]."""
 
     draw: Callable[[np.ndarray | None], np.ndarray]
     lit_fraction: np.ndarray
@@ -74,7 +74,7 @@ class Exposed(NamedTuple):
 
 @dataclass(frozen=True)
 class Stars:
-    """Stars of one batch, before their light is carried anywhere."""
+    """Stars of one batch."""
 
     fields: np.ndarray  #: field angles, [n_star, 2] rad
     offsets: np.ndarray  #: places of the reference points from the centre of the middle pixel, [n_star, 2] pixels
@@ -88,8 +88,8 @@ class Stars:
         return Stars(self.fields[chosen], self.offsets[chosen], photons)
 
 
-def expose_apart(kinds: np.ndarray, expose: Callable[[int, Stars], Exposed], stars: Stars) -> Exposed:
-    """Carry stars of several kinds [n_star] to the focal plane: ``expose`` takes a kind and its stars."""
+def expose_by_kind(kinds: np.ndarray, expose: Callable[[int, Stars], ExposedStars], stars: Stars) -> ExposedStars:
+    """Expose stars of several kinds [n_star], each kind by one call of ``expose`` with the kind and its stars."""
     groups = [np.flatnonzero(kinds == kind) for kind in np.unique(kinds)]
     parts = [expose(int(kinds[chosen[0]]), stars[chosen]) for chosen in groups]
     order = np.argsort(np.concatenate(groups))
@@ -98,7 +98,7 @@ def expose_apart(kinds: np.ndarray, expose: Callable[[int, Stars], Exposed], sta
         shifts = [None if shift is None else shift[chosen] for chosen in groups]
         return np.concatenate([part.draw(moved) for part, moved in zip(parts, shifts, strict=True)])[order]
 
-    return Exposed(
+    return ExposedStars(
         draw,
         np.concatenate([part.lit_fraction for part in parts])[order],
         np.concatenate([part.reference_point for part in parts])[order],
@@ -140,11 +140,11 @@ class PsfEngine(ABC):
         self.focal_length = center_focal_length(self._telescope, self._wavelengths, inputs.threads, inputs.trace)
 
     @abstractmethod
-    def _expose(self, stars: Stars) -> Exposed:
-        """Carry the light of stars to the focal plane."""
+    def _expose(self, stars: Stars) -> ExposedStars:
+        """Expose stars on the focal plane."""
 
     def prepare(self, fields: np.ndarray) -> None:  # noqa: B027 - most engines need nothing
-        """Make what all stars at field angles [n_star, 2] [rad] share, before the first batch is rendered."""
+        """Prepare what stars at field angles [n_star, 2] [rad] have in common, before the first batch."""
 
     def render(
         self,

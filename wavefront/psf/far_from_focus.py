@@ -1,4 +1,4 @@
-"""Stars far from focus: how large their images are, and how finely their pupils must be sampled.
+"""Stars far from focus: size of their images, and sampling of their pupils.
 
 A pupil point stands for the light of the pupil around it. In focus all rays land together, and some hundred points are
 enough; 1.5 mm from focus they would make a ring of dots. How far apart the rays of neighbouring points land follows
@@ -24,8 +24,8 @@ def blur_radii(optics: PupilOptics) -> np.ndarray:
     return np.asarray(np.sqrt(total / np.maximum(optics.lit.sum(axis=(1, 2)), 1)))
 
 
-def finer_sampling(optics: PupilOptics, neighbour: float, largest: float, wanted: float) -> np.ndarray:
-    """Return by what power of two the pupil of each star must be sampled more finely, 1 for stars near focus, [n_star].
+def sampling_refinement(optics: PupilOptics, neighbour: float, largest: float, wanted: float) -> np.ndarray:
+    """Return the refinement of each star's pupil sampling, a power of two, 1 near focus, [n_star].
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def finer_sampling(optics: PupilOptics, neighbour: float, largest: float, wanted
 
 
 def check_stamp(optics: PupilOptics, plane: ImagePlane) -> None:
-    """Raise a DomainError if a star's rays fall beside its stamp, where an engine would fold or lose their light."""
+    """Raise a DomainError if rays of a star fall beside its stamp, where engines alias or lose light."""
     half = 0.5 * plane.side
     beside = (np.abs(optics.displacement) > half).any(axis=-1) & optics.lit
     lit = optics.lit.sum(axis=(1, 2))

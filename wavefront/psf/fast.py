@@ -32,11 +32,11 @@ from ...core.warp_arrays import warp_array
 from ..atmosphere.layer_screens import SLOPE_LAG
 from ..atmosphere.turbulence import coherence, diffraction_otf, slope_variance, structure_function
 from ..pupil_optics import PupilOptics
-from .engine import Exposed, PsfEngine, PsfInputs, Stars, expose_apart, metric_of
-from .far_from_focus import finer_sampling
+from .engine import ExposedStars, PsfEngine, PsfInputs, Stars, expose_by_kind, metric_of
+from .far_from_focus import sampling_refinement
 from .fast_kernels import combine_wavelengths, deposit_rays
 from .image_plane import square_transfer
-from .inner_rim import ended_by_apertures, traced_obscuration
+from .inner_rim import clipped_by_apertures, traced_obscuration
 from .pupil_lattice import PupilLattice
 from .sample_packets import LANES, indices, samples, to_packets
 
@@ -60,8 +60,8 @@ _BATCH, _BATCH_BYTES = 128, 1 << 25
 _TABLE_SIZE = 4096
 
 
-def rest_structure_function(separation: np.ndarray, r0: float, outer_scale: float, cutoff: float) -> np.ndarray:
-    """Return the structure function of the filter, beside rays through the low modes; path squared [m^2], not falling.
+def filter_structure_function(separation: np.ndarray, r0: float, outer_scale: float, cutoff: float) -> np.ndarray:
+    """Return the structure function of the filter for all but the low modes [m^2]; it never decreases.
 
     Separations are rising baselines in the pupil [m]; the low modes are those up to the cut-off [rad/m].
     """
@@ -86,11 +86,11 @@ class FastPsfEngine(PsfEngine):
     options = ("n_pupil", "oversampling")
     screens = ("slopes",)
 
-    def __init__(self, inputs: PsfInputs, finer: int = 1, far: bool = False) -> None:
+    def __init__(self, inputs: PsfInputs, refinement: int = 1, far_from_focus: bool = False) -> None:
         super().__init__(inputs)
-        self._finer = finer
+        self._refinement = refinement
         #: Inner radius of the points over the outer one, and their area over that of the pupil.
-        self._inner = traced_obscuration(self._obscuration) if far else self._obscuration
+        self._inner = traced_obscuration(self._obscuration) if far_from_focus else self._obscuration
         self._area = (1.0 - self._inner**2) / (1.0 - self._obscuration**2)
         still, n_pupil, oversampling = inputs.atmosphere is None, inputs.n_pupil, inputs.oversampling
         if n_pupil is None:
@@ -103,7 +103,7 @@ class FastPsfEngine(PsfEngine):
         self._make_grid()
         self._filter_step, self._filter = self._filter_table()
         n_time = 1 if inputs.atmosphere is None else len(inputs.atmosphere.times)
-        self._turns = self._channels.turns(n_time, -(-len(self._points) // LANES))
+        self._schedule = self._channels.depth_schedule(n_time, -(-len(self._points) // LANES))
         if inputs.atmosphere is None:
             self._units = np.zeros(1, dtype=np.float32)
         else:
@@ -131,7 +131,7 @@ class FastPsfEngine(PsfEngine):
                     f"screen_size = {self._atmosphere.screen_size}: expected at least {least}, so that a pupil of"
                     f" {diameter:g} m has {LEAST_SAMPLES} samples across"
                 )
-        self._lattice = PupilLattice.fill(diameter, obscuration, spacing / self._finer)
+        self._lattice = PupilLattice.fill(diameter, obscuration, spacing / self._refinement)
         self._points = self._lattice.points
         self._weights = self._lattice.weights(diameter, obscuration)
 
@@ -145,7 +145,7 @@ class FastPsfEngine(PsfEngine):
         self._ky = 2.0 * math.pi * scipy.fft.fftfreq(self._grid_size, self._cell)
         self._kx = 2.0 * math.pi * scipy.fft.rfftfreq(self._grid_size, self._cell)
         ky = self._ky[:, None]
-        # Binning into cells averaged over a cell already: take that back.
+        # Binning has averaged over a cell already: the filter undoes that.
         detector = self._plane.transfer(self._kx, ky) / square_transfer(self._kx, ky, self._cell)
         self._detector = detector.astype(np.float32)
 
@@ -155,7 +155,7 @@ class FastPsfEngine(PsfEngine):
         longest = 1.5 * self.focal_length * float(self._wavelengths.max()) / (2.0 * self._cell)
         baseline = np.linspace(0.0, longest, _TABLE_SIZE)
         table = np.repeat(self._diffraction(baseline)[None], len(self._wavelengths), axis=0)
-        rest = self._rest(baseline)
+        rest = self._filter_structure(baseline)
         if rest is not None:
             table *= coherence(rest, self._wavelengths[:, None])
         return float(baseline[1]), table.astype(np.float32)
@@ -164,10 +164,10 @@ class FastPsfEngine(PsfEngine):
         """Return the transfer function of diffraction, common to all rays, at baselines [m]."""
         return diffraction_otf(baseline, self._diameter, self._obscuration)
 
-    def _rest(self, baseline: np.ndarray) -> np.ndarray | None:
-        """Return the structure function of the air beside that of the rays [m^2] at baselines [m], if any."""
+    def _filter_structure(self, baseline: np.ndarray) -> np.ndarray | None:
+        """Return the structure function of the filter [m^2] at baselines [m]; None without an atmosphere."""
         air = self._atmosphere
-        return None if air is None else rest_structure_function(baseline, air.r0, air.outer_scale, air.cutoff)
+        return None if air is None else filter_structure_function(baseline, air.r0, air.outer_scale, air.cutoff)
 
     def prepare(self, fields: np.ndarray) -> None:
         """Make the rows of the screens that the light of stars crosses."""
@@ -182,35 +182,35 @@ class FastPsfEngine(PsfEngine):
         rows = air.rows_under(self._direction(fields), 0.5 * self._diameter + air.screen_pixel)
         return air.screens("slopes", self._threads, rows).reshape(air.layer_count, -1)
 
-    def _expose(self, stars: Stars) -> Exposed:
+    def _expose(self, stars: Stars) -> ExposedStars:
         optics = self._trace(stars.fields, self._points, self._threads)
         if self._inputs.n_pupil is None:
             pixel = self._plane.pixel_size
             largest, wanted = RAY_DISTANCE_STILL if self._atmosphere is None else RAY_DISTANCE
             neighbour = 2.0 * self._lattice.spacing / self._diameter
-            finer = finer_sampling(optics, neighbour, largest * pixel, wanted * pixel)
-            if (finer > 1).any():
-                return expose_apart(finer, self._expose_finer, stars)
+            refinement = sampling_refinement(optics, neighbour, largest * pixel, wanted * pixel)
+            if (refinement > 1).any():
+                return expose_by_kind(refinement, self._expose_refined, stars)
         return self._expose_traced(optics, stars)
 
-    def _expose_finer(self, finer: int, stars: Stars) -> Exposed:
-        """Carry stars to the focal plane, with pupil points so many times closer."""
-        return FastPsfEngine(self._inputs, finer, far=finer > 1).expose_as_set(stars)
+    def _expose_refined(self, refinement: int, stars: Stars) -> ExposedStars:
+        """Expose stars with a refined sampling of the pupil."""
+        return FastPsfEngine(self._inputs, refinement, far_from_focus=refinement > 1).expose_without_refinement(stars)
 
-    def expose_as_set(self, stars: Stars) -> Exposed:
-        """Carry stars to the focal plane with this engine's own pupil points, however far from focus they are."""
+    def expose_without_refinement(self, stars: Stars) -> ExposedStars:
+        """Expose stars with this engine's pupil points, however far from focus they are."""
         return self._expose_traced(self._trace(stars.fields, self._points, self._threads), stars)
 
-    def _expose_traced(self, optics: PupilOptics, stars: Stars) -> Exposed:
+    def _expose_traced(self, optics: PupilOptics, stars: Stars) -> ExposedStars:
         if self._inner < self._obscuration:
-            optics = ended_by_apertures(optics, self._points, 0.5 * self._diameter * self._obscuration)
+            optics = clipped_by_apertures(optics, self._points, 0.5 * self._diameter * self._obscuration)
         light = optics.lit * self._weights
         if stars.photons is not None:
             light = light * stars.photons[:, :, None]
         deposit = self._deposit(optics, light)
         combined = self._combine(self._transforms(deposit, optics, light), optics, stars.offsets)
         # A dark star has no light to divide by.
-        total = np.where(optics.lit.any(axis=(1, 2)), light.sum(axis=(1, 2)), 1.0) * len(self._turns.time)
+        total = np.where(optics.lit.any(axis=(1, 2)), light.sum(axis=(1, 2)), 1.0) * len(self._schedule.time)
 
         def draw(shift: np.ndarray | None) -> np.ndarray:
             moved = combined
@@ -221,10 +221,10 @@ class FastPsfEngine(PsfEngine):
                 moved *= np.exp(ramp[:, 0] * self._kx).astype(np.complex64)[:, None, :]
             return self._stamps(moved, total)
 
-        return Exposed(draw, self._area * optics.lit.mean(axis=2), optics.reference_points)
+        return ExposedStars(draw, self._area * optics.lit.mean(axis=2), optics.reference_points)
 
     def _transforms(self, deposit: np.ndarray, optics: PupilOptics, light: np.ndarray) -> np.ndarray:
-        """Return the transforms of what was binned, shape [n_star, n_channel, ky, kx]."""
+        """Return the transforms of the binned rays, shape [n_star, n_channel, ky, kx]."""
         # One transform a star, so that its bytes do not depend on its neighbours.
         return np.stack(self._map(scipy.fft.rfft2, deposit))
 
@@ -251,9 +251,11 @@ class FastPsfEngine(PsfEngine):
                 atmosphere.pupil_centers(self._direction(optics.fields), atmosphere.times[0]) + self._lattice.origin
             ) / pixel
             # Points that share a sample of the screens stand around it.
-            start += 0.5 * (1.0 - math.gcd(self._stride, self._finer) / self._finer)
+            start += 0.5 * (1.0 - math.gcd(self._stride, self._refinement) / self._refinement)
             step = -atmosphere.velocities * (atmosphere.exposure / len(atmosphere.times)) / pixel
-            column, row = (line * self._stride // self._finer for line in (self._lattice.column, self._lattice.row))
+            column, row = (
+                line * self._stride // self._refinement for line in (self._lattice.column, self._lattice.row)
+            )
         lattice = to_packets(row * screen_size + column, np.int32)
         # Rays that were lost have no place to land; they carry no light either.
         lit = optics.lit[:, self._channels.wave, :, None]
@@ -269,11 +271,11 @@ class FastPsfEngine(PsfEngine):
                 warp_array(self._units, wp.float32),
                 screen_size,
                 n_layer,
-                len(self._turns.time),
+                len(self._schedule.time),
                 warp_array(start, wp.float64),
                 warp_array(step, wp.float64),
-                warp_array(self._turns.time.astype(np.int32), wp.int32),
-                warp_array(self._turns.channel, wp.int32),
+                warp_array(self._schedule.time.astype(np.int32), wp.int32),
+                warp_array(self._schedule.channel, wp.int32),
                 warp_array(lattice, indices),
                 int(max(column.max(), row.max())) + 1,
                 warp_array(cells_per_slope.astype(np.float32), wp.float32),
@@ -296,7 +298,7 @@ class FastPsfEngine(PsfEngine):
         middle = self._plane.middle * self._plane.pixel_size - self._grid_size // 2 * self._cell
         shift = shift + (offsets * self._plane.pixel_size + middle)[:, None, :]
         # Rays of a channel stand for its light; the further diffusion is a product of Gaussians along x and y.
-        across = (channels.weight / self._turns.fraction)[:, None] * channels.spread(self._kx)
+        across = (channels.weight / self._schedule.fraction)[:, None] * channels.spread(self._kx)
         along = channels.spread(self._ky)
         combined = np.empty((n_star, n_row, n_column), dtype=np.complex64)
         launch(

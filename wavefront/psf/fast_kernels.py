@@ -33,21 +33,21 @@ def unpack(counts: indices, unit: wp.float32):
 
 
 @wp.func
-def own_channel(channel: wp.array3d(dtype=wp.int32), wave: wp.int32, t: wp.int32, packet: wp.int32):
-    """Channel of a wavelength that has but one."""
+def single_channel(channel: wp.array3d(dtype=wp.int32), wave: wp.int32, t: wp.int32, packet: wp.int32):
+    """Channel of a wavelength that has a single one."""
     return wave
 
 
 @wp.func
-def channel_of_turn(channel: wp.array3d(dtype=wp.int32), wave: wp.int32, t: wp.int32, packet: wp.int32):
-    """Channel of a wavelength at the turn of a packet."""
+def scheduled_channel(channel: wp.array3d(dtype=wp.int32), wave: wp.int32, t: wp.int32, packet: wp.int32):
+    """Channel of a wavelength that the schedule gives to a packet."""
     return channel[wave, t, packet]
 
 
 @kernel_pair
 def deposit_rays(special: bool, module: wp.Module) -> wp.Kernel:
     """Return the kernel that deposits rays; the special one is that of wavelengths with several channels."""
-    channel_of = channel_of_turn if special else own_channel
+    channel_of = scheduled_channel if special else single_channel
 
     @wp.kernel(module=module)
     def deposit_rays(

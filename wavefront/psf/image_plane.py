@@ -1,4 +1,4 @@
-r"""The detector end of the PSF engines: the grid of a stamp, and what pixels, diffusion and jitter do to it.
+r"""Detector of the PSF engines: grid of a stamp, and transfer functions of pixels, diffusion and jitter.
 
 An image :math:`I(X)` on the focal plane has the transform :math:`\tilde I(k) = \int I(X) e^{-i k \cdot X} dX`, with k
 in radians per metre of the focal plane. A pupil baseline b belongs to :math:`k = (2 \pi / \lambda) J^{-T} b`, where J

@@ -1,4 +1,4 @@
-"""The inner rim of the pupil, where the telescope has it.
+"""Inner rim of the pupil as the apertures of the telescope define it.
 
 Off the axis the hole of a mirror stands aside from that of the pupil, which lies in another plane: by 8 mm at 1.64
 degrees of the LSST. A ring that ends at the pupil's own hole has a dark crescent there, which a fit of a donut takes
@@ -22,8 +22,8 @@ def traced_obscuration(obscuration: float) -> float:
     return max(obscuration - _WITHIN, 0.0)
 
 
-def ended_by_apertures(optics: PupilOptics, points: np.ndarray, inner_radius: float) -> PupilOptics:
-    """Return optics whose lit points [n, 2] end where apertures do; where none does, at an inner radius [m]."""
+def clipped_by_apertures(optics: PupilOptics, points: np.ndarray, inner_radius: float) -> PupilOptics:
+    """Return optics whose lit points [n, 2] end at the apertures or, without any, at an inner radius [m]."""
     within = np.hypot(*points.T) < inner_radius
     unbounded = np.all(optics.lit[:, :, within], axis=2, keepdims=True)
     return replace(optics, lit=optics.lit & ~(unbounded & within))

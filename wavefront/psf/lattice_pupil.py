@@ -27,9 +27,9 @@ from .pupil_lattice import PupilLattice
 
 #: Points of the default lattice in a disc: 196 across, for vanes of a few centimetres; and in rings without any.
 LATTICE_POINTS, RINGS_POINTS = 30000, 7500
-#: Fewest points that may be asked for.
+#: Fewest points of a lattice.
 FEWEST_POINTS = 500
-#: Most points across the diameter: stars that need more are left to dense rays.
+#: Most points across the diameter: stars that need more are drawn by dense rays.
 MOST_ACROSS = 1024
 # Largest change of the phase of a ray from one point to the next, as the image of its star is wide (rms along an axis):
 # splines then follow the transfer function to 1e-4.
@@ -50,7 +50,7 @@ _TERMS = [(d + 1) * (d + 2) // 2 for d in range(_DEGREE, -1, -1)]
 
 @dataclass(frozen=True)
 class LatticeRays:
-    """Rays of stars through a lattice at the middle wavelength, and what differs at the others."""
+    """Rays of stars through a lattice at the middle wavelength, and the differences at the others."""
 
     optics: PupilOptics  #: of the middle wavelength
     path: np.ndarray  #: coefficients of the paths at each wavelength less those [m], [n_star, n_wave, n_term]
@@ -81,13 +81,13 @@ class LatticeTransfer:
         """Pupil coordinates [m], shape [n_pupil, 2]."""
         return self.lattice.points @ _TURN.T
 
-    def closer(self, finer: int) -> LatticeTransfer:
-        """Return the lattice with points so many times closer."""
-        spacing = self.lattice.spacing / finer
+    def refined(self, refinement: int) -> LatticeTransfer:
+        """Return the lattice with its spacing divided by a factor."""
+        spacing = self.lattice.spacing / refinement
         return replace(self, lattice=PupilLattice.fill(self.diameter, self.obscuration, spacing))
 
-    def finer(self, rays: LatticeRays) -> np.ndarray:
-        """Return how many times closer the points of each star must be, 1 for stars near focus, [n_star] int."""
+    def refinement(self, rays: LatticeRays) -> np.ndarray:
+        """Return the factor by which each star needs a finer lattice, 1 near focus, [n_star] int."""
         optics = rays.optics
         lit = optics.lit[:, 0, :, None]
         landed = np.where(lit, optics.displacement[:, 0], np.float32(0.0))

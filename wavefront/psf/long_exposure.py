@@ -23,7 +23,7 @@ Where anything but discs and rings stops light, much of the pupil is vignetted o
 autocorrelation over a lattice of rays takes the place of spokes and strips (:mod:`.lattice_pupil`), at some thirty
 times the cost.
 
-Stars far from focus, donuts, are left to the dense rays of :mod:`.mean_rays`.
+Stars far from focus (donuts) are drawn by the dense rays of :mod:`.mean_rays`.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from ...core.warp_arrays import warp_array
 from ...models.telescope import Telescope
 from ..atmosphere.turbulence import coherence, structure_function
 from ..pupil_optics import PupilOptics
-from .clear_pupil import SpokePupil, clear_edges, only_rings
-from .engine import Exposed, PsfEngine, PsfInputs, Stars, expose_apart, metric_of
+from .clear_pupil import SpokePupil, clear_edges, has_only_annuli
+from .engine import ExposedStars, PsfEngine, PsfInputs, Stars, expose_by_kind, metric_of
 from .lattice_pupil import LATTICE_POINTS, MOST_ACROSS, RINGS_POINTS, LatticeRays, LatticeTransfer
 from .long_exposure_kernels import place_points, sample_pixels, transform_pupils
-from .mean_rays import MeanRaysEngine, ray_counts, wanted_rays
+from .mean_rays import MeanRaysEngine, drawing_ray_counts, ray_counts
 from .pupil_rims import strip_overlap
 from .sample_packets import LANES, samples
 
@@ -75,7 +75,7 @@ _TABLE_SIZE = 2048
 
 def default_points(telescope: Telescope) -> int:
     """Return the points of the pupil by default: of spokes where only discs and rings stop light, else of a lattice."""
-    return PUPIL_POINTS if only_rings(telescope) else LATTICE_POINTS
+    return PUPIL_POINTS if has_only_annuli(telescope) else LATTICE_POINTS
 
 
 class LongExposureEngine(PsfEngine):
@@ -103,9 +103,9 @@ class LongExposureEngine(PsfEngine):
         self._step = self._wavelengths * self.focal_length / self.period
         # Width of the pupil's ring.
         self._width = 0.5 * self._diameter * (1.0 - self._obscuration)
-        given, rings = inputs.n_pupil, only_rings(self._telescope)
-        # Whether strips along the rims are wrong for every star.
-        self._general = not rings or not self._strips_apart()
+        given, rings = inputs.n_pupil, has_only_annuli(self._telescope)
+        # Whether every star needs the lattice in place of strips along the rims.
+        self._general = not rings or not self._strips_suffice()
         count = given or LATTICE_POINTS
         if rings:
             count = LATTICE_POINTS if self._general else RINGS_POINTS
@@ -125,10 +125,10 @@ class LongExposureEngine(PsfEngine):
         """Return the mean transfer function of the atmosphere at baselines [m], shape [n_wave, n]."""
         return coherence(structure_function(baseline, self._r0, self._outer_scale), self._wavelengths[:, None])
 
-    def _strengths(self, longest: float) -> np.ndarray:
-        """Return the transfer function of atmosphere and detector at each frequency up to a baseline [m], [n_wave, n].
+    def _transfer_bounds(self, longest: float) -> np.ndarray:
+        """Return the largest transfer of atmosphere and detector at each frequency up to a baseline [m], [n_wave, n].
 
-        Along the axis or the diagonal where it is larger.
+        It is the larger one of those along the axes and the diagonal.
         """
         step = self._step
         count = np.arange(1, math.ceil(longest / step.min()) + 1)
@@ -138,17 +138,17 @@ class LongExposureEngine(PsfEngine):
         left = np.array([self._turbulence(s * count)[w] for w, s in enumerate(step)]) * np.max(np.abs(detector), axis=0)
         return np.asarray(left * self._channels.of_wavelength(self._channels.spread(k)))
 
-    def _strips_apart(self) -> bool:
-        """Return whether next to nothing is left of baselines half as long as the pupil's ring is wide."""
+    def _strips_suffice(self) -> bool:
+        """Return whether the transfer is negligible at baselines of half the width of the pupil's annulus."""
         half = 0.5 * self._width
-        left = self._strengths(half)
+        left = self._transfer_bounds(half)
         last = np.minimum(np.ceil(half / self._step).astype(int), left.shape[1]) - 1
         return bool(left[np.arange(len(left)), last].max() <= _LARGEST_LEFT)
 
     def _choose_frequencies(self) -> None:
         """Choose the largest frequency of the sums."""
         longest = self._diameter if self._general else self._width
-        strong = np.flatnonzero((self._strengths(longest) > _NEGLIGIBLE).any(axis=0))
+        strong = np.flatnonzero((self._transfer_bounds(longest) > _NEGLIGIBLE).any(axis=0))
         #: Largest frequency along either axis, in steps of one over the period.
         self._reach = int(strong[-1]) + 1 if strong.size else 1
 
@@ -190,7 +190,7 @@ class LongExposureEngine(PsfEngine):
         self._fade_x = (self._channels.weight[:, None, None] * spread).astype(np.float32)
         self._fade_y = spread.astype(np.float32)
 
-    def _expose(self, stars: Stars) -> Exposed:
+    def _expose(self, stars: Stars) -> ExposedStars:
         if self._general:
             return self._expose_lattice(stars)
         optics = self._trace(stars.fields, self._pupil.points, self._threads)
@@ -200,52 +200,54 @@ class LongExposureEngine(PsfEngine):
             rays = ray_counts(optics, self._plane.pixel_size)
             kinds = np.where(rays > 0, rays, kinds)
         if (kinds == _NEAR).all():
-            return self._expose_near(optics, edges, stars)
-        return expose_apart(kinds, self._expose_kind, stars)
+            return self._expose_spokes(optics, edges, stars)
+        return expose_by_kind(kinds, self._expose_kind, stars)
 
-    def _expose_kind(self, kind: int, stars: Stars) -> Exposed:
-        """Carry stars to the focal plane: far ones by so many rays, others by strips or by a lattice."""
+    def _expose_kind(self, kind: int, stars: Stars) -> ExposedStars:
+        """Expose stars of a kind: by strips, by a lattice or, far from focus, by a number of rays."""
         if kind == _VIGNETTED:
             return self._expose_lattice(stars)
         if kind == _NEAR:
             optics = self._trace(stars.fields, self._pupil.points, self._threads)
-            return self._expose_near(optics, self._edges(stars.fields), stars)
-        return MeanRaysEngine(self._inputs, kind).expose_as_set(stars)
+            return self._expose_spokes(optics, self._edges(stars.fields), stars)
+        return MeanRaysEngine(self._inputs, kind).expose_without_refinement(stars)
 
-    def _expose_lattice(self, stars: Stars) -> Exposed:
-        """Carry stars to the focal plane by lattices as close as each needs, or by rays where that is very close."""
+    def _expose_lattice(self, stars: Stars) -> ExposedStars:
+        """Expose stars by lattices as fine as each needs, or by rays where that is too fine."""
         rays = self._lattice_rays(self._lattice, stars)
-        finer = self._lattice.finer(rays)
-        if (finer == 1).all():
-            return self._expose_correlated([(self._lattice, rays, stars)])
+        refinement = self._lattice.refinement(rays)
+        if (refinement == 1).all():
+            return self._expose_autocorrelation([(self._lattice, rays, stars)])
         most = MOST_ACROSS // self._lattice.lattice.size
-        kinds = np.where(finer > most, -wanted_rays(rays.optics, self._plane.pixel_size), finer)
+        kinds = np.where(refinement > most, -drawing_ray_counts(rays.optics, self._plane.pixel_size), refinement)
 
-        def expose(kind: int, stars: Stars) -> Exposed:
+        def expose(kind: int, stars: Stars) -> ExposedStars:
             if kind < 0:
-                return MeanRaysEngine(self._inputs, -kind).expose_as_set(stars)
-            lattice = self._lattice.closer(kind)
+                return MeanRaysEngine(self._inputs, -kind).expose_without_refinement(stars)
+            lattice = self._lattice.refined(kind)
             few = max(1, self.batch // kind**2)
             parts = (stars[first : first + few] for first in range(0, len(stars), few))
-            return self._expose_correlated((lattice, self._lattice_rays(lattice, part), part) for part in parts)
+            return self._expose_autocorrelation((lattice, self._lattice_rays(lattice, part), part) for part in parts)
 
-        return expose_apart(kinds, expose, stars)
+        return expose_by_kind(kinds, expose, stars)
 
     def _lattice_rays(self, lattice: LatticeTransfer, stars: Stars) -> LatticeRays:
         return lattice.trace(lambda wavelengths, points: self._trace(stars.fields, points, self._threads, wavelengths))
 
-    def _expose_correlated(self, parts: Iterable[tuple[LatticeTransfer, LatticeRays, Stars]]) -> Exposed:
-        """Carry the light of lattice points to the focal plane, some stars after the others."""
+    def _expose_autocorrelation(self, parts: Iterable[tuple[LatticeTransfer, LatticeRays, Stars]]) -> ExposedStars:
+        """Expose stars by the autocorrelation of their lattices, batch by batch."""
         spectra, lit, points, offsets = [], [], [], []
         for lattice, rays, stars in parts:
-            spectra += self._map(partial(self._correlate, lattice, rays, stars.photons), range(len(stars)))
+            spectra += self._map(
+                partial(self._autocorrelation_transfer, lattice, rays, stars.photons), range(len(stars))
+            )
             lit.append(np.repeat(rays.optics.lit.mean(axis=2), len(self._wavelengths), axis=1))
             points.append(rays.optics.reference_points)
             offsets.append(stars.offsets)
         together = (np.concatenate(values) for values in (offsets, lit, points))
         return self._sampled(np.stack(spectra), *together)
 
-    def _correlate(
+    def _autocorrelation_transfer(
         self, lattice: LatticeTransfer, rays: LatticeRays, photons: np.ndarray | None, star: int
     ) -> np.ndarray:
         """Return the transfer function of a star without the detector, as :func:`transform_pupils` lays it out."""
@@ -255,7 +257,7 @@ class LongExposureEngine(PsfEngine):
         k = 2.0 * math.pi / self.period * np.stack([np.tile(column, 2), np.concatenate([row, -row])], axis=1)
         along = k @ rays.optics.jacobian[star]
         baseline = np.hypot(*along.T) / (2.0 * math.pi)
-        table, channels = self._air, self._channels
+        table, channels = self._atmosphere_table, self._channels
         air = np.array([np.interp(w * baseline, *table[[0, n]]) for n, w in enumerate(self._wavelengths, 1)])
         filters = (air * np.exp(-1j * (self._dispersion @ along.T)))[channels.wave]
         filters *= channels.weight[:, None] * channels.spread(np.hypot(*k.T))
@@ -268,7 +270,7 @@ class LongExposureEngine(PsfEngine):
         return laid.reshape(4, *self._detector.shape[1:])
 
     @cached_property
-    def _air(self) -> np.ndarray:
+    def _atmosphere_table(self) -> np.ndarray:
         """Baselines [m], and the mean transfer functions of the atmosphere there over the number of wavelengths."""
         baseline = self._baselines()
         return np.concatenate([baseline[None], self._turbulence(baseline) / len(self._wavelengths)])
@@ -278,16 +280,16 @@ class LongExposureEngine(PsfEngine):
         middle = float(self._wavelengths[len(self._wavelengths) // 2])
         return clear_edges(self._telescope, self._direction(fields), self._pupil.unit, middle, self._threads)
 
-    def _area(self, edges: np.ndarray) -> np.ndarray:
+    def _clear_area(self, edges: np.ndarray) -> np.ndarray:
         """Return the clear areas of the pupil [m^2], [n_star]."""
         return np.asarray(math.pi / self._pupil.n_spoke * (edges[..., 1] ** 2 - edges[..., 0] ** 2).sum(axis=1))
 
     def _lit_fraction(self, edges: np.ndarray) -> np.ndarray:
         inner, outer = self._pupil.radius[[0, -1]]
-        return self._area(edges) / (math.pi * (outer**2 - inner**2))
+        return self._clear_area(edges) / (math.pi * (outer**2 - inner**2))
 
-    def _expose_near(self, optics: PupilOptics, edges: np.ndarray, stars: Stars) -> Exposed:
-        spectrum = self._transform(optics, edges, self._area(edges), stars.photons)
+    def _expose_spokes(self, optics: PupilOptics, edges: np.ndarray, stars: Stars) -> ExposedStars:
+        spectrum = self._transform(optics, edges, self._clear_area(edges), stars.photons)
         lit_fraction = np.repeat(self._lit_fraction(edges)[:, None], len(self._wavelengths), axis=1)
         return self._sampled(spectrum, stars.offsets, lit_fraction, optics.reference_points)
 
@@ -350,8 +352,10 @@ class LongExposureEngine(PsfEngine):
         )
         return spectrum
 
-    def _sampled(self, spectrum: np.ndarray, offsets: np.ndarray, lit: np.ndarray, points: np.ndarray) -> Exposed:
-        return Exposed(lambda shift: self._sample(spectrum, offsets if shift is None else offsets - shift), lit, points)
+    def _sampled(self, spectrum: np.ndarray, offsets: np.ndarray, lit: np.ndarray, points: np.ndarray) -> ExposedStars:
+        return ExposedStars(
+            lambda shift: self._sample(spectrum, offsets if shift is None else offsets - shift), lit, points
+        )
 
     def _sample(self, spectrum: np.ndarray, offsets: np.ndarray) -> np.ndarray:
         """Return the stamps of transfer functions, shape [n_star, stamp_size, stamp_size]."""

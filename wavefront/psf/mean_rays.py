@@ -34,22 +34,22 @@ _SMOOTH_POINTS, _DARK = 2000, 1e-3
 
 
 def ray_counts(optics: PupilOptics, pixel_size: float) -> np.ndarray:
-    """Return the rays of each star for :class:`MeanRaysEngine`, 0 for stars near focus, shape [n_star] int.
+    """Return the number of rays of each star for :class:`MeanRaysEngine`, 0 near focus, shape [n_star] int.
 
     ``pixel_size`` is in metres.
     """
-    return np.where(blur_radii(optics) > FAR, wanted_rays(optics, pixel_size), 0)
+    return np.where(blur_radii(optics) > FAR, drawing_ray_counts(optics, pixel_size), 0)
 
 
-def wanted_rays(optics: PupilOptics, pixel_size: float) -> np.ndarray:
-    """Return the rays that draw each star, shape [n_star] int; ``pixel_size`` is in metres."""
+def drawing_ray_counts(optics: PupilOptics, pixel_size: float) -> np.ndarray:
+    """Return the number of rays that draw each star, shape [n_star] int; ``pixel_size`` is in metres."""
     # Powers of two, so that a batch has few different numbers.
     count = 2 ** np.ceil(np.log2(_RAYS * np.maximum(blur_radii(optics) / pixel_size, 1.0) ** 2))
     return np.asarray(count, dtype=np.int64)
 
 
 class MeanRaysEngine(FastPsfEngine):
-    """Rays of the optics alone, blurred as the mean of all turbulence blurs.
+    """Rays of the optics alone, filtered by the mean transfer function of all turbulence.
 
     Pupil points stand on a spiral, which lines up with no rim. Rays are shared among the four cells around them: in
     the nearest cell alone, rows of rays that line up with rows of cells would show, by 1 %.
@@ -57,7 +57,7 @@ class MeanRaysEngine(FastPsfEngine):
 
     def __init__(self, inputs: PsfInputs, rays: int) -> None:
         self._air = inputs.atmosphere
-        super().__init__(replace(inputs, atmosphere=None, n_pupil=rays, oversampling=OVERSAMPLING), far=True)
+        super().__init__(replace(inputs, atmosphere=None, n_pupil=rays, oversampling=OVERSAMPLING), far_from_focus=True)
 
     def _place_pupil(self, n_pupil: int) -> None:
         self._points = spiral_annulus(0.5 * self._diameter, self._inner, int(self._area * n_pupil)).points
@@ -65,7 +65,7 @@ class MeanRaysEngine(FastPsfEngine):
 
     def _make_grid(self) -> None:
         super()._make_grid()
-        # The share of a cell falls linearly: averaged over a square twice, of which the engine takes back one.
+        # Cloud-in-cell weights are a square averaged twice; the engine undoes one of the averages.
         self._detector /= square_transfer(self._kx, self._ky[:, None], self._cell).astype(np.float32)
 
     def _deposit(self, optics: PupilOptics, light: np.ndarray) -> np.ndarray:
@@ -75,7 +75,7 @@ class MeanRaysEngine(FastPsfEngine):
         lit = light[:, channels.wave] * ((place >= 0.0) & (place < side - 1)).all(axis=-1)
 
         def share(star: int) -> np.ndarray:
-            return np.stack([_shared(*ray, side) for ray in zip(place[star], lit[star], strict=True)])
+            return np.stack([_cloud_in_cell(*ray, side) for ray in zip(place[star], lit[star], strict=True)])
 
         return np.stack(self._map(share, range(len(place))))
 
@@ -107,19 +107,19 @@ class MeanRaysEngine(FastPsfEngine):
                 places = places + (self._grid_size // 2) * self._cell
                 k = np.stack([kx[bright], ky[bright]], axis=-1)
                 found = rims.transfer(np.stack([x[bright], y[bright]], axis=-1), k, places, inward)
-                # The detector's filter undoes the share of a cell of the deposit.
+                # The detector's filter undoes the cloud-in-cell average of the rays.
                 found *= square_transfer(k[:, 0], k[:, 1], self._cell) ** 2
                 spectra[star, channel][bright] += float(light[star, wave].sum()) * found
 
         list(self._map(diffract, range(len(spectra))))
         return spectra
 
-    def _rest(self, baseline: np.ndarray) -> np.ndarray | None:
+    def _filter_structure(self, baseline: np.ndarray) -> np.ndarray | None:
         return None if self._air is None else structure_function(baseline, self._air.r0, self._air.outer_scale)
 
 
-def _shared(place: np.ndarray, light: np.ndarray, side: int) -> np.ndarray:
-    """Return light [n] of rays at places [n, 2] in cells, shared linearly among the cells, [side, side] float32."""
+def _cloud_in_cell(place: np.ndarray, light: np.ndarray, side: int) -> np.ndarray:
+    """Bin light [n] at positions [n, 2] [cells], linearly among four cells (cloud in cell): [side, side] float32."""
     shining = light > 0.0
     place, light = place[shining], light[shining]
     corner = place.astype(np.int64)

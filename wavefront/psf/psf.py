@@ -187,19 +187,21 @@ def make_psfs(
         falls between the CCDs.
     """
     check_choice("engine", engine, ENGINES)
-    angles = _table(radians(fields, "fields"), "fields", None)
+    angles = _finite_pairs(radians(fields, "fields"), "fields", None)
     telescope.check_field(angles[:, 0], angles[:, 1])
     lengths = metres(wavelengths, "wavelengths").reshape(-1)
     if not lengths.size or not (np.isfinite(lengths) & (lengths > 0.0)).all():
         raise DomainError(f"wavelengths = {wavelengths!r}: expected one or more positive lengths in metres")
-    photons = None if wavelength_weights is None else _photons(wavelength_weights, len(angles), len(lengths))
-    places = np.zeros((len(angles), 2)) if offsets is None else _table(offsets, "offsets", len(angles))
-    shifts = None if dispersion is None else _table(radians(dispersion, "dispersion"), "dispersion", len(lengths))
+    photons = None if wavelength_weights is None else _relative_photons(wavelength_weights, len(angles), len(lengths))
+    places = np.zeros((len(angles), 2)) if offsets is None else _finite_pairs(offsets, "offsets", len(angles))
+    shifts = (
+        None if dispersion is None else _finite_pairs(radians(dispersion, "dispersion"), "dispersion", len(lengths))
+    )
     plane = ImagePlane(
         stamp_size,
         length(pixel_size, "pixel_size"),
         length(diffusion, "diffusion"),
-        _on_detector(jitter, telescope, lengths),
+        _jitter_on_detector(jitter, telescope, lengths),
     )
     maker = ENGINES[engine](
         PsfInputs(
@@ -247,7 +249,7 @@ def make_psfs(
     )
 
 
-def _on_detector(jitter: Any, telescope: Telescope, wavelengths: np.ndarray) -> float:
+def _jitter_on_detector(jitter: Any, telescope: Telescope, wavelengths: np.ndarray) -> float:
     """Return the displacement on the detector [m] of a jitter [rad], at the centre of the field."""
     spread = angle(jitter, "jitter")
     if not spread >= 0.0:
@@ -255,7 +257,7 @@ def _on_detector(jitter: Any, telescope: Telescope, wavelengths: np.ndarray) -> 
     return spread * center_focal_length(telescope, wavelengths) if spread else 0.0
 
 
-def _photons(values: Any, n_star: int, n_wave: int) -> np.ndarray:
+def _relative_photons(values: Any, n_star: int, n_wave: int) -> np.ndarray:
     """Return relative numbers of photons, of mean 1 for each star, shape [n_star, n_wave]."""
     table = pure_numbers(values, "wavelength_weights")
     if table.shape not in ((n_wave,), (n_star, n_wave)):
@@ -268,7 +270,7 @@ def _photons(values: Any, n_star: int, n_wave: int) -> np.ndarray:
     return np.asarray(table / table.mean(axis=1, keepdims=True))
 
 
-def _table(values: Any, name: str, count: int | None) -> np.ndarray:
+def _finite_pairs(values: Any, name: str, count: int | None) -> np.ndarray:
     """Return pairs of finite numbers as a float64 array of shape [count, 2]."""
     table = pure_numbers(values, name)
     if count is None:

@@ -22,7 +22,7 @@ import numpy as np
 
 from ...models.telescope import Telescope
 from ...raytrace.launch import aimed_points
-from ...raytrace.pack.surfaces import clear_ring
+from ...raytrace.pack.surfaces import clear_annulus
 from ..atmosphere.turbulence import diffraction_otf
 from ..pupil_polynomials import PupilPolynomials
 from .clear_pupil import clear_edges
@@ -60,7 +60,7 @@ class PupilRims:
         return places, np.einsum("nij,nj->ni", slopes, self.normals)
 
     def transfer(self, baseline: np.ndarray, wave: np.ndarray, landing: np.ndarray, inward: np.ndarray) -> np.ndarray:
-        """Return what diffraction at the rims adds to the transfer function, shape [n_frequency], complex64.
+        """Return the transfer function of diffraction at the rims, shape [n_frequency], complex64.
 
         Parameters
         ----------
@@ -129,7 +129,7 @@ def pupil_rims(telescope: Telescope, direction: np.ndarray, wavelength: float) -
     """
     angle = 2.0 * math.pi * (np.arange(_PIECES) + 0.5) / _PIECES
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    edges = clear_edges(_rings_alone(telescope), direction[None], unit, wavelength, threads=1)[0]
+    edges = clear_edges(_annular_apertures_only(telescope), direction[None], unit, wavelength, threads=1)[0]
     area, points, normals, parts = 0.0, [], [], []
     for side, sign in ((0, 1.0), (1, -1.0)):
         rim = edges[:, side, None] * unit
@@ -147,7 +147,9 @@ def pupil_rims(telescope: Telescope, direction: np.ndarray, wavelength: float) -
     return PupilRims(np.concatenate(points), np.concatenate(normals), np.concatenate(parts) / max(area, 1e-300))
 
 
-def _rings_alone(telescope: Telescope) -> Telescope:
-    """Return the telescope without what stops light but for discs and rings."""
-    surfaces = tuple(s if clear_ring(s.aperture) is not None else replace(s, aperture=None) for s in telescope.surfaces)
+def _annular_apertures_only(telescope: Telescope) -> Telescope:
+    """Return the telescope without obstructions, and without apertures other than discs and rings."""
+    surfaces = tuple(
+        s if clear_annulus(s.aperture) is not None else replace(s, aperture=None) for s in telescope.surfaces
+    )
     return replace(telescope, surfaces=surfaces, obstructions=())

@@ -41,8 +41,8 @@ from ...core.threads import thread_count
 from ...core.warp_arrays import warp_array
 from ..atmosphere.spline import spline_weights
 from ..pupil_optics import PupilOptics
-from .engine import Exposed, PsfEngine, PsfInputs, Stars
-from .inner_rim import ended_by_apertures, traced_obscuration
+from .engine import ExposedStars, PsfEngine, PsfInputs, Stars
+from .inner_rim import clipped_by_apertures, traced_obscuration
 from .pupil_lattice import PupilLattice
 from .sample_packets import LANES, indices, samples
 from .wave_kernels import Screens, Taps, add_squares, pupil_fields
@@ -61,7 +61,7 @@ _NEGLIGIBLE, _TRIED = 1e-4, 64
 
 
 class WavePsfEngine(PsfEngine):
-    """Fourier optics, one star per thread."""
+    """Fourier optics; each thread computes one star at a time."""
 
     name = "wave"
     depths = 3
@@ -70,12 +70,12 @@ class WavePsfEngine(PsfEngine):
 
     def __init__(self, inputs: PsfInputs) -> None:
         super().__init__(inputs)
-        self._lay_grid(inputs.padding, inputs.pupil_spacing)
-        self._take_screens()
-        self._turns = self._channels.turns(1 if inputs.atmosphere is None else len(inputs.atmosphere.times))
+        self._make_pupil_lattice(inputs.padding, inputs.pupil_spacing)
+        self._load_screens()
+        self._schedule = self._channels.depth_schedule(1 if inputs.atmosphere is None else len(inputs.atmosphere.times))
         self.batch = thread_count(inputs.threads)
 
-    def _lay_grid(self, padding: bool | None, spacing: float | None) -> None:
+    def _make_pupil_lattice(self, padding: bool | None, spacing: float | None) -> None:
         if spacing is None:
             largest = LARGEST_SPACING_OPTICS if self._atmosphere is None else LARGEST_SPACING
             largest = min(largest, self._diameter / FEWEST_ACROSS)
@@ -96,7 +96,7 @@ class WavePsfEngine(PsfEngine):
         self._reach = min(math.floor(longest / spacing), (self._size - 1) // 2)
 
     def _longest_baseline(self) -> float:
-        """Return the baseline [m] beyond which charge diffusion leaves next to nothing, at most the diameter."""
+        """Return the baseline [m] beyond which the transfer of charge diffusion is negligible, at most the diameter."""
         baseline = np.linspace(min(LONGEST_BASELINE, self._diameter), self._diameter, _TRIED)
         k = 2.0 * math.pi * baseline / (float(self._wavelengths.max()) * self.focal_length)
         spread = self._channels.of_wavelength(self._channels.spread(k)).max(axis=0)
@@ -104,8 +104,8 @@ class WavePsfEngine(PsfEngine):
         too_short = int(np.count_nonzero(left > _NEGLIGIBLE))
         return float(baseline[min(too_short, _TRIED - 1)])
 
-    def _take_screens(self) -> None:
-        """Take the spline coefficients of the low and the high screens [m], and lay the lattice over them."""
+    def _load_screens(self) -> None:
+        """Load the spline coefficients of the low and the high screens [m], and place the lattice on them."""
         atmosphere = self._atmosphere
         if atmosphere is None:
             self._splines = [np.zeros((1, 1), dtype=np.float32)] * 2
@@ -127,7 +127,7 @@ class WavePsfEngine(PsfEngine):
             screens.values, screens.size, screens.run = warp_array(values, wp.float32), int(size), run
         return packed
 
-    def _expose(self, stars: Stars) -> Exposed:
+    def _expose(self, stars: Stars) -> ExposedStars:
         photons = [None] * len(stars) if stars.photons is None else stars.photons
         optics, spectra = zip(*self._map(self._expose_star, stars.fields, photons), strict=True)
         area = 0.25 * math.pi * self._diameter**2 * (1.0 - self._obscuration**2)
@@ -138,13 +138,13 @@ class WavePsfEngine(PsfEngine):
             jacobians = [star.jacobian[0] for star in optics]
             return np.stack(self._map(self._sample, spectra, jacobians, places))
 
-        return Exposed(draw, lit, np.concatenate([star.reference_points for star in optics]))
+        return ExposedStars(draw, lit, np.concatenate([star.reference_points for star in optics]))
 
     def _expose_star(self, field: np.ndarray, photons: np.ndarray | None) -> tuple[PupilOptics, np.ndarray]:
         """Return the optics of a star and its spectra, the OTF times the transfer function of the detector."""
         points = self._lattice.points
         optics = self._trace(field[None], points, 1)
-        optics = ended_by_apertures(optics, points, 0.5 * self._diameter * self._obscuration)
+        optics = clipped_by_apertures(optics, points, 0.5 * self._diameter * self._obscuration)
         spectra = self._filtered(self._intensity(field, optics), optics.jacobian[0])
         if photons is not None and optics.lit.any():
             # Wavelengths count by their light, of which the spectra have a sum of 1.
@@ -178,16 +178,16 @@ class WavePsfEngine(PsfEngine):
             warp_array(fields, wp.vec2f),
         ]
         moments = self._screen_places(field)
-        for step, time in enumerate(self._turns.time):
-            chosen = np.ascontiguousarray(self._turns.channel[:, step, 0])
-            now = [*screens, n_layer, self._taps(moments[time]), *before, warp_array(chosen, wp.int32)]
+        for step, time in enumerate(self._schedule.time):
+            chosen = np.ascontiguousarray(self._schedule.channel[:, step, 0])
+            now = [*screens, n_layer, self._screen_samples(moments[time]), *before, warp_array(chosen, wp.int32)]
             launch(pupil_fields, line, [*now, *after], threads=1)
             for wave in range(n_wave):
                 focused = scipy.fft.fft2(fields[wave]).view(np.float32).reshape(-1, LANES)
                 launch(add_squares, len(focused), [warp_array(focused, samples), squares[chosen[wave]]], threads=1)
         intensity = np.empty((n_channel, size, size))
-        count = len(self._turns.time) * lit.sum()
-        for channel, part in enumerate(channels.weight / self._turns.fraction):
+        count = len(self._schedule.time) * lit.sum()
+        for channel, part in enumerate(channels.weight / self._schedule.fraction):
             parts = squares[channel].numpy().reshape(size, size, 2)
             intensity[channel] = part * (parts.sum(axis=-1, dtype=np.float64) / count)
         return intensity
@@ -211,7 +211,7 @@ class WavePsfEngine(PsfEngine):
         both = np.stack([corner / atmosphere.screen_pixel, corner / atmosphere.fine_pixel], axis=-2)
         return both.reshape(len(atmosphere.times), -1, 2)
 
-    def _taps(self, places: np.ndarray) -> Any:
+    def _screen_samples(self, places: np.ndarray) -> Any:
         """Return the samples of the screens around the lattice points at one time, and their weights."""
         sides, steps = np.tile(self._sides, len(places) // 2), np.tile(self._steps, len(places) // 2)
         start = places - sides[:, None] * np.floor(places / sides[:, None])

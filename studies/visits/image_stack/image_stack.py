@@ -1,4 +1,4 @@
-"""Stack of the images of many visits: what decides it, and its files."""
+"""Stack of the images of many visits: its settings and its files."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from ....imaging.exposure import Exposure
 from ....imaging.image_file import CcdImage
 from ....imaging.wcs import CcdWcs, ccd_wcs
 from ....models.camera.camera import Camera
-from ....pipeline.defaults import given
 from ....pipeline.experiment import Experiment
+from ....pipeline.resolved_values import resolved_value
 from ....pipeline.run_folder import CONFIG_NAME
 from ..config import STACK_STAMP, VisitsConfig, load_visits_configuration
 from ..plan import Visit
@@ -35,7 +35,7 @@ _FAINTEST_SNR = 4.0
 
 @dataclass(frozen=True, eq=False)
 class ImageStack:
-    """Stack of images that a folder of visits holds, or will.
+    """Stack of the images of a folder of visits, made or to be made.
 
     Attributes
     ----------
@@ -82,17 +82,17 @@ class ImageStack:
         before = _settings_before(folder)
         if settings is None and before is None:
             raise ProductError(f"{visits_folder}: no images; expected the folder of pachon stack-images")
-        settings = _resolved(settings or before or ImageStackConfig(), before, visits, experiment)
+        settings = _resolved_settings(settings or before or ImageStackConfig(), before, visits, experiment)
         frame = StackFrame.of(experiment, STACK_STAMP)
         source = visits.galaxy_source(experiment, _exposure(experiment, frame))
-        galaxies_in = source.down_to(given(settings.faintest))
+        galaxies_in = source.down_to(resolved_value(settings.faintest))
         return cls(
             folder,
             visits,
             settings,
             experiment,
             frame,
-            choose_tiles(experiment, frame, given(settings.side), settings.tiles, visits),
+            choose_tiles(experiment, frame, resolved_value(settings.side), settings.tiles, visits),
             Sky(sky_points_of(experiment, visits, frame), galaxies_in),
             Stamp(visits.galaxies_digest(experiment, images=settings.model_dump(mode="json")), experiment.config.seed),
         )
@@ -116,7 +116,7 @@ class ImageStack:
                 telescope = visit_telescope(self.experiment, visit)
                 own = {
                     name: ccd_wcs(telescope, camera, name, wavelength=wavelength, threads=threads)
-                    for name in given(self.experiment.config.ccds)
+                    for name in resolved_value(self.experiment.config.ccds)
                 }
                 known = {visit.rotator_deg: own}
             yield visit, {name: VisitWcs(ccd, visit) for name, ccd in known[visit.rotator_deg].items()}
@@ -143,7 +143,7 @@ def tile_side(camera: Camera) -> int:
     return int(np.ceil(np.sqrt(camera.pixels.prod(axis=1).max())))
 
 
-def _resolved(
+def _resolved_settings(
     settings: ImageStackConfig, before: ImageStackConfig | None, visits: VisitsConfig, experiment: Experiment
 ) -> ImageStackConfig:
     """Return settings without open values, which are first those of the images that there are."""

@@ -14,7 +14,7 @@ from ....core.files import write_bytes, write_json
 from ....core.ordered_jobs import ordered_results
 from ....core.products import Stamp
 from ....core.progress import Reporter
-from ....core.random_streams import natural
+from ....core.random_streams import natural_number
 from ....core.units import ARCMIN
 from ....core.workers import MakeWorkers
 from ....imaging.image_file import CcdImage
@@ -76,7 +76,7 @@ def measure_stack(
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> dict[int, dict[str, Any]]:
-    """Detect, select and fit what the stacked images of a folder of visits show.
+    """Detect objects on the stacked images of visits, select stars, and fit galaxies.
 
     Every galaxy is fitted with the PSF of the models of the visits, and with the true one, of the nearest place without
     a star. Products are tables of galaxies, ``images.json`` and ``images.png``.
@@ -208,7 +208,7 @@ def measure_tile(
         true_usable=usable[1],
     )
     true, axes = galaxies_on(stack.sky, tile, tile.wcs(stack.frame)), stack.frame.matrix
-    key: tuple[str | int, ...] = ("images", psfs.visits, natural(tile.column), natural(tile.row))
+    key: tuple[str | int, ...] = ("images", psfs.visits, natural_number(tile.column), natural_number(tile.row))
     options: dict[str, Any] = {"reach": reach, "threads": threads}
     stamps = measure_galaxies(psfs, axes, true, exposure, stack.stamp.seed, *key, **options)
     both = np.intersect1d(galaxies.index[galaxies.usable], stamps.index[stamps.usable])
@@ -245,11 +245,11 @@ def tile_metrics(tiles: list[MeasuredTile]) -> dict[str, Any]:
     ellipticities, of galaxies usable on the image and on the stamp; differences are image minus stamp.
     """
     area = sum(tile.area for tile in tiles)
-    pairs = [_pairs(tile) for tile in tiles]
+    pairs = [_paired_ellipticities(tile) for tile in tiles]
     image, stamp, reference = (np.concatenate([pair[k] for pair in pairs]) for k in range(3))
     difference = image - stamp
-    slopes = [_slope(e, reference) for e in (image, stamp, difference)]
-    lost, faint = (sum(int(_fate(tile)[k]) for tile in tiles) for k in range(2))
+    slopes = [_response_slope(e, reference) for e in (image, stamp, difference)]
+    lost, faint = (sum(int(_loss_counts(tile)[k]) for tile in tiles) for k in range(2))
 
     def density(name: str, flag: str) -> float:
         return sum(int(getattr(getattr(tile, name), flag).sum()) for tile in tiles) / area
@@ -278,7 +278,7 @@ def tile_metrics(tiles: list[MeasuredTile]) -> dict[str, Any]:
     }
 
 
-def _pairs(tile: MeasuredTile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _paired_ellipticities(tile: MeasuredTile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return complex ellipticities on image and stamp, and without noise, of galaxies that are usable on all."""
     n = 1 + max((int(s.index.max(initial=-1)) for s in (tile.stamps, tile.noise_free, tile.galaxies)), default=-1)
     found = []
@@ -292,15 +292,15 @@ def _pairs(tile: MeasuredTile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return image, stamp, reference
 
 
-def _fate(tile: MeasuredTile) -> tuple[int, int]:
-    """Return how many galaxies usable on stamps have no object on the image, or one that is not usable."""
+def _loss_counts(tile: MeasuredTile) -> tuple[int, int]:
+    """Count the galaxies usable on stamps that are not detected, or not usable, on the image."""
     wanted = tile.stamps.index[tile.stamps.usable]
     there = np.isin(wanted, tile.galaxies.index)
     good = np.isin(wanted, tile.galaxies.index[tile.galaxies.usable])
     return int((~there).sum()), int((there & ~good).sum())
 
 
-def _slope(e: np.ndarray, reference: np.ndarray) -> tuple[float | None, float | None]:
+def _response_slope(e: np.ndarray, reference: np.ndarray) -> tuple[float | None, float | None]:
     """Return the slope of ellipticities against reference ones, both components together, and its standard error."""
     if len(e) < 2:
         return None, None

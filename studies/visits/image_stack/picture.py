@@ -1,4 +1,4 @@
-"""Picture of the same part of the sky after more and more visits."""
+"""Picture of one part of the sky in stacks of increasing depth."""
 
 from __future__ import annotations
 

@@ -48,10 +48,10 @@ def add_resampled(
     threads : int, optional
         Number of threads; all processors by default. No byte depends on it.
     """
-    part = _touched(tile, frame, window, wcs)
+    part = _overlap(tile, frame, window, wcs)
     if part is None:
         return
-    step, nodes = _nodes(tile, frame, part, window, wcs)
+    step, nodes = _mapping_nodes(tile, frame, part, window, wcs)
     inputs = [
         warp_array(exposed.image, wp.float32),
         warp_array(exposed.variance, wp.float32),
@@ -68,7 +68,7 @@ def add_resampled(
     launch(add_rows, part.height, inputs, threads=threads)
 
 
-def _touched(tile: Tile, frame: StackFrame, window: Window, wcs: SkyPixels) -> Window | None:
+def _overlap(tile: Tile, frame: StackFrame, window: Window, wcs: SkyPixels) -> Window | None:
     """Return the rectangle of pixels of a tile that a window of a CCD touches; None if there is none."""
     # The edges of the window are straight on the sky to a fraction of a pixel, and its rim of two pixels is not used.
     x, y = (start + np.linspace(-0.5, n - 0.5, 9) for start, n in ((window.x, window.width), (window.y, window.height)))
@@ -81,7 +81,9 @@ def _touched(tile: Tile, frame: StackFrame, window: Window, wcs: SkyPixels) -> W
     return Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
 
 
-def _nodes(tile: Tile, frame: StackFrame, part: Window, window: Window, wcs: SkyPixels) -> tuple[int, np.ndarray]:
+def _mapping_nodes(
+    tile: Tile, frame: StackFrame, part: Window, window: Window, wcs: SkyPixels
+) -> tuple[int, np.ndarray]:
     """Return the pixels between nodes of a part of a tile, and x, y in the window and area of a pixel at them."""
     to_sky = np.linalg.inv(frame.matrix)
     inside = Window(0, 0, window.width, window.height)

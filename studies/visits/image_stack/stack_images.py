@@ -15,7 +15,7 @@ from ....core.memory import readable, require_bytes
 from ....core.ordered_jobs import ordered_results
 from ....core.progress import Reporter
 from ....core.units import ARCSEC
-from ....core.workers import AHEAD, MakeWorkers
+from ....core.workers import JOBS_AHEAD, MakeWorkers
 from ....imaging.exposure import Exposure
 from ....imaging.image_file import CcdImage, is_whole
 from ....imaging.scene import ellipticities, object_columns, sky_ranges
@@ -113,7 +113,7 @@ def stack_images(
             own.add(of_visit)
             if own.visits in stack.visits.kept:
                 _write_image(stack, tile, own)
-            # Written last: visits that it counts have left their image.
+            # Written last, so that all visits that it counts are in the image.
             own.write(stack.sums_path(tile), stack.stamp)
     return stack
 
@@ -169,7 +169,7 @@ def _write_image(stack: ImageStack, tile: Tile, sums: TileSums) -> None:
     ):
         header[key] = (value, comment)
     image, variance, mask = sums.stacked()
-    objects = _truth(stack, tile, wcs, exposure)
+    objects = _truth_table(stack, tile, wcs, exposure)
     name = f"tile {tile.name}"
     found = CcdImage(name, image, variance, mask, header, objects, stack.stamp, STACK_MASK_BITS)
     found.write(stack.path(sums.visits, tile))
@@ -182,7 +182,7 @@ def galaxies_on(sky: Sky, tile: Tile, wcs: CcdWcs) -> Any:
     return galaxies.take(np.flatnonzero(tile.inside.contains(pixels)))
 
 
-def _truth(stack: ImageStack, tile: Tile, wcs: CcdWcs, exposure: Exposure) -> dict[str, np.ndarray]:
+def _truth_table(stack: ImageStack, tile: Tile, wcs: CcdWcs, exposure: Exposure) -> dict[str, np.ndarray]:
     """Return the table of the stars and galaxies of a tile; electrons are those of an unvignetted telescope."""
     points = stack.sky.points
     galaxies = galaxies_on(stack.sky, tile, wcs)
@@ -242,13 +242,13 @@ def _check_room(stack: ImageStack) -> None:
 
 
 def _check_memory(stack: ImageStack, threads: int | None, processes: int) -> None:
-    """Raise ConfigError where the memory cannot hold the tiles and what so many processes draw."""
+    """Raise ConfigError where memory cannot hold the tiles and the images of so many processes."""
     sums = _tile_bytes(stack) * len(stack.tiles)
     # In each process a CCD that is drawn, or a tile that is written, and the sums of a visit. Here the sums, and those
     # of visits that workers have sent.
     largest = max(tile_side(stack.experiment.camera), stack.tiles[0].side)
     each = needed_bytes(stack.experiment, threads) + BYTES_PER_PIXEL * largest**2 + sums
-    require_bytes(processes * each + sums * (1 + AHEAD * processes * (processes != 1)), "images")
+    require_bytes(processes * each + sums * (1 + JOBS_AHEAD * processes * (processes != 1)), "images")
 
 
 def _tile_bytes(stack: ImageStack) -> int:

@@ -24,9 +24,9 @@ NO_DATA = 1
 STACK_MASK_BITS = {NO_DATA: "NO_DATA"}
 #: Bytes of a pixel of a tile: sums of data and variance, number of visits.
 BYTES = 10
-#: Nodes along a side of a CCD that tell which part of it touches tiles.
+#: Nodes along a side of a CCD for its overlap with tiles.
 _NODES = 65
-#: Visits, and points along a side of a tile, that tell how much of it visits see.
+#: Visits, and points along a side of a tile, for the coverage of the tile.
 _VISITS, _POINTS = 10, 5
 
 
@@ -72,7 +72,7 @@ class Tile:
 
 
 def choose_tiles(experiment: Experiment, frame: StackFrame, side: int, most: int, config: VisitsConfig) -> list[Tile]:
-    """Return tiles of which the CCDs of visits see at least half on average, from the pointing outwards.
+    """Return tiles of which the CCDs of visits cover at least half on average, from the pointing outwards.
 
     The first visits of the plan decide, whatever the number of visits of a stack.
 

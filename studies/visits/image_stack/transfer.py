@@ -1,4 +1,4 @@
-"""Transfer function of the resampling: how much broader stars of stacked images are than PSFs centred on pixels.
+"""Transfer function of the resampling, which broadens stars of stacked images against PSFs centred on pixels.
 
 Cubic convolution of an image at a fraction s of a pixel multiplies its component of frequency k by
 T(k) = sum over j of w_j(s) exp(2 pi i k (j - 1 - s)), w_j being the weights of the four neighbours j = 0 to 3. T is 1
@@ -54,7 +54,7 @@ def mean_transfer(tile: Tile, frame: StackFrame, images: Sequence[SkyPixels]) ->
         to_frame = np.linalg.inv(wcs.jacobians(pixels[:1])[0] @ to_sky)
         along = frequency @ to_frame
         s = pixels - np.floor(pixels)
-        total += (_along(along[:, 0], s[:, 0]) * _along(along[:, 1], s[:, 1])).sum(axis=0)
+        total += (_fraction_transfer(along[:, 0], s[:, 0]) * _fraction_transfer(along[:, 1], s[:, 1])).sum(axis=0)
         count += len(pixels)
     return (total / max(count, 1)).reshape(GRID, GRID // 2 + 1).astype(np.complex64)
 
@@ -67,7 +67,7 @@ def broadened(psfs: np.ndarray, transfer: np.ndarray) -> np.ndarray:
     return np.asarray(images / images.sum(axis=(1, 2), keepdims=True, dtype=np.float64).astype(np.float32))
 
 
-def _along(frequency: np.ndarray, s: np.ndarray) -> np.ndarray:
+def _fraction_transfer(frequency: np.ndarray, s: np.ndarray) -> np.ndarray:
     """Return the transfer functions along one axis at fractions s of a pixel, shape [len(s), len(frequency)]."""
     t = s[:, None]
     weights = (

@@ -12,8 +12,8 @@ from ....imaging.draw import Window, add_stamps, draw_galaxies
 from ....imaging.exposure import ExposedImage, Exposure, expose
 from ....imaging.psf_field import PsfField, to_pixel
 from ....imaging.scene import STAR_ROOM, galaxies_near
-from ....pipeline.defaults import noise_free_components
 from ....pipeline.experiment import Experiment
+from ....pipeline.resolved_values import noise_free_components
 from ....pipeline.simulate.ccd_exposure import expose_centered, expose_positions
 from ....pipeline.simulate.star_field import magnitudes_at
 from ..plan import Visit
@@ -121,11 +121,11 @@ def visit_image(
         corners = nearest.astype(np.int64) - stars.image.shape[1] // 2 - (window.x, window.y)
         add_stamps(scene, stars.image * light[:, None, None], corners)
     exposed = expose(scene, exposure, config.seed, name, visit.epoch, threads=threads)
-    exposed.mask[_rim(window, pixels)] |= EDGE
+    exposed.mask[_rim_mask(window, pixels)] |= EDGE
     return exposed
 
 
-def _rim(window: Window, pixels: np.ndarray) -> np.ndarray:
+def _rim_mask(window: Window, pixels: np.ndarray) -> np.ndarray:
     """Return whether pixels of a window are on the rim of the CCD of `pixels` along x and y, shape [ny, nx]."""
     x, y = (start + np.arange(n) for start, n in ((window.x, window.width), (window.y, window.height)))
     inner = [(v >= RIM) & (v < n - RIM) for v, n in zip((x, y), pixels, strict=True)]

@@ -40,17 +40,17 @@ class VisitWcs:
 
     def to_pixel(self, sky: ArrayLike) -> np.ndarray:
         """Return pixels (x, y), shape [n, 2], of (xi, eta), shape [n, 2]."""
-        return self.ccd.to_pixel(self._own(sky)[0])
+        return self.ccd.to_pixel(self._to_visit_plane(sky)[0])
 
     def jacobians(self, pixels: ArrayLike) -> np.ndarray:
         """Return d(x, y)/d(xi, eta) at pixels, shape [n, 2, 2]."""
-        own, ahead = self._own(self.to_sky(pixels))
+        own, ahead = self._to_visit_plane(self.to_sky(pixels))
         matrix = self.visit.matrix
         # Derivative of (X, Y) / Z, both linear in xi and eta.
         change = (matrix[None, :2, :2] - own[:, :, None] * matrix[None, 2:, :2]) / ahead[:, :, None]
         return self.ccd.jacobians(pixels) @ change
 
-    def _own(self, sky: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    def _to_visit_plane(self, sky: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return positions about the visit's own pointing, and the component towards it before the division by it."""
         place = np.atleast_2d(np.asarray(sky, dtype=np.float64))
         source = np.column_stack([place, np.ones(len(place))]) @ self.visit.matrix.T

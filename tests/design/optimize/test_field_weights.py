@@ -8,7 +8,7 @@ import pytest
 import pachon
 from pachon.design.optimize.merit import Beams, SpotMerit, WavefrontMerit
 from pachon.models.io.prescription import load_telescope
-from pachon.studies.metrics.bare_telescope import BareScene, spots, throughput
+from pachon.studies.metrics.telescope import TelescopeScene, spots, throughput
 
 LENS = Path(__file__).parents[2] / "data" / "zmx" / "lens1.zmx"
 WEIGHTS, COLORS = np.array([4.0, 0.0, 1.0]) / 5.0, np.array([1.0, 2.0, 1.0]) / 4.0
@@ -53,7 +53,7 @@ def test_merits_have_the_weights_of_the_file(lens, squares):
 
 
 def test_means_of_reports_have_the_weights_of_the_file(lens, squares):
-    scene = BareScene(lens, threads=1)
+    scene = TelescopeScene(lens, threads=1)
     # Nothing is vignetted, so weights of the rays are those of the merit.
     assert spots(scene)["spot_rms_um"] == pytest.approx(1e6 * np.sqrt(WEIGHTS @ squares), rel=1e-9)
     assert throughput(scene)["throughput_mean"] == pytest.approx(1.0)

@@ -271,7 +271,7 @@ def test_an_object_at_infinity_may_be_written_so(tmp_path):
     assert telescope == load_telescope(written(tmp_path, TRIPLET))
 
 
-BARE = """EPD 5.0
+TELESCOPE_METRICS = """EPD 5.0
 WL 587.6
 YAN 0.0 3.0
 SO 0.0 1e10
@@ -283,12 +283,12 @@ SI 0.0 0.0
 
 @pytest.mark.parametrize("aperture", ["EPD 5.0", "FNO 4.0"])
 def test_radii_without_rdm_are_read_when_lenient(tmp_path, aperture):
-    (tmp_path / "bare.seq").write_text(BARE.replace("EPD 5.0", aperture))
+    (tmp_path / "bare.seq").write_text(TELESCOPE_METRICS.replace("EPD 5.0", aperture))
     with pytest.raises(PrescriptionError, match=r"curvature 50: a sphere smaller than .*; expected RDM"):
         load_telescope(tmp_path / "bare.seq")
     with pytest.warns(PrescriptionWarning, match=r"expected RDM .*; the surfaces have radii"):
         found = load_telescope(tmp_path / "bare.seq", lenient=True)
-    (tmp_path / "stated.seq").write_text("RDM\n" + BARE.replace("EPD 5.0", aperture))
+    (tmp_path / "stated.seq").write_text("RDM\n" + TELESCOPE_METRICS.replace("EPD 5.0", aperture))
     stated = load_telescope(tmp_path / "stated.seq")
     assert [s.shape for s in found.surfaces] == [s.shape for s in stated.surfaces]
     # The glass is given by its index and Abbe number.

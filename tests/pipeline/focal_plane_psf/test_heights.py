@@ -8,7 +8,7 @@ from pachon.models.camera.cameras import load_camera
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.camera.height_budget import SIMULATED
 from pachon.pipeline.focal_plane_psf.covariance import Places
-from pachon.pipeline.focal_plane_psf.heights import DEGREE, HeightPrior, legendre, powers, project
+from pachon.pipeline.focal_plane_psf.heights import DEGREE, HeightPrior, legendre, powers, project_heights
 
 NM = 1e-9
 
@@ -115,8 +115,8 @@ def test_projected_coefficients_are_a_polynomial_focal_plane(part, degree):
     powers_of = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
     flat = FocalPlane.flat(camera)
     plane = replace(flat, surfaces=replace(flat.surfaces, polynomial=coefficients.copy()))
-    prior = HeightPrior.broad(camera, degree=degree)
-    parameters = np.concatenate([np.zeros(prior.n_common), project(plane, degree).ravel()])
+    prior = HeightPrior.uninformative(camera, degree=degree)
+    parameters = np.concatenate([np.zeros(prior.n_common), project_heights(plane, degree).ravel()])
     assert len(parameters) == prior.n_parameter
     places = random_places(camera, 300, 4)
     u, v = places.uv.T
@@ -127,7 +127,7 @@ def test_projected_coefficients_are_a_polynomial_focal_plane(part, degree):
 
 def test_common_parameters_are_a_quadratic_and_pistons_of_rafts(part):
     camera = part("R22", "R34")
-    prior = HeightPrior.broad(camera)
+    prior = HeightPrior.uninformative(camera)
     rng = np.random.default_rng(5)
     parameters = np.zeros(prior.n_parameter)
     parameters[: prior.n_common] = rng.normal(0.0, 3e-6, prior.n_common)
@@ -146,7 +146,7 @@ def test_common_parameters_are_a_quadratic_and_pistons_of_rafts(part):
 
 def test_per_ccd_is_the_scatter_of_the_heights_of_each_ccd(part):
     camera = part("R22", "R34")
-    prior = HeightPrior.broad(camera, degree=3)
+    prior = HeightPrior.uninformative(camera, degree=3)
     root = np.random.default_rng(7).normal(0.0, 1e-6, (prior.n_parameter, prior.n_parameter + 5))
     covariance = root @ root.T
     found = prior.per_ccd(covariance)
@@ -173,7 +173,7 @@ def test_a_normal_matrix_gets_the_precision_of_the_prior(part):
     terms = np.zeros((30, prior.n_parameter))
     terms[:, : prior.n_common] = prior.common_terms(places)
     for row, ccd in enumerate(places.ccd):
-        terms[row, prior.columns_of(ccd)] = prior.own_terms(places)[row]
+        terms[row, prior.columns_of(ccd)] = prior.ccd_polynomials(places)[row]
     inverse = np.linalg.inv(normal[: prior.n_parameter, : prior.n_parameter])
     expected = terms @ inverse @ terms.T
     # Variances of 1e-18 to 1e-11 m^2 side by side: a condition of 1e7.
@@ -202,7 +202,7 @@ def test_the_focal_plane_has_the_heights_to_a_nanometre(part, mean):
 
 def test_degree_and_columns():
     camera = load_camera("lsst")
-    prior = HeightPrior.broad(camera)
+    prior = HeightPrior.uninformative(camera)
     assert prior.degree == DEGREE == 4
     assert prior.n_common == 5 + 21
     assert prior.columns_of(0) == slice(26, 41)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pachon.pipeline.focal_plane_psf.images import ResidualImages, deformed
+from pachon.pipeline.focal_plane_psf.images import ResidualImages, with_shapes
 from pachon.pipeline.focal_plane_psf.mosaic import Mosaic
 from pachon.pipeline.measure.shapes import measure_shapes
 
@@ -34,7 +34,7 @@ CHANGE = np.array([[0.03, -0.02, 0.04], [-0.02, 0.03, -0.03], [0.05, 0.05, 0.08]
 @pytest.mark.parametrize("factor", [0.1, 1.0])
 def test_images_have_the_shapes_asked_for(factor):
     asked = values(BASE)[0] + factor * CHANGE
-    found = deformed(BASE, asked, PIXEL, WEIGHT)
+    found = with_shapes(BASE, asked, PIXEL, WEIGHT)
     shapes, centre = values(found)
     # 1e-5 is a hundredth of the scatter that a star of the highest signal to noise has.
     np.testing.assert_allclose(shapes, asked, atol=1e-5)
@@ -45,7 +45,7 @@ def test_images_have_the_shapes_asked_for(factor):
 
 def test_images_of_their_own_shapes_stay_as_they_are():
     centred = BASE[[0, 2]]
-    found = deformed(centred, values(centred)[0], PIXEL, WEIGHT)
+    found = with_shapes(centred, values(centred)[0], PIXEL, WEIGHT)
     # Nothing to change but centroids of 1e-7 pixels and rounding of the transforms.
     np.testing.assert_allclose(found, centred, atol=1e-6 * centred.max())
 
@@ -59,7 +59,7 @@ def test_a_gaussian_stays_a_gaussian_of_the_other_moments():
 
     # A convolution adds moments: the image of other moments is the Gaussian of these, in every pixel.
     old, new = gaussian(np.diag([3.0, 3.0])), gaussian(np.array([[3.06, 0.04], [0.04, 3.02]]))
-    found = deformed(old[None], values(new[None])[0], PIXEL, WEIGHT)[0]
+    found = with_shapes(old[None], values(new[None])[0], PIXEL, WEIGHT)[0]
     # What is left of the shapes after three iterations, 1e-6 for so small a change, makes as much of the peak; the ends
     # of the stamp make 1e-7.
     np.testing.assert_allclose(found, new, atol=1e-5 * new.max())

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from pachon.pipeline.focal_plane_psf.covariance import Covariance, Places
-from pachon.pipeline.focal_plane_psf.kriging import leave_one_out, neighbourhood, neighbours_of, on_threads
+from pachon.pipeline.focal_plane_psf.kriging import leave_one_out, map_on_threads, neighbourhood, neighbours_of
 
 COVARIANCE = Covariance(
     50.0,
@@ -90,7 +90,7 @@ def test_no_byte_depends_on_the_threads():
         k = COVARIANCE.between(STARS[stars], ELSEWHERE)
         return np.concatenate([near.predict(k), near.weights(k).ravel(), *leave_one_out(near)])
 
-    one, two = (np.concatenate(on_threads(job, groups, threads)) for threads in (1, 2))
+    one, two = (np.concatenate(map_on_threads(job, groups, threads)) for threads in (1, 2))
     assert one.tobytes() == two.tobytes()
     # In the order of the items, whichever ends first.
-    assert on_threads(lambda item: item, range(100), 2) == list(range(100))
+    assert map_on_threads(lambda item: item, range(100), 2) == list(range(100))

@@ -4,7 +4,7 @@ import scipy.optimize
 from scipy.stats import multivariate_normal
 
 from pachon.pipeline.focal_plane_psf.covariance import COMPONENTS, Covariance, Places
-from pachon.pipeline.focal_plane_psf.kriging import on_threads
+from pachon.pipeline.focal_plane_psf.kriging import map_on_threads
 from pachon.pipeline.focal_plane_psf.likelihood import blocks_of, fit_covariance, log_likelihood
 
 SIDE = 0.6  # of the field [m]
@@ -148,7 +148,7 @@ def test_variance_and_correlation_of_a_known_field_are_found():
         return fit_covariance(here, drawn(true, here, noise, seed + 10), noise).covariance
 
     variance, along, across = [], [], []
-    for found in on_threads(fitted, range(3), 2):
+    for found in map_on_threads(fitted, range(3), 2):
         variance.append(found.variance + found.nugget)
         for store, direction in ((along, angle), (across, angle + np.pi / 2)):
             offsets = LAGS[:, None] * np.array([np.cos(direction), np.sin(direction)])

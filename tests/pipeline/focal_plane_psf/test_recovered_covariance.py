@@ -5,7 +5,7 @@ import pytest
 
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.pipeline.focal_plane_psf.covariance import Places
-from pachon.pipeline.focal_plane_psf.heights import HeightPrior, project
+from pachon.pipeline.focal_plane_psf.heights import HeightPrior, project_heights
 from pachon.pipeline.focal_plane_psf.likelihood import fit_covariance
 from pachon.pipeline.focal_plane_psf.model import FocalPlanePsf
 from pachon.pipeline.focal_plane_psf.response import Instrument
@@ -87,7 +87,7 @@ def test_of_a_sum_the_covariance_is_that_of_the_turbulence(exposure_of, part, ls
         plane = FocalPlane.from_budget(camera, seed=5 + seed)
         exposure = exposure_of(plane, holdout=2, noise=1e-3, turbulence=4e-3, seed=seed, at=1 + seed)
         parameters = np.zeros(prior.n_parameter)
-        parameters[prior.n_common :] = project(plane, prior.degree).ravel()
+        parameters[prior.n_common :] = project_heights(plane, prior.degree).ravel()
         xy = exposure.xy[exposure.first]
         instrument = Instrument.of(lsst_r, wavelengths)
         optics = instrument.shapes(instrument.fields(xy), prior.focal_plane(parameters), None)

@@ -152,7 +152,7 @@ def test_cosmic_rays_change_little():
     for i in struck:
         x, y = rng.integers(3, 28, 2)
         with_rays[i, y : y + 3, x] += rng.uniform(0.05, 0.3, 3)
-    clean = PsfModel.fit(stamps, places, extent=EXTENT)
+    cleaned_stars = PsfModel.fit(stamps, places, extent=EXTENT)
     model = PsfModel.fit(with_rays, places, extent=EXTENT)
     unclipped = PsfModel.fit(with_rays, places, extent=EXTENT, clip_sigma=None)
 
@@ -161,8 +161,8 @@ def test_cosmic_rays_change_little():
 
     assert model.rejected[struck].min() >= 3
     assert model.n_rejected <= 16  # 5 sigma of 38 000 pixels: none but the cosmic rays and a few by bad luck
-    assert rms(model) < 1.3 * rms(clean)
-    assert rms(unclipped) > 5.0 * rms(clean)
+    assert rms(model) < 1.3 * rms(cleaned_stars)
+    assert rms(unclipped) > 5.0 * rms(cleaned_stars)
 
 
 @pytest.mark.parametrize("fraction", [0.01, 0.05])

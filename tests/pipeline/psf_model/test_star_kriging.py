@@ -108,7 +108,7 @@ def test_the_slope_of_the_posterior_is_its_change():
         distance, 3.0 * rng.normal(size=(25, 3)), rng.uniform(0.1, 2.0, 25), terms, np.zeros(7), np.full(7, 2.0)
     )
     at, kept = rng.normal(size=7), np.array([True, True, True, True, True, False, True])
-    value, slope = posterior.surprise(at, kept)
+    value, slope = posterior.negative_log_posterior(at, kept)
     variance, length, floor, *trend = np.where(kept, np.exp(at), 0.0)
     covariance = variance * np.exp(-distance / length) + np.diag(posterior.noise + floor)
     covariance += terms @ np.diag(np.repeat([1e4, *trend], [1, 2, 3, 4, 5])) @ terms.T
@@ -117,7 +117,9 @@ def test_the_slope_of_the_posterior_is_its_change():
     assert value == pytest.approx(likelihood + 0.5 * ((at[kept] / 2.0) ** 2).sum(), rel=1e-10)
     for column in range(7):
         step = np.eye(7)[column] * 1e-5
-        change = (posterior.surprise(at + step, kept)[0] - posterior.surprise(at - step, kept)[0]) / 2e-5
+        change = (
+            posterior.negative_log_posterior(at + step, kept)[0] - posterior.negative_log_posterior(at - step, kept)[0]
+        ) / 2e-5
         # Rounding of values near 100, over the step.
         assert slope[column] == pytest.approx(change, abs=1e-7 * abs(value))
 

@@ -5,7 +5,7 @@ import pytest
 
 import pachon
 from pachon.core.errors import PachonError
-from pachon.studies.metrics.bare_telescope import BARE, BareScene
+from pachon.studies.metrics.telescope import TELESCOPE_METRICS, TelescopeScene
 from pachon.studies.sweep.file import read_sweep
 from pachon.studies.sweep.sweep import run_sweep
 
@@ -69,8 +69,10 @@ def test_metrics_of_images():
     """The functions that they stand for, at the fields and wavelengths of the sweep."""
     lens = pachon.load_telescope(LENS)
     fields, waves = np.deg2rad(FIELDS), np.array([587.6e-9])
-    scene = BareScene(lens, fields, waves)
-    found = {key: value for name in ("ee80", "mtf", "throughput") for key, value in BARE[name](scene).items()}
+    scene = TelescopeScene(lens, fields, waves)
+    found = {
+        key: value for name in ("ee80", "mtf", "throughput") for key, value in TELESCOPE_METRICS[name](scene).items()
+    }
     radii = pachon.encircled_energy(lens, fields, waves, pixels=128, n_pupil=256).radius_holding(0.8) * 1e6
     # Another number of pixels and of pupil points.
     assert found["ee80_um"] == pytest.approx(radii.mean(), rel=0.01)

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from pachon.core.page import with_digits
-from pachon.studies.metrics.bare_telescope import BARE
 from pachon.studies.metrics.stars import STARS
+from pachon.studies.metrics.telescope import TELESCOPE_METRICS
 from pachon.studies.sweep.analysis import allowances, curves
 from pachon.studies.sweep.file import read_sweep
 from pachon.studies.sweep.report import write_report
@@ -104,7 +104,7 @@ def test_errors_of_effects_are_those_of_the_mean_over_replicas(tmp_path):
 
 
 def test_every_metric_and_parameter_is_defined_in_the_report(tmp_path):
-    for name, group in [*STARS.items(), *BARE.items()]:
+    for name, group in [*STARS.items(), *TELESCOPE_METRICS.items()]:
         assert all(metric.meaning for metric in group.metrics), name
     # The longest name that fits: one is the beginning of the other.
     assert "0.5 to 1 deg from the axis" in described_metric("mean_e_0.5_to_1_deg").text

@@ -151,8 +151,8 @@ def test_lattice_and_strips_agree(silicon, monkeypatch):
     dispersion = np.stack([np.linspace(-1e-6, 1e-6, 5), np.zeros(5)], axis=1)
     given = {"dispersion": dispersion, "jitter": 2e-7, "offsets": [[0.3, 0.2]] * 3, "silicon": silicon}
     found = []
-    for rings in (engine_module.only_rings, lambda telescope: False):
-        monkeypatch.setattr(engine_module, "only_rings", rings)
+    for rings in (engine_module.has_only_annuli, lambda telescope: False):
+        monkeypatch.setattr(engine_module, "has_only_annuli", rings)
         found.append(make_psfs(telescope, fields, wavelengths, atmosphere=air(), engine="long_exposure", **given))
     strips, lattice = found
     np.testing.assert_allclose(lattice.image, strips.image, atol=1.5e-3 * strips.image.max())
@@ -198,13 +198,13 @@ def test_donuts_of_a_telescope_with_vanes():
     telescope, plane = defocused("hsc", 0.5e-3), ImagePlane(51, 15e-6, 5e-6)
     engine = engine_for(telescope, 770e-9, plane)
     field = np.radians([[0.3, 0.2]])
-    assert engine._lattice.finer(engine._lattice_rays(engine._lattice, Stars(field, np.zeros((1, 2))))) == [2]
+    assert engine._lattice.refinement(engine._lattice_rays(engine._lattice, Stars(field, np.zeros((1, 2))))) == [2]
     image = engine.render(field, np.zeros((1, 2))).image[0]
     expected, _ = brute_force(telescope, field[0], 770e-9, plane, spacing=0.0125, longest=1.2)
     np.testing.assert_allclose(image, expected, atol=2e-3 * expected.max())
     # Dense rays under one filter, which stars still farther out are left to, lose 4 % of the peak along the rims.
     inputs = PsfInputs(telescope, np.array([770e-9]), plane, atmosphere=air(), threads=1)
-    rays = MeanRaysEngine(inputs, 1 << 14).expose_as_set(Stars(field, np.zeros((1, 2)))).draw(None)[0]
+    rays = MeanRaysEngine(inputs, 1 << 14).expose_without_refinement(Stars(field, np.zeros((1, 2)))).draw(None)[0]
     np.testing.assert_allclose(image, rays, atol=0.05 * rays.max())
     assert image.sum() == pytest.approx(rays.sum(), rel=2e-3)
 
@@ -228,4 +228,4 @@ def test_points_of_the_lattice_fill_the_ring():
     radius = np.hypot(*transfer.points.T)
     assert radius.min() >= 4.1 * 0.155
     assert radius.max() < 4.1
-    assert transfer.closer(3).lattice.spacing == pytest.approx(transfer.lattice.spacing / 3)
+    assert transfer.refined(3).lattice.spacing == pytest.approx(transfer.lattice.spacing / 3)

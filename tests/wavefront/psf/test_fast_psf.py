@@ -20,7 +20,7 @@ from pachon.wavefront.atmosphere.turbulence import (
 from pachon.wavefront.psf.engine import PsfInputs
 from pachon.wavefront.psf.fast import (
     FastPsfEngine,
-    rest_structure_function,
+    filter_structure_function,
 )
 from pachon.wavefront.psf.image_plane import ImagePlane
 from pachon.wavefront.psf.psf import make_psfs
@@ -90,7 +90,7 @@ def test_weights_make_sums_integrals_up_to_fourth_order():
 
 def test_rest_structure_function_starts_as_that_of_the_high_modes_and_never_falls():
     b = np.linspace(0.0, 2.0, 2001)
-    rest = rest_structure_function(b, 0.16, 25.0, 8.75)
+    rest = filter_structure_function(b, 0.16, 25.0, 8.75)
     assert rest[0] == 0.0
     assert np.all(np.diff(rest) >= 0.0)
     # Low modes bend over a baseline b by (k b)^2 / 24 of their own at most: 1 % of the structure function at 5 cm. What
@@ -146,7 +146,7 @@ def test_rays_through_the_layers_against_plain_numpy(polynomial_pupil, seed):
             for wave, wavelength in enumerate(wavelengths):
                 lit = traced.lit[star, wave]
                 x, y = cell * np.floor((angle @ jacobian.T + traced.displacement[star, wave])[lit].T / cell + 0.5)
-                rest = rest_structure_function(np.unique(baseline * wavelength), 0.16, 25.0, 5.0)
+                rest = filter_structure_function(np.unique(baseline * wavelength), 0.16, 25.0, 5.0)
                 rest = np.interp(baseline * wavelength, np.unique(baseline * wavelength), rest)
                 transfer = diffraction_otf(baseline * wavelength, 8.36, 0.612)
                 transfer = transfer * np.exp(-0.5 * (2 * np.pi / wavelength) ** 2 * rest) * detector

@@ -198,7 +198,7 @@ def test_equivalent_defocus_is_that_of_photons(band, wavelength):
 
 def test_turns_give_each_depth_its_light():
     channels = Channels.of(Silicon(), np.array([620e-9, 870e-9, 970e-9]), 4e-6, 3)
-    turns = channels.turns(300, 21)
+    turns = channels.depth_schedule(300, 21)
     assert turns.time.tolist() == list(range(300))
     assert (turns.channel // 3 == np.arange(3)[:, None, None]).all()
     share = channels.weight.reshape(3, 3) / channels.weight.reshape(3, 3).sum(axis=1)[:, None]
@@ -207,7 +207,7 @@ def test_turns_give_each_depth_its_light():
     for axis, allowed in ((1, 0.02), (2, 0.15)):
         of_depth = np.stack([(turns.channel % 3 == d).mean(axis=axis) for d in range(3)])
         assert np.abs(of_depth - share.T[:, :, None]).max() < allowed
-    few = channels.turns(5, 2)
+    few = channels.depth_schedule(5, 2)
     assert few.time.tolist() == [t for t in range(5) for _ in range(3)]
     np.testing.assert_allclose(few.fraction, 1.0 / 3.0)
 

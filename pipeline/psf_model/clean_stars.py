@@ -29,7 +29,7 @@ class CleanStars:
         return CleanStars(self.mean + shift, self.deviations - shift, self.rejected)
 
 
-def clean(
+def cleaned_stars(
     images: np.ndarray,
     masked: np.ndarray,
     terms: np.ndarray,
@@ -81,8 +81,8 @@ def make_basis(
     return shapelets(stars.mean, stars.deviations, count, shape, scale)
 
 
-def project(stars: CleanStars, found: Basis, basis: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the projections of stars on a basis of theirs [n_stars, k], and squares of what is left [n_stars]."""
+def project_stars(stars: CleanStars, found: Basis, basis: str) -> tuple[np.ndarray, np.ndarray]:
+    """Project stars onto their basis: coefficients [n_stars, k], and residual sums of squares [n_stars]."""
     deviations = stars.deviations
     if basis == "pixels":
         return deviations, np.zeros(len(deviations))

@@ -1,4 +1,4 @@
-"""Packets of the pupil that apertures on the straight way to the first mirror or lens can let through."""
+"""Packets of pupil points that the apertures before the first mirror or lens can transmit."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from ..models.shapes.mesh import MeshSurface
 from ..models.surface import Interaction, Surface
 from ..models.telescope import Telescope
-from ..raytrace.pack.surfaces import clear_ring
+from ..raytrace.pack.surfaces import clear_annulus
 
 #: Radii and angles at which the sag within an aperture is sampled.
 _RADII, _ANGLES = 257, 32
@@ -17,10 +17,10 @@ _RADII, _ANGLES = 257, 32
 _ROUNDING = 1e-9
 
 
-def passing_packets(
+def transmitted_packets(
     telescope: Telescope, pupil: np.ndarray, directions: np.ndarray, start: np.ndarray
 ) -> np.ndarray | None:
-    """Return which packets can have light behind those apertures, shape [n_field, n_packet].
+    """Return the packets that can have light behind these apertures, bool [n_field, n_packet].
 
     They are the discs and rings up to the first surface that deflects light. ``pupil`` [2, n_packet, lanes]: points on
     the plane of the entrance pupil [m]. ``directions`` [n_field, 3]: unit vectors of light from infinity, or ``start``
@@ -31,22 +31,22 @@ def passing_packets(
     for surface in telescope.surfaces:
         heights = _sag_range(surface)
         if heights is not None:
-            through = _through_ring(surface, heights, points, directions, start)
+            through = _packets_through_ring(surface, heights, points, directions, start)
             passing = through if passing is None else passing & through
         if surface.interaction != Interaction.PASS:
             return passing
     return passing
 
 
-def _through_ring(
+def _packets_through_ring(
     surface: Surface, heights: tuple[float, float], points: np.ndarray, directions: np.ndarray, start: np.ndarray
 ) -> np.ndarray:
-    """Return which packets of points [n_packet, lanes, 3] [m] on straight rays can pass a ring, [n_field, n_packet].
+    """Return the packets of points [n_packet, lanes, 3] [m] whose straight rays can pass a ring, [n_field, n_packet].
 
     A ray lands within the ring at a height between the lowest and the highest sag there. Its distance from the centre
     differs from that of its pupil point by at most its slope times the height between them.
     """
-    ring = clear_ring(surface.aperture)
+    ring = clear_annulus(surface.aperture)
     assert ring is not None
     x, y, inner, outer = ring
     local = surface.to_local(points)
@@ -67,7 +67,7 @@ def _through_ring(
 @lru_cache(maxsize=64)
 def _sag_range(surface: Surface) -> tuple[float, float] | None:
     """Return bounds of the sag within a disc or ring [m]; None where the surface has none."""
-    ring = clear_ring(surface.aperture)
+    ring = clear_annulus(surface.aperture)
     if surface.aperture is None or ring is None:
         return None
     if isinstance(surface.shape, MeshSurface) or surface.interaction == Interaction.PHASE:

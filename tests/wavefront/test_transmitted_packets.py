@@ -9,7 +9,7 @@ import pachon
 from pachon.models.shapes.polynomial import ZernikeSag
 from pachon.models.surface import Interaction
 from pachon.raytrace.rays import RayStatus, object_points
-from pachon.wavefront.straight_light import passing_packets
+from pachon.wavefront.transmitted_packets import transmitted_packets
 
 LANES = 32
 
@@ -42,7 +42,7 @@ def test_no_packet_with_light_is_left_out(model, change):
     angles = np.array([[0.0, 0.0], [0.3, -0.6]]) * telescope.field_radius
     request = pachon.Request.of(telescope, angles)
     start = object_points(telescope, request.directions) if change == "near" else np.empty((0, 3))
-    passing = passing_packets(telescope, packets, request.directions, start)
+    passing = transmitted_packets(telescope, packets, request.directions, start)
     for i, field in enumerate(angles):
         # Every ray to the first mirror alone: what the apertures up to it let through, whatever comes behind.
         rays = request.at_fields(slice(i, i + 1)).launch(request.wavelength, packets.reshape(2, -1).T)

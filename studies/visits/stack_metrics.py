@@ -13,12 +13,12 @@ from .stack import PsfStack
 
 #: Correlations of a stack: of the true PSFs at all points, and of true minus model at stars and where no star is.
 KINDS = ("psf", "residual_stars", "residual_places")
-Correlated = dict[str, Correlation]
+StackCorrelations = dict[str, Correlation]
 # Smallest separation [arcmin], bins, and side of a patch of the jackknife over that of a CCD.
 _LEAST, _BINS, _PATCH = 1.0, 15, 3.0
 
 
-def correlated(stack: PsfStack, cell: float) -> Correlated:
+def stack_correlations(stack: PsfStack, cell: float) -> StackCorrelations:
     """Return the correlations of a stack by kind; `cell` is the angle of the side of a CCD [rad].
 
     Errors are those of a jackknife over squares of three CCDs.
@@ -35,7 +35,7 @@ def correlated(stack: PsfStack, cell: float) -> Correlated:
 
 def correlations(
     x: np.ndarray, y: np.ndarray, values: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]], patch: np.ndarray
-) -> Correlated:
+) -> StackCorrelations:
     """Return correlations of ellipticities e1, e2 at some of the positions [rad], all in the same bins, by kind.
 
     Errors are those of a jackknife over patches, where there are several.
@@ -57,19 +57,19 @@ def correlations(
     return found
 
 
-def stack_metrics(stack: PsfStack, found: Correlated) -> dict[str, Any]:
+def stack_metrics(stack: PsfStack, found: StackCorrelations) -> dict[str, Any]:
     """Return the figures of a stack: ellipticities, sizes and mean correlations."""
     stars, places = stack.star, ~stack.star
     e, left = (stack.e1, stack.e2), (stack.residual_e1, stack.residual_e2)
     size = (stack.size - stack.model_size) / stack.size
     metrics: dict[str, Any] = {
         "points": len(stack),
-        "rms_e": _rms(*e),
-        "rms_residual_e_stars": _rms(*(v[stars] for v in left)),
-        "rms_residual_e_places": _rms(*(v[places] for v in left)),
+        "rms_e": _rms_modulus(*e),
+        "rms_residual_e_stars": _rms_modulus(*(v[stars] for v in left)),
+        "rms_residual_e_places": _rms_modulus(*(v[places] for v in left)),
         # Medians beside the rms: a polynomial fitted to few stars goes far astray at a few places.
-        "median_residual_e_stars": _median(*(v[stars] for v in left)),
-        "median_residual_e_places": _median(*(v[places] for v in left)),
+        "median_residual_e_stars": _median_modulus(*(v[stars] for v in left)),
+        "median_residual_e_places": _median_modulus(*(v[places] for v in left)),
         "median_size_arcsec": float(np.nanmedian(stack.size) / ARCSEC),
         "rms_relative_residual_size_places": float(np.sqrt(np.nanmean(size[places] ** 2))),
     }
@@ -80,11 +80,11 @@ def stack_metrics(stack: PsfStack, found: Correlated) -> dict[str, Any]:
     return metrics
 
 
-def _median(e1: np.ndarray, e2: np.ndarray) -> float:
+def _median_modulus(e1: np.ndarray, e2: np.ndarray) -> float:
     """Return the median of the absolute value of an ellipticity."""
     return float(np.nanmedian(np.hypot(e1, e2)))
 
 
-def _rms(e1: np.ndarray, e2: np.ndarray) -> float:
+def _rms_modulus(e1: np.ndarray, e2: np.ndarray) -> float:
     """Return the rms of the absolute value of an ellipticity."""
     return float(np.sqrt(np.nanmean(e1**2 + e2**2)))

@@ -1,4 +1,4 @@
-"""Points of a sweep over a telescope without a camera: values of the prescription, and metrics of the optics alone.
+"""Points of a sweep over a telescope without a camera: values of its prescription, and metrics of its optics.
 
 The configuration may state `telescope`, `wavelengths_nm` and `changes`; a parameter is one of these keys, or a value of
 the prescription with its unit.
@@ -20,25 +20,25 @@ from ...models.io.bundled import BUNDLED
 from ...models.io.prescription import load_telescope
 from ...models.telescope import Telescope
 from ...pipeline.config import Configuration, configuration_of
-from ..metrics.bare_telescope import BARE, BareScene
+from ..metrics.telescope import TELESCOPE_METRICS, TelescopeScene
 from .file import SweepFile
 
-#: Keys of the configuration that a telescope alone has use for.
+#: Keys of the configuration that apply to a telescope without a camera.
 KEYS = ("telescope", "wavelengths_nm", "changes", "seed")
 #: Rings of pupil points for compensators, and relative precision of the mean square radius.
 _RINGS, _TOLERANCE = 4, 1e-9
 
 
-def is_bare(sweep: SweepFile, parameters: dict[str, Any], folder: Path) -> bool:
+def has_no_camera(sweep: SweepFile, parameters: dict[str, Any], folder: Path) -> bool:
     """Return whether the telescope of a point has no camera."""
     base = sweep.base if isinstance(sweep.base, dict) else {}
     name = parameters.get("telescope", base.get("telescope"))
     return isinstance(name, str) and _without_camera(_path(name, folder))
 
 
-def bare_metrics(sweep: SweepFile, parameters: dict[str, Any], folder: Path, threads: int) -> dict[str, float]:
+def point_metrics(sweep: SweepFile, parameters: dict[str, Any], folder: Path, threads: int) -> dict[str, float]:
     """Return the metrics of one point, compensators solved for the smallest spots."""
-    telescope, config = bare_telescope(sweep, parameters, folder)
+    telescope, config = point_telescope(sweep, parameters, folder)
     fields = None if sweep.fields_deg is None else np.deg2rad(sweep.fields_deg)
     waves = None if config.wavelengths_nm is None else np.array(config.wavelengths_nm) * 1e-9
     solved = {}
@@ -57,15 +57,15 @@ def bare_metrics(sweep: SweepFile, parameters: dict[str, Any], folder: Path, thr
         telescope = found.telescope
         for name, change, (_, size) in zip(sweep.compensators, found.changes, chosen, strict=True):
             solved[f"solved {name}"] = float(change / size)
-    scene = BareScene(telescope, fields, waves, threads)
+    scene = TelescopeScene(telescope, fields, waves, threads)
     metrics: dict[str, float] = {}
     for name in dict.fromkeys(sweep.metrics):
-        metrics |= BARE[name].compute(scene)
+        metrics |= TELESCOPE_METRICS[name].compute(scene)
     return metrics | solved
 
 
-def bare_telescope(sweep: SweepFile, parameters: dict[str, Any], folder: Path) -> tuple[Telescope, Configuration]:
-    """Return the telescope and the configuration of one point; an error names the key that has no place there."""
+def point_telescope(sweep: SweepFile, parameters: dict[str, Any], folder: Path) -> tuple[Telescope, Configuration]:
+    """Return the telescope and the configuration of one point; other keys are an error."""
     content = deepcopy(sweep.base) if isinstance(sweep.base, dict) else {}
     for name, value in parameters.items():
         if name in KEYS:
@@ -80,12 +80,12 @@ def bare_telescope(sweep: SweepFile, parameters: dict[str, Any], folder: Path) -
     return apply_changes(telescope, config.changes), config
 
 
-def check_bare_sweep(sweep: SweepFile, parameters: dict[str, Any], folder: Path) -> None:
+def check_telescope_sweep(sweep: SweepFile, parameters: dict[str, Any], folder: Path) -> None:
     """Check the names of metrics and compensators, and the values of one point."""
     for name in sweep.metrics:
-        if name not in BARE:
-            raise unknown_name("metric of a telescope without a camera", name, BARE)
-    telescope, _ = bare_telescope(sweep, parameters, folder)
+        if name not in TELESCOPE_METRICS:
+            raise unknown_name("metric of a telescope without a camera", name, TELESCOPE_METRICS)
+    telescope, _ = point_telescope(sweep, parameters, folder)
     for name in sweep.compensators:
         parse_change(telescope, name, "compensators")
 

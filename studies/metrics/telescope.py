@@ -19,7 +19,7 @@ from ...wavefront.request import Request
 from .metric import THROUGHPUT, Metric, MetricTable
 
 #: Metrics of a telescope without a camera.
-BARE = MetricTable()
+TELESCOPE_METRICS = MetricTable()
 #: Rings of pupil points, pixels of the images of encircled energy, points across the pupil, rays for the throughput.
 _RINGS, _PIXELS, _ACROSS, _RAYS = 6, 96, 192, 4096
 #: Fraction of the light, and contrast.
@@ -27,7 +27,7 @@ _ENERGY, _CONTRAST = 0.8, 0.5
 
 
 @dataclass(frozen=True)
-class BareScene:
+class TelescopeScene:
     """A telescope with field points [rad] and wavelengths [m]; None stands for its own."""
 
     telescope: Telescope
@@ -41,37 +41,37 @@ class BareScene:
         return Request.of(self.telescope, self.fields, self.wavelengths, n_pupil=_RINGS, threads=self.threads)
 
 
-@BARE.group(
+@TELESCOPE_METRICS.group(
     "spots",
     Metric("spot_rms_um", "um", meaning="rms spot radius about the centroid, rms over the fields with their weights"),
     Metric("spot_worst_um", "um", meaning="rms spot radius about the centroid, largest of the fields"),
 )
-def spots(scene: BareScene) -> dict[str, float]:
+def spots(scene: TelescopeScene) -> dict[str, float]:
     """Return the rms spot radius over the fields, and the largest."""
     request = scene.request
     radii = spot_diagram(request).rms_radius * 1e6
     return {"spot_rms_um": float(np.sqrt(request.field_weights @ radii**2)), "spot_worst_um": float(radii.max())}
 
 
-@BARE.group(
+@TELESCOPE_METRICS.group(
     "wavefront",
     Metric("wavefront_rms_nm", "nm", meaning="rms wavefront without piston and tilt, over fields and wavelengths"),
 )
-def wavefront(scene: BareScene) -> dict[str, float]:
+def wavefront(scene: TelescopeScene) -> dict[str, float]:
     """Return the rms wavefront without piston and tilt, over fields and wavelengths."""
     beams = Beams.of(scene.telescope, scene.fields, scene.wavelengths, n_pupil=_RINGS, threads=scene.threads)
     residuals = WavefrontMerit(scene.telescope, beams).residuals(scene.telescope)
     return {"wavefront_rms_nm": float(np.linalg.norm(residuals)) * 1e9}
 
 
-@BARE.group(
+@TELESCOPE_METRICS.group(
     "ee80",
     Metric(
         "ee80_um", "um", meaning="radius of 80 % of the light with diffraction, middle wavelength, mean of the fields"
     ),
     Metric("ee80_worst_um", "um", meaning="radius of 80 % of the light with diffraction, largest of the fields"),
 )
-def ee80(scene: BareScene) -> dict[str, float]:
+def ee80(scene: TelescopeScene) -> dict[str, float]:
     """Return the radius of 80 % of the light with diffraction at the middle wavelength, mean and largest."""
     energy = encircled_energy(
         scene.telescope, scene.fields, scene.request.middle, pixels=_PIXELS, n_pupil=_ACROSS, threads=scene.threads
@@ -80,20 +80,20 @@ def ee80(scene: BareScene) -> dict[str, float]:
     return {"ee80_um": float(scene.request.field_weights @ radii), "ee80_worst_um": float(radii.max())}
 
 
-@BARE.group(
+@TELESCOPE_METRICS.group(
     "mtf",
     Metric("mtf50_per_mm", "1/mm", meaning="frequency of contrast 0.5, mean over fields, tangential and sagittal"),
     Metric("mtf50_worst_per_mm", "1/mm", meaning="frequency of contrast 0.5, least of fields and directions"),
 )
-def transfer(scene: BareScene) -> dict[str, float]:
+def transfer(scene: TelescopeScene) -> dict[str, float]:
     """Return the frequency at which the contrast falls to a half, mean and least over fields and two directions."""
     found = mtf(scene.telescope, scene.fields, scene.wavelengths, threads=scene.threads).frequency_at(_CONTRAST) * 1e-3
     mean = float(scene.request.field_weights @ found.reshape(len(found), -1).mean(axis=1))
     return {"mtf50_per_mm": mean, "mtf50_worst_per_mm": float(found.min())}
 
 
-@BARE.group("throughput", *THROUGHPUT)
-def throughput(scene: BareScene) -> dict[str, float]:
+@TELESCOPE_METRICS.group("throughput", *THROUGHPUT)
+def throughput(scene: TelescopeScene) -> dict[str, float]:
     """Return mean and minimum of the lit fraction of the pupil over the fields."""
     request = scene.request
     lit = vignetting(scene.telescope, request.fields, request.middle, n_pupil=_RAYS, threads=scene.threads).lit_fraction
