@@ -175,6 +175,7 @@ def optimize(
         covariance=covariance,
         collinear=collinear,
         message=str(done.message),
+        vignetting=tuple(b.request.vignetting for b in beams),
     )
 
 
