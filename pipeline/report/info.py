@@ -205,7 +205,8 @@ def figure_rows(description: dict[str, Any]) -> list[tuple[str, str]]:
         ]
         image = [pupil, ("paraxial image", f"z = {length(d['image_z_m'])}")]
     elif d["focal_length_m"] is None:
-        lens, image = [("first-order figures", "none: the surfaces do not share one axis, or there is no focus")], []
+        why = "the surfaces do not share one axis, or there is no focus; pachon rays has those of real rays"
+        lens, image = [("first-order figures", f"none: {why}")], []
     else:
         lens = [
             ("focal length", length(d["focal_length_m"])),
