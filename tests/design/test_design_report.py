@@ -15,7 +15,6 @@ from pachon.models.shapes.shape import EvenAsphere, Plane
 from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM
 
-
 DATA = Path(__file__).parents[1] / "data" / "zmx"
 
 
