@@ -206,7 +206,7 @@ def _from_file(given: Given, path: Path, out: Path | None) -> Any:
     """Return the optimum of a file, or the choice of glasses that it asks for."""
     from ...design.optimize.glass_choice import choose_glasses
     from ...design.optimize.optimize import optimize as compute
-    from ...design.optimize.optimize_file import load_optimization, optimization_arguments
+    from ...design.optimize.optimize_file import catalogue_of, load_optimization, optimization_arguments
 
     if given.fields is not None or given.wavelength is not None:
         raise ConfigError("--field-deg or --wavelength-nm is given beside --config: expected them in the file")
@@ -215,10 +215,12 @@ def _from_file(given: Given, path: Path, out: Path | None) -> Any:
     arguments = optimization_arguments(file, given.telescope, path)
     if file.glasses and file.configurations:
         raise ConfigError("glasses: expected a file without configurations", file=path)
+    catalogue = catalogue_of(file, path)
     with errors_of(path):
         if not file.glasses:
             return compute(**arguments, **given.how)
-        return choose_glasses(**arguments, glasses=file.glasses, nearest=file.nearest_glasses, **given.how)
+        choice: Any = dict(glasses=file.glasses, nearest=file.nearest_glasses, catalogue=catalogue)
+        return choose_glasses(**arguments, **choice, **given.how)
 
 
 def _optimum(result: Any) -> Any:
