@@ -210,7 +210,7 @@ def figure_rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     else:
         lens = [
             ("focal length", length(d["focal_length_m"])),
-            ("focal ratio", f"f/{d['f_number']:.4f}"),
+            ("focal ratio", f"f/{abs(d['f_number']):.4f}"),
             ("plate scale", f'{d["plate_scale_arcsec_per_um"]:.6f}"/µm'),
         ]
         image = [pupil, ("paraxial focus", f"z = {length(d['focus_z_m'])}")]
