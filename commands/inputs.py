@@ -48,6 +48,15 @@ def load_model(model: str, lenient: bool = False, glass_catalogues: Sequence[Pat
 
 
 @contextmanager
+def errors_of(file: Path) -> Iterator[None]:
+    """Raise the errors of the block that name no file again with this one, whose content they are about."""
+    try:
+        yield
+    except PachonError as error:
+        raise (error if error.file else error.within(file=file)) from None
+
+
+@contextmanager
 def warnings_shown(kind: type[Warning]) -> Iterator[None]:
     """Print the warnings of a kind on standard error, a line each, at the end of the ``with`` block."""
     with warnings.catch_warnings(record=True) as caught:

@@ -105,7 +105,7 @@ def print_json(content: Any) -> None:
 
 
 def number_texts(values: Iterable[Any], form: str) -> list[str]:
-    """Return numbers in a format, pairs with a comma, zeros without a minus sign; text stays as it is."""
+    """Return numbers in a format, pairs with a comma, zeros without a minus sign, NaN as a dash; text as it is."""
     return [
         v if isinstance(v, str) else ", ".join(number_texts(v, form)) if hasattr(v, "__len__") else _number(v, form)
         for v in values
@@ -113,6 +113,8 @@ def number_texts(values: Iterable[Any], form: str) -> list[str]:
 
 
 def _number(value: float, form: str) -> str:
+    if math.isnan(value):
+        return "-"
     text = format(value, form)
     return format(0.0, form) if float(text) == 0.0 else text
 

@@ -8,9 +8,9 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from .inputs import load_model
+from .inputs import errors_of, load_model
 from .interrupt import interruptible
-from .options import Json, Lenient, Model, Quiet, Threads
+from .options import GlassCatalogues, Json, Lenient, Model, Quiet, Threads
 from .tables import Rows, number_texts, print_json
 from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
 
@@ -30,6 +30,7 @@ def tolerance_command(
     draws: Annotated[int | None, Option("--draws", "-n", min=1, help="Telescopes to draw, as in the file.")] = None,
     seed: Annotated[int | None, Option(help="Seed of the draws, as in the file.")] = None,
     resume: Annotated[bool, Option("--resume", help="Compute only what is missing in the folder.")] = False,
+    glass_catalogue: GlassCatalogues = None,
     lenient: Lenient = False,
     processes: Processes = None,
     scheduler: Scheduler = None,
@@ -56,7 +57,7 @@ def tolerance_command(
     from ..studies.tolerance.product import tolerance_summary, write_tolerances
     from ..studies.tolerance.study import run_tolerances
 
-    telescope = load_model(model, lenient)
+    telescope = load_model(model, lenient, glass_catalogue or ())
     source = model if model in BUNDLED else str(Path(model).resolve())
     file = with_settings(load_tolerances(tolerances, source), method=method, draws=draws, seed=seed)
     folder = out or Path(f"tolerance_{telescope.name}")
@@ -65,6 +66,7 @@ def tolerance_command(
     with (
         interruptible(quiet, resumed) as reporter,
         chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
+        errors_of(tolerances),
     ):
         study = run_tolerances(
             telescope,

@@ -155,3 +155,8 @@ def plain_text(name: str) -> str:
 def figure_of(axes: Axes) -> Figure:
     """Return the figure that axes belong to."""
     return cast("Figure", axes.get_figure(root=True))
+
+
+def length_unit_of(largest: float) -> tuple[str, float]:
+    """Return the unit of an axis with lengths up to one [m], and numbers of it per metre."""
+    return ("mm", 1e3) if largest < 0.5 else ("m", 1.0)

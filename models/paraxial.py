@@ -10,6 +10,7 @@ with the index n negative behind an odd number of mirrors.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -40,18 +41,24 @@ class ParaxialSurfaces:
     _ahead: float = 0.0
 
     @classmethod
-    def of(cls, telescope: Telescope, stop: str) -> ParaxialSurfaces:
-        """Return the surfaces of a telescope, with one of them as the stop; DomainError if one is off the axis."""
+    def of(cls, telescope: Telescope, stop: str, *, front: bool = False, tilted: bool = False) -> ParaxialSurfaces:
+        """Return the surfaces of a telescope, with one of them as the stop; DomainError if one is off the axis.
+
+        With `front` they end with the stop; with `tilted` they may be off the axis, as for Zemax.
+        """
         found, medium = cls(), telescope.medium_before
         z = telescope.surfaces[0].vertex[2]
         for surface in telescope.surfaces:
-            require_on_axis(surface, telescope.name)
+            if not tilted:
+                require_on_axis(surface, telescope.name)
             found.advance(z - surface.vertex[2])
             z = surface.vertex[2]
             if surface.name == stop:
                 found.mark_stop(0.0)
             x, y = curvatures_across(surface)
             found.add((-x, -y), medium, surface.medium_after, mirror=surface.interaction == Interaction.MIRROR)
+            if front and surface.name == stop:
+                break
             medium = surface.medium_after
         return found
 
@@ -163,15 +170,17 @@ class StopImage:
         return distance / (value * cone) if cone else math.inf
 
 
-def stop_image(telescope: Telescope) -> StopImage:
+def stop_image(telescope: Telescope, *, front: bool = False) -> StopImage:
     """Return the paraxial image of a telescope's stop at its default wavelength.
 
+    With `front` the surfaces behind the stop are left out, and may be off the axis; its image, and the pupil of an
+    aperture that is not a focal ratio, do not depend on them.
     DomainError if its design data name no stop, a surface is off the axis, or the image is at infinity.
     """
     data = telescope.design_data
     if data.stop is None:
         raise DomainError(f"{telescope.name}: expected a surface that is the stop (design data: stop)")
-    surfaces = ParaxialSurfaces.of(telescope, data.stop)
+    surfaces = ParaxialSurfaces.of(telescope, data.stop, front=front)
     distance = telescope.object_distance - telescope.surfaces[0].vertex[2]
     found = StopImage.of(surfaces, telescope.default_wavelength, distance, telecentric=data.telecentric)
     if found is None:
@@ -190,7 +199,8 @@ def with_floating_pupil(telescope: Telescope) -> Telescope:
     DomainError
         If the design data have no stop or no aperture, a surface is off the axis, or the pupil has no finite size.
     """
-    image, data = stop_image(telescope), telescope.design_data
+    data = telescope.design_data
+    image = stop_image(telescope, front=data.aperture not in ("f_number", "working_f_number"))
     if data.aperture is None or data.aperture_value is None:
         raise DomainError(f"{telescope.name}: expected an aperture in its design data")
     diameter = image.diameter(data.aperture, data.aperture_value)
@@ -211,6 +221,43 @@ def stop_makes_pupil(t: Telescope) -> bool:
         return False
     close = {"rel_tol": _ROUNDING, "abs_tol": _ROUNDING * t.pupil_diameter}
     return math.isclose(made.stop_z, t.stop_z, **close) and math.isclose(made.pupil_diameter, t.pupil_diameter, **close)
+
+
+def stop_states_rays(t: Telescope) -> bool:
+    """Return whether a lens file that states stop, aperture and ray aiming has the rays of a telescope.
+
+    Stop and aperture make its entrance pupil; or they need not, as rays of given angles are aimed at the stop, and the
+    aperture is the diameter of their beam. A reader has a place for the pupil then, without effect on the rays.
+    """
+    if stop_makes_pupil(t):
+        return True
+    data = t.design_data
+    if data.stop is None or data.aiming == "off" or math.isfinite(t.object_distance) or data.field_type != "angle":
+        return False
+    if (data.aperture, data.aperture_value) != ("entrance_pupil", t.pupil_diameter):
+        return False
+    surfaces = ParaxialSurfaces.of(t, data.stop, tilted=True)
+    return StopImage.of(surfaces, t.default_wavelength, math.inf, telecentric=False) is not None
+
+
+def with_true_aperture(telescope: Telescope) -> Telescope:
+    """Return a telescope of the same rays whose stop and stated aperture make its entrance pupil, where there is one.
+
+    A focal ratio that a change has made untrue becomes the diameter of the pupil, which stays. Where rays are aimed at
+    the stop, the entrance pupil moves to where the stop is imaged now; elsewhere the plane of the pupil stays, and what
+    its stop does not make is left as it is.
+    """
+    data = telescope.design_data
+    if data.stop is None or data.aperture is None or data.telecentric or stop_makes_pupil(telescope):
+        return telescope
+    stated = telescope
+    if data.aperture in ("f_number", "working_f_number", "entrance_pupil"):
+        stated = telescope.with_design(aperture="entrance_pupil", aperture_value=telescope.pupil_diameter)
+    if data.aiming != "off" and math.isinf(telescope.object_distance):
+        # Surfaces off the axis have no such image; the rays do not depend on it.
+        with suppress(DomainError):
+            stated = with_floating_pupil(stated)
+    return stated if stop_states_rays(stated) else telescope
 
 
 def require_on_axis(surface: Surface, name: str) -> None:

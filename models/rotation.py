@@ -9,6 +9,9 @@ import numpy as np
 
 from ..core.units import radians
 
+#: Cosine of the rotation about y below which those about x and z are about the same line.
+_SAME_LINE = 1e-15
+
 
 def rotation_matrix(tilt: Any) -> np.ndarray:
     """Return Rx @ Ry @ Rz, shape (3, 3), of angles [rad] about x, the new y and the new z, as in Zemax."""
@@ -23,8 +26,11 @@ def rotation_matrix(tilt: Any) -> np.ndarray:
 
 def rotation_angles(matrix: np.ndarray) -> tuple[float, float, float]:
     """Return the angles [rad] of a rotation matrix, about x, the new y and the new z."""
-    about_y = math.asin(max(-1.0, min(1.0, matrix[0, 2])))
-    if abs(matrix[0, 2]) > 1 - 1e-14:
+    along = math.hypot(matrix[0, 0], matrix[0, 1])
+    if along < _SAME_LINE:
         # About y by a right angle, x and z turn about the same line: one of them does.
-        return math.atan2(matrix[2, 1], matrix[1, 1]), about_y, 0.0
-    return math.atan2(-matrix[1, 2], matrix[2, 2]), about_y, math.atan2(-matrix[0, 1], matrix[0, 0])
+        return math.atan2(matrix[2, 1], matrix[1, 1]), math.atan2(matrix[0, 2], along), 0.0
+    about_x = math.atan2(-matrix[1, 2], matrix[2, 2])
+    # What is left without the first rotation: near a right angle the others make up for its rounding.
+    left = rotation_matrix((-about_x, 0.0, 0.0)) @ matrix
+    return about_x, math.atan2(left[0, 2], left[2, 2]), math.atan2(left[1, 0], left[1, 1])

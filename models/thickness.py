@@ -50,6 +50,22 @@ def thickness(telescope: Telescope, index: int) -> float:
     return float(light_axis(telescope, index) @ (behind - here))
 
 
+def impossible_thicknesses(telescope: Telescope) -> list[str]:
+    """Return a text for each glass of negative thickness on the axis, up to the first surface that is tilted.
+
+    A negative distance in air is none: dummy surfaces and virtual images have one.
+    """
+    found: list[str] = []
+    name, unit = telescope.length_unit
+    for i, surface in enumerate(telescope.surfaces[:-1]):
+        if surface.matrix[2, 2] != 1.0 or telescope.surfaces[i + 1].matrix[2, 2] != 1.0:
+            break
+        if surface.medium_after != telescope.medium_before and (distance := thickness(telescope, i)) < 0.0:
+            glass = surface.medium_after.name or "glass"
+            found.append(f"surface {surface.name}: {glass} of thickness {distance / unit:.6g} {name}: expected from 0")
+    return found
+
+
 def with_thicknesses(telescope: Telescope, start: Telescope, changes: Iterable[tuple[int, float]]) -> Telescope:
     """Return the telescope with thicknesses behind some surfaces, by their indices, changed by lengths [m].
 

@@ -11,7 +11,7 @@ import numpy as np
 from ..core.arguments import check_arguments
 from ..core.docstrings import Description, described
 from ..core.errors import DomainError
-from ..core.plotting import BLUE, axes_at, figure_at, figure_of, plain_text, styled
+from ..core.plotting import BLUE, axes_at, figure_at, figure_of, length_unit_of, plain_text, styled
 from ..core.result import Result
 from ..models.zernike_polynomials import NOLL_NAMES
 
@@ -198,8 +198,10 @@ def _draw_map(axes: Axes, opd: OpdMap, value: np.ndarray, title: str) -> None:
     nm, wavelength = value * 1e9, opd.wavelength * 1e9
     edge = max(float(np.nanmax(np.abs(nm))), 1e-6)
     half = float(np.abs(opd.x).max()) + 0.5 * abs(float(opd.x[0, 1] - opd.x[0, 0]))
-    image = axes.imshow(nm, extent=(-half, half, -half, half), cmap="RdBu_r", vmin=-edge, vmax=edge)
-    axes.set(facecolor="0.93", aspect="equal", xlabel="entrance pupil x [m]", ylabel="entrance pupil y [m]")
+    unit, size = length_unit_of(half)
+    frame = np.array([-half, half, -half, half]) * size
+    image = axes.imshow(nm, extent=tuple(frame.tolist()), cmap="RdBu_r", vmin=-edge, vmax=edge)
+    axes.set(facecolor="0.93", aspect="equal", xlabel=f"entrance pupil x [{unit}]", ylabel=f"entrance pupil y [{unit}]")
     rms, span = float(np.nanstd(nm)), float(np.nanmax(nm) - np.nanmin(nm))
     title += f"\nrms {rms:.4g} nm = {rms / wavelength:.4f} waves; peak to valley {span:.4g} nm"
     axes.set_title(title, loc="left")

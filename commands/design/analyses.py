@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from typer import Option
 
 from ...core.errors import ConfigError
-from ..tables import FIELD, Column, Rows
+from ..tables import FIELD, Column, Rows, number_texts
 from .command import Given, Outcome, Study, design_command
 
 Points = Annotated[int, Option(min=3, max=10001, help="Rays along each diameter of the pupil.")]
@@ -154,9 +154,15 @@ def _seidel_rows(result: Any) -> Rows:
     return Rows(("surface", *headings), rows, caption)
 
 
+def _matrix_heading(summary: dict[str, Any]) -> str:
+    """Return the heading of the spots of a matrix, with its heights or wavelengths."""
+    key, unit = ("defocus_um", "µm") if "defocus_um" in summary else ("columns_nm", "nm")
+    return f"rms [µm] at {', '.join(number_texts(summary[key], '.4g'))} {unit}"
+
+
 @design_command(
     FIELD,
-    Column("rms of each column [µm]", "rms_radius_um", ".3f"),
+    Column(_matrix_heading, "rms_radius_um", ".3f"),
     Column("Airy [µm]", "airy_radius_um", ".3f"),
     band=True,
 )

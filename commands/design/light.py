@@ -76,7 +76,7 @@ def _throughput_rows(result: Any) -> Rows:
     Column("of the rms", "strehl_of_rms", ".4f"),
     Column("of the wavefront", "strehl_of_wavefront", ".4f"),
     Column("of the PSF", lambda result: result.psf, ".4f"),
-    caption="Piston and tilt removed; a number for each wavelength.",
+    caption="Piston and tilt removed; a number for each wavelength; a dash: too steep for the points of the pupil.",
     band=True,
 )
 def strehl(

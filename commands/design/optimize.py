@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Option
 
-from ...core.errors import ConfigError, PrescriptionWarning
-from ..inputs import warnings_shown
+from ...core.errors import ConfigError, PrescriptionError, PrescriptionWarning
+from ..inputs import errors_of, warnings_shown
 from ..options import name_list
 from ..tables import Column
 from .command import Given, Outcome, design_command
+
+if TYPE_CHECKING:
+    from ...design.optimize.operand import Operand
 
 _ADDRESSES = "Separated by commas: M2.dx, Camera.* (six motions), M1.radius, M1.conic, M1.a6, M1.Z4-22, L1_entrance.n"
 
@@ -78,13 +83,39 @@ def sensitivity(
     return Outcome(result, notes=notes)
 
 
+#: Units in which operands are shown that are small beside the lens, as in files.
+_SMALL = {"rms_spot": ("µm", 1e-6), "rms_wavefront": ("nm", 1e-9), "sag": ("µm", 1e-6)}
+
+
+def _shown_unit(result: Any, unit: str) -> tuple[str, float]:
+    """Return the unit in which tables show numbers of an SI unit, and its size: lengths in that of the lens."""
+    return _optimum(result).telescope.length_unit if unit == "m" else (unit, 1.0)
+
+
+def _operand_unit(result: Any, operand: Operand) -> tuple[str, float]:
+    if operand.unit == "rad":
+        return "deg", math.radians(1.0)
+    return _SMALL.get(operand.kind, _shown_unit(result, operand.unit))
+
+
+def _of_variables(name: str) -> Callable[[Any], list[float]]:
+    """Return the function from a result to an attribute of its optimum, variable by variable, in the units shown."""
+
+    def values(result: Any) -> list[float]:
+        found = _optimum(result)
+        sizes = [_shown_unit(found, parameter.unit)[1] for parameter in found.variables]
+        return [float(v) / size for v, size in zip(getattr(found, name), sizes, strict=True)]
+
+    return values
+
+
 @design_command(
     Column("variable", "variables"),
-    Column("unit", "units"),
-    Column("start", "start_values", ".9g"),
-    Column("end", "values", ".9g"),
-    Column("change", "changes", ".4g"),
-    Column("uncertainty", "uncertainty", ".2g"),
+    Column("unit", lambda result: [_shown_unit(result, p.unit or "1")[0] for p in _optimum(result).variables]),
+    Column("start", _of_variables("start_values"), ".9g"),
+    Column("end", _of_variables("values"), ".9g"),
+    Column("change", _of_variables("changes"), ".4g"),
+    Column("uncertainty", _of_variables("uncertainty"), ".2g"),
     Column(
         lambda s: f"effect of the change [µ{'rad' if 'rms_start_rad' in s else 'm'}]",
         lambda result: _optimum(result).step_effects,
@@ -148,7 +179,13 @@ def optimize(
     paths = [out or Path(f"optimized_{telescope.name}.yaml") for telescope in found.telescopes]
     with warnings_shown(PrescriptionWarning):
         for telescope, path in zip(found.telescopes, paths, strict=True):
-            save_telescope(telescope, path, lenient=given.lenient)
+            try:
+                save_telescope(telescope, path, lenient=given.lenient)
+            except PrescriptionError as error:
+                # What took long is not lost.
+                kept = path.with_suffix(".yaml")
+                save_telescope(telescope, kept)
+                raise error.within(subject=f"{path}, in place of which {kept.name} was written") from None
     return Outcome(result, notes=[*_notes(result), *(f"prescription: {path.resolve()}" for path in paths)])
 
 
@@ -169,18 +206,21 @@ def _from_file(given: Given, path: Path, out: Path | None) -> Any:
     """Return the optimum of a file, or the choice of glasses that it asks for."""
     from ...design.optimize.glass_choice import choose_glasses
     from ...design.optimize.optimize import optimize as compute
-    from ...design.optimize.optimize_file import load_optimization, optimization_arguments
+    from ...design.optimize.optimize_file import catalogue_of, load_optimization, optimization_arguments
 
     if given.fields is not None or given.wavelength is not None:
         raise ConfigError("--field-deg or --wavelength-nm is given beside --config: expected them in the file")
     file = load_optimization(path)
     _check_out(given, out, several=bool(file.configurations))
     arguments = optimization_arguments(file, given.telescope, path)
-    if not file.glasses:
-        return compute(**arguments, **given.how)
-    if file.configurations:
+    if file.glasses and file.configurations:
         raise ConfigError("glasses: expected a file without configurations", file=path)
-    return choose_glasses(**arguments, glasses=file.glasses, nearest=file.nearest_glasses, **given.how)
+    catalogue = catalogue_of(file, path)
+    with errors_of(path):
+        if not file.glasses:
+            return compute(**arguments, **given.how)
+        choice: Any = dict(glasses=file.glasses, nearest=file.nearest_glasses, catalogue=catalogue)
+        return choose_glasses(**arguments, **choice, **given.how)
 
 
 def _optimum(result: Any) -> Any:
@@ -197,10 +237,12 @@ def _notes(result: Any) -> list[str]:
         start, end = 1e6 * optimum.history[[0, -1]]
         lines.append(f"with operands: {start:.6g} -> {end:.6g} {unit}")
     several = len(s["configurations"]) > 1
-    for one in s["operands"]:
-        unit = "" if one["unit"] == "1" else f" {one['unit']}"
-        owner = f" of {one['configuration']}" if several else ""
-        lines.append(f"{one['operand']}{owner}: {one['start']:.6g} -> {one['end']:.6g}{unit} ({one['goal']})")
+    for one in optimum.operands:
+        name, size = _operand_unit(optimum, one.operand)
+        unit = "" if name == "1" else f" {name}"
+        owner = f" of {one.configuration}" if several else ""
+        label, goal = one.operand.label, one.operand.goal_text(size)
+        lines.append(f"{label}{owner}: {one.start / size:.6g} -> {one.end / size:.6g}{unit} ({goal})")
     lines += [f"glass: {old} -> {new}" for old, new in s.get("glasses", {}).items()]
     return lines + [f"collinear: {combination}" for combination in s["collinear"]]
 

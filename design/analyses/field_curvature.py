@@ -151,7 +151,8 @@ def field_curvature(
         slope = np.linalg.norm(request.slopes, axis=-1)
         height = np.linalg.norm(bundles.chief_landing() - origin, axis=-1)
         with np.errstate(invalid="ignore", divide="ignore"):
-            distortion.append(np.where(slope > 1e-12, 100.0 * (height / (scale * slope) - 1.0), np.nan))
+            # On the axis it is zero, the limit.
+            distortion.append(np.where(slope > 1e-12, 100.0 * (height / (scale * slope) - 1.0), 0.0))
         scales.append(scale)
     require_focus(telescope, np.array(foci))
     tangential, sagittal = np.moveaxis(np.array(foci), 0, -1).transpose(1, 0, 2)

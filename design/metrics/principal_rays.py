@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.plotting import BLUE, GREY, ORANGE, figure_at, styled
+from ...core.plotting import BLUE, GREY, ORANGE, figure_at, length_unit_of, styled
 from ...core.units import field_label
 from ...models.telescope import Telescope
 from ...raytrace.ideal_lens import image_points
@@ -126,11 +126,13 @@ class PrincipalRays(FieldResult):
         """Draw focal ratio, plate scale, exit pupil and incidence against the distance from the axis."""
         radius, distance = self.axis_distances()
         order = np.argsort(radius, kind="stable")
+        lengths = np.abs([self.exit_pupil_distance, self.exit_pupil_diameter])
+        unit, size = length_unit_of(float(lengths.max(where=np.isfinite(lengths), initial=0.0)))
         pairs = [
             ("working focal ratio", self.f_number),
             (self.image_text('plate scale ["/µm]'), np.rad2deg(self.plate_scale) * 3600e-6),
-            ("exit pupil, from the detector [m]", self.exit_pupil_distance),
-            ("diameter of the exit pupil [m]", self.exit_pupil_diameter),
+            (f"exit pupil, from the detector [{unit}]", self.exit_pupil_distance * size),
+            (f"diameter of the exit pupil [{unit}]", self.exit_pupil_diameter * size),
         ]
         with styled():
             figure = figure_at(ax, 11.0, 6.4)

@@ -20,18 +20,25 @@ _SPOTS, _RINGS = 5, 8
 
 
 def draw_before_after(
-    figure: SubFigure, telescopes: tuple[Telescope, Telescope], fields: np.ndarray, wavelengths: np.ndarray
+    figure: SubFigure,
+    telescopes: tuple[Telescope, Telescope],
+    fields: np.ndarray,
+    wavelengths: np.ndarray,
+    vignetting: np.ndarray | None = None,
 ) -> None:
     """Draw the sections of two telescopes side by side, and below them their spots at some field points."""
-    shown = fields[np.unique(np.linspace(0, len(fields) - 1, _SPOTS).astype(int))]
+    some = np.unique(np.linspace(0, len(fields) - 1, _SPOTS).astype(int))
+    shown, given = fields[some], None if vignetting is None else vignetting[some]
     parts: Any = figure.subfigures(2, 1)
     sections, spots = parts
     middle = float(wavelengths[len(wavelengths) // 2])
     for axes, telescope, name in zip(sections.subplots(1, 2), telescopes, ("before", "after"), strict=True):
-        draw_section(axes, layout(telescope, shown, middle))
-        axes.text(0.02, 0.03, name, transform=axes.transAxes)
-    requests = [Request.of(t, shown, wavelengths, sampling="rings", n_pupil=_RINGS) for t in telescopes]
-    diagrams = [spot_diagram(r) for r in requests]
+        draw_section(axes, layout(*with_fields(telescope, shown, given), middle))
+        axes.set_title(name)
+    diagrams = [
+        spot_diagram(Request.of(*with_fields(t, shown, given), wavelengths, sampling="rings", n_pupil=_RINGS))
+        for t in telescopes
+    ]
     panels = spots.subplots(2, len(shown), squeeze=False)
     for row, diagram, name in zip(panels, diagrams, ("before", "after"), strict=True):
         half = 1.1e6 * float(np.nanmax(diagram.geometric_radius, initial=1e-9))
@@ -44,3 +51,15 @@ def draw_before_after(
             axes.set_title(field_text(shown[i]), fontsize=8)
             axes.set_xlabel(diagram.image_text(f"rms {diagram.rms_radius[i] * 1e6:.3g} µm"), fontsize=7.5)
         row[0].set_ylabel(diagram.image_text(f"{name}, ±{half:.3g} µm"), fontsize=7.5)
+
+
+def with_fields(
+    telescope: Telescope, fields: np.ndarray, vignetting: np.ndarray | None
+) -> tuple[Telescope, np.ndarray | None]:
+    """Return a telescope and field points; its own if they have vignetting factors, which others have not."""
+    if vignetting is None or telescope.design_data.telecentric:
+        return telescope, fields
+    rows = tuple(map(tuple, vignetting.tolist()))
+    points = tuple(map(tuple, fields.tolist()))
+    stated = telescope.with_design(field_type="angle", fields=points, field_weights=(), vignetting=rows)
+    return stated, None

@@ -158,6 +158,7 @@ def choose_glasses(
         changes=changes,
         merits=np.array([model.merits[0], best.merits[1]]),
         history=np.concatenate([model.history, best.history[1:]]),
+        operands=tuple(replace(b, start=m.start) for b, m in zip(best.operands, model.operands, strict=True)),
     )
     return GlassChoice(final, model, chosen, tuple(trials))
 

@@ -76,6 +76,13 @@ class Operand:
         texts = [_degrees(v) if name == "field" else _shown(v) for name, v in given]
         return f"{self.kind}({', '.join(texts)})" if texts else self.kind
 
+    def goal_text(self, unit: float = 1.0) -> str:
+        """Return the wanted value or the limits as text, in a unit of a size in SI."""
+        if self.value is not None:
+            return f"= {self.value / unit:.6g}"
+        limits = ((">=", self.minimum), ("<=", self.maximum))
+        return ", ".join(f"{sign} {number / unit:.6g}" for sign, number in limits if number is not None)
+
     @property
     def exact(self) -> bool:
         """Whether :meth:`gradient` returns derivatives; otherwise they are taken by differences."""

@@ -14,7 +14,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, PachonError, shown
 from ...core.threads import one_blas_thread
 from ...core.units import require_count
-from ...models.paraxial import stop_makes_pupil, with_floating_pupil
+from ...models.paraxial import with_true_aperture
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
 from ...wavefront.pupil_sampling import PupilSampling
@@ -152,7 +152,7 @@ def optimize(
     covariance, collinear = _covariance(values, slopes, chosen, rate)
     changes = np.array([v.change(x) for v, x in zip(chosen, solved, strict=True)])
     start_values = np.array([v.start for v in chosen])
-    ended = [_as_stated(before, after) for before, after in zip(telescopes, problem.telescopes(solved), strict=True)]
+    ended = [with_true_aperture(after) for after in problem.telescopes(solved)]
     return Optimum(
         telescopes=tuple(ended),
         start_telescopes=tuple(telescopes),
@@ -175,23 +175,8 @@ def optimize(
         covariance=covariance,
         collinear=collinear,
         message=str(done.message),
+        vignetting=tuple(b.request.vignetting for b in beams),
     )
-
-
-def _as_stated(before: Telescope, after: Telescope) -> Telescope:
-    """Return a telescope whose stated aperture and stop are true again, of the same rays.
-
-    A focal ratio that is true no longer becomes the diameter of the pupil, which stays. Where rays are aimed at the
-    stop, the entrance pupil moves to where the stop is imaged now.
-    """
-    data = after.design_data
-    if not stop_makes_pupil(before) or stop_makes_pupil(after):
-        return after
-    if data.aperture in ("f_number", "working_f_number"):
-        after = after.with_design(aperture="entrance_pupil", aperture_value=after.pupil_diameter)
-    if data.aiming == "off" or np.isfinite(after.object_distance):
-        return after
-    return with_floating_pupil(after)
 
 
 def _solve(

@@ -14,6 +14,7 @@
     configurations:
       - {telescope: zoom_2.yaml, weight: 2}
     glasses: [N-SK16, N-SF2]
+    glass_catalogue: schott
     restarts: 10
 
 An operand has one of the kinds of :data:`~.operand.OPERANDS`, with the unit of its numbers at the end of the name.
@@ -34,6 +35,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, error_context, unknown_name
 from ...core.schema import Count, Positive, Real, Section, Whole, validated
 from ...core.yaml_reader import read_mapping
+from ...models.io.glass_catalogue import GlassCatalogue
 from ...models.io.prescription import load_telescope
 from ...models.telescope import Telescope
 from ..parameters.changes import ANGLES, LENGTHS, parse_change
@@ -168,11 +170,25 @@ class OptimizeFile(StateSection):
     configurations: tuple[ConfigurationSection, ...] = ()
     glasses: tuple[str, ...] = ()
     nearest_glasses: Count = 4
+    glass_catalogue: str | None = None
     n_pupil: Count | None = None
     max_steps: Count = 200
     restarts: Whole = 0
     spread: Positive = 0.3
     seed: Whole = 0
+
+
+def catalogue_of(file: OptimizeFile, path: Path) -> GlassCatalogue | None:
+    """Return the catalogue that a file names: that of a maker, or an AGF file from its folder on; None by default."""
+    name = file.glass_catalogue
+    if name is None or not file.glasses:
+        if name is not None:
+            raise ConfigError(f"glass_catalogue = {name!r}: expected glasses that are chosen from it", file=path)
+        return None
+    with error_context(file=path, key="glass_catalogue"):
+        if Path(name).suffix.lower() == ".agf":
+            return GlassCatalogue.read(path.parent / name)
+        return GlassCatalogue.of_maker(name)
 
 
 @check_arguments

@@ -41,11 +41,7 @@ class OperandChange(Values):
     @property
     def goal(self) -> str:
         """Wanted value or limits as text."""
-        one = self.operand
-        if one.value is not None:
-            return f"= {one.value:.6g}"
-        parts = [f">= {one.minimum:.6g}"] if one.minimum is not None else []
-        return ", ".join([*parts, f"<= {one.maximum:.6g}"] if one.maximum is not None else parts)
+        return self.operand.goal_text()
 
 
 @dataclass(frozen=True)
@@ -86,6 +82,8 @@ class Optimum(Result):
         Combinations of variables without effect, such as "M1.radius - 0.998 M1.curvature".
     message : str
         Why the solver stopped.
+    vignetting : tuple of (ndarray, shape [n_field, 5], or None)
+        Vignetting factors of the fields of each configuration.
     """
 
     _table = ("start_values", "values", "changes", "uncertainty", "effect")
@@ -108,6 +106,7 @@ class Optimum(Result):
     covariance: np.ndarray
     collinear: tuple[str, ...]
     message: str
+    vignetting: tuple[np.ndarray | None, ...]
 
     @property
     def telescope(self) -> Telescope:
@@ -188,6 +187,7 @@ class Optimum(Result):
                 (self.start_telescopes[0], self.telescope),
                 self.fields[0],
                 self.wavelengths[0],
+                self.vignetting[0],
             )
             return figure
 

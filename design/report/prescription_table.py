@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from ...core.errors import DomainError
+from ...core.errors import DomainError, PachonError
 from ...core.units import ARCSEC
 from ...models.first_order import first_order, seidel_sums
 from ...models.media.medium import ConstantIndex
 from ...models.shapes.shape import Rotational
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
+from ..metrics.principal_rays import principal_rays
 
 COLUMNS = ("surface", "type", "radius", "thickness", "medium", "index", "semi-diameter", "conic", "coefficients, place")
 _TYPES = {
@@ -100,6 +101,7 @@ def first_order_rows(telescope: Telescope, wavelength: float) -> list[tuple[str,
     ]
     if math.isfinite(telescope.object_distance):
         rows.append(("object", f"{text(telescope.object_distance - telescope.stop_z)} from the entrance pupil"))
+    stated = len(rows)
     with contextlib.suppress(DomainError):
         optics = first_order(telescope, wavelength)
         detector = telescope.surfaces[-1].vertex[2]
@@ -126,7 +128,28 @@ def first_order_rows(telescope: Telescope, wavelength: float) -> list[tuple[str,
             ("Petzval radius", text(_petzval_radius(telescope, wavelength))),
             ("effective area", f"{optics.effective_area / unit**2:.6g} {name}²"),
         ]
-    return rows
+    return rows if len(rows) > stated else [*rows, *_real_ray_rows(telescope, wavelength)]
+
+
+def _real_ray_rows(telescope: Telescope, wavelength: float) -> list[tuple[str, str]]:
+    """Return focal lengths and focal ratios of real rays about the chief ray of the axis; none without a focus."""
+    if math.isfinite(telescope.object_distance) or telescope.design_data.afocal:
+        return []
+    try:
+        rays = principal_rays(telescope, [(0.0, 0.0)], wavelength)
+    except PachonError:
+        return []
+    name, unit = telescope.length_unit
+    lengths, ratios = 1.0 / rays.plate_scale[0], rays.f_number[0]
+    if not (np.isfinite(lengths).all() and np.isfinite(ratios).all()):
+        return []
+    about = "of real rays about the chief ray of the axis, in the plane of y and z, and across it"
+    scales = ", ".join(f"{v / ARCSEC * unit:.6g}" for v in rays.plate_scale[0])
+    return [
+        ("effective focal lengths", f"{', '.join(f'{v / unit:.8g}' for v in lengths)} {name}, {about}"),
+        ("working focal ratios", ", ".join(f"f/{v:.6g}" for v in ratios)),
+        ("plate scales", f"{scales} arcsec/{name}"),
+    ]
 
 
 def _petzval_radius(telescope: Telescope, wavelength: float) -> float:

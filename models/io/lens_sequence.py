@@ -20,7 +20,7 @@ from ..design_data import DesignData
 from ..media.air import STANDARD_ATMOSPHERE, ZERO_CELSIUS
 from ..media.medium import ConstantIndex, Medium
 from ..media.tabulated import TabulatedIndex
-from ..paraxial import stop_makes_pupil
+from ..paraxial import stop_makes_pupil, stop_states_rays, with_true_aperture
 from ..rotation import rotation_angles
 from ..shapes.shape import Plane, Shape
 from ..surface import Interaction, Surface
@@ -112,14 +112,15 @@ class LensSequence:
         PrescriptionError for a telescope that no file of a sequence of surfaces can hold, and unless lenient, which
         makes it a warning, for links and coatings.
         """
-        t, data, findings = require_met(telescope), telescope.design_data, Findings(lenient)
+        t, findings = with_true_aperture(require_met(telescope)), Findings(lenient)
+        data = t.design_data
         with error_context(subject=t.name):
             require_sequential(t, file)
             if data.telecentric:
                 raise PrescriptionError(f"telecentric object space: {file} has no place for it")
             others = ["afocal"] if data.afocal and not afocal else []
             report_unheld(t, (*data.pickups, *data.solves), file, lenient=lenient, others=others)
-            own_stop = stop_makes_pupil(t)
+            own_stop = stop_makes_pupil(t) or (aimed != "off" and stop_states_rays(t))
             if data.stop is not None and not own_stop:
                 said = f"stop = {data.stop}: with surfaces off the axis it does not make the stated pupil"
                 findings.note(PrescriptionError(said), "a plane in front carries the stop and the pupil")

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 from ...core.errors import PrescriptionError
 from ..links import Pickup, Solve
+from ..media.fitted import fitted_dispersion
+from ..media.medium import Medium
 from ..surface import Interaction
 from ..telescope import Telescope
 from ..thickness import thickness
@@ -14,6 +17,10 @@ from .zemax.file import Findings
 
 #: Relative difference from a pickup that rounding in files makes.
 _ROUNDING = 1e-6
+#: Factors of the shortest and the longest wavelength of a telescope between which a fitted formula holds.
+_MARGIN = (0.85, 1.2)
+#: Deviation of a fitted index that needs no leniency: a fiftieth of the precision of catalogues.
+_LARGEST_DEVIATION = 1e-7
 
 
 def require_sequential(telescope: Telescope, file: str) -> None:
@@ -31,6 +38,40 @@ def report_unheld(
     coated = [f"coating of {s.name}" for s in telescope.surfaces if s.coating is not None]
     if names := ", ".join([*(link.address for link in links), *coated, *others]):
         Findings(lenient).report(PrescriptionError(f"{names}: {file} has no place for it"), "left out")
+
+
+def report_pupil_plane(telescope: Telescope, findings: Findings, *, own_stop: bool) -> None:
+    """Warn where a plane in front has to carry the stop of a telescope, whose rays are aimed at it."""
+    data = telescope.design_data
+    if data.stop is not None and data.aiming != "off" and not own_stop:
+        said = f"stop = {data.stop}, aiming = {data.aiming}: the stop and the stated aperture do not make the pupil"
+        findings.note(PrescriptionError(said), "a plane in front carries the stop, and rays are not aimed")
+
+
+def with_formulas(telescope: Telescope, written: Callable[[Medium], object], findings: Findings) -> Telescope:
+    """Return a telescope all of whose media a file can hold, formulas fitted to the others.
+
+    `written` raises a PrescriptionError for a medium that the file cannot hold. A formula covers the wavelengths of the
+    telescope and some beyond. One that is near its medium is a warning, another one an error unless lenient.
+    """
+    used = (*telescope.design_data.wavelengths, telescope.default_wavelength, *(telescope.band or ()))
+    low, high = telescope.wavelength_range
+    low, high = max(low, _MARGIN[0] * min(used)), min(high, _MARGIN[1] * max(used))
+    media = [telescope.medium_before, *(s.medium_after for s in telescope.surfaces)]
+    fits: dict[Medium, Medium] = {}
+    for medium in dict.fromkeys(media):
+        try:
+            written(medium)
+        except PrescriptionError as error:
+            fits[medium], deviation = fitted_dispersion(medium, (low, high))
+            said = PrescriptionError(f"medium {medium.name or type(medium).__name__}: {error}")
+            instead = (
+                f"a formula is fitted, within {deviation:.1g} of its index, {low * 1e9:.4g} to {high * 1e9:.4g} nm"
+            )
+            (findings.report if deviation > _LARGEST_DEVIATION else findings.note)(said, instead)
+    before, *after = (fits.get(medium, medium) for medium in media)
+    surfaces = tuple(replace(s, medium_after=m) for s, m in zip(telescope.surfaces, after, strict=True))
+    return replace(telescope, medium_before=before, surfaces=surfaces) if fits else telescope
 
 
 def require_met(telescope: Telescope) -> Telescope:

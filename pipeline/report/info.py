@@ -205,11 +205,12 @@ def figure_rows(description: dict[str, Any]) -> list[tuple[str, str]]:
         ]
         image = [pupil, ("paraxial image", f"z = {length(d['image_z_m'])}")]
     elif d["focal_length_m"] is None:
-        lens, image = [("first-order figures", "none: the surfaces do not share one axis, or there is no focus")], []
+        why = "the surfaces do not share one axis, or there is no focus; pachon rays has those of real rays"
+        lens, image = [("first-order figures", f"none: {why}")], []
     else:
         lens = [
             ("focal length", length(d["focal_length_m"])),
-            ("focal ratio", f"f/{d['f_number']:.4f}"),
+            ("focal ratio", f"f/{abs(d['f_number']):.4f}"),
             ("plate scale", f'{d["plate_scale_arcsec_per_um"]:.6f}"/µm'),
         ]
         image = [pupil, ("paraxial focus", f"z = {length(d['focus_z_m'])}")]

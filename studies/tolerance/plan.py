@@ -63,11 +63,18 @@ def tolerance_plan(file: ToleranceFile, telescope: Telescope) -> TolerancePlan:
     telescope, elements = with_elements(resolved(telescope))
     maker = _Maker(telescope, file)
     chosen: dict[str, tuple[DegreeOfFreedom, Tolerance]] = {}
+    listed: set[str] = set()
     for section in _common(file, telescope, elements):
         chosen |= maker.of(section)
     for i, section in enumerate(file.tolerances):
         with error_context(key=f"tolerances.{i}"):
             found = maker.of(section)
+            again = _same_quantity(found, chosen)
+            if twice := again & listed:
+                raise ConfigError(f"{section.name} is {min(twice)} once more: expected each quantity once")
+            # In another unit, or as a percentage, a quantity replaces that of all surfaces.
+            chosen = {name: one for name, one in chosen.items() if name not in again}
+            listed |= set(found)
             if section.name.rpartition(".")[2].startswith("irregularity"):
                 # Another range of terms replaces all of those before.
                 begin = next(iter(found)).rpartition(" ")[0]
@@ -84,6 +91,14 @@ def tolerance_plan(file: ToleranceFile, telescope: Telescope) -> TolerancePlan:
     members = (*(freedom for freedom, _ in chosen.values()), *free.values())
     dof = DegreesOfFreedom(members, tuple(maker.deformations.values()))
     return TolerancePlan(telescope, tuple(t for _, t in chosen.values()), tuple(free), dof)
+
+
+def _same_quantity(
+    found: dict[str, tuple[DegreeOfFreedom, Tolerance]], chosen: dict[str, tuple[DegreeOfFreedom, Tolerance]]
+) -> set[str]:
+    """Return the names of chosen tolerances that are of the one parameter of a tolerance that was found."""
+    parameters = {tuple(freedom.of) for freedom, _ in found.values() if len(freedom.of) == 1}
+    return {name for name, (freedom, _) in chosen.items() if tuple(freedom.of) in parameters}
 
 
 def _common(file: ToleranceFile, telescope: Telescope, elements: tuple[str, ...]) -> Iterator[ToleranceSection]:
@@ -153,7 +168,7 @@ class _Maker:
         """Return the degree of freedom of a name: a named one, or a parameter with its unit."""
         if self._named is not None and name in self._named.names:
             return self._named.members[self._named.index(name)]
-        parameter, _ = parse_change(self.telescope, name, "tolerances")
+        parameter, _ = parse_change(self.telescope, name, "")
         unit = name.rpartition("_")[2] if parameter.unit in ("m", "rad") else "1"
         return DegreeOfFreedom(name, unit, {parameter.address: 1.0})
 

@@ -106,7 +106,14 @@ def test_bad_input_is_one_line(capsys, written, text, options, words):
 def test_an_optimization_from_a_file(capsys, in_folder, written):
     assert main(["optimize", LENS, "--config", written("opt.yaml", OPTIMIZATION), "--out", "better.yaml"]) == 0
     out = capsys.readouterr().out
-    for words in ("rms of spots: ", "with operands: ", "focal_length: 0.024", "edge_thickness(S1): ", "(>= 0.0005)"):
+    for words in (
+        "rms of spots: ",
+        "with operands: ",
+        "focal_length: 24.",
+        " mm (= 25)",
+        "edge_thickness(S1): ",
+        "(>= 0.5)",
+    ):
         assert words in out
     assert (in_folder / "optimize_lens1.png").read_bytes().startswith(b"\x89PNG")
     better = pachon.load_telescope(in_folder / "better.yaml")
@@ -127,3 +134,30 @@ def test_options_that_exclude_each_other(capsys, written, options, words):
     written("opt.yaml", OPTIMIZATION)
     assert main(["optimize", LENS, *options]) == 2
     assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("command", "name", "text", "words"),
+    [
+        ("tolerance", "tol.yaml", "tolerances: [{name: S99.dz_um, size: 1}]", "tol.yaml: tolerances.0: unknown"),
+        ("tolerance", "tol.yaml", "surfaces: {radius_percent: 1}\nfields_deg: [[0, 85]]", "tol.yaml: field = (0, 85)"),
+        ("optimize", "opt.yaml", "variables: [S1.radius]\nfields_deg: [[0, 85]]", "opt.yaml: field = (0, 85)"),
+        ("optimize", "opt.yaml", "variables: [S1.radius, S1.radius]", "opt.yaml: variable 'S1.radius' occurs"),
+    ],
+)
+def test_errors_of_the_content_name_the_file(capsys, in_folder, written, command, name, text, words):
+    options = ["--config", written(name, text)] if command == "optimize" else [written(name, text)]
+    assert main([command, LENS, *options]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_an_optimum_that_its_format_cannot_hold_is_not_lost(capsys, written, in_folder):
+    """The format is found out before, unless the optimisation makes what it has no place for, here a glass."""
+    telescope = pachon.doublet(diameter=0.02, f_number=10.0)
+    pachon.save_telescope(telescope, "lens.yaml")
+    name = telescope.surfaces[0].name
+    config = written("opt.yaml", f"variables: [{name}.n]\nfields_deg: [[0, 0]]\nn_pupil: 2\nmax_steps: 2\n")
+    assert main(["optimize", "lens.yaml", "--config", config, "--out", "better.seq"]) == 2
+    assert "better.seq, in place of which better.yaml was written: " in capsys.readouterr().err
+    better = pachon.load_telescope(in_folder / "better.yaml")
+    assert better.surface(name).medium_after != telescope.surface(name).medium_after

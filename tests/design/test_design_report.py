@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from pachon.design.report.prescription_table import first_order_rows, prescripti
 from pachon.models.shapes.shape import EvenAsphere, Plane
 from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM
+
+DATA = Path(__file__).parents[1] / "data" / "zmx"
 
 
 class Reader(HTMLParser):
@@ -118,3 +121,11 @@ def test_whole_reports(name, request):
     check(page)
     assert page.count("<img") >= (2 if "fold" in name else len(sections.SECTIONS))
     assert page == pachon.design_report(pachon.load_telescope(path), threads=1)
+
+
+def test_first_order_data_of_an_off_axis_parabola():
+    """Half the radius of the parent over cos^2 of half the angle of 90 degrees: its radius."""
+    rows = dict(first_order_rows(pachon.load_telescope(DATA / "zmax_37992.zmx"), 587.6e-9))
+    lengths = re.findall(r"[0-9.]+", rows["effective focal lengths"])
+    assert [float(v) for v in lengths[:2]] == pytest.approx([190.6, 190.6], rel=1e-6)
+    assert "back focus" not in rows

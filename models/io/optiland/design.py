@@ -11,8 +11,9 @@ from typing import Any
 
 from ....core.errors import PrescriptionError
 from ...design_data import DesignData
-from ...paraxial import stop_makes_pupil
+from ...paraxial import stop_states_rays
 from ...telescope import Telescope
+from ..zemax.file import Findings
 from ..zemax.text import scaled
 from .reader import APERTURES, FIELD_TYPES
 
@@ -23,22 +24,31 @@ _APERTURES = {"entrance_pupil": "EPD", "f_number": "imageFNO", "object_na": "obj
 _FIELDS = {"angle": 0, "object_height": 1, "paraxial_image_height": 2, "real_image_height": 3}
 
 
+def with_optiland_aperture(t: Telescope) -> Telescope:
+    """Return a telescope whose working focal ratio, which optiland has not, is the aperture at the object instead."""
+    if t.design_data.aperture != "working_f_number" or not math.isfinite(t.object_distance):
+        return t
+    half_angle = math.atan(0.5 * t.pupil_diameter / abs(t.object_distance - t.stop_z))
+    index = float(t.medium_before.index(t.default_wavelength))
+    return t.with_design(aperture="object_na", aperture_value=index * math.sin(half_angle))
+
+
 def own_stop(t: Telescope) -> str | None:
     """Return the surface that is the stop in a file of optiland, None where a plane in front has to be it.
 
     PrescriptionError for a telecentric object space without a stop and the aperture that optiland has for it.
     """
     data = t.design_data
-    stop = data.stop if data.aperture in _APERTURES and stop_makes_pupil(t) else None
+    stop = data.stop if data.aperture in _APERTURES and stop_states_rays(t) else None
     if data.telecentric and (stop is None or data.aperture != "object_na"):
         raise PrescriptionError("a telecentric object space needs its stop, and object_na as aperture, in optiland")
     return stop
 
 
-def system_items(t: Telescope) -> dict[str, Any]:
+def system_items(t: Telescope, findings: Findings) -> dict[str, Any]:
     """Return the entries of aperture, fields, wavelengths and ray aiming.
 
-    PrescriptionError for vignetting factors that optiland has not.
+    PrescriptionError for vignetting factors that optiland has not; if lenient, all are left out with a warning.
     """
     data, stop = t.design_data, own_stop(t)
     aperture: dict[str, Any] = {"type": "EPD", "value": t.pupil_diameter / MM}
@@ -47,14 +57,16 @@ def system_items(t: Telescope) -> dict[str, Any]:
         assert kind in APERTURES
         size = {"EPD": 1 / MM, "float_by_stop_size": 2 / MM}.get(kind, 1.0)
         aperture = {"type": kind, "value": data.aperture_value * size}
-    found = {"aperture": aperture, "fields": _fields(t), "wavelengths": _wavelengths(t)}
+    found = {"aperture": aperture, "fields": _fields(t, findings), "wavelengths": _wavelengths(t)}
     if stop is not None and data.aiming != "off":
-        # Its aiming is at the radius of the real marginal ray; optiland has none at the paraxial one.
+        if data.aiming == "paraxial":
+            said = PrescriptionError("aiming = paraxial: optiland aims at the radius of the real marginal ray alone")
+            findings.note(said, "read back it is real")
         found["ray_tracer"] = {"ray_aiming_config": {"mode": "robust", "max_iter": 100, "tol": 1e-10}}
     return found
 
 
-def _fields(t: Telescope) -> dict[str, Any]:
+def _fields(t: Telescope, findings: Findings) -> dict[str, Any]:
     data, kind = t.design_data, 0
     edge = math.degrees(t.field_radius)
     rows = [(0.0, fraction * edge, 0.0, 0.0, 1.0) for fraction in (0.0, 0.7, 1.0)]
@@ -62,7 +74,13 @@ def _fields(t: Telescope) -> dict[str, Any]:
         kind = _FIELDS[data.field_type]
         size = math.degrees(1.0) if kind == 0 else 1 / MM
         weights = data.field_weights or (1.0,) * len(data.fields)
-        factors = [_compression(row) for row in data.vignetting] or [(0.0, 0.0)] * len(data.fields)
+        factors = [(x, y) for _, _, x, y, _ in data.vignetting] or [(0.0, 0.0)] * len(data.fields)
+        moved = next((row for row in data.vignetting if row[0] or row[1] or row[4]), None)
+        if moved is not None:
+            said = f"vignetting = {list(moved)}: optiland has compressions alone, no decentre and no angle"
+            # Compressions without their decentres would let other light through.
+            findings.report(PrescriptionError(said), "the factors of all fields are left out")
+            factors = [(0.0, 0.0)] * len(data.fields)
         rows = [
             (-x * size + 0.0, y * size, *compression, weight)
             for (x, y), compression, weight in zip(data.fields, factors, weights, strict=True)
@@ -74,13 +92,6 @@ def _fields(t: Telescope) -> dict[str, Any]:
         "telecentric": data.telecentric,
         "field_definition": {"field_type": definition},
     }
-
-
-def _compression(row: tuple[float, float, float, float, float]) -> tuple[float, float]:
-    """Return the compressions of vignetting factors, the only ones that optiland has."""
-    if row[0] or row[1] or row[4]:
-        raise PrescriptionError(f"vignetting = {list(row)}: optiland has compressions alone, no decentre and no angle")
-    return row[2], row[3]
 
 
 def _wavelengths(t: Telescope) -> dict[str, Any]:

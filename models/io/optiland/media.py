@@ -102,10 +102,7 @@ def material_items(medium: Medium) -> dict[str, Any]:
     if isinstance(medium, TabulatedIndex) and medium.interpolation == "linear":
         table = {"wavelengths_um": [w * 1e6 for w in medium.wavelengths], "indices": list(medium.indices)}
         return _material(medium, {"kind": "tabulated", **table})
-    raise PrescriptionError(
-        f"medium {medium.name or type(medium).__name__}: expected a constant index, a formula of Sellmeier or of "
-        "powers, or a table with linear interpolation"
-    )
+    raise PrescriptionError("expected a constant index, a formula of Sellmeier or of powers, or a linear table")
 
 
 _PROPAGATION = {"propagation_model": {"class": "HomogeneousPropagation"}}

@@ -15,12 +15,15 @@ import numpy as np
 
 from ....core.errors import PrescriptionError, error_context
 from ...aperture import Annulus, Aperture, Circle, Complement, Ellipse, Rectangle
+from ...paraxial import with_true_aperture
+from ...rotation import rotation_angles
 from ...surface import Interaction, Surface
 from ...telescope import Telescope
-from ..writable import report_unheld, require_sequential
+from ..writable import report_pupil_plane, report_unheld, require_sequential, with_formulas
+from ..zemax.file import Findings
 from ..zemax.frame import HALF_TURN, rotated_aperture, rotated_shape
 from ..zemax.reader import PUPIL_COMMENT
-from .design import MM, own_stop, system_items
+from .design import MM, own_stop, system_items, with_optiland_aperture
 from .media import material_items
 from .shapes import geometry_items
 
@@ -31,13 +34,15 @@ def telescope_to_optiland(telescope: Telescope, *, lenient: bool = False) -> str
     PrescriptionError, with surface and part, if a part of the telescope has no counterpart in optiland; pickups and
     solves have none, and are left out with a warning where `lenient`.
     """
-    t = telescope
+    t, findings = with_optiland_aperture(with_true_aperture(telescope)), Findings(lenient)
     with error_context(subject=t.name):
         require_sequential(t, "a file of optiland")
+        t = with_formulas(t, material_items, findings)
         data = t.design_data
         others = ["afocal"] if data.afocal else []
         report_unheld(t, (*data.pickups, *data.solves), "a file of optiland", lenient=lenient, others=others)
-        stop, system = own_stop(t), system_items(t)
+        stop, system = own_stop(t), system_items(t, findings)
+        report_pupil_plane(t, findings, own_stop=stop is not None)
         first = -t.surfaces[0].vertex[2]
         before = material_items(t.medium_before)
         surfaces: list[dict[str, Any]] = [
@@ -76,11 +81,8 @@ def telescope_to_optiland(telescope: Telescope, *, lenient: bool = False) -> str
 def _system(z: float, x: float = 0.0, y: float = 0.0, axes: np.ndarray | None = None) -> dict[str, Any]:
     """Return a coordinate system [m] [rad]: rotations about x, then the old y, then the old z."""
     turn = np.eye(3) if axes is None else axes
-    angles = (
-        math.atan2(turn[2, 1], turn[2, 2]),
-        math.asin(max(-1.0, min(1.0, -turn[2, 0]))),
-        math.atan2(turn[1, 0], turn[0, 0]),
-    )
+    # The transpose is the product of the opposite rotations in the order of rotation_angles.
+    angles = tuple(-v for v in rotation_angles(turn.T))
     places = dict(zip(("x", "y", "z", "rx", "ry", "rz"), (x, y, z, *(v + 0.0 for v in angles)), strict=True))
     return {**places, "reference_cs": None}
 

@@ -29,6 +29,7 @@ from ...rotation import rotation_matrix
 from ...shapes.shape import Plane
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope
+from ...thickness import impossible_thicknesses
 from ..glass_catalogue import GlassCatalogue
 from ..glass_search import find_glass, glass_hint
 from .apertures import read_aperture
@@ -64,7 +65,10 @@ def read_lens(
         catalogues = [c if isinstance(c, GlassCatalogue) else GlassCatalogue.read(c) for c in glass_catalogues]
         beside = path.with_suffix(".agf")
         catalogues += [GlassCatalogue.read(beside)] if beside.is_file() else []
-        return _LensReader(file, findings, catalogues).telescope()
+        telescope = _LensReader(file, findings, catalogues).telescope()
+    for text in impossible_thicknesses(telescope):
+        findings.note(PrescriptionError(text, file=path), "read as it is: rays go back within it")
+    return telescope
 
 
 class _LensReader:

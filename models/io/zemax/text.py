@@ -12,7 +12,7 @@ from ....core.files import read_bytes
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file in UTF-16 (with a byte order mark), UTF-8 or ISO 8859-1."""
+    """Return the text of a file in UTF-16 (with a byte order mark), UTF-8 or Windows-1252."""
     return decoded(read_bytes(path, PrescriptionError), str(path))
 
 
@@ -24,8 +24,11 @@ def decoded(raw: bytes, source: str) -> str:
     except UnicodeDecodeError:
         if wide:
             raise PrescriptionError("not a UTF-16 text file, although it begins like one", file=source) from None
-        # Every byte is a character of ISO 8859-1.
-        text = raw.decode("iso-8859-1")
+        # Windows' own characters; it has none for five bytes, which are control characters in ISO 8859-1.
+        try:
+            text = raw.decode("cp1252")
+        except UnicodeDecodeError:
+            text = raw.decode("iso-8859-1")
     if "\0" in text:
         raise PrescriptionError("not a text file", file=source)
     return text

@@ -20,14 +20,15 @@ from ....core.errors import PrescriptionError, error_context
 from ...design_data import FIELD_TYPES, DesignData
 from ...media.dispersion import Dispersion
 from ...media.medium import ConstantIndex, Medium, Sellmeier
-from ...paraxial import stop_makes_pupil
+from ...paraxial import stop_states_rays, with_true_aperture
 from ...rotation import rotation_angles
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope
 from ..glass_catalogue import NUMBERED, SELLMEIER_TERMS, GlassCatalogue
-from ..writable import report_unheld, require_met, require_sequential
+from ..writable import report_pupil_plane, report_unheld, require_met, require_sequential, with_formulas
 from .apertures import aperture_lines
 from .design import design_lines, stop_lines
+from .file import Findings
 from .frame import HALF_TURN, rotated_aperture, rotated_shape
 from .links import add_link_lines
 from .reader import PUPIL_COMMENT
@@ -47,13 +48,16 @@ def telescope_to_zemax(telescope: Telescope, *, lenient: bool = False) -> tuple[
     PrescriptionError, with surface and part, if a part of the telescope has no counterpart in a Zemax file; pickups and
     solves without one are left out with a warning where `lenient`.
     """
-    t = require_met(telescope)
+    t, findings = with_true_aperture(require_met(telescope)), Findings(lenient)
     with error_context(subject=t.name):
         require_sequential(t, "a Zemax file")
+        t = with_formulas(t, _formula, findings)
     glasses = _glass_names(t)
     data = t.design_data
     unit = MM if data == DesignData() else data.unit
-    own_stop = stop_makes_pupil(t)
+    own_stop = stop_states_rays(t)
+    with error_context(subject=t.name):
+        report_pupil_plane(t, findings, own_stop=own_stop)
     if data.telecentric and not own_stop:
         raise PrescriptionError(f"{t.name}: a telecentric object space needs its stop and its aperture in a Zemax file")
     lines = [
@@ -200,14 +204,15 @@ def _catalogue_lines(glasses: dict[Medium, str]) -> Iterator[str]:
     if own:
         yield "CC Glasses of the lens file of the same name, written by pachon\n"
     for medium, name in own.items():
-        formula, coefficients, limits = _formula(medium, name)
+        formula, coefficients, limits = _formula(medium)
         nd = float(medium.index(5.875618e-7)) if limits[0] <= 5.875618e-7 <= limits[1] else 0.0
         yield f"NM {name} {formula} 0 {nd:.6f} 0 0 0\n"
         yield f"CD {' '.join(number_text(c) for c in coefficients)}\n"
         yield f"LD {_micrometres(limits[0])} {_micrometres(limits[1])}\n"
 
 
-def _formula(medium: Medium, name: str) -> tuple[int, list[float], tuple[float, float]]:
+def _formula(medium: Medium) -> tuple[int, list[float], tuple[float, float]]:
+    """Return number and coefficients of a medium's formula, and its range of wavelengths [m]."""
     if isinstance(medium, ConstantIndex):
         return CONSTANT_FORMULA, [medium.n**2], (1e-8, 1e-3)
     if isinstance(medium, Sellmeier):
@@ -220,9 +225,7 @@ def _formula(medium: Medium, name: str) -> tuple[int, list[float], tuple[float, 
         numbers = {formula: number for number, formula in NUMBERED.items()}
         if kind in numbers:
             return numbers[kind], list(medium.coefficients), medium.wavelength_range
-    raise PrescriptionError(
-        f"glass {name}: {type(medium).__name__} is none of the dispersion formulas of a Zemax glass catalogue"
-    )
+    raise PrescriptionError(f"{type(medium).__name__} is none of the dispersion formulas of a Zemax glass catalogue")
 
 
 def catalogue_path(path: Path) -> Path:

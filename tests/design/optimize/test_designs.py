@@ -239,6 +239,7 @@ def test_glasses_of_a_catalogue(lens):
     assert found.optimum.merits[1] < 0.5 * plain.merits[1]
     assert found.optimum.start_telescopes == (start,)
     assert found.optimum.values == pytest.approx(found.optimum.start_values + found.optimum.changes)
+    assert found.optimum.operands[0].start == pytest.approx(pachon.FocalLength(0.1).measure(start), rel=1e-12)
     assert found.summary()["glasses"] == found.glasses
     with pytest.raises(UnknownNameError, match=r"N-FK5.*N-BAK4"):
         pachon.choose_glasses(start, ACHROMAT, ["N-FK5"], **how)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import pachon
+from pachon.design.optimize.before_after import with_fields
 from pachon.design.optimize.merit import Beams, SpotMerit, WavefrontMerit
 from pachon.models.io.prescription import load_telescope
 from pachon.studies.metrics.telescope import TelescopeScene, spots, throughput
@@ -73,3 +74,18 @@ def test_parts_of_a_request_keep_their_weights(lens):
     assert request.field_weights == pytest.approx(WEIGHTS)
     assert request.at_fields(slice(1, 3)).field_weights == pytest.approx([0.0, 1.0])
     assert request.at_fields(request.fields).field_weights == pytest.approx(np.full(3, 1 / 3))
+
+
+def test_pictures_before_and_after_have_the_vignetting_factors_of_the_file():
+    """Some of the fields of a merit, each with its own factors: the spots that `pachon spots` has."""
+    lens = pachon.triplet(diameter=0.01, f_number=5.0)
+    rows = ((0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.1, 0.0, 0.3, 0.0), (0.0, 0.2, 0.1, 0.4, 0.0))
+    lens = lens.with_design(fields=((0.0, 0.0), (0.0, 0.1), (0.0, 0.2)), field_weights=(), vignetting=rows)
+    whole = pachon.spots(lens, sampling="rings", n_pupil=4)
+    found = pachon.optimize(lens, [f"{lens.surfaces[-1].name}.dz"], n_pupil=2, max_steps=2)
+    some, none = with_fields(lens, found.fields[0][1:], found.vignetting[0][1:])
+    assert none is None
+    drawn = pachon.spots(some, sampling="rings", n_pupil=4)
+    assert drawn.rms_radius == pytest.approx(whole.rms_radius[1:], rel=1e-12)
+    plain = pachon.spots(lens, found.fields[0][1:], sampling="rings", n_pupil=4)
+    assert (np.abs(drawn.rms_radius / plain.rms_radius - 1.0) > 0.05).all()

@@ -6,7 +6,7 @@ import pytest
 import pachon
 from pachon.core.errors import PachonError
 from pachon.design.optimize.optimize import optimize
-from pachon.design.optimize.optimize_file import load_optimization, optimization_arguments
+from pachon.design.optimize.optimize_file import OptimizeFile, catalogue_of, load_optimization, optimization_arguments
 
 LENS = "tests/data/zmx/lens1.zmx"
 
@@ -115,3 +115,24 @@ def test_wrong_files(arguments, tmp_path, text, words):
         arguments(text)
     assert str(caught.value).startswith(str(tmp_path / "opt.yaml"))
     assert "\n" not in str(caught.value)
+
+
+def test_the_catalogue_of_glasses(tmp_path):
+    """A maker, or a file beside that of the optimisation; by default that of common glasses."""
+    path = tmp_path / "opt.yaml"
+    (tmp_path / "own.agf").write_text("NM OWN 2 0 1.5 60 0\nCD 1.0 0.01 0.2 0.02 1.0 100.0\n")
+
+    def catalogue(**content):
+        file = OptimizeFile.model_validate({"variables": ["S1.radius"], "glasses": ["N-BK7"], **content})
+        return catalogue_of(file, path)
+
+    assert catalogue() is None
+    assert "S-BSL7" in catalogue(glass_catalogue="ohara")
+    assert list(catalogue(glass_catalogue="own.agf")) == ["OWN"]
+    for content, words in (
+        ({"glass_catalogue": "oharra"}, "opt.yaml: glass_catalogue: unknown glass maker 'oharra'"),
+        ({"glass_catalogue": "none.agf"}, "none.agf: no such file"),
+        ({"glass_catalogue": "ohara", "glasses": []}, "opt.yaml: glass_catalogue = 'ohara': expected glasses that"),
+    ):
+        with pytest.raises(pachon.PachonError, match=words):
+            catalogue(**content)

@@ -14,7 +14,7 @@ from pachon.models.io.prescription import load_telescope, save_telescope
 DATA = Path(__file__).parents[2] / "data" / "zmx"
 FILES = sorted(DATA.glob("*.zmx"))
 #: Files whose stop is off the axis, which is not written.
-FOLDED = ("HoO-V2C18Ex46", "simple_fold_mirror_up", "zmax_37992")
+FOLDED = ("HoO-V2C18Ex46",)
 
 LENS = """MODE SEQ
 UNIT CM X W X CM MR CPMM
@@ -136,12 +136,56 @@ def test_a_pupil_of_another_origin_is_written_as_a_plane(tmp_path):
     from dataclasses import replace
 
     telescope = lens(tmp_path)
-    other = replace(telescope, stop_z=telescope.stop_z + 0.01)
+    other = replace(telescope, stop_z=telescope.stop_z + 0.01).with_design(aiming="off")
     save_telescope(other, tmp_path / "again.zmx")
     again = load_telescope(tmp_path / "again.zmx")
     assert again.stop_z == pytest.approx(other.stop_z, abs=1e-16)
     assert (again.design_data.stop, again.design_data.aiming) == (None, "off")
     assert again.design_data.fields == other.design_data.fields
+
+
+def rays_of(telescope, field):
+    """Landing points of a few rays that the telescope's own design data launch; NaN where none arrives."""
+    rim = np.array([[0.0, 0.0], [0.9, 0.0], [0.0, 0.9], [-0.5, 0.4]]) * 0.5 * telescope.pupil_diameter
+    rays = pachon.launch_rays(telescope, field, telescope.default_wavelength, rim.T)
+    return pachon.trace(telescope, rays).position[:, :2]
+
+
+@pytest.mark.parametrize("ending", ["zmx", "json"])
+@pytest.mark.parametrize("aperture", ["ENPD 2", "FNUM 3 0", "FLOA"])
+def test_a_changed_lens_whose_rays_are_aimed_keeps_stop_and_aiming(tmp_path, aperture, ending):
+    """A change moves the image of the stop and makes the focal ratio untrue; the rays of the file are the same."""
+    telescope = pachon.apply_changes(
+        lens(tmp_path, aperture=aperture).with_design(vignetting=(), aiming="real"),
+        {"front.radius_mm": 20.0, "front.n": 0.03, "front.abbe": -4.0},
+    )
+    with pytest.warns(pachon.PrescriptionWarning, match="a formula is fitted, within"):
+        save_telescope(telescope, tmp_path / f"again.{ending}")
+    again = load_telescope(tmp_path / f"again.{ending}")
+    assert (again.design_data.stop, again.design_data.aiming) == ("iris", "real")
+    for field in telescope.design_data.fields:
+        assert np.allclose(rays_of(again, field), rays_of(telescope, field), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("ending", ["zmx", "seq", "json"])
+def test_an_aimed_stop_off_the_axis_is_kept(tmp_path, ending):
+    """The middle of the stop fixes the chief rays, not the paraxial pupil, which tilted surfaces have not."""
+    aiming = "paraxial" if ending == "seq" else "real"
+    telescope = lens(tmp_path).with_design(vignetting=(), aiming=aiming)
+    tilted = telescope.perturbed("front", shift=(1e-4, 2e-4, 0.0), tilt=(1e-3, 2e-3, 0.0))
+    tilted = tilted.perturbed("iris", shift=(3e-4, -2e-4, 0.0))
+    save_telescope(tilted, tmp_path / f"again.{ending}")
+    again = load_telescope(tmp_path / f"again.{ending}")
+    assert (again.design_data.stop, again.design_data.aiming) == ("iris", aiming)
+    for field in telescope.design_data.fields:
+        assert np.allclose(rays_of(again, field), rays_of(tilted, field), rtol=0, atol=1e-13)
+        assert not np.allclose(rays_of(again, field), rays_of(telescope, field), rtol=0, atol=1e-5)
+
+
+def test_an_aimed_stop_that_cannot_be_written_is_a_warning(tmp_path):
+    telescope = lens(tmp_path, kind=1, distance="100").perturbed("front", shift=(1e-4, 0.0, 0.0))
+    with pytest.warns(pachon.PrescriptionWarning, match="stop = iris, aiming = real: .* rays are not aimed"):
+        save_telescope(telescope.with_design(aiming="real"), tmp_path / "again.zmx")
 
 
 def test_codev_files_keep_fields_and_wavelengths(tmp_path):

@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from pachon.core.errors import PrescriptionError
+from pachon.core.errors import PrescriptionError, PrescriptionWarning
 from pachon.models.aperture import Circle, Intersection, Polygon
 from pachon.models.io.glass_catalogue import GlassCatalogue
 from pachon.models.io.prescription import load_telescope, save_telescope
@@ -103,14 +104,27 @@ def test_what_a_zemax_file_cannot_hold_is_one_line(tmp_path, lsst, changes, expe
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    "glass",
-    [TabulatedIndex((3e-7, 1.2e-6), (1.47, 1.45)), Sellmeier((0.1,) * 6, (0.01,) * 6)],
-    ids=["table", "six Sellmeier terms"],
-)
-def test_glasses_without_a_formula_of_zemax_are_refused(tmp_path, lsst, glass):
+SMOOTH = Sellmeier((0.1, 0.2, 0.3, 0.4, 0.05, 0.01), (0.001, 0.003, 0.005, 0.008, 0.01, 90.0))
+ROUGH = TabulatedIndex((3e-7, 5e-7, 5.5e-7, 6e-7, 1.2e-6), (1.47, 1.465, 1.464, 1.459, 1.45))
+
+
+def test_a_glass_without_a_formula_of_zemax_is_fitted(tmp_path, lsst):
+    """Six terms of Sellmeier's formula, of which Zemax has five at most: as smooth as any glass."""
+    with pytest.warns(PrescriptionWarning, match="a formula is fitted, within [0-9]e-1[0-9] of its index"):
+        save_telescope(with_glass(lsst, SMOOTH), tmp_path / "a.zmx")
+    again = load_telescope(tmp_path / "a.zmx").surface("L1_entrance").medium_after
+    w = np.linspace(*lsst.band, 50)
+    assert np.abs(again.index(w) - SMOOTH.index(w)).max() < 1e-10
+
+
+def test_a_glass_that_no_formula_is_near_is_refused(tmp_path, lsst):
+    """A table with an edge: a smooth formula is far from it, and said to be so where lenient."""
     with pytest.raises(PrescriptionError, match="none of the dispersion formulas"):
-        save_telescope(with_glass(lsst, glass), tmp_path / "a.zmx")
+        save_telescope(with_glass(lsst, ROUGH), tmp_path / "a.zmx")
+    with pytest.warns(PrescriptionWarning, match="a formula is fitted, within 0.000[0-9]+ of its index"):
+        save_telescope(with_glass(lsst, ROUGH), tmp_path / "a.zmx", lenient=True)
+    again = load_telescope(tmp_path / "a.zmx").surface("L1_entrance").medium_after
+    assert np.abs(again.index(lsst.band) - ROUGH.index(lsst.band)).max() < 1e-3
 
 
 def test_a_telescope_without_a_detector_is_refused(tmp_path, lsst):

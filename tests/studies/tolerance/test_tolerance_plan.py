@@ -166,7 +166,7 @@ def test_named_degrees_of_freedom(lsst_r):
     [
         ({}, ConfigError, "tolerances = \\[\\]"),
         ({"tolerances": [{"name": "S9.dz_um", "size": 1}]}, UnknownNameError, r"tolerances.0.*S9"),
-        ({"tolerances": [{"name": "S1.dz", "size": 1}]}, ConfigError, r"tolerances.S1.dz.*unit"),
+        ({"tolerances": [{"name": "S1.dz", "size": 1}]}, ConfigError, r"tolerances.0.S1.dz: .*unit"),
         ({"tolerances": [{"name": "S1.wedge_arcmin", "size": 1}]}, UnknownNameError, r"wedge.*L1"),
         ({"tolerances": [{"name": "Image.irregularity_nm", "size": 1}]}, ConfigError, "clear aperture"),
         ({"tolerances": [{"name": "S1.irregularity_nm", "size": 1, "zernikes": [9, 5]}]}, ConfigError, "rise, from 4"),
@@ -232,3 +232,12 @@ def test_what_follows_other_values_has_no_tolerance_of_its_own(triplet):
     names = [{t.name for t in plan_of(one, **content).tolerances} for one in (triplet, linked)]
     assert names[0] - names[1] == {"S7.radius_percent", "S6.n", "S4.thickness_um"}
     assert names[1] < names[0]
+
+
+def test_a_quantity_in_another_unit_is_the_same_one(triplet):
+    """Of the list it replaces that of all surfaces; twice in the list it is refused."""
+    plan = plan_of(triplet, surfaces={"radius_percent": 0.1}, tolerances=[{"name": "S3.radius_um", "size": 5}])
+    assert [t.name for t in plan.tolerances if t.name.startswith("S3.")] == ["S3.radius_um"]
+    names = [{"name": f"S3.radius_{unit}", "size": 1} for unit in ("mm", "percent")]
+    with pytest.raises(ConfigError, match=r"tolerances\.1\.S3\.radius_percent is S3.radius_mm once more"):
+        plan_of(triplet, tolerances=names)
