@@ -224,8 +224,8 @@ from .pipeline.measure.shapes import measure_shapes as measure_shapes
 from .pipeline.measure.star_catalogue import load_stars as load_stars
 from .pipeline.measure.star_selection import StarFlag as StarFlag
 from .pipeline.measure.star_selection import flag_stars as flag_stars
-from .pipeline.own_stars.own_stars import OwnStars as OwnStars
 from .pipeline.own_stars.own_stars import fit_own_stars as fit_own_stars
+from .pipeline.own_stars.result import OwnStars as OwnStars
 from .pipeline.piff.comparison import PiffComparison as PiffComparison
 from .pipeline.piff.comparison import compare_with_piff as compare_with_piff
 from .pipeline.piff.psf import PiffPsf as PiffPsf
@@ -273,7 +273,7 @@ from .studies.sweep.sweep import run_sweep as run_sweep
 from .studies.sweep.table import SweepTable as SweepTable
 from .studies.sweep.table import load_sweep_table as load_sweep_table
 from .studies.tolerance.file import load_tolerances as load_tolerances
-from .studies.tolerance.study import ToleranceStudy as ToleranceStudy
+from .studies.tolerance.result import ToleranceStudy as ToleranceStudy
 from .studies.tolerance.study import run_tolerances as run_tolerances
 from .studies.validation import Validation as Validation
 from .studies.validation import file_schema as file_schema
