@@ -142,6 +142,8 @@ from .models.fringe_zernikes import fringe_from_noll as fringe_from_noll
 from .models.fringe_zernikes import fringe_zernikes as fringe_zernikes
 from .models.fringe_zernikes import noll_from_fringe as noll_from_fringe
 from .models.io.glass_catalogue import GlassCatalogue as GlassCatalogue
+from .models.io.grid_file import read_grid as read_grid
+from .models.io.hdf5_map import read_hdf5_map as read_hdf5_map
 from .models.io.heights.zernike_table import corner_sensors as corner_sensors
 from .models.io.prescription import load_telescope as load_telescope
 from .models.io.prescription import save_telescope as save_telescope

@@ -108,7 +108,7 @@ class Rays(Result):
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw where the rays start, in x and y of the telescope."""
-        return draw_points(ax, *self.position[:, :2].T, ("x [m]", "y [m]"), equal=True)
+        return draw_points(ax, self.position[:, 0], self.position[:, 1], ("x [m]", "y [m]"), equal=True)
 
     def _label(self) -> str:
         return f"{len(self)} rays, {self.wavelength * 1e9:.5g} nm"

@@ -84,11 +84,10 @@ class StarSelection(Result):
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw the places of the selected stars, coloured by the logarithm of their S/N."""
-        snr, title = np.log10(self.snr), f"{len(self)} stars, half-light radius {self.half_light_radius:.3g} pixel"
-        labels = "x [pixel]", "y [pixel]"
-        return draw_points(
-            ax, *self.positions.T, labels, color=snr, color_label="log10 of S/N", equal=True, title=title
-        )
+        title = f"{len(self)} stars, half-light radius {self.half_light_radius:.3g} pixel"
+        x, y = self.positions.T
+        color = {"color": np.log10(self.snr), "color_label": "log10 of S/N"}
+        return draw_points(ax, x, y, ("x [pixel]", "y [pixel]"), **color, equal=True, title=title)
 
     def __len__(self) -> int:
         return len(self.index)

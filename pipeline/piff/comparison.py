@@ -14,7 +14,6 @@ from scipy.spatial import cKDTree
 
 from ...core.arguments import check_arguments
 from ...core.files import make_folder, write_bytes, write_json
-from ...core.plotting import png_bytes
 from ...core.products import Columns, described_table, write_ecsv
 from ...core.result import Result
 from ...core.table_files import write_table
@@ -26,7 +25,7 @@ from ..own_stars.own_stars import FEWEST_STARS, fit_own_stars
 from ..own_stars.result import OwnStars, part_of, star_rho_statistics
 from ..psf_model.polynomial import as_positions
 from ..report.diagnostics import correlation_columns
-from ..report.statistics_plots import draw_rho
+from ..report.statistics_plots import draw_rho, rho_plot
 from .psf import PiffPsf
 
 if TYPE_CHECKING:
@@ -79,14 +78,14 @@ class PiffComparison(Result):
         }
 
     @check_arguments
-    def write(self, folder: Path) -> tuple[str, ...]:
+    def write_folder(self, folder: Path) -> tuple[str, ...]:
         """Write the tables, a picture of the rho statistics and all metrics into a folder; return their names."""
         make_folder(folder)
         each = {f"{name}: {key}": c for name, rho in self.rho.items() for key, c in rho.items()}
         for name, table in (("stars.ecsv", self.stars), ("models.ecsv", self.models)):
             write_table(folder / name, table)
         write_ecsv(folder / "rho.ecsv", correlation_columns(each), {"what": "rho statistics 1 to 5"})
-        write_bytes(folder / "rho.png", png_bytes(self.plot()))
+        write_bytes(folder / "rho.png", rho_plot(self.rho))
         write_json(folder / "comparison.json", self.as_dict())
         return ("stars.ecsv", "models.ecsv", "rho.ecsv", "rho.png", "comparison.json")
 
