@@ -103,7 +103,7 @@ def _compare(
     folder = stars.with_name(f"{stars.stem}_piff") if out is None else out
     with interruptible(quiet) as reporter, reporter.stage(f"PSF of {stars.name}"):
         found = compare_with_piff(load_piff(piff), *load_stars(stars, **columns), **options)
-        found.write(folder)
+        found.write_folder(folder)
     if as_json:
         print_json(found.as_dict())
     elif not quiet:

@@ -46,11 +46,11 @@ def model_command(
     - `pachon model stars.ecsv --images stamps.fits --x X --y Y -o psf.fits`
     """
     from ..core.files import write_bytes
+    from ..core.plotting import png_bytes
     from ..core.table_files import write_table
     from ..core.units import ARCSEC
     from ..pipeline.measure.star_catalogue import load_stars
     from ..pipeline.own_stars.own_stars import fit_own_stars
-    from ..pipeline.own_stars.plots import own_stars_picture
 
     path = stars.with_name(f"{stars.stem}_psf.fits") if out is None else out
     with interruptible(quiet) as reporter, reporter.stage(f"PSF of {stars.name}"):
@@ -64,7 +64,7 @@ def model_command(
             background=background,
         )
         own.model.write(path)
-        write_bytes(path.with_suffix(".png"), own_stars_picture(own, stars.name))
+        write_bytes(path.with_suffix(".png"), png_bytes(own.plot(stars.name)))
         write_table(path.with_suffix(".ecsv"), own.table())
     found = own.summary()
     if as_json:
@@ -76,7 +76,7 @@ def model_command(
             ("stars, used", f"{found['stars']}, {found['used']}"),
             ("flagged", flagged or "none"),
             ("S/N, median", f"{found['median_snr']:.0f}"),
-            ("FWHM", f"{found['fwhm_arcsec']:.3g} arcsec"),
+            (f"FWHM, pixels of {pixel_arcsec:.4g} arcsec", f"{found['fwhm_arcsec']:.3g} arcsec"),
             ("rms of e of the stars", f"{100 * found['rms_e']:.2f} %"),
             ("... less the model, held out", f"{100 * found['rms_e_held_out']:.2f} %"),
             ("... of which noise of the stars", f"{100 * found['rms_e_noise']:.2f} %"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy.io import fits
@@ -13,9 +13,15 @@ from astropy.wcs import WCS
 from ..core.arguments import check_arguments
 from ..core.docstrings import Description
 from ..core.errors import ProductError
+from ..core.plotting import axes_at, plain_text, styled
 from ..core.products import Columns, Stamp, column, read_fits, table_hdu, write_fits
 from ..core.result import Result
 from .exposure import MASK_BITS
+from .stretch import draw_image
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Columns of the table of objects: unit and description.
 OBJECT_COLUMNS = {
@@ -67,6 +73,17 @@ class CcdImage(Result):
     objects: dict[str, np.ndarray] = field(default_factory=dict)
     stamp: Stamp | None = None
     mask_bits: dict[int, str] = field(default_factory=MASK_BITS.copy)
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the image, binned to about a thousand pixels, with an asinh stretch, and where north and east are."""
+        with styled():
+            figure, axes = axes_at(ax, 7.0, 6.6)
+            draw_image(axes, self.image, self.variance, self.header)
+            words = [self.name]
+            if "FILTER" in self.header:
+                words += [f"{self.header['FILTER']} band", f"{self.header['EXPTIME']:g} s"]
+            axes.set_title(plain_text(", ".join(words)), loc="left")
+            return figure
 
     def _label(self) -> str:
         ny, nx = self.image.shape

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from astropy import units as u
@@ -11,6 +11,7 @@ from astropy.table import QTable, Table
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError
+from ..core.plotting import BLUE, ORANGE, axes_at, styled
 from ..core.products import described_table
 from ..core.result import Result
 from ..core.units import ARCMIN
@@ -24,6 +25,10 @@ from ..pipeline.focal_plane_psf.model import FocalPlanePsf
 from ..pipeline.psf_model.model import PsfModel
 from .image_file import CcdImage
 from .image_stars import fit_image_psf, objects_and_stars, pixels_of_ccd
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Largest distance of a detected object from a true one [pixel].
 _MATCH = 3.0
@@ -58,6 +63,18 @@ class ImageCatalogue(Result):
     galaxies: np.ndarray
     fits: GalaxyFits
     usable: np.ndarray
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw half-light radius against magnitude, selected stars in another colour."""
+        magnitude, radius = self.objects.magnitude(self.image.header["ZEROPNT"]), self.objects.half_light_radius
+        stars = self.stars.index
+        with styled():
+            figure, axes = axes_at(ax, 5.4, 4.2)
+            axes.plot(magnitude, radius, ".", color=BLUE, markersize=3, label="all objects")
+            axes.plot(magnitude[stars], radius[stars], ".", color=ORANGE, markersize=5, label="selected stars")
+            axes.set(xlabel="magnitude", ylabel="half-light radius [pixel]")
+            axes.legend(loc="upper left")
+            return figure
 
     def _label(self) -> str:
         count, stars = len(self.objects), len(self.stars)

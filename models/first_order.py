@@ -15,18 +15,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
+from ..core.plotting import BLUE, RED, axes_at, styled
+from ..core.point_plots import draw_bars
 from ..core.result import Result, Values
 from ..core.units import ARCSEC, length, metres
 from .paraxial import curvatures_across, require_on_axis
 from .surface import Interaction, Surface
 from .telescope import Telescope
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -80,6 +86,25 @@ class FirstOrder(Values):
     magnification: float
     working_f_number: float
 
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw pupils and paraxial focus along the axis, in the telescope frame."""
+        pupils = {
+            "entrance pupil": (self.entrance_pupil_z, self.entrance_pupil_diameter),
+            "exit pupil": (self.exit_pupil_z, self.exit_pupil_diameter),
+        }
+        with styled():
+            figure, axes = axes_at(ax, 6.4, 3.4)
+            for (name, (z, diameter)), style in zip(pupils.items(), ("-", "--"), strict=True):
+                if math.isfinite(z) and math.isfinite(diameter):
+                    half = 0.5 * abs(diameter)
+                    axes.plot([z, z], [-half, half], style, color=BLUE, linewidth=2.0, label=name)
+            if math.isfinite(self.image_z):
+                axes.plot(self.image_z, 0.0, "x", color=RED, label="paraxial focus")
+            axes.axhline(0.0, color="0.6", linewidth=0.6)
+            axes.set(xlabel="z [m]", ylabel="distance from the axis [m]")
+            axes.legend()
+            return figure
+
     @property
     def arcsec_per_um(self) -> float:
         """Plate scale in arc seconds for each micrometre."""
@@ -105,6 +130,11 @@ class SeidelSums(Result):
 
     names: tuple[str, ...]
     contributions: np.ndarray
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the five sums of the telescope as bars."""
+        names = ["spherical", "coma", "astigmatism", "Petzval", "distortion"]
+        return draw_bars(ax, names, 1e6 * self.total, "Seidel sum [um]")
 
     @property
     def total(self) -> np.ndarray:

@@ -143,6 +143,8 @@ from .models.fringe_zernikes import fringe_from_noll as fringe_from_noll
 from .models.fringe_zernikes import fringe_zernikes as fringe_zernikes
 from .models.fringe_zernikes import noll_from_fringe as noll_from_fringe
 from .models.io.glass_catalogue import GlassCatalogue as GlassCatalogue
+from .models.io.grid_file import read_grid as read_grid
+from .models.io.hdf5_map import read_hdf5_map as read_hdf5_map
 from .models.io.heights.zernike_table import corner_sensors as corner_sensors
 from .models.io.prescription import load_telescope as load_telescope
 from .models.io.prescription import save_telescope as save_telescope
@@ -225,8 +227,8 @@ from .pipeline.measure.shapes import measure_shapes as measure_shapes
 from .pipeline.measure.star_catalogue import load_stars as load_stars
 from .pipeline.measure.star_selection import StarFlag as StarFlag
 from .pipeline.measure.star_selection import flag_stars as flag_stars
-from .pipeline.own_stars.own_stars import OwnStars as OwnStars
 from .pipeline.own_stars.own_stars import fit_own_stars as fit_own_stars
+from .pipeline.own_stars.result import OwnStars as OwnStars
 from .pipeline.piff.comparison import PiffComparison as PiffComparison
 from .pipeline.piff.comparison import compare_with_piff as compare_with_piff
 from .pipeline.piff.psf import PiffPsf as PiffPsf
@@ -274,7 +276,7 @@ from .studies.sweep.sweep import run_sweep as run_sweep
 from .studies.sweep.table import SweepTable as SweepTable
 from .studies.sweep.table import load_sweep_table as load_sweep_table
 from .studies.tolerance.file import load_tolerances as load_tolerances
-from .studies.tolerance.study import ToleranceStudy as ToleranceStudy
+from .studies.tolerance.result import ToleranceStudy as ToleranceStudy
 from .studies.tolerance.study import run_tolerances as run_tolerances
 from .studies.validation import Validation as Validation
 from .studies.validation import file_schema as file_schema

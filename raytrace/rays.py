@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,10 +12,15 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.buffers import empty
 from ..core.errors import ConfigError, DomainError
+from ..core.point_plots import draw_points
 from ..core.result import Result
 from ..core.units import broadcast_together, metres, radians
 from ..models.telescope import Telescope
 from .kernels import surface as surface_kernels
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 class RayStatus(IntEnum):
@@ -100,6 +105,10 @@ class Rays(Result):
     direction: np.ndarray
     path_length: np.ndarray
     wavelength: float
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw where the rays start, in x and y of the telescope."""
+        return draw_points(ax, self.position[:, 0], self.position[:, 1], ("x [m]", "y [m]"), equal=True)
 
     def _label(self) -> str:
         return f"{len(self)} rays, {self.wavelength * 1e9:.5g} nm"

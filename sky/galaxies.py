@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -13,11 +13,16 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, shown
 from ..core.launch import launch, start_warp
+from ..core.point_plots import draw_points
 from ..core.result import Result
-from ..core.units import broadcast_together, for_each, pure_numbers, radians
+from ..core.units import ARCMIN, broadcast_together, for_each, pure_numbers, radians
 from ..core.warp_arrays import warp_array
 from .galaxy_kernels import transform_galaxies
 from .sersic import GREATEST_INDEX, LEAST_INDEX, sersic_table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _PER_GALAXY = ("xi", "eta", "magnitude", "radius")
 _PER_COMPONENT = ("dx", "dy", "fraction", "component_radius", "e1", "e2", "sersic")
@@ -96,6 +101,11 @@ class Galaxies(Result):
             raise DomainError(f"sersic: expected {LEAST_INDEX} to {GREATEST_INDEX}")
         if n and np.any(np.abs(np.add.reduceat(self.fraction, self.first[:-1]) - 1.0) > 1e-6):
             raise DomainError("fraction: expected the sum 1 in every galaxy")
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the places, east to the right, coloured by magnitude."""
+        labels, xi, eta = ("xi [arcmin]", "eta [arcmin]"), self.xi / ARCMIN, self.eta / ARCMIN
+        return draw_points(ax, xi, eta, labels, color=self.magnitude, color_label="magnitude", equal=True)
 
     @classmethod
     def single(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -16,6 +16,7 @@ from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.launch import launch, start_warp
 from ..core.memory import require_bytes
+from ..core.point_plots import draw_points
 from ..core.result import Result
 from ..core.threads import one_blas_thread
 from ..core.units import ARCMIN, ARCSEC, for_each, positive_angle, radians, require_positive
@@ -24,6 +25,10 @@ from .cells import SIDE, Cell, Region, poisson_arrivals
 from .cutouts import Cutouts, cut_galaxies, read_mosaic
 from .galaxies import grid_arguments, reduced_shear
 from .stamp_kernels import transform_stamps
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Steps of the tables: so many in the frequency that has one cycle over a stamp.
 OVERSAMPLING = 8
@@ -67,6 +72,10 @@ class GalaxyStamps(Result):
     psf_radius: float
     surface_density: float
     finest_pixel: float
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw half-light radius against magnitude."""
+        return draw_points(ax, self.magnitude, self.radius / ARCSEC, ("magnitude", "half-light radius [arcsec]"))
 
     @classmethod
     @check_arguments

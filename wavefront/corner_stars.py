@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
+from ..core.point_plots import draw_points
 from ..core.result import Result
 from ..core.units import length, require_count
 from ..models.camera.corner_rafts import corner_focal_plane
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from .chief_rays import fields_at
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Least distance of stars from the rims of a sensor [m]: donuts are 0.6 mm wide to either side.
 _MARGIN = 2e-3
@@ -44,6 +50,12 @@ class CornerStars(Result):
     sensors: tuple[str, ...]
     positions: np.ndarray
     fields: np.ndarray
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the places of the stars, coloured by the heights of the sensors there."""
+        x, y = 1e3 * self.positions.T
+        labels, height = ("x [mm]", "y [mm]"), 1e3 * self.heights
+        return draw_points(ax, x, y, labels, color=height, color_label="height [mm]", equal=True)
 
     def __len__(self) -> int:
         return len(self.sensors)

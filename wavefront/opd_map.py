@@ -145,6 +145,22 @@ class OpdMaps(_PupilMaps):
     fields: np.ndarray
     centers: np.ndarray
 
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the maps of the first six field points on one scale."""
+        count = min(len(self), 6)
+        edge = max(float(np.nanmax(np.abs(self.value[:count]), initial=0.0)) * 1e9, 1e-6)
+        with styled():
+            figure = figure_at(ax, 2.4 * count + 1.0, 3.0)
+            panels = figure.subplots(1, count, squeeze=False)[0]
+            for axes, value, field in zip(panels, self.value, np.rad2deg(self.fields), strict=False):
+                points = (np.ravel(v) for v in np.broadcast_arrays(self.x, self.y, 1e9 * value))
+                x, y, nm = (v[np.isfinite(np.ravel(value))] for v in points)
+                shown = axes.scatter(x, y, c=nm, s=4, cmap="RdBu_r", vmin=-edge, vmax=edge, linewidths=0)
+                axes.set(aspect="equal", xlabel="pupil x [m]", title=f"({field[0]:.3g}, {field[1]:.3g})°")
+            panels[0].set_ylabel("pupil y [m]")
+            figure.colorbar(shown, ax=list(panels), label="OPD [nm]")
+            return figure
+
     def __len__(self) -> int:
         return len(self.fields)
 

@@ -143,10 +143,12 @@ class ChromaticFocus(Analysis):
         nm = self.wavelengths * 1e9
         for k, (zone, color) in enumerate(zip(self.zones, (BLUE, ORANGE, RED, GREY) * 9, strict=False)):
             label = f"zone {zone:g}" if zone else "paraxial"
-            axes.plot(self.shift[:, k] * scale, nm, color=color, label=label)
+            axes.plot(self.shift[:, k] * scale, nm, "-" if np.ptp(nm) else "o", color=color, label=label)
         axes.axvspan(-self.depth * scale, self.depth * scale, color="0.92", label="depth of focus")
         axes.axvline(0.0, color="0.5", linewidth=0.7)
-        finish_axes(axes, ylim=(nm.min(), nm.max()), xlabel=f"focal shift [{unit}]", ylabel="wavelength [nm]")
+        # A single wavelength has no range.
+        limits = {"ylim": (nm.min(), nm.max())} if np.ptp(nm) else {}
+        finish_axes(axes, **limits, xlabel=f"focal shift [{unit}]", ylabel="wavelength [nm]")
         axes.legend()
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, PachonError, check_unique, unknown_name
+from ...core.result import Result
 from ...core.units import require_count
 from ...models.io.glass_catalogue import GlassCatalogue
 from ...models.media.medium import LINE_D, Medium, abbe_number
@@ -19,6 +20,7 @@ from .optimize import optimize
 from .optimum import Optimum
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 #: End of the name of a glass while its index and Abbe number are variables.
@@ -45,7 +47,7 @@ class GlassTrial:
 
 
 @dataclass(frozen=True)
-class GlassChoice:
+class GlassChoice(Result):
     """Telescope with glasses from a catalogue.
 
     Attributes
@@ -60,17 +62,25 @@ class GlassChoice:
         All glasses that were tried.
     """
 
+    _row_type = GlassTrial
+
     optimum: Optimum
     model: Optimum
     glasses: dict[str, str]
     trials: tuple[GlassTrial, ...]
 
-    def plot(self) -> Figure:
-        """Draw the optimum; see :meth:`Optimum.plot`."""
-        return self.optimum.plot()
+    def _columns(self) -> dict[str, Any]:
+        return {name: [getattr(t, name) for t in self.trials] for name in ("glass", "name", "rms")}
 
-    def summary(self) -> dict[str, Any]:
-        """Return the results by name and unit."""
+    def _label(self) -> str:
+        chosen = ", ".join(f"{old} -> {new}" for old, new in self.glasses.items())
+        return f"{chosen or 'no glasses'}; {len(self.trials)} tried"
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the optimum; see :meth:`Optimum.plot`."""
+        return self.optimum.plot(ax)
+
+    def _summary(self) -> dict[str, Any]:
         trials = [{"glass": t.glass, "name": t.name, "rms_m": t.rms} for t in self.trials]
         model = {"rms_of_model_glasses_m": self.model.history[-1]}
         return {**self.optimum.summary(), "glasses": self.glasses, **model, "glass_trials": trials}

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.result import Values
+
 
 @dataclass(frozen=True)
-class Yield:
+class Yield(Values):
     """Fraction of telescopes that meet a requirement.
 
     Attributes

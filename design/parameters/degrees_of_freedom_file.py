@@ -12,7 +12,9 @@
       - {name: M1M3_B1, unit: um, of: {M1M3.Z5: 1.0, M1M3.Z12: -0.1}}
       - {name: M2_B1, unit: um, of: M2_bending.B1}
 
-Radii are in metres; a file of a grid is FITS (:mod:`~pachon.models.io.grid_file`), its path relative to this file. `of`
+Radii are in metres; a file of a grid is FITS (:mod:`~pachon.models.io.grid_file`), its path relative to this file.
+Maps in HDF5 files (:func:`~pachon.read_hdf5_map`) stand under ``hdf5`` in place of ``grids``:
+``{M1: {file: m1.h5, half_width: 4.18, unit: 0.5e-6, quarter_turns: -1}}``. `of`
 is an address, or several with the change of each by one of the degree of freedom: the address's SI unit per SI unit. An
 address that begins with the name of a deformation (`figures`) is a term of it. The file ``bend.yaml`` of batoid_rubin's
 bending modes (:mod:`~.bending_folder`) may stand in place of such a file.
@@ -32,7 +34,9 @@ from ...core.schema import Section, checked, expected, mapping, problem, validat
 from ...core.yaml_reader import as_number, read_mapping
 from ...models.io.bundled import DATA
 from ...models.io.grid_file import read_grid
+from ...models.io.hdf5_map import read_hdf5_map
 from ...models.io.yaml.values import ROWS, Names, Number, PositiveNumber, Text
+from ...models.shapes.grid import GridSag
 from ...models.shapes.modes import GridModes
 from ...models.shapes.polynomial import ZernikeSag
 from ...models.shapes.shape import Shape
@@ -89,6 +93,11 @@ def _highest_term(value: Any) -> int | None:
     return int(number) if number is not None and number % 1 == 0 and 0 < number <= 500 else None
 
 
+def _quarter_turns(value: Any) -> int | None:
+    number = as_number(value)
+    return int(number) if number is not None and number % 1 == 0 and abs(number) <= 3 else None
+
+
 def _without_dots(value: Any) -> Any:
     for name in value if isinstance(value, dict) else ():
         if "." in name:
@@ -112,19 +121,40 @@ class ZernikeSection(Section):
     terms: Annotated[int, checked(_highest_term, "the highest Noll index, a whole number up to 500")]
 
 
+class Hdf5MapSection(Section):
+    """Map in an HDF5 file, which says neither where its nodes are nor its unit."""
+
+    file: Text
+    half_width: PositiveNumber
+    unit: PositiveNumber
+    dataset: Text | None = None
+    quarter_turns: Annotated[int, checked(_quarter_turns, "a whole number from -3 to 3")] = 0
+
+    def map(self, folder: Path) -> GridSag:
+        """Return the map; the path of its file starts from the folder."""
+        return read_hdf5_map(
+            folder / self.file,
+            self.half_width,
+            unit=self.unit,
+            dataset=self.dataset,
+            quarter_turns=self.quarter_turns,
+        )
+
+
 class DeformationSection(Section):
-    """Deformations of surfaces: Zernike polynomials, or grids of sag in FITS files by the name of the mode."""
+    """Deformations of surfaces: Zernike polynomials, or maps of sag in files by the name of the mode."""
 
     surfaces: Names
     zernike: Annotated[ZernikeSection | None, mapping] = None
     grids: Annotated[dict[str, Text] | None, checked(lambda v: v or None, "names of modes with their FITS files")] = (
         None
     )
+    hdf5: Annotated[dict[str, Hdf5MapSection] | None, checked(lambda v: v or None, "modes with their maps")] = None
 
     @classmethod
     def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
-        if ("zernike" in content) == ("grids" in content):
-            raise problem(": expected either zernike or grids")
+        if sum(key in content for key in ("zernike", "grids", "hdf5")) != 1:
+            raise problem(": expected one of zernike, grids, hdf5")
 
     def shape(self, folder: Path) -> Shape:
         """Return the deformation; paths of files start from the folder."""
@@ -132,6 +162,9 @@ class DeformationSection(Section):
             with error_context(key="zernike"):
                 rims = self.zernike
                 return ZernikeSag((0.0,) * rims.terms, rims.outer_radius, rims.inner_radius)
+        if self.hdf5 is not None:
+            with error_context(key="hdf5"):
+                return GridModes({mode: one.map(folder) for mode, one in self.hdf5.items()})
         with error_context(key="grids"):
             return GridModes({mode: read_grid(folder / file) for mode, file in (self.grids or {}).items()})
 

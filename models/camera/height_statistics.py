@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.point_plots import draw_bars
 from ...core.result import Values
 from .focal_plane import FocalPlane
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Cells along the side of a CCD, at whose centres heights are taken.
 _CELLS = 24
@@ -53,6 +59,13 @@ class HeightStatistics(Values):
     within_width95: float
     tilt_rms: float
     shape_rms: float
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the heights and their parts as bars."""
+        named = {
+            k.replace("_", " "): 1e6 * v for k, v in self._values().items() if k not in ("n_ccd", "peak_to_valley")
+        }
+        return draw_bars(ax, list(named), np.array(list(named.values())), "height [um]")
 
 
 @check_arguments

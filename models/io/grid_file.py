@@ -14,17 +14,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError, error_context
 from ...core.files import parsing, require_file, write_bytes
 from ..shapes.grid import GridSag
+from .hdf5_map import SIGNATURE
 
 if TYPE_CHECKING:
     from astropy.io import fits
 
 #: First bytes of other formats in which maps of mirrors come.
-_FOREIGN = {b"\x89HDF\r\n\x1a\n": "HDF5", b"MATLAB 5.0 MAT-file": "MATLAB"}
+_FOREIGN = {SIGNATURE: "HDF5", b"MATLAB 5.0 MAT-file": "MATLAB"}
 
 
+@check_arguments
 def read_grid(path: str | os.PathLike[str]) -> GridSag:
     """Return the sag that a FITS image holds.
 
@@ -54,7 +57,8 @@ def fits_image(path: Path, dimensions: int) -> tuple[fits.Header, np.ndarray]:
         for signature, kind in _FOREIGN.items():
             if start.startswith(signature):
                 text = f"{kind} file, whose maps have no nodes and no unit: expected a FITS image"
-                raise PrescriptionError(f"{text}, or a pachon.GridSag of its map", file=path)
+                other = "pachon.read_hdf5_map" if kind == "HDF5" else "a pachon.GridSag of its map"
+                raise PrescriptionError(f"{text}, or {other}", file=path)
         file.seek(0)
         hdus = fits.open(file, memmap=False)
         images = [(hdu.header, hdu.data) for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == dimensions]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import IntFlag
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy.table import QTable, Table
@@ -13,10 +13,15 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.point_plots import draw_shapes
 from ...core.products import Columns, described_table
 from ...core.result import Result
 from ...core.units import real_array, require_positive
 from ...core.version import VERSION
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Half-light radius of a round Gaussian over its rms width along one axis.
 HALF_LIGHT = float(np.sqrt(2.0 * np.log(2.0)))
@@ -75,6 +80,10 @@ class GalaxyFits(Result):
     pixels: np.ndarray
     evaluations: np.ndarray
     flags: np.ndarray
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the ellipticities before the PSF in their plane, coloured by the size."""
+        return draw_shapes(ax, self.e1, self.e2, self.size, "rms width before the PSF [pixel]")
 
     def __len__(self) -> int:
         return len(self.flags)

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntFlag
+from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy.table import QTable, Table
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.point_plots import draw_points
 from ...core.products import Columns, described_table
 from ...core.result import Result
 from ...core.version import VERSION
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 class ObjectFlag(IntFlag):
@@ -74,6 +80,13 @@ class DetectedObjects(Result):
     flags: np.ndarray
     segmentation: np.ndarray
     background: np.ndarray
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the objects on the image, coloured by the logarithm of their S/N."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            snr = np.log10(self.snr)
+        labels = "x [pixel]", "y [pixel]"
+        return draw_points(ax, self.x, self.y, labels, color=snr, color_label="log10 of S/N", equal=True)
 
     def __len__(self) -> int:
         return len(self.x)

@@ -10,14 +10,20 @@ is g up to terms of order g^(k/2 - 1) e^(k/2): pairs at 90 degrees leave -g* e^2
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.point_plots import draw_bars
 from ...core.result import Values
 from ...core.units import real_array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,11 @@ class ShearCalibration(Values):
     c: np.ndarray
     c_error: np.ndarray
     n_rings: int
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw multiplicative and additive bias of both components with their standard errors."""
+        values, errors = (1e3 * np.concatenate(v) for v in ((self.m, self.c), (self.m_error, self.c_error)))
+        return draw_bars(ax, ["m of g1", "m of g2", "c of g1", "c of g2"], values, "bias [1e-3]", errors=errors)
 
 
 @check_arguments

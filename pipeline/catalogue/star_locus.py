@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import IntFlag
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.point_plots import draw_points
 from ...core.result import Result
 from ...core.units import real_array, require_count, require_positive
 from ..simulate.stamps import center_stamps
 from .cutouts import cut_out, first_pixel
 from .objects import DetectedObjects
 from .pixel_checks import flagged
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # The locus is the interval of half-light radii of this relative width with the most objects: at least so many times
 # the objects of equally wide intervals on either side of it, between these multiples of its radius.
@@ -76,6 +82,13 @@ class StarSelection(Result):
     positions: np.ndarray
     snr: np.ndarray
     stamps: np.ndarray
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the places of the selected stars, coloured by the logarithm of their S/N."""
+        title = f"{len(self)} stars, half-light radius {self.half_light_radius:.3g} pixel"
+        x, y = self.positions.T
+        color = {"color": np.log10(self.snr), "color_label": "log10 of S/N"}
+        return draw_points(ax, x, y, ("x [pixel]", "y [pixel]"), **color, equal=True, title=title)
 
     def __len__(self) -> int:
         return len(self.index)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,6 +34,10 @@ from .mosaic import Mosaic, PsfShapes
 from .response import Instrument
 from .stars import FocalPlaneStars, places_of, stars_of
 from .static_heights import StaticHeights
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Images that are deformed at a time.
 _BATCH = 512
@@ -86,6 +90,10 @@ class FocalPlanePsf(Result):
     stamp_size: int
     mean_star: np.ndarray | None = None
     pca: ResidualImages | None = None
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the shapes predicted at each star from the others."""
+        return self.leave_one_out.plot(ax=ax)
 
     @classmethod
     @check_arguments

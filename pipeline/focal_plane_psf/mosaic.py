@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy import units as u
 from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError, unknown_name
-from ...core.units import metres
+from ...core.point_plots import draw_shapes
+from ...core.units import ARCSEC, metres
 from ...models.camera.camera import Camera
 from .covariance import Places
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Distance outside the rim of a CCD, in halves of its side, at which a position still counts as on it.
 _RIM = 1e-3
@@ -118,6 +123,10 @@ class PsfShapes:
     e1: np.ndarray
     e2: np.ndarray
     size: np.ndarray
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the ellipticities in their plane, coloured by the size."""
+        return draw_shapes(ax, self.e1, self.e2, self.size / ARCSEC, "weighted rms size [arcsec]")
 
     @classmethod
     def of_values(cls, values: ArrayLike) -> PsfShapes:

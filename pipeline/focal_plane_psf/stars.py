@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from astropy import units as u
@@ -16,12 +16,17 @@ from numpy.typing import NDArray
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
 from ...core.files import parsing, require_file
+from ...core.point_plots import draw_points
 from ...core.result import Result
 from ...core.units import ARCSEC
 from ..ccd_product import CcdProduct, ObservedStars, read_product
 from ..measure.shapes import Shapes, measure_shapes
 from .covariance import Places
 from .mosaic import Mosaic
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Noise of e1, e2 and ln size times the S/N, of stars as wide as the weight, where no stamps are given.
 NOISE_PER_SNR = (0.50, 0.50, 0.52)
@@ -85,6 +90,13 @@ class FocalPlaneStars(Result):
     pixel_scale: float | None = None
     weight_fwhm: float = 0.7 * ARCSEC
     pixels: bool = False
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the places of the stars, coloured by the weighted rms size."""
+        x, y = (self.x, self.y) if self.pixels else (1e3 * self.x, 1e3 * self.y)
+        labels = ("x [pixel]", "y [pixel]") if self.pixels else ("x [mm]", "y [mm]")
+        size = np.exp(self.values[:, 2]) / ARCSEC
+        return draw_points(ax, x, y, labels, color=size, color_label="weighted rms size [arcsec]", equal=True)
 
     def __len__(self) -> int:
         return len(self.x)

@@ -15,7 +15,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.linalg
@@ -41,6 +41,10 @@ from .mosaic import Mosaic
 from .response import Instrument
 from .stars import places_of, stars_of
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 #: Gauss-Newton steps about the heights of all exposures.
 STEPS = 3
 
@@ -64,6 +68,10 @@ class StaticHeights(Result):
     focal_plane: FocalPlane
     covariance: np.ndarray
     exposures: int
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the heights of the focal plane."""
+        return self.focal_plane.plot(ax=ax)
 
     @property
     def camera(self) -> Camera:

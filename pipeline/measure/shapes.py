@@ -10,16 +10,21 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from enum import IntFlag
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.point_plots import draw_shapes
 from ...core.result import Result
 from ...core.threads import one_blas_thread
-from ...core.units import positive_angle, pure_numbers, real_numbers, require_positive
+from ...core.units import ARCSEC, positive_angle, pure_numbers, real_numbers, require_positive
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _BATCH_PIXELS = 1 << 20  # 8 MB a work array: the memory used does not grow with the number of stars
 
@@ -66,6 +71,10 @@ class Shapes(Result):
     x: np.ndarray
     y: np.ndarray
     flags: np.ndarray
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the ellipticities in their plane, coloured by the size."""
+        return draw_shapes(ax, self.e1, self.e2, self.size / ARCSEC, "weighted rms size [arcsec]")
 
     @property
     def usable(self) -> np.ndarray:

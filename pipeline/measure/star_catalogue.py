@@ -104,7 +104,8 @@ def load_stars(
         also = " and no image of three axes" if stamp in missing and hdus is not None else ""
         raise ProductError(
             f"{path}: no column {', '.join(map(repr, missing))}{also}; its columns are {', '.join(columns) or 'none'}"
-            + "; stamps are images [n, ny, nx], as SExtractor's VIGNET" * (stamp in missing)
+            + "".join(f"; looked for {name}: {', '.join(OTHER_NAMES[name])}" for name in missing if name in OTHER_NAMES)
+            + "; stamps are images [n, ny, nx]" * (stamp in missing)
         )
     positions = np.stack([_checked_column(path, name, columns[names[name.lower()]], 1) for name in (x, y)], axis=1)
     stamps = _checked_column(path, stamp, columns[names[stamp.lower()]], 3) if cube is None else cube

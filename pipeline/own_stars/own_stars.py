@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from astropy.table import QTable, Table
 from astropy.units import Quantity
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.products import Columns, described_table
 from ...core.random_streams import stream
-from ...core.result import Result
-from ...core.units import ARCSEC, positive_angle, real_array, require_seed
-from ..measure.rho_statistics import RhoStatistics, rho_statistics
+from ...core.units import positive_angle, real_array, require_seed
 from ..measure.shapes import Shapes, fwhm, measure_shapes
 from ..measure.star_selection import StarFlag, flag_stars, require_stars
 from ..psf_model import kriging
@@ -26,6 +21,7 @@ from ..psf_model.model import PsfModel
 from ..psf_model.polynomial import as_positions
 from ..simulate.stamps import center_stamps
 from .candidates import CANDIDATES, KRIGING, choose_candidate
+from .result import OwnStars
 
 #: Fewest stars that a model is made of.
 FEWEST_STARS = 5
@@ -35,126 +31,6 @@ FOLDS = 5
 _SKY = 0.4
 # Rim of a stamp that a shift may bring in from the other side [pixel].
 _RIM = 2
-
-
-@check_arguments
-@dataclass(frozen=True, eq=False)
-class OwnStars(Result):
-    """Stars of an image, the PSF model made from the good ones, and its prediction of each star held out.
-
-    Attributes
-    ----------
-    model : PsfModel
-        Of all stars that are used; positions in the unit of the stars'.
-    positions : ndarray
-        Of all stars, [n, 2].
-    snr : ndarray
-        Signal-to-noise ratio, [n].
-    flags : ndarray
-        :class:`~.StarFlag` bits, [n]; stars without any, and of enough S/N, are used.
-    used : ndarray
-        [n] bool.
-    shapes : Shapes
-        Of the stars, angles in rad.
-    held_out : Shapes
-        Of the model made without the star and others of its part; NaN for stars that are not used.
-    stamps, predicted : ndarray
-        Used stars and the models made without them, unit sum, [n_used, ny, nx].
-    sigma_e, sigma_size : ndarray
-        Noise of a component of the ellipticity, and of the relative size, of the used stars, [n_used].
-    pixel_scale, weight_fwhm : float
-        Of the stamps [rad], and of the weight of the moments [rad].
-    kind : str
-        Kind of model that was chosen, one of :data:`~.own_stars.candidates.CANDIDATES`; ``given`` where options said.
-    """
-
-    _images = ("stamps", "predicted")
-
-    model: PsfModel
-    positions: np.ndarray
-    snr: np.ndarray
-    flags: np.ndarray
-    used: NDArray[np.bool_]
-    shapes: Shapes
-    held_out: Shapes
-    stamps: np.ndarray
-    predicted: np.ndarray
-    sigma_e: np.ndarray
-    sigma_size: np.ndarray
-    pixel_scale: float
-    weight_fwhm: float
-    kind: str
-
-    def table(self) -> Table:
-        """Return all stars with their shapes and residuals."""
-        one, other = self.shapes, self.held_out
-        columns: Columns = {
-            "x": (self.positions[:, 0], "", "place, in the unit of the positions"),
-            "y": (self.positions[:, 1], "", "place, in the unit of the positions"),
-            "snr": (self.snr, "", "signal-to-noise ratio"),
-            "flags": (self.flags, "", "bits of StarFlag"),
-            "used": (self.used, "", "whether the model is made of it"),
-            "e1": (one.e1, "", "ellipticity along x"),
-            "e2": (one.e2, "", "ellipticity along the diagonal x = y"),
-            "size": (one.size / ARCSEC, "arcsec", "weighted rms size"),
-            "held_out_e1": (other.e1, "", "e1 of the model made without the star"),
-            "held_out_e2": (other.e2, "", "e2 of the model made without the star"),
-            "held_out_size": (other.size / ARCSEC, "arcsec", "size of the model made without the star"),
-        }
-        return described_table(columns, {})
-
-    def residuals(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return e1, e2 and relative size of the used stars less those predicted without them, [n_used] each."""
-        one, other, used = self.shapes, self.held_out, self.used
-        return (
-            (one.e1 - other.e1)[used],
-            (one.e2 - other.e2)[used],
-            (one.size / other.size - 1.0)[used],
-        )
-
-    def _label(self) -> str:
-        return f"{len(self.used)} stars, {int(self.used.sum())} used, {self.model!r}"
-
-    def to_table(self) -> QTable:
-        """Return the stars of :meth:`table`."""
-        return QTable(self.table())
-
-    def _summary(self) -> dict[str, Any]:
-        """Return numbers of stars, FWHM, and rms residuals at stars that were held out, beside their noise."""
-        d1, d2, size = self.residuals()
-        counts = {str(f.name).lower(): int(((self.flags & f) > 0).sum()) for f in StarFlag if f}
-        return {
-            "kind": self.kind,
-            "stars": len(self.used),
-            "used": int(self.used.sum()),
-            "flagged": counts,
-            "median_snr": float(np.median(self.snr[self.used])),
-            "fwhm_arcsec": float(np.median(fwhm(self.predicted, self.pixel_scale))) / ARCSEC,
-            "rms_e": _rms(self.shapes.e1[self.used], self.shapes.e2[self.used]),
-            "rms_e_held_out": _rms(d1, d2),
-            "rms_e_noise": _rms(self.sigma_e),
-            "rms_size_held_out": _rms(size),
-            "rms_size_noise": _rms(self.sigma_size),
-        }
-
-    def rho_statistics(self, bins: int = 8) -> RhoStatistics:
-        """Return the rho statistics of the held-out residuals; positions must be in pixels of the stamps."""
-        used = self.used
-        one, other = part_of(self.shapes, used), part_of(self.held_out, used)
-        return star_rho_statistics(self.positions[used] * self.pixel_scale, one, other, bins)
-
-
-def part_of(shapes: Shapes, chosen: np.ndarray) -> Shapes:
-    """Return the shapes of some stars, those of a mask [n] or of indices."""
-    return Shapes(**{name: value[chosen] for name, value in vars(shapes).items()})
-
-
-def star_rho_statistics(places: np.ndarray, stars: Shapes, model: Shapes, bins: int) -> RhoStatistics:
-    """Return the rho statistics of a model at stars, whose places on the sky [rad] are [n, 2]."""
-    x, y = (places - places.mean(axis=0)).T
-    one, other = ([getattr(s, name) for name in ("e1", "e2", "size")] for s in (stars, model))
-    longest = float(np.hypot(np.ptp(x), np.ptp(y)))
-    return rho_statistics(x, y, *one, *other, min_sep=longest / 100.0, max_sep=longest, n_bins=bins)
 
 
 @check_arguments
@@ -270,10 +146,6 @@ def fit_own_stars(
     return OwnStars(
         model, places, snr, flags, used, shapes, held_out, stamps_used, predicted, *sigmas, scale, weight, name
     )
-
-
-def _rms(*values: np.ndarray) -> float:
-    return float(np.sqrt(np.nanmean(np.concatenate(values) ** 2)))
 
 
 def _signal_to_noise(stamps: np.ndarray, rms: np.ndarray, gain: float) -> np.ndarray:

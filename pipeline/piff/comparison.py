@@ -5,26 +5,32 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from astropy.table import Table
+from astropy.table import QTable, Table
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from ...core.arguments import check_arguments
 from ...core.files import make_folder, write_bytes, write_json
 from ...core.products import Columns, described_table, write_ecsv
+from ...core.result import Result
 from ...core.table_files import write_table
 from ...core.units import ARCSEC, pure_numbers
 from ..measure.rho_statistics import RhoStatistics, trace_of_moments
 from ..measure.shapes import Shapes, measure_shapes
 from ..measure.summary import finite_mean, rms
-from ..own_stars.own_stars import FEWEST_STARS, OwnStars, fit_own_stars, part_of, star_rho_statistics
+from ..own_stars.own_stars import FEWEST_STARS, fit_own_stars
+from ..own_stars.result import OwnStars, part_of, star_rho_statistics
 from ..psf_model.polynomial import as_positions
 from ..report.diagnostics import correlation_columns
-from ..report.statistics_plots import rho_plot
+from ..report.statistics_plots import draw_rho, rho_plot
 from .psf import PiffPsf
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Farthest that a star of the table may be from that of the file [pixel]: programs count pixels from 0 or from 1.
 _NEAR = 2.0
@@ -33,7 +39,7 @@ _FEWEST_RESERVED = 5
 
 
 @dataclass(frozen=True, eq=False)
-class PiffComparison:
+class PiffComparison(Result):
     """Residuals of the models of Piff and of ours.
 
     Attributes
@@ -50,15 +56,29 @@ class PiffComparison:
     models: Table
     rho: dict[str, RhoStatistics]
 
+    def _label(self) -> str:
+        return f"{len(self.stars)} stars, {', '.join(self.models['model'])}"
+
+    def _summary(self) -> dict[str, Any]:
+        return {row["model"]: {k: row[k] for k in self.models.colnames[1:]} for row in self.models}
+
+    def to_table(self) -> QTable:
+        """Return the residuals of each model."""
+        return QTable(self.models)
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the rho statistics of each model."""
+        return draw_rho(ax, self.rho)
+
     def as_dict(self) -> dict[str, Any]:
         """Return all metrics as plain mappings and arrays."""
         return {
-            "models": {row["model"]: {k: row[k] for k in self.models.colnames[1:]} for row in self.models},
+            "models": self._summary(),
             "rho": {name: {key: c.as_dict() for key, c in rho.items()} for name, rho in self.rho.items()},
         }
 
     @check_arguments
-    def write(self, folder: Path) -> tuple[str, ...]:
+    def write_folder(self, folder: Path) -> tuple[str, ...]:
         """Write the tables, a picture of the rho statistics and all metrics into a folder; return their names."""
         make_folder(folder)
         each = {f"{name}: {key}": c for name, rho in self.rho.items() for key, c in rho.items()}

@@ -55,7 +55,8 @@ class PiffPsf:
 
     def __repr__(self) -> str:
         count, used = len(self.stars["used"]), int(self.stars["used"].sum())
-        return f"PiffPsf({len(self.chips)} chips, {used} of {count} stars used, Piff {self.version})"
+        chips = f"{len(self.chips)} chip{'s' * (len(self.chips) != 1)}"
+        return f"<PiffPsf: {chips}, {used} of {count} stars used, Piff {self.version}>"
 
     @property
     def property_names(self) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ Plots are in the detector's frame as the telescope's frame has it: x to the righ
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,6 +21,8 @@ from ...models.camera.camera import Camera
 TRUTH, OBSERVED, RESIDUAL, AWAY, LEFT_OUT = GREY, BLUE, RED, ORANGE, PURPLE
 #: Residuals of the CCDs' own models, beside those of a focal-plane model.
 CCD_MODEL = GREY
+#: Most whiskers of a panel.
+_MOST_WHISKERS = 2500
 #: Limits from here on, as fractions of the radius of the field of view, are near its edge; and where they are moved to.
 _NEAR, _MARGIN = 0.65, 1.02
 RESIDUAL_TITLES = {
@@ -101,6 +103,29 @@ def key_ellipticity(values: np.ndarray) -> float:
     typical = float(np.quantile(finite, 0.9)) if finite.size else 0.01
     rounds = np.array([0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5])
     return float(rounds[np.argmin(np.abs(np.log(rounds / max(typical, 1e-4))))])
+
+
+def draw_whisker_panels(
+    every: Iterable[Axes],
+    x: np.ndarray,
+    y: np.ndarray,
+    panels: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    labels: tuple[str, str],
+) -> None:
+    """Draw whiskers of several ellipticities, by title, at the same places [n], on the scale of the first panel."""
+    key = key_ellipticity(np.hypot(*next(iter(panels.values()))))
+    middle = 0.5 * (np.max(x) + np.min(x)), 0.5 * (np.max(y) + np.min(y))
+    half = 0.55 * max(float(np.ptp(x)), float(np.ptp(y))) or 1.0
+    scale = 0.12 * half / key
+    some = np.s_[:: max(1, len(x) // _MOST_WHISKERS)]
+    for column, (axes, (title, (e1, e2))) in enumerate(zip(every, panels.items(), strict=True)):
+        draw_whiskers(axes, whiskers(x[some], y[some], e1[some], e2[some], scale), "black", 0.6)
+        axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
+        axes.set(xlabel=labels[0], ylabel="" if column else labels[1])
+        finite = np.isfinite(e1) & np.isfinite(e2)
+        rms = float(np.sqrt(np.mean((e1**2 + e2**2)[finite]))) if finite.any() else float("nan")
+        axes.set_title(f"{title}: rms |e| {rms:.1e}", loc="left")
+        draw_key_whisker(axes, key, scale, 1.0)
 
 
 def frame_axes(

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, png_bytes, styled
+from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, figure_at, new_figure, png_bytes, styled
 from ..ccd_product import CcdStars
 from ..measure.correlation import Correlation
 from ..measure.rho_statistics import RhoStatistics
@@ -123,9 +124,14 @@ def models_plot(correlated: Mapping[str, Correlation]) -> bytes:
 
 
 def rho_plot(rho: Mapping[str, RhoStatistics]) -> bytes:
+    """Draw rho statistics as PNG; see :func:`draw_rho`."""
+    return png_bytes(draw_rho(None, rho))
+
+
+def draw_rho(ax: Axes | Figure | None, rho: Mapping[str, RhoStatistics]) -> Figure:
     """Draw rho statistics, grouped as in Jarvis et al. 2016, one row for each residual or other name."""
     with styled():
-        figure = new_figure(11.0, 4.1 * len(rho) + 0.5)
+        figure = figure_at(ax, 11.0, 4.1 * len(rho) + 0.5)
         panels = figure.subplots(len(rho), 2, sharex=True, sharey="col", squeeze=False)
         for row, (kind, statistics) in zip(panels, rho.items(), strict=True):
             found = dict(statistics.items())
@@ -140,7 +146,7 @@ def rho_plot(rho: Mapping[str, RhoStatistics]) -> bytes:
             axes.set_ylim(max(low, 1e-12), 2.0 * high)
         for axes in panels[-1]:
             axes.set_xlabel("separation [arcmin]")
-        return png_bytes(figure)
+        return figure
 
 
 def log_axes(axes: Axes, title: str) -> None:

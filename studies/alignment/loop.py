@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...core.arguments import check_arguments
+from ...core.plotting import BLUE, GREY, ORANGE, axes_at, styled
 from ...core.progress import Reporter
 from ...core.random_streams import stream
 from ...core.result import Result
@@ -18,6 +20,10 @@ from .exposure import expose, fit
 from .field_quality import FieldMeans
 from .scene import NOLL, AlignmentScene
 from .store import VisitRecord, VisitStore
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Visits after which the expected state no longer changes.
 _STEADY = 100
@@ -62,6 +68,19 @@ class Alignment(Result):
     donuts: np.ndarray
     first: VisitRecord
     last: VisitRecord
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the wavefront that misalignment adds, visit by visit, as it is and as expected."""
+        with styled():
+            figure, axes = axes_at(ax, 6.4, 3.8)
+            axes.plot([1e9 * v.added for v in self.visits], "o-", color=BLUE, markersize=3.0, label="telescope")
+            axes.plot(1e9 * self.expected, color=ORANGE, label="expected from the covariance")
+            axes.axhline(1e9 * self.floor, color=GREY, linewidth=0.8, linestyle="--", label="floor")
+            axes.set(xlabel="visit", ylabel="wavefront added [nm rms]")
+            if np.all(self.expected > 0.0):
+                axes.set_yscale("log")
+            axes.legend()
+            return figure
 
 
 @check_arguments

@@ -8,12 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ...core.plotting import new_figure, png_bytes, styled
-from ...models.camera.focal_plane import FocalPlane
+from ...core.plotting import png_bytes
 from ...pipeline.experiment import Experiment
 from ...pipeline.report.diagnostics import correlation_columns
-from ...pipeline.report.focal_plane_axes import draw_outlines, frame_axes
-from ...pipeline.report.focal_plane_plots import draw_heights
 from ...pipeline.run_folder import stamp_of
 from ..product import write_products
 from .shim import Shims, shimmed_configuration
@@ -55,30 +52,9 @@ def write_shims(shims: Shims, folder: Path, experiment: Experiment) -> tuple[str
             "shims.ecsv": ("motions beside the focus of the whole focal plane", columns),
             "correlations.ecsv": ("xi of the ellipticities of each state", correlation_columns(shims.correlations)),
         },
-        {"shims.png": shims_plot(shims)},
+        {"shims.png": png_bytes(shims.plot())},
         {"shims.json": shim_metrics(shims)},
         stamp_of(experiment).meta(),
         shimmed_configuration(experiment.config, shims),
         "the run with the focus and the shims among its moved rafts and CCDs.",
     )
-
-
-def shims_plot(shims: Shims) -> bytes:
-    """Draw the heights focused as a whole, the motions of the parts, and the heights with them, on one scale."""
-    camera = shims.focal_plane.camera
-    edge = 1.04e3 * camera.reach
-    limits = (-edge, edge, -edge, edge)
-    flat = FocalPlane.flat(camera)
-    for name, motion in shims.motions.items():
-        flat = flat.with_moved(name, dz=motion.dz, rx=motion.rx, ry=motion.ry)
-    planes = {"focused as a whole": shims.focused, f"motions of {shims.parts}": flat, "shimmed": shims.focal_plane}
-    bounds = 3e6 * float(np.std(shims.focused.height(*camera.centers.T))) or 1.0
-    with styled():
-        figure = new_figure(13.0, 4.6)
-        for i, (axes, (title, plane)) in enumerate(zip(figure.subplots(1, 3), planes.items(), strict=True)):
-            image = draw_heights(axes, plane, limits, 350, bounds=bounds)
-            draw_outlines(axes, camera, range(len(camera)), "0.55", 0.3)
-            frame_axes(axes, limits, y_label=i == 0)
-            axes.set_title(title)
-        figure.colorbar(image, ax=list(figure.axes), fraction=0.02, pad=0.01, extend="both", label="height [µm]")
-        return png_bytes(figure)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.optimize
@@ -28,6 +28,11 @@ from ...pipeline.measure.correlation import Correlation, shear_correlation
 from ...wavefront.chief_rays import fields_at
 from .curves import Places, focus_curves, measured
 from .pairs import PairSum, separation_edges
+from .picture import draw_shims
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 MERITS = ("fwhm", "ellipticity", "xi")
 PARTS = ("rafts", "ccds")
@@ -101,6 +106,14 @@ class Shims(Result):
     correlations: dict[str, Correlation]
     focused: FocalPlane
     focal_plane: FocalPlane
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the heights focused as a whole, the motions, and the heights with them, on one scale."""
+        flat = FocalPlane.flat(self.focal_plane.camera)
+        for name, motion in self.motions.items():
+            flat = flat.with_moved(name, dz=motion.dz, rx=motion.rx, ry=motion.ry)
+        planes = {"focused as a whole": self.focused, f"motions of {self.parts}": flat, "shimmed": self.focal_plane}
+        return draw_shims(ax, planes)
 
     def _columns(self) -> dict[str, Any]:
         moved = self.motions.values()

@@ -6,14 +6,15 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy.table import Table
 
 from ...core.arguments import check_arguments
 from ...core.docstrings import Description
-from ...core.errors import ProductError
+from ...core.errors import DomainError, ProductError, unknown_name
+from ...core.plotting import BLUE, figure_at, plain_text, styled
 from ...core.products import Columns, described_table
 from ...core.result import Result
 from ...core.schema import key_description
@@ -23,6 +24,12 @@ from ..metrics.stars import STARS
 from ..metrics.telescope import TELESCOPE_METRICS
 from .store import SweepStore, readable_rows
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Panels of a picture, at most.
+_PANELS = 6
 #: Motions in names of parameters.
 _CHANGES = {
     **{f"d{axis}": f"shift along {axis}" for axis in "xyz"},
@@ -58,6 +65,22 @@ class SweepTable(Result):
     metrics: dict[str, np.ndarray]
     problem: np.ndarray
     seconds: np.ndarray
+
+    def plot(self, metric: str | None = None, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw a metric, the first by default, against each of the first six parameters."""
+        if metric is None:
+            metric = next(iter(self.metrics), None)
+        if metric not in self.metrics:
+            raise DomainError("no metric") if metric is None else unknown_name("metric", metric, self.metrics)
+        names = list(self.parameters)[:_PANELS]
+        with styled():
+            figure = figure_at(ax, 2.8 * max(len(names), 1) + 0.6, 3.0)
+            panels = figure.subplots(1, max(len(names), 1), sharey=True, squeeze=False)[0]
+            for axes, name in zip(panels, names, strict=False):
+                axes.plot(self.parameters[name], self.metrics[metric], ".", color=BLUE, markersize=4)
+                axes.set_xlabel(plain_text(name))
+            panels[0].set_ylabel(plain_text(metric))
+            return figure
 
     def __len__(self) -> int:
         return len(self.number)

@@ -6,51 +6,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...core.plotting import BLUE, GREY, ORANGE, RED, new_figure, plain_text, png_bytes, styled
-from .study import ToleranceStudy
+from ...core.plotting import BLUE, GREY, ORANGE, RED, new_figure, png_bytes, styled
+from .result import SHOWN, ToleranceStudy, merit_unit, name_rows, study_title
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-#: Tolerances in the picture, the costliest.
-_SHOWN = 25
+    pass
 
 
 def sensitivity_plot(study: ToleranceStudy) -> bytes:
-    """Draw the change of the merit at the ends of the costliest tolerances, and in the draws, with its error."""
-    shown = study.offenders[:_SHOWN][::-1]
-    scale = study.merit.scale
-    with styled():
-        figure = new_figure(9.6, 1.5 + 0.24 * len(shown))
-        axes, drawn = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1.0))
-        rows = np.arange(len(shown))
-        for values, color, name, height in (
-            (study.lower, BLUE, "lower end", 0.7),
-            (study.upper, RED, "upper end", 0.4),
-        ):
-            change = scale * (values[shown] - study.nominal)
-            axes.barh(rows, change, height=height, color=color, alpha=0.8, label=name)
-            for row in rows[np.isnan(change)]:
-                axes.text(0.0, row, " light is lost", va="center", fontsize=7)
-        _name_rows(axes, study, shown)
-        axes.axvline(0.0, color=GREY, linewidth=0.8)
-        axes.set_xlabel(f"change of the {study.merit.title}{_unit(study)},\nthe tolerance alone")
-        axes.legend(loc="lower right")
-        effect, error = (scale * v[:, shown] for v in study.effects)
-        for end, color, name in ((0, BLUE, "lowest third"), (1, RED, "highest third")):
-            bars = {"markersize": 3.5, "elinewidth": 1.0, "capsize": 2.0, "color": color, "label": name}
-            drawn.errorbar(effect[end], rows + (0.15 if end else -0.15), xerr=error[end], fmt="o", **bars)
-        drawn.axvline(0.0, color=GREY, linewidth=0.8)
-        drawn.set_xlabel(f"less the mean of the other draws{_unit(study)},\nall tolerances at once")
-        drawn.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
-        title = f"{len(shown)} of {len(study.tolerances)} tolerances, the costliest on top"
-        figure.suptitle(_title(study, title), fontsize="medium")
-        return png_bytes(figure)
+    """Draw :meth:`ToleranceStudy.plot` as PNG."""
+    return png_bytes(study.plot())
 
 
 def inverse_plot(study: ToleranceStudy) -> bytes:
     """Draw the size that costs the stated loss over the size of each of the costliest tolerances."""
-    shown = study.offenders[:_SHOWN][::-1]
+    shown = study.offenders[:SHOWN][::-1]
     ratio = study.inverse[shown] / np.array([study.tolerances[i].size for i in shown])
     known = np.isfinite(ratio)
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -63,7 +33,7 @@ def inverse_plot(study: ToleranceStudy) -> bytes:
         axes.barh(rows[known], ratio[known] - 1.0, left=1.0, height=0.6, color=colors[known], alpha=0.8)
         for row in rows[~known]:
             axes.text(1.0, row, " no size costs as much", va="center", fontsize=7)
-        _name_rows(axes, study, shown)
+        name_rows(axes, study, shown)
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -71,7 +41,7 @@ def inverse_plot(study: ToleranceStudy) -> bytes:
         axes.axvline(1.0, color=GREY, linewidth=0.8)
         axes.grid(True, axis="x", color="0.93", linewidth=0.5)
         axes.set_xlabel(f"size that costs {100 * study.loss:g} % of the {study.merit.title}, over the tolerance")
-        axes.set_title(_title(study, "inverse sensitivity; red: the tolerance costs more"))
+        axes.set_title(study_title(study, "inverse sensitivity; red: the tolerance costs more"))
         return png_bytes(figure)
 
 
@@ -87,18 +57,10 @@ def draws_plot(study: ToleranceStudy) -> bytes:
         axes.axvline(scale * study.nominal, color=GREY, linestyle=(0, (4, 2)), linewidth=0.9, label="as designed")
         if study.requirement is not None:
             axes.axvline(scale * study.requirement, color=ORANGE, linewidth=1.2, label="requirement")
-        axes.set(xlabel=f"{study.merit.title}{_unit(study)}", ylabel="telescopes")
+        axes.set(xlabel=f"{study.merit.title}{merit_unit(study)}", ylabel="telescopes")
         axes.legend(loc="best")
-        axes.set_title(_title(study, "Monte Carlo"))
+        axes.set_title(study_title(study, "Monte Carlo"))
         return png_bytes(figure)
-
-
-def _name_rows(axes: Axes, study: ToleranceStudy, shown: np.ndarray) -> None:
-    labels = [
-        f"{plain_text(t.name)} ± {t.size:.3g}{'' if u == '1' else f' {u}'}"
-        for t, u in ((study.tolerances[i], study.units[i]) for i in shown)
-    ]
-    axes.set_yticks(np.arange(len(shown)), labels)
 
 
 def yield_plot(study: ToleranceStudy) -> bytes:
@@ -118,18 +80,12 @@ def yield_plot(study: ToleranceStudy) -> bytes:
             found = study.yield_at(study.requirement)
             label = f"requirement: {100 * found.fraction:.1f} % ({100 * found.low:.1f} to {100 * found.high:.1f})"
             axes.axvline(scale * study.requirement, color=ORANGE, linewidth=1.2, label=label)
-        axes.set(xlabel=f"requirement on the {study.merit.title}{_unit(study)}", ylabel="telescopes that meet it [%]")
+        axes.set(
+            xlabel=f"requirement on the {study.merit.title}{merit_unit(study)}", ylabel="telescopes that meet it [%]"
+        )
         axes.set_ylim(0, 102)
         axes.grid(True, color="0.93", linewidth=0.5)
         axes.legend(loc="best")
         compensated = f", compensated by {', '.join(study.compensators)}" if study.compensators else ""
-        axes.set_title(_title(study, f"{study.method}{compensated}"))
+        axes.set_title(study_title(study, f"{study.method}{compensated}"))
         return png_bytes(figure)
-
-
-def _unit(study: ToleranceStudy) -> str:
-    return f" [{study.merit.unit}]".replace("um", "µm").replace("urad", "µrad") if study.merit.unit else ""
-
-
-def _title(study: ToleranceStudy, text: str) -> str:
-    return f"{plain_text(study.telescope)}: {plain_text(text)}"

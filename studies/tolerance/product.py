@@ -13,7 +13,7 @@ from ...core.version import VERSION
 from .file import ToleranceFile
 from .plots import draws_plot, inverse_plot, sensitivity_plot, yield_plot
 from .report import tolerance_page
-from .study import ToleranceStudy
+from .result import ToleranceStudy
 
 _PERCENT = (50, 80, 90, 95, 98)
 #: Worst offenders in the summary.

@@ -11,7 +11,7 @@ import numpy as np
 from ...core.page import Picture, render, with_digits, with_error
 from ...core.version import VERSION
 from .file import ToleranceFile
-from .study import ToleranceStudy
+from .result import ToleranceStudy
 
 #: How the merit of a drawn telescope is found.
 _METHODS = {

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,114 +15,18 @@ from ...core.progress import Reporter
 from ...core.threads import one_blas_thread
 from ...core.workers import Compute, MakeWorkers, Workers, serial_worker
 from ...design.optimize.toleranced_merit import TolerancedMerit
-from ...design.optimize.yields import Yield
-from ...design.parameters.tolerances import Tolerance, draw
+from ...design.parameters.tolerances import draw
 from ...models.telescope import Telescope
 from ..sweep.store import PointResult, StoreKind, SweepPoint, SweepStore, check_same_sweep, create_store, store_exists
 from .file import ToleranceFile
 from .measurement import DRAW, INVERSE, LOWER, NOMINAL, UPPER, Batch, ToleranceMeasurement
-from .merits import ToleranceMerit, tolerance_merit
+from .merits import tolerance_merit
 from .plan import tolerance_plan
+from .result import ToleranceStudy
 
 #: Points that a worker computes at once.
 _BATCH = 25
 _STORE = StoreKind("tolerance study", "pachon tolerance makes", "remove it, and begin again")
-
-
-@dataclass(frozen=True)
-class ToleranceStudy:
-    """Results of a tolerance study.
-
-    Attributes
-    ----------
-    telescope : str
-        Name of the telescope.
-    merit : ToleranceMerit
-        The merit; numbers below are in SI.
-    method : str
-        "linear", "quadratic" or "traced".
-    tolerances : tuple of Tolerance
-        The tolerances.
-    compensators : tuple of str
-        Degrees of freedom that follow each deviation.
-    units, compensator_units : tuple of str
-        Units of deviations and compensators.
-    nominal : float
-        Merit of the telescope as designed, compensated.
-    lower, upper : ndarray, shape [n_tolerance]
-        Merit at minus and plus the size of each tolerance, compensated, traced.
-    inverse : ndarray, shape [n_tolerance]
-        Size of each tolerance whose worse end costs the loss; NaN where none within a factor of 1e4 does.
-    loss : float
-        Relative loss of the merit of these.
-    deviations : ndarray, shape [n, n_tolerance]
-        Drawn deviations.
-    moves : ndarray, shape [n, n_compensator]
-        Compensators of each draw.
-    draws : ndarray, shape [n]
-        Merit of each draw; NaN where its light is lost.
-    requirement : float, optional
-        Requirement on the merit.
-    """
-
-    telescope: str
-    merit: ToleranceMerit
-    method: str
-    tolerances: tuple[Tolerance, ...]
-    compensators: tuple[str, ...]
-    units: tuple[str, ...]
-    compensator_units: tuple[str, ...]
-    nominal: float
-    lower: np.ndarray
-    upper: np.ndarray
-    inverse: np.ndarray
-    loss: float
-    deviations: np.ndarray
-    moves: np.ndarray
-    draws: np.ndarray
-    requirement: float | None = field(default=None)
-
-    @property
-    def cost(self) -> np.ndarray:
-        """Loss of the merit at the worse end of each tolerance, shape [n_tolerance]; infinite where light is lost."""
-        ends = self.merit.loss(np.stack([self.lower, self.upper]), self.nominal)
-        return np.max(np.where(np.isnan(ends), np.inf, ends), axis=0)
-
-    @property
-    def offenders(self) -> np.ndarray:
-        """Indices of the tolerances, the costliest first."""
-        return np.argsort(-self.cost, kind="stable")
-
-    @cached_property
-    def effects(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean merit of the draws with the lowest and the highest third of each deviation less that of the others.
-
-        Both arrays are [2, n_tolerance], lowest third first: the difference, and its standard error; NaN where a group
-        has less than two telescopes with light.
-        """
-        known = np.isfinite(self.draws)
-        effect, error = np.full((2, 2, self.deviations.shape[1]), np.nan)
-        for i, column in enumerate(self.deviations.T):
-            low, high = np.quantile(column, (1 / 3, 2 / 3))
-            for end, third in enumerate((column <= low, column >= high)):
-                inner, outer = self.draws[known & third], self.draws[known & ~third]
-                if min(len(inner), len(outer)) >= 2:
-                    effect[end, i] = inner.mean() - outer.mean()
-                    error[end, i] = np.sqrt(inner.var(ddof=1) / len(inner) + outer.var(ddof=1) / len(outer))
-        return effect, error
-
-    @check_arguments
-    def at_most(self, fraction: float) -> float:
-        """Return the merit that a fraction (0 to 1) of the telescopes reaches; lost ones are worst."""
-        worst = -np.inf if self.merit.larger else np.inf
-        merits = np.where(np.isnan(self.draws), worst, self.draws)
-        part = 1.0 - fraction if self.merit.larger else fraction
-        return float(np.quantile(merits, part, method="lower" if self.merit.larger else "higher"))
-
-    @check_arguments
-    def yield_at(self, requirement: float) -> Yield:
-        """Return the fraction of the telescopes that meet a requirement on the merit, with its binomial error."""
-        return Yield.of(self.draws, requirement, larger=self.merit.larger)
 
 
 @check_arguments

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy.io import fits
@@ -11,11 +12,17 @@ from numpy.typing import NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
+from ...core.plotting import figure_at, styled
 from ...core.products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
 from ...core.result import Result
 from ...core.units import ARCMIN, ARCSEC
 from ...pipeline.measure.shapes import Shapes, measure_shapes
+from ...pipeline.report.focal_plane_axes import draw_whisker_panels
 from .psf_visit import VisitPsfs
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Card of the number of visits.
 VISITS_CARD = "VISITS"
@@ -108,6 +115,19 @@ class PsfStack(Result):
     model_e1: np.ndarray
     model_e2: np.ndarray
     model_size: np.ndarray
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw whiskers of the PSF, of the mean of the models, and of their difference."""
+        panels = {
+            "PSF": (self.e1, self.e2),
+            "mean of the models": (self.model_e1, self.model_e2),
+            "PSF - model": (self.residual_e1, self.residual_e2),
+        }
+        with styled():
+            figure = figure_at(ax, 13.0, 4.6)
+            labels = "x of the stack [arcmin]", "y of the stack [arcmin]"
+            draw_whisker_panels(figure.subplots(1, 3), self.x / ARCMIN, self.y / ARCMIN, panels, labels)
+            return figure
 
     @classmethod
     @check_arguments

@@ -62,7 +62,7 @@ def test_the_page_of_piff_runs_on_a_file(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     shutil.copy(LENSES.parent / "piff" / "moffat.piff", tmp_path / "psf.piff")
     exec(compile(BLOCK.findall(PAGES["piff_files.md"])[0], "piff_files.md", "exec"), {})
-    assert capsys.readouterr().out.startswith("PiffPsf(1 chips, ")
+    assert capsys.readouterr().out.startswith("<PiffPsf: 1 chip, ")
 
 
 def test_the_page_of_lens_files_runs_on_lenses(tmp_path, monkeypatch):

@@ -332,7 +332,7 @@ GOOD = "name: a\ndegrees_of_freedom:\n  - {name: one, unit: um, of: M2.dz}\n"
         ("of: M2.dz", "of: {M2.dz: much}", "M2.dz = 'much': expected a number"),
         ("name: one,", "nam: one,", "nam"),
         ("  - {name", "  - {name: one, unit: um, of: M2.dx}\n  - {name", "'one' occurs more than once"),
-        ("name: a", "name: a\nfigures: {f: {surfaces: [M1]}}", "either zernike or grids"),
+        ("name: a", "name: a\nfigures: {f: {surfaces: [M1]}}", "one of zernike, grids, hdf5"),
         ("name: a", "name: a\nfigures: {f: {surfaces: [M1], grids: {}}}", "names of modes"),
         ("name: a", "name: a\nfigures: {f: {surfaces: [M1], grids: {B1: no.fits}}}", "no such file"),
         ("name: a", "name: a\nfigures: {f: {surfaces: [M1], zernike: {outer_radius: 1, terms: 2.5}}}", "terms"),

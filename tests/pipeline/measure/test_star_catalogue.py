@@ -75,6 +75,7 @@ def test_files_that_cannot_be_used(tmp_path):
     refused(r"stars\.fits: no such file")
     path = catalogue(tmp_path / "stars.fits", stamps, positions, ("ra", "y"), magnitude=np.zeros(14))
     refused(r"stars\.fits: no column 'x', 'stamp' and no image of three axes; its columns are ra, y, magnitude")
+    refused("columns are ra, y, magnitude; looked for x: xwin_image, x_image, .*; looked for stamp: vignet; stamps are")
     refused("no column 'dec'", x="ra", y="dec", stamp="y")
     refused("column 'magnitude' has shape .14,. and type .*, expected an image", x="ra", stamp="magnitude")
     whole = path.read_bytes()

@@ -43,7 +43,7 @@ def test_stars_of_the_fit_are_told_from_reserved_ones():
     assert list(psf.chips) == [1, 2]
     assert [int((psf.stars["chip"] == n).sum()) for n in (1, 2)] == [16, 16]
     assert int((~psf.stars["used"]).sum()) == 4
-    assert repr(psf) == "PiffPsf(2 chips, 28 of 32 stars used, Piff 1.7.0)"
+    assert repr(psf) == "<PiffPsf: 2 chips, 28 of 32 stars used, Piff 1.7.0>"
 
 
 def test_draw_is_one_of_at():
