@@ -87,6 +87,7 @@ class ZernikeRays:
         #: Derivatives of the terms along x and y of the plane of the entrance pupil [1/m], [n_term, 2, n_point].
         self._gradients = _gradients(telescope, direction, middle, cells.points, noll)
         self._response = -np.concatenate([self._jacobian_times_gradients(float(w)) for w in wavelengths], axis=1)
+        self._single = self._response.astype(np.float32)
         self._last: tuple[np.ndarray, np.ndarray] | None = None
         self._rims = RimsOfCells(cells, self._response)
         #: Sides of the image of a cell [m], columns of a matrix.
@@ -140,7 +141,7 @@ class ZernikeRays:
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the response at zero coefficients, the same to 1e-3 for all; see :class:`LightRays`."""
-        return self._response
+        return self._single
 
 
 def _gradients(
