@@ -28,7 +28,7 @@ _SURVEY, _FEWEST, _MOST = 48, 48, 400
 #: first by which the number of cells goes: 2.9 nm with 60 cells, 0.9 with 120 (LSST, 1.5 mm, 0.8").
 _CELLS_LEAVE, _SMALL, _FALL = 2.9e-9, 0.2, 0.55
 #: Error of the photons [m] below which cells become no smaller.
-_LEAST_ERROR = 1e-9
+_LEAST_ERROR = 0.5e-9
 #: Spacing of landing points over the FWHM of the blur, which smooths what cells on rims leave.
 _SPACING = 0.5
 #: FWHM of the blur in cells of the grid beyond which the cells resolve it; finest grid, in cells along a pixel.
