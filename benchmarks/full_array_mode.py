@@ -1,11 +1,11 @@
 """Full-array mode: the whole camera moved 1.5 mm out of focus, to one side and the other, one donut a CCD.
 
-Run: python benchmarks/full_array_mode.py [CCDs] [sides] [picture.png]
+Run: python benchmarks/full_array_mode.py [CCDs] [sides] [picture.png] [electrons]
 
 The LSST (r band), off by twice the tolerances of ``pachon align`` in each of fifty degrees of freedom, exposes one
-star of 5e6 electrons on each of so many CCDs (all within the field of view by default), with the heights of the camera
-as built, its detector 1.5 mm behind the focus, and with ``sides`` 2 (the default) in front of it too. All donuts
-together give the degrees of freedom (``fit_donuts(degrees_of_freedom=)``). Printed: the wavefront over the field
+star (5e6 electrons by default) on each of so many CCDs (all within the field of view by default), with the heights of
+the camera as built, its detector 1.5 mm behind the focus, and with ``sides`` 2 (the default) in front of it too. All
+donuts together give the degrees of freedom (``fit_donuts(degrees_of_freedom=)``). Printed: the wavefront over the field
 before and after they are taken off, what the covariance of the fit expects, and processor time and memory.
 """
 
@@ -27,7 +27,8 @@ from pachon.studies.alignment.scene import AlignmentScene
 COUNT = int(sys.argv[1]) if len(sys.argv) > 1 else 189
 SIDES = int(sys.argv[2]) if len(sys.argv) > 2 else 2
 PICTURE = sys.argv[3] if len(sys.argv) > 3 else None
-DEFOCUS, ELECTRONS, SKY, READ_NOISE, DIFFUSION = 1.5e-3, 5e6, 300.0, 8.8, 4e-6
+ELECTRONS = float(sys.argv[4]) if len(sys.argv) > 4 else 5e6
+DEFOCUS, SKY, READ_NOISE, DIFFUSION = 1.5e-3, 300.0, 8.8, 4e-6
 
 
 def main() -> None:
@@ -86,6 +87,9 @@ def main() -> None:
     before, after = (1e9 * scene.quality.means(t).added for t in (true, left))
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"pachon {pachon.__version__}; {fit.usable.sum()} of {SIDES * count} donuts used")
+    error = found.values - state * scene.tolerances
+    quality = error @ np.linalg.solve(found.covariance, error) / len(error)
+    print(f"chi-square of the errors: {quality:.2f} a degree of freedom")
     print(f"wavefront over the field: {before:.0f} nm rms before, {after:.1f} after ({1e9 * expected:.1f} expected)")
     print(f"processor time: {drawn:.0f} s for the donuts, {fitted:.0f} s for the fit; memory {memory:.1f} GiB")
     quality = fit.chi2[fit.usable] / fit.n_pixels[fit.usable]

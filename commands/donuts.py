@@ -61,6 +61,11 @@ def donuts_command(
     saturation: Annotated[float | None, Option(help="Level of saturated pixels [electrons].")] = None,
     terms: Annotated[int, Option("--zernikes", min=4, max=78, help="Highest Noll index.")] = 22,
     higher_order_nm: Annotated[float, Option(help="Rms of each Zernike of the next radial degree [nm].")] = 10.0,
+    exposure_s: Annotated[
+        float | None,
+        Option(help="Length of the exposure [s]: its turbulence adds to errors, and its higher terms are fitted."),
+    ] = None,
+    site: Annotated[str, Option(help="Site whose turbulence and winds --exposure-s is about.")] = "cerro_pachon",
     degrees_of_freedom: Annotated[
         str | None, Option(help="Fit degrees of freedom to all donuts: lsst, or a YAML file.")
     ] = None,
@@ -97,12 +102,14 @@ def donuts_command(
     from ..design.parameters.degrees_of_freedom_file import load_degrees_of_freedom
     from ..pipeline.wavefront_sensing.fit import fit_donuts
     from ..pipeline.wavefront_sensing.stamp_files import border_variance, read_stamps
+    from ..wavefront.atmosphere.atmosphere import Atmosphere
 
     kind = picture_kind(picture)
     if out is not None and out.suffix.lower() not in FORMATS:
         raise ConfigError(f"--out = {out}: expected a name that ends in {', '.join(FORMATS)}")
     model = load_model(telescope, lenient, glass_catalogue or ())
     freedoms = None if degrees_of_freedom is None else load_degrees_of_freedom(degrees_of_freedom)
+    air = None if exposure_s is None else Atmosphere.from_site(site, 0, exposure=exposure_s)
     given = None if field_deg is None else np.deg2rad(degrees_pair(field_deg, "--field-deg"))
     images, fields, defocus = [], [], []
     for path in files:
@@ -129,6 +136,7 @@ def donuts_command(
             sky_variance=variance,
             noll=range(4, terms + 1),
             higher_order=higher_order_nm * 1e-9,
+            turbulence=air,
             degrees_of_freedom=freedoms,
             defocus=np.concatenate(defocus),
             outer_scale=outer_scale_m,

@@ -23,29 +23,35 @@ class PupilPolynomials:
 
     def __init__(self, points: np.ndarray, center: np.ndarray, least: float) -> None:
         self._center, self._radius = center, max(float(np.abs(points - center).max()), least)
-        self._values, self._slopes = self._terms(points)
-        self._products = self._values.T @ self._values
+        values, slopes = self._terms(points)
+        # Monomials up to the eighth degree: products keep seven digits. Too few points determine some of them.
+        self._values, self._inverse = values, np.linalg.pinv(values @ values.T, rcond=1e-13, hermitian=True)
+        self._slopes = slopes.astype(np.float32)
 
     def _terms(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return monomials at points [n, 2], shape [n, m], and their derivatives along x and y [1/m], [2, n, m]."""
+        """Return monomials at points [n, 2], shape [m, n], and their derivatives along x and y [1/m], [2, m, n]."""
         x, y = (points - self._center).T / self._radius
         p, q = np.array([(a, b) for a in range(_DEGREE + 1) for b in range(_DEGREE + 1 - a)]).T
-        powers_x, powers_y = (np.vander(v, _DEGREE + 1, increasing=True) for v in (x, y))
-        values = powers_x[:, p] * powers_y[:, q]
-        along_x = (p / self._radius) * powers_x[:, np.maximum(p - 1, 0)] * powers_y[:, q]
-        along_y = (q / self._radius) * powers_x[:, p] * powers_y[:, np.maximum(q - 1, 0)]
-        return values, np.stack([along_x, along_y])
+        powers_x, powers_y = (np.vander(v, _DEGREE + 1, increasing=True).T.copy() for v in (x, y))
+        slopes_x, slopes_y = (np.zeros_like(powers_x) for _ in range(2))
+        for k in range(1, _DEGREE + 1):
+            slopes_x[k], slopes_y[k] = (k / self._radius * powers[k - 1] for powers in (powers_x, powers_y))
+        return powers_x[p] * powers_y[q], np.stack([slopes_x[p] * powers_y[q], powers_x[p] * slopes_y[q]])
 
     def _fitted(self, values: np.ndarray) -> np.ndarray:
-        # Monomials up to the eighth degree: products keep seven digits. Too few points determine some of them.
-        return np.linalg.lstsq(self._products, self._values.T @ values, rcond=1e-13)[0]
+        """Return the coefficients of values [n, k], shape [m, k]."""
+        right = self._values @ values
+        fitted = self._inverse @ right
+        # One step of refinement: the inverse of nearly dependent products is the less exact of the two.
+        return np.asarray(fitted + self._inverse @ (right - self._values @ (self._values.T @ fitted)))
 
     def derivatives(self, values: np.ndarray) -> np.ndarray:
-        """Return the derivatives of values [n, 2] along the pupil at the points, shape [n, 2, 2]."""
-        return np.moveaxis(self._slopes @ self._fitted(values), 0, -1)
+        """Return the derivatives of values [n, 2] along the pupil at the points, in single precision, [n, 2, 2]."""
+        fitted = self._fitted(values).astype(np.float32)
+        return np.moveaxis(np.matmul(fitted.T, self._slopes), 0, -1).transpose(1, 0, 2)
 
     def at(self, points: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return values [n, k] at other points [m, 2], shape [m, k], and their derivatives there, [m, k, 2]."""
         terms, slopes = self._terms(points)
         fitted = self._fitted(values)
-        return terms @ fitted, np.moveaxis(slopes @ fitted, 0, -1)
+        return terms.T @ fitted, np.moveaxis(slopes.transpose(0, 2, 1) @ fitted, 0, -1)

@@ -37,7 +37,7 @@ _SHOWN = 12
 
 
 class FreedomRays:
-    """Landing points of one star's light by degrees of freedom, each in its unit.
+    """Landing points of one star's light by degrees of freedom, each in its unit; their response is not stored.
 
     Parameters
     ----------
@@ -45,8 +45,6 @@ class FreedomRays:
         As in :class:`~pachon.pipeline.wavefront_sensing.donut_rays.ZernikeRays`.
     freedoms : DegreesOfFreedom
         The degrees of freedom.
-    at : ndarray, shape [n_freedom]
-        Values at which the response is computed.
     footprint : ndarray, shape [2, 2]
         Footprint of a cell in the model of the image [m].
     """
@@ -59,33 +57,22 @@ class FreedomRays:
         wavelength_weights: np.ndarray,
         cells: PupilCells,
         freedoms: DegreesOfFreedom,
-        at: np.ndarray,
         footprint: np.ndarray,
     ) -> None:
         self._prepared, self._parameters, self._matrix = freedoms.parameter_matrix(telescope)
-        self._direction, self._wavelengths, self._points = direction, wavelengths, cells.points
-        self._cells, self._footprint = cells, footprint
+        self._direction, self._wavelengths = direction, wavelengths
+        self._cells, self._footprint, self._rims = cells, footprint, RimsOfCells(cells)
         self._weights = np.outer(wavelength_weights, cells.weights).ravel()
         self.rates = np.zeros((len(self._weights), 0))
         middle = float(wavelengths[len(wavelengths) // 2])
         #: Where the chief ray crosses the plane of the entrance pupil: that of the telescope as it is believed to be.
         self._chief = np.reshape(aimed_points(telescope, direction[None], middle, np.zeros((1, 2))), (1, 2))
-        columns = ParameterColumns.at(self._prepared, self._parameters, self._matrix @ at)
-
-        def derivatives(wavelength: float, points: np.ndarray) -> np.ndarray:
-            rays = parallel_rays(columns.telescope, direction[None], wavelength, points)
-            forward = forward_pass(columns.telescope, rays, threads=1)
-            return columns.derivatives(forward, landing_gradient(forward), threads=1) @ self._matrix
-
-        landing = [derivatives(float(w), cells.points) for w in wavelengths]
-        self._response = np.concatenate(landing, axis=1) - derivatives(middle, self._chief)
-        self._rims = RimsOfCells(cells, self._response)
 
     def landing(self, unknowns: np.ndarray) -> np.ndarray:
         """Return landing points minus that of the chief ray [m], of the telescope with its degrees of freedom."""
         changed = apply(self._prepared, dict(zip(self._parameters, self._matrix @ unknowns, strict=True)))
         places = [
-            landing_of(changed, parallel_rays(changed, self._direction[None], float(w), self._points))
+            landing_of(changed, parallel_rays(changed, self._direction[None], float(w), self._cells.points))
             for w in self._wavelengths
         ]
         middle = float(self._wavelengths[len(self._wavelengths) // 2])
@@ -95,7 +82,7 @@ class FreedomRays:
         return np.concatenate(places) - chief
 
     def weights(self, unknowns: np.ndarray) -> np.ndarray:
-        """Return fractions of the light, at the values of the construction."""
+        """Return fractions of the light of the cells."""
         return self._weights
 
     def spread(self, landing: np.ndarray) -> np.ndarray:
@@ -103,12 +90,28 @@ class FreedomRays:
         return spread_of(self._cells, landing, self._footprint)
 
     def at_rims(self, rims: PupilRims, landing: np.ndarray) -> RimsAt:
-        """Return rims of the telescope as it is believed to be on the detector."""
+        """Return rims of the telescope as it is believed to be on the detector, with the last response."""
         return self._rims.at(rims, landing)
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
-        """Return the derivatives at the values of the construction, shape [2, n, n_freedom]."""
-        return self._response
+        """Return the derivatives, shape [2, n, n_freedom]."""
+        columns = ParameterColumns.at(self._prepared, self._parameters, self._matrix @ unknowns)
+
+        def derivatives(wavelength: float, points: np.ndarray) -> np.ndarray:
+            rays = parallel_rays(columns.telescope, self._direction[None], wavelength, points)
+            forward = forward_pass(columns.telescope, rays, threads=1)
+            return columns.derivatives(forward, landing_gradient(forward), threads=1) @ self._matrix
+
+        landing = [derivatives(float(w), self._cells.points) for w in self._wavelengths]
+        middle = float(self._wavelengths[len(self._wavelengths) // 2])
+        found = np.concatenate(landing, axis=1) - derivatives(middle, self._chief)
+        self._rims = RimsOfCells(self._cells, found)
+        return found
+
+    def release(self) -> None:
+        """Free what was computed for the last unknowns."""
+        self._rims = RimsOfCells(self._cells)
+        self._cells.release()
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,9 @@ class LightRays(Protocol):
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the derivatives of :meth:`landing` with respect to the unknown wavefront, shape [2, n, n_wave]."""
 
+    def release(self) -> None:
+        """Free what can be computed again."""
+
 
 class ZernikeRays:
     """Landing points for a wavefront of annular Zernikes [m].
@@ -78,7 +81,7 @@ class ZernikeRays:
         noll: np.ndarray,
     ) -> None:
         self._telescope, self._direction, self._wavelengths = telescope, direction, wavelengths
-        self._cells, self._points = cells, cells.points
+        self.cells, self._points = cells, cells.points
         self._weights = np.outer(wavelength_weights, cells.weights).ravel()
         rates = np.zeros((len(cells), 0)) if cells.rates is None else cells.rates
         self.rates = np.kron(wavelength_weights[:, None], rates)
@@ -87,6 +90,7 @@ class ZernikeRays:
         #: Derivatives of the terms along x and y of the plane of the entrance pupil [1/m], [n_term, 2, n_point].
         self._gradients = _gradients(telescope, direction, middle, cells.points, noll)
         self._response = -np.concatenate([self._jacobian_times_gradients(float(w)) for w in wavelengths], axis=1)
+        self._single = self._response.astype(np.float32)
         self._last: tuple[np.ndarray, np.ndarray] | None = None
         self._rims = RimsOfCells(cells, self._response)
         #: Sides of the image of a cell [m], columns of a matrix.
@@ -132,7 +136,7 @@ class ZernikeRays:
 
     def spread(self, landing: np.ndarray) -> np.ndarray:
         """Return the spread of the image of each point; see :class:`LightRays`."""
-        return spread_of(self._cells, landing, self.footprint)
+        return spread_of(self.cells, landing, self.footprint)
 
     def at_rims(self, rims: PupilRims, landing: np.ndarray) -> RimsAt:
         """Return the rims on the detector; see :class:`LightRays`."""
@@ -140,7 +144,11 @@ class ZernikeRays:
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the response at zero coefficients, the same to 1e-3 for all; see :class:`LightRays`."""
-        return self._response
+        return self._single
+
+    def release(self) -> None:
+        """Free the polynomials over the pupil."""
+        self.cells.release()
 
 
 def _gradients(
@@ -176,17 +184,20 @@ class RimsOfCells:
     ----------
     cells : PupilCells
         The cells.
-    response : ndarray, shape [2, n, n_wave]
-        Derivatives of the landing points of the cells, of one or more wavelengths one after the other [m].
+    response : ndarray, shape [2, n, n_wave], optional
+        Derivatives of the landing points of the cells, of one or more wavelengths one after the other [m]; without
+        them rims have none.
     """
 
-    def __init__(self, cells: PupilCells, response: np.ndarray) -> None:
+    def __init__(self, cells: PupilCells, response: np.ndarray | None = None) -> None:
         self._cells, self._response = cells, response
         self._last: tuple[PupilRims, np.ndarray] | None = None
 
     def at(self, rims: PupilRims, landing: np.ndarray) -> RimsAt:
         """Return rims at the middle wavelength for landing points of the cells [m], shape [n, 2]."""
         smooth = self._cells.smooth
+        if self._response is None:
+            return RimsAt(*rims.landing(smooth, self._middle(landing)), np.zeros((2, len(rims.points), 0)))
         if self._last is None or self._last[0] is not rims:
             self._last = rims, np.stack([smooth.at(rims.points, self._middle(one))[0] for one in self._response])
         return RimsAt(*rims.landing(smooth, self._middle(landing)), self._last[1])

@@ -19,13 +19,13 @@ from ...design.parameters.tolerances import Tolerance
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ...raytrace.rays import field_direction
+from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.request import relative_weights, wavelength_points
 from .degrees import FreedomEstimate, prior_spreads
 from .fit_star import SMALLEST_DONUT, StarFit, fit_star
 from .flags import DonutFlag
 from .image_model import BACKGROUND, FLUX, RATIO, STRENGTH, X, Y
 from .inputs import (
-    further_terms,
     noll_indices,
     one_for_each,
     outer_scale_of,
@@ -33,12 +33,13 @@ from .inputs import (
     sky_variances,
     small_length,
 )
-from .joint import JointFit, field_terms, fit_field, fit_freedoms
+from .joint import JointFit, field_terms, fit_field, fit_freedoms, with_freedoms
 from .light import Instrument
 from .likelihood import model_image, pulls
 from .result import DonutFit
 from .seeing import Seeing
 from .stamps import Pixels
+from .terms import WavefrontTerms
 
 #: Seeing that the search starts from [rad].
 _START_FWHM = 0.8 * ARCSEC
@@ -62,6 +63,7 @@ def fit_donuts(
     noll: Iterable[int] = range(4, 23),
     left_out: ArrayLike = 200e-9,
     higher_order: ArrayLike = 0.0,
+    turbulence: Atmosphere | None = None,
     degrees_of_freedom: DegreesOfFreedom | None = None,
     prior: ArrayLike | Mapping[str, Any] | Sequence[Tolerance] | None = None,
     field_noll: Iterable[int] | None = None,
@@ -113,6 +115,10 @@ def fit_donuts(
         Rms of each further Zernike, of the next radial degree at every azimuthal order of `noll` [m]: 10 nm, say, for
         what turbulence leaves in 15 s. They are fitted too, with that prior, and not returned. Without them (0, the
         default) light that they move is taken for low orders, which is worst on an annulus.
+    turbulence : Atmosphere, optional
+        Turbulence of the exposure, its winds and length. The terms up to Z78 that its mean wavefront has beside `noll`
+        are fitted too, with the prior of the closed form, and not returned; its own terms of `noll`, which no single
+        donut tells from the telescope's, are added to `covariance`. Three times the time; no joint fits.
     degrees_of_freedom : DegreesOfFreedom, optional
         Fit these degrees of freedom of the telescope to all donuts together, in place of Zernikes of each.
     prior : array_like, mapping or tolerances, optional
@@ -166,6 +172,8 @@ def fit_donuts(
         raise ConfigError("degrees_of_freedom and field_noll are both given: expected one of them")
     if prior is not None and degrees_of_freedom is None:
         raise ConfigError("prior: expected degrees_of_freedom with it")
+    if turbulence is not None and not (degrees_of_freedom is None and field_noll is None):
+        raise ConfigError("turbulence: expected fits of single donuts, no degrees_of_freedom or field_noll with it")
     stack, shapes = padded(images, "images", np.float64, np.nan)
     count = len(stack)
     angles = np.atleast_2d(radians(fields, "fields"))
@@ -179,7 +187,8 @@ def fit_donuts(
     left, size = (small_length(v, n) for v, n in ((left_out, "left_out"), (higher_order, "higher_order")))
     # Joint fits share their terms: those of single donuts would have a prior of their own at every field term.
     spare = left if field_noll is None else 0.0
-    further, precision = further_terms(terms, *((spare, size) if degrees_of_freedom is None else (0.0, 0.0)))
+    others = (spare, size) if degrees_of_freedom is None else (0.0, 0.0)
+    wavefront = WavefrontTerms.of(terms, *others, telescope, turbulence)
     field_indices = None if field_noll is None else noll_indices(field_noll, "field_noll", 1)
     shifts = one_for_each(metres(defocus, "defocus"), count, "defocus")
     if (np.abs(shifts) > _MOST_DEFOCUS).any():
@@ -203,8 +212,8 @@ def fit_donuts(
         require_positive(metres(pixel_size, "pixel_size"), "pixel_size", "metres"),
         Seeing(float(waves[len(waves) // 2]), outer_scale_of(outer_scale)),
         spread,
-        np.concatenate([terms, further]),
-        np.concatenate([np.zeros(len(terms)), precision]),
+        wavefront.every,
+        wavefront.precision,
         focal_plane,
         cells,
         diffraction,
@@ -229,7 +238,7 @@ def fit_donuts(
         )
         if progress is not None:
             progress(1)
-        return found
+        return found if degrees_of_freedom is None else with_freedoms(instrument, found, degrees_of_freedom)
 
     with one_blas_thread(), ThreadPoolExecutor(thread_count(threads)) as pool:
         stars = list(pool.map(one, range(count)))
@@ -255,7 +264,7 @@ def fit_donuts(
             )
             solution = result.solution
             estimate = FreedomEstimate(degrees_of_freedom, solution.shared, solution.shared_covariance, spreads)
-    return _collected(instrument, terms, stack, angles, stars, usable, result, estimate, field_indices)
+    return _collected(instrument, wavefront, stack, angles, stars, usable, result, estimate, field_indices)
 
 
 def _fit_one(
@@ -292,7 +301,7 @@ def _fit_one(
 
 def _collected(
     instrument: Instrument,
-    noll: np.ndarray,
+    wavefront: WavefrontTerms,
     stack: np.ndarray,
     angles: np.ndarray,
     stars: list[StarFit],
@@ -302,7 +311,7 @@ def _collected(
     field_noll: np.ndarray | None,
 ) -> DonutFit:
     """Return the result of single fits, or of a joint one."""
-    count, n_noll = len(stars), len(noll)
+    count, noll, n_noll = len(stars), wavefront.asked, len(wavefront.asked)
     zernikes, covariance = np.full((count, n_noll), np.nan), np.full((count, n_noll, n_noll), np.nan)
     values, errors = np.full((2, count, 8), np.nan)
     chi2, n_pixels = np.full(count, np.nan), np.zeros(count, dtype=np.int64)
@@ -320,11 +329,14 @@ def _collected(
         ny, nx = full.image.shape
         best = star.model if joint is None else None
         best = model_image(full, found, solution.waves[place]) if best is None else best
+        if joint is not None:
+            full.release()
         model[i, :ny, :nx] = best
         used[i, :ny, :nx] = full.used
         chi2[i], n_pixels[i] = (pulls(full, best)[full.used] ** 2).sum(), full.used.sum()
         if joint is None:
-            zernikes[i], covariance[i] = solution.shared[:n_noll], solution.shared_covariance[:n_noll, :n_noll]
+            zernikes[i] = solution.shared[:n_noll]
+            covariance[i] = solution.shared_covariance[:n_noll, :n_noll] + wavefront.air
         else:
             along = joint.zernike_map[k, :n_noll]
             zernikes[i], covariance[i] = joint.zernikes[k, :n_noll], along @ solution.shared_covariance @ along.T

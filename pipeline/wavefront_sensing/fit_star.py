@@ -164,6 +164,7 @@ class _StarFitter:
         n = len(self._precision)
         self._map = np.eye(n)[None] if wavefront else np.zeros((1, n, 0))
         self._rays: dict[int, ZernikeRays] = {}
+        self._binned: dict[int, Pixels] = {}
         #: Cells across the pupil that the last fits are expected to need, so that the first ones share them.
         self._across = self._sampling(self._fwhm, self._side(self._fwhm))[1].across
 
@@ -196,7 +197,9 @@ class _StarFitter:
         else:
             fwhm = float(instrument.seeing.fwhm(found.stars[0][STRENGTH]))
             wave = slice(len(instrument.noll)) if len(found.shared) else slice(0)
-            error = math.sqrt(np.trace(found.shared_covariance[wave, wave])) or math.inf
+            # Pixels without noise, whatever variance is claimed for them, know the wavefront better than claimed.
+            noise = min(found.loss / last.stamp.used.sum(), 1.0)
+            error = math.sqrt(noise * np.trace(found.shared_covariance[wave, wave])) or math.inf
             if not self._sampling(_ENOUGH * fwhm, last.pixels.side, _ENOUGH * error)[1].finer_than(last.sampling):
                 return last
             pixels, sampling = self._sampling(fwhm, min(self._side(fwhm), last.pixels.side), error)
@@ -205,7 +208,7 @@ class _StarFitter:
         return _Fine(stamp, pixels, sampling)
 
     def _sampling(self, fwhm: float, side: int, error: float = math.inf) -> tuple[Pixels, Sampling]:
-        pixels = self._clean.binned(side)
+        pixels = self._binned.get(side) or self._binned.setdefault(side, self._clean.binned(side))
         return pixels, self._instrument.sampling(self._light, pixels, fwhm, error)
 
     def every_pixel(self, fine: _Fine) -> Stamp:

@@ -98,18 +98,20 @@ class ImageGrid:
         #: Place of the centre of the stamp on the grid, (y, x) cells.
         self._middle = [0.5 * (n - 1) * oversampling for n in shape]
         turns = [fft.fftfreq(self._size[0]), fft.rfftfreq(self._size[1])]  # cycles a cell
-        y, x = np.meshgrid(*turns, indexing="ij")
-        self._phase = -2.0 * math.pi * oversampling / pixels.side * np.stack([x, y])  # for shifts in detector pixels
-        wave = 2.0 * math.pi * oversampling / pixel * np.stack([x, y])  # rad/m
+        y, x = np.meshgrid(*turns, indexing="ij", sparse=True)
+        both = np.stack(np.broadcast_arrays(x, y))
+        self._phase = -2.0 * math.pi * oversampling / pixels.side * both  # for shifts in detector pixels
+        wave = 2.0 * math.pi * oversampling / pixel * both  # rad/m
         baseline = np.tensordot(jacobian.T, wave, axes=1) * seeing.wavelength / (2.0 * math.pi)
         self._exponent = seeing.exponent(np.hypot(*baseline))
-        spline = (np.sinc(x) * np.sinc(y)) ** 4
+        spline = np.sinc(x) ** 4 * np.sinc(y) ** 4
         cell = np.prod(np.sinc(np.tensordot(footprint.T, wave, axes=1) / (2.0 * math.pi)), axis=0)
         # A cell of the grid holds less light than a pixel.
         self._detector = (
             oversampling**2
-            * square_transfer(wave[0], wave[1], side * pixels.width)
-            * np.exp(-0.5 * blur**2 * (wave**2).sum(axis=0))
+            * square_transfer(wave[0, :1], wave[1, :, :1], side * pixels.width)
+            * np.exp(-0.5 * blur**2 * wave[0, :1] ** 2)
+            * np.exp(-0.5 * blur**2 * wave[1, :, :1] ** 2)
             * cell
             / spline
         )
@@ -133,31 +135,22 @@ class ImageGrid:
         for axis in (0, 1):
             place = self._middle[1 - axis] + self.oversampling * points[:, axis]
             low = np.floor(place)
-            t = (place - low).astype(np.float32)[:, None]
-            powers = np.concatenate([np.ones_like(t), t, t * t, t**3], axis=1)
-            # The spline and its first three derivatives, per pixel.
-            values.append([powers[:, : 4 - k] @ (self.oversampling**k * _SPLINES[k]) for k in range(4)])
-            indices.append((low.astype(np.int64)[:, None] + np.arange(-1, 3)) % self._size[1 - axis])
-        cells = (indices[1][:, :, None] * self._size[1] + indices[0][:, None, :]).reshape(-1).astype(np.int32)
+            t = (place - low).astype(np.float32)
+            powers = np.stack([np.ones_like(t), t, t * t, t * t * t])
+            # The spline and its first three derivatives, per pixel, shape [4, n]: long rows are quick.
+            values.append([(self.oversampling**k * _SPLINES[k]).T @ powers[: 4 - k] for k in range(4)])
+            indices.append((low.astype(np.int32) + np.arange(-1, 3, dtype=np.int32)[:, None]) % self._size[1 - axis])
+        cells = _by_point(indices[1][:, None] * np.int32(self._size[1]) + indices[0])
         starts = np.arange(0, cells.size + 1, 16, dtype=np.int32)
         shape = (self._size[0] * self._size[1], len(points))
-
-        def taps(along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
-            return np.asarray(along_y[:, :, None] * along_x[:, None, :])
-
-        def matrix(values: np.ndarray) -> csc_array:
-            return csc_array((values.ravel(), cells, starts), shape=shape)
-
         x, y = values
-        (xx, xy), (_, yy) = np.moveaxis(spread.astype(np.float32), 0, -1)[..., None]
+        half_xx, xy, half_yy = (spread[:, [0, 0, 1], [0, 1, 1]] * [0.5, 1.0, 0.5]).astype(np.float32).T
 
         def spline(i: int, j: int) -> csc_array:
             """Return the derivative of order i along x and j along y."""
-            wide_y = y[j] + np.float32(0.5) * yy * y[j + 2]
-            values = taps(x[i], wide_y)
-            values += taps(np.float32(0.5) * xx * x[i + 2], y[j])
-            values += taps(xy * x[i + 1], y[j + 1])
-            return matrix(values)
+            taps = (y[j] + half_yy * y[j + 2])[:, None] * (x[i] + half_xx * x[i + 2])
+            taps += y[j + 1][:, None] * (xy * x[i + 1])
+            return csc_array((_by_point(taps), cells, starts), shape=shape)
 
         return [spline(i, j) for i, j in (((0, 0), (1, 0), (0, 1)) if derivatives else ((0, 0),))]
 
@@ -236,7 +229,7 @@ class ImageGrid:
         deposits = [spline @ weights for spline in splines]
         if response is not None:
             _, along_x, along_y = splines
-            moved = (response / self.pixel * light.weights[:, None]).astype(np.float32)
+            moved = response.astype(np.float32, copy=False) * (weights / np.float32(self.pixel))
             deposits.append(along_x @ moved[0] + along_y @ moved[1])
         if rates is not None and rates.shape[1]:
             deposits.append(splines[0] @ rates.astype(np.float32))
@@ -265,6 +258,11 @@ class ImageGrid:
         for axis in (0, 1):
             spectra[light.where, 1 + axis] -= 1j * (light.wave[:, axis] * self.pixel).astype(np.float32) * found
         spectra[light.where, 3 : 3 + rims.response.shape[2]] += light.slopes(rims) * turn[:, None]
+
+
+def _by_point(taps: np.ndarray) -> np.ndarray:
+    """Return values of the 4 x 4 cells of n points, shape [4, 4, n], point by point, flat."""
+    return np.ascontiguousarray(taps.reshape(16, -1).T).ravel()
 
 
 # Cubic B-spline at t - 1 ... t + 2 by powers of t, 0 <= t < 1, and its derivatives with respect to the point's place.

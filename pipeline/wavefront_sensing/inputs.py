@@ -10,10 +10,7 @@ from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError, shown
 from ...core.units import length, pure_numbers, require_positive
-from ...models.zernike_polynomials import noll_to_nm
 
-# Terms up to the fifth radial degree, and the spherical term of the sixth.
-_LOW_TERMS = 22
 # Largest spread or wavefront [m], and light of a pixel [electron].
 _MOST_LENGTH, _MOST_ELECTRONS = 1e-3, 1e20
 
@@ -50,30 +47,6 @@ def noll_indices(values: Iterable[int], name: str, least: int) -> np.ndarray:
     if not listed or any(int(j) != j or j < least for j in listed) or len(set(listed)) != len(listed):
         raise DomainError(f"{name} = {listed}: expected different Noll indices from {least}")
     return np.array(listed, dtype=np.int64)
-
-
-def further_terms(noll: np.ndarray, left_out: float, higher_order: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return terms to fit beside those asked for, and the inverse variances of their priors [1/m^2].
-
-    They are those up to Z28 where some up to Z22 are left out, and the next radial degree, each if its rms [m] is
-    above 0. Misaligned and bent optics have as much of all terms up to the fifth degree, and a tenth of it beyond.
-    """
-    usual, every = np.arange(4, _LOW_TERMS + 1), np.arange(4, 29)
-    left = np.setdiff1d(every, noll) if left_out > 0.0 and not np.isin(usual, noll).all() else noll[:0]
-    spreads = np.where(left <= _LOW_TERMS, left_out, 0.1 * left_out)
-    following = next_terms(np.concatenate([noll, left])) if higher_order > 0.0 else noll[:0]
-    spreads = np.concatenate([spreads, np.full(len(following), higher_order)])
-    return np.concatenate([left, following]), spreads**-2.0
-
-
-def next_terms(noll: np.ndarray) -> np.ndarray:
-    """Return the Noll indices of the next radial degree at every azimuthal order of some, without these."""
-    highest: dict[int, int] = {}
-    for n, m in map(noll_to_nm, noll):
-        highest[m] = max(highest.get(m, 0), n)
-    wanted = {(n + 2, m) for m, n in highest.items()}
-    last = (max(highest.values()) + 3) * (max(highest.values()) + 4) // 2
-    return np.array([j for j in range(1, last + 1) if noll_to_nm(j) in wanted and j not in noll], dtype=np.int64)
 
 
 def one_for_each(values: np.ndarray, count: int, name: str) -> np.ndarray:

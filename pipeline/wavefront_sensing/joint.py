@@ -17,7 +17,7 @@ from .donut_rays import ZernikeRays
 from .fit_star import StarFit
 from .image_model import STRENGTH
 from .light import Instrument
-from .pupil_cells import pupil_cells
+from .pupil_cells import PupilCells, pupil_cells
 from .solve import Group, Solution, solve
 from .stamps import Pixels
 
@@ -98,8 +98,8 @@ def fit_freedoms(
     identity = np.repeat(np.eye(len(freedoms))[None], len(stars), axis=0)
     shared, unknowns = _start(stars, maps, precision), _star_unknowns(stars)
     for _ in range(_OUTER):
-        moved = [_with_freedoms(instrument, star, freedoms, shared) for star in stars]
-        group = Group(tuple(s.stamp for s in moved if s.stamp), identity, precision, fixed)
+        moved = [_with_vignetting(instrument, star, freedoms, shared) for star in stars]
+        group = Group(tuple(s.stamp for s in moved if s.stamp), identity, precision, fixed, transient=True)
         joint = solve(group, unknowns, shared, steps=_INNER, pool=pool)
         change, shared, unknowns = joint.shared - shared, joint.shared, list(joint.stars)
         if float(change @ np.linalg.solve(joint.shared_covariance, change)) < _SETTLED * len(change):
@@ -115,8 +115,16 @@ def fit_freedoms(
     return JointFit(tuple(moved), joint, found - before, response.matrix[:, noll - 1])
 
 
-def _with_freedoms(instrument: Instrument, star: StarFit, freedoms: DegreesOfFreedom, at: np.ndarray) -> StarFit:
-    """Return a star whose light depends on degrees of freedom, with vignetting and response at some values."""
+def with_freedoms(instrument: Instrument, star: StarFit, freedoms: DegreesOfFreedom) -> StarFit:
+    """Return a star whose light depends on degrees of freedom in place of its own Zernikes."""
+    stamp = star.stamp
+    if stamp is None or star.full is None or not isinstance(stamp.rays, ZernikeRays):
+        return star
+    return _with_cells(instrument, star, freedoms, stamp.rays.cells)
+
+
+def _with_vignetting(instrument: Instrument, star: StarFit, freedoms: DegreesOfFreedom, at: np.ndarray) -> StarFit:
+    """Return a star with the vignetting of some values of the degrees of freedom."""
     light, stamp, solution = star.light, star.stamp, star.solution
     if light is None or stamp is None or solution is None:
         return star
@@ -124,9 +132,19 @@ def _with_freedoms(instrument: Instrument, star: StarFit, freedoms: DegreesOfFre
     pixels = Pixels(stamp.image, stamp.variance, stamp.used, round(stamp.grid.scale))
     across = instrument.sampling(light, pixels, fwhm).across
     cells = pupil_cells(freedoms.apply(light.telescope, at), light.direction, instrument.middle, across)
+    return _with_cells(instrument, star, freedoms, cells)
+
+
+def _with_cells(instrument: Instrument, star: StarFit, freedoms: DegreesOfFreedom, cells: PupilCells) -> StarFit:
+    light, stamp, full = star.light, star.stamp, star.full
+    if light is None or stamp is None or full is None:
+        return star
     waves = (instrument.wavelengths, instrument.wavelength_weights)
-    rays = FreedomRays(light.telescope, light.direction, *waves, cells, freedoms, at, stamp.grid.footprint)
-    return replace(star, stamp=replace(stamp, rays=rays))
+    rays = FreedomRays(light.telescope, light.direction, *waves, cells, freedoms, stamp.grid.footprint)
+    stamp, full = replace(stamp, rays=rays), replace(full, rays=rays)
+    stamp.release()
+    full.release()
+    return replace(star, stamp=stamp, full=full)
 
 
 def _star_unknowns(stars: Sequence[StarFit]) -> list[np.ndarray]:

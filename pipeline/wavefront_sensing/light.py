@@ -27,6 +27,8 @@ _SURVEY, _FEWEST, _MOST = 48, 48, 400
 #: Error that cells leave in a wavefront [m], the part of the error of the photons that it may be, and the power of the
 #: first by which the number of cells goes: 2.9 nm with 60 cells, 0.9 with 120 (LSST, 1.5 mm, 0.8").
 _CELLS_LEAVE, _SMALL, _FALL = 2.9e-9, 0.2, 0.55
+#: Error of the photons [m] below which cells become no smaller.
+_LEAST_ERROR = 0.5e-9
 #: Spacing of landing points over the FWHM of the blur, which smooths what cells on rims leave.
 _SPACING = 0.5
 #: FWHM of the blur in cells of the grid beyond which the cells resolve it; finest grid, in cells along a pixel.
@@ -135,7 +137,7 @@ class Instrument:
         oversampling = min(max(math.ceil(_RESOLVED * distance / max(width, 1e-12)), 1), _FINEST)
         # A lattice as fine as the grid leaves no pattern where nothing else blurs it.
         spacing = _SPACING * width if oversampling == 1 else distance / oversampling
-        finer = max((_CELLS_LEAVE / (_SMALL * max(error, 1e-12))) ** _FALL, 1.0)
+        finer = max((_CELLS_LEAVE / (_SMALL * max(error, _LEAST_ERROR))) ** _FALL, 1.0)
         across = self.n_pupil or min(max(math.ceil(finer * light.diameter / spacing), _FEWEST), _MOST)
         return Sampling(oversampling, across)
 

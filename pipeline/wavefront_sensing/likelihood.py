@@ -43,6 +43,12 @@ class Stamp:
     grid: ImageGrid
     rays: LightRays
 
+    def release(self) -> None:
+        """Free what the model can compute again."""
+        self.rays.release()
+        if self.grid.rim_light is not None:
+            self.grid.rim_light.release()
+
 
 @dataclass(frozen=True)
 class NormalEquations:

@@ -64,6 +64,10 @@ class PupilCells:
         """Polynomials through values at the points."""
         return PupilPolynomials(self.points, self.center, self.side)
 
+    def release(self) -> None:
+        """Free the polynomials; they are made again when they are needed."""
+        self.__dict__.pop("smooth", None)
+
     def magnification(self, landing: np.ndarray) -> np.ndarray:
         """Return the derivative of landing points [n, 2] along the pupil, shape [n, 2, 2], by smooth polynomials."""
         return self.smooth.derivatives(landing)

@@ -54,7 +54,8 @@ class DonutFit(Result):
         :func:`~pachon.wavefront_opd` of the true telescope minus those of the telescope given; positive where the
         wavefront leads.
     covariance : ndarray, shape [n, n_noll, n_noll]
-        Covariance of `zernikes` [m^2]: the inverse of Fisher's information, the Cramer-Rao bound.
+        Covariance of `zernikes` [m^2]: the inverse of Fisher's information, the Cramer-Rao bound; with
+        ``turbulence``, and the covariance of the air's own wavefront.
     noll : ndarray of int, shape [n_noll]
         Noll indices.
     flux, flux_error : ndarray, shape [n]

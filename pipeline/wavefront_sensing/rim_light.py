@@ -90,6 +90,11 @@ class RimLight:
             self._slopes, self._bent = self._over_lattice(found), at.landing
         return self._slopes
 
+    def release(self) -> None:
+        """Free the transfer function and its derivatives."""
+        self._landing, self._bent = np.full((2, 1, 2), np.inf)
+        self._transfer, self._slopes = np.zeros(0, dtype=np.complex64), np.zeros((0, 0), dtype=np.complex64)
+
     def _at_where(self, values: np.ndarray) -> np.ndarray:
         return np.asarray(values[:, self.where].T)
 

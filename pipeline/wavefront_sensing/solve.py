@@ -36,12 +36,16 @@ class Group:
         Inverse variances of Gaussian priors about zero; 0 for none.
     fixed_strength : bool
         Whether the strengths of the turbulence are held.
+    transient : bool
+        Whether what the model of a star can compute again is freed after each of its normal equations: memory then
+        hardly grows with the number of stars.
     """
 
     stamps: tuple[Stamp, ...]
     maps: np.ndarray
     precision: np.ndarray
     fixed_strength: bool = False
+    transient: bool = False
 
 
 @dataclass(frozen=True)
@@ -157,7 +161,11 @@ def _linearize(group: Group, joined: np.ndarray, sizes: list[int], pool: Executo
     shared = joined[n_star:]
 
     def one(i: int) -> NormalEquations:
-        return normal_equations(group.stamps[i], joined[bounds[i] : bounds[i + 1]], group.maps[i] @ shared)
+        stamp = group.stamps[i]
+        equations = normal_equations(stamp, joined[bounds[i] : bounds[i + 1]], group.maps[i] @ shared)
+        if group.transient:
+            stamp.release()
+        return equations
 
     apply: Callable[..., object] = map if pool is None else pool.map
     found: list[NormalEquations] = list(apply(one, range(len(group.stamps))))  # type: ignore[call-overload]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
+from scipy.ndimage import gaussian_filter1d, maximum_filter, median_filter, minimum_filter
 from scipy.signal import fftconvolve
 
 #: A pixel this many standard deviations above its neighbours, and this much brighter, is no part of a donut.
@@ -55,22 +55,25 @@ class Pixels:
         if side == 1:
             return self
         blur = _SMOOTHING * side
-        weight = gaussian_filter(self.used.astype(np.float64), blur, mode="constant")
-        scale = side**2 / np.maximum(weight, 1e-12)
         count = [(n - 1) // side + 1 for n in self.image.shape]
         first = [(n - 1 - (m - 1) * side) // 2 for n, m in zip(self.image.shape, count, strict=True)]
         rows, columns = (slice(a, a + (m - 1) * side + 1, side) for a, m in zip(first, count, strict=True))
 
         def sampled(values: np.ndarray) -> np.ndarray:
-            return (gaussian_filter(np.where(self.used, values, 0.0), blur, mode="constant") * scale)[rows, columns]
+            along_y = gaussian_filter1d(np.where(self.used, values, 0.0), blur, axis=0, mode="constant")[rows]
+            return np.asarray(gaussian_filter1d(along_y, blur, axis=1, mode="constant")[:, columns])
 
+        weight = sampled(np.ones_like(self.image))
+        scale = side**2 / np.maximum(weight, 1e-12)
         lost = [
             (0.5 * (n - 1) - a) / side - 0.5 * (m - 1) for n, a, m in zip(self.image.shape, first, count, strict=True)
         ]
         # Near the edges of the stamp and of masked regions values are those of places farther in.
-        used = (weight > _MOSTLY_USED)[rows, columns]
+        used = weight > _MOSTLY_USED
         offset = (lost[1], lost[0])
-        return Pixels(sampled(self.image), sampled(self.variance), used, side, 1, blur, offset)
+        even = bool((self.variance == self.variance[0, 0]).all())
+        variance = self.variance[0, 0] * weight if even else sampled(self.variance)
+        return Pixels(scale * sampled(self.image), scale * variance, used, side, 1, blur, offset)
 
     def binned(self, side: int) -> Pixels:
         """Return sums over squares of so many pixels; a square with an unused pixel is unused."""

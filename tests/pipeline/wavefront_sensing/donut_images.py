@@ -33,10 +33,35 @@ def donut(
     radius = 0.5 * tel.pupil_diameter
     angle, half = 0.4567, 1.45
     u = ((np.arange(rays * half) + 0.5) / (rays * half) * 2.0 - 1.0) * half * radius
-    x, y = (v.ravel() for v in np.meshgrid(u, u))
-    x, y = x * np.cos(angle) - y * np.sin(angle), x * np.sin(angle) + y * np.cos(angle)
-    near = np.hypot(x, y) < 1.02 * radius
-    x, y = x[near], y[near]
+    chief = pachon.trace(tel, pachon.launch_rays(tel, field, WAVELENGTH, (0.0, 0.0)))
+    detector = tel.surfaces[-1]
+    margin = 8
+    n = size + 2 * margin
+    edges = (np.arange(n * FINE + 1) / FINE) - 0.5 * n
+    fine, count = np.zeros((n * FINE, n * FINE)), 0
+    # Some rows of the lattice at a time.
+    for rows in np.array_split(u, max(rays // 100, 1)):
+        x, y = (v.ravel() for v in np.meshgrid(u, rows))
+        x, y = x * np.cos(angle) - y * np.sin(angle), x * np.sin(angle) + y * np.cos(angle)
+        near = np.hypot(x, y) < 1.02 * radius
+        x, y = x[near], y[near]
+        if not len(x):
+            continue
+        end = pachon.trace(tel, _light(tel, field, x, y, zernikes))
+        place = (detector.to_local(end.position) - detector.to_local(chief.position))[:, :2] / pixel + np.asarray(shift)
+        place = place[end.status == 0]
+        count += len(place)
+        fine += np.histogram2d(place[:, 1], place[:, 0], [edges, edges])[0]
+    # The bins blur too, by a twelfth of their square.
+    left = np.sqrt(max(blur**2 * FINE**2 - 1.0 / 12.0, 0.0))
+    fine = gaussian_filter(fine, left, mode="constant", truncate=6.0) if blur else fine
+    image = fine.reshape(n, FINE, n, FINE).sum(axis=(1, 3))[margin:-margin, margin:-margin]
+    return flux * image / count
+
+
+def _light(tel, field, x, y, zernikes):
+    """Rays of a star through points of the entrance pupil, turned by a wavefront."""
+    radius = 0.5 * tel.pupil_diameter
     slope = np.tan(np.asarray(field))
     light = np.array([*slope, -1.0]) / np.sqrt(1.0 + slope @ slope)
     cosines = np.tile(light[:2], (len(x), 1))
@@ -46,18 +71,7 @@ def donut(
     direction = np.column_stack([cosines, -np.sqrt(1.0 - (cosines**2).sum(axis=1))])
     point = np.column_stack([x, y, np.full(len(x), tel.stop_z)])
     back = (point * direction).sum(axis=1) + tel.launch_distance
-    end = pachon.trace(tel, pachon.Rays(point - direction * back[:, None], direction, np.zeros(len(x)), WAVELENGTH))
-    chief = pachon.trace(tel, pachon.launch_rays(tel, field, WAVELENGTH, (0.0, 0.0)))
-    detector = tel.surfaces[-1]
-    place = (detector.to_local(end.position) - detector.to_local(chief.position))[:, :2] / pixel + np.asarray(shift)
-    place = place[end.status == 0]
-    margin = 8
-    n = size + 2 * margin
-    edges = (np.arange(n * FINE + 1) / FINE) - 0.5 * n
-    fine = np.histogram2d(place[:, 1], place[:, 0], [edges, edges])[0]
-    fine = gaussian_filter(fine, blur * FINE, mode="constant") if blur else fine
-    image = fine.reshape(n, FINE, n, FINE).sum(axis=(1, 3))[margin:-margin, margin:-margin]
-    return flux * image / len(place)
+    return pachon.Rays(point - direction * back[:, None], direction, np.zeros(len(x)), WAVELENGTH)
 
 
 def noisy(image, sky, seed):
