@@ -26,11 +26,14 @@ MAX_ALIASED = 1_000_000
 _NODE = 20
 #: Most levels of lists and mappings, far below Python's limit of recursion.
 MAX_DEPTH = 50
+_TOO_DEEP = f"more than {MAX_DEPTH} levels of nesting"
 #: Longest text of an integer: YAML's base 60 takes a time that grows with its square.
 MAX_DIGITS = 100
 #: Longest reason of a problem in an error message: some hold a name of the file's.
 _MAX_REASON = 200
 _MERGE = "tag:yaml.org,2002:merge"
+# What libyaml says of nesting beyond a limit of its own, which it meets before ours where brackets stand in a row.
+_LIBYAML_NESTING = "exceeded maximum nesting depth"
 
 
 def _parser() -> Any:
@@ -72,7 +75,7 @@ class _StrictLoader(yaml.composer.Composer, _Parser, yaml.constructor.SafeConstr
         event = self.peek_event()
         is_alias, mark = isinstance(event, yaml.AliasEvent), event.start_mark
         if self._depth == MAX_DEPTH:
-            raise yaml.composer.ComposerError(None, None, f"more than {MAX_DEPTH} levels of nesting", mark)
+            raise yaml.composer.ComposerError(None, None, _TOO_DEEP, mark)
         before = self._size
         self._depth += 1
         node = super().compose_node(parent, index)
@@ -93,6 +96,27 @@ class _StrictLoader(yaml.composer.Composer, _Parser, yaml.constructor.SafeConstr
             text = f"more than {self._max_size} characters, {_NODE} of them for each value"
             raise yaml.composer.ComposerError(None, None, text, mark)
         return node
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Write merged keys into a mapping: its own override them, and those of earlier mappings those of later ones.
+
+        PyYAML 6.0.4 lets the keys of a mapping that is merged into override its own, where that is merged in turn.
+        """
+        own: list[tuple[yaml.Node, yaml.Node]] = []
+        merged: dict[Hashable, tuple[yaml.Node, yaml.Node]] = {}
+        for key, value in node.value:
+            if key.tag != _MERGE:
+                own.append((key, value))
+                continue
+            for part in value.value if isinstance(value, yaml.SequenceNode) else [value]:
+                if not isinstance(part, yaml.MappingNode):
+                    text = f"expected a mapping or list of mappings for merging, but found {part.id}"
+                    raise yaml.constructor.ConstructorError(None, None, text, part.start_mark)
+                self.flatten_mapping(part)
+                # Of equal keys the last one counts, which is the part's own.
+                for name, pair in {pair[0].value: pair for pair in part.value}.items():
+                    merged.setdefault(name, pair)
+        node.value = [*merged.values(), *own]
 
     def check_keys(self, node: yaml.MappingNode) -> None:
         """Raise a ConstructorError for a key that is no name or occurs twice in a mapping or one merged into it."""
@@ -150,9 +174,9 @@ def read_mapping(
     except yaml.MarkedYAMLError as problem:
         mark = problem.problem_mark or problem.context_mark
         place = f"line {mark.line + 1}" if mark else None
-        raise error(
-            f"not valid YAML: {_short_reason(problem.problem or problem.context)}", file=path, place=place
-        ) from None
+        reason = problem.problem or problem.context
+        text = _TOO_DEEP if reason == _LIBYAML_NESTING else _short_reason(reason)
+        raise error(f"not valid YAML: {text}", file=path, place=place) from None
     except (yaml.YAMLError, ValueError, ArithmeticError, LookupError, AttributeError) as problem:
         # PyYAML raises the others for values that do not fit their tags.
         raise error(f"not valid YAML: {_short_reason(problem)}", file=path) from None
