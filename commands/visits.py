@@ -62,7 +62,7 @@ def visits_command(
     **Examples**
 
     - `pachon visits --raft R22`: ten visits of the central raft, a minute on two cores
-    - `pachon visits --all -n 100 -o full`: 100 visits of 189 CCDs, two hours
+    - `pachon visits --all -n 100 -o full`: 100 visits of 189 CCDs, an hour and a half
     - `pachon visits --all -n 200 -o full --resume --processes 2`: a hundred more, two visits side by side
     - `pachon visits --rotator random`: the camera turned against the telescope too, by up to 90 degrees
     - `pachon visits -n 2 --roll 0,0 --rotator 0,45`: a telescope that stands still on the sky, its camera turned

@@ -30,7 +30,7 @@ _FOUND = [
 #: Figures and tables in the order of the paper.
 FIGURES = {each.name: each for each in sorted(_FOUND, key=_number)}
 # Approximate time of the run, of the visits and of their galaxies, at the scales `small` and `paper` [min].
-_SHARED_MINUTES = {"of_run": (0.5, 24.0), "of_visits": (0.4, 200.0), "of_galaxies": (0.6, 600.0)}
+_SHARED_MINUTES = {"of_run": (0.5, 24.0), "of_visits": (0.4, 90.0), "of_galaxies": (0.6, 600.0)}
 _ALL = "all"
 
 
