@@ -244,8 +244,8 @@ def with_true_aperture(telescope: Telescope) -> Telescope:
     """Return a telescope of the same rays whose stop and stated aperture make its entrance pupil, where there is one.
 
     A focal ratio that a change has made untrue becomes the diameter of the pupil, which stays. Where rays are aimed at
-    the stop, the entrance pupil moves to where the stop is imaged now; elsewhere the plane of the pupil stays, and what
-    its stop does not make is left as it is.
+    the stop, the entrance pupil moves to where the stop is imaged now; elsewhere the plane of the pupil stays, whether
+    or not the stop makes it.
     """
     data = telescope.design_data
     if data.stop is None or data.aperture is None or data.telecentric or stop_makes_pupil(telescope):
@@ -257,7 +257,17 @@ def with_true_aperture(telescope: Telescope) -> Telescope:
         # Surfaces off the axis have no such image; the rays do not depend on it.
         with suppress(DomainError):
             stated = with_floating_pupil(stated)
-    return stated if stop_states_rays(stated) else telescope
+    untrue = data.aperture in ("f_number", "working_f_number") and not _states_diameter(telescope)
+    return stated if untrue or stop_states_rays(stated) else telescope
+
+
+def _states_diameter(t: Telescope) -> bool:
+    """Return whether the stated aperture makes the diameter of the pupil, or cannot be compared with it."""
+    try:
+        made = with_floating_pupil(t)
+    except DomainError:
+        return True
+    return math.isclose(made.pupil_diameter, t.pupil_diameter, rel_tol=_ROUNDING)
 
 
 def require_on_axis(surface: Surface, name: str) -> None:
