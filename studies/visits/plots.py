@@ -103,7 +103,10 @@ def density_picture(results: Mapping[int, NullTest]) -> bytes:
         axes.plot(density, noise, "-", color="0.5", label="shot noise")
         axes.plot(density, found, "o", color=BLUE, label="mean $|\\xi_+|$ of the galaxies")
         for result, x, y in zip(results.values(), density, found, strict=True):
-            axes.annotate(_visits(result.visits), (x, y), xytext=(6, 4), textcoords="offset points", fontsize=8)
+            # Beside the point, towards the middle of the axes.
+            ahead, side = (-6, "right") if x > np.sqrt(density.min() * density.max()) else (6, "left")
+            label = _visits(result.visits)
+            axes.annotate(label, (x, y), xytext=(ahead, -10), textcoords="offset points", ha=side, fontsize=8)
         slope = density_slope(density, found)
         log_axes(axes, "" if slope is None else f"slope {slope:.2f}; paper: -0.97 ± 0.06")
         axes.set(xlabel="usable galaxies per arcmin²", ylabel="amplitude")
