@@ -10,6 +10,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import current_process, get_context
+from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 from .errors import ProductError
@@ -38,7 +39,8 @@ def second_process(threads: int | None = None) -> Iterator[Submit]:
     pool = ProcessPoolExecutor(1, mp_context=get_context("fork"), initializer=begin_worker, initargs=(os.getpid(),))
 
     def submit(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-        future = pool.submit(function, *arguments)
+        # The pool would pickle arguments in a thread of its own, while this one goes on to change what they hold.
+        future = pool.submit(_run_pickled, bytes(ForkingPickler.dumps((function, arguments))))
         return lambda: _result(future)
 
     try:
@@ -47,6 +49,11 @@ def second_process(threads: int | None = None) -> Iterator[Submit]:
         yield submit
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _run_pickled(call: bytes) -> Any:
+    function, arguments = ForkingPickler.loads(call)
+    return function(*arguments)
 
 
 def _run_at_once(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:

@@ -33,6 +33,28 @@ def test_computations_are_done_by_one_other_process():
         os.kill(other, 0)
 
 
+class Recorded:
+    """Argument that records the threads in which it is pickled."""
+
+    def __init__(self, threads):
+        self.threads = threads
+
+    def __reduce__(self):
+        self.threads.append(threading.get_ident())
+        return int, (7,)
+
+
+@needs_linux
+def test_arguments_are_those_of_the_moment_of_the_call():
+    # Pickled in another thread, an object that this one goes on to change ended a run, now and then.
+    numbers, threads = [1, 2], []
+    with second_process(2) as submit:
+        total, seven = submit(sum, numbers), submit(abs, Recorded(threads))
+        numbers.append(10)
+        assert (total(), seven()) == (3, 7)
+    assert threads == [threading.get_ident()]
+
+
 def test_one_thread_has_one_process():
     with second_process(1) as submit:
         assert submit(os.getpid)() == os.getpid()
