@@ -16,8 +16,9 @@ from ..core.errors import ProductError
 from ..core.plotting import axes_at, plain_text, styled
 from ..core.products import Columns, Stamp, column, read_fits, table_hdu, write_fits
 from ..core.result import Result
+from ..core.units import ARCSEC
 from .exposure import MASK_BITS
-from .stretch import draw_image
+from .stretch import draw_image, pixel_scale_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -108,7 +109,7 @@ class CcdImage(Result):
     @property
     def pixel_scale(self) -> float:
         """Angle of a pixel at the reference point of the world coordinates [rad]."""
-        return float(np.deg2rad(np.sqrt(abs(np.linalg.det(self.wcs.pixel_scale_matrix)))))
+        return pixel_scale_of(self.header) * ARCSEC
 
     @check_arguments
     def write(self, path: str | Path) -> None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy.io import fits
+from astropy.wcs import WCS
 
 from ..core.plotting import ORANGE
 
@@ -39,7 +40,7 @@ def sky_level(header: fits.Header) -> float:
 
 def pixel_scale_of(header: fits.Header) -> float:
     """Return the side of a pixel at the reference point [arcsec]."""
-    return float(np.sqrt(abs(np.linalg.det(_cd(header))))) * 3600.0
+    return float(np.sqrt(abs(np.linalg.det(WCS(header).pixel_scale_matrix)))) * 3600.0
 
 
 def _cd(header: fits.Header) -> np.ndarray:
