@@ -50,19 +50,28 @@ def thickness(telescope: Telescope, index: int) -> float:
     return float(light_axis(telescope, index) @ (behind - here))
 
 
-def impossible_thicknesses(telescope: Telescope) -> list[str]:
-    """Return a text for each glass of negative thickness on the axis, up to the first surface that is tilted.
+def impossible_glasses(telescope: Telescope) -> list[int]:
+    """Return the surfaces in front of glass of negative thickness on the axis, up to the first that is tilted.
 
     A negative distance in air is none: dummy surfaces and virtual images have one.
     """
-    found: list[str] = []
-    name, unit = telescope.length_unit
+    found = []
     for i, surface in enumerate(telescope.surfaces[:-1]):
         if surface.matrix[2, 2] != 1.0 or telescope.surfaces[i + 1].matrix[2, 2] != 1.0:
             break
-        if surface.medium_after != telescope.medium_before and (distance := thickness(telescope, i)) < 0.0:
-            glass = surface.medium_after.name or "glass"
-            found.append(f"surface {surface.name}: {glass} of thickness {distance / unit:.6g} {name}: expected from 0")
+        if surface.medium_after != telescope.medium_before and thickness(telescope, i) < 0.0:
+            found.append(i)
+    return found
+
+
+def impossible_thicknesses(telescope: Telescope) -> list[str]:
+    """Return a text for each of the :func:`impossible_glasses`."""
+    found: list[str] = []
+    name, unit = telescope.length_unit
+    for i in impossible_glasses(telescope):
+        surface = telescope.surfaces[i]
+        glass, distance = surface.medium_after.name or "glass", thickness(telescope, i)
+        found.append(f"surface {surface.name}: {glass} of thickness {distance / unit:.6g} {name}: expected from 0")
     return found
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from ...models.aperture import Annulus, Aperture, Circle, Complement, Ellipse, Intersection, Polygon, Rectangle, Union
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
+from ...models.thickness import impossible_glasses
 from ...raytrace.pack.surfaces import refractive_indices
 from ...raytrace.rays import Rays, RayStatus
 from ...raytrace.trace import trace
@@ -162,13 +163,14 @@ def drawn_radii(request: Request) -> dict[str, float]:
 
 
 def find_lenses(telescope: Telescope, wavelength: float) -> tuple[Lens, ...]:
-    """Return the pieces of glass between neighbouring surfaces."""
+    """Return the pieces of glass between neighbouring surfaces; one of negative thickness is none."""
+    impossible = impossible_glasses(telescope)
     index = refractive_indices(telescope, wavelength)
     # Planes inside a lens, such as its stop, do not divide it.
     acting = [k for k, s in enumerate(telescope.surfaces) if s.interaction in (Interaction.REFRACT, Interaction.MIRROR)]
     found = []
     for front, back in pairwise(acting):
-        if index[front + 1] >= _GLASS:
+        if index[front + 1] >= _GLASS and front not in impossible:
             names = telescope.surfaces[front].name, telescope.surfaces[back].name
             found.append(Lens(_common_name(*names), *names, float(index[front + 1])))
     return tuple(found)

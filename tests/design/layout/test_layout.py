@@ -11,7 +11,7 @@ import pachon
 from pachon.core.plotting import png_bytes
 from pachon.design.layout.layout import layout
 from pachon.design.layout.meshes import surface_mesh, tubes
-from pachon.design.layout.sections import outer_radius, surface_section
+from pachon.design.layout.sections import find_lenses, outer_radius, surface_section
 from pachon.models.aperture import Annulus, Circle, Complement, Intersection, Polygon, Rectangle, Union, Vane
 from pachon.models.media.medium import ConstantIndex
 from pachon.models.obstruction import Obstruction
@@ -94,6 +94,9 @@ def test_lenses_without_rims_end_where_the_light_does(paraboloid):
     )
     mirror, detector = telescope.surfaces
     found = layout(replace(telescope, surfaces=(mirror, *lens, detector)), wavelength=6e-7)
+    # Glass whose back stands in front of it has no body that could be drawn.
+    behind = replace(telescope, surfaces=(mirror, lens[0], replace(lens[1], vertex=(0.0, 0.0, 1.48)), detector))
+    assert find_lenses(behind, 6e-7) == ()
     assert found.lenses[0].name == "A, B"
     # A cone from 0.25 m at the mirror to the field at the focus, seen from the edge of the field: 0.0175 m.
     assert 0.0625 < found.reach["A"] < 0.09
