@@ -90,6 +90,11 @@ def process_workers(compute: Compute, count: int, threads: int | None = None) ->
                 raise ProductError(
                     "a worker process died, killed or short of memory; what was computed is kept, go on with --resume"
                 ) from None
+            except BaseException:
+                # Ctrl-C or an error: nobody will take the results of the jobs under way, which may take minutes.
+                for process in list(pool._processes.values()):
+                    process.terminate()
+                raise
             finally:
                 pool.shutdown(wait=True, cancel_futures=True)
 

@@ -23,7 +23,7 @@ from .stamps import Pixels
 from .vignetting import cells_with_rims, movable_rims, shift_spread
 
 #: Points across the pupil for the size of an image, and the least and most cells for its model.
-_SURVEY, _FEWEST, _MOST = 48, 48, 400
+_SURVEY, _FEWEST, _MOST = 48, 48, 800
 #: Error that cells leave in a wavefront [m], the part of the error of the photons that it may be, and the power of the
 #: first by which the number of cells goes: 2.9 nm with 60 cells, 0.9 with 120 (LSST, 1.5 mm, 0.8").
 _CELLS_LEAVE, _SMALL, _FALL = 2.9e-9, 0.2, 0.55
@@ -32,7 +32,7 @@ _LEAST_ERROR = 0.5e-9
 #: Spacing of landing points over the FWHM of the blur, which smooths what cells on rims leave.
 _SPACING = 0.5
 #: FWHM of the blur in cells of the grid beyond which the cells resolve it; finest grid, in cells along a pixel.
-_RESOLVED, _FINEST = 1.9, 3
+_RESOLVED, _FINEST = 1.9, 5
 #: FWHM of the blur in binned pixels, most pixels along a binned one, least part of the pixels that binning keeps.
 _BINNED, _MOST_BINNED, _KEPT = 1.95, 4, 0.95
 _FWHM_PER_RMS = 2.354820045

@@ -22,17 +22,23 @@ if __name__ == "__main__":
 """
 
 
+def start(folder):
+    """Driver whose worker has begun a job of a minute, and the number of that worker."""
+    (folder / "driver.py").write_text(_DRIVER)
+    driver = subprocess.Popen([sys.executable, "driver.py"], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                              text=True, env={**os.environ, "PYTHONPATH": os.getcwd()})  # fmt: skip
+    return driver, int(driver.stdout.readline())
+
+
 @pytest.mark.long
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="processes are looked up in /proc")
 def test_workers_end_after_their_driver_is_killed(tmp_path):
-    (tmp_path / "driver.py").write_text(_DRIVER)
-    driver = subprocess.Popen([sys.executable, "driver.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True,
-                              env={**os.environ, "PYTHONPATH": os.getcwd()})  # fmt: skip
-    worker = int(driver.stdout.readline())
+    driver, worker = start(tmp_path)
     assert lives(worker)
     driver.send_signal(signal.SIGKILL)
     driver.wait()
     driver.stdout.close()
+    driver.stderr.close()
     for _ in range(40):
         if not lives(worker):
             break
@@ -40,3 +46,17 @@ def test_workers_end_after_their_driver_is_killed(tmp_path):
     else:
         os.kill(worker, signal.SIGKILL)
         pytest.fail("the worker outlived its driver by 4 s")
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="processes are looked up in /proc")
+def test_an_interrupt_does_not_wait_for_jobs_under_way(tmp_path):
+    driver, worker = start(tmp_path)
+    assert lives(worker)
+    driver.send_signal(signal.SIGINT)
+    try:
+        said = driver.communicate(timeout=10.0)[1]
+    finally:
+        driver.kill()
+    assert "KeyboardInterrupt" in said
+    assert not lives(worker)

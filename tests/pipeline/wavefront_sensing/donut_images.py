@@ -11,6 +11,8 @@ WAVELENGTH = 622e-9
 PIXEL, SIZE = 20e-6, 91
 #: Bins along a pixel, so that the blur is nearly that of a continuous image.
 FINE = 4
+#: Pixels around a stamp from which light is blurred into it.
+MARGIN = 8
 
 
 def donut(
@@ -30,15 +32,19 @@ def donut(
 
     ``zernikes`` are coefficients [m] from j = 1 of a wavefront that leads: an incoming ray turns by minus its gradient.
     """
+    return blurred(fine_bins(tel, field, zernikes, shift, rays, size, pixel), blur, flux)
+
+
+def fine_bins(tel, field, zernikes, shift, rays, size, pixel, fine=FINE):
+    """Fraction of the light in each of ``fine`` x ``fine`` bins of every pixel of a stamp with a margin."""
     radius = 0.5 * tel.pupil_diameter
     angle, half = 0.4567, 1.45
     u = ((np.arange(rays * half) + 0.5) / (rays * half) * 2.0 - 1.0) * half * radius
     chief = pachon.trace(tel, pachon.launch_rays(tel, field, WAVELENGTH, (0.0, 0.0)))
     detector = tel.surfaces[-1]
-    margin = 8
-    n = size + 2 * margin
-    edges = (np.arange(n * FINE + 1) / FINE) - 0.5 * n
-    fine, count = np.zeros((n * FINE, n * FINE)), 0
+    n = size + 2 * MARGIN
+    edges = (np.arange(n * fine + 1) / fine) - 0.5 * n
+    bins, count = np.zeros((n * fine, n * fine)), 0
     # Some rows of the lattice at a time.
     for rows in np.array_split(u, max(rays // 100, 1)):
         x, y = (v.ravel() for v in np.meshgrid(u, rows))
@@ -51,12 +57,18 @@ def donut(
         place = (detector.to_local(end.position) - detector.to_local(chief.position))[:, :2] / pixel + np.asarray(shift)
         place = place[end.status == 0]
         count += len(place)
-        fine += np.histogram2d(place[:, 1], place[:, 0], [edges, edges])[0]
+        bins += np.histogram2d(place[:, 1], place[:, 0], [edges, edges])[0]
+    return bins / count
+
+
+def blurred(bins, blur, flux, fine=FINE):
+    """Image [electrons] of the light in fine bins, with a Gaussian blur [pixels]."""
     # The bins blur too, by a twelfth of their square.
-    left = np.sqrt(max(blur**2 * FINE**2 - 1.0 / 12.0, 0.0))
-    fine = gaussian_filter(fine, left, mode="constant", truncate=6.0) if blur else fine
-    image = fine.reshape(n, FINE, n, FINE).sum(axis=(1, 3))[margin:-margin, margin:-margin]
-    return flux * image / count
+    left = np.sqrt(max(blur**2 * fine**2 - 1.0 / 12.0, 0.0))
+    image = gaussian_filter(bins, left, mode="constant", truncate=6.0) if blur else bins
+    n = len(bins) // fine
+    image = image.reshape(n, fine, n, fine).sum(axis=(1, 3))[MARGIN:-MARGIN, MARGIN:-MARGIN]
+    return flux * image
 
 
 def _light(tel, field, x, y, zernikes):

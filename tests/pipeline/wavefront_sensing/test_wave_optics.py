@@ -1,0 +1,71 @@
+"""Donuts of waves: squared Fourier transforms of the pupil under a long exposure, fitted with diffraction."""
+
+import numpy as np
+import pytest
+from scipy import fft
+from scipy.ndimage import map_coordinates
+
+import pachon
+from pachon.raytrace.rays import RayStatus
+from pachon.wavefront.atmosphere.turbulence import coherence, long_exposure_fwhm, structure_function
+from pachon.wavefront.chief_rays import image_jacobians
+
+WAVELENGTH, PIXEL, SIZE, OUTER_SCALE = 620e-9, 10e-6, 161, 25.0
+#: Points of the field along a side, and their distance on the pupil [m].
+COUNT, STEP = 4096, 4e-3
+
+
+@pytest.fixture(scope="module")
+def on_axis(behind_focus):
+    """Transform of the donut on the axis without air, wavenumbers [rad/m], cell [m] and landing over direction [m]."""
+    outer = 0.5 * behind_focus.pupil_diameter
+    inner = behind_focus.pupil_obscuration * outer
+    radius = np.linspace(0.0, outer, 2001)
+    end = pachon.trace(behind_focus, pachon.launch_rays(behind_focus, (0.0, 0.0), WAVELENGTH, (radius, 0.0 * radius)))
+    lit = end.status == RayStatus.OK
+    odd = np.polynomial.polynomial.polyfit(radius[lit] / outer, end.position[lit, 0], range(1, 15, 2))
+    length = float(image_jacobians(behind_focus, np.array([[0.0, 0.0, -1.0]]), WAVELENGTH)[0, 0, 0])
+    # Light lands where the gradient of the wavefront sends it; on the axis all of it is along the radius.
+    path = np.polynomial.polynomial.polyint(odd) * outer / length
+    along = (np.arange(COUNT) - COUNT // 2) * STEP
+    r = np.hypot(along, along[:, None])
+    amplitude = np.clip((outer - r) / STEP + 0.5, 0.0, 1.0) * np.clip((r - inner) / STEP + 0.5, 0.0, 1.0)
+    phase = 2.0 * np.pi / WAVELENGTH * np.polynomial.polynomial.polyval(np.minimum(r, 1.01 * outer) / outer, path)
+    light = np.abs(fft.fft2(fft.ifftshift(amplitude * np.exp(1j * phase)))) ** 2
+    cell = WAVELENGTH * length / (COUNT * STEP)
+    kx, ky = 2.0 * np.pi * fft.rfftfreq(COUNT, cell), 2.0 * np.pi * fft.fftfreq(COUNT, cell)[:, None]
+    return fft.rfft2(light / light.sum()), kx, ky, cell, length
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("r0", "left", "of_rays"), [(0.1045, 4e-9, 30e-9), (0.16, 8e-9, 40e-9)])
+def test_diffraction_is_not_taken_for_wavefront(behind_focus, on_axis, r0, left, of_rays):
+    spectrum, kx, ky, cell, length = on_axis
+    air = coherence(
+        structure_function(np.hypot(kx, ky) * length * WAVELENGTH / (2.0 * np.pi), r0, OUTER_SCALE), WAVELENGTH
+    )
+    pixel = np.sinc(0.5 * kx * PIXEL / np.pi) * np.sinc(0.5 * ky * PIXEL / np.pi)
+    fine = fft.fftshift(fft.irfft2(spectrum * air * pixel, s=(COUNT, COUNT)))
+    at = COUNT // 2 + (np.arange(SIZE) - SIZE // 2) * PIXEL / cell
+    image = 5e6 * (PIXEL / cell) ** 2 * map_coordinates(fine, np.meshgrid(at, at, indexing="ij"), order=5)
+    assert image.sum() == pytest.approx(5e6, rel=2e-4)
+    found = {
+        diffraction: pachon.fit_donuts(
+            behind_focus,
+            image[None],
+            [(0.0, 0.0)],
+            WAVELENGTH,
+            sky_variance=1000.0,
+            outer_scale=OUTER_SCALE,
+            diffusion=0.0,
+            pixel_size=PIXEL,
+            diffraction=diffraction,
+            threads=1,
+        )
+        for diffraction in (False, True)
+    }
+    rss = {key: float(np.linalg.norm(fit.zernikes[0])) for key, fit in found.items()}
+    assert rss[True] < left
+    assert rss[False] > of_rays
+    seeing = long_exposure_fwhm(WAVELENGTH, r0, OUTER_SCALE)
+    assert abs(found[True].fwhm[0] - seeing) < abs(found[False].fwhm[0] - seeing)
