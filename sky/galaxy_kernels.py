@@ -56,6 +56,30 @@ def half_logarithms(x: samples):
     return half
 
 
+@wp.func
+def profile_at(
+    profile: wp.array2d(dtype=wp.float32),
+    item: wp.int32,
+    squared: samples,
+    start: wp.float32,
+    per_step: wp.float32,
+):
+    """Transform of a component at squared wave numbers, interpolated by cubics in their logarithm."""
+    # The logarithm of zero lies below the table, where the transform is 1.
+    at = half_logarithms(squared) * per_step
+    value = samples()
+    for lane in range(LANES):
+        j, v = cell(at[lane] - start, profile.shape[1])
+        w = cubic_weights(v)
+        value[lane] = (
+            w[0] * profile[item, j - 1]
+            + w[1] * profile[item, j]
+            + w[2] * profile[item, j + 1]
+            + w[3] * profile[item, j + 2]
+        )
+    return value
+
+
 @wp.kernel
 def transform_galaxies(
     first: wp.int32,
@@ -102,6 +126,9 @@ def transform_galaxies(
         per_step = 1.0 / steps[3]
         start = steps[2] / steps[3]
         columns = size // 2 + 1
+        # Where packets would hold the last column alone, packets along that column do.
+        left = columns % LANES
+        blocks = wp.where(left == 1, columns // LANES, (columns + LANES - 1) // LANES)
         # Wave vector of the unit circle: (ax kx + ay ky, bx kx + by ky).
         step = two_pi / wp.float64(size)
         ax = wp.float32(step * shape[0, 0])
@@ -114,27 +141,35 @@ def transform_galaxies(
             y = wp.float32(ky)
             angle = step * wp.float64(ky) * place[1]
             phase = wp.vec2d(wp.cos(angle), -wp.sin(angle))
-            for block in range((columns + LANES - 1) // LANES):
+            for block in range(blocks):
                 squared = samples()
                 for lane in range(LANES):
                     x = wp.float32(block * LANES + lane)
                     a = ax * x + ay * y
                     b = bx * x + by * y
                     squared[lane] = a * a + b * b
-                # The logarithm of zero lies below the table, where the transform is 1.
-                at = half_logarithms(squared) * per_step
-                value = samples()
-                for lane in range(LANES):
-                    j, v = cell(at[lane] - start, table.shape[1])
-                    w = cubic_weights(v)
-                    value[lane] = (
-                        w[0] * profile[item, j - 1]
-                        + w[1] * profile[item, j]
-                        + w[2] * profile[item, j + 1]
-                        + w[3] * profile[item, j + 2]
-                    )
+                value = profile_at(profile, item, squared, start, per_step)
                 for lane in range(LANES):
                     column = block * LANES + lane
                     if column < columns:
                         result[item, row, column] += value[lane] * wp.vec2(wp.float32(phase[0]), wp.float32(phase[1]))
                         phase = product(phase, turn)
+        if left == 1:
+            x = wp.float32(columns - 1)
+            for block in range((size + LANES - 1) // LANES):
+                squared = samples()
+                for lane in range(LANES):
+                    row = block * LANES + lane
+                    y = wp.float32(wp.where(row < (size + 1) // 2, row, row - size))
+                    a = ax * x + ay * y
+                    b = bx * x + by * y
+                    squared[lane] = a * a + b * b
+                value = profile_at(profile, item, squared, start, per_step)
+                for lane in range(LANES):
+                    row = block * LANES + lane
+                    if row < size:
+                        ky = wp.where(row < (size + 1) // 2, row, row - size)
+                        angle = step * (wp.float64(columns - 1) * place[0] + wp.float64(ky) * place[1])
+                        result[item, row, columns - 1] += value[lane] * wp.vec2(
+                            wp.float32(wp.cos(angle)), -wp.float32(wp.sin(angle))
+                        )
