@@ -47,6 +47,8 @@ _START_FWHM = 0.8 * ARCSEC
 _MOST_FWHM, _MOST_DEFOCUS, _MOST_CELLS = 60.0 * ARCSEC, 0.1, 2000
 #: Saturated pixels from which on a donut is flagged, as a fraction of the stamp; fewer are left out.
 _SATURATED = 0.002
+#: Electrons up to which pixels of equal value are no sign of saturation.
+_FAINT = 100.0
 #: Chi-square a pixel above which a fit is poor, beside so many standard deviations of the noise's own.
 _POOR, _BY_CHANCE = 1.2, 5.0
 
@@ -146,7 +148,8 @@ def fit_donuts(
     mask : array_like of bool, as `images`, optional
         True at pixels to leave out.
     saturation : float, optional
-        Level from which on pixels are saturated [electrons].
+        Level from which on pixels are saturated [electrons]. Many pixels of the same greatest value are taken to be
+        saturated without it.
     n_pupil : int, optional
         Cells across the pupil; by default as many as an image needs.
     projection : {"zemax", "gnomonic", "postel"}
@@ -285,11 +288,14 @@ def _fit_one(
         return StarFit(DonutFlag.NOT_FINITE)
     if np.hypot(*angles) > instrument.telescope.field_limit * (1.0 + 1e-12):
         return StarFit(DonutFlag.OUTSIDE_FIELD)
+    most = max(_SATURATED * image.size, 1.0)
     if saturation is not None:
         high = (image >= saturation) & ~masked
-        if high.sum() > max(_SATURATED * image.size, 1.0):
+        if high.sum() > most:
             return StarFit(DonutFlag.SATURATED)
         masked = masked | high
+    if _plateau(image[~masked]) > most:
+        return StarFit(DonutFlag.SATURATED)
     try:
         light = instrument.light(direction, defocus)
     except DomainError:
@@ -297,6 +303,15 @@ def _fit_one(
     pixels = Pixels(np.where(masked, 0.0, image), variance, ~masked)
     wavefront = not joint or light.diameter > SMALLEST_DONUT * instrument.pixel
     return fit_star(instrument, light, pixels, strength=strength, fixed_strength=fixed_strength, wavefront=wavefront)
+
+
+def _plateau(values: np.ndarray) -> int:
+    """Return how many pixels have the greatest value, where that is far above the noise of single electrons.
+
+    Pixels with noise hardly agree unless they are saturated.
+    """
+    top = values.max(initial=0.0)
+    return int((values == top).sum()) if top > _FAINT else 0
 
 
 def _collected(

@@ -246,6 +246,36 @@ def test_bad_donuts_are_flagged_and_others_go_on(focused, behind_focus, clean):
     assert np.isnan(fit.flux[bad]).all()
 
 
+@pytest.mark.long
+def test_a_wavefront_that_explains_the_wrong_side_of_focus_is_not_believed(focused):
+    """1.4 um of coma and trefoil make a noisy donut in the corner look like one of the other side."""
+    field = np.deg2rad([-1.19, -1.125])
+    true = focused.perturbed("Detector", shift=(0.0, 0.0, 1.5e-3)).perturbed("M2", shift=(1e-4, 0.0, 0.0))
+    image = noisy(donut(true, field, flux=2e6), 1200.0, 3)
+    behind, front = (
+        pachon.fit_donuts(
+            focused,
+            image[None],
+            [field],
+            WAVELENGTH,
+            defocus=height,
+            sky_variance=1200.0,
+            higher_order=10e-9,
+            **OPTIONS,
+        )
+        for height in (1.5e-3, -1.5e-3)
+    )
+    assert behind.usable.all()
+    assert front.flags.tolist() == [pachon.DonutFlag.DEFOCUS_SIGN]
+
+
+@pytest.mark.long
+def test_a_flat_top_is_saturated_without_a_level(behind_focus, clean):
+    image = np.minimum(noisy(clean, 500.0, 4), 0.5 * clean.max())
+    fit = pachon.fit_donuts(behind_focus, image[None], [FIELD], WAVELENGTH, sky_variance=500.0, **OPTIONS)
+    assert fit.flags.tolist() == [pachon.DonutFlag.SATURATED]
+
+
 def test_no_light_passes_a_closed_telescope(behind_focus, clean):
     from dataclasses import replace
 
