@@ -25,9 +25,8 @@ _FOUND = 8.0
 #: Least gain of twice the logarithm of the likelihood by a second star or another focus, and the largest part of the
 #: misfit that may be left: what turbulence and missing terms of the wavefront do to an image, neither explains.
 _GAIN, _LEFT = 100.0, 0.5
-#: Loss a coarse pixel, or wavefront [m], from which on the other side of focus is tried; part of that wavefront that is
-#: enough there.
-_MISFIT, _LARGE_WAVE, _SMALLER = 1.5, 0.5e-6, 0.5
+#: Loss a coarse pixel from which on the other side of focus is tried; photons leave 0.1, since smoothed noise is small.
+_MISFIT = 0.15
 #: Loss a coarse pixel from which on second stars are searched for at these distances over the diameter of the donut.
 _POOR, _NEAR_RADII, _NEAR_ANGLES = 1.0, (0.08, 0.2), 6
 #: Least flux of a second star over that of the first.
@@ -292,22 +291,12 @@ class _StarFitter:
         return best
 
     def other_focus_is_better(self, pixels: Pixels, stamp: Stamp, here: Solution) -> bool:
-        """Return whether the image fits a detector on the other side of focus better.
-
-        A misfit may say so, or a large wavefront, which makes a donut look like one of the other side.
-        """
-        misfit = here.loss / stamp.used.sum()
-        if misfit < _MISFIT and self._rms(here) < _LARGE_WAVE:
+        """Return whether the image fits a detector on the other side of focus better."""
+        if here.loss / stamp.used.sum() < _MISFIT:
             return False
         other = self.stamp(self._light.mirrored(), pixels)
         start, _ = self.start(other, self.template(other))
-        there = self.solve(other, start, tolerance=COARSE)
-        likelier = here.loss - there.loss > _GAIN * max(misfit, 1.0)
-        return _explains_more(there, here) or (likelier and self._rms(there) < _SMALLER * self._rms(here))
-
-    def _rms(self, solution: Solution) -> float:
-        """Return the wavefront of a solution [m]."""
-        return float(np.linalg.norm(solution.shared[: len(self._instrument.noll)]))
+        return _explains_more(self.solve(other, start, tolerance=COARSE), here)
 
 
 def _explains_more(trial: Solution, other: Solution) -> bool:
