@@ -18,6 +18,8 @@ app = typer.Typer()
 
 _CAPTION = "Completeness and purity of the stars; magnitude at which half of the objects are found; purity of all."
 _MODELS = ("ccd", "focal_plane")
+#: What names of products add to that of an image.
+_CATALOGUE, _PSF = "_galaxies", "_psf"
 
 
 @app.command("measure")
@@ -69,6 +71,9 @@ def measure_command(
         raise ConfigError("--telescope: expected with --model focal_plane alone")
     if out is not None:
         make_folder(out)
+    # Written beside the images, products have names that a pattern of images finds too.
+    products = {path.with_name(f"{path.stem}{added}.fits") for path in images for added in (_CATALOGUE, _PSF)}
+    images = [path for path in images if path not in products]
     kind: dict[str, Any] = {"basis": basis, "interpolation": interpolation, "order": order}
     found = {}
     with interruptible(quiet, "catalogues that are written stay") as reporter:
@@ -82,8 +87,8 @@ def measure_command(
                 catalogue = measure_image(CcdImage.read(path), psf=psf, **kind, min_snr=min_snr, threads=threads)
                 folder = path.parent if out is None else out
                 if psf is None:
-                    catalogue.psf.write(folder / f"{path.stem}_psf.fits")
-                write_table(folder / f"{path.stem}_galaxies.fits", catalogue.table())
+                    catalogue.psf.write(folder / f"{path.stem}{_PSF}.fits")
+                write_table(folder / f"{path.stem}{_CATALOGUE}.fits", catalogue.table())
                 found[path.name] = catalogue.metrics()
                 stage.advance()
                 stage.step(path.name, number, len(images))

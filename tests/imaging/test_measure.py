@@ -140,6 +140,12 @@ def test_the_command_writes_catalogue_and_psf(image, catalogue, tmp_path, capsys
     table = Table.read(tmp_path / "out" / "image_galaxies.fits")
     np.testing.assert_array_equal(table["e1"], catalogue.fits.e1)
     assert fits.getheader(tmp_path / "out" / "image_psf.fits")["SIMPLE"]
+    # Products beside the images, which image*.fits finds too, are no images.
+    for name in ("image_galaxies.fits", "image_psf.fits"):
+        (tmp_path / name).write_bytes((tmp_path / "out" / name).read_bytes())
+    given = [str(path) for path in sorted(tmp_path.glob("image*.fits"))]
+    assert main(["measure", *given, "--json", "--quiet", "-o", str(tmp_path / "again")]) == 0
+    assert list(json.loads(capsys.readouterr().out)["images"]) == ["image.fits"]
 
 
 @pytest.mark.slow
