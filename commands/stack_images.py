@@ -47,7 +47,8 @@ def stack_images_command(
     the PSFs of the visits are. The stacks of 1, 10, 100 and all visits become FITS images; on them galaxies are
     detected and measured with the PSF of the models of the visits, beside the same galaxies on stamps of their own.
 
-    Images, tables of galaxies, images.json and images.png go into the folder images of the visits.
+    Images, tables of galaxies, images.json (with the correlations of the ellipticities, as of `pachon null-test`) and
+    pictures go into the folder images of the visits.
 
     **Examples**
 

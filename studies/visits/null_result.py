@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from ...pipeline.catalogue.shear_calibration import ShearCalibration
 from ...pipeline.measure.correlation import Correlation
 from .galaxy_shapes import GalaxyShapes
+from .stack_metrics import correlations
 
 
 def shear_bias(e: np.ndarray, shear: np.ndarray) -> ShearCalibration:
@@ -56,14 +57,33 @@ class NullTest:
         ``model``: ellipticities measured with the PSF of the models; ``true``: with the true PSF; ``difference``: of
         the two, of galaxies that are usable with either.
     calibration : dict of str to ShearCalibration
-        Biases of the shear with the PSF of the models and the true one.
+        Biases of the shear with the PSF of the models and the true one, where they were measured.
     """
 
     visits: int
     galaxies: GalaxyShapes
     density: float
     correlations: dict[str, Correlation]
-    calibration: dict[str, ShearCalibration]
+    calibration: dict[str, ShearCalibration] = field(default_factory=dict)
+
+
+def galaxy_correlations(galaxies: GalaxyShapes, patch: np.ndarray) -> dict[str, Correlation]:
+    """Return the correlations of a :class:`NullTest`, with errors of a jackknife where there are several patches.
+
+    Parameters
+    ----------
+    galaxies : GalaxyShapes
+        Galaxies.
+    patch : ndarray of int, shape [n]
+        Patch of each.
+    """
+    both = galaxies.usable & galaxies.true_usable
+    kinds = {
+        "model": (galaxies.e1, galaxies.e2, galaxies.usable),
+        "true": (galaxies.true_e1, galaxies.true_e2, galaxies.true_usable),
+        "difference": (galaxies.e1 - galaxies.true_e1, galaxies.e2 - galaxies.true_e2, both),
+    }
+    return correlations(galaxies.x, galaxies.y, kinds, patch)
 
 
 def null_metrics(result: NullTest) -> dict[str, Any]:

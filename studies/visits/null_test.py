@@ -21,17 +21,15 @@ from ...core.workers import MakeWorkers
 from ...imaging.exposure import Exposure
 from ...imaging.galaxies import SkyGalaxies
 from ...pipeline.catalogue.shear_calibration import ShearCalibration
-from ...pipeline.measure.correlation import Correlation
 from ...pipeline.run_folder import CONFIG_NAME
 from ...sky.galaxies import Galaxies
 from ...sky.mosaic import PlantedGalaxies
 from .config import STACK_STAMP, load_visits_configuration
 from .galaxy_shapes import GalaxyShapes, measure_galaxies
-from .null_result import NullTest, null_metrics, shear_bias
+from .null_result import NullTest, galaxy_correlations, null_metrics, shear_bias
 from .plots import density_picture, null_test_picture
 from .psf_visit import StackFrame, stack_limit
 from .stack import PsfStack
-from .stack_metrics import correlations
 from .visits import cell_of, pixel_scale_of, stack_path
 
 #: S/N of a star as faint as the faintest galaxies that are drawn: fainter ones have no useful ellipticity.
@@ -132,7 +130,7 @@ def null_test(
         with reporter.stage(f"correlations in {visits} visits"):
             patch = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
             density = float(galaxies.usable.sum() / (len(chosen) * (cell / ARCMIN) ** 2))
-            found[visits] = NullTest(visits, galaxies, density, _correlations(galaxies, patch), bias)
+            found[visits] = NullTest(visits, galaxies, density, galaxy_correlations(galaxies, patch), bias)
     write_json(folder / "null_test.json", {"stacks": {str(n): null_metrics(r) for n, r in found.items()}})
     write_bytes(folder / "null_test.png", null_test_picture(found))
     write_bytes(folder / "null_test_density.png", density_picture(found))
@@ -218,16 +216,6 @@ def measure_job(job: dict[str, Any], threads: int) -> GalaxyShapes:
 def _shear_along_diagonal(n: int) -> np.ndarray:
     """Return the directions of the shear of n galaxies: every other one along x = y."""
     return np.where(np.arange(n) % 2 == 0, 1.0, 1j)
-
-
-def _correlations(galaxies: GalaxyShapes, patch: np.ndarray) -> dict[str, Correlation]:
-    both = galaxies.usable & galaxies.true_usable
-    kinds = {
-        "model": (galaxies.e1, galaxies.e2, galaxies.usable),
-        "true": (galaxies.true_e1, galaxies.true_e2, galaxies.true_usable),
-        "difference": (galaxies.e1 - galaxies.true_e1, galaxies.e2 - galaxies.true_e2, both),
-    }
-    return correlations(galaxies.x, galaxies.y, kinds, patch)
 
 
 def _calibration(axes: np.ndarray, n: int, measured: list[GalaxyShapes]) -> dict[str, ShearCalibration]:

@@ -25,7 +25,9 @@ from ....pipeline.catalogue.matching import match_positions
 from ....pipeline.catalogue.star_locus import StarSelection, select_stars
 from ....pipeline.measure.shapes import measure_shapes
 from ..galaxy_shapes import GalaxyShapes, measure_galaxies
+from ..null_result import NullTest, galaxy_correlations, null_metrics
 from ..null_test import REACH, write_shapes
+from ..plots import density_picture, null_test_picture
 from ..stack import PsfStack
 from ..visits import cell_of, pixel_scale_of, stack_path
 from .image_stack import ImageStack
@@ -79,7 +81,8 @@ def measure_stack(
     """Detect objects on the stacked images of visits, select stars, and fit galaxies.
 
     Every galaxy is fitted with the PSF of the models of the visits, and with the true one, of the nearest place without
-    a star. Products are tables of galaxies, ``images.json`` and ``images.png``.
+    a star. Products are tables of galaxies, ``images.json``, ``images.png``, and pictures of the correlations of the
+    ellipticities, which no shear has touched.
 
     Parameters
     ----------
@@ -129,8 +132,26 @@ def measure_stack(
         write_shapes(stack.folder / f"galaxies_{visits:04d}_tile_{tile.name}.fits", measured.galaxies, stack.stamp)
         tiles[visits].append(measured)
     found = {visits: tile_metrics(own) for visits, own in tiles.items()}
+    tests = null_tests(tiles)
+    for visits, result in tests.items():
+        found[visits] |= null_metrics(result)
+    if tests:
+        write_bytes(stack.folder / "null_test.png", null_test_picture(tests))
+        write_bytes(stack.folder / "null_test_density.png", density_picture(tests))
     write_json(stack.folder / "images.json", {"stacks": {str(n): metrics for n, metrics in found.items()}})
     return found
+
+
+def null_tests(tiles: dict[int, list[MeasuredTile]]) -> dict[int, NullTest]:
+    """Return the null test of the galaxies on the images, by number of visits, of stacks with pairs of galaxies."""
+    tests = {}
+    for visits, own in tiles.items():
+        galaxies = GalaxyShapes.joined([tile.galaxies for tile in own])
+        if (galaxies.usable & galaxies.true_usable).sum() >= 2:
+            patch = np.repeat(np.arange(len(own)), [len(tile.galaxies) for tile in own])
+            density = float(galaxies.usable.sum()) / sum(tile.area for tile in own)
+            tests[visits] = NullTest(visits, galaxies, density, galaxy_correlations(galaxies, patch))
+    return tests
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,14 +1,17 @@
 """Figures of tiles: counts and slopes known beforehand, and a small stack with noise."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pachon.commands.cli import main
+from pachon.core.units import ARCMIN
 from pachon.pipeline.run_folder import CONFIG_NAME
 from pachon.studies.visits.galaxy_shapes import GalaxyShapes
-from pachon.studies.visits.image_stack.measure import MeasuredTile, tile_metrics
+from pachon.studies.visits.image_stack.measure import MeasuredTile, null_tests, tile_metrics
+from pachon.studies.visits.null_result import null_metrics
 from pachon.studies.visits.visits import stack_path
 
 RNG = np.random.default_rng(4)
@@ -61,6 +64,28 @@ def test_no_galaxies_have_no_figures():
     assert found["response_difference"] is None
 
 
+def test_null_tests_of_tiles_correlate_what_is_common_to_their_galaxies():
+    """Ellipticities that are equal everywhere have their square as correlation, at all separations."""
+    common, added = 0.03 - 0.01j, 0.002 + 0.004j
+
+    def tile(corner):
+        x, y = ARCMIN * (RNG.uniform(0.0, 13.0, (2, 300)) + np.array(corner)[:, None])
+        e = np.full(300, common)
+        usable = np.arange(300) > 50
+        galaxies = replace(shapes(np.arange(300), e, usable), x=x, y=y, e1=(e + added).real, e2=(e + added).imag)
+        nothing = shapes(np.zeros(0, dtype=int), np.zeros(0, dtype=complex), [])
+        return MeasuredTile(galaxies, nothing, nothing, 169.0, {})
+
+    found = null_tests(
+        {1: [tile((0.0, 0.0)), tile((13.0, 0.0))], 10: [MeasuredTile(*[tile((0, 0)).stamps] * 3, 1.0, {})]}
+    )
+    assert list(found) == [1]
+    assert found[1].density == pytest.approx(249 / 169)
+    for kind, e in (("model", common + added), ("true", common), ("difference", added)):
+        np.testing.assert_allclose(found[1].correlations[kind].xi_plus, abs(e) ** 2, rtol=1e-6)
+    assert null_metrics(found[1])["xi_plus_difference_short"] == pytest.approx(abs(added) ** 2)
+
+
 @pytest.mark.slow
 def test_a_small_stack_is_measured(visit_products, small_visits, tmp_path, capsys):
     section = small_visits.visits.model_copy(update={"snapshots": (2,)})
@@ -77,7 +102,10 @@ def test_a_small_stack_is_measured(visit_products, small_visits, tmp_path, capsy
         # PSFs and stars of one image: sizes agree to their noise.
         assert abs(figures["stars"][0]["size_difference"]) < 0.03
         assert 0.5 < figures["usable_per_arcmin2"] / figures["usable_per_arcmin2_stamps"] < 1.5
-    assert (tmp_path / "images" / "images.png").stat().st_size > 10000
+        # Shot noise of what is left of one image and of its PSF.
+        assert 0.1 < figures["mean_abs_xi_plus"] / figures["shot_noise_xi_plus"] < 5.0
+    for name in ("images.png", "null_test.png", "null_test_density.png"):
+        assert (tmp_path / "images" / name).stat().st_size > 10000
 
 
 @pytest.mark.slow
