@@ -13,7 +13,7 @@ from .flags import DonutFlag
 from .image_model import FLUX, NUISANCES, RATIO, STRENGTH, X, Y
 from .light import Instrument, Light, Sampling
 from .likelihood import Stamp, model_image, pulls
-from .solve import COARSE, FINE, Group, Solution, solve
+from .solve import COARSE, FINE, STEPS, Group, Solution, solve
 from .stamps import Match, Pixels, match_template, without_cosmic_rays
 
 #: Images wider than this are donuts [pixels].
@@ -29,6 +29,8 @@ _GAIN, _LEFT = 100.0, 0.5
 _MISFIT = 0.15
 #: Loss a coarse pixel from which on second stars are searched for at these distances over the diameter of the donut.
 _POOR, _NEAR_RADII, _NEAR_ANGLES = 1.0, (0.08, 0.2), 6
+#: Steps from each of these places, and how many of the best solutions are finished.
+_FIRST_STEPS, _FINISHED = 4, 2
 #: Least flux of a second star over that of the first.
 _LEAST_RATIO = 0.01
 #: Fraction of the light that may fall beside the stamp.
@@ -236,12 +238,17 @@ class _StarFitter:
         return unknowns, found
 
     def solve(
-        self, stamp: Stamp, star: np.ndarray, shared: np.ndarray | None = None, tolerance: float = FINE
+        self,
+        stamp: Stamp,
+        star: np.ndarray,
+        shared: np.ndarray | None = None,
+        tolerance: float = FINE,
+        steps: int = STEPS,
     ) -> Solution:
         """Return the best unknowns from a start."""
         n = self._map.shape[2]
         group = Group((stamp,), self._map, self._precision[:n], self._fixed)
-        return solve(group, [star], np.zeros(n) if shared is None else shared, tolerance=tolerance)
+        return solve(group, [star], np.zeros(n) if shared is None else shared, tolerance=tolerance, steps=steps)
 
     def with_companion(
         self, pixels: Pixels, stamp: Stamp, single: Solution, first: np.ndarray, template: np.ndarray
@@ -277,7 +284,7 @@ class _StarFitter:
         the second stands: places around the first are tried, without aberrations.
         """
         diameter = self._light.diameter / self._instrument.pixel
-        nothing = np.zeros_like(best.shared)
+        nothing, trials = np.zeros_like(best.shared), []
         for radius in _NEAR_RADII:
             for angle in np.arange(_NEAR_ANGLES) * 2.0 * np.pi / _NEAR_ANGLES:
                 offset = radius * diameter * np.array([np.cos(angle), np.sin(angle)])
@@ -285,9 +292,12 @@ class _StarFitter:
                 star[FLUX] *= 0.5
                 # The template stands in the middle of the two.
                 star[[X, Y]] -= 0.5 * offset
-                trial = self.solve(stamp, star, nothing, COARSE)
-                if _explains_more(trial, best) and trial.stars[0][RATIO] > _LEAST_RATIO:
-                    best = trial
+                trials.append(self.solve(stamp, star, nothing, COARSE, _FIRST_STEPS))
+        # After a few steps the places that lead nowhere are known.
+        for begun in sorted(trials, key=lambda trial: trial.loss)[:_FINISHED]:
+            trial = self.solve(stamp, begun.stars[0], begun.shared, COARSE)
+            if _explains_more(trial, best) and trial.stars[0][RATIO] > _LEAST_RATIO:
+                best = trial
         return best
 
     def other_focus_is_better(self, pixels: Pixels, stamp: Stamp, here: Solution) -> bool:

@@ -16,6 +16,8 @@ from .likelihood import NormalEquations, Stamp, normal_equations
 #: A step that is to lower twice the negative logarithm of the likelihood by less, per unit of chi-square a pixel, is
 #: the last: a fifth of a standard deviation, of which the step leaves a hundredth.
 FINE, COARSE = 5e-2, 0.3
+#: Most steps.
+STEPS = 25
 #: The same for a search that ran out of steps and is near enough to its end.
 _NEAR = 1.0
 _DAMPING = 1e-3
@@ -97,7 +99,7 @@ def solve(
     shared: np.ndarray,
     *,
     tolerance: float = FINE,
-    steps: int = 25,
+    steps: int = STEPS,
     pool: Executor | None = None,
 ) -> Solution:
     """Maximise the likelihood from a starting point, by so many steps or until one is to gain less than a tolerance."""
