@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -54,21 +54,9 @@ def fit_fields(
     points = as_positions(positions)
     if len(points) != n_stars:
         raise DomainError(f"positions: {len(points)} given, expected one for each of the {n_stars} stamps")
-    for option, value, known in (
-        ("basis", basis, BASES),
-        ("interpolation", interpolation, INTERPOLATIONS),
-        ("replacement", replacement, ("mean", "polynomial")),
-    ):
-        if value not in known:
-            raise ConfigError(f"{option} = {value!r}: expected one of {', '.join(known)}")
+    _check_options(basis, interpolation, replacement, scale, clip_sigma, max_iterations, gain)
     limit = min(n_stars - 1, ny * nx)
     count = _component_count(basis, n_components, n_stars, limit, ny * nx)
-    if scale is not None and (basis != "shapelets" or not (np.isfinite(scale) and scale > 0.0)):
-        raise ConfigError(f"scale = {scale}: expected a positive number of pixels, for shapelets only")
-    if clip_sigma is not None and not clip_sigma > 0.0:
-        raise ConfigError(f"clip_sigma = {clip_sigma}: expected a positive number or None")
-    if max_iterations < 1:
-        raise ConfigError(f"max_iterations = {max_iterations}: expected at least 1")
     star_weights = None if isinstance(weights, str) else as_weights(weights, n_stars)
     if interpolation != "polynomial":
         if weights is not None:
@@ -78,8 +66,6 @@ def fit_fields(
         if order == "auto":
             raise ConfigError(f"order = 'auto': expected a number or None with interpolation = {interpolation!r}")
         check_distinct_positions(points, interpolation)
-    if gain is not None and not (np.isfinite(gain) and gain > 0.0):
-        raise ConfigError(f"gain = {gain}: expected a number of electrons above 0, or None for no photon noise")
     fixed = None if order == "auto" else int(ORDERS[interpolation] if order is None else order)
     if fixed is not None and not 0 <= fixed <= MOST_ORDER:
         raise ConfigError(f"order = {fixed}: expected a polynomial order from 0 to {MOST_ORDER}")
@@ -120,34 +106,23 @@ def fit_fields(
             stars = stars.about_weighted_mean(basis_weights)
             star_weights = basis_weights
         order = chosen if fixed is None else fixed
-        terms = terms[:, : term_count(order)]
         found = basis_of(stars, basis_weights, count)
         coefficients, unexplained = project_stars(stars, found, basis)
-        kernel = alpha = None
-        mapped_points = mapped(points, span)
+        places, own = mapped(points, span), terms[:, : term_count(order)]
         if interpolation == "gp" and shapes is not None:
-            kernel = gaussian_process.fit_kernels(
-                mapped_points, coefficients, terms, shapes.noise, shared=basis == "pixels"
-            )
-            polynomial, alpha, _ = gaussian_process.krige(mapped_points, coefficients, terms, kernel, shapes.noise)
-            star_weights = 1.0 / shapes.noise
+            between = _gaussian_process(places, coefficients, own, shapes.noise, shared=basis == "pixels")
         elif interpolation == "kriging":
             deviations = coefficients if basis == "pixels" else coefficients @ found.vectors
-            numbers, filters = kriging.shape_numbers(found.mean.reshape(ny, nx), deviations)
-            noise = kriging.star_noise(images, deviations, found.mean.reshape(ny, nx), filters, gain)
-            noise = np.maximum(noise, _LEAST_NOISE * (numbers**2).mean(axis=0) + np.finfo(float).tiny)
-            covariance = kriging.fit_kernel(mapped_points, numbers, noise, terms)
-            star_noise = (noise / np.median(noise, axis=0)).mean(axis=1)
-            polynomial, alpha, _ = kriging.krige(mapped_points, coefficients, terms, covariance, star_noise)
-            kernel, star_weights = np.tile(covariance, (coefficients.shape[1], 1)), 1.0 / star_noise
+            between = _kriging(places, coefficients, own, images, found.mean.reshape(ny, nx), deviations, gain)
         else:
-            q, r = np.linalg.qr(weighted(terms, star_weights))
+            q, r = np.linalg.qr(weighted(own, star_weights))
             polynomial = scipy.linalg.solve_triangular(r, q.T @ weighted(coefficients, star_weights))
+            between = _Interpolated(polynomial, star_weights)
         return dict(
             mean=found.mean.reshape(ny, nx),
             components=found.vectors.reshape(-1, ny, nx),
             coefficients=coefficients,
-            polynomial=polynomial,
+            polynomial=between.polynomial,
             eigenvalues=found.spectrum[:limit] ** 2 / (n_stars - 1),
             positions=points,
             order=order,
@@ -156,10 +131,74 @@ def fit_fields(
             rejected=stars.rejected.sum(axis=1),
             basis=basis,
             scale=found.scale,
-            weights=star_weights,
-            kernel=kernel,
-            alpha=alpha,
+            weights=between.weights,
+            kernel=between.kernel,
+            alpha=between.alpha,
         )
+
+
+class _Interpolated(NamedTuple):
+    """Coefficients between the stars: of the polynomials, weights of the stars, and kernel and weights of a process."""
+
+    polynomial: np.ndarray
+    weights: np.ndarray | None
+    kernel: np.ndarray | None = None
+    alpha: np.ndarray | None = None
+
+
+def _gaussian_process(
+    places: np.ndarray, coefficients: np.ndarray, terms: np.ndarray, noise: np.ndarray, *, shared: bool
+) -> _Interpolated:
+    """Return Gaussian processes through the coefficients of stars of some noise."""
+    kernel = gaussian_process.fit_kernels(places, coefficients, terms, noise, shared=shared)
+    polynomial, alpha, _ = gaussian_process.krige(places, coefficients, terms, kernel, noise)
+    return _Interpolated(polynomial, 1.0 / noise, kernel, alpha)
+
+
+def _kriging(
+    places: np.ndarray,
+    coefficients: np.ndarray,
+    terms: np.ndarray,
+    images: np.ndarray,
+    mean: np.ndarray,
+    deviations: np.ndarray,
+    gain: float | None,
+) -> _Interpolated:
+    """Return kriging of the coefficients by the covariance of the shapes of stars that deviate from a mean."""
+    numbers, filters = kriging.shape_numbers(mean, deviations)
+    noise = kriging.star_noise(images, deviations, mean, filters, gain)
+    noise = np.maximum(noise, _LEAST_NOISE * (numbers**2).mean(axis=0) + np.finfo(float).tiny)
+    covariance = kriging.fit_kernel(places, numbers, noise, terms)
+    star_noise = (noise / np.median(noise, axis=0)).mean(axis=1)
+    polynomial, alpha, _ = kriging.krige(places, coefficients, terms, covariance, star_noise)
+    return _Interpolated(polynomial, 1.0 / star_noise, np.tile(covariance, (coefficients.shape[1], 1)), alpha)
+
+
+def _check_options(
+    basis: str,
+    interpolation: str,
+    replacement: str,
+    scale: float | None,
+    clip_sigma: float | None,
+    max_iterations: int,
+    gain: float | None,
+) -> None:
+    """Raise ConfigError for an option that is none, or does not belong to the others."""
+    for option, value, known in (
+        ("basis", basis, BASES),
+        ("interpolation", interpolation, INTERPOLATIONS),
+        ("replacement", replacement, ("mean", "polynomial")),
+    ):
+        if value not in known:
+            raise ConfigError(f"{option} = {value!r}: expected one of {', '.join(known)}")
+    if scale is not None and (basis != "shapelets" or not (np.isfinite(scale) and scale > 0.0)):
+        raise ConfigError(f"scale = {scale}: expected a positive number of pixels, for shapelets only")
+    if clip_sigma is not None and not clip_sigma > 0.0:
+        raise ConfigError(f"clip_sigma = {clip_sigma}: expected a positive number or None")
+    if max_iterations < 1:
+        raise ConfigError(f"max_iterations = {max_iterations}: expected at least 1")
+    if gain is not None and not (np.isfinite(gain) and gain > 0.0):
+        raise ConfigError(f"gain = {gain}: expected a number of electrons above 0, or None for no photon noise")
 
 
 def _checked_gain(images: np.ndarray, gain: float | None) -> float | None:
