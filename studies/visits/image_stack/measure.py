@@ -134,7 +134,7 @@ def measure_stack(
     found = {visits: tile_metrics(own) for visits, own in tiles.items()}
     tests = null_tests(tiles)
     for visits, result in tests.items():
-        found[visits] |= null_metrics(result)
+        found[visits]["null_test"] = null_metrics(result)
     if tests:
         write_bytes(stack.folder / "null_test.png", null_test_picture(tests))
         write_bytes(stack.folder / "null_test_density.png", density_picture(tests))
