@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ....core.errors import DomainError
 from ....core.files import write_bytes, write_json
 from ....core.ordered_jobs import ordered_results
 from ....core.products import Stamp
@@ -18,7 +19,7 @@ from ....core.random_streams import natural_number
 from ....core.units import ARCMIN
 from ....core.workers import MakeWorkers
 from ....imaging.image_file import CcdImage
-from ....pipeline.catalogue.detect import detect_objects
+from ....pipeline.catalogue.detect import DetectedObjects, detect_objects
 from ....pipeline.catalogue.fit_galaxies import fit_galaxies
 from ....pipeline.catalogue.galaxy_fits import usable_galaxies
 from ....pipeline.catalogue.matching import match_positions
@@ -42,8 +43,8 @@ MATCH_RADIUS = 3.0
 #: Of the pixels of an object [standard deviations]: at 3, one in six of the galaxies that are usable on stamps of their
 #: own has no five pixels above it. Detected noise has no ellipticity that is known well enough to be used.
 _THRESHOLD = 1.5
-#: S/N in one visit of the objects that determine the locus of stars.
-_BRIGHT_SNR = 45.0
+#: S/N in one visit of the objects that determine the locus of stars: the first for which there is one.
+_BRIGHT_SNR = (45.0, 37.0, 30.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +104,7 @@ def measure_stack(
     Raises
     ------
     PachonError
-        If the folder holds no stacks of PSFs or images, or a tile has no stars.
+        If the folder holds no stacks of PSFs or images, or no tile has stars enough; others without are left out.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
     stack = ImageStack.of(folder)
@@ -128,10 +129,17 @@ def measure_stack(
         reporter=reporter,
     )
     tiles: dict[int, list[MeasuredTile]] = {visits: [] for visits in stack.visits.kept}
+    left_out: dict[int, dict[str, str]] = {visits: {} for visits in stack.visits.kept}
     for (visits, tile), measured in zip(numbered, results, strict=True):
+        if isinstance(measured, str):
+            left_out[visits][tile.name] = measured
+            if len(left_out[visits]) == len(stack.tiles):
+                raise DomainError(measured, subject=f"{visits} visits, tile {tile.name}")
+            reporter.line(f"{visits} visits, tile {tile.name} is left out: {measured}")
+            continue
         write_shapes(stack.folder / f"galaxies_{visits:04d}_tile_{tile.name}.fits", measured.galaxies, stack.stamp)
         tiles[visits].append(measured)
-    found = {visits: tile_metrics(own) for visits, own in tiles.items()}
+    found = {visits: tile_metrics(own) | {"left_out": left_out[visits]} for visits, own in tiles.items()}
     tests = null_tests(tiles)
     for visits, result in tests.items():
         found[visits]["null_test"] = null_metrics(result)
@@ -160,9 +168,12 @@ class TileMeasurement:
 
     stack: ImageStack
 
-    def __call__(self, job: tuple[Tile, CcdImage, PsfStack], threads: int) -> MeasuredTile:
-        """Measure one tile."""
-        return measure_tile(self.stack, *job, threads=threads)
+    def __call__(self, job: tuple[Tile, CcdImage, PsfStack], threads: int) -> MeasuredTile | str:
+        """Measure one tile, or return why it cannot be measured."""
+        try:
+            return measure_tile(self.stack, *job, threads=threads)
+        except DomainError as error:
+            return str(error)
 
 
 def measure_tile(
@@ -179,10 +190,7 @@ def measure_tile(
     # White noise that is as strong in averages over several pixels as the correlated noise of the stack.
     variance = image.variance * np.float32(exposure.noise_rms**2 / np.median(image.variance[image.mask == 0]))
     objects = detect_objects(image.image, variance, image.mask, threshold=_THRESHOLD, background_size=None)
-    # The stars are those of one visit. Fainter objects, which deeper stacks are full of, would hide their locus.
-    depth = float(np.sqrt(psfs.visits))
-    least = stack.experiment.config.stars.snr_min
-    stars = select_stars(objects, image.image, mask=image.mask, min_snr=least * depth, bright_snr=_BRIGHT_SNR * depth)
+    stars = selected_stars(objects, image, stack.experiment.config.stars.snr_min, psfs.visits)
     truth = image.objects
     scale = pixel_scale_of(stack.frame)
     reach = REACH * cell_of(stack.experiment, stack.frame) / float(np.sqrt(stack.visits.visits.places))
@@ -238,6 +246,18 @@ def measure_tile(
     noise_free = replace(noise_free, index=both[noise_free.index])
     area = float((image.mask == 0).sum()) * (scale / ARCMIN) ** 2
     return MeasuredTile(galaxies, stamps, noise_free, area, _star_metrics(stars, psfs, transfer, stack, tile))
+
+
+def selected_stars(objects: DetectedObjects, image: CcdImage, least: float, visits: int) -> StarSelection:
+    """Return the stars of a stack, of at least an S/N in one visit; DomainError where there is no locus of stars."""
+    # The stars are those of one visit. Fainter objects, which deeper stacks are full of, would hide their locus.
+    depth = float(np.sqrt(visits))
+    for bright in _BRIGHT_SNR:
+        try:
+            return select_stars(objects, image.image, mask=image.mask, min_snr=least * depth, bright_snr=bright * depth)
+        except DomainError as error:
+            reason = error
+    raise reason
 
 
 def _star_metrics(

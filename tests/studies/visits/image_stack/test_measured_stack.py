@@ -2,15 +2,19 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from pachon.commands.cli import main
+from pachon.core.errors import DomainError
 from pachon.core.units import ARCMIN
+from pachon.pipeline.catalogue.objects import DetectedObjects
+from pachon.pipeline.catalogue.star_locus import select_stars
 from pachon.pipeline.run_folder import CONFIG_NAME
 from pachon.studies.visits.galaxy_shapes import GalaxyShapes
-from pachon.studies.visits.image_stack.measure import MeasuredTile, null_tests, tile_metrics
+from pachon.studies.visits.image_stack.measure import MeasuredTile, null_tests, selected_stars, tile_metrics
 from pachon.studies.visits.null_result import null_metrics
 from pachon.studies.visits.visits import stack_path
 
@@ -84,6 +88,37 @@ def test_null_tests_of_tiles_correlate_what_is_common_to_their_galaxies():
     for kind, e in (("model", common + added), ("true", common), ("difference", added)):
         np.testing.assert_allclose(found[1].correlations[kind].xi_plus, abs(e) ** 2, rtol=1e-6)
     assert null_metrics(found[1])["xi_plus_difference_short"] == pytest.approx(abs(added) ** 2)
+
+
+def test_a_locus_of_few_bright_stars_is_found_with_fainter_ones():
+    """Fifteen stars among as many galaxies, of which nine are bright: with those alone there is no locus."""
+    n = 30
+    snr = np.where(np.arange(n) < 9, 200.0, 115.0)
+    radius = np.where(np.arange(n) < 15, RNG.normal(1.7, 0.01, n), RNG.uniform(2.0, 4.0, n))
+    x = y = np.linspace(40.0, 960.0, n)
+    nothing, flags = np.zeros(n), np.zeros(n, dtype=int)
+    objects = DetectedObjects(
+        x=x,
+        y=y,
+        flux=snr,
+        flux_error=nothing + 1.0,
+        half_light_radius=radius,
+        fwhm=2.0 * radius,
+        a=radius,
+        b=radius,
+        theta=nothing,
+        peak=snr,
+        neighbour_distance=nothing + 30.0,
+        flags=flags,
+        background=np.zeros((1000, 1000)),
+        segmentation=np.zeros((1000, 1000), dtype=int),
+    )
+    image = SimpleNamespace(image=np.ones((1000, 1000)), mask=np.zeros((1000, 1000), dtype=int))
+    with pytest.raises(DomainError, match="no stellar locus: 9 bright objects"):
+        select_stars(objects, image.image, min_snr=90.0, bright_snr=135.0)
+    stars = selected_stars(objects, image, 30.0, 9)
+    assert stars.half_light_radius == pytest.approx(1.7, abs=0.02)
+    assert list(stars.index) == list(range(15))
 
 
 @pytest.mark.slow
