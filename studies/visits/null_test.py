@@ -33,7 +33,7 @@ from .stack import PsfStack
 from .visits import cell_of, pixel_scale_of, stack_path
 
 #: S/N of a star as faint as the faintest galaxies that are drawn: fainter ones have no useful ellipticity.
-_FAINTEST_SNR = 8.0
+FAINTEST_SNR = 8.0
 #: Largest distance of galaxies from the nearest position with a known PSF, over the mean distance of these.
 REACH = 2.0
 #: Shear of the calibration.
@@ -100,7 +100,7 @@ def null_test(
         stamp = Stamp(config.galaxies_digest(experiment, stack=visits), seed)
         stack = PsfStack.read(stack_path(folder, visits), Stamp(config.digest(experiment), seed))
         exposure = Exposure.of_run(experiment, visits, gain=1.0, pixel_scale=scale)
-        galaxies_in = source.down_to(faintest := stack_limit(experiment, _FAINTEST_SNR, visits))
+        galaxies_in = source.down_to(faintest := stack_limit(experiment, FAINTEST_SNR, visits))
         chosen = _covered_tiles(stack, cell, config.visits.places)[:tiles]
         if not chosen:
             raise DomainError(f"{folder}: no part of the sky as large as a CCD was seen by half of {visits} visits")

@@ -27,8 +27,9 @@ from ....pipeline.catalogue.star_locus import StarSelection, select_stars
 from ....pipeline.measure.shapes import measure_shapes
 from ..galaxy_shapes import GalaxyShapes, measure_galaxies
 from ..null_result import NullTest, galaxy_correlations, null_metrics
-from ..null_test import REACH, write_shapes
+from ..null_test import FAINTEST_SNR, REACH, write_shapes
 from ..plots import density_picture, null_test_picture
+from ..psf_visit import stack_limit
 from ..stack import PsfStack
 from ..visits import cell_of, pixel_scale_of, stack_path
 from .image_stack import ImageStack
@@ -239,7 +240,9 @@ def measure_tile(
     true, axes = galaxies_on(stack.sky, tile, tile.wcs(stack.frame)), stack.frame.matrix
     key: tuple[str | int, ...] = ("images", psfs.visits, natural_number(tile.column), natural_number(tile.row))
     options: dict[str, Any] = {"reach": reach, "threads": threads}
-    stamps = measure_galaxies(psfs, axes, true, exposure, stack.stamp.seed, *key, **options)
+    drawn = np.flatnonzero(true.magnitude <= stack_limit(stack.experiment, FAINTEST_SNR, psfs.visits))
+    stamps = measure_galaxies(psfs, axes, true.take(drawn), exposure, stack.stamp.seed, *key, **options)
+    stamps = replace(stamps, index=drawn[stamps.index])
     both = np.intersect1d(galaxies.index[galaxies.usable], stamps.index[stamps.usable])
     silent = replace(exposure, noise=False)
     noise_free = measure_galaxies(psfs, axes, true.take(both), silent, stack.stamp.seed, *key, **options)
