@@ -118,7 +118,7 @@ def draw_galaxies(
     wcs: SkyPixels,
     *,
     window: Window | None = None,
-    noise: float = 1.0,
+    noise: float | np.ndarray = 1.0,
     way: str = "direct",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
@@ -137,7 +137,7 @@ def draw_galaxies(
         World coordinates of the CCD.
     window : Window, optional
         Part of the CCD to draw; all of it by default.
-    noise : float
+    noise : float or ndarray, shape [n]
         rms noise of a pixel [electron], a hundredth of which is the error allowed where a galaxy's light leaves its
         grid.
     way : {"direct", "eigen"}
@@ -167,7 +167,7 @@ def draw_galaxies(
     return _convolve_with_psf(scene, psf, wide, threads)[margin:-margin, margin:-margin].copy()
 
 
-def grid_sizes(electrons: np.ndarray, radius: np.ndarray, profile: np.ndarray, noise: float) -> np.ndarray:
+def grid_sizes(electrons: np.ndarray, radius: np.ndarray, profile: np.ndarray, noise: float | np.ndarray) -> np.ndarray:
     """Return the size of the grid of each galaxy: the first of :data:`SIZES` that holds its light, [n].
 
     Light beyond the grid wraps around, so none is lost. A size is accepted where a de Vaucouleurs galaxy and a star
@@ -181,7 +181,7 @@ def grid_sizes(electrons: np.ndarray, radius: np.ndarray, profile: np.ndarray, n
         Half-light radii [pixel].
     profile : ndarray
         Largest value of the PSF beyond each number of pixels; zero after the last.
-    noise : float
+    noise : float or ndarray, shape [n]
         rms noise of a pixel [electron].
     """
     chosen = np.full(len(electrons), SIZES[-1])
@@ -211,7 +211,7 @@ def _draw_direct(
     psf: PsfField | None,
     wcs: SkyPixels,
     window: Window,
-    noise: float,
+    noise: float | np.ndarray,
     threads: int | None,
     progress: Callable[[int], None] | None,
 ) -> np.ndarray:

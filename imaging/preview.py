@@ -7,13 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from ..core.plotting import new_figure, plain_text, png_bytes, styled
-from ..core.units import ARCSEC
 from .image_file import CcdImage
-from .scene import CcdScene
+from .scene import CcdScene, deep_exposures, middle_window
 from .stretch import draw_compass, pixel_scale_of, show_stretched, sky_level
-
-#: Side of the cutouts [arcsec], and the long exposure beside the run's [s], as in Jee & Tyson 2011, fig. 10.
-CUTOUT, DEEP = 100.0, 6000.0
 
 
 def preview_png(image: CcdImage) -> bytes:
@@ -24,7 +20,7 @@ def preview_png(image: CcdImage) -> bytes:
 def cutouts_png(scene: CcdScene, *, threads: int | None = None) -> bytes:
     """Return a cutout of 100 arcsec in one exposure, in 6000 s and without noise, side by side."""
     settings = scene.exposure
-    deep = replace(settings, exposures=max(1, round(DEEP / settings.time)))
+    deep = replace(settings, exposures=deep_exposures(settings))
     panels = [
         (f"{settings.time:g} s", replace(settings, exposures=1, noise=True)),
         (f"{deep.total_time:g} s", replace(deep, noise=True)),
@@ -51,8 +47,6 @@ def cutouts_png(scene: CcdScene, *, threads: int | None = None) -> bytes:
 
 def _middle(scene: CcdScene) -> CcdScene:
     """Return the middle of a scene, as large as a cutout or the scene."""
-    side = round(CUTOUT * ARCSEC / scene.exposure.pixel_scale)
-    height, width = (min(side, n) for n in scene.electrons.shape)
-    y, x = (scene.electrons.shape[0] - height) // 2, (scene.electrons.shape[1] - width) // 2
-    window = replace(scene.window, x=scene.window.x + x, y=scene.window.y + y, width=width, height=height)
-    return replace(scene, electrons=scene.electrons[y : y + height, x : x + width], window=window)
+    window = middle_window(scene.window, scene.exposure)
+    y, x = window.y - scene.window.y, window.x - scene.window.x
+    return replace(scene, electrons=scene.electrons[y : y + window.height, x : x + window.width], window=window)

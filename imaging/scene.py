@@ -25,7 +25,8 @@ from .wcs import CcdWcs, ccd_wcs
 #: Pixels by which stamps of stars are larger than those of the PSF: in sums of hundreds of exposures the wings of a
 #: star just below saturation stay above the noise that far out.
 STAR_ROOM = 64
-
+#: Side of the cutouts [arcsec], and the long exposure beside the run's [s], as in Jee & Tyson 2011, fig. 10.
+CUTOUT, DEEP = 100.0, 6000.0
 
 #: Function that gives the galaxies with xi and eta in two ranges [rad].
 GalaxiesIn = Callable[[tuple[float, float], tuple[float, float]], Sources]
@@ -106,7 +107,8 @@ def draw_ccd(
         Galaxies about the pointing, wherever they are; or a function that gives those with xi and eta in two ranges
         [rad].
     exposure : Exposure, optional
-        Band, depth and noise; by default those of the run, in one exposure.
+        Band, depth and noise; by default those of the run, in one exposure. Light that the grids of galaxies do not
+        hold is far below this noise, and in the middle 100 arcsec below that of 6000 s.
     pointing, position_angle
         As in :func:`ccd_wcs`.
     window : Window, optional
@@ -153,6 +155,9 @@ def draw_ccd(
     galaxies = galaxies_near(galaxies, wcs, part)
     pixels = wcs.to_pixel(np.stack([galaxies.xi, galaxies.eta], axis=1))
     electrons = exposure.electrons(galaxies.magnitude) * psf.lit_fraction(pixels)
+    noise = np.full(len(galaxies), exposure.noise_rms)
+    middle = middle_window(part, exposure).contains(pixels, 0.5 * SIZES[-1])
+    noise[middle] /= np.sqrt(max(deep_exposures(exposure) / exposure.exposures, 1.0))
     own = part.contains(pixels)
     check_density(float(electrons[own].sum()) / (part.width * part.height), exposure)
     image = draw_galaxies(
@@ -161,7 +166,7 @@ def draw_ccd(
         psf,
         wcs,
         window=part,
-        noise=exposure.noise_rms,
+        noise=noise,
         way=way,
         threads=threads,
         progress=progress,
@@ -197,6 +202,19 @@ def draw_ccd(
         config.seed,
         config.atmosphere.epoch,
     )
+
+
+def deep_exposures(exposure: Exposure) -> int:
+    """Return how many exposures the deep cutouts have."""
+    return max(1, round(DEEP / exposure.time))
+
+
+def middle_window(window: Window, exposure: Exposure) -> Window:
+    """Return the middle of a window, as large as a cutout or the window."""
+    side = round(CUTOUT * ARCSEC / exposure.pixel_scale)
+    width, height = min(side, window.width), min(side, window.height)
+    x, y = window.x + (window.width - width) // 2, window.y + (window.height - height) // 2
+    return replace(window, x=x, y=y, width=width, height=height)
 
 
 def ellipticities(galaxies: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from ...core.units import ARCMIN
 from ...imaging.config import ImagesConfig
 from ...imaging.draw import Window
 from ...imaging.preview import cutouts_png
-from ...imaging.scene import draw_ccd
+from ...imaging.scene import DEEP, draw_ccd
 from ...pipeline.config import with_options
 from ...pipeline.measure.correlation import Correlation
 from ...pipeline.simulate.ccd_exposure import expose_positions
@@ -29,8 +29,6 @@ _ENOUGH = 10
 _NAMES = {"psf": "PSF", "residual_stars": "residual at the stars", "residual_places": "residual where no star is"}
 # The image of Fig. 10: CCD, pixels on a side, and magnitude limit.
 _CCD, _SIDE, _FAINTEST = "R22_S11", 640, 29.0
-# Time of the deep image [s].
-_DEEP = 6000.0
 
 
 @figure(
@@ -64,10 +62,10 @@ def image_of_the_sky(bench: Bench) -> Reproduced:
     width = effective_fwhm(star.image, star.pixel_scale)
     seconds = scene.exposure.time
     limit = limiting_magnitude(5.0, experiment.band, seconds, width)
-    deep = limit + 1.25 * np.log10(_DEEP / seconds)
+    deep = limit + 1.25 * np.log10(DEEP / seconds)
     hdus = [image_hdu("ELECTRONS", scene.electrons, "expected electrons of galaxies and stars in one exposure")]
     here = (
-        f"galaxies to {_FAINTEST:g} mag; 5 sigma of a star at {deep:.2f} mag in {_DEEP:g} s, at {limit:.2f} mag in"
+        f"galaxies to {_FAINTEST:g} mag; 5 sigma of a star at {deep:.2f} mag in {DEEP:g} s, at {limit:.2f} mag in"
         f" {seconds:g} s"
     )
     return Reproduced(

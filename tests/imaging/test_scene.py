@@ -12,7 +12,7 @@ from pachon.core.units import ARCSEC
 from pachon.imaging.draw import Window
 from pachon.imaging.exposure import Exposure
 from pachon.imaging.image_file import OBJECT_COLUMNS, CcdImage
-from pachon.imaging.scene import STAR_ROOM, draw_ccd, ellipticities
+from pachon.imaging.scene import STAR_ROOM, deep_exposures, draw_ccd, ellipticities, middle_window
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.measure.shapes import measure_shapes
 from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
@@ -153,6 +153,29 @@ def test_a_deeper_exposure_of_a_scene_has_more_of_everything(small_run, stars):
     unclipped = plain.mask == 0
     assert np.allclose(deep.image[unclipped], 100.0 * plain.image[unclipped], rtol=1e-5, atol=1e-2)
     assert np.allclose(deep.objects["FLUX"], 100.0 * plain.objects["FLUX"], rtol=1e-12)
+
+
+def test_light_beyond_the_grids_is_below_the_noise_of_the_deep_cutout(small_run):
+    """A spheroid of 22 mag: its grid is chosen for one exposure, but in the middle for all of those of the cutout."""
+
+    def spheroids(xi, eta):
+        middle, corner = (np.mean(xi), np.mean(eta)), (np.mean(xi) + 100.0 * ARCSEC, np.mean(eta))
+        return Galaxies.single(*np.transpose([middle, corner]), [22.0, 22.0], [0.8 * ARCSEC] * 2, sersic=4.0)
+
+    one = Exposure("r", 15.0)
+    deep = Exposure("r", 15.0, deep_exposures(one))
+    window = Window(1300, 1300, 1500, 1500)
+    shallow, wide = (
+        draw_ccd(small_run, "R22_S11", spheroids, window=window, exposure=e).electrons for e in (one, deep)
+    )
+    lost = np.abs(shallow * np.float32(deep.exposures) - wide) / deep.noise_rms
+    cutout = middle_window(window, one)
+    inside = np.zeros(window.shape, dtype=bool)
+    inside[cutout.y - window.y :, cutout.x - window.x :][: cutout.height, : cutout.width] = True
+    assert cutout.width < 600
+    # Elsewhere the edge of a grid is a twentieth of the noise of the deep image and more.
+    assert lost[inside].max() < 0.01
+    assert lost.max() > 0.03
 
 
 def test_whole_galaxies_have_the_moments_of_their_components():

@@ -6,7 +6,7 @@ import numpy as np
 
 from ....core.plotting import new_figure, png_bytes, styled
 from ....imaging.image_file import CcdImage
-from ....imaging.preview import CUTOUT
+from ....imaging.scene import CUTOUT
 from ....imaging.stretch import draw_compass, pixel_scale_of, show_stretched
 
 
