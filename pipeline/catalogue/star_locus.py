@@ -142,6 +142,7 @@ def select_stars(
     max_ellipticity: float = 0.1,
     isolation: float = 12.0,
     min_stars: int = 10,
+    radius_range: tuple[float, float] | None = None,
     size: int = 31,
     mask: ArrayLike | NDArray[np.bool_] | None = None,
 ) -> StarSelection:
@@ -166,6 +167,8 @@ def select_stars(
         Least distance to the nearest other object [pixel].
     min_stars : int
         Fewest stars that make a locus.
+    radius_range : (float, float), optional
+        Half-light radii between which the locus is known to lie [pixel].
     size : int
         Side of the stamps, odd [pixel].
     mask : array, optional
@@ -204,10 +207,14 @@ def select_stars(
     spoilt = cut_out(bad, objects.x, objects.y, size, True).any(axis=(1, 2))
     cuts[(objects.flags != 0) | spoilt | ~np.isfinite(objects.fwhm)] |= StarCut.FLAGGED
     cuts[~(snr >= min_snr)] |= StarCut.FAINT
-    center, width = _stellar_locus(radius[(cuts == 0) & (snr >= bright_snr)], min_stars)
+    bright = (cuts == 0) & (snr >= bright_snr)
+    if radius_range is not None:
+        low, high = (require_positive(v, "radius_range") for v in radius_range)
+        bright &= (radius >= low) & (radius <= high)
+    center, width = _stellar_locus(radius[bright], min_stars)
     noise = 1.0 / np.maximum(snr, 1.0)
     cuts[~(np.abs(radius - center) < n_sigma * np.hypot(width, center * noise))] |= StarCut.SIZE
-    locus = (cuts == 0) & (snr >= bright_snr)
+    locus = bright & (cuts == 0)
     fwhm = _median_and_sigma(objects.fwhm[locus])
     cuts[~(np.abs(objects.fwhm - fwhm[0]) < n_sigma * np.hypot(fwhm[1], fwhm[0] * noise))] |= StarCut.WIDTH
     e1, e2 = (e - np.median(e[locus]) for e in (objects.e1, objects.e2))

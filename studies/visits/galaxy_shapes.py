@@ -103,7 +103,7 @@ def measure_galaxies(
     distance, nearest = tree.query(pixels * exposure.pixel_scale, distance_upper_bound=reach)
     near = np.flatnonzero(np.isfinite(distance))
     psf = places[nearest[near]]
-    widths = _half_light_radii(stack.true[places])
+    widths = half_light_radii(stack.true[places])
     width = widths[nearest[near]]
     on_image = np.hypot(galaxies.radius[near] / exposure.pixel_scale, width)
     electrons = exposure.electrons(galaxies.magnitude[near])
@@ -145,7 +145,7 @@ def _psf_transforms(psfs: np.ndarray, size: int) -> np.ndarray:
     return fft.rfft2(wide, workers=1)
 
 
-def _half_light_radii(psfs: np.ndarray) -> np.ndarray:
+def half_light_radii(psfs: np.ndarray) -> np.ndarray:
     """Return half-light radii of PSFs of unit sum from their growth curves [pixel]."""
     half = psfs.shape[1] // 2
     y, x = np.mgrid[-half : half + 1, -half : half + 1]

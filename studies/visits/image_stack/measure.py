@@ -25,7 +25,7 @@ from ....pipeline.catalogue.galaxy_fits import usable_galaxies
 from ....pipeline.catalogue.matching import match_positions
 from ....pipeline.catalogue.star_locus import StarSelection, select_stars
 from ....pipeline.measure.shapes import measure_shapes
-from ..galaxy_shapes import GalaxyShapes, measure_galaxies
+from ..galaxy_shapes import GalaxyShapes, half_light_radii, measure_galaxies
 from ..null_result import NullTest, galaxy_correlations, null_metrics
 from ..null_test import FAINTEST_SNR, REACH, write_shapes
 from ..plots import density_picture, null_test_picture
@@ -44,8 +44,9 @@ MATCH_RADIUS = 3.0
 #: Of the pixels of an object [standard deviations]: at 3, one in six of the galaxies that are usable on stamps of their
 #: own has no five pixels above it. Detected noise has no ellipticity that is known well enough to be used.
 _THRESHOLD = 1.5
-#: S/N in one visit of the objects that determine the locus of stars: the first for which there is one.
-_BRIGHT_SNR = (45.0, 37.0, 30.0)
+#: S/N in one visit of the objects that determine the locus of stars, the fewest of them, and the range of their
+#: half-light radii over those of the PSFs of the models.
+_BRIGHT_SNR, _FEWEST_STARS, _RADII = 45.0, 5, (0.9, 1.1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +192,6 @@ def measure_tile(
     # White noise that is as strong in averages over several pixels as the correlated noise of the stack.
     variance = image.variance * np.float32(exposure.noise_rms**2 / np.median(image.variance[image.mask == 0]))
     objects = detect_objects(image.image, variance, image.mask, threshold=_THRESHOLD, background_size=None)
-    stars = selected_stars(objects, image, stack.experiment.config.stars.snr_min, psfs.visits)
     truth = image.objects
     scale = pixel_scale_of(stack.frame)
     reach = REACH * cell_of(stack.experiment, stack.frame) / float(np.sqrt(stack.visits.visits.places))
@@ -199,6 +199,9 @@ def measure_tile(
     at = np.stack([objects.x, objects.y], axis=1) + tile.first
     images = [ccd for _, wcs in stack.wcs(stack.plan[: psfs.visits], threads) for ccd in wcs.values()]
     transfer = mean_transfer(tile, stack.frame, images)
+    near = places[tile.inside.contains(np.stack([psfs.x, psfs.y], axis=1)[places] / scale - tile.first)]
+    modelled = broadened(psfs.model[near if len(near) else places], transfer)
+    stars = selected_stars(objects, image, modelled, stack.experiment.config.stars.snr_min, psfs.visits)
     tree = cKDTree(np.stack([psfs.x, psfs.y], axis=1)[places])
     distance, nearest = tree.query(at * scale, distance_upper_bound=reach)
     ours = np.isfinite(distance)
@@ -251,16 +254,23 @@ def measure_tile(
     return MeasuredTile(galaxies, stamps, noise_free, area, _star_metrics(stars, psfs, transfer, stack, tile))
 
 
-def selected_stars(objects: DetectedObjects, image: CcdImage, least: float, visits: int) -> StarSelection:
-    """Return the stars of a stack, of at least an S/N in one visit; DomainError where there is no locus of stars."""
-    # The stars are those of one visit. Fainter objects, which deeper stacks are full of, would hide their locus.
-    depth = float(np.sqrt(visits))
-    for bright in _BRIGHT_SNR:
-        try:
-            return select_stars(objects, image.image, mask=image.mask, min_snr=least * depth, bright_snr=bright * depth)
-        except DomainError as error:
-            reason = error
-    raise reason
+def selected_stars(
+    objects: DetectedObjects, image: CcdImage, psfs: np.ndarray, least: float, visits: int
+) -> StarSelection:
+    """Return the stars of a stack, as wide as the PSFs of the models and of at least an S/N in one visit.
+
+    Few stars of one visit are among many galaxies of a deep stack: their locus is looked for where the PSFs say.
+    """
+    depth, radius = float(np.sqrt(visits)), float(np.median(half_light_radii(psfs)))
+    return select_stars(
+        objects,
+        image.image,
+        mask=image.mask,
+        min_snr=least * depth,
+        bright_snr=_BRIGHT_SNR * depth,
+        min_stars=_FEWEST_STARS,
+        radius_range=(_RADII[0] * radius, _RADII[1] * radius),
+    )
 
 
 def _star_metrics(

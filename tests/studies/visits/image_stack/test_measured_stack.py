@@ -11,7 +11,6 @@ from pachon.commands.cli import main
 from pachon.core.errors import DomainError
 from pachon.core.units import ARCMIN
 from pachon.pipeline.catalogue.objects import DetectedObjects
-from pachon.pipeline.catalogue.star_locus import select_stars
 from pachon.pipeline.run_folder import CONFIG_NAME
 from pachon.studies.visits.galaxy_shapes import GalaxyShapes
 from pachon.studies.visits.image_stack.measure import MeasuredTile, null_tests, selected_stars, tile_metrics
@@ -90,11 +89,11 @@ def test_null_tests_of_tiles_correlate_what_is_common_to_their_galaxies():
     assert null_metrics(found[1])["xi_plus_difference_short"] == pytest.approx(abs(added) ** 2)
 
 
-def test_a_locus_of_few_bright_stars_is_found_with_fainter_ones():
-    """Fifteen stars among as many galaxies, of which nine are bright: with those alone there is no locus."""
+def test_few_stars_are_found_where_the_psfs_say():
+    """Seven stars among more bright galaxies, ten of which are equally large."""
     n = 30
-    snr = np.where(np.arange(n) < 9, 200.0, 115.0)
-    radius = np.where(np.arange(n) < 15, RNG.normal(1.7, 0.01, n), RNG.uniform(2.0, 4.0, n))
+    snr = np.full(n, 200.0)
+    radius = np.concatenate([RNG.normal(1.7, 0.01, 7), RNG.normal(3.0, 0.01, 10), RNG.uniform(2.0, 4.0, n - 17)])
     x = y = np.linspace(40.0, 960.0, n)
     nothing, flags = np.zeros(n), np.zeros(n, dtype=int)
     objects = DetectedObjects(
@@ -114,11 +113,15 @@ def test_a_locus_of_few_bright_stars_is_found_with_fainter_ones():
         segmentation=np.zeros((1000, 1000), dtype=int),
     )
     image = SimpleNamespace(image=np.ones((1000, 1000)), mask=np.zeros((1000, 1000), dtype=int))
-    with pytest.raises(DomainError, match="no stellar locus: 9 bright objects"):
-        select_stars(objects, image.image, min_snr=90.0, bright_snr=135.0)
-    stars = selected_stars(objects, image, 30.0, 9)
+    # A Gaussian has half of its light within 1.177 sigma.
+    place = np.arange(31) - 15.0
+    psf = np.exp(-0.5 * (place[:, None] ** 2 + place**2) / (1.69 / 1.1774) ** 2)
+    stars = selected_stars(objects, image, (psf / psf.sum())[None], 30.0, 9)
     assert stars.half_light_radius == pytest.approx(1.7, abs=0.02)
-    assert list(stars.index) == list(range(15))
+    assert list(stars.index) == list(range(7))
+    wrong = np.exp(-0.5 * (place[:, None] ** 2 + place**2) / 4.0**2)
+    with pytest.raises(DomainError, match="no stellar locus: 0 bright objects"):
+        selected_stars(objects, image, (wrong / wrong.sum())[None], 30.0, 9)
 
 
 @pytest.mark.slow
