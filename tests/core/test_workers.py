@@ -10,7 +10,7 @@ import pytest
 from drivers import lives
 
 _DRIVER = """
-import os, time
+import os, signal, time
 from pachon.core.workers import process_workers
 
 def wait(point, threads):
@@ -18,6 +18,8 @@ def wait(point, threads):
     time.sleep(60.0)
 
 if __name__ == "__main__":
+    # A shell lets its jobs in the background ignore Ctrl-C, and so does what they start.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     list(process_workers(wait, 1).results([0]))
 """
 
@@ -53,10 +55,11 @@ def test_workers_end_after_their_driver_is_killed(tmp_path):
 def test_an_interrupt_does_not_wait_for_jobs_under_way(tmp_path):
     driver, worker = start(tmp_path)
     assert lives(worker)
-    driver.send_signal(signal.SIGINT)
-    try:
-        said = driver.communicate(timeout=10.0)[1]
-    finally:
-        driver.kill()
+    with driver:
+        driver.send_signal(signal.SIGINT)
+        try:
+            said = driver.communicate(timeout=10.0)[1]
+        finally:
+            driver.kill()
     assert "KeyboardInterrupt" in said
     assert not lives(worker)

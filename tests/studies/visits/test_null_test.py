@@ -145,7 +145,7 @@ def tested(visits_config, tmp_path_factory):
     folder = tmp_path_factory.mktemp("null")
     stack_visits(visits_config(places=12), folder, threads=1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "_FAINTEST_SNR", 100.0)
+        patch.setattr(module, "FAINTEST_SNR", 100.0)
         return null_test(folder, tiles=1, rings=40, threads=1), folder
 
 
@@ -170,7 +170,7 @@ def test_the_null_test_of_a_folder(tested):
 @pytest.mark.slow
 def test_a_null_test_goes_on_to_the_same_bytes_with_other_workers(tested, backwards, monkeypatch):
     _, folder = tested
-    monkeypatch.setattr(module, "_FAINTEST_SNR", 100.0)
+    monkeypatch.setattr(module, "FAINTEST_SNR", 100.0)
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     gone = sorted((folder / "galaxies").iterdir())[0]
     gone.unlink()
