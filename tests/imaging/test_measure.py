@@ -156,7 +156,7 @@ def test_the_command_fits_one_psf_to_all_images(image, focal_plane_psf, tmp_path
     assert json.loads(capsys.readouterr().out)["images"]["image.fits"]["usable"] > 80
     found = FocalPlanePsf.read(tmp_path / "focal_plane_psf.fits")
     assert found.field.optics is not None
-    own = fit_exposure_psf([tmp_path / "image.fits"], found.field.optics.telescope)
+    own = fit_exposure_psf([tmp_path / "image.fits"], found.field.optics.instrument.telescope)
     np.testing.assert_array_equal(own.draw("R22_S11", 0.0, 0.0), found.draw("R22_S11", 0.0, 0.0))
     assert not (tmp_path / "image_psf.fits").exists()
 
