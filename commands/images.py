@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from .interrupt import interruptible
-from .options import Ccds, Json, Quiet, Raft, Threads, one_name_list
+from .options import AllCcds, Ccds, Json, Quiet, Raft, Threads, chosen_ccds
 from .tables import Rows, print_json
 from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
 
@@ -24,7 +24,7 @@ def images_command(
     config: Annotated[Path | None, Argument(metavar="CONFIG.yaml", help="Configuration; all has a default.")] = None,
     ccds: Ccds = None,
     raft: Raft = None,
-    all_ccds: Annotated[bool, Option("--all", help="All CCDs of the camera.")] = False,
+    all_ccds: AllCcds = False,
     out: Annotated[Path, Option("--out", "-o", help="Folder of the images.")] = Path("pachon_images"),
     exposures: Annotated[int | None, Option(min=1, help="Exposures of the run's time that are summed.")] = None,
     way: Annotated[
@@ -55,7 +55,7 @@ def images_command(
 
     - `pachon images --ccds R22_S11 --quick -o first_look`: the middle of a CCD, within seconds
     - `pachon images --ccds R22_S11`: one whole CCD, a minute on two cores
-    - `pachon images --all --faintest 27 -o field --processes 2`: the whole focal plane, 33 GB
+    - `pachon images --all --faintest 27 -o field --processes 2`: the whole focal plane, 31 GB
     - `pachon images --ccds R22_S11 --exposures 400 -o deep`: 400 exposures of 15 s
     - `pachon images --ccds R22_S11 --no-noise --way eigen -o expected`
     - `pachon images my_images.yaml -o field --resume`: go on where it was stopped
@@ -74,7 +74,7 @@ def images_command(
 
     base = ImagesConfig() if config is None else load_images_configuration(config)
     options = {
-        "run__ccds": one_name_list(ccds=ccds, raft=raft, all="all" if all_ccds else None),
+        "run__ccds": chosen_ccds(ccds, raft, all_ccds),
         "run__seed": seed,
         "image__exposures": exposures,
         "image__way": way,

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 Config = Annotated[Path | None, Argument(metavar="CONFIG.yaml", help="Configuration; all has a default.")]
 Ccds = Annotated[str | None, Option(help="CCDs, separated by commas: R22_S11,R22_S12.")]
 Raft = Annotated[str | None, Option(help="All CCDs of rafts: R22 or R22,R23.")]
+AllCcds = Annotated[bool, Option("--all", help="All CCDs of the camera.")]
 TruthStars = Annotated[int | None, Option(help="Noise-free PSFs on each CCD.")]
 ObservedStars = Annotated[int | None, Option(help="Observed stars on each CCD.")]
 Model = Annotated[str, Argument(help="Bundled model, or path of a prescription.")]
@@ -70,6 +71,11 @@ def name_list(text: str, option: str) -> tuple[str, ...]:
     if not names:
         raise ConfigError(f"{option} = {text!r}: expected names separated by commas, such as R22_S11,R22_S12")
     return names
+
+
+def chosen_ccds(ccds: str | None, raft: str | None, all_ccds: bool) -> tuple[str, ...] | None:
+    """Return the CCDs of the one option of :data:`Ccds`, :data:`Raft` and :data:`AllCcds` that is given, if any."""
+    return one_name_list(ccds=ccds, raft=raft, all="all" if all_ccds else None)
 
 
 def one_name_list(**options: str | None) -> tuple[str, ...] | None:

@@ -12,7 +12,7 @@ from typer import Option
 from ..core.errors import ConfigError
 from .inputs import configured_experiment
 from .interrupt import interruptible
-from .options import Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, one_name_list
+from .options import AllCcds, Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, chosen_ccds
 from .tables import Rows, plain_table, print_json, wide_console
 from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
 
@@ -24,7 +24,7 @@ def run_command(
     config: Config = None,
     ccds: Ccds = None,
     raft: Raft = None,
-    all_ccds: Annotated[bool, Option("--all", help="All CCDs of the camera.")] = False,
+    all_ccds: AllCcds = False,
     out: Annotated[Path, Option("--out", "-o", help="Folder of the run.")] = Path("pachon_run"),
     seed: Annotated[int | None, Option(help="Seed of all random numbers.")] = None,
     resume: Annotated[bool, Option("--resume", help="Keep the CCDs that are finished, compute the others.")] = False,
@@ -61,7 +61,7 @@ def run_command(
     from ..pipeline.run import run
     from ..pipeline.simulate.ccd_loop import left_out_line
 
-    names = one_name_list(ccds=ccds, raft=raft, all="all" if all_ccds else None)
+    names = chosen_ccds(ccds, raft, all_ccds)
     experiment = configured_experiment(
         config, ccds=names, seed=seed, stars__truth=truth_stars, stars__observed=observed_stars
     )

@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from ..core.errors import ConfigError
 from .interrupt import interruptible
-from .options import Ccds, Json, Quiet, Raft, Threads, one_name_list
+from .options import AllCcds, Ccds, Json, Quiet, Raft, Threads, chosen_ccds
 from .tables import Rows, print_json
 from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
 
@@ -32,7 +32,7 @@ def visits_command(
     config: Annotated[Path | None, Argument(metavar="CONFIG.yaml", help="Configuration; all has a default.")] = None,
     ccds: Ccds = None,
     raft: Raft = None,
-    all_ccds: Annotated[bool, Option("--all", help="All CCDs of the camera.")] = False,
+    all_ccds: AllCcds = False,
     count: Annotated[int | None, Option("--count", "-n", min=1, help="Visits; 10 by default.")] = None,
     dither_deg: Annotated[float | None, Option(help="Radius of the disc of the pointings [deg].")] = None,
     roll: Annotated[
@@ -80,7 +80,7 @@ def visits_command(
     from ..studies.visits.config import VisitsConfig, load_visits_configuration
     from ..studies.visits.visits import stack_visits
 
-    names = one_name_list(ccds=ccds, raft=raft, all="all" if all_ccds else None)
+    names = chosen_ccds(ccds, raft, all_ccds)
     base = VisitsConfig() if config is None else load_visits_configuration(config)
     settings = with_options(
         base,

@@ -62,6 +62,11 @@ class GalaxyShapes:
     def __len__(self) -> int:
         return len(self.x)
 
+    @property
+    def usable_twice(self) -> np.ndarray:
+        """Whether each galaxy is fit for shear with either PSF, bool [n]."""
+        return self.usable & self.true_usable
+
     @classmethod
     def joined(cls, parts: list[GalaxyShapes]) -> GalaxyShapes:
         """Return the galaxies of several parts."""

@@ -66,30 +66,31 @@ class NullTest:
     correlations: dict[str, Correlation]
     calibration: dict[str, ShearCalibration] = field(default_factory=dict)
 
-
-def galaxy_correlations(galaxies: GalaxyShapes, patch: np.ndarray) -> dict[str, Correlation]:
-    """Return the correlations of a :class:`NullTest`, with errors of a jackknife where there are several patches.
-
-    Parameters
-    ----------
-    galaxies : GalaxyShapes
-        Galaxies.
-    patch : ndarray of int, shape [n]
-        Patch of each.
-    """
-    both = galaxies.usable & galaxies.true_usable
-    kinds = {
-        "model": (galaxies.e1, galaxies.e2, galaxies.usable),
-        "true": (galaxies.true_e1, galaxies.true_e2, galaxies.true_usable),
-        "difference": (galaxies.e1 - galaxies.true_e1, galaxies.e2 - galaxies.true_e2, both),
-    }
-    return correlations(galaxies.x, galaxies.y, kinds, patch)
+    @classmethod
+    def of(
+        cls,
+        visits: int,
+        parts: list[GalaxyShapes],
+        area: float,
+        calibration: dict[str, ShearCalibration] | None = None,
+    ) -> NullTest:
+        """Return the test of the galaxies of tiles of an area [arcmin^2], with errors of a jackknife over the tiles."""
+        galaxies = GalaxyShapes.joined(parts)
+        both = galaxies.usable_twice
+        kinds = {
+            "model": (galaxies.e1, galaxies.e2, galaxies.usable),
+            "true": (galaxies.true_e1, galaxies.true_e2, galaxies.true_usable),
+            "difference": (galaxies.e1 - galaxies.true_e1, galaxies.e2 - galaxies.true_e2, both),
+        }
+        tile = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+        found = correlations(galaxies.x, galaxies.y, kinds, tile)
+        return cls(visits, galaxies, float(galaxies.usable.sum() / area), found, calibration or {})
 
 
 def null_metrics(result: NullTest) -> dict[str, Any]:
     """Return the figures of a null test; keys end in their unit."""
     galaxies = result.galaxies
-    usable, both = galaxies.usable, galaxies.usable & galaxies.true_usable
+    usable, both = galaxies.usable, galaxies.usable_twice
     shift = np.stack([galaxies.e1 - galaxies.true_e1, galaxies.e2 - galaxies.true_e2])[:, both]
     metrics: dict[str, Any] = {
         "galaxies": len(galaxies),

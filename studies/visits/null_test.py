@@ -26,7 +26,7 @@ from ...sky.galaxies import Galaxies
 from ...sky.mosaic import PlantedGalaxies
 from .config import STACK_STAMP, load_visits_configuration
 from .galaxy_shapes import GalaxyShapes, measure_galaxies
-from .null_result import NullTest, galaxy_correlations, null_metrics, shear_bias
+from .null_result import NullTest, null_metrics, shear_bias
 from .plots import density_picture, null_test_picture
 from .psf_visit import StackFrame, stack_limit
 from .stack import PsfStack
@@ -122,19 +122,21 @@ def null_test(
             write_shapes(path, next(results), stamp)
         # Read from the files, as by a resumed test, so that both have the same numbers.
         parts = [_read_shapes(path, stamp) for path in paths]
-        galaxies = GalaxyShapes.joined(parts)
-        if (n := int((galaxies.usable & galaxies.true_usable).sum())) < 2:
-            text = f"{n} of {len(galaxies)} galaxies to magnitude {faintest:.2f} are usable in {visits} visits"
+        if (n := sum(int(part.usable_twice.sum()) for part in parts)) < 2:
+            text = f"{n} of {sum(map(len, parts))} galaxies to magnitude {faintest:.2f} are usable in {visits} visits"
             raise DomainError(f"{folder}: {text}; expected two or more, of the galaxies of {CONFIG_NAME}")
         bias = _calibration(frame.matrix, len(depth.ring_galaxies(chosen, rings)), list(results))
         with reporter.stage(f"correlations in {visits} visits"):
-            patch = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-            density = float(galaxies.usable.sum() / (len(chosen) * (cell / ARCMIN) ** 2))
-            found[visits] = NullTest(visits, galaxies, density, galaxy_correlations(galaxies, patch), bias)
+            found[visits] = NullTest.of(visits, parts, len(chosen) * (cell / ARCMIN) ** 2, bias)
     write_json(folder / "null_test.json", {"stacks": {str(n): null_metrics(r) for n, r in found.items()}})
-    write_bytes(folder / "null_test.png", null_test_picture(found))
-    write_bytes(folder / "null_test_density.png", density_picture(found))
+    write_pictures(folder, found)
     return found
+
+
+def write_pictures(folder: Path, results: dict[int, NullTest]) -> None:
+    """Write the pictures of null tests: correlations (Fig. 17), and their amplitude against density (Fig. 18)."""
+    write_bytes(folder / "null_test.png", null_test_picture(results))
+    write_bytes(folder / "null_test_density.png", density_picture(results))
 
 
 def _covered_tiles(stack: PsfStack, cell: float, places: int) -> list[tuple[int, int]]:

@@ -26,9 +26,8 @@ from ....pipeline.catalogue.matching import match_positions
 from ....pipeline.catalogue.star_locus import StarSelection, select_stars
 from ....pipeline.measure.shapes import measure_shapes
 from ..galaxy_shapes import GalaxyShapes, half_light_radii, measure_galaxies
-from ..null_result import NullTest, galaxy_correlations, null_metrics
-from ..null_test import FAINTEST_SNR, REACH, write_shapes
-from ..plots import density_picture, null_test_picture
+from ..null_result import NullTest, null_metrics
+from ..null_test import FAINTEST_SNR, REACH, write_pictures, write_shapes
 from ..psf_visit import stack_limit
 from ..stack import PsfStack
 from ..visits import cell_of, pixel_scale_of, stack_path
@@ -146,22 +145,18 @@ def measure_stack(
     for visits, result in tests.items():
         found[visits]["null_test"] = null_metrics(result)
     if tests:
-        write_bytes(stack.folder / "null_test.png", null_test_picture(tests))
-        write_bytes(stack.folder / "null_test_density.png", density_picture(tests))
+        write_pictures(stack.folder, tests)
     write_json(stack.folder / "images.json", {"stacks": {str(n): metrics for n, metrics in found.items()}})
     return found
 
 
 def null_tests(tiles: dict[int, list[MeasuredTile]]) -> dict[int, NullTest]:
     """Return the null test of the galaxies on the images, by number of visits, of stacks with pairs of galaxies."""
-    tests = {}
-    for visits, own in tiles.items():
-        galaxies = GalaxyShapes.joined([tile.galaxies for tile in own])
-        if (galaxies.usable & galaxies.true_usable).sum() >= 2:
-            patch = np.repeat(np.arange(len(own)), [len(tile.galaxies) for tile in own])
-            density = float(galaxies.usable.sum()) / sum(tile.area for tile in own)
-            tests[visits] = NullTest(visits, galaxies, density, galaxy_correlations(galaxies, patch))
-    return tests
+    return {
+        visits: NullTest.of(visits, [tile.galaxies for tile in own], sum(tile.area for tile in own))
+        for visits, own in tiles.items()
+        if sum(int(tile.galaxies.usable_twice.sum()) for tile in own) >= 2
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,11 +194,11 @@ def measure_tile(
     at = np.stack([objects.x, objects.y], axis=1) + tile.first
     images = [ccd for _, wcs in stack.wcs(stack.plan[: psfs.visits], threads) for ccd in wcs.values()]
     transfer = mean_transfer(tile, stack.frame, images)
-    near = places[tile.inside.contains(np.stack([psfs.x, psfs.y], axis=1)[places] / scale - tile.first)]
+    known_at = np.stack([psfs.x, psfs.y], axis=1)[places]
+    near = places[tile.inside.contains(known_at / scale - tile.first)]
     modelled = broadened(psfs.model[near if len(near) else places], transfer)
     stars = selected_stars(objects, image, modelled, stack.experiment.config.stars.snr_min, psfs.visits)
-    tree = cKDTree(np.stack([psfs.x, psfs.y], axis=1)[places])
-    distance, nearest = tree.query(at * scale, distance_upper_bound=reach)
+    distance, nearest = cKDTree(known_at).query(at * scale, distance_upper_bound=reach)
     ours = np.isfinite(distance)
     ours[stars.index] = False
     rows = np.flatnonzero(ours)
