@@ -32,6 +32,12 @@ LENSES = sorted((Path(__file__).parents[1] / "data" / "lenses").glob("*.zmx"))
 OFF_AXIS, ODD = ("decentred", "fold"), "odd_asphere"
 
 
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path, monkeypatch):
+    """Its importer of CODE V writes a log into the folder it is called from."""
+    monkeypatch.chdir(tmp_path)
+
+
 def compare_rays(telescope, model, origin):
     """Compare rays through a model of ray-optics with ours; `origin` is the height of its first surface [m]."""
     from rayoptics.raytr import trace
