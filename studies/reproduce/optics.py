@@ -85,7 +85,7 @@ def layout(bench: Bench) -> Reproduced:
         f" {len(camera)} CCDs, {0.2 * bench.optics.field_radius_on_detector * 1e3:.1f} cm",
         agrees,
         'but for the plate scale: 206265"/10.3 m is 0.0200"/µm, so the paper\'s 0.0197 does not go with its own focal'
-        " length. The four corner rafts of wavefront sensors are not modelled",
+        " length. The corner rafts are cameras of their own (lsst_wavefront, lsst_guider) and are not drawn",
         measured,
     )
 
