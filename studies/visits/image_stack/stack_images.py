@@ -77,8 +77,10 @@ def stack_images(
     reporter = Reporter(quiet=True) if reporter is None else reporter
     stack = ImageStack.of(folder, settings)
     check_rotators(stack.experiment, stack.plan)
-    _claim(stack, resume)
+    # Before the settings are written, so that others can be tried.
+    _check_memory(stack, threads, 1)
     _check_room(stack)
+    _claim(stack, resume)
     plan = stack.plan
     sums = {tile: _sums_so_far(stack, tile, resume) for tile in stack.tiles}
     done = min(s.visits for s in sums.values())
@@ -235,7 +237,7 @@ def _check_room(stack: ImageStack) -> None:
     tile, tiles = _tile_bytes(stack), len(stack.tiles)
     # Sums, one of them twice while it is replaced, and the stacks that are kept.
     needed = tile * (tiles + 1 + tiles * len(stack.visits.kept))
-    free = shutil.disk_usage(stack.folder).free
+    free = shutil.disk_usage(stack.folder.parent).free
     there = sum(path.stat().st_size for path in stack.folder.glob("*.fits"))
     if needed - there > free:
         raise DomainError(f"{stack.folder}: the stacks need {readable(needed)} of disk, {readable(free)} are free")

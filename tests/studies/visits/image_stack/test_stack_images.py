@@ -171,13 +171,19 @@ def test_refusals(visits_folder, tmp_path_factory, monkeypatch, capsys):
     with pytest.raises(ProductError, match="no images"):
         ImageStack.of(visits_folder)
     monkeypatch.setattr(module.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 1000}))
+    folder = tmp_path_factory.mktemp("visits")
+    (folder / "config.yaml").write_bytes((visits_folder / "config.yaml").read_bytes())
     with pytest.raises(DomainError, match="of disk"):
-        stack_images(visits_folder, SMALL)
+        stack_images(folder, SMALL)
+    # Settings that were refused are not left behind.
+    assert [path.name for path in folder.iterdir()] == ["config.yaml"]
     monkeypatch.undo()
+    (folder / "images").mkdir()
+    (folder / "images" / "images.yaml").write_text(ImageStack.of(folder, SMALL).settings.to_yaml())
     with pytest.raises(ProductError, match="go on with --resume"):
-        stack_images(visits_folder, SMALL)
+        stack_images(folder, SMALL)
     with pytest.raises(ProductError, match="images of other settings"):
-        stack_images(visits_folder, SMALL.model_copy(update={"noise": False}), resume=True)
+        stack_images(folder, SMALL.model_copy(update={"noise": False}), resume=True)
 
 
 def test_the_limit_of_the_galaxies_follows_the_depth_and_then_stays(visits_folder, small_visits):
