@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from typer import Argument, Option
@@ -13,13 +13,12 @@ from .inputs import load_model
 from .interrupt import interruptible
 from .options import Json, Quiet, Threads
 from .tables import Rows, print_json
+from .workers import Processes, chosen_workers
 
 app = typer.Typer()
 
 _CAPTION = "Completeness and purity of the stars; magnitude at which half of the objects are found; purity of all."
 _MODELS = ("ccd", "focal_plane")
-#: What names of products add to that of an image.
-_CATALOGUE, _PSF = "_galaxies", "_psf"
 
 
 @app.command("measure")
@@ -43,6 +42,7 @@ def measure_command(
     ] = None,
     order: Annotated[int | None, Option(min=0, max=6, help="Order of polynomials over the image.")] = None,
     min_snr: Annotated[float, Option(help="Least S/N of stars.")] = 30.0,
+    processes: Processes = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -56,14 +56,13 @@ def measure_command(
     **Examples**
 
     - `pachon measure pachon_images/image_R22_S11.fits`
+    - `pachon measure pachon_images/image_*.fits -o catalogues --processes 2`: two images at a time
     - `pachon measure pachon_images/image_*.fits -o catalogues --basis pca --order 3`: the PSF in the paper's way
     - `pachon measure pachon_images/image_*.fits -o catalogues --model focal_plane`: optics, heights and turbulence
     """
     from ..core.files import make_folder
-    from ..core.table_files import write_table
     from ..imaging.exposure_psf import fit_exposure_psf
-    from ..imaging.image_file import CcdImage
-    from ..imaging.measure import measure_image
+    from ..imaging.measure_files import images_among, measure_files
 
     if model not in _MODELS:
         raise ConfigError(f"--model = {model!r}: expected one of {', '.join(_MODELS)}")
@@ -71,27 +70,18 @@ def measure_command(
         raise ConfigError("--telescope: expected with --model focal_plane alone")
     if out is not None:
         make_folder(out)
-    # Written beside the images, products have names that a pattern of images finds too.
-    products = {path.with_name(f"{path.stem}{added}.fits") for path in images for added in (_CATALOGUE, _PSF)}
-    images = [path for path in images if path not in products]
-    kind: dict[str, Any] = {"basis": basis, "interpolation": interpolation, "order": order}
-    found = {}
-    with interruptible(quiet, "catalogues that are written stay") as reporter:
+    images = images_among(images)
+    options = {"basis": basis, "interpolation": interpolation, "order": order, "min_snr": min_snr}
+    with (
+        interruptible(quiet, "catalogues that are written stay") as reporter,
+        chosen_workers(processes, None, None, threads, reporter.line) as maker,
+    ):
         psf = None
         if model == "focal_plane":
             known = None if telescope is None else load_model(telescope)
             psf = fit_exposure_psf(images, known, min_snr=min_snr, threads=threads, reporter=reporter)
             psf.write((images[0].parent if out is None else out) / "focal_plane_psf.fits")
-        with reporter.stage(f"objects of {len(images)} images", total=len(images)) as stage:
-            for number, path in enumerate(images, start=1):
-                catalogue = measure_image(CcdImage.read(path), psf=psf, **kind, min_snr=min_snr, threads=threads)
-                folder = path.parent if out is None else out
-                if psf is None:
-                    catalogue.psf.write(folder / f"{path.stem}{_PSF}.fits")
-                write_table(folder / f"{path.stem}{_CATALOGUE}.fits", catalogue.table())
-                found[path.name] = catalogue.metrics()
-                stage.advance()
-                stage.step(path.name, number, len(images))
+        found = measure_files(images, out, psf=psf, options=options, workers=maker, threads=threads, reporter=reporter)
     if as_json:
         print_json({"images": found})
     elif not quiet:

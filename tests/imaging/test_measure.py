@@ -148,12 +148,42 @@ def test_the_command_writes_catalogue_and_psf(image, catalogue, tmp_path, capsys
     assert list(json.loads(capsys.readouterr().out)["images"]) == ["image.fits"]
 
 
+def test_images_side_by_side_have_the_same_products(image, tmp_path, capsys):
+    for name in ("a", "b"):
+        image.write(tmp_path / f"{name}.fits")
+    images = [str(tmp_path / name) for name in ("a.fits", "b.fits", "a.fits")]
+    for folder, options in (("one", ()), ("two", ("--processes", "2"))):
+        assert main(["measure", *images, "--json", "--quiet", "-o", str(tmp_path / folder), *options]) == 0
+        assert list(json.loads(capsys.readouterr().out)["images"]) == ["a.fits", "b.fits"]
+    one, two = ({path.name: path.read_bytes() for path in (tmp_path / folder).iterdir()} for folder in ("one", "two"))
+    assert sorted(one) == ["a_galaxies.fits", "a_psf.fits", "b_galaxies.fits", "b_psf.fits"]
+    assert one == two
+
+
+def test_images_of_one_name_have_no_common_folder(image, tmp_path, capsys):
+    images = [tmp_path / folder / "image.fits" for folder in ("first", "second")]
+    for path in images:
+        path.parent.mkdir()
+        image.write(path)
+    given = ["measure", *map(str, images), "--json", "--quiet"]
+    assert main([*given, "-o", str(tmp_path / "out")]) == 2
+    assert "two images are called image.fits; expected different names, or no --out" in capsys.readouterr().err
+    assert main(given) == 0
+    assert list(json.loads(capsys.readouterr().out)["images"]) == [str(path) for path in images]
+    assert all(path.with_name("image_galaxies.fits").exists() for path in images)
+
+
 @pytest.mark.slow
 def test_the_command_fits_one_psf_to_all_images(image, focal_plane_psf, tmp_path, capsys):
     image.write(tmp_path / "image.fits")
     command = ["measure", str(tmp_path / "image.fits"), "--model", "focal_plane", "--json", "--quiet"]
     assert main([*command, "--telescope", "lsst_v3.3_r"]) == 0
     assert json.loads(capsys.readouterr().out)["images"]["image.fits"]["usable"] > 80
+    product = tmp_path / "image_galaxies.fits"
+    before = product.read_bytes()
+    assert main([*command, "--telescope", "lsst_v3.3_r", "--processes", "2"]) == 0
+    assert product.read_bytes() == before
+    capsys.readouterr()
     found = FocalPlanePsf.read(tmp_path / "focal_plane_psf.fits")
     assert found.field.optics is not None
     own = fit_exposure_psf([tmp_path / "image.fits"], found.field.optics.instrument.telescope)
