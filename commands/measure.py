@@ -42,6 +42,7 @@ def measure_command(
     ] = None,
     order: Annotated[int | None, Option(min=0, max=6, help="Order of polynomials over the image.")] = None,
     min_snr: Annotated[float, Option(help="Least S/N of stars.")] = 30.0,
+    resume: Annotated[bool, Option("--resume", help="Keep images that were measured in the same way.")] = False,
     processes: Processes = None,
     threads: Threads = None,
     quiet: Quiet = False,
@@ -57,6 +58,7 @@ def measure_command(
 
     - `pachon measure pachon_images/image_R22_S11.fits`
     - `pachon measure pachon_images/image_*.fits -o catalogues --processes 2`: two images at a time
+    - `pachon measure pachon_images/image_*.fits -o catalogues --resume`: go on where it was stopped
     - `pachon measure pachon_images/image_*.fits -o catalogues --basis pca --order 3`: the PSF in the paper's way
     - `pachon measure pachon_images/image_*.fits -o catalogues --model focal_plane`: optics, heights and turbulence
     """
@@ -73,15 +75,17 @@ def measure_command(
     images = images_among(images)
     options = {"basis": basis, "interpolation": interpolation, "order": order, "min_snr": min_snr}
     with (
-        interruptible(quiet, "catalogues that are written stay") as reporter,
+        interruptible(quiet, "catalogues that are written stay, and --resume goes on from there") as reporter,
         chosen_workers(processes, None, None, threads, reporter.line) as maker,
     ):
         psf = None
         if model == "focal_plane":
             known = None if telescope is None else load_model(telescope)
-            psf = fit_exposure_psf(images, known, min_snr=min_snr, threads=threads, reporter=reporter)
-            psf.write((images[0].parent if out is None else out) / "focal_plane_psf.fits")
-        found = measure_files(images, out, psf=psf, options=options, workers=maker, threads=threads, reporter=reporter)
+            psf = (images[0].parent if out is None else out) / "focal_plane_psf.fits"
+            fit_exposure_psf(images, known, min_snr=min_snr, threads=threads, reporter=reporter).write(psf)
+        found = measure_files(
+            images, out, psf=psf, options=options, resume=resume, workers=maker, threads=threads, reporter=reporter
+        )
     if as_json:
         print_json({"images": found})
     elif not quiet:

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
+import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from ..core.errors import ConfigError
+from astropy.table import Table
+
+from ..core.errors import ConfigError, ProductError
+from ..core.files import parsing, read_bytes
 from ..core.memory import require_bytes
 from ..core.ordered_jobs import ordered_results
 from ..core.progress import Reporter
 from ..core.table_files import write_table
+from ..core.version import VERSION
 from ..core.workers import MakeWorkers
+from ..pipeline.config import digest
 from ..pipeline.focal_plane_psf.model import FocalPlanePsf
 from .image_file import CcdImage
 from .measure import measure_image
@@ -24,7 +33,7 @@ CATALOGUE_SUFFIX, PSF_SUFFIX = "_galaxies", "_psf"
 _FILE_SIZES = 8
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class FileMeasurement:
     """Measure image files; a picklable function for every kind of worker.
 
@@ -32,24 +41,57 @@ class FileMeasurement:
     ----------
     folder : Path or None
         Folder of the products; None for that of each image.
-    psf : FocalPlanePsf or None
-        Model of all images; None for one of each image.
+    psf : Path or None
+        File of the model of all images; None for one of each image.
     options : dict
         Further arguments of :func:`~.measure.measure_image`.
     """
 
     folder: Path | None
-    psf: FocalPlanePsf | None
+    psf: Path | None
     options: dict[str, Any]
 
     def __call__(self, path: Path, threads: int) -> dict[str, Any]:
-        """Measure an image, write its catalogue and its PSF model, and return its metrics."""
-        catalogue = measure_image(CcdImage.read(path), psf=self.psf, threads=threads, **self.options)
-        folder = path.parent if self.folder is None else self.folder
-        if self.psf is None:
-            catalogue.psf.write(folder / f"{path.stem}{PSF_SUFFIX}.fits")
-        write_table(folder / f"{path.stem}{CATALOGUE_SUFFIX}.fits", catalogue.table())
-        return catalogue.metrics()
+        """Measure an image, write its PSF model and its catalogue, and return its metrics."""
+        psf = None if self.psf is None else _model_in(self.psf, _content(self.psf))
+        catalogue = measure_image(CcdImage.read(path), psf=psf, threads=threads, **self.options)
+        if psf is None:
+            catalogue.psf.write(self.product(path, PSF_SUFFIX))
+        table, metrics = catalogue.table(), catalogue.metrics()
+        table.meta |= {"MEASHASH": self.digest(path), "METRICS": json.dumps(metrics)}
+        # Last: a resumed measurement takes it for the sign of a finished image.
+        write_table(self.product(path, CATALOGUE_SUFFIX), table)
+        return metrics
+
+    def product(self, path: Path, suffix: str) -> Path:
+        """Return the path of a product of an image."""
+        return (path.parent if self.folder is None else self.folder) / f"{path.stem}{suffix}.fits"
+
+    def digest(self, path: Path) -> str:
+        """Return the SHA-256 of all that decides the products of an image: its file, options, model, version."""
+        model = None if self.psf is None else _content(self.psf)
+        return digest({"image": _content(path), "psf": model, "options": self.options, "version": VERSION})
+
+    def finished(self, path: Path) -> dict[str, Any] | None:
+        """Return the metrics of an image that is measured already, in the same way."""
+        file = self.product(path, CATALOGUE_SUFFIX)
+        try:
+            data = read_bytes(file, ProductError)
+            with parsing(file, "damaged or no table", ProductError):
+                meta = Table.read(io.BytesIO(data), format="fits").meta
+        except ProductError:
+            return None
+        return json.loads(meta["METRICS"]) if meta.get("MEASHASH") == self.digest(path) else None
+
+
+@lru_cache(maxsize=1)
+def _model_in(path: Path, content: str) -> FocalPlanePsf:
+    """Return the model in a file of that content; it is kept from image to image."""
+    return FocalPlanePsf.read(path)
+
+
+def _content(path: Path) -> str:
+    return hashlib.sha256(read_bytes(path, ProductError)).hexdigest()
 
 
 def images_among(paths: Sequence[Path]) -> list[Path]:
@@ -64,8 +106,9 @@ def measure_files(
     images: Sequence[Path],
     folder: Path | None = None,
     *,
-    psf: FocalPlanePsf | None = None,
+    psf: Path | None = None,
     options: dict[str, Any] | None = None,
+    resume: bool = False,
     workers: MakeWorkers | None = None,
     threads: int | None = None,
     reporter: Reporter | None = None,
@@ -80,10 +123,12 @@ def measure_files(
         Files of :class:`~.image_file.CcdImage`.
     folder : Path, optional
         Folder of the products; by default that of each image.
-    psf : FocalPlanePsf, optional
-        Model of all images; by default one of each image is fitted, and written.
+    psf : Path, optional
+        File of a :class:`~pachon.FocalPlanePsf` of all images; by default a model of each image is fitted, and written.
     options : dict, optional
         Further arguments of :func:`~.measure.measure_image`.
+    resume : bool
+        Keep the products of images that were measured in the same way.
     workers : callable, optional
         Function that makes the workers, which see the same files; by default this process.
     threads : int, optional
@@ -101,15 +146,18 @@ def measure_files(
         if folder is not None:
             raise ConfigError(f"{folder}: two images are called {twice[0]}; expected different names, or no --out")
         names = [str(path) for path in images]
-    sizes = [path.stat().st_size for path in images if path.is_file()]
+    measure = FileMeasurement(folder, psf, options or {})
+    found = {name: measure.finished(path) if resume else None for name, path in zip(names, images, strict=True)}
+    due = [(name, path) for name, path in zip(names, images, strict=True) if found[name] is None]
+    sizes = [path.stat().st_size for _, path in due if path.is_file()]
     metrics = ordered_results(
-        FileMeasurement(folder, psf, options or {}),
-        names,
-        images,
-        title=f"objects of {len(images)} images",
+        measure,
+        [name for name, _ in due],
+        [path for _, path in due],
+        title=f"objects of {len(due)} images",
         workers=workers,
         threads=threads,
         check=lambda count: require_bytes(count * _FILE_SIZES * max(sizes, default=0), f"{count} images at a time"),
         reporter=Reporter(quiet=True) if reporter is None else reporter,
     )
-    return dict(zip(names, metrics, strict=True))
+    return found | dict(zip([name for name, _ in due], metrics, strict=True))

@@ -1,6 +1,7 @@
 """From a simulated image to a catalogue: stars, the PSF from them and galaxies against the truth of the image."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -158,6 +159,20 @@ def test_images_side_by_side_have_the_same_products(image, tmp_path, capsys):
     one, two = ({path.name: path.read_bytes() for path in (tmp_path / folder).iterdir()} for folder in ("one", "two"))
     assert sorted(one) == ["a_galaxies.fits", "a_psf.fits", "b_galaxies.fits", "b_psf.fits"]
     assert one == two
+    # One catalogue is of another image, one is damaged; the third is kept.
+    image.write(tmp_path / "c.fits")
+    assert main(["measure", str(tmp_path / "c.fits"), "--quiet", "-o", str(tmp_path / "two")]) == 0
+    kept = (tmp_path / "two" / "c_galaxies.fits").stat().st_mtime_ns
+    capsys.readouterr()
+    (tmp_path / "two" / "a_galaxies.fits").write_bytes(one["a_galaxies.fits"][:5000])
+    replace(image, image=image.image + 1.0).write(tmp_path / "b.fits")
+    images = [str(tmp_path / name) for name in ("a.fits", "b.fits", "c.fits")]
+    assert main(["measure", *images, "--json", "--quiet", "--resume", "-o", str(tmp_path / "two")]) == 0
+    metrics = json.loads(capsys.readouterr().out)["images"]
+    assert metrics["a.fits"] == metrics["c.fits"]
+    assert (tmp_path / "two" / "a_galaxies.fits").read_bytes() == one["a_galaxies.fits"]
+    assert (tmp_path / "two" / "b_galaxies.fits").read_bytes() != one["b_galaxies.fits"]
+    assert (tmp_path / "two" / "c_galaxies.fits").stat().st_mtime_ns == kept
 
 
 def test_images_of_one_name_have_no_common_folder(image, tmp_path, capsys):
