@@ -52,7 +52,8 @@ def measure_command(
 
     Each image.fits leaves image_galaxies.fits, a table with sky positions, magnitudes and ellipticities before the PSF,
     and image_psf.fits, the PSF model of the CCD. With `--model focal_plane` one model of all images of an exposure
-    takes its place: focal_plane_psf.fits. Simulated images know the truth: completeness and purity are printed.
+    takes its place: focal_plane_psf.fits. Simulated images know the truth: completeness and purity are printed. Images
+    without objects, or with too few stars, are reported and left out.
 
     **Examples**
 
@@ -87,7 +88,7 @@ def measure_command(
             images, out, psf=psf, options=options, resume=resume, workers=maker, threads=threads, reporter=reporter
         )
     if as_json:
-        print_json({"images": found})
+        print_json({"images": found.metrics, "left_out": found.left_out})
     elif not quiet:
         rows = [
             (
@@ -99,7 +100,7 @@ def measure_command(
                 f"{m.get('purity', float('nan')):.3f}",
                 f"{m['usable_per_arcmin2']:.1f}",
             )
-            for name, m in found.items()
+            for name, m in found.metrics.items()
         ]
         headings = ("image", "objects", "stars", "complete, pure", "half [mag]", "purity", "usable/arcmin²")
         Rows(headings, rows, _CAPTION).show()

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from astropy.table import Table
 
-from ..core.errors import ConfigError, ProductError
+from ..core.errors import ConfigError, DomainError, ProductError
 from ..core.files import parsing, read_bytes
 from ..core.memory import require_bytes
 from ..core.ordered_jobs import ordered_results
@@ -31,6 +31,13 @@ from .measure import measure_image
 CATALOGUE_SUFFIX, PSF_SUFFIX = "_galaxies", "_psf"
 #: Memory that measuring an image takes, in sizes of its file: 1.3 GiB for 4096 x 4096 pixels.
 _FILE_SIZES = 8
+
+
+class MeasuredFiles(NamedTuple):
+    """Results of image files, by their names."""
+
+    metrics: dict[str, dict[str, Any]]  #: those of :class:`~.measure.ImageCatalogue`
+    left_out: dict[str, str]  #: why an image could not be measured
 
 
 @dataclass(frozen=True)
@@ -51,10 +58,14 @@ class FileMeasurement:
     psf: Path | None
     options: dict[str, Any]
 
-    def __call__(self, path: Path, threads: int) -> dict[str, Any]:
-        """Measure an image, write its PSF model and its catalogue, and return its metrics."""
+    def __call__(self, path: Path, threads: int) -> dict[str, Any] | str:
+        """Measure an image, write its PSF model and its catalogue, and return its metrics, or why it has none."""
         psf = None if self.psf is None else _model_in(self.psf, _content(self.psf))
-        catalogue = measure_image(CcdImage.read(path), psf=psf, threads=threads, **self.options)
+        image = CcdImage.read(path)
+        try:
+            catalogue = measure_image(image, psf=psf, threads=threads, **self.options)
+        except DomainError as error:
+            return str(error)
         if psf is None:
             catalogue.psf.write(self.product(path, PSF_SUFFIX))
         table, metrics = catalogue.table(), catalogue.metrics()
@@ -112,10 +123,11 @@ def measure_files(
     workers: MakeWorkers | None = None,
     threads: int | None = None,
     reporter: Reporter | None = None,
-) -> dict[str, dict[str, Any]]:
-    """Measure image files, and write a catalogue and a PSF model of each; return the metrics of each.
+) -> MeasuredFiles:
+    """Measure image files, and write a catalogue and a PSF model of each.
 
-    Products have the same bytes on any number of threads and by any workers.
+    Images without objects, or with too few stars, are reported and left out. Products have the same bytes on any number
+    of threads and by any workers.
 
     Parameters
     ----------
@@ -139,25 +151,36 @@ def measure_files(
     Raises
     ------
     PachonError
-        If two products would have one name, memory is short, or an image cannot be measured.
+        If two products would have one name, memory is short, an image cannot be read, or none can be measured.
     """
     names = [path.name for path in images]
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         if folder is not None:
             raise ConfigError(f"{folder}: two images are called {twice[0]}; expected different names, or no --out")
         names = [str(path) for path in images]
+    reporter = Reporter(quiet=True) if reporter is None else reporter
     measure = FileMeasurement(folder, psf, options or {})
-    found = {name: measure.finished(path) if resume else None for name, path in zip(names, images, strict=True)}
-    due = [(name, path) for name, path in zip(names, images, strict=True) if found[name] is None]
-    sizes = [path.stat().st_size for _, path in due if path.is_file()]
-    metrics = ordered_results(
+    metrics = {name: measure.finished(path) if resume else None for name, path in zip(names, images, strict=True)}
+    due = {name: path for name, path in zip(names, images, strict=True) if metrics[name] is None}
+    sizes = [path.stat().st_size for path in due.values() if path.is_file()]
+    results = ordered_results(
         measure,
-        [name for name, _ in due],
-        [path for _, path in due],
+        list(due),
+        due.values(),
         title=f"objects of {len(due)} images",
         workers=workers,
         threads=threads,
         check=lambda count: require_bytes(count * _FILE_SIZES * max(sizes, default=0), f"{count} images at a time"),
-        reporter=Reporter(quiet=True) if reporter is None else reporter,
+        reporter=reporter,
     )
-    return found | dict(zip([name for name, _ in due], metrics, strict=True))
+    left_out = {}
+    for name, result in zip(due, results, strict=True):
+        if isinstance(result, str):
+            left_out[name] = result
+            reporter.line(f"{name} is left out: {result}")
+        else:
+            metrics[name] = result
+    if len(left_out) == len(images):
+        name, reason = next(iter(left_out.items()))
+        raise DomainError(reason if len(images) == 1 else f"no image can be measured; {name}: {reason}")
+    return MeasuredFiles({name: found for name, found in metrics.items() if found is not None}, left_out)

@@ -228,6 +228,15 @@ def test_what_cannot_be_measured(image, tmp_path, capsys):
     empty = CcdImage(image.name, 0.0 * image.image, image.variance, image.mask, image.header, image.objects)
     with pytest.raises(PachonError, match="CCD R22_S11: "):
         measure_image(empty)
+    empty.write(tmp_path / "empty.fits")
+    assert main(["measure", str(tmp_path / "empty.fits"), "--quiet"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    # The others go on.
+    image.write(tmp_path / "image.fits")
+    assert main(["measure", str(tmp_path / "empty.fits"), str(tmp_path / "image.fits"), "--json", "--quiet"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert list(found["images"]) == ["image.fits"]
+    assert found["left_out"]["empty.fits"].startswith("CCD R22_S11: ")
     (tmp_path / "text.fits").write_text("no image")
     assert main(["measure", str(tmp_path / "text.fits")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
