@@ -94,9 +94,8 @@ def main() -> None:
     print(f"chi-square a pixel: median {np.median(quality):.3f}, worst {quality.max():.3f}")
     beyond = np.tile(np.hypot(*fields.T) > telescope.field_radius, SIDES)[fit.usable]
     if beyond.any():
-        print(
-            f"of {beyond.sum()} donuts beyond {np.rad2deg(telescope.field_radius):.2f} deg: worst {quality[beyond].max():.3f}"
-        )
+        edge = np.rad2deg(telescope.field_radius)
+        print(f"of {beyond.sum()} donuts beyond {edge:.2f} degrees: worst {quality[beyond].max():.3f}")
     ratio = found.combinations()[0]
     print(f"combinations known to better than a sixth of the prior: {(ratio < 1 / 6).sum()} of {len(ratio)}")
     if PICTURE:
