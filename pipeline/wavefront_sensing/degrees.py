@@ -39,6 +39,8 @@ _SHOWN = 12
 class FreedomRays:
     """Landing points of one star's light by degrees of freedom, each in its unit; their response is not stored.
 
+    Unknowns are the degrees of freedom and then, where cells have rates of change by them, the shifts of rims.
+
     Parameters
     ----------
     telescope, direction, wavelengths, wavelength_weights, cells
@@ -47,6 +49,8 @@ class FreedomRays:
         The degrees of freedom.
     footprint : ndarray, shape [2, 2]
         Footprint of a cell in the model of the image [m].
+    shifts : ndarray, shape [n_shift], optional
+        Shifts of rims that the weights of the cells have in them [m]; none by default.
     """
 
     def __init__(
@@ -58,19 +62,25 @@ class FreedomRays:
         cells: PupilCells,
         freedoms: DegreesOfFreedom,
         footprint: np.ndarray,
+        shifts: np.ndarray | None = None,
     ) -> None:
         self._prepared, self._parameters, self._matrix = freedoms.parameter_matrix(telescope)
         self._direction, self._wavelengths = direction, wavelengths
         self._cells, self._footprint, self._rims = cells, footprint, RimsOfCells(cells)
         self._weights = np.outer(wavelength_weights, cells.weights).ravel()
-        self.rates = np.zeros((len(self._weights), 0))
+        rates = np.zeros((len(cells), 0)) if cells.rates is None else cells.rates
+        self.rates = np.kron(wavelength_weights[:, None], rates)
+        self._count = len(freedoms)
+        self._shifts = np.zeros(rates.shape[1]) if shifts is None else shifts
         middle = float(wavelengths[len(wavelengths) // 2])
         #: Where the chief ray crosses the plane of the entrance pupil: that of the telescope as it is believed to be.
         self._chief = np.reshape(aimed_points(telescope, direction[None], middle, np.zeros((1, 2))), (1, 2))
 
     def landing(self, unknowns: np.ndarray) -> np.ndarray:
         """Return landing points minus that of the chief ray [m], of the telescope with its degrees of freedom."""
-        changed = apply(self._prepared, dict(zip(self._parameters, self._matrix @ unknowns, strict=True)))
+        changed = apply(
+            self._prepared, dict(zip(self._parameters, self._matrix @ unknowns[: self._count], strict=True))
+        )
         places = [
             landing_of(changed, parallel_rays(changed, self._direction[None], float(w), self._cells.points))
             for w in self._wavelengths
@@ -83,7 +93,7 @@ class FreedomRays:
 
     def weights(self, unknowns: np.ndarray) -> np.ndarray:
         """Return fractions of the light of the cells."""
-        return self._weights
+        return self._weights + self.rates @ (unknowns[self._count :] - self._shifts)
 
     def spread(self, landing: np.ndarray) -> np.ndarray:
         """Return the spread of the image of each point."""
@@ -95,7 +105,7 @@ class FreedomRays:
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the derivatives, shape [2, n, n_freedom]."""
-        columns = ParameterColumns.at(self._prepared, self._parameters, self._matrix @ unknowns)
+        columns = ParameterColumns.at(self._prepared, self._parameters, self._matrix @ unknowns[: self._count])
 
         def derivatives(wavelength: float, points: np.ndarray) -> np.ndarray:
             rays = parallel_rays(columns.telescope, self._direction[None], wavelength, points)

@@ -9,6 +9,7 @@ the spline and :math:`w_n\, \partial x_n / \partial a`: they are the derivatives
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,6 +118,12 @@ class ImageGrid:
         )
         # The filter has the images of cells, and the spline, which light of rims has not.
         self.rim_light = None if rims is None else RimLight(rims, side, wave, baseline, cell / spline, self._filter)
+
+    def with_rims(self, rims: PupilRims) -> ImageGrid:
+        """Return the grid for other rims of the pupil."""
+        other = copy(self)
+        other.rim_light = None if self.rim_light is None else self.rim_light.of(rims)
+        return other
 
     def _filter(self, strength: float) -> np.ndarray:
         """Return the transfer function of air and detector."""

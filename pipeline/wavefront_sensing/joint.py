@@ -12,14 +12,17 @@ from ...core.errors import DomainError
 from ...design.metrics.field_zernikes import wavefront_zernikes
 from ...design.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...models.zernike_polynomials import annular_zernikes
+from ...raytrace.launch import aimed_points
+from ...wavefront.psf.pupil_rims import pupil_rims
 from .degrees import FreedomRays
 from .donut_rays import ZernikeRays
 from .fit_star import StarFit
 from .image_model import STRENGTH
 from .light import Instrument
-from .pupil_cells import PupilCells, pupil_cells
+from .pupil_cells import PupilCells
 from .solve import Group, Solution, solve
 from .stamps import Pixels
+from .vignetting import cells_with_rims, rim_shifts
 
 #: Times that vignetting and response to the degrees of freedom are computed, steps with each, and squared change in
 #: units of the errors, a degree of freedom, that is small enough.
@@ -95,11 +98,15 @@ def fit_freedoms(
     sensitivity = freedoms.sensitivity(telescope, fields, instrument.middle, n_zernike=jmax, projection=projection)
     maps = sensitivity.matrix[:, noll - 1]
     precision = prior**-2.0
-    identity = np.repeat(np.eye(len(freedoms))[None], len(stars), axis=0)
+    shifts = _shifts_by_freedoms(instrument, stars, freedoms, prior)
+    every = [np.concatenate([np.eye(len(freedoms)), own]) for own in shifts]
     shared, unknowns = _start(stars, maps, precision), _star_unknowns(stars)
     for _ in range(_OUTER):
-        moved = [_with_vignetting(instrument, star, freedoms, shared) for star in stars]
-        group = Group(tuple(s.stamp for s in moved if s.stamp), identity, precision, fixed, transient=True)
+        moved = [
+            _with_vignetting(instrument, star, freedoms, shared, own @ shared)
+            for star, own in zip(stars, shifts, strict=True)
+        ]
+        group = Group(tuple(s.stamp for s in moved if s.stamp), every, precision, fixed, transient=True)
         joint = solve(group, unknowns, shared, steps=_INNER, pool=pool)
         change, shared, unknowns = joint.shared - shared, joint.shared, list(joint.stars)
         if float(change @ np.linalg.solve(joint.shared_covariance, change)) < _SETTLED * len(change):
@@ -123,24 +130,56 @@ def with_freedoms(instrument: Instrument, star: StarFit, freedoms: DegreesOfFree
     return _with_cells(instrument, star, freedoms, stamp.rays.cells)
 
 
-def _with_vignetting(instrument: Instrument, star: StarFit, freedoms: DegreesOfFreedom, at: np.ndarray) -> StarFit:
-    """Return a star with the vignetting of some values of the degrees of freedom."""
+def _shifts_by_freedoms(
+    instrument: Instrument, stars: Sequence[StarFit], freedoms: DegreesOfFreedom, prior: np.ndarray
+) -> list[np.ndarray]:
+    """Return the shifts of the rims of each star by the degrees of freedom, [n_shift, n_freedom]."""
+    telescope, wavelength = instrument.telescope, instrument.middle
+    lights = [star.light for star in stars if star.light]
+    rims = [rim for light in lights for rim in light.rims]
+    if not rims:
+        return [np.zeros((0, len(freedoms)))] * len(stars)
+    directions = np.array([light.direction for light in lights for _ in light.rims])
+    points = np.array([rim.point for rim in rims])[:, None]
+    aimed = aimed_points(telescope, directions, wavelength, points).reshape(-1, 2)
+    aimed_rims = [replace(rim, point=point) for rim, point in zip(rims, aimed, strict=True)]
+    moved = [(freedoms.apply(telescope, step), freedoms.apply(telescope, -step)) for step in np.diag(prior)]
+    found = rim_shifts(moved, prior, directions, wavelength, aimed_rims)
+    ends = np.cumsum([2 * len(light.rims) for light in lights])
+    return np.split(found, ends[:-1])
+
+
+def _with_vignetting(
+    instrument: Instrument, star: StarFit, freedoms: DegreesOfFreedom, at: np.ndarray, shifts: np.ndarray
+) -> StarFit:
+    """Return a star with the vignetting of some values of the degrees of freedom, which shift its rims so far."""
     light, stamp, solution = star.light, star.stamp, star.solution
     if light is None or stamp is None or solution is None:
         return star
     fwhm = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
     pixels = Pixels(stamp.image, stamp.variance, stamp.used, round(stamp.grid.scale))
     across = instrument.sampling(light, pixels, fwhm).across
-    cells = pupil_cells(freedoms.apply(light.telescope, at), light.direction, instrument.middle, across)
-    return _with_cells(instrument, star, freedoms, cells)
+    changed = freedoms.apply(light.telescope, at)
+    cells = cells_with_rims(changed, light.direction, instrument.middle, across, light.rims)
+    if light.rims and light.pupil_rims is not None and star.full is not None:
+        rims = pupil_rims(changed, light.direction, instrument.middle)
+        both = [replace(each, grid=each.grid.with_rims(rims)) for each in (stamp, star.full)]
+        star = replace(star, stamp=both[0], full=both[1])
+    return _with_cells(instrument, star, freedoms, cells, shifts)
 
 
-def _with_cells(instrument: Instrument, star: StarFit, freedoms: DegreesOfFreedom, cells: PupilCells) -> StarFit:
+def _with_cells(
+    instrument: Instrument,
+    star: StarFit,
+    freedoms: DegreesOfFreedom,
+    cells: PupilCells,
+    shifts: np.ndarray | None = None,
+) -> StarFit:
     light, stamp, full = star.light, star.stamp, star.full
     if light is None or stamp is None or full is None:
         return star
     waves = (instrument.wavelengths, instrument.wavelength_weights)
-    rays = FreedomRays(light.telescope, light.direction, *waves, cells, freedoms, stamp.grid.footprint)
+    rays = FreedomRays(light.telescope, light.direction, *waves, cells, freedoms, stamp.grid.footprint, shifts)
     stamp, full = replace(stamp, rays=rays), replace(full, rays=rays)
     stamp.release()
     full.release()

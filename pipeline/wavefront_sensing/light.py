@@ -20,7 +20,7 @@ from .image_model import ImageGrid
 from .likelihood import Stamp
 from .seeing import Seeing
 from .stamps import Pixels
-from .vignetting import cells_with_rims, movable_rims, shift_spread
+from .vignetting import MovableRim, cells_with_rims, movable_rims, shift_spread
 
 #: Points across the pupil for the size of an image, and the least and most cells for its model.
 _SURVEY, _FEWEST, _MOST = 48, 48, 800
@@ -105,7 +105,9 @@ class Instrument:
         # Light passes up to half a cell beyond the outermost points.
         diameter = 2.0 * float(np.hypot(*place.T).max()) * (1.0 + 1.0 / _SURVEY)
         diffracting = pupil_rims(telescope, direction, self.middle) if self.diffraction else None
-        return Light(telescope, direction, diameter, depth, jacobian, movable_rims(telescope, ends), diffracting)
+        return Light(
+            telescope, direction, diameter, depth, jacobian, movable_rims(telescope, points, ends), diffracting
+        )
 
     def _with_detector(self, direction: np.ndarray, defocus: float) -> Telescope:
         """Return the telescope with its detector in the tangent plane of the chief ray's CCD, moved by a defocus."""
@@ -204,8 +206,8 @@ class Light:
         Distance from the detector to the best focus along the detector's z [m].
     jacobian : ndarray, shape [2, 2]
         Derivative of the chief ray's landing point by direction cosines [m].
-    rims : dict
-        Surfaces whose rims stand aside by an unknown amount, with the diameter of the beam there [m].
+    rims : tuple of MovableRim
+        Rims that stand aside by an unknown amount.
     pupil_rims : PupilRims or None
         Rims of the clear pupil, where they diffract.
     """
@@ -215,7 +217,7 @@ class Light:
     diameter: float
     depth: float
     jacobian: np.ndarray
-    rims: dict[str, float]
+    rims: tuple[MovableRim, ...]
     pupil_rims: PupilRims | None = None
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,6 +69,13 @@ class RimLight:
         #: Frequencies of the grid where something of the diffracted light is left, and their wave vectors [n, 2].
         self.where, self.wave = np.zeros(lattice.shape, dtype=bool), np.zeros((0, 2))
         self._transfer, self._slopes = np.zeros(0, dtype=np.complex64), np.zeros((0, 0), dtype=np.complex64)
+
+    def of(self, rims: PupilRims) -> RimLight:
+        """Return the same for other rims."""
+        other = copy(self)
+        other.rims = rims
+        other.release()
+        return other
 
     def transfer(self, strength: float, at: RimsAt) -> np.ndarray:
         """Return the transfer function about the chief ray at :attr:`where`, shape [n]; turbulence of a strength."""

@@ -32,8 +32,8 @@ class Group:
     ----------
     stamps : tuple of Stamp
         The stars.
-    maps : ndarray, shape [n_star, n_wave, n_shared]
-        Unknowns of each star's wavefront by the shared ones.
+    maps : sequence of n_star ndarray, each of shape [n_wave, n_shared]
+        Unknowns of each star's wavefront, and shifts of its rims, by the shared ones.
     precision : ndarray, shape [n_shared]
         Inverse variances of Gaussian priors about zero; 0 for none.
     fixed_strength : bool
@@ -44,7 +44,7 @@ class Group:
     """
 
     stamps: tuple[Stamp, ...]
-    maps: np.ndarray
+    maps: Sequence[np.ndarray] | np.ndarray
     precision: np.ndarray
     fixed_strength: bool = False
     transient: bool = False
@@ -151,7 +151,7 @@ class _Linearized:
 
 def _held(group: Group, sizes: list[int]) -> np.ndarray:
     """Return which unknowns are held, shape [n]."""
-    held = np.zeros(sum(sizes) + group.maps.shape[2], dtype=bool)
+    held = np.zeros(sum(sizes) + len(group.precision), dtype=bool)
     if group.fixed_strength:
         held[np.cumsum([0, *sizes[:-1]]) + STRENGTH] = True
     return held

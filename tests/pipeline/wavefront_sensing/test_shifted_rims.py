@@ -19,7 +19,7 @@ def rims_at(tel, field):
     along = 0.98 * (np.arange(60) - 29.5) / 60 * tel.pupil_diameter
     points = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
     rays = parallel_rays(tel, field_direction(*field)[None], WAVELENGTH, points)
-    return movable_rims(tel, pachon.trace(tel, rays, "all"))
+    return {rim.name: rim for rim in movable_rims(tel, points, pachon.trace(tel, rays, "all"))}
 
 
 def test_only_rims_with_a_narrow_beam_matter(behind_focus):
@@ -32,7 +32,7 @@ def test_only_rims_with_a_narrow_beam_matter(behind_focus):
 
 def test_rates_are_those_of_a_shifted_rim(behind_focus):
     direction, name, shift = field_direction(*EDGE), "Filter_entrance", 4e-4
-    rims = {name: rims_at(behind_focus, EDGE)[name]}
+    rims = [rims_at(behind_focus, EDGE)[name]]
     cells = cells_with_rims(behind_focus, direction, WAVELENGTH, 48, rims)
     assert cells.weights.sum() == pytest.approx(1.0)
     np.testing.assert_allclose(cells.rates.sum(axis=0), 0.0, atol=1e-9)
