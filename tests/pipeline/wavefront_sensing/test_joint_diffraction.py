@@ -69,8 +69,8 @@ def test_rims_near_the_image_move_with_the_telescope(focused):
         degrees_of_freedom=freedoms,
         prior=5.0 * size,
     )
-    # Rims that follow from one outer iteration to the next, without derivatives, left 3e-2 a pixel, and M2 and camera off
-    # by 370 times the claimed variance.
+    # Rims that follow from one outer iteration to the next, without derivatives, left 3e-2 a pixel, and M2 and camera
+    # off by 370 times the claimed variance.
     error = fit.degrees_of_freedom.values - state
     assert fit.chi2.max() < 2e-3 * fit.n_pixels.min()
     assert error @ np.linalg.solve(fit.degrees_of_freedom.covariance, error) < 0.3 * len(error)
