@@ -78,9 +78,8 @@ class FreedomRays:
 
     def landing(self, unknowns: np.ndarray) -> np.ndarray:
         """Return landing points minus that of the chief ray [m], of the telescope with its degrees of freedom."""
-        changed = apply(
-            self._prepared, dict(zip(self._parameters, self._matrix @ unknowns[: self._count], strict=True))
-        )
+        values = self._matrix @ unknowns[: self._count]
+        changed = apply(self._prepared, dict(zip(self._parameters, values, strict=True)))
         places = [
             landing_of(changed, parallel_rays(changed, self._direction[None], float(w), self._cells.points))
             for w in self._wavelengths

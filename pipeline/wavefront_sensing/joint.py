@@ -27,6 +27,8 @@ from .vignetting import cells_with_rims, rim_shifts
 #: Times that vignetting and response to the degrees of freedom are computed, steps with each, and squared change in
 #: units of the errors, a degree of freedom, that is small enough.
 _OUTER, _INNER, _SETTLED = 4, 6, 1e-3
+#: Step of the differences by which rims follow degrees of freedom, in units of the prior.
+_STEP = 1e-3
 _MANY_TERMS = 37
 
 
@@ -143,8 +145,9 @@ def _shifts_by_freedoms(
     points = np.array([rim.point for rim in rims])[:, None]
     aimed = aimed_points(telescope, directions, wavelength, points).reshape(-1, 2)
     aimed_rims = [replace(rim, point=point) for rim, point in zip(rims, aimed, strict=True)]
-    moved = [(freedoms.apply(telescope, step), freedoms.apply(telescope, -step)) for step in np.diag(prior)]
-    found = rim_shifts(moved, prior, directions, wavelength, aimed_rims)
+    steps = _STEP * prior
+    moved = [(freedoms.apply(telescope, step), freedoms.apply(telescope, -step)) for step in np.diag(steps)]
+    found = rim_shifts(moved, steps, directions, wavelength, aimed_rims)
     ends = np.cumsum([2 * len(light.rims) for light in lights])
     return np.split(found, ends[:-1])
 

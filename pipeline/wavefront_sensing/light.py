@@ -105,9 +105,8 @@ class Instrument:
         # Light passes up to half a cell beyond the outermost points.
         diameter = 2.0 * float(np.hypot(*place.T).max()) * (1.0 + 1.0 / _SURVEY)
         diffracting = pupil_rims(telescope, direction, self.middle) if self.diffraction else None
-        return Light(
-            telescope, direction, diameter, depth, jacobian, movable_rims(telescope, points, ends), diffracting
-        )
+        rims = movable_rims(telescope, points, ends)
+        return Light(telescope, direction, diameter, depth, jacobian, rims, diffracting)
 
     def _with_detector(self, direction: np.ndarray, defocus: float) -> Telescope:
         """Return the telescope with its detector in the tangent plane of the chief ray's CCD, moved by a defocus."""

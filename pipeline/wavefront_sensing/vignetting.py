@@ -100,7 +100,8 @@ def rim_shifts(
                 place = telescope.surfaces[at].to_local(ends[at].position[i : i + 1])[0, :2]
                 # Where the light goes to one side, the rim stands to the other.
                 shifts[i, :, k] -= sign * place / (2.0 * step)
-    return shifts.reshape(-1, len(moved))
+    # A ray that some surface does not meet tells of no shift.
+    return np.nan_to_num(shifts).reshape(-1, len(moved))
 
 
 def cells_with_rims(
