@@ -180,7 +180,7 @@ def measure_files(
             reporter.line(f"{name} is left out: {result}")
         else:
             metrics[name] = result
-    if len(left_out) == len(images):
+    if left_out and len(left_out) == len(images):
         name, reason = next(iter(left_out.items()))
         raise DomainError(reason if len(images) == 1 else f"no image can be measured; {name}: {reason}")
     return MeasuredFiles({name: found for name, found in metrics.items() if found is not None}, left_out)

@@ -6,10 +6,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ...pipeline.catalogue.shear_calibration import ShearCalibration
 from ...pipeline.measure.correlation import Correlation
 from .galaxy_shapes import GalaxyShapes
+from .stack import PsfStack
 from .stack_metrics import correlations
 
 
@@ -41,6 +43,39 @@ def shear_bias(e: np.ndarray, shear: np.ndarray) -> ShearCalibration:
     return ShearCalibration(m, m_error, c, c_error, int(whole.sum()))
 
 
+def psf_leakage(stack: PsfStack, parts: list[GalaxyShapes]) -> dict[str, tuple[float, float]]:
+    """Return the part of the PSF's ellipticity that usable galaxies have, with its error, by either PSF.
+
+    The slope through the origin of their ellipticities against that of the true PSF (weighted moments) at the nearest
+    place without a star, with an error of a jackknife over tiles.
+
+    Parameters
+    ----------
+    stack : PsfStack
+        PSFs of the stack.
+    parts : list of GalaxyShapes
+        Galaxies of each tile.
+    """
+    places = ~stack.star
+    tree = cKDTree(np.stack([stack.x, stack.y], axis=1)[places])
+    psf = (stack.e1 + 1j * stack.e2)[places]
+    nearest = [psf[tree.query(np.stack([part.x, part.y], axis=1))[1]] for part in parts]
+    found = {}
+    for kind, prefix in (("model", ""), ("true", "true_")):
+        sums = np.zeros((len(parts), 2))
+        for own, part, at in zip(sums, parts, nearest, strict=True):
+            e1, e2, usable = (getattr(part, prefix + name) for name in ("e1", "e2", "usable"))
+            e, p = (e1 + 1j * e2)[usable], at[usable]
+            own[:] = (np.conj(p) * e).real.sum(), (np.abs(p) ** 2).sum()
+        product, square = (sums.sum(axis=0) - sums).T
+        without = product / np.where(square > 0.0, square, np.nan)
+        count = len(parts)
+        total = sums.sum(axis=0)
+        slope = float(total[0] / total[1]) if total[1] > 0.0 else float("nan")
+        found[kind] = slope, float(np.sqrt((count - 1) / count * ((without - without.mean()) ** 2).sum()))
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class NullTest:
     """Shear correlations of galaxies in a stack of a number of visits.
@@ -58,6 +93,8 @@ class NullTest:
         the two, of galaxies that are usable with either.
     calibration : dict of str to ShearCalibration
         Biases of the shear with the PSF of the models and the true one, where they were measured.
+    leakage : dict of str to (float, float)
+        Part of the PSF's ellipticity that galaxies have, and its error, where it was measured: :func:`psf_leakage`.
     """
 
     visits: int
@@ -65,6 +102,7 @@ class NullTest:
     density: float
     correlations: dict[str, Correlation]
     calibration: dict[str, ShearCalibration] = field(default_factory=dict)
+    leakage: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -73,6 +111,7 @@ class NullTest:
         parts: list[GalaxyShapes],
         area: float,
         calibration: dict[str, ShearCalibration] | None = None,
+        leakage: dict[str, tuple[float, float]] | None = None,
     ) -> NullTest:
         """Return the test of the galaxies of tiles of an area [arcmin^2], with errors of a jackknife over the tiles."""
         galaxies = GalaxyShapes.joined(parts)
@@ -84,7 +123,7 @@ class NullTest:
         }
         tile = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         found = correlations(galaxies.x, galaxies.y, kinds, tile)
-        return cls(visits, galaxies, float(galaxies.usable.sum() / area), found, calibration or {})
+        return cls(visits, galaxies, float(galaxies.usable.sum() / area), found, calibration or {}, leakage or {})
 
 
 def null_metrics(result: NullTest) -> dict[str, Any]:
@@ -106,6 +145,8 @@ def null_metrics(result: NullTest) -> dict[str, Any]:
         for span in ("short", "long"):
             metrics[f"xi_plus_{kind}_{span}"] = correlation.mean_xi_plus(span)
             metrics[f"xi_plus_{kind}_{span}_error"] = correlation.error_mean_xi_plus(span)
+    for kind, (part, error) in result.leakage.items():
+        metrics[f"psf_leakage_{kind}"], metrics[f"psf_leakage_{kind}_error"] = part, error
     for kind, found in result.calibration.items():
         for name in ("m", "c"):
             for k in range(2):

@@ -26,7 +26,7 @@ from ...sky.galaxies import Galaxies
 from ...sky.mosaic import PlantedGalaxies
 from .config import STACK_STAMP, load_visits_configuration
 from .galaxy_shapes import GalaxyShapes, measure_galaxies
-from .null_result import NullTest, null_metrics, shear_bias
+from .null_result import NullTest, null_metrics, psf_leakage, shear_bias
 from .plots import density_picture, null_test_picture
 from .psf_visit import StackFrame, stack_limit
 from .stack import PsfStack
@@ -127,7 +127,8 @@ def null_test(
             raise DomainError(f"{folder}: {text}; expected two or more, of the galaxies of {CONFIG_NAME}")
         bias = _calibration(frame.matrix, len(depth.ring_galaxies(chosen, rings)), list(results))
         with reporter.stage(f"correlations in {visits} visits"):
-            found[visits] = NullTest.of(visits, parts, len(chosen) * (cell / ARCMIN) ** 2, bias)
+            area = len(chosen) * (cell / ARCMIN) ** 2
+            found[visits] = NullTest.of(visits, parts, area, bias, psf_leakage(stack, parts))
     write_json(folder / "null_test.json", {"stacks": {str(n): null_metrics(r) for n, r in found.items()}})
     write_pictures(folder, found)
     return found

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,8 @@ from pachon.core.units import ARCMIN, ARCSEC
 from pachon.imaging.exposure import Exposure
 from pachon.sky.galaxies import Galaxies
 from pachon.studies.visits import null_test as module
-from pachon.studies.visits.galaxy_shapes import measure_galaxies
-from pachon.studies.visits.null_result import density_slope, shear_bias
+from pachon.studies.visits.galaxy_shapes import GalaxyShapes, measure_galaxies
+from pachon.studies.visits.null_result import density_slope, psf_leakage, shear_bias
 from pachon.studies.visits.null_test import ellipticity_along, null_test
 from pachon.studies.visits.stack import PsfStack
 from pachon.studies.visits.visits import stack_visits
@@ -189,3 +190,40 @@ def test_a_folder_without_visits(tmp_path, capsys):
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "expected the folder of pachon visits" in error
+
+
+def test_leakage_is_the_part_of_the_psf_that_galaxies_have():
+    rng = np.random.default_rng(5)
+    psf = stack_of(gaussian(0.0 + 0.0j, 2.0), gaussian(0.0 + 0.0j, 2.0), places=30)
+    field = 0.01 * (np.sin(psf.x / ARCMIN) + 1j * np.cos(0.7 * psf.y / ARCMIN))
+    stack = replace(psf, star=np.zeros(len(psf.x), dtype=bool), e1=field.real, e2=field.imag)
+    parts = []
+    for _ in range(20):
+        own = rng.integers(0, len(psf.x), 400)
+        noise = 0.02 * (rng.normal(size=(2, 400)) + 1j * rng.normal(size=(2, 400)))
+        e = {"model": 0.3 * field[own] + noise[0], "true": 0.1 * field[own] + noise[1]}
+        # What is not usable does not count.
+        usable = rng.random(400) < 0.7
+        e = {kind: np.where(usable, values, np.nan) for kind, values in e.items()}
+        nothing = np.zeros(400)
+        parts.append(
+            GalaxyShapes(
+                own,
+                psf.x[own],
+                psf.y[own],
+                nothing,
+                e["model"].real,
+                e["model"].imag,
+                nothing,
+                usable,
+                e["true"].real,
+                e["true"].imag,
+                usable,
+            )
+        )
+    found = psf_leakage(stack, parts)
+    for kind, expected in (("model", 0.3), ("true", 0.1)):
+        value, error = found[kind]
+        assert abs(value - expected) < 3.0 * error
+        # Of 5600 galaxies: 0.02 sqrt(2) a galaxy over the PSF's rms.
+        assert error == pytest.approx(0.02 / np.sqrt(5600.0) / np.sqrt(np.mean(np.abs(field) ** 2)), rel=0.4)
