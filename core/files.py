@@ -6,6 +6,7 @@ or finds the disk full leaves no partial file under the final name.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
@@ -195,6 +196,11 @@ def read_bytes(path: Path, error: type[PachonError], *, max_bytes: int | None = 
     if max_bytes is not None and len(data) > max_bytes:
         raise error(f"expected a file of at most {max_bytes} bytes", file=path)
     return data
+
+
+def content_hash(path: Path, error: type[PachonError]) -> str:
+    """Return the SHA-256 of the content of a file, in hexadecimal; errors as of :func:`read_bytes`."""
+    return hashlib.sha256(read_bytes(path, error)).hexdigest()
 
 
 @contextmanager

@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -18,7 +17,7 @@ from pydantic import BeforeValidator, Field
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, ProductError, error_context
-from ..core.files import read_bytes
+from ..core.files import content_hash
 from ..core.schema import Count, Positive, Real, Section, Switch, plain_number, validated
 from ..core.yaml_reader import read_mapping
 from ..pipeline.config import Configuration, PointingConfig, digest, section_yaml, with_options, with_run
@@ -62,7 +61,7 @@ class GalaxySourceConfig(Section):
         content = self.model_dump(mode="json")
         for key in _FILES:
             if content[key] is not None:
-                content[key] = hashlib.sha256(read_bytes(Path(content[key]), ProductError)).hexdigest()
+                content[key] = content_hash(Path(content[key]), ProductError)
         return content
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 from collections import Counter
@@ -15,7 +14,7 @@ from typing import Any, NamedTuple
 from astropy.table import Table
 
 from ..core.errors import ConfigError, DomainError, ProductError
-from ..core.files import parsing, read_bytes
+from ..core.files import content_hash, parsing, read_bytes
 from ..core.memory import require_bytes
 from ..core.ordered_jobs import ordered_results
 from ..core.progress import Reporter
@@ -60,7 +59,7 @@ class FileMeasurement:
 
     def __call__(self, path: Path, threads: int) -> dict[str, Any] | str:
         """Measure an image, write its PSF model and its catalogue, and return its metrics, or why it has none."""
-        psf = None if self.psf is None else _model_in(self.psf, _content(self.psf))
+        psf = None if self.psf is None else _model_in(self.psf, content_hash(self.psf, ProductError))
         image = CcdImage.read(path)
         try:
             catalogue = measure_image(image, psf=psf, threads=threads, **self.options)
@@ -80,8 +79,9 @@ class FileMeasurement:
 
     def digest(self, path: Path) -> str:
         """Return the SHA-256 of all that decides the products of an image: its file, options, model, version."""
-        model = None if self.psf is None else _content(self.psf)
-        return digest({"image": _content(path), "psf": model, "options": self.options, "version": VERSION})
+        model = None if self.psf is None else content_hash(self.psf, ProductError)
+        image = content_hash(path, ProductError)
+        return digest({"image": image, "psf": model, "options": self.options, "version": VERSION})
 
     def finished(self, path: Path) -> dict[str, Any] | None:
         """Return the metrics of an image that is measured already, in the same way."""
@@ -99,10 +99,6 @@ class FileMeasurement:
 def _model_in(path: Path, content: str) -> FocalPlanePsf:
     """Return the model in a file of that content; it is kept from image to image."""
     return FocalPlanePsf.read(path)
-
-
-def _content(path: Path) -> str:
-    return hashlib.sha256(read_bytes(path, ProductError)).hexdigest()
 
 
 def images_among(paths: Sequence[Path]) -> list[Path]:

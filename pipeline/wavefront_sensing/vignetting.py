@@ -94,9 +94,8 @@ def rim_shifts(
     for k, (pair, step) in enumerate(zip(moved, steps, strict=True)):
         for telescope, sign in zip(pair, (1.0, -1.0), strict=True):
             ends = trace(telescope, parallel_rays(telescope, directions, wavelength, points), "all", threads=1)
-            index = {surface.name: i for i, surface in enumerate(telescope.surfaces)}
             for i, rim in enumerate(rims):
-                at = index[rim.name]
+                at = telescope.surface_names.index(rim.name)
                 place = telescope.surfaces[at].to_local(ends[at].position[i : i + 1])[0, :2]
                 # Where the light goes to one side, the rim stands to the other.
                 shifts[i, :, k] -= sign * place / (2.0 * step)

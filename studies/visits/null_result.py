@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...pipeline.catalogue.shear_calibration import ShearCalibration
-from ...pipeline.measure.correlation import Correlation
+from ...pipeline.measure.correlation import Correlation, jackknife_error
 from .galaxy_shapes import GalaxyShapes
 from .stack import PsfStack
 from .stack_metrics import correlations
@@ -69,10 +69,9 @@ def psf_leakage(stack: PsfStack, parts: list[GalaxyShapes]) -> dict[str, tuple[f
             own[:] = (np.conj(p) * e).real.sum(), (np.abs(p) ** 2).sum()
         product, square = (sums.sum(axis=0) - sums).T
         without = product / np.where(square > 0.0, square, np.nan)
-        count = len(parts)
         total = sums.sum(axis=0)
         slope = float(total[0] / total[1]) if total[1] > 0.0 else float("nan")
-        found[kind] = slope, float(np.sqrt((count - 1) / count * ((without - without.mean()) ** 2).sum()))
+        found[kind] = slope, float(jackknife_error(without))
     return found
 
 
