@@ -15,7 +15,7 @@ import numpy as np
 
 import pachon
 from pachon.design.optimize.sensitivity import field_rings, sensitivity
-from pachon.design.parameters.parameters import apply, with_shape_terms
+from pachon.models.parameters.parameters import apply, with_shape_terms
 from pachon.models.zernike_polynomials import annular_zernikes
 from pachon.raytrace.rays import field_direction, parallel_rays
 

@@ -25,7 +25,7 @@ from .options import (
 from .tables import Rows, print_json
 
 if TYPE_CHECKING:
-    from ..pipeline.wavefront_sensing.result import DonutFit
+    from ..sensing.result import DonutFit
 
 app = typer.Typer()
 
@@ -99,9 +99,9 @@ def donuts_command(
     from ..core.files import write_bytes
     from ..core.plotting import picture_bytes
     from ..core.table_files import FORMATS, write_table
-    from ..design.parameters.degrees_of_freedom_file import load_degrees_of_freedom
-    from ..pipeline.wavefront_sensing.fit import fit_donuts
-    from ..pipeline.wavefront_sensing.stamp_files import border_variance, read_stamps
+    from ..models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
+    from ..sensing.fit import fit_donuts
+    from ..sensing.stamp_files import border_variance, read_stamps
     from ..wavefront.atmosphere.atmosphere import Atmosphere
 
     kind = picture_kind(picture)

@@ -9,8 +9,8 @@ import numpy as np
 
 from ..core.errors import DomainError
 from ..core.units import ARCSEC
-from ..pipeline.focal_plane_psf.model import FocalPlanePsf
-from ..pipeline.psf_model.model import PsfModel
+from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
+from ..reconstruction.psf_model.model import PsfModel
 from ..wavefront.psf.psf import Psfs
 from .wcs import CcdWcs
 

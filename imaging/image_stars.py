@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, PachonError
 from ..core.units import ARCSEC, positive_angle
-from ..pipeline.catalogue.detect import detect_objects
-from ..pipeline.catalogue.objects import DetectedObjects
-from ..pipeline.catalogue.star_locus import StarSelection, select_stars
-from ..pipeline.focal_plane_psf.stars import CcdStars, FocalPlaneStars
-from ..pipeline.measure.shapes import measure_shapes
-from ..pipeline.measure.star_selection import flag_stars
-from ..pipeline.psf_model.checks import snr_weights
-from ..pipeline.psf_model.model import PsfModel
+from ..measure.catalogue.detect import detect_objects
+from ..measure.catalogue.objects import DetectedObjects
+from ..measure.catalogue.star_locus import StarSelection, select_stars
+from ..reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
+from ..measure.shapes import measure_shapes
+from ..measure.star_selection import flag_stars
+from ..reconstruction.psf_model.checks import snr_weights
+from ..reconstruction.psf_model.model import PsfModel
 from .exposure import SATURATED
 from .image_file import CcdImage
 

@@ -16,13 +16,13 @@ from ..core.products import described_table
 from ..core.result import Result
 from ..core.units import ARCMIN
 from ..core.version import VERSION
-from ..pipeline.catalogue.fit_galaxies import fit_galaxies
-from ..pipeline.catalogue.galaxy_fits import GalaxyFits, usable_galaxies
-from ..pipeline.catalogue.matching import detection_rates, match_positions
-from ..pipeline.catalogue.objects import DetectedObjects
-from ..pipeline.catalogue.star_locus import StarSelection
-from ..pipeline.focal_plane_psf.model import FocalPlanePsf
-from ..pipeline.psf_model.model import PsfModel
+from ..measure.catalogue.fit_galaxies import fit_galaxies
+from ..measure.catalogue.galaxy_fits import GalaxyFits, usable_galaxies
+from ..measure.catalogue.matching import detection_rates, match_positions
+from ..measure.catalogue.objects import DetectedObjects
+from ..measure.catalogue.star_locus import StarSelection
+from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
+from ..reconstruction.psf_model.model import PsfModel
 from .image_file import CcdImage
 from .image_stars import fit_image_psf, objects_and_stars, pixels_of_ccd
 

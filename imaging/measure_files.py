@@ -22,7 +22,7 @@ from ..core.table_files import write_table
 from ..core.version import VERSION
 from ..core.workers import MakeWorkers
 from ..pipeline.config import digest
-from ..pipeline.focal_plane_psf.model import FocalPlanePsf
+from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
 from .image_file import CcdImage
 from .measure import measure_image
 

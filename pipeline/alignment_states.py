@@ -31,7 +31,7 @@ def with_active_optics_state(telescope: Telescope, path: str, visit: int) -> Tel
     # Degrees of freedom come with the kernels of derivatives, which take a quarter of a second.
     from astropy.table import QTable
 
-    from ..design.parameters.degrees_of_freedom_file import load_degrees_of_freedom
+    from ..models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
 
     file = Path(path)
     text = read_bytes(file, ConfigError)

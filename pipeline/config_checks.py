@@ -7,7 +7,7 @@ from ..core.schema import json_text
 from ..models.media.silicon import WAVELENGTH_RANGE as SILICON_RANGE
 from ..models.telescope import Telescope
 from .config import Configuration, FocalPlaneConfig, StarsConfig
-from .psf_model.polynomial import term_count
+from ..reconstruction.psf_model.polynomial import term_count
 from .resolved_values import noise_free_components, resolved_value
 from .sensor.brighter_fatter import PIXEL_SIZE as BRIGHTER_FATTER_PIXEL
 from .star_list import NAMES

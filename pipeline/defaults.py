@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from ..core.errors import ConfigError, error_context
 from ..core.table_files import ENDINGS as STAR_ENDINGS
 from ..core.units import ARCSEC
-from ..design.parameters.changes import apply_changes
+from ..models.parameters.changes import apply_changes
 from ..models.camera.camera import Camera
 from ..models.camera.cameras import CAMERAS, load_camera
 from ..models.camera.cameras import ENDINGS as CAMERA_ENDINGS
@@ -34,7 +34,7 @@ from .alignment_states import with_active_optics_state
 from .config import BandName, Configuration, PsfConfig, ReconstructionConfig
 from .config_checks import WEIGHT_PIXELS, check_combinations
 from .photometry import band_of, pixel_angle, resolved_photometry
-from .psf_model.fit import COMPONENTS, ORDERS
+from ..reconstruction.psf_model.fit import COMPONENTS, ORDERS
 from .resolved_values import resolved_value
 from .simulate.photometry import PROVISIONAL_FWHM, limiting_magnitude, saturation_magnitude
 from .simulate.screen_cover import check_screens

@@ -18,9 +18,9 @@ from ..core.progress import Reporter
 from ..models.camera.focal_plane import FocalPlane
 from .ccd_product import CcdProduct, Stars, of_ccd_model, write_focal_plane_columns
 from .experiment import Experiment
-from .focal_plane_psf.model import FocalPlanePsf
-from .focal_plane_psf.stars import FocalPlaneStars
-from .focal_plane_psf.static_heights import StaticHeights
+from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
+from ..reconstruction.focal_plane_psf.stars import FocalPlaneStars
+from ..reconstruction.focal_plane_psf.static_heights import StaticHeights
 
 #: Name of the focal-plane model in the folder of a run.
 FOCAL_PLANE_PSF_NAME = "focal_plane_psf.fits"

@@ -6,8 +6,8 @@ from typing import TypeVar
 
 from ..core.errors import ConfigError
 from .config import Configuration
-from .psf_model.fit import COMPONENTS
-from .psf_model.polynomial import term_count
+from ..reconstruction.psf_model.fit import COMPONENTS
+from ..reconstruction.psf_model.polynomial import term_count
 
 _T = TypeVar("_T")
 

@@ -23,7 +23,7 @@ from .ccd_worker import compute_ccds
 from .config import Configuration
 from .experiment import Experiment
 from .focal_plane_stage import apply_focal_plane_model, write_focal_plane_model
-from .measure.summary import correlations, run_metrics
+from .summary import correlations, run_metrics
 from .memory import check_memory
 from .report.focal_plane_files import write_focal_plane
 from .report.report import build_report

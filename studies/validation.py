@@ -19,7 +19,7 @@ from ..core.schema import problems_of
 from ..core.yaml_reader import line_of, read_mapping
 from ..design.analyses.coatings import Coatings, CoatingsFile
 from ..design.optimize.optimize_file import OptimizeFile, load_optimization
-from ..design.parameters.degrees_of_freedom_file import DegreesOfFreedomFile, load_degrees_of_freedom
+from ..models.parameters.degrees_of_freedom_file import DegreesOfFreedomFile, load_degrees_of_freedom
 from ..imaging.config import ImagesConfig, load_images_configuration
 from ..models.camera.focal_plane import FocalPlane
 from ..models.io.prescription import ENDINGS, load_telescope

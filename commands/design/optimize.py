@@ -62,8 +62,8 @@ def sensitivity(
     """
     from ...design.optimize.sensitivity import sensitivity as compute
     from ...design.optimize.sensitivity_file import write_sensitivity
-    from ...design.parameters.degrees_of_freedom_file import load_degrees_of_freedom
-    from ...design.parameters.parameters import usual_parameters
+    from ...models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
+    from ...models.parameters.parameters import usual_parameters
 
     if out is not None and out.suffix not in (".fits", ".ecsv"):
         raise ConfigError(f"--out {out}: expected a name that ends in .fits or .ecsv")

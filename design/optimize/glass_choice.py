@@ -15,7 +15,7 @@ from ...core.units import require_count
 from ...models.io.glass_catalogue import GlassCatalogue
 from ...models.media.medium import LINE_D, Medium, abbe_number
 from ...models.telescope import VACUUM, Telescope
-from ..parameters.parameters import Parameter
+from ...models.parameters.parameters import Parameter
 from .optimize import optimize
 from .optimum import Optimum
 

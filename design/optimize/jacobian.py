@@ -14,9 +14,9 @@ from ...raytrace.adjoint.backward_pass import OutputGradient, backward_pass
 from ...raytrace.adjoint.forward_pass import ForwardPass
 from ...raytrace.adjoint.sphere_adjoint import SPHERE_COLUMNS
 from ...wavefront.reference_sphere import plane_distance_derivatives, sphere_distance_derivatives
-from ..parameters.links import has_links, without_links
-from ..parameters.parameters import Parameter, apply, index_surfaces, linked, shapes_with_terms, twists
-from ..parameters.shape_terms import term_polynomial
+from ...models.parameters.links import has_links, without_links
+from ...models.parameters.parameters import Parameter, apply, index_surfaces, linked, shapes_with_terms, twists
+from ...models.parameters.shape_terms import term_polynomial
 
 #: Kinds of parameters that change the index of a medium.
 _MEDIA = ("index", "abbe")

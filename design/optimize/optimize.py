@@ -18,7 +18,7 @@ from ...models.paraxial import with_true_aperture
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
 from ...wavefront.pupil_sampling import PupilSampling
-from ..parameters.parameters import Parameter, resolved
+from ...models.parameters.parameters import Parameter, resolved
 from .configuration import DesignConfiguration, configurations
 from .jacobian import ParameterColumns
 from .merit import Beams, Merit, SpotMerit, WavefrontMerit
@@ -74,7 +74,7 @@ def optimize(
     fields, wavelengths, wavelength_weights, sampling, n_pupil, projection, threads
         As in :meth:`pachon.Request.of`, but for 6 rings of pupil points by default.
     variables : iterable of str or Parameter
-        Free parameters, see :mod:`~pachon.design.parameters.parameters`. Configurations that have an address share
+        Free parameters, see :mod:`~pachon.models.parameters.parameters`. Configurations that have an address share
         it; after the name of a telescope and a colon it is that of one of them: ``zoom_2:L2.thickness``.
     merit : {"spots", "wavefront"} or Merit
         Merit function: rms spot radius, or rms wavefront without piston and tilt; an object for one telescope.

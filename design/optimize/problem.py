@@ -9,7 +9,7 @@ import numpy as np
 
 from ...core.errors import PachonError
 from ...models.telescope import Telescope
-from ..parameters.parameters import apply
+from ...models.parameters.parameters import apply
 from .jacobian import ParameterColumns
 from .merit import Merit
 from .operand import Operand

@@ -19,7 +19,7 @@ from ...models.zernike_polynomials import MOST_TERMS, annular_zernikes
 from ...raytrace.rays import RayStatus
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
-from ..parameters.parameters import Parameter, ParameterVector, Variables, parse_parameters
+from ...models.parameters.parameters import Parameter, ParameterVector, Variables, parse_parameters
 from ..result import FieldResult
 from .jacobian import ParameterColumns
 from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
@@ -178,7 +178,7 @@ def sensitivity(
     telescope, fields, wavelength, sampling, n_pupil, projection, threads
         As in :meth:`pachon.Request.of`, but for the defaults: 31 field points (:func:`field_rings`), and 12 rings.
     parameters : iterable of str or Parameter
-        Parameters, see :mod:`~pachon.design.parameters.parameters`; for degrees of freedom see
+        Parameters, see :mod:`~pachon.models.parameters.parameters`; for degrees of freedom see
         :meth:`DegreesOfFreedom.sensitivity`.
     n_zernike : int
         Highest Noll index.

@@ -9,9 +9,9 @@ import numpy as np
 
 from ...core.errors import DomainError, PachonError
 from ...models.telescope import Telescope
-from ..parameters.degrees_of_freedom import DegreesOfFreedom
-from ..parameters.parameters import Parameter, apply
-from ..parameters.tolerances import Tolerance
+from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
+from ...models.parameters.parameters import Parameter, apply
+from ...models.parameters.tolerances import Tolerance
 from .jacobian import ParameterColumns
 from .merit import Merit
 from .optimize import NO_EFFECT

@@ -22,9 +22,9 @@ from ...core.products import Stamp, described_table, write_ecsv
 from ..ccd_product import CCD_KINDS, KINDS, CcdProduct, Stars, product_path, read_product
 from ..config import load_configuration
 from ..experiment import Experiment
-from ..measure.correlation import Correlation
-from ..measure.rho_statistics import RhoStatistics, rho_statistics, trace_of_moments
-from ..measure.summary import (
+from ...measure.correlation import Correlation
+from ...measure.rho_statistics import RhoStatistics, rho_statistics, trace_of_moments
+from ..summary import (
     correlations,
     ellipticities,
     finite_mean,

@@ -17,7 +17,7 @@ from ...core.plotting import new_figure, png_bytes, styled
 from ...models.camera.camera import Camera
 from ...models.camera.focal_plane import FocalPlane
 from ..ccd_product import CcdStars, Stars
-from ..measure.summary import ellipticities
+from ..summary import ellipticities
 from .focal_plane_axes import (
     AWAY,
     OBSERVED,

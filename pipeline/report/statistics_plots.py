@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 
 from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, figure_at, new_figure, png_bytes, styled
 from ..ccd_product import CcdStars
-from ..measure.correlation import Correlation
-from ..measure.rho_statistics import RhoStatistics
-from ..measure.summary import ellipticities
+from ...measure.correlation import Correlation
+from ...measure.rho_statistics import RhoStatistics
+from ..summary import ellipticities
 from .focal_plane_axes import AWAY, CCD_MODEL, LEFT_OUT, OBSERVED, RESIDUAL, RESIDUAL_TITLES, TRUTH
 
 _LABELS = {

@@ -9,8 +9,8 @@ from astropy.table import Table
 
 from ...models.camera.camera import Camera
 from ...models.camera.height_statistics import HeightStatistics
-from ..measure.correlation import SEPARATION_RANGES
-from ..measure.summary import CORRELATED
+from ...measure.correlation import SEPARATION_RANGES
+from ..summary import CORRELATED
 
 _NAMES = {
     "truth": "noise-free PSFs",

@@ -17,7 +17,7 @@ from ...wavefront.psf.engine import center_focal_length
 from ...wavefront.psf.engines import ENGINES
 from ...wavefront.psf.psf import make_psfs
 from ..experiment import Experiment
-from ..measure.shapes import measure_shapes
+from ...measure.shapes import measure_shapes
 from ..resolved_values import resolved_value
 from ..sensor.displacement import displace_stamps
 from .photometry import PROVISIONAL_FWHM, electrons, limiting_magnitude

@@ -77,7 +77,7 @@ def center_stamps(images: Any, x: Any, y: Any, size: int = 31, *, normalize: boo
         [n, ny, nx], or one image [ny, nx].
     x, y : float or array
         Centroids from the centre of the image, ``((ny - 1)/2, (nx - 1)/2)``, in pixels, as
-        :func:`~pachon.pipeline.measure.shapes.measure_shapes` gives them.
+        :func:`~pachon.measure.shapes.measure_shapes` gives them.
     size : int
         Pixels along one side of the stamp, odd.
     normalize : bool

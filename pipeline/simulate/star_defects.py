@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from ...core.errors import DomainError
-from ..measure.star_selection import StarFlag
+from ...measure.star_selection import StarFlag
 
 
 def add_defects(

@@ -7,8 +7,8 @@ import numpy as np
 from ...core.random_streams import stream
 from ...models.telescope import Telescope
 from ...pipeline.simulate.donuts import draw_donuts
-from ...pipeline.wavefront_sensing.fit import fit_donuts
-from ...pipeline.wavefront_sensing.result import DonutFit
+from ...sensing.fit import fit_donuts
+from ...sensing.result import DonutFit
 from ...wavefront.aberration import StarWavefronts
 from .scene import NOLL, AlignmentScene
 

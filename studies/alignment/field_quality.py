@@ -9,7 +9,7 @@ import numpy as np
 
 from ...core.units import ARCSEC
 from ...models.telescope import Telescope
-from ...pipeline.measure.shapes import fwhm, measure_shapes
+from ...measure.shapes import fwhm, measure_shapes
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.opd import wavefront_opds
 from ...wavefront.psf.psf import make_psfs

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import ConfigError, error_context
-from ...design.parameters.degrees_of_freedom import DegreesOfFreedom
-from ...design.parameters.degrees_of_freedom_file import load_degrees_of_freedom
+from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
+from ...models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
 from ...models.io.prescription import ENDINGS, load_telescope, prescription_digest
 from ...models.telescope import Telescope
 from ...wavefront.atmosphere.atmosphere import Atmosphere

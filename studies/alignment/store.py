@@ -13,7 +13,7 @@ import numpy as np
 from ...core.errors import PachonError, ProductError
 from ...core.files import claim_folder, write_bytes
 from ...pipeline.config import differences
-from ...pipeline.wavefront_sensing.result import DonutFit
+from ...sensing.result import DonutFit
 from .config import AlignConfig, load_align_configuration
 from .field_quality import FieldMeans
 

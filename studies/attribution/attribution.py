@@ -27,8 +27,8 @@ from ...pipeline.ccd_product import CCD_KINDS, CcdProduct, CcdStars
 from ...pipeline.config import Configuration
 from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_stage import apply_focal_plane_model
-from ...pipeline.measure.correlation import SEPARATION_RANGES, Correlation, jackknife_error
-from ...pipeline.measure.summary import correlations, ellipticities, has_focal_plane_model, rms
+from ...measure.correlation import SEPARATION_RANGES, Correlation, jackknife_error
+from ...pipeline.summary import correlations, ellipticities, has_focal_plane_model, rms
 from ...pipeline.memory import check_memory
 from ...pipeline.simulate.ccd_exposure import CcdExposure
 from ...pipeline.simulate.ccd_loop import simulate_ccds

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from ...core.plotting import new_figure, png_bytes, styled
 from ...pipeline.config import Configuration
 from ...pipeline.experiment import Experiment
-from ...pipeline.measure.correlation import SEPARATION_RANGES, Correlation
+from ...measure.correlation import SEPARATION_RANGES, Correlation
 from ...pipeline.report.diagnostics import correlation_columns
 from ...pipeline.report.focal_plane_axes import AWAY, RESIDUAL, TRUTH
 from ...pipeline.report.statistics_plots import log_axes

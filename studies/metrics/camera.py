@@ -6,8 +6,8 @@ import numpy as np
 
 from ...core.units import ARCSEC
 from ...pipeline.focal_plane_stage import apply_focal_plane_model
-from ...pipeline.measure.shapes import fwhm, measure_shapes
-from ...pipeline.measure.summary import ccd_metrics
+from ...measure.shapes import fwhm, measure_shapes
+from ...pipeline.summary import ccd_metrics
 from ...pipeline.simulate.ccd_exposure import expose_ccd, expose_positions
 from ...pipeline.simulate.ccd_model import model_ccd
 from ...wavefront.chief_rays import fields_at

@@ -17,9 +17,9 @@ from ...design.metrics.distortion import Distortion, distortion
 from ...models.telescope import Telescope
 from ...pipeline.ccd_product import to_detector_axes
 from ...pipeline.experiment import Experiment
-from ...pipeline.measure.correlation import Correlation, shear_correlation
-from ...pipeline.measure.shapes import Shapes, measure_shapes
-from ...pipeline.measure.summary import SHORTEST_ARCMIN
+from ...measure.correlation import Correlation, shear_correlation
+from ...measure.shapes import Shapes, measure_shapes
+from ...pipeline.summary import SHORTEST_ARCMIN
 from ...pipeline.simulate.ccd_exposure import NoiseFreeStars, expose_positions, holdout_positions
 from ...wavefront.request import Request, field_points, wavelength_points
 

@@ -9,9 +9,9 @@ from itertools import product
 
 from ...core.errors import ConfigError
 from ...pipeline.config import Configuration
-from ...pipeline.psf_model.basis import BASES
-from ...pipeline.psf_model.fit import COMPONENTS, ORDERS
-from ...pipeline.psf_model.polynomial import term_count
+from ...reconstruction.psf_model.basis import BASES
+from ...reconstruction.psf_model.fit import COMPONENTS, ORDERS
+from ...reconstruction.psf_model.polynomial import term_count
 from ...pipeline.resolved_values import resolved_value
 
 #: Weights of the stars in the polynomials, as for :func:`~.snr_weights` (equal in the paper).
@@ -32,7 +32,7 @@ class Case:
 
     stars: int  #: stars of a CCD
     snr: float = 30.0  #: S/N of the faintest star; :data:`NOISE_FREE` for stars without noise
-    basis: str = "pca"  #: one of :data:`~pachon.pipeline.psf_model.basis.BASES`; moments of a focal-plane model
+    basis: str = "pca"  #: one of :data:`~pachon.reconstruction.psf_model.basis.BASES`; moments of a focal-plane model
     interpolation: str = "equal"  #: one of :data:`POLYNOMIALS`, :data:`PROCESSES`, :data:`FOCAL_PLANE`
     order: int = 3  #: of the polynomials, or the trend under a process
     components: int = 20  #: of the basis; 0 for pixels, which are all used

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...core.products import Columns
 from ...pipeline.config import Configuration
-from ...pipeline.measure.correlation import SEPARATION_RANGES
+from ...measure.correlation import SEPARATION_RANGES
 from ...pipeline.run_folder import stamp_of
 from ..product import write_products
 from .plan import FOCAL_PLANE, POLYNOMIALS, Case

@@ -9,9 +9,9 @@ import numpy as np
 from ...core.progress import Reporter
 from ...core.random_streams import stream
 from ...pipeline.experiment import Experiment
-from ...pipeline.measure.shapes import Shapes, measure_shapes
-from ...pipeline.psf_model.checks import snr_weights
-from ...pipeline.psf_model.model import CLIP_SIGMA, PsfModel
+from ...measure.shapes import Shapes, measure_shapes
+from ...reconstruction.psf_model.checks import snr_weights
+from ...reconstruction.psf_model.model import CLIP_SIGMA, PsfModel
 from ...pipeline.simulate.ccd_exposure import CcdExposure
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_observation import Observation, collected_images, observe_ccd

@@ -13,8 +13,8 @@ from ...core.products import image_hdu, table_hdu
 from ...core.random_streams import stream
 from ...core.units import ARCMIN, ARCSEC
 from ...models.ideal_telescope import ideal_telescope
-from ...pipeline.measure.correlation import Correlation, shear_correlation
-from ...pipeline.measure.shapes import fwhm, measure_shapes
+from ...measure.correlation import Correlation, shear_correlation
+from ...measure.shapes import fwhm, measure_shapes
 from ...pipeline.report.focal_plane_axes import TRUTH, draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.atmosphere.turbulence import long_exposure_fwhm

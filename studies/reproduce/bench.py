@@ -13,8 +13,8 @@ from ...core.workers import MakeWorkers
 from ...pipeline.ccd_product import CcdProduct, product_path, read_product
 from ...pipeline.config import Configuration, digest, with_options
 from ...pipeline.experiment import Experiment
-from ...pipeline.measure.correlation import Correlation
-from ...pipeline.measure.summary import correlations, run_metrics
+from ...measure.correlation import Correlation
+from ...pipeline.summary import correlations, run_metrics
 from ...pipeline.run import run
 from ...pipeline.run_folder import finished_ccds, stamp_of
 from ..visits.config import VisitsConfig

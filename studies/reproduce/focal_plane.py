@@ -13,7 +13,7 @@ from ...core.units import ARCSEC
 from ...models.camera.camera import Camera
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import SIMULATED, SPECIFICATION, TERMS
-from ...pipeline.measure.shapes import measure_shapes
+from ...measure.shapes import measure_shapes
 from ...pipeline.report.focal_plane_axes import (
     OBSERVED,
     TRUTH,

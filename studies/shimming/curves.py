@@ -9,8 +9,8 @@ import numpy as np
 from ...core.units import ARCSEC
 from ...models.camera.focal_plane import FocalPlane
 from ...pipeline.experiment import Experiment
-from ...pipeline.focal_plane_psf.height_series import HeightSeries
-from ...pipeline.measure.shapes import fwhm, measure_shapes
+from ...reconstruction.focal_plane_psf.height_series import HeightSeries
+from ...measure.shapes import fwhm, measure_shapes
 from ...pipeline.simulate.ccd_exposure import expose_positions
 
 #: Chebyshev nodes of the height: the widths of the engine are met to 1e-4 over +-40 um.

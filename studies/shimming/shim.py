@@ -23,8 +23,8 @@ from ...core.result import Result
 from ...models.camera.focal_plane import FocalPlane
 from ...pipeline.config import Configuration, MotionConfig
 from ...pipeline.experiment import Experiment
-from ...pipeline.focal_plane_psf.height_series import HeightSeries
-from ...pipeline.measure.correlation import Correlation, shear_correlation
+from ...reconstruction.focal_plane_psf.height_series import HeightSeries
+from ...measure.correlation import Correlation, shear_correlation
 from ...wavefront.chief_rays import fields_at
 from .curves import Places, focus_curves, measured
 from .pairs import PairSum, separation_edges

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...design.optimize.merit import Beams, SpotMerit
 from ...design.optimize.optimize import optimize
-from ...design.parameters.changes import parse_change
+from ...models.parameters.changes import parse_change
 from ...pipeline.experiment import Experiment
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.silicon_focus import focus_height

@@ -5,7 +5,7 @@ A parameter is
 - a key of the configuration, with dots between sections: ``band``, ``atmosphere.r0_m``, ``focal_plane.raft_um``;
 - a motion of a raft or CCD of the point's camera: ``R22.dz_um``, ``R22_S11.rx_urad``, ``R22_S11.ry_urad``;
 - a value of the prescription with its unit: ``M2.dz_um``, ``Camera.rx_urad``, ``M1.Z5_nm``, ``M1.radius_m``; see
-  :mod:`pachon.design.parameters.parameters`.
+  :mod:`pachon.models.parameters.parameters`.
 
 A telescope without a camera has metrics of the optics alone: see :mod:`pachon.studies.sweep.telescope_point`.
 
@@ -24,7 +24,7 @@ from typing import Any
 from ...core.errors import ConfigError, PachonError, unknown_name
 from ...core.schema import known_keys
 from ...core.workers import worker_name
-from ...design.parameters.changes import parse_change
+from ...models.parameters.changes import parse_change
 from ...pipeline.config import Configuration, configuration_of
 from ...pipeline.defaults import resolve
 from ...pipeline.experiment import Experiment

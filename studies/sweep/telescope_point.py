@@ -15,7 +15,7 @@ import numpy as np
 
 from ...core.errors import ConfigError, unknown_name
 from ...design.optimize.optimize import optimize
-from ...design.parameters.changes import apply_changes, parse_change
+from ...models.parameters.changes import apply_changes, parse_change
 from ...models.io.bundled import BUNDLED
 from ...models.io.prescription import load_telescope
 from ...models.telescope import Telescope

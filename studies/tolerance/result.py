@@ -12,7 +12,7 @@ from ...core.arguments import check_arguments
 from ...core.plotting import BLUE, GREY, RED, figure_at, plain_text, styled
 from ...core.result import Result
 from ...design.optimize.yields import Yield
-from ...design.parameters.tolerances import Tolerance
+from ...models.parameters.tolerances import Tolerance
 from .merits import ToleranceMerit
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from ...core.progress import Reporter
 from ...core.threads import one_blas_thread
 from ...core.workers import Compute, MakeWorkers, Workers, serial_worker
 from ...design.optimize.toleranced_merit import TolerancedMerit
-from ...design.parameters.tolerances import draw
+from ...models.parameters.tolerances import draw
 from ...models.telescope import Telescope
 from ..sweep.store import PointResult, StoreKind, SweepPoint, SweepStore, check_same_sweep, create_store, store_exists
 from .file import ToleranceFile

@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 from ...core.random_streams import stream
 from ...imaging.draw import Sources
 from ...imaging.exposure import Exposure
-from ...pipeline.catalogue.fit_galaxies import fit_galaxy_stamps
-from ...pipeline.catalogue.galaxy_fits import GalaxyFits, usable_galaxies
+from ...measure.catalogue.fit_galaxies import fit_galaxy_stamps
+from ...measure.catalogue.galaxy_fits import GalaxyFits, usable_galaxies
 from .stack import PsfStack
 
 #: Sides of stamps [pixel], each drawn on a grid of twice the side, and the half-light radii on the image over which a

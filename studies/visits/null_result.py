@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...pipeline.catalogue.shear_calibration import ShearCalibration
-from ...pipeline.measure.correlation import Correlation, jackknife_error
+from ...measure.catalogue.shear_calibration import ShearCalibration
+from ...measure.correlation import Correlation, jackknife_error
 from .galaxy_shapes import GalaxyShapes
 from .stack import PsfStack
 from .stack_metrics import correlations

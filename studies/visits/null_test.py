@@ -20,7 +20,7 @@ from ...core.units import ARCMIN
 from ...core.workers import MakeWorkers
 from ...imaging.exposure import Exposure
 from ...imaging.galaxies import SkyGalaxies
-from ...pipeline.catalogue.shear_calibration import ShearCalibration
+from ...measure.catalogue.shear_calibration import ShearCalibration
 from ...pipeline.run_folder import CONFIG_NAME
 from ...sky.galaxies import Galaxies
 from ...sky.mosaic import PlantedGalaxies

@@ -14,7 +14,7 @@ from ...core.units import ARCSEC
 from ...models.telescope import Telescope
 from ...pipeline.config import with_options
 from ...pipeline.experiment import Experiment
-from ...pipeline.focal_plane_psf.stars import CcdStars, FocalPlaneStars
+from ...reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
 from ...pipeline.focal_plane_stage import fit_focal_plane_model
 from ...pipeline.resolved_values import resolved_value
 from ...pipeline.simulate.ccd_exposure import CcdExposure, ccd_bounds

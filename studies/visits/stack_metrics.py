@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...core.units import ARCMIN, ARCSEC
-from ...pipeline.measure.correlation import SEPARATION_RANGES, Correlation, shear_correlation
+from ...measure.correlation import SEPARATION_RANGES, Correlation, shear_correlation
 from .stack import PsfStack
 
 #: Correlations of a stack: of the true PSFs at all points, and of true minus model at stars and where no star is.

@@ -5,21 +5,22 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
+from hatchling.builders.sdist import SdistBuilder
+from hatchling.builders.wheel import WheelBuilder
 
 ROOT = Path(__file__).parents[2]
-SETUPTOOLS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
-#: Folder of each package that stands at the top level.
-TOP = {name: ROOT / folder for name, folder in SETUPTOOLS["package-dir"].items()}
+WHEEL = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["build"]["targets"]["wheel"]
+#: Folders of the package that stand at the top level.
+TOP = [ROOT / name for name in WHEEL["only-include"]]
 
 
 @pytest.fixture
 def checkout(tmp_path):
     """A copy of the folders of the package, as a clone has them."""
-    for folder in TOP.values():
+    for folder in TOP:
         shutil.copytree(folder, tmp_path / folder.name, ignore=shutil.ignore_patterns("__pycache__"))
     return tmp_path
 
@@ -40,23 +41,24 @@ def test_a_checkout_imports_from_its_root(checkout):
     assert {Path(file).relative_to(checkout).parts[0] for file in files} >= {"pachon", "core", "models"}
 
 
-def package_of(path):
-    """Name of the package that a file belongs to."""
-    name, folder = next((n, f) for n, f in TOP.items() if f in path.parents)
-    return ".".join([name, *path.parent.relative_to(folder).parts])
+def test_every_file_is_installed():
+    built = {
+        file.relative_path: file.distribution_path for file in WheelBuilder(str(ROOT)).recurse_included_files()
+    }
+    product = [
+        path.relative_to(ROOT).as_posix()
+        for folder in TOP
+        for path in folder.rglob("*")
+        if path.is_file() and path.suffix != ".pyc"
+    ]
+    assert len(product) > 500
+    expected = {path: path if path.startswith("pachon/") else f"pachon/{path}" for path in product}
+    assert built == expected
 
 
-def test_every_data_file_is_installed():
-    left_out = []
-    for folder in TOP.values():
-        for path in folder.rglob("*"):
-            if path.is_dir() or path.suffix in (".py", ".pyc"):
-                continue
-            # Data lie in a package or in a folder below it.
-            package, name = package_of(path), path.name
-            while package not in SETUPTOOLS["packages"]:
-                package, _, parent = package.rpartition(".")
-                name = f"{parent}/{name}"
-            if not any(fnmatch(name, pattern) for pattern in SETUPTOOLS["package-data"].get(package, [])):
-                left_out.append(str(path.relative_to(ROOT)))
-    assert left_out == []
+def test_the_source_archive_is_whole():
+    archived = {file.relative_path for file in SdistBuilder(str(ROOT)).recurse_included_files()}
+    for folder in ("tests", "docs", "benchmarks", ".ci", ".github", "commands"):
+        assert any(path.startswith(f"{folder}/") for path in archived), folder
+    assert archived >= {"CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", ".readthedocs.yaml"}
+    assert not any(path.startswith(("docs/_build", ".venv")) or path.endswith(".pyc") for path in archived)

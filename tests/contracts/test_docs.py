@@ -10,7 +10,7 @@ import pytest
 
 import pachon
 from pachon.models.io.bundled import DATA
-from pachon.pipeline.psf_model.model import PsfModel
+from pachon.reconstruction.psf_model.model import PsfModel
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = {path.name: path.read_text(encoding="utf-8") for path in sorted(DOCS.glob("*.md"))}

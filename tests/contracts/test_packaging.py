@@ -1,4 +1,4 @@
-"""Files beside the package: the source archive is whole, citation and version agree, workflows are valid YAML."""
+"""Files beside the package: citation and version agree, workflows are valid YAML."""
 
 import re
 import tomllib
@@ -10,16 +10,6 @@ from pachon.core.version import VERSION
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-
-
-def test_the_source_archive_is_whole():
-    listed = (ROOT / "MANIFEST.in").read_text(encoding="utf-8")
-    for folder in ("tests", "docs", "benchmarks", ".ci", ".github"):
-        assert (ROOT / folder).is_dir()
-        assert f"recursive-include {folder} *" in listed
-    for path in ("CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", ".readthedocs.yaml"):
-        assert (ROOT / path).is_file()
-        assert path in listed
 
 
 def test_citation_project_and_package_agree():

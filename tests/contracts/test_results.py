@@ -14,7 +14,7 @@ import pachon
 from pachon.core.plotting import picture_bytes
 from pachon.core.result import Result
 from pachon.imaging.image_file import OBJECT_COLUMNS
-from pachon.pipeline.focal_plane_psf.mosaic import PsfShapes
+from pachon.reconstruction.focal_plane_psf.mosaic import PsfShapes
 from pachon.studies.baseline.check import Deviation
 from pachon.studies.shimming.shim import Motion
 

@@ -29,7 +29,7 @@ from pachon.models.io.grid_file import read_grid, write_grid
 from pachon.models.mesh_file import load_mesh
 from pachon.pipeline.alignment_states import with_active_optics_state
 from pachon.pipeline.star_list import place_stars
-from pachon.pipeline.wavefront_sensing.stamp_files import read_stamps
+from pachon.sensing.stamp_files import read_stamps
 from pachon.sky.cutouts import read_mosaic
 from pachon.studies.sweep.file import read_sweep
 from pachon.studies.sweep.store import PointResult, SweepStore, create_store, readable_rows

@@ -15,7 +15,7 @@ from pachon.models.mesh_file import load_mesh
 from pachon.models.shapes.grid import GridSag
 from pachon.models.shapes.sum import Sum
 from pachon.pipeline.config import load_configuration
-from pachon.pipeline.measure.star_catalogue import load_stars
+from pachon.reconstruction.own_stars.star_catalogue import load_stars
 
 
 def _aliases(levels):

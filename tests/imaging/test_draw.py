@@ -7,7 +7,7 @@ from pachon.core.errors import ConfigError
 from pachon.core.units import ARCSEC
 from pachon.imaging.draw import SIZES, Window, add_stamps, draw_galaxies, grid_sizes
 from pachon.imaging.psf_field import PsfField
-from pachon.pipeline.measure.shapes import measure_shapes
+from pachon.measure.shapes import measure_shapes
 from pachon.sky.galaxies import Galaxies
 
 #: Half-light radius of a Gaussian of unit rms width, sqrt(2 ln 2).

@@ -19,7 +19,7 @@ from pachon.models.camera.silicon import Silicon
 from pachon.models.shapes.grid import GridSag
 from pachon.models.shapes.polynomial import ZernikeSag
 from pachon.models.surface import Interaction
-from pachon.pipeline.focal_plane_psf.model import FocalPlanePsf
+from pachon.reconstruction.focal_plane_psf.model import FocalPlanePsf
 
 galsim = pytest.importorskip("galsim")
 

@@ -18,9 +18,9 @@ from pachon.imaging.image_file import CcdImage
 from pachon.imaging.image_stars import focal_plane_stars, regular_shapes
 from pachon.imaging.measure import measure_image
 from pachon.imaging.scene import draw_ccd
-from pachon.pipeline.catalogue.matching import match_positions
+from pachon.measure.catalogue.matching import match_positions
 from pachon.pipeline.experiment import Experiment
-from pachon.pipeline.focal_plane_psf.model import FocalPlanePsf
+from pachon.reconstruction.focal_plane_psf.model import FocalPlanePsf
 from pachon.sky.galaxies import Galaxies
 
 pytestmark = pytest.mark.long

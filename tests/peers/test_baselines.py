@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import pachon
-from pachon.pipeline.measure.shapes import fwhm, measure_shapes
+from pachon.measure.shapes import fwhm, measure_shapes
 from pachon.studies.baseline.baseline import bundled_baselines
 from pachon.studies.baseline.file import read_baseline
 from pachon.wavefront.chief_rays import fields_at

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pachon.pipeline.measure.shapes import fwhm
+from pachon.measure.shapes import fwhm
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 
 galsim = pytest.importorskip("galsim")

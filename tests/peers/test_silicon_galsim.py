@@ -10,7 +10,7 @@ import pachon
 from pachon.core.units import ARCSEC
 from pachon.models.camera.silicon import Silicon
 from pachon.models.media.silicon import absorption_length
-from pachon.pipeline.measure.shapes import measure_shapes
+from pachon.measure.shapes import measure_shapes
 from pachon.raytrace.rays import RayStatus, field_direction, parallel_rays
 from pachon.raytrace.trace import trace
 from pachon.wavefront.psf.psf import make_psfs

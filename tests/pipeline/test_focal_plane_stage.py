@@ -15,10 +15,10 @@ from pachon.pipeline import focal_plane_stage, run_folder
 from pachon.pipeline.ccd_product import CCD_KINDS, KINDS, of_ccd_model, read_product
 from pachon.pipeline.config import to_yaml
 from pachon.pipeline.experiment import Experiment
-from pachon.pipeline.focal_plane_psf.model import FocalPlanePsf
+from pachon.reconstruction.focal_plane_psf.model import FocalPlanePsf
 from pachon.pipeline.focal_plane_stage import FOCAL_PLANE_PSF_NAME, apply_focal_plane_model
-from pachon.pipeline.measure.correlation import shear_correlation
-from pachon.pipeline.measure.summary import correlations, run_metrics, separation_bins
+from pachon.measure.correlation import shear_correlation
+from pachon.pipeline.summary import correlations, run_metrics, separation_bins
 from pachon.pipeline.report import pictures as pictures_module
 from pachon.pipeline.report.diagnostics import diagnose
 from pachon.pipeline.report.tables import headline, models_rows

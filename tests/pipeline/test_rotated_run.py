@@ -10,7 +10,7 @@ from pachon.pipeline import run as run_module
 from pachon.pipeline.ccd_product import product_path, read_product, write_product
 from pachon.pipeline.config import with_options
 from pachon.pipeline.experiment import Experiment
-from pachon.pipeline.measure.summary import correlations, separation_bins
+from pachon.pipeline.summary import correlations, separation_bins
 from pachon.pipeline.report.diagnostics import diagnose
 from pachon.pipeline.run import run
 from pachon.pipeline.run_folder import stamp_of

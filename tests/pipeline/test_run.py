@@ -17,8 +17,8 @@ from pachon.pipeline import run_folder
 from pachon.pipeline.ccd_product import read_product
 from pachon.pipeline.config import load_configuration, with_options
 from pachon.pipeline.experiment import Experiment
-from pachon.pipeline.measure.correlation import shear_correlation
-from pachon.pipeline.measure.summary import separation_bins
+from pachon.measure.correlation import shear_correlation
+from pachon.pipeline.summary import separation_bins
 from pachon.pipeline.run import run
 from pachon.pipeline.simulate import ccd_exposure, ccd_loop
 from pachon.pipeline.simulate.ccd_model import model_ccd

@@ -12,9 +12,9 @@ from pachon.pipeline.ccd_product import CCD_KINDS, KINDS
 from pachon.pipeline.config import load_configuration, with_options
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.focal_plane_stage import apply_focal_plane_model
-from pachon.pipeline.measure.correlation import SEPARATION_RANGES, shear_correlation
-from pachon.pipeline.measure.shapes import measure_shapes
-from pachon.pipeline.measure.summary import correlations
+from pachon.measure.correlation import SEPARATION_RANGES, shear_correlation
+from pachon.measure.shapes import measure_shapes
+from pachon.pipeline.summary import correlations
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd
 from pachon.pipeline.simulate.ccd_model import model_ccd
 from pachon.pipeline.simulate.stamps import center_stamps

@@ -10,7 +10,7 @@ import pachon
 from pachon.commands.cli import main
 from pachon.core.units import ARCSEC
 from pachon.models.camera.silicon import Silicon
-from pachon.pipeline.measure.shapes import fwhm, measure_shapes
+from pachon.measure.shapes import fwhm, measure_shapes
 from pachon.pipeline.simulate.photometry import effective_fwhm
 from pachon.studies.baseline.baseline import check_baseline, make_baseline
 from pachon.studies.baseline.file import write_baseline

@@ -11,8 +11,8 @@ from pachon.core.progress import Reporter
 from pachon.core.units import ARCMIN, ARCSEC
 from pachon.pipeline.config import load_configuration
 from pachon.pipeline.experiment import Experiment
-from pachon.pipeline.measure.shapes import measure_shapes
-from pachon.pipeline.psf_model.polynomial import mapped
+from pachon.measure.shapes import measure_shapes
+from pachon.reconstruction.psf_model.polynomial import mapped
 from pachon.pipeline.simulate.ccd_exposure import CcdExposure, NoiseFreeStars
 from pachon.pipeline.simulate.ccd_observation import Observation
 from pachon.pipeline.simulate.star_field import make_star_field

@@ -12,7 +12,7 @@ from pachon.core.files import json_text
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.pipeline.config import Configuration, load_configuration, with_options
 from pachon.pipeline.experiment import Experiment
-from pachon.pipeline.measure.correlation import shear_correlation
+from pachon.measure.correlation import shear_correlation
 from pachon.studies.shimming.curves import Places, focus_curves, measured
 from pachon.studies.shimming.pairs import PairSum, separation_edges
 from pachon.studies.shimming.product import shim_metrics

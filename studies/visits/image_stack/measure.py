@@ -19,12 +19,12 @@ from ....core.random_streams import natural_number
 from ....core.units import ARCMIN
 from ....core.workers import MakeWorkers
 from ....imaging.image_file import CcdImage
-from ....pipeline.catalogue.detect import DetectedObjects, detect_objects
-from ....pipeline.catalogue.fit_galaxies import fit_galaxies
-from ....pipeline.catalogue.galaxy_fits import usable_galaxies
-from ....pipeline.catalogue.matching import match_positions
-from ....pipeline.catalogue.star_locus import StarSelection, select_stars
-from ....pipeline.measure.shapes import measure_shapes
+from ....measure.catalogue.detect import DetectedObjects, detect_objects
+from ....measure.catalogue.fit_galaxies import fit_galaxies
+from ....measure.catalogue.galaxy_fits import usable_galaxies
+from ....measure.catalogue.matching import match_positions
+from ....measure.catalogue.star_locus import StarSelection, select_stars
+from ....measure.shapes import measure_shapes
 from ..galaxy_shapes import GalaxyShapes, half_light_radii, measure_galaxies
 from ..null_result import NullTest, null_metrics
 from ..null_test import FAINTEST_SNR, REACH, write_pictures, write_shapes

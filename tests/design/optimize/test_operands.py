@@ -9,7 +9,7 @@ from pachon.design.optimize.geometry_operands import clear_radius
 from pachon.design.optimize.jacobian import ParameterColumns
 from pachon.design.optimize.operand import OPERANDS
 from pachon.design.optimize.optimize import optimize
-from pachon.design.parameters.parameters import apply, parse_parameters
+from pachon.models.parameters.parameters import apply, parse_parameters
 
 FIELD = (0.0, float(np.deg2rad(8.0)))
 EDGE = (0.0, float(np.deg2rad(12.0)))

@@ -9,7 +9,7 @@ from astropy import units as u
 import pachon
 from pachon.core.errors import ConfigError, DomainError, UnknownNameError
 from pachon.design.optimize.sensitivity import field_rings, sensitivity
-from pachon.design.parameters.parameters import apply, with_shape_terms
+from pachon.models.parameters.parameters import apply, with_shape_terms
 from pachon.models.shapes.grid import GridSag
 from pachon.models.shapes.mesh import MeshSurface
 from pachon.models.zernike_polynomials import annular_zernikes

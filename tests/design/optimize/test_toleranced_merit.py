@@ -9,9 +9,9 @@ from pachon.design.optimize.merit import Beams, SpotMerit
 from pachon.design.optimize.monte_carlo import monte_carlo
 from pachon.design.optimize.toleranced_merit import TolerancedMerit
 from pachon.design.optimize.yields import Yield
-from pachon.design.parameters.degrees_of_freedom import DegreesOfFreedom
-from pachon.design.parameters.parameters import apply
-from pachon.design.parameters.tolerances import Tolerance
+from pachon.models.parameters.degrees_of_freedom import DegreesOfFreedom
+from pachon.models.parameters.parameters import apply
+from pachon.models.parameters.tolerances import Tolerance
 
 FIELDS = np.deg2rad([[0.0, 0.0], [0.0, 8.0], [0.0, -11.0]])
 TOLERANCES = (

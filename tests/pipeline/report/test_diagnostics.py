@@ -10,8 +10,8 @@ from pachon.commands.cli import main
 from pachon.core.errors import ProductError
 from pachon.models.camera.cameras import load_camera
 from pachon.pipeline.ccd_product import KINDS, product_path, read_product
-from pachon.pipeline.measure.rho_statistics import rho_statistics
-from pachon.pipeline.measure.shapes import measure_shapes
+from pachon.measure.rho_statistics import rho_statistics
+from pachon.measure.shapes import measure_shapes
 from pachon.pipeline.report import diagnostics
 from pachon.pipeline.report.diagnostics import FOLDER_NAME, diagnose
 from pachon.pipeline.report.focal_plane_plots import residual_plot

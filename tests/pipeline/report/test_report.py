@@ -16,7 +16,7 @@ from pachon.core.plotting import new_figure, png_bytes
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.pipeline.ccd_product import read_product
 from pachon.pipeline.experiment import Experiment
-from pachon.pipeline.measure.correlation import shear_correlation
+from pachon.measure.correlation import shear_correlation
 from pachon.pipeline.report import focal_plane_plots, statistics_plots
 from pachon.pipeline.report.focal_plane_axes import around_field_circle, key_ellipticity, whiskers
 from pachon.pipeline.report.focal_plane_plots import is_flat

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from pachon.core.errors import DomainError
-from pachon.pipeline.measure.shapes import measure_shapes
+from pachon.measure.shapes import measure_shapes
 from pachon.pipeline.simulate.stamps import center_stamps, observe_stamps
 
 ARCSEC = np.pi / 180.0 / 3600.0

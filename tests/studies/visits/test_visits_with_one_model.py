@@ -5,7 +5,7 @@ import pytest
 
 from pachon.core.errors import DomainError
 from pachon.core.units import ARCMIN, ARCSEC
-from pachon.pipeline.measure.shapes import measure_shapes
+from pachon.measure.shapes import measure_shapes
 from pachon.studies.visits.config import VisitsConfig
 from pachon.studies.visits.plan import Visit
 from pachon.studies.visits.psf_visit import StackFrame, visit_psfs

@@ -10,7 +10,7 @@ import pytest
 from pachon.commands.cli import main
 from pachon.core.errors import DomainError
 from pachon.core.units import ARCMIN
-from pachon.pipeline.catalogue.objects import DetectedObjects
+from pachon.measure.catalogue.objects import DetectedObjects
 from pachon.pipeline.run_folder import CONFIG_NAME
 from pachon.studies.visits.galaxy_shapes import GalaxyShapes
 from pachon.studies.visits.image_stack.measure import MeasuredTile, null_tests, selected_stars, tile_metrics

@@ -8,7 +8,7 @@ from pachon.commands.cli import main
 from pachon.core.errors import DomainError, ProductError
 from pachon.core.units import ARCSEC
 from pachon.imaging.image_file import CcdImage
-from pachon.pipeline.measure.shapes import measure_shapes
+from pachon.measure.shapes import measure_shapes
 from pachon.studies.visits.image_stack import stack_images as module
 from pachon.studies.visits.image_stack.config import ImageStackConfig
 from pachon.studies.visits.image_stack.stack_images import ImageStack, stack_images

@@ -5,7 +5,7 @@ import pytest
 
 from pachon.imaging.draw import Window
 from pachon.imaging.exposure import ExposedImage
-from pachon.pipeline.measure.shapes import measure_shapes
+from pachon.measure.shapes import measure_shapes
 from pachon.pipeline.run_folder import CONFIG_NAME
 from pachon.studies.visits.config import VisitsConfig, VisitsSection
 from pachon.studies.visits.image_stack.config import ImageStackConfig

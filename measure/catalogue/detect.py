@@ -1,0 +1,213 @@
+"""Detection and photometry of objects by SEP (Barbary 2016), the library of SExtractor (Bertin & Arnouts 1996)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import sep
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
+
+from ...core.arguments import check_arguments
+from ...core.errors import DomainError
+from ...core.units import real_array, require_count, require_positive
+from ..shapes import fwhm
+from .cutouts import cut_out
+from .objects import DetectedObjects, ObjectFlag
+from .pixel_checks import check_pixels
+
+# Kron photometry as in SExtractor: radius over which the Kron radius is averaged, its factor, the least radius, in
+# units of the rms axes.
+_KRON_LIMIT, _KRON_FACTOR, _KRON_LEAST = 6.0, 2.5, 3.5
+# The window of centroids has the half-light radius of the object as its HWHM.
+_WINDOW = 2.0 / 2.35
+# Stamps on which widths at half maximum are measured, batches of them.
+_FWHM_SIDE, _FWHM_BATCH = 25, 2048
+# Room of SEP for pixels above the threshold, as a fraction of the image, and for pieces of one blend.
+_PIXEL_ROOM, _PIECES = 0.2, 8192
+
+
+@check_arguments
+def detect_objects(
+    image: ArrayLike,
+    variance: ArrayLike,
+    mask: ArrayLike | NDArray[np.bool_] | None = None,
+    *,
+    saturated: int = 0,
+    threshold: float = 3.0,
+    min_area: int = 5,
+    kernel: ArrayLike | None = None,
+    deblend_levels: int = 32,
+    deblend_contrast: float = 0.005,
+    background_size: int | None = 64,
+) -> DetectedObjects:
+    """Detect objects and measure positions, fluxes, sizes and isophotal shapes.
+
+    Parameters
+    ----------
+    image : array
+        [ny, nx], in any unit.
+    variance : array
+        Of the pixels, in the square of that unit, [ny, nx].
+    mask : array of int, optional
+        [ny, nx] bits. Pixels with any bit other than those of `saturated` are left out.
+    saturated : int
+        Bits of saturated pixels, which belong to their object and flag it.
+    threshold : float
+        Of pixels of the filtered image [standard deviations].
+    min_area : int
+        Fewest connected pixels above the threshold.
+    kernel : array, optional
+        Filter, such as an image of the PSF; that of SExtractor by default, 3 x 3 pixels.
+    deblend_levels : int
+        Thresholds between that of detection and the peak at which an object may split.
+    deblend_contrast : float
+        Least fraction of the flux in a piece; 1 for no deblending.
+    background_size : int, optional
+        Side of the cells of which the background is made [pixel]; None for an image without background.
+
+    Returns
+    -------
+    DetectedObjects
+        In the order of SEP: by rows, roughly.
+
+    Raises
+    ------
+    DomainError
+        If shapes differ, a pixel that is not masked is not finite or has no positive variance, an option is out of
+        range, or nothing is detected.
+    """
+    bits = np.zeros(np.shape(image), dtype=np.int64) if mask is None else np.asarray(mask)
+    if bits.dtype.kind not in "iub" or hasattr(mask, "unit"):
+        raise DomainError(f"mask has type {bits.dtype}: expected integers, the bits of each pixel")
+    bits = bits.astype(np.int64)
+    require_count(saturated, "saturated", 0, 2**63 - 1)
+    pixels, variances, ignored = check_pixels(image, variance, bits & ~np.int64(saturated))
+    options = _sep_options(threshold, min_area, kernel, deblend_levels, deblend_contrast)
+    if background_size is not None:
+        require_count(background_size, "background_size", 1, 2**31 - 1)
+    if ignored.all():
+        raise DomainError("mask: expected at least one pixel that is not masked")
+    data = np.where(ignored, 0.0, pixels)
+    # SEP reads C arrays; masked pixels have any positive variance.
+    variances = np.ascontiguousarray(np.where(ignored, 1.0, variances))
+    with _sep_memory(data.size):
+        try:
+            level = np.zeros_like(data)
+            if background_size is not None:
+                level = sep.Background(data, mask=ignored, bw=background_size, bh=background_size).back()
+                data = np.where(ignored, 0.0, data - level)
+            found, segmentation = sep.extract(data, var=variances, mask=ignored, segmentation_map=True, **options)
+        except Exception as error:  # SEP raises Exception itself
+            raise DomainError(f"SEP: {' '.join(str(error).split())}") from None
+    if not len(found):
+        raise DomainError(
+            f"no objects: expected {min_area} connected pixels above {threshold:g} standard deviations of the noise"
+        )
+    return _measure_objects(data, variances, ignored, (bits & saturated) != 0, found, segmentation, level)
+
+
+def _sep_options(
+    threshold: float, min_area: int, kernel: ArrayLike | None, deblend_levels: int, deblend_contrast: float
+) -> dict[str, Any]:
+    """Return the arguments of SEP's extraction."""
+    options: dict[str, Any] = {"thresh": require_positive(threshold, "threshold", "standard deviations")}
+    for name, value in (("min_area", min_area), ("deblend_levels", deblend_levels)):
+        require_count(value, name, 1, 2**31 - 1)
+    if not 0.0 <= deblend_contrast <= 1.0:
+        raise DomainError(f"deblend_contrast = {deblend_contrast}: expected a number from 0 to 1")
+    if kernel is not None:
+        weights = real_array(kernel, "kernel: expected real numbers [ny, nx]")
+        if weights.ndim != 2 or not np.isfinite(weights).all() or not weights.sum() > 0.0:
+            raise DomainError(f"kernel of shape {weights.shape}: expected [ny, nx] with a positive sum")
+        options["filter_kernel"] = np.ascontiguousarray(weights)
+    return options | {"minarea": min_area, "deblend_nthresh": deblend_levels, "deblend_cont": deblend_contrast}
+
+
+@contextmanager
+def _sep_memory(size: int) -> Iterator[None]:
+    """Give SEP room for the objects of an image inside a with block."""
+    before = sep.get_extract_pixstack(), sep.get_sub_object_limit()
+    sep.set_extract_pixstack(max(before[0], int(_PIXEL_ROOM * size)))
+    sep.set_sub_object_limit(max(before[1], _PIECES))
+    try:
+        yield
+    finally:
+        sep.set_extract_pixstack(before[0])
+        sep.set_sub_object_limit(before[1])
+
+
+def _measure_objects(
+    data: np.ndarray,
+    variance: np.ndarray,
+    ignored: np.ndarray,
+    saturated: np.ndarray,
+    found: np.ndarray,
+    segmentation: np.ndarray,
+    background: np.ndarray,
+) -> DetectedObjects:
+    """Measure the objects that SEP found, without the pixels of their neighbours."""
+    count = len(found)
+    others = {"mask": ignored, "segmap": segmentation, "seg_id": np.arange(1, count + 1, dtype=np.int32)}
+    a, b = np.maximum(found["a"], 1e-3), np.maximum(found["b"], 1e-3)
+    # SEP refuses an angle that rounding puts beyond a right one.
+    theta = np.clip(found["theta"], -0.5 * np.pi, 0.5 * np.pi)
+    ellipse = found["x"], found["y"], a, b, theta
+    kron, _ = sep.kron_radius(data, *ellipse, _KRON_LIMIT, **others)
+    aperture = np.fmax(_KRON_FACTOR * kron, _KRON_LEAST)
+    flux, flux_error, aperture_flags = sep.sum_ellipse(data, *ellipse, aperture, var=variance, subpix=1, **others)
+    radius, _ = sep.flux_radius(data, found["x"], found["y"], _KRON_LIMIT * a, 0.5, normflux=flux, **others)
+    radius = np.where((flux > 0.0) & (radius > 0.0), radius, np.nan)
+    window = np.where(np.isfinite(radius), radius, a) * _WINDOW
+    wx, wy, failed = sep.winpos(data, found["x"], found["y"], window, mask=ignored)
+    moved = np.hypot(wx - found["x"], wy - found["y"])
+    # SEP's windows take in the light of neighbours, and may leave the image.
+    windowed = (failed == 0) & (moved < window) & ((found["flag"] & sep.OBJ_MERGED) == 0)
+    for at, pixels in ((wx, data.shape[1]), (wy, data.shape[0])):
+        windowed &= (at >= 0.0) & (at <= pixels - 1)
+    x, y = np.where(windowed, wx, found["x"]), np.where(windowed, wy, found["y"])
+    flags = np.zeros(count, dtype=np.int32)
+    flags[((found["flag"] & sep.OBJ_TRUNC) | (aperture_flags & sep.APER_TRUNC)) != 0] |= ObjectFlag.EDGE
+    flags[(found["flag"] & sep.OBJ_MERGED) != 0] |= ObjectFlag.BLENDED
+    flags[np.bincount(segmentation[saturated], minlength=count + 1)[1:] > 0] |= ObjectFlag.SATURATED
+    # Neighbours are masked as well: masked pixels of the image alone count here.
+    _, _, masked = sep.sum_ellipse(data, *ellipse, aperture, mask=ignored, subpix=1)
+    flags[(masked & sep.APER_HASMASKED) != 0] |= ObjectFlag.MASKED
+    return DetectedObjects(
+        x=x,
+        y=y,
+        flux=flux,
+        flux_error=flux_error,
+        half_light_radius=radius,
+        fwhm=_measure_fwhm(data, segmentation, x, y),
+        a=a,
+        b=b,
+        theta=theta,
+        peak=found["peak"].astype(np.float64),
+        neighbour_distance=_neighbour_distance(x, y),
+        flags=flags,
+        segmentation=segmentation,
+        background=background,
+    )
+
+
+def _measure_fwhm(data: np.ndarray, segmentation: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the full widths at half maximum [pixel], with neighbours set to zero; NaN without a positive peak."""
+    result = []
+    for i in range(0, len(x), _FWHM_BATCH):
+        part = slice(i, i + _FWHM_BATCH)
+        stamps = cut_out(data, x[part], y[part], _FWHM_SIDE, 0.0)
+        labels = cut_out(segmentation, x[part], y[part], _FWHM_SIDE, 0)
+        own = np.arange(i + 1, i + 1 + len(stamps))[:, None, None]
+        stamps[(labels != 0) & (labels != own)] = 0.0
+        result.append(fwhm(stamps, 1.0))
+    return np.concatenate(result)
+
+
+def _neighbour_distance(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the distance of each object to the nearest other one, infinite for a single one."""
+    places = np.stack([x, y], axis=1)
+    return KDTree(places).query(places, k=[2])[0][:, 0]

@@ -1,0 +1,271 @@
+"""Selection of stars by the stellar locus of half-light radius against magnitude (Jee & Tyson 2011, sec. 4.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import IntFlag
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...core.arguments import check_arguments
+from ...core.errors import DomainError
+from ...core.point_plots import draw_points
+from ...core.result import Result
+from ...core.units import real_array, require_count, require_positive
+from ...pipeline.simulate.stamps import center_stamps
+from .cutouts import cut_out, first_pixel
+from .objects import DetectedObjects
+from .pixel_checks import flagged
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# The locus is the interval of half-light radii of this relative width with the most objects: at least so many times
+# the objects of equally wide intervals on either side of it, between these multiples of its radius.
+_INTERVAL, _CONTRAST, _SIDE = 0.08, 3.0, (1.15, 1.75)
+# Least width of the locus, relative: the PSF varies over a CCD.
+_LEAST_WIDTH = 0.01
+# Margin of a stamp for the light that its Fourier shift wraps around [pixel].
+_MARGIN = 8
+_MAD_TO_SIGMA = 1.4826
+
+
+class StarCut(IntFlag):
+    """Reasons for the rejection of an object as a star; zero for a selected one.
+
+    ``FLAGGED``: edge, saturated, blended or masked, or such pixels within the stamp. ``FAINT``: below the least S/N.
+    ``SIZE``, ``WIDTH``, ``SHAPE``: half-light radius, FWHM and ellipticity apart from those of the locus.
+    ``NEIGHBOUR``: another object nearby. ``DEFECT``: a stamp that is not that of a single star.
+    """
+
+    SELECTED = 0
+    FLAGGED = 1
+    FAINT = 2
+    SIZE = 4
+    WIDTH = 8
+    SHAPE = 16
+    NEIGHBOUR = 32
+    DEFECT = 64
+
+
+@dataclass(frozen=True, eq=False)
+class StarSelection(Result):
+    """Stars among n objects.
+
+    Parameters
+    ----------
+    index : array of int
+        The selected objects, [k].
+    cuts : array of int
+        :class:`StarCut` bits of every object, [n].
+    half_light_radius, width : float
+        Middle of the stellar locus and its standard deviation [pixel].
+    positions : array
+        Centroids of the selected stars [pixel], [k, 2].
+    snr : array
+        Flux over its error, [k].
+    stamps : array
+        The selected stars shifted to the centre of a pixel, background subtracted, in the unit of the image, [k, size,
+        size].
+    """
+
+    _table = ("index", "positions", "snr")
+    _images = ("stamps",)
+
+    index: np.ndarray
+    cuts: np.ndarray
+    half_light_radius: float
+    width: float
+    positions: np.ndarray
+    snr: np.ndarray
+    stamps: np.ndarray
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the places of the selected stars, coloured by the logarithm of their S/N."""
+        title = f"{len(self)} stars, half-light radius {self.half_light_radius:.3g} pixel"
+        x, y = self.positions.T
+        color = {"color": np.log10(self.snr), "color_label": "log10 of S/N"}
+        return draw_points(ax, x, y, ("x [pixel]", "y [pixel]"), **color, equal=True, title=title)
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    @check_arguments
+    def without(self, defects: NDArray[np.bool_]) -> StarSelection:
+        """Return the selection without those of its stars that have defects, [k] bool."""
+        if defects.shape != self.index.shape:
+            raise DomainError(f"defects has shape {defects.shape}: expected {self.index.shape}, one for each star")
+        cuts, good = self.cuts.copy(), ~defects
+        cuts[self.index[defects]] |= StarCut.DEFECT
+        return replace(
+            self,
+            index=self.index[good],
+            cuts=cuts,
+            positions=self.positions[good],
+            snr=self.snr[good],
+            stamps=self.stamps[good],
+        )
+
+    @check_arguments
+    def completeness(self, is_star: ArrayLike | NDArray[np.bool_]) -> float:
+        """Return the fraction of true stars of sufficient S/N that were selected; NaN where there are none.
+
+        `is_star` [n] says which objects are stars in truth.
+        """
+        true = self._truth(is_star) & (self.cuts & StarCut.FAINT == 0)
+        return float((self.cuts[true] == 0).mean()) if true.any() else np.nan
+
+    @check_arguments
+    def purity(self, is_star: ArrayLike | NDArray[np.bool_]) -> float:
+        """Return the fraction of selected objects that are stars in truth; NaN where none were selected."""
+        true = self._truth(is_star)
+        return float(true[self.index].mean()) if len(self) else np.nan
+
+    def _truth(self, is_star: ArrayLike | NDArray[np.bool_]) -> np.ndarray:
+        true = np.asarray(is_star)
+        if true.shape != self.cuts.shape or true.dtype.kind != "b":
+            raise DomainError(f"is_star has shape {true.shape} and type {true.dtype}: expected bool {self.cuts.shape}")
+        return true
+
+
+@check_arguments
+def select_stars(
+    objects: DetectedObjects,
+    image: ArrayLike,
+    *,
+    min_snr: float = 30.0,
+    bright_snr: float = 60.0,
+    n_sigma: float = 4.0,
+    max_ellipticity: float = 0.1,
+    isolation: float = 12.0,
+    min_stars: int = 10,
+    radius_range: tuple[float, float] | None = None,
+    size: int = 31,
+    mask: ArrayLike | NDArray[np.bool_] | None = None,
+) -> StarSelection:
+    """Select isolated stars by the stellar locus, and cut out their stamps.
+
+    The locus is the mode of the half-light radii of bright objects, its width follows from their median absolute
+    deviation. FWHM and ellipticity are compared with the medians of the objects of the locus.
+
+    Parameters
+    ----------
+    objects : DetectedObjects
+        As of :func:`~pachon.detect_objects`.
+    image : array
+        The image on which they were detected, [ny, nx]; their background is subtracted here.
+    min_snr, bright_snr : float
+        Least S/N of stars, and of the objects that determine the locus.
+    n_sigma : float
+        Largest deviations of half-light radius and FWHM [standard deviations of the locus and of the noise].
+    max_ellipticity : float
+        Largest deviation of the isophotal ellipticity.
+    isolation : float
+        Least distance to the nearest other object [pixel].
+    min_stars : int
+        Fewest stars that make a locus.
+    radius_range : (float, float), optional
+        Half-light radii between which the locus is known to lie [pixel].
+    size : int
+        Side of the stamps, odd [pixel].
+    mask : array, optional
+        [ny, nx], not zero for pixels that no stamp may hold; those that are not finite are among them.
+
+    Returns
+    -------
+    StarSelection
+        Stamps and positions go to :meth:`pachon.PsfModel.fit` and :meth:`pachon.FocalPlaneStars.from_table` as they
+        are.
+
+    Raises
+    ------
+    DomainError
+        If the image has another shape, an option is out of range, or there is no stellar locus.
+    """
+    pixels = real_array(image, "image: expected real numbers [ny, nx]")
+    if pixels.shape != objects.segmentation.shape:
+        raise DomainError(f"image has shape {pixels.shape}: expected {objects.segmentation.shape}, that of the objects")
+    masked = flagged(mask, pixels.shape)
+    if masked.shape != pixels.shape:
+        raise DomainError(f"mask has shape {masked.shape}: expected {pixels.shape}, that of the image")
+    bad = ~np.isfinite(pixels) | masked
+    if require_count(size, "size", 1, 4096) % 2 == 0:
+        raise DomainError(f"size = {size}: expected an odd number of pixels")
+    for name, value in (
+        ("min_snr", min_snr),
+        ("bright_snr", bright_snr),
+        ("n_sigma", n_sigma),
+        ("max_ellipticity", max_ellipticity),
+    ):
+        require_positive(value, name)
+    snr = np.where(np.isfinite(objects.half_light_radius), objects.snr, 0.0)
+    radius = np.where(np.isfinite(objects.half_light_radius), objects.half_light_radius, 0.0)
+    cuts = np.zeros(len(objects), dtype=np.int32)
+    spoilt = cut_out(bad, objects.x, objects.y, size, True).any(axis=(1, 2))
+    cuts[(objects.flags != 0) | spoilt | ~np.isfinite(objects.fwhm)] |= StarCut.FLAGGED
+    cuts[~(snr >= min_snr)] |= StarCut.FAINT
+    bright = (cuts == 0) & (snr >= bright_snr)
+    if radius_range is not None:
+        low, high = (require_positive(v, "radius_range") for v in radius_range)
+        bright &= (radius >= low) & (radius <= high)
+    center, width = _stellar_locus(radius[bright], min_stars)
+    noise = 1.0 / np.maximum(snr, 1.0)
+    cuts[~(np.abs(radius - center) < n_sigma * np.hypot(width, center * noise))] |= StarCut.SIZE
+    locus = bright & (cuts == 0)
+    fwhm = _median_and_sigma(objects.fwhm[locus])
+    cuts[~(np.abs(objects.fwhm - fwhm[0]) < n_sigma * np.hypot(fwhm[1], fwhm[0] * noise))] |= StarCut.WIDTH
+    e1, e2 = (e - np.median(e[locus]) for e in (objects.e1, objects.e2))
+    cuts[~(np.hypot(e1, e2) < max_ellipticity)] |= StarCut.SHAPE
+    cuts[objects.neighbour_distance < isolation] |= StarCut.NEIGHBOUR
+    index = np.flatnonzero(cuts == 0)
+    x, y = objects.x[index], objects.y[index]
+    return StarSelection(
+        index=index,
+        cuts=cuts,
+        half_light_radius=center,
+        width=width,
+        positions=np.stack([x, y], axis=1),
+        snr=objects.snr[index],
+        stamps=_centered_stamps(np.where(bad, 0.0, pixels - objects.background), x, y, size),
+    )
+
+
+def _stellar_locus(radius: np.ndarray, least: int) -> tuple[float, float]:
+    """Return middle and standard deviation of the stellar locus of half-light radii of bright objects."""
+    if len(radius) < least:
+        raise DomainError(f"no stellar locus: {len(radius)} bright objects without flags, expected at least {least}")
+    ordered = np.sort(radius)
+    inside = np.searchsorted(ordered, ordered * (1.0 + _INTERVAL), side="right") - np.arange(len(ordered))
+    first, count = int(inside.argmax()), int(inside.max())
+    center, width = _median_and_sigma(ordered[first : first + count])
+    nearness = np.abs(np.log(ordered / center))
+    beside = (nearness > np.log(_SIDE[0])) & (nearness < np.log(_SIDE[1]))
+    galaxies = max((beside & (ordered > center)).sum(), (beside & (ordered < center)).sum())
+    expected = galaxies * np.log1p(_INTERVAL) / np.log(_SIDE[1] / _SIDE[0])
+    if count < max(least, _CONTRAST * expected):
+        raise DomainError(
+            f"no stellar locus: {count} of {len(radius)} bright objects within {100.0 * _INTERVAL:g} % of a half-light "
+            f"radius of {center:.3g} pixels, expected at least {max(least, int(np.ceil(_CONTRAST * expected)))}"
+        )
+    for _ in range(5):
+        near = ordered[np.abs(ordered - center) < min(3.0 * max(width, _LEAST_WIDTH * center), _INTERVAL * center)]
+        center, width = _median_and_sigma(near)
+    return center, max(width, _LEAST_WIDTH * center)
+
+
+def _median_and_sigma(values: np.ndarray) -> tuple[float, float]:
+    """Return the median, and the standard deviation by the median absolute deviation."""
+    middle = float(np.median(values))
+    return middle, _MAD_TO_SIGMA * float(np.median(np.abs(values - middle)))
+
+
+def _centered_stamps(image: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> np.ndarray:
+    """Return stamps with stars shifted to the centre of their middle pixel."""
+    side = size + 2 * _MARGIN
+    around = cut_out(image, x, y, side, 0.0)
+    middle = 0.5 * (side - 1)
+    dx, dy = (at - first_pixel(at, side) - middle for at in (x, y))
+    return center_stamps(around, dx, dy, size, normalize=False)

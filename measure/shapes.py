@@ -1,0 +1,360 @@
+"""Ellipticities, sizes and widths of star images from weighted moments.
+
+Images are ``[y, x]`` with y up and pixel centres at integers; positions are counted from the centre of the stamp,
+``((ny - 1)/2, (nx - 1)/2)``, x to the right. An ellipticity with e1 > 0 points along x, with e2 > 0 along the diagonal
+x = y.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from enum import IntFlag
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..core.arguments import check_arguments
+from ..core.errors import DomainError
+from ..core.point_plots import draw_shapes
+from ..core.result import Result
+from ..core.threads import one_blas_thread
+from ..core.units import ARCSEC, positive_angle, pure_numbers, real_numbers, require_positive
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_BATCH_PIXELS = 1 << 20  # 8 MB a work array: the memory used does not grow with the number of stars
+
+
+class ShapeFlag(IntFlag):
+    """Failures of a shape measurement; zero for a good one.
+
+    ``CENTROID_LEFT_STAMP``: the centroid came nearer to an edge than the rms width of the weight (or half-way to it,
+    where the weight is wider than that). ``NO_FLUX``: the weighted sum is not positive, or a pixel is not finite.
+    """
+
+    OK = 0
+    NOT_CONVERGED = 1
+    NEGATIVE_MOMENTS = 2
+    CENTROID_LEFT_STAMP = 4
+    NO_FLUX = 8
+
+
+@dataclass(frozen=True)
+class Shapes(Result):
+    """Shapes of n images, one array element each.
+
+    Parameters
+    ----------
+    e1, e2 : array
+        Ellipticity (a - b)/(a + b), along x and along the diagonal. NaN where flagged.
+    size : array
+        ``(Q11 Q22 - Q12^2)^(1/4)`` of the weighted moments [rad]: for a round Gaussian image of rms width s under a
+        weight of rms width w it is s w / sqrt(s^2 + w^2), not s. NaN where flagged.
+    flux : array
+        Plain sum of the pixels, background subtracted and not weighted, in the units of the image.
+    x, y : array
+        Centroid from the centre of the stamp [pixel]. NaN where the iteration failed.
+    flags : array of int
+        :class:`ShapeFlag` bits.
+    """
+
+    _table = ("e1", "e2", "size", "flux", "x", "y", "flags")
+
+    e1: np.ndarray
+    e2: np.ndarray
+    size: np.ndarray
+    flux: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    flags: np.ndarray
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the ellipticities in their plane, coloured by the size."""
+        return draw_shapes(ax, self.e1, self.e2, self.size / ARCSEC, "weighted rms size [arcsec]")
+
+    @property
+    def usable(self) -> np.ndarray:
+        """Images without a flag, [n] bool."""
+        return self.flags == 0
+
+    def __len__(self) -> int:
+        """Return the number of images."""
+        return len(self.flags)
+
+
+@check_arguments
+def measure_shapes(
+    images: ArrayLike,
+    pixel_scale: ArrayLike,
+    weight_fwhm: ArrayLike,
+    *,
+    background: ArrayLike = 0.0,
+    max_iterations: int = 50,
+    tolerance: float = 1e-6,
+) -> Shapes:
+    r"""Measure ellipticities from weighted quadrupole moments (Jee & Tyson 2011, eq. 5).
+
+    .. math:: Q_{ij} = \frac{\sum W I (\theta_i - \bar\theta_i)(\theta_j - \bar\theta_j)}{\sum W I},\qquad
+              e = \frac{Q_{11} - Q_{22} + 2 i Q_{12}}{Q_{11} + Q_{22} + 2 \sqrt{Q_{11} Q_{22} - Q_{12}^2}}
+
+    with a round Gaussian W centred on the centroid, which is iterated until the weighted first moment vanishes. The
+    paper's eq. 6 prints Q12 where 2 Q12 belongs: its own orientation angle, and the (a - b)/(a + b) that it states,
+    need the 2.
+
+    The sums run over pixel centres. They stand for integrals as long as image times weight is well sampled: for a round
+    Gaussian product of rms width s pixels the relative error is about 2 exp(-2 pi^2 s^2), 1e-4 at s = 0.7 and 1e-7 at
+    s = 0.9. A 0.3" weight belongs on images with pixels of 0.1" or less, a 0.7" weight works on 0.2" pixels.
+
+    Every image is measured on its own: splitting a batch changes no byte.
+
+    Parameters
+    ----------
+    images : array
+        [n, ny, nx], or one image [ny, nx].
+    pixel_scale : float or Quantity
+        Side of a pixel [rad].
+    weight_fwhm : float or Quantity
+        FWHM of the Gaussian weight [rad]: 0.3" for the optics alone, 0.7" with the atmosphere (Jee & Tyson 2011, sec.
+        3).
+    background : float or array
+        Level to subtract, one for all or one per image.
+    max_iterations : int
+        Most centroid steps.
+    tolerance : float
+        The centroid has converged once a step is shorter than this [pixel]. Steps are Newton's, so the error after
+        the last one is far smaller.
+
+    Returns
+    -------
+    Shapes
+        Arrays of length n, also for one image (n = 1).
+
+    Raises
+    ------
+    DomainError
+        If an argument has the wrong shape or is not positive.
+    """
+    stack = _stamp_cube(images)
+    scale = positive_angle(pixel_scale, "pixel_scale")
+    sigma = positive_angle(weight_fwhm, "weight_fwhm") / np.sqrt(8.0 * np.log(2.0)) / scale
+    if max_iterations < 1:
+        raise DomainError(f"max_iterations = {max_iterations}: expected at least 1")
+    tolerance = require_positive(tolerance, "tolerance", "pixels")
+    count = len(stack)
+    try:
+        level = np.broadcast_to(pure_numbers(background, "background"), (count,))
+    except ValueError as error:
+        raise DomainError(f"background has shape {np.shape(background)}: expected one value or {count}") from error
+    batch = max(1, _BATCH_PIXELS // (stack.shape[1] * stack.shape[2]))
+    parts = [
+        _measure_batch(
+            np.array(stack[i : i + batch], dtype=np.float64, order="C") - level[i : i + batch, None, None],
+            scale,
+            sigma,
+            max_iterations,
+            tolerance,
+        )
+        for i in range(0, count, batch)
+    ]
+    if not parts:
+        none = np.empty(0)
+        return Shapes(none, none, none, none, none, none, np.empty(0, dtype=np.int32))
+    return Shapes(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Shapes)})
+
+
+def fwhm(images: Any, pixel_scale: Any, *, upsampling: int = 8) -> np.ndarray:
+    """Measure the full width at half maximum of star images [rad], [n], pixel included; NaN without a positive maximum.
+
+    Defined as the diameter of the circle with the area over which the image exceeds half its maximum. Image and maximum
+    are those of the band-limited function through the pixels: Fourier interpolation on a grid finer by `upsampling`, a
+    paraboloid through the highest node and its neighbours, and borders that count with the part of a fine pixel above
+    half maximum. In a noisy image the maximum is biased upwards.
+
+    Parameters
+    ----------
+    images : array
+        [n, ny, nx], or one image [ny, nx]; background subtracted, nearly zero at the edges.
+    pixel_scale : float or Quantity
+        Side of a pixel [rad].
+    """
+    stack = _stamp_cube(images)
+    scale = positive_angle(pixel_scale, "pixel_scale")
+    if upsampling < 2:
+        raise DomainError(f"upsampling = {upsampling}: expected at least 2")
+    result = np.full(len(stack), np.nan)
+    with one_blas_thread():
+        for i, image in enumerate(stack):
+            image = np.asarray(image, dtype=np.float64)
+            if not np.all(np.isfinite(image)):
+                continue
+            fine = _upsampled_core(image, upsampling)
+            peak = _interpolated_peak(fine)
+            if peak > 0.0:
+                result[i] = 2.0 * np.sqrt(_area_above(fine, 0.5 * peak) / np.pi) / upsampling * scale
+    return result
+
+
+def _measure_batch(images: np.ndarray, scale: float, sigma: float, max_iterations: int, tolerance: float) -> Shapes:
+    """Measure a batch of background-subtracted float64 images; sigma is the rms width of the weight in pixels."""
+    count, ny, nx = images.shape
+    half = np.array([(nx - 1) / 2.0, (ny - 1) / 2.0])
+    farthest = half - np.minimum(sigma, 0.5 * half)  # nearer to the edge, the weight would be cut
+    flags = np.zeros(count, dtype=np.int32)
+    with np.errstate(invalid="ignore"):  # infinities of both signs
+        flux = images.reshape(count, -1).sum(axis=1)
+    flags[~np.isfinite(flux)] |= ShapeFlag.NO_FLUX
+    center = np.zeros((count, 2))
+    active = np.flatnonzero(flags == 0)
+    for _ in range(max_iterations):
+        if not len(active):
+            break
+        total, first, second = _weighted_moments(images[active], center[active], sigma)
+        dark = ~(total > 0.0)
+        flags[active[dark]] |= ShapeFlag.NO_FLUX
+        active, first, second = active[~dark], first[~dark], second[~dark]
+        step = _newton_step(first, second, sigma)
+        done = np.hypot(step[:, 0], step[:, 1]) < tolerance
+        center[active] += step
+        gone = np.any(np.abs(center[active]) > farthest, axis=1)
+        flags[active[gone]] |= ShapeFlag.CENTROID_LEFT_STAMP
+        active = active[~(done | gone)]
+    flags[active] |= ShapeFlag.NOT_CONVERGED
+    center[flags != 0] = np.nan
+    measured = np.flatnonzero(flags == 0)
+    # Once more about the final centre: the moments of the last pass belong to the centre before its step.
+    _, first, second = _weighted_moments(images[measured], center[measured], sigma)
+    q11 = second[:, 0] - first[:, 0] ** 2
+    q22 = second[:, 1] - first[:, 1] ** 2
+    q12 = second[:, 2] - first[:, 0] * first[:, 1]
+    determinant = q11 * q22 - q12**2
+    good = (determinant > 0.0) & (q11 > 0.0)
+    flags[measured[~good]] |= ShapeFlag.NEGATIVE_MOMENTS
+    e1, e2, size = (np.full(count, np.nan) for _ in range(3))
+    root = np.sqrt(determinant[good])
+    trace = q11[good] + q22[good] + 2.0 * root
+    e1[measured[good]] = (q11[good] - q22[good]) / trace
+    e2[measured[good]] = 2.0 * q12[good] / trace
+    size[measured[good]] = np.sqrt(root) * scale
+    return Shapes(e1, e2, size, flux, center[:, 0], center[:, 1], flags)
+
+
+def _weighted_moments(
+    images: np.ndarray, center: np.ndarray, sigma: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the sum [n], mean (x, y) [n, 2] and (xx, yy, xy) [n, 3] of weight times image about `center`.
+
+    Plain sums along the last axis and no matrix products: these add in an order that no batch size and no BLAS changes.
+    """
+    _, ny, nx = images.shape
+    x = np.arange(nx) - (nx - 1) / 2.0 - center[:, :1]
+    y = np.arange(ny) - (ny - 1) / 2.0 - center[:, 1:]
+    weight_x = np.exp(-0.5 * (x / sigma) ** 2)
+    weight_y = np.exp(-0.5 * (y / sigma) ** 2)
+    product = images * weight_x[:, None, :]
+    row0 = product.sum(axis=2) * weight_y
+    product *= x[:, None, :]
+    row1 = product.sum(axis=2) * weight_y
+    product *= x[:, None, :]
+    row2 = product.sum(axis=2) * weight_y
+    total = row0.sum(axis=1)
+    sums = np.stack(
+        [row1.sum(axis=1), (row0 * y).sum(axis=1), row2.sum(axis=1), (row0 * y**2).sum(axis=1), (row1 * y).sum(axis=1)],
+        axis=1,
+    )
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # a stamp without light is flagged by its sum
+        means = sums / total[:, None]
+    return total, means[:, :2], means[:, 2:]
+
+
+def _newton_step(first: np.ndarray, second: np.ndarray, sigma: float) -> np.ndarray:
+    """Return the step that brings the weighted first moment to zero.
+
+    The derivative of sum(W I (x - c)) with respect to -c is sum(W I) (1 - M/sigma^2), M being the second moments
+    about c; for a Gaussian image that gives the exact centroid at once. Where the image is too broad or too noisy for
+    it (an eigenvalue under 0.1) that eigenvalue is raised to 0.1, and no step is longer than the weight is wide.
+    """
+    a = 1.0 - second[:, 0] / sigma**2
+    b = 1.0 - second[:, 1] / sigma**2
+    c = -second[:, 2] / sigma**2
+    mean, radius = 0.5 * (a + b), np.hypot(0.5 * (a - b), c)
+    low, high = np.maximum(mean - radius, 0.1), np.maximum(mean + radius, 0.1)
+    # The inverse of the matrix with eigenvalues (high, low), as (trace part) + (trace-free part along the old axes).
+    even, odd = 0.5 * (1.0 / high + 1.0 / low), 0.5 * (1.0 / high - 1.0 / low)
+    safe = np.where(radius > 0.0, radius, 1.0)
+    cos, sin = np.where(radius > 0.0, 0.5 * (a - b), 0.0) / safe, np.where(radius > 0.0, c, 0.0) / safe
+    step = np.stack(
+        [
+            (even + odd * cos) * first[:, 0] + odd * sin * first[:, 1],
+            odd * sin * first[:, 0] + (even - odd * cos) * first[:, 1],
+        ],
+        axis=1,
+    )
+    length = np.hypot(step[:, 0], step[:, 1])
+    return step * (sigma / np.maximum(length, sigma))[:, None]
+
+
+@lru_cache(maxsize=8)
+def _sinc_matrix(count: int, factor: int) -> np.ndarray:
+    """Return the matrix of the band-limited function through `count` pixels at steps of 1/factor, from pixel 0 on.
+
+    Shape [count factor, count]: the periodic sinc, whose highest frequency stands for both its signs if count is even.
+    """
+    turn = np.pi * (np.arange(count * factor)[:, None] / factor - np.arange(count)) / count
+    below = np.tan(turn) if count % 2 == 0 else np.sin(turn)
+    on_pixel = np.abs(np.sin(turn)) < 1e-12
+    return np.where(on_pixel, 1.0, np.sin(count * turn) / (count * np.where(on_pixel, 1.0, below)))
+
+
+def _upsampled_core(image: np.ndarray, factor: int) -> np.ndarray:
+    """Return the band-limited image on a grid `factor` times finer, about the pixels above a quarter of the maximum."""
+    bright = image > 0.25 * image.max()
+    if not bright.any():  # all pixels are negative
+        return image
+    to_fine = []
+    for count, lit in zip(image.shape, (bright.any(axis=1), bright.any(axis=0)), strict=True):
+        first, *_, last = np.flatnonzero(lit)[[0, -1]]
+        span = slice(max(first - 2, 0) * factor, min(last + 3, count) * factor)
+        to_fine.append(_sinc_matrix(count, factor)[span])
+    return to_fine[0] @ image @ to_fine[1].T
+
+
+def _interpolated_peak(fine: np.ndarray) -> float:
+    """Return the maximum of the paraboloid through the highest pixel and its neighbours."""
+    j, i = np.unravel_index(np.argmax(fine), fine.shape)
+    ny, nx = fine.shape
+    value = fine[j, i]
+    peak = value
+    for before, after in ((fine[j, i - 1], fine[j, (i + 1) % nx]), (fine[j - 1, i], fine[(j + 1) % ny, i])):
+        curvature = before + after - 2.0 * value
+        if curvature < 0.0:
+            peak -= (after - before) ** 2 / (8.0 * curvature)
+    return float(peak)
+
+
+def _area_above(fine: np.ndarray, level: float) -> float:
+    """Return the area above a level [fine pixel^2], border pixels counted in part as if the image were plane there."""
+    gy, gx = np.gradient(fine)
+    slope = np.hypot(gx, gy)
+    inside = fine > level
+    border = np.abs(fine - level) < 0.5 * slope
+    covered = inside.astype(np.float64)
+    covered[border] = 0.5 + (fine[border] - level) / slope[border]
+    return float(covered.sum())
+
+
+def _stamp_cube(images: Any) -> np.ndarray:
+    """Return the images as an array [n, ny, nx]."""
+    numbers = real_numbers(images)
+    array = np.empty(0) if numbers is None or hasattr(numbers, "unit") else np.asarray(numbers)
+    if array.ndim == 2:
+        array = array[None]
+    if array.ndim != 3 or min(array.shape[1:]) < 3 or array.dtype.kind not in "iufb":
+        raise DomainError(
+            f"images have shape {np.shape(images)} and type {array.dtype}: "
+            "expected real numbers [n, ny, nx] or [ny, nx], at least 3 x 3"
+        )
+    return array

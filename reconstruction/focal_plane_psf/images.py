@@ -1,0 +1,151 @@
+r"""Images of the PSF of a given shape, and principal components of residual stamps over the focal plane.
+
+A change of second moments is a convolution with a narrow Gaussian, of positive or negative width,
+
+.. math:: \tilde I(k) \to \tilde I(k) \, e^{-k^T S k / 2},
+
+to lowest order the effect of turbulence on the image of the optics. S is found by Broyden's method, so that the
+image has the predicted e1, e2 and size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...measure.shapes import measure_shapes
+from .covariance import Covariance, Places
+from .kriging import map_on_threads, neighbourhood, neighbours_of
+from .likelihood import fit_covariance
+from .mosaic import Mosaic
+
+# The three deformations, as coefficients of kx^2, ky^2 and kx ky: along x, along x = y, and round.
+_SHAPES = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 2.0], [1.0, 1.0, 0.0]])
+_STEP = 0.02
+_ITERATIONS = 7
+# Least square of a step for an update of the Jacobian.
+_SMALLEST = 1e-14
+# Pixels of zeros about a stamp while it is convolved.
+_ROOM = 8
+
+
+def with_shapes(images: np.ndarray, values: np.ndarray, pixel_scale: float, weight_fwhm: float) -> np.ndarray:
+    """Convolve images [n, ny, nx] to the shapes e1, e2, ln size [n, 3]; the result is centred and of unit sum."""
+    ny, nx = images.shape[1:]
+    padded = np.pad(images.astype(np.float64), ((0, 0), (_ROOM, _ROOM), (_ROOM, _ROOM)))
+    spectrum = np.fft.rfft2(padded)
+    ky = 2.0 * np.pi * np.fft.fftfreq(ny + 2 * _ROOM)[:, None]
+    kx = 2.0 * np.pi * np.fft.rfftfreq(nx + 2 * _ROOM)
+    forms = np.einsum("sp,pyx->syx", _SHAPES, np.stack(np.broadcast_arrays(kx**2, ky**2, kx * ky)))
+    amounts, shift = np.zeros((len(images), 3)), np.zeros((len(images), 2))
+
+    def image(amounts: np.ndarray, shift: np.ndarray) -> np.ndarray:
+        exponent = -0.5 * np.einsum("ns,syx->nyx", amounts, forms)
+        phase = kx * shift[:, 0, None, None] + ky * shift[:, 1, None, None]
+        result = np.fft.irfft2(spectrum * np.exp(exponent + 1j * phase), s=padded.shape[1:])
+        return result[:, _ROOM : ny + _ROOM, _ROOM : nx + _ROOM]
+
+    def measured(stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        found = measure_shapes(stamps, pixel_scale, weight_fwhm)
+        return np.stack([found.e1, found.e2, np.log(found.size)], axis=1), np.stack([found.x, found.y], axis=1)
+
+    now, centre = measured(image(amounts, shift))
+    jacobian = np.empty((len(images), 3, 3))
+    for shape in range(3):
+        step = np.zeros(3)
+        step[shape] = _STEP
+        ends = [measured(image(amounts + sign * step, shift))[0] for sign in (1.0, -1.0)]
+        jacobian[:, :, shape] = (ends[0] - ends[1]) / (2.0 * _STEP)
+    for _ in range(_ITERATIONS):
+        step = np.linalg.solve(jacobian, (values - now)[:, :, None])[:, :, 0]
+        amounts, shift, before = amounts + step, shift + centre, now
+        now, centre = measured(image(amounts, shift))
+        # Broyden's update of the Jacobian, where there was a step.
+        square = (step**2).sum(axis=1)
+        missed = now - before - np.einsum("nfs,ns->nf", jacobian, step)
+        moved = square > _SMALLEST
+        jacobian[moved] += missed[moved, :, None] * (step / np.maximum(square, _SMALLEST)[:, None])[moved, None]
+    result = image(amounts, shift)
+    return result / result.sum(axis=(1, 2), keepdims=True)
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualImages:
+    """Principal components of stamps less the model, each interpolated over the focal plane as a random field.
+
+    Attributes
+    ----------
+    mosaic : Mosaic
+        The CCDs.
+    components : ndarray, shape [k, ny, nx]
+        Orthonormal components, of sum zero.
+    places : Places
+        Of the stars.
+    coefficients, noise : ndarray, shape [n, k]
+        Projections of the stars, and variances of their noise.
+    covariances : tuple of Covariance
+        Of each coefficient.
+    """
+
+    mosaic: Mosaic
+    components: np.ndarray
+    places: Places
+    coefficients: np.ndarray
+    noise: np.ndarray
+    covariances: tuple[Covariance, ...]
+
+    @classmethod
+    def fit(
+        cls,
+        residuals: np.ndarray,
+        places: Places,
+        weight: np.ndarray,
+        mosaic: Mosaic,
+        count: int,
+        threads: int | None,
+    ) -> ResidualImages | None:
+        """Fit up to `count` components to residual stamps [n, ny, nx]; None if none of them is above the noise.
+
+        `weight` [n] are the inverse variances of the stars but for a factor. The noise of a pixel is that of the
+        corners of the stamps.
+        """
+        n, ny, nx = residuals.shape
+        flat = (residuals - residuals.mean(axis=(1, 2), keepdims=True)).reshape(n, -1)
+        root = np.sqrt(weight / weight.mean())[:, None]
+        _, values, rows = np.linalg.svd(flat * root, full_matrices=False)
+        # Noise alone makes the largest singular value sigma (sqrt(n) + sqrt(pixels)) (Marchenko & Pastur 1967).
+        edge = np.ones((ny, nx), dtype=bool)
+        edge[ny // 6 : -(ny // 6), nx // 6 : -(nx // 6)] = False
+        sigma = float(np.std((flat * root)[:, edge.ravel()]))
+        keep = min(count, int((values > 1.05 * sigma * (np.sqrt(n) + np.sqrt(ny * nx))).sum()))
+        if keep == 0:
+            return None
+        rows = rows[:keep]
+        signs = np.where(rows[range(keep), np.abs(rows).argmax(axis=1)] < 0, -1.0, 1.0)
+        components = rows * signs[:, None]
+        coefficients = np.einsum("np,kp->nk", flat, components)
+        noise = np.repeat((sigma / root) ** 2, keep, axis=1)
+
+        def covariance(k: int) -> Covariance:
+            return fit_covariance(places, coefficients[:, k], noise[:, k], max_iterations=25).covariance
+
+        covariances = tuple(map_on_threads(covariance, range(keep), threads))
+        return cls(mosaic, components.reshape(keep, ny, nx), places, coefficients, noise, covariances)
+
+    def at(self, places: Places, threads: int | None = None) -> np.ndarray:
+        """Return the sum of the components at places, shape [n, ny, nx]."""
+        amount = np.zeros((len(places), len(self.components)))
+
+        def job(ccd: int) -> tuple[np.ndarray, np.ndarray]:
+            at = np.flatnonzero(places.ccd == ccd)
+            stars = neighbours_of(self.places, self.mosaic.centers[ccd])
+            found = np.empty((len(at), len(self.components)))
+            for k, covariance in enumerate(self.covariances):
+                near = neighbourhood(covariance, self.places, self.coefficients[:, k], self.noise[:, k], stars)
+                found[:, k] = near.predict(covariance.between(self.places[stars], places[at]))
+            return at, found
+
+        for at, found in map_on_threads(job, np.unique(places.ccd), threads):
+            amount[at] = found
+        return np.einsum("nk,kyx->nyx", amount, self.components)

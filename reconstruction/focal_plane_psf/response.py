@@ -1,0 +1,344 @@
+r"""Shapes of the long-exposure PSF of a telescope, as functions of CCD height, residual wavefront and seeing.
+
+The shape of the PSF of the optics under the mean of all turbulence changes with the height of the CCD, with the
+residual aberration of the exposure and with the Fried parameter. Heights enter through a polynomial between Chebyshev
+nodes, whose derivative is exact: five nodes over +-25 um reproduce the shapes of the engine to 5e-5 at any height.
+The other parameters are linear about the last solution, with derivatives that are functions of field and height.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.errors import DomainError
+from ...core.units import ARCSEC, angle, length, metres, positive_angle, radians
+from ...models.camera.camera import Camera
+from ...models.camera.cameras import load_camera
+from ...models.camera.focal_plane import FocalPlane
+from ...models.camera.silicon import Silicon
+from ...models.io.yaml.writer import telescope_to_yaml
+from ...models.telescope import Telescope
+from ...models.zernike_polynomials import noll_to_nm
+from ...wavefront.aberration import LINEAR_FRACTION, ResidualWavefront
+from ...wavefront.atmosphere.atmosphere import Atmosphere
+from ...wavefront.chief_rays import fields_at
+from ...wavefront.psf.clear_pupil import has_only_annuli
+from ...wavefront.psf.psf import make_psfs
+from ...measure.shapes import measure_shapes
+from .height_series import HeightSeries, level_plane
+
+#: Noll terms of the residual wavefront of an exposure, each constant and linear over the field.
+NOLL = tuple(range(4, 12))
+#: Number of parameters of an exposure: Noll terms on the axis and along x and y, and the Fried parameter.
+N_EXPOSURE = 3 * len(NOLL) + 1
+# Standard deviation of the logarithm of the Fried parameter.
+_SEEING = 0.3
+#: Height range of the polynomial about its centre [m].
+LARGEST_HEIGHT = 25e-6
+_NODES = 5
+# Steps of the differences: wavefront [m] and logarithm of the Fried parameter.
+_WAVEFRONT_STEP, _SEEING_STEP = 0.05e-6, 0.05
+# Stars at which derivatives are computed, fewer where they are costly, and the degree of their dependence on the field.
+_SAMPLES, _SAMPLES_LATTICE, _FIELD_DEGREE = 300, 120, 6
+# Heights about the centre [m] between which these derivatives are linear.
+_LEVEL = 8e-6
+_BATCH = 2048
+# Pixels of the LSST, and rms charge diffusion in them [m].
+_PIXEL, _DIFFUSION = 10e-6, 4e-6
+# Points of a pupil with vanes or plates: e is good to 2e-4, a tenth of what turbulence adds, in a third of the time.
+# For changes fewer do: the same points are lit before and after.
+_LATTICE_POINTS, _LATTICE_POINTS_CHANGES = 6000, 3000
+
+
+@dataclass(frozen=True, eq=False)
+class Instrument:
+    """Parameters of the long-exposure PSF of a star at a position and height.
+
+    Attributes
+    ----------
+    telescope : Telescope
+        The telescope.
+    wavelengths : ndarray, shape [n_wave]
+        Wavelengths [m].
+    atmosphere : Atmosphere
+        Fried parameter and outer scale.
+    pixel_size, diffusion : float
+        Pixel of the stamps, and rms charge diffusion [m].
+    jitter : float
+        Pointing, rms along each axis [rad].
+    weight_fwhm : float
+        Weight of the moments [rad].
+    dispersion : ndarray, shape [n_wave, 2], or None
+        Shift of each wavelength by the air [rad].
+    stamp_size : int
+        Pixels on a side of a stamp.
+    silicon : Silicon or None
+        Silicon of the CCDs; None where all light turns into charge at their surface.
+    """
+
+    telescope: Telescope
+    wavelengths: np.ndarray
+    atmosphere: Atmosphere
+    pixel_size: float
+    diffusion: float
+    jitter: float
+    weight_fwhm: float
+    dispersion: np.ndarray | None
+    stamp_size: int
+    silicon: Silicon | None
+
+    @classmethod
+    def of(
+        cls,
+        telescope: Telescope,
+        wavelengths: ArrayLike | None = None,
+        atmosphere: Atmosphere | None = None,
+        *,
+        camera: str | Camera | None = None,
+        pixel_size: ArrayLike | None = None,
+        diffusion: ArrayLike | None = None,
+        jitter: ArrayLike = 0.0,
+        weight_fwhm: ArrayLike = 0.7 * ARCSEC,
+        dispersion: ArrayLike | None = None,
+        stamp_size: int = 31,
+        silicon: Silicon | None = None,
+    ) -> Instrument:
+        """Return an instrument of numbers in SI or quantities.
+
+        By default of five wavelengths over the band, of the turbulence of the telescope's site (Cerro Pachon), and of
+        the pixels of the camera, the telescope's unless told (10 um without one), with a charge diffusion of 0.4 of
+        them.
+        """
+        known = telescope.camera if camera is None else camera
+        if pixel_size is None:
+            pixel_size = _PIXEL if known is None else load_camera(known).pixel_size
+        pixel = length(pixel_size, "pixel_size")
+        if wavelengths is None:
+            low, high = telescope.band or telescope.wavelength_range
+            wavelengths = np.linspace(low, high, 5)
+        return cls(
+            telescope,
+            np.atleast_1d(metres(wavelengths, "wavelengths")),
+            Atmosphere.from_site(telescope.site or "cerro_pachon", seed=0) if atmosphere is None else atmosphere,
+            pixel,
+            _DIFFUSION * (pixel / _PIXEL) if diffusion is None else length(diffusion, "diffusion"),
+            angle(jitter, "jitter"),
+            positive_angle(weight_fwhm, "weight_fwhm"),
+            None if dispersion is None else radians(dispersion, "dispersion"),
+            stamp_size,
+            silicon,
+        )
+
+    @property
+    def key(self) -> str:
+        """SHA-256 of all parameters."""
+        air = self.atmosphere
+        numbers = (air.r0, air.outer_scale, self.pixel_size, self.diffusion, self.jitter, self.weight_fwhm)
+        arrays = (self.wavelengths, np.zeros(0) if self.dispersion is None else self.dispersion)
+        text = (
+            telescope_to_yaml(self.telescope) + repr((*numbers, self.stamp_size)) + repr([a.tolist() for a in arrays])
+        )
+        text += "" if self.silicon is None else repr(self.silicon)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def fields(self, xy: np.ndarray, threads: int | None = None) -> np.ndarray:
+        """Return the field angles of positions on the detector [rad], shape [n, 2]."""
+        return fields_at(self.telescope, xy, self.wavelengths[len(self.wavelengths) // 2], threads=threads)
+
+    def images(
+        self,
+        fields: np.ndarray,
+        plane: FocalPlane,
+        aberration: ResidualWavefront | None,
+        seeing: float = 0.0,
+        threads: int | None = None,
+        points: int = _LATTICE_POINTS,
+    ) -> tuple[np.ndarray, float]:
+        """Return the PSFs of stars at field angles, of unit sum [n, ny, nx], and the angle of a pixel [rad].
+
+        ``points`` are those of a pupil with vanes or plates.
+        """
+        atmosphere = self.atmosphere
+        if seeing:
+            atmosphere = replace(atmosphere, r0=atmosphere.r0 * float(np.exp(seeing)))
+        psfs = make_psfs(
+            self.telescope,
+            fields,
+            self.wavelengths,
+            focal_plane=plane,
+            atmosphere=atmosphere,
+            aberration=aberration,
+            silicon=self.silicon,
+            engine="long_exposure",
+            stamp_size=self.stamp_size,
+            pixel_size=self.pixel_size,
+            diffusion=self.diffusion,
+            jitter=self.jitter,
+            dispersion=self.dispersion,
+            n_pupil=None if has_only_annuli(self.telescope) else points,
+            threads=threads,
+        )
+        return psfs.image, psfs.pixel_scale
+
+    def shapes(
+        self,
+        fields: np.ndarray,
+        plane: FocalPlane,
+        aberration: ResidualWavefront | None,
+        seeing: float = 0.0,
+        threads: int | None = None,
+        progress: Callable[[int], None] | None = None,
+        points: int = _LATTICE_POINTS,
+    ) -> np.ndarray:
+        """Return e1, e2 and the logarithm of the size [rad] of PSFs at field angles, shape [n, 3]."""
+        found = np.empty((len(fields), 3))
+        for first in range(0, len(fields), _BATCH):
+            part = slice(first, first + _BATCH)
+            images, scale = self.images(fields[part], plane, aberration, seeing, threads, points)
+            shapes = measure_shapes(images, scale, self.weight_fwhm)
+            found[part] = np.stack([shapes.e1, shapes.e2, np.log(shapes.size)], axis=1)
+            if progress is not None:
+                progress(len(images))
+        return found
+
+
+def height_response(
+    instrument: Instrument,
+    fields: np.ndarray,
+    plane: FocalPlane,
+    aberration: ResidualWavefront | None,
+    seeing: float = 0.0,
+    threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
+    *,
+    center: float = 0.0,
+) -> HeightSeries:
+    """Return the shapes of stars as series of the height of the CCD; `plane` gives the camera alone."""
+
+    def shapes(level: FocalPlane) -> np.ndarray:
+        return instrument.shapes(fields, level, aberration, seeing, threads, progress)
+
+    series = HeightSeries.of(shapes, plane, LARGEST_HEIGHT, _NODES, center=center)
+    lost = int((~np.isfinite(series.coefficients).all(axis=(0, 2))).sum())
+    if lost:
+        raise DomainError(
+            f"{instrument.telescope.name}: the PSF at {lost} of {len(fields)} stars has no shape within"
+            f" {1e6 * LARGEST_HEIGHT:g} um of the heights: expected the telescope that they were taken with"
+        )
+    return series
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureResponse:
+    """Derivatives of the shapes with respect to the parameters of an exposure.
+
+    Parameters: coefficients [m] of the Noll terms on the axis, their slopes along x and y of the field [m per field
+    radius], and the logarithm of the Fried parameter.
+    """
+
+    polynomial: np.ndarray  #: [n_term + 1, level, field term, 3]
+    radius: float  #: of the field [rad]
+    center: float  #: height about which they are linear in the height [m]
+
+    @classmethod
+    def of(
+        cls,
+        instrument: Instrument,
+        fields: np.ndarray,
+        plane: FocalPlane,
+        aberration: ResidualWavefront | None,
+        seeing: float,
+        threads: int | None = None,
+        progress: Callable[[int], None] | None = None,
+        *,
+        center: float = 0.0,
+    ) -> ExposureResponse:
+        """Compute central differences at some of the stars, and fit them over the field."""
+        radius = float(np.hypot(*fields.T).max()) or instrument.telescope.field_radius
+        most = _SAMPLES if has_only_annuli(instrument.telescope) else _SAMPLES_LATTICE
+        chosen = fields[np.unique(np.linspace(0, len(fields) - 1, min(most, len(fields))).astype(int))]
+        degree = min(_FIELD_DEGREE, max(0, int((np.sqrt(8 * len(chosen) / 3 + 1) - 3) / 2)))
+        terms = field_terms(chosen / radius, degree)
+        found = []
+        for parameter in range(len(NOLL) + 1):
+            levels = []
+            for level in (center - _LEVEL, center + _LEVEL):
+                flat, ends = level_plane(plane, level), []
+                for sign in (1.0, -1.0):
+                    changed, air = aberration, seeing
+                    if parameter < len(NOLL):
+                        step = np.zeros((3, len(NOLL)))
+                        step[0, parameter] = sign * _WAVEFRONT_STEP
+                        changed = wavefront(instrument.telescope, step, radius, aberration)
+                    else:
+                        air = seeing + sign * _SEEING_STEP
+                    ends.append(
+                        instrument.shapes(chosen, flat, changed, air, threads, progress, _LATTICE_POINTS_CHANGES)
+                    )
+                width = 2.0 * (_WAVEFRONT_STEP if parameter < len(NOLL) else _SEEING_STEP)
+                change = (ends[0] - ends[1]) / width
+                levels.append(np.linalg.lstsq(terms, change, rcond=None)[0])
+            found.append(levels)
+        polynomial: np.ndarray = np.array(found)
+        if not np.isfinite(polynomial).all():
+            raise DomainError(
+                f"{instrument.telescope.name}: the PSF has no shape where alignment or seeing change a little: expected"
+                " stamps and a weight that hold it, and the telescope that the stars were taken with"
+            )
+        return cls(polynomial, radius, center)
+
+    def columns(self, fields: np.ndarray, heights: np.ndarray) -> np.ndarray:
+        """Return the derivatives at field angles [rad] and heights [m], shape [n, n_parameter, 3]."""
+        first, second = self._at_levels(fields)
+        upper = 0.5 + (heights - self.center) / (2.0 * _LEVEL)
+        return self._expanded_over_field(fields, first + upper[:, None, None] * (second - first))
+
+    def height_slopes(self, fields: np.ndarray) -> np.ndarray:
+        """Return the derivatives of :meth:`columns` with respect to the height [1/m], shape [n, n_parameter, 3]."""
+        first, second = self._at_levels(fields)
+        return self._expanded_over_field(fields, (second - first) / (2.0 * _LEVEL))
+
+    def _at_levels(self, fields: np.ndarray) -> np.ndarray:
+        """Return the derivatives at the two heights, parameters on the axis alone: [level, n, n_term + 1, 3]."""
+        degree = round((np.sqrt(8 * self.polynomial.shape[2] + 1) - 3) / 2)
+        terms = field_terms(fields / self.radius, degree)
+        return np.einsum("nt,pltf->lnpf", terms, self.polynomial)
+
+    def _expanded_over_field(self, fields: np.ndarray, own: np.ndarray) -> np.ndarray:
+        """Add the parameters along x and y of the field, whose derivatives are those on the axis times x and y."""
+        along, waves = fields / self.radius, own[:, :-1]
+        return np.concatenate(
+            [waves, along[:, 0, None, None] * waves, along[:, 1, None, None] * waves, own[:, -1:]], axis=1
+        )
+
+
+def exposure_sigma(alignment_rms: float) -> np.ndarray:
+    """Return the prior standard deviations of the parameters of an exposure, those of :class:`.ResidualWavefront`."""
+    degree = np.array([float(noll_to_nm(j)[0]) for j in NOLL])
+    variance = degree ** (-11.0 / 3.0)
+    sigma = alignment_rms * np.sqrt(variance / variance.sum())
+    along = np.sqrt(2.0 * LINEAR_FRACTION) * sigma
+    return np.concatenate([np.sqrt(1.0 - LINEAR_FRACTION) * sigma, along, along, [_SEEING]])
+
+
+def wavefront(
+    telescope: Telescope, coefficients: np.ndarray, radius: float, base: ResidualWavefront | None = None
+) -> ResidualWavefront:
+    """Return a residual wavefront of coefficients [3, n_term] (on the axis, along x, along y), added to another."""
+    values = np.zeros((3, NOLL[-1] - 3))
+    values[:, np.array(NOLL) - 4] = coefficients
+    constant, gradient = values[0], values[1:].T / radius
+    if base is not None:
+        constant, gradient = constant + base.coefficients, gradient + base.field_gradient
+    return ResidualWavefront(constant, telescope.pupil_diameter, telescope.pupil_obscuration, gradient)
+
+
+def field_terms(slopes: np.ndarray, degree: int) -> np.ndarray:
+    """Return products of Legendre polynomials over the field up to a total degree, shape [n, n_term]."""
+    x, y = (np.polynomial.legendre.legvander(slopes[:, axis], degree) for axis in range(2))
+    return np.stack([x[:, i] * y[:, t - i] for t in range(degree + 1) for i in range(t + 1)], axis=1)

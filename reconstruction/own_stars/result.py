@@ -1,0 +1,238 @@
+"""PSF model of own stars: the stars, the model, its prediction of each star held out, and their picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from astropy.table import QTable, Table
+from numpy.typing import NDArray
+
+from ...core.arguments import check_arguments
+from ...core.plotting import BLUE, ORANGE, RED, figure_at, plain_text, styled
+from ...core.products import Columns, described_table
+from ...core.result import Result
+from ...core.units import ARCMIN, ARCSEC
+from ...measure.rho_statistics import RhoStatistics, rho_statistics
+from ...measure.shapes import Shapes, fwhm
+from ...measure.star_selection import StarFlag
+from ..psf_model.model import PsfModel
+from ...pipeline.report.focal_plane_axes import draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
+from ...pipeline.report.psf_plots import StampGallery, stretched
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Stars that the picture shows: twice as many.
+_SHOWN = 5
+
+
+@check_arguments
+@dataclass(frozen=True, eq=False)
+class OwnStars(Result):
+    """Stars of an image, the PSF model made from the good ones, and its prediction of each star held out.
+
+    Attributes
+    ----------
+    model : PsfModel
+        Of all stars that are used; positions in the unit of the stars'.
+    positions : ndarray
+        Of all stars, [n, 2].
+    snr : ndarray
+        Signal-to-noise ratio, [n].
+    flags : ndarray
+        :class:`~.StarFlag` bits, [n]; stars without any, and of enough S/N, are used.
+    used : ndarray
+        [n] bool.
+    shapes : Shapes
+        Of the stars, angles in rad.
+    held_out : Shapes
+        Of the model made without the star and others of its part; NaN for stars that are not used.
+    stamps, predicted : ndarray
+        Used stars and the models made without them, unit sum, [n_used, ny, nx].
+    sigma_e, sigma_size : ndarray
+        Noise of a component of the ellipticity, and of the relative size, of the used stars, [n_used].
+    pixel_scale, weight_fwhm : float
+        Of the stamps [rad], and of the weight of the moments [rad].
+    kind : str
+        Kind of model that was chosen, one of :data:`~.own_stars.candidates.CANDIDATES`; ``given`` where options said.
+    """
+
+    _images = ("stamps", "predicted")
+
+    model: PsfModel
+    positions: np.ndarray
+    snr: np.ndarray
+    flags: np.ndarray
+    used: NDArray[np.bool_]
+    shapes: Shapes
+    held_out: Shapes
+    stamps: np.ndarray
+    predicted: np.ndarray
+    sigma_e: np.ndarray
+    sigma_size: np.ndarray
+    pixel_scale: float
+    weight_fwhm: float
+    kind: str
+
+    def table(self) -> Table:
+        """Return all stars with their shapes and residuals."""
+        one, other = self.shapes, self.held_out
+        columns: Columns = {
+            "x": (self.positions[:, 0], "", "place, in the unit of the positions"),
+            "y": (self.positions[:, 1], "", "place, in the unit of the positions"),
+            "snr": (self.snr, "", "signal-to-noise ratio"),
+            "flags": (self.flags, "", "bits of StarFlag"),
+            "used": (self.used, "", "whether the model is made of it"),
+            "e1": (one.e1, "", "ellipticity along x"),
+            "e2": (one.e2, "", "ellipticity along the diagonal x = y"),
+            "size": (one.size / ARCSEC, "arcsec", "weighted rms size"),
+            "held_out_e1": (other.e1, "", "e1 of the model made without the star"),
+            "held_out_e2": (other.e2, "", "e2 of the model made without the star"),
+            "held_out_size": (other.size / ARCSEC, "arcsec", "size of the model made without the star"),
+        }
+        return described_table(columns, {})
+
+    def residuals(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return e1, e2 and relative size of the used stars less those predicted without them, [n_used] each."""
+        one, other, used = self.shapes, self.held_out, self.used
+        return (
+            (one.e1 - other.e1)[used],
+            (one.e2 - other.e2)[used],
+            (one.size / other.size - 1.0)[used],
+        )
+
+    def plot(self, title: str = "own stars", *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw whiskers, residuals of held-out stars against S/N, rho statistics and stamps."""
+        return _draw(self, title, ax)
+
+    def _label(self) -> str:
+        return f"{len(self.used)} stars, {int(self.used.sum())} used, {self.model!r}"
+
+    def to_table(self) -> QTable:
+        """Return the stars of :meth:`table`."""
+        return QTable(self.table())
+
+    def _summary(self) -> dict[str, Any]:
+        """Return numbers of stars, FWHM, and rms residuals at stars that were held out, beside their noise."""
+        d1, d2, size = self.residuals()
+        counts = {str(f.name).lower(): int(((self.flags & f) > 0).sum()) for f in StarFlag if f}
+        return {
+            "kind": self.kind,
+            "stars": len(self.used),
+            "used": int(self.used.sum()),
+            "flagged": counts,
+            "median_snr": float(np.median(self.snr[self.used])),
+            "fwhm_arcsec": float(np.median(fwhm(self.predicted, self.pixel_scale))) / ARCSEC,
+            "rms_e": _rms(self.shapes.e1[self.used], self.shapes.e2[self.used]),
+            "rms_e_held_out": _rms(d1, d2),
+            "rms_e_noise": _rms(self.sigma_e),
+            "rms_size_held_out": _rms(size),
+            "rms_size_noise": _rms(self.sigma_size),
+        }
+
+    def rho_statistics(self, bins: int = 8) -> RhoStatistics:
+        """Return the rho statistics of the held-out residuals; positions must be in pixels of the stamps."""
+        used = self.used
+        one, other = part_of(self.shapes, used), part_of(self.held_out, used)
+        return star_rho_statistics(self.positions[used] * self.pixel_scale, one, other, bins)
+
+
+def part_of(shapes: Shapes, chosen: np.ndarray) -> Shapes:
+    """Return the shapes of some stars, those of a mask [n] or of indices."""
+    return Shapes(**{name: value[chosen] for name, value in vars(shapes).items()})
+
+
+def star_rho_statistics(places: np.ndarray, stars: Shapes, model: Shapes, bins: int) -> RhoStatistics:
+    """Return the rho statistics of a model at stars, whose places on the sky [rad] are [n, 2]."""
+    x, y = (places - places.mean(axis=0)).T
+    one, other = ([getattr(s, name) for name in ("e1", "e2", "size")] for s in (stars, model))
+    longest = float(np.hypot(np.ptp(x), np.ptp(y)))
+    return rho_statistics(x, y, *one, *other, min_sep=longest / 100.0, max_sep=longest, n_bins=bins)
+
+
+def _rms(*values: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(np.concatenate(values) ** 2)))
+
+
+def _draw(own: OwnStars, title: str, ax: Axes | Figure | None) -> Figure:
+    used = own.used
+    d1, d2, size = own.residuals()
+    x, y = own.positions[used].T
+    panels = (
+        ("stars", own.shapes.e1[used], own.shapes.e2[used], BLUE),
+        ("model without the star", own.held_out.e1[used], own.held_out.e2[used], "0.3"),
+        ("difference", d1, d2, RED),
+    )
+    with styled():
+        figure = figure_at(ax, 13.0, 12.0)
+        grid = figure.add_gridspec(3, 3, height_ratios=(1.0, 0.9, 1.1))
+        key = key_ellipticity(np.hypot(panels[0][1], panels[0][2]))
+        scale = 0.12 * max(np.ptp(x), np.ptp(y)) / key
+        for column, (name, e1, e2, color) in enumerate(panels):
+            axes = figure.add_subplot(grid[0, column])
+            draw_whiskers(axes, whiskers(x, y, e1, e2, scale), color, 1.2)
+            axes.set(xlabel="x", ylabel="y" if column == 0 else "", aspect="equal")
+            margin = 0.05 * max(np.ptp(x), np.ptp(y))
+            axes.set(xlim=(x.min() - margin, x.max() + margin), ylim=(y.min() - margin, y.max() + margin))
+            axes.set_title(name, loc="left")
+            draw_key_whisker(axes, key, scale, 1.2)
+        snr = own.snr[used]
+        rising = np.argsort(snr)
+        for column, (label, values, noise) in enumerate(
+            (
+                ("e, star - model", np.stack([d1, d2]), own.sigma_e),
+                ("size, (star - model)/model", size[None], own.sigma_size),
+            )
+        ):
+            axes = figure.add_subplot(grid[1, column])
+            for row, (one, color) in enumerate(zip(values, (BLUE, ORANGE), strict=False)):
+                axes.plot(snr, one, ".", color=color, label=f"e{row + 1}" if len(values) > 1 else None)
+            for sign in (1.0, -1.0):
+                noise_label = "noise of the stars, 1 sigma" if sign > 0.0 else None
+                axes.plot(snr[rising], sign * noise[rising], "-", color="0.4", linewidth=1.0, label=noise_label)
+            limit = 4.0 * float(np.nanstd(values))
+            axes.set(xscale="log", xlabel="S/N", ylim=(-limit, limit))
+            axes.axhline(0.0, color="0.7", linewidth=0.6)
+            axes.set_title(f"{label}; stars held out", loc="left")
+            axes.legend()
+        axes = figure.add_subplot(grid[1, 2])
+        rho = dict(own.rho_statistics().items())
+        for name, color in (("rho1", RED), ("rho2", BLUE)):
+            correlation = rho[name]
+            theta = correlation.r / ARCMIN
+            axes.errorbar(theta, correlation.xi_plus, correlation.error_plus, fmt=".-", color=color, label=name)
+        axes.axhline(0.0, color="0.7", linewidth=0.6)
+        axes.set(xscale="log", xlabel="separation [arcmin]")
+        axes.ticklabel_format(axis="y", style="sci", scilimits=(0, 0))
+        axes.set_title("rho statistics of the held-out stars", loc="left")
+        axes.legend()
+        _stamps(own, figure.add_subplot(grid[2, :]))
+        found = own.summary()
+        figure.suptitle(
+            f"{plain_text(title)}: {found['used']} of {found['stars']} stars, FWHM {found['fwhm_arcsec']:.3g} arcsec; "
+            f"rms of e held out {100 * found['rms_e_held_out']:.2g} %, "
+            f"noise of the stars {100 * found['rms_e_noise']:.2g} %",
+            fontsize=10,
+        )
+        return figure
+
+
+def _stamps(own: OwnStars, axes: Axes) -> None:
+    """Draw used stars from the brightest to the faintest, the models made without them, and the difference."""
+    order = np.argsort(-own.snr[own.used], kind="stable")
+    ranks = np.unique(np.linspace(0, len(order) - 1, 2 * _SHOWN).round().astype(int))
+    gallery = StampGallery(axes, own.stamps.shape[1], own.pixel_scale)
+    for column, star in enumerate(order[ranks]):
+        top = own.predicted[star].max()
+        images = (own.stamps[star], own.predicted[star], own.stamps[star] - own.predicted[star])
+        for row, image in enumerate(images):
+            colours: dict[str, Any] = {"cmap": "viridis", "vmin": float(stretched(np.array(-0.02))), "vmax": 1.0}
+            shown = stretched(image / top)
+            if row == 2:
+                colours, shown = {"cmap": "RdBu_r", "vmin": -0.1, "vmax": 0.1}, image / top
+            title = f"S/N {own.snr[own.used][star]:.0f}" if row == 0 else ""
+            gallery.show(shown, row, column, title, **colours)
+    gallery.finish(3, len(ranks), ("star (asinh)", "model without it", "difference, ±10 %"))

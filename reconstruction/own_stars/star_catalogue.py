@@ -1,0 +1,166 @@
+"""Stars from a user's own table: positions, and cutouts in a column or in an image cube."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from astropy.io import fits
+from astropy.table import Table
+
+from ...core.arguments import check_arguments
+from ...core.errors import ProductError
+from ...core.files import parsing, read_bytes
+
+#: Names that SExtractor and the LSST pipelines have for columns, in lower case.
+OTHER_NAMES = {
+    "x": ("xwin_image", "x_image", "xpsf_image", "slot_centroid_x", "base_sdsscentroid_x"),
+    "y": ("ywin_image", "y_image", "ypsf_image", "slot_centroid_y", "base_sdsscentroid_y"),
+    "stamp": ("vignet",),
+}
+# SExtractor's masked pixels are -1e30.
+_MASKED = -1e29
+
+
+class StarCutouts(NamedTuple):
+    """Stars to fit a PSF model to."""
+
+    stamps: np.ndarray  #: [n, ny, nx], as they stand in the file
+    positions: np.ndarray  #: [n, 2], in the unit of the table
+
+
+@check_arguments
+def load_stars(
+    catalogue: str | Path,
+    *,
+    x: str = "x",
+    y: str = "y",
+    stamp: str = "stamp",
+    images: str | Path | None = None,
+) -> StarCutouts:
+    """Read stars from a FITS or ECSV table.
+
+    Nothing is subtracted, shifted or left out: :func:`~pachon.pipeline.simulate.stamps.center_stamps` centres stars,
+    :func:`~pachon.measure.star_selection.flag_stars` finds those to leave out.
+
+    Parameters
+    ----------
+    catalogue : str or Path
+        The table; of a FITS file its first one with a position. The names of columns may be in any case.
+    x, y : str
+        Columns of the positions, in any unit; for "x" and "y" names of SExtractor and of LSST stand in,
+        :data:`OTHER_NAMES`.
+    stamp : str
+        Column of the stamps, [ny, nx] in every row; VIGNET of SExtractor stands in for "stamp", its masked pixels
+        become NaN. Where a FITS file has none, its first image of three axes is taken.
+    images : str or Path, optional
+        FITS file whose first image of three axes, [n, ny, nx], holds the stamps in the order of the table.
+
+    Returns
+    -------
+    StarCutouts
+        Stamps and positions, to be unpacked.
+
+    Raises
+    ------
+    ProductError
+        If a file is missing, cut short, of another kind, or lacks a column; one line that names it.
+    """
+    path = Path(catalogue)
+    data = read_bytes(path, ProductError)
+    hdus: fits.HDUList | None = None
+    if data.startswith(b"SIMPLE"):
+        hdus = _read_fits_parts(path, data)
+        tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU) and not isinstance(hdu, fits.CompImageHDU)]
+        if not tables:
+            raise ProductError(
+                f"has no table, expected one of stars with columns {x}, {y} and their stamps, {stamp}", file=path
+            )
+        with parsing(path, "damaged or not FITS", ProductError):
+            # SExtractor's LDAC files have a table of the image's header before that of the objects.
+            table = next((t for t in tables if _find_column(x, t.columns.names)), tables[0])
+            columns = {name: np.asarray(table.data[name]) for name in table.columns.names}
+    elif data.lstrip().startswith(b"# %ECSV"):
+        columns = _read_ecsv_columns(path, data)
+    else:
+        raise ProductError("neither FITS nor ECSV, expected a table of stars", file=path)
+
+    cube = None
+    if images is not None:
+        cube = _first_cube(_read_fits_parts(Path(images), read_bytes(Path(images), ProductError)))
+        if cube is None:
+            raise ProductError("has no image of three axes, expected the stamps [n, ny, nx]", file=images)
+    x, y, stamp = (_find_column(name, columns) or name for name in (x, y, stamp))
+    names = {name.lower(): name for name in columns}
+    if cube is None and stamp.lower() not in names and hdus is not None:
+        cube = _first_cube(hdus)
+    wanted = [x, y] if cube is not None else [x, y, stamp]
+    missing = [name for name in wanted if name.lower() not in names]
+    if missing:
+        also = " and no image of three axes" if stamp in missing and hdus is not None else ""
+        raise ProductError(
+            f"{path}: no column {', '.join(map(repr, missing))}{also}; its columns are {', '.join(columns) or 'none'}"
+            + "".join(f"; looked for {name}: {', '.join(OTHER_NAMES[name])}" for name in missing if name in OTHER_NAMES)
+            + "; stamps are images [n, ny, nx]" * (stamp in missing)
+        )
+    positions = np.stack([_checked_column(path, name, columns[names[name.lower()]], 1) for name in (x, y)], axis=1)
+    stamps = _checked_column(path, stamp, columns[names[stamp.lower()]], 3) if cube is None else cube
+    if len(stamps) != len(positions):
+        raise ProductError(f"{len(positions)} stars in the table, {len(stamps)} stamps in the images", file=path)
+    return StarCutouts(np.where(stamps < _MASKED, np.nan, stamps), positions)
+
+
+def _find_column(name: str, columns: Iterable[str]) -> str | None:
+    """Return the column of a name, or of another one that programs have for it; None without one."""
+    names = {column.lower(): column for column in columns}
+    return next((names[other] for other in (name.lower(), *OTHER_NAMES.get(name, ())) if other in names), None)
+
+
+def _read_fits_parts(path: Path, data: bytes) -> fits.HDUList:
+    """Return the parts of a FITS file in memory; the warning that it is cut short is an error, others are dropped."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with parsing(path, "damaged or not FITS", ProductError):
+            hdus = fits.open(io.BytesIO(data), lazy_load_hdus=False)
+            for hdu in hdus:
+                hdu.data  # noqa: B018 - reads it now, within the checks
+    cut = [str(w.message) for w in caught if "truncated" in str(w.message).lower()]
+    if cut:
+        raise ProductError(f"cut short ({' '.join(cut[0].split())})", file=path)
+    return hdus
+
+
+def _read_ecsv_columns(path: Path, data: bytes) -> dict[str, np.ndarray]:
+    """Return the columns of an ECSV table; values left empty are NaN."""
+    with parsing(path, "damaged or no ECSV table", ProductError):
+        table = Table.read(data.decode().splitlines(), format="ascii.ecsv")
+    columns = {}
+    for name in table.colnames:
+        values = table[name]
+        if hasattr(values, "filled"):
+            values = values.astype(float).filled(np.nan) if values.dtype.kind in "fiu" else values.filled()
+        columns[name] = np.asarray(values)
+    return columns
+
+
+def _first_cube(hdus: fits.HDUList) -> np.ndarray | None:
+    """Return the first image of three axes, or None."""
+    for hdu in hdus:
+        if hdu.is_image and hdu.data is not None and hdu.data.ndim == 3:
+            return np.asarray(hdu.data, dtype=np.float64)
+    return None
+
+
+def _checked_column(path: Path, name: str, values: Any, axes: int) -> np.ndarray:
+    """Return a column as float64 in the machine's byte order, with the axes it must have."""
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu" or array.ndim != axes:
+        shape = "one number" if axes == 1 else "an image [ny, nx]"
+        raise ProductError(
+            f"{path}: column {name!r} has shape {array.shape} and type {array.dtype}, expected {shape} in every row"
+        )
+    return array.astype(np.float64)

@@ -1,0 +1,221 @@
+r"""Landing points of the light of one donut, and their response to the unknown wavefront.
+
+Rays pass given points p of the plane of the entrance pupil. A wavefront W(p) [m] beside the telescope's own, positive
+where it leads, is an optical delay of -W: it turns the light at p by :math:`-\nabla W`, and the ray lands elsewhere by
+:math:`-J(p) \nabla W`, with J(p) the derivative of the landing point with respect to the direction cosines of the
+incoming light at a fixed point of the pupil. Rays are traced with their own changed directions, so landing points
+are exact for a wavefront of any size. Where rays are aimed, Zernikes are functions of the stop's coordinates.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from typing import Protocol
+
+import numpy as np
+
+from ..core.errors import DomainError
+from ..models.telescope import Telescope
+from ..models.zernike_polynomials import annular_zernike_gradients
+from ..raytrace.aiming import pupil_coordinates
+from ..raytrace.launch import launch_bundles
+from ..raytrace.rays import Rays, RayStatus, parallel_rays
+from ..raytrace.trace import trace
+from ..wavefront.chief_rays import JACOBIAN_STEP
+from ..wavefront.psf.pupil_rims import PupilRims
+from .pupil_cells import PupilCells
+from .rim_light import RimsAt
+
+#: Step of the differences by which aimed pupil points follow those of the entrance pupil, in units of its radius.
+_DIFFERENCE = 1e-4
+
+
+class LightRays(Protocol):
+    """Landing points of one star's light as functions of unknowns: those of the wavefront, then shifts of rims."""
+
+    rates: np.ndarray  #: derivatives of :meth:`weights` with respect to the shifts of rims [1/m], [n, n_shift]
+
+    def weights(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return fractions of the light of the points, shape [n]."""
+
+    def landing(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return landing points minus that of the chief ray [m], detector x and y, shape [n, 2]."""
+
+    def spread(self, landing: np.ndarray) -> np.ndarray:
+        """Return second moments of the image of each point, beside the footprint of the cells [m^2], [n, 2, 2]."""
+
+    def at_rims(self, rims: PupilRims, landing: np.ndarray) -> RimsAt:
+        """Return where the light of rims lands for landing points of the light [m]."""
+
+    def response(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return the derivatives of :meth:`landing` with respect to the unknown wavefront, shape [2, n, n_wave]."""
+
+    def release(self) -> None:
+        """Free what can be computed again."""
+
+
+class ZernikeRays:
+    """Landing points for a wavefront of annular Zernikes [m].
+
+    Parameters
+    ----------
+    telescope : Telescope
+        Telescope with the detector where the star's light meets it.
+    direction : ndarray, shape [3]
+        Unit vector along which the light travels.
+    wavelengths, wavelength_weights : ndarray, shape [n_wave]
+        Vacuum wavelengths [m] and fractions of the light.
+    cells : PupilCells
+        Points of the pupil and their weights, for all wavelengths.
+    noll : ndarray of int
+        Noll indices of the terms.
+    """
+
+    def __init__(
+        self,
+        telescope: Telescope,
+        direction: np.ndarray,
+        wavelengths: np.ndarray,
+        wavelength_weights: np.ndarray,
+        cells: PupilCells,
+        noll: np.ndarray,
+    ) -> None:
+        self._telescope, self._direction, self._wavelengths = telescope, direction, wavelengths
+        self.cells, self._points = cells, cells.points
+        self._weights = np.outer(wavelength_weights, cells.weights).ravel()
+        rates = np.zeros((len(cells), 0)) if cells.rates is None else cells.rates
+        self.rates = np.kron(wavelength_weights[:, None], rates)
+        middle = float(wavelengths[len(wavelengths) // 2])
+        self._chief = chief_landing(telescope, direction, middle)
+        #: Derivatives of the terms along x and y of the plane of the entrance pupil [1/m], [n_term, 2, n_point].
+        self._gradients = _gradients(telescope, direction, middle, cells.points, noll)
+        self._response = -np.concatenate([self._jacobian_times_gradients(float(w)) for w in wavelengths], axis=1)
+        self._single = self._response.astype(np.float32)
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
+        self._rims = RimsOfCells(cells, self._response)
+        #: Sides of the image of a cell [m], columns of a matrix.
+        self.footprint = cells.footprint(self._landing(middle, np.zeros((1, 1, 2)))[0])
+
+    def _landing(self, wavelength: float, slopes: np.ndarray) -> np.ndarray:
+        """Return detector x and y [m] of rays, [m, n, 2], with direction cosines changed by slopes [m, n or 1, 2]."""
+        cosines = np.broadcast_to(self._direction[:2] + slopes, (len(slopes), *self._points.shape))
+        down = -np.sqrt(1.0 - (cosines**2).sum(axis=2, keepdims=True))
+        directions = np.concatenate([cosines, down], axis=2).reshape(-1, 3)
+        points = np.tile(self._points, (len(slopes), 1))[:, None]
+        return landing_of(self._telescope, parallel_rays(self._telescope, directions, wavelength, points)).reshape(
+            cosines.shape
+        )
+
+    def _jacobian_times_gradients(self, wavelength: float) -> np.ndarray:
+        """Return J(p) times the gradients of the terms, shape [2, n_point, n_term]."""
+        steps = JACOBIAN_STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+        along = self._landing(wavelength, steps[:, None])
+        jacobian = (along[0::2] - along[1::2]) / (2.0 * JACOBIAN_STEP)  # [direction axis, n_point, detector axis]
+        x, y = np.moveaxis(self._gradients, 1, 0)
+        return np.stack([jacobian[0, :, i, None] * x.T + jacobian[1, :, i, None] * y.T for i in range(2)])
+
+    def weights(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return fractions of the light; see :class:`LightRays`."""
+        return self._weights + self.rates @ unknowns[len(self._gradients) :]
+
+    def at_shifts(self, unknowns: np.ndarray) -> ZernikeRays:
+        """Return the light with its rims held where unknowns have them, for unknowns of the wavefront alone."""
+        held = copy(self)
+        held._weights, held.rates = self.weights(unknowns), self.rates[:, :0]
+        return held
+
+    def landing(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return landing points for coefficients [m]; see :class:`LightRays`."""
+        coefficients = unknowns[: len(self._gradients)]
+        # Several images of one wavefront follow each other.
+        if self._last is None or not np.array_equal(self._last[0], coefficients):
+            slopes = -np.tensordot(coefficients, self._gradients, axes=1).T[None]
+            landing = np.concatenate([self._landing(float(w), slopes)[0] for w in self._wavelengths]) - self._chief
+            self._last = (coefficients.copy(), landing)
+        return self._last[1]
+
+    def spread(self, landing: np.ndarray) -> np.ndarray:
+        """Return the spread of the image of each point; see :class:`LightRays`."""
+        return spread_of(self.cells, landing, self.footprint)
+
+    def at_rims(self, rims: PupilRims, landing: np.ndarray) -> RimsAt:
+        """Return the rims on the detector; see :class:`LightRays`."""
+        return self._rims.at(rims, landing)
+
+    def response(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return the response at zero coefficients, the same to 1e-3 for all; see :class:`LightRays`."""
+        return self._single
+
+    def release(self) -> None:
+        """Free the polynomials over the pupil."""
+        self.cells.release()
+
+
+def _gradients(
+    telescope: Telescope, direction: np.ndarray, wavelength: float, points: np.ndarray, noll: np.ndarray
+) -> np.ndarray:
+    """Return the derivatives of Zernike terms of the pupil by points of its plane [1/m], [n_term, 2, n_point]."""
+    radius = 0.5 * telescope.pupil_diameter
+    x, y = pupil_coordinates(telescope, direction, wavelength, points).T / radius
+    terms: np.ndarray = annular_zernike_gradients(int(noll.max()), x, y, telescope.pupil_obscuration)[noll - 1] / radius
+    if telescope.design_data.aiming == "off":
+        return terms
+    step = _DIFFERENCE * radius
+    sides = [
+        pupil_coordinates(telescope, direction, wavelength, points + axis)
+        - pupil_coordinates(telescope, direction, wavelength, points - axis)
+        for axis in step * np.eye(2)
+    ]
+    # [n_point, pupil axis, axis of the plane]: the terms are functions of the pupil, which the front of a lens deforms.
+    change = np.stack(sides, axis=-1) / (2.0 * step)
+    return np.einsum("tip,pij->tjp", terms, change)
+
+
+def spread_of(cells: PupilCells, landing: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+    """Return the spreads [m^2] of the landing points of one or more wavelengths, one after the other."""
+    each = landing.reshape(-1, len(cells), 2)
+    return np.concatenate([cells.spread(one, footprint) for one in each])
+
+
+class RimsOfCells:
+    """Rims on the detector, from the landing points of the cells of the pupil.
+
+    Parameters
+    ----------
+    cells : PupilCells
+        The cells.
+    response : ndarray, shape [2, n, n_wave], optional
+        Derivatives of the landing points of the cells, of one or more wavelengths one after the other [m]; without
+        them rims have none.
+    """
+
+    def __init__(self, cells: PupilCells, response: np.ndarray | None = None) -> None:
+        self._cells, self._response = cells, response
+        self._last: tuple[PupilRims, np.ndarray] | None = None
+
+    def at(self, rims: PupilRims, landing: np.ndarray) -> RimsAt:
+        """Return rims at the middle wavelength for landing points of the cells [m], shape [n, 2]."""
+        smooth = self._cells.smooth
+        if self._response is None:
+            return RimsAt(*rims.landing(smooth, self._middle(landing)), np.zeros((2, len(rims.points), 0)))
+        if self._last is None or self._last[0] is not rims:
+            self._last = rims, np.stack([smooth.at(rims.points, self._middle(one))[0] for one in self._response])
+        return RimsAt(*rims.landing(smooth, self._middle(landing)), self._last[1])
+
+    def _middle(self, values: np.ndarray) -> np.ndarray:
+        """Return values of all wavelengths at the middle one."""
+        each = values.reshape(-1, len(self._cells), values.shape[1])
+        return np.asarray(each[len(each) // 2])
+
+
+def landing_of(telescope: Telescope, rays: Rays) -> np.ndarray:
+    """Return landing points x and y [m] in the detector's own frame, shape [n, 2]."""
+    return telescope.surfaces[-1].to_local(trace(telescope, rays, threads=1).position)[:, :2]
+
+
+def chief_landing(telescope: Telescope, direction: np.ndarray, wavelength: float) -> np.ndarray:
+    """Return the landing point x, y [m] of the chief ray, vignetting ignored; a lost ray is a DomainError."""
+    end = trace(telescope, launch_bundles(telescope, direction[None], wavelength, np.zeros((1, 2))), threads=1)
+    if end.status[0] > RayStatus.VIGNETTED:
+        raise DomainError("the chief ray does not reach the image")
+    return telescope.surfaces[-1].to_local(end.position)[0, :2]

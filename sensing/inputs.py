@@ -1,0 +1,82 @@
+"""Arguments of the fit of donuts, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..core.errors import DomainError, shown
+from ..core.units import length, pure_numbers, require_positive
+
+# Largest spread or wavefront [m], and light of a pixel [electron].
+_MOST_LENGTH, _MOST_ELECTRONS = 1e-3, 1e20
+
+
+def padded(
+    values: ArrayLike | Sequence[ArrayLike], name: str, kind: type, fill: Any
+) -> tuple[np.ndarray, list[tuple[int, int]]]:
+    """Return images as one stack, smaller ones filled up at the end, and their shapes."""
+    try:
+        each: Any = values
+        read = _numbers if kind is np.float64 else lambda one, _: np.asarray(one, dtype=kind)
+        listed: list[np.ndarray] = [read(one, name) for one in each]
+    except (TypeError, ValueError):
+        raise DomainError(f"{name}: expected an array of shape [n, ny, nx], or n arrays of two dimensions") from None
+    if not listed or any(v.ndim != 2 or min(v.shape) < 8 for v in listed):
+        shape = [v.shape for v in listed][:1]
+        raise DomainError(f"{name} of shape {shape}: expected [n, ny, nx], stamps of at least 8 pixels a side")
+    shapes = [(int(v.shape[0]), int(v.shape[1])) for v in listed]
+    stack: np.ndarray = np.full((len(listed), max(s[0] for s in shapes), max(s[1] for s in shapes)), fill, dtype=kind)
+    for row, one in zip(stack, listed, strict=True):
+        row[: one.shape[0], : one.shape[1]] = one
+    return stack, shapes
+
+
+def _numbers(values: ArrayLike, name: str) -> np.ndarray:
+    """Return numbers without a unit; those that no detector counts are not finite."""
+    numbers = pure_numbers(values, name)
+    return np.where(np.abs(numbers) < _MOST_ELECTRONS, numbers, np.nan)
+
+
+def noll_indices(values: Iterable[int], name: str, least: int) -> np.ndarray:
+    """Return Noll indices as an array, or raise DomainError."""
+    listed = list(values)
+    if not listed or any(int(j) != j or j < least for j in listed) or len(set(listed)) != len(listed):
+        raise DomainError(f"{name} = {listed}: expected different Noll indices from {least}")
+    return np.array(listed, dtype=np.int64)
+
+
+def one_for_each(values: np.ndarray, count: int, name: str) -> np.ndarray:
+    """Return one finite number for each image."""
+    if values.shape not in ((), (count,)) or not np.isfinite(values).all():
+        raise DomainError(f"{name} of shape {values.shape}: expected one finite number, or {count}")
+    return np.broadcast_to(values, (count,))
+
+
+def sky_variances(values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the variance of sky and readout of every pixel."""
+    variance = pure_numbers(values, "sky_variance")
+    variance = variance[:, None, None] if variance.ndim == 1 else variance
+    try:
+        variance = np.broadcast_to(variance, shape)
+    except ValueError:
+        raise DomainError(f"sky_variance of shape {np.shape(values)}: expected a number, [n] or {shape}") from None
+    if not (np.isfinite(variance) & (variance >= 0.0)).all():
+        raise DomainError("sky_variance: expected finite numbers from 0 [electron^2]")
+    return variance
+
+
+def small_length(value: ArrayLike, name: str) -> float:
+    """Return a length [m] of zero or more, and less than would leave the detector."""
+    size = length(value, name)
+    if not 0.0 <= size <= _MOST_LENGTH:
+        raise DomainError(f"{name} = {shown(value)}: expected a length from 0 to {_MOST_LENGTH:g} m")
+    return size
+
+
+def outer_scale_of(value: float) -> float:
+    """Return an outer scale [m] above 0, which may be infinite."""
+    return float("inf") if value == float("inf") else require_positive(value, "outer_scale", "metres")

@@ -1,0 +1,185 @@
+"""Cells of the entrance pupil: lit areas and centroids of the squares of a lattice.
+
+A cell stands for its lit part by area, centroid and second moments. Its image is blurred by the image of a cell of mean
+magnification, the footprint, which one transfer function holds; what its second moments have beyond that, on rims and
+where the magnification is another, is its spread. Cells then cover the image of the lit pupil without gaps or overlap,
+but for the third moments of cells on rims.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
+
+from ..models.telescope import Telescope
+from ..raytrace.launch import aimed_points
+from ..raytrace.rays import RayStatus, parallel_rays
+from ..raytrace.trace import trace
+from ..wavefront.pupil_polynomials import PupilPolynomials
+
+#: Side of the lattice over the diameter of the pupil: light off the axis may cross the plane of the stop just outside.
+_MARGIN = 1.02
+#: Chords of a cell on a rim, nodes along each, and divisions of a piece with a rim into parts: to a 500th of a cell.
+_CHORDS, _NODES, _DIVISIONS, _PARTS = 8, 5, 3, 4
+#: Points of the rim that the width of an aimed beam is taken from.
+_RIM = 48
+
+
+@dataclass(frozen=True)
+class PupilCells:
+    """Lit cells of the entrance pupil for one direction of the light.
+
+    Attributes
+    ----------
+    points : ndarray, shape [n, 2]
+        Centroids of the lit parts [m], in the plane of the entrance pupil.
+    weights : ndarray, shape [n]
+        Fractions of the light; they sum to 1. Empty where no light passes.
+    moments : ndarray, shape [n, 2, 2]
+        Second moments of the lit parts about their centroids [m^2].
+    side : float
+        Side of a cell [m].
+    center : ndarray, shape [2]
+        Middle of the lattice [m].
+    rates : ndarray, shape [n, n_shift], optional
+        Derivatives of the weights by shifts of rims [1/m]; cells of zero weight may have them.
+    """
+
+    points: np.ndarray
+    weights: np.ndarray
+    moments: np.ndarray
+    side: float
+    center: np.ndarray
+    rates: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    @cached_property
+    def smooth(self) -> PupilPolynomials:
+        """Polynomials through values at the points."""
+        return PupilPolynomials(self.points, self.center, self.side)
+
+    def release(self) -> None:
+        """Free the polynomials; they are made again when they are needed."""
+        self.__dict__.pop("smooth", None)
+
+    def magnification(self, landing: np.ndarray) -> np.ndarray:
+        """Return the derivative of landing points [n, 2] along the pupil, shape [n, 2, 2], by smooth polynomials."""
+        return self.smooth.derivatives(landing)
+
+    def footprint(self, landing: np.ndarray) -> np.ndarray:
+        """Return the sides of the mean image of a cell [m], columns of a matrix [2, 2], from landing points [n, 2]."""
+        return self.side * np.tensordot(self.weights, self.magnification(landing), axes=1)
+
+    def spread(self, landing: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+        """Return second moments of the images of the cells minus those of a footprint [m^2], shape [n, 2, 2]."""
+        # Component by component: products of many matrices of two by two take ten times as long.
+        (xx, xy), (yx, yy) = np.moveaxis(self.magnification(landing), 0, -1)
+        (uu, uv), (_, vv) = np.moveaxis(self.moments, 0, -1)
+        across = xx * (yx * uu + yy * uv) + xy * (yx * uv + yy * vv)
+        along = xx * (xx * uu + 2.0 * xy * uv) + xy * xy * vv, yx * (yx * uu + 2.0 * yy * uv) + yy * yy * vv
+        image = np.array([[along[0], across], [across, along[1]]])
+        return np.moveaxis(image, -1, 0) - footprint @ footprint.T / 12.0
+
+
+def pupil_cells(telescope: Telescope, direction: np.ndarray, wavelength: float, across: int) -> PupilCells:
+    """Return the lit cells of a lattice with so many cells across the beam, for light of one direction [3].
+
+    They are cells of the plane of the entrance pupil, on which the light of a star is even; where rays are aimed at the
+    stop the lattice covers the light that fills it.
+    """
+    center, width = _beam(telescope, direction, wavelength)
+    side = _MARGIN * width / across
+    middle = (np.arange(across) - 0.5 * (across - 1)) * side
+
+    def lit(points: np.ndarray) -> np.ndarray:
+        """Return which rays through points [..., 2] pass all apertures."""
+        rays = parallel_rays(telescope, direction[None], wavelength, points.reshape(-1, 2))
+        return (trace(telescope, rays, threads=1).status == RayStatus.OK).reshape(points.shape[:-1])
+
+    centers = np.stack(np.meshgrid(middle, middle), axis=-1) + center
+    # Four points of each cell; a rim passes cells where these or those next to them differ.
+    along = (np.arange(2 * across) - 0.5 * (2 * across - 1)) * 0.5 * side
+    status = lit(np.stack(np.meshgrid(along, along), axis=-1) + center)
+    differ = maximum_filter(status, 3, mode="constant") != minimum_filter(status, 3, mode="constant")
+    quarters = (across, 2, across, 2)
+    area, rim = status.reshape(quarters).mean(axis=(1, 3)), differ.reshape(quarters).any(axis=(1, 3))
+    moments = np.tile(side**2 / 12.0 * np.eye(2), (across, across, 1, 1))
+    if rim.any():
+        smooth = uniform_filter(area, 3, mode="constant")
+        down, across_rim = np.gradient(smooth)
+        upright = np.abs(down[rim]) > np.abs(across_rim[rim])
+        area[rim], offset, moments[rim] = _lit_parts(lit, centers[rim], side, upright)
+        centers[rim] += offset
+    some = area > 0.0
+    return PupilCells(centers[some], area[some] / max(area.sum(), 1e-300), moments[some], side, center)
+
+
+def _beam(telescope: Telescope, direction: np.ndarray, wavelength: float) -> tuple[np.ndarray, float]:
+    """Return middle [2] and width [m] of the light of one direction in the plane of the entrance pupil."""
+    angle = 2.0 * np.pi * np.arange(_RIM) / _RIM
+    rim = 0.5 * telescope.pupil_diameter * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    points = aimed_points(telescope, direction[None], wavelength, rim)
+    if points.ndim == 2:
+        return np.zeros(2), telescope.pupil_diameter
+    low, high = np.nanmin(points[0], axis=0), np.nanmax(points[0], axis=0)
+    return 0.5 * (low + high), float((high - low).max())
+
+
+def _lit_parts(
+    lit: Callable[[np.ndarray], np.ndarray], centers: np.ndarray, side: float, upright: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return lit fractions [n], centroids from the centre [n, 2] and second moments [n, 2, 2], by chords.
+
+    Chords run along x, or along y where ``upright``, across the rim. Rims on them are found between nodes of different
+    status.
+    """
+    node = side * np.linspace(-0.5, 0.5, _NODES)
+    row = side * ((np.arange(_CHORDS) + 0.5) / _CHORDS - 0.5)
+
+    def places(along: np.ndarray, across: np.ndarray, cell: np.ndarray) -> np.ndarray:
+        offset = np.stack(np.broadcast_arrays(along, across), axis=-1)
+        turned = upright[cell].reshape(-1, *[1] * (offset.ndim - 1))
+        return centers[cell].reshape(-1, *[1] * (offset.ndim - 2), 2) + np.where(turned, offset[..., ::-1], offset)
+
+    every = np.arange(len(centers))
+    across = np.broadcast_to(row[:, None], (len(centers), _CHORDS, _NODES))
+    status = lit(places(np.broadcast_to(node, across.shape), across, every))
+    start, end = np.broadcast_to(node[:-1], (len(centers), _CHORDS, _NODES - 1)), node[1:]
+    low, high = start * np.ones(1), end * np.ones(start.shape)
+    cell, chord, piece = np.nonzero(status[:, :, 1:] != status[:, :, :-1])
+    first, last, begins = node[piece], node[piece + 1], status[cell, chord, piece]
+    for _ in range(_DIVISIONS):
+        part = (last - first) / _PARTS
+        inner = first[:, None] + part[:, None] * np.arange(1, _PARTS)
+        # Parts before the first change of status; of several rims, the first.
+        same = lit(places(inner, row[chord][:, None], cell)) == begins[:, None]
+        first = first + part * np.cumprod(same, axis=1).sum(axis=1)
+        last = first + part
+    rim = 0.5 * (first + last)
+    low[cell, chord, piece] = np.where(begins, low[cell, chord, piece], rim)
+    high[cell, chord, piece] = np.where(begins, rim, high[cell, chord, piece])
+    length = np.where(status[:, :, 1:] | status[:, :, :-1], high - low, 0.0)
+    middles, rows = 0.5 * (low + high), row[:, None]
+    total = length.sum(axis=(1, 2))
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.asarray((length * values).sum(axis=(1, 2)) / np.where(total > 0.0, total, 1.0))
+
+    u, v = mean(middles), mean(rows)
+    uu = mean(middles**2 + length**2 / 12.0) - u * u
+    vv = mean(rows**2 + (side / _CHORDS) ** 2 / 12.0) - v * v
+    uv = mean(middles * rows) - u * v
+    moments = np.stack([np.stack([uu, uv], axis=-1), np.stack([uv, vv], axis=-1)], axis=-1)
+    offset = np.stack([u, v], axis=-1)
+    turned = upright[:, None]
+    return (
+        total / (side * _CHORDS),
+        np.where(turned, offset[:, ::-1], offset),
+        np.where(turned[:, :, None], moments[:, ::-1, ::-1], moments),
+    )

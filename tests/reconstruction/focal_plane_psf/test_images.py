@@ -1,0 +1,103 @@
+import numpy as np
+import pytest
+
+from pachon.reconstruction.focal_plane_psf.images import ResidualImages, with_shapes
+from pachon.reconstruction.focal_plane_psf.mosaic import Mosaic
+from pachon.measure.shapes import measure_shapes
+
+ARCSEC = np.pi / 648000
+PIXEL, WEIGHT = 0.2 * ARCSEC, 0.7 * ARCSEC
+SIZE = 31
+
+
+def moffat(e1, e2, scale=2.2, beta=4.0, center=(0.0, 0.0)):
+    """Stars with wings, of unit sum; axis ratio and direction by a shear of their isophotes."""
+    y, x = np.mgrid[:SIZE, :SIZE] - SIZE // 2.0
+    x, y = x - center[0], y - center[1]
+    radius = (1 - 2 * e1) * x**2 + (1 + 2 * e1) * y**2 - 4 * e2 * x * y
+    image = (1 + radius / scale**2) ** -beta
+    return image / image.sum()
+
+
+def values(images):
+    found = measure_shapes(images, PIXEL, WEIGHT)
+    assert found.usable.all()
+    return np.stack([found.e1, found.e2, np.log(found.size)], axis=1), np.stack([found.x, found.y], axis=1)
+
+
+BASE = np.stack([moffat(0.01, -0.02), moffat(-0.03, 0.01, center=(0.3, -0.4)), moffat(0.0, 0.0, 2.6, 3.0)])
+
+
+CHANGE = np.array([[0.03, -0.02, 0.04], [-0.02, 0.03, -0.03], [0.05, 0.05, 0.08]])
+
+
+@pytest.mark.parametrize("factor", [0.1, 1.0])
+def test_images_have_the_shapes_asked_for(factor):
+    asked = values(BASE)[0] + factor * CHANGE
+    found = with_shapes(BASE, asked, PIXEL, WEIGHT)
+    shapes, centre = values(found)
+    # 1e-5 is a hundredth of the scatter that a star of the highest signal to noise has.
+    np.testing.assert_allclose(shapes, asked, atol=1e-5)
+    np.testing.assert_allclose(found.sum(axis=(1, 2)), 1.0, rtol=1e-13)
+    # Centred: the second star stood half a pixel off.
+    np.testing.assert_allclose(centre, 0.0, atol=1e-4)
+
+
+def test_images_of_their_own_shapes_stay_as_they_are():
+    centred = BASE[[0, 2]]
+    found = with_shapes(centred, values(centred)[0], PIXEL, WEIGHT)
+    # Nothing to change but centroids of 1e-7 pixels and rounding of the transforms.
+    np.testing.assert_allclose(found, centred, atol=1e-6 * centred.max())
+
+
+def test_a_gaussian_stays_a_gaussian_of_the_other_moments():
+    def gaussian(covariance):
+        y, x = np.mgrid[:SIZE, :SIZE] - SIZE // 2.0
+        i = np.linalg.inv(covariance)
+        image = np.exp(-0.5 * (i[0, 0] * x * x + 2 * i[0, 1] * x * y + i[1, 1] * y * y))
+        return image / image.sum()
+
+    # A convolution adds moments: the image of other moments is the Gaussian of these, in every pixel.
+    old, new = gaussian(np.diag([3.0, 3.0])), gaussian(np.array([[3.06, 0.04], [0.04, 3.02]]))
+    found = with_shapes(old[None], values(new[None])[0], PIXEL, WEIGHT)[0]
+    # What is left of the shapes after three iterations, 1e-6 for so small a change, makes as much of the peak; the ends
+    # of the stamp make 1e-7.
+    np.testing.assert_allclose(found, new, atol=1e-5 * new.max())
+
+
+@pytest.mark.long
+def test_components_that_vary_over_the_plane_are_found():
+    rng = np.random.default_rng(1)
+    n = 240
+    xy = rng.uniform(0.0, 0.1, (n, 2))
+    mosaic = Mosaic(("a",), np.array([[0.05, 0.05]]), 0.05)
+    places = mosaic.at(xy, np.zeros(n, dtype=int))
+    y, x = np.mgrid[:SIZE, :SIZE] - SIZE // 2.0
+    # A trefoil, orthogonal to all moments up to the second.
+    mode = (x**3 - 3 * x * y**2) * np.exp(-(x**2 + y**2) / 18.0)
+    mode /= np.sqrt((mode**2).sum())
+
+    def amount(xy):
+        return 0.02 * np.sin(40.0 * xy[:, 0]) + 0.01 * np.cos(30.0 * xy[:, 1])
+
+    sigma = 1e-3
+    stamps = amount(xy)[:, None, None] * mode + rng.normal(0.0, sigma, (n, SIZE, SIZE))
+    found = ResidualImages.fit(stamps, places, np.ones(n), mosaic, 3, 2)
+    assert len(found.components) == 1
+    # Noise of the component, sigma / sqrt(sum a^2) in each pixel: a cosine of 1 - 961 sigma^2 / (2 sum a^2).
+    power = (amount(xy) ** 2).sum()
+    assert abs((found.components[0] * mode).sum()) > 1.0 - 961 * sigma**2 / power
+    elsewhere = mosaic.at(rng.uniform(0.01, 0.09, (50, 2)), np.zeros(50, dtype=int))
+    truth = amount(elsewhere.xy)
+    got = (found.at(elsewhere) * mode).sum(axis=(1, 2))
+    # A coefficient has the noise of a pixel; the smooth field averages over several stars about a place.
+    assert np.sqrt(np.mean((got - truth) ** 2)) < sigma
+    assert found.at(elsewhere, 1).tobytes() == found.at(elsewhere, 2).tobytes()
+
+
+def test_noise_has_no_components():
+    n = 240
+    mosaic = Mosaic(("a",), np.array([[0.05, 0.05]]), 0.05)
+    places = mosaic.at(np.random.default_rng(2).uniform(0.0, 0.1, (n, 2)), np.zeros(n, dtype=int))
+    stamps = np.random.default_rng(3).normal(0.0, 1e-3, (n, SIZE, SIZE))
+    assert ResidualImages.fit(stamps, places, np.ones(n), mosaic, 3, 1) is None

@@ -1,0 +1,245 @@
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.table import MaskedColumn, Table
+
+from pachon.core.errors import DomainError, PachonError, ProductError
+from pachon.reconstruction.focal_plane_psf.model import FocalPlanePsf
+from pachon.reconstruction.focal_plane_psf.stars import FocalPlaneStars, noise_per_snr, photon_noise, stars_of
+from pachon.measure.shapes import measure_shapes
+
+ARCSEC = np.pi / 648000
+PIXEL, WEIGHT = 0.2 * ARCSEC, 0.7 * ARCSEC
+SIZE = 25
+
+
+def star():
+    """A Moffat star of 0.7 arcsec, sheared, of unit sum."""
+    y, x = np.mgrid[:SIZE, :SIZE] - SIZE // 2.0
+    image = (1 + (0.95 * x**2 + 1.05 * y**2 - 0.1 * x * y) / 8.0) ** -3.5
+    return image / image.sum()
+
+
+def noisy(electrons, level, n, seed):
+    """Stamps of unit sum of stars of so many electrons over a background that is subtracted."""
+    rng = np.random.default_rng(seed)
+    image = rng.poisson(electrons * star(), (n, SIZE, SIZE)) + rng.normal(0.0, np.sqrt(level), (n, SIZE, SIZE))
+    return image / electrons
+
+
+def scatter(stamps):
+    found = measure_shapes(stamps, PIXEL, WEIGHT)
+    return np.std([found.e1, found.e2, np.log(found.size)], axis=1)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("electrons", "level"), [(2e5, 100.0), (5e4, 1500.0)])
+def test_photon_noise_is_the_scatter_of_measured_shapes(electrons, level):
+    stamps = noisy(electrons, level, 400, 1)
+    found = photon_noise(stamps, np.full(400, electrons), np.full(400, level), PIXEL, WEIGHT)
+    assert found.shape == (400, 3)
+    # A standard deviation of 400 draws is known to 1 / sqrt(800) = 3.5 %: 10 % is 2.8 sigma.
+    np.testing.assert_allclose(found.mean(axis=0), scatter(stamps), rtol=0.1)
+    # Four times the electrons and sixteen times the variance of the background leave twice... of the noise only the
+    # part of the photons falls: it stays between 1/2 and 1 of what it was.
+    more = photon_noise(stamps, np.full(400, 4 * electrons), np.full(400, 16 * level), PIXEL, WEIGHT)
+    assert ((more < found) & (more > 0.5 * found)).all()
+
+
+@pytest.mark.long
+def test_noise_per_snr_is_the_scatter_of_faint_stars():
+    electrons, level = 2e4, 2000.0
+    stamps = noisy(electrons, level, 400, 2)
+    # Signal to noise of PSF photometry in white noise: F sqrt(sum I^2 / V).
+    snr = electrons * np.sqrt((star() ** 2).sum() / level)
+    found = noise_per_snr(stamps, np.full(400, snr), PIXEL, WEIGHT) / snr
+    # 3.5 % of the draws; photons of the star add 5 % to the variance of the brightest pixels (700 to 2000 at most,
+    # near the centre, where the derivatives are small).
+    np.testing.assert_allclose(found, scatter(stamps), rtol=0.15)
+
+
+N = 12
+RNG = np.random.default_rng(5)
+COLUMNS = {
+    "ccd": np.array(["R22_S11"] * 7 + ["R22_S12"] * 5),
+    "x": RNG.uniform(-0.02, 0.02, N),
+    "y": RNG.uniform(-0.02, 0.02, N),
+    "e1": RNG.normal(0.0, 0.01, N),
+    "e2": RNG.normal(0.0, 0.01, N),
+    "size": RNG.uniform(0.25, 0.3, N) * ARCSEC,
+    "e1_noise": RNG.uniform(0.001, 0.002, N),
+    "e2_noise": RNG.uniform(0.001, 0.002, N),
+    "size_noise": RNG.uniform(0.001, 0.002, N),
+}
+
+
+def check(stars, rtol=0.0):
+    assert stars.ccd == tuple(COLUMNS["ccd"])
+    expected = np.stack([COLUMNS["e1"], COLUMNS["e2"], np.log(COLUMNS["size"])], axis=1)
+    noise = np.stack([COLUMNS[f"{n}_noise"] for n in ("e1", "e2", "size")], axis=1)
+    # Rounding of a conversion of units where there is one.
+    for found, truth in ((stars.x, COLUMNS["x"]), (stars.y, COLUMNS["y"]), (stars.values, expected)):
+        np.testing.assert_allclose(found, truth, rtol=rtol)
+    np.testing.assert_array_equal(stars.noise, noise)
+    assert stars.usable.all()
+    assert not stars.pixels
+
+
+def with_units():
+    table = Table(COLUMNS)
+    table["x"] = 1e3 * COLUMNS["x"] * u.mm
+    table["y"] = 1e6 * COLUMNS["y"] * u.um
+    table["size"] = COLUMNS["size"] / ARCSEC * u.arcsec
+    return table
+
+
+def test_mappings_tables_and_arrays_are_the_same():
+    check(FocalPlaneStars.from_table(COLUMNS))
+    check(FocalPlaneStars.from_table(Table(COLUMNS)))
+    check(FocalPlaneStars.from_table(Table(COLUMNS).as_array()))
+    check(stars_of(COLUMNS))
+    stars = FocalPlaneStars.from_table(COLUMNS)
+    assert stars_of(stars) is stars
+
+
+def test_units_are_honoured():
+    check(FocalPlaneStars.from_table(with_units()), rtol=1e-14)
+
+
+def test_columns_in_upper_case_as_in_the_products_of_a_run():
+    table = with_units()
+    for name in table.colnames:
+        table.rename_column(name, name.upper())
+    table["USED"] = np.arange(N) != 3
+    table["MAG"] = 20.0
+    found = FocalPlaneStars.from_table(table)
+    assert len(found) == N - 1
+    np.testing.assert_array_equal(found.values[:, 0], np.delete(COLUMNS["e1"], 3))
+
+
+@pytest.mark.parametrize("name", ["stars.fits", "stars.ecsv"])
+def test_files_are_read(tmp_path, name):
+    path = tmp_path / name
+    with_units().write(path)
+    check(FocalPlaneStars.read(path), rtol=1e-14)
+    check(stars_of(str(path)), rtol=1e-14)
+
+
+def test_positions_in_pixels():
+    table = Table(COLUMNS)
+    table["x"], table["y"] = np.arange(N) * 100.0 * u.pix, np.arange(N) * 50.0 * u.pix
+    found = FocalPlaneStars.from_table(table)
+    assert found.pixels
+    np.testing.assert_array_equal(found.x, 100.0 * np.arange(N))
+
+
+def test_stamps_are_measured_and_scaled_to_unit_sum():
+    columns = {k: COLUMNS[k] for k in ("ccd", "x", "y")} | {"snr": np.full(N, 100.0)}
+    stamps = np.stack([(1.0 + i) * star() for i in range(N)])
+    truth = measure_shapes(star(), PIXEL, WEIGHT)
+    for found in (
+        FocalPlaneStars.from_table(columns, stamps=stamps, pixel_scale=PIXEL),
+        FocalPlaneStars.from_table(columns | {"stamp": stamps}, pixel_scale=PIXEL),
+    ):
+        np.testing.assert_allclose(found.stamps.sum(axis=(1, 2)), 1.0, rtol=1e-13)
+        # Rounding: the same image but for a factor.
+        np.testing.assert_allclose(found.values[:, 0], truth.e1[0], atol=1e-12)
+        np.testing.assert_allclose(found.values[:, 2], np.log(truth.size[0]), atol=1e-12)
+
+
+def test_noise_of_a_signal_to_noise_falls_as_its_inverse():
+    columns = {k: COLUMNS[k] for k in ("ccd", "x", "y", "e1", "e2", "size")} | {"snr": 50.0 * 2.0 ** np.arange(N)}
+    found = FocalPlaneStars.from_table(columns).noise
+    np.testing.assert_allclose(found[0] / found[1:], (2.0 ** np.arange(1, N))[:, None] * np.ones(3), rtol=1e-14)
+
+
+def test_masked_and_infinite_stars_are_not_usable():
+    table = Table(COLUMNS)
+    table["e1"] = MaskedColumn(COLUMNS["e1"], mask=np.arange(N) == 2)
+    table["size"][4] = -1.0
+    table["e2_noise"][5] = 0.0
+    table["x"][6] = np.inf
+    found = FocalPlaneStars.from_table(table)
+    np.testing.assert_array_equal(np.flatnonzero(~found.usable), [2, 4, 5, 6])
+    assert len(found.chosen(found.usable)) == N - 4
+
+
+def without(name):
+    return {k: v for k, v in COLUMNS.items() if k != name}
+
+
+def in_unit(name, unit):
+    table = Table(COLUMNS)
+    table[name] = COLUMNS[name] * unit
+    return table
+
+
+STAMPS = np.broadcast_to(star(), (N, SIZE, SIZE))
+
+
+@pytest.mark.parametrize(
+    ("bad", "options", "words"),
+    [
+        *((without(name), {}, [name]) for name in COLUMNS),
+        (in_unit("x", u.s), {}, ["x", "s", "m"]),
+        (in_unit("size", u.m), {}, ["size", "rad"]),
+        (COLUMNS | {"x": ["a"] * N}, {}, ["x", "numbers"]),
+        (COLUMNS | {"y": np.zeros((N, 2))}, {}, ["y", str((N, 2))]),
+        (COLUMNS, {"stamps": STAMPS}, ["pixel_scale"]),
+        (COLUMNS, {"stamps": STAMPS[:5], "pixel_scale": PIXEL}, ["5", "12"]),
+        ({}, {}, ["ccd"]),
+        (17, {}, ["int"]),
+    ],
+)
+def test_bad_tables_give_one_clear_line(bad, options, words):
+    with pytest.raises(DomainError) as raised:
+        FocalPlaneStars.from_table(bad, **options)
+    text = str(raised.value)
+    assert "\n" not in text
+    for word in words:
+        assert word in text
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        COLUMNS | {"y": np.zeros(N - 1)},
+        COLUMNS | {"e1": np.zeros(N + 3)},
+        COLUMNS | {"ccd": COLUMNS["ccd"][:4]},
+        COLUMNS | {"used": np.ones(N - 2, dtype=bool)},
+    ],
+    ids=["y", "e1", "ccd", "used"],
+)
+def test_columns_of_different_lengths_give_one_clear_line(bad):
+    with pytest.raises(PachonError) as raised:
+        FocalPlaneStars.from_table(bad)
+    assert "\n" not in str(raised.value)
+
+
+def test_no_stars_and_only_nan_stars_give_one_clear_line():
+    nothing = {k: v[:0] for k, v in COLUMNS.items()}
+    for bad in (nothing, COLUMNS | {"e1": np.full(N, np.nan)}):
+        with pytest.raises(DomainError, match=r"^0 of ") as raised:
+            FocalPlanePsf.fit(bad, camera="lsst")
+        assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "notes.ecsv",
+        "short.fits",
+        "lacks.ecsv",
+        "none.fits",
+        "folder",
+    ],
+)
+def test_bad_files_give_one_clear_line_with_their_name(tmp_path, name):
+    (tmp_path / "notes.ecsv").write_text("no table\n")
+    (tmp_path / "short.fits").write_bytes(b"SIMPLE  =")
+    (tmp_path / "folder").mkdir()
+    Table(without("x")).write(tmp_path / "lacks.ecsv")
+    with pytest.raises(ProductError) as raised:
+        FocalPlaneStars.read(tmp_path / name)
+    assert "\n" not in str(raised.value)
+    assert name in str(raised.value)

@@ -1,0 +1,152 @@
+import os
+import shutil
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_limits
+
+from pachon.core.errors import DomainError, ProductError
+from pachon.models.camera.focal_plane import FocalPlane
+from pachon.reconstruction.focal_plane_psf.fit import ExposureFit
+from pachon.reconstruction.focal_plane_psf.heights import powers
+from pachon.reconstruction.focal_plane_psf.response import Instrument
+from pachon.reconstruction.focal_plane_psf.static_heights import StaticHeights, fit_static_heights
+
+STEPS = 2
+
+
+@pytest.fixture(scope="module")
+def exposures(exposure_of, part):
+    """Two exposures of one focal plane, the stars at the same places; turbulence and noise are their own."""
+    plane = FocalPlane.from_budget(part("R23", count=4), seed=5)
+    return [exposure_of(plane, stars=20, holdout=0, noise=5e-4, turbulence=0.001, seed=s) for s in (1, 2)]
+
+
+@pytest.fixture(scope="module")
+def fit(exposures, lsst_r, wavelengths):
+    """``fit([0, 1], folder=...)``"""
+    options = {"camera": exposures[0].camera, "instrument": Instrument.of(lsst_r, wavelengths), "alignment_rms": 0.0}
+
+    def of(which, **others):
+        stars = [exposures[i].stars() for i in which]
+        return fit_static_heights(stars, lsst_r, steps=STEPS, **(options | others))
+
+    return of
+
+
+@pytest.fixture(scope="module")
+def both(fit, tmp_path_factory):
+    """The heights of both exposures, and the folder that they were kept in."""
+    folder = tmp_path_factory.mktemp("static") / "kept"
+    return fit([0, 1], folder=folder), folder
+
+
+def error(heights, truth):
+    """Rms error over the CCDs [m], without the mean height, which is the focus of the exposures."""
+    camera = truth.camera
+    grid = np.linspace(-0.9, 0.9, 9) * (0.5 * camera.shortest_side)
+    dx, dy = (a.ravel() for a in np.meshgrid(grid, grid))
+    x, y = camera.centers[:, :1] + dx, camera.centers[:, 1:] + dy
+    left = heights.focal_plane.height(x, y) - truth.height(x, y)
+    return np.sqrt(np.mean((left - left.mean()) ** 2))
+
+
+@pytest.mark.slow
+def test_two_exposures_tell_the_heights_better_than_one(exposures, fit, both):
+    truth = exposures[0].plane
+    one = [fit([i]) for i in range(2)]
+    assert error(both[0], truth) < np.mean([error(o, truth) for o in one])
+    assert error(both[0], truth) < error(StaticHeights(FocalPlane.flat(truth.camera), both[0].covariance, 0), truth)
+    # More data make every CCD better known; by less than sqrt(2), since there is a prior.
+    assert both[0].exposures == 2
+    assert (both[0].sigma < one[0].sigma).all()
+    assert (both[0].sigma > one[0].sigma / 2.0).all()
+
+
+@pytest.mark.long
+def test_covariances_are_those_of_the_legendre_terms(both, exposures):
+    covariance = both[0].covariance
+    assert covariance.shape == (4, len(powers(6)), len(powers(6)))
+    for each in covariance:
+        np.testing.assert_allclose(each, each.T, atol=1e-12 * np.abs(each).max())
+        assert np.linalg.eigvalsh(each)[0] > 0.0
+    # The sum of the variances of terms of unit rms is the mean square over the CCD.
+    np.testing.assert_allclose(both[0].sigma ** 2, np.trace(covariance, axis1=1, axis2=2), rtol=1e-12)
+
+
+@pytest.mark.long
+def test_a_fit_that_was_stopped_goes_on(both, fit, monkeypatch):
+    first, folder = both
+    assert len(list(folder.iterdir())) == 2 * STEPS
+
+    def never(self):
+        raise AssertionError("computed again")
+
+    monkeypatch.setattr(ExposureFit, "linearise", never)
+    again = fit([0, 1], folder=folder)
+    assert again.covariance.tobytes() == first.covariance.tobytes()
+    np.testing.assert_array_equal(again.focal_plane.grid, first.focal_plane.grid)
+
+
+@pytest.mark.long
+def test_a_fit_goes_on_with_another_number_of_threads_of_blas(both, fit, monkeypatch):
+    if len(os.sched_getaffinity(0)) < 2:
+        pytest.skip("BLAS has one thread on one processor")
+
+    def never(self):
+        raise AssertionError("computed again")
+
+    monkeypatch.setattr(ExposureFit, "linearise", never)
+    with threadpool_limits(2, user_api="blas"):
+        fit([0, 1], folder=both[1])
+
+
+@pytest.mark.long
+def test_what_belongs_to_other_stars_or_is_damaged_is_computed_again(both, fit, monkeypatch, tmp_path):
+    folder = tmp_path / "copy"
+    shutil.copytree(both[1], folder)
+
+    def never(self):
+        raise InterruptedError
+
+    monkeypatch.setattr(ExposureFit, "linearise", never)
+    with pytest.raises(InterruptedError):
+        fit([1, 0], folder=folder)
+    (folder / "exposure_00000_step_0.npz").write_bytes(b"PK")
+    with pytest.raises(InterruptedError):
+        fit([0, 1], folder=folder)
+
+
+@pytest.mark.long
+def test_files_of_another_telescope_are_computed_again(both, fit, exposures, monkeypatch, lsst_r, wavelengths):
+    def never(self):
+        raise InterruptedError
+
+    monkeypatch.setattr(ExposureFit, "linearise", never)
+    moved = Instrument.of(lsst_r.perturbed("M2", shift=(1e-3, 0.0, 0.0)), wavelengths)
+    with pytest.raises(InterruptedError):
+        fit([0, 1], folder=both[1], instrument=moved)
+
+
+@pytest.mark.long
+def test_a_written_file_is_the_same(both, tmp_path, exposures):
+    path = tmp_path / "heights.fits"
+    both[0].write(path)
+    read = StaticHeights.read(path, exposures[0].camera)
+    x, y = exposures[0].xy.T
+    np.testing.assert_array_equal(read.focal_plane.height(x, y), both[0].focal_plane.height(x, y))
+    np.testing.assert_array_equal(read.covariance, both[0].covariance)
+    assert read.exposures == 2
+    prior = read.prior()
+    assert prior.mean is read.focal_plane
+    assert prior.degree == 6
+
+
+def test_bad_input_gives_one_clear_line(lsst_r, tmp_path):
+    with pytest.raises(DomainError, match=r"^exposures: [^\n]*$"):
+        fit_static_heights([], lsst_r)
+    (tmp_path / "bad.fits").write_bytes(b"SIMPLE  =")
+    for name in ("bad.fits", "none.fits"):
+        with pytest.raises(ProductError) as raised:
+            StaticHeights.read(tmp_path / name)
+        assert "\n" not in str(raised.value)

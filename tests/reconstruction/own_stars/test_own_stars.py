@@ -1,0 +1,172 @@
+"""PSF models of stars from other programs: what is kept, how well held-out stars are predicted, and the command."""
+
+import json
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+
+from pachon import PsfModel
+from pachon.commands.cli import main
+from pachon.core.errors import ConfigError, DomainError
+from pachon.measure.shapes import measure_shapes
+from pachon.reconstruction.own_stars.star_catalogue import StarCutouts, load_stars
+from pachon.measure.star_selection import StarFlag
+from pachon.reconstruction.own_stars.candidates import CANDIDATES, choose_candidate
+from pachon.reconstruction.own_stars.own_stars import fit_own_stars
+
+PIXEL = np.deg2rad(0.2 / 3600.0)
+SIZE, SKY, COUNT = 33, 22.0, 60
+
+
+def profiles(positions, dx, dy):
+    """Moffat profiles of unit sum whose shape changes linearly over 4000 pixels, at places within a pixel."""
+    y, x = np.indices((SIZE, SIZE)) - SIZE // 2
+    u, v = (positions.T / 2000.0 - 1.0)[:, :, None, None]
+    x, y = x - dx[:, None, None], y - dy[:, None, None]
+    square = x**2 * (1 - 0.02 * u) + y**2 * (1 + 0.02 * u) - 0.04 * v * x * y
+    images = (1.0 + square / (2.8 * (1.0 + 0.01 * u)) ** 2) ** -3
+    return images / images.sum(axis=(1, 2), keepdims=True)
+
+
+@pytest.fixture(scope="module")
+def stars():
+    """Sixty stars in electrons over a background, one hit by a cosmic ray, one with a neighbour, one too faint."""
+    rng = np.random.default_rng(4)
+    positions = rng.uniform(1.0, 4000.0, (COUNT, 2))
+    electrons = 5000.0 * 10.0 ** rng.uniform(0.3, 1.5, COUNT)
+    electrons[5] = 1500.0
+    light = electrons[:, None, None] * profiles(positions, *rng.uniform(-0.5, 0.5, (2, COUNT)))
+    light[7] += 0.4 * np.roll(light[7], (7, 4), axis=(0, 1))
+    stamps = light + rng.normal(size=light.shape) * np.sqrt(SKY**2 + light)
+    stamps[9, 12:14, 20] += 0.6 * stamps[9].max()
+    return StarCutouts(stamps + 300.0, positions)
+
+
+@pytest.fixture(scope="module")
+def own(stars):
+    return fit_own_stars(*stars, PIXEL)
+
+
+def test_stars_with_defects_and_faint_ones_are_left_out(own):
+    assert own.flags[7] & StarFlag.NEIGHBOUR
+    assert own.flags[9] & StarFlag.COSMIC_RAY
+    assert own.snr[5] < 20.0
+    assert set(np.flatnonzero(~own.used)) == {5, 7, 9}
+
+
+def test_the_model_is_that_of_the_truth_between_the_stars(own):
+    rng = np.random.default_rng(8)
+    places = rng.uniform(200.0, 3800.0, (80, 2))
+    truth = profiles(places, *np.zeros((2, 80)))
+    drawn = own.model.at(places)
+    rim = (SIZE - drawn.shape[1]) // 2
+    made, true = (measure_shapes(i, PIXEL, own.weight_fwhm) for i in (drawn, truth[:, rim:-rim, rim:-rim]))
+    noise = own.summary()["rms_e_noise"]
+    assert np.sqrt(np.mean((made.e1 - true.e1) ** 2 + (made.e2 - true.e2) ** 2) / 2.0) < 0.35 * noise
+    assert np.std(true.e1) > 0.5 * noise, "the field varies"
+    assert np.sqrt(np.mean((made.size / true.size - 1.0) ** 2)) < 0.006
+
+
+def test_residuals_of_held_out_stars_are_their_noise(own):
+    d1, d2, size = own.residuals()
+    assert 0.8 < np.std(np.concatenate([d1, d2]) / np.tile(own.sigma_e, 2)) < 1.35
+    assert 0.8 < np.std(size / own.sigma_size) < 1.35
+    rho = own.rho_statistics()
+    assert abs(np.nanmean(rho.rho1.xi_plus)) < 0.2 * own.summary()["rms_e"] ** 2
+
+
+@pytest.mark.long
+def test_the_parts_held_out_are_those_of_the_seed(stars, own):
+    options = {"basis": "pixels", "interpolation": "polynomial", "order": 1, "weights": "noise"}
+    one, again, other = (fit_own_stars(*stars, PIXEL, seed=seed, **options) for seed in (1, 1, 2))
+    assert np.array_equal(again.predicted, one.predicted)
+    assert np.array_equal(other.model.at((5.0, 5.0)), one.model.at((5.0, 5.0)))
+    assert not np.array_equal(other.predicted, one.predicted)
+    assert (one.kind, own.kind) == ("given", "kriging of pixels")
+    assert (one.model.order, one.model.kernel) == (1, None)
+
+
+def predictions(residuals):
+    """Stars of unit sum with residuals of e1 and so on from each kind of model, by name."""
+    rng = np.random.default_rng(0)
+    x = np.indices((SIZE, SIZE))[1] - SIZE // 2
+    mean = profiles(np.full((1, 2), 2000.0), np.zeros(1), np.zeros(1))[0]
+    stars = np.repeat(mean[None], 40, axis=0) * 1e5
+    stars += rng.normal(size=stars.shape) * np.sqrt(SKY**2 + stars)
+    found = {name: stars / stars.sum(axis=(1, 2), keepdims=True) for name in CANDIDATES}
+    shape = mean * (np.abs(x) > 2) - mean * (np.abs(x) <= 2)
+    return stars, {name: images - residuals[name][:, None, None] * shape for name, images in found.items()}
+
+
+@pytest.mark.parametrize(("size", "chosen"), [(0.5, "pixels, order 1"), (0.97, "kriging of pixels")])
+def test_another_kind_must_be_better_by_two_standard_errors(size, chosen):
+    rng = np.random.default_rng(3)
+    residuals = {name: 0.02 * rng.normal(size=40) for name in CANDIDATES}
+    residuals = {name: values / values.std() * 0.02 for name, values in residuals.items()}
+    residuals["pixels, order 1"] = size * residuals["pixels, order 1"]
+    stars, found = predictions(residuals)
+    tried = []
+
+    def predict(options):
+        name = next(name for name, each in CANDIDATES.items() if each is options)
+        tried.append(name)
+        if name == "principal components":
+            raise ConfigError("too few stars")
+        return found[name]
+
+    name, predicted = choose_candidate(predict, stars, 1.0)
+    assert name == chosen
+    assert predicted is found[chosen]
+    assert tried == list(CANDIDATES)
+
+
+def test_names_of_columns_of_sextractor(stars, tmp_path):
+    stamps = stars.stamps.copy()
+    stamps[3, 0, 0] = -1e30
+    header = Table({"Field Header Card": np.array(["SIMPLE  =  T"])})
+    table = Table({"XWIN_IMAGE": stars.positions[:, 0], "YWIN_IMAGE": stars.positions[:, 1], "VIGNET": stamps})
+    parts = [fits.PrimaryHDU(), fits.table_to_hdu(header), fits.table_to_hdu(table)]
+    fits.HDUList(parts).writeto(tmp_path / "ldac.cat")
+    found = load_stars(tmp_path / "ldac.cat")
+    assert np.array_equal(found.positions, stars.positions)
+    assert np.isnan(found.stamps[3, 0, 0])
+    assert np.array_equal(found.stamps[4], stars.stamps[4])
+    # A masked pixel takes its star out.
+    assert fit_own_stars(*found, PIXEL, interpolation="polynomial", order=0).flags[3] == StarFlag.UNUSABLE
+
+
+@pytest.mark.long
+def test_the_command_leaves_model_picture_and_table(stars, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Table({"x": stars.positions[:, 0], "y": stars.positions[:, 1], "stamp": stars.stamps}).write("stars.fits")
+    assert main(["model", "stars.fits", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["stars"], found["used"], found["flagged"]["cosmic_ray"]) == (COUNT, COUNT - 3, 1)
+    assert PsfModel.read("stars_psf.fits").draw(2000.0, 2000.0).sum() == pytest.approx(1.0)
+    assert (tmp_path / "stars_psf.png").read_bytes().startswith(b"\x89PNG")
+    table = Table.read("stars_psf.ecsv")
+    assert len(table) == COUNT
+    assert np.isnan(table["held_out_e1"][7])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"size": 30}, "size = 30: expected an odd number of pixels from 9 to 33"),
+        ({"size": 35}, "size = 35: expected an odd number"),
+        ({"gain": 0.0}, "gain = 0.0: expected a number of electrons above 0"),
+        ({"min_snr": 1e6}, "0 of 60 stars left"),
+        ({"pixel_scale": -1.0}, "pixel_scale"),
+    ],
+)
+def test_bad_values_are_named(stars, change, message):
+    with pytest.raises(DomainError, match=message):
+        fit_own_stars(*stars, **({"pixel_scale": PIXEL} | change))
+
+
+def test_stamps_of_noise_are_no_stars():
+    noise = np.random.default_rng(1).normal(size=(20, 21, 21))
+    with pytest.raises(DomainError, match="stars"):
+        fit_own_stars(noise, np.random.default_rng(2).uniform(size=(20, 2)), PIXEL)

@@ -1,0 +1,117 @@
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+
+from pachon.core.errors import ProductError
+from pachon.reconstruction.own_stars.star_catalogue import load_stars
+from pachon.reconstruction.psf_model.model import PsfModel
+
+
+def stars(count=14):
+    rng = np.random.default_rng(1)
+    y, x = np.mgrid[:9, :11] - np.array([4, 5])[:, None, None]
+    positions = rng.uniform(0.0, 4000.0, (count, 2))
+    width = 1.5 + 0.1 * positions[:, 0, None, None] / 4000.0
+    return 1e4 * np.exp(-0.5 * (x**2 + y**2) / width**2), positions
+
+
+def catalogue(path, stamps, positions, names=("x", "y", "stamp"), **more):
+    table = Table({names[0]: positions[:, 0], names[1]: positions[:, 1], **more})
+    if len(names) > 2:
+        table[names[2]] = stamps
+    table.write(path, overwrite=True)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["fits", "ecsv"])
+def test_tables_give_what_was_put_in(tmp_path, kind):
+    stamps, positions = stars()
+    found, places = load_stars(catalogue(tmp_path / f"stars.{kind}", stamps, positions))
+    assert found.dtype == places.dtype == np.float64
+    assert found.dtype.isnative
+    np.testing.assert_array_equal(found, stamps)
+    np.testing.assert_array_equal(places, positions)
+    model = PsfModel.fit(found, places, n_components=2, order=1)
+    assert model.draw(2000.0, 2000.0).shape == (9, 11)
+
+
+def test_names_of_columns(tmp_path):
+    stamps, positions = stars()
+    path = catalogue(tmp_path / "stars.fits", stamps, positions, ("XPOS", "YPOS", "CUTOUT"))
+    np.testing.assert_array_equal(load_stars(path, x="xpos", y="YPOS", stamp="cutout").stamps, stamps)
+
+
+def test_image_cubes(tmp_path):
+    stamps, positions = stars()
+    cube = fits.ImageHDU(stamps.astype(np.float32))
+    fits.HDUList([fits.PrimaryHDU(), cube]).writeto(tmp_path / "cube.fits")
+    path = catalogue(tmp_path / "stars.ecsv", stamps, positions, ("x", "y"))
+    found = load_stars(path, images=tmp_path / "cube.fits")
+    np.testing.assert_array_equal(found.stamps, stamps.astype(np.float32))
+    # In the same file, beside the table.
+    table = fits.BinTableHDU(Table({"x": positions[:, 0], "y": positions[:, 1]}))
+    fits.HDUList([fits.PrimaryHDU(), table, cube]).writeto(tmp_path / "both.fits")
+    np.testing.assert_array_equal(load_stars(tmp_path / "both.fits").stamps, found.stamps)
+    fits.HDUList([fits.PrimaryHDU(stamps[:5])]).writeto(tmp_path / "few.fits")
+    with pytest.raises(ProductError, match="14 stars in the table, 5 stamps"):
+        load_stars(path, images=tmp_path / "few.fits")
+    fits.HDUList([fits.PrimaryHDU(stamps[0])]).writeto(tmp_path / "one.fits")
+    with pytest.raises(ProductError, match=r"one\.fits: has no image of three axes"):
+        load_stars(path, images=tmp_path / "one.fits")
+
+
+def test_files_that_cannot_be_used(tmp_path):
+    stamps, positions = stars()
+
+    def refused(match, path=None, **options):
+        with pytest.raises(ProductError, match=match) as caught:
+            load_stars(path or tmp_path / "stars.fits", **options)
+        assert "\n" not in str(caught.value)
+
+    refused(r"stars\.fits: no such file")
+    path = catalogue(tmp_path / "stars.fits", stamps, positions, ("ra", "y"), magnitude=np.zeros(14))
+    refused(r"stars\.fits: no column 'x', 'stamp' and no image of three axes; its columns are ra, y, magnitude")
+    refused("columns are ra, y, magnitude; looked for x: xwin_image, x_image, .*; looked for stamp: vignet; stamps are")
+    refused("no column 'dec'", x="ra", y="dec", stamp="y")
+    refused("column 'magnitude' has shape .14,. and type .*, expected an image", x="ra", stamp="magnitude")
+    whole = path.read_bytes()
+    for end in (40, 2000, len(whole) - 2000):
+        path.write_bytes(whole[:end])
+        refused(r"stars\.fits: (damaged|cut short)")
+    path.write_bytes(b"")
+    refused(r"stars\.fits: neither FITS nor ECSV")
+    path.write_text("x,y\n1,2\n")
+    refused(r"stars\.fits: neither FITS nor ECSV")
+    fits.HDUList([fits.PrimaryHDU(stamps)]).writeto(path, overwrite=True)
+    refused("has no table, expected one of stars with columns x, y and their stamps, stamp")
+    ecsv = catalogue(tmp_path / "stars.ecsv", stamps, positions, ("x", "flux"))
+    refused("no column 'y', 'stamp'; its columns are x, flux", ecsv)
+    ecsv.write_text("".join(ecsv.read_text().splitlines(keepends=True)[:6]))
+    refused(r"stars\.ecsv: damaged or no ECSV", ecsv)
+
+
+def test_the_example_of_the_documentation_runs(tmp_path, monkeypatch):
+    rng = np.random.default_rng(2)
+    positions = rng.uniform(0.0, 4000.0, (30, 2))
+    y, x = np.mgrid[:31, :31] - 15.0
+    moved = rng.uniform(-0.5, 0.5, (30, 2, 1, 1))
+    width = 1.7 + 0.1 * positions[:, 0, None, None] / 4000.0
+    stamps = 1e4 * np.exp(-0.5 * ((x - moved[:, 0]) ** 2 + (y - moved[:, 1]) ** 2) / width**2)
+    stamps += rng.normal(0.0, 22.0, stamps.shape) + rng.normal(0.0, 1.0, stamps.shape) * np.sqrt(stamps)
+    stamps[3, 4:8, 20] += 5000.0
+    catalogue(tmp_path / "my_stars.fits", stamps, positions)
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).parents[3] / "docs" / "psf_models.md").read_text(encoding="utf-8")
+    names = {}
+    for block in re.findall(r"```python\n(.*?)```", page, flags=re.S):
+        exec(compile(block, "psf_models.md", "exec"), names)
+    assert names["psf"].shape == (21, 21)
+    assert not names["keep"][3]
+    y, x = np.mgrid[:21, :21] - 10.0
+    truth = np.exp(-0.5 * (x**2 + y**2) / (1.7 + 0.1 * 1024.0 / 4000.0) ** 2)
+    # Thirty stars of S/N above 200: two per cent of the peak.
+    np.testing.assert_allclose(names["psf"], truth / truth.sum(), atol=0.02 * truth.max() / truth.sum())

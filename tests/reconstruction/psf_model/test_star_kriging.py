@@ -1,0 +1,230 @@
+"""Kriging of PSFs with the noise of each star: against brute force, and against what one would choose by hand."""
+
+import numpy as np
+import pytest
+
+from pachon.core.errors import ConfigError, DomainError
+from pachon.core.threads import one_blas_thread
+from pachon.measure.shapes import measure_shapes
+from pachon.reconstruction.psf_model import kriging
+from pachon.reconstruction.psf_model.model import PsfModel
+from pachon.reconstruction.psf_model.polynomial import design_matrix
+
+SIZE = 21
+EXTENT = (-1.0, 1.0, -1.0, 1.0)
+OPTIONS = {"basis": "pixels", "interpolation": "kriging", "extent": EXTENT}
+
+
+def psfs(e1, e2, width):
+    """Elliptical Moffat profiles of unit sum, (1 + r^2)^-3, of rms width about `width` pixels."""
+    y, x = np.indices((SIZE, SIZE)) - SIZE // 2
+    e1, e2, width = (np.asarray(v)[:, None, None] for v in (e1, e2, width))
+    square = (x**2 * (1 - 2 * e1) + y**2 * (1 + 2 * e1) - 4 * e2 * x * y) / (2.2 * width) ** 2
+    images = (1.0 + square) ** -3
+    return images / images.sum(axis=(1, 2), keepdims=True)
+
+
+def field(seed, count, rough, holdouts=150):
+    """Stars in electrons, and noise-free PSFs elsewhere, under a quadratic field and an exponential process."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1.0, 1.0, (count + holdouts, 2))
+    distance = np.hypot(*np.moveaxis(points[:, None] - points, -1, 0))
+    process = np.linalg.cholesky(np.exp(-2.0 * distance) + 1e-9 * np.eye(len(points)))
+
+    def values():
+        smooth = design_matrix(points, EXTENT, 2) @ rng.normal(size=6)
+        return 0.006 * (smooth + rough * process @ rng.normal(size=len(points)))
+
+    images = psfs(values(), values(), 1.5 * (1.0 + values()))
+    electrons = 4000.0 * 10.0 ** rng.uniform(0.0, 2.0, count)
+    stars = electrons[:, None, None] * images[:count]
+    stars = stars + rng.normal(size=stars.shape) * np.sqrt(22.0**2 + stars)
+    return stars, points[:count], images[count:], points[count:]
+
+
+def error(images, truth):
+    made, true = (measure_shapes(i, 0.2, 0.7) for i in (images, truth))
+    return np.sqrt(np.mean((made.e1 - true.e1) ** 2 + (made.e2 - true.e2) ** 2))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("rough", [0.0, 0.5, 2.0])
+@pytest.mark.parametrize("count", [20, 40, 100])
+def test_it_is_near_to_the_best_of_all_choices_of_polynomials(count, rough):
+    # What is best is found with the truth, anew for each field, which nobody has.
+    ratios = []
+    for seed in range(3):
+        stars, places, truth, elsewhere = field(100 * seed + count, count, rough)
+        electrons = stars.sum(axis=(1, 2))
+        softened = 1.0 / (electrons**-2.0 + (30.0 * 22.0 * 5.0) ** -2.0)
+        errors = [
+            error(PsfModel.fit(stars, places, **by_hand, weights=weights).at(elsewhere), truth)
+            for by_hand in ({"basis": "pixels", "order": order, "extent": EXTENT} for order in range(4))
+            for weights in (None, electrons**2, softened)
+            if (by_hand["order"] + 1) * (by_hand["order"] + 2) // 2 < count
+        ]
+        ratios.append(error(PsfModel.fit(stars, places, **OPTIONS).at(elsewhere), truth) / min(errors))
+    assert np.exp(np.log(ratios).mean()) < 1.1
+
+
+def test_degrees_that_the_stars_do_not_show_cost_nothing_and_others_are_found():
+    # A field that is an exact quadratic, and one with terms of degree 4 as large as the linear ones.
+    rng = np.random.default_rng(2)
+    points = rng.uniform(-1.0, 1.0, (60, 2))
+    terms = design_matrix(points, EXTENT, 4)
+    noise = np.full((60, 3), 1e-4)
+    degrees = np.repeat(np.arange(5), np.arange(1, 6))
+    for amplitudes in ([1.0, 1.0, 1.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0, 1.0]):
+        numbers = terms @ (0.1 * np.array(amplitudes)[degrees][:, None] * rng.normal(size=(15, 3)))
+        with one_blas_thread():
+            kernel = kriging.fit_kernel(points, numbers + 1e-2 * rng.normal(size=(60, 3)), noise, terms)
+        # Variances in units of the noise, 100 where there are terms; fewer than fifty numbers tell each.
+        for found, amplitude in zip(kernel[3:], amplitudes[1:], strict=True):
+            assert (10.0 < found < 1000.0) if amplitude else found < 0.1
+
+
+def test_a_process_is_found_where_there_is_one_and_hardly_any_on_a_polynomial():
+    rng = np.random.default_rng(4)
+    points = rng.uniform(-1.0, 1.0, (80, 2))
+    terms, noise = design_matrix(points, EXTENT, 4), np.full((80, 3), 1e-4)
+    distance = np.hypot(*np.moveaxis(points[:, None] - points, -1, 0))
+    rough = np.linalg.cholesky(np.exp(-distance / 0.5)) @ rng.normal(size=(80, 3))
+    smooth = terms[:, :6] @ rng.normal(size=(6, 3)) + 1e-2 * rng.normal(size=(80, 3))
+    with one_blas_thread():
+        # 1e-2 of noise is the unit; the process drawn has a variance of 25.
+        assert 8.0 < kriging.fit_kernel(points, smooth + 5e-2 * rough, noise, terms)[0] < 80.0
+        kernel = kriging.fit_kernel(points, smooth, noise, terms)
+    # A hundredth of the noise of one star; degrees that are not there are left out.
+    assert kernel[0] < 0.01
+    assert (kernel[5:] == 0.0).all()
+
+
+def test_the_slope_of_the_posterior_is_its_change():
+    rng = np.random.default_rng(5)
+    points = rng.uniform(-1.0, 1.0, (25, 2))
+    distance = np.hypot(*np.moveaxis(points[:, None] - points, -1, 0))
+    terms = design_matrix(points, EXTENT, 4)
+    posterior = kriging.Posterior(
+        distance, 3.0 * rng.normal(size=(25, 3)), rng.uniform(0.1, 2.0, 25), terms, np.zeros(7), np.full(7, 2.0)
+    )
+    at, kept = rng.normal(size=7), np.array([True, True, True, True, True, False, True])
+    value, slope = posterior.negative_log_posterior(at, kept)
+    variance, length, floor, *trend = np.where(kept, np.exp(at), 0.0)
+    covariance = variance * np.exp(-distance / length) + np.diag(posterior.noise + floor)
+    covariance += terms @ np.diag(np.repeat([1e4, *trend], [1, 2, 3, 4, 5])) @ terms.T
+    likelihood = 1.5 * np.linalg.slogdet(covariance)[1]
+    likelihood += 0.5 * np.sum(posterior.numbers * np.linalg.solve(covariance, posterior.numbers))
+    assert value == pytest.approx(likelihood + 0.5 * ((at[kept] / 2.0) ** 2).sum(), rel=1e-10)
+    for column in range(7):
+        step = np.eye(7)[column] * 1e-5
+        change = (
+            posterior.negative_log_posterior(at + step, kept)[0] - posterior.negative_log_posterior(at - step, kept)[0]
+        ) / 2e-5
+        # Rounding of values near 100, over the step.
+        assert slope[column] == pytest.approx(change, abs=1e-7 * abs(value))
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    stars, places, _, elsewhere = field(5, 30, 1.0)
+    return PsfModel.fit(stars, places, **OPTIONS), stars, elsewhere
+
+
+def test_trend_and_process_are_those_of_one_large_gaussian(fitted):
+    model, _, elsewhere = fitted
+    variance, length, floor, *trend = model.kernel[0]
+    assert len(trend) == 4
+    prior = np.diag(np.repeat([1e4, *trend], [1, 2, 3, 4, 5]))
+    at_stars, there = (design_matrix(p, EXTENT, 4) for p in (model.positions, elsewhere))
+
+    def covariance(a, b, terms_a, terms_b):
+        distance = np.hypot(*np.moveaxis(a[:, None] - b, -1, 0))
+        return variance * np.exp(-distance / length) + terms_a @ prior @ terms_b.T
+
+    own = covariance(model.positions, model.positions, at_stars, at_stars) + np.diag(1.0 / model.weights + floor)
+    between = covariance(elsewhere, model.positions, there, at_stars)
+    expected = between @ np.linalg.solve(own, model.coefficients)
+    np.testing.assert_allclose(model.amplitudes(elsewhere), expected, atol=1e-9 * np.abs(expected).max())
+    # Each star predicted from the others, by solving without it.
+    for star in (0, 17):
+        rest = np.delete(np.arange(30), star)
+        alone = own[star, rest] @ np.linalg.solve(own[np.ix_(rest, rest)], model.coefficients[rest])
+        left_out = model.leave_one_out()[star] - model.mean
+        np.testing.assert_allclose(left_out.ravel(), alone, atol=1e-8 * np.abs(expected).max())
+
+
+def test_places_do_not_depend_on_their_batch_and_files_keep_every_digit(fitted, tmp_path):
+    model, _, elsewhere = fitted
+    together = model.at(elsewhere)
+    assert np.array_equal(model.at(elsewhere[7])[0], together[7])
+    model.write(tmp_path / "psf.fits")
+    again = PsfModel.read(tmp_path / "psf.fits")
+    assert np.array_equal(again.at(elsewhere), together)
+    assert np.array_equal(again.leave_one_out(), model.leave_one_out())
+    np.testing.assert_allclose(together.sum(axis=(1, 2)), 1.0, atol=1e-12)
+
+
+def test_shape_numbers_are_the_changes_of_the_shape():
+    mean = psfs([0.0], [0.0], [1.5])[0]
+    others = psfs([1e-4, 0.0, 0.0], [0.0, 1e-4, 0.0], [1.5, 1.5, 1.5 * 1.0002])
+    numbers, _ = kriging.shape_numbers(mean, (others - mean).reshape(3, -1))
+    # Each is large for its own kind of change, and zero for the others.
+    assert np.abs(numbers - np.diag(np.diagonal(numbers))).max() < 2e-3 * np.abs(numbers).max()
+    assert (np.diagonal(numbers) > 2e-5).all()
+
+
+@pytest.mark.parametrize("gain", [1.0, 2.5])
+def test_the_noise_of_a_star_is_that_of_many_draws(gain):
+    rng = np.random.default_rng(1)
+    image, electrons = psfs([0.0], [0.0], [1.5])[0], np.geomspace(3e3, 3e6, 12)
+    truth = electrons[:, None, None] * image / gain
+
+    def draw():
+        return truth + rng.normal(size=truth.shape) * np.sqrt(22.0**2 + electrons[:, None, None] * image) / gain
+
+    def relative(images):
+        return (images * gain / electrons[:, None, None] - image).reshape(12, -1)
+
+    filters = kriging.shape_numbers(image, relative(truth))[1]
+    scatter = np.std([kriging.shape_numbers(image, relative(draw()))[0] for _ in range(400)], axis=0)
+    stated = np.mean([kriging.star_noise(s, relative(s), image, filters, gain) for s in (draw() for _ in range(20))], 0)
+    np.testing.assert_allclose(np.sqrt(stated), scatter, rtol=0.12)
+
+
+def test_bright_stars_do_not_have_the_noise_of_faint_ones():
+    # The deviations are from a mean of equal weights, which the faint stars make noisy.
+    rng = np.random.default_rng(8)
+    image, electrons = psfs([0.0], [0.0], [1.5])[0], np.geomspace(3e3, 3e6, 24)
+    stars = electrons[:, None, None] * image
+    stars = stars + rng.normal(size=stars.shape) * np.sqrt(22.0**2 + stars)
+    unit = (stars / electrons[:, None, None]).reshape(24, -1)
+    filters = kriging.shape_numbers(image, unit)[1]
+    stated = kriging.star_noise(stars, unit - unit.mean(axis=0), image, filters, 1.0)
+    squares = (filters**2).sum(axis=1), filters**2 @ image.ravel()
+    true = (22.0 / electrons[:, None]) ** 2 * squares[0] + squares[1] / electrons[:, None]
+    # The sky of one stamp is good to a tenth (it was 20 times too large for the brightest).
+    np.testing.assert_allclose(stated, true, rtol=0.4)
+    assert abs(np.log(stated / true).mean()) < 0.1
+
+
+def test_few_stars_noise_free_ones_and_equal_ones_are_no_trouble():
+    stars, places, truth, elsewhere = field(3, 4, 0.0)
+    assert error(PsfModel.fit(stars, places, **OPTIONS).at(elsewhere), truth) < 0.03
+    model = PsfModel.fit(truth, elsewhere, **OPTIONS, gain=None, clip_sigma=None)
+    assert error(model.at(model.positions), truth) < 1e-4
+    same = PsfModel.fit(np.repeat(truth[:1], 12, axis=0), elsewhere[:12], **OPTIONS, gain=None)
+    np.testing.assert_allclose(same.at(elsewhere[20:22]), np.repeat(truth[:1], 2, axis=0), atol=1e-12)
+
+
+def test_stamps_that_are_not_in_electrons_are_noticed():
+    stars, places, _, _ = field(3, 12, 0.0)
+    unit = stars / stars.sum(axis=(1, 2), keepdims=True)
+    with pytest.raises(DomainError, match=r"gain = 1: the middle star has 1 electrons; expected stamps in electrons"):
+        PsfModel.fit(unit, places, **OPTIONS)
+    for gain in (0.0, -1.0, np.nan):
+        with pytest.raises(ConfigError, match=r"gain = .*: expected a number of electrons above 0"):
+            PsfModel.fit(stars, places, **OPTIONS, gain=gain)
+    with pytest.raises(ConfigError, match="weights: expected none with interpolation = 'kriging'"):
+        PsfModel.fit(stars, places, **OPTIONS, weights=np.ones(12))
+    with pytest.raises(DomainError, match="expected places apart for interpolation = 'kriging'"):
+        PsfModel.fit(stars, np.vstack([places[:11], places[:1]]), **OPTIONS)

@@ -1,0 +1,129 @@
+"""The model of a donut: against brute force, and its derivatives against central differences."""
+
+import numpy as np
+import pytest
+from donut_images import PIXEL, SIZE, WAVELENGTH, donut
+
+from pachon.sensing.donut_rays import ZernikeRays
+from pachon.sensing.image_model import ImageGrid, LandedLight
+from pachon.sensing.likelihood import Stamp, model_image, normal_equations
+from pachon.sensing.pupil_cells import pupil_cells
+from pachon.sensing.seeing import Seeing
+from pachon.sensing.stamps import Pixels
+from pachon.raytrace.rays import field_direction
+from pachon.wavefront.atmosphere.turbulence import long_exposure_fwhm
+from pachon.wavefront.chief_rays import image_jacobians
+from pachon.wavefront.psf.pupil_rims import pupil_rims
+
+NOLL = np.arange(4, 12)
+FIELD = np.deg2rad([1.2, 0.4])
+
+
+def stamp_of(tel, across, *, blur=0.0, size=SIZE, outer_scale=25.0, image=None, reach=0.0, side=1, rims=None):
+    direction = field_direction(*FIELD)
+    cells = pupil_cells(tel, direction, WAVELENGTH, across)
+    rays = ZernikeRays(tel, direction, np.array([WAVELENGTH]), np.ones(1), cells, NOLL)
+    jacobian = image_jacobians(tel, direction[None], WAVELENGTH)[0]
+    seeing = Seeing(WAVELENGTH, outer_scale)
+    image = np.zeros((size, size)) if image is None else image
+    pixels = Pixels(image, np.full(image.shape, 500.0), np.ones(image.shape, dtype=bool)).binned(side)
+    grid = ImageGrid(pixels, PIXEL, seeing, jacobian, blur, rays.footprint, 1, reach, rims)
+    return Stamp(pixels.image, pixels.variance, pixels.used, grid, rays)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("amplitude", [0.0, 200e-9])
+def test_image_is_that_of_brute_force(behind_focus, amplitude):
+    wave = amplitude * np.array([1.0, -0.5, 0.7, 0.4, -0.6, 0.3, 0.2, -0.3])
+    expected = donut(
+        behind_focus, FIELD, zernikes=[0.0, 0.0, 0.0, *wave], blur=1.3, shift=(0.3, -0.2), flux=1.0, rays=1200
+    )
+    stamp = stamp_of(behind_focus, 60, blur=1.3 * PIXEL)
+    model = model_image(stamp, np.array([1.0, 0.3, -0.2, 0.0, 0.0]), wave)
+    # Bins of a quarter pixel, and one ray more or less in those on the rims.
+    np.testing.assert_allclose(model, expected, atol=5e-3 * expected.max())
+    assert model.sum() == pytest.approx(expected.sum(), abs=1e-4)
+
+
+@pytest.mark.long
+def test_coarse_cells_give_the_image_of_fine_ones(behind_focus):
+    wave = 200e-9 * np.array([1.0, -0.5, 0.7, 0.4, -0.6, 0.3, 0.2, -0.3])
+    star = np.array([1.0, 0.3, -0.2, 0.0, 10.0])
+    coarse, fine = (model_image(stamp_of(behind_focus, n), star, wave) for n in (60, 150))
+    # Third moments of cells of a pixel on the rims.
+    np.testing.assert_allclose(coarse, fine, atol=6e-3 * fine.max())
+
+
+@pytest.mark.parametrize("side", [2, 3])
+@pytest.mark.parametrize("companion", [(), (0.3, 12.0, -7.5)])
+def test_summed_pixels_have_the_model_of_the_sums(behind_focus, side, companion):
+    """The unknowns stay those of the detector's pixels, also where pixels are left over at the end."""
+    star, wave = np.array([1e6, 1.2, -0.7, 3.0, 5.0, *companion]), 60e-9 * np.cos(np.arange(len(NOLL)))
+    # FWHM of two sums, as the fit has it.
+    blur = 0.85 * side * PIXEL
+    single, summed = (
+        model_image(stamp_of(behind_focus, 60, side=k, blur=blur, reach=60 * PIXEL), star, wave) for k in (1, side)
+    )
+    n = SIZE // side
+    expected = single[: n * side, : n * side].reshape(n, side, n, side).sum(axis=(1, 3))
+    # The spline of the coarser grid leaves 1e-3 beyond its Nyquist frequency.
+    np.testing.assert_allclose(summed, expected, atol=2e-3 * expected.max())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("companion", "diffracted"), [((), False), ((0.3, 12.0, -7.5), False), ((), True)], ids=["one", "two", "diffracted"]
+)
+def test_derivatives_are_central_differences(behind_focus, companion, diffracted):
+    rims = pupil_rims(behind_focus, field_direction(*FIELD), WAVELENGTH) if diffracted else None
+    stamp = stamp_of(behind_focus, 80, reach=60 * PIXEL if companion else 0.0, rims=rims)
+    star, wave = np.array([1e6, 1.2, -0.7, 3.0, 9.0, *companion]), 60e-9 * np.cos(np.arange(len(NOLL)))
+    joined = np.concatenate([star, wave])
+    steps = np.concatenate([[1e3, 3e-2, 3e-2, 1.0, 0.05], np.full(len(companion), 0.02), np.full(len(NOLL), 5e-9)])
+    landing = stamp.rays.landing(wave)
+    at_rims = stamp.rays.at_rims(rims, landing) if diffracted else None
+    light = LandedLight(landing, stamp.rays.weights(wave), stamp.rays.spread(landing), at_rims)
+    image, columns, scales = stamp.grid.derivatives(star, light, stamp.rays.response(wave), stamp.rays.rates)
+    np.testing.assert_allclose(image, model_image(stamp, star, wave), atol=1e-6 * image.max())
+    for k, step in enumerate(steps):
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = joined.copy()
+            moved[k] += sign * step
+            ends.append(model_image(stamp, moved[: len(star)], moved[len(star) :]))
+        expected = (ends[0] - ends[1]) / (2.0 * step)
+        # The spread of the cells moves with the wavefront too, and so do the widths of the strips along the rims: the
+        # columns leave that out. Without derivatives of the rims' places, those of a diffracted image are 18 % off.
+        bound = 3e-2 if diffracted else 2e-2
+        assert np.linalg.norm(columns[..., k] * scales[k] - expected) < bound * np.linalg.norm(expected)
+
+
+@pytest.mark.long
+def test_gradient_is_that_of_the_loss(behind_focus):
+    star, wave = np.array([1e6, 0.2, 0.1, 3.0, 9.0]), np.zeros(len(NOLL))
+    image = model_image(stamp_of(behind_focus, 40), np.array([1.1e6, 0.0, 0.0, 0.0, 9.5]), wave + 20e-9)
+    stamp = stamp_of(behind_focus, 40, image=image)
+    found = normal_equations(stamp, star, wave)
+    for k, step in [(0, 1e3), (1, 1e-2), (3, 0.1), (4, 1e-2)]:
+        ends = [normal_equations(stamp, star + sign * step * np.eye(5)[k], wave).loss for sign in (1.0, -1.0)]
+        assert found.gradient[k] == pytest.approx(-0.5 * (ends[0] - ends[1]) / (2.0 * step), rel=1e-3)
+
+
+@pytest.mark.parametrize("outer_scale", [25.0, np.inf])
+def test_seeing_has_the_width_of_the_long_exposure(outer_scale):
+    seeing = Seeing(WAVELENGTH, outer_scale)
+    # Kolmogorov's is von Karman's at an outer scale beyond all else, which goes as its power of -1/3.
+    expected = long_exposure_fwhm(WAVELENGTH, 0.15, min(outer_scale, 1e9))
+    assert float(seeing.fwhm(np.array(1.0 / 0.15))) == pytest.approx(expected, rel=2e-3)
+    assert seeing.strength(expected) == pytest.approx(1.0 / 0.15, rel=2e-3)
+
+
+def test_cells_measure_areas_and_moments(focused):
+    cells = pupil_cells(focused, field_direction(0.0, 0.0), WAVELENGTH, 24)
+    radius, inner = 0.5 * focused.pupil_diameter, 0.5 * focused.pupil_diameter * focused.pupil_obscuration
+    x, y = cells.points.T
+    # Mean square radius of the annulus: of the centroids plus that within the cells.
+    square = cells.weights @ (x**2 + y**2 + cells.moments[:, 0, 0] + cells.moments[:, 1, 1])
+    assert square == pytest.approx(0.5 * (radius**2 + inner**2), rel=2e-4)
+    assert abs(cells.weights @ x) < 1e-4
+    assert abs(cells.weights @ y) < 1e-4
