@@ -34,9 +34,9 @@ import scipy.fft
 import pachon
 from pachon.core.random_streams import stream
 from pachon.core.units import ARCMIN, ARCSEC
+from pachon.measure.shapes import fwhm
 from pachon.models.ideal_telescope import ideal_telescope
 from pachon.models.telescope import Telescope
-from pachon.measure.shapes import fwhm
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.layer_screens import SLOPE_LAG
 

@@ -24,7 +24,6 @@ from pathlib import Path
 import numpy as np
 
 import pachon
-from pachon.pipeline.ccd_product import product_path, write_product
 from pachon.pipeline.config import Configuration, with_options
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.run_folder import stamp_of, write_ccd
@@ -33,6 +32,7 @@ from pachon.pipeline.simulate.ccd_loop import simulate_ccds
 from pachon.pipeline.simulate.ccd_model import model_ccd
 from pachon.pipeline.simulate.screen_cover import corner_fields
 from pachon.raytrace.rays import field_direction
+from pachon.reconstruction.ccd_product import product_path, write_product
 
 LAYERS = {
     n: {"altitudes": a, "weights": w, "wind_speeds": s}

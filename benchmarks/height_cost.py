@@ -15,10 +15,10 @@ import treecorr
 
 import pachon
 from pachon.core.units import ARCMIN, ARCSEC
+from pachon.measure.shapes import fwhm, measure_shapes
 from pachon.models.camera.silicon import Silicon
 from pachon.reconstruction.focal_plane_psf.height_series import level_plane
 from pachon.reconstruction.focal_plane_psf.response import Instrument
-from pachon.measure.shapes import fwhm, measure_shapes
 
 _HEIGHTS = np.arange(-30.0, 31.0, 5.0)
 _OFF_FOCUS = (5.0, 10.0, 15.0, 20.0)

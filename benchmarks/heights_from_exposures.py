@@ -29,12 +29,12 @@ from pachon.core.units import ARCSEC
 from pachon.models.camera.camera import Camera
 from pachon.pipeline.config import Configuration
 from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
+from pachon.pipeline.simulate.ccd_observation import observe_ccd
 from pachon.reconstruction.focal_plane_psf.covariance import Places
 from pachon.reconstruction.focal_plane_psf.heights import STATIC_DEGREE, HeightPrior
 from pachon.reconstruction.focal_plane_psf.response import Instrument
 from pachon.reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
-from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
-from pachon.pipeline.simulate.ccd_observation import observe_ccd
 
 matplotlib.use("Agg")
 RAFTS = ("R22", "R23", "R33")

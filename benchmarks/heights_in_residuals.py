@@ -25,13 +25,13 @@ import matplotlib
 import numpy as np
 
 import pachon
-from pachon.pipeline.ccd_product import read_product
 from pachon.pipeline.config import configuration_of
 from pachon.pipeline.experiment import Experiment
-from pachon.reconstruction.focal_plane_psf.response import Instrument, height_response
-from pachon.reconstruction.focal_plane_psf.stars import FocalPlaneStars
 from pachon.pipeline.focal_plane_stage import fit_focal_plane_model
 from pachon.pipeline.run_folder import SUMMARY_NAME
+from pachon.reconstruction.ccd_product import read_product
+from pachon.reconstruction.focal_plane_psf.response import Instrument, height_response
+from pachon.reconstruction.focal_plane_psf.stars import FocalPlaneStars
 
 matplotlib.use("Agg")
 _BINS = 10

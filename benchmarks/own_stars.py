@@ -20,9 +20,9 @@ import numpy as np
 import pachon
 from pachon.core.errors import PachonError
 from pachon.core.units import ARCSEC
+from pachon.measure.stamps import center_stamps
 from pachon.reconstruction.psf_model import kriging
 from pachon.reconstruction.psf_model.polynomial import design_matrix
-from pachon.pipeline.simulate.stamps import center_stamps
 
 PIXEL, STAMP, SKY, FWHM = 0.2, 33, 22.0, 0.7
 PLACES, AMPLITUDE, CORRELATION = 150, 0.006, 0.5

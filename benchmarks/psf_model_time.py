@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 import pachon
-from pachon.pipeline.ccd_product import CcdProduct, read_product
+from pachon.reconstruction.ccd_product import CcdProduct, read_product
 
 OPTIONS = {"polynomials": {"interpolation": "polynomial", "order": 3}, "Gaussian processes": {"interpolation": "gp"}}
 

@@ -22,8 +22,8 @@ from threadpoolctl import threadpool_limits
 
 import pachon
 from pachon.core.units import ARCSEC
-from pachon.pipeline.ccd_product import read_product
 from pachon.measure.shapes import measure_shapes
+from pachon.reconstruction.ccd_product import read_product
 
 PIXEL = 10.0e-6  # side of a pixel [m]
 WEIGHT = 0.7 * ARCSEC

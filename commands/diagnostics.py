@@ -95,10 +95,10 @@ def _compare(
     as_json: bool,
 ) -> None:
     """Compare a model of Piff with ours at the stars of a table."""
+    from ..pipeline.report.tables import PIFF_CAPTION, PIFF_COLUMNS, piff_rows
     from ..reconstruction.own_stars.star_catalogue import load_stars
     from ..reconstruction.piff.comparison import compare_with_piff
     from ..reconstruction.piff.psf import load_piff
-    from ..pipeline.report.tables import PIFF_CAPTION, PIFF_COLUMNS, piff_rows
 
     folder = stars.with_name(f"{stars.stem}_piff") if out is None else out
     with interruptible(quiet) as reporter, reporter.stage(f"PSF of {stars.name}"):

@@ -49,8 +49,8 @@ def model_command(
     from ..core.plotting import png_bytes
     from ..core.table_files import write_table
     from ..core.units import ARCSEC
-    from ..reconstruction.own_stars.star_catalogue import load_stars
     from ..reconstruction.own_stars.own_stars import fit_own_stars
+    from ..reconstruction.own_stars.star_catalogue import load_stars
 
     path = stars.with_name(f"{stars.stem}_psf.fits") if out is None else out
     with interruptible(quiet) as reporter, reporter.stage(f"PSF of {stars.name}"):

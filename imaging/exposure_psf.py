@@ -9,8 +9,8 @@ from typing import Any
 from ..core.errors import ConfigError
 from ..core.progress import Reporter
 from ..models.telescope import Telescope
-from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ..pipeline.focal_plane_stage import fit_focal_plane_model
+from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
 from .config import load_images_configuration
 from .image_file import CcdImage
 from .image_stars import focal_plane_stars

@@ -14,9 +14,9 @@ from ..core.units import ARCSEC, positive_angle
 from ..measure.catalogue.detect import detect_objects
 from ..measure.catalogue.objects import DetectedObjects
 from ..measure.catalogue.star_locus import StarSelection, select_stars
-from ..reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
 from ..measure.shapes import measure_shapes
 from ..measure.star_selection import flag_stars
+from ..reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
 from ..reconstruction.psf_model.checks import snr_weights
 from ..reconstruction.psf_model.model import PsfModel
 from .exposure import SATURATED

@@ -14,10 +14,10 @@ from ..core.arguments import check_arguments
 from ..core.threads import one_blas_thread
 from ..core.units import for_each, pure_numbers
 from ..pipeline.experiment import Experiment
-from ..reconstruction.psf_model.model import PsfModel
-from ..reconstruction.psf_model.polynomial import design_matrix
 from ..pipeline.resolved_values import noise_free_components
 from ..pipeline.simulate.ccd_exposure import expose_positions, holdout_positions
+from ..reconstruction.psf_model.model import PsfModel
+from ..reconstruction.psf_model.polynomial import design_matrix
 
 #: Pixels around a CCD that the PSF is extrapolated to, for galaxies whose light reaches the CCD.
 RIM = 40

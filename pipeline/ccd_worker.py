@@ -15,7 +15,7 @@ from ..core.errors import PachonError, ProductError
 from ..core.files import folder_of_worker, marked_folder, write_bytes
 from ..core.progress import Reporter
 from ..core.workers import MakeWorkers
-from .ccd_product import product_path
+from ..reconstruction.ccd_product import product_path
 from .experiment import Experiment
 from .memory import check_memory
 from .run_folder import write_ccd

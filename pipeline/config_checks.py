@@ -6,8 +6,8 @@ from ..core.errors import ConfigError
 from ..core.schema import json_text
 from ..models.media.silicon import WAVELENGTH_RANGE as SILICON_RANGE
 from ..models.telescope import Telescope
-from .config import Configuration, FocalPlaneConfig, StarsConfig
 from ..reconstruction.psf_model.polynomial import term_count
+from .config import Configuration, FocalPlaneConfig, StarsConfig
 from .resolved_values import noise_free_components, resolved_value
 from .sensor.brighter_fatter import PIXEL_SIZE as BRIGHTER_FATTER_PIXEL
 from .star_list import NAMES

@@ -14,7 +14,6 @@ from pydantic import BaseModel
 from ..core.errors import ConfigError, error_context
 from ..core.table_files import ENDINGS as STAR_ENDINGS
 from ..core.units import ARCSEC
-from ..models.parameters.changes import apply_changes
 from ..models.camera.camera import Camera
 from ..models.camera.cameras import CAMERAS, load_camera
 from ..models.camera.cameras import ENDINGS as CAMERA_ENDINGS
@@ -24,9 +23,11 @@ from ..models.io.heights.file import ENDINGS as HEIGHT_ENDINGS
 from ..models.io.heights.zernike_table import AS_MEASURED
 from ..models.io.prescription import ENDINGS, load_telescope
 from ..models.io.site_file import load_site
+from ..models.parameters.changes import apply_changes
 from ..models.site import Site
 from ..models.telescope import Telescope
 from ..raytrace.ideal_lens import require_image
+from ..reconstruction.psf_model.fit import COMPONENTS, ORDERS
 from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.psf.long_exposure import default_points
 from .alignment_states import ENDINGS as STATE_ENDINGS
@@ -34,7 +35,6 @@ from .alignment_states import with_active_optics_state
 from .config import BandName, Configuration, PsfConfig, ReconstructionConfig
 from .config_checks import WEIGHT_PIXELS, check_combinations
 from .photometry import band_of, pixel_angle, resolved_photometry
-from ..reconstruction.psf_model.fit import COMPONENTS, ORDERS
 from .resolved_values import resolved_value
 from .simulate.photometry import PROVISIONAL_FWHM, limiting_magnitude, saturation_magnitude
 from .simulate.screen_cover import check_screens

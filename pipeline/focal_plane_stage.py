@@ -16,11 +16,11 @@ import numpy as np
 from ..core.products import Stamp, read_fits, write_hdus
 from ..core.progress import Reporter
 from ..models.camera.focal_plane import FocalPlane
-from .ccd_product import CcdProduct, Stars, of_ccd_model, write_focal_plane_columns
-from .experiment import Experiment
+from ..reconstruction.ccd_product import CcdProduct, Stars, of_ccd_model, write_focal_plane_columns
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ..reconstruction.focal_plane_psf.stars import FocalPlaneStars
 from ..reconstruction.focal_plane_psf.static_heights import StaticHeights
+from .experiment import Experiment
 
 #: Name of the focal-plane model in the folder of a run.
 FOCAL_PLANE_PSF_NAME = "focal_plane_psf.fits"

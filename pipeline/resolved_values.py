@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TypeVar
 
 from ..core.errors import ConfigError
-from .config import Configuration
 from ..reconstruction.psf_model.fit import COMPONENTS
 from ..reconstruction.psf_model.polynomial import term_count
+from .config import Configuration
 
 _T = TypeVar("_T")
 

@@ -18,17 +18,17 @@ from ..core.second_process import Submit, second_process
 from ..core.threads import thread_count
 from ..core.version import VERSION
 from ..core.workers import MakeWorkers
-from .ccd_product import product_path, read_product
+from ..reconstruction.ccd_product import product_path, read_product
 from .ccd_worker import compute_ccds
 from .config import Configuration
 from .experiment import Experiment
 from .focal_plane_stage import apply_focal_plane_model, write_focal_plane_model
-from .summary import correlations, run_metrics
 from .memory import check_memory
 from .report.focal_plane_files import write_focal_plane
 from .report.report import build_report
 from .run_folder import SUMMARY_NAME, claim_run, finished_ccds, stamp_of, write_ccd
 from .simulate.ccd_loop import check_catalogue, simulate_ccds
+from .summary import correlations, run_metrics
 
 REPORT_NAME = "report.html"
 

@@ -9,7 +9,7 @@ from ..core.errors import PachonError, ProductError
 from ..core.files import claim_folder
 from ..core.products import Stamp
 from ..core.version import VERSION
-from .ccd_product import MODEL_CARD, product_path, read_product, write_product
+from ..reconstruction.ccd_product import MODEL_CARD, product_path, read_product, write_product
 from .config import Configuration, differences, load_configuration, to_yaml
 from .experiment import Experiment
 from .simulate.ccd_exposure import CcdExposure

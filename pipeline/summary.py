@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from ..core.statistics import finite_mean, finite_median, rms
 from ..core.units import ARCMIN, ARCSEC
-from .ccd_product import CCD_KINDS, CcdProduct, CcdStars, Stars
 from ..measure.correlation import SEPARATION_RANGES, Correlation, shear_correlation
+from ..reconstruction.ccd_product import CCD_KINDS, CcdProduct, CcdStars, Stars
 
 #: Ellipticities that are correlated; ``truth`` and ``away`` (noise-free - model) are of the holdout positions.
 CORRELATED = ("truth", "observed", "residual", "away")
@@ -74,7 +75,7 @@ def ccd_metrics(product: CcdProduct) -> dict[str, Any]:
         "y_mm": product.center[1] * 1e3,
         "field_deg": float(np.rad2deg(np.hypot(*field))),
         "stars_with_defects": int((observed.defects != 0).sum()),
-        "fwhm_arcsec": _median(holdout.fwhm) / ARCSEC,
+        "fwhm_arcsec": finite_median(holdout.fwhm) / ARCSEC,
         "pixels_rejected": product.model.n_rejected,
         "kink_observed": product.model.elbow,
         "kink_truth": product.noise_free_model.elbow,
@@ -93,7 +94,7 @@ def run_metrics(products: Sequence[CcdProduct], correlated: dict[str, Correlatio
     together = {
         "ccds": len(products),
         "snr_min": float(min(p.observed.snr.min() for p in products)),
-        "fwhm_arcsec": _median(fwhm),
+        "fwhm_arcsec": finite_median(fwhm),
         "fwhm_min_arcsec": float(np.nanmin(fwhm)),
         "fwhm_max_arcsec": float(np.nanmax(fwhm)),
         "max_e_truth": float(np.nanmax(np.hypot(*ellipticities(products, "truth")))),
@@ -134,19 +135,3 @@ def _chi2_away(products: Sequence[CcdProduct], key: str) -> float:
         np.concatenate([getattr(p.holdout, f"{start}{key}") for p in products]) for start in ("", "model_", "sigma_")
     )
     return finite_mean(((true - model) / sigma) ** 2)
-
-
-def finite_mean(values: np.ndarray) -> float:
-    """Return the mean of the finite values; NaN where there are none."""
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if finite.size else np.nan
-
-
-def rms(values: np.ndarray) -> float:
-    """Return the root of the mean square of the finite values; NaN where there are none."""
-    return float(np.sqrt(finite_mean(values**2)))
-
-
-def _median(values: np.ndarray) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if finite.size else np.nan

@@ -13,6 +13,7 @@ from ..core.errors import ConfigError, DomainError
 from ..core.plotting import BLUE, ORANGE, figure_at, plain_text, styled
 from ..core.result import Result
 from ..design.optimize.jacobian import ParameterColumns
+from ..design.optimize.sensitivity import sensitivity
 from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ..models.parameters.parameters import apply
 from ..models.parameters.tolerances import Tolerance
@@ -228,7 +229,7 @@ def prior_spreads(
     1 um rms over the field.
     """
     if prior is None:
-        return np.asarray(DEFAULT_PRIOR / freedoms.sensitivity(telescope, wavelength=wavelength).rms)
+        return np.asarray(DEFAULT_PRIOR / sensitivity(telescope, freedoms, wavelength=wavelength).rms)
     if isinstance(prior, Sequence) and prior and isinstance(prior[0], Tolerance):
         prior = {t.name: t.spread for t in prior if isinstance(t, Tolerance)}
     if isinstance(prior, Mapping):

@@ -14,9 +14,9 @@ from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError, shown
 from ..core.threads import one_blas_thread, thread_count
 from ..core.units import ARCSEC, metres, radians, require_count, require_positive
+from ..models.camera.focal_plane import FocalPlane
 from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ..models.parameters.tolerances import Tolerance
-from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..raytrace.rays import field_direction
 from ..wavefront.atmosphere.atmosphere import Atmosphere

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..core.errors import DomainError
 from ..design.metrics.field_zernikes import wavefront_zernikes
+from ..design.optimize.sensitivity import sensitivity
 from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ..models.zernike_polynomials import annular_zernikes
 from ..raytrace.launch import aimed_points
@@ -97,8 +98,8 @@ def fit_freedoms(
     """Fit degrees of freedom of the telescope with Gaussian priors of given standard deviations."""
     telescope, noll = instrument.telescope, instrument.noll
     jmax = int(noll.max())
-    sensitivity = freedoms.sensitivity(telescope, fields, instrument.middle, n_zernike=jmax, projection=projection)
-    maps = sensitivity.matrix[:, noll - 1]
+    response = sensitivity(telescope, freedoms, fields, instrument.middle, n_zernike=jmax, projection=projection)
+    maps = response.matrix[:, noll - 1]
     precision = prior**-2.0
     shifts = _shifts_by_freedoms(instrument, stars, freedoms, prior)
     every = [np.concatenate([np.eye(len(freedoms)), own]) for own in shifts]
@@ -120,7 +121,7 @@ def fit_freedoms(
         wavefront_zernikes(t, fields, instrument.middle, jmax=jmax, projection=projection).coefficients[:, noll - 1]
         for t in (telescope, after)
     )
-    response = freedoms.sensitivity(after, fields, instrument.middle, n_zernike=many, projection=projection)
+    response = sensitivity(after, freedoms, fields, instrument.middle, n_zernike=many, projection=projection)
     return JointFit(tuple(moved), joint, found - before, response.matrix[:, noll - 1])
 
 

@@ -19,12 +19,12 @@ from ..core.schema import problems_of
 from ..core.yaml_reader import line_of, read_mapping
 from ..design.analyses.coatings import Coatings, CoatingsFile
 from ..design.optimize.optimize_file import OptimizeFile, load_optimization
-from ..models.parameters.degrees_of_freedom_file import DegreesOfFreedomFile, load_degrees_of_freedom
 from ..imaging.config import ImagesConfig, load_images_configuration
 from ..models.camera.focal_plane import FocalPlane
 from ..models.io.prescription import ENDINGS, load_telescope
 from ..models.io.site_file import SiteFile, load_site
 from ..models.io.yaml.reader import MAX_BYTES, Prescription
+from ..models.parameters.degrees_of_freedom_file import DegreesOfFreedomFile, load_degrees_of_freedom
 from ..pipeline.config import Configuration, load_configuration, with_run
 from ..pipeline.experiment import Experiment
 from .alignment.config import AlignConfig, load_align_configuration

@@ -17,7 +17,11 @@ from ..tables import Column
 from .command import Given, Outcome, design_command
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from ...design.optimize.operand import Operand
+    from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
+    from ...models.parameters.parameters import Parameter
 
 _ADDRESSES = "Separated by commas: M2.dx, Camera.* (six motions), M1.radius, M1.conic, M1.a6, M1.Z4-22, L1_entrance.n"
 
@@ -70,12 +74,12 @@ def sensitivity(
     if parameters is not None and degrees_of_freedom is not None:
         raise ConfigError("--parameters and --degrees-of-freedom are both given: expected one of them")
     telescope, *where = given.where
-    how = dict(n_zernike=zernikes, **given.how)
+    variables: DegreesOfFreedom | Iterable[str | Parameter]
     if degrees_of_freedom is not None:
-        result = load_degrees_of_freedom(degrees_of_freedom).sensitivity(telescope, *where, **how)
+        variables = load_degrees_of_freedom(degrees_of_freedom)
     else:
-        chosen = usual_parameters(telescope) if parameters is None else name_list(parameters, "--parameters")
-        result = compute(telescope, chosen, *where, **how)
+        variables = usual_parameters(telescope) if parameters is None else name_list(parameters, "--parameters")
+    result = compute(telescope, variables, *where, n_zernike=zernikes, **given.how)
     path = out or Path(f"sensitivity_{telescope.name}.fits")
     write_sensitivity(path, result)
     values, _ = result.modes()

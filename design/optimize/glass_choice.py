@@ -14,8 +14,8 @@ from ...core.result import Result
 from ...core.units import require_count
 from ...models.io.glass_catalogue import GlassCatalogue
 from ...models.media.medium import LINE_D, Medium, abbe_number
-from ...models.telescope import VACUUM, Telescope
 from ...models.parameters.parameters import Parameter
+from ...models.telescope import VACUUM, Telescope
 from .optimize import optimize
 from .optimum import Optimum
 

@@ -7,6 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...models.media.medium import LINE_D
+from ...models.parameters.links import has_links, without_links
+from ...models.parameters.parameters import Parameter, apply, index_surfaces, linked, shapes_with_terms, twists
+from ...models.parameters.shape_terms import term_polynomial
 from ...models.shapes.polar_polynomial import PolarPolynomial
 from ...models.telescope import Telescope
 from ...raytrace.adjoint.adjoint_matrix import AdjointMatrix, column_table, polynomial_terms
@@ -14,9 +17,6 @@ from ...raytrace.adjoint.backward_pass import OutputGradient, backward_pass
 from ...raytrace.adjoint.forward_pass import ForwardPass
 from ...raytrace.adjoint.sphere_adjoint import SPHERE_COLUMNS
 from ...wavefront.reference_sphere import plane_distance_derivatives, sphere_distance_derivatives
-from ...models.parameters.links import has_links, without_links
-from ...models.parameters.parameters import Parameter, apply, index_surfaces, linked, shapes_with_terms, twists
-from ...models.parameters.shape_terms import term_polynomial
 
 #: Kinds of parameters that change the index of a medium.
 _MEDIA = ("index", "abbe")

@@ -13,10 +13,10 @@ from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, check_choice
 from ...core.plotting import BLUE, GREY, RED, figure_at, plain_text, styled
 from ...core.result import Result
-from ...models.telescope import Telescope
-from ...wavefront.pupil_sampling import PupilSampling
 from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...models.parameters.tolerances import Tolerance, draw
+from ...models.telescope import Telescope
+from ...wavefront.pupil_sampling import PupilSampling
 from .merit import Beams, Merit, SpotMerit, WavefrontMerit
 from .sensitivity import field_rings
 from .toleranced_merit import TolerancedMerit

@@ -14,11 +14,11 @@ from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, PachonError, shown
 from ...core.threads import one_blas_thread
 from ...core.units import require_count
+from ...models.parameters.parameters import Parameter, resolved
 from ...models.paraxial import with_true_aperture
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
 from ...wavefront.pupil_sampling import PupilSampling
-from ...models.parameters.parameters import Parameter, resolved
 from .configuration import DesignConfiguration, configurations
 from .jacobian import ParameterColumns
 from .merit import Beams, Merit, SpotMerit, WavefrontMerit

@@ -37,8 +37,8 @@ from ...core.schema import Count, Positive, Real, Section, Whole, validated
 from ...core.yaml_reader import read_mapping
 from ...models.io.glass_catalogue import GlassCatalogue
 from ...models.io.prescription import load_telescope
-from ...models.telescope import Telescope
 from ...models.parameters.changes import ANGLES, LENGTHS, parse_change
+from ...models.telescope import Telescope
 from . import geometry_operands, ray_operands, targets
 from .configuration import DesignConfiguration
 from .operand import OPERANDS, GoalOperand, Operand

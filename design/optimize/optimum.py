@@ -9,8 +9,8 @@ import numpy as np
 
 from ...core.plotting import BLUE, GREY, figure_at, plain_text, styled
 from ...core.result import Result, Values
-from ...models.telescope import Telescope
 from ...models.parameters.parameters import Parameter
+from ...models.telescope import Telescope
 from .before_after import draw_before_after
 from .operand import Operand
 

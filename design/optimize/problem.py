@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ...core.errors import PachonError
-from ...models.telescope import Telescope
 from ...models.parameters.parameters import apply
+from ...models.telescope import Telescope
 from .jacobian import ParameterColumns
 from .merit import Merit
 from .operand import Operand

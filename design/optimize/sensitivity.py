@@ -14,12 +14,13 @@ from ...core.errors import DomainError
 from ...core.plotting import BLUE, figure_at, plain_text, styled
 from ...core.threads import one_blas_thread
 from ...core.units import field_label, require_count
+from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
+from ...models.parameters.parameters import Parameter, ParameterVector, Variables, parse_parameters
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import MOST_TERMS, annular_zernikes
 from ...raytrace.rays import RayStatus
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
-from ...models.parameters.parameters import Parameter, ParameterVector, Variables, parse_parameters
 from ..result import FieldResult
 from .jacobian import ParameterColumns
 from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
@@ -157,7 +158,7 @@ def field_rings(telescope: Telescope) -> np.ndarray:
 @check_arguments
 def sensitivity(
     telescope: Telescope,
-    parameters: Iterable[str | Parameter],
+    parameters: DegreesOfFreedom | Iterable[str | Parameter],
     fields: ArrayLike | None = None,
     wavelength: ArrayLike | None = None,
     *,
@@ -177,9 +178,8 @@ def sensitivity(
     ----------
     telescope, fields, wavelength, sampling, n_pupil, projection, threads
         As in :meth:`pachon.Request.of`, but for the defaults: 31 field points (:func:`field_rings`), and 12 rings.
-    parameters : iterable of str or Parameter
-        Parameters, see :mod:`~pachon.models.parameters.parameters`; for degrees of freedom see
-        :meth:`DegreesOfFreedom.sensitivity`.
+    parameters : DegreesOfFreedom, or iterable of str or Parameter
+        What changes: degrees of freedom, each in its own unit, or parameters (:mod:`~.models.parameters.parameters`).
     n_zernike : int
         Highest Noll index.
 
@@ -190,10 +190,16 @@ def sensitivity(
     UnknownNameError, ConfigError
         If an address is unknown.
     """
-    chosen = parse_parameters(parameters, telescope)
+    variables: Variables
+    if isinstance(parameters, DegreesOfFreedom):
+        variables = parameters
+        prepared, addresses, of_parameters = parameters.parameter_matrix(telescope)
+    else:
+        prepared, addresses, of_parameters = telescope, parse_parameters(parameters, telescope), None
+        variables = ParameterVector(addresses)
     n_zernike = require_count(n_zernike, "n_zernike", 1, MOST_TERMS)
     request = Request.of(
-        telescope,
+        prepared,
         field_rings(telescope) if fields is None else fields,
         wavelength,
         sampling=sampling,
@@ -204,10 +210,10 @@ def sensitivity(
     )
     points, pupil, (x, y) = request.fields, request.pupil, request.unit_pupil.T
     terms = annular_zernikes(n_zernike, x, y, telescope.pupil_obscuration)
-    columns = ParameterColumns.at(telescope, chosen)
+    columns = ParameterColumns.at(prepared, addresses)
     weights = columns.weights_at(request.wavelength)
     zernikes = np.empty((len(points), n_zernike))
-    matrix = np.empty((len(points), n_zernike, len(chosen)))
+    matrix = np.empty((len(points), n_zernike, len(addresses)))
     weighted, by_ray = pupil.weights * terms, np.ascontiguousarray(terms.T)
 
     def products(rays: np.ndarray) -> np.ndarray:
@@ -238,4 +244,6 @@ def sensitivity(
         terms_size = np.max(wavefronts.map(fit), axis=0) @ np.abs(weights)
     # Rotation about the axis has no effect; its rounding errors become zero.
     matrix[:, :, np.abs(matrix).max(axis=(0, 1)) < _ROUNDING * terms_size] = 0.0
-    return Sensitivity(request, ParameterVector(chosen), telescope.pupil_obscuration, matrix, zernikes)
+    if of_parameters is not None:
+        matrix = matrix @ of_parameters
+    return Sensitivity(request, variables, telescope.pupil_obscuration, matrix, zernikes)

@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 
 from ...core.errors import DomainError, PachonError
-from ...models.telescope import Telescope
 from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...models.parameters.parameters import Parameter, apply
 from ...models.parameters.tolerances import Tolerance
+from ...models.telescope import Telescope
 from .jacobian import ParameterColumns
 from .merit import Merit
 from .optimize import NO_EFFECT

@@ -9,9 +9,9 @@ import numpy as np
 
 from ...core.errors import ConfigError, DomainError, UnknownNameError, check_unique
 from ...core.random_streams import stream
-from ...models.telescope import Telescope
 from ...models.parameters.links import followers, quantity_of
 from ...models.parameters.parameters import Parameter, parse_parameters
+from ...models.telescope import Telescope
 from .geometry_operands import clear_radius
 
 #: Largest slope of default bounds of curvatures: clear radius over radius of curvature.

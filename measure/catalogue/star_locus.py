@@ -14,7 +14,7 @@ from ...core.errors import DomainError
 from ...core.point_plots import draw_points
 from ...core.result import Result
 from ...core.units import real_array, require_count, require_positive
-from ...pipeline.simulate.stamps import center_stamps
+from ..stamps import center_stamps
 from .cutouts import cut_out, first_pixel
 from .objects import DetectedObjects
 from .pixel_checks import flagged

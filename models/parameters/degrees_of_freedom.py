@@ -22,7 +22,6 @@ from ...core.units import pure_numbers
 from ..shapes.shape import Shape
 from ..shapes.sum import Sum
 from ..telescope import Telescope
-from ...design.optimize.sensitivity import Sensitivity, sensitivity
 from .parameters import Parameter, apply, parse_parameters
 
 #: Base units of values.
@@ -256,18 +255,6 @@ class DegreesOfFreedom:
                 for one in found:
                     rows.setdefault(one, np.zeros(len(self)))[column] += weight * size
         return bending.telescope, parse_parameters(rows, bending.telescope), np.array(list(rows.values()))
-
-    def sensitivity(
-        self, telescope: Telescope, fields: ArrayLike | None = None, wavelength: ArrayLike | None = None, **options: Any
-    ) -> Sensitivity:
-        """Return the sensitivity matrix of the wavefront to the degrees of freedom.
-
-        It is in metres of wavefront per unit of each degree of freedom, in the order of the vector. Arguments are those
-        of :func:`~pachon.design.optimize.sensitivity.sensitivity`.
-        """
-        prepared, parameters, matrix = self.parameter_matrix(telescope)
-        found = sensitivity(prepared, parameters, fields, wavelength, **options)
-        return replace(found, parameters=self, matrix=found.matrix @ matrix)
 
 
 class _Bending:

@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ...core.plotting import new_figure, plain_text, styled
+from ...measure.focal_plane_axes import ccd_corners, draw_outlines, frame_axes
 from ...models.camera.camera import Camera
-from .focal_plane_axes import ccd_corners, draw_outlines, frame_axes
 
 # Part of the width of a CCD that its name fills, and width of a letter over its height.
 _FILLED, _LETTER = 0.8, 0.62

@@ -19,11 +19,13 @@ from astropy.table import Table
 from ...core.errors import PachonError, ProductError
 from ...core.files import make_folder, write_bytes, write_json
 from ...core.products import Stamp, described_table, write_ecsv
-from ..ccd_product import CCD_KINDS, KINDS, CcdProduct, Stars, product_path, read_product
+from ...measure.correlation import Correlation
+from ...measure.correlation_plots import correlation_columns, rho_plot
+from ...measure.rho_statistics import RhoStatistics, rho_statistics, trace_of_moments
+from ...reconstruction.ccd_product import CCD_KINDS, KINDS, CcdProduct, Stars, product_path, read_product
 from ..config import load_configuration
 from ..experiment import Experiment
-from ...measure.correlation import Correlation
-from ...measure.rho_statistics import RhoStatistics, rho_statistics, trace_of_moments
+from ..run_folder import CONFIG_NAME, SUMMARY_NAME, stamp_of
 from ..summary import (
     correlations,
     ellipticities,
@@ -33,9 +35,8 @@ from ..summary import (
     rms,
     separation_bins,
 )
-from ..run_folder import CONFIG_NAME, SUMMARY_NAME, stamp_of
 from .focal_plane_plots import residual_plot
-from .statistics_plots import correlation_plot, rho_plot
+from .statistics_plots import correlation_plot
 
 #: Residuals: at the stars, leave-one-out, and at holdout positions.
 RESIDUALS = ("residual", "left_out", "away")
@@ -215,23 +216,3 @@ def _overall_metrics(
         for key, values in (("r_arcmin", r), ("xi_plus", correlation.xi_plus), ("error_plus", correlation.error_plus)):
             metrics[f"largest_{kind}_{key}"] = np.nan if largest is None else float(values[largest])
     return metrics
-
-
-def correlation_columns(correlated: Mapping[str, Correlation]) -> dict[str, tuple[np.ndarray, str, str]]:
-    """Return correlations as the columns of one table, one after the other, by the name of each."""
-    each = [c.as_dict() for c in correlated.values()]
-
-    def together(key: str) -> np.ndarray:
-        return np.concatenate([c[key] for c in each])
-
-    kinds = np.repeat(list(correlated), [len(c["r_arcmin"]) for c in each])
-    by = "jackknife over the CCDs" if next(iter(correlated.values())).n_patches else "scatter of the ellipticities"
-    return {
-        "kind": (kinds, "", "what is correlated"),
-        "r_arcmin": (together("r_arcmin"), "arcmin", "mean separation"),
-        "xi_plus": (together("xi_plus"), "", "mean of Re(e e'*)"),
-        "error_plus": (together("error_plus"), "", f"standard error by {by}"),
-        "xi_minus": (together("xi_minus"), "", "mean of Re(e e' exp(-4 i phi))"),
-        "error_minus": (together("error_minus"), "", f"standard error by {by}"),
-        "pairs": (together("pairs"), "", "pairs of stars"),
-    }

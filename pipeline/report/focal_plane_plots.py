@@ -14,11 +14,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from ...core.plotting import new_figure, png_bytes, styled
-from ...models.camera.camera import Camera
-from ...models.camera.focal_plane import FocalPlane
-from ..ccd_product import CcdStars, Stars
-from ..summary import ellipticities
-from .focal_plane_axes import (
+from ...measure.focal_plane_axes import (
     AWAY,
     OBSERVED,
     RESIDUAL,
@@ -34,6 +30,10 @@ from .focal_plane_axes import (
     key_ellipticity,
     whiskers,
 )
+from ...models.camera.camera import Camera
+from ...models.camera.focal_plane import FocalPlane
+from ...reconstruction.ccd_product import CcdStars, Stars
+from ..summary import ellipticities
 
 #: More CCDs than this are many: each is small on the page.
 _MANY = 30

@@ -10,10 +10,10 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, plain_text, styled
+from ...measure.focal_plane_axes import draw_outlines, frame_axes
 from ...models.camera.camera import Camera
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_statistics import height_statistics, sampled_heights
-from .focal_plane_axes import draw_outlines, frame_axes
 
 _COLOURS = (RED, BLUE, ORANGE, PURPLE, GREY)
 # Pixels of the map along a side, and the percentile of |height| at the ends of its scale: a few corners go far beyond.

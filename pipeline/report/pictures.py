@@ -11,11 +11,11 @@ import numpy as np
 
 from ...core.page import Picture
 from ...core.second_process import Submit
-from ..ccd_product import CcdProduct, CcdStars
-from ..experiment import Experiment
 from ...measure.correlation import Correlation
-from ..summary import CORRELATED, has_focal_plane_model
+from ...reconstruction.ccd_product import CcdProduct, CcdStars
+from ..experiment import Experiment
 from ..resolved_values import noise_free_components
+from ..summary import CORRELATED, has_focal_plane_model
 from .focal_plane_plots import close_up_plot, heights_plot, whiskers_plot
 from .psf_plots import eigen_psf_plot, spectrum_plot, stamps_plot
 from .statistics_plots import correlation_plot, models_plot, scatter_plot

@@ -6,14 +6,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, figure_at, new_figure, png_bytes, styled
-from ..ccd_product import CcdStars
+from ...core.plotting import new_figure, png_bytes, styled
 from ...measure.correlation import Correlation
-from ...measure.rho_statistics import RhoStatistics
+from ...measure.correlation_plots import draw_correlation, log_axes
+from ...measure.focal_plane_axes import AWAY, CCD_MODEL, LEFT_OUT, OBSERVED, RESIDUAL, RESIDUAL_TITLES, TRUTH
+from ...reconstruction.ccd_product import CcdStars
 from ..summary import ellipticities
-from .focal_plane_axes import AWAY, CCD_MODEL, LEFT_OUT, OBSERVED, RESIDUAL, RESIDUAL_TITLES, TRUTH
 
 _LABELS = {
     "truth": (TRUTH, "o", "noise-free PSFs, at holdout positions"),
@@ -21,13 +20,6 @@ _LABELS = {
     "residual": (RESIDUAL, "D", "observed - model, at the stars"),
     "left_out": (LEFT_OUT, "v", "observed - model fitted without the star"),
     "away": (AWAY, "^", "noise-free - model, at holdout positions"),
-}
-_RHO_STYLES = {
-    "rho1": (RED, "D", "$\\rho_1 = \\langle\\delta e^*\\,\\delta e\\rangle$"),
-    "rho2": (BLUE, "s", "$\\rho_2 = \\langle e^*\\,\\delta e\\rangle$"),
-    "rho3": (ORANGE, "^", "$\\rho_3 = \\langle (e\\,\\delta T/T)^* (e\\,\\delta T/T)\\rangle$"),
-    "rho4": (PURPLE, "v", "$\\rho_4 = \\langle\\delta e^* (e\\,\\delta T/T)\\rangle$"),
-    "rho5": (GREY, "o", "$\\rho_5 = \\langle e^* (e\\,\\delta T/T)\\rangle$"),
 }
 
 
@@ -121,58 +113,3 @@ def models_plot(correlated: Mapping[str, Correlation]) -> bytes:
         low, high = panels[0].get_ylim()
         panels[0].set_ylim(max(low, 1e-10), 2.0 * high)
         return png_bytes(figure)
-
-
-def rho_plot(rho: Mapping[str, RhoStatistics]) -> bytes:
-    """Draw rho statistics as PNG; see :func:`draw_rho`."""
-    return png_bytes(draw_rho(None, rho))
-
-
-def draw_rho(ax: Axes | Figure | None, rho: Mapping[str, RhoStatistics]) -> Figure:
-    """Draw rho statistics, grouped as in Jarvis et al. 2016, one row for each residual or other name."""
-    with styled():
-        figure = figure_at(ax, 11.0, 4.1 * len(rho) + 0.5)
-        panels = figure.subplots(len(rho), 2, sharex=True, sharey="col", squeeze=False)
-        for row, (kind, statistics) in zip(panels, rho.items(), strict=True):
-            found = dict(statistics.items())
-            for axes, names in zip(row, (("rho1", "rho3", "rho4"), ("rho2", "rho5")), strict=True):
-                for name in names:
-                    draw_correlation(axes, found[name], "plus", *_RHO_STYLES[name])
-                log_axes(axes, RESIDUAL_TITLES.get(kind, kind))
-                axes.legend(loc="best")
-            row[0].set_ylabel("$|\\rho|$: filled positive, open negative")
-        for axes in panels[0]:
-            low, high = axes.get_ylim()
-            axes.set_ylim(max(low, 1e-12), 2.0 * high)
-        for axes in panels[-1]:
-            axes.set_xlabel("separation [arcmin]")
-        return figure
-
-
-def log_axes(axes: Axes, title: str) -> None:
-    """Give axes logarithmic scales, a grid and a title."""
-    axes.set(xscale="log", yscale="log", axisbelow=True)
-    axes.set_title(title, loc="left")
-    axes.grid(True, which="major", color="0.9", linewidth=0.6)
-
-
-def draw_correlation(axes: Axes, correlation: Correlation, sign: str, color: str, marker: str, label: str) -> None:
-    """Draw one correlation of a sign, ``plus`` or ``minus``, with error bars: negative values with open symbols."""
-    r = correlation.r_arcmin
-    xi, error = getattr(correlation, f"xi_{sign}"), getattr(correlation, f"error_{sign}")
-    size = np.abs(xi)
-    some = np.isfinite(xi) & (size > 0.0)
-    # On a logarithmic scale an error bar cannot go through zero: it ends at a tenth of the value instead.
-    below = np.minimum(error, 0.9 * size)
-    axes.errorbar(r[some], size[some], [below[some], error[some]], fmt="none", ecolor=color, elinewidth=0.7, alpha=0.6)
-    axes.plot(r[some], size[some], "-", color=color, linewidth=0.6, alpha=0.5)
-    for chosen, face in ((some & (xi > 0.0), color), (some & (xi < 0.0), "white")):
-        axes.plot(
-            r[chosen],
-            size[chosen],
-            marker,
-            color=color,
-            markersize=4.5,
-            markerfacecolor=face,
-            label=label if face == color else None,
-        )

@@ -7,9 +7,9 @@ from typing import Any
 
 from astropy.table import Table
 
+from ...measure.correlation import SEPARATION_RANGES
 from ...models.camera.camera import Camera
 from ...models.camera.height_statistics import HeightStatistics
-from ...measure.correlation import SEPARATION_RANGES
 from ..summary import CORRELATED
 
 _NAMES = {

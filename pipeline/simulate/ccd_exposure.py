@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from ...core.errors import DomainError
+from ...measure.shapes import measure_shapes
 from ...models.camera.camera import Camera
 from ...models.ideal_telescope import ideal_telescope
 from ...models.star_spectrum import blackbody_photons
@@ -17,7 +18,6 @@ from ...wavefront.psf.engine import center_focal_length
 from ...wavefront.psf.engines import ENGINES
 from ...wavefront.psf.psf import make_psfs
 from ..experiment import Experiment
-from ...measure.shapes import measure_shapes
 from ..resolved_values import resolved_value
 from ..sensor.displacement import displace_stamps
 from .photometry import PROVISIONAL_FWHM, electrons, limiting_magnitude

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..ccd_product import CcdProduct, HoldoutStars, ObservedStars
-from ..experiment import Experiment
 from ...measure.shapes import Shapes, fwhm, measure_shapes
 from ...measure.star_selection import require_stars
+from ...reconstruction.ccd_product import CcdProduct, HoldoutStars, ObservedStars
 from ...reconstruction.psf_model.checks import snr_weights
 from ...reconstruction.psf_model.model import CLIP_SIGMA, PsfModel
+from ..experiment import Experiment
 from ..resolved_values import least_star_count, noise_free_components, resolved_value
 from .ccd_exposure import CcdExposure, ccd_stars
 from .ccd_observation import Observation, collected_images, observe_ccd

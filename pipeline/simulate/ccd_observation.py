@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...core.random_streams import stream
-from ..experiment import Experiment
 from ...measure.shapes import Shapes, measure_shapes
+from ...measure.stamps import center_stamps, observe_stamps
 from ...measure.star_selection import StarFlag, flag_stars
+from ..experiment import Experiment
 from ..sensor.brighter_fatter import brighter_fatter
 from .photometry import instrument_noise, sky_electrons_per_pixel
-from .stamps import center_stamps, observe_stamps
 from .star_defects import add_defects
 
 

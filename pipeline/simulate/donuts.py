@@ -14,11 +14,11 @@ from ...core.plotting import draw_stamps
 from ...core.random_streams import stream
 from ...core.result import Result
 from ...core.units import ARCSEC, for_each, pure_numbers, radians, require_seed
+from ...measure.stamps import observe_stamps
 from ...models.camera.photometry import READ_NOISE
 from ...models.telescope import Telescope
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.psf.psf import Psfs, make_psfs
-from .stamps import observe_stamps
 from .star_defects import add_defects
 
 if TYPE_CHECKING:

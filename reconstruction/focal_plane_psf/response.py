@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
 from ...core.units import ARCSEC, angle, length, metres, positive_angle, radians
+from ...measure.shapes import measure_shapes
 from ...models.camera.camera import Camera
 from ...models.camera.cameras import load_camera
 from ...models.camera.focal_plane import FocalPlane
@@ -29,7 +30,6 @@ from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.clear_pupil import has_only_annuli
 from ...wavefront.psf.psf import make_psfs
-from ...measure.shapes import measure_shapes
 from .height_series import HeightSeries, level_plane
 
 #: Noll terms of the residual wavefront of an exposure, each constant and linear over the field.

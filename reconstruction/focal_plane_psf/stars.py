@@ -19,8 +19,8 @@ from ...core.files import parsing, require_file
 from ...core.point_plots import draw_points
 from ...core.result import Result
 from ...core.units import ARCSEC
-from ...pipeline.ccd_product import CcdProduct, ObservedStars, read_product
 from ...measure.shapes import Shapes, measure_shapes
+from ..ccd_product import CcdProduct, ObservedStars, read_product
 from .covariance import Places
 from .mosaic import Mosaic
 

@@ -14,12 +14,12 @@ from ...core.errors import DomainError
 from ...core.random_streams import stream
 from ...core.units import positive_angle, real_array, require_seed
 from ...measure.shapes import Shapes, fwhm, measure_shapes
+from ...measure.stamps import center_stamps
 from ...measure.star_selection import StarFlag, flag_stars, require_stars
 from ..psf_model import kriging
 from ..psf_model.checks import as_extent
 from ..psf_model.model import PsfModel
 from ..psf_model.polynomial import as_positions
-from ...pipeline.simulate.stamps import center_stamps
 from .candidates import CANDIDATES, KRIGING, choose_candidate
 from .result import OwnStars
 

@@ -14,12 +14,12 @@ from ...core.plotting import BLUE, ORANGE, RED, figure_at, plain_text, styled
 from ...core.products import Columns, described_table
 from ...core.result import Result
 from ...core.units import ARCMIN, ARCSEC
+from ...measure.focal_plane_axes import draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
 from ...measure.rho_statistics import RhoStatistics, rho_statistics
 from ...measure.shapes import Shapes, fwhm
 from ...measure.star_selection import StarFlag
 from ..psf_model.model import PsfModel
-from ...pipeline.report.focal_plane_axes import draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
-from ...pipeline.report.psf_plots import StampGallery, stretched
+from ..stamp_gallery import StampGallery, stretched
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -44,7 +44,7 @@ def load_stars(
 ) -> StarCutouts:
     """Read stars from a FITS or ECSV table.
 
-    Nothing is subtracted, shifted or left out: :func:`~pachon.pipeline.simulate.stamps.center_stamps` centres stars,
+    Nothing is subtracted, shifted or left out: :func:`~pachon.measure.stamps.center_stamps` centres stars,
     :func:`~pachon.measure.star_selection.flag_stars` finds those to leave out.
 
     Parameters

@@ -16,16 +16,15 @@ from ...core.arguments import check_arguments
 from ...core.files import make_folder, write_bytes, write_json
 from ...core.products import Columns, described_table, write_ecsv
 from ...core.result import Result
+from ...core.statistics import finite_mean, rms
 from ...core.table_files import write_table
 from ...core.units import ARCSEC, pure_numbers
+from ...measure.correlation_plots import correlation_columns, draw_rho, rho_plot
 from ...measure.rho_statistics import RhoStatistics, trace_of_moments
 from ...measure.shapes import Shapes, measure_shapes
-from ...pipeline.summary import finite_mean, rms
 from ..own_stars.own_stars import FEWEST_STARS, fit_own_stars
 from ..own_stars.result import OwnStars, part_of, star_rho_statistics
 from ..psf_model.polynomial import as_positions
-from ...pipeline.report.diagnostics import correlation_columns
-from ...pipeline.report.statistics_plots import draw_rho, rho_plot
 from .psf import PiffPsf
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from ...core.units import ARCSEC
-from ...models.telescope import Telescope
 from ...measure.shapes import fwhm, measure_shapes
+from ...models.telescope import Telescope
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.opd import wavefront_opds
 from ...wavefront.psf.psf import make_psfs

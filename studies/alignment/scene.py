@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import ConfigError, error_context
+from ...design.optimize.sensitivity import sensitivity
+from ...models.io.prescription import ENDINGS, load_telescope, prescription_digest
 from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
-from ...models.io.prescription import ENDINGS, load_telescope, prescription_digest
 from ...models.telescope import Telescope
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.atmosphere.mean_wavefront import mean_wavefront_covariance
@@ -105,7 +106,7 @@ class AlignmentScene:
         The root of the sum of squares of a column is an rms over the field.
         """
         fields = self.quality.fields
-        matrix = self.freedoms.sensitivity(self.telescope, fields, self.wavelength, n_zernike=28).matrix[:, 3:]
+        matrix = sensitivity(self.telescope, self.freedoms, fields, self.wavelength, n_zernike=28).matrix[:, 3:]
         return np.asarray(matrix.reshape(-1, len(self.freedoms)) / np.sqrt(len(fields)))
 
     @cached_property
@@ -128,7 +129,7 @@ class AlignmentScene:
     def sensitivity(self) -> np.ndarray:
         """Zernikes of the donuts by the state [m per tolerance], shape [n_star * n_noll, n]."""
         last = int(NOLL[-1])
-        found = self.freedoms.sensitivity(self.telescope, self.stars.fields, self.wavelength, n_zernike=last)
+        found = sensitivity(self.telescope, self.freedoms, self.stars.fields, self.wavelength, n_zernike=last)
         return np.asarray((found.matrix[:, NOLL - 1] * self.tolerances).reshape(-1, len(self.freedoms)))
 
     @cached_property

@@ -22,17 +22,18 @@ import numpy as np
 
 from ...core.errors import DomainError
 from ...core.progress import Reporter
+from ...core.statistics import rms
 from ...core.units import ARCSEC
-from ...pipeline.ccd_product import CCD_KINDS, CcdProduct, CcdStars
+from ...measure.correlation import SEPARATION_RANGES, Correlation, jackknife_error
 from ...pipeline.config import Configuration
 from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_stage import apply_focal_plane_model
-from ...measure.correlation import SEPARATION_RANGES, Correlation, jackknife_error
-from ...pipeline.summary import correlations, ellipticities, has_focal_plane_model, rms
 from ...pipeline.memory import check_memory
 from ...pipeline.simulate.ccd_exposure import CcdExposure
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_model import model_ccd
+from ...pipeline.summary import correlations, ellipticities, has_focal_plane_model
+from ...reconstruction.ccd_product import CCD_KINDS, CcdProduct, CcdStars
 from .causes import FULL, NOISE, OPTICS, checked_causes, without
 
 _XI = ("truth", "observed", "residual", "away")

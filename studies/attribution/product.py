@@ -10,12 +10,11 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ...core.plotting import new_figure, png_bytes, styled
+from ...measure.correlation import SEPARATION_RANGES, Correlation
+from ...measure.correlation_plots import correlation_columns, log_axes
+from ...measure.focal_plane_axes import AWAY, RESIDUAL, TRUTH
 from ...pipeline.config import Configuration
 from ...pipeline.experiment import Experiment
-from ...measure.correlation import SEPARATION_RANGES, Correlation
-from ...pipeline.report.diagnostics import correlation_columns
-from ...pipeline.report.focal_plane_axes import AWAY, RESIDUAL, TRUTH
-from ...pipeline.report.statistics_plots import log_axes
 from ...pipeline.run_folder import stamp_of
 from ..product import write_products
 from .attribution import Attribution

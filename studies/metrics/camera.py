@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from ...core.units import ARCSEC
-from ...pipeline.focal_plane_stage import apply_focal_plane_model
 from ...measure.shapes import fwhm, measure_shapes
-from ...pipeline.summary import ccd_metrics
+from ...pipeline.focal_plane_stage import apply_focal_plane_model
 from ...pipeline.simulate.ccd_exposure import expose_ccd, expose_positions
 from ...pipeline.simulate.ccd_model import model_ccd
+from ...pipeline.summary import ccd_metrics
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.pupil_optics import trace_pupils
 from .metric import Metric, MetricTable

@@ -14,13 +14,13 @@ from ...core.errors import ConfigError, DomainError, unknown_name
 from ...core.schema import Positive, Real, Section
 from ...core.units import ARCMIN
 from ...design.metrics.distortion import Distortion, distortion
-from ...models.telescope import Telescope
-from ...pipeline.ccd_product import to_detector_axes
-from ...pipeline.experiment import Experiment
 from ...measure.correlation import Correlation, shear_correlation
 from ...measure.shapes import Shapes, measure_shapes
-from ...pipeline.summary import SHORTEST_ARCMIN
+from ...models.telescope import Telescope
+from ...pipeline.experiment import Experiment
 from ...pipeline.simulate.ccd_exposure import NoiseFreeStars, expose_positions, holdout_positions
+from ...pipeline.summary import SHORTEST_ARCMIN
+from ...reconstruction.ccd_product import to_detector_axes
 from ...wavefront.request import Request, field_points, wavelength_points
 
 #: Fields of a plan, in units of the field's radius: not symmetric under any symmetry of a telescope.

@@ -13,13 +13,13 @@ from scipy.spatial import cKDTree
 
 from ...core.units import ARCSEC
 from ...design.images.encircled_energy import energy_curve
-from ...pipeline.focal_plane_stage import apply_focal_plane_model
 from ...measure.correlation import SEPARATION_RANGES
-from ...pipeline.summary import correlations, run_metrics
-from ...reconstruction.psf_model.polynomial import design_matrix
+from ...pipeline.focal_plane_stage import apply_focal_plane_model
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_model import model_ccd
 from ...pipeline.simulate.photometry import effective_fwhm
+from ...pipeline.summary import correlations, run_metrics
+from ...reconstruction.psf_model.polynomial import design_matrix
 from ...wavefront.opd import wavefront_opd
 from ...wavefront.zernike import fit_zernikes
 from .metric import THROUGHPUT, Metric, MetricTable

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...pipeline.experiment import Experiment
+from ...pipeline.focal_plane_stage import fit_focal_plane_model
 from ...reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ...reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
-from ...pipeline.focal_plane_stage import fit_focal_plane_model
 from .plan import Case
 from .stars import ObservedCcd, SimulatedCcd, used_stars
 

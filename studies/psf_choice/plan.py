@@ -9,10 +9,10 @@ from itertools import product
 
 from ...core.errors import ConfigError
 from ...pipeline.config import Configuration
+from ...pipeline.resolved_values import resolved_value
 from ...reconstruction.psf_model.basis import BASES
 from ...reconstruction.psf_model.fit import COMPONENTS, ORDERS
 from ...reconstruction.psf_model.polynomial import term_count
-from ...pipeline.resolved_values import resolved_value
 
 #: Weights of the stars in the polynomials, as for :func:`~.snr_weights` (equal in the paper).
 POLYNOMIALS = ("equal", "snr", "softened")

@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ...core.plotting import new_figure, png_bytes, styled
+from ...measure.focal_plane_axes import AWAY, LEFT_OUT, OBSERVED, RESIDUAL, TRUTH
 from ...reconstruction.psf_model.basis import BASES
-from ...pipeline.report.focal_plane_axes import AWAY, LEFT_OUT, OBSERVED, RESIDUAL, TRUTH
 from .plan import FOCAL_PLANE, NOISE_FREE, POLYNOMIALS, PROCESSES, Case
 from .study import Study
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ...core.products import Columns
-from ...pipeline.config import Configuration
 from ...measure.correlation import SEPARATION_RANGES
+from ...pipeline.config import Configuration
 from ...pipeline.run_folder import stamp_of
 from ..product import write_products
 from .plan import FOCAL_PLANE, POLYNOMIALS, Case

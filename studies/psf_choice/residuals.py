@@ -11,11 +11,11 @@ import numpy as np
 from ...core.errors import DomainError
 from ...core.threads import one_blas_thread
 from ...core.units import ARCMIN
+from ...measure.correlation import SEPARATION_RANGES, jackknife_error, shear_correlation
+from ...measure.shapes import Shapes, measure_shapes
 from ...pipeline.experiment import Experiment
 from ...reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ...reconstruction.focal_plane_psf.mosaic import PsfShapes
-from ...measure.correlation import SEPARATION_RANGES, jackknife_error, shear_correlation
-from ...measure.shapes import Shapes, measure_shapes
 from ...reconstruction.psf_model.model import PsfModel
 from ...reconstruction.psf_model.polynomial import Extent, design_matrix
 from .plan import POLYNOMIALS, Case

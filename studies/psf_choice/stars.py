@@ -8,10 +8,9 @@ import numpy as np
 
 from ...core.progress import Reporter
 from ...core.random_streams import stream
-from ...pipeline.experiment import Experiment
 from ...measure.shapes import Shapes, measure_shapes
-from ...reconstruction.psf_model.checks import snr_weights
-from ...reconstruction.psf_model.model import CLIP_SIGMA, PsfModel
+from ...measure.stamps import observe_stamps
+from ...pipeline.experiment import Experiment
 from ...pipeline.simulate.ccd_exposure import CcdExposure
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_observation import Observation, collected_images, observe_ccd
@@ -22,8 +21,9 @@ from ...pipeline.simulate.photometry import (
     signal_to_noise,
     sky_electrons_per_pixel,
 )
-from ...pipeline.simulate.stamps import observe_stamps
 from ...pipeline.simulate.star_field import make_star_field
+from ...reconstruction.psf_model.checks import snr_weights
+from ...reconstruction.psf_model.model import CLIP_SIGMA, PsfModel
 from .plan import NOISE_FREE, PROCESSES, Case
 
 

@@ -19,10 +19,10 @@ from ...core.errors import ConfigError, DomainError, PachonError
 from ...core.progress import Reporter
 from ...pipeline.config import Configuration, with_options
 from ...pipeline.experiment import Experiment
-from ...reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ...pipeline.memory import check_memory
-from ...reconstruction.psf_model.model import PsfModel
 from ...pipeline.resolved_values import require_drawn_stars
+from ...reconstruction.focal_plane_psf.model import FocalPlanePsf
+from ...reconstruction.psf_model.model import PsfModel
 from .focal_plane import fit_focal_plane
 from .plan import FOCAL_PLANE, NOISE_FREE, PROCESSES, Case, Plan
 from .residuals import Residuals, case_metrics, measure_residuals

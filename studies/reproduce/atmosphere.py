@@ -12,10 +12,10 @@ from ...core.plotting import new_figure, png_bytes, styled
 from ...core.products import image_hdu, table_hdu
 from ...core.random_streams import stream
 from ...core.units import ARCMIN, ARCSEC
-from ...models.ideal_telescope import ideal_telescope
 from ...measure.correlation import Correlation, shear_correlation
+from ...measure.focal_plane_axes import TRUTH, draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
 from ...measure.shapes import fwhm, measure_shapes
-from ...pipeline.report.focal_plane_axes import TRUTH, draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
+from ...models.ideal_telescope import ideal_telescope
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.atmosphere.turbulence import long_exposure_fwhm
 from ...wavefront.psf.psf import make_psfs

@@ -10,13 +10,13 @@ from typing import Any
 from ...core.products import Stamp
 from ...core.progress import Reporter
 from ...core.workers import MakeWorkers
-from ...pipeline.ccd_product import CcdProduct, product_path, read_product
+from ...measure.correlation import Correlation
 from ...pipeline.config import Configuration, digest, with_options
 from ...pipeline.experiment import Experiment
-from ...measure.correlation import Correlation
-from ...pipeline.summary import correlations, run_metrics
 from ...pipeline.run import run
 from ...pipeline.run_folder import finished_ccds, stamp_of
+from ...pipeline.summary import correlations, run_metrics
+from ...reconstruction.ccd_product import CcdProduct, product_path, read_product
 from ..visits.config import VisitsConfig
 from ..visits.null_result import NullTest
 from ..visits.null_test import null_test

@@ -10,11 +10,7 @@ from scipy.spatial import cKDTree
 from ...core.plotting import new_figure, png_bytes, styled
 from ...core.products import Columns
 from ...core.units import ARCSEC
-from ...models.camera.camera import Camera
-from ...models.camera.focal_plane import FocalPlane
-from ...models.camera.height_budget import SIMULATED, SPECIFICATION, TERMS
-from ...measure.shapes import measure_shapes
-from ...pipeline.report.focal_plane_axes import (
+from ...measure.focal_plane_axes import (
     OBSERVED,
     TRUTH,
     draw_field_circle,
@@ -25,6 +21,10 @@ from ...pipeline.report.focal_plane_axes import (
     key_ellipticity,
     whiskers,
 )
+from ...measure.shapes import measure_shapes
+from ...models.camera.camera import Camera
+from ...models.camera.focal_plane import FocalPlane
+from ...models.camera.height_budget import SIMULATED, SPECIFICATION, TERMS
 from ...pipeline.report.focal_plane_plots import draw_heights, height_range, heights_plot
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.psf import make_psfs

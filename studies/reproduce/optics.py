@@ -14,12 +14,12 @@ from ...core.plotting import new_figure, png_bytes, styled
 from ...core.units import ARCSEC
 from ...design.images.encircled_energy import energy_curve
 from ...design.layout.sections import outer_radius, ray_paths, surface_section
+from ...measure.focal_plane_axes import OBSERVED, RESIDUAL, TRUTH, draw_field_circle, draw_outlines, frame_axes
 from ...models.camera.camera import Camera
 from ...models.first_order import first_order
 from ...models.io.prescription import load_telescope
 from ...models.surface import Surface
 from ...models.telescope import Telescope
-from ...pipeline.report.focal_plane_axes import OBSERVED, RESIDUAL, TRUTH, draw_field_circle, draw_outlines, frame_axes
 from ...raytrace.launch import launch_rays
 from ...wavefront.psf.psf import make_psfs
 from .bench import Bench

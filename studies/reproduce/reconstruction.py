@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...core.products import Columns, image_hdu, table_hdu
-from ...pipeline.ccd_product import CcdProduct
 from ...pipeline.report.focal_plane_plots import whiskers_plot
 from ...pipeline.report.pictures import closest_middle_farthest
 from ...pipeline.report.psf_plots import eigen_psf_plot, spectrum_plot
 from ...pipeline.report.statistics_plots import correlation_plot, scatter_plot
 from ...pipeline.report.tables import percent
+from ...reconstruction.ccd_product import CcdProduct
 from .bench import Bench
 from .figure import EcsvData, FitsData, Reproduced, figure
 from .focal_plane import optics_ellipticity

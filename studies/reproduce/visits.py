@@ -12,8 +12,8 @@ from ...imaging.config import ImagesConfig
 from ...imaging.draw import Window
 from ...imaging.preview import cutouts_png
 from ...imaging.scene import DEEP, draw_ccd
-from ...pipeline.config import with_options
 from ...measure.correlation import Correlation
+from ...pipeline.config import with_options
 from ...pipeline.simulate.ccd_exposure import expose_positions
 from ...pipeline.simulate.photometry import effective_fwhm, limiting_magnitude
 from ...sky.population import GalaxyPopulation

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...core.units import ARCSEC
+from ...measure.shapes import fwhm, measure_shapes
 from ...models.camera.focal_plane import FocalPlane
 from ...pipeline.experiment import Experiment
-from ...reconstruction.focal_plane_psf.height_series import HeightSeries
-from ...measure.shapes import fwhm, measure_shapes
 from ...pipeline.simulate.ccd_exposure import expose_positions
+from ...reconstruction.focal_plane_psf.height_series import HeightSeries
 
 #: Chebyshev nodes of the height: the widths of the engine are met to 1e-4 over +-40 um.
 _NODES = 9

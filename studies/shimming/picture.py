@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...core.plotting import figure_at, styled
+from ...measure.focal_plane_axes import draw_outlines, frame_axes
 from ...models.camera.focal_plane import FocalPlane
-from ...pipeline.report.focal_plane_axes import draw_outlines, frame_axes
 from ...pipeline.report.focal_plane_plots import draw_heights
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ...core.plotting import png_bytes
+from ...measure.correlation_plots import correlation_columns
 from ...pipeline.experiment import Experiment
-from ...pipeline.report.diagnostics import correlation_columns
 from ...pipeline.run_folder import stamp_of
 from ..product import write_products
 from .shim import Shims, shimmed_configuration

@@ -20,11 +20,11 @@ from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, check_choice
 from ...core.progress import Reporter
 from ...core.result import Result
+from ...measure.correlation import Correlation, shear_correlation
 from ...models.camera.focal_plane import FocalPlane
 from ...pipeline.config import Configuration, MotionConfig
 from ...pipeline.experiment import Experiment
 from ...reconstruction.focal_plane_psf.height_series import HeightSeries
-from ...measure.correlation import Correlation, shear_correlation
 from ...wavefront.chief_rays import fields_at
 from .curves import Places, focus_curves, measured
 from .pairs import PairSum, separation_edges

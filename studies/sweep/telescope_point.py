@@ -15,9 +15,9 @@ import numpy as np
 
 from ...core.errors import ConfigError, unknown_name
 from ...design.optimize.optimize import optimize
-from ...models.parameters.changes import apply_changes, parse_change
 from ...models.io.bundled import BUNDLED
 from ...models.io.prescription import load_telescope
+from ...models.parameters.changes import apply_changes, parse_change
 from ...models.telescope import Telescope
 from ...pipeline.config import Configuration, configuration_of
 from ..metrics.telescope import TELESCOPE_METRICS, TelescopeScene

@@ -10,13 +10,13 @@ import numpy as np
 
 from ...core.errors import ConfigError, error_context, unknown_name
 from ...design.optimize.geometry_operands import clear_radius
+from ...models.media.medium import abbe_number
 from ...models.parameters.changes import ANGLES, LENGTHS, parse_change
 from ...models.parameters.degrees_of_freedom import DegreeOfFreedom, DegreesOfFreedom, SurfaceDeformation
 from ...models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
 from ...models.parameters.links import followers
 from ...models.parameters.parameters import Parameter, resolved
 from ...models.parameters.tolerances import Tolerance
-from ...models.media.medium import abbe_number
 from ...models.shapes.polynomial import ZernikeSag
 from ...models.surface import Interaction
 from ...models.telescope import Telescope

@@ -8,8 +8,8 @@ import numpy as np
 
 from ...core.plotting import BLUE, GREY, ORANGE, new_figure, png_bytes, styled
 from ...core.units import ARCMIN
-from ...pipeline.report.focal_plane_axes import draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
-from ...pipeline.report.statistics_plots import draw_correlation, log_axes
+from ...measure.correlation_plots import draw_correlation, log_axes
+from ...measure.focal_plane_axes import draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
 from .null_result import NullTest, amplitude, density_slope, shot_noise
 from .stack import PsfStack
 from .stack_metrics import StackCorrelations

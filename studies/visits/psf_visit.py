@@ -14,7 +14,6 @@ from ...core.units import ARCSEC
 from ...models.telescope import Telescope
 from ...pipeline.config import with_options
 from ...pipeline.experiment import Experiment
-from ...reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
 from ...pipeline.focal_plane_stage import fit_focal_plane_model
 from ...pipeline.resolved_values import resolved_value
 from ...pipeline.simulate.ccd_exposure import CcdExposure, ccd_bounds
@@ -30,6 +29,7 @@ from ...pipeline.simulate.photometry import (
 )
 from ...pipeline.simulate.screen_cover import check_screens
 from ...pipeline.simulate.star_field import StarField, magnitudes_at
+from ...reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
 from .plan import Visit
 from .resample import resample_stamps
 from .sky_points import SkyPoints

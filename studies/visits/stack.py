@@ -16,8 +16,8 @@ from ...core.plotting import figure_at, styled
 from ...core.products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
 from ...core.result import Result
 from ...core.units import ARCMIN, ARCSEC
+from ...measure.focal_plane_axes import draw_whisker_panels
 from ...measure.shapes import Shapes, measure_shapes
-from ...pipeline.report.focal_plane_axes import draw_whisker_panels
 from .psf_visit import VisitPsfs
 
 if TYPE_CHECKING:

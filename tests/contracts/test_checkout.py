@@ -12,9 +12,9 @@ from hatchling.builders.sdist import SdistBuilder
 from hatchling.builders.wheel import WheelBuilder
 
 ROOT = Path(__file__).parents[2]
-WHEEL = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["build"]["targets"]["wheel"]
+BUILD = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["build"]
 #: Folders of the package that stand at the top level.
-TOP = [ROOT / name for name in WHEEL["only-include"]]
+TOP = [ROOT / name for name in BUILD["targets"]["wheel"]["only-include"]]
 
 
 @pytest.fixture
@@ -42,9 +42,7 @@ def test_a_checkout_imports_from_its_root(checkout):
 
 
 def test_every_file_is_installed():
-    built = {
-        file.relative_path: file.distribution_path for file in WheelBuilder(str(ROOT)).recurse_included_files()
-    }
+    built = {file.relative_path: file.distribution_path for file in WheelBuilder(str(ROOT)).recurse_included_files()}
     product = [
         path.relative_to(ROOT).as_posix()
         for folder in TOP

@@ -10,10 +10,10 @@ import pachon
 from pachon.core.errors import DomainError, PrescriptionError, PrescriptionWarning
 from pachon.design.optimize.jacobian import ParameterColumns
 from pachon.design.optimize.merit import Beams, SpotMerit, WavefrontMerit
-from pachon.models.parameters.parameters import parse_parameters
 from pachon.models.design_data import DesignData
 from pachon.models.first_order import first_order
 from pachon.models.media.medium import ConstantIndex
+from pachon.models.parameters.parameters import parse_parameters
 from pachon.models.shapes.shape import Conic, Plane
 from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM, Telescope

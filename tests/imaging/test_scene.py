@@ -13,8 +13,8 @@ from pachon.imaging.draw import Window
 from pachon.imaging.exposure import Exposure
 from pachon.imaging.image_file import OBJECT_COLUMNS, CcdImage
 from pachon.imaging.scene import STAR_ROOM, deep_exposures, draw_ccd, ellipticities, middle_window
-from pachon.pipeline.experiment import Experiment
 from pachon.measure.shapes import measure_shapes
+from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
 from pachon.sky.galaxies import Galaxies
 

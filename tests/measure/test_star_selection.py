@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from pachon.core.errors import DomainError
+from pachon.measure.stamps import observe_stamps
 from pachon.measure.star_selection import StarFlag, flag_stars
-from pachon.reconstruction.psf_model.model import PsfModel
-from pachon.pipeline.simulate.stamps import observe_stamps
 from pachon.pipeline.simulate.star_defects import add_defects
+from pachon.reconstruction.psf_model.model import PsfModel
 
 SIZE, GRID = 31, 128
 SKY, READ = 400.0, 9.0

@@ -8,9 +8,9 @@ import pytest
 
 import pachon
 from pachon.core.units import ARCSEC
+from pachon.measure.shapes import measure_shapes
 from pachon.models.camera.silicon import Silicon
 from pachon.models.media.silicon import absorption_length
-from pachon.measure.shapes import measure_shapes
 from pachon.raytrace.rays import RayStatus, field_direction, parallel_rays
 from pachon.raytrace.trace import trace
 from pachon.wavefront.psf.psf import make_psfs

@@ -11,19 +11,19 @@ from astropy.io import fits
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, ProductError, UnknownNameError
 from pachon.core.progress import Reporter
+from pachon.measure.correlation import shear_correlation
 from pachon.pipeline import focal_plane_stage, run_folder
-from pachon.pipeline.ccd_product import CCD_KINDS, KINDS, of_ccd_model, read_product
 from pachon.pipeline.config import to_yaml
 from pachon.pipeline.experiment import Experiment
-from pachon.reconstruction.focal_plane_psf.model import FocalPlanePsf
 from pachon.pipeline.focal_plane_stage import FOCAL_PLANE_PSF_NAME, apply_focal_plane_model
-from pachon.measure.correlation import shear_correlation
-from pachon.pipeline.summary import correlations, run_metrics, separation_bins
 from pachon.pipeline.report import pictures as pictures_module
 from pachon.pipeline.report.diagnostics import diagnose
 from pachon.pipeline.report.tables import headline, models_rows
 from pachon.pipeline.run import run
 from pachon.pipeline.run_folder import stamp_of
+from pachon.pipeline.summary import correlations, run_metrics, separation_bins
+from pachon.reconstruction.ccd_product import CCD_KINDS, KINDS, of_ccd_model, read_product
+from pachon.reconstruction.focal_plane_psf.model import FocalPlanePsf
 
 CCDS = ("R22_S11", "R22_S12")
 ARCSEC = np.pi / 180.0 / 3600.0

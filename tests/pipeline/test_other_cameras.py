@@ -9,7 +9,6 @@ from astropy.table import Table
 import pachon
 from pachon import PachonError, load_camera
 from pachon.commands.cli import main
-from pachon.pipeline.ccd_product import read_product
 from pachon.pipeline.config import Configuration, configuration_of, with_options
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.run import run
@@ -17,6 +16,7 @@ from pachon.pipeline.run_folder import finished_ccds, stamp_of
 from pachon.pipeline.sensor.displacement import EdgeRolloff
 from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_ccd
 from pachon.pipeline.simulate.ccd_model import model_ccd
+from pachon.reconstruction.ccd_product import read_product
 from pachon.studies.sweep.file import load_sweep
 
 SMALL = {

@@ -7,14 +7,14 @@ import pytest
 import treecorr
 
 from pachon.pipeline import run as run_module
-from pachon.pipeline.ccd_product import product_path, read_product, write_product
 from pachon.pipeline.config import with_options
 from pachon.pipeline.experiment import Experiment
-from pachon.pipeline.summary import correlations, separation_bins
 from pachon.pipeline.report.diagnostics import diagnose
 from pachon.pipeline.run import run
 from pachon.pipeline.run_folder import stamp_of
 from pachon.pipeline.simulate.ccd_exposure import expose_positions
+from pachon.pipeline.summary import correlations, separation_bins
+from pachon.reconstruction.ccd_product import product_path, read_product, write_product
 from pachon.studies.metrics.scene import Scene
 from pachon.studies.sweep.file import read_sweep
 from pachon.studies.sweep.point import point_experiment

@@ -12,17 +12,17 @@ from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, PachonError, ProductError
 from pachon.core.files import _owning_process
 from pachon.core.progress import Reporter
+from pachon.measure.correlation import shear_correlation
 from pachon.pipeline import run as run_module
 from pachon.pipeline import run_folder
-from pachon.pipeline.ccd_product import read_product
 from pachon.pipeline.config import load_configuration, with_options
 from pachon.pipeline.experiment import Experiment
-from pachon.measure.correlation import shear_correlation
-from pachon.pipeline.summary import separation_bins
 from pachon.pipeline.run import run
 from pachon.pipeline.simulate import ccd_exposure, ccd_loop
 from pachon.pipeline.simulate.ccd_model import model_ccd
 from pachon.pipeline.simulate.photometry import electrons
+from pachon.pipeline.summary import separation_bins
+from pachon.reconstruction.ccd_product import read_product
 
 CCDS = ("R22_S11", "R24_S12")
 CHANGES_EVERY_TIME = "timings.json"

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pachon.pipeline.ccd_product import read_product
 from pachon.measure.correlation import Correlation
 from pachon.pipeline.summary import run_metrics
+from pachon.reconstruction.ccd_product import read_product
 
 ARCMIN = np.deg2rad(1 / 60)
 

@@ -10,12 +10,12 @@ import pachon
 from pachon.models.aperture import Circle
 from pachon.models.io.prescription import load_telescope
 from pachon.models.zernike_polynomials import annular_zernikes
-from pachon.sensing.donut_rays import ZernikeRays
-from pachon.sensing.pupil_cells import pupil_cells
 from pachon.raytrace.aiming import stop_of
 from pachon.raytrace.rays import Rays, field_direction
+from pachon.sensing.donut_rays import ZernikeRays
+from pachon.sensing.pupil_cells import pupil_cells
 
-WIDE = Path(__file__).parents[2] / "data" / "zmx" / "circular_aperture_example_with_aperture.zmx"
+WIDE = Path(__file__).parents[1] / "data" / "zmx" / "circular_aperture_example_with_aperture.zmx"
 FIELD = np.deg2rad((0.0, 40.0))
 
 

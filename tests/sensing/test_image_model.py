@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from donut_images import PIXEL, SIZE, WAVELENGTH, donut
 
+from pachon.raytrace.rays import field_direction
 from pachon.sensing.donut_rays import ZernikeRays
 from pachon.sensing.image_model import ImageGrid, LandedLight
 from pachon.sensing.likelihood import Stamp, model_image, normal_equations
 from pachon.sensing.pupil_cells import pupil_cells
 from pachon.sensing.seeing import Seeing
 from pachon.sensing.stamps import Pixels
-from pachon.raytrace.rays import field_direction
 from pachon.wavefront.atmosphere.turbulence import long_exposure_fwhm
 from pachon.wavefront.chief_rays import image_jacobians
 from pachon.wavefront.psf.pupil_rims import pupil_rims

@@ -13,7 +13,7 @@ FIELDS = np.deg2rad([(0.3, 0.2), (-1.1, 0.6), (0.9, 1.1), (0.4, -1.4)])
 def test_joint_fits_find_a_misaligned_telescope(focused):
     freedoms = pachon.load_degrees_of_freedom("lsst")
     # 90 nm rms of wavefront over the field for each.
-    size = 90e-9 / freedoms.sensitivity(focused, wavelength=WAVELENGTH).rms
+    size = 90e-9 / pachon.sensitivity(focused, freedoms, wavelength=WAVELENGTH).rms
     state = size * np.random.default_rng(1).standard_normal(len(freedoms))
     true = freedoms.apply(focused, state)
     air = pachon.Atmosphere.from_site("cerro_pachon", seed=1)
@@ -52,7 +52,7 @@ def test_rims_near_the_image_move_with_the_telescope(focused):
     freedoms = pachon.load_degrees_of_freedom("lsst")
     freedoms = freedoms.select([name for name in freedoms.names if "_B" not in name])
     # 100 nm rms of wavefront over the field for each.
-    size = 100e-9 / freedoms.sensitivity(focused, wavelength=WAVELENGTH).rms
+    size = 100e-9 / pachon.sensitivity(focused, freedoms, wavelength=WAVELENGTH).rms
     state = 2.0 * size * np.random.default_rng(2).standard_normal(len(freedoms))
     true = freedoms.apply(focused, state).perturbed("Detector", shift=(0.0, 0.0, DEFOCUS))
     air = pachon.Atmosphere.from_site("cerro_pachon", seed=1)

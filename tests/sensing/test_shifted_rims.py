@@ -8,9 +8,9 @@ from donut_images import PIXEL, WAVELENGTH, donut
 
 import pachon
 from pachon.models.aperture import shifted
+from pachon.raytrace.rays import field_direction, parallel_rays
 from pachon.sensing.pupil_cells import pupil_cells
 from pachon.sensing.vignetting import cells_with_rims, movable_rims
-from pachon.raytrace.rays import field_direction, parallel_rays
 
 EDGE = np.deg2rad([1.75 * 0.6, 1.75 * 0.8])
 

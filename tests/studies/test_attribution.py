@@ -8,16 +8,16 @@ from scipy.special import j0
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, UnknownNameError
 from pachon.core.units import ARCSEC
-from pachon.pipeline.ccd_product import CCD_KINDS, KINDS
+from pachon.measure.correlation import SEPARATION_RANGES, shear_correlation
+from pachon.measure.shapes import measure_shapes
+from pachon.measure.stamps import center_stamps
 from pachon.pipeline.config import load_configuration, with_options
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.focal_plane_stage import apply_focal_plane_model
-from pachon.measure.correlation import SEPARATION_RANGES, shear_correlation
-from pachon.measure.shapes import measure_shapes
-from pachon.pipeline.summary import correlations
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd
 from pachon.pipeline.simulate.ccd_model import model_ccd
-from pachon.pipeline.simulate.stamps import center_stamps
+from pachon.pipeline.summary import correlations
+from pachon.reconstruction.ccd_product import CCD_KINDS, KINDS
 from pachon.studies.attribution import attribution
 from pachon.studies.attribution.attribution import attribute, changes, without_cause
 from pachon.studies.attribution.causes import CAUSES, FULL, GROUND_LIFT, NOISE, OPTICS, checked_causes, without

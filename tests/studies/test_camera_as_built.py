@@ -9,8 +9,8 @@ from astropy.table import Table
 import pachon
 from pachon.commands.cli import main
 from pachon.core.units import ARCSEC
-from pachon.models.camera.silicon import Silicon
 from pachon.measure.shapes import fwhm, measure_shapes
+from pachon.models.camera.silicon import Silicon
 from pachon.pipeline.simulate.photometry import effective_fwhm
 from pachon.studies.baseline.baseline import check_baseline, make_baseline
 from pachon.studies.baseline.file import write_baseline

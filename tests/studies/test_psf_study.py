@@ -9,13 +9,13 @@ from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError
 from pachon.core.progress import Reporter
 from pachon.core.units import ARCMIN, ARCSEC
+from pachon.measure.shapes import measure_shapes
 from pachon.pipeline.config import load_configuration
 from pachon.pipeline.experiment import Experiment
-from pachon.measure.shapes import measure_shapes
-from pachon.reconstruction.psf_model.polynomial import mapped
 from pachon.pipeline.simulate.ccd_exposure import CcdExposure, NoiseFreeStars
 from pachon.pipeline.simulate.ccd_observation import Observation
 from pachon.pipeline.simulate.star_field import make_star_field
+from pachon.reconstruction.psf_model.polynomial import mapped
 from pachon.studies.psf_choice.plan import NOISE_FREE, PROCESSES, Case, Plan, make_plan
 from pachon.studies.psf_choice.residuals import case_metrics, measure_residuals, noise_law, residual_correlations
 from pachon.studies.psf_choice.stars import SimulatedCcd, fit, observe, simulate

@@ -19,8 +19,8 @@ from pachon.design.images.encircled_energy import energy_curve
 from pachon.models.ideal_telescope import ideal_telescope
 from pachon.models.io.prescription import load_telescope
 from pachon.models.io.site_file import load_site
-from pachon.pipeline.ccd_product import product_path, read_product
 from pachon.pipeline.run_folder import stamp_of
+from pachon.reconstruction.ccd_product import product_path, read_product
 from pachon.studies.reproduce import reproduce as module
 from pachon.studies.reproduce.atmosphere import shortened_exposure
 from pachon.studies.reproduce.bench import PAPER, SMALL, Bench, Scale

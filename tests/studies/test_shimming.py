@@ -9,10 +9,10 @@ import pytest
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError
 from pachon.core.files import json_text
+from pachon.measure.correlation import shear_correlation
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.pipeline.config import Configuration, load_configuration, with_options
 from pachon.pipeline.experiment import Experiment
-from pachon.measure.correlation import shear_correlation
 from pachon.studies.shimming.curves import Places, focus_curves, measured
 from pachon.studies.shimming.pairs import PairSum, separation_edges
 from pachon.studies.shimming.product import shim_metrics

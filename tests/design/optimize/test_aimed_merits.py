@@ -10,8 +10,8 @@ import pachon
 from pachon.design.optimize.merit import Beams, SpotMerit
 from pachon.design.optimize.ray_operands import RmsWavefront
 from pachon.design.optimize.targets import ChiefRay
-from pachon.models.parameters.parameters import apply
 from pachon.models.io.prescription import load_telescope
+from pachon.models.parameters.parameters import apply
 from pachon.models.shapes.shape import Plane
 from pachon.models.surface import Interaction
 

@@ -10,9 +10,9 @@ import pachon
 from pachon.core.errors import ConfigError, DomainError, UnknownNameError
 from pachon.design.optimize.merit import Beams, SpotMerit
 from pachon.design.optimize.optimize import optimize
-from pachon.models.parameters.parameters import apply
 from pachon.models.io.glass_catalogue import GlassCatalogue
 from pachon.models.media.medium import abbe_number
+from pachon.models.parameters.parameters import apply
 from pachon.models.shapes.shape import Plane, Sphere
 from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM, Telescope

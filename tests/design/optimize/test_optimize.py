@@ -11,8 +11,8 @@ from pachon.design.optimize.jacobian import ParameterColumns
 from pachon.design.optimize.merit import Beams, SpotMerit, WavefrontMerit
 from pachon.design.optimize.optimize import optimize, wavefronts
 from pachon.design.optimize.targets import FocalLength, Target
-from pachon.models.parameters.parameters import apply, parse_parameters
 from pachon.models.first_order import first_order
+from pachon.models.parameters.parameters import apply, parse_parameters
 from pachon.models.shapes.shape import Conic
 from pachon.raytrace.rays import RayStatus
 

@@ -9,9 +9,9 @@ import pachon
 from pachon.core.errors import DomainError, UnknownNameError
 from pachon.design.optimize.jacobian import ParameterColumns
 from pachon.design.optimize.merit import Beams, SpotMerit, WavefrontMerit
-from pachon.models.parameters.parameters import Parameter, apply, parse_parameters, twists
 from pachon.models.io.glass_catalogue import GlassCatalogue
 from pachon.models.media.medium import ChangedIndex, ConstantIndex, abbe_number, with_index_change
+from pachon.models.parameters.parameters import Parameter, apply, parse_parameters, twists
 
 FIELDS = np.deg2rad([[0.0, 0.0], [3.0, 8.0]])
 WAVES = [486.1327e-9, 656.2725e-9]

@@ -12,9 +12,9 @@ from pachon.core.errors import ConfigError, DomainError, PachonError, UnknownNam
 from pachon.core.files import json_text
 from pachon.design.optimize.monte_carlo import monte_carlo
 from pachon.design.optimize.optimize import optimize
+from pachon.models.io.grid_file import write_grid
 from pachon.models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
 from pachon.models.parameters.tolerances import Tolerance, draw
-from pachon.models.io.grid_file import write_grid
 from pachon.models.shapes.grid import GridSag
 
 FIELDS = np.deg2rad([[0.0, 0.0], [0.0, 1.0], [-1.2, 0.6]])

@@ -8,14 +8,14 @@ from astropy.table import Table
 
 from pachon.commands.cli import main
 from pachon.core.errors import ProductError
-from pachon.models.camera.cameras import load_camera
-from pachon.pipeline.ccd_product import KINDS, product_path, read_product
+from pachon.measure.correlation_plots import rho_plot
 from pachon.measure.rho_statistics import rho_statistics
 from pachon.measure.shapes import measure_shapes
+from pachon.models.camera.cameras import load_camera
 from pachon.pipeline.report import diagnostics
 from pachon.pipeline.report.diagnostics import FOLDER_NAME, diagnose
 from pachon.pipeline.report.focal_plane_plots import residual_plot
-from pachon.pipeline.report.statistics_plots import rho_plot
+from pachon.reconstruction.ccd_product import KINDS, product_path, read_product
 
 CCDS = ("R22_S11", "R24_S12")
 ARCSEC = np.pi / 180.0 / 3600.0

@@ -13,16 +13,16 @@ import pytest
 
 from pachon.core import plotting
 from pachon.core.plotting import new_figure, png_bytes
-from pachon.models.camera.focal_plane import FocalPlane
-from pachon.pipeline.ccd_product import read_product
-from pachon.pipeline.experiment import Experiment
 from pachon.measure.correlation import shear_correlation
+from pachon.measure.focal_plane_axes import around_field_circle, key_ellipticity, whiskers
+from pachon.models.camera.focal_plane import FocalPlane
+from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.report import focal_plane_plots, statistics_plots
-from pachon.pipeline.report.focal_plane_axes import around_field_circle, key_ellipticity, whiskers
 from pachon.pipeline.report.focal_plane_plots import is_flat
 from pachon.pipeline.report.pictures import closest_middle_farthest
 from pachon.pipeline.report.report import build_report
 from pachon.pipeline.report.tables import percent
+from pachon.reconstruction.ccd_product import read_product
 from pachon.wavefront.opd import wavefront_opd
 from pachon.wavefront.zernike import fit_zernikes
 

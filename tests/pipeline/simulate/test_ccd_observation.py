@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from pachon.core.errors import ConfigError, DomainError
+from pachon.measure.shapes import measure_shapes
+from pachon.measure.star_selection import StarFlag
 from pachon.pipeline.config import ReconstructionConfig, with_options
 from pachon.pipeline.defaults import with_paper_model
 from pachon.pipeline.experiment import Experiment
-from pachon.measure.shapes import measure_shapes
-from pachon.measure.star_selection import StarFlag
-from pachon.reconstruction.psf_model.checks import snr_weights
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd, expose_centered
 from pachon.pipeline.simulate.ccd_model import model_ccd
 from pachon.pipeline.simulate.ccd_observation import observe_ccd
+from pachon.reconstruction.psf_model.checks import snr_weights
 
 NAME = "R22_S11"
 N = 40

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from pachon.measure.shapes import measure_shapes
 from pachon.reconstruction.focal_plane_psf.images import ResidualImages, with_shapes
 from pachon.reconstruction.focal_plane_psf.mosaic import Mosaic
-from pachon.measure.shapes import measure_shapes
 
 ARCSEC = np.pi / 648000
 PIXEL, WEIGHT = 0.2 * ARCSEC, 0.7 * ARCSEC

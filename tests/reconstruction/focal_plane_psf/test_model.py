@@ -9,11 +9,11 @@ from astropy import units as u
 from threadpoolctl import threadpool_limits
 
 from pachon.core.errors import DomainError, PachonError, ProductError, UnknownNameError
+from pachon.measure.shapes import measure_shapes
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.camera.silicon import Silicon
 from pachon.reconstruction.focal_plane_psf.model import FocalPlanePsf
 from pachon.reconstruction.focal_plane_psf.response import Instrument
-from pachon.measure.shapes import measure_shapes
 
 UM = 1e-6
 PLANTED = "R23_S11"

@@ -4,9 +4,9 @@ from astropy import units as u
 from astropy.table import MaskedColumn, Table
 
 from pachon.core.errors import DomainError, PachonError, ProductError
+from pachon.measure.shapes import measure_shapes
 from pachon.reconstruction.focal_plane_psf.model import FocalPlanePsf
 from pachon.reconstruction.focal_plane_psf.stars import FocalPlaneStars, noise_per_snr, photon_noise, stars_of
-from pachon.measure.shapes import measure_shapes
 
 ARCSEC = np.pi / 648000
 PIXEL, WEIGHT = 0.2 * ARCSEC, 0.7 * ARCSEC

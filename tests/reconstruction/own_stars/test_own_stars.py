@@ -11,10 +11,10 @@ from pachon import PsfModel
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError
 from pachon.measure.shapes import measure_shapes
-from pachon.reconstruction.own_stars.star_catalogue import StarCutouts, load_stars
 from pachon.measure.star_selection import StarFlag
 from pachon.reconstruction.own_stars.candidates import CANDIDATES, choose_candidate
 from pachon.reconstruction.own_stars.own_stars import fit_own_stars
+from pachon.reconstruction.own_stars.star_catalogue import StarCutouts, load_stars
 
 PIXEL = np.deg2rad(0.2 / 3600.0)
 SIZE, SKY, COUNT = 33, 22.0, 60

@@ -212,7 +212,7 @@ def test_same_bytes_and_splitting():
 @pytest.mark.slow
 def test_bytes_do_not_depend_on_blas_threads():
     code = (
-        "import numpy as np, zlib; from pachon.reconstruction.psf_model.model import PsfModel; g = np.random.default_rng(0);"
+        "import numpy as np, zlib; from pachon import PsfModel; g = np.random.default_rng(0);"
         "m = PsfModel.fit(1 + g.random((150, 31, 31)), g.random((150, 2)));"
         "print(zlib.crc32(m.components.tobytes() + m.polynomial.tobytes() + m.eigenvalues.tobytes()))"
     )

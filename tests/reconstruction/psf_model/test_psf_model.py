@@ -278,7 +278,7 @@ def test_splitting_changes_no_byte(basis, interpolation):
 )
 def test_bytes_do_not_depend_on_blas_threads(options):
     code = (
-        "import numpy as np, zlib; from pachon.reconstruction.psf_model.model import PsfModel; g = np.random.default_rng(0);"
+        "import numpy as np, zlib; from pachon import PsfModel; g = np.random.default_rng(0);"
         f"o = {options}; o.update(masks=g.random((60, 21, 21)) < 0.01) if 'masks' in o else None;"
         "y, x = np.mgrid[:21, :21] - 10;"
         "s = np.exp(-(x**2 + y**2) / 6) + 0.01 * g.random((60, 21, 21));"

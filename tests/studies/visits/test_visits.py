@@ -7,10 +7,10 @@ from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, PachonError
 from pachon.core.progress import Reporter
 from pachon.core.units import ARCSEC
+from pachon.measure.shapes import measure_shapes
 from pachon.models.camera.lsst import lsst_camera
 from pachon.pipeline.config import Configuration, digest, with_options
 from pachon.pipeline.experiment import Experiment
-from pachon.measure.shapes import measure_shapes
 from pachon.pipeline.simulate.ccd_exposure import expose_positions
 from pachon.studies.visits.config import VisitsConfig, VisitsSection, load_visits_configuration
 from pachon.studies.visits.plan import Visit

@@ -8,8 +8,8 @@ from astropy import units as u
 
 import pachon
 from pachon.core.errors import DomainError
-from pachon.models.site import Weather
 from pachon.measure.shapes import fwhm
+from pachon.models.site import Weather
 from pachon.wavefront.atmosphere.refraction import air_refractivity, dispersion_shift
 
 ARCSEC = math.radians(1.0 / 3600.0)

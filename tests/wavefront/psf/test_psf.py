@@ -7,8 +7,8 @@ from pydantic import ValidationError
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError, PachonError
-from pachon.pipeline.config import Configuration
 from pachon.measure.shapes import fwhm
+from pachon.pipeline.config import Configuration
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.chief_rays import fields_at
 from pachon.wavefront.psf.engines import ENGINES

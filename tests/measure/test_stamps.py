@@ -3,7 +3,7 @@ import pytest
 
 from pachon.core.errors import DomainError
 from pachon.measure.shapes import measure_shapes
-from pachon.pipeline.simulate.stamps import center_stamps, observe_stamps
+from pachon.measure.stamps import center_stamps, observe_stamps
 
 ARCSEC = np.pi / 180.0 / 3600.0
 PIXEL = 0.2 * ARCSEC

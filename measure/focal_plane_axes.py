@@ -14,8 +14,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.transforms import ScaledTranslation, blended_transform_factory
 
-from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, figure_of
-from ...models.camera.camera import Camera
+from ..core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, figure_of
+from ..models.camera.camera import Camera
 
 #: Colour of each quantity in every plot; blue and red for observed and residual as in Jee & Tyson 2011.
 TRUTH, OBSERVED, RESIDUAL, AWAY, LEFT_OUT = GREY, BLUE, RED, ORANGE, PURPLE

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from scipy import fft
 
-from ...core.errors import DomainError
-from ...core.units import real_array
+from ..core.errors import DomainError
+from ..core.units import real_array
 
 
 def observe_stamps(

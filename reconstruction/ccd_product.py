@@ -17,7 +17,7 @@ from astropy.io import fits
 from ..core.errors import ProductError, unknown_name
 from ..core.products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits, write_hdus
 from ..core.units import ARCSEC
-from ..reconstruction.psf_model.model import PsfModel
+from .psf_model.model import PsfModel
 
 
 class _Unit(NamedTuple):
