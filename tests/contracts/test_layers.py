@@ -27,7 +27,7 @@ LAYERS = [
 ]
 FILES = [path for layer in LAYERS for path in sorted((ROOT / layer).rglob("*.py"))]
 #: A longer file holds two subjects.
-MOST_LINES = 400
+MOST_LINES = 500
 
 
 def module_of(path):
