@@ -25,6 +25,11 @@ from .telescope import Telescope
 _NO_IMAGE = 1e-9
 #: Difference of two pupils that rounding makes, over their size.
 _ROUNDING = 1e-12
+#: Largest radius of a reference sphere [m]; paths to a sphere that large are those to a plane, to 1e-10 m at a blur of
+#: a millimetre.
+_LARGEST_SPHERE = 1e4
+#: Smallest radius of a reference sphere, over the diameter of the entrance pupil.
+_SMALLEST_SPHERE = 1e-2
 
 
 @dataclass
@@ -186,6 +191,16 @@ def stop_image(telescope: Telescope, *, front: bool = False) -> StopImage:
     if found is None:
         raise DomainError(f"{telescope.name}: the stop {data.stop!r} makes an entrance pupil at infinity (telecentric)")
     return found
+
+
+def reference_radius(pupil_distance: float, focal_length: float, pupil_diameter: float) -> float:
+    """Return the radius [m] of the reference sphere through the exit pupil.
+
+    ``pupil_distance`` is that from the exit pupil to the image [m], which may be infinite. Where the exit pupil is at
+    the image, the focal length takes its place. A sphere has at most 1e4 m.
+    """
+    least = _SMALLEST_SPHERE * pupil_diameter
+    return next(min(abs(v), _LARGEST_SPHERE) for v in (pupil_distance, focal_length, 1.0) if abs(v) > least or v == 1.0)
 
 
 @check_arguments

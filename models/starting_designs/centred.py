@@ -13,6 +13,7 @@ from ...core.errors import DomainError
 from ..aperture import Aperture, Circle
 from ..first_order import first_order, footprints
 from ..media.medium import Medium
+from ..paraxial import reference_radius
 from ..shapes.shape import Plane, Shape
 from ..surface import Interaction, Surface
 from ..telescope import VACUUM, Telescope
@@ -58,8 +59,8 @@ def centred(name: str, description: str, source: str, surfaces: Sequence[Surface
 def focused(telescope: Telescope, detector_at: Callable[[float], Surface] = detector) -> Telescope:
     """Return a telescope with its detector at the paraxial focus, and the reference sphere through the exit pupil."""
     optics = first_order(telescope)
-    distance = abs(optics.exit_pupil_z - optics.focus_z)
-    radius = distance if math.isfinite(distance) and distance > 0 else abs(optics.focal_length)
+    distance = optics.exit_pupil_z - optics.focus_z
+    radius = reference_radius(distance, optics.focal_length, telescope.pupil_diameter)
     end = detector_at(optics.focus_z)
     edge = abs(optics.focal_length) * math.tan(telescope.field_radius)
     end = replace(end, aperture=Circle(1.2 * edge + 1e-3 * telescope.pupil_diameter))

@@ -38,24 +38,38 @@ TWO = wp.constant(wp.float64(2.0))
 
 
 @wp.func
-def conic_distance(c: wp.float64, k: wp.float64, x: lanes, y: lanes, z: lanes, u: lanes, v: lanes, w: lanes):
+def conic_distance(
+    c: wp.float64,
+    k: wp.float64,
+    sign_change: wp.float64,
+    x: lanes,
+    y: lanes,
+    z: lanes,
+    u: lanes,
+    v: lanes,
+    w: lanes,
+):
     """Distance along each ray to the conic, to its sheet at the vertex, in closed form; NaN where the ray misses.
 
     A t^2 - 2 B t + C = 0 with A = c (1 + k w^2), B = w - c (x u + y v + (1 + k) z w) and
-    C = c (x^2 + y^2 + (1 + k) z^2) - 2 z. On the vertex sheet the normal's component along the ray, B - A t, has the
-    sign of w, so t = (B - sign(w) r) / A = C / (B + sign(w) r), r = sqrt(B^2 - A C); of the two forms a lane takes
-    the one that does not cancel (the second for all but rays that start beyond the centre of curvature).
+    C = c (x^2 + y^2 + (1 + k) z^2) - 2 z. The normal's component along the ray, B - A t, is +r at one intersection and
+    -r at the other, r = sqrt(B^2 - A C). On the vertex sheet it has the sign of w, unless the ray is so nearly
+    perpendicular to the axis that both intersections are on that sheet. It is taken as -r for w below ``sign_change``,
+    which is 0 or, for curved mirrors, close to it. With s = +-1 that sign, t = (B - s r) / A = C / (B + s r); of the
+    two forms a lane takes the one that does not cancel (the second for all but rays that start beyond the centre of
+    curvature).
     """
     a = c * (lanes(ONE) + k * wp.cw_mul(w, w))
     b = w - c * (wp.cw_mul(x, u) + wp.cw_mul(y, v) + (ONE + k) * wp.cw_mul(z, w))
     e = c * (wp.cw_mul(x, x) + wp.cw_mul(y, y) + (ONE + k) * wp.cw_mul(z, z)) - TWO * z
     r = lanes_sqrt(wp.cw_mul(b, b) - wp.cw_mul(a, e))
     for i in range(LANES):
-        r[i] = wp.where(w[i] < ZERO, -r[i], r[i])
+        r[i] = wp.where(w[i] < sign_change, -r[i], r[i])
     top = lanes()
     bottom = lanes()
     for i in range(LANES):
-        same = b[i] * w[i] >= ZERO
+        # Not the sign of a product with w, which is 0 for a ray perpendicular to the axis.
+        same = wp.where(w[i] < sign_change, -b[i], b[i]) >= ZERO
         top[i] = wp.where(same, e[i], b[i] - r[i])
         bottom[i] = wp.where(same, b[i] + r[i], a[i])
     return wp.cw_div(top, bottom)

@@ -42,14 +42,16 @@ PHASE = wp.constant(4)
 
 # Columns of the table of numbers, a row per surface: curvature [1/m], conic constant, vertex [m] (3), rotation (9,
 # row by row), clear aperture: centre x, y, inner and outer radius [m]; the curvature of the conic that the search for a
-# landing starts from, another one where the surface has no conic of its own.
+# landing starts from, another one where the surface has no conic of its own; the direction cosine w, 0 or close to it,
+# at which rays change from one intersection with that conic to the other.
 CURVATURE = wp.constant(0)
 CONIC = wp.constant(1)
 VERTEX = wp.constant(2)
 ROTATION = wp.constant(5)
 APERTURE = wp.constant(14)
 FIRST_CURVATURE = wp.constant(18)
-NUMBERS = 19
+SIGN_CHANGE = wp.constant(19)
+NUMBERS = 20
 # Columns of the table of kinds: interaction, number of aspheric coefficients, whether rotated, whether stopped down
 # (0 no, 1 by a disc or ring, 2 by another aperture), whether obstructions lie on the way to it, whether its shape has
 # parts besides the conic and its even powers (1) or is a mesh (2), which of the distinct media lies before and after.
@@ -178,7 +180,8 @@ def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
             c = surfaces.numbers[s, CURVATURE]
             k = surfaces.numbers[s, CONIC]
             terms = surfaces.kinds[s, TERMS]
-            t = conic_distance(surfaces.numbers[s, FIRST_CURVATURE], k, x, y, z, u, v, w)
+            first_curvature = surfaces.numbers[s, FIRST_CURVATURE]
+            t = conic_distance(first_curvature, k, surfaces.numbers[s, SIGN_CHANGE], x, y, z, u, v, w)
             if terms > 0:
                 t, running = aspheric_distance(c, k, surfaces.coefficients, s, terms, x, y, z, u, v, w, t)
                 for i in range(LANES):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -13,14 +15,19 @@ from ...core.warp_arrays import warp_array
 from ...models.aperture import Annulus, Aperture, Circle, Complement
 from ...models.media.medium import Medium
 from ...models.shapes.mesh import MeshSurface
-from ...models.surface import Interaction
+from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
 from ..kernels.surface import FAR
 from ..kernels.trace import DEFORMED, INTERACTION, KINDS, NUMBERS, OBSTRUCTED, PHASE, STOPPED, PackedSurfaces
 from .apertures import pack_apertures
 from .meshes import pack_meshes
 from .obstructions import obstruction_table, pack_obstructions
-from .shapes import pack_deformations, split_shape
+from .shapes import SplitShape, pack_deformations, split_shape
+
+#: Rays are nearly perpendicular to the axis of a mirror when their direction cosine along it is below this (6 degrees).
+PERPENDICULAR = 0.1
+#: Vertices are at one height when they differ in it by less than this fraction of their distance.
+ROUNDING = 1e-9
 
 
 def clear_annulus(aperture: Aperture | None) -> tuple[float, float, float, float] | None:
@@ -35,6 +42,25 @@ def clear_annulus(aperture: Aperture | None) -> tuple[float, float, float, float
         # The complement of a disc is a ring of infinite outer radius.
         return (aperture.part.x, aperture.part.y, aperture.part.radius, float(FAR))
     return None
+
+
+def sign_change(mirror: Surface, behind: Sequence[Surface], shape: SplitShape) -> float:
+    """Return the direction cosine w at which rays change between the two intersections with a conic.
+
+    ``behind`` are the surfaces after the mirror. A ray nearly perpendicular to the axis of a mirror, as on an off-axis
+    paraboloid that turns light by 90 degrees, meets the sheet at the vertex twice, once from each side, and the sign of
+    w does not tell which side reflects. Light leaves towards the next surface, so it is that of the next vertex.
+    """
+    if mirror.interaction != Interaction.MIRROR or shape.first_curvature == 0.0:
+        return 0.0
+    # Within 1 / sqrt(-k) both intersections with a hyperboloid are on one of its two sheets.
+    size = PERPENDICULAR / math.sqrt(max(1.0, abs(shape.base.conic)))
+    for surface in behind:
+        offset = np.subtract(surface.vertex, mirror.vertex)
+        height = offset @ mirror.matrix[:, 2]
+        if abs(height) > ROUNDING * np.linalg.norm(offset):
+            return math.copysign(size, height)
+    return 0.0
 
 
 @lru_cache(maxsize=64)
@@ -58,7 +84,8 @@ def pack_surfaces(telescope: Telescope, device: str = "cpu") -> Any:
         general.append(s.aperture if ring is None else None)
         stopped = 2 if ring is None else int(s.aperture is not None)
         frame = (*s.vertex, *s.matrix.ravel())
-        numbers[row] = [base.curvature, base.conic, *frame, *(ring or (0.0,) * 4), shapes[row].first_curvature]
+        first = shapes[row].first_curvature, sign_change(s, surfaces[row + 1 :], shapes[row])
+        numbers[row] = [base.curvature, base.conic, *frame, *(ring or (0.0,) * 4), *first]
         kinds[row] = [
             int(s.interaction),
             len(terms),

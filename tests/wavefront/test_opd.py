@@ -145,3 +145,62 @@ def test_a_dark_map_has_no_rms(lsst_r):
 def test_bad_arguments(lsst_r, change, error, words):
     with pytest.raises(error, match=words):
         pachon.wavefront_opd(lsst_r, **(dict(field=(0.0, 0.0), wavelength=620e-9) | change))
+
+
+TELECENTRIC = """VERS 190513 30 123457 L123457
+MODE SEQ
+UNIT MM X W X CM MR CPMM
+ENPD 40
+FTYP 0 0 1 1 0 0 0
+XFLN 0
+YFLN 8
+WAVM 1 0.55 1
+PWAV 1
+SURF 0
+  TYPE STANDARD
+  CURV 0.0
+  DISZ INFINITY
+SURF 1
+  STOP
+  TYPE STANDARD
+  CURV 0.0
+  DISZ {stop!r}
+SURF 2
+  TYPE STANDARD
+  CURV -0.005
+  DISZ -100
+  GLAS MIRROR 0 0
+SURF 3
+  TYPE STANDARD
+  CURV 0.0
+  DISZ 0
+"""
+
+
+def test_the_opd_does_not_jump_where_the_exit_pupil_goes_to_infinity(tmp_path):
+    angle = np.arange(40) * 2.4
+    radius = 0.0198 * np.sqrt(np.arange(40) / 39)
+    pupil = radius * np.cos(angle), radius * np.sin(angle)
+    field, waves = (0.0, np.deg2rad(8.0)), {}
+    for distance in (9e3, 9.99e3, 1.001e4, 1.1e4, 1e6, np.inf, -1e6, -1.001e4, -9.99e3):
+        # Newton: a stop f^2 / distance beyond the front focus of a mirror of f = 100 mm.
+        (tmp_path / "mirror.zmx").write_text(TELECENTRIC.format(stop=100.0 + 1e4 / (1e3 * distance)))
+        mirror = pachon.load_telescope(tmp_path / "mirror.zmx")
+        # The file has a resolution of 1e-14 m in f^2 / distance, of 1e-6 m.
+        assert mirror.reference_sphere_radius == pytest.approx(min(abs(distance), 1e4), rel=1e-7)
+        opd = pachon.wavefront_opd(mirror, field, 550e-9, pupil)
+        rays = pachon.trace(mirror, pachon.launch_rays(mirror, field, 550e-9, pupil))
+        # The limit of a plane wave: paths to the foot of the perpendicular from the image point, which the chief ray,
+        # the first one, meets.
+        away = rays.position - rays.position[0]
+        path = rays.path_length - (away * rays.direction).sum(axis=1)
+        blur = np.linalg.norm(np.cross(away, rays.direction), axis=1).max()
+        # A sphere of R differs by blur^2 / 2R; paths of 1e4 m and back have a rounding of 2e-12 m.
+        assert np.abs(opd.value - (path[0] - path)).max() < blur**2 / (2 * 9e3) + 4e-12
+        waves[distance] = np.ptp(opd.value) / 550e-9
+    assert waves[np.inf] > 10.0
+    # The stop moves by 2 um in all, over f = 100 mm.
+    assert np.ptp(list(waves.values())) < 1e-4 * waves[np.inf]
+    # On a sphere of the focal length it is another wavefront.
+    short = np.ptp(pachon.wavefront_opd(mirror, field, 550e-9, pupil, sphere_radius=0.1).value) / 550e-9
+    assert abs(short - waves[np.inf]) > 0.1

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ...paraxial import ParaxialSurfaces, StopImage
+from ...paraxial import ParaxialSurfaces, StopImage, reference_radius
 from .design import Fields
 from .file import Block, Findings, ZemaxFile
 from .text import scaled
@@ -104,11 +104,9 @@ def read_pupil(
         raise header.problem(f"{keyword}: expected an entrance pupil of finite size, not {diameter:g} m")
     if len(found) > 1:
         findings.report(header.problem(f"{' and '.join(found)}: two apertures"), f"{keyword} is taken")
-    # From the exit pupil to the image; where that is infinite or nothing, the focal length.
     to_pupil = image.image_scale / image.image_slope if image.image_slope else math.inf
-    least, largest = 1e-2 * diameter, 1e4
-    reference = next(abs(v) for v in (to_pupil, image.focal_length, 1.0) if least < abs(v) < largest or v == 1.0)
-    return Pupil(image, diameter, aperture, _field_radius(header, fields, unit, image), reference)
+    radius = reference_radius(to_pupil, image.focal_length, diameter)
+    return Pupil(image, diameter, aperture, _field_radius(header, fields, unit, image), radius)
 
 
 def _aperture(header: Block, keyword: str, surfaces: ParaxialSurfaces, unit: float) -> tuple[str, float] | None:
