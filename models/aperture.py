@@ -275,14 +275,14 @@ def _crossing_edges(corners: np.ndarray) -> tuple[int, int] | None:
         forward = (end[i] - start[i]) @ (end[j] - start[j])
         if side(start[i], end[i], end[j]) == 0 and forward < 0:
             return i, j
-        others = np.array([k for k in range(i + 2, n) if (k + 1) % n != i], dtype=int)
-        a, b, c, d = start[i], end[i], start[others], end[others]
-        one, two, three, four = side(a, b, c), side(a, b, d), side(c, d, a), side(c, d, b)
-        meet = (one * two < 0) & (three * four < 0)
-        meet |= (one == 0) & beside(a, b, c) | (two == 0) & beside(a, b, d)
-        meet |= (three == 0) & beside(c, d, a) | (four == 0) & beside(c, d, b)
+        candidates = np.array([k for k in range(i + 2, n) if (k + 1) % n != i], dtype=int)
+        a, b, c, d = start[i], end[i], start[candidates], end[candidates]
+        side_c, side_d, side_a, side_b = side(a, b, c), side(a, b, d), side(c, d, a), side(c, d, b)
+        meet = (side_c * side_d < 0) & (side_a * side_b < 0)
+        meet |= (side_c == 0) & beside(a, b, c) | (side_d == 0) & beside(a, b, d)
+        meet |= (side_a == 0) & beside(c, d, a) | (side_b == 0) & beside(c, d, b)
         if np.any(meet):
-            return i, int(others[np.argmax(meet)])
+            return i, int(candidates[np.argmax(meet)])
     return None
 
 
@@ -302,7 +302,7 @@ class Union(_Combination):
     """Points of at least one of several regions."""
 
     def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:  # noqa: D102
-        return np.logical_or.reduce([part.contains(x, y) for part in self.parts])
+        return np.logical_or.reduce([region.contains(x, y) for region in self.parts])
 
 
 @check_arguments
@@ -310,7 +310,7 @@ class Intersection(_Combination):
     """Points of all of several regions."""
 
     def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:  # noqa: D102
-        return np.logical_and.reduce([part.contains(x, y) for part in self.parts])
+        return np.logical_and.reduce([region.contains(x, y) for region in self.parts])
 
 
 @check_arguments
@@ -330,7 +330,7 @@ Aperture = Circle | Annulus | Ellipse | Rectangle | Vane | Polygon | Union | Int
 def shifted(aperture: Aperture, x: float, y: float) -> Aperture:
     """Return an aperture shifted in the plane of its surface [m]."""
     if isinstance(aperture, Union | Intersection):
-        return type(aperture)(tuple(shifted(part, x, y) for part in aperture.parts))
+        return type(aperture)(tuple(shifted(region, x, y) for region in aperture.parts))
     if isinstance(aperture, Complement):
         return Complement(shifted(aperture.part, x, y))
     if isinstance(aperture, Polygon):

@@ -45,9 +45,9 @@ class GridModes(GridSag):
         if not self.modes:
             raise PrescriptionError("modes = {}: expected at least one map")
         amounts = {name: float(self.amounts.get(name, 0.0)) for name in self.modes}
-        (first, grid), *others = self.modes.items()
-        for name, other in others:
-            if not (np.array_equal(grid.x, other.x) and np.array_equal(grid.y, other.y)):
+        (first, grid), *other_modes = self.modes.items()
+        for name, mode_grid in other_modes:
+            if not (np.array_equal(grid.x, mode_grid.x) and np.array_equal(grid.y, mode_grid.y)):
                 raise PrescriptionError(f"mode {name!r}: expected the nodes of mode {first!r}")
         values = sum(a * self.modes[name].values for name, a in amounts.items())
         for name, value in (("modes", dict(self.modes)), ("amounts", amounts), ("x", grid.x), ("y", grid.y)):

@@ -225,8 +225,10 @@ class Rotational(Shape):
     @property
     def parameters(self) -> dict[str, float]:  # noqa: D102
         c = self.curvature
-        found = {"radius": 1.0 / c if c else np.inf, "curvature": c, "conic": self.conic}
-        return found | {f"a{power}": a for power, a in zip(range(4, 1000, 2), self.coefficients, strict=False)}
+        conic_parameters = {"radius": 1.0 / c if c else np.inf, "curvature": c, "conic": self.conic}
+        return conic_parameters | {
+            f"a{power}": a for power, a in zip(range(4, 1000, 2), self.coefficients, strict=False)
+        }
 
     def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
         s = x * x + y * y
