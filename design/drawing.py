@@ -83,9 +83,9 @@ def round_length(value: float) -> float:
 
 def draw_scale_bar(axes: Axes, length: float, label: str) -> None:
     """Draw a bar of a length in data units with its label at the lower left, after the limits are set."""
-    left, right = axes.get_xlim()
-    low, high = axes.get_ylim()
-    x, y = left + 0.05 * (right - left), low + 0.05 * (high - low)
+    x_low, x_high = axes.get_xlim()
+    y_low, y_high = axes.get_ylim()
+    x, y = x_low + 0.05 * (x_high - x_low), y_low + 0.05 * (y_high - y_low)
     axes.plot([x, x + length], [y, y], color="black", linewidth=1.8, solid_capstyle="butt")
     axes.annotate(label, (x, y), xytext=(0, 3), textcoords="offset points", fontsize=7.5, va="bottom")
 
@@ -128,7 +128,7 @@ def draw_field_map(axes: Axes, places: np.ndarray, values: np.ndarray, **style: 
     from matplotlib.tri import Triangulation
 
     x, y = places.T
-    known = np.isfinite(values)
-    image = axes.tripcolor(Triangulation(x[known], y[known]), values[known], shading="gouraud", **style)
+    finite = np.isfinite(values)
+    image = axes.tripcolor(Triangulation(x[finite], y[finite]), values[finite], shading="gouraud", **style)
     axes.set_aspect("equal")
     return image

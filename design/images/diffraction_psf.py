@@ -147,8 +147,8 @@ class DiffractionPsf(FieldResult):
             bar = drawing.round_length(0.6 * half)
             drawing.draw_scale_bar(panels[0], bar, self.size_text(bar * 1e-6, float(self.plate_scale[0])))
             bar_and_label: Any = (*panels[0].lines, *panels[0].texts)
-            for part in bar_and_label:
-                part.set_color("white")
+            for artist in bar_and_label:
+                artist.set_color("white")
             key = above.colorbar(image, ax=above.axes, shrink=0.85, pad=0.015, aspect=30)
             key.set_label("light over that of\nthe brightest pixel")
             way = "Fourier sum" if self.method == "fft" else "Huygens' wavelets"
