@@ -10,7 +10,6 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,11 +23,11 @@ class Region(ABC):
     """A region of the x, y plane of a surface's own frame."""
 
     @abstractmethod
-    def contains(self, x: Any, y: Any) -> np.ndarray:
+    def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return whether points x, y [m] of the surface's own frame lie in the region."""
 
 
-def _require(condition: Any, problem: str) -> None:
+def _require(condition: bool | np.bool_, problem: str) -> None:
     if not condition:
         raise PrescriptionError(problem)
 
@@ -44,7 +43,7 @@ def _require_place(text: str, x: float, y: float, angle: float, expected: str = 
     _require(np.all(np.isfinite((x, y, angle))), problem)
 
 
-def _shifted(x: Any, y: Any, centre_x: float, centre_y: float) -> tuple[np.ndarray, np.ndarray]:
+def _shifted(x: ArrayLike, y: ArrayLike, centre_x: float, centre_y: float) -> tuple[np.ndarray, np.ndarray]:
     px, py = plane_points(x, y)
     return px - centre_x, py - centre_y
 
@@ -294,7 +293,7 @@ class _Combination(Region):
     parts: tuple[Aperture, ...]
 
     def __post_init__(self) -> None:
-        _require(self.parts, f"{type(self).__name__.lower()} of no parts: expected at least one region")
+        _require(bool(self.parts), f"{type(self).__name__.lower()} of no parts: expected at least one region")
 
 
 @check_arguments

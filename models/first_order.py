@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -233,7 +233,7 @@ def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> Fi
     )
 
 
-def footprints(telescope: Telescope, field: float, wavelength: Any = None) -> np.ndarray:
+def footprints(telescope: Telescope, field: float, wavelength: ArrayLike | None = None) -> np.ndarray:
     """Return the paraxial radius [m] of the light of a field angle [rad] on each mirror and lens surface."""
     return np.abs(_trace(telescope, wavelength, np.tan(field), marginal=_marginal(telescope)).h).sum(axis=1)
 
@@ -336,7 +336,7 @@ def _marginal(telescope: Telescope) -> float:
 
 
 def _trace(
-    telescope: Telescope, wavelength: Any, slope: float, *, section: bool = False, marginal: float = 0.0
+    telescope: Telescope, wavelength: ArrayLike | None, slope: float, *, section: bool = False, marginal: float = 0.0
 ) -> _Trace:
     """Trace the ray at the rim of the pupil, of slope `marginal`, and one through its centre with a slope.
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.units import radians
 
@@ -13,7 +13,7 @@ from ..core.units import radians
 _SAME_LINE = 1e-15
 
 
-def rotation_matrix(tilt: Any) -> np.ndarray:
+def rotation_matrix(tilt: ArrayLike) -> np.ndarray:
     """Return Rx @ Ry @ Rz, shape (3, 3), of angles [rad] about x, the new y and the new z, as in Zemax."""
     rx, ry, rz = radians(tilt, "tilt")
     cx, cy, cz = np.cos((rx, ry, rz))

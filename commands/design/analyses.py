@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 from typer import Option
 
 from ...core.errors import ConfigError
 from ..tables import FIELD, Column, Rows, number_texts
 from .command import Outcome, SharedOptions, Study, design_command
+
+if TYPE_CHECKING:
+    from ...design.analyses.seidel import SeidelDiagram
 
 Points = Annotated[int, Option(min=3, max=10001, help="Rays along each diameter of the pupil.")]
 
@@ -144,7 +147,7 @@ def seidel(shared: SharedOptions) -> Outcome:
     return Outcome(seidel_diagram(shared.telescope, shared.wavelength, field=angle), _seidel_rows)
 
 
-def _seidel_rows(result: Any) -> Rows:
+def _seidel_rows(result: SeidelDiagram) -> Rows:
     s = result.summary()
     names = [*s["surfaces"], "sum"]
     values = [*s["waves"], s["total_waves"]]
@@ -188,6 +191,6 @@ def spot_matrix(
     from ...design.analyses.spot_matrix import spot_matrix as compute
 
     defocus = None if range_um is None else np.linspace(*range_um, steps) * 1e-6
-    telescope, fields, wavelengths = shared.first_arguments
-    how: dict[str, Any] = {"against": against, "defocus": defocus, "n_pupil": rays, **shared.trace_options}
-    return compute(telescope, fields, wavelengths, **how)
+    # The function itself refuses other texts.
+    columns = cast('Literal["focus", "wavelength"]', against)
+    return compute(*shared.first_arguments, against=columns, defocus=defocus, n_pupil=rays, **shared.trace_options)

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypedDict
 
 import typer
 
@@ -63,13 +63,20 @@ class Outcome:
     notes: Sequence[str] = ()  #: lines below the table
 
 
+class TraceOptions(TypedDict):
+    """Keyword arguments of every function that traces."""
+
+    projection: str
+    threads: int | None
+
+
 @dataclass(frozen=True)
 class SharedOptions:
     """The options that design commands share; files are read when they are first used."""
 
     model: str
     field_deg: Sequence[str] | str | None = None
-    wavelength_nm: Any = None
+    wavelength_nm: float | Sequence[float] | None = None
     across_band: int | None = None
     projection: str = "zemax"
     aiming: str | None = None
@@ -89,19 +96,19 @@ class SharedOptions:
         return options.field_list([self.field_deg] if isinstance(self.field_deg, str) else self.field_deg)
 
     @cached_property
-    def wavelength(self) -> Any:
+    def wavelength(self) -> float | np.ndarray | None:
         """The wavelength or wavelengths [m]; None where none is given."""
         if isinstance(self.wavelength_nm, float):
             return self.wavelength_nm * 1e-9
         return options.wavelength_list(self.telescope, self.wavelength_nm, self.across_band)
 
     @property
-    def first_arguments(self) -> tuple[Telescope, Any, Any]:
+    def first_arguments(self) -> tuple[Telescope, np.ndarray | None, float | np.ndarray | None]:
         """Telescope, field angles and wavelengths: the first arguments of most functions."""
         return self.telescope, self.fields, self.wavelength
 
     @property
-    def trace_options(self) -> dict[str, Any]:
+    def trace_options(self) -> TraceOptions:
         """Projection and threads, as keyword arguments."""
         return {"projection": self.projection, "threads": self.threads}
 

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from typer import Option
 
 from ...core.errors import ConfigError
 from ..tables import Column, Rows, field_headings, number_texts
 from .command import Outcome, SharedOptions, design_command
+
+if TYPE_CHECKING:
+    from ...design.metrics.distortion import Distortion
+    from ...design.metrics.footprint import Footprint
+    from ...design.metrics.vignetting import Vignetting
 
 #: Number of rays that takes longer than two seconds to trace.
 _MANY_RAYS = 10_000_000
@@ -36,7 +41,7 @@ def distortion(
     return Outcome(compute(*shared.first_arguments, reference=reference, **shared.trace_options), _distortion_rows)
 
 
-def _distortion_rows(result: Any) -> Rows:
+def _distortion_rows(result: Distortion) -> Rows:
     s = result.summary()
     scales = ("that fits best", result.focal_length), ("at the axis", result.axis_focal_length)
     name, shown = ("angular magnification", "{:.6f}".format) if result.in_angles else ("focal length", _length)
@@ -68,14 +73,16 @@ def vignetting(
     from ...design.metrics.vignetting import field_disc
     from ...design.metrics.vignetting import vignetting as compute
 
-    fields: Any = field_disc(shared.telescope) if shared.fields is None else shared.fields
+    fields = field_disc(shared.telescope) if shared.fields is None else shared.fields
     parts = len(fields) + 1
     with shared.stage("vignetting", parts) if rays * parts >= _MANY_RAYS else nullcontext() as progress:
-        how = dict(n_pupil=rays, progress=progress, **shared.trace_options)
-        return Outcome(compute(shared.telescope, fields, shared.wavelength, **how), _vignetting_rows)
+        traced = compute(
+            shared.telescope, fields, shared.wavelength, n_pupil=rays, progress=progress, **shared.trace_options
+        )
+        return Outcome(traced, _vignetting_rows)
 
 
-def _vignetting_rows(result: Any) -> Rows:
+def _vignetting_rows(result: Vignetting) -> Rows:
     """Return the light at each distance from the axis."""
     import numpy as np
 
@@ -105,11 +112,11 @@ def footprint(
     """
     from ...design.metrics.footprint import footprint as compute
 
-    telescope, *where = shared.first_arguments
-    return Outcome(compute(telescope, surface or None, *where, **shared.trace_options), _footprint_rows)
+    telescope, fields, wavelength = shared.first_arguments
+    return Outcome(compute(telescope, surface or None, fields, wavelength, **shared.trace_options), _footprint_rows)
 
 
-def _footprint_rows(result: Any) -> Rows:
+def _footprint_rows(result: Footprint) -> Rows:
     import numpy as np
 
     rows = []

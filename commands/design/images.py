@@ -66,8 +66,14 @@ def psf(
     compute = huygens_psf if huygens else fft_psf
     pixel = None if pixel_um is None else pixel_um * 1e-6
     with shared.stage("diffraction images", shared.images) as progress:
-        how = dict(pixels=pixels, n_pupil=pupil_points, progress=progress, **shared.trace_options)
-        result = compute(*shared.first_arguments, pixel=pixel, **how)
+        result = compute(
+            *shared.first_arguments,
+            pixel=pixel,
+            pixels=pixels,
+            n_pupil=pupil_points,
+            progress=progress,
+            **shared.trace_options,
+        )
     if fits is not None:
         cards = [
             ("MODEL", result.telescope, "telescope"),
@@ -108,8 +114,14 @@ def ee(
 
     kind, total = ("geometric", None) if geometric else ("diffraction", shared.images)
     with shared.stage("encircled energy", total) as progress:
-        how = dict(pixels=pixels, n_pupil=None if geometric else pupil_points, **shared.trace_options)
-        return encircled_energy(*shared.first_arguments, kind=kind, progress=progress, **how)
+        return encircled_energy(
+            *shared.first_arguments,
+            kind=kind,
+            pixels=pixels,
+            n_pupil=None if geometric else pupil_points,
+            progress=progress,
+            **shared.trace_options,
+        )
 
 
 @design_command(
@@ -208,7 +220,11 @@ def ghosts(
             err=True,
         )
     with shared.stage("ghosts", traced) as progress:
-        how = dict(
+        return compute(
+            shared.telescope,
+            field,
+            shared.wavelength,
+            reflectivity=lenses,
             detector_reflectivity=detector_reflectivity,
             coatings=coatings,
             n_pupil=rays,
@@ -216,7 +232,6 @@ def ghosts(
             progress=progress,
             **shared.trace_options,
         )
-        return compute(shared.telescope, field, shared.wavelength, reflectivity=lenses, **how)
 
 
 def _reflectivities(texts: list[str]) -> float | dict[str, float] | None:

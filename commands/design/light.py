@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from typer import Option
 
@@ -11,6 +11,12 @@ from ...core.errors import ConfigError
 from ..options import degrees_pair
 from ..tables import FIELD, Column, Rows
 from .command import Outcome, SharedOptions, Study, design_command
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ...design.analyses.target_image import TargetImage
+    from ...design.analyses.throughput import Throughput
 
 _Coatings = Annotated[Path | None, Option(metavar="FILE.yaml", help="Coatings of surfaces and absorption of glasses.")]
 
@@ -57,7 +63,7 @@ def throughput(
     return Outcome(compute(*shared.first_arguments, coatings=coatings, **shared.trace_options), _throughput_rows)
 
 
-def _throughput_rows(result: Any) -> Rows:
+def _throughput_rows(result: Throughput) -> Rows:
     from ...design.drawing import field_text
 
     headings = ("wavelength [nm]", *(field_text(f) for f in result.fields))
@@ -124,11 +130,19 @@ def target(
     picture = bar_target(bars=bars) if image is None else _grey(image)
     middle = np.deg2rad(degrees_pair(field_deg, "--field-deg"))
     width = None if width_arcsec is None else width_arcsec * ARCSEC
-    how: dict[str, Any] = {"width": width, "field": middle, "wavelengths": shared.wavelength, "n_rays": rays}
-    return Outcome(target_image(shared.telescope, picture, **how, **shared.trace_options), _target_rows)
+    result = target_image(
+        shared.telescope,
+        picture,
+        width=width,
+        field=middle,
+        wavelengths=shared.wavelength,
+        n_rays=rays,
+        **shared.trace_options,
+    )
+    return Outcome(result, _target_rows)
 
 
-def _grey(path: Path) -> Any:
+def _grey(path: Path) -> np.ndarray:
     """Return a picture as brightness, rows upwards."""
     from matplotlib.image import imread
 
@@ -139,7 +153,7 @@ def _grey(path: Path) -> Any:
     return (values if values.ndim == 2 else values[..., :3].mean(axis=-1))[::-1].astype(float)
 
 
-def _target_rows(result: Any) -> Rows:
+def _target_rows(result: TargetImage) -> Rows:
     s = result.summary()
     rows = [
         ("pixel of the target", f"{s['target_pixel_arcsec']:.5g} arcsec"),

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Option
 
 from ...core.errors import ConfigError
 from ..tables import FIELD, Column, Rows, field_headings, number_texts, numbers_of
 from .command import Outcome, SharedOptions, Study, design_command
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    import numpy as np
+
+    from ...design.metrics.field_zernikes import DoubleZernikes, FieldZernikes
 
 
 @design_command(
@@ -45,7 +52,7 @@ def spots(
     return compute(*shared.first_arguments, sampling=sampling, n_pupil=rays, **shared.trace_options)
 
 
-def _largest(strehl: Any) -> Any:
+def _largest(strehl: np.ndarray) -> np.ndarray:
     """Return the largest ratio of each field; NaN where all are too far from focus to be known."""
     import numpy as np
 
@@ -119,25 +126,28 @@ def zernikes(
     if sum((bool(shared.field_deg), over_field, double is not None)) > 1:
         raise ConfigError("--field-deg, --map and --double: expected one of them")
     telescope = shared.telescope
-    how = dict(jmax=jmax, pupil=pupil, **shared.trace_options)
     if fringe and double is not None:
         raise ConfigError("--fringe and --double: expected one of them")
     if double is not None:
-        terms = double_zernikes(telescope, shared.wavelength, kmax=double, **how)
+        terms = double_zernikes(
+            telescope, shared.wavelength, jmax=jmax, kmax=double, pupil=pupil, **shared.trace_options
+        )
         return Outcome(terms, _double_rows, stem=f"double_zernikes_{telescope.name}")
     fields = field_disc(telescope) if over_field else shared.fields
     ordering = "fringe" if fringe else "noll"
-    coefficients = wavefront_zernikes(telescope, fields, shared.wavelength, ordering=ordering, **how)
+    coefficients = wavefront_zernikes(
+        telescope, fields, shared.wavelength, jmax=jmax, pupil=pupil, ordering=ordering, **shared.trace_options
+    )
     return Outcome(coefficients, _map_rows if over_field else _rows)
 
 
-def _rows(result: Any) -> Rows:
+def _rows(result: FieldZernikes) -> Rows:
     """Return every term at every field."""
     summary = numbers_of(result.summary())
     return _terms(summary, field_headings(result), summary["zernike_nm"])
 
 
-def _map_rows(result: Any) -> Rows:
+def _map_rows(result: FieldZernikes) -> Rows:
     """Return statistics of every term over the field."""
     import numpy as np
 
@@ -153,14 +163,14 @@ def term_labels(count: int, ordering: str = "noll") -> list[str]:
     return [term_label(j, ordering) for j in range(1, count + 1)]
 
 
-def _terms(summary: dict[str, Any], headings: list[str], columns: Any) -> Rows:
+def _terms(summary: dict[str, Any], headings: list[str], columns: Iterable[np.ndarray]) -> Rows:
     cells = [number_texts(values, ".2f") for values in columns]
     caption = "{telescope}, {wavelength_nm:g} nm; {pupil} pupil, obscuration {obscuration:g}; nm".format_map(summary)
     labels = term_labels(len(cells[0]), summary["ordering"])
     return Rows(["term", *headings], [*zip(labels, *cells, strict=True)], caption)
 
 
-def _double_rows(result: Any) -> Rows:
+def _double_rows(result: DoubleZernikes) -> Rows:
     """Return the sixteen largest terms from defocus on."""
     import numpy as np
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 #: Columns of a table by name: values, their unit, empty for names and pure numbers, and their meaning.
-Columns = dict[str, tuple[Any, str, str]]
+Columns = dict[str, tuple[ArrayLike, str, str]]
 #: Points of curves along the field where none are given.
 _ALONG_FIELD = 33
 #: Wavelengths across the band where none are given.
@@ -124,7 +124,9 @@ def line_request(
     return Request.of(telescope, line, wavelengths, sampling=CHIEF_RAY, projection=projection, threads=threads)
 
 
-def band_wavelengths(telescope: Telescope, wavelengths: ArrayLike | None, count: int = _ACROSS_BAND) -> Any:
+def band_wavelengths(
+    telescope: Telescope, wavelengths: ArrayLike | None, count: int = _ACROSS_BAND
+) -> ArrayLike | None:
     """Return wavelengths [m] to study colour at: as given, those of the telescope's file, or some across its band."""
     if wavelengths is None and len(Request.of(telescope, sampling=CHIEF_RAY).wavelengths) == 1:
         return np.linspace(*(telescope.band or telescope.wavelength_range), count)

@@ -6,7 +6,7 @@ that an image without aberrations is smooth. Diffraction is left out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -226,7 +226,7 @@ def target_image(
     return TargetImage(request, picture, step, image, side, center)
 
 
-def _landings(request: Request, picture: np.ndarray, step: float) -> Any:
+def _landings(request: Request, picture: np.ndarray, step: float) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
     """Yield weight of a wavelength, landing points [n, 2] of lit rays and their light, some pixels at a time."""
     telescope, count = request.telescope, len(request.pupil)
     row, column = np.nonzero(picture)

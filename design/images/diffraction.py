@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -201,7 +200,7 @@ def wavelet_sum(wavelets: Wavelets, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 class _Plan:
     """Common inputs of both sums, and the reduction of irradiances to images."""
 
-    def __init__(self, request: Request, pixel: Any, pixels: int, reference: str) -> None:
+    def __init__(self, request: Request, pixel: ArrayLike | None, pixels: int, reference: str) -> None:
         check_choice("reference", reference, REFERENCES)
         self.request, self.pixels = request, require_count(pixels, "pixels", 3, 4096)
         # The middle of the images weighs all wavelengths alike.

@@ -16,6 +16,7 @@ from ..result import FieldResult
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 #: Factor of the interpolated pixels along each axis, on which widths are measured.
 _FINER = 4
@@ -162,7 +163,7 @@ def pixel_axis(pixel: float, pixels: int) -> np.ndarray:
     return (np.arange(pixels) - pixels // 2) * pixel
 
 
-def _draw_image(axes: Axes, psf: DiffractionPsf, i: int) -> Any:
+def _draw_image(axes: Axes, psf: DiffractionPsf, i: int) -> AxesImage:
     from matplotlib.colors import LogNorm
 
     image = psf.image[i] / psf.image[i].max()

@@ -18,7 +18,7 @@ from ...raytrace.rays import RayStatus
 from ...raytrace.trace import trace
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
-from ..drawing import FEW, field_colors, panel_grid
+from ..drawing import FEW, Color, field_colors, panel_grid
 from ..result import FieldResult
 
 if TYPE_CHECKING:
@@ -202,7 +202,7 @@ def _frame(points: np.ndarray) -> tuple[np.ndarray, float]:
     return np.zeros(2), 1.15 * float(np.abs([low, high]).max())
 
 
-def _draw_surface(axes: Axes, footprint: SurfaceFootprint, colors: list[Any], names: list[str]) -> None:
+def _draw_surface(axes: Axes, footprint: SurfaceFootprint, colors: list[Color], names: list[str]) -> None:
     from matplotlib.colors import ListedColormap
 
     surface = footprint.surface

@@ -48,9 +48,9 @@ class _Kind:
 class CcdFrame:
     """Frames of CCDs, one for each of so many points or one for all."""
 
-    x: Any  #: centres on the focal plane [m]
-    y: Any
-    direction: Any  #: cosine and sine of their angles, shape [2, ...]; None where all are zero
+    x: np.ndarray  #: centres on the focal plane along x [m]
+    y: np.ndarray  #: centres along y [m]
+    direction: np.ndarray | None  #: cosine and sine of their angles, shape [2, ...]; None where all are zero
 
     def along_ccd(self, x: Any, y: Any) -> tuple[Any, Any]:
         """Return the components along the axes of the CCDs of vectors of the focal plane."""

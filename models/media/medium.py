@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,7 +35,7 @@ def check_wavelength_range(wavelength_range: tuple[float, float]) -> None:
         raise PrescriptionError(f"wavelength_range = {wavelength_range!r}: expected 0 < shortest < longest")
 
 
-def wavelengths_within(wavelength: Any, wavelength_range: tuple[float, float], model: str) -> np.ndarray:
+def wavelengths_within(wavelength: ArrayLike, wavelength_range: tuple[float, float], model: str) -> np.ndarray:
     """Return wavelengths [m] as a float64 array, or raise DomainError where one is out of the range of a model."""
     w = metres(wavelength, "wavelength")
     low, high = wavelength_range

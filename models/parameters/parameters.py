@@ -25,7 +25,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -145,7 +145,7 @@ class Variables(Protocol):
     def units(self) -> tuple[str, ...]:
         """Units of the values; "1" for a pure number."""
 
-    def apply(self, telescope: Telescope, values: Any) -> Telescope:
+    def apply(self, telescope: Telescope, values: ArrayLike) -> Telescope:
         """Return the telescope with a vector of changes applied, each in its unit."""
 
 

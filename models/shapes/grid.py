@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -67,7 +67,7 @@ class GridSag(ContentEquality, Shape):
             )
 
     @cached_property
-    def _content(self) -> tuple[Any, ...]:
+    def _content(self) -> tuple[Hashable, ...]:
         return self.x.tobytes(), self.y.tobytes(), self.values.tobytes()
 
     def __repr__(self) -> str:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
@@ -103,7 +104,7 @@ class MeshSurface(ContentEquality, Shape):
             )
 
     @cached_property
-    def _content(self) -> tuple[Any, ...]:
+    def _content(self) -> tuple[Hashable, ...]:
         return self.vertices.tobytes(), self.faces.tobytes(), self.smooth
 
     def __repr__(self) -> str:

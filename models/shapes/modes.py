@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -56,7 +55,7 @@ class GridModes(GridSag):
         super().__post_init__()
 
     @cached_property
-    def _content(self) -> tuple[Any, ...]:
+    def _content(self) -> tuple[Hashable, ...]:
         return super()._content, *((name, a, self.modes[name]) for name, a in self.amounts.items())
 
     def __repr__(self) -> str:

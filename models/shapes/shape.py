@@ -13,7 +13,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,7 +48,7 @@ def with_coefficient(coefficients: tuple[float, ...], place: int, value: float) 
     return (*coefficients[:place], value, *coefficients[place + 1 :])
 
 
-def coordinates(x: Any, y: Any) -> Pair:
+def coordinates(x: ArrayLike, y: ArrayLike) -> Pair:
     """Return x and y [m] as float64 arrays of one shape."""
     x, y = plane_points(x, y)
     return x, y
