@@ -192,9 +192,7 @@ def mtf(
     needed = int(np.ceil(2.0 * reach * period))
     across = max(_FEWEST, needed) if n_pupil is None else require_count(n_pupil, "n_pupil", 16, math.isqrt(MOST))
     if across < needed or (n_pupil is None and across > _MOST_ACROSS):
-        reason = (
-            f"n_pupil = {across}: too few" if n_pupil is not None else f"more than {_MOST_ACROSS} points are needed"
-        )
+        reason = f"n_pupil = {across}: too few" if n_pupil else f"more than {_MOST_ACROSS} points are needed"
         raise DomainError(
             f"{reason} for spots of {2e6 * reach:.4g} um; expected at least {needed}, or smaller spots", key="n_pupil"
         )
