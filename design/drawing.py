@@ -11,9 +11,14 @@ from ..core.plotting import figure_at
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.collections import TriMesh
     from matplotlib.figure import Figure, SubFigure
     from matplotlib.legend import Legend
 
+#: Red, green, blue and opacity, 0 to 1.
+Color = tuple[float, float, float, float]
+#: Style of a line: its name, or an offset and the lengths of dashes and gaps [points].
+LineStyle = str | tuple[float, tuple[float, ...]]
 #: Fields that a legend or a row of panels can hold; a plot of more is drawn against the distance from the axis.
 FEW = 12
 
@@ -26,17 +31,17 @@ def field_text(field: np.ndarray) -> str:
     return f"({x:.4g}°, {y:.4g}°)"
 
 
-def field_colors(count: int) -> list[Any]:
+def field_colors(count: int) -> list[Color]:
     """Return a colour for each field of a list, from dark at the axis to bright at the edge."""
     return _colors("plasma", 0.05, 0.78, count)
 
 
-def wavelength_colors(count: int) -> list[Any]:
+def wavelength_colors(count: int) -> list[Color]:
     """Return a colour for each wavelength of a list, from blue to red; one alone is blue."""
     return _colors("turbo", 0.12, 0.76, count)
 
 
-def _colors(name: str, first: float, span: float, count: int) -> list[Any]:
+def _colors(name: str, first: float, span: float, count: int) -> list[Color]:
     from matplotlib import colormaps
 
     return [colormaps[name](first + span * i / max(count - 1, 1)) for i in range(count)]
@@ -83,9 +88,9 @@ def round_length(value: float) -> float:
 
 def draw_scale_bar(axes: Axes, length: float, label: str) -> None:
     """Draw a bar of a length in data units with its label at the lower left, after the limits are set."""
-    left, right = axes.get_xlim()
-    low, high = axes.get_ylim()
-    x, y = left + 0.05 * (right - left), low + 0.05 * (high - low)
+    x_low, x_high = axes.get_xlim()
+    y_low, y_high = axes.get_ylim()
+    x, y = x_low + 0.05 * (x_high - x_low), y_low + 0.05 * (y_high - y_low)
     axes.plot([x, x + length], [y, y], color="black", linewidth=1.8, solid_capstyle="butt")
     axes.annotate(label, (x, y), xytext=(0, 3), textcoords="offset points", fontsize=7.5, va="bottom")
 
@@ -102,7 +107,9 @@ def second_scale(axes: Axes, factor: float, label: str) -> None:
     axes.secondary_xaxis("top", functions=(convert, back)).set_xlabel(label, fontsize=8)
 
 
-def draw_circle(axes: Axes, radius: float, color: str = "0.3", style: Any = "-", label: str | None = None) -> None:
+def draw_circle(
+    axes: Axes, radius: float, color: str = "0.3", style: LineStyle = "-", label: str | None = None
+) -> None:
     """Draw a circle about the origin."""
     from matplotlib.patches import Circle
 
@@ -123,12 +130,12 @@ def spread_in_field(fields: np.ndarray) -> bool:
     return len(fields) > FEW and bool(strengths[-1] > 1e-3 * strengths[0])
 
 
-def draw_field_map(axes: Axes, places: np.ndarray, values: np.ndarray, **style: Any) -> Any:
+def draw_field_map(axes: Axes, places: np.ndarray, values: np.ndarray, **style: Any) -> TriMesh:
     """Draw values at places [n, 2] as a smooth map, and return the image for a colour bar."""
     from matplotlib.tri import Triangulation
 
     x, y = places.T
-    known = np.isfinite(values)
-    image = axes.tripcolor(Triangulation(x[known], y[known]), values[known], shading="gouraud", **style)
+    finite = np.isfinite(values)
+    image = axes.tripcolor(Triangulation(x[finite], y[finite]), values[finite], shading="gouraud", **style)
     axes.set_aspect("equal")
     return image

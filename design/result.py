@@ -106,10 +106,12 @@ class FieldResult(Result):
         return self.request.telescope.design_data.afocal
 
     def _described(self, name: str) -> Description:
-        found = super()._described(name)
+        description = super()._described(name)
         if not (self.in_angles and name in self._on_image):
-            return found
-        return found._replace(unit={"m": "rad", "rad / m": "", "1 / m": "1 / rad"}.get(found.unit, found.unit))
+            return description
+        return description._replace(
+            unit={"m": "rad", "rad / m": "", "1 / m": "1 / rad"}.get(description.unit, description.unit)
+        )
 
     def on_image(self, items: dict[str, Any]) -> dict[str, Any]:
         """Return entries of a summary, lengths on the image, under names of angles where it is at infinity."""

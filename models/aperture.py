@@ -10,7 +10,6 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,11 +23,11 @@ class Region(ABC):
     """A region of the x, y plane of a surface's own frame."""
 
     @abstractmethod
-    def contains(self, x: Any, y: Any) -> np.ndarray:
+    def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return whether points x, y [m] of the surface's own frame lie in the region."""
 
 
-def _require(condition: Any, problem: str) -> None:
+def _require(condition: bool | np.bool_, problem: str) -> None:
     if not condition:
         raise PrescriptionError(problem)
 
@@ -44,7 +43,7 @@ def _require_place(text: str, x: float, y: float, angle: float, expected: str = 
     _require(np.all(np.isfinite((x, y, angle))), problem)
 
 
-def _shifted(x: Any, y: Any, centre_x: float, centre_y: float) -> tuple[np.ndarray, np.ndarray]:
+def _shifted(x: ArrayLike, y: ArrayLike, centre_x: float, centre_y: float) -> tuple[np.ndarray, np.ndarray]:
     px, py = plane_points(x, y)
     return px - centre_x, py - centre_y
 
@@ -275,14 +274,14 @@ def _crossing_edges(corners: np.ndarray) -> tuple[int, int] | None:
         forward = (end[i] - start[i]) @ (end[j] - start[j])
         if side(start[i], end[i], end[j]) == 0 and forward < 0:
             return i, j
-        others = np.array([k for k in range(i + 2, n) if (k + 1) % n != i], dtype=int)
-        a, b, c, d = start[i], end[i], start[others], end[others]
-        one, two, three, four = side(a, b, c), side(a, b, d), side(c, d, a), side(c, d, b)
-        meet = (one * two < 0) & (three * four < 0)
-        meet |= (one == 0) & beside(a, b, c) | (two == 0) & beside(a, b, d)
-        meet |= (three == 0) & beside(c, d, a) | (four == 0) & beside(c, d, b)
+        candidates = np.array([k for k in range(i + 2, n) if (k + 1) % n != i], dtype=int)
+        a, b, c, d = start[i], end[i], start[candidates], end[candidates]
+        side_c, side_d, side_a, side_b = side(a, b, c), side(a, b, d), side(c, d, a), side(c, d, b)
+        meet = (side_c * side_d < 0) & (side_a * side_b < 0)
+        meet |= (side_c == 0) & beside(a, b, c) | (side_d == 0) & beside(a, b, d)
+        meet |= (side_a == 0) & beside(c, d, a) | (side_b == 0) & beside(c, d, b)
         if np.any(meet):
-            return i, int(others[np.argmax(meet)])
+            return i, int(candidates[np.argmax(meet)])
     return None
 
 
@@ -294,7 +293,7 @@ class _Combination(Region):
     parts: tuple[Aperture, ...]
 
     def __post_init__(self) -> None:
-        _require(self.parts, f"{type(self).__name__.lower()} of no parts: expected at least one region")
+        _require(bool(self.parts), f"{type(self).__name__.lower()} of no parts: expected at least one region")
 
 
 @check_arguments
@@ -302,7 +301,7 @@ class Union(_Combination):
     """Points of at least one of several regions."""
 
     def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:  # noqa: D102
-        return np.logical_or.reduce([part.contains(x, y) for part in self.parts])
+        return np.logical_or.reduce([region.contains(x, y) for region in self.parts])
 
 
 @check_arguments
@@ -310,7 +309,7 @@ class Intersection(_Combination):
     """Points of all of several regions."""
 
     def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:  # noqa: D102
-        return np.logical_and.reduce([part.contains(x, y) for part in self.parts])
+        return np.logical_and.reduce([region.contains(x, y) for region in self.parts])
 
 
 @check_arguments
@@ -330,7 +329,7 @@ Aperture = Circle | Annulus | Ellipse | Rectangle | Vane | Polygon | Union | Int
 def shifted(aperture: Aperture, x: float, y: float) -> Aperture:
     """Return an aperture shifted in the plane of its surface [m]."""
     if isinstance(aperture, Union | Intersection):
-        return type(aperture)(tuple(shifted(part, x, y) for part in aperture.parts))
+        return type(aperture)(tuple(shifted(region, x, y) for region in aperture.parts))
     if isinstance(aperture, Complement):
         return Complement(shifted(aperture.part, x, y))
     if isinstance(aperture, Polygon):

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Hashable
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 
 class ContentEquality:
     """Base of frozen dataclasses with arrays: read-only arrays, equality and hash of their bytes."""
 
     @property
-    def _content(self) -> tuple[Any, ...]:
+    def _content(self) -> tuple[Hashable, ...]:
         raise NotImplementedError
 
-    def _freeze(self, **dtypes: Any) -> None:
+    def _freeze(self, **dtypes: DTypeLike) -> None:
         """Replace fields by read-only arrays of given types."""
         for name, dtype in dtypes.items():
             array = np.array(getattr(self, name), dtype=dtype)

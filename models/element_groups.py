@@ -16,7 +16,7 @@ def element_groups(surfaces: Sequence[Surface], medium_before: Medium) -> dict[s
     elements are one. Planes without effect within it move along. Light that comes back through a lens meets surfaces of
     another name, which are another lens.
     """
-    found: list[tuple[str, ...]] = []
+    lenses: list[tuple[str, ...]] = []
     inside: list[str] = []
     medium = medium_before
     for surface in surfaces:
@@ -25,8 +25,8 @@ def element_groups(surfaces: Sequence[Surface], medium_before: Medium) -> dict[s
         if (inside or entering) and surface.interaction != Interaction.DETECTOR:
             inside.append(surface.name)
         if inside and medium == medium_before:
-            found.append(tuple(inside))
+            lenses.append(tuple(inside))
             inside = []
-    taken = {s.name for s in surfaces}
-    free = (name for name in (f"L{number}" for number in count(1)) if name not in taken)
-    return {next(free): members for members in found}
+    surface_names = {s.name for s in surfaces}
+    lens_names = (name for name in (f"L{number}" for number in count(1)) if name not in surface_names)
+    return {next(lens_names): members for members in lenses}

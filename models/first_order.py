@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -210,8 +210,9 @@ def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> Fi
         )
     focal_length, to_focus = (math.inf, math.inf) if parallel else (1.0 / power, -h / u)
     to_pupil = -hb / ub if ub != 0 else math.inf
-    seen = _trace(telescope, wavelength, 1.0, section=True, marginal=slope)
-    behind, height = 0.0 if parallel and not slope else float(seen.u_after[-1, 0]), float(seen.h[-1, 0])
+    marginal_trace = _trace(telescope, wavelength, 1.0, section=True, marginal=slope)
+    behind = 0.0 if parallel and not slope else float(marginal_trace.u_after[-1, 0])
+    height = float(marginal_trace.h[-1, 0])
     return FirstOrder(
         wavelength=trace.wavelength,
         focal_length=focal_length,
@@ -227,12 +228,12 @@ def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> Fi
         # The chief ray has unit slope in front; along an axis that mirrors turn, slopes change their sign with it.
         angular_magnification=math.inf if telescope.design_data.telecentric else math.copysign(1.0, n) * ub,
         image_z=last_z + height / behind if behind else math.inf,
-        magnification=float(seen.n[0]) * slope / (n * behind) if behind else math.inf,
+        magnification=float(marginal_trace.n[0]) * slope / (n * behind) if behind else math.inf,
         working_f_number=0.5 / abs(n * behind) if behind else math.inf,
     )
 
 
-def footprints(telescope: Telescope, field: float, wavelength: Any = None) -> np.ndarray:
+def footprints(telescope: Telescope, field: float, wavelength: ArrayLike | None = None) -> np.ndarray:
     """Return the paraxial radius [m] of the light of a field angle [rad] on each mirror and lens surface."""
     return np.abs(_trace(telescope, wavelength, np.tan(field), marginal=_marginal(telescope)).h).sum(axis=1)
 
@@ -335,7 +336,7 @@ def _marginal(telescope: Telescope) -> float:
 
 
 def _trace(
-    telescope: Telescope, wavelength: Any, slope: float, *, section: bool = False, marginal: float = 0.0
+    telescope: Telescope, wavelength: ArrayLike | None, slope: float, *, section: bool = False, marginal: float = 0.0
 ) -> _Trace:
     """Trace the ray at the rim of the pupil, of slope `marginal`, and one through its centre with a slope.
 

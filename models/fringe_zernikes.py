@@ -78,8 +78,8 @@ def fringe_zernikes(jmax: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         If the index is out of range.
     """
     require_count(jmax, "jmax", 1, FRINGE_TERMS)
-    wanted = _INDEX[:jmax]
-    terms = annular_zernikes(int(wanted.max()), x, y)[wanted - 1]
+    noll_indices = _INDEX[:jmax]
+    terms = annular_zernikes(int(noll_indices.max()), x, y)[noll_indices - 1]
     return terms / _NORM[:jmax].reshape(-1, *(1,) * (terms.ndim - 1))
 
 
@@ -105,8 +105,8 @@ def fringe_from_noll(coefficients: ArrayLike) -> np.ndarray:
     noll = np.atleast_1d(metres(coefficients, "coefficients"))
     if not (count := noll.shape[-1]):
         raise DomainError(f"coefficients of shape {noll.shape}: expected at least one")
-    other = np.setdiff1d(np.arange(count), _INDEX - 1)
-    lost = other[(noll.reshape(-1, count)[:, other] != 0).any(axis=0)]
+    absent_terms = np.setdiff1d(np.arange(count), _INDEX - 1)
+    lost = absent_terms[(noll.reshape(-1, count)[:, absent_terms] != 0).any(axis=0)]
     if len(lost):
         raise DomainError(f"coefficients: Noll term {lost[0] + 1} is not among the {FRINGE_TERMS} Fringe terms")
     padded = np.concatenate([noll, np.zeros((*noll.shape[:-1], max(0, int(_INDEX.max()) - count)))], axis=-1)

@@ -160,7 +160,7 @@ class LayerStack:
         films = list(zip(self.indices, self.thicknesses, strict=True))[::order]
         # Beyond the angle of total reflection cosines are imaginary.
         behind, *inside = (np.sqrt(1.0 - (n1 / n) ** 2 * (1.0 - first**2)) for n in (n2, *(n for n, _ in films)))
-        found = np.zeros(first.shape)
+        transmission = np.zeros(first.shape)
         for power in (1, -1):
             entry, end = n1 * first**power, n2 * behind**power
             b: Any = 1.0
@@ -171,5 +171,5 @@ class LayerStack:
                     np.cos(phase) * b + 1j * np.sin(phase) / admittance * c,
                     1j * admittance * np.sin(phase) * b + np.cos(phase) * c,
                 )
-            found += 0.5 * 4.0 * entry.real * end.real / np.abs(entry * b + c) ** 2
-        return found
+            transmission += 0.5 * 4.0 * entry.real * end.real / np.abs(entry * b + c) ** 2
+        return transmission

@@ -105,24 +105,26 @@ class Solve:
 
 def check_links(pickups: Sequence[Pickup], solves: Sequence[Solve], surface_names: Sequence[str]) -> None:
     """Raise PrescriptionError where surfaces are missing, or a value follows two others."""
-    taken: set[tuple[str, str]] = set()
+    followers: set[tuple[str, str]] = set()
     links: list[Pickup | Solve] = [*pickups, *solves]
     for link in links:
         quantity = link.quantity if isinstance(link, Pickup) else "thickness"
         for name in (link.surface, link.source) if isinstance(link, Pickup) else (link.surface,):
             if name not in surface_names or (quantity == "thickness" and name == surface_names[-1]):
-                which = "a surface with another one behind it" if quantity == "thickness" else "the name of a surface"
-                _refuse(f"{link.address}: {name!r}: expected {which}")
-        if (link.surface, quantity) in taken:
+                expected = (
+                    "a surface with another one behind it" if quantity == "thickness" else "the name of a surface"
+                )
+                _refuse(f"{link.address}: {name!r}: expected {expected}")
+        if (link.surface, quantity) in followers:
             _refuse(f"{link.address}: its {quantity} follows another value already")
-        taken.add((link.surface, quantity))
+        followers.add((link.surface, quantity))
     followed = {(p.surface, p.quantity): p.source for p in pickups}
     for pickup in pickups:
-        place, seen = pickup.source, {pickup.surface}
+        place, visited = pickup.source, {pickup.surface}
         while (place, pickup.quantity) in followed:
-            if place in seen:
+            if place in visited:
                 _refuse(f"{pickup.address}: follows itself through {place}")
-            seen.add(place)
+            visited.add(place)
             place = followed[place, pickup.quantity]
 
 

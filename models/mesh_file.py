@@ -46,7 +46,7 @@ def files_of_mesh(path: Path) -> list[str]:
         return []
     try:
         content = json.loads(read_bytes(path, PrescriptionError, max_bytes=MAX_MESH_BYTES))
-        named = [part.get("uri") for key in ("buffers", "images") for part in content.get(key, ())]
+        named = [entry.get("uri") for key in ("buffers", "images") for entry in content.get(key, ())]
     except (ValueError, AttributeError, TypeError, RecursionError):
         # Not JSON, or no GLTF: what reads the mesh says so.
         return []
@@ -71,7 +71,7 @@ def load_mesh(path: str | os.PathLike[str], *, merged: bool) -> trimesh.Trimesh:
     load = trimesh.load if merged else trimesh.load_scene
     with parsing(path, "cannot be read as a mesh", PrescriptionError), error_context(file=path):
         mesh: Any = load(data, file_type=path.suffix.lower()[1:], resolver=_Beside(path.parent), **how)
-    parts = mesh.geometry.values() if isinstance(mesh, trimesh.Scene) else [mesh]
-    if not any(len(getattr(part, "faces", ())) for part in parts):
+    geometries = mesh.geometry.values() if isinstance(mesh, trimesh.Scene) else [mesh]
+    if not any(len(getattr(geometry, "faces", ())) for geometry in geometries):
         raise PrescriptionError("expected a mesh with at least one triangle", file=path)
     return cast("trimesh.Trimesh", mesh.to_mesh() if isinstance(mesh, trimesh.Scene) else mesh)

@@ -51,21 +51,21 @@ class ParaxialSurfaces:
 
         With `front` they end with the stop; with `tilted` they may be off the axis, as for Zemax.
         """
-        found, medium = cls(), telescope.medium_before
+        paraxial, medium = cls(), telescope.medium_before
         z = telescope.surfaces[0].vertex[2]
         for surface in telescope.surfaces:
             if not tilted:
                 require_on_axis(surface, telescope.name)
-            found.advance(z - surface.vertex[2])
+            paraxial.advance(z - surface.vertex[2])
             z = surface.vertex[2]
             if surface.name == stop:
-                found.mark_stop(0.0)
+                paraxial.mark_stop(0.0)
             x, y = curvatures_across(surface)
-            found.add((-x, -y), medium, surface.medium_after, mirror=surface.interaction == Interaction.MIRROR)
+            paraxial.add((-x, -y), medium, surface.medium_after, mirror=surface.interaction == Interaction.MIRROR)
             if front and surface.name == stop:
                 break
             medium = surface.medium_after
-        return found
+        return paraxial
 
     def add(self, curvatures: tuple[float, float], before: Medium, after: Medium, *, mirror: bool) -> None:
         """Add a surface of given curvatures along x and y."""
@@ -187,10 +187,10 @@ def stop_image(telescope: Telescope, *, front: bool = False) -> StopImage:
         raise DomainError(f"{telescope.name}: expected a surface that is the stop (design data: stop)")
     surfaces = ParaxialSurfaces.of(telescope, data.stop, front=front)
     distance = telescope.object_distance - telescope.surfaces[0].vertex[2]
-    found = StopImage.of(surfaces, telescope.default_wavelength, distance, telecentric=data.telecentric)
-    if found is None:
+    image = StopImage.of(surfaces, telescope.default_wavelength, distance, telecentric=data.telecentric)
+    if image is None:
         raise DomainError(f"{telescope.name}: the stop {data.stop!r} makes an entrance pupil at infinity (telecentric)")
-    return found
+    return image
 
 
 def reference_radius(pupil_distance: float, focal_length: float, pupil_diameter: float) -> float:
@@ -231,11 +231,12 @@ def stop_makes_pupil(t: Telescope) -> bool:
     if t.design_data.stop is None or t.design_data.aperture is None:
         return False
     try:
-        made = with_floating_pupil(t)
+        floating = with_floating_pupil(t)
     except DomainError:
         return False
     close = {"rel_tol": _ROUNDING, "abs_tol": _ROUNDING * t.pupil_diameter}
-    return math.isclose(made.stop_z, t.stop_z, **close) and math.isclose(made.pupil_diameter, t.pupil_diameter, **close)
+    same_plane = math.isclose(floating.stop_z, t.stop_z, **close)
+    return same_plane and math.isclose(floating.pupil_diameter, t.pupil_diameter, **close)
 
 
 def stop_states_rays(t: Telescope) -> bool:
@@ -279,10 +280,10 @@ def with_true_aperture(telescope: Telescope) -> Telescope:
 def _states_diameter(t: Telescope) -> bool:
     """Return whether the stated aperture makes the diameter of the pupil, or cannot be compared with it."""
     try:
-        made = with_floating_pupil(t)
+        floating = with_floating_pupil(t)
     except DomainError:
         return True
-    return math.isclose(made.pupil_diameter, t.pupil_diameter, rel_tol=_ROUNDING)
+    return math.isclose(floating.pupil_diameter, t.pupil_diameter, rel_tol=_ROUNDING)
 
 
 def require_on_axis(surface: Surface, name: str) -> None:
@@ -294,9 +295,9 @@ def require_on_axis(surface: Surface, name: str) -> None:
 
 def curvatures_across(surface: Surface) -> tuple[float, float]:
     """Return the curvatures [1/m] of a surface on the axis along x and y of the telescope."""
-    own = surface.shape.curvatures
-    if own[0] == own[1]:
-        return own
+    shape_curvatures = surface.shape.curvatures
+    if shape_curvatures[0] == shape_curvatures[1]:
+        return shape_curvatures
     # Euler's theorem: squares of the cosines between the axes weight the curvatures of the surface.
-    along_x, along_y = surface.matrix[:2, :2] ** 2 @ np.array(own)
+    along_x, along_y = surface.matrix[:2, :2] ** 2 @ np.array(shape_curvatures)
     return float(along_x), float(along_y)

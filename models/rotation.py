@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.units import radians
 
@@ -13,7 +13,7 @@ from ..core.units import radians
 _SAME_LINE = 1e-15
 
 
-def rotation_matrix(tilt: Any) -> np.ndarray:
+def rotation_matrix(tilt: ArrayLike) -> np.ndarray:
     """Return Rx @ Ry @ Rz, shape (3, 3), of angles [rad] about x, the new y and the new z, as in Zemax."""
     rx, ry, rz = radians(tilt, "tilt")
     cx, cy, cz = np.cos((rx, ry, rz))
@@ -32,5 +32,5 @@ def rotation_angles(matrix: np.ndarray) -> tuple[float, float, float]:
         return math.atan2(matrix[2, 1], matrix[1, 1]), math.atan2(matrix[0, 2], along), 0.0
     about_x = math.atan2(-matrix[1, 2], matrix[2, 2])
     # What is left without the first rotation: near a right angle the others make up for its rounding.
-    left = rotation_matrix((-about_x, 0.0, 0.0)) @ matrix
-    return about_x, math.atan2(left[0, 2], left[2, 2]), math.atan2(left[1, 0], left[1, 1])
+    about_y_z = rotation_matrix((-about_x, 0.0, 0.0)) @ matrix
+    return about_x, math.atan2(about_y_z[0, 2], about_y_z[2, 2]), math.atan2(about_y_z[1, 0], about_y_z[1, 1])

@@ -83,8 +83,8 @@ class Site:
     def __post_init__(self) -> None:
         if not self.wind_directions:
             object.__setattr__(self, "wind_directions", (None,) * len(self.altitudes))
-        parts = (self.altitudes, self.weights, self.wind_speeds, self.wind_directions)
-        if not self.altitudes or len({len(part) for part in parts}) > 1:
+        profiles = (self.altitudes, self.weights, self.wind_speeds, self.wind_directions)
+        if not self.altitudes or len({len(profile) for profile in profiles}) > 1:
             raise PrescriptionError(f"layers of site {self.name!r}: expected an altitude, weight and wind for each")
         if not (np.isfinite(self.altitudes).all() and self.altitudes[0] >= 0 and (np.diff(self.altitudes) > 0).all()):
             raise PrescriptionError(f"altitudes = {self.altitudes!r}: expected to rise from 0 m or more")

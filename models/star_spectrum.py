@@ -25,8 +25,10 @@ COLORS: dict[str, tuple[float, float, float]] = {
     "r_i": (616.6e-9, 748.0e-9, 0.0),
     "bp_rp": (511.0e-9, 776.9e-9, 0.3406),
 }
-#: Temperatures between which stars are taken to be [K].
-COOLEST, HOTTEST = 2000.0, 50000.0
+#: Lowest temperature that stars are taken to have [K].
+COOLEST = 2000.0
+#: Highest temperature that stars are taken to have [K].
+HOTTEST = 50000.0
 #: Second radiation constant, h c / k [m K].
 _RADIATION = 1.438776877e-2
 _STEPS = 400
@@ -91,5 +93,5 @@ def color_temperature(color: ArrayLike, bands: str = "g_r") -> np.ndarray:
     colors = 7.5 * math.log10(first / second) + 2.5 * (
         np.log10(np.expm1(inverse / first)) - np.log10(np.expm1(inverse / second))
     )
-    given = pure_numbers(color, "color") - zero
-    return np.asarray(np.exp(np.interp(given, colors, log_kelvin)))
+    ab_colors = pure_numbers(color, "color") - zero
+    return np.asarray(np.exp(np.interp(ab_colors, colors, log_kelvin)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -138,7 +138,9 @@ def _points(points: ArrayLike) -> np.ndarray:
     return values
 
 
-def move_frame(vertex: Vector, axes: Matrix, *, rotation: Any, about: Any, shift: Any) -> tuple[Vector, Matrix]:
+def move_frame(
+    vertex: Vector, axes: Matrix, *, rotation: ArrayLike, about: ArrayLike, shift: ArrayLike
+) -> tuple[Vector, Matrix]:
     """Return a frame (origin [m] and axes as columns) rotated about a point [m], then shifted [m]."""
     rotation = pure_numbers(rotation, "rotation")
     about, shift = metres(about, "about"), metres(shift, "shift")

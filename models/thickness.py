@@ -24,8 +24,8 @@ def front_surface(telescope: Telescope, target: str) -> int:
     """
     names = telescope.surface_names
     if target in telescope.groups:
-        first, *others = (names.index(member) for member in telescope.groups[target])
-        if others != [first + 1]:
+        first, *back_surfaces = (names.index(member) for member in telescope.groups[target])
+        if back_surfaces != [first + 1]:
             raise DomainError(f"parameter '{target}.thickness': expected a group of two surfaces, front and back")
         return first
     index = names.index(telescope.surface(target).name)
@@ -46,8 +46,8 @@ def light_axis(telescope: Telescope, index: int) -> np.ndarray:
 
 def thickness(telescope: Telescope, index: int) -> float:
     """Return the distance [m] from the vertex of a surface to the next one, along the light."""
-    here, behind = (np.array(s.vertex) for s in telescope.surfaces[index : index + 2])
-    return float(light_axis(telescope, index) @ (behind - here))
+    vertex, next_vertex = (np.array(s.vertex) for s in telescope.surfaces[index : index + 2])
+    return float(light_axis(telescope, index) @ (next_vertex - vertex))
 
 
 def impossible_glasses(telescope: Telescope) -> list[int]:
@@ -55,24 +55,24 @@ def impossible_glasses(telescope: Telescope) -> list[int]:
 
     A negative distance in air is none: dummy surfaces and virtual images have one.
     """
-    found = []
+    indices = []
     for i, surface in enumerate(telescope.surfaces[:-1]):
         if surface.matrix[2, 2] != 1.0 or telescope.surfaces[i + 1].matrix[2, 2] != 1.0:
             break
         if surface.medium_after != telescope.medium_before and thickness(telescope, i) < 0.0:
-            found.append(i)
-    return found
+            indices.append(i)
+    return indices
 
 
 def impossible_thicknesses(telescope: Telescope) -> list[str]:
     """Return a text for each of the :func:`impossible_glasses`."""
-    found: list[str] = []
+    problems: list[str] = []
     name, unit = telescope.length_unit
     for i in impossible_glasses(telescope):
         surface = telescope.surfaces[i]
         glass, distance = surface.medium_after.name or "glass", thickness(telescope, i)
-        found.append(f"surface {surface.name}: {glass} of thickness {distance / unit:.6g} {name}: expected from 0")
-    return found
+        problems.append(f"surface {surface.name}: {glass} of thickness {distance / unit:.6g} {name}: expected from 0")
+    return problems
 
 
 def with_thicknesses(telescope: Telescope, start: Telescope, changes: Iterable[tuple[int, float]]) -> Telescope:

@@ -142,9 +142,9 @@ def radial_series(m: int, count: int, obscuration: float = 0.0) -> np.ndarray:
         series = np.polynomial.legendre.leg2poly([0.0] * degree + [1.0])
         expanded = np.polynomial.Polynomial(series)(node)
         powers[: degree + 1, degree] = expanded.coef
-    found: np.ndarray = powers @ _radial_coefficients(m, count, float(obscuration))
-    found.flags.writeable = False
-    return found
+    coefficients: np.ndarray = powers @ _radial_coefficients(m, count, float(obscuration))
+    coefficients.flags.writeable = False
+    return coefficients
 
 
 def zernike_monomials(jmax: int) -> np.ndarray:
@@ -160,8 +160,9 @@ def zernike_monomials(jmax: int) -> np.ndarray:
             # (x^2 + y^2)^k times the real or imaginary part of (x + iy)^m
             for a in range(k + 1):
                 for b in range(m + 1):
-                    part = (1j**b).imag if signed < 0 else (1j**b).real
-                    out[row, m - b + 2 * (k - a), b + 2 * a] += scale * coefficient * comb(k, a) * comb(m, b) * part
+                    phase_factor = (1j**b).imag if signed < 0 else (1j**b).real
+                    term = scale * coefficient * comb(k, a) * comb(m, b) * phase_factor
+                    out[row, m - b + 2 * (k - a), b + 2 * a] += term
     return out
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 from typer import Option
 
 from ...core.errors import ConfigError
 from ..tables import FIELD, Column, Rows, number_texts
-from .command import Given, Outcome, Study, design_command
+from .command import Outcome, SharedOptions, Study, design_command
+
+if TYPE_CHECKING:
+    from ...design.analyses.seidel import SeidelDiagram
 
 Points = Annotated[int, Option(min=3, max=10001, help="Rays along each diameter of the pupil.")]
 
@@ -19,7 +22,7 @@ Points = Annotated[int, Option(min=3, max=10001, help="Rays along each diameter 
     caption="Transverse aberration along each fan against the chief ray of the middle wavelength.",
     band=True,
 )
-def fans(given: Given, points: Points = 65) -> Study:
+def fans(shared: SharedOptions, points: Points = 65) -> Study:
     """Draw ray fans: transverse aberration against the pupil, tangential and sagittal.
 
     Tangential is the diameter of the pupil along the field point's direction from the axis, sagittal that across it.
@@ -31,7 +34,7 @@ def fans(given: Given, points: Points = 65) -> Study:
     """
     from ...design.analyses.ray_fans import ray_fans
 
-    return ray_fans(*given.where, n_points=points, **given.how)
+    return ray_fans(*shared.first_arguments, n_points=points, **shared.trace_options)
 
 
 @design_command(
@@ -40,7 +43,7 @@ def fans(given: Given, points: Points = 65) -> Study:
     caption="Over both fans, a number for each wavelength; reference sphere of {reference_sphere_m:.6g} m.",
     band=True,
 )
-def opd_fans(given: Given, points: Points = 65) -> Study:
+def opd_fans(shared: SharedOptions, points: Points = 65) -> Study:
     """Draw OPD fans: optical path difference against the pupil, tangential and sagittal, in waves.
 
     **Examples**
@@ -50,7 +53,7 @@ def opd_fans(given: Given, points: Points = 65) -> Study:
     """
     from ...design.analyses.ray_fans import opd_fans as compute
 
-    return compute(*given.where, n_points=points, **given.how)
+    return compute(*shared.first_arguments, n_points=points, **shared.trace_options)
 
 
 @design_command(
@@ -61,7 +64,7 @@ def opd_fans(given: Given, points: Points = 65) -> Study:
     caption="A number for each wavelength; foci are behind the detector as light travels.",
     band=True,
 )
-def field_curvature(given: Given) -> Study:
+def field_curvature(shared: SharedOptions) -> Study:
     """Draw tangential and sagittal field curvature, and distortion, against the field.
 
     Foci are those of rays close to the chief ray; distortion is against f tan(theta) with the scale on the axis.
@@ -73,7 +76,7 @@ def field_curvature(given: Given) -> Study:
     """
     from ...design.analyses.field_curvature import field_curvature as compute
 
-    return compute(*given.where, **given.how)
+    return compute(*shared.first_arguments, **shared.trace_options)
 
 
 @design_command(
@@ -84,7 +87,7 @@ def field_curvature(given: Given) -> Study:
     caption="Shift of the chief ray of each wavelength along the field, against {reference_nm:.6g} nm.",
     band=True,
 )
-def lateral_color(given: Given) -> Study:
+def lateral_color(shared: SharedOptions) -> Study:
     """Draw lateral colour: landing points of the chief rays of several wavelengths, against the field.
 
     **Examples**
@@ -94,7 +97,7 @@ def lateral_color(given: Given) -> Study:
     """
     from ...design.analyses.color import lateral_color as compute
 
-    return compute(*given.where, **given.how)
+    return compute(*shared.first_arguments, **shared.trace_options)
 
 
 @design_command(
@@ -105,7 +108,7 @@ def lateral_color(given: Given) -> Study:
     band=True,
 )
 def focal_shift(
-    given: Given,
+    shared: SharedOptions,
     zone: Annotated[list[float] | None, Option(help="Zone of the pupil, up to 1, once for each; 0.7 and 1.")] = None,
 ) -> Study:
     """Draw the chromatic focal shift: focus on the axis against the wavelength, paraxial and of real rays.
@@ -117,14 +120,14 @@ def focal_shift(
     """
     from ...design.analyses.color import chromatic_focus
 
-    if given.field_deg:
+    if shared.field_deg:
         raise ConfigError("--field-deg: expected none; the focus is that on the axis")
     zones = {} if zone is None else {"zones": zone}
-    return chromatic_focus(given.telescope, given.wavelength, threads=given.threads, **zones)
+    return chromatic_focus(shared.telescope, shared.wavelength, threads=shared.threads, **zones)
 
 
 @design_command()
-def seidel(given: Given) -> Outcome:
+def seidel(shared: SharedOptions) -> Outcome:
     """Draw the Seidel diagram: third-order and chromatic aberrations of each surface, in waves.
 
     Wavefront at the rims of pupil and field; `--field-deg` takes the field angle of the chief ray.
@@ -138,13 +141,13 @@ def seidel(given: Given) -> Outcome:
 
     from ...design.analyses.seidel import seidel_diagram
 
-    if given.fields is not None and len(given.fields) != 1:
+    if shared.fields is not None and len(shared.fields) != 1:
         raise ConfigError("--field-deg: expected one field")
-    angle = None if given.fields is None else float(np.linalg.norm(given.fields[0]))
-    return Outcome(seidel_diagram(given.telescope, given.wavelength, field=angle), _seidel_rows)
+    angle = None if shared.fields is None else float(np.linalg.norm(shared.fields[0]))
+    return Outcome(seidel_diagram(shared.telescope, shared.wavelength, field=angle), _seidel_rows)
 
 
-def _seidel_rows(result: Any) -> Rows:
+def _seidel_rows(result: SeidelDiagram) -> Rows:
     s = result.summary()
     names = [*s["surfaces"], "sum"]
     values = [*s["waves"], s["total_waves"]]
@@ -167,7 +170,7 @@ def _matrix_heading(summary: dict[str, Any]) -> str:
     band=True,
 )
 def spot_matrix(
-    given: Given,
+    shared: SharedOptions,
     against: Annotated[str, Option(help="Columns: focus or wavelength.")] = "focus",
     range_um: Annotated[
         tuple[float, float] | None, Option(metavar="LOW HIGH", help="Heights of the detector [um].")
@@ -188,6 +191,6 @@ def spot_matrix(
     from ...design.analyses.spot_matrix import spot_matrix as compute
 
     defocus = None if range_um is None else np.linspace(*range_um, steps) * 1e-6
-    telescope, fields, wavelengths = given.where
-    how: dict[str, Any] = {"against": against, "defocus": defocus, "n_pupil": rays, **given.how}
-    return compute(telescope, fields, wavelengths, **how)
+    # The function itself refuses other texts.
+    columns = cast('Literal["focus", "wavelength"]', against)
+    return compute(*shared.first_arguments, against=columns, defocus=defocus, n_pupil=rays, **shared.trace_options)

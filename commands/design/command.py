@@ -1,8 +1,8 @@
 """Builder of design commands, with the options, tables and pictures that all of them have.
 
-A command is one function that takes the shared options as a :class:`Given`, has the command's own options as further
-parameters, and returns a result with ``summary()`` and ``plot()``. Its name and docstring are those of the command;
-:func:`design_command` adds the shared options, and the columns of the table.
+A command is one function that takes the options of all design commands as :class:`SharedOptions`, has the command's own
+options as further parameters, and returns a result with ``summary()`` and ``plot()``. Its name and docstring are those
+of the command; :func:`design_command` adds the shared options, and the columns of the table.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypedDict
 
 import typer
 
@@ -63,13 +63,20 @@ class Outcome:
     notes: Sequence[str] = ()  #: lines below the table
 
 
+class TraceOptions(TypedDict):
+    """Keyword arguments of every function that traces."""
+
+    projection: str
+    threads: int | None
+
+
 @dataclass(frozen=True)
-class Given:
+class SharedOptions:
     """The options that design commands share; files are read when they are first used."""
 
     model: str
     field_deg: Sequence[str] | str | None = None
-    wavelength_nm: Any = None
+    wavelength_nm: float | Sequence[float] | None = None
     across_band: int | None = None
     projection: str = "zemax"
     aiming: str | None = None
@@ -89,19 +96,19 @@ class Given:
         return options.field_list([self.field_deg] if isinstance(self.field_deg, str) else self.field_deg)
 
     @cached_property
-    def wavelength(self) -> Any:
+    def wavelength(self) -> float | np.ndarray | None:
         """The wavelength or wavelengths [m]; None where none is given."""
         if isinstance(self.wavelength_nm, float):
             return self.wavelength_nm * 1e-9
         return options.wavelength_list(self.telescope, self.wavelength_nm, self.across_band)
 
     @property
-    def where(self) -> tuple[Telescope, Any, Any]:
+    def first_arguments(self) -> tuple[Telescope, np.ndarray | None, float | np.ndarray | None]:
         """Telescope, field angles and wavelengths: the first arguments of most functions."""
         return self.telescope, self.fields, self.wavelength
 
     @property
-    def how(self) -> dict[str, Any]:
+    def trace_options(self) -> TraceOptions:
         """Projection and threads, as keyword arguments."""
         return {"projection": self.projection, "threads": self.threads}
 
@@ -110,7 +117,7 @@ class Given:
         """The number of images, over fields and wavelengths."""
         from ...wavefront.request import Request
 
-        request = Request.of(*self.where, projection=self.projection)
+        request = Request.of(*self.first_arguments, projection=self.projection)
         return len(request.fields) * len(request.wavelengths)
 
     @contextmanager
@@ -148,18 +155,18 @@ def design_command(
 
     def build(compute: Callable[..., Study | Outcome]) -> Callable[..., Study | Outcome]:
         name = compute.__name__.replace("_", "-")
-        parameters, own = _parameters(compute, band, picture)
+        parameters, option_names = _parameters(compute, band, picture)
 
         def command(picture: Path | None, as_json: bool, **values: Any) -> None:
             kind = options.picture_kind(picture)
             import_modules(_NEEDED)
-            shared = Given(**{f.name: values[f.name] for f in fields(Given) if f.name in values})
+            shared = SharedOptions(**{f.name: values[f.name] for f in fields(SharedOptions) if f.name in values})
             try:
-                found = compute(shared, **{key: values[key] for key in own})
+                result = compute(shared, **{key: values[key] for key in option_names})
             except PachonError as error:
-                option = next((key for key in own if error.key == _ARGUMENTS.get(key, key)), None)
+                option = next((key for key in option_names if error.key == _ARGUMENTS.get(key, key)), None)
                 raise error if option is None else error.renamed(f"--{option.replace('_', '-')}") from None
-            outcome = found if isinstance(found, Outcome) else Outcome(found)
+            outcome = result if isinstance(result, Outcome) else Outcome(result)
             path = picture or Path(f"{outcome.stem or f'{name}_{shared.telescope.name}'}.png")
             _deliver(outcome, outcome.table or rows, path, kind, as_json)
 
@@ -175,14 +182,14 @@ def design_command(
 
 def _parameters(compute: Callable[..., Any], band: bool, picture: Any) -> tuple[list[inspect.Parameter], list[str]]:
     """Return the parameters of a command, shared and own, and the names of its own."""
-    _, *own = inspect.signature(compute, eval_str=True).parameters.values()
-    one = {"wavelength_nm": (options.WavelengthNm, None)}
+    _, *command_parameters = inspect.signature(compute, eval_str=True).parameters.values()
+    single = {"wavelength_nm": (options.WavelengthNm, None)}
     several = {"wavelength_nm": (options.WavelengthsNm, None), "across_band": (options.AcrossBand, None)}
-    taken: dict[str, tuple[Any, Any]] = {
+    option_table: dict[str, tuple[Any, Any]] = {
         "model": (options.Model, inspect.Parameter.empty),
         "field_deg": (options.FieldsDeg, None),
-        **(several if band else one),
-        **{p.name: (p.annotation, p.default) for p in own},
+        **(several if band else single),
+        **{p.name: (p.annotation, p.default) for p in command_parameters},
         "projection": (options.Projection, "zemax"),
         "aiming": (options.Aiming, None),
         "glass_catalogue": (options.GlassCatalogues, None),
@@ -193,8 +200,8 @@ def _parameters(compute: Callable[..., Any], band: bool, picture: Any) -> tuple[
     }
     # Keyword-only, so that an option without a default may follow one that has a default.
     kind = inspect.Parameter.KEYWORD_ONLY
-    parameters = [inspect.Parameter(key, kind, annotation=a, default=d) for key, (a, d) in taken.items()]
-    return parameters, [p.name for p in own]
+    parameters = [inspect.Parameter(key, kind, annotation=a, default=d) for key, (a, d) in option_table.items()]
+    return parameters, [p.name for p in command_parameters]
 
 
 def _deliver(outcome: Outcome, table: Callable[[Any], Rows], path: Path, kind: str, as_json: bool) -> None:

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from typer import Option
 
 from ...core.errors import ConfigError
 from ..tables import Column, Rows, field_headings, number_texts
-from .command import Given, Outcome, design_command
+from .command import Outcome, SharedOptions, design_command
+
+if TYPE_CHECKING:
+    from ...design.metrics.distortion import Distortion
+    from ...design.metrics.footprint import Footprint
+    from ...design.metrics.vignetting import Vignetting
 
 #: Number of rays that takes longer than two seconds to trace.
 _MANY_RAYS = 10_000_000
@@ -18,7 +23,7 @@ _MANY_RAYS = 10_000_000
 
 @design_command()
 def distortion(
-    given: Given,
+    shared: SharedOptions,
     centroid: Annotated[bool, Option("--centroid", help="Centroids of the light, not chief rays.")] = False,
 ) -> Outcome:
     """Compare where stars land with a scaled picture of the sky, r = f tan(theta).
@@ -33,10 +38,10 @@ def distortion(
     from ...design.metrics.distortion import distortion as compute
 
     reference = "centroid" if centroid else "chief"
-    return Outcome(compute(*given.where, reference=reference, **given.how), _distortion_rows)
+    return Outcome(compute(*shared.first_arguments, reference=reference, **shared.trace_options), _distortion_rows)
 
 
-def _distortion_rows(result: Any) -> Rows:
+def _distortion_rows(result: Distortion) -> Rows:
     s = result.summary()
     scales = ("that fits best", result.focal_length), ("at the axis", result.axis_focal_length)
     name, shown = ("angular magnification", "{:.6f}".format) if result.in_angles else ("focal length", _length)
@@ -56,7 +61,7 @@ def _length(metres: float) -> str:
 
 @design_command()
 def vignetting(
-    given: Given, rays: Annotated[int, Option(min=16, max=10**7, help="Rays of each field.")] = 16384
+    shared: SharedOptions, rays: Annotated[int, Option(min=16, max=10**7, help="Rays of each field.")] = 16384
 ) -> Outcome:
     """Find how much of the pupil is lit against field, with an error, as profile and map.
 
@@ -68,14 +73,16 @@ def vignetting(
     from ...design.metrics.vignetting import field_disc
     from ...design.metrics.vignetting import vignetting as compute
 
-    fields: Any = field_disc(given.telescope) if given.fields is None else given.fields
+    fields = field_disc(shared.telescope) if shared.fields is None else shared.fields
     parts = len(fields) + 1
-    with given.stage("vignetting", parts) if rays * parts >= _MANY_RAYS else nullcontext() as progress:
-        how = dict(n_pupil=rays, progress=progress, **given.how)
-        return Outcome(compute(given.telescope, fields, given.wavelength, **how), _vignetting_rows)
+    with shared.stage("vignetting", parts) if rays * parts >= _MANY_RAYS else nullcontext() as progress:
+        traced = compute(
+            shared.telescope, fields, shared.wavelength, n_pupil=rays, progress=progress, **shared.trace_options
+        )
+        return Outcome(traced, _vignetting_rows)
 
 
-def _vignetting_rows(result: Any) -> Rows:
+def _vignetting_rows(result: Vignetting) -> Rows:
     """Return the light at each distance from the axis."""
     import numpy as np
 
@@ -93,7 +100,7 @@ def _vignetting_rows(result: Any) -> Rows:
 
 @design_command()
 def footprint(
-    given: Given,
+    shared: SharedOptions,
     surface: Annotated[list[str] | None, Option(help="Name of a surface, once for each; all by default.")] = None,
 ) -> Outcome:
     """Draw the footprints of beams on surfaces, over the clear apertures, and the light that each surface blocks.
@@ -105,11 +112,11 @@ def footprint(
     """
     from ...design.metrics.footprint import footprint as compute
 
-    telescope, *where = given.where
-    return Outcome(compute(telescope, surface or None, *where, **given.how), _footprint_rows)
+    telescope, fields, wavelength = shared.first_arguments
+    return Outcome(compute(telescope, surface or None, fields, wavelength, **shared.trace_options), _footprint_rows)
 
 
-def _footprint_rows(result: Any) -> Rows:
+def _footprint_rows(result: Footprint) -> Rows:
     import numpy as np
 
     rows = []
@@ -132,7 +139,7 @@ def _footprint_rows(result: Any) -> Rows:
     left=2,
 )
 def draw(
-    given: Given,
+    shared: SharedOptions,
     glb: Annotated[Path | None, Option(help="Write the telescope and its rays in three dimensions, .glb.")] = None,
 ) -> Outcome:
     """Draw a telescope: its section with rays of some fields, and a model in three dimensions.
@@ -151,9 +158,9 @@ def draw(
 
     if glb is not None and glb.suffix.lower() != ".glb":
         raise ConfigError(f"--glb = {str(glb)!r}: expected a name that ends in .glb")
-    result = layout(*given.where, **given.how)
+    result = layout(*shared.first_arguments, **shared.trace_options)
     notes = [f"{field_label(result.fields[i])}: no ray arrives, so none is drawn" for i in result.dark]
-    if notes and given.telescope.design_data.stop and given.telescope.design_data.aiming == "off":
+    if notes and shared.telescope.design_data.stop and shared.telescope.design_data.aiming == "off":
         notes.append("the rays of these fields may miss the stop: --aiming paraxial aims them at it")
     if glb is not None:
         write_bytes(glb, result.glb())

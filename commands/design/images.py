@@ -10,7 +10,7 @@ from typer import Option
 
 from ...core.errors import ConfigError
 from ..tables import FIELD, Column
-from .command import Given, Study, design_command
+from .command import SharedOptions, Study, design_command
 
 #: Pairs of surfaces whose ghosts take longer than ten seconds.
 _MANY_PAIRS = 200
@@ -41,7 +41,7 @@ def _pixels_text(s: dict[str, Any]) -> str:
     band=True,
 )
 def psf(
-    given: Given,
+    shared: SharedOptions,
     huygens: Annotated[bool, Option("--huygens", help="Sum the wave of every ray at every pixel.")] = False,
     pixel_um: Annotated[float | None, Option(help="Distance of pixels [um]; λf/5 or more by default.")] = None,
     pixels: Annotated[int, Option(min=16, max=4096, help="Pixels on a side.")] = 128,
@@ -65,9 +65,15 @@ def psf(
         raise ConfigError("--huygens and --pupil-points: expected one of them")
     compute = huygens_psf if huygens else fft_psf
     pixel = None if pixel_um is None else pixel_um * 1e-6
-    with given.stage("diffraction images", given.images) as progress:
-        how = dict(pixels=pixels, n_pupil=pupil_points, progress=progress, **given.how)
-        result = compute(*given.where, pixel=pixel, **how)
+    with shared.stage("diffraction images", shared.images) as progress:
+        result = compute(
+            *shared.first_arguments,
+            pixel=pixel,
+            pixels=pixels,
+            n_pupil=pupil_points,
+            progress=progress,
+            **shared.trace_options,
+        )
     if fits is not None:
         cards = [
             ("MODEL", result.telescope, "telescope"),
@@ -89,7 +95,7 @@ def psf(
     band=True,
 )
 def ee(
-    given: Given,
+    shared: SharedOptions,
     geometric: Annotated[bool, Option("--geometric", help="Of rays alone, without diffraction.")] = False,
     pixels: Annotated[int, Option(min=16, max=4096, help="Pixels of the images, on a side.")] = 256,
     pupil_points: PupilPoints = None,
@@ -106,10 +112,16 @@ def ee(
     """
     from ...design.images.encircled_energy import encircled_energy
 
-    kind, total = ("geometric", None) if geometric else ("diffraction", given.images)
-    with given.stage("encircled energy", total) as progress:
-        how = dict(pixels=pixels, n_pupil=None if geometric else pupil_points, **given.how)
-        return encircled_energy(*given.where, kind=kind, progress=progress, **how)
+    kind, total = ("geometric", None) if geometric else ("diffraction", shared.images)
+    with shared.stage("encircled energy", total) as progress:
+        return encircled_energy(
+            *shared.first_arguments,
+            kind=kind,
+            pixels=pixels,
+            n_pupil=None if geometric else pupil_points,
+            progress=progress,
+            **shared.trace_options,
+        )
 
 
 @design_command(
@@ -122,7 +134,7 @@ def ee(
     band=True,
 )
 def mtf(
-    given: Given,
+    shared: SharedOptions,
     pupil_points: Annotated[
         int | None,
         Option(min=16, max=4096, help="Lattice points across the pupil; 256 by default, or as many as spots need."),
@@ -137,8 +149,8 @@ def mtf(
     """
     from ...design.images.mtf import mtf as compute
 
-    with given.stage("modulation transfer", given.images) as progress:
-        return compute(*given.where, n_pupil=pupil_points, progress=progress, **given.how)
+    with shared.stage("modulation transfer", shared.images) as progress:
+        return compute(*shared.first_arguments, n_pupil=pupil_points, progress=progress, **shared.trace_options)
 
 
 @design_command(
@@ -158,7 +170,7 @@ def mtf(
     most=20,
 )
 def ghosts(
-    given: Given,
+    shared: SharedOptions,
     field_deg: Annotated[
         str | None,
         Option(
@@ -198,8 +210,8 @@ def ghosts(
     from ...design.metrics.ghosts import ghosts as compute
 
     lenses = _reflectivities(reflectivity or [])
-    field = None if given.fields is None else given.fields[0]
-    pairs = len(ghost_pairs(given.telescope))
+    field = None if shared.fields is None else shared.fields[0]
+    pairs = len(ghost_pairs(shared.telescope))
     traced = max(pairs if brightest is None else min(brightest, pairs), 1)
     if traced > _MANY_PAIRS:
         typer.echo(
@@ -207,21 +219,24 @@ def ghosts(
             "the time or less",
             err=True,
         )
-    with given.stage("ghosts", traced) as progress:
-        how = dict(
+    with shared.stage("ghosts", traced) as progress:
+        return compute(
+            shared.telescope,
+            field,
+            shared.wavelength,
+            reflectivity=lenses,
             detector_reflectivity=detector_reflectivity,
             coatings=coatings,
             n_pupil=rays,
             brightest=brightest,
             progress=progress,
-            **given.how,
+            **shared.trace_options,
         )
-        return compute(given.telescope, field, given.wavelength, reflectivity=lenses, **how)
 
 
 def _reflectivities(texts: list[str]) -> float | dict[str, float] | None:
     """Return the reflectivities: None where there are none, one number for all, or numbers by name."""
-    found: dict[str, float] = {}
+    surface_reflectivities: dict[str, float] = {}
     for text in texts:
         name, _, value = text.rpartition("=")
         try:
@@ -232,5 +247,5 @@ def _reflectivities(texts: list[str]) -> float | dict[str, float] | None:
             if len(texts) > 1:
                 raise ConfigError(f"--reflectivity = {text!r}: expected one number alone, or NAME=number for each")
             return number
-        found[name] = number
-    return found or None
+        surface_reflectivities[name] = number
+    return surface_reflectivities or None

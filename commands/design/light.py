@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from typer import Option
 
 from ...core.errors import ConfigError
 from ..options import degrees_pair
 from ..tables import FIELD, Column, Rows
-from .command import Given, Outcome, Study, design_command
+from .command import Outcome, SharedOptions, Study, design_command
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ...design.analyses.target_image import TargetImage
+    from ...design.analyses.throughput import Throughput
 
 _Coatings = Annotated[Path | None, Option(metavar="FILE.yaml", help="Coatings of surfaces and absorption of glasses.")]
 
@@ -22,7 +28,7 @@ _Coatings = Annotated[Path | None, Option(metavar="FILE.yaml", help="Coatings of
     caption="By the projected solid angle of the exit pupil; a uniform source.",
 )
 def illumination(
-    given: Given,
+    shared: SharedOptions,
     rays: Annotated[int, Option(min=16, max=10**6, help="Rays of each field.")] = 2000,
     coatings: _Coatings = None,
 ) -> Study:
@@ -35,12 +41,12 @@ def illumination(
     """
     from ...design.analyses.illumination import relative_illumination
 
-    return relative_illumination(*given.where, coatings=coatings, n_pupil=rays, **given.how)
+    return relative_illumination(*shared.first_arguments, coatings=coatings, n_pupil=rays, **shared.trace_options)
 
 
 @design_command(band=True)
 def throughput(
-    given: Given,
+    shared: SharedOptions,
     coatings: _Coatings = None,
 ) -> Outcome:
     """Draw the throughput against the wavelength: bare or coated surfaces, absorption, vignetting.
@@ -54,10 +60,10 @@ def throughput(
     """
     from ...design.analyses.throughput import throughput as compute
 
-    return Outcome(compute(*given.where, coatings=coatings, **given.how), _throughput_rows)
+    return Outcome(compute(*shared.first_arguments, coatings=coatings, **shared.trace_options), _throughput_rows)
 
 
-def _throughput_rows(result: Any) -> Rows:
+def _throughput_rows(result: Throughput) -> Rows:
     from ...design.drawing import field_text
 
     headings = ("wavelength [nm]", *(field_text(f) for f in result.fields))
@@ -80,7 +86,7 @@ def _throughput_rows(result: Any) -> Rows:
     band=True,
 )
 def strehl(
-    given: Given, psf: Annotated[bool, Option("--psf/--no-psf", help="Diffraction images too.")] = True
+    shared: SharedOptions, psf: Annotated[bool, Option("--psf/--no-psf", help="Diffraction images too.")] = True
 ) -> Study:
     """Compute Strehl ratios from the rms wavefront, from the wavefront, and from the diffraction image.
 
@@ -91,12 +97,12 @@ def strehl(
     """
     from ...design.analyses.strehl import strehl as compute
 
-    return compute(*given.where, from_psf=psf, **given.how)
+    return compute(*shared.first_arguments, from_psf=psf, **shared.trace_options)
 
 
 @design_command(band=True)
 def target(
-    given: Given,
+    shared: SharedOptions,
     field_deg: Annotated[
         str, Option(metavar="X,Y | R", help="Field angle of the middle of the target [deg], or a distance along +y.")
     ] = "0,0",
@@ -124,11 +130,19 @@ def target(
     picture = bar_target(bars=bars) if image is None else _grey(image)
     middle = np.deg2rad(degrees_pair(field_deg, "--field-deg"))
     width = None if width_arcsec is None else width_arcsec * ARCSEC
-    how: dict[str, Any] = {"width": width, "field": middle, "wavelengths": given.wavelength, "n_rays": rays}
-    return Outcome(target_image(given.telescope, picture, **how, **given.how), _target_rows)
+    result = target_image(
+        shared.telescope,
+        picture,
+        width=width,
+        field=middle,
+        wavelengths=shared.wavelength,
+        n_rays=rays,
+        **shared.trace_options,
+    )
+    return Outcome(result, _target_rows)
 
 
-def _grey(path: Path) -> Any:
+def _grey(path: Path) -> np.ndarray:
     """Return a picture as brightness, rows upwards."""
     from matplotlib.image import imread
 
@@ -139,7 +153,7 @@ def _grey(path: Path) -> Any:
     return (values if values.ndim == 2 else values[..., :3].mean(axis=-1))[::-1].astype(float)
 
 
-def _target_rows(result: Any) -> Rows:
+def _target_rows(result: TargetImage) -> Rows:
     s = result.summary()
     rows = [
         ("pixel of the target", f"{s['target_pixel_arcsec']:.5g} arcsec"),

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Option
 
 from ...core.errors import ConfigError
 from ..tables import FIELD, Column, Rows, field_headings, number_texts, numbers_of
-from .command import Given, Outcome, Study, design_command
+from .command import Outcome, SharedOptions, Study, design_command
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    import numpy as np
+
+    from ...design.metrics.field_zernikes import DoubleZernikes, FieldZernikes
 
 
 @design_command(
@@ -24,7 +31,7 @@ from .command import Given, Outcome, Study, design_command
     band=True,
 )
 def spots(
-    given: Given,
+    shared: SharedOptions,
     sampling: Annotated[str, Option(help="Sampling of the pupil: gauss, rings, spiral or square.")] = "gauss",
     rays: Annotated[
         int | None, Option(min=1, help="Rays along the radius (gauss, rings), in all (spiral), across.")
@@ -42,15 +49,15 @@ def spots(
     """
     from ...design.metrics.spots import spots as compute
 
-    return compute(*given.where, sampling=sampling, n_pupil=rays, **given.how)
+    return compute(*shared.first_arguments, sampling=sampling, n_pupil=rays, **shared.trace_options)
 
 
-def _largest(strehl: Any) -> Any:
+def _largest(strehl: np.ndarray) -> np.ndarray:
     """Return the largest ratio of each field; NaN where all are too far from focus to be known."""
     import numpy as np
 
-    known = np.isfinite(strehl)
-    return np.where(known.any(axis=1), np.where(known, strehl, 0.0).max(axis=1), np.nan)
+    finite = np.isfinite(strehl)
+    return np.where(finite.any(axis=1), np.where(finite, strehl, 0.0).max(axis=1), np.nan)
 
 
 @design_command(
@@ -64,7 +71,7 @@ def _largest(strehl: Any) -> Any:
     band=True,
 )
 def focus(
-    given: Given,
+    shared: SharedOptions,
     range_um: Annotated[
         tuple[float, float] | None,
         Option(
@@ -90,12 +97,12 @@ def focus(
     if range_um is not None and not range_um[0] < range_um[1]:
         raise ConfigError(f"--range-um = {range_um[0]:g} {range_um[1]:g}: expected the lower height first")
     heights = None if range_um is None else np.linspace(*range_um, steps) * 1e-6
-    return through_focus(*given.where, heights, **given.how)
+    return through_focus(*shared.first_arguments, heights, **shared.trace_options)
 
 
 @design_command()
 def zernikes(
-    given: Given,
+    shared: SharedOptions,
     jmax: Annotated[int, Option(min=4, max=500, help="Highest index in the pupil.")] = 28,
     pupil: Annotated[str, Option(help="full: the whole annulus, orthogonal; lit: where light passes.")] = "full",
     over_field: Annotated[bool, Option("--map", help="Maps over the field of view.")] = False,
@@ -116,28 +123,31 @@ def zernikes(
     from ...design.metrics.field_zernikes import double_zernikes, wavefront_zernikes
     from ...design.metrics.vignetting import field_disc
 
-    if sum((bool(given.field_deg), over_field, double is not None)) > 1:
+    if sum((bool(shared.field_deg), over_field, double is not None)) > 1:
         raise ConfigError("--field-deg, --map and --double: expected one of them")
-    telescope = given.telescope
-    how = dict(jmax=jmax, pupil=pupil, **given.how)
+    telescope = shared.telescope
     if fringe and double is not None:
         raise ConfigError("--fringe and --double: expected one of them")
     if double is not None:
-        terms = double_zernikes(telescope, given.wavelength, kmax=double, **how)
+        terms = double_zernikes(
+            telescope, shared.wavelength, jmax=jmax, kmax=double, pupil=pupil, **shared.trace_options
+        )
         return Outcome(terms, _double_rows, stem=f"double_zernikes_{telescope.name}")
-    fields = field_disc(telescope) if over_field else given.fields
+    fields = field_disc(telescope) if over_field else shared.fields
     ordering = "fringe" if fringe else "noll"
-    found = wavefront_zernikes(telescope, fields, given.wavelength, ordering=ordering, **how)
-    return Outcome(found, _map_rows if over_field else _rows)
+    coefficients = wavefront_zernikes(
+        telescope, fields, shared.wavelength, jmax=jmax, pupil=pupil, ordering=ordering, **shared.trace_options
+    )
+    return Outcome(coefficients, _map_rows if over_field else _rows)
 
 
-def _rows(result: Any) -> Rows:
+def _rows(result: FieldZernikes) -> Rows:
     """Return every term at every field."""
     summary = numbers_of(result.summary())
     return _terms(summary, field_headings(result), summary["zernike_nm"])
 
 
-def _map_rows(result: Any) -> Rows:
+def _map_rows(result: FieldZernikes) -> Rows:
     """Return statistics of every term over the field."""
     import numpy as np
 
@@ -153,14 +163,14 @@ def term_labels(count: int, ordering: str = "noll") -> list[str]:
     return [term_label(j, ordering) for j in range(1, count + 1)]
 
 
-def _terms(summary: dict[str, Any], headings: list[str], columns: Any) -> Rows:
+def _terms(summary: dict[str, Any], headings: list[str], columns: Iterable[np.ndarray]) -> Rows:
     cells = [number_texts(values, ".2f") for values in columns]
     caption = "{telescope}, {wavelength_nm:g} nm; {pupil} pupil, obscuration {obscuration:g}; nm".format_map(summary)
     labels = term_labels(len(cells[0]), summary["ordering"])
     return Rows(["term", *headings], [*zip(labels, *cells, strict=True)], caption)
 
 
-def _double_rows(result: Any) -> Rows:
+def _double_rows(result: DoubleZernikes) -> Rows:
     """Return the sixteen largest terms from defocus on."""
     import numpy as np
 
@@ -182,7 +192,7 @@ def _double_rows(result: Any) -> Rows:
     Column("its diameter [mm]", "exit_pupil_diameter_m", ".3f", 1e3),
     caption="Pairs: tangential, sagittal. The exit pupil is at that distance from the detector, along the light.",
 )
-def rays(given: Given) -> Study:
+def rays(shared: SharedOptions) -> Study:
     """Trace chief and marginal rays: focal ratio, plate scale, exit pupil, incidence on the detector, field by field.
 
     Tangential is the direction of the field point seen from the axis, sagittal is across it.
@@ -194,4 +204,4 @@ def rays(given: Given) -> Study:
     """
     from ...design.metrics.principal_rays import principal_rays
 
-    return principal_rays(*given.where, **given.how)
+    return principal_rays(*shared.first_arguments, **shared.trace_options)

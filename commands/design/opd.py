@@ -10,7 +10,7 @@ from typer import Option
 
 from ..options import degrees_pair
 from ..tables import Column
-from .command import Given, Outcome, design_command
+from .command import Outcome, SharedOptions, design_command
 from .metrics import term_labels
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class FittedOpd:
     picture=OpdPicture,
 )
 def opd(
-    given: Given,
+    shared: SharedOptions,
     field_deg: Annotated[
         str | None,
         Option(
@@ -107,13 +107,13 @@ def opd(
     from ...wavefront.request import field_points
     from ...wavefront.zernike import fit_zernikes
 
-    telescope = given.telescope
+    telescope = shared.telescope
     if field_deg is None:
-        x, y = np.rad2deg(field_points(telescope, projection=given.projection)[0]).tolist()
+        x, y = np.rad2deg(field_points(telescope, projection=shared.projection)[0]).tolist()
     else:
         x, y = degrees_pair(field_deg, "--field-deg")
-    wavelength = telescope.default_wavelength if given.wavelength is None else given.wavelength
-    found = wavefront_opd(telescope, tuple(np.deg2rad([x, y])), wavelength, grid=grid, **given.how)
-    fit = fit_zernikes(found, 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration, zernikes)
-    stem = f"opd_{telescope.name}_{x:g}_{y:g}_{found.wavelength * 1e9:g}nm"
-    return Outcome(FittedOpd(telescope, (x, y), found, fit), stem=stem)
+    wavelength = telescope.default_wavelength if shared.wavelength is None else shared.wavelength
+    wavefront = wavefront_opd(telescope, tuple(np.deg2rad([x, y])), wavelength, grid=grid, **shared.trace_options)
+    fit = fit_zernikes(wavefront, 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration, zernikes)
+    stem = f"opd_{telescope.name}_{x:g}_{y:g}_{wavefront.wavelength * 1e9:g}nm"
+    return Outcome(FittedOpd(telescope, (x, y), wavefront, fit), stem=stem)

@@ -14,7 +14,7 @@ from ...core.errors import ConfigError, PrescriptionError, PrescriptionWarning
 from ..inputs import errors_of, warnings_shown
 from ..options import name_list
 from ..tables import Column
-from .command import Given, Outcome, design_command
+from .command import Outcome, SharedOptions, design_command
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -41,7 +41,7 @@ def _largest_terms(result: Any) -> list[str]:
     left=2,
 )
 def sensitivity(
-    given: Given,
+    shared: SharedOptions,
     parameters: Annotated[
         str | None,
         Option(help=f"{_ADDRESSES}. By default five motions of every mirror and group but the first mirror."),
@@ -73,13 +73,13 @@ def sensitivity(
         raise ConfigError(f"--out {out}: expected a name that ends in .fits or .ecsv")
     if parameters is not None and degrees_of_freedom is not None:
         raise ConfigError("--parameters and --degrees-of-freedom are both given: expected one of them")
-    telescope, *where = given.where
+    telescope, *where = shared.first_arguments
     variables: DegreesOfFreedom | Iterable[str | Parameter]
     if degrees_of_freedom is not None:
         variables = load_degrees_of_freedom(degrees_of_freedom)
     else:
         variables = usual_parameters(telescope) if parameters is None else name_list(parameters, "--parameters")
-    result = compute(telescope, variables, *where, n_zernike=zernikes, **given.how)
+    result = compute(telescope, variables, *where, n_zernike=zernikes, **shared.trace_options)
     path = out or Path(f"sensitivity_{telescope.name}.fits")
     write_sensitivity(path, result)
     values, _ = result.modes()
@@ -106,9 +106,9 @@ def _of_variables(name: str) -> Callable[[Any], list[float]]:
     """Return the function from a result to an attribute of its optimum, variable by variable, in the units shown."""
 
     def values(result: Any) -> list[float]:
-        found = _optimum(result)
-        sizes = [_shown_unit(found, parameter.unit)[1] for parameter in found.variables]
-        return [float(v) / size for v, size in zip(getattr(found, name), sizes, strict=True)]
+        optimum = _optimum(result)
+        sizes = [_shown_unit(optimum, parameter.unit)[1] for parameter in optimum.variables]
+        return [float(v) / size for v, size in zip(getattr(optimum, name), sizes, strict=True)]
 
     return values
 
@@ -130,7 +130,7 @@ def _of_variables(name: str) -> Callable[[Any], list[float]]:
     band=True,
 )
 def optimize(
-    given: Given,
+    shared: SharedOptions,
     variables: Annotated[str | None, Option(help=f"{_ADDRESSES}, L1.thickness, silica.abbe.")] = None,
     merit: Annotated[str | None, Option(help="Merit function to minimise: spots (by default) or wavefront.")] = None,
     focal_length: Annotated[float | None, Option(help="Focal length to be held [m].")] = None,
@@ -164,12 +164,12 @@ def optimize(
         for name, value in (("merit", merit), ("focal-length", focal_length), ("bounds", bounds)):
             if value is not None:
                 raise ConfigError(f"--{name} is given beside --config: expected it in the file")
-        result = _from_file(given, config, out)
+        result = _from_file(shared, config, out)
     else:
         from ...design.optimize.optimize import optimize as compute
 
-        telescope, *where = given.where
-        _check_out(given, out)
+        telescope, *where = shared.first_arguments
+        _check_out(shared, out)
         result = compute(
             telescope,
             name_list(variables or "", "--variables"),
@@ -177,23 +177,23 @@ def optimize(
             *where,
             bounds=dict(_bounds(text) for text in bounds or ()),
             targets=() if focal_length is None else (FocalLength(focal_length),),
-            **given.how,
+            **shared.trace_options,
         )
-    found = _optimum(result)
-    paths = [out or Path(f"optimized_{telescope.name}.yaml") for telescope in found.telescopes]
+    optimum = _optimum(result)
+    paths = [out or Path(f"optimized_{telescope.name}.yaml") for telescope in optimum.telescopes]
     with warnings_shown(PrescriptionWarning):
-        for telescope, path in zip(found.telescopes, paths, strict=True):
+        for telescope, path in zip(optimum.telescopes, paths, strict=True):
             try:
-                save_telescope(telescope, path, lenient=given.lenient)
+                save_telescope(telescope, path, lenient=shared.lenient)
             except PrescriptionError as error:
                 # What took long is not lost.
-                kept = path.with_suffix(".yaml")
-                save_telescope(telescope, kept)
-                raise error.within(subject=f"{path}, in place of which {kept.name} was written") from None
+                yaml_path = path.with_suffix(".yaml")
+                save_telescope(telescope, yaml_path)
+                raise error.within(subject=f"{path}, in place of which {yaml_path.name} was written") from None
     return Outcome(result, notes=[*_notes(result), *(f"prescription: {path.resolve()}" for path in paths)])
 
 
-def _check_out(given: Given, out: Path | None, *, several: bool = False) -> None:
+def _check_out(shared: SharedOptions, out: Path | None, *, several: bool = False) -> None:
     """Raise before a computation what cannot be written after it."""
     from ...models.io.prescription import prescription_files
 
@@ -203,28 +203,28 @@ def _check_out(given: Given, out: Path | None, *, several: bool = False) -> None
         raise ConfigError(f"--out {out}: expected none with several configurations, each is named after its telescope")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PrescriptionWarning)
-        prescription_files(given.telescope, out, lenient=given.lenient)
+        prescription_files(shared.telescope, out, lenient=shared.lenient)
 
 
-def _from_file(given: Given, path: Path, out: Path | None) -> Any:
+def _from_file(shared: SharedOptions, path: Path, out: Path | None) -> Any:
     """Return the optimum of a file, or the choice of glasses that it asks for."""
     from ...design.optimize.glass_choice import choose_glasses
     from ...design.optimize.optimize import optimize as compute
     from ...design.optimize.optimize_file import catalogue_of, load_optimization, optimization_arguments
 
-    if given.fields is not None or given.wavelength is not None:
+    if shared.fields is not None or shared.wavelength is not None:
         raise ConfigError("--field-deg or --wavelength-nm is given beside --config: expected them in the file")
     file = load_optimization(path)
-    _check_out(given, out, several=bool(file.configurations))
-    arguments = optimization_arguments(file, given.telescope, path)
+    _check_out(shared, out, several=bool(file.configurations))
+    arguments = optimization_arguments(file, shared.telescope, path)
     if file.glasses and file.configurations:
         raise ConfigError("glasses: expected a file without configurations", file=path)
     catalogue = catalogue_of(file, path)
     with errors_of(path):
         if not file.glasses:
-            return compute(**arguments, **given.how)
+            return compute(**arguments, **shared.trace_options)
         choice: Any = dict(glasses=file.glasses, nearest=file.nearest_glasses, catalogue=catalogue)
-        return choose_glasses(**arguments, **choice, **given.how)
+        return choose_glasses(**arguments, **choice, **shared.trace_options)
 
 
 def _optimum(result: Any) -> Any:
@@ -241,20 +241,20 @@ def _notes(result: Any) -> list[str]:
         start, end = 1e6 * optimum.history[[0, -1]]
         lines.append(f"with operands: {start:.6g} -> {end:.6g} {unit}")
     several = len(s["configurations"]) > 1
-    for one in optimum.operands:
-        name, size = _operand_unit(optimum, one.operand)
+    for evaluation in optimum.operands:
+        name, size = _operand_unit(optimum, evaluation.operand)
         unit = "" if name == "1" else f" {name}"
-        owner = f" of {one.configuration}" if several else ""
-        label, goal = one.operand.label, one.operand.goal_text(size)
-        lines.append(f"{label}{owner}: {one.start / size:.6g} -> {one.end / size:.6g}{unit} ({goal})")
-    lines += [f"glass: {old} -> {new}" for old, new in s.get("glasses", {}).items()]
+        owner = f" of {evaluation.configuration}" if several else ""
+        label, goal = evaluation.operand.label, evaluation.operand.goal_text(size)
+        lines.append(f"{label}{owner}: {evaluation.start / size:.6g} -> {evaluation.end / size:.6g}{unit} ({goal})")
+    lines += [f"glass: {start_glass} -> {end_glass}" for start_glass, end_glass in s.get("glasses", {}).items()]
     return lines + [f"collinear: {combination}" for combination in s["collinear"]]
 
 
 def _bounds(text: str) -> tuple[str, tuple[float, float]]:
     address, _, limits = text.partition("=")
     try:
-        low, high = (float(part) for part in limits.split(":"))
+        low, high = (float(limit) for limit in limits.split(":"))
     except ValueError:
         raise ConfigError(f"--bounds {text}: expected ADDRESS=LOW:HIGH, such as M1.conic=-1.1:-0.9") from None
     return address.strip(), (low, high)

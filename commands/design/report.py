@@ -9,7 +9,7 @@ from typer import Option
 
 from ..interrupt import interruptible
 from ..options import AcrossBand, FieldsDeg, Lenient, Model, Quiet, Threads, WavelengthsNm
-from .command import Given, app
+from .command import SharedOptions, app
 
 
 @app.command("design-report")
@@ -35,8 +35,8 @@ def design_report_command(
     from ...core.files import require_writable, write_bytes
     from ...design.report.report import STEPS, design_report
 
-    given = Given(model, field_deg, wavelength_nm, across_band, lenient=lenient)
-    telescope, fields, wavelengths = given.where
+    shared = SharedOptions(model, field_deg, wavelength_nm, across_band, lenient=lenient)
+    telescope, fields, wavelengths = shared.first_arguments
     path = out or Path(f"design_report_{telescope.name}.html")
     require_writable(path, file=True)
     with interruptible(quiet) as reporter, reporter.stage("design report", STEPS) as stage:

@@ -25,9 +25,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 #: Columns of a table by name: values, their unit, empty for names and pure numbers, and their meaning.
-Columns = dict[str, tuple[Any, str, str]]
-#: Points of curves along the field, and wavelengths across the band, where none are given.
-_ALONG_FIELD, _ACROSS_BAND = 33, 5
+Columns = dict[str, tuple[ArrayLike, str, str]]
+#: Points of curves along the field where none are given.
+_ALONG_FIELD = 33
+#: Wavelengths across the band where none are given.
+_ACROSS_BAND = 5
 
 
 @dataclass(frozen=True)
@@ -95,13 +97,13 @@ class Analysis(FieldResult):
 
     def _field_columns(self, extra: int = 0) -> Columns:
         """Return the columns of the field points, with so many axes of length 1 behind that of the fields."""
-        points, unit, what = (
+        points, unit, quantity = (
             (np.rad2deg(self.fields), "deg", "field angle")
             if self.on_sky
             else (1e3 * self.object_heights, "mm", "place on the object")
         )
         x, y = (v.reshape(-1, *(1,) * extra) for v in points.T)
-        return {"field_x": (x, unit, f"{what}, x"), "field_y": (y, unit, f"{what}, y")}
+        return {"field_x": (x, unit, f"{quantity}, x"), "field_y": (y, unit, f"{quantity}, y")}
 
 
 def field_line(telescope: Telescope) -> np.ndarray:
@@ -122,7 +124,9 @@ def line_request(
     return Request.of(telescope, line, wavelengths, sampling=CHIEF_RAY, projection=projection, threads=threads)
 
 
-def band_wavelengths(telescope: Telescope, wavelengths: ArrayLike | None, count: int = _ACROSS_BAND) -> Any:
+def band_wavelengths(
+    telescope: Telescope, wavelengths: ArrayLike | None, count: int = _ACROSS_BAND
+) -> ArrayLike | None:
     """Return wavelengths [m] to study colour at: as given, those of the telescope's file, or some across its band."""
     if wavelengths is None and len(Request.of(telescope, sampling=CHIEF_RAY).wavelengths) == 1:
         return np.linspace(*(telescope.band or telescope.wavelength_range), count)

@@ -89,9 +89,9 @@ class Coatings:
     @classmethod
     def of(cls, telescope: Telescope, given: Coatings | str | os.PathLike[str] | None = None) -> Coatings:
         """Return the coatings of the surfaces of a telescope, in their place those that are given, or of a file."""
-        known = given if isinstance(given, Coatings) else cls() if given is None else cls.read(given)
-        own = {s.name: s.coating for s in telescope.surfaces if s.coating is not None}
-        return cls({**own, **known.surfaces}, known.glasses)
+        overrides = given if isinstance(given, Coatings) else cls() if given is None else cls.read(given)
+        prescribed = {s.name: s.coating for s in telescope.surfaces if s.coating is not None}
+        return cls({**prescribed, **overrides.surfaces}, overrides.glasses)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Coatings:
@@ -158,18 +158,18 @@ class CoatingsFile(Section):
 
     def coatings(self, folder: Path) -> Coatings:
         """Return the coatings; paths of files start from the folder."""
-        known: dict[str, AnyCoating] = {}
+        named_coatings: dict[str, AnyCoating] = {}
         glasses = {}
         for name, table in self.coatings_.items():
             with error_context(key=f"coatings.{name}"):
-                known[name] = table.coating_in(name, folder)
+                named_coatings[name] = table.coating_in(name, folder)
         for surface, name in self.surfaces.items():
-            if name not in known:
-                raise ConfigError(f"surfaces.{surface} = {name!r}: expected {one_of(known, name)}")
+            if name not in named_coatings:
+                raise ConfigError(f"surfaces.{surface} = {name!r}: expected {one_of(named_coatings, name)}")
         for name, glass in self.glasses.items():
             with error_context(key=f"glasses.{name}"):
                 glasses[name] = Absorption(glass.coating(name, folder), 1e-3 * glass.thickness_mm)
-        return Coatings({surface: known[name] for surface, name in self.surfaces.items()}, glasses)
+        return Coatings({surface: named_coatings[name] for surface, name in self.surfaces.items()}, glasses)
 
 
 def _plain(waves: tuple[float, ...], values: tuple[float, ...], file: str | None, name: str, folder: Path) -> Coating:

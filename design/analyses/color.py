@@ -24,8 +24,10 @@ from .field_curvature import close_foci
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Zones of the pupil, of its radius, whose foci are traced; the first counts as paraxial.
-_PARAXIAL, _ZONES = 1e-3, (0.7, 1.0)
+#: Zone of the pupil, in units of its radius, whose focus counts as paraxial.
+_PARAXIAL = 1e-3
+#: Zones of the pupil, in units of its radius, whose foci are traced by default.
+_ZONES = (0.7, 1.0)
 #: Wavelengths of the curve of the focus.
 _WAVELENGTHS = 33
 
@@ -221,8 +223,8 @@ def chromatic_focus(
     traced = np.concatenate([[_PARAXIAL], radii]) * 0.5 * telescope.pupil_diameter
     up = np.stack([np.zeros_like(traced), traced], axis=-1)
     pairs = np.concatenate([up, -up])
-    everything = np.append(request.wavelengths, telescope.default_wavelength)
-    focus = np.array([close_foci(request, request.bundles(float(w), pairs))[0] for w in everything])
+    all_wavelengths = np.append(request.wavelengths, telescope.default_wavelength)
+    focus = np.array([close_foci(request, request.bundles(float(w), pairs))[0] for w in all_wavelengths])
     require_focus(telescope, focus)
     principal = principal_rays_of(request)
     depth = 2.0 * telescope.default_wavelength * float(principal.mean_f_number[0]) ** 2

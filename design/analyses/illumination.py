@@ -153,15 +153,15 @@ def relative_illumination(
         one_wavelength=True,
     )
     bare = coatings is None and all(s.coating is None for s in telescope.surfaces)
-    known = None if bare else coatings_of(telescope, coatings)
+    telescope_coatings = None if bare else coatings_of(telescope, coatings)
     # Each field with its own vignetting factors; the axis is not one of the stated fields.
-    each = [
+    field_requests = [
         request.at_fields(np.zeros((1, 2))),
         *(request.at_fields(slice(i, i + 1)) for i in range(len(request.fields))),
     ]
     solid, lit = [], []
-    for one in each:
-        area, fraction = _projected(one, known)
+    for field_request in field_requests:
+        area, fraction = _projected(field_request, telescope_coatings)
         solid.append(area)
         lit.append(fraction)
     if not solid[0] > 0:
@@ -182,11 +182,11 @@ def _projected(request: Request, coatings: Coatings | None) -> tuple[float, floa
     if coatings is not None:
         for efficiency in efficiencies(request, coatings, wavelength)[1].values():
             ratio = ratio * efficiency[0, lit]
-    known = np.isfinite(ratio)
+    finite = np.isfinite(ratio)
     index = float(telescope.medium_before.index(wavelength))
     area = np.pi * (0.5 * telescope.pupil_diameter * index) ** 2 * (1.0 - telescope.pupil_obscuration**2)
     fraction = float(sample.weights[lit].sum())
-    mean = float(np.average(ratio[known], weights=sample.weights[lit][known])) if known.any() else 0.0
+    mean = float(np.average(ratio[finite], weights=sample.weights[lit][finite])) if finite.any() else 0.0
     return area * fraction * mean, fraction
 
 

@@ -255,7 +255,12 @@ def opd_fans(
 
 
 def _traced(
-    telescope: Telescope, fields: Any, wavelengths: Any, n_points: int, projection: str, threads: int | None
+    telescope: Telescope,
+    fields: ArrayLike | None,
+    wavelengths: ArrayLike | None,
+    n_points: int,
+    projection: str,
+    threads: int | None,
 ) -> tuple[Request, np.ndarray, np.ndarray, list[Bundles]]:
     """Return request, pupil coordinates [n], axes of the fans and bundles of both fans, tangential first."""
     count = require_count(n_points, "n_points", 3, 100_000)

@@ -82,14 +82,14 @@ class SeidelDiagram(Analysis):
 
     def _draw(self, panels: Sequence[Axes]) -> None:
         (axes,) = panels
-        everything = np.vstack([self.waves, self.total])
-        place, width = np.arange(len(everything)), 0.85 / len(ABERRATIONS)
+        bars = np.vstack([self.waves, self.total])
+        place, width = np.arange(len(bars)), 0.85 / len(ABERRATIONS)
         for i, (name, color) in enumerate(zip(ABERRATIONS, _COLORS, strict=True)):
             label = f"{SYMBOLS[i]} {name}"
-            axes.bar(place + (i - 3) * width, everything[:, i], width, color=color, label=label)
+            axes.bar(place + (i - 3) * width, bars[:, i], width, color=color, label=label)
         axes.axhline(0.0, color="0.3", linewidth=0.7)
         axes.axvline(len(self.names) - 0.5, color="0.3", linewidth=0.9)
-        largest = float(np.abs(everything).max())
+        largest = float(np.abs(bars).max())
         if largest > 100.0 * float(np.abs(self.total).max()):
             # The sums would be too small to be visible.
             axes.set_yscale("symlog", linthresh=max(largest / 1000.0, 1e-9))
@@ -104,7 +104,7 @@ class SeidelDiagram(Analysis):
             rotation_mode="anchor",
             fontsize=7.5,
         )
-        axes.set(ylabel="wavefront [waves]", xlim=(-0.5, len(everything) - 0.5))
+        axes.set(ylabel="wavefront [waves]", xlim=(-0.5, len(bars) - 0.5))
         axes.grid(True, axis="y", color="0.92", linewidth=0.6)
         axes.set_axisbelow(True)
         axes.legend(fontsize=7, ncols=2)

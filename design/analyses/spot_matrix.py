@@ -24,8 +24,10 @@ from .analysis import Analysis, Columns, band_wavelengths, require_focus
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Heights of the detector where none are given, and how far they go in depths of focus.
-_HEIGHTS, _DEPTHS = 5, 2.0
+#: Heights of the detector where none are given.
+_HEIGHTS = 5
+#: Largest of these heights, in depths of focus.
+_DEPTHS = 2.0
 
 
 @dataclass(frozen=True)
@@ -56,11 +58,11 @@ class SpotMatrix(Analysis):
     @property
     def rms_radius(self) -> np.ndarray:
         """Root mean square radius of each spot about its own centroid [m], shape [n_field, n_column]; NaN if dark."""
-        known = np.where(self.weight[..., None] > 0, self.displacement, 0.0)
+        lit_displacement = np.where(self.weight[..., None] > 0, self.displacement, 0.0)
         light = self.weight.sum(axis=(2, 3))
         with np.errstate(invalid="ignore"):
-            mean = np.einsum("fcwp,fcwpi->fci", self.weight, known) / light[..., None]
-            square = np.einsum("fcwp,fcwpi->fc", self.weight, (known - mean[:, :, None, None]) ** 2) / light
+            mean = np.einsum("fcwp,fcwpi->fci", self.weight, lit_displacement) / light[..., None]
+            square = np.einsum("fcwp,fcwpi->fc", self.weight, (lit_displacement - mean[:, :, None, None]) ** 2) / light
         return np.sqrt(square)
 
     @property
@@ -193,7 +195,7 @@ def _centered(bundles: list[Bundles], weight: np.ndarray, height: float) -> np.n
     """Return landing points at a height [m] about the centroid of all wavelengths, [n_field, n_wave, n_pupil, 2]."""
     landing = [b.landing() + height * b.direction[..., :2] / b.direction[..., 2:] for b in bundles]
     points = np.stack(landing, axis=1)
-    known = np.where(weight[..., None] > 0, points, 0.0)
+    lit_points = np.where(weight[..., None] > 0, points, 0.0)
     with np.errstate(invalid="ignore"):
-        centroid = np.einsum("fwp,fwpi->fi", weight, known) / weight.sum(axis=(1, 2))[:, None]
+        centroid = np.einsum("fwp,fwpi->fi", weight, lit_points) / weight.sum(axis=(1, 2))[:, None]
     return points - centroid[:, None, None]

@@ -142,6 +142,6 @@ def _rms_and_strehl(opd: np.ndarray, lit: np.ndarray, request: Request, waveleng
     root = np.sqrt(weight)
     plane = np.stack([np.ones(len(weight)), *request.unit_pupil[lit].T], axis=-1) * root[:, None]
     value = opd[lit] * root
-    rest = (value - plane @ np.linalg.lstsq(plane, value, rcond=None)[0]) / root
-    peak = brightest_strehl(weight, request.unit_pupil[lit], rest / wavelength)
-    return float(np.sqrt((weight * rest**2).sum())), peak
+    residual = (value - plane @ np.linalg.lstsq(plane, value, rcond=None)[0]) / root
+    peak = brightest_strehl(weight, request.unit_pupil[lit], residual / wavelength)
+    return float(np.sqrt((weight * residual**2).sum())), peak

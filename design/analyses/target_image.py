@@ -6,7 +6,7 @@ that an image without aberrations is smooth. Diffraction is left out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -31,8 +31,10 @@ if TYPE_CHECKING:
 
 #: Steps of the quasi-random sequence of Roberts in two dimensions: inverse powers of the plastic number.
 _STEPS = np.array([0.7548776662466927, 0.5698402909980532])
-#: Most rays of one image, and most pixels along a side.
-_MOST_RAYS, _MOST_PIXELS = 10**8, 4096
+#: Most rays of one image.
+_MOST_RAYS = 10**8
+#: Most pixels along a side, of target and image.
+_MOST_PIXELS = 4096
 
 
 @dataclass(frozen=True)
@@ -224,7 +226,7 @@ def target_image(
     return TargetImage(request, picture, step, image, side, center)
 
 
-def _landings(request: Request, picture: np.ndarray, step: float) -> Any:
+def _landings(request: Request, picture: np.ndarray, step: float) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
     """Yield weight of a wavelength, landing points [n, 2] of lit rays and their light, some pixels at a time."""
     telescope, count = request.telescope, len(request.pupil)
     row, column = np.nonzero(picture)
@@ -234,12 +236,12 @@ def _landings(request: Request, picture: np.ndarray, step: float) -> Any:
     detector = telescope.surfaces[-1]
     at_once = max(1, RAYS_AT_ONCE // count)
     for first in range(0, len(row), at_once):
-        some = slice(first, first + at_once)
-        angles = request.fields[0] + step * (offset[some, None] + within)
+        batch = slice(first, first + at_once)
+        angles = request.fields[0] + step * (offset[batch, None] + within)
         telescope.check_field(angles[..., 0], angles[..., 1])
         directions = field_direction(angles[..., 0].ravel(), angles[..., 1].ravel(), request.projection)
         pupil = np.tile(request.pupil.points, (len(angles), 1))[:, None]
-        light = np.repeat(picture[row[some], column[some]] / count, count)
+        light = np.repeat(picture[row[batch], column[batch]] / count, count)
         for wavelength, weight in zip(request.wavelengths, request.weights, strict=True):
             rays = launch_bundles(telescope, directions, float(wavelength), pupil)
             end = trace(telescope, rays, threads=request.threads)

@@ -136,7 +136,7 @@ def throughput(
     DomainError
         If a table does not cover a wavelength, or the angle of a ray that is lit.
     """
-    known = coatings_of(telescope, coatings)
+    telescope_coatings = coatings_of(telescope, coatings)
     request = Request.of(
         telescope,
         fields,
@@ -147,11 +147,11 @@ def throughput(
         threads=threads,
     )
     value, lit, factors = [], [], []
-    for _, some in request.parts():
-        found = [_passed(some, known, float(w)) for w in request.wavelengths]
-        value.append(np.stack([f[0] for f in found], axis=-1))
-        lit.append(np.stack([f[1] for f in found], axis=-1))
-        factors.append([f[2] for f in found])
+    for _, batch in request.parts():
+        by_wavelength = [_passed(batch, telescope_coatings, float(w)) for w in request.wavelengths]
+        value.append(np.stack([f[0] for f in by_wavelength], axis=-1))
+        lit.append(np.stack([f[1] for f in by_wavelength], axis=-1))
+        factors.append([f[2] for f in by_wavelength])
     steps = list(factors[0][0])
     efficiency = [np.concatenate([np.stack([f[name] for f in p], axis=-1) for p in factors]) for name in steps]
     shape = (len(request.fields), len(request.wavelengths))
@@ -161,37 +161,37 @@ def throughput(
 
 def coatings_of(telescope: Telescope, coatings: Coatings | str | os.PathLike[str] | None) -> Coatings:
     """Return coatings, or those of a file, that belong to a telescope; errors are those of :func:`throughput`."""
-    known = Coatings.of(telescope, coatings)
+    telescope_coatings = Coatings.of(telescope, coatings)
     names = telescope.surface_names
     glasses = [s.medium_after.name for s in telescope.surfaces if s.medium_after.name]
-    for name in known.surfaces:
+    for name in telescope_coatings.surfaces:
         if name not in names:
             raise unknown_name(f"surface of {telescope.name}", name, names)
         surface = telescope.surface(name)
-        if isinstance(known.surfaces[name], LayerStack) and surface.interaction != Interaction.REFRACT:
+        if isinstance(telescope_coatings.surfaces[name], LayerStack) and surface.interaction != Interaction.REFRACT:
             raise ConfigError(f"coating of {name}: layers are those of lens surfaces; expected a table")
-    for name in known.glasses:
+    for name in telescope_coatings.glasses:
         if name not in glasses:
             raise unknown_name(f"glass of {telescope.name}", name, dict.fromkeys(glasses) or ("none",))
-    return known
+    return telescope_coatings
 
 
 def _passed(
-    request: Request, known: Coatings, wavelength: float
+    request: Request, coatings: Coatings, wavelength: float
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Return throughput and lit fraction [n_field], and the mean efficiency of each step [n_field] by its name."""
-    lit, found = efficiencies(request, known, wavelength)
+    lit, step_efficiency = efficiencies(request, coatings, wavelength)
     weight = np.where(lit, request.pupil.weights, 0.0)
     fraction = weight.sum(axis=1)
-    left, steps = np.ones(lit.shape), {}
-    for name, each in found.items():
-        left = left * each
+    transmission, steps = np.ones(lit.shape), {}
+    for name, efficiency in step_efficiency.items():
+        transmission = transmission * efficiency
         with np.errstate(invalid="ignore"):
-            steps[name] = (weight * each).sum(axis=1) / fraction
-    return (weight * left).sum(axis=1), fraction, steps
+            steps[name] = (weight * efficiency).sum(axis=1) / fraction
+    return (weight * transmission).sum(axis=1), fraction, steps
 
 
-def efficiencies(request: Request, known: Coatings, wavelength: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def efficiencies(request: Request, coatings: Coatings, wavelength: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return which rays are lit [n_field, n_pupil], and the efficiency of each step for them by its name, else 0."""
     telescope = request.telescope
     rays = request.launch(wavelength)
@@ -201,20 +201,24 @@ def efficiencies(request: Request, known: Coatings, wavelength: float) -> tuple[
     steps: dict[str, np.ndarray] = {}
     before: TraceResult | None = None
     for k, (surface, result) in enumerate(zip(telescope.surfaces, results, strict=True)):
-        found: dict[str, np.ndarray] = {}
+        surface_steps: dict[str, np.ndarray] = {}
         glass = telescope.surfaces[k - 1].medium_after.name if k else ""
-        if before is not None and glass in known.glasses:
+        if before is not None and glass in coatings.glasses:
             path = np.linalg.norm(result.position - before.position, axis=-1)
-            found[f"in {glass} before {surface.name}"] = known.glasses[glass].through(path, wavelength)
+            surface_steps[f"in {glass} before {surface.name}"] = coatings.glasses[glass].through(path, wavelength)
         direction = rays.direction if before is None else before.direction
-        if surface.name in known.surfaces:
+        if surface.name in coatings.surfaces:
             incidence = _incidence(surface, result, direction)
-            coating = known.surfaces[surface.name]
-            found[surface.name] = coating.efficiency(wavelength, incidence, float(index[k]), float(index[k + 1]))
-            _check_angles(surface.name, found[surface.name], incidence, lit.ravel())
+            coating = coatings.surfaces[surface.name]
+            surface_steps[surface.name] = coating.efficiency(
+                wavelength, incidence, float(index[k]), float(index[k + 1])
+            )
+            _check_angles(surface.name, surface_steps[surface.name], incidence, lit.ravel())
         elif surface.interaction == Interaction.REFRACT and index[k] != index[k + 1]:
-            found[surface.name] = fresnel_transmission(_incidence(surface, result, direction), index[k], index[k + 1])
-        for name, efficiency in found.items():
+            surface_steps[surface.name] = fresnel_transmission(
+                _incidence(surface, result, direction), index[k], index[k + 1]
+            )
+        for name, efficiency in surface_steps.items():
             steps[name] = np.where(lit, efficiency.reshape(lit.shape), 0.0)
         before = result
     return lit, steps

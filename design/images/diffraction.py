@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,19 +27,26 @@ from ..metrics.spots import REFERENCES, spot_diagram
 from .diffraction_psf import DiffractionPsf, pixel_axis
 from .wavelets import WaveletLattice, Wavelets, lattice_wavelets, range_of_cosines, spot_reach, traced_wavelets
 
-#: Default pixels on a side, and pixels across wavelength times focal ratio.
-_PIXELS, _PER_AIRY = 128, 5.0
-#: Smallest and largest default number of lattice points across the pupil.
-_FEWEST, _MOST = 128, 2048
+#: Default number of pixels on a side.
+_PIXELS = 128
+#: Default number of pixels across wavelength times focal ratio.
+_PER_AIRY = 5.0
+#: Smallest default number of lattice points across the pupil.
+_FEWEST = 128
+#: Largest number of lattice points across the pupil.
+_MOST = 2048
 #: Period of the pattern in sides of the image.
 _PERIODS = 2.0
 #: Rays across the pupil for sums of Huygens' wavelets.
 _HUYGENS_ACROSS = 160
 #: Wavelets summed at once: two complex numbers for each and each column of the image.
 _AT_ONCE = 4096
-#: Steps of the search for the peak across wavelength times focal ratio, the largest number of steps along an axis, and
-#: the number of finer ones about the highest.
-_PEAK, _MOST_PLACES, _FINE = 3.0, 192, 33
+#: Steps of the search for the peak across wavelength times focal ratio.
+_PEAK = 3.0
+#: Largest number of points of that search along an axis.
+_MOST_PLACES = 192
+#: Finer points along an axis about the highest of them.
+_FINE = 33
 
 
 @check_arguments
@@ -104,15 +110,16 @@ def fft_psf(
         across = require_count(across, "n_pupil", 8, _MOST)
     period = across * plan.wave_over_range
     if period < side or period < plan.spread:
-        what = f"an image of {side * 1e6:.4g} {unit} and spots of {plan.spread * 1e6:.4g} {unit}"
+        sizes = f"an image of {side * 1e6:.4g} {unit} and spots of {plan.spread * 1e6:.4g} {unit}"
         raise DomainError(
-            f"n_pupil = {across}: the pattern repeats after {period * 1e6:.4g} {unit}; expected more points for {what}",
+            f"n_pupil = {across}: the pattern repeats after {period * 1e6:.4g} {unit}; "
+            f"expected more points for {sizes}",
             key="n_pupil",
         )
 
-    def waves(one: Request, wavelength: float, center: np.ndarray) -> tuple[Wavelets, _Sum]:
-        found = lattice_wavelets(one, wavelength, center, plan.range_of_cosines / across)
-        return found.wavelets, lambda x, y: lattice_sum(found, x, y)
+    def waves(field_request: Request, wavelength: float, center: np.ndarray) -> tuple[Wavelets, _Sum]:
+        lattice = lattice_wavelets(field_request, wavelength, center, plan.range_of_cosines / across)
+        return lattice.wavelets, lambda x, y: lattice_sum(lattice, x, y)
 
     return plan.image("fft", waves, int(across), progress)
 
@@ -151,9 +158,9 @@ def huygens_psf(
     )
     plan = _Plan(request, pixel, pixels, reference)
 
-    def waves(one: Request, wavelength: float, center: np.ndarray) -> tuple[Wavelets, _Sum]:
-        found = traced_wavelets(one, wavelength, center)
-        return found, lambda x, y: wavelet_sum(found, x, y)
+    def waves(field_request: Request, wavelength: float, center: np.ndarray) -> tuple[Wavelets, _Sum]:
+        wavelets = traced_wavelets(field_request, wavelength, center)
+        return wavelets, lambda x, y: wavelet_sum(wavelets, x, y)
 
     return plan.image("huygens", waves, round(2.0 * np.sqrt(len(request.pupil) / np.pi)), progress)
 
@@ -184,16 +191,16 @@ def wavelet_sum(wavelets: Wavelets, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     field, cosine = wavelets.field[lit], wavelets.cosine[lit]
     amplitude = np.zeros((len(y), len(x)), dtype=np.complex128)
     for first in range(0, len(field), _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
-        rows = np.exp(turn * np.outer(y, cosine[some, 1])) * field[some]
-        amplitude += rows @ np.exp(turn * np.outer(cosine[some, 0], x))
+        batch = slice(first, first + _AT_ONCE)
+        rows = np.exp(turn * np.outer(y, cosine[batch, 1])) * field[batch]
+        amplitude += rows @ np.exp(turn * np.outer(cosine[batch, 0], x))
     return amplitude.real**2 + amplitude.imag**2
 
 
 class _Plan:
     """Common inputs of both sums, and the reduction of irradiances to images."""
 
-    def __init__(self, request: Request, pixel: Any, pixels: int, reference: str) -> None:
+    def __init__(self, request: Request, pixel: ArrayLike | None, pixels: int, reference: str) -> None:
         check_choice("reference", reference, REFERENCES)
         self.request, self.pixels = request, require_count(pixels, "pixels", 3, 4096)
         # The middle of the images weighs all wavelengths alike.
@@ -227,20 +234,20 @@ class _Plan:
         finer = self._samples()
         images, lit, strehl = [], [], []
         for i, center in enumerate(self.spots.reference_point):
-            one = self.request.at_fields(slice(i, i + 1))
-            found: list[tuple[float, Wavelets, _Sum]] = []
+            field_request = self.request.at_fields(slice(i, i + 1))
+            by_wavelength: list[tuple[float, Wavelets, _Sum]] = []
             total = np.zeros((self.pixels, self.pixels))
             for wavelength, weight in zip(self.request.wavelengths, self.request.weights, strict=True):
-                wavelets, irradiance = waves(one, float(wavelength), center)
-                found.append((float(weight), wavelets, irradiance))
+                wavelets, irradiance = waves(field_request, float(wavelength), center)
+                by_wavelength.append((float(weight), wavelets, irradiance))
                 total += weight * self._on_pixels(irradiance(finer, finer))
                 if progress is not None:
                     progress(1)
-            whole = sum(weight * wavelets.lit_fraction for weight, wavelets, _ in found)
-            perfect = sum(weight * wavelets.perfect_peak for weight, wavelets, _ in found)
-            images.append(total * self.pixel**2 / whole)
-            lit.append(whole)
-            strehl.append(self._peak(found, total) / perfect)
+            lit_fraction = sum(weight * wavelets.lit_fraction for weight, wavelets, _ in by_wavelength)
+            perfect = sum(weight * wavelets.perfect_peak for weight, wavelets, _ in by_wavelength)
+            images.append(total * self.pixel**2 / lit_fraction)
+            lit.append(lit_fraction)
+            strehl.append(self._peak(by_wavelength, total) / perfect)
         return DiffractionPsf(
             request=self.request,
             method=method,
@@ -260,19 +267,19 @@ class _Plan:
         The pattern has no period below wavelength times focal ratio: samples at that distance sum to the light.
         """
         across = int(np.ceil(self.pixel / self.wave_over_range - 1e-9))
-        part = (np.arange(across) + 0.5) / across - 0.5
-        return (pixel_axis(self.pixel, self.pixels)[:, None] + self.pixel * part).ravel()
+        offsets = (np.arange(across) + 0.5) / across - 0.5
+        return (pixel_axis(self.pixel, self.pixels)[:, None] + self.pixel * offsets).ravel()
 
     def _on_pixels(self, irradiance: np.ndarray) -> np.ndarray:
         """Return the mean of the samples of each pixel."""
         across = len(irradiance) // self.pixels
         return irradiance.reshape(self.pixels, across, self.pixels, across).mean(axis=(1, 3))
 
-    def _peak(self, found: Sequence[tuple[float, Wavelets, _Sum]], image: np.ndarray) -> float:
+    def _peak(self, by_wavelength: Sequence[tuple[float, Wavelets, _Sum]], image: np.ndarray) -> float:
         """Return the highest irradiance of the image [1/m^2]."""
 
         def irradiance(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-            return np.asarray(sum(weight * at(x, y) for weight, _, at in found))
+            return np.asarray(sum(weight * at(x, y) for weight, _, at in by_wavelength))
 
         axis, step = pixel_axis(self.pixel, self.pixels), self.pixel
         if step > self.wave_over_range / _PEAK:

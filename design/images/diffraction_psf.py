@@ -16,6 +16,7 @@ from ..result import FieldResult
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 #: Factor of the interpolated pixels along each axis, on which widths are measured.
 _FINER = 4
@@ -147,8 +148,8 @@ class DiffractionPsf(FieldResult):
             bar = drawing.round_length(0.6 * half)
             drawing.draw_scale_bar(panels[0], bar, self.size_text(bar * 1e-6, float(self.plate_scale[0])))
             bar_and_label: Any = (*panels[0].lines, *panels[0].texts)
-            for part in bar_and_label:
-                part.set_color("white")
+            for artist in bar_and_label:
+                artist.set_color("white")
             key = above.colorbar(image, ax=above.axes, shrink=0.85, pad=0.015, aspect=30)
             key.set_label("light over that of\nthe brightest pixel")
             way = "Fourier sum" if self.method == "fft" else "Huygens' wavelets"
@@ -162,7 +163,7 @@ def pixel_axis(pixel: float, pixels: int) -> np.ndarray:
     return (np.arange(pixels) - pixels // 2) * pixel
 
 
-def _draw_image(axes: Axes, psf: DiffractionPsf, i: int) -> Any:
+def _draw_image(axes: Axes, psf: DiffractionPsf, i: int) -> AxesImage:
     from matplotlib.colors import LogNorm
 
     image = psf.image[i] / psf.image[i].max()

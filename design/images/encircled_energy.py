@@ -64,8 +64,8 @@ class EncircledEnergy(FieldResult):
         """Return the radius that holds a fraction of the light [m], shape [n_field]; NaN beyond the curve."""
         if not 0 < fraction < 1:
             raise DomainError(f"fraction = {fraction!r}: expected a number between 0 and 1")
-        found = np.array([_crossing(row, self.radius, fraction) for row in self.fraction])
-        return np.where(self.fraction[:, -1] >= fraction, found, np.nan)
+        crossings = np.array([_crossing(row, self.radius, fraction) for row in self.fraction])
+        return np.where(self.fraction[:, -1] >= fraction, crossings, np.nan)
 
     def _columns(self) -> dict[str, Any]:
         return self._along("radius", "fraction")
@@ -73,7 +73,7 @@ class EncircledEnergy(FieldResult):
     def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the fields."""
         arcsec = arcseconds(self.plate_scale)
-        radii = {f"ee{round(100 * part)}_radius": self.radius_holding(part) for part in (0.5, 0.8, 0.9)}
+        radii = {f"ee{round(100 * fraction)}_radius": self.radius_holding(fraction) for fraction in (0.5, 0.8, 0.9)}
         return {
             "telescope": self.telescope,
             "kind": self.kind,
@@ -91,9 +91,9 @@ class EncircledEnergy(FieldResult):
         """Draw the curves, and the radii of 50 and 80 % against the field."""
         with styled():
             figure = figure_at(ax, 10.0, 4.2)
-            left, right = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
-            _draw_curves(left, self)
-            _draw_radii(right, self)
+            curve_axes, radius_axes = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
+            _draw_curves(curve_axes, self)
+            _draw_radii(radius_axes, self)
             kind = "with diffraction" if self.kind == "diffraction" else "of rays alone"
             return self._titled(figure, f"encircled energy {kind}, {self._nanometres()}")
 
@@ -145,11 +145,14 @@ def encircled_energy(
         If radii do not ascend, or no light passes.
     """
     check_choice("kind", kind, KINDS)
-    given = None if radii is None else np.atleast_1d(metres(radii, "radii"))
-    if given is not None and not (
-        given.ndim == 1 and np.isfinite(given).all() and (given >= 0).all() and (np.diff(given) > 0).all()
+    circle_radii = None if radii is None else np.atleast_1d(metres(radii, "radii"))
+    if circle_radii is not None and not (
+        circle_radii.ndim == 1
+        and np.isfinite(circle_radii).all()
+        and (circle_radii >= 0).all()
+        and (np.diff(circle_radii) > 0).all()
     ):
-        raise DomainError(f"radii of shape {given.shape}: expected ascending lengths from 0, shape [n]")
+        raise DomainError(f"radii of shape {circle_radii.shape}: expected ascending lengths from 0, shape [n]")
     common: dict[str, Any] = dict(
         wavelength_weights=wavelength_weights,
         n_pupil=n_pupil,
@@ -158,8 +161,10 @@ def encircled_energy(
         threads=threads,
     )
     if kind == "geometric":
-        return _geometric(spots(telescope, fields, wavelengths, sampling=sampling, **common), given)
-    return energy_of_psf(fft_psf(telescope, fields, wavelengths, pixels=pixels, progress=progress, **common), given)
+        return _geometric(spots(telescope, fields, wavelengths, sampling=sampling, **common), circle_radii)
+    return energy_of_psf(
+        fft_psf(telescope, fields, wavelengths, pixels=pixels, progress=progress, **common), circle_radii
+    )
 
 
 def energy_of_psf(psf: DiffractionPsf, radii: np.ndarray | None = None) -> EncircledEnergy:
@@ -220,9 +225,9 @@ def energy_curve(
     across, along = (np.add.outer(v - c, inside).ravel() for v, c in zip((x, y), center, strict=True))
     squared = np.add.outer(along**2, across**2).ravel()
     order = np.argsort(squared, kind="stable")
-    each = np.repeat(np.repeat(light / parts**2, parts, axis=0), parts, axis=1).ravel()[order]
+    part_light = np.repeat(np.repeat(light / parts**2, parts, axis=0), parts, axis=1).ravel()[order]
     # Each part stands in the middle of its own light.
-    within = np.cumsum(each) - 0.5 * each
+    within = np.cumsum(part_light) - 0.5 * part_light
     return np.concatenate([[0.0], np.sqrt(squared[order])]), np.concatenate([[0.0], within])
 
 
@@ -236,30 +241,32 @@ def _geometric(diagram: SpotDiagram, radii: np.ndarray | None) -> EncircledEnerg
     for at, weight in zip(distance, diagram.weight, strict=True):
         lit = weight > 0
         order = np.argsort(at[lit], kind="stable")
-        each = weight[lit][order]
+        ray_light = weight[lit][order]
         # A ray stands in the middle of the light that it carries.
-        within = (np.cumsum(each) - 0.5 * each) / each.sum() if len(each) else np.zeros(0)
-        rows.append(np.interp(radius, at[lit][order], within, left=0.0, right=1.0) if len(each) else np.nan * radius)
+        within = (np.cumsum(ray_light) - 0.5 * ray_light) / ray_light.sum() if len(ray_light) else np.zeros(0)
+        rows.append(
+            np.interp(radius, at[lit][order], within, left=0.0, right=1.0) if len(ray_light) else np.nan * radius
+        )
     return EncircledEnergy(diagram.request, "geometric", radius, np.stack(rows), diagram.plate_scale)
 
 
-def _crossing(fraction: np.ndarray, radius: np.ndarray, wanted: float) -> float:
+def _crossing(fraction: np.ndarray, radius: np.ndarray, level: float) -> float:
     """Return where a rising curve reaches a fraction, linear between two points."""
-    k = int(np.argmax(fraction >= wanted))
+    k = int(np.argmax(fraction >= level))
     if k == 0:
         return float(radius[0])
     low, high = fraction[k - 1], fraction[k]
-    return float(radius[k - 1] + (wanted - low) / (high - low) * (radius[k] - radius[k - 1]))
+    return float(radius[k - 1] + (level - low) / (high - low) * (radius[k] - radius[k - 1]))
 
 
 def _draw_curves(axes: Axes, result: EncircledEnergy) -> None:
-    few = len(result.fields) <= FEW
+    labelled = len(result.fields) <= FEW
     colors = field_colors(len(result.fields))
     for label, row, color in zip(result.field_labels(), result.fraction, colors, strict=True):
-        axes.plot(result.radius * 1e6, row, color=color, linewidth=1.3, label=label if few else None)
-    for part in (0.5, 0.8):
-        axes.axhline(part, color="0.6", linewidth=0.7, linestyle=(0, (4, 3)))
-        axes.annotate(f"{100 * part:.0f} %", (1.0, part), xycoords=("axes fraction", "data"), xytext=(-3, 2),
+        axes.plot(result.radius * 1e6, row, color=color, linewidth=1.3, label=label if labelled else None)
+    for fraction in (0.5, 0.8):
+        axes.axhline(fraction, color="0.6", linewidth=0.7, linestyle=(0, (4, 3)))
+        axes.annotate(f"{100 * fraction:.0f} %", (1.0, fraction), xycoords=("axes fraction", "data"), xytext=(-3, 2),
                       textcoords="offset points", ha="right", fontsize=7.5, color="0.4")  # fmt: skip
     # Beyond the light of every field the curves are flat.
     full = np.flatnonzero((result.fraction >= 0.985).all(axis=0))
@@ -273,7 +280,7 @@ def _draw_curves(axes: Axes, result: EncircledEnergy) -> None:
     )
     if result.on_sky and not result.in_angles:
         second_scale(axes, float(np.rad2deg(result.plate_scale[0])) * 3600e-6, "arc seconds")
-    if few:
+    if labelled:
         axes.legend(loc="lower right")
 
 
@@ -283,9 +290,11 @@ def _draw_radii(axes: Axes, result: EncircledEnergy) -> None:
     if result.on_sky and not result.in_angles:
         scale, unit = arcseconds(result.plate_scale), "arcsec"
     order = np.argsort(away, kind="stable")
-    for part, color in ((0.9, ORANGE), (0.8, RED), (0.5, BLUE)):
-        radius = (result.radius_holding(part) * scale)[order]
-        axes.plot(away[order], radius, "o-", color=color, markersize=3.5, linewidth=1.2, label=f"{100 * part:.0f} %")
+    for fraction, color in ((0.9, ORANGE), (0.8, RED), (0.5, BLUE)):
+        radius = (result.radius_holding(fraction) * scale)[order]
+        axes.plot(
+            away[order], radius, "o-", color=color, markersize=3.5, linewidth=1.2, label=f"{100 * fraction:.0f} %"
+        )
     label = f"radius that holds the fraction [{unit}]"
     finish_axes(axes, ylim=(0.0, None), xlabel=distance, ylabel=label)
     axes.legend(loc="best", ncols=3)

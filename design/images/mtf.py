@@ -39,8 +39,10 @@ if TYPE_CHECKING:
 
 #: Panels in a row.
 _MOST = 3
-#: Smallest and largest default number of lattice points across the pupil.
-_FEWEST, _MOST_ACROSS = 256, 2048
+#: Smallest default number of lattice points across the pupil.
+_FEWEST = 256
+#: Largest default number of lattice points across the pupil.
+_MOST_ACROSS = 2048
 
 
 @dataclass(frozen=True)
@@ -190,9 +192,9 @@ def mtf(
     needed = int(np.ceil(2.0 * reach * period))
     across = max(_FEWEST, needed) if n_pupil is None else require_count(n_pupil, "n_pupil", 16, math.isqrt(MOST))
     if across < needed or (n_pupil is None and across > _MOST_ACROSS):
-        given = f"n_pupil = {across}: too few" if n_pupil is not None else f"more than {_MOST_ACROSS} points are needed"
+        reason = f"n_pupil = {across}: too few" if n_pupil else f"more than {_MOST_ACROSS} points are needed"
         raise DomainError(
-            f"{given} for spots of {2e6 * reach:.4g} um; expected at least {needed}, or smaller spots", key="n_pupil"
+            f"{reason} for spots of {2e6 * reach:.4g} um; expected at least {needed}, or smaller spots", key="n_pupil"
         )
     step = period / across
     frequency = np.arange(across + 1) * step
@@ -200,14 +202,14 @@ def mtf(
     shape = (2, len(request.fields), len(frequency))
     transfer, perfect, rays = np.zeros(shape, complex), np.zeros(shape, complex), np.zeros(shape, complex)
     for i, (center, angle) in enumerate(zip(diagram.reference_point, angles, strict=True)):
-        one = request.at_fields(slice(i, i + 1))
+        field_request = request.at_fields(slice(i, i + 1))
         for wavelength, weight in zip(request.wavelengths, request.weights, strict=True):
-            found = lattice_wavelets(one, float(wavelength), center, float(wavelength) * step, float(angle))
-            for total, pupil in ((transfer, found.wavelets.field), (perfect, np.abs(found.wavelets.field))):
+            lattice = lattice_wavelets(field_request, float(wavelength), center, float(wavelength) * step, float(angle))
+            for total, pupil in ((transfer, lattice.wavelets.field), (perfect, np.abs(lattice.wavelets.field))):
                 for axis in (0, 1):
                     overlap = _overlap(pupil if axis == 0 else pupil.T, len(frequency))
                     # The square of the lit fraction of a cell on the rim is too little light.
-                    overlap[0] = found.wavelets.lit_fraction * (found.spacing / wavelength) ** 2
+                    overlap[0] = lattice.wavelets.lit_fraction * (lattice.spacing / wavelength) ** 2
                     total[axis, i] += weight * overlap
             if progress is not None:
                 progress(1)

@@ -43,8 +43,10 @@ _AIM = 1e-4
 _MOST_TRACES = 8
 #: Parts of a cell along each axis where a rim crosses it, to find its lit fraction.
 _PARTS = 6
-#: Fraction of the light that images hold by default, and their margin beyond it.
-_HELD, _BEYOND = 0.99, 1.1
+#: Fraction of the light that images hold by default.
+_HELD = 0.99
+#: Reach of images by default, over the radius that holds that fraction.
+_BEYOND = 1.1
 #: Range of direction cosines below which there is no focus.
 _PARALLEL = 1e-7
 #: Step of the derivative of the cosines with respect to the pupil point, over the radius of the pupil.
@@ -91,14 +93,14 @@ def traced_wavelets(request: Request, wavelength: float, center: np.ndarray) -> 
     beside = (points, points + np.array([step, 0.0]), points + np.array([0.0, step]))
     bundle = request.bundles(wavelength, np.concatenate(beside))
     opd, cosine = _at_reference(telescope, bundle, center)
-    here, along_x, along_y = cosine.reshape(3, -1, 2)
-    (xx, xy), (yx, yy) = (along_x - here).T, (along_y - here).T
+    central, along_x, along_y = cosine.reshape(3, -1, 2)
+    (xx, xy), (yx, yy) = (along_x - central).T, (along_y - central).T
     jacobian = np.abs(xx * yy - xy * yx) / step**2
     lit = bundle.lit[0, : len(points)] & np.isfinite(jacobian)
     annulus = 0.25 * np.pi * telescope.pupil_diameter**2 * (1.0 - telescope.pupil_obscuration**2)
     amplitude = np.where(lit, weights * np.sqrt(annulus * jacobian), 0.0)
     return Wavelets(
-        cosine=np.where(lit[:, None], here, 0.0),
+        cosine=np.where(lit[:, None], central, 0.0),
         opd=np.where(lit, opd[: len(points)], 0.0),
         amplitude=amplitude,
         lit_fraction=float(weights[lit].sum()),
@@ -142,26 +144,26 @@ def lattice_wavelets(
     targets, points = targets[near], start[near, :2]
     jacobian, by_cosine = slopes[near, :2], slopes[near, 2:]
     lit, opd = np.empty(len(points), dtype=bool), np.empty(len(points))
-    left = np.arange(len(points))
+    pending = np.arange(len(points))
     for _ in range(_MOST_TRACES):
-        bundle, opd[left], cosine = rays(points[left])
-        lit[left] = lit_rays(bundle, points[left])
-        off = targets[left] - cosine
-        known = np.isfinite(off).all(axis=1)
+        bundle, opd[pending], cosine = rays(points[pending])
+        lit[pending] = lit_rays(bundle, points[pending])
+        off = targets[pending] - cosine
+        finite = np.isfinite(off).all(axis=1)
         if not lit.any():
             raise DomainError(f"{field_label(request.fields[0])}: no light passes; expected a lit pupil")
         # Rays that are stopped need not be found, but may be lit where they should have been.
-        away = known & ~(np.abs(off) <= _AIM * spacing).all(axis=1)
-        if not (away & lit[left]).any():
+        away = finite & ~(np.abs(off) <= _AIM * spacing).all(axis=1)
+        if not (away & lit[pending]).any():
             break
-        left, off = left[away], off[away]
-        points[left] += np.einsum("nij,nj->ni", jacobian[left], off)
+        pending, off = pending[away], off[away]
+        points[pending] += np.einsum("nij,nj->ni", jacobian[pending], off)
     else:
         raise DomainError(
             f"{field_label(request.fields[0])}: rays could not be aimed at all directions; expected a pupil that the "
             "telescope maps one to one on its image (huygens_psf does without)"
         )
-    cover = _coverage(lambda some: lit_rays(rays(some)[0], some), points, jacobian, lit, near, n, spacing)
+    cover = _coverage(lambda finer: lit_rays(rays(finer)[0], finer), points, jacobian, lit, near, n, spacing)
     cell = np.abs(np.linalg.det(by_cosine)) * spacing**2
     annulus = np.pi * radius**2 * (1.0 - telescope.pupil_obscuration**2)
     energy = np.where(np.isfinite(opd), cell / annulus, 0.0)
@@ -177,12 +179,12 @@ def lattice_wavelets(
 
 def range_of_cosines(principal: PrincipalRays) -> float:
     """Return the largest range of direction cosines across the pupil, 1 over the smallest focal ratio."""
-    found = float((1.0 / principal.f_number).max())
-    if not _PARALLEL < found < np.inf:
+    largest_range = float((1.0 / principal.f_number).max())
+    if not _PARALLEL < largest_range < np.inf:
         raise DomainError(
             f"{principal.telescope}: focal ratio above {1.0 / _PARALLEL:.0e}, the light is parallel; expected a focus"
         )
-    return found
+    return largest_range
 
 
 def spot_reach(diagram: SpotDiagram) -> float:
@@ -217,13 +219,13 @@ class _InverseMap:
         linear = np.column_stack([np.ones(len(cosine)), cosine])
         slope = np.linalg.lstsq(linear[lit], points[lit], rcond=None)[0]
         off = np.linalg.norm(linear @ slope - points, axis=-1)
-        known = off <= max(_ASTRAY * float(off[lit].max()), 0.01 * radius)
+        usable = off <= max(_ASTRAY * float(off[lit].max()), 0.01 * radius)
         terms = (_DEGREE + 1) * (_DEGREE + 2) // 2
-        if known.sum() < 2 * terms:
+        if usable.sum() < 2 * terms:
             raise DomainError(
-                f"{telescope.name}: {int(known.sum())} of {len(known)} rays arrive; expected most of them"
+                f"{telescope.name}: {int(usable.sum())} of {len(usable)} rays arrive; expected most of them"
             )
-        values, cosine = np.concatenate([entrance, points], axis=1)[known], cosine[known]
+        values, cosine = np.concatenate([entrance, points], axis=1)[usable], cosine[usable]
         self.reach = float(np.abs(cosine).max())
         first, second = (self._powers(cosine[:, axis]) for axis in (0, 1))
         i, j = np.nonzero(np.add.outer(np.arange(_DEGREE + 1), np.arange(_DEGREE + 1)) <= _DEGREE)
@@ -263,9 +265,9 @@ def _coverage(
     spacing: float,
 ) -> np.ndarray:
     """Return the lit fraction of each cell, from more rays where neighbours differ."""
-    whole = np.zeros(n * n, dtype=np.int8)
-    whole[near] = lit
-    square = np.pad(whole.reshape(n, n), 1)
+    lit_cells = np.zeros(n * n, dtype=np.int8)
+    lit_cells[near] = lit
+    square = np.pad(lit_cells.reshape(n, n), 1)
     shifts = [square[1 + i : n + 1 + i, 1 + j : n + 1 + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]
     mixed = (np.minimum.reduce(shifts) != np.maximum.reduce(shifts)).ravel()[near]
     cover = lit.astype(np.float64)

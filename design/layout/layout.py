@@ -22,12 +22,20 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Rays of a field on either side of the axis, and around the pupil.
-_FAN, _SPOKES = 5, 12
+#: Rays of a field on either side of the axis.
+_FAN = 5
+#: Rays of a field around the pupil.
+_SPOKES = 12
 #: Length of the rays above the telescope, over its height.
 _ABOVE = 0.08
+#: Colours of the rays, field by field.
 _RAYS = (BLUE, GREY, RED, ORANGE, PURPLE, "#2a9d6f")
-_GLASS, _GLASS_RIM, _MIRROR, _DETECTOR, _BAFFLE = "#bfe3f2", "#3f7d99", "#1a1a1a", "#0b6b3a", "#6b4a2b"
+#: Colours of the surfaces.
+_GLASS = "#bfe3f2"
+_GLASS_RIM = "#3f7d99"
+_MIRROR = "#1a1a1a"
+_DETECTOR = "#0b6b3a"
+_BAFFLE = "#6b4a2b"
 #: Lenses and detector have a panel of their own below this fraction of the whole size.
 _SMALL = 0.4
 
@@ -111,25 +119,25 @@ class Layout(Result):
         drawing = _Drawing(self)
         surfaces = self.telescope.surfaces
         names = [s.name for s in surfaces if np.isfinite(self.profiles[s.name]).all(axis=1).any()]
-        whole = drawing.box(names)
+        full_box = drawing.box(names)
         within = {lens.front for lens in self.lenses} | {lens.back for lens in self.lenses}
         within |= {s.name for s in surfaces if s.interaction == Interaction.DETECTOR}
-        small = drawing.box([n for n in names if n in within]) if within & set(names) else whole
-        zoom = bool(self.lenses) and bool(np.ptp(small, axis=0).max() < _SMALL * np.ptp(whole, axis=0).max())
+        lens_box = drawing.box([n for n in names if n in within]) if within & set(names) else full_box
+        zoom = bool(self.lenses) and bool(np.ptp(lens_box, axis=0).max() < _SMALL * np.ptp(full_box, axis=0).max())
         with styled():
             if zoom:
                 figure = figure_at(ax, 12.4, 5.4 if drawing.lying else 6.4)
-                left, right = figure.subplots(1, 2)
-                _draw(right, drawing, small, within & set(names), beams=False)
+                full_axes, lens_axes = figure.subplots(1, 2)
+                _draw(lens_axes, drawing, lens_box, within & set(names), beams=False)
                 outside = [n for n in names if n not in within]
-                _draw(left, drawing, whole, set(outside), beams=True)
+                _draw(full_axes, drawing, full_box, set(outside), beams=True)
             else:
-                ratio = np.ptp(whole, axis=0)
+                ratio = np.ptp(full_box, axis=0)
                 wide = float(np.clip(5.2 * ratio[0] / max(ratio[1], 1e-12), 6.4, 12.0))
                 figure = figure_at(ax, wide + 1.2, float(np.clip(wide * ratio[1] / ratio[0], 3.0, 7.5)) + 1.6)
-                left = figure.subplots()
-                _draw(left, drawing, whole, set(names), beams=True)
-            legend_below(figure, left, 8)
+                full_axes = figure.subplots()
+                _draw(full_axes, drawing, full_box, set(names), beams=True)
+            legend_below(figure, full_axes, 8)
             figure.suptitle(
                 f"{plain_text(self.telescope.name)}: section x = 0, rays of {self.wavelength * 1e9:.4g} nm; "
                 f"light comes from {'the left' if drawing.lying else 'above'}",
@@ -169,8 +177,10 @@ def layout(
         field along y.
     """
     edge, stated = telescope.field_radius, telescope.design_data.fields
-    given = [[0.0, -edge], [0.0, 0.0], [0.0, edge]] if fields is None and not stated else fields
-    request = Request.of(telescope, given, wavelength, projection=projection, threads=threads, one_wavelength=True)
+    field_angles = [[0.0, -edge], [0.0, 0.0], [0.0, edge]] if fields is None and not stated else fields
+    request = Request.of(
+        telescope, field_angles, wavelength, projection=projection, threads=threads, one_wavelength=True
+    )
     points, w = request.fields, request.wavelength
     lenses = find_lenses(telescope, w)
     reach = even_edges(telescope, lenses, drawn_radii(request))
@@ -187,8 +197,10 @@ def layout(
 
     def rays(pupil: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, ...]:
         through = np.stack(pupil, axis=-1)
-        parts = (request.at_fields(slice(i, i + 1)) for i in range(len(points)))
-        return tuple(ray_paths(telescope, part.launch(w, through), top, threads) for part in parts)
+        field_requests = (request.at_fields(slice(i, i + 1)) for i in range(len(points)))
+        return tuple(
+            ray_paths(telescope, field_request.launch(w, through), top, threads) for field_request in field_requests
+        )
 
     return Layout(
         telescope=telescope,
@@ -303,7 +315,7 @@ def _labels(
     for surface in layout.telescope.surfaces:
         if surface.name in named - covered:
             parts[surface.name] = [surface.name]
-    found = []
+    labels = []
     for name, members in parts.items():
         points = np.concatenate([drawing(layout.profiles[m]) for m in members]) * scale
         points = points[np.isfinite(points).all(axis=1)]
@@ -313,8 +325,8 @@ def _labels(
         rim = points[points[:, side] >= points[:, side].max() - 1e-6 * scale]
         place = rim.mean(axis=0)
         if (place >= limits[0]).all() and (place <= limits[1]).all():
-            found.append((name, place))
-    return found
+            labels.append((name, place))
+    return labels
 
 
 def _write_names(axes: Axes, labels: list[tuple[str, np.ndarray]], lying: bool) -> None:
@@ -343,10 +355,10 @@ def _write_names(axes: Axes, labels: list[tuple[str, np.ndarray]], lying: bool) 
         )
 
 
-def _apart(wanted: np.ndarray, step: float, low: float, high: float) -> np.ndarray:
-    """Return ascending positions near those wanted, a step apart and within bounds where there is room."""
-    step = min(step, (high - low) / max(len(wanted) - 1, 1))
-    places = np.clip(wanted, low, high)
+def _apart(preferred: np.ndarray, step: float, low: float, high: float) -> np.ndarray:
+    """Return ascending positions near preferred ones, a step apart and within bounds where there is room."""
+    step = min(step, (high - low) / max(len(preferred) - 1, 1))
+    places = np.clip(preferred, low, high)
     # Groups that are too close spread about their middle and merge with neighbours.
     groups = [[float(p), 1] for p in places]
     merged = True
@@ -358,8 +370,8 @@ def _apart(wanted: np.ndarray, step: float, low: float, high: float) -> np.ndarr
                 groups[i : i + 2] = [[(a * n + b * m) / (n + m), n + m]]
                 merged = True
                 break
-    found = np.concatenate([c + step * (np.arange(n) - 0.5 * (n - 1)) for c, n in groups])
-    return found + max(low - found[0], 0.0) - max(found[-1] - high, 0.0)
+    spread = np.concatenate([c + step * (np.arange(n) - 0.5 * (n - 1)) for c, n in groups])
+    return spread + max(low - spread[0], 0.0) - max(spread[-1] - high, 0.0)
 
 
 def _cut(triangles: np.ndarray) -> np.ndarray:
@@ -368,10 +380,10 @@ def _cut(triangles: np.ndarray) -> np.ndarray:
     before, after = start[..., 0], end[..., 0]
     crosses = (before < 0) != (after < 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        part = np.where(crosses, before / (before - after), np.nan)
-    points = start + part[..., None] * (end - start)
-    both = crosses.sum(axis=1) == 2
-    return points[both][crosses[both]].reshape(-1, 2, 3)
+        fraction = np.where(crosses, before / (before - after), np.nan)
+    points = start + fraction[..., None] * (end - start)
+    divided = crosses.sum(axis=1) == 2
+    return points[divided][crosses[divided]].reshape(-1, 2, 3)
 
 
 def _signed_label(field: np.ndarray) -> str:

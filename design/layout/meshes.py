@@ -14,10 +14,14 @@ from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
 from .sections import Lens, clear_region
 
-#: Points of a surface along the radius and around.
-_RINGS, _SPOKES = 24, 120
-#: Thickness of the rays over the width of the telescope, and sides of the tubes that they are.
-_RAY, _SIDES = 6e-4, 5
+#: Points of a surface along the radius.
+_RINGS = 24
+#: Points of a surface around the axis.
+_SPOKES = 120
+#: Diameter of the tubes of rays over the largest extent of the telescope.
+_RAY = 6e-4
+#: Sides of the tubes of rays.
+_SIDES = 5
 #: Colours with opacity, how metallic and how rough.
 _LOOKS: dict[str, tuple[tuple[float, float, float, float], float, float]] = {
     "mirror": ((0.80, 0.82, 0.85, 1.0), 1.0, 0.12),
@@ -75,9 +79,9 @@ def layout_scene(
         faces = [surface_mesh(surfaces[name], reach[name]) for name in (lens.front, lens.back)]
         edge = _wall(*(_rim(surfaces[name], reach[name]) for name in (lens.front, lens.back)))
         mirrors = [n for n in (lens.front, lens.back) if surfaces[n].interaction == Interaction.MIRROR]
-        whole = trimesh.util.concatenate([*faces, edge])
-        assert isinstance(whole, trimesh.Trimesh)
-        add(lens.name, whole, _LOOKS["glass"])
+        body = trimesh.util.concatenate([*faces, edge])
+        assert isinstance(body, trimesh.Trimesh)
+        add(lens.name, body, _LOOKS["glass"])
         glass -= set(mirrors)
     for name, surface in surfaces.items():
         if name in glass or surface.interaction == Interaction.PHASE:
@@ -132,8 +136,8 @@ def tubes(paths: np.ndarray, radius: float) -> trimesh.Trimesh:
     start, end, length = start[solid], end[solid], length[solid]
     along = (end - start) / length[:, None]
     # Two directions across each piece, from the axis that is least along it.
-    other = np.eye(3)[np.argmin(np.abs(along), axis=-1)]
-    first = np.cross(along, other)
+    least_along = np.eye(3)[np.argmin(np.abs(along), axis=-1)]
+    first = np.cross(along, least_along)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     second = np.cross(along, first)
     angle = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
@@ -141,8 +145,8 @@ def tubes(paths: np.ndarray, radius: float) -> trimesh.Trimesh:
     points = np.stack([start[:, None] + around, end[:, None] + around], axis=1).reshape(-1, 3)
     i = np.arange(_SIDES)
     j = (i + 1) % _SIDES
-    one = np.concatenate([np.stack([i, i + _SIDES, j], -1), np.stack([j, i + _SIDES, j + _SIDES], -1)])
-    faces = (2 * _SIDES * np.arange(len(start))[:, None, None] + one).reshape(-1, 3)
+    segment_faces = np.concatenate([np.stack([i, i + _SIDES, j], -1), np.stack([j, i + _SIDES, j + _SIDES], -1)])
+    faces = (2 * _SIDES * np.arange(len(start))[:, None, None] + segment_faces).reshape(-1, 3)
     return trimesh.Trimesh(points, faces, process=False)
 
 
@@ -172,5 +176,5 @@ def _wall(first: np.ndarray, second: np.ndarray) -> trimesh.Trimesh:
     j = (i + 1) % n
     faces = np.concatenate([np.stack([i, j, i + n], -1), np.stack([j, j + n, i + n], -1)])
     points = np.concatenate([first, second])
-    known = np.isfinite(points[faces]).all(axis=(1, 2))
-    return trimesh.Trimesh(np.where(np.isfinite(points), points, 0.0), faces[known], process=False)
+    finite = np.isfinite(points[faces]).all(axis=(1, 2))
+    return trimesh.Trimesh(np.where(np.isfinite(points), points, 0.0), faces[finite], process=False)

@@ -63,18 +63,18 @@ def surface_section(surface: Surface, reach: float) -> np.ndarray:
         return clear_region(surface.aperture, np.zeros_like(y), y) != blocks
 
     y = np.linspace(-reach, reach, _POINTS)
-    here = solid(y)
+    solid_samples = solid(y)
     # Ends by bisection.
-    ends = np.flatnonzero(here[1:] != here[:-1])
+    ends = np.flatnonzero(solid_samples[1:] != solid_samples[:-1])
     low, high = y[ends].copy(), y[ends + 1].copy()
     for _ in range(40):
         middle = 0.5 * (low + high)
-        same = solid(middle) == here[ends]
+        same = solid(middle) == solid_samples[ends]
         low, high = np.where(same, middle, low), np.where(same, high, middle)
     y = np.concatenate([y, low, high])
     order = np.argsort(y, kind="stable")
     y = y[order]
-    keep = np.concatenate([here, here[ends], here[ends + 1]])[order]
+    keep = np.concatenate([solid_samples, solid_samples[ends], solid_samples[ends + 1]])[order]
     sag = np.zeros_like(y) if surface.interaction == Interaction.PHASE else surface.shape.sag(np.zeros_like(y), y)
     local = np.stack([np.zeros_like(y), y, np.where(keep, sag, np.nan)], axis=-1)
     return surface.to_telescope(local)
@@ -101,33 +101,33 @@ def outer_radius(region: Aperture | None) -> float:
     if isinstance(region, Polygon):
         return float(np.hypot(*np.array(region.corners).T).max())
     if isinstance(region, Union):
-        return max(outer_radius(part) for part in region.parts)
+        return max(outer_radius(subregion) for subregion in region.parts)
     if isinstance(region, Intersection):
-        return min(outer_radius(part) for part in region.parts)
+        return min(outer_radius(subregion) for subregion in region.parts)
     return float("inf")
 
 
 def even_edges(telescope: Telescope, lenses: tuple[Lens, ...], reach: dict[str, float]) -> dict[str, float]:
     """Return radii with surfaces whose size is not stated as large as the other of their lens, if they do not cross."""
-    found = dict(reach)
+    radii = dict(reach)
     for lens in lenses:
-        both = max(found[lens.front], found[lens.back])
+        lens_radius = max(radii[lens.front], radii[lens.back])
         for name in (lens.front, lens.back):
             surface = telescope.surface(name)
             stated = surface.aperture is not None or surface.semi_diameter is not None
-            if not stated and _apart(telescope.surface(lens.front), telescope.surface(lens.back), both):
-                found[name] = both
-    return found
+            if not stated and _apart(telescope.surface(lens.front), telescope.surface(lens.back), lens_radius):
+                radii[name] = lens_radius
+    return radii
 
 
 def _apart(front: Surface, back: Surface, reach: float) -> bool:
     """Return whether two surfaces exist and do not cross out to a radius [m], in the section x = 0."""
     y = np.linspace(-reach, reach, _POINTS)
-    one, other = (
+    front_z, back_z = (
         s.to_telescope(np.stack([np.zeros_like(y), y, s.shape.sag(np.zeros_like(y), y)], axis=-1))[:, 2]
         for s in (front, back)
     )
-    gap = one - other
+    gap = front_z - back_z
     return bool(np.isfinite(gap).all() and (gap * gap[len(y) // 2] > 0).all())
 
 
@@ -138,19 +138,19 @@ def drawn_radii(request: Request) -> dict[str, float]:
     """
     telescope, threads = request.telescope, request.threads
     edge = telescope.field_radius * np.array([[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]])
-    everywhere = [request] if telescope.design_data.fields else [request, request.at_fields(edge)]
+    requests = [request] if telescope.design_data.fields else [request, request.at_fields(edge)]
     angle = 2.0 * np.pi * np.arange(16) / 16
     radius = 0.5 * telescope.pupil_diameter
     rim = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     lit = np.zeros(len(telescope.surfaces))
-    for some in everywhere:
-        rays = some.launch(request.wavelength, rim)
+    for field_request in requests:
+        rays = field_request.launch(request.wavelength, rim)
         for k, met in enumerate(trace(telescope, rays, "all", threads=threads)):
             local = telescope.surfaces[k].to_local(met.position)
             # Vignetted light counts too, where there is nothing else.
             away = np.hypot(local[:, 0], local[:, 1])
             lit[k] = max(lit[k], float(np.nanmax(away, initial=0.0)) if np.isfinite(away).any() else 0.0)
-    found = {}
+    radii = {}
     for surface, light in zip(telescope.surfaces, lit, strict=True):
         bound = outer_radius(surface.aperture)
         if surface.interaction == Interaction.PASS:
@@ -158,8 +158,8 @@ def drawn_radii(request: Request) -> dict[str, float]:
             bound = blocked if np.isfinite(blocked) else _RIM * (bound if np.isfinite(bound) else light)
         if np.isinf(bound):
             bound = surface.semi_diameter or _BEYOND * max(light, 1e-3 * radius)
-        found[surface.name] = bound
-    return found
+        radii[surface.name] = bound
+    return radii
 
 
 def find_lenses(telescope: Telescope, wavelength: float) -> tuple[Lens, ...]:
@@ -168,12 +168,12 @@ def find_lenses(telescope: Telescope, wavelength: float) -> tuple[Lens, ...]:
     index = refractive_indices(telescope, wavelength)
     # Planes inside a lens, such as its stop, do not divide it.
     acting = [k for k, s in enumerate(telescope.surfaces) if s.interaction in (Interaction.REFRACT, Interaction.MIRROR)]
-    found = []
+    lenses = []
     for front, back in pairwise(acting):
         if index[front + 1] >= _GLASS and front not in impossible:
             names = telescope.surfaces[front].name, telescope.surfaces[back].name
-            found.append(Lens(_common_name(*names), *names, float(index[front + 1])))
-    return tuple(found)
+            lenses.append(Lens(_common_name(*names), *names, float(index[front + 1])))
+    return tuple(lenses)
 
 
 def _common_name(first: str, second: str) -> str:

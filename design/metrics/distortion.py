@@ -203,7 +203,7 @@ def field_lattice(telescope: Telescope, across: int) -> np.ndarray:
 def _landing(request: Request, reference: str) -> np.ndarray:
     if reference == "chief":
         return request.bundles(request.wavelength, np.zeros((1, 2))).chief_landing()
-    return np.concatenate([spot_diagram(some).reference_point for _, some in request.parts()])
+    return np.concatenate([spot_diagram(batch).reference_point for _, batch in request.parts()])
 
 
 def _similarity(slopes: np.ndarray, position: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -213,9 +213,9 @@ def _similarity(slopes: np.ndarray, position: np.ndarray) -> tuple[float, np.nda
     """
     mean_slope, mean_position = slopes.mean(axis=0), position.mean(axis=0)
     a, b = slopes - mean_slope, position - mean_position
-    left, strengths, right = np.linalg.svd(b.T @ a)
-    rotation = left @ right
-    scale = float(strengths.sum() / (a**2).sum())
+    u, singular_values, vt = np.linalg.svd(b.T @ a)
+    rotation = u @ vt
+    scale = float(singular_values.sum() / (a**2).sum())
     return scale, rotation, mean_position - scale * rotation @ mean_slope
 
 

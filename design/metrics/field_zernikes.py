@@ -247,16 +247,16 @@ def wavefront_zernikes(
         one_wavelength=True,
     )
     points, sample = request.fields, request.pupil
-    most = len(sample) if ordering == "noll" else min(len(sample), FRINGE_TERMS)
-    jmax = require_count(jmax, "jmax", 1, most)
+    largest_jmax = len(sample) if ordering == "noll" else min(len(sample), FRINGE_TERMS)
+    jmax = require_count(jmax, "jmax", 1, largest_jmax)
     x, y = request.unit_pupil.T
     noll = ordering == "noll"
     terms = (annular_zernikes(jmax, x, y, telescope.pupil_obscuration) if noll else fringe_zernikes(jmax, x, y)).T
     coefficients, residual = np.empty((len(points), jmax)), np.empty(len(points))
-    for part, some in request.parts():
-        value, lit = _wavefronts(some)
+    for rows, batch in request.parts():
+        value, lit = _wavefronts(batch)
         used = np.isfinite(value) & (lit | (pupil == "full"))
-        coefficients[part], residual[part] = _fit(terms, value, used, sample.weights, some.fields, pupil)
+        coefficients[rows], residual[rows] = _fit(terms, value, used, sample.weights, batch.fields, pupil)
     return FieldZernikes(request, coefficients, residual, telescope.pupil_obscuration, pupil, ordering)
 
 
@@ -336,8 +336,8 @@ def double_zernikes(
     terms = annular_zernikes(kmax, *(nodes.points.T / radius)).T
     root = np.sqrt(nodes.weights)[:, None]
     coefficients, *_ = np.linalg.lstsq(terms * root, at_nodes.coefficients * root, rcond=None)
-    rest = at_nodes.coefficients - terms @ coefficients
-    return DoubleZernikes(coefficients, radius, at_nodes, np.sqrt(nodes.weights @ rest**2))
+    residual = at_nodes.coefficients - terms @ coefficients
+    return DoubleZernikes(coefficients, radius, at_nodes, np.sqrt(nodes.weights @ residual**2))
 
 
 def _fit(
@@ -348,24 +348,24 @@ def _fit(
     jmax = terms.shape[1]
     short = used.sum(axis=1) < (len(weights) if pupil == "full" else jmax)
     if short.any():
-        what = field_label(fields[short][0])
+        field_name = field_label(fields[short][0])
         if pupil == "full":
-            raise DomainError(f"{what}: rays of the annulus miss the detector; pupil='lit' leaves them out")
-        raise DomainError(f"{what}: {int(used[short][0].sum())} pupil points are lit; expected at least {jmax}")
+            raise DomainError(f"{field_name}: rays of the annulus miss the detector; pupil='lit' leaves them out")
+        raise DomainError(f"{field_name}: {int(used[short][0].sum())} pupil points are lit; expected at least {jmax}")
     coefficients = np.empty((len(value), jmax))
-    everything = used.all(axis=1)
-    if everything.any():
+    complete = used.all(axis=1)
+    if complete.any():
         # One factorisation serves all fields whose points are the same.
         orthogonal, triangle = np.linalg.qr(terms * root[:, None])
         size = np.abs(np.diag(triangle))
         if size.min() < 1e-9 * size.max():
             raise DomainError(f"jmax = {jmax}: the {len(weights)} points of the pupil cannot separate so many terms")
-        coefficients[everything] = np.linalg.solve(triangle, (value[everything] * root @ orthogonal).T).T
-    for i in np.flatnonzero(~everything):
+        coefficients[complete] = np.linalg.solve(triangle, (value[complete] * root @ orthogonal).T).T
+    for i in np.flatnonzero(~complete):
         lit = used[i]
         coefficients[i], *_ = np.linalg.lstsq(terms[lit] * root[lit, None], value[i, lit] * root[lit], rcond=None)
-    rest = np.where(used, value - coefficients @ terms.T, 0.0)
-    return coefficients, np.sqrt((rest**2 @ weights) / (used @ weights))
+    residual = np.where(used, value - coefficients @ terms.T, 0.0)
+    return coefficients, np.sqrt((residual**2 @ weights) / (used @ weights))
 
 
 def term_label(j: int, ordering: str = "noll") -> str:

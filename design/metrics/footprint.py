@@ -18,16 +18,18 @@ from ...raytrace.rays import RayStatus
 from ...raytrace.trace import trace
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
-from ..drawing import FEW, field_colors, panel_grid
+from ..drawing import FEW, Color, field_colors, panel_grid
 from ..result import FieldResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Points of an outline, and their distance from the rims of the annulus in units of its radius: rounding decides
-#: whether a ray through the very rim is blocked.
-_RIM, _INSIDE = 181, 1e-6
+#: Points of an outline.
+_RIM = 181
+#: Distance of outlines from the rims of the annulus in units of its radius: rounding decides whether a ray through the
+#: very rim is blocked.
+_INSIDE = 1e-6
 #: Points across the image of a clear aperture.
 _ACROSS = 700
 
@@ -154,7 +156,7 @@ def footprint(
     names = [surfaces] if isinstance(surfaces, str) else list(telescope.surface_names if surfaces is None else surfaces)
     if not names:
         raise DomainError("surfaces = []: expected the name of a surface at least")
-    wanted = [telescope.surface_names.index(telescope.surface(name).name) for name in names]
+    surface_indices = [telescope.surface_names.index(telescope.surface(name).name) for name in names]
     request = Request.of(
         telescope,
         fields,
@@ -169,10 +171,10 @@ def footprint(
     angle = np.linspace(0.0, 2.0 * np.pi, _RIM)
     circle = 0.5 * telescope.pupil_diameter * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     hole = telescope.pupil_obscuration + _INSIDE if telescope.pupil_obscuration else np.nan
-    everything = np.concatenate([(1.0 - _INSIDE) * circle, hole * circle, request.pupil.points])
-    results = trace(telescope, request.launch(request.wavelength, everything), "all", threads=threads)
+    pupil_points = np.concatenate([(1.0 - _INSIDE) * circle, hole * circle, request.pupil.points])
+    results = trace(telescope, request.launch(request.wavelength, pupil_points), "all", threads=threads)
     footprints = []
-    for i in wanted:
+    for i in surface_indices:
         surface = telescope.surfaces[i]
         position = surface.to_local(results[i].position).reshape(n_field, -1, 3)[:, :, :2]
         before = results[i - 1].status if i else np.zeros_like(results[i].status)
@@ -200,17 +202,17 @@ def _frame(points: np.ndarray) -> tuple[np.ndarray, float]:
     return np.zeros(2), 1.15 * float(np.abs([low, high]).max())
 
 
-def _draw_surface(axes: Axes, footprint: SurfaceFootprint, colors: list[Any], names: list[str]) -> None:
+def _draw_surface(axes: Axes, footprint: SurfaceFootprint, colors: list[Color], names: list[str]) -> None:
     from matplotlib.colors import ListedColormap
 
     surface = footprint.surface
-    known = footprint.arriving_points().reshape(-1, 2)
-    known = known[np.isfinite(known).all(axis=-1)]
-    if not len(known):
+    arrivals = footprint.arriving_points().reshape(-1, 2)
+    arrivals = arrivals[np.isfinite(arrivals).all(axis=-1)]
+    if not len(arrivals):
         axes.set_title(f"{plain_text(surface.name)}: no ray arrives", loc="left")
         axes.set_axis_off()
         return
-    middle, half = _frame(known)
+    middle, half = _frame(arrivals)
     x, y = (np.linspace(c - half, c + half, _ACROSS) for c in middle)
     extent = tuple(1e3 * v for v in (x[0], x[-1], y[0], y[-1]))
     if surface.aperture is not None:

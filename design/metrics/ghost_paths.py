@@ -46,19 +46,19 @@ class Reflectivities:
     def __init__(
         self,
         telescope: Telescope,
-        given: float | Mapping[str, float] | None,
+        stated: float | Mapping[str, float] | None,
         detector: float,
         coatings: Coatings,
         wavelength: float,
     ) -> None:
         lenses = [s.name for s in telescope.surfaces if s.interaction == Interaction.REFRACT]
-        if isinstance(given, Mapping):
-            for name in given:
+        if isinstance(stated, Mapping):
+            for name in stated:
                 if name not in lenses:
                     raise unknown_name(f"lens surface of {telescope.name}", name, lenses)
-            table = {name: float(value) for name, value in given.items()}
+            table = {name: float(value) for name, value in stated.items()}
         else:
-            table = {} if given is None else {name: float(given) for name in lenses}
+            table = {} if stated is None else {name: float(stated) for name in lenses}
         last = telescope.surfaces[-1]
         if last.interaction == Interaction.DETECTOR:
             table[last.name] = float(detector)
@@ -94,10 +94,10 @@ class Reflectivities:
     def _coating(self, place: int, cosine: np.ndarray, before: float, after: float) -> np.ndarray:
         """Return what a coating does not transmit, from the cosine of the angle of incidence."""
         name = self._coated[place]
-        found = 1.0 - self._coatings.surfaces[name].efficiency(self._wavelength, cosine, before, after)
-        if (np.isnan(found) & ~np.isnan(cosine)).any():
+        reflectivity = 1.0 - self._coatings.surfaces[name].efficiency(self._wavelength, cosine, before, after)
+        if (np.isnan(reflectivity) & ~np.isnan(cosine)).any():
             raise DomainError(f"coating of {name}: expected a table that reaches the angles of all ghosts")
-        return np.asarray(np.clip(found, 0.0, 1.0))
+        return np.asarray(np.clip(reflectivity, 0.0, 1.0))
 
 
 @dataclass(frozen=True)

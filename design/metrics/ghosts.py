@@ -40,8 +40,10 @@ if TYPE_CHECKING:
 
 #: Rays in each cell of the irradiance of a ghost, on average.
 _RAYS_PER_CELL = 40
-#: Least number of rays of a star, and their number in the first trace, which finds the brightest ghosts.
-_LEAST_RAYS, _FIRST_RAYS = 400, 4000
+#: Least number of rays of a star.
+_LEAST_RAYS = 400
+#: Rays of a star in the first trace, which finds the brightest ghosts.
+_FIRST_RAYS = 4000
 #: Rays of a ghost below which its area, and so its irradiance, is unknown.
 _LEAST_OF_GHOST = 10
 #: Fraction of the light of a ghost within the circle that its position and size are measured in.
@@ -50,9 +52,12 @@ _CORE = 0.98
 _MAP = 160
 #: Field of the star where none is given, over the radius of the field of view.
 _FIELD = 0.5
+#: Fraction of the light that a detector reflects, where none is given.
 DETECTOR_REFLECTIVITY = 0.15
-#: Ghosts with a panel of their own, and decades of irradiance of the map.
-_ALONE, _DECADES = 8, 4.0
+#: Ghosts with a panel of their own, the brightest.
+_ALONE = 8
+#: Decades of irradiance of the map.
+_DECADES = 4.0
 
 
 @dataclass(frozen=True)
@@ -170,13 +175,13 @@ class Ghosts(FieldResult):
         with styled():
             figure = figure_at(ax, 11.6, 5.3)
             parts: Any = figure.subfigures(1, 2, width_ratios=[1.0, 1.12])
-            left, right = parts
-            _draw_map(left.subplots(), self)
+            map_figure, ghost_figure = parts
+            _draw_map(map_figure.subplots(), self)
             shown = self.ghosts[:_ALONE]
-            panels = panels_of(right, len(shown), 2, _ALONE // 2)
+            panels = panels_of(ghost_figure, len(shown), 2, _ALONE // 2)
             for axes, ghost, magnitude in zip(panels, shown, self.magnitudes, strict=False):
                 _draw_ghost(axes, ghost, float(magnitude))
-            right.suptitle("the brightest: reflected at, and then at", fontsize=9.5)
+            ghost_figure.suptitle("the brightest: reflected at, and then at", fontsize=9.5)
             flux, reflected = 100 * self.flux, 100 * self.detector_reflectivity
             return self._titled(
                 figure,
@@ -233,11 +238,11 @@ def ghosts(
     """
     n_pupil = require_count(n_pupil, "n_pupil", _LEAST_RAYS)
     brightest = None if brightest is None else require_count(brightest, "brightest", 1)
-    where: Any = [0.0, _FIELD * telescope.field_radius] if field is None else [field]
+    star_field: Any = [0.0, _FIELD * telescope.field_radius] if field is None else [field]
     require_image(telescope, "a map of ghosts")
     request = Request.of(
         telescope,
-        where,
+        star_field,
         wavelength,
         sampling="spiral",
         n_pupil=n_pupil,
@@ -245,8 +250,8 @@ def ghosts(
         threads=threads,
         one_wavelength=True,
     )
-    known = Coatings.of(telescope, coatings)
-    surfaces = Reflectivities(telescope, reflectivity, detector_reflectivity, known, request.wavelength)
+    telescope_coatings = Coatings.of(telescope, coatings)
+    surfaces = Reflectivities(telescope, reflectivity, detector_reflectivity, telescope_coatings, request.wavelength)
     pairs = ghost_pairs(telescope)
     if not pairs:
         raise DomainError(
@@ -259,8 +264,8 @@ def ghosts(
     direct = float(image.weight.sum())
     star = np.average(image.position, axis=0, weights=image.weight)
     if brightest is not None and brightest < len(pairs):
-        few = request.launch(request.wavelength, pupil_sampling(telescope, "spiral", _FIRST_RAYS).points)
-        first = GhostTrace(telescope, few, surfaces, threads).ghosts(pairs)
+        first_rays = request.launch(request.wavelength, pupil_sampling(telescope, "spiral", _FIRST_RAYS).points)
+        first = GhostTrace(telescope, first_rays, surfaces, threads).ghosts(pairs)
         peaks = np.array([_measure(landing, 1.0).peak if landing.weight.sum() > 0 else np.nan for landing in first])
         pairs = [pairs[i] for i in sorted(np.argsort(-peaks, kind="stable")[:brightest])]
     landings = []
@@ -272,21 +277,21 @@ def ghosts(
     rim = request.at_fields(edge).bundles(request.wavelength, np.zeros((1, 2))).chief_landing()
     with ThreadPoolExecutor(thread_count(threads)) as pool:
         lit = [landing for landing in landings if landing.weight.sum() > 0]
-        found = list(pool.map(partial(_measure, direct=direct), lit))
+        measured_ghosts = list(pool.map(partial(_measure, direct=direct), lit))
     # Where no ray from the edge of the field arrives, the map covers whole ghosts.
     radius = float(np.nanmax(np.linalg.norm(rim, axis=-1), initial=0.0)) or max(
-        (g.diameter for g in found), default=1.0
+        (g.diameter for g in measured_ghosts), default=1.0
     )
     edges = np.linspace(-1.1 * radius, 1.1 * radius, _MAP + 1)
-    together = np.zeros((_MAP, _MAP))
+    irradiance = np.zeros((_MAP, _MAP))
     for landing in lit:
-        together += _irradiance(landing, edges, edges) / direct
+        irradiance += _irradiance(landing, edges, edges) / direct
     return Ghosts(
         request=request,
         detector_reflectivity=float(detector_reflectivity),
-        ghosts=tuple(sorted(found, key=lambda g: (-np.nan_to_num(g.peak), g.first, g.second))),
+        ghosts=tuple(sorted(measured_ghosts, key=lambda g: (-np.nan_to_num(g.peak), g.first, g.second))),
         star=star,
-        irradiance=together,
+        irradiance=irradiance,
         edges=edges,
         image_radius=radius,
         plate_scale=float(principal_rays_of(request).mean_plate_scale[0]),

@@ -118,12 +118,12 @@ class SpotDiagram(FieldResult):
             raise DomainError(f"fraction = {fraction!r}: expected a number between 0 and 1")
         radii = np.linalg.norm(self._centered(), axis=-1).reshape(len(self.fields), -1)
         weights = self.weight.reshape(len(self.fields), -1)
-        found = np.full(len(self.fields), np.nan)
+        quantiles = np.full(len(self.fields), np.nan)
         for i, (radius, weight) in enumerate(zip(radii, weights, strict=True)):
             order = np.argsort(radius[weight > 0], kind="stable")
             if len(order):
-                found[i] = _weighted_quantile(radius[weight > 0][order], weight[weight > 0][order], fraction)
-        return found
+                quantiles[i] = _weighted_quantile(radius[weight > 0][order], weight[weight > 0][order], fraction)
+        return quantiles
 
     def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the fields."""
@@ -169,9 +169,9 @@ class SpotDiagram(FieldResult):
 
     def _mean(self, values: np.ndarray) -> np.ndarray:
         """Return the weighted mean of values [n_field, n_wave, n_pupil, 2] over the rays of each field."""
-        known = np.where(self.weight[..., None] > 0, values, 0.0)
+        lit_values = np.where(self.weight[..., None] > 0, values, 0.0)
         with np.errstate(invalid="ignore"):
-            return np.einsum("fwp,fwpi->fi", self.weight, known) / self.lit_fraction[:, None]
+            return np.einsum("fwp,fwpi->fi", self.weight, lit_values) / self.lit_fraction[:, None]
 
     def _centered(self) -> np.ndarray:
         return self.displacement - self.centroid[:, None, None]

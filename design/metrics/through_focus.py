@@ -220,9 +220,9 @@ def _wavefronts(request: Request, bundles: list[Bundles], heights: np.ndarray) -
             for k, height in enumerate(heights):
                 value = bundle.one(i).opd(radius, float(height))[0, lit]
                 scaled = value * np.sqrt(weight)
-                rest = scaled - basis @ (basis.T @ scaled)
-                square[i, k] += fraction * (rest**2).sum()
-                waves = rest / np.sqrt(weight) / bundle.wavelength
+                residual = scaled - basis @ (basis.T @ scaled)
+                square[i, k] += fraction * (residual**2).sum()
+                waves = residual / np.sqrt(weight) / bundle.wavelength
                 strehl[i, k] += fraction * brightest_strehl(weight, request.unit_pupil[lit], waves)
     return np.sqrt(square), strehl
 
@@ -238,10 +238,10 @@ def _lowest(x: np.ndarray, y: np.ndarray) -> float:
 
 def _draw_curves(axes: Axes, result: ThroughFocus, values: np.ndarray, best: np.ndarray) -> None:
     heights = result.defocus * 1e6
-    few = len(result.fields) <= FEW
+    labelled = len(result.fields) <= FEW
     colors = field_colors(len(result.fields))
     for row, label, color, height in zip(values, result.field_labels(), colors, best * 1e6, strict=True):
-        axes.plot(heights, row, color=color, linewidth=1.4, label=label if few else None)
+        axes.plot(heights, row, color=color, linewidth=1.4, label=label if labelled else None)
         if heights[0] <= height <= heights[-1]:
             axes.plot(height, np.interp(height, heights, row), "o", color=color, markersize=4.0)
     axes.axvline(0.0, color="0.6", linewidth=0.7)

@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Rings and spokes of field points where none are given.
-_RINGS, _SPOKES = 14, 24
+#: Rings of field points where none are given.
+_RINGS = 14
+#: Spokes of field points where none are given.
+_SPOKES = 24
 
 
 @dataclass(frozen=True)
@@ -123,11 +125,11 @@ def vignetting(
         threads=threads,
         one_wavelength=True,
     )
-    everywhere = request.at_fields(np.concatenate([np.zeros((1, 2)), request.fields]))
-    quarters = np.empty((len(everywhere.fields), 4))
-    for part, some in everywhere.parts():
-        lit = some.bundles(request.wavelength).lit
-        quarters[part] = lit.reshape(len(lit), -1, 4).mean(axis=1)
+    with_axis = request.at_fields(np.concatenate([np.zeros((1, 2)), request.fields]))
+    quarters = np.empty((len(with_axis.fields), 4))
+    for rows, batch in with_axis.parts():
+        lit = batch.bundles(request.wavelength).lit
+        quarters[rows] = lit.reshape(len(lit), -1, 4).mean(axis=1)
         if progress is not None:
             progress(len(lit))
     fraction = quarters.mean(axis=1)

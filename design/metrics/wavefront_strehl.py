@@ -44,9 +44,9 @@ def brightest_strehl(weight: np.ndarray, pupil: np.ndarray, waves: np.ndarray) -
     steepest = 0.5 * np.sqrt(len(waves) / np.pi)
     count = int(np.ceil(min(float(np.abs(waves).max()), steepest, _FARTHEST) / _STEP))
     amplitude = (_powers(pupil[:, 1], count) * field) @ _powers(pupil[:, 0], count).T
-    found = amplitude.real**2 + amplitude.imag**2
-    row, column = np.unravel_index(int(np.argmax(found)), found.shape)
-    place, best = _STEP * np.array([column - count, row - count]), float(found[row, column])
+    irradiance = amplitude.real**2 + amplitude.imag**2
+    row, column = np.unravel_index(int(np.argmax(irradiance)), irradiance.shape)
+    place, best = _STEP * np.array([column - count, row - count]), float(irradiance[row, column])
     for _ in range(_NEWTON):
         value, gradient, hessian = _with_derivatives(field, pupil, place)
         best = max(best, value)
@@ -70,8 +70,8 @@ def _powers(u: np.ndarray, many: int) -> np.ndarray:
 
 def _with_derivatives(field: np.ndarray, pupil: np.ndarray, place: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the irradiance at a place, its gradient and its Hessian."""
-    one = field * np.exp(-2j * np.pi * (pupil @ place))
+    phasors = field * np.exp(-2j * np.pi * (pupil @ place))
     turned = -2j * np.pi * pupil
-    amplitude, first, second = one.sum(), one @ turned, (turned * one[:, None]).T @ turned
+    amplitude, first, second = phasors.sum(), phasors @ turned, (turned * phasors[:, None]).T @ turned
     hessian = 2.0 * (np.conj(amplitude) * second + np.outer(np.conj(first), first)).real
     return float(abs(amplitude) ** 2), 2.0 * (np.conj(amplitude) * first).real, hessian

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
 from ...models.telescope import Telescope
@@ -42,12 +43,12 @@ class Where:
     threads: int | None
 
     @property
-    def one_wavelength(self) -> Any:
+    def one_wavelength(self) -> float | None:
         """The wavelength in the middle of the list [m]; None where none is given."""
         return None if self.wavelengths is None else float(self.wavelengths[len(self.wavelengths) // 2])
 
     @property
-    def colors(self) -> Any:
+    def colors(self) -> ArrayLike | None:
         """Wavelengths [m] across the band where none are given."""
         if self.telescope.design_data.wavelengths:
             return self.wavelengths

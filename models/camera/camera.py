@@ -48,9 +48,9 @@ class _Kind:
 class CcdFrame:
     """Frames of CCDs, one for each of so many points or one for all."""
 
-    x: Any  #: centres on the focal plane [m]
-    y: Any
-    direction: Any  #: cosine and sine of their angles, shape [2, ...]; None where all are zero
+    x: np.ndarray  #: centres on the focal plane along x [m]
+    y: np.ndarray  #: centres along y [m]
+    direction: np.ndarray | None  #: cosine and sine of their angles, shape [2, ...]; None where all are zero
 
     def along_ccd(self, x: Any, y: Any) -> tuple[Any, Any]:
         """Return the components along the axes of the CCDs of vectors of the focal plane."""
@@ -134,8 +134,8 @@ class Camera(Pictured):
             raise DomainError(f"camera {self.name}, pixel_size = {self.pixel_size!r}: expected a length above 0")
         wrong = np.flatnonzero(((self.pixels < 1) | (self.pixels != np.round(self.pixels))).any(axis=1))
         if wrong.size:
-            found = self.pixels[wrong[0]].tolist()
-            raise DomainError(f"CCD {self.ccd_names[wrong[0]]}, pixels = {found}: expected whole numbers of 1 or more")
+            pixels = self.pixels[wrong[0]].tolist()
+            raise DomainError(f"CCD {self.ccd_names[wrong[0]]}, pixels = {pixels}: expected whole numbers of 1 or more")
         self._check_overlap()
 
     def __repr__(self) -> str:
@@ -305,9 +305,9 @@ class Camera(Pictured):
         index = np.full(px.shape, -1, dtype=np.int64)
         finite = np.isfinite(px) & np.isfinite(py)
         for kind in self._kinds:
-            left = finite if kind is self._kinds[0] else finite & (index < 0)
-            if np.any(left):
-                index[left] = self._of_kind(kind, px[left], py[left], margin)
+            unassigned = finite if kind is self._kinds[0] else finite & (index < 0)
+            if np.any(unassigned):
+                index[unassigned] = self._of_kind(kind, px[unassigned], py[unassigned], margin)
         return index
 
     def _of_kind(self, kind: _Kind, x: np.ndarray, y: np.ndarray, margin: float) -> np.ndarray:
@@ -366,23 +366,26 @@ class Camera(Pictured):
         first, second = np.nonzero(np.triu(near, 1))
         apart = np.zeros(len(first), dtype=bool)
         offset = self.centers[second] - self.centers[first]
-        for own, other in ((first, second), (second, first)):
-            away = np.abs(np.stack(self.frame(own).along_ccd(*offset.T), axis=-1))
+        for ccd, neighbour in ((first, second), (second, first)):
+            away = np.abs(np.stack(self.frame(ccd).along_ccd(*offset.T), axis=-1))
             # Half the other rectangle along the axes of this one.
-            turn = np.deg2rad(self.rotation_deg[other] - self.rotation_deg[own])
+            turn = np.deg2rad(self.rotation_deg[neighbour] - self.rotation_deg[ccd])
             cosine, sine = np.abs(np.cos(turn)), np.abs(np.sin(turn))
-            a, b = self.half_sizes[other].T
+            a, b = self.half_sizes[neighbour].T
             across = np.stack([cosine * a + sine * b, sine * a + cosine * b], axis=-1)
-            apart |= (away > self.half_sizes[own] + across - _TOUCHING).any(axis=1)
+            apart |= (away > self.half_sizes[ccd] + across - _TOUCHING).any(axis=1)
         if not apart.all():
             i = int(np.flatnonzero(~apart)[0])
-            one, two = self.ccd_names[first[i]], self.ccd_names[second[i]]
-            raise DomainError(f"camera {self.name}: CCDs {one} and {two} overlap: expected them beside each other")
+            first_name, second_name = self.ccd_names[first[i]], self.ccd_names[second[i]]
+            raise DomainError(
+                f"camera {self.name}: CCDs {first_name} and {second_name} overlap: expected them beside each other"
+            )
 
 
 def _directions(angles_deg: np.ndarray) -> np.ndarray:
     """Return cosine and sine of angles [deg], shape [2, ...]; exact for quarter turns."""
     quarters = np.round(angles_deg / 90.0).astype(np.int64)
-    rest = np.deg2rad(angles_deg - 90.0 * quarters)
+    remainder = np.deg2rad(angles_deg - 90.0 * quarters)
     cosine, sine = _QUARTER_COSINES[quarters % 4], _QUARTER_COSINES[(quarters - 1) % 4]
-    return np.stack([cosine * np.cos(rest) - sine * np.sin(rest), sine * np.cos(rest) + cosine * np.sin(rest)])
+    c, s = np.cos(remainder), np.sin(remainder)
+    return np.stack([cosine * c - sine * s, sine * c + cosine * s])

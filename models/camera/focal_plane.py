@@ -106,9 +106,9 @@ class FocalPlane(HeightMap):
         budget = load_budget(budget) if isinstance(budget, str) else budget
         if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
             raise DomainError(f"seed = {seed!r}: expected a whole number of zero or more")
-        wanted = chosen_terms(terms)
-        surfaces = draw_heights(camera, budget, int(seed), wanted)
-        return cls(camera, surfaces, np.zeros(len(camera), dtype=bool), wanted, budget, int(seed))._placed()
+        ordered_terms = chosen_terms(terms)
+        surfaces = draw_heights(camera, budget, int(seed), ordered_terms)
+        return cls(camera, surfaces, np.zeros(len(camera), dtype=bool), ordered_terms, budget, int(seed))._placed()
 
     @classmethod
     def flat(cls, camera: str | Camera = "lsst") -> FocalPlane:

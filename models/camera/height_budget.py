@@ -84,11 +84,11 @@ def load_budget(name: str) -> HeightBudget:
 
 def chosen_terms(terms: str | Iterable[str] | None) -> tuple[str, ...]:
     """Return terms in the order of :data:`TERMS`, all by default; UnknownNameError for another name."""
-    wanted = TERMS if terms is None else (terms,) if isinstance(terms, str) else tuple(terms)
-    for term in wanted:
+    names = TERMS if terms is None else (terms,) if isinstance(terms, str) else tuple(terms)
+    for term in names:
         if term not in TERMS:
             raise unknown_name("height term", term, TERMS)
-    return tuple(term for term in TERMS if term in wanted)
+    return tuple(term for term in TERMS if term in names)
 
 
 def draw_heights(camera: Camera, budget: HeightBudget, seed: int, terms: tuple[str, ...]) -> CcdSurfaces:

@@ -19,8 +19,12 @@ if TYPE_CHECKING:
 
 # Fewest points for a polynomial of each degree; about twice its number of coefficients from the quadratic on.
 _DEGREES = ((20, 3, 10), (9, 2, 6), (3, 1, 3))
-# From here on a B-spline is added, of at most one coefficient for every three points and side of 20.
-_SPLINE_POINTS, _POINTS_PER_COEFFICIENT, _LARGEST_GRID = 48, 3, 20
+# Fewest points of a CCD for which a B-spline is added to its polynomial.
+_SPLINE_POINTS = 48
+# Fewest points for each coefficient of the B-spline.
+_POINTS_PER_COEFFICIENT = 3
+# Largest number of coefficients of the B-spline along a side of the CCD.
+_LARGEST_GRID = 20
 # Weight of the spline's second differences against the data. Ripples of two cycles a CCD lose less than 1e-4 of
 # their height to it, while patches without points are bridged smoothly.
 _SMOOTHING = 1e-4
@@ -54,11 +58,11 @@ def fit_heights(
     for i, (first, last) in enumerate(pairwise(bounds)):
         if first == last:
             continue
-        chosen = order[first:last]
-        u, v = camera.to_uv(i, np.stack([x[chosen], y[chosen]], axis=1)).T
-        polynomial[i], rest = _fit_polynomial(u, v, z[chosen], camera.ccd_names[i])
+        ccd_points = order[first:last]
+        u, v = camera.to_uv(i, np.stack([x[ccd_points], y[ccd_points]], axis=1)).T
+        polynomial[i], residual = _fit_polynomial(u, v, z[ccd_points], camera.ccd_names[i])
         if grid is not None and bending is not None and last - first >= _SPLINE_POINTS:
-            grid[i] = _fit_spline(u, v, rest, bending)
+            grid[i] = _fit_spline(u, v, residual, bending)
     return CcdSurfaces(camera.half_sizes, polynomial, np.zeros((len(camera), 2, 4)), grid), counts > 0
 
 

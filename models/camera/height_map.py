@@ -15,8 +15,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Points of the map along a side, and the percentile of |height| at the ends of its scale.
-_SAMPLES, _SCALE = 400, 99.0
+#: Points of the map along a side.
+_SAMPLES = 400
+#: Percentile of |height| at the ends of the scale of the map.
+_SCALE = 99.0
 
 
 class HeightMap(Result):

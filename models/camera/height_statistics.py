@@ -88,12 +88,12 @@ def height_statistics(focal_plane: FocalPlane) -> dict[str, HeightStatistics]:
         If a CCD has fewer than three measured points on the grid.
     """
     camera, (u, v, heights) = focal_plane.camera, sampled_heights(focal_plane)
-    chosen = np.flatnonzero(focal_plane.measured if focal_plane.measured.any() else np.ones(len(camera), dtype=bool))
-    heights = heights[chosen]
-    planes = np.stack([_plane(u, v, row, camera.ccd_names[i]) for i, row in zip(chosen, heights, strict=True)])
-    groups = {"all": np.ones(len(chosen), dtype=bool)}
+    ccds = np.flatnonzero(focal_plane.measured if focal_plane.measured.any() else np.ones(len(camera), dtype=bool))
+    heights = heights[ccds]
+    planes = np.stack([_plane(u, v, row, camera.ccd_names[i]) for i, row in zip(ccds, heights, strict=True)])
+    groups = {"all": np.ones(len(ccds), dtype=bool)}
     for vendor in dict.fromkeys(camera.vendors):
-        groups[vendor] = np.array([camera.vendors[i] == vendor for i in chosen])
+        groups[vendor] = np.array([camera.vendors[i] == vendor for i in ccds])
     return {name: _statistics(heights[of], planes[of]) for name, of in groups.items() if of.any()}
 
 
@@ -111,11 +111,11 @@ def sampled_heights(focal_plane: FocalPlane) -> tuple[np.ndarray, np.ndarray, np
 
 def _plane(u: np.ndarray, v: np.ndarray, height: np.ndarray, name: str) -> np.ndarray:
     """Return the best plane of one CCD, at all points."""
-    known = np.isfinite(height)
-    if known.sum() < 3:
-        raise DomainError(f"{name}: {known.sum()} measured points: expected 3 or more")
+    finite = np.isfinite(height)
+    if finite.sum() < 3:
+        raise DomainError(f"{name}: {finite.sum()} measured points: expected 3 or more")
     design = np.stack([np.ones_like(u), u, v], axis=1)
-    return design @ np.linalg.lstsq(design[known], height[known], rcond=None)[0]
+    return design @ np.linalg.lstsq(design[finite], height[finite], rcond=None)[0]
 
 
 def _statistics(heights: np.ndarray, planes: np.ndarray) -> HeightStatistics:

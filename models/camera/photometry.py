@@ -108,16 +108,16 @@ class CameraPhotometry:
         Zero points are scaled to the area of another telescope than the camera's own, if it differs by more than 10 %.
         UnknownNameError if the camera has measured bands, and not this one.
         """
-        known = {band.name: band for band in self.bands}
-        if known and name not in known:
-            raise unknown_name(f"band of {camera}", name, known)
-        found = known.get(name) or estimated_band(name, area, wavelengths, self.throughput)
-        if known and abs(area / self.area - 1.0) > _OTHER_TELESCOPE:
-            zero_point = round(found.zero_point + 2.5 * float(np.log10(area / self.area)), 3)
-            source = f"{found.source}; scaled from {self.area:.3g} to {area:.3g} m2"
-            found = replace(found, zero_point=zero_point, source=source)
+        measured_bands = {band.name: band for band in self.bands}
+        if measured_bands and name not in measured_bands:
+            raise unknown_name(f"band of {camera}", name, measured_bands)
+        camera_band = measured_bands.get(name) or estimated_band(name, area, wavelengths, self.throughput)
+        if measured_bands and abs(area / self.area - 1.0) > _OTHER_TELESCOPE:
+            zero_point = round(camera_band.zero_point + 2.5 * float(np.log10(area / self.area)), 3)
+            source = f"{camera_band.source}; scaled from {self.area:.3g} to {area:.3g} m2"
+            camera_band = replace(camera_band, zero_point=zero_point, source=source)
         return replace(
-            found,
+            camera_band,
             read_noise=self.read_noise,
             dark_current=self.dark_current,
             full_well=self.full_well,

@@ -44,19 +44,19 @@ class SensorHeights:
             )
         rows = np.array([index[name] for name in camera.ccd_names if name in index])
         offset = self.center[rows] - camera.centers[measured]
-        for name, off, there in zip(np.array(camera.ccd_names)[measured], offset, self.center[rows], strict=True):
+        for name, off, center in zip(np.array(camera.ccd_names)[measured], offset, self.center[rows], strict=True):
             if (np.abs(off) > camera.half_sizes[camera.ccd_index(name)]).any():
-                x, y = 1e3 * (there - off)
+                x, y = 1e3 * (center - off)
                 raise DomainError(
-                    f"{name} at (x, y) = ({1e3 * there[0]:.2f}, {1e3 * there[1]:.2f}) mm of the telescope frame: "
+                    f"{name} at (x, y) = ({1e3 * center[0]:.2f}, {1e3 * center[1]:.2f}) mm of the telescope frame: "
                     f"expected ({x:.2f}, {y:.2f}) mm as in {camera.name}; is the frame of the file right?"
                 )
-        n, chosen = len(camera), self.surfaces.chosen(rows)
+        n, sensor_surfaces = len(camera), self.surfaces.chosen(rows)
         radius, origin = camera.half_sizes[:, 0].copy(), np.zeros((n, 2))
-        coefficients = np.zeros((n, *chosen.coefficients.shape[1:]))
+        coefficients = np.zeros((n, *sensor_surfaces.coefficients.shape[1:]))
         limits = np.stack([-camera.half_sizes, camera.half_sizes], axis=-1)
-        radius[measured], origin[measured], coefficients[measured] = chosen.radius, offset, chosen.coefficients
-        limits[measured] = chosen.limits
+        radius[measured], origin[measured] = sensor_surfaces.radius, offset
+        coefficients[measured], limits[measured] = sensor_surfaces.coefficients, sensor_surfaces.limits
         zernikes = ZernikeSurfaces(radius, origin, coefficients, limits)
         return CcdSurfaces(camera.half_sizes, np.zeros((n, 10)), np.zeros((n, 2, 4)), zernikes=zernikes), measured
 

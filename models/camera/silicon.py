@@ -110,12 +110,12 @@ def _gauss_rule(silicon: Silicon, wavelength: float, count: int) -> ConversionPa
     density /= density.sum()
     # Recurrence of the orthonormal polynomials of the distribution, by Stieltjes' procedure.
     diagonal, beside = np.empty(count), np.zeros(count)
-    before, now = np.zeros_like(path), np.ones_like(path)
+    previous, current = np.zeros_like(path), np.ones_like(path)
     for k in range(count):
-        diagonal[k] = density @ (path * now**2)
-        after = (path - diagonal[k]) * now - beside[k - 1] * before
-        beside[k] = math.sqrt(density @ after**2)
-        before, now = now, after / beside[k]
+        diagonal[k] = density @ (path * current**2)
+        following = (path - diagonal[k]) * current - beside[k - 1] * previous
+        beside[k] = math.sqrt(density @ following**2)
+        previous, current = current, following / beside[k]
     roots, vectors = eigh_tridiagonal(diagonal, beside[: count - 1])
     rule = ConversionPaths(length * roots, silicon.absorbed(wavelength) * vectors[0] ** 2)
     # Shared by all callers.

@@ -125,9 +125,11 @@ class Air(Medium):
         # Fraction of water molecules, with the enhancement factor of vapour among air.
         enhancement = 1.00062 + 3.14e-8 * self.pressure + 5.6e-7 * t**2
         fraction = enhancement * self.water_vapour / self.pressure if self.pressure > 0 else 0.0
-        here = self.pressure / (_compressibility(self.pressure, self.temperature, fraction) * self.temperature)
-        dry_density = here * air_mass * (1.0 - fraction) / GAS_CONSTANT
-        vapour_density = here * WATER_MOLAR_MASS * fraction / GAS_CONSTANT
+        pressure_over_zt = self.pressure / (
+            _compressibility(self.pressure, self.temperature, fraction) * self.temperature
+        )
+        dry_density = pressure_over_zt * air_mass * (1.0 - fraction) / GAS_CONSTANT
+        vapour_density = pressure_over_zt * WATER_MOLAR_MASS * fraction / GAS_CONSTANT
         warm, warmer = 288.15, 293.15
         dry_standard = STANDARD_ATMOSPHERE * air_mass / (_compressibility(STANDARD_ATMOSPHERE, warm, 0.0) * warm)
         vapour_standard = 1333.0 * WATER_MOLAR_MASS / (_compressibility(1333.0, warmer, 1.0) * warmer)

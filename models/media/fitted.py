@@ -33,6 +33,6 @@ def fitted_dispersion(medium: Medium, wavelength_range: tuple[float, float]) -> 
     size = np.abs(columns).max(axis=0)
     solution = np.linalg.lstsq(columns / size, medium.index(w) ** 2, rcond=1e-15)[0] / size
     coefficients = solution * (middle * 1e12) ** -_POWERS.astype(float)
-    found = Dispersion("extended_3", tuple(coefficients.tolist()), (low, high), medium.name)
+    dispersion = Dispersion("extended_3", tuple(coefficients.tolist()), (low, high), medium.name)
     between = wavelengths(2 * _NODES + 1)
-    return found, float(np.abs(found.index(between) - medium.index(between)).max())
+    return dispersion, float(np.abs(dispersion.index(between) - medium.index(between)).max())

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,8 +16,15 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError, PrescriptionError
 from ...core.units import metres
 
-#: Fraunhofer lines d, F, C and g [um], at which glass makers state the index.
-LINE_D, LINE_F, LINE_C, LINE_G = 0.5875618, 0.4861327, 0.6562725, 0.4358343
+# Wavelengths [um] of the Fraunhofer lines at which glass makers state the index.
+#: Helium, yellow; that of the index n_d and of the Abbe number.
+LINE_D = 0.5875618
+#: Hydrogen, blue; of the dispersion n_F - n_C.
+LINE_F = 0.4861327
+#: Hydrogen, red; of the dispersion n_F - n_C.
+LINE_C = 0.6562725
+#: Mercury, violet; of the partial dispersion.
+LINE_G = 0.4358343
 
 
 def check_wavelength_range(wavelength_range: tuple[float, float]) -> None:
@@ -29,7 +35,7 @@ def check_wavelength_range(wavelength_range: tuple[float, float]) -> None:
         raise PrescriptionError(f"wavelength_range = {wavelength_range!r}: expected 0 < shortest < longest")
 
 
-def wavelengths_within(wavelength: Any, wavelength_range: tuple[float, float], model: str) -> np.ndarray:
+def wavelengths_within(wavelength: ArrayLike, wavelength_range: tuple[float, float], model: str) -> np.ndarray:
     """Return wavelengths [m] as a float64 array, or raise DomainError where one is out of the range of a model."""
     w = metres(wavelength, "wavelength")
     low, high = wavelength_range
@@ -73,9 +79,9 @@ class Medium(ABC):
         """
 
 
-def _nanometres(wavelength: np.ndarray, which: np.ndarray) -> str:
+def _nanometres(wavelength: np.ndarray, mask: np.ndarray) -> str:
     """Return the text for the first of the chosen wavelengths [m], in nm."""
-    return f"wavelength = {np.atleast_1d(wavelength)[np.atleast_1d(which)][0] * 1e9:.6g} nm"
+    return f"wavelength = {np.atleast_1d(wavelength)[np.atleast_1d(mask)][0] * 1e9:.6g} nm"
 
 
 def real_index(index: np.ndarray, wavelength: np.ndarray, *, squared: bool = False) -> np.ndarray:

@@ -29,13 +29,27 @@ WAVELENGTH_RANGE = (0.3e-6, 1.1e-6)
 TEMPERATURE_RANGE = (100.0, 350.0)
 _DATA = Path(__file__).parents[1] / "data" / "silicon.yaml"
 
-# Rajkanan et al. (1979), Table 1: energies [eV], absorption [1/cm/eV^2, 1/cm/eV^0.5], Varshni's band gap.
+#: Boltzmann constant [eV/K].
 _BOLTZMANN = 8.617e-5
+#: Energy of a photon times its wavelength, h c [eV m].
 _PHOTON = 1.239842e-6
-_GAPS, _STRENGTHS = (1.1557, 2.5), (3.231e2, 7.237e3)
-_PHONONS, _COUPLINGS = (1.827e-2, 5.773e-2), (5.5, 4.0)
-_DIRECT_GAP, _DIRECT_STRENGTH = 3.2, 1.052e6
-_VARSHNI, _VARSHNI_TEMPERATURE = 7.021e-4, 1108.0
+# Rajkanan et al. (1979), Table 1.
+#: Indirect band gaps at 0 K [eV].
+_GAPS = (1.1557, 2.5)
+#: Absorption of the transitions over each of these gaps [1/cm/eV^2].
+_STRENGTHS = (3.231e2, 7.237e3)
+#: Energies of the phonons [eV].
+_PHONONS = (1.827e-2, 5.773e-2)
+#: Relative strengths of the transitions with each of these phonons.
+_COUPLINGS = (5.5, 4.0)
+#: Direct band gap at 0 K [eV].
+_DIRECT_GAP = 3.2
+#: Absorption of the direct transition [1/cm/eV^0.5].
+_DIRECT_STRENGTH = 1.052e6
+#: Narrowing of the gaps with temperature T after Varshni, a T^2 / (T + b): a [eV/K].
+_VARSHNI = 7.021e-4
+#: The temperature b of that formula [K].
+_VARSHNI_TEMPERATURE = 1108.0
 
 
 class _Measured(NamedTuple):
@@ -76,8 +90,8 @@ def silicon_index(wavelength: ArrayLike, temperature: float = 295.0) -> np.ndarr
     """
     light = wavelengths_within(wavelength, WAVELENGTH_RANGE, "silicon")
     check_temperature(temperature)
-    known = _measured()
-    return np.asarray(known.index(light) + (temperature - known.temperature) * known.index_slope(light))
+    measured = _measured()
+    return np.asarray(measured.index(light) + (temperature - measured.temperature) * measured.index_slope(light))
 
 
 def absorption_length(wavelength: ArrayLike, temperature: float = 295.0) -> np.ndarray:
@@ -87,9 +101,9 @@ def absorption_length(wavelength: ArrayLike, temperature: float = 295.0) -> np.n
     """
     light = wavelengths_within(wavelength, WAVELENGTH_RANGE, "silicon")
     check_temperature(temperature)
-    known = _measured()
-    length = light / (4.0 * np.pi * np.exp(known.log_extinction(light)))
-    return np.asarray(length * _rajkanan(light, known.temperature) / _rajkanan(light, temperature))
+    measured = _measured()
+    length = light / (4.0 * np.pi * np.exp(measured.log_extinction(light)))
+    return np.asarray(length * _rajkanan(light, measured.temperature) / _rajkanan(light, temperature))
 
 
 def _rajkanan(wavelength: np.ndarray, temperature: float) -> np.ndarray:

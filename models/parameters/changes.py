@@ -52,18 +52,18 @@ def apply_changes(telescope: Telescope, changes: Mapping[str, float]) -> Telesco
 
 def parse_change(telescope: Telescope, name: str, section: str = "changes") -> tuple[Parameter, float]:
     """Return the parameter of a name with a unit, and the size of that unit in SI; `section` is for messages."""
-    said = f"{section}.{name}" if section else name
+    full_name = f"{section}.{name}" if section else name
     address, _, ending = name.rpartition("_")
     if address and ending in (*LENGTHS, *ANGLES) and "." in address:
         parameter = Parameter.parse(address, telescope)
         units = _units(parameter)
         if ending not in units:
-            raise ConfigError(f"{said}: {address} is in {parameter.unit or 'no unit'}, not in {ending}")
+            raise ConfigError(f"{full_name}: {address} is in {parameter.unit or 'no unit'}, not in {ending}")
         return parameter, units[ending]
     parameter = Parameter.parse(name, telescope)
     units = _units(parameter)
     if units:
-        raise ConfigError(f"{said}: expected its unit at the end, such as {name}_{list(units)[2]}")
+        raise ConfigError(f"{full_name}: expected its unit at the end, such as {name}_{list(units)[2]}")
     return parameter, 1.0
 
 

@@ -103,8 +103,8 @@ class DegreesOfFreedom:
     source: str = ""
 
     def __repr__(self) -> str:
-        few = ", ".join(self.names[:4]) + ", ..." * (len(self) > 4)
-        return f"<DegreesOfFreedom{' ' * bool(self.name)}{self.name}: {len(self)}: {few}>"
+        first_names = ", ".join(self.names[:4]) + ", ..." * (len(self) > 4)
+        return f"<DegreesOfFreedom{' ' * bool(self.name)}{self.name}: {len(self)}: {first_names}>"
 
     def __post_init__(self) -> None:
         if not self.members:
@@ -126,10 +126,10 @@ class DegreesOfFreedom:
         UnknownNameError, ConfigError
             As :func:`~pachon.models.parameters.parameters.parse_parameters`.
         """
-        found = parse_parameters(addresses, telescope)
-        units = [p.unit if p.unit in ("m", "rad") else "1" for p in found]
+        parameters = parse_parameters(addresses, telescope)
+        units = [p.unit if p.unit in ("m", "rad") else "1" for p in parameters]
         return cls(
-            tuple(DegreeOfFreedom(p.address, unit, {p.address: 1.0}) for p, unit in zip(found, units, strict=True))
+            tuple(DegreeOfFreedom(p.address, unit, {p.address: 1.0}) for p, unit in zip(parameters, units, strict=True))
         )
 
     def __len__(self) -> int:
@@ -248,12 +248,12 @@ class DegreesOfFreedom:
         for column, (member, size) in enumerate(zip(self.members, self.unit_sizes, strict=True)):
             for address, weight in member.of.items():
                 try:
-                    found = bending.addresses(address)
-                    parse_parameters(found, bending.telescope)
+                    parameter_addresses = bending.addresses(address)
+                    parse_parameters(parameter_addresses, bending.telescope)
                 except PachonError as error:
                     raise error.within(subject=f"degree of freedom {member.name!r}") from None
-                for one in found:
-                    rows.setdefault(one, np.zeros(len(self)))[column] += weight * size
+                for parameter_address in parameter_addresses:
+                    rows.setdefault(parameter_address, np.zeros(len(self)))[column] += weight * size
         return bending.telescope, parse_parameters(rows, bending.telescope), np.array(list(rows.values()))
 
 
@@ -281,11 +281,11 @@ class _Bending:
         return [f"{name}.{_term(self.telescope.surface(name).shape, shape, mode)}" for name in surfaces]
 
 
-def _term(shape: Shape, part: Shape, mode: str) -> str:
+def _term(shape: Shape, component: Shape, mode: str) -> str:
     """Return the name of a mode of a part within a sum; of equal parts the last."""
     if not isinstance(shape, Sum):
         return mode
     for name in (mode, *(f"part{i}.{mode}" for i in range(len(shape.parts), 0, -1))):
-        if name in shape.parameters and shape.place(name)[0] is part:
+        if name in shape.parameters and shape.place(name)[0] is component:
             return name
     raise unknown_name("term", mode, shape.parameters)

@@ -69,7 +69,7 @@ def load_degrees_of_freedom(name_or_path: str | os.PathLike[str]) -> DegreesOfFr
         # The motions of M2 and of the camera are the first ten, as in batoid_rubin.
         return bending_modes(content, path, load_degrees_of_freedom("lsst").members[:10])
     file = validated(DegreesOfFreedomFile, content, str(path), PrescriptionError)
-    members = tuple(DegreeOfFreedom(one.name, one.unit, one.of) for one in file.degrees_of_freedom)
+    members = tuple(DegreeOfFreedom(d.name, d.unit, d.of) for d in file.degrees_of_freedom)
     deformations = []
     for name, section in file.figures.items():
         with error_context(file=path, key=f"figures.{name}"):
@@ -164,7 +164,7 @@ class DeformationSection(Section):
                 return ZernikeSag((0.0,) * rims.terms, rims.outer_radius, rims.inner_radius)
         if self.hdf5 is not None:
             with error_context(key="hdf5"):
-                return GridModes({mode: one.map(folder) for mode, one in self.hdf5.items()})
+                return GridModes({mode: section.map(folder) for mode, section in self.hdf5.items()})
         with error_context(key="grids"):
             return GridModes({mode: read_grid(folder / file) for mode, file in (self.grids or {}).items()})
 

@@ -69,16 +69,18 @@ def with_followers(
     DomainError
         If a thickness cannot be solved for.
     """
-    found = _Growing(telescope, list(parameters), list(map(float, values)), list(np.eye(len(parameters))), parse, apply)
+    changes = _Growing(
+        telescope, list(parameters), list(map(float, values)), list(np.eye(len(parameters))), parse, apply
+    )
     data, names = telescope.design_data, telescope.surface_names
-    found.pick_up(data.pickups)
+    changes.pick_up(data.pickups)
     if data.solves and _centred(telescope):
-        for solve in sorted(data.solves, key=lambda one: names.index(one.surface)):
-            found.solve(solve, len(parameters))
+        for solve in sorted(data.solves, key=lambda s: names.index(s.surface)):
+            changes.solve(solve, len(parameters))
             # Thicknesses that follow a solved one.
-            found.pick_up([p for p in data.pickups if p.quantity == "thickness" and p.source == solve.surface])
-    rates = np.array(found.rates).reshape(len(found.parameters), len(parameters))
-    return Followers(tuple(found.parameters), np.array(found.values), rates)
+            changes.pick_up([p for p in data.pickups if p.quantity == "thickness" and p.source == solve.surface])
+    rates = np.array(changes.rates).reshape(len(changes.parameters), len(parameters))
+    return Followers(tuple(changes.parameters), np.array(changes.values), rates)
 
 
 def followers(telescope: Telescope) -> set[tuple[str, str]]:
@@ -118,16 +120,16 @@ class _Growing:
         while waiting:
             sources = {p.source for p in waiting} & {p.surface for p in waiting}
             # Those come first whose source waits for nothing; check_links has refused circles.
-            now = [p for p in waiting if p.source not in sources or not any(self._leads(q, p) for q in waiting)]
-            for pickup in now:
+            ready = [p for p in waiting if p.source not in sources or not any(self._leads(q, p) for q in waiting)]
+            for pickup in ready:
                 for i in range(len(self.parameters)):
                     if self._quantities[i] == (pickup.source, pickup.quantity):
                         self._follow(pickup, i)
-            waiting = [p for p in waiting if p not in now]
+            waiting = [p for p in waiting if p not in ready]
 
     @staticmethod
-    def _leads(one: Pickup, other: Pickup) -> bool:
-        return (one.surface, one.quantity) == (other.source, other.quantity)
+    def _leads(first: Pickup, second: Pickup) -> bool:
+        return (first.surface, first.quantity) == (second.source, second.quantity)
 
     def _follow(self, pickup: Pickup, i: int) -> None:
         source, change = self.parameters[i], self.values[i]
@@ -141,20 +143,20 @@ class _Growing:
         else:
             self._add(parameter, pickup.scale * change, pickup.scale * self.rates[i])
 
-    def solve(self, solve: Solve, given: int) -> None:
+    def solve(self, solve: Solve, count: int) -> None:
         """Add the change of a thickness that is solved for, with its derivatives by differences."""
         index = self.telescope.surface_names.index(solve.surface)
         parameter = self.parse(f"{solve.surface}.thickness")
         before = thickness(self.telescope, index)
-        values, rate = np.array(self.values), np.zeros(given)
+        values, rate = np.array(self.values), np.zeros(count)
         change = self._solved(solve, index, values) - before
-        for k in range(given):
+        for k in range(count):
             direction = np.array([row[k] for row in self.rates])
             if not any(d and p.kind != "motion" for d, p in zip(direction, self.parameters, strict=True)):
                 continue
-            one = self.parameters[k]
-            least = _LEAST.get(one.name.rstrip("0123456789"), 1.0)
-            step = _STEP * max(abs(one.value(self.telescope) + values[k]), least)
+            varied = self.parameters[k]
+            least = _LEAST.get(varied.name.rstrip("0123456789"), 1.0)
+            step = _STEP * max(abs(varied.value(self.telescope) + values[k]), least)
             ends = [self._solved(solve, index, values + sign * step * direction) for sign in (1.0, -1.0)]
             rate[k] = (ends[0] - ends[1]) / (2.0 * step)
         # What was asked for itself comes on top of the solution.
@@ -172,8 +174,8 @@ class _Growing:
     def _add(self, parameter: Parameter, change: float, rate: np.ndarray) -> None:
         """Add a change to that of the same parameter, where there is one."""
         about = quantity_of(parameter, self.telescope)
-        for i, known in enumerate(self.parameters):
-            if self._quantities[i] == about and known.name == parameter.name:
+        for i, candidate in enumerate(self.parameters):
+            if self._quantities[i] == about and candidate.name == parameter.name:
                 self.values[i] += change
                 self.rates[i] = self.rates[i] + rate
                 return
@@ -185,18 +187,18 @@ class _Growing:
 
 def solved_thickness(telescope: Telescope, solve: Solve, index: int) -> float:
     """Return the thickness [m] behind a surface, by its index, that meets a solve."""
-    here, behind = telescope.surfaces[index : index + 2]
+    front, back = telescope.surfaces[index : index + 2]
     if solve.kind == "edge_thickness":
         along = light_axis(telescope, index)[2]
-        edge = [float(s.shape.sag(0.0, solve.radius)) for s in (here, behind)]
+        edge = [float(s.shape.sag(0.0, solve.radius)) for s in (front, back)]
         if not np.isfinite(edge).all():
             raise DomainError(f"{solve.address}: expected surfaces that reach the radius {solve.radius:g} m")
         return solve.value - along * (edge[1] - edge[0])
-    z, height, slope = paraxial_rays(telescope, here.name)[int(solve.kind == "chief_height")]
+    z, height, slope = paraxial_rays(telescope, front.name)[int(solve.kind == "chief_height")]
     if slope == 0.0:
-        raise DomainError(f"{solve.address}: the ray is parallel to the axis behind {here.name}")
+        raise DomainError(f"{solve.address}: the ray is parallel to the axis behind {front.name}")
     place = z - (solve.value - height) / slope
-    return float(light_axis(telescope, index)[2] * (place - here.vertex[2]))
+    return float(light_axis(telescope, index)[2] * (place - front.vertex[2]))
 
 
 def _centred(telescope: Telescope) -> bool:

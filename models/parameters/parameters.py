@@ -25,7 +25,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -112,12 +112,12 @@ class Parameter:
 
     @classmethod
     def _of_medium(cls, text: str, target: str, name: str, telescope: Telescope) -> Parameter:
-        found = cls(text, target, name, "index" if name == "n" else "abbe", "")
+        parameter = cls(text, target, name, "index" if name == "n" else "abbe", "")
         if name == "abbe":
             with error_context(subject=f"parameter {text!r}"):
-                if not np.isfinite(found.value(telescope)):
+                if not np.isfinite(parameter.value(telescope)):
                     raise DomainError("expected a medium with dispersion")
-        return found
+        return parameter
 
     def value(self, telescope: Telescope) -> float:
         """Return the present value: of a term, thickness or Abbe number, or the index at the default wavelength.
@@ -145,7 +145,7 @@ class Variables(Protocol):
     def units(self) -> tuple[str, ...]:
         """Units of the values; "1" for a pure number."""
 
-    def apply(self, telescope: Telescope, values: Any) -> Telescope:
+    def apply(self, telescope: Telescope, values: ArrayLike) -> Telescope:
         """Return the telescope with a vector of changes applied, each in its unit."""
 
 
@@ -175,10 +175,10 @@ class ParameterVector:
 
 def parse_parameters(texts: Iterable[str | Parameter], telescope: Telescope) -> tuple[Parameter, ...]:
     """Return the parameters at addresses; ``M1.Z4-22`` stands for Z4, Z5 ... Z22, ``M2.*`` for six motions."""
-    found: list[Parameter] = []
+    parameters: list[Parameter] = []
     for text in texts:
         if isinstance(text, Parameter):
-            found.append(text)
+            parameters.append(text)
             continue
         span = re.fullmatch(r"(.*\.Z)(\d+)-(\d+)", text)
         if span:
@@ -186,15 +186,15 @@ def parse_parameters(texts: Iterable[str | Parameter], telescope: Telescope) -> 
             if not 1 <= first <= last:
                 raise ConfigError(f"parameter {text!r}: expected Noll indices that rise, from 1, such as Z4-22")
             highest = Parameter.parse(f"{span[1]}{last}", telescope)
-            found += [replace(highest, address=f"{span[1]}{j}", name=f"Z{j}") for j in range(first, last + 1)]
+            parameters += [replace(highest, address=f"{span[1]}{j}", name=f"Z{j}") for j in range(first, last + 1)]
         elif text.endswith(".*"):
-            found += [Parameter.parse(f"{text[:-1]}{motion}", telescope) for motion in MOTIONS]
+            parameters += [Parameter.parse(f"{text[:-1]}{motion}", telescope) for motion in MOTIONS]
         else:
-            found.append(Parameter.parse(text, telescope))
-    if not found:
+            parameters.append(Parameter.parse(text, telescope))
+    if not parameters:
         raise ConfigError("parameters = []: expected at least one, such as M2.dz")
-    check_unique("parameter", [p.address for p in found])
-    return tuple(found)
+    check_unique("parameter", [p.address for p in parameters])
+    return tuple(parameters)
 
 
 def usual_parameters(telescope: Telescope) -> tuple[Parameter, ...]:
@@ -203,7 +203,7 @@ def usual_parameters(telescope: Telescope) -> tuple[Parameter, ...]:
     The first mirror is left out: the others are aligned to it.
     """
     groups = {name: set(members) for name, members in telescope.groups.items()}
-    outer = [g for g, members in groups.items() if not any(members < others for others in groups.values())]
+    outer = [g for g, members in groups.items() if not any(members < larger for larger in groups.values())]
     inside = set().union(*groups.values()) if groups else set()
     mirrors = [s.name for s in telescope.surfaces if s.interaction == Interaction.MIRROR]
     bodies = [m for m in mirrors[1:] if m not in inside] + outer
@@ -227,12 +227,12 @@ def shapes_with_terms(telescope: Telescope, parameters: Iterable[Parameter]) -> 
             names.setdefault(parameter.target, []).append(parameter.name)
     for target, terms in names.items():
         surface = telescope.surface(target)
-        known = set(surface.shape.parameters)
+        term_names = set(surface.shape.parameters)
         # The highest Zernike term, or power, makes room for those below it.
         for name in sorted(terms, key=lambda name: (len(name), name), reverse=True):
-            if name not in known:
+            if name not in term_names:
                 surface = replace(surface, shape=shape_with_term(surface, name))
-                known = set(surface.shape.parameters)
+                term_names = set(surface.shape.parameters)
         shapes[target] = surface.shape
     return shapes
 
@@ -248,8 +248,8 @@ def apply(telescope: Telescope, values: Mapping[str, float] | Mapping[Parameter,
     if wrong := [f"{p.address} = {c!r}" for p, c in zip(parameters, changes, strict=True) if not np.isfinite(c)]:
         raise DomainError(f"{wrong[0]}: expected a finite change")
     if has_links(telescope):
-        found = linked(telescope, parameters, changes)
-        parameters, changes = list(found.parameters), found.values.tolist()
+        followers = linked(telescope, parameters, changes)
+        parameters, changes = list(followers.parameters), followers.values.tolist()
     return _apply_alone(telescope, dict(zip(parameters, changes, strict=True)))
 
 
@@ -260,8 +260,8 @@ def resolved(telescope: Telescope) -> Telescope:
 
 def linked(telescope: Telescope, parameters: Iterable[Parameter], changes: Iterable[float]) -> Followers:
     """Return parameters and changes with those of all that follows them, and the derivatives."""
-    found, values, parse = tuple(parameters), tuple(changes), partial(Parameter.parse, telescope=telescope)
-    return with_followers(telescope, found, values, parse, _apply_alone)
+    parse = partial(Parameter.parse, telescope=telescope)
+    return with_followers(telescope, tuple(parameters), tuple(changes), parse, _apply_alone)
 
 
 def _apply_alone(telescope: Telescope, values: Mapping[Parameter, float]) -> Telescope:
@@ -315,15 +315,15 @@ def index_surfaces(telescope: Telescope, target: str) -> list[int]:
 
     One refracting surface, and those after it up to the next that refracts; for a medium, all such runs.
     """
-    found: list[int] = []
+    indices: list[int] = []
     inside = False
     for i, surface in enumerate(telescope.surfaces):
         if surface.interaction == Interaction.REFRACT:
-            wanted = surface.name if target in telescope.surface_names else surface.medium_after.name
-            inside = wanted == target
+            name = surface.name if target in telescope.surface_names else surface.medium_after.name
+            inside = name == target
         if inside:
-            found.append(i)
-    return found
+            indices.append(i)
+    return indices
 
 
 def _body_motions(

@@ -30,18 +30,19 @@ def shape_with_term(surface: Surface, name: str) -> Shape:
     zernike = re.fullmatch(r"Z([1-9]\d{0,2})", name)
     parts = shape.parts if isinstance(shape, Sum) else (shape,)
     if zernike:
-        missing = int(zernike[1])
-        for i, part in enumerate(parts):
-            if isinstance(part, ZernikeSag):
-                longer = replace(part, coefficients=part.coefficients + (0.0,) * (missing - len(part.coefficients)))
+        noll_index = int(zernike[1])
+        for i, component in enumerate(parts):
+            if isinstance(component, ZernikeSag):
+                zeros = (0.0,) * (noll_index - len(component.coefficients))
+                longer = replace(component, coefficients=component.coefficients + zeros)
                 return _sum((*parts[:i], longer, *parts[i + 1 :]))
-        return _sum((*parts, ZernikeSag((0.0,) * missing, *_rims(surface))))
+        return _sum((*parts, ZernikeSag((0.0,) * noll_index, *_rims(surface))))
     power = re.fullmatch(r"a([468]|[1-9]\d)", name)
     if power and int(power[1]) % 2 == 0:
-        for i, part in enumerate(parts):
-            if isinstance(part, Rotational) and part.curvature:
-                terms = part.coefficients + (0.0,) * (int(power[1]) // 2 - 1 - len(part.coefficients))
-                asphere = EvenAsphere(1.0 / part.curvature, part.conic, terms)
+        for i, component in enumerate(parts):
+            if isinstance(component, Rotational) and component.curvature:
+                terms = component.coefficients + (0.0,) * (int(power[1]) // 2 - 1 - len(component.coefficients))
+                asphere = EvenAsphere(1.0 / component.curvature, component.conic, terms)
                 return _sum((*parts[:i], asphere, *parts[i + 1 :]))
     raise unknown_name(f"shape term of {surface.name}", name, [*shape.parameters, "Z4"])
 
@@ -49,8 +50,8 @@ def shape_with_term(surface: Surface, name: str) -> Shape:
 def term_polynomial(shape: Shape, name: str) -> PolarPolynomial | None:
     """Return the change of sag [m] per unit of a term, if it is a polynomial of x and y; else None."""
     if isinstance(shape, Sum):
-        part, inner = shape.place(name)
-        return term_polynomial(part, inner)
+        component, inner = shape.place(name)
+        return term_polynomial(component, inner)
     if isinstance(shape, ZernikeSag):
         return _zernike_term(int(name[1:]), shape.outer_radius, shape.inner_radius)
     if isinstance(shape, XYPolynomial):
@@ -69,8 +70,8 @@ def _zernike_term(j: int, outer_radius: float, inner_radius: float) -> PolarPoly
 def term_unit(shape: Shape, name: str) -> str:
     """Return the unit of a term; empty for a pure number."""
     if isinstance(shape, Sum):
-        part, inner = shape.place(name)
-        return term_unit(part, inner)
+        component, inner = shape.place(name)
+        return term_unit(component, inner)
     powers = [int(n) for n in re.findall(r"\d+", name)] if re.fullmatch(r"a\d+|x\d+y\d+", name) else []
     if powers:
         return {0: "", 1: "m"}.get(1 - sum(powers), f"m^{1 - sum(powers)}")
@@ -95,12 +96,12 @@ def _rims(surface: Surface) -> tuple[float, float]:
 
 def with_changes(shape: Shape, changes: Sequence[tuple[str, float]]) -> Shape:
     """Return a shape with changes of parameters, by name."""
-    together = {}
+    new_values = {}
     before = shape.parameters
     for name, change in changes:
         if name.endswith(("radius", "curvature")):
             # Two names of one parameter: one change follows the other.
             shape = shape.with_parameter(name, shape.parameters[name] + change)
         else:
-            together[name] = before[name] + change
-    return shape.with_parameters(together) if together else shape
+            new_values[name] = before[name] + change
+    return shape.with_parameters(new_values) if new_values else shape

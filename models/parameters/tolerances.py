@@ -87,8 +87,8 @@ def draw(tolerances: Iterable[Tolerance], seed: int, n: int = 1) -> np.ndarray:
 
     Each tolerance has a random stream of its own, by its name, so the draws of the others do not depend on it.
     """
-    chosen = tuple(tolerances)
-    if not chosen:
+    tolerances = tuple(tolerances)
+    if not tolerances:
         raise ConfigError("tolerances = []: expected at least one")
-    check_unique("tolerance", [t.name for t in chosen])
-    return np.stack([t.draw(seed, n) for t in chosen], axis=1)
+    check_unique("tolerance", [t.name for t in tolerances])
+    return np.stack([t.draw(seed, n) for t in tolerances], axis=1)

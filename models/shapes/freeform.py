@@ -90,13 +90,13 @@ class OddAsphere(Shape):
 
     @property
     def parameters(self) -> dict[str, float]:  # noqa: D102
-        found = {"radius": self.radius, "curvature": 1.0 / self.radius, "conic": self.conic}
-        return found | {f"a{power}": a for power, a in enumerate(self.coefficients, start=1)}
+        conic_parameters = {"radius": self.radius, "curvature": 1.0 / self.radius, "conic": self.conic}
+        return conic_parameters | {f"a{power}": a for power, a in enumerate(self.coefficients, start=1)}
 
     def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
         if name.startswith("a"):
-            one = (0.0,) * (int(name[1:]) - 1) + (1.0,)
-            _, value, slope, _ = replace(self, coefficients=one)._powers(x, y)
+            unit_coefficients = (0.0,) * (int(name[1:]) - 1) + (1.0,)
+            _, value, slope, _ = replace(self, coefficients=unit_coefficients)._powers(x, y)
             return value, slope * x, slope * y
         f, slope = conic_derivative(1.0 / self.radius, self.conic, name, x * x + y * y)
         return f, 2 * x * slope, 2 * y * slope
@@ -174,14 +174,14 @@ class Biconic(_TwoRadii):
         """Return u and v of the formula and their derivatives by x, y and the parameters, named by letters."""
         cx, cy = 1.0 / self.radius_x, 1.0 / self.radius_y
         kx, ky = 1 + self.conic_x, 1 + self.conic_y
-        one = np.ones_like(x)
-        u = {"": cx * x * x + cy * y * y, "x": 2 * cx * x, "y": 2 * cy * y, "xx": 2 * cx * one, "yy": 2 * cy * one}
+        unit = np.ones_like(x)
+        u = {"": cx * x * x + cy * y * y, "x": 2 * cx * x, "y": 2 * cy * y, "xx": 2 * cx * unit, "yy": 2 * cy * unit}
         v = {
             "": kx * cx**2 * x * x + ky * cy**2 * y * y,
             "x": 2 * kx * cx**2 * x,
             "y": 2 * ky * cy**2 * y,
-            "xx": 2 * kx * cx**2 * one,
-            "yy": 2 * ky * cy**2 * one,
+            "xx": 2 * kx * cx**2 * unit,
+            "yy": 2 * ky * cy**2 * unit,
         }
         # a, b: the curvatures; k, l: the conic constants.
         u |= {"a": x * x, "ax": 2 * x, "b": y * y, "by": 2 * y}
@@ -198,22 +198,22 @@ class Biconic(_TwoRadii):
         def slope(of: str) -> np.ndarray:
             return -0.5 * v.get(of, zero) / w
 
-        found = []
+        derivatives = []
         for name in names:
             if not name:
-                found.append(u[""] / (1 + w))
+                derivatives.append(u[""] / (1 + w))
             elif len(name) == 1:
-                found.append(u.get(name, zero) / (1 + w) - u[""] * slope(name) / (1 + w) ** 2)
+                derivatives.append(u.get(name, zero) / (1 + w) - u[""] * slope(name) / (1 + w) ** 2)
             else:
                 p, q = name[0], name[1]
                 w_p, w_q = slope(p), slope(q)
                 w_pq = -0.5 * v.get(name, zero) / w - w_p * w_q / w
-                found.append(
+                derivatives.append(
                     u.get(name, zero) / (1 + w)
                     - (u.get(p, zero) * w_q + u.get(q, zero) * w_p + u[""] * w_pq) / (1 + w) ** 2
                     + 2 * u[""] * w_p * w_q / (1 + w) ** 3
                 )
-        return found
+        return derivatives
 
     def _sag(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return self._derivatives(x, y, "")[0]

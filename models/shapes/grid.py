@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -67,7 +67,7 @@ class GridSag(ContentEquality, Shape):
             )
 
     @cached_property
-    def _content(self) -> tuple[Any, ...]:
+    def _content(self) -> tuple[Hashable, ...]:
         return self.x.tobytes(), self.y.tobytes(), self.values.tobytes()
 
     def __repr__(self) -> str:
@@ -94,7 +94,7 @@ class GridSag(ContentEquality, Shape):
         i = np.clip(np.where(outside, 0, px).astype(int), 0, len(self.x) - 2)
         j = np.clip(np.where(outside, 0, py).astype(int), 0, len(self.y) - 2)
         corners = np.stack([np.stack([self.nodes[j + b, i + a] for a in (0, 1)], -2) for b in (0, 1)], -3)
-        found = []
+        values = []
         for nx, ny in derivatives:
             wx, wy = _weights(px - i, nx), _weights(py - j, ny)
             value = (
@@ -103,8 +103,8 @@ class GridSag(ContentEquality, Shape):
                 + np.einsum("...ba,...a,...b", corners[..., 2], wx[0], wy[1])
                 + np.einsum("...ba,...a,...b", corners[..., 3], wx[1], wy[1])
             )
-            found.append(np.where(outside, np.nan, value / (hx**nx * hy**ny)))
-        return found
+            values.append(np.where(outside, np.nan, value / (hx**nx * hy**ny)))
+        return values
 
     def _sag(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return self._evaluate(x, y, (0, 0))[0]
@@ -140,9 +140,9 @@ class GridSag(ContentEquality, Shape):
         return int(j), int(i)
 
     def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
-        one = np.zeros_like(self.values)
-        one[self._place(name)] = 1.0
-        f, fx, fy = GridSag(self.x, self.y, one)._evaluate(x, y, (0, 0), (1, 0), (0, 1))
+        unit_values = np.zeros_like(self.values)
+        unit_values[self._place(name)] = 1.0
+        f, fx, fy = GridSag(self.x, self.y, unit_values)._evaluate(x, y, (0, 0), (1, 0), (0, 1))
         return f, fx, fy
 
     def _changed(self, name: str, value: float) -> GridSag:

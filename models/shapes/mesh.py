@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
@@ -103,7 +104,7 @@ class MeshSurface(ContentEquality, Shape):
             )
 
     @cached_property
-    def _content(self) -> tuple[Any, ...]:
+    def _content(self) -> tuple[Hashable, ...]:
         return self.vertices.tobytes(), self.faces.tobytes(), self.smooth
 
     def __repr__(self) -> str:
@@ -161,10 +162,10 @@ class MeshSurface(ContentEquality, Shape):
         inside = np.all((cell >= -1) & (cell <= side), axis=-1)
         column, row = np.moveaxis(np.clip(np.where(inside[..., None], cell, 0).astype(int), 0, side - 1), -1, 0)
         start, stop = starts[row * side + column], starts[row * side + column + 1]
-        found, weights = np.full(x.shape, -1), np.full((*x.shape, 3), np.nan)
+        facet_index, weights = np.full(x.shape, -1), np.full((*x.shape, 3), np.nan)
         corners = self.corners[..., :2]
         for step in range(int(np.where(inside, stop - start, 0).max(initial=0))):
-            open_ = inside & (found < 0) & (start + step < stop)
+            open_ = inside & (facet_index < 0) & (start + step < stop)
             facet = facets[(start + step)[open_]]
             a, b, c = np.moveaxis(corners[facet], 1, 0)
             p, q, r = b - a, c - a, place[open_] - a
@@ -173,9 +174,9 @@ class MeshSurface(ContentEquality, Shape):
             wc = (p[:, 0] * r[:, 1] - p[:, 1] * r[:, 0]) / area
             w = np.stack([1 - wb - wc, wb, wc], axis=-1)
             within = np.all(w >= -EDGE, axis=-1)
-            found[open_] = np.where(within, facet, -1)
+            facet_index[open_] = np.where(within, facet, -1)
             weights[open_] = np.where(within[:, None], w, np.nan)
-        return found, weights
+        return facet_index, weights
 
     def _sag(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         facet, weights = self._locate(x, y)

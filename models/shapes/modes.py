@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -45,9 +44,9 @@ class GridModes(GridSag):
         if not self.modes:
             raise PrescriptionError("modes = {}: expected at least one map")
         amounts = {name: float(self.amounts.get(name, 0.0)) for name in self.modes}
-        (first, grid), *others = self.modes.items()
-        for name, other in others:
-            if not (np.array_equal(grid.x, other.x) and np.array_equal(grid.y, other.y)):
+        (first, grid), *other_modes = self.modes.items()
+        for name, mode_grid in other_modes:
+            if not (np.array_equal(grid.x, mode_grid.x) and np.array_equal(grid.y, mode_grid.y)):
                 raise PrescriptionError(f"mode {name!r}: expected the nodes of mode {first!r}")
         values = sum(a * self.modes[name].values for name, a in amounts.items())
         for name, value in (("modes", dict(self.modes)), ("amounts", amounts), ("x", grid.x), ("y", grid.y)):
@@ -56,7 +55,7 @@ class GridModes(GridSag):
         super().__post_init__()
 
     @cached_property
-    def _content(self) -> tuple[Any, ...]:
+    def _content(self) -> tuple[Hashable, ...]:
         return super()._content, *((name, a, self.modes[name]) for name, a in self.amounts.items())
 
     def __repr__(self) -> str:

@@ -30,8 +30,8 @@ class PolarPolynomial:
     def __add__(self, other: PolarPolynomial) -> PolarPolynomial:
         shape = np.maximum(self.terms.shape, other.terms.shape)
         total = np.zeros(shape, dtype=np.complex128)
-        for one in (self.terms, other.terms):
-            total[: one.shape[0], : one.shape[1]] += one
+        for terms in (self.terms, other.terms):
+            total[: terms.shape[0], : terms.shape[1]] += terms
         return PolarPolynomial(total)
 
     @property

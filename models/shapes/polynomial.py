@@ -122,8 +122,8 @@ class ZernikeSag(_Polynomial):
         return replace(self, coefficients=tuple(coefficients))
 
     def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
-        one = (0.0,) * (int(name[1:]) - 1) + (1.0,)
-        polynomial = from_zernikes(one, self.outer_radius, self.inner_radius)
+        unit_coefficients = (0.0,) * (int(name[1:]) - 1) + (1.0,)
+        polynomial = from_zernikes(unit_coefficients, self.outer_radius, self.inner_radius)
         return polynomial.value(x, y), *polynomial.gradient(x, y)
 
     def _changed(self, name: str, value: float) -> Shape:

@@ -13,7 +13,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,7 +48,7 @@ def with_coefficient(coefficients: tuple[float, ...], place: int, value: float) 
     return (*coefficients[:place], value, *coefficients[place + 1 :])
 
 
-def coordinates(x: Any, y: Any) -> Pair:
+def coordinates(x: ArrayLike, y: ArrayLike) -> Pair:
     """Return x and y [m] as float64 arrays of one shape."""
     x, y = plane_points(x, y)
     return x, y
@@ -225,8 +224,10 @@ class Rotational(Shape):
     @property
     def parameters(self) -> dict[str, float]:  # noqa: D102
         c = self.curvature
-        found = {"radius": 1.0 / c if c else np.inf, "curvature": c, "conic": self.conic}
-        return found | {f"a{power}": a for power, a in zip(range(4, 1000, 2), self.coefficients, strict=False)}
+        conic_parameters = {"radius": 1.0 / c if c else np.inf, "curvature": c, "conic": self.conic}
+        return conic_parameters | {
+            f"a{power}": a for power, a in zip(range(4, 1000, 2), self.coefficients, strict=False)
+        }
 
     def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
         s = x * x + y * y

@@ -37,11 +37,11 @@ class Sum(Shape):
 
     @property
     def curvature(self) -> float:  # noqa: D102
-        return sum(part.curvature for part in self.parts)
+        return sum(component.curvature for component in self.parts)
 
     @property
     def curvatures(self) -> tuple[float, float]:  # noqa: D102
-        along_x, along_y = zip(*(part.curvatures for part in self.parts), strict=True)
+        along_x, along_y = zip(*(component.curvatures for component in self.parts), strict=True)
         return sum(along_x), sum(along_y)
 
     @property
@@ -50,27 +50,27 @@ class Sum(Shape):
         return sum(p.fourth_order + p.curvature**3 / 8 for p in self.parts) - self.curvature**3 / 8
 
     def _sag(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return np.sum([part.sag(x, y) for part in self.parts], axis=0)
+        return np.sum([component.sag(x, y) for component in self.parts], axis=0)
 
     def _gradient(self, x: np.ndarray, y: np.ndarray) -> Pair:
-        along_x, along_y = np.sum([part.gradient(x, y) for part in self.parts], axis=0)
+        along_x, along_y = np.sum([component.gradient(x, y) for component in self.parts], axis=0)
         return along_x, along_y
 
     def _hessian(self, x: np.ndarray, y: np.ndarray) -> Triple:
-        xx, xy, yy = np.sum([part.hessian(x, y) for part in self.parts], axis=0)
+        xx, xy, yy = np.sum([component.hessian(x, y) for component in self.parts], axis=0)
         return xx, xy, yy
 
     @property
     def parameters(self) -> dict[str, float]:  # noqa: D102
-        values = [part.parameters for part in self.parts]
+        values = [component.parameters for component in self.parts]
         return {name: values[i][inner] for name, (i, inner) in self._places.items()}
 
     @cached_property
     def _places(self) -> dict[str, tuple[int, str]]:
         """Index of the part, and name within it, of each parameter."""
         places: dict[str, tuple[int, str]] = {}
-        for i, part in enumerate(self.parts):
-            for name in part.parameters:
+        for i, component in enumerate(self.parts):
+            for name in component.parameters:
                 places[f"part{i + 1}.{name}" if name in places else name] = (i, name)
         return places
 
@@ -84,8 +84,8 @@ class Sum(Shape):
         inner: dict[int, dict[str, float]] = {}
         for name, value in values.items():
             self._check_parameter(name)
-            i, own = self._places[name]
-            inner.setdefault(i, {})[own] = value
+            i, inner_name = self._places[name]
+            inner.setdefault(i, {})[inner_name] = value
         parts = (p.with_parameters(inner[i]) if i in inner else p for i, p in enumerate(self.parts))
         return replace(self, parts=tuple(parts))
 
@@ -94,8 +94,8 @@ class Sum(Shape):
             super()._check_parameter(name)
 
     def sag_derivative(self, name: str, x: ArrayLike, y: ArrayLike) -> Triple:  # noqa: D102
-        part, inner = self.place(name)
-        return part.sag_derivative(inner, x, y)
+        component, inner = self.place(name)
+        return component.sag_derivative(inner, x, y)
 
     def _changed(self, name: str, value: float) -> Shape:
         i, inner = self._places[name]

@@ -87,7 +87,7 @@ def solved(residuals: Callable[[np.ndarray], np.ndarray], start: Sequence[float]
     from scipy.optimize import least_squares
 
     scale = np.maximum(np.abs(start), 0.1)
-    found = least_squares(residuals, start, x_scale=scale, method="trf", xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    if not np.abs(found.fun).max() < 1e-9:
+    solution = least_squares(residuals, start, x_scale=scale, method="trf", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    if not np.abs(solution.fun).max() < 1e-9:
         raise DomainError(f"{what}: expected values at which the third-order equations have a solution")
-    return np.asarray(found.x)
+    return np.asarray(solution.x)

@@ -84,9 +84,9 @@ def _relative(telescope: Telescope) -> np.ndarray:
 
 def _finished(telescope: Telescope, stop: int) -> Telescope:
     """Return a lens in focus with clear apertures; that of the stop passes the light on the axis."""
-    found = focused(telescope)
+    focused_lens = focused(telescope)
     name = f"S{stop + 1}"
-    return cleared(found, **{name: Circle(1.02 * float(footprints(found, 0.0)[stop]))})
+    return cleared(focused_lens, **{name: Circle(1.02 * float(footprints(focused_lens, 0.0)[stop]))})
 
 
 @check_arguments

@@ -76,15 +76,15 @@ def new_telescope(
         If a number is out of range, or does not belong to the kind.
     """
     check_choice("kind", kind, KINDS)
-    given: dict[str, Any] = {"diameter": diameter, "field_radius": field_radius}
-    given["focal_ratio" if kind == "three-mirror" else "f_number"] = f_number
+    options: dict[str, Any] = {"diameter": diameter, "field_radius": field_radius}
+    options["focal_ratio" if kind == "three-mirror" else "f_number"] = f_number
     for name, value in (("primary_f_number", primary_f_number), ("back_focus", back_focus)):
         if value is not None and kind not in two_mirror.KINDS:
             raise DomainError(
                 f"{name} = {value!r}: expected none for a {kind}; two-mirror telescopes have it", key=name
             )
-        given[name] = value
-    return KINDS[kind](**{name: value for name, value in given.items() if value is not None})
+        options[name] = value
+    return KINDS[kind](**{name: value for name, value in options.items() if value is not None})
 
 
 def new_prescription(kind: str, **options: Any) -> tuple[Telescope, str]:

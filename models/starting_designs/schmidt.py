@@ -79,7 +79,7 @@ def schmidt(diameter: float = 0.5, f_number: float = 2.5, *, field_radius: float
     a4 = 0.0
     for _ in range(_STEPS):
         step = 1e-3 / (4.0 * (2.0 * f) ** 3)
-        here, beside = (float(seidel_sums(built(a), field=1e-6).total[0]) for a in (a4, a4 + step))
-        a4 -= here * step / (beside - here)
+        spherical, spherical_beside = (float(seidel_sums(built(a), field=1e-6).total[0]) for a in (a4, a4 + step))
+        a4 -= spherical * step / (spherical_beside - spherical)
     telescope = focused(built(a4), lambda z: detector(z, Sphere(center - z)))
     return replace(cleared(telescope, Plate_back=Circle(rim * 1.001)), groups={"Plate": ("Plate_front", "Plate_back")})
