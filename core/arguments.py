@@ -70,14 +70,16 @@ def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any
 
     @functools.wraps(function)
     def checked(*args: Any, **options: Any) -> Any:
-        known = checks()
+        parameter_checks = checks()
         # Each value of ``*names`` is checked on its own.
-        places = list(known.items())
+        places = list(parameter_checks.items())
         places += places[-1:] * (len(args) - len(places))
         try:
-            given = [v if check is None else check(name, v) for v, (name, check) in zip(args, places, strict=False)]
+            checked_args = [
+                v if check is None else check(name, v) for v, (name, check) in zip(args, places, strict=False)
+            ]
             for name, value in options.items():
-                if (check := known.get(name)) is not None:
+                if (check := parameter_checks.get(name)) is not None:
                     options[name] = check(name, value)
         except _MismatchError as problem:
             name = problem.name.partition("[")[0]
@@ -86,12 +88,12 @@ def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any
                 if name in options:
                     options[name] = _plain_numbers(options[name], unit, name)
                 else:
-                    at = [*known].index(name)
+                    at = [*parameter_checks].index(name)
                     args = (*args[:at], _plain_numbers(args[at], unit, name), *args[at + 1 :])
                 return checked(*args, **options)
             text = f"{problem.name} = {shown(problem.value)}: expected {problem.expected}"
             raise problem.error(text, key=problem.name) from None
-        return function(*given, **options)
+        return function(*checked_args, **options)
 
     return checked
 
@@ -125,11 +127,11 @@ def _annotation_check(kind: Any) -> _Check | None:
         arms = list(get_args(kind))
         if str in arms and any(arm is Path or get_origin(arm) is os.PathLike for arm in arms):
             # Names of bundled files, too, are texts that may be paths.
-            others = [a for a in arms if a not in (str, Path, type(None)) and get_origin(a) is not os.PathLike]
-            return _union_check([_valid_path, *filter(None, map(_annotation_check, others))], type(None) in arms)
+            non_path_arms = [a for a in arms if a not in (str, Path, type(None)) and get_origin(a) is not os.PathLike]
+            return _union_check([_valid_path, *filter(None, map(_annotation_check, non_path_arms))], type(None) in arms)
         arrays = [_real_array] if set(arms) >= _ARRAY_ARMS else []
-        others = [a for a in arms if a is not type(None) and not (arrays and a in _ARRAY_ARMS)]
-        checks = [_annotation_check(arm) for arm in others]
+        non_array_arms = [a for a in arms if a is not type(None) and not (arrays and a in _ARRAY_ARMS)]
+        checks = [_annotation_check(arm) for arm in non_array_arms]
         return None if None in checks else _union_check([*arrays, *filter(None, checks)], type(None) in arms)
     if origin is Literal:
         return _word_check(get_args(kind))
@@ -162,8 +164,10 @@ _PLAIN_CLASSES: dict[Any, tuple[tuple[Any, ...], str]] = {
 }
 #: Types that Python and NumPy take for whole numbers, and that are refused here.
 _NO_NUMBERS = (bool, np.timedelta64)
-#: Longest path, and longest name of a file or folder, of common systems [characters].
-_LONGEST_PATH, _LONGEST_NAME = 4096, 255
+#: Longest path of common systems [characters].
+_LONGEST_PATH = 4096
+#: Longest name of a file or folder of common systems [characters].
+_LONGEST_NAME = 255
 _SEQUENCES = (tuple, list, Sequence, Iterable)
 
 
@@ -229,9 +233,9 @@ def _union_check(checks: list[_Check], optional: bool) -> _Check:
         if optional and value is None:
             return None
         problems = []
-        for each in checks:
+        for arm_check in checks:
             try:
-                return each(name, value)
+                return arm_check(name, value)
             except _MismatchError as problem:
                 problems.append(problem)
         # Of a sequence whose elements are wrong, the element is the likelier mistake.
@@ -272,9 +276,10 @@ def _sequence_check(kind: Any, elements: tuple[Any, ...]) -> _Check:
             return value
         if fixed and len(value) != len(checks):
             raise _MismatchError(name, value, expected)
-        each = checks if fixed else checks * len(value)
-        found = [v if c is None else c(f"{name}[{i}]", v) for i, (v, c) in enumerate(zip(value, each, strict=True))]
-        return tuple(found) if kind is tuple else found
+        element_checks = checks if fixed else checks * len(value)
+        pairs = enumerate(zip(value, element_checks, strict=True))
+        elements = [v if check is None else check(f"{name}[{i}]", v) for i, (v, check) in pairs]
+        return tuple(elements) if kind is tuple else elements
 
     return check
 
@@ -285,11 +290,11 @@ def _mapping_check(kinds: tuple[Any, ...]) -> _Check:
     def check(name: str, value: Any) -> Any:
         if not isinstance(value, Mapping):
             raise _MismatchError(name, value, "a mapping")
-        for key, each in value.items():
+        for key, entry in value.items():
             if check_key is not None:
                 check_key(f"key of {name}", key)
             if check_value is not None:
-                check_value(f"{name}[{key!r}]", each)
+                check_value(f"{name}[{key!r}]", entry)
         return value
 
     return check

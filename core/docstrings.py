@@ -34,14 +34,14 @@ def described(kind: Any, name: str) -> Description:
 
 def _documented_entries(docstring: str) -> dict[str, str]:
     """Return the entries of the sections Attributes and Parameters of a docstring, by name."""
-    found = {}
+    meanings = {}
     sections = _SECTION.split(inspect.cleandoc(docstring))
     for title, body in zip(sections[1::2], sections[2::2], strict=True):
         if title in ("Attributes", "Parameters"):
             entries = _ENTRY.split(body)
             for names, meaning in zip(entries[1::2], entries[2::2], strict=True):
-                found.update(dict.fromkeys(names.split(", "), " ".join(meaning.split())))
-    return found
+                meanings.update(dict.fromkeys(names.split(", "), " ".join(meaning.split())))
+    return meanings
 
 
 def _first_sentence(text: str) -> str:
@@ -54,12 +54,12 @@ def _unit_of(text: str) -> str:
     """Return the first unit in square brackets, as astropy spells it; empty where there is none."""
     from astropy import units as u
 
-    for found in re.findall(r"\[([^][,]*[A-Za-z][^][,]*)\]", _SHAPE.sub("", text)):
-        for said, spelt in _SPELLINGS.items():
-            found = found.replace(said, spelt)
+    for unit_text in re.findall(r"\[([^][,]*[A-Za-z][^][,]*)\]", _SHAPE.sub("", text)):
+        for spelling, astropy_spelling in _SPELLINGS.items():
+            unit_text = unit_text.replace(spelling, astropy_spelling)
         try:
             # What follows says what they are counted from, as in "pixels from the centre".
-            return str(u.Unit(re.split(" from | of ", found)[0]).to_string())
+            return str(u.Unit(re.split(" from | of ", unit_text)[0]).to_string())
         except ValueError:
             continue
     return ""

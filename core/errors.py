@@ -9,8 +9,12 @@ from difflib import get_close_matches
 from reprlib import Repr
 from typing import Any, Self
 
-#: Longest text of a value and of a path in a message, and of a message [characters].
-_MAX_VALUE, _MAX_PATH, _MAX_MESSAGE = 80, 200, 600
+#: Longest text of a value in a message [characters].
+_MAX_VALUE = 80
+#: Longest text of a path in a message [characters].
+_MAX_PATH = 200
+#: Longest message [characters].
+_MAX_MESSAGE = 600
 _REPR = Repr()
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = _MAX_VALUE
 _REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = 8
@@ -59,7 +63,7 @@ class PachonError(Exception):
     @property
     def reason(self) -> str:
         """Text of the error without its subject."""
-        where = ", ".join(cut_short(part, _MAX_PATH) for part in (self.file, self.place) if part)
+        where = ", ".join(cut_short(location, _MAX_PATH) for location in (self.file, self.place) if location)
         return f"{where}: {self.problem}" if where else self.problem
 
     def within(
@@ -79,8 +83,10 @@ class PachonError(Exception):
         if file is None and not key:
             # A subject that an inner context has stated is not repeated.
             stated = subject is not None and f"{self.subject}:".startswith(f"{subject}:")
-            both = ": ".join(part for part in (None if stated else subject, self.subject) if part)
-            return type(self)(self.problem, subject=both or None, file=self.file, place=self.place, key=self.key)
+            full_subject = ": ".join(text for text in (None if stated else subject, self.subject) if text)
+            return type(self)(
+                self.problem, subject=full_subject or None, file=self.file, place=self.place, key=self.key
+            )
         inner = self.file is None and self.subject is None
         # A problem that begins with a key goes on with its section, one that begins with a name or a word does not.
         join = ": " if not inner or self.problem.startswith(("unknown ", "'")) else "."
@@ -154,8 +160,8 @@ def error_context(**context: Any) -> Iterator[None]:
 
 def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
     """Raise a ConfigError if an argument is not one of the choices."""
-    if value not in (known := tuple(choices)):
-        raise ConfigError(f"{name} = {shown(value)}: expected one of {', '.join(known)}")
+    if value not in (allowed := tuple(choices)):
+        raise ConfigError(f"{name} = {shown(value)}: expected one of {', '.join(allowed)}")
 
 
 def check_unique(kind: str, names: Sequence[str]) -> None:
@@ -168,16 +174,16 @@ def check_unique(kind: str, names: Sequence[str]) -> None:
 def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> UnknownNameError:
     """Return the error for an unknown name of a kind, such as ``"CCD"``, with the nearest of the allowed names."""
     names = list(allowed)
-    few = ", ".join(names) if len(names) <= 12 else f"{len(names)} names such as {', '.join(names[:3])}"
-    hint = nearest(name, names, n=4, cutoff=0.5) or f"expected one of {few}"
+    listed_names = ", ".join(names) if len(names) <= 12 else f"{len(names)} names such as {', '.join(names[:3])}"
+    hint = nearest(name, names, n=4, cutoff=0.5) or f"expected one of {listed_names}"
     return UnknownNameError(f"unknown {kind} {shown(name)}: {hint}")
 
 
-def nearest(name: object, known: Iterable[str], n: int = 2, cutoff: float = 0.6) -> str:
-    """Return the known names nearest to a name, as "did you mean"; empty where none is near."""
+def nearest(name: object, names: Iterable[str], n: int = 2, cutoff: float = 0.6) -> str:
+    """Return the names nearest to a name, as "did you mean"; empty where none is near."""
     if len(str(name)) > _MAX_VALUE:
         # Comparing takes a time that grows with the square of the length.
         return ""
-    lowered = {key.lower(): key for key in known}
+    lowered = {key.lower(): key for key in names}
     near = [lowered[key] for key in get_close_matches(str(name).lower(), list(lowered), n=n, cutoff=cutoff)]
     return f"did you mean {' or '.join(near)}?" if near else ""

@@ -11,7 +11,7 @@ import json
 import os
 import platform
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -88,8 +88,8 @@ def claim_folder(path: Path, content: bytes, *, products: str, check: Callable[[
     """
     folder = path.parent
     make_folder(folder)
-    if not path.exists() and (left := sorted(folder.glob(products))):
-        raise ProductError(f"{folder} holds {left[0].name} but no {path.name}; choose another --out")
+    if not path.exists() and (stray_products := sorted(folder.glob(products))):
+        raise ProductError(f"{folder} holds {stray_products[0].name} but no {path.name}; choose another --out")
     if not write_new_bytes(path, content):
         check()
         write_bytes(path, content)
@@ -152,8 +152,8 @@ def folder_of_worker(folder: Path, mark: str) -> Iterator[Path]:
     if (folder / mark).is_file():
         yield folder
         return
-    with TemporaryDirectory(prefix="pachon_") as own:
-        yield Path(own)
+    with TemporaryDirectory(prefix="pachon_") as temporary_folder:
+        yield Path(temporary_folder)
 
 
 def _remove_leftovers(folder: Path) -> None:
@@ -240,7 +240,7 @@ def make_folder(folder: Path) -> None:
     _remove_leftovers(folder)
 
 
-def write_json(path: Path, content: dict[str, Any]) -> None:
+def write_json(path: Path, content: Mapping[str, object]) -> None:
     """Write a JSON file with sorted keys; numbers that are not finite become null."""
     write_bytes(path, (json_text(content) + "\n").encode())
 

@@ -46,17 +46,17 @@ def start_warp() -> None:
         if _started:
             return
         sys.stderr.flush()
-        kept = os.dup(2)
-        void = os.open(os.devnull, os.O_WRONLY)
+        saved_stderr = os.dup(2)
+        null_device = os.open(os.devnull, os.O_WRONLY)
         try:
-            os.dup2(void, 2)
-            told = _with_kernel_cache(wp.init)
+            os.dup2(null_device, 2)
+            cache_warning = _with_kernel_cache(wp.init)
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-            os.close(void)
-        if told:
-            print(told, file=sys.stderr, flush=True)
+            os.dup2(saved_stderr, 2)
+            os.close(saved_stderr)
+            os.close(null_device)
+        if cache_warning:
+            print(cache_warning, file=sys.stderr, flush=True)
         _started.append(True)
 
 
@@ -74,9 +74,9 @@ def load_kernels(kernel: wp.Kernel, device: str = "cpu") -> None:
         if not (Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(block)).exists():
             name = kernel.module.name.rpartition(".")[2]
             print(f"compiling {name} for this machine (once)", file=sys.stderr, flush=True)
-        told = _with_kernel_cache(lambda: wp.load_module(kernel.module, device=device, block_dim=block))
-        if told:
-            print(told, file=sys.stderr, flush=True)
+        cache_warning = _with_kernel_cache(lambda: wp.load_module(kernel.module, device=device, block_dim=block))
+        if cache_warning:
+            print(cache_warning, file=sys.stderr, flush=True)
         _loaded.add(key)
 
 

@@ -44,8 +44,8 @@ def _machine_memory(root: Path) -> Iterator[int]:
 
 def _control_groups(root: Path) -> Iterator[int]:
     for line in _lines(root / "proc/self/cgroup"):
-        number, _, rest = line.partition(":")
-        controllers, _, path = rest.partition(":")
+        number, _, controllers_and_path = line.partition(":")
+        controllers, _, path = controllers_and_path.partition(":")
         if number == "0" and not controllers:
             base, names = root / "sys/fs/cgroup", _UNIFIED
         elif "memory" in controllers.split(","):

@@ -75,14 +75,14 @@ def ordered_results(
         That of a job that failed; if a worker is lost.
     """
     ordered = OrderedComputation(compute)
-    chosen = serial_worker(ordered, threads) if workers is None else workers(ordered)
-    check(chosen.processes)
+    job_workers = serial_worker(ordered, threads) if workers is None else workers(ordered)
+    check(job_workers.processes)
     jobs = (OrderedJob(i, *job) for i, job in enumerate(zip(labels, contents, strict=True)))
-    named = title if workers is None else f"{title}, {chosen.description}"
+    named = title if workers is None else f"{title}, {job_workers.description}"
     waiting: dict[int, Any] = {}
     done = due = 0
     with nullcontext() if title is None else reporter.stage(str(named), total=len(labels)) as stage:
-        for number, result in chosen.results(jobs):
+        for number, result in job_workers.results(jobs):
             if isinstance(result, PachonError):
                 raise result
             done += 1

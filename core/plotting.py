@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
@@ -36,7 +37,7 @@ _DPI = 150
 #: Stamps of one picture.
 _STAMPS = 6
 #: Metadata of each format, left out: equal pictures have equal bytes.
-_NAMELESS: dict[str, dict[str, Any]] = {
+_NAMELESS: dict[str, dict[str, None]] = {
     "png": {"Software": None},
     "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
     "svg": {"Date": None, "Creator": None},
@@ -45,7 +46,7 @@ _NAMELESS: dict[str, dict[str, Any]] = {
 logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
 
 
-def styled() -> Any:
+def styled() -> AbstractContextManager[None]:
     """Return the context in which figures are drawn: our style on top of matplotlib's own, not the user's."""
     import matplotlib
 

@@ -31,13 +31,13 @@ def draw_points(
 
     With `equal` the scales of both axes are the same. Values that are not finite are left out.
     """
-    every = slice(None, None, max(1, -(-len(x) // _MOST)))
+    thinning = slice(None, None, max(1, -(-len(x) // _MOST)))
     with styled():
         figure, axes = axes_at(ax, 5.4, 4.6)
         if color is None:
-            axes.plot(x[every], y[every], ".", color=BLUE, markersize=3)
+            axes.plot(x[thinning], y[thinning], ".", color=BLUE, markersize=3)
         else:
-            shown = axes.scatter(x[every], y[every], c=color[every], s=8, cmap="viridis")
+            shown = axes.scatter(x[thinning], y[thinning], c=color[thinning], s=8, cmap="viridis")
             figure.colorbar(shown, ax=axes, label=color_label)
         axes.set(xlabel=labels[0], ylabel=labels[1], title=title)
         if equal:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ _WHEN = "FITS checksum"
 _FORMATS = {"f": "D", "i": "J", "b": "L"}
 #: Columns of a table in order, by name: values, unit in FITS notation (empty for pure numbers), description.
 Columns = dict[str, tuple[np.ndarray, str, str]]
+#: Keyword, value and comment of a line of a FITS header.
+Card = tuple[str, object, str]
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class Stamp:
     seed: int
     version: str = VERSION
 
-    def cards(self) -> list[tuple[str, Any, str]]:
+    def cards(self) -> list[Card]:
         """Return the header cards."""
         return [
             ("CREATOR", f"pachon {self.version}", "program and version"),
@@ -42,7 +45,7 @@ class Stamp:
             ("SEED", self.seed, "seed of all random numbers"),
         ]
 
-    def meta(self) -> dict[str, Any]:
+    def meta(self) -> dict[str, str | int]:
         """Return the entries of a table's header or a JSON file."""
         return {"pachon": self.version, "config_hash": self.config_hash, "seed": self.seed}
 
@@ -56,7 +59,7 @@ def card_text(text: str) -> str:
     return text.encode("ascii", "backslashreplace").decode()
 
 
-def write_fits(path: Path, hdus: list[Any], stamp: Stamp | None, cards: list[tuple[str, Any, str]]) -> None:
+def write_fits(path: Path, hdus: list[Any], stamp: Stamp | None, cards: Sequence[Card]) -> None:
     """Write named extensions as a FITS product with checksums.
 
     The primary header has the stamp, which is None for a product of no run, and `cards`: (keyword, value, comment).
@@ -101,11 +104,11 @@ def read_fits(path: Path) -> fits.HDUList:
     return hdus
 
 
-def _checksum_holds(part: bytes) -> bool:
+def _checksum_holds(hdu: bytes) -> bool:
     """Return whether the 32-bit ones'-complement sum of a header and its data is all ones (FITS standard 4.0, J.1)."""
-    if not part or len(part) % 4:
+    if not hdu or len(hdu) % 4:
         return False
-    total = int(np.frombuffer(part, dtype=">u4").sum(dtype=np.uint64))
+    total = int(np.frombuffer(hdu, dtype=">u4").sum(dtype=np.uint64))
     while total >> 32:
         total = (total & 0xFFFFFFFF) + (total >> 32)
     return total == 0xFFFFFFFF
@@ -138,14 +141,14 @@ def column(table: fits.BinTableHDU, name: str) -> np.ndarray:
     return values.astype(values.dtype.newbyteorder("="))
 
 
-def write_ecsv(path: Path, columns: Columns, meta: dict[str, Any]) -> None:
+def write_ecsv(path: Path, columns: Columns, meta: Mapping[str, object]) -> None:
     """Write an ECSV table, which people and astropy both read."""
     text = io.StringIO()
     described_table(columns, meta).write(text, format="ascii.ecsv")
     write_bytes(path, text.getvalue().encode())
 
 
-def described_table(columns: Columns, meta: dict[str, Any]) -> Table:
+def described_table(columns: Columns, meta: Mapping[str, object]) -> Table:
     """Return an astropy table with units and descriptions."""
     table = Table(meta=meta)
     for key, (values, unit, description) in columns.items():

@@ -46,10 +46,10 @@ class Stage:
     def step(self, name: str, done: int, total: int) -> None:
         """Write that one more part is done, and the time left, unless there is a bar."""
         seconds = time.perf_counter() - self._start
-        left = seconds / done * (total - done)
-        time_left = f"{left:.0f} s" if left < 100.0 else f"{left / 60.0:.0f} min"
-        rest = f", {_speed_text(done / seconds)}, about {time_left} left" if done < total else ""
-        self.line(f"{name} ({done} of {total}{rest})")
+        seconds_left = seconds / done * (total - done)
+        time_left = f"{seconds_left:.0f} s" if seconds_left < 100.0 else f"{seconds_left / 60.0:.0f} min"
+        forecast = f", {_speed_text(done / seconds)}, about {time_left} left" if done < total else ""
+        self.line(f"{name} ({done} of {total}{forecast})")
 
 
 class _SpeedColumn(ProgressColumn):

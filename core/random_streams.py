@@ -15,7 +15,7 @@ def stream(seed: int, *key: str | int) -> np.random.Generator:
     not negative.
     """
     # CRC-32 and not hash(): Python's own hash of a string changes from process to process.
-    words = tuple(zlib.crc32(part.encode()) if isinstance(part, str) else int(part) for part in key)
+    words = tuple(zlib.crc32(word.encode()) if isinstance(word, str) else int(word) for word in key)
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(int(seed), spawn_key=words)))
 
 

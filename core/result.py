@@ -18,8 +18,10 @@ from .notebook import html_picture
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-#: Rows of a table in HTML, and columns named in a representation.
-_ROWS, _NAMED = 8, 6
+#: Rows of a table in HTML.
+_ROWS = 8
+#: Columns that a representation names.
+_NAMED = 6
 
 
 class Result:
@@ -49,8 +51,8 @@ class Result:
         """Return the content in a few words, for the representation."""
         columns = self._columns()
         rows = len(next(iter(columns.values()), ()))
-        more = ", ..." if len(columns) > _NAMED else ""
-        return f"{rows} row{'s' * (rows != 1)} of {', '.join(list(columns)[:_NAMED])}{more}"
+        ellipsis = ", ..." if len(columns) > _NAMED else ""
+        return f"{rows} row{'s' * (rows != 1)} of {', '.join(list(columns)[:_NAMED])}{ellipsis}"
 
     def _columns(self) -> dict[str, Any]:
         """Return the columns of the table, described by the attribute of each name."""
@@ -74,8 +76,8 @@ class Result:
         return {**self._meta(), "rows": len(table), **medians}
 
     def _described(self, name: str) -> Description:
-        own = described(type(self), name)
-        return own if own.text else described(self._row_type, name)
+        description = described(type(self), name)
+        return description if description.text else described(self._row_type, name)
 
     def summary(self) -> dict[str, Any]:
         """Return the results by name as plain numbers, texts and lists for JSON; None where there is no number."""
@@ -129,8 +131,8 @@ class Values(Result):
     """Base of results that are a few numbers: a table of one row, a column for each field."""
 
     def _label(self) -> str:
-        few = [*self._values().items()][:_NAMED]
-        return ", ".join(f"{name} {_cell_text(value)}" for name, value in few)
+        first_values = [*self._values().items()][:_NAMED]
+        return ", ".join(f"{name} {_cell_text(value)}" for name, value in first_values)
 
     def _columns(self) -> dict[str, Any]:
         return {name: [value] for name, value in self._values().items()}
@@ -155,14 +157,14 @@ def html_table(table: QTable, rows: int = _ROWS) -> str:
         heads.append(f'<th title="{escape(table[name].info.description or "")}">{escape(text)}</th>')
         cells.append([escape(_cell_text(value)) for value in table[name][:rows]])
     lines = [f"<tr>{''.join(f'<td>{c}</td>' for c in row)}</tr>" for row in zip(*cells, strict=True)]
-    more = f"<p>{len(table) - rows} more rows</p>" if len(table) > rows else ""
+    row_note = f"<p>{len(table) - rows} more rows</p>" if len(table) > rows else ""
     body = f"<table><tr>{''.join(heads)}</tr>{''.join(lines)}</table>"
-    return f'<div style="overflow-x:auto">{body}</div>{more}'
+    return f'<div style="overflow-x:auto">{body}</div>{row_note}'
 
 
 def _cell_text(value: Any) -> str:
     value = getattr(value, "value", value)
     if np.ndim(value):
-        few = np.ravel(value)
-        return ", ".join(map(_cell_text, few[:4])) + (", ..." if len(few) > 4 else "")
+        elements = np.ravel(value)
+        return ", ".join(map(_cell_text, elements[:4])) + (", ..." if len(elements) > 4 else "")
     return f"{value:.5g}" if isinstance(value, (float, np.floating)) else str(value)

@@ -55,10 +55,10 @@ class Section(BaseModel):
     @classmethod
     def _only_known_keys(cls, content: Any) -> Any:
         if isinstance(content, dict):
-            known = cls.keys()
+            allowed_keys = cls.keys()
             for key in content:
-                if key not in known:
-                    raise unknown_key(key, known)
+                if key not in allowed_keys:
+                    raise unknown_key(key, allowed_keys)
             cls.check(content)
         return content
 
@@ -93,10 +93,10 @@ def validated(
         except ValidationError as problems:
             # A misspelt key is the likelier cause of the other problems, so it goes first.
             first = min(problems.errors(include_url=False), key=lambda p: p["type"] != "unknown_key")
-            found = _one_line_error(first, content, source, error)
+            first_error = _one_line_error(first, content, source, error)
             if drop is None or first["type"] != "unknown_key":
-                raise found from None
-            drop(found)
+                raise first_error from None
+            drop(first_error)
             del first["input"][first["ctx"]["key"]]
 
 
@@ -107,7 +107,7 @@ def problems_of(
 
     Unknown keys are taken out of the content.
     """
-    found: list[PachonError] = []
+    all_errors: list[PachonError] = []
     while True:
         try:
             # Validators write into the context.
@@ -115,17 +115,17 @@ def problems_of(
         except ValidationError as problems:
             errors = problems.errors(include_url=False)
             unknown = [p for p in errors if p["type"] == "unknown_key"]
-            found += [_one_line_error(p, content, source, error) for p in unknown or errors]
-            for one in unknown:
-                del one["input"][one["ctx"]["key"]]
+            all_errors += [_one_line_error(p, content, source, error) for p in unknown or errors]
+            for unknown_problem in unknown:
+                del unknown_problem["input"][unknown_problem["ctx"]["key"]]
             if unknown:
                 continue
-        return found
+        return all_errors
 
 
-def unknown_key(key: str, known: list[str]) -> PydanticCustomError:
+def unknown_key(key: str, allowed: list[str]) -> PydanticCustomError:
     """Return the error of a validator of a section with an unknown key."""
-    return PydanticCustomError("unknown_key", "unknown key", {"key": key, "known": known})
+    return PydanticCustomError("unknown_key", "unknown key", {"key": key, "allowed": allowed})
 
 
 def expected(text: str, key: str = "") -> PydanticCustomError:
@@ -140,11 +140,11 @@ def one_of(choices: Iterable[str], value: object) -> str:
     return f"one of {', '.join(names)}" + (f" ({near})" if near else "")
 
 
-def either(content: Mapping[str, Any], key: str, others: Iterable[str]) -> None:
-    """Raise unless a section has one key, or else all of the others."""
-    for other in others:
-        if (key in content) == (other in content):
-            raise expected(f"{key} or {other}, not both", other)
+def either(content: Mapping[str, Any], key: str, alternatives: Iterable[str]) -> None:
+    """Raise unless a section has one key, or else all of its alternatives."""
+    for alternative in alternatives:
+        if (key in content) == (alternative in content):
+            raise expected(f"{key} or {alternative}, not both", alternative)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,11 +231,11 @@ class Parameters(Section):
     def written(cls, built: Any) -> dict[str, Any]:
         """Return the section of an object that it builds."""
         values = (getattr(built, field.name) for field in fields(built))
-        found = {key: (next(values), next(values)) if key in cls.pairs else next(values) for key in cls.parameters}
-        for key, value in found.items():
+        section = {key: (next(values), next(values)) if key in cls.pairs else next(values) for key in cls.parameters}
+        for key, value in section.items():
             for how in cls.model_fields[key].metadata:
-                found[key] = how.convert(value) if isinstance(how, WrittenAs) else found[key]
-        return found
+                section[key] = how.convert(value) if isinstance(how, WrittenAs) else section[key]
+        return section
 
 
 def written(classes: Mapping[str, type[Parameters]], built: Any) -> tuple[str, dict[str, Any]] | None:
@@ -255,10 +255,10 @@ def checked(convert: Callable[[Any], Any], text: str) -> BeforeValidator:
     """Return a validator that converts a value; where the conversion gives None, the value is not as expected."""
 
     def convert_or_raise(value: Any) -> Any:
-        found = convert(value)
-        if found is None:
+        converted = convert(value)
+        if converted is None:
             raise expected(text)
-        return found
+        return converted
 
     return BeforeValidator(convert_or_raise)
 
@@ -281,13 +281,13 @@ def known_keys(model: type[BaseModel]) -> tuple[str, ...]:
 
 def key_description(model: type[BaseModel], key: str) -> str:
     """Return the description of a key of a model, with dots between sections; empty where there is none."""
-    first, _, rest = key.partition(".")
+    first, _, inner_key = key.partition(".")
     for name, field in model.model_fields.items():
         if (field.alias or name) == first:
             section = field.annotation
-            if rest and isinstance(section, type) and issubclass(section, BaseModel):
-                return key_description(section, rest)
-            return "" if rest else field.description or ""
+            if inner_key and isinstance(section, type) and issubclass(section, BaseModel):
+                return key_description(section, inner_key)
+            return "" if inner_key else field.description or ""
     return ""
 
 
@@ -316,8 +316,8 @@ def _one_line_error(problem: Mapping[str, Any], content: Any, source: str, error
     kind, value, limits = problem["type"], problem["input"], problem.get("ctx", {})
     path = _key_path([*problem["loc"], *filter(None, [limits.get("key")])], content)
     if kind == "unknown_key":
-        key, known = limits["key"], limits["known"]
-        hint = nearest(key, known) or f"expected one of {', '.join(known)}"
+        key, allowed_keys = limits["key"], limits["allowed"]
+        hint = nearest(key, allowed_keys) or f"expected one of {', '.join(allowed_keys)}"
         return error(f"unknown key {path} = {_value_text(error, value[key])}: {hint}", file=source, key=path)
     if kind == "problem":
         return error(f"{path}{limits['text']}", file=source, key=path)
@@ -349,16 +349,16 @@ _LABELS = {"layers": "altitude", "shape": "shape"}
 def _key_path(location: Iterable[int | str], content: Any) -> str:
     """Return a location as a path of keys: ``surfaces[M1].radius``; tags, in angle brackets, are left out."""
     path = label = ""
-    for part in location:
-        if isinstance(part, str) and part.startswith("<"):
+    for component in location:
+        if isinstance(component, str) and component.startswith("<"):
             continue
-        inside = (isinstance(content, dict) and part in content) or (
-            isinstance(content, list) and isinstance(part, int) and part < len(content)
+        inside = (isinstance(content, dict) and component in content) or (
+            isinstance(content, list) and isinstance(component, int) and component < len(content)
         )
-        content = content[part] if inside else None
-        if isinstance(part, int):
-            path += f"[{content.get(label, part) if isinstance(content, dict) else part}]"
+        content = content[component] if inside else None
+        if isinstance(component, int):
+            path += f"[{content.get(label, component) if isinstance(content, dict) else component}]"
         else:
-            path += f".{part}" if path else part
-            label = _LABELS.get(part, "name")
+            path += f".{component}" if path else component
+            label = _LABELS.get(component, "name")
     return path

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from astropy.io import fits
-from astropy.table import Table
+from astropy.table import Column, Table
 from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
 
 from .errors import ConfigError, PachonError, ProductError
@@ -26,7 +26,7 @@ ENDINGS = (*FORMATS, ".fit")
 Described = tuple[np.ndarray, str, str]
 
 
-def read_columns(path: Path) -> dict[str, Any]:
+def read_columns(path: Path) -> dict[str, Column | np.ndarray]:
     """Return the columns of a file, of FITS its first table, by their names in small letters.
 
     Raises
@@ -97,9 +97,9 @@ def _encoded(table: Table, kind: str, path: Path, images: Mapping[str, Described
                 hdu.header["BUNIT"] = unit
             hdu.header["COMMENT"] = card_text(meaning)
             hdus.append(hdu)
-        whole = io.BytesIO()
-        hdus.writeto(whole)
-        return whole.getvalue()
+        file_data = io.BytesIO()
+        hdus.writeto(file_data)
+        return file_data.getvalue()
     parquet = parquet_module(path, ConfigError)
     import pyarrow
 

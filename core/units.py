@@ -35,8 +35,8 @@ def real_numbers(values: Any) -> Any:
     if type(values) is np.ndarray:
         return values if values.dtype.kind in "iuf" else None
     if isinstance(values, (tuple, list)) and any(map(_has_unit_or_mask, values)):
-        found = [real_numbers(v) for v in values]
-        return None if any(v is None for v in found) else found
+        elements = [real_numbers(v) for v in values]
+        return None if any(v is None for v in elements) else elements
     if hasattr(values, "mask") and hasattr(values, "filled"):
         if values.dtype.kind not in "iuf":
             return None

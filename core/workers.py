@@ -69,17 +69,17 @@ def process_workers(compute: Compute, count: int, threads: int | None = None) ->
 
     `compute` is a function of a module, or a picklable object.
     """
-    each = max(1, thread_count(threads) // count)
+    threads_per_process = max(1, thread_count(threads) // count)
 
     def results(jobs: Iterable[Any]) -> Iterator[Any]:
         # A fresh interpreter, not a fork: Warp and OpenMP keep threads that a fork would lose. Variables that bound the
         # threads of libraries must be set before a worker imports them.
-        with _environment({name: str(each) for name in _THREAD_VARIABLES}):
+        with _environment({name: str(threads_per_process) for name in _THREAD_VARIABLES}):
             pool = ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=begin_worker)
             waiting: set[Future[Any]] = set()
             try:
                 for job in jobs:
-                    waiting.add(pool.submit(compute, job, each))
+                    waiting.add(pool.submit(compute, job, threads_per_process))
                     if len(waiting) >= JOBS_AHEAD * count:
                         done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                         yield from (future.result() for future in done)
@@ -98,7 +98,9 @@ def process_workers(compute: Compute, count: int, threads: int | None = None) ->
             finally:
                 pool.shutdown(wait=True, cancel_futures=True)
 
-    return Workers(f"{count} processes of {each} thread{'s' * (each > 1)}", count, results)
+    return Workers(
+        f"{count} processes of {threads_per_process} thread{'s' * (threads_per_process > 1)}", count, results
+    )
 
 
 def worker_name() -> str:
@@ -121,7 +123,7 @@ def exit_with_parent(parent: int) -> None:
 
 @contextmanager
 def _environment(variables: dict[str, str]) -> Iterator[None]:
-    before: dict[str, Any] = {name: os.environ.get(name) for name in variables}
+    before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
         yield

@@ -102,21 +102,21 @@ class _StrictLoader(yaml.composer.Composer, _Parser, yaml.constructor.SafeConstr
 
         PyYAML 6.0.4 lets the keys of a mapping that is merged into override its own, where that is merged in turn.
         """
-        own: list[tuple[yaml.Node, yaml.Node]] = []
+        direct_pairs: list[tuple[yaml.Node, yaml.Node]] = []
         merged: dict[Hashable, tuple[yaml.Node, yaml.Node]] = {}
         for key, value in node.value:
             if key.tag != _MERGE:
-                own.append((key, value))
+                direct_pairs.append((key, value))
                 continue
-            for part in value.value if isinstance(value, yaml.SequenceNode) else [value]:
-                if not isinstance(part, yaml.MappingNode):
-                    text = f"expected a mapping or list of mappings for merging, but found {part.id}"
-                    raise yaml.constructor.ConstructorError(None, None, text, part.start_mark)
-                self.flatten_mapping(part)
-                # Of equal keys the last one counts, which is the part's own.
-                for name, pair in {pair[0].value: pair for pair in part.value}.items():
+            for merged_node in value.value if isinstance(value, yaml.SequenceNode) else [value]:
+                if not isinstance(merged_node, yaml.MappingNode):
+                    text = f"expected a mapping or list of mappings for merging, but found {merged_node.id}"
+                    raise yaml.constructor.ConstructorError(None, None, text, merged_node.start_mark)
+                self.flatten_mapping(merged_node)
+                # Of equal keys the last one counts, which is the merged mapping's own.
+                for name, pair in {pair[0].value: pair for pair in merged_node.value}.items():
                     merged.setdefault(name, pair)
-        node.value = [*merged.values(), *own]
+        node.value = [*merged.values(), *direct_pairs]
 
     def check_keys(self, node: yaml.MappingNode) -> None:
         """Raise a ConstructorError for a key that is no name or occurs twice in a mapping or one merged into it."""
@@ -124,23 +124,23 @@ class _StrictLoader(yaml.composer.Composer, _Parser, yaml.constructor.SafeConstr
         if id(node) in self._checked:
             return
         self._checked.add(id(node))
-        seen: set[Hashable] = set()
+        unique_keys: set[Hashable] = set()
         for key_node, value_node in node.value:
             if key_node.tag == _MERGE:
                 key: Any = "<<"
                 parts = value_node.value if isinstance(value_node, yaml.SequenceNode) else [value_node]
-                for part in parts:
-                    if isinstance(part, yaml.MappingNode):
-                        self.check_keys(part)
+                for merged_node in parts:
+                    if isinstance(merged_node, yaml.MappingNode):
+                        self.check_keys(merged_node)
             else:
                 key = self.construct_object(key_node, deep=True)
             if not isinstance(key, str):
                 text = f"key {cut_short(repr(key))}: expected a name"
                 raise yaml.constructor.ConstructorError(None, None, text, key_node.start_mark)
-            if key in seen:
+            if key in unique_keys:
                 text = f"key {cut_short(repr(key))} occurs twice"
                 raise yaml.constructor.ConstructorError(None, None, text, key_node.start_mark)
-            seen.add(key)
+            unique_keys.add(key)
 
 
 def _short_integer(loader: _StrictLoader, node: yaml.ScalarNode) -> int:
@@ -196,25 +196,25 @@ def line_of(path: Path, key: str) -> int | None:
     except (OSError, ValueError, yaml.YAMLError):
         return None
     line = None
-    for part in re.findall(r"[^.\[\]]+|\[[^\]]*\]", key):
-        found = _child_node(node, part)
-        if found is None:
+    for component in re.findall(r"[^.\[\]]+|\[[^\]]*\]", key):
+        child = _child_node(node, component)
+        if child is None:
             break
-        node, line = found[1], found[0].start_mark.line + 1
+        node, line = child[1], child[0].start_mark.line + 1
     return line
 
 
-def _child_node(node: Any, part: str) -> tuple[Any, Any] | None:
+def _child_node(node: Any, component: str) -> tuple[Any, Any] | None:
     """Return the node of a key or entry, for its place, and that of its value; None where there is none."""
-    if part.startswith("[") and isinstance(node, yaml.SequenceNode):
-        label = part[1:-1]
+    if component.startswith("[") and isinstance(node, yaml.SequenceNode):
+        label = component[1:-1]
         if label.isdigit() and int(label) < len(node.value):
             return (node.value[int(label)],) * 2
         for entry in node.value:
             if isinstance(entry, yaml.MappingNode) and any(value.value == label for _, value in entry.value):
                 return entry, entry
     if isinstance(node, yaml.MappingNode):
-        return next((pair for pair in node.value if pair[0].value == part), None)
+        return next((pair for pair in node.value if pair[0].value == component), None)
     return None
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -51,23 +50,23 @@ def entrance_points(telescope: Telescope, directions: np.ndarray, wavelength: fl
     relative = np.broadcast_to(relative, (len(directions), *pupil.shape[-2:]))
     if relative.shape[1] < FEWEST:
         return _search_points(telescope, stop, directions, wavelength, relative)
-    found = np.empty(relative.shape)
+    crossings = np.empty(relative.shape)
     # Rays of all fields together: with few rays the launch of the kernel takes most of the time.
     at_nodes = [
-        _search_points(telescope, stop, directions[part], wavelength, pupil_nodes(relative[part]))
-        for part in (slice(i, i + _FIELDS) for i in range(0, len(directions), _FIELDS))
+        _search_points(telescope, stop, directions[batch], wavelength, pupil_nodes(relative[batch]))
+        for batch in (slice(i, i + _FIELDS) for i in range(0, len(directions), _FIELDS))
     ]
-    for i, (target, known) in enumerate(zip(relative, np.concatenate(at_nodes), strict=True)):
+    for i, (target, node_crossings) in enumerate(zip(relative, np.concatenate(at_nodes), strict=True)):
         light = directions[i : i + 1]
 
         def at_stop(points: np.ndarray, light: np.ndarray = light) -> np.ndarray:
             return stop.relative(straight_bundles(telescope, light, wavelength, points))
 
-        def search(some: np.ndarray, light: np.ndarray = light) -> np.ndarray:
-            return _search_points(telescope, stop, light, wavelength, some[None])[0]
+        def search(relative_points: np.ndarray, light: np.ndarray = light) -> np.ndarray:
+            return _search_points(telescope, stop, light, wavelength, relative_points[None])[0]
 
-        found[i] = smooth_pupil(target, known, at_stop, search)
-    return found
+        crossings[i] = smooth_pupil(target, node_crossings, at_stop, search)
+    return crossings
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,9 +95,9 @@ class AimedPoints:
         stop, difference = stop_of(telescope), _central_difference_step(telescope)
         target = np.broadcast_to(_stop_coordinates(telescope, stop, pupil), self.points.shape).reshape(-1, 2)
         landing = stop.landing(np.repeat(directions, pupil.shape[-2], axis=0), wavelength)
-        found = find_points(landing, self.points.reshape(-1, 2), target, stop.radius, difference, self.slopes)
-        sense = determinants(derivatives(landing, found, difference, target)) * determinants(self.slopes)
-        return found.reshape(self.points.shape) if (sense > 0.0).all() else None
+        crossings = find_points(landing, self.points.reshape(-1, 2), target, stop.radius, difference, self.slopes)
+        sense = determinants(derivatives(landing, crossings, difference, target)) * determinants(self.slopes)
+        return crossings.reshape(self.points.shape) if (sense > 0.0).all() else None
 
 
 def _search_points(
@@ -114,15 +113,15 @@ def _search_points(
     # All rays of a field begin with the derivatives at its chief ray.
     slopes = derivatives(stop.landing(directions, wavelength), chief, difference)
     first = start + solve_2x2(np.repeat(slopes, relative.shape[1], axis=0), target)
-    found = find_points(landing, first, target, stop.radius, difference)
+    crossings = find_points(landing, first, target, stop.radius, difference)
     # The sense of the map from the entrance pupil to the stop is that at the chief ray; where it is the other one, the
     # search came beyond a fold of the pupil, to a second ray through the same point.
     sense = np.repeat(determinants(slopes), relative.shape[1], axis=0)
-    lost = np.flatnonzero(~(determinants(derivatives(landing, found, difference, target)) * sense > 0.0))
+    lost = np.flatnonzero(~(determinants(derivatives(landing, crossings, difference, target)) * sense > 0.0))
     if len(lost):
 
-        def of_lost(points: np.ndarray, which: np.ndarray) -> np.ndarray:
-            return landing(points, lost[which])
+        def of_lost(points: np.ndarray, indices: np.ndarray) -> np.ndarray:
+            return landing(points, lost[indices])
 
         # They are followed from the chief ray outwards.
         points = start[lost]
@@ -130,8 +129,8 @@ def _search_points(
             points = find_points(of_lost, points, target[lost] * (k / _PUPIL_STEPS), stop.radius, difference)
         turned = ~(determinants(derivatives(of_lost, points, difference, target[lost])) * sense[lost] > 0.0)
         points[turned] = np.nan
-        found[lost] = points
-    return found.reshape(n, -1, 2)
+        crossings[lost] = points
+    return crossings.reshape(n, -1, 2)
 
 
 def pupil_coordinates(telescope: Telescope, direction: np.ndarray, wavelength: float, points: np.ndarray) -> np.ndarray:
@@ -200,8 +199,8 @@ class Stop:
         """Return the function from points of the entrance pupil to the stop for rays of given chief directions."""
         traced = RepeatedTrace(self.telescope, wavelength, self.index)
 
-        def land(points: np.ndarray, which: np.ndarray) -> np.ndarray:
-            rays = straight_bundles(self.telescope, directions[which], wavelength, points[:, None])
+        def land(points: np.ndarray, indices: np.ndarray) -> np.ndarray:
+            rays = straight_bundles(self.telescope, directions[indices], wavelength, points[:, None])
             return self.surface.to_local(traced.positions(rays))[:, :2]
 
         return land
@@ -249,8 +248,7 @@ def _front_group(telescope: Telescope, stop: int) -> Telescope:
     before = surfaces[-2].medium_after if len(surfaces) > 1 else telescope.medium_before
     last = replace(surfaces[-1], interaction=Interaction.PASS, medium_after=before)
     clear = tuple(replace(s, aperture=None) for s in (*surfaces[:-1], last))
-    bare: dict[str, Any] = {"groups": {}, "group_frames": {}, "obstructions": (), "design_data": DesignData()}
-    return replace(telescope, surfaces=clear, **bare)
+    return replace(telescope, surfaces=clear, groups={}, group_frames={}, obstructions=(), design_data=DesignData())
 
 
 def _stop_coordinates(telescope: Telescope, stop: Stop, pupil: np.ndarray) -> np.ndarray:
@@ -272,23 +270,23 @@ def _chief_ray_points(telescope: Telescope, stop: Stop, directions: np.ndarray, 
     slopes = directions[:, :2] / -directions[:, 2:]
     size = np.hypot(*slopes.T)
     angle, along = np.arctan(size), slopes / np.where(size > 0, size, 1.0)[:, None]
-    found = np.full_like(slopes, np.nan)
+    chief_points = np.full_like(slopes, np.nan)
     for step in _FIELD_STEPS:
-        left = np.flatnonzero(np.isnan(found).any(axis=1))
-        points = before = np.zeros((len(left), 2))
-        for k in range(int(np.ceil(angle[left].max(initial=0.0) / step)) + 1):
-            at = np.minimum(k * step, angle[left])
-            going = (k - 1) * step < angle[left]
-            tx, ty = (np.tan(at)[:, None] * along[left])[going].T
+        unsolved = np.flatnonzero(np.isnan(chief_points).any(axis=1))
+        points = before = np.zeros((len(unsolved), 2))
+        for k in range(int(np.ceil(angle[unsolved].max(initial=0.0) / step)) + 1):
+            at = np.minimum(k * step, angle[unsolved])
+            going = (k - 1) * step < angle[unsolved]
+            tx, ty = (np.tan(at)[:, None] * along[unsolved])[going].T
             light = field_direction(tx, ty, "gnomonic")
             landing = stop.landing(light, wavelength)
             # Across the beam the pupil moves steadily with the field: go on as in the step before.
-            ahead = [np.cos(np.minimum((k - i) * step, angle[left]))[:, None] for i in range(3)]
+            ahead = [np.cos(np.minimum((k - i) * step, angle[unsolved]))[:, None] for i in range(3)]
             guess = ((2.0 * points * ahead[1] - before * ahead[2]) / ahead[0])[going] if k > 1 else points[going]
             moved = points.copy()
             moved[going] = find_points(
                 landing, guess, np.zeros_like(guess), stop.radius, _central_difference_step(telescope)
             )
             points, before = moved, np.where(going[:, None], points, moved)
-        found[left] = points
-    return found
+        chief_points[unsolved] = points
+    return chief_points

@@ -62,12 +62,16 @@ def land_bundle(
     t = np.zeros_like(x)
 
     def carry(first: int) -> None:
-        part = slice(first, first + CHUNK)
-        for one in np.unique(ccd[part]):
-            here = first + np.flatnonzero(ccd[part] == one)
-            (px, py, pz), (u, v, w) = ([component[here] for component in vector] for vector in (position, direction))
-            if one >= 0:
-                t[here] = _distance_to_ccd(focal_plane, np.array([one]), (px, py, pz), (u, v, w), BUNDLE_STEPS)
+        chunk = slice(first, first + CHUNK)
+        for ccd_index in np.unique(ccd[chunk]):
+            ray_indices = first + np.flatnonzero(ccd[chunk] == ccd_index)
+            (px, py, pz), (u, v, w) = (
+                [component[ray_indices] for component in vector] for vector in (position, direction)
+            )
+            if ccd_index >= 0:
+                t[ray_indices] = _distance_to_ccd(
+                    focal_plane, np.array([ccd_index]), (px, py, pz), (u, v, w), BUNDLE_STEPS
+                )
 
     starts = range(0, len(x), CHUNK)
     if len(starts) == 1:
@@ -102,8 +106,8 @@ def _bundle_ccds(focal_plane: FocalPlane, x: np.ndarray, y: np.ndarray) -> np.nd
     finite = np.isfinite(x)
     if not finite.any():
         return np.full(x.shape, -1)
-    [most] = focal_plane.ccd_at(np.median(x[finite])[None], np.median(y[finite])[None])
-    ccd = np.where(camera.depth(most, x, y) >= 0.0, most, -1)
-    others = np.flatnonzero(ccd < 0)
-    ccd[others] = focal_plane.ccd_at(x[others], y[others])
+    [main_ccd] = focal_plane.ccd_at(np.median(x[finite])[None], np.median(y[finite])[None])
+    ccd = np.where(camera.depth(main_ccd, x, y) >= 0.0, main_ccd, -1)
+    off_main = np.flatnonzero(ccd < 0)
+    ccd[off_main] = focal_plane.ccd_at(x[off_main], y[off_main])
     return ccd

@@ -9,10 +9,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-#: Distance from its target at which a ray is found, and at which it counts as found after the last step [size].
-_FOUND, _NEAR = 1e-12, 1e-9
-#: Most steps of the iteration, and most halvings of a step that increases the distance.
-_STEPS, _HALVINGS = 30, 8
+#: Distance from its target at which the search for a ray ends [size].
+_FOUND = 1e-12
+#: Distance from its target at which a ray counts as found after the last step [size].
+_NEAR = 1e-9
+#: Most steps of the iteration.
+_STEPS = 30
+#: Most halvings of a step that increases the distance.
+_HALVINGS = 8
 
 #: Function from coordinates [k, 2] and indices of rays [k] to landing points [k, 2]; NaN where a ray does not arrive.
 Landing = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -43,28 +47,28 @@ def find_points(
     slopes : ndarray, shape [n, 2, 2], optional
         First derivatives where they are known, about.
     """
-    points, every = start.copy(), np.arange(len(start))
-    here = landing(points, every)
-    miss = here - target
-    slopes = derivatives(landing, points, difference, here) if slopes is None else slopes.copy()
+    points, indices = start.copy(), np.arange(len(start))
+    landed = landing(points, indices)
+    miss = landed - target
+    slopes = derivatives(landing, points, difference, landed) if slopes is None else slopes.copy()
     stuck = np.zeros(len(points), dtype=bool)
     for _ in range(_STEPS):
         distance = np.linalg.norm(miss, axis=1)
         # A ray at NaN is lost: no step leads away from it.
-        left = np.flatnonzero((distance > _FOUND * size) & ~stuck & (np.abs(determinants(slopes)) > 0.0))
-        if not len(left):
+        active = np.flatnonzero((distance > _FOUND * size) & ~stuck & (np.abs(determinants(slopes)) > 0.0))
+        if not len(active):
             break
-        step = -solve_2x2(slopes[left], miss[left])
+        step = -solve_2x2(slopes[active], miss[active])
         for _ in range(_HALVINGS):
-            trial = landing(points[left] + step, left) - target[left]
-            astray = ~(np.linalg.norm(trial, axis=1) < distance[left])
+            trial = landing(points[active] + step, active) - target[active]
+            astray = ~(np.linalg.norm(trial, axis=1) < distance[active])
             if not astray.any():
                 break
             step = np.where(astray[:, None], 0.5 * step, step)
-        stuck[left[astray]] = True
-        rows, step, change = left[~astray], step[~astray], (trial - miss[left])[~astray]
-        rest = change - (slopes[rows] @ step[..., None])[..., 0]
-        slopes[rows] += rest[..., None] * step[:, None] / (step**2).sum(axis=1)[:, None, None]
+        stuck[active[astray]] = True
+        rows, step, change = active[~astray], step[~astray], (trial - miss[active])[~astray]
+        residual = change - (slopes[rows] @ step[..., None])[..., 0]
+        slopes[rows] += residual[..., None] * step[:, None] / (step**2).sum(axis=1)[:, None, None]
         points[rows] += step
         miss[rows] = trial[~astray]
     points[~(np.linalg.norm(miss, axis=1) <= _NEAR * size)] = np.nan
@@ -84,11 +88,13 @@ def solve_2x2(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
         return np.stack([d * x - b * y, a * y - c * x], axis=-1) / determinants(matrices)[:, None]
 
 
-def derivatives(landing: Landing, points: np.ndarray, difference: float, here: np.ndarray | None = None) -> np.ndarray:
+def derivatives(
+    landing: Landing, points: np.ndarray, difference: float, landed: np.ndarray | None = None
+) -> np.ndarray:
     """Return the derivatives [n, 2, 2] of landing points by the coordinates, from one-sided differences."""
-    every = np.arange(len(points))
-    here = landing(points, every) if here is None else here
+    indices = np.arange(len(points))
+    landed = landing(points, indices) if landed is None else landed
     # Both sides in one trace: with few rays the launch of the kernel takes most of the time.
     moved = np.concatenate([points + difference * axis for axis in np.eye(2)])
-    beside = landing(moved, np.tile(every, 2)).reshape(2, -1, 2) - here
+    beside = landing(moved, np.tile(indices, 2)).reshape(2, -1, 2) - landed
     return np.moveaxis(beside, 0, -1) / difference

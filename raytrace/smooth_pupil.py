@@ -15,14 +15,22 @@ from ..core.threads import one_blas_thread
 
 #: Fewest rays of a field for which this is faster than separate searches.
 FEWEST = 1500
-#: Degree of the polynomials, and rings of the rays that they go through, of six rays more each.
-_DEGREE, _RINGS = 10, 9
-#: Distance at the stop, over its radius, at which a ray is found, and one whose square is less than that.
-_FOUND, _NEAR = 1e-13, 1e-7
+#: Degree of the polynomials.
+_DEGREE = 10
+#: Rings of the rays that the polynomials go through, of six rays more each.
+_RINGS = 9
+#: Distance at the stop, over its radius, at which a ray is found.
+_FOUND = 1e-13
+#: Distance at the stop, over its radius, whose square is below ``_FOUND``.
+_NEAR = 1e-7
 #: Error of the slopes of the polynomials over that of their values at most: the square of the degree, and ten times it.
 _SLOPES = 1e3
-#: Steps after which a ray is left to the search; rays at once, and those whose monomials stay in the cache.
-_STEPS, _AT_ONCE, _IN_CACHE = 8, 1 << 18, 1 << 10
+#: Steps after which a ray is left to the search.
+_STEPS = 8
+#: Rays at once.
+_AT_ONCE = 1 << 18
+#: Rays whose monomials stay in the cache.
+_IN_CACHE = 1 << 10
 
 #: Function of points [n, 2]; NaN where a ray does not arrive, or is not found.
 PointMap = Callable[[np.ndarray], np.ndarray]
@@ -43,24 +51,24 @@ def smooth_pupil(target: np.ndarray, at_nodes: np.ndarray, stop: PointMap, searc
     ``search`` finds points of the entrance pupil one by one. It is taken where polynomials fail: beyond folds of the
     pupil, and where rays do not arrive.
     """
-    reach, known = float(_node_radius(target)), np.isfinite(at_nodes).all(axis=1)
-    if known.sum() < 1.5 * _TERMS:
+    reach, finite = float(_node_radius(target)), np.isfinite(at_nodes).all(axis=1)
+    if finite.sum() < 1.5 * _TERMS:
         return search(target)
-    basis, inverse = _fit_matrices() if known.all() else _least_squares_inverse(_monomials(_disk_nodes()[known]))
-    coefficients = inverse @ at_nodes[known]
+    basis, inverse = _fit_matrices() if finite.all() else _least_squares_inverse(_monomials(_disk_nodes()[finite]))
+    coefficients = inverse @ at_nodes[finite]
     table = np.concatenate([coefficients, *(_differentiated(coefficients, axis) / reach for axis in (0, 1))], axis=1)
     sense = np.sign(np.linalg.det(table[0, 2:].reshape(2, 2)))
     # A step leaves the error of its slopes, times the distance: where that is rounding, no trace has to confirm it.
-    error = float(np.abs(basis @ coefficients - at_nodes[known]).max() / np.abs(table[0, 2:]).max())
+    error = float(np.abs(basis @ coefficients - at_nodes[finite]).max() / np.abs(table[0, 2:]).max())
     near = min(_NEAR, _FOUND / max(_SLOPES * error, _FOUND))
-    found = np.empty_like(target)
+    points = np.empty_like(target)
     for first in range(0, len(target), _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
-        found[part] = _by_newton(target[part], table, reach, float(sense), near, stop)
-    lost = np.flatnonzero(~np.isfinite(found).all(axis=1))
+        chunk = slice(first, first + _AT_ONCE)
+        points[chunk] = _by_newton(target[chunk], table, reach, float(sense), near, stop)
+    lost = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(lost):
-        found[lost] = search(target[lost])
-    return found
+        points[lost] = search(target[lost])
+    return points
 
 
 def _by_newton(
@@ -72,18 +80,18 @@ def _by_newton(
     """
     value = np.empty((len(target), 6))
     for first in range(0, len(target), _IN_CACHE):
-        part = slice(first, first + _IN_CACHE)
-        value[part] = _monomials(target[part] / reach) @ table
+        chunk = slice(first, first + _IN_CACHE)
+        value[chunk] = _monomials(target[chunk] / reach) @ table
     points, by_x, by_y = value[:, :2].copy(), value[:, 2:4], value[:, 4:]
-    left = np.arange(len(target))
+    active = np.arange(len(target))
     for step in range(_STEPS):
-        some = slice(None) if step == 0 else left
-        miss = target[some] - stop(points[some])
-        points[some] += miss[:, :1] * by_x[some] + miss[:, 1:] * by_y[some]
-        left = left[~((np.abs(miss[:, 0]) <= near) & (np.abs(miss[:, 1]) <= near))]
-        if not len(left):
+        rows = slice(None) if step == 0 else active
+        miss = target[rows] - stop(points[rows])
+        points[rows] += miss[:, :1] * by_x[rows] + miss[:, 1:] * by_y[rows]
+        active = active[~((np.abs(miss[:, 0]) <= near) & (np.abs(miss[:, 1]) <= near))]
+        if not len(active):
             break
-    points[left] = np.nan
+    points[active] = np.nan
     # Beyond a fold the map goes the other way round.
     points[~((by_x[:, 0] * by_y[:, 1] - by_x[:, 1] * by_y[:, 0]) * sense > 0.0)] = np.nan
     return points

@@ -113,8 +113,8 @@ def trace_packets(
     start.direction = warp_array(to_packets(rays.direction.T[None]), lanes)
     start.path = warp_array(to_packets(rays.path_length[None]), lanes)
     # Of few rays, threads cost more than the trace.
-    some = 1 if count <= _ONE_THREAD else threads
-    launch(trace_rays.variant_for(packed), count, [packed, warp_array(indices[None]), start, end], threads=some)
+    threads = 1 if count <= _ONE_THREAD else threads
+    launch(trace_rays.variant_for(packed), count, [packed, warp_array(indices[None]), start, end], threads=threads)
     return PacketTrace(indices, start, end)
 
 
@@ -184,17 +184,18 @@ def trace(
     if surfaces not in ("last", "all"):
         raise ConfigError(f"surfaces = {surfaces!r}: expected 'last' or 'all'")
     n = len(rays)
-    every = len(telescope.surfaces) if surfaces == "all" else 1
+    n_stored = len(telescope.surfaces) if surfaces == "all" else 1
     if out is not None:
         _check_out(out, n, alone=surfaces == "last" and focal_plane is None)
     stored = None if out is None else out._packets
-    end = trace_packets(telescope, rays, every, threads=threads, out=stored).end
+    end = trace_packets(telescope, rays, n_stored, threads=threads, out=stored).end
     names = telescope.surface_names if surfaces == "all" else telescope.surface_names[-1:]
     positions, directions = from_packets(end.position, n), from_packets(end.direction, n)
     paths, statuses = from_packets(end.path, n), from_packets(end.status, n)
+    packets = end if n_stored == 1 else None
     # Transposed views, not copies: the rays stay in structure-of-arrays order.
     results = [
-        TraceResult(name, positions[i].T, directions[i].T, paths[i], statuses[i], _packets=end if every == 1 else None)
+        TraceResult(name, positions[i].T, directions[i].T, paths[i], statuses[i], _packets=packets)
         for i, name in enumerate(names)
     ]
     if focal_plane is not None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from astropy import units as u
+from astropy.table import Column
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
@@ -147,7 +148,7 @@ def tangent_plane(ra: Any, dec: Any, pointing: Any) -> tuple[np.ndarray, np.ndar
 
 
 def _column_values(
-    columns: dict[str, Any], name: str, unit: u.UnitBase | None = None, default: Any = None
+    columns: dict[str, Column | np.ndarray], name: str, unit: u.UnitBase | None = None, default: float | None = None
 ) -> np.ndarray:
     """Return a column as numbers, in rad where it has a unit of angle; `unit` is that of a column without one."""
     key = next((alias for alias in NAMES.get(name, (name,)) if alias in columns), None)
@@ -168,13 +169,13 @@ def _column_values(
         raise DomainError(f"column {key!r}, row {bad[0] + 1}: expected a finite number", key=key)
     if unit is None:
         return numbers
-    given = getattr(column, "unit", None)
-    if isinstance(given, u.UnrecognizedUnit):
-        raise DomainError(f"column {key!r} in {given}: expected a unit of angle", key=key)
-    return radians(u.Quantity(numbers, given or unit), key)
+    column_unit = getattr(column, "unit", None)
+    if isinstance(column_unit, u.UnrecognizedUnit):
+        raise DomainError(f"column {key!r} in {column_unit}: expected a unit of angle", key=key)
+    return radians(u.Quantity(numbers, column_unit or unit), key)
 
 
-def _from_catalogue(columns: dict[str, Any], pointing: Any) -> Galaxies:
+def _from_catalogue(columns: dict[str, Column | np.ndarray], pointing: Any) -> Galaxies:
     """Return galaxies of one component from the columns of a catalogue."""
     if "xi" in columns or "eta" in columns:
         xi, eta = (_column_values(columns, name, u.rad) for name in ("xi", "eta"))
@@ -184,8 +185,8 @@ def _from_catalogue(columns: dict[str, Any], pointing: Any) -> Galaxies:
             raise DomainError("ra, dec: expected pointing=(right ascension, declination)", key="pointing")
         xi, eta = tangent_plane(ra, dec, pointing)
     else:
-        found = ", ".join(columns) or "none"
-        raise ProductError(f"no columns 'ra' and 'dec', nor 'xi' and 'eta'; columns are {found}", key="ra")
+        column_names = ", ".join(columns) or "none"
+        raise ProductError(f"no columns 'ra' and 'dec', nor 'xi' and 'eta'; columns are {column_names}", key="ra")
     magnitude = _column_values(columns, "mag")
     radius = _column_values(columns, "half_light_radius", u.arcsec)
     if "q" in columns:
@@ -196,13 +197,13 @@ def _from_catalogue(columns: dict[str, Any], pointing: Any) -> Galaxies:
         e = (1.0 - ratio) / (1.0 + ratio) * np.exp(2j * (0.5 * np.pi - _column_values(columns, "pa", u.deg)))
         e1, e2 = e.real, e.imag
     else:
-        given = "e1" in columns or "e2" in columns
-        e1, e2 = (_column_values(columns, name, default=None if given else 0.0) for name in ("e1", "e2"))
+        has_ellipticity = "e1" in columns or "e2" in columns
+        e1, e2 = (_column_values(columns, name, default=None if has_ellipticity else 0.0) for name in ("e1", "e2"))
     sersic = _column_values(columns, "n", default=1.0)
     return Galaxies.single(xi, eta, magnitude, radius, e1=e1, e2=e2, sersic=sersic)
 
 
-def _from_components(columns: dict[str, Any]) -> Galaxies:
+def _from_components(columns: dict[str, Column | np.ndarray]) -> Galaxies:
     """Return galaxies from the columns of a table of components."""
     owner = _column_values(columns, "galaxy")
     first = np.flatnonzero(np.diff(owner, prepend=-1.0))

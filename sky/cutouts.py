@@ -22,8 +22,10 @@ from ..core.units import ARCMIN
 LEAST_AREA = 8
 #: Header keywords of an AB zero point, tried after PHOTFLAM and PHOTPLAM of the HST.
 ZERO_POINT_KEYS = ("MAGZPT", "MAGZERO", "MAGZP", "ZEROPNT", "ZEROPT", "ZP", "ABZP")
-#: Signal-to-noise ratio and number of objects that determine the stellar locus.
-LOCUS_SNR, LOCUS_COUNT = 50.0, 8
+#: Least signal-to-noise ratio of objects that determine the stellar locus.
+LOCUS_SNR = 50.0
+#: Fewest objects that determine the stellar locus.
+LOCUS_COUNT = 8
 #: Objects within this factor of the half-light radius of the PSF count as stars.
 LOCUS_WIDTH = 1.15
 # Half-light radii are measured within so many semi-major axes.
@@ -80,10 +82,10 @@ def read_mosaic(path: str | Path, zero_point: float | str | None = None) -> Mosa
         warnings.simplefilter("ignore", AstropyWarning)
         with parsing(path, "cannot be read as FITS", ProductError), open(path, "rb") as file:
             hdus = fits.open(file, memmap=False)
-            found = next(((h.data, h.header) for h in hdus if h.is_image and np.ndim(h.data) == 2), None)
-        if found is None:
+            first_image = next(((h.data, h.header) for h in hdus if h.is_image and np.ndim(h.data) == 2), None)
+        if first_image is None:
             raise ProductError("has no image of two axes, expected a mosaic of the sky", file=path)
-        data, header = found
+        data, header = first_image
         with parsing(path, "celestial coordinates", ProductError):
             coordinates = WCS(header)
             scale = np.deg2rad(coordinates.celestial.pixel_scale_matrix) if coordinates.has_celestial else None
@@ -93,17 +95,17 @@ def read_mosaic(path: str | Path, zero_point: float | str | None = None) -> Mosa
         return Mosaic(str(path), np.asarray(data, dtype=np.float32), scale, _zero_point(path, header, zero_point))
 
 
-def _zero_point(path: str | Path, header: fits.Header, given: float | str | None) -> float:
-    """Return the AB zero point that is given, or that of a header."""
-    if given is None and "PHOTFLAM" in header and "PHOTPLAM" in header:
+def _zero_point(path: str | Path, header: fits.Header, zero_point: float | str | None) -> float:
+    """Return an AB zero point, or that of a header by keyword or by default."""
+    if zero_point is None and "PHOTFLAM" in header and "PHOTPLAM" in header:
         # AB magnitude of a flux per wavelength at the pivot wavelength (ACS Data Handbook, sec. 5.1).
         with np.errstate(all="ignore"):
             value = -2.5 * np.log10(float(header["PHOTFLAM"])) - 5.0 * np.log10(float(header["PHOTPLAM"])) - 2.408
         name = "PHOTFLAM, PHOTPLAM"
-    elif isinstance(given, int | float | np.number):
-        name, value = "zero_point", float(given)
+    elif isinstance(zero_point, int | float | np.number):
+        name, value = "zero_point", float(zero_point)
     else:
-        keys = ZERO_POINT_KEYS if given is None else (given,)
+        keys = ZERO_POINT_KEYS if zero_point is None else (zero_point,)
         name = next((key for key in keys if key in header), "")
         if not name:
             text = f"has no {' or '.join(keys)} in its header, expected an AB zero point (zero_point=)"
@@ -134,49 +136,49 @@ def cut_galaxies(mosaic: Mosaic, *, side: float, psf_radius: float | None, seed:
         If there are no objects, too few to find the stars among them, or none larger than the PSF.
     """
     require_bytes(_BYTES_PER_PIXEL * mosaic.image.size, f"galaxies of {mosaic.path}")
-    missing = ~np.isfinite(mosaic.image)
-    if missing.all():
+    bad_pixels = ~np.isfinite(mosaic.image)
+    if bad_pixels.all():
         raise ProductError("has no finite pixels", file=mosaic.path)
-    data = np.ascontiguousarray(np.where(missing, np.float32(0.0), mosaic.image))
-    background = sep.Background(data, mask=missing)
+    data = np.ascontiguousarray(np.where(bad_pixels, np.float32(0.0), mosaic.image))
+    background = sep.Background(data, mask=bad_pixels)
     data -= background.back(dtype=np.float32)
     noise = background.rms(dtype=np.float32)
-    if not np.all(noise[~missing] > 0.0):
+    if not np.all(noise[~bad_pixels] > 0.0):
         raise ProductError("the sky has no noise, expected a mosaic with a measurable rms", file=mosaic.path)
     # Bright galaxies have more pixels than sep reserves room for.
     sep.set_extract_pixstack(max(300_000, data.size // 4))
-    options = {"mask": missing, "minarea": LEAST_AREA, "segmentation_map": True, "filter_type": "conv"}
-    found, owner = sep.extract(data, 1.0, err=noise, **options)
-    if not len(found):
+    options = {"mask": bad_pixels, "minarea": LEAST_AREA, "segmentation_map": True, "filter_type": "conv"}
+    objects, owner = sep.extract(data, 1.0, err=noise, **options)
+    if not len(objects):
         raise ProductError(f"no objects of {LEAST_AREA} connected pixels above the rms of the sky", file=mosaic.path)
-    x, y, a = found["x"], found["y"], found["a"]
-    ids = np.arange(1, len(found) + 1)
+    x, y, a = objects["x"], objects["y"], objects["a"]
+    ids = np.arange(1, len(objects) + 1)
     radius, _ = sep.flux_radius(
-        data, x, y, _REACH * a, 0.5, normflux=found["flux"], mask=missing, segmap=owner, seg_id=ids
+        data, x, y, _REACH * a, 0.5, normflux=objects["flux"], mask=bad_pixels, segmap=owner, seg_id=ids
     )
-    snr = found["flux"] / (noise[np.rint(y).astype(int), np.rint(x).astype(int)] * np.sqrt(found["npix"]))
+    snr = objects["flux"] / (noise[np.rint(y).astype(int), np.rint(x).astype(int)] * np.sqrt(objects["npix"]))
     if psf_radius is None:
         psf_radius = _stellar_locus(mosaic.path, radius[snr > LOCUS_SNR])
 
-    images, center, fluxes, kept = [], [], [], []
+    images, center, fluxes, cut_indices = [], [], [], []
     for i in np.flatnonzero(radius > LOCUS_WIDTH * psf_radius):
         column, row, half = round(x[i]), round(y[i]), int(np.ceil(0.5 * side * a[i]))
         square = (slice(row - half, row + half + 1), slice(column - half, column + half + 1))
         inside = half <= column < data.shape[1] - half and half <= row < data.shape[0] - half
-        if not inside or missing[square].any():
+        if not inside or bad_pixels[square].any():
             continue
-        others = (owner[square] != 0) & (owner[square] != ids[i])
-        sky = stream(seed, "mosaic", int(i)).normal(size=others.shape) * noise[square]
-        image = np.where(others, sky, data[square])
+        neighbours = (owner[square] != 0) & (owner[square] != ids[i])
+        sky = stream(seed, "mosaic", int(i)).normal(size=neighbours.shape) * noise[square]
+        image = np.where(neighbours, sky, data[square])
         if image.sum() > 0.0:
             images.append(image)
             center.append((x[i] - column, y[i] - row))
             fluxes.append(image.sum())
-            kept.append(i)
+            cut_indices.append(i)
     if not images:
-        text = f"none of {len(found)} objects is larger than the PSF (half-light radius {psf_radius:.2f} pixels)"
+        text = f"none of {len(objects)} objects is larger than the PSF (half-light radius {psf_radius:.2f} pixels)"
         raise ProductError(text, file=mosaic.path)
-    return Cutouts(images, np.array(center), np.array(fluxes), radius[kept], float(psf_radius))
+    return Cutouts(images, np.array(center), np.array(fluxes), radius[cut_indices], float(psf_radius))
 
 
 def _stellar_locus(path: str, radius: np.ndarray) -> float:

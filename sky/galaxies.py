@@ -122,25 +122,26 @@ class Galaxies(Result):
         """Return galaxies of one component each, from arrays of one shape [n] or scalars; units as in the class."""
         angles = {"xi": xi, "eta": eta, "radius": radius}
         numbers = {"magnitude": magnitude, "e1": e1, "e2": e2, "sersic": sersic}
-        given = {name: radians(v, name) for name, v in angles.items()}
-        given |= {name: pure_numbers(v, name) for name, v in numbers.items()}
-        for name, values in given.items():
+        arrays = {name: radians(v, name) for name, v in angles.items()}
+        arrays |= {name: pure_numbers(v, name) for name, v in numbers.items()}
+        for name, values in arrays.items():
             if values.ndim > 1:
                 raise DomainError(f"{name} has shape {values.shape}: expected one number or [n]")
-        each = broadcast_together({name: np.atleast_1d(values) for name, values in given.items()})
-        named = dict(zip(given, each, strict=True))
-        none = np.zeros(len(named["xi"]))
-        first = np.arange(len(none) + 1)
-        return cls(first=first, dx=none, dy=none, fraction=none + 1.0, component_radius=named["radius"], **named)
+        columns = broadcast_together({name: np.atleast_1d(values) for name, values in arrays.items()})
+        named = dict(zip(arrays, columns, strict=True))
+        count = len(named["xi"])
+        zero = np.zeros(count)
+        first = np.arange(count + 1)
+        return cls(first=first, dx=zero, dy=zero, fraction=np.ones(count), component_radius=named["radius"], **named)
 
     @classmethod
     def concatenate(cls, parts: Sequence[Galaxies]) -> Galaxies:
         """Join galaxies in order; none at all give an empty object."""
         joined = {
-            name: np.concatenate([np.zeros(0), *(getattr(part, name) for part in parts)])
+            name: np.concatenate([np.zeros(0), *(getattr(galaxies, name) for galaxies in parts)])
             for name in (*_PER_GALAXY, *_PER_COMPONENT)
         }
-        counts = np.concatenate([np.zeros(1, dtype=np.int64), *(np.diff(part.first) for part in parts)])
+        counts = np.concatenate([np.zeros(1, dtype=np.int64), *(np.diff(galaxies.first) for galaxies in parts)])
         return cls(first=np.cumsum(counts), **joined)
 
     def __len__(self) -> int:
@@ -154,15 +155,15 @@ class Galaxies(Result):
     def take(self, indices: Any) -> Galaxies:
         """Return some of the galaxies: indices, which may repeat, a boolean mask or a slice."""
         try:
-            chosen = np.atleast_1d(np.arange(len(self))[indices])
+            selection = np.atleast_1d(np.arange(len(self))[indices])
         except (IndexError, ValueError):
-            chosen = np.empty((0, 0))
-        if chosen.ndim != 1:
+            selection = np.empty((0, 0))
+        if selection.ndim != 1:
             raise DomainError(f"indices = {shown(indices)}: expected integers below {len(self)}, a mask or a slice")
-        counts = np.diff(self.first)[chosen]
+        counts = np.diff(self.first)[selection]
         first = np.concatenate([[0], np.cumsum(counts)])
-        component = np.arange(first[-1]) + np.repeat(self.first[chosen] - first[:-1], counts)
-        parts = {name: getattr(self, name)[chosen] for name in _PER_GALAXY}
+        component = np.arange(first[-1]) + np.repeat(self.first[selection] - first[:-1], counts)
+        parts = {name: getattr(self, name)[selection] for name in _PER_GALAXY}
         parts |= {name: getattr(self, name)[component] for name in _PER_COMPONENT}
         return Galaxies(first=first, **parts)
 
@@ -240,14 +241,14 @@ class Galaxies(Result):
         DomainError
             If an index is outside the galaxies, or shapes do not match.
         """
-        chosen, jacobian, offset = grid_arguments(len(self), indices, jacobian, offset, size)
+        selection, jacobian, offset = grid_arguments(len(self), indices, jacobian, offset, size)
         start_warp()
         table = sersic_table()
-        drawn = self.take(chosen)
-        result = np.zeros((len(chosen), size, size // 2 + 1), dtype=np.complex64)
+        drawn = self.take(selection)
+        result = np.zeros((len(selection), size, size // 2 + 1), dtype=np.complex64)
         launch(
             transform_galaxies,
-            len(chosen),
+            len(selection),
             [
                 warp_array(drawn.first, wp.int32),
                 warp_array(np.stack([getattr(drawn, name) for name in _PER_COMPONENT], axis=1)),
@@ -256,7 +257,7 @@ class Galaxies(Result):
                 warp_array(table.values, wp.float32),
                 wp.vec4(*table.log_index, *table.log_wave_number),
                 size,
-                wp.empty((len(chosen), table.values.shape[1]), dtype=wp.float32, device="cpu"),
+                wp.empty((len(selection), table.values.shape[1]), dtype=wp.float32, device="cpu"),
                 warp_array(result, wp.vec2),
             ],
             threads=threads,
@@ -277,11 +278,13 @@ def grid_arguments(
     count: int, indices: Any, jacobian: Any, offset: Any, size: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the arguments of a transform as arrays, or raise DomainError where they do not belong together."""
-    chosen = np.asarray(indices)
+    selection = np.asarray(indices)
     jacobian = np.asarray(jacobian, dtype=np.float64)
     offset = np.asarray(offset, dtype=np.float64)
-    n = chosen.size
-    if chosen.shape != (n,) or (n and not (chosen.dtype.kind in "iu" and 0 <= chosen.min() <= chosen.max() < count)):
+    n = selection.size
+    if selection.shape != (n,) or (
+        n and not (selection.dtype.kind in "iu" and 0 <= selection.min() <= selection.max() < count)
+    ):
         raise DomainError(f"indices: expected a list of integers from 0 to {count - 1}")
     if jacobian.shape != (n, 2, 2) or not np.all(np.isfinite(jacobian)):
         raise DomainError(f"jacobian: shape {jacobian.shape}, expected finite numbers of shape ({n}, 2, 2)")
@@ -290,4 +293,4 @@ def grid_arguments(
     if not (isinstance(size, int | np.integer) and size >= 1):
         raise DomainError(f"size = {size!r}: expected a positive number of pixels")
     # An empty list has no type.
-    return chosen.astype(np.int64), jacobian, offset
+    return selection.astype(np.int64), jacobian, offset

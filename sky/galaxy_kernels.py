@@ -102,15 +102,15 @@ def transform_galaxies(
     the transform of one component. Result [item, ky, kx]: complex, zero before.
     """
     item = first + wp.tid()
-    one = wp.float64(1.0)
+    unity = wp.float64(1.0)
     two_pi = wp.float64(wp.TAU)
     for c in range(components[item], components[item + 1]):
         fraction = numbers[c, 2]
         e1 = numbers[c, 4]
         e2 = numbers[c, 5]
         # The unit circle becomes the isophote that holds half of the light.
-        scale = numbers[c, 3] / wp.sqrt(one - e1 * e1 - e2 * e2)
-        shape = scale * jacobian[item] * wp.mat22d(one + e1, e2, e2, one - e1)
+        scale = numbers[c, 3] / wp.sqrt(unity - e1 * e1 - e2 * e2)
+        shape = scale * jacobian[item] * wp.mat22d(unity + e1, e2, e2, unity - e1)
         place = offset[item] + jacobian[item] * wp.vec2d(numbers[c, 0], numbers[c, 1])
 
         i, u = cell((wp.float32(wp.log(numbers[c, 6])) - steps[0]) / steps[1], table.shape[0])
@@ -127,8 +127,8 @@ def transform_galaxies(
         start = steps[2] / steps[3]
         columns = size // 2 + 1
         # Where packets would hold the last column alone, packets along that column do.
-        left = columns % LANES
-        blocks = wp.where(left == 1, columns // LANES, (columns + LANES - 1) // LANES)
+        tail_columns = columns % LANES
+        blocks = wp.where(tail_columns == 1, columns // LANES, (columns + LANES - 1) // LANES)
         # Wave vector of the unit circle: (ax kx + ay ky, bx kx + by ky).
         step = two_pi / wp.float64(size)
         ax = wp.float32(step * shape[0, 0])
@@ -154,7 +154,7 @@ def transform_galaxies(
                     if column < columns:
                         result[item, row, column] += value[lane] * wp.vec2(wp.float32(phase[0]), wp.float32(phase[1]))
                         phase = product(phase, turn)
-        if left == 1:
+        if tail_columns == 1:
             x = wp.float32(columns - 1)
             for block in range((size + LANES - 1) // LANES):
                 squared = samples()

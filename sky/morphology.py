@@ -17,7 +17,12 @@ MOST_CLUMPS = 6
 #: Random numbers of a galaxy, and of each of its clumps.
 ATTRIBUTES = ("kind", "irregular_kind", "axis_ratio", "angle", "index", "bulge", "clumps")
 CLUMP_ATTRIBUTES = ("distance", "direction", "light", "size", "ellipticity", "angle")
-SPHEROID, DISC, FIRST_IRREGULAR = 0, 1, 2
+#: Kind of spheroids.
+SPHEROID = 0
+#: Kind of discs.
+DISC = 1
+#: First of the irregular kinds, which follow in the order of ``IRREGULAR_KINDS``.
+FIRST_IRREGULAR = 2
 
 
 class IrregularKind(NamedTuple):
@@ -39,14 +44,20 @@ IRREGULAR_KINDS = (
     IrregularKind("double", 126, (0.5, 0.9), (2, 2), 0.7, 0.8, 0.3, (0.25, 0.45)),
     IrregularKind("tadpole", 97, (0.2, 0.5), (1, 1), 0.45, 1.1, 0.2, (0.15, 0.3)),
 )
-# Sersic indices: flat envelopes and clumps without exponential discs; bulges.
-_ENVELOPE_INDEX, _BULGE_INDEX = 0.7, 4.0
+# Sersic index of envelopes and clumps, which are flat and have no exponential disc.
+_ENVELOPE_INDEX = 0.7
+# Sersic index of bulges (Miller et al. 2013).
+_BULGE_INDEX = 4.0
 # Medians and scatter of ln n of discs and spheroids, and their ranges.
 _INDICES = {DISC: (1.0, 0.25, 0.6, 2.0), SPHEROID: (3.5, 0.3, 1.5, 6.0)}
-# Sigma of the bulge-to-total ratio, and half-light radius of a bulge over that of its disc (0.6 scale lengths).
-_BULGE_RATIO, _BULGE_RADIUS = 0.1, 0.6 / 1.678
-# Scatter of the logarithm of the light of clumps, and their greatest ellipticity.
-_CLUMP_SCATTER, _CLUMP_ELLIPTICITY = 0.5, 0.3
+# Sigma of the bulge-to-total ratio (Miller et al. 2013).
+_BULGE_RATIO = 0.1
+# Half-light radius of a bulge over that of its disc: 0.6 scale lengths (Miller et al. 2013) over 1.678.
+_BULGE_RADIUS = 0.6 / 1.678
+# Scatter of the logarithm of the light of clumps.
+_CLUMP_SCATTER = 0.5
+# Greatest ellipticity of clumps.
+_CLUMP_ELLIPTICITY = 0.3
 
 
 class Components(NamedTuple):
@@ -72,9 +83,9 @@ def irregular_fraction(magnitude: np.ndarray) -> np.ndarray:
 def galaxy_kinds(magnitude: np.ndarray, kind: np.ndarray, irregular_kind: np.ndarray) -> np.ndarray:
     """Return 0 for a spheroid, 1 for a disc, 2 and more for the irregular kinds, from two uniform numbers each, [n]."""
     share = np.cumsum([k.number for k in IRREGULAR_KINDS])
-    which = np.searchsorted(share[:-1], irregular_kind * share[-1], side="right")
+    irregular_index = np.searchsorted(share[:-1], irregular_kind * share[-1], side="right")
     regular = np.where(kind < SPHEROIDS, SPHEROID, DISC)
-    return np.where(kind >= 1.0 - irregular_fraction(magnitude), FIRST_IRREGULAR + which, regular)
+    return np.where(kind >= 1.0 - irregular_fraction(magnitude), FIRST_IRREGULAR + irregular_index, regular)
 
 
 @lru_cache(maxsize=2)
@@ -140,17 +151,17 @@ def make_components(magnitude: np.ndarray, uniform: np.ndarray, clump_uniform: n
 
     place -= np.sum(fraction * place, axis=1, keepdims=True)
     # Half-light radius of a sum of round Gaussians about one centre, to first order in their differences.
-    whole = np.sqrt(np.sum(fraction * (radius**2 + np.log(2.0) * np.abs(place) ** 2), axis=1, keepdims=True))
+    galaxy_radius = np.sqrt(np.sum(fraction * (radius**2 + np.log(2.0) * np.abs(place) ** 2), axis=1, keepdims=True))
     present = fraction > 0.0
     main = np.abs(ellipticity[:, 0])
     return Components(
         first=np.concatenate([[0], np.cumsum(present.sum(axis=1))]),
         axis_ratio=(1.0 - main) / (1.0 + main),
         spheroid=kind == SPHEROID,
-        dx=(place / whole).real[present],
-        dy=(place / whole).imag[present],
+        dx=(place / galaxy_radius).real[present],
+        dy=(place / galaxy_radius).imag[present],
         fraction=fraction[present],
-        radius=(radius / whole)[present],
+        radius=(radius / galaxy_radius)[present],
         e1=ellipticity.real[present],
         e2=ellipticity.imag[present],
         sersic=sersic[present],
@@ -170,8 +181,8 @@ def _add_clumps(
 ) -> None:
     """Put clumps into the galaxies of one kind, whose envelopes have the given complex ellipticities."""
     u = dict(zip(CLUMP_ATTRIBUTES, np.moveaxis(clump_uniform, 2, 0), strict=True))
-    fewest, most = traits.clumps
-    number = fewest + np.floor((most - fewest + 1) * count)
+    low, high = traits.clumps
+    number = low + np.floor((high - low + 1) * count)
     order = np.arange(MOST_CLUMPS)
     light = np.where(order < number[:, None], np.exp(_CLUMP_SCATTER * ndtri(u["light"])), 0.0)
     light *= traits.light / light.sum(axis=1, keepdims=True)

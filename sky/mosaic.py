@@ -123,8 +123,8 @@ class GalaxyStamps(Result):
         finest = positive_angle(finest_pixel, "finest_pixel")
         mosaic = read_mosaic(path, zero_point)
         pixel = float(np.sqrt(abs(np.linalg.det(mosaic.scale))))
-        given = None if psf_radius is None else positive_angle(psf_radius, "psf_radius") / pixel
-        cut: Cutouts = cut_galaxies(mosaic, side=side, psf_radius=given, seed=seed)
+        psf_pixels = None if psf_radius is None else positive_angle(psf_radius, "psf_radius") / pixel
+        cut: Cutouts = cut_galaxies(mosaic, side=side, psf_radius=psf_pixels, seed=seed)
         return cls(
             magnitude=mosaic.zero_point - 2.5 * np.log10(cut.flux),
             radius=cut.radius * pixel,
@@ -227,7 +227,7 @@ class PlantedGalaxies:
     def concatenate(cls, parts: Sequence[PlantedGalaxies]) -> PlantedGalaxies:
         """Join galaxies of the same stamps, at least one part."""
         joined = {
-            name: np.concatenate([getattr(part, name) for part in parts])
+            name: np.concatenate([getattr(galaxies, name) for galaxies in parts])
             for name in ("index", "xi", "eta", "distortion")
         }
         return cls(parts[0].stamps, **joined)
@@ -284,19 +284,19 @@ class PlantedGalaxies:
         DomainError
             If an index is outside the galaxies, shapes do not match, or pixels are finer than the stamps are made for.
         """
-        chosen, jacobian, offset = grid_arguments(len(self), indices, jacobian, offset, size)
+        selection, jacobian, offset = grid_arguments(len(self), indices, jacobian, offset, size)
         start_warp()
-        stamp, tables = self.index[chosen], self.stamps.tables
+        stamp, tables = self.index[selection], self.stamps.tables
         # Frequencies on the grid [cycles/pixel] to those of the mosaic.
-        frequency = np.swapaxes(jacobian @ self.distortion[chosen] @ self.stamps.scale, 1, 2)
+        frequency = np.swapaxes(jacobian @ self.distortion[selection] @ self.stamps.scale, 1, 2)
         corners = np.abs(frequency @ np.array([[0.5, 0.5], [0.5, -0.5]])).max(initial=0.0)
         if corners > self.stamps.reach < 0.5:
             text = f"expected {self.stamps.finest_pixel / ARCSEC:.3g} arcsec or more (finest_pixel=)"
             raise DomainError(f"jacobian: pixels finer than the stamps are made for, {text}")
-        result = np.empty((len(chosen), size, size // 2 + 1), dtype=np.complex64)
+        result = np.empty((len(selection), size, size // 2 + 1), dtype=np.complex64)
         launch(
             transform_stamps,
-            len(chosen),
+            len(selection),
             [
                 warp_array(stamp, wp.int32),
                 warp_array(frequency * (self.stamps.steps[stamp] / size)[:, None, None], wp.mat22d),
@@ -338,9 +338,9 @@ class StampPopulation:
 
     def _galaxies_of(self, cell: Cell, region: Region) -> PlantedGalaxies:
         n = len(poisson_arrivals(cell.stream(self.seed, "mosaic", "number"), self.density * (SIDE / ARCMIN) ** 2))
-        x, y, which, angle = cell.stream(self.seed, "mosaic", "traits").random((n, 4)).T
+        x, y, stamp_uniform, angle = cell.stream(self.seed, "mosaic", "traits").random((n, 4)).T
         xi, eta = cell.place(x, y)
-        index = (which * len(self.stamps)).astype(np.int64)
+        index = (stamp_uniform * len(self.stamps)).astype(np.int64)
         planted = PlantedGalaxies(self.stamps, index, xi, eta, _rotation_matrices(2.0 * np.pi * angle))
         return planted.take(region.contains(xi, eta))
 

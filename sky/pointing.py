@@ -113,7 +113,7 @@ class Pointing:
 
 def _angle_pairs(values: ArrayLike, name: str) -> np.ndarray:
     """Return angles as [n, 2]; one pair may be given as [2]."""
-    found = np.atleast_2d(radians(values, name))
-    if found.ndim != 2 or found.shape[1] != 2:
+    pairs = np.atleast_2d(radians(values, name))
+    if pairs.ndim != 2 or pairs.shape[1] != 2:
         raise DomainError(f"{name} has shape {np.shape(values)}: expected [n, 2]")
-    return found
+    return pairs

@@ -45,12 +45,21 @@ from .cells import SIDE, Cell, Region, poisson_arrivals
 from .galaxies import Galaxies
 from .morphology import ATTRIBUTES, CLUMP_ATTRIBUTES, MOST_CLUMPS, make_components
 
-#: Galaxies per square arcminute brighter than 25, and slope of the logarithm of the counts.
-COUNT, SLOPE = 46.0, 0.31
-#: Median of ln(disc scale length / arcsec) at magnitude 23, its slope per magnitude, and the scatter.
-LOG_LENGTH, LENGTH_SLOPE, LENGTH_SCATTER = -1.145, -0.269, 0.4
-#: Half-light radius over scale length: of an exponential disc, and of spheroids for the same median.
-DISC_RADIUS, SPHEROID_RADIUS = 1.678, 0.839
+#: Galaxies brighter than 25 [1/arcmin^2] (LSST Science Book 2009, eq. 3.7).
+COUNT = 46.0
+#: Slope of the decimal logarithm of the counts per magnitude (ibid.).
+SLOPE = 0.31
+#: Median of ln(disc scale length / arcsec) at magnitude 23 (Miller et al. 2013).
+LOG_LENGTH = -1.145
+#: Slope of that median per magnitude (ibid.).
+LENGTH_SLOPE = -0.269
+#: Scatter of ln(scale length): that of late types of one mass (van der Wel et al. 2014).
+LENGTH_SCATTER = 0.4
+#: Half-light radius of an exponential disc over its scale length.
+DISC_RADIUS = 1.678
+#: Half-light radius of spheroids over the scale length of discs of the same median: half that of discs (van der
+#: Wel et al. 2014).
+SPHEROID_RADIUS = 0.839
 
 
 def counts(magnitude: Any) -> np.ndarray:

@@ -10,16 +10,22 @@ from scipy.special import gammaincinv, loggamma
 
 from ..core.threads import one_blas_thread
 
-#: Range of the Sersic index, that of GalSim.
-LEAST_INDEX, GREATEST_INDEX = 0.3, 6.2
+#: Least Sersic index, that of GalSim.
+LEAST_INDEX = 0.3
+#: Greatest Sersic index, that of GalSim.
+GREATEST_INDEX = 6.2
 # Steps of the table. Interpolation with four points each way is off by 4e-6 of the flux at most, at an index of 0.3,
 # whose transform oscillates.
 _INDICES = 48
 _WAVE_NUMBERS = 476
 # Below exp(-9) / radius the transform is 1 to 5e-7, beyond exp(10) / radius less than 3e-6.
 _LOG_WAVE_NUMBERS = (-9.0, 10.0)
-# Mellin-Barnes integral: real part of the path, step and end of the trapezoidal rule.
-_REAL, _STEP, _END = 1.0, 0.15, 80.0
+# Real part of the path of the Mellin-Barnes integral.
+_REAL = 1.0
+# Step of the trapezoidal rule along the path.
+_STEP = 0.15
+# End of the trapezoidal rule.
+_END = 80.0
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ def transform_stamps(
     either side of zero; size of the grid. Result [item, ky, kx]: complex.
     """
     item = first + wp.tid()
-    which = stamp[item]
+    stamp_index = stamp[item]
     step = wp.float64(wp.TAU) / wp.float64(size)
     turn = wp.vec2d(wp.cos(step * offset[item][0]), -wp.sin(step * offset[item][0]))
     for row in range(size):
@@ -59,7 +59,7 @@ def transform_stamps(
         phase = wp.vec2d(wp.cos(step * ky * offset[item][1]), -wp.sin(step * ky * offset[item][1]))
         for column in range(size // 2 + 1):
             at = steps[item] * wp.vec2d(wp.float64(column), ky)
-            value = interpolated(table, start[which], half[which], wp.float32(at[0]), wp.float32(at[1]))
+            value = interpolated(table, start[stamp_index], half[stamp_index], wp.float32(at[0]), wp.float32(at[1]))
             placed = product(wp.vec2d(wp.float64(value[0]), wp.float64(value[1])), phase)
             result[item, row, column] = wp.vec2(wp.float32(placed[0]), wp.float32(placed[1]))
             phase = product(phase, turn)

@@ -127,15 +127,15 @@ class ResidualWavefront:
             raise DomainError(f"linear_fraction = {linear_fraction!r}: expected 0 to 1")
         for name, number in (("seed", seed), ("epoch", epoch)):
             require_seed(number, name)
-        chosen = sorted(set(terms))
-        if not chosen or chosen[0] < 4:
-            raise DomainError(f"terms = {chosen}: expected Noll indices from 4 (piston and tilt are not drawn)")
-        variance = np.array([float(noll_to_nm(j)[0]) ** (-11.0 / 3.0) for j in chosen])
+        noll_indices = sorted(set(terms))
+        if not noll_indices or noll_indices[0] < 4:
+            raise DomainError(f"terms = {noll_indices}: expected Noll indices from 4 (piston and tilt are not drawn)")
+        variance = np.array([float(noll_to_nm(j)[0]) ** (-11.0 / 3.0) for j in noll_indices])
         sigma = size.item() * np.sqrt(variance / variance.sum())
         # The mean square of a slope along x over a disc is a quarter of the square of its radius.
         per_radian = math.sqrt(2.0 * linear_fraction) / telescope.field_radius
-        coefficients, gradient = np.zeros(chosen[-1] - 3), np.zeros((chosen[-1] - 3, 2))
-        for j, scale in zip(chosen, sigma, strict=True):
+        coefficients, gradient = np.zeros(noll_indices[-1] - 3), np.zeros((noll_indices[-1] - 3, 2))
+        for j, scale in zip(noll_indices, sigma, strict=True):
             normal = scale * stream(seed, "active optics", epoch, j).standard_normal(3)
             coefficients[j - 4] = math.sqrt(1.0 - linear_fraction) * normal[0]
             gradient[j - 4] = per_radian * normal[1:]

@@ -21,8 +21,10 @@ from .request import Request
 JACOBIAN_STEP = 1.0e-4
 #: Largest distance of a chief ray from its target on the detector [m].
 _TOLERANCE = 1e-12
-#: Steps of the iteration with the scale on the axis, and of Newton's method after it.
-_SCALE_STEPS, _NEWTON_STEPS = 12, 20
+#: Steps of the iteration with the scale on the axis.
+_SCALE_STEPS = 12
+#: Steps of Newton's method after it.
+_NEWTON_STEPS = 20
 
 
 def chief_rays(

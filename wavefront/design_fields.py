@@ -52,7 +52,7 @@ def _real_slopes(telescope: Telescope) -> np.ndarray:
     if size == 0.0:
         return np.zeros_like(target)
 
-    def landing(slopes: np.ndarray, which: np.ndarray) -> np.ndarray:
+    def landing(slopes: np.ndarray, indices: np.ndarray) -> np.ndarray:
         directions = field_direction(slopes[:, 0], slopes[:, 1], "gnomonic")
         points = entrance_points(telescope, directions, light, np.zeros((1, 2)))
         end = trace(telescope, straight_bundles(telescope, directions, light, points))
@@ -65,10 +65,10 @@ def _real_slopes(telescope: Telescope) -> np.ndarray:
     linear = solve_2x2(np.repeat(scale[None], len(target), axis=0), target - origin)
     slopes = find_points(landing, linear, target, size, _SLOPE)
     lost = np.isnan(slopes).any(axis=1)
-    found = linear[lost] * 0.0
+    lost_slopes = linear[lost] * 0.0
     for k in range(1, _STEPS + 1) if lost.any() else ():
-        found = find_points(landing, found, origin + (target[lost] - origin) * (k / _STEPS), size, _SLOPE)
-    slopes[lost] = found
+        lost_slopes = find_points(landing, lost_slopes, origin + (target[lost] - origin) * (k / _STEPS), size, _SLOPE)
+    slopes[lost] = lost_slopes
     lost = np.isnan(slopes).any(axis=1)
     if lost.any():
         x, y = target[lost][0] / telescope.design_data.unit

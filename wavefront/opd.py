@@ -212,8 +212,8 @@ def _sphere_radius(
     telescope: Telescope, sphere_radius: ArrayLike | None, focal_plane: FocalPlane | None, silicon: Silicon | None
 ) -> float:
     """Return the radius of reference spheres [m]; DomainError for arguments that an afocal telescope cannot have."""
-    given = {"a sphere_radius": sphere_radius, "a focal plane": focal_plane, "silicon": silicon}
-    for name in (name for name, value in given.items() if value is not None):
+    image_arguments = {"a sphere_radius": sphere_radius, "a focal plane": focal_plane, "silicon": silicon}
+    for name in (name for name, value in image_arguments.items() if value is not None):
         require_image(telescope, name)
     if sphere_radius is None:
         return telescope.sphere_radius

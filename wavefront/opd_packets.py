@@ -39,11 +39,11 @@ def traced_opds(
     telescope, directions = request.telescope, request.directions
     if telescope.design_data.afocal:
         return _plane_wave_opds(request, np.stack([x, y], axis=-1), progress)
-    whole = pack_surfaces(telescope)
-    stages = [whole]
+    all_surfaces = pack_surfaces(telescope)
+    stages = [all_surfaces]
     stop = next((i for i, s in enumerate(telescope.surfaces) if s.aperture is not None), None)
     if stop is not None and stop + 1 < len(telescope.surfaces):
-        stages.insert(0, leading_surfaces(whole, stop + 1))
+        stages.insert(0, leading_surfaces(all_surfaces, stop + 1))
     start = object_points(telescope, directions) if np.isfinite(telescope.object_distance) else np.empty((0, 3))
     indices = warp_array(refractive_indices(telescope, request.wavelength)[None])
     # From the centre outwards, so that a central obscuration or a rim stops whole packets.
@@ -58,15 +58,15 @@ def traced_opds(
     # Fields with pupil points of their own are traced one by one.
     step = 1 if shared is None else max(1, _RAYS_AT_ONCE // max(1, x.size))
     for first in range(0, len(value), step):
-        part = slice(first, min(first + step, len(value)))
+        batch = slice(first, min(first + step, len(value)))
         pupil = to_packets(points[first].T) if shared is None else shared
-        passing = transmitted_packets(telescope, pupil, directions[part], start[part])
-        lit = np.ones((part.stop - first) * len(packed_place)) if passing is None else passing.ravel()
+        passing = transmitted_packets(telescope, pupil, directions[batch], start[batch])
+        lit = np.ones((batch.stop - first) * len(packed_place)) if passing is None else passing.ravel()
         lit = lit.astype(np.int32)
         for surfaces in stages if passing is None else stages[-1:]:
             work = np.flatnonzero(lit).astype(np.int32)
             # Stages before the last one only count the lit lanes.
-            filled = value[part] if surfaces is whole else value[:0]
+            filled = value[batch] if surfaces is all_surfaces else value[:0]
             launch(
                 trace_opds.variant_for(surfaces),
                 len(work),
@@ -78,9 +78,9 @@ def traced_opds(
                     packed_place,
                     float(telescope.stop_z),
                     float(telescope.launch_distance),
-                    warp_array(directions[part]),
-                    warp_array(start[part]),
-                    warp_array(spheres[part]),
+                    warp_array(directions[batch]),
+                    warp_array(start[batch]),
+                    warp_array(spheres[batch]),
                     radius,
                     ray_packets(),
                     warp_array(filled),
@@ -89,7 +89,7 @@ def traced_opds(
                 threads=request.threads,
             )
         if progress is not None:
-            progress(part.stop - first)
+            progress(batch.stop - first)
     return value
 
 

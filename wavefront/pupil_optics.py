@@ -153,7 +153,8 @@ def trace_pupils(
             [traced(slice(s, s + 1), np.array([w]), points[s]) for w, points in enumerate(aimed)] for s in range(n_star)
         ]
         x, y, traced_path, status = (
-            np.concatenate([np.concatenate([found[k] for found in star], axis=1) for star in pieces]) for k in range(4)
+            np.concatenate([np.concatenate([outputs[k] for outputs in star], axis=1) for star in pieces])
+            for k in range(4)
         )
     offset = np.stack([x, y], axis=-1)
     if not np.array_equal(rotation, np.eye(3)):

@@ -149,8 +149,8 @@ def pupil_sampling(
     radius, obscuration = 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration
     default = _DEFAULT_N_PUPIL[sampling]
     # On a spiral the number of points, else of those along a radius or side.
-    most = MOST if sampling == "spiral" else math.isqrt(MOST)
-    n = require_count(default if n_pupil is None else n_pupil, "n_pupil", 1, most)
+    limit = MOST if sampling == "spiral" else math.isqrt(MOST)
+    n = require_count(default if n_pupil is None else n_pupil, "n_pupil", 1, limit)
     if sampling == "gauss":
         return gauss_annulus(radius, obscuration, n, 4 * n)
     return {"rings": ring_annulus, "spiral": spiral_annulus, "square": square_annulus}[sampling](radius, obscuration, n)

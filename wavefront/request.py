@@ -214,13 +214,13 @@ class Request:
         points = self.vignetted(pupil)
         key = (wavelength, points.tobytes())
         if key not in self._aimed:
-            own = aimed_points(self.telescope, self.directions, wavelength, points)
-            self._aimed[key] = AimedPoints.of(self.telescope, self.directions, wavelength, points, own)
-        known = self._aimed[key]
+            crossings = aimed_points(self.telescope, self.directions, wavelength, points)
+            self._aimed[key] = AimedPoints.of(self.telescope, self.directions, wavelength, points, crossings)
+        aimed = self._aimed[key]
         if telescope is self.telescope:
-            return known.points
+            return aimed.points
         points = replace(self, telescope=telescope).vignetted(pupil)
-        moved = known.moved(telescope, self.directions, wavelength, points)
+        moved = aimed.moved(telescope, self.directions, wavelength, points)
         return aimed_points(telescope, self.directions, wavelength, points) if moved is None else moved
 
     @cached_property
@@ -286,8 +286,8 @@ class Request:
         """Yield slices of the field points and their requests, which bound the memory for many field points."""
         step = max(1, RAYS_AT_ONCE // (len(self.pupil) + 1))
         for first in range(0, len(self.fields), step):
-            part = slice(first, min(first + step, len(self.fields)))
-            yield part, self.at_fields(part)
+            batch = slice(first, min(first + step, len(self.fields)))
+            yield batch, self.at_fields(batch)
 
 
 @check_arguments

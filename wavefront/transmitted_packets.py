@@ -11,8 +11,10 @@ from ..models.surface import Interaction, Surface
 from ..models.telescope import Telescope
 from ..raytrace.pack.surfaces import clear_annulus
 
-#: Radii and angles at which the sag within an aperture is sampled.
-_RADII, _ANGLES = 257, 32
+#: Radii at which the sag within an aperture is sampled.
+_RADII = 257
+#: Angles at which the sag within an aperture is sampled.
+_ANGLES = 32
 #: Rounding of a landing point [m].
 _ROUNDING = 1e-9
 

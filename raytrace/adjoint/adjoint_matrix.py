@@ -69,20 +69,21 @@ class AdjointMatrix:
         return self._quantity(surface, "intersection")[0]
 
 
-def column_table(telescope: Telescope, wanted: Iterable[tuple[int, str]] | None = None, first: int = 0) -> np.ndarray:
+def column_table(
+    telescope: Telescope, quantities: Iterable[tuple[int, str]] | None = None, first: int = 0
+) -> np.ndarray:
     """Return the table of columns for some quantities, shape [n_surface + 1, 13]; -1 stands for none.
 
-    ``wanted`` are pairs (index of a surface, name), all quantities by default: "sag", "index", "intersection", or "gap"
-    for the gap in front of it; the gap behind the last surface belongs to the index after that. The first column has
-    the number ``first``.
+    ``quantities`` are pairs (index of a surface, name), all of them by default: "sag", "index", "intersection", or
+    "gap" for the gap in front of it; the gap behind the last surface belongs to the index after that. The first column
+    has the number ``first``.
     """
     count = len(telescope.surfaces)
-    if wanted is None:
-        every = [(s, name) for s in range(count) for name in _QUANTITIES]
-        wanted = [*every, (count, "gap")]
+    if quantities is None:
+        quantities = [*((s, name) for s in range(count) for name in _QUANTITIES), (count, "gap")]
     table = np.full((count + 1, QUANTITIES), -1, dtype=np.int32)
     column = first
-    for surface, name in sorted(set(wanted)):
+    for surface, name in sorted(set(quantities)):
         start, width = _QUANTITIES[name]
         table[surface, start : start + width] = range(column, column + width)
         column += width
@@ -92,22 +93,23 @@ def column_table(telescope: Telescope, wanted: Iterable[tuple[int, str]] | None 
 def polynomial_terms(degree: int) -> list[tuple[int, int, bool]]:
     """Return m, k and whether it is the imaginary part of the sags ``s^k (x + i y)^m``, ``m + 2 k <= degree``."""
     return [
-        (m, k, part)
+        (m, k, imaginary)
         for m in range(degree + 1)
         for k in range((degree - m) // 2 + 1)
-        for part in (False, True)[: 1 + (m > 0)]
+        for imaginary in (False, True)[: 1 + (m > 0)]
     ]
 
 
 def column_count(columns: np.ndarray, polynomials: Polynomials) -> int:
     """Return the number of columns of a table and of polynomials."""
-    return 1 + max([int(columns.max()), *(int(own.max()) for *_, own in polynomials)])
+    return 1 + max([int(columns.max()), *(int(term_columns.max()) for *_, term_columns in polynomials)])
 
 
 def polynomial_tables(columns: np.ndarray, polynomials: Polynomials) -> tuple[wp.array, wp.array]:
     """Return the tables of polynomials for the kernels: degree and columns, and the scales."""
-    table = np.full((max(len(polynomials), 1), 3 + max([0, *(len(own) for *_, own in polynomials)])), -1)
-    for j, (surface, _, degree, own) in enumerate(polynomials):
+    most_terms = max([0, *(len(term_columns) for *_, term_columns in polynomials)])
+    table = np.full((max(len(polynomials), 1), 3 + most_terms), -1)
+    for j, (surface, _, degree, term_columns) in enumerate(polynomials):
         table[j, :3] = degree, columns[surface, SAG], columns[surface, INTERSECTION]
-        table[j, 3 : 3 + len(own)] = own
+        table[j, 3 : 3 + len(term_columns)] = term_columns
     return warp_array(table, wp.int32), warp_array([scale for _, scale, *_ in polynomials])

@@ -48,8 +48,8 @@ def image_gradient(forward: ForwardPass) -> OutputGradient:
     matrix = forward.telescope.surfaces[-1].matrix
     u, v, w = matrix.T @ forward.direction
     # By (u, v, w) of (u, v) / abs(w).
-    zero, one, side = np.zeros_like(w), 1.0 / np.abs(w), np.sign(w)
-    local = np.array([[one, zero, -u * side / w**2], [zero, one, -v * side / w**2]])
+    zero, inverse_w, side = np.zeros_like(w), 1.0 / np.abs(w), np.sign(w)
+    local = np.array([[inverse_w, zero, -u * side / w**2], [zero, inverse_w, -v * side / w**2]])
     direction = np.einsum("ij,ojn->oin", matrix, local)
     return OutputGradient(np.zeros_like(direction), direction, np.zeros(2), own_frame=True)
 

@@ -50,7 +50,7 @@ class SphereAdjoint:
         check_differentiable(telescope)
         self._columns, self._n_surface, self._n_pupil = columns, len(telescope.surfaces), pupil.shape[-2]
         self._n_columns = max(sphere_column + SPHERE_COLUMNS, column_count(columns, polynomials))
-        points = np.stack([to_packets(own.T) for own in (pupil if pupil.ndim == 3 else pupil[None])])
+        points = np.stack([to_packets(pupil_set.T) for pupil_set in (pupil if pupil.ndim == 3 else pupil[None])])
         self._n_packets = points.shape[2]
         distant = not np.isfinite(telescope.object_distance)
         self._inputs = [

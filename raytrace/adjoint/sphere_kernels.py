@@ -69,12 +69,12 @@ def sphere_paths(special: bool, module: wp.Module) -> wp.Kernel:
         for p in range(count * item / n_items, count * (item + 1) / n_items):
             f = first_field + p / n_packets
             q = p % n_packets
-            own = f % pupil.shape[0]
+            pupil_set = f % pupil.shape[0]
             du = lanes(fields[f, 0])
             dv = lanes(fields[f, 1])
             dw = lanes(fields[f, 2])
-            at_x = pupil[own, 0, q]
-            at_y = pupil[own, 1, q]
+            at_x = pupil[pupil_set, 0, q]
+            at_y = pupil[pupil_set, 1, q]
             px, py, pz = plane_wave_start(at_x, at_y, pupil_z, fields[f, 0], fields[f, 1], fields[f, 2], distance)
             if objects.shape[0] > 0:
                 px = lanes(objects[f, 0])

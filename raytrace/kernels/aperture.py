@@ -62,8 +62,8 @@ def within_outline(edges: wp.array2d(dtype=wp.float64), first: wp.int32, last: w
         slope = edges[edge, 3]
         for i in range(LANES):
             above = wp.where(ay > y[i], 1, 0) ^ wp.where(by > y[i], 1, 0)
-            left = wp.where(x[i] < ax + (y[i] - ay) * slope, 1, 0)
-            inside[i] = inside[i] ^ (above & left)
+            edge_ahead = wp.where(x[i] < ax + (y[i] - ay) * slope, 1, 0)
+            inside[i] = inside[i] ^ (above & edge_ahead)
     return inside
 
 

@@ -28,9 +28,9 @@ class KernelPair:
 
 def kernel_pair(make: Callable[[bool, wp.Module], wp.Kernel]) -> KernelPair:
     """Return both variants of the kernel that ``make(special, module)`` defines in a module."""
-    made = []
+    variants = []
     for special in (False, True):
         module = wp.get_module(f"{make.__module__}_{'special' if special else 'plain'}")
         wp.set_module_options(FORWARD_OPTIONS, module=module)
-        made.append(make(special, module))
-    return KernelPair(*made)
+        variants.append(make(special, module))
+    return KernelPair(*variants)

@@ -77,9 +77,9 @@ def to_packets(values: np.ndarray) -> np.ndarray:
     """
     values = np.ascontiguousarray(values, dtype=np.float64)
     n = values.shape[-1]
-    missing = packet_count(n) * LANES - n
-    if missing:
-        values = np.concatenate([values, np.repeat(values[..., -1:], missing, axis=-1)], axis=-1)
+    padding = packet_count(n) * LANES - n
+    if padding:
+        values = np.concatenate([values, np.repeat(values[..., -1:], padding, axis=-1)], axis=-1)
     return values.reshape(*values.shape[:-1], -1, LANES)
 
 

@@ -62,8 +62,8 @@ def polar_sag(
     value = lanes()
     slope_x = lanes()
     slope_y = lanes()
-    for part in range(LANES // BLOCK + 0 * degree):
-        start = part * BLOCK
+    for block_index in range(LANES // BLOCK + 0 * degree):
+        start = block_index * BLOCK
         bx = block()
         by = block()
         for i in range(BLOCK):
@@ -242,11 +242,11 @@ def added_sag(deformations: PackedDeformations, s: wp.int32, x: lanes, y: lanes)
     slope_x = lanes(ZERO)
     slope_y = lanes(ZERO)
     outside = lanes(ZERO)
-    for part in range(deformations.span[s, 0], deformations.span[s, 1]):
-        kind = deformations.parts[part, 0]
-        offset = deformations.parts[part, 1]
-        a = deformations.parts[part, 2]
-        b = deformations.parts[part, 3]
+    for row in range(deformations.span[s, 0], deformations.span[s, 1]):
+        kind = deformations.parts[row, 0]
+        offset = deformations.parts[row, 1]
+        a = deformations.parts[row, 2]
+        b = deformations.parts[row, 3]
         dz = lanes(ZERO)
         dx = lanes(ZERO)
         dy = lanes(ZERO)
@@ -327,10 +327,10 @@ def deformed_distance(
             sag_y[i] = wp.where(on, slope_y[i], sag_y[i])
             t[i] = wp.where(on, t[i] - step[i], t[i])
             finished = wp.where(outside[i] > ZERO, NAN, t[i])
-            more = wp.abs(step[i]) > DEFORMATION_STEP
+            moving = wp.abs(step[i]) > DEFORMATION_STEP
             # A ray may pass beyond a grid on its way, but not end there. A NaN (a ray that misses) stops too.
-            t[i] = wp.where(on, wp.where(more, t[i], finished), t[i])
-            running[i] = wp.where(more, running[i], ZERO)
+            t[i] = wp.where(on, wp.where(moving, t[i], finished), t[i])
+            running[i] = wp.where(moving, running[i], ZERO)
         busy = wp.dot(running, running)
         steps += 1
     return t, sag, sag_x, sag_y, running

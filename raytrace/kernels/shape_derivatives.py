@@ -235,11 +235,11 @@ def added_derivatives(deformations: PackedDeformations, s: wp.int32, x: lanes, y
     zxx = lanes(ZERO)
     zxy = lanes(ZERO)
     zyy = lanes(ZERO)
-    for part in range(deformations.span[s, 0], deformations.span[s, 1]):
-        kind = deformations.parts[part, 0]
-        offset = deformations.parts[part, 1]
-        n = deformations.parts[part, 2]
-        m = deformations.parts[part, 3]
+    for row in range(deformations.span[s, 0], deformations.span[s, 1]):
+        kind = deformations.parts[row, 0]
+        offset = deformations.parts[row, 1]
+        n = deformations.parts[row, 2]
+        m = deformations.parts[row, 3]
         a = lanes(ZERO)
         b = lanes(ZERO)
         c = lanes(ZERO)

@@ -189,14 +189,14 @@ def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
             interaction = surfaces.kinds[s, INTERACTION]
             if wp.static(special):
                 deformed = surfaces.kinds[s, DEFORMED]
-                part = lanes()
-                part_x = lanes()
-                part_y = lanes()
+                sag = lanes()
+                sag_x = lanes()
+                sag_y = lanes()
                 if deformed == 2:
-                    t, part_x, part_y = mesh_distance(surfaces.meshes, s, x, y, z, u, v, w)
+                    t, sag_x, sag_y = mesh_distance(surfaces.meshes, s, x, y, z, u, v, w)
                 elif deformed == 1:
                     screen = wp.where(interaction == PHASE, 1, 0)
-                    t, part, part_x, part_y, running = deformed_distance(
+                    t, sag, sag_x, sag_y, running = deformed_distance(
                         surfaces.deformations, c, k, surfaces.coefficients, s, terms, x, y, z, u, v, w, t, screen
                     )
                     for i in range(LANES):
@@ -248,11 +248,11 @@ def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
                 ny = -wp.cw_mul(radial, y)
                 if wp.static(special):
                     if deformed > 0:
-                        b = b - part
+                        b = b - sag
                         if terms > 0:
                             radial = lanes(c) + wp.cw_mul(slope, lanes(ONE) - ((ONE + k) * c) * b)
-                        nx = -wp.cw_mul(radial, x) - wp.cw_mul(part_x, lanes(ONE) - ((ONE + k) * c) * b)
-                        ny = -wp.cw_mul(radial, y) - wp.cw_mul(part_y, lanes(ONE) - ((ONE + k) * c) * b)
+                        nx = -wp.cw_mul(radial, x) - wp.cw_mul(sag_x, lanes(ONE) - ((ONE + k) * c) * b)
+                        ny = -wp.cw_mul(radial, y) - wp.cw_mul(sag_y, lanes(ONE) - ((ONE + k) * c) * b)
                 nz = lanes(ONE) - ((ONE + k) * c) * b
                 if interaction == MIRROR:
                     u, v, w = reflected(u, v, w, nx, ny, nz)
@@ -272,10 +272,10 @@ def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
                 if interaction == PHASE:
                     if wp.static(chromatic):
                         n = indices[surfaces.kinds[s, MEDIUM_BEFORE], packet]
-                        u, v, w = through_screen(n, part_x, part_y, u, v, w)
+                        u, v, w = through_screen(n, sag_x, sag_y, u, v, w)
                     else:
-                        path = path + part
-                        u, v, w = through_screen(before, part_x, part_y, u, v, w)
+                        path = path + sag
+                        u, v, w = through_screen(before, sag_x, sag_y, u, v, w)
                     for i in range(LANES):
                         total = wp.where(status[i] <= VIGNETTED, TOTAL_REFLECTION, status[i])
                         status[i] = wp.where(wp.abs(w[i]) < FAR, status[i], total)

@@ -36,8 +36,8 @@ def depth(aperture: Aperture) -> int:
         return depth(aperture.part)
     if isinstance(aperture, (Union, Intersection)):
         # The first part is on the stack when the others come, each of which is taken off at once.
-        first, *others = (depth(part) for part in aperture.parts)
-        return max([first, *(1 + d for d in others)])
+        first, *later_depths = (depth(operand) for operand in aperture.parts)
+        return max([first, *(1 + d for d in later_depths)])
     return 1
 
 
@@ -77,8 +77,8 @@ class _Programme:
             self.add(a.part)
             self._step(kernels.OUTSIDE)
         else:
-            for i, part in enumerate(a.parts):
-                self.add(part)
+            for i, operand in enumerate(a.parts):
+                self.add(operand)
                 if i:
                     self._step(kernels.EITHER if isinstance(a, Union) else kernels.BOTH)
 

@@ -41,20 +41,20 @@ def split_shape(shape: Shape, *, screen: bool = False) -> SplitShape:
     parts = list(_flattened_terms(shape))
     base: Rotational = Plane()
     if not screen:
-        for i, part in enumerate(parts):
-            if isinstance(part, Rotational) and not isinstance(part, Plane):
-                base = part
+        for i, term in enumerate(parts):
+            if isinstance(term, Rotational) and not isinstance(term, Plane):
+                base = term
                 del parts[i]
                 break
-    rest = tuple(p for p in parts if not isinstance(p, Plane))
+    added_shapes = tuple(p for p in parts if not isinstance(p, Plane))
     first = shape.curvature if isinstance(base, Plane) and not screen else base.curvature
-    return SplitShape(base, rest, first)
+    return SplitShape(base, added_shapes, first)
 
 
 def _flattened_terms(shape: Shape) -> Sequence[Shape]:
     """Return the terms of a sum, of sums within it too; an odd asphere comes after its own conic."""
     if isinstance(shape, Sum):
-        return [one for part in shape.parts for one in _flattened_terms(part)]
+        return [term for summand in shape.parts for term in _flattened_terms(summand)]
     return [shape.base, shape] if isinstance(shape, OddAsphere) else [shape]
 
 
@@ -69,10 +69,10 @@ def pack_deformations(shapes: Sequence[SplitShape], device: str = "cpu") -> Any:
     offset = 0
     for row, shape in enumerate(shapes):
         span[row, 0] = len(rows)
-        for kind, sizes, own in _encoded_parts(shape.parts):
+        for kind, sizes, part_numbers in _encoded_parts(shape.parts):
             rows.append([kind, offset, *sizes])
-            numbers.append(own)
-            offset += len(own)
+            numbers.append(part_numbers)
+            offset += len(part_numbers)
         span[row, 1] = len(rows)
     packed = PackedDeformations()
     table = np.array(rows, dtype=np.int32).reshape(-1, PART_COLUMNS)
@@ -84,12 +84,12 @@ def pack_deformations(shapes: Sequence[SplitShape], device: str = "cpu") -> Any:
 
 def _encoded_parts(shapes: Sequence[Shape]) -> list[tuple[int, tuple[int, int], np.ndarray]]:
     """Return the kind, two whole numbers and the numbers of each part; all polynomials make one part."""
-    found: list[tuple[int, tuple[int, int], np.ndarray]] = []
+    encoded: list[tuple[int, tuple[int, int], np.ndarray]] = []
     polynomial: PolarPolynomial | None = None
 
-    def add(one: PolarPolynomial) -> None:
+    def add(term: PolarPolynomial) -> None:
         nonlocal polynomial
-        polynomial = one if polynomial is None else polynomial + one
+        polynomial = term if polynomial is None else polynomial + term
 
     for shape in shapes:
         if isinstance(shape, (XYPolynomial, ZernikeSag)):
@@ -97,27 +97,27 @@ def _encoded_parts(shapes: Sequence[Shape]) -> list[tuple[int, tuple[int, int], 
         elif isinstance(shape, OddAsphere):
             if shape.coefficients[0::2]:
                 odd = np.array(shape.coefficients[0::2])
-                found.append((int(ODD), (len(odd), 0), odd))
+                encoded.append((int(ODD), (len(odd), 0), odd))
             add(from_even_powers(shape.coefficients[1::2], first=2))
         elif isinstance(shape, Rotational):
             add(from_even_powers(shape.coefficients))
-            found.append(_encoded_conic(shape))
+            encoded.append(_encoded_conic(shape))
         elif isinstance(shape, Biconic):
             c = np.array([1.0 / shape.radius_x, 1.0 / shape.radius_y])
             k = np.array([1.0 + shape.conic_x, 1.0 + shape.conic_y])
-            found.append((int(BICONIC), (0, 0), np.concatenate([c, k * c**2])))
+            encoded.append((int(BICONIC), (0, 0), np.concatenate([c, k * c**2])))
         elif isinstance(shape, Toroid):
             cx, cy = 1.0 / shape.radius_x, 1.0 / shape.radius_y
-            found.append((int(TOROID), (0, 0), np.array([cx, cy, (1.0 + shape.conic_y) * cy**2])))
+            encoded.append((int(TOROID), (0, 0), np.array([cx, cy, (1.0 + shape.conic_y) * cy**2])))
         elif isinstance(shape, GridSag):
             head = [shape.x[0], shape.y[0], *(1.0 / step for step in shape.step)]
             numbers = np.concatenate([head, shape.nodes.ravel()])
-            found.append((int(GRID), (len(shape.x), len(shape.y)), numbers))
+            encoded.append((int(GRID), (len(shape.x), len(shape.y)), numbers))
         else:
             raise PrescriptionError(f"shape {type(shape).__name__}: expected one that can be part of a sum or a map")
     if polynomial is not None and np.any(polynomial.terms):
-        found.insert(0, _encoded_polynomial(polynomial))
-    return found
+        encoded.insert(0, _encoded_polynomial(polynomial))
+    return encoded
 
 
 def _encoded_conic(shape: Rotational) -> tuple[int, tuple[int, int], np.ndarray]:

@@ -271,9 +271,9 @@ class Atmosphere(LayerScreens):
 
     def _with_shared_screens(self, **changes: Any) -> Atmosphere:
         """Return a changed atmosphere with shared screens: nothing that determines them may change."""
-        other = replace(self, **changes)
-        object.__setattr__(other, "_cache", self._cache)
-        return other
+        atmosphere = replace(self, **changes)
+        object.__setattr__(atmosphere, "_cache", self._cache)
+        return atmosphere
 
 
 def _length(value: Any, name: str) -> float:

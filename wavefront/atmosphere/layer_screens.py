@@ -198,17 +198,17 @@ class LayerScreens(Layers):
                     screens,
                     np.zeros((self.layer_count, size), dtype=bool),
                 )
-            screens, made = self._cache[kind], self._cache[_rows_key(kind)]
+            screens, computed_rows = self._cache[kind], self._cache[_rows_key(kind)]
             base: Any = screens.base
-            wanted = np.ones(made.shape, dtype=bool) if rows is None or kind != "slopes" else rows
-            lacking = (wanted & ~made).any(axis=1)
-            if made.any():
-                wanted = np.ones(made.shape, dtype=bool)
+            needed_rows = np.ones(computed_rows.shape, dtype=bool) if rows is None or kind != "slopes" else rows
+            lacking = (needed_rows & ~computed_rows).any(axis=1)
+            if computed_rows.any():
+                needed_rows = np.ones(computed_rows.shape, dtype=bool)
             for layer in np.flatnonzero(lacking):
-                chosen = in_whole_blocks(wanted[layer] & ~made[layer])
-                some: dict[str, Any] = {} if chosen.all() else {"rows": chosen}
-                make(int(layer), threads=threads, out=base[layer], **some)
-                made[layer] |= chosen
+                new_rows = in_whole_blocks(needed_rows[layer] & ~computed_rows[layer])
+                row_option = {} if new_rows.all() else {"rows": new_rows}
+                make(int(layer), threads=threads, out=base[layer], **row_option)
+                computed_rows[layer] |= new_rows
             return screens
 
     def release(self) -> None:

@@ -83,25 +83,25 @@ class Stars:
     def __len__(self) -> int:
         return len(self.fields)
 
-    def __getitem__(self, chosen: Any) -> Stars:
-        photons = None if self.photons is None else self.photons[chosen]
-        return Stars(self.fields[chosen], self.offsets[chosen], photons)
+    def __getitem__(self, indices: np.ndarray | slice) -> Stars:
+        photons = None if self.photons is None else self.photons[indices]
+        return Stars(self.fields[indices], self.offsets[indices], photons)
 
 
 def expose_by_kind(kinds: np.ndarray, expose: Callable[[int, Stars], ExposedStars], stars: Stars) -> ExposedStars:
     """Expose stars of several kinds [n_star], each kind by one call of ``expose`` with the kind and its stars."""
     groups = [np.flatnonzero(kinds == kind) for kind in np.unique(kinds)]
-    parts = [expose(int(kinds[chosen[0]]), stars[chosen]) for chosen in groups]
+    exposures = [expose(int(kinds[group[0]]), stars[group]) for group in groups]
     order = np.argsort(np.concatenate(groups))
 
     def draw(shift: np.ndarray | None) -> np.ndarray:
-        shifts = [None if shift is None else shift[chosen] for chosen in groups]
-        return np.concatenate([part.draw(moved) for part, moved in zip(parts, shifts, strict=True)])[order]
+        shifts = [None if shift is None else shift[group] for group in groups]
+        return np.concatenate([exposure.draw(moved) for exposure, moved in zip(exposures, shifts, strict=True)])[order]
 
     return ExposedStars(
         draw,
-        np.concatenate([part.lit_fraction for part in parts])[order],
-        np.concatenate([part.reference_point for part in parts])[order],
+        np.concatenate([exposure.lit_fraction for exposure in exposures])[order],
+        np.concatenate([exposure.reference_point for exposure in exposures])[order],
     )
 
 
@@ -170,18 +170,18 @@ class PsfEngine(ABC):
     def _trace(
         self, fields: np.ndarray, pupil: np.ndarray, threads: int | None, wavelengths: np.ndarray | None = None
     ) -> PupilOptics:
-        given = self._inputs
-        optics = given.trace(
+        inputs = self._inputs
+        optics = inputs.trace(
             self._telescope,
             fields,
             self._wavelengths if wavelengths is None else wavelengths,
             pupil,
-            focal_plane=given.focal_plane,
-            projection=given.projection,
+            focal_plane=inputs.focal_plane,
+            projection=inputs.projection,
             threads=threads,
-            aberration=given.aberration,
+            aberration=inputs.aberration,
         )
-        check_stamp(optics, given.plane)
+        check_stamp(optics, inputs.plane)
         return optics
 
     def _direction(self, fields: np.ndarray) -> np.ndarray:

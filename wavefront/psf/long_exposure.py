@@ -59,16 +59,20 @@ GRID_MARGIN = 1.25
 _NEGLIGIBLE = 1e-5
 # Largest coherence at a baseline half as long as the pupil's ring is wide, where the strips along its rims are a half
 # of it: on AuxTel, where 0.04 are left, they are wrong by 1e-3 in e.
-_LARGEST_LEFT = 1e-3
+_LARGEST_COHERENCE = 1e-3
 # Part of the ring that is lit from which on rims cross few spokes. At 8 um of defocus e of the LSST is wrong by 1e-4 at
 # 0.8, by 5e-4 at 0.62, by 1.5e-3 at 0.57 and by 3e-3 at 0.42.
 _LEAST_LIT = 0.6
-# Kinds of stars beside those of so many rays.
-_NEAR, _VIGNETTED = 0, -1
+# Kind of stars near focus; a positive kind is the number of rays of a star far from focus.
+_NEAR = 0
+# Kind of stars whose ring is vignetted, which the lattice draws.
+_VIGNETTED = -1
 # Bytes of a point of the lattice and a wavelength.
 _LATTICE_BYTES = 24
-# Stars of one batch, fewer where the room for their waves would fill more than this many bytes.
-_BATCH, _BATCH_BYTES = 256, 1 << 25
+# Most stars of one batch.
+_BATCH = 256
+# Most memory for the waves of a batch [bytes].
+_BATCH_BYTES = 1 << 25
 # Samples of the filter against the baseline: linear interpolation is then good to 1e-6.
 _TABLE_SIZE = 2048
 
@@ -103,10 +107,10 @@ class LongExposureEngine(PsfEngine):
         self._step = self._wavelengths * self.focal_length / self.period
         # Width of the pupil's ring.
         self._width = 0.5 * self._diameter * (1.0 - self._obscuration)
-        given, rings = inputs.n_pupil, has_only_annuli(self._telescope)
+        requested_points, rings = inputs.n_pupil, has_only_annuli(self._telescope)
         # Whether every star needs the lattice in place of strips along the rims.
         self._general = not rings or not self._strips_suffice()
-        count = given or LATTICE_POINTS
+        count = requested_points or LATTICE_POINTS
         if rings:
             count = LATTICE_POINTS if self._general else RINGS_POINTS
         self._lattice = LatticeTransfer.fill(self._diameter, self._obscuration, count, self._wavelengths)
@@ -116,7 +120,7 @@ class LongExposureEngine(PsfEngine):
             star_bytes = _LATTICE_BYTES * len(self._wavelengths) * len(self._lattice.points)
         else:
             self._tabulate_filter()
-            n_pupil = PUPIL_POINTS if given is None else given
+            n_pupil = PUPIL_POINTS if requested_points is None else requested_points
             self._pupil = SpokePupil.fill(self._diameter, self._obscuration, n_pupil)
             star_bytes = 2 * 2 * 4 * LANES * self._detector.shape[2] * len(self._pupil.points) * self._channels.depths
         self.batch = max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
@@ -135,15 +139,16 @@ class LongExposureEngine(PsfEngine):
         k = 2.0 * math.pi / self.period * count
         diagonal = math.sqrt(0.5) * k
         detector = [self._plane.transfer(*along) for along in ((k, 0 * k), (0 * k, k), (diagonal, diagonal))]
-        left = np.array([self._turbulence(s * count)[w] for w, s in enumerate(step)]) * np.max(np.abs(detector), axis=0)
-        return np.asarray(left * self._channels.of_wavelength(self._channels.spread(k)))
+        turbulence = np.array([self._turbulence(s * count)[w] for w, s in enumerate(step)])
+        bounds = turbulence * np.max(np.abs(detector), axis=0)
+        return np.asarray(bounds * self._channels.of_wavelength(self._channels.spread(k)))
 
     def _strips_suffice(self) -> bool:
         """Return whether the transfer is negligible at baselines of half the width of the pupil's annulus."""
         half = 0.5 * self._width
-        left = self._transfer_bounds(half)
-        last = np.minimum(np.ceil(half / self._step).astype(int), left.shape[1]) - 1
-        return bool(left[np.arange(len(left)), last].max() <= _LARGEST_LEFT)
+        bounds = self._transfer_bounds(half)
+        last = np.minimum(np.ceil(half / self._step).astype(int), bounds.shape[1]) - 1
+        return bool(bounds[np.arange(len(bounds)), last].max() <= _LARGEST_COHERENCE)
 
     def _choose_frequencies(self) -> None:
         """Choose the largest frequency of the sums."""
@@ -218,16 +223,18 @@ class LongExposureEngine(PsfEngine):
         refinement = self._lattice.refinement(rays)
         if (refinement == 1).all():
             return self._expose_autocorrelation([(self._lattice, rays, stars)])
-        most = MOST_ACROSS // self._lattice.lattice.size
-        kinds = np.where(refinement > most, -drawing_ray_counts(rays.optics, self._plane.pixel_size), refinement)
+        finest = MOST_ACROSS // self._lattice.lattice.size
+        kinds = np.where(refinement > finest, -drawing_ray_counts(rays.optics, self._plane.pixel_size), refinement)
 
         def expose(kind: int, stars: Stars) -> ExposedStars:
             if kind < 0:
                 return MeanRaysEngine(self._inputs, -kind).expose_without_refinement(stars)
             lattice = self._lattice.refined(kind)
-            few = max(1, self.batch // kind**2)
-            parts = (stars[first : first + few] for first in range(0, len(stars), few))
-            return self._expose_autocorrelation((lattice, self._lattice_rays(lattice, part), part) for part in parts)
+            size = max(1, self.batch // kind**2)
+            batches = (stars[first : first + size] for first in range(0, len(stars), size))
+            return self._expose_autocorrelation(
+                (lattice, self._lattice_rays(lattice, batch), batch) for batch in batches
+            )
 
         return expose_by_kind(kinds, expose, stars)
 

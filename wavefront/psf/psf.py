@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -228,14 +228,14 @@ def make_psfs(
     reference_point, offset, inside = np.empty((len(angles), 3)), np.empty((len(angles), 2)), np.empty(len(angles))
     maker.prepare(angles)
     for first in range(0, len(angles), maker.batch):
-        part = slice(first, min(first + maker.batch, len(angles)))
-        stars = maker.render(angles[part], places[part], centroids, None if photons is None else photons[part])
-        inside[part] = stars.image.sum(axis=(1, 2))
-        image[part] = stars.image / np.where(inside[part] > 0.0, inside[part], 1.0)[:, None, None]
-        lit_fraction[part], reference_point[part] = stars.lit_fraction, stars.reference_point
-        offset[part] = stars.offset
+        rows = slice(first, min(first + maker.batch, len(angles)))
+        stars = maker.render(angles[rows], places[rows], centroids, None if photons is None else photons[rows])
+        inside[rows] = stars.image.sum(axis=(1, 2))
+        image[rows] = stars.image / np.where(inside[rows] > 0.0, inside[rows], 1.0)[:, None, None]
+        lit_fraction[rows], reference_point[rows] = stars.lit_fraction, stars.reference_point
+        offset[rows] = stars.offset
         if progress is not None:
-            progress(part.stop - first)
+            progress(rows.stop - first)
     return Psfs(
         image=image,
         pixel_scale=pixel_scale,
@@ -249,7 +249,7 @@ def make_psfs(
     )
 
 
-def _jitter_on_detector(jitter: Any, telescope: Telescope, wavelengths: np.ndarray) -> float:
+def _jitter_on_detector(jitter: ArrayLike, telescope: Telescope, wavelengths: np.ndarray) -> float:
     """Return the displacement on the detector [m] of a jitter [rad], at the centre of the field."""
     spread = angle(jitter, "jitter")
     if not spread >= 0.0:
@@ -257,7 +257,7 @@ def _jitter_on_detector(jitter: Any, telescope: Telescope, wavelengths: np.ndarr
     return spread * center_focal_length(telescope, wavelengths) if spread else 0.0
 
 
-def _relative_photons(values: Any, n_star: int, n_wave: int) -> np.ndarray:
+def _relative_photons(values: ArrayLike, n_star: int, n_wave: int) -> np.ndarray:
     """Return relative numbers of photons, of mean 1 for each star, shape [n_star, n_wave]."""
     table = pure_numbers(values, "wavelength_weights")
     if table.shape not in ((n_wave,), (n_star, n_wave)):
@@ -270,7 +270,7 @@ def _relative_photons(values: Any, n_star: int, n_wave: int) -> np.ndarray:
     return np.asarray(table / table.mean(axis=1, keepdims=True))
 
 
-def _finite_pairs(values: Any, name: str, count: int | None) -> np.ndarray:
+def _finite_pairs(values: ArrayLike, name: str, count: int | None) -> np.ndarray:
     """Return pairs of finite numbers as a float64 array of shape [count, 2]."""
     table = pure_numbers(values, name)
     if count is None:
