@@ -78,7 +78,7 @@ def test_residuals_of_held_out_stars_are_their_noise(own):
     assert abs(np.nanmean(rho.rho1.xi_plus)) < 0.2 * own.summary()["rms_e"] ** 2
     with pytest.raises(DomainError, match="bins = 1001: expected a whole number of at most 1000"):
         own.rho_statistics(1001)
-    with pytest.raises(DomainError, match="positions: the stars lie within .* rad; expected 1e-10 to 6.283 rad"):
+    with pytest.raises(DomainError, match=r"positions: the stars lie within .* rad; expected 1e-10 to 6.283 rad"):
         replace(own, positions=1e-60 * own.positions).rho_statistics()
 
 
