@@ -9,12 +9,13 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError
+from .help_group import HelpGroup
 from .interrupt import interruptible
 from .options import FieldsDeg, Json, Model, Quiet, Threads, WavelengthsNm, field_list, name_list
 from .tables import print_json
 
 app = typer.Typer()
-baseline_app = typer.Typer()
+baseline_app = typer.Typer(cls=HelpGroup)
 app.add_typer(baseline_app, name="baseline")
 
 

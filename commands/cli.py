@@ -3,8 +3,8 @@
 Every file of commands has an ``app`` that this one adds to its own. Modules that compute are slow to import;
 commands import them inside their functions, so that ``pachon --help`` is quick.
 
-Exit status 0: done; 1: a check failed; 2: bad input or a file that cannot be written, one line on standard error;
-130: interrupted.
+Exit status 0: done; 1: a check failed; 2: bad input or a file that cannot be written, one line on standard error, or
+no command, after the help; 130: interrupted.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ from . import (
     tolerance,
     visits,
 )
+from .help_group import HelpGroup
 from .interrupt import InterruptedRunError
 from .targets import with_checked_targets
 
@@ -51,8 +52,8 @@ _UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "
 
 app = typer.Typer(
     name="pachon",
+    cls=HelpGroup,
     help="Ray-traced telescope wavefronts, turbulent atmospheres and PSF reconstruction.",
-    no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )

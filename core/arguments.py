@@ -40,7 +40,8 @@ def check_arguments(target: Target) -> Target:
     A value of the wrong kind is a DomainError, or a ConfigError where one of several words is expected; it names
     argument, value and what was expected. Checked are numbers, texts, paths, functions, classes, and sequences and
     mappings of them. Arguments annotated as arrays take real numbers: no boolean values, texts, times, complex numbers
-    or objects. Masked ones become NaN; quantities keep their unit. A quantity where plain numbers are expected is
+    or objects. Masked ones become NaN; quantities keep their unit. Those annotated as boolean arrays take True and
+    False, and 1 and 0. A quantity where plain numbers are expected is
     converted to the unit in square brackets of the docstring.
 
     Names of arguments are checked by Python (TypeError); shapes, ranges and NaN by the function itself.
@@ -201,12 +202,15 @@ def _unitless_array(name: str, value: Any) -> Any:
 
 def _boolean_array(name: str, value: Any) -> Any:
     try:
-        flags = np.asarray(value).dtype.kind == "b"
-    except ValueError:
-        flags = False
-    if not flags:
-        raise _MismatchError(name, value, "an array of True and False")
-    return value
+        flags = np.asarray(value)
+    except (ValueError, OverflowError):
+        flags = np.empty(0)
+    if flags.dtype.kind == "b":
+        return value
+    # Masks are often stored as whole numbers, for lack of a type for them.
+    if flags.dtype.kind not in "iu" or is_quantity(value) or not np.isin(flags, (0, 1)).all():
+        raise _MismatchError(name, value, "an array of True and False, or of 1 and 0")
+    return flags.astype(bool)
 
 
 def _valid_path(name: str, value: Any) -> str | os.PathLike[str]:

@@ -81,37 +81,57 @@ def write_hdus(path: Path, hdus: fits.HDUList) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def read_fits(path: Path) -> fits.HDUList:
+def read_fits(path: Path, *, checksums: bool = True) -> fits.HDUList:
     """Read a FITS product into memory and check the checksum of every part.
+
+    Without `checksums` a part need not have any, nor the file its number of parts: the standard leaves them free, and
+    files may come from other programs. Those that are there must hold.
 
     Raises ProductError if there is no such file, or it is no product of this program as it was written.
     """
     data = read_bytes(path, ProductError)
     with warnings.catch_warnings():
         warnings.simplefilter("error", AstropyWarning)
-        with parsing(path, "damaged or no FITS product", ProductError):
+        with parsing(path, "damaged or no FITS product" if checksums else "damaged or not FITS", ProductError):
             hdus = fits.open(io.BytesIO(data), lazy_load_hdus=False)
             for hdu in hdus:
-                place = hdu.fileinfo()
-                if not _checksum_holds(data[place["hdrLoc"] : place["datLoc"] + place["datSpan"]]):
-                    raise ProductError(f"damaged ({hdu.name} does not match its checksum)", file=path)
+                if problem := _checksum_problem(hdu, data, required=checksums):
+                    raise ProductError(f"damaged ({hdu.name} {problem})", file=path)
                 hdu.data  # noqa: B018 - reads it now, within the checks
                 # Parts are found by their names.
                 hdu.header.get("EXTNAME")
-            if len(hdus) != hdus[0].header["NPARTS"]:
-                text = f"cut short; expected {hdus[0].header['NPARTS']} parts, found {len(hdus)}"
-                raise ProductError(text, file=path)
+            parts = hdus[0].header["NPARTS"] if checksums else hdus[0].header.get("NPARTS", len(hdus))
+            if len(hdus) != parts:
+                raise ProductError(f"cut short; expected {parts} parts, found {len(hdus)}", file=path)
     return hdus
 
 
-def _checksum_holds(hdu: bytes) -> bool:
-    """Return whether the 32-bit ones'-complement sum of a header and its data is all ones (FITS standard 4.0, J.1)."""
-    if not hdu or len(hdu) % 4:
-        return False
-    total = int(np.frombuffer(hdu, dtype=">u4").sum(dtype=np.uint64))
+def _checksum_problem(hdu: Any, data: bytes, *, required: bool) -> str:
+    """Return what is wrong with the checksums of a part of a file: empty where they hold, or none is required or there.
+
+    An empty keyword is one whose value is undefined (FITS standard 4.0, 4.4.2.7).
+    """
+    place = hdu.fileinfo()
+    content = slice(place["datLoc"], place["datLoc"] + place["datSpan"])
+    if hdu.header.get("CHECKSUM") or required:
+        holds = _ones_complement_sum(data[place["hdrLoc"] : content.stop]) == 0xFFFFFFFF
+        return "" if holds else "does not match its checksum"
+    if datasum := hdu.header.get("DATASUM"):
+        return "" if _ones_complement_sum(data[content]) == int(datasum) else "does not match its DATASUM"
+    return ""
+
+
+def _ones_complement_sum(part: bytes) -> int:
+    """Return the 32-bit ones'-complement sum; of a header and its data it is all ones (FITS standard 4.0, J.1).
+
+    It is -1 of a part that was cut within a word.
+    """
+    if len(part) % 4:
+        return -1
+    total = int(np.frombuffer(part, dtype=">u4").sum(dtype=np.uint64))
     while total >> 32:
         total = (total & 0xFFFFFFFF) + (total >> 32)
-    return total == 0xFFFFFFFF
+    return total
 
 
 def table_hdu(name: str, columns: Columns) -> fits.BinTableHDU:

@@ -13,6 +13,8 @@ html_theme = "furo"
 html_static_path = ["_static"]
 html_css_files = ["narrow.css"]
 exclude_patterns = ["_build", "gallery/made"]
+# What is typed stays: --resume can be copied, and 0.7" are arc seconds, not a closing quotation mark.
+smartquotes = False
 # Anchors of headings, so that pages link to sections of others.
 myst_heading_anchors = 3
 autodoc_member_order = "bysource"

@@ -132,22 +132,23 @@ class CcdImage(Result):
     @classmethod
     @check_arguments
     def read(cls, path: str | Path) -> CcdImage:
-        """Read a file of :meth:`write`; ProductError if it is none, or damaged."""
-        hdus = read_fits(Path(path))
+        """Read a file with the extensions of :meth:`write`; ProductError if it has not, or is damaged.
+
+        Checksums may be missing, as in files that other programs have written.
+        """
+        hdus = read_fits(Path(path), checksums=False)
+        planes = [_plane(path, hdus, name) for name in ("IMAGE", "VARIANCE", "MASK")]
+        if len({plane.shape for plane in planes}) > 1:
+            shapes = ", ".join(str(plane.shape) for plane in planes)
+            raise ProductError(f"IMAGE, VARIANCE and MASK have shapes {shapes}; expected the same", file=path)
+        if "TRUTH" not in hdus or not isinstance(hdus["TRUTH"], fits.BinTableHDU):
+            raise ProductError("no image of a CCD (the table TRUTH is missing)", file=path)
+        header = hdus[0].header
         try:
-            primary, image, variance, mask, truth = (hdus[key] for key in (0, "IMAGE", "VARIANCE", "MASK", "TRUTH"))
-            stamp = _stamp(primary.header)
-            return cls(
-                primary.header["CCD"],
-                _native_byte_order(image.data),
-                _native_byte_order(variance.data),
-                _native_byte_order(mask.data),
-                image.header,
-                {key: column(truth, key) for key in OBJECT_COLUMNS},
-                stamp,
-            )
+            objects = {key: column(hdus["TRUTH"], key) for key in OBJECT_COLUMNS}
+            return cls(str(header["CCD"]), *planes, hdus["IMAGE"].header, objects, _stamp(header))
         except KeyError as error:
-            raise ProductError(f"no image of a CCD ({error.args[0]} is missing)", file=path) from None
+            raise ProductError(f"no image of a CCD ({' '.join(str(error.args[0]).split())})", file=path) from None
 
 
 def is_whole(path: Path, stamp: Stamp) -> bool:
@@ -164,5 +165,9 @@ def _stamp(header: Any) -> Stamp | None:
     return Stamp(header["CONFHASH"], header["SEED"], header["CREATOR"].removeprefix("pachon "))
 
 
-def _native_byte_order(array: np.ndarray) -> np.ndarray:
+def _plane(path: str | Path, hdus: fits.HDUList, name: str) -> np.ndarray:
+    """Return the image of an extension in the machine's own byte order."""
+    array = hdus[name].data if name in hdus else None
+    if not isinstance(array, np.ndarray) or array.ndim != 2 or (array.dtype.kind not in "iu" and name == "MASK"):
+        raise ProductError(f"no image of a CCD ({name} is missing, or has not two axes)", file=path)
     return array.astype(array.dtype.newbyteorder("="))

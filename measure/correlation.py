@@ -24,6 +24,14 @@ if TYPE_CHECKING:
 SEPARATION_RANGES = {"short": (0.0, 10.0), "long": (10.0, 180.0)}
 EXACT_LIMIT = 10_000
 """Largest number of stars whose pairs are counted exactly by default: a second on one core."""
+#: Least separation [rad], 0.2 microarcseconds. The square of 1e-200 is zero: TreeCorr ends by a segmentation fault.
+LEAST_SEPARATION = 1e-12
+#: Largest separation [rad]: a whole turn.
+LARGEST_SEPARATION = 2.0 * np.pi
+#: Largest number of bins: ten arrays of them for each of the 17 955 pairs of the LSST's CCDs, as patches, take 1.4 GB.
+MOST_BINS = 1000
+#: Least width of a bin, as the logarithm of the ratio of its ends: far above the rounding of a logarithm, 1e-14.
+LEAST_BIN_WIDTH = 1e-6
 
 
 @dataclass(frozen=True)
@@ -187,9 +195,9 @@ def shear_correlation(
     e1, e2 : array
         Ellipticities. A star with NaN in position or ellipticity is left out.
     min_sep, max_sep : float or Quantity
-        Separations at which the first bin begins and the last one ends [rad].
+        Separations at which the first bin begins and the last one ends [rad], from 1e-12 to a whole turn.
     n_bins : int
-        Logarithmic bins.
+        Logarithmic bins, at most 1000.
     subtract_mean : bool
         Whether to take the mean ellipticity off first, which removes the constant part of xi+.
     exact : bool, optional
@@ -208,8 +216,8 @@ def shear_correlation(
     Raises
     ------
     DomainError
-        If shapes differ, a weight is negative or not finite, separations are not positive and rising, fewer than two
-        stars are usable, or these are all of one patch.
+        If shapes differ, a weight is negative or not finite, separations or bins are out of their ranges, fewer than
+        two stars are usable, or these are all of one patch.
     """
     columns = [radians(v, n) for v, n in ((x, "x"), (y, "y"))]
     if other is not None and len(other) != 2:
@@ -230,10 +238,7 @@ def shear_correlation(
         raise DomainError("patch has masked labels: expected one for each star")
     if labels is not None and labels.shape != columns[0].shape:
         raise DomainError(f"patch has shape {labels.shape}: expected {columns[0].shape}, one for each star")
-    low, high = (angle(v, n) for v, n in ((min_sep, "min_sep"), (max_sep, "max_sep")))
-    if not (np.isfinite(high) and 0.0 < low < high):
-        raise DomainError(f"min_sep = {min_sep}, max_sep = {max_sep}: expected 0 < min_sep < max_sep")
-    n_bins = require_count(n_bins, "n_bins", 1, 10**6)
+    low, high, n_bins = _bins(min_sep, max_sep, n_bins)
     usable = np.all(np.isfinite(columns), axis=0)
     n_stars = int(usable.sum())
     if n_stars < 2:
@@ -274,6 +279,21 @@ def shear_correlation(
         leave_one_out_plus=left[0],
         leave_one_out_pairs=np.rint(leave_one_out_pairs / len(catalogs)).astype(np.int64),
     )
+
+
+def _bins(min_sep: Any, max_sep: Any, n_bins: Any) -> tuple[float, float, int]:
+    """Return both ends [rad] and number of the bins, or raise DomainError where one is out of its range."""
+    count = require_count(n_bins, "n_bins", 1, MOST_BINS)
+    low, high = angle(min_sep, "min_sep"), angle(max_sep, "max_sep")
+    ends = f"min_sep = {shown(min_sep)}, max_sep = {shown(max_sep)}"
+    for key, separation in (("min_sep", low), ("max_sep", high)):
+        if not LEAST_SEPARATION <= separation <= LARGEST_SEPARATION:
+            limits = f"{LEAST_SEPARATION:g} to {LARGEST_SEPARATION:.4g} rad"
+            raise DomainError(f"{ends}: expected separations of {limits}", key=key)
+    if not np.log(high / low) >= LEAST_BIN_WIDTH * count:
+        least = f"a max_sep of at least {np.exp(LEAST_BIN_WIDTH * count):.7g} min_sep"
+        raise DomainError(f"{ends}: expected {least}, for {count} bins", key="max_sep")
+    return low, high, count
 
 
 def jackknife_error(left: np.ndarray) -> np.ndarray:

@@ -119,9 +119,9 @@ def rho_statistics(
     model_e1, model_e2, model_size : array
         The same of the model at these positions. A star with NaN in any column is left out of all five.
     min_sep, max_sep : float or Quantity
-        Separations at which the first bin begins and the last one ends [rad].
+        Separations at which the first bin begins and the last one ends [rad], from 1e-12 to a whole turn.
     n_bins : int
-        Logarithmic bins.
+        Logarithmic bins, at most 1000.
     exact, patch
         As in :func:`~.shear_correlation`; with patches the errors are jackknife errors.
 

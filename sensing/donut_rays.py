@@ -99,7 +99,9 @@ class ZernikeRays:
     def _landing(self, wavelength: float, slopes: np.ndarray) -> np.ndarray:
         """Return detector x and y [m] of rays, [m, n, 2], with direction cosines changed by slopes [m, n or 1, 2]."""
         cosines = np.broadcast_to(self._direction[:2] + slopes, (len(slopes), *self._points.shape))
-        down = -np.sqrt(1.0 - (cosines**2).sum(axis=2, keepdims=True))
+        with np.errstate(invalid="ignore"):
+            # NaN for slopes of more than a right angle, which trials of a search may have.
+            down = -np.sqrt(1.0 - (cosines**2).sum(axis=2, keepdims=True))
         directions = np.concatenate([cosines, down], axis=2).reshape(-1, 3)
         points = np.tile(self._points, (len(slopes), 1))[:, None]
         return landing_of(self._telescope, parallel_rays(self._telescope, directions, wavelength, points)).reshape(

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError, shown
@@ -76,7 +76,7 @@ def fit_donuts(
     outer_scale: float = 25.0,
     diffusion: ArrayLike = 0.0,
     diffraction: bool = False,
-    mask: ArrayLike | Sequence[ArrayLike] | None = None,
+    mask: NDArray[np.bool_] | Sequence[NDArray[np.bool_]] | None = None,
     saturation: float | None = None,
     n_pupil: int | None = None,
     projection: str = "zemax",
@@ -204,9 +204,11 @@ def fit_donuts(
     if saturation is not None:
         saturation = require_positive(saturation, "saturation", "electrons")
     variance = sky_variances(sky_variance, stack.shape)
-    masked = np.zeros(stack.shape, dtype=bool) if mask is None else padded(mask, "mask", bool, True)[0]
-    if masked.shape != stack.shape:
-        raise DomainError(f"mask of shape {masked.shape}: expected that of the images, {stack.shape}")
+    masked = np.zeros(stack.shape, dtype=bool)
+    if mask is not None:
+        masked, mask_shapes = padded(mask, "mask", bool, True)
+        if mask_shapes != shapes:
+            raise DomainError(f"mask of shape {masked.shape}: expected those of the images, {stack.shape}", key="mask")
     light = relative_weights(wavelength_weights, len(waves))
     instrument = Instrument(
         telescope,

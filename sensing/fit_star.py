@@ -14,7 +14,14 @@ from .image_model import FLUX, NUISANCES, RATIO, STRENGTH, X, Y
 from .light import Instrument, Light, Sampling
 from .likelihood import Stamp, model_image, pulls
 from .solve import COARSE, FINE, STEPS, Group, Solution, solve
-from .stamps import Match, Pixels, match_template, without_cosmic_rays
+from .stamps import (
+    Match,
+    Pixels,
+    match_template,
+    measured_variance,
+    significance_above_sky,
+    without_cosmic_rays,
+)
 
 #: Images wider than this are donuts [pixels].
 SMALLEST_DONUT = 24.0
@@ -22,6 +29,8 @@ SMALLEST_DONUT = 24.0
 _COARSE_DIAMETER = 30.0
 #: Signal over noise of a template that is found.
 _FOUND = 8.0
+#: The same above a uniform sky of any level, which is less; the noise of a sky reaches 4 somewhere on a stamp.
+_ABOVE_SKY = 6.0
 #: Least gain of twice the logarithm of the likelihood by a second star or another focus, and the largest part of the
 #: misfit that may be left: what turbulence and missing terms of the wavefront do to an image, neither explains.
 _GAIN, _LEFT = 100.0, 0.5
@@ -96,7 +105,7 @@ def fit_star(
     coarse = fitter.stamp(light, small)
     template = fitter.template(coarse)
     start, found = fitter.start(coarse, template)
-    if found.significance < _FOUND:
+    if not found.significance >= _FOUND or not fitter.significance(coarse, template) >= _ABOVE_SKY:
         flags |= DonutFlag.NO_DONUT
     if found.flux < len(NUISANCES) + (len(instrument.noll) if wavefront else 0):
         flags |= DonutFlag.TOO_FEW_PHOTONS
@@ -134,7 +143,7 @@ def fit_star(
         flags |= DonutFlag.CLIPPED
     if blended:
         flags |= DonutFlag.BLENDED
-    if not best.converged:
+    if not (best.converged and np.isfinite(model).all()):
         flags |= DonutFlag.NOT_CONVERGED
     return StarFit(flags, light, stamp, full, best, model)
 
@@ -229,6 +238,11 @@ class _StarFitter:
         unknowns[[X, Y]] = -stamp.grid.scale * stamp.grid.offset
         return model_image(stamp, unknowns, np.zeros(len(self._precision)))
 
+    def significance(self, stamp: Stamp, template: np.ndarray) -> float:
+        """Return the signal over noise of a star anywhere on the stamp, above a uniform sky."""
+        measured = stamp.grid.scale**2 * measured_variance(self._clean)
+        return significance_above_sky(stamp.image, stamp.used, stamp.variance, template, measured)
+
     def start(self, stamp: Stamp, template: np.ndarray) -> tuple[np.ndarray, Match]:
         """Return unknowns of the star where its template fits best."""
         found = match_template(stamp.image, stamp.used, stamp.variance, template)
@@ -263,7 +277,7 @@ class _StarFitter:
         for star, aberration, shared in starts:
             rest = stamp.image - model_image(stamp, star, aberration)
             second = match_template(rest, stamp.used, stamp.variance, template)
-            if second.significance < _FOUND:
+            if not second.significance >= _FOUND:
                 continue
             place = ([second.x, second.y] - stamp.grid.offset) * stamp.grid.scale
             if roomy is None:

@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike
 from ..core.errors import DomainError, shown
 from ..core.units import length, pure_numbers, require_positive
 
-# Largest spread or wavefront [m], and light of a pixel [electron].
-_MOST_LENGTH, _MOST_ELECTRONS = 1e-3, 1e20
+#: Largest spread or wavefront [m].
+_MOST_LENGTH = 1e-3
+#: Light of a pixel from which on it is no number that a detector counts [electron].
+MOST_ELECTRONS = 1e20
 
 
 def padded(
@@ -38,7 +40,7 @@ def padded(
 def _numbers(values: ArrayLike, name: str) -> np.ndarray:
     """Return numbers without a unit; those that no detector counts are not finite."""
     numbers = pure_numbers(values, name)
-    return np.where(np.abs(numbers) < _MOST_ELECTRONS, numbers, np.nan)
+    return np.where(np.abs(numbers) < MOST_ELECTRONS, numbers, np.nan)
 
 
 def noll_indices(values: Iterable[int], name: str, least: int) -> np.ndarray:

@@ -61,7 +61,8 @@ class NormalEquations:
     gradient : ndarray, shape [n]
         Gradient of the logarithm of the likelihood.
     loss : float
-        Twice the negative logarithm of the likelihood over that of a perfect model: nearly chi-square.
+        Twice the negative logarithm of the likelihood over that of a perfect model: nearly chi-square. Infinite where
+        the wavefront is so steep that light has no direction or misses the telescope.
     chi2 : float
         Sum of squares of residuals over their variance.
     """
@@ -74,8 +75,12 @@ class NormalEquations:
 
 def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> NormalEquations:
     """Return the normal equations of one star; unknowns are those of the star, then of its wavefront."""
+    light = _landed(stamp, wave)
+    if light is None:
+        n = len(unknowns) + len(wave)
+        return NormalEquations(np.zeros((n, n)), np.zeros(n), np.inf, np.inf)
     response = stamp.rays.response(wave)
-    model, columns, scales = stamp.grid.derivatives(unknowns, _landed(stamp, wave), response, stamp.rays.rates)
+    model, columns, scales = stamp.grid.derivatives(unknowns, light, response, stamp.rays.rates)
     # A slice where all pixels are used, since that is no copy.
     used = stamp.used if not stamp.used.all() else np.s_[:, :]
     variance = _variance(stamp, model)[used].ravel()
@@ -88,12 +93,16 @@ def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> No
 
 
 def model_image(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> np.ndarray:
-    """Return the model of a stamp [electrons], shape [ny, nx]."""
-    return stamp.grid.image(unknowns, _landed(stamp, wave))
+    """Return the model of a stamp [electrons], shape [ny, nx]; NaN where light does not reach the detector."""
+    light = _landed(stamp, wave)
+    return np.full(stamp.image.shape, np.nan) if light is None else stamp.grid.image(unknowns, light)
 
 
-def _landed(stamp: Stamp, wave: np.ndarray) -> LandedLight:
+def _landed(stamp: Stamp, wave: np.ndarray) -> LandedLight | None:
+    """Return the light on the detector; None where a wavefront is so steep that it does not get there."""
     landing, light = stamp.rays.landing(wave), stamp.grid.rim_light
+    if not np.isfinite(landing).all():
+        return None
     at_rims = None if light is None else stamp.rays.at_rims(light.rims, landing)
     return LandedLight(landing, stamp.rays.weights(wave), stamp.rays.spread(landing), at_rims)
 

@@ -220,7 +220,8 @@ def _draw(fit: DonutFit, donuts: slice | list[int] | None, ax: Axes | Figure | N
         panels = upper.subplots(3, n, squeeze=False, sharex=True, sharey=True)
         for column, i in enumerate(chosen):
             image, model = fit.images[i], fit.model[i]
-            top = float(np.nanpercentile(image, 99.5)) if np.isfinite(image).any() else 1.0
+            top = float(np.nanpercentile(image, 99.5)) if np.isfinite(image).any() else 0.0
+            top = top if top > 0.0 else 1.0
             noise = np.sqrt(
                 np.maximum(np.abs(model), 1.0) + np.nanvar(fit.residuals[i][model < 0.05 * top])
                 if fit.usable[i]

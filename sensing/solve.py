@@ -102,14 +102,17 @@ def solve(
     steps: int = STEPS,
     pool: Executor | None = None,
 ) -> Solution:
-    """Maximise the likelihood from a starting point, by so many steps or until one is to gain less than a tolerance."""
+    """Maximise the likelihood from a starting point, by so many steps or until one is to gain less than a tolerance.
+
+    A start without a likelihood is returned as it is, with an infinite loss.
+    """
     joined = np.concatenate([*stars, shared])
     sizes = [len(s) for s in stars]
     pixels = sum(int(stamp.used.sum()) for stamp in group.stamps)
     held = _held(group, sizes)
     state = _linearize(group, joined, sizes, pool)
     damping, converged, predicted = _DAMPING, False, np.inf
-    for _ in range(steps):
+    for _ in range(steps if np.isfinite(state.loss) else 0):
         step = np.zeros_like(joined)
         curvature = state.curvature[np.ix_(~held, ~held)]
         scale = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
@@ -189,6 +192,9 @@ def _linearize(group: Group, joined: np.ndarray, sizes: list[int], pool: Executo
         gradient[own] = equations.gradient[:size]
         gradient[n_star:] += group.maps[i].T @ equations.gradient[size:]
     loss = sum(e.loss for e in found) + float(group.precision @ shared**2)
+    if not (np.isfinite(loss) and np.isfinite(curvature).all() and np.isfinite(gradient).all()):
+        # No step starts there, and none leads there.
+        curvature, gradient, loss = np.zeros_like(curvature), np.zeros_like(gradient), np.inf
     return _Linearized(curvature, gradient, np.array([e.chi2 for e in found]), loss)
 
 

@@ -17,6 +17,7 @@ from astropy.table import Table
 
 from ..core.errors import ProductError
 from ..core.files import parsing, require_file
+from .inputs import MOST_ELECTRONS
 
 #: Smallest side of a stamp [pixels].
 _SMALLEST = 8
@@ -91,9 +92,12 @@ def _described(header: fits.Header) -> dict[str, float]:
 
 
 def border_variance(image: np.ndarray) -> float:
-    """Return the variance of the pixels along the edge of a stamp, by their median absolute deviation."""
+    """Return the variance of the pixels along the edge of a stamp, by their median absolute deviation.
+
+    Pixels that are not finite, or that no detector counts, are left out.
+    """
     edge = np.concatenate([image[:2].ravel(), image[-2:].ravel(), image[2:-2, :2].ravel(), image[2:-2, -2:].ravel()])
-    edge = edge[np.isfinite(edge)]
+    edge = edge[np.abs(edge) < MOST_ELECTRONS]
     return float((1.4826 * np.median(np.abs(edge - np.median(edge)))) ** 2) if edge.size else 0.0
 
 

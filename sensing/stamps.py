@@ -14,6 +14,10 @@ _SIGMA, _CONTRAST = 8.0, 1.0
 _SMOOTHING, _MOSTLY_USED = 1.0, 0.9
 #: Least part of the squared template that must lie on the stamp.
 _ON_STAMP = 0.1
+#: Standard deviation over the median of absolute deviations, of Gaussian noise.
+_DEVIATION_OVER_MEDIAN = 1.4826
+#: Least variance of a pixel [electron^2] in the search for donuts: pixels without any noise are not real.
+_LEAST_VARIANCE = 1.0
 
 
 @dataclass(frozen=True)
@@ -120,6 +124,8 @@ def match_template(image: np.ndarray, used: np.ndarray, variance: np.ndarray, te
     overlap = fftconvolve(used.astype(np.float64), mirrored**2)
     product = fftconvolve(np.where(used, image, 0.0), mirrored)
     enough = overlap > _ON_STAMP * float((template**2).sum())
+    if not enough.any():
+        return Match(0.0, 0.0, 0.0, 0.0)
     score = np.where(enough, product / np.sqrt(np.where(enough, overlap, 1.0)), -np.inf)
     row, column = np.unravel_index(int(np.argmax(score)), score.shape)
     flux = float(product[row, column] / overlap[row, column])
@@ -128,3 +134,37 @@ def match_template(image: np.ndarray, used: np.ndarray, variance: np.ndarray, te
     noise = np.sqrt(max(float(np.mean(variance)) + own, 1e-30))
     ny, nx = image.shape
     return Match(float(column - nx + 1), float(row - ny + 1), flux, float(score[row, column] / noise))
+
+
+def measured_variance(pixels: Pixels) -> float:
+    """Return the variance of a pixel [electron^2] by differences of neighbours, in which smooth light cancels.
+
+    Their median is that of the sky where a donut covers less than half of the stamp.
+    """
+    steps = np.abs(np.diff(pixels.image, axis=1))[pixels.used[:, 1:] & pixels.used[:, :-1]]
+    return float((_DEVIATION_OVER_MEDIAN * np.median(steps)) ** 2 / 2.0) if steps.size else 0.0
+
+
+def significance_above_sky(
+    image: np.ndarray, used: np.ndarray, variance: np.ndarray, template: np.ndarray, measured: float
+) -> float:
+    """Return the signal over noise of a template where it stands out most from a uniform background of any level.
+
+    Least squares of template and background at every whole-pixel place; :func:`match_template` takes sky that was
+    left in for light of the star. The variance of a pixel is that claimed, or the measured one where that is larger.
+    """
+    mirrored, count = template[::-1, ::-1], int(used.sum())
+    if not count:
+        return 0.0
+    pixels = np.where(used, image - image[used].mean(), 0.0)
+    squared, area = (fftconvolve(used.astype(np.float64), mirrored**power) for power in (2, 1))
+    contrast = squared - area**2 / count
+    enough = np.minimum(squared, contrast) > _ON_STAMP * float((template**2).sum())
+    product = np.where(enough, fftconvolve(pixels, mirrored), 0.0)
+    contrast = np.where(enough, contrast, 1.0)
+    score = product / np.sqrt(contrast)
+    best = int(np.argmax(score))
+    flux = max(float(product.ravel()[best] / contrast.ravel()[best]), 0.0)
+    photons = flux * float((template**2).sum() / template.sum())
+    claimed = float(np.mean(variance)) + photons
+    return float(score.ravel()[best] / np.sqrt(max(claimed, measured, _LEAST_VARIANCE)))

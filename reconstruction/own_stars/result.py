@@ -10,10 +10,12 @@ from astropy.table import QTable, Table
 from numpy.typing import NDArray
 
 from ...core.arguments import check_arguments
+from ...core.errors import DomainError
 from ...core.plotting import BLUE, ORANGE, RED, figure_at, plain_text, styled
 from ...core.products import Columns, described_table
 from ...core.result import Result
-from ...core.units import ARCMIN, ARCSEC
+from ...core.units import ARCMIN, ARCSEC, require_count
+from ...measure.correlation import LARGEST_SEPARATION, LEAST_SEPARATION, MOST_BINS
 from ...measure.focal_plane_axes import draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
 from ...measure.rho_statistics import RhoStatistics, rho_statistics
 from ...measure.shapes import Shapes, fwhm
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
 
 # Stars that the picture shows: twice as many.
 _SHOWN = 5
+#: Largest over least separation of the rho statistics.
+_LONGEST_OVER_SHORTEST = 100.0
 
 
 @check_arguments
@@ -149,8 +153,13 @@ def star_rho_statistics(places: np.ndarray, stars: Shapes, model: Shapes, bins: 
     """Return the rho statistics of a model at stars, whose places on the sky [rad] are [n, 2]."""
     x, y = (places - places.mean(axis=0)).T
     one, other = ([getattr(s, name) for name in ("e1", "e2", "size")] for s in (stars, model))
+    bins = require_count(bins, "bins", 1, MOST_BINS)
     longest = float(np.hypot(np.ptp(x), np.ptp(y)))
-    return rho_statistics(x, y, *one, *other, min_sep=longest / 100.0, max_sep=longest, n_bins=bins)
+    least = LEAST_SEPARATION * _LONGEST_OVER_SHORTEST
+    if not least <= longest <= LARGEST_SEPARATION:
+        limits = f"{least:g} to {LARGEST_SEPARATION:.4g} rad, with positions in pixels"
+        raise DomainError(f"positions: the stars lie within {longest:g} rad; expected {limits}", key="positions")
+    return rho_statistics(x, y, *one, *other, min_sep=longest / _LONGEST_OVER_SHORTEST, max_sep=longest, n_bins=bins)
 
 
 def _rms(*values: np.ndarray) -> float:

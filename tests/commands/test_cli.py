@@ -41,6 +41,16 @@ def test_help_explains_and_gives_examples(capsys, command):
         assert f"pachon {command[0]} " in out.partition("Examples")[2]
 
 
+@pytest.mark.parametrize("group", [[], ["baseline"]])
+def test_a_group_alone_prints_its_help_and_no_error(capsys, group):
+    assert main(group) == 2
+    out, err = capsys.readouterr()
+    assert err == ""
+    main([*group, "--help"])
+    assert out == capsys.readouterr().out
+    assert "Usage: pachon" in out
+
+
 def test_version(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == "pachon 0.1.0\n"

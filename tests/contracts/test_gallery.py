@@ -2,6 +2,7 @@
 
 import importlib.util
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -80,6 +81,14 @@ def test_every_command_and_option_is_in_the_reference(pages):
     assert len(names) > 30
 
 
+def test_pages_show_options_as_they_are_typed(pages, monkeypatch):
+    # Texts name options outside of code too, where docutils' "smart quotes" make a dash of two hyphens.
+    text = re.sub(r"```.*?```|`[^`\n]*`", "", pages.command_page(), flags=re.S)
+    assert re.search(r"(?<!\S)--\w", text)
+    monkeypatch.setattr(sys, "path", [*sys.path])  # conf.py adds to it
+    assert runpy.run_path(str(DOCS / "conf.py"))["smartquotes"] is False
+
+
 @pytest.mark.parametrize("path", [*DOCS.glob("*.md"), *GALLERY], ids=lambda path: path.stem)
 def test_links_within_the_pages_lead_somewhere(path):
     text = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.S)
@@ -100,6 +109,9 @@ def test_the_pages_are_built_without_warnings(tmp_path):
     assert done.returncode == 0, done.stderr
     pages = {path.name for path in (tmp_path / "html").rglob("*.html")}
     assert {"index.html", "commands.html", "api_models.html", "02_spots.html"} <= pages
+    commands = (tmp_path / "html" / "reference" / "commands.html").read_text(encoding="utf-8")
+    assert "goes on by --resume" in commands
+    assert "\N{EN DASH}" not in commands
     broken = []
     for page in (tmp_path / "html").rglob("*.html"):
         for link in re.findall(r'(?:href|src)="([^"#:?]+)"', page.read_text(encoding="utf-8")):

@@ -2,14 +2,27 @@
 
 import re
 import tomllib
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+import pytest
 import yaml
+from packaging.requirements import Requirement
+from packaging.version import Version
 
 from pachon.core.version import VERSION
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+#: Requirements by extra; "" are those of the package itself.
+REQUIREMENTS = {
+    group: [Requirement(text) for text in texts]
+    for group, texts in {
+        "build": PROJECT["build-system"]["requires"],
+        "": PROJECT["project"]["dependencies"],
+        **PROJECT["project"]["optional-dependencies"],
+    }.items()
+}
 
 
 def test_citation_project_and_package_agree():
@@ -38,3 +51,59 @@ def test_the_install_page_lists_the_extras():
     rows = re.findall(r"^\| (`.+?) \|", table, flags=re.M)[1:]
     listed = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
     assert listed == set(PROJECT["project"]["optional-dependencies"])
+
+
+def _bound(requirement):
+    """Return the lower bound of a requirement, or None."""
+    return next((Version(s.version) for s in requirement.specifier if s.operator == ">="), None)
+
+
+@pytest.mark.parametrize("group", REQUIREMENTS)
+def test_every_dependency_has_a_lower_bound_that_is_installed(group):
+    for requirement in REQUIREMENTS[group]:
+        bound = _bound(requirement)
+        assert bound is not None, requirement
+        try:
+            installed = Version(version(requirement.name))
+        except PackageNotFoundError:
+            continue  # of an extra that the tests do not need
+        # The build requirement is installed where the package is built.
+        assert group == "build" or bound <= installed, requirement
+
+
+def test_a_dependency_has_one_bound_in_all_extras():
+    bounds = {}
+    for requirement in (r for requirements in REQUIREMENTS.values() for r in requirements):
+        assert bounds.setdefault(requirement.name, _bound(requirement)) == _bound(requirement), requirement
+
+
+@pytest.mark.parametrize(
+    ("name", "lowest"),
+    [
+        ("numpy", "2.0.1"),  # inverse of np.unique(axis=None) has another shape in 2.0.0
+        ("scipy", "1.15"),  # rng of its optimisers and statistics
+        ("pydantic", "2.12"),  # load_telescope: TypeError
+        ("typer", "0.20"),  # before 0.15.4 prints the version in place of the command, before 0.20 suggests no name
+        ("trimesh", "4.6"),  # load_scene
+        ("matplotlib", "3.10"),  # the report fails after all CCDs are done
+        ("h5py", "3.11"),  # wheels for NumPy 2
+        ("pytest-xdist", "3.8"),  # --no-loadscope-reorder
+        ("pyarrow", "16"),  # wheels for NumPy 2
+    ],
+)
+def test_nothing_is_claimed_below_what_was_found_to_work(name, lowest):
+    requirements = [r for group in REQUIREMENTS.values() for r in group if r.name == name]
+    assert requirements
+    assert all(_bound(r) >= Version(lowest) for r in requirements)
+
+
+def test_the_lowest_versions_are_tested_by_the_documented_commands():
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    section = page[page.index("**Lowest versions.**") :]
+    documented = [line.strip() for line in re.findall(r"^ {4}(.+)$", section, flags=re.M)[:3]]
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "test.yml").read_text(encoding="utf-8"))
+    steps = workflow["jobs"]["lowest"]["steps"]
+    assert "\n".join(step["run"] for step in steps if "run" in step).splitlines() == documented
+    assert any("--resolution lowest-direct" in line for line in documented)
+    python = next(step["with"]["python-version"] for step in steps if "python-version" in step.get("with", {}))
+    assert PROJECT["project"]["requires-python"] == f">={python}"

@@ -51,6 +51,26 @@ def test_values_of_their_kind_pass(name, value):
     assert value in example(**{name: value})
 
 
+@check_arguments
+def masked(mask: NDArray[np.bool_] | Sequence[NDArray[np.bool_]] | None = None):
+    return mask
+
+
+def test_masks_are_boolean_or_ones_and_zeros():
+    flags = np.array([[True, False], [False, True]])
+    assert masked(flags) is flags
+    assert masked(flags.tolist()) == flags.tolist()
+    for kind in (np.uint8, np.int64):
+        found = masked(flags.astype(kind))
+        assert found.dtype == bool
+        np.testing.assert_array_equal(found, flags)
+    for one, other in zip(masked([flags, flags[:1]]), (flags, flags[:1]), strict=True):
+        np.testing.assert_array_equal(one, other)
+    for wrong in (2 * flags.astype(int), flags.astype(float), "mask", [flags, np.array([2, 1])], 1 * flags * u.m):
+        with pytest.raises(DomainError, match=r"mask.* = .*: expected an array of True and False, or of 1 and 0"):
+            masked(wrong)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [

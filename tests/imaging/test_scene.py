@@ -1,5 +1,7 @@
 """Scenes and files of a small run: stars against their own PSFs, places, table, bytes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -8,10 +10,11 @@ from astropy.table import Table
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError, ProductError
+from pachon.core.products import Stamp
 from pachon.core.units import ARCSEC
 from pachon.imaging.draw import Window
 from pachon.imaging.exposure import Exposure
-from pachon.imaging.image_file import OBJECT_COLUMNS, CcdImage
+from pachon.imaging.image_file import OBJECT_COLUMNS, CcdImage, is_whole
 from pachon.imaging.scene import STAR_ROOM, deep_exposures, draw_ccd, ellipticities, middle_window
 from pachon.measure.shapes import measure_shapes
 from pachon.pipeline.experiment import Experiment
@@ -19,6 +22,7 @@ from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
 from pachon.sky.galaxies import Galaxies
 
 POINTING, ROLL = (0.3, 0.2), 0.7
+STAMP = Stamp("ab" * 32, 7)
 
 
 def nothing(xi, eta):
@@ -119,6 +123,60 @@ def test_another_product_is_no_image(tmp_path):
     write_fits(tmp_path / "other.fits", [image_hdu("MEAN", np.zeros((3, 3)), "")], None, [])
     with pytest.raises(ProductError, match=r"other\.fits: no image of a CCD"):
         CcdImage.read(tmp_path / "other.fits")
+
+
+@pytest.fixture
+def parts(image, tmp_path):
+    """Write an image, and return its parts without checksums and the number of parts, as other programs write them."""
+    replace(image, stamp=STAMP).write(tmp_path / "image.fits")
+    assert is_whole(tmp_path / "image.fits", STAMP)
+    with fits.open(tmp_path / "image.fits", lazy_load_hdus=False) as hdus:
+        copies = fits.HDUList([hdu.copy() for hdu in hdus])
+    for hdu in copies:
+        for key in ("CHECKSUM", "DATASUM", "NPARTS"):
+            hdu.header.remove(key, ignore_missing=True)
+    return copies
+
+
+def test_an_image_without_checksums_is_not_damaged(image, parts, tmp_path):
+    path = tmp_path / "foreign.fits"
+    parts.writeto(path)
+    back = CcdImage.read(path)
+    for name in ("image", "variance", "mask"):
+        assert np.array_equal(getattr(back, name), getattr(image, name))
+    assert np.array_equal(back.objects["X"], image.objects["X"])
+    # Going on with a command takes only what that command itself has written whole.
+    assert not is_whole(path, STAMP)
+    # A sum that is there must hold, of the data alone too.
+    parts["IMAGE"].header["DATASUM"] = "1"
+    parts.writeto(path, overwrite=True)
+    with pytest.raises(ProductError, match=r"foreign\.fits: damaged \(IMAGE does not match its DATASUM\)"):
+        CcdImage.read(path)
+    for hdu in parts:
+        hdu.add_datasum()
+    parts.writeto(path, overwrite=True)
+    assert np.array_equal(CcdImage.read(path).image, image.image)
+    path.write_bytes(path.read_bytes()[:-2880])
+    with pytest.raises(ProductError, match=r"foreign\.fits: damaged or not FITS"):
+        CcdImage.read(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda parts: parts.pop(1), r"no image of a CCD \(IMAGE is missing"),
+        (lambda parts: parts.pop(4), r"no image of a CCD \(the table TRUTH is missing\)"),
+        (lambda parts: parts[0].header.remove("CCD"), r"no image of a CCD \(Keyword 'CCD' not found\.\)"),
+        (lambda parts: setattr(parts["MASK"], "data", np.zeros(3, np.int16)), r"no image of a CCD \(MASK "),
+        (lambda parts: setattr(parts["MASK"], "data", np.zeros((3, 2), np.int16)), r".* MASK have shapes .*\(3, 2\);"),
+        (lambda parts: setattr(parts["TRUTH"].columns["ETA"], "name", "ETTA"), r"no image of a CCD \(.*ETA"),
+    ],
+)
+def test_a_file_of_another_program_that_is_no_image_is_one_line(parts, tmp_path, change, text):
+    change(parts)
+    parts.writeto(tmp_path / "foreign.fits")
+    with pytest.raises(ProductError, match=rf"foreign\.fits: {text}"):
+        CcdImage.read(tmp_path / "foreign.fits")
 
 
 def test_astropy_reads_image_uncertainty_mask_and_table(image, tmp_path):

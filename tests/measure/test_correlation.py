@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from astropy import units as u
@@ -247,6 +250,51 @@ def test_bad_arguments():
             shear_correlation(x, y, e1, e2, min_sep=low, max_sep=high)
     with pytest.raises(DomainError, match="n_bins"):
         shear_correlation(x, y, e1, e2, min_sep=0.1, max_sep=1.0, n_bins=0)
+
+
+#: Calls with separations or bins of no physical sense, and what the one line of each begins with.
+BEYOND_RANGES = (
+    (
+        {"min_sep": 1e-200, "max_sep": 0.1},
+        "min_sep = 1e-200, max_sep = 0.1: expected separations of 1e-12 to 6.2",
+    ),
+    ({"min_sep": 5e-324, "max_sep": 0.1}, "min_sep = 5e-324, max_sep = 0.1: expected separations"),
+    ({"min_sep": -1.0, "max_sep": 0.1}, "min_sep = -1.0, max_sep = 0.1: expected separations"),
+    ({"min_sep": 1e-3, "max_sep": 1e10}, "min_sep = 0.001, max_sep = 10000000000.0: expected separations"),
+    ({"min_sep": 1e-3, "max_sep": 1e60}, "max_sep = 1e+60: expected one angle below 1e+50 in SI"),
+    ({"min_sep": 0.5, "max_sep": 0.5000001}, "min_sep = 0.5, max_sep = 0.5000001: expected a max_sep of at least"),
+    ({"min_sep": 0.1, "max_sep": 1.0, "n_bins": 1001}, "n_bins = 1001: expected a whole number of at most 1000"),
+)
+_CALLS = f"""
+import numpy as np, pachon
+x, y, e1, e2 = np.random.default_rng(0).normal(0.0, 0.01, (4, 60))
+x[1], y[1] = x[0], y[0]
+size = np.ones(60)
+for options, _ in {BEYOND_RANGES!r}:
+    for call, columns in (
+        (pachon.shear_correlation, (e1, e2)),
+        (pachon.rho_statistics, (e1, e2, size, 0.9 * e1, 0.9 * e2, size)),
+    ):
+        try:
+            call(x, y, *columns, **options)
+        except pachon.PachonError as error:
+            print(error)
+# The widest range of all, with two stars at one place.
+print(pachon.shear_correlation(x, y, e1, e2, min_sep=1e-12, max_sep=6.28, n_bins=1000).n_pairs.sum())
+"""
+
+
+@pytest.mark.long
+def test_separations_and_bins_beyond_their_ranges_are_refused():
+    # In a process of its own, which a segmentation fault ends: TreeCorr looks for the bin of log(0) in its arrays.
+    run = subprocess.run([sys.executable, "-c", _CALLS], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    *errors, pairs = run.stdout.splitlines()
+    assert len(errors) == 2 * len(BEYOND_RANGES)
+    for i, (_, begin) in enumerate(BEYOND_RANGES):
+        assert all(line.startswith(begin) for line in errors[2 * i : 2 * i + 2])
+    # All pairs of 60 stars but the one of no separation.
+    assert int(pairs) == 60 * 59 // 2 - 1
 
 
 def test_whole_weights_are_stars_that_many_times():

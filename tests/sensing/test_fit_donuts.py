@@ -1,13 +1,16 @@
 """Fits of donuts: accuracy without noise, honest errors with it, joint fits, and other images than donuts."""
 
 import json
+import warnings
 
 import numpy as np
 import pytest
 from donut_images import PIXEL, SIZE, WAVELENGTH, blurred, donut, fine_bins, noisy
+from scipy.ndimage import gaussian_filter
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError
+from pachon.core.plotting import picture_bytes
 from pachon.wavefront.atmosphere.mean_wavefront import mean_wavefront_covariance
 
 FIELD = np.deg2rad([0.6, 0.9])
@@ -246,6 +249,73 @@ def test_bad_donuts_are_flagged_and_others_go_on(focused, behind_focus, clean):
     assert np.isnan(fit.flux[bad]).all()
 
 
+def empty_stamp(seed):
+    """A stamp without a donut, and the variance that is claimed for it: noise, sky left in or taken off."""
+    level = (0, 1, 30, 100, 300, 1000, 3000, 10_000, 100_000, 1_000_000)[seed % 10]
+    rng = np.random.default_rng(seed)
+    sky = rng.poisson(level, (SIZE, SIZE)).astype(float)
+    noise = rng.normal(0.0, 1.0 + level, sky.shape)
+    return ((sky, 0.0), (sky, level), (sky - level, level), (noise, 0.0))[seed % 4]
+
+
+@pytest.mark.long
+def test_empty_stamps_are_flagged_and_the_others_go_on(behind_focus, clean):
+    flat, rng = np.zeros((SIZE, SIZE)), np.random.default_rng(3)
+    hot = flat.copy()
+    hot[45, 40] = 1e6
+    cloud = gaussian_filter(rng.normal(size=flat.shape), 4.0)
+    stamps = [
+        *(empty_stamp(seed) for seed in range(40)),
+        *((flat + level, 0.0) for level in (0.0, 1.0, 50.0, 1e4, 1e19, -1.0, -1e3, -1e19)),
+        (-np.abs(rng.normal(0.0, 10.0, flat.shape)), 0.0),
+        *((image, 100.0) for image in (hot, hot + rng.normal(0.0, 10.0, flat.shape))),
+        (np.full_like(flat, np.nan), 0.0),
+        *((np.full_like(flat, sign * np.inf), 0.0) for sign in (1.0, -1.0)),
+        (rng.poisson(1e3 * np.exp(cloud / cloud.std())).astype(float), 1000.0),
+    ]
+    images = [noisy(clean, 500.0, 3), *(image for image, _ in stamps)]
+    variance = np.array([500.0, *(claimed for _, claimed in stamps)])
+    options = {"noll": range(4, 12), "left_out": 0.0, **OPTIONS}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit = pachon.fit_donuts(
+            behind_focus, images, [FIELD] * len(images), WAVELENGTH, sky_variance=variance, **options
+        )
+        # A donut, zeros, the most negative, NaN.
+        assert picture_bytes(fit.plot([0, 41, 48, 52]), "png")
+    assert fit.usable.tolist() == [True] + [False] * len(stamps)
+    assert all(fit.reasons[1:])
+    assert set(fit.reasons[1:41]) == {"no donut", "no donut, too few photons"}
+    alone = pachon.fit_donuts(behind_focus, images[:1], [FIELD], WAVELENGTH, sky_variance=500.0, **options)
+    assert fit.zernikes[0].tobytes() == alone.zernikes[0].tobytes()
+
+
+@pytest.mark.long
+def test_faint_donuts_are_found_whether_the_sky_is_left_in_or_not(behind_focus, clean):
+    # Of 5e4 electrons on some 1800 pixels: a signal of 50 times the noise of the sky there.
+    images = [noisy(0.01 * clean, 500.0, seed) + left for seed in range(2) for left in (0.0, 500.0)]
+    options = {"sky_variance": 500.0, "noll": range(4, 9), "left_out": 0.0, **OPTIONS}
+    fit = pachon.fit_donuts(behind_focus, images, [FIELD] * 4, WAVELENGTH, **options)
+    assert fit.usable.all()
+    np.testing.assert_allclose(fit.flux, 5e4, atol=5.0 * fit.flux_error.max())
+    np.testing.assert_allclose(fit.background, [0.0, 500.0] * 2, atol=5.0 * 500**0.5 / 40)
+
+
+@pytest.mark.long
+def test_masks_of_booleans_or_of_ones_leave_pixels_out(behind_focus, clean):
+    image = noisy(clean, 500.0, 3)
+    mask = np.zeros((1, SIZE, SIZE), dtype=bool)
+    mask[0, 40:43, 20:70] = True
+    spoilt = np.where(mask[0], np.nan, image)
+    fits = [
+        pachon.fit_donuts(behind_focus, [spoilt], [FIELD], WAVELENGTH, mask=m, sky_variance=500.0, **OPTIONS)
+        for m in (mask, mask.astype(int), list(mask))
+    ]
+    assert fits[0].usable.all()
+    assert not fits[0].used[mask].any()
+    assert {fit.zernikes.tobytes() for fit in fits} == {fits[0].zernikes.tobytes()}
+
+
 @pytest.mark.long
 def test_a_wavefront_that_explains_the_wrong_side_of_focus_is_not_believed(focused):
     """1.4 um of coma and trefoil make a noisy donut in the corner look like one of the other side."""
@@ -412,7 +482,9 @@ def test_tables_summaries_and_pictures(behind_focus, clean):
         ),
         ({"higher_order": -1.0}, "higher_order"),
         ({"outer_scale": 0.0}, "outer_scale"),
-        ({"mask": np.zeros((1, 9, 9))}, "mask of shape"),
+        ({"mask": np.zeros((1, 9, 9), dtype=bool)}, "mask of shape"),
+        ({"mask": [np.zeros((9, 9), dtype=bool)]}, "mask of shape"),
+        ({"mask": np.full((1, SIZE, SIZE), 0.5)}, r"mask.* = .*: expected an array of True and False"),
     ],
 )
 def test_bad_arguments(behind_focus, clean, changes, text):

@@ -1,5 +1,7 @@
 """The model of a donut: against brute force, and its derivatives against central differences."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from donut_images import PIXEL, SIZE, WAVELENGTH, donut
@@ -10,6 +12,7 @@ from pachon.sensing.image_model import ImageGrid, LandedLight
 from pachon.sensing.likelihood import Stamp, model_image, normal_equations
 from pachon.sensing.pupil_cells import pupil_cells
 from pachon.sensing.seeing import Seeing
+from pachon.sensing.solve import Group, solve
 from pachon.sensing.stamps import Pixels
 from pachon.wavefront.atmosphere.turbulence import long_exposure_fwhm
 from pachon.wavefront.chief_rays import image_jacobians
@@ -127,3 +130,19 @@ def test_cells_measure_areas_and_moments(focused):
     assert square == pytest.approx(0.5 * (radius**2 + inner**2), rel=2e-4)
     assert abs(cells.weights @ x) < 1e-4
     assert abs(cells.weights @ y) < 1e-4
+
+
+def test_a_search_neither_starts_nor_steps_where_light_has_no_direction(behind_focus):
+    stamp = stamp_of(behind_focus, 30)
+    maps, prior, star = np.eye(len(NOLL))[None], np.zeros(len(NOLL)), np.array([1e5, 0.0, 0.0, 0.0, 5.0])
+    # 10 m of wavefront on a pupil of 4 m: slopes beyond a right angle.
+    steep = np.full(len(NOLL), 10.0)
+    assert np.isnan(model_image(stamp, star, steep)).all()
+    solution = solve(Group((stamp,), maps, prior), [star], steep)
+    assert not solution.converged
+    assert solution.loss == np.inf
+    np.testing.assert_array_equal(solution.shared, steep)
+    # A spread of light so wide that nothing but such wavefronts explains it: the search stays where light lands.
+    noise = np.random.default_rng(1).poisson(1e4, stamp.image.shape).astype(float)
+    solution = solve(Group((replace(stamp, image=noise),), maps, prior), [star], np.zeros(len(NOLL)))
+    assert np.isfinite(solution.loss)

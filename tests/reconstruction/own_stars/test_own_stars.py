@@ -1,6 +1,7 @@
 """PSF models of stars from other programs: what is kept, how well held-out stars are predicted, and the command."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -75,6 +76,10 @@ def test_residuals_of_held_out_stars_are_their_noise(own):
     assert 0.8 < np.std(size / own.sigma_size) < 1.35
     rho = own.rho_statistics()
     assert abs(np.nanmean(rho.rho1.xi_plus)) < 0.2 * own.summary()["rms_e"] ** 2
+    with pytest.raises(DomainError, match="bins = 1001: expected a whole number of at most 1000"):
+        own.rho_statistics(1001)
+    with pytest.raises(DomainError, match=r"positions: the stars lie within .* rad; expected 1e-10 to 6.283 rad"):
+        replace(own, positions=1e-60 * own.positions).rho_statistics()
 
 
 @pytest.mark.long

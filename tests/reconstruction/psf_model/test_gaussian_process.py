@@ -30,7 +30,7 @@ def psf(places):
     return image / image.sum(axis=(1, 2), keepdims=True)
 
 
-def setup(n=30, seed=0):
+def kriging_case(n=30, seed=0):
     rng = np.random.default_rng(seed)
     points, values = rng.uniform(-1.0, 1.0, (n, 2)), rng.normal(size=(n, 3))
     terms = np.stack([np.ones(n), *points.T], axis=1)
@@ -39,7 +39,7 @@ def setup(n=30, seed=0):
 
 
 def test_kriging_equals_its_normal_equations():
-    points, values, terms, kernels, star_noise = setup()
+    points, values, terms, kernels, star_noise = kriging_case()
     trend, weights, _ = krige(points, values, terms, kernels, star_noise)
     at = np.random.default_rng(1).uniform(-1.0, 1.0, (7, 2))
     found = np.stack([np.ones(7), *at.T], axis=1) @ trend + predict(points, at, kernels, weights)
@@ -55,7 +55,7 @@ def test_kriging_equals_its_normal_equations():
 
 
 def test_left_out_equals_leaving_out():
-    points, values, terms, kernels, star_noise = setup()
+    points, values, terms, kernels, star_noise = kriging_case()
     left_out = krige(points, values, terms, kernels, star_noise)[2]
     for i in (0, 17):
         keep = np.arange(30) != i
@@ -65,7 +65,7 @@ def test_left_out_equals_leaving_out():
 
 
 def test_each_place_alone():
-    points, values, terms, kernels, star_noise = setup()
+    points, values, terms, kernels, star_noise = kriging_case()
     _, weights, _ = krige(points, values, terms, kernels, star_noise)
     at = np.random.default_rng(1).uniform(-1.0, 1.0, (50, 2))
     whole = predict(points, at, kernels, weights)
