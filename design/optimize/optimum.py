@@ -15,8 +15,10 @@ from ..parameters.parameters import Parameter
 from .before_after import draw_before_after
 from .operand import Operand
 
-#: Relative difference of the merit measured anew above which it is said, and rounding of it.
-_DIFFERENT, _ROUNDING = 1e-2, 1e-9
+#: Relative difference of the merit measured anew above which it is said.
+_DIFFERENT = 1e-2
+#: Relative difference of two merits that rounding makes.
+_ROUNDING = 1e-9
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
