@@ -14,6 +14,7 @@ from ...core.errors import DomainError
 from ...core.plotting import BLUE, figure_at, plain_text, styled
 from ...core.threads import one_blas_thread
 from ...core.units import field_label, require_count
+from ...models.paraxial import following_stop
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import MOST_TERMS, annular_zernikes
 from ...raytrace.rays import RayStatus
@@ -171,7 +172,8 @@ def sensitivity(
 
     Each ray takes one forward and one backward pass, whatever the number of parameters. The wavefront is that of
     :func:`~pachon.wavefront.opd.wavefront_opd`, to a sphere about the landing point of the chief ray, which moves with
-    the parameters. The set of lit rays is fixed: derivatives leave out the motion of rims.
+    the parameters. The set of lit rays is fixed: derivatives leave out the motion of rims. Rays fill a stop that has
+    mirrors or lenses in front of it, aimed as `aiming` "real" where the design data state none.
 
     Parameters
     ----------
@@ -190,6 +192,7 @@ def sensitivity(
     UnknownNameError, ConfigError
         If an address is unknown.
     """
+    telescope = following_stop(telescope)
     chosen = parse_parameters(parameters, telescope)
     n_zernike = require_count(n_zernike, "n_zernike", 1, MOST_TERMS)
     request = Request.of(
