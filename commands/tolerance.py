@@ -53,6 +53,7 @@ def tolerance_command(
     """
     from ..core.files import make_folder
     from ..models.io.bundled import BUNDLED
+    from ..models.paraxial import following_stop
     from ..studies.tolerance.file import load_tolerances, with_settings
     from ..studies.tolerance.product import tolerance_summary, write_tolerances
     from ..studies.tolerance.study import run_tolerances
@@ -83,6 +84,8 @@ def tolerance_command(
         return
     if not quiet:
         _show(summary)
+        if following_stop(telescope) is not telescope:
+            print(f"rays fill the stop {telescope.design_data.stop}, as with aiming: real")
     print(f"tolerances: {folder.resolve()}")
 
 

@@ -68,6 +68,7 @@ def sensitivity(
     from ...design.optimize.sensitivity_file import write_sensitivity
     from ...models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
     from ...models.parameters.parameters import usual_parameters
+    from ...models.paraxial import following_stop
 
     if out is not None and out.suffix not in (".fits", ".ecsv"):
         raise ConfigError(f"--out {out}: expected a name that ends in .fits or .ecsv")
@@ -84,6 +85,8 @@ def sensitivity(
     write_sensitivity(path, result)
     values, _ = result.modes()
     notes = [f"singular values: {values[0]:.3g} to {values[-1]:.3g}", f"matrix: {path.resolve()}"]
+    if following_stop(telescope) is not telescope:
+        notes.insert(0, f"rays fill the stop {telescope.design_data.stop}, as with --aiming real")
     return Outcome(result, notes=notes)
 
 
@@ -237,6 +240,13 @@ def _notes(result: Any) -> list[str]:
     s, optimum = result.summary(), _optimum(result)
     unit, (start, end) = "µrad" if optimum.in_angles else "µm", 1e6 * optimum.merits
     lines = [f"rms of {s['merit']}: {start:.6g} -> {end:.6g} {unit}, {s['steps']} steps"]
+    filled, stated = 1e6 * optimum.remeasured.T
+    if stops := ", ".join(optimum.filled_stops):
+        lines.append(f"rays fill the stop {stops}, as with --aiming real; without: {_from_to(stated)} {unit}")
+    if not optimum.is_as_measured:
+        lines.append(f"measured anew on the saved lens, of its light and fields: {_from_to(filled)} {unit}")
+    if not optimum.is_better:
+        lines.append(f"not better than the start: {s['merit']} of {_from_to(filled)} {unit}")
     if s["operands"]:
         start, end = 1e6 * optimum.history[[0, -1]]
         lines.append(f"with operands: {start:.6g} -> {end:.6g} {unit}")
@@ -249,6 +259,10 @@ def _notes(result: Any) -> list[str]:
         lines.append(f"{label}{owner}: {evaluation.start / size:.6g} -> {evaluation.end / size:.6g}{unit} ({goal})")
     lines += [f"glass: {start_glass} -> {end_glass}" for start_glass, end_glass in s.get("glasses", {}).items()]
     return lines + [f"collinear: {combination}" for combination in s["collinear"]]
+
+
+def _from_to(pair: Any) -> str:
+    return f"{pair[0]:.6g} -> {pair[1]:.6g}"
 
 
 def _bounds(text: str) -> tuple[str, tuple[float, float]]:
