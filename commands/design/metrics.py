@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from typer import Option
 
 from ...core.errors import ConfigError
+from ...core.file_names import file_name
 from ..tables import FIELD, Column, Rows, field_headings, number_texts, numbers_of
 from .command import Given, Outcome, Study, design_command
 
@@ -124,7 +125,7 @@ def zernikes(
         raise ConfigError("--fringe and --double: expected one of them")
     if double is not None:
         terms = double_zernikes(telescope, given.wavelength, kmax=double, **how)
-        return Outcome(terms, _double_rows, stem=f"double_zernikes_{telescope.name}")
+        return Outcome(terms, _double_rows, stem=f"double_zernikes_{file_name(telescope.name)}")
     fields = field_disc(telescope) if over_field else given.fields
     ordering = "fringe" if fringe else "noll"
     found = wavefront_zernikes(telescope, fields, given.wavelength, ordering=ordering, **how)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Option
 
 from ...core.errors import ConfigError, PrescriptionError, PrescriptionWarning
+from ...core.file_names import file_name
 from ..inputs import errors_of, warnings_shown
 from ..options import name_list
 from ..tables import Column
@@ -77,7 +78,7 @@ def sensitivity(
     else:
         chosen = usual_parameters(telescope) if parameters is None else name_list(parameters, "--parameters")
         result = compute(telescope, chosen, *where, **how)
-    path = out or Path(f"sensitivity_{telescope.name}.fits")
+    path = out or Path(f"sensitivity_{file_name(telescope.name)}.fits")
     write_sensitivity(path, result)
     values, _ = result.modes()
     notes = [f"singular values: {values[0]:.3g} to {values[-1]:.3g}", f"matrix: {path.resolve()}"]
@@ -179,7 +180,7 @@ def optimize(
             **given.how,
         )
     found = _optimum(result)
-    paths = [out or Path(f"optimized_{telescope.name}.yaml") for telescope in found.telescopes]
+    paths = [out or Path(f"optimized_{file_name(telescope.name)}.yaml") for telescope in found.telescopes]
     with warnings_shown(PrescriptionWarning):
         for telescope, path in zip(found.telescopes, paths, strict=True):
             try:
