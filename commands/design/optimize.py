@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Option
 
 from ...core.errors import ConfigError, PrescriptionError, PrescriptionWarning
+from ...core.file_names import file_name
 from ..inputs import errors_of, warnings_shown
 from ..options import name_list
 from ..tables import Column
@@ -81,7 +82,7 @@ def sensitivity(
     else:
         variables = usual_parameters(telescope) if parameters is None else name_list(parameters, "--parameters")
     result = compute(telescope, variables, *where, n_zernike=zernikes, **shared.trace_options)
-    path = out or Path(f"sensitivity_{telescope.name}.fits")
+    path = out or Path(f"sensitivity_{file_name(telescope.name)}.fits")
     write_sensitivity(path, result)
     values, _ = result.modes()
     notes = [f"singular values: {values[0]:.3g} to {values[-1]:.3g}", f"matrix: {path.resolve()}"]
@@ -183,7 +184,7 @@ def optimize(
             **shared.trace_options,
         )
     optimum = _optimum(result)
-    paths = [out or Path(f"optimized_{telescope.name}.yaml") for telescope in optimum.telescopes]
+    paths = [out or Path(f"optimized_{file_name(telescope.name)}.yaml") for telescope in optimum.telescopes]
     with warnings_shown(PrescriptionWarning):
         for telescope, path in zip(optimum.telescopes, paths, strict=True):
             try:
