@@ -95,7 +95,7 @@ def fit_donuts(
     ----------
     telescope : Telescope
         Telescope as it is believed to be, defocus included: ``tel.perturbed("Detector", shift=(0, 0, 1.5e-3))`` is
-        behind focus.
+        behind focus; ``"Camera"`` in its place where the camera moves, as in full-array mode.
     images : array_like, shape [n, ny, nx], or sequence of n arrays
         Stamps [electrons], sky subtracted, ``[iy, ix]`` along +y and +x of the detector, each centred on its donut
         within a few pixels.
@@ -129,8 +129,8 @@ def fit_donuts(
     field_noll : iterable of int, optional
         Fit double Zernikes to all donuts together: Noll indices of terms over the field, from 1.
     defocus : float or array, shape [n]
-        Shift of the detector of each image along its z, beside that of the telescope [m]: 0 for all in one plane, or
-        1.5 mm and 0 for donuts and in-focus stars, which then share one likelihood.
+        Shift of the detector, not of the camera, of each image along its z, beside that of the telescope [m]: 0 for all
+        in one plane, or 1.5 mm and 0 for donuts and in-focus stars, which then share one likelihood.
     focal_plane : FocalPlane, optional
         Heights of the CCDs.
     wavelength_weights : array_like, shape [n_wave], optional

@@ -75,11 +75,12 @@ class NormalEquations:
 
 def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> NormalEquations:
     """Return the normal equations of one star; unknowns are those of the star, then of its wavefront."""
+    # First: of joint fits, the rims on the detector are those of the last response.
+    response = stamp.rays.response(wave)
     light = _landed(stamp, wave)
     if light is None:
         n = len(unknowns) + len(wave)
         return NormalEquations(np.zeros((n, n)), np.zeros(n), np.inf, np.inf)
-    response = stamp.rays.response(wave)
     model, columns, scales = stamp.grid.derivatives(unknowns, light, response, stamp.rays.rates)
     # A slice where all pixels are used, since that is no copy.
     used = stamp.used if not stamp.used.all() else np.s_[:, :]
