@@ -18,7 +18,7 @@ from ..pupil_polynomials import PupilPolynomials
 from ..pupil_sampling import spiral_annulus
 from .engine import PsfInputs
 from .far_from_focus import blur_radii
-from .fast import FastPsfEngine
+from .fast import FastEngine, FastRenderer
 from .image_plane import square_transfer
 from .pupil_rims import pupil_rims, strip_overlap
 
@@ -34,7 +34,7 @@ _SMOOTH_POINTS, _DARK = 2000, 1e-3
 
 
 def ray_counts(optics: PupilOptics, pixel_size: float) -> np.ndarray:
-    """Return the number of rays of each star for :class:`MeanRaysEngine`, 0 near focus, shape [n_star] int.
+    """Return the number of rays of each star for :class:`MeanRaysRenderer`, 0 near focus, shape [n_star] int.
 
     ``pixel_size`` is in metres.
     """
@@ -48,7 +48,7 @@ def drawing_ray_counts(optics: PupilOptics, pixel_size: float) -> np.ndarray:
     return np.asarray(count, dtype=np.int64)
 
 
-class MeanRaysEngine(FastPsfEngine):
+class MeanRaysRenderer(FastRenderer):
     """Rays of the optics alone, filtered by the mean transfer function of all turbulence.
 
     Pupil points stand on a spiral, which lines up with no rim. Rays are shared among the four cells around them: in
@@ -57,7 +57,8 @@ class MeanRaysEngine(FastPsfEngine):
 
     def __init__(self, inputs: PsfInputs, rays: int) -> None:
         self._air = inputs.atmosphere
-        super().__init__(replace(inputs, atmosphere=None, n_pupil=rays, oversampling=OVERSAMPLING), far_from_focus=True)
+        options = FastEngine(n_pupil=rays, oversampling=OVERSAMPLING)
+        super().__init__(replace(inputs, atmosphere=None), options, far_from_focus=True)
 
     def _place_pupil(self, n_pupil: int) -> None:
         self._points = spiral_annulus(0.5 * self._diameter, self._inner, int(self._area * n_pupil)).points

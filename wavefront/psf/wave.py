@@ -29,19 +29,21 @@ In silicon w is the path to one depth; time steps take turns at the depths, and 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import scipy.fft
 import warp as wp
 
-from ...core.errors import DomainError
+from ...core.arguments import check_arguments
 from ...core.launch import launch
 from ...core.threads import thread_count
+from ...core.units import require_positive
 from ...core.warp_arrays import warp_array
 from ..atmosphere.spline import spline_weights
 from ..pupil_optics import PupilOptics
-from .engine import ExposedStars, PsfEngine, PsfInputs, Stars
+from .engine import ExposedStars, PsfEngine, PsfInputs, PsfRenderer, Stars
 from .inner_rim import clipped_by_apertures, traced_obscuration
 from .pupil_lattice import PupilLattice
 from .sample_packets import LANES, indices, samples
@@ -60,17 +62,48 @@ FEWEST_ACROSS = 96
 _NEGLIGIBLE, _TRIED = 1e-4, 64
 
 
-class WavePsfEngine(PsfEngine):
-    """Fourier optics; each thread computes one star at a time."""
+@check_arguments
+@dataclass(frozen=True)
+class WaveEngine(PsfEngine):
+    """Fourier optics, the slow reference engine.
+
+    Attributes
+    ----------
+    padding : bool, optional
+        Whether all baselines are used, up to the diameter of the pupil. By default they are where there is no
+        atmosphere or next to no charge diffusion.
+    pupil_spacing : float, optional
+        Distance of the pupil points [m], above 0. By default the image repeats itself outside the stamp only, and the
+        distance is at most 0.02 m, or 0.04 m without an atmosphere, and a 96th of the diameter.
+
+    Raises
+    ------
+    DomainError
+        If the distance is not positive.
+    """
 
     name = "wave"
-    depths = 3
-    options = ("padding", "pupil_spacing")
     screens = ("low", "high")
 
-    def __init__(self, inputs: PsfInputs) -> None:
+    padding: bool | None = None
+    pupil_spacing: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.pupil_spacing is not None:
+            require_positive(self.pupil_spacing, "pupil_spacing", "metres")
+
+    def _renderer(self, inputs: PsfInputs) -> WaveRenderer:
+        return WaveRenderer(inputs, self)
+
+
+class WaveRenderer(PsfRenderer):
+    """Renderer of :class:`WaveEngine`; each thread computes one star at a time."""
+
+    depths = 3
+
+    def __init__(self, inputs: PsfInputs, options: WaveEngine) -> None:
         super().__init__(inputs)
-        self._make_pupil_lattice(inputs.padding, inputs.pupil_spacing)
+        self._make_pupil_lattice(options.padding, options.pupil_spacing)
         self._load_screens()
         self._schedule = self._channels.depth_schedule(1 if inputs.atmosphere is None else len(inputs.atmosphere.times))
         self.batch = thread_count(inputs.threads)
@@ -80,8 +113,6 @@ class WavePsfEngine(PsfEngine):
             largest = LARGEST_SPACING_OPTICS if self._atmosphere is None else LARGEST_SPACING
             largest = min(largest, self._diameter / FEWEST_ACROSS)
             spacing = min(largest, float(self._wavelengths.min()) * self.focal_length / self._plane.side)
-        if not (math.isfinite(spacing) and spacing > 0.0):
-            raise DomainError(f"pupil_spacing = {spacing!r}: expected a positive length in metres")
         diameter = self._diameter
         longest = diameter
         if padding is False:
@@ -112,7 +143,8 @@ class WavePsfEngine(PsfEngine):
             self._sides, self._steps = np.ones(2, dtype=np.int64), np.ones(2)
         else:
             self._splines = [
-                atmosphere.screens(scale, self._threads).reshape(atmosphere.layer_count, -1) for scale in self.screens
+                atmosphere.screens(scale, self._threads).reshape(atmosphere.layer_count, -1)
+                for scale in WaveEngine.screens
             ]
             self._sides = np.array([atmosphere.screen_size, atmosphere.fine_size])
             self._steps = self._lattice.spacing / np.array([atmosphere.screen_pixel, atmosphere.fine_pixel])
@@ -250,7 +282,7 @@ class WavePsfEngine(PsfEngine):
 
     def _sample(self, spectra: np.ndarray, jacobian: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """Return the stamp: the spectra of all wavelengths evaluated at the pixel centres."""
-        side = self._plane.stamp_size
+        side = self._plane.size
         step = np.arange(-self._reach, self._reach + 1)
         x, y = np.meshgrid(self._plane.pixel_centers, self._plane.pixel_centers)
         pixels = np.stack([x, y], axis=-1).reshape(-1, 2) - offset * self._plane.pixel_size
