@@ -68,7 +68,7 @@ class LayerScreens(Layers):
                 )
         # A store of other screens, as that of an atmosphere with another Fried parameter, is not shared.
         names = [name for name in LayerScreens.__annotations__ if name != "store"]
-        key = (tuple(self.weights.tolist()), *(getattr(self, name) for name in names))
+        key = (type(self), tuple(self.weights.tolist()), *(getattr(self, name) for name in names))
         if self.store.key != key:
             object.__setattr__(self, "store", ScreenStore(key))
 

@@ -16,10 +16,10 @@ _making_lock = threading.Lock()
 
 
 class ScreenStore:
-    """Screens of the layers, each row made once, held until no atmosphere uses them.
+    """Screens of the layers, each row made once.
 
-    An atmosphere uses the store from its first call of :meth:`screens` to its :meth:`release`, or its own end. Copies
-    and pickles of a store are empty.
+    An atmosphere uses the store from its first call of :meth:`screens` to its :meth:`release`, or its own end. The
+    screens are freed by a :meth:`release` that leaves no user, and with the store. Copies and pickles of it are empty.
 
     Parameters
     ----------
