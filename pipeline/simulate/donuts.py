@@ -135,8 +135,8 @@ def draw_donuts(
         if not np.all((np.asarray(value) >= 0.0) & (np.asarray(value) <= _MOST_ELECTRONS)):
             raise DomainError(f"{name} = {shown(value)}: expected 0 to {_MOST_ELECTRONS:g} electrons", key=name)
     caught = light * np.minimum(stars.inside, 1.0)
-    stamps = observe_stamps(stars.image, caught, sky, read_noise, stream(seed, "donuts", "noise"))
+    observed = observe_stamps(stars.image, caught, sky, read_noise, stream(seed, "donuts", "noise"))
     images, defects = add_defects(
-        stamps, stars.image, stream(seed, "donuts", "defects"), neighbours=second_stars, cosmic_rays=cosmic_rays
+        observed, stars.image, stream(seed, "donuts", "defects"), neighbours=second_stars, cosmic_rays=cosmic_rays
     )
     return Donuts(images, float(sky + read_noise**2), stars, light.copy(), defects)

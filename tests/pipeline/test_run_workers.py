@@ -119,6 +119,7 @@ def test_screens_are_kept_where_they_are_the_same_and_freed_where_not(tiny):
     assert not np.array_equal(other.screens("slopes"), screens)
     # In use until released, then freed and made again.
     assert same.screens("slopes") is screens
+    one.release()
     same.release()
     assert same.screens("slopes") is not screens
 

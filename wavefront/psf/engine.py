@@ -125,7 +125,8 @@ class PsfEngine(ABC):
 
     def with_n_pupil(self, n_pupil: int | None) -> Self:
         """Return the engine with another number of pupil points; the same one if it has no such option."""
-        return replace(self, n_pupil=n_pupil) if "n_pupil" in {f.name for f in fields(self)} else self
+        options: dict[str, Any] = {"n_pupil": n_pupil}
+        return replace(self, **options) if "n_pupil" in {f.name for f in fields(self)} else self
 
 
 class PsfRenderer(ABC):
