@@ -186,5 +186,5 @@ def test_requests_keep_what_the_design_data_state():
     for name, value in {"fields": [0.0, 0.0], "wavelengths": 6e-7, "projection": "postel"}.items():
         with pytest.raises(ConfigError, match=rf"^{name} = .*: given beside a Request, which has its own$"):
             pachon.spots(request, **{name: value})
-    with pytest.raises(DomainError, match="^wavelength: 2 wavelengths are given; expected one$"):
+    with pytest.raises(DomainError, match=r"^wavelength: 2 wavelengths are given; expected one$"):
         pachon.distortion(pachon.Request.of(lens, wavelengths=[5.5e-7, 6e-7]))
