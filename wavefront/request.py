@@ -307,8 +307,8 @@ class Request:
         """Yield slices of the field points and their requests, which bound the memory for many field points."""
         step = max(1, RAYS_AT_ONCE // (len(self.pupil) + 1))
         for first in range(0, len(self.fields), step):
-            part = slice(first, min(first + step, len(self.fields)))
-            yield part, self.at_fields(part)
+            field_slice = slice(first, min(first + step, len(self.fields)))
+            yield field_slice, self.at_fields(field_slice)
 
 
 @check_arguments

@@ -84,27 +84,29 @@ def checked_layers(
     height = np.array(site.altitudes if altitudes is None else altitudes, dtype=np.float64).reshape(-1)
     count = len(height)
     if wind_directions is None:
-        known = site.wind_directions if altitudes is None else (None,) * count
+        site_directions = site.wind_directions if altitudes is None else (None,) * count
         wind_directions = [
             2.0 * math.pi * layer_random(seed, epoch, n, "wind", 1)[0] if direction is None else direction
-            for n, direction in enumerate(known)
+            for n, direction in enumerate(site_directions)
         ]
-    given = {
+    layer_values = {
         "altitudes": height,
         "weights": np.array(site.weights if weights is None else weights, dtype=np.float64),
         "wind_speeds": np.array(site.wind_speeds if wind_speeds is None else wind_speeds, dtype=np.float64),
         "wind_directions": np.array(wind_directions, dtype=np.float64),
     }
-    for name, values in given.items():
+    for name, values in layer_values.items():
         if values.shape != (count,) or count == 0:
             raise DomainError(f"{name} of shape {values.shape}: expected one number for each of the {count} layers")
         low = -math.inf if name == "wind_directions" else 0.0
         if not np.all(np.isfinite(values) & (values >= low)):
             raise DomainError(f"{name} = {values.tolist()}: expected finite numbers{' from 0' if low == 0.0 else ''}")
-    total = float(given["weights"].sum())
+    total = float(layer_values["weights"].sum())
     if abs(total - 1.0) > WEIGHT_TOLERANCE:
-        raise DomainError(f"weights = {given['weights'].tolist()}: expected fractions that sum to 1, not {total:.6g}")
-    return height, given["weights"] / total, given["wind_speeds"], given["wind_directions"]
+        raise DomainError(
+            f"weights = {layer_values['weights'].tolist()}: expected fractions that sum to 1, not {total:.6g}"
+        )
+    return height, layer_values["weights"] / total, layer_values["wind_speeds"], layer_values["wind_directions"]
 
 
 def line_of_sight(heights: np.ndarray, ground_lift: float, zenith: float) -> np.ndarray:

@@ -25,9 +25,11 @@ from ...models.zernike_polynomials import annular_zernikes, noll_to_nm
 from .atmosphere import Atmosphere
 from .turbulence import path_spectrum
 
-# Frequencies times the diameter of the pupil, on a logarithmic scale, and directions over half the plane: enough for
-# the narrow lobe of a long exposure, which is 1/300 rad wide at 1 cycle/m after 15 s of 20 m/s.
-_FREQUENCIES, _DIRECTIONS = (0.005, 40.0, 100), 768
+# Frequencies times the diameter of the pupil: lowest, highest and number, on a logarithmic scale.
+_FREQUENCIES = (0.005, 40.0, 100)
+# Directions over half the plane: enough for the narrow lobe of a long exposure, which is 1/300 rad wide at 1 cycle/m
+# after 15 s of 20 m/s.
+_DIRECTIONS = 768
 # Nodes of the integral over the radius of the pupil.
 _RADII = 60
 # Distance, in outer scales, beyond which the light of two stars crosses independent turbulence.
@@ -75,21 +77,21 @@ def mean_wavefront_covariance(
     n_star, n_noll = len(slopes), len(indices)
     covariance = np.zeros((n_star, n_noll, n_star, n_noll))
     for altitude, weight, velocity in zip(atmosphere.altitudes, atmosphere.weights, atmosphere.velocities, strict=True):
-        seen = weight * power[:, None] * np.sinc(plane @ (velocity * atmosphere.exposure)) ** 2
+        layer_power = weight * power[:, None] * np.sinc(plane @ (velocity * atmosphere.exposure)) ** 2
         apart = altitude * (slopes[:, None] - slopes)
-        known: dict[tuple[float, float], np.ndarray] = {}
+        covariance_at: dict[tuple[float, float], np.ndarray] = {}
         for a in range(n_star):
             for b in range(a, n_star):
                 distance = apart[a, b]
                 if np.hypot(*distance) > _INDEPENDENT * atmosphere.outer_scale:
                     continue
                 key = (float(distance[0]), float(distance[1]))
-                if key not in known:
-                    shifted = transform * (seen * np.exp(-2j * np.pi * (plane @ distance)))[..., None]
-                    known[key] = np.tensordot(shifted, transform.conj(), axes=((0, 1), (0, 1))).real
-                covariance[a, :, b] += known[key]
+                if key not in covariance_at:
+                    shifted = transform * (layer_power * np.exp(-2j * np.pi * (plane @ distance)))[..., None]
+                    covariance_at[key] = np.tensordot(shifted, transform.conj(), axes=((0, 1), (0, 1))).real
+                covariance[a, :, b] += covariance_at[key]
                 if a != b:
-                    covariance[b, :, a] += known[key].T
+                    covariance[b, :, a] += covariance_at[key].T
     return covariance
 
 

@@ -133,8 +133,8 @@ def phase_screen(
     field = np.empty((size, size), dtype=np.float32) if out is None else out
 
     def along_y(first: int) -> None:
-        part = modes[first : first + _COLUMN_BLOCK]
-        padded = _in_fft_order(part, size)
+        block = modes[first : first + _COLUMN_BLOCK]
+        padded = _in_fft_order(block, size)
         columns[first : first + _COLUMN_BLOCK] = scipy.fft.ifft(padded, axis=1, norm="forward", overwrite_x=True)
 
     def along_x(first: int) -> None:
@@ -179,25 +179,25 @@ def slope_screen(
     step = 2.0 * math.pi / length
     i = np.arange(reach + 1, dtype=np.float32)[:, np.newaxis] * np.float32(step)
     j = np.arange(-reach, reach + 1, dtype=np.float32) * np.float32(step)
-    wanted = np.ones(size, dtype=bool) if rows is None else in_whole_blocks(rows)
+    needed_rows = np.ones(size, dtype=bool) if rows is None else in_whole_blocks(rows)
     # Where a row stands among those that are computed.
-    place = np.concatenate([[0], np.cumsum(wanted)])
-    kept = slice(None) if wanted.all() else np.flatnonzero(wanted)
+    place = np.concatenate([[0], np.cumsum(needed_rows)])
+    row_index = slice(None) if needed_rows.all() else np.flatnonzero(needed_rows)
     columns = np.empty((2 * reach + 1, place[-1]), dtype=np.complex64)
     packed = np.empty((size, size), dtype=np.int32) if out is None else out
 
     def along_y(first: int) -> None:
-        part = slice(first, min(first + _COLUMN_BLOCK, reach + 1))
+        block = slice(first, min(first + _COLUMN_BLOCK, reach + 1))
         # NumPy's sinc is sin(pi x)/(pi x).
-        modes[part] *= np.sinc(np.hypot(i[part], j) * (0.5 * lag / math.pi)) / unit
+        modes[block] *= np.sinc(np.hypot(i[block], j) * (0.5 * lag / math.pi)) / unit
         # The gradient along x and i times that along y, of the modes with i and of their conjugates with -i.
         for sign in (1, -1):
-            here = modes[part] if sign == 1 else np.conj(modes[part, ::-1])
-            padded = _in_fft_order((1j * sign) * i[part] * here - j * here, size)
-            lines = reach + np.arange(part.start, part.stop) * sign
-            if sign == -1 and part.start == 0:
+            signed_modes = modes[block] if sign == 1 else np.conj(modes[block, ::-1])
+            padded = _in_fft_order((1j * sign) * i[block] * signed_modes - j * signed_modes, size)
+            lines = reach + np.arange(block.start, block.stop) * sign
+            if sign == -1 and block.start == 0:
                 padded, lines = padded[1:], lines[1:]
-            columns[lines] = scipy.fft.ifft(padded, axis=1, norm="forward", overwrite_x=True)[:, kept]
+            columns[lines] = scipy.fft.ifft(padded, axis=1, norm="forward", overwrite_x=True)[:, row_index]
 
     def along_x(first: int) -> None:
         rows = slice(first, min(first + _ROW_BLOCK, size))
@@ -209,5 +209,5 @@ def slope_screen(
 
     with ThreadPoolExecutor(thread_count(threads)) as pool:
         list(pool.map(along_y, range(0, reach + 1, _COLUMN_BLOCK)))
-        list(pool.map(along_x, (first for first in range(0, size, _ROW_BLOCK) if wanted[first])))
+        list(pool.map(along_x, (first for first in range(0, size, _ROW_BLOCK) if needed_rows[first])))
     return packed

@@ -19,9 +19,13 @@ _FEW_STEPS = 128
 # Smallest transfer function of charge diffusion: products of smaller ones would be denormal, which takes processors ten
 # times as long as zero.
 _DARK = 1e-15
-# Parts of a turn from one time step, group of pupil points and wavelength to the next: irrational, and far from simple
-# fractions and from each other, so that few or many of them fill a turn evenly.
-_TIME_STEP, _GROUP_STEP, _WAVE_STEP = 0.5 * (5.0**0.5 - 1.0), 2.0**0.5 - 1.0, 0.5497004779019703
+# Fractions of a turn from one step to the next: irrational, and far from simple fractions and from each other, so that
+# few or many of them fill a turn evenly. Of time steps:
+_TIME_STEP = 0.5 * (5.0**0.5 - 1.0)
+# Of groups of pupil points.
+_GROUP_STEP = 2.0**0.5 - 1.0
+# Of wavelengths.
+_WAVE_STEP = 0.5497004779019703
 
 
 @dataclass(frozen=True)

@@ -43,10 +43,10 @@ def within(a: wp.float64, b: wp.float64, c: wp.float64, square: wp.float64):
         if inner > zero:
             # The two roots without the difference of near-equal numbers.
             scaled_root = -half * (slope + wp.where(slope < zero, -wp.sqrt(inner), wp.sqrt(inner)))
-            one = scaled_root / curvature
-            other = wp.where(scaled_root == zero, zero, start / scaled_root)
-            low = wp.clamp(wp.min(one, other), zero, two)
-            high = wp.clamp(wp.max(one, other), zero, two)
+            first_root = scaled_root / curvature
+            second_root = wp.where(scaled_root == zero, zero, start / scaled_root)
+            low = wp.clamp(wp.min(first_root, second_root), zero, two)
+            high = wp.clamp(wp.max(first_root, second_root), zero, two)
     elif curvature <= zero:
         end = c - square
         if start < zero and end < zero:

@@ -85,17 +85,17 @@ class Stars:
 def expose_by_kind(kinds: np.ndarray, expose: Callable[[int, Stars], ExposedStars], stars: Stars) -> ExposedStars:
     """Expose stars of several kinds [n_star], each kind by one call of ``expose`` with the kind and its stars."""
     groups = [np.flatnonzero(kinds == kind) for kind in np.unique(kinds)]
-    parts = [expose(int(kinds[group[0]]), stars[group]) for group in groups]
+    exposed = [expose(int(kinds[group[0]]), stars[group]) for group in groups]
     order = np.argsort(np.concatenate(groups))
 
     def draw(shift: np.ndarray | None) -> np.ndarray:
         shifts = [None if shift is None else shift[group] for group in groups]
-        return np.concatenate([part.draw(moved) for part, moved in zip(parts, shifts, strict=True)])[order]
+        return np.concatenate([e.draw(moved) for e, moved in zip(exposed, shifts, strict=True)])[order]
 
     return ExposedStars(
         draw,
-        np.concatenate([part.lit_fraction for part in parts])[order],
-        np.concatenate([part.reference_point for part in parts])[order],
+        np.concatenate([e.lit_fraction for e in exposed])[order],
+        np.concatenate([e.reference_point for e in exposed])[order],
     )
 
 

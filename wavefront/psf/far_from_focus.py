@@ -24,7 +24,7 @@ def blur_radii(optics: PupilOptics) -> np.ndarray:
     return np.asarray(np.sqrt(total / np.maximum(optics.lit.sum(axis=(1, 2)), 1)))
 
 
-def sampling_refinement(optics: PupilOptics, neighbour: float, largest: float, wanted: float) -> np.ndarray:
+def sampling_refinement(optics: PupilOptics, neighbour: float, largest: float, refined: float) -> np.ndarray:
     """Return the refinement of each star's pupil sampling, a power of two, 1 near focus, [n_star].
 
     Parameters
@@ -33,12 +33,12 @@ def sampling_refinement(optics: PupilOptics, neighbour: float, largest: float, w
         Rays of the stars.
     neighbour : float
         Distance of neighbouring points over the radius of the pupil.
-    largest, wanted : float
+    largest, refined : float
         Distance of the rays of neighbouring points [m] from which on a star counts as far from focus, and that which
         its rays then have at most.
     """
     distance = neighbour * blur_radii(optics)
-    power = np.ceil(np.log2(np.maximum(distance / wanted, 1.0))).astype(np.int64)
+    power = np.ceil(np.log2(np.maximum(distance / refined, 1.0))).astype(np.int64)
     return np.where(distance > largest, 2**power, 1)
 
 

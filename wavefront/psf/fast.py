@@ -42,22 +42,32 @@ from .inner_rim import clipped_by_apertures, traced_obscuration
 from .pupil_lattice import PupilLattice
 from .sample_packets import LANES, indices, samples, to_packets
 
-#: Pupil points by default, with and without an atmosphere (which smears the pattern of the points).
-PUPIL_POINTS, PUPIL_POINTS_STILL = 334, 5000
-#: Side of the fine periodic grid over that of the stamp, with and without an atmosphere, whose wings wrap around. With
-#: 1.25 they would make the edge of a stamp of 6 arcsec 1.5 times and its corners 2.2 times as bright as they are,
-#: at 1e-4 of the peak; with 2 they leave 1.1 and 1.2 times.
-GRID_MARGIN, GRID_MARGIN_STILL = 2.0, 1.25
+#: Pupil points by default, with an atmosphere, which smears the pattern of the points.
+PUPIL_POINTS = 334
+#: Pupil points by default, without an atmosphere.
+PUPIL_POINTS_STILL = 5000
+#: Side of the fine periodic grid over that of the stamp, with an atmosphere, whose wings wrap around. With 1.25 they
+#: would make the edge of a stamp of 6 arcsec 1.5 times and its corners 2.2 times as bright as they are, at 1e-4 of the
+#: peak; with 2 they leave 1.1 and 1.2 times.
+GRID_MARGIN = 2.0
+#: The same without an atmosphere.
+GRID_MARGIN_STILL = 1.25
 #: Fewest samples of a screen across the pupil, on which its points lie.
 LEAST_SAMPLES = 4
-#: Cells per pixel by default, with and without an atmosphere. A ray counts as spread over its cell, which is right on
-#: the mean over many rays; an undisturbed spot may be no larger than one cell of a quarter of a pixel.
-OVERSAMPLING, OVERSAMPLING_STILL = 2, 12
-#: Distance on the CCD of the rays of neighbouring pupil points [pixels], with and without an atmosphere, beyond which a
-#: star counts as far from focus and is drawn with more points, and the largest that it then has.
-RAY_DISTANCE, RAY_DISTANCE_STILL = (1.0, 0.25), (0.25, 0.125)
-# Stars of one batch, fewer where their grids would fill more than this many bytes.
-_BATCH, _BATCH_BYTES = 128, 1 << 25
+#: Cells per pixel by default, with an atmosphere. A ray counts as spread over its cell, which is right on the mean over
+#: many rays.
+OVERSAMPLING = 2
+#: Cells per pixel by default, without an atmosphere: an undisturbed spot may be no larger than a quarter of a pixel.
+OVERSAMPLING_STILL = 12
+#: Distance on the CCD of the rays of neighbouring pupil points [pixels], with an atmosphere, beyond which a star counts
+#: as far from focus and is drawn with more points, and the largest that it then has.
+RAY_DISTANCE = (1.0, 0.25)
+#: The same without an atmosphere [pixels].
+RAY_DISTANCE_STILL = (0.25, 0.125)
+# Most stars of one batch.
+_BATCH = 128
+# Largest memory of the grids of a batch [bytes], which then has fewer stars.
+_BATCH_BYTES = 1 << 25
 # Samples of the filter against the baseline: linear interpolation is then good to 3e-6.
 _TABLE_SIZE = 4096
 
@@ -67,9 +77,9 @@ def filter_structure_function(separation: np.ndarray, r0: float, outer_scale: fl
 
     Separations are rising baselines in the pupil [m]; the low modes are those up to the cut-off [rad/m].
     """
-    rest = structure_function(separation, r0, outer_scale)
-    rest = rest - slope_variance(r0, outer_scale, cutoff, SLOPE_LAG) * separation**2
-    return np.maximum.accumulate(np.maximum(rest, 0.0))
+    filter_structure = structure_function(separation, r0, outer_scale)
+    filter_structure = filter_structure - slope_variance(r0, outer_scale, cutoff, SLOPE_LAG) * separation**2
+    return np.maximum.accumulate(np.maximum(filter_structure, 0.0))
 
 
 def least_screen_size(diameter: float, screen_length: float) -> int:
@@ -187,9 +197,9 @@ class FastRenderer(PsfRenderer):
         longest = 1.5 * self.focal_length * float(self._wavelengths.max()) / (2.0 * self._cell)
         baseline = np.linspace(0.0, longest, _TABLE_SIZE)
         table = np.repeat(self._diffraction(baseline)[None], len(self._wavelengths), axis=0)
-        rest = self._filter_structure(baseline)
-        if rest is not None:
-            table *= coherence(rest, self._wavelengths[:, None])
+        structure = self._filter_structure(baseline)
+        if structure is not None:
+            table *= coherence(structure, self._wavelengths[:, None])
         return float(baseline[1]), table.astype(np.float32)
 
     def _diffraction(self, baseline: np.ndarray) -> np.ndarray:
@@ -218,9 +228,9 @@ class FastRenderer(PsfRenderer):
         optics = self._trace(stars.fields, self._points, self._threads)
         if self._options.n_pupil is None:
             pixel = self._plane.pixel_size
-            largest, wanted = RAY_DISTANCE_STILL if self._atmosphere is None else RAY_DISTANCE
+            largest, refined = RAY_DISTANCE_STILL if self._atmosphere is None else RAY_DISTANCE
             neighbour = 2.0 * self._lattice.spacing / self._diameter
-            refinement = sampling_refinement(optics, neighbour, largest * pixel, wanted * pixel)
+            refinement = sampling_refinement(optics, neighbour, largest * pixel, refined * pixel)
             if (refinement > 1).any():
                 return expose_by_kind(refinement, self._expose_refined, stars)
         return self._expose_traced(optics, stars)

@@ -25,8 +25,10 @@ from ..pupil_optics import PupilOptics
 from .channels import Channels
 from .pupil_lattice import PupilLattice
 
-#: Points of the default lattice in a disc: 196 across, for vanes of a few centimetres; and in rings without any.
-LATTICE_POINTS, RINGS_POINTS = 30000, 7500
+#: Points of the default lattice in a disc: 196 across, for vanes of a few centimetres.
+LATTICE_POINTS = 30000
+#: Points of the lattice in a disc where there are only rings.
+RINGS_POINTS = 7500
 #: Fewest points of a lattice.
 FEWEST_POINTS = 500
 #: Most points across the diameter: stars that need more are drawn by dense rays.
@@ -41,9 +43,12 @@ _SLOPE = 0.5 * (math.sqrt(5.0) - 1.0)
 _TURN = np.array([[1.0, -_SLOPE], [_SLOPE, 1.0]]) / math.hypot(1.0, _SLOPE)
 # Baselines beyond the longest one that is wanted, for the splines.
 _ROOM = 4
-# Rays that tell the paths at other wavelengths, and the degree of the polynomials through those that are lit; there are
-# at least so many lit rays to a term.
-_SPARSE, _DEGREE, _RAYS_A_TERM = 400, 6, 3
+# Rays that determine the paths at other wavelengths.
+_SPARSE = 400
+# Degree of the polynomials through those that are lit.
+_DEGREE = 6
+# Fewest lit rays to a term of them.
+_RAYS_A_TERM = 3
 # Numbers of the terms of whole degrees, the largest first.
 _TERMS = [(d + 1) * (d + 2) // 2 for d in range(_DEGREE, -1, -1)]
 
@@ -105,18 +110,18 @@ class LatticeTransfer:
         n_star, n_wave = len(optics.lit), len(self.wavelengths)
         if n_wave == 1:
             return LatticeRays(optics, np.zeros((n_star, 1, 1)), np.zeros((n_star, 1, 2)))
-        few = trace(self.wavelengths, self.sparse)
+        sparse_optics = trace(self.wavelengths, self.sparse)
         terms = self._terms(self.sparse, _DEGREE)
         path, shift = np.zeros((n_star, n_wave, terms.shape[1])), np.zeros((n_star, n_wave, 2))
         with one_blas_thread():
             for star in range(n_star):
                 # Dark rays may pass a lens far outside of what is ground.
-                lit = few.lit[star].all(axis=0)
+                lit = sparse_optics.lit[star].all(axis=0)
                 count = next((n for n in _TERMS if _RAYS_A_TERM * n <= lit.sum()), 0)
                 if count:
-                    change = few.path[star][:, lit] - few.path[star][middle, lit]
+                    change = sparse_optics.path[star][:, lit] - sparse_optics.path[star][middle, lit]
                     path[star, :, :count] = np.linalg.lstsq(terms[lit, :count], change.T, rcond=None)[0].T
-                    landed = few.displacement[star][:, lit]
+                    landed = sparse_optics.displacement[star][:, lit]
                     shift[star] = (landed - landed[middle]).mean(axis=1, dtype=np.float64)
         return LatticeRays(optics, path, shift)
 
@@ -139,19 +144,19 @@ class LatticeTransfer:
         ndarray of complex, shape [n_channel, n]
             1 at zero, 0 everywhere for a dark star.
         """
-        one = rays.optics.star(star)
-        lit = np.flatnonzero(one.lit[0, 0])
+        star_optics = rays.optics.star(star)
+        lit = np.flatnonzero(star_optics.lit[0, 0])
         out = np.zeros((len(channels.wave), len(k)), dtype=np.complex64)
         if not lit.size:
             return out
-        one = replace(one, pupil=one.pupil[lit])
-        terms = self._terms(one.pupil, _DEGREE if len(self.wavelengths) > 1 else 0)
-        path = one.path[:, :, lit] + np.einsum("wt,pt->wp", rays.path[star], terms)
-        path = channels.path(replace(one, path=path))[0]
-        mean = one.displacement[0, 0, lit].mean(axis=0, dtype=np.float64) + rays.shift[star][channels.wave]
+        star_optics = replace(star_optics, pupil=star_optics.pupil[lit])
+        terms = self._terms(star_optics.pupil, _DEGREE if len(self.wavelengths) > 1 else 0)
+        path = star_optics.path[:, :, lit] + np.einsum("wt,pt->wp", rays.path[star], terms)
+        path = channels.path(replace(star_optics, path=path))[0]
+        mean = star_optics.displacement[0, 0, lit].mean(axis=0, dtype=np.float64) + rays.shift[star][channels.wave]
         if channels.shift.any():
-            mean += channels.shift[:, None] * one.exit_cosines[0].mean(axis=0)
-        jacobian = one.jacobian[0]
+            mean += channels.shift[:, None] * star_optics.exit_cosines[0].mean(axis=0)
+        jacobian = star_optics.jacobian[0]
         tilts = 2.0 * math.pi / self.wavelengths[channels.wave, None] * np.linalg.solve(jacobian, mean.T).T
         # Baselines and tilts along the rows and columns of the lattice.
         tilts = tilts @ _TURN
@@ -185,10 +190,10 @@ class LatticeTransfer:
         lags = scipy.fft.ifft2(spectrum.real**2 + spectrum.imag**2)
         reach = min(longest, size - 1)
         step = np.arange(-reach, reach + 1)
-        found = np.zeros((len(field), 2 * longest + 1, 2 * longest + 1), dtype=np.complex128)
+        correlations = np.zeros((len(field), 2 * longest + 1, 2 * longest + 1), dtype=np.complex128)
         inner = slice(longest - reach, longest + reach + 1)
-        found[:, inner, inner] = lags[:, step[:, None], step] / len(lit)
-        return found
+        correlations[:, inner, inner] = lags[:, step[:, None], step] / len(lit)
+        return correlations
 
     def _initial_fall(self, lit: np.ndarray) -> np.ndarray:
         """Return how steeply the autocorrelation of lit points, by number, falls at first along x and y [1/m], [2]."""

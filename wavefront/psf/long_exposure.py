@@ -65,12 +65,16 @@ _LARGEST_LEFT = 1e-3
 # Part of the ring that is lit from which on rims cross few spokes. At 8 um of defocus e of the LSST is wrong by 1e-4 at
 # 0.8, by 5e-4 at 0.62, by 1.5e-3 at 0.57 and by 3e-3 at 0.42.
 _LEAST_LIT = 0.6
-# Kinds of stars beside those of so many rays.
-_NEAR, _VIGNETTED = 0, -1
+# Kinds of stars beside those of so many rays: near focus.
+_NEAR = 0
+# Much vignetted.
+_VIGNETTED = -1
 # Bytes of a point of the lattice and a wavelength.
 _LATTICE_BYTES = 24
-# Stars of one batch, fewer where the room for their waves would fill more than this many bytes.
-_BATCH, _BATCH_BYTES = 256, 1 << 25
+# Most stars of one batch.
+_BATCH = 256
+# Largest memory of the waves of a batch [bytes], which then has fewer stars.
+_BATCH_BYTES = 1 << 25
 # Samples of the filter against the baseline: linear interpolation is then good to 1e-6.
 _TABLE_SIZE = 2048
 
@@ -160,15 +164,16 @@ class LongExposureRenderer(PsfRenderer):
         k = 2.0 * math.pi / self.period * count
         diagonal = math.sqrt(0.5) * k
         detector = [self._plane.transfer(*along) for along in ((k, 0 * k), (0 * k, k), (diagonal, diagonal))]
-        left = np.array([self._turbulence(s * count)[w] for w, s in enumerate(step)]) * np.max(np.abs(detector), axis=0)
-        return np.asarray(left * self._channels.of_wavelength(self._channels.spread(k)))
+        air = np.array([self._turbulence(s * count)[w] for w, s in enumerate(step)])
+        transfer = air * np.max(np.abs(detector), axis=0)
+        return np.asarray(transfer * self._channels.of_wavelength(self._channels.spread(k)))
 
     def _strips_suffice(self) -> bool:
         """Return whether the transfer is negligible at baselines of half the width of the pupil's annulus."""
         half = 0.5 * self._width
-        left = self._transfer_bounds(half)
-        last = np.minimum(np.ceil(half / self._step).astype(int), left.shape[1]) - 1
-        return bool(left[np.arange(len(left)), last].max() <= _LARGEST_LEFT)
+        transfer = self._transfer_bounds(half)
+        last = np.minimum(np.ceil(half / self._step).astype(int), transfer.shape[1]) - 1
+        return bool(transfer[np.arange(len(transfer)), last].max() <= _LARGEST_LEFT)
 
     def _choose_frequencies(self) -> None:
         """Choose the largest frequency of the sums."""
@@ -243,16 +248,18 @@ class LongExposureRenderer(PsfRenderer):
         refinement = self._lattice.refinement(rays)
         if (refinement == 1).all():
             return self._expose_autocorrelation([(self._lattice, rays, stars)])
-        most = MOST_ACROSS // self._lattice.lattice.size
-        kinds = np.where(refinement > most, -drawing_ray_counts(rays.optics, self._plane.pixel_size), refinement)
+        finest = MOST_ACROSS // self._lattice.lattice.size
+        kinds = np.where(refinement > finest, -drawing_ray_counts(rays.optics, self._plane.pixel_size), refinement)
 
         def expose(kind: int, stars: Stars) -> ExposedStars:
             if kind < 0:
                 return MeanRaysRenderer(self._inputs, -kind).expose_without_refinement(stars)
             lattice = self._lattice.refined(kind)
-            few = max(1, self.batch // kind**2)
-            parts = (stars[first : first + few] for first in range(0, len(stars), few))
-            return self._expose_autocorrelation((lattice, self._lattice_rays(lattice, part), part) for part in parts)
+            step = max(1, self.batch // kind**2)
+            parts = (stars[first : first + step] for first in range(0, len(stars), step))
+            return self._expose_autocorrelation(
+                (lattice, self._lattice_rays(lattice, star_batch), star_batch) for star_batch in parts
+            )
 
         return expose_by_kind(kinds, expose, stars)
 

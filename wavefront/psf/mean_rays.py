@@ -29,8 +29,10 @@ OVERSAMPLING = 4
 FAR = 50e-6
 # Rays in the square of the rms radius of the blur: a donut of 1.2 mm is drawn to 6e-4 of its light (rms).
 _RAYS = 70.0
-# Rays that landing points of the rims are found from, and transfer of air and detector below which these are left out.
-_SMOOTH_POINTS, _DARK = 2000, 1e-3
+# Rays from which the landing points of the rims are interpolated.
+_SMOOTH_POINTS = 2000
+# Transfer of air and detector below which the strips along the rims are left out.
+_DARK = 1e-3
 
 
 def ray_counts(optics: PupilOptics, pixel_size: float) -> np.ndarray:
@@ -88,29 +90,31 @@ class MeanRaysRenderer(FastRenderer):
         directions, channels = self._direction(optics.fields), self._channels
         landing = channels.displacement(optics)
         kx, ky = np.meshgrid(self._kx, self._ky)
-        some = slice(None, None, max(1, len(self._points) // _SMOOTH_POINTS))
-        smooth = PupilPolynomials(self._points[some], np.zeros(2), 0.0)
+        thinned = slice(None, None, max(1, len(self._points) // _SMOOTH_POINTS))
+        smooth = PupilPolynomials(self._points[thinned], np.zeros(2), 0.0)
 
         def diffract(star: int) -> None:
             for channel, wave in enumerate(channels.wave):
-                wavelength, bare = float(self._wavelengths[wave]), landing[star, channel, some].astype(np.float64)
+                wavelength = float(self._wavelengths[wave])
+                bare = landing[star, channel, thinned].astype(np.float64)
                 if not (np.isfinite(bare).all() and light[star, wave].any()):
                     continue
                 # Baseline over wavelength: J^T k / 2 pi.
                 jacobian = optics.jacobian[star] * wavelength / (2.0 * np.pi)
                 x, y = (jacobian[0, i] * kx + jacobian[1, i] * ky for i in (0, 1))
                 length = np.hypot(x, y)
-                left = np.interp(length, self._filter_step * np.arange(self._filter.shape[1]), self._filter[wave])
-                bright = np.abs(left * self._detector) > _DARK
+                table = self._filter[wave]
+                transfer = np.interp(length, self._filter_step * np.arange(len(table)), table)
+                bright = np.abs(transfer * self._detector) > _DARK
                 rims = pupil_rims(self._telescope, directions[star], wavelength)
                 places, inward = rims.landing(smooth, bare)
                 # The deposit has its origin in the first cell.
                 places = places + (self._grid_size // 2) * self._cell
                 k = np.stack([kx[bright], ky[bright]], axis=-1)
-                found = rims.transfer(np.stack([x[bright], y[bright]], axis=-1), k, places, inward)
+                strips = rims.transfer(np.stack([x[bright], y[bright]], axis=-1), k, places, inward)
                 # The detector's filter undoes the cloud-in-cell average of the rays.
-                found *= square_transfer(k[:, 0], k[:, 1], self._cell) ** 2
-                spectra[star, channel][bright] += float(light[star, wave].sum()) * found
+                strips *= square_transfer(k[:, 0], k[:, 1], self._cell) ** 2
+                spectra[star, channel][bright] += float(light[star, wave].sum()) * strips
 
         list(self._map(diffract, range(len(spectra))))
         return spectra
@@ -127,5 +131,5 @@ def _cloud_in_cell(place: np.ndarray, light: np.ndarray, side: int) -> np.ndarra
     x, y = (place - corner).T
     first = corner[:, 1] * side + corner[:, 0]
     shares = (((1.0 - x) * (1.0 - y), 0), (x * (1.0 - y), 1), ((1.0 - x) * y, side), (x * y, side + 1))
-    cells = sum(np.bincount(first + step, part * light, minlength=side * side) for part, step in shares)
+    cells = sum(np.bincount(first + step, fraction * light, minlength=side * side) for fraction, step in shares)
     return np.asarray(cells, dtype=np.float32).reshape(side, side)

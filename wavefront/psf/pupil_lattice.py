@@ -56,5 +56,5 @@ class PupilLattice:
         powers = [(a, b) for a in range(5) for b in range(5 - a)]
         means = np.array([angle[a, b] * radius[a + b] if (a, b) in angle else 0.0 for a, b in powers])
         monomials = np.array([x**a * y**b for a, b in powers])
-        missing = means * len(x) - monomials.sum(axis=1)
-        return 1.0 + np.linalg.lstsq(monomials, missing, rcond=None)[0]
+        deficit = means * len(x) - monomials.sum(axis=1)
+        return 1.0 + np.linalg.lstsq(monomials, deficit, rcond=None)[0]

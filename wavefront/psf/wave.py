@@ -58,8 +58,10 @@ LARGEST_SPACING = 0.02
 LARGEST_SPACING_OPTICS = 0.04
 #: Fewest pupil points across the diameter: the rim of a small telescope is as fine as that of a large one.
 FEWEST_ACROSS = 96
-# Largest transfer function of charge diffusion at longer baselines than those of a grid, and baselines that are tried.
-_NEGLIGIBLE, _TRIED = 1e-4, 64
+# Largest transfer function of charge diffusion at longer baselines than those of a grid.
+_NEGLIGIBLE = 1e-4
+# Longest baselines of a grid that are tried.
+_TRIED = 64
 
 
 @check_arguments
@@ -131,8 +133,8 @@ class WaveRenderer(PsfRenderer):
         baseline = np.linspace(min(LONGEST_BASELINE, self._diameter), self._diameter, _TRIED)
         k = 2.0 * math.pi * baseline / (float(self._wavelengths.max()) * self.focal_length)
         spread = self._channels.of_wavelength(self._channels.spread(k)).max(axis=0)
-        left = spread * np.exp(-0.5 * (k * self._plane.diffusion) ** 2)
-        too_short = int(np.count_nonzero(left > _NEGLIGIBLE))
+        transfer = spread * np.exp(-0.5 * (k * self._plane.diffusion) ** 2)
+        too_short = int(np.count_nonzero(transfer > _NEGLIGIBLE))
         return float(baseline[min(too_short, _TRIED - 1)])
 
     def _load_screens(self) -> None:
@@ -211,17 +213,25 @@ class WaveRenderer(PsfRenderer):
         ]
         moments = self._screen_places(field)
         for step, time in enumerate(self._schedule.time):
-            chosen = np.ascontiguousarray(self._schedule.channel[:, step, 0])
-            now = [*screens, n_layer, self._screen_samples(moments[time]), *before, warp_array(chosen, wp.int32)]
-            launch(pupil_fields, line, [*now, *after], threads=1)
+            step_channels = np.ascontiguousarray(self._schedule.channel[:, step, 0])
+            step_arguments = [
+                *screens,
+                n_layer,
+                self._screen_samples(moments[time]),
+                *before,
+                warp_array(step_channels, wp.int32),
+            ]
+            launch(pupil_fields, line, [*step_arguments, *after], threads=1)
             for wave in range(n_wave):
                 focused = scipy.fft.fft2(fields[wave]).view(np.float32).reshape(-1, LANES)
-                launch(add_squares, len(focused), [warp_array(focused, samples), squares[chosen[wave]]], threads=1)
+                launch(
+                    add_squares, len(focused), [warp_array(focused, samples), squares[step_channels[wave]]], threads=1
+                )
         intensity = np.empty((n_channel, size, size))
         count = len(self._schedule.time) * lit.sum()
-        for channel, part in enumerate(channels.weight / self._schedule.fraction):
+        for channel, scale in enumerate(channels.weight / self._schedule.fraction):
             parts = squares[channel].numpy().reshape(size, size, 2)
-            intensity[channel] = part * (parts.sum(axis=-1, dtype=np.float64) / count)
+            intensity[channel] = scale * (parts.sum(axis=-1, dtype=np.float64) / count)
         return intensity
 
     def _rows(self, values: np.ndarray) -> np.ndarray:
@@ -240,18 +250,18 @@ class WaveRenderer(PsfRenderer):
         if atmosphere is None:
             return np.zeros((1, 2, 2))
         corner = atmosphere.pupil_centers(self._direction(field), atmosphere.times) + self._lattice.origin
-        both = np.stack([corner / atmosphere.screen_pixel, corner / atmosphere.fine_pixel], axis=-2)
-        return both.reshape(len(atmosphere.times), -1, 2)
+        first_points = np.stack([corner / atmosphere.screen_pixel, corner / atmosphere.fine_pixel], axis=-2)
+        return first_points.reshape(len(atmosphere.times), -1, 2)
 
     def _screen_samples(self, places: np.ndarray) -> Any:
         """Return the samples of the screens around the lattice points at one time, and their weights."""
         sides, steps = np.tile(self._sides, len(places) // 2), np.tile(self._steps, len(places) // 2)
         start = places - sides[:, None] * np.floor(places / sides[:, None])
-        whole = np.floor(start)
-        along = (start - whole)[..., None] + steps[:, None, None] * np.arange(self._packets * LANES)
+        first_sample = np.floor(start)
+        along = (start - first_sample)[..., None] + steps[:, None, None] * np.arange(self._packets * LANES)
         sample = np.floor(along)
         weights = spline_weights((along - sample).astype(np.float32))
-        first = whole.astype(np.int32)
+        first = first_sample.astype(np.int32)
         sample = sample.astype(np.int32)
         # The spline's first tap is one sample before the point.
         column = (first[:, 0] - 1) % sides

@@ -102,16 +102,16 @@ def add_screen(
             first = taps.column_weight[screen, 1, packet]
             second = taps.column_weight[screen, 2, packet]
             after = taps.column_weight[screen, 3, packet]
-            here = samples()
+            screen_path = samples()
             for i in range(LANES):
                 k = at[i]
-                here[i] = (
+                screen_path[i] = (
                     before[i] * blended[item, k]
                     + first[i] * blended[item, k + 1]
                     + second[i] * blended[item, k + 2]
                     + after[i] * blended[item, k + 3]
                 )
-            path[item, packet] = path[item, packet] + here
+            path[item, packet] = path[item, packet] + screen_path
 
 
 @wp.kernel
