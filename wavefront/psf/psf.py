@@ -18,7 +18,8 @@ from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ..aberration import ResidualWavefront
 from ..atmosphere.atmosphere import Atmosphere
-from .engine import PsfEngine, PsfInputs, Recenter, center_focal_length
+from ..request import Request
+from .engine import PsfEngine, PsfInputs, PsfRenderer, Recenter, Stars, center_focal_length
 from .engines import psf_engine
 from .light import Light
 from .stamps import Stamps
@@ -96,19 +97,19 @@ class Psfs(Result):
     oversampling="engine=FastEngine(oversampling=...)",
     padding="engine=WaveEngine(padding=...)",
     pupil_spacing="engine=WaveEngine(pupil_spacing=...)",
+    projection="Request.of(telescope, fields, wavelengths, projection=...) in place of the telescope",
 )
 @check_arguments
 def make_psfs(
-    telescope: Telescope,
-    fields: ArrayLike,
-    wavelengths: ArrayLike | Light,
+    telescope: Telescope | Request,
+    fields: ArrayLike | None = None,
+    wavelengths: ArrayLike | Light | None = None,
     *,
     focal_plane: FocalPlane | None = None,
     atmosphere: Atmosphere | None = None,
     aberration: ResidualWavefront | None = None,
     stamps: Stamps | None = None,
     engine: str | PsfEngine = "fast",
-    projection: str = "zemax",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Psfs:
@@ -119,10 +120,10 @@ def make_psfs(
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
+    telescope : Telescope or Request
+        The telescope; or a :class:`~pachon.Request` in place of it, of fields and wavelengths.
     fields : array_like or Quantity, shape [n_star, 2]
-        Field angles [rad], of the light's own travel.
+        Field angles [rad], of the light's own travel, in the projection "zemax"; a request may have another one.
     wavelengths : array_like or Quantity, shape [n_wave], or Light
         Vacuum wavelengths [m], of equal numbers of photons before the telescope; or :class:`Light`, which holds spectra
         and atmospheric dispersion too.
@@ -139,8 +140,6 @@ def make_psfs(
         :class:`FastEngine`: geometric optics with filters. :class:`WaveEngine`: Fourier optics, the slow reference
         engine. :class:`LongExposureEngine`: mean over all turbulence, the quickest for many stars per call; it needs an
         atmosphere, of which it uses the Fried parameter and the outer scale only.
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the field angles.
     threads : int, optional
         Number of threads; all processors by default.
     progress : callable, optional
@@ -153,12 +152,18 @@ def make_psfs(
     Raises
     ------
     ConfigError
-        If the engine or the projection is unknown, or the engine needs an atmosphere.
+        If the engine is unknown or needs an atmosphere, or fields or wavelengths are given beside a request.
     DomainError
         If an argument is outside its range or of the wrong shape, silicon is transparent at a wavelength, or a star
         falls between the CCDs.
     """
-    options, stamps = psf_engine(engine), stamps or Stamps()
+    options, stamps, projection = psf_engine(engine), stamps or Stamps(), "zemax"
+    if isinstance(telescope, Request):
+        request = Request.of(telescope, fields, wavelengths, threads=threads)
+        telescope, fields, projection, threads = request.telescope, request.fields, request.projection, request.threads
+        wavelengths = Light(request.wavelengths, request.weights if np.ptp(request.weights) else None)
+    if fields is None or wavelengths is None:
+        raise DomainError("fields, wavelengths: expected both beside a telescope; a Request would have them")
     light = wavelengths if isinstance(wavelengths, Light) else Light(wavelengths)
     angles = _finite_pairs(radians(fields, "fields"), "fields", None)
     telescope.check_field(angles[:, 0], angles[:, 1])
@@ -172,42 +177,51 @@ def make_psfs(
     shifts = None
     if light.dispersion is not None:
         shifts = _finite_pairs(radians(light.dispersion, "dispersion"), "dispersion", len(lengths))
-    plane = stamps.image_plane(center_focal_length(telescope, lengths) if stamps.jitter else 0.0)
-    renderer = options.renderer(
-        PsfInputs(
-            telescope,
-            lengths,
-            plane,
-            dispersion=shifts,
-            focal_plane=focal_plane,
-            atmosphere=atmosphere,
-            aberration=aberration,
-            silicon=stamps.silicon,
-            projection=projection,
-            threads=threads,
-        )
+    inputs = PsfInputs(
+        telescope,
+        lengths,
+        stamps.image_plane(center_focal_length(telescope, lengths) if stamps.jitter else 0.0),
+        dispersion=shifts,
+        focal_plane=focal_plane,
+        atmosphere=atmosphere,
+        aberration=aberration,
+        silicon=stamps.silicon,
+        projection=projection,
+        threads=threads,
     )
-    pixel_scale = plane.pixel_size / renderer.focal_length
-    recenter = stamps.recenter
+    return _render_stars(options.renderer(inputs), inputs, Stars(angles, places, photons), stamps.recenter, progress)
+
+
+def _render_stars(
+    renderer: PsfRenderer,
+    inputs: PsfInputs,
+    stars: Stars,
+    recenter: Callable[[np.ndarray, float], np.ndarray] | None,
+    progress: Callable[[int], None] | None,
+) -> Psfs:
+    """Return the images of stars, rendered batch by batch."""
+    n_star, size = len(stars), inputs.plane.size
+    pixel_scale = inputs.plane.pixel_size / renderer.focal_length
     centroids: Recenter | None = None if recenter is None else lambda images: recenter(images, pixel_scale)
-    image = np.empty((len(angles), plane.size, plane.size), dtype=np.float32)
-    lit_fraction = np.empty((len(angles), len(lengths)))
-    reference_point, offset, inside = np.empty((len(angles), 3)), np.empty((len(angles), 2)), np.empty(len(angles))
-    renderer.prepare(angles)
-    for first in range(0, len(angles), renderer.batch):
-        batch = slice(first, min(first + renderer.batch, len(angles)))
-        stars = renderer.render(angles[batch], places[batch], centroids, None if photons is None else photons[batch])
-        inside[batch] = stars.image.sum(axis=(1, 2))
-        image[batch] = stars.image / np.where(inside[batch] > 0.0, inside[batch], 1.0)[:, None, None]
-        lit_fraction[batch], reference_point[batch] = stars.lit_fraction, stars.reference_point
-        offset[batch] = stars.offset
+    image = np.empty((n_star, size, size), dtype=np.float32)
+    lit_fraction = np.empty((n_star, len(inputs.wavelengths)))
+    reference_point, offset, inside = np.empty((n_star, 3)), np.empty((n_star, 2)), np.empty(n_star)
+    renderer.prepare(stars.fields)
+    for first in range(0, n_star, renderer.batch):
+        batch = slice(first, min(first + renderer.batch, n_star))
+        batch_stars = stars[batch]
+        rendered = renderer.render(batch_stars.fields, batch_stars.offsets, centroids, batch_stars.photons)
+        inside[batch] = rendered.image.sum(axis=(1, 2))
+        image[batch] = rendered.image / np.where(inside[batch] > 0.0, inside[batch], 1.0)[:, None, None]
+        lit_fraction[batch], reference_point[batch] = rendered.lit_fraction, rendered.reference_point
+        offset[batch] = rendered.offset
         if progress is not None:
             progress(batch.stop - first)
     return Psfs(
         image=image,
         pixel_scale=pixel_scale,
-        fields=angles,
-        wavelengths=lengths,
+        fields=stars.fields,
+        wavelengths=inputs.wavelengths,
         reference_point=reference_point,
         offset=offset,
         lit_fraction=lit_fraction,

@@ -231,7 +231,12 @@ def test_configurations_offer_every_engine():
         ({"pupil_spacing": 0.1}, ConfigError, r"pupil_spacing: .* expected engine=WaveEngine\(pupil_spacing=\.\.\.\)$"),
         ({"stamp_size": 41}, ConfigError, r"stamp_size: .* expected stamps=Stamps\(size=\.\.\.\)$"),
         ({"stamps": 41}, DomainError, "stamps = 41: expected a Stamps"),
-        ({"projection": "mercator"}, ConfigError, "projection"),
+        (
+            {"projection": "postel"},
+            ConfigError,
+            r"projection: .* expected Request.of\(telescope",
+        ),
+        ({"fields": None}, DomainError, "^fields, wavelengths: expected both beside a telescope"),
         ({"wavelengths": []}, DomainError, "wavelengths"),
         ({"wavelengths": [-1e-7]}, DomainError, "wavelengths"),
         ({"wavelengths": [5e-6]}, PachonError, "wavelength"),
@@ -283,3 +288,18 @@ def test_names_of_engines_stand_for_their_defaults(lsst_r):
         lsst_r, fields, WAVELENGTHS, atmosphere=atmosphere, engine=pachon.FastEngine(), stamps=Stamps()
     )
     assert by_name.image.tobytes() == by_object.image.tobytes()
+
+
+def test_a_request_stands_for_telescope_fields_and_wavelengths(lsst_r):
+    fields, options = [[0.01, 0.005], [0.0, -0.02]], {"atmosphere": small_atmosphere(), "engine": "long_exposure"}
+    request = pachon.Request.of(lsst_r, fields, WAVELENGTHS)
+    by_request, by_telescope = make_psfs(request, **options), make_psfs(lsst_r, fields, WAVELENGTHS, **options)
+    assert by_request.image.tobytes() == by_telescope.image.tobytes()
+    weighted = pachon.Request.of(lsst_r, fields, WAVELENGTHS, wavelength_weights=[1.0, 3.0, 2.0])
+    light = pachon.Light(WAVELENGTHS, [1.0, 3.0, 2.0])
+    assert np.array_equal(make_psfs(weighted, **options).image, make_psfs(lsst_r, fields, light, **options).image)
+    # Angles of the other projection that mean the same directions.
+    slopes = pachon.Request.of(lsst_r, np.tan(fields), WAVELENGTHS, projection="gnomonic")
+    assert np.abs(make_psfs(slopes, **options).image - by_telescope.image).max() < 1e-6
+    with pytest.raises(ConfigError, match=r"^fields = .*: given beside a Request, which has its own$"):
+        make_psfs(request, fields, **options)
