@@ -49,7 +49,7 @@ def exposed(longest: Atmosphere, exposure: float, lift: float) -> Atmosphere:
 
 def ellipticities(atmosphere: Atmosphere, fields: np.ndarray) -> np.ndarray:
     telescope = ideal_telescope()
-    plane = {"pixel_size": PIXEL * telescope.reference_sphere_radius, "stamp_size": STAMP}
+    plane = {"pixel_size": PIXEL * telescope.reference_sphere_radius, "size": STAMP}
     return ellipticity(pachon_stars(telescope, atmosphere, fields, **plane), PIXEL)
 
 

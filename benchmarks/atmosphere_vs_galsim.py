@@ -116,8 +116,8 @@ def galsim_stars(
 def pachon_stars(telescope: Telescope, atmosphere: Atmosphere, fields: np.ndarray, **options) -> np.ndarray:
     """Return the fast engine's images of stars, shape [star, y, x]."""
     pixel = PIXEL * telescope.reference_sphere_radius
-    common = {"pixel_size": pixel, "stamp_size": STAMP, "diffusion": 0.0, "threads": 1}
-    return pachon.make_psfs(telescope, fields, [WAVELENGTH], atmosphere=atmosphere, **(common | options)).image
+    stamps = pachon.Stamps(**({"size": STAMP, "pixel_size": pixel, "diffusion": 0.0} | options))
+    return pachon.make_psfs(telescope, fields, [WAVELENGTH], atmosphere=atmosphere, stamps=stamps, threads=1).image
 
 
 def ellipticity(images: np.ndarray, pixel: float = PIXEL) -> np.ndarray:

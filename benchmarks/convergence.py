@@ -57,7 +57,7 @@ class Field:
                 focal_plane=self.focal_plane,
                 atmosphere=atmosphere,
                 threads=1,
-                **sampling,
+                engine=pachon.FastEngine(**sampling),
             )
             seconds += time.perf_counter() - start
             shapes = pachon.measure_shapes(psfs.image, psfs.pixel_scale, 0.7 * ARCSEC)

@@ -55,9 +55,8 @@ def main() -> None:
             electrons=electrons,
             sky=SKY,
             read_noise=READ_NOISE,
-            diffusion=DIFFUSION,
-            stamp_size=side,
             seed=k,
+            stamps=pachon.Stamps(side, diffusion=DIFFUSION),
         )
         images += list(drawn.images)
         defocus += [height] * len(at)

@@ -22,6 +22,7 @@ import numpy as np
 import pachon
 from pachon.core.files import write_bytes
 from pachon.core.plotting import picture_bytes
+from pachon.pipeline.simulate.donuts import STAMP_SIZE
 from pachon.studies.alignment.config import AlignConfig
 from pachon.studies.alignment.scene import AlignmentScene
 
@@ -57,8 +58,8 @@ def main() -> None:
                 electrons=ELECTRONS,
                 sky=SKY,
                 read_noise=READ_NOISE,
-                diffusion=DIFFUSION,
                 seed=int(side > 0),
+                stamps=pachon.Stamps(STAMP_SIZE, diffusion=DIFFUSION),
             ).images
         )
         defocus.append(np.full(count, side * DEFOCUS))

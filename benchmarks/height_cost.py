@@ -36,7 +36,7 @@ def stars(instrument, fields, plane):
             focal_plane=plane,
             atmosphere=instrument.atmosphere,
             engine="long_exposure",
-            silicon=Silicon(),
+            stamps=pachon.Stamps(silicon=Silicon()),
         )
         shapes = measure_shapes(psfs.image, psfs.pixel_scale, instrument.weight_fwhm)
         widths = fwhm(psfs.image, psfs.pixel_scale) / ARCSEC, shapes.size / ARCSEC

@@ -37,7 +37,12 @@ def moments(scene: AlignmentScene, fields: np.ndarray, states: np.ndarray) -> np
     for state in states:
         telescope = scene.freedoms.apply(scene.telescope, state * scene.tolerances)
         psf = pachon.make_psfs(
-            telescope, fields, scene.wavelengths, atmosphere=scene.atmosphere, engine="long_exposure", stamp_size=41
+            telescope,
+            fields,
+            scene.wavelengths,
+            atmosphere=scene.atmosphere,
+            engine="long_exposure",
+            stamps=pachon.Stamps(41),
         )
         shapes = pachon.measure_shapes(psf.image, psf.pixel_scale, 0.7 * ARCSEC)
         out.append(np.stack([shapes.e1, shapes.e2, np.log(shapes.size)], axis=-1))

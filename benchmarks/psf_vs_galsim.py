@@ -40,7 +40,7 @@ from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.psf.fast import PUPIL_POINTS
 
 PIXEL, STAMP, STARS = 0.2 * ARCSEC, 31, 64
-FINE = {"n_pupil": 1300}
+FINE = {"engine": pachon.FastEngine(n_pupil=1300)}
 FINE_STEP = 0.005
 
 
@@ -100,8 +100,8 @@ def main() -> None:
         return pachon.make_psfs(lsst, fields, waves, atmosphere=atmosphere, threads=1, **more).image
 
     def through_ideal(atmosphere, fields, **more):
-        plane = {"pixel_size": PIXEL * ideal.reference_sphere_radius, "stamp_size": STAMP, "diffusion": 0.0}
-        plane |= {"atmosphere": atmosphere, "threads": 1}
+        stamps = pachon.Stamps(STAMP, PIXEL * ideal.reference_sphere_radius, diffusion=0.0)
+        plane = {"stamps": stamps, "atmosphere": atmosphere, "threads": 1}
         return pachon.make_psfs(ideal, fields, [WAVELENGTH], **plane, **more).image
 
     engines = {"LSST": through_lsst, "ideal": through_ideal}

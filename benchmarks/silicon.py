@@ -59,7 +59,7 @@ def shapes(telescope, wavelengths, silicon):
         wavelengths,
         atmosphere=pachon.Atmosphere.from_site("cerro_pachon", seed=0),
         engine="long_exposure",
-        silicon=silicon,
+        stamps=pachon.Stamps(silicon=silicon),
     )
     found = pachon.measure_shapes(psfs.image, psfs.pixel_scale, WEIGHT)
     return np.stack([found.e1, found.e2]), found.size / ARCSEC, psfs.inside.mean()
@@ -112,7 +112,13 @@ def times():
                 for silicon, seconds in spent.items():
                     start = time.process_time()
                     pachon.make_psfs(
-                        telescope, fields, light, engine=engine, atmosphere=atmosphere, silicon=silicon, threads=1
+                        telescope,
+                        fields,
+                        light,
+                        atmosphere=atmosphere,
+                        threads=1,
+                        engine=engine,
+                        stamps=pachon.Stamps(silicon=silicon),
                     )
                     seconds.append(1e3 * (time.process_time() - start) / count)
             off, on = (min(seconds[1:]) for seconds in spent.values())

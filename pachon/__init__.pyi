@@ -297,8 +297,13 @@ from .wavefront.opd import wavefront_opds as wavefront_opds
 from .wavefront.opd_map import OpdMap as OpdMap
 from .wavefront.opd_map import OpdMaps as OpdMaps
 from .wavefront.opd_map import ZernikeFit as ZernikeFit
+from .wavefront.psf.fast import FastEngine as FastEngine
+from .wavefront.psf.light import Light as Light
+from .wavefront.psf.long_exposure import LongExposureEngine as LongExposureEngine
 from .wavefront.psf.psf import Psfs as Psfs
 from .wavefront.psf.psf import make_psfs as make_psfs
+from .wavefront.psf.stamps import Stamps as Stamps
+from .wavefront.psf.wave import WaveEngine as WaveEngine
 from .wavefront.pupil_sampling import PupilSampling as PupilSampling
 from .wavefront.pupil_sampling import pupil_sampling as pupil_sampling
 from .wavefront.request import Request as Request

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -315,7 +316,7 @@ def measured_focal_plane(name: str, camera: Camera) -> FocalPlane:
     if Path(name).suffix.lower() in HEIGHT_ENDINGS:
         with error_context(key="heights"):
             content = read_bytes(Path(name), PrescriptionError)
-            return _focal_plane_of_file(name, hashlib.sha256(content).hexdigest(), camera)
+            return _focal_plane_of_file(_HeightsFile(name, hashlib.sha256(content).hexdigest()), camera)
     if name not in AS_MEASURED:
         expected = f"{', '.join(AS_MEASURED)}, or a file ending in {', '.join(HEIGHT_ENDINGS)}"
         raise ConfigError(f"heights = {name}: expected {expected}", key="heights")
@@ -325,11 +326,17 @@ def measured_focal_plane(name: str, camera: Camera) -> FocalPlane:
     return focal_plane
 
 
+class _HeightsFile(NamedTuple):
+    """One version of a file of heights."""
+
+    path: str
+    sha256: str  #: of its content
+
+
 @lru_cache(maxsize=1)
-def _focal_plane_of_file(name: str, content: str, camera: Camera) -> FocalPlane:
-    """Return the heights of a file of a content; kept, since a fit takes seconds and the points of a sweep share it."""
-    del content
-    return FocalPlane.from_file(name, camera)
+def _focal_plane_of_file(file: _HeightsFile, camera: Camera) -> FocalPlane:
+    """Return the heights of a file; cached, since a fit takes seconds and the points of a sweep share it."""
+    return FocalPlane.from_file(file.path, camera)
 
 
 def _atmosphere(config: Configuration, site: Site) -> Atmosphere | None:

@@ -21,8 +21,10 @@ def with_cached_screens(experiment: Experiment) -> Experiment:
     if experiment.atmosphere is None or not experiment.screen_kinds:
         return experiment
     with _cache_lock:
-        atmosphere = experiment.atmosphere.with_screens_of(_cached[0]) if _cached else experiment.atmosphere
-        if atmosphere is experiment.atmosphere:
+        atmosphere = experiment.atmosphere
+        if _cached and atmosphere.store.key == _cached[0].store.key:
+            atmosphere = replace(atmosphere, store=_cached[0].store)
+        else:
             for before in _cached:
                 before.release()
             _cached[:] = [atmosphere]

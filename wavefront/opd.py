@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError
-from ..core.units import length
+from ..core.units import field_label, length
 from ..models.camera.focal_plane import FocalPlane
 from ..models.camera.silicon import Silicon
 from ..models.telescope import Telescope
@@ -30,9 +30,9 @@ _ADVICE = "; wavefront_opd can do without it, with reference='mean'"
 
 @check_arguments
 def wavefront_opd(
-    telescope: Telescope,
-    field: ArrayLike,
-    wavelength: ArrayLike,
+    telescope: Telescope | Request,
+    field: ArrayLike | None = None,
+    wavelength: ArrayLike | None = None,
     pupil: tuple[ArrayLike, ArrayLike] | None = None,
     *,
     grid: int | None = None,
@@ -40,7 +40,7 @@ def wavefront_opd(
     sphere_radius: ArrayLike | None = None,
     focal_plane: FocalPlane | None = None,
     silicon: Silicon | None = None,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
 ) -> OpdMap:
     """Return the optical path difference over the entrance pupil.
@@ -52,7 +52,7 @@ def wavefront_opd(
     Parameters
     ----------
     telescope, projection, threads
-        As in :meth:`pachon.Request.of`.
+        As in :meth:`pachon.Request.of`: a request in place of the telescope has the field and the wavelength too.
     field : (tx, ty)
         Field angles [rad] or Quantities, in the stated projection; slopes of the light's own travel.
     wavelength : float or Quantity
@@ -90,11 +90,12 @@ def wavefront_opd(
     """
     if reference not in ("chief", "mean"):
         raise ConfigError(f"reference = {reference!r}: expected 'chief' or 'mean'")
-    x, y, inside = _pupil_points(telescope, pupil, grid)
-    radius = _sphere_radius(telescope, sphere_radius, focal_plane, silicon)
     request = Request.of(telescope, field, wavelength, sampling=CHIEF_RAY, projection=projection, threads=threads)
+    telescope, threads = request.telescope, request.threads
     if len(request.fields) != 1:
         raise DomainError(f"field of shape {request.fields.shape}: expected two angles")
+    x, y, inside = _pupil_points(telescope, pupil, grid)
+    radius = _sphere_radius(telescope, sphere_radius, focal_plane, silicon)
     w, index = request.wavelength, refractive_indices(telescope, request.wavelength)[-2]
     rays = request.launch(w, np.stack([x.ravel(), y.ravel()], axis=-1))
     end = trace(telescope, rays, focal_plane=focal_plane, threads=threads)
@@ -105,7 +106,7 @@ def wavefront_opd(
         center = sphere[:3]
     else:
         if not lit.any():
-            raise DomainError(f"field = {field!r}: no ray reaches the image")
+            raise DomainError(f"{field_label(request.fields[0])}: no ray reaches the image")
         center = landing[lit].mean(axis=0)
     path = _reference_path(telescope, end, index, center, radius)
     if silicon is not None:
@@ -128,16 +129,16 @@ def wavefront_opd(
 
 @check_arguments
 def wavefront_opds(
-    telescope: Telescope,
-    fields: ArrayLike,
-    wavelength: ArrayLike,
+    telescope: Telescope | Request,
+    fields: ArrayLike | None = None,
+    wavelength: ArrayLike | None = None,
     pupil: tuple[ArrayLike, ArrayLike] | None = None,
     *,
     grid: int | None = None,
     sphere_radius: ArrayLike | None = None,
     focal_plane: FocalPlane | None = None,
     silicon: Silicon | None = None,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> OpdMaps:
@@ -168,9 +169,9 @@ def wavefront_opds(
         If a field or the wavelength lies outside what the telescope covers, or a chief ray does not reach the image or
         lands between the CCDs.
     """
-    x, y, inside = _pupil_points(telescope, pupil, grid)
-    radius = _sphere_radius(telescope, sphere_radius, focal_plane, silicon)
     request = Request.of(telescope, fields, wavelength, sampling=CHIEF_RAY, projection=projection, threads=threads)
+    x, y, inside = _pupil_points(request.telescope, pupil, grid)
+    radius = _sphere_radius(request.telescope, sphere_radius, focal_plane, silicon)
     spheres = _spheres(request, radius, focal_plane)
     value = traced_opds(request, x.ravel(), y.ravel(), spheres, radius, progress).reshape(-1, *x.shape)
     value[:, ~inside] = np.nan

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
-from ..core.errors import DomainError, shown
+from ..core.errors import ConfigError, DomainError, shown
 from ..core.units import metres, pure_numbers, radians
 from ..models.design_data import unvignetted, vignetted
 from ..models.telescope import Telescope
-from ..raytrace.aiming import AimedPoints, pupil_coordinates
+from ..raytrace.aiming import pupil_coordinates
 from ..raytrace.launch import aimed_points
 from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import Rays, RayStatus, field_direction, straight_bundles
 from ..raytrace.trace import trace
+from .aimed_start import AimedStart
 from .bundles import Bundles
 from .design_fields import design_fields
 from .pupil_sampling import PupilSampling, pupil_sampling
@@ -76,24 +78,26 @@ class Request:
     @check_arguments
     def of(
         cls,
-        telescope: Telescope,
+        telescope: Telescope | Request,
         fields: ArrayLike | None = None,
         wavelengths: ArrayLike | None = None,
         *,
         wavelength_weights: ArrayLike | None = None,
-        sampling: str | PupilSampling = "gauss",
+        sampling: str | PupilSampling | None = None,
         n_pupil: int | None = None,
-        projection: str = "zemax",
+        projection: str | None = None,
         threads: int | None = None,
         aiming: str | None = None,
         one_wavelength: bool = False,
+        default_fields: Callable[[Telescope], ArrayLike] | None = None,
     ) -> Request:
         """Validate a request and fill in its defaults.
 
         Parameters
         ----------
-        telescope : Telescope
-            The telescope.
+        telescope : Telescope or Request
+            The telescope; or a request in place of it and of all that it holds. Beside a request, only pupil points and
+            threads may be given, and stand in place of its own.
         fields : array_like or Quantity, shape [n_field, 2] or [2], optional
             Field angles [rad]: slopes of the light's own travel, in the stated projection. By default those that the
             design data of the telescope state, with their vignetting factors and weights; where they state none, five
@@ -105,28 +109,42 @@ class Request:
             Relative amounts of light in front of the telescope; equal by default, but for wavelengths of the design
             data.
         sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
-            Points of the entrance pupil, see :func:`~pachon.pupil_sampling`.
+            Points of the entrance pupil, see :func:`~pachon.pupil_sampling`; "gauss" by default.
         n_pupil : int, optional
             Points along the radius (gauss, rings), in all (spiral) or along the diameter (square).
         projection : {"zemax", "gnomonic", "postel"}
-            Meaning of the field angles, see :func:`~pachon.raytrace.rays.field_direction`.
+            Meaning of the field angles, see :func:`~pachon.raytrace.rays.field_direction`; "zemax" by default.
         threads : int, optional
             Number of threads; all processors by default. Results do not depend on it.
         aiming : {"off", "paraxial", "real"}, optional
             Ray aiming at the stop, see :class:`~pachon.DesignData`; as the design data say by default.
         one_wavelength : bool
-            Whether no wavelength means the telescope's default alone.
+            Whether no wavelength means the telescope's default alone, and a request may have one only.
+        default_fields : callable, optional
+            Field angles [rad] of a telescope, in place of the defaults above.
 
         Raises
         ------
         ConfigError
-            If the sampling or the projection is unknown.
+            If the sampling or the projection is unknown, or fields, wavelengths, weights, projection or aiming are
+            given beside a request.
         PrescriptionError
             If the aiming is unknown, or rays are to be aimed and the telescope has no stop.
         DomainError
             If an array has another shape, a field point or wavelength lies outside what the telescope covers, or a
             weight is negative.
         """
+        if isinstance(telescope, Request):
+            held = {"fields": fields, "wavelengths": wavelengths, "wavelength_weights": wavelength_weights}
+            for name, value in (held | {"projection": projection, "aiming": aiming}).items():
+                if value is not None:
+                    raise ConfigError(f"{name} = {shown(value)}: given beside a Request, which has its own", key=name)
+            if one_wavelength:
+                _ = telescope.wavelength
+            return telescope._with(sampling, n_pupil, threads)
+        projection = "zemax" if projection is None else projection
+        if fields is None and default_fields is not None:
+            fields = default_fields(telescope)
         if aiming is not None:
             telescope = telescope.with_design(aiming=aiming)
         data = telescope.design_data
@@ -136,13 +154,20 @@ class Request:
         if own_waves and wavelength_weights is None:
             wavelength_weights = data.wavelength_weights or None
         weights = relative_weights(wavelength_weights, len(waves))
-        pupil = pupil_sampling(telescope, sampling, n_pupil)
+        pupil = pupil_sampling(telescope, "gauss" if sampling is None else sampling, n_pupil)
         primary = telescope.default_wavelength if own_waves else None
         vignetting = np.array(data.vignetting) if fields is None and data.vignetting else None
         stated = np.array(data.field_weights) if fields is None and data.field_weights else None
         request = cls(telescope, points, waves, weights, pupil, projection, threads, primary, vignetting, stated)
         _ = request.directions  # an unknown projection is an error of the request, not of its first use
         return request
+
+    def _with(self, sampling: str | PupilSampling | None, n_pupil: int | None, threads: int | None) -> Request:
+        """Return the request with other pupil points and threads, where given."""
+        changes: dict[str, Any] = {} if threads is None else {"threads": threads}
+        if sampling is not None or n_pupil is not None:
+            changes["pupil"] = pupil_sampling(self.telescope, "gauss" if sampling is None else sampling, n_pupil)
+        return replace(self, **changes) if changes else self
 
     def at_fields(self, fields: np.ndarray | slice) -> Request:
         """Return the request for a part of its fields, or for other field angles [rad], without vignetting factors."""
@@ -211,21 +236,17 @@ class Request:
 
         Those of the request's own telescope are found once; they are where the search for others starts.
         """
-        points = self.vignetted(pupil)
-        key = (wavelength, points.tobytes())
-        if key not in self._aimed:
-            crossings = aimed_points(self.telescope, self.directions, wavelength, points)
-            self._aimed[key] = AimedPoints.of(self.telescope, self.directions, wavelength, points, crossings)
-        aimed = self._aimed[key]
+        start = self.aimed_start.at(wavelength, self.vignetted(pupil))
         if telescope is self.telescope:
-            return aimed.points
+            return start.points
         points = replace(self, telescope=telescope).vignetted(pupil)
-        moved = aimed.moved(telescope, self.directions, wavelength, points)
+        moved = start.moved(telescope, self.directions, wavelength, points)
         return aimed_points(telescope, self.directions, wavelength, points) if moved is None else moved
 
     @cached_property
-    def _aimed(self) -> dict[tuple[float, bytes], AimedPoints]:
-        return {}
+    def aimed_start(self) -> AimedStart:
+        """Aimed points of the request's own telescope, where the search for those of a telescope like it starts."""
+        return AimedStart(self.telescope, self.directions)
 
     def vignetted(self, pupil: np.ndarray) -> np.ndarray:
         """Return pupil points [m] with the vignetting factors of each field, [n_field, n_pupil, 2].
@@ -286,8 +307,8 @@ class Request:
         """Yield slices of the field points and their requests, which bound the memory for many field points."""
         step = max(1, RAYS_AT_ONCE // (len(self.pupil) + 1))
         for first in range(0, len(self.fields), step):
-            batch = slice(first, min(first + step, len(self.fields)))
-            yield batch, self.at_fields(batch)
+            field_slice = slice(first, min(first + step, len(self.fields)))
+            yield field_slice, self.at_fields(field_slice)
 
 
 @check_arguments

@@ -113,21 +113,33 @@ def field_line(telescope: Telescope) -> np.ndarray:
 
 
 def line_request(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None,
     wavelengths: ArrayLike | None,
-    projection: str,
+    projection: str | None,
     threads: int | None,
 ) -> Request:
     """Return the request of curves along the field, with chief rays as pupil points."""
-    line = field_line(telescope) if fields is None else fields
-    return Request.of(telescope, line, wavelengths, sampling=CHIEF_RAY, projection=projection, threads=threads)
+    return Request.of(
+        telescope,
+        fields,
+        wavelengths,
+        sampling=CHIEF_RAY,
+        projection=projection,
+        threads=threads,
+        default_fields=field_line,
+    )
 
 
 def band_wavelengths(
-    telescope: Telescope, wavelengths: ArrayLike | None, count: int = _ACROSS_BAND
+    telescope: Telescope | Request, wavelengths: ArrayLike | None, count: int = _ACROSS_BAND
 ) -> ArrayLike | None:
-    """Return wavelengths [m] to study colour at: as given, those of the telescope's file, or some across its band."""
+    """Return wavelengths [m] to study colour at: as given, those of the telescope's file, or some across its band.
+
+    Those of a request are its own: None.
+    """
+    if isinstance(telescope, Request):
+        return wavelengths
     if wavelengths is None and len(Request.of(telescope, sampling=CHIEF_RAY).wavelengths) == 1:
         return np.linspace(*(telescope.band or telescope.wavelength_range), count)
     return wavelengths

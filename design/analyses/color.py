@@ -156,11 +156,11 @@ class ChromaticFocus(Analysis):
 
 @check_arguments
 def lateral_color(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
 ) -> LateralColor:
     """Trace lateral colour along the field.

@@ -114,11 +114,11 @@ class FieldCurvature(Analysis):
 
 @check_arguments
 def field_curvature(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
 ) -> FieldCurvature:
     """Trace tangential and sagittal foci, and distortion.
@@ -136,6 +136,7 @@ def field_curvature(
         If a chief ray, or a ray close to it, does not reach the detector, or the light is parallel.
     """
     request = line_request(telescope, fields, wavelengths, projection, threads)
+    telescope = request.telescope
     axes = tangential_axes(request)
     steps = _CLOSE * 0.5 * telescope.pupil_diameter * np.concatenate([axes, -axes], axis=1)
     slopes = _NEAR_AXIS * np.array([0.0, 1.0, -1.0, 2.0, -2.0])

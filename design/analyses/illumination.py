@@ -107,13 +107,13 @@ class RelativeIllumination(Analysis):
 
 @check_arguments
 def relative_illumination(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelength: ArrayLike | None = None,
     *,
     coatings: Coatings | str | os.PathLike[str] | None = None,
     n_pupil: int = 2000,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
 ) -> RelativeIllumination:
     """Trace the relative illumination of the detector.
@@ -140,18 +140,19 @@ def relative_illumination(
         If a coating belongs to no surface, or absorption to no glass.
     """
     count = require_count(n_pupil, "n_pupil", 16, 10**6)
-    line = field_line(telescope) if fields is None else fields
-    require_image(telescope, "a relative illumination")
     request = Request.of(
         telescope,
-        line,
+        fields,
         wavelength,
         sampling="spiral",
         n_pupil=count,
         projection=projection,
         threads=threads,
         one_wavelength=True,
+        default_fields=field_line,
     )
+    telescope = request.telescope
+    require_image(telescope, "a relative illumination")
     bare = coatings is None and all(s.coating is None for s in telescope.surfaces)
     telescope_coatings = None if bare else coatings_of(telescope, coatings)
     # Each field with its own vignetting factors; the axis is not one of the stated fields.

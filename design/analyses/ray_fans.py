@@ -186,12 +186,12 @@ class OpdFans(Fans):
 
 @check_arguments
 def ray_fans(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
     n_points: int = 65,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
 ) -> RayFans:
     """Trace ray fans, tangential and sagittal.
@@ -217,13 +217,13 @@ def ray_fans(
 
 @check_arguments
 def opd_fans(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
     n_points: int = 65,
     sphere_radius: ArrayLike | None = None,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
 ) -> OpdFans:
     """Trace OPD fans, tangential and sagittal.
@@ -244,27 +244,29 @@ def opd_fans(
     DomainError
         If there are too few rays, or the radius is zero or not finite.
     """
+    request, pupil, _, bundles = _traced(telescope, fields, wavelengths, n_points, projection, threads)
+    telescope = request.telescope
     radius = telescope.sphere_radius
     if sphere_radius is not None:
         require_image(telescope, "a sphere_radius")
         radius = length(sphere_radius, "sphere_radius")
         require_positive(abs(radius), "sphere_radius", "metres")
-    request, pupil, _, bundles = _traced(telescope, fields, wavelengths, n_points, projection, threads)
     value = np.stack([b.opd(radius) for b in bundles], axis=1).reshape(len(request.fields), len(bundles), 2, -1)
     return OpdFans(request, pupil, _lit(bundles), value, radius)
 
 
 def _traced(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None,
     wavelengths: ArrayLike | None,
     n_points: int,
-    projection: str,
+    projection: str | None,
     threads: int | None,
 ) -> tuple[Request, np.ndarray, np.ndarray, list[Bundles]]:
     """Return request, pupil coordinates [n], axes of the fans and bundles of both fans, tangential first."""
     count = require_count(n_points, "n_points", 3, 100_000)
     request = Request.of(telescope, fields, wavelengths, sampling=CHIEF_RAY, projection=projection, threads=threads)
+    telescope = request.telescope
     pupil, axes = np.linspace(-1.0, 1.0, count), tangential_axes(request)
     points = 0.5 * telescope.pupil_diameter * pupil[:, None] * axes[:, :, None]
     points = points.reshape(len(axes), -1, 2)

@@ -126,7 +126,7 @@ class SpotMatrix(Analysis):
 
 @check_arguments
 def spot_matrix(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
@@ -134,7 +134,7 @@ def spot_matrix(
     defocus: ArrayLike | None = None,
     sampling: str | PupilSampling = "rings",
     n_pupil: int | None = 10,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
 ) -> SpotMatrix:
     """Trace spots of each field against the focus, or against the wavelength.
@@ -167,6 +167,7 @@ def spot_matrix(
     request = Request.of(
         telescope, fields, wavelengths, sampling=sampling, n_pupil=rays, projection=projection, threads=threads
     )
+    telescope = request.telescope
     bundles = [request.bundles(float(w)) for w in request.wavelengths]
     ratio = principal_rays_of(request).mean_f_number
     if against == "focus" or not telescope.design_data.afocal:

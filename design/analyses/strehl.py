@@ -94,14 +94,14 @@ class StrehlRatios(Analysis):
 @check_arguments
 @one_blas_thread()
 def strehl(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
     from_psf: bool = True,
-    sampling: str | PupilSampling = "gauss",
+    sampling: str | PupilSampling | None = None,
     n_pupil: int | None = None,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
 ) -> StrehlRatios:
     """Compute Strehl ratios from wavefronts and diffraction images.
@@ -121,6 +121,7 @@ def strehl(
     request = Request.of(
         telescope, fields, wavelengths, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
     )
+    telescope, threads, projection = request.telescope, request.threads, request.projection
     shape = (len(request.fields), len(request.wavelengths))
     rms, ratio, peak = (np.full(shape, np.nan) for _ in range(3))
     for w, wavelength in enumerate(map(float, request.wavelengths)):

@@ -147,17 +147,17 @@ def bar_target(pixels: int = 96, *, bars: int = 3) -> np.ndarray:
 
 @check_arguments
 def target_image(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     target: ArrayLike | None = None,
     *,
     width: ArrayLike | None = None,
-    field: ArrayLike = (0.0, 0.0),
+    field: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     wavelength_weights: ArrayLike | None = None,
     n_rays: int = 400,
     pixel: ArrayLike | None = None,
     pixels: int | None = None,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
 ) -> TargetImage:
     """Trace the geometric image of a target.
@@ -199,10 +199,12 @@ def target_image(
         wavelengths,
         wavelength_weights=wavelength_weights,
         sampling="spiral",
+        default_fields=lambda telescope: (0.0, 0.0),
         n_pupil=count,
         projection=projection,
         threads=threads,
     )
+    telescope = request.telescope
     principal = principal_rays_of(request)
     require_focus(telescope, principal.mean_f_number, principal.mean_plate_scale)
     scale = float(principal.mean_plate_scale[0])

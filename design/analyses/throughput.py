@@ -105,14 +105,14 @@ class Throughput(Analysis):
 
 @check_arguments
 def throughput(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
     coatings: Coatings | str | os.PathLike[str] | None = None,
-    sampling: str | PupilSampling = "gauss",
+    sampling: str | PupilSampling | None = None,
     n_pupil: int | None = None,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
 ) -> Throughput:
     """Trace the throughput with reflection losses, coatings and absorption.
@@ -136,7 +136,6 @@ def throughput(
     DomainError
         If a table does not cover a wavelength, or the angle of a ray that is lit.
     """
-    telescope_coatings = coatings_of(telescope, coatings)
     request = Request.of(
         telescope,
         fields,
@@ -146,6 +145,7 @@ def throughput(
         projection=projection,
         threads=threads,
     )
+    telescope_coatings = coatings_of(request.telescope, coatings)
     value, lit, factors = [], [], []
     for _, batch in request.parts():
         by_wavelength = [_passed(batch, telescope_coatings, float(w)) for w in request.wavelengths]

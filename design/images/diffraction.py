@@ -51,7 +51,7 @@ _FINE = 33
 
 @check_arguments
 def fft_psf(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
@@ -60,7 +60,7 @@ def fft_psf(
     pixels: int = _PIXELS,
     n_pupil: int | None = None,
     reference: str = "centroid",
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> DiffractionPsf:
@@ -93,6 +93,7 @@ def fft_psf(
     request = Request.of(
         telescope, fields, wavelengths, wavelength_weights=wavelength_weights, projection=projection, threads=threads
     )
+    telescope = request.telescope
     plan = _Plan(request, pixel, pixels, reference)
     side, unit = plan.pixel * plan.pixels, "urad" if telescope.design_data.afocal else "um"
     across = n_pupil
@@ -126,7 +127,7 @@ def fft_psf(
 
 @check_arguments
 def huygens_psf(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
@@ -136,7 +137,7 @@ def huygens_psf(
     sampling: str | PupilSampling = "square",
     n_pupil: int | None = None,
     reference: str = "centroid",
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> DiffractionPsf:

@@ -16,6 +16,7 @@ from ...core.plotting import BLUE, ORANGE, RED, figure_at, styled
 from ...core.units import arcseconds, metres, pure_numbers, require_count
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling
+from ...wavefront.request import Request
 from ..drawing import FEW, field_colors, finish_axes, second_scale
 from ..metrics.spots import SpotDiagram, spots
 from ..result import FieldResult
@@ -100,7 +101,7 @@ class EncircledEnergy(FieldResult):
 
 @check_arguments
 def encircled_energy(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
@@ -111,7 +112,7 @@ def encircled_energy(
     sampling: str | PupilSampling = "spiral",
     pixels: int = _PIXELS,
     n_pupil: int | None = None,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> EncircledEnergy:

@@ -156,13 +156,13 @@ class Mtf(FieldResult):
 @check_arguments
 @one_blas_thread()
 def mtf(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
     wavelength_weights: ArrayLike | None = None,
     n_pupil: int | None = None,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Mtf:
@@ -186,6 +186,7 @@ def mtf(
     request = Request.of(
         telescope, fields, wavelengths, wavelength_weights=wavelength_weights, projection=projection, threads=threads
     )
+    telescope = request.telescope
     principal, diagram = principal_rays_of(request), spot_diagram(request)
     period = range_of_cosines(principal) / float(request.wavelengths.min())
     reach = spot_reach(diagram)

@@ -161,11 +161,11 @@ class Layout(Result):
 
 @check_arguments
 def layout(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelength: ArrayLike | None = None,
     *,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
 ) -> Layout:
     """Lay a telescope out for drawing.
@@ -176,11 +176,17 @@ def layout(
         As in :meth:`pachon.Request.of`; where the design data state no fields, they are the axis and both edges of the
         field along y.
     """
-    edge, stated = telescope.field_radius, telescope.design_data.fields
-    field_angles = [[0.0, -edge], [0.0, 0.0], [0.0, edge]] if fields is None and not stated else fields
+    stated = isinstance(telescope, Request) or telescope.design_data.fields
     request = Request.of(
-        telescope, field_angles, wavelength, projection=projection, threads=threads, one_wavelength=True
+        telescope,
+        fields,
+        wavelength,
+        projection=projection,
+        threads=threads,
+        one_wavelength=True,
+        default_fields=None if stated else _across_field,
     )
+    telescope, threads = request.telescope, request.threads
     points, w = request.fields, request.wavelength
     lenses = find_lenses(telescope, w)
     reach = even_edges(telescope, lenses, drawn_radii(request))
@@ -212,6 +218,12 @@ def layout(
         fans=rays((np.zeros_like(across), across)),
         bundles=rays(around),
     )
+
+
+def _across_field(telescope: Telescope) -> list[list[float]]:
+    """Return field angles [rad]: both edges of the field along y, and the axis between them."""
+    edge = telescope.field_radius
+    return [[0.0, -edge], [0.0, 0.0], [0.0, edge]]
 
 
 def section(telescope: Telescope) -> Figure:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -124,14 +125,14 @@ class Distortion(FieldResult):
 
 @check_arguments
 def distortion(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelength: ArrayLike | None = None,
     *,
     reference: str = "chief",
-    sampling: str | PupilSampling = "gauss",
+    sampling: str | PupilSampling | None = None,
     n_pupil: int | None = None,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
 ) -> Distortion:
     """Compare landing points with a scaled picture of the sky.
@@ -152,16 +153,16 @@ def distortion(
         If there are too few fields, or a star does not reach the detector.
     """
     check_choice("reference", reference, REFERENCES)
-    points = field_lattice(telescope, _ACROSS) if fields is None else fields
     request = Request.of(
         telescope,
-        points,
+        fields,
         wavelength,
         sampling=sampling,
         n_pupil=n_pupil,
         projection=projection,
         threads=threads,
         one_wavelength=True,
+        default_fields=partial(field_lattice, across=_ACROSS),
     )
     slopes = request.slopes
     if len(slopes) < 3 or np.linalg.matrix_rank(slopes - slopes.mean(axis=0), tol=1e-9) < 2:

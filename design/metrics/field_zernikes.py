@@ -197,16 +197,16 @@ class DoubleZernikes(Result):
 
 @check_arguments
 def wavefront_zernikes(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelength: ArrayLike | None = None,
     *,
     jmax: int = 28,
     pupil: str = "full",
     ordering: str = "noll",
-    sampling: str | PupilSampling = "gauss",
+    sampling: str | PupilSampling | None = None,
     n_pupil: int | None = None,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
 ) -> FieldZernikes:
     """Fit annular Zernikes to the wavefronts of several field points.
@@ -246,6 +246,7 @@ def wavefront_zernikes(
         threads=threads,
         one_wavelength=True,
     )
+    telescope = request.telescope
     points, sample = request.fields, request.pupil
     largest_jmax = len(sample) if ordering == "noll" else min(len(sample), FRINGE_TERMS)
     jmax = require_count(jmax, "jmax", 1, largest_jmax)

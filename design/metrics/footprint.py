@@ -127,14 +127,14 @@ class Footprint(FieldResult):
 
 @check_arguments
 def footprint(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     surfaces: str | Sequence[str] | None = None,
     fields: ArrayLike | None = None,
     wavelength: ArrayLike | None = None,
     *,
     sampling: str | PupilSampling = "rings",
     n_pupil: int | None = None,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
 ) -> Footprint:
     """Trace the footprints of field points on surfaces.
@@ -153,10 +153,6 @@ def footprint(
     DomainError
         If no surface is named.
     """
-    names = [surfaces] if isinstance(surfaces, str) else list(telescope.surface_names if surfaces is None else surfaces)
-    if not names:
-        raise DomainError("surfaces = []: expected the name of a surface at least")
-    surface_indices = [telescope.surface_names.index(telescope.surface(name).name) for name in names]
     request = Request.of(
         telescope,
         fields,
@@ -167,6 +163,11 @@ def footprint(
         threads=threads,
         one_wavelength=True,
     )
+    telescope, threads = request.telescope, request.threads
+    names = [surfaces] if isinstance(surfaces, str) else list(telescope.surface_names if surfaces is None else surfaces)
+    if not names:
+        raise DomainError("surfaces = []: expected the name of a surface at least")
+    surface_indices = [telescope.surface_names.index(telescope.surface(name).name) for name in names]
     n_field = len(request.fields)
     angle = np.linspace(0.0, 2.0 * np.pi, _RIM)
     circle = 0.5 * telescope.pupil_diameter * np.stack([np.cos(angle), np.sin(angle)], axis=-1)

@@ -192,7 +192,7 @@ class Ghosts(FieldResult):
 
 @check_arguments
 def ghosts(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     field: ArrayLike | None = None,
     wavelength: ArrayLike | None = None,
     *,
@@ -201,7 +201,7 @@ def ghosts(
     coatings: Coatings | str | os.PathLike[str] | None = None,
     n_pupil: int = 40000,
     brightest: int | None = None,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Ghosts:
@@ -238,8 +238,7 @@ def ghosts(
     """
     n_pupil = require_count(n_pupil, "n_pupil", _LEAST_RAYS)
     brightest = None if brightest is None else require_count(brightest, "brightest", 1)
-    star_field: Any = [0.0, _FIELD * telescope.field_radius] if field is None else [field]
-    require_image(telescope, "a map of ghosts")
+    star_field: list[ArrayLike] | None = None if field is None else [field]
     request = Request.of(
         telescope,
         star_field,
@@ -249,7 +248,10 @@ def ghosts(
         projection=projection,
         threads=threads,
         one_wavelength=True,
+        default_fields=lambda telescope: [0.0, _FIELD * telescope.field_radius],
     )
+    telescope, threads = request.telescope, request.threads
+    require_image(telescope, "a map of ghosts")
     telescope_coatings = Coatings.of(telescope, coatings)
     surfaces = Reflectivities(telescope, reflectivity, detector_reflectivity, telescope_coatings, request.wavelength)
     pairs = ghost_pairs(telescope)

@@ -160,11 +160,11 @@ PARALLEL = 1e-12
 
 @check_arguments
 def principal_rays(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelength: ArrayLike | None = None,
     *,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
 ) -> PrincipalRays:
     """Trace chief and marginal rays; find exit pupil, focal ratio, plate scale.

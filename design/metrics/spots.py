@@ -179,15 +179,15 @@ class SpotDiagram(FieldResult):
 
 @check_arguments
 def spots(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
     wavelength_weights: ArrayLike | None = None,
-    sampling: str | PupilSampling = "gauss",
+    sampling: str | PupilSampling | None = None,
     n_pupil: int | None = None,
     reference: str = "centroid",
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
 ) -> SpotDiagram:
     """Trace spot diagrams.

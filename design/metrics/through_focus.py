@@ -113,15 +113,15 @@ class ThroughFocus(FieldResult):
 @check_arguments
 @one_blas_thread()
 def through_focus(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     defocus: ArrayLike | None = None,
     *,
     wavelength_weights: ArrayLike | None = None,
-    sampling: str | PupilSampling = "gauss",
+    sampling: str | PupilSampling | None = None,
     n_pupil: int | None = None,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
 ) -> ThroughFocus:
     """Measure spots and wavefronts against the height of the detector.
@@ -139,7 +139,6 @@ def through_focus(
     DomainError
         If heights do not ascend, no light of a field reaches the detector, or it arrives parallel.
     """
-    require_image(telescope, "a focus")
     request = Request.of(
         telescope,
         fields,
@@ -150,6 +149,7 @@ def through_focus(
         projection=projection,
         threads=threads,
     )
+    require_image(request.telescope, "a focus")
     bundles = [request.bundles(float(w)) for w in request.wavelengths]
     square = _mean_squares(request, bundles)
     parallel = np.sqrt(square[:, 2]) < PARALLEL

@@ -84,12 +84,12 @@ class Vignetting(FieldResult):
 
 @check_arguments
 def vignetting(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelength: ArrayLike | None = None,
     *,
     n_pupil: int = 16384,
-    projection: str = "zemax",
+    projection: str | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Vignetting:
@@ -117,14 +117,16 @@ def vignetting(
     count = 4 * (n_pupil // 4)
     request = Request.of(
         telescope,
-        field_disc(telescope) if fields is None else fields,
+        fields,
         wavelength,
         sampling="spiral",
         n_pupil=count,
         projection=projection,
         threads=threads,
         one_wavelength=True,
+        default_fields=field_disc,
     )
+    telescope = request.telescope
     with_axis = request.at_fields(np.concatenate([np.zeros((1, 2)), request.fields]))
     quarters = np.empty((len(with_axis.fields), 4))
     for rows, batch in with_axis.parts():

@@ -15,8 +15,10 @@ from ...models.ideal_telescope import ideal_telescope
 from ...models.star_spectrum import blackbody_photons
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.engine import center_focal_length
-from ...wavefront.psf.engines import ENGINES
+from ...wavefront.psf.engines import psf_engine
+from ...wavefront.psf.light import Light
 from ...wavefront.psf.psf import make_psfs
+from ...wavefront.psf.stamps import Stamps
 from ..experiment import Experiment
 from ..resolved_values import resolved_value
 from ..sensor.displacement import displace_stamps
@@ -207,21 +209,24 @@ def _expose(
     psfs = make_psfs(
         telescope,
         fields,
-        wavelengths,
-        wavelength_weights=None if temperatures is None else blackbody_photons(temperatures, wavelengths),
+        Light(
+            wavelengths,
+            None if temperatures is None else blackbody_photons(temperatures, wavelengths),
+            experiment.dispersion,
+        ),
         focal_plane=experiment.focal_plane if optical else None,
         atmosphere=experiment.atmosphere,
         aberration=experiment.aberration if optical else None,
-        silicon=experiment.silicon,
-        engine=config.psf.engine,
-        stamp_size=experiment.stamp_size + room,
-        pixel_size=experiment.pixel_size * magnification,
-        diffusion=experiment.diffusion * magnification,
-        jitter=experiment.jitter,
-        offsets=offsets,
-        recenter=recenter,
-        dispersion=experiment.dispersion,
-        n_pupil=config.psf.n_pupil if "n_pupil" in ENGINES[config.psf.engine].options else None,
+        stamps=Stamps(
+            experiment.stamp_size + room,
+            experiment.pixel_size * magnification,
+            experiment.diffusion * magnification,
+            experiment.jitter,
+            experiment.silicon,
+            offsets,
+            recenter,
+        ),
+        engine=psf_engine(config.psf.engine).with_n_pupil(config.psf.n_pupil),
         threads=threads,
         progress=progress,
     )

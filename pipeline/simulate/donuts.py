@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +18,10 @@ from ...measure.stamps import observe_stamps
 from ...models.camera.photometry import READ_NOISE
 from ...models.telescope import Telescope
 from ...wavefront.atmosphere.atmosphere import Atmosphere
+from ...wavefront.psf.engine import PsfEngine
+from ...wavefront.psf.light import Light
 from ...wavefront.psf.psf import Psfs, make_psfs
+from ...wavefront.psf.stamps import Stamps
 from .star_defects import add_defects
 
 if TYPE_CHECKING:
@@ -73,7 +76,7 @@ class Donuts(Result):
 def draw_donuts(
     telescope: Telescope,
     fields: ArrayLike,
-    wavelengths: ArrayLike,
+    wavelengths: ArrayLike | Light,
     *,
     atmosphere: Atmosphere | None = None,
     electrons: ArrayLike = 1e6,
@@ -82,8 +85,8 @@ def draw_donuts(
     second_stars: float = 0.0,
     cosmic_rays: float = 0.0,
     seed: int = 0,
-    engine: str = "long_exposure",
-    stamp_size: int = STAMP_SIZE,
+    engine: str | PsfEngine = "long_exposure",
+    stamps: Stamps | None = None,
     **psf: Any,
 ) -> Donuts:
     """Expose stars far from focus.
@@ -93,8 +96,11 @@ def draw_donuts(
     telescope : Telescope
         The telescope, defocus included: ``telescope.perturbed("Detector", shift=(0, 0, 1.5e-3))``; or in focus, with
         a ``focal_plane`` that carries the heights, such as that of :func:`~pachon.corner_stars`.
-    fields, wavelengths, atmosphere, engine, stamp_size
+    fields, wavelengths, atmosphere, engine
         As in :func:`~pachon.make_psfs`; by default the mean of all turbulence, which needs an atmosphere.
+    stamps : Stamps, optional
+        Pixels and charge diffusion; by default 181 x 181 pixels. Where it has no ``offsets``, stars stand anywhere
+        within a pixel of the middle one.
     electrons : float or array_like, shape [n_star]
         Electrons of each star.
     sky, read_noise : float
@@ -106,8 +112,7 @@ def draw_donuts(
     seed : int
         Seed of places within the pixel, noise and defects, not negative. More stars leave the first as they are.
     **psf
-        Further arguments of :func:`~pachon.make_psfs`. Where it has no ``offsets``, stars stand anywhere within a
-        pixel of the middle one.
+        Further arguments of :func:`~pachon.make_psfs`.
 
     Returns
     -------
@@ -121,18 +126,17 @@ def draw_donuts(
     """
     seed = require_seed(seed)
     angles = np.atleast_2d(radians(fields, "fields"))
-    if psf.get("offsets") is None:
-        psf["offsets"] = stream(seed, "donuts", "places").uniform(-0.5, 0.5, angles.shape)
-    stars = make_psfs(
-        telescope, fields, wavelengths, atmosphere=atmosphere, engine=engine, stamp_size=stamp_size, **psf
-    )
+    stamps = Stamps(STAMP_SIZE) if stamps is None else stamps
+    if stamps.offsets is None:
+        stamps = replace(stamps, offsets=stream(seed, "donuts", "places").uniform(-0.5, 0.5, angles.shape))
+    stars = make_psfs(telescope, fields, wavelengths, atmosphere=atmosphere, engine=engine, stamps=stamps, **psf)
     light = for_each(pure_numbers(electrons, "electrons"), len(stars.image), "electrons")
     for name, value in (("electrons", light), ("sky", sky), ("read_noise", read_noise)):
         if not np.all((np.asarray(value) >= 0.0) & (np.asarray(value) <= _MOST_ELECTRONS)):
             raise DomainError(f"{name} = {shown(value)}: expected 0 to {_MOST_ELECTRONS:g} electrons", key=name)
     caught = light * np.minimum(stars.inside, 1.0)
-    stamps = observe_stamps(stars.image, caught, sky, read_noise, stream(seed, "donuts", "noise"))
+    observed = observe_stamps(stars.image, caught, sky, read_noise, stream(seed, "donuts", "noise"))
     images, defects = add_defects(
-        stamps, stars.image, stream(seed, "donuts", "defects"), neighbours=second_stars, cosmic_rays=cosmic_rays
+        observed, stars.image, stream(seed, "donuts", "defects"), neighbours=second_stars, cosmic_rays=cosmic_rays
     )
     return Donuts(images, float(sky + read_noise**2), stars, light.copy(), defects)

@@ -29,7 +29,10 @@ from ...wavefront.aberration import LINEAR_FRACTION, ResidualWavefront
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.clear_pupil import has_only_annuli
+from ...wavefront.psf.light import Light
+from ...wavefront.psf.long_exposure import LongExposureEngine
 from ...wavefront.psf.psf import make_psfs
+from ...wavefront.psf.stamps import Stamps
 from .height_series import HeightSeries, level_plane
 
 #: Noll terms of the residual wavefront of an exposure, each constant and linear over the field.
@@ -169,18 +172,12 @@ class Instrument:
         psfs = make_psfs(
             self.telescope,
             fields,
-            self.wavelengths,
+            Light(self.wavelengths, dispersion=self.dispersion),
             focal_plane=plane,
             atmosphere=atmosphere,
             aberration=aberration,
-            silicon=self.silicon,
-            engine="long_exposure",
-            stamp_size=self.stamp_size,
-            pixel_size=self.pixel_size,
-            diffusion=self.diffusion,
-            jitter=self.jitter,
-            dispersion=self.dispersion,
-            n_pupil=None if has_only_annuli(self.telescope) else points,
+            stamps=Stamps(self.stamp_size, self.pixel_size, self.diffusion, self.jitter, self.silicon),
+            engine=LongExposureEngine(None if has_only_annuli(self.telescope) else points),
             threads=threads,
         )
         return psfs.image, psfs.pixel_scale

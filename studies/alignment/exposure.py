@@ -10,6 +10,7 @@ from ...pipeline.simulate.donuts import draw_donuts
 from ...sensing.fit import fit_donuts
 from ...sensing.result import DonutFit
 from ...wavefront.aberration import StarWavefronts
+from ...wavefront.psf.stamps import Stamps
 from .scene import NOLL, AlignmentScene
 
 #: Rms of the charge diffusion [m].
@@ -43,8 +44,7 @@ def expose(scene: AlignmentScene, telescope: Telescope, visit: int, threads: int
         read_noise=donuts.read_noise,
         second_stars=donuts.second_stars,
         cosmic_rays=donuts.cosmic_rays,
-        stamp_size=donuts.stamp,
-        diffusion=_DIFFUSION,
+        stamps=Stamps(donuts.stamp, diffusion=_DIFFUSION),
         seed=int(stream(seed, "alignment", "donuts", visit).integers(2**31)),
         threads=threads,
     ).images

@@ -13,6 +13,7 @@ from ...models.telescope import Telescope
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.opd import wavefront_opds
 from ...wavefront.psf.psf import make_psfs
+from ...wavefront.psf.stamps import Stamps
 from ...wavefront.pupil_sampling import gauss_annulus, spiral_annulus
 
 #: Points of the field, at equal areas; rings and spokes of the pupil, which integrate squares up to the 13th degree.
@@ -73,7 +74,7 @@ class FieldQuality:
             self.wavelengths,
             atmosphere=self.atmosphere,
             engine="long_exposure",
-            stamp_size=41,
+            stamps=Stamps(41),
             threads=threads,
         )
         shapes = measure_shapes(stars.image, stars.pixel_scale, _WEIGHT)

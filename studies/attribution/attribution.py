@@ -80,8 +80,14 @@ def attribute(
     left_out: dict[str, str] = {}
     with full.screens(threads, reporter):
         for case in [FULL, *(c for c in chosen if c != NOISE)]:
-            experiment = full if case == FULL else without_cause(full, case)
-            found, failed = _stars_by_case(experiment, case, NOISE in chosen and case == FULL, threads, reporter)
+            # No experiment outlives its case: its atmosphere would hold the screens.
+            found, failed = _stars_by_case(
+                full if case == FULL else without_cause(full, case),
+                case,
+                NOISE in chosen and case == FULL,
+                threads,
+                reporter,
+            )
             stars |= found
             left_out |= {name: reason for name, reason in failed.items() if name not in left_out}
     if not stars[FULL].keys() - left_out:

@@ -11,6 +11,7 @@ from ...core.errors import ConfigError, unknown_name
 from ...models.io.site_file import load_site
 from ...pipeline.config import Configuration, with_options
 from ...pipeline.resolved_values import resolved_value
+from ...wavefront.psf.engines import ENGINES
 
 #: Name of the case with all causes, and of the two causes that are no options of the configuration.
 FULL, NOISE, OPTICS = "full", "noise", "optics"
@@ -55,11 +56,12 @@ def _no_atmosphere(config: Configuration) -> str | None:
         return "atmosphere.enabled = false"
     if config.reconstruction.model == "focal_plane":
         return "reconstruction.model = focal_plane, which needs it"
-    return "psf.engine = long_exposure, which needs it" if config.psf.engine == "long_exposure" else None
+    engine = config.psf.engine
+    return f"psf.engine = {engine}, which needs it" if ENGINES[engine].needs_atmosphere else None
 
 
 def _no_ground_layer(config: Configuration) -> str | None:
-    if not config.atmosphere.enabled or config.psf.engine == "long_exposure":
+    if not (config.atmosphere.enabled and ENGINES[config.psf.engine].screens):
         return "no star is imaged through turbulence"
     if config.atmosphere.ground_lift_m > 0.0 or load_site(resolved_value(config.atmosphere.site)).altitudes[0] > 0.0:
         return "no layer is on the ground"

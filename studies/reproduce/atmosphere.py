@@ -19,6 +19,8 @@ from ...models.ideal_telescope import ideal_telescope
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.atmosphere.turbulence import long_exposure_fwhm
 from ...wavefront.psf.psf import make_psfs
+from ...wavefront.psf.stamps import Stamps
+from ...wavefront.psf.wave import WaveEngine
 from .bench import Bench
 from .figure import EcsvData, FitsData, Reproduced, figure
 
@@ -70,11 +72,10 @@ def speckles(bench: Bench) -> Reproduced:
                 np.zeros((1, 2)),
                 [_SPECKLE_WAVELENGTH],
                 atmosphere=air.at_times(new),
-                engine="wave",
-                pixel_size=_SPECKLE_PIXEL * ARCSEC * telescope.reference_sphere_radius,
-                stamp_size=_SPECKLE_STAMP,
-                diffusion=0.0,
-                pupil_spacing=bench.scale.speckle_spacing,
+                stamps=Stamps(
+                    _SPECKLE_STAMP, _SPECKLE_PIXEL * ARCSEC * telescope.reference_sphere_radius, diffusion=0.0
+                ),
+                engine=WaveEngine(pupil_spacing=bench.scale.speckle_spacing),
                 threads=bench.threads,
             )
             total = total + len(new) * float(psfs.inside[0]) * psfs.image[0]
@@ -174,7 +175,7 @@ def ellipticity(bench: Bench) -> Reproduced:
                 visits.append(e_pairs)
                 if epoch == 0:
                     e = _atmosphere_ellipticity(bench, begun, fields)
-        air.release()
+        begun.release()
     xi = {time: _mean_and_error(list_) for time, list_ in correlated.items()}
     r = correlated[_VISIT][0].r_arcmin
     near = int(np.argmin(np.abs(r - 1.0)))
@@ -242,8 +243,7 @@ def _atmosphere_ellipticity(bench: Bench, air: Atmosphere, fields: np.ndarray) -
         fields,
         [_WAVELENGTH],
         atmosphere=air,
-        pixel_size=pixel * telescope.reference_sphere_radius,
-        diffusion=0.0,
+        stamps=Stamps(pixel_size=pixel * telescope.reference_sphere_radius, diffusion=0.0),
         threads=bench.threads,
     )
     shapes = measure_shapes(psfs.image, pixel, _WEIGHT)

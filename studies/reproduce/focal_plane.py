@@ -28,6 +28,8 @@ from ...models.camera.height_budget import SIMULATED, SPECIFICATION, TERMS
 from ...pipeline.report.focal_plane_plots import draw_heights, height_range, heights_plot
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.psf import make_psfs
+from ...wavefront.psf.stamps import Stamps
+from ...wavefront.psf.wave import WaveEngine
 from .bench import Bench
 from .figure import EcsvData, Reproduced, figure
 
@@ -220,11 +222,8 @@ def optics_ellipticity(bench: Bench, positions: np.ndarray) -> np.ndarray:
         fields_at(bench.optics.telescope, positions, _R_BAND, threads=bench.threads),
         [_R_BAND],
         focal_plane=bench.optics.focal_plane,
-        engine="wave",
-        pixel_size=2.5e-6,
-        stamp_size=31,
-        diffusion=0.0,
-        pupil_spacing=bench.scale.optics_spacing,
+        stamps=Stamps(pixel_size=2.5e-6, diffusion=0.0),
+        engine=WaveEngine(pupil_spacing=bench.scale.optics_spacing),
         threads=bench.threads,
     )
     shapes = measure_shapes(psfs.image, psfs.pixel_scale, _WEIGHT)

@@ -22,6 +22,8 @@ from ...models.surface import Surface
 from ...models.telescope import Telescope
 from ...raytrace.launch import launch_rays
 from ...wavefront.psf.psf import make_psfs
+from ...wavefront.psf.stamps import Stamps
+from ...wavefront.psf.wave import WaveEngine
 from .bench import Bench
 from .figure import EcsvData, Reproduced, figure
 
@@ -182,11 +184,8 @@ def encircled_energy_over_field(bench: Bench) -> Reproduced:
         telescope,
         np.deg2rad(np.stack([np.zeros_like(field), field], axis=1)),
         [_I_BAND],
-        engine="wave",
-        pixel_size=_EE_PIXEL,
-        stamp_size=_EE_STAMP,
-        diffusion=0.0,
-        pupil_spacing=min(bench.scale.optics_spacing, _EE_SPACING),
+        stamps=Stamps(_EE_STAMP, _EE_PIXEL, diffusion=0.0),
+        engine=WaveEngine(pupil_spacing=min(bench.scale.optics_spacing, _EE_SPACING)),
         threads=bench.threads,
     )
     pixel = psfs.pixel_scale / ARCSEC

@@ -72,7 +72,7 @@ class _Made:
         return self.lsst.perturbed("Detector", shift=(0.0, 0.0, 1.5e-3))
 
     def make_donuts(self):
-        tiny = {"stamp_size": 60, "pixel_size": 30e-6, "electrons": 1e6, "sky": 10.0}
+        tiny = {"stamps": pachon.Stamps(60, pixel_size=30e-6), "electrons": 1e6, "sky": 10.0}
         air = pachon.Atmosphere.from_site("cerro_pachon", seed=2, screen_size=512, screen_length=40.0, exposure=0.1)
         return pachon.draw_donuts(self.defocused, [(0.005, 0.005)], 622e-9, atmosphere=air, **tiny)
 
@@ -327,7 +327,8 @@ def calls(folder):
                          "wavelength": 622e-9}),
         "draw_donuts": (pachon.draw_donuts, {"telescope": m.lsst, "fields": [(0.005, 0.005)],
                         "wavelengths": 622e-9, "atmosphere": None, "electrons": 1e6, "sky": 10.0, "read_noise": 5.0,
-                        "second_stars": 0.0, "cosmic_rays": 0.0, "seed": 1, "engine": "fast", "stamp_size": 21}),
+                        "second_stars": 0.0, "cosmic_rays": 0.0, "seed": 1, "engine": "fast",
+                        "stamps": pachon.Stamps(21)}),
         "fit_donuts": (pachon.fit_donuts, {"telescope": m.defocused, "images": m.donuts.images,
                        "fields": [(0.005, 0.005)], "wavelength": 622e-9, "pixel_size": 30e-6, "sky_variance": 10.0,
                        "noll": (4, 5), "higher_order": 0.0, "prior": None, "field_noll": None, "defocus": 0.0,
@@ -397,9 +398,9 @@ def calls(folder):
         "wavefront_opd": (pachon.wavefront_opd, one | {"field": (0.0, 0.0), "pupil": (x, y), "reference": "chief",
                           "sphere_radius": 5.0}),
         "wavefront_opds": (pachon.wavefront_opds, one | {"fields": on_axis, "grid": 8, "sphere_radius": 5.0}),
-        "make_psfs": (pachon.make_psfs, {"telescope": tel, "fields": on_axis, "wavelengths": [w], "engine": "fast",
-                      "stamp_size": 15, "pixel_size": 1e-5, "diffusion": 4e-6, "jitter": 0.0, "n_pupil": 40,
-                      "wavelength_weights": [1.0], "atmosphere": None, "threads": 1}),
+        "make_psfs": (pachon.make_psfs, {"telescope": tel, "fields": on_axis, "wavelengths": pachon.Light([w], [1.0]),
+                      "engine": pachon.FastEngine(n_pupil=40), "stamps": pachon.Stamps(15), "atmosphere": None,
+                      "threads": 1}),
         "blackbody_photons": (pachon.blackbody_photons, {"temperature": [3500.0, 6000.0], "wavelengths": [w]}),
         "color_temperature": (pachon.color_temperature, {"color": [0.4, 1.2], "bands": "g_r"}),
         "pupil_sampling": (pachon.pupil_sampling, {"telescope": tel, "sampling": "gauss", "n_pupil": 3}),

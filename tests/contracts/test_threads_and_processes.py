@@ -37,7 +37,12 @@ def traced():
 CALLS = {
     "trace": traced,
     "make_psfs": lambda: pachon.make_psfs(
-        telescope(), FIELDS, [WAVELENGTH], atmosphere=air(), n_pupil=300, stamp_size=255
+        telescope(),
+        FIELDS,
+        [WAVELENGTH],
+        atmosphere=air(),
+        engine=pachon.FastEngine(n_pupil=300),
+        stamps=pachon.Stamps(255),
     ).image.tobytes(),
     "wavefront_opd": lambda: pachon.wavefront_opd(telescope(), FIELDS[1], WAVELENGTH, grid=256).value.tobytes(),
     "fft_psf": lambda: pachon.fft_psf(telescope(), [FIELDS[1]], WAVELENGTH, pixels=256, n_pupil=64).image.tobytes(),

@@ -83,18 +83,18 @@ def test_stars_of_a_turned_ccd_are_those_of_make_psfs(small_run, angle):
     psfs = pachon.make_psfs(
         run.telescope.with_rotator(np.deg2rad(angle)),
         pachon.fields_at(run.telescope, field.observed, run.wavelengths[len(run.wavelengths) // 2]),
-        run.wavelengths,
+        pachon.Light(run.wavelengths, dispersion=run.dispersion),
         focal_plane=replace(run.focal_plane, camera=camera),
         atmosphere=run.atmosphere,
         aberration=run.aberration,
-        engine="long_exposure",
-        stamp_size=run.stamp_size + STAR_ROOM,
-        pixel_size=run.pixel_size,
-        diffusion=run.diffusion,
-        jitter=run.jitter,
-        offsets=pixels - nearest,
-        dispersion=run.dispersion,
-        n_pupil=300,
+        engine=pachon.LongExposureEngine(n_pupil=300),
+        stamps=pachon.Stamps(
+            run.stamp_size + STAR_ROOM,
+            pixel_size=run.pixel_size,
+            diffusion=run.diffusion,
+            jitter=run.jitter,
+            offsets=pixels - nearest,
+        ),
     )
     electrons = Exposure("r", run.config.atmosphere.exposure_s).electrons(scene.objects["MAG"])
     assert np.allclose(scene.objects["FLUX"], electrons * psfs.lit_fraction.mean(axis=1), rtol=1e-12)

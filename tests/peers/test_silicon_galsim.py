@@ -1,6 +1,7 @@
 """Silicon against GalSim: its table of absorption lengths, and its SiliconSensor with the same photons."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,7 @@ def test_size_and_ellipticity_are_those_of_galsims_sensor(band, wavelength):
     diffusion = sensor._calculate_diff_step() * 1e-6
     # The temperature of GalSim's table.
     silicon = Silicon(sensor.config["SensorThickness"] * 1e-6, temperature=295.0)
-    options = {"stamp_size": 41, "engine": "fast", "n_pupil": 5000, "jitter": SEEING}
+    engine, stamps = pachon.FastEngine(n_pupil=5000), pachon.Stamps(41, diffusion=diffusion, jitter=SEEING)
 
     radius = 0.5 * telescope.pupil_diameter * np.sqrt(rng.uniform(telescope.pupil_obscuration**2, 1.0, count))
     angle = rng.uniform(0.0, 2.0 * np.pi, count)
@@ -53,8 +54,10 @@ def test_size_and_ellipticity_are_those_of_galsims_sensor(band, wavelength):
     passed = end.status == RayStatus.OK
     landing, travel = end.position[passed, :2], end.direction[passed]
 
-    psfs = [make_psfs(telescope, field[None], [wavelength], diffusion=diffusion, silicon=s, **options)
-            for s in (silicon, None)]  # fmt: skip
+    psfs = [
+        make_psfs(telescope, field[None], [wavelength], engine=engine, stamps=replace(stamps, silicon=s))
+        for s in (silicon, None)
+    ]
     focal_length = 10e-6 / psfs[0].pixel_scale
     airy = galsim.Airy(lam=wavelength * 1e9, diam=telescope.pupil_diameter, obscuration=telescope.pupil_obscuration)
     kicks = airy.shoot(passed.sum(), galsim.BaseDeviate(7))

@@ -21,7 +21,9 @@ from pachon.pipeline.simulate.ccd_loop import simulate_ccds
 from pachon.pipeline.star_list import RIM, place_stars
 from pachon.studies.psf_choice.plan import make_plan
 from pachon.studies.psf_choice.study import study_experiment
+from pachon.wavefront.psf.fast import FastEngine
 from pachon.wavefront.psf.psf import make_psfs
+from pachon.wavefront.psf.stamps import Stamps
 
 CAMERA = pachon.lsst_camera()
 LIGHT = 620e-9
@@ -180,15 +182,21 @@ def test_colours_of_a_catalogue_are_spectra_in_a_run(tmp_path, telescope):
         found = expose_ccd(experiment, ccd, stars)
         waves, room = experiment.wavelengths, found.observed.image.shape[1] - experiment.stamp_size
         plain = expose_positions(experiment, stars.observed, offsets=found.observed.offset, room=room)
+        stamps = Stamps(
+            found.observed.image.shape[1], experiment.pixel_size, experiment.diffusion, offsets=found.observed.offset
+        )
         one_by_one = [
             make_psfs(
-                experiment.telescope, found.observed.fields, waves, wavelength_weights=np.eye(len(waves))[w],
-                focal_plane=experiment.focal_plane, atmosphere=experiment.atmosphere, dispersion=experiment.dispersion,
-                stamp_size=found.observed.image.shape[1], pixel_size=experiment.pixel_size,
-                diffusion=experiment.diffusion, offsets=found.observed.offset, n_pupil=experiment.config.psf.n_pupil,
+                experiment.telescope,
+                found.observed.fields,
+                pachon.Light(waves, weights, experiment.dispersion),
+                focal_plane=experiment.focal_plane,
+                atmosphere=experiment.atmosphere,
+                engine=FastEngine(n_pupil=experiment.config.psf.n_pupil),
+                stamps=stamps,
             )
-            for w in range(len(waves))
-        ]  # fmt: skip
+            for weights in np.eye(len(waves))
+        ]
     kelvin = stars.temperature
     photons = pachon.blackbody_photons(kelvin, waves)
     light = np.stack([p.inside * p.lit_fraction[:, w] for w, p in enumerate(one_by_one)], axis=1) * photons

@@ -50,7 +50,7 @@ def at_centres(camera, plane, silicon):
         focal_plane=plane,
         atmosphere=air,
         engine="long_exposure",
-        silicon=silicon,
+        stamps=pachon.Stamps(silicon=silicon),
     )
 
 

@@ -154,11 +154,8 @@ def test_encircled_energy_of_an_annular_pupil_is_that_of_theory(lsst_r):
         telescope,
         [[0.0, 0.0]],
         [wavelength],
-        engine="wave",
-        pixel_size=pixel * telescope.reference_sphere_radius,
-        stamp_size=101,
-        diffusion=0.0,
-        pupil_spacing=0.08,
+        engine=pachon.WaveEngine(pupil_spacing=0.08),
+        stamps=pachon.Stamps(101, pixel_size=pixel * telescope.reference_sphere_radius, diffusion=0.0),
     )
     radii = np.array([4.0, 8.0, 12.0, 20.0, 30.0, 40.0])
     energy = psf.inside[0] * np.interp(radii, *energy_curve(psf.image[0]))
@@ -229,11 +226,10 @@ def test_exposures_of_the_speckles_are_nested(made):
         [[0.0, 0.0]],
         [600e-9],
         atmosphere=air,
-        engine="wave",
-        pixel_size=0.02 * ARCSEC * telescope.reference_sphere_radius,
-        stamp_size=images.shape[-1],
-        diffusion=0.0,
-        pupil_spacing=0.04,
+        engine=pachon.WaveEngine(pupil_spacing=0.04),
+        stamps=pachon.Stamps(
+            images.shape[-1], pixel_size=0.02 * ARCSEC * telescope.reference_sphere_radius, diffusion=0.0
+        ),
     ).image[0]
     # In single precision; the sum of its parts is the whole exposure.
     assert images[-1] == pytest.approx(whole, abs=1e-5 * float(whole.max()))
@@ -306,9 +302,7 @@ def test_whiskers_of_the_optics_are_those_of_a_finer_pupil(made, tmp_path):
         [624e-9],
         focal_plane=bench.optics.focal_plane,
         engine="wave",
-        pixel_size=2.5e-6,
-        stamp_size=31,
-        diffusion=0.0,
+        stamps=pachon.Stamps(31, pixel_size=2.5e-6, diffusion=0.0),
     )
     shape = pachon.measure_shapes(psf.image, psf.pixel_scale, 0.3 * ARCSEC)
     # At a spacing of 0.08 m it is 7e-4 rms; the error goes as the area of the rim, 0.16 m here.

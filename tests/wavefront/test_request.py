@@ -1,3 +1,4 @@
+import inspect
 from dataclasses import replace
 from pathlib import Path
 
@@ -103,3 +104,87 @@ def test_perturbed_telescopes_are_aimed_as_if_alone():
         # Both searches end at 1e-12 of the radius of the stop.
         assert found == pytest.approx(alone, abs=1e-11 * lens.pupil_diameter)
         assert np.abs(found - request.entrance_points(light, pupil)).max() > 1e-6 * lens.pupil_diameter
+
+
+def arrays(result):
+    """All arrays of a result, by name."""
+    return {name: value for name, value in vars(result).items() if isinstance(value, np.ndarray)}
+
+
+@pytest.mark.parametrize(
+    ("analysis", "options"),
+    [
+        (pachon.wavefront_opds, {"grid": 8}),
+        (pachon.distortion, {}),
+        (pachon.principal_rays, {}),
+        (pachon.relative_illumination, {"n_pupil": 64}),
+        (pachon.vignetting, {"n_pupil": 64}),
+        (pachon.wavefront_zernikes, {}),
+        (pachon.encircled_energy, {"kind": "geometric", "n_pupil": 64}),
+        (pachon.fft_psf, {"n_pupil": 64, "pixels": 16}),
+        (pachon.field_curvature, {}),
+        (pachon.huygens_psf, {"n_pupil": 16, "pixels": 16}),
+        (pachon.lateral_color, {}),
+        (pachon.mtf, {"n_pupil": 64}),
+        (pachon.opd_fans, {"n_points": 5}),
+        (pachon.ray_fans, {"n_points": 5}),
+        (pachon.spot_matrix, {}),
+        (pachon.spots, {}),
+        (pachon.strehl, {"from_psf": False}),
+        (pachon.through_focus, {}),
+        (pachon.throughput, {}),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_analyses_take_a_request_in_place_of_a_telescope(lsst_r, analysis, options):
+    fields = np.deg2rad([[0.3, 0.2], [1.0, -0.6], [0.0, 1.4]])
+    request = pachon.Request.of(lsst_r, fields, 620e-9, threads=1)
+    by_request, by_telescope = arrays(analysis(request, **options)), arrays(analysis(lsst_r, fields, 620e-9, **options))
+    assert by_request
+    assert by_request.keys() == by_telescope.keys()
+    for name, values in by_telescope.items():
+        assert np.array_equal(by_request[name], values, equal_nan=values.dtype.kind == "f"), name
+
+
+@pytest.mark.parametrize(
+    ("analysis", "options"),
+    [
+        (pachon.wavefront_opd, {"grid": 8}),
+        (pachon.target_image, {"n_rays": 5}),
+        (pachon.ghosts, {"n_pupil": 400}),
+        (pachon.layout, {}),
+        (pachon.footprint, {"surfaces": "M1"}),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_analyses_of_one_field_take_a_request_too(lsst_r, analysis, options):
+    field = np.deg2rad([0.3, 0.2])
+    request = pachon.Request.of(lsst_r, field, 620e-9, threads=1)
+    names = inspect.signature(analysis).parameters
+    where = {"field" if "field" in names else "fields": field}
+    where["wavelength" if "wavelength" in names else "wavelengths"] = 620e-9
+    by_request, by_telescope = analysis(request, **options), analysis(lsst_r, **where, **options)
+    for name, values in arrays(by_telescope).items():
+        assert np.array_equal(getattr(by_request, name), values, equal_nan=True), name
+
+
+def test_requests_keep_what_the_design_data_state():
+    lens = pachon.load_telescope(DATA / "circular_aperture_example_with_aperture.zmx")
+    factors = ((0.1, -0.05, 0.3, 0.2, 0.4), (0.0, 0.0, 0.1, 0.1, 0.0))
+    lens = lens.with_design(fields=((0.0, 0.4), (0.1, 0.2)), field_weights=(1.0, 3.0), vignetting=factors)
+    request = pachon.Request.of(lens, n_pupil=4)
+    ours, theirs = pachon.spots(request), pachon.spots(lens, n_pupil=4)
+    assert ours.request is request
+    assert np.array_equal(ours.displacement, theirs.displacement)
+    assert np.array_equal(ours.weight, theirs.weight)
+    assert ours.request.field_weights.tolist() == [0.25, 0.75]
+    # Other pupil points and threads may be given, and nothing else.
+    rings = pachon.spots(request, sampling="rings", n_pupil=2, threads=1).request
+    assert np.array_equal(rings.pupil.points, pachon.pupil_sampling(lens, "rings", 2).points)
+    assert np.array_equal(rings.vignetting, factors)
+    assert rings.threads == 1
+    for name, value in {"fields": [0.0, 0.0], "wavelengths": 6e-7, "projection": "postel"}.items():
+        with pytest.raises(ConfigError, match=rf"^{name} = .*: given beside a Request, which has its own$"):
+            pachon.spots(request, **{name: value})
+    with pytest.raises(DomainError, match=r"^wavelength: 2 wavelengths are given; expected one$"):
+        pachon.distortion(pachon.Request.of(lens, wavelengths=[5.5e-7, 6e-7]))

@@ -66,6 +66,9 @@ class Atmosphere(LayerScreens):
         Seed of the run and number of the exposure: each epoch has its own winds and screens.
     fixed_modulus : bool
         Whether modes have a fixed modulus and a random phase in place of a Gaussian amplitude.
+    store : ScreenStore
+        Memory of the screens, by default an empty one. Atmospheres that differ in nothing that determines the screens
+        share it: those of ``replace(atmosphere, times=...)``, and of ``replace(atmosphere, store=other.store)``.
     """
 
     exposure: float
@@ -198,7 +201,7 @@ class Atmosphere(LayerScreens):
     def at_times(self, times: ArrayLike, exposure: float | None = None) -> Atmosphere:
         """Return the same turbulence at other times, with shared screens.
 
-        Screens made by either are stored for both, and :meth:`release` of either frees them for both.
+        Screens made by either are stored for both, until neither uses them, see :meth:`release`.
 
         Parameters
         ----------
@@ -224,7 +227,7 @@ class Atmosphere(LayerScreens):
             raise DomainError(f"times: expected the middles of {len(middles)} equal steps of {step:g} s, rising")
         check_drift(self.altitudes, np.hypot(*self.velocities.T), exposure, self.screen_length)
         middles.setflags(write=False)
-        return self._with_shared_screens(exposure=exposure, times=middles)
+        return replace(self, exposure=exposure, times=middles)
 
     @check_arguments
     def at_altitudes(self, altitudes: ArrayLike) -> Atmosphere:
@@ -244,7 +247,7 @@ class Atmosphere(LayerScreens):
         if heights.shape != self.altitudes.shape or not np.all(np.isfinite(heights) & (heights >= 0.0)):
             raise DomainError(f"altitudes = {altitudes!r}: expected {self.layer_count} distances of 0 m or more")
         heights.setflags(write=False)
-        return self._with_shared_screens(altitudes=heights)
+        return replace(self, altitudes=heights)
 
     def rows_under(self, directions: np.ndarray, radius: float) -> np.ndarray:
         """Return the rows of the low screens that light of a pupil crosses, bool [n_layer, screen_size].
@@ -260,20 +263,6 @@ class Atmosphere(LayerScreens):
         last = np.ceil((middle.max(axis=(0, 1)) + radius) / pixel) + 2.0
         from_first = (np.arange(size) - first[:, None]) % size
         return np.asarray(from_first <= (last - first)[:, None])
-
-    def with_screens_of(self, other: Atmosphere) -> Atmosphere:
-        """Return this atmosphere with the screens of another one, stored for both, where they are the same screens."""
-        if not self.has_screens_of(other):
-            return self
-        shared = replace(self)
-        object.__setattr__(shared, "_cache", other._cache)
-        return shared
-
-    def _with_shared_screens(self, **changes: Any) -> Atmosphere:
-        """Return a changed atmosphere with shared screens: nothing that determines them may change."""
-        atmosphere = replace(self, **changes)
-        object.__setattr__(atmosphere, "_cache", self._cache)
-        return atmosphere
 
 
 def _length(value: Any, name: str) -> float:

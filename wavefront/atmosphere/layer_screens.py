@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,8 @@ from ...core.memory import require_bytes
 from ...core.random_streams import stream
 from ...core.units import plane_points
 from .layers import Layers
-from .screens import draw_modes, in_whole_blocks, phase_screen, slope_screen, working_bytes
+from .screen_store import ScreenStore
+from .screens import draw_modes, phase_screen, slope_screen, working_bytes
 from .spline import evaluate
 from .turbulence import slope_variance
 
@@ -25,8 +26,6 @@ from .turbulence import slope_variance
 SLOPE_LAG = 0.2
 # Larger screens, of 17 GB and more, would fill the memory.
 _LARGEST_SIZE = 65536
-
-_cache_lock = threading.Lock()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -43,7 +42,7 @@ class LayerScreens(Layers):
     seed: int
     epoch: int
     fixed_modulus: bool = False
-    _cache: dict[str, np.ndarray] = field(default_factory=dict, init=False, repr=False)
+    store: ScreenStore = field(default_factory=ScreenStore, repr=False)
 
     @property
     def screen_pixel(self) -> float:
@@ -67,6 +66,11 @@ class LayerScreens(Layers):
                     f"cutoff = {self.cutoff:.6g} rad/m: expected between the lowest mode and the Nyquist limit of the"
                     f" {scale} screens, {lowest:.4g} to {nyquist:.4g} rad/m"
                 )
+        # A store of other screens, as that of an atmosphere with another Fried parameter, is not shared.
+        names = [name for name in LayerScreens.__annotations__ if name != "store"]
+        key = (type(self), tuple(self.weights.tolist()), *(getattr(self, name) for name in names))
+        if self.store.key != key:
+            object.__setattr__(self, "store", ScreenStore(key))
 
     def _band(self, scale: str) -> tuple[int, float, tuple[float, float]]:
         """Return samples, side [m] and range of wavenumbers [rad/m] of the low or the high screens."""
@@ -188,38 +192,19 @@ class LayerScreens(Layers):
         make, dtype = kinds[kind]
         size = self._band(kind)[0]
         name = "fine_size" if kind == "high" else "screen_size"
-        with _cache_lock:
-            if kind not in self._cache:
-                require_bytes(self.screen_bytes([kind]), f"{name} = {size} in {self.layer_count} layers")
-                # Memory of rows that are never made is never touched.
-                screens = np.empty((self.layer_count, size, size), dtype=dtype)[:]
-                screens.setflags(write=False)
-                self._cache[kind], self._cache[_rows_key(kind)] = (
-                    screens,
-                    np.zeros((self.layer_count, size), dtype=bool),
-                )
-            screens, computed_rows = self._cache[kind], self._cache[_rows_key(kind)]
-            base: Any = screens.base
-            needed_rows = np.ones(computed_rows.shape, dtype=bool) if rows is None or kind != "slopes" else rows
-            lacking = (needed_rows & ~computed_rows).any(axis=1)
-            if computed_rows.any():
-                needed_rows = np.ones(computed_rows.shape, dtype=bool)
-            for layer in np.flatnonzero(lacking):
-                new_rows = in_whole_blocks(needed_rows[layer] & ~computed_rows[layer])
-                row_option = {} if new_rows.all() else {"rows": new_rows}
-                make(int(layer), threads=threads, out=base[layer], **row_option)
-                computed_rows[layer] |= new_rows
-            return screens
+
+        def allocate() -> np.ndarray:
+            require_bytes(self.screen_bytes([kind]), f"{name} = {size} in {self.layer_count} layers")
+            # Memory of rows that are never made is never touched.
+            return np.empty((self.layer_count, size, size), dtype=dtype)
+
+        return self.store.screens(
+            self, kind, allocate, partial(make, threads=threads), rows if kind == "slopes" else None
+        )
 
     def release(self) -> None:
-        """Free the screens; the next call makes the same ones again."""
-        with _cache_lock:
-            self._cache.clear()
-
-    def has_screens_of(self, other: LayerScreens) -> bool:
-        """Return whether all that determines the screens is the same; they are then the same to the last bit."""
-        names = ("weights", *(name for name in LayerScreens.__annotations__ if name != "_cache"))
-        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
+        """Free the screens where no other atmosphere uses them; the next call makes the same ones again."""
+        self.store.release(self)
 
     def path(self, x: ArrayLike, y: ArrayLike, layer: int, *, scale: str = "low") -> np.ndarray:
         """Return the path [m] through one screen at screen coordinates x, y [m], by plain NumPy; float64.
@@ -232,11 +217,6 @@ class LayerScreens(Layers):
         make, pixel = scales[scale]
         x, y = plane_points(x, y)
         return evaluate(make(layer), pixel, x, y)
-
-
-def _rows_key(kind: str) -> str:
-    """Return the key of the rows of a kind of screens that are made, bool [n_layer, size]."""
-    return f"{kind}: rows"
 
 
 def screen_samples(value: int, name: str) -> int:

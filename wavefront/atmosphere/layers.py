@@ -84,10 +84,10 @@ def checked_layers(
     height = np.array(site.altitudes if altitudes is None else altitudes, dtype=np.float64).reshape(-1)
     count = len(height)
     if wind_directions is None:
-        default_directions = site.wind_directions if altitudes is None else (None,) * count
+        site_directions = site.wind_directions if altitudes is None else (None,) * count
         wind_directions = [
             2.0 * math.pi * layer_random(seed, epoch, n, "wind", 1)[0] if direction is None else direction
-            for n, direction in enumerate(default_directions)
+            for n, direction in enumerate(site_directions)
         ]
     layer_values = {
         "altitudes": height,

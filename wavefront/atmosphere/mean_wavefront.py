@@ -25,7 +25,7 @@ from ...models.zernike_polynomials import annular_zernikes, noll_to_nm
 from .atmosphere import Atmosphere
 from .turbulence import path_spectrum
 
-# Least and greatest frequency times the diameter of the pupil, and their number, on a logarithmic scale.
+# Frequencies times the diameter of the pupil: lowest, highest and number, on a logarithmic scale.
 _FREQUENCIES = (0.005, 40.0, 100)
 # Directions over half the plane: enough for the narrow lobe of a long exposure, which is 1/300 rad wide at 1 cycle/m
 # after 15 s of 20 m/s.
@@ -77,7 +77,7 @@ def mean_wavefront_covariance(
     n_star, n_noll = len(slopes), len(indices)
     covariance = np.zeros((n_star, n_noll, n_star, n_noll))
     for altitude, weight, velocity in zip(atmosphere.altitudes, atmosphere.weights, atmosphere.velocities, strict=True):
-        averaged_power = weight * power[:, None] * np.sinc(plane @ (velocity * atmosphere.exposure)) ** 2
+        layer_power = weight * power[:, None] * np.sinc(plane @ (velocity * atmosphere.exposure)) ** 2
         apart = altitude * (slopes[:, None] - slopes)
         covariance_at: dict[tuple[float, float], np.ndarray] = {}
         for a in range(n_star):
@@ -87,7 +87,7 @@ def mean_wavefront_covariance(
                     continue
                 key = (float(distance[0]), float(distance[1]))
                 if key not in covariance_at:
-                    shifted = transform * (averaged_power * np.exp(-2j * np.pi * (plane @ distance)))[..., None]
+                    shifted = transform * (layer_power * np.exp(-2j * np.pi * (plane @ distance)))[..., None]
                     covariance_at[key] = np.tensordot(shifted, transform.conj(), axes=((0, 1), (0, 1))).real
                 covariance[a, :, b] += covariance_at[key]
                 if a != b:

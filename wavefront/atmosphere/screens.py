@@ -179,10 +179,10 @@ def slope_screen(
     step = 2.0 * math.pi / length
     i = np.arange(reach + 1, dtype=np.float32)[:, np.newaxis] * np.float32(step)
     j = np.arange(-reach, reach + 1, dtype=np.float32) * np.float32(step)
-    computed_rows = np.ones(size, dtype=bool) if rows is None else in_whole_blocks(rows)
+    needed_rows = np.ones(size, dtype=bool) if rows is None else in_whole_blocks(rows)
     # Where a row stands among those that are computed.
-    place = np.concatenate([[0], np.cumsum(computed_rows)])
-    row_selection = slice(None) if computed_rows.all() else np.flatnonzero(computed_rows)
+    place = np.concatenate([[0], np.cumsum(needed_rows)])
+    row_index = slice(None) if needed_rows.all() else np.flatnonzero(needed_rows)
     columns = np.empty((2 * reach + 1, place[-1]), dtype=np.complex64)
     packed = np.empty((size, size), dtype=np.int32) if out is None else out
 
@@ -197,7 +197,7 @@ def slope_screen(
             lines = reach + np.arange(block.start, block.stop) * sign
             if sign == -1 and block.start == 0:
                 padded, lines = padded[1:], lines[1:]
-            columns[lines] = scipy.fft.ifft(padded, axis=1, norm="forward", overwrite_x=True)[:, row_selection]
+            columns[lines] = scipy.fft.ifft(padded, axis=1, norm="forward", overwrite_x=True)[:, row_index]
 
     def along_x(first: int) -> None:
         rows = slice(first, min(first + _ROW_BLOCK, size))
@@ -209,5 +209,5 @@ def slope_screen(
 
     with ThreadPoolExecutor(thread_count(threads)) as pool:
         list(pool.map(along_y, range(0, reach + 1, _COLUMN_BLOCK)))
-        list(pool.map(along_x, (first for first in range(0, size, _ROW_BLOCK) if computed_rows[first])))
+        list(pool.map(along_x, (first for first in range(0, size, _ROW_BLOCK) if needed_rows[first])))
     return packed

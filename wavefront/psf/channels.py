@@ -19,12 +19,12 @@ _FEW_STEPS = 128
 # Smallest transfer function of charge diffusion: products of smaller ones would be denormal, which takes processors ten
 # times as long as zero.
 _DARK = 1e-15
-# Part of a turn from one time step to the next. This and the next two are irrational, and far from simple fractions and
-# from each other, so that few or many of them fill a turn evenly.
+# Fractions of a turn from one step to the next: irrational, and far from simple fractions and from each other, so that
+# few or many of them fill a turn evenly. Of time steps:
 _TIME_STEP = 0.5 * (5.0**0.5 - 1.0)
-# Part of a turn from one group of pupil points to the next.
+# Of groups of pupil points.
 _GROUP_STEP = 2.0**0.5 - 1.0
-# Part of a turn from one wavelength to the next.
+# Of wavelengths.
 _WAVE_STEP = 0.5497004779019703
 
 

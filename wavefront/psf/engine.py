@@ -1,12 +1,12 @@
-"""The protocol of PSF engines: one set of inputs, and the steps common to all engines."""
+"""PSF engines: their options, the inputs of one call, and the steps common to all renderers."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 import numpy as np
 
@@ -23,8 +23,6 @@ from .channels import Channels
 from .far_from_focus import check_stamp
 from .image_plane import ImagePlane, focal_length
 
-#: Options of :class:`PsfInputs` that some engines take.
-OPTIONS = ("n_pupil", "oversampling", "padding", "pupil_spacing")
 #: Centroids (x, y) of stamps [n, ny, nx] from the centre of the middle pixel [pixels], shape [n, 2].
 Recenter = Callable[[np.ndarray], np.ndarray]
 _Result = TypeVar("_Result")
@@ -32,7 +30,7 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True, eq=False)
 class PsfInputs:
-    """Inputs of a PSF engine: checked arguments of :func:`.make_psfs`, and the tracer of the pupils.
+    """Inputs of a PSF renderer: checked arguments of :func:`.make_psfs`, and the tracer of the pupils.
 
     ``trace`` has the signature of :func:`.pupil_optics.trace_pupils`; another one gives optics of known wavefront.
     """
@@ -47,10 +45,6 @@ class PsfInputs:
     silicon: Silicon | None = None
     projection: str = "zemax"
     threads: int | None = None
-    n_pupil: int | None = None
-    oversampling: int | None = None
-    padding: bool | None = None
-    pupil_spacing: float | None = None
     trace: Callable[..., PupilOptics] = trace_pupils
 
 
@@ -83,49 +77,66 @@ class Stars:
     def __len__(self) -> int:
         return len(self.fields)
 
-    def __getitem__(self, indices: np.ndarray | slice) -> Stars:
-        photons = None if self.photons is None else self.photons[indices]
-        return Stars(self.fields[indices], self.offsets[indices], photons)
+    def __getitem__(self, index: Any) -> Stars:
+        photons = None if self.photons is None else self.photons[index]
+        return Stars(self.fields[index], self.offsets[index], photons)
 
 
 def expose_by_kind(kinds: np.ndarray, expose: Callable[[int, Stars], ExposedStars], stars: Stars) -> ExposedStars:
     """Expose stars of several kinds [n_star], each kind by one call of ``expose`` with the kind and its stars."""
     groups = [np.flatnonzero(kinds == kind) for kind in np.unique(kinds)]
-    exposures = [expose(int(kinds[group[0]]), stars[group]) for group in groups]
+    exposed = [expose(int(kinds[group[0]]), stars[group]) for group in groups]
     order = np.argsort(np.concatenate(groups))
 
     def draw(shift: np.ndarray | None) -> np.ndarray:
         shifts = [None if shift is None else shift[group] for group in groups]
-        return np.concatenate([exposure.draw(moved) for exposure, moved in zip(exposures, shifts, strict=True)])[order]
+        return np.concatenate([e.draw(moved) for e, moved in zip(exposed, shifts, strict=True)])[order]
 
     return ExposedStars(
         draw,
-        np.concatenate([exposure.lit_fraction for exposure in exposures])[order],
-        np.concatenate([exposure.reference_point for exposure in exposures])[order],
+        np.concatenate([e.lit_fraction for e in exposed])[order],
+        np.concatenate([e.reference_point for e in exposed])[order],
     )
 
 
+@dataclass(frozen=True)
 class PsfEngine(ABC):
-    """Base of the PSF engines.
+    """Base of the PSF engines: a way to compute PSFs, with its options.
 
-    An option that the engine does not take is a :class:`ConfigError`, one outside its range a :class:`DomainError`.
+    An engine is a frozen dataclass of its options, of which None means the default, and is listed in
+    :mod:`.engines` under its name.
     """
 
-    name: ClassVar[str]
-    options: ClassVar[tuple[str, ...]]  #: members of :data:`OPTIONS` that the engine takes
-    screens: ClassVar[tuple[str, ...]]  #: kinds of screens that it uses, as :meth:`.Atmosphere.screens` names them
+    name: ClassVar[str]  #: in configurations and on the command line
+    screens: ClassVar[tuple[str, ...]] = ()  #: kinds of screens that it uses, see :meth:`.Atmosphere.screens`
+    needs_atmosphere: ClassVar[bool] = False
+
+    def renderer(self, inputs: PsfInputs) -> PsfRenderer:
+        """Return the renderer of the stars of one call; ConfigError if the engine needs an atmosphere."""
+        if self.needs_atmosphere and inputs.atmosphere is None:
+            raise ConfigError(
+                f"engine = {self.name!r}: expected an atmosphere, whose mean it takes ('wave' does without one)"
+            )
+        return self._renderer(inputs)
+
+    @abstractmethod
+    def _renderer(self, inputs: PsfInputs) -> PsfRenderer:
+        """Return the renderer of the stars of one call."""
+
+    def with_n_pupil(self, n_pupil: int | None) -> Self:
+        """Return the engine with another number of pupil points; the same one if it has no such option."""
+        options: dict[str, Any] = {"n_pupil": n_pupil}
+        return replace(self, **options) if "n_pupil" in {f.name for f in fields(self)} else self
+
+
+class PsfRenderer(ABC):
+    """Base of the renderers: an engine applied to the telescope, light and stamps of one call."""
+
     depths: ClassVar[int]  #: conversion depths in silicon of each wavelength
     batch: int  #: number of stars to render at a time
     focal_length: float  #: effective one at the centre of the field [m]
 
     def __init__(self, inputs: PsfInputs) -> None:
-        for option in OPTIONS:
-            value = getattr(inputs, option)
-            if value is not None and option not in self.options:
-                raise ConfigError(
-                    f"{option} = {value!r}: not an option of engine = {self.name!r}, which takes"
-                    f" {' and '.join(self.options)}"
-                )
         self._inputs = inputs
         self._telescope = inputs.telescope
         self._diameter = inputs.telescope.pupil_diameter

@@ -54,6 +54,6 @@ def check_stamp(optics: PupilOptics, plane: ImagePlane) -> None:
         needed = 2 * int(np.ceil(1.1 * reach / plane.pixel_size)) + 1
         x, y = np.rad2deg(optics.fields[star])
         raise DomainError(
-            f"stamp_size = {plane.stamp_size}: {100.0 * lost[star]:.0f} % of the light of the star at field ({x:.4g}, "
+            f"stamps: size = {plane.size}: {100.0 * lost[star]:.0f} % of the light of the star at field ({x:.4g}, "
             f"{y:.4g}) deg falls beside the stamp; expected at least {needed} pixels"
         )

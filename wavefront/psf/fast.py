@@ -20,11 +20,13 @@ the r band 0.1 % too wide for a cut-off of 1/r0 and 0.5 % for 1.4/r0 (plain high
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
 import warp as wp
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.launch import launch
 from ...core.units import require_count
@@ -32,7 +34,7 @@ from ...core.warp_arrays import warp_array
 from ..atmosphere.layer_screens import SLOPE_LAG
 from ..atmosphere.turbulence import coherence, diffraction_otf, slope_variance, structure_function
 from ..pupil_optics import PupilOptics
-from .engine import ExposedStars, PsfEngine, PsfInputs, Stars, expose_by_kind, metric_of
+from .engine import ExposedStars, PsfEngine, PsfInputs, PsfRenderer, Stars, expose_by_kind, metric_of
 from .far_from_focus import sampling_refinement
 from .fast_kernels import combine_wavelengths, deposit_rays
 from .image_plane import square_transfer
@@ -40,32 +42,31 @@ from .inner_rim import clipped_by_apertures, traced_obscuration
 from .pupil_lattice import PupilLattice
 from .sample_packets import LANES, indices, samples, to_packets
 
-#: Pupil points by default with an atmosphere, which smears the pattern of the points.
+#: Pupil points by default, with an atmosphere, which smears the pattern of the points.
 PUPIL_POINTS = 334
-#: Pupil points by default without an atmosphere.
+#: Pupil points by default, without an atmosphere.
 PUPIL_POINTS_STILL = 5000
-#: Side of the fine periodic grid over that of the stamp with an atmosphere, whose wings wrap around. With 1.25 they
+#: Side of the fine periodic grid over that of the stamp, with an atmosphere, whose wings wrap around. With 1.25 they
 #: would make the edge of a stamp of 6 arcsec 1.5 times and its corners 2.2 times as bright as they are, at 1e-4 of the
 #: peak; with 2 they leave 1.1 and 1.2 times.
 GRID_MARGIN = 2.0
-#: Side of the fine periodic grid over that of the stamp without an atmosphere.
+#: The same without an atmosphere.
 GRID_MARGIN_STILL = 1.25
 #: Fewest samples of a screen across the pupil, on which its points lie.
 LEAST_SAMPLES = 4
-#: Cells per pixel by default with an atmosphere. A ray counts as spread over its cell, which is right on the mean over
+#: Cells per pixel by default, with an atmosphere. A ray counts as spread over its cell, which is right on the mean over
 #: many rays.
 OVERSAMPLING = 2
-#: Cells per pixel by default without an atmosphere: an undisturbed spot may be no larger than one cell of a quarter of
-#: a pixel.
+#: Cells per pixel by default, without an atmosphere: an undisturbed spot may be no larger than a quarter of a pixel.
 OVERSAMPLING_STILL = 12
-#: Distances on the CCD of the rays of neighbouring pupil points [pixels] with an atmosphere: beyond the first a star
-#: counts as far from focus and is drawn with more points, and the second is the largest that it then has.
+#: Distance on the CCD of the rays of neighbouring pupil points [pixels], with an atmosphere, beyond which a star counts
+#: as far from focus and is drawn with more points, and the largest that it then has.
 RAY_DISTANCE = (1.0, 0.25)
-#: The same distances without an atmosphere [pixels].
+#: The same without an atmosphere [pixels].
 RAY_DISTANCE_STILL = (0.25, 0.125)
 # Most stars of one batch.
 _BATCH = 128
-# Most memory for the grids of a batch [bytes].
+# Largest memory of the grids of a batch [bytes], which then has fewer stars.
 _BATCH_BYTES = 1 << 25
 # Samples of the filter against the baseline: linear interpolation is then good to 3e-6.
 _TABLE_SIZE = 4096
@@ -76,9 +77,9 @@ def filter_structure_function(separation: np.ndarray, r0: float, outer_scale: fl
 
     Separations are rising baselines in the pupil [m]; the low modes are those up to the cut-off [rad/m].
     """
-    residual_structure = structure_function(separation, r0, outer_scale)
-    residual_structure = residual_structure - slope_variance(r0, outer_scale, cutoff, SLOPE_LAG) * separation**2
-    return np.maximum.accumulate(np.maximum(residual_structure, 0.0))
+    filter_structure = structure_function(separation, r0, outer_scale)
+    filter_structure = filter_structure - slope_variance(r0, outer_scale, cutoff, SLOPE_LAG) * separation**2
+    return np.maximum.accumulate(np.maximum(filter_structure, 0.0))
 
 
 def least_screen_size(diameter: float, screen_length: float) -> int:
@@ -86,30 +87,60 @@ def least_screen_size(diameter: float, screen_length: float) -> int:
     return math.ceil(LEAST_SAMPLES * screen_length / diameter)
 
 
-class FastPsfEngine(PsfEngine):
-    """Geometric optics with filters.
+@check_arguments
+@dataclass(frozen=True)
+class FastEngine(PsfEngine):
+    """Geometric optics for the long waves of the atmosphere, with filters for everything else.
 
-    ``n_pupil`` gives the approximate number of pupil points: the lattice is a whole number of screen pixels wide.
+    Attributes
+    ----------
+    n_pupil : int, optional
+        Approximate number of pupil points, at least 10: the lattice is a whole number of screen pixels wide. By default
+        334, and 5000 without an atmosphere; more for stars far from focus.
+    oversampling : int, optional
+        Cells of the fine grid per pixel, 1 to 32; 2 by default, and 12 without an atmosphere.
+
+    Raises
+    ------
+    DomainError
+        If an option is outside its range.
     """
 
     name = "fast"
-    depths = 2
-    options = ("n_pupil", "oversampling")
     screens = ("slopes",)
 
-    def __init__(self, inputs: PsfInputs, refinement: int = 1, far_from_focus: bool = False) -> None:
+    n_pupil: int | None = None
+    oversampling: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.n_pupil is not None:
+            require_count(self.n_pupil, "n_pupil", 10)
+        if self.oversampling is not None:
+            require_count(self.oversampling, "oversampling", 1, 32)
+
+    def _renderer(self, inputs: PsfInputs) -> FastRenderer:
+        return FastRenderer(inputs, self)
+
+
+class FastRenderer(PsfRenderer):
+    """Renderer of :class:`FastEngine`; `refinement` divides the spacing of its pupil points."""
+
+    depths = 2
+
+    def __init__(
+        self, inputs: PsfInputs, options: FastEngine, refinement: int = 1, far_from_focus: bool = False
+    ) -> None:
         super().__init__(inputs)
-        self._refinement = refinement
+        self._options, self._refinement = options, refinement
         #: Inner radius of the points over the outer one, and their area over that of the pupil.
         self._inner = traced_obscuration(self._obscuration) if far_from_focus else self._obscuration
         self._area = (1.0 - self._inner**2) / (1.0 - self._obscuration**2)
-        still, n_pupil, oversampling = inputs.atmosphere is None, inputs.n_pupil, inputs.oversampling
+        still, n_pupil, oversampling = inputs.atmosphere is None, options.n_pupil, options.oversampling
         if n_pupil is None:
             n_pupil = PUPIL_POINTS_STILL if still else PUPIL_POINTS
         if oversampling is None:
             oversampling = OVERSAMPLING_STILL if still else OVERSAMPLING
-        require_count(n_pupil, "n_pupil", 10)
-        self._oversampling = require_count(oversampling, "oversampling", 1, 32)
+        self._oversampling = oversampling
         self._place_pupil(n_pupil)
         self._make_grid()
         self._filter_step, self._filter = self._filter_table()
@@ -150,7 +181,7 @@ class FastPsfEngine(PsfEngine):
         """Lay out the fine grid and its frequencies."""
         self._cell = self._plane.pixel_size / self._oversampling
         margin = GRID_MARGIN_STILL if self._atmosphere is None else GRID_MARGIN
-        size = math.ceil(margin * self._plane.stamp_size * self._oversampling)
+        size = math.ceil(margin * self._plane.size * self._oversampling)
         # even, for the half plane of frequencies of a real transform
         self._grid_size = 2 * scipy.fft.next_fast_len(-(-size // 2), real=True)
         self._ky = 2.0 * math.pi * scipy.fft.fftfreq(self._grid_size, self._cell)
@@ -166,9 +197,9 @@ class FastPsfEngine(PsfEngine):
         longest = 1.5 * self.focal_length * float(self._wavelengths.max()) / (2.0 * self._cell)
         baseline = np.linspace(0.0, longest, _TABLE_SIZE)
         table = np.repeat(self._diffraction(baseline)[None], len(self._wavelengths), axis=0)
-        filter_structure = self._filter_structure(baseline)
-        if filter_structure is not None:
-            table *= coherence(filter_structure, self._wavelengths[:, None])
+        structure = self._filter_structure(baseline)
+        if structure is not None:
+            table *= coherence(structure, self._wavelengths[:, None])
         return float(baseline[1]), table.astype(np.float32)
 
     def _diffraction(self, baseline: np.ndarray) -> np.ndarray:
@@ -195,21 +226,22 @@ class FastPsfEngine(PsfEngine):
 
     def _expose(self, stars: Stars) -> ExposedStars:
         optics = self._trace(stars.fields, self._points, self._threads)
-        if self._inputs.n_pupil is None:
+        if self._options.n_pupil is None:
             pixel = self._plane.pixel_size
-            largest, refined_distance = RAY_DISTANCE_STILL if self._atmosphere is None else RAY_DISTANCE
+            largest, refined = RAY_DISTANCE_STILL if self._atmosphere is None else RAY_DISTANCE
             neighbour = 2.0 * self._lattice.spacing / self._diameter
-            refinement = sampling_refinement(optics, neighbour, largest * pixel, refined_distance * pixel)
+            refinement = sampling_refinement(optics, neighbour, largest * pixel, refined * pixel)
             if (refinement > 1).any():
                 return expose_by_kind(refinement, self._expose_refined, stars)
         return self._expose_traced(optics, stars)
 
     def _expose_refined(self, refinement: int, stars: Stars) -> ExposedStars:
         """Expose stars with a refined sampling of the pupil."""
-        return FastPsfEngine(self._inputs, refinement, far_from_focus=refinement > 1).expose_without_refinement(stars)
+        renderer = FastRenderer(self._inputs, self._options, refinement, far_from_focus=refinement > 1)
+        return renderer.expose_without_refinement(stars)
 
     def expose_without_refinement(self, stars: Stars) -> ExposedStars:
-        """Expose stars with this engine's pupil points, however far from focus they are."""
+        """Expose stars with the pupil points of this renderer, however far from focus they are."""
         return self._expose_traced(self._trace(stars.fields, self._points, self._threads), stars)
 
     def _expose_traced(self, optics: PupilOptics, stars: Stars) -> ExposedStars:
@@ -242,7 +274,7 @@ class FastPsfEngine(PsfEngine):
     def _stamps(self, combined: np.ndarray, light: np.ndarray) -> np.ndarray:
         """Return the stamps of transforms of the fine grid as fractions of each star's light, [n_star, side, side]."""
         grid = (self._grid_size, self._grid_size)
-        span = slice(0, self._plane.stamp_size * self._oversampling, self._oversampling)
+        span = slice(0, self._plane.size * self._oversampling, self._oversampling)
         stamps = self._map(lambda star: scipy.fft.irfft2(star, s=grid)[span, span].astype(np.float64), combined)
         # The transform gave light per cell; a pixel, averaged over already, holds so many cells.
         return np.stack(stamps) * (self._oversampling**2 / light)[:, None, None]

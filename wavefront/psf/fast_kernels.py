@@ -129,9 +129,9 @@ def deposit_rays(special: bool, module: wp.Module) -> wp.Kernel:
                 moved_x = angle_x * xx + angle_y * xy
                 moved_y = angle_x * yx + angle_y * yy
                 for wave in range(n_wave):
-                    channel_index = channel_of(channel, wave, t, packet)
-                    cell_x = moved_x + displacement[star, channel_index, packet, 0]
-                    cell_y = moved_y + displacement[star, channel_index, packet, 1]
+                    light_channel = channel_of(channel, wave, t, packet)
+                    cell_x = moved_x + displacement[star, light_channel, packet, 0]
+                    cell_y = moved_y + displacement[star, light_channel, packet, 1]
                     light = weight[star, wave, packet]
                     for i in range(LANES):
                         # No branch, so that the lanes stay together; light beyond the grid is left out.
@@ -140,7 +140,7 @@ def deposit_rays(special: bool, module: wp.Module) -> wp.Kernel:
                         near_column = wp.clamp(column, 0, grid_size - 1)
                         near_row = wp.clamp(row, 0, grid_size - 1)
                         caught = wp.where(column == near_column and row == near_row, light[i], wp.float32(0.0))
-                        cell = (channel_index * grid_size + near_row) * grid_size + near_column
+                        cell = (light_channel * grid_size + near_row) * grid_size + near_column
                         image[star, cell] = image[star, cell] + caught
 
     return deposit_rays
@@ -181,11 +181,11 @@ def combine_wavelengths(
         total = wp.vec2f(0.0, 0.0)
         for wave in range(table.shape[0]):
             value = tabulated(table, wave, separation * baseline[wave])
-            for channel in range(wave * n_depth, (wave + 1) * n_depth):
-                px = ramp_x[star, channel, column]
-                py = ramp_y[star, channel, row]
+            for light_channel in range(wave * n_depth, (wave + 1) * n_depth):
+                px = ramp_x[star, light_channel, column]
+                py = ramp_y[star, light_channel, row]
                 re = px[0] * py[0] - px[1] * py[1]
                 im = px[0] * py[1] + px[1] * py[0]
-                s = spectra[star, channel, row, column]
+                s = spectra[star, light_channel, row, column]
                 total = total + wp.vec2f(s[0] * re - s[1] * im, s[0] * im + s[1] * re) * value
         combined[star, row, column] = total * detector[row, column]

@@ -20,13 +20,13 @@ from ...core.units import require_count
 class ImagePlane:
     """The pixels of a stamp and the detector behind them."""
 
-    stamp_size: int  #: pixels on a side
+    size: int  #: pixels on a side of a stamp
     pixel_size: float  #: side of a square pixel [m]
     diffusion: float  #: rms along each axis of the charge diffusion [m]
     jitter: float = 0.0  #: rms along each axis of how far the telescope's pointing moves images during an exposure [m]
 
     def __post_init__(self) -> None:
-        require_count(self.stamp_size, "stamp_size", 3, 4096)
+        require_count(self.size, "size", 3, 4096)
         if not (math.isfinite(self.pixel_size) and self.pixel_size > 0.0):
             raise DomainError(f"pixel_size = {self.pixel_size!r}: expected a positive length in metres")
         for name, rms in (("diffusion", self.diffusion), ("jitter", self.jitter)):
@@ -36,17 +36,17 @@ class ImagePlane:
     @property
     def side(self) -> float:
         """Side of the stamp [m]."""
-        return self.stamp_size * self.pixel_size
+        return self.size * self.pixel_size
 
     @property
     def middle(self) -> int:
         """Index of the middle pixel, where a star without an offset has its reference point."""
-        return self.stamp_size // 2
+        return self.size // 2
 
     @property
     def pixel_centers(self) -> np.ndarray:
         """Coordinates of the pixel centres along an axis from the middle pixel [m]."""
-        return (np.arange(self.stamp_size) - self.middle) * self.pixel_size
+        return (np.arange(self.size) - self.middle) * self.pixel_size
 
     def transfer(self, kx: np.ndarray, ky: np.ndarray) -> np.ndarray:
         """Return the transfer function of a square pixel, Gaussian charge diffusion and Gaussian pointing jitter.

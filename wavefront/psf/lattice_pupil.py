@@ -27,7 +27,7 @@ from .pupil_lattice import PupilLattice
 
 #: Points of the default lattice in a disc: 196 across, for vanes of a few centimetres.
 LATTICE_POINTS = 30000
-#: Points of the lattice in rings without vanes.
+#: Points of the lattice in a disc where there are only rings.
 RINGS_POINTS = 7500
 #: Fewest points of a lattice.
 FEWEST_POINTS = 500
@@ -41,13 +41,13 @@ _ORDER = 3
 # sqrt(5) - 2: as evenly as lines can. Along its rows or diagonals they would hit too many points, or none.
 _SLOPE = 0.5 * (math.sqrt(5.0) - 1.0)
 _TURN = np.array([[1.0, -_SLOPE], [_SLOPE, 1.0]]) / math.hypot(1.0, _SLOPE)
-# Baselines beyond the longest one that is interpolated, for the splines.
+# Baselines beyond the longest one that is wanted, for the splines.
 _ROOM = 4
-# Rays that are traced for the paths at other wavelengths.
+# Rays that determine the paths at other wavelengths.
 _SPARSE = 400
-# Degree of the polynomials through those of them that are lit.
+# Degree of the polynomials through those that are lit.
 _DEGREE = 6
-# Fewest lit rays to a term of these polynomials.
+# Fewest lit rays to a term of them.
 _RAYS_A_TERM = 3
 # Numbers of the terms of whole degrees, the largest first.
 _TERMS = [(d + 1) * (d + 2) // 2 for d in range(_DEGREE, -1, -1)]
@@ -190,10 +190,10 @@ class LatticeTransfer:
         lags = scipy.fft.ifft2(spectrum.real**2 + spectrum.imag**2)
         reach = min(longest, size - 1)
         step = np.arange(-reach, reach + 1)
-        correlation = np.zeros((len(field), 2 * longest + 1, 2 * longest + 1), dtype=np.complex128)
+        correlations = np.zeros((len(field), 2 * longest + 1, 2 * longest + 1), dtype=np.complex128)
         inner = slice(longest - reach, longest + reach + 1)
-        correlation[:, inner, inner] = lags[:, step[:, None], step] / len(lit)
-        return correlation
+        correlations[:, inner, inner] = lags[:, step[:, None], step] / len(lit)
+        return correlations
 
     def _initial_fall(self, lit: np.ndarray) -> np.ndarray:
         """Return how steeply the autocorrelation of lit points, by number, falls at first along x and y [1/m], [2]."""

@@ -30,22 +30,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
 import warp as wp
 
-from ...core.errors import ConfigError
+from ...core.arguments import check_arguments
 from ...core.launch import launch
+from ...core.units import require_count
 from ...core.warp_arrays import warp_array
 from ...models.telescope import Telescope
 from ..atmosphere.turbulence import coherence, structure_function
 from ..pupil_optics import PupilOptics
 from .clear_pupil import SpokePupil, clear_edges, has_only_annuli
-from .engine import ExposedStars, PsfEngine, PsfInputs, Stars, expose_by_kind, metric_of
+from .engine import ExposedStars, PsfEngine, PsfInputs, PsfRenderer, Stars, expose_by_kind, metric_of
 from .lattice_pupil import LATTICE_POINTS, MOST_ACROSS, RINGS_POINTS, LatticeRays, LatticeTransfer
 from .long_exposure_kernels import place_points, sample_pixels, transform_pupils
-from .mean_rays import MeanRaysEngine, drawing_ray_counts, ray_counts
+from .mean_rays import MeanRaysRenderer, drawing_ray_counts, ray_counts
 from .pupil_rims import strip_overlap
 from .sample_packets import LANES, samples
 
@@ -59,19 +61,19 @@ GRID_MARGIN = 1.25
 _NEGLIGIBLE = 1e-5
 # Largest coherence at a baseline half as long as the pupil's ring is wide, where the strips along its rims are a half
 # of it: on AuxTel, where 0.04 are left, they are wrong by 1e-3 in e.
-_LARGEST_COHERENCE = 1e-3
+_LARGEST_LEFT = 1e-3
 # Part of the ring that is lit from which on rims cross few spokes. At 8 um of defocus e of the LSST is wrong by 1e-4 at
 # 0.8, by 5e-4 at 0.62, by 1.5e-3 at 0.57 and by 3e-3 at 0.42.
 _LEAST_LIT = 0.6
-# Kind of stars near focus; a positive kind is the number of rays of a star far from focus.
+# Kinds of stars beside those of so many rays: near focus.
 _NEAR = 0
-# Kind of stars whose ring is vignetted, which the lattice draws.
+# Much vignetted.
 _VIGNETTED = -1
 # Bytes of a point of the lattice and a wavelength.
 _LATTICE_BYTES = 24
 # Most stars of one batch.
 _BATCH = 256
-# Most memory for the waves of a batch [bytes].
+# Largest memory of the waves of a batch [bytes], which then has fewer stars.
 _BATCH_BYTES = 1 << 25
 # Samples of the filter against the baseline: linear interpolation is then good to 1e-6.
 _TABLE_SIZE = 2048
@@ -82,24 +84,47 @@ def default_points(telescope: Telescope) -> int:
     return PUPIL_POINTS if has_only_annuli(telescope) else LATTICE_POINTS
 
 
+@check_arguments
+@dataclass(frozen=True)
 class LongExposureEngine(PsfEngine):
-    """Mean over all turbulence.
+    """Mean over all turbulence, the quickest engine for many stars per call.
 
-    The atmosphere gives the Fried parameter and the outer scale; its screens are not made. No atmosphere is a
-    :class:`ConfigError`, too few points a :class:`DomainError`.
+    It needs an atmosphere, of which it uses the Fried parameter and the outer scale only; screens are not made.
+
+    Attributes
+    ----------
+    n_pupil : int, optional
+        Approximate number of pupil points, at least 10; at least 500, of a lattice in a disc, where anything but discs
+        and rings stops light. By default 80 and 30000; stars far from focus are drawn by more rays.
+
+    Raises
+    ------
+    DomainError
+        If there are too few points.
     """
 
     name = "long_exposure"
-    depths = 2
-    options = ("n_pupil",)
-    screens = ()
+    needs_atmosphere = True
 
-    def __init__(self, inputs: PsfInputs) -> None:
-        if inputs.atmosphere is None:
-            raise ConfigError(
-                "engine = 'long_exposure': expected an atmosphere, whose mean it takes ('wave' does without one)"
-            )
+    n_pupil: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.n_pupil is not None:
+            require_count(self.n_pupil, "n_pupil", 10)
+
+    def _renderer(self, inputs: PsfInputs) -> LongExposureRenderer:
+        return LongExposureRenderer(inputs, self)
+
+
+class LongExposureRenderer(PsfRenderer):
+    """Renderer of :class:`LongExposureEngine`."""
+
+    depths = 2
+
+    def __init__(self, inputs: PsfInputs, options: LongExposureEngine) -> None:
+        assert inputs.atmosphere is not None, "the engine needs one"
         super().__init__(inputs)
+        self._options = options
         self._r0, self._outer_scale = inputs.atmosphere.r0, inputs.atmosphere.outer_scale
         #: Side of the periodic image [m].
         self.period = GRID_MARGIN * self._plane.side
@@ -107,10 +132,10 @@ class LongExposureEngine(PsfEngine):
         self._step = self._wavelengths * self.focal_length / self.period
         # Width of the pupil's ring.
         self._width = 0.5 * self._diameter * (1.0 - self._obscuration)
-        requested_points, rings = inputs.n_pupil, has_only_annuli(self._telescope)
+        rings = has_only_annuli(self._telescope)
         # Whether every star needs the lattice in place of strips along the rims.
         self._general = not rings or not self._strips_suffice()
-        count = requested_points or LATTICE_POINTS
+        count = options.n_pupil or LATTICE_POINTS
         if rings:
             count = LATTICE_POINTS if self._general else RINGS_POINTS
         self._lattice = LatticeTransfer.fill(self._diameter, self._obscuration, count, self._wavelengths)
@@ -120,7 +145,7 @@ class LongExposureEngine(PsfEngine):
             star_bytes = _LATTICE_BYTES * len(self._wavelengths) * len(self._lattice.points)
         else:
             self._tabulate_filter()
-            n_pupil = PUPIL_POINTS if requested_points is None else requested_points
+            n_pupil = PUPIL_POINTS if options.n_pupil is None else options.n_pupil
             self._pupil = SpokePupil.fill(self._diameter, self._obscuration, n_pupil)
             star_bytes = 2 * 2 * 4 * LANES * self._detector.shape[2] * len(self._pupil.points) * self._channels.depths
         self.batch = max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
@@ -139,16 +164,16 @@ class LongExposureEngine(PsfEngine):
         k = 2.0 * math.pi / self.period * count
         diagonal = math.sqrt(0.5) * k
         detector = [self._plane.transfer(*along) for along in ((k, 0 * k), (0 * k, k), (diagonal, diagonal))]
-        turbulence = np.array([self._turbulence(s * count)[w] for w, s in enumerate(step)])
-        bounds = turbulence * np.max(np.abs(detector), axis=0)
-        return np.asarray(bounds * self._channels.of_wavelength(self._channels.spread(k)))
+        air = np.array([self._turbulence(s * count)[w] for w, s in enumerate(step)])
+        transfer = air * np.max(np.abs(detector), axis=0)
+        return np.asarray(transfer * self._channels.of_wavelength(self._channels.spread(k)))
 
     def _strips_suffice(self) -> bool:
         """Return whether the transfer is negligible at baselines of half the width of the pupil's annulus."""
         half = 0.5 * self._width
-        bounds = self._transfer_bounds(half)
-        last = np.minimum(np.ceil(half / self._step).astype(int), bounds.shape[1]) - 1
-        return bool(bounds[np.arange(len(bounds)), last].max() <= _LARGEST_COHERENCE)
+        transfer = self._transfer_bounds(half)
+        last = np.minimum(np.ceil(half / self._step).astype(int), transfer.shape[1]) - 1
+        return bool(transfer[np.arange(len(transfer)), last].max() <= _LARGEST_LEFT)
 
     def _choose_frequencies(self) -> None:
         """Choose the largest frequency of the sums."""
@@ -187,9 +212,9 @@ class LongExposureEngine(PsfEngine):
         self._detector = np.stack(detector).reshape(2, n_row, n_packet, LANES).astype(np.float32)
         angle = k * np.outer(plane.pixel_centers, row)
         self._pixel_rows = np.stack([np.cos(angle), np.sin(angle)], axis=-1).astype(np.float32)
-        across = -(-plane.stamp_size // LANES)
+        across = -(-plane.size // LANES)
         columns = np.zeros((2, n_row, across * LANES), dtype=np.float32)
-        columns[:, :, : plane.stamp_size] = np.stack([np.cos(angle.T), np.sin(angle.T)])
+        columns[:, :, : plane.size] = np.stack([np.cos(angle.T), np.sin(angle.T)])
         self._pixel_columns = columns.reshape(2, n_row, across, LANES)
         spread = self._channels.spread(k * column).reshape(-1, n_packet, LANES)
         self._fade_x = (self._channels.weight[:, None, None] * spread).astype(np.float32)
@@ -201,7 +226,7 @@ class LongExposureEngine(PsfEngine):
         optics = self._trace(stars.fields, self._pupil.points, self._threads)
         edges = self._edges(stars.fields)
         kinds = np.where(self._lit_fraction(edges) < _LEAST_LIT, _VIGNETTED, _NEAR)
-        if self._inputs.n_pupil is None:
+        if self._options.n_pupil is None:
             rays = ray_counts(optics, self._plane.pixel_size)
             kinds = np.where(rays > 0, rays, kinds)
         if (kinds == _NEAR).all():
@@ -215,7 +240,7 @@ class LongExposureEngine(PsfEngine):
         if kind == _NEAR:
             optics = self._trace(stars.fields, self._pupil.points, self._threads)
             return self._expose_spokes(optics, self._edges(stars.fields), stars)
-        return MeanRaysEngine(self._inputs, kind).expose_without_refinement(stars)
+        return MeanRaysRenderer(self._inputs, kind).expose_without_refinement(stars)
 
     def _expose_lattice(self, stars: Stars) -> ExposedStars:
         """Expose stars by lattices as fine as each needs, or by rays where that is too fine."""
@@ -228,12 +253,12 @@ class LongExposureEngine(PsfEngine):
 
         def expose(kind: int, stars: Stars) -> ExposedStars:
             if kind < 0:
-                return MeanRaysEngine(self._inputs, -kind).expose_without_refinement(stars)
+                return MeanRaysRenderer(self._inputs, -kind).expose_without_refinement(stars)
             lattice = self._lattice.refined(kind)
-            size = max(1, self.batch // kind**2)
-            batches = (stars[first : first + size] for first in range(0, len(stars), size))
+            step = max(1, self.batch // kind**2)
+            parts = (stars[first : first + step] for first in range(0, len(stars), step))
             return self._expose_autocorrelation(
-                (lattice, self._lattice_rays(lattice, batch), batch) for batch in batches
+                (lattice, self._lattice_rays(lattice, star_batch), star_batch) for star_batch in parts
             )
 
         return expose_by_kind(kinds, expose, stars)
@@ -365,8 +390,8 @@ class LongExposureEngine(PsfEngine):
         )
 
     def _sample(self, spectrum: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-        """Return the stamps of transfer functions, shape [n_star, stamp_size, stamp_size]."""
-        n_star, side = len(spectrum), self._plane.stamp_size
+        """Return the stamps of transfer functions, shape [n_star, side, side]."""
+        n_star, side = len(spectrum), self._plane.size
         n_packet = self._detector.shape[2]
         lines = np.empty((n_star, n_packet, 2, LANES), dtype=np.float32)
         image = np.empty((n_star, side, self._pixel_columns.shape[2], LANES), dtype=np.float32)

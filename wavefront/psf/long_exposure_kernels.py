@@ -97,10 +97,10 @@ def place_points(
     angle = tau / wp.float64(n_spoke)
     start = edges[star, spoke, 0] * edges[star, spoke, 0]
     span = edges[star, spoke, 1] * edges[star, spoke, 1] - start
-    landed_count = zero
+    landed_rays = zero
     for ring in range(n_ring):
-        landed_count = landed_count + landed[star, ring * n_spoke + spoke]
-    clear = span > zero and landed_count > zero
+        landed_rays = landed_rays + landed[star, ring * n_spoke + spoke]
+    clear = span > zero and landed_rays > zero
     # Direction cosines of the light at the image change along the spoke by this per metre.
     turn = -wp.transpose(wp.inverse(jacobian[star])) * unit[spoke]
     values = ring_values()
@@ -140,9 +140,9 @@ def place_points(
                     slope = slope + wp.vec2d(slopes[k] * x, slopes[k] * y)
             for d in range(shift.shape[1]):
                 deep = landing + shift[wave, d] * steepness
-                channel = wave * shift.shape[1] + d
-                place[star, channel, 0, point] = wp.float32(deep[0] / period)
-                place[star, channel, 1, point] = wp.float32(deep[1] / period)
+                light_channel = wave * shift.shape[1] + d
+                place[star, light_channel, 0, point] = wp.float32(deep[0] / period)
+                place[star, light_channel, 1, point] = wp.float32(deep[1] / period)
             if outermost:
                 slope = slope + mean_shift[wave] * turn
                 lean[star, wave, rim, 0] = wp.float32(depth * tau / period * slope[0])
@@ -232,28 +232,28 @@ def transform_pupils(
                 spectrum[star, component, row, packet] = samples()
     for wave in range(n_wave):
         for depth in range(n_depth):
-            channel = wave * n_depth + depth
+            light_channel = wave * n_depth + depth
             for point in range(n_point):
-                x = place[star, channel, 0, point]
-                y = place[star, channel, 1, point]
+                x = place[star, light_channel, 0, point]
+                y = place[star, light_channel, 1, point]
                 scale = light[star, point]
                 if point < inner_end or point >= outer_start:
                     scale = wp.float32(1.0)
-                slot = depth * n_point + point
+                sample = depth * n_point + point
                 for packet in range(n_packet):
                     number = lane_numbers(packet)
                     cosine, sine = unit_circle(-x * number)
-                    fade = scale * fade_x[channel, packet]
-                    along_x[star, packet, slot, 0] = wp.cw_mul(fade, cosine)
-                    along_x[star, packet, slot, 1] = wp.cw_mul(fade, sine)
+                    fade = scale * fade_x[light_channel, packet]
+                    along_x[star, packet, sample, 0] = wp.cw_mul(fade, cosine)
+                    along_x[star, packet, sample, 1] = wp.cw_mul(fade, sine)
                 for packet in range(n_packet):
                     number = lane_numbers(packet)
                     cosine, sine = unit_circle(-y * number)
-                    cosine = wp.cw_mul(fade_y[channel, packet], cosine)
-                    sine = wp.cw_mul(fade_y[channel, packet], sine)
+                    cosine = wp.cw_mul(fade_y[light_channel, packet], cosine)
+                    sine = wp.cw_mul(fade_y[light_channel, packet], sine)
                     for i in range(LANES):
-                        along_y[star, packet * LANES + i, slot, 0] = cosine[i]
-                        along_y[star, packet * LANES + i, slot, 1] = sine[i]
+                        along_y[star, packet * LANES + i, sample, 0] = cosine[i]
+                        along_y[star, packet * LANES + i, sample, 1] = sine[i]
         for packet in range(n_packet):
             number = lane_numbers(packet)
             for row in range(rows[packet]):
@@ -306,18 +306,18 @@ def transform_pupils(
                     point_light = samples(light[star, point])
                     width = magnitudes(width_x + samples(width_y))
                     phase = wp.cw_mul(wp.cw_mul(width, width), lean_x + samples(lean_y))
-                    inner_light = point_light - width
+                    inside_light = point_light - width
                     re = cc - ss
                     im = cs + sc
-                    re_plus = re_plus + wp.cw_mul(inner_light, re) + wp.cw_mul(phase, im)
-                    im_plus = im_plus + wp.cw_mul(inner_light, im) - wp.cw_mul(phase, re)
+                    re_plus = re_plus + wp.cw_mul(inside_light, re) + wp.cw_mul(phase, im)
+                    im_plus = im_plus + wp.cw_mul(inside_light, im) - wp.cw_mul(phase, re)
                     width = magnitudes(width_x - samples(width_y))
                     phase = wp.cw_mul(wp.cw_mul(width, width), lean_x - samples(lean_y))
-                    inner_light = point_light - width
+                    inside_light = point_light - width
                     re = cc + ss
                     im = sc - cs
-                    re_minus = re_minus + wp.cw_mul(inner_light, re) + wp.cw_mul(phase, im)
-                    im_minus = im_minus + wp.cw_mul(inner_light, im) - wp.cw_mul(phase, re)
+                    re_minus = re_minus + wp.cw_mul(inside_light, re) + wp.cw_mul(phase, im)
+                    im_minus = im_minus + wp.cw_mul(inside_light, im) - wp.cw_mul(phase, re)
                 value = photons[star, wave] * filtered(table, wave, per_step[wave], metric, star, number, ky)
                 spectrum[star, 0, row, packet] = spectrum[star, 0, row, packet] + wp.cw_mul(value, re_plus)
                 spectrum[star, 1, row, packet] = spectrum[star, 1, row, packet] + wp.cw_mul(value, im_plus)
@@ -387,10 +387,10 @@ def sample_pixels(
         for packet_x in range(image.shape[2]):
             total = samples()
             for column in range(pixel_columns.shape[1]):
-                real_index = (column // LANES) * 2 * LANES + column % LANES
+                sample = (column // LANES) * 2 * LANES + column % LANES
                 total = (
                     total
-                    + line[star, real_index] * pixel_columns[0, column, packet_x]
-                    - line[star, real_index + LANES] * pixel_columns[1, column, packet_x]
+                    + line[star, sample] * pixel_columns[0, column, packet_x]
+                    - line[star, sample + LANES] * pixel_columns[1, column, packet_x]
                 )
             image[star, y, packet_x] = total

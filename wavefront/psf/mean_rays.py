@@ -18,7 +18,7 @@ from ..pupil_polynomials import PupilPolynomials
 from ..pupil_sampling import spiral_annulus
 from .engine import PsfInputs
 from .far_from_focus import blur_radii
-from .fast import FastPsfEngine
+from .fast import FastEngine, FastRenderer
 from .image_plane import square_transfer
 from .pupil_rims import pupil_rims, strip_overlap
 
@@ -29,14 +29,14 @@ OVERSAMPLING = 4
 FAR = 50e-6
 # Rays in the square of the rms radius of the blur: a donut of 1.2 mm is drawn to 6e-4 of its light (rms).
 _RAYS = 70.0
-# Rays that landing points of the rims are found from.
+# Rays from which the landing points of the rims are interpolated.
 _SMOOTH_POINTS = 2000
-# Transfer of air and detector below which the rims are left out.
+# Transfer of air and detector below which the strips along the rims are left out.
 _DARK = 1e-3
 
 
 def ray_counts(optics: PupilOptics, pixel_size: float) -> np.ndarray:
-    """Return the number of rays of each star for :class:`MeanRaysEngine`, 0 near focus, shape [n_star] int.
+    """Return the number of rays of each star for :class:`MeanRaysRenderer`, 0 near focus, shape [n_star] int.
 
     ``pixel_size`` is in metres.
     """
@@ -50,7 +50,7 @@ def drawing_ray_counts(optics: PupilOptics, pixel_size: float) -> np.ndarray:
     return np.asarray(count, dtype=np.int64)
 
 
-class MeanRaysEngine(FastPsfEngine):
+class MeanRaysRenderer(FastRenderer):
     """Rays of the optics alone, filtered by the mean transfer function of all turbulence.
 
     Pupil points stand on a spiral, which lines up with no rim. Rays are shared among the four cells around them: in
@@ -59,7 +59,8 @@ class MeanRaysEngine(FastPsfEngine):
 
     def __init__(self, inputs: PsfInputs, rays: int) -> None:
         self._air = inputs.atmosphere
-        super().__init__(replace(inputs, atmosphere=None, n_pupil=rays, oversampling=OVERSAMPLING), far_from_focus=True)
+        options = FastEngine(n_pupil=rays, oversampling=OVERSAMPLING)
+        super().__init__(replace(inputs, atmosphere=None), options, far_from_focus=True)
 
     def _place_pupil(self, n_pupil: int) -> None:
         self._points = spiral_annulus(0.5 * self._diameter, self._inner, int(self._area * n_pupil)).points
@@ -89,30 +90,31 @@ class MeanRaysEngine(FastPsfEngine):
         directions, channels = self._direction(optics.fields), self._channels
         landing = channels.displacement(optics)
         kx, ky = np.meshgrid(self._kx, self._ky)
-        thinning = slice(None, None, max(1, len(self._points) // _SMOOTH_POINTS))
-        smooth = PupilPolynomials(self._points[thinning], np.zeros(2), 0.0)
+        thinned = slice(None, None, max(1, len(self._points) // _SMOOTH_POINTS))
+        smooth = PupilPolynomials(self._points[thinned], np.zeros(2), 0.0)
 
         def diffract(star: int) -> None:
             for channel, wave in enumerate(channels.wave):
-                wavelength, bare = float(self._wavelengths[wave]), landing[star, channel, thinning].astype(np.float64)
+                wavelength = float(self._wavelengths[wave])
+                bare = landing[star, channel, thinned].astype(np.float64)
                 if not (np.isfinite(bare).all() and light[star, wave].any()):
                     continue
                 # Baseline over wavelength: J^T k / 2 pi.
                 jacobian = optics.jacobian[star] * wavelength / (2.0 * np.pi)
                 x, y = (jacobian[0, i] * kx + jacobian[1, i] * ky for i in (0, 1))
                 length = np.hypot(x, y)
-                baselines = self._filter_step * np.arange(self._filter.shape[1])
-                attenuation = np.interp(length, baselines, self._filter[wave])
-                bright = np.abs(attenuation * self._detector) > _DARK
+                table = self._filter[wave]
+                transfer = np.interp(length, self._filter_step * np.arange(len(table)), table)
+                bright = np.abs(transfer * self._detector) > _DARK
                 rims = pupil_rims(self._telescope, directions[star], wavelength)
                 places, inward = rims.landing(smooth, bare)
                 # The deposit has its origin in the first cell.
                 places = places + (self._grid_size // 2) * self._cell
                 k = np.stack([kx[bright], ky[bright]], axis=-1)
-                rim_transfer = rims.transfer(np.stack([x[bright], y[bright]], axis=-1), k, places, inward)
+                strips = rims.transfer(np.stack([x[bright], y[bright]], axis=-1), k, places, inward)
                 # The detector's filter undoes the cloud-in-cell average of the rays.
-                rim_transfer *= square_transfer(k[:, 0], k[:, 1], self._cell) ** 2
-                spectra[star, channel][bright] += float(light[star, wave].sum()) * rim_transfer
+                strips *= square_transfer(k[:, 0], k[:, 1], self._cell) ** 2
+                spectra[star, channel][bright] += float(light[star, wave].sum()) * strips
 
         list(self._map(diffract, range(len(spectra))))
         return spectra

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.arguments import check_arguments
-from ...core.errors import DomainError, check_choice
+from ...core.arguments import check_arguments, removed_arguments
+from ...core.errors import DomainError
 from ...core.plotting import draw_stamps
 from ...core.result import Result
-from ...core.units import ARCSEC, angle, length, metres, pure_numbers, radians
+from ...core.units import ARCSEC, metres, pure_numbers, radians
 from ...models.camera.focal_plane import FocalPlane
-from ...models.camera.silicon import Silicon
 from ...models.telescope import Telescope
 from ..aberration import ResidualWavefront
 from ..atmosphere.atmosphere import Atmosphere
-from .engine import PsfInputs, Recenter, center_focal_length
-from .engines import ENGINES
-from .image_plane import ImagePlane
+from ..request import Request
+from .engine import PsfEngine, PsfInputs, PsfRenderer, Recenter, Stars, center_focal_length
+from .engines import psf_engine
+from .light import Light
+from .stamps import Stamps
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -82,30 +83,33 @@ class Psfs(Result):
         return draw_stamps(ax, self.image, self.pixel_scale / ARCSEC, titles)
 
 
+@removed_arguments(
+    wavelength_weights="wavelengths=Light(wavelengths, weights=...)",
+    dispersion="wavelengths=Light(wavelengths, dispersion=...)",
+    stamp_size="stamps=Stamps(size=...)",
+    pixel_size="stamps=Stamps(pixel_size=...)",
+    diffusion="stamps=Stamps(diffusion=...)",
+    jitter="stamps=Stamps(jitter=...)",
+    silicon="stamps=Stamps(silicon=...)",
+    offsets="stamps=Stamps(offsets=...)",
+    recenter="stamps=Stamps(recenter=...)",
+    n_pupil="engine=FastEngine(n_pupil=...) or LongExposureEngine(n_pupil=...)",
+    oversampling="engine=FastEngine(oversampling=...)",
+    padding="engine=WaveEngine(padding=...)",
+    pupil_spacing="engine=WaveEngine(pupil_spacing=...)",
+    projection="Request.of(telescope, fields, wavelengths, projection=...) in place of the telescope",
+)
 @check_arguments
 def make_psfs(
-    telescope: Telescope,
-    fields: ArrayLike,
-    wavelengths: ArrayLike,
+    telescope: Telescope | Request,
+    fields: ArrayLike | None = None,
+    wavelengths: ArrayLike | Light | None = None,
     *,
-    wavelength_weights: ArrayLike | None = None,
     focal_plane: FocalPlane | None = None,
     atmosphere: Atmosphere | None = None,
     aberration: ResidualWavefront | None = None,
-    silicon: Silicon | None = None,
-    engine: str = "fast",
-    stamp_size: int = 31,
-    pixel_size: ArrayLike = 10e-6,
-    diffusion: ArrayLike = 4e-6,
-    jitter: ArrayLike = 0.0,
-    offsets: ArrayLike | None = None,
-    recenter: Callable[[np.ndarray, float], np.ndarray] | None = None,
-    dispersion: ArrayLike | None = None,
-    n_pupil: int | None = None,
-    oversampling: int | None = None,
-    padding: bool | None = None,
-    pupil_spacing: float | None = None,
-    projection: str = "zemax",
+    stamps: Stamps | None = None,
+    engine: str | PsfEngine = "fast",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Psfs:
@@ -116,59 +120,26 @@ def make_psfs(
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
+    telescope : Telescope or Request
+        The telescope; or a :class:`~pachon.Request` in place of it, of fields and wavelengths.
     fields : array_like or Quantity, shape [n_star, 2]
-        Field angles [rad], of the light's own travel.
-    wavelengths : array_like or Quantity, shape [n_wave]
-        Vacuum wavelengths [m], of equal numbers of photons before the telescope unless weighted.
-    wavelength_weights : array_like, shape [n_wave] or [n_star, n_wave], optional
-        Relative numbers of photons of each wavelength before the telescope: the spectrum of all stars, or of each, such
-        as :func:`blackbody_photons` gives.
+        Field angles [rad], of the light's own travel, in the projection "zemax"; a request may have another one.
+    wavelengths : array_like or Quantity, shape [n_wave], or Light
+        Vacuum wavelengths [m], of equal numbers of photons before the telescope; or :class:`Light`, which holds spectra
+        and atmospheric dispersion too.
     focal_plane : FocalPlane, optional
         CCD heights; the nominal flat plane by default.
     atmosphere : Atmosphere, optional
         The exposure; none outside the atmosphere.
     aberration : ResidualWavefront, optional
         Wavefront error that active optics leaves; none by default.
-    silicon : Silicon, optional
-        Silicon of the CCDs, in which light turns into charge below the surface, and some of it not at all; by default
-        all of it does so at the surface.
-    engine : {"fast", "wave", "long_exposure"}
-        ``"fast"``: geometric optics with filters. ``"wave"``: Fourier optics, the slow reference engine.
-        ``"long_exposure"``: mean over all turbulence, the quickest for many stars per call. It needs an atmosphere, of
-        which it uses the Fried parameter and the outer scale only.
-    stamp_size : int
-        Pixels on a side of a stamp.
-    pixel_size : float or Quantity
-        Side of a pixel [m].
-    diffusion : float or Quantity
-        Root mean square of the charge diffusion along each axis [m]; in silicon that of charge from the surface, and
-        less from deeper down.
-    jitter : float or Quantity
-        Root mean square of the telescope's pointing along each axis during the exposure [rad]: a Gaussian blur, the
-        same for all stars.
-    offsets : array_like, shape [n_star, 2], optional
-        Place of each star (x, y) from the centre of the middle pixel [pixels]; 0 by default.
-    recenter : callable, optional
-        Centroids of stamps: given images [n, ny, nx] and the angle of a pixel [rad], it returns places (x, y) from the
-        centre of the middle pixel [pixels], shape [n, 2]. Each star is then drawn once more, with its centroid at the
-        centre. That is exact, unlike a shift of the pixels, and costs little.
-    dispersion : array_like or Quantity, shape [n_wave, 2], optional
-        Shift in field angle of each wavelength by the atmosphere [rad], such as
-        :func:`~pachon.wavefront.atmosphere.refraction.dispersion_shift` gives.
-    n_pupil : int, optional
-        Approximate number of pupil points (fast and long_exposure).
-    oversampling : int, optional
-        Cells of the fine grid per pixel (fast).
-    padding : bool, optional
-        Whether all baselines are used, up to the diameter of the pupil (wave). By default they are where there is no
-        atmosphere or next to no charge diffusion.
-    pupil_spacing : float, optional
-        Distance of the pupil points [m] (wave). By default the image repeats itself outside the stamp only, and the
-        distance is at most 0.02 m, or 0.04 m without an atmosphere, and a 96th of the diameter.
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the field angles.
+    stamps : Stamps, optional
+        Pixels, charge diffusion, silicon, jitter, and places of the stars; by default 31 x 31 pixels of 10 um.
+    engine : FastEngine, WaveEngine, LongExposureEngine, or {"fast", "wave", "long_exposure"}
+        The engine with its options, or the name of one with its defaults.
+        :class:`FastEngine`: geometric optics with filters. :class:`WaveEngine`: Fourier optics, the slow reference
+        engine. :class:`LongExposureEngine`: mean over all turbulence, the quickest for many stars per call; it needs an
+        atmosphere, of which it uses the Fried parameter and the outer scale only.
     threads : int, optional
         Number of threads; all processors by default.
     progress : callable, optional
@@ -181,66 +152,76 @@ def make_psfs(
     Raises
     ------
     ConfigError
-        If the engine or the projection is unknown, or the engine needs an atmosphere or does not take an option.
+        If the engine is unknown or needs an atmosphere, or fields or wavelengths are given beside a request.
     DomainError
         If an argument is outside its range or of the wrong shape, silicon is transparent at a wavelength, or a star
         falls between the CCDs.
     """
-    check_choice("engine", engine, ENGINES)
+    options, stamps, projection = psf_engine(engine), stamps or Stamps(), "zemax"
+    if isinstance(telescope, Request):
+        request = Request.of(telescope, fields, wavelengths, threads=threads)
+        telescope, fields, projection, threads = request.telescope, request.fields, request.projection, request.threads
+        wavelengths = Light(request.wavelengths, request.weights if np.ptp(request.weights) else None)
+    if fields is None or wavelengths is None:
+        raise DomainError("fields, wavelengths: expected both beside a telescope; a Request would have them")
+    light = wavelengths if isinstance(wavelengths, Light) else Light(wavelengths)
     angles = _finite_pairs(radians(fields, "fields"), "fields", None)
     telescope.check_field(angles[:, 0], angles[:, 1])
-    lengths = metres(wavelengths, "wavelengths").reshape(-1)
+    lengths = metres(light.wavelengths, "wavelengths").reshape(-1)
     if not lengths.size or not (np.isfinite(lengths) & (lengths > 0.0)).all():
-        raise DomainError(f"wavelengths = {wavelengths!r}: expected one or more positive lengths in metres")
-    photons = None if wavelength_weights is None else _relative_photons(wavelength_weights, len(angles), len(lengths))
-    places = np.zeros((len(angles), 2)) if offsets is None else _finite_pairs(offsets, "offsets", len(angles))
-    shifts = (
-        None if dispersion is None else _finite_pairs(radians(dispersion, "dispersion"), "dispersion", len(lengths))
+        raise DomainError(f"wavelengths = {light.wavelengths!r}: expected one or more positive lengths in metres")
+    photons = None if light.weights is None else _relative_photons(light.weights, len(angles), len(lengths))
+    places = np.zeros((len(angles), 2))
+    if stamps.offsets is not None:
+        places = _finite_pairs(stamps.offsets, "offsets", len(angles))
+    shifts = None
+    if light.dispersion is not None:
+        shifts = _finite_pairs(radians(light.dispersion, "dispersion"), "dispersion", len(lengths))
+    inputs = PsfInputs(
+        telescope,
+        lengths,
+        stamps.image_plane(center_focal_length(telescope, lengths) if stamps.jitter else 0.0),
+        dispersion=shifts,
+        focal_plane=focal_plane,
+        atmosphere=atmosphere,
+        aberration=aberration,
+        silicon=stamps.silicon,
+        projection=projection,
+        threads=threads,
     )
-    plane = ImagePlane(
-        stamp_size,
-        length(pixel_size, "pixel_size"),
-        length(diffusion, "diffusion"),
-        _jitter_on_detector(jitter, telescope, lengths),
-    )
-    maker = ENGINES[engine](
-        PsfInputs(
-            telescope,
-            lengths,
-            plane,
-            dispersion=shifts,
-            focal_plane=focal_plane,
-            atmosphere=atmosphere,
-            aberration=aberration,
-            silicon=silicon,
-            projection=projection,
-            threads=threads,
-            n_pupil=n_pupil,
-            oversampling=oversampling,
-            padding=padding,
-            pupil_spacing=pupil_spacing,
-        )
-    )
-    pixel_scale = plane.pixel_size / maker.focal_length
+    return _render_stars(options.renderer(inputs), inputs, Stars(angles, places, photons), stamps.recenter, progress)
+
+
+def _render_stars(
+    renderer: PsfRenderer,
+    inputs: PsfInputs,
+    stars: Stars,
+    recenter: Callable[[np.ndarray, float], np.ndarray] | None,
+    progress: Callable[[int], None] | None,
+) -> Psfs:
+    """Return the images of stars, rendered batch by batch."""
+    n_star, size = len(stars), inputs.plane.size
+    pixel_scale = inputs.plane.pixel_size / renderer.focal_length
     centroids: Recenter | None = None if recenter is None else lambda images: recenter(images, pixel_scale)
-    image = np.empty((len(angles), plane.stamp_size, plane.stamp_size), dtype=np.float32)
-    lit_fraction = np.empty((len(angles), len(lengths)))
-    reference_point, offset, inside = np.empty((len(angles), 3)), np.empty((len(angles), 2)), np.empty(len(angles))
-    maker.prepare(angles)
-    for first in range(0, len(angles), maker.batch):
-        rows = slice(first, min(first + maker.batch, len(angles)))
-        stars = maker.render(angles[rows], places[rows], centroids, None if photons is None else photons[rows])
-        inside[rows] = stars.image.sum(axis=(1, 2))
-        image[rows] = stars.image / np.where(inside[rows] > 0.0, inside[rows], 1.0)[:, None, None]
-        lit_fraction[rows], reference_point[rows] = stars.lit_fraction, stars.reference_point
-        offset[rows] = stars.offset
+    image = np.empty((n_star, size, size), dtype=np.float32)
+    lit_fraction = np.empty((n_star, len(inputs.wavelengths)))
+    reference_point, offset, inside = np.empty((n_star, 3)), np.empty((n_star, 2)), np.empty(n_star)
+    renderer.prepare(stars.fields)
+    for first in range(0, n_star, renderer.batch):
+        batch = slice(first, min(first + renderer.batch, n_star))
+        batch_stars = stars[batch]
+        rendered = renderer.render(batch_stars.fields, batch_stars.offsets, centroids, batch_stars.photons)
+        inside[batch] = rendered.image.sum(axis=(1, 2))
+        image[batch] = rendered.image / np.where(inside[batch] > 0.0, inside[batch], 1.0)[:, None, None]
+        lit_fraction[batch], reference_point[batch] = rendered.lit_fraction, rendered.reference_point
+        offset[batch] = rendered.offset
         if progress is not None:
-            progress(rows.stop - first)
+            progress(batch.stop - first)
     return Psfs(
         image=image,
         pixel_scale=pixel_scale,
-        fields=angles,
-        wavelengths=lengths,
+        fields=stars.fields,
+        wavelengths=inputs.wavelengths,
         reference_point=reference_point,
         offset=offset,
         lit_fraction=lit_fraction,
@@ -249,28 +230,18 @@ def make_psfs(
     )
 
 
-def _jitter_on_detector(jitter: ArrayLike, telescope: Telescope, wavelengths: np.ndarray) -> float:
-    """Return the displacement on the detector [m] of a jitter [rad], at the centre of the field."""
-    spread = angle(jitter, "jitter")
-    if not spread >= 0.0:
-        raise DomainError(f"jitter = {spread:g}: expected an angle in radians from 0")
-    return spread * center_focal_length(telescope, wavelengths) if spread else 0.0
-
-
-def _relative_photons(values: ArrayLike, n_star: int, n_wave: int) -> np.ndarray:
+def _relative_photons(values: Any, n_star: int, n_wave: int) -> np.ndarray:
     """Return relative numbers of photons, of mean 1 for each star, shape [n_star, n_wave]."""
-    table = pure_numbers(values, "wavelength_weights")
+    table = pure_numbers(values, "weights")
     if table.shape not in ((n_wave,), (n_star, n_wave)):
-        raise DomainError(
-            f"wavelength_weights of shape {list(table.shape)}: expected [{n_wave}] or [{n_star}, {n_wave}]"
-        )
+        raise DomainError(f"weights of shape {list(table.shape)}: expected [{n_wave}] or [{n_star}, {n_wave}]")
     table = np.array(np.broadcast_to(table, (n_star, n_wave)))
     if not (np.isfinite(table) & (table >= 0.0)).all() or not table.any(axis=1).all():
-        raise DomainError("wavelength_weights: expected numbers of photons from 0, some of each star above it")
+        raise DomainError("weights: expected numbers of photons from 0, some of each star above it")
     return np.asarray(table / table.mean(axis=1, keepdims=True))
 
 
-def _finite_pairs(values: ArrayLike, name: str, count: int | None) -> np.ndarray:
+def _finite_pairs(values: Any, name: str, count: int | None) -> np.ndarray:
     """Return pairs of finite numbers as a float64 array of shape [count, 2]."""
     table = pure_numbers(values, name)
     if count is None:

@@ -19,7 +19,7 @@ def to_packets(values: np.ndarray, dtype: Any, fill: str = "edge") -> np.ndarray
 
     The last packet is filled up with copies of the last value (``"edge"``) or with zeros (``"constant"``).
     """
-    pad_count = -values.shape[-1] % LANES
-    padding = [(0, 0)] * (values.ndim - 1) + [(0, pad_count)]
+    padding_count = -values.shape[-1] % LANES
+    padding = [(0, 0)] * (values.ndim - 1) + [(0, padding_count)]
     filled = np.pad(values.astype(dtype), padding, mode=fill)  # type: ignore[call-overload]
     return np.ascontiguousarray(filled.reshape(*values.shape[:-1], -1, LANES))

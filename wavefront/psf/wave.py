@@ -29,19 +29,21 @@ In silicon w is the path to one depth; time steps take turns at the depths, and 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import scipy.fft
 import warp as wp
 
-from ...core.errors import DomainError
+from ...core.arguments import check_arguments
 from ...core.launch import launch
 from ...core.threads import thread_count
+from ...core.units import require_positive
 from ...core.warp_arrays import warp_array
 from ..atmosphere.spline import spline_weights
 from ..pupil_optics import PupilOptics
-from .engine import ExposedStars, PsfEngine, PsfInputs, Stars
+from .engine import ExposedStars, PsfEngine, PsfInputs, PsfRenderer, Stars
 from .inner_rim import clipped_by_apertures, traced_obscuration
 from .pupil_lattice import PupilLattice
 from .sample_packets import LANES, indices, samples
@@ -58,21 +60,52 @@ LARGEST_SPACING_OPTICS = 0.04
 FEWEST_ACROSS = 96
 # Largest transfer function of charge diffusion at longer baselines than those of a grid.
 _NEGLIGIBLE = 1e-4
-# Baselines that are tried for the longest one of a grid.
+# Longest baselines of a grid that are tried.
 _TRIED = 64
 
 
-class WavePsfEngine(PsfEngine):
-    """Fourier optics; each thread computes one star at a time."""
+@check_arguments
+@dataclass(frozen=True)
+class WaveEngine(PsfEngine):
+    """Fourier optics, the slow reference engine.
+
+    Attributes
+    ----------
+    padding : bool, optional
+        Whether all baselines are used, up to the diameter of the pupil. By default they are where there is no
+        atmosphere or next to no charge diffusion.
+    pupil_spacing : float, optional
+        Distance of the pupil points [m], above 0. By default the image repeats itself outside the stamp only, and the
+        distance is at most 0.02 m, or 0.04 m without an atmosphere, and a 96th of the diameter.
+
+    Raises
+    ------
+    DomainError
+        If the distance is not positive.
+    """
 
     name = "wave"
-    depths = 3
-    options = ("padding", "pupil_spacing")
     screens = ("low", "high")
 
-    def __init__(self, inputs: PsfInputs) -> None:
+    padding: bool | None = None
+    pupil_spacing: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.pupil_spacing is not None:
+            require_positive(self.pupil_spacing, "pupil_spacing", "metres")
+
+    def _renderer(self, inputs: PsfInputs) -> WaveRenderer:
+        return WaveRenderer(inputs, self)
+
+
+class WaveRenderer(PsfRenderer):
+    """Renderer of :class:`WaveEngine`; each thread computes one star at a time."""
+
+    depths = 3
+
+    def __init__(self, inputs: PsfInputs, options: WaveEngine) -> None:
         super().__init__(inputs)
-        self._make_pupil_lattice(inputs.padding, inputs.pupil_spacing)
+        self._make_pupil_lattice(options.padding, options.pupil_spacing)
         self._load_screens()
         self._schedule = self._channels.depth_schedule(1 if inputs.atmosphere is None else len(inputs.atmosphere.times))
         self.batch = thread_count(inputs.threads)
@@ -82,8 +115,6 @@ class WavePsfEngine(PsfEngine):
             largest = LARGEST_SPACING_OPTICS if self._atmosphere is None else LARGEST_SPACING
             largest = min(largest, self._diameter / FEWEST_ACROSS)
             spacing = min(largest, float(self._wavelengths.min()) * self.focal_length / self._plane.side)
-        if not (math.isfinite(spacing) and spacing > 0.0):
-            raise DomainError(f"pupil_spacing = {spacing!r}: expected a positive length in metres")
         diameter = self._diameter
         longest = diameter
         if padding is False:
@@ -114,7 +145,8 @@ class WavePsfEngine(PsfEngine):
             self._sides, self._steps = np.ones(2, dtype=np.int64), np.ones(2)
         else:
             self._splines = [
-                atmosphere.screens(scale, self._threads).reshape(atmosphere.layer_count, -1) for scale in self.screens
+                atmosphere.screens(scale, self._threads).reshape(atmosphere.layer_count, -1)
+                for scale in WaveEngine.screens
             ]
             self._sides = np.array([atmosphere.screen_size, atmosphere.fine_size])
             self._steps = self._lattice.spacing / np.array([atmosphere.screen_pixel, atmosphere.fine_pixel])
@@ -182,14 +214,14 @@ class WavePsfEngine(PsfEngine):
         moments = self._screen_places(field)
         for step, time in enumerate(self._schedule.time):
             step_channels = np.ascontiguousarray(self._schedule.channel[:, step, 0])
-            step_inputs = [
+            step_arguments = [
                 *screens,
                 n_layer,
                 self._screen_samples(moments[time]),
                 *before,
                 warp_array(step_channels, wp.int32),
             ]
-            launch(pupil_fields, line, [*step_inputs, *after], threads=1)
+            launch(pupil_fields, line, [*step_arguments, *after], threads=1)
             for wave in range(n_wave):
                 focused = scipy.fft.fft2(fields[wave]).view(np.float32).reshape(-1, LANES)
                 launch(
@@ -197,9 +229,9 @@ class WavePsfEngine(PsfEngine):
                 )
         intensity = np.empty((n_channel, size, size))
         count = len(self._schedule.time) * lit.sum()
-        for channel, channel_weight in enumerate(channels.weight / self._schedule.fraction):
+        for channel, scale in enumerate(channels.weight / self._schedule.fraction):
             parts = squares[channel].numpy().reshape(size, size, 2)
-            intensity[channel] = channel_weight * (parts.sum(axis=-1, dtype=np.float64) / count)
+            intensity[channel] = scale * (parts.sum(axis=-1, dtype=np.float64) / count)
         return intensity
 
     def _rows(self, values: np.ndarray) -> np.ndarray:
@@ -218,18 +250,18 @@ class WavePsfEngine(PsfEngine):
         if atmosphere is None:
             return np.zeros((1, 2, 2))
         corner = atmosphere.pupil_centers(self._direction(field), atmosphere.times) + self._lattice.origin
-        corners = np.stack([corner / atmosphere.screen_pixel, corner / atmosphere.fine_pixel], axis=-2)
-        return corners.reshape(len(atmosphere.times), -1, 2)
+        first_points = np.stack([corner / atmosphere.screen_pixel, corner / atmosphere.fine_pixel], axis=-2)
+        return first_points.reshape(len(atmosphere.times), -1, 2)
 
     def _screen_samples(self, places: np.ndarray) -> Any:
         """Return the samples of the screens around the lattice points at one time, and their weights."""
         sides, steps = np.tile(self._sides, len(places) // 2), np.tile(self._steps, len(places) // 2)
         start = places - sides[:, None] * np.floor(places / sides[:, None])
-        start_pixel = np.floor(start)
-        along = (start - start_pixel)[..., None] + steps[:, None, None] * np.arange(self._packets * LANES)
+        first_sample = np.floor(start)
+        along = (start - first_sample)[..., None] + steps[:, None, None] * np.arange(self._packets * LANES)
         sample = np.floor(along)
         weights = spline_weights((along - sample).astype(np.float32))
-        first = start_pixel.astype(np.int32)
+        first = first_sample.astype(np.int32)
         sample = sample.astype(np.int32)
         # The spline's first tap is one sample before the point.
         column = (first[:, 0] - 1) % sides
@@ -260,7 +292,7 @@ class WavePsfEngine(PsfEngine):
 
     def _sample(self, spectra: np.ndarray, jacobian: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """Return the stamp: the spectra of all wavelengths evaluated at the pixel centres."""
-        side = self._plane.stamp_size
+        side = self._plane.size
         step = np.arange(-self._reach, self._reach + 1)
         x, y = np.meshgrid(self._plane.pixel_centers, self._plane.pixel_centers)
         pixels = np.stack([x, y], axis=-1).reshape(-1, 2) - offset * self._plane.pixel_size

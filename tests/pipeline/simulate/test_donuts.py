@@ -8,7 +8,7 @@ from pachon.core.errors import DomainError
 
 LSST = pachon.load_telescope("lsst_v3.3_r").perturbed("Detector", shift=(0.0, 0.0, 0.3e-3))
 FIELDS = np.deg2rad([(0.2, 0.1), (-0.7, 0.9), (1.0, 1.2)])
-OPTIONS = {"atmosphere": pachon.Atmosphere.from_site("cerro_pachon", seed=1), "stamp_size": 61}
+OPTIONS = {"atmosphere": pachon.Atmosphere.from_site("cerro_pachon", seed=1), "stamps": pachon.Stamps(61)}
 
 
 def draw(**options):
@@ -47,5 +47,5 @@ def test_second_stars_and_cosmic_rays_are_flagged_and_bright():
 
 
 def test_stamps_too_small_for_the_donuts_are_refused():
-    with pytest.raises(DomainError, match=r"stamp_size = 21: .* expected at least 3[0-9] pixels"):
-        pachon.draw_donuts(LSST, FIELDS, [620e-9], atmosphere=OPTIONS["atmosphere"], stamp_size=21)
+    with pytest.raises(DomainError, match=r"size = 21: .* expected at least 3[0-9] pixels"):
+        pachon.draw_donuts(LSST, FIELDS, [620e-9], atmosphere=OPTIONS["atmosphere"], stamps=pachon.Stamps(21))

@@ -18,6 +18,7 @@ from pachon.reconstruction.focal_plane_psf.response import (
 )
 from pachon.wavefront.aberration import ResidualWavefront
 from pachon.wavefront.psf.psf import make_psfs
+from pachon.wavefront.psf.stamps import Stamps
 
 UM = 1e-6
 
@@ -183,7 +184,7 @@ def test_silicon_is_part_of_the_instrument(lsst_r, plane):
         focal_plane=plane,
         atmosphere=thick.atmosphere,
         engine="long_exposure",
-        silicon=Silicon(),
+        stamps=Stamps(silicon=Silicon()),
     ).image
     np.testing.assert_array_equal(images, exact)
     assert (thick.shapes(fields, plane, None) != without.shapes(fields, plane, None)).all()

@@ -121,8 +121,8 @@ def test_dispersion_elongates_the_image_at_45_degrees():
     atmosphere = pachon.Atmosphere.from_site("cerro_pachon", 1, r0=0.12)
     shift = dispersion_shift(wavelengths, wavelengths[2], math.radians(45.0), 0.5 * math.pi, PACHON)
     round_, long_ = (
-        pachon.make_psfs(telescope, [[0.0, 0.0]], wavelengths, atmosphere=atmosphere, engine="long_exposure", **options)
-        for options in ({}, {"dispersion": shift})
+        pachon.make_psfs(telescope, [[0.0, 0.0]], light, atmosphere=atmosphere, engine="long_exposure")
+        for light in (wavelengths, pachon.Light(wavelengths, dispersion=shift))
     )
     assert fwhm(round_.image, round_.pixel_scale)[0] / ARCSEC == pytest.approx(0.7, abs=0.03)
     # The variance of a band spread evenly over so much, against that of a Gaussian of 0.7 arcsec.

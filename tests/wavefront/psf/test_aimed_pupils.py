@@ -24,7 +24,7 @@ def wide():
 )
 def test_every_engine_has_the_light_that_the_apertures_leave(wide, engine):
     spots = pachon.spots(wide, sampling="spiral", n_pupil=4000, threads=1)
-    options = {"engine": engine, "pixel_size": 1e-6, "stamp_size": 41, "threads": 1}
+    options = {"engine": engine, "stamps": pachon.Stamps(41, pixel_size=1e-6), "threads": 1}
     if engine == "long_exposure":
         options["atmosphere"] = pachon.Atmosphere.from_site(
             "cerro_pachon", seed=1, screen_size=512, screen_length=40.0, exposure=0.1

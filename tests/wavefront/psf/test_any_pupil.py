@@ -17,8 +17,9 @@ from pachon.wavefront.psf.engine import PsfInputs, Stars
 from pachon.wavefront.psf.image_plane import ImagePlane
 from pachon.wavefront.psf.lattice_pupil import FEWEST_POINTS, LatticeTransfer
 from pachon.wavefront.psf.long_exposure import LongExposureEngine, default_points
-from pachon.wavefront.psf.mean_rays import MeanRaysEngine
+from pachon.wavefront.psf.mean_rays import MeanRaysRenderer
 from pachon.wavefront.psf.psf import make_psfs
+from pachon.wavefront.psf.stamps import Stamps
 from pachon.wavefront.pupil_optics import trace_pupils
 
 ARCSEC = np.pi / 180 / 3600
@@ -31,9 +32,9 @@ def air(seed=1, **options):
     return pachon.Atmosphere.from_site("cerro_pachon", seed, **({"r0": R0, "outer_scale": OUTER_SCALE} | options))
 
 
-def engine_for(telescope, wavelengths, plane, **options):
-    given = {"atmosphere": air(), "threads": 1} | options
-    return LongExposureEngine(PsfInputs(telescope, np.atleast_1d(wavelengths), plane, **given))
+def renderer_for(telescope, wavelengths, plane, n_pupil=None, threads=1):
+    inputs = PsfInputs(telescope, np.atleast_1d(wavelengths), plane, atmosphere=air(), threads=threads)
+    return LongExposureEngine(n_pupil).renderer(inputs)
 
 
 def brute_force(telescope, field, wavelengths, plane, *, spacing, longest):
@@ -48,7 +49,7 @@ def brute_force(telescope, field, wavelengths, plane, *, spacing, longest):
     inside = np.flatnonzero((radius < 1.0) & (radius >= telescope.pupil_obscuration))
     optics = trace_pupils(telescope, field[None], wavelengths, p[inside])
     step = np.arange(-int(longest / spacing), int(longest / spacing) + 1)
-    image = np.zeros((plane.stamp_size, plane.stamp_size))
+    image = np.zeros((plane.size, plane.size))
     for wave, wavelength in enumerate(wavelengths):
         lit = optics.lit[0, wave]
         pupil = np.zeros(size * size, dtype=complex)
@@ -100,7 +101,7 @@ LSST, COARSE = ImagePlane(31, 10e-6, 4e-6), ImagePlane(37, 15e-6, 5e-6)
 def test_against_brute_force_over_the_pupil(make, field_deg, plane, wavelengths, spacing, longest):
     telescope, field = make(), np.radians(field_deg)
     expected, scale = brute_force(telescope, field, wavelengths, plane, spacing=spacing, longest=longest)
-    stars = engine_for(telescope, wavelengths, plane).render(field[None], np.zeros((1, 2)))
+    stars = renderer_for(telescope, wavelengths, plane).render(field[None], np.zeros((1, 2)))
     (e, size), (e_wave, size_wave) = shape(stars.image[0], scale), shape(expected, scale)
     # Points of the lattices of both, which are lit or dark: 2e-4 for 7500 points of a ring, 8e-5 for 30 000.
     np.testing.assert_allclose(e, e_wave, atol=2e-4)
@@ -123,20 +124,24 @@ def test_a_small_refractor_is_the_closed_product_of_transfer_functions():
     """An open pupil as wide as the Fried parameter, where no baseline is left out."""
     telescope = pachon.load_telescope(REFRACTOR)
     plane = ImagePlane(31, 2.4e-6, 0.5e-6)
-    image = engine_for(telescope, 620e-9, plane).render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
+    image = renderer_for(telescope, 620e-9, plane).render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
     expected = closed_form(plane, 0.1, 0.0, 0.8, 620e-9, R0)
     # Rays that come round after 98 times lambda/D carry 3e-4; the rim of the lattice.
     np.testing.assert_allclose(image, expected, atol=5e-4 * expected.max())
     assert shape(image, 2.4e-6 / 0.8)[1] == pytest.approx(shape(expected, 2.4e-6 / 0.8)[1], rel=5e-4)
     # A run of wave optics without an atmosphere is sharper: turbulence does its share.
-    sharp = make_psfs(telescope, [[0, 0]], 620e-9, engine="wave", pixel_size=2.4e-6, diffusion=5e-7).image[0]
+    sharp = make_psfs(
+        telescope, [[0, 0]], 620e-9, engine="wave", stamps=Stamps(pixel_size=2.4e-6, diffusion=5e-7)
+    ).image[0]
     assert sharp.max() > 1.2 * image.max()
 
 
 def test_weak_turbulence_keeps_long_baselines(polynomial_pupil):
     """A Fried parameter of 2 m leaves 0.1 of a baseline as long as the ring is wide."""
     plane = ImagePlane(61, 2e-6, 0.0)
-    engine = LongExposureEngine(polynomial_pupil().inputs(np.array([620e-9]), plane, atmosphere=air(r0=2.0), threads=1))
+    engine = LongExposureEngine().renderer(
+        polynomial_pupil().inputs(np.array([620e-9]), plane, atmosphere=air(r0=2.0), threads=1)
+    )
     image = engine.render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
     expected = closed_form(plane, 8.36, 0.612, engine.focal_length, 620e-9, 2.0)
     np.testing.assert_allclose(image, expected, atol=2e-3 * expected.max())
@@ -149,11 +154,12 @@ def test_lattice_and_strips_agree(silicon, monkeypatch):
     telescope = defocused("lsst_v3.3_y", 8e-6)
     fields, wavelengths = np.radians([(0.0, 0.0), (0.8, 0.6), (1.3, 1.0)]), np.linspace(*telescope.band, 5)
     dispersion = np.stack([np.linspace(-1e-6, 1e-6, 5), np.zeros(5)], axis=1)
-    given = {"dispersion": dispersion, "jitter": 2e-7, "offsets": [[0.3, 0.2]] * 3, "silicon": silicon}
+    light = pachon.Light(wavelengths, dispersion=dispersion)
+    stamps = Stamps(jitter=2e-7, offsets=[[0.3, 0.2]] * 3, silicon=silicon)
     found = []
     for rings in (engine_module.has_only_annuli, lambda telescope: False):
         monkeypatch.setattr(engine_module, "has_only_annuli", rings)
-        found.append(make_psfs(telescope, fields, wavelengths, atmosphere=air(), engine="long_exposure", **given))
+        found.append(make_psfs(telescope, fields, light, atmosphere=air(), engine="long_exposure", stamps=stamps))
     strips, lattice = found
     np.testing.assert_allclose(lattice.image, strips.image, atol=1.5e-3 * strips.image.max())
     np.testing.assert_allclose(lattice.inside, strips.inside, atol=2e-4)
@@ -169,7 +175,7 @@ def test_bytes_do_not_depend_on_threads_batches_or_company():
     fields, offsets = rng.uniform(-0.008, 0.008, (5, 2)), rng.uniform(-0.5, 0.5, (5, 2))
 
     def images(select, threads):
-        engine = engine_for(telescope, [750e-9, 790e-9], COARSE, threads=threads, n_pupil=1000)
+        engine = renderer_for(telescope, [750e-9, 790e-9], COARSE, threads=threads, n_pupil=1000)
         return engine.render(fields[select], offsets[select]).image
 
     everything = images(slice(None), 1)
@@ -196,7 +202,7 @@ def test_vanes_and_solids_are_served(lsst_r):
 def test_donuts_of_a_telescope_with_vanes():
     """Out of focus the points are as close as the donut needs, and its image is that of brute force."""
     telescope, plane = defocused("hsc", 0.5e-3), ImagePlane(51, 15e-6, 5e-6)
-    engine = engine_for(telescope, 770e-9, plane)
+    engine = renderer_for(telescope, 770e-9, plane)
     field = np.radians([[0.3, 0.2]])
     assert engine._lattice.refinement(engine._lattice_rays(engine._lattice, Stars(field, np.zeros((1, 2))))) == [2]
     image = engine.render(field, np.zeros((1, 2))).image[0]
@@ -204,7 +210,7 @@ def test_donuts_of_a_telescope_with_vanes():
     np.testing.assert_allclose(image, expected, atol=2e-3 * expected.max())
     # Dense rays under one filter, which stars still farther out are left to, lose 4 % of the peak along the rims.
     inputs = PsfInputs(telescope, np.array([770e-9]), plane, atmosphere=air(), threads=1)
-    rays = MeanRaysEngine(inputs, 1 << 14).expose_without_refinement(Stars(field, np.zeros((1, 2)))).draw(None)[0]
+    rays = MeanRaysRenderer(inputs, 1 << 14).expose_without_refinement(Stars(field, np.zeros((1, 2)))).draw(None)[0]
     np.testing.assert_allclose(image, rays, atol=0.05 * rays.max())
     assert image.sum() == pytest.approx(rays.sum(), rel=2e-3)
 
@@ -219,7 +225,7 @@ def test_dark_stars_and_points_asked_for(lsst_r):
     hsc = pachon.load_telescope("hsc")
     assert (default_points(lsst_r), default_points(hsc)) == (80, 30000)
     with pytest.raises(pachon.PachonError, match=f"n_pupil = 80: expected .*{FEWEST_POINTS}"):
-        engine_for(hsc, 770e-9, COARSE, n_pupil=80)
+        renderer_for(hsc, 770e-9, COARSE, n_pupil=80)
 
 
 def test_points_of_the_lattice_fill_the_ring():

@@ -1,5 +1,7 @@
 """Donuts by the PSF engines: against a histogram of random rays, against each other, and stamps that are too small."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.fft
@@ -10,6 +12,7 @@ from pachon.raytrace.rays import RayStatus
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.turbulence import coherence, diffraction_otf, structure_function
 from pachon.wavefront.psf.psf import make_psfs
+from pachon.wavefront.psf.stamps import Stamps
 
 LSST = pachon.load_telescope("lsst_v3.3_r")
 WAVE = 620e-9
@@ -72,7 +75,7 @@ def test_long_exposure_donuts_are_random_rays_under_the_mean_atmosphere():
     n_ray = 500_000
     telescope = defocused(0.6e-3)
     expected = brute_force(telescope, CORNER, 81, n_ray, blur)
-    psf = make_psfs(telescope, [CORNER], [WAVE], atmosphere=air(WIDE), engine="long_exposure", stamp_size=81)
+    psf = make_psfs(telescope, [CORNER], [WAVE], atmosphere=air(WIDE), engine="long_exposure", stamps=Stamps(81))
     # Noise: 5e5 rays on 1300 pixels, averaged over the 28 pixels of the blur, make 1 %.
     assert difference(psf.image[0], expected) < 0.014
     assert psf.inside[0] > 0.99
@@ -88,7 +91,7 @@ def test_fast_donuts_without_air_are_random_rays():
         return diffraction_otf(baseline, LSST.pupil_diameter, LSST.pupil_obscuration) * np.exp(-0.5 * (charge * k) ** 2)
 
     expected = brute_force(telescope, CORNER, 81, 500_000, smooth)
-    psf = make_psfs(telescope, [CORNER], [WAVE], stamp_size=81, diffusion=charge)
+    psf = make_psfs(telescope, [CORNER], [WAVE], stamps=Stamps(81, diffusion=charge))
     # The noise of the random rays is 1 % as above.
     assert difference(psf.image[0], expected) < 0.014
 
@@ -96,7 +99,7 @@ def test_fast_donuts_without_air_are_random_rays():
 @pytest.mark.long
 def test_geometric_donuts_are_those_of_wave_optics_within_the_fringes_of_the_rims():
     telescope = defocused(0.3e-3)
-    common = {"stamp_size": 41, "diffusion": 15e-6}
+    common = {"stamps": Stamps(41, diffusion=15e-6)}
     fast = make_psfs(telescope, [CORNER], [WAVE], **common).image[0]
     wave = make_psfs(telescope, [CORNER], [WAVE], engine="wave", **common).image[0]
     # Fresnel fringes at the rims, sqrt(wavelength x defocus) = 14 um wide, are what is left: a mirrored or moved donut
@@ -109,7 +112,7 @@ def test_geometric_donuts_are_those_of_wave_optics_within_the_fringes_of_the_rim
 @pytest.mark.long
 def test_fast_donuts_average_to_the_long_exposure():
     telescope = defocused(0.5e-3)
-    long = make_psfs(telescope, [CORNER], [WAVE], atmosphere=air(), engine="long_exposure", stamp_size=71).image[0]
+    long = make_psfs(telescope, [CORNER], [WAVE], atmosphere=air(), engine="long_exposure", stamps=Stamps(71)).image[0]
     mean = np.zeros_like(long)
     screens = {
         "screen_size": 1024,
@@ -120,7 +123,7 @@ def test_fast_donuts_average_to_the_long_exposure():
     }
     for epoch in range(2):
         exposure = air(epoch=epoch, **screens)
-        mean += make_psfs(telescope, [CORNER], [WAVE], atmosphere=exposure, stamp_size=71).image[0] / 2
+        mean += make_psfs(telescope, [CORNER], [WAVE], atmosphere=exposure, stamps=Stamps(71)).image[0] / 2
     # Each exposure differs by some 5 %; with dots in place of a donut it were 40.
     assert difference(mean, long) < 0.07
 
@@ -130,8 +133,9 @@ def test_fast_donuts_average_to_the_long_exposure():
 def test_stars_do_not_depend_on_donuts_beside_them(engine):
     heights = pachon.FocalPlane.flat("lsst").with_moved("R22_S11", dz=0.4e-3)
     fields = pachon.fields_at(LSST, [(0.0, 0.0), (0.05, 0.0)])
-    options = {"focal_plane": heights, "stamp_size": 61, "engine": engine, "pixel_size": PIXEL}
-    options |= {"oversampling": 2} if engine == "fast" else {"atmosphere": air()}
+    stamps = Stamps(61, pixel_size=PIXEL)
+    options = {"focal_plane": heights, "stamps": stamps, "engine": engine}
+    options |= {"engine": pachon.FastEngine(oversampling=2)} if engine == "fast" else {"atmosphere": air()}
     together = make_psfs(LSST, fields, [WAVE], **options)
     for i, field in enumerate(fields):
         alone = make_psfs(LSST, [field], [WAVE], **options)
@@ -139,7 +143,8 @@ def test_stars_do_not_depend_on_donuts_beside_them(engine):
         assert alone.reference_point[0].tobytes() == together.reference_point[i].tobytes()
     peaks = together.image.max(axis=(1, 2))
     assert peaks[1] > 5.0 * peaks[0]
-    recentred = make_psfs(LSST, fields, [WAVE], recenter=lambda im, scale: np.full((len(im), 2), 2.0), **options)
+    options["stamps"] = replace(stamps, recenter=lambda im, scale: np.full((len(im), 2), 2.0))
+    recentred = make_psfs(LSST, fields, [WAVE], **options)
     # Moved by two whole pixels; what leaves the stamp or comes in at its rim is faint.
     assert recentred.image[:, 5:-5, 5:-5] == pytest.approx(together.image[:, 7:-3, 7:-3], abs=2e-3 * float(peaks.min()))
 
@@ -148,7 +153,7 @@ def test_stars_do_not_depend_on_donuts_beside_them(engine):
 def test_spiders_shade_long_exposure_donuts():
     obstructed = defocused(0.6e-3, pachon.load_telescope("lsst_v3.3_r_obstructed"))
     expected = brute_force(obstructed, CORNER, 81, 500_000, blur)
-    options = {"atmosphere": air(WIDE), "engine": "long_exposure", "stamp_size": 81}
+    options = {"atmosphere": air(WIDE), "engine": "long_exposure", "stamps": Stamps(81)}
     image = make_psfs(obstructed, [CORNER], [WAVE], **options).image[0]
     without = make_psfs(defocused(0.6e-3), [CORNER], [WAVE], **options).image[0]
     assert difference(image, expected) < 0.014
@@ -158,7 +163,5 @@ def test_spiders_shade_long_exposure_donuts():
 @pytest.mark.parametrize("engine", ["fast", "wave", "long_exposure"])
 def test_stamps_that_cut_the_light_off_are_refused(engine):
     options = {"atmosphere": air()} if engine == "long_exposure" else {}
-    with pytest.raises(
-        DomainError, match=r"stamp_size = 31: .* of the light of the star at field .* at least 15[13] p"
-    ):
+    with pytest.raises(DomainError, match=r"size = 31: .* of the light of the star at field .* at least 15[13] p"):
         make_psfs(defocused(1.5e-3), [(0.0, 0.01)], [WAVE], engine=engine, **options)

@@ -19,12 +19,13 @@ from pachon.wavefront.atmosphere.turbulence import (
 )
 from pachon.wavefront.psf.engine import PsfInputs
 from pachon.wavefront.psf.fast import (
-    FastPsfEngine,
+    FastEngine,
     filter_structure_function,
 )
 from pachon.wavefront.psf.image_plane import ImagePlane
 from pachon.wavefront.psf.psf import make_psfs
 from pachon.wavefront.psf.pupil_lattice import PupilLattice
+from pachon.wavefront.psf.stamps import Stamps
 
 FOCAL_LENGTH = 10.31
 PLANE = ImagePlane(31, 10e-6, 4e-6)
@@ -43,7 +44,7 @@ def high_structure_function(b, r0, outer_scale, cutoff):
 
 def center_of(image, plane=PLANE):
     """Centroid of a stamp under a Gaussian weight of 5 pixels rms, iterated, from the middle pixel [pixels]."""
-    grid = np.arange(plane.stamp_size) - plane.middle
+    grid = np.arange(plane.size) - plane.middle
     x, y = np.meshgrid(grid, grid)
     center = np.zeros(2)
     for _ in range(60):
@@ -119,7 +120,7 @@ def test_rays_through_the_layers_against_plain_numpy(polynomial_pupil, seed):
     )
     fields = np.array([[0.01, -0.02], [0.0, 0.0], [-0.015, 0.005]])
     wavelengths = np.array([550e-9, 700e-9])
-    engine = FastPsfEngine(optics.inputs(wavelengths, PLANE, atmosphere=atmosphere, n_pupil=334))
+    engine = FastEngine(n_pupil=334).renderer(optics.inputs(wavelengths, PLANE, atmosphere=atmosphere))
     images = engine.render(fields, np.zeros((3, 2))).image
 
     lattice = PupilLattice.fill(8.36, 0.612, 2 * 0.16)
@@ -172,7 +173,7 @@ def hankel_image(otf, wavelength, plane, shift=(0.0, 0.0)):
 
 def test_perfect_optics_give_the_airy_pattern_of_the_annulus(polynomial_pupil):
     telescope = polynomial_pupil()
-    engine = FastPsfEngine(telescope.inputs(ONE_WAVE, PLANE, threads=1, oversampling=32))
+    engine = FastEngine(oversampling=32).renderer(telescope.inputs(ONE_WAVE, PLANE, threads=1))
     image = engine.render(np.zeros((1, 2)), np.array([[0.3, -0.2]])).image[0]
     expected = hankel_image(lambda b: diffraction_otf(b, 8.36, 0.612), 620e-9, PLANE, (3e-6, -2e-6))
     # All rays share one cell of 0.3 um, as whose mean they count: -h^2 / 12 of 24 um^2 of variance. Both images repeat
@@ -187,7 +188,7 @@ def test_strong_seeing_gives_the_long_exposure_within_one_star(polynomial_pupil)
     atmosphere = Atmosphere.from_site(
         "cerro_pachon", 4, exposure=2.0, time_step=0.5, cutoff=0.7, outer_scale=5.0, screen_size=128, screen_length=64.0
     )
-    engine = FastPsfEngine(telescope.inputs(ONE_WAVE, PLANE, atmosphere=atmosphere, threads=1))
+    engine = FastEngine().renderer(telescope.inputs(ONE_WAVE, PLANE, atmosphere=atmosphere, threads=1))
     image = engine.render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
 
     def otf(b):
@@ -210,8 +211,8 @@ def test_tilt_dispersion_and_offset_move_the_image(polynomial_pupil, tilt):
     offset = np.array([[0.25, -0.4]])
     dispersion = np.array([[1e-6, -2e-6]])
     for wave in range(3):
-        engine = FastPsfEngine(
-            telescope.inputs(wavelengths[wave : wave + 1], PLANE, dispersion=dispersion, threads=1, oversampling=32)
+        engine = FastEngine(oversampling=32).renderer(
+            telescope.inputs(wavelengths[wave : wave + 1], PLANE, dispersion=dispersion, threads=1)
         )
         image = engine.render(np.zeros((1, 2)), offset).image[0]
         expected = offset[0] + jacobian @ (np.array(tilt) + dispersion[0]) / 10e-6
@@ -223,9 +224,10 @@ def test_wavelengths_add_up_by_their_light_and_shift(polynomial_pupil):
     telescope = polynomial_pupil()
     wavelengths = np.array([500e-9, 700e-9])
     dispersion = np.array([[4e-6, 0.0], [-4e-6, 1e-6]])
-    both = FastPsfEngine(telescope.inputs(wavelengths, PLANE, dispersion=dispersion, threads=1))
+    both = FastEngine().renderer(telescope.inputs(wavelengths, PLANE, dispersion=dispersion, threads=1))
     parts = [
-        FastPsfEngine(telescope.inputs(wavelengths[[w]], PLANE, dispersion=dispersion[[w]], threads=1)) for w in (0, 1)
+        FastEngine().renderer(telescope.inputs(wavelengths[[w]], PLANE, dispersion=dispersion[[w]], threads=1))
+        for w in (0, 1)
     ]
     star = np.zeros((1, 2)), np.zeros((1, 2))
     expected = 0.5 * sum(part.render(*star).image for part in parts)
@@ -236,7 +238,7 @@ def test_wavelengths_add_up_by_their_light_and_shift(polynomial_pupil):
 def test_layers_bend_light_by_their_gradient_where_it_crosses_them(polynomial_pupil, single_modes):
     jacobian = np.array([[10.3, 0.5], [-0.4, 10.6]])
     telescope = polynomial_pupil(jacobian=jacobian)
-    engine = FastPsfEngine(telescope.inputs(ONE_WAVE, PLANE, atmosphere=single_modes, threads=1, oversampling=16))
+    engine = FastEngine(oversampling=16).renderer(telescope.inputs(ONE_WAVE, PLANE, atmosphere=single_modes, threads=1))
     pupil = PupilLattice.fill(8.36, 0.612, 0.32).points
     for field in np.array([[0.0, 0.0], [0.03, 0.0], [0.0, -0.025], [-0.02, 0.03]]):
         image = engine.render(field[None], np.zeros((1, 2))).image[0]
@@ -282,7 +284,7 @@ def test_mean_of_many_exposures_has_the_long_exposure_width(polynomial_pupil, cu
             wind_speeds=[10.0] * 6,
             fine_size=512,
         )
-        engine = FastPsfEngine(telescope.inputs(ONE_WAVE, plane, atmosphere=atmosphere, threads=1))
+        engine = FastEngine().renderer(telescope.inputs(ONE_WAVE, plane, atmosphere=atmosphere, threads=1))
         total += engine.render(fields, np.zeros((6, 2))).image.sum(axis=0)
     pixel = plane.pixel_size / FOCAL_LENGTH
     theory = hankel_image(
@@ -308,7 +310,7 @@ def test_bytes_do_not_depend_on_threads_batches_or_company(lsst_r):
     wavelengths = np.array([550e-9, 620e-9, 690e-9])
 
     def images(select, threads):
-        engine = FastPsfEngine(
+        engine = FastEngine().renderer(
             PsfInputs(lsst_r, wavelengths, PLANE, dispersion=np.zeros((3, 2)), atmosphere=atmosphere, threads=threads)
         )
         return engine.render(fields[select], offsets[select]).image
@@ -322,7 +324,9 @@ def test_bytes_do_not_depend_on_threads_batches_or_company(lsst_r):
 @pytest.mark.parametrize("n_pupil", [12, 334])
 def test_no_light_of_a_vignetted_star_is_lost_or_won(lsst_r, n_pupil):
     fields = np.radians([[0.0, 0.0], [1.2, 1.2], [-1.0, 1.4]])
-    psfs = make_psfs(lsst_r, fields, ONE_WAVE, n_pupil=n_pupil, stamp_size=41, pixel_size=5e-6, threads=2)
+    psfs = make_psfs(
+        lsst_r, fields, ONE_WAVE, threads=2, engine=FastEngine(n_pupil=n_pupil), stamps=Stamps(41, pixel_size=5e-6)
+    )
     assert np.all(psfs.lit_fraction[1:] < 0.96)
     # All rays land on the stamp, so what it misses are the wings of the diffraction filter, the same for every star up
     # to the scale of the plate, which changes by less than 1 %.
@@ -334,7 +338,7 @@ def test_no_light_of_a_vignetted_star_is_lost_or_won(lsst_r, n_pupil):
 def test_batches_shrink_with_the_stamp(polynomial_pupil):
     telescope = polynomial_pupil()
     batches = [
-        FastPsfEngine(telescope.inputs(ONE_WAVE, ImagePlane(size, 1e-5, 4e-6), oversampling=1)).batch
+        FastEngine(oversampling=1).renderer(telescope.inputs(ONE_WAVE, ImagePlane(size, 1e-5, 4e-6))).batch
         for size in (31, 601, 2501)
     ]
     assert batches[0] > batches[1] > batches[2] == 1
@@ -344,15 +348,15 @@ def test_batches_shrink_with_the_stamp(polynomial_pupil):
     ("options", "named"),
     [({"n_pupil": 3}, "n_pupil"), ({"oversampling": 0}, "oversampling"), ({"oversampling": 2.5}, "oversampling")],
 )
-def test_refuses_bad_sampling(polynomial_pupil, options, named):
+def test_refuses_bad_sampling(options, named):
     with pytest.raises(DomainError, match=named):
-        FastPsfEngine(polynomial_pupil().inputs(ONE_WAVE, PLANE, **options))
+        FastEngine(**options)
 
 
 def test_refuses_screens_narrower_than_the_pupil(polynomial_pupil):
     atmosphere = Atmosphere.from_site("cerro_pachon", 5, screen_size=64, screen_length=8.0, exposure=0.1)
     with pytest.raises(DomainError, match="wider than the pupil"):
-        FastPsfEngine(polynomial_pupil().inputs(ONE_WAVE, PLANE, atmosphere=atmosphere))
+        FastEngine().renderer(polynomial_pupil().inputs(ONE_WAVE, PLANE, atmosphere=atmosphere))
 
 
 def test_screens_too_coarse_for_a_small_pupil_are_refused():
@@ -375,9 +379,9 @@ def test_rows_of_the_screens_that_no_light_crosses_do_not_matter(n_pupil):
             rows = air.rows_under(np.column_stack([fields, -np.ones(3)]), 0.5 * telescope.pupil_diameter + 0.2)
             assert rows.mean() < 0.3
             screens = air.screens("slopes", None, rows)
-            screens.base[~air._cache["slopes: rows"]] = 0x7FFF7FFF
+            screens.base[~air.store.made_rows("slopes")] = 0x7FFF7FFF
         else:
             air.screens("slopes")
-        return make_psfs(telescope, fields, 620e-9, atmosphere=air, n_pupil=n_pupil)
+        return make_psfs(telescope, fields, 620e-9, atmosphere=air, engine=FastEngine(n_pupil=n_pupil))
 
     assert psfs(spoil=True).image.tobytes() == psfs(spoil=False).image.tobytes()

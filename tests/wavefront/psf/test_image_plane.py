@@ -9,6 +9,7 @@ from pachon.core.errors import DomainError
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.psf.image_plane import ImagePlane, focal_length, square_transfer
 from pachon.wavefront.psf.psf import make_psfs
+from pachon.wavefront.psf.stamps import Stamps
 
 ARCSEC = np.pi / 180 / 3600
 
@@ -62,10 +63,10 @@ def test_jitter_adds_to_the_variance_of_an_image(lsst_r, engine):
         "cerro_pachon", 4, exposure=0.2, screen_size=256, screen_length=40.96, fine_size=1024, fine_pixel=0.02
     )
     sigma = 0.3
-    options = {"atmosphere": atmosphere, "engine": engine, "stamp_size": 63, "threads": 2}
+    options = {"atmosphere": atmosphere, "engine": engine, "threads": 2}
     variance = []
     for jitter in (0.0, sigma * u.arcsec):
-        psf = make_psfs(lsst_r, [[0.01, 0.005]], [620e-9], jitter=jitter, **options)
+        psf = make_psfs(lsst_r, [[0.01, 0.005]], [620e-9], stamps=Stamps(63, jitter=jitter), **options)
         image, place = psf.image[0].astype(float), (np.arange(63) - 31) * psf.pixel_scale / ARCSEC
         x, y = np.meshgrid(place, place)
         x, y = (v - np.average(v, weights=image) for v in (x, y))
@@ -77,16 +78,16 @@ def test_jitter_adds_to_the_variance_of_an_image(lsst_r, engine):
 @pytest.mark.parametrize(
     ("jitter", "named"), [(-1e-7, "jitter = -1e-07"), (np.nan, "jitter = nan"), (1 * u.m, "jitter"), ([0, 0], "jitter")]
 )
-def test_bad_jitter_is_named(lsst_r, jitter, named):
+def test_bad_jitter_is_named(jitter, named):
     with pytest.raises(DomainError, match=named):
-        make_psfs(lsst_r, [[0.0, 0.0]], [620e-9], jitter=jitter)
+        Stamps(jitter=jitter)
 
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ((2, 1e-5, 0.0), "stamp_size"),
-        ((9.5, 1e-5, 0.0), "stamp_size"),
+        ((2, 1e-5, 0.0), "size"),
+        ((9.5, 1e-5, 0.0), "size"),
         ((9, 0.0, 0.0), "pixel_size"),
         ((9, np.nan, 0.0), "pixel_size"),
         ((9, 1e-5, -1e-6), "diffusion"),

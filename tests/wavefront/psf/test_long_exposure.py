@@ -1,6 +1,7 @@
 """The long-exposure engine: against brute force over the pupil, closed forms and the mean of the fast engine."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -20,11 +21,12 @@ from pachon.wavefront.atmosphere.turbulence import diffraction_otf, long_exposur
 from pachon.wavefront.chief_rays import fields_at
 from pachon.wavefront.psf.clear_pupil import SpokePupil, clear_edges
 from pachon.wavefront.psf.engine import PsfInputs
-from pachon.wavefront.psf.fast import FastPsfEngine
+from pachon.wavefront.psf.fast import FastEngine
 from pachon.wavefront.psf.image_plane import ImagePlane
 from pachon.wavefront.psf.long_exposure import PUPIL_POINTS, LongExposureEngine
 from pachon.wavefront.psf.psf import DARK, make_psfs
 from pachon.wavefront.psf.pupil_lattice import PupilLattice
+from pachon.wavefront.psf.stamps import Stamps
 from pachon.wavefront.pupil_optics import trace_pupils
 
 FOCAL_LENGTH = 10.31
@@ -37,11 +39,10 @@ def air(seed=1, **options):
     return Atmosphere.from_site("cerro_pachon", seed, **({"r0": R0, "outer_scale": OUTER_SCALE} | options))
 
 
-def engine_for(telescope, wavelengths=ONE_WAVE, plane=PLANE, **options):
+def renderer_for(telescope, wavelengths=ONE_WAVE, plane=PLANE, n_pupil=None, **options):
     options = {"atmosphere": air(), "threads": 1} | options
-    if isinstance(telescope, pachon.Telescope):
-        return LongExposureEngine(PsfInputs(telescope, wavelengths, plane, **options))
-    return LongExposureEngine(telescope.inputs(wavelengths, plane, **options))
+    make = partial(PsfInputs, telescope) if isinstance(telescope, pachon.Telescope) else telescope.inputs
+    return LongExposureEngine(n_pupil).renderer(make(wavelengths, plane, **options))
 
 
 def moments(image):
@@ -123,7 +124,7 @@ def test_against_brute_force_over_the_pupil(lsst_r, field_deg, defocus, residual
     field = np.radians(field_deg)
     aberration = ResidualWavefront.draw(telescope, residual, seed=2) if residual else None
     expected, _ = brute_force(telescope, field, 620e-9, aberration=aberration)
-    stars = engine_for(telescope, aberration=aberration).render(field[None], np.zeros((1, 2)))
+    stars = renderer_for(telescope, aberration=aberration).render(field[None], np.zeros((1, 2)))
     (e, size, center), (e_wave, size_wave, center_wave) = moments(stars.image[0]), moments(expected)
     np.testing.assert_allclose(e, e_wave, atol=shape)
     assert size == pytest.approx(size_wave, rel=3e-4)
@@ -153,7 +154,7 @@ def test_perfect_optics_give_the_long_exposure_in_closed_form(polynomial_pupil):
     # Sixteen spokes for the rim, whose piece across a baseline goes as |cos|, leave 3e-5; many spokes leave what is
     # wrong for these small pixels with frequencies beyond that of 1e-5 left out.
     for n_pupil, allowed in ((None, 5e-5), (2000, 2e-5)):
-        image = engine_for(telescope, plane=plane, n_pupil=n_pupil).render(*star).image[0]
+        image = renderer_for(telescope, plane=plane, n_pupil=n_pupil).render(*star).image[0]
         np.testing.assert_allclose(image, expected, atol=allowed * expected.max())
     # The wings of an image that does not come round so soon are fainter, by up to 3e-4 of the peak in the corners.
     np.testing.assert_allclose(image, theory(plane, shift=shift, margin=4.0), atol=4e-4 * expected.max())
@@ -161,7 +162,7 @@ def test_perfect_optics_give_the_long_exposure_in_closed_form(polynomial_pupil):
 
 def test_width_of_perfect_optics(polynomial_pupil):
     plane = ImagePlane(121, 2.5e-6, 0.0)
-    image = engine_for(polynomial_pupil(), plane=plane).render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
+    image = renderer_for(polynomial_pupil(), plane=plane).render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
     falling = image[60, 60:100]
     width = 2 * np.interp(-0.5 * image.max(), -falling, np.arange(40)) * 2.5e-6 / FOCAL_LENGTH
     expected = long_exposure_fwhm(620e-9, R0, OUTER_SCALE, diameter=8.36, obscuration=0.612)
@@ -175,7 +176,7 @@ def test_defocus_and_coma_against_brute_force_over_a_circle(polynomial_pupil, ri
     inner, outer = 4.18 * 0.612 + rim, 4.18 - 2 * rim
     jacobian = np.array([[10.3, 0.9], [-0.5, 10.8]])
     telescope = polynomial_pupil(clear=(inner, outer), defocus=1.5e-6, coma=0.6e-6, jacobian=jacobian)
-    stars = engine_for(telescope).render(np.array([[0.01, 0.0]]), np.zeros((1, 2)))
+    stars = renderer_for(telescope).render(np.array([[0.01, 0.0]]), np.zeros((1, 2)))
     assert stars.lit_fraction[0, 0] == pytest.approx((outer**2 - inner**2) / (4.18**2 * (1 - 0.612**2)), rel=1e-12)
 
     spacing, reach, wavenumber = 0.0125, 60, 2 * np.pi / 620e-9
@@ -208,7 +209,7 @@ def test_defocus_and_coma_against_brute_force_over_a_circle(polynomial_pupil, ri
 
 
 def test_an_image_on_the_axis_is_round(lsst_r):
-    image = engine_for(lsst_r).render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
+    image = renderer_for(lsst_r).render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
     for turned in (image.T, image[::-1], image[:, ::-1]):
         # Landing points and sums in single precision.
         np.testing.assert_allclose(turned, image, atol=2e-6 * image.max())
@@ -223,9 +224,9 @@ def test_mean_of_many_exposures_of_the_fast_engine(polynomial_pupil):
     total = np.zeros((31, 31))
     for seed in range(8):
         atmosphere = air(seed, exposure=15.0, time_step=0.15, cutoff=6.25, screen_size=2048, screen_length=327.68)
-        fast = FastPsfEngine(telescope.inputs(ONE_WAVE, PLANE, atmosphere=atmosphere))
+        fast = FastEngine().renderer(telescope.inputs(ONE_WAVE, PLANE, atmosphere=atmosphere))
         total += fast.render(fields, np.zeros((6, 2))).image.sum(axis=0)
-    image = engine_for(telescope).render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
+    image = renderer_for(telescope).render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
     (e, size, center), (e_mean, size_mean, center_mean) = moments(image), moments(total)
     # The mean over eight exposures has a noise of 0.5 % in width and of 2e-3 in e; the fast engine leaves diffraction
     # the same for all rays, 0.5 %.
@@ -240,7 +241,7 @@ def test_bytes_do_not_depend_on_threads_batches_or_company(lsst_r):
     wavelengths = np.array([550e-9, 620e-9, 690e-9])
 
     def images(select, threads):
-        return engine_for(lsst_r, wavelengths, threads=threads).render(fields[select], offsets[select]).image
+        return renderer_for(lsst_r, wavelengths, threads=threads).render(fields[select], offsets[select]).image
 
     everything = images(slice(None), 1)
     np.testing.assert_array_equal(images(slice(None), 3), everything)
@@ -263,7 +264,7 @@ def test_no_random_numbers_and_no_screens(lsst_r, monkeypatch):
 
 
 def test_offset_moves_the_image(lsst_r):
-    engine = engine_for(lsst_r)
+    engine = renderer_for(lsst_r)
     field = np.array([[0.012, -0.02]])
     image = engine.render(field, np.zeros((1, 2))).image[0]
     moved = engine.render(field, np.array([[2.0, -3.0]])).image[0]
@@ -275,7 +276,7 @@ def test_offset_moves_the_image(lsst_r):
 
 
 def test_recentred_star_is_drawn_elsewhere(lsst_r):
-    engine = engine_for(lsst_r)
+    engine = renderer_for(lsst_r)
     fields, offsets = np.array([[0.012, -0.02], [0.0, 0.01]]), np.array([[0.1, 0.2], [0.3, -0.4]])
     shift = np.array([[0.5, -0.25], [0.125, 0.75]])
     given = []
@@ -290,9 +291,9 @@ def test_tilt_and_dispersion_move_the_image(polynomial_pupil, tilt):
     jacobian = np.array([[10.3, 0.5], [-0.4, 10.6]])
     dispersion = np.array([[1e-6, -2e-6]])
     star = np.zeros((1, 2)), np.array([[0.25, -0.4]])
-    moved = engine_for(polynomial_pupil(tilt=tilt, jacobian=jacobian), dispersion=dispersion).render(*star).image
+    moved = renderer_for(polynomial_pupil(tilt=tilt, jacobian=jacobian), dispersion=dispersion).render(*star).image
     shift = (jacobian @ (np.array(tilt) + dispersion[0]))[None] / 10e-6
-    plain = engine_for(polynomial_pupil(jacobian=jacobian)).render(star[0], star[1] + shift).image
+    plain = renderer_for(polynomial_pupil(jacobian=jacobian)).render(star[0], star[1] + shift).image
     np.testing.assert_allclose(moved, plain, atol=2e-6 * plain.max())
 
 
@@ -300,12 +301,13 @@ def test_wavelengths_add_up(lsst_r):
     wavelengths = np.array([550e-9, 620e-9, 690e-9])
     star = np.array([[0.015, 0.02]]), np.zeros((1, 2))
     dispersion = np.array([[4e-6, 0.0], [0.0, 0.0], [-4e-6, 1e-6]])
-    image = engine_for(lsst_r, wavelengths, dispersion=dispersion).render(*star).image
+    image = renderer_for(lsst_r, wavelengths, dispersion=dispersion).render(*star).image
     # Reference points and rims belong to the middle wavelength, so it goes along with each of the others.
     parts = [
-        engine_for(lsst_r, wavelengths[[w, 1, 1]], dispersion=dispersion[[w, 1, 1]]).render(*star).image for w in (0, 2)
+        renderer_for(lsst_r, wavelengths[[w, 1, 1]], dispersion=dispersion[[w, 1, 1]]).render(*star).image
+        for w in (0, 2)
     ]
-    middle = engine_for(lsst_r, wavelengths[[1]]).render(*star).image
+    middle = renderer_for(lsst_r, wavelengths[[1]]).render(*star).image
     # Single precision, and frequencies that reach a little farther at one wavelength than at another (1e-5).
     np.testing.assert_allclose(image, sum(parts) - middle, atol=1e-5 * image.max())
 
@@ -344,7 +346,7 @@ def test_edges_are_where_the_trace_vignettes(lsst_r, perturbation):
 
 def test_a_vignetted_star(lsst_r):
     field = np.radians([[1.05, 1.4]])
-    stars = engine_for(lsst_r).render(field, np.zeros((1, 2)))
+    stars = renderer_for(lsst_r).render(field, np.zeros((1, 2)))
     _, area = brute_force(lsst_r, field[0], 620e-9)
     assert stars.lit_fraction.shape == (1, 1)
     # Sixteen spokes, against a lattice: its rim is cut along its cells.
@@ -355,7 +357,13 @@ def test_a_vignetted_star(lsst_r):
 def test_a_dark_star(lsst_r):
     limit = 0.9 * lsst_r.field_limit
     psfs = make_psfs(
-        lsst_r, [[limit, 0.0], [0.0, 0.0]], ONE_WAVE, stamp_size=9, engine="long_exposure", atmosphere=air(), threads=1
+        lsst_r,
+        [[limit, 0.0], [0.0, 0.0]],
+        ONE_WAVE,
+        atmosphere=air(),
+        threads=1,
+        engine="long_exposure",
+        stamps=Stamps(9),
     )
     assert psfs.lit_fraction[0].max() == 0.0
     assert psfs.flags.tolist() == [DARK, 0]
@@ -369,7 +377,7 @@ def test_shape_moves_smoothly_with_the_telescope(lsst_r):
     e = []
     for step in range(7):
         telescope = lsst_r.perturbed("Camera", shift=(1e-4 * step, 0.0, 0.0))
-        e.append(moments(engine_for(telescope).render(field, np.zeros((1, 2))).image[0])[0])
+        e.append(moments(renderer_for(telescope).render(field, np.zeros((1, 2))).image[0])[0])
     e = np.array(e)
     assert np.abs(np.diff(e, axis=0)).max() > 5e-4
     # The rims themselves have corners, where one aperture takes over from another.
@@ -394,7 +402,7 @@ def test_needs_turbulence(lsst_r):
     with pytest.raises(ConfigError, match="engine = 'long_exposure': expected an atmosphere"):
         make_psfs(lsst_r, [[0.0, 0.0]], ONE_WAVE, engine="long_exposure")
     with pytest.raises(DomainError, match="n_pupil = 5"):
-        engine_for(lsst_r, n_pupil=5)
+        renderer_for(lsst_r, n_pupil=5)
 
 
 def test_in_a_run():
@@ -407,8 +415,8 @@ def test_in_a_run():
 
 def test_large_stamps(lsst_r):
     star = np.array([[0.01, 0.015]]), np.zeros((1, 2))
-    large = engine_for(lsst_r, plane=ImagePlane(101, 10e-6, 4e-6)).render(*star).image[0]
-    small = engine_for(lsst_r).render(*star).image[0]
+    large = renderer_for(lsst_r, plane=ImagePlane(101, 10e-6, 4e-6)).render(*star).image[0]
+    small = renderer_for(lsst_r).render(*star).image[0]
     # The wings of the small stamp come round (GRID_MARGIN).
     np.testing.assert_allclose(large[35:66, 35:66], small, atol=3e-3 * small.max())
     np.testing.assert_allclose(large[40:61, 40:61], small[5:26, 5:26], atol=3e-4 * small.max())
@@ -417,8 +425,8 @@ def test_large_stamps(lsst_r):
 def test_even_stamps_of_coarse_pixels(lsst_r):
     """A coarse pixel holds the light of four fine ones; the star stands where these meet."""
     field = np.array([[0.01, 0.015]])
-    coarse = engine_for(lsst_r, plane=ImagePlane(16, 20e-6, 4e-6)).render(field, np.zeros((1, 2))).image[0]
-    fine = engine_for(lsst_r, plane=ImagePlane(32, 10e-6, 4e-6)).render(field, np.array([[-0.5, -0.5]])).image[0]
+    coarse = renderer_for(lsst_r, plane=ImagePlane(16, 20e-6, 4e-6)).render(field, np.zeros((1, 2))).image[0]
+    fine = renderer_for(lsst_r, plane=ImagePlane(32, 10e-6, 4e-6)).render(field, np.array([[-0.5, -0.5]])).image[0]
     assert coarse.shape == (16, 16)
     # Coarse pixel 8 is that of the star, and fine pixels 15 and 16 are on either side of it.
     expected = fine[1:31, 1:31].reshape(15, 2, 15, 2).sum(axis=(1, 3))

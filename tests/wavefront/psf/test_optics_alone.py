@@ -17,12 +17,9 @@ def ellipticity(lsst_r):
             fields_at(lsst_r, positions),
             [624e-9],
             focal_plane=focal_plane,
-            engine="wave",
-            pixel_size=2.5e-6,
+            engine=pachon.WaveEngine(pupil_spacing=0.08),
             # 1.5 arcsec, five times the width of the weight; the image repeats itself after 1.6 arcsec.
-            stamp_size=31,
-            pupil_spacing=0.08,
-            diffusion=0.0,
+            stamps=pachon.Stamps(31, pixel_size=2.5e-6, diffusion=0.0),
         )
         shape = pachon.measure_shapes(psf.image, psf.pixel_scale, weight_fwhm=0.3 * ARCSEC)
         return shape.e1 + 1j * shape.e2

@@ -11,8 +11,9 @@ from pachon.measure.shapes import fwhm
 from pachon.pipeline.config import Configuration
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.chief_rays import fields_at
-from pachon.wavefront.psf.engines import ENGINES
+from pachon.wavefront.psf.engines import ENGINES, psf_engine
 from pachon.wavefront.psf.psf import DARK, make_psfs
+from pachon.wavefront.psf.stamps import Stamps
 
 WAVELENGTHS = np.linspace(545e-9, 703e-9, 3)
 ARCSEC = np.pi / 180 / 3600
@@ -65,12 +66,10 @@ def test_what_comes_back(lsst_r, engine, turbulent):
         WAVELENGTHS * 1e9 * u.nm,
         focal_plane=focal_plane,
         atmosphere=small_atmosphere() if turbulent else None,
-        engine=engine,
-        offsets=offsets,
-        stamp_size=25,
-        pixel_size=10 * u.um,
         threads=2,
         progress=done.append,
+        engine=engine,
+        stamps=Stamps(25, offsets=offsets, pixel_size=10 * u.um),
     )
     assert psfs.image.shape == (2, 25, 25)
     assert psfs.image.dtype == np.float32
@@ -96,7 +95,7 @@ def test_engines_agree_on_single_stars_outside_the_atmosphere(lsst_r):
     telescope = lsst_r.perturbed("Camera", shift=(0.0, 0.0, 30e-6))
     fields = np.radians([[0.0, 0.0], [0.8, 0.9], [-1.2, 0.3]])
     images = [
-        make_psfs(telescope, fields, WAVELENGTHS, engine=engine, stamp_size=21, threads=2).image.astype(float)
+        make_psfs(telescope, fields, WAVELENGTHS, threads=2, engine=engine, stamps=Stamps(21)).image.astype(float)
         for engine in ("fast", "wave")
     ]
     for fast, wave in zip(*images, strict=True):
@@ -109,7 +108,7 @@ def test_engines_agree_on_single_stars_outside_the_atmosphere(lsst_r):
 def engines_apart(telescope, stars, *, wavelengths, threads, focal_plane=None, **atmosphere):
     """Return differences of ellipticity [n, 2] and ratios of widths [n] of the engines on the same screens."""
     fields, offsets = stars
-    options = {"focal_plane": focal_plane, "offsets": offsets, "threads": threads}
+    options = {"focal_plane": focal_plane, "stamps": Stamps(offsets=offsets), "threads": threads}
     screens = Atmosphere.from_site("cerro_pachon", **atmosphere)
     fast, wave = (
         make_psfs(telescope, fields, wavelengths, atmosphere=screens, engine=engine, **options).image.astype(float)
@@ -147,14 +146,14 @@ def test_recentred_stars_are_those_drawn_at_the_other_place(lsst_r, engine):
     """Told where a star is seen, an engine draws it where it then is seen at the centre of a pixel."""
     fields = np.radians([[0.3, -0.2], [1.1, 0.9]])
     offsets = np.array([[0.4, -0.3], [0.1, 0.2]])
-    options = {"atmosphere": small_atmosphere(), "engine": engine, "stamp_size": 21, "threads": 2}
+    options = {"atmosphere": small_atmosphere(), "engine": engine, "threads": 2}
 
     def centroids(images, pixel_scale):
         shapes = pachon.measure_shapes(images, pixel_scale, WEIGHT_FWHM * ARCSEC)
         return np.stack([shapes.x, shapes.y], axis=1)
 
-    psfs = make_psfs(lsst_r, fields, WAVELENGTHS, offsets=offsets, recenter=centroids, **options)
-    again = make_psfs(lsst_r, fields, WAVELENGTHS, offsets=psfs.offset, **options)
+    psfs = make_psfs(lsst_r, fields, WAVELENGTHS, stamps=Stamps(21, offsets=offsets, recenter=centroids), **options)
+    again = make_psfs(lsst_r, fields, WAVELENGTHS, stamps=Stamps(21, offsets=psfs.offset), **options)
     # Single precision of a ramp of phase.
     np.testing.assert_allclose(psfs.image, again.image, atol=2e-6 * again.image.max())
     # The centroid of a fifth of a second in pixels of 0.2 arcsec depends a little on where in a pixel it lies.
@@ -176,7 +175,7 @@ def test_engines_agree_over_the_field(lsst_r):
     for seed in range(25):
         ccds = rng.choice(np.flatnonzero(np.hypot(*centers.T) < 0.31), 8, replace=False)
         positions = centers[ccds] + rng.uniform(-0.018, 0.018, (8, 2))
-        options = {"focal_plane": focal_plane, "offsets": rng.uniform(-0.5, 0.5, (8, 2))}
+        options = {"focal_plane": focal_plane, "stamps": Stamps(offsets=rng.uniform(-0.5, 0.5, (8, 2)))}
         screens = Atmosphere.from_site("cerro_pachon", seed, screen_size=4096, screen_length=650.0)
         for engine, measured in e.items():
             psfs = make_psfs(
@@ -205,12 +204,12 @@ def test_engines_agree_over_the_field(lsst_r):
 
 
 def test_no_stars_and_no_light(lsst_r):
-    none = make_psfs(lsst_r, np.empty((0, 2)), WAVELENGTHS, stamp_size=9)
+    none = make_psfs(lsst_r, np.empty((0, 2)), WAVELENGTHS, stamps=Stamps(9))
     assert none.image.shape == (0, 9, 9)
     # Far outside the field, all is vignetted, and the chief ray still lands.
     limit = 0.9 * lsst_r.field_limit
     for engine in ("fast", "wave"):
-        dark = make_psfs(lsst_r, [[limit, 0.0], [0.0, 0.0]], WAVELENGTHS, stamp_size=9, engine=engine)
+        dark = make_psfs(lsst_r, [[limit, 0.0], [0.0, 0.0]], WAVELENGTHS, engine=engine, stamps=Stamps(9))
         assert dark.lit_fraction[0].max() == 0.0
         assert dark.flags.tolist() == [DARK, 0]
         assert not dark.image[0].any()
@@ -228,25 +227,24 @@ def test_configurations_offer_every_engine():
     ("options", "error", "named"),
     [
         ({"engine": "exact"}, ConfigError, "engine = 'exact': expected one of fast, wave"),
+        ({"engine": 3}, DomainError, "engine = 3: expected a text or a PsfEngine"),
+        ({"pupil_spacing": 0.1}, ConfigError, r"pupil_spacing: .* expected engine=WaveEngine\(pupil_spacing=\.\.\.\)$"),
+        ({"stamp_size": 41}, ConfigError, r"stamp_size: .* expected stamps=Stamps\(size=\.\.\.\)$"),
+        ({"stamps": 41}, DomainError, "stamps = 41: expected a Stamps"),
         (
-            {"pupil_spacing": 0.1},
+            {"projection": "postel"},
             ConfigError,
-            "pupil_spacing = 0.1: not an option of engine = 'fast', which takes n_pupil",
+            r"projection: .* expected Request.of\(telescope",
         ),
-        ({"engine": "wave", "n_pupil": 80}, ConfigError, "n_pupil = 80: not an option of engine = 'wave', which takes"),
-        ({"projection": "mercator"}, ConfigError, "projection"),
+        ({"fields": None}, DomainError, "^fields, wavelengths: expected both beside a telescope"),
         ({"wavelengths": []}, DomainError, "wavelengths"),
         ({"wavelengths": [-1e-7]}, DomainError, "wavelengths"),
         ({"wavelengths": [5e-6]}, PachonError, "wavelength"),
         ({"fields": [[0.0, 0.0], [0.1, 0.0]]}, DomainError, r"field = \(5.72958, 0\) deg: expected within"),
         ({"fields": [[np.nan, 0.0]]}, DomainError, "fields"),
         ({"fields": [[0.0, 0.0, 0.0]]}, DomainError, "fields of shape"),
-        ({"offsets": [[0.0, 0.0], [1.0, 1.0]]}, DomainError, "offsets of shape"),
-        ({"offsets": [["left", 0.0]]}, DomainError, "offsets"),
-        ({"dispersion": [[0.0, 0.0]]}, DomainError, "dispersion of shape"),
-        ({"stamp_size": 1}, DomainError, "stamp_size"),
-        ({"pixel_size": 1 * u.s}, DomainError, "pixel_size"),
-        ({"diffusion": -1e-6}, DomainError, "diffusion"),
+        ({"stamps": Stamps(offsets=[[0.0, 0.0], [1.0, 1.0]])}, DomainError, "offsets of shape"),
+        ({"wavelengths": pachon.Light(WAVELENGTHS, dispersion=[[0.0, 0.0]])}, DomainError, "dispersion of shape"),
         ({"focal_plane": "flat", "fields": [[0.0020485, 0.0]]}, DomainError, "between"),
     ],
 )
@@ -256,3 +254,52 @@ def test_refuses_bad_arguments(lsst_r, options, error, named):
         arguments["focal_plane"] = pachon.FocalPlane.flat("lsst")
     with pytest.raises(error, match=named):
         make_psfs(lsst_r, arguments.pop("fields"), arguments.pop("wavelengths"), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda: Stamps(1), "^size = 1: expected"),
+        (lambda: Stamps(pixel_size=1 * u.s), "pixel_size"),
+        (lambda: Stamps(diffusion=-1e-6), "diffusion"),
+        (lambda: Stamps(offsets=[["left", 0.0]]), "offsets"),
+        (lambda: pachon.Light(["red"]), "wavelengths"),
+        (lambda: pachon.FastEngine(n_pupil=9), "n_pupil = 9"),
+        (lambda: pachon.FastEngine(oversampling=33), "oversampling = 33"),
+        (lambda: pachon.WaveEngine(padding=3), "padding = 3"),
+        (lambda: pachon.WaveEngine(pupil_spacing=0.0), "pupil_spacing = 0"),
+        (lambda: pachon.LongExposureEngine(n_pupil=9), "n_pupil = 9"),
+    ],
+)
+def test_options_check_their_ranges(make, named):
+    with pytest.raises(DomainError, match=named):
+        make()
+
+
+def test_names_of_engines_stand_for_their_defaults(lsst_r):
+    atmosphere = small_atmosphere()
+    for name, engine in ENGINES.items():
+        assert psf_engine(name) == engine()
+        assert engine().needs_atmosphere == (name == "long_exposure")
+        assert engine().with_n_pupil(600) == (engine() if name == "wave" else engine(n_pupil=600))
+    fields = [[0.01, 0.005]]
+    by_name = make_psfs(lsst_r, fields, WAVELENGTHS, atmosphere=atmosphere, engine="fast")
+    by_object = make_psfs(
+        lsst_r, fields, WAVELENGTHS, atmosphere=atmosphere, engine=pachon.FastEngine(), stamps=Stamps()
+    )
+    assert by_name.image.tobytes() == by_object.image.tobytes()
+
+
+def test_a_request_stands_for_telescope_fields_and_wavelengths(lsst_r):
+    fields, options = [[0.01, 0.005], [0.0, -0.02]], {"atmosphere": small_atmosphere(), "engine": "long_exposure"}
+    request = pachon.Request.of(lsst_r, fields, WAVELENGTHS)
+    by_request, by_telescope = make_psfs(request, **options), make_psfs(lsst_r, fields, WAVELENGTHS, **options)
+    assert by_request.image.tobytes() == by_telescope.image.tobytes()
+    weighted = pachon.Request.of(lsst_r, fields, WAVELENGTHS, wavelength_weights=[1.0, 3.0, 2.0])
+    light = pachon.Light(WAVELENGTHS, [1.0, 3.0, 2.0])
+    assert np.array_equal(make_psfs(weighted, **options).image, make_psfs(lsst_r, fields, light, **options).image)
+    # Angles of the other projection that mean the same directions.
+    slopes = pachon.Request.of(lsst_r, np.tan(fields), WAVELENGTHS, projection="gnomonic")
+    assert np.abs(make_psfs(slopes, **options).image - by_telescope.image).max() < 1e-6
+    with pytest.raises(ConfigError, match=r"^fields = .*: given beside a Request, which has its own$"):
+        make_psfs(request, fields, **options)

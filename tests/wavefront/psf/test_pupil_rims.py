@@ -8,6 +8,7 @@ import pachon
 from pachon.wavefront.atmosphere.turbulence import coherence, structure_function
 from pachon.wavefront.psf.psf import make_psfs
 from pachon.wavefront.psf.pupil_rims import PupilRims, pupil_rims
+from pachon.wavefront.psf.stamps import Stamps
 
 LSST = pachon.load_telescope("lsst_v3.3_r")
 WAVE, PIXEL, SIDE = 620e-9, 10e-6, 81
@@ -55,7 +56,7 @@ def difference(image, expected):
 @pytest.mark.long
 def test_long_exposure_donuts_are_diffracted_at_their_rims(defocused, donut):
     image = make_psfs(
-        defocused, [(0.0, 0.0)], [WAVE], atmosphere=AIR, engine="long_exposure", stamp_size=SIDE, diffusion=0.0
+        defocused, [(0.0, 0.0)], [WAVE], atmosphere=AIR, engine="long_exposure", stamps=Stamps(SIDE, diffusion=0.0)
     ).image[0]
     # Without diffraction, or with one filter for all rays, 4 %: what is left is the third order of the strips' width.
     assert difference(image / image.sum(), donut) < 0.01
@@ -78,7 +79,7 @@ def test_donuts_of_the_wave_engine_have_the_hole_of_the_mirror():
     """At 1.64 degrees it stands 8 mm aside from the hole of the pupil: 34 nm of Z5 where light ends at that one."""
     telescope = LSST.perturbed("Detector", shift=(0.0, 0.0, 1.5e-3))
     fields, options = np.deg2rad([[1.19, 1.13]]), {"diffusion": 15e-6}
-    donut = make_psfs(telescope, fields, [WAVE], engine="wave", stamp_size=141, **options).image
+    donut = make_psfs(telescope, fields, [WAVE], engine="wave", stamps=Stamps(141, **options)).image
     fit = pachon.fit_donuts(
         telescope, 1e7 * donut, fields, WAVE, sky_variance=1e4, diffraction=True, fwhm=0.0, **options
     )

@@ -6,7 +6,9 @@ import pytest
 import pachon
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.wavefront.chief_rays import fields_at
+from pachon.wavefront.psf.long_exposure import LongExposureEngine
 from pachon.wavefront.psf.psf import make_psfs
+from pachon.wavefront.psf.stamps import Stamps
 
 #: Decentre of M2 [m]: coma and a pattern of astigmatism without symmetry.
 DECENTRE = np.array([1e-3, -5e-4])
@@ -55,7 +57,7 @@ def test_turning_the_camera_is_turning_all_else_the_other_way(lsst_r, air, heigh
     places = POSITIONS if engine == "long_exposure" else POSITIONS[1:2]
     spread = np.array([[1e-7, -3e-7]])
     one, other = (
-        make_psfs(t, fields_at(t, places), ONE_WAVE, engine=engine, dispersion=d, **options).image
+        make_psfs(t, fields_at(t, places), pachon.Light(ONE_WAVE, dispersion=d), engine=engine, **options).image
         for t, d in ((camera, spread), (mirror, turned(spread, -angle)))
     )
     assert np.abs(one - other).max() < tolerance * other.max()
@@ -70,9 +72,9 @@ def test_the_image_of_a_star_turns_back_by_a_quarter(lsst_r, single_modes, air, 
     telescope = decentred(lsst_r, DECENTRE)
     field = fields_at(telescope, POSITIONS[1:2])
     options = {"atmosphere": {"wave": None, "long_exposure": air, "fast": single_modes}[engine], "threads": 1}
-    options |= {"engine": engine, "dispersion": [[2e-7, -1e-7]]}
-    still = make_psfs(telescope, field, ONE_WAVE, **options)
-    quarter = make_psfs(telescope.with_rotator(0.5 * np.pi), field, ONE_WAVE, **options)
+    options["engine"], light = engine, pachon.Light(ONE_WAVE, dispersion=[[2e-7, -1e-7]])
+    still = make_psfs(telescope, field, light, **options)
+    quarter = make_psfs(telescope.with_rotator(0.5 * np.pi), field, light, **options)
     # x, y of the camera are y, -x of the telescope.
     expected = still.image[0].T[::-1]
     assert np.abs(quarter.image[0] - expected).max() < 1e-6 * expected.max()
@@ -89,12 +91,10 @@ def test_second_moments_turn_with_the_camera(lsst_r, air, degrees):
             made,
             field,
             ONE_WAVE,
-            engine="long_exposure",
             atmosphere=air,
-            pixel_size=5e-6,
-            stamp_size=81,
-            n_pupil=600,
             threads=1,
+            engine=LongExposureEngine(n_pupil=600),
+            stamps=Stamps(81, pixel_size=5e-6),
         )
         shapes = pachon.measure_shapes(psf.image, psf.pixel_scale, 0.7 / 206265)
         e.append(shapes.e1 + 1j * shapes.e2)

@@ -14,9 +14,12 @@ from pachon.raytrace.trace import trace
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.chief_rays import fields_at
 from pachon.wavefront.psf.channels import Channels
-from pachon.wavefront.psf.engines import ENGINES
+from pachon.wavefront.psf.fast import FastEngine
 from pachon.wavefront.psf.image_plane import ImagePlane
+from pachon.wavefront.psf.long_exposure import LongExposureEngine
 from pachon.wavefront.psf.psf import make_psfs
+from pachon.wavefront.psf.stamps import Stamps
+from pachon.wavefront.psf.wave import WaveEngine
 from pachon.wavefront.silicon_focus import focus_height
 
 PLANE = ImagePlane(25, 10e-6, 4e-6)
@@ -50,12 +53,12 @@ def after_path(pupil, shift):
 
 def summed_over_depths(engine, pupil, wavelength, silicon, **options):
     """The PSF by brute force: images of many depths, each with its own diffusion, made without silicon."""
-    image = np.zeros((PLANE.stamp_size, PLANE.stamp_size))
+    image = np.zeros((PLANE.size, PLANE.size))
     for path, weight in zip(*nodes(silicon, wavelength), strict=True):
         plane = replace(PLANE, diffusion=PLANE.diffusion * math.sqrt(1.0 - path / silicon.thickness))
         inputs = pupil.inputs(np.array([wavelength]), plane, **options)
         deep = replace(inputs, trace=after_path(pupil, path / silicon.index(wavelength)))
-        image += weight * ENGINES[engine](deep).render(*STAR).image[0]
+        image += weight * engine.renderer(deep).render(*STAR).image[0]
     return image
 
 
@@ -66,28 +69,28 @@ def turbulence(**options):
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("engine", "wavelength", "options", "allowed"),
+    ("engine", "wavelength", "atmosphere", "allowed"),
     [
         # Two depths are exact up to the third moment of the path, three up to the fifth; air blurs the rest.
-        ("long_exposure", 870e-9, {"atmosphere": turbulence()}, 1e-3),
-        ("long_exposure", 970e-9, {"atmosphere": turbulence()}, 1e-3),
-        ("wave", 870e-9, {"atmosphere": None, "pupil_spacing": 0.08}, 1e-3),
+        (LongExposureEngine(), 870e-9, turbulence(), 1e-3),
+        (LongExposureEngine(), 970e-9, turbulence(), 1e-3),
+        (WaveEngine(pupil_spacing=0.08), 870e-9, None, 1e-3),
         # 4 time steps, each at each depth.
-        ("wave", 970e-9, {"atmosphere": turbulence(), "pupil_spacing": 0.08}, 1e-3),
+        (WaveEngine(pupil_spacing=0.08), 970e-9, turbulence(), 1e-3),
         # Two sharp rings in place of a smooth blur, on cells of a micrometre.
-        ("fast", 970e-9, {"atmosphere": None, "n_pupil": 3000, "oversampling": 6}, 1.5e-2),
+        (FastEngine(n_pupil=3000, oversampling=6), 970e-9, None, 1.5e-2),
         # 134 time steps that share the depths; another ray in a cell makes 1e-2 with 4 steps.
-        ("fast", 870e-9, {"atmosphere": turbulence(time_step=0.0015), "n_pupil": 1000, "oversampling": 4}, 4e-3),
+        (FastEngine(n_pupil=1000, oversampling=4), 870e-9, turbulence(time_step=0.0015), 4e-3),
     ],
 )
-def test_against_brute_force_over_the_depths(polynomial_pupil, engine, wavelength, options, allowed):
+def test_against_brute_force_over_the_depths(polynomial_pupil, engine, wavelength, atmosphere, allowed):
     # The cone of f/1.23, its axis aslant, out of focus by 8 um and with coma.
     pupil = polynomial_pupil(defocus=0.7e-6, coma=0.3e-6, cosines=(0.05, -0.02))
     silicon = Silicon()
-    inputs = pupil.inputs(np.array([wavelength]), PLANE, silicon=silicon, **options)
-    image = ENGINES[engine](inputs).render(*STAR).image[0]
-    exact = summed_over_depths(engine, pupil, wavelength, silicon, **options)
-    without = ENGINES[engine](replace(inputs, silicon=None)).render(*STAR).image[0]
+    inputs = pupil.inputs(np.array([wavelength]), PLANE, silicon=silicon, atmosphere=atmosphere)
+    image = engine.renderer(inputs).render(*STAR).image[0]
+    exact = summed_over_depths(engine, pupil, wavelength, silicon, atmosphere=atmosphere)
+    without = engine.renderer(replace(inputs, silicon=None)).render(*STAR).image[0]
     assert np.abs(image - exact).max() < allowed * exact.max()
     # What silicon does to the shape is well above that.
     assert np.abs(without * (exact.sum() / without.sum()) - exact).max() > 0.04 * exact.max()
@@ -139,16 +142,10 @@ def test_against_photons_one_by_one():
     """The transfer function of the silicon, with diffraction and pixel divided out, is that of 400 000 photons."""
     telescope = pachon.load_telescope("lsst_v3.3_y").perturbed("Detector", shift=(0.0, 0.0, -6e-6))
     field, wavelength, silicon = np.deg2rad([0.9, 0.8]), 970e-9, Silicon()
-    star = {
-        "stamp_size": 81,
-        "pixel_size": 4e-6,
-        "diffusion": 3e-6,
-        "engine": "fast",
-        "n_pupil": 10000,
-        "oversampling": 4,
-    }
+    engine = FastEngine(n_pupil=10000, oversampling=4)
     with_silicon, without = (
-        make_psfs(telescope, field[None], [wavelength], silicon=s, **star) for s in (silicon, None)
+        make_psfs(telescope, field[None], [wavelength], engine=engine, stamps=Stamps(81, 4e-6, 3e-6, silicon=s))
+        for s in (silicon, None)
     )
     seen = photons(telescope, field, wavelength, silicon, 3e-6, 400_000, 1)
     # 2e-3 for three standard errors; 0.4 % for paths that the slant makes longer than the thickness.
@@ -213,12 +210,13 @@ def test_turns_give_each_depth_its_light():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("engine", ["fast", "wave", "long_exposure"])
+@pytest.mark.parametrize(
+    "engine", [FastEngine(n_pupil=100), WaveEngine(pupil_spacing=0.08), LongExposureEngine()], ids=lambda e: e.name
+)
 def test_bytes_do_not_depend_on_threads(engine):
     telescope = pachon.load_telescope("lsst_v3.3_y")
     focal_plane = pachon.FocalPlane.from_budget("lsst", seed=1)
     fields = fields_at(telescope, focal_plane.camera.centers[[3, 90]])
-    options = {"fast": {"n_pupil": 100}, "wave": {"pupil_spacing": 0.08}, "long_exposure": {}}[engine]
     both = [
         make_psfs(
             telescope,
@@ -226,10 +224,9 @@ def test_bytes_do_not_depend_on_threads(engine):
             [960e-9, 1000e-9],
             focal_plane=focal_plane,
             atmosphere=turbulence(),
-            engine=engine,
-            silicon=Silicon(),
             threads=threads,
-            **options,
+            engine=engine,
+            stamps=Stamps(silicon=Silicon()),
         )
         for threads in (1, 2)
     ]
@@ -240,11 +237,9 @@ def test_wavelengths_count_by_the_light_that_silicon_absorbs(polynomial_pupil):
     pupil, silicon = polynomial_pupil(), Silicon()
     wavelengths = np.array([700e-9, 1050e-9])
     options = {"silicon": silicon, "atmosphere": turbulence()}
-    both = ENGINES["long_exposure"](pupil.inputs(wavelengths, PLANE, **options)).render(*STAR).image[0]
-    each = [
-        ENGINES["long_exposure"](pupil.inputs(wavelengths[[w]], PLANE, **options)).render(*STAR).image[0]
-        for w in range(2)
-    ]
+    engine = LongExposureEngine()
+    both = engine.renderer(pupil.inputs(wavelengths, PLANE, **options)).render(*STAR).image[0]
+    each = [engine.renderer(pupil.inputs(wavelengths[[w]], PLANE, **options)).render(*STAR).image[0] for w in range(2)]
     np.testing.assert_allclose(both, 0.5 * (each[0] + each[1]), atol=5e-5 * both.max())
     # Most light of these images falls on them.
     assert each[1].sum() / each[0].sum() == pytest.approx(
@@ -256,4 +251,4 @@ def test_light_to_which_silicon_is_transparent_is_one_clear_line(lsst_r):
     telescope = pachon.load_telescope("lsst_v3.3_y")
     beyond = replace(telescope, wavelength_range=(0.9e-6, 1.2e-6))
     with pytest.raises(DomainError, match=r"^wavelength = 1120 nm: expected 300 to 1100 nm for silicon$"):
-        make_psfs(beyond, [[0.0, 0.0]], [1.12e-6], silicon=Silicon())
+        make_psfs(beyond, [[0.0, 0.0]], [1.12e-6], stamps=Stamps(silicon=Silicon()))

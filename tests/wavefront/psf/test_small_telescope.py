@@ -24,7 +24,9 @@ def newtonian():
 
 @pytest.mark.parametrize("engine", ["wave", "fast"])
 def test_the_light_of_a_small_telescope_is_all_there(newtonian, engine):
-    psf = pachon.make_psfs(newtonian, [(0.0, 0.0)], [6e-7], engine=engine, stamp_size=25, pixel_size=2e-6, threads=1)
+    psf = pachon.make_psfs(
+        newtonian, [(0.0, 0.0)], [6e-7], threads=1, engine=engine, stamps=pachon.Stamps(25, pixel_size=2e-6)
+    )
     # A disc of 96 points across is a lattice of 7000: it misses its area by the square root of its rim's points.
     assert psf.lit_fraction[0] == pytest.approx(1.0, abs=5e-3)
 
@@ -35,7 +37,12 @@ def test_its_image_is_that_of_an_annulus(newtonian):
     from scipy.special import j1
 
     psf = pachon.make_psfs(
-        newtonian, [(0.0, 0.0)], [6e-7], engine="wave", stamp_size=41, pixel_size=0.25e-6, diffusion=0.0, threads=1
+        newtonian,
+        [(0.0, 0.0)],
+        [6e-7],
+        threads=1,
+        engine="wave",
+        stamps=pachon.Stamps(41, pixel_size=0.25e-6, diffusion=0.0),
     )
     obscuration = 0.25
 

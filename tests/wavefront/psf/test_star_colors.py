@@ -6,6 +6,7 @@ import pytest
 import pachon
 from pachon.wavefront.atmosphere.refraction import dispersion_shift
 from pachon.wavefront.psf.psf import make_psfs
+from pachon.wavefront.psf.stamps import Stamps
 
 ARCSEC = np.pi / 180 / 3600
 WEATHER = pachon.load_site("cerro_pachon").weather
@@ -17,11 +18,11 @@ def air(**options):
     return pachon.Atmosphere.from_site("cerro_pachon", 1, **(given | options))
 
 
-def images(telescope, engine, waves, atmosphere, **options):
+def images(telescope, engine, waves, atmosphere, weights=None):
     fields = np.radians([(0.1, 0.2), (0.6, -0.7)])
     dispersion = dispersion_shift(waves, WAVES[1], np.radians(50.0), 0.3, WEATHER)
-    given = {"dispersion": dispersion, "offsets": [[0.2, -0.3], [0.0, 0.1]], "atmosphere": atmosphere}
-    return make_psfs(telescope, fields, waves, engine=engine, **given, **options)
+    light, stamps = pachon.Light(waves, weights, dispersion), Stamps(offsets=[[0.2, -0.3], [0.0, 0.1]])
+    return make_psfs(telescope, fields, light, engine=engine, atmosphere=atmosphere, stamps=stamps)
 
 
 @pytest.mark.parametrize("engine", ["fast", "long_exposure", pytest.param("wave", marks=pytest.mark.slow)])
@@ -32,19 +33,16 @@ def test_spectra_are_direct_sums_over_wavelengths(engine, name):
         pytest.skip("one telescope will do")
     telescope, atmosphere = pachon.load_telescope(name), air()
     photons = np.array([[0.2, 1.0, 2.3], [3.0, 0.5, 0.0]])
-    options = {
-        "fast": {},
-        "long_exposure": {"n_pupil": 1500 if name == "decam" else 80},
-        "wave": {"pupil_spacing": 0.02},
-    }
-    options = options[engine]
-    found = images(telescope, engine, WAVES, atmosphere, wavelength_weights=photons, **options)
+    engine = {
+        "fast": pachon.FastEngine(),
+        "long_exposure": pachon.LongExposureEngine(n_pupil=1500 if name == "decam" else 80),
+        "wave": pachon.WaveEngine(pupil_spacing=0.02),
+    }[engine]
+    found = images(telescope, engine, WAVES, atmosphere, photons)
     total = np.zeros_like(found.image, dtype=np.float64)
     for w, wave in enumerate(WAVES):
         # A pair [wave, middle] has the middle wavelength's reference points too.
-        pair = images(
-            telescope, engine, np.array([wave, WAVES[1]]), atmosphere, wavelength_weights=[1.0, 0.0], **options
-        )
+        pair = images(telescope, engine, np.array([wave, WAVES[1]]), atmosphere, [1.0, 0.0])
         light = photons[:, w, None, None] * pair.inside[:, None, None] * pair.lit_fraction[:, :1, None]
         total += light * pair.image
     total /= total.sum(axis=(1, 2), keepdims=True)
@@ -56,7 +54,7 @@ def test_equal_weights_are_none(lsst_r):
     for engine in ("fast", "long_exposure"):
         plain = images(lsst_r, engine, WAVES, air())
         for weights in ([2.0, 2.0, 2.0], np.full((2, 3), 0.7)):
-            found = images(lsst_r, engine, WAVES, air(), wavelength_weights=weights)
+            found = images(lsst_r, engine, WAVES, air(), weights)
             np.testing.assert_allclose(found.image, plain.image, atol=1e-7 * plain.image.max())
 
 
@@ -68,10 +66,9 @@ def test_five_wavelengths_make_the_colour_of_a_star(lsst_r):
         # The midpoint rule.
         waves = lsst_r.band[0] + (np.arange(count) + 0.5) / count * np.ptp(lsst_r.band)
         dispersion = dispersion_shift(waves, waves[count // 2], zenith, 0.0, WEATHER)
-        psfs = make_psfs(
-            lsst_r, [[0.0, 0.0]] * 2, waves, wavelength_weights=pachon.blackbody_photons(kelvin, waves),
-            dispersion=dispersion, atmosphere=air(), engine="long_exposure", stamp_size=41,
-        )  # fmt: skip
+        light = pachon.Light(waves, pachon.blackbody_photons(kelvin, waves), dispersion)
+        fields = [[0.0, 0.0]] * 2
+        psfs = make_psfs(lsst_r, fields, light, atmosphere=air(), engine="long_exposure", stamps=Stamps(41))
         shapes = pachon.measure_shapes(psfs.image, psfs.pixel_scale, 0.7 * ARCSEC)
         found.append(np.array([shapes.x, shapes.y, shapes.e1, shapes.e2, shapes.size / ARCSEC]))
     five, many = found
@@ -88,13 +85,13 @@ def test_five_wavelengths_make_the_colour_of_a_star(lsst_r):
 @pytest.mark.parametrize(
     ("weights", "words"),
     [
-        ([1.0, 2.0], r"wavelength_weights of shape \[2\]: expected \[3\] or \[2, 3\]"),
-        ([1.0, -2.0, 1.0], "wavelength_weights: expected numbers of photons from 0"),
-        (np.zeros((2, 3)), "wavelength_weights: expected numbers of photons from 0"),
-        (["red", "blue", "green"], "wavelength_weights"),
+        ([1.0, 2.0], r"weights of shape \[2\]: expected \[3\] or \[2, 3\]"),
+        ([1.0, -2.0, 1.0], "weights: expected numbers of photons from 0"),
+        (np.zeros((2, 3)), "weights: expected numbers of photons from 0"),
+        (["red", "blue", "green"], "weights"),
     ],
 )
 def test_bad_weights_are_one_line(lsst_r, weights, words):
     with pytest.raises(pachon.PachonError, match=words) as caught:
-        make_psfs(lsst_r, [[0.0, 0.0]] * 2, WAVES, wavelength_weights=weights)
+        make_psfs(lsst_r, [[0.0, 0.0]] * 2, pachon.Light(WAVES, weights=weights))
     assert "\n" not in str(caught.value)

@@ -12,7 +12,7 @@ from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.turbulence import diffraction_otf
 from pachon.wavefront.psf.engine import PsfInputs
 from pachon.wavefront.psf.image_plane import ImagePlane
-from pachon.wavefront.psf.wave import WavePsfEngine
+from pachon.wavefront.psf.wave import WaveEngine
 from pachon.wavefront.pupil_optics import trace_pupils
 
 FOCAL_LENGTH = 10.31
@@ -46,8 +46,8 @@ def test_against_a_plain_sum_over_the_pupil(polynomial_pupil, fine_pixel, allowe
     dispersion = np.array([[2e-7, 1e-7], [-3e-7, 4e-7]])
     spacing = 0.05
     atmosphere = None if fine_pixel is None else small_atmosphere(exposure=0.1, fine_pixel=fine_pixel)
-    options = {"pupil_spacing": spacing, "padding": True, "atmosphere": atmosphere}
-    engine = WavePsfEngine(pupil.inputs(wavelengths, plane, dispersion=dispersion, **options))
+    inputs = pupil.inputs(wavelengths, plane, dispersion=dispersion, atmosphere=atmosphere)
+    engine = WaveEngine(pupil_spacing=spacing, padding=True).renderer(inputs)
     field, offset = np.array([0.02, -0.01]), np.array([[0.3, -0.2]])
     image = engine.render(field[None], offset).image[0]
 
@@ -88,7 +88,7 @@ def test_against_a_plain_sum_over_the_pupil(polynomial_pupil, fine_pixel, allowe
 @pytest.mark.long
 def test_perfect_optics_have_the_transfer_function_of_the_annulus(polynomial_pupil):
     telescope = polynomial_pupil()
-    engine = WavePsfEngine(telescope.inputs(ONE_WAVE, PLANE, threads=1, pupil_spacing=0.02))
+    engine = WaveEngine(pupil_spacing=0.02).renderer(telescope.inputs(ONE_WAVE, PLANE, threads=1))
     stars = engine.render(*STAR)
     step = 0.02
     b = step * np.arange(-430, 431)
@@ -110,12 +110,12 @@ def test_tilt_dispersion_and_offset_move_the_image(polynomial_pupil, tilt):
     shift = offset + (jacobian @ (np.array(tilt) + dispersion[0]))[None] / 10e-6
     for wavelength in (500e-9, 600e-9, 700e-9):
         wave = np.array([wavelength])
-        options = {"threads": 1, "pupil_spacing": 0.015, "padding": False}
-        moved = WavePsfEngine(
-            polynomial_pupil(tilt=tilt, jacobian=jacobian).inputs(wave, PLANE, dispersion=dispersion, **options)
+        engine = WaveEngine(pupil_spacing=0.015, padding=False)
+        moved = engine.renderer(
+            polynomial_pupil(tilt=tilt, jacobian=jacobian).inputs(wave, PLANE, dispersion=dispersion)
         )
         image = moved.render(np.zeros((1, 2)), offset).image
-        plain = WavePsfEngine(polynomial_pupil(jacobian=jacobian).inputs(wave, PLANE, **options))
+        plain = engine.renderer(polynomial_pupil(jacobian=jacobian).inputs(wave, PLANE))
         expected = plain.render(np.zeros((1, 2)), shift).image
         np.testing.assert_allclose(image, expected, atol=1e-6 * expected.max())
 
@@ -123,8 +123,10 @@ def test_tilt_dispersion_and_offset_move_the_image(polynomial_pupil, tilt):
 def test_layers_bend_light_by_their_gradient_where_it_crosses_them(polynomial_pupil, single_modes):
     jacobian = np.array([[10.3, 0.5], [-0.4, 10.6]])
     telescope = polynomial_pupil(jacobian=jacobian)
-    engine = WavePsfEngine(telescope.inputs(ONE_WAVE, PLANE, atmosphere=single_modes, threads=1, pupil_spacing=0.04))
-    still = WavePsfEngine(telescope.inputs(ONE_WAVE, PLANE, threads=1, pupil_spacing=0.04, padding=False))
+    engine = WaveEngine(pupil_spacing=0.04).renderer(
+        telescope.inputs(ONE_WAVE, PLANE, atmosphere=single_modes, threads=1)
+    )
+    still = WaveEngine(pupil_spacing=0.04, padding=False).renderer(telescope.inputs(ONE_WAVE, PLANE, threads=1))
     line = np.arange(-4.18, 4.18, 0.2)
     pupil = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     radius = np.hypot(*pupil.T)
@@ -144,14 +146,8 @@ def test_layers_bend_light_by_their_gradient_where_it_crosses_them(polynomial_pu
 
 @pytest.mark.long
 def test_padding_changes_nothing_that_the_detector_sees(polynomial_pupil):
-    telescope = polynomial_pupil(defocus=0.5e-6)
-    atmosphere = small_atmosphere()
-    images = [
-        WavePsfEngine(telescope.inputs(ONE_WAVE, PLANE, atmosphere=atmosphere, threads=1, padding=padding))
-        .render(*STAR)
-        .image
-        for padding in (False, True)
-    ]
+    inputs = polynomial_pupil(defocus=0.5e-6).inputs(ONE_WAVE, PLANE, atmosphere=small_atmosphere(), threads=1)
+    images = [WaveEngine(padding=padding).renderer(inputs).render(*STAR).image for padding in (False, True)]
     # exp(-17) is left of a baseline of 1.5 m by charge diffusion; single precision is more.
     np.testing.assert_allclose(images[0], images[1], atol=3e-6 * images[1].max())
 
@@ -159,11 +155,9 @@ def test_padding_changes_nothing_that_the_detector_sees(polynomial_pupil):
 @pytest.mark.long
 def test_a_grid_is_as_wide_as_the_diffusion_demands(polynomial_pupil):
     """Less diffusion: baselines beyond 1.5 m count, those of the whole diameter do not."""
-    plane, atmosphere = ImagePlane(31, 10e-6, 2.2e-6), small_atmosphere()
-    narrow, chosen, padded = (
-        WavePsfEngine(polynomial_pupil(defocus=0.5e-6).inputs(ONE_WAVE, plane, atmosphere=atmosphere, **padding))
-        for padding in ({"padding": False}, {}, {"padding": True})
-    )
+    plane = ImagePlane(31, 10e-6, 2.2e-6)
+    inputs = polynomial_pupil(defocus=0.5e-6).inputs(ONE_WAVE, plane, atmosphere=small_atmosphere())
+    narrow, chosen, padded = (WaveEngine(padding=padding).renderer(inputs) for padding in (False, None, True))
     assert narrow._size < chosen._size < 0.75 * padded._size
     images = [engine.render(*STAR).image for engine in (narrow, chosen, padded)]
     errors = [np.abs(image - images[2]).max() / images[2].max() for image in images[:2]]
@@ -181,8 +175,8 @@ def test_grid_is_padded_where_it_must_be(polynomial_pupil):
     ):
 
         def image(**padding):
-            inputs = polynomial_pupil().inputs(ONE_WAVE, plane, atmosphere=atmosphere, **padding)  # noqa: B023
-            return WavePsfEngine(inputs).render(*STAR).image
+            inputs = polynomial_pupil().inputs(ONE_WAVE, plane, atmosphere=atmosphere)  # noqa: B023
+            return WaveEngine(**padding).renderer(inputs).render(*STAR).image
 
         chosen = image()
         np.testing.assert_array_equal(chosen, image(padding=padded))
@@ -196,7 +190,7 @@ def test_image_points_the_way_of_the_spot_diagram(lsst_r, field_deg):
     field = np.radians([field_deg])
     wave = np.array([lsst_r.default_wavelength])
     plane = ImagePlane(61, 3e-6, 1e-6)
-    engine = WavePsfEngine(PsfInputs(telescope, wave, plane, threads=1))
+    engine = WaveEngine().renderer(PsfInputs(telescope, wave, plane, threads=1))
     image = engine.render(field, np.zeros((1, 2))).image[0]
     x, y = np.meshgrid(plane.pixel_centers, plane.pixel_centers)
 
@@ -233,7 +227,7 @@ def test_bytes_do_not_depend_on_threads_batches_or_company(lsst_r):
     wavelengths = np.array([550e-9, 690e-9])
 
     def images(select, threads):
-        engine = WavePsfEngine(
+        engine = WaveEngine().renderer(
             PsfInputs(lsst_r, wavelengths, PLANE, dispersion=np.zeros((2, 2)), atmosphere=atmosphere, threads=threads)
         )
         return engine.render(fields[select], offsets[select]).image
@@ -249,7 +243,8 @@ def test_heights_of_the_ccds_defocus_the_image(lsst_r):
     field = np.radians([[0.02, 0.03]])
     options = {"dispersion": STILL, "threads": 1}
     image = {
-        name: WavePsfEngine(PsfInputs(lsst_r, ONE_WAVE, PLANE, focal_plane=plane, **options))
+        name: WaveEngine()
+        .renderer(PsfInputs(lsst_r, ONE_WAVE, PLANE, focal_plane=plane, **options))
         .render(field, np.zeros((1, 2)))
         .image[0]
         for name, plane in (
@@ -263,6 +258,7 @@ def test_heights_of_the_ccds_defocus_the_image(lsst_r):
     assert np.abs(image["bumpy"] - image["none"]).max() > 1e-3
 
 
-def test_refuses_bad_spacing(polynomial_pupil):
+@pytest.mark.parametrize("spacing", [0.0, np.nan])
+def test_refuses_bad_spacing(spacing):
     with pytest.raises(DomainError, match="pupil_spacing"):
-        WavePsfEngine(polynomial_pupil().inputs(ONE_WAVE, PLANE, pupil_spacing=0.0))
+        WaveEngine(pupil_spacing=spacing)
