@@ -159,7 +159,8 @@ def make_psfs(
     """
     options, stamps, projection = psf_engine(engine), stamps or Stamps(), "zemax"
     if isinstance(telescope, Request):
-        request = Request.of(telescope, fields, wavelengths, threads=threads)
+        lengths = wavelengths.wavelengths if isinstance(wavelengths, Light) else wavelengths
+        request = Request.of(telescope, fields, lengths, threads=threads)
         telescope, fields, projection, threads = request.telescope, request.fields, request.projection, request.threads
         wavelengths = Light(request.wavelengths, request.weights if np.ptp(request.weights) else None)
     if fields is None or wavelengths is None:
@@ -167,20 +168,20 @@ def make_psfs(
     light = wavelengths if isinstance(wavelengths, Light) else Light(wavelengths)
     angles = _finite_pairs(radians(fields, "fields"), "fields", None)
     telescope.check_field(angles[:, 0], angles[:, 1])
-    lengths = metres(light.wavelengths, "wavelengths").reshape(-1)
-    if not lengths.size or not (np.isfinite(lengths) & (lengths > 0.0)).all():
+    waves = metres(light.wavelengths, "wavelengths").reshape(-1)
+    if not waves.size or not (np.isfinite(waves) & (waves > 0.0)).all():
         raise DomainError(f"wavelengths = {light.wavelengths!r}: expected one or more positive lengths in metres")
-    photons = None if light.weights is None else _relative_photons(light.weights, len(angles), len(lengths))
+    photons = None if light.weights is None else _relative_photons(light.weights, len(angles), len(waves))
     places = np.zeros((len(angles), 2))
     if stamps.offsets is not None:
         places = _finite_pairs(stamps.offsets, "offsets", len(angles))
     shifts = None
     if light.dispersion is not None:
-        shifts = _finite_pairs(radians(light.dispersion, "dispersion"), "dispersion", len(lengths))
+        shifts = _finite_pairs(radians(light.dispersion, "dispersion"), "dispersion", len(waves))
     inputs = PsfInputs(
         telescope,
-        lengths,
-        stamps.image_plane(center_focal_length(telescope, lengths) if stamps.jitter else 0.0),
+        waves,
+        stamps.image_plane(center_focal_length(telescope, waves) if stamps.jitter else 0.0),
         dispersion=shifts,
         focal_plane=focal_plane,
         atmosphere=atmosphere,
