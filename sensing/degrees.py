@@ -67,7 +67,7 @@ class FreedomRays:
     ) -> None:
         self._prepared, self._parameters, self._matrix = freedoms.parameter_matrix(telescope)
         self._direction, self._wavelengths = direction, wavelengths
-        self.cells, self._footprint, self._rims = cells, footprint, RimsOfCells(cells)
+        self.cells, self._footprint = cells, footprint
         self._weights = np.outer(wavelength_weights, cells.weights).ravel()
         rates = np.zeros((len(cells), 0)) if cells.rates is None else cells.rates
         self.rates = np.kron(wavelength_weights[:, None], rates)
@@ -99,9 +99,9 @@ class FreedomRays:
         """Return the spread of the image of each point."""
         return spread_of(self.cells, landing, self._footprint)
 
-    def at_rims(self, rims: PupilRims, landing: np.ndarray) -> RimsAt:
-        """Return rims of the telescope as it is believed to be on the detector, with the last response."""
-        return self._rims.at(rims, landing)
+    def at_rims(self, rims: PupilRims, landing: np.ndarray, response: np.ndarray | None) -> RimsAt:
+        """Return rims of the telescope as it is believed to be on the detector; see :class:`LightRays`."""
+        return RimsOfCells(self.cells, response).at(rims, landing)
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the derivatives, shape [2, n, n_freedom]."""
@@ -114,13 +114,10 @@ class FreedomRays:
 
         landing = [derivatives(float(w), self.cells.points) for w in self._wavelengths]
         middle = float(self._wavelengths[len(self._wavelengths) // 2])
-        response = np.concatenate(landing, axis=1) - derivatives(middle, self._chief)
-        self._rims = RimsOfCells(self.cells, response)
-        return response
+        return np.concatenate(landing, axis=1) - derivatives(middle, self._chief)
 
     def release(self) -> None:
-        """Free what was computed for the last unknowns."""
-        self._rims = RimsOfCells(self.cells)
+        """Free the polynomials over the pupil."""
         self.cells.release()
 
 

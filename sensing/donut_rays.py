@@ -45,8 +45,8 @@ class LightRays(Protocol):
     def spread(self, landing: np.ndarray) -> np.ndarray:
         """Return second moments of the image of each point, beside the footprint of the cells [m^2], [n, 2, 2]."""
 
-    def at_rims(self, rims: PupilRims, landing: np.ndarray) -> RimsAt:
-        """Return where the light of rims lands for landing points of the light [m]."""
+    def at_rims(self, rims: PupilRims, landing: np.ndarray, response: np.ndarray | None) -> RimsAt:
+        """Return where the light of rims lands for landing points of the light [m], and its own response to them."""
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the derivatives of :meth:`landing` with respect to the unknown wavefront, shape [2, n, n_wave]."""
@@ -141,8 +141,8 @@ class ZernikeRays:
         """Return the spread of the image of each point; see :class:`LightRays`."""
         return spread_of(self.cells, landing, self.footprint)
 
-    def at_rims(self, rims: PupilRims, landing: np.ndarray) -> RimsAt:
-        """Return the rims on the detector; see :class:`LightRays`."""
+    def at_rims(self, rims: PupilRims, landing: np.ndarray, response: np.ndarray | None) -> RimsAt:
+        """Return the rims on the detector, always with their response; see :class:`LightRays`."""
         return self._rims.at(rims, landing)
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
