@@ -93,8 +93,8 @@ class ObservedStars:
     def star(self, index: int) -> ObservedStar:
         """Return one star, without what stands beside its stamp."""
         ny, nx = self.shapes[index]
-        pixels = (values[index, :ny, :nx] for values in (self.images, self.variance, self.masked))
-        return ObservedStar(*pixels, self.fields[index], self.directions[index])
+        image, variance, masked = (v[index, :ny, :nx] for v in (self.images, self.variance, self.masked))
+        return ObservedStar(image, variance, masked, self.fields[index], self.directions[index])
 
 
 def padded(
