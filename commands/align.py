@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from ..core.terminal import print_line
 from .interrupt import interruptible
 from .options import Json, Quiet, Threads
 from .tables import Rows, print_json
@@ -80,7 +81,7 @@ def align_command(
         return
     if not quiet:
         _show(summary)
-    print(f"alignment: {out.resolve()}")
+    print_line(f"alignment: {out.resolve()}")
 
 
 def _show(summary: dict[str, Any]) -> None:
@@ -110,4 +111,6 @@ def _show(summary: dict[str, Any]) -> None:
     ]
     Rows(("", "wavefront [nm]", "added [nm]", "FWHM added [mas]", "rms e [1e-3]"), rows, _CAPTION).show()
     first = summary["first_visit_within_1.2_floors"]
-    print("not within 1.2 times the floor" if first is None else f"within 1.2 times the floor from visit {first} on")
+    print_line(
+        "not within 1.2 times the floor" if first is None else f"within 1.2 times the floor from visit {first} on"
+    )

@@ -9,6 +9,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError
+from ..core.terminal import print_line, print_warning
 from .help_group import HelpGroup
 from .interrupt import interruptible
 from .options import FieldsDeg, Json, Model, Quiet, Threads, WavelengthsNm, field_list, name_list
@@ -89,13 +90,13 @@ def baseline_save(
         )
     write_baseline(out, baseline)
     for kind, why in left_out.items():
-        typer.echo(f"pachon: warning: no metrics of kind {kind}: {why}", err=True)
+        print_warning(f"no metrics of kind {kind}: {why}")
     broken = [name for name, m in baseline.figures.items() if m.limit is not None and not m.limit.holds(m.value)]
     _warn_broken(broken)
     if as_json:
         print_json({"baseline": str(out), "figures": len(baseline.figures), "left_out": left_out})
     elif not quiet:
-        print(f"{out}: {len(baseline.figures)} metrics of {baseline.model}")
+        print_line(f"{out}: {len(baseline.figures)} metrics of {baseline.model}")
 
 
 @baseline_app.command("update")
@@ -121,13 +122,13 @@ def baseline_update(
     if as_json:
         print_json({"baseline": str(path), "updated": [d.name for d in check.moved]})
     elif not quiet:
-        print(f"{path}: {len(check.moved)} of {len(check.deviations)} metrics updated")
+        print_line(f"{path}: {len(check.moved)} of {len(check.deviations)} metrics updated")
 
 
 def _warn_broken(names: list[str]) -> None:
     """Print a warning for metrics that do not meet their requirements."""
     if names:
-        typer.echo(f"pachon: warning: {len(names)} metrics are beyond their limits, such as {names[0]}", err=True)
+        print_warning(f"{len(names)} metrics are beyond their limits, such as {names[0]}")
 
 
 @app.command("check")
@@ -170,6 +171,6 @@ def check_command(
         print_json({"passed": passed, "baselines": [check.summary() for check in checks]})
     elif not quiet:
         for check in checks:
-            print(check.text(everything))
+            print_line(check.text(everything))
     if not passed:
         raise typer.Exit(1)

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument
 
+from ..core.file_names import file_name
+from ..core.terminal import print_line
 from .inputs import configured_experiment, warnings_shown
 from .options import Json, Picture, picture_kind
 from .tables import Rows, print_json
@@ -65,11 +67,11 @@ def camera_command(
             return
     from ..pipeline.report.height_plots import vendor_heights_plot
 
-    path = Path(f"camera_{Path(heights).stem}.png") if picture is None else picture
+    path = Path(f"camera_{file_name(Path(heights).stem)}.png") if picture is None else picture
     write_bytes(path, picture_bytes(vendor_heights_plot(plane, f"CCD heights: {Path(heights).stem}"), kind))
     if not as_json:
         Rows(HEIGHT_COLUMNS, height_rows(statistics), HEIGHT_CAPTION).show()
-        print(f"picture: {path.resolve()}")
+        print_line(f"picture: {path.resolve()}")
 
 
 def _listed_camera(name: str) -> Camera | None:
@@ -101,11 +103,11 @@ def _show_camera(camera: Camera, picture: Path | None, kind: str, as_json: bool)
         print_json({"camera": camera.name, "pixel_um": round(camera.pixel_size * 1e6, 9), "ccds": ccds})
         if picture is None:
             return
-    path = Path(f"camera_{camera.name}.png") if picture is None else picture
+    path = Path(f"camera_{file_name(camera.name)}.png") if picture is None else picture
     write_bytes(path, picture_bytes(camera_plot(camera), kind))
     if not as_json:
         Rows(CAMERA_COLUMNS, [[str(cell) for cell in row] for row in rows], CAMERA_CAPTION).show()
-        print(f"picture: {path.resolve()}")
+        print_line(f"picture: {path.resolve()}")
 
 
 def _focal_plane(heights: str) -> FocalPlane:

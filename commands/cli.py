@@ -21,6 +21,7 @@ import typer
 from typer import Option
 
 from ..core.errors import PachonError
+from ..core.terminal import print_line
 from ..core.version import VERSION
 from . import (
     align,
@@ -135,13 +136,13 @@ def _usage_text(error: Any) -> str:
 
 
 def _fail(text: str, status: int = 2) -> int:
-    print(f"pachon: error: {' '.join(text.split())}", file=sys.stderr, flush=True)
+    print_line(f"pachon: error: {' '.join(text.split())}", error=True)
     return status
 
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        print(f"pachon {VERSION}")
+        print_line(f"pachon {VERSION}")
         raise typer.Exit
 
 

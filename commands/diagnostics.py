@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from ..core.terminal import print_line
 from .inputs import configured_experiment
 from .interrupt import interruptible
 from .options import (
@@ -82,7 +83,7 @@ def diagnose_command(
     if result.missing:
         reason = next(iter(result.missing.values()))
         wide_console().print(f"{len(result.missing)} CCDs are left out; the first: {reason}", style="bold")
-    print(f"diagnostics: {result.folder.resolve()}")
+    print_line(f"diagnostics: {result.folder.resolve()}")
 
 
 def _compare(
@@ -108,7 +109,7 @@ def _compare(
         print_json(found.as_dict())
     elif not quiet:
         Rows(PIFF_COLUMNS, piff_rows(found.models), PIFF_CAPTION).show()
-        print(f"comparison: {folder.resolve()}")
+        print_line(f"comparison: {folder.resolve()}")
 
 
 @app.command("attribute")
@@ -163,5 +164,5 @@ def attribute_command(
     if not quiet:
         Rows(ATTRIBUTION_COLUMNS, attribution_rows(result.metrics), ATTRIBUTION_CAPTION).show()
     if result.left_out:
-        print(f"left out of all cases, not to be modelled in one: {', '.join(result.left_out)}")
-    print(f"attribution: {out.resolve()}")
+        print_line(f"left out of all cases, not to be modelled in one: {', '.join(result.left_out)}")
+    print_line(f"attribution: {out.resolve()}")

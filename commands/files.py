@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
+from ..core.terminal import print_line
 from .options import Json
 from .tables import print_json
 
@@ -57,7 +58,7 @@ def new_command(
     }
     telescope, text = new_prescription(kind, **options)
     write_bytes(path, text.encode())
-    print(f"{telescope.description}: written to {path}")
+    print_line(f"{telescope.description}: written to {path}")
 
 
 @app.command("validate")
@@ -82,9 +83,9 @@ def validate_command(
         print_json([one.summary() for one in found])
     for one in found if not as_json else []:
         for problem in one.problems:
-            print(problem)
+            print_line(str(problem))
         if not one.problems:
-            print(f"{one.path}: {one.kind}, no problems")
+            print_line(f"{one.path}: {one.kind}, no problems")
     if any(one.problems for one in found):
         raise typer.Exit(2)
 
@@ -109,4 +110,4 @@ def schema_command(
 
     from ..studies.validation import file_schema
 
-    print(json.dumps(file_schema(kind), indent=1))
+    print_line(json.dumps(file_schema(kind), indent=1))

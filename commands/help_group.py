@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import typer
 from typer.core import TyperGroup
+
+from ..core.terminal import print_line
 
 
 class HelpGroup(TyperGroup):
@@ -17,6 +18,6 @@ class HelpGroup(TyperGroup):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Print the help where there are no arguments."""
         if not args and not ctx.resilient_parsing:
-            typer.echo(ctx.get_help())
+            print_line(ctx.get_help())
             ctx.exit(2)
         return super().parse_args(ctx, args)

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
+from ..core.terminal import print_line
 from .interrupt import interruptible
 from .options import AllCcds, Ccds, Json, Quiet, Raft, Threads, chosen_ccds
 from .tables import Rows, print_json
@@ -96,4 +97,4 @@ def images_command(
     elif not quiet:
         rows = [(name, str(result.objects.get(name, "kept"))) for name in images]
         Rows(("CCD", "objects"), rows, "Stars and galaxies whose centres lie on the image.").show()
-        print(f"images: {out.resolve()}")
+        print_line(f"images: {out.resolve()}")

@@ -8,9 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
-
 from ..core.errors import HeightWarning, PachonError, PrescriptionWarning
+from ..core.terminal import print_warning
 
 if TYPE_CHECKING:
     from ..models.telescope import Telescope
@@ -63,4 +62,4 @@ def warnings_shown(kind: type[Warning]) -> Iterator[None]:
         warnings.simplefilter("always", kind)
         yield
     for warning in caught:
-        typer.echo(f"pachon: warning: {warning.message}", err=True)
+        print_warning(str(warning.message))

@@ -42,7 +42,7 @@ def measure_command(
     ] = None,
     order: Annotated[int | None, Option(min=0, max=6, help="Order of polynomials over the image.")] = None,
     min_snr: Annotated[float, Option(help="Least S/N of stars.")] = 30.0,
-    resume: Annotated[bool, Option("--resume", help="Keep images that were measured in the same way.")] = False,
+    resume: Annotated[bool, Option("--resume", help="Keep whole products of images measured in the same way.")] = False,
     processes: Processes = None,
     threads: Threads = None,
     quiet: Quiet = False,

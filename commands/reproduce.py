@@ -9,6 +9,7 @@ import typer
 from rich.table import Table
 from typer import Argument, Option
 
+from ..core.terminal import print_line
 from .interrupt import interruptible
 from .options import Json, Quiet, Threads
 from .tables import print_json, wide_console
@@ -70,5 +71,5 @@ def _show_reproduced(summary: dict[str, Any], folder: Path) -> None:
         table.add_column(name, ratio=1)
     for name, figure in summary["figures"].items():
         table.add_row(name, figure["paper"], figure["here"], f"{figure['verdict']}: {figure['why']}")
-    wide_console().print(table, markup=False, highlight=False)
-    print(f"figures: {folder.resolve()}")
+    wide_console().print(table, highlight=False)
+    print_line(f"figures: {folder.resolve()}")

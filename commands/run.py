@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,6 +9,7 @@ import typer
 from typer import Option
 
 from ..core.errors import ConfigError
+from ..core.terminal import print_line
 from .inputs import configured_experiment
 from .interrupt import interruptible
 from .options import AllCcds, Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, chosen_ccds
@@ -81,9 +81,9 @@ def run_command(
         )
     if quiet:  # the reporter has printed nothing
         for name, reason in result.not_modelled.items():
-            print(f"pachon: {left_out_line(name, reason)}", file=sys.stderr)
+            print_line(f"pachon: {left_out_line(name, reason)}", error=True)
         for warning in result.summary.get("warnings", ()):
-            print(f"pachon: {warning}", file=sys.stderr)
+            print_line(f"pachon: {warning}", error=True)
     if as_json:
         missing = {"missing": list(result.missing), "not_modelled": result.not_modelled}
         print_json(result.summary if result.report else missing)
@@ -106,8 +106,8 @@ def _part(text: str | None) -> tuple[int, int]:
 def _show_part(result: Any) -> None:
     count = len(result.missing)
     some = f"{', '.join(result.missing[:3])}{', ...' if count > 3 else ''}"
-    print(f"{len(result.computed)} CCDs computed, {len(result.kept)} were there; {count} are missing: {some}")
-    print("the last part to end writes the report")
+    print_line(f"{len(result.computed)} CCDs computed, {len(result.kept)} were there; {count} are missing: {some}")
+    print_line("the last part to end writes the report")
 
 
 def _show_run(result: Any, seconds: float) -> None:
@@ -138,4 +138,4 @@ def _show_run(result: Any, seconds: float) -> None:
     console.print(f"\n{len(result.computed)} CCDs computed, {len(result.kept)} kept, {seconds:.0f} s")
     if result.not_modelled:
         console.print(f"left out, not to be modelled: {', '.join(result.not_modelled)}", style="bold")
-    print(f"report: {result.report.resolve()}")
+    print_line(f"report: {result.report.resolve()}")

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from typer import Option
 
+from ..core.terminal import print_line
 from .inputs import configured_experiment
 from .interrupt import interruptible
 from .options import Ccds, Config, Json, Quiet, Raft, Threads, one_name_list
@@ -79,4 +80,4 @@ def shim_command(
             rows,
             _CAPTION,
         ).show()
-    print(f"shims: {out.resolve()}")
+    print_line(f"shims: {out.resolve()}")

@@ -9,6 +9,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import PachonError
+from ..core.terminal import print_line
 from .interrupt import interruptible
 from .options import Json, Quiet, Threads
 from .tables import Rows, print_json
@@ -79,7 +80,7 @@ def stack_images_command(
     elif not quiet:
         if metrics:
             _show(metrics)
-        print(f"images: {stack.folder.resolve()}")
+        print_line(f"images: {stack.folder.resolve()}")
 
 
 def _show(metrics: dict[str, dict[str, Any]]) -> None:

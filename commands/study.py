@@ -9,6 +9,7 @@ import typer
 from typer import Option
 
 from ..core.errors import ConfigError
+from ..core.terminal import print_line
 from .inputs import configured_experiment
 from .interrupt import interruptible
 from .options import Config, Json, Quiet, Threads, TruthStars, name_list, one_name_list
@@ -99,7 +100,7 @@ def study_command(
         return
     if not quiet:
         _show(result)
-    print(f"study: {out.resolve()}")
+    print_line(f"study: {out.resolve()}")
 
 
 def _show(result: Study) -> None:

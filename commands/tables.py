@@ -7,8 +7,12 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
+
+from ..core.terminal import terminal_json, terminal_text
 
 
 class Column(NamedTuple):
@@ -68,10 +72,10 @@ class Rows:
         """Print the table."""
         # Columns are never cut: a narrower terminal wraps the lines itself.
         columns = zip(self.headings, *self.rows, strict=True)
-        console = Console(width=max(wide_console().width, sum(max(map(len, column)) + 2 for column in columns)))
+        console = wide_console(sum(max(cell_len(terminal_text(text)) for text in column) + 2 for column in columns))
         table = plain_table()
         for i, name in enumerate(self.headings):
-            table.add_column(name.replace("[", "\\["), justify="left" if i < self.left else "right", no_wrap=True)
+            table.add_column(name, justify="left" if i < self.left else "right", no_wrap=True)
         for row in self.rows:
             table.add_row(*row)
         console.print(table)
@@ -101,7 +105,7 @@ def print_json(content: Any) -> None:
     """Print metrics as JSON."""
     from ..core.files import json_text
 
-    print(json_text(content))
+    print(terminal_json(json_text(content)))
 
 
 def number_texts(values: Iterable[Any], form: str) -> list[str]:
@@ -119,9 +123,21 @@ def _number(value: float, form: str) -> str:
     return format(0.0, form) if float(text) == 0.0 else text
 
 
-def wide_console() -> Console:
-    """Return a console of at least 132 columns: a narrower terminal wraps the lines of a table itself."""
-    return Console(width=max(Console().width, 132))
+class PlainConsole(Console):
+    """Console that shows texts as they are: no markup, no names of emoji, control characters as escapes."""
+
+    def __init__(self, least_width: int) -> None:
+        super().__init__(markup=False, emoji=False)
+        self.width = max(self.width, least_width)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return a text to be printed; cells of tables come here as well."""
+        return super().render_str(terminal_text(text), **options)
+
+
+def wide_console(least_width: int = 0) -> Console:
+    """Return a console of 132 columns or more: a narrower terminal wraps the lines of a table itself."""
+    return PlainConsole(max(132, least_width))
 
 
 def plain_table(**options: Any) -> Table:

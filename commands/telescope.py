@@ -9,6 +9,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import PrescriptionWarning
+from ..core.terminal import print_line
 from .imports import import_modules
 from .inputs import load_model, warnings_shown
 from .options import GlassCatalogues, Json, Lenient, Model
@@ -117,4 +118,4 @@ def convert_command(
     telescope = load_model(model, lenient, glass_catalogue or ())
     with warnings_shown(PrescriptionWarning):
         save_telescope(telescope, out, format=format, lenient=lenient)
-    print(f"{telescope.name}: {len(telescope.surfaces)} surfaces written to {out}")
+    print_line(f"{telescope.name}: {len(telescope.surfaces)} surfaces written to {out}")

@@ -8,6 +8,8 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from ..core.file_names import file_name
+from ..core.terminal import print_line
 from .inputs import errors_of, load_model
 from .interrupt import interruptible
 from .options import GlassCatalogues, Json, Lenient, Model, Quiet, Threads
@@ -53,6 +55,7 @@ def tolerance_command(
     """
     from ..core.files import make_folder
     from ..models.io.bundled import BUNDLED
+    from ..models.paraxial import following_stop
     from ..studies.tolerance.file import load_tolerances, with_settings
     from ..studies.tolerance.product import tolerance_summary, write_tolerances
     from ..studies.tolerance.study import run_tolerances
@@ -60,7 +63,7 @@ def tolerance_command(
     telescope = load_model(model, lenient, glass_catalogue or ())
     source = model if model in BUNDLED else str(Path(model).resolve())
     file = with_settings(load_tolerances(tolerances, source), method=method, draws=draws, seed=seed)
-    folder = out or Path(f"tolerance_{telescope.name}")
+    folder = out or Path(f"tolerance_{file_name(telescope.name)}")
     make_folder(folder)
     resumed = f"go on with: pachon tolerance {model} {tolerances} -o {folder} --resume"
     with (
@@ -83,7 +86,9 @@ def tolerance_command(
         return
     if not quiet:
         _show(summary)
-    print(f"tolerances: {folder.resolve()}")
+        if following_stop(telescope) is not telescope:
+            print_line(f"rays fill the stop {telescope.design_data.stop}, as with aiming: real")
+    print_line(f"tolerances: {folder.resolve()}")
 
 
 def _show(summary: dict[str, Any]) -> None:
@@ -100,8 +105,10 @@ def _show(summary: dict[str, Any]) -> None:
     Rows(headings, rows, caption).show()
     reached = ", ".join(f"{p} % {summary[f'reached_by_{p}_percent']:.5g}" for p in (50, 80, 95))
     lost = f"; {summary['lost']} without light" if summary["lost"] else ""
-    print(f"{summary['draws']} telescopes, {summary['method']}: reached by {reached}{plain}{lost}")
+    print_line(f"{summary['draws']} telescopes, {summary['method']}: reached by {reached}{plain}{lost}")
     if "yield" in summary:
         found = summary["yield"]
         interval = f"{100 * found['low']:.1f} to {100 * found['high']:.1f} %"
-        print(f"requirement {summary['requirement']:g}{plain}: met by {100 * found['fraction']:.1f} % ({interval})")
+        print_line(
+            f"requirement {summary['requirement']:g}{plain}: met by {100 * found['fraction']:.1f} % ({interval})"
+        )

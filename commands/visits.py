@@ -9,6 +9,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError
+from ..core.terminal import print_line
 from .interrupt import interruptible
 from .options import AllCcds, Ccds, Json, Quiet, Raft, Threads, chosen_ccds
 from .tables import Rows, print_json
@@ -103,7 +104,7 @@ def visits_command(
         print_json(result.summary)
     elif not quiet:
         _show(result.summary["stacks"])
-        print(f"visits: {out.resolve()}")
+        print_line(f"visits: {out.resolve()}")
 
 
 def angles_of(option: str, text: str | None) -> str | tuple[float, ...] | None:
@@ -184,4 +185,4 @@ def null_test_command(
             rows.append((visits, density, *(f"{metrics[key]:.1e}" for key in keys), *biases))
         headings = ("visits", "per arcmin²", "|ξ+|", "shot noise", "difference", "m1", "c1", "m1 true", "c1 true")
         Rows(headings, rows, _NULL_CAPTION).show()
-        print(f"null test: {folder.resolve()}")
+        print_line(f"null test: {folder.resolve()}")

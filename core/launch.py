@@ -17,6 +17,7 @@ from typing import Any
 import warp as wp
 
 from .errors import ProductError
+from .terminal import print_line
 from .threads import thread_count
 
 wp.config.log_level = wp.LOG_ERROR
@@ -56,7 +57,7 @@ def start_warp() -> None:
             os.close(saved_stderr)
             os.close(null_device)
         if cache_warning:
-            print(cache_warning, file=sys.stderr, flush=True)
+            print_line(cache_warning, error=True)
         _started.append(True)
 
 
@@ -73,10 +74,10 @@ def load_kernels(kernel: wp.Kernel, device: str = "cpu") -> None:
         block = 1 if device == "cpu" else 256
         if not (Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(block)).exists():
             name = kernel.module.name.rpartition(".")[2]
-            print(f"compiling {name} for this machine (once)", file=sys.stderr, flush=True)
+            print_line(f"compiling {name} for this machine (once)", error=True)
         cache_warning = _with_kernel_cache(lambda: wp.load_module(kernel.module, device=device, block_dim=block))
         if cache_warning:
-            print(cache_warning, file=sys.stderr, flush=True)
+            print_line(cache_warning, error=True)
         _loaded.add(key)
 
 

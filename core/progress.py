@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,6 +19,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.text import Text
+
+from .terminal import print_line, terminal_text
 
 
 class Stage:
@@ -41,7 +42,7 @@ class Stage:
     def line(self, text: str) -> None:
         """Write one line, unless there is a bar."""
         if self._say:
-            print(text, file=sys.stderr, flush=True)
+            print_line(text, error=True)
 
     def step(self, name: str, done: int, total: int) -> None:
         """Write that one more part is done, and the time left, unless there is a bar."""
@@ -77,7 +78,7 @@ class Reporter:
     def line(self, text: str) -> None:
         """Write one line."""
         if not self.quiet:
-            print(text, file=sys.stderr, flush=True)
+            print_line(text, error=True)
 
     @contextmanager
     def stage(self, title: str, total: int | None = None) -> Iterator[Stage]:
@@ -93,7 +94,7 @@ class Reporter:
             return
         columns = (
             SpinnerColumn(finished_text="[green]✓"),
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=32),
             MofNCompleteColumn(),
             _SpeedColumn(),
@@ -102,7 +103,7 @@ class Reporter:
         )
         shown = columns if total is not None else (*columns[:2], columns[-1])
         with Progress(*shown, console=console) as bars:
-            task = bars.add_task(title, total=total)
+            task = bars.add_task(terminal_text(title), total=total)
             yield Stage(lambda count: bars.advance(task, count), False, self._check)
             bars.update(task, total=total or 1, completed=total or 1)
         self.seconds[title] = time.perf_counter() - start

@@ -137,16 +137,16 @@ class CcdImage(Result):
         Checksums may be missing, as in files that other programs have written.
         """
         hdus = read_fits(Path(path), checksums=False)
-        planes = [_plane(path, hdus, name) for name in ("IMAGE", "VARIANCE", "MASK")]
-        if len({plane.shape for plane in planes}) > 1:
-            shapes = ", ".join(str(plane.shape) for plane in planes)
+        image, variance, mask = (_plane(path, hdus, name) for name in ("IMAGE", "VARIANCE", "MASK"))
+        if not image.shape == variance.shape == mask.shape:
+            shapes = f"{image.shape}, {variance.shape}, {mask.shape}"
             raise ProductError(f"IMAGE, VARIANCE and MASK have shapes {shapes}; expected the same", file=path)
         if "TRUTH" not in hdus or not isinstance(hdus["TRUTH"], fits.BinTableHDU):
             raise ProductError("no image of a CCD (the table TRUTH is missing)", file=path)
         header = hdus[0].header
         try:
             objects = {key: column(hdus["TRUTH"], key) for key in OBJECT_COLUMNS}
-            return cls(str(header["CCD"]), *planes, hdus["IMAGE"].header, objects, _stamp(header))
+            return cls(str(header["CCD"]), image, variance, mask, hdus["IMAGE"].header, objects, _stamp(header))
         except KeyError as error:
             raise ProductError(f"no image of a CCD ({' '.join(str(error.args[0]).split())})", file=path) from None
 

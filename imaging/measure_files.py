@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections import Counter
 from collections.abc import Sequence
@@ -11,14 +10,14 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from astropy.table import Table
+from astropy.io import fits
 
 from ..core.errors import ConfigError, DomainError, ProductError
-from ..core.files import content_hash, parsing, read_bytes
+from ..core.files import content_hash
 from ..core.memory import require_bytes
 from ..core.ordered_jobs import ordered_results
+from ..core.products import read_fits, write_fits
 from ..core.progress import Reporter
-from ..core.table_files import write_table
 from ..core.version import VERSION
 from ..core.workers import MakeWorkers
 from ..pipeline.config import digest
@@ -65,12 +64,14 @@ class FileMeasurement:
             catalogue = measure_image(image, psf=psf, threads=threads, **self.options)
         except DomainError as error:
             return str(error)
-        if psf is None:
-            catalogue.psf.write(self.product(path, PSF_SUFFIX))
         table, metrics = catalogue.table(), catalogue.metrics()
         table.meta |= {"MEASHASH": self.digest(path), "METRICS": json.dumps(metrics)}
+        if psf is None:
+            model_file = self.product(path, PSF_SUFFIX)
+            catalogue.psf.write(model_file)
+            table.meta["PSFHASH"] = content_hash(model_file, ProductError)
         # Last: a resumed measurement takes it for the sign of a finished image.
-        write_table(self.product(path, CATALOGUE_SUFFIX), table)
+        write_fits(self.product(path, CATALOGUE_SUFFIX), [fits.table_to_hdu(table)], None, [])
         return metrics
 
     def product(self, path: Path, suffix: str) -> Path:
@@ -84,15 +85,21 @@ class FileMeasurement:
         return digest({"image": image, "psf": model, "options": self.options, "version": VERSION})
 
     def finished(self, path: Path) -> dict[str, Any] | None:
-        """Return the metrics of an image that is measured already, in the same way."""
-        file = self.product(path, CATALOGUE_SUFFIX)
+        """Return the metrics of an image that is measured already, in the same way; None if a product is damaged.
+
+        The catalogue is checked by its FITS checksums, the PSF model beside it by the hash that the catalogue has.
+        """
         try:
-            data = read_bytes(file, ProductError)
-            with parsing(file, "damaged or no table", ProductError):
-                meta = Table.read(io.BytesIO(data), format="fits").meta
-        except ProductError:
+            _, table = read_fits(self.product(path, CATALOGUE_SUFFIX))
+            if (
+                self.psf is None
+                and content_hash(self.product(path, PSF_SUFFIX), ProductError) != table.header["PSFHASH"]
+            ):
+                return None
+            return json.loads(table.header["METRICS"]) if table.header["MEASHASH"] == self.digest(path) else None
+        except (ProductError, LookupError, ValueError):
+            # Of another version or program, too.
             return None
-        return json.loads(meta["METRICS"]) if meta.get("MEASHASH") == self.digest(path) else None
 
 
 @lru_cache(maxsize=1)
@@ -136,7 +143,7 @@ def measure_files(
     options : dict, optional
         Further arguments of :func:`~.measure.measure_image`.
     resume : bool
-        Keep the products of images that were measured in the same way.
+        Keep the products of images that were measured in the same way, where both are whole by their checksums.
     workers : callable, optional
         Function that makes the workers, which see the same files; by default this process.
     threads : int, optional

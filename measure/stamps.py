@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy import fft
+from scipy import fft, ndimage
 
 from ..core.errors import DomainError
 from ..core.units import real_array
@@ -64,6 +64,10 @@ def observe_stamps(
     return result
 
 
+# Area of a masked pixel that must fall on another one to mask it, too: it holds a tenth of the value filled in.
+_OVERLAP = 0.1
+
+
 def center_stamps(images: Any, x: Any, y: Any, size: int = 31, *, normalize: bool = True) -> np.ndarray:
     """Shift stars so that their centroid falls on the centre of a pixel, and cut stamps around it.
 
@@ -103,22 +107,51 @@ def center_stamps(images: Any, x: Any, y: Any, size: int = 31, *, normalize: boo
         offsets = np.stack([np.broadcast_to(np.asarray(v, dtype=np.float64), (count,)) for v in (x, y)], axis=1)
     except ValueError as error:
         raise DomainError(f"x and y have shapes {np.shape(x)} and {np.shape(y)}: expected {count} centroids") from error
-    # Pixel (ny//2, nx//2) becomes the middle of the stamp: the central one, or the one after the centre of an even
-    # image.
-    rows, columns = (slice(n // 2 - size // 2, n // 2 - size // 2 + size) for n in (ny, nx))
+    rows, columns = _middle_pixels(size, (ny, nx))
     middle = np.array([nx // 2 - (nx - 1) / 2.0, ny // 2 - (ny - 1) / 2.0])
     result = np.full((count, size, size), np.nan)
     for i, image in enumerate(stack):
         if not np.all(np.isfinite(offsets[i])):
             continue
-        stamp = _fourier_shift(image, *(middle - offsets[i]))[rows, columns]
+        stamp = fourier_shift(image, *(middle - offsets[i]))[rows, columns]
         total = stamp.sum() if normalize else 1.0
         if total > 0.0:
             result[i] = stamp / total
     return result
 
 
-def _fourier_shift(image: np.ndarray, dx: float, dy: float) -> np.ndarray:
+def center_masks(masks: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> np.ndarray:
+    """Return masks [n, ny, nx] as :func:`center_stamps` moves and cuts their stamps, bool [n, size, size].
+
+    A centroid that is NaN counts as the centre.
+    """
+    ny, nx = masks.shape[1:]
+    rows, columns = _middle_pixels(size, (ny, nx))
+    shifts = np.array([nx // 2 - (nx - 1) / 2.0, ny // 2 - (ny - 1) / 2.0]) - np.nan_to_num(np.stack([x, y], axis=1))
+    result = np.zeros((len(masks), size, size), dtype=bool)
+    for i in np.flatnonzero(masks.any(axis=(1, 2))):
+        result[i] = shift_mask(masks[i], *shifts[i])[rows, columns]
+    return result
+
+
+def shift_mask(mask: np.ndarray, dx: float, dy: float) -> np.ndarray:
+    """Return the pixels of an image moved by (dx, dy) that masked ones overlap by a tenth of a pixel or more."""
+    if not mask.any():
+        return mask
+    overlap = ndimage.shift(mask.astype(np.float64), (dy, dx), order=1, mode="constant")
+    return np.asarray(overlap > _OVERLAP)
+
+
+def _middle_pixels(size: int, shape: tuple[int, int]) -> tuple[slice, slice]:
+    """Return rows and columns of a stamp of odd size in an image of a shape (ny, nx).
+
+    Its middle is pixel (ny // 2, nx // 2): the central one, or the one after the centre of an even image.
+    """
+    first = [n // 2 - size // 2 for n in shape]
+    return slice(first[0], first[0] + size), slice(first[1], first[1] + size)
+
+
+def fourier_shift(image: np.ndarray, dx: float, dy: float) -> np.ndarray:
     """Return the band-limited image moved by (dx, dy) pixels.
 
     The highest frequency of an even grid stands for both its signs, so its phase is the mean of the two, a cosine.

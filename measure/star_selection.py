@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import ndimage
+from scipy import fft, ndimage
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
@@ -29,7 +29,8 @@ _FEWEST = 3
 class StarFlag(IntFlag):
     """Defects of a star; zero for a good one.
 
-    ``UNUSABLE``: a pixel is not finite, or there is no light to scale the median star to.
+    ``UNUSABLE``: a pixel is not finite, or there is no light to scale the median star to. ``MASKED``: masked pixels
+    hold more than half of the core or of the weighted light (:func:`~pachon.fit_own_stars`).
     """
 
     GOOD = 0
@@ -37,6 +38,7 @@ class StarFlag(IntFlag):
     COSMIC_RAY = 2
     SATURATED = 4
     UNUSABLE = 8
+    MASKED = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,14 +200,17 @@ def _sharp_pixels(residual: np.ndarray, variance: np.ndarray, fraction: float, t
 
 def _matched_filter(residual: np.ndarray, variance: np.ndarray, star: np.ndarray) -> float:
     """Return the largest significance of a star in the residual."""
-    found = ndimage.correlate(residual, star, mode="constant", origin=_peak_offset(star))
-    error = np.sqrt(ndimage.correlate(variance, star**2, mode="constant", origin=_peak_offset(star)))
-    return float((found / error).max())
+    peak = np.unravel_index(star.argmax(), star.shape)
+    light, squares = _correlate(residual, star, peak), _correlate(variance, star**2, peak)
+    return float((light / np.sqrt(squares)).max())
 
 
-def _peak_offset(star: np.ndarray) -> tuple[int, ...]:
-    """Return the offset of the star's peak from the middle of the stamp, in the convention of SciPy's filters."""
-    return tuple(int(p) - n // 2 for p, n in zip(np.unravel_index(star.argmax(), star.shape), star.shape, strict=True))
+def _correlate(image: np.ndarray, star: np.ndarray, peak: tuple[np.intp, ...]) -> np.ndarray:
+    """Return sums over pixels of image times a star of the same shape whose peak stands on each pixel."""
+    full = tuple(fft.next_fast_len(2 * n - 1, real=True) for n in image.shape)
+    product = fft.irfft2(fft.rfft2(image, full) * fft.rfft2(star[::-1, ::-1], full), full)
+    rows, columns = (slice(n - 1 - int(at), 2 * n - 1 - int(at)) for n, at in zip(image.shape, peak, strict=True))
+    return np.asarray(product[rows, columns])
 
 
 def _stamp_cube(stamps: Any) -> np.ndarray:

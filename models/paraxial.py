@@ -175,17 +175,17 @@ class StopImage:
         return distance / (value * cone) if cone else math.inf
 
 
-def stop_image(telescope: Telescope, *, front: bool = False) -> StopImage:
+def stop_image(telescope: Telescope, *, front: bool = False, tilted: bool = False) -> StopImage:
     """Return the paraxial image of a telescope's stop at its default wavelength.
 
     With `front` the surfaces behind the stop are left out, and may be off the axis; its image, and the pupil of an
-    aperture that is not a focal ratio, do not depend on them.
+    aperture that is not a focal ratio, do not depend on them. With `tilted` any surface may be, as for Zemax.
     DomainError if its design data name no stop, a surface is off the axis, or the image is at infinity.
     """
     data = telescope.design_data
     if data.stop is None:
         raise DomainError(f"{telescope.name}: expected a surface that is the stop (design data: stop)")
-    surfaces = ParaxialSurfaces.of(telescope, data.stop, front=front)
+    surfaces = ParaxialSurfaces.of(telescope, data.stop, front=front, tilted=tilted)
     distance = telescope.object_distance - telescope.surfaces[0].vertex[2]
     image = StopImage.of(surfaces, telescope.default_wavelength, distance, telecentric=data.telecentric)
     if image is None:
@@ -214,8 +214,13 @@ def with_floating_pupil(telescope: Telescope) -> Telescope:
     DomainError
         If the design data have no stop or no aperture, a surface is off the axis, or the pupil has no finite size.
     """
+    return _floating(telescope)
+
+
+def _floating(telescope: Telescope, *, tilted: bool = False) -> Telescope:
+    """Return :func:`with_floating_pupil`; with `tilted` of surfaces off the axis too, as if they were on it."""
     data = telescope.design_data
-    image = stop_image(telescope, front=data.aperture not in ("f_number", "working_f_number"))
+    image = stop_image(telescope, front=data.aperture not in ("f_number", "working_f_number"), tilted=tilted)
     if data.aperture is None or data.aperture_value is None:
         raise DomainError(f"{telescope.name}: expected an aperture in its design data")
     diameter = image.diameter(data.aperture, data.aperture_value)
@@ -223,7 +228,53 @@ def with_floating_pupil(telescope: Telescope) -> Telescope:
         raise DomainError(
             f"{telescope.name}: {data.aperture} = {data.aperture_value:g}: expected a pupil of finite size"
         )
-    return replace(telescope, stop_z=telescope.surfaces[0].vertex[2] - image.z + 0.0, pupil_diameter=diameter)
+    return replace(telescope, stop_z=_pupil_height(telescope, image), pupil_diameter=diameter)
+
+
+def _pupil_height(telescope: Telescope, image: StopImage) -> float:
+    """Return the height of the image of the stop [m], telescope frame."""
+    return telescope.surfaces[0].vertex[2] - image.z + 0.0
+
+
+def stop_is_inside(t: Telescope) -> bool:
+    """Return whether the stop has mirrors or lens surfaces in front of it: a change of them moves its image."""
+    if t.design_data.stop is None:
+        return False
+    front = t.surfaces[: t.surface_names.index(t.design_data.stop)]
+    return any(s.interaction in (Interaction.MIRROR, Interaction.REFRACT) for s in front)
+
+
+def following_stop(t: Telescope) -> Telescope:
+    """Return a telescope whose rays follow its stop when it changes: aimed at it where it is inside.
+
+    Rays that are aimed anyway, those of a telecentric object space, and those of a telescope whose stop is in front of
+    all mirrors and lenses stay as they are.
+    """
+    data = t.design_data
+    if data.aiming != "off" or data.telecentric or not stop_is_inside(t):
+        return t
+    return t.with_design(aiming="real")
+
+
+def with_moved_pupil(t: Telescope) -> Telescope:
+    """Return a changed telescope with its entrance pupil where its stop, inside it, is imaged now.
+
+    The diameter of the pupil stays, of an object at a finite distance the angle of the beam; a stated size of the stop
+    keeps that. Another aperture that the change made untrue becomes a diameter. As for Zemax, surfaces off the axis
+    count as if they were on it. A telescope without such a pupil, or whose stop is not inside, is returned as it is.
+    """
+    data = t.design_data
+    if data.telecentric or not stop_is_inside(t) or stop_makes_pupil(t):
+        return t
+    with suppress(DomainError):
+        stated = t
+        if data.aperture not in ("stop", "object_na"):
+            height = _pupil_height(t, stop_image(t, front=True, tilted=True))
+            farther = (t.object_distance - height) / (t.object_distance - t.stop_z)
+            diameter = t.pupil_diameter * (abs(farther) if math.isfinite(t.object_distance) else 1.0)
+            stated = t.with_design(aperture="entrance_pupil", aperture_value=diameter)
+        return _floating(stated, tilted=True)
+    return t
 
 
 def stop_makes_pupil(t: Telescope) -> bool:
@@ -231,7 +282,7 @@ def stop_makes_pupil(t: Telescope) -> bool:
     if t.design_data.stop is None or t.design_data.aperture is None:
         return False
     try:
-        floating = with_floating_pupil(t)
+        floating = _floating(t, tilted=True)
     except DomainError:
         return False
     close = {"rel_tol": _ROUNDING, "abs_tol": _ROUNDING * t.pupil_diameter}
@@ -264,15 +315,20 @@ def with_true_aperture(telescope: Telescope) -> Telescope:
     or not the stop makes it.
     """
     data = telescope.design_data
-    if data.stop is None or data.aperture is None or data.telecentric or stop_makes_pupil(telescope):
+    if data.stop is None or data.telecentric or stop_makes_pupil(telescope):
         return telescope
     stated = telescope
-    if data.aperture in ("f_number", "working_f_number", "entrance_pupil"):
+    if data.aperture in (None, "f_number", "working_f_number", "entrance_pupil"):
         stated = telescope.with_design(aperture="entrance_pupil", aperture_value=telescope.pupil_diameter)
-    if data.aiming != "off" and math.isinf(telescope.object_distance):
-        # Surfaces off the axis have no such image; the rays do not depend on it.
-        with suppress(DomainError):
-            stated = with_floating_pupil(stated)
+    # Field angles of an object at a finite distance are those of rays through the middle of the pupil.
+    same_fields = math.isinf(telescope.object_distance) or (bool(data.fields) and data.field_type != "angle")
+    if data.aiming != "off" and same_fields:
+        if stop_is_inside(telescope):
+            stated = with_moved_pupil(stated)
+        elif math.isinf(telescope.object_distance):
+            # Surfaces off the axis have no such image; the rays do not depend on it.
+            with suppress(DomainError):
+                stated = with_floating_pupil(stated)
     untrue = data.aperture in ("f_number", "working_f_number") and not _states_diameter(telescope)
     return stated if untrue or stop_states_rays(stated) else telescope
 
@@ -280,7 +336,7 @@ def with_true_aperture(telescope: Telescope) -> Telescope:
 def _states_diameter(t: Telescope) -> bool:
     """Return whether the stated aperture makes the diameter of the pupil, or cannot be compared with it."""
     try:
-        floating = with_floating_pupil(t)
+        floating = _floating(t, tilted=True)
     except DomainError:
         return True
     return math.isclose(floating.pupil_diameter, t.pupil_diameter, rel_tol=_ROUNDING)

@@ -82,7 +82,7 @@ def fit_donuts(
     ----------
     telescope : Telescope
         Telescope as it is believed to be, defocus included: ``tel.perturbed("Detector", shift=(0, 0, 1.5e-3))`` is
-        behind focus.
+        behind focus; ``"Camera"`` in its place where the camera moves, as in full-array mode.
     images : array_like, shape [n, ny, nx], or sequence of n arrays
         Stamps [electrons], sky subtracted, ``[iy, ix]`` along +y and +x of the detector, each centred on its donut
         within a few pixels.

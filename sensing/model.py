@@ -95,8 +95,8 @@ class DonutDetector:
     focal_plane : FocalPlane, optional
         Heights of the CCDs; the nominal flat plane by default.
     defocus : float or array, shape [n]
-        Shift of the detector of each image along its z, beside that of the telescope [m]: 0 for all in one plane, or
-        1.5 mm and 0 for donuts and in-focus stars, which then share one likelihood.
+        Shift of the detector, not of the camera, of each image along its z, beside that of the telescope [m]: 0 for all
+        in one plane, or 1.5 mm and 0 for donuts and in-focus stars, which then share one likelihood.
     saturation : float, optional
         Level from which on pixels are saturated [electrons]. Many pixels of the same greatest value are taken to be
         saturated without it.

@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Any, Protocol, TypedDict
 import typer
 
 from ...core.errors import PachonError
+from ...core.file_names import file_name
+from ...core.terminal import print_line
 from .. import options
 from ..imports import import_modules
 from ..inputs import load_model
@@ -167,7 +169,7 @@ def design_command(
                 option = next((key for key in option_names if error.key == _ARGUMENTS.get(key, key)), None)
                 raise error if option is None else error.renamed(f"--{option.replace('_', '-')}") from None
             outcome = result if isinstance(result, Outcome) else Outcome(result)
-            path = picture or Path(f"{outcome.stem or f'{name}_{shared.telescope.name}'}.png")
+            path = picture or Path(f"{outcome.stem or f'{name}_{file_name(shared.telescope.name)}'}.png")
             _deliver(outcome, outcome.table or rows, path, kind, as_json)
 
         # Typer reads the options of a command from its signature.
@@ -215,5 +217,5 @@ def _deliver(outcome: Outcome, table: Callable[[Any], Rows], path: Path, kind: s
         return
     table(outcome.result).show()
     for note in outcome.notes:
-        print(note)
-    print(f"picture: {path.resolve()}")
+        print_line(note)
+    print_line(f"picture: {path.resolve()}")

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
 from typer import Option
 
 from ...core.errors import ConfigError
+from ...core.terminal import print_line
 from ..tables import FIELD, Column
 from .command import SharedOptions, Study, design_command
 
@@ -214,10 +214,10 @@ def ghosts(
     pairs = len(ghost_pairs(shared.telescope))
     traced = max(pairs if brightest is None else min(brightest, pairs), 1)
     if traced > _MANY_PAIRS:
-        typer.echo(
+        print_line(
             f"ghosts of {pairs} pairs of surfaces, {rays} rays each: with --brightest 20 or --rays 4000 a tenth of "
             "the time or less",
-            err=True,
+            error=True,
         )
     with shared.stage("ghosts", traced) as progress:
         return compute(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Option
 
 from ...core.errors import ConfigError
+from ...core.file_names import file_name
 from ..tables import FIELD, Column, Rows, field_headings, number_texts, numbers_of
 from .command import Outcome, SharedOptions, Study, design_command
 
@@ -132,7 +133,7 @@ def zernikes(
         terms = double_zernikes(
             telescope, shared.wavelength, jmax=jmax, kmax=double, pupil=pupil, **shared.trace_options
         )
-        return Outcome(terms, _double_rows, stem=f"double_zernikes_{telescope.name}")
+        return Outcome(terms, _double_rows, stem=f"double_zernikes_{file_name(telescope.name)}")
     fields = field_disc(telescope) if over_field else shared.fields
     ordering = "fringe" if fringe else "noll"
     coefficients = wavefront_zernikes(

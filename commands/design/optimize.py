@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Option
 
 from ...core.errors import ConfigError, PrescriptionError, PrescriptionWarning
+from ...core.file_names import file_name
 from ..inputs import errors_of, warnings_shown
 from ..options import name_list
 from ..tables import Column
@@ -68,6 +69,7 @@ def sensitivity(
     from ...design.optimize.sensitivity_file import write_sensitivity
     from ...models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
     from ...models.parameters.parameters import usual_parameters
+    from ...models.paraxial import following_stop
 
     if out is not None and out.suffix not in (".fits", ".ecsv"):
         raise ConfigError(f"--out {out}: expected a name that ends in .fits or .ecsv")
@@ -80,10 +82,12 @@ def sensitivity(
     else:
         variables = usual_parameters(telescope) if parameters is None else name_list(parameters, "--parameters")
     result = compute(telescope, variables, *where, n_zernike=zernikes, **shared.trace_options)
-    path = out or Path(f"sensitivity_{telescope.name}.fits")
+    path = out or Path(f"sensitivity_{file_name(telescope.name)}.fits")
     write_sensitivity(path, result)
     values, _ = result.modes()
     notes = [f"singular values: {values[0]:.3g} to {values[-1]:.3g}", f"matrix: {path.resolve()}"]
+    if following_stop(telescope) is not telescope:
+        notes.insert(0, f"rays fill the stop {telescope.design_data.stop}, as with --aiming real")
     return Outcome(result, notes=notes)
 
 
@@ -180,7 +184,7 @@ def optimize(
             **shared.trace_options,
         )
     optimum = _optimum(result)
-    paths = [out or Path(f"optimized_{telescope.name}.yaml") for telescope in optimum.telescopes]
+    paths = [out or Path(f"optimized_{file_name(telescope.name)}.yaml") for telescope in optimum.telescopes]
     with warnings_shown(PrescriptionWarning):
         for telescope, path in zip(optimum.telescopes, paths, strict=True):
             try:
@@ -237,6 +241,13 @@ def _notes(result: Any) -> list[str]:
     s, optimum = result.summary(), _optimum(result)
     unit, (start, end) = "µrad" if optimum.in_angles else "µm", 1e6 * optimum.merits
     lines = [f"rms of {s['merit']}: {start:.6g} -> {end:.6g} {unit}, {s['steps']} steps"]
+    filled, stated = 1e6 * optimum.remeasured.T
+    if stops := ", ".join(optimum.filled_stops):
+        lines.append(f"rays fill the stop {stops}, as with --aiming real; without: {_from_to(stated)} {unit}")
+    if not optimum.is_as_measured:
+        lines.append(f"measured anew on the saved lens, of its light and fields: {_from_to(filled)} {unit}")
+    if not optimum.is_better:
+        lines.append(f"not better than the start: {s['merit']} of {_from_to(filled)} {unit}")
     if s["operands"]:
         start, end = 1e6 * optimum.history[[0, -1]]
         lines.append(f"with operands: {start:.6g} -> {end:.6g} {unit}")
@@ -249,6 +260,10 @@ def _notes(result: Any) -> list[str]:
         lines.append(f"{label}{owner}: {evaluation.start / size:.6g} -> {evaluation.end / size:.6g}{unit} ({goal})")
     lines += [f"glass: {start_glass} -> {end_glass}" for start_glass, end_glass in s.get("glasses", {}).items()]
     return lines + [f"collinear: {combination}" for combination in s["collinear"]]
+
+
+def _from_to(pair: Any) -> str:
+    return f"{pair[0]:.6g} -> {pair[1]:.6g}"
 
 
 def _bounds(text: str) -> tuple[str, tuple[float, float]]:

@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ...models.paraxial import stop_is_inside, with_moved_pupil
 from ...models.telescope import Telescope
 from ...raytrace.adjoint.adjoint_matrix import column_table
 from ...raytrace.adjoint.backward_pass import OutputGradient, backward_pass, landing_gradient
@@ -87,22 +88,25 @@ def _motion(columns: ParameterColumns, rays: Rays, relative: np.ndarray) -> np.n
         return np.asarray(adjugate @ (target - by_parameter) / determinants(by_point)[:, None, None])
 
 
+def pupil_diameter(columns: ParameterColumns) -> tuple[float, np.ndarray]:
+    """Return the diameter of the entrance pupil [m] and its derivatives [n_parameter].
+
+    Of an object at infinity it changes where the size of a stop inside the telescope is stated.
+    """
+    telescope = columns.telescope
+    floats = telescope.design_data.aperture == "stop" and np.isinf(telescope.object_distance)
+    if not (floats and stop_is_inside(telescope)):
+        return telescope.pupil_diameter, np.zeros(1)
+    diameter = with_moved_pupil(telescope).pupil_diameter
+    scale, change, *_ = _scale_motion(columns, stop_of(telescope))
+    along = scale[:, 1]
+    return diameter, -diameter / (along @ along) * (along @ change[:, 1])
+
+
 def _stop_motion(columns: ParameterColumns, stop: Stop) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives of the radius [n_parameter] and of the axes [2, 2, n_parameter] of the stop."""
-    telescope = columns.telescope
-    data, light = telescope.design_data, telescope.default_wavelength
-    rim, axis = 0.5 * telescope.pupil_diameter, field_direction(0.0, 0.0)[None]
-    chief = np.reshape(entrance_points(telescope, axis, light, np.zeros((1, 2))), 2)
-    near = _PARAXIAL * np.eye(2)
-    away = np.array([[0.0, 0.0], [0.0, 1.0], *near, *-near, *2.0 * near, *-2.0 * near])
-    rays = straight_bundles(telescope, axis, light, chief + rim * away)
-    by_point, by_parameter = _at_stop(columns, stop, rays)
-    # All of them move with the chief ray, which stays in the middle of the stop.
-    moved = by_parameter - by_point @ np.linalg.solve(by_point[0], by_parameter[0])
-    scale = by_point[0]
-    # The error of central differences is one of third order, which two steps remove.
-    sides = (4.0 * (moved[2:4] - moved[4:6]) - 0.5 * (moved[6:8] - moved[8:])) / 3.0
-    change = sides.transpose(1, 0, 2) / (2.0 * _PARAXIAL * rim)
+    data, rim = columns.telescope.design_data, 0.5 * columns.telescope.pupil_diameter
+    scale, change, rays, moved = _scale_motion(columns, stop)
     # Derivative of the orthogonal factor of scale: it turns by an angle.
     turned = np.einsum("ki,kjp->ijp", stop.axes, change)
     angle = (turned[1, 0] - turned[0, 1]) / np.trace(stop.axes.T @ scale)
@@ -114,6 +118,26 @@ def _stop_motion(columns: ParameterColumns, stop: Stop) -> tuple[np.ndarray, np.
         return landing @ moved[1] / np.linalg.norm(landing), axes
     marginal = scale @ [0.0, rim]
     return marginal @ (change[:, 1] * rim) / np.linalg.norm(marginal), axes
+
+
+def _scale_motion(columns: ParameterColumns, stop: Stop) -> tuple[np.ndarray, np.ndarray, Rays, np.ndarray]:
+    """Return the scale from the entrance pupil to the stop near the axis [2, 2], and its derivatives.
+
+    These are [2, 2, n_parameter]. Behind them the rays through the middle, the rim and near the axis, and the motion of
+    their points of the stop beside that of the chief ray, [n, 2, n_parameter].
+    """
+    telescope = columns.telescope
+    light, rim, axis = telescope.default_wavelength, 0.5 * telescope.pupil_diameter, field_direction(0.0, 0.0)[None]
+    chief = np.reshape(entrance_points(telescope, axis, light, np.zeros((1, 2))), 2)
+    near = _PARAXIAL * np.eye(2)
+    away = np.array([[0.0, 0.0], [0.0, 1.0], *near, *-near, *2.0 * near, *-2.0 * near])
+    rays = straight_bundles(telescope, axis, light, chief + rim * away)
+    by_point, by_parameter = _at_stop(columns, stop, rays)
+    # All of them move with the chief ray, which stays in the middle of the stop.
+    moved = by_parameter - by_point @ np.linalg.solve(by_point[0], by_parameter[0])
+    # The error of central differences is one of third order, which two steps remove.
+    sides = (4.0 * (moved[2:4] - moved[4:6]) - 0.5 * (moved[6:8] - moved[8:])) / 3.0
+    return by_point[0], sides.transpose(1, 0, 2) / (2.0 * _PARAXIAL * rim), rays, moved
 
 
 def _at_stop(columns: ParameterColumns, stop: Stop, rays: Rays) -> tuple[np.ndarray, np.ndarray]:

@@ -9,6 +9,7 @@ import numpy as np
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...models.first_order import first_order, footprints
+from ...models.paraxial import with_moved_pupil
 from ...models.surface import Interaction
 from ...models.telescope import Telescope
 from ...models.thickness import front_surface, light_axis, thickness
@@ -145,14 +146,14 @@ class BackFocus(GoalOperand):
 def clear_radius(telescope: Telescope, name: str) -> float:
     """Return the clear radius [m] of a surface: of its aperture, or of the paraxial light of the whole field.
 
-    Surfaces without effect, and those of a decentred telescope, have that of the aperture alone; without one it is
-    infinite.
+    The light is that through the stop, wherever a change has moved its image. Surfaces without effect, and those of a
+    decentred telescope, have the radius of the aperture alone; without one it is infinite.
     """
     radius = outer_radius(telescope.surface(name).aperture)
     if np.isfinite(radius):
         return radius
     acting = [s.name for s in telescope.surfaces if s.interaction in (Interaction.MIRROR, Interaction.REFRACT)]
     try:
-        return float(footprints(telescope, telescope.field_radius)[acting.index(name)])
+        return float(footprints(with_moved_pupil(telescope), telescope.field_radius)[acting.index(name)])
     except (ValueError, DomainError):
         return np.inf

@@ -167,6 +167,7 @@ def choose_glasses(
         start_values=best.values - changes,
         changes=changes,
         merits=np.array([model.merits[0], best.merits[1]]),
+        remeasured=np.stack([model.remeasured[0], best.remeasured[1]]),
         history=np.concatenate([model.history, best.history[1:]]),
         operands=tuple(replace(b, start=m.start) for b, m in zip(best.operands, model.operands, strict=True)),
     )

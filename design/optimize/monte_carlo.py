@@ -15,6 +15,7 @@ from ...core.plotting import BLUE, GREY, RED, figure_at, plain_text, styled
 from ...core.result import Result
 from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...models.parameters.tolerances import Tolerance, draw
+from ...models.paraxial import following_stop
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling
 from .merit import Beams, Merit, SpotMerit, WavefrontMerit
@@ -168,7 +169,7 @@ def monte_carlo(
     thousand draws cost little more than one. The merit itself, the root of a sum of squares, is not linearised. In the
     quadratic method the sum of squares has its exact second derivatives, from differences of exact gradients. The
     traced method traces each telescope. Compensators follow from linear least squares, in the quadratic method from the
-    quadratic itself.
+    quadratic itself. Rays fill the stop of each telescope as in :func:`~pachon.design.optimize.optimize.optimize`.
 
     Parameters
     ----------
@@ -198,7 +199,7 @@ def monte_carlo(
     UnknownNameError, DomainError
         If a name does not exist, a number is out of range, or no light arrives.
     """
-    chosen, free = tuple(tolerances), tuple(compensators)
+    telescope, chosen, free = following_stop(telescope), tuple(tolerances), tuple(compensators)
     check_choice("merit", merit, MERITS)
     check_choice("method", method, METHODS)
     deviations = draw(chosen, seed, n)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,16 +14,17 @@ from ...core.errors import ConfigError, DomainError, PachonError, shown
 from ...core.threads import one_blas_thread
 from ...core.units import require_count
 from ...models.parameters.parameters import Parameter, resolved
-from ...models.paraxial import with_true_aperture
+from ...models.paraxial import following_stop
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
 from ...wavefront.pupil_sampling import PupilSampling
 from .configuration import DesignConfiguration, configurations
 from .jacobian import ParameterColumns
-from .merit import Beams, Merit, SpotMerit, WavefrontMerit
+from .merit import Beams, Merit
 from .operand import Operand, check_operands
 from .optimum import OperandChange, Optimum
 from .problem import DesignProblem, DesignState
+from .remeasured import MeritOptions, final_telescope, remeasured
 from .variables import Variable, free_variables, limits, random_starts
 from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
 
@@ -65,7 +65,9 @@ def optimize(
 
     A trust-region least-squares solver with exact derivatives of every ray. Variables are scaled by their effects, so
     that a conic constant and a coefficient of r^8 are comparable; radii are solved for as curvatures. Compensators
-    (focus, tilt of the camera) are variables like all others.
+    (focus, tilt of the camera) are variables like all others. Where the stop has mirrors or lenses in front of it, rays
+    fill it throughout, aimed as `aiming` "real" where the design data state none; the result has the aiming that is
+    stated, and its entrance pupil where the stop is imaged at the end.
 
     Parameters
     ----------
@@ -109,20 +111,20 @@ def optimize(
         If a merit or variable does not exist, or an operand is given twice.
     """
     require_count(restarts, "restarts", 0)
-    states, beams = _states(
-        configurations(
+    given = tuple(
+        replace(one, telescope=resolved(one.telescope))
+        for one in configurations(
             telescope,
             fields=fields,
             wavelengths=wavelengths,
             field_weights=field_weights,
             wavelength_weights=wavelength_weights,
-        ),
-        merit,
-        tuple(targets),
-        reference,
-        goal,
-        dict(sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads),
+        )
     )
+    options = MeritOptions(
+        merit, reference, goal, dict(sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads)
+    )
+    states, beams = _states(given, options, tuple(targets))
     telescopes = [state.telescope for state in states]
     chosen = free_variables(telescopes, variables)
     problem = DesignProblem(states, chosen)
@@ -152,10 +154,13 @@ def optimize(
     covariance, collinear = _covariance(values, slopes, chosen, rate)
     changes = np.array([v.change(x) for v, x in zip(chosen, solved, strict=True)])
     start_values = np.array([v.start for v in chosen])
-    ended = [with_true_aperture(after) for after in problem.telescopes(solved)]
+    started, solutions = tuple(one.telescope for one in given), problem.telescopes(solved)
+    ended = tuple(
+        final_telescope(after, stated.design_data.aiming) for after, stated in zip(solutions, started, strict=True)
+    )
     return Optimum(
-        telescopes=tuple(ended),
-        start_telescopes=tuple(telescopes),
+        telescopes=ended,
+        start_telescopes=started,
         fields=tuple(b.request.fields for b in beams),
         wavelengths=tuple(b.request.wavelengths for b in beams),
         variables=tuple(v.parameter for v in chosen),
@@ -165,10 +170,11 @@ def optimize(
         values=start_values + changes,
         merit_name=merit if isinstance(merit, str) else type(merit).__name__,
         merits=np.array([np.linalg.norm(begun), np.linalg.norm(problem.merit_part(values))]),
+        remeasured=np.array([remeasured(given, lenses, options) for lenses in (started, ended)]),
         history=np.array(history),
         operands=tuple(
             OperandChange(operand, state.telescope.name, operand.measure(state.telescope), operand.measure(after))
-            for state, after in zip(states, ended, strict=True)
+            for state, after in zip(states, solutions, strict=True)
             for operand in state.operands
         ),
         effect=np.linalg.norm(slopes, axis=0) / np.abs(rate),
@@ -218,7 +224,7 @@ def wavefronts(telescope: Telescope, rays: Beams) -> np.ndarray:
 
     Rays are those of :meth:`Beams.of` for the arguments of :func:`optimize`.
     """
-    columns = ParameterColumns.at(telescope, ())
+    columns = ParameterColumns.at(following_stop(telescope), ())
 
     def lit(block: WavefrontBlock) -> np.ndarray:
         return np.where(block.status == RayStatus.OK, block.value, np.nan)
@@ -230,31 +236,26 @@ def wavefronts(telescope: Telescope, rays: Beams) -> np.ndarray:
 
 
 def _states(
-    found: tuple[DesignConfiguration, ...],
-    merit: str | Merit,
-    targets: tuple[Operand, ...],
-    reference: str,
-    goal: Any,
-    options: dict[str, Any],
+    given: tuple[DesignConfiguration, ...], options: MeritOptions, targets: tuple[Operand, ...]
 ) -> tuple[tuple[DesignState, ...], tuple[Beams, ...]]:
     """Return merit and operands of each configuration, and their rays."""
+    merit = options.merit
     if not isinstance(merit, str) and not hasattr(merit, "derivatives"):
         raise ConfigError(f"merit = {shown(merit)}: expected 'spots', 'wavefront' or a Merit")
-    if len(found) > 1 and (goal is not None or not isinstance(merit, str)):
-        raise ConfigError(f"{len(found)} configurations: expected no goal, and the merit 'spots' or 'wavefront'")
-    total, states, beams = sum(one.weight for one in found), [], []
-    for one in (replace(c, telescope=resolved(c.telescope)) for c in found):
-        weights: dict[str, Any] = dict(field_weights=one.field_weights, wavelength_weights=one.wavelength_weights)
-        rays = Beams.of(one.telescope, one.fields, one.wavelengths, **weights, **options)
-        wanted = merit if not isinstance(merit, str) else _merit(merit, one.telescope, rays, reference, goal)
+    if len(given) > 1 and (options.goal is not None or not isinstance(merit, str)):
+        raise ConfigError(f"{len(given)} configurations: expected no goal, and the merit 'spots' or 'wavefront'")
+    total, states, beams = sum(one.weight for one in given), [], []
+    for one in given:
+        telescope = following_stop(one.telescope)
+        rays = options.beams(telescope, one)
         operands = (*targets, *one.operands)
         check_operands(operands)
         bound = []
         for operand in operands:
             # An operand that the telescope does not have is an error of the input, not a step that goes too far.
-            bound.append(operand.bound(one.telescope))
-            _check_start(bound[-1], one.telescope)
-        states.append(DesignState(one.telescope, wanted, tuple(bound), one.weight / total))
+            bound.append(operand.bound(telescope))
+            _check_start(bound[-1], telescope)
+        states.append(DesignState(telescope, options.of(telescope, rays), tuple(bound), one.weight / total))
         beams.append(rays)
     return tuple(states), tuple(beams)
 
@@ -266,18 +267,6 @@ def _check_start(operand: Operand, telescope: Telescope) -> None:
         raise error.within(subject=f"operand {operand.label} of {telescope.name}") from None
     if not np.isfinite(number):
         raise DomainError(f"operand {operand.label} of {telescope.name} = {number!r}: expected a finite number")
-
-
-def _merit(name: str, telescope: Telescope, rays: Beams, reference: str, goal: Any) -> Merit:
-    if reference not in ("centroid", "chief"):
-        raise ConfigError(f"reference = {reference!r}: expected 'centroid' or 'chief'")
-    if name == "wavefront":
-        return WavefrontMerit(telescope, rays, goal)
-    if name != "spots":
-        raise ConfigError(f"merit = {name!r}: expected 'spots' or 'wavefront'")
-    if goal is not None:
-        raise ConfigError("goal is given: expected merit = 'wavefront' with it")
-    return SpotMerit(telescope, rays, reference)
 
 
 def _covariance(

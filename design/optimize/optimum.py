@@ -10,9 +10,15 @@ import numpy as np
 from ...core.plotting import BLUE, GREY, figure_at, plain_text, styled
 from ...core.result import Result, Values
 from ...models.parameters.parameters import Parameter
+from ...models.paraxial import following_stop
 from ...models.telescope import Telescope
 from .before_after import draw_before_after
 from .operand import Operand
+
+#: Relative difference of the merit measured anew above which it is said.
+_DIFFERENT = 1e-2
+#: Relative difference of two merits that rounding makes.
+_ROUNDING = 1e-9
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -70,6 +76,9 @@ class Optimum(Result):
         "spots" or "wavefront".
     merits : ndarray, shape [2]
         Rms of the merit alone [m], without operands, before and after.
+    remeasured : ndarray, shape [2, 2]
+        The same of the telescopes as they stand, of the light that arrives in each: before and after, with rays that
+        fill the stop and with rays as the design data state them; NaN where no light arrives.
     history : ndarray, shape [n_step + 1]
         Rms of merit and operands [m] before the first step and after each.
     operands : tuple of OperandChange
@@ -100,6 +109,7 @@ class Optimum(Result):
     values: np.ndarray
     merit_name: str
     merits: np.ndarray
+    remeasured: np.ndarray
     history: np.ndarray
     operands: tuple[OperandChange, ...]
     effect: np.ndarray
@@ -112,6 +122,22 @@ class Optimum(Result):
     def telescope(self) -> Telescope:
         """The optimised telescope, of several configurations the first."""
         return self.telescopes[0]
+
+    @property
+    def filled_stops(self) -> tuple[str, ...]:
+        """Stops that the rays fill, though the design data state no ray aiming: those inside their telescopes."""
+        filled = (t.design_data.stop for t in self.start_telescopes if following_stop(t) is not t)
+        return tuple(dict.fromkeys(name for name in filled if name is not None))
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the merit alone of the telescopes, measured anew with the stop filled, is not above the start's."""
+        return bool(self.remeasured[1, 0] <= (1.0 + _ROUNDING) * self.remeasured[0, 0])
+
+    @property
+    def is_as_measured(self) -> bool:
+        """Whether the merit, measured anew, is that of the solver within 1 %."""
+        return bool(abs(self.remeasured[1, 0] - self.merits[1]) <= _DIFFERENT * self.merits[1])
 
     @property
     def uncertainty(self) -> np.ndarray:
@@ -150,6 +176,7 @@ class Optimum(Result):
             f"rms_end_{self._unit}": self.merits[1],
             f"rms_start_with_operands_{self._unit}": self.history[0],
             f"rms_end_with_operands_{self._unit}": self.history[-1],
+            **self._remeasured_items(),
             "steps": len(self.history) - 1,
             "variables": list(self.addresses),
             "units": [p.unit or "1" for p in self.variables],
@@ -173,6 +200,16 @@ class Optimum(Result):
             "message": self.message,
         }
 
+    def _remeasured_items(self) -> dict[str, Any]:
+        """Return the merit measured anew where rays fill a stop inside, or where it says something else."""
+        items: dict[str, Any] = {"rays_fill": list(self.filled_stops)} if self.filled_stops else {}
+        if self.filled_stops or not (self.is_better and self.is_as_measured):
+            kinds = ("remeasured", "without_aiming")[: 2 if self.filled_stops else 1]
+            for column, kind in enumerate(kinds):
+                for end, value in zip(("start", "end"), self.remeasured[:, column], strict=True):
+                    items[f"rms_{end}_{kind}_{self._unit}"] = value
+        return items
+
     def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw merit and effects of the variables, and the telescope with its spots before and after."""
         with styled():
@@ -184,7 +221,7 @@ class Optimum(Result):
             self._draw_course(steps, bars)
             draw_before_after(
                 designs,
-                (self.start_telescopes[0], self.telescope),
+                (following_stop(self.start_telescopes[0]), following_stop(self.telescope)),
                 self.fields[0],
                 self.wavelengths[0],
                 self.vignetting[0],

@@ -16,6 +16,7 @@ from ...core.threads import one_blas_thread
 from ...core.units import field_label, require_count
 from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...models.parameters.parameters import Parameter, ParameterVector, Variables, parse_parameters
+from ...models.paraxial import following_stop
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import MOST_TERMS, annular_zernikes
 from ...raytrace.rays import RayStatus
@@ -172,7 +173,8 @@ def sensitivity(
 
     Each ray takes one forward and one backward pass, whatever the number of parameters. The wavefront is that of
     :func:`~pachon.wavefront.opd.wavefront_opd`, to a sphere about the landing point of the chief ray, which moves with
-    the parameters. The set of lit rays is fixed: derivatives leave out the motion of rims.
+    the parameters. The set of lit rays is fixed: derivatives leave out the motion of rims. Rays fill a stop that has
+    mirrors or lenses in front of it, aimed as `aiming` "real" where the design data state none.
 
     Parameters
     ----------
@@ -190,6 +192,7 @@ def sensitivity(
     UnknownNameError, ConfigError
         If an address is unknown.
     """
+    telescope = following_stop(telescope)
     variables: Variables
     if isinstance(parameters, DegreesOfFreedom):
         variables = parameters

@@ -15,7 +15,7 @@ from ...models.telescope import Telescope
 from ...raytrace.adjoint.backward_pass import image_gradient
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
-from .aimed_rays import AimedRays
+from .aimed_rays import AimedRays, pupil_diameter
 from .jacobian import ParameterColumns
 from .operand import GoalOperand, Operand, angles_of, operand_kind, wavelength_of
 
@@ -91,11 +91,13 @@ class FocalLength(_ExactOperand):
 @check_arguments
 @dataclass(frozen=True)
 class FNumber(FocalLength):
-    """Focal ratio: :class:`FocalLength` over the diameter of the entrance pupil."""
+    """Focal ratio: :class:`FocalLength` over the diameter of the entrance pupil, the image of a stop of stated size."""
 
     def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
         length, change = super().gradient(columns)
-        return length / columns.telescope.pupil_diameter, change / columns.telescope.pupil_diameter
+        diameter, by_diameter = pupil_diameter(columns)
+        number = length / diameter
+        return number, change / diameter - number * by_diameter / diameter
 
 
 @operand_kind("chief_ray", "m")

@@ -27,7 +27,7 @@ from ..surface import Interaction, Surface
 from ..telescope import VACUUM, Telescope
 from .glass_catalogue import MAKERS, GlassCatalogue
 from .glass_search import find_glass
-from .writable import report_unheld, require_met, require_sequential
+from .writable import report_pupil_plane, report_unheld, require_met, require_sequential
 from .zemax.file import Findings
 from .zemax.frame import HALF_TURN, rotated_aperture, rotated_shape
 from .zemax.reader import PUPIL_COMMENT
@@ -121,9 +121,7 @@ class LensSequence:
             others = ["afocal"] if data.afocal and not afocal else []
             report_unheld(t, (*data.pickups, *data.solves), file, lenient=lenient, others=others)
             own_stop = stop_makes_pupil(t) or (aimed != "off" and stop_states_rays(t))
-            if data.stop is not None and not own_stop:
-                said = f"stop = {data.stop}: with surfaces off the axis it does not make the stated pupil"
-                findings.note(PrescriptionError(said), "a plane in front carries the stop and the pupil")
+            report_pupil_plane(t, findings, own_stop=own_stop)
             if own_stop and data.aiming != aimed:
                 said = f"aiming = {data.aiming}: {file} does not state how rays are aimed"
                 findings.note(PrescriptionError(said), f"read back it is {aimed}")

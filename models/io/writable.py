@@ -41,11 +41,14 @@ def report_unheld(
 
 
 def report_pupil_plane(telescope: Telescope, findings: Findings, *, own_stop: bool) -> None:
-    """Warn where a plane in front has to carry the stop of a telescope, whose rays are aimed at it."""
+    """Warn where a plane in front has to carry the stop of a telescope."""
     data = telescope.design_data
-    if data.stop is not None and data.aiming != "off" and not own_stop:
-        said = f"stop = {data.stop}, aiming = {data.aiming}: the stop and the stated aperture do not make the pupil"
-        findings.note(PrescriptionError(said), "a plane in front carries the stop, and rays are not aimed")
+    if data.stop is None or own_stop:
+        return
+    aimed = data.aiming != "off"
+    said = f"stop = {data.stop}, aiming = {data.aiming}: the stop and the stated aperture do not make the pupil"
+    instead = "a plane in front carries the stop" + (", and rays are not aimed" if aimed else "")
+    findings.note(PrescriptionError(said), instead)
 
 
 def with_formulas(telescope: Telescope, written: Callable[[Medium], object], findings: Findings) -> Telescope:

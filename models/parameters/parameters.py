@@ -16,7 +16,7 @@ address                    meaning                                      unit
 
 Shift and tilt are those of :meth:`Telescope.perturbed`, of a surface or a group. *Values are changes*: zero leaves the
 telescope as it is. Where several bodies move, groups go before their members. A thickness moves all surfaces behind it
-along the axis of the surface in front of it; that comes last. The entrance pupil stays.
+along the axis of the surface in front of it; that comes last. The entrance pupil stays; see :mod:`.changes`.
 """
 
 from __future__ import annotations

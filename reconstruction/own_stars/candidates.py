@@ -23,7 +23,10 @@ _ERRORS = 2.0
 
 
 def choose_candidate(
-    predict: Callable[[Mapping[str, Any]], np.ndarray], stars: np.ndarray, gain: float
+    predict: Callable[[Mapping[str, Any]], np.ndarray],
+    stars: np.ndarray,
+    gain: float,
+    masked: np.ndarray | None = None,
 ) -> tuple[str, np.ndarray]:
     """Return the name of the kind of model that predicts held-out stars best, and what it predicts.
 
@@ -37,16 +40,21 @@ def choose_candidate(
         DomainError for kinds that the stars do not determine.
     stars : array
         [n, ny, nx], in units of `gain` electrons.
+    masked : array, optional
+        Pixels without weight, bool [n, ny, nx]; they hold what they are filled with.
     """
     kinds = iter(CANDIDATES.items())
     chosen, options = next(kinds)
     best = predict(options)
     unit = (stars / stars.sum(axis=(1, 2), keepdims=True)).reshape(len(stars), -1)
     mean = best.mean(axis=0)
-    shapes = ShapeNoise.of(stars, unit - mean.ravel(), mean, gain)
+    shapes = ShapeNoise.of(stars, unit - mean.ravel(), mean, gain, masked)
 
     def residuals(predicted: np.ndarray) -> np.ndarray:
-        return (unit - predicted.reshape(len(stars), -1)) @ shapes.filters.T
+        deviations = unit - predicted.reshape(len(stars), -1)
+        if masked is not None:
+            deviations = np.where(masked.reshape(len(stars), -1), 0.0, deviations)
+        return deviations @ shapes.filters.T
 
     reference = residuals(best)
     weight = (shapes.model_variance(reference) + shapes.noise) ** -2

@@ -3,24 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from astropy.units import Quantity
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.random_streams import stream
 from ...core.units import positive_angle, real_array, require_seed
 from ...measure.shapes import Shapes, fwhm, measure_shapes
-from ...measure.stamps import center_stamps
+from ...measure.stamps import center_masks, center_stamps
 from ...measure.star_selection import StarFlag, flag_stars, require_stars
 from ..psf_model import kriging
 from ..psf_model.checks import as_extent
 from ..psf_model.model import PsfModel
 from ..psf_model.polynomial import as_positions
 from .candidates import CANDIDATES, KRIGING, choose_candidate
+from .masked_stars import (
+    as_bad_pixels,
+    fill_by_median_star,
+    fill_by_profiles,
+    fill_symmetric,
+    profiles_of_psfs,
+    sky_of_stamps,
+    weight_sigma,
+)
 from .result import OwnStars
 
 #: Fewest stars that a model is made of.
@@ -31,6 +41,9 @@ FOLDS = 5
 _SKY = 0.4
 # Rim of a stamp that a shift may bring in from the other side [pixel].
 _RIM = 2
+# Times that bad pixels are filled anew by the model of stars that were filled: a pixel's error falls by the part that
+# the model takes from the star itself, a fifth or less.
+_MODEL_PASSES = 2
 
 
 @check_arguments
@@ -45,6 +58,7 @@ def fit_own_stars(
     saturation: float | None = None,
     background: bool = True,
     extent: ArrayLike | None = None,
+    masks: NDArray[np.bool_] | None = None,
     seed: int = 1,
     **options: Any,
 ) -> OwnStars:
@@ -71,6 +85,11 @@ def fit_own_stars(
         Whether to subtract the median of the outer pixels of each stamp.
     extent : tuple of float, optional
         (xmin, xmax, ymin, ymax) of the CCD in the unit of the positions; that of the stars by default.
+    masks : array of bool, optional
+        [n, ny, nx], True for pixels to ignore, besides those that hold no light: not finite, or -1e29 or less (-1e30 of
+        SExtractor). They are left out of the sky, of fluxes and of noise, and filled before a star is centred: by
+        the median star, then by the model at the star's place. A star is lost (``MASKED``) only where they hold more
+        than half of its light above half of its peak, or under the weight of the moments.
     seed : int
         Of the parts that are held out.
     **options
@@ -81,11 +100,12 @@ def fit_own_stars(
     DomainError
         If stamps are too small, fewer than five stars are left, or the model cannot be made.
     """
-    images, places = real_array(stamps, "stamps: expected real numbers [n, ny, nx]").copy(), as_positions(positions)
+    images, places = real_array(stamps, "stamps: expected real numbers [n, ny, nx]"), as_positions(positions)
     if images.ndim != 3 or len(images) != len(places):
         raise DomainError(
             f"stamps of shape {images.shape}, {len(places)} positions: expected [n, ny, nx] and as many positions"
         )
+    bad = as_bad_pixels(images, masks)
     scale = positive_angle(pixel_scale, "pixel_scale")
     if not (np.isfinite(gain) and gain > 0.0):
         raise DomainError(f"gain = {gain}: expected a number of electrons above 0")
@@ -94,27 +114,31 @@ def fit_own_stars(
         size = max(side - 2 * _RIM - 1 + (side % 2), 0)
     if size % 2 == 0 or not 9 <= size <= side:
         raise DomainError(f"size = {size}: expected an odd number of pixels from 9 to {side}, the side of the stamps")
-    y, x = np.indices(images.shape[1:]) - 0.5 * (np.array(images.shape[1:])[:, None, None] - 1.0)
-    sky = images[:, np.hypot(x, y) > _SKY * side]
-    middle = np.nanmedian(sky, axis=1)
-    if background:
-        images -= middle[:, None, None]
-    rms = 1.4826 * np.nanmedian(np.abs(sky - middle[:, None]), axis=1)
-    wide = measure_shapes(images, scale, 0.25 * side * scale)
-    weight = float(np.nanmedian(fwhm(images[wide.usable], scale))) if wide.usable.any() else np.nan
+    level, rms = sky_of_stamps(images, bad, _SKY * side)
+    images = np.where(bad, 0.0, images - np.nan_to_num(level)[:, None, None] if background else images)
+    filled = fill_symmetric(images, bad)
+    wide = measure_shapes(filled, scale, 0.25 * side * scale)
+    weight = float(np.nanmedian(fwhm(filled[wide.usable], scale))) if wide.usable.any() else np.nan
     if not np.isfinite(weight):
         raise DomainError(f"none of {len(images)} stamps has a star in its middle")
-    first = measure_shapes(images, scale, weight)
-    centred = center_stamps(images, first.x, first.y, size=size, normalize=False)
-    shapes = measure_shapes(centred, scale, weight)
-    flags = flag_stars(centred, np.where(rms > 0.0, rms, 1.0), gain=gain, saturation=saturation).flags
-    flags = np.where(shapes.usable, flags, flags | StarFlag.UNUSABLE)
-    snr = _signal_to_noise(centred, rms, gain)
-    used = (flags == 0) & (snr >= min_snr)
-    require_stars(used, flags, FEWEST_STARS)
+
+    def select(filled: np.ndarray, lost: np.ndarray, flags: np.ndarray | None = None) -> _CentredStars:
+        first = measure_shapes(filled, scale, weight)
+        centred = center_stamps(filled, first.x, first.y, size=size, normalize=False)
+        if flags is None:
+            noise = np.where(rms > 0.0, rms, 1.0)
+            flags = flag_stars(centred, noise, gain=gain, saturation=saturation).flags
+        shapes = measure_shapes(centred, scale, weight)
+        flags = np.where(shapes.usable, flags, flags | StarFlag.UNUSABLE)
+        flags = np.where(lost, StarFlag.MASKED, flags)
+        snr = _signal_to_noise(centred, rms, gain)
+        used = (flags == 0) & (snr >= min_snr)
+        require_stars(used, flags, FEWEST_STARS)
+        return _CentredStars(first, centred, center_masks(bad, first.x, first.y, size), shapes, flags, snr, used)
 
     def fit(chosen: np.ndarray, kind: Mapping[str, Any]) -> PsfModel:
-        return PsfModel.fit(centred[chosen], places[chosen], extent=span, **{"gain": gain, **kind})
+        span = as_extent(extent, places[stars.used])
+        return PsfModel.fit(stars.images[chosen], places[chosen], extent=span, **{"gain": gain, **kind})
 
     def predict(kind: Mapping[str, Any]) -> np.ndarray:
         predicted = np.empty((len(which), size, size))
@@ -123,29 +147,77 @@ def fit_own_stars(
             predicted[part] = fit(which[rest], kind).at(places[which[part]])
         return predicted
 
-    span = as_extent(extent, places[used])
+    if bad.any():
+        masked = bad.any(axis=(1, 2))
+        filled, median_star, lost = fill_by_median_star(images, bad, scale, weight)
+        complete = wide.usable & ~lost
+        if not complete.any():
+            require_stars(complete, np.where(lost, StarFlag.MASKED, StarFlag.UNUSABLE), FEWEST_STARS)
+        weight = float(np.nanmedian(fwhm(filled[complete], scale)))
+        stars = select(filled, lost)
+        for _ in range(_MODEL_PASSES):
+            psfs = fit(np.flatnonzero(stars.used), KRIGING | options).at(places[masked])
+            sigma = weight_sigma(scale, weight)
+            filled[masked], lost[masked] = fill_by_profiles(
+                images[masked],
+                bad[masked],
+                profiles_of_psfs(psfs, median_star, sigma),
+                stars.first.x[masked],
+                stars.first.y[masked],
+                sigma,
+            )
+            weight = float(np.nanmedian(fwhm(filled[complete], scale)))
+            stars = select(filled, lost, stars.flags)
+    else:
+        stars = select(filled, np.zeros(len(images), dtype=bool))
+    used = stars.used
     which = np.flatnonzero(used)
     parts = np.array_split(stream(require_seed(seed), "held-out stars").permutation(len(which)), min(FOLDS, len(which)))
+    good = stars.images[used]
+    weightless = stars.masks[used] if stars.masks[used].any() else None
     if options:
         name, kind = "given", KRIGING | options
         predicted = predict(kind)
     else:
-        name, predicted = choose_candidate(predict, centred[used], gain)
+        name, predicted = choose_candidate(predict, good, gain, weightless)
         kind = CANDIDATES[name]
     psf = predicted.mean(axis=0)
-    variance = (weight / scale / 2.354820045) ** 2
-    deviations = (centred[used] / centred[used].sum(axis=(1, 2), keepdims=True) - psf).reshape(len(which), -1)
-    filters = kriging.shape_numbers(psf, deviations, variance)[1]
-    # Shape numbers are twice the changes of e and of the logarithm of the size.
-    sigma = 0.5 * np.sqrt(kriging.star_noise(centred[used], deviations, psf, filters, gain))
-    held_out = _spread(measure_shapes(predicted, scale, weight), used)
-    good = centred[used]
     stamps_used = good / good.sum(axis=(1, 2), keepdims=True)
+    deviations = (stamps_used - psf).reshape(len(which), -1)
+    filters = kriging.shape_numbers(psf, deviations, weight_sigma(scale, weight) ** 2)[1]
+    # Shape numbers are twice the changes of e and of the logarithm of the size.
+    sigma = 0.5 * np.sqrt(kriging.star_noise(good, deviations, psf, filters, gain, weightless))
+    held_out = _spread(measure_shapes(predicted, scale, weight), used)
     sigmas = np.sqrt((sigma[:, :2] ** 2).mean(axis=1)), sigma[:, 2]
     model = fit(which, kind)
     return OwnStars(
-        model, places, snr, flags, used, shapes, held_out, stamps_used, predicted, *sigmas, scale, weight, name
+        model,
+        places,
+        stars.snr,
+        stars.flags,
+        used,
+        stars.shapes,
+        held_out,
+        stamps_used,
+        predicted,
+        *sigmas,
+        scale,
+        weight,
+        name,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _CentredStars:
+    """Stars of which bad pixels are filled, centred, with their defects."""
+
+    first: Shapes  #: of the stamps before they are centred
+    images: np.ndarray  #: [n, size, size]
+    masks: np.ndarray  #: pixels without weight, bool [n, size, size]
+    shapes: Shapes  #: of the centred stars
+    flags: np.ndarray  #: :class:`~.StarFlag` bits, [n]
+    snr: np.ndarray  #: [n]
+    used: np.ndarray  #: bool [n]
 
 
 def _signal_to_noise(stamps: np.ndarray, rms: np.ndarray, gain: float) -> np.ndarray:

@@ -22,7 +22,7 @@ OTHER_NAMES = {
     "y": ("ywin_image", "y_image", "ypsf_image", "slot_centroid_y", "base_sdsscentroid_y"),
     "stamp": ("vignet",),
 }
-# SExtractor's masked pixels are -1e30.
+# Values at or below this are no light: SExtractor's masked pixels are -1e30.
 _MASKED = -1e29
 
 
@@ -55,8 +55,8 @@ def load_stars(
         Columns of the positions, in any unit; for "x" and "y" names of SExtractor and of LSST stand in,
         :data:`OTHER_NAMES`.
     stamp : str
-        Column of the stamps, [ny, nx] in every row; VIGNET of SExtractor stands in for "stamp", its masked pixels
-        become NaN. Where a FITS file has none, its first image of three axes is taken.
+        Column of the stamps, [ny, nx] in every row; VIGNET of SExtractor stands in for "stamp", bad pixels
+        (:func:`bad_pixels`) become NaN. Where a FITS file has none, its first image of three axes is taken.
     images : str or Path, optional
         FITS file whose first image of three axes, [n, ny, nx], holds the stamps in the order of the table.
 
@@ -111,7 +111,15 @@ def load_stars(
     stamps = _checked_column(path, stamp, columns[names[stamp.lower()]], 3) if cube is None else cube
     if len(stamps) != len(positions):
         raise ProductError(f"{len(positions)} stars in the table, {len(stamps)} stamps in the images", file=path)
-    return StarCutouts(np.where(stamps < _MASKED, np.nan, stamps), positions)
+    return StarCutouts(np.where(bad_pixels(stamps), np.nan, stamps), positions)
+
+
+def bad_pixels(stamps: np.ndarray) -> np.ndarray:
+    """Return the pixels that hold no light, bool, shape of the stamps.
+
+    A pixel is bad if it is not finite, or -1e29 or less, as the pixels are that SExtractor masks (-1e30).
+    """
+    return ~np.isfinite(stamps) | (stamps <= _MASKED)
 
 
 def _find_column(name: str, columns: Iterable[str]) -> str | None:

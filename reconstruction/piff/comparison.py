@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy.table import QTable, Table
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from ...core.arguments import check_arguments
@@ -98,6 +98,7 @@ def compare_with_piff(
     chip: int | None = None,
     pixel_scale: ArrayLike | None = None,
     properties: Mapping[str, ArrayLike] | None = None,
+    masks: NDArray[np.bool_] | None = None,
     bins: int = 8,
     **options: Any,
 ) -> PiffComparison:
@@ -119,6 +120,8 @@ def compare_with_piff(
         Side of a pixel [rad]; that of the Piff file by default.
     properties : mapping of str to array, optional
         Values [n] of :attr:`PiffPsf.property_names`.
+    masks : array of bool, optional
+        [n, ny, nx], True for pixels to ignore, as :func:`~pachon.fit_own_stars` takes them.
     bins : int
         Bins of the rho statistics.
     **options
@@ -131,7 +134,7 @@ def compare_with_piff(
     """
     places = as_positions(positions)
     scale = psf.pixel_scale(places.mean(axis=0), chip=chip) if pixel_scale is None else pixel_scale
-    own = fit_own_stars(stamps, places, scale, **options)
+    own = fit_own_stars(stamps, places, scale, masks=masks, **options)
     used = own.used
     given = {key: pure_numbers(values, key)[used] for key, values in (properties or {}).items()}
     images = psf.at(places[used], chip=chip, size=own.stamps.shape[1], properties=given)
@@ -144,7 +147,8 @@ def compare_with_piff(
     if (~in_fit).sum() >= _FEWEST_RESERVED:
         if in_fit.sum() >= FEWEST_STARS:
             some = np.flatnonzero(used)[in_fit]
-            model = fit_own_stars(np.asarray(stamps)[some], places[some], scale, **options).model
+            some_masks = None if masks is None else np.asarray(masks)[some]
+            model = fit_own_stars(np.asarray(stamps)[some], places[some], scale, masks=some_masks, **options).model
             rows.append(("pachon, other stars", _measured(own, model.at(places[used])), ~in_fit))
         rows.append(("Piff, other stars", theirs, ~in_fit))
     return PiffComparison(

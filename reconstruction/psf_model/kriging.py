@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.linalg
@@ -87,16 +87,23 @@ def shape_numbers(
 
 
 def star_noise(
-    images: np.ndarray, deviations: np.ndarray, mean: np.ndarray, filters: np.ndarray, gain: float | None
+    images: np.ndarray,
+    deviations: np.ndarray,
+    mean: np.ndarray,
+    filters: np.ndarray,
+    gain: float | None,
+    masked: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the variance of the noise of the shape numbers of each star, [n, 3].
 
     `images` [n, ny, nx] are in units of `gain` electrons, `deviations` [n, n_pixels] those of the stamps of unit sum
-    from the mean [ny, nx]. Without gain there is no photon noise.
+    from the mean [ny, nx]. Without gain there is no photon noise. Pixels in `masked` [n, ny, nx], which are filled and
+    have no noise of their own, are left out of the scatter of the sky.
     """
     y, x = np.indices(mean.shape) - np.array(mean.shape)[:, None, None] // 2
     sky = (np.hypot(x, y) > _SKY * min(mean.shape)).ravel()
-    noise = _sky_variance(deviations[:, sky])[:, None] * (filters**2).sum(axis=1)
+    outer = None if masked is None else masked.reshape(len(images), -1)[:, sky]
+    noise = _sky_variance(deviations[:, sky], outer)[:, None] * (filters**2).sum(axis=1)
     if gain is not None:
         electrons = images.sum(axis=(1, 2)) * gain
         if np.median(electrons) < FEWEST_ELECTRONS:
@@ -108,17 +115,22 @@ def star_noise(
     return noise
 
 
-def _sky_variance(outer: np.ndarray) -> np.ndarray:
+def _sky_variance(outer: np.ndarray, masked: np.ndarray | None = None) -> np.ndarray:
     """Return the variance of a pixel of sky of each star, [n], from the deviations of outer pixels [n, n_outer].
+
+    Masked ones [n, n_outer] do not count, but in stars without any other.
 
     About a mean with equal weights bright stars would have the noise of the faint ones.
     """
     variance = np.ones(len(outer))
+    median: Any = np.median if masked is None else np.nanmedian
     for _ in range(_SKY_PASSES):
         weights = 1.0 / np.maximum(variance, _LEAST_SKY * variance.max())
         weights /= weights.sum()
         left = outer - weights @ outer
-        rms = 1.4826 * np.median(np.abs(left - np.median(left, axis=1)[:, None]), axis=1)
+        if masked is not None:
+            left = np.where(masked & ~masked.all(axis=1, keepdims=True), np.nan, left)
+        rms = 1.4826 * median(np.abs(left - median(left, axis=1)[:, None]), axis=1)
         # A star takes part in the mean that is subtracted from it.
         variance = rms**2 / np.maximum(1.0 - weights, _LEAST_OWN)
         if not variance.any():  # without noise

@@ -30,10 +30,17 @@ class ShapeNoise:
     noise: np.ndarray  #: variance of a number, mean of the three, [n]
 
     @classmethod
-    def of(cls, images: np.ndarray, deviations: np.ndarray, mean: np.ndarray, gain: float | None) -> ShapeNoise:
+    def of(
+        cls,
+        images: np.ndarray,
+        deviations: np.ndarray,
+        mean: np.ndarray,
+        gain: float | None,
+        masked: np.ndarray | None = None,
+    ) -> ShapeNoise:
         """Return it for stars [n, ny, nx] in units of `gain` electrons, as :func:`~.kriging.star_noise` has them."""
         _, filters = kriging.shape_numbers(mean, deviations)
-        noise = kriging.star_noise(images, deviations, mean, filters, gain)
+        noise = kriging.star_noise(images, deviations, mean, filters, gain, masked)
         unit = np.maximum(np.median(noise, axis=0), np.finfo(float).tiny)
         return cls(filters / np.sqrt(unit)[:, None], np.maximum((noise / unit).mean(axis=1), _LEAST))
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import ProductError
+from ...core.file_names import file_name
 from ...core.files import make_folder, write_bytes, write_json
 from ...core.page import Picture, render, with_digits, with_error
 from ...pipeline.report.report import TEMPLATES
@@ -32,7 +33,7 @@ def write_report(store: SweepStore, folder: Path) -> Path:
     metrics = summary(table, sweep)
     pictures = sweep_pictures(table, sweep)
     for name, picture in pictures:
-        write_bytes(folder / f"{name}.png", picture.data)
+        write_bytes(folder / f"{file_name(name)}.png", picture.data)
     write_json(folder / "summary.json", {**metrics, "pachon": store.about["pachon"], "digest": store.about["digest"]})
     page = render(
         TEMPLATES,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from ...core.threads import one_blas_thread
 from ...core.workers import Compute, MakeWorkers, Workers, serial_worker
 from ...design.optimize.toleranced_merit import TolerancedMerit
 from ...models.parameters.tolerances import draw
+from ...models.paraxial import following_stop
 from ...models.telescope import Telescope
 from ..sweep.store import PointResult, StoreKind, SweepPoint, SweepStore, check_same_sweep, create_store, store_exists
 from .file import ToleranceFile
@@ -43,7 +45,8 @@ def run_tolerances(
 ) -> ToleranceStudy:
     """Compute sensitivity, inverse sensitivity and Monte Carlo of tolerances.
 
-    The results depend on telescope and file alone, not on workers, order or interruptions.
+    The results depend on telescope and file alone, not on workers, order or interruptions. Rays fill the stop of each
+    telescope as in :func:`~pachon.design.optimize.optimize.optimize`.
 
     Parameters
     ----------
@@ -70,8 +73,11 @@ def run_tolerances(
     """
     if merit is not None and file.method != "traced":
         raise ConfigError(f"method = {file.method!r}: expected 'traced' for a merit of one's own")
-    plan = tolerance_plan(file, telescope)
+    plan = tolerance_plan(file, following_stop(telescope))
     judged = tolerance_merit(file, plan.telescope, merit)
+    if plan.telescope.design_data.aiming != telescope.design_data.aiming:
+        filled = f"{judged.definition}; rays fill the stop {telescope.design_data.stop}, aiming: real"
+        judged = replace(judged, definition=filled)
     built = TolerancedMerit.of(
         plan.telescope, plan.tolerances, plan.compensators, plan.degrees_of_freedom, judged.judge
     )

@@ -47,6 +47,22 @@ def test_a_cube_with_a_table(tmp_path, monkeypatch, capsys, stamp):
 
 
 @pytest.mark.long
+def test_stamps_without_donuts_are_listed_beside_a_good_one(tmp_path, monkeypatch, capsys, stamp):
+    monkeypatch.chdir(tmp_path)
+    rng, flat = np.random.default_rng(4), np.zeros_like(stamp)
+    # Sky left in, no light, less than none, and what no detector counts.
+    empty = [rng.poisson(level, flat.shape) for level in (1, 100, 10_000)] + [flat, flat - 50.0, flat + 1e200]
+    fits.PrimaryHDU(np.stack([stamp, *empty]), fits.Header({"FIELD_X": FIELD[0], "FIELD_Y": FIELD[1]})).writeto(
+        "d.fits"
+    )
+    assert main(["donuts", "d.fits", *OPTIONS, "-o", "out.ecsv", "--picture", "donuts.png"]) == 0
+    assert capsys.readouterr().out.count("no donut") == 5
+    reasons = Table.read("out.ecsv")["reasons"].tolist()
+    dark = "no donut, too few photons"
+    assert reasons == ["ok", "no donut", "no donut", "no donut", dark, dark, "not finite"]
+
+
+@pytest.mark.long
 def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, capsys, stamp):
     monkeypatch.chdir(tmp_path)
     header = fits.Header({"FIELD_X": FIELD[0], "FIELD_Y": FIELD[1], "DEFOC_UM": 1500.0})

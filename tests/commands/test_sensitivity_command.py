@@ -1,6 +1,8 @@
 """``pachon sensitivity`` and ``pachon optimize``."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +12,8 @@ import pachon
 from pachon.commands.cli import main
 from pachon.core.products import read_fits
 from pachon.design.optimize.sensitivity import sensitivity
+
+STOP_INSIDE = str(Path(__file__).parents[1] / "data" / "lensfiles" / "stop_inside.zmx")
 
 
 @pytest.fixture(autouse=True)
@@ -90,3 +94,22 @@ def test_what_cannot_be_written_is_refused_before_the_optimisation(tmp_path, cap
     ):
         assert main(["optimize", *given]) == 2
         assert words in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_a_stop_inside_is_filled_and_it_is_said(capsys):
+    """What `optimize` reports is what `spots --aiming real` finds; a lens that got worse is not called better."""
+    command = ["optimize", STOP_INSIDE, "--variables", "S6.thickness", "--out", "moved.zmx"]
+    assert main([*command, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["rays_fill"] == ["S4"]
+    assert found["rms_end_m"] == found["rms_end_remeasured_m"]
+    assert main(["spots", "moved.zmx", "--aiming", "real", "--json"]) == 0
+    radii = np.array(json.loads(capsys.readouterr().out)["rms_radius_um"])
+    assert found["rms_end_m"] == pytest.approx(1e-6 * np.sqrt(np.mean(radii**2)), rel=1e-6)
+    assert main([*command[:3], "S1.radius", *command[4:], "--focal-length", "0.07"]) == 0
+    said = capsys.readouterr().out
+    assert "rays fill the stop S4, as with --aiming real; without: " in said
+    assert re.search(r"^not better than the start: spots of [\d.]+ -> [\d.]+ µm$", said, re.M)
+    assert main(["sensitivity", STOP_INSIDE, "--parameters", "S2.thickness", "--zernikes", "8"]) == 0
+    assert "rays fill the stop S4, as with --aiming real" in capsys.readouterr().out

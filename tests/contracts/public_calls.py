@@ -346,7 +346,7 @@ def calls(folder):
         "load_align_configuration": (pachon.load_align_configuration, {"path": m.folder / "none.yaml"}),
         "fit_own_stars": (pachon.fit_own_stars, {"stamps": m.own, "positions": m.places,
                           "pixel_scale": 1e-6, "size": 11, "min_snr": 1.0, "gain": 1.0, "saturation": 1e7,
-                          "background": False, "extent": (-1.0, 1.0, -1.0, 1.0), "seed": 1}),
+                          "background": False, "extent": (-1.0, 1.0, -1.0, 1.0), "masks": None, "seed": 1}),
         "brighter_fatter": (pachon.brighter_fatter, {"images": m.stamps, "electrons": np.full(12, 1e4), "sensor": "itl",
                             "sky": 10.0}),
         "displace_stamps": (pachon.displace_stamps, {"images": m.stamps, "places": m.places * 1e-3, "pixel_size": 1e-5,

@@ -17,6 +17,7 @@ from pachon.imaging.exposure_psf import fit_exposure_psf
 from pachon.imaging.image_file import CcdImage
 from pachon.imaging.image_stars import focal_plane_stars, regular_shapes
 from pachon.imaging.measure import measure_image
+from pachon.imaging.measure_files import measure_files
 from pachon.imaging.scene import draw_ccd
 from pachon.measure.catalogue.matching import match_positions
 from pachon.pipeline.experiment import Experiment
@@ -173,6 +174,66 @@ def test_images_side_by_side_have_the_same_products(image, tmp_path, capsys):
     assert (tmp_path / "two" / "a_galaxies.fits").read_bytes() == one["a_galaxies.fits"]
     assert (tmp_path / "two" / "b_galaxies.fits").read_bytes() != one["b_galaxies.fits"]
     assert (tmp_path / "two" / "c_galaxies.fits").stat().st_mtime_ns == kept
+
+
+def flipped(data, place):
+    """Bytes of which one has a bit flipped, at a fraction of their length."""
+    i = min(int(place * len(data)), len(data) - 1)
+    return data[:i] + bytes([data[i] ^ 0x10]) + data[i + 1 :]
+
+
+#: What happens to a file: functions of its bytes, and those of the same product of another image.
+DAMAGES = {
+    "deleted": lambda data, other: None,
+    "empty": lambda data, other: b"",
+    "cut to a half": lambda data, other: data[: len(data) // 2],
+    "cut to whole blocks": lambda data, other: data[: len(data) // 5760 * 2880],
+    "without its last block": lambda data, other: data[:-2880],
+    "without its last byte": lambda data, other: data[:-1],
+    "a block longer": lambda data, other: data + bytes(2880),
+    "a few bytes longer": lambda data, other: data + b"more",
+    "zeros from the middle on": lambda data, other: data[: len(data) // 2] + bytes(len(data) - len(data) // 2),
+    "a text": lambda data, other: b"this is no FITS file\n" * 200,
+    "that of another image": lambda data, other: other,
+    **{
+        f"a bit flipped at {place:.4f}": lambda data, other, place=place: flipped(data, place)
+        for place in (0.0, 0.0004, 0.1, 0.77, 1.0)
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def measured(image, tmp_path_factory):
+    """A folder with two images and their products, and the bytes of these."""
+    folder = tmp_path_factory.mktemp("measured")
+    image.write(folder / "a.fits")
+    replace(image, image=image.image + 1.0).write(folder / "b.fits")
+    measure_files([folder / "a.fits", folder / "b.fits"], folder, threads=1)
+    return folder, {path.name: path.read_bytes() for path in folder.glob("*_*.fits")}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("product", ["psf", "galaxies"])
+def test_a_damaged_product_is_made_again_to_the_same_bytes(measured, monkeypatch, catalogue, product, damage):
+    folder, whole = measured
+    damaged = DAMAGES[damage](whole[f"a_{product}.fits"], whole[f"b_{product}.fits"])
+    path = folder / f"a_{product}.fits"
+    path.unlink() if damaged is None else path.write_bytes(damaged)
+    measured_images = []
+
+    def measure_once(image, **options):
+        # Measuring takes seconds, and gives the same bytes (see above).
+        measured_images.append(image)
+        return replace(catalogue, image=image)
+
+    monkeypatch.setattr("pachon.imaging.measure_files.measure_image", measure_once)
+    found = measure_files([folder / "a.fits", folder / "b.fits"], folder, resume=True, threads=1)
+    assert len(measured_images) == 1
+    assert {path.name: path.read_bytes() for path in folder.glob("*_*.fits")} == whole
+    assert list(found.metrics) == ["a.fits", "b.fits"]
+    # Whole ones stay.
+    measure_files([folder / "a.fits", folder / "b.fits"], folder, resume=True, threads=1)
+    assert len(measured_images) == 1
 
 
 def test_images_of_one_name_have_no_common_folder(image, tmp_path, capsys):

@@ -3,7 +3,7 @@ import pytest
 
 from pachon.core.errors import DomainError
 from pachon.measure.stamps import observe_stamps
-from pachon.measure.star_selection import StarFlag, flag_stars
+from pachon.measure.star_selection import StarFlag, _correlate, flag_stars
 from pachon.pipeline.simulate.star_defects import add_defects
 from pachon.reconstruction.psf_model.model import PsfModel
 
@@ -152,3 +152,17 @@ def test_bad_arguments():
         add_defects(stamps, shapes, rng, neighbours=1.5)
     with pytest.raises(DomainError, match="full_well = -1"):
         add_defects(stamps, shapes, rng, full_well=-1.0)
+
+
+def test_the_matched_filter_is_the_sum_over_pixels():
+    rng = np.random.default_rng(6)
+    for shape in ((9, 9), (12, 15)):
+        image, star = rng.normal(size=(2, *shape))
+        peak = np.unravel_index(star.argmax(), shape)
+        expected = np.zeros(shape)
+        for at in np.ndindex(shape):  # the star's peak stands on this pixel
+            for pixel in np.ndindex(shape):
+                place = tuple(a + p - q for a, p, q in zip(at, pixel, peak, strict=True))
+                if all(0 <= i < n for i, n in zip(place, shape, strict=True)):
+                    expected[at] += star[pixel] * image[place]
+        np.testing.assert_allclose(_correlate(image, star, peak), expected, rtol=0, atol=1e-12)

@@ -51,3 +51,27 @@ def test_wavefront_of_a_donut_is_that_of_batoid():
     assert np.linalg.norm(after - before) > 60e-9
     # Rims of 700 rays across, and 3e-3 of the wavefront (docs/donuts.md).
     assert np.linalg.norm(fit.zernikes[0] - (after - before)) < 6e-9
+
+
+@pytest.mark.long
+def test_a_moved_camera_is_not_a_moved_detector():
+    """The wavefront that a fit under the wrong body takes for the telescope's (docs/donuts.md)."""
+    telescope, optic = pachon.load_telescope("lsst_v3.3_r"), batoid.Optic.fromYaml("LSST_r.yaml")
+    fields = np.deg2rad([0.0, 0.5, 1.0, 1.5, 1.75])
+    shift = (0.0, 0.0, 1.5e-3)
+    camera, detector = (
+        pachon.wavefront_zernikes(
+            telescope.perturbed(body, shift=shift), [(0.0, field) for field in fields], WAVELENGTH, jmax=22
+        ).coefficients
+        for body in ("Camera", "Detector")
+    )
+    size = 1e9 * np.linalg.norm((camera - detector)[:, 4:], axis=1)
+    assert np.round(size).tolist() == [38, 69, 146, 269, 349]
+    bodies = [optic.withGloballyShiftedOptic(name, shift) for name in ("LSST.LSSTCamera", "LSST.LSSTCamera.Detector")]
+    for field, ours in zip(fields, camera - detector, strict=True):
+        moved, still = (
+            batoid.zernikeGQ(body, 0.0, field, WAVELENGTH, projection="zemax", jmax=22, eps=0.612)[4:23] * WAVELENGTH
+            for body in bodies
+        )
+        # 349 nm of terms up to Z22 on pupils whose vignetted edges the two sample differently.
+        assert np.abs(moved - still - ours[3:]).max() < 1e-9

@@ -15,7 +15,7 @@ from pachon.models.parameters.tolerances import Tolerance
 
 FIELDS = np.deg2rad([[0.0, 0.0], [0.0, 8.0], [0.0, -11.0]])
 TOLERANCES = (
-    Tolerance("S3.dy", 10e-6),
+    Tolerance("S3.dy", 15e-6),
     Tolerance("S4.thickness", 20e-6, "normal"),
     Tolerance("S1.curvature", 0.05),
     Tolerance("S6.n", 2e-4, "end_point"),

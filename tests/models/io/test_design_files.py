@@ -10,11 +10,10 @@ import pachon
 from pachon.core.errors import PrescriptionError
 from pachon.models.design_data import DesignData, vignetted
 from pachon.models.io.prescription import load_telescope, save_telescope
+from pachon.models.parameters.parameters import apply
 
 DATA = Path(__file__).parents[2] / "data" / "zmx"
 FILES = sorted(DATA.glob("*.zmx"))
-#: Files whose stop is off the axis, which is not written.
-FOLDED = ("HoO-V2C18Ex46",)
 
 LENS = """MODE SEQ
 UNIT CM X W X CM MR CPMM
@@ -123,8 +122,6 @@ def test_real_files_keep_their_design_data(tmp_path, path):
     assert load_telescope(tmp_path / "again.yaml") == telescope
     save_telescope(telescope, tmp_path / "again.zmx")
     expected = telescope.design_data
-    if path.stem in FOLDED:
-        expected = telescope.with_design(stop=None, aiming="off").design_data
     found = load_telescope(tmp_path / "again.zmx").design_data
     # Zemax's own temperature and pressure where a file states none.
     for key in (key for key in DesignData.__dataclass_fields__ if key not in ("temperature", "pressure")):
@@ -137,7 +134,8 @@ def test_a_pupil_of_another_origin_is_written_as_a_plane(tmp_path):
 
     telescope = lens(tmp_path)
     other = replace(telescope, stop_z=telescope.stop_z + 0.01).with_design(aiming="off")
-    save_telescope(other, tmp_path / "again.zmx")
+    with pytest.warns(pachon.PrescriptionWarning, match="do not make the pupil; a plane in front carries the stop$"):
+        save_telescope(other, tmp_path / "again.zmx")
     again = load_telescope(tmp_path / "again.zmx")
     assert again.stop_z == pytest.approx(other.stop_z, abs=1e-16)
     assert (again.design_data.stop, again.design_data.aiming) == (None, "off")
@@ -182,8 +180,24 @@ def test_an_aimed_stop_off_the_axis_is_kept(tmp_path, ending):
         assert not np.allclose(rays_of(again, field), rays_of(telescope, field), rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("ending", ["zmx", "json"])
+@pytest.mark.parametrize("aperture", ["ENPD 2", "OBNA 0.009"])
+def test_an_aimed_stop_of_a_near_object_is_kept(tmp_path, aperture, ending):
+    """The pupil moves with a change; the beam keeps its angle, and the fields their points of the object."""
+    telescope = lens(tmp_path, kind=1, distance="100", aperture=aperture).with_design(vignetting=(), aiming="real")
+    changed = apply(telescope, {"front.radius": 0.02, "front.thickness": 2e-3})
+    changed = changed.perturbed("front", shift=(1e-4, 0.0, 0.0))
+    save_telescope(changed, tmp_path / f"again.{ending}")
+    again = load_telescope(tmp_path / f"again.{ending}")
+    assert (again.design_data.stop, again.design_data.aiming) == ("iris", "real")
+    assert not np.isclose(again.stop_z, changed.stop_z, rtol=0, atol=1e-4)
+    for field, here in zip(pachon.Request.of(changed).fields, pachon.Request.of(again).fields, strict=True):
+        assert np.allclose(rays_of(again, here), rays_of(changed, field), rtol=0, atol=1e-13)
+
+
 def test_an_aimed_stop_that_cannot_be_written_is_a_warning(tmp_path):
-    telescope = lens(tmp_path, kind=1, distance="100").perturbed("front", shift=(1e-4, 0.0, 0.0))
+    """Field angles of a near object are those at the pupil, which must not move then."""
+    telescope = lens(tmp_path, kind=0, distance="100").perturbed("front", shift=(0.0, 0.0, 1e-3))
     with pytest.warns(pachon.PrescriptionWarning, match="stop = iris, aiming = real: .* rays are not aimed"):
         save_telescope(telescope.with_design(aiming="real"), tmp_path / "again.zmx")
 

@@ -158,15 +158,47 @@ def test_rays_of_lenses_written_in_other_formats(tmp_path, name, ending):
         assert kept == pytest.approx(known)
 
 
-@pytest.mark.parametrize("ending", [".seq", ".len", ".roa"])
-def test_a_stop_off_the_axis_stands_on_a_plane_in_front(tmp_path, ending):
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_tilted_stop_stays_on_its_surface(tmp_path, ending):
+    """The image of a tilted stop stands where it stood: its middle did not move."""
     telescope = lens("singlet").with_design(aiming="off")
     telescope = telescope.perturbed(telescope.design_data.stop, tilt=(0.01, 0.0, 0.0))
+    read = again(telescope, tmp_path / f"lens{ending}", lenient=True)
+    assert read.design_data.stop == telescope.design_data.stop
+    assert_same_rays(telescope, read)
+
+
+@pytest.mark.parametrize("ending", [".zmx", ".seq", ".len", ".json", ".roa"])
+def test_a_stop_that_does_not_make_the_pupil_stands_on_a_plane_in_front(tmp_path, ending):
+    telescope = lens("singlet").with_design(aiming="off")
+    telescope = replace(telescope, stop_z=telescope.stop_z + 1e-3)
     path = tmp_path / f"lens{ending}"
     read = again(telescope, path, lenient=True)
-    assert "with surfaces off the axis" in warnings_of(telescope, path)
+    assert "the stop and the stated aperture do not make the pupil" in warnings_of(telescope, path)
     assert read.design_data.stop is None
     assert_same_rays(telescope, read)
+
+
+#: A triplet whose stop is the back of its negative lens; no ray aiming, as is Zemax's default.
+STOP_INSIDE = ROOT / "tests" / "data" / "lensfiles" / "stop_inside.zmx"
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize(
+    "change", [{"S2.thickness_mm": 2.0, "S1.radius_mm": 3.0}, {"S1.dy_um": 100.0}, {"S3.rx_mrad": 2.0}]
+)
+def test_a_changed_lens_keeps_its_stop_inside(tmp_path, ending, change):
+    telescope = pachon.load_telescope(STOP_INSIDE)
+    changed = pachon.apply_changes(telescope, change)
+    path = tmp_path / f"lens{ending}"
+    read = again(changed, path)
+    assert "pachon entrance pupil" not in path.read_text()
+    assert (read.design_data.stop, read.surface_names) == ("S4", telescope.surface_names)
+    assert read.pupil_diameter == pytest.approx(0.01, rel=1e-14)
+    # The first vertex is the origin of what is read.
+    shift = read.surfaces[0].vertex[2] - changed.surfaces[0].vertex[2]
+    assert read.stop_z == pytest.approx(changed.stop_z + shift, abs=1e-15)
+    assert_same_rays(changed, read)
 
 
 @pytest.mark.parametrize("name", ["lsst_v3.3_r", "paul_baker"])

@@ -138,17 +138,20 @@ def test_names_of_columns_of_sextractor(stars, tmp_path):
     assert np.array_equal(found.positions, stars.positions)
     assert np.isnan(found.stamps[3, 0, 0])
     assert np.array_equal(found.stamps[4], stars.stamps[4])
-    # A masked pixel takes its star out.
-    assert fit_own_stars(*found, PIXEL, interpolation="polynomial", order=0).flags[3] == StarFlag.UNUSABLE
+    assert fit_own_stars(*found, PIXEL, interpolation="polynomial", order=0).used[3]
 
 
 @pytest.mark.long
 def test_the_command_leaves_model_picture_and_table(stars, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    Table({"x": stars.positions[:, 0], "y": stars.positions[:, 1], "stamp": stars.stamps}).write("stars.fits")
+    stamps = stars.stamps.copy()
+    stamps[2, 5, 5] = np.nan
+    stamps[3, 14:19, 14:19] = -1e30
+    Table({"x": stars.positions[:, 0], "y": stars.positions[:, 1], "stamp": stamps}).write("stars.fits")
     assert main(["model", "stars.fits", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert (found["stars"], found["used"], found["flagged"]["cosmic_ray"]) == (COUNT, COUNT - 3, 1)
+    assert (found["stars"], found["used"]) == (COUNT, COUNT - 4)
+    assert (found["flagged"]["cosmic_ray"], found["flagged"]["masked"]) == (1, 1)
     assert PsfModel.read("stars_psf.fits").draw(2000.0, 2000.0).sum() == pytest.approx(1.0)
     assert (tmp_path / "stars_psf.png").read_bytes().startswith(b"\x89PNG")
     table = Table.read("stars_psf.ecsv")

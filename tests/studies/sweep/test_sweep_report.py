@@ -51,6 +51,22 @@ def test_effects_budget_and_allowances_are_those_of_a_sum_of_squares(tmp_path):
 
 
 @pytest.mark.long
+def test_metrics_of_a_store_write_no_picture_outside_the_folder(tmp_path):
+    points = numbered_points(SWEEP, Path())
+    here = tmp_path / "a" / "b"
+    here.mkdir(parents=True)
+    create_store(here / "s.sweep", SWEEP, points, {})
+    with SweepStore(here / "s.sweep") as store:
+        for p in points:
+            store.write(PointResult(p.number, {"x/../../../pwned": 1.0 + p.parameters["a"]}, None, 0.1, "here"))
+        # Folders of the first part of the path, which the system would follow.
+        (here / "report" / "curves_x").mkdir(parents=True)
+        write_report(store, here / "report")
+    assert len(list((here / "report").glob("curves_x_.._.._.._pwned-*.png"))) == 1
+    assert {path.name for path in tmp_path.rglob("*") if here not in path.parents} == {"a", "b"}
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("slope", [0.0, -1.0, math.nan])
 def test_a_metric_that_nothing_raises_has_a_report_without_allowances(tmp_path, slope):
     points = numbered_points(SWEEP, Path())

@@ -1,0 +1,185 @@
+"""Bad pixels of star stamps: filled from the other stars and the model, and stars of which too little is left."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from ...core.errors import DomainError
+from ...measure.shapes import measure_shapes
+from ...measure.stamps import fourier_shift, shift_mask
+from .star_catalogue import bad_pixels
+
+#: A star is lost where bad pixels hold more than this fraction of its light above half of its peak, or of its light
+#: under the weight of the moments: what is measured would be the model rather than the star.
+MOST_MASKED = 0.5
+# Standard deviation of the weights of good neighbours [pixel], about the width of a star; and their least sum: a bad
+# pixel without any near starts as sky.
+_NEIGHBOURHOOD, _LEAST_NEIGHBOURS = 1.5, 1e-3
+# Passes end when no centroid moves by more than this [pixel], a tenth of the error of a star of S/N 200.
+_CONVERGED, _MOST_PASSES = 1e-3, 10
+# Fewest pixels of sky; where fewer are good, this fraction of the good pixels stands in, the farthest from the centre.
+_FEWEST_SKY, _OUTERMOST = 20, 0.25
+
+
+def as_bad_pixels(images: np.ndarray, masks: Any) -> np.ndarray:
+    """Return pixels of stamps that are masked or bad (:func:`~.star_catalogue.bad_pixels`), bool [n, ny, nx]."""
+    bad = bad_pixels(images)
+    if masks is None:
+        return bad
+    masked = np.asarray(masks)
+    if masked.shape != images.shape or masked.dtype.kind != "b":
+        raise DomainError(
+            f"masks have shape {masked.shape} and type {masked.dtype}: expected bool {list(images.shape)} as the "
+            "stamps, True is bad"
+        )
+    return bad | masked
+
+
+def sky_of_stamps(images: np.ndarray, bad: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return median and rms noise of the good pixels beyond a radius from the centre [pixel], both [n].
+
+    Where hardly any is good there, those of the farthest quarter of the good pixels; NaN without a good pixel.
+    """
+    y, x = np.indices(images.shape[1:]) - 0.5 * (np.array(images.shape[1:])[:, None, None] - 1.0)
+    distance = np.hypot(x, y)
+    outside = distance > radius
+    sky = np.where(bad[:, outside], np.nan, images[:, outside])
+    sparse = (~bad[:, outside]).sum(axis=1) < min(_FEWEST_SKY, outside.sum())
+    level, rms = np.full((2, len(images)), np.nan)
+    level[~sparse] = np.nanmedian(sky[~sparse], axis=1)
+    rms[~sparse] = 1.4826 * np.nanmedian(np.abs(sky[~sparse] - level[~sparse, None]), axis=1)
+    for i in np.flatnonzero(sparse & ~bad.all(axis=(1, 2))):
+        far = ~bad[i] & (distance >= np.quantile(distance[~bad[i]], 1.0 - _OUTERMOST))
+        level[i] = np.median(images[i][far])
+        rms[i] = 1.4826 * np.median(np.abs(images[i][far] - level[i]))
+    return level, rms
+
+
+def fill_symmetric(images: np.ndarray, bad: np.ndarray) -> np.ndarray:
+    """Fill bad pixels by those opposite the centre, or by the mean of good neighbours: a first guess.
+
+    `images` are background-subtracted [n, ny, nx].
+    """
+    filled = np.where(bad, 0.0, images)
+    opposite = bad & ~bad[:, ::-1, ::-1]
+    filled[opposite] = images[:, ::-1, ::-1][opposite]
+    alone = bad & ~opposite
+    for i in np.flatnonzero(alone.any(axis=(1, 2))):
+        weight, light = (
+            ndimage.gaussian_filter(values, _NEIGHBOURHOOD, mode="constant")
+            for values in ((~bad[i]).astype(np.float64), np.where(bad[i], 0.0, images[i]))
+        )
+        near = alone[i] & (weight > _LEAST_NEIGHBOURS)
+        filled[i][near] = light[near] / weight[near]
+    return filled
+
+
+def fill_by_median_star(
+    images: np.ndarray, bad: np.ndarray, pixel_scale: float, weight_fwhm: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fill bad pixels of background-subtracted stamps [n, ny, nx] by the median star at each star's place and flux.
+
+    Places depend on the filled pixels, so both are iterated. Returns the filled stamps; the median star [ny, nx],
+    centred on pixel (ny // 2, nx // 2); and the stars of which too little is left (:data:`MOST_MASKED`), [n] bool.
+    Stars that are lost hold the median star in their bad pixels; where no star can be measured, the first guess.
+    """
+    filled = fill_symmetric(images, bad)
+    shapes = measure_shapes(filled, pixel_scale, weight_fwhm)
+    x, y, usable = shapes.x, shapes.y, shapes.usable
+    sigma = weight_sigma(pixel_scale, weight_fwhm)
+    masked, lost = np.flatnonzero(bad.any(axis=(1, 2))), np.zeros(len(images), dtype=bool)
+    star = np.zeros(images.shape[1:])
+    for _ in range(_MOST_PASSES):
+        if not usable.any():
+            break
+        star = _median_star(filled[usable], bad[usable], x[usable], y[usable], sigma)
+        profiles = np.broadcast_to(star, (len(masked), *star.shape))
+        filled[masked], lost[masked] = fill_by_profiles(
+            images[masked], bad[masked], profiles, x[masked], y[masked], sigma
+        )
+        shapes = measure_shapes(filled[masked], pixel_scale, weight_fwhm)
+        step = np.hypot(shapes.x - x[masked], shapes.y - y[masked])
+        x[masked], y[masked] = shapes.x, shapes.y
+        usable[masked] = shapes.usable & ~lost[masked]
+        if not (step[usable[masked]] > _CONVERGED).any():
+            break
+    return filled, star, lost
+
+
+def fill_by_profiles(
+    images: np.ndarray, bad: np.ndarray, profiles: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fill bad pixels of stars by their profiles, and tell of which stars too little is left.
+
+    Parameters
+    ----------
+    images, bad, profiles : array
+        Background-subtracted stamps, their bad pixels, and the profile of each star, of any flux, centred on pixel
+        (ny // 2, nx // 2); [n, ny, nx]. Stars have the flux of least squares in the good pixels under the weight.
+    x, y : array
+        Centroids from the centre of the stamps [pixel], [n]; NaN counts as the centre.
+    sigma : float
+        rms width of the weight of the moments [pixel].
+
+    Returns
+    -------
+    tuple of array
+        Filled stamps [n, ny, nx], and the stars that are lost (:data:`MOST_MASKED`), [n] bool.
+    """
+    filled, lost = images.copy(), np.zeros(len(images), dtype=bool)
+    middle = _middle_pixel(images.shape[1:])
+    for i, place in enumerate(np.nan_to_num(np.stack([x, y], axis=1))):
+        profile = fourier_shift(profiles[i], *(place - middle))
+        light = _weight(profile.shape, place, sigma) * profile
+        good = ~bad[i]
+        square = (light * profile)[good].sum()
+        flux = (light * images[i])[good].sum() / square if square > 0.0 else 0.0
+        filled[i][bad[i]] = flux * profile[bad[i]]
+        core = np.where(profile > 0.5 * profile.max(), profile, 0.0)
+        lost[i] = any(part[bad[i]].sum() > MOST_MASKED * part.sum() for part in (core, light))
+    return filled, lost
+
+
+def profiles_of_psfs(psfs: np.ndarray, star: np.ndarray, sigma: float) -> np.ndarray:
+    """Return PSFs [n, size, size] with the wings of the median star [ny, nx] around them, [n, ny, nx].
+
+    They join by their light under the weight of rms width `sigma` [pixel]. All are centred on pixel (ny // 2, nx // 2).
+    """
+    rows, columns = (slice(n // 2 - psfs.shape[1] // 2, n // 2 + psfs.shape[1] // 2 + 1) for n in star.shape)
+    weight = _weight(star.shape, _middle_pixel(star.shape), sigma)[rows, columns]
+    flux = (weight * star[rows, columns]).sum() / (weight * psfs).sum(axis=(1, 2))
+    profiles = np.repeat(star[None], len(psfs), axis=0)
+    profiles[:, rows, columns] = psfs * flux[:, None, None]
+    return profiles
+
+
+def weight_sigma(pixel_scale: float, weight_fwhm: float) -> float:
+    """Return the rms width of a Gaussian weight [pixel]."""
+    return weight_fwhm / pixel_scale / 2.354820045
+
+
+def _median_star(images: np.ndarray, bad: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: float) -> np.ndarray:
+    """Return the median of stars scaled to their light under the weight, centred on pixel (ny // 2, nx // 2)."""
+    shape = images.shape[1:]
+    middle = _middle_pixel(shape)
+    weight = _weight(shape, middle, sigma)
+    stars, masks = np.empty(images.shape), np.empty(images.shape, dtype=bool)
+    for i, place in enumerate(np.stack([x, y], axis=1)):
+        star = fourier_shift(images[i], *(middle - place))
+        stars[i], masks[i] = star / (weight * star).sum(), shift_mask(bad[i], *(middle - place))
+    masks[:, masks.all(axis=0)] = False  # a pixel that is bad in all stars has no better median
+    return np.asarray(np.nanmedian(np.where(masks, np.nan, stars), axis=0))
+
+
+def _middle_pixel(shape: tuple[int, ...]) -> np.ndarray:
+    """Return (x, y) of pixel (ny // 2, nx // 2) from the centre of the stamp [pixel]."""
+    return np.array([n // 2 - (n - 1) / 2.0 for n in shape[::-1]])
+
+
+def _weight(shape: tuple[int, ...], place: np.ndarray, sigma: float) -> np.ndarray:
+    """Return a round Gaussian on pixels about a place from the centre of the stamp [pixel]."""
+    y, x = (np.arange(n) - (n - 1) / 2.0 - at for n, at in zip(shape, place[::-1], strict=True))
+    return np.asarray(np.exp(-0.5 * (y[:, None] ** 2 + x**2) / sigma**2))

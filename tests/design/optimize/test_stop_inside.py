@@ -1,0 +1,303 @@
+"""A lens whose stop is inside and whose file aims no rays: the pupil follows the stop through every change."""
+
+import re
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pachon
+from pachon.core.errors import PrescriptionWarning
+from pachon.design.optimize.aimed_rays import AimedRays
+from pachon.design.optimize.jacobian import ParameterColumns
+from pachon.design.optimize.monte_carlo import monte_carlo
+from pachon.models.first_order import footprints
+from pachon.models.io.prescription import WRITTEN
+from pachon.models.parameters.parameters import apply, parse_parameters
+from pachon.models.parameters.tolerances import Tolerance
+from pachon.models.paraxial import following_stop
+from pachon.raytrace.adjoint.backward_pass import image_gradient
+from pachon.studies.tolerance.file import ToleranceFile
+from pachon.studies.tolerance.study import run_tolerances
+
+LENSES = Path(__file__).parents[2] / "data"
+FILE = LENSES / "lensfiles" / "stop_inside.zmx"
+VARIABLES = [*(f"S{i}.radius" for i in range(1, 7)), "S2.thickness", "S4.thickness", "S6.thickness"]
+BOUNDS = {"S2.thickness": (2e-3, 12e-3), "S4.thickness": (2e-3, 12e-3)}
+RINGS = 3
+
+
+@pytest.fixture(scope="module")
+def lens():
+    return pachon.load_telescope(FILE)
+
+
+@pytest.fixture
+def typed(tmp_path):
+    """``typed((surface, old, new), ...)``: the lens of the file with lines of surfaces typed anew, its pupil too."""
+
+    def load(*edits, aperture="ENPD 10"):
+        head, *blocks = re.split(r"(?=SURF \d)", FILE.read_text().replace("ENPD 10", aperture))
+        for surface, old, new in edits:
+            assert old in blocks[surface]
+            blocks[surface] = blocks[surface].replace(old, new)
+        path = tmp_path / "typed.zmx"
+        path.write_text("".join([head, *blocks]))
+        return pachon.load_telescope(path)
+
+    return load
+
+
+def filled_spots(telescope, n_pupil=RINGS):
+    """Rms spot radius over the fields [m], as ``pachon spots --aiming real`` has it."""
+    radii = pachon.spots(telescope.with_design(aiming="real"), n_pupil=n_pupil).rms_radius
+    return float(np.sqrt(np.mean(radii**2)))
+
+
+@pytest.fixture(scope="module")
+def optimum(lens):
+    return pachon.optimize(
+        lens, VARIABLES, "spots", bounds=BOUNDS, targets=[pachon.FocalLength(0.05)], n_pupil=RINGS, tolerance=1e-3
+    )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("ending", [ending for ending in WRITTEN if ending != ".yml"])
+def test_what_is_reported_is_what_the_saved_lens_does(lens, optimum, tmp_path, ending):
+    path = tmp_path / f"better{ending}"
+    with warnings.catch_warnings():
+        # CODE V has rays aimed at the stop.
+        warnings.filterwarnings("ignore", message=".* does not state how rays are aimed", category=PrescriptionWarning)
+        pachon.save_telescope(optimum.telescope, path)
+    again = pachon.load_telescope(path)
+    assert again.design_data.stop == "S4"
+    assert "pachon entrance pupil" not in path.read_text()
+    assert again.stop_z - again.surfaces[0].vertex[2] == pytest.approx(
+        optimum.telescope.stop_z - optimum.telescope.surfaces[0].vertex[2], abs=1e-15
+    )
+    assert optimum.merits[0] == pytest.approx(filled_spots(lens), rel=1e-9)
+    # Numbers of the file are rounded in their last digits.
+    assert optimum.merits[1] == pytest.approx(filled_spots(again), rel=1e-9)
+    assert optimum.merits[1] < 0.25 * optimum.merits[0]
+
+
+@pytest.mark.long
+def test_the_result_has_the_aiming_of_the_file(lens, optimum):
+    after = optimum.telescope
+    assert (lens.design_data.aiming, after.design_data.aiming) == ("off", "off")
+    assert pachon.with_floating_pupil(after).stop_z == pytest.approx(after.stop_z, abs=1e-16)
+    assert not np.isclose(after.stop_z, lens.stop_z, rtol=0, atol=5e-4)
+    assert after.pupil_diameter == lens.pupil_diameter
+    assert optimum.filled_stops == ("S4",)
+    assert optimum.remeasured[:, 0] == pytest.approx(optimum.merits, rel=1e-9)
+    for telescope, found in zip((lens, after), optimum.remeasured[:, 1], strict=True):
+        plain = pachon.spots(telescope, n_pupil=RINGS).rms_radius
+        assert found == pytest.approx(np.sqrt(np.mean(plain**2)), rel=1e-12)
+    assert optimum.is_better
+    assert optimum.is_as_measured
+    summary = optimum.summary()
+    assert summary["rays_fill"] == ["S4"]
+    assert summary["rms_end_without_aiming_m"] == optimum.remeasured[1, 1]
+
+
+@pytest.mark.long
+def test_a_lens_that_got_worse_is_not_called_better(lens):
+    """A focal length that spoils the spots."""
+    target = pachon.FocalLength(0.055, weight=10.0)
+    worse = pachon.optimize(lens, ["S1.radius"], targets=[target], n_pupil=2, max_steps=5)
+    assert worse.merits[1] > worse.merits[0]
+    assert worse.remeasured[1, 0] == pytest.approx(filled_spots(worse.telescope, 2), rel=1e-9)
+    assert not worse.is_better
+
+
+def through_stop(telescope, field, relative):
+    """Solve for the ray that meets the stop at a point in units of its radius; return where it lands [m].
+
+    The radius is that of the ray on the axis at the rim of the entrance pupil.
+    """
+    stop, light = telescope.surface_names.index("S4"), telescope.default_wavelength
+
+    def met(at, points):
+        rays = pachon.launch_rays(telescope, at, light, np.transpose(points))
+        ends = pachon.trace(telescope, rays, surfaces="all", threads=1)
+        return [telescope.surfaces[i].to_local(ends[i].position)[:, :2] for i in (stop, -1)]
+
+    def solved(at, target, point):
+        step = 1e-6 * np.eye(2)
+        for _ in range(5):
+            # Newton's method, with derivatives by differences.
+            here, *sides = met(at, np.stack([point, *(point + step), *(point - step)]))[0]
+            slopes = np.transpose(np.subtract(sides[:2], sides[2:])) / 2e-6
+            point = point - np.linalg.solve(slopes, here - target)
+        assert met(at, point[None])[0][0] == pytest.approx(target, abs=1e-15)
+        return point
+
+    axis = solved((0.0, 0.0), np.zeros(2), np.zeros(2))
+    rim = met((0.0, 0.0), axis[None] + [0.0, 0.5 * telescope.pupil_diameter])[0][0]
+    return met(field, solved(field, np.hypot(*rim) * relative, 5e-3 * relative)[None])[1][0]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("field_deg", [(0.0, 0.0), (4.0, 14.0)])
+def test_derivatives_of_landing_points_are_those_of_rays_solved_anew(lens, field_deg):
+    """Brute force: lenses with one change, and rays that are searched for through their stops."""
+    steps = {
+        "S1.curvature": 1e-3,
+        "S2.thickness": 1e-5,
+        "S3.dy": 1e-5,
+        "S1.rx": 1e-4,
+        "S4.dx": 1e-5,
+        "S5.curvature": 1e-3,
+    }
+    field, relative = np.deg2rad(field_deg), np.array([[0.0, 0.0], [0.5, -0.7]])
+    request = pachon.Request.of(following_stop(lens), [field])
+    columns = ParameterColumns.at(following_stop(lens), parse_parameters(steps, lens))
+    aimed = AimedRays(columns, request, lens.default_wavelength, 0.5 * lens.pupil_diameter * relative)
+    forward = aimed.forward()
+    found = aimed.derivatives(forward, image_gradient(forward))
+    for i, point in enumerate(relative):
+        assert forward.image[:, i] == pytest.approx(through_stop(lens, field, point), abs=1e-13)
+        for p, (address, step) in enumerate(steps.items()):
+            sides = {k: through_stop(apply(lens, {address: k * step}), field, point) for k in (1, -1, 2, -2)}
+            # Differences without their error of third order, of points that are found to 1e-15 m.
+            numeric = (8 * (sides[1] - sides[-1]) - (sides[2] - sides[-2])) / (12 * step)
+            assert found[:, i, p] == pytest.approx(numeric, rel=1e-7, abs=2e-9), address
+
+
+@pytest.mark.long
+def test_sensitivities_are_those_of_rays_that_fill_the_stop(lens):
+    """Without a word about aiming they are those with it, which brute force has tested."""
+    names, fields = ["S1.dy", "S2.thickness", "S4.rx"], np.deg2rad([[0.0, 0.0], [0.0, 15.0]])
+    plain, aimed = (
+        pachon.sensitivity(t, names, fields, n_pupil=4, n_zernike=8) for t in (lens, lens.with_design(aiming="real"))
+    )
+    assert np.array_equal(plain.matrix, aimed.matrix)
+    assert np.array_equal(plain.zernikes, aimed.zernikes)
+
+
+@pytest.mark.long
+def test_tolerances_fill_the_stop_of_every_lens(lens, typed):
+    file = ToleranceFile.model_validate(
+        {
+            "telescope": str(FILE), "rings": RINGS, "draws": 2,
+            "tolerances": [{"name": "S2.thickness_um", "size": 200}, {"name": "S1.curvature", "size": 0.1}],
+        }
+    )  # fmt: skip
+    study = run_tolerances(lens, file)
+    assert study.nominal == pytest.approx(filled_spots(lens), rel=1e-9)
+    assert study.lower[0] == pytest.approx(filled_spots(typed((2, "DISZ 6.0", "DISZ 5.8"))), rel=1e-9)
+    assert study.upper[0] == pytest.approx(filled_spots(typed((2, "DISZ 6.0", "DISZ 6.2"))), rel=1e-9)
+    # The curvature of the telescope has the other sign: its z axis is against the light.
+    assert study.upper[1] == pytest.approx(filled_spots(typed((1, "CURV 0.0461", "CURV 0.0460"))), rel=1e-9)
+    assert "rays fill the stop S4" in study.merit.definition
+    frozen = apply(lens, {"S2.thickness": 2e-4})
+    radii = pachon.spots(frozen, n_pupil=RINGS).rms_radius
+    assert abs(np.sqrt(np.mean(radii**2)) / study.upper[0] - 1.0) > 5e-3
+
+
+@pytest.mark.long
+def test_drawn_lenses_fill_their_stop(lens, typed):
+    fields = np.array(lens.design_data.fields)
+    found = monte_carlo(
+        lens, [Tolerance("S2.thickness", 2e-4)], "spots", n=2, method="traced", fields=fields, n_pupil=RINGS
+    )
+    for deviation, merit in zip(found.deviations[:, 0], found.merit, strict=True):
+        drawn = typed((2, "DISZ 6.0", f"DISZ {6.0 + 1e3 * float(deviation)!r}"))
+        assert merit == pytest.approx(filled_spots(drawn), rel=1e-9)
+
+
+#: A stop of 3.6 mm in place of a pupil of 10 mm.
+STATED = (4, "  TYPE", "  DIAM 3.6 1\n  TYPE")
+CHANGES = {"S2.thickness_mm": 1.0, "S1.curvature": 2.0}
+TYPED_CHANGES = ((2, "DISZ 6.0", "DISZ 7.0"), (1, "CURV 0.0461", "CURV 0.0441"))
+
+
+@pytest.mark.parametrize("aperture", ["ENPD 10", "FLOA"])
+def test_the_pupil_of_a_changed_lens_is_that_of_its_file(typed, aperture):
+    """A stated diameter stays; that of a stated stop follows."""
+    start = typed(STATED, aperture=aperture)
+    changed = pachon.apply_changes(start, CHANGES)
+    expected = typed(STATED, *TYPED_CHANGES, aperture=aperture)
+    assert changed.design_data == start.design_data
+    assert changed.stop_z == pytest.approx(expected.stop_z, abs=1e-15)
+    assert abs(changed.stop_z - start.stop_z) > 1e-3
+    assert changed.pupil_diameter == pytest.approx(expected.pupil_diameter, rel=1e-13)
+    assert (changed.pupil_diameter == start.pupil_diameter) == (aperture == "ENPD 10")
+    one, other = (pachon.spots(t, n_pupil=RINGS).rms_radius for t in (changed, expected))
+    assert one == pytest.approx(other, rel=1e-9)
+
+
+def test_changes_at_zero_change_nothing(lens):
+    assert pachon.apply_changes(lens, {"S2.thickness_mm": 0.0, "S1.dy_um": 0.0}) == lens
+
+
+@pytest.mark.parametrize("aiming", ["off", "paraxial", "real"])
+def test_edges_are_held_where_the_light_goes_in_the_lens_as_it_is(typed, aiming):
+    """The clear radius of a surface is that of light through the stop, not through the pupil at the start."""
+    start, expected = (t.with_design(aiming=aiming) for t in (typed(), typed(*TYPED_CHANGES)))
+    changed = apply(start, {"S2.thickness": 1e-3, "S1.curvature": 2.0})
+    for surface in ("S1", "S5"):
+        edge = pachon.EdgeThickness(surface, minimum=0.0)
+        assert edge.measure(changed) == pytest.approx(edge.measure(expected), abs=1e-15)
+        # Light through the pupil where it was.
+        frozen = footprints(changed, changed.field_radius)[[int(surface[1]) - 1, int(surface[1])]].max()
+        assert abs(edge.measure(changed) - replace(edge, radius=float(frozen)).measure(changed)) > 1e-5
+
+
+@pytest.mark.long
+def test_an_edge_is_held_on_the_optimum_as_it_is_saved(lens, tmp_path):
+    """The lens before would go below it."""
+    how = dict(bounds={"S2.thickness": BOUNDS["S2.thickness"]}, n_pupil=2, tolerance=1e-4, max_steps=40)
+    free = pachon.optimize(lens, ["S1.radius", "S2.thickness", "S6.thickness"], **how).telescope
+    least = pachon.EdgeThickness("S1", minimum=1.0).measure(free) + 2e-4
+    edge = pachon.EdgeThickness("S1", minimum=least, weight=10.0)
+    held = pachon.optimize(lens, ["S1.radius", "S2.thickness", "S6.thickness"], targets=[edge], **how)
+    pachon.save_telescope(held.telescope, tmp_path / "held.zmx")
+    saved = edge.measure(pachon.load_telescope(tmp_path / "held.zmx"))
+    assert held.operands[0].end == pytest.approx(saved, abs=1e-12)
+    assert saved == pytest.approx(least, abs=2e-5)
+
+
+def test_a_focal_ratio_follows_a_stop_of_stated_size(typed):
+    """With a stop of one size, what is in front of it changes focal length and pupil alike (Lagrange's invariant)."""
+    start = following_stop(typed(STATED, aperture="FLOA"))
+    ratio, focal = pachon.FNumber(5.0), pachon.FocalLength(0.05)
+    names, values = ["S1.curvature", "S2.thickness", "S6.curvature"], np.array([2.0, 1e-3, 0.0])
+    columns = ParameterColumns.at(start, parse_parameters(names, start), values)
+    number, found = ratio.gradient(columns)
+    diameter = pachon.with_floating_pupil(columns.telescope).pupil_diameter
+    assert number == pytest.approx(focal.measure(columns.telescope) / diameter, rel=1e-12)
+    assert number == pytest.approx(ratio.measure(start), rel=1e-7)
+    assert diameter != pytest.approx(start.pupil_diameter, rel=1e-2)
+    by_focal_length = focal.gradient(columns)[1] / diameter
+    # The scale is that of chief rays 1e-4 rad apart.
+    assert (np.abs(found[:2]) < 1e-6 * np.abs(by_focal_length[:2])).all()
+    assert found[2] == by_focal_length[2]
+
+
+@pytest.mark.long
+def test_a_near_object_keeps_its_cone_of_light(tmp_path):
+    """The relay has a working focal ratio, which the change makes untrue: the angle of the beam stays."""
+    relay = pachon.load_telescope(LENSES / "lenses" / "relay.zmx")
+    relay = relay.with_design(field_type="object_height", fields=((0.0, 0.0), (0.0, 0.004)), field_weights=())
+    assert relay.design_data.aiming == "off"
+    found = pachon.optimize(relay, ["A1.curvature", "A3.thickness"], n_pupil=2, max_steps=4)
+    assert found.remeasured[1, 0] == pytest.approx(found.merits[1], rel=1e-9)
+    before, after = relay, found.telescope
+    slopes = [0.5 * t.pupil_diameter / (t.object_distance - t.stop_z) for t in (before, after)]
+    assert slopes[1] == pytest.approx(slopes[0], rel=1e-13)
+    assert after.stop_z != before.stop_z
+    pachon.save_telescope(after, tmp_path / "after.zmx")
+    again = pachon.load_telescope(tmp_path / "after.zmx")
+    assert again.design_data.stop == relay.design_data.stop
+    assert filled_spots(again, 2) == pytest.approx(found.merits[1], rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["lsst_v3.3_r", "paul_baker", "lenses/doublet.zmx", "lenses/ritchey_chretien.zmx"])
+def test_telescopes_without_a_stop_inside_stay_as_they_are(name):
+    telescope = pachon.load_telescope(str(LENSES / name) if name.endswith("zmx") else name)
+    assert following_stop(telescope) is telescope
+    first = telescope.surface_names[0]
+    assert pachon.apply_changes(telescope, {f"{first}.dz_m": 5e-5}) == apply(telescope, {f"{first}.dz": 5e-5})
