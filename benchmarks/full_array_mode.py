@@ -6,8 +6,8 @@ The LSST (r band), off by twice the tolerances of ``pachon align`` in each of fi
 star (5e6 electrons by default) on each of so many CCDs (all by default), with the heights of the camera as built, its
 detector 1.5 mm behind the focus, and with ``sides`` 2 (the default) in front of it too. The observatory moves the
 camera instead, which differs by up to 350 nm (docs/donuts.md, "Which body moves"). All donuts together give the degrees
-of freedom (``fit_donuts(fit=TelescopeFreedoms(...))``). Printed: the wavefront over the field before and after they are taken
-off, what the covariance of the fit expects, and processor time and memory.
+of freedom (``fit_donuts(fit=TelescopeFreedoms(...))``). Printed: the wavefront over the field before and after they are
+taken off, what the covariance of the fit expects, and processor time and memory.
 """
 
 from __future__ import annotations
