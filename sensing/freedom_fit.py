@@ -79,9 +79,9 @@ class TelescopeFreedoms(WavefrontFit):
         instrument, freedoms = usable.instrument, self.freedoms
         telescope, noll, wavelength = instrument.telescope, instrument.noll, instrument.middle
         spreads = prior_spreads(freedoms, self.prior, telescope, wavelength)
-        options: dict[str, Any] = {"projection": usable.projection}
+        fields, projection = usable.fields, usable.projection
         last = int(noll.max())
-        response = sensitivity(telescope, freedoms, usable.fields, wavelength, n_zernike=last, **options)
+        response = sensitivity(telescope, freedoms, fields, wavelength, n_zernike=last, projection=projection)
         precision = spreads**-2.0
         shifts = self._rim_shifts(usable, spreads)
         maps = [np.concatenate([np.eye(len(freedoms)), star_shifts]) for star_shifts in shifts]
@@ -99,11 +99,11 @@ class TelescopeFreedoms(WavefrontFit):
                 break
         after = freedoms.apply(telescope, joint.shared)
         believed, estimated = (
-            wavefront_zernikes(t, usable.fields, wavelength, jmax=last, **options).coefficients[:, noll - 1]
+            wavefront_zernikes(t, fields, wavelength, jmax=last, projection=projection).coefficients[:, noll - 1]
             for t in (telescope, after)
         )
         many = max(last, _MANY_TERMS)
-        response = sensitivity(after, freedoms, usable.fields, wavelength, n_zernike=many, **options)
+        response = sensitivity(after, freedoms, fields, wavelength, n_zernike=many, projection=projection)
         return FittedStars(
             joint_results(stars, joint, estimated - believed, response.matrix[:, noll - 1]),
             degrees_of_freedom=FreedomEstimate(freedoms, joint.shared, joint.shared_covariance, spreads),

@@ -98,7 +98,7 @@ class ObservedStars:
 
 
 def padded(
-    values: ArrayLike | Sequence[ArrayLike], name: str, kind: type, fill: Any
+    values: ArrayLike | Sequence[ArrayLike], name: str, kind: type, fill: float | bool
 ) -> tuple[np.ndarray, list[tuple[int, int]]]:
     """Return images as one stack, smaller ones filled up at the end, and their shapes."""
     try:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from astropy.io import fits
@@ -116,7 +115,7 @@ def _column(table: Table, name: str) -> np.ndarray:
     return values.astype(np.float64)
 
 
-def _places(table: Table, count: int, file: Path) -> tuple[Any, np.ndarray]:
+def _places(table: Table, count: int, file: Path) -> tuple[np.ndarray | None, np.ndarray]:
     """Return field angles [rad], None without columns, and shifts of the detector [m]."""
     names = _names(table)
     if len(table) != count:
