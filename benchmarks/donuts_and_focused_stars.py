@@ -70,12 +70,11 @@ def main() -> None:
             images[:count],
             fields[:count],
             scene.wavelengths,
-            defocus=defocus[:count],
             sky_variance=SKY + READ_NOISE**2,
-            diffusion=DIFFUSION,
-            diffraction=True,
-            degrees_of_freedom=freedoms,
-            prior=PRIOR * tolerances,
+            model=pachon.DonutModel(
+                detector=pachon.DonutDetector(diffusion=DIFFUSION, defocus=defocus[:count]), diffraction=True
+            ),
+            fit=pachon.TelescopeFreedoms(freedoms, prior=PRIOR * tolerances),
         )
         spent = time.process_time() - start
         found = fit.degrees_of_freedom

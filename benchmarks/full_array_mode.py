@@ -6,8 +6,8 @@ The LSST (r band), off by twice the tolerances of ``pachon align`` in each of fi
 star (5e6 electrons by default) on each of so many CCDs (all by default), with the heights of the camera as built, its
 detector 1.5 mm behind the focus, and with ``sides`` 2 (the default) in front of it too. The observatory moves the
 camera instead, which differs by up to 350 nm (docs/donuts.md, "Which body moves"). All donuts together give the degrees
-of freedom (``fit_donuts(degrees_of_freedom=)``). Printed: the wavefront over the field before and after they are taken
-off, what the covariance of the fit expects, and processor time and memory.
+of freedom (``fit_donuts(fit=TelescopeFreedoms(...))``). Printed: the wavefront over the field before and after they are
+taken off, what the covariance of the fit expects, and processor time and memory.
 """
 
 from __future__ import annotations
@@ -72,13 +72,12 @@ def main() -> None:
         np.concatenate(images),
         np.tile(fields, (SIDES, 1)),
         scene.wavelengths,
-        defocus=np.concatenate(defocus),
-        focal_plane=heights,
         sky_variance=SKY + READ_NOISE**2,
-        diffusion=DIFFUSION,
-        diffraction=True,
-        degrees_of_freedom=freedoms,
-        prior=prior,
+        model=pachon.DonutModel(
+            detector=pachon.DonutDetector(diffusion=DIFFUSION, focal_plane=heights, defocus=np.concatenate(defocus)),
+            diffraction=True,
+        ),
+        fit=pachon.TelescopeFreedoms(freedoms, prior=prior),
     )
     fitted = time.process_time() - start
     found = fit.degrees_of_freedom

@@ -73,9 +73,9 @@ def align_command(
     )
     folder = None if config is None else config.parent
     with interruptible(quiet, f"finished visits are in {out}, and --resume goes on from there") as reporter:
-        found = align(settings, folder=folder, store=out, resume=resume, threads=threads, reporter=reporter)
-    write_alignment(found, out)
-    summary = alignment_summary(found)
+        alignment = align(settings, folder=folder, store=out, resume=resume, threads=threads, reporter=reporter)
+    write_alignment(alignment, out)
+    summary = alignment_summary(alignment)
     if as_json:
         print_json(summary)
         return

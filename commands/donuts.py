@@ -25,7 +25,10 @@ from .options import (
 from .tables import Rows, print_json
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from ..sensing.result import DonutFit
+    from ..sensing.wavefront_fits import WavefrontFit
 
 app = typer.Typer()
 
@@ -95,66 +98,94 @@ def donuts_command(
     - `pachon donuts corner_*.fits -t rubin_v3.14_i --degrees-of-freedom lsst --json`
     - `pachon donuts ccd.fits --positions stars.ecsv --stamp 200 --defocus-um -1500`
     """
-    import numpy as np
-
-    from ..core.files import write_bytes
-    from ..core.plotting import picture_bytes
-    from ..core.table_files import FORMATS, write_table
     from ..models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
     from ..sensing.fit import fit_donuts
-    from ..sensing.stamp_files import border_variance, read_stamps
+    from ..sensing.freedom_fit import TelescopeFreedoms
+    from ..sensing.model import DonutAir, DonutDetector, DonutModel
+    from ..sensing.stamp_files import border_variance
+    from ..sensing.wavefront_fits import SingleDonuts
     from ..wavefront.atmosphere.atmosphere import Atmosphere
 
-    kind = picture_kind(picture)
-    if out is not None and out.suffix.lower() not in FORMATS:
-        raise ConfigError(f"--out = {out}: expected a name that ends in {', '.join(FORMATS)}")
-    model = load_model(telescope, lenient, glass_catalogue or ())
-    freedoms = None if degrees_of_freedom is None else load_degrees_of_freedom(degrees_of_freedom)
-    air = None if exposure_s is None else Atmosphere.from_site(site, 0, exposure=exposure_s)
-    given = None if field_deg is None else np.deg2rad(degrees_pair(field_deg, "--field-deg"))
-    images, fields, defocus = [], [], []
-    for path in files:
-        stamps = read_stamps(path, positions, stamp)
-        places = given if stamps.fields is None else stamps.fields
-        if places is None:
-            raise ConfigError(
-                "no field angles: expected FIELD_X and FIELD_Y, a table with them, or --field-deg", file=path
-            )
-        images += [gain * image for image in stamps.images]
-        fields.append(np.broadcast_to(places, (len(stamps), 2)))
-        defocus.append(stamps.defocus + 1e-6 * defocus_um)
-    variance = [border_variance(image) for image in images] if sky_variance is None else sky_variance
+    kind = _output_kind(out, picture)
+    believed = load_model(telescope, lenient, glass_catalogue or ())
+    noll = range(4, terms + 1)
+    wavefront: WavefrontFit = SingleDonuts(noll, higher_order=higher_order_nm * 1e-9)
+    if degrees_of_freedom is not None:
+        wavefront = TelescopeFreedoms(load_degrees_of_freedom(degrees_of_freedom), noll=noll)
+    atmosphere = None if exposure_s is None else Atmosphere.from_site(site, 0, exposure=exposure_s)
+    images, fields, defocus = _stamps(files, positions, stamp, field_deg)
+    images = [gain * image for image in images]
+    model = DonutModel(
+        air=DonutAir(outer_scale=outer_scale_m, atmosphere=atmosphere),
+        detector=DonutDetector(pixel_um * 1e-6, defocus=defocus + 1e-6 * defocus_um, saturation=saturation),
+        diffraction=diffraction,
+    )
     with (
         interruptible(quiet) as reporter,
         reporter.stage(f"wavefronts of {len(images)} donuts", total=len(images)) as stage,
     ):
         fit = fit_donuts(
-            model,
+            believed,
             images,
-            np.concatenate(fields),
-            wavelength_list(model, wavelength_nm, None),
-            pixel_size=pixel_um * 1e-6,
-            sky_variance=variance,
-            noll=range(4, terms + 1),
-            higher_order=higher_order_nm * 1e-9,
-            turbulence=air,
-            degrees_of_freedom=freedoms,
-            defocus=np.concatenate(defocus),
-            outer_scale=outer_scale_m,
-            diffraction=diffraction,
-            saturation=saturation,
+            fields,
+            wavelength_list(believed, wavelength_nm, None),
+            sky_variance=[border_variance(image) for image in images] if sky_variance is None else sky_variance,
+            model=model,
+            fit=wavefront,
             projection=projection,
             threads=threads,
             progress=stage.advance,
         )
-    if out is not None:
-        write_table(out, fit.to_table())
-    if picture is not None:
-        write_bytes(picture, picture_bytes(fit.plot(), kind))
+    _write(fit, out, picture, kind)
     if as_json:
         print_json(fit.summary())
     elif not quiet:
         _show(fit)
+
+
+def _output_kind(table: Path | None, picture: Path | None) -> str:
+    """Return the format of the picture; a ConfigError for names of files of other formats."""
+    from ..core.table_files import FORMATS
+
+    kind = picture_kind(picture)
+    if table is not None and table.suffix.lower() not in FORMATS:
+        raise ConfigError(f"--out = {table}: expected a name that ends in {', '.join(FORMATS)}")
+    return kind
+
+
+def _stamps(
+    files: list[Path], positions: Path | None, size: int, field_deg: str | None
+) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    """Return the stamps of files, their field angles [rad] and shifts of their detectors [m]."""
+    import numpy as np
+
+    from ..sensing.stamp_files import read_stamps
+
+    field = None if field_deg is None else np.deg2rad(degrees_pair(field_deg, "--field-deg"))
+    images, fields, defocus = [], [], []
+    for path in files:
+        stamps = read_stamps(path, positions, size)
+        places = field if stamps.fields is None else stamps.fields
+        if places is None:
+            raise ConfigError(
+                "no field angles: expected FIELD_X and FIELD_Y, a table with them, or --field-deg", file=path
+            )
+        images += stamps.images
+        fields.append(np.broadcast_to(places, (len(stamps), 2)))
+        defocus.append(stamps.defocus)
+    return images, np.concatenate(fields), np.concatenate(defocus)
+
+
+def _write(fit: DonutFit, table: Path | None, picture: Path | None, kind: str) -> None:
+    """Write the table and the picture of a fit, where they are asked for."""
+    from ..core.files import write_bytes
+    from ..core.plotting import picture_bytes
+    from ..core.table_files import write_table
+
+    if table is not None:
+        write_table(table, fit.to_table())
+    if picture is not None:
+        write_bytes(picture, picture_bytes(fit.plot(), kind))
 
 
 def _show(fit: DonutFit) -> None:

@@ -251,7 +251,13 @@ from .reconstruction.psf_model.model import PsfModel as PsfModel
 from .sensing.degrees import FreedomEstimate as FreedomEstimate
 from .sensing.fit import fit_donuts as fit_donuts
 from .sensing.flags import DonutFlag as DonutFlag
+from .sensing.freedom_fit import TelescopeFreedoms as TelescopeFreedoms
+from .sensing.model import DonutAir as DonutAir
+from .sensing.model import DonutDetector as DonutDetector
+from .sensing.model import DonutModel as DonutModel
 from .sensing.result import DonutFit as DonutFit
+from .sensing.wavefront_fits import FieldTerms as FieldTerms
+from .sensing.wavefront_fits import SingleDonuts as SingleDonuts
 from .sky.catalogue import read_galaxies as read_galaxies
 from .sky.catalogue import write_galaxies as write_galaxies
 from .sky.galaxies import Galaxies as Galaxies

@@ -67,7 +67,7 @@ class FreedomRays:
     ) -> None:
         self._prepared, self._parameters, self._matrix = freedoms.parameter_matrix(telescope)
         self._direction, self._wavelengths = direction, wavelengths
-        self._cells, self._footprint, self._rims = cells, footprint, RimsOfCells(cells)
+        self.cells, self._footprint = cells, footprint
         self._weights = np.outer(wavelength_weights, cells.weights).ravel()
         rates = np.zeros((len(cells), 0)) if cells.rates is None else cells.rates
         self.rates = np.kron(wavelength_weights[:, None], rates)
@@ -82,7 +82,7 @@ class FreedomRays:
         values = self._matrix @ unknowns[: self._count]
         changed = apply(self._prepared, dict(zip(self._parameters, values, strict=True)))
         places = [
-            landing_of(changed, parallel_rays(changed, self._direction[None], float(w), self._cells.points))
+            landing_of(changed, parallel_rays(changed, self._direction[None], float(w), self.cells.points))
             for w in self._wavelengths
         ]
         middle = float(self._wavelengths[len(self._wavelengths) // 2])
@@ -97,11 +97,11 @@ class FreedomRays:
 
     def spread(self, landing: np.ndarray) -> np.ndarray:
         """Return the spread of the image of each point."""
-        return spread_of(self._cells, landing, self._footprint)
+        return spread_of(self.cells, landing, self._footprint)
 
-    def at_rims(self, rims: PupilRims, landing: np.ndarray) -> RimsAt:
-        """Return rims of the telescope as it is believed to be on the detector, with the last response."""
-        return self._rims.at(rims, landing)
+    def at_rims(self, rims: PupilRims, landing: np.ndarray, response: np.ndarray | None) -> RimsAt:
+        """Return rims of the telescope as it is believed to be on the detector; see :class:`LightRays`."""
+        return RimsOfCells(self.cells, response).at(rims, landing)
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the derivatives, shape [2, n, n_freedom]."""
@@ -112,16 +112,13 @@ class FreedomRays:
             forward = forward_pass(columns.telescope, rays, threads=1)
             return columns.derivatives(forward, landing_gradient(forward), threads=1) @ self._matrix
 
-        landing = [derivatives(float(w), self._cells.points) for w in self._wavelengths]
+        landing = [derivatives(float(w), self.cells.points) for w in self._wavelengths]
         middle = float(self._wavelengths[len(self._wavelengths) // 2])
-        found = np.concatenate(landing, axis=1) - derivatives(middle, self._chief)
-        self._rims = RimsOfCells(self._cells, found)
-        return found
+        return np.concatenate(landing, axis=1) - derivatives(middle, self._chief)
 
     def release(self) -> None:
-        """Free what was computed for the last unknowns."""
-        self._rims = RimsOfCells(self._cells)
-        self._cells.release()
+        """Free the polynomials over the pupil."""
+        self.cells.release()
 
 
 @dataclass(frozen=True)
@@ -197,16 +194,16 @@ class FreedomEstimate(Result):
         with styled():
             figure = figure_at(ax, min(14.0, 6.0 + 0.16 * n), 8.0)
             grid = figure.add_gridspec(2, 2, width_ratios=(2.2, 1.0), height_ratios=(1.0, 1.2))
-            bars, known, table = (figure.add_subplot(grid[k]) for k in ((0, 0), (0, 1), (1, slice(None))))
+            bars, spectrum, table = (figure.add_subplot(grid[k]) for k in ((0, 0), (0, 1), (1, slice(None))))
             place = np.arange(n)
             bars.errorbar(place, self.values / self.prior, self.errors / self.prior, fmt="o", color=BLUE, markersize=3)
             bars.axhline(0.0, color="0.3", linewidth=0.7)
             bars.set_ylabel("value / prior")
             size = 8 if n <= 24 else 5
             bars.set_xticks(place, names, rotation=90, fontsize=size)
-            known.semilogy(place + 1, ratio, "o-", color=ORANGE, markersize=3.5, linewidth=0.9)
-            known.axhline(1.0, color="0.3", linewidth=0.7)
-            known.set(xlabel="combination, best known first", ylabel="posterior / prior standard deviation")
+            spectrum.semilogy(place + 1, ratio, "o-", color=ORANGE, markersize=3.5, linewidth=0.9)
+            spectrum.axhline(1.0, color="0.3", linewidth=0.7)
+            spectrum.set(xlabel="combination, best known first", ylabel="posterior / prior standard deviation")
             count = min(_SHOWN, n)
             shown = np.unique(np.concatenate([np.arange((count + 1) // 2), np.arange(n - count // 2, n)]))
             image = table.imshow(vectors[shown], cmap="RdBu_r", vmin=-1.0, vmax=1.0, aspect="auto", origin="upper")

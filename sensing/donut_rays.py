@@ -33,6 +33,7 @@ _DIFFERENCE = 1e-4
 class LightRays(Protocol):
     """Landing points of one star's light as functions of unknowns: those of the wavefront, then shifts of rims."""
 
+    cells: PupilCells  #: points of the pupil and their weights
     rates: np.ndarray  #: derivatives of :meth:`weights` with respect to the shifts of rims [1/m], [n, n_shift]
 
     def weights(self, unknowns: np.ndarray) -> np.ndarray:
@@ -44,8 +45,8 @@ class LightRays(Protocol):
     def spread(self, landing: np.ndarray) -> np.ndarray:
         """Return second moments of the image of each point, beside the footprint of the cells [m^2], [n, 2, 2]."""
 
-    def at_rims(self, rims: PupilRims, landing: np.ndarray) -> RimsAt:
-        """Return where the light of rims lands for landing points of the light [m]."""
+    def at_rims(self, rims: PupilRims, landing: np.ndarray, response: np.ndarray | None) -> RimsAt:
+        """Return where the light of rims lands for landing points of the light [m], and its own response to them."""
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the derivatives of :meth:`landing` with respect to the unknown wavefront, shape [2, n, n_wave]."""
@@ -140,8 +141,8 @@ class ZernikeRays:
         """Return the spread of the image of each point; see :class:`LightRays`."""
         return spread_of(self.cells, landing, self.footprint)
 
-    def at_rims(self, rims: PupilRims, landing: np.ndarray) -> RimsAt:
-        """Return the rims on the detector; see :class:`LightRays`."""
+    def at_rims(self, rims: PupilRims, landing: np.ndarray, response: np.ndarray | None) -> RimsAt:
+        """Return the rims on the detector, always with their response; see :class:`LightRays`."""
         return self._rims.at(rims, landing)
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
@@ -175,8 +176,8 @@ def _gradients(
 
 def spread_of(cells: PupilCells, landing: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     """Return the spreads [m^2] of the landing points of one or more wavelengths, one after the other."""
-    each = landing.reshape(-1, len(cells), 2)
-    return np.concatenate([cells.spread(one, footprint) for one in each])
+    by_wavelength = landing.reshape(-1, len(cells), 2)
+    return np.concatenate([cells.spread(points, footprint) for points in by_wavelength])
 
 
 class RimsOfCells:
@@ -201,13 +202,13 @@ class RimsOfCells:
         if self._response is None:
             return RimsAt(*rims.landing(smooth, self._middle(landing)), np.zeros((2, len(rims.points), 0)))
         if self._last is None or self._last[0] is not rims:
-            self._last = rims, np.stack([smooth.at(rims.points, self._middle(one))[0] for one in self._response])
+            self._last = rims, np.stack([smooth.at(rims.points, self._middle(axis))[0] for axis in self._response])
         return RimsAt(*rims.landing(smooth, self._middle(landing)), self._last[1])
 
     def _middle(self, values: np.ndarray) -> np.ndarray:
         """Return values of all wavelengths at the middle one."""
-        each = values.reshape(-1, len(self._cells), values.shape[1])
-        return np.asarray(each[len(each) // 2])
+        by_wavelength = values.reshape(-1, len(self._cells), values.shape[1])
+        return np.asarray(by_wavelength[len(by_wavelength) // 2])
 
 
 def landing_of(telescope: Telescope, rays: Rays) -> np.ndarray:

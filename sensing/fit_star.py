@@ -11,7 +11,7 @@ from scipy.ndimage import maximum_filter
 from .donut_rays import ZernikeRays
 from .flags import DonutFlag
 from .image_model import FLUX, NUISANCES, RATIO, STRENGTH, X, Y
-from .light import Instrument, Light, Sampling
+from .light import Instrument, Sampling, StarLight
 from .likelihood import Stamp, model_image, pulls
 from .solve import COARSE, FINE, STEPS, Group, Solution, solve
 from .stamps import (
@@ -31,121 +31,123 @@ _COARSE_DIAMETER = 30.0
 _FOUND = 8.0
 #: The same above a uniform sky of any level, which is less; the noise of a sky reaches 4 somewhere on a stamp.
 _ABOVE_SKY = 6.0
-#: Least gain of twice the logarithm of the likelihood by a second star or another focus, and the largest part of the
-#: misfit that may be left: what turbulence and missing terms of the wavefront do to an image, neither explains.
-_GAIN, _LEFT = 100.0, 0.5
+#: Least gain of twice the logarithm of the likelihood by a second star or another focus.
+_GAIN = 100.0
+#: Largest fraction of the misfit that they may leave: what turbulence and missing terms do to an image, neither
+#: explains.
+_LEFT = 0.5
 #: Loss a coarse pixel from which on the other side of focus is tried; photons leave 0.1, since smoothed noise is small.
 _MISFIT = 0.15
-#: Loss a coarse pixel from which on second stars are searched for at these distances over the diameter of the donut.
-_POOR, _NEAR_RADII, _NEAR_ANGLES = 1.0, (0.08, 0.2), 6
-#: Steps from each of these places, and how many of the best solutions are finished.
-_FIRST_STEPS, _FINISHED = 4, 2
+#: Loss a coarse pixel from which on second stars are searched for around the first.
+_POOR = 1.0
+#: Distances of such second stars over the diameter of the donut.
+_NEAR_RADII = (0.08, 0.2)
+#: Directions from the first star in which they are searched for.
+_NEAR_ANGLES = 6
+#: Steps from each of these places.
+_FIRST_STEPS = 4
+#: Number of the best of these solutions that are finished.
+_FINISHED = 2
+#: Loss a coarse pixel from which on a second star is searched for without the wavefront of the first, too.
+_MISTAKEN = 3.0
 #: Least flux of a second star over that of the first.
 _LEAST_RATIO = 0.01
 #: Fraction of the light that may fall beside the stamp.
 _BESIDE = 0.05
 #: Least fraction of the variance of the image that the model explains.
 _EXPLAINED = 0.5
-#: Pulls of pixels that are clipped, over that of typical pixels, and rounds of clipping.
-_CLIP, _ROUNDS = 7.0, 3
-#: Most scales of the last fits, and cells across the pupil over those that are needed.
-_SCALES, _ENOUGH = 3, 1.25
+#: Pulls of pixels that are clipped, over that of typical pixels.
+_CLIP = 7.0
+#: Rounds of clipping.
+_ROUNDS = 3
+#: Most scales of the last fits.
+_SCALES = 3
+#: Cells across the pupil over those that are needed.
+_ENOUGH = 1.25
+
+
+@dataclass(frozen=True)
+class StarSolution:
+    """Best model of one star by itself.
+
+    Attributes
+    ----------
+    light : StarLight
+        Light of the star.
+    stamp : Stamp
+        Pixels and model of the last fit.
+    full : Stamp
+        All pixels of the detector, of which those of the fit may be sums.
+    solution : Solution
+        Its unknowns.
+    model : ndarray
+        Best image of all pixels [electrons].
+    """
+
+    light: StarLight
+    stamp: Stamp
+    full: Stamp
+    solution: Solution
+    model: np.ndarray
 
 
 @dataclass(frozen=True)
 class StarFit:
-    """Fit of one star by itself.
-
-    Attributes
-    ----------
-    flags : DonutFlag
-        Outcome.
-    light : Light or None
-        Light of the star.
-    stamp : Stamp or None
-        Pixels and model of the last fit.
-    full : Stamp or None
-        All pixels of the detector, of which those of the fit may be sums.
-    solution : Solution or None
-        Its unknowns.
-    model : ndarray or None
-        Best image of all pixels [electrons].
-    """
+    """Outcome of the fit of one star by itself: flags, and its best model unless it failed."""
 
     flags: DonutFlag
-    light: Light | None = None
-    stamp: Stamp | None = None
-    full: Stamp | None = None
-    solution: Solution | None = None
-    model: np.ndarray | None = None
+    best: StarSolution | None = None
+
+    @property
+    def usable(self) -> StarSolution | None:
+        """The best model where no flag says that there is no result."""
+        return self.best if self.flags.usable else None
 
 
-def fit_star(
-    instrument: Instrument, light: Light, pixels: Pixels, *, strength: float, fixed_strength: bool, wavefront: bool
-) -> StarFit:
+def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength: float, *, wavefront: bool) -> StarFit:
     """Fit one star.
 
     Parameters
     ----------
     instrument, light, pixels
-        Telescope and detector, light of the star and its stamp.
+        Telescope and model of the images, light of the star and its stamp.
     strength : float
-        Strength of the turbulence [1/m]: a start, or the value where it is fixed.
-    fixed_strength : bool
-        Whether it is fixed.
+        Strength of the turbulence [1/m]: a start, or the value where the seeing is known.
     wavefront : bool
         Whether the wavefront is fitted; where not, it is zero.
     """
     across = light.diameter / instrument.pixel
     donut = across > SMALLEST_DONUT
     clean = without_cosmic_rays(pixels) if donut else pixels
-    fitter = _StarFitter(instrument, light, clean, strength, fixed_strength, wavefront)
-    flags = DonutFlag.OK
+    fitter = _StarFitter(instrument, light, clean, strength, wavefront)
     small = clean.smoothed(max(1, round(across / _COARSE_DIAMETER)) if donut else 1)
     coarse = fitter.stamp(light, small)
     template = fitter.template(coarse)
-    start, found = fitter.start(coarse, template)
-    if not found.significance >= _FOUND or not fitter.significance(coarse, template) >= _ABOVE_SKY:
+    start, match = fitter.start(coarse, template)
+    flags = DonutFlag.OK
+    if not match.significance >= _FOUND or not fitter.significance(coarse, template) >= _ABOVE_SKY:
         flags |= DonutFlag.NO_DONUT
-    if found.flux < len(NUISANCES) + (len(instrument.noll) if wavefront else 0):
+    if match.flux < len(NUISANCES) + (len(instrument.noll) if wavefront else 0):
         flags |= DonutFlag.TOO_FEW_PHOTONS
     if flags:
-        return StarFit(flags, light)
+        return StarFit(flags)
     best = fitter.solve(coarse, start, tolerance=COARSE if donut else FINE)
-    if donut:
+    if donut and instrument.model.neighbours:
         best = fitter.with_companion(small, coarse, best, start, template)
-        if fitter.other_focus_is_better(small, coarse, best):
-            return StarFit(DonutFlag.DEFOCUS_SIGN, light)
+    if donut and fitter.other_focus_is_better(small, coarse, best):
+        return StarFit(DonutFlag.DEFOCUS_SIGN)
     if not _explained(coarse, best):
-        return StarFit(DonutFlag.NO_DONUT, light)
+        return StarFit(DonutFlag.NO_DONUT)
     if _beside(coarse, best) > _BESIDE:
-        return StarFit(DonutFlag.CUT_OFF, light)
-    # The seeing of a solution decides how finely the next one is sampled.
-    blended, fine = len(best.stars[0]) > RATIO, None
-    for _ in range(_SCALES):
-        finer = fitter.sampled(best, blended, fine)
-        if finer is fine:
-            break
-        fine, best = finer, fitter.solve(finer.stamp, best.stars[0], best.shared)
-    assert fine is not None
-    stamp, full = fine.stamp, fitter.every_pixel(fine)
-    model = model_image(full, best.stars[0], best.waves[0])
-    for _ in range(_ROUNDS):
-        kept = _clipped(full, model, best.loss / stamp.used.sum())
-        if (kept == full.used).all():
-            break
-        full = replace(full, used=kept)
-        summed = replace(clean, used=kept).binned(fine.pixels.side)
-        stamp = replace(stamp, used=summed.used)
-        best = fitter.solve(stamp, best.stars[0], best.shared)
-        model = model_image(full, best.stars[0], best.waves[0])
-    if (full.used != pixels.used).any():
+        return StarFit(DonutFlag.CUT_OFF)
+    finest = fitter.finest(best)
+    if (finest.full.used != pixels.used).any():
         flags |= DonutFlag.CLIPPED
-    if blended:
+    if len(finest.solution.stars[0]) > RATIO:
         flags |= DonutFlag.BLENDED
-    if not (best.converged and np.isfinite(model).all()):
+    if not (finest.solution.converged and np.isfinite(finest.model).all()):
         flags |= DonutFlag.NOT_CONVERGED
-    return StarFit(flags, light, stamp, full, best, model)
+    return StarFit(flags, finest)
 
 
 @dataclass(frozen=True)
@@ -161,19 +163,13 @@ class _StarFitter:
     """Solutions for one star on stamps of several scales."""
 
     def __init__(
-        self,
-        instrument: Instrument,
-        light: Light,
-        clean: Pixels,
-        strength: float,
-        fixed_strength: bool,
-        wavefront: bool,
+        self, instrument: Instrument, light: StarLight, clean: Pixels, strength: float, wavefront: bool
     ) -> None:
         self._instrument, self._light, self._clean = instrument, light, clean
         self._donut = light.diameter > SMALLEST_DONUT * instrument.pixel
-        self._strength, self._fixed = strength, fixed_strength
+        self._strength = strength
         self._fwhm = float(instrument.seeing.fwhm(np.asarray(strength)))
-        self._precision = np.concatenate([instrument.precision, light.shift_precision])
+        self._precision = np.concatenate([instrument.terms.precision, light.shift_precision])
         n = len(self._precision)
         self._map = np.eye(n)[None] if wavefront else np.zeros((1, n, 0))
         self._rays: dict[int, ZernikeRays] = {}
@@ -181,7 +177,7 @@ class _StarFitter:
         #: Cells across the pupil that the last fits are expected to need, so that the first ones share them.
         self._across = self._sampling(self._fwhm, self._side(self._fwhm))[1].across
 
-    def _of(self, light: Light, across: int) -> ZernikeRays:
+    def _of(self, light: StarLight, across: int) -> ZernikeRays:
         """Return the light through at least so many cells across the pupil, and at most a quarter more."""
         if light is not self._light:
             return self._instrument.rays(light, across)
@@ -190,7 +186,7 @@ class _StarFitter:
                 return rays
         return self._rays.setdefault(across, self._instrument.rays(light, across))
 
-    def stamp(self, light: Light, pixels: Pixels, *, blended: bool = False) -> Stamp:
+    def stamp(self, light: StarLight, pixels: Pixels, *, blended: bool = False) -> Stamp:
         """Return the stamp of a star's light in coarse pixels; a second star needs room beside it."""
         sampling = self._instrument.sampling(light, pixels, self._fwhm)
         # Second stars may stand anywhere beside the stamp.
@@ -202,17 +198,39 @@ class _StarFitter:
         """Return how many pixels are summed along each axis for the last fits in a seeing [rad]."""
         return self._instrument.binning(self._light, self._clean, fwhm) if self._donut else 1
 
-    def sampled(self, found: Solution, blended: bool, last: _Fine | None) -> _Fine:
+    def finest(self, coarse: Solution) -> StarSolution:
+        """Return the best model in pixels as fine as the seeing needs, without those far off it."""
+        best, blended, fine = coarse, len(coarse.stars[0]) > RATIO, None
+        # The seeing of a solution decides how finely the next one is sampled.
+        for _ in range(_SCALES):
+            finer = self.sampled(best, blended, fine)
+            if finer is fine:
+                break
+            fine, best = finer, self.solve(finer.stamp, best.stars[0], best.shared)
+        assert fine is not None
+        stamp, full = fine.stamp, self.every_pixel(fine)
+        model = model_image(full, best.stars[0], best.waves[0])
+        for _ in range(_ROUNDS):
+            used = _clipped(full, model, best.loss / stamp.used.sum())
+            if (used == full.used).all():
+                break
+            full = replace(full, used=used)
+            stamp = replace(stamp, used=replace(self._clean, used=used).binned(fine.pixels.side).used)
+            best = self.solve(stamp, best.stars[0], best.shared)
+            model = model_image(full, best.stars[0], best.waves[0])
+        return StarSolution(self._light, stamp, full, best, model)
+
+    def sampled(self, solution: Solution, blended: bool, last: _Fine | None) -> _Fine:
         """Return a stamp fine enough for the seeing of a solution: the last one if that is, nearly."""
         instrument, light = self._instrument, self._light
         if last is None:
             pixels, sampling = self._sampling(self._fwhm, self._side(self._fwhm))
         else:
-            fwhm = float(instrument.seeing.fwhm(found.stars[0][STRENGTH]))
-            wave = slice(len(instrument.noll)) if len(found.shared) else slice(0)
+            fwhm = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
+            wave = slice(len(instrument.noll)) if len(solution.shared) else slice(0)
             # Pixels without noise, whatever variance is claimed for them, know the wavefront better than claimed.
-            noise = min(found.loss / last.stamp.used.sum(), 1.0)
-            error = math.sqrt(noise * np.trace(found.shared_covariance[wave, wave])) or math.inf
+            noise = min(solution.loss / last.stamp.used.sum(), 1.0)
+            error = math.sqrt(noise * np.trace(solution.shared_covariance[wave, wave])) or math.inf
             if not self._sampling(_ENOUGH * fwhm, last.pixels.side, _ENOUGH * error)[1].finer_than(last.sampling):
                 return last
             pixels, sampling = self._sampling(fwhm, min(self._side(fwhm), last.pixels.side), error)
@@ -245,11 +263,11 @@ class _StarFitter:
 
     def start(self, stamp: Stamp, template: np.ndarray) -> tuple[np.ndarray, Match]:
         """Return unknowns of the star where its template fits best."""
-        found = match_template(stamp.image, stamp.used, stamp.variance, template)
+        match = match_template(stamp.image, stamp.used, stamp.variance, template)
         unknowns = np.zeros(len(NUISANCES))
-        unknowns[[FLUX, STRENGTH]] = max(found.flux, 1.0), self._strength
-        unknowns[[X, Y]] = ([found.x, found.y] - stamp.grid.offset) * stamp.grid.scale
-        return unknowns, found
+        unknowns[[FLUX, STRENGTH]] = max(match.flux, 1.0), self._strength
+        unknowns[[X, Y]] = ([match.x, match.y] - stamp.grid.offset) * stamp.grid.scale
+        return unknowns, match
 
     def solve(
         self,
@@ -261,7 +279,7 @@ class _StarFitter:
     ) -> Solution:
         """Return the best unknowns from a start."""
         n = self._map.shape[2]
-        group = Group((stamp,), self._map, self._precision[:n], self._fixed)
+        group = Group((stamp,), self._map, self._precision[:n], self._instrument.known_seeing)
         return solve(group, [star], np.zeros(n) if shared is None else shared, tolerance=tolerance, steps=steps)
 
     def with_companion(
@@ -272,11 +290,11 @@ class _StarFitter:
         best, misfit = single, single.loss / stamp.used.sum()
         roomy = None
         starts = [(single.stars[0], wave, single.shared)]
-        if misfit > 3.0:
+        if misfit > _MISTAKEN:
             starts.append((first, np.zeros_like(wave), np.zeros_like(single.shared)))
         for star, aberration, shared in starts:
-            rest = stamp.image - model_image(stamp, star, aberration)
-            second = match_template(rest, stamp.used, stamp.variance, template)
+            residual_image = stamp.image - model_image(stamp, star, aberration)
+            second = match_template(residual_image, stamp.used, stamp.variance, template)
             if not second.significance >= _FOUND:
                 continue
             place = ([second.x, second.y] - stamp.grid.offset) * stamp.grid.scale
@@ -314,13 +332,13 @@ class _StarFitter:
                 best = trial
         return best
 
-    def other_focus_is_better(self, pixels: Pixels, stamp: Stamp, here: Solution) -> bool:
+    def other_focus_is_better(self, pixels: Pixels, stamp: Stamp, solution: Solution) -> bool:
         """Return whether the image fits a detector on the other side of focus better."""
-        if here.loss / stamp.used.sum() < _MISFIT:
+        if solution.loss / stamp.used.sum() < _MISFIT:
             return False
-        other = self.stamp(self._light.mirrored(), pixels)
-        start, _ = self.start(other, self.template(other))
-        return _explains_more(self.solve(other, start, tolerance=COARSE), here)
+        mirrored = self.stamp(self._light.mirrored(), pixels)
+        start, _ = self.start(mirrored, self.template(mirrored))
+        return _explains_more(self.solve(mirrored, start, tolerance=COARSE), solution)
 
 
 def _explains_more(trial: Solution, other: Solution) -> bool:

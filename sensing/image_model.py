@@ -100,9 +100,9 @@ class ImageGrid:
         self._middle = [0.5 * (n - 1) * oversampling for n in shape]
         turns = [fft.fftfreq(self._size[0]), fft.rfftfreq(self._size[1])]  # cycles a cell
         y, x = np.meshgrid(*turns, indexing="ij", sparse=True)
-        both = np.stack(np.broadcast_arrays(x, y))
-        self._phase = -2.0 * math.pi * oversampling / pixels.side * both  # for shifts in detector pixels
-        wave = 2.0 * math.pi * oversampling / pixel * both  # rad/m
+        frequencies = np.stack(np.broadcast_arrays(x, y))
+        self._phase = -2.0 * math.pi * oversampling / pixels.side * frequencies  # for shifts in detector pixels
+        wave = 2.0 * math.pi * oversampling / pixel * frequencies  # rad/m
         baseline = np.tensordot(jacobian.T, wave, axes=1) * seeing.wavelength / (2.0 * math.pi)
         self._exponent = seeing.exponent(np.hypot(*baseline))
         spline = np.sinc(x) ** 4 * np.sinc(y) ** 4
@@ -121,9 +121,9 @@ class ImageGrid:
 
     def with_rims(self, rims: PupilRims) -> ImageGrid:
         """Return the grid for other rims of the pupil."""
-        other = copy(self)
-        other.rim_light = None if self.rim_light is None else self.rim_light.of(rims)
-        return other
+        grid = copy(self)
+        grid.rim_light = None if self.rim_light is None else self.rim_light.of(rims)
+        return grid
 
     def _filter(self, strength: float) -> np.ndarray:
         """Return the transfer function of air and detector."""
@@ -208,8 +208,8 @@ class ImageGrid:
             second = star * shift
             turns = [(1j * unknowns[RATIO] * p).astype(np.complex64)[..., None] for p in self._phase]
             extra = [second, *(turn * second for turn in turns)]
-            both = 1.0 + np.float32(unknowns[RATIO]) * shift
-            star, moved = star * both, moved * both
+            both_stars = 1.0 + np.float32(unknowns[RATIO]) * shift
+            star, moved = star * both_stars, moved * both_stars
         uniform = np.zeros_like(star)
         uniform[0, 0] = self._size[0] * self._size[1]
         growth = (-5.0 / 3.0 * self._exponent * strength ** (2.0 / 3.0)).astype(np.float32)[..., None]
@@ -258,12 +258,12 @@ class ImageGrid:
         middle = np.array(self._middle[::-1]) / self.oversampling
         place = self.places(unknowns, np.zeros(2)) + middle
         turn = np.exp(-1j * self.pixel * (light.wave @ place)).astype(np.complex64)
-        found = transfer * turn
-        spectra[light.where, 0] += found
+        diffracted = transfer * turn
+        spectra[light.where, 0] += diffracted
         if spectra.shape[-1] == 1:
             return
         for axis in (0, 1):
-            spectra[light.where, 1 + axis] -= 1j * (light.wave[:, axis] * self.pixel).astype(np.float32) * found
+            spectra[light.where, 1 + axis] -= 1j * (light.wave[:, axis] * self.pixel).astype(np.float32) * diffracted
         spectra[light.where, 3 : 3 + rims.response.shape[2]] += light.slopes(rims) * turn[:, None]
 
 

@@ -3,37 +3,119 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import DomainError, shown
-from ..core.units import length, pure_numbers, require_positive
+from ..core.units import length, pure_numbers, radians, require_positive
+from ..raytrace.rays import field_direction
 
 #: Largest spread or wavefront [m].
 _MOST_LENGTH = 1e-3
 #: Light of a pixel from which on it is no number that a detector counts [electron].
 MOST_ELECTRONS = 1e20
+#: Least side of a stamp [pixels].
+SMALLEST_STAMP = 8
+
+
+@dataclass(frozen=True)
+class ObservedStar:
+    """Stamp of one star: image and variance of the sky, masked pixels, field angles [2], direction of the light [3]."""
+
+    image: np.ndarray
+    variance: np.ndarray
+    masked: np.ndarray
+    field: np.ndarray
+    direction: np.ndarray
+
+
+@dataclass(frozen=True)
+class ObservedStars:
+    """Stamps of stars and their places in the field.
+
+    Attributes
+    ----------
+    images : ndarray, shape [n, ny, nx]
+        Electrons, sky subtracted; NaN beside smaller stamps.
+    variance : ndarray, shape [n, ny, nx]
+        Variance of sky and readout [electron^2].
+    masked : ndarray of bool, shape [n, ny, nx]
+        Pixels to leave out.
+    shapes : list of tuple of int
+        Pixels (ny, nx) of each stamp.
+    fields : ndarray, shape [n, 2]
+        Field angles [rad].
+    directions : ndarray, shape [n, 3]
+        Unit vectors along which the light travels.
+    projection : str
+        Meaning of the field angles.
+    """
+
+    images: np.ndarray
+    variance: np.ndarray
+    masked: np.ndarray
+    shapes: list[tuple[int, int]]
+    fields: np.ndarray
+    directions: np.ndarray
+    projection: str
+
+    @classmethod
+    def of(
+        cls,
+        images: ArrayLike | Sequence[ArrayLike],
+        fields: ArrayLike,
+        sky_variance: ArrayLike,
+        mask: NDArray[np.bool_] | Sequence[NDArray[np.bool_]] | None,
+        projection: str,
+    ) -> ObservedStars:
+        """Return the arguments of a fit as arrays, or raise DomainError for one that is malformed."""
+        stack, shapes = padded(images, "images", np.float64, np.nan)
+        angles = np.atleast_2d(radians(fields, "fields"))
+        if angles.shape != (len(stack), 2) or not np.isfinite(angles).all():
+            expected = f"finite angles of {len(stack)} images, shape [{len(stack)}, 2]"
+            raise DomainError(f"fields of shape {angles.shape}: expected {expected}")
+        directions = field_direction(angles[:, 0], angles[:, 1], projection)
+        masked = np.zeros(stack.shape, dtype=bool)
+        if mask is not None:
+            masked, mask_shapes = padded(mask, "mask", bool, True)
+            if mask_shapes != shapes:
+                expected = f"those of the images, {stack.shape}"
+                raise DomainError(f"mask of shape {masked.shape}: expected {expected}", key="mask")
+        variance = sky_variances(sky_variance, stack.shape)
+        return cls(stack, variance, masked, shapes, angles, directions, projection)
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def star(self, index: int) -> ObservedStar:
+        """Return one star, without what stands beside its stamp."""
+        ny, nx = self.shapes[index]
+        image, variance, masked = (v[index, :ny, :nx] for v in (self.images, self.variance, self.masked))
+        return ObservedStar(image, variance, masked, self.fields[index], self.directions[index])
 
 
 def padded(
-    values: ArrayLike | Sequence[ArrayLike], name: str, kind: type, fill: Any
+    values: ArrayLike | Sequence[ArrayLike], name: str, kind: type, fill: float | bool
 ) -> tuple[np.ndarray, list[tuple[int, int]]]:
     """Return images as one stack, smaller ones filled up at the end, and their shapes."""
     try:
-        each: Any = values
-        read = _numbers if kind is np.float64 else lambda one, _: np.asarray(one, dtype=kind)
-        listed: list[np.ndarray] = [read(one, name) for one in each]
+        sequence: Any = values
+        read = _numbers if kind is np.float64 else lambda stamp, _: np.asarray(stamp, dtype=kind)
+        listed: list[np.ndarray] = [read(stamp, name) for stamp in sequence]
     except (TypeError, ValueError):
         raise DomainError(f"{name}: expected an array of shape [n, ny, nx], or n arrays of two dimensions") from None
-    if not listed or any(v.ndim != 2 or min(v.shape) < 8 for v in listed):
+    if not listed or any(v.ndim != 2 or min(v.shape) < SMALLEST_STAMP for v in listed):
         shape = [v.shape for v in listed][:1]
-        raise DomainError(f"{name} of shape {shape}: expected [n, ny, nx], stamps of at least 8 pixels a side")
+        raise DomainError(
+            f"{name} of shape {shape}: expected [n, ny, nx], stamps of at least {SMALLEST_STAMP} pixels a side"
+        )
     shapes = [(int(v.shape[0]), int(v.shape[1])) for v in listed]
     stack: np.ndarray = np.full((len(listed), max(s[0] for s in shapes), max(s[1] for s in shapes)), fill, dtype=kind)
-    for row, one in zip(stack, listed, strict=True):
-        row[: one.shape[0], : one.shape[1]] = one
+    for row, stamp in zip(stack, listed, strict=True):
+        row[: stamp.shape[0], : stamp.shape[1]] = stamp
     return stack, shapes
 
 

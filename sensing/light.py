@@ -7,45 +7,66 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..core.errors import DomainError
-from ..models.camera.focal_plane import FocalPlane
+from ..core.errors import ConfigError, DomainError
 from ..models.telescope import Telescope
 from ..raytrace.launch import launch_bundles
 from ..raytrace.rays import RayStatus
 from ..raytrace.trace import trace
 from ..wavefront.chief_rays import image_jacobians
+from ..wavefront.psf.light import Light
 from ..wavefront.psf.pupil_rims import PupilRims, pupil_rims
+from ..wavefront.request import relative_weights, wavelength_points
 from .donut_rays import ZernikeRays, chief_landing
 from .image_model import ImageGrid
 from .likelihood import Stamp
+from .model import DonutModel
 from .seeing import Seeing
 from .stamps import Pixels
+from .terms import WavefrontTerms
 from .vignetting import MovableRim, cells_with_rims, movable_rims, shift_spread
 
-#: Points across the pupil for the size of an image, and the least and most cells for its model.
-_SURVEY, _FEWEST, _MOST = 48, 48, 800
-#: Error that cells leave in a wavefront [m], the part of the error of the photons that it may be, and the power of the
-#: first by which the number of cells goes: 2.9 nm with 60 cells, 0.9 with 120 (LSST, 1.5 mm, 0.8").
-_CELLS_LEAVE, _SMALL, _FALL = 2.9e-9, 0.2, 0.55
+#: Points across the pupil for the size of an image.
+_SURVEY = 48
+#: Least number of cells across the pupil for the model of an image.
+_FEWEST = 48
+#: Largest number of cells across the pupil that a model takes by itself: 0.5 million of them.
+_MOST = 800
+#: Error that 60 cells across the pupil leave in a wavefront [m]; 120 leave 0.9 nm (LSST, 1.5 mm, 0.8").
+_CELLS_LEAVE = 2.9e-9
+#: Fraction of the error of the photons that the error by the cells may be.
+_SMALL = 0.2
+#: Power of the error by which the number of cells goes, from the two figures of :data:`_CELLS_LEAVE`.
+_FALL = 0.55
 #: Error of the photons [m] below which cells become no smaller.
 _LEAST_ERROR = 0.5e-9
 #: Spacing of landing points over the FWHM of the blur, which smooths what cells on rims leave.
 _SPACING = 0.5
-#: FWHM of the blur in cells of the grid beyond which the cells resolve it; finest grid, in cells along a pixel.
-_RESOLVED, _FINEST = 1.9, 5
-#: FWHM of the blur in binned pixels, most pixels along a binned one, least part of the pixels that binning keeps.
-_BINNED, _MOST_BINNED, _KEPT = 1.95, 4, 0.95
+#: FWHM of the blur in cells of the grid beyond which the cells resolve it.
+_RESOLVED = 1.9
+#: Finest grid, in cells along a pixel.
+_FINEST = 5
+#: FWHM of the blur in binned pixels.
+_BINNED = 1.95
+#: Most pixels along a binned one.
+_MOST_BINNED = 4
+#: Least fraction of the pixels in use that binning keeps.
+_KEPT = 0.95
+#: Full width at half maximum of a Gaussian over its rms.
 _FWHM_PER_RMS = 2.354820045
 
 
 @dataclass(frozen=True)
 class Instrument:
-    """Telescope, detector and seeing, common to all stars of a fit.
+    """Telescope and model of its images, common to all stars of a fit.
 
     Attributes
     ----------
     telescope : Telescope
         Telescope as it is believed to be.
+    model : DonutModel
+        What the images are made of.
+    terms : WavefrontTerms
+        Terms of the wavefront and their priors.
     wavelengths, wavelength_weights : ndarray, shape [n_wave]
         Vacuum wavelengths [m] and fractions of the light.
     pixel : float
@@ -54,36 +75,44 @@ class Instrument:
         The long exposure.
     diffusion : float
         Rms of the charge diffusion along each axis [m].
-    noll : ndarray of int
-        Noll indices of the wavefront.
-    precision : ndarray, shape [n_noll]
-        Inverse variances of Gaussian priors of the coefficients about zero [1/m^2]; 0 for none.
-    focal_plane : FocalPlane or None
-        Heights of the CCDs.
-    n_pupil : int or None
-        Cells across the pupil; chosen for each image where None.
-    diffraction : bool
-        Whether donuts are diffracted at the rims of the pupil.
     """
 
     telescope: Telescope
+    model: DonutModel
+    terms: WavefrontTerms
     wavelengths: np.ndarray
     wavelength_weights: np.ndarray
     pixel: float
     seeing: Seeing
     diffusion: float
-    noll: np.ndarray
-    precision: np.ndarray
-    focal_plane: FocalPlane | None
-    n_pupil: int | None
-    diffraction: bool = False
+
+    @classmethod
+    def of(cls, telescope: Telescope, model: DonutModel, terms: WavefrontTerms) -> Instrument:
+        """Return the instrument of a model; light that the telescope does not cover is a DomainError."""
+        light, detector = model.light or Light(telescope.default_wavelength), model.detector
+        if light.dispersion is not None:
+            raise ConfigError("dispersion of the light: expected none in fits of donuts")
+        waves = wavelength_points(telescope, light.wavelengths)
+        weights = relative_weights(light.weights, len(waves), "weights")
+        seeing = model.air.seeing(float(waves[len(waves) // 2]))
+        return cls(telescope, model, terms, waves, weights, detector.pixel(), seeing, detector.blur())
+
+    @property
+    def noll(self) -> np.ndarray:
+        """Noll indices of all terms of the wavefront."""
+        return self.terms.every
+
+    @property
+    def known_seeing(self) -> bool:
+        """Whether the strengths of the turbulence are held."""
+        return self.model.air.fwhm is not None
 
     @property
     def middle(self) -> float:
         """Wavelength in the middle of the list [m]."""
         return float(self.wavelengths[len(self.wavelengths) // 2])
 
-    def light(self, direction: np.ndarray, defocus: float) -> Light:
+    def light(self, direction: np.ndarray, defocus: float) -> StarLight:
         """Return the light of a star that travels along a direction [3], on its detector moved by a defocus [m].
 
         A chief ray that reaches no CCD, and a dark pupil, are a DomainError.
@@ -104,22 +133,23 @@ class Instrument:
         jacobian = image_jacobians(telescope, direction[None], self.middle, 1)[0]
         # Light passes up to half a cell beyond the outermost points.
         diameter = 2.0 * float(np.hypot(*place.T).max()) * (1.0 + 1.0 / _SURVEY)
-        diffracting = pupil_rims(telescope, direction, self.middle) if self.diffraction else None
+        diffracting = pupil_rims(telescope, direction, self.middle) if self.model.diffraction else None
         rims = movable_rims(telescope, points, ends)
-        return Light(telescope, direction, diameter, depth, jacobian, rims, diffracting)
+        return StarLight(telescope, direction, diameter, depth, jacobian, rims, diffracting)
 
     def _with_detector(self, direction: np.ndarray, defocus: float) -> Telescope:
         """Return the telescope with its detector in the tangent plane of the chief ray's CCD, moved by a defocus."""
         telescope, detector = self.telescope, self.telescope.surfaces[-1]
         height, tilt = defocus, (0.0, 0.0, 0.0)
         place = chief_landing(telescope, direction, self.middle)
-        if self.focal_plane is not None:
+        focal_plane = self.model.detector.focal_plane
+        if focal_plane is not None:
             rays = launch_bundles(telescope, direction[None], self.middle, np.zeros((1, 2)))
-            chief = trace(telescope, rays, focal_plane=self.focal_plane, threads=1)
+            chief = trace(telescope, rays, focal_plane=focal_plane, threads=1)
             if chief.ccd is None or chief.ccd[0] < 0:
                 raise DomainError("the chief ray lands between the CCDs")
             *on_ccd, rise = detector.to_local(chief.position)[0]
-            along_x, along_y = self.focal_plane.gradient(*on_ccd)
+            along_x, along_y = focal_plane.gradient(*on_ccd)
             # The CCD's plane where the chief ray of the unmoved detector lands.
             height += float(rise + (place - on_ccd) @ (along_x, along_y))
             tilt = (float(along_y), -float(along_x), 0.0)
@@ -128,7 +158,7 @@ class Instrument:
         about = np.asarray(detector.vertex) + detector.matrix @ [*place, 0.0]
         return telescope.perturbed(detector.name, shift=height * detector.matrix[:, 2], tilt=tilt, about=about)
 
-    def sampling(self, light: Light, pixels: Pixels, fwhm: float, error: float = math.inf) -> Sampling:
+    def sampling(self, light: StarLight, pixels: Pixels, fwhm: float, error: float = math.inf) -> Sampling:
         """Return how finely images of a star in a seeing [rad] are sampled on given pixels.
 
         A wavefront known to an error [m] that the cells would add to has more of them.
@@ -139,36 +169,38 @@ class Instrument:
         # A lattice as fine as the grid leaves no pattern where nothing else blurs it.
         spacing = _SPACING * width if oversampling == 1 else distance / oversampling
         finer = max((_CELLS_LEAVE / (_SMALL * max(error, _LEAST_ERROR))) ** _FALL, 1.0)
-        across = self.n_pupil or min(max(math.ceil(finer * light.diameter / spacing), _FEWEST), _MOST)
+        across = self.model.n_pupil or min(max(math.ceil(finer * light.diameter / spacing), _FEWEST), _MOST)
         return Sampling(oversampling, across)
 
-    def binning(self, light: Light, pixels: Pixels, fwhm: float) -> int:
+    def binning(self, light: StarLight, pixels: Pixels, fwhm: float) -> int:
         """Return how many pixels along each axis are summed for the fit of a star in a seeing [rad].
 
         Pixels of half the width of the blur leave the errors as they are to a hundredth.
         """
-        most = min(int(self._width(light, pixels, fwhm) / (_BINNED * self.pixel)), _MOST_BINNED)
+        largest = min(int(self._width(light, pixels, fwhm) / (_BINNED * self.pixel)), _MOST_BINNED)
         if pixels.used.all():
-            return max(most, 1)
+            return max(largest, 1)
         used = int(pixels.used.sum())
-        for side in range(max(most, 1), 1, -1):
+        for side in range(max(largest, 1), 1, -1):
             if side**2 * int(pixels.binned(side).used.sum()) > _KEPT * used:
                 return side
         return 1
 
-    def _width(self, light: Light, pixels: Pixels, fwhm: float) -> float:
+    def _width(self, light: StarLight, pixels: Pixels, fwhm: float) -> float:
         """Return the FWHM of what blurs the images of a star in a seeing [rad], before the pixels [m]."""
         rms = math.hypot(self.diffusion, pixels.blur * self.pixel)
         return math.hypot(fwhm * light.scale, _FWHM_PER_RMS * rms)
 
-    def rays(self, light: Light, across: int) -> ZernikeRays:
+    def rays(self, light: StarLight, across: int) -> ZernikeRays:
         """Return the light of a star through so many cells across the pupil."""
         cells = cells_with_rims(light.telescope, light.direction, self.middle, across, light.rims)
         return ZernikeRays(
             light.telescope, light.direction, self.wavelengths, self.wavelength_weights, cells, self.noll
         )
 
-    def stamp(self, light: Light, pixels: Pixels, rays: ZernikeRays, oversampling: int, reach: float = 0.0) -> Stamp:
+    def stamp(
+        self, light: StarLight, pixels: Pixels, rays: ZernikeRays, oversampling: int, reach: float = 0.0
+    ) -> Stamp:
         """Return a stamp with its model: light within a reach [m] beside it does not wrap around."""
         blur = math.hypot(self.diffusion, pixels.blur * self.pixel)
         grid = ImageGrid(
@@ -190,7 +222,7 @@ class Sampling:
 
 
 @dataclass(frozen=True)
-class Light:
+class StarLight:
     """Light of one star at its detector.
 
     Attributes
@@ -229,7 +261,7 @@ class Light:
         """Distance on the detector over angle on the sky [m]."""
         return math.sqrt(abs(float(np.linalg.det(self.jacobian))))
 
-    def mirrored(self) -> Light:
+    def mirrored(self) -> StarLight:
         """Return the light with the detector as far on the other side of the best focus."""
         detector = self.telescope.surfaces[-1]
         shift = 2.0 * self.depth * detector.matrix[:, 2]

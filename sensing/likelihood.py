@@ -75,12 +75,12 @@ class NormalEquations:
 
 def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> NormalEquations:
     """Return the normal equations of one star; unknowns are those of the star, then of its wavefront."""
-    # First: of joint fits, the rims on the detector are those of the last response.
-    response = stamp.rays.response(wave)
-    light = _landed(stamp, wave)
-    if light is None:
+    landing = stamp.rays.landing(wave)
+    if not np.isfinite(landing).all():
         n = len(unknowns) + len(wave)
         return NormalEquations(np.zeros((n, n)), np.zeros(n), np.inf, np.inf)
+    response = stamp.rays.response(wave)
+    light = _landed(stamp, wave, landing, response)
     model, columns, scales = stamp.grid.derivatives(unknowns, light, response, stamp.rays.rates)
     # A slice where all pixels are used, since that is no copy.
     used = stamp.used if not stamp.used.all() else np.s_[:, :]
@@ -95,16 +95,17 @@ def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> No
 
 def model_image(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> np.ndarray:
     """Return the model of a stamp [electrons], shape [ny, nx]; NaN where light does not reach the detector."""
-    light = _landed(stamp, wave)
-    return np.full(stamp.image.shape, np.nan) if light is None else stamp.grid.image(unknowns, light)
-
-
-def _landed(stamp: Stamp, wave: np.ndarray) -> LandedLight | None:
-    """Return the light on the detector; None where a wavefront is so steep that it does not get there."""
-    landing, light = stamp.rays.landing(wave), stamp.grid.rim_light
+    landing = stamp.rays.landing(wave)
+    # A wavefront may be so steep that light does not get there.
     if not np.isfinite(landing).all():
-        return None
-    at_rims = None if light is None else stamp.rays.at_rims(light.rims, landing)
+        return np.full(stamp.image.shape, np.nan)
+    return stamp.grid.image(unknowns, _landed(stamp, wave, landing, None))
+
+
+def _landed(stamp: Stamp, wave: np.ndarray, landing: np.ndarray, response: np.ndarray | None) -> LandedLight:
+    """Return the light on the detector, with the response of its rims where there is one."""
+    rim_light = stamp.grid.rim_light
+    at_rims = None if rim_light is None else stamp.rays.at_rims(rim_light.rims, landing, response)
     return LandedLight(landing, stamp.rays.weights(wave), stamp.rays.spread(landing), at_rims)
 
 

@@ -23,8 +23,14 @@ from ..wavefront.pupil_polynomials import PupilPolynomials
 
 #: Side of the lattice over the diameter of the pupil: light off the axis may cross the plane of the stop just outside.
 _MARGIN = 1.02
-#: Chords of a cell on a rim, nodes along each, and divisions of a piece with a rim into parts: to a 500th of a cell.
-_CHORDS, _NODES, _DIVISIONS, _PARTS = 8, 5, 3, 4
+#: Chords of a cell on a rim.
+_CHORDS = 8
+#: Nodes along each chord.
+_NODES = 5
+#: Divisions of the piece between two nodes that has a rim: they find it to a 500th of a cell.
+_DIVISIONS = 3
+#: Pieces that each division makes.
+_PARTS = 4
 #: Points of the rim that the width of an aimed beam is taken from.
 _RIM = 48
 
@@ -116,8 +122,8 @@ def pupil_cells(telescope: Telescope, direction: np.ndarray, wavelength: float, 
         upright = np.abs(down[rim]) > np.abs(across_rim[rim])
         area[rim], offset, moments[rim] = _lit_parts(lit, centers[rim], side, upright)
         centers[rim] += offset
-    some = area > 0.0
-    return PupilCells(centers[some], area[some] / max(area.sum(), 1e-300), moments[some], side, center)
+    lit_cells = area > 0.0
+    return PupilCells(centers[lit_cells], area[lit_cells] / max(area.sum(), 1e-300), moments[lit_cells], side, center)
 
 
 def _beam(telescope: Telescope, direction: np.ndarray, wavelength: float) -> tuple[np.ndarray, float]:
@@ -147,20 +153,20 @@ def _lit_parts(
         turned = upright[cell].reshape(-1, *[1] * (offset.ndim - 1))
         return centers[cell].reshape(-1, *[1] * (offset.ndim - 2), 2) + np.where(turned, offset[..., ::-1], offset)
 
-    every = np.arange(len(centers))
+    indices = np.arange(len(centers))
     across = np.broadcast_to(row[:, None], (len(centers), _CHORDS, _NODES))
-    status = lit(places(np.broadcast_to(node, across.shape), across, every))
+    status = lit(places(np.broadcast_to(node, across.shape), across, indices))
     start, end = np.broadcast_to(node[:-1], (len(centers), _CHORDS, _NODES - 1)), node[1:]
     low, high = start * np.ones(1), end * np.ones(start.shape)
     cell, chord, piece = np.nonzero(status[:, :, 1:] != status[:, :, :-1])
     first, last, begins = node[piece], node[piece + 1], status[cell, chord, piece]
     for _ in range(_DIVISIONS):
-        part = (last - first) / _PARTS
-        inner = first[:, None] + part[:, None] * np.arange(1, _PARTS)
+        step = (last - first) / _PARTS
+        inner = first[:, None] + step[:, None] * np.arange(1, _PARTS)
         # Parts before the first change of status; of several rims, the first.
         same = lit(places(inner, row[chord][:, None], cell)) == begins[:, None]
-        first = first + part * np.cumprod(same, axis=1).sum(axis=1)
-        last = first + part
+        first = first + step * np.cumprod(same, axis=1).sum(axis=1)
+        last = first + step
     rim = 0.5 * (first + last)
     low[cell, chord, piece] = np.where(begins, low[cell, chord, piece], rim)
     high[cell, chord, piece] = np.where(begins, rim, high[cell, chord, piece])

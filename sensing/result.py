@@ -211,14 +211,14 @@ class DonutFit(Result):
 
 def _draw(fit: DonutFit, donuts: slice | list[int] | None, ax: Axes | Figure | None) -> Figure:
     """Draw a fit; see :meth:`DonutFit.plot`."""
-    chosen = np.arange(len(fit))[slice(_SHOWN) if donuts is None else donuts]
-    n = len(chosen)
+    shown_donuts = np.arange(len(fit))[slice(_SHOWN) if donuts is None else donuts]
+    n = len(shown_donuts)
     with styled():
         figure = figure_at(ax, max(7.0, 1.9 * n + 0.8), 9.2)
         parts: Any = figure.subfigures(2, 1, height_ratios=(1.75, 1.0))
         upper, lower = parts
         panels = upper.subplots(3, n, squeeze=False, sharex=True, sharey=True)
-        for column, i in enumerate(chosen):
+        for column, i in enumerate(shown_donuts):
             image, model = fit.images[i], fit.model[i]
             top = float(np.nanpercentile(image, 99.5)) if np.isfinite(image).any() else 0.0
             top = top if top > 0.0 else 1.0
@@ -244,7 +244,7 @@ def _draw(fit: DonutFit, donuts: slice | list[int] | None, ax: Axes | Figure | N
         upper.colorbar(spread, ax=panels[2], fraction=0.02, pad=0.01)
         bars = lower.subplots()
         width = 0.85 / n
-        for column, (i, color) in enumerate(zip(chosen, field_colors(n), strict=True)):
+        for column, (i, color) in enumerate(zip(shown_donuts, field_colors(n), strict=True)):
             x, y = np.rad2deg(fit.fields[i])
             bars.bar(
                 fit.noll + (column - 0.5 * (n - 1)) * width,

@@ -10,11 +10,15 @@ import numpy as np
 
 from ..wavefront.psf.pupil_rims import PupilRims
 
-# Transfer of air and detector below which diffraction is left out, for turbulence of so much of the strength.
-_DARK, _SHARPER = 2e-3, 0.9
-# Distances by which landing points may move before the transfer function and its derivatives are computed again [side
-# of a pixel]. Images that are 0.05 pixels off at the rims made 25 nm of coma in a joint fit.
-_MOVED, _BENT = 2e-3, 0.2
+#: Transfer of air and detector below which diffraction is left out.
+_DARK = 2e-3
+#: Fraction of the strength of the turbulence that this transfer is computed for, so that a little less of it fits too.
+_SHARPER = 0.9
+#: Distance by which landing points may move before the transfer function is computed again [side of a pixel]. Images
+#: that are 0.05 pixels off at the rims made 25 nm of coma in a joint fit.
+_MOVED = 2e-3
+#: The same for its derivatives [side of a pixel].
+_BENT = 0.2
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,7 @@ class RimLight:
         Wave vectors of the image [rad/m] and baselines in the pupil [m] of the grid.
     lattice : ndarray, shape [ny, nx]
         Factor of the grid's filter that light of the rims does not have.
-    left : callable
+    air_and_detector : callable
         Transfer function of air and detector at a strength of the turbulence [1/m], shape [ny, nx].
     """
 
@@ -60,10 +64,10 @@ class RimLight:
         wave: np.ndarray,
         baseline: np.ndarray,
         lattice: np.ndarray,
-        left: Callable[[float], np.ndarray],
+        air_and_detector: Callable[[float], np.ndarray],
     ) -> None:
         self.rims = rims
-        self._side, self._grid, self._lattice, self._left = side, (baseline, wave), lattice, left
+        self._side, self._grid, self._lattice, self._filter = side, (baseline, wave), lattice, air_and_detector
         self._strength = np.inf
         self._landing, self._bent = np.full((1, 2), np.inf), np.full((1, 2), np.inf)
         #: Frequencies of the grid where something of the diffracted light is left, and their wave vectors [n, 2].
@@ -72,30 +76,29 @@ class RimLight:
 
     def of(self, rims: PupilRims) -> RimLight:
         """Return the same for other rims."""
-        other = copy(self)
-        other.rims = rims
-        other.release()
-        return other
+        light = copy(self)
+        light.rims = rims
+        light.release()
+        return light
 
     def transfer(self, strength: float, at: RimsAt) -> np.ndarray:
         """Return the transfer function about the chief ray at :attr:`where`, shape [n]; turbulence of a strength."""
         if strength < self._strength:
             self._strength = _SHARPER * strength
-            self.where = np.abs(self._left(self._strength)) > _DARK
+            self.where = np.abs(self._filter(self._strength)) > _DARK
             self.wave = self._at_where(self._grid[1])
             self._landing, self._bent = np.full((2, 1, 2), np.inf)
         if self._far(at.landing, self._landing, _MOVED):
-            found = self.rims.transfer(self._at_where(self._grid[0]), self.wave, at.landing, at.inward)
-            self._transfer, self._landing = self._over_lattice(found[:, None])[:, 0], at.landing
+            diffracted = self.rims.transfer(self._at_where(self._grid[0]), self.wave, at.landing, at.inward)
+            self._transfer, self._landing = self._over_lattice(diffracted[:, None])[:, 0], at.landing
         return self._transfer
 
     def slopes(self, at: RimsAt) -> np.ndarray:
         """Return derivatives of the last :meth:`transfer` by the unknowns of the wavefront, shape [n, n_wave]."""
         if self._far(at.landing, self._bent, _BENT) or self._slopes.shape[1] != at.response.shape[2]:
-            found = self.rims.transfer_slopes(
-                self._at_where(self._grid[0]), self.wave, at.landing, at.inward, at.response
-            )
-            self._slopes, self._bent = self._over_lattice(found), at.landing
+            frequencies = self._at_where(self._grid[0])
+            derivatives = self.rims.transfer_slopes(frequencies, self.wave, at.landing, at.inward, at.response)
+            self._slopes, self._bent = self._over_lattice(derivatives), at.landing
         return self._slopes
 
     def release(self) -> None:

@@ -15,12 +15,16 @@ from .likelihood import NormalEquations, Stamp, normal_equations
 
 #: A step that is to lower twice the negative logarithm of the likelihood by less, per unit of chi-square a pixel, is
 #: the last: a fifth of a standard deviation, of which the step leaves a hundredth.
-FINE, COARSE = 5e-2, 0.3
+FINE = 5e-2
+#: The same for a first search in coarse pixels: half a standard deviation.
+COARSE = 0.3
 #: Most steps.
 STEPS = 25
 #: The same for a search that ran out of steps and is near enough to its end.
 _NEAR = 1.0
+#: Damping of the first step, in units of the curvature.
 _DAMPING = 1e-3
+#: Damping beyond which no step is tried: none gains anything.
 _LARGEST_DAMPING = 1e6
 
 
@@ -83,8 +87,8 @@ class Solution:
     def star_covariance(self, star: int) -> np.ndarray:
         """Return the covariance of the unknowns of one star."""
         first = sum(len(s) for s in self.stars[:star])
-        part = slice(first, first + len(self.stars[star]))
-        return self.covariance[part, part]
+        unknowns = slice(first, first + len(self.stars[star]))
+        return self.covariance[unknowns, unknowns]
 
     @property
     def shared_covariance(self) -> np.ndarray:
@@ -124,9 +128,9 @@ def solve(
         if predicted < tolerance * max(1.0, state.loss / pixels):
             joined, converged = trial, True
             break
-        found = _linearize(group, trial, sizes, pool)
-        if found.loss < state.loss:
-            joined, state, damping = trial, found, 0.1 * damping
+        trial_state = _linearize(group, trial, sizes, pool)
+        if trial_state.loss < state.loss:
+            joined, state, damping = trial, trial_state, 0.1 * damping
         else:
             damping = 10.0 * max(damping, _DAMPING)
             if damping > _LARGEST_DAMPING:
@@ -173,29 +177,29 @@ def _linearize(group: Group, joined: np.ndarray, sizes: list[int], pool: Executo
         return equations
 
     apply: Callable[..., object] = map if pool is None else pool.map
-    found: list[NormalEquations] = list(apply(one, range(len(group.stamps))))  # type: ignore[call-overload]
+    star_equations: list[NormalEquations] = list(apply(one, range(len(group.stamps))))  # type: ignore[call-overload]
     curvature, gradient = np.zeros((len(joined), len(joined))), np.zeros(len(joined))
     # The prior has a likelihood of its own.
     curvature[range(n_star, len(joined)), range(n_star, len(joined))] = group.precision
     gradient[n_star:] = -group.precision * shared
-    for i, equations in enumerate(found):
-        own, size = slice(bounds[i], bounds[i + 1]), sizes[i]
+    for i, equations in enumerate(star_equations):
+        star, size = slice(bounds[i], bounds[i + 1]), sizes[i]
         inner, cross, outer = (
             equations.curvature[:size, :size],
             equations.curvature[:size, size:] @ group.maps[i],
             group.maps[i].T @ equations.curvature[size:, size:] @ group.maps[i],
         )
-        curvature[own, own] = inner
-        curvature[own, n_star:] = cross
-        curvature[n_star:, own] = cross.T
+        curvature[star, star] = inner
+        curvature[star, n_star:] = cross
+        curvature[n_star:, star] = cross.T
         curvature[n_star:, n_star:] += outer
-        gradient[own] = equations.gradient[:size]
+        gradient[star] = equations.gradient[:size]
         gradient[n_star:] += group.maps[i].T @ equations.gradient[size:]
-    loss = sum(e.loss for e in found) + float(group.precision @ shared**2)
+    loss = sum(e.loss for e in star_equations) + float(group.precision @ shared**2)
     if not (np.isfinite(loss) and np.isfinite(curvature).all() and np.isfinite(gradient).all()):
         # No step starts there, and none leads there.
         curvature, gradient, loss = np.zeros_like(curvature), np.zeros_like(gradient), np.inf
-    return _Linearized(curvature, gradient, np.array([e.chi2 for e in found]), loss)
+    return _Linearized(curvature, gradient, np.array([e.chi2 for e in star_equations]), loss)
 
 
 def _bounded(joined: np.ndarray, sizes: list[int], held: np.ndarray) -> np.ndarray:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from astropy.io import fits
@@ -17,10 +16,7 @@ from astropy.table import Table
 
 from ..core.errors import ProductError
 from ..core.files import parsing, require_file
-from .inputs import MOST_ELECTRONS
-
-#: Smallest side of a stamp [pixels].
-_SMALLEST = 8
+from .inputs import MOST_ELECTRONS, SMALLEST_STAMP
 
 
 @dataclass(frozen=True)
@@ -72,7 +68,7 @@ def read_stamps(path: Path, positions: Path | None = None, size: int = 180) -> D
         tables = [Table.read(unit) for unit in units if isinstance(unit, fits.BinTableHDU)]
     table = _table(positions) if positions is not None else tables[0] if tables else None
     stacks = [data for _, data in images]
-    if not stacks or any(d.ndim not in (2, 3) or min(d.shape[-2:]) < _SMALLEST for d in stacks):
+    if not stacks or any(d.ndim not in (2, 3) or min(d.shape[-2:]) < SMALLEST_STAMP for d in stacks):
         raise ProductError("expected images: a cube [n, ny, nx], stamps, or one image of a CCD", file=path)
     if len(stacks) == 1 and stacks[0].ndim == 2 and table is not None and {"x", "y"} <= _names(table):
         cut = [_cut(stacks[0], *place, size) for place in zip(_column(table, "x"), _column(table, "y"), strict=True)]
@@ -81,8 +77,8 @@ def read_stamps(path: Path, positions: Path | None = None, size: int = 180) -> D
     if table is not None:
         return DonutStamps(stamps, *_places(table, len(stamps), positions or path))
     headers = [header for header, data in images for _ in range(len(data) if data.ndim == 3 else 1)]
-    known = all("FIELD_X" in h and "FIELD_Y" in h for h in headers)
-    fields = np.deg2rad([[h["FIELD_X"], h["FIELD_Y"]] for h in headers]) if known else None
+    have_fields = all("FIELD_X" in h and "FIELD_Y" in h for h in headers)
+    fields = np.deg2rad([[h["FIELD_X"], h["FIELD_Y"]] for h in headers]) if have_fields else None
     return DonutStamps(stamps, fields, np.array([1e-6 * h.get("DEFOC_UM", 0.0) for h in headers]))
 
 
@@ -119,7 +115,7 @@ def _column(table: Table, name: str) -> np.ndarray:
     return values.astype(np.float64)
 
 
-def _places(table: Table, count: int, file: Path) -> tuple[Any, np.ndarray]:
+def _places(table: Table, count: int, file: Path) -> tuple[np.ndarray | None, np.ndarray]:
     """Return field angles [rad], None without columns, and shifts of the detector [m]."""
     names = _names(table)
     if len(table) != count:

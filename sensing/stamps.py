@@ -8,10 +8,14 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, maximum_filter, median_filter, minimum_filter
 from scipy.signal import fftconvolve
 
-#: A pixel this many standard deviations above its neighbours, and this much brighter, is no part of a donut.
-_SIGMA, _CONTRAST = 8.0, 1.0
-#: Rms of the Gaussian before sampling, in new pixels, and least part of its weight on used pixels.
-_SMOOTHING, _MOSTLY_USED = 1.0, 0.9
+#: A pixel this many standard deviations above its neighbours is no part of a donut, if it is as much brighter, too.
+_SIGMA = 8.0
+#: Least excess of such a pixel over the light of its neighbours.
+_CONTRAST = 1.0
+#: Rms of the Gaussian before sampling, in new pixels.
+_SMOOTHING = 1.0
+#: Least part of its weight on used pixels.
+_MOSTLY_USED = 0.9
 #: Least part of the squared template that must lie on the stamp.
 _ON_STAMP = 0.1
 #: Standard deviation over the median of absolute deviations, of Gaussian noise.
@@ -130,8 +134,8 @@ def match_template(image: np.ndarray, used: np.ndarray, variance: np.ndarray, te
     row, column = np.unravel_index(int(np.argmax(score)), score.shape)
     flux = float(product[row, column] / overlap[row, column])
     # Of the sky and of the star's own light, by the pixels of the template; an image without either has none.
-    own = max(flux, 0.0) * float((template**2).sum() / template.sum())
-    noise = np.sqrt(max(float(np.mean(variance)) + own, 1e-30))
+    photons = max(flux, 0.0) * float((template**2).sum() / template.sum())
+    noise = np.sqrt(max(float(np.mean(variance)) + photons, 1e-30))
     ny, nx = image.shape
     return Match(float(column - nx + 1), float(row - ny + 1), flux, float(score[row, column] / noise))
 

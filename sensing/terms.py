@@ -13,6 +13,8 @@ from ..wavefront.atmosphere.mean_wavefront import mean_wavefront_covariance
 
 # Terms up to the fifth radial degree, and the spherical term of the sixth.
 _LOW_TERMS = 22
+# Terms up to the sixth radial degree, of which misaligned optics have a little.
+_LAST_TERM = 28
 # Terms up to the eleventh radial degree: what the mean wavefront of the air has beyond is lost in the seeing.
 _AIR_TERMS = 78
 
@@ -23,7 +25,7 @@ class WavefrontTerms:
 
     Attributes
     ----------
-    asked : ndarray of int, shape [n]
+    requested : ndarray of int, shape [n]
         Noll indices asked for.
     further : ndarray of int, shape [m]
         Noll indices of the terms that are fitted beside them.
@@ -33,33 +35,38 @@ class WavefrontTerms:
         Covariance of the terms asked for in the mean wavefront of the air [m^2].
     """
 
-    asked: np.ndarray
+    requested: np.ndarray
     further: np.ndarray
     precision: np.ndarray
     air: np.ndarray
 
     @classmethod
     def of(
-        cls, asked: np.ndarray, left_out: float, higher_order: float, telescope: Telescope, air: Atmosphere | None
+        cls,
+        requested: np.ndarray,
+        left_out: float = 0.0,
+        higher_order: float = 0.0,
+        telescope: Telescope | None = None,
+        air: Atmosphere | None = None,
     ) -> WavefrontTerms:
         """Return the terms beside those asked for by the rms of each [m], and by the turbulence of the exposure."""
-        further, variance = further_terms(asked, left_out, higher_order)
-        added = np.zeros((len(asked), len(asked)))
-        if air is not None:
-            noll = np.arange(4, max(_AIR_TERMS, int(asked.max()), int(further.max(initial=4))) + 1)
+        further, variance = further_terms(requested, left_out, higher_order)
+        added = np.zeros((len(requested), len(requested)))
+        if air is not None and telescope is not None:
+            noll = np.arange(4, max(_AIR_TERMS, int(requested.max()), int(further.max(initial=4))) + 1)
             pupil = telescope.pupil_diameter, telescope.pupil_obscuration
-            found = mean_wavefront_covariance(air, [(0.0, 0.0)], noll, *pupil)[0, :, 0]
-            added = found[np.ix_(asked - 4, asked - 4)]
-            beyond = np.setdiff1d(noll, np.concatenate([asked, further]))
+            covariance = mean_wavefront_covariance(air, [(0.0, 0.0)], noll, *pupil)[0, :, 0]
+            added = covariance[np.ix_(requested - 4, requested - 4)]
+            beyond = np.setdiff1d(noll, np.concatenate([requested, further]))
             variance = np.concatenate([variance, np.zeros(len(beyond))])
             further = np.concatenate([further, beyond])
-            variance = variance + np.diag(found)[further - 4]
-        return cls(asked, further, np.concatenate([np.zeros(len(asked)), 1.0 / variance]), added)
+            variance = variance + np.diag(covariance)[further - 4]
+        return cls(requested, further, np.concatenate([np.zeros(len(requested)), 1.0 / variance]), added)
 
     @property
     def every(self) -> np.ndarray:
         """Noll indices of all terms, shape [n + m]."""
-        return np.concatenate([self.asked, self.further])
+        return np.concatenate([self.requested, self.further])
 
 
 def further_terms(noll: np.ndarray, left_out: float, higher_order: float) -> tuple[np.ndarray, np.ndarray]:
@@ -68,12 +75,12 @@ def further_terms(noll: np.ndarray, left_out: float, higher_order: float) -> tup
     They are those up to Z28 where some up to Z22 are left out, and the next radial degree, each if its rms [m] is
     above 0. Misaligned and bent optics have as much of all terms up to the fifth degree, and a tenth of it beyond.
     """
-    usual, every = np.arange(4, _LOW_TERMS + 1), np.arange(4, 29)
-    left = np.setdiff1d(every, noll) if left_out > 0.0 and not np.isin(usual, noll).all() else noll[:0]
-    spreads = np.where(left <= _LOW_TERMS, left_out, 0.1 * left_out)
-    following = next_terms(np.concatenate([noll, left])) if higher_order > 0.0 else noll[:0]
+    usual, candidates = np.arange(4, _LOW_TERMS + 1), np.arange(4, _LAST_TERM + 1)
+    low_terms = np.setdiff1d(candidates, noll) if left_out > 0.0 and not np.isin(usual, noll).all() else noll[:0]
+    spreads = np.where(low_terms <= _LOW_TERMS, left_out, 0.1 * left_out)
+    following = next_terms(np.concatenate([noll, low_terms])) if higher_order > 0.0 else noll[:0]
     spreads = np.concatenate([spreads, np.full(len(following), higher_order)])
-    return np.concatenate([left, following]), spreads**2
+    return np.concatenate([low_terms, following]), spreads**2
 
 
 def next_terms(noll: np.ndarray) -> np.ndarray:
@@ -81,6 +88,6 @@ def next_terms(noll: np.ndarray) -> np.ndarray:
     highest: dict[int, int] = {}
     for n, m in map(noll_to_nm, noll):
         highest[m] = max(highest.get(m, 0), n)
-    wanted = {(n + 2, m) for m, n in highest.items()}
+    degrees = {(n + 2, m) for m, n in highest.items()}
     last = (max(highest.values()) + 3) * (max(highest.values()) + 4) // 2
-    return np.array([j for j in range(1, last + 1) if noll_to_nm(j) in wanted and j not in noll], dtype=np.int64)
+    return np.array([j for j in range(1, last + 1) if noll_to_nm(j) in degrees and j not in noll], dtype=np.int64)

@@ -108,7 +108,7 @@ def cells_with_rims(
 ) -> PupilCells:
     """Return the cells of a pupil with their rates of change by shifts of rims along x and y of their surfaces."""
     cells = pupil_cells(telescope, direction, wavelength, across)
-    parts, columns = [cells], []
+    cell_sets, columns = [cells], []
     for rim in rims:
         step = _STEP * rim.diameter / across
         for axis in np.eye(2):
@@ -118,29 +118,28 @@ def cells_with_rims(
                 )
                 for sign in (1.0, -1.0)
             ]
-            parts += ends
+            cell_sets += ends
             columns.append(step)
     if not columns:
         return cells
-    sizes = [len(part) for part in parts]
+    sizes = [len(cell_set) for cell_set in cell_sets]
     starts = np.cumsum([0, *sizes])
     rates = np.zeros((starts[-1], len(columns)))
     for k, step in enumerate(columns):
-        for sign, part in ((1.0, 2 * k + 1), (-1.0, 2 * k + 2)):
-            rates[starts[part] : starts[part + 1], k] = sign * parts[part].weights / (2.0 * step)
+        for sign, index in ((1.0, 2 * k + 1), (-1.0, 2 * k + 2)):
+            rates[starts[index] : starts[index + 1], k] = sign * cell_sets[index].weights / (2.0 * step)
     weights = np.concatenate([cells.weights, np.zeros(starts[-1] - sizes[0])])
-    points, moments = (np.concatenate([getattr(part, name) for part in parts]) for name in ("points", "moments"))
-    # Cells that no shift changes stand in all parts.
+    points = np.concatenate([cell_set.points for cell_set in cell_sets])
+    moments = np.concatenate([cell_set.moments for cell_set in cell_sets])
+    # Cells that no shift changes stand in all sets.
     keys = np.concatenate([points, moments.reshape(-1, 4)], axis=1)
     _, first, place = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     place = place.ravel()
     joined = np.zeros((len(first), 1 + len(columns)))
     np.add.at(joined, place, np.column_stack([weights, rates]))
-    kept = np.abs(joined) > 1e-9 * np.abs(joined).max(axis=0)
-    some = kept.any(axis=1)
-    return PupilCells(
-        points[first][some], joined[some, 0], moments[first][some], cells.side, cells.center, joined[some, 1:]
-    )
+    significant = (np.abs(joined) > 1e-9 * np.abs(joined).max(axis=0)).any(axis=1)
+    first, joined = first[significant], joined[significant]
+    return PupilCells(points[first], joined[:, 0], moments[first], cells.side, cells.center, joined[:, 1:])
 
 
 def _with_shifted_rim(telescope: Telescope, name: str, x: float, y: float) -> Telescope:

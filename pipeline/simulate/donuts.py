@@ -13,15 +13,15 @@ from ...core.errors import DomainError, shown
 from ...core.plotting import draw_stamps
 from ...core.random_streams import stream
 from ...core.result import Result
-from ...core.units import ARCSEC, for_each, pure_numbers, radians, require_seed
+from ...core.units import ARCSEC, for_each, length, pure_numbers, radians, require_seed
 from ...measure.stamps import observe_stamps
 from ...models.camera.photometry import READ_NOISE
 from ...models.telescope import Telescope
-from ...wavefront.atmosphere.atmosphere import Atmosphere
-from ...wavefront.psf.engine import PsfEngine
+from ...sensing.model import DonutModel
 from ...wavefront.psf.light import Light
 from ...wavefront.psf.psf import Psfs, make_psfs
 from ...wavefront.psf.stamps import Stamps
+from ...wavefront.request import wavelength_points
 from .star_defects import add_defects
 
 if TYPE_CHECKING:
@@ -76,16 +76,15 @@ class Donuts(Result):
 def draw_donuts(
     telescope: Telescope,
     fields: ArrayLike,
-    wavelengths: ArrayLike | Light,
+    wavelengths: ArrayLike | Light | None = None,
     *,
-    atmosphere: Atmosphere | None = None,
+    model: DonutModel | None = None,
     electrons: ArrayLike = 1e6,
     sky: float = 0.0,
     read_noise: float = READ_NOISE,
     second_stars: float = 0.0,
     cosmic_rays: float = 0.0,
     seed: int = 0,
-    engine: str | PsfEngine = "long_exposure",
     stamps: Stamps | None = None,
     **psf: Any,
 ) -> Donuts:
@@ -96,11 +95,15 @@ def draw_donuts(
     telescope : Telescope
         The telescope, defocus included: ``telescope.perturbed("Detector", shift=(0, 0, 1.5e-3))``; or in focus, with
         a ``focal_plane`` that carries the heights, such as that of :func:`~pachon.corner_stars`.
-    fields, wavelengths, atmosphere, engine
-        As in :func:`~pachon.make_psfs`; by default the mean of all turbulence, which needs an atmosphere.
+    fields, wavelengths
+        As in :func:`~pachon.make_psfs`; wavelengths may be those of the model.
+    model : DonutModel, optional
+        What the images are made of, as :func:`~pachon.fit_donuts` takes it: light, heights, one defocus, pixels,
+        diffusion and saturation of the detector; air of a known seeing, or its exposure, unless ``atmosphere`` is
+        given.
     stamps : Stamps, optional
-        Pixels and charge diffusion; by default 181 x 181 pixels. Where it has no ``offsets``, stars stand anywhere
-        within a pixel of the middle one.
+        Size of the stamps, jitter and places; by default 181 x 181 pixels. Where it has no ``offsets``, stars stand
+        anywhere within a pixel of the middle one. With a model, pixels and charge diffusion are those of its detector.
     electrons : float or array_like, shape [n_star]
         Electrons of each star.
     sky, read_noise : float
@@ -112,7 +115,8 @@ def draw_donuts(
     seed : int
         Seed of places within the pixel, noise and defects, not negative. More stars leave the first as they are.
     **psf
-        Further arguments of :func:`~pachon.make_psfs`.
+        Further arguments of :func:`~pachon.make_psfs`. By default the ``engine`` is the mean of all turbulence, which
+        needs an ``atmosphere``.
 
     Returns
     -------
@@ -122,21 +126,43 @@ def draw_donuts(
     ------
     ConfigError, DomainError
         As :func:`~pachon.make_psfs`, of a stamp that is too small for the donuts too; or if a number of electrons is
-        negative, or a fraction not from 0 to 1.
+        negative, a fraction not from 0 to 1, or a model has more than one defocus or seeing.
     """
     seed = require_seed(seed)
     angles = np.atleast_2d(radians(fields, "fields"))
     stamps = Stamps(STAMP_SIZE) if stamps is None else stamps
     if stamps.offsets is None:
         stamps = replace(stamps, offsets=stream(seed, "donuts", "places").uniform(-0.5, 0.5, angles.shape))
-    stars = make_psfs(telescope, fields, wavelengths, atmosphere=atmosphere, engine=engine, stamps=stamps, **psf)
-    light = for_each(pure_numbers(electrons, "electrons"), len(stars.image), "electrons")
-    for name, value in (("electrons", light), ("sky", sky), ("read_noise", read_noise)):
+    modelled = (model or DonutModel()).with_light(wavelengths)
+    light = modelled.light or Light(telescope.default_wavelength)
+    psf = {"engine": "long_exposure", **psf}
+    if model is not None:
+        stamps = replace(stamps, pixel_size=modelled.detector.pixel(), diffusion=modelled.detector.blur())
+        telescope, psf = _modelled(telescope, modelled, psf)
+    stars = make_psfs(telescope, fields, light, stamps=stamps, **psf)
+    flux = for_each(pure_numbers(electrons, "electrons"), len(stars.image), "electrons")
+    for name, value in (("electrons", flux), ("sky", sky), ("read_noise", read_noise)):
         if not np.all((np.asarray(value) >= 0.0) & (np.asarray(value) <= _MOST_ELECTRONS)):
             raise DomainError(f"{name} = {shown(value)}: expected 0 to {_MOST_ELECTRONS:g} electrons", key=name)
-    caught = light * np.minimum(stars.inside, 1.0)
+    caught = flux * np.minimum(stars.inside, 1.0)
     observed = observe_stamps(stars.image, caught, sky, read_noise, stream(seed, "donuts", "noise"))
     images, defects = add_defects(
         observed, stars.image, stream(seed, "donuts", "defects"), neighbours=second_stars, cosmic_rays=cosmic_rays
     )
-    return Donuts(images, float(sky + read_noise**2), stars, light.copy(), defects)
+    if modelled.detector.saturation is not None:
+        images = np.minimum(images, modelled.detector.saturation)
+    return Donuts(images, float(sky + read_noise**2), stars, flux.copy(), defects)
+
+
+def _modelled(telescope: Telescope, model: DonutModel, psf: dict[str, Any]) -> tuple[Telescope, dict[str, Any]]:
+    """Return the telescope with the defocus of a model, and the arguments of its images where none are given."""
+    detector, surface = model.detector, telescope.surfaces[-1]
+    defocus = length(detector.defocus, "defocus")
+    if defocus:
+        telescope = telescope.perturbed(surface.name, shift=defocus * surface.matrix[:, 2])
+    waves = wavelength_points(telescope, None if model.light is None else model.light.wavelengths)
+    arguments = {
+        "focal_plane": detector.focal_plane,
+        "atmosphere": model.air.exposure(float(waves[len(waves) // 2])),
+    }
+    return telescope, {**arguments, **psf}

@@ -53,8 +53,8 @@ def estimate_state(
     # Wavefronts in nanometres: their covariance in square metres would be near the rounding of a solver.
     scale = 1e9
     kalman = scale * np.linalg.solve(scale**2 * (sensitivity @ across + noise), scale * across.T).T
-    left = np.eye(len(covariance)) - gain * kalman @ sensitivity
-    after = left @ covariance @ left.T + gain**2 * kalman @ noise @ kalman.T + drift
+    retained = np.eye(len(covariance)) - gain * kalman @ sensitivity
+    after = retained @ covariance @ retained.T + gain**2 * kalman @ noise @ kalman.T + drift
     return Estimate(kalman @ wavefront, after)
 
 

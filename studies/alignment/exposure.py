@@ -8,6 +8,7 @@ from ...core.random_streams import stream
 from ...models.telescope import Telescope
 from ...pipeline.simulate.donuts import draw_donuts
 from ...sensing.fit import fit_donuts
+from ...sensing.model import DonutAir, DonutDetector, DonutModel
 from ...sensing.result import DonutFit
 from ...wavefront.aberration import StarWavefronts
 from ...wavefront.psf.stamps import Stamps
@@ -53,16 +54,18 @@ def expose(scene: AlignmentScene, telescope: Telescope, visit: int, threads: int
 def fit(scene: AlignmentScene, images: np.ndarray, threads: int | None = None) -> DonutFit:
     """Return the wavefronts of donuts beyond those of the telescope as designed."""
     donuts, stars = scene.config.donuts, scene.believed
+    model = DonutModel(
+        air=DonutAir(outer_scale=scene.atmosphere.outer_scale),
+        detector=DonutDetector(diffusion=_DIFFUSION, focal_plane=stars.focal_plane),
+        diffraction=True,
+    )
     return fit_donuts(
         scene.telescope,
         images,
         stars.fields,
         scene.wavelengths,
-        focal_plane=stars.focal_plane,
         sky_variance=donuts.sky + donuts.read_noise**2,
         noll=NOLL,
-        diffusion=_DIFFUSION,
-        outer_scale=scene.atmosphere.outer_scale,
-        diffraction=True,
+        model=model,
         threads=threads,
     )

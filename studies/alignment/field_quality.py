@@ -16,8 +16,12 @@ from ...wavefront.psf.psf import make_psfs
 from ...wavefront.psf.stamps import Stamps
 from ...wavefront.pupil_sampling import gauss_annulus, spiral_annulus
 
-#: Points of the field, at equal areas; rings and spokes of the pupil, which integrate squares up to the 13th degree.
-FIELDS, RINGS, SPOKES = 30, 7, 28
+#: Points of the field, at equal areas.
+FIELDS = 30
+#: Rings of the pupil, which with the spokes integrate squares of polynomials up to the 13th degree.
+RINGS = 7
+#: Spokes of the pupil.
+SPOKES = 28
 #: FWHM of the weight of the moments [rad].
 _WEIGHT = 0.7 * ARCSEC
 

@@ -25,26 +25,28 @@ def quality_picture(found: Alignment) -> bytes:
     )
     with styled():
         figure = new_figure(7.0, 8.0)
-        every = figure.subplots(3, 1, sharex=True)
-        for axes, (label, values) in zip(every, panels, strict=True):
+        panel_axes = figure.subplots(3, 1, sharex=True)
+        for axes, (label, values) in zip(panel_axes, panels, strict=True):
             axes.plot(visit, values, "o-", color=BLUE, markersize=3.0, linewidth=0.8, label="telescope")
             axes.set_ylabel(label)
-        for axes in every[[0, 2]]:
+        for axes in panel_axes[[0, 2]]:
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter(PLAIN)
             axes.yaxis.set_minor_formatter(NullFormatter())
             axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        every[0].plot(visit, 1e9 * found.expected, color=ORANGE, label="expected from the covariance")
-        every[0].axhline(1e9 * found.floor, color=GREY, linewidth=0.8, linestyle="--", label="floor")
-        every[1].set_yscale("symlog", linthresh=10.0)
-        every[1].yaxis.set_major_formatter(PLAIN)
-        every[1].axhline(0.0, color=GREY, linewidth=0.8, linestyle="--", label="as designed")
-        every[2].axhline(1e3 * designed.ellipticity, color=GREY, linewidth=0.8, linestyle="--", label="as designed")
-        for axes in every:
+        panel_axes[0].plot(visit, 1e9 * found.expected, color=ORANGE, label="expected from the covariance")
+        panel_axes[0].axhline(1e9 * found.floor, color=GREY, linewidth=0.8, linestyle="--", label="floor")
+        panel_axes[1].set_yscale("symlog", linthresh=10.0)
+        panel_axes[1].yaxis.set_major_formatter(PLAIN)
+        panel_axes[1].axhline(0.0, color=GREY, linewidth=0.8, linestyle="--", label="as designed")
+        panel_axes[2].axhline(
+            1e3 * designed.ellipticity, color=GREY, linewidth=0.8, linestyle="--", label="as designed"
+        )
+        for axes in panel_axes:
             axes.legend(fontsize=8)
-        every[1].set_ylim(bottom=-5.0)
-        every[2].set_xlabel("visit")
-        every[2].xaxis.set_major_locator(MaxNLocator(integer=True))
+        panel_axes[1].set_ylim(bottom=-5.0)
+        panel_axes[2].set_xlabel("visit")
+        panel_axes[2].xaxis.set_major_locator(MaxNLocator(integer=True))
         return png_bytes(figure)
 
 
@@ -72,18 +74,18 @@ def donut_picture(found: Alignment) -> bytes:
     """Draw the donuts of the first and the last visit, and what the fit leaves of them."""
     visits = {"first visit": found.first, f"visit {len(found.visits) - 1}": found.last}
     sensors = found.scene.stars.sensors
-    chosen = np.unique(np.linspace(0, len(sensors) - 1, min(_ACROSS, len(sensors))).astype(int))
+    shown_stars = np.unique(np.linspace(0, len(sensors) - 1, min(_ACROSS, len(sensors))).astype(int))
     with styled():
-        figure = new_figure(1.5 * len(chosen), 6.4)
-        grid = figure.subplots(4, len(chosen), squeeze=False)
+        figure = new_figure(1.5 * len(shown_stars), 6.4)
+        grid = figure.subplots(4, len(shown_stars), squeeze=False)
         for pair, (title, fit) in enumerate(visits.items()):
             donuts = found.scene.config.donuts
             sigma = np.sqrt(np.maximum(fit.model, 0.0) + donuts.sky + donuts.read_noise**2)
-            for column, star in enumerate(chosen):
-                image, rest = grid[2 * pair : 2 * pair + 2, column]
+            for column, star in enumerate(shown_stars):
+                image, residual = grid[2 * pair : 2 * pair + 2, column]
                 image.imshow(fit.images[star], origin="lower", cmap="gray")
-                rest.imshow(fit.residuals[star] / sigma[star], origin="lower", cmap="RdBu_r", vmin=-5.0, vmax=5.0)
-                for axes in (image, rest):
+                residual.imshow(fit.residuals[star] / sigma[star], origin="lower", cmap="RdBu_r", vmin=-5.0, vmax=5.0)
+                for axes in (image, residual):
                     axes.set(xticks=[], yticks=[])
                 if pair == 0:
                     image.set_title(sensors[star], fontsize=8)

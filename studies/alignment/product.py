@@ -62,12 +62,12 @@ def write_alignment(found: Alignment, folder: Path) -> tuple[str, ...]:
         "donuts": (found.donuts, "", "donuts used"),
     }
     tables = {"visits.ecsv": ("visits of an active-optics loop", columns)}
-    for name, what, values in (
+    for name, description, values in (
         ("states.ecsv", "state of the telescope in each visit", found.states),
         ("estimates.ecsv", "estimated state of the telescope in each visit", found.estimates),
         ("state_errors.ecsv", "expected rms of the state in each visit", found.errors),
     ):
-        tables[name] = (what, _by_freedom(found, values))
+        tables[name] = (description, _by_freedom(found, values))
     for file, (subject, content) in tables.items():
         write_ecsv(folder / file, content, {"what": subject, **meta})
     pictures = {"quality.png": quality_picture, "states.png": state_picture, "donuts.png": donut_picture}

@@ -58,9 +58,9 @@ class AlignmentScene:
             freedoms.parameter_matrix(telescope)
         with error_context(key="errors.tolerances"):
             freedoms.vector(config.errors.tolerances)
-        chosen = config.wavelengths_nm
+        nanometres = config.wavelengths_nm
         with error_context(key="wavelengths_nm"):
-            waves = wavelength_points(telescope, None if chosen is None else 1e-9 * np.array(chosen))
+            waves = wavelength_points(telescope, None if nanometres is None else 1e-9 * np.array(nanometres))
         air, donuts = config.air, config.donuts
         atmosphere = Atmosphere.from_site(
             _path(air.site, folder),
@@ -129,8 +129,8 @@ class AlignmentScene:
     def sensitivity(self) -> np.ndarray:
         """Zernikes of the donuts by the state [m per tolerance], shape [n_star * n_noll, n]."""
         last = int(NOLL[-1])
-        found = sensitivity(self.telescope, self.freedoms, self.stars.fields, self.wavelength, n_zernike=last)
-        return np.asarray((found.matrix[:, NOLL - 1] * self.tolerances).reshape(-1, len(self.freedoms)))
+        response = sensitivity(self.telescope, self.freedoms, self.stars.fields, self.wavelength, n_zernike=last)
+        return np.asarray((response.matrix[:, NOLL - 1] * self.tolerances).reshape(-1, len(self.freedoms)))
 
     @cached_property
     def turbulence(self) -> np.ndarray:
@@ -139,8 +139,8 @@ class AlignmentScene:
         if not self.config.air.wavefront:
             return np.zeros((size, size))
         pupil = self.telescope.pupil_diameter, self.telescope.pupil_obscuration
-        found = mean_wavefront_covariance(self.atmosphere, np.tan(self.stars.fields), NOLL, *pupil)
-        return found.reshape(size, size)
+        covariance = mean_wavefront_covariance(self.atmosphere, np.tan(self.stars.fields), NOLL, *pupil)
+        return covariance.reshape(size, size)
 
     def expected_wavefront(self, covariance: np.ndarray) -> float:
         """Return the rms over the field [m] of the wavefront of states of a covariance [tolerances^2]."""

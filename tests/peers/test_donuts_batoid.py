@@ -39,10 +39,10 @@ def test_wavefront_of_a_donut_is_that_of_batoid():
         5e6 * image[None] / lit.sum(),
         [field],
         WAVELENGTH,
-        pixel_size=PIXEL,
         sky_variance=500.0,
-        fwhm=0.0,
-        diffusion=PIXEL,
+        model=pachon.DonutModel(
+            air=pachon.DonutAir(fwhm=0.0), detector=pachon.DonutDetector(pixel_size=PIXEL, diffusion=PIXEL)
+        ),
     )
     before, after = (
         batoid.zernikeGQ(optic, *field, WAVELENGTH, projection="zemax", jmax=37, eps=0.61)[4:23] * WAVELENGTH

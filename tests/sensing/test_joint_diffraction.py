@@ -9,6 +9,10 @@ WAVELENGTH, DEFOCUS, ELECTRONS = 622e-9, 1.5e-3, 5e6
 FIELDS = np.deg2rad([(0.3, 0.2), (-1.1, 0.6), (0.9, 1.1), (0.4, -1.4)])
 
 
+def diffracted(defocus):
+    return pachon.DonutModel(detector=pachon.DonutDetector(diffusion=4e-6, defocus=defocus), diffraction=True)
+
+
 @pytest.mark.slow
 def test_joint_fits_find_a_misaligned_telescope(focused):
     freedoms = pachon.load_degrees_of_freedom("lsst")
@@ -28,12 +32,9 @@ def test_joint_fits_find_a_misaligned_telescope(focused):
         ELECTRONS * np.concatenate(images),
         np.tile(FIELDS, (2, 1)),
         WAVELENGTH,
-        defocus=np.repeat([DEFOCUS, -DEFOCUS], len(FIELDS)),
         sky_variance=400.0,
-        diffusion=4e-6,
-        diffraction=True,
-        degrees_of_freedom=freedoms,
-        prior=5.0 * size,
+        model=diffracted(np.repeat([DEFOCUS, -DEFOCUS], len(FIELDS))),
+        fit=pachon.TelescopeFreedoms(freedoms, prior=5.0 * size),
     )
     # Rims that stand where an earlier step had them, and no derivatives of their places, left 30 to 60 nm of coma.
     before, after = (
@@ -62,12 +63,9 @@ def test_rims_near_the_image_move_with_the_telescope(focused):
         ELECTRONS * images,
         fields,
         WAVELENGTH,
-        defocus=DEFOCUS,
         sky_variance=400.0,
-        diffusion=4e-6,
-        diffraction=True,
-        degrees_of_freedom=freedoms,
-        prior=5.0 * size,
+        model=diffracted(DEFOCUS),
+        fit=pachon.TelescopeFreedoms(freedoms, prior=5.0 * size),
     )
     # Rims that follow from one outer iteration to the next, without derivatives, left 3e-2 a pixel, and M2 and camera
     # off by 370 times the claimed variance.

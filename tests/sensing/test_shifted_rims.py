@@ -68,9 +68,9 @@ def test_shifted_rims_are_not_taken_for_wavefront(behind_focus):
         [EDGE],
         WAVELENGTH,
         sky_variance=1000.0,
-        fwhm=0.0,
-        diffusion=PIXEL,
-        pixel_size=PIXEL,
+        model=pachon.DonutModel(
+            air=pachon.DonutAir(fwhm=0.0), detector=pachon.DonutDetector(pixel_size=PIXEL, diffusion=PIXEL)
+        ),
         threads=1,
     )
     before, after = (

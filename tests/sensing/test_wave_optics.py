@@ -56,10 +56,8 @@ def test_diffraction_is_not_taken_for_wavefront(behind_focus, on_axis, r0, left,
             [(0.0, 0.0)],
             WAVELENGTH,
             sky_variance=1000.0,
-            outer_scale=OUTER_SCALE,
-            diffusion=0.0,
             pixel_size=PIXEL,
-            diffraction=diffraction,
+            model=pachon.DonutModel(air=pachon.DonutAir(outer_scale=OUTER_SCALE), diffraction=diffraction),
             threads=1,
         )
         for diffraction in (False, True)

@@ -1,10 +1,12 @@
 """Simulated donuts: electrons, noise, defects and streams."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import pachon
-from pachon.core.errors import DomainError
+from pachon.core.errors import ConfigError, DomainError
 
 LSST = pachon.load_telescope("lsst_v3.3_r").perturbed("Detector", shift=(0.0, 0.0, 0.3e-3))
 FIELDS = np.deg2rad([(0.2, 0.1), (-0.7, 0.9), (1.0, 1.2)])
@@ -49,3 +51,54 @@ def test_second_stars_and_cosmic_rays_are_flagged_and_bright():
 def test_stamps_too_small_for_the_donuts_are_refused():
     with pytest.raises(DomainError, match=r"size = 21: .* expected at least 3[0-9] pixels"):
         pachon.draw_donuts(LSST, FIELDS, [620e-9], atmosphere=OPTIONS["atmosphere"], stamps=pachon.Stamps(21))
+
+
+@pytest.mark.long
+def test_one_model_draws_and_fits():
+    """Nothing but noise is left where a fit takes images to be made of what they are: seeing, defocus, diffraction."""
+    seeing = pachon.DonutAir(fwhm=0.8 / 206265.0)
+    model = pachon.DonutModel(
+        light=pachon.Light([600e-9, 640e-9], weights=[1.0, 3.0]),
+        air=seeing,
+        detector=pachon.DonutDetector(pixel_size=20e-6, diffusion=8e-6, defocus=-1.2e-3, saturation=1e5),
+        diffraction=True,
+    )
+    telescope = pachon.load_telescope("lsst_v3.3_r")
+    drawn = pachon.draw_donuts(
+        telescope, FIELDS[:2], model=model, stamps=pachon.Stamps(81), electrons=5e6, sky=300.0, second_stars=0.0, seed=3
+    )
+    fit = pachon.fit_donuts(
+        telescope,
+        drawn.images,
+        FIELDS[:2],
+        sky_variance=drawn.sky_variance,
+        noll=range(4, 12),
+        model=replace(model, air=pachon.DonutAir()),
+    )
+    assert fit.reasons == ["", ""]
+    # Of eight terms a star: 16 squares scatter by 35 %.
+    chi2 = np.einsum("ni,nij,nj->", fit.zernikes, np.linalg.inv(fit.covariance), fit.zernikes) / fit.zernikes.size
+    assert chi2 < 2.4
+    assert fit.fwhm == pytest.approx(seeing.fwhm, rel=0.01)
+    assert fit.flux == pytest.approx(5e6, rel=0.005)
+    low = pachon.draw_donuts(
+        telescope,
+        FIELDS[:1],
+        model=replace(model, detector=replace(model.detector, saturation=2000.0)),
+        stamps=pachon.Stamps(81),
+        electrons=5e6,
+    )
+    assert low.images.max() == 2000.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"detector": pachon.DonutDetector(defocus=[1e-3, -1e-3])}, "defocus has shape .*: expected one length"),
+        ({"air": pachon.DonutAir(fwhm=[1e-6, 2e-6])}, "fwhm has shape .*: expected one angle"),
+        ({"light": pachon.Light(622e-9)}, "wavelength and the light of the model are both given"),
+    ],
+)
+def test_models_of_several_exposures_are_refused(changes, text):
+    with pytest.raises((DomainError, ConfigError), match=text):
+        pachon.draw_donuts(LSST, FIELDS[:2], 620e-9, model=pachon.DonutModel(**changes))

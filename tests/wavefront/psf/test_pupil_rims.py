@@ -64,9 +64,10 @@ def test_long_exposure_donuts_are_diffracted_at_their_rims(defocused, donut):
 
 @pytest.mark.slow
 def test_fits_with_diffraction_find_no_wavefront_in_it(defocused, donut):
-    options = {"sky_variance": 1e4, "outer_scale": OUTER_SCALE, "n_pupil": 80}
+    air = pachon.DonutAir(outer_scale=OUTER_SCALE)
     plain, right = (
-        pachon.fit_donuts(defocused, [1e8 * donut], [(0.0, 0.0)], WAVE, diffraction=d, **options) for d in (False, True)
+        pachon.fit_donuts(defocused, [1e8 * donut], [(0.0, 0.0)], WAVE, sky_variance=1e4, model=model)
+        for model in (pachon.DonutModel(air=air, diffraction=d, n_pupil=80) for d in (False, True))
     )
     # Rays and a wider seeing do not make strips along the rims: 24 nm of Z11, at 0.6 mm.
     assert np.linalg.norm(plain.zernikes[0]) > 15e-9
@@ -80,9 +81,8 @@ def test_donuts_of_the_wave_engine_have_the_hole_of_the_mirror():
     telescope = LSST.perturbed("Detector", shift=(0.0, 0.0, 1.5e-3))
     fields, options = np.deg2rad([[1.19, 1.13]]), {"diffusion": 15e-6}
     donut = make_psfs(telescope, fields, [WAVE], engine="wave", stamps=Stamps(141, **options)).image
-    fit = pachon.fit_donuts(
-        telescope, 1e7 * donut, fields, WAVE, sky_variance=1e4, diffraction=True, fwhm=0.0, **options
-    )
+    model = pachon.DonutModel(air=pachon.DonutAir(fwhm=0.0), detector=pachon.DonutDetector(**options), diffraction=True)
+    fit = pachon.fit_donuts(telescope, 1e7 * donut, fields, WAVE, sky_variance=1e4, model=model)
     # Fresnel fringes at the rims, without air.
     assert np.linalg.norm(fit.zernikes[0]) < 10e-9
 

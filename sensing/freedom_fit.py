@@ -1,0 +1,155 @@
+"""Fit of degrees of freedom of the telescope to all donuts of an exposure together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..core.arguments import check_arguments
+from ..design.metrics.field_zernikes import wavefront_zernikes
+from ..design.optimize.sensitivity import sensitivity
+from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
+from ..models.parameters.tolerances import Tolerance
+from ..raytrace.launch import aimed_points
+from ..wavefront.psf.pupil_rims import pupil_rims
+from .degrees import FreedomEstimate, FreedomRays, prior_spreads
+from .fit_star import StarFit, StarSolution
+from .image_model import STRENGTH
+from .inputs import noll_indices
+from .light import Instrument
+from .pupil_cells import PupilCells
+from .solve import Group, solve
+from .stamps import Pixels
+from .vignetting import cells_with_rims, rim_shifts
+from .wavefront_fits import NOLL, FittedStars, UsableStars, WavefrontFit, joint_results
+
+#: Times that vignetting and response to the degrees of freedom are computed.
+_OUTER = 4
+#: Steps with each of them.
+_INNER = 6
+#: Squared change in units of the errors, a degree of freedom, that is small enough.
+_SETTLED = 1e-3
+#: Step of the differences by which rims follow degrees of freedom, in units of the prior.
+_STEP = 1e-3
+#: Terms that are fitted at least over the whole annulus, vignetted or not: no other then shows up in those asked for.
+_MANY_TERMS = 37
+
+
+@check_arguments
+@dataclass(frozen=True, eq=False)
+class TelescopeFreedoms(WavefrontFit):
+    """Fit of degrees of freedom of the telescope to all donuts together; for :func:`~pachon.fit_donuts`.
+
+    Attributes
+    ----------
+    freedoms : DegreesOfFreedom
+        Degrees of freedom, in place of Zernikes of each donut.
+    prior : array_like, mapping or tolerances, optional
+        Standard deviations of the degrees of freedom, each in its unit; by default each makes 1 um rms of wavefront
+        over the field.
+    noll : iterable of int
+        Noll indices of the wavefront that they make at each donut, from 4.
+
+    Raises
+    ------
+    DomainError
+        If indices repeat or are below 4.
+    """
+
+    freedoms: DegreesOfFreedom
+    prior: ArrayLike | Mapping[str, Any] | Sequence[Tolerance] | None = None
+    noll: Iterable[int] = NOLL
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "noll", tuple(noll_indices(self.noll, "noll", 4)))
+
+    def prepared(self, instrument: Instrument, star: StarFit) -> StarFit:
+        """Return a star whose light depends on degrees of freedom in place of its own Zernikes."""
+        if star.best is None:
+            return star
+        return replace(star, best=self._with_cells(instrument, star.best, star.best.stamp.rays.cells))
+
+    def solved(self, usable: UsableStars, pool: Executor) -> FittedStars:
+        """Return the results of a joint fit with Gaussian priors."""
+        instrument, freedoms = usable.instrument, self.freedoms
+        telescope, noll, wavelength = instrument.telescope, instrument.noll, instrument.middle
+        spreads = prior_spreads(freedoms, self.prior, telescope, wavelength)
+        fields, projection = usable.fields, usable.projection
+        last = int(noll.max())
+        response = sensitivity(telescope, freedoms, fields, wavelength, n_zernike=last, projection=projection)
+        precision = spreads**-2.0
+        shifts = self._rim_shifts(usable, spreads)
+        maps = [np.concatenate([np.eye(len(freedoms)), star_shifts]) for star_shifts in shifts]
+        shared, unknowns = usable.start(response.matrix[:, noll - 1], precision), usable.unknowns
+        for _ in range(_OUTER):
+            stars = [
+                self._with_vignetting(instrument, star, shared, star_shifts @ shared)
+                for star, star_shifts in zip(usable.stars, shifts, strict=True)
+            ]
+            stamps = tuple(star.stamp for star in stars)
+            group = Group(stamps, maps, precision, instrument.known_seeing, transient=True)
+            joint = solve(group, unknowns, shared, steps=_INNER, pool=pool)
+            change, shared, unknowns = joint.shared - shared, joint.shared, list(joint.stars)
+            if float(change @ np.linalg.solve(joint.shared_covariance, change)) < _SETTLED * len(change):
+                break
+        after = freedoms.apply(telescope, joint.shared)
+        believed, estimated = (
+            wavefront_zernikes(t, fields, wavelength, jmax=last, projection=projection).coefficients[:, noll - 1]
+            for t in (telescope, after)
+        )
+        many = max(last, _MANY_TERMS)
+        response = sensitivity(after, freedoms, fields, wavelength, n_zernike=many, projection=projection)
+        return FittedStars(
+            joint_results(stars, joint, estimated - believed, response.matrix[:, noll - 1]),
+            degrees_of_freedom=FreedomEstimate(freedoms, joint.shared, joint.shared_covariance, spreads),
+        )
+
+    def _rim_shifts(self, usable: UsableStars, spreads: np.ndarray) -> list[np.ndarray]:
+        """Return the shifts of the rims of each star by the degrees of freedom, [n_shift, n_freedom]."""
+        telescope, wavelength, freedoms = usable.instrument.telescope, usable.instrument.middle, self.freedoms
+        lights = [star.light for star in usable.stars]
+        rims = [rim for light in lights for rim in light.rims]
+        if not rims:
+            return [np.zeros((0, len(freedoms)))] * len(lights)
+        directions = np.array([light.direction for light in lights for _ in light.rims])
+        points = np.array([rim.point for rim in rims])[:, None]
+        aimed = aimed_points(telescope, directions, wavelength, points).reshape(-1, 2)
+        aimed_rims = [replace(rim, point=point) for rim, point in zip(rims, aimed, strict=True)]
+        steps = _STEP * spreads
+        moved = [(freedoms.apply(telescope, step), freedoms.apply(telescope, -step)) for step in np.diag(steps)]
+        shifts = rim_shifts(moved, steps, directions, wavelength, aimed_rims)
+        ends = np.cumsum([2 * len(light.rims) for light in lights])
+        return np.split(shifts, ends[:-1])
+
+    def _with_vignetting(
+        self, instrument: Instrument, star: StarSolution, at: np.ndarray, shifts: np.ndarray
+    ) -> StarSolution:
+        """Return a star with the vignetting of some values of the degrees of freedom, which shift its rims so far."""
+        light, stamp = star.light, star.stamp
+        fwhm = float(instrument.seeing.fwhm(star.solution.stars[0][STRENGTH]))
+        pixels = Pixels(stamp.image, stamp.variance, stamp.used, round(stamp.grid.scale))
+        across = instrument.sampling(light, pixels, fwhm).across
+        changed = self.freedoms.apply(light.telescope, at)
+        cells = cells_with_rims(changed, light.direction, instrument.middle, across, light.rims)
+        if light.rims and light.pupil_rims is not None:
+            rims = pupil_rims(changed, light.direction, instrument.middle)
+            stamp, full = (replace(s, grid=s.grid.with_rims(rims)) for s in (star.stamp, star.full))
+            star = replace(star, stamp=stamp, full=full)
+        return self._with_cells(instrument, star, cells, shifts)
+
+    def _with_cells(
+        self, instrument: Instrument, star: StarSolution, cells: PupilCells, shifts: np.ndarray | None = None
+    ) -> StarSolution:
+        """Return a star with the light through cells of the pupil, by degrees of freedom."""
+        light, footprint = star.light, star.stamp.grid.footprint
+        waves = instrument.wavelengths, instrument.wavelength_weights
+        rays = FreedomRays(light.telescope, light.direction, *waves, cells, self.freedoms, footprint, shifts)
+        stamp, full = replace(star.stamp, rays=rays), replace(star.full, rays=rays)
+        stamp.release()
+        full.release()
+        return replace(star, stamp=stamp, full=full)

@@ -1,0 +1,184 @@
+"""Model of images of donuts: light, air, detector, diffraction and second stars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..core.arguments import check_arguments
+from ..core.errors import ConfigError, DomainError, shown
+from ..core.units import ARCSEC, angle, metres, radians, require_count, require_positive
+from ..models.camera.focal_plane import FocalPlane
+from ..wavefront.atmosphere.atmosphere import Atmosphere
+from ..wavefront.psf.light import Light
+from .inputs import one_for_each, outer_scale_of, small_length
+from .seeing import Seeing
+
+#: Site of an exposure of known seeing; of its layers the mean image depends on nothing but that.
+_SITE = "cerro_pachon"
+#: Seeing that a search starts from [rad].
+_START_FWHM = 0.8 * ARCSEC
+#: Largest seeing [rad]: no image of a star is as wide.
+_MOST_FWHM = 60.0 * ARCSEC
+#: Largest defocus of an image [m].
+_MOST_DEFOCUS = 0.1
+#: Least number of cells across the pupil that make an image of it.
+_FEWEST_CELLS = 8
+#: Largest number of cells across the pupil: 4 million of them.
+_MOST_CELLS = 2000
+
+
+@check_arguments
+@dataclass(frozen=True, eq=False)
+class DonutAir:
+    """Air in front of the telescope, of a :class:`DonutModel`.
+
+    Attributes
+    ----------
+    fwhm : float, array [n] or Quantity, optional
+        Seeing [rad], if it is known; fitted by default. 0 is no atmosphere.
+    outer_scale : float
+        Outer scale of the turbulence [m]; infinite for Kolmogorov's.
+    atmosphere : Atmosphere, optional
+        Turbulence of the exposure, its winds and length. The terms up to Z78 that its mean wavefront has beside those
+        asked for are fitted too, with the prior of the closed form, and not returned; its own of the terms asked for,
+        which no single donut tells from the telescope's, are added to ``covariance``. Three times the time; no joint
+        fits.
+
+    Raises
+    ------
+    DomainError
+        If a number is outside its range.
+    """
+
+    fwhm: ArrayLike | None = None
+    outer_scale: float = 25.0
+    atmosphere: Atmosphere | None = None
+
+    def __post_init__(self) -> None:
+        outer_scale_of(self.outer_scale)
+        widths = np.zeros(1) if self.fwhm is None else radians(self.fwhm, "fwhm")
+        if not ((widths >= 0.0) & (widths < _MOST_FWHM)).all():
+            raise DomainError(f"fwhm = {shown(self.fwhm)}: expected angles from 0 to {_MOST_FWHM:g} rad")
+
+    def seeing(self, wavelength: float) -> Seeing:
+        """Return the long exposure at a wavelength [m]."""
+        return Seeing(wavelength, outer_scale_of(self.outer_scale))
+
+    def exposure(self, wavelength: float) -> Atmosphere | None:
+        """Return the atmosphere, or one of the known seeing at a wavelength [m]; None without any."""
+        if self.atmosphere is not None or self.fwhm is None:
+            return self.atmosphere
+        strength = self.seeing(wavelength).strength(angle(self.fwhm, "fwhm"))
+        return Atmosphere.from_site(_SITE, 0, r0=1.0 / strength, outer_scale=self.outer_scale) if strength else None
+
+    def strengths(self, seeing: Seeing, count: int) -> list[float]:
+        """Return the strength of the turbulence of each of so many stars [1/m]: known, or a start of its search."""
+        if self.fwhm is None:
+            return [seeing.strength(_START_FWHM)] * count
+        return [seeing.strength(float(v)) for v in one_for_each(radians(self.fwhm, "fwhm"), count, "fwhm")]
+
+
+@check_arguments
+@dataclass(frozen=True, eq=False)
+class DonutDetector:
+    """Detector of a :class:`DonutModel`.
+
+    Attributes
+    ----------
+    pixel_size : float or Quantity
+        Side of a pixel [m].
+    diffusion : float or Quantity
+        Rms of the charge diffusion along each axis [m], which a fitted seeing takes up by default.
+    focal_plane : FocalPlane, optional
+        Heights of the CCDs; the nominal flat plane by default.
+    defocus : float or array, shape [n]
+        Shift of the detector, not of the camera, of each image along its z, beside that of the telescope [m]: 0 for all
+        in one plane, or 1.5 mm and 0 for donuts and in-focus stars, which then share one likelihood.
+    saturation : float, optional
+        Level from which on pixels are saturated [electrons]. Many pixels of the same greatest value are taken to be
+        saturated without it.
+
+    Raises
+    ------
+    DomainError
+        If a number is outside its range.
+    """
+
+    pixel_size: ArrayLike = 10e-6
+    diffusion: ArrayLike = 0.0
+    focal_plane: FocalPlane | None = None
+    defocus: ArrayLike = 0.0
+    saturation: float | None = None
+
+    def __post_init__(self) -> None:
+        self.pixel()
+        self.blur()
+        if not (np.abs(metres(self.defocus, "defocus")) <= _MOST_DEFOCUS).all():
+            raise DomainError(f"defocus: expected at most {_MOST_DEFOCUS:g} m on either side")
+        if self.saturation is not None:
+            require_positive(self.saturation, "saturation", "electrons")
+
+    def pixel(self) -> float:
+        """Return the side of a pixel [m]."""
+        return require_positive(metres(self.pixel_size, "pixel_size"), "pixel_size", "metres")
+
+    def blur(self) -> float:
+        """Return the rms of the charge diffusion [m]."""
+        return small_length(self.diffusion, "diffusion")
+
+    def shifts(self, count: int) -> np.ndarray:
+        """Return the shift of each of so many images along z [m]."""
+        return one_for_each(metres(self.defocus, "defocus"), count, "defocus")
+
+
+@check_arguments
+@dataclass(frozen=True, eq=False)
+class DonutModel:
+    """What images of donuts are made of, for :func:`~pachon.fit_donuts` and :func:`~pachon.draw_donuts`.
+
+    Attributes
+    ----------
+    light : Light, optional
+        Wavelengths and their relative amounts of light; the telescope's own wavelength by default.
+    air : DonutAir
+        Seeing and turbulence.
+    detector : DonutDetector
+        Pixels, charge diffusion, heights, defocus and saturation.
+    neighbours : bool
+        Whether a second star may stand on a stamp. It is searched for, and fitted too.
+    diffraction : bool
+        Whether light is diffracted at the rims of the pupil, as that of real stars is: it takes light from strips along
+        the rims of the image. A fit of rays takes their lack for 35 to 45 nm of wavefront, most of it Z11 (LSST, 1.5
+        mm, 620 nm, 0.8"), and a wider seeing. Images made of rays alone, without diffraction, have none (the default).
+        Images are drawn as their engine has it.
+    n_pupil : int, optional
+        Cells across the pupil of a fit; by default as many as an image needs.
+    """
+
+    light: Light | None = None
+    air: DonutAir = field(default_factory=DonutAir)
+    detector: DonutDetector = field(default_factory=DonutDetector)
+    neighbours: bool = True
+    diffraction: bool = False
+    n_pupil: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.n_pupil is not None:
+            require_count(self.n_pupil, "n_pupil", _FEWEST_CELLS, _MOST_CELLS)
+
+    def with_light(self, wavelengths: ArrayLike | Light | None) -> DonutModel:
+        """Return the model with wavelengths [m] that it does not have itself; the same one without any."""
+        if wavelengths is None:
+            return self
+        if self.light is not None:
+            raise ConfigError("wavelength and the light of the model are both given: expected one of them")
+        return replace(self, light=wavelengths if isinstance(wavelengths, Light) else Light(wavelengths))
+
+    def with_pixel_size(self, pixel_size: ArrayLike | None) -> DonutModel:
+        """Return the model with pixels of another side [m]; the same one without."""
+        if pixel_size is None:
+            return self
+        return replace(self, detector=replace(self.detector, pixel_size=pixel_size))

@@ -1,0 +1,279 @@
+"""Fits of the wavefronts of donuts: Zernikes of each, or terms over the field that all of them share."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..core.arguments import check_arguments
+from ..core.errors import ConfigError, DomainError
+from ..models.telescope import Telescope
+from ..models.zernike_polynomials import annular_zernikes
+from ..wavefront.atmosphere.atmosphere import Atmosphere
+from .degrees import FreedomEstimate
+from .donut_rays import ZernikeRays
+from .fit_star import StarFit, StarSolution
+from .inputs import noll_indices, small_length
+from .light import Instrument
+from .likelihood import Stamp, model_image
+from .solve import Group, Solution, solve
+from .terms import WavefrontTerms
+
+#: Noll indices of the wavefront that are fitted by default: up to the fifth radial degree.
+NOLL = tuple(range(4, 23))
+
+
+@dataclass(frozen=True)
+class UsableStars:
+    """Stars of an exposure that a fit of each by itself found.
+
+    Attributes
+    ----------
+    instrument : Instrument
+        Telescope and model of the images.
+    stars : sequence of StarSolution
+        Best model of each by itself.
+    fields : ndarray, shape [n_star, 2]
+        Field angles [rad].
+    projection : str
+        Their meaning.
+    """
+
+    instrument: Instrument
+    stars: Sequence[StarSolution]
+    fields: np.ndarray
+    projection: str
+
+    @property
+    def unknowns(self) -> list[np.ndarray]:
+        """Unknowns of each star beside its wavefront."""
+        return [star.solution.stars[0] for star in self.stars]
+
+    def start(self, maps: Sequence[np.ndarray] | np.ndarray, precision: np.ndarray) -> np.ndarray:
+        """Return the shared unknowns that fit the stars' single wavefronts best.
+
+        Parameters
+        ----------
+        maps : sequence of n_star ndarray, each of shape [n_wave, n_shared]
+            Wavefronts by the shared unknowns.
+        precision : ndarray, shape [n_shared]
+            Inverse variances of their priors.
+        """
+        curvature, gradient = np.diag(precision), np.zeros(len(precision))
+        for star, wavefront_map in zip(self.stars, maps, strict=True):
+            if len(star.solution.shared):
+                # Shifts of rims of a star's own stand after the wavefront.
+                n = len(wavefront_map)
+                information = np.linalg.pinv(star.solution.shared_covariance[:n, :n], hermitian=True)
+                curvature = curvature + wavefront_map.T @ information @ wavefront_map
+                gradient = gradient + wavefront_map.T @ information @ star.solution.shared[:n]
+        return np.linalg.lstsq(curvature, gradient, rcond=1e-14)[0]
+
+
+@dataclass(frozen=True)
+class FittedStar:
+    """Result of one star: its pixels, best model [electrons], unknowns, wavefront [m], and their covariances."""
+
+    pixels: Stamp
+    model: np.ndarray
+    unknowns: np.ndarray
+    covariance: np.ndarray
+    zernikes: np.ndarray
+    zernike_covariance: np.ndarray
+
+
+@dataclass(frozen=True)
+class FittedStars:
+    """Results of all usable stars, and what they share: double Zernikes and their covariance, degrees of freedom."""
+
+    stars: Sequence[FittedStar]
+    double_zernikes: np.ndarray | None = None
+    double_zernike_covariance: np.ndarray | None = None
+    degrees_of_freedom: FreedomEstimate | None = None
+
+
+class WavefrontFit(ABC):
+    """Fit of the wavefronts of donuts: the unknowns of the wavefront, and how they are found.
+
+    Attributes
+    ----------
+    noll : sequence of int
+        Noll indices of the wavefronts that are returned.
+    joint : bool
+        Whether stars share unknowns.
+    """
+
+    noll: Iterable[int]
+    joint: ClassVar[bool] = True
+
+    def terms(self, telescope: Telescope, atmosphere: Atmosphere | None) -> WavefrontTerms:
+        """Return the terms of the wavefront of each star; turbulence is for single donuts."""
+        if atmosphere is not None:
+            raise ConfigError(
+                "atmosphere: expected fits of single donuts, no field terms or degrees of freedom with it"
+            )
+        return WavefrontTerms.of(noll_indices(self.noll, "noll", 4))
+
+    def prepared(self, instrument: Instrument, star: StarFit) -> StarFit:
+        """Return a star that was fitted by itself, made ready for :meth:`solved`."""
+        return star
+
+    @abstractmethod
+    def solved(self, usable: UsableStars, pool: Executor) -> FittedStars:
+        """Return the results of the usable stars."""
+
+
+@check_arguments
+@dataclass(frozen=True, eq=False)
+class SingleDonuts(WavefrontFit):
+    """Fit of each donut by itself, by Zernikes; for :func:`~pachon.fit_donuts`.
+
+    Attributes
+    ----------
+    noll : iterable of int
+        Noll indices of the wavefront, from 4.
+    left_out : float or Quantity
+        Rms of each term from Z4 to Z22 that `noll` leaves out [m]. These are fitted too, with that prior, those up to
+        Z28 with a tenth of it, and not returned: errors of `zernikes` have what is not known of them. 0 is none.
+    higher_order : float or Quantity
+        Rms of each further Zernike, of the next radial degree at every azimuthal order of `noll` [m]: 10 nm, say, for
+        what turbulence leaves in 15 s. They are fitted too, with that prior, and not returned. Without them (0, the
+        default) light that they move is taken for low orders, which is worst on an annulus.
+
+    Raises
+    ------
+    DomainError
+        If indices repeat or are below 4, or a number is outside its range.
+    """
+
+    joint: ClassVar[bool] = False
+
+    noll: Iterable[int] = NOLL
+    left_out: ArrayLike = 200e-9
+    higher_order: ArrayLike = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "noll", tuple(noll_indices(self.noll, "noll", 4)))
+        for name in ("left_out", "higher_order"):
+            small_length(getattr(self, name), name)
+
+    def terms(self, telescope: Telescope, atmosphere: Atmosphere | None) -> WavefrontTerms:
+        """Return the terms of the wavefront of each star, with those of the turbulence."""
+        spreads = small_length(self.left_out, "left_out"), small_length(self.higher_order, "higher_order")
+        return WavefrontTerms.of(np.array(self.noll), *spreads, telescope, atmosphere)
+
+    def solved(self, usable: UsableStars, pool: Executor) -> FittedStars:
+        """Return the results of the stars as each fit has them."""
+        terms = usable.instrument.terms
+        n = len(terms.requested)
+        return FittedStars(
+            [
+                FittedStar(
+                    star.full,
+                    star.model,
+                    star.solution.stars[0],
+                    star.solution.star_covariance(0),
+                    star.solution.shared[:n],
+                    star.solution.shared_covariance[:n, :n] + terms.air,
+                )
+                for star in usable.stars
+            ]
+        )
+
+
+@check_arguments
+@dataclass(frozen=True, eq=False)
+class FieldTerms(WavefrontFit):
+    """Fit of double Zernikes to all donuts together; for :func:`~pachon.fit_donuts`.
+
+    Attributes
+    ----------
+    field_noll : iterable of int
+        Noll indices of terms over the field, from 1; the field's radius is that of the telescope.
+    noll : iterable of int
+        Noll indices of the wavefront, from 4; terms that are left out are taken to be zero.
+    higher_order : float or Quantity
+        As in :class:`SingleDonuts`.
+
+    Raises
+    ------
+    DomainError
+        If indices repeat or are too low, or a number is outside its range.
+    """
+
+    field_noll: Iterable[int]
+    noll: Iterable[int] = NOLL
+    higher_order: ArrayLike = 0.0
+
+    def __post_init__(self) -> None:
+        for name, least in (("field_noll", 1), ("noll", 4)):
+            object.__setattr__(self, name, tuple(noll_indices(getattr(self, name), name, least)))
+        small_length(self.higher_order, "higher_order")
+
+    def terms(self, telescope: Telescope, atmosphere: Atmosphere | None) -> WavefrontTerms:
+        """Return the terms of the wavefront of each star; turbulence is for single donuts."""
+        requested = super().terms(telescope, atmosphere).requested
+        # Terms that `noll` leaves out would have a prior of their own at every field term.
+        return WavefrontTerms.of(requested, 0.0, small_length(self.higher_order, "higher_order"))
+
+    def solved(self, usable: UsableStars, pool: Executor) -> FittedStars:
+        """Return the results of a joint fit of field terms times those of the pupil."""
+        instrument, field_noll = usable.instrument, np.array(self.field_noll)
+        n_noll, n_field = len(instrument.noll), len(field_noll)
+        if len(usable.stars) < n_field:
+            raise DomainError(
+                f"field_noll: {n_field} terms for {len(usable.stars)} usable donuts; expected no more terms"
+            )
+        over_field = annular_zernikes(int(field_noll.max()), *(usable.fields.T / instrument.telescope.field_radius))
+        maps = np.stack([np.kron(row, np.eye(n_noll)) for row in over_field[field_noll - 1].T])
+        precision = np.tile(instrument.terms.precision, n_field)
+        stars = [_with_held_rims(star) for star in usable.stars]
+        group = Group(tuple(star.stamp for star in stars), maps, precision, instrument.known_seeing)
+        solution = solve(group, usable.unknowns, usable.start(maps, precision), pool=pool)
+        n = len(instrument.terms.requested)
+        requested = (n_noll * np.arange(n_field)[:, None] + np.arange(n)).ravel()
+        return FittedStars(
+            joint_results(stars, solution, np.array(solution.waves)[:, :n], maps[:, :n]),
+            solution.shared[requested].reshape(-1, n),
+            solution.shared_covariance[np.ix_(requested, requested)],
+        )
+
+
+def joint_results(
+    stars: Sequence[StarSolution], solution: Solution, zernikes: np.ndarray, zernike_maps: np.ndarray
+) -> list[FittedStar]:
+    """Return the results of stars that share unknowns.
+
+    Parameters
+    ----------
+    stars : sequence of StarSolution
+        The stars with their last stamps.
+    solution : Solution
+        Unknowns of all stars and the shared ones.
+    zernikes : ndarray, shape [n_star, n_noll]
+        Wavefront of each star [m].
+    zernike_maps : ndarray, shape [n_star, n_noll, n_shared]
+        Derivatives of the wavefronts with respect to the shared unknowns.
+    """
+    results = []
+    for i, star in enumerate(stars):
+        pixels = replace(star.full, rays=star.stamp.rays)
+        model = model_image(pixels, solution.stars[i], solution.waves[i])
+        pixels.release()
+        spread = zernike_maps[i] @ solution.shared_covariance @ zernike_maps[i].T
+        covariance = solution.star_covariance(i)
+        results.append(FittedStar(pixels, model, solution.stars[i], covariance, zernikes[i], spread))
+    return results
+
+
+def _with_held_rims(star: StarSolution) -> StarSolution:
+    """Return a star whose rims stand where its own fit has them."""
+    rays = star.stamp.rays
+    assert isinstance(rays, ZernikeRays)
+    return replace(star, stamp=replace(star.stamp, rays=rays.at_shifts(star.solution.waves[0])))
