@@ -87,9 +87,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line with arguments, by default those of the process, and return its exit status."""
     # It reports a cache that it cannot write, and then uses a temporary one.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
-    given = sys.argv[1:] if arguments is None else list(arguments)
+    command_line = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        status = _app_with(given[0] if given else "")(args=given, prog_name="pachon", standalone_mode=False)
+        status = _app_with(command_line[0] if command_line else "")(
+            args=command_line, prog_name="pachon", standalone_mode=False
+        )
         sys.stdout.flush()
         if status == _INTERRUPTED:
             return _fail("interrupted", _INTERRUPTED)
@@ -121,9 +123,9 @@ def _app_with(first: str) -> typer.Typer:
     groups = [g for group in _GROUPS for g in group.app.registered_groups if g.name == first]
     if not commands and not groups:
         return app
-    one = copy(app)
-    one.registered_commands, one.registered_groups = commands, groups
-    return one
+    command_app = copy(app)
+    command_app.registered_commands, command_app.registered_groups = commands, groups
+    return command_app
 
 
 def _usage_text(error: Any) -> str:
@@ -131,8 +133,8 @@ def _usage_text(error: Any) -> str:
     text = error.format_message()
     command = error.ctx.command if getattr(error, "ctx", None) else None
     example = re.search(r"\*\*Examples\*\*\s+- `([^`]+)`", getattr(command, "help", None) or "")
-    missing = any(c.__name__ == "MissingParameter" for c in type(error).__mro__)
-    return f"{text} For example: {example[1]}" if missing and example else text
+    lacks_argument = any(c.__name__ == "MissingParameter" for c in type(error).__mro__)
+    return f"{text} For example: {example[1]}" if lacks_argument and example else text
 
 
 def _fail(text: str, status: int = 2) -> int:
@@ -140,8 +142,8 @@ def _fail(text: str, status: int = 2) -> int:
     return status
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(show_version: bool) -> None:
+    if show_version:
         print_line(f"pachon {VERSION}")
         raise typer.Exit
 

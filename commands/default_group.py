@@ -24,9 +24,9 @@ class DefaultGroup(TyperGroup):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put the name of the command first: the one behind the options, or the default where there is none."""
         if args and args[0].startswith("-") and args[0] != "--help":
-            _, rest, _ = self._with_default("option").make_parser(ctx).parse_args(args=list(args))
-            if rest and rest[0] in self.commands:
-                args = [rest[0], *args[: len(args) - len(rest)], *rest[1:]]
+            _, positionals, _ = self._with_default("option").make_parser(ctx).parse_args(args=list(args))
+            if positionals and positionals[0] in self.commands:
+                args = [positionals[0], *args[: len(args) - len(positionals)], *positionals[1:]]
         first = args[0] if args else ""
         if first not in (*self.commands, "--help") and not self._is_mistyped(first):
             args = [self.default, *args]

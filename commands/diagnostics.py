@@ -103,12 +103,12 @@ def _compare(
 
     folder = stars.with_name(f"{stars.stem}_piff") if out is None else out
     with interruptible(quiet) as reporter, reporter.stage(f"PSF of {stars.name}"):
-        found = compare_with_piff(load_piff(piff), *load_stars(stars, **columns), **options)
-        found.write_folder(folder)
+        piff_comparison = compare_with_piff(load_piff(piff), *load_stars(stars, **columns), **options)
+        piff_comparison.write_folder(folder)
     if as_json:
-        print_json(found.as_dict())
+        print_json(piff_comparison.as_dict())
     elif not quiet:
-        Rows(PIFF_COLUMNS, piff_rows(found.models), PIFF_CAPTION).show()
+        Rows(PIFF_COLUMNS, piff_rows(piff_comparison.models), PIFF_CAPTION).show()
         print_line(f"comparison: {folder.resolve()}")
 
 
@@ -153,10 +153,10 @@ def attribute_command(
     resolved = configured_experiment(
         config, ccds=names, stars__truth=truth_stars, stars__observed=observed_stars, psf__engine=engine
     ).config
-    chosen = checked_causes(resolved, None if causes is None else name_list(causes, "--causes"))
+    cause_names = checked_causes(resolved, None if causes is None else name_list(causes, "--causes"))
     make_folder(out)
     with interruptible(quiet) as reporter:
-        result = attribute(resolved, chosen, threads=threads, reporter=reporter)
+        result = attribute(resolved, cause_names, threads=threads, reporter=reporter)
     write_attribution(result, out, resolved)
     if as_json:
         print_json(result.metrics)

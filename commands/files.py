@@ -78,15 +78,15 @@ def validate_command(
     """
     from ..studies.validation import validate_file
 
-    found = [validate_file(path) for path in files]
+    reports = [validate_file(path) for path in files]
     if as_json:
-        print_json([one.summary() for one in found])
-    for one in found if not as_json else []:
-        for problem in one.problems:
+        print_json([report.summary() for report in reports])
+    for report in reports if not as_json else []:
+        for problem in report.problems:
             print_line(str(problem))
-        if not one.problems:
-            print_line(f"{one.path}: {one.kind}, no problems")
-    if any(one.problems for one in found):
+        if not report.problems:
+            print_line(f"{report.path}: {report.kind}, no problems")
+    if any(report.problems for report in reports):
         raise typer.Exit(2)
 
 

@@ -13,12 +13,12 @@ def import_modules(names: Iterable[str]) -> None:
     Their 100 000 to 200 000 objects stay. Searching them again and again while they are made, and ever after, takes an
     eighth of the processor time of a short command.
     """
-    wanted = gc.isenabled()
+    gc_enabled = gc.isenabled()
     gc.disable()
     try:
         for name in names:
             import_module(name)
         gc.freeze()
     finally:
-        if wanted:
+        if gc_enabled:
             gc.enable()

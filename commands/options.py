@@ -80,17 +80,17 @@ def chosen_ccds(ccds: str | None, raft: str | None, all_ccds: bool) -> tuple[str
 
 def one_name_list(**options: str | None) -> tuple[str, ...] | None:
     """Return the names in the one option that is given; None where none is."""
-    given = [(f"--{name}", text) for name, text in options.items() if text is not None]
-    if len(given) > 1:
+    stated_options = [(f"--{name}", text) for name, text in options.items() if text is not None]
+    if len(stated_options) > 1:
         *first, last = (f"--{name}" for name in options)
         raise ConfigError(f"{', '.join(first)} and {last}: expected one of them")
-    return name_list(given[0][1], given[0][0]) if given else None
+    return name_list(stated_options[0][1], stated_options[0][0]) if stated_options else None
 
 
 def degrees_pair(text: str, option: str) -> tuple[float, float]:
     """Return the two angles [deg] in a text such as ``0,1.2``, or ``1.2``, a distance from the axis along +y."""
     try:
-        x, y = (float(part) for part in (text if "," in text else f"0,{text}").split(","))
+        x, y = (float(angle) for angle in (text if "," in text else f"0,{text}").split(","))
     except ValueError:
         raise ConfigError(
             f"{option} = {text!r}: expected two numbers in degrees, such as 0,1.2, or one along +y, such as 1.2"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Option
@@ -15,6 +15,9 @@ from .interrupt import interruptible
 from .options import AllCcds, Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, chosen_ccds
 from .tables import Rows, plain_table, print_json, wide_console
 from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
+
+if TYPE_CHECKING:
+    from ..pipeline.run import RunResult
 
 app = typer.Typer()
 
@@ -85,8 +88,8 @@ def run_command(
         for warning in result.summary.get("warnings", ()):
             print_line(f"pachon: {warning}", error=True)
     if as_json:
-        missing = {"missing": list(result.missing), "not_modelled": result.not_modelled}
-        print_json(result.summary if result.report else missing)
+        part_summary = {"missing": list(result.missing), "not_modelled": result.not_modelled}
+        print_json(result.summary if result.report else part_summary)
     elif not quiet:
         if result.report:
             _show_run(result, sum(reporter.seconds.values()))
@@ -103,14 +106,16 @@ def _part(text: str | None) -> tuple[int, int]:
     return number, parts
 
 
-def _show_part(result: Any) -> None:
+def _show_part(result: RunResult) -> None:
     count = len(result.missing)
-    some = f"{', '.join(result.missing[:3])}{', ...' if count > 3 else ''}"
-    print_line(f"{len(result.computed)} CCDs computed, {len(result.kept)} were there; {count} are missing: {some}")
+    example_names = f"{', '.join(result.missing[:3])}{', ...' if count > 3 else ''}"
+    print_line(
+        f"{len(result.computed)} CCDs computed, {len(result.kept)} were there; {count} are missing: {example_names}"
+    )
     print_line("the last part to end writes the report")
 
 
-def _show_run(result: Any, seconds: float) -> None:
+def _show_run(result: RunResult, seconds: float) -> None:
     from ..pipeline.report.tables import (
         MODELS_CAPTION,
         MODELS_COLUMNS,

@@ -61,20 +61,22 @@ def stack_images_command(
     from ..studies.visits.image_stack.measure import measure_stack
     from ..studies.visits.image_stack.stack_images import stack_images
 
-    wanted = {"tiles": tiles, "faintest": faintest, "side": side, "noise": noise}
-    settings = ImageStackConfig(**{key: value for key, value in wanted.items() if value is not None})
+    overrides = {"tiles": tiles, "faintest": faintest, "side": side, "noise": noise}
+    settings = ImageStackConfig(**{key: value for key, value in overrides.items() if value is not None})
     with (
         interruptible(quiet, f"finished visits are in {folder}, and --resume goes on from there") as reporter,
         chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
     ):
         stack = stack_images(folder, settings, resume=resume, workers=maker, threads=threads, reporter=reporter)
         try:
-            found = measure_stack(folder, workers=maker, threads=threads, reporter=reporter) if measure else {}
+            metrics_by_visits = (
+                measure_stack(folder, workers=maker, threads=threads, reporter=reporter) if measure else {}
+            )
         except PachonError as error:
             raise error.followed_by(
                 f"the stacked images are kept in {stack.folder}, not all of them measured (--no-measure)"
             ) from None
-    metrics = {str(visits): figures for visits, figures in found.items()}
+    metrics = {str(visits): figures for visits, figures in metrics_by_visits.items()}
     if as_json:
         print_json({"folder": str(stack.folder.resolve()), "stacks": metrics})
     elif not quiet:
@@ -85,14 +87,15 @@ def stack_images_command(
 
 def _show(metrics: dict[str, dict[str, Any]]) -> None:
     rows = []
-    for visits, found in metrics.items():
+    for visits, stack_metrics in metrics.items():
         densities = [
-            f"{found[key]:.1f}" for key in ("detected_per_arcmin2", "usable_per_arcmin2", "usable_per_arcmin2_stamps")
+            f"{stack_metrics[key]:.1f}"
+            for key in ("detected_per_arcmin2", "usable_per_arcmin2", "usable_per_arcmin2_stamps")
         ]
-        if found["pairs"]:
-            error = found["mean_difference_error"]
-            shifts = [f"{found[f'mean_difference_{e}']:.4f} ± {error:.4f}" for e in ("e1", "e2")]
-            response = f"{found['response_difference']:.3f} ± {found['response_difference_error']:.3f}"
+        if stack_metrics["pairs"]:
+            error = stack_metrics["mean_difference_error"]
+            shifts = [f"{stack_metrics[f'mean_difference_{e}']:.4f} ± {error:.4f}" for e in ("e1", "e2")]
+            response = f"{stack_metrics['response_difference']:.3f} ± {stack_metrics['response_difference_error']:.3f}"
         else:
             shifts, response = ["", ""], ""
         rows.append((visits, *densities, *shifts, response))

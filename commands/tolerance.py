@@ -96,10 +96,17 @@ def _show(summary: dict[str, Any]) -> None:
     unit = f" [{summary['unit']}]" if summary["unit"] else ""
     plain = f" {summary['unit']}" if summary["unit"] else ""
     rows = []
-    for one in summary["worst_offenders"][:_SHOWN]:
-        size_unit = "" if one["unit"] == "1" else f" {one['unit']}"
-        ends = number_texts([one["lower_end"], one["upper_end"]], ".5g")
-        rows.append((one["name"], f"{one['size']:.4g}{size_unit}", *ends, f"{one['size_for_the_loss']:.4g}{size_unit}"))
+    for offender in summary["worst_offenders"][:_SHOWN]:
+        size_unit = "" if offender["unit"] == "1" else f" {offender['unit']}"
+        ends = number_texts([offender["lower_end"], offender["upper_end"]], ".5g")
+        rows.append(
+            (
+                offender["name"],
+                f"{offender['size']:.4g}{size_unit}",
+                *ends,
+                f"{offender['size_for_the_loss']:.4g}{size_unit}",
+            )
+        )
     headings = ("tolerance", "size", f"lower end{unit}", f"upper end{unit}", f"{summary['loss_percent']:g} % loss at")
     caption = f"The costliest of {summary['tolerances']}; as designed {summary['nominal']:.5g}{plain}."
     Rows(headings, rows, caption).show()
@@ -107,8 +114,9 @@ def _show(summary: dict[str, Any]) -> None:
     lost = f"; {summary['lost']} without light" if summary["lost"] else ""
     print_line(f"{summary['draws']} telescopes, {summary['method']}: reached by {reached}{plain}{lost}")
     if "yield" in summary:
-        found = summary["yield"]
-        interval = f"{100 * found['low']:.1f} to {100 * found['high']:.1f} %"
+        yield_summary = summary["yield"]
+        interval = f"{100 * yield_summary['low']:.1f} to {100 * yield_summary['high']:.1f} %"
         print_line(
-            f"requirement {summary['requirement']:g}{plain}: met by {100 * found['fraction']:.1f} % ({interval})"
+            f"requirement {summary['requirement']:g}{plain}: met by {100 * yield_summary['fraction']:.1f} %"
+            f" ({interval})"
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from typer import Argument, Option
@@ -112,22 +112,22 @@ def angles_of(option: str, text: str | None) -> str | tuple[float, ...] | None:
     if text is None or text == "random":
         return text
     try:
-        return tuple(float(part) for part in text.split(","))
+        return tuple(float(angle) for angle in text.split(","))
     except ValueError:
         raise ConfigError(f"{option} = {text}: expected random, or angles in degrees with commas between") from None
 
 
-def _show(stacks: dict[str, dict[str, Any]]) -> None:
+def _show(stacks: dict[str, dict[str, float]]) -> None:
     headings = ("visits", "points", "e of the PSF", "residual, stars", "residual, places", "xi+ of the PSF", "residual")
     keys = ("rms_e", "rms_residual_e_stars", "rms_residual_e_places")
     rows = [
         (
             visits,
-            str(found["points"]),
-            *(f"{found[key]:.1e}" for key in keys),
-            *(f"{found[f'xi_plus_{k}_long']:.1e}" for k in ("psf", "residual_places")),
+            str(stack_metrics["points"]),
+            *(f"{stack_metrics[key]:.1e}" for key in keys),
+            *(f"{stack_metrics[f'xi_plus_{k}_long']:.1e}" for k in ("psf", "residual_places")),
         )
-        for visits, found in stacks.items()
+        for visits, stack_metrics in stacks.items()
     ]
     Rows(headings, rows, _CAPTION).show()
 
@@ -170,13 +170,13 @@ def null_test_command(
         results = null_test(
             folder, tiles=tiles, rings=rings, resume=resume, workers=maker, threads=threads, reporter=reporter
         )
-    found = {str(visits): null_metrics(result) for visits, result in results.items()}
+    metrics_by_visits = {str(visits): null_metrics(result) for visits, result in results.items()}
     if as_json:
-        print_json({"stacks": found})
+        print_json({"stacks": metrics_by_visits})
     elif not quiet:
         keys = ("mean_abs_xi_plus", "shot_noise_xi_plus", "xi_plus_difference_long")
         rows = []
-        for visits, metrics in found.items():
+        for visits, metrics in metrics_by_visits.items():
             biases = [
                 f"{metrics[name]:.4f} ± {metrics[f'{name}_error']:.4f}"
                 for name in ("m1_model", "c1_model", "m1_true", "c1_true")

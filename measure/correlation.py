@@ -250,10 +250,10 @@ def shear_correlation(
     if exact is None:
         exact = n_stars <= EXACT_LIMIT
     if labels is not None:
-        found, number = np.unique(labels[usable], return_inverse=True)
-        if len(found) < 2:
-            raise DomainError(f"patch: all usable stars are of patch {found[0]}, expected at least 2 patches")
-        of_stars |= {"patch": number, "npatch": len(found)}
+        patch_labels, number = np.unique(labels[usable], return_inverse=True)
+        if len(patch_labels) < 2:
+            raise DomainError(f"patch: all usable stars are of patch {patch_labels[0]}, expected at least 2 patches")
+        of_stars |= {"patch": number, "npatch": len(patch_labels)}
     import treecorr  # a tenth of a second
 
     catalogs = [treecorr.Catalog(x=px, y=py, g1=g[i], g2=g[i + 1], **of_stars) for i in range(0, len(g), 2)]
@@ -261,11 +261,11 @@ def shear_correlation(
     pairs.process(*catalogs, num_threads=1)
     empty = pairs.npairs == 0
     if labels is None:
-        left, leave_one_out_pairs = np.empty((2, 0, n_bins)), np.empty((0, n_bins))
+        leave_one_out_xi, leave_one_out_pairs = np.empty((2, 0, n_bins)), np.empty((0, n_bins))
         errors = np.sqrt(np.stack([pairs.varxip, pairs.varxim]))
     else:
-        left, leave_one_out_pairs = _leave_one_out_correlations(pairs, len(found))
-        errors = np.stack([jackknife_error(values) for values in left])
+        leave_one_out_xi, leave_one_out_pairs = _leave_one_out_correlations(pairs, len(patch_labels))
+        errors = np.stack([jackknife_error(values) for values in leave_one_out_xi])
     return Correlation(
         r=np.where(empty, pairs.rnom, pairs.meanr),
         xi_plus=np.where(empty, np.nan, pairs.xip),
@@ -275,13 +275,13 @@ def shear_correlation(
         # Two catalogues of the same stars are paired in both orders.
         n_pairs=np.rint(pairs.npairs / len(catalogs)).astype(np.int64),
         n_stars=n_stars,
-        n_patches=left.shape[1],
-        leave_one_out_plus=left[0],
+        n_patches=leave_one_out_xi.shape[1],
+        leave_one_out_plus=leave_one_out_xi[0],
         leave_one_out_pairs=np.rint(leave_one_out_pairs / len(catalogs)).astype(np.int64),
     )
 
 
-def _bins(min_sep: Any, max_sep: Any, n_bins: Any) -> tuple[float, float, int]:
+def _bins(min_sep: float | Quantity, max_sep: float | Quantity, n_bins: int) -> tuple[float, float, int]:
     """Return both ends [rad] and number of the bins, or raise DomainError where one is out of its range."""
     count = require_count(n_bins, "n_bins", 1, MOST_BINS)
     low, high = angle(min_sep, "min_sep"), angle(max_sep, "max_sep")
@@ -296,10 +296,10 @@ def _bins(min_sep: Any, max_sep: Any, n_bins: Any) -> tuple[float, float, int]:
     return low, high, count
 
 
-def jackknife_error(left: np.ndarray) -> np.ndarray:
+def jackknife_error(leave_one_out: np.ndarray) -> np.ndarray:
     """Return standard errors from values without each patch, [n_patches, ...]; NaN where one of the values is."""
-    scatter = ((left - left.mean(axis=0)) ** 2).sum(axis=0)
-    return np.asarray(np.sqrt((1.0 - 1.0 / len(left)) * scatter))
+    scatter = ((leave_one_out - leave_one_out.mean(axis=0)) ** 2).sum(axis=0)
+    return np.asarray(np.sqrt((1.0 - 1.0 / len(leave_one_out)) * scatter))
 
 
 def _leave_one_out_correlations(pairs: treecorr.GGCorrelation, n_patches: int) -> tuple[np.ndarray, np.ndarray]:
@@ -309,8 +309,8 @@ def _leave_one_out_correlations(pairs: treecorr.GGCorrelation, n_patches: int) -
     power of their number, 20 s for 189; here the pairs of each patch are subtracted from the sum of all.
     """
     sums = np.zeros((1 + n_patches, 4, len(pairs.npairs)))
-    for (i, j), part in pairs.results.items():
-        values = np.stack([part.npairs, part.weight, part.xip, part.xim])
+    for (i, j), patch_pair in pairs.results.items():
+        values = np.stack([patch_pair.npairs, patch_pair.weight, patch_pair.xip, patch_pair.xim])
         for row in {0, 1 + i, 1 + j}:
             sums[row] += values
     n_pairs, weight, plus, minus = np.moveaxis(sums[0] - sums[1:], 1, 0)

@@ -24,12 +24,12 @@ _RHO_STYLES = {
 
 def correlation_columns(correlated: Mapping[str, Correlation]) -> dict[str, tuple[np.ndarray, str, str]]:
     """Return correlations as the columns of one table, one after the other, by the name of each."""
-    each = [c.as_dict() for c in correlated.values()]
+    tables = [c.as_dict() for c in correlated.values()]
 
     def together(key: str) -> np.ndarray:
-        return np.concatenate([c[key] for c in each])
+        return np.concatenate([c[key] for c in tables])
 
-    kinds = np.repeat(list(correlated), [len(c["r_arcmin"]) for c in each])
+    kinds = np.repeat(list(correlated), [len(c["r_arcmin"]) for c in tables])
     by = "jackknife over the CCDs" if next(iter(correlated.values())).n_patches else "scatter of the ellipticities"
     return {
         "kind": (kinds, "", "what is correlated"),
@@ -53,10 +53,10 @@ def draw_rho(ax: Axes | Figure | None, rho: Mapping[str, RhoStatistics]) -> Figu
         figure = figure_at(ax, 11.0, 4.1 * len(rho) + 0.5)
         panels = figure.subplots(len(rho), 2, sharex=True, sharey="col", squeeze=False)
         for row, (kind, statistics) in zip(panels, rho.items(), strict=True):
-            found = dict(statistics.items())
+            correlations = dict(statistics.items())
             for axes, names in zip(row, (("rho1", "rho3", "rho4"), ("rho2", "rho5")), strict=True):
                 for name in names:
-                    draw_correlation(axes, found[name], "plus", *_RHO_STYLES[name])
+                    draw_correlation(axes, correlations[name], "plus", *_RHO_STYLES[name])
                 log_axes(axes, RESIDUAL_TITLES.get(kind, kind))
                 axes.legend(loc="best")
             row[0].set_ylabel("$|\\rho|$: filled positive, open negative")
@@ -80,15 +80,17 @@ def draw_correlation(axes: Axes, correlation: Correlation, sign: str, color: str
     r = correlation.r_arcmin
     xi, error = getattr(correlation, f"xi_{sign}"), getattr(correlation, f"error_{sign}")
     size = np.abs(xi)
-    some = np.isfinite(xi) & (size > 0.0)
+    nonzero = np.isfinite(xi) & (size > 0.0)
     # On a logarithmic scale an error bar cannot go through zero: it ends at a tenth of the value instead.
     below = np.minimum(error, 0.9 * size)
-    axes.errorbar(r[some], size[some], [below[some], error[some]], fmt="none", ecolor=color, elinewidth=0.7, alpha=0.6)
-    axes.plot(r[some], size[some], "-", color=color, linewidth=0.6, alpha=0.5)
-    for chosen, face in ((some & (xi > 0.0), color), (some & (xi < 0.0), "white")):
+    axes.errorbar(
+        r[nonzero], size[nonzero], [below[nonzero], error[nonzero]], fmt="none", ecolor=color, elinewidth=0.7, alpha=0.6
+    )
+    axes.plot(r[nonzero], size[nonzero], "-", color=color, linewidth=0.6, alpha=0.5)
+    for sign_mask, face in ((nonzero & (xi > 0.0), color), (nonzero & (xi < 0.0), "white")):
         axes.plot(
-            r[chosen],
-            size[chosen],
+            r[sign_mask],
+            size[sign_mask],
             marker,
             color=color,
             markersize=4.5,

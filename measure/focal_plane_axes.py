@@ -17,14 +17,24 @@ from matplotlib.transforms import ScaledTranslation, blended_transform_factory
 from ..core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, figure_of
 from ..models.camera.camera import Camera
 
-#: Colour of each quantity in every plot; blue and red for observed and residual as in Jee & Tyson 2011.
-TRUTH, OBSERVED, RESIDUAL, AWAY, LEFT_OUT = GREY, BLUE, RED, ORANGE, PURPLE
+#: Colour of noise-free PSFs in every plot.
+TRUTH = GREY
+#: Colour of observed stars, as in Jee & Tyson 2011.
+OBSERVED = BLUE
+#: Colour of residuals at the stars, as in Jee & Tyson 2011.
+RESIDUAL = RED
+#: Colour of residuals at holdout positions.
+AWAY = ORANGE
+#: Colour of residuals at stars that are left out of the fit.
+LEFT_OUT = PURPLE
 #: Residuals of the CCDs' own models, beside those of a focal-plane model.
 CCD_MODEL = GREY
 #: Most whiskers of a panel.
 _MOST_WHISKERS = 2500
-#: Limits from here on, as fractions of the radius of the field of view, are near its edge; and where they are moved to.
-_NEAR, _MARGIN = 0.65, 1.02
+#: Fraction of the radius of the field of view from which limits of axes are near its edge, and moved beyond it.
+_NEAR = 0.65
+#: Where limits near the edge are moved to, as a fraction of that radius: the circle is then within the axes.
+_MARGIN = 1.02
 RESIDUAL_TITLES = {
     "residual": "at the stars: observed - model",
     "left_out": "at stars left out: observed - model",
@@ -106,7 +116,7 @@ def key_ellipticity(values: np.ndarray) -> float:
 
 
 def draw_whisker_panels(
-    every: Iterable[Axes],
+    panel_axes: Iterable[Axes],
     x: np.ndarray,
     y: np.ndarray,
     panels: Mapping[str, tuple[np.ndarray, np.ndarray]],
@@ -117,9 +127,9 @@ def draw_whisker_panels(
     middle = 0.5 * (np.max(x) + np.min(x)), 0.5 * (np.max(y) + np.min(y))
     half = 0.55 * max(float(np.ptp(x)), float(np.ptp(y))) or 1.0
     scale = 0.12 * half / key
-    some = np.s_[:: max(1, len(x) // _MOST_WHISKERS)]
-    for column, (axes, (title, (e1, e2))) in enumerate(zip(every, panels.items(), strict=True)):
-        draw_whiskers(axes, whiskers(x[some], y[some], e1[some], e2[some], scale), "black", 0.6)
+    drawn_rows = np.s_[:: max(1, len(x) // _MOST_WHISKERS)]
+    for column, (axes, (title, (e1, e2))) in enumerate(zip(panel_axes, panels.items(), strict=True)):
+        draw_whiskers(axes, whiskers(x[drawn_rows], y[drawn_rows], e1[drawn_rows], e2[drawn_rows], scale), "black", 0.6)
         axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
         axes.set(xlabel=labels[0], ylabel="" if column else labels[1])
         finite = np.isfinite(e1) & np.isfinite(e2)

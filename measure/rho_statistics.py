@@ -70,8 +70,8 @@ class RhoStatistics(Result):
         return {"r_arcmin": self.r_arcmin, **pairs}
 
     def _described(self, name: str) -> Description:
-        known = super()._described(name)
-        return known if name == "r_arcmin" else Description("", f"xi+ of {name}, and its standard error")
+        base_description = super()._described(name)
+        return base_description if name == "r_arcmin" else Description("", f"xi+ of {name}, and its standard error")
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw the five statistics with their errors against separation."""
@@ -157,7 +157,7 @@ def rho_statistics(
     return RhoStatistics(correlate(de), correlate(e, de), correlate(w), correlate(de, w), correlate(e, w))
 
 
-def trace_of_moments(size: Any, e1: Any, e2: Any) -> np.ndarray:
+def trace_of_moments(size: ArrayLike, e1: ArrayLike, e2: ArrayLike) -> np.ndarray:
     """Return T = Q11 + Q22 = a^2 + b^2 of (Q11 Q22 - Q12^2)^(1/4) = sqrt(a b) and e = (a - b)/(a + b), |e| < 1.
 
     T = 2 size^2 (1 + |e|^2)/(1 - |e|^2), in the square of the unit of `size`.

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from enum import IntFlag
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -161,12 +161,12 @@ def measure_shapes(
         for i in range(0, count, batch)
     ]
     if not parts:
-        none = np.empty(0)
-        return Shapes(none, none, none, none, none, none, np.empty(0, dtype=np.int32))
+        no_values = np.empty(0)
+        return Shapes(*[no_values] * 6, np.empty(0, dtype=np.int32))
     return Shapes(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Shapes)})
 
 
-def fwhm(images: Any, pixel_scale: Any, *, upsampling: int = 8) -> np.ndarray:
+def fwhm(images: ArrayLike, pixel_scale: ArrayLike, *, upsampling: int = 8) -> np.ndarray:
     """Measure the full width at half maximum of star images [rad], [n], pixel included; NaN without a positive maximum.
 
     Defined as the diameter of the circle with the area over which the image exceeds half its maximum. Image and maximum
@@ -346,7 +346,7 @@ def _area_above(fine: np.ndarray, level: float) -> float:
     return float(covered.sum())
 
 
-def _stamp_cube(images: Any) -> np.ndarray:
+def _stamp_cube(images: ArrayLike) -> np.ndarray:
     """Return the images as an array [n, ny, nx]."""
     numbers = real_numbers(images)
     array = np.empty(0) if numbers is None or hasattr(numbers, "unit") else np.asarray(numbers)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import fft, ndimage
 
 from ..core.errors import DomainError
@@ -12,8 +11,8 @@ from ..core.units import real_array
 
 
 def observe_stamps(
-    psf_images: Any,
-    electrons: Any,
+    psf_images: ArrayLike,
+    electrons: ArrayLike,
     sky: float,
     read_noise: float,
     rng: np.random.Generator,
@@ -68,7 +67,9 @@ def observe_stamps(
 _OVERLAP = 0.1
 
 
-def center_stamps(images: Any, x: Any, y: Any, size: int = 31, *, normalize: bool = True) -> np.ndarray:
+def center_stamps(
+    images: ArrayLike, x: ArrayLike, y: ArrayLike, size: int = 31, *, normalize: bool = True
+) -> np.ndarray:
     """Shift stars so that their centroid falls on the centre of a pixel, and cut stamps around it.
 
     The shift multiplies the Fourier transform by a phase: exact for a band-limited image, and it leaves white noise
@@ -166,7 +167,7 @@ def fourier_shift(image: np.ndarray, dx: float, dy: float) -> np.ndarray:
     return fft.irfft2(fft.rfft2(image) * phase_y[:, None] * phase_x, s=(ny, nx))
 
 
-def _stamp_cube(images: Any, name: str) -> np.ndarray:
+def _stamp_cube(images: ArrayLike, name: str) -> np.ndarray:
     """Return the images as a float64 array [n, ny, nx]."""
     array = real_array(images, f"{name}: expected real numbers [n, ny, nx]")
     if array.ndim == 2:

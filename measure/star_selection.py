@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,11 +17,13 @@ from ..core.units import pure_numbers, real_array
 _PSF_CHANGE = 0.05
 # A pixel is sharper than a star can be if it holds so many times more of the light around it than a star's peak does.
 _SHARPER = 1.5
-# Pixels between these fractions of the median star's peak give a star's scale whether or not its core is saturated,
+# Pixels between these fractions of the median star's peak give a star's scale whether or not its core is saturated.
 _WINGS = (0.05, 0.35)
-# those above this one are its core, and a saturated core lacks at least this fraction of its light: a width that
-# differs by 2.5 % takes 0.08 from it.
-_CORE, _LOSS = 0.6, 0.2
+# Fraction of the median star's peak above which pixels are the core of a star.
+_CORE = 0.6
+# Least fraction of its light that a saturated core lacks: a width that differs by 2.5 % takes 0.08 from it.
+_LOSS = 0.2
+# Fewest usable stars, for a median to compare with.
 _FEWEST = 3
 
 
@@ -68,10 +69,10 @@ class Selection:
 
 def require_stars(good: np.ndarray, flags: np.ndarray, least: int) -> None:
     """Raise DomainError, with the number of stars of each defect, if fewer are good."""
-    left = int(good.sum())
-    if left < least:
-        counts = f" ({found})" if (found := _defect_counts(flags)) else ""
-        raise DomainError(f"{left} of {len(good)} stars left{counts}: expected at least {least}")
+    good_count = int(good.sum())
+    if good_count < least:
+        counts = f" ({defect_text})" if (defect_text := _defect_counts(flags)) else ""
+        raise DomainError(f"{good_count} of {len(good)} stars left{counts}: expected at least {least}")
 
 
 def _defect_counts(flags: np.ndarray) -> str:
@@ -186,16 +187,18 @@ def _scale_error(variance: np.ndarray, star: np.ndarray, wings: np.ndarray) -> f
 
 def _sharp_pixels(residual: np.ndarray, variance: np.ndarray, fraction: float, threshold: float) -> np.ndarray:
     """Return the pixels of cosmic rays: sharp ones, and bright ones beside them."""
-    ones = np.ones((3, 3))
-    around = ndimage.convolve(residual, ones, mode="nearest")  # extended beyond the edge, which is no sharp pixel
-    around_variance = ndimage.convolve(variance, ones, mode="nearest")
+    neighbourhood = np.ones((3, 3))
+    around = ndimage.convolve(
+        residual, neighbourhood, mode="nearest"
+    )  # extended beyond the edge, which is no sharp pixel
+    around_variance = ndimage.convolve(variance, neighbourhood, mode="nearest")
     excess = residual - fraction * around
     error = np.sqrt((1.0 - 2.0 * fraction) * variance + fraction**2 * around_variance)
     sharp = excess > threshold * error
     if not sharp.any():
         return sharp
     bright = residual > 0.5 * threshold * np.sqrt(variance)
-    return sharp | ndimage.binary_dilation(sharp, ones, iterations=-1, mask=bright | sharp)
+    return sharp | ndimage.binary_dilation(sharp, neighbourhood, iterations=-1, mask=bright | sharp)
 
 
 def _matched_filter(residual: np.ndarray, variance: np.ndarray, star: np.ndarray) -> float:
@@ -213,7 +216,7 @@ def _correlate(image: np.ndarray, star: np.ndarray, peak: tuple[np.intp, ...]) -
     return np.asarray(product[rows, columns])
 
 
-def _stamp_cube(stamps: Any) -> np.ndarray:
+def _stamp_cube(stamps: ArrayLike) -> np.ndarray:
     """Return the stamps as float64 [n, ny, nx]."""
     images = real_array(stamps, "stamps: expected real numbers [n, ny, nx]")
     if images.ndim != 3 or min(images.shape[1:]) < 5:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 
-def cut_out(image: np.ndarray, x: np.ndarray, y: np.ndarray, size: int, outside: Any) -> np.ndarray:
+def cut_out(image: np.ndarray, x: np.ndarray, y: np.ndarray, size: int, outside: float) -> np.ndarray:
     """Return the `size` x `size` pixels around each position, [n, size, size], filled with `outside` beyond the image.
 
     The middle of a cutout, ``(size - 1)/2``, is within half a pixel of the position along x and y.
@@ -15,8 +13,8 @@ def cut_out(image: np.ndarray, x: np.ndarray, y: np.ndarray, size: int, outside:
     rows, columns = (start[:, None] + np.arange(size) for start in (first_pixel(y, size), first_pixel(x, size)))
     ny, nx = image.shape
     within = ((rows >= 0) & (rows < ny))[:, :, None] & ((columns >= 0) & (columns < nx))[:, None, :]
-    found = image[np.clip(rows, 0, ny - 1)[:, :, None], np.clip(columns, 0, nx - 1)[:, None, :]]
-    return np.where(within, found, outside)
+    extended = image[np.clip(rows, 0, ny - 1)[:, :, None], np.clip(columns, 0, nx - 1)[:, None, :]]
+    return np.where(within, extended, outside)
 
 
 def first_pixel(at: np.ndarray, size: int) -> np.ndarray:

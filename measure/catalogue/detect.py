@@ -19,15 +19,22 @@ from .cutouts import cut_out
 from .objects import DetectedObjects, ObjectFlag
 from .pixel_checks import check_pixels
 
-# Kron photometry as in SExtractor: radius over which the Kron radius is averaged, its factor, the least radius, in
-# units of the rms axes.
-_KRON_LIMIT, _KRON_FACTOR, _KRON_LEAST = 6.0, 2.5, 3.5
+# Radius over which the Kron radius is averaged, as in SExtractor [rms axes].
+_KRON_LIMIT = 6.0
+# Radius of the aperture over the Kron radius, as in SExtractor.
+_KRON_FACTOR = 2.5
+# Least radius of the aperture, as in SExtractor [rms axes].
+_KRON_LEAST = 3.5
 # The window of centroids has the half-light radius of the object as its HWHM.
 _WINDOW = 2.0 / 2.35
-# Stamps on which widths at half maximum are measured, batches of them.
-_FWHM_SIDE, _FWHM_BATCH = 25, 2048
-# Room of SEP for pixels above the threshold, as a fraction of the image, and for pieces of one blend.
-_PIXEL_ROOM, _PIECES = 0.2, 8192
+# Side of the stamps on which widths at half maximum are measured [pixel].
+_FWHM_SIDE = 25
+# Stamps that are measured at a time, which bounds their memory.
+_FWHM_BATCH = 2048
+# Room of SEP for pixels above the threshold, as a fraction of the image: its own does not grow with one.
+_PIXEL_ROOM = 0.2
+# Room of SEP for pieces of one blend.
+_PIECES = 8192
 
 
 @check_arguments
@@ -100,14 +107,14 @@ def detect_objects(
             if background_size is not None:
                 level = sep.Background(data, mask=ignored, bw=background_size, bh=background_size).back()
                 data = np.where(ignored, 0.0, data - level)
-            found, segmentation = sep.extract(data, var=variances, mask=ignored, segmentation_map=True, **options)
+            sep_objects, segmentation = sep.extract(data, var=variances, mask=ignored, segmentation_map=True, **options)
         except Exception as error:  # SEP raises Exception itself
             raise DomainError(f"SEP: {' '.join(str(error).split())}") from None
-    if not len(found):
+    if not len(sep_objects):
         raise DomainError(
             f"no objects: expected {min_area} connected pixels above {threshold:g} standard deviations of the noise"
         )
-    return _measure_objects(data, variances, ignored, (bits & saturated) != 0, found, segmentation, level)
+    return _measure_objects(data, variances, ignored, (bits & saturated) != 0, sep_objects, segmentation, level)
 
 
 def _sep_options(
@@ -145,33 +152,37 @@ def _measure_objects(
     variance: np.ndarray,
     ignored: np.ndarray,
     saturated: np.ndarray,
-    found: np.ndarray,
+    sep_objects: np.ndarray,
     segmentation: np.ndarray,
     background: np.ndarray,
 ) -> DetectedObjects:
     """Measure the objects that SEP found, without the pixels of their neighbours."""
-    count = len(found)
-    others = {"mask": ignored, "segmap": segmentation, "seg_id": np.arange(1, count + 1, dtype=np.int32)}
-    a, b = np.maximum(found["a"], 1e-3), np.maximum(found["b"], 1e-3)
+    count = len(sep_objects)
+    neighbour_mask = {"mask": ignored, "segmap": segmentation, "seg_id": np.arange(1, count + 1, dtype=np.int32)}
+    a, b = np.maximum(sep_objects["a"], 1e-3), np.maximum(sep_objects["b"], 1e-3)
     # SEP refuses an angle that rounding puts beyond a right one.
-    theta = np.clip(found["theta"], -0.5 * np.pi, 0.5 * np.pi)
-    ellipse = found["x"], found["y"], a, b, theta
-    kron, _ = sep.kron_radius(data, *ellipse, _KRON_LIMIT, **others)
+    theta = np.clip(sep_objects["theta"], -0.5 * np.pi, 0.5 * np.pi)
+    ellipse = sep_objects["x"], sep_objects["y"], a, b, theta
+    kron, _ = sep.kron_radius(data, *ellipse, _KRON_LIMIT, **neighbour_mask)
     aperture = np.fmax(_KRON_FACTOR * kron, _KRON_LEAST)
-    flux, flux_error, aperture_flags = sep.sum_ellipse(data, *ellipse, aperture, var=variance, subpix=1, **others)
-    radius, _ = sep.flux_radius(data, found["x"], found["y"], _KRON_LIMIT * a, 0.5, normflux=flux, **others)
+    flux, flux_error, aperture_flags = sep.sum_ellipse(
+        data, *ellipse, aperture, var=variance, subpix=1, **neighbour_mask
+    )
+    radius, _ = sep.flux_radius(
+        data, sep_objects["x"], sep_objects["y"], _KRON_LIMIT * a, 0.5, normflux=flux, **neighbour_mask
+    )
     radius = np.where((flux > 0.0) & (radius > 0.0), radius, np.nan)
     window = np.where(np.isfinite(radius), radius, a) * _WINDOW
-    wx, wy, failed = sep.winpos(data, found["x"], found["y"], window, mask=ignored)
-    moved = np.hypot(wx - found["x"], wy - found["y"])
+    wx, wy, failed = sep.winpos(data, sep_objects["x"], sep_objects["y"], window, mask=ignored)
+    moved = np.hypot(wx - sep_objects["x"], wy - sep_objects["y"])
     # SEP's windows take in the light of neighbours, and may leave the image.
-    windowed = (failed == 0) & (moved < window) & ((found["flag"] & sep.OBJ_MERGED) == 0)
+    windowed = (failed == 0) & (moved < window) & ((sep_objects["flag"] & sep.OBJ_MERGED) == 0)
     for at, pixels in ((wx, data.shape[1]), (wy, data.shape[0])):
         windowed &= (at >= 0.0) & (at <= pixels - 1)
-    x, y = np.where(windowed, wx, found["x"]), np.where(windowed, wy, found["y"])
+    x, y = np.where(windowed, wx, sep_objects["x"]), np.where(windowed, wy, sep_objects["y"])
     flags = np.zeros(count, dtype=np.int32)
-    flags[((found["flag"] & sep.OBJ_TRUNC) | (aperture_flags & sep.APER_TRUNC)) != 0] |= ObjectFlag.EDGE
-    flags[(found["flag"] & sep.OBJ_MERGED) != 0] |= ObjectFlag.BLENDED
+    flags[((sep_objects["flag"] & sep.OBJ_TRUNC) | (aperture_flags & sep.APER_TRUNC)) != 0] |= ObjectFlag.EDGE
+    flags[(sep_objects["flag"] & sep.OBJ_MERGED) != 0] |= ObjectFlag.BLENDED
     flags[np.bincount(segmentation[saturated], minlength=count + 1)[1:] > 0] |= ObjectFlag.SATURATED
     # Neighbours are masked as well: masked pixels of the image alone count here.
     _, _, masked = sep.sum_ellipse(data, *ellipse, aperture, mask=ignored, subpix=1)
@@ -186,7 +197,7 @@ def _measure_objects(
         a=a,
         b=b,
         theta=theta,
-        peak=found["peak"].astype(np.float64),
+        peak=sep_objects["peak"].astype(np.float64),
         neighbour_distance=_neighbour_distance(x, y),
         flags=flags,
         segmentation=segmentation,
@@ -198,11 +209,11 @@ def _measure_fwhm(data: np.ndarray, segmentation: np.ndarray, x: np.ndarray, y: 
     """Return the full widths at half maximum [pixel], with neighbours set to zero; NaN without a positive peak."""
     result = []
     for i in range(0, len(x), _FWHM_BATCH):
-        part = slice(i, i + _FWHM_BATCH)
-        stamps = cut_out(data, x[part], y[part], _FWHM_SIDE, 0.0)
-        labels = cut_out(segmentation, x[part], y[part], _FWHM_SIDE, 0)
-        own = np.arange(i + 1, i + 1 + len(stamps))[:, None, None]
-        stamps[(labels != 0) & (labels != own)] = 0.0
+        batch = slice(i, i + _FWHM_BATCH)
+        stamps = cut_out(data, x[batch], y[batch], _FWHM_SIDE, 0.0)
+        labels = cut_out(segmentation, x[batch], y[batch], _FWHM_SIDE, 0)
+        object_labels = np.arange(i + 1, i + 1 + len(stamps))[:, None, None]
+        stamps[(labels != 0) & (labels != object_labels)] = 0.0
         result.append(fwhm(stamps, 1.0))
     return np.concatenate(result)
 

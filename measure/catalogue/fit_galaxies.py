@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,10 +25,13 @@ STAMP_RADII = 4.0
 MOST_MASKED = 0.25
 # Least eigenvalue of the covariance over the variance of the PSF: noise may make the image of a point sharper.
 _LEAST_MOMENT = -0.25
-# The largest width, and the largest shift, over the side of the stamp.
-_MOST_WIDTH, _REACH = 0.5, 0.25
+# Largest rms width of a galaxy, over the side of its stamp.
+_MOST_WIDTH = 0.5
+# Largest shift of the centre along an axis, over the side of the stamp.
+_REACH = 0.25
 # Numbers of stamps, weights and transforms held at a time: 64 MB.
 _BATCH_NUMBERS = 1 << 23
+# Largest deviation of the sum of a PSF from 1.
 _PSF_SUM_TOLERANCE = 1e-4
 
 
@@ -114,8 +117,8 @@ def fit_galaxies(
         )
     weight = np.where(ignored, 0.0, 1.0 / np.where(ignored, 1.0, variances))
     data = np.where(ignored, 0.0, pixels)
-    wanted = np.searchsorted(STAMP_SIDES, 2.0 * STAMP_RADII * radius)
-    choice = np.minimum(wanted, len(STAMP_SIDES) - 1)
+    side_index = np.searchsorted(STAMP_SIDES, 2.0 * STAMP_RADII * radius)
+    choice = np.minimum(side_index, len(STAMP_SIDES) - 1)
     parts, members = [_no_fits()], [np.empty(0, dtype=np.int64)]
     for k, side in enumerate(STAMP_SIDES):
         batch = _batch_size(side, psfs.shape[-1])
@@ -124,13 +127,13 @@ def fit_galaxies(
             corner = np.stack([first_pixel(px, side), first_pixel(py, side)], axis=1)
             stamps, weights = (cut_out(values, px, py, side, 0.0) for values in (data, weight))
             if labels is not None:
-                found = cut_out(labels, px, py, side, 0)
-                own = labels[np.rint(py).astype(np.int64), np.rint(px).astype(np.int64)]
-                weights[(found != 0) & (found != own[:, None, None])] = 0.0
+                stamp_labels = cut_out(labels, px, py, side, 0)
+                galaxy_labels = labels[np.rint(py).astype(np.int64), np.rint(px).astype(np.int64)]
+                weights[(stamp_labels != 0) & (stamp_labels != galaxy_labels[:, None, None])] = 0.0
             middle = corner + 0.5 * (side - 1)
             beyond = (corner < 0).any(axis=1) | (corner + side > np.array(pixels.shape[::-1])).any(axis=1)
             flags = np.where(beyond, GalaxyFlag.EDGE, 0)
-            flags[wanted[group] == len(STAMP_SIDES)] |= GalaxyFlag.CUT_OFF
+            flags[side_index[group] == len(STAMP_SIDES)] |= GalaxyFlag.CUT_OFF
             parts.append(_fit_stamps(stamps, weights, middle, places[group], psfs, templates[group], flags, **options))
             members.append(group)
     return joined(parts, members)
@@ -182,20 +185,22 @@ def fit_galaxy_stamps(
     if start is not None and len(start) != count:
         raise DomainError(f"start: {len(start)} fits of {count} galaxies")
     side = -(-max(ny, nx) // SIDE_STEP) * SIDE_STEP
-    below, left = (side - ny) // 2, (side - nx) // 2
+    first_row, first_column = (side - ny) // 2, (side - nx) // 2
     parts, members = [_no_fits()], [np.empty(0, dtype=np.int64)]
     for group in _index_chunks(np.arange(count), _batch_size(side, psfs.shape[-1])):
         data, weights = np.zeros((2, len(group), side, side))
-        inside = np.s_[:, below : below + ny, left : left + nx]
+        inside = np.s_[:, first_row : first_row + ny, first_column : first_column + nx]
         good = ~ignored[group]
         data[inside][good] = pixels[group][good]
         weights[inside][good] = 1.0 / variances[group][good]
         # The centre of a stamp of an odd side is half a pixel from that of an even one.
-        offset = np.array([left + 0.5 * (nx - 1), below + 0.5 * (ny - 1)]) - 0.5 * (side - 1)
+        offset = np.array([first_column + 0.5 * (nx - 1), first_row + 0.5 * (ny - 1)]) - 0.5 * (side - 1)
         middle, place = np.broadcast_to(-offset, (len(group), 2)), np.zeros((len(group), 2))
         flags = np.zeros(len(group), dtype=np.int32)
-        known = None if start is None else _fit_parameters(start)[group]
-        parts.append(_fit_stamps(data, weights, middle, place, psfs, templates[group], flags, known, **options))
+        earlier_params = None if start is None else _fit_parameters(start)[group]
+        parts.append(
+            _fit_stamps(data, weights, middle, place, psfs, templates[group], flags, earlier_params, **options)
+        )
         members.append(group)
     return joined(parts, members)
 
@@ -212,7 +217,7 @@ def _fit_stamps(
     psfs: np.ndarray,
     templates: np.ndarray,
     flags: np.ndarray,
-    known: np.ndarray | None = None,
+    earlier_params: np.ndarray | None = None,
     *,
     max_evaluations: int,
     tolerance: float,
@@ -220,48 +225,50 @@ def _fit_stamps(
 ) -> GalaxyFits:
     """Fit stamps [n, side, side] with middles at `middle` and galaxies near `place`, both [n, 2], and add to flags.
 
-    `known` [n, 6] are parameters of earlier fits.
+    `earlier_params` [n, 6] are parameters of earlier fits.
     """
     center = place - middle
     side = data.shape[-1]
-    used, own = np.unique(templates, return_inverse=True)
+    used, psf_index = np.unique(templates, return_inverse=True)
     # Of round Gaussians with the same peaks: the scale of the start and of the bounds, no more.
-    psf_variance = (0.5 / (np.pi * psfs[used].max(axis=(1, 2))))[own]
-    fitter = GaussianStamps(psfs[used], own, data, weight, threads)
+    psf_variance = (0.5 / (np.pi * psfs[used].max(axis=(1, 2))))[psf_index]
+    fitter = GaussianStamps(psfs[used], psf_index, data, weight, threads)
     bounds = Bounds(center, _REACH * side, _LEAST_MOMENT * psf_variance, (_MOST_WIDTH * side) ** 2)
     start = _moment_estimates(data, weight, center, psf_variance)
-    if known is not None:
-        shifted = np.concatenate([known[:, :1], known[:, 1:3] - middle, known[:, 3:]], axis=1)
+    if earlier_params is not None:
+        shifted = np.concatenate(
+            [earlier_params[:, :1], earlier_params[:, 1:3] - middle, earlier_params[:, 3:]], axis=1
+        )
         usable = np.isfinite(shifted).all(axis=1)
         start[usable] = shifted[usable]
     # Steps are solved by LAPACK, whose result must not depend on its threads.
     with one_blas_thread():
-        found = minimize(
+        minimum = minimize(
             fitter,
             start,
             bounds,
             max_evaluations=max_evaluations,
             tolerance=tolerance,
         )
-        covariance = _fisher_inverse(found.equations.matrix)
+        covariance = _fisher_inverse(minimum.equations.matrix)
     inner = np.s_[:, side // 4 : side - side // 4, side // 4 : side - side // 4]
     n_pixels = (weight > 0.0).sum(axis=(1, 2))
     flags = flags.astype(np.int32)
-    flags[~found.converged | ~np.isfinite(covariance).all(axis=(1, 2))] |= GalaxyFlag.NOT_CONVERGED
-    flags[found.at_bounds] |= GalaxyFlag.AT_BOUNDS
+    flags[~minimum.converged | ~np.isfinite(covariance).all(axis=(1, 2))] |= GalaxyFlag.NOT_CONVERGED
+    flags[minimum.at_bounds] |= GalaxyFlag.AT_BOUNDS
     flags[(weight[inner] == 0.0).mean(axis=(1, 2)) > MOST_MASKED] |= GalaxyFlag.MASKED
-    xx, xy, yy = found.params[:, 3:].T
+    xx, xy, yy = minimum.params[:, 3:].T
     flags[(xx * yy <= xy**2) | (xx <= 0.0)] |= GalaxyFlag.UNRESOLVED
-    flags[found.params[:, 0] <= 0.0] |= GalaxyFlag.NO_FLUX
+    flags[minimum.params[:, 0] <= 0.0] |= GalaxyFlag.NO_FLUX
     return GalaxyFits(
-        flux=found.params[:, 0],
-        x=found.params[:, 1] + middle[:, 0],
-        y=found.params[:, 2] + middle[:, 1],
-        moments=found.params[:, 3:],
+        flux=minimum.params[:, 0],
+        x=minimum.params[:, 1] + middle[:, 0],
+        y=minimum.params[:, 2] + middle[:, 1],
+        moments=minimum.params[:, 3:],
         covariance=covariance,
-        chi2=found.equations.chi2,
+        chi2=minimum.equations.chi2,
         pixels=n_pixels.astype(np.int32),
-        evaluations=found.evaluations,
+        evaluations=minimum.evaluations,
         flags=flags,
     )
 
@@ -279,25 +286,25 @@ def _moment_estimates(data: np.ndarray, weight: np.ndarray, center: np.ndarray, 
     safe = np.where(positive, total, 1.0)
     spread = 0.5 * ((along_x * x**2).sum(axis=1) + (along_y * y**2).sum(axis=1)) / safe
     # The inverse variances of a Gaussian and of its window add up.
-    seen = np.clip(spread, 0.25 * width, 0.9 * width)
-    variance = 1.0 / (1.0 / seen - 1.0 / width)
-    own = np.maximum(np.where(positive, variance, 2.0 * psf_variance) - psf_variance, 0.3 * psf_variance)
+    windowed_variance = np.clip(spread, 0.25 * width, 0.9 * width)
+    variance = 1.0 / (1.0 / windowed_variance - 1.0 / width)
+    galaxy_variance = np.maximum(np.where(positive, variance, 2.0 * psf_variance) - psf_variance, 0.3 * psf_variance)
     flux = np.where(positive, total, np.abs(light).sum(axis=(1, 2))) * (1.0 + variance / width)
-    return np.stack([flux, center[:, 0], center[:, 1], own, np.zeros(len(data)), own], axis=1)
+    return np.stack([flux, center[:, 0], center[:, 1], galaxy_variance, np.zeros(len(data)), galaxy_variance], axis=1)
 
 
 def _fisher_inverse(matrix: np.ndarray) -> np.ndarray:
     """Return the inverses of Fisher matrices [n, 6, 6]; NaN for a singular one."""
     scale = np.sqrt(np.diagonal(matrix, axis1=1, axis2=2))
-    known = (scale > 0.0).all(axis=1)
+    regular = (scale > 0.0).all(axis=1)
     scale = np.where(scale > 0.0, scale, 1.0)
     scaled = matrix / (scale[:, :, None] * scale[:, None, :])
     # Six parameters of fewer pixels: the smallest eigenvalue is rounding.
-    known &= np.isfinite(scaled).all(axis=(1, 2))
-    scaled[~known] = np.eye(matrix.shape[1])
-    known &= np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
+    regular &= np.isfinite(scaled).all(axis=(1, 2))
+    scaled[~regular] = np.eye(matrix.shape[1])
+    regular &= np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
     result = np.full(matrix.shape, np.nan)
-    result[known] = np.linalg.inv(scaled[known]) / (scale[known, :, None] * scale[known, None, :])
+    result[regular] = np.linalg.inv(scaled[regular]) / (scale[regular, :, None] * scale[regular, None, :])
     return result
 
 
@@ -327,7 +334,15 @@ def _checked_psfs(psf_images: ArrayLike, psf_index: ArrayLike | None, count: int
     return psfs, np.zeros(count, dtype=np.int64) if shared else np.arange(count)
 
 
-def _checked_options(max_evaluations: int, tolerance: float, threads: int | None) -> dict[str, Any]:
+class _FitOptions(TypedDict):
+    """Options of the fits; see :func:`fit_galaxies`."""
+
+    max_evaluations: int
+    tolerance: float
+    threads: int | None
+
+
+def _checked_options(max_evaluations: int, tolerance: float, threads: int | None) -> _FitOptions:
     """Return the options of the fits."""
     if max_evaluations < 1:
         raise DomainError(f"max_evaluations = {max_evaluations}: expected at least 1")
@@ -362,6 +377,16 @@ def _index_chunks(indices: np.ndarray, size: int) -> list[np.ndarray]:
 
 def _no_fits() -> GalaxyFits:
     """Return the fits of no galaxies."""
-    none, count = np.empty(0), len(PARAMETERS)
-    whole = np.empty(0, dtype=np.int32)
-    return GalaxyFits(none, none, none, np.empty((0, 3)), np.empty((0, count, count)), none, whole, whole, whole)
+    empty_floats, count = np.empty(0), len(PARAMETERS)
+    empty_ints = np.empty(0, dtype=np.int32)
+    return GalaxyFits(
+        empty_floats,
+        empty_floats,
+        empty_floats,
+        np.empty((0, 3)),
+        np.empty((0, count, count)),
+        empty_floats,
+        empty_ints,
+        empty_ints,
+        empty_ints,
+    )

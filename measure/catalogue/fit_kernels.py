@@ -134,7 +134,7 @@ def transform_columns(
 def store(
     columns: wp.array3d(dtype=pixels),
     at: wp.int32,
-    part: wp.int32,
+    channel: wp.int32,
     p: wp.int32,
     packets: wp.int32,
     phase: wp.float64,
@@ -147,12 +147,12 @@ def store(
     """Write a transform at a packet of rows above the centre and at their mirror images, shifted along x."""
     real = even_r + odd_r
     imaginary = even_i + odd_i
-    columns[at, part, p] = phase * real - phase_i * imaginary
-    columns[at, part + 1, p] = phase * imaginary + phase_i * real
+    columns[at, channel, p] = phase * real - phase_i * imaginary
+    columns[at, channel + 1, p] = phase * imaginary + phase_i * real
     real = even_r - odd_r
     imaginary = even_i - odd_i
-    columns[at, part, packets + p] = phase * real - phase_i * imaginary
-    columns[at, part + 1, packets + p] = phase * imaginary + phase_i * real
+    columns[at, channel, packets + p] = phase * real - phase_i * imaginary
+    columns[at, channel + 1, packets + p] = phase * imaginary + phase_i * real
 
 
 @wp.func

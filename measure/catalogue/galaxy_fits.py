@@ -224,7 +224,7 @@ def joined(parts: Sequence[GalaxyFits], places: Sequence[np.ndarray]) -> GalaxyF
     """Return one set of fits from parts, whose galaxies have the indices `places`."""
     order = np.argsort(np.concatenate(places))
     values: dict[str, Any] = {
-        f.name: np.concatenate([getattr(part, f.name) for part in parts])[order] for f in fields(GalaxyFits)
+        f.name: np.concatenate([getattr(fits, f.name) for fits in parts])[order] for f in fields(GalaxyFits)
     }
     return GalaxyFits(**values)
 
@@ -271,5 +271,5 @@ def usable_galaxies(
         raise DomainError("star_half_light_radius: expected positive numbers of at least one star")
     least = require_positive(least_ratio, "least_ratio") * float(np.median(stars))
     with np.errstate(invalid="ignore"):
-        known = fits.ellipticity_error < require_positive(most_error, "most_error")
-        return np.asarray(fits.good & known & (radius > least))
+        precise = fits.ellipticity_error < require_positive(most_error, "most_error")
+        return np.asarray(fits.good & precise & (radius > least))

@@ -88,9 +88,9 @@ class GaussianStamps:
         ]
         self._data, self._weight = (warp_array(_stamp_packets(values), pixels) for values in (data, weight))
 
-    def normal_equations(self, params: np.ndarray, which: np.ndarray) -> NormalEquations:
-        """Return the normal equations of the galaxies `which` [k] of given parameters [k, 6]."""
-        count = len(which)
+    def normal_equations(self, params: np.ndarray, indices: np.ndarray) -> NormalEquations:
+        """Return the normal equations of the galaxies `indices` [k] of given parameters [k, 6]."""
+        count = len(indices)
         block = int(np.clip(count // (4 * self.threads), 1, _MOST_IN_BLOCK))
         blocks = -(-count // block)
         result = np.zeros((count, SUMS))
@@ -100,8 +100,8 @@ class GaussianStamps:
             [
                 block,
                 self._psf,
-                warp_array(self.templates[which], wp.int32),
-                warp_array(which, wp.int32),
+                warp_array(self.templates[indices], wp.int32),
+                warp_array(indices, wp.int32),
                 self._step,
                 warp_array(params),
                 *self._trigonometric_tables,

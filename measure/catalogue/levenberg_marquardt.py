@@ -14,9 +14,14 @@ import numpy as np
 
 from .gaussian_model import GaussianStamps, NormalEquations
 
-# Damping (Marquardt 1963, scaled by the diagonal): where it begins, its factor, where it hardly shortens a step, and
-# where it ends.
-_DAMPING, _FACTOR, _WEAK_DAMPING, _MOST_DAMPING = 0.1, 10.0, 0.1, 1e10
+# Damping of the first step (Marquardt 1963, scaled by the diagonal).
+_DAMPING = 0.1
+# Factor of the damping from step to step: less after an accepted one, more after a rejected one.
+_FACTOR = 10.0
+# Damping up to which a step is hardly shortened, so that a short one means convergence.
+_WEAK_DAMPING = 0.1
+# Damping at which a galaxy that finds no better step is given up.
+_MOST_DAMPING = 1e10
 # Longest step with the whole curvature, in lengths of the step with the Fisher matrix alone.
 _LONGEST = 5.0
 
@@ -42,14 +47,14 @@ class Bounds:
     least: np.ndarray
     most: float
 
-    def project(self, params: np.ndarray, which: np.ndarray) -> np.ndarray:
-        """Return the nearest parameters [k, 6] in the domain of the galaxies `which` [k]."""
+    def project(self, params: np.ndarray, indices: np.ndarray) -> np.ndarray:
+        """Return the nearest parameters [k, 6] in the domain of the galaxies `indices` [k]."""
         inside = params.copy()
-        center = self.center[which]
+        center = self.center[indices]
         inside[:, 1:3] = np.clip(params[:, 1:3], center - self.reach, center + self.reach)
         mean, half = 0.5 * (params[:, 3] + params[:, 5]), 0.5 * (params[:, 3] - params[:, 5])
         radius = np.hypot(half, params[:, 4])
-        low, high = (np.clip(v, self.least[which], self.most) for v in (mean - radius, mean + radius))
+        low, high = (np.clip(v, self.least[indices], self.most) for v in (mean - radius, mean + radius))
         beyond = (low != mean - radius) | (high != mean + radius)
         scale = 0.5 * (high - low) / np.where(radius > 0.0, radius, 1.0)
         clipped = np.stack([0.5 * (low + high) + scale * half, scale * params[:, 4], 0.5 * (low + high) - scale * half])
@@ -103,19 +108,19 @@ def minimize(
         if not len(active):
             break
         before = right[active]
-        wanted = params[active] + _best_step(matrix[active], second[active], before, damping[active])
-        trial = bounds.project(wanted, active)
+        proposal = params[active] + _best_step(matrix[active], second[active], before, damping[active])
+        trial = bounds.project(proposal, active)
         step = trial - params[active]
-        at_bounds[active] = (trial != wanted).any(axis=1)
+        at_bounds[active] = (trial != proposal).any(axis=1)
         change = _scalar_product(_matrix_vector(matrix[active], step), step)
         signal = params[active, 0] ** 2 * matrix[active, 0, 0] + chi2[active]
-        found = stamps.normal_equations(trial, active)
+        trial_equations = stamps.normal_equations(trial, active)
         evaluations[active] += 1
-        better = found.chi2 <= chi2[active]
-        kept = active[better]
-        params[kept], chi2[kept] = trial[better], found.chi2[better]
-        right[kept], matrix[kept] = found.right[better], found.matrix[better]
-        second[active] = _updated_curvature(second[active], matrix[active], step, before - found.right)
+        better = trial_equations.chi2 <= chi2[active]
+        accepted = active[better]
+        params[accepted], chi2[accepted] = trial[better], trial_equations.chi2[better]
+        right[accepted], matrix[accepted] = trial_equations.right[better], trial_equations.matrix[better]
+        second[active] = _updated_curvature(second[active], matrix[active], step, before - trial_equations.right)
         # A strongly damped step is short without being near the minimum; a short one that is rejected is rounding.
         done = (change <= tolerance**2 * signal) & (damping[active] <= _WEAK_DAMPING)
         damping[active] *= np.where(better, 1.0 / _FACTOR, _FACTOR)
@@ -138,13 +143,13 @@ def _best_step(fisher: np.ndarray, second: np.ndarray, right: np.ndarray, dampin
     # Parameters that change nothing stay.
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     damped = np.eye(fisher.shape[1]) * np.where(diagonal > 0.0, damping[:, None], 1.0)[:, None, :]
-    safe, whole = (
+    fisher_step, full_step = (
         _solve_linear(matrix / (scale[:, :, None] * scale[:, None, :]) + damped, right / scale) / scale
         for matrix in (fisher, fisher + second)
     )
-    length, limit = (_scalar_product(_matrix_vector(fisher, step), step) for step in (whole, safe))
-    good = (_scalar_product(whole, right) > 0.0) & (length <= _LONGEST**2 * limit)
-    return np.where(good[:, None], whole, safe)
+    length, limit = (_scalar_product(_matrix_vector(fisher, step), step) for step in (full_step, fisher_step))
+    good = (_scalar_product(full_step, right) > 0.0) & (length <= _LONGEST**2 * limit)
+    return np.where(good[:, None], full_step, fisher_step)
 
 
 def _solve_linear(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -164,9 +169,11 @@ def _updated_curvature(second: np.ndarray, fisher: np.ndarray, step: np.ndarray,
     (Dennis, Gay & Welsch 1981, eqs. 2.5 and 2.8).
     """
     beyond = change - _matrix_vector(fisher, step)
-    known = _scalar_product(_matrix_vector(second, step), step)
+    curvature_along = _scalar_product(_matrix_vector(second, step), step)
     with np.errstate(divide="ignore", invalid="ignore"):
-        size = np.where(known != 0.0, np.minimum(1.0, np.abs(_scalar_product(step, beyond) / known)), 1.0)
+        size = np.where(
+            curvature_along != 0.0, np.minimum(1.0, np.abs(_scalar_product(step, beyond) / curvature_along)), 1.0
+        )
     second = second * size[:, None, None]
     missed = beyond - _matrix_vector(second, step)
     along = np.where((_scalar_product(change, step) > 0.0)[:, None], change, _matrix_vector(fisher, step))

@@ -43,20 +43,20 @@ def match_positions(x: ArrayLike, y: ArrayLike, true_x: ArrayLike, true_y: Array
     DomainError
         If shapes differ, a position is not finite or the radius not positive.
     """
-    found, true = (
+    positions, true_positions = (
         np.stack([real_array(v, f"{name}: expected real numbers [n]").ravel() for v in pair], axis=1)
         if np.shape(pair[0]) == np.shape(pair[1]) and np.ndim(pair[0]) == 1
         else _require_equal_shapes(name, pair)
         for name, pair in (("x, y", (x, y)), ("true_x, true_y", (true_x, true_y)))
     )
-    for name, places in (("x, y", found), ("true_x, true_y", true)):
+    for name, places in (("x, y", positions), ("true_x, true_y", true_positions)):
         if not np.isfinite(places).all():
             raise DomainError(f"{name}: expected finite positions")
     radius = require_positive(radius, "radius")
-    if not len(found) or not len(true):
-        return np.full(len(found), -1)
-    distance, nearest = KDTree(true).query(found, distance_upper_bound=radius)
-    _, back = KDTree(found).query(true)
+    if not len(positions) or not len(true_positions):
+        return np.full(len(positions), -1)
+    distance, nearest = KDTree(true_positions).query(positions, distance_upper_bound=radius)
+    _, back = KDTree(positions).query(true_positions)
     near = np.isfinite(distance)
     mutual = near.copy()
     mutual[near] = back[nearest[near]] == np.flatnonzero(near)
@@ -158,5 +158,5 @@ def detection_rates(
     return DetectionRates(bins, *counts)
 
 
-def _ratio_or_nan(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    return np.where(whole > 0, part / np.maximum(whole, 1), np.nan)
+def _ratio_or_nan(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
+    return np.where(denominator > 0, numerator / np.maximum(denominator, 1), np.nan)

@@ -31,9 +31,9 @@ def check_pixels(
         raise DomainError(f"{name} has shape {pixels.shape}: expected {axes}")
     if variances.ndim == 0:
         variances = np.broadcast_to(variances, pixels.shape)
-    for other_name, other in (("variance", variances), ("mask", ignored)):
-        if other.shape != pixels.shape:
-            raise DomainError(f"{other_name} has shape {other.shape}: expected {pixels.shape}, that of the {name}")
+    for array_name, array in (("variance", variances), ("mask", ignored)):
+        if array.shape != pixels.shape:
+            raise DomainError(f"{array_name} has shape {array.shape}: expected {pixels.shape}, that of the {name}")
     _require_pixels(np.isfinite(pixels) | ignored, name, pixels, "finite")
     _require_pixels(
         (np.isfinite(variances) & (variances > 0.0)) | ignored, "variance", variances, "positive and finite"

@@ -81,13 +81,13 @@ def shear_calibration(e1: ArrayLike, e2: ArrayLike, shear1: ArrayLike, shear2: A
     sizes = [a.shape for a in (*shapes, *shears)]
     if shapes[0].ndim != 2 or shapes[1].shape != shapes[0].shape or any(g.shape != sizes[0][:1] for g in shears):
         raise DomainError(f"e1, e2, shear1, shear2 have shapes {sizes}: expected [n, k] twice and [n] twice")
-    whole = np.isfinite(np.concatenate(shapes, axis=1)).all(axis=1)
-    count = int(whole.sum())
+    complete = np.isfinite(np.concatenate(shapes, axis=1)).all(axis=1)
+    count = int(complete.sum())
     if count < 3:
-        raise DomainError(f"{count} of {len(whole)} rings are complete: expected at least 3")
+        raise DomainError(f"{count} of {len(complete)} rings are complete: expected at least 3")
     lines = []
     for e, g, name in zip(shapes, shears, ("shear1", "shear2"), strict=True):
-        mean, true = e[whole].mean(axis=1), g[whole]
+        mean, true = e[complete].mean(axis=1), g[complete]
         if not np.ptp(true) > 0.0:
             raise DomainError(f"{name} = {true[0]:g} of all rings: expected at least two values")
         spread = ((true - true.mean()) ** 2).sum()

@@ -23,13 +23,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# The locus is the interval of half-light radii of this relative width with the most objects: at least so many times
-# the objects of equally wide intervals on either side of it, between these multiples of its radius.
-_INTERVAL, _CONTRAST, _SIDE = 0.08, 3.0, (1.15, 1.75)
+# Relative width of the interval of half-light radii with the most objects, which is the locus.
+_INTERVAL = 0.08
+# Least number of its objects, over that of equally wide intervals on either side of it.
+_CONTRAST = 3.0
+# Multiples of its radius between which those intervals lie.
+_SIDE = (1.15, 1.75)
 # Least width of the locus, relative: the PSF varies over a CCD.
 _LEAST_WIDTH = 0.01
 # Margin of a stamp for the light that its Fourier shift wraps around [pixel].
 _MARGIN = 8
+# Standard deviation of a Gaussian over its median absolute deviation.
 _MAD_TO_SIGMA = 1.4826
 
 

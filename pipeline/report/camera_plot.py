@@ -9,9 +9,14 @@ from ...core.plotting import new_figure, plain_text, styled
 from ...measure.focal_plane_axes import ccd_corners, draw_outlines, frame_axes
 from ...models.camera.camera import Camera
 
-# Part of the width of a CCD that its name fills, and width of a letter over its height.
-_FILLED, _LETTER = 0.8, 0.62
-_WIDTH, _HEIGHT = 8.6, 8.2
+# Fraction of the width of a CCD that its name fills.
+_FILLED = 0.8
+# Width of a letter over its height.
+_LETTER = 0.62
+# Width of the plot [inch].
+_WIDTH = 8.6
+# Height of the plot [inch].
+_HEIGHT = 8.2
 
 
 def camera_plot(camera: Camera) -> Figure:

@@ -60,7 +60,7 @@ class Diagnostics:
     files: tuple[str, ...]  #: names of the files in the folder
     missing: dict[str, str]  #: reason by CCD without a readable product
     table: Table  #: means and rms of the residuals, a row for each CCD
-    overall: dict[str, Any]  #: the same over all CCDs, and metrics of the correlations; keys end in their unit
+    overall: dict[str, float]  #: the same over all CCDs, and metrics of the correlations; keys end in their unit
     #: Of each of :data:`~.KINDS`, with errors by jackknife over the CCDs where there are two or more; with a
     #: focal-plane model also of :data:`~.CCD_KINDS`, as in the table.
     correlations: dict[str, Correlation]
@@ -100,14 +100,14 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
     stamp, names = stamp_of(experiment), config.ccds or ()
     if not any(product_path(folder, name).exists() for name in names):
         raise ProductError(f"none of its {len(names)} CCDs is finished", file=folder)
-    products, missing = [], {}
+    products, unreadable_ccds = [], {}
     for name in names:
         try:
             products.append(_read_product_or_reason(folder, name, stamp, config.reconstruction.model))
         except ProductError as error:
-            missing[name] = str(error)
+            unreadable_ccds[name] = str(error)
             # Damage happens to single files; a folder without any that can be read has another reason.
-            if strict or len(missing) == len(names):
+            if strict or len(unreadable_ccds) == len(names):
                 raise
     residuals = RESIDUALS + CCD_KINDS if has_focal_plane_model(products) else RESIDUALS
     columns = _ccd_columns(products, residuals)
@@ -131,12 +131,12 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
         ),
         "rho.png": rho_plot(rho),
     }
-    for name, (what, content) in tables.items():
-        write_ecsv(out / name, content, {"what": what, **meta})
+    for name, (description, content) in tables.items():
+        write_ecsv(out / name, content, {"what": description, **meta})
     for name, png in pictures.items():
         write_bytes(out / name, png)
     files = (*tables, *pictures, "diagnostics.json")
-    result = Diagnostics(out, files, missing, described_table(columns, meta), overall, correlated, rho)
+    result = Diagnostics(out, files, unreadable_ccds, described_table(columns, meta), overall, correlated, rho)
     write_json(out / "diagnostics.json", {**meta, **result.as_dict()})
     return result
 
@@ -192,17 +192,17 @@ def _ccd_columns(products: Sequence[CcdProduct], residuals: Sequence[str]) -> di
     for kind in residuals:
         rows = [_residual_moments([p], kind) for p in products]
         for key in rows[0]:
-            what = key.partition("_")[0]
+            statistic = key.partition("_")[0]
             of = "(T - T model)/T" if "_dt_" in key else "e1" if "_e1_" in key else "e2" if "_e2_" in key else "e1, e2"
             values = np.array([row[key] for row in rows])
-            columns[key] = (values, "", f"{what} of {of}: {_MEANINGS[kind]}")
+            columns[key] = (values, "", f"{statistic} of {of}: {_MEANINGS[kind]}")
     return columns
 
 
 def _overall_metrics(
     products: Sequence[CcdProduct], residuals: Sequence[str], correlated: Mapping[str, Correlation]
-) -> dict[str, Any]:
-    metrics: dict[str, Any] = {
+) -> dict[str, float]:
+    metrics: dict[str, float] = {
         "ccds": len(products),
         "stars": sum(len(p.observed) for p in products),
         "truth_psfs": sum(len(p.holdout) for p in products),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,6 +11,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 
 from ...core.plotting import new_figure, png_bytes, styled
 from ...measure.focal_plane_axes import (
@@ -61,8 +61,8 @@ def heights_plot(focal_plane: FocalPlane, used: Sequence[str], field_radius: flo
         draw_field_circle(axes, field_radius * 1e3)
         frame_axes(axes, limits)
         framed = f"; framed: the {len(used)} CCD{'s' * (len(used) != 1)} of this run" if used else ""
-        what = "CCDs, without heights" if is_flat(focal_plane) else "CCD heights"
-        axes.set_title(f"{what}{framed}; dashed: edge of the field of view")
+        heading = "CCDs, without heights" if is_flat(focal_plane) else "CCD heights"
+        axes.set_title(f"{heading}{framed}; dashed: edge of the field of view")
         if not is_flat(focal_plane):
             figure.colorbar(image, ax=axes, fraction=0.045, pad=0.02, label="height along +z, towards the sky [µm]")
         return png_bytes(figure)
@@ -99,15 +99,15 @@ def whiskers_plot(
             figure = new_figure(wide + 1.5, (wide + 1.5) / len(kinds) / across + 0.9, "compressed")
             panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
         bounds = height_range(focal_plane)
-        most = _MOST_WHISKERS if len(products) <= _MANY else _MOST_WHISKERS // 5
+        whisker_limit = _MOST_WHISKERS if len(products) <= _MANY else _MOST_WHISKERS // 5
         for i, (axes, kind) in enumerate(zip(panels, kinds, strict=True)):
             image = draw_heights(axes, focal_plane, limits, 700, alpha=0.35, bounds=bounds)
             draw_outlines(axes, focal_plane.camera, range(len(focal_plane.camera)), "0.5", 0.5)
             draw_field_circle(axes, field_radius * 1e3)
             for product in products:
-                _draw_kind(axes, product, kind, scale, 0.8 if len(products) <= _MANY else 0.5, most)
+                _draw_kind(axes, product, kind, scale, 0.8 if len(products) <= _MANY else 0.5, whisker_limit)
             frame_axes(axes, limits, x_label=not stacked or i == len(kinds) - 1, y_label=stacked or i == 0)
-            axes.set_title(_title_with_count(_TITLES[kind], products, kind, most), loc="left")
+            axes.set_title(_title_with_count(_TITLES[kind], products, kind, whisker_limit), loc="left")
             draw_key_whisker(axes, key, scale, 1.0)
         _add_height_scale(figure, image, panels, focal_plane, 30)
         return png_bytes(figure)
@@ -171,20 +171,20 @@ _SHORT_TITLES = {
 _COLORS = {"truth": TRUTH, "observed": OBSERVED, "residual": RESIDUAL, "away": AWAY}
 
 
-def _title_with_count(title: str, products: Sequence[CcdStars], kind: str, most: int) -> str:
+def _title_with_count(title: str, products: Sequence[CcdStars], kind: str, limit: int) -> str:
     """Return a title, with a note where not every star has a whisker."""
-    step = max(_whisker_stride(product.stars(kind), most) for product in products)
+    step = max(_whisker_stride(product.stars(kind), limit) for product in products)
     return title if step == 1 else f"{title} (one star in {step})"
 
 
-def _whisker_stride(stars: Stars, most: int) -> int:
-    return max(1, -(-len(stars) // most))
+def _whisker_stride(stars: Stars, limit: int) -> int:
+    return max(1, -(-len(stars) // limit))
 
 
-def _draw_kind(axes: Axes, product: CcdStars, kind: str, scale: float, width: float, most: int) -> None:
+def _draw_kind(axes: Axes, product: CcdStars, kind: str, scale: float, width: float, limit: int) -> None:
     stars = product.stars(kind)
     ends = whiskers(stars.x * 1e3, stars.y * 1e3, *product.ellipticity(kind), scale)
-    draw_whiskers(axes, ends[:: _whisker_stride(stars, most)], _COLORS[kind], width)
+    draw_whiskers(axes, ends[:: _whisker_stride(stars, limit)], _COLORS[kind], width)
 
 
 def _common_key(products: Sequence[CcdStars]) -> float:
@@ -225,7 +225,7 @@ def draw_heights(
     samples: int,
     alpha: float = 1.0,
     bounds: float | None = None,
-) -> Any:
+) -> AxesImage:
     """Draw the heights within limits [mm] as an image, gaps left white; the scale is that of the whole focal plane."""
     bounds = height_range(focal_plane) if bounds is None else bounds
     height, extent = _height_map(focal_plane, limits, samples)
@@ -245,10 +245,10 @@ def _height_map(
     focal_plane: FocalPlane, limits: tuple[float, float, float, float], samples: int
 ) -> tuple[np.ndarray, tuple[float, float, float, float]]:
     """Return heights within limits [um] and the extent of the image; kept, since the panels of a row have the same."""
-    left, right, bottom, top = (float(limit) for limit in limits)
-    step = max(right - left, top - bottom) / samples
-    x = np.arange(left + 0.5 * step, right, step)
-    y = np.arange(bottom + 0.5 * step, top, step)
+    x_low, x_high, y_low, y_high = (float(limit) for limit in limits)
+    step = max(x_high - x_low, y_high - y_low) / samples
+    x = np.arange(x_low + 0.5 * step, x_high, step)
+    y = np.arange(y_low + 0.5 * step, y_high, step)
     height = focal_plane.height(x[None, :] * 1e-3, y[:, None] * 1e-3) * 1e6
     return height, (x[0] - 0.5 * step, x[-1] + 0.5 * step, y[0] - 0.5 * step, y[-1] + 0.5 * step)
 

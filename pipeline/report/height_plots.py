@@ -16,8 +16,10 @@ from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_statistics import height_statistics, sampled_heights
 
 _COLOURS = (RED, BLUE, ORANGE, PURPLE, GREY)
-# Pixels of the map along a side, and the percentile of |height| at the ends of its scale: a few corners go far beyond.
-_SAMPLES, _SCALE = 700, 99.0
+# Pixels of the map along a side.
+_SAMPLES = 700
+# Percentile of |height| at the ends of the scale of the map: a few corners go far beyond.
+_SCALE = 99.0
 
 
 def vendor_heights_plot(focal_plane: FocalPlane, title: str) -> Figure:
@@ -81,10 +83,10 @@ def _draw_borders(axes: Axes, camera: Camera) -> None:
         else 0.0
     )
     lines = []
-    for raft, at in centers.items():
-        axes.annotate(f"{raft} {vendor[raft].upper()}", at, ha="center", va="center", fontsize=6.5, color="0.15")
-        for other, there in centers.items():
-            if vendor[raft] < vendor[other] and np.hypot(*(at - there)) < 1.01 * pitch:
-                middle, along = 0.5 * (at + there), 0.5 * (there - at)[::-1]
+    for raft, center in centers.items():
+        axes.annotate(f"{raft} {vendor[raft].upper()}", center, ha="center", va="center", fontsize=6.5, color="0.15")
+        for neighbour, neighbour_center in centers.items():
+            if vendor[raft] < vendor[neighbour] and np.hypot(*(center - neighbour_center)) < 1.01 * pitch:
+                middle, along = 0.5 * (center + neighbour_center), 0.5 * (neighbour_center - center)[::-1]
                 lines.append(np.stack([middle - along, middle + along]))
     axes.add_collection(LineCollection(lines, colors="black", linewidths=2.0))

@@ -175,12 +175,12 @@ def surface_rows(description: dict[str, Any]) -> list[tuple[str, ...]]:
 
 def coefficient_lines(description: dict[str, Any]) -> list[str]:
     """Return the coefficients of the aspheres as text, a line each."""
-    unit, found = LENGTH_UNITS[description["length_unit"]], []
+    unit, lines = LENGTH_UNITS[description["length_unit"]], []
     for s in description["surfaces"]:
         terms = [(4 + 2 * i, c * unit ** (3 + 2 * i)) for i, c in enumerate(s["coefficients"])]
         if any(c for _, c in terms):
-            found.append(f"{s['name']}: " + ", ".join(f"{c:.9g} r^{power}" for power, c in terms if c))
-    return found
+            lines.append(f"{s['name']}: " + ", ".join(f"{c:.9g} r^{power}" for power, c in terms if c))
+    return lines
 
 
 def figure_rows(description: dict[str, Any]) -> list[tuple[str, str]]:
@@ -236,8 +236,8 @@ def _link_text(link: dict[str, Any], unit: float, name: str) -> str:
         return f"{link['surface']} thickness: {link['kind'].replace('_', ' ')} {link['value'] / unit:.6g} {name}{at}"
     offset = link["offset"] if link["quantity"] == "conic" else link["offset"] / unit
     factor = f"{link['scale']:.6g} times " if link["scale"] != 1.0 else ""
-    more = f" {'+-'[offset < 0]} {abs(offset):.6g}" if offset else ""
-    return f"{link['surface']} {link['quantity']}: {factor}that of {link['source']}{more}"
+    offset_text = f" {'+-'[offset < 0]} {abs(offset):.6g}" if offset else ""
+    return f"{link['surface']} {link['quantity']}: {factor}that of {link['source']}{offset_text}"
 
 
 def _stated_rows(design: dict[str, Any], unit: float, name: str) -> list[tuple[str, str]]:

@@ -52,11 +52,11 @@ def draw_pictures(
 ) -> list[Picture]:
     """Return the pictures of a run in the order of the report; no byte depends on where they are drawn."""
     config, plane = experiment.config, experiment.focal_plane
-    none = plane.terms == () and not (plane.measured.any() or plane.polynomial.any())
-    heights = "none" if none else "measured" if config.focal_plane.heights is not None else "budget"
+    flat_plane = plane.terms == () and not (plane.measured.any() or plane.polynomial.any())
+    heights = "none" if flat_plane else "measured" if config.focal_plane.heights is not None else "budget"
     # The paper's figures are the LSST's.
     paper = experiment.camera.name == "lsst"
-    optics, whole = not config.atmosphere.enabled, has_focal_plane_model(products)
+    optics, focal_plane_model = not config.atmosphere.enabled, has_focal_plane_model(products)
     fit, radius = config.reconstruction, experiment.field_radius_on_detector
     # Without images and models, stars are soon sent to another process.
     stars, close = [p.ccd_stars for p in products], closest_middle_farthest(products)
@@ -67,7 +67,7 @@ def draw_pictures(
     at_stars = (
         "Residuals at the stars of a CCD sum to zero by construction, so their correlation between CCDs cancels "
         "whatever the error of the model is"
-        if unweighted and not whole
+        if unweighted and not focal_plane_model
         else "Residuals at the stars hold the noise of each star, some of which the model has followed"
     )
     planned = [
@@ -88,7 +88,7 @@ def draw_pictures(
             "panels share one scale, given by the key above their right corner, so lengths can be compared. "
             + (
                 ""
-                if none
+                if flat_plane
                 else "The pattern follows the heights behind it: whiskers jump where the CCD border is a step. "
             )
             + "Residuals at the stars hold the noise of each star itself.",
@@ -156,7 +156,11 @@ def draw_pictures(
             "Observed stamps from the brightest to the faintest star of three CCDs, the model at their places, and "
             "the difference in units of each pixel's noise: where the model is right to within the star's own noise, "
             "only that noise is left. A bright star can show more: the noise of fainter stars is in the model."
-            + (" The model here is the CCD's own: that of the focal plane has shapes only." if whole else ""),
+            + (
+                " The model here is the CCD's own: that of the focal plane has shapes only."
+                if focal_plane_model
+                else ""
+            ),
         ),
         _PendingPicture(
             "Residuals of both models",
@@ -169,14 +173,17 @@ def draw_pictures(
                 if unweighted
                 else ""
             ),
-            wanted=whole,
+            wanted=focal_plane_model,
         ),
     ]
     planned = [plot for plot in planned if plot.wanted]
     elsewhere = submit(_draw_all, [p.draw for p in planned if p.apart])
-    here = iter(_draw_all([p.draw for p in planned if not p.apart]))
-    there = iter(elsewhere())
-    return [Picture(p.title, next(there if p.apart else here), p.shows, p.of_paper if paper else "") for p in planned]
+    local_pngs = iter(_draw_all([p.draw for p in planned if not p.apart]))
+    remote_pngs = iter(elsewhere())
+    return [
+        Picture(p.title, next(remote_pngs if p.apart else local_pngs), p.shows, p.of_paper if paper else "")
+        for p in planned
+    ]
 
 
 def _draw_all(plots: Sequence[Plot]) -> list[bytes]:

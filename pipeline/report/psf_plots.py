@@ -61,38 +61,49 @@ def spectrum_plot(products: Sequence[CcdProduct]) -> bytes:
     """Draw the eigenvalues of all CCDs, of observed stars and of noise-free PSFs, and the number kept."""
     with styled():
         figure = new_figure(10.0, 4.2)
-        left, right = figure.subplots(1, 2)
+        spectrum_axes, fraction_axes = figure.subplots(1, 2)
         for product in products:
             for model, color in ((product.model, OBSERVED), (product.noise_free_model, TRUTH)):
                 n = np.arange(1, len(model.eigenvalues) + 1)
                 total = model.eigenvalues.sum()
-                left.plot(n, model.eigenvalues, "-", color=color, linewidth=0.8, alpha=0.7)
+                spectrum_axes.plot(n, model.eigenvalues, "-", color=color, linewidth=0.8, alpha=0.7)
                 if 0 < model.elbow <= len(n):
-                    left.plot(model.elbow, model.eigenvalues[model.elbow - 1], "o", color=color, markersize=3.5)
+                    spectrum_axes.plot(
+                        model.elbow, model.eigenvalues[model.elbow - 1], "o", color=color, markersize=3.5
+                    )
                 if total > 0:
-                    missing = 1.0 - np.cumsum(model.eigenvalues) / total
-                    right.plot(n[missing > 1e-15], missing[missing > 1e-15], "-", color=color, linewidth=0.8, alpha=0.7)
+                    unexplained = 1.0 - np.cumsum(model.eigenvalues) / total
+                    fraction_axes.plot(
+                        n[unexplained > 1e-15],
+                        unexplained[unexplained > 1e-15],
+                        "-",
+                        color=color,
+                        linewidth=0.8,
+                        alpha=0.7,
+                    )
         # Models of pixels have all components.
         pixels = products[0].model.basis == "pixels"
         count = (products[0].noise_free_model if pixels else products[0].model).n_components
-        for axes in (left, right):
+        for axes in (spectrum_axes, fraction_axes):
             axes.axvline(count + 0.5, color="0.5", linewidth=0.8, linestyle=(0, (4, 3)))
             axes.set(yscale="log", xlabel="component n", xlim=(0, 2.2 * count))
-        right.axhline(0.01, color=AWAY, linewidth=0.8)
-        right.annotate("1 %", (0.99, 0.01), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8)
+        fraction_axes.axhline(0.01, color=AWAY, linewidth=0.8)
+        fraction_axes.annotate(
+            "1 %", (0.99, 0.01), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8
+        )
         values = [m.eigenvalues[: 2 * count] for p in products for m in (p.model, p.noise_free_model)]
         positive = np.concatenate(values)
         positive = positive[positive > 1e-12 * positive.max()]
-        left.set_ylim(0.5 * positive.min(), 2.0 * positive.max())
-        right.set_ylim(1e-6, 1.0)
-        left.plot([], [], "-o", color=OBSERVED, markersize=3.5, label="observed stars, dot: elbow")
-        left.plot([], [], "-o", color=TRUTH, markersize=3.5, label="noise-free PSFs, dot: elbow")
-        left.legend(loc="upper right")
-        kept = "noise-free components kept" if pixels else "components kept"
-        left.set_title(f"eigenvalues, a line a CCD; dashed: {kept}", loc="left")
-        left.set_ylabel("variance of unit-sum stamps along n")
-        right.set_title("part of the variance beyond n", loc="left")
-        right.set_ylabel("1 - cumulative fraction")
+        spectrum_axes.set_ylim(0.5 * positive.min(), 2.0 * positive.max())
+        fraction_axes.set_ylim(1e-6, 1.0)
+        spectrum_axes.plot([], [], "-o", color=OBSERVED, markersize=3.5, label="observed stars, dot: elbow")
+        spectrum_axes.plot([], [], "-o", color=TRUTH, markersize=3.5, label="noise-free PSFs, dot: elbow")
+        spectrum_axes.legend(loc="upper right")
+        cutoff_label = "noise-free components kept" if pixels else "components kept"
+        spectrum_axes.set_title(f"eigenvalues, a line a CCD; dashed: {cutoff_label}", loc="left")
+        spectrum_axes.set_ylabel("variance of unit-sum stamps along n")
+        fraction_axes.set_title("part of the variance beyond n", loc="left")
+        fraction_axes.set_ylabel("1 - cumulative fraction")
         return png_bytes(figure)
 
 
@@ -101,12 +112,12 @@ def stamps_plot(products: Sequence[CcdProduct], per_ccd: int = 3) -> bytes:
 
     Columns are `per_ccd` stars of each CCD, from the brightest to the faintest.
     """
-    chosen = [(p, i) for p in products for i in _bright_to_faint(p, per_ccd)]
+    shown_stars = [(p, i) for p in products for i in _bright_to_faint(p, per_ccd)]
     with styled():
-        figure = new_figure(1.45 * len(chosen) + 1.3, 5.3)
+        figure = new_figure(1.45 * len(shown_stars) + 1.3, 5.3)
         axes = figure.subplots()
         gallery = StampGallery(axes, products[0].observed_images.shape[1], products[0].pixel_scale)
-        for column, (product, i) in enumerate(chosen):
+        for column, (product, i) in enumerate(shown_stars):
             stars, position = product.observed, np.array([[product.observed.x[i], product.observed.y[i]]])
             model = product.model.at(position)[0]
             observed = np.asarray(product.observed_images[i], dtype=np.float64)
@@ -119,7 +130,7 @@ def stamps_plot(products: Sequence[CcdProduct], per_ccd: int = 3) -> bytes:
                 light = gallery.show(stretched(image / top), row, column, text, cmap="viridis", vmin=_LOW, vmax=1.0)
             residual = SymLogNorm(3.0, vmin=-100.0, vmax=100.0)
             noise = gallery.show(left_over, 2, column, cmap="RdBu_r", norm=residual)
-        gallery.finish(3, len(chosen), ("observed", "model", "observed - model"))
+        gallery.finish(3, len(shown_stars), ("observed", "model", "observed - model"))
         # Beside the two rows, and the one, that they belong to.
         places = [axes.inset_axes((1.005, low, 0.012, high)) for low, high in ((0.42, 0.58), (0.09, 0.28))]
         bar = figure.colorbar(light, cax=places[0], label="over the model's peak (asinh)")

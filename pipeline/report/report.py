@@ -53,5 +53,5 @@ def _model_words(fit: ReconstructionConfig) -> str:
     processes = {"polynomial": "", "gp": "a Gaussian process over ", "kriging": "kriging over "}
     process = processes[resolved_value(fit.interpolation)]
     weights = {"equal": "", "snr": ", weights (S/N)²", "softened": ", weights (S/N)², softened for bright stars"}
-    whole = "; ellipticity and size from one model of the whole focal plane" if fit.model == "focal_plane" else ""
-    return f"{basis}, {process}polynomials of order {fit.order}{weights[resolved_value(fit.weights)]}{whole}"
+    shape_text = "; ellipticity and size from one model of the whole focal plane" if fit.model == "focal_plane" else ""
+    return f"{basis}, {process}polynomials of order {fit.order}{weights[resolved_value(fit.weights)]}{shape_text}"

@@ -31,8 +31,8 @@ def scatter_plot(products: Sequence[CcdStars]) -> bytes:
     )
     with styled():
         figure = new_figure(10.0, 5.2)
-        both = figure.subplots(1, 2, sharex=True, sharey=True)
-        for axes, (title, label, before, after) in zip(both, panels, strict=True):
+        axes_pair = figure.subplots(1, 2, sharex=True, sharey=True)
+        for axes, (title, label, before, after) in zip(axes_pair, panels, strict=True):
             for kind, name in ((before, label), (after, f"{label} - model")):
                 e1, e2 = ellipticities(products, kind)
                 _draw_cloud(axes, e1, e2, _LABELS[kind][0], name)
@@ -41,10 +41,10 @@ def scatter_plot(products: Sequence[CcdStars]) -> bytes:
             axes.set(aspect="equal", xlabel="$e_1$: $(a-b)/(a+b)$ along x")
             axes.set_title(title, loc="left")
             axes.legend(loc="upper right")
-        both[0].set_ylabel("$e_2$: along the diagonal x = y")
+        axes_pair[0].set_ylabel("$e_2$: along the diagonal x = y")
         values = np.concatenate([ellipticities(products, kind) for *_, kind, _ in panels], axis=1)
         edge = 1.1 * float(np.nanmax(np.abs(values)))
-        both[0].set(xlim=(-edge, edge), ylim=(-edge, edge))
+        axes_pair[0].set(xlim=(-edge, edge), ylim=(-edge, edge))
         return png_bytes(figure)
 
 

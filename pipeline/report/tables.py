@@ -54,7 +54,7 @@ CAMERA_COLUMNS = ("ccd", "x_mm", "y_mm", "rotation_deg", "nx", "ny", "raft", "ve
 CAMERA_CAPTION = "Centre on the focal plane, angle from +x towards +y, pixels along x and y of each."
 
 
-def camera_rows(camera: Camera) -> list[tuple[Any, ...]]:
+def camera_rows(camera: Camera) -> list[tuple[str, float, float, float, int, int, str, str]]:
     """Return rows of the CCDs of a camera, in the columns of :data:`CAMERA_COLUMNS`."""
     vendors = camera.vendors or ("",) * len(camera)
     return [
@@ -95,8 +95,8 @@ def models_rows(summary: dict[str, Any]) -> list[tuple[str, ...]]:
     for kind in ("residual", "away"):
         for name, (low, high) in SEPARATION_RANGES.items():
             words = f"{low:g}' to {high:g}'" if low > 0.0 else f"below {high:g}'"
-            both = (_xi_plus(metrics, f"{kind}{end}", name) for end in ("", "_ccd"))
-            rows.append((f"ξ+ of {_NAMES[kind]}, {words}", *both))
+            xi_texts = (_xi_plus(metrics, f"{kind}{end}", name) for end in ("", "_ccd"))
+            rows.append((f"ξ+ of {_NAMES[kind]}, {words}", *xi_texts))
     for key, name in (("left_out", "leave-one-out"), ("away", "at holdout positions")):
         chi2 = {k.rpartition("_")[2]: v for k, v in metrics.items() if k.startswith(f"chi2_{key}_")}
         values = ", ".join(f"{v:.2f}" for v in chi2.values())
@@ -151,7 +151,7 @@ DIAGNOSTICS_CAPTION = (
 )
 
 
-def diagnostics_rows(overall: dict[str, Any]) -> list[tuple[str, ...]]:
+def diagnostics_rows(overall: dict[str, float]) -> list[tuple[str, ...]]:
     """Return a row for each kind of residual, in the columns of :data:`DIAGNOSTICS_COLUMNS`."""
 
     def power(key: str) -> str:
@@ -163,7 +163,7 @@ def diagnostics_rows(overall: dict[str, Any]) -> list[tuple[str, ...]]:
     return [
         (
             name,
-            *(power(f"{what}_{kind}") for what in ("mean_e1", "mean_e2", "rms_e", "mean_dt", "rms_dt")),
+            *(power(f"{statistic}_{kind}") for statistic in ("mean_e1", "mean_e2", "rms_e", "mean_dt", "rms_dt")),
             f"{power(f'largest_{kind}_xi_plus')} ± {power(f'largest_{kind}_error_plus')}",
             f"{r:.1f}" if math.isfinite(r := overall[f"largest_{kind}_r_arcmin"]) else "-",
         )
@@ -204,22 +204,23 @@ ATTRIBUTION_CAPTION = (
 def attribution_rows(metrics: dict[str, dict[str, float]]) -> list[tuple[str, ...]]:
     """Return a row for each case of an attribution, in the columns of :data:`ATTRIBUTION_COLUMNS`."""
 
-    def change(each: dict[str, float]) -> str:
-        if "change_xi_plus_truth_long" not in each:
+    def change(case_metrics: dict[str, float]) -> str:
+        if "change_xi_plus_truth_long" not in case_metrics:
             return "-"
-        value, error = _power(each["change_xi_plus_truth_long"]), _power(each["error_xi_plus_truth_long"])
+        value = _power(case_metrics["change_xi_plus_truth_long"])
+        error = _power(case_metrics["error_xi_plus_truth_long"])
         return f"{value} ± {error}"
 
     return [
         (
             "nothing" if case == "full" else case,
-            *(_percent_number(each[k]) for k in ("rms_e_truth", "rms_residual_at_stars", "rms_residual_away")),
-            _power(each["xi_plus_truth_short"]),
-            _power(each["xi_plus_truth_long"]),
-            change(each),
-            _power(each["xi_plus_away_long"]),
+            *(_percent_number(case_metrics[k]) for k in ("rms_e_truth", "rms_residual_at_stars", "rms_residual_away")),
+            _power(case_metrics["xi_plus_truth_short"]),
+            _power(case_metrics["xi_plus_truth_long"]),
+            change(case_metrics),
+            _power(case_metrics["xi_plus_away_long"]),
         )
-        for case, each in metrics.items()
+        for case, case_metrics in metrics.items()
     ]
 
 

@@ -163,9 +163,13 @@ def displace_stamps(
     boundary_x, boundary_y = (np.concatenate([v - half, v[:, -1:] + half], axis=1) for v in (wide_x, wide_y))
     shift_x = shift_y = np.zeros(1)
     for effect in effects:
-        own = effect.at(*places.T)
-        shift_x = shift_x + own[:, 0, None, None] - effect.at(boundary_x[:, None, :], wide_y[:, :, None])[..., 0]
-        shift_y = shift_y + own[:, 1, None, None] - effect.at(wide_x[:, None, :], boundary_y[:, :, None])[..., 1]
+        middle_shift = effect.at(*places.T)
+        shift_x = (
+            shift_x + middle_shift[:, 0, None, None] - effect.at(boundary_x[:, None, :], wide_y[:, :, None])[..., 0]
+        )
+        shift_y = (
+            shift_y + middle_shift[:, 1, None, None] - effect.at(wide_x[:, None, :], boundary_y[:, :, None])[..., 1]
+        )
     return without_rim(collect(padded, shift_x / pixel_size, shift_y / pixel_size))
 
 

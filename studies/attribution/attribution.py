@@ -74,32 +74,32 @@ def attribute(
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
     full = Experiment.from_config(config)
-    chosen = checked_causes(full.config, causes)
+    cause_names = checked_causes(full.config, causes)
     check_memory(full, threads)
     stars: dict[str, dict[str, CcdStars]] = {}
     left_out: dict[str, str] = {}
     with full.screens(threads, reporter):
-        for case in [FULL, *(c for c in chosen if c != NOISE)]:
+        for case in [FULL, *(c for c in cause_names if c != NOISE)]:
             # No experiment outlives its case: its atmosphere would hold the screens.
-            found, failed = _stars_by_case(
+            case_stars, failed = _stars_by_case(
                 full if case == FULL else without_cause(full, case),
                 case,
-                NOISE in chosen and case == FULL,
+                NOISE in cause_names and case == FULL,
                 threads,
                 reporter,
             )
-            stars |= found
+            stars |= case_stars
             left_out |= {name: reason for name, reason in failed.items() if name not in left_out}
     if not stars[FULL].keys() - left_out:
         name, reason = next(iter(left_out.items()))
         raise DomainError(f"{reason}; no CCD can be modelled in all cases", subject=f"CCD {name}")
     correlated, metrics = {}, {}
-    order = (FULL, *chosen)
+    order = (FULL, *cause_names)
     for case in order:
-        same = [each for name, each in stars[case].items() if name not in left_out]
-        correlated[case] = correlations(same, same[0].kinds)
-        metrics[case] = _case_metrics(same, correlated[case])
-    for case in chosen:
+        common_stars = [ccd_stars for name, ccd_stars in stars[case].items() if name not in left_out]
+        correlated[case] = correlations(common_stars, common_stars[0].kinds)
+        metrics[case] = _case_metrics(common_stars, correlated[case])
+    for case in cause_names:
         metrics[case] |= changes(metrics[FULL], metrics[case], correlated[FULL], correlated[case])
     return Attribution(metrics, correlated, left_out)
 
@@ -118,22 +118,24 @@ def _stars_by_case(
 ) -> tuple[dict[str, dict[str, CcdStars]], dict[str, str]]:
     """Return the stars by case and CCD, the same without noise too; and the reasons of CCDs that are not modelled."""
     kinds = {case: True, NOISE: False} if noiseless else {case: True}
-    whole = experiment.config.reconstruction.model == "focal_plane"
+    focal_plane_model = experiment.config.reconstruction.model == "focal_plane"
 
     def model(exposure: CcdExposure) -> list[CcdStars]:
         products = [model_ccd(experiment, exposure, noisy=noisy) for noisy in kinds.values()]
         # A focal-plane model takes the noise of the stars from their stamps.
-        return [replace(p, holdout_images=p.holdout_images[:0]) if whole else p.ccd_stars for p in products]
+        return [replace(p, holdout_images=p.holdout_images[:0]) if focal_plane_model else p.ccd_stars for p in products]
 
     title = "everything on" if case == FULL else f"{case} off"
-    done = simulate_ccds(experiment, model, title=title, strict=False, threads=threads, reporter=reporter)
-    found = {kind: {name: each[i] for name, each in done.results.items()} for i, kind in enumerate(kinds)}
-    if whole and done.results:
-        for kind, each in found.items():
-            products = [p for p in each.values() if isinstance(p, CcdProduct)]
+    simulated = simulate_ccds(experiment, model, title=title, strict=False, threads=threads, reporter=reporter)
+    stars_by_kind = {
+        kind: {name: stars[i] for name, stars in simulated.results.items()} for i, kind in enumerate(kinds)
+    }
+    if focal_plane_model and simulated.results:
+        for kind, ccd_stars in stars_by_kind.items():
+            products = [p for p in ccd_stars.values() if isinstance(p, CcdProduct)]
             applied, _ = apply_focal_plane_model(experiment, products, threads=threads, reporter=reporter)
-            found[kind] = {product.name: product.ccd_stars for product in applied}
-    return found, done.not_modelled
+            stars_by_kind[kind] = {product.name: product.ccd_stars for product in applied}
+    return stars_by_kind, simulated.not_modelled
 
 
 def _case_metrics(stars: Sequence[CcdStars], correlated: dict[str, Correlation]) -> dict[str, float]:
@@ -159,14 +161,17 @@ def changes(
 
     The stars are the same in both, so that errors in common cancel.
     """
-    found = {f"change_{key}": full[key] - case[key] for key in case}
+    change_metrics = {f"change_{key}": full[key] - case[key] for key in case}
     for kind in (k for k in (*_XI, *CCD_KINDS) if k in with_all):
         for name in SEPARATION_RANGES:
-            one, other = with_all[kind], without[kind]
+            full_correlation, case_correlation = with_all[kind], without[kind]
             error = np.nan
-            if one.n_patches and one.n_patches == other.n_patches:
+            if full_correlation.n_patches and full_correlation.n_patches == case_correlation.n_patches:
                 error = float(
-                    jackknife_error(one.leave_one_out_mean_xi_plus(name) - other.leave_one_out_mean_xi_plus(name))
+                    jackknife_error(
+                        full_correlation.leave_one_out_mean_xi_plus(name)
+                        - case_correlation.leave_one_out_mean_xi_plus(name)
+                    )
                 )
-            found[f"error_xi_plus_{kind}_{name}"] = error
-    return found
+            change_metrics[f"error_xi_plus_{kind}_{name}"] = error
+    return change_metrics

@@ -13,8 +13,12 @@ from ...pipeline.config import Configuration, with_options
 from ...pipeline.resolved_values import resolved_value
 from ...wavefront.psf.engines import ENGINES
 
-#: Name of the case with all causes, and of the two causes that are no options of the configuration.
-FULL, NOISE, OPTICS = "full", "noise", "optics"
+#: Name of the case with all causes.
+FULL = "full"
+#: Name of the noise of the stars as a cause, which is no option of the configuration.
+NOISE = "noise"
+#: Name of the optics as a cause, which are no option of the configuration.
+OPTICS = "optics"
 #: Altitude to which the ground layer is lifted [m]: about that of the next one over Cerro Pachon.
 GROUND_LIFT = 2500.0
 

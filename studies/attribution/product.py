@@ -23,12 +23,16 @@ from .causes import FULL
 
 def write_attribution(result: Attribution, folder: Path, config: Configuration) -> tuple[str, ...]:
     """Write metrics, correlations, plot and configuration; return the names of the files."""
-    keys = list(dict.fromkeys(key for each in result.metrics.values() for key in each))
+    keys = list(dict.fromkeys(key for case_metrics in result.metrics.values() for key in case_metrics))
     columns = {"off": (np.array(list(result.metrics)), "", "cause that is switched off, or full")}
     for key in keys:
         values = np.array([case.get(key, np.nan) for case in result.metrics.values()])
         columns[key] = (values, "arcsec" if key.endswith("arcsec") else "", _metric_description(key))
-    xi = {f"{case} {kind}": c for case, each in result.correlations.items() for kind, c in each.items()}
+    xi = {
+        f"{case} {kind}": correlation
+        for case, case_correlations in result.correlations.items()
+        for kind, correlation in case_correlations.items()
+    }
     return write_products(
         folder,
         {
@@ -81,8 +85,8 @@ def attribution_plot(
             (panels[1, 0], "truth", "$|\\xi_+|$ of the noise-free PSFs"),
             (panels[1, 1], "away", "$|\\xi_+|$ of noise-free - model, at holdout positions"),
         ):
-            for case, each in correlations.items():
-                _draw_curve(axes, each[kind], colors[case], case)
+            for case, case_correlations in correlations.items():
+                _draw_curve(axes, case_correlations[kind], colors[case], case)
             log_axes(axes, f"{title}; open: negative")
             axes.set_xlabel("separation [arcmin]")
         handles, labels = panels[1, 0].get_legend_handles_labels()
@@ -98,7 +102,7 @@ def _draw_bars(axes: Axes, metrics: Mapping[str, Mapping[str, float]], keys: tup
     rows = np.arange(len(metrics))
     height = 0.7 / len(keys)
     for i, (key, color, label) in enumerate(keys):
-        values = [each[key] for each in metrics.values()]
+        values = [case_metrics[key] for case_metrics in metrics.values()]
         axes.barh(rows + (i - 0.5 * (len(keys) - 1)) * height, values, 0.9 * height, color=color, label=label)
         axes.axvline(metrics[FULL][key], color=color, linewidth=0.8, linestyle=(0, (3, 2)))
     axes.set_yticks(rows, [_title(case) for case in metrics])
@@ -110,8 +114,8 @@ def _draw_bars(axes: Axes, metrics: Mapping[str, Mapping[str, float]], keys: tup
 
 def _draw_curve(axes: Axes, correlation: Correlation, color: object, case: str) -> None:
     r, xi = correlation.r_arcmin, correlation.xi_plus
-    some = np.isfinite(xi) & (xi != 0.0)
+    nonzero = np.isfinite(xi) & (xi != 0.0)
     width = 1.8 if case == FULL else 0.9
-    axes.plot(r[some], np.abs(xi[some]), "-", color=color, linewidth=width, label=_title(case))
-    for chosen, face in ((some & (xi > 0.0), color), (some & (xi < 0.0), "white")):
-        axes.plot(r[chosen], np.abs(xi[chosen]), "o", color=color, markersize=3.5, markerfacecolor=face)
+    axes.plot(r[nonzero], np.abs(xi[nonzero]), "-", color=color, linewidth=width, label=_title(case))
+    for sign_mask, face in ((nonzero & (xi > 0.0), color), (nonzero & (xi < 0.0), "white")):
+        axes.plot(r[sign_mask], np.abs(xi[sign_mask]), "o", color=color, markersize=3.5, markerfacecolor=face)

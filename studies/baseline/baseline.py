@@ -110,27 +110,27 @@ def make_baseline(
     experiment = None if configuration is None else _experiment(configuration, _absolute_path(model, Path()), telescope)
     plan = make_plan(telescope, experiment, fields, wavelengths, ccds, pupil)
     scene = Scene(telescope if experiment is None else experiment.telescope, experiment, plan, threads)
-    found, left_out = _measured_metrics(scene, OPTICS if experiment is None else {**OPTICS, **CAMERA}, progress)
-    if not found:
+    measurements, left_out = _measured_metrics(scene, OPTICS if experiment is None else {**OPTICS, **CAMERA}, progress)
+    if not measurements:
         raise ConfigError(f"{model}: no metric can be computed ({next(iter(left_out.values()))})")
 
     def stored(name: str, value: float, tolerance: float, metric: Metric) -> BaselineMetric:
         against = next((text for start, text in (checked or {}).items() if name.startswith(start)), None)
-        given = given_tolerance(tolerance_rules, name, metric.unit, value, tolerance)
+        stated_tolerance = given_tolerance(tolerance_rules, name, metric.unit, value, tolerance)
         return BaselineMetric(
             # Digits of the metric's own tolerance: a given one says what matters, not what is known.
             value=rounded(value, tolerance),
             unit=metric.unit,
-            tolerance=tolerance if given is None else given,
+            tolerance=tolerance if stated_tolerance is None else stated_tolerance,
             limit=given_limit(limit_rules, name, metric.unit),
-            reason=metric.reason if given is None else "given",
+            reason=metric.reason if stated_tolerance is None else "given",
             checked_against=against,
         )
 
     for rules in (tolerance_rules, limit_rules):
-        check_used(rules, found, left_out)
+        check_used(rules, measurements, left_out)
 
-    metrics = {name: stored(name, *each) for name, each in found.items()}
+    metrics = {name: stored(name, *measurement) for name, measurement in measurements.items()}
     baseline = Baseline(
         **_input_stamps(telescope, experiment),
         model=_relative_path(model, folder, BUNDLED),
@@ -174,18 +174,18 @@ def check_baseline(
     name, telescope, experiment = _checked_telescope(path, baseline, model, configuration)
     scene = Scene(telescope if experiment is None else experiment.telescope, experiment, baseline.plan, threads)
     stored = {key.partition(" ")[0] for key in baseline.figures}
-    groups = {group: each for group, each in {**OPTICS, **CAMERA}.items() if group in stored}
-    found, problems = _measured_metrics(scene, groups, progress)
+    groups = {key: group for key, group in {**OPTICS, **CAMERA}.items() if key in stored}
+    measurements, problems = _measured_metrics(scene, groups, progress)
 
     def deviation(key: str, metric: BaselineMetric) -> Deviation:
-        now = found[key][0] if key in found else None
-        problem = None if key in found else problems.get(key.partition(" ")[0], "no such metric")
+        present_value = measurements[key][0] if key in measurements else None
+        problem = None if key in measurements else problems.get(key.partition(" ")[0], "no such metric")
         against, limit = metric.checked_against, metric.limit
-        return Deviation(key, metric.unit, metric.value, metric.tolerance, now, against, problem, limit)
+        return Deviation(key, metric.unit, metric.value, metric.tolerance, present_value, against, problem, limit)
 
     deviations = sorted((deviation(*item) for item in baseline.figures.items()), key=lambda d: (-d.ratio, d.name))
-    now = _input_stamps(telescope, experiment)
-    changed = tuple(name for name, key in _STAMPS.items() if now[key] != getattr(baseline, key))
+    present_stamps = _input_stamps(telescope, experiment)
+    changed = tuple(name for name, key in _STAMPS.items() if present_stamps[key] != getattr(baseline, key))
     return BaselineCheck(str(path), name, tuple(deviations), _input_changes(baseline, changed), changed)
 
 
@@ -210,21 +210,21 @@ def updated_baseline(
 
 
 def _measured_metrics(
-    scene: Scene, groups: Mapping[str, MetricGroup], progress: Callable[[int], None] | None
+    scene: Scene, groups: Mapping[str, MetricGroup[Scene]], progress: Callable[[int], None] | None
 ) -> tuple[dict[str, tuple[float, float, Metric]], dict[str, str]]:
     """Return finite values, tolerances and metrics by name, and the problems of groups that fail."""
-    found: dict[str, tuple[float, float, Metric]] = {}
+    measurements: dict[str, tuple[float, float, Metric]] = {}
     problems: dict[str, str] = {}
     for name, group in groups.items():
         try:
             values = {key: value for key, value in group.compute(scene).items() if np.isfinite(value)}
             metrics = {key: group.metric(key) for key in values}
-            found |= {key: (v, metrics[key].tolerance_of(scene, v), metrics[key]) for key, v in values.items()}
+            measurements |= {key: (v, metrics[key].tolerance_of(scene, v), metrics[key]) for key, v in values.items()}
         except PachonError as error:
             problems[name] = str(error)
         if progress is not None:
             progress(1)
-    return found, problems
+    return measurements, problems
 
 
 def prescription_hash(telescope: Telescope) -> str:
@@ -239,12 +239,12 @@ def _checked_telescope(
     configuration: str | os.PathLike[str] | None,
 ) -> tuple[str, Telescope, Experiment | None]:
     """Return the name of the telescope to check, itself, and the experiment with it."""
-    own = _absolute_path(baseline.model, path.parent)
+    stored_model = _absolute_path(baseline.model, path.parent)
     if isinstance(model, Telescope):
-        name, source, telescope = model.name, own, model
+        name, source, telescope = model.name, stored_model, model
     else:
         name = baseline.model if model is None else os.fspath(model)
-        source = own if model is None else _absolute_path(name, Path())
+        source = stored_model if model is None else _absolute_path(name, Path())
         try:
             telescope = load_telescope(source)
         except PachonError as error:

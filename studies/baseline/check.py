@@ -17,11 +17,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Rows of a table that are shown by default; fewer where all metrics pass.
-_SHOWN, _SHOWN_PASSED = 20, 3
+#: Rows of the table of a cause that are shown by default.
+_SHOWN = 20
+#: Rows that are shown by default where all metrics pass.
+_SHOWN_PASSED = 3
 _COLUMNS = ("metric", "now", "baseline", "tolerance", "limit", "unit", "deviation / tolerance", "checked against")
-#: Causes of failures besides drift, which :attr:`BaselineCheck.drift` names.
-BROKEN, MISSING = "requirement broken", "metric missing"
+#: Cause of failures besides drift (:attr:`BaselineCheck.drift`): a limit is exceeded.
+BROKEN = "requirement broken"
+#: Cause of failures besides drift: a metric cannot be computed.
+MISSING = "metric missing"
 
 
 @dataclass(frozen=True)
@@ -73,10 +77,10 @@ class Deviation:
     def texts(self) -> list[str]:
         """Return its row of a table."""
         digits = max(0, 1 - int(np.floor(np.log10(self.tolerance))))
-        found = self.problem or "none" if self.found is None else f"{self.found:.{digits}f}"
+        value = self.problem or "none" if self.found is None else f"{self.found:.{digits}f}"
         ratio = f"{self.ratio:.2f}" if self.ratio < 1e4 else f"{self.ratio:.1e}"
         against, limit = self.checked_against or "", "" if self.limit is None else str(self.limit)
-        return [self.name, found, f"{self.stored:.{digits}f}", f"{self.tolerance:g}", limit, self.unit, ratio, against]
+        return [self.name, value, f"{self.stored:.{digits}f}", f"{self.tolerance:g}", limit, self.unit, ratio, against]
 
 
 @dataclass(frozen=True)
@@ -129,10 +133,10 @@ class BaselineCheck(Result):
     @property
     def causes(self) -> dict[str, tuple[Deviation, ...]]:
         """Failures by their causes, each once: broken requirements, missing metrics, drift."""
-        found: dict[str, list[Deviation]] = {BROKEN: [], MISSING: [], self.drift: []}
+        failures: dict[str, list[Deviation]] = {BROKEN: [], MISSING: [], self.drift: []}
         for d in self.out:
-            found[BROKEN if d.broken else MISSING if d.found is None else self.drift].append(d)
-        return {cause: tuple(each) for cause, each in found.items() if each}
+            failures[BROKEN if d.broken else MISSING if d.found is None else self.drift].append(d)
+        return {cause: tuple(deviations) for cause, deviations in failures.items() if deviations}
 
     @property
     def verdict(self) -> str:
@@ -153,9 +157,9 @@ class BaselineCheck(Result):
         texts = {
             name: [getattr(d, name) or "" for d in rows] for name in ("name", "unit", "checked_against", "problem")
         }
-        found = [np.nan if d.found is None else d.found for d in rows]
+        values = [np.nan if d.found is None else d.found for d in rows]
         numbers = {name: [getattr(d, name) for d in rows] for name in ("stored", "tolerance", "ratio")}
-        return {"name": texts["name"], "unit": texts.pop("unit"), "found": found, **numbers, **texts}
+        return {"name": texts["name"], "unit": texts.pop("unit"), "found": values, **numbers, **texts}
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw the change of each metric in units of its tolerance, the worst twenty."""
@@ -172,7 +176,7 @@ class BaselineCheck(Result):
 
     def _summary(self) -> dict[str, Any]:
         """Return the result as plain numbers, deviations worst first."""
-        cause = {d.name: name for name, each in self.causes.items() for d in each}
+        cause = {d.name: name for name, failures in self.causes.items() for d in failures}
         return {
             "baseline": self.path,
             "model": self.model,
@@ -180,7 +184,7 @@ class BaselineCheck(Result):
             "figures": len(self.deviations),
             "out": len(self.out),
             "notes": list(self.notes),
-            "causes": {name: len(each) for name, each in self.causes.items()},
+            "causes": {name: len(failures) for name, failures in self.causes.items()},
             "deviations": [
                 {
                     **vars(d),
@@ -201,10 +205,10 @@ class BaselineCheck(Result):
         groups = self.causes
         if everything:
             groups["within"] = tuple(d for d in self.deviations if not (d.moved or d.broken))
-        for name, each in groups.items():
-            kinds = Counter(d.name.partition(" ")[0] for d in each)
+        for name, group in groups.items():
+            kinds = Counter(d.name.partition(" ")[0] for d in group)
             lines.append(f"{name}: {', '.join(f'{kind} {count}' for kind, count in kinds.items()) or 'none'}")
-            lines += _table(each[: None if everything else _SHOWN])
+            lines += _table(group[: None if everything else _SHOWN])
         return "\n".join(lines)
 
 

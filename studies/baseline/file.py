@@ -85,19 +85,22 @@ def read_baseline(path: str | os.PathLike[str]) -> Baseline:
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"no JSON ({error})", file=path) from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        found = content.get("format") if isinstance(content, dict) else type(content).__name__
-        raise ConfigError(f"format = {found!r}: expected {FORMAT!r}, as pachon baseline save writes it", file=path)
+        file_format = content.get("format") if isinstance(content, dict) else type(content).__name__
+        raise ConfigError(
+            f"format = {file_format!r}: expected {FORMAT!r}, as pachon baseline save writes it", file=path
+        )
     if content.get("version") not in VERSIONS:
-        found, writer = content.get("version"), content.get("pachon")
+        file_version, writer = content.get("version"), content.get("pachon")
         problem = (
-            f"version = {found!r}: expected {VERSIONS[0]} or {VERSIONS[1]}; the file was written by pachon {writer}"
+            f"version = {file_version!r}: expected {VERSIONS[0]} or {VERSIONS[1]};"
+            f" the file was written by pachon {writer}"
         )
         raise ConfigError(problem, file=path, key="version")
     baseline = validated(Baseline, content, str(path))
     for name, figure in baseline.figures.items():
         if figure.reason not in baseline.reasons:
-            known = ", ".join(baseline.reasons)
-            raise ConfigError(f"figures.{name}.reason = {figure.reason!r}: expected one of {known}", file=path)
+            reason_names = ", ".join(baseline.reasons)
+            raise ConfigError(f"figures.{name}.reason = {figure.reason!r}: expected one of {reason_names}", file=path)
     return baseline
 
 

@@ -75,15 +75,15 @@ def parse_rules(option: str, texts: Sequence[str]) -> tuple[Rule, ...]:
     return tuple(sorted(rules, key=lambda rule: len(rule.start)))
 
 
-def given_tolerance(rules: Sequence[Rule], name: str, unit: str, value: float, own: float) -> float | None:
+def given_tolerance(rules: Sequence[Rule], name: str, unit: str, value: float, least: float) -> float | None:
     """Return the tolerance of the last rule that applies to a metric; None without one.
 
-    A percentage is a part of the value, but never less than the metric's `own` tolerance, below which rounding moves
-    it.
+    A percentage is a part of the value, but never less than `least`, the metric's own tolerance, below which rounding
+    moves it.
     """
     for rule in reversed(rules):
         if rule.applies_to(name):
-            return max(own, abs(value) * rule.number / 100.0) if rule.unit == "%" else rule.amount(name, unit)
+            return max(least, abs(value) * rule.number / 100.0) if rule.unit == "%" else rule.amount(name, unit)
     return None
 
 

@@ -16,9 +16,11 @@ from .metric import Metric, MetricTable
 from .scene import Scene
 
 #: Metrics of a telescope with a configuration.
-CAMERA = MetricTable()
-#: Ring of the pupil on which the defocus is taken, in units of the radius, and its points.
-_RING, _RING_POINTS = 0.9, 8
+CAMERA: MetricTable[Scene] = MetricTable()
+#: Radius of the ring of the pupil on which the defocus is taken, in units of that of the pupil.
+_RING = 0.9
+#: Points of the ring.
+_RING_POINTS = 8
 
 
 @CAMERA.group("height", Metric("height", "um", "height", 1e-6))
@@ -73,8 +75,8 @@ def reconstruction(scene: Scene) -> dict[str, float]:
     ]
     if together:
         products, _ = apply_focal_plane_model(experiment, products, threads=scene.threads)
-    found = ccd_metrics(products[0])
+    metrics = ccd_metrics(products[0])
     return {
-        f"reconstruction {name} {key.replace('_', ' ')}": float(found[key])
+        f"reconstruction {name} {key.replace('_', ' ')}": float(metrics[key])
         for key in ("mean_e_truth", "rms_residual_at_stars", "rms_residual_away")
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Generic, TypeVar
 
 from .scene import Scene
 
@@ -20,6 +20,7 @@ REASONS = {
     "model": "Singular vectors of float32 stamps: those of the smallest singular values are theirs to rounding.",
     "given": "Given when the baseline was saved.",
 }
+S = TypeVar("S")  #: kind of scene from which a table computes its metrics
 _PER_METRE = {"m": 1.0, "mm": 1e3, "um": 1e6, "nm": 1e9}
 
 
@@ -42,10 +43,10 @@ class Metric:
 
 
 @dataclass(frozen=True)
-class MetricGroup:
+class MetricGroup(Generic[S]):
     """Metrics that are computed together, from a scene to values by name."""
 
-    compute: Callable[[Any], dict[str, float]]
+    compute: Callable[[S], dict[str, float]]
     metrics: tuple[Metric, ...]
 
     def metric(self, name: str) -> Metric:
@@ -53,15 +54,15 @@ class MetricGroup:
         return next(m for m in self.metrics if name.startswith(m.name))
 
 
-class MetricTable(dict[str, MetricGroup]):
+class MetricTable(dict[str, MetricGroup[S]], Generic[S]):
     """Groups of metrics by name."""
 
     def group(
         self, name: str, *metrics: Metric
-    ) -> Callable[[Callable[[Any], dict[str, float]]], Callable[[Any], dict[str, float]]]:
+    ) -> Callable[[Callable[[S], dict[str, float]]], Callable[[S], dict[str, float]]]:
         """Return a decorator that adds a function of a scene as a group of metrics."""
 
-        def add(compute: Callable[[Any], dict[str, float]]) -> Callable[[Any], dict[str, float]]:
+        def add(compute: Callable[[S], dict[str, float]]) -> Callable[[S], dict[str, float]]:
             self[name] = MetricGroup(compute, metrics)
             return compute
 
@@ -69,8 +70,8 @@ class MetricTable(dict[str, MetricGroup]):
 
     def metric(self, name: str) -> Metric | None:
         """Return the metric of a value: of those whose names start its own, the longest; None where there is none."""
-        found = [m for group in self.values() for m in group.metrics if name.startswith(m.name)]
-        return max(found, key=lambda m: len(m.name), default=None)
+        matching_metrics = [m for group in self.values() for m in group.metrics if name.startswith(m.name)]
+        return max(matching_metrics, key=lambda m: len(m.name), default=None)
 
 
 #: Metrics of the light that reaches the detector, of stars and of bare telescopes.

@@ -15,12 +15,14 @@ from .metric import Metric, MetricTable
 from .scene import Scene, one_digit
 
 #: Metrics of a telescope alone.
-OPTICS = MetricTable()
+OPTICS: MetricTable[Scene] = MetricTable()
 #: Highest Zernike term, Noll.
 _HIGHEST = 15
-#: Pixels on a side of the images for the encircled energy, and points across the pupil. Adaptive numbers would grow
-#: with the spots of a faulty telescope, to minutes of computing.
-_EE_PIXELS, _EE_POINTS = 96, 192
+#: Pixels on a side of the images for the encircled energy. An adaptive number would grow with the spots of a faulty
+#: telescope, to minutes of computing.
+_EE_PIXELS = 96
+#: Points across the pupil for the encircled energy, fixed for the same reason.
+_EE_POINTS = 192
 #: Rays of each field for vignetting.
 _VIGNETTING_RAYS = 4096
 #: Slope over which the scale on the axis is taken [rad].
@@ -109,22 +111,26 @@ def ee80(scene: Scene) -> dict[str, float]:
 )
 def distortion(scene: Scene) -> dict[str, float]:
     """Return scale and distortion of the chief rays over the field of view."""
-    found = scene.distortion
+    field_distortion = scene.distortion
     return {
-        "distortion focal length": found.focal_length,
-        "distortion axis focal length": found.axis_focal_length,
-        "distortion largest percent of axis scale": float(np.nanmax(np.abs(found.percent_of_axis_scale), initial=0.0)),
-        "distortion rms shift": found.rms_shift * 1e6,
+        "distortion focal length": field_distortion.focal_length,
+        "distortion axis focal length": field_distortion.axis_focal_length,
+        "distortion largest percent of axis scale": float(
+            np.nanmax(np.abs(field_distortion.percent_of_axis_scale), initial=0.0)
+        ),
+        "distortion rms shift": field_distortion.rms_shift * 1e6,
     }
 
 
 @OPTICS.group("vignetting", Metric("vignetting lit fraction", "", "edge", one_digit(1.5 / _VIGNETTING_RAYS)))
 def lit_fraction(scene: Scene) -> dict[str, float]:
     """Return the fraction of the pupil that lights the detector at the middle wavelength."""
-    found = vignetting(scene.telescope, scene.fields, scene.middle, n_pupil=_VIGNETTING_RAYS, threads=scene.threads)
+    pupil_vignetting = vignetting(
+        scene.telescope, scene.fields, scene.middle, n_pupil=_VIGNETTING_RAYS, threads=scene.threads
+    )
     return {
         f"vignetting lit fraction field {_pair_text(place)}": float(value)
-        for value, place in zip(found.lit_fraction, scene.plan.fields_deg, strict=True)
+        for value, place in zip(pupil_vignetting.lit_fraction, scene.plan.fields_deg, strict=True)
     }
 
 

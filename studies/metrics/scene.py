@@ -71,14 +71,14 @@ def make_plan(
         ]
     names: Sequence[str] = ()
     if experiment is not None:
-        known = experiment.camera.ccd_names
-        count = min(_CCDS, len(known))
-        spread = [(2 * k + 1) * len(known) // (2 * count) for k in range(count)]
+        camera_ccds = experiment.camera.ccd_names
+        count = min(_CCDS, len(camera_ccds))
+        spread = [(2 * k + 1) * len(camera_ccds) // (2 * count) for k in range(count)]
         # The first is modelled: neither in the middle nor where much of the pupil is vignetted.
-        names = [known[i] for i in (*spread[1:], spread[0])] if ccds is None else ccds
+        names = [camera_ccds[i] for i in (*spread[1:], spread[0])] if ccds is None else ccds
         for name in names:
-            if name not in known:
-                raise unknown_name("CCD", name, known)
+            if name not in camera_ccds:
+                raise unknown_name("CCD", name, camera_ccds)
     elif ccds is not None:
         raise ConfigError("ccds: expected a configuration, for the focal plane that they lie in")
     return Plan(

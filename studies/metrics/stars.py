@@ -26,7 +26,7 @@ from .metric import THROUGHPUT, Metric, MetricTable
 from .scene import Scene
 
 #: Metrics of the stars on the CCDs of a configuration.
-STARS = MetricTable()
+STARS: MetricTable[Scene] = MetricTable()
 #: Rings of field angle of the mean ellipticity [deg].
 _RINGS = ((0.0, 0.5), (0.5, 1.0), (1.0, 1.5), (1.5, 1.8))
 #: Zernike terms of the wavefront, Noll.
@@ -145,9 +145,9 @@ def correlation(scene: Scene) -> dict[str, float]:
 )
 def correlation_bins(scene: Scene) -> dict[str, float]:
     """Return xi+ and xi- of each bin of separation."""
-    found = scene.correlation
-    plus = {f"xi_plus_{r:.3g}_arcmin": float(v) for r, v in zip(found.r_arcmin, found.xi_plus, strict=True)}
-    minus = {f"xi_minus_{r:.3g}_arcmin": float(v) for r, v in zip(found.r_arcmin, found.xi_minus, strict=True)}
+    xi = scene.correlation
+    plus = {f"xi_plus_{r:.3g}_arcmin": float(v) for r, v in zip(xi.r_arcmin, xi.xi_plus, strict=True)}
+    minus = {f"xi_minus_{r:.3g}_arcmin": float(v) for r, v in zip(xi.r_arcmin, xi.xi_minus, strict=True)}
     return plus | minus
 
 
@@ -168,10 +168,10 @@ def reconstruction(scene: Scene) -> dict[str, float]:
     products = list(simulated.results.values())
     if experiment.config.reconstruction.model == "focal_plane":
         products, _ = apply_focal_plane_model(experiment, products, threads=scene.threads)
-    found = correlations(products, ("residual", "away"))
-    together = run_metrics(products, found)["all"]
+    correlated = correlations(products, ("residual", "away"))
+    together = run_metrics(products, correlated)["all"]
     metrics = {
-        f"xi_{kind}_{name}": found[kind].mean_xi_plus(name)
+        f"xi_{kind}_{name}": correlated[kind].mean_xi_plus(name)
         for kind in ("residual", "away")
         for name in SEPARATION_RANGES
     }
@@ -214,10 +214,10 @@ def zernikes(scene: Scene) -> dict[str, float]:
     angles = telescope.field_radius * np.array([0.0, 0.5, 0.95])
     fields = {(0.0, 0.0), *((a, 0.0) for a in angles), *((0.0, a) for a in angles)}
     wavelength = float(wavelengths[len(wavelengths) // 2])
-    found = []
+    field_coefficients = []
     for field in sorted(fields):
         opd = wavefront_opd(telescope, field, wavelength, grid=48, threads=scene.threads)
         fit = fit_zernikes(opd, 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration, jmax=22)
-        found.append(fit.coefficients)
-    rms = np.sqrt(np.mean(np.square(found), axis=0)) * 1e9
+        field_coefficients.append(fit.coefficients)
+    rms = np.sqrt(np.mean(np.square(field_coefficients), axis=0)) * 1e9
     return {f"Z{j}_nm": float(rms[j - 1]) for j in _ZERNIKES}

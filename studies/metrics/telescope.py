@@ -19,11 +19,19 @@ from ...wavefront.request import Request
 from .metric import THROUGHPUT, Metric, MetricTable
 
 #: Metrics of a telescope without a camera.
-TELESCOPE_METRICS = MetricTable()
-#: Rings of pupil points, pixels of the images of encircled energy, points across the pupil, rays for the throughput.
-_RINGS, _PIXELS, _ACROSS, _RAYS = 6, 96, 192, 4096
-#: Fraction of the light, and contrast.
-_ENERGY, _CONTRAST = 0.8, 0.5
+TELESCOPE_METRICS: MetricTable[TelescopeScene] = MetricTable()
+#: Rings of pupil points for spots and wavefront.
+_RINGS = 6
+#: Pixels on a side of the images for the encircled energy.
+_PIXELS = 96
+#: Points across the pupil for the encircled energy.
+_ACROSS = 192
+#: Rays of each field for the throughput.
+_RAYS = 4096
+#: Fraction of the light within the radius of encircled energy.
+_ENERGY = 0.8
+#: Contrast at the frequency of the modulation transfer.
+_CONTRAST = 0.5
 
 
 @dataclass(frozen=True)
@@ -87,9 +95,11 @@ def ee80(scene: TelescopeScene) -> dict[str, float]:
 )
 def transfer(scene: TelescopeScene) -> dict[str, float]:
     """Return the frequency at which the contrast falls to a half, mean and least over fields and two directions."""
-    found = mtf(scene.telescope, scene.fields, scene.wavelengths, threads=scene.threads).frequency_at(_CONTRAST) * 1e-3
-    mean = float(scene.request.field_weights @ found.reshape(len(found), -1).mean(axis=1))
-    return {"mtf50_per_mm": mean, "mtf50_worst_per_mm": float(found.min())}
+    frequencies = (
+        mtf(scene.telescope, scene.fields, scene.wavelengths, threads=scene.threads).frequency_at(_CONTRAST) * 1e-3
+    )
+    mean = float(scene.request.field_weights @ frequencies.reshape(len(frequencies), -1).mean(axis=1))
+    return {"mtf50_per_mm": mean, "mtf50_worst_per_mm": float(frequencies.min())}
 
 
 @TELESCOPE_METRICS.group("throughput", *THROUGHPUT)

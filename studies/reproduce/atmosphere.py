@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -27,7 +26,10 @@ from .figure import EcsvData, FitsData, Reproduced, figure
 _SITE = "cerro_pachon"
 _TIMES = (0.0, 0.5, 1.0, 2.0, 5.0, 15.0)
 _SPECKLE_WAVELENGTH = 600e-9
-_SPECKLE_PIXEL, _SPECKLE_STAMP = 0.02, 125
+#: Side of a pixel of the speckle images [arcsec].
+_SPECKLE_PIXEL = 0.02
+#: Pixels along a side of the speckle images.
+_SPECKLE_STAMP = 125
 #: Pixels of the width over those of the speckles: single speckles do not define a width.
 _SPECKLE_BLOCK = 5
 #: FWHM of the weight of the moments [rad].
@@ -37,7 +39,10 @@ _VISIT = 15.0
 _WAVELENGTH = 620e-9
 #: Half the side of a CCD on the sky [rad].
 _HALF_CCD = 6.8 * ARCMIN
-_PAIRS: dict[str, Any] = {"min_sep": 0.3 * ARCMIN, "max_sep": 12.0 * ARCMIN, "n_bins": 9}
+#: Separations at which the bins of the correlation begin and end [rad].
+_SEPARATIONS = (0.3 * ARCMIN, 12.0 * ARCMIN)
+#: Bins of separation.
+_BINS = 9
 _COLORS = ("#b8b8b8", "#7fa8d1", "#1f6fbf", "#0b2a55")
 
 
@@ -65,20 +70,20 @@ def speckles(bench: Bench) -> Reproduced:
     for time in _TIMES:
         # An exposure goes on from the one before, so it is their sum, and no moment is computed twice.
         steps = max(1, round(time / air.exposure * len(air.times)))
-        new = air.times[before:steps]
-        if len(new):
+        added_times = air.times[before:steps]
+        if len(added_times):
             psfs = make_psfs(
                 telescope,
                 np.zeros((1, 2)),
                 [_SPECKLE_WAVELENGTH],
-                atmosphere=air.at_times(new),
+                atmosphere=air.at_times(added_times),
                 stamps=Stamps(
                     _SPECKLE_STAMP, _SPECKLE_PIXEL * ARCSEC * telescope.reference_sphere_radius, diffusion=0.0
                 ),
                 engine=WaveEngine(pupil_spacing=bench.scale.speckle_spacing),
                 threads=bench.threads,
             )
-            total = total + len(new) * float(psfs.inside[0]) * psfs.image[0]
+            total = total + len(added_times) * float(psfs.inside[0]) * psfs.image[0]
             before = steps
         images.append(total / total.sum())
     air.release()
@@ -169,7 +174,17 @@ def ellipticity(bench: Bench) -> Reproduced:
         for time in _EXPOSURES:
             begun = shortened_exposure(air, time, scale.time_step)
             e_pairs = _atmosphere_ellipticity(bench, begun, pairs)
-            correlated[time].append(shear_correlation(pairs[:, 0], pairs[:, 1], e_pairs.real, e_pairs.imag, **_PAIRS))
+            correlated[time].append(
+                shear_correlation(
+                    pairs[:, 0],
+                    pairs[:, 1],
+                    e_pairs.real,
+                    e_pairs.imag,
+                    min_sep=_SEPARATIONS[0],
+                    max_sep=_SEPARATIONS[1],
+                    n_bins=_BINS,
+                )
+            )
             mean_e[time].append(float(np.abs(e_pairs).mean()))
             if time == _VISIT:
                 visits.append(e_pairs)
@@ -264,26 +279,28 @@ def _atmosphere_plot(
     """Draw whiskers on one CCD, and correlations for each exposure time."""
     with styled():
         figure = new_figure(12.0, 5.6)
-        left, right = figure.subplots(1, 2)
+        whisker_axes, xi_axes = figure.subplots(1, 2)
         edge = 7.2
         key = key_ellipticity(np.abs(e))
         scale = 0.5 / key
-        draw_whiskers(left, whiskers(positions[:, 0], positions[:, 1], e.real, e.imag, scale), TRUTH, 0.7)
-        left.set(xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal", xlabel="x [arcmin]", ylabel="y [arcmin]")
-        left.set_title(f"15 s, atmosphere alone: mean |e| {100 * np.abs(e).mean():.2f} %", loc="left")
-        draw_key_whisker(left, key, scale, 1.0)
+        draw_whiskers(whisker_axes, whiskers(positions[:, 0], positions[:, 1], e.real, e.imag, scale), TRUTH, 0.7)
+        whisker_axes.set(
+            xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal", xlabel="x [arcmin]", ylabel="y [arcmin]"
+        )
+        whisker_axes.set_title(f"15 s, atmosphere alone: mean |e| {100 * np.abs(e).mean():.2f} %", loc="left")
+        draw_key_whisker(whisker_axes, key, scale, 1.0)
         for (time, (plus, error, minus)), color in zip(xi.items(), _COLORS, strict=True):
-            right.errorbar(r, plus, error, fmt="o-", color=color, markersize=3, linewidth=1.2, capsize=2)
-            right.plot(r, minus, "--", color=color, linewidth=1.0)
-            right.plot([], [], "o-", color=color, markersize=3, label=f"{time:g} s")
-        right.plot([], [], "-", color="0.3", label="ξ+")
-        right.plot([], [], "--", color="0.3", label="ξ-")
-        right.axhline(0.0, color="0.7", linewidth=0.6)
-        right.set_xscale("log")
-        right.set_yscale("symlog", linthresh=1e-5)
-        right.set_xticks([0.3, 0.5, 1, 2, 5, 10], ["0.3", "0.5", "1", "2", "5", "10"])
-        right.minorticks_off()
-        right.set(xlabel="separation [arcmin]", ylabel="correlation of the ellipticity")
-        right.set_title("mean of the exposures, with the error of that mean", loc="left")
-        figure.legend(*right.get_legend_handles_labels(), ncols=6, loc="outside lower right")
+            xi_axes.errorbar(r, plus, error, fmt="o-", color=color, markersize=3, linewidth=1.2, capsize=2)
+            xi_axes.plot(r, minus, "--", color=color, linewidth=1.0)
+            xi_axes.plot([], [], "o-", color=color, markersize=3, label=f"{time:g} s")
+        xi_axes.plot([], [], "-", color="0.3", label="ξ+")
+        xi_axes.plot([], [], "--", color="0.3", label="ξ-")
+        xi_axes.axhline(0.0, color="0.7", linewidth=0.6)
+        xi_axes.set_xscale("log")
+        xi_axes.set_yscale("symlog", linthresh=1e-5)
+        xi_axes.set_xticks([0.3, 0.5, 1, 2, 5, 10], ["0.3", "0.5", "1", "2", "5", "10"])
+        xi_axes.minorticks_off()
+        xi_axes.set(xlabel="separation [arcmin]", ylabel="correlation of the ellipticity")
+        xi_axes.set_title("mean of the exposures, with the error of that mean", loc="left")
+        figure.legend(*xi_axes.get_legend_handles_labels(), ncols=6, loc="outside lower right")
         return png_bytes(figure)

@@ -6,8 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from astropy.io import fits
+
 from ...core.files import write_bytes
-from ...core.products import Columns, write_ecsv, write_fits
+from ...core.products import Card, Columns, write_ecsv, write_fits
 from ...core.version import VERSION
 from .bench import Bench
 
@@ -24,8 +26,8 @@ class EcsvData:
 class FitsData:
     """Images of a figure as FITS extensions, with cards for the primary header."""
 
-    hdus: list[Any]
-    cards: list[tuple[str, Any, str]] = field(default_factory=list)
+    hdus: list[fits.ImageHDU | fits.BinTableHDU]
+    cards: list[Card] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

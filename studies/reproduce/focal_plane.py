@@ -34,8 +34,10 @@ from .bench import Bench
 from .figure import EcsvData, Reproduced, figure
 
 _TERM_NAMES = ("global focal plane", "raft height", "CCD to CCD height", "CCD tilt", "potato chip")
-#: Wavelength and weight of the optics alone [m], [rad].
-_R_BAND, _WEIGHT = 624e-9, 0.3 * ARCSEC
+#: Wavelength of the r band [m].
+_R_BAND = 624e-9
+#: FWHM of the weight of the moments of the optics alone [rad].
+_WEIGHT = 0.3 * ARCSEC
 
 
 @figure(
@@ -172,11 +174,11 @@ def _budget_plot(rows: Sequence[str], values: Mapping[str, np.ndarray], units: S
 def whiskers_of_optics(bench: Bench) -> Reproduced:
     """Measure ellipticities over the whole focal plane without an atmosphere (Fig. 8), by the wave engine."""
     plane, camera = bench.optics.focal_plane, bench.optics.camera
-    here, across, within = _border_points(camera, bench.scale.borders)
+    beside, across, within = _border_points(camera, bench.scale.borders)
     grid = _ccd_grid(camera, bench.scale.optics_grid)
-    e = optics_ellipticity(bench, np.concatenate([grid, here, across, within]))
-    e, *pairs = np.split(e, np.cumsum([len(grid), len(here), len(across)]))
-    jump, smooth = (float(np.sqrt(np.mean(np.abs(other - pairs[0]) ** 2))) for other in pairs[1:])
+    e = optics_ellipticity(bench, np.concatenate([grid, beside, across, within]))
+    e, *pairs = np.split(e, np.cumsum([len(grid), len(beside), len(across)]))
+    jump, smooth = (float(np.sqrt(np.mean(np.abs(nearby_e - pairs[0]) ** 2))) for nearby_e in pairs[1:])
     fields = np.rad2deg(np.hypot(*fields_at(bench.optics.telescope, grid, _R_BAND, threads=bench.threads).T))
     size = np.abs(e)
     measured = {
@@ -243,9 +245,9 @@ def _border_points(camera: Camera, count: int) -> tuple[np.ndarray, np.ndarray, 
     # Gaps are narrowest within a raft; only where aberrations are strong do heights show.
     distance, right = cKDTree(centers).query(centers + np.array([camera.shortest_side, 0.0]))
     radius = np.hypot(*centers.T)
-    chosen = np.flatnonzero((distance < 1.4e-3) & (radius > 0.10) & (radius < 0.24))
-    chosen = chosen[np.linspace(0, len(chosen) - 1, min(count, len(chosen))).round().astype(int)]
-    middle = 0.5 * (centers[chosen] + centers[right[chosen]])
+    border_ccds = np.flatnonzero((distance < 1.4e-3) & (radius > 0.10) & (radius < 0.24))
+    border_ccds = border_ccds[np.linspace(0, len(border_ccds) - 1, min(count, len(border_ccds))).round().astype(int)]
+    middle = 0.5 * (centers[border_ccds] + centers[right[border_ccds]])
     step = np.array([1.5e-3, 0.0])
     return middle - 0.5 * step, middle + 0.5 * step, middle - 1.5 * step
 

@@ -35,7 +35,10 @@ _TOP = 8.5
 _DETECTOR = 0.32
 #: Middle of the i band, the wavelength of the peers' results [m].
 _I_BAND = 750e-9
-_EE_PIXEL, _EE_STAMP = 0.5e-6, 161
+#: Side of a pixel of the PSFs for the encircled energy [m].
+_EE_PIXEL = 0.5e-6
+#: Pixels along a side of these PSFs.
+_EE_STAMP = 161
 #: Largest spacing of the pupil points without aliasing within the stamp [m].
 _EE_SPACING = 0.09
 _EE_CURVES = (0.0, 1.0, 1.4, 1.75)
@@ -117,12 +120,14 @@ def _layout_plot(
     """Draw the telescope in section with its rays, and the CCD mosaic."""
     with styled():
         figure = new_figure(12.0, 6.0)
-        left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.0))
+        section_axes, mosaic_axes = figure.subplots(1, 2, width_ratios=(1.0, 1.0))
         for (angle, paths), color in zip(rays.items(), (OBSERVED, TRUTH, RESIDUAL), strict=False):
-            left.add_collection(LineCollection(list(paths), colors=color, linewidths=0.5, alpha=0.75))
-            left.plot([], [], color=color, linewidth=1.0, label=f"field {angle:+.2f}°" if angle else "on the axis")
+            section_axes.add_collection(LineCollection(list(paths), colors=color, linewidths=0.5, alpha=0.75))
+            section_axes.plot(
+                [], [], color=color, linewidth=1.0, label=f"field {angle:+.2f}°" if angle else "on the axis"
+            )
         for points in profiles.values():
-            left.plot(points[:, 0], points[:, 1], color="black", linewidth=1.6)
+            section_axes.plot(points[:, 0], points[:, 1], color="black", linewidth=1.6)
         for name, place, ha in (
             ("M1", (-4.3, 0.75), "right"),
             ("M2", (1.85, 6.4), "left"),
@@ -130,22 +135,24 @@ def _layout_plot(
             ("L1, L2, filter, L3, detector", (0.95, 3.6), "left"),
         ):
             behind = {"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.85}
-            left.annotate(name, place, ha=ha, va="center", fontsize=8, bbox=behind)
-        left.set(
+            section_axes.annotate(name, place, ha=ha, va="center", fontsize=8, bbox=behind)
+        section_axes.set(
             xlim=(-5.2, 5.2),
             ylim=(-1.2, _TOP),
             aspect="equal",
             xlabel="y [m]",
             ylabel="z from the vertex of M1, towards the sky [m]",
         )
-        left.set_title("section x = 0 with traced rays; light comes from above", loc="left")
-        left.legend(loc="lower right", fontsize=7)
-        draw_outlines(right, camera, range(len(camera)), "0.25", 0.6)
-        _draw_corner_rafts(right, camera)
-        draw_field_circle(right, field_radius * 1e3)
+        section_axes.set_title("section x = 0 with traced rays; light comes from above", loc="left")
+        section_axes.legend(loc="lower right", fontsize=7)
+        draw_outlines(mosaic_axes, camera, range(len(camera)), "0.25", 0.6)
+        _draw_corner_rafts(mosaic_axes, camera)
+        draw_field_circle(mosaic_axes, field_radius * 1e3)
         edge = 1.1e3 * camera.reach
-        frame_axes(right, (-edge, edge, -edge, edge))
-        right.set_title(f"{len(camera)} CCDs; dashed: field of view of 3.5°, {2e3 * field_radius:.0f} mm", loc="left")
+        frame_axes(mosaic_axes, (-edge, edge, -edge, edge))
+        mosaic_axes.set_title(
+            f"{len(camera)} CCDs; dashed: field of view of 3.5°, {2e3 * field_radius:.0f} mm", loc="left"
+        )
         return png_bytes(figure)
 
 
@@ -251,21 +258,21 @@ def _encircled_energy_plot(
     with styled():
         figure = new_figure(10.5, 6.6)
         top, bottom = np.asarray(figure.subfigures(2, 1, height_ratios=(1.0, 0.5))).ravel()
-        left, right = top.subplots(1, 2)
+        curve_axes, radius_axes = top.subplots(1, 2)
         for color, (angle, curve) in zip(_COLORS, curves.items(), strict=False):
-            left.plot(radius, 100.0 * curve, color=color, label=f"{angle:g}°")
-        left.axhline(80.0, color="0.6", linewidth=0.7, linestyle=(0, (4, 3)))
-        left.set(xlim=(0.0, 0.4), ylim=(0.0, 102.0), xlabel="radius [arcsec]", ylabel="encircled energy [%]")
-        left.legend(title="field angle", loc="lower right")
-        right.plot(field, radius80, "o-", color=OBSERVED, markersize=3.5)
+            curve_axes.plot(radius, 100.0 * curve, color=color, label=f"{angle:g}°")
+        curve_axes.axhline(80.0, color="0.6", linewidth=0.7, linestyle=(0, (4, 3)))
+        curve_axes.set(xlim=(0.0, 0.4), ylim=(0.0, 102.0), xlabel="radius [arcsec]", ylabel="encircled energy [%]")
+        curve_axes.legend(title="field angle", loc="lower right")
+        radius_axes.plot(field, radius80, "o-", color=OBSERVED, markersize=3.5)
         inner = float(radius80[field <= 1.4 + 1e-9].mean())
-        right.axhspan(0.93 * inner, 1.07 * inner, color="0.92", zorder=0, label="±7 % of the mean to 1.4°")
-        right.set(
+        radius_axes.axhspan(0.93 * inner, 1.07 * inner, color="0.92", zorder=0, label="±7 % of the mean to 1.4°")
+        radius_axes.set(
             ylim=(0.0, 1.35 * float(radius80.max())),
             xlabel="field angle [deg]",
             ylabel="radius of 80 % of the light [arcsec]",
         )
-        right.legend(loc="lower right")
+        radius_axes.legend(loc="lower right")
         panels = list(np.atleast_1d(bottom.subplots(1, len(stamps))))
         for axes, (angle, stamp) in zip(panels, stamps.items(), strict=True):
             half = 0.5 * pixel * len(stamp)

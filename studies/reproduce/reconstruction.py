@@ -19,8 +19,10 @@ from .focal_plane import optics_ellipticity
 
 #: Least number of PSFs for a comparison of the variance in 20 components.
 _ENOUGH = 200
-#: Stars for the comparison of PSFs with and without the atmosphere, on every CCD and in all.
-_COMPARED, _MOST_COMPARED = 3, 189
+#: Most stars of a CCD for the comparison of PSFs with and without the atmosphere.
+_COMPARED = 3
+#: Most stars in all for that comparison, but for one on every CCD.
+_MOST_COMPARED = 189
 
 
 @figure(
@@ -44,7 +46,7 @@ def eigen_psfs(bench: Bench) -> Reproduced:
         "EIGENVAL": (model.eigenvalues, "", "variance of unit-sum stamps along it"),
         "FRACTION": (model.eigenvalues / model.eigenvalues.sum(), "", "part of the variance"),
     }
-    few = "too few PSFs, of which 20 components hold nearly all whatever they are: "
+    caveat = "too few PSFs, of which 20 components hold nearly all whatever they are: "
     source = (
         f"{model.n_stars} PSFs of one CCD, optics and heights included; the paper draws the components of 4000 PSFs of"
         " the atmosphere alone, over all CCDs"
@@ -61,7 +63,7 @@ def eigen_psfs(bench: Bench) -> Reproduced:
         f" {len(products)} CCDs, {percent(float(np.median(explained)))} on the median one; observed stars: elbow at"
         f" {np.median(elbows):.0f}",
         worst > 0.99 if model.n_stars >= _ENOUGH else None,
-        (few if model.n_stars < _ENOUGH else "") + source,
+        (caveat if model.n_stars < _ENOUGH else "") + source,
         {
             "ccd": product.name,
             "components": model.n_components,
@@ -81,22 +83,22 @@ def eigen_psfs(bench: Bench) -> Reproduced:
 )
 def whiskers_of_stars(bench: Bench) -> Reproduced:
     """Show whiskers of the PSFs with the atmosphere (Fig. 11)."""
-    made = bench.pipeline
-    e = np.concatenate([np.hypot(p.holdout.e1, p.holdout.e2) for p in made.products])
+    run = bench.pipeline
+    e = np.concatenate([np.hypot(p.holdout.e1, p.holdout.e2) for p in run.products])
     mean, largest = float(np.nanmean(e)), float(np.nanmax(e))
     alike, ratio = _comparison_with_optics(bench)
-    png = whiskers_plot(made.products, made.experiment.focal_plane, bench.optics.field_radius_on_detector, ("truth",))
+    png = whiskers_plot(run.products, run.experiment.focal_plane, bench.optics.field_radius_on_detector, ("truth",))
     return Reproduced(
         {"": png},
-        {"": EcsvData(_star_columns(made.products, "truth"), {"what": "noise-free PSFs"})},
-        f"mean |e| {100 * mean:.2f} %, at most {100 * largest:.1f} %, on {len(made.products)} CCDs; at the same places"
+        {"": EcsvData(_star_columns(run.products, "truth"), {"what": "noise-free PSFs"})},
+        f"mean |e| {100 * mean:.2f} %, at most {100 * largest:.1f} %, on {len(run.products)} CCDs; at the same places"
         f" {100 * ratio:.0f} % of that without an atmosphere (mean taken off), with a correlation of {alike:.2f}",
         alike > 0.5 and ratio < 0.5,
         "the paper gives no number; what the air adds to all stars alike is taken off before the patterns are compared",
         {
             "mean_e": mean,
             "largest_e": largest,
-            "ccds": len(made.products),
+            "ccds": len(run.products),
             "correlation_with_optics_alone": alike,
             "rms_over_that_of_optics_alone": ratio,
         },
@@ -106,16 +108,16 @@ def whiskers_of_stars(bench: Bench) -> Reproduced:
 def _comparison_with_optics(bench: Bench) -> tuple[float, float]:
     """Return correlation and rms ratio of the pattern with that of the optics alone."""
     products = bench.pipeline.products
-    each = min(_COMPARED, max(1, _MOST_COMPARED // len(products)))
+    stars_per_ccd = min(_COMPARED, max(1, _MOST_COMPARED // len(products)))
     stars = [p.holdout for p in products]
-    x, y, e1, e2 = (np.concatenate([getattr(s, key)[:each] for s in stars]) for key in ("x", "y", "e1", "e2"))
-    alone = optics_ellipticity(bench, np.stack([x, y], axis=1))
-    both = e1 + 1j * e2
-    good = np.isfinite(alone) & np.isfinite(both)
-    alone, both = alone[good] - alone[good].mean(), both[good] - both[good].mean()
-    norm = np.sqrt(np.sum(np.abs(alone) ** 2) * np.sum(np.abs(both) ** 2))
-    ratio = np.sqrt(np.sum(np.abs(both) ** 2) / np.sum(np.abs(alone) ** 2))
-    return float(np.sum(alone * np.conj(both)).real / norm), float(ratio)
+    x, y, e1, e2 = (np.concatenate([getattr(s, key)[:stars_per_ccd] for s in stars]) for key in ("x", "y", "e1", "e2"))
+    optics_e = optics_ellipticity(bench, np.stack([x, y], axis=1))
+    total_e = e1 + 1j * e2
+    good = np.isfinite(optics_e) & np.isfinite(total_e)
+    optics_e, total_e = optics_e[good] - optics_e[good].mean(), total_e[good] - total_e[good].mean()
+    norm = np.sqrt(np.sum(np.abs(optics_e) ** 2) * np.sum(np.abs(total_e) ** 2))
+    ratio = np.sqrt(np.sum(np.abs(total_e) ** 2) / np.sum(np.abs(optics_e) ** 2))
+    return float(np.sum(optics_e * np.conj(total_e)).real / norm), float(ratio)
 
 
 @figure(
@@ -127,18 +129,18 @@ def _comparison_with_optics(bench: Bench) -> tuple[float, float]:
 )
 def whiskers_of_residual(bench: Bench) -> Reproduced:
     """Show whiskers of the residual, at the stars and at holdout positions (Fig. 12)."""
-    made = bench.pipeline
-    metrics = made.summary["all"]
+    run = bench.pipeline
+    metrics = run.summary["all"]
     png = whiskers_plot(
-        made.products, made.experiment.focal_plane, bench.optics.field_radius_on_detector, ("residual", "away")
+        run.products, run.experiment.focal_plane, bench.optics.field_radius_on_detector, ("residual", "away")
     )
     at, away = metrics["rms_residual_at_stars"], metrics["rms_residual_away"]
-    observed = _rms(made.products, "observed", ("e1", "e2"))
+    observed = _rms(run.products, "observed", ("e1", "e2"))
     return Reproduced(
         {"": png},
         {
-            "": EcsvData(_star_columns(made.products, "residual"), {"what": "observed - model, at the stars"}),
-            "_away": EcsvData(_star_columns(made.products, "away"), {"what": "truth - model, where no star is"}),
+            "": EcsvData(_star_columns(run.products, "residual"), {"what": "observed - model, at the stars"}),
+            "_away": EcsvData(_star_columns(run.products, "away"), {"what": "truth - model, where no star is"}),
         },
         f"rms of a component: observed {100 * observed:.2f} %, residual at the stars {100 * at:.2f} %, away from them"
         f" {100 * away:.2f} %",
@@ -164,9 +166,9 @@ def scatter(bench: Bench) -> Reproduced:
     # Noise adds to the variance of the PSFs themselves, which the noise-free ones show.
     noise = float(np.sqrt(max(before**2 - _rms(products, "holdout", ("e1", "e2")) ** 2, 0.0)))
     stars = [p.observed for p in products]
-    left = [np.concatenate([getattr(s, k) for s in stars]) for k in ("residual_e1", "residual_e2")]
-    mean = [float(np.nanmean(v)) for v in left]
-    error = after / np.sqrt(np.isfinite(left[0]).sum())
+    residuals = [np.concatenate([getattr(s, k) for s in stars]) for k in ("residual_e1", "residual_e2")]
+    mean = [float(np.nanmean(v)) for v in residuals]
+    error = after / np.sqrt(np.isfinite(residuals[0]).sum())
     columns = _star_columns(products, "observed")
     for key in ("residual_e1", "residual_e2"):
         columns[key] = (np.concatenate([getattr(s, key) for s in stars]), "", "observed - model")
@@ -198,8 +200,8 @@ def scatter(bench: Bench) -> Reproduced:
 )
 def correlation(bench: Bench) -> Reproduced:
     """Show the correlation of ellipticity and residuals (Fig. 14)."""
-    made = bench.pipeline
-    correlated = made.correlated
+    run = bench.pipeline
+    correlated = run.correlated
     columns: Columns = {"separation_arcmin": (correlated["observed"].r_arcmin, "arcmin", "of the observed stars")}
     for kind, c in correlated.items():
         columns[f"r_{kind}_arcmin"] = (c.r_arcmin, "arcmin", "mean separation of the pairs")
@@ -210,8 +212,8 @@ def correlation(bench: Bench) -> Reproduced:
     raw = correlated["observed"].mean_xi_plus("long")
     at, away = (correlated[k].mean_xi_plus("long") for k in ("residual", "away"))
     near = correlated["away"].mean_xi_plus("short")
-    count, of = len(made.products), len(bench.optics.camera)
-    every = count == of
+    count, camera_count = len(run.products), len(bench.optics.camera)
+    all_ccds = count == camera_count
     c = correlated["residual"]
     inside = c.within("long") & (c.n_pairs > 0)
     worst = np.argmax(np.abs(c.xi_plus[inside]))
@@ -222,12 +224,12 @@ def correlation(bench: Bench) -> Reproduced:
         {"": EcsvData(columns, {"what": "correlation of the ellipticity, TreeCorr", "ccds": count})},
         f"from 10' to 3°: {raw:.1e} before; {at:+.0e} after, at the stars (one bin at most {largest:.0e}, its error"
         f" {error:.0e}); {away:+.0e} away from the stars, {near:.0e} there within 10'",
-        reached if every else None,
+        reached if all_ccds else None,
         (
             "in the mean over pairs at the stars, where residuals of each CCD sum to zero by construction; where there"
             " is no star, which is where galaxies are, the residual is larger"
-            if every
-            else f"{count} of {of} CCDs have too few pairs to tell 1e-8 from nothing;"
+            if all_ccds
+            else f"{count} of {camera_count} CCDs have too few pairs to tell 1e-8 from nothing;"
             " residuals of each CCD sum to zero at its stars by construction, and are larger away from them"
         ),
         {

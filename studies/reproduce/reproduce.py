@@ -36,15 +36,15 @@ _ALL = "all"
 
 def chosen_figures(names: Iterable[str]) -> tuple[str, ...]:
     """Return figures by name, each once, in the order of the paper; ``all`` stands for every one."""
-    wanted = set()
+    figure_names = set()
     for name in names:
         if name == _ALL:
-            wanted |= set(FIGURES)
+            figure_names |= set(FIGURES)
         elif name in FIGURES:
-            wanted.add(name)
+            figure_names.add(name)
         else:
             raise unknown_name("figure", name, (*FIGURES, _ALL))
-    return tuple(name for name in FIGURES if name in wanted)
+    return tuple(name for name in FIGURES if name in figure_names)
 
 
 def expected_minutes(names: Iterable[str], scale: Scale) -> float:
@@ -62,10 +62,10 @@ def reproduce(names: Iterable[str], bench: Bench) -> dict[str, Any]:
     ``summary.json``: scale, seed, and for each figure title, statement of the paper, result, verdict with its reason,
     metrics and files.
     """
-    chosen = chosen_figures(names)
+    figure_names = chosen_figures(names)
     make_folder(bench.folder)
-    made = {}
-    for name in chosen:
+    figure_summaries = {}
+    for name in figure_names:
         figure = FIGURES[name]
         if figure.of_run:
             # The run has progress bars of its own, which end before that of the figure.
@@ -75,7 +75,7 @@ def reproduce(names: Iterable[str], bench: Bench) -> dict[str, Any]:
         with bench.reporter.stage(f"{name}: {figure.title}"):
             result = figure.make(bench)
             files = result.write(name, bench)
-        made[name] = {
+        figure_summaries[name] = {
             "title": figure.title,
             "paper": figure.paper,
             "here": result.here,
@@ -84,8 +84,8 @@ def reproduce(names: Iterable[str], bench: Bench) -> dict[str, Any]:
             "measured": result.measured,
             "files": files,
         }
-    summary = {"pachon": VERSION, "scale": bench.scale.name, "seed": bench.seed, "figures": made}
-    if len(made) == len(FIGURES):
+    summary = {"pachon": VERSION, "scale": bench.scale.name, "seed": bench.seed, "figures": figure_summaries}
+    if len(figure_summaries) == len(FIGURES):
         write_json(bench.folder / "summary.json", summary)
     return summary
 
@@ -101,11 +101,11 @@ def reproduce_at(
     reporter: Reporter | None = None,
 ) -> dict[str, Any]:
     """Reproduce figures at a scale given by name, after a line with the expected time: see :func:`reproduce`."""
-    chosen = chosen_figures(names)
+    figure_names = chosen_figures(names)
     if scale not in SCALES:
         raise unknown_name("scale", scale, SCALES)
     bench = Bench(SCALES[scale], folder, seed, threads, workers, reporter or Reporter(quiet=True))
-    minutes = expected_minutes(chosen, bench.scale)
+    minutes = expected_minutes(figure_names, bench.scale)
     long = f"about {minutes:.0f} minutes" if minutes >= 1.5 else f"about {max(60.0 * minutes, 1.0):.0f} s"
-    bench.reporter.line(f"{len(chosen)} figures at the scale {scale}: {long} on two cores")
-    return reproduce(chosen, bench)
+    bench.reporter.line(f"{len(figure_names)} figures at the scale {scale}: {long} on two cores")
+    return reproduce(figure_names, bench)

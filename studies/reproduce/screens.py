@@ -23,8 +23,10 @@ _SITE = "cerro_pachon"
 _LARGEST_ZENITH = 60
 _SEEING = 0.7
 _BANDS = {"u": "#7b3294", "g": "#2166ac", "r": "#1a9850", "i": "#d9a400", "z": "#d95f02", "y": "#a50026"}
-#: Side of the piece of the screens that is drawn [m], and its largest number of samples on a side.
-_PIECE, _KEPT = 200.0, 400
+#: Side of the piece of the screens that is drawn [m].
+_PIECE = 200.0
+#: Largest number of samples on a side of the piece.
+_KEPT = 400
 
 
 @figure(

@@ -27,8 +27,12 @@ PAPER_DENSITY = {1: 10.0, 10: 24.0, 100: 42.0}
 #: Visits from which a stack may be compared with that of the paper.
 _ENOUGH = 10
 _NAMES = {"psf": "PSF", "residual_stars": "residual at the stars", "residual_places": "residual where no star is"}
-# The image of Fig. 10: CCD, pixels on a side, and magnitude limit.
-_CCD, _SIDE, _FAINTEST = "R22_S11", 640, 29.0
+# CCD of the image of Fig. 10.
+_CCD = "R22_S11"
+# Side of this image [pixel].
+_SIDE = 640
+# Faintest galaxies of this image [AB mag].
+_FAINTEST = 29.0
 
 
 @figure(
@@ -64,14 +68,14 @@ def image_of_the_sky(bench: Bench) -> Reproduced:
     limit = limiting_magnitude(5.0, experiment.band, seconds, width)
     deep = limit + 1.25 * np.log10(DEEP / seconds)
     hdus = [image_hdu("ELECTRONS", scene.electrons, "expected electrons of galaxies and stars in one exposure")]
-    here = (
+    depth_text = (
         f"galaxies to {_FAINTEST:g} mag; 5 sigma of a star at {deep:.2f} mag in {DEEP:g} s, at {limit:.2f} mag in"
         f" {seconds:g} s"
     )
     return Reproduced(
         {"": cutouts_png(scene, threads=bench.threads)},
         {"": FitsData(hdus, [("CCD", _CCD, ""), ("FAINTEST", _FAINTEST, "[mag] faintest galaxy")])},
-        here,
+        depth_text,
         abs(deep - 27.5) < 0.3,
         "the depth in 6000 s; galaxies are like those of the Ultra Deep Field, where the paper cuts out its pixels",
         {"limit_6000s_mag": float(deep), "limit_one_exposure_mag": float(limit)},
@@ -89,7 +93,7 @@ def stacked_ellipticities(bench: Bench) -> Reproduced:
     """Show the ellipticities of one visit, of the stack, and of the residuals of models (Fig. 15)."""
     result = bench.stack
     stacks, first, last = result.summary["stacks"], min(result.stacks), max(result.stacks)
-    one, many = stacks[str(first)], stacks[str(last)]
+    first_metrics, last_metrics = stacks[str(first)], stacks[str(last)]
     stack = result.stacks[last]
     columns = {
         name: (getattr(stack, name) / unit, text, description)
@@ -102,12 +106,13 @@ def stacked_ellipticities(bench: Bench) -> Reproduced:
             ("model_e2", 1.0, "", "of the mean of the models"),
         )
     }
-    ratio = one["rms_e"] / many["rms_e"]
+    ratio = first_metrics["rms_e"] / last_metrics["rms_e"]
     return Reproduced(
         {"": ellipticity_picture(result.stacks)},
         {"": EcsvData(columns, {"visits": last})},
-        f"rms |e| {one['rms_e']:.1e} in one visit, {many['rms_e']:.1e} in {last}; the models leave"
-        f" {many['rms_residual_e_stars']:.1e} at the stars and {many['rms_residual_e_places']:.1e} where no star is",
+        f"rms |e| {first_metrics['rms_e']:.1e} in one visit, {last_metrics['rms_e']:.1e} in {last}; the models leave"
+        f" {last_metrics['rms_residual_e_stars']:.1e} at the stars and"
+        f" {last_metrics['rms_residual_e_places']:.1e} where no star is",
         ratio > 2.0 if last >= _ENOUGH else None,
         f"{ratio:.1f} times rounder in {last} visits" + (", too few for the comparison" if last < _ENOUGH else ""),
         {f"{key}_{n}": stacks[str(n)][key] for n in (first, last) for key in _STACK_KEYS},
@@ -129,20 +134,20 @@ def stacked_correlations(bench: Bench) -> Reproduced:
     result = bench.stack
     last = max(result.stacks)
     metrics = result.summary["stacks"][str(last)]
-    found = {
+    mean_xi_plus = {
         kind: (metrics[f"xi_plus_{kind}_long"], metrics[f"xi_plus_{kind}_long_error"])
         for kind in ("psf", "residual_stars", "residual_places")
     }
-    stars, star_error = found["residual_stars"]
+    stars, star_error = mean_xi_plus["residual_stars"]
     return Reproduced(
         {"": correlation_picture(result.correlations)},
         {"": _correlation_data(result.correlations[last], last)},
         f"xi+ beyond 10' in {last} visits: "
-        + ", ".join(f"{_NAMES[kind]} {value:.1e} +- {error:.0e}" for kind, (value, error) in found.items()),
+        + ", ".join(f"{_NAMES[kind]} {value:.1e} +- {error:.0e}" for kind, (value, error) in mean_xi_plus.items()),
         abs(stars) < 1e-7 + 2.0 * star_error if last >= _ENOUGH and np.isfinite(star_error) else None,
         "residual at the stars, which the models are fitted to; where no star is the paper says nothing",
-        {f"xi_plus_{kind}": value for kind, (value, _) in found.items()}
-        | {f"xi_plus_{kind}_error": error for kind, (_, error) in found.items()},
+        {f"xi_plus_{kind}": value for kind, (value, _) in mean_xi_plus.items()}
+        | {f"xi_plus_{kind}_error": error for kind, (_, error) in mean_xi_plus.items()},
     )
 
 
@@ -159,8 +164,8 @@ def galaxy_correlations(bench: Bench) -> Reproduced:
     results = bench.galaxies
     metrics = {n: null_metrics(result) for n, result in results.items()}
     last = max(results)
-    known = {n: results[n].density / PAPER_DENSITY[n] for n in results if n in PAPER_DENSITY}
-    near = all(abs(ratio - 1.0) < 0.15 for ratio in known.values())
+    density_ratios = {n: results[n].density / PAPER_DENSITY[n] for n in results if n in PAPER_DENSITY}
+    near = all(abs(ratio - 1.0) < 0.15 for ratio in density_ratios.values())
     density = ", ".join(f"{results[n].density:.1f} in {n}" for n in results)
     apart = metrics[last]["xi_plus_difference_long"], metrics[last]["xi_plus_difference_long_error"]
     return Reproduced(
@@ -168,9 +173,10 @@ def galaxy_correlations(bench: Bench) -> Reproduced:
         {"": _correlation_data(results[last].correlations, last)},
         f"usable per arcmin^2: {density}; PSF models alone add xi+ of {apart[0]:.1e} +- {apart[1]:.0e} beyond 10' in"
         f" {last} visits",
-        near if known else None,
-        "densities against the paper's: " + ", ".join(f"{100 * (r - 1):+.0f} % in {n}" for n, r in known.items()),
-        {f"{key}_{n}": found[key] for n, found in metrics.items() for key in _NULL_KEYS},
+        near if density_ratios else None,
+        "densities against the paper's: "
+        + ", ".join(f"{100 * (r - 1):+.0f} % in {n}" for n, r in density_ratios.items()),
+        {f"{key}_{n}": stack_metrics[key] for n, stack_metrics in metrics.items() for key in _NULL_KEYS},
     )
 
 
@@ -204,14 +210,14 @@ def noise_against_density(bench: Bench) -> Reproduced:
     """Show the amplitude of xi+ against the density of usable galaxies (Fig. 18)."""
     results = bench.galaxies
     density = np.array([r.density for r in results.values()])
-    found, noise = (np.array([of(r) for r in results.values()]) for of in (amplitude, shot_noise))
-    slopes = [density_slope(density, values) for values in (found, noise)]
+    amplitudes, shot_noises = (np.array([of(r) for r in results.values()]) for of in (amplitude, shot_noise))
+    slopes = [density_slope(density, values) for values in (amplitudes, shot_noises)]
     text = ["none" if s is None else f"{s:.2f}" for s in slopes]
     columns = {
         "visits": (np.array(list(results)), "", "in the stack"),
         "density": (density, "arcmin-2", "usable galaxies"),
-        "amplitude": (found, "", "mean of |xi+| over the bins"),
-        "shot_noise": (noise, "", "the same of unrelated ellipticities"),
+        "amplitude": (amplitudes, "", "mean of |xi+| over the bins"),
+        "shot_noise": (shot_noises, "", "the same of unrelated ellipticities"),
     }
     last = max(results)
     return Reproduced(
@@ -219,6 +225,7 @@ def noise_against_density(bench: Bench) -> Reproduced:
         {"": EcsvData(columns, {})},
         f"slope {text[0]}, of the shot noise {text[1]}",
         abs(slopes[0] + 0.97) < 0.12 if slopes[0] is not None and last >= _ENOUGH else None,
-        "amplitudes over their shot noise: " + ", ".join(f"{f / n:.2f}" for f, n in zip(found, noise, strict=True)),
+        "amplitudes over their shot noise: "
+        + ", ".join(f"{f / n:.2f}" for f, n in zip(amplitudes, shot_noises, strict=True)),
         {"slope": slopes[0], "slope_shot_noise": slopes[1]},
     )

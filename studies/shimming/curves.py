@@ -36,8 +36,8 @@ class Places:
         ccd, uv = np.repeat(index, u.size), np.tile(np.stack([u, v], axis=1), (len(index), 1))
         offset, area = camera.half_sizes[ccd] * uv, camera.pixels[ccd].prod(axis=1)
         weight = np.tile(np.outer(weights, weights).ravel(), len(index)) * (area / area.max())
-        known = focal_plane.surfaces.measured_at(ccd, *offset.T)
-        ccd, offset, weight = ccd[known], offset[known], weight[known]
+        is_measured = focal_plane.surfaces.measured_at(ccd, *offset.T)
+        ccd, offset, weight = ccd[is_measured], offset[is_measured], weight[is_measured]
         position = np.stack(camera.from_local(ccd, offset[:, 0], offset[:, 1]), axis=1)
         return cls(ccd, offset, position, weight / weight.sum())
 

@@ -16,8 +16,10 @@ import scipy.sparse
 
 from ...core.errors import DomainError
 
-# Bins of a decade of separations, and the fewest, as in the correlations of runs.
-_BINS_PER_DECADE, _FEWEST = 6, 4
+# Bins of a decade of separations, as in the correlations of runs.
+_BINS_PER_DECADE = 6
+# Fewest bins, as in the correlations of runs.
+_FEWEST = 4
 #: Largest number of places; the memory of their pairs grows with its square, to 1 GB.
 MOST_PLACES = 6_000
 
@@ -57,10 +59,10 @@ class PairSum:
             # Bins as TreeCorr has them, closed at the lower edge.
             bins.append((np.searchsorted(edges, np.hypot(*(sky - sky[i]).T), side="right") - 1).astype(np.int16))
             bins[i][i] = -1
-        which = np.array(bins)
+        bin_index = np.array(bins)
         blocks = []
         for b in range(len(edges) - 1):
-            row, column = np.nonzero(which == b)
+            row, column = np.nonzero(bin_index == b)
             if len(row):
                 share = weight[row] * weight[column]
                 blocks.append(scipy.sparse.csr_array((share / share.sum(), (row, column)), shape=(n, n)))

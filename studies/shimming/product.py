@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from ...measure.correlation_plots import correlation_columns
 from ...pipeline.experiment import Experiment
 from ...pipeline.run_folder import stamp_of
 from ..product import write_products
-from .shim import Shims, shimmed_configuration
+from .shim import Shims, StateMetrics, shimmed_configuration
 
 
 def shim_metrics(shims: Shims) -> dict[str, Any]:
@@ -21,9 +22,10 @@ def shim_metrics(shims: Shims) -> dict[str, Any]:
     motions = {name: (m.dz * 1e6, m.rx * 1e6, m.ry * 1e6) for name, m in shims.motions.items()}
     named = {name: dict(zip(("dz_um", "rx_urad", "ry_urad"), values, strict=True)) for name, values in motions.items()}
 
-    def states(of: Any) -> dict[str, dict[str, float]]:
+    def states(metrics: Mapping[str, StateMetrics]) -> dict[str, dict[str, float]]:
         return {
-            state: {"mean_fwhm_arcsec": m.fwhm, "rms_e": m.rms_e, "rms_xi_plus": m.rms_xi} for state, m in of.items()
+            state: {"mean_fwhm_arcsec": m.fwhm, "rms_e": m.rms_e, "rms_xi_plus": m.rms_xi}
+            for state, m in metrics.items()
         }
 
     focus = asdict(shims.focus)

@@ -38,9 +38,11 @@ MERITS = ("fwhm", "ellipticity", "xi")
 PARTS = ("rafts", "ccds")
 #: States of the focal plane: as it is, focused as a whole, shimmed, and an ideal plane in focus.
 STATES = ("as built", "focused", "shimmed", "plane")
-# Nodes along the side of a CCD: of the fit by merit, and of the check. Pairs of 3 x 3 nodes have too few separations:
-# what they leave uncorrelated is correlated elsewhere.
-_FIT, _CHECK = {"fwhm": 3, "ellipticity": 3, "xi": 5}, 4
+# Nodes along the side of a CCD in the fit, by merit. Pairs of 3 x 3 nodes have too few separations: what they leave
+# uncorrelated is correlated elsewhere.
+_FIT = {"fwhm": 3, "ellipticity": 3, "xi": 5}
+# Nodes along the side of a CCD in the check, which are other places than those of the fit.
+_CHECK = 4
 # Room for motions beyond the largest height [m].
 _ROOM = 10e-6
 #: Merit at each place and its derivative with respect to the height there, of values and slopes [n, 3].
@@ -166,21 +168,21 @@ def shim(
         curves = focus_curves(experiment, fit, float(np.abs(heights).max()) + _ROOM, threads)
         if not np.isfinite(curves.coefficients).all():
             lost = ~np.isfinite(curves.coefficients).all(axis=(0, 2))
-            some = plane.names[fit.ccd[np.flatnonzero(lost)[0]]]
-            raise DomainError(f"{some}: the PSF has no width or shape within {1e6 * curves.reach:.0f} um of focus")
+            lost_ccd = plane.names[fit.ccd[np.flatnonzero(lost)[0]]]
+            raise DomainError(f"{lost_ccd}: the PSF has no width or shape within {1e6 * curves.reach:.0f} um of focus")
     sky, sky_checked = (_field_angles(experiment, places, threads) for places in (fit, check))
     edges = _separation_bins(plane, np.concatenate([fit.position, check.position]), np.concatenate([sky, sky_checked]))
     pairs = PairSum.of(sky, fit.weight, edges) if merit == "xi" else None
-    whole = [(np.zeros(2), np.arange(len(fit.ccd)))]
+    whole_plane = [(np.zeros(2), np.arange(len(fit.ccd)))]
     with reporter.stage("motions"):
-        (focus,) = _best_motions(curves, fit, heights, whole, merit, pairs)
-        (level,) = _best_motions(curves, fit, np.zeros_like(heights), whole, merit, pairs)
+        (focus,) = _best_motions(curves, fit, heights, whole_plane, merit, pairs)
+        (level,) = _best_motions(curves, fit, np.zeros_like(heights), whole_plane, merit, pairs)
         focused = heights + _height_change(focus, fit.position)
-        named = _parts_with_places(plane, fit, parts)
-        best = _best_motions(curves, fit, focused, [part[1:] for part in named], merit, pairs)
-    motions = {part[0]: motion for part, motion in zip(named, best, strict=True)}
+        named_parts = _parts_with_places(plane, fit, parts)
+        best = _best_motions(curves, fit, focused, [(center, rows) for _, center, rows in named_parts], merit, pairs)
+    motions = {name: motion for (name, *_), motion in zip(named_parts, best, strict=True)}
     shimmed = focused.copy()
-    for name, center, rows in named:
+    for name, center, rows in named_parts:
         shimmed[rows] += _height_change(motions[name], fit.position[rows] - center)
     planes = {
         "as built": plane,
@@ -235,9 +237,8 @@ def shimmed_configuration(config: Configuration, shims: Shims) -> Configuration:
     total = {name: (m.dz_um, m.rx_urad, m.ry_urad) for name, m in config.focal_plane.moved.items()}
     for motions in (whole_as_rafts(shims.focal_plane, shims.focus), shims.motions):
         for name, motion in motions.items():
-            old = total.get(name, (0.0, 0.0, 0.0))
-            new = motion.dz * 1e6, motion.rx * 1e6, motion.ry * 1e6
-            total[name] = (old[0] + new[0], old[1] + new[1], old[2] + new[2])
+            dz, rx, ry = total.get(name, (0.0, 0.0, 0.0))
+            total[name] = (dz + motion.dz * 1e6, rx + motion.rx * 1e6, ry + motion.ry * 1e6)
     moved = {name: MotionConfig(dz_um=dz, rx_urad=rx, ry_urad=ry) for name, (dz, rx, ry) in total.items()}
     return config.model_copy(update={"focal_plane": config.focal_plane.model_copy(update={"moved": moved})})
 
@@ -272,8 +273,11 @@ def _best_motions(
 ) -> list[Motion]:
     """Return the motions of parts, given by centre and rows of their places, that minimise the merit function."""
     separate = merit if pairs is None else "ellipticity"
-    found = np.concatenate(
-        [_minimise_merit(curves, places, heights, [part], _VALUES[separate], np.zeros(3)) for part in parts]
+    terms = np.concatenate(
+        [
+            _minimise_merit(curves, places, heights, [(center, rows)], _VALUES[separate], np.zeros(3))
+            for center, rows in parts
+        ]
     )
     if pairs is not None:
 
@@ -285,8 +289,8 @@ def _best_motions(
 
         rows = np.concatenate([rows for _, rows in parts])
         order = np.argsort(rows)
-        found = _minimise_merit(curves, places, heights, parts, value, found)
-    return [_motion_of_terms(x, places.position[rows] - center) for x, (center, rows) in zip(found, parts, strict=True)]
+        terms = _minimise_merit(curves, places, heights, parts, value, terms)
+    return [_motion_of_terms(x, places.position[rows] - center) for x, (center, rows) in zip(terms, parts, strict=True)]
 
 
 def _minimise_merit(
@@ -299,23 +303,23 @@ def _minimise_merit(
 ) -> np.ndarray:
     """Return piston and tilts of parts [n_part, 3], in units of 1 um of lift, at the minimum next to a start."""
     rows = np.concatenate([rows for _, rows in parts])
-    part = np.repeat(np.arange(len(parts)), [len(rows) for _, rows in parts])
-    some, weight, before = curves.chosen(rows), places.weight[rows], heights[rows]
+    part_index = np.repeat(np.arange(len(parts)), [len(rows) for _, rows in parts])
+    row_curves, weight, before = curves.chosen(rows), places.weight[rows], heights[rows]
     design = np.concatenate([_motion_terms(places.position[rows] - center) for center, rows in parts]) * _UNIT
 
     def merit_function(motion: np.ndarray) -> tuple[float, np.ndarray]:
-        new = before + np.einsum("nk,nk->n", design, motion.reshape(-1, 3)[part])
+        moved_heights = before + np.einsum("nk,nk->n", design, motion.reshape(-1, 3)[part_index])
         # Heights beyond the curves are penalised: the minimum lies within.
-        inside = np.clip(new, -some.reach, some.reach)
-        merits, slope = value(some.at(inside), some.slope(inside))
-        beyond = (new - inside) / _UNIT
+        inside = np.clip(moved_heights, -row_curves.reach, row_curves.reach)
+        merits, slope = value(row_curves.at(inside), row_curves.slope(inside))
+        beyond = (moved_heights - inside) / _UNIT
         total = merits + beyond**2
         slope = weight * (np.where(beyond == 0.0, slope, 0.0) + 2.0 * beyond / _UNIT)
-        change = np.stack([np.bincount(part, slope * along) for along in design.T], axis=1)
+        change = np.stack([np.bincount(part_index, slope * along) for along in design.T], axis=1)
         return float(np.einsum("n,n->", weight, total)), change.ravel()
 
-    found = scipy.optimize.minimize(merit_function, start.ravel(), jac=True, method="BFGS", options={"gtol": 1e-9})
-    return np.asarray(found.x).reshape(-1, 3)
+    minimum = scipy.optimize.minimize(merit_function, start.ravel(), jac=True, method="BFGS", options={"gtol": 1e-9})
+    return np.asarray(minimum.x).reshape(-1, 3)
 
 
 def _motion_terms(position: np.ndarray) -> np.ndarray:
@@ -352,7 +356,7 @@ def _state_metrics(
     places: Places, values: np.ndarray, sky: np.ndarray, edges: np.ndarray
 ) -> tuple[StateMetrics, Correlation]:
     """Return means of values [n, 3] at places, and the correlation of their ellipticities."""
-    found = shear_correlation(
+    correlation = shear_correlation(
         *sky.T,
         *values[:, 1:].T,
         min_sep=edges[0],
@@ -360,6 +364,6 @@ def _state_metrics(
         n_bins=len(edges) - 1,
         weight=places.weight,
     )
-    rms_xi = float(np.sqrt(np.nanmean(found.xi_plus**2)))
+    rms_xi = float(np.sqrt(np.nanmean(correlation.xi_plus**2)))
     rms_e = places.mean((values[:, 1:] ** 2).sum(axis=1)) ** 0.5
-    return StateMetrics(places.mean(values[:, 0]), rms_e, rms_xi), found
+    return StateMetrics(places.mean(values[:, 0]), rms_e, rms_xi), correlation

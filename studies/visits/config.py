@@ -27,8 +27,11 @@ from ...pipeline.experiment import Experiment
 from ...pipeline.resolved_values import require_drawn_stars
 from .plan import Visit, plan_visits
 
-#: Pixels along a side of the stamps of the stack, and of those of a visit, of which turned axes cut the corners.
-STACK_STAMP, VISIT_STAMP = 31, 49
+#: Side of the stamps of the stack [pixel].
+STACK_STAMP = 31
+#: Side of the stamps of a visit [pixel], of which turned axes cut the corners.
+VISIT_STAMP = 49
+#: Raft of the visits where a configuration names no CCDs.
 CENTRAL_RAFT = "R22"
 
 
@@ -92,8 +95,8 @@ class VisitsConfig(Section):
 
     def galaxies_digest(self, experiment: Experiment, **content: Any) -> str:
         """SHA-256 of the settings of the visits, of `content`, and of galaxies other than the default ones."""
-        own = {} if self.galaxies == GalaxySourceConfig() else {"galaxies": self.galaxies.content()}
-        return digest({"visits": self.digest(experiment), **content, **own})
+        galaxy_content = {} if self.galaxies == GalaxySourceConfig() else {"galaxies": self.galaxies.content()}
+        return digest({"visits": self.digest(experiment), **content, **galaxy_content})
 
     def galaxy_source(self, experiment: Experiment, exposure: Exposure) -> GalaxySource:
         """Read the galaxies about the common pointing, which is that of the run for a catalogue with ra and dec.

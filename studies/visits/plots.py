@@ -41,30 +41,32 @@ def ellipticity_picture(stacks: Mapping[int, PsfStack]) -> bytes:
     with styled():
         rows = len(panels) // 2 if len(panels) > 3 else 1
         figure = new_figure(5.2 * len(panels) / rows, 5.4 * rows, "compressed")
-        every = figure.subplots(rows, len(panels) // rows, squeeze=False, sharex=True, sharey=True)
+        axes_grid = figure.subplots(rows, len(panels) // rows, squeeze=False, sharex=True, sharey=True)
         edge = 1.05 / ARCMIN * max(float(np.abs([s.x, s.y]).max()) for s in (first, last))
-        for axes, (stack, what, e1, e2) in zip(every.flat, panels, strict=True):
-            some = np.s_[:: max(1, len(stack) // _MOST)]
+        for axes, (stack, quantity, e1, e2) in zip(axes_grid.flat, panels, strict=True):
+            drawn_rows = np.s_[:: max(1, len(stack) // _MOST)]
             scale = 0.06 * edge / key
-            ends = whiskers(stack.x[some] / ARCMIN, stack.y[some] / ARCMIN, e1[some], e2[some], scale)
+            ends = whiskers(
+                stack.x[drawn_rows] / ARCMIN, stack.y[drawn_rows] / ARCMIN, e1[drawn_rows], e2[drawn_rows], scale
+            )
             draw_whiskers(axes, ends, "black", 0.6)
             axes.set(xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal")
             rms = np.sqrt(np.nanmean(e1**2 + e2**2))
-            axes.set_title(f"{what}, {_visits(stack.visits)}: rms |e| {rms:.1e}", loc="left")
+            axes.set_title(f"{quantity}, {_visits(stack.visits)}: rms |e| {rms:.1e}", loc="left")
             draw_key_whisker(axes, key, scale, 1.0)
-        for axes in every[-1]:
+        for axes in axes_grid[-1]:
             axes.set_xlabel("x of the stack [arcmin]")
-        for axes in every[:, 0]:
+        for axes in axes_grid[:, 0]:
             axes.set_ylabel("y of the stack [arcmin]")
         return png_bytes(figure)
 
 
-def correlation_picture(found: Mapping[int, StackCorrelations]) -> bytes:
+def correlation_picture(correlated: Mapping[int, StackCorrelations]) -> bytes:
     """Draw xi+ of each stack: of the PSF, and of the residuals at stars and between them (Fig. 16)."""
     with styled():
-        figure = new_figure(4.2 * len(found) + 1.0, 4.8)
-        panels = figure.subplots(1, len(found), sharex=True, sharey=True, squeeze=False)[0]
-        for axes, (visits, correlations) in zip(panels, found.items(), strict=True):
+        figure = new_figure(4.2 * len(correlated) + 1.0, 4.8)
+        panels = figure.subplots(1, len(correlated), sharex=True, sharey=True, squeeze=False)[0]
+        for axes, (visits, correlations) in zip(panels, correlated.items(), strict=True):
             for kind, style in _STYLES.items():
                 draw_correlation(axes, correlations[kind], "plus", *style)
             log_axes(axes, _visits(visits))
@@ -96,18 +98,18 @@ def null_test_picture(results: Mapping[int, NullTest]) -> bytes:
 def density_picture(results: Mapping[int, NullTest]) -> bytes:
     """Draw the mean amplitude of xi+ against the density of usable galaxies, with the shot noise (Fig. 18)."""
     density = np.array([r.density for r in results.values()])
-    found, noise = (np.array([of(r) for r in results.values()]) for of in (amplitude, shot_noise))
+    amplitudes, shot_noises = (np.array([of(r) for r in results.values()]) for of in (amplitude, shot_noise))
     with styled():
         figure = new_figure(5.6, 4.6)
         axes = figure.subplots()
-        axes.plot(density, noise, "-", color="0.5", label="shot noise")
-        axes.plot(density, found, "o", color=BLUE, label="mean $|\\xi_+|$ of the galaxies")
-        for result, x, y in zip(results.values(), density, found, strict=True):
+        axes.plot(density, shot_noises, "-", color="0.5", label="shot noise")
+        axes.plot(density, amplitudes, "o", color=BLUE, label="mean $|\\xi_+|$ of the galaxies")
+        for result, x, y in zip(results.values(), density, amplitudes, strict=True):
             # Beside the point, towards the middle of the axes.
             ahead, side = (-6, "right") if x > np.sqrt(density.min() * density.max()) else (6, "left")
             label = _visits(result.visits)
             axes.annotate(label, (x, y), xytext=(ahead, -10), textcoords="offset points", ha=side, fontsize=8)
-        slope = density_slope(density, found)
+        slope = density_slope(density, amplitudes)
         log_axes(axes, "" if slope is None else f"slope {slope:.2f}; paper: -0.97 ± 0.06")
         axes.set(xlabel="usable galaxies per arcmin²", ylabel="amplitude")
         axes.legend(loc="best")

@@ -36,8 +36,10 @@ from .sky_points import SkyPoints
 
 # FWHM of the magnitude limits of the stars, which are the same in every visit, good or bad.
 _NOMINAL_FWHM = 0.7 * ARCSEC
-# Least distance of stars and of places from the edge of a CCD [pixel].
-_STAR_MARGIN, _PLACE_MARGIN = 20, 2
+# Least distance of stars from the edge of a CCD [pixel].
+_STAR_MARGIN = 20
+# Least distance of places without a star from the edge of a CCD [pixel].
+_PLACE_MARGIN = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +61,8 @@ class StackFrame:
     def of(cls, experiment: Experiment, size: int) -> StackFrame:
         """Return the frame of an experiment."""
         center = Visit(0, 0).jacobians(experiment.telescope, np.zeros((1, 2)), middle_wavelength(experiment))[0]
-        left, scale, right = np.linalg.svd(center)
-        return cls(left @ right * scale.mean() / experiment.pixel_size, size)
+        u, scale, vt = np.linalg.svd(center)
+        return cls(u @ vt * scale.mean() / experiment.pixel_size, size)
 
     def to_stamp(self, experiment: Experiment, visit: Visit, sky: np.ndarray, threads: int | None = None) -> np.ndarray:
         """Return d(x, y of a stamp of the visit)/d(x, y of the stack) at positions of the sky, shape [n, 2, 2]."""
@@ -88,8 +90,8 @@ class _CcdResult(NamedTuple):
 
 def visit_experiment(experiment: Experiment, visit: Visit) -> Experiment:
     """Return the experiment of a visit: own turbulence, residual aberration, noise and, where it has one, rotator."""
-    own = with_options(experiment.config, atmosphere__epoch=visit.epoch, rotator_deg=visit.rotator_deg)
-    return Experiment.from_config(own)
+    visit_config = with_options(experiment.config, atmosphere__epoch=visit.epoch, rotator_deg=visit.rotator_deg)
+    return Experiment.from_config(visit_config)
 
 
 def visit_telescope(experiment: Experiment, visit: Visit) -> Telescope:
@@ -144,15 +146,15 @@ def visit_psfs(
     fields, index = _star_fields(experiment, visit, points, threads)
 
     def modelled(exposure: CcdExposure) -> _CcdResult:
-        stars, seen = exposure.positions, exposure.observed
-        counts = stars.electrons * seen.lit_fraction
-        images = collected_images(experiment, seen.image, seen.pixel_scale, counts)
-        observation = observe_ccd(experiment, exposure.name, images, seen.pixel_scale, counts, noisy=True)
+        stars, observed_psfs = exposure.positions, exposure.observed
+        counts = stars.electrons * observed_psfs.lit_fraction
+        images = collected_images(experiment, observed_psfs.image, observed_psfs.pixel_scale, counts)
+        observation = observe_ccd(experiment, exposure.name, images, observed_psfs.pixel_scale, counts, noisy=True)
         true = np.concatenate([exposure.holdout.image, resolved_value(exposure.centered).image])
         if together:
             return _CcdResult(exposure, observation, counts, true, None)
-        width = effective_fwhm(true, seen.pixel_scale)
-        dimmed = stars.magnitude - 2.5 * np.log10(seen.lit_fraction)
+        width = effective_fwhm(true, observed_psfs.pixel_scale)
+        dimmed = stars.magnitude - 2.5 * np.log10(observed_psfs.lit_fraction)
         snr = signal_to_noise(dimmed, stars.band, config.atmosphere.exposure_s, width)
         model = fit_ccd_model(experiment, observation, stars, snr)
         return _CcdResult(exposure, observation, counts, true, model.at(_positions_in_order(stars)))
@@ -168,16 +170,16 @@ def visit_psfs(
             threads=threads,
             reporter=reporter,
         )
-    found = simulated.results
-    if not found:
+    ccd_results = simulated.results
+    if not ccd_results:
         reasons = [f"CCD {name}: {reason}" for name, reason in simulated.not_modelled.items()]
         raise DomainError("; ".join(reasons[:1]) or "no star falls on a CCD")
-    true = [result.true for result in found.values()]
+    true = [result.true for result in ccd_results.values()]
     if together:
-        model = [_focal_plane_images(experiment, found, threads, reporter)]
+        model = [_focal_plane_images(experiment, ccd_results, threads, reporter)]
     else:
-        model = [result.model for result in found.values() if result.model is not None]
-    rows = np.concatenate([index[name] for name in found])
+        model = [result.model for result in ccd_results.values() if result.model is not None]
+    rows = np.concatenate([index[name] for name in ccd_results])
     matrix = frame.to_stamp(experiment, visit, points.sky[rows], threads)
 
     def turned(images: list[np.ndarray]) -> np.ndarray:
@@ -239,12 +241,12 @@ def magnitude_limits(experiment: Experiment) -> tuple[float, float]:
 def stack_limit(experiment: Experiment, snr: float, visits: int) -> float:
     """Return the magnitude of a star of a signal-to-noise ratio in a stack of visits of nominal seeing."""
     config = experiment.config
-    one = limiting_magnitude(snr, experiment.band, config.atmosphere.exposure_s, _NOMINAL_FWHM)
-    return float(one + 1.25 * np.log10(visits))
+    visit_limit = limiting_magnitude(snr, experiment.band, config.atmosphere.exposure_s, _NOMINAL_FWHM)
+    return float(visit_limit + 1.25 * np.log10(visits))
 
 
 def _focal_plane_images(
-    experiment: Experiment, found: dict[str, _CcdResult], threads: int | None, reporter: Reporter | None
+    experiment: Experiment, ccd_results: dict[str, _CcdResult], threads: int | None, reporter: Reporter | None
 ) -> np.ndarray:
     """Return the PSFs of one model of all CCDs at the points."""
     stars = FocalPlaneStars.of_ccds(
@@ -259,13 +261,13 @@ def _focal_plane_images(
                 result.observation.images,
                 result.observation.used,
             )
-            for name, result in found.items()
+            for name, result in ccd_results.items()
         ],
-        next(iter(found.values())).exposure.observed.pixel_scale,
+        next(iter(ccd_results.values())).exposure.observed.pixel_scale,
         experiment.weight_fwhm,
     )
-    model = fit_focal_plane_model(experiment, stars, ccds=list(found), threads=threads, reporter=reporter)
-    places = {name: _positions_in_order(result.exposure.positions) for name, result in found.items()}
+    model = fit_focal_plane_model(experiment, stars, ccds=list(ccd_results), threads=threads, reporter=reporter)
+    places = {name: _positions_in_order(result.exposure.positions) for name, result in ccd_results.items()}
     names = [name for name, xy in places.items() for _ in range(len(xy))]
     return model.draw(names, *np.concatenate(list(places.values())).T, threads=threads)
 

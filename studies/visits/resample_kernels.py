@@ -42,15 +42,15 @@ def resample_rows(
         x = wp.float64(column - result.shape[2] / 2)
         u = matrix[n, 0, 0] * x + matrix[n, 0, 1] * y + wp.float64(width / 2)
         v = matrix[n, 1, 0] * x + matrix[n, 1, 1] * y + wp.float64(height / 2)
-        left = wp.int32(wp.floor(u))
-        below = wp.int32(wp.floor(v))
-        s = wp.float32(u - wp.float64(left))
-        t = wp.float32(v - wp.float64(below))
+        u_floor = wp.int32(wp.floor(u))
+        v_floor = wp.int32(wp.floor(v))
+        s = wp.float32(u - wp.float64(u_floor))
+        t = wp.float32(v - wp.float64(v_floor))
         total = wp.float32(0.0)
-        if left >= 1 and below >= 1 and left < width - 2 and below < height - 2:
+        if u_floor >= 1 and v_floor >= 1 and u_floor < width - 2 and v_floor < height - 2:
             for j in range(4):
                 line = wp.float32(0.0)
                 for i in range(4):
-                    line += weight(i, s) * images[n, below - 1 + j, left - 1 + i]
+                    line += weight(i, s) * images[n, v_floor - 1 + j, u_floor - 1 + i]
                 total += weight(j, t) * line
         result[n, row, column] = factor[n] * total

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -14,8 +13,12 @@ from .stack import PsfStack
 #: Correlations of a stack: of the true PSFs at all points, and of true minus model at stars and where no star is.
 KINDS = ("psf", "residual_stars", "residual_places")
 StackCorrelations = dict[str, Correlation]
-# Smallest separation [arcmin], bins, and side of a patch of the jackknife over that of a CCD.
-_LEAST, _BINS, _PATCH = 1.0, 15, 3.0
+# Smallest separation [arcmin].
+_LEAST = 1.0
+# Bins of separation.
+_BINS = 15
+# Side of a patch of the jackknife over that of a CCD.
+_PATCH = 3.0
 
 
 def stack_correlations(stack: PsfStack, cell: float) -> StackCorrelations:
@@ -41,10 +44,10 @@ def correlations(
     Errors are those of a jackknife over patches, where there are several.
     """
     extent = float(np.hypot(np.ptp(x), np.ptp(y)))
-    found = {}
+    correlated = {}
     for kind, (e1, e2, rows) in values.items():
         several = len(np.unique(patch[rows])) > 1
-        found[kind] = shear_correlation(
+        correlated[kind] = shear_correlation(
             x[rows],
             y[rows],
             e1[rows],
@@ -54,26 +57,26 @@ def correlations(
             n_bins=_BINS,
             patch=patch[rows] if several else None,
         )
-    return found
+    return correlated
 
 
-def stack_metrics(stack: PsfStack, found: StackCorrelations) -> dict[str, Any]:
+def stack_metrics(stack: PsfStack, correlated: StackCorrelations) -> dict[str, float]:
     """Return the figures of a stack: ellipticities, sizes and mean correlations."""
     stars, places = stack.star, ~stack.star
-    e, left = (stack.e1, stack.e2), (stack.residual_e1, stack.residual_e2)
+    e, residual_e = (stack.e1, stack.e2), (stack.residual_e1, stack.residual_e2)
     size = (stack.size - stack.model_size) / stack.size
-    metrics: dict[str, Any] = {
+    metrics: dict[str, float] = {
         "points": len(stack),
         "rms_e": _rms_modulus(*e),
-        "rms_residual_e_stars": _rms_modulus(*(v[stars] for v in left)),
-        "rms_residual_e_places": _rms_modulus(*(v[places] for v in left)),
+        "rms_residual_e_stars": _rms_modulus(*(v[stars] for v in residual_e)),
+        "rms_residual_e_places": _rms_modulus(*(v[places] for v in residual_e)),
         # Medians beside the rms: a polynomial fitted to few stars goes far astray at a few places.
-        "median_residual_e_stars": _median_modulus(*(v[stars] for v in left)),
-        "median_residual_e_places": _median_modulus(*(v[places] for v in left)),
+        "median_residual_e_stars": _median_modulus(*(v[stars] for v in residual_e)),
+        "median_residual_e_places": _median_modulus(*(v[places] for v in residual_e)),
         "median_size_arcsec": float(np.nanmedian(stack.size) / ARCSEC),
         "rms_relative_residual_size_places": float(np.sqrt(np.nanmean(size[places] ** 2))),
     }
-    for kind, correlation in found.items():
+    for kind, correlation in correlated.items():
         for span in SEPARATION_RANGES:
             metrics[f"xi_plus_{kind}_{span}"] = correlation.mean_xi_plus(span)
             metrics[f"xi_plus_{kind}_{span}_error"] = correlation.error_mean_xi_plus(span)

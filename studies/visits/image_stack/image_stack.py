@@ -26,8 +26,10 @@ from .tiles import Tile, choose_tiles
 from .visit_image import Sky
 from .visit_wcs import VisitWcs
 
-#: Folder of the products in that of the visits, and file of the settings in it.
-FOLDER_NAME, SETTINGS_NAME = "images", "images.yaml"
+#: Folder of the products in that of the visits.
+FOLDER_NAME = "images"
+#: File of the settings in the folder of the products.
+SETTINGS_NAME = "images.yaml"
 #: S/N of a star as faint as the faintest galaxies in the stack of all visits, and its FWHM: fainter ones are not
 #: detected, and all of those below together are 3 % of its noise in a pixel.
 _FAINTEST_SNR = 4.0
@@ -109,17 +111,17 @@ class ImageStack:
     def wcs(self, visits: Sequence[Visit], threads: int | None = None) -> Iterator[tuple[Visit, dict[str, VisitWcs]]]:
         """Yield visits with the world coordinates of their CCDs."""
         camera, wavelength = self.experiment.camera, middle_wavelength(self.experiment)
-        known: dict[float | None, dict[str, CcdWcs]] = {}
+        wcs_by_rotator: dict[float | None, dict[str, CcdWcs]] = {}
         for visit in visits:
             # About the visit's own pointing, at a position angle of 0, all visits of a rotator angle have the same.
-            if visit.rotator_deg not in known:
+            if visit.rotator_deg not in wcs_by_rotator:
                 telescope = visit_telescope(self.experiment, visit)
-                own = {
+                camera_wcs = {
                     name: ccd_wcs(telescope, camera, name, wavelength=wavelength, threads=threads)
                     for name in resolved_value(self.experiment.config.ccds)
                 }
-                known = {visit.rotator_deg: own}
-            yield visit, {name: VisitWcs(ccd, visit) for name, ccd in known[visit.rotator_deg].items()}
+                wcs_by_rotator = {visit.rotator_deg: camera_wcs}
+            yield visit, {name: VisitWcs(ccd, visit) for name, ccd in wcs_by_rotator[visit.rotator_deg].items()}
 
     def path(self, visits: int, tile: Tile) -> Path:
         """Return the path of the image of a tile in the stack of a number of visits."""

@@ -48,24 +48,24 @@ def add_resampled(
     threads : int, optional
         Number of threads; all processors by default. No byte depends on it.
     """
-    part = _overlap(tile, frame, window, wcs)
-    if part is None:
+    overlap = _overlap(tile, frame, window, wcs)
+    if overlap is None:
         return
-    step, nodes = _mapping_nodes(tile, frame, part, window, wcs)
+    step, nodes = _mapping_nodes(tile, frame, overlap, window, wcs)
     inputs = [
         warp_array(exposed.image, wp.float32),
         warp_array(exposed.variance, wp.float32),
         warp_array(exposed.mask, wp.int16),
         warp_array(nodes),
         step,
-        part.x,
-        part.y,
-        part.width,
+        overlap.x,
+        overlap.y,
+        overlap.width,
         warp_array(sums.data, wp.float32),
         warp_array(sums.variance, wp.float32),
         warp_array(sums.count, wp.int16),
     ]
-    launch(add_rows, part.height, inputs, threads=threads)
+    launch(add_rows, overlap.height, inputs, threads=threads)
 
 
 def _overlap(tile: Tile, frame: StackFrame, window: Window, wcs: SkyPixels) -> Window | None:
@@ -82,19 +82,19 @@ def _overlap(tile: Tile, frame: StackFrame, window: Window, wcs: SkyPixels) -> W
 
 
 def _mapping_nodes(
-    tile: Tile, frame: StackFrame, part: Window, window: Window, wcs: SkyPixels
+    tile: Tile, frame: StackFrame, overlap: Window, window: Window, wcs: SkyPixels
 ) -> tuple[int, np.ndarray]:
-    """Return the pixels between nodes of a part of a tile, and x, y in the window and area of a pixel at them."""
+    """Return the pixels between nodes of the overlap with a tile, and x, y in the window and pixel area at them."""
     to_sky = np.linalg.inv(frame.matrix)
     inside = Window(0, 0, window.width, window.height)
     for step in _STEPS:
         # Nodes and, between them, places where the mapping is checked.
-        counts = [2 * -(-n // step) + 1 for n in (part.width, part.height)]
-        x, y = (0.5 * step * np.arange(n) + start for n, start in zip(counts, (part.x, part.y), strict=True))
+        counts = [2 * -(-n // step) + 1 for n in (overlap.width, overlap.height)]
+        x, y = (0.5 * step * np.arange(n) + start for n, start in zip(counts, (overlap.x, overlap.y), strict=True))
         pixels = wcs.to_pixel((np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) + tile.first) @ to_sky.T)
         area = np.abs(np.linalg.det(wcs.jacobians(pixels) @ to_sky))
-        found = np.column_stack([pixels - (window.x, window.y), area]).reshape(len(y), len(x), 3)
-        nodes, between = found[::2, ::2].copy(), found[1::2, 1::2, :2]
+        mapping = np.column_stack([pixels - (window.x, window.y), area]).reshape(len(y), len(x), 3)
+        nodes, between = mapping[::2, ::2].copy(), mapping[1::2, 1::2, :2]
         linear = 0.25 * (nodes[:-1, :-1] + nodes[:-1, 1:] + nodes[1:, :-1] + nodes[1:, 1:])[..., :2]
         # Polynomials hold on the CCD only.
         on_ccd = inside.contains(between.reshape(-1, 2)).reshape(between.shape[:2])

@@ -33,13 +33,13 @@ def add_rows(
     row = first + wp.tid()
     cell_y = row / step
     v = wp.float64(row - cell_y * step) / wp.float64(step)
-    one = wp.float64(1.0)
+    unit = wp.float64(1.0)
     for column in range(width):
         cell_x = column / step
         u = wp.float64(column - cell_x * step) / wp.float64(step)
-        a = (one - u) * (one - v)
-        b = u * (one - v)
-        c = (one - u) * v
+        a = (unit - u) * (unit - v)
+        b = u * (unit - v)
+        c = (unit - u) * v
         d = u * v
         x = a * nodes[cell_y, cell_x, 0]
         x += b * nodes[cell_y, cell_x + 1, 0]
@@ -49,15 +49,15 @@ def add_rows(
         y += b * nodes[cell_y, cell_x + 1, 1]
         y += c * nodes[cell_y + 1, cell_x, 1]
         y += d * nodes[cell_y + 1, cell_x + 1, 1]
-        left = wp.int32(wp.floor(x))
-        below = wp.int32(wp.floor(y))
-        if left >= 1 and below >= 1 and left < image.shape[1] - 2 and below < image.shape[0] - 2:
+        x_floor = wp.int32(wp.floor(x))
+        y_floor = wp.int32(wp.floor(y))
+        if x_floor >= 1 and y_floor >= 1 and x_floor < image.shape[1] - 2 and y_floor < image.shape[0] - 2:
             area = a * nodes[cell_y, cell_x, 2]
             area += b * nodes[cell_y, cell_x + 1, 2]
             area += c * nodes[cell_y + 1, cell_x, 2]
             area += d * nodes[cell_y + 1, cell_x + 1, 2]
-            s = wp.float32(x - wp.float64(left))
-            t = wp.float32(y - wp.float64(below))
+            s = wp.float32(x - wp.float64(x_floor))
+            t = wp.float32(y - wp.float64(y_floor))
             bad = wp.int32(0)
             value = wp.float32(0.0)
             spread = wp.float32(0.0)
@@ -66,9 +66,9 @@ def add_rows(
                 line_spread = wp.float32(0.0)
                 for i in range(4):
                     w = weight(i, s)
-                    bad += wp.int32(mask[below - 1 + j, left - 1 + i])
-                    line += w * image[below - 1 + j, left - 1 + i]
-                    line_spread += w * w * variance[below - 1 + j, left - 1 + i]
+                    bad += wp.int32(mask[y_floor - 1 + j, x_floor - 1 + i])
+                    line += w * image[y_floor - 1 + j, x_floor - 1 + i]
+                    line_spread += w * w * variance[y_floor - 1 + j, x_floor - 1 + i]
                 w = weight(j, t)
                 value += w * line
                 spread += w * w * line_spread

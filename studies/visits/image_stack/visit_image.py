@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from ....imaging.draw import Window, add_stamps, draw_galaxies
 from ....imaging.exposure import ExposedImage, Exposure, expose
+from ....imaging.galaxies import SkyGalaxies
 from ....imaging.psf_field import PsfField, to_pixel
 from ....imaging.scene import STAR_ROOM, galaxies_near
 from ....pipeline.experiment import Experiment
@@ -43,7 +42,7 @@ class Sky:
     """
 
     points: SkyPoints
-    galaxies: Callable[[Any, Any], Any]
+    galaxies: SkyGalaxies
 
 
 def visit_image(
@@ -111,12 +110,12 @@ def visit_image(
     noise = exposure.noise_rms / np.sqrt(depth)
     scene = draw_galaxies(galaxies, electrons, field, wcs, window=window, noise=noise, threads=threads)
     reach = 0.5 * (field.stamp + STAR_ROOM)
-    own = np.flatnonzero(points.star[rows] & window.contains(at[rows], reach))
-    if len(own):
-        nearest = np.rint(at[rows[own]])
-        offsets = at[rows[own]] - nearest + psfs.offset[own]
-        stars = expose_positions(experiment, xy[rows[own]], threads, room=STAR_ROOM, offsets=offsets, along=name)
-        magnitude = magnitudes_at(points.quantile[rows[own]], *magnitude_limits(experiment))
+    star_rows = np.flatnonzero(points.star[rows] & window.contains(at[rows], reach))
+    if len(star_rows):
+        nearest = np.rint(at[rows[star_rows]])
+        offsets = at[rows[star_rows]] - nearest + psfs.offset[star_rows]
+        stars = expose_positions(experiment, xy[rows[star_rows]], threads, room=STAR_ROOM, offsets=offsets, along=name)
+        magnitude = magnitudes_at(points.quantile[rows[star_rows]], *magnitude_limits(experiment))
         light = (exposure.electrons(magnitude) * stars.lit_fraction).astype(np.float32)
         corners = nearest.astype(np.int64) - stars.image.shape[1] // 2 - (window.x, window.y)
         add_stamps(scene, stars.image * light[:, None, None], corners)

@@ -34,8 +34,8 @@ class VisitWcs:
 
     def to_sky(self, pixels: ArrayLike) -> np.ndarray:
         """Return (xi, eta), shape [n, 2], of pixels (x, y), shape [n, 2]."""
-        own = self.ccd.to_sky(pixels)
-        source = np.column_stack([own, np.ones(len(own))]) @ self.visit.matrix
+        visit_plane = self.ccd.to_sky(pixels)
+        source = np.column_stack([visit_plane, np.ones(len(visit_plane))]) @ self.visit.matrix
         return np.asarray(source[:, :2] / source[:, 2:])
 
     def to_pixel(self, sky: ArrayLike) -> np.ndarray:
@@ -44,10 +44,10 @@ class VisitWcs:
 
     def jacobians(self, pixels: ArrayLike) -> np.ndarray:
         """Return d(x, y)/d(xi, eta) at pixels, shape [n, 2, 2]."""
-        own, ahead = self._to_visit_plane(self.to_sky(pixels))
+        visit_plane, ahead = self._to_visit_plane(self.to_sky(pixels))
         matrix = self.visit.matrix
         # Derivative of (X, Y) / Z, both linear in xi and eta.
-        change = (matrix[None, :2, :2] - own[:, :, None] * matrix[None, 2:, :2]) / ahead[:, :, None]
+        change = (matrix[None, :2, :2] - visit_plane[:, :, None] * matrix[None, 2:, :2]) / ahead[:, :, None]
         return self.ccd.jacobians(pixels) @ change
 
     def _to_visit_plane(self, sky: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
