@@ -183,7 +183,7 @@ def test_refusals(visits_folder, tmp_path_factory, monkeypatch, capsys):
     (folder / "images" / "images.yaml").write_text(ImageStack.of(folder, SMALL).settings.to_yaml())
     with pytest.raises(ProductError, match="go on with --resume"):
         stack_images(folder, SMALL)
-    with pytest.raises(ProductError, match="images of other settings"):
+    with pytest.raises(ProductError, match="images of another configuration"):
         stack_images(folder, SMALL.model_copy(update={"noise": False}), execution=Execution(resume=True))
 
 
