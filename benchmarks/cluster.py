@@ -10,12 +10,15 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import distributed
 
 from pachon.core.dask_cluster import dask_workers, local_cluster
-from pachon.pipeline.ccd_worker import CcdComputation, CcdJob, CcdResult
+from pachon.core.errors import PachonError
+from pachon.core.long_work import Job, JobComputation, JobResult
+from pachon.pipeline.ccd_worker import compute_ccd
 from pachon.pipeline.config import Configuration, with_options
 from pachon.pipeline.experiment import Experiment
 
@@ -32,14 +35,14 @@ class Nothing:
     sent_back: int
 
     def __call__(self, job, threads):
-        return CcdResult(job.name, bytes(self.sent_back))
+        return JobResult(job.number, None, (("product", bytes(self.sent_back)),))
 
 
 def seconds_a_job(client, compute, names):
     start = time.perf_counter()
-    for result in dask_workers(compute, client).results(CcdJob(name) for name in names):
-        if result.problem is not None:
-            sys.exit(result.problem)
+    for result in dask_workers(compute, client).results(Job(i, name, name) for i, name in enumerate(names)):
+        if isinstance(result.value, PachonError):
+            sys.exit(str(result.value))
     return (time.perf_counter() - start) / len(names)
 
 
@@ -56,7 +59,7 @@ def main():
             seconds = seconds_a_job(client, Nothing(experiment, size), many)
             print(f"{title}: {1e3 * seconds:.1f} ms a job, {1.0 / seconds:.0f} jobs a second")
         for title, made in (("21 noise-free and 40 observed stars", small), ("800 and 40", experiment)):
-            computation = CcdComputation(made, Path(folder), "none")
+            computation = JobComputation(partial(compute_ccd, made), Path(folder), "none")
             first = seconds_a_job(client, computation, names[:2])
             each = 2.0 * seconds_a_job(client, computation, names[2:8])
             print(f"CCD of {title}: {each:.1f} s of a worker; the first of each, with six screens: {2.0 * first:.0f} s")

@@ -9,9 +9,9 @@ import typer
 from typer import Argument, Option
 
 from ..core.terminal import print_line
-from .interrupt import interruptible
 from .options import Json, Quiet, Threads
 from .tables import Rows, print_json
+from .workers import long_work
 
 app = typer.Typer()
 _CAPTION = "Root mean squares over pupil and field; late: the second half of the visits."
@@ -72,8 +72,9 @@ def align_command(
         seed=seed,
     )
     folder = None if config is None else config.parent
-    with interruptible(quiet, f"finished visits are in {out}, and --resume goes on from there") as reporter:
-        alignment = align(settings, folder=folder, store=out, resume=resume, threads=threads, reporter=reporter)
+    hint = f"finished visits are in {out}, and --resume goes on from there"
+    with long_work(quiet, hint, threads=threads, resume=resume) as execution:
+        alignment = align(settings, folder=folder, store=out, execution=execution)
     write_alignment(alignment, out)
     summary = alignment_summary(alignment)
     if as_json:

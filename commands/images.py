@@ -9,10 +9,9 @@ import typer
 from typer import Argument, Option
 
 from ..core.terminal import print_line
-from .interrupt import interruptible
 from .options import AllCcds, Ccds, Json, Quiet, Raft, Threads, chosen_ccds
 from .tables import Rows, print_json
-from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
+from .workers import DaskWorkers, Processes, Scheduler, long_work
 
 app = typer.Typer()
 
@@ -84,13 +83,11 @@ def images_command(
     }
     settings = with_options(with_options(base, **(_QUICK if quick else {})), **options)
     experiment = settings.experiment(None if config is None else config.parent)
-    with (
-        interruptible(quiet, f"finished CCDs are in {out}, and --resume goes on from there") as reporter,
-        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
-    ):
-        result = simulate_images(
-            settings, out, experiment=experiment, resume=resume, workers=maker, threads=threads, reporter=reporter
-        )
+    hint = f"finished CCDs are in {out}, and --resume goes on from there"
+    with long_work(
+        quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
+    ) as execution:
+        result = simulate_images(settings, out, experiment=experiment, execution=execution)
     images = {name: str(path.resolve()) for name, path in result.images.items()}
     if as_json:
         print_json({"images": images, "objects": result.objects, "kept": list(result.kept)})

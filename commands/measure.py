@@ -10,10 +10,9 @@ from typer import Argument, Option
 
 from ..core.errors import ConfigError
 from .inputs import load_model
-from .interrupt import interruptible
 from .options import Json, Quiet, Threads
 from .tables import Rows, print_json
-from .workers import Processes, chosen_workers
+from .workers import Processes, long_work
 
 app = typer.Typer()
 
@@ -75,18 +74,14 @@ def measure_command(
         make_folder(out)
     images = images_among(images)
     options = {"basis": basis, "interpolation": interpolation, "order": order, "min_snr": min_snr}
-    with (
-        interruptible(quiet, "catalogues that are written stay, and --resume goes on from there") as reporter,
-        chosen_workers(processes, None, None, threads, reporter.line) as maker,
-    ):
+    hint = "catalogues that are written stay, and --resume goes on from there"
+    with long_work(quiet, hint, threads=threads, resume=resume, processes=processes) as execution:
         psf = None
         if model == "focal_plane":
             known = None if telescope is None else load_model(telescope)
             psf = (images[0].parent if out is None else out) / "focal_plane_psf.fits"
-            fit_exposure_psf(images, known, min_snr=min_snr, threads=threads, reporter=reporter).write(psf)
-        found = measure_files(
-            images, out, psf=psf, options=options, resume=resume, workers=maker, threads=threads, reporter=reporter
-        )
+            fit_exposure_psf(images, known, min_snr=min_snr, threads=threads, reporter=execution.reporter).write(psf)
+        found = measure_files(images, out, psf=psf, options=options, execution=execution)
     if as_json:
         print_json({"images": found.metrics, "left_out": found.left_out})
     elif not quiet:

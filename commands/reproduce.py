@@ -10,10 +10,9 @@ from rich.table import Table
 from typer import Argument, Option
 
 from ..core.terminal import print_line
-from .interrupt import interruptible
 from .options import Json, Quiet, Threads
 from .tables import print_json, wide_console
-from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
+from .workers import DaskWorkers, Processes, Scheduler, long_work
 
 app = typer.Typer()
 
@@ -51,13 +50,8 @@ def reproduce_command(
     from ..studies.reproduce.reproduce import reproduce_at
 
     hint = f"finished parts are in {out}, and are used by the next call"
-    with (
-        interruptible(quiet, hint) as reporter,
-        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
-    ):
-        summary = reproduce_at(
-            figures or ("all",), scale, out, seed=seed, workers=maker, threads=threads, reporter=reporter
-        )
+    with long_work(quiet, hint, threads=threads, processes=processes, scheduler=scheduler, dask=workers) as execution:
+        summary = reproduce_at(figures or ("all",), scale, out, seed=seed, execution=execution)
     if as_json:
         print_json(summary)
     elif not quiet:

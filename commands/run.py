@@ -11,10 +11,9 @@ from typer import Option
 from ..core.errors import ConfigError
 from ..core.terminal import print_line
 from .inputs import configured_experiment
-from .interrupt import interruptible
 from .options import AllCcds, Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, chosen_ccds
 from .tables import Rows, plain_table, print_json, wide_console
-from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
+from .workers import DaskWorkers, Processes, Scheduler, long_work
 
 if TYPE_CHECKING:
     from ..pipeline.run import RunResult
@@ -68,20 +67,11 @@ def run_command(
     experiment = configured_experiment(
         config, ccds=names, seed=seed, stars__truth=truth_stars, stars__observed=observed_stars
     )
-    with (
-        interruptible(quiet, f"finished CCDs are in {out}, and --resume goes on from there") as reporter,
-        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
-    ):
-        result = run(
-            experiment,
-            out,
-            resume=resume,
-            strict=strict,
-            workers=maker,
-            part=_part(part),
-            threads=threads,
-            reporter=reporter,
-        )
+    hint = f"finished CCDs are in {out}, and --resume goes on from there"
+    with long_work(
+        quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
+    ) as execution:
+        result = run(experiment, out, strict=strict, part=_part(part), execution=execution)
     if quiet:  # the reporter has printed nothing
         for name, reason in result.not_modelled.items():
             print_line(f"pachon: {left_out_line(name, reason)}", error=True)
@@ -92,7 +82,7 @@ def run_command(
         print_json(result.summary if result.report else part_summary)
     elif not quiet:
         if result.report:
-            _show_run(result, sum(reporter.seconds.values()))
+            _show_run(result, sum(execution.reporter.seconds.values()))
         else:
             _show_part(result)
 

@@ -10,10 +10,9 @@ from typer import Argument, Option
 
 from ..core.errors import PachonError
 from ..core.terminal import print_line
-from .interrupt import interruptible
 from .options import Json, Quiet, Threads
 from .tables import Rows, print_json
-from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
+from .workers import DaskWorkers, Processes, Scheduler, long_work
 
 app = typer.Typer()
 
@@ -63,15 +62,13 @@ def stack_images_command(
 
     overrides = {"tiles": tiles, "faintest": faintest, "side": side, "noise": noise}
     settings = ImageStackConfig(**{key: value for key, value in overrides.items() if value is not None})
-    with (
-        interruptible(quiet, f"finished visits are in {folder}, and --resume goes on from there") as reporter,
-        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
-    ):
-        stack = stack_images(folder, settings, resume=resume, workers=maker, threads=threads, reporter=reporter)
+    hint = f"finished visits are in {folder}, and --resume goes on from there"
+    with long_work(
+        quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
+    ) as execution:
+        stack = stack_images(folder, settings, execution=execution)
         try:
-            metrics_by_visits = (
-                measure_stack(folder, workers=maker, threads=threads, reporter=reporter) if measure else {}
-            )
+            metrics_by_visits = measure_stack(folder, execution=execution) if measure else {}
         except PachonError as error:
             raise error.followed_by(
                 f"the stacked images are kept in {stack.folder}, not all of them measured (--no-measure)"

@@ -11,14 +11,12 @@ from typer import Argument, Option
 from ..core.errors import ConfigError
 from ..core.threads import thread_count
 from .default_group import DefaultGroup
-from .interrupt import interruptible
 from .options import Json, Quiet, Threads
 from .tables import Rows, print_json
-from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
+from .workers import DaskWorkers, Processes, Scheduler, long_work
 
 if TYPE_CHECKING:
-    from ..core.progress import Reporter
-    from ..core.workers import MakeWorkers
+    from ..core.long_work import Execution
 
 app = typer.Typer()
 sweep_app = typer.Typer(cls=DefaultGroup, subcommand_metavar="| COMMAND [ARGS]...")
@@ -74,25 +72,24 @@ def sweep_run(
     resumed = f"go on with: pachon sweep {path} -o {store} --resume"
     if scheduler is None and workers is None and processes is None:
         processes = thread_count(threads)
-    with (
-        interruptible(quiet, resumed) as reporter,
-        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
-    ):
-        outcome = _run(path, store, resume, maker, reporter)
+    with long_work(
+        quiet, resumed, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
+    ) as execution:
+        outcome = _run(path, store, execution)
     _show(outcome, as_json, quiet)
 
 
-def _run(path: Path, store: Path, resume: bool, maker: MakeWorkers | None, reporter: Reporter) -> dict[str, Any]:
+def _run(path: Path, store: Path, execution: Execution) -> dict[str, Any]:
     """Compute the points that are missing, write the report, and return the counts."""
     from ..studies.sweep.file import load_sweep
     from ..studies.sweep.report import write_report
     from ..studies.sweep.store import SweepStore
     from ..studies.sweep.sweep import run_sweep
 
-    outcome = run_sweep(load_sweep(path), store, folder=path.parent, resume=resume, workers=maker, reporter=reporter)
+    outcome = run_sweep(load_sweep(path), store, folder=path.parent, execution=execution)
     report = None
     if outcome.failed < outcome.points:
-        with reporter.stage("report"), SweepStore(store) as opened:
+        with execution.reporter.stage("report"), SweepStore(store) as opened:
             report = str(write_report(opened, _report_folder(store)))
     counts = {key: getattr(outcome, key) for key in ("points", "kept", "computed", "failed")}
     return {"store": str(store), **counts, "report": report}

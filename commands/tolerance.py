@@ -11,10 +11,9 @@ from typer import Argument, Option
 from ..core.file_names import file_name
 from ..core.terminal import print_line
 from .inputs import errors_of, load_model
-from .interrupt import interruptible
 from .options import GlassCatalogues, Json, Lenient, Model, Quiet, Threads
 from .tables import Rows, number_texts, print_json
-from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
+from .workers import DaskWorkers, Processes, Scheduler, long_work
 
 app = typer.Typer()
 #: Tolerances in the table, the costliest.
@@ -67,18 +66,12 @@ def tolerance_command(
     make_folder(folder)
     resumed = f"go on with: pachon tolerance {model} {tolerances} -o {folder} --resume"
     with (
-        interruptible(quiet, resumed) as reporter,
-        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
+        long_work(
+            quiet, resumed, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
+        ) as execution,
         errors_of(tolerances),
     ):
-        study = run_tolerances(
-            telescope,
-            file,
-            folder / "points.tolerance",
-            resume=resume,
-            workers=maker,
-            reporter=reporter,
-        )
+        study = run_tolerances(telescope, file, folder / "points.tolerance", execution=execution)
     write_tolerances(study, file, folder)
     summary = tolerance_summary(study)
     if as_json:

@@ -10,10 +10,9 @@ from typer import Argument, Option
 
 from ..core.errors import ConfigError
 from ..core.terminal import print_line
-from .interrupt import interruptible
 from .options import AllCcds, Ccds, Json, Quiet, Raft, Threads, chosen_ccds
 from .tables import Rows, print_json
-from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
+from .workers import DaskWorkers, Processes, Scheduler, long_work
 
 app = typer.Typer()
 
@@ -93,13 +92,11 @@ def visits_command(
         visits__rotator_deg=angles_of("--rotator", rotator),
     )
     experiment = settings.experiment(None if config is None else config.parent)
-    with (
-        interruptible(quiet, f"finished visits are in {out}, and --resume goes on from there") as reporter,
-        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
-    ):
-        result = stack_visits(
-            settings, out, experiment=experiment, resume=resume, workers=maker, threads=threads, reporter=reporter
-        )
+    hint = f"finished visits are in {out}, and --resume goes on from there"
+    with long_work(
+        quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
+    ) as execution:
+        result = stack_visits(settings, out, experiment=experiment, execution=execution)
     if as_json:
         print_json(result.summary)
     elif not quiet:
@@ -163,13 +160,10 @@ def null_test_command(
     from ..studies.visits.null_test import null_test
 
     hint = f"finished tiles are in {folder}, and --resume goes on from there"
-    with (
-        interruptible(quiet, hint) as reporter,
-        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
-    ):
-        results = null_test(
-            folder, tiles=tiles, rings=rings, resume=resume, workers=maker, threads=threads, reporter=reporter
-        )
+    with long_work(
+        quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
+    ) as execution:
+        results = null_test(folder, tiles=tiles, rings=rings, execution=execution)
     metrics_by_visits = {str(visits): null_metrics(result) for visits, result in results.items()}
     if as_json:
         print_json({"stacks": metrics_by_visits})

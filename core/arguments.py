@@ -44,7 +44,8 @@ def check_arguments(target: Target) -> Target:
     False, and 1 and 0. A quantity where plain numbers are expected is
     converted to the unit in square brackets of the docstring.
 
-    Names of arguments are checked by Python (TypeError); shapes, ranges and NaN by the function itself.
+    Names of arguments are checked by Python (TypeError), and one that is a field of another argument is a ConfigError;
+    shapes, ranges and NaN by the function itself.
     """
     if not inspect.isclass(target):
         return cast(Target, _checked(target, target))
@@ -99,6 +100,8 @@ def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any
             for name, value in options.items():
                 if (check := parameter_checks.get(name)) is not None:
                     options[name] = check(name, value)
+                elif name not in parameter_checks:
+                    _refuse_field(function, name)
         except _MismatchError as problem:
             name = problem.name.partition("[")[0]
             # Most calls come without quantities: what they cost is paid here, where plain numbers were expected.
@@ -114,6 +117,19 @@ def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any
         return function(*checked_args, **options)
 
     return checked
+
+
+def _refuse_field(function: Callable[..., Any], name: str) -> None:
+    """Raise ConfigError for an unknown argument that is a field of an object that the function takes."""
+    try:
+        annotations = typing.get_type_hints(function)
+    except NameError:
+        return
+    for parameter, annotation in annotations.items():
+        for kind in (annotation, *get_args(annotation)):
+            if parameter != "return" and name in getattr(kind, "__dataclass_fields__", ()):
+                text = f"{name}: expected within {parameter}, as {parameter}={kind.__name__}({name}=...)"
+                raise ConfigError(text, key=name)
 
 
 def _plain_numbers(value: Any, unit: str, name: str) -> Any:

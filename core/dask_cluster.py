@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from itertools import islice
@@ -28,7 +28,7 @@ def dask_workers(compute: Compute, client: Any, *, local: bool = False) -> Worke
     count = len(info["workers"])
     description = f"{count} Dask worker{'s' * (count != 1)} of {info['address']}"
 
-    def results(jobs: Iterable[Any]) -> Iterator[Any]:
+    def results(jobs: Iterable[Any]) -> Generator[Any, None, None]:
         from distributed import CancelledError, as_completed
         from distributed.scheduler import KilledWorker
 

@@ -64,37 +64,6 @@ def require_writable(path: Path, *, file: bool = False, error: type[PachonError]
         raise error(f"cannot write {path}: {getattr(problem, 'strerror', None) or problem}") from None
 
 
-def claim_folder(path: Path, content: bytes, *, products: str, check: Callable[[], None]) -> None:
-    """Write the configuration of a run into its folder, or check the one that is there.
-
-    If several runs start in a new folder together, one of them writes the file. In the others, and in an existing
-    folder, `check` compares it with their own and raises where they differ; otherwise it is written again.
-
-    Parameters
-    ----------
-    path : Path
-        File of the configuration; its folder is made where missing.
-    content : bytes
-        Content of the file.
-    products : str
-        Pattern of the names of products. With some of them and without the file a folder is refused.
-    check : callable
-        Function that raises a ProductError where the file is of another configuration.
-
-    Raises
-    ------
-    ProductError
-        If the folder holds another run, or cannot be made or written.
-    """
-    folder = path.parent
-    make_folder(folder)
-    if not path.exists() and (stray_products := sorted(folder.glob(products))):
-        raise ProductError(f"{folder} holds {stray_products[0].name} but no {path.name}; choose another --out")
-    if not write_new_bytes(path, content):
-        check()
-        write_bytes(path, content)
-
-
 def partial_path(path: Path) -> Path:
     """Return the temporary path under which this process writes a file."""
     return path.with_name(f".{path.name}.{_owning_process(os.getpid())}.partial")

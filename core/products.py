@@ -81,13 +81,14 @@ def write_hdus(path: Path, hdus: fits.HDUList) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def read_fits(path: Path, *, checksums: bool = True) -> fits.HDUList:
-    """Read a FITS product into memory and check the checksum of every part.
+def read_fits(path: Path, stamp: Stamp | None = None, *, checksums: bool = True) -> fits.HDUList:
+    """Read a FITS product into memory and check the checksum of every part, and the stamp where one is given.
 
     Without `checksums` a part need not have any, nor the file its number of parts: the standard leaves them free, and
     files may come from other programs. Those that are there must hold.
 
-    Raises ProductError if there is no such file, or it is no product of this program as it was written.
+    Raises ProductError if there is no such file, it is no product of this program as it was written, or has another
+    stamp.
     """
     data = read_bytes(path, ProductError)
     with warnings.catch_warnings():
@@ -103,7 +104,18 @@ def read_fits(path: Path, *, checksums: bool = True) -> fits.HDUList:
             parts = hdus[0].header["NPARTS"] if checksums else hdus[0].header.get("NPARTS", len(hdus))
             if len(hdus) != parts:
                 raise ProductError(f"cut short; expected {parts} parts, found {len(hdus)}", file=path)
+    if stamp is not None and not stamp.matches(hdus[0].header):
+        raise ProductError("was made with another version, configuration or seed", file=path)
     return hdus
+
+
+def is_whole(path: Path, stamp: Stamp) -> bool:
+    """Return whether there is an undamaged FITS product with a stamp."""
+    try:
+        read_fits(path, stamp)
+    except ProductError:
+        return False
+    return True
 
 
 def _checksum_problem(hdu: Any, data: bytes, *, required: bool) -> str:

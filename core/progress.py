@@ -72,7 +72,7 @@ class Reporter:
 
     def __init__(self, quiet: bool = False, check: Callable[[], None] | None = None) -> None:
         self.quiet = quiet
-        self._check = check or (lambda: None)
+        self.check = check or (lambda: None)
         self.seconds: dict[str, float] = {}
 
     def line(self, text: str) -> None:
@@ -83,11 +83,11 @@ class Reporter:
     @contextmanager
     def stage(self, title: str, total: int | None = None) -> Iterator[Stage]:
         """Show one stage while it runs; without the total number of items its bar has no length."""
-        self._check()
+        self.check()
         start = time.perf_counter()
         console = Console(stderr=True)
         if self.quiet or not console.is_terminal:
-            stage = Stage(None, not self.quiet, self._check)
+            stage = Stage(None, not self.quiet, self.check)
             yield stage
             self.seconds[title] = time.perf_counter() - start
             stage.line(f"{title}: {self.seconds[title]:.1f} s")
@@ -104,6 +104,6 @@ class Reporter:
         shown = columns if total is not None else (*columns[:2], columns[-1])
         with Progress(*shown, console=console) as bars:
             task = bars.add_task(terminal_text(title), total=total)
-            yield Stage(lambda count: bars.advance(task, count), False, self._check)
+            yield Stage(lambda count: bars.advance(task, count), False, self.check)
             bars.update(task, total=total or 1, completed=total or 1)
         self.seconds[title] = time.perf_counter() - start

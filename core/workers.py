@@ -11,7 +11,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -51,7 +51,7 @@ class Workers:
 
     description: str  #: number and kind
     processes: int  #: processes of this machine among which its memory is shared; 0 on others
-    results: Callable[[Iterable[Any]], Iterator[Any]]
+    results: Callable[[Iterable[Any]], Generator[Any, None, None]]
 
 
 #: Function that makes workers of the function that does a job.
@@ -71,7 +71,7 @@ def process_workers(compute: Compute, count: int, threads: int | None = None) ->
     """
     threads_per_process = max(1, thread_count(threads) // count)
 
-    def results(jobs: Iterable[Any]) -> Iterator[Any]:
+    def results(jobs: Iterable[Any]) -> Generator[Any, None, None]:
         # A fresh interpreter, not a fork: Warp and OpenMP keep threads that a fork would lose. Variables that bound the
         # threads of libraries must be set before a worker imports them.
         with _environment({name: str(threads_per_process) for name in _THREAD_VARIABLES}):

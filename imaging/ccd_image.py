@@ -1,21 +1,16 @@
-"""The image of one CCD of a configuration, drawn by this process or as the job of a worker."""
+"""The image of one CCD of a configuration, drawn in this process or as the job of a worker."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ..core.errors import ConfigError, PachonError, ProductError, error_context
-from ..core.files import folder_of_worker, marked_folder, write_bytes
+from ..core.errors import ConfigError, PachonError, error_context
+from ..core.files import write_bytes
 from ..core.products import Stamp
-from ..core.progress import Reporter
-from ..core.workers import MakeWorkers
-from ..pipeline.ccd_worker import CcdJob
 from ..pipeline.experiment import Experiment
-from ..pipeline.memory import check_memory
 from ..pipeline.screen_cache import with_cached_screens
 from .config import ImagesConfig
 from .draw import Window
@@ -23,72 +18,6 @@ from .exposure import Exposure
 from .galaxies import GalaxySource, SkyGalaxies
 from .preview import cutouts_png, preview_png
 from .scene import draw_ccd, stamped
-
-
-@dataclass(frozen=True)
-class DrawnImage:
-    """Result of one CCD, as a worker returns it."""
-
-    name: str
-    objects: int = 0  #: number of objects on it
-    files: tuple[tuple[str, bytes], ...] = ()  #: names and contents, where the worker does not share the folder
-    problem: str | None = None  #: one line: the CCD could not be drawn, or a file not be written
-
-
-@dataclass(frozen=True)
-class ImageComputation:
-    """Draw CCDs of a configuration; a picklable function for every kind of worker."""
-
-    config: ImagesConfig
-    experiment: Experiment
-    folder: Path
-    mark: str  #: file in the folder, by which workers that share it are told
-
-    def __call__(self, job: CcdJob, threads: int) -> DrawnImage:
-        """Draw one CCD."""
-        experiment = with_cached_screens(self.experiment)
-        try:
-            experiment.make_screens(threads)
-            galaxies = galaxies_of(self.config, experiment)
-            with folder_of_worker(self.folder, self.mark) as place:
-                objects = draw_image(self.config, experiment, job.name, galaxies, place, threads)
-                # The image last: a resumed run takes it for the sign of a finished CCD.
-                own = sorted(place.iterdir(), key=lambda path: path.name == image_name(job.name))
-                sent = () if place == self.folder else tuple((path.name, path.read_bytes()) for path in own)
-        except PachonError as error:
-            return DrawnImage(job.name, problem=" ".join(str(error).split()))
-        return DrawnImage(job.name, objects, sent)
-
-
-def draw_by_workers(
-    config: ImagesConfig,
-    experiment: Experiment,
-    folder: Path,
-    names: Sequence[str],
-    workers: MakeWorkers,
-    reporter: Reporter,
-) -> dict[str, int]:
-    """Have workers draw CCDs into a folder, and return the number of objects on each.
-
-    Raises
-    ------
-    ProductError
-        If a CCD cannot be drawn, a file cannot be written, or a worker is lost.
-    """
-    objects: dict[str, int] = {}
-    with marked_folder(folder) as mark:
-        chosen = workers(ImageComputation(config, experiment, folder.resolve(), mark))
-        check_memory(experiment, 1, copies=chosen.processes)
-        with reporter.stage(f"images of {len(names)} CCDs, {chosen.description}", len(names)) as stage:
-            for number, drawn in enumerate(chosen.results(CcdJob(name) for name in names), start=1):
-                if drawn.problem is not None:
-                    raise ProductError(drawn.problem)
-                for name, data in drawn.files:
-                    write_bytes(folder / name, data)
-                objects[drawn.name] = drawn.objects
-                stage.advance()
-                stage.step(drawn.name, number, len(names))
-    return {name: objects[name] for name in names}
 
 
 def image_name(name: str) -> str:
@@ -101,16 +30,26 @@ def stamp_of(config: ImagesConfig, experiment: Experiment) -> Stamp:
     return Stamp(config.digest(experiment), experiment.config.seed)
 
 
+def draw_by_worker(config: ImagesConfig, experiment: Experiment, name: str, threads: int, folder: Path) -> int:
+    """Draw one CCD as the job of a worker, which keeps the phase screens of its last CCD for the next one."""
+    experiment = with_cached_screens(experiment)
+    experiment.make_screens(threads)
+    return draw_image(config, experiment, galaxies_of(config, experiment), lambda: None, name, threads, folder)
+
+
 def draw_image(
     config: ImagesConfig,
     experiment: Experiment,
-    name: str,
     galaxies: Any,
-    folder: Path,
+    check: Callable[[], None],
+    name: str,
     threads: int | None,
-    check: Callable[[int], None] | None = None,
+    folder: Path,
 ) -> int:
-    """Draw, expose and write one CCD into a folder; return its number of objects."""
+    """Draw, expose and write one CCD into a folder; return its number of objects.
+
+    `check` is called now and then, and ends the work by raising.
+    """
     pointing, path = config.pointing, folder / image_name(name)
     exposure = exposure_of(config, experiment)
     try:
@@ -125,7 +64,7 @@ def draw_image(
             way=config.image.way,
             interpolation=config.image.interpolation,
             threads=threads,
-            progress=None if check is None else lambda _: check(0),
+            progress=lambda _: check(),
         )
     except PachonError as error:
         raise error.within(subject=f"CCD {name}") from None

@@ -151,14 +151,6 @@ class CcdImage(Result):
             raise ProductError(f"no image of a CCD ({' '.join(str(error.args[0]).split())})", file=path) from None
 
 
-def is_whole(path: Path, stamp: Stamp) -> bool:
-    """Return whether there is an undamaged image of a CCD with a stamp."""
-    try:
-        return stamp.matches(read_fits(path)[0].header)
-    except ProductError:
-        return False
-
-
 def _stamp(header: Any) -> Stamp | None:
     if "CONFHASH" not in header:
         return None

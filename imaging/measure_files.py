@@ -14,12 +14,10 @@ from astropy.io import fits
 
 from ..core.errors import ConfigError, DomainError, ProductError
 from ..core.files import content_hash
+from ..core.long_work import Execution
 from ..core.memory import require_bytes
-from ..core.ordered_jobs import ordered_results
 from ..core.products import read_fits, write_fits
-from ..core.progress import Reporter
 from ..core.version import VERSION
-from ..core.workers import MakeWorkers
 from ..pipeline.config import digest
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
 from .image_file import CcdImage
@@ -122,10 +120,7 @@ def measure_files(
     *,
     psf: Path | None = None,
     options: dict[str, Any] | None = None,
-    resume: bool = False,
-    workers: MakeWorkers | None = None,
-    threads: int | None = None,
-    reporter: Reporter | None = None,
+    execution: Execution | None = None,
 ) -> MeasuredFiles:
     """Measure image files, and write a catalogue and a PSF model of each.
 
@@ -142,14 +137,9 @@ def measure_files(
         File of a :class:`~pachon.FocalPlanePsf` of all images; by default a model of each image is fitted, and written.
     options : dict, optional
         Further arguments of :func:`~.measure.measure_image`.
-    resume : bool
-        Keep the products of images that were measured in the same way, where both are whole by their checksums.
-    workers : callable, optional
-        Function that makes the workers, which see the same files; by default this process.
-    threads : int, optional
-        Number of threads; all processors by default.
-    reporter : Reporter, optional
-        Progress display; silent by default.
+    execution : Execution, optional
+        Workers, which see the same files; threads; progress display; and whether to keep the products of images that
+        were measured in the same way, where both are whole by their checksums.
 
     Raises
     ------
@@ -161,28 +151,26 @@ def measure_files(
         if folder is not None:
             raise ConfigError(f"{folder}: two images are called {twice[0]}; expected different names, or no --out")
         names = [str(path) for path in images]
-    reporter = Reporter(quiet=True) if reporter is None else reporter
+    execution = execution or Execution()
     measure = FileMeasurement(folder, psf, options or {})
-    metrics = {name: measure.finished(path) if resume else None for name, path in zip(names, images, strict=True)}
+    finished = measure.finished if execution.resume else lambda _: None
+    metrics = {name: finished(path) for name, path in zip(names, images, strict=True)}
     due = {name: path for name, path in zip(names, images, strict=True) if metrics[name] is None}
     sizes = [path.stat().st_size for path in due.values() if path.is_file()]
-    results = ordered_results(
+    left_out = {}
+    with execution.results(
         measure,
         list(due),
         due.values(),
         title=f"objects of {len(due)} images",
-        workers=workers,
-        threads=threads,
         check=lambda count: require_bytes(count * _FILE_SIZES * max(sizes, default=0), f"{count} images at a time"),
-        reporter=reporter,
-    )
-    left_out = {}
-    for name, result in zip(due, results, strict=True):
-        if isinstance(result, str):
-            left_out[name] = result
-            reporter.line(f"{name} is left out: {result}")
-        else:
-            metrics[name] = result
+    ) as results:
+        for name, result in zip(due, results, strict=True):
+            if isinstance(result, str):
+                left_out[name] = result
+                execution.reporter.line(f"{name} is left out: {result}")
+            else:
+                metrics[name] = result
     if left_out and len(left_out) == len(images):
         name, reason = next(iter(left_out.items()))
         raise DomainError(reason if len(images) == 1 else f"no image can be measured; {name}: {reason}")

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from ..core.arguments import check_arguments
 from ..core.errors import ProductError
-from ..core.files import claim_folder
+from ..core.long_work import Execution, claim_folder
 from ..core.memory import require_bytes
-from ..core.progress import Reporter
-from ..core.workers import MakeWorkers
 from ..core.yaml_reader import read_mapping
-from ..pipeline.config import differences
 from ..pipeline.experiment import Experiment
-from ..pipeline.memory import needed_bytes
+from ..pipeline.memory import check_memory, needed_bytes
 from ..pipeline.resolved_values import resolved_value
-from .ccd_image import draw_by_workers, draw_image, galaxies_of, image_name, stamp_of, window_of
+from .ccd_image import draw_by_worker, draw_image, galaxies_of, image_name, stamp_of, window_of
 from .config import ImagesConfig
-from .image_file import is_whole
 
 CONFIG_NAME = "images.yaml"
 #: Copies of a CCD's pixels that are held at once, in bytes a pixel: scene, image, variance, mask, and the file twice.
@@ -42,10 +40,7 @@ def simulate_images(
     folder: Path,
     *,
     experiment: Experiment | None = None,
-    resume: bool = False,
-    workers: MakeWorkers | None = None,
-    threads: int | None = None,
-    reporter: Reporter | None = None,
+    execution: Execution | None = None,
 ) -> ImagesResult:
     """Draw, expose and write the CCDs of a configuration.
 
@@ -60,14 +55,8 @@ def simulate_images(
         Folder of the images, made where missing.
     experiment : Experiment, optional
         Experiment of the configuration, if it is made already.
-    resume : bool
-        Keep CCDs that are finished already.
-    workers : callable, optional
-        Function that makes the workers that draw the CCDs, as in :func:`~pachon.run`; by default this process.
-    threads : int, optional
-        Number of threads; all processors by default.
-    reporter : Reporter, optional
-        Progress display; silent by default.
+    execution : Execution, optional
+        Workers that draw the CCDs, threads, whether to keep finished CCDs, and progress display.
 
     Raises
     ------
@@ -75,7 +64,8 @@ def simulate_images(
         If the configuration does not hold together, the folder holds images of another one, or a file cannot be
         written.
     """
-    reporter = Reporter(quiet=True) if reporter is None else reporter
+    execution = execution or Execution()
+    threads, reporter, alone = execution.threads, execution.reporter, execution.alone
     experiment = config.experiment() if experiment is None else experiment
     resolved = config.resolved(experiment)
     names = resolved_value(experiment.config.ccds)
@@ -84,39 +74,42 @@ def simulate_images(
     most = max(window.width * window.height for window in windows.values())
     require_bytes(needed_bytes(experiment, threads) + BYTES_PER_PIXEL * most, "images")
     stamp = stamp_of(config, experiment)
-    _claim(folder, resolved, resume=resume)
+    claim_images(folder, resolved, resume=execution.resume)
     paths = {name: folder / image_name(name) for name in names}
-    kept = tuple(name for name in names if resume and is_whole(paths[name], stamp))
+    kept = execution.finished(paths, stamp)
     missing = [name for name in names if name not in kept]
     objects: dict[str, int] = {}
-    if missing and workers is not None:
-        objects = draw_by_workers(config, experiment, folder, missing, workers, reporter)
-    elif missing:
-        with experiment.screens(threads, reporter):
-            bar = reporter.stage(f"images of {len(missing)} CCDs", total=len(missing))
-            with bar as stage:
-                for i, name in enumerate(missing, start=1):
-                    objects[name] = draw_image(config, experiment, name, galaxies, folder, threads, stage.advance)
-                    stage.advance()
-                    stage.step(name, i, len(missing))
+    if missing:
+        draw: partial[int] = (
+            partial(draw_image, config, experiment, galaxies, reporter.check)
+            if alone
+            else partial(draw_by_worker, config, experiment)
+        )
+        with (
+            experiment.screens(threads, reporter) if alone else nullcontext(),
+            execution.results(
+                draw,
+                [f"CCD {name}" for name in missing],
+                missing,
+                title=f"images of {len(missing)} CCDs",
+                folder=folder,
+                product=lambda number: paths[missing[number]],
+                check=lambda processes: check_memory(experiment, threads if alone else 1, copies=processes),
+            ) as results,
+        ):
+            objects = dict(zip(missing, results, strict=True))
     return ImagesResult(folder, paths, kept, tuple(missing), objects)
 
 
-def _claim(folder: Path, config: ImagesConfig, *, resume: bool) -> None:
+def claim_images(folder: Path, config: ImagesConfig, *, resume: bool) -> None:
     """Make the folder, or check that its images are of the same configuration, and write images.yaml."""
-    path, now = folder / CONFIG_NAME, config.model_dump(mode="json", by_alias=True)
-
-    def check() -> None:
-        try:
-            before = read_mapping(path, ProductError)
-        except ProductError as error:
-            raise ProductError(f"{folder} holds images that cannot be read ({error}); choose another --out") from None
+    claim_folder(
+        folder / CONFIG_NAME,
+        config.to_yaml().encode(),
+        products="image_*.fits",
+        noun="images",
+        now=config.model_dump(mode="json", by_alias=True),
+        read=lambda path: read_mapping(path, ProductError),
         # No CCD depends on the others.
-        if resume and isinstance(before.get("run"), dict):
-            before["run"]["ccds"] = now["run"]["ccds"]
-        found = differences(before, now)
-        if found:
-            text = "; ".join(found[:3])
-            raise ProductError(f"{folder} holds images of another configuration ({text}); choose another --out")
-
-    claim_folder(path, config.to_yaml().encode(), products="image_*.fits", check=check)
+        free_keys=("run.ccds",) if resume else (),
+    )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -25,7 +25,6 @@ from ..core.schema import (
     Section,
     Switch,
     Whole,
-    json_text,
     plain_number,
     validated,
 )
@@ -348,15 +347,6 @@ def with_options(config: _Model, **options: Any) -> _Model:
     return validated(type(config), content, "command line")
 
 
-def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """Return one ``key: old -> new`` for each key in which two resolved configurations differ."""
-    before, after = dict(_flat(old)), dict(_flat(new))
-    keys = [*before, *(k for k in after if k not in before)]
-    return [
-        f"{k}: {json_text(before.get(k))} -> {json_text(after.get(k))}" for k in keys if before.get(k) != after.get(k)
-    ]
-
-
 def digest(content: Any) -> str:
     """Return the SHA-256 of a value written as canonical JSON, in hexadecimal."""
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
@@ -390,11 +380,3 @@ def _yaml_lines(section: Section, names: list[str], indent: str) -> list[str]:
         else:
             lines.append(f"{entry:<34}  # {field.description}")
     return lines
-
-
-def _flat(content: dict[str, Any], place: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in content.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{place}{key}.")
-        else:
-            yield f"{place}{key}", value

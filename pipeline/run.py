@@ -5,19 +5,18 @@ from __future__ import annotations
 import os
 import platform
 import sys
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.files import write_bytes, write_json
+from ..core.long_work import Execution
 from ..core.progress import Reporter
 from ..core.second_process import Submit, second_process
 from ..core.threads import thread_count
 from ..core.version import VERSION
-from ..core.workers import MakeWorkers
 from ..reconstruction.ccd_product import product_path, read_product
 from .ccd_worker import compute_ccds
 from .config import Configuration
@@ -26,8 +25,8 @@ from .focal_plane_stage import apply_focal_plane_model, write_focal_plane_model
 from .memory import check_memory
 from .report.focal_plane_files import write_focal_plane
 from .report.report import build_report
-from .run_folder import SUMMARY_NAME, claim_run, finished_ccds, stamp_of, write_ccd
-from .simulate.ccd_loop import check_catalogue, simulate_ccds
+from .run_folder import SUMMARY_NAME, claim_run, finished_ccds, stamp_of
+from .simulate.ccd_loop import check_catalogue
 from .summary import correlations, run_metrics
 
 REPORT_NAME = "report.html"
@@ -67,12 +66,9 @@ def run(
     config: Configuration | Experiment,
     folder: Path,
     *,
-    resume: bool = False,
     strict: bool = False,
-    workers: MakeWorkers | None = None,
     part: tuple[int, int] = (1, 1),
-    threads: int | None = None,
-    reporter: Reporter | None = None,
+    execution: Execution | None = None,
 ) -> RunResult:
     """Simulate the CCDs of a configuration, model their PSFs and write the report.
 
@@ -85,21 +81,14 @@ def run(
         Configuration, or the experiment made from it.
     folder : Path
         Folder of the products, made where missing.
-    resume : bool
-        Keep CCDs that are finished already, and add to them.
     strict : bool
         Whether a CCD whose PSF cannot be modelled ends the run, which keeps what is finished; else it is reported and
         left out.
-    workers : callable, optional
-        Function that makes the workers that compute the CCDs, such as
-        ``lambda compute: process_workers(compute, 4)`` (:mod:`pachon.core.workers`); by default this process.
     part : (i, n)
         Compute the i-th of n parts of the CCDs, of 1 to n; parts run side by side, on several machines, in one folder.
-        Finished CCDs are kept, as with `resume`, and the part that ends last writes the report.
-    threads : int, optional
-        Number of threads of this process; all processors by default.
-    reporter : Reporter, optional
-        Progress display; silent by default.
+        Finished CCDs are kept, as on resuming, and the part that ends last writes the report.
+    execution : Execution, optional
+        Workers that compute the CCDs, threads, whether to keep finished CCDs and add to them, and progress display.
 
     Raises
     ------
@@ -107,7 +96,8 @@ def run(
         If the configuration does not hold together, a product cannot be written, or no CCD can be modelled; with
         `strict`, if one of them cannot.
     """
-    reporter = Reporter(quiet=True) if reporter is None else reporter
+    execution = execution or Execution()
+    threads, reporter = execution.threads, execution.reporter
     experiment = config if isinstance(config, Experiment) else Experiment.from_config(config)
     names = experiment.config.ccds or ()
     number, parts = part
@@ -115,14 +105,15 @@ def run(
         raise DomainError(f"part = {number}/{parts}: expected i/n with i from 1 to n, and n at most {len(names)} CCDs")
     # Before the screens, which take longer than all of the checks.
     check_catalogue(experiment, names, strict=strict)
-    resume = resume or parts > 1
-    kept = finished_ccds(folder, experiment) if resume else ()
+    if parts > 1:
+        execution = replace(execution, resume=True)
+    kept = finished_ccds(folder, experiment) if execution.resume else ()
     missing = tuple(name for name in names[number - 1 :: parts] if name not in kept)
     # The report of a finished run needs no screens.
-    if missing and workers is None:
+    if missing and execution.alone:
         check_memory(experiment, threads)
     with second_process(threads) as submit:
-        claim_run(folder, experiment, resume=resume)
+        claim_run(folder, experiment, resume=execution.resume)
         if experiment.star_list is not None:
             reporter.line(experiment.star_list.text)
         if kept:
@@ -130,21 +121,16 @@ def run(
         focal_plane = submit(write_focal_plane, experiment, folder)
         submit(_load_plots)
         failed: dict[str, str] = {}
-        if missing and workers is not None:
-            failed = compute_ccds(experiment, folder, missing, workers, strict=strict, reporter=reporter)
-        elif missing:
-            with experiment.screens(threads, reporter):
-                write = partial(write_ccd, experiment, folder)
-                simulated = simulate_ccds(experiment, write, missing, strict=strict, threads=threads, reporter=reporter)
-                failed = simulated.not_modelled
+        if missing:
+            failed = compute_ccds(experiment, folder, missing, execution, strict=strict)
         computed = tuple(name for name in missing if name not in failed)
         if parts > 1:
             # Other parts may have ended meanwhile.
-            left = [name for name in names if name not in (*kept, *missing)]
-            finished = finished_ccds(folder, experiment, left)
-            waited = tuple(name for name in left if name not in finished)
-            if waited:
-                return RunResult(folder, None, {}, kept, computed, failed, waited)
+            other_ccds = [name for name in names if name not in (*kept, *missing)]
+            finished = finished_ccds(folder, experiment, other_ccds)
+            unfinished = tuple(name for name in other_ccds if name not in finished)
+            if unfinished:
+                return RunResult(folder, None, {}, kept, computed, failed, unfinished)
         with reporter.stage("focal plane"):
             focal_plane()
         summary = _summarize(experiment, folder, failed, submit, threads, reporter)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
-from ..core.errors import PachonError, ProductError
-from ..core.files import claim_folder
-from ..core.products import Stamp
+from ..core.long_work import claim_folder
+from ..core.products import Stamp, is_whole
 from ..core.version import VERSION
-from ..reconstruction.ccd_product import MODEL_CARD, product_path, read_product, write_product
-from .config import Configuration, differences, load_configuration, to_yaml
+from ..reconstruction.ccd_product import MODEL_CARD, product_path, write_product
+from .config import load_configuration, to_yaml
 from .experiment import Experiment
 from .simulate.ccd_exposure import CcdExposure
 from .simulate.ccd_model import model_ccd
@@ -24,48 +24,27 @@ def claim_run(folder: Path, experiment: Experiment, *, resume: bool) -> None:
     A run may be resumed with more CCDs than before, since no CCD depends on the others. A folder with another
     configuration's run, or one that cannot be made or written, raises ProductError.
     """
-    path = folder / CONFIG_NAME
+    path, now = folder / CONFIG_NAME, experiment.config.as_dict()
     heading = (
         f"pachon {VERSION}: all that decides this run.",
         "The same bytes again: pachon run config.yaml --out OTHER",
     )
+
+    def read(path: Path) -> dict[str, Any]:
+        before = load_configuration(path).as_dict()
+        # No CCD depends on the others, so CCDs may be added; without one of them its product would be orphaned.
+        if resume and set(before["ccds"] or ()) <= set(now["ccds"]):
+            before["ccds"] = now["ccds"]
+        return before
+
     content = to_yaml(experiment.config, heading).encode()
-
-    def check() -> None:
-        try:
-            before = load_configuration(path)
-        except PachonError as error:
-            raise ProductError(f"{folder} holds a run that cannot be read ({error}); choose another --out") from None
-        _refuse_other(folder, before, experiment.config, resume)
-
-    claim_folder(path, content, products="ccd_*.fits", check=check)
-
-
-def _refuse_other(folder: Path, before: Configuration, now: Configuration, resume: bool) -> None:
-    old, new = before.as_dict(), now.as_dict()
-    # No CCD depends on the others, so CCDs may be added; without one of them its product would be orphaned.
-    if resume and set(old["ccds"] or ()) <= set(new["ccds"]):
-        del old["ccds"], new["ccds"]
-    found = differences(old, new)
-    if found:
-        more = f" and {len(found) - 3} more" if len(found) > 3 else ""
-        raise ProductError(
-            f"{folder} holds the run of another configuration ({'; '.join(found[:3])}{more}); choose another --out"
-        )
+    claim_folder(path, content, products="ccd_*.fits", noun="a run", now=now, read=read)
 
 
 def finished_ccds(folder: Path, experiment: Experiment, names: Iterable[str] | None = None) -> tuple[str, ...]:
     """Return the CCDs of a run, or those among some names, with complete products of this configuration."""
     stamp, names = stamp_of(experiment), (experiment.config.ccds or ()) if names is None else names
-    return tuple(name for name in names if _is_whole(product_path(folder, name), stamp))
-
-
-def _is_whole(path: Path, stamp: Stamp) -> bool:
-    try:
-        read_product(path, stamp)
-    except ProductError:
-        return False
-    return True
+    return tuple(name for name in names if is_whole(product_path(folder, name), stamp))
 
 
 def stamp_of(experiment: Experiment) -> Stamp:

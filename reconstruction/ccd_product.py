@@ -289,10 +289,8 @@ def read_product(path: Path, stamp: Stamp | None = None, *, holdout_images: bool
 
     A missing or damaged file, or one with another stamp than the one given, raises ProductError.
     """
-    hdus = read_fits(path)
+    hdus = read_fits(path, stamp)
     header = hdus[0].header
-    if stamp is not None and not stamp.matches(header):
-        raise ProductError("was made with another version, configuration or seed", file=path)
     try:
         return CcdProduct(
             name=header["CCD"],

@@ -8,6 +8,7 @@ import yaml
 
 import pachon
 from pachon.core.errors import DomainError
+from pachon.core.long_work import Execution
 from pachon.core.products import image_hdu, write_fits
 from pachon.pipeline import focal_plane_stage
 from pachon.pipeline.config import Configuration, with_options
@@ -180,7 +181,7 @@ def pytest_collection_modifyitems(items):
 def finished_run(tiny, tmp_path_factory):
     """The folder of a finished run on one thread; tests only read it."""
     folder = tmp_path_factory.mktemp("finished") / "run"
-    run(tiny(), folder, threads=1)
+    run(tiny(), folder, execution=Execution(threads=1))
     return folder
 
 

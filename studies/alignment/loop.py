@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...core.arguments import check_arguments
+from ...core.errors import ConfigError
+from ...core.long_work import Execution
 from ...core.plotting import BLUE, GREY, ORANGE, axes_at, styled
-from ...core.progress import Reporter
 from ...core.random_streams import stream
 from ...core.result import Result
 from ...core.threads import one_blas_thread
@@ -89,9 +90,7 @@ def align(
     *,
     folder: Path | None = None,
     store: Path | None = None,
-    resume: bool = False,
-    threads: int | None = None,
-    reporter: Reporter | None = None,
+    execution: Execution | None = None,
 ) -> Alignment:
     """Run an active-optics loop.
 
@@ -103,12 +102,9 @@ def align(
         Folder that relative paths in the configuration start from; the current one by default.
     store : Path, optional
         Folder for a file of each visit, from which a loop goes on that was killed, or that is to be longer.
-    resume : bool
-        Whether to go on with the visits of `store`; a folder with visits is an error otherwise.
-    threads : int, optional
-        Number of threads; all processors by default. No byte depends on it.
-    reporter : Reporter, optional
-        Progress display; silent by default.
+    execution : Execution, optional
+        Threads, progress display, and whether to go on with the visits of `store`, which are an error otherwise. There
+        are no workers: each visit begins with the telescope that the one before leaves.
 
     Raises
     ------
@@ -116,9 +112,12 @@ def align(
         If a name does not exist, the models do not fit together, donuts do not fit on their stamps, or `store` holds
         visits of another configuration, or of other contents of the files that it names.
     """
-    reporter = Reporter(quiet=True) if reporter is None else reporter
+    execution = execution or Execution()
+    threads, reporter = execution.threads, execution.reporter
+    if not execution.alone:
+        raise ConfigError("execution.workers: expected none, each visit begins with the telescope of the one before")
     scene = AlignmentScene.of(config, folder)
-    kept = None if store is None else VisitStore.claimed(store, config, scene.inputs, resume=resume)
+    kept = None if store is None else VisitStore.claimed(store, config, scene.inputs, resume=execution.resume)
     errors, n = config.errors, len(scene.freedoms)
     drift = np.diag(scene.steps**2)
     covariance = errors.initial**2 * np.eye(n)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import io
 import json
+from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
 
-from ...core.errors import PachonError, ProductError
-from ...core.files import claim_folder, write_bytes
-from ...pipeline.config import differences
+from ...core.errors import ProductError
+from ...core.files import write_bytes
+from ...core.long_work import claim_folder
 from ...sensing.result import DonutFit
 from .config import AlignConfig, load_align_configuration
 from .field_quality import FieldMeans
@@ -85,23 +86,21 @@ class VisitStore:
         ProductError
             If the folder holds visits of another configuration, or of this one without ``resume``.
         """
-        path, choose = folder / CONFIG_NAME, "choose another --out"
-
-        def check() -> None:
-            if not any(folder.glob(_PATTERN)):
-                return
-            try:
-                before = load_align_configuration(path)
-            except PachonError as error:
-                raise ProductError(f"{folder} holds visits that cannot be read ({error}); {choose}") from None
-            if not resume:
-                raise ProductError(f"{folder} holds visits already; go on with --resume, or {choose}")
-            old, new = (c.model_dump(mode="json", exclude={"visits"}) for c in (before, config))
-            found = differences(old, new)
-            if found:
-                raise ProductError(f"{folder} holds visits of another configuration ({'; '.join(found[:3])}); {choose}")
-
-        claim_folder(path, config.to_yaml().encode(), products=_PATTERN, check=check)
+        path = folder / CONFIG_NAME
+        if not any(folder.glob(_PATTERN)):
+            # Of a loop that was killed in its first visit.
+            with suppress(OSError):
+                path.unlink()
+        claim_folder(
+            path,
+            config.to_yaml().encode(),
+            products=_PATTERN,
+            noun="visits",
+            now=config.model_dump(mode="json"),
+            read=lambda path: load_align_configuration(path).model_dump(mode="json"),
+            free_keys=("visits",),
+            wanted=resume,
+        )
         return cls(folder, inputs)
 
     def _path(self, visit: int) -> Path:

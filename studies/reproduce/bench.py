@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from ...core.long_work import Execution
 from ...core.products import Stamp
 from ...core.progress import Reporter
-from ...core.workers import MakeWorkers
 from ...measure.correlation import Correlation
 from ...pipeline.config import Configuration, digest, with_options
 from ...pipeline.experiment import Experiment
@@ -132,16 +132,27 @@ class Bench:
     """Settings of the figures, and objects that they share, each made at its first use.
 
     The run of the pipeline is in the sub-folder ``run`` of that of the figures, the visits are in ``visits``. Both, and
-    the galaxies in the stacks, are computed by `workers` where they are given. Results do not depend on them, nor on
-    `threads`.
+    the galaxies in the stacks, are computed by the workers of `execution`, on which no result depends.
     """
 
     scale: Scale
     folder: Path
     seed: int = 1
-    threads: int | None = None
-    workers: MakeWorkers | None = None
-    reporter: Reporter = field(default_factory=lambda: Reporter(quiet=True))
+    execution: Execution = field(default_factory=Execution)
+
+    @property
+    def threads(self) -> int | None:
+        """Number of threads; all processors by default."""
+        return self.execution.threads
+
+    @property
+    def reporter(self) -> Reporter:
+        """Progress display."""
+        return self.execution.reporter
+
+    @property
+    def _resumed(self) -> Execution:
+        return replace(self.execution, resume=True)
 
     @cached_property
     def stamp(self) -> Stamp:
@@ -171,27 +182,13 @@ class Bench:
             "visits__places": places,
         }
         config = with_options(VisitsConfig(), **options)
-        return stack_visits(
-            config,
-            self.folder / "visits",
-            resume=True,
-            workers=self.workers,
-            threads=self.threads,
-            reporter=self.reporter,
-        )
+        return stack_visits(config, self.folder / "visits", execution=self._resumed)
 
     @cached_property
     def galaxies(self) -> dict[int, NullTest]:
         """Null tests of the stacks, in the same folder."""
-        return null_test(
-            self.stack.folder,
-            tiles=self.scale.tiles,
-            rings=self.scale.rings,
-            resume=True,
-            workers=self.workers,
-            threads=self.threads,
-            reporter=self.reporter,
-        )
+        folder, scale = self.stack.folder, self.scale
+        return null_test(folder, tiles=scale.tiles, rings=scale.rings, execution=self._resumed)
 
     @cached_property
     def pipeline(self) -> PipelineRun:
@@ -209,15 +206,7 @@ class Bench:
         experiment = Experiment.from_config(with_options(Configuration(), **options))
         names = experiment.config.ccds or ()
         if len(finished_ccds(folder, experiment)) < len(names):
-            run(
-                experiment.config,
-                folder,
-                resume=True,
-                strict=True,
-                workers=self.workers,
-                threads=self.threads,
-                reporter=self.reporter,
-            )
+            run(experiment.config, folder, strict=True, execution=self._resumed)
         stamp = stamp_of(experiment)
         products = [read_product(product_path(folder, name), stamp, holdout_images=False) for name in names]
         correlated = correlations(products)

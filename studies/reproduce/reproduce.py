@@ -8,9 +8,8 @@ from typing import Any
 
 from ...core.errors import unknown_name
 from ...core.files import make_folder, write_json
-from ...core.progress import Reporter
+from ...core.long_work import Execution
 from ...core.version import VERSION
-from ...core.workers import MakeWorkers
 from . import atmosphere, focal_plane, optics, reconstruction, screens, visits
 from .bench import SCALES, Bench, Scale
 from .figure import Figure
@@ -96,15 +95,13 @@ def reproduce_at(
     folder: Path,
     *,
     seed: int = 1,
-    workers: MakeWorkers | None = None,
-    threads: int | None = None,
-    reporter: Reporter | None = None,
+    execution: Execution | None = None,
 ) -> dict[str, Any]:
     """Reproduce figures at a scale given by name, after a line with the expected time: see :func:`reproduce`."""
     figure_names = chosen_figures(names)
     if scale not in SCALES:
         raise unknown_name("scale", scale, SCALES)
-    bench = Bench(SCALES[scale], folder, seed, threads, workers, reporter or Reporter(quiet=True))
+    bench = Bench(SCALES[scale], folder, seed, execution or Execution())
     minutes = expected_minutes(figure_names, bench.scale)
     long = f"about {minutes:.0f} minutes" if minutes >= 1.5 else f"about {max(60.0 * minutes, 1.0):.0f} s"
     bench.reporter.line(f"{len(figure_names)} figures at the scale {scale}: {long} on two cores")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +16,8 @@ from typing import Any, Protocol
 
 from ...core.errors import ConfigError, ProductError, cut_short
 from ...core.files import make_folder, partial_path, publish_new
+from ...core.long_work import differences
 from ...core.version import VERSION
-from ...pipeline.config import differences
 from .file import SweepFile, read_sweep
 
 #: Format of the tables; stores of other formats are refused.
@@ -172,6 +172,35 @@ class SweepStore:
             raise _damaged_error(self.path, error, self.kind) from None
 
 
+def open_store(
+    path: Path,
+    study: StoredStudy,
+    make_points: Callable[[], Iterable[SweepPoint]],
+    *,
+    resume: bool,
+    extra: dict[str, str] | None = None,
+    kind: StoreKind = SWEEP,
+) -> SweepStore:
+    """Open the store of a study, made with its points where missing.
+
+    Raises
+    ------
+    ConfigError
+        If the store is of another study, or there is one and nothing is resumed.
+    """
+    if not path.exists():
+        create_store(path, study, make_points(), extra or {}, kind)
+    elif not resume:
+        raise _store_exists(path)
+    store = SweepStore(path, kind)
+    try:
+        check_same_sweep(store, study)
+    except ConfigError:
+        store.close()
+        raise
+    return store
+
+
 def create_store(
     path: Path, sweep: StoredStudy, points: Iterable[SweepPoint], extra: dict[str, str], kind: StoreKind = SWEEP
 ) -> None:
@@ -204,7 +233,7 @@ def create_store(
         for leftover in _sqlite_companions(path):
             leftover.unlink(missing_ok=True)
     except FileExistsError:
-        raise store_exists(path) from None
+        raise _store_exists(path) from None
     except sqlite3.Error as error:
         raise _store_error(path, error, kind) from None
     except OSError as error:
@@ -215,7 +244,7 @@ def create_store(
                 leftover.unlink(missing_ok=True)
 
 
-def store_exists(path: Path) -> ConfigError:
+def _store_exists(path: Path) -> ConfigError:
     """Return the error for a new study whose store is there already."""
     return ConfigError(f"{path} exists: go on with it by --resume, or give another -o")
 

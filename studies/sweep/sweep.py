@@ -9,15 +9,14 @@ from pathlib import Path
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, ProductError
+from ...core.long_work import Execution
 from ...core.memory import available_bytes, readable
-from ...core.progress import Reporter
 from ...core.random_streams import stream
-from ...core.workers import MakeWorkers, serial_worker
 from ...pipeline.config import Configuration
 from .design import design_points, point_count
 from .file import SweepFile
 from .point import PointMeasurement, check_sweep
-from .store import SweepPoint, SweepStore, check_same_sweep, create_store, store_exists
+from .store import PointResult, SweepPoint, check_same_sweep, open_store
 
 #: More points than this are a mistake: at a second each they would take a year.
 MOST_POINTS = 30_000_000
@@ -42,9 +41,7 @@ def run_sweep(
     path: str | os.PathLike[str],
     *,
     folder: Path | None = None,
-    resume: bool = False,
-    workers: MakeWorkers | None = None,
-    reporter: Reporter | None = None,
+    execution: Execution | None = None,
 ) -> SweepOutcome:
     """Compute the missing points of a sweep.
 
@@ -58,51 +55,49 @@ def run_sweep(
         The store, a SQLite file.
     folder : Path, optional
         Folder that relative paths in the configuration start from; the current one by default.
-    resume : bool
-        Continue an existing store; points that could not be computed are tried again.
-    workers : callable
-        Function that makes workers of the function that computes a point; by default this process.
-    reporter : Reporter, optional
-        Progress display; silent by default.
+    execution : Execution, optional
+        Workers that compute the points; threads; progress display; and whether to continue an existing store, where
+        points that could not be computed are tried again.
 
     Raises
     ------
     ConfigError
-        If the store belongs to another sweep, or there is one and ``resume`` is False.
+        If the store belongs to another sweep, or there is one and nothing is resumed.
     PachonError
         If a name or value of the sweep is not possible, the store cannot be written, or the workers are lost.
     """
-    reporter = Reporter(quiet=True) if reporter is None else reporter
+    execution = execution or Execution()
     path, folder = Path(path), Path() if folder is None else folder
-    if path.exists() and not resume:
-        raise store_exists(path)
-    if not path.exists():
+
+    def checked_points() -> list[SweepPoint]:
         check_room(sweep, path)
         points = numbered_points(sweep, folder)
         check_sweep(sweep, points, folder)
-        create_store(path, sweep, points, {"folder": str(folder.resolve())})
-    with SweepStore(path) as store:
-        check_same_sweep(store, sweep)
+        return points
+
+    place = str(folder.resolve())
+    with open_store(path, sweep, checked_points, resume=execution.resume, extra={"folder": place}) as store:
+
+        def save(result: PointResult) -> None:
+            # Each point reads the telescope again: one of another telescope is never kept.
+            check_same_sweep(store, sweep)
+            store.write(result)
+
         store.forget_problems()
-        done = store.finished()
+        finished = store.finished()
         points = store.points()
-        missing = [p for p in points if p.number not in done]
-        if done:
-            reporter.line(f"{len(done)} of {len(points)} points are there already")
+        missing = [p for p in points if p.number not in finished]
+        if finished:
+            execution.reporter.line(f"{len(finished)} of {len(points)} points are there already")
         if missing:
-            chosen = (workers or serial_worker)(PointMeasurement(sweep, str(folder.resolve())))
-            with reporter.stage(f"{sweep.name}: {len(missing)} points, {chosen.description}", len(missing)) as stage:
-                for number, result in enumerate(chosen.results(missing), start=1):
-                    # Each point reads the telescope again: one of another telescope is never kept.
-                    check_same_sweep(store, sweep)
-                    store.write(result)
-                    stage.advance()
+            labels, title = [point.label for point in missing], f"{sweep.name}: {len(missing)} points"
+            compute = PointMeasurement(sweep, place)
+            with execution.results(compute, labels, missing, title=title, save=save) as results:
+                for result in results:
                     if result.problem is not None:
-                        reporter.line(f"point {result.number}: {result.problem}")
-                    if number % max(1, len(missing) // 20) == 0:
-                        stage.step("points", number, len(missing))
+                        execution.reporter.line(f"point {result.number}: {result.problem}")
         failed = sum(result.problem is not None for result in store.results())
-    return SweepOutcome(path, len(points), len(done), len(missing), failed)
+    return SweepOutcome(path, len(points), len(finished), len(missing), failed)
 
 
 def numbered_points(sweep: SweepFile, folder: Path) -> list[SweepPoint]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,14 +13,13 @@ import numpy as np
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError
-from ...core.progress import Reporter
+from ...core.long_work import Execution
 from ...core.threads import one_blas_thread
-from ...core.workers import Compute, MakeWorkers, Workers, serial_worker
 from ...design.optimize.toleranced_merit import TolerancedMerit
 from ...models.parameters.tolerances import draw
 from ...models.paraxial import following_stop
 from ...models.telescope import Telescope
-from ..sweep.store import PointResult, StoreKind, SweepPoint, SweepStore, check_same_sweep, create_store, store_exists
+from ..sweep.store import PointResult, StoreKind, SweepPoint, open_store
 from .file import ToleranceFile
 from .measurement import DRAW, INVERSE, LOWER, NOMINAL, UPPER, Batch, ToleranceMeasurement
 from .merits import tolerance_merit
@@ -39,9 +39,7 @@ def run_tolerances(
     store: str | os.PathLike[str] | None = None,
     *,
     merit: Callable[[Telescope], float] | None = None,
-    resume: bool = False,
-    workers: MakeWorkers | None = None,
-    reporter: Reporter | None = None,
+    execution: Execution | None = None,
 ) -> ToleranceStudy:
     """Compute sensitivity, inverse sensitivity and Monte Carlo of tolerances.
 
@@ -59,12 +57,8 @@ def run_tolerances(
     merit : callable, optional
         Function of a telescope that returns a number to be kept small, in place of the merit of the file. For several
         processes it must be one of a module. Compensators minimise the spots.
-    resume : bool
-        Go on with an existing store.
-    workers : callable, optional
-        Function that makes workers of the function that computes points; by default this process.
-    reporter : Reporter, optional
-        Progress display; silent by default.
+    execution : Execution, optional
+        Workers that compute the points, whether to go on with an existing store, and progress display.
 
     Raises
     ------
@@ -85,8 +79,7 @@ def run_tolerances(
     n = len(plan.tolerances)
     deviations = draw(plan.tolerances, file.seed, file.draws)
     points, values = _points(measured, deviations if file.method == "traced" else deviations[:0])
-    results = dict(_results(measured, points, values, file, store, resume, workers, reporter))
-    numbers = np.array([results[i] for i in range(len(points))])
+    numbers = _numbers(measured, points, values, file, store, execution or Execution())
     ends = numbers[1 : 1 + 2 * n].reshape(n, 2)
     if file.method == "traced":
         drawn = numbers[1 + 3 * n :]
@@ -129,57 +122,46 @@ def _points(measured: ToleranceMeasurement, deviations: np.ndarray) -> tuple[lis
     return [SweepPoint(i, one, 0) for i, one in enumerate(about)], measured.values_of(rows)
 
 
-def _results(
+def _numbers(
     measured: ToleranceMeasurement,
     points: list[SweepPoint],
     values: np.ndarray,
     file: ToleranceFile,
-    store: str | os.PathLike[str] | None,
-    resume: bool,
-    workers: MakeWorkers | None,
-    reporter: Reporter | None,
-) -> Iterator[tuple[int, float]]:
-    """Yield number and result of every point, those in the store first; new ones are written to it."""
-    reporter = Reporter(quiet=True) if reporter is None else reporter
-    opened = None if store is None else _open(Path(store), file, points, resume)
-    try:
-        done: list[PointResult] = [] if opened is None else opened.results()
-        yield from map(_number, done)
-        finished = {result.number for result in done}
+    path: str | os.PathLike[str] | None,
+    execution: Execution,
+) -> np.ndarray:
+    """Return the result of every point; those that the store misses are computed, and written to it."""
+    numbers = np.full(len(points), np.nan)
+    finished: set[int] = set()
+    with ExitStack() as stack:
+        store = None
+        if path is not None:
+            store = open_store(Path(path), file, lambda: points, resume=execution.resume, kind=_STORE)
+            stack.enter_context(store)
+            for result in store.results():
+                numbers[result.number] = _number(result)
+                finished.add(result.number)
+
+        def save(batch: list[PointResult]) -> None:
+            for result in batch:
+                if store is not None:
+                    store.write(result)
+                numbers[result.number] = _number(result)
+
         missing = [p for p in points if p.number not in finished]
         batches = [_batch(missing[i : i + _BATCH], values) for i in range(0, len(missing), _BATCH)]
-        chosen = (workers or _one_thread)(measured)
-        title = f"tolerances: {len(missing)} telescopes, {chosen.description}"
-        with reporter.stage(title, len(missing)) as stage:
-            for found in chosen.results(batches) if batches else ():
-                for result in found:
-                    if opened is not None:
-                        opened.write(result)
-                    yield _number(result)
-                stage.advance(len(found))
-    finally:
-        if opened is not None:
-            opened.close()
-
-
-def _one_thread(compute: Compute) -> Workers:
-    return serial_worker(compute, 1)
-
-
-def _open(path: Path, file: ToleranceFile, points: Sequence[SweepPoint], resume: bool) -> SweepStore:
-    if path.exists() and not resume:
-        raise store_exists(path)
-    if not path.exists():
-        create_store(path, file, points, {}, _STORE)
-    store = SweepStore(path, _STORE)
-    check_same_sweep(store, file)
-    return store
+        title = f"tolerances: {len(missing)} telescopes, {_BATCH} at a time"
+        labels = [batch.label for batch in batches]
+        with execution.results(measured, labels, batches, title=title, save=save) as results:
+            for _ in results:
+                pass
+    return numbers
 
 
 def _batch(points: Sequence[SweepPoint], values: np.ndarray) -> Batch:
     return Batch(tuple(points), values[[p.number for p in points]])
 
 
-def _number(result: PointResult) -> tuple[int, float]:
+def _number(result: PointResult) -> float:
     (value,) = (result.metrics or {"merit": np.nan}).values()
-    return result.number, value
+    return value

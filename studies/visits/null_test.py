@@ -12,12 +12,10 @@ import numpy as np
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
 from ...core.files import make_folder, write_bytes, write_json
-from ...core.ordered_jobs import ordered_results
+from ...core.long_work import Execution
 from ...core.products import Stamp, column, read_fits, table_hdu, write_fits
-from ...core.progress import Reporter
 from ...core.random_streams import natural_number
 from ...core.units import ARCMIN
-from ...core.workers import MakeWorkers
 from ...imaging.exposure import Exposure
 from ...imaging.galaxies import SkyGalaxies
 from ...measure.catalogue.shear_calibration import ShearCalibration
@@ -50,10 +48,7 @@ def null_test(
     *,
     tiles: int | None = None,
     rings: int = 2000,
-    resume: bool = False,
-    workers: MakeWorkers | None = None,
-    threads: int | None = None,
-    reporter: Reporter | None = None,
+    execution: Execution | None = None,
 ) -> dict[int, NullTest]:
     """Measure galaxies in the stacks of a folder of visits, and correlate their ellipticities.
 
@@ -69,14 +64,8 @@ def null_test(
         Most tiles, those nearest to the pointing; all by default.
     rings : int
         Rings of galaxies for the calibration of the shear.
-    resume : bool
-        Keep the tiles that are finished.
-    workers : callable, optional
-        Function that makes the workers that measure the tiles, as in :func:`~pachon.run`; by default this process.
-    threads : int, optional
-        Number of threads; all processors by default.
-    reporter : Reporter, optional
-        Progress display; silent by default.
+    execution : Execution, optional
+        Workers that measure the tiles, threads, whether to keep finished tiles, and progress display.
 
     Raises
     ------
@@ -84,7 +73,7 @@ def null_test(
         If the folder holds no stacks, galaxies cannot be read, fewer than two are usable, or a product cannot be
         written.
     """
-    reporter = Reporter(quiet=True) if reporter is None else reporter
+    execution = execution or Execution()
     if not (folder / CONFIG_NAME).exists():
         raise ProductError(f"{folder}: no visits (no {CONFIG_NAME}); expected the folder of pachon visits")
     config = load_visits_configuration(folder / CONFIG_NAME)
@@ -104,29 +93,26 @@ def null_test(
         chosen = _covered_tiles(stack, cell, config.visits.places)[:tiles]
         if not chosen:
             raise DomainError(f"{folder}: no part of the sky as large as a CCD was seen by half of {visits} visits")
-        paths = [folder / "galaxies" / f"visits_{visits:04d}_tile_{i:+03d}_{j:+03d}.fits" for i, j in chosen]
-        todo = [
-            (tile, path) for tile, path in zip(chosen, paths, strict=True) if not (resume and _is_finished(path, stamp))
-        ]
+        paths = {(i, j): folder / "galaxies" / f"visits_{visits:04d}_tile_{i:+03d}_{j:+03d}.fits" for i, j in chosen}
+        finished = execution.finished(paths, stamp)
+        todo = [tile for tile in chosen if tile not in finished]
         depth = _StackMeasurement(stack, frame.matrix, exposure, galaxies_in, seed, cell, reach)
-        results = ordered_results(
+        with execution.results(
             measure_job,
-            [*(path.stem for _, path in todo), *(f"ring {k}, shear {sign:+.0f}" for k, sign in _RING_JOBS)],
-            depth.jobs([tile for tile, _ in todo], chosen, rings),
+            [*(paths[tile].stem for tile in todo), *(f"ring {k}, shear {sign:+.0f}" for k, sign in _RING_JOBS)],
+            depth.jobs(todo, chosen, rings),
             title=f"galaxies in {visits} visits",
-            workers=workers,
-            threads=threads,
-            reporter=reporter,
-        )
-        for _, path in todo:
-            write_shapes(path, next(results), stamp)
+        ) as results:
+            for tile in todo:
+                write_shapes(paths[tile], next(results), stamp)
+            measured_rings = list(results)
         # Read from the files, as by a resumed test, so that both have the same numbers.
-        parts = [_read_shapes(path, stamp) for path in paths]
+        parts = [_read_shapes(path, stamp) for path in paths.values()]
         if (n := sum(int(part.usable_twice.sum()) for part in parts)) < 2:
             text = f"{n} of {sum(map(len, parts))} galaxies to magnitude {faintest:.2f} are usable in {visits} visits"
             raise DomainError(f"{folder}: {text}; expected two or more, of the galaxies of {CONFIG_NAME}")
-        bias = _calibration(frame.matrix, len(depth.ring_galaxies(chosen, rings)), list(results))
-        with reporter.stage(f"correlations in {visits} visits"):
+        bias = _calibration(frame.matrix, len(depth.ring_galaxies(chosen, rings)), measured_rings)
+        with execution.reporter.stage(f"correlations in {visits} visits"):
             area = len(chosen) * (cell / ARCMIN) ** 2
             found[visits] = NullTest.of(visits, parts, area, bias, psf_leakage(stack, parts))
     write_json(folder / "null_test.json", {"stacks": {str(n): null_metrics(r) for n, r in found.items()}})
@@ -264,16 +250,6 @@ def write_shapes(path: Path, galaxies: GalaxyShapes, stamp: Stamp) -> None:
 
 def _read_shapes(path: Path, stamp: Stamp) -> GalaxyShapes:
     """Return the galaxies of a finished tile; ProductError for a damaged one or one of another configuration."""
-    hdus = read_fits(path)
-    if not stamp.matches(hdus[0].header):
-        raise ProductError("was made with another version, configuration or seed", file=path)
+    hdus = read_fits(path, stamp)
     found = {name: column(hdus["GALAXIES"], name.upper()) for name in _COLUMNS}
     return GalaxyShapes(**{n: v * _COLUMNS[n][0] if _COLUMNS[n][0] != 1.0 else v for n, v in found.items()})
-
-
-def _is_finished(path: Path, stamp: Stamp) -> bool:
-    try:
-        _read_shapes(path, stamp)
-    except ProductError:
-        return False
-    return True

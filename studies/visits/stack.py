@@ -235,9 +235,7 @@ _COLUMNS = {
 
 
 def _read_table(path: Path, stamp: Stamp | None) -> fits.HDUList:
-    hdus = read_fits(path)
-    if stamp is not None and not stamp.matches(hdus[0].header):
-        raise ProductError("was made with another version, configuration or seed", file=path)
+    hdus = read_fits(path, stamp)
     if VISITS_CARD not in hdus[0].header:
         raise ProductError("no stack of visits", file=path)
     return hdus

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError, PachonError, ProductError
-from ...core.files import claim_folder, make_folder, write_bytes, write_json
+from ...core.errors import DomainError, ProductError
+from ...core.files import make_folder, write_bytes, write_json
+from ...core.long_work import Execution, claim_folder
 from ...core.memory import readable
-from ...core.ordered_jobs import ordered_results
 from ...core.products import Stamp, write_ecsv
 from ...core.progress import Reporter
 from ...core.units import ARCSEC
-from ...core.workers import MakeWorkers
-from ...pipeline.config import differences
 from ...pipeline.experiment import Experiment
 from ...pipeline.memory import check_memory
 from ...pipeline.run_folder import CONFIG_NAME, SUMMARY_NAME
@@ -67,10 +66,7 @@ def stack_visits(
     folder: Path,
     *,
     experiment: Experiment | None = None,
-    resume: bool = False,
-    workers: MakeWorkers | None = None,
-    threads: int | None = None,
-    reporter: Reporter | None = None,
+    execution: Execution | None = None,
 ) -> StackResult:
     """Visit a field many times, and stack true PSFs and those of the models of each visit's stars.
 
@@ -87,21 +83,17 @@ def stack_visits(
         Folder of the products, made where missing.
     experiment : Experiment, optional
         Experiment of the configuration, where it is made already.
-    resume : bool
-        Go on after the visits that the folder has, with more of them than asked for before too.
-    workers : callable, optional
-        Function that makes the workers that compute the visits, as in :func:`~pachon.run`; by default this process.
-    threads : int, optional
-        Number of threads; all processors by default.
-    reporter : Reporter, optional
-        Progress display; silent by default.
+    execution : Execution, optional
+        Workers that compute the visits; threads; progress display; and whether to go on after the visits that the
+        folder has, with more of them than asked for before too.
 
     Raises
     ------
     PachonError
         If the configuration does not hold together, the folder holds other visits or has no room, or a visit fails.
     """
-    reporter = Reporter(quiet=True) if reporter is None else reporter
+    execution = execution or Execution()
+    threads, reporter = execution.threads, execution.reporter
     experiment = config.experiment() if experiment is None else experiment
     config = config.resolved(experiment)
     stamp = Stamp(config.digest(experiment), experiment.config.seed)
@@ -111,8 +103,8 @@ def stack_visits(
     check_rotators(experiment, visits)
     make_folder(folder)
     _check_room(folder, points, len(config.kept))
-    _claim(folder, config, resume)
-    sums = _sums_so_far(folder, stamp, len(points), resume)
+    claim_visits(folder, config, resume=execution.resume)
+    sums = _sums_so_far(folder, stamp, len(points), execution.resume)
     if sums.visits > len(visits):
         raise ProductError(f"{folder} holds {sums.visits} visits: expected at most {len(visits)}; choose another --out")
     gone = [n for n in config.kept if n <= sums.visits and not stack_path(folder, n).exists()]
@@ -123,26 +115,23 @@ def stack_visits(
     scale = pixel_scale_of(frame)
     due = visits[sums.visits :]
     # In this process each visit shows its own stages.
-    alone = workers is None
-    results = ordered_results(
-        VisitComputation(points, frame, reporter if alone else None),
+    alone = execution.alone
+    with execution.results(
+        partial(compute_visit, points, frame, reporter if alone else None),
         [visit.label for visit in due],
         ((visit_experiment(experiment, visit), visit) for visit in due),
         title=None if alone else f"{len(due)} visits",
-        workers=workers,
-        threads=threads,
         check=lambda processes: check_memory(experiment, threads, copies=processes),
-        reporter=reporter,
-    )
-    for visit, seen in zip(due, results, strict=True):
-        if seen.left_out:
-            reporter.line(f"{visit.label}: {_left_out_line(seen.left_out)}")
-        sums.add(seen)
-        if sums.visits in config.kept:
-            stack = PsfStack.of(sums, points.sky, points.star, frame.matrix, scale, experiment.weight_fwhm)
-            stack.write_product(stack_path(folder, sums.visits), stamp)
-        # Written last, so that all visits that it counts are in the stack.
-        sums.write(folder / SUMS_NAME, stamp)
+    ) as results:
+        for visit, psfs in zip(due, results, strict=True):
+            if psfs.left_out:
+                reporter.line(f"{visit.label}: {_left_out_line(psfs.left_out)}")
+            sums.add(psfs)
+            if sums.visits in config.kept:
+                stack = PsfStack.of(sums, points.sky, points.star, frame.matrix, scale, experiment.weight_fwhm)
+                stack.write_product(stack_path(folder, sums.visits), stamp)
+            # Written last, so that all visits that it counts are in the stack.
+            sums.write(folder / SUMS_NAME, stamp)
     stacks = {n: PsfStack.read(stack_path(folder, n), stamp) for n in config.kept}
     with reporter.stage("correlations"):
         found = {n: stack_correlations(stack, cell_of(experiment, frame)) for n, stack in stacks.items()}
@@ -150,20 +139,14 @@ def stack_visits(
     return StackResult(folder, stacks, found, summary)
 
 
-@dataclass(frozen=True)
-class VisitComputation:
-    """PSFs of visits; a picklable function for every kind of worker, where there is no reporter."""
-
-    points: SkyPoints
-    frame: StackFrame
-    reporter: Reporter | None = None
-
-    def __call__(self, job: tuple[Experiment, Visit], threads: int) -> VisitPsfs:
-        """Compute one visit with its experiment."""
-        experiment, visit = job
-        if self.reporter is not None:
-            self.reporter.line(f"{visit.label}, {visit}")
-        return visit_psfs(experiment, visit, self.points, self.frame, threads=threads, reporter=self.reporter)
+def compute_visit(
+    points: SkyPoints, frame: StackFrame, reporter: Reporter | None, job: tuple[Experiment, Visit], threads: int
+) -> VisitPsfs:
+    """Compute the PSFs of one visit with its experiment; workers have no reporter."""
+    experiment, visit = job
+    if reporter is not None:
+        reporter.line(f"{visit.label}, {visit}")
+    return visit_psfs(experiment, visit, points, frame, threads=threads, reporter=reporter)
 
 
 def _left_out_line(reasons: dict[str, str]) -> str:
@@ -194,27 +177,22 @@ def sky_points_of(experiment: Experiment, config: VisitsConfig, frame: StackFram
     return draw_points(experiment.config.seed, radius, cell_of(experiment, frame), settings.stars, settings.places)
 
 
-def _claim(folder: Path, config: VisitsConfig, resume: bool) -> None:
+def claim_visits(folder: Path, config: VisitsConfig, *, resume: bool) -> None:
     """Write the configuration, or check that the folder is of the same, but for galaxies and number of visits."""
-    path = folder / CONFIG_NAME
 
-    def check() -> None:
-        try:
-            before = load_visits_configuration(path)
-        except PachonError as error:
-            raise ProductError(f"{folder} holds visits that cannot be read ({error}); choose another --out") from None
-        if not resume:
-            raise ProductError(f"{folder} holds visits already; go on with --resume, or choose another --out")
-        old, new = ({**c.model_dump(mode="json", by_alias=True)} for c in (before, config))
-        for each in (old, new):
-            del each["galaxies"]
-            for key in ("count", "snapshots"):
-                del each["visits"][key]
-        found = differences(old, new)
-        if found:
-            raise ProductError(f"{folder} holds visits of another configuration ({'; '.join(found[:3])})")
+    def plain(settings: VisitsConfig) -> dict[str, Any]:
+        return settings.model_dump(mode="json", by_alias=True)
 
-    claim_folder(path, config.to_yaml().encode(), products="stack_*.fits", check=check)
+    claim_folder(
+        folder / CONFIG_NAME,
+        config.to_yaml().encode(),
+        products="stack_*.fits",
+        noun="visits",
+        now=plain(config),
+        read=lambda path: plain(load_visits_configuration(path)),
+        free_keys=("galaxies", "visits.count", "visits.snapshots"),
+        wanted=resume,
+    )
 
 
 def _sums_so_far(folder: Path, stamp: Stamp, n: int, resume: bool) -> PsfSums:

@@ -22,6 +22,9 @@ class _Made:
             self._kept[name] = getattr(type(self), f"make_{name}")(self)
         return self._kept[name]
 
+    def make_execution(self):
+        return pachon.Execution(threads=1)
+
     def make_tel(self):
         return pachon.paul_baker()
 
@@ -342,7 +345,7 @@ def calls(folder):
         "SingleDonuts": (pachon.SingleDonuts, {"noll": (4, 5), "left_out": 0.0, "higher_order": 0.0}),
         "FieldTerms": (pachon.FieldTerms, {"field_noll": (1, 2), "noll": (4, 5), "higher_order": 0.0}),
         "TelescopeFreedoms": (pachon.TelescopeFreedoms, {"freedoms": m.dofs, "prior": None, "noll": (4, 5)}),
-        "align": (pachon.align, {"config": pachon.AlignConfig(telescope="none.yaml"), "threads": 1}),
+        "align": (pachon.align, {"config": pachon.AlignConfig(telescope="none.yaml"), "execution": m.execution}),
         "load_align_configuration": (pachon.load_align_configuration, {"path": m.folder / "none.yaml"}),
         "fit_own_stars": (pachon.fit_own_stars, {"stamps": m.own, "positions": m.places,
                           "pixel_scale": 1e-6, "size": 11, "min_snr": 1.0, "gain": 1.0, "saturation": 1e7,
@@ -368,15 +371,15 @@ def calls(folder):
         "write_baseline": (pachon.write_baseline, {"path": m.folder / "b.json", "baseline": m.baseline}),
         "load_sweep": (pachon.load_sweep, {"path": m.folder / "none.yaml"}),
         "load_sweep_table": (pachon.load_sweep_table, {"path": m.folder / "none.db"}),
-        "run_sweep": (pachon.run_sweep, {"sweep": m.sweep, "path": m.file}),
-        "run": (pachon.run, {"config": m.config, "folder": m.folder / "none", "resume": False, "strict": False,
-                             "threads": 1}),
-        "simulate_images": (pachon.simulate_images, {"config": pachon.ImagesConfig(run=m.config), "resume": False,
-                            "threads": 1, "folder": m.folder / "none"}),
-        "stack_visits": (pachon.stack_visits, {"config": pachon.VisitsConfig(run=m.config), "resume": False,
-                         "threads": 1, "folder": m.folder / "none"}),
-        "null_test": (pachon.null_test, {"folder": m.folder / "none", "tiles": 2, "rings": 10, "resume": False,
-                      "threads": 1}),
+        "run_sweep": (pachon.run_sweep, {"sweep": m.sweep, "path": m.file, "execution": m.execution}),
+        "run": (pachon.run, {"config": m.config, "folder": m.folder / "none", "strict": False,
+                             "execution": m.execution}),
+        "simulate_images": (pachon.simulate_images, {"config": pachon.ImagesConfig(run=m.config),
+                            "execution": m.execution, "folder": m.folder / "none"}),
+        "stack_visits": (pachon.stack_visits, {"config": pachon.VisitsConfig(run=m.config),
+                         "execution": m.execution, "folder": m.folder / "none"}),
+        "null_test": (pachon.null_test, {"folder": m.folder / "none", "tiles": 2, "rings": 10,
+                      "execution": m.execution}),
         "load_visits_configuration": (pachon.load_visits_configuration, {"path": m.folder / "none.yaml"}),
         "shim": (pachon.shim, {"experiment": m.experiment, "merit": "fwhm", "parts": "rafts", "threads": 1}),
         "measure_image": (

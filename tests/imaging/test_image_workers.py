@@ -6,9 +6,9 @@ import pytest
 
 import pachon
 from pachon.core.errors import ProductError
+from pachon.core.long_work import Execution, JobResult
 from pachon.core.workers import Workers, serial_worker
-from pachon.imaging.ccd_image import ImageComputation, image_name
-from pachon.pipeline.ccd_worker import CcdJob
+from pachon.imaging.ccd_image import image_name
 
 SETTINGS = {
     "run": {
@@ -28,22 +28,35 @@ def contents(folder):
 
 
 @pytest.mark.long
-def test_workers_write_the_bytes_of_one_process(tmp_path):
+def test_workers_write_the_bytes_of_one_process(tmp_path, monkeypatch):
     config = pachon.ImagesConfig.model_validate(SETTINGS)
     alone = pachon.simulate_images(config, tmp_path / "one")
-    shared = pachon.simulate_images(config, tmp_path / "two", workers=serial_worker)
+    shared = pachon.simulate_images(config, tmp_path / "two", execution=Execution(workers=serial_worker))
     assert contents(tmp_path / "two") == contents(tmp_path / "one")
     assert shared.objects == alone.objects
     assert shared.computed == alone.computed
     # A worker that does not see the folder sends its files.
-    computation = ImageComputation(config, config.experiment(), tmp_path / "three", "no mark")
-    drawn = computation(CcdJob("R22_S12"), 1)
-    assert dict(drawn.files) == {k: v for k, v in contents(tmp_path / "one").items() if "R22_S12" in k}
-    assert drawn.files[-1][0] == image_name("R22_S12")
-    lost = replace(drawn, problem="CCD R22_S12: nothing")
+    written = []
+
+    def far(compute):
+        return Workers("far", 0, lambda jobs: (replace(compute, mark="none")(job, 1) for job in jobs))
+
+    def write(path, data):
+        written.append(path.name)
+        path.write_bytes(data)
+
+    monkeypatch.setattr("pachon.core.long_work.write_bytes", write)
+    pachon.simulate_images(config, tmp_path / "three", execution=Execution(workers=far))
+    assert contents(tmp_path / "three") == contents(tmp_path / "one")
+    # The image is the sign of a finished CCD.
+    assert [written.index(image_name(name)) for name in shared.computed] == [2, 5]
 
     def failing(compute):
-        return Workers("failing", 0, lambda jobs: (lost for _ in jobs))
+        def results(jobs):
+            for job in jobs:
+                yield JobResult(job.number, ProductError("nothing", subject=job.label))
 
-    with pytest.raises(ProductError, match="CCD R22_S12: nothing"):
-        pachon.simulate_images(config, tmp_path / "four", workers=failing)
+        return Workers("failing", 0, results)
+
+    with pytest.raises(ProductError, match="CCD R22_S11: nothing"):
+        pachon.simulate_images(config, tmp_path / "four", execution=Execution(workers=failing))

@@ -10,6 +10,7 @@ from astropy.table import Table
 
 from pachon.commands.cli import main
 from pachon.core.errors import PachonError
+from pachon.core.long_work import Execution
 from pachon.core.units import ARCSEC
 from pachon.imaging.draw import Window
 from pachon.imaging.exposure import Exposure
@@ -208,7 +209,7 @@ def measured(image, tmp_path_factory):
     folder = tmp_path_factory.mktemp("measured")
     image.write(folder / "a.fits")
     replace(image, image=image.image + 1.0).write(folder / "b.fits")
-    measure_files([folder / "a.fits", folder / "b.fits"], folder, threads=1)
+    measure_files([folder / "a.fits", folder / "b.fits"], folder, execution=Execution(threads=1))
     return folder, {path.name: path.read_bytes() for path in folder.glob("*_*.fits")}
 
 
@@ -227,12 +228,12 @@ def test_a_damaged_product_is_made_again_to_the_same_bytes(measured, monkeypatch
         return replace(catalogue, image=image)
 
     monkeypatch.setattr("pachon.imaging.measure_files.measure_image", measure_once)
-    found = measure_files([folder / "a.fits", folder / "b.fits"], folder, resume=True, threads=1)
+    found = measure_files([folder / "a.fits", folder / "b.fits"], folder, execution=Execution(resume=True, threads=1))
     assert len(measured_images) == 1
     assert {path.name: path.read_bytes() for path in folder.glob("*_*.fits")} == whole
     assert list(found.metrics) == ["a.fits", "b.fits"]
     # Whole ones stay.
-    measure_files([folder / "a.fits", folder / "b.fits"], folder, resume=True, threads=1)
+    measure_files([folder / "a.fits", folder / "b.fits"], folder, execution=Execution(resume=True, threads=1))
     assert len(measured_images) == 1
 
 

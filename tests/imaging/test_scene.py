@@ -10,11 +10,11 @@ from astropy.table import Table
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError, ProductError
-from pachon.core.products import Stamp
+from pachon.core.products import Stamp, is_whole
 from pachon.core.units import ARCSEC
 from pachon.imaging.draw import Window
 from pachon.imaging.exposure import Exposure
-from pachon.imaging.image_file import OBJECT_COLUMNS, CcdImage, is_whole
+from pachon.imaging.image_file import OBJECT_COLUMNS, CcdImage
 from pachon.imaging.scene import STAR_ROOM, deep_exposures, draw_ccd, ellipticities, middle_window
 from pachon.measure.shapes import measure_shapes
 from pachon.pipeline.experiment import Experiment

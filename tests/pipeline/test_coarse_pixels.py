@@ -10,6 +10,7 @@ from astropy.io import fits
 
 import pachon
 from pachon import ConfigError, DomainError
+from pachon.core.long_work import Execution
 from pachon.pipeline.config import configuration_of
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.run import run
@@ -69,7 +70,7 @@ def test_a_focal_plane_model_of_a_refractor_predicts_its_own_errors(tmp_path):
     """Moments under the wider weight are measured, fitted and predicted alike."""
     experiment = small(tmp_path, reconstruction={"model": "focal_plane"})
     folder = tmp_path / "run"
-    run(experiment, folder, threads=2)
+    run(experiment, folder, execution=Execution(threads=2))
     metrics = json.loads((folder / "summary.json").read_text())["all"]
     for shape in ("e1", "e2", "size"):
         # Forty stars tell a variance to 22 %.

@@ -7,11 +7,12 @@ import pytest
 
 import pachon
 from pachon.core.errors import ConfigError, PachonError
+from pachon.core.long_work import differences
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.camera.silicon import Silicon
 from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.io.site_file import DATA as SITES
-from pachon.pipeline.config import Configuration, differences, digest, load_configuration, to_yaml, with_options
+from pachon.pipeline.config import Configuration, digest, load_configuration, to_yaml, with_options
 from pachon.pipeline.config_hash import hashed_heights, hashed_stars
 from pachon.pipeline.experiment import Experiment
 from pachon.wavefront.aberration import LARGEST_RMS, ResidualWavefront

@@ -10,6 +10,7 @@ from astropy.io import fits
 
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, ProductError, UnknownNameError
+from pachon.core.long_work import Execution
 from pachon.core.progress import Reporter
 from pachon.measure.correlation import shear_correlation
 from pachon.pipeline import focal_plane_stage, run_folder
@@ -43,7 +44,7 @@ def whole_run(focal_plane_config, tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
-        run(focal_plane_config(), folder, threads=1)
+        run(focal_plane_config(), folder, execution=Execution(threads=1))
     return folder
 
 
@@ -53,7 +54,7 @@ def ccd_run(focal_plane_config, tmp_path_factory):
     folder = tmp_path_factory.mktemp("single") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
-        run(focal_plane_config(reconstruction__model="ccd"), folder, threads=1)
+        run(focal_plane_config(reconstruction__model="ccd"), folder, execution=Execution(threads=1))
     return folder
 
 
@@ -140,7 +141,7 @@ def test_default_runs_have_no_more_columns(finished_run):
 def test_a_finished_run_resumed_on_two_threads_has_the_same_bytes(whole_run, focal_plane_config, tmp_path, no_report):
     shutil.copytree(whole_run, tmp_path / "copy")
     (tmp_path / "copy" / FOCAL_PLANE_PSF_NAME).unlink()
-    assert run(focal_plane_config(), tmp_path / "copy", resume=True, threads=2).computed == ()
+    assert run(focal_plane_config(), tmp_path / "copy", execution=Execution(resume=True, threads=2)).computed == ()
     assert contents(tmp_path / "copy") == contents(whole_run)
 
 
@@ -164,7 +165,7 @@ def test_a_run_stopped_while_products_are_rewritten_goes_on_to_the_same_bytes(
     with pytest.raises(ProductError, match="CCD R22_S12: has no focal-plane model yet, which pachon run --resume adds"):
         diagnose(out, strict=True)
     monkeypatch.setattr(focal_plane_stage, "write_focal_plane_columns", real)
-    result = run(focal_plane_config(), out, resume=True)
+    result = run(focal_plane_config(), out, execution=Execution(resume=True))
     assert (result.kept, result.computed) == (CCDS, ())
     assert contents(out) == contents(tmp_path / "at_once")
 
@@ -174,7 +175,7 @@ def test_a_run_that_grows_models_all_ccds_again(focal_plane_config, tmp_path, pl
     options = {"stars__observed": 32}
     run(focal_plane_config(ccds=CCDS[:1], **options), tmp_path / "grows")
     alone = tables(tmp_path / "grows", CCDS[0], "STARS")[0]
-    assert run(focal_plane_config(**options), tmp_path / "grows", resume=True).kept == CCDS[:1]
+    assert run(focal_plane_config(**options), tmp_path / "grows", execution=Execution(resume=True)).kept == CCDS[:1]
     assert not np.array_equal(tables(tmp_path / "grows", CCDS[0], "STARS")[0]["MODEL_E1"], alone["MODEL_E1"])
     run(focal_plane_config(**options), tmp_path / "at_once")
     assert contents(tmp_path / "grows") == contents(tmp_path / "at_once")
@@ -191,7 +192,7 @@ def test_ccds_computed_apart_make_the_run_of_one_machine(focal_plane_config, tmp
             run(focal_plane_config(ccds=(name,)), tmp_path / name)
         for file in (f"ccd_{name}.fits", "config.yaml"):
             shutil.copy(tmp_path / name / file, together)
-    assert run(focal_plane_config(), together, resume=True).computed == ()
+    assert run(focal_plane_config(), together, execution=Execution(resume=True)).computed == ()
     assert contents(together) == contents(tmp_path / "at_once")
 
 
@@ -211,7 +212,7 @@ def test_a_ccd_that_cannot_be_modelled_is_left_out(focal_plane_config, tmp_path,
     run(focal_plane_config(stars__observed=32, ccds=CCDS[1:]), tmp_path / "alone")
     name = f"ccd_{CCDS[1]}.fits"
     assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
-    assert run(config, tmp_path / "out", resume=True).computed == CCDS[:1]
+    assert run(config, tmp_path / "out", execution=Execution(resume=True)).computed == CCDS[:1]
     run(config, tmp_path / "at_once")
     assert contents(tmp_path / "out") == contents(tmp_path / "at_once")
 
@@ -220,7 +221,7 @@ def test_a_ccd_that_cannot_be_modelled_is_left_out(focal_plane_config, tmp_path,
 def test_a_product_of_another_model_is_not_kept(ccd_run, focal_plane_config, tmp_path, plane_model, no_report):
     shutil.copytree(ccd_run, tmp_path / "out")
     with pytest.raises(ProductError, match=r'reconstruction\.model: "ccd" -> "focal_plane"'):
-        run(focal_plane_config(), tmp_path / "out", resume=True)
+        run(focal_plane_config(), tmp_path / "out", execution=Execution(resume=True))
 
 
 @pytest.mark.long
@@ -296,7 +297,7 @@ def test_the_report_has_both_residuals_and_the_warnings(focal_plane_config, tmp_
         monkeypatch.setattr(pictures_module, name, lambda *_, **__: b"")
     for name in ("correlation_plot", "models_plot"):
         monkeypatch.setattr(pictures_module, name, keep(name))
-    result = run(focal_plane_config(), tmp_path / "out", threads=1, reporter=Reporter())
+    result = run(focal_plane_config(), tmp_path / "out", execution=Execution(threads=1, reporter=Reporter()))
     assert "the plane is <flat>\n" in capsys.readouterr().err
     assert list(drawn["correlation_plot"][0]) == ["truth", "observed", "residual", "away"]
     assert set(CCD_KINDS) < set(drawn["models_plot"][0])

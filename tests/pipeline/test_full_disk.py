@@ -9,6 +9,7 @@ import pytest
 
 from pachon.core import files
 from pachon.core.errors import ProductError
+from pachon.core.long_work import Execution, claim_folder
 from pachon.pipeline.run import run
 from pachon.studies.sweep.file import read_sweep
 from pachon.studies.sweep.store import PointResult, SweepStore, create_store
@@ -38,7 +39,7 @@ def test_a_claim_on_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch):
     path.write_bytes(b"old")
     monkeypatch.setattr(files.os, "fsync", Disk(0))
     with pytest.raises(ProductError, match="No space left on device"):
-        files.claim_folder(path, b"new", products="*.fits", check=lambda: None)
+        claim_folder(path, b"new", products="*.fits", noun="products", now={}, read=lambda _: {})
     assert content(tmp_path) == {"config.yaml": b"old"}
 
 
@@ -74,12 +75,12 @@ def test_a_kernel_cache_that_cannot_be_written_is_one_line(tmp_path):
 @pytest.mark.slow
 def test_a_run_goes_on_after_a_disk_that_was_full_at_any_write(tiny, tmp_path, monkeypatch):
     config = tiny(ccds=("R22_S11", "R22_S12"), psf__engine="long_exposure", wavelengths_nm=[620.0])
-    run(config, tmp_path / "whole", threads=1)
+    run(config, tmp_path / "whole", execution=Execution(threads=1))
     expected = content(tmp_path / "whole")
     disk = Disk(10**9)
     with monkeypatch.context() as patch:
         patch.setattr(files.os, "fsync", disk)
-        run(config, tmp_path / "counted", threads=1)
+        run(config, tmp_path / "counted", execution=Execution(threads=1))
     # Configuration, two CCDs, summary, heights, report, times.
     assert disk.writes >= 6
     for room in range(disk.writes):
@@ -87,7 +88,7 @@ def test_a_run_goes_on_after_a_disk_that_was_full_at_any_write(tiny, tmp_path, m
         with monkeypatch.context() as patch:
             patch.setattr(files.os, "fsync", Disk(room))
             with pytest.raises(ProductError, match=r"^cannot write .*: No space left on device$"):
-                run(config, folder, threads=1)
+                run(config, folder, execution=Execution(threads=1))
         assert not list(folder.glob(".*.partial"))
-        run(config, folder, threads=1, resume=True)
+        run(config, folder, execution=Execution(threads=1, resume=True))
         assert content(folder) == expected

@@ -11,6 +11,7 @@ import pytest
 
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError
+from pachon.core.long_work import Execution
 from pachon.pipeline import memory as run_memory
 from pachon.pipeline import run as run_module
 from pachon.pipeline.config import Configuration, with_options
@@ -70,7 +71,7 @@ def test_a_run_that_does_not_fit_leaves_nothing_and_a_finished_one_is_reported_a
     monkeypatch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
     monkeypatch.setattr(run_module, "build_report", lambda *_: "")
     shutil.copytree(finished_run, folder)
-    assert run_module.run(tiny(), folder, resume=True).computed == ()
+    assert run_module.run(tiny(), folder, execution=Execution(resume=True)).computed == ()
 
 
 def test_a_damaged_product_counts_as_one_to_be_computed(monkeypatch, tmp_path, tiny, finished_run):
@@ -81,7 +82,7 @@ def test_a_damaged_product_counts_as_one_to_be_computed(monkeypatch, tmp_path, t
     before = product.read_bytes()
     monkeypatch.setattr(run_memory, "available_bytes", lambda: 1000)
     with pytest.raises(ConfigError, match="needs about"):
-        run_module.run(tiny(), folder, resume=True)
+        run_module.run(tiny(), folder, execution=Execution(resume=True))
     assert product.read_bytes() == before
 
 
@@ -99,9 +100,11 @@ def test_the_estimate_is_near_the_peak_of_a_run(options, tmp_path):
     """Whole runs of one CCD in a process of their own; the report's pictures included."""
     code = (
         "import json, resource, sys; from pathlib import Path; from pachon.pipeline.run import run;"
+        "from pachon.core.long_work import Execution;"
         "from pachon.pipeline.config import Configuration, with_options;"
         "options = json.loads(sys.argv[1]);"
-        "run(with_options(Configuration(), ccds=('R22_S11',), **options), Path(sys.argv[2]), threads=2);"
+        "run(with_options(Configuration(), ccds=('R22_S11',), **options), Path(sys.argv[2]),"
+        "execution=Execution(threads=2));"
         "print(1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
     )
     arguments = [sys.executable, "-c", code, json.dumps(options), str(tmp_path / "out")]

@@ -4,15 +4,15 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
 
-from pachon.core import files
+from pachon.core import long_work
 from pachon.core.errors import ConfigError, ProductError
 from pachon.core.files import _owning_process, make_folder, write_new_bytes
+from pachon.core.long_work import Execution, JobResult
 from pachon.core.workers import Workers
 from pachon.imaging import simulate
 from pachon.imaging.config import ImagesConfig
@@ -76,15 +76,17 @@ def test_a_sweep_stops_where_its_telescope_is_edited(configuration, edited):
     path.write_text("base: run.yaml\nparameters: {M2.dz_um: {values: [0, 1, 2]}}\ndesign: {kind: grid}\n")
     sweep = load_sweep(path)
 
-    def results(points):
-        for point in points:
-            if point.number == 1:
+    def results(jobs):
+        for job in jobs:
+            if job.number == 1:
                 with open(folder / edited, "ab") as file:
                     file.write(b"\n")
-            yield PointResult(point.number, {"fwhm": 1.0}, None, 0.0, "here")
+            yield JobResult(job.number, PointResult(job.content.number, {"fwhm": 1.0}, None, 0.0, "here"))
 
     with pytest.raises(ConfigError, match="other file contents") as caught:
-        run_sweep(sweep, folder / "s.db", folder=folder, workers=lambda _: Workers("these", 1, results))
+        run_sweep(
+            sweep, folder / "s.db", folder=folder, execution=Execution(workers=lambda _: Workers("these", 1, results))
+        )
     assert "\n" not in str(caught.value)
     with SweepStore(folder / "s.db") as store:
         assert store.finished() == {0}
@@ -107,15 +109,15 @@ def _run(folder, seed, configuration):
 
 
 def _images(folder, seed, _):
-    simulate._claim(folder, ImagesConfig(run=Configuration(seed=seed)), resume=False)
+    simulate.claim_images(folder, ImagesConfig(run=Configuration(seed=seed)), resume=False)
 
 
 def _visits(folder, seed, _):
-    visits._claim(folder, VisitsConfig(run=Configuration(seed=seed)), False)
+    visits.claim_visits(folder, VisitsConfig(run=Configuration(seed=seed)), resume=False)
 
 
 def _stacked_images(folder, seed, _):
-    stack_images._claim(SimpleNamespace(folder=folder, settings=ImageStackConfig(tiles=seed)), False)
+    stack_images.claim_stack(folder, ImageStackConfig(tiles=seed), resume=False)
 
 
 CLAIMS = {"config.yaml": _run, "images.yaml": _images, "visits": _visits, "stack-images": _stacked_images}
@@ -125,14 +127,14 @@ CLAIMS = {"config.yaml": _run, "images.yaml": _images, "visits": _visits, "stack
 def test_a_run_that_comes_second_in_a_new_folder_is_refused(tmp_path, configuration, monkeypatch, claim):
     folder = tmp_path / "out"
     # The first run writes its configuration after the second has found none.
-    real = files.write_new_bytes
+    real = long_work.write_new_bytes
 
     def late(path, content):
-        monkeypatch.setattr(files, "write_new_bytes", real)
+        monkeypatch.setattr(long_work, "write_new_bytes", real)
         claim(folder, 1, configuration)
         return real(path, content)
 
-    monkeypatch.setattr(files, "write_new_bytes", late)
+    monkeypatch.setattr(long_work, "write_new_bytes", late)
     with pytest.raises(ProductError, match=r"another configuration|holds visits already|holds images already"):
         claim(folder, 2, configuration)
     [written] = folder.iterdir()

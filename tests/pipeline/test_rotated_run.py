@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import treecorr
 
+from pachon.core.long_work import Execution
 from pachon.pipeline import run as run_module
 from pachon.pipeline.config import with_options
 from pachon.pipeline.experiment import Experiment
@@ -124,7 +125,7 @@ def test_a_run_with_a_rotated_camera(tiny, tmp_path, monkeypatch):
     monkeypatch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
     monkeypatch.setattr(run_module, "build_report", lambda *_: "")
     config = with_options(tiny(psf__engine="long_exposure"), **QUARTER)
-    run(config, tmp_path / "run", threads=1)
+    run(config, tmp_path / "run", execution=Execution(threads=1))
     products = [read_product(product_path(tmp_path / "run", n)) for n in config.ccds]
     assert [p.rotator for p in products] == [pytest.approx(0.5 * np.pi, abs=1e-15)] * 2
     far = products[1].observed

@@ -11,6 +11,7 @@ import pytest
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, PachonError, ProductError
 from pachon.core.files import _owning_process
+from pachon.core.long_work import Execution
 from pachon.core.progress import Reporter
 from pachon.measure.correlation import shear_correlation
 from pachon.pipeline import run as run_module
@@ -68,7 +69,7 @@ def test_a_run_leaves_its_files_and_no_other(finished_run):
 @pytest.mark.long
 def test_running_its_configuration_again_gives_the_same_bytes_on_two_threads(finished_run, tmp_path):
     config = Experiment.from_config(load_configuration(finished_run / "config.yaml"), finished_run).config
-    run(config, tmp_path / "again", threads=2)
+    run(config, tmp_path / "again", execution=Execution(threads=2))
     assert contents(tmp_path / "again") == contents(finished_run)
 
 
@@ -86,7 +87,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(finished_run, copied, 
     done = []
     real = ccd_loop.expose_ccd
     monkeypatch.setattr(ccd_loop, "expose_ccd", lambda e, name, **k: done.append(name) or real(e, name, **k))
-    result = run(tiny(), copied, resume=True)
+    result = run(tiny(), copied, execution=Execution(resume=True))
     assert done == ["R24_S12"]
     assert result.kept == ("R22_S11",)
     assert contents(copied) == contents(finished_run)
@@ -101,7 +102,7 @@ def test_ccds_computed_apart_make_the_run_that_one_machine_makes(finished_run, t
         run(tiny(ccds=(name,)), tmp_path / name)
         shutil.copy(tmp_path / name / f"ccd_{name}.fits", together)
         shutil.copy(tmp_path / name / "config.yaml", together)
-    result = run(tiny(), together, resume=True)
+    result = run(tiny(), together, execution=Execution(resume=True))
     assert result.computed == ()
     assert contents(together) == contents(finished_run)
 
@@ -111,7 +112,7 @@ def test_a_damaged_product_is_computed_again(finished_run, copied, tiny, no_repo
     data = bytearray(path.read_bytes())
     data[-4000] ^= 1
     path.write_bytes(data)
-    assert run(tiny(), copied, resume=True).computed == ("R22_S11",)
+    assert run(tiny(), copied, execution=Execution(resume=True)).computed == ("R22_S11",)
     assert contents(copied) == contents(finished_run)
 
 
@@ -129,7 +130,7 @@ def test_an_interrupted_run_keeps_the_ccds_that_were_finished(finished_run, tmp_
     finished = {"ccd_R22_S11.fits", "config.yaml", "focal_plane.ecsv", "focal_plane.glb"}
     assert {p.name for p in (tmp_path / "out").iterdir()} == finished
     monkeypatch.setattr(ccd_loop, "expose_ccd", real)
-    assert run(tiny(), tmp_path / "out", resume=True).kept == ("R22_S11",)
+    assert run(tiny(), tmp_path / "out", execution=Execution(resume=True)).kept == ("R22_S11",)
     assert contents(tmp_path / "out") == contents(finished_run)
 
 
@@ -137,7 +138,7 @@ def test_an_interrupted_run_keeps_the_ccds_that_were_finished(finished_run, tmp_
 def test_another_configuration_is_refused_and_nothing_is_lost(copied, resume, tiny, no_report):
     before = contents(copied)
     with pytest.raises(ProductError, match=r"another configuration \(seed: 1 -> 2; stars.truth: 14 -> 15\)"):
-        run(tiny(seed=2, stars__truth=15), copied, resume=resume)
+        run(tiny(seed=2, stars__truth=15), copied, execution=Execution(resume=resume))
     assert contents(copied) == before
 
 
@@ -146,10 +147,10 @@ def test_a_run_may_grow_when_resumed_and_not_otherwise(finished_run, tmp_path, t
     run(tiny(ccds=("R22_S11",)), folder)
     with pytest.raises(ProductError, match="ccds: "):
         run(tiny(), folder)
-    assert run(tiny(), folder, resume=True).kept == ("R22_S11",)
+    assert run(tiny(), folder, execution=Execution(resume=True)).kept == ("R22_S11",)
     assert contents(folder) == contents(finished_run)
     with pytest.raises(ProductError, match="ccds: "):
-        run(tiny(ccds=("R22_S11",)), folder, resume=True)
+        run(tiny(ccds=("R22_S11",)), folder, execution=Execution(resume=True))
 
 
 def test_products_without_a_configuration_are_not_written_over(copied, tiny, no_report):
@@ -190,7 +191,7 @@ def failing_ccd(monkeypatch):
 def test_a_ccd_that_cannot_be_modelled_is_left_out(finished_run, tmp_path, tiny, failing_ccd, monkeypatch, capsys):
     monkeypatch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
     out = tmp_path / "out"
-    result = run(tiny(), out, reporter=Reporter())
+    result = run(tiny(), out, execution=Execution(reporter=Reporter()))
     assert result.not_modelled == {"R22_S11": failing_ccd}
     assert result.computed == ("R24_S12",)
     assert f"CCD R22_S11 is left out, it cannot be modelled: {failing_ccd}\n" in capsys.readouterr().err
@@ -210,9 +211,9 @@ def test_a_ccd_that_cannot_be_modelled_is_left_out(finished_run, tmp_path, tiny,
 def test_a_ccd_that_could_not_be_modelled_is_tried_again(
     finished_run, tmp_path, tiny, no_report, failing_ccd, monkeypatch
 ):
-    run(tiny(), tmp_path / "out", threads=1)
+    run(tiny(), tmp_path / "out", execution=Execution(threads=1))
     monkeypatch.setattr(run_folder, "model_ccd", model_ccd)
-    result = run(tiny(), tmp_path / "out", resume=True)
+    result = run(tiny(), tmp_path / "out", execution=Execution(resume=True))
     assert (result.kept, result.computed, result.not_modelled) == (("R24_S12",), ("R22_S11",), {})
     assert contents(tmp_path / "out") == contents(finished_run)
 

@@ -1,6 +1,8 @@
 """A run by processes, by a cluster and in parts: the same bytes as one process leaves."""
 
 import shutil
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,10 +12,11 @@ from drivers import kill_a_worker, start, wait_for
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, ProductError
 from pachon.core.files import marked_folder
+from pachon.core.long_work import Execution, Job, JobComputation
 from pachon.core.workers import Workers, serial_worker
 from pachon.pipeline import memory, run_folder
 from pachon.pipeline import run as run_module
-from pachon.pipeline.ccd_worker import CcdComputation, CcdJob
+from pachon.pipeline.ccd_worker import compute_ccd
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.memory import check_memory
 from pachon.pipeline.run import run
@@ -32,22 +35,22 @@ def contents(folder):
 
 
 def test_workers_write_the_bytes_of_one_process(finished_run, tmp_path, tiny):
-    result = run(tiny(), tmp_path / "run", workers=serial_worker)
+    result = run(tiny(), tmp_path / "run", execution=Execution(workers=serial_worker))
     assert contents(tmp_path / "run") == contents(finished_run)
     assert result.computed == ("R22_S11", "R24_S12")
 
 
 def test_a_worker_that_does_not_see_the_folder_sends_its_product(finished_run, tmp_path, tiny):
     experiment = Experiment.from_config(tiny())
-    computation = CcdComputation(experiment, tmp_path, ".another_mark")
-    result = computation(CcdJob("R24_S12"), 1)
-    assert result.product == (finished_run / "ccd_R24_S12.fits").read_bytes()
+    computation = JobComputation(partial(compute_ccd, experiment), tmp_path, ".another_mark")
+    result = computation(Job(0, "CCD R24_S12", "R24_S12"), 1)
+    assert result.files == (("ccd_R24_S12.fits", (finished_run / "ccd_R24_S12.fits").read_bytes()),)
     assert not any(tmp_path.iterdir())
 
     def far(compute):
-        return Workers("far", 0, lambda jobs: (CcdComputation(experiment, tmp_path, "none")(job, 1) for job in jobs))
+        return Workers("far", 0, lambda jobs: (replace(compute, mark="none")(job, 1) for job in jobs))
 
-    run(tiny(), tmp_path / "run", workers=far)
+    run(tiny(), tmp_path / "run", execution=Execution(workers=far))
     assert contents(tmp_path / "run") == contents(finished_run)
 
 
@@ -84,10 +87,10 @@ def test_a_ccd_that_cannot_be_modelled_is_left_out_or_ends_the_run(tmp_path, tin
         return real(experiment, exposure)
 
     monkeypatch.setattr(run_folder, "model_ccd", fails)
-    result = run(tiny(), tmp_path / "one", workers=serial_worker)
+    result = run(tiny(), tmp_path / "one", execution=Execution(workers=serial_worker))
     assert (result.not_modelled, result.computed) == ({"R22_S11": "3 of 12 stars left"}, ("R24_S12",))
     with pytest.raises(ProductError, match=r"^CCD R22_S11: 3 of 12 stars left$"):
-        run(tiny(), tmp_path / "two", workers=serial_worker, strict=True)
+        run(tiny(), tmp_path / "two", execution=Execution(workers=serial_worker), strict=True)
 
 
 def test_a_product_that_cannot_be_written_ends_the_run_in_one_line(tmp_path, tiny, monkeypatch):
@@ -95,8 +98,8 @@ def test_a_product_that_cannot_be_written_ends_the_run_in_one_line(tmp_path, tin
         raise ProductError("cannot write ccd.fits: No space left on device")
 
     monkeypatch.setattr(run_folder, "write_product", full)
-    with pytest.raises(ProductError, match=r"^cannot write ccd\.fits: No space left on device$"):
-        run(tiny(), tmp_path / "run", workers=serial_worker)
+    with pytest.raises(ProductError, match=r"^CCD R22_S11: cannot write ccd\.fits: No space left on device$"):
+        run(tiny(), tmp_path / "run", execution=Execution(workers=serial_worker))
 
 
 def test_processes_that_do_not_fit_into_memory_are_refused(tiny, monkeypatch):

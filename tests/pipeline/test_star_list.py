@@ -10,6 +10,7 @@ from astropy.table import Table
 
 import pachon
 from pachon.core.errors import PachonError
+from pachon.core.long_work import Execution
 from pachon.core.table_files import write_table
 from pachon.pipeline.config import Configuration, load_configuration, to_yaml, with_options
 from pachon.pipeline.experiment import Experiment
@@ -378,13 +379,13 @@ def test_a_whole_run_of_a_catalogue_goes_on_and_has_a_model_of_the_focal_plane(t
     assert (result.summary["catalogue"]["on_the_ccds"], result.report.is_file()) == (63, True)
     table = fits.getdata(tmp_path / "a" / "ccd_R24_S12.fits", "STARS")
     assert {"RA", "DEC", "CCD_E1"} <= set(table.names)
-    kept = run(config, tmp_path / "a", resume=True)
+    kept = run(config, tmp_path / "a", execution=Execution(resume=True))
     assert (kept.kept, kept.computed) == (CCDS[:2], ())
     found = diagnose(tmp_path / "a", tmp_path / "residuals")
     assert found.overall["ccds"] == 2
     # Without its last star, the catalogue is another: no CCD of the old one is kept.
     path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
-    other = run(config, tmp_path / "a", resume=True)
+    other = run(config, tmp_path / "a", execution=Execution(resume=True))
     assert (other.kept, other.computed) == ((), CCDS[:2])
     assert other.summary["catalogue"]["stars"] == 62
 

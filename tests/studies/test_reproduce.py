@@ -14,6 +14,7 @@ from scipy.special import j1
 
 import pachon
 from pachon.commands.cli import main
+from pachon.core.long_work import Execution
 from pachon.core.workers import process_workers
 from pachon.design.images.encircled_energy import energy_curve
 from pachon.models.ideal_telescope import ideal_telescope
@@ -62,7 +63,7 @@ TINY = Scale(
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """All figures at the tiny scale: the bench and the summary; tests only read them."""
-    bench = Bench(TINY, tmp_path_factory.mktemp("figures"), threads=2)
+    bench = Bench(TINY, tmp_path_factory.mktemp("figures"), execution=Execution(threads=2))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
         # Some hundred galaxies in place of ten thousand.
@@ -80,7 +81,7 @@ def few_galaxies(monkeypatch):
 
 @pytest.mark.slow
 def test_figures_of_visits_are_those_of_their_folder(few_galaxies, tmp_path):
-    bench = Bench(TINY, tmp_path, threads=2)
+    bench = Bench(TINY, tmp_path, execution=Execution(threads=2))
     summary = reproduce(["fig10", "fig15", "fig16", "fig17", "fig18"], bench)["figures"]
     stacks = json.loads((tmp_path / "visits" / "summary.json").read_text())["stacks"]
     assert summary["fig15"]["measured"]["rms_e_2"] == pytest.approx(stacks["2"]["rms_e"], rel=1e-8)
@@ -94,7 +95,7 @@ def test_figures_of_visits_are_those_of_their_folder(few_galaxies, tmp_path):
 def test_stacks_by_processes_have_the_bytes_of_one(few_galaxies, tmp_path):
     folders = [tmp_path / name for name in ("alone", "processes")]
     for folder, workers in zip(folders, (None, lambda compute: process_workers(compute, 2, 1)), strict=True):
-        reproduce(["fig15", "fig17"], Bench(TINY, folder, threads=1, workers=workers))
+        reproduce(["fig15", "fig17"], Bench(TINY, folder, execution=Execution(threads=1, workers=workers)))
     files = sorted(path.relative_to(folders[0]) for path in folders[0].rglob("*.fits"))
     assert len(files) >= 4
     for file in files:
@@ -293,7 +294,7 @@ def test_whiskers_of_the_optics_are_those_of_a_finer_pupil(made, tmp_path):
     found = table(bench, "fig8.ecsv")
     some = [3, 60, 94, 150]
     chosen = found[some]
-    alone = optics_ellipticity(Bench(TINY, tmp_path, threads=1), bench.optics.camera.centers[some])
+    alone = optics_ellipticity(Bench(TINY, tmp_path, execution=Execution(threads=1)), bench.optics.camera.centers[some])
     assert np.array_equal(np.asarray(chosen["e1"]) + 1j * np.asarray(chosen["e2"]), alone), "one thread, few stars"
     fields = pachon.fields_at(bench.optics.telescope, np.stack([chosen["x_mm"], chosen["y_mm"]], axis=1) * 1e-3, 624e-9)
     psf = pachon.make_psfs(
@@ -380,7 +381,7 @@ def test_the_run_is_made_once_and_then_kept(made, tmp_path):
     products = sorted((bench.folder / "run").glob("ccd_*.fits"))
     before = [p.stat().st_mtime_ns for p in products]
     data = (bench.folder / "fig13.ecsv").read_bytes()
-    again = Bench(TINY, bench.folder, threads=1)
+    again = Bench(TINY, bench.folder, execution=Execution(threads=1))
     reproduce(["fig13"], again)
     assert [p.stat().st_mtime_ns for p in products] == before
     assert (bench.folder / "fig13.ecsv").read_bytes() == data
@@ -390,7 +391,7 @@ def test_the_run_is_made_once_and_then_kept(made, tmp_path):
 def test_data_have_the_same_bytes_on_any_number_of_threads(made, tmp_path):
     bench, summary = made
     names = ("fig4", "fig6", "table1")
-    reproduce(names, Bench(replace(TINY), tmp_path, threads=1))
+    reproduce(names, Bench(replace(TINY), tmp_path, execution=Execution(threads=1)))
     files = [file for name in names for file in summary["figures"][name]["files"]]
     assert len(files) >= 8
     for file in files:

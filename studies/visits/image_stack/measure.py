@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,10 @@ from scipy.spatial import cKDTree
 
 from ....core.errors import DomainError
 from ....core.files import write_bytes, write_json
-from ....core.ordered_jobs import ordered_results
+from ....core.long_work import Execution
 from ....core.products import Stamp
-from ....core.progress import Reporter
 from ....core.random_streams import natural_number
 from ....core.units import ARCMIN
-from ....core.workers import MakeWorkers
 from ....imaging.image_file import CcdImage
 from ....measure.catalogue.detect import DetectedObjects, detect_objects
 from ....measure.catalogue.fit_galaxies import fit_galaxies
@@ -76,9 +75,7 @@ class MeasuredTile:
 def measure_stack(
     folder: Path,
     *,
-    workers: MakeWorkers | None = None,
-    threads: int | None = None,
-    reporter: Reporter | None = None,
+    execution: Execution | None = None,
 ) -> dict[int, dict[str, Any]]:
     """Detect objects on the stacked images of visits, select stars, and fit galaxies.
 
@@ -90,12 +87,8 @@ def measure_stack(
     ----------
     folder : Path
         Folder of :func:`~..visits.stack_visits` and of :func:`.stack_images`.
-    workers : callable, optional
-        Function that makes the workers that measure the tiles, as in :func:`~pachon.run`; by default this process.
-    threads : int, optional
-        Number of threads; all processors by default.
-    reporter : Reporter, optional
-        Progress display; silent by default.
+    execution : Execution, optional
+        Workers that measure the tiles, threads, and progress display.
 
     Returns
     -------
@@ -107,7 +100,7 @@ def measure_stack(
     PachonError
         If the folder holds no stacks of PSFs or images, or no tile has stars enough; others without are left out.
     """
-    reporter = Reporter(quiet=True) if reporter is None else reporter
+    execution = execution or Execution()
     stack = ImageStack.of(folder)
     origin = Stamp(stack.visits.digest(stack.experiment), stack.experiment.config.seed)
     images = {visits: stack.image(visits, stack.tiles[0]) for visits in stack.visits.kept}
@@ -120,26 +113,22 @@ def measure_stack(
             for tile in stack.tiles:
                 yield tile, stack.image(visits, tile), psfs
 
-    results = ordered_results(
-        TileMeasurement(stack),
-        [f"{visits} visits, tile {tile.name}" for visits, tile in numbered],
-        jobs(),
-        title="galaxies in the stacked images",
-        workers=workers,
-        threads=threads,
-        reporter=reporter,
-    )
     tiles: dict[int, list[MeasuredTile]] = {visits: [] for visits in stack.visits.kept}
     left_out: dict[int, dict[str, str]] = {visits: {} for visits in stack.visits.kept}
-    for (visits, tile), measured in zip(numbered, results, strict=True):
-        if isinstance(measured, str):
-            left_out[visits][tile.name] = measured
-            if len(left_out[visits]) == len(stack.tiles):
-                raise DomainError(measured, subject=f"{visits} visits, tile {tile.name}")
-            reporter.line(f"{visits} visits, tile {tile.name} is left out: {measured}")
-            continue
-        write_shapes(stack.folder / f"galaxies_{visits:04d}_tile_{tile.name}.fits", measured.galaxies, stack.stamp)
-        tiles[visits].append(measured)
+    labels = [f"{visits} visits, tile {tile.name}" for visits, tile in numbered]
+    with execution.results(
+        partial(measured_or_reason, stack), labels, jobs(), title="galaxies in the stacked images"
+    ) as results:
+        for (visits, tile), label, measured in zip(numbered, labels, results, strict=True):
+            if isinstance(measured, str):
+                left_out[visits][tile.name] = measured
+                if len(left_out[visits]) == len(stack.tiles):
+                    raise DomainError(measured, subject=label)
+                execution.reporter.line(f"{label} is left out: {measured}")
+                continue
+            path = stack.folder / f"galaxies_{visits:04d}_tile_{tile.name}.fits"
+            write_shapes(path, measured.galaxies, stack.stamp)
+            tiles[visits].append(measured)
     found = {visits: tile_metrics(own) | {"left_out": left_out[visits]} for visits, own in tiles.items()}
     tests = null_tests(tiles)
     for visits, result in tests.items():
@@ -159,18 +148,12 @@ def null_tests(tiles: dict[int, list[MeasuredTile]]) -> dict[int, NullTest]:
     }
 
 
-@dataclass(frozen=True, eq=False)
-class TileMeasurement:
-    """Measurement of tiles; a picklable function for every kind of worker."""
-
-    stack: ImageStack
-
-    def __call__(self, job: tuple[Tile, CcdImage, PsfStack], threads: int) -> MeasuredTile | str:
-        """Measure one tile, or return why it cannot be measured."""
-        try:
-            return measure_tile(self.stack, *job, threads=threads)
-        except DomainError as error:
-            return str(error)
+def measured_or_reason(stack: ImageStack, job: tuple[Tile, CcdImage, PsfStack], threads: int) -> MeasuredTile | str:
+    """Measure one tile as the job of a worker, or return why it cannot be measured."""
+    try:
+        return measure_tile(stack, *job, threads=threads)
+    except DomainError as error:
+        return str(error)
 
 
 def measure_tile(

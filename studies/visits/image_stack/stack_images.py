@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ....core.errors import DomainError, ProductError, error_context
-from ....core.files import claim_folder
+from ....core.long_work import Execution, claim_folder
 from ....core.memory import readable, require_bytes
-from ....core.ordered_jobs import ordered_results
+from ....core.products import is_whole
 from ....core.progress import Reporter
 from ....core.units import ARCSEC
-from ....core.workers import JOBS_AHEAD, MakeWorkers
+from ....core.workers import JOBS_AHEAD
 from ....imaging.exposure import Exposure
-from ....imaging.image_file import CcdImage, is_whole
+from ....imaging.image_file import CcdImage
 from ....imaging.scene import ellipticities, object_columns, sky_ranges
 from ....imaging.simulate import BYTES_PER_PIXEL
 from ....imaging.wcs import CcdWcs
-from ....pipeline.config import differences
 from ....pipeline.experiment import Experiment
 from ....pipeline.memory import needed_bytes
 from ....pipeline.simulate.star_field import magnitudes_at
@@ -43,10 +42,7 @@ def stack_images(
     folder: Path,
     settings: ImageStackConfig,
     *,
-    resume: bool = False,
-    workers: MakeWorkers | None = None,
-    threads: int | None = None,
-    reporter: Reporter | None = None,
+    execution: Execution | None = None,
 ) -> ImageStack:
     """Draw the images of the visits of a folder, and stack them on tiles of the common frame.
 
@@ -59,14 +55,8 @@ def stack_images(
         Folder of :func:`~..visits.stack_visits`; its configuration suffices.
     settings : ImageStackConfig
         What is drawn and stacked.
-    resume : bool
-        Go on after the visits whose images are stacked.
-    workers : callable, optional
-        Function that makes the workers that draw the visits, as in :func:`~pachon.run`; by default this process.
-    threads : int, optional
-        Number of threads; all processors by default.
-    reporter : Reporter, optional
-        Progress display; silent by default.
+    execution : Execution, optional
+        Workers that draw the visits, threads, whether to go on after those that are stacked, and progress display.
 
     Raises
     ------
@@ -74,15 +64,16 @@ def stack_images(
         If the folder holds no visits, or images of other settings; if memory or disk will not hold the tiles; or a
         visit fails.
     """
-    reporter = Reporter(quiet=True) if reporter is None else reporter
+    execution = execution or Execution()
+    threads, reporter = execution.threads, execution.reporter
     stack = ImageStack.of(folder, settings)
     check_rotators(stack.experiment, stack.plan)
     # Before the settings are written, so that others can be tried.
     _check_memory(stack, threads, 1)
     _check_room(stack)
-    _claim(stack, resume)
+    claim_stack(stack.folder, settings, resume=execution.resume)
     plan = stack.plan
-    sums = {tile: _sums_so_far(stack, tile, resume) for tile in stack.tiles}
+    sums = {tile: _sums_so_far(stack, tile, execution.resume) for tile in stack.tiles}
     done = min(s.visits for s in sums.values())
     if max(s.visits for s in sums.values()) > len(plan):
         raise ProductError(f"{stack.folder} holds more than the {len(plan)} visits of {folder}; remove one of them")
@@ -93,10 +84,10 @@ def stack_images(
             raise ProductError(f"{stack.folder} {text}")
     if done:
         reporter.line(f"images of {done} of {len(plan)} visits are stacked already")
-    alone, due = workers is None, plan[done:]
+    alone, due = execution.alone, plan[done:]
     before = {tile: own.visits for tile, own in sums.items()}
-    results = ordered_results(
-        VisitImages(stack, reporter if alone else None),
+    with execution.results(
+        partial(draw_visit, stack, reporter if alone else None),
         [visit.label for visit in due],
         (
             # Tiles written before an interruption may be ahead by a visit.
@@ -104,52 +95,45 @@ def stack_images(
             for visit, wcs in stack.wcs(due, threads)
         ),
         title=None if alone else f"images of {len(due)} visits",
-        workers=workers,
-        threads=threads,
         check=lambda processes: _check_memory(stack, threads, processes),
-        reporter=reporter,
-    )
-    for seen in results:
-        for tile, of_visit in seen.items():
-            own = sums[tile]
-            own.add(of_visit)
-            if own.visits in stack.visits.kept:
-                _write_image(stack, tile, own)
-            # Written last, so that all visits that it counts are in the image.
-            own.write(stack.sums_path(tile), stack.stamp)
+    ) as results:
+        for visit_sums in results:
+            for tile, tile_sums in visit_sums.items():
+                total = sums[tile]
+                total.add(tile_sums)
+                if total.visits in stack.visits.kept:
+                    _write_image(stack, tile, total)
+                # Written last, so that all visits that it counts are in the image.
+                total.write(stack.sums_path(tile), stack.stamp)
     return stack
 
 
-@dataclass(frozen=True, eq=False)
-class VisitImages:
-    """Sums over tiles of the images of visits; a picklable function for every kind of worker, without a reporter."""
-
-    stack: ImageStack
-    reporter: Reporter | None = None
-
-    def __call__(
-        self, job: tuple[Visit, Experiment, dict[str, VisitWcs], list[Tile]], threads: int
-    ) -> dict[Tile, TileSums]:
-        """Draw the CCDs of a visit that touch tiles, and resample them onto the tiles."""
-        visit, experiment, wcs, tiles = job
-        stack, reporter = self.stack, self.reporter or Reporter(quiet=True)
-        reporter.line(f"{visit.label}, {visit}")
-        touched = {name: window_on(tiles, stack.frame, own) for name, own in wcs.items()}
-        windows = {name: window for name, window in touched.items() if window is not None}
-        exposure, sums = stack.exposure(), {tile: TileSums.empty(tile.side) for tile in tiles}
-        bar = reporter.stage(f"images of {len(windows)} CCDs", total=len(windows))
-        with experiment.screens(threads, reporter), bar as stage:
-            for i, (name, window) in enumerate(windows.items(), start=1):
-                seen, depth = wcs[name], stack.visits.visits.count
-                with error_context(subject=f"CCD {name}"):
-                    exposed = visit_image(
-                        experiment, visit, name, seen, stack.sky, exposure, window, depth=depth, threads=threads
-                    )
-                for tile in tiles:
-                    add_resampled(sums[tile], tile, stack.frame, exposed, window, seen, threads=threads)
-                stage.advance()
-                stage.step(name, i, len(windows))
-        return sums
+def draw_visit(
+    stack: ImageStack,
+    reporter: Reporter | None,
+    job: tuple[Visit, Experiment, dict[str, VisitWcs], list[Tile]],
+    threads: int,
+) -> dict[Tile, TileSums]:
+    """Draw the CCDs of a visit that touch tiles, and resample them onto the tiles; workers have no reporter."""
+    visit, experiment, wcs, tiles = job
+    reporter = reporter or Reporter(quiet=True)
+    reporter.line(f"{visit.label}, {visit}")
+    touched = {name: window_on(tiles, stack.frame, own) for name, own in wcs.items()}
+    windows = {name: window for name, window in touched.items() if window is not None}
+    exposure, sums = stack.exposure(), {tile: TileSums.empty(tile.side) for tile in tiles}
+    bar = reporter.stage(f"images of {len(windows)} CCDs", total=len(windows))
+    with experiment.screens(threads, reporter), bar as stage:
+        for i, (name, window) in enumerate(windows.items(), start=1):
+            seen, depth = wcs[name], stack.visits.visits.count
+            with error_context(subject=f"CCD {name}"):
+                exposed = visit_image(
+                    experiment, visit, name, seen, stack.sky, exposure, window, depth=depth, threads=threads
+                )
+            for tile in tiles:
+                add_resampled(sums[tile], tile, stack.frame, exposed, window, seen, threads=threads)
+            stage.advance()
+            stage.step(name, i, len(windows))
+    return sums
 
 
 def _write_image(stack: ImageStack, tile: Tile, sums: TileSums) -> None:
@@ -210,19 +194,18 @@ def _truth_table(stack: ImageStack, tile: Tile, wcs: CcdWcs, exposure: Exposure)
     return object_columns({key: np.concatenate([table[key] for table in tables]) for key in tables[0]}, wcs)
 
 
-def _claim(stack: ImageStack, resume: bool) -> None:
+def claim_stack(folder: Path, settings: ImageStackConfig, *, resume: bool) -> None:
     """Make the folder, or check that its images are of the same settings."""
-    path = stack.folder / SETTINGS_NAME
-
-    def check() -> None:
-        if not resume:
-            raise ProductError(f"{stack.folder} holds images already; go on with --resume, or remove it")
-        settings = (load_image_stack_configuration(path), stack.settings)
-        found = differences(*(s.model_dump(mode="json") for s in settings))
-        if found:
-            raise ProductError(f"{stack.folder} holds images of other settings ({'; '.join(found[:3])})")
-
-    claim_folder(path, stack.settings.to_yaml().encode(), products="*.fits", check=check)
+    claim_folder(
+        folder / SETTINGS_NAME,
+        settings.to_yaml().encode(),
+        products="*.fits",
+        noun="images",
+        now=settings.model_dump(mode="json"),
+        read=lambda path: load_image_stack_configuration(path).model_dump(mode="json"),
+        wanted=resume,
+        remedy="remove it",
+    )
 
 
 def _sums_so_far(stack: ImageStack, tile: Tile, resume: bool) -> TileSums:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 
-from ....core.errors import DomainError, ProductError
+from ....core.errors import DomainError
 from ....core.products import Stamp, image_hdu, read_fits, write_fits
 from ....imaging.draw import SkyPixels, Window
 from ....imaging.wcs import CcdWcs
@@ -185,9 +185,7 @@ class TileSums:
     @classmethod
     def read(cls, path: Path, stamp: Stamp) -> TileSums:
         """Read sums; ProductError for those of another configuration, and for a damaged file."""
-        hdus = read_fits(path)
-        if not stamp.matches(hdus[0].header) or VISITS_CARD not in hdus[0].header:
-            raise ProductError("was made with another version, configuration or seed", file=path)
+        hdus = read_fits(path, stamp)
         data, variance = (np.array(hdus[key].data, dtype=np.float32) for key in ("DATA", "VARIANCE"))
         return cls(hdus[0].header[VISITS_CARD], data, variance, np.array(hdus["COUNT"].data, dtype=np.int16))
 

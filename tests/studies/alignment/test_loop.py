@@ -9,6 +9,7 @@ from astropy.table import QTable
 import pachon
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, ProductError, UnknownNameError
+from pachon.core.long_work import Execution
 from pachon.models.io.yaml.writer import telescope_to_yaml
 from pachon.pipeline.config_hash import hashed_states
 from pachon.pipeline.experiment import Experiment
@@ -65,7 +66,7 @@ def test_the_loop_converges_within_two_corrections_to_what_it_expects(aligned):
 
 @pytest.mark.long
 def test_bytes_do_not_depend_on_threads_or_later_visits(aligned, traced_donuts):
-    again = align(config(visits=2), threads=1)
+    again = align(config(visits=2), execution=Execution(threads=1))
     assert again.states.tobytes() == aligned.states[:2].tobytes()
     assert again.visits == aligned.visits[:2]
 
@@ -92,9 +93,9 @@ def test_a_killed_loop_goes_on_to_the_same_bytes(traced_donuts, tmp_path, monkey
     with pytest.raises(ProductError, match="go on with --resume"):
         align(config(visits=2), store=killed)
     with pytest.raises(ProductError, match=r"another configuration \(seed: 1"):
-        align(config(visits=2, seed=2), store=killed, resume=True)
+        align(config(visits=2, seed=2), store=killed, execution=Execution(resume=True))
     # One visit stands; the second alone is exposed.
-    align(config(visits=2), store=killed, resume=True)
+    align(config(visits=2), store=killed, execution=Execution(resume=True))
     assert len(calls) == 3
     names = sorted(path.name for path in whole.iterdir())
     assert names == sorted(path.name for path in killed.iterdir())
@@ -104,7 +105,7 @@ def test_a_killed_loop_goes_on_to_the_same_bytes(traced_donuts, tmp_path, monkey
     damaged = killed / "visit_00000.npz"
     damaged.write_bytes(damaged.read_bytes()[:-100])
     with pytest.raises(ProductError, match=r"visit_00000\.npz: expected a visit of a loop"):
-        align(config(visits=2), store=killed, resume=True)
+        align(config(visits=2), store=killed, execution=Execution(resume=True))
 
 
 @pytest.mark.long
@@ -117,10 +118,10 @@ def test_a_loop_does_not_go_on_with_other_optics(traced_donuts, tmp_path):
     # Same optics, but another content, and back again.
     telescope.write_text(text + "\n# changed\n")
     with pytest.raises(ProductError, match=r"visit_00000\.npz: the file of telescope has changed since") as caught:
-        align(settings, folder=tmp_path, store=tmp_path / "out", resume=True)
+        align(settings, folder=tmp_path, store=tmp_path / "out", execution=Execution(resume=True))
     assert "\n" not in str(caught.value)
     telescope.write_text(text)
-    align(settings, folder=tmp_path, store=tmp_path / "out", resume=True)
+    align(settings, folder=tmp_path, store=tmp_path / "out", execution=Execution(resume=True))
 
 
 @pytest.mark.slow

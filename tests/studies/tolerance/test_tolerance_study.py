@@ -9,6 +9,7 @@ from astropy.table import Table
 
 import pachon
 from pachon.core.errors import ConfigError, ProductError
+from pachon.core.long_work import Execution
 from pachon.core.workers import process_workers
 from pachon.design.optimize.merit import Beams, SpotMerit
 from pachon.design.optimize.optimize import optimize
@@ -109,14 +110,14 @@ def test_the_same_numbers_of_any_workers(triplet, study, tmp_path):
         return pachon.core.workers.Workers("stopping", 1, results)
 
     with pytest.raises(StoppedError):
-        run_tolerances(triplet, file, store, workers=stopping)
+        run_tolerances(triplet, file, store, execution=Execution(workers=stopping))
     with SweepStore(store) as opened:
         assert 0 < len(opened.results()) < len(opened.points())
     with pytest.raises(ConfigError, match="--resume"):
         run_tolerances(triplet, file, store)
     with pytest.raises(ConfigError, match=r"another tolerance study.*draws"):
-        run_tolerances(triplet, file_of(draws=31), store, resume=True)
-    resumed = run_tolerances(triplet, file, store, resume=True)
+        run_tolerances(triplet, file_of(draws=31), store, execution=Execution(resume=True))
+    resumed = run_tolerances(triplet, file, store, execution=Execution(resume=True))
     folders = []
     for name, one in (("one", study), ("resumed", resumed)):
         folder = tmp_path / name
@@ -133,7 +134,9 @@ def test_the_same_numbers_of_any_workers(triplet, study, tmp_path):
 
 @pytest.mark.slow
 def test_processes_give_the_same_bytes(triplet, study, tmp_path):
-    found = run_tolerances(triplet, file_of(), tmp_path / "points", workers=lambda c: process_workers(c, 2))
+    found = run_tolerances(
+        triplet, file_of(), tmp_path / "points", execution=Execution(workers=lambda c: process_workers(c, 2))
+    )
     for name in ("lower", "upper", "inverse", "draws", "moves"):
         assert getattr(found, name).tobytes() == getattr(study, name).tobytes()
 
@@ -205,7 +208,7 @@ def test_a_store_that_is_none(triplet, tmp_path):
     path = tmp_path / "points"
     path.write_text("no store")
     with pytest.raises(ProductError, match="damaged"):
-        run_tolerances(triplet, file_of(), path, resume=True)
+        run_tolerances(triplet, file_of(), path, execution=Execution(resume=True))
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 from pachon.commands.cli import main
+from pachon.core.long_work import Execution
 from pachon.core.units import ARCMIN
 from pachon.pipeline.config import digest
 from pachon.pipeline.run_folder import CONFIG_NAME
@@ -28,7 +29,7 @@ def folder(visits_config, tmp_path_factory):
     place = tmp_path_factory.mktemp("visits")
     config = visits_config(count=1, places=12)
     run = config.run.model_validate(config.run.model_dump(by_alias=True) | {"pointing": POINTING})
-    stack_visits(config.model_copy(update={"run": run}), place, threads=1)
+    stack_visits(config.model_copy(update={"run": run}), place, execution=Execution(threads=1))
     return place
 
 
@@ -85,7 +86,7 @@ def test_galaxies_of_a_catalogue_are_measured_where_and_as_it_says(folder, backw
     columns = {"mag": magnitude, "half_light_radius": 0.8, "e1": e1, "e2": e2, "n": 0.5}
     write_catalogue(folder / "own.ecsv", xi, eta, **columns)
     with_galaxies(folder, catalogue="own.ecsv")
-    found = null_test(folder, tiles=1, rings=12, threads=1)[1]
+    found = null_test(folder, tiles=1, rings=12, execution=Execution(threads=1))[1]
     galaxies = found.galaxies
     assert len(galaxies) == n - 2
     frame = StackFrame.of(load_visits_configuration(folder / CONFIG_NAME).experiment(), 31)
@@ -100,19 +101,21 @@ def test_galaxies_of_a_catalogue_are_measured_where_and_as_it_says(folder, backw
     # Other galaxies leave the stacks of PSFs as they are; the same ones keep finished tiles.
     tile = next((folder / "galaxies").iterdir())
     before = tile.stat().st_mtime_ns
-    null_test(folder, tiles=1, rings=12, resume=True, threads=1)
+    null_test(folder, tiles=1, rings=12, execution=Execution(resume=True, threads=1))
     assert tile.stat().st_mtime_ns == before
     write_catalogue(
         folder / "own.ecsv", xi[:30], eta[:30], **{k: np.broadcast_to(v, n)[:30] for k, v in columns.items()}
     )
-    assert len(null_test(folder, tiles=1, rings=12, resume=True, workers=backwards)[1].galaxies) == 28
+    assert (
+        len(null_test(folder, tiles=1, rings=12, execution=Execution(resume=True, workers=backwards))[1].galaxies) == 28
+    )
 
 
 @pytest.mark.long
 def test_galaxies_of_a_mosaic_are_planted_and_measured(folder):
     write_mosaic(folder / "own.fits", e=0.3)
     with_galaxies(folder, mosaic="own.fits", mosaic_psf_arcsec=0.05, density=0.01)
-    galaxies = null_test(folder, tiles=1, rings=12, threads=1)[1].galaxies
+    galaxies = null_test(folder, tiles=1, rings=12, execution=Execution(threads=1))[1].galaxies
     # 20 in 400 arcsec^2, 0.01 of that on a CCD: 335, and five standard deviations of a Poisson number.
     expected = 0.01 * 20 / (20.0 / 60.0) ** 2 * (4096 * 0.2 / 60.0) ** 2
     assert abs(len(galaxies) - expected) < 5.0 * np.sqrt(expected)

@@ -7,6 +7,7 @@ from scipy.special import ndtri
 
 from pachon.commands.cli import main
 from pachon.core.errors import PachonError
+from pachon.core.long_work import Execution
 from pachon.core.units import ARCMIN, ARCSEC
 from pachon.imaging.exposure import Exposure
 from pachon.sky.galaxies import Galaxies
@@ -144,10 +145,10 @@ def test_slope_of_a_power_law():
 @pytest.fixture(scope="module")
 def tested(visits_config, tmp_path_factory):
     folder = tmp_path_factory.mktemp("null")
-    stack_visits(visits_config(places=12), folder, threads=1)
+    stack_visits(visits_config(places=12), folder, execution=Execution(threads=1))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "FAINTEST_SNR", 100.0)
-        return null_test(folder, tiles=1, rings=40, threads=1), folder
+        return null_test(folder, tiles=1, rings=40, execution=Execution(threads=1)), folder
 
 
 @pytest.mark.long
@@ -177,9 +178,9 @@ def test_a_null_test_goes_on_to_the_same_bytes_with_other_workers(tested, backwa
     gone.unlink()
     damaged = sorted((folder / "galaxies").iterdir())[0]
     damaged.write_bytes(damaged.read_bytes()[:4000])
-    null_test(folder, tiles=1, rings=40, resume=True, threads=2)
+    null_test(folder, tiles=1, rings=40, execution=Execution(resume=True, threads=2))
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
-    null_test(folder, tiles=1, rings=40, workers=backwards)
+    null_test(folder, tiles=1, rings=40, execution=Execution(workers=backwards))
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, PachonError
+from pachon.core.long_work import Execution
 from pachon.core.progress import Reporter
 from pachon.core.units import ARCSEC
 from pachon.measure.shapes import measure_shapes
@@ -29,7 +30,7 @@ def content(folder):
 @pytest.fixture(scope="module")
 def stacked(visits_config, tmp_path_factory):
     folder = tmp_path_factory.mktemp("visits")
-    return stack_visits(visits_config(), folder, threads=1), folder
+    return stack_visits(visits_config(), folder, execution=Execution(threads=1)), folder
 
 
 def test_psfs_are_those_of_the_detector_turned_with_the_sky(visits_config):
@@ -97,23 +98,23 @@ def test_an_interrupted_stack_goes_on_to_the_same_bytes(stacked, visits_config, 
         return Reporter(quiet=True, check=check)
 
     with pytest.raises(KeyboardInterrupt):
-        stack_visits(visits_config(), tmp_path, reporter=stop_at(3), threads=1)
+        stack_visits(visits_config(), tmp_path, execution=Execution(reporter=stop_at(3), threads=1))
     assert (tmp_path / SUMS_NAME).exists() is False or len(content(tmp_path)) < len(content(folder))
-    stack_visits(visits_config(), tmp_path, resume=True, threads=2)
+    stack_visits(visits_config(), tmp_path, execution=Execution(resume=True, threads=2))
     assert content(tmp_path) == content(folder)
 
 
 def test_workers_that_end_visits_in_another_order_leave_the_same_bytes(stacked, visits_config, backwards, tmp_path):
     _, folder = stacked
-    stack_visits(visits_config(), tmp_path, workers=backwards)
+    stack_visits(visits_config(), tmp_path, execution=Execution(workers=backwards))
     assert content(tmp_path) == content(folder)
 
 
 @pytest.mark.slow
 def test_more_visits_join_a_finished_stack(stacked, visits_config, tmp_path):
     _, folder = stacked
-    stack_visits(visits_config(count=1), tmp_path, threads=1)
-    stack_visits(visits_config(count=2), tmp_path, resume=True, threads=1)
+    stack_visits(visits_config(count=1), tmp_path, execution=Execution(threads=1))
+    stack_visits(visits_config(count=2), tmp_path, execution=Execution(resume=True, threads=1))
     assert content(tmp_path) == content(folder)
 
 
@@ -123,12 +124,12 @@ def test_other_visits_are_refused(stacked, visits_config):
     with pytest.raises(PachonError, match="holds visits already; go on with --resume"):
         stack_visits(visits_config(), folder)
     with pytest.raises(PachonError, match=r"visits\.places: 8 -> 9"):
-        stack_visits(visits_config(places=9), folder, resume=True)
+        stack_visits(visits_config(places=9), folder, execution=Execution(resume=True))
     with pytest.raises(PachonError, match="holds 2 visits: expected at most 1"):
-        stack_visits(visits_config(count=1), folder, resume=True)
+        stack_visits(visits_config(count=1), folder, execution=Execution(resume=True))
     (folder / "stack_0002.fits").rename(folder / "elsewhere.fits")
     with pytest.raises(PachonError, match="kept no stack of 2 visits"):
-        stack_visits(visits_config(), folder, resume=True)
+        stack_visits(visits_config(), folder, execution=Execution(resume=True))
     (folder / "elsewhere.fits").rename(folder / "stack_0002.fits")
     assert content(folder) == before
 

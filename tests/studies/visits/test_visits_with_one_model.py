@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pachon.core.errors import DomainError
+from pachon.core.long_work import Execution
 from pachon.core.units import ARCMIN, ARCSEC
 from pachon.measure.shapes import measure_shapes
 from pachon.studies.visits.config import VisitsConfig
@@ -60,10 +61,10 @@ def test_stacks_of_few_stars_a_ccd(tmp_path):
         run = RUN | {"ccds": ["R22"], "reconstruction": {"model": model}}
         visits = {"count": 2, "stars": 4, "places": 4, "snapshots": [1], "dither_deg": 0.3, "rotator_deg": "random"}
         config = VisitsConfig.model_validate({"run": run, "visits": visits})
-        metrics = stack_visits(config, tmp_path / model, threads=1).summary["stacks"]
+        metrics = stack_visits(config, tmp_path / model, execution=Execution(threads=1)).summary["stacks"]
         residuals[model] = np.array([metrics[n]["rms_residual_e_places"] for n in ("1", "2")])
     # Four stars of S/N 30 and more on a CCD tell less of it than 36 of all.
     assert (residuals["focal_plane"] < 0.8 * residuals["ccd"]).all()
     content = [path.read_bytes() for path in sorted((tmp_path / "focal_plane").glob("*.fits"))]
-    stack_visits(config, tmp_path / "again", threads=2)
+    stack_visits(config, tmp_path / "again", execution=Execution(threads=2))
     assert [path.read_bytes() for path in sorted((tmp_path / "again").glob("*.fits"))] == content

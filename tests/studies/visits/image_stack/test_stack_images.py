@@ -6,6 +6,7 @@ from astropy.wcs import WCS
 
 from pachon.commands.cli import main
 from pachon.core.errors import DomainError, ProductError
+from pachon.core.long_work import Execution
 from pachon.core.units import ARCSEC
 from pachon.imaging.image_file import CcdImage
 from pachon.measure.shapes import measure_shapes
@@ -102,7 +103,7 @@ def test_an_interrupted_stack_ends_with_the_same_bytes(visits_folder, backwards,
     settings = SMALL.model_copy(update={"tiles": 2})
     whole = tmp_path_factory.mktemp("whole")
     (whole / "config.yaml").write_bytes((visits_folder / "config.yaml").read_bytes())
-    stack_images(whole, settings, threads=1)
+    stack_images(whole, settings, execution=Execution(threads=1))
 
     write, calls = TileSums.write, []
 
@@ -115,19 +116,19 @@ def test_an_interrupted_stack_ends_with_the_same_bytes(visits_folder, backwards,
 
     monkeypatch.setattr(TileSums, "write", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        stack_images(visits_folder, settings, threads=2)
+        stack_images(visits_folder, settings, execution=Execution(threads=2))
     monkeypatch.undo()
     assert files(visits_folder) != files(whole)
-    stack_images(visits_folder, settings, resume=True, threads=2)
+    stack_images(visits_folder, settings, execution=Execution(resume=True, threads=2))
     assert files(visits_folder) == files(whole)
     assert len(files(whole)) == 6
     others = tmp_path_factory.mktemp("workers")
     (others / "config.yaml").write_bytes((whole / "config.yaml").read_bytes())
-    stack_images(others, settings, workers=backwards)
+    stack_images(others, settings, execution=Execution(workers=backwards))
     assert files(others) == files(whole)
     (whole / "images" / "stack_0001_tile_+00_+00.fits").unlink()
     with pytest.raises(ProductError, match=r"no image of 1 visits of tile \+00_\+00, and has gone on"):
-        stack_images(whole, settings, resume=True)
+        stack_images(whole, settings, execution=Execution(resume=True))
 
 
 def test_images_of_several_tiles_are_found_again(visits_folder):
@@ -182,8 +183,8 @@ def test_refusals(visits_folder, tmp_path_factory, monkeypatch, capsys):
     (folder / "images" / "images.yaml").write_text(ImageStack.of(folder, SMALL).settings.to_yaml())
     with pytest.raises(ProductError, match="go on with --resume"):
         stack_images(folder, SMALL)
-    with pytest.raises(ProductError, match="images of other settings"):
-        stack_images(folder, SMALL.model_copy(update={"noise": False}), resume=True)
+    with pytest.raises(ProductError, match="images of another configuration"):
+        stack_images(folder, SMALL.model_copy(update={"noise": False}), execution=Execution(resume=True))
 
 
 def test_the_limit_of_the_galaxies_follows_the_depth_and_then_stays(visits_folder, small_visits):
