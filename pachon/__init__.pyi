@@ -232,6 +232,9 @@ from .pipeline.simulate.donuts import Donuts as Donuts
 from .pipeline.simulate.donuts import draw_donuts as draw_donuts
 from .raytrace.launch import launch_rays as launch_rays
 from .raytrace.mesh import land_on_mesh as land_on_mesh
+from .raytrace.one_surface import intersect as intersect
+from .raytrace.one_surface import reflect as reflect
+from .raytrace.one_surface import refract as refract
 from .raytrace.rays import Rays as Rays
 from .raytrace.rays import RayStatus as RayStatus
 from .raytrace.trace import TraceResult as TraceResult
