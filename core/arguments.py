@@ -58,6 +58,23 @@ def check_arguments(target: Target) -> Target:
     return target
 
 
+def removed_arguments(**replacements: str) -> Callable[[Target], Target]:
+    """Refuse arguments that a function no longer takes, with what replaces each."""
+
+    def decorate(function: Target) -> Target:
+        @functools.wraps(function)
+        def checked(*args: Any, **options: Any) -> Any:
+            for name in options.keys() & replacements.keys():
+                raise ConfigError(
+                    f"{name}: no argument of {function.__name__}; expected {replacements[name]}", key=name
+                )
+            return function(*args, **options)
+
+        return cast(Target, checked)
+
+    return decorate
+
+
 def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any]:
     if not set(inspect.get_annotations(function)) - {"return"}:
         return function

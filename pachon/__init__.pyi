@@ -70,8 +70,6 @@ from .design.optimize.geometry_operands import SagAt as SagAt
 from .design.optimize.geometry_operands import TotalLength as TotalLength
 from .design.optimize.glass_choice import GlassChoice as GlassChoice
 from .design.optimize.glass_choice import choose_glasses as choose_glasses
-from .design.optimize.monte_carlo import MonteCarlo as MonteCarlo
-from .design.optimize.monte_carlo import monte_carlo as monte_carlo
 from .design.optimize.optimize import optimize as optimize
 from .design.optimize.optimize_file import load_optimization as load_optimization
 from .design.optimize.optimum import Optimum as Optimum
@@ -87,8 +85,10 @@ from .design.optimize.targets import FNumber as FNumber
 from .design.optimize.targets import FocalLength as FocalLength
 from .design.optimize.targets import RelativeDistortion as RelativeDistortion
 from .design.optimize.targets import Target as Target
-from .design.optimize.yields import Yield as Yield
 from .design.report.report import design_report as design_report
+from .design.tolerancing.monte_carlo import MonteCarlo as MonteCarlo
+from .design.tolerancing.monte_carlo import monte_carlo as monte_carlo
+from .design.tolerancing.yields import Yield as Yield
 from .imaging.config import ImagesConfig as ImagesConfig
 from .imaging.config import load_images_configuration as load_images_configuration
 from .imaging.draw import Window as Window

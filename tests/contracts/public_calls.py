@@ -235,7 +235,7 @@ def calls(folder):
         "vignetting": (pachon.vignetting, mono | {"n_pupil": 64}),
         "monte_carlo": (pachon.monte_carlo, {"telescope": tel, "tolerances": [pachon.Tolerance("M2.dz", 1e-5)],
                         "merit": "spots", "n": 2, "seed": 1, "method": "linear", "fields": on_axis,
-                        "wavelengths": [w], "sampling": "gauss", "n_pupil": 3, "threads": 1, "compensators": []}),
+                        "compensators": []}),
         "optimize": (pachon.optimize, waves | {"variables": ["M2.dz"], "merit": "spots", "n_pupil": 3,
                      "bounds": {"M2.dz": (-1e-3, 1e-3)}, "targets": [], "field_weights": [1.0],
                      "reference": "centroid", "sampling": "gauss"}),

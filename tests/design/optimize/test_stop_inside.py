@@ -12,7 +12,7 @@ import pachon
 from pachon.core.errors import PrescriptionWarning
 from pachon.design.optimize.aimed_rays import AimedRays
 from pachon.design.optimize.jacobian import ParameterColumns
-from pachon.design.optimize.monte_carlo import monte_carlo
+from pachon.design.tolerancing.monte_carlo import monte_carlo
 from pachon.models.first_order import footprints
 from pachon.models.io.prescription import WRITTEN
 from pachon.models.parameters.parameters import apply, parse_parameters
@@ -191,7 +191,7 @@ def test_tolerances_fill_the_stop_of_every_lens(lens, typed):
     assert study.upper[0] == pytest.approx(filled_spots(typed((2, "DISZ 6.0", "DISZ 6.2"))), rel=1e-9)
     # The curvature of the telescope has the other sign: its z axis is against the light.
     assert study.upper[1] == pytest.approx(filled_spots(typed((1, "CURV 0.0461", "CURV 0.0460"))), rel=1e-9)
-    assert "rays fill the stop S4" in study.merit.definition
+    assert "rays fill the stop S4" in study.criterion.definition
     frozen = apply(lens, {"S2.thickness": 2e-4})
     radii = pachon.spots(frozen, n_pupil=RINGS).rms_radius
     assert abs(np.sqrt(np.mean(radii**2)) / study.upper[0] - 1.0) > 5e-3
@@ -201,7 +201,7 @@ def test_tolerances_fill_the_stop_of_every_lens(lens, typed):
 def test_drawn_lenses_fill_their_stop(lens, typed):
     fields = np.array(lens.design_data.fields)
     found = monte_carlo(
-        lens, [Tolerance("S2.thickness", 2e-4)], "spots", n=2, method="traced", fields=fields, n_pupil=RINGS
+        pachon.Request.of(lens, fields, n_pupil=RINGS), [Tolerance("S2.thickness", 2e-4)], "spots", n=2, method="traced"
     )
     for deviation, merit in zip(found.deviations[:, 0], found.merit, strict=True):
         drawn = typed((2, "DISZ 6.0", f"DISZ {6.0 + 1e3 * float(deviation)!r}"))
