@@ -70,6 +70,8 @@ from .design.optimize.geometry_operands import SagAt as SagAt
 from .design.optimize.geometry_operands import TotalLength as TotalLength
 from .design.optimize.glass_choice import GlassChoice as GlassChoice
 from .design.optimize.glass_choice import choose_glasses as choose_glasses
+from .design.optimize.merit_function import SpotSize as SpotSize
+from .design.optimize.merit_function import WavefrontError as WavefrontError
 from .design.optimize.optimize import optimize as optimize
 from .design.optimize.optimize_file import load_optimization as load_optimization
 from .design.optimize.optimum import Optimum as Optimum
@@ -80,6 +82,7 @@ from .design.optimize.ray_operands import RmsWavefront as RmsWavefront
 from .design.optimize.ray_operands import WavefrontMtf as WavefrontMtf
 from .design.optimize.sensitivity import Sensitivity as Sensitivity
 from .design.optimize.sensitivity import sensitivity as sensitivity
+from .design.optimize.solver import LeastSquares as LeastSquares
 from .design.optimize.targets import ChiefRay as ChiefRay
 from .design.optimize.targets import FNumber as FNumber
 from .design.optimize.targets import FocalLength as FocalLength
