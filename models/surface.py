@@ -17,7 +17,7 @@ from .aperture import Aperture
 from .coating import AnyCoating
 from .layer_stack import LayerStack
 from .media.medium import Medium
-from .shapes.shape import Shape
+from .shapes.shape import Plane, Shape
 
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
@@ -92,6 +92,23 @@ class Surface:
         matrix = np.array(self.rotation, dtype=np.float64)
         matrix.flags.writeable = False
         return matrix
+
+    @property
+    def meeting_shape(self) -> Shape:
+        """Shape that rays meet: the plane z = 0 of a phase screen."""
+        return Plane() if self.interaction == Interaction.PHASE else self.shape
+
+    def sag(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
+        """Return the height [m] over the vertex plane at x, y [m] of the surface's own frame; NaN beyond the rim."""
+        return self.meeting_shape.sag(x, y)
+
+    def normal(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
+        """Return the unit normals on the +z side at x, y [m], all in the surface's own frame, shape [..., 3].
+
+        Where rays meet a surface, and how they leave it: :func:`pachon.intersect`, :func:`pachon.reflect` and
+        :func:`pachon.refract`.
+        """
+        return self.meeting_shape.normal(x, y)
 
     def coated(self, coating: AnyCoating | None) -> Surface:
         """Return the surface with a coating, or none; PrescriptionError for layers on what is no lens surface."""

@@ -104,9 +104,21 @@ def trace_packets(
 
     They are stored in the RayPackets ``out`` where these are given.
     """
-    packed = pack_surfaces(telescope)
-    count = packet_count(len(rays))
     indices = refractive_indices(telescope, rays.wavelength)
+    return launch_trace(pack_surfaces(telescope), indices, rays, n_stored, threads=threads, out=out)
+
+
+def launch_trace(
+    packed: Any,
+    indices: np.ndarray,
+    rays: Rays | TraceResult,
+    n_stored: int,
+    *,
+    threads: int | None = None,
+    out: Any = None,
+) -> PacketTrace:
+    """Trace as :func:`trace_packets` through packed surfaces, with the indices before the first and after each."""
+    count = packet_count(len(rays.path_length))
     # The status of the start is not read.
     start, end = RayPackets(), ray_packets(n_stored, count) if out is None else out
     start.position = warp_array(to_packets(rays.position.T[None]), lanes)

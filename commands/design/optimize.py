@@ -170,18 +170,17 @@ def optimize(
                 raise ConfigError(f"--{name} is given beside --config: expected it in the file")
         result = _from_file(shared, config, out)
     else:
+        from ...design.optimize.configuration import DesignConfiguration
         from ...design.optimize.optimize import optimize as compute
 
-        telescope, *where = shared.first_arguments
         _check_out(shared, out)
         result = compute(
-            telescope,
+            DesignConfiguration(*shared.first_arguments, projection=shared.projection),
             name_list(variables or "", "--variables"),
             merit or "spots",
-            *where,
             bounds=dict(_bounds(text) for text in bounds or ()),
             targets=() if focal_length is None else (FocalLength(focal_length),),
-            **shared.trace_options,
+            threads=shared.threads,
         )
     optimum = _optimum(result)
     paths = [out or Path(f"optimized_{file_name(telescope.name)}.yaml") for telescope in optimum.telescopes]
@@ -220,15 +219,15 @@ def _from_file(shared: SharedOptions, path: Path, out: Path | None) -> Any:
         raise ConfigError("--field-deg or --wavelength-nm is given beside --config: expected them in the file")
     file = load_optimization(path)
     _check_out(shared, out, several=bool(file.configurations))
-    arguments = optimization_arguments(file, shared.telescope, path)
+    arguments = optimization_arguments(file, shared.telescope, path, shared.projection)
     if file.glasses and file.configurations:
         raise ConfigError("glasses: expected a file without configurations", file=path)
     catalogue = catalogue_of(file, path)
     with errors_of(path):
         if not file.glasses:
-            return compute(**arguments, **shared.trace_options)
+            return compute(**arguments, threads=shared.threads)
         choice: Any = dict(glasses=file.glasses, nearest=file.nearest_glasses, catalogue=catalogue)
-        return choose_glasses(**arguments, **choice, **shared.trace_options)
+        return choose_glasses(**arguments, **choice, threads=shared.threads)
 
 
 def _optimum(result: Any) -> Any:

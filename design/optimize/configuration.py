@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,10 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError
+from ...models.parameters.parameters import resolved
 from ...models.telescope import Telescope
+from ...wavefront.pupil_sampling import PupilSampling
+from .merit import Beams
 from .operand import Operand
 
 
@@ -24,8 +27,12 @@ class DesignConfiguration:
     ----------
     telescope : Telescope
         The telescope; its name is that of the configuration.
-    fields, wavelengths, field_weights, wavelength_weights
+    fields, wavelengths, n_pupil
         As in :func:`~.optimize.optimize`; those of the optimisation where not given.
+    field_weights : array_like, shape [n_field], optional
+        Weights in the mean square; by default those of the design data with their fields, else equal.
+    wavelength_weights, sampling, projection
+        As in :meth:`pachon.Request.of`.
     weight : float
         Relative weight in the mean square.
     operands : sequence of Operand
@@ -39,6 +46,9 @@ class DesignConfiguration:
     wavelength_weights: ArrayLike | None = None
     weight: float = 1.0
     operands: Sequence[Operand] = ()
+    sampling: str | PupilSampling = "gauss"
+    n_pupil: int | None = None
+    projection: str = "zemax"
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.weight) and self.weight > 0):
@@ -46,19 +56,36 @@ class DesignConfiguration:
                 f"weight of {self.telescope.name} = {self.weight!r}: expected a positive number of a configuration"
             )
 
+    def beams(self, telescope: Telescope, threads: int | None) -> Beams:
+        """Return the rays of the configuration through a telescope."""
+        return Beams.of(
+            telescope,
+            self.fields,
+            self.wavelengths,
+            field_weights=self.field_weights,
+            wavelength_weights=self.wavelength_weights,
+            sampling=self.sampling,
+            n_pupil=self.n_pupil,
+            projection=self.projection,
+            threads=threads,
+        )
+
 
 def configurations(
-    given: Telescope | Sequence[Telescope | DesignConfiguration], **common: Any
+    telescope: Telescope | DesignConfiguration | Sequence[Telescope | DesignConfiguration],
+    fields: ArrayLike | None,
+    wavelengths: ArrayLike | None,
+    n_pupil: int | None,
 ) -> tuple[DesignConfiguration, ...]:
     """Return the configurations, with what they have in common where they state nothing themselves."""
-    listed: Iterable[Telescope | DesignConfiguration] = [given] if isinstance(given, Telescope) else given
-    found = []
-    for one in listed:
-        own = {} if isinstance(one, Telescope) else {k: v for k in common if (v := getattr(one, k)) is not None}
-        if isinstance(one, Telescope):
-            found.append(DesignConfiguration(one, **common))
-        else:
-            found.append(DesignConfiguration(one.telescope, **(common | own), weight=one.weight, operands=one.operands))
-    if not found:
+    listed: Iterable[Telescope | DesignConfiguration]
+    listed = [telescope] if isinstance(telescope, (Telescope, DesignConfiguration)) else telescope
+    common = {"fields": fields, "wavelengths": wavelengths, "n_pupil": n_pupil}
+    states = []
+    for item in listed:
+        state = DesignConfiguration(item) if isinstance(item, Telescope) else item
+        changes: dict[str, Any] = {k: v for k, v in common.items() if getattr(state, k) is None}
+        states.append(replace(state, telescope=resolved(state.telescope), **changes))
+    if not states:
         raise ConfigError("telescope = []: expected at least one configuration")
-    return tuple(found)
+    return tuple(states)

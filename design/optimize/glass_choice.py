@@ -16,6 +16,8 @@ from ...models.io.glass_catalogue import GlassCatalogue
 from ...models.media.medium import LINE_D, Medium, abbe_number
 from ...models.parameters.parameters import Parameter
 from ...models.telescope import VACUUM, Telescope
+from .configuration import DesignConfiguration
+from .merit_function import MeritFunction
 from .optimize import optimize
 from .optimum import Optimum
 
@@ -88,10 +90,10 @@ class GlassChoice(Result):
 
 @check_arguments
 def choose_glasses(
-    telescope: Telescope,
+    telescope: Telescope | DesignConfiguration,
     variables: Iterable[str | Parameter],
     glasses: Iterable[str],
-    merit: str = "spots",
+    merit: str | MeritFunction = "spots",
     *,
     catalogue: GlassCatalogue | None = None,
     nearest: int = 4,
@@ -126,6 +128,8 @@ def choose_glasses(
     PachonError
         As :func:`~.optimize.optimize`.
     """
+    state = DesignConfiguration(telescope) if isinstance(telescope, Telescope) else telescope
+    telescope = state.telescope
     names, fixed = list(glasses), list(variables)
     source = GlassCatalogue.bundled() if catalogue is None else catalogue
     require_count(nearest, "nearest", 1)
@@ -142,7 +146,7 @@ def choose_glasses(
 
     def optimum(start: Telescope, left: list[str]) -> Optimum:
         of_glasses = [f"{name}{_MODEL}.{what}" for name in left for what in ("n", "abbe")]
-        return optimize(start, [*fixed, *of_glasses], merit, **options)
+        return optimize(replace(state, telescope=start), [*fixed, *of_glasses], merit, **options)
 
     model = best = optimum(free, names)
     changes, trials, chosen = best.changes[: -2 * len(names)], [], {}

@@ -5,14 +5,15 @@ The rays of a merit are those that are lit at the start; otherwise a merit could
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.errors import DomainError
+from ...core.errors import ConfigError, DomainError, shown
 from ...core.units import field_label
+from ...models.paraxial import following_stop
 from ...models.telescope import Telescope
 from ...raytrace.adjoint.backward_pass import image_gradient
 from ...raytrace.adjoint.forward_pass import forward_pass
@@ -39,7 +40,7 @@ class Beams:
     @classmethod
     def of(
         cls,
-        telescope: Telescope,
+        telescope: Telescope | Request,
         fields: ArrayLike | None = None,
         wavelengths: ArrayLike | None = None,
         *,
@@ -50,10 +51,18 @@ class Beams:
     ) -> Beams:
         """Return the rays of a request, by default in 6 rings; further options are those of :meth:`Request.of`.
 
-        Weights of the fields are those that the design data state, where neither fields nor weights are given.
+        Weights of the fields are those that the design data state, where neither fields nor weights are given. In place
+        of a telescope stands a request with all of these but the weights.
         """
-        count = _RINGS if n_pupil is None and sampling == "gauss" else n_pupil
-        request = Request.of(telescope, fields, wavelengths, sampling=sampling, n_pupil=count, **options)
+        if isinstance(telescope, Request):
+            stated = {"fields": fields, "wavelengths": wavelengths, "n_pupil": n_pupil, **options}
+            for name, value in stated.items():
+                if value is not None:
+                    raise ConfigError(f"{name} = {shown(value)}: given beside a Request, which has its own", key=name)
+            request = telescope
+        else:
+            count = _RINGS if n_pupil is None and sampling == "gauss" else n_pupil
+            request = Request.of(telescope, fields, wavelengths, sampling=sampling, n_pupil=count, **options)
         weights = request.stated_weights if field_weights is None else field_weights
         return cls(request, relative_weights(weights, len(request.fields), "field_weights"))
 
@@ -78,6 +87,13 @@ class Beams:
                 raise DomainError(f"{field_label(dark)}: no ray reaches the image of {telescope.name}")
             found.append(lit / total * self.field_weights[:, None])
         return np.array(found) * self.request.weights[:, None, None]
+
+
+def filling_stop(telescope: Telescope | Request) -> Telescope | Request:
+    """Return a telescope, or a request, whose rays follow the stop when it changes."""
+    if isinstance(telescope, Request):
+        return replace(telescope, telescope=following_stop(telescope.telescope))
+    return following_stop(telescope)
 
 
 class Merit(Protocol):

@@ -3,62 +3,56 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import OptimizeResult, least_squares
 
-from ...core.arguments import check_arguments
-from ...core.errors import ConfigError, DomainError, PachonError, shown
+from ...core.arguments import check_arguments, removed_arguments
+from ...core.errors import ConfigError, DomainError, PachonError
 from ...core.threads import one_blas_thread
-from ...core.units import require_count
-from ...models.parameters.parameters import Parameter, resolved
+from ...models.parameters.parameters import Parameter
 from ...models.paraxial import following_stop
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
-from ...wavefront.pupil_sampling import PupilSampling
 from .configuration import DesignConfiguration, configurations
 from .jacobian import ParameterColumns
 from .merit import Beams, Merit
+from .merit_function import MeritFunction, merit_function
 from .operand import Operand, check_operands
 from .optimum import OperandChange, Optimum
 from .problem import DesignProblem, DesignState
-from .remeasured import MeritOptions, final_telescope, remeasured
-from .variables import Variable, free_variables, limits, random_starts
+from .remeasured import final_telescope, remeasured
+from .solver import LeastSquares
+from .variables import Variable, free_variables, limits
 from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
 
 #: Fraction of the effects of single surfaces on single rays below which the effect of a variable is rounding.
 NO_EFFECT = 1e-11
-#: Effect of the longest first step, in units of the merit at the start.
-_FIRST_STEP = 100.0
 #: Singular value, relative to the largest, below which variables scaled to equal effects are collinear.
 _COLLINEAR = 1e-6
+#: What replaces arguments of earlier versions.
+_REPLACED = {
+    **dict.fromkeys(("field_weights", "wavelength_weights", "sampling", "projection"), "it in a DesignConfiguration"),
+    "reference": "merit=SpotSize(reference)",
+    "goal": "merit=WavefrontError(goal)",
+    **dict.fromkeys(("tolerance", "max_steps", "restarts", "spread", "seed"), "it in solver=LeastSquares(...)"),
+}
 
 
+@removed_arguments(**_REPLACED)
 @check_arguments
 @one_blas_thread()
 def optimize(
-    telescope: Telescope | Sequence[Telescope | DesignConfiguration],
+    telescope: Telescope | DesignConfiguration | Sequence[Telescope | DesignConfiguration],
     variables: Iterable[str | Parameter],
-    merit: str | Merit = "spots",
+    merit: str | MeritFunction | Merit = "spots",
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     targets: Sequence[Operand] = (),
-    field_weights: ArrayLike | None = None,
-    wavelength_weights: ArrayLike | None = None,
-    reference: str = "centroid",
-    goal: ArrayLike | None = None,
-    sampling: str | PupilSampling = "gauss",
     n_pupil: int | None = None,
-    projection: str = "zemax",
-    tolerance: float = 1e-10,
-    max_steps: int = 200,
-    restarts: int = 0,
-    spread: float = 0.3,
-    seed: int = 0,
+    solver: LeastSquares | None = None,
     threads: int | None = None,
 ) -> Optimum:
     """Minimise spots or wavefronts over chosen variables.
@@ -71,37 +65,24 @@ def optimize(
 
     Parameters
     ----------
-    telescope : Telescope or sequence of Telescope and DesignConfiguration
-        The telescope, or configurations that are optimised together: bands, zoom positions. Each has a name of its own.
-    fields, wavelengths, wavelength_weights, sampling, n_pupil, projection, threads
+    telescope : Telescope, DesignConfiguration, or sequence of them
+        The telescope; with weights, operands and rays of its own a configuration; or several that are optimised
+        together: bands, zoom positions. Each has a name of its own.
+    fields, wavelengths, n_pupil, threads
         As in :meth:`pachon.Request.of`, but for 6 rings of pupil points by default.
     variables : iterable of str or Parameter
         Free parameters, see :mod:`~pachon.models.parameters.parameters`. Configurations that have an address share
         it; after the name of a telescope and a colon it is that of one of them: ``zoom_2:L2.thickness``.
-    merit : {"spots", "wavefront"} or Merit
-        Merit function: rms spot radius, or rms wavefront without piston and tilt; an object for one telescope.
+    merit : {"spots", "wavefront"}, SpotSize, WavefrontError or Merit
+        Merit function: rms spot radius, or rms wavefront without piston and tilt, with options in an object; or a merit
+        of one telescope.
     bounds : mapping of str to (low, high), optional
         Limits of variables: of the change for a motion, else of the value itself. By default curvatures are limited by
         the clear radii of their surfaces, thicknesses to positive values, indices and Abbe numbers to those of glasses.
     targets : sequence of Operand
         Further numbers to be reached or held within limits, of each configuration.
-    field_weights : array_like, shape [n_field], optional
-        Weights in the mean square; by default those of the design data with their fields, else equal.
-    reference : {"centroid", "chief"}
-        Origin of the landing points.
-    goal : array_like, shape [n_field, n_wave, n_pupil], optional
-        Target wavefronts [m], such as those of :func:`wavefronts`; zero by default.
-    tolerance : float
-        Relative change of the sum of squares, or of the variables, at which the solver stops.
-    max_steps : int
-        Largest number of evaluations of the merit, from each start.
-    restarts : int
-        Number of random starts beside the telescope as it is; the best end is returned.
-    spread : float
-        Width of the random starts, relative to the values of the variables; those with two bounds are drawn evenly
-        between them.
-    seed : int
-        Seed of the random starts.
+    solver : LeastSquares, optional
+        Solver, with its tolerance, largest number of steps and random starts.
 
     Raises
     ------
@@ -110,113 +91,64 @@ def optimize(
     ConfigError, UnknownNameError
         If a merit or variable does not exist, or an operand is given twice.
     """
-    require_count(restarts, "restarts", 0)
-    given = tuple(
-        replace(one, telescope=resolved(one.telescope))
-        for one in configurations(
-            telescope,
-            fields=fields,
-            wavelengths=wavelengths,
-            field_weights=field_weights,
-            wavelength_weights=wavelength_weights,
-        )
-    )
-    options = MeritOptions(
-        merit, reference, goal, dict(sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads)
-    )
-    states, beams = _states(given, options, tuple(targets))
+    function = merit_function(merit)
+    given = configurations(telescope, fields, wavelengths, n_pupil)
+    states, beams = _states(given, function, tuple(targets), threads)
     telescopes = [state.telescope for state in states]
-    chosen = free_variables(telescopes, variables)
-    problem = DesignProblem(states, chosen)
-    box = limits(telescopes, chosen, bounds or {})
-    still = np.zeros(len(chosen))
-    start, slopes = problem.linear(still)
+    problem = DesignProblem(states, free_variables(telescopes, variables))
+    box = limits(telescopes, problem.variables, bounds or {})
+    start, slopes = problem.linear(np.zeros(len(problem.variables)))
     effect = np.linalg.norm(slopes, axis=0)
-    scale = np.divide(1.0, effect, out=np.ones_like(effect), where=effect > 0)
-    rounding = NO_EFFECT * problem.rounding()
-    idle = [v.address for v, value, least in zip(chosen, effect, rounding, strict=True) if not value > least]
-    if idle:
-        raise DomainError(f"variable {idle[0]} has no effect on the merit: leave it out")
-    begun = problem.merit_part(start)
-    done, history = _solve(problem, box, still, start, scale, tolerance, max_steps)
-    for other in random_starts(chosen, bounds or {}, box, spread, seed, restarts):
-        residuals = problem.residuals(other)
-        if np.isfinite(residuals).all():
-            found, course = _solve(problem, box, other, residuals, scale, tolerance, max_steps)
-            if found.cost < done.cost:
-                done, history = found, course
-    solved = done.x * scale
-    values, slopes = problem.linear(solved)
-    end = float(np.linalg.norm(values))
-    if end != history[-1]:
-        history.append(end)
-    rate = np.array([v.rate(x) for v, x in zip(chosen, solved, strict=True)])
-    covariance, collinear = _covariance(values, slopes, chosen, rate)
-    changes = np.array([v.change(x) for v, x in zip(chosen, solved, strict=True)])
-    start_values = np.array([v.start for v in chosen])
-    started, solutions = tuple(one.telescope for one in given), problem.telescopes(solved)
+    _check_effects(problem, effect)
+    solution = (solver or LeastSquares()).solve(problem, box, bounds or {}, start, effect)
+    values, slopes = problem.linear(solution.changes)
+    if (end := float(np.linalg.norm(values))) != solution.history[-1]:
+        solution.history.append(end)
+    rate = np.array([v.rate(x) for v, x in zip(problem.variables, solution.changes, strict=True)])
+    covariance, collinear = _covariance(values, slopes, problem.variables, rate)
+    changes = np.array([v.change(x) for v, x in zip(problem.variables, solution.changes, strict=True)])
+    start_values = np.array([v.start for v in problem.variables])
+    started, solved = tuple(state.telescope for state in given), problem.telescopes(solution.changes)
     ended = tuple(
-        final_telescope(after, stated.design_data.aiming) for after, stated in zip(solutions, started, strict=True)
+        final_telescope(after, stated.design_data.aiming) for after, stated in zip(solved, started, strict=True)
     )
     return Optimum(
         telescopes=ended,
         start_telescopes=started,
         fields=tuple(b.request.fields for b in beams),
         wavelengths=tuple(b.request.wavelengths for b in beams),
-        variables=tuple(v.parameter for v in chosen),
-        addresses=tuple(v.address for v in chosen),
+        variables=tuple(v.parameter for v in problem.variables),
+        addresses=tuple(v.address for v in problem.variables),
         changes=changes,
         start_values=start_values,
         values=start_values + changes,
-        merit_name=merit if isinstance(merit, str) else type(merit).__name__,
-        merits=np.array([np.linalg.norm(begun), np.linalg.norm(problem.merit_part(values))]),
-        remeasured=np.array([remeasured(given, lenses, options) for lenses in (started, ended)]),
-        history=np.array(history),
-        operands=tuple(
-            OperandChange(operand, state.telescope.name, operand.measure(state.telescope), operand.measure(after))
-            for state, after in zip(states, solutions, strict=True)
-            for operand in state.operands
-        ),
+        merit_name=function.name,
+        merits=np.array([np.linalg.norm(problem.merit_part(residuals)) for residuals in (start, values)]),
+        remeasured=np.array([remeasured(given, lenses, function, threads) for lenses in (started, ended)]),
+        history=np.array(solution.history),
+        operands=_operand_changes(states, solved),
         effect=np.linalg.norm(slopes, axis=0) / np.abs(rate),
         covariance=covariance,
         collinear=collinear,
-        message=str(done.message),
+        message=solution.message,
         vignetting=tuple(b.request.vignetting for b in beams),
     )
 
 
-def _solve(
-    problem: DesignProblem,
-    box: tuple[np.ndarray, np.ndarray],
-    start: np.ndarray,
-    residuals: np.ndarray,
-    scale: np.ndarray,
-    tolerance: float,
-    max_steps: int,
-) -> tuple[OptimizeResult, list[float]]:
-    """Return the solution in variables over their scale, and the rms of all residuals before and after each step."""
-    history: list[float] = []
+def _check_effects(problem: DesignProblem, effect: np.ndarray) -> None:
+    """Raise a DomainError for a variable whose effect on the merit is rounding."""
+    rounding = NO_EFFECT * problem.rounding()
+    for variable, value, least in zip(problem.variables, effect, rounding, strict=True):
+        if not value > least:
+            raise DomainError(f"variable {variable.address} has no effect on the merit: leave it out")
 
-    def jacobian(scaled: np.ndarray) -> np.ndarray:
-        # Called at the start and after each step.
-        values, change = problem.linear(scaled * scale)
-        history.append(float(np.linalg.norm(values)))
-        return change * scale
 
-    done = least_squares(
-        lambda scaled: problem.residuals(scaled * scale),
-        start / scale,
-        jac=jacobian,
-        bounds=(box[0] / scale, box[1] / scale),
-        method="trf",
-        # Generous first steps: variables that compensate each other move far for little effect.
-        x_scale=float(max(_FIRST_STEP * float(np.linalg.norm(residuals)), np.finfo(float).tiny)),
-        ftol=tolerance,
-        xtol=tolerance,
-        gtol=1e-15,
-        max_nfev=max_steps,
+def _operand_changes(states: Sequence[DesignState], solved: Sequence[Telescope]) -> tuple[OperandChange, ...]:
+    return tuple(
+        OperandChange(operand, state.telescope.name, operand.measure(state.telescope), operand.measure(after))
+        for state, after in zip(states, solved, strict=True)
+        for operand in state.operands
     )
-    return done, history
 
 
 def wavefronts(telescope: Telescope, rays: Beams) -> np.ndarray:
@@ -236,18 +168,18 @@ def wavefronts(telescope: Telescope, rays: Beams) -> np.ndarray:
 
 
 def _states(
-    given: tuple[DesignConfiguration, ...], options: MeritOptions, targets: tuple[Operand, ...]
+    given: tuple[DesignConfiguration, ...],
+    function: MeritFunction,
+    targets: tuple[Operand, ...],
+    threads: int | None,
 ) -> tuple[tuple[DesignState, ...], tuple[Beams, ...]]:
     """Return merit and operands of each configuration, and their rays."""
-    merit = options.merit
-    if not isinstance(merit, str) and not hasattr(merit, "derivatives"):
-        raise ConfigError(f"merit = {shown(merit)}: expected 'spots', 'wavefront' or a Merit")
-    if len(given) > 1 and (options.goal is not None or not isinstance(merit, str)):
+    if len(given) > 1 and function.of_one_telescope:
         raise ConfigError(f"{len(given)} configurations: expected no goal, and the merit 'spots' or 'wavefront'")
     total, states, beams = sum(one.weight for one in given), [], []
     for one in given:
         telescope = following_stop(one.telescope)
-        rays = options.beams(telescope, one)
+        rays = one.beams(telescope, threads)
         operands = (*targets, *one.operands)
         check_operands(operands)
         bound = []
@@ -255,7 +187,7 @@ def _states(
             # An operand that the telescope does not have is an error of the input, not a step that goes too far.
             bound.append(operand.bound(telescope))
             _check_start(bound[-1], telescope)
-        states.append(DesignState(telescope, options.of(telescope, rays), tuple(bound), one.weight / total))
+        states.append(DesignState(telescope, function.of(telescope, rays), tuple(bound), one.weight / total))
         beams.append(rays)
     return tuple(states), tuple(beams)
 

@@ -41,7 +41,9 @@ from ...models.parameters.changes import ANGLES, LENGTHS, parse_change
 from ...models.telescope import Telescope
 from . import geometry_operands, ray_operands, targets
 from .configuration import DesignConfiguration
+from .merit_function import SpotSize, WavefrontError
 from .operand import OPERANDS, GoalOperand, Operand
+from .solver import LeastSquares
 
 _DEGREE = ANGLES["deg"]
 #: Keys of files for the fields of operands, and their units in SI; other fields have their own names.
@@ -204,7 +206,9 @@ def load_optimization(path: str | os.PathLike[str]) -> OptimizeFile:
     return validated(OptimizeFile, read_mapping(path, ConfigError), str(path))
 
 
-def optimization_arguments(file: OptimizeFile, telescope: Telescope, path: Path) -> dict[str, Any]:
+def optimization_arguments(
+    file: OptimizeFile, telescope: Telescope, path: Path, projection: str = "zemax"
+) -> dict[str, Any]:
     """Return the arguments of :func:`~.optimize.optimize` for a file and the telescope of its command.
 
     Paths in the file start from its folder. Errors name the file and the key.
@@ -212,7 +216,7 @@ def optimization_arguments(file: OptimizeFile, telescope: Telescope, path: Path)
     common: dict[str, Any] = file.rays()
     with error_context(file=path):
         operands = file.operand_list()
-        states = [DesignConfiguration(telescope, **common, operands=operands)]
+        states = [DesignConfiguration(telescope, **common, operands=operands, projection=projection)]
         for i, section in enumerate(file.configurations):
             with error_context(key=f"configurations.{i}"):
                 beside = path.parent / section.telescope
@@ -222,7 +226,13 @@ def optimization_arguments(file: OptimizeFile, telescope: Telescope, path: Path)
                     other = dataclasses.replace(other, name=beside.stem)
                 rays = {k: common[k] if v is None else v for k, v in section.rays().items()}
                 states.append(
-                    DesignConfiguration(other, **rays, weight=section.weight, operands=section.operand_list())
+                    DesignConfiguration(
+                        other,
+                        **rays,
+                        weight=section.weight,
+                        operands=section.operand_list(),
+                        projection=projection,
+                    )
                 )
         bounds = {}
         for text, pair in file.bounds.items():
@@ -232,16 +242,11 @@ def optimization_arguments(file: OptimizeFile, telescope: Telescope, path: Path)
                 raise unknown_name("configuration of bounds", owner, known)
             parameter, size = parse_change(known[owner] if colon else telescope, name, "bounds")
             bounds[owner + colon + parameter.address] = (size * pair[0], size * pair[1])
-    start = {"telescope": states} if file.configurations else {"telescope": telescope, **common, "targets": operands}
     return {
-        **start,
+        "telescope": states if file.configurations else states[0],
         "variables": file.variables,
-        "merit": file.merit,
+        "merit": SpotSize(file.reference) if file.merit == "spots" else WavefrontError(),
         "bounds": bounds,
-        "reference": file.reference,
         "n_pupil": file.n_pupil,
-        "max_steps": file.max_steps,
-        "restarts": file.restarts,
-        "spread": file.spread,
-        "seed": file.seed,
+        "solver": LeastSquares(max_steps=file.max_steps, restarts=file.restarts, spread=file.spread, seed=file.seed),
     }

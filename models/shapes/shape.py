@@ -74,6 +74,12 @@ class Shape(ABC):
         """Return the slopes dz/dx and dz/dy."""
         return self._gradient(*coordinates(x, y))
 
+    def normal(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
+        """Return the unit normals on the +z side, shape [..., 3]."""
+        along_x, along_y = self.gradient(x, y)
+        normal = np.stack([-along_x, -along_y, np.ones_like(along_x)], axis=-1)
+        return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
     def hessian(self, x: ArrayLike, y: ArrayLike) -> Triple:
         """Return the second derivatives of the sag along xx, xy and yy [1/m]."""
         return self._hessian(*coordinates(x, y))

@@ -12,9 +12,10 @@ from ...models.surface import Interaction
 from ...models.telescope import Telescope
 from ..kernels.obstruction import PackedObstructions
 from .meshes import warp_mesh
+from .sequence import SurfaceSequence
 
 
-def obstruction_table(telescope: Telescope) -> np.ndarray:
+def obstruction_table(telescope: Telescope | SurfaceSequence) -> np.ndarray:
     """Return the obstructions on the path of light to each surface, bool [n_surface, n_obstruction].
 
     Light on its way to a mirror, a lens surface or the detector crosses the baffle planes before it, which go with
@@ -37,7 +38,7 @@ def obstruction_table(telescope: Telescope) -> np.ndarray:
     return blocked
 
 
-def pack_obstructions(telescope: Telescope, device: str = "cpu") -> Any:
+def pack_obstructions(telescope: Telescope | SurfaceSequence, device: str = "cpu") -> Any:
     """Return the telescope's obstructions as a :class:`PackedObstructions` struct on a device."""
     corners = [obstruction.triangles.reshape(-1, 3) for obstruction in telescope.obstructions]
     meshes = [warp_mesh(points, np.arange(len(points)), device) for points in corners]

@@ -22,6 +22,7 @@ from ..kernels.trace import DEFORMED, INTERACTION, KINDS, NUMBERS, OBSTRUCTED, P
 from .apertures import pack_apertures
 from .meshes import pack_meshes
 from .obstructions import obstruction_table, pack_obstructions
+from .sequence import SurfaceSequence
 from .shapes import SplitShape, pack_deformations, split_shape
 
 #: Rays are nearly perpendicular to the axis of a mirror when their direction cosine along it is below this (6 degrees).
@@ -64,7 +65,7 @@ def sign_change(mirror: Surface, behind: Sequence[Surface], shape: SplitShape) -
 
 
 @lru_cache(maxsize=64)
-def pack_surfaces(telescope: Telescope, device: str = "cpu") -> Any:
+def pack_surfaces(telescope: Telescope | SurfaceSequence, device: str = "cpu") -> Any:
     """Return the telescope's surfaces as a :class:`PackedSurfaces` struct on a device."""
     start_warp()
     surfaces = telescope.surfaces
@@ -121,7 +122,7 @@ def leading_surfaces(packed: Any, count: int) -> Any:
     return front
 
 
-def distinct_media(telescope: Telescope) -> tuple[Medium, ...]:
+def distinct_media(telescope: Telescope | SurfaceSequence) -> tuple[Medium, ...]:
     """Return the media of a telescope, each once."""
     return tuple(dict.fromkeys([telescope.medium_before, *(s.medium_after for s in telescope.surfaces)]))
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...design.optimize.merit import Beams, SpotMerit
 from ...design.optimize.optimize import optimize
+from ...design.optimize.solver import LeastSquares
 from ...models.parameters.changes import parse_change
 from ...pipeline.experiment import Experiment
 from ...wavefront.chief_rays import fields_at
@@ -48,7 +49,7 @@ def compensated(
         heights = heights - focus_height(telescope, experiment.silicon, wavelength, threads)
     merit = SpotMerit(telescope, rays, heights=heights)
     found = optimize(
-        telescope, [p for p, _ in chosen], merit, fields, [wavelength], tolerance=_TOLERANCE, threads=threads
+        telescope, [p for p, _ in chosen], merit, fields, [wavelength], solver=LeastSquares(_TOLERANCE), threads=threads
     )
     values = {name: float(v / factor) for name, v, (_, factor) in zip(names, found.changes, chosen, strict=True)}
     return replace(experiment, telescope=found.telescope), values

@@ -15,6 +15,7 @@ import numpy as np
 
 from ...core.errors import ConfigError, unknown_name
 from ...design.optimize.optimize import optimize
+from ...design.optimize.solver import LeastSquares
 from ...models.io.bundled import BUNDLED
 from ...models.io.prescription import load_telescope
 from ...models.parameters.changes import apply_changes, parse_change
@@ -51,7 +52,7 @@ def point_metrics(sweep: SweepFile, parameters: dict[str, Any], folder: Path, th
             fields,
             waves,
             n_pupil=_RINGS,
-            tolerance=_TOLERANCE,
+            solver=LeastSquares(_TOLERANCE),
             threads=threads,
         )
         telescope = found.telescope

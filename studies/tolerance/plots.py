@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from ...core.plotting import BLUE, GREY, ORANGE, RED, new_figure, png_bytes, styled
 from .result import SHOWN, ToleranceStudy, merit_unit, name_rows, study_title
-
-if TYPE_CHECKING:
-    pass
 
 
 def sensitivity_plot(study: ToleranceStudy) -> bytes:
@@ -40,24 +35,24 @@ def inverse_plot(study: ToleranceStudy) -> bytes:
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.axvline(1.0, color=GREY, linewidth=0.8)
         axes.grid(True, axis="x", color="0.93", linewidth=0.5)
-        axes.set_xlabel(f"size that costs {100 * study.loss:g} % of the {study.merit.title}, over the tolerance")
+        axes.set_xlabel(f"size that costs {100 * study.loss:g} % of the {study.criterion.title}, over the tolerance")
         axes.set_title(study_title(study, "inverse sensitivity; red: the tolerance costs more"))
         return png_bytes(figure)
 
 
 def draws_plot(study: ToleranceStudy) -> bytes:
     """Draw the histogram of the merit over the drawn telescopes, with the requirement."""
-    scale = study.merit.scale
-    finite = scale * study.draws[np.isfinite(study.draws)]
+    scale = study.criterion.scale
+    finite = scale * study.merit[np.isfinite(study.merit)]
     with styled():
         figure = new_figure(6.4, 4.2)
         axes = figure.subplots()
         bins = max(5, min(60, round(len(finite) ** 0.5)))
-        axes.hist(finite, bins=bins, color=BLUE, alpha=0.7, label=f"{len(study.draws)} telescopes, {study.method}")
+        axes.hist(finite, bins=bins, color=BLUE, alpha=0.7, label=f"{len(study.merit)} telescopes, {study.method}")
         axes.axvline(scale * study.nominal, color=GREY, linestyle=(0, (4, 2)), linewidth=0.9, label="as designed")
         if study.requirement is not None:
             axes.axvline(scale * study.requirement, color=ORANGE, linewidth=1.2, label="requirement")
-        axes.set(xlabel=f"{study.merit.title}{merit_unit(study)}", ylabel="telescopes")
+        axes.set(xlabel=f"{study.criterion.title}{merit_unit(study)}", ylabel="telescopes")
         axes.legend(loc="best")
         axes.set_title(study_title(study, "Monte Carlo"))
         return png_bytes(figure)
@@ -65,14 +60,14 @@ def draws_plot(study: ToleranceStudy) -> bytes:
 
 def yield_plot(study: ToleranceStudy) -> bytes:
     """Draw the fraction of the telescopes that meet a requirement, against it, with its binomial error."""
-    finite = np.unique(study.draws[np.isfinite(study.draws)])
+    finite = np.unique(study.merit[np.isfinite(study.merit)])
     at = finite[np.unique(np.linspace(0, len(finite) - 1, min(len(finite), 200)).astype(int))]
     yields = [study.yield_at(float(v)) for v in at]
-    scale = study.merit.scale
+    scale = study.criterion.scale
     with styled():
         figure = new_figure(6.4, 4.2)
         axes = figure.subplots()
-        axes.plot(scale * at, [100 * y.fraction for y in yields], color=BLUE, label=f"{len(study.draws)} telescopes")
+        axes.plot(scale * at, [100 * y.fraction for y in yields], color=BLUE, label=f"{len(study.merit)} telescopes")
         limits = [100 * y.low for y in yields], [100 * y.high for y in yields]
         axes.fill_between(scale * at, *limits, color=BLUE, alpha=0.2, linewidth=0, label="binomial, 1 sigma")
         axes.axvline(scale * study.nominal, color=GREY, linestyle=(0, (4, 2)), linewidth=0.9, label="as designed")
@@ -80,9 +75,8 @@ def yield_plot(study: ToleranceStudy) -> bytes:
             found = study.yield_at(study.requirement)
             label = f"requirement: {100 * found.fraction:.1f} % ({100 * found.low:.1f} to {100 * found.high:.1f})"
             axes.axvline(scale * study.requirement, color=ORANGE, linewidth=1.2, label=label)
-        axes.set(
-            xlabel=f"requirement on the {study.merit.title}{merit_unit(study)}", ylabel="telescopes that meet it [%]"
-        )
+        axes.set_xlabel(f"requirement on the {study.criterion.title}{merit_unit(study)}")
+        axes.set_ylabel("telescopes that meet it [%]")
         axes.set_ylim(0, 102)
         axes.grid(True, color="0.93", linewidth=0.5)
         axes.legend(loc="best")

@@ -22,12 +22,12 @@ _WORST = 20
 
 def tolerance_summary(study: ToleranceStudy) -> dict[str, Any]:
     """Return the figures of a study as plain numbers, merits in the unit of the study."""
-    scale, draws = study.merit.scale, study.draws
+    scale, draws = study.criterion.scale, study.merit
     finite = draws[np.isfinite(draws)]
     summary: dict[str, Any] = {
         "telescope": study.telescope,
-        "merit": study.merit.name,
-        "unit": study.merit.unit,
+        "merit": study.criterion.name,
+        "unit": study.criterion.unit,
         "method": study.method,
         "tolerances": len(study.tolerances),
         "compensators": list(study.compensators),
@@ -61,8 +61,8 @@ def tolerance_summary(study: ToleranceStudy) -> dict[str, Any]:
 
 def write_tolerances(study: ToleranceStudy, file: ToleranceFile, folder: Path) -> tuple[str, ...]:
     """Write the files of a study into an existing folder, and return their names."""
-    unit, scale = study.merit.unit, study.merit.scale
-    meta = {"pachon": VERSION, "telescope": study.telescope, "merit": study.merit.title, "seed": file.seed}
+    unit, scale = study.criterion.unit, study.criterion.scale
+    meta = {"pachon": VERSION, "telescope": study.telescope, "merit": study.criterion.title, "seed": file.seed}
     about, (effect, effect_error) = "merit, compensated", study.effects
     sensitivity: Columns = {
         "name": (np.array([t.name for t in study.tolerances]), "", "tolerance"),
@@ -82,7 +82,7 @@ def write_tolerances(study: ToleranceStudy, file: ToleranceFile, folder: Path) -
             )
         },
     }
-    draws: Columns = {"merit": (scale * study.draws, unit, about)}
+    draws: Columns = {"merit": (scale * study.merit, unit, about)}
     for i, name in enumerate(study.compensators):
         draws[f"{name} (compensator)"] = (study.moves[:, i], _fits(study.compensator_units[i]), "")
     for i, tolerance in enumerate(study.tolerances):

@@ -27,8 +27,8 @@ def tolerance_page(
     study: ToleranceStudy, file: ToleranceFile, summary: dict[str, Any], pictures: tuple[bytes, ...]
 ) -> str:
     """Return the page of a study with its pictures (PNG): sensitivity, inverse sensitivity, draws, yield."""
-    title = study.merit.title
-    loss, at = f"{summary['loss_percent']:g} %", "at least" if study.merit.larger else "at most"
+    title = study.criterion.title
+    loss, at = f"{summary['loss_percent']:g} %", "at least" if study.criterion.larger else "at most"
     captions = (
         (
             "Sensitivity",
@@ -54,8 +54,8 @@ def tolerance_page(
         "tolerance.html",
         summary=summary,
         title=title,
-        unit=study.merit.unit,
-        definition=study.merit.definition,
+        unit=study.criterion.unit,
+        definition=study.criterion.definition,
         method=_METHODS[study.method],
         found=_drawn(summary),
         pictures=[Picture(name, data, shows) for (name, shows), data in zip(captions, pictures, strict=True)],
@@ -88,7 +88,7 @@ def _drawn(summary: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _rows(study: ToleranceStudy) -> list[tuple[str, ...]]:
     """Return the cells of the costliest tolerances."""
-    scale, (effect, error) = study.merit.scale, study.effects
+    scale, (effect, error) = study.criterion.scale, study.effects
     rows = []
     for i in study.offenders[:_SHOWN]:
         tolerance, unit = study.tolerances[i], "" if study.units[i] == "1" else f" {study.units[i]}"

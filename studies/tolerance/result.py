@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...core.arguments import check_arguments
 from ...core.plotting import BLUE, GREY, RED, figure_at, plain_text, styled
 from ...core.result import Result
-from ...design.optimize.yields import Yield
+from ...design.tolerancing.monte_carlo import MonteCarlo
 from ...models.parameters.tolerances import Tolerance
-from .merits import ToleranceMerit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,37 +22,17 @@ SHOWN = 25
 
 
 @dataclass(frozen=True)
-class ToleranceStudy(Result):
-    """Results of a tolerance study.
+class ToleranceStudy(MonteCarlo):
+    """Results of a tolerance study: a Monte Carlo, and each tolerance alone.
 
     Attributes
     ----------
-    telescope : str
-        Name of the telescope.
-    merit : ToleranceMerit
-        The merit; numbers below are in SI.
-    method : str
-        "linear", "quadratic" or "traced".
-    tolerances : tuple of Tolerance
-        The tolerances.
-    compensators : tuple of str
-        Degrees of freedom that follow each deviation.
-    units, compensator_units : tuple of str
-        Units of deviations and compensators.
-    nominal : float
-        Merit of the telescope as designed, compensated.
     lower, upper : ndarray, shape [n_tolerance]
         Merit at minus and plus the size of each tolerance, compensated, traced.
     inverse : ndarray, shape [n_tolerance]
         Size of each tolerance whose worse end costs the loss; NaN where none within a factor of 1e4 does.
     loss : float
         Relative loss of the merit of these.
-    deviations : ndarray, shape [n, n_tolerance]
-        Drawn deviations.
-    moves : ndarray, shape [n, n_compensator]
-        Compensators of each draw.
-    draws : ndarray, shape [n]
-        Merit of each draw; NaN where its light is lost.
     requirement : float, optional
         Requirement on the merit.
     """
@@ -62,32 +40,25 @@ class ToleranceStudy(Result):
     _table = ("lower", "upper", "inverse", "cost")
     _row_type = Tolerance
 
-    telescope: str
-    merit: ToleranceMerit
-    method: str
-    tolerances: tuple[Tolerance, ...]
-    compensators: tuple[str, ...]
-    units: tuple[str, ...]
-    compensator_units: tuple[str, ...]
-    nominal: float
     lower: np.ndarray
     upper: np.ndarray
     inverse: np.ndarray
     loss: float
-    deviations: np.ndarray
-    moves: np.ndarray
-    draws: np.ndarray
-    requirement: float | None = field(default=None)
+    requirement: float | None = None
 
     def _columns(self) -> dict[str, Any]:
         rows = {"name": [t.name for t in self.tolerances], "size": [t.size for t in self.tolerances]}
         return rows | {"units": list(self.units)} | super()._columns()
 
     def _meta(self) -> dict[str, Any]:
-        return {"telescope": self.telescope, "merit": self.merit.name, "method": self.method, "nominal": self.nominal}
+        names = {"telescope": self.telescope, "merit": self.merit_name}
+        return names | {"method": self.method, "nominal": self.nominal}
+
+    def _summary(self) -> dict[str, Any]:
+        return Result._summary(self)
 
     def _label(self) -> str:
-        return f"{self.telescope}, {len(self.tolerances)} tolerances, {len(self.draws)} telescopes drawn"
+        return f"{self.telescope}, {len(self.tolerances)} tolerances, {len(self.merit)} telescopes drawn"
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw the change of the merit at the ends of the costliest tolerances, and in the draws, with its error."""
@@ -96,7 +67,7 @@ class ToleranceStudy(Result):
     @property
     def cost(self) -> np.ndarray:
         """Loss of the merit at the worse end of each tolerance, shape [n_tolerance]; infinite where light is lost."""
-        ends = self.merit.loss(np.stack([self.lower, self.upper]), self.nominal)
+        ends = self.criterion.loss(np.stack([self.lower, self.upper]), self.nominal)
         return np.max(np.where(np.isnan(ends), np.inf, ends), axis=0)
 
     @property
@@ -111,34 +82,21 @@ class ToleranceStudy(Result):
         Both arrays are [2, n_tolerance], lowest third first: the difference, and its standard error; NaN where a group
         has less than two telescopes with light.
         """
-        known = np.isfinite(self.draws)
+        finite = np.isfinite(self.merit)
         effect, error = np.full((2, 2, self.deviations.shape[1]), np.nan)
         for i, column in enumerate(self.deviations.T):
             low, high = np.quantile(column, (1 / 3, 2 / 3))
             for end, third in enumerate((column <= low, column >= high)):
-                inner, outer = self.draws[known & third], self.draws[known & ~third]
+                inner, outer = self.merit[finite & third], self.merit[finite & ~third]
                 if min(len(inner), len(outer)) >= 2:
                     effect[end, i] = inner.mean() - outer.mean()
                     error[end, i] = np.sqrt(inner.var(ddof=1) / len(inner) + outer.var(ddof=1) / len(outer))
         return effect, error
 
-    @check_arguments
-    def at_most(self, fraction: float) -> float:
-        """Return the merit that a fraction (0 to 1) of the telescopes reaches; lost ones are worst."""
-        worst = -np.inf if self.merit.larger else np.inf
-        merits = np.where(np.isnan(self.draws), worst, self.draws)
-        part = 1.0 - fraction if self.merit.larger else fraction
-        return float(np.quantile(merits, part, method="lower" if self.merit.larger else "higher"))
-
-    @check_arguments
-    def yield_at(self, requirement: float) -> Yield:
-        """Return the fraction of the telescopes that meet a requirement on the merit, with its binomial error."""
-        return Yield.of(self.draws, requirement, larger=self.merit.larger)
-
 
 def _draw(study: ToleranceStudy, ax: Axes | Figure | None) -> Figure:
     shown = study.offenders[:SHOWN][::-1]
-    scale = study.merit.scale
+    scale = study.criterion.scale
     with styled():
         figure = figure_at(ax, 9.6, 1.5 + 0.24 * len(shown))
         axes, drawn = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1.0))
@@ -153,7 +111,7 @@ def _draw(study: ToleranceStudy, ax: Axes | Figure | None) -> Figure:
                 axes.text(0.0, row, " light is lost", va="center", fontsize=7)
         name_rows(axes, study, shown)
         axes.axvline(0.0, color=GREY, linewidth=0.8)
-        axes.set_xlabel(f"change of the {study.merit.title}{merit_unit(study)},\nthe tolerance alone")
+        axes.set_xlabel(f"change of the {study.criterion.title}{merit_unit(study)},\nthe tolerance alone")
         axes.legend(loc="lower right")
         effect, error = (scale * v[:, shown] for v in study.effects)
         for end, color, name in ((0, BLUE, "lowest third"), (1, RED, "highest third")):
@@ -178,7 +136,7 @@ def name_rows(axes: Axes, study: ToleranceStudy, shown: np.ndarray) -> None:
 
 def merit_unit(study: ToleranceStudy) -> str:
     """Return the unit of the merit for a label."""
-    return f" [{study.merit.unit}]".replace("um", "µm").replace("urad", "µrad") if study.merit.unit else ""
+    return f" [{study.criterion.unit}]".replace("um", "µm").replace("urad", "µrad") if study.criterion.unit else ""
 
 
 def study_title(study: ToleranceStudy, text: str) -> str:

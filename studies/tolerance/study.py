@@ -15,14 +15,15 @@ from ...core.arguments import check_arguments
 from ...core.errors import ConfigError
 from ...core.long_work import Execution
 from ...core.threads import one_blas_thread
-from ...design.optimize.toleranced_merit import TolerancedMerit
+from ...design.optimize.merit import Beams
+from ...design.tolerancing.criterion import Criterion
+from ...design.tolerancing.toleranced_merit import TolerancedMerit
 from ...models.parameters.tolerances import draw
 from ...models.paraxial import following_stop
 from ...models.telescope import Telescope
 from ..sweep.store import PointResult, StoreKind, SweepPoint, open_store
 from .file import ToleranceFile
 from .measurement import DRAW, INVERSE, LOWER, NOMINAL, UPPER, Batch, ToleranceMeasurement
-from .merits import tolerance_merit
 from .plan import tolerance_plan
 from .result import ToleranceStudy
 
@@ -68,50 +69,50 @@ def run_tolerances(
     if merit is not None and file.method != "traced":
         raise ConfigError(f"method = {file.method!r}: expected 'traced' for a merit of one's own")
     plan = tolerance_plan(file, following_stop(telescope))
-    judged = tolerance_merit(file, plan.telescope, merit)
+    criterion = _criterion(file, plan.telescope, merit)
     if plan.telescope.design_data.aiming != telescope.design_data.aiming:
-        filled = f"{judged.definition}; rays fill the stop {telescope.design_data.stop}, aiming: real"
-        judged = replace(judged, definition=filled)
-    built = TolerancedMerit.of(
-        plan.telescope, plan.tolerances, plan.compensators, plan.degrees_of_freedom, judged.judge
+        filled = f"{criterion.definition}; rays fill the stop {telescope.design_data.stop}, aiming: real"
+        criterion = replace(criterion, definition=filled)
+    toleranced = TolerancedMerit.of(
+        plan.telescope, plan.tolerances, plan.compensators, plan.degrees_of_freedom, criterion
     )
-    measured = ToleranceMeasurement(built, judged, file.loss_percent / 100.0)
+    measurement = ToleranceMeasurement(toleranced, file.loss_percent / 100.0)
     n = len(plan.tolerances)
     deviations = draw(plan.tolerances, file.seed, file.draws)
-    points, values = _points(measured, deviations if file.method == "traced" else deviations[:0])
-    numbers = _numbers(measured, points, values, file, store, execution or Execution())
+    traced = file.method == "traced"
+    points, values = _points(toleranced, deviations if traced else deviations[:0])
+    numbers = _numbers(measurement, points, values, file, store, execution or Execution())
     ends = numbers[1 : 1 + 2 * n].reshape(n, 2)
-    if file.method == "traced":
-        drawn = numbers[1 + 3 * n :]
-    else:
-        drawn = built.linear(deviations) if file.method == "linear" else built.quadratic(deviations)
-    units = plan.degrees_of_freedom.units
-    return ToleranceStudy(
-        telescope=telescope.name,
-        merit=judged,
-        method=file.method,
-        tolerances=plan.tolerances,
-        compensators=plan.compensators,
-        units=units[:n],
-        compensator_units=units[n:],
-        nominal=float(numbers[0]),
+    return ToleranceStudy.of(
+        toleranced,
+        file.method,
+        deviations,
+        numbers[1 + 3 * n :] if traced else None,
+        float(numbers[0]),
         lower=ends[:, 0],
         upper=ends[:, 1],
         inverse=numbers[1 + 2 * n : 1 + 3 * n],
-        loss=measured.loss,
-        deviations=deviations,
-        moves=built.moves(deviations),
-        draws=drawn,
-        requirement=None if file.requirement is None else file.requirement / judged.scale,
+        loss=measurement.loss,
+        requirement=None if file.requirement is None else file.requirement / criterion.scale,
     )
 
 
-def _points(measured: ToleranceMeasurement, deviations: np.ndarray) -> tuple[list[SweepPoint], np.ndarray]:
+def _criterion(file: ToleranceFile, telescope: Telescope, function: Callable[[Telescope], float] | None) -> Criterion:
+    """Return the criterion of a file, or a function of one's own, for a telescope; it takes one thread."""
+    fields = None if file.fields_deg is None else np.deg2rad(file.fields_deg)
+    wavelengths = None if file.wavelengths_nm is None else np.array(file.wavelengths_nm) * 1e-9
+    weights = None if file.field_weights is None else list(file.field_weights)
+    beams = Beams.of(telescope, fields, wavelengths, field_weights=weights, n_pupil=file.rings, threads=1)
+    frequency = None if file.frequency_per_mm is None else 1e3 * file.frequency_per_mm
+    return Criterion.of(file.merit, telescope, beams, frequency=frequency, function=function)
+
+
+def _points(toleranced: TolerancedMerit, deviations: np.ndarray) -> tuple[list[SweepPoint], np.ndarray]:
     """Return all points, and deviations and compensators of each, shape [n_point, n_degree_of_freedom].
 
     The telescope as designed comes first, then the ends of each tolerance, the inverse sensitivities, and the draws.
     """
-    sizes = np.array([t.size for t in measured.built.tolerances])
+    sizes = np.array([t.size for t in toleranced.tolerances])
     n = len(sizes)
     ends = np.stack([-np.diag(sizes), np.diag(sizes)], axis=1).reshape(2 * n, n)
     rows = np.concatenate([np.zeros((1, n)), ends, np.zeros((n, n)), deviations])
@@ -119,7 +120,7 @@ def _points(measured: ToleranceMeasurement, deviations: np.ndarray) -> tuple[lis
     about += [{"kind": kind, "tolerance": i} for i in range(n) for kind in (LOWER, UPPER)]
     about += [{"kind": INVERSE, "tolerance": i} for i in range(n)]
     about += [{"kind": DRAW, "draw": i} for i in range(len(deviations))]
-    return [SweepPoint(i, one, 0) for i, one in enumerate(about)], measured.values_of(rows)
+    return [SweepPoint(i, one, 0) for i, one in enumerate(about)], toleranced.compensated(rows)
 
 
 def _numbers(

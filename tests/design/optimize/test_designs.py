@@ -46,7 +46,15 @@ def test_an_achromatic_doublet(doublet):
 def test_two_numbers(doublet):
     """The rms of the spots leaves penalties out, the other number holds them."""
     target = pachon.FocalLength(0.2, weight=1.0)
-    found = optimize(doublet, ["S1.curvature"], "spots", [[0.0, 0.0]], targets=[target], max_steps=1, n_pupil=3)
+    found = optimize(
+        doublet,
+        ["S1.curvature"],
+        "spots",
+        [[0.0, 0.0]],
+        targets=[target],
+        solver=pachon.LeastSquares(max_steps=1),
+        n_pupil=3,
+    )
     alone = SpotMerit(doublet, Beams.of(doublet, [[0.0, 0.0]], n_pupil=3)).residuals(doublet)
     assert found.merits[0] == pytest.approx(np.linalg.norm(alone), rel=1e-12)
     penalty = 0.2 - pachon.FocalLength(0.2).measure(doublet)
@@ -74,7 +82,9 @@ def test_limits_that_nobody_stated(lens):
     start = lens([(20.0, 4.0, "N-BK7"), (-20.0, 15.0, "")], pupil=16.0, field_deg=0.5)
     pull = [pachon.FocalLength(2e-3, weight=100.0)]
     variables = ["S1.radius", "S2.radius", "S1.thickness"]
-    found = optimize(start, variables, "spots", [[0.0, 0.0]], targets=pull, n_pupil=2, max_steps=15)
+    found = optimize(
+        start, variables, "spots", [[0.0, 0.0]], targets=pull, n_pupil=2, solver=pachon.LeastSquares(max_steps=15)
+    )
     assert np.all(np.abs(found.values[:2]) >= 8e-3)
     assert found.values[2] >= 0.0
 
@@ -150,7 +160,9 @@ def test_a_triplet_from_a_poor_start(lens):
         *(pachon.EdgeThickness(name, minimum=0.1e-3) for name in ("S2", "S4")),
         pachon.TotalLength(maximum=35e-3),
     ]
-    found = optimize(poor, variables, "spots", fields, [F, D, C], targets=operands, max_steps=300)
+    found = optimize(
+        poor, variables, "spots", fields, [F, D, C], targets=operands, solver=pachon.LeastSquares(max_steps=300)
+    )
     assert found.merits[0] > 2e-3
     assert found.merits[1] <= reference.merits[1]
     for one in found.operands[1:]:
@@ -176,7 +188,7 @@ def test_a_corrector_of_another_glass():
         changed.append(replace(design, surfaces=surfaces))
     variables = [f"{name}.curvature" for name in lenses]
     variables += ["L1_exit.thickness", "L2_exit.thickness", "M3.thickness", "Detector.dz", "L2_exit.conic"]
-    found = optimize(changed, variables, "spots", fields, n_pupil=4, max_steps=80)
+    found = optimize(changed, variables, "spots", fields, n_pupil=4, solver=pachon.LeastSquares(max_steps=80))
     before = optimize(designs, ["Detector.dz"], "spots", fields, n_pupil=4)
     # In the beginning the images are lost; in the end they are as they were within a few tens of per cent.
     assert found.merits[0] > 50 * before.merits[1]
@@ -217,9 +229,10 @@ def test_configurations_share_variables_and_have_their_own(zoom):
 
 
 def test_restarts_keep_the_best_and_depend_on_the_seed_alone(doublet):
-    how = dict(merit="spots", fields=[[0.0, 0.0]], targets=[pachon.FocalLength(0.1)], n_pupil=2, max_steps=4)
-    alone = optimize(doublet, ACHROMAT, **how)
-    found, again = (optimize(doublet, ACHROMAT, restarts=2, seed=3, spread=0.5, **how) for _ in range(2))
+    how = dict(merit="spots", fields=[[0.0, 0.0]], targets=[pachon.FocalLength(0.1)], n_pupil=2)
+    alone = optimize(doublet, ACHROMAT, solver=pachon.LeastSquares(max_steps=4), **how)
+    solver = pachon.LeastSquares(max_steps=4, restarts=2, seed=3, spread=0.5)
+    found, again = (optimize(doublet, ACHROMAT, solver=solver, **how) for _ in range(2))
     assert np.array_equal(found.changes, again.changes)
     assert found.history[-1] <= alone.history[-1]
 
@@ -229,7 +242,13 @@ def test_glasses_of_a_catalogue(lens):
     """A doublet of two crowns becomes one of crown and flint, as good as with glasses that do not exist."""
     crowns = lens([(np.inf, 4.0, "N-BK7"), (np.inf, 2.0, "N-BAK4"), (np.inf, 100.0, "")], pupil=5.0, field_deg=0.5)
     start = apply(crowns, {"S1.curvature": -15.0, "S2.curvature": 5.0})
-    how = dict(fields=[[0.0, 0.0]], wavelengths=[D, F, C], targets=[pachon.FocalLength(0.1)], n_pupil=3, max_steps=60)
+    how = dict(
+        fields=[[0.0, 0.0]],
+        wavelengths=[D, F, C],
+        targets=[pachon.FocalLength(0.1)],
+        n_pupil=3,
+        solver=pachon.LeastSquares(max_steps=60),
+    )
     plain = optimize(start, ACHROMAT, "spots", **how)
     found = pachon.choose_glasses(start, ACHROMAT, ["N-BAK4"], nearest=3, **how)
     assert len(found.trials) == 3
@@ -253,8 +272,7 @@ def test_glasses_of_a_catalogue(lens):
         ([], {}, ConfigError, "variables"),
         (["S1.curvature", "S1.curvature"], {}, ConfigError, "more than once"),
         (["S1.radius"], {"bounds": {"S1.radius": (-1.0, 1.0)}}, DomainError, "one sign"),
-        (["S1.curvature"], {"goal": np.zeros((1, 1, 1)), "merit": "wavefront"}, ConfigError, "2 configurations"),
-        (["S1.curvature"], {"restarts": -1}, DomainError, "restarts"),
+        (["S1.curvature"], {"merit": pachon.WavefrontError(np.zeros((1, 1, 1)))}, ConfigError, "2 configurations"),
     ],
 )
 def test_wrong_configurations(zoom, variables, options, error, words):

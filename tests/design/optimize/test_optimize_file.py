@@ -47,9 +47,9 @@ def test_units(arguments):
     twelve = float(np.deg2rad(12.0))
     assert found["bounds"]["S2.thickness"] == pytest.approx((0.5e-3, 6e-3))
     assert found["bounds"]["S1.radius"] == pytest.approx((-20e-3, -10e-3))
-    assert np.asarray(found["fields"])[1] == pytest.approx([0.0, twelve])
-    assert found["wavelengths"] == pytest.approx([486.1e-9, 587.6e-9])
-    focal, distortion, angle, edge, mtf, spot = found["targets"]
+    assert np.asarray(found["telescope"].fields)[1] == pytest.approx([0.0, twelve])
+    assert found["telescope"].wavelengths == pytest.approx([486.1e-9, 587.6e-9])
+    focal, distortion, angle, edge, mtf, spot = found["telescope"].operands
     assert focal == pachon.FocalLength(0.025, weight=2.0)
     assert (distortion.field, distortion.minimum, distortion.maximum) == ((0.0, pytest.approx(twelve)), -0.01, 0.01)
     assert angle.maximum == pytest.approx(np.pi / 4)
@@ -57,7 +57,7 @@ def test_units(arguments):
     assert (edge.radius, edge.minimum) == (pytest.approx(4e-3), pytest.approx(5e-4))
     assert (mtf.frequency, mtf.angle, mtf.minimum) == (pytest.approx(4e4), pytest.approx(np.pi / 2), 0.5)
     assert (spot.wavelengths, spot.n_pupil, spot.maximum) == ((pytest.approx(5e-7),), 3, pytest.approx(5e-6))
-    result = optimize(**{**found, "max_steps": 1, "n_pupil": 2})
+    result = optimize(**{**found, "solver": pachon.LeastSquares(max_steps=1), "n_pupil": 2})
     assert len(result.operands) == 6
 
 
@@ -78,7 +78,7 @@ def test_configurations(arguments, tmp_path, triplet):
     assert second.weight == 2.0
     assert np.asarray(second.fields)[0, 1] == pytest.approx(np.deg2rad(5.0))
     assert found["bounds"] == {"near:S7.thickness": pytest.approx((15e-3, 25e-3))}
-    result = optimize(**{**found, "max_steps": 2, "n_pupil": 2})
+    result = optimize(**{**found, "solver": pachon.LeastSquares(max_steps=2), "n_pupil": 2})
     assert [(o.configuration, o.operand.kind) for o in result.operands] == [("near", "f_number")]
 
 

@@ -10,8 +10,8 @@ import pytest
 import pachon
 from pachon.core.errors import ConfigError, DomainError, PachonError, UnknownNameError
 from pachon.core.files import json_text
-from pachon.design.optimize.monte_carlo import monte_carlo
 from pachon.design.optimize.optimize import optimize
+from pachon.design.tolerancing.monte_carlo import monte_carlo
 from pachon.models.io.grid_file import write_grid
 from pachon.models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
 from pachon.models.parameters.tolerances import Tolerance, draw
@@ -65,7 +65,8 @@ def rms_wavefront(telescope, fields, wavelength):
 
 def test_the_merit_is_the_rms_of_the_wavefront(lsst_r):
     tolerance = [Tolerance("M2.dx", 200e-6)]
-    found = monte_carlo(lsst_r, tolerance, n=2, seed=1, fields=FIELDS, wavelengths=620e-9, method="traced")
+    request = pachon.Request.of(lsst_r, FIELDS, 620e-9, n_pupil=6)
+    found = monte_carlo(request, tolerance, n=2, seed=1, method="traced")
     # Quadrature over the pupil against a grid of cells at its rims: a per cent.
     assert found.nominal == pytest.approx(rms_wavefront(lsst_r, FIELDS, 620e-9), rel=0.015)
     for values, merit in zip(found.deviations, found.merit, strict=True):
@@ -133,7 +134,7 @@ def test_contributions_add_in_squares(lsst_r):
 def test_compensators_are_where_an_optimisation_puts_them(lsst_r):
     tolerances = [Tolerance("M2.dz", 20e-6), Tolerance("M2.rx", 2e-5)]
     free = ["Camera.dz", "Camera.rx"]
-    found = monte_carlo(lsst_r, tolerances, n=2, seed=9, fields=FIELDS, compensators=free, method="traced", n_pupil=6)
+    found = monte_carlo(lsst_r, tolerances, n=2, seed=9, fields=FIELDS, compensators=free, method="traced")
     for values, moves, merit in zip(found.deviations, found.moves, found.merit, strict=True):
         moved = lsst_r.perturbed("M2", shift=(0, 0, values[0]), tilt=(values[1], 0, 0))
         best = optimize(moved, free, "wavefront", FIELDS, n_pupil=6)
@@ -144,7 +145,10 @@ def test_compensators_are_where_an_optimisation_puts_them(lsst_r):
 
 def test_many_draws_are_the_same_for_a_seed(lsst_r):
     tolerances = [Tolerance("M2.dz", 20e-6), Tolerance("Camera.ry", 2e-5, "normal")]
-    one, two = (monte_carlo(lsst_r, tolerances, n=500, seed=3, threads=t) for t in (1, 2))
+    fields = pachon.design.optimize.sensitivity.field_rings(lsst_r)
+    requests = [pachon.Request.of(lsst_r, fields, n_pupil=6, threads=threads) for threads in (1, 2)]
+    one, two = (monte_carlo(request, tolerances, n=500, seed=3) for request in requests)
+    assert np.array_equal(one.merit, monte_carlo(lsst_r, tolerances, n=500, seed=3).merit)
     assert np.array_equal(one.merit, two.merit)
     shares = [one.at_most(s) for s in (0.1, 0.5, 0.9)]
     assert shares == sorted(shares)
@@ -188,6 +192,8 @@ def test_lost_telescopes_count_as_the_worst(lsst_r):
         (dict(n=0), DomainError, "n = 0"),
         (dict(n=2.5), DomainError, "n = 2.5"),
         (dict(seed=-1), DomainError, "seed = -1"),
+        (dict(wavelengths=[6e-7]), ConfigError, r"wavelengths: no argument of monte_carlo; expected a Request"),
+        (dict(threads=1), ConfigError, r"threads: no argument of monte_carlo; expected a Request"),
         (dict(degrees_of_freedom=load_degrees_of_freedom("lsst")), UnknownNameError, "M2_dz"),
     ],
 )
@@ -195,6 +201,11 @@ def test_bad_arguments(lsst_r, change, error, words):
     with pytest.raises(error, match=words) as caught:
         monte_carlo(lsst_r, **(dict(tolerances=[Tolerance("M2.dz", 1e-6)], fields=FIELDS[:1]) | change))
     assert "\n" not in str(caught.value)
+
+
+def test_fields_stand_in_a_request_or_beside_a_telescope(lsst_r):
+    with pytest.raises(ConfigError, match=r"fields = .*: given beside a Request, which has its own"):
+        monte_carlo(pachon.Request.of(lsst_r, FIELDS[:1]), [Tolerance("M2.dz", 1e-6)], fields=FIELDS[:1])
 
 
 @pytest.mark.parametrize(

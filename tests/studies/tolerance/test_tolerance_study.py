@@ -82,11 +82,11 @@ def test_inverse_sensitivities_cost_the_loss(triplet, study):
 def test_offenders_and_quantiles(study):
     order = study.offenders
     assert np.all(np.diff(study.cost[order]) <= 0)
-    assert study.at_most(1.0) == study.draws.max()
+    assert study.at_most(1.0) == study.merit.max()
     assert study.yield_at(study.at_most(0.8)).fraction == pytest.approx(0.8, abs=1 / 30)
     requirement = study.yield_at(study.requirement)
     assert study.requirement == pytest.approx(6.4e-6)
-    assert requirement.fraction == np.mean(study.draws <= 6.4e-6)
+    assert requirement.fraction == np.mean(study.merit <= 6.4e-6)
     assert 0.0 < requirement.low < requirement.fraction < requirement.high < 1.0
 
 
@@ -126,7 +126,7 @@ def test_the_same_numbers_of_any_workers(triplet, study, tmp_path):
     assert folders[0] == folders[1]
     table = Table.read(folder / "draws.ecsv")
     assert len(table) == 30
-    assert list(table["merit"]) == pytest.approx(study.draws * 1e6)
+    assert list(table["merit"]) == pytest.approx(study.merit * 1e6)
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["yield"]["fraction"] == pytest.approx(study.yield_at(study.requirement).fraction)
     assert summary["worst_offenders"][0]["name"] == study.tolerances[study.offenders[0]].name
@@ -145,7 +145,7 @@ def test_a_method_without_tracing(triplet, study):
     found = run_tolerances(triplet, file_of(method="quadratic"))
     assert np.array_equal(found.deviations, study.deviations)
     assert np.array_equal(found.lower, study.lower)
-    assert np.sqrt(np.mean((found.draws - study.draws) ** 2)) < 0.05 * study.draws.std()
+    assert np.sqrt(np.mean((found.merit - study.merit) ** 2)) < 0.05 * study.merit.std()
 
 
 def shortened(telescope):
@@ -163,7 +163,7 @@ def test_a_merit_of_ones_own(triplet):
     # The space is 754 um long: ten per cent of the length would not fit into it, and no light passes beyond.
     far = run_tolerances(triplet, ToleranceFile.model_validate({**content, "loss_percent": 10}), merit=shortened)
     assert far.inverse[0] == pytest.approx(754.469, rel=1e-3)
-    assert found.draws == pytest.approx(length + 1e-6 * found.deviations[:, 0])
+    assert found.merit == pytest.approx(length + 1e-6 * found.deviations[:, 0])
     with pytest.raises(ConfigError, match="one's own"):
         run_tolerances(triplet, ToleranceFile.model_validate({**content, "method": "linear"}), merit=shortened)
 
@@ -184,9 +184,9 @@ def test_other_merits(triplet, merit):
         full = pachon.mtf(triplet, fields, n_pupil=64)
         rows = [np.interp(2e4, full.frequency, r) for r in (*full.tangential, *full.sagittal)]
         assert found.nominal == pytest.approx(np.mean(rows), abs=0.05)
-        assert found.merit.larger
+        assert found.criterion.larger
         assert found.cost[0] > 0
-        assert found.at_most(1.0) == found.draws.min()
+        assert found.at_most(1.0) == found.merit.min()
     assert tolerance_summary(found)["merit"] == merit
 
 
@@ -201,7 +201,7 @@ def test_settings_and_lost_light(triplet, tmp_path):
     assert found.cost[0] == np.inf
     assert 0 < tolerance_summary(found)["lost"] < 6
     assert found.at_most(1.0) == np.inf
-    assert found.yield_at(1.0).fraction == np.mean(np.isfinite(found.draws))
+    assert found.yield_at(1.0).fraction == np.mean(np.isfinite(found.merit))
 
 
 def test_a_store_that_is_none(triplet, tmp_path):
@@ -229,8 +229,8 @@ def test_a_thousand_traced_triplets(triplet):
     traced = run_tolerances(triplet, ToleranceFile.model_validate(content))
     seconds = time.process_time() - start
     linear = run_tolerances(triplet, ToleranceFile.model_validate({**content, "method": "linear"}))
-    spread = traced.draws.std()
-    off = np.sqrt(np.mean((linear.draws - traced.draws) ** 2)) / spread
+    spread = traced.merit.std()
+    off = np.sqrt(np.mean((linear.merit - traced.merit) ** 2)) / spread
     print(f"{len(traced.tolerances)} tolerances, 1000 draws: {seconds:.1f} s; linear off by {off:.4f} of the spread")
     assert off < 0.02
 
@@ -242,6 +242,6 @@ def test_what_thirds_of_a_deviation_do_in_the_draws(study):
         order = np.argsort(column)
         for end, inner in enumerate((order[:10], order[-10:])):
             outer = np.setdiff1d(order, inner)
-            a, b = study.draws[inner], study.draws[outer]
+            a, b = study.merit[inner], study.merit[outer]
             assert effect[end, i] == pytest.approx(a.mean() - b.mean(), rel=1e-12)
             assert error[end, i] == pytest.approx(np.hypot(a.std(ddof=1) / 10**0.5, b.std(ddof=1) / 20**0.5), rel=1e-12)

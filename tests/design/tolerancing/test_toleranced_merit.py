@@ -5,10 +5,11 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 import pachon
-from pachon.design.optimize.merit import Beams, SpotMerit
-from pachon.design.optimize.monte_carlo import monte_carlo
-from pachon.design.optimize.toleranced_merit import TolerancedMerit
-from pachon.design.optimize.yields import Yield
+from pachon.design.optimize.merit import Beams
+from pachon.design.tolerancing.criterion import Criterion
+from pachon.design.tolerancing.monte_carlo import monte_carlo
+from pachon.design.tolerancing.toleranced_merit import TolerancedMerit
+from pachon.design.tolerancing.yields import Yield
 from pachon.models.parameters.degrees_of_freedom import DegreesOfFreedom
 from pachon.models.parameters.parameters import apply
 from pachon.models.parameters.tolerances import Tolerance
@@ -30,8 +31,8 @@ def triplet():
 @pytest.fixture(scope="module")
 def built(triplet):
     dof = DegreesOfFreedom.of_parameters(triplet, [*(t.name for t in TOLERANCES), "Image.dz"])
-    judge = SpotMerit(triplet, Beams.of(triplet, FIELDS, n_pupil=3))
-    return TolerancedMerit.of(triplet, TOLERANCES, ("Image.dz",), dof, judge)
+    criterion = Criterion.of("spots", triplet, Beams.of(triplet, FIELDS, n_pupil=3))
+    return TolerancedMerit.of(triplet, TOLERANCES, ("Image.dz",), dof, criterion)
 
 
 def test_second_derivatives(triplet, built):
@@ -40,7 +41,7 @@ def test_second_derivatives(triplet, built):
     steps = np.array([5e-6, 1e-5, 0.02, 1e-4, 1e-5])
 
     def square(values):
-        return np.sum(built.judge.residuals(apply(triplet, dict(zip(names, values, strict=True)))) ** 2)
+        return np.sum(built.criterion.judge.residuals(apply(triplet, dict(zip(names, values, strict=True)))) ** 2)
 
     start, gradient, hessian = built.second_order
     assert start == pytest.approx(square(np.zeros(5)), rel=1e-12)
@@ -61,7 +62,7 @@ def test_quadratic_compensation_is_the_best_focus(triplet, built):
     found = built.quadratic(deviations)[0]
     moved = apply(triplet, dict(zip([t.name for t in TOLERANCES], deviations[0], strict=True)))
     best = minimize_scalar(
-        lambda h: np.linalg.norm(built.judge.residuals(apply(moved, {"Image.dz": h}))),
+        lambda h: np.linalg.norm(built.criterion.judge.residuals(apply(moved, {"Image.dz": h}))),
         bounds=(-1e-4, 1e-4),
         method="bounded",
     ).fun
@@ -71,9 +72,10 @@ def test_quadratic_compensation_is_the_best_focus(triplet, built):
 
 def test_methods_and_their_yields_agree(triplet):
     """Tolerances of good work: merits within 2 per cent of their spread, yields within their binomial errors."""
-    how = dict(merit="spots", n=100, seed=2, compensators=["Image.dz"], fields=FIELDS, n_pupil=3)
+    how = dict(merit="spots", n=100, seed=2, compensators=["Image.dz"])
+    request = pachon.Request.of(triplet, FIELDS, n_pupil=3)
     linear, quadratic, traced = (
-        monte_carlo(triplet, TOLERANCES, method=m, **how) for m in ("linear", "quadratic", "traced")
+        monte_carlo(request, TOLERANCES, method=m, **how) for m in ("linear", "quadratic", "traced")
     )
     assert np.array_equal(linear.deviations, traced.deviations)
     spread = traced.merit.std()

@@ -1,4 +1,4 @@
-"""Merit of a telescope as a function of deviations within tolerances, with compensators: exact, linear, quadratic."""
+"""Merit of a telescope as a function of deviations within tolerances, with compensators: traced, linear, quadratic."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...models.parameters.parameters import Parameter, apply
 from ...models.parameters.tolerances import Tolerance
 from ...models.telescope import Telescope
-from .jacobian import ParameterColumns
-from .merit import Merit
-from .optimize import NO_EFFECT
+from ..optimize.jacobian import ParameterColumns
+from ..optimize.optimize import NO_EFFECT
+from .criterion import Criterion
 
 #: Steps of the differences of gradients, in standard deviations of the tolerances.
 _STEP = 0.5
@@ -34,8 +34,8 @@ class TolerancedMerit:
         Degrees of freedom that follow, behind the tolerances in `degrees_of_freedom`.
     degrees_of_freedom : DegreesOfFreedom
         Degrees of freedom of tolerances and compensators, in this order.
-    judge : Merit
-        Merit with derivatives.
+    criterion : Criterion
+        The number, and the merit with derivatives that sets the compensators.
     prepared, parameters, matrix
         As in :meth:`DegreesOfFreedom.parameter_matrix`.
     residuals : ndarray, shape [n]
@@ -50,7 +50,7 @@ class TolerancedMerit:
     tolerances: tuple[Tolerance, ...]
     compensators: tuple[str, ...]
     degrees_of_freedom: DegreesOfFreedom
-    judge: Merit
+    criterion: Criterion
     prepared: Telescope
     parameters: tuple[Parameter, ...]
     matrix: np.ndarray
@@ -66,24 +66,26 @@ class TolerancedMerit:
         tolerances: tuple[Tolerance, ...],
         compensators: tuple[str, ...],
         degrees_of_freedom: DegreesOfFreedom,
-        judge: Merit,
+        criterion: Criterion,
     ) -> TolerancedMerit:
         """Return the merit with its derivatives; a compensator without effect is a DomainError."""
         prepared, parameters, matrix = degrees_of_freedom.parameter_matrix(telescope)
         columns = ParameterColumns.at(prepared, parameters)
-        residuals, slopes = judge.derivatives(columns)
+        residuals, slopes = criterion.judge.derivatives(columns)
         slopes = slopes @ matrix
         n = len(tolerances)
         by_draw, by_free = slopes[:, :n], slopes[:, n:]
         # Rounding errors of the effects, a fraction of the terms that cancel.
-        least = NO_EFFECT * (judge.size_of_terms(columns) @ np.abs(matrix))[n:] if compensators else np.zeros(0)
+        least = np.zeros(0)
+        if compensators:
+            least = NO_EFFECT * (criterion.judge.size_of_terms(columns) @ np.abs(matrix))[n:]
         setting = _settings(by_free, compensators, least)
         return cls(
             telescope,
             tolerances,
             compensators,
             degrees_of_freedom,
-            judge,
+            criterion,
             prepared,
             parameters,
             matrix,
@@ -99,7 +101,7 @@ class TolerancedMerit:
         return self.residuals - self.by_free @ (self.setting @ self.residuals)
 
     @cached_property
-    def left(self) -> np.ndarray:
+    def by_deviation(self) -> np.ndarray:
         """Derivatives of the residuals with respect to the deviations, compensated, shape [n, n_tolerance]."""
         return self.by_draw - self.by_free @ (self.setting @ self.by_draw)
 
@@ -116,7 +118,7 @@ class TolerancedMerit:
     @property
     def contribution(self) -> np.ndarray:
         """Rms contribution of each tolerance alone, in quadrature, to first order [m], shape [n_tolerance]."""
-        return np.linalg.norm(self.left, axis=0) * self.spreads
+        return np.linalg.norm(self.by_deviation, axis=0) * self.spreads
 
     def moves(self, deviations: np.ndarray) -> np.ndarray:
         """Return the compensators for deviations [n, n_tolerance] by linear least squares, [n, n_compensator]."""
@@ -125,8 +127,8 @@ class TolerancedMerit:
     def linear(self, deviations: np.ndarray) -> np.ndarray:
         """Return the merit for deviations [n, n_tolerance], residuals linear in them [m], shape [n]."""
         # |r + J v|^2 through the small matrices J^T J and J^T r.
-        square = self.fixed @ self.fixed + 2.0 * deviations @ (self.left.T @ self.fixed)
-        square = square + np.einsum("ni,ij,nj->n", deviations, self.left.T @ self.left, deviations)
+        square = self.fixed @ self.fixed + 2.0 * deviations @ (self.by_deviation.T @ self.fixed)
+        square = square + np.einsum("ni,ij,nj->n", deviations, self.by_deviation.T @ self.by_deviation, deviations)
         return np.sqrt(np.maximum(square, 0.0))
 
     def quadratic(self, deviations: np.ndarray) -> np.ndarray:
@@ -160,26 +162,32 @@ class TolerancedMerit:
     def _gradient(self, values: np.ndarray) -> np.ndarray:
         """Return the gradient of the square of the merit [m^2 per unit] at deviations and compensators."""
         columns = ParameterColumns.at(self.prepared, self.parameters, self.matrix @ values)
-        residuals, slopes = self.judge.derivatives(columns)
+        residuals, slopes = self.criterion.judge.derivatives(columns)
         gradient: np.ndarray = 2.0 * residuals @ slopes @ self.matrix
         return gradient
 
-    @property
-    def nominal_telescope(self) -> Telescope:
-        """The telescope as designed, compensated to first order."""
-        still = np.concatenate([np.zeros(len(self.tolerances)), -(self.setting @ self.residuals)])
-        return self.degrees_of_freedom.apply(self.telescope, still)
+    def compensated(self, deviations: np.ndarray) -> np.ndarray:
+        """Return deviations [n, n_tolerance] with their compensators behind, [n, n_tolerance + n_compensator]."""
+        return np.concatenate([deviations, self.moves(deviations)], axis=1)
 
     def telescope_at(self, values: np.ndarray) -> Telescope:
         """Return the telescope at deviations and compensators, shape [n_tolerance + n_compensator]."""
         return apply(self.prepared, dict(zip(self.parameters, self.matrix @ values, strict=True)))
 
-    def measure(self, telescope: Telescope) -> float:
-        """Return the merit of a telescope [m]; NaN where its light is lost."""
+    def traced(self, values: np.ndarray) -> float:
+        """Return the criterion at deviations and compensators, in SI; NaN where there is no such telescope."""
+        if not values.any():
+            return self.criterion.measure(self.telescope)
         try:
-            return float(np.linalg.norm(self.judge.residuals(telescope)))
+            telescope = self.telescope_at(values)
         except PachonError:
             return np.nan
+        return self.criterion.measure(telescope)
+
+    @cached_property
+    def traced_nominal(self) -> float:
+        """Criterion of the telescope as designed, compensated to first order, in SI."""
+        return self.traced(self.compensated(np.zeros((1, len(self.tolerances))))[0])
 
 
 def _settings(slopes: np.ndarray, names: tuple[str, ...], least: np.ndarray) -> np.ndarray:

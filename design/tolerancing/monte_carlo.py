@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.arguments import check_arguments
+from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import ConfigError, check_choice
 from ...core.plotting import BLUE, GREY, RED, figure_at, plain_text, styled
 from ...core.result import Result
 from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...models.parameters.tolerances import Tolerance, draw
-from ...models.paraxial import following_stop
 from ...models.telescope import Telescope
-from ...wavefront.pupil_sampling import PupilSampling
-from .merit import Beams, Merit, SpotMerit, WavefrontMerit
-from .sensitivity import field_rings
+from ...wavefront.request import Request
+from ..optimize.merit import Beams, filling_stop
+from ..optimize.sensitivity import field_rings
+from .criterion import Criterion
 from .toleranced_merit import TolerancedMerit
 from .yields import Yield
 
@@ -27,12 +27,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MERITS: dict[str, Callable[[Telescope, Beams], Merit]] = {"wavefront": WavefrontMerit, "spots": SpotMerit}
+MERITS = ("wavefront", "spots")
 METHODS = ("linear", "quadratic", "traced")
 _PERCENTILES = (50, 80, 90, 95)
+_REQUEST = "a Request in place of the telescope, Request.of(telescope, fields, wavelengths, ...)"
+#: Arguments of :func:`monte_carlo` that a request holds.
+_REPLACED = dict.fromkeys(("wavelengths", "sampling", "n_pupil", "projection", "threads"), _REQUEST)
 #: Largest contributions in the plot.
 _BARS = 20
-_TITLES = {"wavefront": "rms wavefront", "spots": "rms spot radius"}
 
 
 @dataclass(frozen=True)
@@ -43,14 +45,14 @@ class MonteCarlo(Result):
     ----------
     telescope : str
         Name of the telescope.
-    merit_name : str
-        "wavefront" (rms without piston and tilt) or "spots" (rms radius), over all fields and wavelengths.
+    criterion : Criterion
+        The number that is kept good; merits are in SI.
     method : str
         "linear", "quadratic" or "traced".
     tolerances : tuple of Tolerance
         The tolerances.
     compensators : tuple of str
-        Degrees of freedom that are optimised for each draw.
+        Degrees of freedom that follow the deviations of each draw.
     units, compensator_units : tuple of str
         Units of the deviations and of the compensators.
     deviations : ndarray, shape [n, n_tolerance]
@@ -58,17 +60,18 @@ class MonteCarlo(Result):
     moves : ndarray, shape [n, n_compensator]
         Values of the compensators.
     merit : ndarray, shape [n]
-        Merit of each draw [m]; NaN where a traced telescope loses rays.
+        Merit of each draw [m]; NaN where a traced telescope loses its light.
     nominal : float
         Merit of the telescope without deviations, compensated [m].
     contribution : ndarray, shape [n_tolerance]
-        Rms contribution of each tolerance alone, compensated, in quadrature, to first order [m].
+        Rms contribution of each tolerance alone to the merit that compensators minimise, compensated, in quadrature,
+        to first order [m].
     """
 
     _table = ("merit", "deviations", "moves")
 
     telescope: str
-    merit_name: str
+    criterion: Criterion
     method: str
     tolerances: tuple[Tolerance, ...]
     compensators: tuple[str, ...]
@@ -80,15 +83,60 @@ class MonteCarlo(Result):
     nominal: float
     contribution: np.ndarray
 
+    @classmethod
+    def of(
+        cls,
+        toleranced: TolerancedMerit,
+        method: str,
+        deviations: np.ndarray,
+        traced: np.ndarray | None,
+        nominal: float,
+        **fields: Any,
+    ) -> Self:
+        """Return the result for deviations: their `traced` merits, or those that the method computes.
+
+        Further `fields` are those of a subclass.
+        """
+        count, units = len(toleranced.tolerances), toleranced.degrees_of_freedom.units
+        if traced is None:
+            traced = toleranced.linear(deviations) if method == "linear" else toleranced.quadratic(deviations)
+        return cls(
+            telescope=toleranced.telescope.name,
+            criterion=toleranced.criterion,
+            method=method,
+            tolerances=toleranced.tolerances,
+            compensators=toleranced.compensators,
+            units=units[:count],
+            compensator_units=units[count:],
+            deviations=deviations,
+            moves=toleranced.moves(deviations),
+            merit=traced,
+            nominal=nominal,
+            contribution=toleranced.contribution,
+            **fields,
+        )
+
+    @property
+    def merit_name(self) -> str:
+        """Name of the criterion, such as "wavefront" or "spots"."""
+        return self.criterion.name
+
     @check_arguments
     def at_most(self, fraction: float) -> float:
-        """Return the quantile of the merit [m] for a fraction (0 to 1) of the telescopes; lost ones count as worst."""
-        return float(np.quantile(np.where(np.isnan(self.merit), np.inf, self.merit), fraction, method="higher"))
+        """Return the merit that a fraction (0 to 1) of the telescopes reaches, in SI; lost ones are worst."""
+        worst = -np.inf if self.criterion.larger else np.inf
+        merits = np.where(np.isnan(self.merit), worst, self.merit)
+        quantile, method = (1.0 - fraction, "lower") if self.criterion.larger else (fraction, "higher")
+        return float(np.quantile(merits, quantile, method=method))
 
     @check_arguments
     def yield_at(self, requirement: float) -> Yield:
-        """Return the fraction of the telescopes whose merit [m] is at most a requirement, with its binomial error."""
-        return Yield.of(self.merit, requirement)
+        """Return the fraction of the telescopes that meet a requirement on the merit, with its binomial error."""
+        return Yield.of(self.merit, requirement, larger=self.criterion.larger)
+
+    def _meta(self) -> dict[str, Any]:
+        names = ("telescope", "merit_name", "method", "nominal")
+        return {name: getattr(self, name) for name in names}
 
     def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit."""
@@ -127,9 +175,7 @@ class MonteCarlo(Result):
                     left.annotate(
                         f"{percent} %: {value:.4g}", (value, percent), (6, -3), textcoords="offset points", va="top"
                     )
-            left.set(
-                xlabel=f"{_TITLES[self.merit_name]} [{unit}]", ylabel="telescopes at most there [%]", ylim=(0, 103)
-            )
+            left.set(xlabel=f"{self.criterion.title} [{unit}]", ylabel="telescopes at most there [%]", ylim=(0, 103))
             left.margins(x=0.12)
             left.legend(loc="lower right")
             left.set_title(f"{len(self.merit)} draws, {self.method}")
@@ -144,9 +190,10 @@ class MonteCarlo(Result):
             return figure
 
 
+@removed_arguments(**_REPLACED)
 @check_arguments
 def monte_carlo(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     tolerances: Iterable[Tolerance],
     merit: str = "wavefront",
     n: int = 100,
@@ -156,11 +203,6 @@ def monte_carlo(
     compensators: Iterable[str] = (),
     method: str = "linear",
     fields: ArrayLike | None = None,
-    wavelengths: ArrayLike | None = None,
-    sampling: str | PupilSampling = "gauss",
-    n_pupil: int | None = None,
-    projection: str = "zemax",
-    threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> MonteCarlo:
     """Return the merits of telescopes drawn within tolerances.
@@ -173,12 +215,12 @@ def monte_carlo(
 
     Parameters
     ----------
-    telescope, wavelengths, sampling, n_pupil, projection, threads
-        As in :func:`~pachon.design.optimize.optimize.optimize`.
+    telescope : Telescope or Request
+        The telescope as designed, with 6 rings of pupil points; or a request with the rays that are traced.
     tolerances : iterable of Tolerance
         Tolerances of degrees of freedom by name, or of parameters by address if there are none.
     merit : {"wavefront", "spots"}
-        Merit function.
+        Merit function: rms without piston and tilt, or rms radius, over all fields and wavelengths.
     n, seed : int
         Number of draws, and their seed.
     degrees_of_freedom : DegreesOfFreedom, optional
@@ -188,53 +230,37 @@ def monte_carlo(
     method : {"linear", "quadratic", "traced"}
         Method, see above.
     fields : array_like or Quantity, shape [n_field, 2], optional
-        Field angles [rad]; by default 31 over the field of view, see :func:`~.field_rings`.
+        Field angles [rad], of a telescope; by default 31 over the field of view, see :func:`~.field_rings`.
     progress : callable, optional
         Called with the number of draws done since the last call (traced method).
 
     Raises
     ------
     ConfigError
-        If a merit or method is unknown, or a name is both tolerance and compensator.
+        If a merit or method is unknown, a name is both tolerance and compensator, or fields are given beside a request.
     UnknownNameError, DomainError
         If a name does not exist, a number is out of range, or no light arrives.
     """
-    telescope, chosen, free = following_stop(telescope), tuple(tolerances), tuple(compensators)
     check_choice("merit", merit, MERITS)
     check_choice("method", method, METHODS)
-    deviations = draw(chosen, seed, n)
-    names = [t.name for t in chosen] + list(free)
+    tolerances, compensators = tuple(tolerances), tuple(compensators)
+    deviations = draw(tolerances, seed, n)
+    names = [t.name for t in tolerances] + list(compensators)
     for name in names:
         if names.count(name) > 1:
             raise ConfigError(f"{name!r} occurs more than once: expected either a tolerance or a compensator")
-    dof = (degrees_of_freedom or DegreesOfFreedom.of_parameters(telescope, names)).select(names)
-    fields = field_rings(telescope) if fields is None else fields
-    rays = Beams.of(
-        telescope, fields, wavelengths, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
-    )
-    built = TolerancedMerit.of(telescope, chosen, free, dof, MERITS[merit](telescope, rays))
-    moves = built.moves(deviations)
-    if method == "traced":
-        found = np.empty(len(deviations))
-        for i, values in enumerate(np.concatenate([deviations, moves], axis=1)):
-            found[i] = built.measure(built.telescope_at(values))
-            if progress is not None:
-                progress(1)
-        nominal = built.measure(built.nominal_telescope)
-    else:
-        found = built.linear(deviations) if method == "linear" else built.quadratic(deviations)
-        nominal = built.nominal
-    return MonteCarlo(
-        telescope=telescope.name,
-        merit_name=merit,
-        method=method,
-        tolerances=chosen,
-        compensators=free,
-        units=dof.units[: len(chosen)],
-        compensator_units=dof.units[len(chosen) :],
-        deviations=deviations,
-        moves=moves,
-        merit=found,
-        nominal=nominal,
-        contribution=built.contribution,
-    )
+    if not isinstance(telescope, Request) and fields is None:
+        fields = field_rings(telescope)
+    beams = Beams.of(filling_stop(telescope), fields)
+    filled = beams.request.telescope
+    dof = (degrees_of_freedom or DegreesOfFreedom.of_parameters(filled, names)).select(names)
+    criterion = Criterion.of(merit, filled, beams)
+    toleranced = TolerancedMerit.of(filled, tolerances, compensators, dof, criterion)
+    if method != "traced":
+        return MonteCarlo.of(toleranced, method, deviations, None, toleranced.nominal)
+    merits = np.empty(len(deviations))
+    for i, values in enumerate(toleranced.compensated(deviations)):
+        merits[i] = toleranced.traced(values)
+        if progress is not None:
+            progress(1)
+    return MonteCarlo.of(toleranced, method, deviations, merits, toleranced.traced_nominal)

@@ -1,0 +1,1 @@
+"""Tolerancing: criteria, merits of deviations with compensators, Monte Carlo, yields."""
