@@ -28,7 +28,7 @@ _COLUMNS = {
     "xi_plus_away_long": "ξ+ beyond 10'",
 }
 _CAPTION = (
-    "Residuals of the base, of the recommended model, and of the best order of each number of stars. Rms of one "
+    "Residuals of the base, the default, the recommended model, and the best order of each number of stars. Rms of one "
     "component of e: observed - model at the stars of the fit, which is too small; noise-free - model at holdout "
     "positions. Also at holdout positions: rms of the relative size, rms over CCDs of the mean e, and mean ξ+ from 10' "
     "to 3 deg."
@@ -106,7 +106,7 @@ def _show(result: Study) -> None:
     from ..studies.psf_choice.plan import FOCAL_PLANE
 
     plan, chosen, console = result.plan, result.recommended(), wide_console()
-    cases = [plan.base, *([chosen] if chosen is not None else [])]
+    cases = [plan.base, plan.default, *([chosen] if chosen is not None else [])]
     ways = ("equal", "softened", *(FOCAL_PLANE if plan.focal_plane else ()))
     for stars in plan.stars:
         cases += [best for how in ways if (best := result.best_order(stars, how))]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,8 +16,8 @@ from ..measure.catalogue.star_locus import StarSelection, select_stars
 from ..measure.shapes import measure_shapes
 from ..measure.star_selection import flag_stars
 from ..reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
-from ..reconstruction.psf_model.checks import snr_weights
 from ..reconstruction.psf_model.model import PsfModel
+from ..reconstruction.psf_model.recipe import DEFAULT, Recipe
 from .exposure import SATURATED
 from .image_file import CcdImage
 
@@ -49,17 +48,8 @@ def sky_variance(image: CcdImage) -> float:
     return float(np.median(image.variance[image.mask == 0]))
 
 
-def fit_image_psf(
-    image: CcdImage,
-    stars: StarSelection,
-    *,
-    basis: Literal["pca", "pixels", "shapelets"] = "pixels",
-    interpolation: Literal["polynomial", "gp", "kriging"] = "kriging",
-    order: int | None = None,
-) -> PsfModel:
+def fit_image_psf(image: CcdImage, stars: StarSelection, recipe: Recipe = DEFAULT) -> PsfModel:
     """Fit a PSF model of one CCD to the selected stars of its image; positions are pixels of the image.
-
-    Polynomials of pixels are weighted by S/N up to about 100, those of the paper's components are not.
 
     Raises
     ------
@@ -67,15 +57,12 @@ def fit_image_psf(
         If there are too few stars for the model.
     """
     height, width = image.image.shape
-    weighted = basis == "pixels" and interpolation == "polynomial"
     try:
         return PsfModel.fit(
             stars.stamps,
             stars.positions,
-            basis=basis,
-            interpolation=interpolation,
-            weights=snr_weights("softened", stars.snr) if weighted else None,
-            order=order,
+            recipe=recipe,
+            weights=recipe.star_weights(stars.snr),
             gain=image.gain,
             extent=(-0.5, width - 0.5, -0.5, height - 0.5),
         )

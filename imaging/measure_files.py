@@ -23,6 +23,7 @@ from ..core.version import VERSION
 from ..core.workers import MakeWorkers
 from ..pipeline.config import digest
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
+from ..reconstruction.psf_model.recipe import DEFAULT, Recipe
 from .image_file import CcdImage
 from .measure import measure_image
 
@@ -49,20 +50,23 @@ class FileMeasurement:
         Folder of the products; None for that of each image.
     psf : Path or None
         File of the model of all images; None for one of each image.
-    options : dict
-        Further arguments of :func:`~.measure.measure_image`.
+    recipe : Recipe or None
+        Of the models of the images; None for the default one.
+    min_snr : float
+        Least S/N of stars.
     """
 
     folder: Path | None
     psf: Path | None
-    options: dict[str, Any]
+    recipe: Recipe | None
+    min_snr: float
 
     def __call__(self, path: Path, threads: int) -> dict[str, Any] | str:
         """Measure an image, write its PSF model and its catalogue, and return its metrics, or why it has none."""
         psf = None if self.psf is None else _model_in(self.psf, content_hash(self.psf, ProductError))
         image = CcdImage.read(path)
         try:
-            catalogue = measure_image(image, psf=psf, threads=threads, **self.options)
+            catalogue = measure_image(image, psf=psf, recipe=self.recipe, min_snr=self.min_snr, threads=threads)
         except DomainError as error:
             return str(error)
         if psf is None:
@@ -81,7 +85,10 @@ class FileMeasurement:
         """Return the SHA-256 of all that decides the products of an image: its file, options, model, version."""
         model = None if self.psf is None else content_hash(self.psf, ProductError)
         image = content_hash(path, ProductError)
-        return digest({"image": image, "psf": model, "options": self.options, "version": VERSION})
+        options: dict[str, Any] = {"basis": None, "interpolation": None, "order": None, "min_snr": self.min_snr}
+        if self.recipe not in (None, DEFAULT):
+            options |= self.recipe.keys()
+        return digest({"image": image, "psf": model, "options": options, "version": VERSION})
 
     def finished(self, path: Path) -> dict[str, Any] | None:
         """Return the metrics of an image that is measured already, in the same way."""
@@ -114,7 +121,8 @@ def measure_files(
     folder: Path | None = None,
     *,
     psf: Path | None = None,
-    options: dict[str, Any] | None = None,
+    recipe: Recipe | None = None,
+    min_snr: float = 30.0,
     resume: bool = False,
     workers: MakeWorkers | None = None,
     threads: int | None = None,
@@ -133,8 +141,10 @@ def measure_files(
         Folder of the products; by default that of each image.
     psf : Path, optional
         File of a :class:`~pachon.FocalPlanePsf` of all images; by default a model of each image is fitted, and written.
-    options : dict, optional
-        Further arguments of :func:`~.measure.measure_image`.
+    recipe : Recipe, optional
+        Of the models of the images.
+    min_snr : float
+        Least S/N of stars.
     resume : bool
         Keep the products of images that were measured in the same way.
     workers : callable, optional
@@ -155,7 +165,7 @@ def measure_files(
             raise ConfigError(f"{folder}: two images are called {twice[0]}; expected different names, or no --out")
         names = [str(path) for path in images]
     reporter = Reporter(quiet=True) if reporter is None else reporter
-    measure = FileMeasurement(folder, psf, options or {})
+    measure = FileMeasurement(folder, psf, recipe, min_snr)
     metrics = {name: measure.finished(path) if resume else None for name, path in zip(names, images, strict=True)}
     due = {name: path for name, path in zip(names, images, strict=True) if metrics[name] is None}
     sizes = [path.stat().st_size for path in due.values() if path.is_file()]

@@ -33,9 +33,9 @@ def needed_bytes(experiment: Experiment, threads: int | None = None) -> int:
     workers = thread_count(threads) if config.psf.engine == "wave" else 0
     stamps = stars * experiment.stamp_size**2 * _STAMP_BYTES
     of_worker = _WAVE_THREAD + (0 if experiment.silicon is None else _SILICON_THREAD)
-    # The report holds the PSF model of every CCD; a model of pixels stores each star, and its weight under a process.
-    pixels = config.reconstruction.basis == "pixels"
-    models = 16 * len(resolved_value(config.ccds)) * config.stars.observed * experiment.stamp_size**2 if pixels else 0
+    # The report holds the PSF model of every CCD; one without components stores each star, and its weight in kriging.
+    stored_stars = 0 if config.reconstruction.psf_recipe().basis.has_components else config.stars.observed
+    models = 16 * len(resolved_value(config.ccds)) * stored_stars * experiment.stamp_size**2
     return max(_REPORT + models, _BASE + screen_bytes(experiment) + workers * of_worker + stamps)
 
 

@@ -72,9 +72,8 @@ def spectrum_plot(products: Sequence[CcdProduct]) -> bytes:
                 if total > 0:
                     missing = 1.0 - np.cumsum(model.eigenvalues) / total
                     right.plot(n[missing > 1e-15], missing[missing > 1e-15], "-", color=color, linewidth=0.8, alpha=0.7)
-        # Models of pixels have all components.
-        pixels = products[0].model.basis == "pixels"
-        count = (products[0].noise_free_model if pixels else products[0].model).n_components
+        chosen = products[0].model.basis.kind.has_components
+        count = (products[0].model if chosen else products[0].noise_free_model).n_components
         for axes in (left, right):
             axes.axvline(count + 0.5, color="0.5", linewidth=0.8, linestyle=(0, (4, 3)))
             axes.set(yscale="log", xlabel="component n", xlim=(0, 2.2 * count))
@@ -88,7 +87,7 @@ def spectrum_plot(products: Sequence[CcdProduct]) -> bytes:
         left.plot([], [], "-o", color=OBSERVED, markersize=3.5, label="observed stars, dot: elbow")
         left.plot([], [], "-o", color=TRUTH, markersize=3.5, label="noise-free PSFs, dot: elbow")
         left.legend(loc="upper right")
-        kept = "noise-free components kept" if pixels else "components kept"
+        kept = "components kept" if chosen else "noise-free components kept"
         left.set_title(f"eigenvalues, a line a CCD; dashed: {kept}", loc="left")
         left.set_ylabel("variance of unit-sum stamps along n")
         right.set_title("part of the variance beyond n", loc="left")

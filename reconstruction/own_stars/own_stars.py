@@ -20,7 +20,7 @@ from ..psf_model import kriging
 from ..psf_model.checks import as_extent
 from ..psf_model.model import PsfModel
 from ..psf_model.polynomial import as_positions
-from .candidates import CANDIDATES, KRIGING, choose_candidate
+from .candidates import CANDIDATES, choose_candidate
 from .result import OwnStars
 
 #: Fewest stars that a model is made of.
@@ -74,7 +74,7 @@ def fit_own_stars(
     seed : int
         Of the parts that are held out.
     **options
-        Options of :meth:`~.PsfModel.fit`, for kriging of pixels or another kind of model, without a choice.
+        Options of :meth:`~.PsfModel.fit`, `recipe` and its keys among them, for a kind of model without a choice.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def fit_own_stars(
     which = np.flatnonzero(used)
     parts = np.array_split(stream(require_seed(seed), "held-out stars").permutation(len(which)), min(FOLDS, len(which)))
     if options:
-        name, kind = "given", KRIGING | options
+        name, kind = "given", options
         predicted = predict(kind)
     else:
         name, predicted = choose_candidate(predict, centred[used], gain)

@@ -1,4 +1,4 @@
-"""Stamps in a basis: outliers rejected, masked pixels filled, stars projected on components."""
+"""Stars of a CCD to be modelled: outliers rejected, masked pixels filled."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .basis import Basis, pixel_grid, principal_components, shapelets
 from .masked_pixels import fill_masked, mean_and_flux
 from .outliers import find_outliers, restore_predicted
 
@@ -63,30 +62,3 @@ def cleaned_stars(
         mean = stars.mean(axis=0)
         deviations = np.where(by_mean, 0.0, stars - mean)
     return CleanStars(mean, deviations, rejected)
-
-
-def make_basis(
-    stars: CleanStars,
-    shape: tuple[int, int],
-    basis: str,
-    count: int,
-    scale: float | None,
-    weights: np.ndarray | None = None,
-) -> Basis:
-    """Return a basis of stars of a shape (ny, nx); `weights` [n_stars] are those of the stars in eigen-PSFs."""
-    if basis == "pixels":
-        return pixel_grid(stars.mean, stars.deviations)
-    if basis == "pca":
-        return principal_components(stars.mean, stars.deviations, count, weights)
-    return shapelets(stars.mean, stars.deviations, count, shape, scale)
-
-
-def project_stars(stars: CleanStars, found: Basis, basis: str) -> tuple[np.ndarray, np.ndarray]:
-    """Project stars onto their basis: coefficients [n_stars, k], and residual sums of squares [n_stars]."""
-    deviations = stars.deviations
-    if basis == "pixels":
-        return deviations, np.zeros(len(deviations))
-    if basis == "shapelets":
-        deviations = deviations + (stars.mean - found.mean)  # its mean is not that of the stars
-    coefficients = deviations @ found.vectors.T
-    return coefficients, ((deviations - coefficients @ found.vectors) ** 2).sum(axis=1)

@@ -19,14 +19,17 @@ Variances are in units of the noise of the middle star.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 import scipy.linalg
 
 from ...core.errors import DomainError
-from .polynomial import term_count
+from ...core.threads import one_blas_thread
+from .file_parts import ModelParts
+from .interpolation import FittedInterpolation, Interpolation, StarField
+from .polynomial import mapped, term_count
 
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
@@ -60,8 +63,78 @@ _SKY = 0.35
 # Passes after which the noise of the sky, and the mean of stars that are weighted by it, change no more; the least
 # part of a star's deviation from that mean that is its own; and the least noise over that of the faintest star.
 _SKY_PASSES, _LEAST_OWN, _LEAST_SKY = 3, 0.05, 1e-12
+# Variance of a star's noise over that of its shape, at least: stars without noise would make the covariance singular.
+_LEAST_NOISE = 1e-6
 #: Stars of fewer photons are not in electrons.
 FEWEST_ELECTRONS = 100.0
+
+
+@dataclass(frozen=True)
+class Kriging(Interpolation):
+    """One covariance over the CCD for all components, learnt from the shapes of the stars, with the noise of each."""
+
+    name = "kriging"
+    label = "kriging"
+    words = "kriging over "
+
+    order: int | Literal["auto"] = ORDER
+
+    def fit(self, stars: StarField) -> FittedKriging:
+        """Krige the coefficients of stars by the covariance of their shapes."""
+        mean = stars.basis.mean
+        deviations = stars.basis.deviations(stars.coefficients)
+        numbers, filters = shape_numbers(mean, deviations)
+        noise = star_noise(stars.images, deviations, mean, filters, stars.gain)
+        noise = np.maximum(noise, _LEAST_NOISE * (numbers**2).mean(axis=0) + np.finfo(float).tiny)
+        places = mapped(stars.positions, stars.extent)
+        kernel = fit_kernel(places, numbers, noise, stars.terms)
+        of_stars = (noise / np.median(noise, axis=0)).mean(axis=1)
+        polynomial, alpha, _ = krige(places, stars.coefficients, stars.terms, kernel, of_stars)
+        return FittedKriging(stars.positions, stars.extent, stars.order, polynomial, 1.0 / of_stars, kernel, alpha)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedKriging(FittedInterpolation, kind=Kriging):
+    """A trend and a process of one covariance."""
+
+    kernel: np.ndarray  #: of the covariance: :data:`COLUMNS`
+    alpha: np.ndarray  #: dual coefficients: inverse covariance times coefficients, [n, k]
+
+    def at(self, positions: Any) -> np.ndarray:
+        """Evaluate the coefficients at positions [m, 2], [m, k]; no batch size matters."""
+        points, places = (mapped(p, self.extent) for p in (self.positions, positions))
+        return super().at(positions) + predict(points, places, self.kernel, self.alpha)
+
+    def leave_one_out(self, coefficients: np.ndarray) -> np.ndarray:
+        """Return coefficients [n, k] of the stars less their prediction by the others under the same covariance."""
+        points = mapped(self.positions, self.extent)
+        noise = 1.0 / (np.ones(len(points)) if self.weights is None else self.weights)
+        with one_blas_thread():
+            return krige(points, coefficients, self.terms(), self.kernel, noise)[2]
+
+    def truncated(self, count: int) -> Self:
+        """Return the interpolation of the first components only."""
+        return replace(super().truncated(count), alpha=self.alpha[:, :count])
+
+    def parts(self) -> ModelParts:
+        """Return what the interpolation has in a FITS file, the covariance once for each component."""
+        parts = super().parts()
+        kernels = np.tile(self.kernel, (self.polynomial.shape[1], 1))
+        return ModelParts(
+            {"ORDER": parts.cards["ORDER"]},
+            {**parts.images, "KERNEL": kernels},
+            {**parts.columns, "pull": self.alpha},
+        )
+
+    @classmethod
+    def reads(cls, parts: ModelParts) -> bool:
+        """Return whether a FITS file holds kriging."""
+        kernel = parts.images.get("KERNEL")
+        return "INTERP" not in parts.cards and kernel is not None and kernel.shape[1] >= COLUMNS
+
+    @classmethod
+    def _fields_of(cls, parts: ModelParts) -> dict[str, Any]:
+        return {"kernel": parts.image("KERNEL")[0], "alpha": parts.column("pull")}
 
 
 def shape_numbers(

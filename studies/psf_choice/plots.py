@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 
 from ...core.plotting import new_figure, png_bytes, styled
 from ...measure.focal_plane_axes import AWAY, LEFT_OUT, OBSERVED, RESIDUAL, TRUTH
-from ...reconstruction.psf_model.basis import BASES
+from ...reconstruction.psf_model.recipe import BASES
 from .plan import FOCAL_PLANE, NOISE_FREE, POLYNOMIALS, PROCESSES, Case
 from .study import Study
 
@@ -20,12 +20,11 @@ _HOW = {
     "equal": (OBSERVED, "o", "equal weights"),
     "snr": (LEFT_OUT, "s", "weights (S/N)$^2$"),
     "softened": (AWAY, "D", "softened weights"),
-    "gp": ("#2a8a57", "^", PROCESSES["gp"]),
-    "kriging": ("#7b4a1e", "X", PROCESSES["kriging"]),
+    **{name: ("#7b4a1e", "X", label) for name, label in PROCESSES.items()},
     "no_telescope": ("0.5", "P", FOCAL_PLANE["no_telescope"]),
     "focal_plane": ("#c2307f", "v", FOCAL_PLANE["focal_plane"]),
 }
-_BASIS = {"pca": (OBSERVED, "o"), "pixels": (AWAY, "s"), "shapelets": (LEFT_OUT, "D")}
+_BASIS = dict(zip(BASES, ((OBSERVED, "o"), (AWAY, "s"), (LEFT_OUT, "D")), strict=False))
 _RMS = "rms of one component of e, no star"
 # Upper limit of the axis over the base: fits with as many terms as stars diverge.
 _LIMIT = 4.0
@@ -76,6 +75,8 @@ def choices_plot(result: Study) -> bytes:
                 best = [(n, c) for n in plan.stars if (c := result.best_order(n, how))]
                 text = f"{label}, best order" if how in POLYNOMIALS else label
                 _draw_line(axes, result, best, key, color, marker, text)
+            by_default = [(n, replace(plan.default, stars=n)) for n in plan.stars]
+            _draw_line(axes, result, by_default, key, RESIDUAL, "*", f"default: {plan.default}")
             paper = [(n, replace(base, stars=n)) for n in plan.stars]
             _draw_line(axes, result, paper, key, TRUTH, "x", f"{_HOW[base.interpolation][2]}, order {base.order}")
             _logarithmic_axes(

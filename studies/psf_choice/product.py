@@ -33,7 +33,7 @@ def write_study(result: Study, folder: Path, config: Configuration) -> tuple[str
 
 
 def study_summary(result: Study) -> dict[str, Any]:
-    """Return the base, the recommended case, those of the focal plane, and the best order for each number of stars."""
+    """Return the base, default and recommended case, those of the focal plane, and the best orders."""
     plan, chosen = result.plan, result.recommended()
     orders = {
         how: {str(n): best.order for n in plan.stars if (best := result.best_order(n, how))} for how in POLYNOMIALS
@@ -41,6 +41,7 @@ def study_summary(result: Study) -> dict[str, Any]:
     together = [best for how in FOCAL_PLANE if (best := result.best_order(plan.base.stars, how))]
     return {
         "base": _case_entry(result, plan.base),
+        "default": _case_entry(result, plan.default),
         "recommended": None if chosen is None else _case_entry(result, chosen),
         **({"focal_plane": [_case_entry(result, case) for case in together]} if plan.focal_plane else {}),
         "best_order": orders,

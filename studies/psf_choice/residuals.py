@@ -53,7 +53,7 @@ def measure_residuals(
     fields: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     law = np.full((len(ccds), 2), np.nan)
     for i, (ccd, stars, model) in enumerate(zip(ccds, observed, models, strict=True)):
-        if isinstance(model, PsfModel) and case.basis == "pca":
+        if isinstance(model, PsfModel) and model.basis.kind.ordered:
             model = model.truncated(min(case.components, model.n_components))
         used = used_stars(case, stars)
         exposure, places = ccd.exposure, ccd.exposure.positions

@@ -23,8 +23,9 @@ from ...pipeline.memory import check_memory
 from ...pipeline.resolved_values import require_drawn_stars
 from ...reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ...reconstruction.psf_model.model import PsfModel
+from ...reconstruction.psf_model.recipe import BASES
 from .focal_plane import fit_focal_plane
-from .plan import FOCAL_PLANE, NOISE_FREE, PROCESSES, Case, Plan
+from .plan import FOCAL_PLANE, NOISE_FREE, Case, Plan
 from .residuals import Residuals, case_metrics, measure_residuals
 from .stars import ObservedCcd, SimulatedCcd, fit, observe, simulate
 
@@ -145,12 +146,12 @@ def _models_of_ccds(
 
 def _fit_key(case: Case) -> tuple[Any, ...]:
     """Return the sort key of a case: cases of one fit are adjacent, by their number of principal components."""
-    shared = case.basis == "pca"
+    shared = case.basis in BASES and BASES[case.basis].ordered
     return (case.basis, case.interpolation, case.order, case.stars, 0 if shared else case.components)
 
 
 def _complexity_key(case: Case) -> tuple[int, int]:
     """Return the sort key of a case: focal-plane models last, then the number of free parameters."""
-    components = case.components or 10**6
-    last = 1 + [*FOCAL_PLANE].index(case.interpolation) if case.interpolation in FOCAL_PLANE else 0
-    return last, components * (case.stars if case.interpolation in PROCESSES else case.terms)
+    if case.interpolation in FOCAL_PLANE:
+        return 1 + [*FOCAL_PLANE].index(case.interpolation), case.components * case.terms
+    return 0, (case.components or 10**6) * case.recipe().interpolation.parameter_count(case.stars)
