@@ -11,7 +11,18 @@ from typer import Argument, Option
 from ..core.errors import ConfigError
 from .inputs import load_model
 from .interrupt import interruptible
-from .options import Json, Quiet, Threads
+from .options import (
+    Basis,
+    Components,
+    Interpolation,
+    Json,
+    Order,
+    Quiet,
+    Recipe,
+    Threads,
+    Weights,
+    recipe_of_options,
+)
 from .tables import Rows, print_json
 from .workers import Processes, chosen_workers
 
@@ -36,11 +47,12 @@ def measure_command(
             help="Telescope of the focal-plane model: name or file. By default images.yaml beside the images has it."
         ),
     ] = None,
-    basis: Annotated[str | None, Option(help="Basis of the CCD's model: pixels (default), pca, shapelets.")] = None,
-    interpolation: Annotated[
-        str | None, Option(help="Between the stars: kriging (default of pixels), polynomial, gp.")
-    ] = None,
-    order: Annotated[int | None, Option(min=0, max=6, help="Order of polynomials over the image.")] = None,
+    recipe: Recipe = None,
+    basis: Basis = None,
+    interpolation: Interpolation = None,
+    components: Components = None,
+    weights: Weights = None,
+    order: Order = None,
     min_snr: Annotated[float, Option(help="Least S/N of stars.")] = 30.0,
     resume: Annotated[bool, Option("--resume", help="Keep images that were measured in the same way.")] = False,
     processes: Processes = None,
@@ -60,7 +72,7 @@ def measure_command(
     - `pachon measure pachon_images/image_R22_S11.fits`
     - `pachon measure pachon_images/image_*.fits -o catalogues --processes 2`: two images at a time
     - `pachon measure pachon_images/image_*.fits -o catalogues --resume`: go on where it was stopped
-    - `pachon measure pachon_images/image_*.fits -o catalogues --basis pca --order 3`: the PSF in the paper's way
+    - `pachon measure pachon_images/image_*.fits -o catalogues --recipe paper`: the PSF in the paper's way
     - `pachon measure pachon_images/image_*.fits -o catalogues --model focal_plane`: optics, heights and turbulence
     """
     from ..core.files import make_folder
@@ -74,7 +86,9 @@ def measure_command(
     if out is not None:
         make_folder(out)
     images = images_among(images)
-    options = {"basis": basis, "interpolation": interpolation, "order": order, "min_snr": min_snr}
+    chosen_recipe = recipe_of_options(recipe, basis, interpolation, components, weights, order)
+    if model != "ccd" and chosen_recipe is not None:
+        raise ConfigError("--recipe and its options are of models of a CCD: expected none with --model focal_plane")
     with (
         interruptible(quiet, "catalogues that are written stay, and --resume goes on from there") as reporter,
         chosen_workers(processes, None, None, threads, reporter.line) as maker,
@@ -85,7 +99,15 @@ def measure_command(
             psf = (images[0].parent if out is None else out) / "focal_plane_psf.fits"
             fit_exposure_psf(images, known, min_snr=min_snr, threads=threads, reporter=reporter).write(psf)
         found = measure_files(
-            images, out, psf=psf, options=options, resume=resume, workers=maker, threads=threads, reporter=reporter
+            images,
+            out,
+            psf=psf,
+            recipe=chosen_recipe,
+            min_snr=min_snr,
+            resume=resume,
+            workers=maker,
+            threads=threads,
+            reporter=reporter,
         )
     if as_json:
         print_json({"images": found.metrics, "left_out": found.left_out})

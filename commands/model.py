@@ -9,7 +9,23 @@ import typer
 from typer import Argument, Option
 
 from .interrupt import interruptible
-from .options import Gain, Json, MinSnr, Quiet, StarImages, StarStamp, StarX, StarY
+from .options import (
+    Basis,
+    Components,
+    Gain,
+    Interpolation,
+    Json,
+    MinSnr,
+    Order,
+    Quiet,
+    Recipe,
+    StarImages,
+    StarStamp,
+    StarX,
+    StarY,
+    Weights,
+    recipe_of_options,
+)
 from .tables import Rows, print_json
 
 app = typer.Typer()
@@ -29,15 +45,21 @@ def model_command(
     gain: Gain = 1.0,
     saturation: Annotated[float | None, Option(help="Level from which on a pixel is saturated.")] = None,
     background: Annotated[bool, Option(help="Subtract the median of the outer pixels of each stamp.")] = True,
+    recipe: Recipe = None,
+    basis: Basis = None,
+    interpolation: Interpolation = None,
+    components: Components = None,
+    weights: Weights = None,
+    order: Order = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Model the PSF of an image from a table of its stars, and show how well it predicts stars that were held out.
 
     Stars are centred, those with neighbours, cosmic rays and saturated cores left out. The kind of model is the one
-    that predicts held-out stars best: kriging of pixels, unless another is clearly better. It leaves the model,
-    STARS_psf.fits; a picture beside it, .png; and all stars with their shapes and what the model made without them
-    predicts, .ecsv.
+    that predicts held-out stars best: kriging of pixels, unless another is clearly better, or that of the options. It
+    leaves the model, STARS_psf.fits; a picture beside it, .png; and all stars with their shapes and what the model made
+    without them predicts, .ecsv.
 
     **Examples**
 
@@ -52,6 +74,7 @@ def model_command(
     from ..reconstruction.own_stars.own_stars import fit_own_stars
     from ..reconstruction.own_stars.star_catalogue import load_stars
 
+    chosen_recipe = recipe_of_options(recipe, basis, interpolation, components, weights, order)
     path = stars.with_name(f"{stars.stem}_psf.fits") if out is None else out
     with interruptible(quiet) as reporter, reporter.stage(f"PSF of {stars.name}"):
         own = fit_own_stars(
@@ -62,6 +85,7 @@ def model_command(
             gain=gain,
             saturation=saturation,
             background=background,
+            **({} if chosen_recipe is None else {"recipe": chosen_recipe}),
         )
         own.model.write(path)
         write_bytes(path.with_suffix(".png"), png_bytes(own.plot(stars.name)))
