@@ -422,7 +422,7 @@ def to_yaml(config: Configuration, heading: Sequence[str] = ()) -> str:
     for name in sections:
         section = getattr(config, name)
         lines += ["", f"# {(type(section).__doc__ or '').strip()}", f"{name}:"]
-        lines += _yaml_lines(section, list(type(section).model_fields), "  ")
+        lines += _yaml_lines(section, list(section.model_dump()), "  ")
     return "\n".join(lines) + "\n"
 
 
