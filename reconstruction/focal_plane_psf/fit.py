@@ -22,7 +22,8 @@ from ...core.progress import Reporter
 from ...core.threads import one_blas_thread
 from ...models.camera.focal_plane import FocalPlane
 from ...wavefront.aberration import ResidualWavefront
-from .covariance import Covariance, Places, inverse_from_cholesky
+from ..gaussian_field import inverse_from_cholesky
+from .covariance import Covariance, Places
 from .heights import HeightPrior
 from .kriging import map_on_threads
 from .likelihood import CovarianceFit, blocks_of, fit_covariance, log_likelihood

@@ -18,7 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from .covariance import CCD_TERMS, COMPONENTS, Covariance, Places, ccd_terms, inverse_from_cholesky
+from ..gaussian_field import inverse_from_cholesky
+from .covariance import CCD_TERMS, COMPONENTS, Covariance, Places, ccd_terms
 
 #: Largest number of stars in a block.
 BLOCK = 300

@@ -27,7 +27,7 @@ from ...wavefront.atmosphere.atmosphere import Atmosphere
 from .covariance import Covariance, Places
 from .field import ShapeField
 from .field_fit import LEAST_STARS, FittedField, fit_field, height_prior, mosaic_of
-from .file import model_fields, model_hdus
+from .file import model_hdus, read_model
 from .fit import SHAPES, ShapeData
 from .images import ResidualImages, with_shapes
 from .mosaic import Mosaic, PsfShapes
@@ -150,8 +150,8 @@ class FocalPlanePsf(Result):
         dispersion : array_like, shape [n_wave, 2], optional
             Shift of each wavelength by the air [rad].
         budget : str, HeightBudget or None
-            Prior of unknown heights: "simulated", "specification", a budget of one's own, or None for a weak prior
-            them.
+            Prior of unknown heights: "simulated", "specification", a budget of one's own, or None for a weak one of
+            coefficients of 10 um.
         alignment_rms : float or Quantity
             Prior rms of the residual wavefront of the exposure [m]: annular Zernike terms 4 to 11, each constant and
             linear over the field. 0 for an aligned telescope.
@@ -326,7 +326,7 @@ class FocalPlanePsf(Result):
     @check_arguments
     def read(cls, path: str | Path) -> FocalPlanePsf:
         """Read a model; ProductError if the file is missing, damaged or of another kind."""
-        return cls(**model_fields(read_fits(Path(path)), Path(path)))
+        return cls(*read_model(read_fits(Path(path)), Path(path)))
 
     def _draw_places(self, places: Places, values: np.ndarray, threads: int | None) -> np.ndarray:
         """Return images of given shapes e1, e2 and ln size [n, 3]."""

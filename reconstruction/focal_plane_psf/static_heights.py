@@ -33,7 +33,7 @@ from ...models.camera.ccd_surfaces import CcdSurfaces
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import HeightBudget
 from ...models.telescope import Telescope
-from .covariance import inverse_from_cholesky
+from ..gaussian_field import inverse_from_cholesky
 from .fit import ExposureFit, ShapeData
 from .height_equations import ExposureState, HeightEquations
 from .heights import STATIC_DEGREE, HeightPrior

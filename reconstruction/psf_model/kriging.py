@@ -27,6 +27,7 @@ import scipy.linalg
 
 from ...core.errors import DomainError
 from ...core.threads import one_blas_thread
+from ..gaussian_field import inverse_from_cholesky, leave_one_out_residuals
 from .file_parts import ModelParts
 from .interpolation import FittedInterpolation, Interpolation, StarField
 from .polynomial import mapped, term_count
@@ -253,8 +254,7 @@ class Posterior:
             root = np.linalg.cholesky(_kernel_covariance(kernel, self.distance, self.terms, self.noise))
         except np.linalg.LinAlgError:
             return 1e12, np.zeros(len(kept))
-        lower = np.tril(scipy.linalg.lapack.dpotri(root, lower=1)[0])
-        inverse = lower + np.tril(lower, -1).T
+        inverse = inverse_from_cholesky(root)
         solved = inverse @ self.numbers
         count = self.numbers.shape[1]
         value = 0.5 * (solved * self.numbers).sum() + count * np.log(np.diagonal(root)).sum()
@@ -301,7 +301,7 @@ def krige(
     inverse = scipy.linalg.inv(covariance, check_finite=False)
     weights = inverse @ values
     trend = _trend_variances(kernel, terms.shape[1])[:, None] * (terms.T @ weights)
-    return trend, weights, weights / np.diagonal(inverse)[:, None]
+    return trend, weights, leave_one_out_residuals(weights, inverse)
 
 
 def predict(points: np.ndarray, at: np.ndarray, kernel: np.ndarray, weights: np.ndarray) -> np.ndarray:
