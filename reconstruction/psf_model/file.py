@@ -84,9 +84,9 @@ def read_model(hdus: Iterable[Any], name: str) -> ModelFit:
         model = ModelFit(
             basis,
             interpolation,
-            parts.column("coefficient").reshape(len(stars.data), -1),
-            parts.column("unexplained"),
-            parts.column("rejected").astype(np.int64),
+            parts.columns["coefficient"].reshape(len(stars.data), -1),
+            parts.columns["unexplained"],
+            parts.columns["rejected"].astype(np.int64),
         )
     except KeyError as error:
         raise ProductError(f"no PSF model {name!r} in the FITS file: {error.args[0]} is missing") from error

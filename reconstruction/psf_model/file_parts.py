@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -25,10 +25,6 @@ class ModelParts:
             raise KeyError(f"{self.name}_{ending}".upper())
         return self.images[ending]
 
-    def card(self, keyword: str) -> Any:
-        """Return the value of a card; KeyError if it is missing."""
-        return self.cards[keyword]
-
-    def column(self, name: str) -> np.ndarray:
-        """Return a column; KeyError if it is missing."""
-        return self.columns[name]
+    def extended(self, images: dict[str, np.ndarray], columns: dict[str, np.ndarray]) -> ModelParts:
+        """Return the parts with further images and columns."""
+        return replace(self, images=self.images | images, columns=self.columns | columns)

@@ -107,6 +107,8 @@ class FittedInterpolation:
     """Coefficients between the stars: polynomials, which subclasses may add to."""
 
     kind: ClassVar[type[Interpolation]]
+    #: Columns of the image KERNEL in files of kinds that have no card INTERP, as those before others came.
+    kernel_columns: ClassVar[range | None] = None
 
     positions: np.ndarray  #: of the stars, [n, 2]
     extent: Extent  #: (xmin, xmax, ymin, ymax) of the CCD in the unit of the positions
@@ -151,27 +153,25 @@ class FittedInterpolation:
 
     def parts(self) -> ModelParts:
         """Return what the interpolation has in a FITS file."""
-        return ModelParts(
-            {
-                "ORDER": (self.order, "total degree of the polynomials"),
-                "INTERP": (self.name, "interpolation over the CCD"),
-            },
-            {"POLY": self.polynomial},
-            {} if self.weights is None else {"weight": self.weights},
-        )
+        cards: dict[str, Any] = {"ORDER": (self.order, "total degree of the polynomials")}
+        if self.kernel_columns is None:
+            cards["INTERP"] = (self.name, "interpolation over the CCD")
+        return ModelParts(cards, {"POLY": self.polynomial}, {} if self.weights is None else {"weight": self.weights})
 
     @classmethod
     def reads(cls, parts: ModelParts) -> bool:
         """Return whether a FITS file holds this kind."""
-        return parts.cards.get("INTERP") == cls.kind.name
+        if cls.kernel_columns is None or "INTERP" in parts.cards:
+            return bool(parts.cards.get("INTERP") == cls.kind.name)
+        return (parts.images["KERNEL"].shape[1] if "KERNEL" in parts.images else 0) in cls.kernel_columns
 
     @classmethod
     def of_parts(cls, parts: ModelParts) -> Self:
         """Return the interpolation in a FITS file; KeyError where something is missing."""
         return cls(
-            parts.column("position"),
+            parts.columns["position"],
             parts.extent,
-            int(parts.card("ORDER")),
+            int(parts.cards["ORDER"]),
             parts.image("POLY"),
             parts.columns.get("weight"),
             **cls._fields_of(parts),

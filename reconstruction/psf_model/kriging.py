@@ -30,7 +30,7 @@ from ...core.threads import one_blas_thread
 from ..gaussian_field import inverse_from_cholesky, leave_one_out_residuals
 from .file_parts import ModelParts
 from .interpolation import FittedInterpolation, Interpolation, StarField
-from .polynomial import mapped, term_count
+from .polynomial import MOST_ORDER, mapped, term_count
 
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
@@ -98,6 +98,8 @@ class Kriging(Interpolation):
 class FittedKriging(FittedInterpolation, kind=Kriging):
     """A trend and a process of one covariance."""
 
+    kernel_columns = range(COLUMNS, COLUMNS + MOST_ORDER)
+
     kernel: np.ndarray  #: of the covariance: :data:`COLUMNS`
     alpha: np.ndarray  #: dual coefficients: inverse covariance times coefficients, [n, k]
 
@@ -119,23 +121,12 @@ class FittedKriging(FittedInterpolation, kind=Kriging):
 
     def parts(self) -> ModelParts:
         """Return what the interpolation has in a FITS file, the covariance once for each component."""
-        parts = super().parts()
         kernels = np.tile(self.kernel, (self.polynomial.shape[1], 1))
-        return ModelParts(
-            {"ORDER": parts.cards["ORDER"]},
-            {**parts.images, "KERNEL": kernels},
-            {**parts.columns, "pull": self.alpha},
-        )
-
-    @classmethod
-    def reads(cls, parts: ModelParts) -> bool:
-        """Return whether a FITS file holds kriging."""
-        kernel = parts.images.get("KERNEL")
-        return "INTERP" not in parts.cards and kernel is not None and kernel.shape[1] >= COLUMNS
+        return super().parts().extended({"KERNEL": kernels}, {"pull": self.alpha})
 
     @classmethod
     def _fields_of(cls, parts: ModelParts) -> dict[str, Any]:
-        return {"kernel": parts.image("KERNEL")[0], "alpha": parts.column("pull")}
+        return {"kernel": parts.image("KERNEL")[0], "alpha": parts.columns["pull"]}
 
 
 def shape_numbers(

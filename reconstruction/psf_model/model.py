@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from astropy.io import fits
@@ -17,22 +17,29 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import ProductError
+from ...core.plotting import figure_at, styled
 from ...core.products import read_fits, write_fits
+from ...core.result import Result
 from ...core.version import CREATOR
 from .basis import Basis, FittedBasis, elbow_of
 from .file import model_hdus, read_model
 from .fit import ModelFit, fit_stars
 from .interpolation import FittedInterpolation, Interpolation
-from .picture import PicturedModel
 from .polynomial import Extent
 from .recipe import Recipe
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 #: Pixels of noisy stars that deviate by more standard deviations are rejected.
 CLIP_SIGMA = 5.0
+# Components that are drawn beside the mean.
+_SHOWN = 5
 
 
 @dataclass(frozen=True, eq=False)
-class PsfModel(PicturedModel):
+class PsfModel(Result):
     """A PSF model of one CCD: PSF = mean + sum over k of a_k(x, y) component_k.
 
     Every stamp is normalised to unit sum, so the components sum to zero and the model to one wherever it is evaluated.
@@ -52,6 +59,8 @@ class PsfModel(PicturedModel):
     rejected : array of int
         Per star, pixels rejected as outliers and replaced, [n].
     """
+
+    _table = ("positions", "coefficients", "unexplained", "rejected")
 
     basis: FittedBasis
     interpolation: FittedInterpolation
@@ -158,6 +167,31 @@ class PsfModel(PicturedModel):
                 replacement=replacement,
             )
         )
+
+    def _label(self) -> str:
+        ny, nx = self.mean.shape
+        components, order = f"{self.n_components} components ({self.basis.name})", self.order
+        return f"{components}, order {order}, {self.n_stars} stars, stamps {nx} x {ny}"
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the mean PSF and the first components, each over its largest magnitude."""
+        images = self.components[: _SHOWN if self.basis.kind.has_components else 0]
+        with styled():
+            figure = figure_at(ax, max(1.9 * (len(images) + 1), 4.0), 2.3)
+            row = figure.subplots(1, len(images) + 1, squeeze=False)[0]
+            row[0].imshow(np.sqrt(np.maximum(self.mean, 0.0)), cmap="viridis", vmin=0.0)
+            row[0].set_title("mean (square root)", fontsize=8.5)
+            for k, (axes, image) in enumerate(zip(row[1:], images, strict=True), start=1):
+                axes.imshow(image / float(np.abs(image).max()), cmap="RdBu_r", vmin=-1.0, vmax=1.0)
+                axes.set_title(f"component {k}", fontsize=8.5)
+            for axes in row:
+                axes.set(xticks=[], yticks=[])
+            return figure
+
+    @property
+    def n_components(self) -> int:
+        """Number of components kept."""
+        return len(self.components)
 
     @property
     def mean(self) -> np.ndarray:

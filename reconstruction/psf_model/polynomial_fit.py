@@ -8,7 +8,6 @@ from typing import Literal
 import numpy as np
 import scipy.linalg
 
-from .file_parts import ModelParts
 from .interpolation import FittedInterpolation, Interpolation, StarField, weighted
 from .polynomial import term_count
 
@@ -57,6 +56,8 @@ class Polynomial(Interpolation):
 class FittedPolynomial(FittedInterpolation, kind=Polynomial):
     """Polynomials alone."""
 
+    kernel_columns = range(1)
+
     def leave_one_out(self, coefficients: np.ndarray) -> np.ndarray:
         """Return coefficients [n, k] of the stars less the polynomials of the other stars.
 
@@ -66,13 +67,3 @@ class FittedPolynomial(FittedInterpolation, kind=Polynomial):
         room = 1.0 - self.leverage()
         room = np.where(room > _LEAST_ROOM, room, np.nan)
         return np.asarray((coefficients - self.at(self.positions)) / room[:, None])
-
-    def parts(self) -> ModelParts:
-        """Return what the interpolation has in a FITS file, where it is that of files without the card INTERP."""
-        parts = super().parts()
-        return ModelParts({"ORDER": parts.cards["ORDER"]}, parts.images, parts.columns)
-
-    @classmethod
-    def reads(cls, parts: ModelParts) -> bool:
-        """Return whether a FITS file holds polynomials alone."""
-        return "INTERP" not in parts.cards and "KERNEL" not in parts.images

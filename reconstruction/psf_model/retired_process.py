@@ -36,6 +36,8 @@ class GaussianProcess(Interpolation):
 class FittedGaussianProcess(FittedInterpolation, kind=GaussianProcess):
     """Polynomials and processes of a file."""
 
+    kernel_columns = range(3, 4)
+
     kernels: np.ndarray  #: variance, correlation length where the extent is 2 wide, variance of the noise, [k, 3]
     alpha: np.ndarray  #: dual coefficients: inverse covariance times coefficients less trend, [n, k]
 
@@ -77,18 +79,8 @@ class FittedGaussianProcess(FittedInterpolation, kind=GaussianProcess):
 
     def parts(self) -> ModelParts:
         """Return what the interpolation has in a FITS file."""
-        parts = super().parts()
-        return ModelParts(
-            {"ORDER": parts.cards["ORDER"]},
-            {**parts.images, "KERNEL": self.kernels},
-            {**parts.columns, "pull": self.alpha},
-        )
-
-    @classmethod
-    def reads(cls, parts: ModelParts) -> bool:
-        """Return whether a FITS file holds such processes."""
-        return "INTERP" not in parts.cards and parts.images.get("KERNEL", np.empty((0, 0))).shape[1] == 3
+        return super().parts().extended({"KERNEL": self.kernels}, {"pull": self.alpha})
 
     @classmethod
     def _fields_of(cls, parts: ModelParts) -> dict[str, Any]:
-        return {"kernels": parts.image("KERNEL"), "alpha": parts.column("pull")}
+        return {"kernels": parts.image("KERNEL"), "alpha": parts.columns["pull"]}

@@ -81,7 +81,7 @@ class GaussHermite(FittedBasis, kind=Shapelets):
 
     @classmethod
     def _options_of(cls, parts: ModelParts) -> dict[str, Any]:
-        return {"scale": float(parts.card("SCALE"))}
+        return {"scale": float(parts.cards["SCALE"])}
 
 
 def shapelet_images(count: int, shape: tuple[int, int], scale: float) -> np.ndarray:

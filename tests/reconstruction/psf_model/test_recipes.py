@@ -167,7 +167,7 @@ class FittedNearest(FittedInterpolation, kind=Nearest):
 
     @classmethod
     def _fields_of(cls, parts):
-        return {"coefficients": parts.column("coefficient").reshape(len(parts.column("position")), -1)}
+        return {"coefficients": parts.columns["coefficient"].reshape(len(parts.columns["position"]), -1)}
 
 
 def test_an_interpolation_is_a_class(monkeypatch, tmp_path):
