@@ -95,10 +95,10 @@ def measure_command(
     ):
         psf = None
         if model == "focal_plane":
-            known = None if telescope is None else load_model(telescope)
+            telescope_model = None if telescope is None else load_model(telescope)
             psf = (images[0].parent if out is None else out) / "focal_plane_psf.fits"
-            fit_exposure_psf(images, known, min_snr=min_snr, threads=threads, reporter=reporter).write(psf)
-        found = measure_files(
+            fit_exposure_psf(images, telescope_model, min_snr=min_snr, threads=threads, reporter=reporter).write(psf)
+        measured = measure_files(
             images,
             out,
             psf=psf,
@@ -110,7 +110,7 @@ def measure_command(
             reporter=reporter,
         )
     if as_json:
-        print_json({"images": found.metrics, "left_out": found.left_out})
+        print_json({"images": measured.metrics, "left_out": measured.left_out})
     elif not quiet:
         rows = [
             (
@@ -122,7 +122,7 @@ def measure_command(
                 f"{m.get('purity', float('nan')):.3f}",
                 f"{m['usable_per_arcmin2']:.1f}",
             )
-            for name, m in found.metrics.items()
+            for name, m in measured.metrics.items()
         ]
         headings = ("image", "objects", "stars", "complete, pure", "half [mag]", "purity", "usable/arcmin²")
         Rows(headings, rows, _CAPTION).show()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
@@ -75,9 +75,10 @@ def model_command(
     from ..reconstruction.own_stars.star_catalogue import load_stars
 
     chosen_recipe = recipe_of_options(recipe, basis, interpolation, components, weights, order)
+    options: dict[str, Any] = {} if chosen_recipe is None else {"recipe": chosen_recipe}
     path = stars.with_name(f"{stars.stem}_psf.fits") if out is None else out
     with interruptible(quiet) as reporter, reporter.stage(f"PSF of {stars.name}"):
-        own = fit_own_stars(
+        result = fit_own_stars(
             *load_stars(stars, x=x, y=y, stamp=stamp, images=images),
             pixel_arcsec * ARCSEC,
             size=size,
@@ -85,27 +86,27 @@ def model_command(
             gain=gain,
             saturation=saturation,
             background=background,
-            **({} if chosen_recipe is None else {"recipe": chosen_recipe}),
+            **options,
         )
-        own.model.write(path)
-        write_bytes(path.with_suffix(".png"), png_bytes(own.plot(stars.name)))
-        write_table(path.with_suffix(".ecsv"), own.table())
-    found = own.summary()
+        result.model.write(path)
+        write_bytes(path.with_suffix(".png"), png_bytes(result.plot(stars.name)))
+        write_table(path.with_suffix(".ecsv"), result.table())
+    summary_of_stars = result.summary()
     if as_json:
-        print_json({"model": str(path), **found})
+        print_json({"model": str(path), **summary_of_stars})
     elif not quiet:
-        flagged = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in found["flagged"].items() if n)
+        flagged = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in summary_of_stars["flagged"].items() if n)
         rows = [
-            ("kind of model", str(found["kind"])),
-            ("stars, used", f"{found['stars']}, {found['used']}"),
+            ("kind of model", str(summary_of_stars["kind"])),
+            ("stars, used", f"{summary_of_stars['stars']}, {summary_of_stars['used']}"),
             ("flagged", flagged or "none"),
-            ("S/N, median", f"{found['median_snr']:.0f}"),
-            (f"FWHM, pixels of {pixel_arcsec:.4g} arcsec", f"{found['fwhm_arcsec']:.3g} arcsec"),
-            ("rms of e of the stars", f"{100 * found['rms_e']:.2f} %"),
-            ("... less the model, held out", f"{100 * found['rms_e_held_out']:.2f} %"),
-            ("... of which noise of the stars", f"{100 * found['rms_e_noise']:.2f} %"),
-            ("rms of size less the model, held out", f"{100 * found['rms_size_held_out']:.2f} %"),
-            ("... of which noise of the stars", f"{100 * found['rms_size_noise']:.2f} %"),
+            ("S/N, median", f"{summary_of_stars['median_snr']:.0f}"),
+            (f"FWHM, pixels of {pixel_arcsec:.4g} arcsec", f"{summary_of_stars['fwhm_arcsec']:.3g} arcsec"),
+            ("rms of e of the stars", f"{100 * summary_of_stars['rms_e']:.2f} %"),
+            ("... less the model, held out", f"{100 * summary_of_stars['rms_e_held_out']:.2f} %"),
+            ("... of which noise of the stars", f"{100 * summary_of_stars['rms_e_noise']:.2f} %"),
+            ("rms of size less the model, held out", f"{100 * summary_of_stars['rms_size_held_out']:.2f} %"),
+            ("... of which noise of the stars", f"{100 * summary_of_stars['rms_size_noise']:.2f} %"),
             ("model, picture, stars", f"{path}, .png, .ecsv"),
         ]
         Rows(("", ""), rows, left=2).show()

@@ -21,9 +21,12 @@ from ..reconstruction.psf_model.recipe import DEFAULT, Recipe
 from .exposure import SATURATED
 from .image_file import CcdImage
 
-# Stars whose shape deviates from that of their neighbours by more of the usual deviations than this are left out; a
-# galaxy or a blend among fewer stars than the second number cannot be told from the change of the PSF.
-_DEVIATIONS, _FEWEST, _PASSES = 6.0, 12, 5
+# Stars whose shape deviates from that of their neighbours by more of the usual deviations than this are left out.
+_DEVIATIONS = 6.0
+# A galaxy or a blend among fewer stars cannot be told from the change of the PSF.
+_FEWEST = 12
+# Most passes of leaving them out.
+_PASSES = 5
 
 
 def objects_and_stars(image: CcdImage, min_snr: float) -> tuple[DetectedObjects, StarSelection]:
@@ -103,7 +106,7 @@ def focal_plane_stars(
         If no image has stars.
     """
     weight = positive_angle(weight_fwhm, "weight_fwhm")
-    found, scale, reason = [], 0.0, "there are no images"
+    ccd_stars, scale, reason = [], 0.0, "there are no images"
     for image in images:
         try:
             _, stars = objects_and_stars(image, min_snr)
@@ -111,10 +114,10 @@ def focal_plane_stars(
             reason = str(error)
             continue
         scale = image.pixel_scale
-        found.append(_ccd_stars(image, stars, weight))
-    if not found:
+        ccd_stars.append(_ccd_stars(image, stars, weight))
+    if not ccd_stars:
         raise DomainError(f"no stars on the images: {reason}")
-    return FocalPlaneStars.of_ccds(found, scale, weight, pixels=True)
+    return FocalPlaneStars.of_ccds(ccd_stars, scale, weight, pixels=True)
 
 
 def _ccd_stars(image: CcdImage, stars: StarSelection, weight_fwhm: float) -> CcdStars:
@@ -144,8 +147,8 @@ def regular_shapes(values: np.ndarray, snr: np.ndarray, positions: np.ndarray) -
     for _ in range(_PASSES):
         trend = np.linalg.lstsq((terms * weight)[good], (values * weight)[good], rcond=None)[0]
         deviation = np.abs(values - terms @ trend) * weight
-        now = (deviation <= _DEVIATIONS * 1.4826 * np.median(deviation[good], axis=0)).all(axis=1)
-        if (now == good).all():
+        regular = (deviation <= _DEVIATIONS * 1.4826 * np.median(deviation[good], axis=0)).all(axis=1)
+        if (regular == good).all():
             break
-        good = now
+        good = regular
     return good

@@ -121,7 +121,7 @@ class ImageCatalogue(Result):
         """Return numbers of objects and, against the truth of a simulated image, completeness and purity."""
         header, mask = self.image.header, self.image.mask
         area = float((mask == 0).sum()) * (self.image.pixel_scale / ARCMIN) ** 2
-        found: dict[str, Any] = {
+        numbers: dict[str, Any] = {
             "objects": len(self.objects),
             "stars": len(self.stars),
             "galaxies_fitted": len(self.galaxies),
@@ -140,13 +140,13 @@ class ImageCatalogue(Result):
             edges = np.arange(np.floor(np.nanmin(magnitude)), np.ceil(np.nanmax(magnitude)) + 0.5, 0.5)
             rates = detection_rates(magnitude, match, truth["MAG"], edges)
             half = np.flatnonzero((rates.n_true > 10) & (rates.completeness < 0.5))
-            found |= {
+            numbers |= {
                 "purity": float(real.mean()),
                 "magnitude_half_complete": float(edges[half[0]]) if len(half) else None,
                 "star_completeness": self.stars.completeness(star),
                 "star_purity": self.stars.purity(star),
             }
-        return found
+        return numbers
 
 
 @check_arguments

@@ -121,8 +121,8 @@ class PsfField:
     @check_arguments
     def amplitudes(self, positions: ArrayLike) -> np.ndarray:
         """Return amplitudes of mean and components, shape [n, 1 + k]; the first is 1."""
-        found = self.model.amplitudes(self._on_ccd(positions))
-        return np.concatenate([np.ones((len(found), 1)), found], axis=1)
+        of_components = self.model.amplitudes(self._on_ccd(positions))
+        return np.concatenate([np.ones((len(of_components), 1)), of_components], axis=1)
 
     @check_arguments
     def lit_fraction(self, positions: ArrayLike) -> np.ndarray:

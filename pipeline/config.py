@@ -9,7 +9,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar
 
 import yaml
 from pydantic import BeforeValidator, Field, SerializerFunctionWrapHandler, model_serializer
@@ -36,7 +36,9 @@ from ..reconstruction.psf_model.retired_process import GaussianProcess
 
 BandName = Literal["u", "g", "r", "i", "z", "y"]
 if TYPE_CHECKING:
-    RecipeName = BasisName = InterpolationName = str
+    RecipeName: TypeAlias = str
+    BasisName: TypeAlias = str
+    InterpolationName: TypeAlias = str
 else:
     RecipeName, BasisName, InterpolationName = (Literal[tuple(table)] for table in (RECIPES, BASES, INTERPOLATIONS))
 _Model = TypeVar("_Model", bound=Section)

@@ -180,25 +180,25 @@ def _camera_of(telescope: Telescope, name: str | None) -> Camera:
     ConfigError where there is none, DomainError where the telescope is afocal.
     """
     require_image(telescope, "a camera")
-    found = name or telescope.camera
-    if found is None:
+    camera_name = name or telescope.camera
+    if camera_name is None:
         raise ConfigError(
             f"telescope = {telescope.name}, which has none: expected a camera: {', '.join(CAMERAS)}, or a file, "
             "e.g. camera: hsc"
         )
     with error_context(key="camera"):
-        return load_camera(found)
+        return load_camera(camera_name)
 
 
 def _stamp_geometry(config: Configuration, telescope: Telescope, camera: Camera) -> dict[str, float]:
     """Return the default pixels [um] and size of stamps, as large on the sky as those of the LSST."""
     side, fine = (_SIDE, 1) if config.atmosphere.enabled else (_SIDE_ALONE, _FINE)
     pixel = camera.pixel_size / fine
-    found: dict[str, float] = {"pixel_um": round(pixel * 1e6, 9)}
+    geometry: dict[str, float] = {"pixel_um": round(pixel * 1e6, 9)}
     if config.psf.stamp is None:
         pixels = side * ARCSEC / pixel_angle(telescope, pixel)
-        found["stamp"] = max(2 * round(0.5 * (pixels - 1.0)) + 1, _FEWEST)
-    return found
+        geometry["stamp"] = max(2 * round(0.5 * (pixels - 1.0)) + 1, _FEWEST)
+    return geometry
 
 
 def _pixel_arcsec(psf: PsfConfig, telescope: Telescope) -> float:

@@ -104,11 +104,11 @@ def fit_ccd_model(
 
 def _position_columns(experiment: Experiment, positions: np.ndarray, fields: np.ndarray) -> dict[str, np.ndarray]:
     """Return positions on the detector and of the sky; celestial ones where the configuration has a pointing."""
-    found = {"x": positions[:, 0], "y": positions[:, 1], "field_x": fields[:, 0], "field_y": fields[:, 1]}
+    columns = {"x": positions[:, 0], "y": positions[:, 1], "field_x": fields[:, 0], "field_y": fields[:, 1]}
     aim = experiment.pointing
     if aim is not None:
-        found["ra"], found["dec"] = aim.to_celestial(aim.to_sky(np.tan(fields))).T
-    return found
+        columns["ra"], columns["dec"] = aim.to_celestial(aim.to_sky(np.tan(fields))).T
+    return columns
 
 
 def _shape_columns(measured: Shapes, model: Shapes) -> dict[str, np.ndarray]:

@@ -55,14 +55,14 @@ class Basis(ABC):
 
     def component_count(self, n_stars: int, n_pixels: int) -> int:
         """Return how many components to make, of an automatic choice the largest number; ConfigError if impossible."""
-        most, reason = self.most_components(n_stars, n_pixels)
+        limit, reason = self.most_components(n_stars, n_pixels)
         if self.automatic:
-            return min(most, _MOST_COMPONENTS)
+            return min(limit, _MOST_COMPONENTS)
         count = self.n_components
         if isinstance(count, bool) or not isinstance(count, (int, np.integer)):
             raise ConfigError(f"n_components = {count!r}: expected a whole number, 'auto' or None")
-        if not 1 <= count <= most:
-            raise ConfigError(f"n_components = {count}: expected 1 to {most}, no more than {reason}")
+        if not 1 <= count <= limit:
+            raise ConfigError(f"n_components = {count}: expected 1 to {limit}, no more than {reason}")
         return int(count)
 
     @abstractmethod

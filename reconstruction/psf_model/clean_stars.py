@@ -42,13 +42,13 @@ def cleaned_stars(
     `images` [n_stars, ny, nx] are finite and of any flux; pixels in `masked` are not used. The polynomial terms at the
     stars [n_stars, n_terms] keep stars whose deviation the others predict, and fill masked pixels.
     """
-    pixels, missing = images.reshape(len(images), -1), masked.reshape(len(images), -1)
-    if missing.any():
-        guess, flux = mean_and_flux(pixels, missing)
-        pixels = np.where(missing, flux[:, None] * guess, pixels)
+    pixels, filled_pixels = images.reshape(len(images), -1), masked.reshape(len(images), -1)
+    if filled_pixels.any():
+        guess, flux = mean_and_flux(pixels, filled_pixels)
+        pixels = np.where(filled_pixels, flux[:, None] * guess, pixels)
     rejected = np.zeros(pixels.shape, dtype=bool)
     if clip_sigma is not None:
-        rejected = find_outliers(pixels, clip_sigma, max_iterations) & ~missing
+        rejected = find_outliers(pixels, clip_sigma, max_iterations) & ~filled_pixels
     mean, flux = mean_and_flux(pixels, rejected)
     if rejected.any():
         rejected = restore_predicted(pixels / pixels.sum(axis=1)[:, None], mean, rejected, terms)
@@ -56,9 +56,9 @@ def cleaned_stars(
     deviations = np.where(rejected, 0.0, pixels / flux[:, None] - mean)
 
     by_mean = rejected & (replacement == "mean")
-    missing = missing | (rejected & ~by_mean)
-    if missing.any():
-        stars = fill_masked(mean + deviations, missing, by_mean, terms)
+    filled_pixels = filled_pixels | (rejected & ~by_mean)
+    if filled_pixels.any():
+        stars = fill_masked(mean + deviations, filled_pixels, by_mean, terms)
         mean = stars.mean(axis=0)
         deviations = np.where(by_mean, 0.0, stars - mean)
     return CleanStars(mean, deviations, rejected)

@@ -77,10 +77,10 @@ def choose_by_cross_validation(
             residuals[held_out, i] = numbers[:, None] - summed[:, np.minimum(counts, len(vectors))]
     # One column for each order and number of components.
     squares = (residuals**2).mean(axis=-1).reshape(len(terms), -1)
-    residuals = residuals.reshape(len(terms), -1, 3)
+    case_residuals = residuals.reshape(len(terms), -1, 3)
     best = int(np.argmin(squares.mean(axis=0)))
     for _ in range(2):
-        weight = (shapes.model_variance(residuals[:, best]) + shapes.noise) ** -2
+        weight = (shapes.model_variance(case_residuals[:, best]) + shapes.noise) ** -2
         best = int(np.argmin(weight @ squares))
     order, count = divmod(best, len(counts))
     return orders[order], int(counts[count])

@@ -53,7 +53,8 @@ _FIRST_OPTIONAL_DEGREE = 3
 # Where the search starts: nearly all trend of degree 2, nearly all process, all trend of every degree. The logarithms
 # of the trend's variances start, up to the degree given, at the second number for degree 1 and fall by the third for
 # each degree more; beyond, where they are expected.
-_TREND, _PROCESS = (-4.0, math.log(0.7), -4.0), (0.0, math.log(0.7), -4.0)
+_TREND = (-4.0, math.log(0.7), -4.0)
+_PROCESS = (0.0, math.log(0.7), -4.0)
 _STARTS = ((_TREND, 2, 2.0, 1.0), (_PROCESS, 2, 1.0, 2.0), (_TREND, math.inf, 3.0, 0.5))
 # Variance of the trend's constant: as good as unknown.
 _CONSTANT = 1e4
@@ -61,9 +62,12 @@ _CONSTANT = 1e4
 _MOST_STARS = 300
 # Distance from the centre beyond which a stamp is sky, as a fraction of its side.
 _SKY = 0.35
-# Passes after which the noise of the sky, and the mean of stars that are weighted by it, change no more; the least
-# part of a star's deviation from that mean that is its own; and the least noise over that of the faintest star.
-_SKY_PASSES, _LEAST_OWN, _LEAST_SKY = 3, 0.05, 1e-12
+# Passes after which the noise of the sky, and the mean of stars that are weighted by it, change no more.
+_SKY_PASSES = 3
+# Least part of a star's deviation from that mean that is its own.
+_LEAST_OWN = 0.05
+# Least noise over that of the faintest star.
+_LEAST_SKY = 1e-12
 # Variance of a star's noise over that of its shape, at least: stars without noise would make the covariance singular.
 _LEAST_NOISE = 1e-6
 #: Stars of fewer photons are not in electrons.
@@ -198,29 +202,29 @@ def fit_kernel(points: np.ndarray, numbers: np.ndarray, noise: np.ndarray, terms
     to [-1, 1], `noise` [n, 3] are the variances of the numbers, `terms` [n, n_terms] those of the trend.
     """
     unit = np.median(noise, axis=0)
-    chosen = np.sort(np.argsort(noise.sum(axis=1), kind="stable")[:_MOST_STARS])
+    brightest = np.sort(np.argsort(noise.sum(axis=1), kind="stable")[:_MOST_STARS])
     degrees = np.arange(1, max(order_of(terms.shape[1]), COLUMNS - 3) + 1)
     expected = np.where(degrees < 3, 1.0 - degrees, 3.0 - 3.0 * degrees)
     posterior = Posterior(
-        _pair_distances(points[chosen], points[chosen]),
-        numbers[chosen] / np.sqrt(unit),
-        (noise[chosen] / unit).mean(axis=1),
-        terms[chosen],
+        _pair_distances(points[brightest], points[brightest]),
+        numbers[brightest] / np.sqrt(unit),
+        (noise[brightest] / unit).mean(axis=1),
+        terms[brightest],
         np.concatenate([_PRIOR[:, 0], expected]),
         np.concatenate([_PRIOR[:, 1], np.full(len(degrees), _TREND_WIDTH)]),
     )
-    every = np.ones(3 + len(degrees), dtype=bool)
-    found = []
+    all_columns = np.ones(3 + len(degrees), dtype=bool)
+    optima = []
     for process, last, first, fall in _STARTS if len(degrees) > 2 else _STARTS[:2]:
         start = np.concatenate([process, np.where(degrees <= last, first - fall * (degrees - 1), expected)])
-        found.append(posterior.minimize(start, every))
-    best, kept = min(found, key=lambda each: each.fun), every
-    for column in range(len(every) - 1, 1 + _FIRST_OPTIONAL_DEGREE, -1):
-        fewer = kept & (np.arange(len(kept)) != column)
+        optima.append(posterior.minimize(start, all_columns))
+    best, best_columns = min(optima, key=lambda each: each.fun), all_columns
+    for column in range(len(all_columns) - 1, 1 + _FIRST_OPTIONAL_DEGREE, -1):
+        fewer = best_columns & (np.arange(len(best_columns)) != column)
         without = posterior.minimize(best.x, fewer)
         if without.fun < best.fun + _EVIDENCE:
-            best, kept = without, fewer
-    return posterior.kernel(best.x, kept)
+            best, best_columns = without, fewer
+    return posterior.kernel(best.x, best_columns)
 
 
 @dataclass(frozen=True, eq=False)

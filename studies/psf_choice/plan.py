@@ -48,7 +48,7 @@ class Case:
         components = self.components if basis.has_components else 0
         if basis.ordered:
             components = min(components, self.stars - 1)
-        order = self.order if self.interpolation in POLYNOMIALS else self.recipe().interpolation.order
+        order = self.order if self.interpolation in POLYNOMIALS else self.recipe().interpolation.fixed_order or 0
         interpolation = self.interpolation
         if self.snr == NOISE_FREE and interpolation in POLYNOMIALS:
             interpolation = "equal"
@@ -72,8 +72,8 @@ class Case:
         if self.interpolation in FOCAL_PLANE:
             return FOCAL_PLANE[self.interpolation]
         how = PROCESSES.get(self.interpolation, f"order {self.order}, {self.interpolation} weights")
-        what = f"{self.components} components of {self.basis}" if self.components else self.basis
-        return f"{what}, {how}"
+        description = f"{self.components} components of {self.basis}" if self.components else self.basis
+        return f"{description}, {how}"
 
 
 @dataclass(frozen=True)
@@ -105,26 +105,26 @@ class Plan:
         each other have a plane: stars and order, order and components.
         """
         base = self.base
-        polynomials, others = POLYNOMIALS, self.without_polynomials
-        found: list[Case] = []
+        polynomials, without_order = POLYNOMIALS, self.without_polynomials
+        all_cases: list[Case] = []
 
         def sweep(**axes: Sequence[object]) -> None:
             for values in product(*axes.values()):
-                found.append(replace(base, **dict(zip(axes, values, strict=True))).normalised())  # type: ignore[arg-type]
+                all_cases.append(replace(base, **dict(zip(axes, values, strict=True))).normalised())  # type: ignore[arg-type]
 
         sweep(stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=polynomials, order=self.orders)
         sweep(order=self.orders, components=self.components, interpolation=polynomials)
         sweep(stars=self.stars, components=self.components, interpolation=polynomials)
         sweep(snr=(NOISE_FREE,), order=self.orders, components=self.components)
         sweep(snr=self.snrs, order=self.orders, interpolation=polynomials)
-        sweep(basis=BASES, stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=polynomials)
-        sweep(basis=BASES, order=self.orders, interpolation=polynomials)
-        sweep(basis=BASES, components=self.components, interpolation=polynomials)
-        found += [replace(self.default, stars=n, snr=snr) for n in self.stars for snr in (base.snr, NOISE_FREE)]
-        sweep(stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=others)
-        sweep(components=self.components, interpolation=others)
-        sweep(snr=self.snrs, interpolation=others)
-        return tuple(dict.fromkeys(found))
+        sweep(basis=tuple(BASES), stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=polynomials)
+        sweep(basis=tuple(BASES), order=self.orders, interpolation=polynomials)
+        sweep(basis=tuple(BASES), components=self.components, interpolation=polynomials)
+        all_cases += [replace(self.default, stars=n, snr=snr) for n in self.stars for snr in (base.snr, NOISE_FREE)]
+        sweep(stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=without_order)
+        sweep(components=self.components, interpolation=without_order)
+        sweep(snr=self.snrs, interpolation=without_order)
+        return tuple(dict.fromkeys(all_cases))
 
 
 def make_plan(

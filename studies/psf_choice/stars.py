@@ -94,11 +94,13 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
     electrons = stars.electrons * light
     collected = collected_images(experiment, exposed.image, exposed.pixel_scale, electrons)
     images = observe_stamps(collected, electrons, sky, instrument_noise(places.band, places.exposure), rng)
-    found = _centered_and_measured(experiment, ccd.exposure, images)
+    observation = _centered_and_measured(experiment, ccd.exposure, images)
     snr = signal_to_noise(stars.magnitude - 2.5 * np.log10(light), places.band, places.exposure, width)
     # The noise of e is proportional to 1/(S/N); the factor is that of all stars together.
-    noise = np.stack([found.shapes.e1 - ccd.noise_free.shapes.e1, found.shapes.e2 - ccd.noise_free.shapes.e2])
-    return ObservedCcd(found, electrons, snr, np.mean((noise * snr)[:, found.used] ** 2) / snr**2)
+    noise = np.stack(
+        [observation.shapes.e1 - ccd.noise_free.shapes.e1, observation.shapes.e2 - ccd.noise_free.shapes.e2]
+    )
+    return ObservedCcd(observation, electrons, snr, np.mean((noise * snr)[:, observation.used] ** 2) / snr**2)
 
 
 def fit(case: Case, ccd: SimulatedCcd, observed: ObservedCcd) -> PsfModel:

@@ -107,27 +107,27 @@ def study(config: Configuration, plan: Plan, *, threads: int | None = None, repo
     total, done = sum(n_draws.values()), 0
     with reporter.stage(f"{len(cases)} ways to model", total=total) as stage:
         for snr in sorted({case.snr for case in cases}):
-            wanted = [case for case in cases if case.snr == snr]
-            for draw in range(n_draws[wanted[0]]):
+            snr_cases = [case for case in cases if case.snr == snr]
+            for draw in range(n_draws[snr_cases[0]]):
                 observed = [observe(experiment, ccd, snr, draw) for ccd in ccds]
                 # Principal components do not depend on how many are kept: one fit for all of these numbers.
-                for _, group in groupby(sorted(wanted, key=_fit_key), key=_fit_key):
+                for _, group in groupby(sorted(snr_cases, key=_fit_key), key=_fit_key):
                     together = list(group)
                     try:
                         models = _models_of_ccds(together[-1], experiment, ccds, observed, threads)
                         for case in together:
-                            found = measure_residuals(experiment, case, ccds, observed, models, threads)
-                            samples[case].append(found)
+                            residuals = measure_residuals(experiment, case, ccds, observed, models, threads)
+                            samples[case].append(residuals)
                     except PachonError as error:
                         problems |= dict.fromkeys(together, str(error))
                     stage.advance(len(together))
-                done += len(wanted)
+                done += len(snr_cases)
                 stage.step(f"S/N {snr:g}, noise {draw + 1}", done, total)
-    made = [case for case in cases if case not in problems]
-    if not made:
+    fitted_cases = [case for case in cases if case not in problems]
+    if not fitted_cases:
         raise DomainError(f"no model could be fitted: {problems[cases[0]]}")
-    metrics = {case: case_metrics(samples[case]) for case in made}
-    squares = {case: np.mean([s.square[:, 1] @ (2.0, 1.0) for s in samples[case]], axis=0) for case in made}
+    metrics = {case: case_metrics(samples[case]) for case in fitted_cases}
+    squares = {case: np.mean([s.square[:, 1] @ (2.0, 1.0) for s in samples[case]], axis=0) for case in fitted_cases}
     return Study(plan, metrics, {case: problems[case] for case in cases if case in problems}, squares)
 
 
