@@ -8,21 +8,8 @@ import numpy as np
 
 from .basis import FittedBasis
 from .clean_stars import CleanStars
-from .polynomial import term_count
+from .polynomial import FOLDS, term_count
 from .shape_noise import ShapeNoise
-
-#: Orders from which an automatic choice is made.
-ORDERS = range(5)
-# Number of folds; the i-th star is in fold i modulo this.
-_FOLDS = 5
-# Most terms of polynomials over the stars that they are fitted to.
-_MOST_TERMS = 0.5
-
-
-def automatic_orders(n_stars: int) -> list[int]:
-    """Return the orders of polynomials that may be chosen for so many stars, ascending."""
-    fitted = n_stars - -(-n_stars // _FOLDS)
-    return [order for order in ORDERS if order == 0 or term_count(order) <= _MOST_TERMS * fitted]
 
 
 def choose_by_cross_validation(
@@ -53,7 +40,7 @@ def choose_by_cross_validation(
     given : array or None
         Weights of the stars in the polynomials, [n], with equal ones in the basis; None for those of their noise.
     """
-    fold = np.arange(len(terms)) % _FOLDS
+    fold = np.arange(len(terms)) % FOLDS
     residuals = np.full((len(terms), len(orders), len(counts), 3), np.nan)
     for index in range(fold.max() + 1):
         held_out = fold == index

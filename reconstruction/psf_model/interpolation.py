@@ -16,9 +16,8 @@ from ...core.errors import ConfigError
 from ...core.threads import one_blas_thread
 from .basis import FittedBasis
 from .checks import check_distinct_positions, check_terms
-from .cross_validation import automatic_orders
 from .file_parts import ModelParts
-from .polynomial import MOST_ORDER, Extent, design_matrix
+from .polynomial import MOST_ORDER, Extent, automatic_orders, design_matrix
 
 # Order of the polynomials that predict outliers and masked pixels where the interpolation has none of its own.
 _SMOOTH_ORDER = 2

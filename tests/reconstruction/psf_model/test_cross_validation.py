@@ -7,9 +7,8 @@ import pytest
 
 from pachon.core.errors import ConfigError
 from pachon.measure.shapes import measure_shapes
-from pachon.reconstruction.psf_model.cross_validation import automatic_orders
 from pachon.reconstruction.psf_model.model import PsfModel
-from pachon.reconstruction.psf_model.polynomial import design_matrix
+from pachon.reconstruction.psf_model.polynomial import automatic_orders, design_matrix
 from pachon.reconstruction.psf_model.shape_noise import ShapeNoise
 
 #: The recipe of the paper, where a test does not say otherwise.
