@@ -71,7 +71,7 @@ def linear(products, experiment) -> np.ndarray:
         used, xy = stars.used, np.stack([stars.x, stars.y], axis=1)
         weights = snr_weights("softened", stars.snr[used])
         stamps = product.observed_images[used]
-        model = PsfModel.fit(stamps, xy[used], basis="pixels", order=1, weights=weights)
+        model = PsfModel.fit(stamps, xy[used], recipe="paper", basis="pixels", order=1, weights=weights)
         images = model.at(np.stack([product.holdout.x, product.holdout.y], axis=1))
         shapes = measure_shapes(images, product.pixel_scale, experiment.weight_fwhm)
         result.append(np.stack([shapes.e1, shapes.e2, np.log(shapes.size)], axis=1))

@@ -75,14 +75,13 @@ def options(electrons):
     """Return the options of PsfModel.fit that one could choose."""
     weights = {"equal weights": None, "(S/N)^2": electrons**2, "weights by noise": "noise"}
     found = {
-        f"pixels, order {order}, {name}": {"basis": "pixels", "order": order, "weights": value}
+        f"pixels, order {order}, {name}": {"recipe": "paper", "basis": "pixels", "order": order, "weights": value}
         for order in range(4)
         for name, value in weights.items()
     }
     found |= {f"PCA auto, order {order}": {"n_components": "auto", "order": order} for order in (1, 2, 3, "auto")}
     found["PCA 20, order 3 (paper)"] = {"n_components": min(20, len(electrons) - 2)}
-    found["Gaussian process"] = {"interpolation": "gp", "n_components": min(20, len(electrons) - 2)}
-    found["kriging of pixels"] = {"basis": "pixels", "interpolation": "kriging"}
+    found["kriging of pixels"] = {}
     return found
 
 
@@ -125,7 +124,7 @@ def one_field(kind, count, seed, piff_orders, without=()):
     first = pachon.measure_shapes(stars, PIXEL * ARCSEC, FWHM * ARCSEC)
     centred = center_stamps(stars, first.x, first.y, size=size, normalize=False)[used]
     electrons = centred.sum(axis=(1, 2))
-    exact = {"basis": "pixels", "order": 2, "weights": exact_weights(electrons, truth.mean(axis=0))}
+    exact = {"recipe": "paper", "basis": "pixels", "order": 2, "weights": exact_weights(electrons, truth.mean(axis=0))}
     chosen = {name: how for name, how in options(electrons).items() if not any(text in name for text in without)}
     for name, how in ({EXACT: exact} | chosen).items():
         try:

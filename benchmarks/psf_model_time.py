@@ -21,7 +21,7 @@ import numpy as np
 import pachon
 from pachon.reconstruction.ccd_product import CcdProduct, read_product
 
-OPTIONS = {"polynomials": {"interpolation": "polynomial", "order": 3}, "Gaussian processes": {"interpolation": "gp"}}
+OPTIONS = {"polynomials": {"order": 3}, "kriging": {"interpolation": "kriging", "gain": None}}
 
 
 def fit_and_write(product: CcdProduct, options: dict, path: Path) -> None:

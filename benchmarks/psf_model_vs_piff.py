@@ -92,9 +92,9 @@ def main() -> None:
         stamps = product.observed_images[used].astype(np.float64)
         places = np.stack([product.observed.x, product.observed.y], axis=1)[used]
         elsewhere = np.stack([product.holdout.x, product.holdout.y], axis=1)
-        stars, options = piff_stars(product), {"order": order, "extent": product.model.extent}
+        stars, options = piff_stars(product), {"recipe": "paper", "order": order, "extent": product.model.extent}
         weights, electrons = product.observed.snr[used] ** 2, product.observed.electrons[used, None, None]
-        kriged = {"basis": "pixels", "interpolation": "kriging", "extent": product.model.extent}
+        kriged = {"extent": product.model.extent}
         jobs = {
             "plain": lambda o=options, s=stamps, p=places: pachon.PsfModel.fit(s, p, **o),
             "weighted": lambda o=options, s=stamps, p=places, w=weights: pachon.PsfModel.fit(s, p, weights=w, **o),

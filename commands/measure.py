@@ -10,7 +10,18 @@ from typer import Argument, Option
 
 from ..core.errors import ConfigError
 from .inputs import load_model
-from .options import Json, Quiet, Threads
+from .options import (
+    Basis,
+    Components,
+    Interpolation,
+    Json,
+    Order,
+    Quiet,
+    Recipe,
+    Threads,
+    Weights,
+    recipe_of_options,
+)
 from .tables import Rows, print_json
 from .workers import Processes, long_work
 
@@ -35,11 +46,12 @@ def measure_command(
             help="Telescope of the focal-plane model: name or file. By default images.yaml beside the images has it."
         ),
     ] = None,
-    basis: Annotated[str | None, Option(help="Basis of the CCD's model: pixels (default), pca, shapelets.")] = None,
-    interpolation: Annotated[
-        str | None, Option(help="Between the stars: kriging (default of pixels), polynomial, gp.")
-    ] = None,
-    order: Annotated[int | None, Option(min=0, max=6, help="Order of polynomials over the image.")] = None,
+    recipe: Recipe = None,
+    basis: Basis = None,
+    interpolation: Interpolation = None,
+    components: Components = None,
+    weights: Weights = None,
+    order: Order = None,
     min_snr: Annotated[float, Option(help="Least S/N of stars.")] = 30.0,
     resume: Annotated[bool, Option("--resume", help="Keep whole products of images measured in the same way.")] = False,
     processes: Processes = None,
@@ -59,7 +71,7 @@ def measure_command(
     - `pachon measure pachon_images/image_R22_S11.fits`
     - `pachon measure pachon_images/image_*.fits -o catalogues --processes 2`: two images at a time
     - `pachon measure pachon_images/image_*.fits -o catalogues --resume`: go on where it was stopped
-    - `pachon measure pachon_images/image_*.fits -o catalogues --basis pca --order 3`: the PSF in the paper's way
+    - `pachon measure pachon_images/image_*.fits -o catalogues --recipe paper`: the PSF in the paper's way
     - `pachon measure pachon_images/image_*.fits -o catalogues --model focal_plane`: optics, heights and turbulence
     """
     from ..core.files import make_folder
@@ -73,17 +85,21 @@ def measure_command(
     if out is not None:
         make_folder(out)
     images = images_among(images)
-    options = {"basis": basis, "interpolation": interpolation, "order": order, "min_snr": min_snr}
+    ccd_recipe = recipe_of_options(recipe, basis, interpolation, components, weights, order)
+    if model != "ccd" and ccd_recipe is not None:
+        raise ConfigError("--recipe and its options are of models of a CCD: expected none with --model focal_plane")
     hint = "catalogues that are written stay, and --resume goes on from there"
     with long_work(quiet, hint, threads=threads, resume=resume, processes=processes) as execution:
         psf = None
         if model == "focal_plane":
-            known = None if telescope is None else load_model(telescope)
+            telescope_model = None if telescope is None else load_model(telescope)
             psf = (images[0].parent if out is None else out) / "focal_plane_psf.fits"
-            fit_exposure_psf(images, known, min_snr=min_snr, threads=threads, reporter=execution.reporter).write(psf)
-        found = measure_files(images, out, psf=psf, options=options, execution=execution)
+            fit_exposure_psf(
+                images, telescope_model, min_snr=min_snr, threads=threads, reporter=execution.reporter
+            ).write(psf)
+        measured = measure_files(images, out, psf=psf, recipe=ccd_recipe, min_snr=min_snr, execution=execution)
     if as_json:
-        print_json({"images": found.metrics, "left_out": found.left_out})
+        print_json({"images": measured.metrics, "left_out": measured.left_out})
     elif not quiet:
         rows = [
             (
@@ -95,7 +111,7 @@ def measure_command(
                 f"{m.get('purity', float('nan')):.3f}",
                 f"{m['usable_per_arcmin2']:.1f}",
             )
-            for name, m in found.metrics.items()
+            for name, m in measured.metrics.items()
         ]
         headings = ("image", "objects", "stars", "complete, pure", "half [mag]", "purity", "usable/arcmin²")
         Rows(headings, rows, _CAPTION).show()

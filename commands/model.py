@@ -3,13 +3,29 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
 
 from .interrupt import interruptible
-from .options import Gain, Json, MinSnr, Quiet, StarImages, StarStamp, StarX, StarY
+from .options import (
+    Basis,
+    Components,
+    Gain,
+    Interpolation,
+    Json,
+    MinSnr,
+    Order,
+    Quiet,
+    Recipe,
+    StarImages,
+    StarStamp,
+    StarX,
+    StarY,
+    Weights,
+    recipe_of_options,
+)
 from .tables import Rows, print_json
 
 app = typer.Typer()
@@ -29,15 +45,21 @@ def model_command(
     gain: Gain = 1.0,
     saturation: Annotated[float | None, Option(help="Level from which on a pixel is saturated.")] = None,
     background: Annotated[bool, Option(help="Subtract the median of the outer pixels of each stamp.")] = True,
+    recipe: Recipe = None,
+    basis: Basis = None,
+    interpolation: Interpolation = None,
+    components: Components = None,
+    weights: Weights = None,
+    order: Order = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Model the PSF of an image from a table of its stars, and show how well it predicts stars that were held out.
 
     Stars are centred, those with neighbours, cosmic rays and saturated cores left out. The kind of model is the one
-    that predicts held-out stars best: kriging of pixels, unless another is clearly better. It leaves the model,
-    STARS_psf.fits; a picture beside it, .png; and all stars with their shapes and what the model made without them
-    predicts, .ecsv.
+    that predicts held-out stars best: kriging of pixels, unless another is clearly better, or that of the options. It
+    leaves the model, STARS_psf.fits; a picture beside it, .png; and all stars with their shapes and what the model made
+    without them predicts, .ecsv.
 
     **Examples**
 
@@ -52,9 +74,11 @@ def model_command(
     from ..reconstruction.own_stars.own_stars import fit_own_stars
     from ..reconstruction.own_stars.star_catalogue import load_stars
 
+    chosen_recipe = recipe_of_options(recipe, basis, interpolation, components, weights, order)
+    options: dict[str, Any] = {} if chosen_recipe is None else {"recipe": chosen_recipe}
     path = stars.with_name(f"{stars.stem}_psf.fits") if out is None else out
     with interruptible(quiet) as reporter, reporter.stage(f"PSF of {stars.name}"):
-        own = fit_own_stars(
+        result = fit_own_stars(
             *load_stars(stars, x=x, y=y, stamp=stamp, images=images),
             pixel_arcsec * ARCSEC,
             size=size,
@@ -62,26 +86,27 @@ def model_command(
             gain=gain,
             saturation=saturation,
             background=background,
+            **options,
         )
-        own.model.write(path)
-        write_bytes(path.with_suffix(".png"), png_bytes(own.plot(stars.name)))
-        write_table(path.with_suffix(".ecsv"), own.table())
-    found = own.summary()
+        result.model.write(path)
+        write_bytes(path.with_suffix(".png"), png_bytes(result.plot(stars.name)))
+        write_table(path.with_suffix(".ecsv"), result.table())
+    summary_of_stars = result.summary()
     if as_json:
-        print_json({"model": str(path), **found})
+        print_json({"model": str(path), **summary_of_stars})
     elif not quiet:
-        flagged = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in found["flagged"].items() if n)
+        flagged = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in summary_of_stars["flagged"].items() if n)
         rows = [
-            ("kind of model", str(found["kind"])),
-            ("stars, used", f"{found['stars']}, {found['used']}"),
+            ("kind of model", str(summary_of_stars["kind"])),
+            ("stars, used", f"{summary_of_stars['stars']}, {summary_of_stars['used']}"),
             ("flagged", flagged or "none"),
-            ("S/N, median", f"{found['median_snr']:.0f}"),
-            (f"FWHM, pixels of {pixel_arcsec:.4g} arcsec", f"{found['fwhm_arcsec']:.3g} arcsec"),
-            ("rms of e of the stars", f"{100 * found['rms_e']:.2f} %"),
-            ("... less the model, held out", f"{100 * found['rms_e_held_out']:.2f} %"),
-            ("... of which noise of the stars", f"{100 * found['rms_e_noise']:.2f} %"),
-            ("rms of size less the model, held out", f"{100 * found['rms_size_held_out']:.2f} %"),
-            ("... of which noise of the stars", f"{100 * found['rms_size_noise']:.2f} %"),
+            ("S/N, median", f"{summary_of_stars['median_snr']:.0f}"),
+            (f"FWHM, pixels of {pixel_arcsec:.4g} arcsec", f"{summary_of_stars['fwhm_arcsec']:.3g} arcsec"),
+            ("rms of e of the stars", f"{100 * summary_of_stars['rms_e']:.2f} %"),
+            ("... less the model, held out", f"{100 * summary_of_stars['rms_e_held_out']:.2f} %"),
+            ("... of which noise of the stars", f"{100 * summary_of_stars['rms_e_noise']:.2f} %"),
+            ("rms of size less the model, held out", f"{100 * summary_of_stars['rms_size_held_out']:.2f} %"),
+            ("... of which noise of the stars", f"{100 * summary_of_stars['rms_size_noise']:.2f} %"),
             ("model, picture, stars", f"{path}, .png, .ecsv"),
         ]
         Rows(("", ""), rows, left=2).show()

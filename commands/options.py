@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ..models.telescope import Telescope
+    from ..reconstruction.psf_model.recipe import Recipe as PsfRecipe
 
 Config = Annotated[Path | None, Argument(metavar="CONFIG.yaml", help="Configuration; all has a default.")]
 Ccds = Annotated[str | None, Option(help="CCDs, separated by commas: R22_S11,R22_S12.")]
@@ -60,9 +61,35 @@ StarStamp = Annotated[str, Option("--stamp", help="Column of the stamps [ny, nx]
 StarImages = Annotated[Path | None, Option("--images", help="FITS cube of the stamps, where the table has none.")]
 MinSnr = Annotated[float, Option(help="Least S/N of a star.")]
 Gain = Annotated[float, Option(help="Electrons in a unit of the stamps.")]
+Recipe = Annotated[
+    str | None, Option(help="Model of the CCD: kriging (of pixels, default), paper (20 eigen-PSFs, cubic polynomials).")
+]
+Basis = Annotated[str | None, Option(help="Of the recipe: pixels, pca, shapelets.")]
+Interpolation = Annotated[str | None, Option(help="Of the recipe, between the stars: kriging, polynomial.")]
+Components = Annotated[int | None, Option(min=1, help="Components of pca and shapelets.")]
+Weights = Annotated[str | None, Option(help="Of the stars in polynomials: equal, snr, softened, noise.")]
+Order = Annotated[int | None, Option(min=0, max=6, help="Of polynomials over the image, or of the trend in kriging.")]
 Threads = Annotated[int | None, Option(min=1, help="Threads; all processors by default. No byte depends on it.")]
 Quiet = Annotated[bool, Option("--quiet", help="No progress, no table.")]
 Json = Annotated[bool, Option("--json", help="Print metrics as JSON on standard output, and nothing else there.")]
+
+
+def recipe_of_options(
+    recipe: str | None,
+    basis: str | None,
+    interpolation: str | None,
+    components: int | None,
+    weights: str | None,
+    order: int | None,
+) -> PsfRecipe | None:
+    """Return the recipe of the options of a PSF model; None where none is given."""
+    from ..reconstruction.psf_model.recipe import Recipe as PsfRecipe
+
+    if all(value is None for value in (recipe, basis, interpolation, components, weights, order)):
+        return None
+    return PsfRecipe.of(
+        recipe, basis=basis, interpolation=interpolation, n_components=components, weights=weights, order=order
+    )
 
 
 def name_list(text: str, option: str) -> tuple[str, ...]:

@@ -29,7 +29,7 @@ _COLUMNS = {
     "xi_plus_away_long": "ξ+ beyond 10'",
 }
 _CAPTION = (
-    "Residuals of the base, of the recommended model, and of the best order of each number of stars. Rms of one "
+    "Residuals of the base, the default, the recommended model, and the best order of each number of stars. Rms of one "
     "component of e: observed - model at the stars of the fit, which is too small; noise-free - model at holdout "
     "positions. Also at holdout positions: rms of the relative size, rms over CCDs of the mean e, and mean ξ+ from 10' "
     "to 3 deg."
@@ -106,8 +106,8 @@ def study_command(
 def _show(result: Study) -> None:
     from ..studies.psf_choice.plan import FOCAL_PLANE
 
-    plan, chosen, console = result.plan, result.recommended(), wide_console()
-    cases = [plan.base, *([chosen] if chosen is not None else [])]
+    plan, best_case, console = result.plan, result.recommended(), wide_console()
+    cases = [plan.base, plan.default, *([best_case] if best_case is not None else [])]
     ways = ("equal", "softened", *(FOCAL_PLANE if plan.focal_plane else ()))
     for stars in plan.stars:
         cases += [best for how in ways if (best := result.best_order(stars, how))]
@@ -121,20 +121,20 @@ def _show(result: Study) -> None:
         console.print(
             f"{len(result.problems)} models could not be fitted, such as {case.stars} stars, {case}: {why}", style="dim"
         )
-    if chosen is None:
+    if best_case is None:
         console.print(f"no model of {plan.base.stars} stars could be fitted")
         return
-    error = result.metrics[chosen]["error_rms_e_away"]
+    error = result.metrics[best_case]["error_rms_e_away"]
     console.print(
-        f"recommended for {plan.base.stars} stars of S/N {plan.base.snr:g} and more: {chosen}; residual of e at "
-        f"holdout positions {result.metrics[chosen]['rms_e_away']:.2e} ± {error:.0e}",
+        f"recommended for {plan.base.stars} stars of S/N {plan.base.snr:g} and more: {best_case}; residual of e at "
+        f"holdout positions {result.metrics[best_case]['rms_e_away']:.2e} ± {error:.0e}",
         highlight=False,
     )
 
 
 def _numbers(text: str, option: str, kind: type[_Number]) -> tuple[_Number, ...]:
     try:
-        return tuple(kind(part) for part in name_list(text, option))
+        return tuple(kind(number) for number in name_list(text, option))
     except ValueError:
         expected = "whole numbers" if kind is int else "numbers"
         raise ConfigError(f"{option} = {text!r}: expected {expected} separated by commas, such as 20,40") from None

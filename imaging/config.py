@@ -20,7 +20,16 @@ from ..core.errors import ConfigError, ProductError, error_context
 from ..core.files import content_hash
 from ..core.schema import Count, Positive, Real, Section, Switch, plain_number, validated
 from ..core.yaml_reader import read_mapping
-from ..pipeline.config import Configuration, PointingConfig, digest, section_yaml, with_options, with_run
+from ..pipeline.config import (
+    Configuration,
+    InterpolationName,
+    PointingConfig,
+    digest,
+    refuse_retired_interpolation,
+    section_yaml,
+    with_options,
+    with_run,
+)
 from ..pipeline.experiment import Experiment
 
 #: Pixels along a side of the PSF's stamps where the run leaves them open: wings down to 1e-6 of the light.
@@ -84,12 +93,17 @@ class ImageConfig(Section):
     way: Literal["direct", "eigen"] = Field(
         "direct", description="direct (each galaxy under its own PSF), eigen (whole image, component by component)"
     )
-    interpolation: Literal["polynomial", "gp"] = Field("polynomial", description="of the PSF over the CCD")
+    interpolation: InterpolationName = Field("polynomial", description="of the PSF over the CCD: polynomial or kriging")
     side: Annotated[int, Field(strict=True, ge=64)] | None = Field(
         None, description="only the central square of a CCD [pixel]; by default all of it"
     )
     preview: Switch = Field(True, description="a PNG of each CCD")
     cutouts: Switch = Field(True, description="a PNG of 100 arcsec at the exposure time, at 6000 s, and without noise")
+
+    @classmethod
+    def check(cls, content: dict[str, Any]) -> None:
+        """Raise the error of an interpolation that another one has replaced."""
+        refuse_retired_interpolation(content)
 
 
 class ImagesConfig(Section):

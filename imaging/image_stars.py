@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,14 +16,17 @@ from ..measure.catalogue.star_locus import StarSelection, select_stars
 from ..measure.shapes import measure_shapes
 from ..measure.star_selection import flag_stars
 from ..reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
-from ..reconstruction.psf_model.checks import snr_weights
 from ..reconstruction.psf_model.model import PsfModel
+from ..reconstruction.psf_model.recipe import DEFAULT, Recipe
 from .exposure import SATURATED
 from .image_file import CcdImage
 
-# Stars whose shape deviates from that of their neighbours by more of the usual deviations than this are left out; a
-# galaxy or a blend among fewer stars than the second number cannot be told from the change of the PSF.
-_DEVIATIONS, _FEWEST, _PASSES = 6.0, 12, 5
+# Stars whose shape deviates from that of their neighbours by more of the usual deviations than this are left out.
+_DEVIATIONS = 6.0
+# A galaxy or a blend among fewer stars cannot be told from the change of the PSF.
+_FEWEST = 12
+# Most passes of leaving them out.
+_PASSES = 5
 
 
 def objects_and_stars(image: CcdImage, min_snr: float) -> tuple[DetectedObjects, StarSelection]:
@@ -49,17 +51,8 @@ def sky_variance(image: CcdImage) -> float:
     return float(np.median(image.variance[image.mask == 0]))
 
 
-def fit_image_psf(
-    image: CcdImage,
-    stars: StarSelection,
-    *,
-    basis: Literal["pca", "pixels", "shapelets"] = "pixels",
-    interpolation: Literal["polynomial", "gp", "kriging"] = "kriging",
-    order: int | None = None,
-) -> PsfModel:
+def fit_image_psf(image: CcdImage, stars: StarSelection, recipe: Recipe = DEFAULT) -> PsfModel:
     """Fit a PSF model of one CCD to the selected stars of its image; positions are pixels of the image.
-
-    Polynomials of pixels are weighted by S/N up to about 100, those of the paper's components are not.
 
     Raises
     ------
@@ -67,15 +60,12 @@ def fit_image_psf(
         If there are too few stars for the model.
     """
     height, width = image.image.shape
-    weighted = basis == "pixels" and interpolation == "polynomial"
     try:
         return PsfModel.fit(
             stars.stamps,
             stars.positions,
-            basis=basis,
-            interpolation=interpolation,
-            weights=snr_weights("softened", stars.snr) if weighted else None,
-            order=order,
+            recipe=recipe,
+            weights=recipe.star_weights(stars.snr),
             gain=image.gain,
             extent=(-0.5, width - 0.5, -0.5, height - 0.5),
         )
@@ -116,7 +106,7 @@ def focal_plane_stars(
         If no image has stars.
     """
     weight = positive_angle(weight_fwhm, "weight_fwhm")
-    found, scale, reason = [], 0.0, "there are no images"
+    ccd_stars, scale, reason = [], 0.0, "there are no images"
     for image in images:
         try:
             _, stars = objects_and_stars(image, min_snr)
@@ -124,10 +114,10 @@ def focal_plane_stars(
             reason = str(error)
             continue
         scale = image.pixel_scale
-        found.append(_ccd_stars(image, stars, weight))
-    if not found:
+        ccd_stars.append(_ccd_stars(image, stars, weight))
+    if not ccd_stars:
         raise DomainError(f"no stars on the images: {reason}")
-    return FocalPlaneStars.of_ccds(found, scale, weight, pixels=True)
+    return FocalPlaneStars.of_ccds(ccd_stars, scale, weight, pixels=True)
 
 
 def _ccd_stars(image: CcdImage, stars: StarSelection, weight_fwhm: float) -> CcdStars:
@@ -157,8 +147,8 @@ def regular_shapes(values: np.ndarray, snr: np.ndarray, positions: np.ndarray) -
     for _ in range(_PASSES):
         trend = np.linalg.lstsq((terms * weight)[good], (values * weight)[good], rcond=None)[0]
         deviation = np.abs(values - terms @ trend) * weight
-        now = (deviation <= _DEVIATIONS * 1.4826 * np.median(deviation[good], axis=0)).all(axis=1)
-        if (now == good).all():
+        regular = (deviation <= _DEVIATIONS * 1.4826 * np.median(deviation[good], axis=0)).all(axis=1)
+        if (regular == good).all():
             break
-        good = now
+        good = regular
     return good

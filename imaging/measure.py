@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy import units as u
@@ -22,7 +22,10 @@ from ..measure.catalogue.matching import detection_rates, match_positions
 from ..measure.catalogue.objects import DetectedObjects
 from ..measure.catalogue.star_locus import StarSelection
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
+from ..reconstruction.psf_model.basis import Basis
+from ..reconstruction.psf_model.interpolation import Interpolation
 from ..reconstruction.psf_model.model import PsfModel
+from ..reconstruction.psf_model.recipe import Recipe
 from .image_file import CcdImage
 from .image_stars import fit_image_psf, objects_and_stars, pixels_of_ccd
 
@@ -118,7 +121,7 @@ class ImageCatalogue(Result):
         """Return numbers of objects and, against the truth of a simulated image, completeness and purity."""
         header, mask = self.image.header, self.image.mask
         area = float((mask == 0).sum()) * (self.image.pixel_scale / ARCMIN) ** 2
-        found: dict[str, Any] = {
+        numbers: dict[str, Any] = {
             "objects": len(self.objects),
             "stars": len(self.stars),
             "galaxies_fitted": len(self.galaxies),
@@ -137,13 +140,13 @@ class ImageCatalogue(Result):
             edges = np.arange(np.floor(np.nanmin(magnitude)), np.ceil(np.nanmax(magnitude)) + 0.5, 0.5)
             rates = detection_rates(magnitude, match, truth["MAG"], edges)
             half = np.flatnonzero((rates.n_true > 10) & (rates.completeness < 0.5))
-            found |= {
+            numbers |= {
                 "purity": float(real.mean()),
                 "magnitude_half_complete": float(edges[half[0]]) if len(half) else None,
                 "star_completeness": self.stars.completeness(star),
                 "star_purity": self.stars.purity(star),
             }
-        return found
+        return numbers
 
 
 @check_arguments
@@ -151,8 +154,11 @@ def measure_image(
     image: CcdImage,
     *,
     psf: FocalPlanePsf | None = None,
-    basis: Literal["pca", "pixels", "shapelets"] | None = None,
-    interpolation: Literal["polynomial", "gp", "kriging"] | None = None,
+    recipe: str | Recipe | None = None,
+    basis: str | Basis | None = None,
+    interpolation: str | Interpolation | None = None,
+    weights: str | None = None,
+    n_components: int | None = None,
     order: int | None = None,
     min_snr: float = 30.0,
     threads: int | None = None,
@@ -166,9 +172,12 @@ def measure_image(
     psf : FocalPlanePsf, optional
         Model of all CCDs, such as one fitted to :func:`~pachon.focal_plane_stars` of the images of the exposure. By
         default a model of the CCD is fitted to the stars of the image.
-    basis, interpolation, order : str, str, int, optional
+    recipe : str or Recipe, optional
         Kind of the model of the CCD, as of :meth:`~pachon.PsfModel.fit`: by default every pixel by kriging, which needs
-        no choice; with a `basis` of "pca", and wherever an `order` is given, polynomials as in Jee & Tyson (2011).
+        no choice; ``paper`` for that of Jee & Tyson (2011).
+    basis, interpolation, weights, n_components, order : optional
+        Keys of the recipe to change: weights are equal, snr, softened or noise, the others as of
+        :meth:`~pachon.PsfModel.fit`.
     min_snr : float
         Least S/N of stars.
     threads : int, optional
@@ -181,18 +190,22 @@ def measure_image(
     DomainError
         If nothing is detected, there are too few stars for a locus or a model, or the CCD is none of `psf`.
     """
-    if psf is not None and not (basis is interpolation is order is None):
-        raise ConfigError("basis, interpolation and order are of models of the CCD: expected none beside psf")
+    keys = {
+        "basis": basis,
+        "interpolation": interpolation,
+        "weights": weights,
+        "n_components": n_components,
+        "order": order,
+    }
+    if psf is not None and not all(value is None for value in (recipe, *keys.values())):
+        raise ConfigError(f"recipe, {', '.join(keys)} are of models of the CCD: expected none beside psf")
     objects, stars = objects_and_stars(image, min_snr)
     rows = np.setdiff1d(np.arange(len(objects)), stars.index)
     places = np.stack([objects.x[rows], objects.y[rows]], axis=1)
     model: PsfModel | FocalPlanePsf
     if psf is None:
-        basis = "pixels" if basis is None else basis
-        if interpolation is None:
-            interpolation = "kriging" if basis == "pixels" and order is None else "polynomial"
-        model = own = fit_image_psf(image, stars, basis=basis, interpolation=interpolation, order=order)
-        psfs = own.at(places)
+        model = fitted_psf = fit_image_psf(image, stars, Recipe.of(recipe, **keys))
+        psfs = fitted_psf.at(places)
     else:
         model = psf
         # Centroids at the rim may lie outside by a part of a pixel.

@@ -20,6 +20,7 @@ from ..core.products import read_fits, write_fits
 from ..core.version import VERSION
 from ..pipeline.config import digest
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
+from ..reconstruction.psf_model.recipe import DEFAULT, Recipe
 from .image_file import CcdImage
 from .measure import measure_image
 
@@ -46,20 +47,23 @@ class FileMeasurement:
         Folder of the products; None for that of each image.
     psf : Path or None
         File of the model of all images; None for one of each image.
-    options : dict
-        Further arguments of :func:`~.measure.measure_image`.
+    recipe : Recipe or None
+        Of the models of the images; None for the default one.
+    min_snr : float
+        Least S/N of stars.
     """
 
     folder: Path | None
     psf: Path | None
-    options: dict[str, Any]
+    recipe: Recipe | None
+    min_snr: float
 
     def __call__(self, path: Path, threads: int) -> dict[str, Any] | str:
         """Measure an image, write its PSF model and its catalogue, and return its metrics, or why it has none."""
         psf = None if self.psf is None else _model_in(self.psf, content_hash(self.psf, ProductError))
         image = CcdImage.read(path)
         try:
-            catalogue = measure_image(image, psf=psf, threads=threads, **self.options)
+            catalogue = measure_image(image, psf=psf, recipe=self.recipe, min_snr=self.min_snr, threads=threads)
         except DomainError as error:
             return str(error)
         table, metrics = catalogue.table(), catalogue.metrics()
@@ -80,7 +84,10 @@ class FileMeasurement:
         """Return the SHA-256 of all that decides the products of an image: its file, options, model, version."""
         model = None if self.psf is None else content_hash(self.psf, ProductError)
         image = content_hash(path, ProductError)
-        return digest({"image": image, "psf": model, "options": self.options, "version": VERSION})
+        options: dict[str, Any] = {"basis": None, "interpolation": None, "order": None, "min_snr": self.min_snr}
+        if self.recipe not in (None, DEFAULT):
+            options |= self.recipe.keys()
+        return digest({"image": image, "psf": model, "options": options, "version": VERSION})
 
     def finished(self, path: Path) -> dict[str, Any] | None:
         """Return the metrics of an image that is measured already, in the same way; None if a product is damaged.
@@ -119,7 +126,8 @@ def measure_files(
     folder: Path | None = None,
     *,
     psf: Path | None = None,
-    options: dict[str, Any] | None = None,
+    recipe: Recipe | None = None,
+    min_snr: float = 30.0,
     execution: Execution | None = None,
 ) -> MeasuredFiles:
     """Measure image files, and write a catalogue and a PSF model of each.
@@ -135,8 +143,10 @@ def measure_files(
         Folder of the products; by default that of each image.
     psf : Path, optional
         File of a :class:`~pachon.FocalPlanePsf` of all images; by default a model of each image is fitted, and written.
-    options : dict, optional
-        Further arguments of :func:`~.measure.measure_image`.
+    recipe : Recipe, optional
+        Of the models of the images.
+    min_snr : float
+        Least S/N of stars.
     execution : Execution, optional
         Workers, which see the same files; threads; progress display; and whether to keep the products of images that
         were measured in the same way, where both are whole by their checksums.
@@ -152,7 +162,7 @@ def measure_files(
             raise ConfigError(f"{folder}: two images are called {twice[0]}; expected different names, or no --out")
         names = [str(path) for path in images]
     execution = execution or Execution()
-    measure = FileMeasurement(folder, psf, options or {})
+    measure = FileMeasurement(folder, psf, recipe, min_snr)
     finished = measure.finished if execution.resume else lambda _: None
     metrics = {name: finished(path) for name, path in zip(names, images, strict=True)}
     due = {name: path for name, path in zip(names, images, strict=True) if metrics[name] is None}
@@ -174,4 +184,6 @@ def measure_files(
     if left_out and len(left_out) == len(images):
         name, reason = next(iter(left_out.items()))
         raise DomainError(reason if len(images) == 1 else f"no image can be measured; {name}: {reason}")
-    return MeasuredFiles({name: found for name, found in metrics.items() if found is not None}, left_out)
+    return MeasuredFiles(
+        {name: image_metrics for name, image_metrics in metrics.items() if image_metrics is not None}, left_out
+    )

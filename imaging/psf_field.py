@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,8 +15,10 @@ from ..core.units import for_each, pure_numbers
 from ..pipeline.experiment import Experiment
 from ..pipeline.resolved_values import noise_free_components
 from ..pipeline.simulate.ccd_exposure import expose_positions, holdout_positions
+from ..reconstruction.psf_model.interpolation import Interpolation
 from ..reconstruction.psf_model.model import PsfModel
 from ..reconstruction.psf_model.polynomial import design_matrix
+from ..reconstruction.psf_model.recipe import Recipe
 
 #: Pixels around a CCD that the PSF is extrapolated to, for galaxies whose light reaches the CCD.
 RIM = 40
@@ -47,7 +48,7 @@ class PsfField:
         lit_fraction: ArrayLike | None = None,
         n_components: int | None = None,
         order: int = 4,
-        interpolation: Literal["polynomial", "gp"] = "polynomial",
+        interpolation: str | Interpolation = "polynomial",
     ) -> PsfField:
         """Fit noise-free PSFs on one CCD.
 
@@ -62,7 +63,8 @@ class PsfField:
         lit_fraction : array, optional
             [n], part of the entrance pupil whose light arrives; 1 by default.
         n_components, order, interpolation
-            As in :meth:`pachon.PsfModel.fit`; 20 components or one less than the PSFs.
+            As in :meth:`pachon.PsfModel.fit`; 20 components or one less than the PSFs. The order is that of polynomials
+            alone.
 
         Raises
         ------
@@ -72,15 +74,10 @@ class PsfField:
         places = pure_numbers(positions, "positions")
         size = for_each(pure_numbers(pixels, "pixels"), 2, "pixels")
         extent = (-0.5, float(size[0]) - 0.5, -0.5, float(size[1]) - 0.5)
-        model = PsfModel.fit(
-            stamps,
-            places,
-            n_components=n_components,
-            order=order if interpolation == "polynomial" else 0,
-            interpolation=interpolation,
-            extent=extent,
-            clip_sigma=None,
-        )
+        recipe = Recipe.of("paper", interpolation=interpolation, n_components=n_components)
+        if not recipe.interpolation.needs_noise:
+            recipe = recipe.changed(order=order)
+        model = PsfModel.fit(stamps, places, recipe=recipe, gain=None, extent=extent, clip_sigma=None)
         share = 1.0 if lit_fraction is None else lit_fraction
         light = for_each(pure_numbers(share, "lit_fraction"), len(places), "lit_fraction")
         terms = design_matrix(places, extent, order)
@@ -93,7 +90,7 @@ class PsfField:
         experiment: Experiment,
         ccd: str,
         *,
-        interpolation: Literal["polynomial", "gp"] = "polynomial",
+        interpolation: str | Interpolation = "polynomial",
         threads: int | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> PsfField:
@@ -124,8 +121,8 @@ class PsfField:
     @check_arguments
     def amplitudes(self, positions: ArrayLike) -> np.ndarray:
         """Return amplitudes of mean and components, shape [n, 1 + k]; the first is 1."""
-        found = self.model.amplitudes(self._on_ccd(positions))
-        return np.concatenate([np.ones((len(found), 1)), found], axis=1)
+        of_components = self.model.amplitudes(self._on_ccd(positions))
+        return np.concatenate([np.ones((len(of_components), 1)), of_components], axis=1)
 
     @check_arguments
     def lit_fraction(self, positions: ArrayLike) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +16,7 @@ from ..core.units import ARCSEC
 from ..pipeline.experiment import Experiment
 from ..pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
 from ..pipeline.simulate.photometry import effective_fwhm
+from ..reconstruction.psf_model.interpolation import Interpolation
 from .draw import SIZES, SkyPixels, Sources, Window, add_stamps, draw_galaxies
 from .exposure import Exposure, expose
 from .image_file import CcdImage
@@ -88,7 +89,7 @@ def draw_ccd(
     position_angle: ArrayLike = 0.0,
     window: Window | None = None,
     way: str = "direct",
-    interpolation: Literal["polynomial", "gp"] = "polynomial",
+    interpolation: str | Interpolation = "polynomial",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> CcdScene:
@@ -115,8 +116,8 @@ def draw_ccd(
         Part of the CCD; all of it by default.
     way : {"direct", "eigen"}
         How galaxies are convolved, as in :func:`~pachon.imaging.draw.draw_galaxies`.
-    interpolation : {"polynomial", "gp"}
-        Of the PSF between the noise-free ones.
+    interpolation : str or Interpolation
+        Of the PSF between the noise-free ones: polynomial or kriging.
     threads : int, optional
         Number of threads; all processors by default. No byte depends on it.
     progress : callable, optional

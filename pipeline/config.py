@@ -9,10 +9,10 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar
 
 import yaml
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, SerializerFunctionWrapHandler, model_serializer
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError
@@ -25,12 +25,21 @@ from ..core.schema import (
     Section,
     Switch,
     Whole,
+    expected,
     plain_number,
     validated,
 )
 from ..core.yaml_reader import read_mapping
+from ..reconstruction.psf_model.recipe import BASES, INTERPOLATIONS, RECIPES, Recipe, names_of
+from ..reconstruction.psf_model.retired_process import GaussianProcess
 
 BandName = Literal["u", "g", "r", "i", "z", "y"]
+if TYPE_CHECKING:
+    RecipeName: TypeAlias = str
+    BasisName: TypeAlias = str
+    InterpolationName: TypeAlias = str
+else:
+    RecipeName, BasisName, InterpolationName = (Literal[tuple(table)] for table in (RECIPES, BASES, INTERPOLATIONS))
 _Model = TypeVar("_Model", bound=Section)
 #: Values of the height budget that a resolved configuration has without their being given.
 _CAMERAS_OWN = {"budget": "simulated"}
@@ -226,8 +235,14 @@ class SensorConfig(Section):
     edge_rolloff_length_um: Positive = Field(50.0, description="distance over which it falls by e [um]")
 
 
+def refuse_retired_interpolation(content: dict[str, Any]) -> None:
+    """Raise the error of a section whose interpolation another one has replaced."""
+    if content.get("interpolation") == GaussianProcess.name:
+        raise expected(names_of(INTERPOLATIONS, GaussianProcess.name), "interpolation")
+
+
 class ReconstructionConfig(Section):
-    """How the PSF is measured and modelled: pixels and kriging, or Jee & Tyson 2011 where basis, ... are given."""
+    """How the PSF is measured and modelled: by a recipe, each of whose keys may be given in place of its own."""
 
     model: Literal["ccd", "focal_plane"] = Field(
         "ccd", description="ccd (each CCD by itself), focal_plane (one more model, of the shapes on all CCDs together)"
@@ -235,24 +250,62 @@ class ReconstructionConfig(Section):
     flag_stars: Switch = Field(
         False, description="leave out stars with neighbours, cosmic rays and saturated cores, as far as they are seen"
     )
-    basis: Literal["pca", "pixels", "shapelets"] | None = Field(
+    recipe: RecipeName | None = Field(
+        None,
+        description="of the five keys below that are not given: kriging (of pixels), the default; paper (Jee & Tyson "
+        "2011: 20 eigen-PSFs, cubic polynomials, equal weights), that of components alone",
+    )
+    basis: BasisName | None = Field(
         None, description="what stars are described in: pca (eigen-PSFs), pixels (each on its own), shapelets"
     )
     components: Count | None = Field(None, description="components kept on each CCD, 20 by default; none of pixels")
-    interpolation: Literal["polynomial", "gp", "kriging"] | None = Field(
+    interpolation: InterpolationName | None = Field(
         None,
-        description="over the CCD: polynomial, gp (Gaussian process over a polynomial trend), kriging (one process and "
-        "trend for all, with the noise of each star)",
+        description="over the CCD: polynomial, kriging (one process and trend for all, with the noise of each star)",
     )
     weights: Literal["equal", "snr", "softened"] | None = Field(
         None, description="of the stars in the polynomials: equal, snr (S/N squared), softened (snr up to about 100)"
     )
     order: Whole | None = Field(
         None,
-        description="order of the polynomials fitted to the observed stars, 3; of the trend under a gp 0, in kriging 4",
+        description="order of the polynomials fitted to the observed stars, 3; of the trend in kriging 4",
     )
     truth_order: Whole = Field(4, description="order of the polynomials fitted to the noise-free PSFs")
     weight_fwhm_arcsec: Positive | None = Field(None, description="FWHM of the weight of the moments [arcsec]")
+
+    @classmethod
+    def check(cls, content: dict[str, Any]) -> None:
+        """Raise the error of an interpolation that another one has replaced."""
+        refuse_retired_interpolation(content)
+
+    @model_serializer(mode="wrap")
+    def _without_open_recipe(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Return the section without the name of a recipe where there is none: resolved, its keys stand for it."""
+        content: dict[str, Any] = handler(self)
+        return {key: value for key, value in content.items() if key != "recipe" or value is not None}
+
+    @property
+    def names_no_model(self) -> bool:
+        """Whether neither a recipe nor one of its keys is given."""
+        keys = (self.recipe, self.basis, self.components, self.interpolation, self.weights, self.order)
+        return all(value is None for value in keys)
+
+    def psf_recipe(self) -> Recipe:
+        """Return the recipe of the PSF model of a CCD, with the keys that are given; ConfigError if they exclude."""
+        recipe = Recipe.of(self.recipe, basis=self.basis, interpolation=self.interpolation)
+        named = self.recipe or self.basis
+        if self.components is not None and named and not recipe.basis.has_components:
+            raise ConfigError(
+                f"reconstruction.components = {self.components}: expected null with basis = {recipe.basis.name}"
+            )
+        if self.components is not None and not named:
+            recipe = Recipe.of(n_components=self.components, interpolation=self.interpolation)
+        if self.weights not in (None, "equal") and recipe.interpolation.needs_noise:
+            raise ConfigError(
+                f"reconstruction.weights = {self.weights}: expected equal with interpolation = "
+                f"{recipe.interpolation.name}, which has the noise of each star"
+            )
+        return recipe.changed(n_components=self.components, order=self.order, weights=self.weights)
 
 
 class Configuration(Section):
@@ -361,7 +414,7 @@ def to_yaml(config: Configuration, heading: Sequence[str] = ()) -> str:
     for name in sections:
         section = getattr(config, name)
         lines += ["", f"# {(type(section).__doc__ or '').strip()}", f"{name}:"]
-        lines += _yaml_lines(section, list(type(section).model_fields), "  ")
+        lines += _yaml_lines(section, list(section.model_dump()), "  ")
     return "\n".join(lines) + "\n"
 
 

@@ -68,12 +68,6 @@ def _check_reconstruction(config: Configuration, pixel_arcsec: float) -> None:
         )
     if fit.model == "focal_plane" and not config.atmosphere.enabled:
         raise ConfigError("reconstruction.model = focal_plane: expected atmosphere.enabled = true, whose mean it takes")
-    if fit.basis == "pixels" and fit.components is not None:
-        raise ConfigError(f"reconstruction.components = {fit.components}: expected null with basis = pixels")
-    if fit.interpolation != "polynomial" and fit.weights != "equal":
-        raise ConfigError(
-            f"reconstruction.weights = {fit.weights}: expected equal with interpolation = {fit.interpolation}"
-        )
 
 
 def _check_catalogue(stars: StarsConfig) -> None:
@@ -94,19 +88,19 @@ def _check_catalogue(stars: StarsConfig) -> None:
 
 
 def _check_star_counts(config: Configuration) -> None:
-    fit, stars = config.reconstruction, config.stars
+    fit, stars, recipe = config.reconstruction, config.stars, config.reconstruction.psf_recipe()
     for kind in ("truth",) if stars.catalogue else ("observed", "truth"):
         count = getattr(stars, kind)
         # The noise-free PSFs are always described by principal components.
         components = noise_free_components(config) if kind == "truth" else fit.components
-        if components is not None and components > count - 1 and (kind == "truth" or fit.basis == "pca"):
+        if components is not None and components > count - 1 and (kind == "truth" or recipe.basis.ordered):
             raise ConfigError(
                 f"reconstruction.components = {components}: expected at most {count - 1}, one less than "
                 f"stars.{kind} = {count}"
             )
         key = "order" if kind == "observed" else "truth_order"
         terms = term_count(getattr(fit, key))
-        if terms > count and (kind == "truth" or fit.interpolation != "kriging"):
+        if terms > count and (kind == "truth" or not recipe.interpolation.needs_noise):
             raise ConfigError(
                 f"reconstruction.{key} = {getattr(fit, key)}: its {terms} terms need as many stars, "
                 f"stars.{kind} = {count}"

@@ -27,7 +27,7 @@ from ..models.parameters.changes import apply_changes
 from ..models.site import Site
 from ..models.telescope import Telescope
 from ..raytrace.ideal_lens import require_image
-from ..reconstruction.psf_model.fit import COMPONENTS, ORDERS
+from ..reconstruction.psf_model.basis import COMPONENTS
 from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.psf.long_exposure import default_points
 from .alignment_states import ENDINGS as STATE_ENDINGS
@@ -40,10 +40,6 @@ from .simulate.photometry import PROVISIONAL_FWHM, limiting_magnitude, saturatio
 from .simulate.screen_cover import check_screens
 
 _WAVELENGTHS = 5
-# Keys of the PSF model of a CCD: where none is given it is _KRIGING, else _PAPER fills the other ones.
-_MODEL_KEYS = ("basis", "components", "interpolation", "weights", "order")
-_KRIGING = {"basis": "pixels", "interpolation": "kriging"}
-_PAPER = {"basis": "pca", "interpolation": "polynomial", "weights": "equal"}
 #: Largest number of CCDs of a camera that is computed whole by default.
 _FEW = 9
 #: Site of telescopes that name none.
@@ -147,16 +143,21 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
 
 
 def _reconstruction(fit: ReconstructionConfig, weight_fwhm_arcsec: float) -> ReconstructionConfig:
-    """Return the section with its defaults: kriging of pixels, or the paper's model once one of its keys is given.
-
-    Kriging halves the residual between the stars (docs/psf_models.md). Where basis, components, interpolation, weights
-    or order are given, the others are those of Jee & Tyson 2011.
-    """
-    if _names_no_model(fit):
-        fit = fit.model_copy(update=_KRIGING)
-    fit = _with_defaults(fit, _PAPER | {"weight_fwhm_arcsec": weight_fwhm_arcsec})
-    components = None if fit.basis == "pixels" else COMPONENTS
-    return _with_defaults(fit, {"components": components, "order": ORDERS[resolved_value(fit.interpolation)]})
+    """Return the section with every key of its recipe written out, in place of the recipe's name."""
+    recipe = fit.psf_recipe()
+    return _with_defaults(
+        fit.model_copy(
+            update={
+                "recipe": None,
+                "basis": recipe.basis.name,
+                "components": recipe.basis.n_components,
+                "interpolation": recipe.interpolation.name,
+                "weights": recipe.weights,
+                "order": recipe.interpolation.order,
+            }
+        ),
+        {"weight_fwhm_arcsec": weight_fwhm_arcsec},
+    )
 
 
 def with_paper_model(config: Configuration) -> Configuration:
@@ -165,15 +166,12 @@ def with_paper_model(config: Configuration) -> Configuration:
     With few stars, it has as many components as they determine.
     """
     fit = config.reconstruction
-    if not _names_no_model(fit):
+    if not fit.names_no_model:
         return config
     components = max(1, min(COMPONENTS, config.stars.truth - 1, config.stars.observed - 1))
-    paper = fit.model_copy(update={**_PAPER, "components": components})
-    return config.model_copy(update={"reconstruction": paper})
-
-
-def _names_no_model(fit: ReconstructionConfig) -> bool:
-    return all(getattr(fit, key) is None for key in _MODEL_KEYS)
+    return config.model_copy(
+        update={"reconstruction": fit.model_copy(update={"recipe": "paper", "components": components})}
+    )
 
 
 def _camera_of(telescope: Telescope, name: str | None) -> Camera:
@@ -182,25 +180,25 @@ def _camera_of(telescope: Telescope, name: str | None) -> Camera:
     ConfigError where there is none, DomainError where the telescope is afocal.
     """
     require_image(telescope, "a camera")
-    found = name or telescope.camera
-    if found is None:
+    camera_name = name or telescope.camera
+    if camera_name is None:
         raise ConfigError(
             f"telescope = {telescope.name}, which has none: expected a camera: {', '.join(CAMERAS)}, or a file, "
             "e.g. camera: hsc"
         )
     with error_context(key="camera"):
-        return load_camera(found)
+        return load_camera(camera_name)
 
 
 def _stamp_geometry(config: Configuration, telescope: Telescope, camera: Camera) -> dict[str, float]:
     """Return the default pixels [um] and size of stamps, as large on the sky as those of the LSST."""
     side, fine = (_SIDE, 1) if config.atmosphere.enabled else (_SIDE_ALONE, _FINE)
     pixel = camera.pixel_size / fine
-    found: dict[str, float] = {"pixel_um": round(pixel * 1e6, 9)}
+    geometry: dict[str, float] = {"pixel_um": round(pixel * 1e6, 9)}
     if config.psf.stamp is None:
         pixels = side * ARCSEC / pixel_angle(telescope, pixel)
-        found["stamp"] = max(2 * round(0.5 * (pixels - 1.0)) + 1, _FEWEST)
-    return found
+        geometry["stamp"] = max(2 * round(0.5 * (pixels - 1.0)) + 1, _FEWEST)
+    return geometry
 
 
 def _pixel_arcsec(psf: PsfConfig, telescope: Telescope) -> float:

@@ -33,9 +33,9 @@ def needed_bytes(experiment: Experiment, threads: int | None = None) -> int:
     workers = thread_count(threads) if config.psf.engine == "wave" else 0
     stamps = stars * experiment.stamp_size**2 * _STAMP_BYTES
     of_worker = _WAVE_THREAD + (0 if experiment.silicon is None else _SILICON_THREAD)
-    # The report holds the PSF model of every CCD; a model of pixels stores each star, and its weight under a process.
-    pixels = config.reconstruction.basis == "pixels"
-    models = 16 * len(resolved_value(config.ccds)) * config.stars.observed * experiment.stamp_size**2 if pixels else 0
+    # The report holds the PSF model of every CCD; one without components stores each star, and its weight in kriging.
+    stored_stars = 0 if config.reconstruction.psf_recipe().basis.has_components else config.stars.observed
+    models = 16 * len(resolved_value(config.ccds)) * stored_stars * experiment.stamp_size**2
     return max(_REPORT + models, _BASE + screen_bytes(experiment) + workers * of_worker + stamps)
 
 
@@ -53,15 +53,15 @@ def check_memory(experiment: Experiment, threads: int | None = None, *, copies: 
             f"{int(free // needed)} would do"
         )
     short = f"needs about {readable(needed)} of memory, {readable(free)} are free"
-    rest = needed - screen_bytes(experiment)
+    other_bytes = needed - screen_bytes(experiment)
     stars = experiment.config.stars
-    if rest > free or experiment.atmosphere is None:
-        most = max(map(experiment.observed_count, resolved_value(experiment.config.ccds)))
-        raise ConfigError(f"stars.truth = {stars.truth}, stars.observed = {most}: {short}")
+    if other_bytes > free or experiment.atmosphere is None:
+        star_count = max(map(experiment.observed_count, resolved_value(experiment.config.ccds)))
+        raise ConfigError(f"stars.truth = {stars.truth}, stars.observed = {star_count}: {short}")
     smaller = experiment.atmosphere
-    while smaller.screen_size > 16 and rest + screen_bytes(replace(experiment, atmosphere=smaller)) > free:
+    while smaller.screen_size > 16 and other_bytes + screen_bytes(replace(experiment, atmosphere=smaller)) > free:
         smaller = replace(smaller, screen_size=smaller.screen_size // 2)
     raise ConfigError(
         f"atmosphere.screen_size = {experiment.atmosphere.screen_size}: {short}; {smaller.screen_size} would do with"
-        f" {readable(rest + screen_bytes(replace(experiment, atmosphere=smaller)))}"
+        f" {readable(other_bytes + screen_bytes(replace(experiment, atmosphere=smaller)))}"
     )

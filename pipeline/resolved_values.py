@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import TypeVar
 
 from ..core.errors import ConfigError
-from ..reconstruction.psf_model.fit import COMPONENTS
-from ..reconstruction.psf_model.polynomial import term_count
+from ..reconstruction.psf_model.basis import COMPONENTS
 from .config import Configuration
 
 _T = TypeVar("_T")
@@ -27,9 +26,8 @@ def noise_free_components(config: Configuration) -> int:
 
 def least_star_count(config: Configuration) -> int:
     """Return how many observed stars the PSF model of a resolved configuration needs on a CCD."""
-    fit = config.reconstruction
-    terms = 0 if fit.interpolation == "kriging" else term_count(fit.order or 0)
-    return max(1 + (fit.components or 0) if fit.basis == "pca" else 2, terms)
+    recipe = config.reconstruction.psf_recipe()
+    return max(recipe.basis.least_stars, recipe.interpolation.least_stars)
 
 
 def require_drawn_stars(config: Configuration) -> None:

@@ -26,7 +26,8 @@ class _Unit(NamedTuple):
 
 
 _MM, _DEG, _SEC, _NONE = _Unit("mm", 1e-3), _Unit("deg", np.pi / 180.0), _Unit("arcsec", ARCSEC), _Unit("", 1.0)
-_MODEL, _NOISE_FREE_MODEL = "PSF", "TRUEPSF"
+_MODEL = "PSF"
+_NOISE_FREE_MODEL = "TRUEPSF"
 #: Ellipticities of a CCD, see :meth:`CcdProduct.ellipticity`.
 KINDS = ("truth", "observed", "residual", "left_out", "away")
 #: Residuals of the CCD's own model in runs with a focal-plane model.
@@ -274,9 +275,9 @@ def write_focal_plane_columns(folder: Path, product: CcdProduct) -> None:
     hdus = read_fits(path)
     for name, stars in (("STARS", product.observed), ("TRUTH", product.holdout)):
         before, table = hdus[name], _stars_table(stars)
-        known = before.columns.names
+        column_names = before.columns.names
         for key, (_, unit, description) in table.items():
-            source = key if key in known else _CCD_COLUMNS.get(key, key)
+            source = key if key in column_names else _CCD_COLUMNS.get(key, key)
             if key not in _REPLACED:
                 table[key] = (column(before, source), unit, description)
         hdus[name] = table_hdu(name, table)
@@ -327,10 +328,10 @@ def _stars_table(stars: Stars) -> dict[str, tuple[np.ndarray, str, str]]:
 
 def _stars_from_hdu(kind: type[_StarsKind], hdu: fits.BinTableHDU) -> _StarsKind:
     values = {}
-    for each in fields(kind):
-        name, unit, _ = _COLUMNS[each.name]
-        if each.default is None and name not in hdu.columns.names:
+    for attribute in fields(kind):
+        name, unit, _ = _COLUMNS[attribute.name]
+        if attribute.default is None and name not in hdu.columns.names:
             continue
         data = column(hdu, name)
-        values[each.name] = data * unit.size if data.dtype.kind == "f" else data
+        values[attribute.name] = data * unit.size if data.dtype.kind == "f" else data
     return kind(**values)

@@ -33,10 +33,10 @@ class StampGallery:
 
     def show(self, image: np.ndarray, row: int, column: int, title: str = "", **colours: Any) -> AxesImage:
         """Draw a stamp, with a title above it."""
-        side, rim, left, bottom = self._side, self._rim, self._step * column, self._down * row
-        self._axes.text(left + 0.5 * side, bottom + 1.02 * side, title, ha="center", va="bottom", fontsize=8)
+        side, rim, x0, bottom = self._side, self._rim, self._step * column, self._down * row
+        self._axes.text(x0 + 0.5 * side, bottom + 1.02 * side, title, ha="center", va="bottom", fontsize=8)
         middle = image[rim : len(image) - rim, rim : len(image) - rim]
-        return self._axes.imshow(middle, extent=(left, left + side, bottom, bottom + side), **colours)
+        return self._axes.imshow(middle, extent=(x0, x0 + side, bottom, bottom + side), **colours)
 
     def finish(self, rows: int, columns: int, names: Sequence[str] = ()) -> None:
         """Set limits, names of rows at the left, and a bar of a round number of arcseconds under the first stamp."""

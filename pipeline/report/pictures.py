@@ -57,13 +57,13 @@ def draw_pictures(
     # The paper's figures are the LSST's.
     paper = experiment.camera.name == "lsst"
     optics, focal_plane_model = not config.atmosphere.enabled, has_focal_plane_model(products)
-    fit, radius = config.reconstruction, experiment.field_radius_on_detector
+    recipe, radius = config.reconstruction.psf_recipe(), experiment.field_radius_on_detector
     # Without images and models, stars are soon sent to another process.
     stars, close = [p.ccd_stars for p in products], closest_middle_farthest(products)
     components = noise_free_components(config)
     jackknife = all(c.n_patches for c in correlated.values())
     errors = "by jackknife over the CCDs" if jackknife else "from the scatter of the ellipticities of one CCD alone"
-    unweighted = fit.interpolation == "polynomial" and fit.weights == "equal"
+    unweighted = recipe.weights == "equal" and not recipe.interpolation.needs_noise
     at_stars = (
         "Residuals at the stars of a CCD sum to zero by construction, so their correlation between CCDs cancels "
         "whatever the error of the model is"
@@ -122,7 +122,7 @@ def draw_pictures(
             "The same CCD, from the stars that were observed: components beyond the first few are noise.",
             "The paper keeps 20 components for observed stars too.",
             # Single pixels and shapelets look the same whatever the stars are.
-            wanted=fit.basis == "pca",
+            wanted=recipe.basis.ordered,
         ),
         _PendingPicture(
             "Number of components needed",

@@ -81,9 +81,8 @@ def spectrum_plot(products: Sequence[CcdProduct]) -> bytes:
                         linewidth=0.8,
                         alpha=0.7,
                     )
-        # Models of pixels have all components.
-        pixels = products[0].model.basis == "pixels"
-        count = (products[0].noise_free_model if pixels else products[0].model).n_components
+        described = products[0].model.basis.kind.has_components
+        count = (products[0].model if described else products[0].noise_free_model).n_components
         for axes in (spectrum_axes, fraction_axes):
             axes.axvline(count + 0.5, color="0.5", linewidth=0.8, linestyle=(0, (4, 3)))
             axes.set(yscale="log", xlabel="component n", xlim=(0, 2.2 * count))
@@ -99,7 +98,7 @@ def spectrum_plot(products: Sequence[CcdProduct]) -> bytes:
         spectrum_axes.plot([], [], "-o", color=OBSERVED, markersize=3.5, label="observed stars, dot: elbow")
         spectrum_axes.plot([], [], "-o", color=TRUTH, markersize=3.5, label="noise-free PSFs, dot: elbow")
         spectrum_axes.legend(loc="upper right")
-        cutoff_label = "noise-free components kept" if pixels else "components kept"
+        cutoff_label = "components kept" if described else "noise-free components kept"
         spectrum_axes.set_title(f"eigenvalues, a line a CCD; dashed: {cutoff_label}", loc="left")
         spectrum_axes.set_ylabel("variance of unit-sum stamps along n")
         fraction_axes.set_title("part of the variance beyond n", loc="left")

@@ -9,7 +9,6 @@ from typing import Any
 from ...core.page import Picture, render
 from ..config import ReconstructionConfig, to_yaml
 from ..experiment import Experiment
-from ..resolved_values import resolved_value
 from .tables import (
     MODELS_CAPTION,
     MODELS_COLUMNS,
@@ -47,11 +46,8 @@ def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequ
 
 def _model_words(fit: ReconstructionConfig) -> str:
     """Return the PSF model in words."""
-    described = {"pca": "principal components a CCD", "shapelets": "shapelets a CCD", "pixels": "each pixel on its own"}
-    kind = described[resolved_value(fit.basis)]
-    basis = kind if fit.components is None else f"{fit.components} {kind}"
-    processes = {"polynomial": "", "gp": "a Gaussian process over ", "kriging": "kriging over "}
-    process = processes[resolved_value(fit.interpolation)]
+    recipe = fit.psf_recipe()
+    basis = recipe.basis.words if fit.components is None else f"{fit.components} {recipe.basis.words}"
     weights = {"equal": "", "snr": ", weights (S/N)²", "softened": ", weights (S/N)², softened for bright stars"}
     shape_text = "; ellipticity and size from one model of the whole focal plane" if fit.model == "focal_plane" else ""
-    return f"{basis}, {process}polynomials of order {fit.order}{weights[resolved_value(fit.weights)]}{shape_text}"
+    return f"{basis}, {recipe.interpolation.words}polynomials of order {fit.order}{weights[recipe.weights]}{shape_text}"

@@ -7,10 +7,9 @@ import numpy as np
 from ...measure.shapes import Shapes, fwhm, measure_shapes
 from ...measure.star_selection import require_stars
 from ...reconstruction.ccd_product import CcdProduct, HoldoutStars, ObservedStars
-from ...reconstruction.psf_model.checks import snr_weights
 from ...reconstruction.psf_model.model import CLIP_SIGMA, PsfModel
 from ..experiment import Experiment
-from ..resolved_values import least_star_count, noise_free_components, resolved_value
+from ..resolved_values import least_star_count, noise_free_components
 from .ccd_exposure import CcdExposure, ccd_stars
 from .ccd_observation import Observation, collected_images, observe_ccd
 from .photometry import effective_fwhm, signal_to_noise
@@ -88,19 +87,16 @@ def fit_ccd_model(
     experiment: Experiment, observation: Observation, stars: StarField, snr: np.ndarray, *, noisy: bool = True
 ) -> PsfModel:
     """Fit the PSF model of the configuration to the observed stars of one CCD, S/N [n], that can be used."""
-    fit, used = experiment.config.reconstruction, observation.used
+    recipe, used = experiment.config.reconstruction.psf_recipe(), observation.used
     require_stars(used, observation.defects, least_star_count(experiment.config))
     images = observation.images[used]
-    if fit.interpolation != "polynomial":  # a process needs the photons
+    if recipe.interpolation.needs_noise:  # in electrons
         images = images * stars.electrons[used, None, None]
     return PsfModel.fit(
         images,
         stars.observed[used],
-        basis=resolved_value(fit.basis),
-        interpolation=resolved_value(fit.interpolation),
-        weights=snr_weights(resolved_value(fit.weights), snr[used]),
-        n_components=fit.components,
-        order=fit.order,
+        recipe=recipe,
+        weights=recipe.star_weights(snr[used]),
         extent=stars.extent,
         clip_sigma=CLIP_SIGMA if noisy else None,
     )
@@ -108,11 +104,11 @@ def fit_ccd_model(
 
 def _position_columns(experiment: Experiment, positions: np.ndarray, fields: np.ndarray) -> dict[str, np.ndarray]:
     """Return positions on the detector and of the sky; celestial ones where the configuration has a pointing."""
-    found = {"x": positions[:, 0], "y": positions[:, 1], "field_x": fields[:, 0], "field_y": fields[:, 1]}
+    columns = {"x": positions[:, 0], "y": positions[:, 1], "field_x": fields[:, 0], "field_y": fields[:, 1]}
     aim = experiment.pointing
     if aim is not None:
-        found["ra"], found["dec"] = aim.to_celestial(aim.to_sky(np.tan(fields))).T
-    return found
+        columns["ra"], columns["dec"] = aim.to_celestial(aim.to_sky(np.tan(fields))).T
+    return columns
 
 
 def _shape_columns(measured: Shapes, model: Shapes) -> dict[str, np.ndarray]:

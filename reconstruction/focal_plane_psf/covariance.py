@@ -122,9 +122,3 @@ def _scaled_distance(difference: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     u = matrix[0, 0] * difference[..., 0] + matrix[0, 1] * difference[..., 1]
     v = matrix[1, 1] * difference[..., 1]
     return np.sqrt(u * u + v * v)
-
-
-def inverse_from_cholesky(root: np.ndarray) -> np.ndarray:
-    """Return the inverse of a symmetric matrix of given lower Cholesky factor."""
-    lower = scipy.linalg.lapack.dpotri(root, lower=1)[0]
-    return np.tril(lower) + np.tril(lower, -1).T

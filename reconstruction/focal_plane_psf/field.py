@@ -76,12 +76,12 @@ class ShapeField:
                         spread[:, shape] += self._optics_variance(ccd, shape, design[at, :, shape], stars, weights)
             return at, change, spread
 
-        found = np.empty((len(places), 3)) if variance else None
+        variances = np.empty((len(places), 3)) if variance else None
         for at, change, spread in map_on_threads(job, ccds, threads):
             values[at] += change
-            if found is not None:
-                found[at] = spread
-        return values, found
+            if variances is not None:
+                variances[at] = spread
+        return values, variances
 
     def _neighbours(self, ccd: int) -> np.ndarray:
         return neighbours_of(self.data.places, self.mosaic.centers[ccd])
@@ -104,13 +104,13 @@ class ShapeField:
             first = common + int(np.searchsorted(ccds, of)) * width
             return np.r_[:common, first : first + width, len(used) - N_EXPOSURE : len(used)]
 
-        left = np.zeros((len(design), len(used)))
-        left[:, columns(ccd)] = design
-        for other in np.unique(at):
-            rows = at == other
-            left[:, columns(other)] -= weights[rows].T @ self.design[stars[rows], :, shape]
+        sensitivity = np.zeros((len(design), len(used)))
+        sensitivity[:, columns(ccd)] = design
+        for star_ccd in np.unique(at):
+            rows = at == star_ccd
+            sensitivity[:, columns(star_ccd)] -= weights[rows].T @ self.design[stars[rows], :, shape]
         covariance = self.optics.covariance[np.ix_(used, used)].astype(np.float64)
-        return np.asarray(((left @ covariance) * left).sum(axis=1))
+        return np.asarray(((sensitivity @ covariance) * sensitivity).sum(axis=1))
 
     def leave_one_out_residuals(self, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return shapes minus leave-one-out predictions, and their variances, each of shape [n, 3].
@@ -121,18 +121,18 @@ class ShapeField:
 
         def job(ccd: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             stars = self._neighbours(ccd)
-            own = self.data.places.ccd[stars] == ccd
+            on_ccd = self.data.places.ccd[stars] == ccd
             pairs = [leave_one_out(self._neighbourhood(stars, shape)) for shape in range(3)]
             return (
-                stars[own],
-                np.stack([p[0][own] for p in pairs], axis=1),
-                np.stack([p[1][own] for p in pairs], axis=1),
+                stars[on_ccd],
+                np.stack([p[0][on_ccd] for p in pairs], axis=1),
+                np.stack([p[1][on_ccd] for p in pairs], axis=1),
             )
 
-        left, variance = np.full((2, len(self.data), 3), np.nan)
+        residuals, variance = np.full((2, len(self.data), 3), np.nan)
         for at, difference, spread in map_on_threads(job, ccds, threads):
-            left[at], variance[at] = difference, spread
-        return left, variance
+            residuals[at], variance[at] = difference, spread
+        return residuals, variance
 
     def inliers(self, threads: int | None = None) -> np.ndarray:
         """Return the stars within :data:`CLIP_SIGMA` of the prediction from the others of their block, [n] bool."""
@@ -142,8 +142,8 @@ class ShapeField:
             values = []
             for shape, covariance in enumerate(self.covariances):
                 near = neighbourhood(covariance, data.places, self.residuals[:, shape], data.noise[:, shape], index)
-                left, variance = leave_one_out(near)
-                values.append(left / np.sqrt(variance))
+                block_residuals, variance = leave_one_out(near)
+                values.append(block_residuals / np.sqrt(variance))
             return np.stack(values, axis=1)
 
         blocks = blocks_of(data.places.xy)

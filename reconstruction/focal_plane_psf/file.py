@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from astropy.io import fits
@@ -31,10 +31,29 @@ from .mosaic import Mosaic, PsfShapes
 from .optics_part import OpticsPart
 from .response import ExposureResponse, Instrument
 
+if TYPE_CHECKING:
+    from .model import FocalPlanePsf
 
-def model_hdus(model: Any) -> list[fits.ImageHDU | fits.BinTableHDU]:
+
+class ModelFields(NamedTuple):
+    """Attributes of :class:`~pachon.FocalPlanePsf`, in its order."""
+
+    field: ShapeField
+    used: np.ndarray
+    leave_one_out: PsfShapes
+    chi2: dict[str, float]
+    evidence: float
+    warnings: tuple[str, ...]
+    weight_fwhm: float
+    pixel_scale: float | None
+    stamp_size: int
+    mean_star: np.ndarray | None
+    pca: ResidualImages | None
+
+
+def model_hdus(model: FocalPlanePsf) -> list[fits.ImageHDU | fits.BinTableHDU]:
     """Return a focal-plane model as FITS extensions."""
-    field: ShapeField = model.field
+    field = model.field
     mosaic, data = field.mosaic, field.data
     about: dict[str, Any] = {
         "chi2": model.chi2,
@@ -57,7 +76,7 @@ def model_hdus(model: Any) -> list[fits.ImageHDU | fits.BinTableHDU]:
         }
         if not camera.alike:
             about["camera"]["rotation_deg"] = camera.rotation_deg.tolist()
-    left = model.leave_one_out
+    predicted = model.leave_one_out
     hdus = [
         _image_hdu("CENTERS", mosaic.centers),
         _image_hdu("POSITION", data.places.xy),
@@ -67,7 +86,7 @@ def model_hdus(model: Any) -> list[fits.ImageHDU | fits.BinTableHDU]:
         _image_hdu("RESIDUAL", field.residuals),
         _image_hdu("COVARIANCE", np.stack([_covariance_row(c) for c in field.covariances])),
         _image_hdu("USED", model.used.astype(np.int16)),
-        _image_hdu("LEFT_OUT", np.stack([left.e1, left.e2, left.size], axis=1)),
+        _image_hdu("LEFT_OUT", np.stack([predicted.e1, predicted.e2, predicted.size], axis=1)),
     ]
     if model.mean_star is not None:
         hdus.append(_image_hdu("MEAN", model.mean_star))
@@ -111,33 +130,33 @@ def model_hdus(model: Any) -> list[fits.ImageHDU | fits.BinTableHDU]:
     return [_image_hdu("ABOUT", text, "JSON, one character of UTF-8 a pixel"), *hdus]
 
 
-def model_fields(hdus: Iterable[Any], path: Path) -> Mapping[str, Any]:
+def read_model(hdus: Iterable[fits.ImageHDU], path: Path) -> ModelFields:
     """Return the fields of a model from the extensions of :func:`model_hdus`; ProductError where they are missing."""
-    found = {hdu.name: hdu.data for hdu in hdus}
+    extensions = {hdu.name: hdu.data for hdu in hdus}
 
     def part(name: str) -> np.ndarray:
-        values = np.asarray(found[name])
+        values = np.asarray(extensions[name])
         return values.astype(values.dtype.newbyteorder("="))
 
     try:
         about = json.loads(bytes(part("ABOUT")))
         camera = None
         if "camera" in about:
-            known = about["camera"]
+            described = about["camera"]
             camera = Camera(
-                known["name"],
+                described["name"],
                 tuple(about["ccds"]),
-                tuple(known["rafts"]),
-                np.array(known["raft_index"]),
+                tuple(described["rafts"]),
+                np.array(described["raft_index"]),
                 part("CENTERS"),
-                np.broadcast_to(known["pixels"], (len(about["ccds"]), 2)).copy(),
-                known["pixel_size"],
-                rotation_deg=np.array(known.get("rotation_deg", [0.0])),
+                np.broadcast_to(described["pixels"], (len(about["ccds"]), 2)).copy(),
+                described["pixel_size"],
+                rotation_deg=np.array(described.get("rotation_deg", [0.0])),
             )
         mosaic = Mosaic(tuple(about["ccds"]), part("CENTERS"), about["half_size"], camera)
         places = _places_of(mosaic, part("POSITION"), part("STAR_CCD"))
         pca = None
-        if "PCA" in found:
+        if "PCA" in extensions:
             pca = ResidualImages(
                 mosaic,
                 part("PCA"),
@@ -148,9 +167,9 @@ def model_fields(hdus: Iterable[Any], path: Path) -> Mapping[str, Any]:
             )
         optics = None
         if "telescope" in about and camera is not None:
-            optics = _optics_part(about, part, found, camera)
-        return {
-            "field": ShapeField(
+            optics = _optics_part(about, part, frozenset(extensions), camera)
+        return ModelFields(
+            field=ShapeField(
                 mosaic,
                 ShapeData(places, part("SHAPE"), part("NOISE")),
                 part("RESIDUAL"),
@@ -158,34 +177,36 @@ def model_fields(hdus: Iterable[Any], path: Path) -> Mapping[str, Any]:
                 optics,
                 part("DESIGN") if optics is not None else None,
             ),
-            "used": part("USED").astype(bool),
-            "leave_one_out": PsfShapes(*part("LEFT_OUT").T),
-            "chi2": about["chi2"],
-            "evidence": np.nan if about["evidence"] is None else about["evidence"],
-            "warnings": tuple(about["warnings"]),
-            "weight_fwhm": about["weight_fwhm"],
-            "pixel_scale": about["pixel_scale"],
-            "stamp_size": about["stamp_size"],
-            "mean_star": part("MEAN") if "MEAN" in found else None,
-            "pca": pca,
-        }
+            used=part("USED").astype(bool),
+            leave_one_out=PsfShapes(*part("LEFT_OUT").T),
+            chi2=about["chi2"],
+            evidence=np.nan if about["evidence"] is None else about["evidence"],
+            warnings=tuple(about["warnings"]),
+            weight_fwhm=about["weight_fwhm"],
+            pixel_scale=about["pixel_scale"],
+            stamp_size=about["stamp_size"],
+            mean_star=part("MEAN") if "MEAN" in extensions else None,
+            pca=pca,
+        )
     except KeyError as error:
         raise ProductError(f"no focal-plane PSF model ({error.args[0]} is missing)", file=path) from None
 
 
-def _optics_part(about: Mapping[str, Any], part: Any, found: Mapping[str, Any], camera: Camera) -> OpticsPart:
+def _optics_part(
+    about: Mapping[str, Any], part: Callable[[str], np.ndarray], names: frozenset[str], camera: Camera
+) -> OpticsPart:
     instrument = Instrument.of(
         _telescope_from_text(about["telescope"]),
         part("WAVELENGTHS"),
         Atmosphere.from_site("cerro_pachon", seed=0, **about["atmosphere"]),
         **about["instrument"],
         weight_fwhm=about["weight_fwhm"],
-        dispersion=part("DISPERSION") if "DISPERSION" in found else None,
+        dispersion=part("DISPERSION") if "DISPERSION" in names else None,
         stamp_size=about["stamp_size"],
         silicon=Silicon(**about["silicon"]) if "silicon" in about else None,
     )
     cubic = part("HEIGHT_CUBIC")
-    grid = part("HEIGHT_SPLINE") if "HEIGHT_SPLINE" in found else None
+    grid = part("HEIGHT_SPLINE") if "HEIGHT_SPLINE" in names else None
     surfaces = CcdSurfaces(camera.half_sizes, cubic, np.zeros((len(cubic), 2, 4)), grid)
     wavefront, telescope = part("WAVEFRONT"), instrument.telescope
     return OpticsPart(

@@ -22,7 +22,8 @@ from ...core.progress import Reporter
 from ...core.threads import one_blas_thread
 from ...models.camera.focal_plane import FocalPlane
 from ...wavefront.aberration import ResidualWavefront
-from .covariance import Covariance, Places, inverse_from_cholesky
+from ..gaussian_field import inverse_from_cholesky
+from .covariance import Covariance, Places
 from .heights import HeightPrior
 from .kriging import map_on_threads
 from .likelihood import CovarianceFit, blocks_of, fit_covariance, log_likelihood
@@ -47,8 +48,10 @@ _MEAN = (0.02, 0.02, 0.01)
 _BLOCK = 750
 # Steps of Gauss-Newton and of the covariances, before the optics are evaluated again about the alignment found.
 _STEPS = 2
-# Rounds after these, as long as a coefficient of the wavefront moved by more [m] since the optics were evaluated.
-_ROUNDS, _MOVED = 3, 50e-9
+# Rounds after these.
+_ROUNDS = 3
+# ... as long as a coefficient of the wavefront moved by more [m] since the optics were evaluated.
+_MOVED = 50e-9
 # Most times that a step is halved.
 _HALVINGS = 6
 
@@ -113,9 +116,9 @@ class BlockEquations(NamedTuple):
 
 def columns_acting_on(prior: HeightPrior, ccds: np.ndarray) -> np.ndarray:
     """Return the columns of the parameters that act on some CCDs: the common ones, those of each, the exposure's."""
-    every = np.arange(prior.n_parameter + N_EXPOSURE)
-    own = [every[prior.columns_of(ccd)] for ccd in ccds]
-    return np.concatenate([every[: prior.n_common], *own, every[prior.n_parameter :]])
+    columns = np.arange(prior.n_parameter + N_EXPOSURE)
+    ccd_columns = [columns[prior.columns_of(ccd)] for ccd in ccds]
+    return np.concatenate([columns[: prior.n_common], *ccd_columns, columns[prior.n_parameter :]])
 
 
 def _design_columns(terms: np.ndarray, slopes: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -170,8 +173,8 @@ class ExposureFit:
         """Evaluate the optics about the parameters of the exposure."""
         aberration = wavefront(self.instrument.telescope, self.exposure[:-1].reshape(3, -1), self._radius)
         seeing = float(self.exposure[-1])
-        again = ", again" if self._response is not None else ""
-        with self.reporter.stage(f"optics at the stars{again}", total=5 * len(self.data)) as stage:
+        repetition = ", again" if self._response is not None else ""
+        with self.reporter.stage(f"optics at the stars{repetition}", total=5 * len(self.data)) as stage:
             self.optics = height_response(
                 self.instrument,
                 self.fields,
@@ -182,7 +185,7 @@ class ExposureFit:
                 stage.advance,
                 center=self._center,
             )
-        with self.reporter.stage(f"response to alignment and seeing{again}"):
+        with self.reporter.stage(f"response to alignment and seeing{repetition}"):
             self._response = ExposureResponse.of(
                 self.instrument, self.fields, self.flat, aberration, seeing, self.threads, center=self._center
             )
@@ -239,19 +242,19 @@ class ExposureFit:
                 max_iterations=max_iterations,
             )
 
-        found: list[CovarianceFit] = map_on_threads(fit, range(3), self.threads)
-        self.covariances = [f.covariance for f in found]
-        self.at_bounds = tuple(f"{n} of {SHAPES[i]}" for i, f in enumerate(found) for n in f.at_bounds)
+        covariance_fits: list[CovarianceFit] = map_on_threads(fit, range(3), self.threads)
+        self.covariances = [f.covariance for f in covariance_fits]
+        self.at_bounds = tuple(f"{n} of {SHAPES[i]}" for i, f in enumerate(covariance_fits) for n in f.at_bounds)
 
     def _terms(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the parameters that act on some stars, and their terms in the height, zero for the exposure's own."""
-        prior, here = self.prior, self.data.places[index]
-        ccds, width = np.unique(here.ccd), self.own.shape[1]
+        prior, star_places = self.prior, self.data.places[index]
+        ccds, width = np.unique(star_places.ccd), self.own.shape[1]
         used = columns_acting_on(prior, ccds)
         terms = np.zeros((len(index), len(used)))
         terms[:, : prior.n_common] = self.common[index]
         for i, ccd in enumerate(ccds):
-            rows = here.ccd == ccd
+            rows = star_places.ccd == ccd
             first = prior.n_common + i * width
             terms[rows, first : first + width] = self.own[index][rows]
         return used, terms
@@ -261,14 +264,14 @@ class ExposureFit:
         residuals, slopes, columns = self._columns()
 
         def contribution(index: np.ndarray) -> BlockEquations:
-            here = self.data.places[index]
+            block_places = self.data.places[index]
             used, terms = self._terms(index)
             matrix, vector = np.zeros((len(used), len(used))), np.zeros(len(used))
             for shape, covariance in enumerate(self.covariances):
                 design = _design_columns(terms, slopes[index, shape], columns[index, :, shape])
-                root = covariance.root(here, self.data.noise[index, shape])
-                both = np.column_stack([design, residuals[index, shape]])
-                white = scipy.linalg.solve_triangular(root, both, lower=True, check_finite=False)
+                root = covariance.root(block_places, self.data.noise[index, shape])
+                design_and_residuals = np.column_stack([design, residuals[index, shape]])
+                white = scipy.linalg.solve_triangular(root, design_and_residuals, lower=True, check_finite=False)
                 matrix += white[:, :-1].T @ white[:, :-1]
                 vector += white[:, :-1].T @ white[:, -1]
             return BlockEquations(used, matrix, vector)
@@ -292,25 +295,25 @@ class ExposureFit:
         ccds = np.unique(self.data.places.ccd)
         active = columns_acting_on(self.prior, ccds)
         within = np.ix_(active, active)
-        now = np.concatenate([self.heights, self.exposure])
-        before = self._objective(now, precision)
+        parameters = np.concatenate([self.heights, self.exposure])
+        before = self._objective(parameters, precision)
         for _ in range(steps):
             normal = self.normal_equations()
-            right = (normal.vector - precision @ now)[active]
+            right = (normal.vector - precision @ parameters)[active]
             matrix = (normal.matrix + precision)[within]
             # Parameters of metres and of pure numbers side by side: scale the matrix to a unit diagonal.
             scale = 1.0 / np.sqrt(np.diagonal(matrix))
             with one_blas_thread():
                 root = scipy.linalg.cholesky(matrix * scale[:, None] * scale, lower=True, overwrite_a=True)
-                step = np.zeros_like(now)
+                step = np.zeros_like(parameters)
                 step[active] = scale * scipy.linalg.cho_solve((root, True), scale * right)
             for halved in range(_HALVINGS):
-                trial = now + 0.5**halved * step
+                trial = parameters + 0.5**halved * step
                 after = self._objective(trial, precision)
                 if after <= before:
-                    now, before = trial, after
+                    parameters, before = trial, after
                     break
-            self.heights, self.exposure = now[:n_height], now[n_height:]
+            self.heights, self.exposure = parameters[:n_height], parameters[n_height:]
         self._log_determinant = 2.0 * float(np.log(np.diagonal(root)).sum() - np.log(scale).sum())
         with one_blas_thread():
             inverse = inverse_from_cholesky(root)
@@ -326,16 +329,16 @@ class ExposureFit:
     def _objective(self, parameters: np.ndarray, precision: np.ndarray) -> float:
         """Return the objective function of the fit."""
         n = self.prior.n_parameter
-        kept = self.heights, self.exposure
+        fitted_parameters = self.heights, self.exposure
         self.heights, self.exposure = parameters[:n], parameters[n:]
         residuals, _, _ = self._columns()
-        self.heights, self.exposure = kept
+        self.heights, self.exposure = fitted_parameters
 
         def of_block(index: np.ndarray) -> float:
-            here = self.data.places[index]
+            block_places = self.data.places[index]
             total = 0.0
             for shape, covariance in enumerate(self.covariances):
-                root = covariance.root(here, self.data.noise[index, shape])
+                root = covariance.root(block_places, self.data.noise[index, shape])
                 white = scipy.linalg.solve_triangular(root, residuals[index, shape], lower=True, check_finite=False)
                 total += float(white @ white)
             return total
@@ -346,19 +349,19 @@ class ExposureFit:
         n_height = self.prior.n_parameter
         precision = np.zeros((n_height + N_EXPOSURE,) * 2)
         self.prior.add_to(precision)
-        own = range(n_height, len(precision))
-        precision[own, own] += self.sigma**-2
+        exposure_terms = range(n_height, len(precision))
+        precision[exposure_terms, exposure_terms] += self.sigma**-2
         return precision
 
     def log_evidence(self) -> float:
         """Return the logarithm of the likelihood of the stars, all parameters of the optics marginalised (Laplace)."""
         residuals, _, _ = self._columns()
-        now = np.concatenate([self.heights, self.exposure])
+        parameters = np.concatenate([self.heights, self.exposure])
         precision = self._precision()
         scale = 1.0 / np.sqrt(np.diagonal(precision))
         _, log_prior = np.linalg.slogdet(precision * scale[:, None] * scale)
         log_prior -= 2.0 * float(np.log(scale).sum())
-        total = 0.5 * (log_prior - self._log_determinant - float(now @ precision @ now))
+        total = 0.5 * (log_prior - self._log_determinant - float(parameters @ precision @ parameters))
         for shape, covariance in enumerate(self.covariances):
             values, noise = residuals[:, shape], self.data.noise[:, shape]
             total += log_likelihood(covariance, self.data.places, values, noise, self.blocks)

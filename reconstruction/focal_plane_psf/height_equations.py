@@ -36,26 +36,26 @@ class HeightEquations(NamedTuple):
         """Marginalise the parameters of an exposure, with their prior, in the equations of its blocks."""
         n = fit.prior.n_parameter
         cross, vector = np.zeros((n, N_EXPOSURE)), np.zeros(n)
-        own, right = np.diag(fit.sigma**-2), -(fit.sigma**-2) * fit.exposure
+        exposure_matrix, right = np.diag(fit.sigma**-2), -(fit.sigma**-2) * fit.exposure
         heights = []
         for block in blocks:
             used, m = block.used[:-N_EXPOSURE], len(block.used) - N_EXPOSURE
             heights.append((used, block.matrix[:m, :m]))
             cross[used] += block.matrix[:m, m:]
             vector[used] += block.vector[:m]
-            own += block.matrix[m:, m:]
+            exposure_matrix += block.matrix[m:, m:]
             right += block.vector[m:]
         # Parameters of metres and of pure numbers side by side.
-        scale = 1.0 / np.sqrt(np.diagonal(own))
-        root = scipy.linalg.cholesky(own * scale[:, None] * scale, lower=True)
+        scale = 1.0 / np.sqrt(np.diagonal(exposure_matrix))
+        root = scipy.linalg.cholesky(exposure_matrix * scale[:, None] * scale, lower=True)
         factor = scipy.linalg.solve_triangular(root, (cross * scale).T, lower=True).T
         vector -= factor @ scipy.linalg.solve_triangular(root, scale * right, lower=True)
         return cls(heights, factor, vector, ExposureState(fit.exposure, fit.covariances))
 
     def add_to(self, matrix: np.ndarray, vector: np.ndarray) -> None:
         """Add to the normal equations of all exposures."""
-        for used, part in self.blocks:
-            matrix[np.ix_(used, used)] += part
+        for used, block in self.blocks:
+            matrix[np.ix_(used, used)] += block
         with one_blas_thread():
             matrix -= self.factor @ self.factor.T
         vector += self.vector
@@ -63,9 +63,9 @@ class HeightEquations(NamedTuple):
     def write(self, path: Path, key: str) -> None:
         """Write a file, with a key of all inputs of the equations."""
         arrays: dict[str, Any] = {"factor": self.factor, "vector": self.vector, "exposure": self.state.exposure}
-        for i, (used, part) in enumerate(self.blocks):
+        for i, (used, block) in enumerate(self.blocks):
             arrays[f"block_used_{i}"] = used
-            arrays[f"block_matrix_{i}"] = part[np.tril_indices(len(used))]
+            arrays[f"block_matrix_{i}"] = block[np.tril_indices(len(used))]
         for i, covariance in enumerate(self.state.covariances):
             for name, value in vars(covariance).items():
                 arrays[f"{name}_{i}"] = np.asarray(value)
@@ -80,19 +80,19 @@ class HeightEquations(NamedTuple):
         if not path.exists():
             return None
         try:
-            kept = np.load(path)
-            if str(kept["key"]) != key:
+            arrays = np.load(path)
+            if str(arrays["key"]) != key:
                 return None
             blocks, covariances = [], []
-            for i in range(sum(name.startswith("block_used_") for name in kept.files)):
-                used = kept[f"block_used_{i}"]
+            for i in range(sum(name.startswith("block_used_") for name in arrays.files)):
+                used = arrays[f"block_used_{i}"]
                 lower = np.zeros((len(used), len(used)))
-                lower[np.tril_indices(len(used))] = kept[f"block_matrix_{i}"]
+                lower[np.tril_indices(len(used))] = arrays[f"block_matrix_{i}"]
                 blocks.append((used, lower + np.tril(lower, -1).T))
-            for i in range(sum(name.startswith("constant_") for name in kept.files)):
-                amplitude, matrix, ccd = (kept[f"{name}_{i}"] for name in ("amplitude", "matrix", "ccd"))
-                constant, nugget = float(kept[f"constant_{i}"]), float(kept[f"nugget_{i}"])
+            for i in range(sum(name.startswith("constant_") for name in arrays.files)):
+                amplitude, matrix, ccd = (arrays[f"{name}_{i}"] for name in ("amplitude", "matrix", "ccd"))
+                constant, nugget = float(arrays[f"constant_{i}"]), float(arrays[f"nugget_{i}"])
                 covariances.append(Covariance(constant, amplitude, matrix, ccd, nugget))
-            return cls(blocks, kept["factor"], kept["vector"], ExposureState(kept["exposure"], covariances))
+            return cls(blocks, arrays["factor"], arrays["vector"], ExposureState(arrays["exposure"], covariances))
         except (OSError, ValueError, KeyError):
             return None

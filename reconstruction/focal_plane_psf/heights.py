@@ -18,8 +18,10 @@ from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import HeightBudget, load_budget
 from .covariance import Places
 
-#: Largest total degree within a CCD, for one exposure and for many: of a potato chip of 1 to 2 cycles 6 leaves 0.3 um.
-DEGREE, STATIC_DEGREE = 4, 6
+#: Largest total degree within a CCD, for one exposure.
+DEGREE = 4
+#: ... and for many: of a potato chip of 1 to 2 cycles 6 leaves 0.3 um.
+STATIC_DEGREE = 6
 # Focal planes of a budget that are drawn to find the covariance of its terms.
 _DRAWS = 8
 # Nodes along the side of a CCD at which drawn heights are projected and fitted heights are tabulated.
@@ -73,23 +75,25 @@ class HeightPrior:
         ]
         rows = np.array(planes)
         quadratic = rows.T @ rows / len(rows) + _LEAST * np.eye(5)
-        own = np.broadcast_to(ccd + _LEAST * np.eye(len(ccd)), (len(camera), *ccd.shape))
-        return cls(camera, quadratic, max(budget.raft_height**2 / 12.0, _LEAST), own, _nominal_heights(camera))
+        ccd_covariances = np.broadcast_to(ccd + _LEAST * np.eye(len(ccd)), (len(camera), *ccd.shape))
+        return cls(
+            camera, quadratic, max(budget.raft_height**2 / 12.0, _LEAST), ccd_covariances, _nominal_heights(camera)
+        )
 
     @classmethod
     def uninformative(cls, camera: Camera, size: float = 10e-6, degree: int = DEGREE) -> HeightPrior:
         """Return a weak prior of heights [m]: independent coefficients that decrease with the degree."""
         total = np.array([i + j for i, j in powers(degree)])
         ccd = np.diag((size / (1.0 + total) ** 2) ** 2)
-        own = np.broadcast_to(ccd, (len(camera), *ccd.shape))
-        return cls(camera, size**2 * np.eye(5), size**2, own, _nominal_heights(camera))
+        ccd_covariances = np.broadcast_to(ccd, (len(camera), *ccd.shape))
+        return cls(camera, size**2 * np.eye(5), size**2, ccd_covariances, _nominal_heights(camera))
 
     @classmethod
     def known(cls, plane: FocalPlane, covariance: np.ndarray | None = None) -> HeightPrior:
         """Return the prior of known heights, with the covariance of each CCD's coefficients [n_ccd, n_term, n_term]."""
         k = len(powers(DEGREE)) if covariance is None else covariance.shape[1]
-        own = np.zeros((len(plane.camera), k, k)) if covariance is None else covariance
-        return cls(plane.camera, _LEAST * np.eye(5), _LEAST, own + _LEAST * np.eye(k), plane)
+        ccd_covariances = np.zeros((len(plane.camera), k, k)) if covariance is None else covariance
+        return cls(plane.camera, _LEAST * np.eye(5), _LEAST, ccd_covariances + _LEAST * np.eye(k), plane)
 
     @cached_property
     def precision(self) -> np.ndarray:
@@ -136,12 +140,12 @@ class HeightPrior:
 
     def covariance(self, places: Places) -> np.ndarray:
         """Return the prior covariance of the heights at places [m^2], shape [n, n]."""
-        common, own = self.common_terms(places), self.ccd_polynomials(places)
+        common, ccd_terms = self.common_terms(places), self.ccd_polynomials(places)
         total = common[:, :5] @ self.global_covariance @ common[:, :5].T
         total += self.raft * (common[:, 5:] @ common[:, 5:].T)
         for ccd in np.unique(places.ccd):
             rows = np.flatnonzero(places.ccd == ccd)
-            total[np.ix_(rows, rows)] += own[rows] @ self.ccd[ccd] @ own[rows].T
+            total[np.ix_(rows, rows)] += ccd_terms[rows] @ self.ccd[ccd] @ ccd_terms[rows].T
         return total
 
     def per_ccd(self, covariance: np.ndarray) -> np.ndarray:
@@ -165,9 +169,9 @@ class HeightPrior:
 
     def heights(self, parameters: np.ndarray, places: Places) -> np.ndarray:
         """Return the heights at places [m], shape [n], mean of the prior included."""
-        own = parameters[self.n_common :].reshape(len(self.camera), -1)
+        ccd_parameters = parameters[self.n_common :].reshape(len(self.camera), -1)
         change = self.common_terms(places) @ parameters[: self.n_common]
-        change += np.einsum("nk,nk->n", self.ccd_polynomials(places), own[places.ccd])
+        change += np.einsum("nk,nk->n", self.ccd_polynomials(places), ccd_parameters[places.ccd])
         return change if self.mean is None else change + self.mean.height(*places.xy.T)
 
     def focal_plane(self, parameters: np.ndarray) -> FocalPlane:

@@ -47,10 +47,12 @@ def with_shapes(images: np.ndarray, values: np.ndarray, pixel_scale: float, weig
         return result[:, _ROOM : ny + _ROOM, _ROOM : nx + _ROOM]
 
     def measured(stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        found = measure_shapes(stamps, pixel_scale, weight_fwhm)
-        return np.stack([found.e1, found.e2, np.log(found.size)], axis=1), np.stack([found.x, found.y], axis=1)
+        moments = measure_shapes(stamps, pixel_scale, weight_fwhm)
+        return np.stack([moments.e1, moments.e2, np.log(moments.size)], axis=1), np.stack(
+            [moments.x, moments.y], axis=1
+        )
 
-    now, centre = measured(image(amounts, shift))
+    image_shapes, centre = measured(image(amounts, shift))
     jacobian = np.empty((len(images), 3, 3))
     for shape in range(3):
         step = np.zeros(3)
@@ -58,12 +60,12 @@ def with_shapes(images: np.ndarray, values: np.ndarray, pixel_scale: float, weig
         ends = [measured(image(amounts + sign * step, shift))[0] for sign in (1.0, -1.0)]
         jacobian[:, :, shape] = (ends[0] - ends[1]) / (2.0 * _STEP)
     for _ in range(_ITERATIONS):
-        step = np.linalg.solve(jacobian, (values - now)[:, :, None])[:, :, 0]
-        amounts, shift, before = amounts + step, shift + centre, now
-        now, centre = measured(image(amounts, shift))
+        step = np.linalg.solve(jacobian, (values - image_shapes)[:, :, None])[:, :, 0]
+        amounts, shift, before = amounts + step, shift + centre, image_shapes
+        image_shapes, centre = measured(image(amounts, shift))
         # Broyden's update of the Jacobian, where there was a step.
         square = (step**2).sum(axis=1)
-        missed = now - before - np.einsum("nfs,ns->nf", jacobian, step)
+        missed = image_shapes - before - np.einsum("nfs,ns->nf", jacobian, step)
         moved = square > _SMALLEST
         jacobian[moved] += missed[moved, :, None] * (step / np.maximum(square, _SMALLEST)[:, None])[moved, None]
     result = image(amounts, shift)
@@ -140,12 +142,12 @@ class ResidualImages:
         def job(ccd: int) -> tuple[np.ndarray, np.ndarray]:
             at = np.flatnonzero(places.ccd == ccd)
             stars = neighbours_of(self.places, self.mosaic.centers[ccd])
-            found = np.empty((len(at), len(self.components)))
+            amounts = np.empty((len(at), len(self.components)))
             for k, covariance in enumerate(self.covariances):
                 near = neighbourhood(covariance, self.places, self.coefficients[:, k], self.noise[:, k], stars)
-                found[:, k] = near.predict(covariance.between(self.places[stars], places[at]))
-            return at, found
+                amounts[:, k] = near.predict(covariance.between(self.places[stars], places[at]))
+            return at, amounts
 
-        for at, found in map_on_threads(job, np.unique(places.ccd), threads):
-            amount[at] = found
+        for at, amounts in map_on_threads(job, np.unique(places.ccd), threads):
+            amount[at] = amounts
         return np.einsum("nk,kyx->nyx", amount, self.components)

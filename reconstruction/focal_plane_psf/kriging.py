@@ -17,6 +17,7 @@ import numpy as np
 import scipy.linalg
 
 from ...core.threads import one_blas_thread, thread_count
+from ..gaussian_field import inverse_from_cholesky, leave_one_out_residuals
 from .covariance import Covariance, Places
 
 #: Stars that a prediction is made from.
@@ -67,10 +68,9 @@ def neighbourhood(
 
 
 def leave_one_out(near: Neighbourhood) -> tuple[np.ndarray, np.ndarray]:
-    """Return value minus prediction of the other stars, and the variance of that, each of shape [m] (Dubrule 1983)."""
-    lower = scipy.linalg.lapack.dpotri(near.root, lower=1)[0]
-    own = np.diagonal(lower)
-    return near.alpha / own, 1.0 / own
+    """Return value minus prediction of the other stars, and the variance of that, each of shape [m]."""
+    inverse = inverse_from_cholesky(near.root)
+    return leave_one_out_residuals(near.alpha, inverse), 1.0 / np.diagonal(inverse)
 
 
 def map_on_threads(job: Callable[..., Any], items: Iterable[object], threads: int | None) -> list[Any]:

@@ -18,18 +18,24 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from .covariance import CCD_TERMS, COMPONENTS, Covariance, Places, ccd_terms, inverse_from_cholesky
+from ..gaussian_field import inverse_from_cholesky
+from .covariance import CCD_TERMS, COMPONENTS, Covariance, Places, ccd_terms
 
 #: Largest number of stars in a block.
 BLOCK = 300
-# Logarithmic bounds of amplitudes over the variance of the values, and of lengths over the extent of the field.
-_AMPLITUDES, _LENGTHS, _SHEAR = (-14.0, 2.0), (-6.5, 1.0), (-10.0, 10.0)
+# Logarithmic bounds of amplitudes over the variance of the values.
+_AMPLITUDES = (-14.0, 2.0)
+# ... of lengths over the extent of the field.
+_LENGTHS = (-6.5, 1.0)
+# Bounds of the shear of a component.
+_SHEAR = (-10.0, 10.0)
 # Lengths from which the fit starts, over the extent of the field: 3 and 16 arcmin over 3.5 degrees.
 _START = (0.014, 0.08, 0.3)
-# Widths of the priors about the first guess: of each component (logarithm of the amplitude, of two lengths, shear), and
-# of the logarithms of the variances of the terms of the CCDs and of the nugget. Of many stars the data dominate; the
-# likelihood of some hundred stars in a few streaks has secondary maxima far away.
-_WIDTHS, _VARIANCE_WIDTH = (1.0, 1.0, 1.0, 1.5), 3.0
+# Widths of the priors of each component about the first guess: logarithm of the amplitude, of two lengths, shear. Of
+# many stars the data dominate; the likelihood of some hundred stars in a few streaks has secondary maxima far away.
+_WIDTHS = (1.0, 1.0, 1.0, 1.5)
+# ... of the logarithms of the variances of the terms of the CCDs and of the nugget.
+_VARIANCE_WIDTH = 3.0
 # Logarithm of the amplitude of a component over the variance of the values, below which it counts as absent.
 _VANISHED = -6.0
 #: Variance of the part common to all stars, over the mean square of the values.
@@ -67,12 +73,12 @@ def blocks_of(xy: np.ndarray, size: int = BLOCK) -> list[np.ndarray]:
     """Cut places [n, 2] into blocks of neighbours, at most `size` each: indices, by halves along the longer side."""
     waiting, blocks = [np.arange(len(xy))], []
     while waiting:
-        part = waiting.pop()
-        if len(part) <= size:
-            blocks.append(np.sort(part))
+        stars = waiting.pop()
+        if len(stars) <= size:
+            blocks.append(np.sort(stars))
             continue
-        along = int(np.argmax(np.ptp(xy[part], axis=0)))
-        order = part[np.argsort(xy[part, along], kind="stable")]
+        along = int(np.argmax(np.ptp(xy[stars], axis=0)))
+        order = stars[np.argsort(xy[stars, along], kind="stable")]
         waiting += [order[len(order) // 2 :], order[: len(order) // 2]]
     return blocks
 
@@ -120,17 +126,21 @@ def fit_covariance(
         constant = _CONSTANT * max(power, float(np.mean(values**2)))
     prepared = []
     for index in blocks_of(places.xy) if blocks is None else blocks:
-        here = places[index]
+        block_places = places[index]
         held = np.diag(noise[index] / power) + constant / power
-        own = values[index] / np.sqrt(power)
-        products = np.outer(own, own)
+        scaled_values = values[index] / np.sqrt(power)
+        products = np.outer(scaled_values, scaled_values)
         if spread is not None:
             products += spread(index) / power
-        terms = ccd_terms(here, here) if with_ccds else ()
-        difference = (here.xy[:, None] - here.xy) / extent
+        terms = ccd_terms(block_places, block_places) if with_ccds else ()
+        difference = (block_places.xy[:, None] - block_places.xy) / extent
         prepared.append(_Block(difference, held, products, terms))
     n_ccd = len(CCD_TERMS) if with_ccds else 0
-    names = [f"{what} {j + 1}" for j in range(COMPONENTS) for what in ("amplitude", "length", "length across", "shear")]
+    names = [
+        f"{quantity} {j + 1}"
+        for j in range(COMPONENTS)
+        for quantity in ("amplitude", "length", "length across", "shear")
+    ]
     names += [*CCD_TERMS[:n_ccd], "nugget"]
     bounds = [_AMPLITUDES, _LENGTHS, _LENGTHS, _SHEAR] * COMPONENTS + [_AMPLITUDES] * (n_ccd + 1)
     # Inverse lengths are fitted.
@@ -138,17 +148,17 @@ def fit_covariance(
     guess = _first_guess(centred, noise, power, n_ccd)
     first = guess.copy()
     if start is not None:
-        again = _pack_parameters(start, power, extent, n_ccd)
+        packed_start = _pack_parameters(start, power, extent, n_ccd)
         for j in range(COMPONENTS):
             # A component of zero amplitude has no gradient, and would stay at zero.
-            if again[4 * j] > _VANISHED:
-                first[4 * j : 4 * j + 4] = again[4 * j : 4 * j + 4]
-        first[4 * COMPONENTS :] = again[4 * COMPONENTS :]
+            if packed_start[4 * j] > _VANISHED:
+                first[4 * j : 4 * j + 4] = packed_start[4 * j : 4 * j + 4]
+        first[4 * COMPONENTS :] = packed_start[4 * COMPONENTS :]
     first = np.clip(first, *np.transpose(bounds))
     width = np.array([*_WIDTHS * COMPONENTS, *[_VARIANCE_WIDTH] * (n_ccd + 1)])
     from scipy.optimize import minimize  # a fifth of a second
 
-    found = minimize(
+    optimum = minimize(
         _negative_log_posterior,
         first,
         args=(prepared, guess, width),
@@ -159,13 +169,13 @@ def fit_covariance(
     )
     at_bounds = tuple(
         name
-        for name, value, (low, high) in zip(names, found.x, bounds, strict=True)
+        for name, value, (low, high) in zip(names, optimum.x, bounds, strict=True)
         # A variance of zero is a valid result, not a failed fit.
         if value >= high - 1e-9 or (value <= low + 1e-9 and ("length" in name or name == "shear"))
     )
-    covariance = _unpack_parameters(found.x, power, extent, constant, n_ccd)
+    covariance = _unpack_parameters(optimum.x, power, extent, constant, n_ccd)
     count = sum(len(block.fixed) for block in prepared)
-    value, _ = _negative_log_likelihood(found.x, prepared)
+    value, _ = _negative_log_likelihood(optimum.x, prepared)
     return CovarianceFit(covariance, -value - 0.5 * count * np.log(power), at_bounds)
 
 

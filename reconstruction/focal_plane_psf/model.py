@@ -27,7 +27,7 @@ from ...wavefront.atmosphere.atmosphere import Atmosphere
 from .covariance import Covariance, Places
 from .field import ShapeField
 from .field_fit import LEAST_STARS, FittedField, fit_field, height_prior, mosaic_of
-from .file import model_fields, model_hdus
+from .file import model_hdus, read_model
 from .fit import SHAPES, ShapeData
 from .images import ResidualImages, with_shapes
 from .mosaic import Mosaic, PsfShapes
@@ -150,8 +150,8 @@ class FocalPlanePsf(Result):
         dispersion : array_like, shape [n_wave, 2], optional
             Shift of each wavelength by the air [rad].
         budget : str, HeightBudget or None
-            Prior of unknown heights: "simulated", "specification", a budget of one's own, or None for a weak prior
-            them.
+            Prior of unknown heights: "simulated", "specification", a budget of one's own, or None for a weak one of
+            coefficients of 10 um.
         alignment_rms : float or Quantity
             Prior rms of the residual wavefront of the exposure [m]: annular Zernike terms 4 to 11, each constant and
             linear over the field. 0 for an aligned telescope.
@@ -173,22 +173,22 @@ class FocalPlanePsf(Result):
             outside its range.
         """
         reporter = Reporter(quiet=True) if reporter is None else reporter
-        given = stars_of(stars)
-        weight = given.weight_fwhm if weight_fwhm is None else positive_angle(weight_fwhm, "weight_fwhm")
-        if given.pixel_scale is not None and weight < given.pixel_scale:
+        catalogue = stars_of(stars)
+        weight = catalogue.weight_fwhm if weight_fwhm is None else positive_angle(weight_fwhm, "weight_fwhm")
+        if catalogue.pixel_scale is not None and weight < catalogue.pixel_scale:
             raise DomainError(
                 f"weight_fwhm = {weight / ARCSEC:.3g} arcsec: expected at least a pixel of the stamps,"
-                f" {given.pixel_scale / ARCSEC:.3g} arcsec, and better 2.5 of them"
+                f" {catalogue.pixel_scale / ARCSEC:.3g} arcsec, and better 2.5 of them"
             )
-        mosaic = mosaic_of(given, telescope, focal_plane, camera)
-        used = given.usable
+        mosaic = mosaic_of(catalogue, telescope, focal_plane, camera)
+        used = catalogue.usable
         if used.sum() < LEAST_STARS:
             raise DomainError(
-                f"{used.sum()} of {len(given)} stars have position, shape and noise: expected {LEAST_STARS} or more"
+                f"{used.sum()} of {len(catalogue)} stars have position, shape and noise: expected {LEAST_STARS} or more"
             )
-        chosen = given.chosen(used)
-        data = ShapeData(places_of(mosaic, chosen), chosen.values, chosen.noise**2)
-        stamp_size = stamp_size if given.stamps is None else given.stamps.shape[1]
+        usable_stars = catalogue.chosen(used)
+        data = ShapeData(places_of(mosaic, usable_stars), usable_stars.values, usable_stars.noise**2)
+        stamp_size = stamp_size if catalogue.stamps is None else catalogue.stamps.shape[1]
         instrument = prior = None
         if telescope is not None:
             instrument = Instrument.of(
@@ -216,10 +216,10 @@ class FocalPlanePsf(Result):
                 # Covariances are hardly changed by a few stars; all else is solved again without them.
                 field = field.with_stars(good)
                 used[np.flatnonzero(used)[~good]] = False
-            left, variance = field.leave_one_out_residuals(threads)
-        predicted = np.full((len(given), 3), np.nan)
-        predicted[used] = field.data.values - left
-        chi2 = {name: float(v) for name, v in zip(SHAPES, np.nanmean(left**2 / variance, axis=0), strict=True)}
+            residuals, variance = field.leave_one_out_residuals(threads)
+        predicted = np.full((len(catalogue), 3), np.nan)
+        predicted[used] = field.data.values - residuals
+        chi2 = {name: float(v) for name, v in zip(SHAPES, np.nanmean(residuals**2 / variance, axis=0), strict=True)}
         model = cls(
             field,
             used,
@@ -228,21 +228,25 @@ class FocalPlanePsf(Result):
             fitted.evidence,
             _fit_warnings(field, chi2, fitted, mosaic.names if ccds is None else ccds),
             weight,
-            given.pixel_scale,
+            catalogue.pixel_scale,
             stamp_size,
         )
-        return model._with_stamps(given, components, threads, reporter)
+        return model._with_stamps(catalogue, components, threads, reporter)
 
     def _label(self) -> str:
         return f"{int(self.used.sum())} of {len(self.used)} stars"
 
     def _columns(self) -> dict[str, Any]:
-        left = self.leave_one_out
-        return {"used": self.used, "e1": left.e1, "e2": left.e2, "size": left.size}
+        predicted = self.leave_one_out
+        return {"used": self.used, "e1": predicted.e1, "e2": predicted.e2, "size": predicted.size}
 
     def _described(self, name: str) -> Description:
-        known = described(type(self) if name == "used" else PsfShapes, name)
-        return known if name == "used" else known._replace(text=f"Prediction from all other stars: {known.text}")
+        description = described(type(self) if name == "used" else PsfShapes, name)
+        return (
+            description
+            if name == "used"
+            else description._replace(text=f"Prediction from all other stars: {description.text}")
+        )
 
     @property
     def mosaic(self) -> Mosaic:
@@ -326,7 +330,7 @@ class FocalPlanePsf(Result):
     @check_arguments
     def read(cls, path: str | Path) -> FocalPlanePsf:
         """Read a model; ProductError if the file is missing, damaged or of another kind."""
-        return cls(**model_fields(read_fits(Path(path)), Path(path)))
+        return cls(*read_model(read_fits(Path(path)), Path(path)))
 
     def _draw_places(self, places: Places, values: np.ndarray, threads: int | None) -> np.ndarray:
         """Return images of given shapes e1, e2 and ln size [n, 3]."""
@@ -336,13 +340,13 @@ class FocalPlanePsf(Result):
             raise DomainError("draw: expected a telescope, or stars with stamps")
         images = np.empty((len(places), self.stamp_size, self.stamp_size))
         for first in range(0, len(places), _BATCH):
-            part = slice(first, first + _BATCH)
-            here = places[part]
-            base = np.asarray(mean) if optics is None else optics.images(here, threads)
+            batch = slice(first, first + _BATCH)
+            batch_places = places[batch]
+            base = np.asarray(mean) if optics is None else optics.images(batch_places, threads)
             if self.pca is not None:
-                base = base + self.pca.at(here, threads)
-            images[part] = with_shapes(
-                np.broadcast_to(base, (len(here), *images.shape[1:])), values[part], scale, self.weight_fwhm
+                base = base + self.pca.at(batch_places, threads)
+            images[batch] = with_shapes(
+                np.broadcast_to(base, (len(batch_places), *images.shape[1:])), values[batch], scale, self.weight_fwhm
             )
         return images
 

@@ -44,18 +44,27 @@ _SEEING = 0.3
 #: Height range of the polynomial about its centre [m].
 LARGEST_HEIGHT = 25e-6
 _NODES = 5
-# Steps of the differences: wavefront [m] and logarithm of the Fried parameter.
-_WAVEFRONT_STEP, _SEEING_STEP = 0.05e-6, 0.05
-# Stars at which derivatives are computed, fewer where they are costly, and the degree of their dependence on the field.
-_SAMPLES, _SAMPLES_LATTICE, _FIELD_DEGREE = 300, 120, 6
+# Step of the differences of the wavefront [m].
+_WAVEFRONT_STEP = 0.05e-6
+# ... and of the logarithm of the Fried parameter.
+_SEEING_STEP = 0.05
+# Stars at which derivatives are computed.
+_SAMPLES = 300
+# ... fewer where they are costly.
+_SAMPLES_LATTICE = 120
+# Degree of their dependence on the field.
+_FIELD_DEGREE = 6
 # Heights about the centre [m] between which these derivatives are linear.
 _LEVEL = 8e-6
 _BATCH = 2048
-# Pixels of the LSST, and rms charge diffusion in them [m].
-_PIXEL, _DIFFUSION = 10e-6, 4e-6
+# Pixels of the LSST [m].
+_PIXEL = 10e-6
+# Rms charge diffusion in them [m].
+_DIFFUSION = 4e-6
 # Points of a pupil with vanes or plates: e is good to 2e-4, a tenth of what turbulence adds, in a third of the time.
+_LATTICE_POINTS = 6000
 # For changes fewer do: the same points are lit before and after.
-_LATTICE_POINTS, _LATTICE_POINTS_CHANGES = 6000, 3000
+_LATTICE_POINTS_CHANGES = 3000
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,9 +126,9 @@ class Instrument:
         the pixels of the camera, the telescope's unless told (10 um without one), with a charge diffusion of 0.4 of
         them.
         """
-        known = telescope.camera if camera is None else camera
+        camera_or_name = telescope.camera if camera is None else camera
         if pixel_size is None:
-            pixel_size = _PIXEL if known is None else load_camera(known).pixel_size
+            pixel_size = _PIXEL if camera_or_name is None else load_camera(camera_or_name).pixel_size
         pixel = length(pixel_size, "pixel_size")
         if wavelengths is None:
             low, high = telescope.band or telescope.wavelength_range
@@ -193,15 +202,15 @@ class Instrument:
         points: int = _LATTICE_POINTS,
     ) -> np.ndarray:
         """Return e1, e2 and the logarithm of the size [rad] of PSFs at field angles, shape [n, 3]."""
-        found = np.empty((len(fields), 3))
+        values = np.empty((len(fields), 3))
         for first in range(0, len(fields), _BATCH):
-            part = slice(first, first + _BATCH)
-            images, scale = self.images(fields[part], plane, aberration, seeing, threads, points)
+            batch = slice(first, first + _BATCH)
+            images, scale = self.images(fields[batch], plane, aberration, seeing, threads, points)
             shapes = measure_shapes(images, scale, self.weight_fwhm)
-            found[part] = np.stack([shapes.e1, shapes.e2, np.log(shapes.size)], axis=1)
+            values[batch] = np.stack([shapes.e1, shapes.e2, np.log(shapes.size)], axis=1)
             if progress is not None:
                 progress(len(images))
-        return found
+        return values
 
 
 def height_response(
@@ -257,11 +266,11 @@ class ExposureResponse:
     ) -> ExposureResponse:
         """Compute central differences at some of the stars, and fit them over the field."""
         radius = float(np.hypot(*fields.T).max()) or instrument.telescope.field_radius
-        most = _SAMPLES if has_only_annuli(instrument.telescope) else _SAMPLES_LATTICE
-        chosen = fields[np.unique(np.linspace(0, len(fields) - 1, min(most, len(fields))).astype(int))]
-        degree = min(_FIELD_DEGREE, max(0, int((np.sqrt(8 * len(chosen) / 3 + 1) - 3) / 2)))
-        terms = field_terms(chosen / radius, degree)
-        found = []
+        sample_limit = _SAMPLES if has_only_annuli(instrument.telescope) else _SAMPLES_LATTICE
+        sampled_fields = fields[np.unique(np.linspace(0, len(fields) - 1, min(sample_limit, len(fields))).astype(int))]
+        degree = min(_FIELD_DEGREE, max(0, int((np.sqrt(8 * len(sampled_fields) / 3 + 1) - 3) / 2)))
+        terms = field_terms(sampled_fields / radius, degree)
+        responses = []
         for parameter in range(len(NOLL) + 1):
             levels = []
             for level in (center - _LEVEL, center + _LEVEL):
@@ -275,13 +284,15 @@ class ExposureResponse:
                     else:
                         air = seeing + sign * _SEEING_STEP
                     ends.append(
-                        instrument.shapes(chosen, flat, changed, air, threads, progress, _LATTICE_POINTS_CHANGES)
+                        instrument.shapes(
+                            sampled_fields, flat, changed, air, threads, progress, _LATTICE_POINTS_CHANGES
+                        )
                     )
                 width = 2.0 * (_WAVEFRONT_STEP if parameter < len(NOLL) else _SEEING_STEP)
                 change = (ends[0] - ends[1]) / width
                 levels.append(np.linalg.lstsq(terms, change, rcond=None)[0])
-            found.append(levels)
-        polynomial: np.ndarray = np.array(found)
+            responses.append(levels)
+        polynomial: np.ndarray = np.array(responses)
         if not np.isfinite(polynomial).all():
             raise DomainError(
                 f"{instrument.telescope.name}: the PSF has no shape where alignment or seeing change a little: expected"

@@ -116,8 +116,8 @@ class FocalPlaneStars(Result):
 
         With `pixels` positions are in pixels of the CCDs, in place of metres on the detector.
         """
-        parts = [part.columns() for part in ccds]
-        if not any(len(part[0]) for part in parts):
+        parts = [ccd_columns.columns() for ccd_columns in ccds]
+        if not any(len(ccd_columns[0]) for ccd_columns in parts):
             raise DomainError("no stars: expected products with stars that a PSF model can use")
         names, x, y, values, electrons, level, stamps = (np.concatenate(column) for column in zip(*parts, strict=True))
         noise = photon_noise(stamps, electrons, level, pixel_scale, weight_fwhm)
@@ -270,8 +270,8 @@ def photon_noise(
         Variance of a pixel without the star [electron^2].
     """
     mean, slopes = _mean_star(stamps, electrons / np.sqrt(electrons + level), pixel_scale, weight_fwhm)
-    white, own = (slopes**2).sum(axis=1), (slopes**2 * np.maximum(mean.ravel(), 0.0)).sum(axis=1)
-    return np.sqrt(white * (level / electrons**2)[:, None] + own / electrons[:, None])
+    white, photons = (slopes**2).sum(axis=1), (slopes**2 * np.maximum(mean.ravel(), 0.0)).sum(axis=1)
+    return np.sqrt(white * (level / electrons**2)[:, None] + photons / electrons[:, None])
 
 
 def noise_per_snr(stamps: np.ndarray, snr: np.ndarray, pixel_scale: float, weight_fwhm: float) -> np.ndarray:
@@ -337,7 +337,7 @@ def _quantity(columns: Mapping[str, Any], name: str, unit: u.UnitBase | None = N
     if name not in columns:
         raise DomainError(f"stars: no column {name!r}; columns are {', '.join(columns) or 'none'}")
     column = columns[name]
-    own = getattr(column, "unit", None)
+    column_unit = getattr(column, "unit", None)
     values = column.filled(np.nan) if hasattr(column, "filled") and np.ma.isMaskedArray(column) else column
     try:
         array = np.asarray(getattr(values, "value", values), dtype=np.float64)
@@ -345,9 +345,9 @@ def _quantity(columns: Mapping[str, Any], name: str, unit: u.UnitBase | None = N
         raise DomainError(f"stars: column {name!r} of type {np.asarray(values).dtype}: expected numbers") from None
     if array.ndim != 1:
         raise DomainError(f"stars: column {name!r} has shape {array.shape}: expected one number a star")
-    if unit is None or own is None or str(own) in ("", "pix"):
+    if unit is None or column_unit is None or str(column_unit) in ("", "pix"):
         return array
     try:
-        return array * u.Unit(own).to(unit)
+        return array * u.Unit(column_unit).to(unit)
     except u.UnitConversionError:
-        raise DomainError(f"stars: column {name!r} in {own}: expected a unit that converts to {unit}") from None
+        raise DomainError(f"stars: column {name!r} in {column_unit}: expected a unit that converts to {unit}") from None

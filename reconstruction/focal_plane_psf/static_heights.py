@@ -33,7 +33,7 @@ from ...models.camera.ccd_surfaces import CcdSurfaces
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import HeightBudget
 from ...models.telescope import Telescope
-from .covariance import inverse_from_cholesky
+from ..gaussian_field import inverse_from_cholesky
 from .fit import ExposureFit, ShapeData
 from .height_equations import ExposureState, HeightEquations
 from .heights import STATIC_DEGREE, HeightPrior
@@ -115,15 +115,15 @@ class StaticHeights(Result):
         """Read heights, of a camera that is not bundled with `camera`; ProductError if the file is no such product."""
         hdus = read_fits(Path(path))
         try:
-            known = load_camera(hdus[0].header["CAMERA"] if camera is None else camera)
+            camera_of_file = load_camera(hdus[0].header["CAMERA"] if camera is None else camera)
             grid = _hdu_array(hdus["GRID"])
             surfaces = CcdSurfaces(
-                known.half_sizes,
+                camera_of_file.half_sizes,
                 _hdu_array(hdus["POLYNOMIAL"]),
-                np.zeros((len(known), 2, 4)),
+                np.zeros((len(camera_of_file), 2, 4)),
                 grid if grid.size else None,
             )
-            plane = FocalPlane(known, surfaces, np.ones(len(known), dtype=bool))
+            plane = FocalPlane(camera_of_file, surfaces, np.ones(len(camera_of_file), dtype=bool))
             return cls(plane, _hdu_array(hdus["COVARIANCE"]), int(hdus[0].header["NEXPOSE"]))
         except KeyError as error:
             raise ProductError(f"no product with heights ({' '.join(str(error).split())})", file=path) from None
@@ -176,10 +176,10 @@ def fit_static_heights(
     reporter = Reporter(quiet=True) if reporter is None else reporter
     if not len(exposures):
         raise DomainError("exposures: expected one or more")
-    known = telescope.camera if camera is None else camera
-    if known is None:
+    camera_or_name = telescope.camera if camera is None else camera
+    if camera_or_name is None:
         raise DomainError(f"camera: {telescope.name} names none, expected one with the heights of its CCDs")
-    cam = load_camera(known)
+    cam = load_camera(camera_or_name)
     degree = STATIC_DEGREE
     prior = (
         HeightPrior.uninformative(cam, degree=degree)
@@ -197,9 +197,9 @@ def fit_static_heights(
         matrix, vector = precision.copy(), -precision @ heights
         with reporter.stage(f"heights, step {step + 1} of {steps}", total=len(exposures)) as stage:
             jobs = [(step, i, exposure, states[i]) for i, exposure in enumerate(exposures)]
-            for number, part in enumerate(map_jobs(job, jobs)):
-                part.add_to(matrix, vector)
-                states[number] = part.state
+            for number, equations in enumerate(map_jobs(job, jobs)):
+                equations.add_to(matrix, vector)
+                states[number] = equations.state
                 stage.advance(1)
         scale = 1.0 / np.sqrt(np.diagonal(matrix))
         with one_blas_thread():
@@ -232,9 +232,9 @@ class _ExposureJob:
         data = ShapeData(places, stars.values, stars.noise**2)
         key = self._key(data, state)
         path = None if self.folder is None else self.folder / f"exposure_{number:05d}_step_{step}.npz"
-        kept = None if path is None else HeightEquations.read(path, key)
-        if kept is not None:
-            return kept
+        saved_equations = None if path is None else HeightEquations.read(path, key)
+        if saved_equations is not None:
+            return saved_equations
         fit = ExposureFit(data, self.instrument, self.prior, self.alignment_rms, self.threads, Reporter(quiet=True))
         fit.heights = self.heights.copy()
         if state is not None:
@@ -246,10 +246,10 @@ class _ExposureJob:
         fit.fit_covariances(10 if state is None else 4)
         blocks = fit.solve_exposure()
         with one_blas_thread():
-            part = HeightEquations.of(fit, blocks)
+            equations = HeightEquations.of(fit, blocks)
         if path is not None:
-            part.write(path, key)
-        return part
+            equations.write(path, key)
+        return equations
 
     def _key(self, data: ShapeData, state: ExposureState | None) -> str:
         digest = hashlib.sha256()

@@ -8,15 +8,18 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import ConfigError, DomainError
+from ..psf_model.pixels import Pixels
+from ..psf_model.polynomial_fit import Polynomial
+from ..psf_model.principal_components import PrincipalComponents
+from ..psf_model.recipe import Recipe
 from ..psf_model.shape_noise import ShapeNoise
 
-#: The kind of model that needs no choice, and nearly always is the best (docs/psf_models.md).
-KRIGING: dict[str, Any] = {"basis": "pixels", "interpolation": "kriging"}
-#: Options of :meth:`~.PsfModel.fit` by name, the one that is preferred first.
+#: Options of :meth:`~.PsfModel.fit` by name, the one that is preferred first: the default recipe, which needs no choice
+#: and nearly always is the best (docs/psf_models.md).
 CANDIDATES: dict[str, dict[str, Any]] = {
-    "kriging of pixels": KRIGING,
-    **{f"pixels, order {order}": {"basis": "pixels", "order": order, "weights": "noise"} for order in range(3)},
-    "principal components": {"n_components": "auto", "order": "auto"},
+    "kriging of pixels": {},
+    **{f"pixels, order {n}": {"recipe": Recipe(Pixels(), Polynomial(n), "noise")} for n in range(3)},
+    "principal components": {"recipe": Recipe(PrincipalComponents("auto"), Polynomial("auto"))},
 }
 # Standard errors by which another kind must be better. With one, chance alone would choose a worse one too often.
 _ERRORS = 2.0

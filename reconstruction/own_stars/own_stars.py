@@ -21,7 +21,7 @@ from ..psf_model import kriging
 from ..psf_model.checks import as_extent
 from ..psf_model.model import PsfModel
 from ..psf_model.polynomial import as_positions
-from .candidates import CANDIDATES, KRIGING, choose_candidate
+from .candidates import CANDIDATES, choose_candidate
 from .masked_stars import (
     as_bad_pixels,
     fill_by_median_star,
@@ -93,7 +93,7 @@ def fit_own_stars(
     seed : int
         Of the parts that are held out.
     **options
-        Options of :meth:`~.PsfModel.fit`, for kriging of pixels or another kind of model, without a choice.
+        Options of :meth:`~.PsfModel.fit`, `recipe` and its keys among them, for a kind of model without a choice.
 
     Raises
     ------
@@ -156,7 +156,7 @@ def fit_own_stars(
         weight = float(np.nanmedian(fwhm(filled[complete], scale)))
         stars = select(filled, lost)
         for _ in range(_MODEL_PASSES):
-            psfs = fit(np.flatnonzero(stars.used), KRIGING | options).at(places[masked])
+            psfs = fit(np.flatnonzero(stars.used), options).at(places[masked])
             sigma = weight_sigma(scale, weight)
             filled[masked], lost[masked] = fill_by_profiles(
                 images[masked],
@@ -176,7 +176,7 @@ def fit_own_stars(
     good = stars.images[used]
     weightless = stars.masks[used] if stars.masks[used].any() else None
     if options:
-        name, kind = "given", KRIGING | options
+        name, kind = "given", options
         predicted = predict(kind)
     else:
         name, predicted = choose_candidate(predict, good, gain, weightless)

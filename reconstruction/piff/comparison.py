@@ -80,10 +80,10 @@ class PiffComparison(Result):
     def write_folder(self, folder: Path) -> tuple[str, ...]:
         """Write the tables, a picture of the rho statistics and all metrics into a folder; return their names."""
         make_folder(folder)
-        each = {f"{name}: {key}": c for name, rho in self.rho.items() for key, c in rho.items()}
+        correlations = {f"{name}: {key}": c for name, rho in self.rho.items() for key, c in rho.items()}
         for name, table in (("stars.ecsv", self.stars), ("models.ecsv", self.models)):
             write_table(folder / name, table)
-        write_ecsv(folder / "rho.ecsv", correlation_columns(each), {"what": "rho statistics 1 to 5"})
+        write_ecsv(folder / "rho.ecsv", correlation_columns(correlations), {"what": "rho statistics 1 to 5"})
         write_bytes(folder / "rho.png", rho_plot(self.rho))
         write_json(folder / "comparison.json", self.as_dict())
         return ("stars.ecsv", "models.ecsv", "rho.ecsv", "rho.png", "comparison.json")
@@ -134,11 +134,15 @@ def compare_with_piff(
     """
     places = as_positions(positions)
     scale = psf.pixel_scale(places.mean(axis=0), chip=chip) if pixel_scale is None else pixel_scale
-    own = fit_own_stars(stamps, places, scale, masks=masks, **options)
-    used = own.used
-    given = {key: pure_numbers(values, key)[used] for key, values in (properties or {}).items()}
-    images = psf.at(places[used], chip=chip, size=own.stamps.shape[1], properties=given)
-    shapes, held_out, theirs = part_of(own.shapes, used), part_of(own.held_out, used), _measured(own, images)
+    pachon_stars = fit_own_stars(stamps, places, scale, masks=masks, **options)
+    used = pachon_stars.used
+    star_properties = {key: pure_numbers(values, key)[used] for key, values in (properties or {}).items()}
+    images = psf.at(places[used], chip=chip, size=pachon_stars.stamps.shape[1], properties=star_properties)
+    shapes, held_out, theirs = (
+        part_of(pachon_stars.shapes, used),
+        part_of(pachon_stars.held_out, used),
+        _measured(pachon_stars, images),
+    )
     in_fit = _in_fit(psf, places[used], chip)
     everywhere = np.ones(len(in_fit), dtype=bool)
     rows = [("pachon, star held out", held_out, everywhere)]
@@ -146,23 +150,25 @@ def compare_with_piff(
         rows.append(("Piff, stars of its fit", theirs, in_fit))
     if (~in_fit).sum() >= _FEWEST_RESERVED:
         if in_fit.sum() >= FEWEST_STARS:
-            some = np.flatnonzero(used)[in_fit]
-            some_masks = None if masks is None else np.asarray(masks)[some]
-            model = fit_own_stars(np.asarray(stamps)[some], places[some], scale, masks=some_masks, **options).model
-            rows.append(("pachon, other stars", _measured(own, model.at(places[used])), ~in_fit))
+            fitted_stars = np.flatnonzero(used)[in_fit]
+            fitted_masks = None if masks is None else np.asarray(masks)[fitted_stars]
+            model = fit_own_stars(
+                np.asarray(stamps)[fitted_stars], places[fitted_stars], scale, masks=fitted_masks, **options
+            ).model
+            rows.append(("pachon, other stars", _measured(pachon_stars, model.at(places[used])), ~in_fit))
         rows.append(("Piff, other stars", theirs, ~in_fit))
     return PiffComparison(
-        _stars(own, in_fit, theirs),
+        _stars(pachon_stars, in_fit, theirs),
         _models(shapes, rows),
-        {name: _rho(own, shapes, model, chosen, bins) for name, model, chosen in rows},
+        {name: _rho(pachon_stars, shapes, model, star_mask, bins) for name, model, star_mask in rows},
     )
 
 
 def _in_fit(psf: PiffPsf, places: np.ndarray, chip: int | None) -> np.ndarray:
     """Return which stars Piff's fit used, [n] bool."""
     of_chip = psf.stars["used"] & (psf.stars["chip"] == (next(iter(psf.chips)) if chip is None else chip))
-    known = np.stack([psf.stars["x"], psf.stars["y"]], axis=1)[of_chip]
-    return cKDTree(known).query(places)[0] <= _NEAR if len(known) else np.zeros(len(places), dtype=bool)
+    fit_places = np.stack([psf.stars["x"], psf.stars["y"]], axis=1)[of_chip]
+    return cKDTree(fit_places).query(places)[0] <= _NEAR if len(fit_places) else np.zeros(len(places), dtype=bool)
 
 
 def _measured(own: OwnStars, images: np.ndarray) -> Shapes:
@@ -171,17 +177,17 @@ def _measured(own: OwnStars, images: np.ndarray) -> Shapes:
 
 def _growth(stars: Shapes, model: Shapes) -> np.ndarray:
     """Return (T - T of the model)/T, T = Q11 + Q22, [n]."""
-    own = trace_of_moments(stars.size, stars.e1, stars.e2)
-    result: np.ndarray = 1.0 - trace_of_moments(model.size, model.e1, model.e2) / own
+    star_trace = trace_of_moments(stars.size, stars.e1, stars.e2)
+    result: np.ndarray = 1.0 - trace_of_moments(model.size, model.e1, model.e2) / star_trace
     return result
 
 
 def _models(stars: Shapes, rows: Sequence[tuple[str, Shapes, np.ndarray]]) -> Table:
     metrics = []
-    for _, model, chosen in rows:
-        d1, d2, growth = (v[chosen] for v in (stars.e1 - model.e1, stars.e2 - model.e2, _growth(stars, model)))
-        both = np.concatenate([d1, d2])
-        metrics.append([finite_mean(d1), finite_mean(d2), rms(both), finite_mean(growth), rms(growth)])
+    for _, model, star_mask in rows:
+        d1, d2, growth = (v[star_mask] for v in (stars.e1 - model.e1, stars.e2 - model.e2, _growth(stars, model)))
+        components = np.concatenate([d1, d2])
+        metrics.append([finite_mean(d1), finite_mean(d2), rms(components), finite_mean(growth), rms(growth)])
     texts = (
         ("mean_e1", "mean of e1 less that of the model"),
         ("mean_e2", "mean of e2 less that of the model"),
@@ -191,7 +197,7 @@ def _models(stars: Shapes, rows: Sequence[tuple[str, Shapes, np.ndarray]]) -> Ta
     )
     columns: Columns = {
         "model": (np.array([name for name, _, _ in rows]), "", "model, and at which stars"),
-        "stars": (np.array([int(chosen.sum()) for _, _, chosen in rows]), "", "number of stars"),
+        "stars": (np.array([int(star_mask.sum()) for _, _, star_mask in rows]), "", "number of stars"),
     }
     columns |= {key: (np.array(v), "", text) for (key, text), v in zip(texts, zip(*metrics, strict=True), strict=True)}
     return described_table(columns, {"what": "residuals of two PSF models"})

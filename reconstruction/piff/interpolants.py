@@ -19,8 +19,10 @@ _KINDS: dict[str, Callable[..., np.ndarray]] = {
     "laguerre": laguerre.lagvander2d,
     "hermite": hermite.hermvander2d,
 }
-#: Highest power of a property, and most properties.
-_MOST_ORDER, _MOST_KEYS = 20, 4
+#: Highest power of a property.
+_MOST_ORDER = 20
+#: Most properties.
+_MOST_KEYS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,15 +59,15 @@ def _basis_polynomial(tables: PiffTables) -> Interpolant:
     settings = tables.settings("interp")
     keys = tuple(settings.get("keys", ["u", "v"]))
     order = settings.get("order")
-    given = order if isinstance(order, list) else [order] * len(keys)
-    if not 0 < len(keys) == len(given) <= _MOST_KEYS:
+    key_orders = order if isinstance(order, list) else [order] * len(keys)
+    if not 0 < len(keys) == len(key_orders) <= _MOST_KEYS:
         raise tables.error(f"interp keys = {shown(keys)}, order = {shown(order)}: expected an order of each key")
-    orders = [tables.whole("interp", "order", value, 0, _MOST_ORDER) for value in given]
-    most = tables.whole("interp", "max_order", settings.get("max_order", max(orders)), 0, _MOST_ORDER)
+    orders = [tables.whole("interp", "order", value, 0, _MOST_ORDER) for value in key_orders]
+    total_order = tables.whole("interp", "max_order", settings.get("max_order", max(orders)), 0, _MOST_ORDER)
     exponents = np.stack(np.meshgrid(*(np.arange(n + 1) for n in orders), indexing="ij"), axis=-1).reshape(
         -1, len(keys)
     )
-    exponents = exponents[exponents.sum(axis=1) <= most]
+    exponents = exponents[exponents.sum(axis=1) <= total_order]
 
     def products(properties: np.ndarray) -> np.ndarray:
         return np.prod(properties[:, None, :] ** exponents, axis=2)

@@ -21,8 +21,10 @@ _NODES = 7
 _HARMONICS = 5
 #: Radius from which on a Kolmogorov profile is its power law [half-light radii].
 _TAIL = 30.0
-#: Most lobes of a Lanczos function, and pixels along a side of a grid.
-_MOST_LOBES, _MOST_PIXELS = 50, 1000
+#: Most lobes of a Lanczos function.
+_MOST_LOBES = 50
+#: Most pixels along a side of a grid.
+_MOST_PIXELS = 1000
 
 
 class Profile(Protocol):
@@ -137,13 +139,13 @@ def read_profile(tables: PiffTables) -> Profile:
     flux = bool(settings.get("fit_flux", 0))
     if kind == "PixelGrid":
         text = settings.get("interp", "Lanczos(3)")
-        found = re.match(r"(?:galsim\.)?Lanczos\((?:n=)?(\d+)(?:, *(?:conserve_dc=)?(True|False))?[,)]", str(text))
-        if found is None:
+        lanczos = re.match(r"(?:galsim\.)?Lanczos\((?:n=)?(\d+)(?:, *(?:conserve_dc=)?(True|False))?[,)]", str(text))
+        if lanczos is None:
             raise tables.error(f"model interp = {str(text)[:40]}: expected Lanczos(n)")
-        lobes = tables.whole("model interp", "Lanczos", int(found[1]), 1, _MOST_LOBES)
+        lobes = tables.whole("model interp", "Lanczos", int(lanczos[1]), 1, _MOST_LOBES)
         size = tables.whole("model", "size", settings.get("size"), 1, _MOST_PIXELS)
         scale = tables.positive("model", "scale", settings.get("scale"))
-        return PixelGrid(scale, size, lobes, found[2] != "False", flux)
+        return PixelGrid(scale, size, lobes, lanczos[2] != "False", flux)
     shape = (bool(settings.get("centered", 1)), flux, bool(settings.get("include_pixel", 1)))
     if kind == "Gaussian":
         return Gaussian(*shape)
@@ -197,5 +199,5 @@ def _kolmogorov_profile() -> tuple[CubicSpline, float]:
     half = brentq(lambda r: float(r * (w * transform * j1(k * r)).sum()) - 0.5, 0.5, 5.0, xtol=1e-14)
     # Close to each other where the profile is steep.
     r = _TAIL * np.linspace(0.0, 1.0, 1500) ** 2
-    value = half**2 / (2.0 * math.pi) * np.array([(w * transform * k * j0(k * half * one)).sum() for one in r])
+    value = half**2 / (2.0 * math.pi) * np.array([(w * transform * k * j0(k * half * radius)).sum() for radius in r])
     return CubicSpline(r, value), float(value[-1] * _TAIL ** (11.0 / 3.0))

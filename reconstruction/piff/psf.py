@@ -101,16 +101,16 @@ class PiffPsf:
         if not len(places):
             return np.empty((0, side, side))
         field, jacobians = model.world.at(places)
-        known = {"x": places[:, 0], "y": places[:, 1], "u": field[:, 0], "v": field[:, 1]}
+        property_values = {"x": places[:, 0], "y": places[:, 1], "u": field[:, 0], "v": field[:, 1]}
         for key in self.property_names:
             if properties is None or key not in properties:
                 raise DomainError(f"properties: expected values of {', '.join(self.property_names)}")
             values = pure_numbers(properties[key], f"properties[{key!r}]")
             if values.shape != (len(places),):
                 raise DomainError(f"properties[{key!r}] has shape {values.shape}: expected [{len(places)}]")
-            known[key] = values
+            property_values[key] = values
         keys = model.interpolant.keys
-        at = np.stack([known[key] for key in keys], axis=1) if keys else np.empty((len(places), 0))
+        at = np.stack([property_values[key] for key in keys], axis=1) if keys else np.empty((len(places), 0))
         parameters = model.interpolant.parameters(at)
         return np.stack([model.profile.draw(p, j, side) for p, j in zip(parameters, jacobians, strict=True)])
 
@@ -126,10 +126,10 @@ class PiffPsf:
         return float(np.sqrt(abs(np.linalg.det(jacobian))) * ARCSEC)
 
     def _chip(self, chip: int | None) -> PiffChip:
-        known = tuple(self.chips)
-        number = known[0] if chip is None and len(known) == 1 else chip
-        if number is None or number not in known:
-            raise DomainError(f"chip = {shown(chip)}: expected one of {', '.join(map(str, known))}")
+        chip_numbers = tuple(self.chips)
+        number = chip_numbers[0] if chip is None and len(chip_numbers) == 1 else chip
+        if number is None or number not in chip_numbers:
+            raise DomainError(f"chip = {shown(chip)}: expected one of {', '.join(map(str, chip_numbers))}")
         return self.chips[number]
 
 

@@ -37,8 +37,8 @@ class PiffTables:
             warnings.simplefilter("error")
             with parsing(path, "damaged or no FITS file of Piff", ProductError):
                 hdus = fits.open(io.BytesIO(data), lazy_load_hdus=False)
-                found = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)]
-                tables = {hdu.name.lower(): hdu.data for hdu in found}
+                binary_tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)]
+                tables = {hdu.name.lower(): hdu.data for hdu in binary_tables}
         return cls(path, tables)
 
     def below(self, name: str) -> PiffTables:

@@ -11,10 +11,14 @@ from .tables import PiffTables
 
 #: Columns of a star: field position [arcsec], d(u, v)/d(x, y) [arcsec/pixel].
 _COLUMNS = ("u", "v", "dudx", "dudy", "dvdx", "dvdy")
-#: Largest order of the polynomials, and stars needed beyond the number of terms.
-_MOST, _SPARE = 5, 3
-#: Relative errors at which no higher order is tried, and from which on the coordinates are refused.
-_ENOUGH, _TOO_MUCH = 1e-10, 1e-3
+#: Largest order of the polynomials.
+_MOST = 5
+#: Stars needed beyond the number of terms.
+_SPARE = 3
+#: Relative error at which no higher order is tried.
+_ENOUGH = 1e-10
+#: Relative error from which on the coordinates are refused.
+_TOO_MUCH = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,26 +62,26 @@ class StarWorld:
         scale = np.abs(values[:, 2:]).max()
         span = scale * max(np.ptp(places, axis=0).max(), 1.0)
         sizes = np.array([span, span, scale, scale, scale, scale])
-        found = None
+        best = None
         for order in range(1, _MOST + 1):
             if term_count(order) + _SPARE > len(stars):
                 break
             terms = design_matrix(places, extent, order)
             inverse = np.linalg.pinv(terms)
-            left = (values - terms @ (inverse @ values)) / sizes
-            own = np.einsum("ij,ji->i", terms, inverse)[:, None]
-            error = float(np.abs(left / np.maximum(1.0 - own, 1e-6)).max())
-            if found is None or error < found.error:
-                found = cls(extent, order, inverse @ values, error)
+            residuals = (values - terms @ (inverse @ values)) / sizes
+            leverage = np.einsum("ij,ji->i", terms, inverse)[:, None]
+            error = float(np.abs(residuals / np.maximum(1.0 - leverage, 1e-6)).max())
+            if best is None or error < best.error:
+                best = cls(extent, order, inverse @ values, error)
             if error < _ENOUGH:
                 break
-        assert found is not None
-        if found.error > _TOO_MUCH:
+        assert best is not None
+        if best.error > _TOO_MUCH:
             raise tables.error(
-                f"its {len(stars)} stars have the world coordinates with errors of {found.error:.1g}: expected more "
+                f"its {len(stars)} stars have the world coordinates with errors of {best.error:.1g}: expected more "
                 "stars (the WCS is pickled, and never read)"
             )
-        return found
+        return best
 
     def at(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return u, v [arcsec], shape [n, 2], and Jacobians [arcsec/pixel], shape [n, 2, 2], at pixels [n, 2]."""

@@ -1,166 +1,157 @@
-"""Bases in which the stars of a CCD are described: eigen-PSFs, the pixels themselves, and shapelets.
+"""Bases in which the stars of a CCD are described: what all have in common, and the number of eigen-PSFs.
 
 A basis is a mean PSF of unit sum and orthonormal components that sum to zero, so that every combination has unit sum.
+A subclass of :class:`Basis` holds the options of a kind, one of :class:`FittedBasis` what it makes of stars, with its
+part of a FITS file. A new kind is one file, and an entry in :data:`~.recipe.BASES`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
 from ...core.errors import ConfigError
+from .clean_stars import CleanStars
+from .file_parts import ModelParts
 
-#: Names of the bases.
-BASES = ("pca", "pixels", "shapelets")
-# Scales of shapelets tried first, over the rms width of the mean star, before the best is refined.
-_SCALES = np.geomspace(0.4, 1.6, 13)
-# Most components for the choice of the scale: with many, the residual hardly depends on it.
-_FOR_SCALE = 20
-_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+#: Components where no number is given (Jee & Tyson 2011, sec. 3).
+COMPONENTS = 20
+#: Most components from which an automatic choice is made.
+_MOST_COMPONENTS = 65
+
+
+@dataclass(frozen=True)
+class Basis(ABC):
+    """Options of a basis."""
+
+    name: ClassVar[str]
+    fitted: ClassVar[type[FittedBasis]]
+    #: In the report of a run, after the number of components.
+    words: ClassVar[str]
+    #: Whether the components are those of the stars, by falling variance: the first ones are the best so many.
+    ordered: ClassVar[bool] = False
+    #: Whether there are components to choose; else every pixel is one.
+    has_components: ClassVar[bool] = True
+
+    #: Components to keep; ``auto`` for as many as predict the shapes of held-out stars best.
+    n_components: int | Literal["auto"] | None = None
+
+    @property
+    def automatic(self) -> bool:
+        """Whether the number of components is chosen by the stars."""
+        return self.n_components == "auto"
+
+    @property
+    def least_stars(self) -> int:
+        """Fewest stars of a fit."""
+        return 2
+
+    @abstractmethod
+    def most_components(self, n_stars: int, n_pixels: int) -> tuple[int, str]:
+        """Return the largest number of components, and what limits it."""
+
+    def component_count(self, n_stars: int, n_pixels: int) -> int:
+        """Return how many components to make, of an automatic choice the largest number; ConfigError if impossible."""
+        limit, reason = self.most_components(n_stars, n_pixels)
+        if self.automatic:
+            return min(limit, _MOST_COMPONENTS)
+        count = self.n_components
+        if isinstance(count, bool) or not isinstance(count, (int, np.integer)):
+            raise ConfigError(f"n_components = {count!r}: expected a whole number, 'auto' or None")
+        if not 1 <= count <= limit:
+            raise ConfigError(f"n_components = {count}: expected 1 to {limit}, no more than {reason}")
+        return int(count)
+
+    @abstractmethod
+    def fit(
+        self, stars: CleanStars, shape: tuple[int, int], count: int, weights: np.ndarray | None = None
+    ) -> FittedBasis:
+        """Return mean and `count` components of stars of a shape (ny, nx), with `weights` [n_stars] where they matter.
+
+        ConfigError if the stamps do not resolve that many.
+        """
 
 
 @dataclass(frozen=True, eq=False)
-class Basis:
+class FittedBasis:
     """A mean and components."""
 
-    mean: np.ndarray  #: [n_pixels], unit sum
-    vectors: np.ndarray  #: [k, n_pixels], orthonormal, each of sum zero; of pixels the unit vectors
-    spectrum: np.ndarray  #: singular values of the stars' deviations from their mean, falling
-    scale: float = np.nan  #: of shapelets [pixel]
+    kind: ClassVar[type[Basis]]
 
+    mean: np.ndarray  #: [ny, nx], unit sum
+    components: np.ndarray  #: [k, ny, nx], orthonormal, each of sum zero; of pixels the unit vectors
+    eigenvalues: np.ndarray  #: variance of the stars along their principal components, falling, [min(n - 1, ny nx)]
 
-def principal_components(
-    mean: np.ndarray, deviations: np.ndarray, count: int, weights: np.ndarray | None = None
-) -> Basis:
-    """Return the `count` eigen-PSFs of largest eigenvalue, the element of largest magnitude of each positive.
+    def __init_subclass__(cls, kind: type[Basis]) -> None:
+        super().__init_subclass__()
+        cls.kind, kind.fitted = kind, cls
 
-    `deviations` [n_stars, n_pixels] are the stars less their mean [n_pixels]. With `weights` [n_stars], of mean 1, each
-    star counts in the covariance by its own.
-    """
-    if weights is not None:
-        deviations = deviations * np.sqrt(weights)[:, None]
-    _, singular, vectors = np.linalg.svd(deviations, full_matrices=False)
-    vectors = vectors[:count]
-    largest = np.take_along_axis(vectors, np.abs(vectors).argmax(axis=1)[:, None], axis=1)
-    return Basis(mean, vectors * np.where(largest < 0.0, -1.0, 1.0), singular)
+    @property
+    def name(self) -> str:
+        """Name of the kind."""
+        return self.kind.name
 
+    @property
+    def vectors(self) -> np.ndarray:
+        """The components, [k, n_pixels]."""
+        return self.components.reshape(len(self.components), -1)
 
-def pixel_grid(mean: np.ndarray, deviations: np.ndarray) -> Basis:
-    """Return the basis in which every pixel is its own component."""
-    return Basis(mean, identity(len(mean)), np.linalg.svd(deviations, compute_uv=False))
+    def project(self, stars: CleanStars) -> tuple[np.ndarray, np.ndarray]:
+        """Project stars: coefficients [n_stars, k], and residual sums of squares [n_stars]."""
+        deviations = self._deviations_of(stars)
+        coefficients = deviations @ self.vectors.T
+        return coefficients, ((deviations - coefficients @ self.vectors) ** 2).sum(axis=1)
 
+    def _deviations_of(self, stars: CleanStars) -> np.ndarray:
+        """Return the deviations of stars from the mean of the basis, [n_stars, n_pixels]."""
+        return stars.deviations
 
-def identity(count: int) -> np.ndarray:
-    """Return the unit matrix [count, count], read-only, in the memory of two of its rows.
+    def at(self, coefficients: np.ndarray) -> np.ndarray:
+        """Return mean plus coefficients [n, k] times components, [n, ny, nx]; no batch size matters."""
+        images = np.repeat(self.mean[None], len(coefficients), axis=0)
+        for k, component in enumerate(self.components):  # no BLAS: its sums depend on the batch
+            images += coefficients[:, k, None, None] * component
+        return images
 
-    Every model of pixels has one: thousands of pixels would need a hundred megabytes each.
-    """
-    unit = np.zeros(2 * count - 1)
-    unit[count - 1] = 1.0
-    return np.lib.stride_tricks.sliding_window_view(unit, count)[::-1]
+    def deviations(self, coefficients: np.ndarray) -> np.ndarray:
+        """Return the deviations of stars of coefficients [n, k] from the mean, [n, n_pixels]."""
+        return coefficients @ self.vectors
 
+    def variance_along(self, coefficients: np.ndarray) -> np.ndarray:
+        """Return the variance of stars of coefficients [n, k] along each component, [k]."""
+        return np.asarray(coefficients.var(axis=0, ddof=1))
 
-def shapelets(
-    mean: np.ndarray, deviations: np.ndarray, count: int, shape: tuple[int, int], scale: float | None
-) -> Basis:
-    """Return Gauss-Hermite functions (Refregier 2003) of the scale with the least residual of the stars.
+    def truncated(self, count: int) -> Self:
+        """Return the basis with its first components only; ConfigError if there are fewer, or they have no order."""
+        k = len(self.components)
+        if not self.kind.has_components or not 1 <= count <= k:
+            raise ConfigError(f"n_components = {count}: expected 1 to {k} of a model of pca or shapelets")
+        return replace(self, components=self.components[:count])
 
-    The first `count` + 1 shapelets by total order, sampled at the centres of the pixels about the centre of the stamp,
-    and restricted to unit sum, make a mean and `count` components. The mean is the projection of the mean star: what
-    the shapelets truncate is left out, as in the shapelet method that Jee & Tyson 2011, sec. 3, compare with. `mean`
-    and `deviations` are as in :func:`principal_components`, `shape` is (ny, nx). `scale` is the rms width of the
-    Gaussian [pixel]; None chooses the one with the least squares of the residuals of all stars. ConfigError if the
-    stamps have too few pixels for independent shapelets.
-    """
-    if scale is None:
-        scale = _best_scale(mean + deviations, min(count, _FOR_SCALE), shape)
-    base, vectors = _unit_sum_shapelets(count, shape, scale)
-    held = base + (vectors @ (mean - base)) @ vectors
-    return Basis(held, vectors, np.linalg.svd(deviations, compute_uv=False), float(scale))
-
-
-def shapelet_images(count: int, shape: tuple[int, int], scale: float) -> np.ndarray:
-    """Return the first shapelets by total order, [count, ny, nx], sampled at the centres of the pixels.
-
-    Within an order the one along x comes first. Each has unit square integral over the plane [pixel^-1]. `scale` is the
-    rms width of the Gaussian of order zero [pixel].
-    """
-    # An order's amplitude is exp(-r^2 / 2 beta^2): the Gaussian of order zero has rms width beta.
-    order = 0
-    while (order + 1) * (order + 2) // 2 < count:
-        order += 1
-    along_y, along_x = (_hermite_functions(order, (np.arange(n) - (n - 1) / 2.0) / scale) for n in shape)
-    pairs = [(total - m, m) for total in range(order + 1) for m in range(total + 1)][:count]
-    return np.stack([along_y[m][:, None] * along_x[n] for n, m in pairs]) / scale
-
-
-def _hermite_functions(order: int, x: np.ndarray) -> np.ndarray:
-    """Return H_n(x) exp(-x^2/2) / sqrt(2^n n! sqrt(pi)) for n = 0 to `order`, by their recurrence."""
-    rows = [np.pi**-0.25 * np.exp(-0.5 * x**2)]
-    rows.append(np.sqrt(2.0) * x * rows[0])
-    for n in range(1, order):
-        rows.append(np.sqrt(2.0 / (n + 1)) * x * rows[n] - np.sqrt(n / (n + 1)) * rows[n - 1])
-    return np.stack(rows[: order + 1])
-
-
-def _unit_sum_shapelets(count: int, shape: tuple[int, int], scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Gaussian of unit sum [n_pixels] and orthonormal combinations of sum zero [count, n_pixels].
-
-    The first m components span the same combinations of sum zero as the first m + 1 shapelets.
-    """
-    images = shapelet_images(count + 1, shape, scale).reshape(count + 1, -1)
-    base = images[0] / images[0].sum()
-    changes = images[1:] - images[1:].sum(axis=1)[:, None] * base
-    q, r = np.linalg.qr(changes.T)
-    size = np.abs(np.diagonal(r))
-    if count > len(base) - 1 or size.min() < 1e-8 * size.max():
-        raise ConfigError(
-            f"n_components = {count}: stamps of {shape[1]} x {shape[0]} pixels do not resolve that many shapelets "
-            f"of scale {scale:.3g} pixels"
+    def parts(self) -> ModelParts:
+        """Return what the basis has in a FITS file."""
+        return ModelParts(
+            {"BASIS": (self.name, "kind of the components")}, {"MEAN": self.mean, "EIGEN": self.components}
         )
-    return base, (q * np.where(np.diagonal(r) < 0.0, -1.0, 1.0)).T
+
+    @classmethod
+    def of_parts(cls, parts: ModelParts) -> Self:
+        """Return the basis in a FITS file; KeyError where something is missing."""
+        return cls(parts.image("MEAN"), parts.image("EIGEN"), parts.eigenvalues, **cls._options_of(parts))
+
+    @classmethod
+    def _options_of(cls, parts: ModelParts) -> dict[str, Any]:
+        """Return further fields."""
+        return {}
 
 
-def _best_scale(stars: np.ndarray, count: int, shape: tuple[int, int]) -> float:
-    """Return the scale with the least residual of the stars [n, n_pixels], by golden section."""
-    width = _rms_width(stars.mean(axis=0).reshape(shape))
-
-    def left(log_scale: float) -> float:
-        try:
-            base, vectors = _unit_sum_shapelets(count, shape, float(np.exp(log_scale)))
-        except ConfigError:
-            return np.inf
-        rest = stars - base
-        return float(((rest - (rest @ vectors.T) @ vectors) ** 2).sum())
-
-    tried = np.log(_SCALES * width)
-    values = [left(t) for t in tried]
-    best = int(np.argmin(values))
-    if not np.isfinite(values[best]):
-        _unit_sum_shapelets(count, shape, width)  # raises the error
-    low, high = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
-    a, b = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-    at_a, at_b = left(a), left(b)
-    while high - low > 1e-9:
-        if at_a < at_b:
-            high, b, at_b = b, a, at_a
-            a = high - _GOLDEN * (high - low)
-            at_a = left(a)
-        else:
-            low, a, at_a = a, b, at_b
-            b = low + _GOLDEN * (high - low)
-            at_b = left(b)
-    return float(np.exp(0.5 * (low + high)))
-
-
-def _rms_width(image: np.ndarray) -> float:
-    """Return the rms width [pixel] of the part of a star above a tenth of its peak, without the wings."""
-    y, x = np.indices(image.shape)
-    light = np.where(image > 0.1 * image.max(), image, 0.0).ravel()
-    light /= light.sum()
-    x0, y0 = (light * x.ravel()).sum(), (light * y.ravel()).sum()
-    return float(np.sqrt(0.5 * (light * ((x.ravel() - x0) ** 2 + (y.ravel() - y0) ** 2)).sum() + 0.25))
+def eigenvalues_of(singular: np.ndarray, stars: CleanStars) -> np.ndarray:
+    """Return the variances of stars along their principal components from singular values."""
+    n_stars, n_pixels = stars.deviations.shape
+    return np.asarray(singular[: min(n_stars - 1, n_pixels)] ** 2 / (n_stars - 1))
 
 
 def elbow_of(eigenvalues: np.ndarray) -> int:

@@ -1,4 +1,4 @@
-"""Stamps in a basis: outliers rejected, masked pixels filled, stars projected on components."""
+"""Stars of a CCD to be modelled: outliers rejected, masked pixels filled."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .basis import Basis, pixel_grid, principal_components, shapelets
 from .masked_pixels import fill_masked, mean_and_flux
 from .outliers import find_outliers, restore_predicted
 
@@ -43,13 +42,13 @@ def cleaned_stars(
     `images` [n_stars, ny, nx] are finite and of any flux; pixels in `masked` are not used. The polynomial terms at the
     stars [n_stars, n_terms] keep stars whose deviation the others predict, and fill masked pixels.
     """
-    pixels, missing = images.reshape(len(images), -1), masked.reshape(len(images), -1)
-    if missing.any():
-        guess, flux = mean_and_flux(pixels, missing)
-        pixels = np.where(missing, flux[:, None] * guess, pixels)
+    pixels, filled_pixels = images.reshape(len(images), -1), masked.reshape(len(images), -1)
+    if filled_pixels.any():
+        guess, flux = mean_and_flux(pixels, filled_pixels)
+        pixels = np.where(filled_pixels, flux[:, None] * guess, pixels)
     rejected = np.zeros(pixels.shape, dtype=bool)
     if clip_sigma is not None:
-        rejected = find_outliers(pixels, clip_sigma, max_iterations) & ~missing
+        rejected = find_outliers(pixels, clip_sigma, max_iterations) & ~filled_pixels
     mean, flux = mean_and_flux(pixels, rejected)
     if rejected.any():
         rejected = restore_predicted(pixels / pixels.sum(axis=1)[:, None], mean, rejected, terms)
@@ -57,36 +56,9 @@ def cleaned_stars(
     deviations = np.where(rejected, 0.0, pixels / flux[:, None] - mean)
 
     by_mean = rejected & (replacement == "mean")
-    missing = missing | (rejected & ~by_mean)
-    if missing.any():
-        stars = fill_masked(mean + deviations, missing, by_mean, terms)
+    filled_pixels = filled_pixels | (rejected & ~by_mean)
+    if filled_pixels.any():
+        stars = fill_masked(mean + deviations, filled_pixels, by_mean, terms)
         mean = stars.mean(axis=0)
         deviations = np.where(by_mean, 0.0, stars - mean)
     return CleanStars(mean, deviations, rejected)
-
-
-def make_basis(
-    stars: CleanStars,
-    shape: tuple[int, int],
-    basis: str,
-    count: int,
-    scale: float | None,
-    weights: np.ndarray | None = None,
-) -> Basis:
-    """Return a basis of stars of a shape (ny, nx); `weights` [n_stars] are those of the stars in eigen-PSFs."""
-    if basis == "pixels":
-        return pixel_grid(stars.mean, stars.deviations)
-    if basis == "pca":
-        return principal_components(stars.mean, stars.deviations, count, weights)
-    return shapelets(stars.mean, stars.deviations, count, shape, scale)
-
-
-def project_stars(stars: CleanStars, found: Basis, basis: str) -> tuple[np.ndarray, np.ndarray]:
-    """Project stars onto their basis: coefficients [n_stars, k], and residual sums of squares [n_stars]."""
-    deviations = stars.deviations
-    if basis == "pixels":
-        return deviations, np.zeros(len(deviations))
-    if basis == "shapelets":
-        deviations = deviations + (stars.mean - found.mean)  # its mean is not that of the stars
-    coefficients = deviations @ found.vectors.T
-    return coefficients, ((deviations - coefficients @ found.vectors) ** 2).sum(axis=1)

@@ -6,23 +6,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from .basis import Basis
+from .basis import FittedBasis
 from .clean_stars import CleanStars
-from .polynomial import term_count
+from .polynomial import FOLDS, term_count
 from .shape_noise import ShapeNoise
-
-#: Orders from which an automatic choice is made.
-ORDERS = range(5)
-# Number of folds; the i-th star is in fold i modulo this.
-_FOLDS = 5
-# Most terms of polynomials over the stars that they are fitted to.
-_MOST_TERMS = 0.5
-
-
-def automatic_orders(n_stars: int) -> list[int]:
-    """Return the orders of polynomials that may be chosen for so many stars, ascending."""
-    fitted = n_stars - -(-n_stars // _FOLDS)
-    return [order for order in ORDERS if order == 0 or term_count(order) <= _MOST_TERMS * fitted]
 
 
 def choose_by_cross_validation(
@@ -31,7 +18,7 @@ def choose_by_cross_validation(
     shapes: ShapeNoise,
     orders: Sequence[int],
     counts: np.ndarray,
-    basis_of: Callable[[CleanStars, np.ndarray | None, int], Basis],
+    basis_of: Callable[[CleanStars, np.ndarray | None, int], FittedBasis],
     given: np.ndarray | None,
 ) -> tuple[int, int]:
     """Return the order and the number of components whose models predict the shapes of held-out stars best.
@@ -53,32 +40,34 @@ def choose_by_cross_validation(
     given : array or None
         Weights of the stars in the polynomials, [n], with equal ones in the basis; None for those of their noise.
     """
-    fold = np.arange(len(terms)) % _FOLDS
-    left = np.full((len(terms), len(orders), len(counts), 3), np.nan)
-    for part in range(fold.max() + 1):
-        held = fold == part
-        rest, others = shapes.of_stars(~held), stars.of_stars(~held)
+    fold = np.arange(len(terms)) % FOLDS
+    residuals = np.full((len(terms), len(orders), len(counts), 3), np.nan)
+    for index in range(fold.max() + 1):
+        held_out = fold == index
+        fitted_shapes, fitted_stars = shapes.of_stars(~held_out), stars.of_stars(~held_out)
         for i, order in enumerate(orders):
-            some = terms[:, : term_count(order)]
+            order_terms = terms[:, : term_count(order)]
             if given is None:
-                weights = rest.star_weights(others.deviations, some[~held])
-                about = others.about_weighted_mean(weights)
+                weights = fitted_shapes.star_weights(fitted_stars.deviations, order_terms[~held_out])
+                centred_stars = fitted_stars.about_weighted_mean(weights)
             else:
-                weights, about = given[~held], others.about_weighted_mean(np.ones(len(others.deviations)))
-            basis = basis_of(about, None if given is not None else weights, int(counts[-1]))
+                weights = given[~held_out]
+                centred_stars = fitted_stars.about_weighted_mean(np.ones(len(weights)))
+            basis = basis_of(centred_stars, None if given is not None else weights, int(counts[-1]))
+            mean, vectors = basis.mean.ravel(), basis.vectors
             root = np.sqrt(weights)[:, None]
-            rule = some[held] @ np.linalg.pinv(some[~held] * root) * root.T
-            coefficients = (about.deviations + (about.mean - basis.mean)) @ basis.vectors.T
-            predicted = (rule @ coefficients)[:, :, None] * (basis.vectors @ shapes.filters.T)
+            rule = order_terms[held_out] @ np.linalg.pinv(order_terms[~held_out] * root) * root.T
+            coefficients = (centred_stars.deviations + (centred_stars.mean - mean)) @ vectors.T
+            predicted = (rule @ coefficients)[:, :, None] * (vectors @ shapes.filters.T)
             summed = np.concatenate([np.zeros_like(predicted[:, :1]), np.cumsum(predicted, axis=1)], axis=1)
-            found = (stars.deviations[held] + (stars.mean - basis.mean)) @ shapes.filters.T
-            left[held, i] = found[:, None] - summed[:, np.minimum(counts, len(basis.vectors))]
+            numbers = (stars.deviations[held_out] + (stars.mean - mean)) @ shapes.filters.T
+            residuals[held_out, i] = numbers[:, None] - summed[:, np.minimum(counts, len(vectors))]
     # One column for each order and number of components.
-    squares = (left**2).mean(axis=-1).reshape(len(terms), -1)
-    residuals = left.reshape(len(terms), -1, 3)
+    squares = (residuals**2).mean(axis=-1).reshape(len(terms), -1)
+    case_residuals = residuals.reshape(len(terms), -1, 3)
     best = int(np.argmin(squares.mean(axis=0)))
     for _ in range(2):
-        weight = (shapes.model_variance(residuals[:, best]) + shapes.noise) ** -2
+        weight = (shapes.model_variance(case_residuals[:, best]) + shapes.noise) ** -2
         best = int(np.argmin(weight @ squares))
     order, count = divmod(best, len(counts))
     return orders[order], int(counts[count])

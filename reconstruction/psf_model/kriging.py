@@ -19,14 +19,18 @@ Variances are in units of the noise of the middle star.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 import scipy.linalg
 
 from ...core.errors import DomainError
-from .polynomial import term_count
+from ...core.threads import one_blas_thread
+from ..gaussian_field import inverse_from_cholesky, leave_one_out_residuals
+from .file_parts import ModelParts
+from .interpolation import FittedInterpolation, Interpolation, StarField
+from .polynomial import MOST_ORDER, mapped, term_count
 
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
@@ -49,7 +53,8 @@ _FIRST_OPTIONAL_DEGREE = 3
 # Where the search starts: nearly all trend of degree 2, nearly all process, all trend of every degree. The logarithms
 # of the trend's variances start, up to the degree given, at the second number for degree 1 and fall by the third for
 # each degree more; beyond, where they are expected.
-_TREND, _PROCESS = (-4.0, math.log(0.7), -4.0), (0.0, math.log(0.7), -4.0)
+_TREND = (-4.0, math.log(0.7), -4.0)
+_PROCESS = (0.0, math.log(0.7), -4.0)
 _STARTS = ((_TREND, 2, 2.0, 1.0), (_PROCESS, 2, 1.0, 2.0), (_TREND, math.inf, 3.0, 0.5))
 # Variance of the trend's constant: as good as unknown.
 _CONSTANT = 1e4
@@ -57,11 +62,75 @@ _CONSTANT = 1e4
 _MOST_STARS = 300
 # Distance from the centre beyond which a stamp is sky, as a fraction of its side.
 _SKY = 0.35
-# Passes after which the noise of the sky, and the mean of stars that are weighted by it, change no more; the least
-# part of a star's deviation from that mean that is its own; and the least noise over that of the faintest star.
-_SKY_PASSES, _LEAST_OWN, _LEAST_SKY = 3, 0.05, 1e-12
+# Passes after which the noise of the sky, and the mean of stars that are weighted by it, change no more.
+_SKY_PASSES = 3
+# Least part of a star's deviation from that mean that is its own.
+_LEAST_OWN = 0.05
+# Least noise over that of the faintest star.
+_LEAST_SKY = 1e-12
+# Variance of a star's noise over that of its shape, at least: stars without noise would make the covariance singular.
+_LEAST_NOISE = 1e-6
 #: Stars of fewer photons are not in electrons.
 FEWEST_ELECTRONS = 100.0
+
+
+@dataclass(frozen=True)
+class Kriging(Interpolation):
+    """One covariance over the CCD for all components, learnt from the shapes of the stars, with the noise of each."""
+
+    name = "kriging"
+    label = "kriging"
+    words = "kriging over "
+
+    order: int | Literal["auto"] = ORDER
+
+    def fit(self, stars: StarField) -> FittedKriging:
+        """Krige the coefficients of stars by the covariance of their shapes."""
+        mean = stars.basis.mean
+        deviations = stars.basis.deviations(stars.coefficients)
+        numbers, filters = shape_numbers(mean, deviations)
+        noise = star_noise(stars.images, deviations, mean, filters, stars.gain)
+        noise = np.maximum(noise, _LEAST_NOISE * (numbers**2).mean(axis=0) + np.finfo(float).tiny)
+        places = mapped(stars.positions, stars.extent)
+        kernel = fit_kernel(places, numbers, noise, stars.terms)
+        of_stars = (noise / np.median(noise, axis=0)).mean(axis=1)
+        polynomial, alpha, _ = krige(places, stars.coefficients, stars.terms, kernel, of_stars)
+        return FittedKriging(stars.positions, stars.extent, stars.order, polynomial, 1.0 / of_stars, kernel, alpha)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedKriging(FittedInterpolation, kind=Kriging):
+    """A trend and a process of one covariance."""
+
+    kernel_columns = range(COLUMNS, COLUMNS + MOST_ORDER)
+
+    kernel: np.ndarray  #: of the covariance: :data:`COLUMNS`
+    alpha: np.ndarray  #: dual coefficients: inverse covariance times coefficients, [n, k]
+
+    def at(self, positions: Any) -> np.ndarray:
+        """Evaluate the coefficients at positions [m, 2], [m, k]; no batch size matters."""
+        points, places = (mapped(p, self.extent) for p in (self.positions, positions))
+        return super().at(positions) + predict(points, places, self.kernel, self.alpha)
+
+    def leave_one_out(self, coefficients: np.ndarray) -> np.ndarray:
+        """Return coefficients [n, k] of the stars less their prediction by the others under the same covariance."""
+        points = mapped(self.positions, self.extent)
+        noise = 1.0 / (np.ones(len(points)) if self.weights is None else self.weights)
+        with one_blas_thread():
+            return krige(points, coefficients, self.terms(), self.kernel, noise)[2]
+
+    def truncated(self, count: int) -> Self:
+        """Return the interpolation of the first components only."""
+        return replace(super().truncated(count), alpha=self.alpha[:, :count])
+
+    def parts(self) -> ModelParts:
+        """Return what the interpolation has in a FITS file, the covariance once for each component."""
+        kernels = np.tile(self.kernel, (self.polynomial.shape[1], 1))
+        return super().parts().extended({"KERNEL": kernels}, {"pull": self.alpha})
+
+    @classmethod
+    def _fields_of(cls, parts: ModelParts) -> dict[str, Any]:
+        return {"kernel": parts.image("KERNEL")[0], "alpha": parts.columns["pull"]}
 
 
 def shape_numbers(
@@ -145,29 +214,29 @@ def fit_kernel(points: np.ndarray, numbers: np.ndarray, noise: np.ndarray, terms
     to [-1, 1], `noise` [n, 3] are the variances of the numbers, `terms` [n, n_terms] those of the trend.
     """
     unit = np.median(noise, axis=0)
-    chosen = np.sort(np.argsort(noise.sum(axis=1), kind="stable")[:_MOST_STARS])
+    brightest = np.sort(np.argsort(noise.sum(axis=1), kind="stable")[:_MOST_STARS])
     degrees = np.arange(1, max(order_of(terms.shape[1]), COLUMNS - 3) + 1)
     expected = np.where(degrees < 3, 1.0 - degrees, 3.0 - 3.0 * degrees)
     posterior = Posterior(
-        _pair_distances(points[chosen], points[chosen]),
-        numbers[chosen] / np.sqrt(unit),
-        (noise[chosen] / unit).mean(axis=1),
-        terms[chosen],
+        _pair_distances(points[brightest], points[brightest]),
+        numbers[brightest] / np.sqrt(unit),
+        (noise[brightest] / unit).mean(axis=1),
+        terms[brightest],
         np.concatenate([_PRIOR[:, 0], expected]),
         np.concatenate([_PRIOR[:, 1], np.full(len(degrees), _TREND_WIDTH)]),
     )
-    every = np.ones(3 + len(degrees), dtype=bool)
-    found = []
+    all_columns = np.ones(3 + len(degrees), dtype=bool)
+    optima = []
     for process, last, first, fall in _STARTS if len(degrees) > 2 else _STARTS[:2]:
         start = np.concatenate([process, np.where(degrees <= last, first - fall * (degrees - 1), expected)])
-        found.append(posterior.minimize(start, every))
-    best, kept = min(found, key=lambda each: each.fun), every
-    for column in range(len(every) - 1, 1 + _FIRST_OPTIONAL_DEGREE, -1):
-        fewer = kept & (np.arange(len(kept)) != column)
+        optima.append(posterior.minimize(start, all_columns))
+    best, best_columns = min(optima, key=lambda each: each.fun), all_columns
+    for column in range(len(all_columns) - 1, 1 + _FIRST_OPTIONAL_DEGREE, -1):
+        fewer = best_columns & (np.arange(len(best_columns)) != column)
         without = posterior.minimize(best.x, fewer)
         if without.fun < best.fun + _EVIDENCE:
-            best, kept = without, fewer
-    return posterior.kernel(best.x, kept)
+            best, best_columns = without, fewer
+    return posterior.kernel(best.x, best_columns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,8 +261,7 @@ class Posterior:
             root = np.linalg.cholesky(_kernel_covariance(kernel, self.distance, self.terms, self.noise))
         except np.linalg.LinAlgError:
             return 1e12, np.zeros(len(kept))
-        lower = np.tril(scipy.linalg.lapack.dpotri(root, lower=1)[0])
-        inverse = lower + np.tril(lower, -1).T
+        inverse = inverse_from_cholesky(root)
         solved = inverse @ self.numbers
         count = self.numbers.shape[1]
         value = 0.5 * (solved * self.numbers).sum() + count * np.log(np.diagonal(root)).sum()
@@ -240,7 +308,7 @@ def krige(
     inverse = scipy.linalg.inv(covariance, check_finite=False)
     weights = inverse @ values
     trend = _trend_variances(kernel, terms.shape[1])[:, None] * (terms.T @ weights)
-    return trend, weights, weights / np.diagonal(inverse)[:, None]
+    return trend, weights, leave_one_out_residuals(weights, inverse)
 
 
 def predict(points: np.ndarray, at: np.ndarray, kernel: np.ndarray, weights: np.ndarray) -> np.ndarray:

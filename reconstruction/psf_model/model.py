@@ -1,94 +1,72 @@
-"""The PSF across a CCD from its stars: a mean, components, and their amplitudes as functions of position.
+"""The PSF across a CCD from its stars: a mean, components, and their coefficients as functions of position.
 
 Jee & Tyson 2011, section 3: mean PSF with outlier rejection, singular value decomposition, and polynomials for the
-amplitudes of the first components. Pixels or shapelets may stand for the principal components, and a Gaussian process
-for the polynomials, behind the same interface.
+amplitudes of the first components. Other bases and interpolations stand behind the same interface.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from astropy.io import fits
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments
-from ...core.errors import ConfigError, ProductError
+from ...core.errors import ProductError
+from ...core.plotting import figure_at, styled
 from ...core.products import read_fits, write_fits
-from ...core.threads import one_blas_thread
+from ...core.result import Result
 from ...core.version import CREATOR
-from . import gaussian_process, kriging
-from .basis import elbow_of
-from .file import model_fields, model_hdus
-from .fit import fit_fields, weighted
-from .picture import PicturedModel
-from .polynomial import Extent, design_matrix, mapped
+from .basis import Basis, FittedBasis, elbow_of
+from .file import model_hdus, read_model
+from .fit import ModelFit, fit_stars
+from .interpolation import FittedInterpolation, Interpolation
+from .polynomial import Extent
+from .recipe import Recipe
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Pixels of noisy stars that deviate by more standard deviations are rejected.
 CLIP_SIGMA = 5.0
+# Components that are drawn beside the mean.
+_SHOWN = 5
 
 
 @dataclass(frozen=True, eq=False)
-class PsfModel(PicturedModel):
+class PsfModel(Result):
     """A PSF model of one CCD: PSF = mean + sum over k of a_k(x, y) component_k.
 
     Every stamp is normalised to unit sum, so the components sum to zero and the model to one wherever it is evaluated.
 
     Parameters
     ----------
-    mean : array
-        Mean PSF, [ny, nx], unit sum.
-    components : array
-        [k, ny, nx]. Eigen-PSFs by falling eigenvalue, the element of largest magnitude of each positive; or shapelets
-        of unit sum by rising order; both orthonormal. Or one for each pixel.
+    basis : FittedBasis
+        Mean and components; of the class of its kind: :class:`~.EigenPsfs`, :class:`~.PixelGrid`,
+        :class:`~.GaussHermite`.
+    interpolation : FittedInterpolation
+        The stars' coefficients between them; of the class of its kind: :class:`~.FittedPolynomial`,
+        :class:`~.FittedKriging`.
     coefficients : array
         Projections of the stars on the components, [n, k].
-    polynomial : array
-        Coefficients of the terms of :func:`~pachon.reconstruction.psf_model.polynomial.design_matrix`, [n_terms, k].
-    eigenvalues : array
-        All n - 1 eigenvalues of the covariance of the stamps (fewer where a stamp has fewer pixels), falling.
-    positions : array
-        Positions of the stars, [n, 2].
-    order : int
-        Largest total degree of the polynomials.
-    extent : tuple of float
-        (xmin, xmax, ymin, ymax), in the unit of the positions, mapped to [-1, 1].
     unexplained : array
         Per star, sum over its pixels of the square of what the components leave, [n].
     rejected : array of int
         Per star, pixels rejected as outliers and replaced, [n].
-    basis : str
-        ``pca``, ``pixels`` or ``shapelets``.
-    scale : float
-        rms width of the Gaussian under shapelets [pixel]; NaN else.
-    weights : array or None
-        Of the stars in the polynomials, [n]; under a process their inverse variances, in units of the middle star's.
-    kernel : array or None
-        Of a Gaussian process for each component: variance, correlation length where the extent is 2 wide, variance of
-        the noise, [k, 3]; under kriging those of :data:`.kriging.COLUMNS`. None where there are only polynomials.
-    alpha : array or None
-        Dual coefficients of the Gaussian process: inverse covariance times coefficients less trend, [n, k].
     """
 
-    mean: np.ndarray
-    components: np.ndarray
+    _table = ("positions", "coefficients", "unexplained", "rejected")
+
+    basis: FittedBasis
+    interpolation: FittedInterpolation
     coefficients: np.ndarray
-    polynomial: np.ndarray
-    eigenvalues: np.ndarray
-    positions: np.ndarray
-    order: int
-    extent: Extent
     unexplained: np.ndarray
     rejected: np.ndarray
-    basis: str = "pca"
-    scale: float = np.nan
-    weights: np.ndarray | None = None
-    kernel: np.ndarray | None = None
-    alpha: np.ndarray | None = None
 
     @classmethod
     @check_arguments
@@ -97,8 +75,9 @@ class PsfModel(PicturedModel):
         stamps: ArrayLike,
         positions: ArrayLike,
         *,
-        basis: Literal["pca", "pixels", "shapelets"] = "pca",
-        interpolation: Literal["polynomial", "gp", "kriging"] = "polynomial",
+        recipe: str | Recipe | None = None,
+        basis: str | Basis | None = None,
+        interpolation: str | Interpolation | None = None,
         weights: ArrayLike | Literal["noise"] | None = None,
         masks: NDArray[np.bool_] | None = None,
         n_components: int | Literal["auto"] | None = None,
@@ -112,9 +91,10 @@ class PsfModel(PicturedModel):
     ) -> PsfModel:
         """Fit the model to the stars of one CCD.
 
-        Outliers are found pixel by pixel (:func:`~.find_outliers`) and replaced by the mean
-        of the stars that are good there. By default the polynomials are fitted without weights, as in Jee & Tyson 2011,
-        sec. 3.
+        Outliers are found pixel by pixel (:func:`~.find_outliers`) and replaced by the mean of the stars that are good
+        there. Where nothing else is said every pixel is interpolated by kriging (:mod:`~.psf_model.kriging`), the best
+        choice where nothing is known of the PSF; each keyword changes that part of the recipe alone. With
+        `n_components` and no basis, which pixels lack, the recipe is ``paper``: that of Jee & Tyson 2011, sec. 3.
 
         Parameters
         ----------
@@ -122,13 +102,15 @@ class PsfModel(PicturedModel):
             [n, ny, nx] background-subtracted stars centred on a pixel; of any flux, normalised to unit sum here.
         positions : array
             [n, 2] of the stars, in any unit.
-        basis : str
+        recipe : str or Recipe, optional
+            ``kriging`` of pixels, the default; ``paper``: 20 eigen-PSFs and cubic polynomials without weights; or one's
+            own :class:`~.psf_model.recipe.Recipe`.
+        basis : str or Basis, optional
             ``pca``: eigen-PSFs. ``pixels``: every pixel on its own. ``shapelets``: Gauss-Hermite functions, which
-            truncate the wings (Jee & Tyson 2011, sec. 3).
-        interpolation : str
-            ``polynomial``, or ``gp``: a Gaussian process for each component (one for all pixels) over a polynomial
-            trend, with the noise of each star. ``kriging``: one rule for all pixels, with the noise of each star
-            (:mod:`~.psf_model.kriging`); with ``basis="pixels"`` the best choice where nothing is known.
+            truncate the wings (Jee & Tyson 2011, sec. 3). Or an object with options, such as
+            :class:`~.psf_model.shapelets.Shapelets`.
+        interpolation : str or Interpolation, optional
+            ``polynomial``; ``kriging``: one rule for all components, with the noise of each star. Or an object.
         weights : array or str, optional
             [n] of the stars in the polynomials. ``noise``: in the mean and the eigen-PSFs, too, each star counts by the
             inverse of its noise and of what the polynomials leave (:mod:`~.psf_model.shape_noise`); where `order` or
@@ -141,8 +123,8 @@ class PsfModel(PicturedModel):
             ``auto`` takes the number, up to 65, that predicts the shapes of held-out stars best; :attr:`elbow` is the
             alternative. None for pixels.
         order : int or str, optional
-            Largest total degree of the polynomials, 3 where left out; of the trend 0 under a Gaussian process and 4 in
-            kriging, which shrinks it. ``auto``: of polynomials the order, up to 4, that predicts held-out stars best.
+            Largest total degree of the polynomials, 3 where left out; of the trend in kriging 4, which shrinks it.
+            ``auto``: of polynomials the order, up to 4, that predicts held-out stars best.
         extent : tuple of float, optional
             (xmin, xmax, ymin, ymax) of the CCD in the unit of the positions. Where left out, that of the stars.
         scale : float, optional
@@ -168,23 +150,87 @@ class PsfModel(PicturedModel):
             If an array has the wrong shape, a pixel is not finite, a star has no flux, or the stars do not determine
             the polynomials (all on a line, say).
         """
-        fitted = fit_fields(
-            stamps,
-            positions,
-            basis=basis,
-            interpolation=interpolation,
-            weights=weights,
-            masks=masks,
-            n_components=n_components,
-            order=order,
-            extent=extent,
-            scale=scale,
-            gain=gain,
-            clip_sigma=clip_sigma,
-            max_iterations=max_iterations,
-            replacement=replacement,
+        chosen_recipe = Recipe.of(
+            recipe, basis=basis, interpolation=interpolation, n_components=n_components, scale=scale, order=order
         )
-        return cls(**fitted)
+        return cls(
+            *fit_stars(
+                stamps,
+                positions,
+                chosen_recipe,
+                weights=weights,
+                masks=masks,
+                extent=extent,
+                gain=gain,
+                clip_sigma=clip_sigma,
+                max_iterations=max_iterations,
+                replacement=replacement,
+            )
+        )
+
+    def _label(self) -> str:
+        ny, nx = self.mean.shape
+        components, order = f"{self.n_components} components ({self.basis.name})", self.order
+        return f"{components}, order {order}, {self.n_stars} stars, stamps {nx} x {ny}"
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the mean PSF and the first components, each over its largest magnitude."""
+        images = self.components[: _SHOWN if self.basis.kind.has_components else 0]
+        with styled():
+            figure = figure_at(ax, max(1.9 * (len(images) + 1), 4.0), 2.3)
+            row = figure.subplots(1, len(images) + 1, squeeze=False)[0]
+            row[0].imshow(np.sqrt(np.maximum(self.mean, 0.0)), cmap="viridis", vmin=0.0)
+            row[0].set_title("mean (square root)", fontsize=8.5)
+            for k, (axes, image) in enumerate(zip(row[1:], images, strict=True), start=1):
+                axes.imshow(image / float(np.abs(image).max()), cmap="RdBu_r", vmin=-1.0, vmax=1.0)
+                axes.set_title(f"component {k}", fontsize=8.5)
+            for axes in row:
+                axes.set(xticks=[], yticks=[])
+            return figure
+
+    @property
+    def n_components(self) -> int:
+        """Number of components kept."""
+        return len(self.components)
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Mean PSF, [ny, nx], unit sum."""
+        return self.basis.mean
+
+    @property
+    def components(self) -> np.ndarray:
+        """Components, [k, ny, nx].
+
+        Eigen-PSFs by falling eigenvalue, the element of largest magnitude of each positive; or shapelets of unit sum by
+        rising order; both orthonormal. Or one for each pixel.
+        """
+        return self.basis.components
+
+    @property
+    def eigenvalues(self) -> np.ndarray:
+        """All n - 1 eigenvalues of the covariance of the stamps (fewer where a stamp has fewer pixels), falling."""
+        return self.basis.eigenvalues
+
+    @property
+    def positions(self) -> np.ndarray:
+        """Positions of the stars, [n, 2]."""
+        return self.interpolation.positions
+
+    @property
+    def extent(self) -> Extent:
+        """(xmin, xmax, ymin, ymax) of the CCD, in the unit of the positions."""
+        return self.interpolation.extent
+
+    @property
+    def order(self) -> int:
+        """Largest total degree of the polynomials."""
+        return self.interpolation.order
+
+    @property
+    def weights(self) -> np.ndarray | None:
+        """Weights of the stars, [n], or None; under a process inverse variances, in units of the middle star's."""
+        return self.interpolation.weights
 
     @property
     def n_stars(self) -> int:
@@ -200,10 +246,7 @@ class PsfModel(PicturedModel):
     def explained_variance(self) -> np.ndarray:
         """Fraction of the variance of the stamps along each component, [k] (zeros where all stamps are equal)."""
         total = self.eigenvalues.sum()
-        along = self.eigenvalues[: self.n_components]
-        if self.basis != "pca":
-            along = self.coefficients.var(axis=0, ddof=1)
-        return along / (total if total > 0.0 else 1.0)
+        return self.basis.variance_along(self.coefficients) / (total if total > 0.0 else 1.0)
 
     @property
     def explained(self) -> float:
@@ -218,20 +261,18 @@ class PsfModel(PicturedModel):
     @property
     def leave_one_out_curve(self) -> np.ndarray:
         """Rms of stamps minus models without the star, by components used, 0 to k; the last is `leave_one_out_rms`."""
-        left_out, own = self._leave_one_out_residuals() ** 2, self.coefficients**2
-        gained = np.concatenate([[0.0], np.cumsum((left_out - own).sum(axis=0))])
-        total = self.unexplained.sum() + own.sum() + gained
+        residual_squares, squares = self.interpolation.leave_one_out(self.coefficients) ** 2, self.coefficients**2
+        gained = np.concatenate([[0.0], np.cumsum((residual_squares - squares).sum(axis=0))])
+        total = self.unexplained.sum() + squares.sum() + gained
         return np.sqrt(np.maximum(total, 0.0) / (self.n_stars * self.mean.size))
 
     @property
     def leverage(self) -> np.ndarray:
         """Diagonal of the polynomials' hat matrix, [n]: how far a star determines the fit at its own place, 0 to 1.
 
-        That of the trend alone, without weights, where there is a Gaussian process.
+        That of the trend alone where there is a process.
         """
-        with one_blas_thread():
-            q, _ = np.linalg.qr(weighted(design_matrix(self.positions, self.extent, self.order), self.weights))
-        return (q**2).sum(axis=1)
+        return self.interpolation.leverage()
 
     @check_arguments
     def at(self, positions: ArrayLike) -> np.ndarray:
@@ -244,7 +285,7 @@ class PsfModel(PicturedModel):
         positions : array
             [m, 2], or one position [2], in the unit of the fit.
         """
-        return self._combine(self.amplitudes(positions))
+        return self.basis.at(self.interpolation.at(positions))
 
     @check_arguments
     def draw(self, x: float, y: float) -> np.ndarray:
@@ -254,35 +295,24 @@ class PsfModel(PicturedModel):
     @check_arguments
     def amplitudes(self, positions: ArrayLike) -> np.ndarray:
         """Evaluate the amplitudes of the components at positions, [m, k]."""
-        terms = design_matrix(positions, self.extent, self.order)
-        result = np.zeros((len(terms), self.n_components))
-        for column, row in zip(terms.T, self.polynomial, strict=True):  # no BLAS: its sums depend on the batch
-            result += column[:, None] * row
-        if self.kernel is not None and self.alpha is not None:
-            points, at = (mapped(p, self.extent) for p in (self.positions, positions))
-            if self._kriged:
-                result += kriging.predict(points, at, self.kernel[0], self.alpha)
-            else:
-                result += gaussian_process.predict(points, at, self.kernel, self.alpha)
-        return result
+        return self.interpolation.at(positions)
 
     def reconstruct(self) -> np.ndarray:
         """Return the stars from their own projections on the components, without the polynomials, [n, ny, nx]."""
-        return self._combine(self.coefficients)
+        return self.basis.at(self.coefficients)
 
     def leave_one_out(self) -> np.ndarray:
         """Return the model at each star with that star left out of the interpolation, [n, ny, nx].
 
-        Mean PSF, components and the kernel of a process are held, to which the star did contribute; only the
-        polynomials are those of the other n - 1 stars. That needs no new fit: the residual of a star left out is that
-        in the full fit divided by 1 - leverage. NaN where the other stars do not determine the polynomials.
+        Mean PSF, components and the covariance of a process are held, to which the star did contribute; only the
+        interpolation is that of the other n - 1 stars. NaN where these do not determine it.
         """
-        return self._combine(self.coefficients - self._leave_one_out_residuals())
+        return self.basis.at(self.coefficients - self.interpolation.leave_one_out(self.coefficients))
 
     @property
     def leave_one_out_rms(self) -> float:
         """Rms over stars and pixels of (stamp - :meth:`leave_one_out`), what the components cannot hold included."""
-        squares = (self._leave_one_out_residuals() ** 2).sum(axis=1) + self.unexplained
+        squares = (self.interpolation.leave_one_out(self.coefficients) ** 2).sum(axis=1) + self.unexplained
         return float(np.sqrt(squares.mean() / self.mean.size))
 
     @check_arguments
@@ -295,16 +325,12 @@ class PsfModel(PicturedModel):
             If the model has fewer components, or is one of pixels, which have no order.
         """
         k = n_components
-        if self.basis == "pixels" or not 1 <= k <= self.n_components:
-            raise ConfigError(f"n_components = {k}: expected 1 to {self.n_components} of a model of pca or shapelets")
         return replace(
             self,
-            components=self.components[:k],
+            basis=self.basis.truncated(k),
+            interpolation=self.interpolation.truncated(k),
             coefficients=self.coefficients[:, :k],
-            polynomial=self.polynomial[:, :k],
             unexplained=self.unexplained + (self.coefficients[:, k:] ** 2).sum(axis=1),
-            kernel=None if self.kernel is None else self.kernel[:k],
-            alpha=None if self.alpha is None else self.alpha[:, :k],
         )
 
     def to_hdus(self, name: str = "PSF") -> list[fits.ImageHDU | fits.BinTableHDU]:
@@ -316,7 +342,8 @@ class PsfModel(PicturedModel):
             Start of the extension names, such as the CCD's name: NAME_MEAN, NAME_EIGEN, NAME_POLY, NAME_EXTENT images
             and NAME_SPECTRUM, NAME_STARS tables.
         """
-        return model_hdus({field.name: getattr(self, field.name) for field in fields(self)}, name)
+        fit = ModelFit(self.basis, self.interpolation, self.coefficients, self.unexplained, self.rejected)
+        return model_hdus(fit, name)
 
     @classmethod
     def from_hdus(cls, hdus: Iterable[Any], name: str = "PSF") -> PsfModel:
@@ -327,7 +354,7 @@ class PsfModel(PicturedModel):
         ProductError
             If an extension or a column is missing.
         """
-        return cls(**model_fields(hdus, name))
+        return cls(*read_model(hdus, name))
 
     @check_arguments
     def write(self, path: str | Path, name: str = "PSF") -> None:
@@ -355,31 +382,3 @@ class PsfModel(PicturedModel):
             return cls.from_hdus(hdus, name)
         except ProductError as error:
             raise ProductError(str(error), file=path) from None
-
-    def _leave_one_out_residuals(self) -> np.ndarray:
-        """Return coefficient minus its prediction by the other stars, [n, k]."""
-        if self.kernel is not None:
-            points = mapped(self.positions, self.extent)
-            terms = design_matrix(self.positions, self.extent, self.order)
-            with one_blas_thread():
-                if self._kriged and self.weights is not None:
-                    return kriging.krige(points, self.coefficients, terms, self.kernel[0], 1.0 / self.weights)[2]
-                # Files of older versions have no noise of their stars, which was taken to be the same.
-                noise = np.ones(self.n_stars) if self.weights is None else 1.0 / self.weights
-                return gaussian_process.krige(points, self.coefficients, terms, self.kernel, noise)[2]
-        room = 1.0 - self.leverage
-        room = np.where(room > 1e-10, room, np.nan)
-        return (self.coefficients - self.amplitudes(self.positions)) / room[:, None]
-
-    @property
-    def _kriged(self) -> bool:
-        return self.kernel is not None and self.kernel.shape[1] >= kriging.COLUMNS
-
-    def _combine(self, amplitudes: np.ndarray) -> np.ndarray:
-        """Return mean plus amplitudes times components, one component after the other so that no batch size matters."""
-        if self.basis == "pixels":
-            return self.mean + amplitudes.reshape(-1, *self.mean.shape)
-        result = np.repeat(self.mean[None], len(amplitudes), axis=0)
-        for k, component in enumerate(self.components):
-            result += amplitudes[:, k, None, None] * component
-        return result

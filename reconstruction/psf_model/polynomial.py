@@ -22,6 +22,18 @@ def term_count(order: int) -> int:
 
 #: Highest order of a polynomial.
 MOST_ORDER = 100
+# Orders from which an automatic choice is made.
+_AUTOMATIC_ORDERS = range(5)
+#: Number of folds of stars that are held out for it; the i-th star is in fold i modulo this.
+FOLDS = 5
+# Most terms of polynomials over the stars that they are fitted to.
+_MOST_TERMS = 0.5
+
+
+def automatic_orders(n_stars: int) -> list[int]:
+    """Return the orders of polynomials that may be chosen for so many stars, ascending."""
+    fitted = n_stars - -(-n_stars // FOLDS)
+    return [order for order in _AUTOMATIC_ORDERS if order == 0 or term_count(order) <= _MOST_TERMS * fitted]
 
 
 def design_matrix(positions: Any, extent: Extent, order: int) -> np.ndarray:

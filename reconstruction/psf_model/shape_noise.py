@@ -14,8 +14,10 @@ import numpy as np
 
 from . import kriging
 
-# Passes after which the variance that a model leaves changes no more than matters, and those of the weights.
-_PASSES, _WEIGHT_PASSES = 20, 4
+# Passes after which the variance that a model leaves changes no more than matters.
+_PASSES = 20
+# ... and those of the weights.
+_WEIGHT_PASSES = 4
 # Least variance that a model leaves, over the noise of the middle star.
 _LEAST = 1e-3
 # Least part of a star's residual that is its own in a fit to all stars.
@@ -67,7 +69,7 @@ class ShapeNoise:
         for _ in range(_WEIGHT_PASSES):
             root = np.sqrt(weights)[:, None]
             q, _ = np.linalg.qr(terms * root)
-            left = numbers - q @ (q.T @ (root * numbers)) / root
+            residuals = numbers - q @ (q.T @ (root * numbers)) / root
             room = np.maximum(1.0 - (q**2).sum(axis=1), _LEAST_ROOM)
-            weights = 1.0 / (self.noise + self.model_variance(left / room[:, None]))
+            weights = 1.0 / (self.noise + self.model_variance(residuals / room[:, None]))
         return weights / weights.mean()

@@ -37,7 +37,7 @@ def fit_focal_plane(
 
 
 def _stars_of_ccd(case: Case, ccd: SimulatedCcd, observed: ObservedCcd) -> CcdStars:
-    found, electrons = observed.observation, np.minimum(observed.electrons, _ELECTRONS)
+    noisy_stars, electrons = observed.observation, np.minimum(observed.electrons, _ELECTRONS)
     x, y = ccd.exposure.positions.observed.T
     name, used = ccd.exposure.name, used_stars(case, observed)
-    return CcdStars(name, x, y, found.shapes, electrons, found.noise, found.images, used)
+    return CcdStars(name, x, y, noisy_stars.shapes, electrons, noisy_stars.noise, noisy_stars.images, used)

@@ -9,21 +9,19 @@ from itertools import product
 
 from ...core.errors import ConfigError
 from ...pipeline.config import Configuration
-from ...pipeline.resolved_values import resolved_value
-from ...reconstruction.psf_model.basis import BASES
-from ...reconstruction.psf_model.fit import COMPONENTS, ORDERS
+from ...reconstruction.psf_model.basis import COMPONENTS
 from ...reconstruction.psf_model.polynomial import term_count
+from ...reconstruction.psf_model.polynomial_fit import Polynomial
+from ...reconstruction.psf_model.recipe import BASES, DEFAULT, INTERPOLATIONS, Recipe
 
-#: Weights of the stars in the polynomials, as for :func:`~.snr_weights` (equal in the paper).
+#: Weights of the stars in the polynomials, as of a recipe (equal in the paper).
 POLYNOMIALS = ("equal", "snr", "softened")
 #: Models of the shapes on all CCDs together in place of one of each CCD, without the telescope and with it, in words.
 FOCAL_PLANE = {"no_telescope": "focal plane, no telescope", "focal_plane": "focal plane"}
 #: Signal-to-noise ratio, or stars without noise.
 NOISE_FREE = math.inf
-
-
-#: Interpolations by a process, whose order is fixed here, and their names.
-PROCESSES = {"gp": "Gaussian process", "kriging": "kriging"}
+#: Interpolations with the noise of each star, whose order is fixed here, and their names.
+PROCESSES = {name: kind.label for name, kind in INTERPOLATIONS.items() if kind.needs_noise}
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,7 @@ class Case:
 
     stars: int  #: stars of a CCD
     snr: float = 30.0  #: S/N of the faintest star; :data:`NOISE_FREE` for stars without noise
-    basis: str = "pca"  #: one of :data:`~pachon.reconstruction.psf_model.basis.BASES`; moments of a focal-plane model
+    basis: str = "pca"  #: one of :data:`~pachon.reconstruction.psf_model.recipe.BASES`; moments of a focal-plane model
     interpolation: str = "equal"  #: one of :data:`POLYNOMIALS`, :data:`PROCESSES`, :data:`FOCAL_PLANE`
     order: int = 3  #: of the polynomials, or the trend under a process
     components: int = 20  #: of the basis; 0 for pixels, which are all used
@@ -46,23 +44,36 @@ class Case:
         """Return the case as it is fitted: parameters without effect have one value."""
         if self.interpolation in FOCAL_PLANE:
             return replace(self, basis="moments", order=0, components=3)
-        components = self.components
-        if self.basis == "pca":
+        basis = BASES[self.basis]
+        components = self.components if basis.has_components else 0
+        if basis.ordered:
             components = min(components, self.stars - 1)
-        elif self.basis == "pixels":
-            components = 0
-        order = self.order if self.interpolation in POLYNOMIALS else ORDERS.get(self.interpolation, 0)
+        order = self.order if self.interpolation in POLYNOMIALS else self.recipe().interpolation.fixed_order or 0
         interpolation = self.interpolation
         if self.snr == NOISE_FREE and interpolation in POLYNOMIALS:
             interpolation = "equal"
         return replace(self, components=components, order=order, interpolation=interpolation)
 
+    @classmethod
+    def of_recipe(cls, stars: int, snr: float, recipe: Recipe) -> Case:
+        """Return the case of a recipe."""
+        keys, interpolation = recipe.keys(), recipe.interpolation
+        how = interpolation.name if interpolation.needs_noise else recipe.weights
+        return cls(stars, snr, recipe.basis.name, how, keys["order"], keys["n_components"] or 0).normalised()
+
+    def recipe(self) -> Recipe:
+        """Return the recipe of the case, with the order of the interpolation itself under a process."""
+        basis = BASES[self.basis]() if not self.components else BASES[self.basis](self.components)
+        if self.interpolation in PROCESSES:
+            return Recipe(basis, INTERPOLATIONS[self.interpolation]())
+        return Recipe(basis, Polynomial(self.order), self.interpolation)
+
     def __str__(self) -> str:
         if self.interpolation in FOCAL_PLANE:
             return FOCAL_PLANE[self.interpolation]
         how = PROCESSES.get(self.interpolation, f"order {self.order}, {self.interpolation} weights")
-        what = self.basis if self.basis == "pixels" else f"{self.components} components of {self.basis}"
-        return f"{what}, {how}"
+        description = f"{self.components} components of {self.basis}" if self.components else self.basis
+        return f"{description}, {how}"
 
 
 @dataclass(frozen=True)
@@ -82,6 +93,11 @@ class Plan:
         """Interpolations that have no order: processes on each CCD, and models of the whole focal plane."""
         return (*PROCESSES, *(FOCAL_PLANE if self.focal_plane else ()))
 
+    @property
+    def default(self) -> Case:
+        """The base's stars under the recipe where nothing is said."""
+        return Case.of_recipe(self.base.stars, self.base.snr, DEFAULT)
+
     def cases(self) -> tuple[Case, ...]:
         """Return the cases of the study, each once.
 
@@ -89,25 +105,26 @@ class Plan:
         each other have a plane: stars and order, order and components.
         """
         base = self.base
-        polynomials, others = POLYNOMIALS, self.without_polynomials
-        found: list[Case] = []
+        polynomials, without_order = POLYNOMIALS, self.without_polynomials
+        all_cases: list[Case] = []
 
         def sweep(**axes: Sequence[object]) -> None:
             for values in product(*axes.values()):
-                found.append(replace(base, **dict(zip(axes, values, strict=True))).normalised())  # type: ignore[arg-type]
+                all_cases.append(replace(base, **dict(zip(axes, values, strict=True))).normalised())  # type: ignore[arg-type]
 
         sweep(stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=polynomials, order=self.orders)
         sweep(order=self.orders, components=self.components, interpolation=polynomials)
         sweep(stars=self.stars, components=self.components, interpolation=polynomials)
         sweep(snr=(NOISE_FREE,), order=self.orders, components=self.components)
         sweep(snr=self.snrs, order=self.orders, interpolation=polynomials)
-        sweep(basis=BASES, stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=polynomials)
-        sweep(basis=BASES, order=self.orders, interpolation=polynomials)
-        sweep(basis=BASES, components=self.components, interpolation=polynomials)
-        sweep(stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=others)
-        sweep(components=self.components, interpolation=others)
-        sweep(snr=self.snrs, interpolation=others)
-        return tuple(dict.fromkeys(found))
+        sweep(basis=tuple(BASES), stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=polynomials)
+        sweep(basis=tuple(BASES), order=self.orders, interpolation=polynomials)
+        sweep(basis=tuple(BASES), components=self.components, interpolation=polynomials)
+        all_cases += [replace(self.default, stars=n, snr=snr) for n in self.stars for snr in (base.snr, NOISE_FREE)]
+        sweep(stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=without_order)
+        sweep(components=self.components, interpolation=without_order)
+        sweep(snr=self.snrs, interpolation=without_order)
+        return tuple(dict.fromkeys(all_cases))
 
 
 def make_plan(
@@ -125,14 +142,7 @@ def make_plan(
     one.
     """
     fit = config.reconstruction
-    base = Case(
-        config.stars.observed,
-        config.stars.snr_min,
-        resolved_value(fit.basis),
-        resolved_value(fit.interpolation) if fit.interpolation in PROCESSES else resolved_value(fit.weights),
-        fit.order or 0,
-        fit.components or 0,
-    )
+    base = Case.of_recipe(config.stars.observed, config.stars.snr_min, fit.psf_recipe())
 
     def values(name: str, given: Iterable[float], own: float, least: float) -> tuple[float, ...]:
         for value in (*given, own):
@@ -143,7 +153,7 @@ def make_plan(
     if draws < 1:
         raise ConfigError(f"draws = {draws}: expected at least 1")
     return Plan(
-        base.normalised(),
+        base,
         tuple(int(n) for n in values("stars", tuple(stars), base.stars, 2)),
         tuple(int(n) for n in values("orders", tuple(orders), base.order, 0)),
         tuple(int(n) for n in values("components", tuple(components), base.components or COMPONENTS, 1)),

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 
 from ...core.plotting import new_figure, png_bytes, styled
 from ...measure.focal_plane_axes import AWAY, LEFT_OUT, OBSERVED, RESIDUAL, TRUTH
-from ...reconstruction.psf_model.basis import BASES
+from ...reconstruction.psf_model.recipe import BASES
 from .plan import FOCAL_PLANE, NOISE_FREE, POLYNOMIALS, PROCESSES, Case
 from .study import Study
 
@@ -20,12 +20,11 @@ _HOW = {
     "equal": (OBSERVED, "o", "equal weights"),
     "snr": (LEFT_OUT, "s", "weights (S/N)$^2$"),
     "softened": (AWAY, "D", "softened weights"),
-    "gp": ("#2a8a57", "^", PROCESSES["gp"]),
-    "kriging": ("#7b4a1e", "X", PROCESSES["kriging"]),
+    **{name: ("#7b4a1e", "X", label) for name, label in PROCESSES.items()},
     "no_telescope": ("0.5", "P", FOCAL_PLANE["no_telescope"]),
     "focal_plane": ("#c2307f", "v", FOCAL_PLANE["focal_plane"]),
 }
-_BASIS = {"pca": (OBSERVED, "o"), "pixels": (AWAY, "s"), "shapelets": (LEFT_OUT, "D")}
+_BASIS = dict(zip(BASES, ((OBSERVED, "o"), (AWAY, "s"), (LEFT_OUT, "D")), strict=False))
 _RMS = "rms of one component of e, no star"
 # Upper limit of the axis over the base: fits with as many terms as stars diverge.
 _LIMIT = 4.0
@@ -67,7 +66,7 @@ def choices_plot(result: Study) -> bytes:
         _draw_components(panels[0, 1], result)
         _draw_bases(panels[0, 2], result)
         _draw_snrs(panels[0, 3], result)
-        for axes, key, what in (
+        for axes, key, ylabel in (
             (panels[1, 0], "rms_e_away", _RMS),
             (panels[1, 1], "rms_size_away", "rms of the relative size, no star"),
         ):
@@ -76,12 +75,14 @@ def choices_plot(result: Study) -> bytes:
                 best = [(n, c) for n in plan.stars if (c := result.best_order(n, how))]
                 text = f"{label}, best order" if how in POLYNOMIALS else label
                 _draw_line(axes, result, best, key, color, marker, text)
+            by_default = [(n, replace(plan.default, stars=n)) for n in plan.stars]
+            _draw_line(axes, result, by_default, key, RESIDUAL, "*", f"default: {plan.default}")
             paper = [(n, replace(base, stars=n)) for n in plan.stars]
             _draw_line(axes, result, paper, key, TRUTH, "x", f"{_HOW[base.interpolation][2]}, order {base.order}")
             _logarithmic_axes(
                 axes, plan.stars, "stars of a CCD", "interpolation" + (": size" if "size" in key else ": e")
             )
-            axes.set_ylabel(what)
+            axes.set_ylabel(ylabel)
         _limit_axis(panels[1, 0], result)
         _draw_common_residuals(
             panels[1, 2], result, "mean_e", "rms over CCDs of their mean of e", "what a CCD has in common"
@@ -101,11 +102,11 @@ def _draw_orders(axes: Axes, result: Study) -> None:
     """Draw the residual at the stars and at the holdout positions against the order."""
     plan, base = result.plan, result.plan.base
     cases = [(order, replace(base, order=order)) for order in plan.orders]
-    for kind, color, marker, what, where in (
+    for kind, color, marker, observed_or_truth, where in (
         ("at_stars", RESIDUAL, "D", "observed", "at the stars"),
         ("away", AWAY, "^", "truth", "no star"),
     ):
-        _draw_line(axes, result, cases, f"rms_e_{kind}", color, marker, f"{what} - model, {where}")
+        _draw_line(axes, result, cases, f"rms_e_{kind}", color, marker, f"{observed_or_truth} - model, {where}")
         _draw_line(axes, result, cases, f"noise_law_{kind}", color, "", f"noise alone, {where}, in theory", (0, (4, 2)))
     quiet = [(order, replace(c, snr=NOISE_FREE)) for order, c in cases]
     _draw_line(axes, result, quiet, "rms_e_away", TRUTH, "", "truth - model, stars without noise", _QUIET)
@@ -161,10 +162,10 @@ def _draw_bases(axes: Axes, result: Study) -> None:
 def _draw_common_residuals(axes: Axes, result: Study, key: str, label: str, title: str) -> None:
     """Draw residuals in common to a CCD, or to several, at the stars and at the holdout positions."""
     plan, base = result.plan, result.plan.base
-    other = result.best_order(base.stars, "softened")
+    softened = result.best_order(base.stars, "softened")
     ways: dict[str, tuple[Case, Any]] = {f"order {base.order}, {_HOW[base.interpolation][2]}": (base, "-")}
-    if other is not None:
-        ways[f"order {other.order}, softened weights"] = (other, (0, (4, 2)))
+    if softened is not None:
+        ways[f"order {softened.order}, softened weights"] = (softened, (0, (4, 2)))
     if plan.focal_plane:
         ways[FOCAL_PLANE["focal_plane"]] = (replace(base, interpolation="focal_plane"), _QUIET)
     for name, (way, line) in ways.items():
@@ -192,8 +193,12 @@ def _draw_line(
     linestyle: Any = "-",
 ) -> None:
     """Draw a metric of the fitted cases against their values, negative ones as open markers."""
-    rows = [(x, found) for x, case in cases if (found := result.metrics.get(case.normalised())) is not None]
-    points = np.array([(x, found[key], found.get(f"error_{key}", np.nan)) for x, found in rows]).reshape(-1, 3)
+    rows = [
+        (x, case_metrics) for x, case in cases if (case_metrics := result.metrics.get(case.normalised())) is not None
+    ]
+    points = np.array(
+        [(x, case_metrics[key], case_metrics.get(f"error_{key}", np.nan)) for x, case_metrics in rows]
+    ).reshape(-1, 3)
     # Residuals of a perfect fit are rounding errors, and are left out.
     x, value, error = points[np.isfinite(points[:, 1]) & (np.abs(points[:, 1]) > 1e-12)].T
     size = np.abs(value)
@@ -201,11 +206,19 @@ def _draw_line(
     if marker:
         # On a logarithmic scale an error bar cannot go through zero: it ends at a tenth of the value instead.
         bars = [np.minimum(error, 0.9 * size), error]
-        some = np.isfinite(error)
-        axes.errorbar(x[some], size[some], [b[some] for b in bars], fmt="none", ecolor=color, elinewidth=0.8, alpha=0.7)
-    for chosen, face in ((value > 0.0, color), (value < 0.0, "white")):
+        finite = np.isfinite(error)
+        axes.errorbar(
+            x[finite], size[finite], [b[finite] for b in bars], fmt="none", ecolor=color, elinewidth=0.8, alpha=0.7
+        )
+    for sign_mask, face in ((value > 0.0, color), (value < 0.0, "white")):
         axes.plot(
-            x[chosen], size[chosen], linestyle="", marker=marker, color=color, markersize=4.0, markerfacecolor=face
+            x[sign_mask],
+            size[sign_mask],
+            linestyle="",
+            marker=marker,
+            color=color,
+            markersize=4.0,
+            markerfacecolor=face,
         )
     axes.plot([], [], color=color, linestyle=linestyle, linewidth=1.0, marker=marker, markersize=4.0, label=label)
 

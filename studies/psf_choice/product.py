@@ -33,15 +33,16 @@ def write_study(result: Study, folder: Path, config: Configuration) -> tuple[str
 
 
 def study_summary(result: Study) -> dict[str, Any]:
-    """Return the base, the recommended case, those of the focal plane, and the best order for each number of stars."""
-    plan, chosen = result.plan, result.recommended()
+    """Return the base, default and recommended case, those of the focal plane, and the best orders."""
+    plan, best_case = result.plan, result.recommended()
     orders = {
         how: {str(n): best.order for n in plan.stars if (best := result.best_order(n, how))} for how in POLYNOMIALS
     }
     together = [best for how in FOCAL_PLANE if (best := result.best_order(plan.base.stars, how))]
     return {
         "base": _case_entry(result, plan.base),
-        "recommended": None if chosen is None else _case_entry(result, chosen),
+        "default": _case_entry(result, plan.default),
+        "recommended": None if best_case is None else _case_entry(result, best_case),
         **({"focal_plane": [_case_entry(result, case) for case in together]} if plan.focal_plane else {}),
         "best_order": orders,
         "fitted": len(result.metrics),
@@ -64,7 +65,7 @@ def study_columns(result: Study) -> Columns:
         "order": "of the polynomials",
         "components": "of the basis; 0: all pixels",
     }
-    columns = {key: (np.array([getattr(c, key) for c in cases]), "", what) for key, what in about.items()}
+    columns = {key: (np.array([getattr(c, key) for c in cases]), "", description) for key, description in about.items()}
     for key in next(iter(result.metrics.values()), {}):
         values: list[Mapping[str, float]] = [result.metrics.get(case, {}) for case in cases]
         columns[key] = (np.array([v.get(key, np.nan) for v in values]), "", _metric_description(key))
@@ -77,7 +78,7 @@ def _metric_description(key: str) -> str:
     if key.startswith("error_"):
         return "standard error over the CCDs: " + _metric_description(key.removeprefix("error_"))
     where = "observed - model, at the stars" if "at_stars" in key else "truth - model, where no star is"
-    what = {
+    descriptions = {
         "rms_e": "rms of one component of e",
         "rms_size": "rms of the relative size",
         "mean_e": "rms over CCDs of their mean of one component of e",
@@ -88,4 +89,4 @@ def _metric_description(key: str) -> str:
         low, high = SEPARATION_RANGES["long"]
         span = f"below {low:g}" if key.endswith("short") else f"{low:g} to {high:g}"
         return f"xi+ {span} arcmin, {where}"
-    return next(f"{words}, {where}" for start, words in what.items() if key.startswith(start))
+    return next(f"{words}, {where}" for start, words in descriptions.items() if key.startswith(start))

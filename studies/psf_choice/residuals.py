@@ -53,7 +53,7 @@ def measure_residuals(
     fields: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     law = np.full((len(ccds), 2), np.nan)
     for i, (ccd, stars, model) in enumerate(zip(ccds, observed, models, strict=True)):
-        if isinstance(model, PsfModel) and case.basis == "pca":
+        if isinstance(model, PsfModel) and model.basis.kind.ordered:
             model = model.truncated(min(case.components, model.n_components))
         used = used_stars(case, stars)
         exposure, places = ccd.exposure, ccd.exposure.positions
@@ -66,16 +66,20 @@ def measure_residuals(
             ),
             (places.holdout, ccd.holdout, exposure.holdout, np.ones(len(places.holdout), dtype=bool)),
         )
-        for k, (at, shapes, exposed, chosen) in enumerate(jobs):
-            found: Shapes | PsfShapes
+        for k, (at, shapes, exposed, star_mask) in enumerate(jobs):
+            model_shapes: Shapes | PsfShapes
             if isinstance(model, PsfModel):
-                found = measure_shapes(model.at(at), exposed.pixel_scale, experiment.weight_fwhm)
+                model_shapes = measure_shapes(model.at(at), exposed.pixel_scale, experiment.weight_fwhm)
             else:
-                found = model.shapes(exposure.name, *at.T, threads=threads)
-            if not np.isfinite(found.e1).any():
+                model_shapes = model.shapes(exposure.name, *at.T, threads=threads)
+            if not np.isfinite(model_shapes.e1).any():
                 raise DomainError(f"CCD {exposure.name}: the model has no shape anywhere")
-            residuals[k].append(np.stack([shapes.e1 - found.e1, shapes.e2 - found.e2, shapes.size / found.size - 1.0]))
-            fields[k].append(exposed.fields[chosen])
+            residuals[k].append(
+                np.stack(
+                    [shapes.e1 - model_shapes.e1, shapes.e2 - model_shapes.e2, shapes.size / model_shapes.size - 1.0]
+                )
+            )
+            fields[k].append(exposed.fields[star_mask])
         if isinstance(model, PsfModel) and case.interpolation in POLYNOMIALS:
             law[i] = noise_law(
                 places.observed[used], places.holdout, stars.variance[used], model.weights, case.order, model.extent
@@ -100,22 +104,22 @@ def residual_correlations(fields: list[np.ndarray], residuals: list[np.ndarray])
     x, y = np.concatenate(fields).T
     e = np.concatenate(residuals, axis=1)[:2]
     patch = np.repeat(np.arange(len(fields)), [len(f) for f in fields])
-    found = shear_correlation(x, y, *e, **_BINS, patch=patch)
-    return found.xi_plus, found.leave_one_out_plus
+    correlation = shear_correlation(x, y, *e, **_BINS, patch=patch)
+    return correlation.xi_plus, correlation.leave_one_out_plus
 
 
 def case_metrics(samples: Sequence[Residuals]) -> dict[str, float]:
     """Return the metrics of a case from its draws; see :class:`~pachon.studies.psf_choice.study.Study`."""
-    square, mean, law, xi, left = (
+    square, mean, law, xi, xi_without = (
         np.stack([getattr(s, key) for s in samples]) for key in ("square", "mean", "law", "xi", "xi_left")
     )
     result: dict[str, float] = {}
 
     def root(name: str, squares: np.ndarray) -> None:
         # Mean squares [n_draw, n_ccd]: the draws of a CCD share its PSF, so the CCDs give the error.
-        each = squares.mean(axis=0)
-        result[name] = value = float(np.sqrt(each.mean()))
-        error = each.std(ddof=1) / np.sqrt(len(each)) if len(each) > 1 else np.nan
+        ccd_squares = squares.mean(axis=0)
+        result[name] = value = float(np.sqrt(ccd_squares.mean()))
+        error = ccd_squares.std(ddof=1) / np.sqrt(len(ccd_squares)) if len(ccd_squares) > 1 else np.nan
         result[f"error_{name}"] = float(0.5 * error / value) if value > 0.0 else np.nan
 
     for k, kind in enumerate(KINDS):
@@ -125,7 +129,7 @@ def case_metrics(samples: Sequence[Residuals]) -> dict[str, float]:
         result[f"noise_law_{kind}"] = float(np.sqrt(law[:, :, k].mean()))
         for b, name in enumerate(SEPARATION_RANGES):
             result[f"xi_plus_{kind}_{name}"] = float(xi[:, k, b].mean())
-            result[f"error_xi_plus_{kind}_{name}"] = float(jackknife_error(left[:, k, :, b].mean(axis=0)))
+            result[f"error_xi_plus_{kind}_{name}"] = float(jackknife_error(xi_without[:, k, :, b].mean(axis=0)))
     result["lost"] = float(sum(s.lost for s in samples))
     return result
 

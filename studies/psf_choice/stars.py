@@ -22,9 +22,8 @@ from ...pipeline.simulate.photometry import (
     sky_electrons_per_pixel,
 )
 from ...pipeline.simulate.star_field import make_star_field
-from ...reconstruction.psf_model.checks import snr_weights
 from ...reconstruction.psf_model.model import CLIP_SIGMA, PsfModel
-from .plan import NOISE_FREE, PROCESSES, Case
+from .plan import NOISE_FREE, Case
 
 
 @dataclass(frozen=True)
@@ -95,30 +94,30 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
     electrons = stars.electrons * light
     collected = collected_images(experiment, exposed.image, exposed.pixel_scale, electrons)
     images = observe_stamps(collected, electrons, sky, instrument_noise(places.band, places.exposure), rng)
-    found = _centered_and_measured(experiment, ccd.exposure, images)
+    observation = _centered_and_measured(experiment, ccd.exposure, images)
     snr = signal_to_noise(stars.magnitude - 2.5 * np.log10(light), places.band, places.exposure, width)
     # The noise of e is proportional to 1/(S/N); the factor is that of all stars together.
-    noise = np.stack([found.shapes.e1 - ccd.noise_free.shapes.e1, found.shapes.e2 - ccd.noise_free.shapes.e2])
-    return ObservedCcd(found, electrons, snr, np.mean((noise * snr)[:, found.used] ** 2) / snr**2)
+    noise = np.stack(
+        [observation.shapes.e1 - ccd.noise_free.shapes.e1, observation.shapes.e2 - ccd.noise_free.shapes.e2]
+    )
+    return ObservedCcd(observation, electrons, snr, np.mean((noise * snr)[:, observation.used] ** 2) / snr**2)
 
 
 def fit(case: Case, ccd: SimulatedCcd, observed: ObservedCcd) -> PsfModel:
     """Fit the PSF model of a case to the first stars of a CCD."""
     used = used_stars(case, observed)
-    process = case.interpolation in PROCESSES
+    recipe = case.recipe()
     images = observed.observation.images[used]
-    photons = process and case.snr != NOISE_FREE
+    photons = recipe.interpolation.needs_noise and case.snr != NOISE_FREE
     if photons:
         images = images * observed.electrons[used, None, None]
     return PsfModel.fit(
         images,
         ccd.exposure.positions.observed[used],
-        basis=case.basis,  # type: ignore[arg-type]
-        interpolation=case.interpolation if process else "polynomial",  # type: ignore[arg-type]
-        weights=None if process else snr_weights(case.interpolation, observed.snr[used]),
+        recipe=recipe,
         # A star that is not usable costs one principal component.
-        n_components=min(case.components, used.sum() - 1) if case.basis == "pca" else case.components or None,
-        order=case.order,
+        n_components=min(case.components, int(used.sum()) - 1) if recipe.basis.ordered else None,
+        weights=recipe.star_weights(observed.snr[used]),
         gain=1.0 if photons else None,
         extent=ccd.exposure.positions.extent,
         clip_sigma=None if case.snr == NOISE_FREE else CLIP_SIGMA,  # without noise there are no outliers

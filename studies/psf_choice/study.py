@@ -23,8 +23,9 @@ from ...pipeline.memory import check_memory
 from ...pipeline.resolved_values import require_drawn_stars
 from ...reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ...reconstruction.psf_model.model import PsfModel
+from ...reconstruction.psf_model.recipe import BASES
 from .focal_plane import fit_focal_plane
-from .plan import FOCAL_PLANE, NOISE_FREE, PROCESSES, Case, Plan
+from .plan import FOCAL_PLANE, NOISE_FREE, Case, Plan
 from .residuals import Residuals, case_metrics, measure_residuals
 from .stars import ObservedCcd, SimulatedCcd, fit, observe, simulate
 
@@ -106,27 +107,27 @@ def study(config: Configuration, plan: Plan, *, threads: int | None = None, repo
     total, done = sum(n_draws.values()), 0
     with reporter.stage(f"{len(cases)} ways to model", total=total) as stage:
         for snr in sorted({case.snr for case in cases}):
-            wanted = [case for case in cases if case.snr == snr]
-            for draw in range(n_draws[wanted[0]]):
+            snr_cases = [case for case in cases if case.snr == snr]
+            for draw in range(n_draws[snr_cases[0]]):
                 observed = [observe(experiment, ccd, snr, draw) for ccd in ccds]
                 # Principal components do not depend on how many are kept: one fit for all of these numbers.
-                for _, group in groupby(sorted(wanted, key=_fit_key), key=_fit_key):
+                for _, group in groupby(sorted(snr_cases, key=_fit_key), key=_fit_key):
                     together = list(group)
                     try:
                         models = _models_of_ccds(together[-1], experiment, ccds, observed, threads)
                         for case in together:
-                            found = measure_residuals(experiment, case, ccds, observed, models, threads)
-                            samples[case].append(found)
+                            residuals = measure_residuals(experiment, case, ccds, observed, models, threads)
+                            samples[case].append(residuals)
                     except PachonError as error:
                         problems |= dict.fromkeys(together, str(error))
                     stage.advance(len(together))
-                done += len(wanted)
+                done += len(snr_cases)
                 stage.step(f"S/N {snr:g}, noise {draw + 1}", done, total)
-    made = [case for case in cases if case not in problems]
-    if not made:
+    fitted_cases = [case for case in cases if case not in problems]
+    if not fitted_cases:
         raise DomainError(f"no model could be fitted: {problems[cases[0]]}")
-    metrics = {case: case_metrics(samples[case]) for case in made}
-    squares = {case: np.mean([s.square[:, 1] @ (2.0, 1.0) for s in samples[case]], axis=0) for case in made}
+    metrics = {case: case_metrics(samples[case]) for case in fitted_cases}
+    squares = {case: np.mean([s.square[:, 1] @ (2.0, 1.0) for s in samples[case]], axis=0) for case in fitted_cases}
     return Study(plan, metrics, {case: problems[case] for case in cases if case in problems}, squares)
 
 
@@ -145,12 +146,12 @@ def _models_of_ccds(
 
 def _fit_key(case: Case) -> tuple[Any, ...]:
     """Return the sort key of a case: cases of one fit are adjacent, by their number of principal components."""
-    shared = case.basis == "pca"
+    shared = case.basis in BASES and BASES[case.basis].ordered
     return (case.basis, case.interpolation, case.order, case.stars, 0 if shared else case.components)
 
 
 def _complexity_key(case: Case) -> tuple[int, int]:
     """Return the sort key of a case: focal-plane models last, then the number of free parameters."""
-    components = case.components or 10**6
-    last = 1 + [*FOCAL_PLANE].index(case.interpolation) if case.interpolation in FOCAL_PLANE else 0
-    return last, components * (case.stars if case.interpolation in PROCESSES else case.terms)
+    if case.interpolation in FOCAL_PLANE:
+        return 1 + [*FOCAL_PLANE].index(case.interpolation), case.components * case.terms
+    return 0, (case.components or 10**6) * case.recipe().interpolation.parameter_count(case.stars)

@@ -176,7 +176,7 @@ class Bench:
             "run__seed": self.seed,
             "run__atmosphere__screen_size": self.scale.screen_size,
             "run__atmosphere__time_step_s": self.scale.time_step,
-            "run__reconstruction__basis": "pca",
+            "run__reconstruction__recipe": "paper",
             "visits__count": self.scale.visits,
             "visits__stars": stars,
             "visits__places": places,
@@ -201,7 +201,7 @@ class Bench:
             "stars__observed": self.scale.observed,
             "atmosphere__screen_size": self.scale.screen_size,
             "atmosphere__time_step_s": self.scale.time_step,
-            "reconstruction__basis": "pca",
+            "reconstruction__recipe": "paper",
         }
         experiment = Experiment.from_config(with_options(Configuration(), **options))
         names = experiment.config.ccds or ()

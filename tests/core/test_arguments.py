@@ -186,7 +186,7 @@ def test_masked_stars_and_pixels():
     assert shapes.flags[1] != 0
     np.testing.assert_array_equal(shapes.e1[[0, 2]], right.e1[[0, 2]])
     with pytest.raises(DomainError, match=r"stamps\[1\] has pixels that are not finite"):
-        pachon.PsfModel.fit(masked, [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], order=0)
+        pachon.PsfModel.fit(masked, [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], recipe="paper", order=0)
 
 
 def test_checked_classes_stay_themselves():

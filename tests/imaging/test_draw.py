@@ -153,10 +153,10 @@ def test_psf_and_lit_fraction_are_those_of_the_place(psf, gaussian, psf_covarian
 
 
 @pytest.mark.long
-def test_gaussian_processes_interpolate_too(gaussian, psf_covariance):
+def test_kriging_interpolates_too(gaussian, psf_covariance):
     places = np.random.default_rng(3).uniform(0, 4096, (40, 2))
     stamps = np.stack([gaussian(21, psf_covariance(place)) for place in places])
-    field = PsfField.fit(stamps, places, 4096, interpolation="gp", n_components=6)
+    field = PsfField.fit(stamps, places, 4096, interpolation="kriging", n_components=6)
     place = (2000.0, 2000.0)
     spectrum = np.einsum("k,kij->ij", field.amplitudes(place)[0], field.transforms(21))
     assert np.abs(np.fft.irfft2(spectrum, s=(21, 21)) - gaussian(21, psf_covariance(place))).max() < 1e-4

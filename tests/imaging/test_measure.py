@@ -75,7 +75,7 @@ def focal_plane_psf(image):
 def catalogues(image, catalogue, focal_plane_psf):
     return {
         "kriging": catalogue,
-        "paper": measure_image(image, basis="pca", order=1, threads=1),
+        "paper": measure_image(image, recipe="paper", order=1, threads=1),
         "focal plane": measure_image(image, psf=focal_plane_psf, threads=1),
     }
 

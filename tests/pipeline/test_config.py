@@ -86,7 +86,10 @@ def test_numbers_without_a_point_are_numbers(tmp_path):
             {"stars__truth": 15, "reconstruction__basis": "pca"},
             ["reconstruction.components = 20", "at most 14", "stars.truth = 15"],
         ),
-        ({"reconstruction__order": 8}, ["reconstruction.order = 8", "45 terms", "stars.observed = 40"]),
+        (
+            {"reconstruction__interpolation": "polynomial", "reconstruction__order": 8},
+            ["reconstruction.order = 8", "45 terms", "stars.observed = 40"],
+        ),
         ({"psf__stamp": 30}, ["psf.stamp = 30", "odd"]),
         ({"wavelengths_nm": (2000.0,)}, ["wavelengths_nm[0] = 2000", "300 to 1200"]),
         ({"wavelengths_nm": ()}, ["wavelengths_nm = []"]),

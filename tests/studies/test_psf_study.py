@@ -203,7 +203,9 @@ def test_plan_of_a_configuration(tiny):
     assert all(c.components < c.stars for c in cases if c.basis == "pca")
     other = tiny(reconstruction__basis="pixels", reconstruction__components=None, reconstruction__weights="softened")
     assert make_plan(other, components=(8,)).base == Case(12, 30.0, "pixels", "softened", 1, 0)
-    assert make_plan(tiny(reconstruction__interpolation="gp")).base.interpolation == "gp"
+    assert make_plan(tiny(reconstruction__interpolation="kriging")).base.interpolation == "kriging"
+    assert plan.default == Case(12, 30.0, "pixels", "kriging", 4, 0)
+    assert {replace(plan.default, stars=n) for n in plan.stars} < set(cases)
     for options in ({"stars": (1,)}, {"orders": (-1,)}, {"components": (0,)}, {"snrs": (np.inf,)}, {"draws": 0}):
         with pytest.raises(ConfigError, match=next(iter(options)).removesuffix("s")):
             make_plan(tiny(), **options)

@@ -15,6 +15,7 @@ from pachon.pipeline.simulate.ccd_exposure import expose_ccd, expose_centered
 from pachon.pipeline.simulate.ccd_model import model_ccd
 from pachon.pipeline.simulate.ccd_observation import observe_ccd
 from pachon.reconstruction.psf_model.checks import snr_weights
+from pachon.reconstruction.psf_model.recipe import Recipe
 
 NAME = "R22_S11"
 N = 40
@@ -102,7 +103,7 @@ def test_a_ccd_all_of_whose_stars_are_rejected_is_one_line(experiment, exposure)
         ({"reconstruction__basis": "shapelets", "reconstruction__components": 12}, "shapelets", 12, "equal"),
         ({"reconstruction__weights": "snr"}, "pca", 4, "snr"),
         ({"reconstruction__weights": "softened"}, "pca", 4, "softened"),
-        ({"reconstruction__interpolation": "gp"}, "pca", 4, "equal"),
+        ({"reconstruction__interpolation": "kriging"}, "pca", 4, "equal"),
         (None, "pixels", 961, None),
     ],
 )
@@ -123,9 +124,10 @@ def test_the_configuration_chooses_the_model(experiment, exposure, plain, option
         chosen = configured(experiment, stars__truth=60, **options)
     product = model_ccd(chosen, exposure)
     model = product.model
-    assert (model.basis, model.n_components, model.order) == (basis, components, 4 if options is None else 1)
-    assert (model.kernel is not None) == (options is None or "reconstruction__interpolation" in options)
-    if model.kernel is not None:
+    assert (model.basis.name, model.n_components, model.order) == (basis, components, 4 if options is None else 1)
+    kriged = options is None or "reconstruction__interpolation" in options
+    assert model.interpolation.kind.needs_noise == kriged
+    if kriged:
         # A process weighs stars by their own noise, of which a bright one has less.
         assert np.corrcoef(np.log(model.weights), np.log(product.observed.snr))[0, 1] > 0.95
     else:
@@ -135,7 +137,7 @@ def test_the_configuration_chooses_the_model(experiment, exposure, plain, option
             np.testing.assert_array_equal(model.weights, expected)
     assert not np.array_equal(product.holdout.model_e1, plain.holdout.model_e1)
     # The noise-free PSFs are described by principal components all the same.
-    assert product.noise_free_model.basis == "pca"
+    assert product.noise_free_model.basis.name == "pca"
     # Another description of the same stars is about as good.
     assert np.isfinite(product.observed.leave_one_out_e1).all()
     assert np.std(product.holdout.residual_e1) < 3.0 * np.std(plain.holdout.residual_e1)
@@ -154,7 +156,9 @@ def test_weights_are_between_equal_and_inverse_variance():
     ("options", "message"),
     [
         ({"basis": "pixels", "components": 20}, "components = 20: expected null with basis = pixels"),
-        ({"interpolation": "gp", "weights": "snr"}, "weights = snr: expected equal with interpolation = gp"),
+        ({"interpolation": "kriging", "weights": "snr"}, "weights = snr: expected equal with interpolation = kriging"),
+        ({"interpolation": "gp"}, 'interpolation = "gp": expected one of polynomial, kriging, which replaced gp'),
+        ({"recipe": "best"}, 'reconstruction.recipe = "best": expected one of kriging, paper'),
         ({"basis": "shapelet"}, 'reconstruction.basis = "shapelet": expected one of pca, pixels, shapelets'),
         ({"components": 40}, "components = 40: expected at most 39, one less than stars.observed = 40"),
     ],
@@ -164,28 +168,62 @@ def test_models_that_cannot_be_are_one_line(tiny, options, message):
         tiny(stars__observed=N, stars__truth=100, **{f"reconstruction__{key}": v for key, v in options.items()})
 
 
-def test_defaults_follow_basis_and_interpolation(tiny):
-    config = tiny()
-    fresh = type(config)(**{"reconstruction": {"interpolation": "gp"}})
-    assert Experiment.from_config(fresh).config.reconstruction.order == 0
-    assert Experiment.from_config(fresh).config.reconstruction.components == 20
-    assert (
-        Experiment.from_config(type(config)(**{"reconstruction": {"basis": "pixels"}})).config.reconstruction.components
-        is None
-    )
-    # Nothing given: kriging of pixels. Any key of the paper's way brings the others.
-    by_default = Experiment.from_config(type(config)()).config.reconstruction
-    assert (by_default.basis, by_default.interpolation, by_default.weights) == ("pixels", "kriging", "equal")
-    assert (by_default.components, by_default.order) == (None, 4)
-    paper = {"basis": "pca", "components": 20, "interpolation": "polynomial", "weights": "equal", "order": 3}
-    for key, value in paper.items():
-        found = Experiment.from_config(type(config)(**{"reconstruction": {key: value}})).config.reconstruction
-        assert found.model_dump(include=set(paper)) == paper
-    pinned = with_paper_model(type(config)())
-    assert Experiment.from_config(pinned).config.reconstruction.model_dump(include=set(paper)) == paper
-    assert with_paper_model(fresh) is fresh
+KEYS = ("basis", "components", "interpolation", "weights", "order")
+KRIGING = {"basis": "pixels", "components": None, "interpolation": "kriging", "weights": "equal", "order": 4}
+PAPER = {"basis": "pca", "components": 20, "interpolation": "polynomial", "weights": "equal", "order": 3}
+
+
+@pytest.mark.parametrize(("recipe", "keys"), [(None, KRIGING), ("kriging", KRIGING), ("paper", PAPER)])
+def test_stating_a_default_changes_no_byte_and_another_value_that_key_alone(tiny, recipe, keys):
+    kind = type(tiny())
+
+    def resolved(**given):
+        given |= {} if recipe is None else {"recipe": recipe}
+        return Experiment.from_config(kind(**{"reconstruction": given}))
+
+    nothing = resolved()
+    assert nothing.config.reconstruction.model_dump(include=set(KEYS)) == keys
+    assert "recipe" not in nothing.config.as_dict()["reconstruction"]
+    for key, value in keys.items():
+        stated = resolved(**{key: value})
+        assert stated.config.as_dict() == nothing.config.as_dict()
+        assert stated.config_hash == nothing.config_hash
+    others = {"order": 2, "basis": "shapelets", "interpolation": "polynomial" if keys is KRIGING else "kriging"}
+    if keys is PAPER:
+        others |= {"components": 7, "weights": "snr"}
+    for key, value in others.items():
+        # Another basis or interpolation has options of its own.
+        follow = {"basis": {"components": 20}, "interpolation": {"order": 3 if keys is KRIGING else 4}}.get(key, {})
+        changed = resolved(**{key: value}).config.reconstruction
+        assert changed.model_dump(include=set(KEYS)) == {**keys, key: value, **follow}
+        again = Experiment.from_config(kind(**{"reconstruction": changed.model_dump()})).config.reconstruction
+        assert again == changed
+
+
+def test_python_and_configuration_have_one_recipe(tiny):
+    kind = type(tiny())
+    for given in ({}, {"basis": "pca"}, {"order": 2}, {"interpolation": "polynomial"}, {"recipe": "paper", "order": 1}):
+        assert Experiment.from_config(kind(**{"reconstruction": given})).config.reconstruction.psf_recipe() == (
+            Recipe.of(**given)
+        )
+
+
+def test_components_which_pixels_lack_are_those_of_the_paper(tiny):
+    found = Experiment.from_config(type(tiny())(**{"reconstruction": {"components": 7}})).config.reconstruction
+    assert found.model_dump(include=set(KEYS)) == PAPER | {"components": 7}
+    assert Recipe.of(n_components=7, order=2).keys() == Recipe.of("paper", n_components=7, order=2).keys()
+    # With a basis of its own nothing else changes.
+    assert Recipe.of(basis="pca", n_components=7).interpolation == Recipe.of().interpolation
+
+
+def test_the_paper_takes_the_place_of_no_model_alone(tiny):
+    kind = type(tiny())
+    pinned = with_paper_model(kind())
+    assert Experiment.from_config(pinned).config.reconstruction.model_dump(include=set(PAPER)) == PAPER
+    chosen = kind(**{"reconstruction": {"interpolation": "polynomial"}})
+    assert with_paper_model(chosen) is chosen
     # Twelve PSFs have eleven components about their mean.
-    few = with_paper_model(type(config)(**{"stars": {"truth": 16, "observed": 12}}))
+    few = with_paper_model(kind(**{"stars": {"truth": 16, "observed": 12}}))
     assert Experiment.from_config(few).config.reconstruction.components == 11
 
 

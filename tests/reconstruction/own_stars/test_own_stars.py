@@ -90,7 +90,7 @@ def test_the_parts_held_out_are_those_of_the_seed(stars, own):
     assert np.array_equal(other.model.at((5.0, 5.0)), one.model.at((5.0, 5.0)))
     assert not np.array_equal(other.predicted, one.predicted)
     assert (one.kind, own.kind) == ("given", "kriging of pixels")
-    assert (one.model.order, one.model.kernel) == (1, None)
+    assert (one.model.order, one.model.interpolation.name) == (1, "polynomial")
 
 
 def predictions(residuals):

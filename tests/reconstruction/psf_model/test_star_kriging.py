@@ -59,7 +59,9 @@ def test_it_is_near_to_the_best_of_all_choices_of_polynomials(count, rough):
         softened = 1.0 / (electrons**-2.0 + (30.0 * 22.0 * 5.0) ** -2.0)
         errors = [
             error(PsfModel.fit(stars, places, **by_hand, weights=weights).at(elsewhere), truth)
-            for by_hand in ({"basis": "pixels", "order": order, "extent": EXTENT} for order in range(4))
+            for by_hand in (
+                {"recipe": "paper", "basis": "pixels", "order": order, "extent": EXTENT} for order in range(4)
+            )
             for weights in (None, electrons**2, softened)
             if (by_hand["order"] + 1) * (by_hand["order"] + 2) // 2 < count
         ]
@@ -132,7 +134,7 @@ def fitted():
 
 def test_trend_and_process_are_those_of_one_large_gaussian(fitted):
     model, _, elsewhere = fitted
-    variance, length, floor, *trend = model.kernel[0]
+    variance, length, floor, *trend = model.interpolation.kernel
     assert len(trend) == 4
     prior = np.diag(np.repeat([1e4, *trend], [1, 2, 3, 4, 5]))
     at_stars, there = (design_matrix(p, EXTENT, 4) for p in (model.positions, elsewhere))

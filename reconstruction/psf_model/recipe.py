@@ -1,0 +1,142 @@
+"""Recipes of PSF models: a basis, an interpolation and weights of the stars; the tables of all kinds by name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+
+from ...core.errors import ConfigError
+from .basis import Basis
+from .checks import snr_weights
+from .interpolation import FittedInterpolation, Interpolation
+from .kriging import Kriging
+from .pixels import Pixels
+from .polynomial_fit import Polynomial
+from .principal_components import PrincipalComponents
+from .retired_process import FittedGaussianProcess
+from .shapelets import Shapelets
+
+_Kind = TypeVar("_Kind", Basis, Interpolation)
+
+#: Kinds of bases and interpolations by name. A new kind is its file and its entry here.
+BASES: dict[str, type[Basis]] = {kind.name: kind for kind in (PrincipalComponents, Pixels, Shapelets)}
+INTERPOLATIONS: dict[str, type[Interpolation]] = {kind.name: kind for kind in (Polynomial, Kriging)}
+#: Interpolations in FITS files, retired ones too.
+FITTED_INTERPOLATIONS: tuple[type[FittedInterpolation], ...] = (
+    *(kind.fitted for kind in INTERPOLATIONS.values()),
+    FittedGaussianProcess,
+)
+#: Names of weights of the stars: equal, by S/N (:func:`~.checks.snr_weights`), or by noise (:mod:`~.shape_noise`).
+WEIGHTS = ("equal", "snr", "softened", "noise")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a PSF model is made of stars: its basis, its interpolation over the CCD, and weights of the stars.
+
+    Parameters
+    ----------
+    basis : Basis
+        What stars are described in, with its options.
+    interpolation : Interpolation
+        Between the stars, with its options.
+    weights : str
+        Of the stars in polynomials, one of :data:`WEIGHTS`.
+    """
+
+    basis: Basis
+    interpolation: Interpolation
+    weights: str = "equal"
+
+    def __post_init__(self) -> None:
+        if self.weights not in WEIGHTS:
+            raise ConfigError(f"weights = {self.weights!r}: expected one of {', '.join(WEIGHTS)}")
+        if self.interpolation.needs_noise and self.weights != "equal":
+            raise ConfigError(
+                f"weights = {self.weights}: expected equal with interpolation = {self.interpolation.name}"
+            )
+
+    @classmethod
+    def of(cls, recipe: str | Recipe | None = None, **keys: Any) -> Recipe:
+        """Return a recipe or the one of a name, by default :data:`DEFAULT`, with some of its keys changed.
+
+        With `n_components` but neither recipe nor basis it is the paper's, since pixels have none to choose. Keys are
+        those of :meth:`changed`. ConfigError for a name that is none.
+        """
+        if recipe is None and keys.get("basis") is None and keys.get("n_components") is not None:
+            recipe = "paper"
+        if isinstance(recipe, str):
+            if recipe not in RECIPES:
+                raise ConfigError(f"recipe = {recipe!r}: expected one of {', '.join(RECIPES)}")
+            recipe = RECIPES[recipe]
+        return (DEFAULT if recipe is None else recipe).changed(**keys)
+
+    def changed(
+        self,
+        *,
+        basis: str | Basis | None = None,
+        interpolation: str | Interpolation | None = None,
+        weights: str | None = None,
+        n_components: Any = None,
+        scale: float | None = None,
+        order: Any = None,
+    ) -> Recipe:
+        """Return the recipe with those keys changed that are given, and no others.
+
+        Another kind of basis or interpolation comes with its own number of components, scale or order. ConfigError if
+        a basis has no such option.
+        """
+        new_basis = _of_kind(self.basis, "basis", basis, BASES)
+        if scale is not None and "scale" not in {field.name for field in fields(new_basis)}:
+            raise ConfigError(f"scale = {scale}: expected a positive number of pixels, for shapelets only")
+        options = {"n_components": n_components, "scale": scale}
+        new_interpolation = _of_kind(self.interpolation, "interpolation", interpolation, INTERPOLATIONS)
+        return Recipe(
+            replace(new_basis, **{key: value for key, value in options.items() if value is not None}),
+            new_interpolation if order is None else replace(new_interpolation, order=order),
+            self.weights if weights is None else weights,
+        )
+
+    def keys(self) -> dict[str, Any]:
+        """Return the recipe as keys and plain values."""
+        basis = {field.name: getattr(self.basis, field.name) for field in fields(self.basis)}
+        return {
+            "basis": self.basis.name,
+            **basis,
+            "interpolation": self.interpolation.name,
+            "order": self.interpolation.order,
+            "weights": self.weights,
+        }
+
+    def star_weights(self, snr: np.ndarray | None = None) -> np.ndarray | Literal["noise"] | None:
+        """Return the weights of stars for :meth:`~.PsfModel.fit` from their S/N [n]; ConfigError where it is needed."""
+        if self.weights == "noise":
+            return "noise"
+        if snr is None and self.weights != "equal":
+            raise ConfigError(f"weights = {self.weights!r}: expected equal, noise, or those of the stars' S/N")
+        return None if snr is None else snr_weights(self.weights, snr)
+
+
+#: The recipe where nothing is said: the best that knows nothing of the PSF (docs/psf_models.md).
+DEFAULT = Recipe(Pixels(), Kriging())
+#: Recipes by name; ``paper`` is that of Jee & Tyson 2011, sec. 3.
+RECIPES = {"kriging": DEFAULT, "paper": Recipe(PrincipalComponents(), Polynomial())}
+
+
+def _of_kind(present: _Kind, key: str, name: str | _Kind | None, table: dict[str, type[_Kind]]) -> _Kind:
+    """Return what is present where it is of that name, else the kind of the name with its own options."""
+    if name is None or name == present.name:
+        return present
+    if not isinstance(name, str):
+        return name
+    if name not in table:
+        raise ConfigError(f"{key} = {name!r}: expected {names_of(table, name)}")
+    return table[name]()
+
+
+def names_of(table: dict[str, Any], name: object = None) -> str:
+    """Return the names of a table in words, with what replaced a retired one."""
+    replaced = ", which replaced gp" if name == FittedGaussianProcess.kind.name else ""
+    return f"one of {', '.join(table)}{replaced}"
