@@ -82,7 +82,7 @@ def run_command(
         print_json(result.summary if result.report else part_summary)
     elif not quiet:
         if result.report:
-            _show_run(result, sum(execution.reporter.seconds.values()))
+            _show_run(result, result.report, sum(execution.reporter.seconds.values()))
         else:
             _show_part(result)
 
@@ -105,7 +105,7 @@ def _show_part(result: RunResult) -> None:
     print_line("the last part to end writes the report")
 
 
-def _show_run(result: RunResult, seconds: float) -> None:
+def _show_run(result: RunResult, report: Path, seconds: float) -> None:
     from ..pipeline.report.tables import (
         MODELS_CAPTION,
         MODELS_COLUMNS,
@@ -133,4 +133,4 @@ def _show_run(result: RunResult, seconds: float) -> None:
     console.print(f"\n{len(result.computed)} CCDs computed, {len(result.kept)} kept, {seconds:.0f} s")
     if result.not_modelled:
         console.print(f"left out, not to be modelled: {', '.join(result.not_modelled)}", style="bold")
-    print_line(f"report: {result.report.resolve()}")
+    print_line(f"report: {report.resolve()}")

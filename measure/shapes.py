@@ -162,7 +162,7 @@ def measure_shapes(
     ]
     if not parts:
         no_values = np.empty(0)
-        return Shapes(*[no_values] * 6, np.empty(0, dtype=np.int32))
+        return Shapes(no_values, no_values, no_values, no_values, no_values, no_values, np.empty(0, dtype=np.int32))
     return Shapes(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Shapes)})
 
 

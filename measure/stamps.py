@@ -12,7 +12,7 @@ from ..core.units import real_array
 
 def observe_stamps(
     psf_images: ArrayLike,
-    electrons: ArrayLike,
+    electrons: float | np.ndarray,
     sky: float,
     read_noise: float,
     rng: np.random.Generator,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,7 +27,7 @@ class FitsData:
     """Images of a figure as FITS extensions, with cards for the primary header."""
 
     hdus: list[fits.ImageHDU | fits.BinTableHDU]
-    cards: list[Card] = field(default_factory=list)
+    cards: Sequence[Card] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
