@@ -71,7 +71,7 @@ def stack_images(
     # Before the settings are written, so that others can be tried.
     _check_memory(stack, threads, 1)
     _check_room(stack)
-    claim_stack(stack.folder, settings, resume=execution.resume)
+    claim_stack(stack.folder, stack.settings, resume=execution.resume)
     plan = stack.plan
     sums = {tile: _sums_so_far(stack, tile, execution.resume) for tile in stack.tiles}
     done = min(s.visits for s in sums.values())
