@@ -174,4 +174,6 @@ def measure_files(
     if left_out and len(left_out) == len(images):
         name, reason = next(iter(left_out.items()))
         raise DomainError(reason if len(images) == 1 else f"no image can be measured; {name}: {reason}")
-    return MeasuredFiles({name: found for name, found in metrics.items() if found is not None}, left_out)
+    return MeasuredFiles(
+        {name: image_metrics for name, image_metrics in metrics.items() if image_metrics is not None}, left_out
+    )

@@ -11,12 +11,15 @@ from .experiment import Experiment
 from .resolved_values import resolved_value
 
 # Measured on runs of 0.5 to 2.6 GB (both engines, screens of 512 to 8192, 140 to 8000 stars on a CCD): the estimate is
-# 3 to 18 % above the peak. Python with its libraries and kernels while PSFs are made, and with the pictures of the
-# report, when the screens are gone.
-_BASE, _REPORT = 400_000_000, 600_000_000
-# Memory of a thread of the wave engine: fields, intensities and spectra of a star at five wavelengths; and in silicon
-# intensities and phases of three depths of each.
-_WAVE_THREAD, _SILICON_THREAD = 150_000_000, 110_000_000
+# 3 to 18 % above the peak.
+# Python with its libraries and kernels while PSFs are made [bytes].
+_BASE = 400_000_000
+# Python with the pictures of the report, when the screens are gone [bytes].
+_REPORT = 600_000_000
+# Memory of a thread of the wave engine: fields, intensities and spectra of a star at five wavelengths [bytes].
+_WAVE_THREAD = 150_000_000
+# What silicon adds to it: intensities and phases of three depths of each wavelength [bytes].
+_SILICON_THREAD = 110_000_000
 # Copies of the stamps of a CCD's stars that are held at once, in bytes a pixel.
 _STAMP_BYTES = 48
 
@@ -53,15 +56,18 @@ def check_memory(experiment: Experiment, threads: int | None = None, *, copies: 
             f"{int(free // needed)} would do"
         )
     short = f"needs about {readable(needed)} of memory, {readable(free)} are free"
-    rest = needed - screen_bytes(experiment)
+    bytes_without_screens = needed - screen_bytes(experiment)
     stars = experiment.config.stars
-    if rest > free or experiment.atmosphere is None:
-        most = max(map(experiment.observed_count, resolved_value(experiment.config.ccds)))
-        raise ConfigError(f"stars.truth = {stars.truth}, stars.observed = {most}: {short}")
+    if bytes_without_screens > free or experiment.atmosphere is None:
+        largest_star_count = max(map(experiment.observed_count, resolved_value(experiment.config.ccds)))
+        raise ConfigError(f"stars.truth = {stars.truth}, stars.observed = {largest_star_count}: {short}")
     smaller = experiment.atmosphere
-    while smaller.screen_size > 16 and rest + screen_bytes(replace(experiment, atmosphere=smaller)) > free:
+    while (
+        smaller.screen_size > 16
+        and bytes_without_screens + screen_bytes(replace(experiment, atmosphere=smaller)) > free
+    ):
         smaller = replace(smaller, screen_size=smaller.screen_size // 2)
     raise ConfigError(
         f"atmosphere.screen_size = {experiment.atmosphere.screen_size}: {short}; {smaller.screen_size} would do with"
-        f" {readable(rest + screen_bytes(replace(experiment, atmosphere=smaller)))}"
+        f" {readable(bytes_without_screens + screen_bytes(replace(experiment, atmosphere=smaller)))}"
     )

@@ -17,8 +17,10 @@ from .merits import ToleranceMerit
 
 #: Kinds of points in the store.
 NOMINAL, LOWER, UPPER, INVERSE, DRAW = "nominal", "lower end", "upper end", "inverse", "draw"
-#: Precision of an inverse sensitivity, a binary logarithm, and the largest factor from the tolerance to it.
-_PRECISION, _FARTHEST = 1e-3, 1e4
+#: Precision of an inverse sensitivity, a binary logarithm.
+_PRECISION = 1e-3
+#: Largest factor from the tolerance to an inverse sensitivity.
+_FARTHEST = 1e4
 #: Half of the range about a predicted inverse sensitivity, a binary logarithm.
 _NARROW = 0.1
 
@@ -47,15 +49,15 @@ class ToleranceMeasurement:
     def __call__(self, batch: Batch, threads: int) -> list[PointResult]:
         """Compute a batch of points."""
         del threads  # one telescope has too few rays to share
-        found = []
+        results = []
         for point, values in zip(batch.points, batch.values, strict=True):
             start = time.perf_counter()
             if point.parameters["kind"] == INVERSE:
                 number = {"size": self._inverse(int(point.parameters["tolerance"]))}
             else:
                 number = {"merit": self.at(values)}
-            found.append(PointResult(point.number, number, None, time.perf_counter() - start, worker_name()))
-        return found
+            results.append(PointResult(point.number, number, None, time.perf_counter() - start, worker_name()))
+        return results
 
     def at(self, values: np.ndarray) -> float:
         """Return the merit at deviations and compensators, in SI; NaN where there is no such telescope."""
@@ -84,16 +86,16 @@ class ToleranceMeasurement:
         """
         nominal = self.nominal
         allowed = self.loss * abs(nominal)
-        known: dict[float, float] = {}
+        excess_at: dict[float, float] = {}
 
         def excess(power: float) -> float:
-            if power not in known:
+            if power not in excess_at:
                 ends = np.zeros((2, len(self.built.tolerances)))
                 ends[:, index] = start * 2.0**power * np.array([-1.0, 1.0])
                 losses = self.merit.loss(np.array([self.at(v) for v in self.values_of(ends)]), nominal)
                 # A telescope that loses its light costs more than any that does not.
-                known[power] = float(np.max(np.where(np.isnan(losses), _FARTHEST * allowed, losses))) - allowed
-            return known[power]
+                excess_at[power] = float(np.max(np.where(np.isnan(losses), _FARTHEST * allowed, losses))) - allowed
+            return excess_at[power]
 
         start = self.built.tolerances[index].size
         predicted = np.log2(self._predicted(index) / start)

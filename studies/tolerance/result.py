@@ -111,12 +111,12 @@ class ToleranceStudy(Result):
         Both arrays are [2, n_tolerance], lowest third first: the difference, and its standard error; NaN where a group
         has less than two telescopes with light.
         """
-        known = np.isfinite(self.draws)
+        lit_draws = np.isfinite(self.draws)
         effect, error = np.full((2, 2, self.deviations.shape[1]), np.nan)
         for i, column in enumerate(self.deviations.T):
             low, high = np.quantile(column, (1 / 3, 2 / 3))
             for end, third in enumerate((column <= low, column >= high)):
-                inner, outer = self.draws[known & third], self.draws[known & ~third]
+                inner, outer = self.draws[lit_draws & third], self.draws[lit_draws & ~third]
                 if min(len(inner), len(outer)) >= 2:
                     effect[end, i] = inner.mean() - outer.mean()
                     error[end, i] = np.sqrt(inner.var(ddof=1) / len(inner) + outer.var(ddof=1) / len(outer))

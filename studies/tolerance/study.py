@@ -119,7 +119,7 @@ def _points(measured: ToleranceMeasurement, deviations: np.ndarray) -> tuple[lis
     about += [{"kind": kind, "tolerance": i} for i in range(n) for kind in (LOWER, UPPER)]
     about += [{"kind": INVERSE, "tolerance": i} for i in range(n)]
     about += [{"kind": DRAW, "draw": i} for i in range(len(deviations))]
-    return [SweepPoint(i, one, 0) for i, one in enumerate(about)], measured.values_of(rows)
+    return [SweepPoint(i, parameters, 0) for i, parameters in enumerate(about)], measured.values_of(rows)
 
 
 def _numbers(
@@ -148,9 +148,9 @@ def _numbers(
                     store.write(result)
                 numbers[result.number] = _number(result)
 
-        missing = [p for p in points if p.number not in finished]
-        batches = [_batch(missing[i : i + _BATCH], values) for i in range(0, len(missing), _BATCH)]
-        title = f"tolerances: {len(missing)} telescopes, {_BATCH} at a time"
+        unfinished_points = [p for p in points if p.number not in finished]
+        batches = [_batch(unfinished_points[i : i + _BATCH], values) for i in range(0, len(unfinished_points), _BATCH)]
+        title = f"tolerances: {len(unfinished_points)} telescopes, {_BATCH} at a time"
         labels = [batch.label for batch in batches]
         with execution.results(measured, labels, batches, title=title, save=save) as results:
             for _ in results:

@@ -92,8 +92,8 @@ class VisitsConfig(Section):
 
     def galaxies_digest(self, experiment: Experiment, **content: Any) -> str:
         """SHA-256 of the settings of the visits, of `content`, and of galaxies other than the default ones."""
-        own = {} if self.galaxies == GalaxySourceConfig() else {"galaxies": self.galaxies.content()}
-        return digest({"visits": self.digest(experiment), **content, **own})
+        galaxies_content = {} if self.galaxies == GalaxySourceConfig() else {"galaxies": self.galaxies.content()}
+        return digest({"visits": self.digest(experiment), **content, **galaxies_content})
 
     def galaxy_source(self, experiment: Experiment, exposure: Exposure) -> GalaxySource:
         """Read the galaxies about the common pointing, which is that of the run for a catalogue with ra and dec.

@@ -70,7 +70,7 @@ class GalaxyShapes:
     @classmethod
     def joined(cls, parts: list[GalaxyShapes]) -> GalaxyShapes:
         """Return the galaxies of several parts."""
-        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
+        return cls(*(np.concatenate([getattr(shapes, f.name) for shapes in parts]) for f in fields(cls)))
 
 
 def measure_galaxies(
@@ -114,28 +114,28 @@ def measure_galaxies(
     electrons = exposure.electrons(galaxies.magnitude[near])
     # Between pixels, as the sky is to the pixels of the stack.
     offset = pixels[near] - np.rint(pixels[near])
-    found: list[tuple[np.ndarray, GalaxyFits, GalaxyFits]] = []
+    fits_of_blocks: list[tuple[np.ndarray, GalaxyFits, GalaxyFits]] = []
     rng = stream(seed, *key)
     for side, rows in zip(_SIDES, (on_image <= _LARGE, on_image > _LARGE), strict=True):
-        for own in _row_blocks(np.flatnonzero(rows)):
+        for block in _row_blocks(np.flatnonzero(rows)):
             size = 2 * side
-            used, index = np.unique(psf[own], return_inverse=True)
+            used, index = np.unique(psf[block], return_inverse=True)
             spectra = galaxies.transform(
-                near[own], np.broadcast_to(axes, (len(own), 2, 2)), offset[own], size, threads=threads
+                near[block], np.broadcast_to(axes, (len(block), 2, 2)), offset[block], size, threads=threads
             )
             spectra *= _psf_transforms(stack.true[used], size)[index]
             images = fft.irfft2(spectra, s=(size, size), workers=1)[:, side // 2 : -side // 2, side // 2 : -side // 2]
-            images *= electrons[own, None, None].astype(np.float32)
+            images *= electrons[block, None, None].astype(np.float32)
             variance = exposure.noise_rms**2
             if exposure.noise:
                 images += np.sqrt(variance + np.maximum(images, 0.0)) * rng.standard_normal(images.shape, np.float32)
-            every = np.full(images.shape, variance)
-            by_model = fit_galaxy_stamps(images, every, stack.model[used], psf_index=index, threads=threads)
+            pixel_variance = np.full(images.shape, variance)
+            by_model = fit_galaxy_stamps(images, pixel_variance, stack.model[used], psf_index=index, threads=threads)
             by_true = fit_galaxy_stamps(
-                images, every, stack.true[used], psf_index=index, start=by_model, threads=threads
+                images, pixel_variance, stack.true[used], psf_index=index, start=by_model, threads=threads
             )
-            found.append((own, by_model, by_true))
-    return _joined_shapes(galaxies, near, pixels * exposure.pixel_scale, width, found)
+            fits_of_blocks.append((block, by_model, by_true))
+    return _joined_shapes(galaxies, near, pixels * exposure.pixel_scale, width, fits_of_blocks)
 
 
 def _row_blocks(rows: np.ndarray) -> Iterator[np.ndarray]:
@@ -171,13 +171,13 @@ def _joined_shapes(
     """Return the shapes of the fits of blocks of galaxies, in the order of the galaxies."""
     columns = {name: np.full(len(near), np.nan) for name in ("e1", "e2", "error", "true_e1", "true_e2")}
     usable = {name: np.zeros(len(near), dtype=bool) for name in ("usable", "true_usable")}
-    for own, *both in found:
-        for fits, prefix in zip(both, ("", "true_"), strict=True):
-            columns[f"{prefix}e1"][own], columns[f"{prefix}e2"][own] = fits.e1, fits.e2
+    for block, *model_and_true_fits in found:
+        for fits, prefix in zip(model_and_true_fits, ("", "true_"), strict=True):
+            columns[f"{prefix}e1"][block], columns[f"{prefix}e2"][block] = fits.e1, fits.e2
             # Half-light radius on the image, of the fitted Gaussian under the PSF.
-            on_image = np.hypot(fits.half_light_radius, width[own])
-            usable[f"{prefix}usable"][own] = usable_galaxies(fits, on_image, width)
+            on_image = np.hypot(fits.half_light_radius, width[block])
+            usable[f"{prefix}usable"][block] = usable_galaxies(fits, on_image, width)
             if not prefix:
-                columns["error"][own] = fits.ellipticity_error
+                columns["error"][block] = fits.ellipticity_error
     x, y = positions[near].T
     return GalaxyShapes(index=near, x=x, y=y, magnitude=galaxies.magnitude[near], **columns, **usable)

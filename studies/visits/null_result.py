@@ -28,19 +28,19 @@ def shear_bias(e: np.ndarray, shear: np.ndarray) -> ShearCalibration:
     shear : ndarray of complex, shape [n]
         g1 + i g2 of each ring, along one of the two axes.
     """
-    whole = np.isfinite(e).all(axis=(0, 2))
-    mean = e[:, whole].mean(axis=2)
+    complete_rings = np.isfinite(e).all(axis=(0, 2))
+    mean = e[:, complete_rings].mean(axis=2)
     level, change = 0.5 * (mean[0] + mean[1]), 0.5 * (mean[0] - mean[1])
     biases = []
-    for part in (np.real, np.imag):
-        g = part(shear[whole])
-        along = np.abs(g) > 0.5 * np.abs(shear[whole])
-        response = part(change)[along] / g[along]
-        c = part(level)
+    for component in (np.real, np.imag):
+        g = component(shear[complete_rings])
+        along = np.abs(g) > 0.5 * np.abs(shear[complete_rings])
+        response = component(change)[along] / g[along]
+        c = component(level)
         ends = [(v.mean(), v.std(ddof=1) / np.sqrt(len(v))) if len(v) > 1 else (np.nan, np.nan) for v in (response, c)]
         biases.append((ends[0][0] - 1.0, ends[0][1], *ends[1]))
     m, m_error, c, c_error = np.array(biases).T
-    return ShearCalibration(m, m_error, c, c_error, int(whole.sum()))
+    return ShearCalibration(m, m_error, c, c_error, int(complete_rings.sum()))
 
 
 def psf_leakage(stack: PsfStack, parts: list[GalaxyShapes]) -> dict[str, tuple[float, float]]:
@@ -59,20 +59,20 @@ def psf_leakage(stack: PsfStack, parts: list[GalaxyShapes]) -> dict[str, tuple[f
     places = ~stack.star
     tree = cKDTree(np.stack([stack.x, stack.y], axis=1)[places])
     psf = (stack.e1 + 1j * stack.e2)[places]
-    nearest = [psf[tree.query(np.stack([part.x, part.y], axis=1))[1]] for part in parts]
-    found = {}
+    nearest = [psf[tree.query(np.stack([galaxies.x, galaxies.y], axis=1))[1]] for galaxies in parts]
+    leakage = {}
     for kind, prefix in (("model", ""), ("true", "true_")):
         sums = np.zeros((len(parts), 2))
-        for own, part, at in zip(sums, parts, nearest, strict=True):
-            e1, e2, usable = (getattr(part, prefix + name) for name in ("e1", "e2", "usable"))
+        for tile_sums, galaxies, at in zip(sums, parts, nearest, strict=True):
+            e1, e2, usable = (getattr(galaxies, prefix + name) for name in ("e1", "e2", "usable"))
             e, p = (e1 + 1j * e2)[usable], at[usable]
-            own[:] = (np.conj(p) * e).real.sum(), (np.abs(p) ** 2).sum()
+            tile_sums[:] = (np.conj(p) * e).real.sum(), (np.abs(p) ** 2).sum()
         product, square = (sums.sum(axis=0) - sums).T
         without = product / np.where(square > 0.0, square, np.nan)
         total = sums.sum(axis=0)
         slope = float(total[0] / total[1]) if total[1] > 0.0 else float("nan")
-        found[kind] = slope, float(jackknife_error(without))
-    return found
+        leakage[kind] = slope, float(jackknife_error(without))
+    return leakage
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,9 +120,9 @@ class NullTest:
             "true": (galaxies.true_e1, galaxies.true_e2, galaxies.true_usable),
             "difference": (galaxies.e1 - galaxies.true_e1, galaxies.e2 - galaxies.true_e2, both),
         }
-        tile = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-        found = correlations(galaxies.x, galaxies.y, kinds, tile)
-        return cls(visits, galaxies, float(galaxies.usable.sum() / area), found, calibration or {}, leakage or {})
+        tile = np.repeat(np.arange(len(parts)), [len(shapes) for shapes in parts])
+        correlated = correlations(galaxies.x, galaxies.y, kinds, tile)
+        return cls(visits, galaxies, float(galaxies.usable.sum() / area), correlated, calibration or {}, leakage or {})
 
 
 def null_metrics(result: NullTest) -> dict[str, Any]:

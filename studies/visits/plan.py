@@ -132,9 +132,9 @@ def plan_visits(
         raise DomainError(f"visits = {count}: expected at least 1")
     if not 0.0 <= dither <= np.deg2rad(5.0):
         raise DomainError(f"dither = {np.rad2deg(dither):g} deg: expected 0 to 5")
-    for name, given in (("roll_deg", rolls_deg), ("rotator_deg", rotators_deg)):
-        if given is not None and not isinstance(given, str) and len(given) < count:
-            raise DomainError(f"{name}: {len(given)} angles for {count} visits, expected one for each")
+    for name, angles_deg in (("roll_deg", rolls_deg), ("rotator_deg", rotators_deg)):
+        if angles_deg is not None and not isinstance(angles_deg, str) and len(angles_deg) < count:
+            raise DomainError(f"{name}: {len(angles_deg)} angles for {count} visits, expected one for each")
     visits = []
     for number in range(count):
         rng = stream(seed, "visit", number)

@@ -41,20 +41,20 @@ def ellipticity_picture(stacks: Mapping[int, PsfStack]) -> bytes:
     with styled():
         rows = len(panels) // 2 if len(panels) > 3 else 1
         figure = new_figure(5.2 * len(panels) / rows, 5.4 * rows, "compressed")
-        every = figure.subplots(rows, len(panels) // rows, squeeze=False, sharex=True, sharey=True)
+        panel_axes = figure.subplots(rows, len(panels) // rows, squeeze=False, sharex=True, sharey=True)
         edge = 1.05 / ARCMIN * max(float(np.abs([s.x, s.y]).max()) for s in (first, last))
-        for axes, (stack, what, e1, e2) in zip(every.flat, panels, strict=True):
-            some = np.s_[:: max(1, len(stack) // _MOST)]
+        for axes, (stack, label, e1, e2) in zip(panel_axes.flat, panels, strict=True):
+            thinned = np.s_[:: max(1, len(stack) // _MOST)]
             scale = 0.06 * edge / key
-            ends = whiskers(stack.x[some] / ARCMIN, stack.y[some] / ARCMIN, e1[some], e2[some], scale)
+            ends = whiskers(stack.x[thinned] / ARCMIN, stack.y[thinned] / ARCMIN, e1[thinned], e2[thinned], scale)
             draw_whiskers(axes, ends, "black", 0.6)
             axes.set(xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal")
             rms = np.sqrt(np.nanmean(e1**2 + e2**2))
-            axes.set_title(f"{what}, {_visits(stack.visits)}: rms |e| {rms:.1e}", loc="left")
+            axes.set_title(f"{label}, {_visits(stack.visits)}: rms |e| {rms:.1e}", loc="left")
             draw_key_whisker(axes, key, scale, 1.0)
-        for axes in every[-1]:
+        for axes in panel_axes[-1]:
             axes.set_xlabel("x of the stack [arcmin]")
-        for axes in every[:, 0]:
+        for axes in panel_axes[:, 0]:
             axes.set_ylabel("y of the stack [arcmin]")
         return png_bytes(figure)
 

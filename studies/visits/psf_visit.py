@@ -88,8 +88,8 @@ class _CcdResult(NamedTuple):
 
 def visit_experiment(experiment: Experiment, visit: Visit) -> Experiment:
     """Return the experiment of a visit: own turbulence, residual aberration, noise and, where it has one, rotator."""
-    own = with_options(experiment.config, atmosphere__epoch=visit.epoch, rotator_deg=visit.rotator_deg)
-    return Experiment.from_config(own)
+    visit_config = with_options(experiment.config, atmosphere__epoch=visit.epoch, rotator_deg=visit.rotator_deg)
+    return Experiment.from_config(visit_config)
 
 
 def visit_telescope(experiment: Experiment, visit: Visit) -> Telescope:
@@ -168,16 +168,16 @@ def visit_psfs(
             threads=threads,
             reporter=reporter,
         )
-    found = simulated.results
-    if not found:
+    ccd_results = simulated.results
+    if not ccd_results:
         reasons = [f"CCD {name}: {reason}" for name, reason in simulated.not_modelled.items()]
         raise DomainError("; ".join(reasons[:1]) or "no star falls on a CCD")
-    true = [result.true for result in found.values()]
+    true = [result.true for result in ccd_results.values()]
     if together:
-        model = [_focal_plane_images(experiment, found, threads, reporter)]
+        model = [_focal_plane_images(experiment, ccd_results, threads, reporter)]
     else:
-        model = [result.model for result in found.values() if result.model is not None]
-    rows = np.concatenate([index[name] for name in found])
+        model = [result.model for result in ccd_results.values() if result.model is not None]
+    rows = np.concatenate([index[name] for name in ccd_results])
     matrix = frame.to_stamp(experiment, visit, points.sky[rows], threads)
 
     def turned(images: list[np.ndarray]) -> np.ndarray:
@@ -239,8 +239,8 @@ def magnitude_limits(experiment: Experiment) -> tuple[float, float]:
 def stack_limit(experiment: Experiment, snr: float, visits: int) -> float:
     """Return the magnitude of a star of a signal-to-noise ratio in a stack of visits of nominal seeing."""
     config = experiment.config
-    one = limiting_magnitude(snr, experiment.band, config.atmosphere.exposure_s, _NOMINAL_FWHM)
-    return float(one + 1.25 * np.log10(visits))
+    visit_limit = limiting_magnitude(snr, experiment.band, config.atmosphere.exposure_s, _NOMINAL_FWHM)
+    return float(visit_limit + 1.25 * np.log10(visits))
 
 
 def _focal_plane_images(

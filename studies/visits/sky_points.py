@@ -45,7 +45,7 @@ def draw_points(seed: int, radius: float, cell: float, stars: int, places: int) 
                 sky.append(cell * (np.array([i, j]) - 0.5 + draw[:, :2]))
                 star.append(np.full(count, kind == "stars"))
                 quantile.append(draw[:, 2] if kind == "stars" else np.full(count, np.nan))
-    points, is_star, counts = (np.concatenate(part) for part in (sky, star, quantile))
+    points, is_star, counts = (np.concatenate(arrays) for arrays in (sky, star, quantile))
     inside = np.hypot(*points.T) <= radius
     return SkyPoints(points[inside], is_star[inside], counts[inside])
 

@@ -210,10 +210,12 @@ class PsfStack(Result):
     def read(cls, path: Path, stamp: Stamp | None = None) -> PsfStack:
         """Read a stack; ProductError for a damaged file and, with a stamp, for one of another configuration."""
         hdus = _read_table(path, stamp)
-        found = {name: column(hdus["POINTS"], name.upper()) for name in _COLUMNS}
-        found = {name: found[name] * scale if scale != 1.0 else found[name] for name, (scale, _, _) in _COLUMNS.items()}
+        columns = {name: column(hdus["POINTS"], name.upper()) for name in _COLUMNS}
+        columns = {
+            name: columns[name] * scale if scale != 1.0 else columns[name] for name, (scale, _, _) in _COLUMNS.items()
+        }
         images = {"true": _image_from_hdu(hdus["TRUE"]), "model": _image_from_hdu(hdus["MODEL"])}
-        return cls(**{"visits": hdus[0].header[VISITS_CARD], **found, **images})
+        return cls(**{"visits": hdus[0].header[VISITS_CARD], **columns, **images})
 
 
 _COLUMNS = {

@@ -41,10 +41,10 @@ def correlations(
     Errors are those of a jackknife over patches, where there are several.
     """
     extent = float(np.hypot(np.ptp(x), np.ptp(y)))
-    found = {}
+    correlated = {}
     for kind, (e1, e2, rows) in values.items():
         several = len(np.unique(patch[rows])) > 1
-        found[kind] = shear_correlation(
+        correlated[kind] = shear_correlation(
             x[rows],
             y[rows],
             e1[rows],
@@ -54,22 +54,22 @@ def correlations(
             n_bins=_BINS,
             patch=patch[rows] if several else None,
         )
-    return found
+    return correlated
 
 
 def stack_metrics(stack: PsfStack, found: StackCorrelations) -> dict[str, Any]:
     """Return the figures of a stack: ellipticities, sizes and mean correlations."""
     stars, places = stack.star, ~stack.star
-    e, left = (stack.e1, stack.e2), (stack.residual_e1, stack.residual_e2)
+    e, residual = (stack.e1, stack.e2), (stack.residual_e1, stack.residual_e2)
     size = (stack.size - stack.model_size) / stack.size
     metrics: dict[str, Any] = {
         "points": len(stack),
         "rms_e": _rms_modulus(*e),
-        "rms_residual_e_stars": _rms_modulus(*(v[stars] for v in left)),
-        "rms_residual_e_places": _rms_modulus(*(v[places] for v in left)),
+        "rms_residual_e_stars": _rms_modulus(*(v[stars] for v in residual)),
+        "rms_residual_e_places": _rms_modulus(*(v[places] for v in residual)),
         # Medians beside the rms: a polynomial fitted to few stars goes far astray at a few places.
-        "median_residual_e_stars": _median_modulus(*(v[stars] for v in left)),
-        "median_residual_e_places": _median_modulus(*(v[places] for v in left)),
+        "median_residual_e_stars": _median_modulus(*(v[stars] for v in residual)),
+        "median_residual_e_places": _median_modulus(*(v[places] for v in residual)),
         "median_size_arcsec": float(np.nanmedian(stack.size) / ARCSEC),
         "rms_relative_residual_size_places": float(np.sqrt(np.nanmean(size[places] ** 2))),
     }

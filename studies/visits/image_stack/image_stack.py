@@ -109,17 +109,17 @@ class ImageStack:
     def wcs(self, visits: Sequence[Visit], threads: int | None = None) -> Iterator[tuple[Visit, dict[str, VisitWcs]]]:
         """Yield visits with the world coordinates of their CCDs."""
         camera, wavelength = self.experiment.camera, middle_wavelength(self.experiment)
-        known: dict[float | None, dict[str, CcdWcs]] = {}
+        wcs_of_rotator: dict[float | None, dict[str, CcdWcs]] = {}
         for visit in visits:
             # About the visit's own pointing, at a position angle of 0, all visits of a rotator angle have the same.
-            if visit.rotator_deg not in known:
+            if visit.rotator_deg not in wcs_of_rotator:
                 telescope = visit_telescope(self.experiment, visit)
-                own = {
+                wcs_of_ccds = {
                     name: ccd_wcs(telescope, camera, name, wavelength=wavelength, threads=threads)
                     for name in resolved_value(self.experiment.config.ccds)
                 }
-                known = {visit.rotator_deg: own}
-            yield visit, {name: VisitWcs(ccd, visit) for name, ccd in known[visit.rotator_deg].items()}
+                wcs_of_rotator = {visit.rotator_deg: wcs_of_ccds}
+            yield visit, {name: VisitWcs(ccd, visit) for name, ccd in wcs_of_rotator[visit.rotator_deg].items()}
 
     def path(self, visits: int, tile: Tile) -> Path:
         """Return the path of the image of a tile in the stack of a number of visits."""

@@ -48,24 +48,24 @@ def add_resampled(
     threads : int, optional
         Number of threads; all processors by default. No byte depends on it.
     """
-    part = _overlap(tile, frame, window, wcs)
-    if part is None:
+    overlap = _overlap(tile, frame, window, wcs)
+    if overlap is None:
         return
-    step, nodes = _mapping_nodes(tile, frame, part, window, wcs)
+    step, nodes = _mapping_nodes(tile, frame, overlap, window, wcs)
     inputs = [
         warp_array(exposed.image, wp.float32),
         warp_array(exposed.variance, wp.float32),
         warp_array(exposed.mask, wp.int16),
         warp_array(nodes),
         step,
-        part.x,
-        part.y,
-        part.width,
+        overlap.x,
+        overlap.y,
+        overlap.width,
         warp_array(sums.data, wp.float32),
         warp_array(sums.variance, wp.float32),
         warp_array(sums.count, wp.int16),
     ]
-    launch(add_rows, part.height, inputs, threads=threads)
+    launch(add_rows, overlap.height, inputs, threads=threads)
 
 
 def _overlap(tile: Tile, frame: StackFrame, window: Window, wcs: SkyPixels) -> Window | None:

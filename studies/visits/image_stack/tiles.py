@@ -105,27 +105,31 @@ def choose_tiles(experiment: Experiment, frame: StackFrame, side: int, most: int
     inside = (np.arange(_POINTS) + 0.5) * side / _POINTS
     offsets = np.stack(np.meshgrid(inside, inside), axis=-1).reshape(-1, 2)
     to_sky = np.linalg.inv(frame.matrix).T
-    angles = [given for given in (config.visits.roll_deg, config.visits.rotator_deg) if isinstance(given, tuple)]
+    angles = [
+        listed_angles
+        for listed_angles in (config.visits.roll_deg, config.visits.rotator_deg)
+        if isinstance(listed_angles, tuple)
+    ]
     plan = config.plan_of(min([_VISITS, *map(len, angles)]), experiment.config.seed)
     telescopes = [visit_telescope(experiment, visit) for visit in plan]
     wavelength = middle_wavelength(experiment)
-    chosen: list[Tile] = []
+    covered_tiles: list[Tile] = []
     for tile in tiles:
         sky = (offsets + tile.first) @ to_sky
-        seen = 0.0
+        coverage = 0.0
         for visit, telescope in zip(plan, telescopes, strict=True):
             at = visit.on_detector(telescope, sky, wavelength)
             near = np.any([camera.depth(ccd, *at.T) >= 0.0 for ccd in ccds], axis=0)
-            seen += near.mean() / len(plan)
-        if seen >= 0.5:
-            chosen.append(tile)
-        if len(chosen) == most:
+            coverage += near.mean() / len(plan)
+        if coverage >= 0.5:
+            covered_tiles.append(tile)
+        if len(covered_tiles) == most:
             break
-    if not chosen:
+    if not covered_tiles:
         raise DomainError(
             f"no tile of {side} pixels is seen by half of the visits; expected more CCDs, or smaller tiles"
         )
-    return chosen
+    return covered_tiles
 
 
 @dataclass(eq=False)
@@ -162,9 +166,9 @@ class TileSums:
 
     def stacked(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return image, variance and mask of the mean of the visits times their number, as of one long exposure."""
-        known = self.count > 0
-        factor = np.divide(self.visits, self.count, out=np.zeros(self.data.shape, np.float32), where=known)
-        mask = np.where(known, 0, NO_DATA).astype(np.int16)
+        has_data = self.count > 0
+        factor = np.divide(self.visits, self.count, out=np.zeros(self.data.shape, np.float32), where=has_data)
+        mask = np.where(has_data, 0, NO_DATA).astype(np.int16)
         return self.data * factor, self.variance * factor**2, mask
 
     def write(self, path: Path, stamp: Stamp) -> None:
@@ -180,6 +184,8 @@ class TileSums:
     def read(cls, path: Path, stamp: Stamp) -> TileSums:
         """Read sums; ProductError for those of another configuration, and for a damaged file."""
         hdus = read_fits(path, stamp)
+        if VISITS_CARD not in hdus[0].header:
+            raise ProductError("no sums of a tile", file=path)
         data, variance = (np.array(hdus[key].data, dtype=np.float32) for key in ("DATA", "VARIANCE"))
         return cls(hdus[0].header[VISITS_CARD], data, variance, np.array(hdus["COUNT"].data, dtype=np.int16))
 
@@ -197,8 +203,8 @@ def window_on(tiles: Sequence[Tile], frame: StackFrame, wcs: SkyPixels) -> Windo
         return None
     ends = []
     for axis, (line, step, pixels) in enumerate(zip(nodes, steps, (width, height), strict=True)):
-        own = np.flatnonzero(near.any(axis=axis))
-        low, high = line[own[0]] - step, line[own[-1]] + step
+        touching_lines = np.flatnonzero(near.any(axis=axis))
+        low, high = line[touching_lines[0]] - step, line[touching_lines[-1]] + step
         ends.append((max(0, int(low)), min(pixels, int(np.ceil(high)) + 1)))
     (x0, x1), (y0, y1) = ends
     return Window(x0, y0, x1 - x0, y1 - y0)

@@ -111,12 +111,14 @@ def visit_image(
     noise = exposure.noise_rms / np.sqrt(depth)
     scene = draw_galaxies(galaxies, electrons, field, wcs, window=window, noise=noise, threads=threads)
     reach = 0.5 * (field.stamp + STAR_ROOM)
-    own = np.flatnonzero(points.star[rows] & window.contains(at[rows], reach))
-    if len(own):
-        nearest = np.rint(at[rows[own]])
-        offsets = at[rows[own]] - nearest + psfs.offset[own]
-        stars = expose_positions(experiment, xy[rows[own]], threads, room=STAR_ROOM, offsets=offsets, along=name)
-        magnitude = magnitudes_at(points.quantile[rows[own]], *magnitude_limits(experiment))
+    stars_on_window = np.flatnonzero(points.star[rows] & window.contains(at[rows], reach))
+    if len(stars_on_window):
+        nearest = np.rint(at[rows[stars_on_window]])
+        offsets = at[rows[stars_on_window]] - nearest + psfs.offset[stars_on_window]
+        stars = expose_positions(
+            experiment, xy[rows[stars_on_window]], threads, room=STAR_ROOM, offsets=offsets, along=name
+        )
+        magnitude = magnitudes_at(points.quantile[rows[stars_on_window]], *magnitude_limits(experiment))
         light = (exposure.electrons(magnitude) * stars.lit_fraction).astype(np.float32)
         corners = nearest.astype(np.int64) - stars.image.shape[1] // 2 - (window.x, window.y)
         add_stamps(scene, stars.image * light[:, None, None], corners)

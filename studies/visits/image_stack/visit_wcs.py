@@ -34,8 +34,8 @@ class VisitWcs:
 
     def to_sky(self, pixels: ArrayLike) -> np.ndarray:
         """Return (xi, eta), shape [n, 2], of pixels (x, y), shape [n, 2]."""
-        own = self.ccd.to_sky(pixels)
-        source = np.column_stack([own, np.ones(len(own))]) @ self.visit.matrix
+        offsets = self.ccd.to_sky(pixels)
+        source = np.column_stack([offsets, np.ones(len(offsets))]) @ self.visit.matrix
         return np.asarray(source[:, :2] / source[:, 2:])
 
     def to_pixel(self, sky: ArrayLike) -> np.ndarray:
