@@ -102,12 +102,12 @@ def exposure_of(config: ImagesConfig, experiment: Experiment) -> Exposure:
 
 def galaxies_of(config: ImagesConfig, experiment: Experiment) -> SkyGalaxies:
     """Return the function that gives the galaxies of a part of the sky."""
-    wanted, pointing = config.galaxies, config.pointing
+    settings, pointing = config.galaxies, config.pointing
     source = GalaxySource.read(
-        wanted,
+        settings,
         exposure_of(config, experiment),
         pointing=(math.radians(pointing.ra_deg), math.radians(pointing.dec_deg)),
         seed=experiment.config.seed,
     )
     # Catalogues and mosaics are drawn to their own depth.
-    return source.down_to(wanted.faintest if source.given is None else math.inf)
+    return source.down_to(settings.faintest if source.given is None else math.inf)

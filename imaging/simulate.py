@@ -71,15 +71,15 @@ def simulate_images(
     names = resolved_value(experiment.config.ccds)
     windows = {name: window_of(config, experiment, name) for name in names}
     galaxies = galaxies_of(config, experiment)
-    most = max(window.width * window.height for window in windows.values())
-    require_bytes(needed_bytes(experiment, threads) + BYTES_PER_PIXEL * most, "images")
+    largest_window = max(window.width * window.height for window in windows.values())
+    require_bytes(needed_bytes(experiment, threads) + BYTES_PER_PIXEL * largest_window, "images")
     stamp = stamp_of(config, experiment)
     claim_images(folder, resolved, resume=execution.resume)
     paths = {name: folder / image_name(name) for name in names}
-    kept = execution.finished(paths, stamp)
-    missing = [name for name in names if name not in kept]
+    finished_ccds = execution.finished(paths, stamp)
+    unfinished_ccds = [name for name in names if name not in finished_ccds]
     objects: dict[str, int] = {}
-    if missing:
+    if unfinished_ccds:
         draw: partial[int] = (
             partial(draw_image, config, experiment, galaxies, reporter.check)
             if alone
@@ -89,16 +89,16 @@ def simulate_images(
             experiment.screens(threads, reporter) if alone else nullcontext(),
             execution.results(
                 draw,
-                [f"CCD {name}" for name in missing],
-                missing,
-                title=f"images of {len(missing)} CCDs",
+                [f"CCD {name}" for name in unfinished_ccds],
+                unfinished_ccds,
+                title=f"images of {len(unfinished_ccds)} CCDs",
                 folder=folder,
-                product=lambda number: paths[missing[number]],
+                product=lambda number: paths[unfinished_ccds[number]],
                 check=lambda processes: check_memory(experiment, threads if alone else 1, copies=processes),
             ) as results,
         ):
-            objects = dict(zip(missing, results, strict=True))
-    return ImagesResult(folder, paths, kept, tuple(missing), objects)
+            objects = dict(zip(unfinished_ccds, results, strict=True))
+    return ImagesResult(folder, paths, finished_ccds, tuple(unfinished_ccds), objects)
 
 
 def claim_images(folder: Path, config: ImagesConfig, *, resume: bool) -> None:

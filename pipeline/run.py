@@ -108,9 +108,9 @@ def run(
     if parts > 1:
         execution = replace(execution, resume=True)
     kept = finished_ccds(folder, experiment) if execution.resume else ()
-    missing = tuple(name for name in names[number - 1 :: parts] if name not in kept)
+    unfinished_ccds = tuple(name for name in names[number - 1 :: parts] if name not in kept)
     # The report of a finished run needs no screens.
-    if missing and execution.alone:
+    if unfinished_ccds and execution.alone:
         check_memory(experiment, threads)
     with second_process(threads) as submit:
         claim_run(folder, experiment, resume=execution.resume)
@@ -121,12 +121,12 @@ def run(
         focal_plane = submit(write_focal_plane, experiment, folder)
         submit(_load_plots)
         failed: dict[str, str] = {}
-        if missing:
-            failed = compute_ccds(experiment, folder, missing, execution, strict=strict)
-        computed = tuple(name for name in missing if name not in failed)
+        if unfinished_ccds:
+            failed = compute_ccds(experiment, folder, unfinished_ccds, execution, strict=strict)
+        computed = tuple(name for name in unfinished_ccds if name not in failed)
         if parts > 1:
             # Other parts may have ended meanwhile.
-            other_ccds = [name for name in names if name not in (*kept, *missing)]
+            other_ccds = [name for name in names if name not in (*kept, *unfinished_ccds)]
             finished = finished_ccds(folder, experiment, other_ccds)
             unfinished = tuple(name for name in other_ccds if name not in finished)
             if unfinished:

@@ -72,15 +72,15 @@ class Allowance:
 
 def curves(table: SweepTable, sweep: SweepFile, metric: str) -> list[Curve]:
     """Return a curve for each numeric parameter that was varied one at a time."""
-    found = []
+    one_at_a_time_curves = []
     nominal = {name: p.nominal for name, p in sweep.parameters.items()}
     for name, parameter in sweep.parameters.items():
         if not _is_numeric(table, name):
             continue
-        others = [n for n in table.parameters if n != name and n in nominal]
+        other_parameters = [n for n in table.parameters if n != name and n in nominal]
         alone = np.ones(len(table), dtype=bool)
-        for other in others:
-            alone &= table.parameters[other] == nominal[other]
+        for parameter_name in other_parameters:
+            alone &= table.parameters[parameter_name] == nominal[parameter_name]
         alone &= np.isfinite(table.metrics[metric])
         values = np.unique(table.parameters[name][alone].astype(float))
         if len(values) < _CURVE or parameter.nominal is None or float(parameter.nominal) not in values:
@@ -97,8 +97,10 @@ def curves(table: SweepTable, sweep: SweepFile, metric: str) -> list[Curve]:
             for mark, value in parameter.marks.items()
             if value in values
         }
-        found.append(Curve(name, metric, values, mean, spread, mean_change, error, marks, float(parameter.nominal)))
-    return found
+        one_at_a_time_curves.append(
+            Curve(name, metric, values, mean, spread, mean_change, error, marks, float(parameter.nominal))
+        )
+    return one_at_a_time_curves
 
 
 def budget(table: SweepTable, sweep: SweepFile, metric: str, mark: str) -> Budget | None:
@@ -124,12 +126,12 @@ def allowances(found: Sequence[Curve], target: float) -> list[Allowance]:
     The change is a power of the distance from nominal, fitted to the outer half of the curve, where it is largest. The
     error is to first order, from that of the change at the farthest point.
     """
-    each = []
+    allowances_of_curves = []
     for curve in found:
         distance = np.abs(curve.value - curve.nominal)
         outer = (distance >= 0.5 * distance.max()) & (curve.change > 0)
         if outer.sum() < 2 or len(np.unique(distance[outer])) < 2:
-            each.append(Allowance(curve.parameter, np.nan, np.nan, np.nan, np.nan))
+            allowances_of_curves.append(Allowance(curve.parameter, np.nan, np.nan, np.nan, np.nan))
             continue
         power, intercept = np.polyfit(np.log(distance[outer]), np.log(curve.change[outer]), 1)
         bounds = []
@@ -141,13 +143,13 @@ def allowances(found: Sequence[Curve], target: float) -> list[Allowance]:
         last = int(np.flatnonzero(outer)[np.argmax(distance[outer])])
         error = float(curve.error[last] / curve.change[last] / power) if power > 0 else np.nan
         alone, shared = bounds
-        each.append(Allowance(curve.parameter, float(power), alone, shared, error))
-    return each
+        allowances_of_curves.append(Allowance(curve.parameter, float(power), alone, shared, error))
+    return allowances_of_curves
 
 
 def rank_correlations(table: SweepTable, metric: str) -> dict[str, tuple[float, float]]:
     """Return Spearman's rank correlation of a metric with each numeric parameter, and its standard error."""
-    found = {}
+    correlations = {}
     good = np.isfinite(table.metrics[metric])
     for name in table.parameters:
         if not _is_numeric(table, name) or good.sum() < 4:
@@ -156,8 +158,8 @@ def rank_correlations(table: SweepTable, metric: str) -> dict[str, tuple[float, 
         if np.ptp(values) == 0.0 or np.ptp(table.metrics[metric][good]) == 0.0:
             continue
         rho = float(np.corrcoef(rankdata(values), rankdata(table.metrics[metric][good]))[0, 1])
-        found[name] = (rho, float((1.0 - rho**2) / np.sqrt(good.sum() - 1)))
-    return found
+        correlations[name] = (rho, float((1.0 - rho**2) / np.sqrt(good.sum() - 1)))
+    return correlations
 
 
 def summary(table: SweepTable, sweep: SweepFile) -> dict[str, Any]:
@@ -165,12 +167,12 @@ def summary(table: SweepTable, sweep: SweepFile) -> dict[str, Any]:
     marks = list(dict.fromkeys(mark for p in sweep.parameters.values() for mark in p.marks))
     metrics: dict[str, Any] = {}
     for metric in table.metrics:
-        found = curves(table, sweep, metric)
+        metric_curves = curves(table, sweep, metric)
         entry: dict[str, Any] = {
             "range": [float(np.nanmin(table.metrics[metric])), float(np.nanmax(table.metrics[metric]))]
             if np.isfinite(table.metrics[metric]).any()
             else None,
-            "largest_change": {c.parameter: float(c.change[np.nanargmax(np.abs(c.change))]) for c in found},
+            "largest_change": {c.parameter: float(c.change[np.nanargmax(np.abs(c.change))]) for c in metric_curves},
             "rank_correlation": {name: rho for name, (rho, _) in rank_correlations(table, metric).items()},
         }
         for mark in marks:
@@ -185,7 +187,7 @@ def summary(table: SweepTable, sweep: SweepFile) -> dict[str, Any]:
         if sweep.xi_target is not None and metric.startswith("xi"):
             entry["allowance"] = {
                 a.parameter: {"power": a.power, "alone": a.alone, "shared": a.shared, "error": a.error}
-                for a in allowances(found, sweep.xi_target)
+                for a in allowances(metric_curves, sweep.xi_target)
             }
         metrics[metric] = entry
     return {
@@ -213,8 +215,8 @@ def _over_replicas(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 def _metric_at(table: SweepTable, point: dict[str, Any], seed: int, metric: str) -> float:
     """Return the metric of one point; NaN where it was not computed."""
-    here = table.seed == seed
+    matching_rows = table.seed == seed
     for name, value in point.items():
         if name in table.parameters:
-            here &= table.parameters[name] == value
-    return float(table.metrics[metric][here][0]) if here.any() else np.nan
+            matching_rows &= table.parameters[name] == value
+    return float(table.metrics[metric][matching_rows][0]) if matching_rows.any() else np.nan

@@ -178,10 +178,10 @@ def _check(sweep: SweepFile) -> None:
         raise ConfigError("parameters = {}: expected at least one parameter to vary")
     for name, parameter in sweep.parameters.items():
         place = f"parameters.{name}"
-        given = [key for key in ("values", "range", "normal") if getattr(parameter, key) is not None]
-        if len(given) != 1 and not table:
-            found = " and ".join(given) or "none of them"
-            raise ConfigError(f"{place} has {found}: expected one of values, range, normal")
+        stated_keys = [key for key in ("values", "range", "normal") if getattr(parameter, key) is not None]
+        if len(stated_keys) != 1 and not table:
+            stated_text = " and ".join(stated_keys) or "none of them"
+            raise ConfigError(f"{place} has {stated_text}: expected one of values, range, normal")
         if parameter.values is not None and not parameter.values:
             raise ConfigError(f"{place}.values = []: expected at least one value")
         if parameter.range is not None and not parameter.range[0] < parameter.range[1]:

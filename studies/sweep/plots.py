@@ -21,13 +21,15 @@ _PAIRS = 4
 
 def tornado_plot(curves: Mapping[str, Sequence[Curve]]) -> bytes:
     """Draw the change of each metric over the range of each parameter, a panel a metric, the largest on top."""
-    shown = {metric: [c for c in each if np.isfinite(c.change).any()] for metric, each in curves.items()}
-    shown = {metric: each for metric, each in shown.items() if each}
-    tallest = max(len(each) for each in shown.values())
+    shown = {
+        metric: [c for c in metric_curves if np.isfinite(c.change).any()] for metric, metric_curves in curves.items()
+    }
+    shown = {metric: metric_curves for metric, metric_curves in shown.items() if metric_curves}
+    tallest = max(len(metric_curves) for metric_curves in shown.values())
     with styled():
         figure, panels = _panels(len(shown), 2, 5.6, 1.15 + 0.36 * tallest)
-        for axes, (metric, each) in zip(panels.flat, shown.items(), strict=False):
-            _draw_tornado(axes, metric, each)
+        for axes, (metric, metric_curves) in zip(panels.flat, shown.items(), strict=False):
+            _draw_tornado(axes, metric, metric_curves)
         return png_bytes(figure)
 
 
@@ -49,9 +51,9 @@ def _draw_tornado(axes: Axes, metric: str, curves: Sequence[Curve]) -> None:
     names: dict[str, str] = {}
     for row, curve in enumerate(ordered):
         for sign, color in ((-1, _LOW), (1, _HIGH)):
-            here = ((curve.value - curve.nominal) * sign > 0) & np.isfinite(curve.change)
-            if here.any():
-                side, errors = curve.change[here], curve.error[here]
+            on_this_side = ((curve.value - curve.nominal) * sign > 0) & np.isfinite(curve.change)
+            if on_this_side.any():
+                side, errors = curve.change[on_this_side], curve.error[on_this_side]
                 farthest = int(np.argmax(np.abs(side)))
                 axes.barh(row, side[farthest], height=0.62, color=color, alpha=0.75)
                 if np.isfinite(errors[farthest]):
@@ -102,10 +104,10 @@ def curves_plot(curves: Sequence[Curve]) -> bytes:
 
 def pairs_plot(table: SweepTable, metric: str, names: Sequence[str]) -> bytes:
     """Draw one metric over pairs of parameters, a dot a point of the sweep."""
-    chosen = list(names)[:_PAIRS]
+    shown_names = list(names)[:_PAIRS]
     values = table.metrics[metric]
     with styled():
-        n = len(chosen) - 1
+        n = len(shown_names) - 1
         figure = new_figure(2.7 * n + 1.2, 2.5 * n + 0.4)
         grid = figure.subplots(n, n, squeeze=False)
         low, high = np.nanpercentile(values, [2, 98])
@@ -115,12 +117,12 @@ def pairs_plot(table: SweepTable, metric: str, names: Sequence[str]) -> bytes:
                 if j > i:
                     axes.axis("off")
                     continue
-                x, y = (table.parameters[chosen[k]].astype(float) for k in (j, i + 1))
+                x, y = (table.parameters[shown_names[k]].astype(float) for k in (j, i + 1))
                 dots = axes.scatter(x, y, c=values, s=9, cmap="viridis", vmin=low, vmax=high, linewidths=0)
                 if i == n - 1:
-                    axes.set_xlabel(plain_text(chosen[j]))
+                    axes.set_xlabel(plain_text(shown_names[j]))
                 if j == 0:
-                    axes.set_ylabel(plain_text(chosen[i + 1]))
+                    axes.set_ylabel(plain_text(shown_names[i + 1]))
         bar = figure_of(grid[0, 0]).colorbar(dots, ax=grid.ravel().tolist(), fraction=0.03, pad=0.02)
         bar.set_label(metric)
         return png_bytes(figure)
@@ -153,9 +155,9 @@ def correlations_plot(found: Mapping[str, Mapping[str, tuple[float, float]]]) ->
     """Draw the rank correlation of each metric with each parameter of a random design as bars."""
     with styled():
         figure, panels = _panels(len(found), 2, 5.2, 1.0 + 0.34 * max(map(len, found.values())))
-        for axes, (metric, each) in zip(panels.flat, found.items(), strict=False):
-            ordered = sorted(each, key=lambda name: abs(each[name][0]))
-            rho, error = np.array([each[name] for name in ordered]).T
+        for axes, (metric, metric_correlations) in zip(panels.flat, found.items(), strict=False):
+            ordered = sorted(metric_correlations, key=lambda name: abs(metric_correlations[name][0]))
+            rho, error = np.array([metric_correlations[name] for name in ordered]).T
             colors = [_HIGH if r > 0 else _LOW for r in rho]
             axes.barh(range(len(ordered)), rho, xerr=error, height=0.62, color=colors, alpha=0.75, ecolor="0.3")
             axes.set_yticks(range(len(ordered)), [plain_text(name) for name in ordered])

@@ -136,6 +136,6 @@ def check_sweep(sweep: SweepFile, points: list[SweepPoint], folder: Path) -> Non
 
 
 def _set_value(content: dict[str, Any], path: list[str], value: Any) -> None:
-    for part in path[:-1]:
-        content = content.setdefault(part, {})
+    for key in path[:-1]:
+        content = content.setdefault(key, {})
     content[path[-1]] = value

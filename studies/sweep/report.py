@@ -56,7 +56,7 @@ def sweep_pictures(table: SweepTable, sweep: SweepFile) -> list[tuple[str, Pictu
     """Return the plots for the design of a sweep, with the names of their files."""
     # Correlations first: they are the purpose of most sweeps.
     drawn = {m: curves(table, sweep, m) for m in sorted(table.metrics, key=lambda m: (not m.startswith("xi"), m))}
-    drawn = {metric: each for metric, each in drawn.items() if each}
+    drawn = {metric: metric_curves for metric, metric_curves in drawn.items() if metric_curves}
     pictures = list(_one_at_a_time(table, sweep, drawn)) if drawn else []
     numeric = [n for n, v in table.parameters.items() if v.dtype.kind in "fi" and len(np.unique(v)) > 2]
     if sweep.design.kind != "one_at_a_time" and len(table) >= _ENOUGH and numeric:
@@ -80,15 +80,15 @@ def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Cu
     marks = list(dict.fromkeys(mark for p in sweep.parameters.values() for mark in p.marks))
     correlated = [m for m in drawn if m.startswith("xi")]
     for metric in correlated:
-        found = [b for mark in marks if (b := budget(table, sweep, metric, mark)) is not None]
-        if found:
-            picture = Picture(f"Error budget of {metric}", plots.budget_plot(found), _budget_text(found))
+        budgets = [b for mark in marks if (b := budget(table, sweep, metric, mark)) is not None]
+        if budgets:
+            picture = Picture(f"Error budget of {metric}", plots.budget_plot(budgets), _budget_text(budgets))
             yield f"budget_{metric}", picture
     if sweep.xi_target is not None:
         # A metric that no parameter raises, such as xi of a single CCD, cannot be drawn on logarithmic axes.
         for metric in (m for m in correlated if any(np.any(curve.change > 0) for curve in drawn[m])):
             allowed = allowances(drawn[metric], sweep.xi_target)
-            each = (f"{a.parameter}: {with_error(a.alone, a.error * a.alone)} alone, "
+            allowance_texts = (f"{a.parameter}: {with_error(a.alone, a.error * a.alone)} alone, "
                     f"{with_error(a.shared, a.error * a.shared)} with an equal share"
                     for a in allowed if np.isfinite(a.alone))  # fmt: skip
             title = f"Allowance of each term for {metric} below {sweep.xi_target:g}"
@@ -97,7 +97,7 @@ def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Cu
                 f"{_defined(metric)} Distance of each parameter from nominal that raises it by the target (diamonds), "
                 "or by an equal share of it, with the standard error over the replicas. Power: exponent of the change "
                 "against the distance. "
-                + ("; ".join(each) or "No term reaches the target within twice its range")
+                + ("; ".join(allowance_texts) or "No term reaches the target within twice its range")
                 + "."
             )
             yield f"allowance_{metric}", Picture(title, plot, text)
@@ -112,14 +112,16 @@ def _defined(metric: str) -> str:
 def _budget_text(found: list[Budget]) -> str:
     """Return a sentence on the sum of the effects at each mark."""
     texts = []
-    for one in found:
-        if np.isfinite(one.together) and one.total:
-            apart = abs(one.together - one.total)
+    for effects in found:
+        if np.isfinite(effects.together) and effects.total:
+            apart = abs(effects.together - effects.total)
             # Equal within two standard errors, or a tenth for one replica.
-            same = apart < (2.0 * one.together_error if np.isfinite(one.together_error) else 0.1 * abs(one.total))
+            same = apart < (
+                2.0 * effects.together_error if np.isfinite(effects.together_error) else 0.1 * abs(effects.total)
+            )
             texts.append(
-                f"{one.mark}: single effects sum to {with_digits(one.total, one.together_error)}, all at once make "
-                f"{with_error(one.together, one.together_error)}: "
+                f"{effects.mark}: single effects sum to {with_digits(effects.total, effects.together_error)}, all at "
+                f"once make {with_error(effects.together, effects.together_error)}: "
                 + ("they add, as far as this tells." if same else "they do not simply add.")
             )
     return (
@@ -130,7 +132,7 @@ def _budget_text(found: list[Budget]) -> str:
 
 def _random_pictures(table: SweepTable, numeric: list[str]) -> Iterator[tuple[str, Picture]]:
     ranks = {metric: rank_correlations(table, metric) for metric in table.metrics}
-    ranks = {metric: each for metric, each in ranks.items() if each}
+    ranks = {metric: metric_ranks for metric, metric_ranks in ranks.items() if metric_ranks}
     if not ranks:
         return
     text = "Spearman's rank correlation of each metric with each parameter, all of them varied at once."
@@ -153,8 +155,8 @@ def _metric_rows(table: SweepTable, sweep: SweepFile) -> list[dict[str, str]]:
         if not np.isfinite(values).any():
             continue
         spreads = [c.spread[np.isfinite(c.spread)] for c in curves(table, sweep, name)]
-        known = np.concatenate([np.empty(0), *spreads])
-        scatter = float(np.median(known)) if known.size else np.nan
+        finite_values = np.concatenate([np.empty(0), *spreads])
+        scatter = float(np.median(finite_values)) if finite_values.size else np.nan
         low, middle, high = (float(f(values)) for f in (np.nanmin, np.nanmedian, np.nanmax))
         texts = {"low": low, "median": middle, "high": high}
         rows.append(

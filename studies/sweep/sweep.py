@@ -20,8 +20,10 @@ from .store import PointResult, SweepPoint, check_same_sweep, open_store
 
 #: More points than this are a mistake: at a second each they would take a year.
 MOST_POINTS = 30_000_000
-# Size of a point in the store [bytes], and in memory while the design is made.
-_BYTES_ON_DISK, _BYTES_IN_MEMORY = 1500, 2500
+# Size of a point in the store [bytes].
+_BYTES_ON_DISK = 1500
+# Size of a point in memory while the design is made [bytes].
+_BYTES_IN_MEMORY = 2500
 
 
 @dataclass(frozen=True)
@@ -86,18 +88,19 @@ def run_sweep(
         store.forget_problems()
         finished = store.finished()
         points = store.points()
-        missing = [p for p in points if p.number not in finished]
+        unfinished_points = [p for p in points if p.number not in finished]
         if finished:
             execution.reporter.line(f"{len(finished)} of {len(points)} points are there already")
-        if missing:
-            labels, title = [point.label for point in missing], f"{sweep.name}: {len(missing)} points"
+        if unfinished_points:
+            labels = [point.label for point in unfinished_points]
+            title = f"{sweep.name}: {len(labels)} points"
             compute = PointMeasurement(sweep, place)
-            with execution.results(compute, labels, missing, title=title, save=save) as results:
+            with execution.results(compute, labels, unfinished_points, title=title, save=save) as results:
                 for result in results:
                     if result.problem is not None:
                         execution.reporter.line(f"point {result.number}: {result.problem}")
         failed = sum(result.problem is not None for result in store.results())
-    return SweepOutcome(path, len(points), len(finished), len(missing), failed)
+    return SweepOutcome(path, len(points), len(finished), len(unfinished_points), failed)
 
 
 def numbered_points(sweep: SweepFile, folder: Path) -> list[SweepPoint]:
@@ -127,13 +130,13 @@ def check_room(sweep: SweepFile, path: Path) -> None:
         raise ProductError(f"{place}: {error.strerror}") from None
     # What has no size, such as /proc, is not full: the first write says what is wrong with it.
     disk = usage.free if usage.total else None
-    for kind, need, there in (
+    for kind, need, free in (
         ("memory", count * _BYTES_IN_MEMORY, available_bytes()),
         ("disk", count * _BYTES_ON_DISK, disk),
     ):
-        if there is not None and need > 0.8 * there:
+        if free is not None and need > 0.8 * free:
             raise ConfigError(
-                f"sweep {sweep.name}: {count:,} points take about {readable(need)} of {kind}, {readable(there)} are "
+                f"sweep {sweep.name}: {count:,} points take about {readable(need)} of {kind}, {readable(free)} are "
                 "free: expected fewer points"
             )
     if count > MOST_POINTS:

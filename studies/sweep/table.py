@@ -186,8 +186,8 @@ def described_parameter(name: str) -> Description:
     if not text:
         # The address of a value of the prescription, or the motion of a part of the camera.
         body, _, quantity = name.rpartition(".")
-        what, unit = quantity.removesuffix(f"_{_unit(name)}"), _unit(name)
-        text = f"change of {body}: {_CHANGES[what]}" if what in _CHANGES else f"change of {what} of {body}"
+        motion, unit = quantity.removesuffix(f"_{_unit(name)}"), _unit(name)
+        text = f"change of {body}: {_CHANGES[motion]}" if motion in _CHANGES else f"change of {motion} of {body}"
         return Description(unit, text)
     return Description(_unit(name), text)
 

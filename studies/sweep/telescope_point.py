@@ -45,7 +45,7 @@ def point_metrics(sweep: SweepFile, parameters: dict[str, Any], folder: Path, th
     solved = {}
     if sweep.compensators:
         chosen = [parse_change(telescope, name, "compensators") for name in sweep.compensators]
-        found = optimize(
+        optimum = optimize(
             telescope,
             [parameter for parameter, _ in chosen],
             "spots",
@@ -55,8 +55,8 @@ def point_metrics(sweep: SweepFile, parameters: dict[str, Any], folder: Path, th
             solver=LeastSquares(_TOLERANCE),
             threads=threads,
         )
-        telescope = found.telescope
-        for name, change, (_, size) in zip(sweep.compensators, found.changes, chosen, strict=True):
+        telescope = optimum.telescope
+        for name, change, (_, size) in zip(sweep.compensators, optimum.changes, chosen, strict=True):
             solved[f"solved {name}"] = float(change / size)
     scene = TelescopeScene(telescope, fields, waves, threads)
     metrics: dict[str, float] = {}

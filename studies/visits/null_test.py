@@ -84,23 +84,25 @@ def null_test(
     reach = REACH * float(cell / np.sqrt(config.visits.places))
     source = config.galaxy_source(experiment, Exposure.of_run(experiment, gain=1.0, pixel_scale=scale))
     make_folder(folder / "galaxies")
-    found = {}
+    tests = {}
     for visits in config.kept:
         stamp = Stamp(config.galaxies_digest(experiment, stack=visits), seed)
         stack = PsfStack.read(stack_path(folder, visits), Stamp(config.digest(experiment), seed))
         exposure = Exposure.of_run(experiment, visits, gain=1.0, pixel_scale=scale)
         galaxies_in = source.down_to(faintest := stack_limit(experiment, FAINTEST_SNR, visits))
-        chosen = _covered_tiles(stack, cell, config.visits.places)[:tiles]
-        if not chosen:
+        covered_tiles = _covered_tiles(stack, cell, config.visits.places)[:tiles]
+        if not covered_tiles:
             raise DomainError(f"{folder}: no part of the sky as large as a CCD was seen by half of {visits} visits")
-        paths = {(i, j): folder / "galaxies" / f"visits_{visits:04d}_tile_{i:+03d}_{j:+03d}.fits" for i, j in chosen}
+        paths = {
+            (i, j): folder / "galaxies" / f"visits_{visits:04d}_tile_{i:+03d}_{j:+03d}.fits" for i, j in covered_tiles
+        }
         finished = execution.finished(paths, stamp)
-        todo = [tile for tile in chosen if tile not in finished]
+        todo = [tile for tile in covered_tiles if tile not in finished]
         depth = _StackMeasurement(stack, frame.matrix, exposure, galaxies_in, seed, cell, reach)
         with execution.results(
             measure_job,
             [*(paths[tile].stem for tile in todo), *(f"ring {k}, shear {sign:+.0f}" for k, sign in _RING_JOBS)],
-            depth.jobs(todo, chosen, rings),
+            depth.jobs(todo, covered_tiles, rings),
             title=f"galaxies in {visits} visits",
         ) as results:
             for tile in todo:
@@ -108,16 +110,16 @@ def null_test(
             measured_rings = list(results)
         # Read from the files, as by a resumed test, so that both have the same numbers.
         parts = [_read_shapes(path, stamp) for path in paths.values()]
-        if (n := sum(int(part.usable_twice.sum()) for part in parts)) < 2:
+        if (n := sum(int(shapes.usable_twice.sum()) for shapes in parts)) < 2:
             text = f"{n} of {sum(map(len, parts))} galaxies to magnitude {faintest:.2f} are usable in {visits} visits"
             raise DomainError(f"{folder}: {text}; expected two or more, of the galaxies of {CONFIG_NAME}")
-        bias = _calibration(frame.matrix, len(depth.ring_galaxies(chosen, rings)), measured_rings)
+        bias = _calibration(frame.matrix, len(depth.ring_galaxies(covered_tiles, rings)), measured_rings)
         with execution.reporter.stage(f"correlations in {visits} visits"):
-            area = len(chosen) * (cell / ARCMIN) ** 2
-            found[visits] = NullTest.of(visits, parts, area, bias, psf_leakage(stack, parts))
-    write_json(folder / "null_test.json", {"stacks": {str(n): null_metrics(r) for n, r in found.items()}})
-    write_pictures(folder, found)
-    return found
+            area = len(covered_tiles) * (cell / ARCMIN) ** 2
+            tests[visits] = NullTest.of(visits, parts, area, bias, psf_leakage(stack, parts))
+    write_json(folder / "null_test.json", {"stacks": {str(n): null_metrics(r) for n, r in tests.items()}})
+    write_pictures(folder, tests)
+    return tests
 
 
 def write_pictures(folder: Path, results: dict[int, NullTest]) -> None:
@@ -128,11 +130,11 @@ def write_pictures(folder: Path, results: dict[int, NullTest]) -> None:
 
 def _covered_tiles(stack: PsfStack, cell: float, places: int) -> list[tuple[int, int]]:
     """Return the tiles in which at least three quarters of the places are known, from the pointing outwards."""
-    own = ~stack.star
-    corner = np.floor(np.stack([stack.xi, stack.eta], axis=1)[own] / cell + 0.5).astype(int)
+    is_place = ~stack.star
+    corner = np.floor(np.stack([stack.xi, stack.eta], axis=1)[is_place] / cell + 0.5).astype(int)
     tiles, count = np.unique(corner, axis=0, return_counts=True)
-    known = [(int(i), int(j)) for (i, j), n in zip(tiles, count, strict=True) if n >= 0.75 * places]
-    return sorted(known, key=lambda tile: (tile[0] ** 2 + tile[1] ** 2, tile))
+    covered_tiles = [(int(i), int(j)) for (i, j), n in zip(tiles, count, strict=True) if n >= 0.75 * places]
+    return sorted(covered_tiles, key=lambda tile: (tile[0] ** 2 + tile[1] ** 2, tile))
 
 
 def _tile_ranges(tile: tuple[int, int], cell: float) -> list[tuple[float, float]]:
@@ -210,18 +212,18 @@ def _shear_along_diagonal(n: int) -> np.ndarray:
 def _calibration(axes: np.ndarray, n: int, measured: list[GalaxyShapes]) -> dict[str, ShearCalibration]:
     """Return the biases of the shear from n rings of galaxies, each under a shear and its opposite, with one noise."""
     along = {kind: np.full((2, n, _ORIENTATIONS), np.nan + 0j) for kind in ("model", "true")}
-    for (k, sign), found in zip(_RING_JOBS, measured, strict=True):
+    for (k, sign), shapes in zip(_RING_JOBS, measured, strict=True):
         for kind, prefix in (("model", ""), ("true", "true_")):
-            e1, e2, usable = (getattr(found, prefix + name) for name in ("e1", "e2", "usable"))
-            along[kind][int(sign < 0.0), found.index[usable], k] = (e1 + 1j * e2)[usable]
+            e1, e2, usable = (getattr(shapes, prefix + name) for name in ("e1", "e2", "usable"))
+            along[kind][int(sign < 0.0), shapes.index[usable], k] = (e1 + 1j * e2)[usable]
     # Ellipticities are along the axes of the stack, the shear along those of the sky.
     return {kind: shear_bias(e, ellipticity_along(axes, SHEAR * _shear_along_diagonal(n))) for kind, e in along.items()}
 
 
 def ellipticity_along(axes: np.ndarray, e: np.ndarray) -> np.ndarray:
     """Return ellipticities e1 + i e2 along xi, eta in the axes of the stack, rotated or mirrored by a matrix."""
-    seen = e if np.linalg.det(axes) > 0.0 else np.conj(e)
-    return np.asarray(seen * np.exp(2j * np.arctan2(axes[1, 0], axes[0, 0])))
+    along_sky = e if np.linalg.det(axes) > 0.0 else np.conj(e)
+    return np.asarray(along_sky * np.exp(2j * np.arctan2(axes[1, 0], axes[0, 0])))
 
 
 _COLUMNS = {
@@ -251,5 +253,5 @@ def write_shapes(path: Path, galaxies: GalaxyShapes, stamp: Stamp) -> None:
 def _read_shapes(path: Path, stamp: Stamp) -> GalaxyShapes:
     """Return the galaxies of a finished tile; ProductError for a damaged one or one of another configuration."""
     hdus = read_fits(path, stamp)
-    found = {name: column(hdus["GALAXIES"], name.upper()) for name in _COLUMNS}
-    return GalaxyShapes(**{n: v * _COLUMNS[n][0] if _COLUMNS[n][0] != 1.0 else v for n, v in found.items()})
+    columns = {name: column(hdus["GALAXIES"], name.upper()) for name in _COLUMNS}
+    return GalaxyShapes(**{n: v * _COLUMNS[n][0] if _COLUMNS[n][0] != 1.0 else v for n, v in columns.items()})

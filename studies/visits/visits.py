@@ -134,9 +134,9 @@ def stack_visits(
             sums.write(folder / SUMS_NAME, stamp)
     stacks = {n: PsfStack.read(stack_path(folder, n), stamp) for n in config.kept}
     with reporter.stage("correlations"):
-        found = {n: stack_correlations(stack, cell_of(experiment, frame)) for n, stack in stacks.items()}
-    summary = _write_products(folder, config, stamp, visits, stacks, found)
-    return StackResult(folder, stacks, found, summary)
+        correlated = {n: stack_correlations(stack, cell_of(experiment, frame)) for n, stack in stacks.items()}
+    summary = _write_products(folder, config, stamp, visits, stacks, correlated)
+    return StackResult(folder, stacks, correlated, summary)
 
 
 def compute_visit(
@@ -151,8 +151,8 @@ def compute_visit(
 
 def _left_out_line(reasons: dict[str, str]) -> str:
     """Return one line on the CCDs of a visit that cannot be modelled, such as those at the edge of the stars."""
-    (name, reason), *others = reasons.items()
-    if not others:
+    (name, reason), *other_reasons = reasons.items()
+    if not other_reasons:
         return f"CCD {name} is left out, it cannot be modelled: {reason}"
     return f"{len(reasons)} CCDs are left out, they cannot be modelled; CCD {name}: {reason}"
 

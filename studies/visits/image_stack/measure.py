@@ -42,9 +42,12 @@ MATCH_RADIUS = 3.0
 #: Of the pixels of an object [standard deviations]: at 3, one in six of the galaxies that are usable on stamps of their
 #: own has no five pixels above it. Detected noise has no ellipticity that is known well enough to be used.
 _THRESHOLD = 1.5
-#: S/N in one visit of the objects that determine the locus of stars, the fewest of them, and the range of their
-#: half-light radii over those of the PSFs of the models.
-_BRIGHT_SNR, _FEWEST_STARS, _RADII = 45.0, 5, (0.9, 1.1)
+#: S/N in one visit of the objects that determine the locus of stars.
+_BRIGHT_SNR = 45.0
+#: The fewest objects that determine the locus of stars.
+_FEWEST_STARS = 5
+#: Range of the half-light radii of stars over those of the PSFs of the models.
+_RADII = (0.9, 1.1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +132,10 @@ def measure_stack(
             path = stack.folder / f"galaxies_{visits:04d}_tile_{tile.name}.fits"
             write_shapes(path, measured.galaxies, stack.stamp)
             tiles[visits].append(measured)
-    found = {visits: tile_metrics(own) | {"left_out": left_out[visits]} for visits, own in tiles.items()}
+    found = {
+        visits: tile_metrics(measured_tiles) | {"left_out": left_out[visits]}
+        for visits, measured_tiles in tiles.items()
+    }
     tests = null_tests(tiles)
     for visits, result in tests.items():
         found[visits]["null_test"] = null_metrics(result)
@@ -142,9 +148,11 @@ def measure_stack(
 def null_tests(tiles: dict[int, list[MeasuredTile]]) -> dict[int, NullTest]:
     """Return the null test of the galaxies on the images, by number of visits, of stacks with pairs of galaxies."""
     return {
-        visits: NullTest.of(visits, [tile.galaxies for tile in own], sum(tile.area for tile in own))
-        for visits, own in tiles.items()
-        if sum(int(tile.galaxies.usable_twice.sum()) for tile in own) >= 2
+        visits: NullTest.of(
+            visits, [tile.galaxies for tile in measured_tiles], sum(tile.area for tile in measured_tiles)
+        )
+        for visits, measured_tiles in tiles.items()
+        if sum(int(tile.galaxies.usable_twice.sum()) for tile in measured_tiles) >= 2
     }
 
 
@@ -191,14 +199,14 @@ def measure_tile(
             np.where(image.mask == 0, variance, 1.0),
             objects.x[rows],
             objects.y[rows],
-            broadened(known[places], transfer),
+            broadened(psf_images[places], transfer),
             psf_index=nearest[rows],
             half_light_radius=objects.half_light_radius[rows],
             mask=image.mask,
             segmentation=objects.segmentation,
             threads=threads,
         )
-        for known in (psfs.model, psfs.true)
+        for psf_images in (psfs.model, psfs.true)
     ]
     usable = [usable_galaxies(fit, objects.half_light_radius[rows], stars.half_light_radius) for fit in fits]
     match = match_positions(objects.x, objects.y, truth["X"], truth["Y"], MATCH_RADIUS)[rows]
@@ -224,10 +232,10 @@ def measure_tile(
     drawn = np.flatnonzero(true.magnitude <= stack_limit(stack.experiment, FAINTEST_SNR, psfs.visits))
     stamps = measure_galaxies(psfs, axes, true.take(drawn), exposure, stack.stamp.seed, *key, **options)
     stamps = replace(stamps, index=drawn[stamps.index])
-    both = np.intersect1d(galaxies.index[galaxies.usable], stamps.index[stamps.usable])
+    usable_on_both = np.intersect1d(galaxies.index[galaxies.usable], stamps.index[stamps.usable])
     silent = replace(exposure, noise=False)
-    noise_free = measure_galaxies(psfs, axes, true.take(both), silent, stack.stamp.seed, *key, **options)
-    noise_free = replace(noise_free, index=both[noise_free.index])
+    noise_free = measure_galaxies(psfs, axes, true.take(usable_on_both), silent, stack.stamp.seed, *key, **options)
+    noise_free = replace(noise_free, index=usable_on_both[noise_free.index])
     area = float((image.mask == 0).sum()) * (scale / ARCMIN) ** 2
     return MeasuredTile(galaxies, stamps, noise_free, area, _star_metrics(stars, psfs, transfer, stack, tile))
 
@@ -256,11 +264,11 @@ def _star_metrics(
 ) -> dict[str, float]:
     """Return how the selected stars differ from the true PSFs of the stack at them."""
     scale = pixel_scale_of(stack.frame)
-    known = np.flatnonzero(psfs.star)
-    places = np.stack([psfs.x, psfs.y], axis=1)[known] / scale - tile.first
+    star_rows = np.flatnonzero(psfs.star)
+    places = np.stack([psfs.x, psfs.y], axis=1)[star_rows] / scale - tile.first
     match = match_positions(stars.positions[:, 0], stars.positions[:, 1], places[:, 0], places[:, 1], MATCH_RADIUS)
     real = match >= 0
-    rows = known[match[real]]
+    rows = star_rows[match[real]]
     shapes, true = (
         measure_shapes(stamps, scale, stack.experiment.weight_fwhm)
         for stamps in (stars.stamps[real], broadened(psfs.true[rows], transfer))
@@ -313,23 +321,23 @@ def tile_metrics(tiles: list[MeasuredTile]) -> dict[str, Any]:
 def _paired_ellipticities(tile: MeasuredTile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return complex ellipticities on image and stamp, and without noise, of galaxies that are usable on all."""
     n = 1 + max((int(s.index.max(initial=-1)) for s in (tile.stamps, tile.noise_free, tile.galaxies)), default=-1)
-    found = []
+    ellipticities = []
     for shapes, prefix in ((tile.galaxies, ""), (tile.stamps, ""), (tile.noise_free, "true_")):
         e = np.full(n, np.nan + 0j)
         rows = getattr(shapes, f"{prefix}usable") & (shapes.index >= 0)
         e[shapes.index[rows]] = (getattr(shapes, f"{prefix}e1") + 1j * getattr(shapes, f"{prefix}e2"))[rows]
-        found.append(e)
-    own = np.isfinite(np.sum(found, axis=0))
-    image, stamp, reference = (e[own] for e in found)
+        ellipticities.append(e)
+    measured_thrice = np.isfinite(np.sum(ellipticities, axis=0))
+    image, stamp, reference = (e[measured_thrice] for e in ellipticities)
     return image, stamp, reference
 
 
 def _loss_counts(tile: MeasuredTile) -> tuple[int, int]:
     """Count the galaxies usable on stamps that are not detected, or not usable, on the image."""
-    wanted = tile.stamps.index[tile.stamps.usable]
-    there = np.isin(wanted, tile.galaxies.index)
-    good = np.isin(wanted, tile.galaxies.index[tile.galaxies.usable])
-    return int((~there).sum()), int((there & ~good).sum())
+    usable_on_stamps = tile.stamps.index[tile.stamps.usable]
+    detected = np.isin(usable_on_stamps, tile.galaxies.index)
+    good = np.isin(usable_on_stamps, tile.galaxies.index[tile.galaxies.usable])
+    return int((~detected).sum()), int((detected & ~good).sum())
 
 
 def _response_slope(e: np.ndarray, reference: np.ndarray) -> tuple[float | None, float | None]:

@@ -71,7 +71,7 @@ def stack_images(
     # Before the settings are written, so that others can be tried.
     _check_memory(stack, threads, 1)
     _check_room(stack)
-    claim_stack(stack.folder, settings, resume=execution.resume)
+    claim_stack(stack.folder, stack.settings, resume=execution.resume)
     plan = stack.plan
     sums = {tile: _sums_so_far(stack, tile, execution.resume) for tile in stack.tiles}
     done = min(s.visits for s in sums.values())
@@ -118,19 +118,19 @@ def draw_visit(
     visit, experiment, wcs, tiles = job
     reporter = reporter or Reporter(quiet=True)
     reporter.line(f"{visit.label}, {visit}")
-    touched = {name: window_on(tiles, stack.frame, own) for name, own in wcs.items()}
+    touched = {name: window_on(tiles, stack.frame, ccd_wcs) for name, ccd_wcs in wcs.items()}
     windows = {name: window for name, window in touched.items() if window is not None}
     exposure, sums = stack.exposure(), {tile: TileSums.empty(tile.side) for tile in tiles}
     bar = reporter.stage(f"images of {len(windows)} CCDs", total=len(windows))
     with experiment.screens(threads, reporter), bar as stage:
         for i, (name, window) in enumerate(windows.items(), start=1):
-            seen, depth = wcs[name], stack.visits.visits.count
+            visit_wcs, depth = wcs[name], stack.visits.visits.count
             with error_context(subject=f"CCD {name}"):
                 exposed = visit_image(
-                    experiment, visit, name, seen, stack.sky, exposure, window, depth=depth, threads=threads
+                    experiment, visit, name, visit_wcs, stack.sky, exposure, window, depth=depth, threads=threads
                 )
             for tile in tiles:
-                add_resampled(sums[tile], tile, stack.frame, exposed, window, seen, threads=threads)
+                add_resampled(sums[tile], tile, stack.frame, exposed, window, visit_wcs, threads=threads)
             stage.advance()
             stage.step(name, i, len(windows))
     return sums
@@ -157,8 +157,8 @@ def _write_image(stack: ImageStack, tile: Tile, sums: TileSums) -> None:
     image, variance, mask = sums.stacked()
     objects = _truth_table(stack, tile, wcs, exposure)
     name = f"tile {tile.name}"
-    found = CcdImage(name, image, variance, mask, header, objects, stack.stamp, STACK_MASK_BITS)
-    found.write(stack.path(sums.visits, tile))
+    stacked_image = CcdImage(name, image, variance, mask, header, objects, stack.stamp, STACK_MASK_BITS)
+    stacked_image.write(stack.path(sums.visits, tile))
 
 
 def galaxies_on(sky: Sky, tile: Tile, wcs: CcdWcs) -> Any:
@@ -221,8 +221,8 @@ def _check_room(stack: ImageStack) -> None:
     # Sums, one of them twice while it is replaced, and the stacks that are kept.
     needed = tile * (tiles + 1 + tiles * len(stack.visits.kept))
     free = shutil.disk_usage(stack.folder.parent).free
-    there = sum(path.stat().st_size for path in stack.folder.glob("*.fits"))
-    if needed - there > free:
+    bytes_on_disk = sum(path.stat().st_size for path in stack.folder.glob("*.fits"))
+    if needed - bytes_on_disk > free:
         raise DomainError(f"{stack.folder}: the stacks need {readable(needed)} of disk, {readable(free)} are free")
 
 
@@ -232,8 +232,8 @@ def _check_memory(stack: ImageStack, threads: int | None, processes: int) -> Non
     # In each process a CCD that is drawn, or a tile that is written, and the sums of a visit. Here the sums, and those
     # of visits that workers have sent.
     largest = max(tile_side(stack.experiment.camera), stack.tiles[0].side)
-    each = needed_bytes(stack.experiment, threads) + BYTES_PER_PIXEL * largest**2 + sums
-    require_bytes(processes * each + sums * (1 + JOBS_AHEAD * processes * (processes != 1)), "images")
+    bytes_per_process = needed_bytes(stack.experiment, threads) + BYTES_PER_PIXEL * largest**2 + sums
+    require_bytes(processes * bytes_per_process + sums * (1 + JOBS_AHEAD * processes * (processes != 1)), "images")
 
 
 def _tile_bytes(stack: ImageStack) -> int:
