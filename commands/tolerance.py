@@ -96,10 +96,11 @@ def _show(summary: dict[str, Any]) -> None:
     unit = f" [{summary['unit']}]" if summary["unit"] else ""
     plain = f" {summary['unit']}" if summary["unit"] else ""
     rows = []
-    for one in summary["worst_offenders"][:_SHOWN]:
-        size_unit = "" if one["unit"] == "1" else f" {one['unit']}"
-        ends = number_texts([one["lower_end"], one["upper_end"]], ".5g")
-        rows.append((one["name"], f"{one['size']:.4g}{size_unit}", *ends, f"{one['size_for_the_loss']:.4g}{size_unit}"))
+    for tolerance in summary["worst_offenders"][:_SHOWN]:
+        size_unit = "" if tolerance["unit"] == "1" else f" {tolerance['unit']}"
+        ends = number_texts([tolerance["lower_end"], tolerance["upper_end"]], ".5g")
+        sizes = [f"{tolerance[key]:.4g}{size_unit}" for key in ("size", "size_for_the_loss")]
+        rows.append((tolerance["name"], sizes[0], *ends, sizes[1]))
     headings = ("tolerance", "size", f"lower end{unit}", f"upper end{unit}", f"{summary['loss_percent']:g} % loss at")
     caption = f"The costliest of {summary['tolerances']}; as designed {summary['nominal']:.5g}{plain}."
     Rows(headings, rows, caption).show()
@@ -107,8 +108,6 @@ def _show(summary: dict[str, Any]) -> None:
     lost = f"; {summary['lost']} without light" if summary["lost"] else ""
     print_line(f"{summary['draws']} telescopes, {summary['method']}: reached by {reached}{plain}{lost}")
     if "yield" in summary:
-        found = summary["yield"]
-        interval = f"{100 * found['low']:.1f} to {100 * found['high']:.1f} %"
-        print_line(
-            f"requirement {summary['requirement']:g}{plain}: met by {100 * found['fraction']:.1f} % ({interval})"
-        )
+        met = summary["yield"]
+        interval = f"{100 * met['low']:.1f} to {100 * met['high']:.1f} %"
+        print_line(f"requirement {summary['requirement']:g}{plain}: met by {100 * met['fraction']:.1f} % ({interval})")

@@ -15,12 +15,14 @@ def with_elements(telescope: Telescope) -> tuple[Telescope, tuple[str, ...]]:
     telescope has, or a new one: L1, L2...
     """
     groups = dict(telescope.groups)
-    known = {members: name for name, members in groups.items()}
+    group_names = {members: name for name, members in groups.items()}
     names = []
     for members in element_groups(telescope.surfaces, telescope.medium_before).values():
-        if members not in known:
-            taken = {*groups, *telescope.surface_names}
-            known[members] = next(name for i in range(1, len(taken) + 2) if (name := f"L{i}") not in taken)
-            groups[known[members]] = members
-        names.append(known[members])
+        if members not in group_names:
+            used_names = {*groups, *telescope.surface_names}
+            group_names[members] = next(
+                name for i in range(1, len(used_names) + 2) if (name := f"L{i}") not in used_names
+            )
+            groups[group_names[members]] = members
+        names.append(group_names[members])
     return replace(telescope, groups=groups), tuple(names)

@@ -17,7 +17,7 @@ def inverse_plot(study: ToleranceStudy) -> bytes:
     """Draw the size that costs the stated loss over the size of each of the costliest tolerances."""
     shown = study.offenders[:SHOWN][::-1]
     ratio = study.inverse[shown] / np.array([study.tolerances[i].size for i in shown])
-    known = np.isfinite(ratio)
+    finite = np.isfinite(ratio)
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     with styled():
@@ -25,8 +25,8 @@ def inverse_plot(study: ToleranceStudy) -> bytes:
         axes = figure.subplots()
         rows = np.arange(len(shown))
         colors = np.where(ratio < 1.0, RED, BLUE)
-        axes.barh(rows[known], ratio[known] - 1.0, left=1.0, height=0.6, color=colors[known], alpha=0.8)
-        for row in rows[~known]:
+        axes.barh(rows[finite], ratio[finite] - 1.0, left=1.0, height=0.6, color=colors[finite], alpha=0.8)
+        for row in rows[~finite]:
             axes.text(1.0, row, " no size costs as much", va="center", fontsize=7)
         name_rows(axes, study, shown)
         axes.set_xscale("log")
@@ -72,8 +72,8 @@ def yield_plot(study: ToleranceStudy) -> bytes:
         axes.fill_between(scale * at, *limits, color=BLUE, alpha=0.2, linewidth=0, label="binomial, 1 sigma")
         axes.axvline(scale * study.nominal, color=GREY, linestyle=(0, (4, 2)), linewidth=0.9, label="as designed")
         if study.requirement is not None:
-            found = study.yield_at(study.requirement)
-            label = f"requirement: {100 * found.fraction:.1f} % ({100 * found.low:.1f} to {100 * found.high:.1f})"
+            met = study.yield_at(study.requirement)
+            label = f"requirement: {100 * met.fraction:.1f} % ({100 * met.low:.1f} to {100 * met.high:.1f})"
             axes.axvline(scale * study.requirement, color=ORANGE, linewidth=1.2, label=label)
         axes.set_xlabel(f"requirement on the {study.criterion.title}{merit_unit(study)}")
         axes.set_ylabel("telescopes that meet it [%]")
