@@ -11,9 +11,10 @@ from typer import Argument, Option
 from ..core.file_names import file_name
 from ..core.terminal import print_line
 from .inputs import errors_of, load_model
+from .interrupt import interruptible
 from .options import GlassCatalogues, Json, Lenient, Model, Quiet, Threads
 from .tables import Rows, number_texts, print_json
-from .workers import DaskWorkers, Processes, Scheduler, long_work
+from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
 
 app = typer.Typer()
 #: Tolerances in the table, the costliest.
@@ -66,12 +67,18 @@ def tolerance_command(
     make_folder(folder)
     resumed = f"go on with: pachon tolerance {model} {tolerances} -o {folder} --resume"
     with (
-        long_work(
-            quiet, resumed, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
-        ) as execution,
+        interruptible(quiet, resumed) as reporter,
+        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
         errors_of(tolerances),
     ):
-        study = run_tolerances(telescope, file, folder / "points.tolerance", execution=execution)
+        study = run_tolerances(
+            telescope,
+            file,
+            folder / "points.tolerance",
+            resume=resume,
+            workers=maker,
+            reporter=reporter,
+        )
     write_tolerances(study, file, folder)
     summary = tolerance_summary(study)
     if as_json:
@@ -89,17 +96,11 @@ def _show(summary: dict[str, Any]) -> None:
     unit = f" [{summary['unit']}]" if summary["unit"] else ""
     plain = f" {summary['unit']}" if summary["unit"] else ""
     rows = []
-    for offender in summary["worst_offenders"][:_SHOWN]:
-        size_unit = "" if offender["unit"] == "1" else f" {offender['unit']}"
-        ends = number_texts([offender["lower_end"], offender["upper_end"]], ".5g")
-        rows.append(
-            (
-                offender["name"],
-                f"{offender['size']:.4g}{size_unit}",
-                *ends,
-                f"{offender['size_for_the_loss']:.4g}{size_unit}",
-            )
-        )
+    for tolerance in summary["worst_offenders"][:_SHOWN]:
+        size_unit = "" if tolerance["unit"] == "1" else f" {tolerance['unit']}"
+        ends = number_texts([tolerance["lower_end"], tolerance["upper_end"]], ".5g")
+        sizes = [f"{tolerance[key]:.4g}{size_unit}" for key in ("size", "size_for_the_loss")]
+        rows.append((tolerance["name"], sizes[0], *ends, sizes[1]))
     headings = ("tolerance", "size", f"lower end{unit}", f"upper end{unit}", f"{summary['loss_percent']:g} % loss at")
     caption = f"The costliest of {summary['tolerances']}; as designed {summary['nominal']:.5g}{plain}."
     Rows(headings, rows, caption).show()
@@ -107,9 +108,6 @@ def _show(summary: dict[str, Any]) -> None:
     lost = f"; {summary['lost']} without light" if summary["lost"] else ""
     print_line(f"{summary['draws']} telescopes, {summary['method']}: reached by {reached}{plain}{lost}")
     if "yield" in summary:
-        yield_summary = summary["yield"]
-        interval = f"{100 * yield_summary['low']:.1f} to {100 * yield_summary['high']:.1f} %"
-        print_line(
-            f"requirement {summary['requirement']:g}{plain}: met by {100 * yield_summary['fraction']:.1f} %"
-            f" ({interval})"
-        )
+        met = summary["yield"]
+        interval = f"{100 * met['low']:.1f} to {100 * met['high']:.1f} %"
+        print_line(f"requirement {summary['requirement']:g}{plain}: met by {100 * met['fraction']:.1f} % ({interval})")

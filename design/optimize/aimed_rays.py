@@ -36,14 +36,14 @@ class AimedRays:
 
     def __init__(self, columns: ParameterColumns, request: Request, wavelength: float, pupil: np.ndarray) -> None:
         telescope = columns.telescope
-        here = request if telescope is request.telescope else replace(request, telescope=telescope)
+        moved_request = request if telescope is request.telescope else replace(request, telescope=telescope)
         #: Points of the plane of the entrance pupil [m], [n_pupil, 2] or [n_field, n_pupil, 2].
         self.points = request.entrance_points_of(telescope, wavelength, pupil)
         self._columns, self._directions, self._wavelength = columns, request.directions, wavelength
         #: [n, 2, n_parameter] motion of the points with the parameters; None where they stay.
         self.motion = None
         if telescope.design_data.aiming != "off" and columns.parameters:
-            relative = here.vignetted(pupil) / (0.5 * telescope.pupil_diameter)
+            relative = moved_request.vignetted(pupil) / (0.5 * telescope.pupil_diameter)
             relative = np.broadcast_to(relative, (len(request.fields), *pupil.shape)).reshape(-1, 2)
             self.motion = _motion(columns, self.rays, relative)
 
@@ -54,10 +54,12 @@ class AimedRays:
 
     def part(self, rays: slice) -> AimedRays:
         """Return some of the rays."""
-        some, every = copy(self), self.rays
-        some.rays = Rays(every.position[rays], every.direction[rays], every.path_length[rays], every.wavelength)
-        some.motion = None if self.motion is None else self.motion[rays]
-        return some
+        subset, all_rays = copy(self), self.rays
+        subset.rays = Rays(
+            all_rays.position[rays], all_rays.direction[rays], all_rays.path_length[rays], all_rays.wavelength
+        )
+        subset.motion = None if self.motion is None else self.motion[rays]
+        return subset
 
     def forward(self, threads: int | None = None) -> ForwardPass:
         """Trace the rays to every surface."""

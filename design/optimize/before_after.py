@@ -15,8 +15,10 @@ from ..metrics.spots import spot_diagram
 if TYPE_CHECKING:
     from matplotlib.figure import SubFigure
 
-#: Field points whose spots are drawn, and rings of rays of a spot.
-_SPOTS, _RINGS = 5, 8
+#: Field points whose spots are drawn.
+_SPOTS = 5
+#: Rings of pupil points of a spot.
+_RINGS = 8
 
 
 def draw_before_after(
@@ -27,16 +29,16 @@ def draw_before_after(
     vignetting: np.ndarray | None = None,
 ) -> None:
     """Draw the sections of two telescopes side by side, and below them their spots at some field points."""
-    some = np.unique(np.linspace(0, len(fields) - 1, _SPOTS).astype(int))
-    shown, given = fields[some], None if vignetting is None else vignetting[some]
+    field_indices = np.unique(np.linspace(0, len(fields) - 1, _SPOTS).astype(int))
+    shown, factors = fields[field_indices], None if vignetting is None else vignetting[field_indices]
     parts: Any = figure.subfigures(2, 1)
     sections, spots = parts
     middle = float(wavelengths[len(wavelengths) // 2])
     for axes, telescope, name in zip(sections.subplots(1, 2), telescopes, ("before", "after"), strict=True):
-        draw_section(axes, layout(*with_fields(telescope, shown, given), middle))
+        draw_section(axes, layout(*with_fields(telescope, shown, factors), middle))
         axes.set_title(name)
     diagrams = [
-        spot_diagram(Request.of(*with_fields(t, shown, given), wavelengths, sampling="rings", n_pupil=_RINGS))
+        spot_diagram(Request.of(*with_fields(t, shown, factors), wavelengths, sampling="rings", n_pupil=_RINGS))
         for t in telescopes
     ]
     panels = spots.subplots(2, len(shown), squeeze=False)

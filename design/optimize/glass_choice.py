@@ -75,8 +75,8 @@ class GlassChoice(Result):
         return {name: [getattr(t, name) for t in self.trials] for name in ("glass", "name", "rms")}
 
     def _label(self) -> str:
-        chosen = ", ".join(f"{old} -> {new}" for old, new in self.glasses.items())
-        return f"{chosen or 'no glasses'}; {len(self.trials)} tried"
+        replacements = ", ".join(f"{model_name} -> {glass_name}" for model_name, glass_name in self.glasses.items())
+        return f"{replacements or 'no glasses'}; {len(self.trials)} tried"
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw the optimum; see :meth:`Optimum.plot`."""
@@ -136,22 +136,22 @@ def choose_glasses(
     check_unique("glass", names)
     if not names:
         raise ConfigError("glasses = []: expected at least one medium of the telescope")
-    known = {s.medium_after.name for s in telescope.surfaces if s.medium_after.name}
+    medium_names = {s.medium_after.name for s in telescope.surfaces if s.medium_after.name}
     for name in names:
-        if name not in known:
-            raise unknown_name(f"medium of {telescope.name}", name, sorted(known))
+        if name not in medium_names:
+            raise unknown_name(f"medium of {telescope.name}", name, sorted(medium_names))
     free = telescope
     for name in names:
         free = _with_medium(free, name, _medium_of(free, name), name + _MODEL)
 
-    def optimum(start: Telescope, left: list[str]) -> Optimum:
-        of_glasses = [f"{name}{_MODEL}.{what}" for name in left for what in ("n", "abbe")]
+    def optimum(start: Telescope, model_names: list[str]) -> Optimum:
+        of_glasses = [f"{name}{_MODEL}.{quantity}" for name in model_names for quantity in ("n", "abbe")]
         return optimize(replace(state, telescope=start), [*fixed, *of_glasses], merit, **options)
 
     model = best = optimum(free, names)
-    changes, trials, chosen = best.changes[: -2 * len(names)], [], {}
+    changes, trials, glass_by_medium = best.changes[: -2 * len(names)], [], {}
     for i, name in enumerate(names):
-        found: list[tuple[float, str, Optimum]] = []
+        optima: list[tuple[float, str, Optimum]] = []
         for glass in _nearest(source, _medium_of(best.telescope, name + _MODEL), nearest):
             medium = source[glass] if telescope.medium_before == VACUUM else source.in_vacuum(glass)
             try:
@@ -160,10 +160,10 @@ def choose_glasses(
                 trials.append(GlassTrial(name, glass, np.inf))
                 continue
             trials.append(GlassTrial(name, glass, float(end.history[-1])))
-            found.append((float(end.history[-1]), glass, end))
-        if not found:
+            optima.append((float(end.history[-1]), glass, end))
+        if not optima:
             raise ConfigError(f"glass {name!r}: no glass of {source.source} near it lets light through")
-        _, chosen[name], best = min(found, key=lambda one: one[:2])
+        _, glass_by_medium[name], best = min(optima, key=lambda one: one[:2])
         changes = changes + best.changes[: len(changes)]
     final = replace(
         best,
@@ -175,7 +175,7 @@ def choose_glasses(
         history=np.concatenate([model.history, best.history[1:]]),
         operands=tuple(replace(b, start=m.start) for b, m in zip(best.operands, model.operands, strict=True)),
     )
-    return GlassChoice(final, model, chosen, tuple(trials))
+    return GlassChoice(final, model, glass_by_medium, tuple(trials))
 
 
 def _medium_of(telescope: Telescope, name: str) -> Medium:
@@ -192,12 +192,12 @@ def _with_medium(telescope: Telescope, old: str, medium: Medium, name: str) -> T
 def _nearest(catalogue: GlassCatalogue, medium: Medium, count: int) -> list[str]:
     """Return the names of the glasses nearest to a medium, the nearest first."""
     power, number = float(medium.index(LINE_D * 1e-6)) - 1.0, abbe_number(medium)
-    found = []
+    distances = []
     for name in catalogue:
         glass = catalogue[name]
         try:
             change = float(glass.index(LINE_D * 1e-6)) - 1.0 - power, number / abbe_number(glass) - 1.0
         except PachonError:
             continue
-        found.append((float(np.hypot(change[0] / power, change[1])), name))
-    return [name for _, name in sorted(found)[:count]]
+        distances.append((float(np.hypot(change[0] / power, change[1])), name))
+    return [name for _, name in sorted(distances)[:count]]

@@ -51,9 +51,9 @@ class ParameterColumns:
         """Return the columns for derivatives at given changes of the parameters; at none by default."""
         values = np.zeros(len(parameters)) if values is None else values
         if has_links(telescope):
-            found = linked(telescope, parameters, values)
-            own = cls._alone(telescope, found.parameters, found.values)
-            return replace(own, chain=found.chain)
+            links = linked(telescope, parameters, values)
+            columns = cls._alone(telescope, links.parameters, links.values)
+            return replace(columns, chain=links.chain)
         return cls._alone(telescope, parameters, values)
 
     @classmethod
@@ -62,46 +62,46 @@ class ParameterColumns:
         telescope = without_links(telescope)
         moved = apply(telescope, dict(zip(parameters, values, strict=True)))
         names = telescope.surface_names
-        shaped = [(p, names.index(one.target), one) for p, one in enumerate(parameters) if one.kind == "shape"]
-        wanted = {(s, name) for _, s, _ in shaped for name in ("sag", "intersection")}
-        intermediate = column_table(telescope, wanted)
+        shaped = [(p, names.index(q.target), q) for p, q in enumerate(parameters) if q.kind == "shape"]
+        derivative_kinds = {(s, name) for _, s, _ in shaped for name in ("sag", "intersection")}
+        intermediate = column_table(telescope, derivative_kinds)
         count = int(intermediate.max()) + 1
         first = count + SPHERE_COLUMNS
 
         # The effect of motions is that of the difference between the bodies on both sides of a gap.
         ends = np.zeros((len(parameters), 1, 6))
         motion = -np.diff(twists(telescope, parameters, values), axis=1, prepend=ends, append=ends)
-        runs = {p: index_surfaces(telescope, one.target) for p, one in enumerate(parameters) if one.kind in _MEDIA}
+        runs = {p: index_surfaces(telescope, q.target) for p, q in enumerate(parameters) if q.kind in _MEDIA}
         behind = {(s, "index") for run in runs.values() for s in run}
         before = {(s + 1, "index") for run in runs.values() for s in run if s + 1 < len(names)}
         gaps = {(int(g), "gap") for g in np.flatnonzero(motion.any(axis=(0, 2)))}
-        own = column_table(telescope, behind | before | gaps, first)
-        table = np.maximum(intermediate, own)
+        direct = column_table(telescope, behind | before | gaps, first)
+        table = np.maximum(intermediate, direct)
 
         # Rays need only terms that are not zero; derivatives need all terms of the parameters.
         shapes = shapes_with_terms(moved, parameters)
-        used = max(first, int(own.max()) + 1)
+        used = max(first, int(direct.max()) + 1)
         terms: dict[int, dict[int, PolarPolynomial]] = {}
-        others: list[tuple[int, int, str]] = []
+        added_terms: list[tuple[int, int, str]] = []
         for p, s, parameter in shaped:
             polynomial = term_polynomial(shapes[parameter.target], parameter.name)
             if polynomial is None:
-                others.append((p, s, parameter.name))
+                added_terms.append((p, s, parameter.name))
             else:
                 terms.setdefault(s, {})[p] = polynomial
         blocks = []
-        for s, found in terms.items():
+        for s, surface_terms in terms.items():
             # The length unit of the polynomials over a surface is its outer radius, or that of the pupil.
             aperture = telescope.surfaces[s].aperture
             outer = getattr(aperture, "outer", getattr(aperture, "radius", None))
             scale = float(outer) if outer else 0.5 * telescope.pupil_diameter
-            degree, weights = _polynomial_weights(found, len(parameters), scale)
+            degree, weights = _polynomial_weights(surface_terms, len(parameters), scale)
             present = weights.any(axis=1)
             columns = np.where(present, used + np.cumsum(present) - 1, -1).astype(np.int32)
             blocks.append((s, scale, degree, columns, weights[present]))
             used += int(present.sum())
 
-        total = np.zeros((used + len(others), len(parameters)))
+        total = np.zeros((used + len(added_terms), len(parameters)))
         for g in np.flatnonzero(motion.any(axis=(0, 2))):
             total[table[g, 7:]] = motion[:, g].T
         for p, run in runs.items():
@@ -109,11 +109,11 @@ class ParameterColumns:
             total[[table[s + 1, 3] for s in run if s + 1 < len(names)], p] = 1.0
         for *_, columns, weights in blocks:
             total[columns[columns >= 0]] = weights
-        for i, (p, _, _) in enumerate(others):
+        for i, (p, _, _) in enumerate(added_terms):
             total[used + i, p] = 1.0
         listed = tuple(block[:4] for block in blocks)
-        numbers = {p: one.value(telescope) + values[p] for p, one in enumerate(parameters) if one.kind == "abbe"}
-        other_terms = tuple((s, name) for _, s, name in others)
+        numbers = {p: q.value(telescope) + values[p] for p, q in enumerate(parameters) if q.kind == "abbe"}
+        other_terms = tuple((s, name) for _, s, name in added_terms)
         return cls(moved, parameters, table, listed, other_terms, count, total[first:], numbers)
 
     def leading(self, front: Telescope, wavelength: float) -> ParameterColumns:
@@ -125,22 +125,23 @@ class ParameterColumns:
         table = self.table[: count + 1].copy()
         table[count] = -1
         polynomials = [block for block in self.polynomials if block[0] < count]
-        kept = np.unique(np.concatenate([table.ravel(), *(columns for *_, columns in polynomials)]))
-        early, late = kept[(kept >= 0) & (kept < self.intermediate)], kept[kept >= first]
+        column_numbers = np.unique(np.concatenate([table.ravel(), *(columns for *_, columns in polynomials)]))
+        early = column_numbers[(column_numbers >= 0) & (column_numbers < self.intermediate)]
+        late = column_numbers[column_numbers >= first]
         # Numbers -1, for none, stand at the end.
-        number = np.full(max(int(kept[-1]), 0) + 2, -1, dtype=np.int32)
+        number = np.full(max(int(column_numbers[-1]), 0) + 2, -1, dtype=np.int32)
         number[early] = np.arange(len(early))
         number[late] = len(early) + SPHERE_COLUMNS + np.arange(len(late))
-        others = [i for i, (s, _) in enumerate(self.other_terms) if s < count]
+        front_terms = [i for i, (s, _) in enumerate(self.other_terms) if s < count]
         direct = len(self.weights) - len(self.other_terms)
-        rows = [*(late - first), *(direct + i for i in others)]
+        rows = [*(late - first), *(direct + i for i in front_terms)]
         shaped = tuple(p for p in self.parameters if p.kind == "shape" and p.target in front.surface_names)
         return ParameterColumns(
             front,
             shaped,
             number[table],
             tuple((s, scale, degree, number[columns]) for s, scale, degree, columns in polynomials),
-            tuple(self.other_terms[i] for i in others),
+            tuple(self.other_terms[i] for i in front_terms),
             len(early),
             self.weights_at(wavelength)[rows],
             {},

@@ -77,7 +77,7 @@ class Beams:
 
     def weights(self, telescope: Telescope) -> np.ndarray:
         """Return the weight of each ray in the mean square, [n_wave, n_field, n_pupil]; zero where it is not lit."""
-        fields, pupil, found = self.request.fields, self.request.pupil, []
+        fields, pupil, ray_weights = self.request.fields, self.request.pupil, []
         for wavelength in self.request.wavelengths:
             status = trace(telescope, self.rays(telescope, wavelength), threads=self.request.threads).status
             lit = (status == RayStatus.OK).reshape(len(fields), -1) * np.maximum(pupil.weights, 0.0)
@@ -85,8 +85,8 @@ class Beams:
             if not total.all():
                 dark = fields[~total[:, 0].astype(bool)][0]
                 raise DomainError(f"{field_label(dark)}: no ray reaches the image of {telescope.name}")
-            found.append(lit / total * self.field_weights[:, None])
-        return np.array(found) * self.request.weights[:, None, None]
+            ray_weights.append(lit / total * self.field_weights[:, None])
+        return np.array(ray_weights) * self.request.weights[:, None, None]
 
 
 def filling_stop(telescope: Telescope | Request) -> Telescope | Request:
@@ -122,15 +122,16 @@ class SpotMerit:
         self._beams = beams
         self._weights = beams.weights(telescope)
         self._reference = reference
-        given = np.zeros(len(beams.request.fields)) if heights is None else np.asarray(heights, dtype=np.float64)
-        if given.any():
+        n_field = len(beams.request.fields)
+        field_heights = np.zeros(n_field) if heights is None else np.asarray(heights, dtype=np.float64)
+        if field_heights.any():
             require_image(telescope, "a height of the image surface")
-        if given.shape != (len(beams.request.fields),):
+        if field_heights.shape != (n_field,):
             raise DomainError(
-                f"heights of shape {list(given.shape)}: expected one for each of {len(beams.request.fields)} fields"
+                f"heights of shape {list(field_heights.shape)}: expected one for each of {n_field} fields"
             )
         # One for each ray, field by field.
-        self._heights = np.repeat(given, len(beams.request.pupil))
+        self._heights = np.repeat(field_heights, len(beams.request.pupil))
 
     def residuals(self, telescope: Telescope) -> np.ndarray:  # noqa: D102
         landing = []
@@ -205,15 +206,17 @@ class WavefrontMerit:
         weights = beams.weights(telescope)
         self._goal = np.zeros(weights.shape)
         if goal is not None:
-            given = np.asarray(goal, dtype=np.float64)
+            target = np.asarray(goal, dtype=np.float64)
             expected = (*weights.shape[1::-1], weights.shape[2])
-            if given.shape != expected:
-                raise DomainError(f"goal of shape {list(given.shape)}: expected {list(expected)}, field by wave by ray")
-            given = given.transpose(1, 0, 2)
-            known = np.isfinite(given)
+            if target.shape != expected:
+                raise DomainError(
+                    f"goal of shape {list(target.shape)}: expected {list(expected)}, field by wave by ray"
+                )
+            target = target.transpose(1, 0, 2)
+            finite = np.isfinite(target)
             total = weights.sum(axis=2, keepdims=True)
-            weights = np.where(known, weights, 0.0)
-            self._goal = np.where(known, given, 0.0)
+            weights = np.where(finite, weights, 0.0)
+            self._goal = np.where(finite, target, 0.0)
             weights *= total / np.maximum(weights.sum(axis=2, keepdims=True), np.finfo(float).tiny)
         self._roots = np.sqrt(weights)
         # Orthonormal basis of piston and tilts, to be removed from each wavefront.
@@ -234,12 +237,12 @@ class WavefrontMerit:
                 value = block.value - self._goal[i, block.fields]
                 # NaN for a lost ray makes the solver take a shorter step.
                 value = np.where((block.status > RayStatus.VIGNETTED) & (roots > 0), np.nan, value)
-                both = roots[..., None] * np.concatenate([value[..., None], block.change(weights)], axis=2)
-                return (both - basis @ (basis.transpose(0, 2, 1) @ both)).reshape(-1, both.shape[-1])
+                rows = roots[..., None] * np.concatenate([value[..., None], block.change(weights)], axis=2)
+                return (rows - basis @ (basis.transpose(0, 2, 1) @ rows)).reshape(-1, rows.shape[-1])
 
             parts += FieldWavefronts(columns, beams.request, float(wavelength)).map(reduced)
-        whole = np.concatenate(parts)
-        return whole[:, 0], whole[:, 1:]
+        stacked = np.concatenate(parts)
+        return stacked[:, 0], stacked[:, 1:]
 
     def size_of_terms(self, columns: ParameterColumns) -> np.ndarray:  # noqa: D102
         request = self._beams.request

@@ -72,8 +72,8 @@ class Operand:
     @property
     def label(self) -> str:
         """Name in messages and tables, such as "edge_thickness(L1)"."""
-        given = [(name, v) for name, v in self.quantity if v is not None and not callable(v)]
-        texts = [_degrees(v) if name == "field" else _shown(v) for name, v in given]
+        stated = [(name, v) for name, v in self.quantity if v is not None and not callable(v)]
+        texts = [_degrees(v) if name == "field" else _shown(v) for name, v in stated]
         return f"{self.kind}({', '.join(texts)})" if texts else self.kind
 
     def goal_text(self, unit: float = 1.0) -> str:
@@ -102,12 +102,12 @@ class Operand:
 
     def residual(self, number: float) -> tuple[float, float]:
         """Return the residual [m] that a number leaves, and its derivative with respect to the number."""
-        wanted = self.value
-        if wanted is None:
+        goal = self.value
+        if goal is None:
             low = -np.inf if self.minimum is None else self.minimum
             high = np.inf if self.maximum is None else self.maximum
-            wanted = float(np.clip(number, low, high))
-        off = number - wanted
+            goal = float(np.clip(number, low, high))
+        off = number - goal
         return self.weight * off, self.weight if off or self.value is not None else 0.0
 
     def residuals(self, telescope: Telescope) -> np.ndarray:
@@ -150,12 +150,12 @@ class GoalOperand(Operand):
 
 def check_operands(operands: tuple[Operand, ...]) -> None:
     """Raise a ConfigError where two operands state one number."""
-    seen: list[tuple[Any, ...]] = []
+    keys: list[tuple[Any, ...]] = []
     for operand in operands:
         key = (operand.kind, operand.quantity)
-        if key in seen:
+        if key in keys:
             raise ConfigError(f"operand {operand.label} is given twice: expected each number once")
-        seen.append(key)
+        keys.append(key)
 
 
 def direction_of(field: ArrayLike, telescope: Telescope) -> np.ndarray:

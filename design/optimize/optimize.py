@@ -92,8 +92,8 @@ def optimize(
         If a merit or variable does not exist, or an operand is given twice.
     """
     function = merit_function(merit)
-    given = configurations(telescope, fields, wavelengths, n_pupil)
-    states, beams = _states(given, function, tuple(targets), threads)
+    configured = configurations(telescope, fields, wavelengths, n_pupil)
+    states, beams = _states(configured, function, tuple(targets), threads)
     telescopes = [state.telescope for state in states]
     problem = DesignProblem(states, free_variables(telescopes, variables))
     box = limits(telescopes, problem.variables, bounds or {})
@@ -108,7 +108,7 @@ def optimize(
     covariance, collinear = _covariance(values, slopes, problem.variables, rate)
     changes = np.array([v.change(x) for v, x in zip(problem.variables, solution.changes, strict=True)])
     start_values = np.array([v.start for v in problem.variables])
-    started, solved = tuple(state.telescope for state in given), problem.telescopes(solution.changes)
+    started, solved = tuple(state.telescope for state in configured), problem.telescopes(solution.changes)
     ended = tuple(
         final_telescope(after, stated.design_data.aiming) for after, stated in zip(solved, started, strict=True)
     )
@@ -124,7 +124,7 @@ def optimize(
         values=start_values + changes,
         merit_name=function.name,
         merits=np.array([np.linalg.norm(problem.merit_part(residuals)) for residuals in (start, values)]),
-        remeasured=np.array([remeasured(given, lenses, function, threads) for lenses in (started, ended)]),
+        remeasured=np.array([remeasured(configured, lenses, function, threads) for lenses in (started, ended)]),
         history=np.array(solution.history),
         operands=_operand_changes(states, solved),
         effect=np.linalg.norm(slopes, axis=0) / np.abs(rate),
@@ -176,18 +176,18 @@ def _states(
     """Return merit and operands of each configuration, and their rays."""
     if len(given) > 1 and function.of_one_telescope:
         raise ConfigError(f"{len(given)} configurations: expected no goal, and the merit 'spots' or 'wavefront'")
-    total, states, beams = sum(one.weight for one in given), [], []
-    for one in given:
-        telescope = following_stop(one.telescope)
-        rays = one.beams(telescope, threads)
-        operands = (*targets, *one.operands)
+    total, states, beams = sum(configuration.weight for configuration in given), [], []
+    for configuration in given:
+        telescope = following_stop(configuration.telescope)
+        rays = configuration.beams(telescope, threads)
+        operands = (*targets, *configuration.operands)
         check_operands(operands)
         bound = []
         for operand in operands:
             # An operand that the telescope does not have is an error of the input, not a step that goes too far.
             bound.append(operand.bound(telescope))
             _check_start(bound[-1], telescope)
-        states.append(DesignState(telescope, function.of(telescope, rays), tuple(bound), one.weight / total))
+        states.append(DesignState(telescope, function.of(telescope, rays), tuple(bound), configuration.weight / total))
         beams.append(rays)
     return tuple(states), tuple(beams)
 

@@ -90,22 +90,22 @@ class OperandSection(Section):
         """Return the operand; ConfigError or DomainError where its numbers do not fit together."""
         cls, size = _kind(self.kind)
         names = [f.name for f in dataclasses.fields(cls) if f.repr]
-        own = {n: _KEYS.get(n, (n, None)) for n in names if n not in ("value", "minimum", "maximum", "weight")}
-        keys = [key for key, _ in own.values()]
+        key_units = {n: _KEYS.get(n, (n, None)) for n in names if n not in ("value", "minimum", "maximum", "weight")}
+        keys = [key for key, _ in key_units.values()]
         for key in self.model_fields_set - {"kind", "target", "min", "max", "weight"}:
             if key not in keys:
                 raise unknown_name(f"key of operand {self.kind}", key, keys)
         values: dict[str, Any] = {"weight": self.weight}
-        for name, (key, unit) in own.items():
+        for name, (key, unit) in key_units.items():
             if (value := getattr(self, key)) is not None:
                 values[name] = value if unit is None else _scaled(value, unit)
         for name, number in (("value", self.target), ("minimum", self.min), ("maximum", self.max)):
             if number is not None:
                 values[name] = number * size
         needed = [f for f in dataclasses.fields(cls) if f.default is dataclasses.MISSING]
-        for one in needed:
-            if one.name not in values:
-                raise ConfigError(f"operand {self.kind}: {own[one.name][0]} is missing")
+        for required in needed:
+            if required.name not in values:
+                raise ConfigError(f"operand {self.kind}: {key_units[required.name][0]} is missing")
         return cls(**values)
 
 
@@ -118,10 +118,10 @@ def _kind(text: str) -> tuple[type[GoalOperand], float]:
             if unit in units:
                 return cls, units[unit]
             raise ConfigError(f"operand {text!r}: expected its unit at the end, one of {', '.join(units)}")
-    known = [
+    spellings = [
         kind if cls.unit == "1" else f"{kind}_{'mm' if cls.unit == 'm' else 'deg'}" for kind, cls in OPERANDS.items()
     ]
-    raise unknown_name("operand", text, known)
+    raise unknown_name("operand", text, spellings)
 
 
 def _scaled(value: Any, unit: float) -> Any:
@@ -148,11 +148,11 @@ class StateSection(Section):
 
     def operand_list(self) -> list[Operand]:
         """Return the operands; an error names the place."""
-        found = []
+        operands = []
         for i, section in enumerate(self.operands):
             with error_context(key=f"operands.{i}"):
-                found.append(section.operand())
-        return found
+                operands.append(section.operand())
+        return operands
 
 
 class ConfigurationSection(StateSection):
@@ -220,14 +220,14 @@ def optimization_arguments(
         for i, section in enumerate(file.configurations):
             with error_context(key=f"configurations.{i}"):
                 beside = path.parent / section.telescope
-                other = load_telescope(beside if beside.is_file() else section.telescope)
-                if other.name in [s.telescope.name for s in states] and beside.is_file():
+                position = load_telescope(beside if beside.is_file() else section.telescope)
+                if position.name in [s.telescope.name for s in states] and beside.is_file():
                     # Positions of a zoom lens, saved from one telescope, have its name.
-                    other = dataclasses.replace(other, name=beside.stem)
+                    position = dataclasses.replace(position, name=beside.stem)
                 rays = {k: common[k] if v is None else v for k, v in section.rays().items()}
                 states.append(
                     DesignConfiguration(
-                        other,
+                        position,
                         **rays,
                         weight=section.weight,
                         operands=section.operand_list(),
@@ -237,10 +237,10 @@ def optimization_arguments(
         bounds = {}
         for text, pair in file.bounds.items():
             owner, colon, name = text.rpartition(":")
-            known = {s.telescope.name: s.telescope for s in states}
-            if colon and owner not in known:
-                raise unknown_name("configuration of bounds", owner, known)
-            parameter, size = parse_change(known[owner] if colon else telescope, name, "bounds")
+            telescopes = {s.telescope.name: s.telescope for s in states}
+            if colon and owner not in telescopes:
+                raise unknown_name("configuration of bounds", owner, telescopes)
+            parameter, size = parse_change(telescopes[owner] if colon else telescope, name, "bounds")
             bounds[owner + colon + parameter.address] = (size * pair[0], size * pair[1])
     return {
         "telescope": states if file.configurations else states[0],

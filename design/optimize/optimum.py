@@ -187,14 +187,14 @@ class Optimum(Result):
             f"effect_{self._unit}_per_unit": self.effect,
             "operands": [
                 {
-                    "operand": one.operand.label,
-                    "configuration": one.configuration,
-                    "unit": one.operand.unit,
-                    "goal": one.goal,
-                    "start": one.start,
-                    "end": one.end,
+                    "operand": change.operand.label,
+                    "configuration": change.configuration,
+                    "unit": change.operand.unit,
+                    "goal": change.goal,
+                    "start": change.start,
+                    "end": change.end,
                 }
-                for one in self.operands
+                for change in self.operands
             ],
             "collinear": list(self.collinear),
             "message": self.message,

@@ -45,20 +45,20 @@ class DesignProblem:
 
     def residuals(self, changes: np.ndarray) -> np.ndarray:
         """Return all residuals [m]; NaN, for a shorter step, where a telescope is not valid."""
-        found: list[np.ndarray] = []
+        blocks: list[np.ndarray] = []
         try:
             for state, telescope in zip(self.states, self.telescopes(changes), strict=True):
-                found.append(np.sqrt(state.weight) * state.merit.residuals(telescope))
-                found += [operand.residuals(telescope) for operand in state.operands]
+                blocks.append(np.sqrt(state.weight) * state.merit.residuals(telescope))
+                blocks += [operand.residuals(telescope) for operand in state.operands]
         except PachonError:
             if not self.sizes:
                 raise
             return np.full(sum(a + b for a, b in self.sizes), np.nan)
-        return np.concatenate(found)
+        return np.concatenate(blocks)
 
     def linear(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return all residuals [m] and their derivatives, shape [n, n_variable]."""
-        found, rates, self.sizes = [], [], []
+        blocks, rates, self.sizes = [], [], []
         for i, state in enumerate(self.states):
             places = [k for k, v in enumerate(self.variables) if v.parameters[i]]
             parameters = tuple(p for v in self.variables if (p := v.parameters[i]))
@@ -77,9 +77,9 @@ class DesignProblem:
             for value, rate in parts:
                 full = np.zeros((len(value), len(self.variables)))
                 full[:, places] = rate
-                found.append(value)
+                blocks.append(value)
                 rates.append(full)
-        return np.concatenate(found), np.concatenate(rates)
+        return np.concatenate(blocks), np.concatenate(rates)
 
     def rounding(self) -> np.ndarray:
         """Return the size of the terms that cancel where a variable has no effect on the merits [m], [n_variable]."""

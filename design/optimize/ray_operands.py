@@ -60,11 +60,11 @@ class IncidenceAngle(GoalOperand):
         rays = launch_bundles(telescope, light, wavelength_of(self.wavelength, telescope), point)
         results = trace(telescope, rays, surfaces="all", threads=1)
         i = telescope.surface_names.index(surface.name)
-        here = results[i]
-        if here.status[0] > RayStatus.VIGNETTED:
+        landed = results[i]
+        if landed.status[0] > RayStatus.VIGNETTED:
             raise DomainError(f"operand {self.label}: the ray does not reach the surface")
-        ray = here.direction[0] if self.behind else (results[i - 1].direction[0] if i else rays.direction[0])
-        x, y, _ = surface.to_local(here.position[0])
+        ray = landed.direction[0] if self.behind else (results[i - 1].direction[0] if i else rays.direction[0])
+        x, y, _ = surface.to_local(landed.position[0])
         slope_x, slope_y = surface.shape.gradient(x, y)
         normal = surface.matrix @ np.array([-float(slope_x), -float(slope_y), 1.0])
         # The arc tangent stays exact for small angles.
@@ -101,9 +101,9 @@ class _RmsOperand(GoalOperand):
         return replace(self, merit=type(self)._merits(telescope, rays))
 
     def _merit(self, telescope: Telescope) -> Merit:
-        found = self.merit or self.bound(telescope).merit
-        assert found is not None
-        return found
+        merit = self.merit or self.bound(telescope).merit
+        assert merit is not None
+        return merit
 
     def measure(self, telescope: Telescope) -> float:
         return float(np.linalg.norm(self._merit(telescope).residuals(telescope)))
@@ -201,10 +201,10 @@ class WavefrontMtf(GoalOperand):
             raise DomainError(f"operand {self.label}: expected a frequency below the cut-off of diffraction")
         across = outer * (2.0 * (np.arange(_ACROSS) + 0.5) / _ACROSS - 1.0)
         points = np.stack([v.ravel() for v in np.meshgrid(across, across)])
-        both = [points + sign * 0.5 * shear[:, None] for sign in (1.0, -1.0)]
-        inside = np.all([(inner <= np.hypot(*p)) & (np.hypot(*p) <= outer) for p in both], axis=0)
+        sheared_pupils = [points + sign * 0.5 * shear[:, None] for sign in (1.0, -1.0)]
+        inside = np.all([(inner <= np.hypot(*p)) & (np.hypot(*p) <= outer) for p in sheared_pupils], axis=0)
         wavelength = wavelength_of(self.wavelength, telescope)
-        pupil = np.concatenate([p[:, inside] for p in both], axis=1)
+        pupil = np.concatenate([p[:, inside] for p in sheared_pupils], axis=1)
         opd = wavefront_opd(telescope, self.field, wavelength, (pupil[0], pupil[1]), threads=1).value
         change = np.subtract(*opd.reshape(2, -1))
         change = change[np.isfinite(change)]

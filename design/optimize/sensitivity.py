@@ -150,9 +150,9 @@ class Sensitivity(FieldResult):
 def field_rings(telescope: Telescope) -> np.ndarray:
     """Return 31 field points [rad], shape [31, 2]: the axis, 10 half-way to the edge, 20 near the edge."""
     rings = [np.zeros((1, 2))]
-    for count, part in ((10, 0.5), (20, 0.98)):
+    for count, fraction in ((10, 0.5), (20, 0.98)):
         angle = 2.0 * np.pi * np.arange(count) / count
-        rings.append(part * telescope.field_radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+        rings.append(fraction * telescope.field_radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
     return np.concatenate(rings)
 
 
@@ -221,28 +221,28 @@ def sensitivity(
 
     def products(rays: np.ndarray) -> np.ndarray:
         """Return the products of the terms, summed over some rays, shape [n_zernike, n_zernike]."""
-        some = by_ray[rays]
-        return (some.T * pupil.weights[rays]) @ some
+        ray_terms = by_ray[rays]
+        return (ray_terms.T * pupil.weights[rays]) @ ray_terms
 
     def fit(block: WavefrontBlock) -> np.ndarray:
-        part, lit = block.fields, block.status == RayStatus.OK
-        few = lit.sum(axis=1) < n_zernike
-        if few.any():
+        block_fields, lit = block.fields, block.status == RayStatus.OK
+        too_dark = lit.sum(axis=1) < n_zernike
+        if too_dark.any():
             raise DomainError(
-                f"{field_label(points[part][few][0])}: only {int(lit[few][0].sum())} pupil points are lit; "
-                f"expected at least n_zernike = {n_zernike}"
+                f"{field_label(points[block_fields][too_dark][0])}: only {int(lit[too_dark][0].sum())} pupil points "
+                f"are lit; expected at least n_zernike = {n_zernike}"
             )
         # Normal equations of the fit of each field: those of the whole pupil, less the few rays that are not lit.
-        normal = whole - np.stack([products(dark) for dark in ~lit])
+        normal = full_normal - np.stack([products(dark) for dark in ~lit])
         value, change = block.project(weighted, weights)
         solved = np.linalg.solve(normal, np.concatenate([change, value[..., None]], axis=2))
-        matrix[part], zernikes[part] = solved[..., :-1], solved[..., -1]
-        matrix[part, 0] += block.piston
+        matrix[block_fields], zernikes[block_fields] = solved[..., :-1], solved[..., -1]
+        matrix[block_fields, 0] += block.piston
         # Size of the terms that cancel where a parameter has no effect, from some of the rays.
         return np.abs(block.table[4:, -1, ::8]).max(axis=1)
 
     with one_blas_thread():
-        whole = products(np.arange(len(pupil)))
+        full_normal = products(np.arange(len(pupil)))
         wavefronts = FieldWavefronts(columns, request, request.wavelength, lit_only=True)
         terms_size = np.max(wavefronts.map(fit), axis=0) @ np.abs(weights)
     # Rotation about the axis has no effect; its rounding errors become zero.

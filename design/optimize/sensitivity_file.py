@@ -66,7 +66,7 @@ def write_sensitivity(path: Path, result: Sensitivity) -> None:
 
 def _metres_per(unit: str) -> str:
     """Return metres per unit of a parameter, in the spelling of astropy."""
-    known = {"": "m", "m": "", "rad": "m / rad", "1/m": "m2"}
+    spellings = {"": "m", "m": "", "rad": "m / rad", "1/m": "m2"}
     if unit.startswith("m^"):
         return f"m{1 - int(unit.removeprefix('m^'))}"
-    return known.get(unit, f"m / {unit}")
+    return spellings.get(unit, f"m / {unit}")

@@ -75,27 +75,27 @@ def free_variables(telescopes: Sequence[Telescope], variables: Iterable[str | Pa
     names = [t.name for t in telescopes]
     if len(telescopes) > 1:
         check_unique("configuration", names)
-    found: list[Variable] = []
+    free: list[Variable] = []
     for text in variables:
-        found += _of_address(telescopes, names, text)
-    if not found:
+        free += _of_address(telescopes, names, text)
+    if not free:
         raise ConfigError("variables = []: expected at least one, such as M2.dz")
-    check_unique("variable", [v.address for v in found])
-    return tuple(found)
+    check_unique("variable", [v.address for v in free])
+    return tuple(free)
 
 
 def _of_address(telescopes: Sequence[Telescope], names: list[str], text: str | Parameter) -> list[Variable]:
     address = text.address if isinstance(text, Parameter) else text
     owner = next((n for n in names if len(names) > 1 and address.startswith(f"{n}:")), None)
     prefix = "" if owner is None else f"{owner}:"
-    wanted = address.removeprefix(prefix) if isinstance(text, str) else text
+    parameter_text = address.removeprefix(prefix) if isinstance(text, str) else text
     parsed: list[tuple[Parameter, ...]] = []
     problem: UnknownNameError | None = None
     for telescope in telescopes:
         parsed.append(())
         if owner in (None, telescope.name):
             try:
-                parsed[-1] = parse_parameters([wanted], telescope)
+                parsed[-1] = parse_parameters([parameter_text], telescope)
             except UnknownNameError as error:
                 problem = error
     longest = max(parsed, key=len)
@@ -104,9 +104,9 @@ def _of_address(telescopes: Sequence[Telescope], names: list[str], text: str | P
         raise problem
     result = []
     for place, parameter in enumerate(longest):
-        each = tuple(found[place] if found else None for found in parsed)
-        first = next(i for i, p in enumerate(each) if p)
-        solver = tuple(p if p is None else _for_solver(p, t) for p, t in zip(each, telescopes, strict=True))
+        by_telescope = tuple(parameters[place] if parameters else None for parameters in parsed)
+        first = next(i for i, p in enumerate(by_telescope) if p)
+        solver = tuple(p if p is None else _for_solver(p, t) for p, t in zip(by_telescope, telescopes, strict=True))
         if quantity_of(parameter, telescopes[first]) in followers(telescopes[first]):
             raise ConfigError(f"variable {parameter.address} follows other values: expected one of those")
         start = parameter.value(telescopes[first])
@@ -172,8 +172,8 @@ def _usual(telescopes: Sequence[Telescope], variable: Variable) -> tuple[float, 
     if parameter.kind in _GLASSES:
         return _GLASSES[parameter.kind]
     if parameter.kind == "shape" and parameter.name.rpartition(".")[2].startswith("curvature"):
-        found = [clear_radius(t, p.target) for t, p in zip(telescopes, variable.parameters, strict=True) if p]
-        steepest = _STEEPEST / max(found)
+        clear_radii = [clear_radius(t, p.target) for t, p in zip(telescopes, variable.parameters, strict=True) if p]
+        steepest = _STEEPEST / max(clear_radii)
         return (-steepest, steepest) if steepest else (-np.inf, np.inf)
     return -np.inf, np.inf
 
@@ -193,11 +193,11 @@ def random_starts(
     """
     first = [next(p for p in v.parameters if p) for v in variables]
     kinds = [p.kind + p.name.rpartition(".")[2] for p in first]
-    values, given = np.array([v.solver_start for v in variables]), set(bounded)
+    values, bounded_addresses = np.array([v.solver_start for v in variables]), set(bounded)
     starts = np.empty((n, len(values)))
     for i, variable in enumerate(variables):
         rng, (low, high) = stream(seed, "restart", variable.address), (box[0][i], box[1][i])
-        if variable.address in given and np.isfinite(high - low):
+        if variable.address in bounded_addresses and np.isfinite(high - low):
             starts[:, i] = rng.uniform(low, high, n)
         else:
             alike = values[[kind == kinds[i] for kind in kinds]]

@@ -119,13 +119,13 @@ class FieldWavefronts:
             )
         # Landing points, or directions, and paths together, four outputs.
         zero = np.zeros((3, len(fields)))
-        both = OutputGradient(
+        outputs = OutputGradient(
             np.concatenate([axes.position, gradient.position]),
             np.concatenate([axes.direction, gradient.direction]),
             np.append(axes.path, gradient.path),
             index=np.concatenate([zero, gradient.index]),
         )
-        derivatives = aimed.derivatives(chief, both, threads=1)
+        derivatives = aimed.derivatives(chief, outputs, threads=1)
         self._moved = derivatives[:3].transpose(1, 0, 2)
         self._piston = derivatives[3] - np.einsum("in,nip->np", by_reference, self._moved)
 
@@ -137,7 +137,7 @@ class FieldWavefronts:
         bounds = [count * i // blocks for i in range(blocks + 1)]
         parts = [slice(*ends) for ends in pairwise(bounds)]
         if self._threads == 1 or blocks == 1:
-            return [work(self.block(part)) for part in parts]
+            return [work(self.block(field_slice)) for field_slice in parts]
         with ThreadPoolExecutor(self._threads) as pool:
             return list(pool.map(lambda part: work(self.block(part)), parts))
 

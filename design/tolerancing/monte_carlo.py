@@ -164,28 +164,32 @@ class MonteCarlo(Result):
         shown = np.argsort(self.contribution)[::-1][:_BARS]
         with styled():
             figure = figure_at(ax, 9.0, max(3.4, 1.2 + 0.19 * len(shown)))
-            left, right = figure.subplots(1, 2)
+            merit_axes, contribution_axes = figure.subplots(1, 2)
             percent_below = 100.0 * np.arange(1, len(finite) + 1) / len(self.merit)
-            left.step(finite * scale, percent_below, where="post", color=BLUE)
-            left.axvline(self.nominal * scale, color=GREY, linestyle=(0, (4, 2)), linewidth=0.9, label="as designed")
+            merit_axes.step(finite * scale, percent_below, where="post", color=BLUE)
+            merit_axes.axvline(
+                self.nominal * scale, color=GREY, linestyle=(0, (4, 2)), linewidth=0.9, label="as designed"
+            )
             for percent in (50, 95):
                 value = self.at_most(percent / 100.0) * scale
                 if np.isfinite(value):
-                    left.plot(value, percent, "o", color=RED, markersize=4.0)
-                    left.annotate(
+                    merit_axes.plot(value, percent, "o", color=RED, markersize=4.0)
+                    merit_axes.annotate(
                         f"{percent} %: {value:.4g}", (value, percent), (6, -3), textcoords="offset points", va="top"
                     )
-            left.set(xlabel=f"{self.criterion.title} [{unit}]", ylabel="telescopes at most there [%]", ylim=(0, 103))
-            left.margins(x=0.12)
-            left.legend(loc="lower right")
-            left.set_title(f"{len(self.merit)} draws, {self.method}")
-            right.barh(np.arange(len(shown)), self.contribution[shown] * scale, color=BLUE, height=0.7)
-            right.set_yticks(np.arange(len(shown)), [plain_text(self.tolerances[i].name) for i in shown])
-            right.invert_yaxis()
-            right.set_xlabel(f"contribution, added in squares [{unit}]")
+            merit_axes.set(
+                xlabel=f"{self.criterion.title} [{unit}]", ylabel="telescopes at most there [%]", ylim=(0, 103)
+            )
+            merit_axes.margins(x=0.12)
+            merit_axes.legend(loc="lower right")
+            merit_axes.set_title(f"{len(self.merit)} draws, {self.method}")
+            contribution_axes.barh(np.arange(len(shown)), self.contribution[shown] * scale, color=BLUE, height=0.7)
+            contribution_axes.set_yticks(np.arange(len(shown)), [plain_text(self.tolerances[i].name) for i in shown])
+            contribution_axes.invert_yaxis()
+            contribution_axes.set_xlabel(f"contribution, added in squares [{unit}]")
             compensated = f", compensated by {', '.join(self.compensators)}" if self.compensators else ""
-            more = f" (largest {_BARS} of {len(self.contribution)})" if len(self.contribution) > _BARS else ""
-            right.set_title(f"each tolerance alone{more}")
+            largest_note = f" (largest {_BARS} of {len(self.contribution)})" if len(self.contribution) > _BARS else ""
+            contribution_axes.set_title(f"each tolerance alone{largest_note}")
             figure.suptitle(f"{plain_text(self.telescope)}: within tolerances{compensated}", fontsize=11)
             return figure
 

@@ -15,14 +15,14 @@ def with_elements(telescope: Telescope) -> tuple[Telescope, tuple[str, ...]]:
     telescope has, or a new one: L1, L2...
     """
     groups = dict(telescope.groups)
-    names_of_members = {members: name for name, members in groups.items()}
+    group_names = {members: name for name, members in groups.items()}
     names = []
     for members in element_groups(telescope.surfaces, telescope.medium_before).values():
-        if members not in names_of_members:
+        if members not in group_names:
             used_names = {*groups, *telescope.surface_names}
-            names_of_members[members] = next(
+            group_names[members] = next(
                 name for i in range(1, len(used_names) + 2) if (name := f"L{i}") not in used_names
             )
-            groups[names_of_members[members]] = members
-        names.append(names_of_members[members])
+            groups[group_names[members]] = members
+        names.append(group_names[members])
     return replace(telescope, groups=groups), tuple(names)

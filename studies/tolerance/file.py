@@ -122,10 +122,10 @@ def load_tolerances(path: str | os.PathLike[str], telescope: str | None = None) 
     path = Path(path)
     file = validated(ToleranceFile, read_mapping(path, ConfigError), str(path))
     with error_context(file=path):
-        found = file.telescope if telescope is None else telescope
-        if not found:
+        telescope_name = file.telescope if telescope is None else telescope
+        if not telescope_name:
             raise ConfigError("telescope is missing: expected a name or a file")
-        changed = {"telescope": _beside(path, found) if telescope is None else found}
+        changed = {"telescope": _beside(path, telescope_name) if telescope is None else telescope_name}
         if file.degrees_of_freedom is not None:
             changed["degrees_of_freedom"] = _beside(path, file.degrees_of_freedom)
         changed_file = file.model_copy(update=changed)
@@ -136,9 +136,11 @@ def load_tolerances(path: str | os.PathLike[str], telescope: str | None = None) 
 def with_settings(file: ToleranceFile, **settings: Any) -> ToleranceFile:
     """Return a file with other values of some keys, those that are not None."""
     changed = {key: value for key, value in settings.items() if value is not None}
-    found = validated(ToleranceFile, {**file.model_dump(mode="json", exclude_unset=True), **changed}, "tolerances")
-    _check(found)
-    return found
+    changed_file = validated(
+        ToleranceFile, {**file.model_dump(mode="json", exclude_unset=True), **changed}, "tolerances"
+    )
+    _check(changed_file)
+    return changed_file
 
 
 def _check(file: ToleranceFile) -> None:

@@ -62,35 +62,37 @@ def tolerance_plan(file: ToleranceFile, telescope: Telescope) -> TolerancePlan:
     """
     telescope, elements = with_elements(resolved(telescope))
     maker = _Maker(telescope, file)
-    chosen: dict[str, tuple[DegreeOfFreedom, Tolerance]] = {}
+    quantities: dict[str, tuple[DegreeOfFreedom, Tolerance]] = {}
     listed: set[str] = set()
     for section in _common(file, telescope, elements):
-        chosen |= maker.of(section)
+        quantities |= maker.of(section)
     for i, section in enumerate(file.tolerances):
         with error_context(key=f"tolerances.{i}"):
-            found = maker.of(section)
-            again = _same_quantity(found, chosen)
-            if twice := again & listed:
+            section_quantities = maker.of(section)
+            replaced = _same_quantity(section_quantities, quantities)
+            if twice := replaced & listed:
                 raise ConfigError(f"{section.name} is {min(twice)} once more: expected each quantity once")
             # In another unit, or as a percentage, a quantity replaces that of all surfaces.
-            chosen = {name: one for name, one in chosen.items() if name not in again}
-            listed |= set(found)
+            quantities = {name: quantity for name, quantity in quantities.items() if name not in replaced}
+            listed |= set(section_quantities)
             if section.name.rpartition(".")[2].startswith("irregularity"):
                 # Another range of terms replaces all of those before.
-                begin = next(iter(found)).rpartition(" ")[0]
-                chosen = {name: one for name, one in chosen.items() if not name.startswith(f"{begin} ")}
-            chosen |= found
-    if not chosen:
+                begin = next(iter(section_quantities)).rpartition(" ")[0]
+                quantities = {
+                    name: quantity for name, quantity in quantities.items() if not name.startswith(f"{begin} ")
+                }
+            quantities |= section_quantities
+    if not quantities:
         raise ConfigError("tolerances = []: expected at least one, or some of surfaces, elements and gaps")
     free = {}
     for name in file.compensators:
         with error_context(key="compensators"):
-            if name in chosen:
+            if name in quantities:
                 raise ConfigError(f"{name!r} is a tolerance too: expected either a tolerance or a compensator")
             free[name] = maker.freedom(name)
-    members = (*(freedom for freedom, _ in chosen.values()), *free.values())
+    members = (*(freedom for freedom, _ in quantities.values()), *free.values())
     dof = DegreesOfFreedom(members, tuple(maker.deformations.values()))
-    return TolerancePlan(telescope, tuple(t for _, t in chosen.values()), tuple(free), dof)
+    return TolerancePlan(telescope, tuple(t for _, t in quantities.values()), tuple(free), dof)
 
 
 def _same_quantity(
@@ -148,8 +150,8 @@ class _Maker:
 
     def of(self, section: ToleranceSection) -> dict[str, tuple[DegreeOfFreedom, Tolerance]]:
         """Return the degrees of freedom of a tolerance by name, and the tolerance of each."""
-        body, _, what = section.name.rpartition(".")
-        kind, _, unit = what.rpartition("_")
+        body, _, quantity = section.name.rpartition(".")
+        kind, _, unit = quantity.rpartition("_")
         if kind in _PAIRS and unit in (ANGLES if kind == "tilt" else LENGTHS):
             return self._alike(section, [self.freedom(f"{body}.{motion}_{unit}") for motion in _PAIRS[kind]])
         if kind == "wedge" and unit in ANGLES:
@@ -198,13 +200,13 @@ class _Maker:
             raise ConfigError(f"{section.name}: expected a surface with a clear aperture")
         name = body.replace(".", "_") + _IRREGULAR
         terms = range(first, last + 1)
-        known = self.deformations.get(name)
-        count = max(last, len(known.shape.parameters) if known else 0)
+        deformation = self.deformations.get(name)
+        count = max(last, len(deformation.shape.parameters) if deformation else 0)
         self.deformations[name] = SurfaceDeformation(name, (surface.name,), ZernikeSag((0.0,) * count, radius))
         variance = np.array([float(noll_to_nm(j)[0]) ** -section.power for j in terms])
         sizes = section.size * np.sqrt(variance / variance.sum())
-        found = {}
+        zernike_terms = {}
         for j, size in zip(terms, sizes, strict=True):
             member = DegreeOfFreedom(f"{section.name} Z{j}", unit, {f"{name}.Z{j}": 1.0})
-            found[member.name] = (member, Tolerance(member.name, float(size), "normal"))
-        return found
+            zernike_terms[member.name] = (member, Tolerance(member.name, float(size), "normal"))
+        return zernike_terms

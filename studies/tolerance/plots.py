@@ -72,10 +72,8 @@ def yield_plot(study: ToleranceStudy) -> bytes:
         axes.fill_between(scale * at, *limits, color=BLUE, alpha=0.2, linewidth=0, label="binomial, 1 sigma")
         axes.axvline(scale * study.nominal, color=GREY, linestyle=(0, (4, 2)), linewidth=0.9, label="as designed")
         if study.requirement is not None:
-            estimate = study.yield_at(study.requirement)
-            label = (
-                f"requirement: {100 * estimate.fraction:.1f} % ({100 * estimate.low:.1f} to {100 * estimate.high:.1f})"
-            )
+            met = study.yield_at(study.requirement)
+            label = f"requirement: {100 * met.fraction:.1f} % ({100 * met.low:.1f} to {100 * met.high:.1f})"
             axes.axvline(scale * study.requirement, color=ORANGE, linewidth=1.2, label=label)
         axes.set_xlabel(f"requirement on the {study.criterion.title}{merit_unit(study)}")
         axes.set_ylabel("telescopes that meet it [%]")

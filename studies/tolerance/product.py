@@ -53,9 +53,9 @@ def tolerance_summary(study: ToleranceStudy) -> dict[str, Any]:
         "loss_percent": 100.0 * study.loss,
     }
     if study.requirement is not None:
-        yield_fraction = study.yield_at(study.requirement)
+        met = study.yield_at(study.requirement)
         summary["requirement"] = scale * study.requirement
-        summary["yield"] = {"fraction": yield_fraction.fraction, "low": yield_fraction.low, "high": yield_fraction.high}
+        summary["yield"] = {"fraction": met.fraction, "low": met.low, "high": met.high}
     return summary
 
 

@@ -120,7 +120,7 @@ def _points(toleranced: TolerancedMerit, deviations: np.ndarray) -> tuple[list[S
     about += [{"kind": kind, "tolerance": i} for i in range(n) for kind in (LOWER, UPPER)]
     about += [{"kind": INVERSE, "tolerance": i} for i in range(n)]
     about += [{"kind": DRAW, "draw": i} for i in range(len(deviations))]
-    return [SweepPoint(i, one, 0) for i, one in enumerate(about)], toleranced.compensated(rows)
+    return [SweepPoint(i, parameters, 0) for i, parameters in enumerate(about)], toleranced.compensated(rows)
 
 
 def _numbers(
