@@ -20,7 +20,7 @@ from ..media.air import ZERO_CELSIUS, Air
 from ..media.dispersion import FORMULAS, Dispersion
 from ..media.medium import Medium, RelativeToAir, Sellmeier
 from .bundled import DATA
-from .zemax.text import Record, read_text, records
+from .lens.text import Record, read_text, records
 
 BUNDLED = DATA / "glasses.agf"
 #: Makers whose catalogues come with the package, in the order in which a glass is looked up.

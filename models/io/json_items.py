@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 from ...core.errors import PrescriptionError, shown
 from ...core.files import read_bytes
-from .zemax.file import Findings
+from .lens.source import Findings
 
 #: Longest file [byte]: grids of sag take megabytes.
 MAX_BYTES = 50_000_000

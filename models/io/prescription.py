@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,7 +45,7 @@ from .glass_catalogue import GlassCatalogue
 from .yaml.reader import MAX_BYTES, read_telescope, telescope_of
 
 if TYPE_CHECKING:
-    from .zemax.file import Findings, ZemaxFile
+    from .lens.read import Reader
 
 #: Endings of lens files: Zemax and its archives, CODE V, OSLO, optiland, ray-optics.
 _LENS_FILES = (".zmx", ".zar", ".seq", ".len", ".json", ".roa")
@@ -58,32 +58,32 @@ WRITTEN = {
 ENDINGS = (".yaml", ".yml", *_LENS_FILES)
 
 
-def _parts_reader(ending: str) -> Callable[[Path, Findings], ZemaxFile]:
-    """Return the reader of the parts of lens files with an ending."""
+def _lens_reader(ending: str) -> Reader:
+    """Return the reader of lens files with an ending."""
     # Imported where they are needed, like the writers.
     if ending == ".zar":
         from .zar.reader import read_zemax_archive
 
         return read_zemax_archive
+    from .zemax.reader import described, read_zemax_lens
+
     if ending == ".len":
         from .oslo.reader import read_oslo_file
 
-        return read_oslo_file
+        return lambda path, findings, glasses: described(read_oslo_file(path, findings), findings, glasses)
     if ending == ".json":
         from .optiland.reader import read_optiland_file
 
-        return read_optiland_file
+        return lambda path, findings, glasses: described(read_optiland_file(path, findings), findings, glasses)
     if ending == ".roa":
         from .rayoptics.reader import read_rayoptics_file
 
-        return read_rayoptics_file
+        return lambda path, findings, glasses: described(read_rayoptics_file(path, findings), findings, glasses)
     if ending == ".seq":
         from .codev.reader import read_codev_file
 
-        return read_codev_file
-    from .zemax.file import read_zemax_file
-
-    return read_zemax_file
+        return lambda path, findings, glasses: described(read_codev_file(path, findings), findings, glasses)
+    return read_zemax_lens
 
 
 @check_arguments
@@ -131,10 +131,10 @@ def load_telescope(
 
         return batoid_telescope(content, path, lenient=lenient)
     if path.suffix.lower() in _LENS_FILES:
-        from .zemax.reader import read_lens
+        from .lens.read import read_lens
 
-        parts = _parts_reader(path.suffix.lower())
-        return read_lens(path, parts, lenient=lenient, glass_catalogues=glass_catalogues)
+        reader = _lens_reader(path.suffix.lower())
+        return read_lens(path, reader, lenient=lenient, glass_catalogues=glass_catalogues)
     if isinstance(name_or_path, os.PathLike) or len(path.parts) > 1 or path.is_file():
         raise PrescriptionError(f"expected a prescription file that ends in {', '.join(ENDINGS)}", file=path)
     raise unknown_name("telescope", text, BUNDLED)
@@ -158,7 +158,7 @@ def prescription_digest(path: str | os.PathLike[str]) -> str:
 
         named = [path.with_suffix(".agf").name, *(os.path.abspath(p) for p in user_catalogues())]
         if path.suffix.lower() == ".zmx":
-            from .zemax.text import read_text
+            from .lens.text import read_text
             from .zemax.user_apertures import named_apertures
 
             named += [os.path.abspath(p) for p in named_apertures(path, read_text(path))]

@@ -13,7 +13,7 @@ from ..media.medium import Medium
 from ..surface import Interaction
 from ..telescope import Telescope
 from ..thickness import thickness
-from .zemax.file import Findings
+from .lens.source import Findings
 
 #: Relative difference from a pickup that rounding in files makes.
 _ROUNDING = 1e-6

@@ -28,8 +28,8 @@ from ...media.medium import Medium
 from ...shapes.shape import Plane
 from ...surface import IDENTITY, Interaction, Matrix, Surface, Vector
 from ...telescope import VACUUM, Telescope
+from ..lens.source import Findings
 from ..writable import require_met
-from ..zemax.file import Findings
 from . import ROOT
 from .apertures import clear_region
 from .optics import BatoidFile, Compound, Extras, Frame, Interface, Optic, Screen

@@ -21,9 +21,10 @@ from typing import Any
 from ....core.errors import PrescriptionError
 from ...media.medium import Medium
 from ...media.tabulated import TabulatedIndex
-from ..zemax.file import Block, Findings, ZemaxFile
+from ..lens.source import Findings
+from ..lens.text import Record, read_text, scaled
+from ..zemax.file import Block, ZemaxFile
 from ..zemax.placed import made_record
-from ..zemax.text import Record, read_text, scaled
 
 UNITS = {"M": "MM", "MM": "MM", "C": "CM", "CM": "CM", "I": "IN", "IN": "IN"}
 FIELDS = {
@@ -90,7 +91,7 @@ def _commands(path: Path) -> Iterator[Record]:
             words = part.split()
             if words:
                 after = part.strip()[len(words[0]) :].strip()
-                yield Record(str(path), first, "", words[0].upper(), tuple(words[1:]), after)
+                yield Record(str(path), "", words[0].upper(), line=first, words=tuple(words[1:]), text=after)
 
 
 class _Translation:
@@ -342,7 +343,7 @@ class _Translation:
         """Refuse a paraxial image solve (PIM) whose solution does not stand in the file."""
         for number, values in enumerate(self.values[:-1]):
             if "PIM" in values and not values.get("THI"):
-                line = Record(str(self.path), int(values["PIM"]), f"surface {number}", "PIM", (), "")
+                line = Record(str(self.path), f"surface {number}", "PIM", line=int(values["PIM"]), words=(), text="")
                 raise line.problem("PIM: expected the thickness of the solve in the file; it is 0")
 
     def _blocks(self) -> list[Block]:

@@ -15,9 +15,9 @@ from ...aperture import Annulus, Circle, Complement, Ellipse, Rectangle
 from ...media.medium import Medium
 from ...surface import Interaction
 from ...telescope import VACUUM, Telescope
-from ..lens_sequence import LensSequence, SequenceSurface, catalogue_name, maker_of, quoted
+from ..lens.sequence import LensSequence, SequenceSurface, catalogue_name, maker_of, quoted
+from ..lens.text import number_text, scaled
 from ..profile import Profile
-from ..zemax.text import number_text, scaled
 from .reader import MMHG, POWERS
 
 FILE = "a CODE V file"

@@ -13,8 +13,8 @@ from ....core.errors import PrescriptionError
 from ...design_data import DesignData
 from ...paraxial import stop_states_rays
 from ...telescope import Telescope
-from ..zemax.file import Findings
-from ..zemax.text import scaled
+from ..lens.source import Findings
+from ..lens.text import scaled
 from .reader import APERTURES, FIELD_TYPES
 
 MM = 1e-3

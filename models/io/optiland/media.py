@@ -16,7 +16,7 @@ from ...media.medium import ConstantIndex, Medium, Sellmeier
 from ...media.tabulated import TabulatedIndex
 from ..glass_catalogue import MAKERS, SUBSTANCES, GlassCatalogue
 from ..json_items import JsonObject
-from ..zemax.file import Findings
+from ..lens.source import Findings
 from ..zemax.placed import Line, PlacedSurfaces
 
 #: Powers of the wavelength [um] in the series of makers, by the name of the formula.

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from ..json_items import JsonObject
-from ..zemax.file import Findings, ZemaxFile
+from ..lens.source import Findings
+from ..zemax.file import ZemaxFile
 from ..zemax.placed import Line, PlacedSurfaces
 from .media import glass_lines
 from .shapes import shape_lines

@@ -29,9 +29,9 @@ from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere
 from ...shapes.sum import Sum
 from ...zernike_polynomials import noll_to_nm
 from ..json_items import JsonObject
-from ..zemax.file import Findings
+from ..lens.shapes import MOST_ODD, polynomial_powers, square_term
+from ..lens.source import Findings
 from ..zemax.placed import Line, numbered
-from ..zemax.shapes import MOST_ODD, polynomial_powers, square_term
 
 #: Highest degree of polynomials.
 MOST_DEGREE = 40

@@ -19,10 +19,10 @@ from ...paraxial import with_true_aperture
 from ...rotation import rotation_angles
 from ...surface import Interaction, Surface
 from ...telescope import Telescope
+from ..lens.description import PUPIL_PLANE
+from ..lens.frame import HALF_TURN, rotated_aperture, rotated_shape
+from ..lens.source import Findings
 from ..writable import report_pupil_plane, report_unheld, require_sequential, with_formulas
-from ..zemax.file import Findings
-from ..zemax.frame import HALF_TURN, rotated_aperture, rotated_shape
-from ..zemax.reader import PUPIL_COMMENT
 from .design import MM, own_stop, system_items, with_optiland_aperture
 from .media import material_items
 from .shapes import geometry_items
@@ -55,7 +55,7 @@ def telescope_to_optiland(telescope: Telescope, *, lenient: bool = False) -> str
         ]
         if stop is None:
             plane = {"type": "Plane", "radius": math.inf}
-            surfaces.append(_items(_system(-t.stop_z - first), plane, before, PUPIL_COMMENT, stop=True))
+            surfaces.append(_items(_system(-t.stop_z - first), plane, before, PUPIL_PLANE, stop=True))
         for surface in t.surfaces:
             try:
                 surfaces.append(_surface_items(surface, first, stop=surface.name == stop))

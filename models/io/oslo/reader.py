@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ....core.errors import PrescriptionError, error_context
@@ -21,9 +21,10 @@ from ...media.dispersion import model_glass
 from ...media.medium import Medium
 from ...media.tabulated import TabulatedIndex
 from ..glass_search import find_glass
-from ..zemax.file import Findings, ZemaxFile
+from ..lens.source import Findings
+from ..lens.text import Record, read_text, scaled
+from ..zemax.file import ZemaxFile
 from ..zemax.placed import Line, PlacedSurfaces, numbered
-from ..zemax.text import Record, read_text, scaled
 from .frames import surface_frames
 from .solves import AxialRay
 
@@ -89,7 +90,9 @@ def _commands(path: Path) -> Iterator[Record]:
             words = re.findall(r'"[^"]*"|//.*|[^\s,"]+', part)
             words = words[: next((i for i, w in enumerate(words) if w.startswith("//")), len(words))]
             if words:
-                yield Record(str(path), number, "", words[0].upper(), tuple(words[1:]), " ".join(words[1:]))
+                yield Record(
+                    str(path), "", words[0].upper(), line=number, words=tuple(words[1:]), text=" ".join(words[1:])
+                )
 
 
 class _Translation:
@@ -136,7 +139,7 @@ class _Translation:
     def _read(self, command: Record) -> None:
         key, current = command.keyword, self.surfaces[-1]
         place = f"surface {current.number}"
-        command = Record(command.source, command.line, place, key, command.words, command.text)
+        command = replace(command, place=place)
         indexed = re.fullmatch(r"(WV|WW)(\d*)", key)
         if key == "NXT":
             self.surfaces.append(_Surface(current.number + 1))

@@ -15,10 +15,10 @@ from ...media.tabulated import TabulatedIndex
 from ...telescope import VACUUM
 from ..glass_catalogue import MAKERS, GlassCatalogue
 from ..json_items import JsonObject
-from ..lens_sequence import LensSequence
-from ..zemax.file import Findings
+from ..lens.sequence import LensSequence
+from ..lens.source import Findings
+from ..lens.text import scaled
 from ..zemax.placed import Line, PlacedSurfaces
-from ..zemax.text import scaled
 from .items import array, attributes, class_name, instance, module_name, numbers
 
 #: Formulas of the coefficients, by maker and number of them: Sellmeier's lists those of B before those of C.

@@ -15,9 +15,10 @@ import numpy as np
 
 from ...rotation import rotation_matrix
 from ..json_items import JsonObject
-from ..zemax.file import Findings, ZemaxFile
+from ..lens.source import Findings
+from ..lens.text import scaled
+from ..zemax.file import ZemaxFile
 from ..zemax.placed import INFINITE, Line, PlacedSurfaces
-from ..zemax.text import scaled
 from .items import attributes, class_name, named, numbers
 from .media import medium_lines
 from .shapes import profile_lines

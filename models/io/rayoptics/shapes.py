@@ -13,10 +13,10 @@ from typing import Any
 
 from ....core.errors import PrescriptionError
 from ..json_items import JsonObject
+from ..lens.shapes import MOST_ODD
+from ..lens.source import Findings
 from ..profile import Profile
-from ..zemax.file import Findings
 from ..zemax.placed import Line, numbered
-from ..zemax.shapes import MOST_ODD
 from .items import attributes, class_name, instance, numbers
 
 #: Zemax type, and power of r of each step of the coefficients.

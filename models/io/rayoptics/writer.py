@@ -16,9 +16,9 @@ from ....core.errors import PrescriptionError, error_context
 from ...aperture import Circle, Ellipse, Rectangle
 from ...surface import Interaction
 from ...telescope import Telescope
-from ..lens_sequence import LensSequence, SequenceSurface
+from ..lens.sequence import LensSequence, SequenceSurface
+from ..lens.text import scaled
 from ..profile import Profile
-from ..zemax.text import scaled
 from .items import array, instance
 from .media import Media
 from .reader import FIELDS, MMHG

@@ -17,8 +17,12 @@ from ....core.errors import PrescriptionError, shown
 from ....core.files import read_bytes
 from ...media.medium import Medium
 from ..glass_catalogue import GlassCatalogue
-from ..zemax.file import Findings, ZemaxFile, parse_zemax_file
-from ..zemax.text import decoded
+from ..lens.description import LensDescription
+from ..lens.glasses import Glasses
+from ..lens.source import Findings
+from ..lens.text import decoded
+from ..zemax.file import parse_zemax_file
+from ..zemax.reader import described
 
 #: Ending of the names of compressed files.
 _PACKED = ".lzw"
@@ -40,8 +44,8 @@ class _Layout:
 LAYOUTS = {0xEC: _Layout(0x10, 8, 0x30, "utf-16-le", 0x288), 0xEA: _Layout(0xC, 4, 0x20, "iso-8859-1", 0x14C)}
 
 
-def read_zemax_archive(path: Path, findings: Findings) -> ZemaxFile:
-    """Return the parts of the lens file of an archive; glasses of its catalogues come first.
+def read_zemax_archive(path: Path, findings: Findings, catalogues: Glasses) -> LensDescription:
+    """Return the description of the lens file of an archive; glasses of its catalogues come first.
 
     PrescriptionError if it is no archive, is damaged, or does not hold one lens file.
     """
@@ -65,7 +69,7 @@ def read_zemax_archive(path: Path, findings: Findings) -> ZemaxFile:
         found = ", ".join(map(shown, lenses)) or "none"
         raise PrescriptionError(f"expected one lens file (.zmx) in the archive, found {found}", file=path)
     (lens,) = lenses.values()
-    return replace(parse_zemax_file(lens, path, findings), glasses=glasses)
+    return described(replace(parse_zemax_file(lens, path, findings), glasses=glasses), findings, catalogues)
 
 
 def _members(data: bytes, path: Path) -> Iterator[tuple[str, bytes]]:

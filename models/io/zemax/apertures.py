@@ -8,8 +8,10 @@ import numpy as np
 
 from ....core.errors import PrescriptionError
 from ...aperture import Annulus, Aperture, Circle, Complement, Ellipse, Rectangle, Union, Vane, shifted
-from .file import Block, Findings
-from .text import number_text
+from ..lens.apertures import ellipse, rectangle, ring
+from ..lens.source import Findings
+from ..lens.text import number_text
+from .file import Block
 from .user_apertures import read_user_aperture
 
 
@@ -35,16 +37,10 @@ def read_aperture(block: Block, unit: float, findings: Findings) -> Aperture | N
             turns = (2 * math.pi * arm / int(second) for arm in range(int(second)))
             region = Union(tuple(Vane(first * unit, x, y, turn) for turn in turns))
         elif keyword in ("SQAP", "SQOB", "ELAP", "ELOB"):
-            if not (first > 0 and second > 0):
-                raise line.error("two positive half widths")
-            if keyword in ("SQAP", "SQOB"):
-                region = Rectangle(2 * first * unit, 2 * second * unit, x, y)
-            else:
-                region = Ellipse(first * unit, second * unit, x, y)
-        elif not 0 <= first < second:
-            raise line.error("a smallest and a largest radius")
+            half = rectangle if keyword in ("SQAP", "SQOB") else ellipse
+            region = half(line, first * unit, second * unit, x, y)
         else:
-            region = Annulus(first * unit, second * unit, x, y) if first else Circle(second * unit, x, y)
+            region = ring(line, first * unit, second * unit, x, y)
         found.append(Complement(region) if keyword in ("OBSC", "SQOB", "ELOB", "SPID") else region)
     for keyword in ("UDAD", "USAP", "USOB", "UDAP"):
         for line in block.all(keyword)[:1]:

@@ -14,8 +14,8 @@ import numpy as np
 
 from ...media.medium import ConstantIndex, Medium
 from ...rotation import rotation_angles
+from ..lens.text import Record, number_text
 from .file import Block, ZemaxFile
-from .text import Record, number_text
 
 #: Lines of a surface: a keyword and its words.
 Line = tuple[str | float, ...]
@@ -131,7 +131,7 @@ def numbered(keyword: str, values: Mapping[int, float] | Iterable[float]) -> lis
 def made_record(path: Path, place: str, line: Line) -> Record:
     """Return a line of a translated file; `place` is that of its block."""
     words = tuple(number_text(v) if isinstance(v, float) else str(v) for v in line)
-    return Record(str(path), 1, place, words[0], words[1:], " ".join(words[1:]))
+    return Record(str(path), place, words[0], line=1, words=words[1:], text=" ".join(words[1:]))
 
 
 def _break(values: list[float], order: int) -> list[Line]:

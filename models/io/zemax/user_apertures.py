@@ -18,7 +18,7 @@ import numpy as np
 from ....core.errors import PrescriptionError, error_context
 from ....core.files import read_bytes
 from ...aperture import Aperture, Circle, Complement, Ellipse, Intersection, Polygon, Union
-from .text import Record, decoded, records
+from ..lens.text import Record, decoded, records
 
 #: Keywords of surfaces, and whether light passes within the outlines.
 KEYWORDS = {"USAP": True, "USOB": False}
@@ -61,7 +61,7 @@ def read_user_aperture(line: Record, unit: float) -> Aperture:
     name = aperture_name(line.text)
     if line.keyword not in KEYWORDS or name is None:
         raise line.problem(f"{line.shown}: user-defined apertures are read where USAP or USOB names a file NAME.uda")
-    path = aperture_file(Path(line.source), name)
+    path = aperture_file(Path(line.file), name)
     if path is None:
         raise line.problem(f"{line.shown}: expected the file {name} beside the lens file")
     text = decoded(read_bytes(path, PrescriptionError, max_bytes=_MAX_BYTES), name)

@@ -25,15 +25,15 @@ from ...rotation import rotation_angles
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope
 from ..glass_catalogue import NUMBERED, SELLMEIER_TERMS, GlassCatalogue
+from ..lens.description import PUPIL_PLANE
+from ..lens.frame import HALF_TURN, rotated_aperture, rotated_shape
+from ..lens.source import Findings
+from ..lens.text import number_text, scaled
 from ..writable import report_pupil_plane, report_unheld, require_met, require_sequential, with_formulas
 from .apertures import aperture_lines
-from .design import design_lines, stop_lines
-from .file import Findings
-from .frame import HALF_TURN, rotated_aperture, rotated_shape
 from .links import add_link_lines
-from .reader import PUPIL_COMMENT
 from .shapes import shape_lines
-from .text import number_text, scaled
+from .system import design_lines, stop_lines
 
 MM = 1e-3
 #: Names of the units of a file [m].
@@ -76,7 +76,7 @@ def telescope_to_zemax(telescope: Telescope, *, lenient: bool = False) -> tuple[
     if not own_stop:
         # The plane of the stop, in front of all; z counts along the light, from the origin.
         blocks.append(
-            [f"COMM {PUPIL_COMMENT}", "STOP", "TYPE STANDARD", "CURV 0.0", *_glass_line(t.medium_before, glasses)]
+            [f"COMM {PUPIL_PLANE}", "STOP", "TYPE STANDARD", "CURV 0.0", *_glass_line(t.medium_before, glasses)]
         )
     place = -first
     before = t.medium_before

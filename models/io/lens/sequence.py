@@ -14,23 +14,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...core.errors import PrescriptionError, error_context
-from ..aperture import Aperture, Complement
-from ..design_data import DesignData
-from ..media.air import STANDARD_ATMOSPHERE, ZERO_CELSIUS
-from ..media.medium import ConstantIndex, Medium
-from ..media.tabulated import TabulatedIndex
-from ..paraxial import stop_makes_pupil, stop_states_rays, with_true_aperture
-from ..rotation import rotation_angles
-from ..shapes.shape import Plane, Shape
-from ..surface import Interaction, Surface
-from ..telescope import VACUUM, Telescope
-from .glass_catalogue import MAKERS, GlassCatalogue
-from .glass_search import find_glass
-from .writable import report_pupil_plane, report_unheld, require_met, require_sequential
-from .zemax.file import Findings
-from .zemax.frame import HALF_TURN, rotated_aperture, rotated_shape
-from .zemax.reader import PUPIL_COMMENT
+from ....core.errors import PrescriptionError, error_context
+from ...aperture import Aperture, Complement
+from ...design_data import DesignData
+from ...media.air import STANDARD_ATMOSPHERE, ZERO_CELSIUS
+from ...media.medium import ConstantIndex, Medium
+from ...media.tabulated import TabulatedIndex
+from ...paraxial import stop_makes_pupil, stop_states_rays, with_true_aperture
+from ...rotation import rotation_angles
+from ...shapes.shape import Plane, Shape
+from ...surface import Interaction, Surface
+from ...telescope import VACUUM, Telescope
+from ..glass_catalogue import MAKERS, GlassCatalogue
+from ..glass_search import find_glass
+from ..writable import report_pupil_plane, report_unheld, require_met, require_sequential
+from .description import PUPIL_PLANE
+from .frame import HALF_TURN, rotated_aperture, rotated_shape
+from .source import Findings
 
 MM = 1e-3
 #: Cosine, of the local z axis with the light, below which it is against the sense that the mirrors make.
@@ -154,7 +154,7 @@ class LensSequence:
     @property
     def pupil_plane(self) -> bool:
         """Whether a plane of its own in front carries the stop."""
-        return self.surfaces[0].name == PUPIL_COMMENT
+        return self.surfaces[0].name == PUPIL_PLANE
 
     @property
     def title(self) -> str:
@@ -275,7 +275,7 @@ def _surfaces(t: Telescope, stop: str | None, *, along_light: bool) -> tuple[Seq
     heights: list[float] = []
     if stop is None:
         plane = SequenceSurface(
-            PUPIL_COMMENT, Interaction.PASS, Plane(), None, None, (0.0, 0.0), (0.0,) * 3, 0.0, medium, medium, True
+            PUPIL_PLANE, Interaction.PASS, Plane(), None, None, (0.0, 0.0), (0.0,) * 3, 0.0, medium, medium, True
         )
         found.append(plane)
         heights.append(-t.stop_z)

@@ -1,4 +1,4 @@
-"""Rotation between the axes of Zemax, where light enters along +z, and those of a telescope, where it enters along -z.
+"""Rotation between the axes of a lens, where light enters along +z, and those of a telescope, where it enters along -z.
 
 The two differ by half a turn about y: ``(x, y, z)`` in one is ``(-x, y, -z)`` in the other, for points and for the
 local axes of each surface alike. A surface that is not tilted in one is not tilted in the other; its sag changes sign
@@ -36,7 +36,7 @@ def rotated_axes(axes: np.ndarray) -> Matrix:
 
 
 def rotated_shape(shape: Shape) -> Shape:
-    """Return the shape in the rotated axes, ``-sag(-x, y)``; PrescriptionError if Zemax files have no such shape."""
+    """Return the shape in the rotated axes, ``-sag(-x, y)``; PrescriptionError if lens files have no such shape."""
     if isinstance(shape, Plane):
         return shape
     if isinstance(shape, Sphere | Conic):
@@ -53,7 +53,7 @@ def rotated_shape(shape: Shape) -> Shape:
         return GridSag(-shape.x[::-1], shape.y, -shape.values[:, ::-1])
     if isinstance(shape, Sum):
         return Sum(tuple(rotated_shape(part) for part in shape.parts))
-    raise PrescriptionError(f"shape {type(shape).__name__}: expected one that a Zemax file can hold")
+    raise PrescriptionError(f"shape {type(shape).__name__}: expected one that a lens file can hold")
 
 
 def _parity(j: int) -> int:
