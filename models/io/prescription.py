@@ -82,7 +82,7 @@ def _lens_reader(ending: str) -> Reader:
     if ending == ".seq":
         from .codev.reader import read_codev_file
 
-        return lambda path, findings, glasses: described(read_codev_file(path, findings), findings, glasses)
+        return read_codev_file
     return read_zemax_lens
 
 
