@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 from ...core.errors import PrescriptionError, shown
 from ...core.files import read_bytes
-from .lens.source import Findings
+from .lens.source import Findings, Source
 
 #: Longest file [byte]: grids of sag take megabytes.
 MAX_BYTES = 50_000_000
@@ -50,6 +50,14 @@ class JsonObject:
     def problem(self, text: str) -> PrescriptionError:
         """Return an error of this object."""
         return PrescriptionError(text, file=self.source, place=self.place or None)
+
+    def at(self, key: str) -> Source:
+        """Return the source of a value."""
+        return Source(self.source, self.place, key, shown(self.content.get(key)))
+
+    def part(self, text: str) -> Source:
+        """Return the source of a part of this object, as messages name it."""
+        return Source(self.source, self.place, text)
 
     def refuse(self, key: str, expected: str) -> NoReturn:
         """Raise the error of a value that is not the expected one."""

@@ -74,7 +74,7 @@ def _lens_reader(ending: str) -> Reader:
     if ending == ".json":
         from .optiland.reader import read_optiland_file
 
-        return lambda path, findings, glasses: described(read_optiland_file(path, findings), findings, glasses)
+        return read_optiland_file
     if ending == ".roa":
         from .rayoptics.reader import read_rayoptics_file
 

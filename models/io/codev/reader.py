@@ -22,13 +22,12 @@ import numpy as np
 
 from ....core.errors import PrescriptionError
 from ...aperture import Aperture, Circle, Complement
-from ...media.air import STANDARD_ATMOSPHERE, ZERO_CELSIUS
 from ...media.medium import Medium
 from ...media.tabulated import TabulatedIndex
 from ...rotation import rotation_matrix
 from ...telescope import VACUUM
 from ..lens.apertures import ellipse, rectangle, ring
-from ..lens.description import Format, LensDescription
+from ..lens.description import Format, LensDescription, LensSurface
 from ..lens.glasses import Glasses, numbered_glass
 from ..lens.shapes import even_asphere
 from ..lens.source import Findings, Source
@@ -36,17 +35,10 @@ from ..lens.text import Record, read_text, scaled
 
 FORMAT = Format("CODE V", "EPD, FNO or NAO", "WL", "STO")
 UNITS = {"M": 1e-3, "MM": 1e-3, "C": 1e-2, "CM": 1e-2, "I": 0.0254, "IN": 0.0254}
-#: Axis and type of field points.
-FIELDS = {
-    f"{axis}{ending}": (axis, kind)
-    for axis in "XY"
-    for ending, kind in (
-        ("AN", "angle"),
-        ("OB", "object_height"),
-        ("IM", "paraxial_image_height"),
-        ("RI", "real_image_height"),
-    )
-}
+#: Types of field points by the ending of the command, whose first letter is the axis.
+FIELDS = {"AN": "angle", "OB": "object_height", "IM": "paraxial_image_height", "RI": "real_image_height"}
+#: Commands of field points.
+POINTS = tuple(f"{axis}{ending}" for axis in "XY" for ending in FIELDS)
 #: System apertures, the first of which counts.
 APERTURES = ("EPD", "FNO", "NAO")
 #: Millimetres of mercury in an atmosphere.
@@ -54,7 +46,7 @@ MMHG = 760.0
 #: Vignetting factors: the parts by which the upper and lower halves of the pupil shrink, along x and y.
 VIGNETTING = ("VUX", "VLX", "VUY", "VLY")
 #: Commands of the whole system with numbers.
-NUMERIC = ("WL", "WTW", "WTF", "TEM", "PRE", "REF", *VIGNETTING, *APERTURES, *FIELDS)
+NUMERIC = ("WL", "WTW", "WTF", "TEM", "PRE", "REF", *VIGNETTING, *APERTURES, *POINTS)
 SYSTEM = frozenset(("RDM", "DIM", "TIT", "AFO", "PRV", *NUMERIC))
 LONG_NAMES = {"TITLE": "TIT", "STOP": "STO"}
 POWERS = "ABCDEFG"
@@ -110,6 +102,11 @@ def _commands(path: Path) -> Iterator[Record]:
                 after = part.strip()[len(words[0]) :].strip()
                 key = LONG_NAMES.get(words[0].upper(), words[0].upper())
                 yield Record(str(path), "", key, line=first, words=tuple(words[1:]), text=after)
+
+
+def _largest(records: list[Record], default: Source) -> Source:
+    """Return the command with the number that is farthest from zero."""
+    return max(records, key=lambda record: max(map(abs, record.numbers()), default=0.0), default=default)
 
 
 @dataclass
@@ -334,14 +331,11 @@ class _Reader:
 
     def _state_system(self) -> None:
         lens, system = self.description, self.system
-        unit = system.get("DIM")
-        if unit is not None:
-            name = (unit.words or ("M",))[0].upper()
-            if name not in UNITS:
-                raise unit.error(f"one of {', '.join(UNITS)}")
-            lens.state_unit(UNITS[name])
-        else:
-            lens.state_unit(UNITS["M"])
+        unit = system.get("DIM", Record(str(self.path), words=("M",)))
+        name = (unit.words or ("M",))[0].upper()
+        if name not in UNITS:
+            raise unit.error(f"one of {', '.join(UNITS)}")
+        lens.state_unit(UNITS[name])
         lens.title = system["TIT"].text.strip("'\" ") if "TIT" in system else ""
         distance = self.surfaces[0].get("THI")
         lens.object_distance = math.inf if abs(distance) >= INFINITE else distance * lens.unit
@@ -359,14 +353,10 @@ class _Reader:
         if "AFO" in system:
             words = system["AFO"].words
             lens.state(system["AFO"], afocal=not (words and words[0].upper().startswith("N")))
-        environment = [system[key] for key in ("TEM", "PRE") if key in system]
-        if environment:
-            celsius, pressure = (
-                system[key].number(0, usual) if key in system else usual
-                for key, usual in (("TEM", 20.0), ("PRE", MMHG))
-            )
-            air = {"temperature": celsius + ZERO_CELSIUS, "pressure": pressure / MMHG * STANDARD_ATMOSPHERE}
-            lens.state(environment[0], **air)
+        air = [system.get("TEM"), system.get("PRE")]
+        celsius, pressure = (v.number(0, usual) if v else usual for v, usual in zip(air, (20.0, MMHG), strict=True))
+        for command in [v for v in air if v][:1]:
+            lens.state_air(command, celsius, pressure / MMHG)
 
     def _numbers(self, key: str) -> list[float]:
         return self.system[key].numbers() if key in self.system else []
@@ -375,34 +365,23 @@ class _Reader:
         if "WL" not in self.system:
             return
         waves = [scaled(v, -9) for v in self._numbers("WL")]
-        weights = (self._numbers("WTW") + [1.0] * len(waves))[: len(waves)]
         reference = self.system.get("REF")
         primary = 1 if reference is None else reference.integer(0)
         if reference is not None and waves and not 1 <= primary <= len(waves):
             raise reference.error(f"1 to {len(waves)}")
-        self.description.state_wavelengths(self.system["WL"], waves, weights, primary - 1)
+        self.description.state_wavelengths(self.system["WL"], waves, self._numbers("WTW"), primary - 1)
 
     def _state_fields(self) -> None:
         lens = self.description
-        stated = {FIELDS[key][0]: record for key, record in self.system.items() if key in FIELDS}
-        kind = next((FIELDS[key][1] for key in reversed(self.system) if key in FIELDS), "angle")
-        columns = [stated[axis].numbers() if axis in stated else [] for axis in "XY"]
-        points = list(zip_longest(*columns, fillvalue=0.0)) or [(0.0, 0.0)]
-        farthest = max("XY", key=lambda axis: max(map(abs, columns["XY".index(axis)]), default=-1.0))
-        lens.state_fields(stated.get(farthest, Source(str(self.path), keyword="YAN")), kind, points)
+        stated = [record for key, record in self.system.items() if key in POINTS]
+        columns = {record.keyword[0]: record.numbers() for record in stated}
+        points = list(zip_longest(columns.get("X", ()), columns.get("Y", ()), fillvalue=0.0)) or [(0.0, 0.0)]
+        kind = FIELDS[stated[-1].keyword[1:]] if stated else "angle"
+        lens.state_fields(_largest(stated, Source(str(self.path), keyword="YAN")), kind, points)
         if "WTF" in self.system:
             lens.state_field_weights(self.system["WTF"], self._numbers("WTF"))
-        factors = {key: self.system[key] for key in VIGNETTING if key in self.system}
-        if factors:
-            both = [
-                list(zip_longest(self._numbers(f"VU{axis}"), self._numbers(f"VL{axis}"), fillvalue=0.0))
-                for axis in "XY"
-            ]
-            # The pupil reaches from lower - 1 to 1 - upper.
-            decentres = ([0.5 * (low - up) for up, low in ends] for ends in both)
-            compressions = ([0.5 * (low + up) for up, low in ends] for ends in both)
-            largest = max(factors.values(), key=lambda record: max(map(abs, record.numbers()), default=0.0))
-            lens.state_vignetting(largest, *decentres, *compressions)
+        factors = [self.system[key] for key in VIGNETTING if key in self.system]
+        lens.state_vignetted_ends(_largest(factors, Source(str(self.path))), *map(self._numbers, VIGNETTING))
 
     def _medium(self, surface: _Surface) -> Medium:
         name, command = surface.glass_name, surface.glass
@@ -413,12 +392,11 @@ class _Reader:
         if digits:
             # A number: the digits of nd - 1, then the Abbe number times ten, each with three digits or six.
             index, abbe = (digits[1], digits[2]) if digits[1] else (digits[3], digits[4])
-            return numbered_glass(
-                1 + float(f"0.{index}"), float(abbe) / 10 ** (len(abbe) - 2), 0.0, name.upper(), command
-            )
+            nd, vd = 1 + float(f"0.{index}"), float(abbe) / 10 ** (len(abbe) - 2)
+            return numbered_glass(nd, vd, 0.0, name, command)
         if numbers:
             # Index and Abbe number as they are.
-            return numbered_glass(float(numbers[1]), float(numbers[2]), 0.0, name.upper(), command)
+            return numbered_glass(float(numbers[1]), float(numbers[2]), 0.0, name, command)
         name = name.strip("'").split("_")[0].upper()
         return self.private[name] if name in self.private else self.glasses.named(name, command)
 
@@ -486,17 +464,16 @@ class _Reader:
         powers = [0.0, *(surface.get(p) * unit ** (1 - 2 * i) for i, p in enumerate(POWERS, start=2))]
         with command.context():
             shape = even_asphere(surface.get("CURV") / unit, surface.get("K"), powers)
-        lens.add(
+        placed = LensSurface(
             surface.commands.get("STO", surface.place) if surface.stop else surface.place,
             shape,
             origin,
             axes,
             name=surface.name,
-            mirror=surface.mirror,
-            medium=self._medium(surface),
+            after=self._medium(surface),
             aperture=self._aperture(surface),
             semi_diameter=surface.get("EDGE") * unit,
             stop=surface.stop,
             distance=distance,
-            number=number,
         )
+        lens.add(placed, mirror=surface.mirror)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ...aperture import Annulus, Aperture, Circle, Complement, Ellipse, Rectangle
+from ...aperture import Annulus, Aperture, Circle, Ellipse, Rectangle
 from .source import Source
 
 
@@ -28,8 +28,3 @@ def ellipse(source: Source, half_x: float, half_y: float, x: float, y: float) ->
 def _require_positive(source: Source, half_x: float, half_y: float) -> None:
     if not (half_x > 0 and half_y > 0):
         raise source.error("two positive half widths")
-
-
-def obscuring(aperture: Aperture, blocks: bool = True) -> Aperture:
-    """Return the region outside an aperture, or where it does not block itself."""
-    return Complement(aperture) if blocks else aperture

@@ -136,7 +136,7 @@ def _pupil(lens: LensDescription, surfaces: Sequence[LensSurface]) -> _Pupil:
     for surface in surfaces:
         paraxial.advance(surface.distance or 0.0)
         if surface.stop:
-            paraxial.mark_stop(surface.semi_diameter or 0.0)
+            paraxial.mark_stop(surface.semi_diameter)
             stop_source = surface.source
         mirror = surface.interaction == Interaction.MIRROR
         paraxial.add(surface.shape.curvatures, surface.before, surface.after, mirror=mirror)
@@ -202,7 +202,7 @@ def _placed(surface: LensSurface, name: str, z0: float) -> Surface:
             medium_after=surface.after,
             aperture=None if surface.aperture is None else rotated_aperture(surface.aperture),
             rotation=rotated_axes(surface.axes),
-            semi_diameter=surface.semi_diameter,
+            semi_diameter=surface.semi_diameter if surface.semi_diameter > 0 else None,
         )
 
 

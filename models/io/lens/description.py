@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from ....core.errors import PrescriptionError
 from ...aperture import Aperture
 from ...design_data import LENGTH_UNITS, DesignData
 from ...links import Pickup, Solve
+from ...media.air import STANDARD_ATMOSPHERE, ZERO_CELSIUS
 from ...media.medium import Medium
 from ...shapes.shape import Shape
 from ...surface import Interaction
@@ -54,19 +56,19 @@ class LensSurface:
     alone. `before` and `after` are the media on either side; `number` is that of the file.
     """
 
-    name: str
-    interaction: Interaction
+    source: Source
     shape: Shape
     position: np.ndarray
     axes: np.ndarray
-    before: Medium
-    after: Medium
+    name: str = ""
+    interaction: Interaction = Interaction.PASS
+    before: Medium = VACUUM
+    after: Medium = VACUUM
     aperture: Aperture | None = None
-    semi_diameter: float | None = None
+    semi_diameter: float = 0.0
     stop: bool = False
     distance: float | None = None
     number: int = 0
-    source: Source = field(default_factory=lambda: Source(""))
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ class LensDescription:
     object_distance: float = math.inf
     medium: Medium = VACUUM
     surfaces: list[LensSurface] = field(default_factory=list)
-    design: DesignData = field(default_factory=DesignData)
+    design: DesignData = field(default_factory=lambda: DesignData(length_unit="mm"))
     apertures: list[StatedAperture] = field(default_factory=list)
     telecentric: bool = False
     largest_field: float = 0.0
@@ -129,12 +131,11 @@ class LensDescription:
     def state_wavelengths(
         self, source: Source, wavelengths: Sequence[float], weights: Sequence[float] = (), primary: int = 0
     ) -> None:
-        """Set vacuum wavelengths [m], their weights and the place of the primary one."""
+        """Set vacuum wavelengths [m], their weights, 1 where they are missing, and the place of the primary one."""
         if not wavelengths or not all(0 < v < _LONGEST for v in wavelengths):
             raise source.error("positive wavelengths below a centimetre")
         self.state(source, wavelengths=tuple(wavelengths))
-        if len(set(weights)) > 1:
-            self.state(source, wavelength_weights=tuple(weights))
+        self.state(source, wavelength_weights=_varied(weights, len(wavelengths)))
         self.primary_wavelength = wavelengths[primary]
 
     def state_fields(self, source: Source, kind: str, points: Iterable[Sequence[float]]) -> None:
@@ -150,10 +151,7 @@ class LensDescription:
 
     def state_field_weights(self, source: Source, weights: Sequence[float]) -> None:
         """Set the weights of the fields; what is missing is 1."""
-        count = len(self.design.fields)
-        full = (*weights, *(1.0,) * count)[:count]
-        if len(set(full)) > 1:
-            self.state(source, field_weights=full)
+        self.state(source, field_weights=_varied(weights, len(self.design.fields)))
 
     def state_vignetting(self, source: Source, *columns: Sequence[float]) -> None:
         """Set decentres and compressions of the pupil along x and y, and its angles [deg], of the fields.
@@ -167,39 +165,35 @@ class LensDescription:
         if mirrored.any():
             self.state(source, vignetting=tuple(map(tuple, mirrored.tolist())))
 
-    def add(
-        self,
-        source: Source,
-        shape: Shape,
-        position: np.ndarray,
-        axes: np.ndarray,
-        *,
-        name: str = "",
-        mirror: bool = False,
-        medium: Medium = VACUUM,
-        aperture: Aperture | None = None,
-        semi_diameter: float = 0.0,
-        stop: bool = False,
-        distance: float | None = None,
-        number: int | None = None,
-    ) -> None:
-        """Add a surface in the order of the light; `medium` is that behind one that is no mirror."""
+    def state_vignetted_ends(self, source: Source, *ends: Sequence[float]) -> None:
+        """Set the parts of the pupil that are cut off: at the upper and the lower end along x, then along y."""
+        (x, y) = (list(zip_longest(*ends[i : i + 2], fillvalue=0.0)) for i in (0, 2))
+        # The pupil reaches from lower - 1 to 1 - upper.
+        decentres = ([0.5 * (low - up) for up, low in column] for column in (x, y))
+        compressions = ([0.5 * (low + up) for up, low in column] for column in (x, y))
+        self.state_vignetting(source, *decentres, *compressions)
+
+    def state_air(self, source: Source, celsius: float, atmospheres: float) -> None:
+        """Set the temperature [deg C] and the pressure [atm] of the design."""
+        self.state(source, temperature=celsius + ZERO_CELSIUS, pressure=atmospheres * STANDARD_ATMOSPHERE)
+
+    def add(self, surface: LensSurface, *, mirror: bool = False) -> None:
+        """Add a surface in the order of the light; what is in front of it, and behind a mirror, follows."""
         before = self.surfaces[-1].after if self.surfaces else self.medium
-        after = before if mirror else medium
+        after = before if mirror else surface.after
         passing = Interaction.PASS if after == before else Interaction.REFRACT
-        surface = LensSurface(
-            name=" ".join(name.split()),
+        followed = replace(
+            surface,
+            name=" ".join(surface.name.split()),
             interaction=Interaction.MIRROR if mirror else passing,
-            shape=shape,
-            position=position,
-            axes=axes,
             before=before,
             after=after,
-            aperture=aperture,
-            semi_diameter=semi_diameter if semi_diameter > 0 else None,
-            stop=stop,
-            distance=distance,
-            number=len(self.surfaces) + 1 if number is None else number,
-            source=source,
+            number=surface.number or len(self.surfaces) + 1,
         )
-        self.surfaces.append(surface)
+        self.surfaces.append(followed)
+
+
+def _varied(weights: Sequence[float], count: int) -> tuple[float, ...]:
+    """Return the weights of a number of items, 1 where they are missing; none where all are equal."""
+    full = (*weights, *(1.0,) * count)[:count]
+    return full if len(set(full)) > 1 else ()

@@ -19,9 +19,7 @@ from .reader import APERTURES, FIELD_TYPES
 
 MM = 1e-3
 #: Keys of the aperture by that of the design data; a working focal ratio has none.
-_APERTURES = {"entrance_pupil": "EPD", "f_number": "imageFNO", "object_na": "objectNA", "stop": "float_by_stop_size"}
-#: Fields by the type of design data, in the order of Zemax.
-_FIELDS = {"angle": 0, "object_height": 1, "paraxial_image_height": 2, "real_image_height": 3}
+_APERTURES = {kind: key for key, kind in APERTURES.items()}
 
 
 def with_optiland_aperture(t: Telescope) -> Telescope:
@@ -54,7 +52,6 @@ def system_items(t: Telescope, findings: Findings) -> dict[str, Any]:
     aperture: dict[str, Any] = {"type": "EPD", "value": t.pupil_diameter / MM}
     if stop is not None and data.aperture is not None and data.aperture_value is not None:
         kind = _APERTURES[data.aperture]
-        assert kind in APERTURES
         size = {"EPD": 1 / MM, "float_by_stop_size": 2 / MM}.get(kind, 1.0)
         aperture = {"type": kind, "value": data.aperture_value * size}
     found = {"aperture": aperture, "fields": _fields(t, findings), "wavelengths": _wavelengths(t)}
@@ -67,12 +64,12 @@ def system_items(t: Telescope, findings: Findings) -> dict[str, Any]:
 
 
 def _fields(t: Telescope, findings: Findings) -> dict[str, Any]:
-    data, kind = t.design_data, 0
+    data, kind = t.design_data, "angle"
     edge = math.degrees(t.field_radius)
     rows = [(0.0, fraction * edge, 0.0, 0.0, 1.0) for fraction in (0.0, 0.7, 1.0)]
     if data.fields:
-        kind = _FIELDS[data.field_type]
-        size = math.degrees(1.0) if kind == 0 else 1 / MM
+        kind = data.field_type
+        size = math.degrees(1.0) if kind == "angle" else 1 / MM
         weights = data.field_weights or (1.0,) * len(data.fields)
         factors = [(x, y) for _, _, x, y, _ in data.vignetting] or [(0.0, 0.0)] * len(data.fields)
         moved = next((row for row in data.vignetting if row[0] or row[1] or row[4]), None)
@@ -86,7 +83,7 @@ def _fields(t: Telescope, findings: Findings) -> dict[str, Any]:
             for (x, y), compression, weight in zip(data.fields, factors, weights, strict=True)
         ]
     keys = ("x", "y", "vx", "vy", "weight")
-    definition = next(name for name, number in FIELD_TYPES.items() if number == kind)
+    definition = next(name for name, field_type in FIELD_TYPES.items() if field_type == kind)
     return {
         "fields": [dict(zip(keys, row, strict=True)) for row in rows],
         "telecentric": data.telecentric,

@@ -1,4 +1,4 @@
-"""Materials of optiland as glasses of a lens file, and media as materials.
+"""Materials of optiland as media, and media as materials.
 
 A ``Material`` is known by the file of the refractiveindex.info database that it was taken from, whose folder is the
 maker; without one by its name. Formulas of a ``DataMaterial`` are numbered as in that database: 1 and 2 are
@@ -14,10 +14,12 @@ from ....core.errors import PrescriptionError
 from ...media.dispersion import Dispersion, model_glass
 from ...media.medium import ConstantIndex, Medium, Sellmeier
 from ...media.tabulated import TabulatedIndex
+from ...telescope import VACUUM
 from ..glass_catalogue import MAKERS, SUBSTANCES, GlassCatalogue
 from ..json_items import JsonObject
+from ..lens.description import LensDescription
+from ..lens.glasses import Glasses
 from ..lens.source import Findings
-from ..zemax.placed import Line, PlacedSurfaces
 
 #: Powers of the wavelength [um] in the series of makers, by the name of the formula.
 SERIES = {
@@ -30,27 +32,32 @@ SERIES = {
 WIDEST_RANGE = (0.2, 20.0)
 
 
-def glass_lines(material: JsonObject, found: PlacedSurfaces, findings: Findings) -> list[Line]:
-    """Return the line of a material, none for air."""
+def medium_of(material: JsonObject, lens: LensDescription, glasses: Glasses) -> Medium:
+    """Return the medium of a material."""
     kind = material.text("type")
     if kind == "IdealMaterial":
-        return found.constant_glass(material.number("index"))
+        index = material.number("index")
+        with material.at("index").context():
+            return VACUUM if index == 1.0 else ConstantIndex(index)
     if kind in ("Material", "MaterialFile"):
-        return _catalogue_glass(material, found, findings)
+        return _catalogue_glass(material, glasses, lens.findings)
     if kind == "DataMaterial":
-        name = material.text("name", "") or f"MATERIAL_{len(found.glasses) + 1}"
-        return found.glass(name, _data_medium(material, name))
+        with material.part("definition").context():
+            # Materials without a name are numbered among the media of the lens.
+            number = len({lens.medium, *(s.after for s in lens.surfaces)} - {VACUUM}) + 1
+            return _data_medium(material, material.text("name", "") or f"MATERIAL_{number}")
     if kind == "AbbeMaterial":
         nd, vd = material.number("index"), material.number("abbe")
         text = f"AbbeMaterial {nd:g}, {vd:g}: optiland's dispersion of it is not read"
-        findings.note(material.problem(text), "taken as a model glass of that index and Abbe number")
-        return found.glass(f"{nd!r} {vd!r}", model_glass(nd, vd))
+        lens.findings.note(material.problem(text), "taken as a model glass of that index and Abbe number")
+        with material.at("index").context():
+            return model_glass(nd, vd)
     raise material.problem(
         f"material_post {kind}: expected IdealMaterial, Material, MaterialFile, DataMaterial or AbbeMaterial"
     )
 
 
-def _catalogue_glass(material: JsonObject, found: PlacedSurfaces, findings: Findings) -> list[Line]:
+def _catalogue_glass(material: JsonObject, glasses: Glasses, findings: Findings) -> Medium:
     path = re.findall(r"[^/\\]+", material.text("filename", ""))
     name = path[-1].rsplit(".", 1)[0] if path else material.text("name")
     maker = (path[-2] if len(path) > 1 else material.text("reference", "")).lower()
@@ -59,11 +66,11 @@ def _catalogue_glass(material: JsonObject, found: PlacedSurfaces, findings: Find
         name, maker = f"{path[path.index('main') + 1]}_{name}", SUBSTANCES
     if maker in (*MAKERS, SUBSTANCES) and name in GlassCatalogue.of_maker(maker):
         # Several makers have glasses of one name.
-        return found.glass(f"{name} ({maker})", GlassCatalogue.of_maker(maker)[name])
+        return GlassCatalogue.of_maker(maker)[name]
     if maker:
         text = f"material {name} of {maker}: not among the bundled glasses"
         findings.report(material.problem(text), "a glass of that name is taken")
-    return [("GLAS", name)]
+    return glasses.named(name, material.at("filename" if path else "name"))
 
 
 def _data_medium(material: JsonObject, name: str) -> Medium:

@@ -16,7 +16,7 @@ import numpy as np
 from ...media.medium import Medium
 from ...rotation import rotation_matrix
 from ...telescope import VACUUM
-from ..lens.description import LensDescription
+from ..lens.description import LensDescription, LensSurface
 from ..lens.glasses import Glasses, numbered_glass
 from ..lens.source import Findings, Source
 from .apertures import read_aperture
@@ -128,20 +128,20 @@ class _LensReader:
             shape = read_shape(block, lens.unit, self.findings)
             aperture = read_aperture(block, lens.unit, self.findings)
         mirror, medium = self._glass(block)
-        lens.add(
+        surface = LensSurface(
             source,
             shape,
             self.origin,
             self.axes,
             name=block.text("COMM"),
-            mirror=mirror,
-            medium=medium,
+            after=medium,
             aperture=aperture,
             semi_diameter=block.number("DIAM", 0.0) * lens.unit,
             stop=self.stop_ahead,
             distance=self.distance,
             number=number,
         )
+        lens.add(surface, mirror=mirror)
         self.stop_ahead, self.distance = False, 0.0
 
     def _glass(self, block: Block) -> tuple[bool, Medium]:

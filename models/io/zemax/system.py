@@ -44,11 +44,9 @@ def read_system(lens: LensDescription, header: Block) -> None:
         lens.state(aiming, aiming=AIMING[aiming.integer(1, 0)])
     environment = header.last("ENVD")
     if environment is not None:
-        temperature = environment.number(0) + ZERO_CELSIUS
-        pressure = environment.number(1, 1.0) * STANDARD_ATMOSPHERE
-        lens.state(environment, temperature=temperature, pressure=pressure)
-        usual = (environment.number(0), environment.number(1, 1.0)) == (20.0, 1.0)
-        if environment.number(2, 0.0) != 0 and not usual:
+        air = environment.number(0), environment.number(1, 1.0)
+        lens.state_air(environment, *air)
+        if environment.number(2, 0.0) != 0 and air != (20.0, 1.0):
             text = f"{environment.shown}: indices are not adjusted to temperature and pressure"
             lens.findings.report(environment.problem(text))
 
