@@ -78,7 +78,7 @@ def _lens_reader(ending: str) -> Reader:
     if ending == ".roa":
         from .rayoptics.reader import read_rayoptics_file
 
-        return lambda path, findings, glasses: described(read_rayoptics_file(path, findings), findings, glasses)
+        return read_rayoptics_file
     if ending == ".seq":
         from .codev.reader import read_codev_file
 

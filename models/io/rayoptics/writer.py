@@ -30,7 +30,6 @@ APERTURES = {
     "entrance_pupil": ("object", "epd"), "object_na": ("object", "NA"), "f_number": ("image", "f/#"),
     "working_f_number": ("image", "f/#"),
 }  # fmt: skip
-_FIELDS = {"angle": 0, "object_height": 1, "paraxial_image_height": 2}
 #: Version of ray-optics whose form of the file this is, and its distance of an object at infinity.
 VERSION, FAR = "0.9.8", 1e10
 
@@ -178,11 +177,11 @@ def _optical_items(sequence: LensSequence) -> dict[str, Any]:
 
 
 def _field_items(sequence: LensSequence) -> dict[str, Any]:
-    if sequence.field_type not in _FIELDS:
+    if sequence.field_type not in FIELDS.values():
         raise PrescriptionError(f"field_type = {sequence.field_type}: {FILE} has none of that kind")
     if any(row[4] for row in sequence.vignetting):
         raise PrescriptionError(f"vignetting: {FILE} has no angle of the pupil")
-    kind = next(words for words, number in FIELDS.items() if number == _FIELDS[sequence.field_type])
+    kind = next(words for words, field_type in FIELDS.items() if field_type == sequence.field_type)
     size = 1.0 if sequence.field_type == "angle" else sequence.unit
     points = []
     rows = zip(sequence.fields, sequence.field_weights, sequence.vignetting, strict=True)
