@@ -65,12 +65,11 @@ def _lens_reader(ending: str) -> Reader:
         from .zar.reader import read_zemax_archive
 
         return read_zemax_archive
-    from .zemax.reader import described, read_zemax_lens
 
     if ending == ".len":
         from .oslo.reader import read_oslo_file
 
-        return lambda path, findings, glasses: described(read_oslo_file(path, findings), findings, glasses)
+        return read_oslo_file
     if ending == ".json":
         from .optiland.reader import read_optiland_file
 
@@ -83,6 +82,8 @@ def _lens_reader(ending: str) -> Reader:
         from .codev.reader import read_codev_file
 
         return read_codev_file
+    from .zemax.reader import read_zemax_lens
+
     return read_zemax_lens
 
 

@@ -18,10 +18,11 @@ from ...telescope import VACUUM, Telescope
 from ..lens.sequence import LensSequence, SequenceSurface, catalogue_name, quoted
 from ..lens.text import number_text, scaled
 from ..profile import Profile
-from .reader import FRACTIONS, UNITS
+from .reader import FIELDS, FRACTIONS, UNITS
 
 FILE = "an OSLO file"
-FIELDS = {"angle": "ANG", "object_height": "OBH", "paraxial_image_height": "GIH"}
+#: Commands of field points by their type.
+_FIELDS = {kind: command for command, kind in FIELDS.items()}
 #: Coefficients of a symmetric or odd asphere (``AS1``...) that the reader takes.
 _MOST = 8
 #: Fractions of a field height, and apertures of a surface, that are equal.
@@ -35,7 +36,7 @@ def telescope_to_oslo(telescope: Telescope, *, lenient: bool = False) -> str:
     PrescriptionError, with surface and part, if a part of the telescope has no counterpart in it; if lenient, links,
     coatings, fields and formulas of glasses are left out with a warning.
     """
-    sequence = LensSequence.of(telescope, FILE, tuple(v * 1e-3 for v in UNITS), lenient=lenient)
+    sequence = LensSequence.of(telescope, FILE, tuple(UNITS.values()), lenient=lenient)
     unit = sequence.unit
     with error_context(subject=telescope.name):
         names = sequence.glass_names("its indices at the stated wavelengths")
@@ -89,7 +90,7 @@ def _system_lines(sequence: LensSequence) -> Iterator[str]:
 
 
 def _field_line(sequence: LensSequence) -> str:
-    if sequence.field_type not in FIELDS:
+    if sequence.field_type not in _FIELDS:
         raise PrescriptionError(f"field_type = {sequence.field_type}: {FILE} has none of that kind")
     largest = max(sequence.fields, key=lambda field: math.hypot(*field))
     size = 1.0 if sequence.field_type == "angle" else sequence.unit
@@ -105,7 +106,7 @@ def _field_line(sequence: LensSequence) -> str:
         sequence.leave_out(f"field_weights: {FILE} has no place for them", "left out")
     if any(any(row) for row in sequence.vignetting):
         sequence.leave_out(f"vignetting: {FILE} has no place for its factors", "left out")
-    return f"{FIELDS[sequence.field_type]} {number_text(value / size)}"
+    return f"{_FIELDS[sequence.field_type]} {number_text(value / size)}"
 
 
 def _medium_lines(

@@ -87,7 +87,7 @@ class Block:
 class ZemaxFile:
     """Parts of a lens file: lines before the surfaces, surfaces from the object to the image, lines after.
 
-    `glasses` are those that the file itself defines, by name in capitals; `program` wrote the file.
+    `glasses` are those of catalogues packed with it, by name in capitals.
     """
 
     path: Path
@@ -95,7 +95,6 @@ class ZemaxFile:
     surfaces: list[Block]
     trailer: Block
     glasses: Mapping[str, Medium] = field(default_factory=dict)
-    program: str = "Zemax"
 
 
 def read_zemax_file(path: Path, findings: Findings) -> ZemaxFile:

@@ -8,7 +8,6 @@ no effect on rays are listed in `file`. The page docs/zemax.md has the tables.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +47,7 @@ class _LensReader:
         self.file = file
         self.findings = findings
         self.glasses = glasses
-        self.description = LensDescription(file.path, replace(FORMAT, program=file.program), findings)
+        self.description = LensDescription(file.path, FORMAT, findings)
         self.origin, self.axes = np.zeros(3), np.eye(3)
         #: Distance along the axis from the last surface [m].
         self.distance = 0.0
