@@ -22,6 +22,7 @@ from ...design_data import LENGTH_UNITS, DesignData
 from ...links import Pickup, Solve
 from ...media.air import STANDARD_ATMOSPHERE, ZERO_CELSIUS
 from ...media.medium import Medium
+from ...rotation import rotation_angles
 from ...shapes.shape import Shape
 from ...surface import Interaction
 from ...telescope import VACUUM
@@ -69,6 +70,16 @@ class LensSurface:
     stop: bool = False
     distance: float | None = None
     number: int = 0
+
+    @property
+    def off_axis(self) -> bool:
+        """Whether it is decentred or tilted."""
+        return bool(np.any(self.position[:2])) or not np.array_equal(self.axes, np.eye(3))
+
+    @property
+    def tilt(self) -> tuple[float, float, float]:
+        """Angles about x, the new y and the new z, right-handed [rad]."""
+        return (0.0, 0.0, 0.0) if np.array_equal(self.axes, np.eye(3)) else rotation_angles(self.axes)
 
 
 @dataclass(frozen=True)

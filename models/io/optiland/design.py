@@ -13,6 +13,7 @@ from ....core.errors import PrescriptionError
 from ...design_data import DesignData
 from ...paraxial import stop_states_rays
 from ...telescope import Telescope
+from ..lens.sequence import stated_wavelengths
 from ..lens.source import Findings
 from ..lens.text import scaled
 from .reader import APERTURES, FIELD_TYPES
@@ -94,7 +95,7 @@ def _fields(t: Telescope, findings: Findings) -> dict[str, Any]:
 def _wavelengths(t: Telescope) -> dict[str, Any]:
     """Return the stated wavelengths, or the default and the edges of the band."""
     data: DesignData = t.design_data
-    lengths = list(data.wavelengths or dict.fromkeys([t.default_wavelength, *(t.band or ())]))
+    lengths = stated_wavelengths(t)
     weights = data.wavelength_weights or (1.0,) * len(lengths)
     rows = [
         {

@@ -15,7 +15,8 @@ from ...aperture import Circle
 from ...media.medium import Medium
 from ...surface import Interaction
 from ...telescope import VACUUM, Telescope
-from ..lens.sequence import LensSequence, SequenceSurface, catalogue_name, quoted
+from ..lens.description import LensSurface
+from ..lens.sequence import LensSequence, catalogue_name, quoted
 from ..lens.text import number_text, scaled
 from ..profile import Profile
 from .reader import FIELDS, FRACTIONS, UNITS
@@ -109,11 +110,9 @@ def _field_line(sequence: LensSequence) -> str:
     return f"{_FIELDS[sequence.field_type]} {number_text(value / size)}"
 
 
-def _medium_lines(
-    sequence: LensSequence, place: SequenceSurface | Medium, names: Mapping[Medium, str]
-) -> Iterator[str]:
+def _medium_lines(sequence: LensSequence, place: LensSurface | Medium, names: Mapping[Medium, str]) -> Iterator[str]:
     medium = place
-    if isinstance(place, SequenceSurface):
+    if isinstance(place, LensSurface):
         if place.interaction == Interaction.MIRROR:
             yield "RFL"
             return
@@ -131,7 +130,7 @@ def _medium_lines(
         yield f"GLA {model}{names[medium]} {' '.join(map(number_text, indices))}"
 
 
-def _surface_lines(sequence: LensSequence, surface: SequenceSurface, number: int) -> Iterator[str]:
+def _surface_lines(sequence: LensSequence, surface: LensSurface, number: int) -> Iterator[str]:
     unit = sequence.unit
     profile = Profile.of(surface.shape, unit)
     yield f'NOT "{quoted(surface.name, _FORBIDDEN)}"'
@@ -143,7 +142,7 @@ def _surface_lines(sequence: LensSequence, surface: SequenceSurface, number: int
     if surface.stop:
         yield "AST"
     if surface.off_axis:
-        x, y = (v / unit for v in surface.decentre)
+        x, y = (v / unit for v in surface.position[:2])
         # The first two angles are left-handed.
         a, b, c = (sign * math.degrees(v) for sign, v in zip((-1.0, -1.0, 1.0), surface.tilt, strict=True))
         for key, value in zip(("DCX", "DCY", "TLA", "TLB", "TLC"), (x, y, a, b, c), strict=True):
@@ -175,15 +174,15 @@ def _asphere_lines(profile: Profile) -> Iterator[str]:
         yield from (f"{key} {number_text(a)}" for key, a in keys if a)
 
 
-def _aperture_lines(sequence: LensSequence, surface: SequenceSurface) -> Iterator[str]:
+def _aperture_lines(sequence: LensSequence, surface: LensSurface) -> Iterator[str]:
     region, size, unit = surface.aperture, surface.semi_diameter, sequence.unit
     if isinstance(region, Circle) and not (region.x or region.y):
-        if size is not None and not math.isclose(size, region.radius, rel_tol=_EQUAL):
+        if size and not math.isclose(size, region.radius, rel_tol=_EQUAL):
             text = f"surface {surface.name}: semi-diameter beside a clear aperture: {FILE} has one AP"
             sequence.leave_out(text, "left out")
         yield f"AP CHK {number_text(region.radius / unit)}"
         return
     if region is not None:
         sequence.leave_out_aperture(surface, "discs about the vertex")
-    if size is not None:
+    if size:
         yield f"AP {number_text(size / unit)}"

@@ -16,7 +16,8 @@ from ....core.errors import PrescriptionError, error_context
 from ...aperture import Circle, Ellipse, Rectangle
 from ...surface import Interaction
 from ...telescope import Telescope
-from ..lens.sequence import LensSequence, SequenceSurface
+from ..lens.description import LensSurface
+from ..lens.sequence import LensSequence
 from ..lens.text import scaled
 from ..profile import Profile
 from .items import array, instance
@@ -115,7 +116,7 @@ def _surface_items(name: str, mode: str, profile: str, radius: float) -> dict[st
     return instance("rayoptics.elem.surface", "Surface", values)
 
 
-def _aperture_items(sequence: LensSequence, surface: SequenceSurface) -> list[dict[str, Any]]:
+def _aperture_items(sequence: LensSequence, surface: LensSurface) -> list[dict[str, Any]]:
     region, unit = surface.aperture, sequence.unit
     sizes: dict[str, float]
     if isinstance(region, Circle):
@@ -133,12 +134,12 @@ def _aperture_items(sequence: LensSequence, surface: SequenceSurface) -> list[di
     return [instance("rayoptics.elem.surface", kind, values | {"rotation": 0.0})]
 
 
-def _decenter_items(surface: SequenceSurface, unit: float) -> dict[str, Any] | None:
+def _decenter_items(surface: LensSurface, unit: float) -> dict[str, Any] | None:
     if not surface.off_axis:
         return None
     # The first two angles are left-handed.
     angles = [sign * math.degrees(v) + 0.0 for sign, v in zip((-1.0, -1.0, 1.0), surface.tilt, strict=True)]
-    shift = [*(v / unit for v in surface.decentre), 0.0]
+    shift = [*(v / unit for v in surface.position[:2]), 0.0]
     values = {"_dtype": "dec and return", "dec": array(shift), "euler": array(angles), "rot_pt": array([0.0] * 3)}
     return instance("rayoptics.elem.surface", "DecenterData", values | {"rot_mat": None})
 
