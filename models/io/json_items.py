@@ -128,8 +128,8 @@ class JsonObject:
 
     def report_rest(self, findings: Findings, ignored: Iterable[str] = ()) -> None:
         """Report every key with a value that was neither read nor is among those to ignore."""
-        known = self.used.union(ignored)
+        understood_keys = self.used.union(ignored)
         for key, value in self.content.items():
-            if key not in known and value not in (None, [], {}):
+            if key not in understood_keys and value not in (None, [], {}):
                 text = f"{shown(key)} = {shown(value)}: this key is not understood"
                 findings.report(self.problem(text))

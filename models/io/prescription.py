@@ -153,7 +153,7 @@ def prescription_digest(path: str | os.PathLike[str]) -> str:
         If a file cannot be read.
     """
     path = Path(path)
-    own = hashlib.sha256(read_bytes(path, PrescriptionError)).hexdigest()
+    digest = hashlib.sha256(read_bytes(path, PrescriptionError)).hexdigest()
     if path.suffix.lower() in _LENS_FILES:
         from .user_glasses import user_catalogues
 
@@ -169,11 +169,14 @@ def prescription_digest(path: str | os.PathLike[str]) -> str:
     files = [name for name in named if os.path.isfile(path.parent / name)]
     for name in files:
         # A list that grows: files of meshes name no others.
-        beside = (os.path.join(os.path.dirname(name), other) for other in files_of_mesh(path.parent / name))
-        files += [other for other in beside if os.path.isfile(path.parent / other) and other not in files]
+        beside = (os.path.join(os.path.dirname(name), mesh) for mesh in files_of_mesh(path.parent / name))
+        files += [mesh for mesh in beside if os.path.isfile(path.parent / mesh) and mesh not in files]
     if not files:
-        return own
-    contents = [own, *(hashlib.sha256(read_bytes(path.parent / n, PrescriptionError)).hexdigest() for n in files)]
+        return digest
+    contents = [
+        digest,
+        *(hashlib.sha256(read_bytes(path.parent / n, PrescriptionError)).hexdigest() for n in files),
+    ]
     return hashlib.sha256("".join(contents).encode()).hexdigest()
 
 
@@ -182,8 +185,8 @@ def _texts(content: Any) -> Iterator[str]:
     if isinstance(content, str):
         yield content
     elif isinstance(content, (dict, list)):
-        for part in content.values() if isinstance(content, dict) else content:
-            yield from _texts(part)
+        for item in content.values() if isinstance(content, dict) else content:
+            yield from _texts(item)
 
 
 @cache

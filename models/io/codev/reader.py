@@ -96,10 +96,10 @@ def _commands(path: Path) -> Iterator[Record]:
             carried = text[:-1] + " "
             continue
         carried = ""
-        for part in re.split(r";(?=(?:[^']*'[^']*')*[^']*$)", text):
-            words = part.split()
+        for statement in re.split(r";(?=(?:[^']*'[^']*')*[^']*$)", text):
+            words = statement.split()
             if words:
-                after = part.strip()[len(words[0]) :].strip()
+                after = statement.strip()[len(words[0]) :].strip()
                 key = LONG_NAMES.get(words[0].upper(), words[0].upper())
                 yield Record(str(path), "", key, line=first, words=tuple(words[1:]), text=after)
 
@@ -425,17 +425,17 @@ class _Reader:
     def _place(self) -> None:
         """Add the surfaces one after the other, with the local frame of the light."""
         lens, unit = self.description, self.description.unit
-        first, *others = self.surfaces
+        first, *surfaces_behind = self.surfaces
         lens.medium = self._medium(first)
         for key in ("XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", *POWERS):
             if first.get(key):
                 shown = first.commands[key].shown
                 self.findings.report(first.commands[key].problem(f"{shown}: expected a flat object on the axis"))
         # The thickness of the image is a defocus: it counts from where the surface before it leads.
-        others[-2].values["THI"] = others[-2].get("THI") + others[-1].get("THI")
-        others[-1].values["THI"] = 0.0
+        surfaces_behind[-2].values["THI"] = surfaces_behind[-2].get("THI") + surfaces_behind[-1].get("THI")
+        surfaces_behind[-1].values["THI"] = 0.0
         origin, axes, distance = np.zeros(3), np.eye(3), 0.0
-        for number, surface in enumerate(others, start=1):
+        for number, surface in enumerate(surfaces_behind, start=1):
             # The first two angles are left-handed.
             angles = (-surface.get("ADE"), -surface.get("BDE"), surface.get("CDE"))
             shift = np.array([surface.get("XDE"), surface.get("YDE"), surface.get("ZDE")]) * unit

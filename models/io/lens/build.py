@@ -149,15 +149,15 @@ def _pupil(lens: LensDescription, surfaces: Sequence[LensSurface]) -> _Pupil:
         raise stop_source.problem("the stop makes an entrance pupil at infinity (telecentric): not supported")
     if not lens.apertures:
         raise lens.problem(f"expected the aperture: {lens.format.aperture}")
-    aperture, *others = lens.apertures
+    aperture, *further_apertures = lens.apertures
     value = paraxial.stop_radius if aperture.kind == "stop" else aperture.value
     diameter = image.diameter(aperture.kind, value)
     if not 0 < diameter < math.inf:
         raise aperture.source.error(f"an entrance pupil of finite size, not {diameter:g} m")
-    if others:
+    if further_apertures:
         keywords = [stated.source.keyword for stated in lens.apertures]
         text = f"{' and '.join(keywords)}: two apertures"
-        lens.findings.report(others[0].source.problem(text), f"{keywords[0]} is taken")
+        lens.findings.report(further_apertures[0].source.problem(text), f"{keywords[0]} is taken")
     to_pupil = image.image_scale / image.image_slope if image.image_slope else math.inf
     radius = reference_radius(to_pupil, image.focal_length, diameter)
     return _Pupil(image, diameter, replace(aperture, value=value), _field_radius(lens, image), radius)

@@ -52,7 +52,7 @@ def rotated_shape(shape: Shape) -> Shape:
     if isinstance(shape, GridSag):
         return GridSag(-shape.x[::-1], shape.y, -shape.values[:, ::-1])
     if isinstance(shape, Sum):
-        return Sum(tuple(rotated_shape(part) for part in shape.parts))
+        return Sum(tuple(rotated_shape(component) for component in shape.parts))
     raise PrescriptionError(f"shape {type(shape).__name__}: expected one that a lens file can hold")
 
 
@@ -70,7 +70,7 @@ def rotated_aperture(aperture: Aperture) -> Aperture:
     if isinstance(aperture, Complement):
         return Complement(rotated_aperture(aperture.part))
     if isinstance(aperture, Union | Intersection):
-        return type(aperture)(tuple(rotated_aperture(part) for part in aperture.parts))
+        return type(aperture)(tuple(rotated_aperture(region) for region in aperture.parts))
     if isinstance(aperture, Ellipse | Rectangle | Vane):
         aperture = replace(aperture, angle=(math.pi if isinstance(aperture, Vane) else 0.0) - aperture.angle)
     return replace(aperture, x=0.0 - aperture.x)

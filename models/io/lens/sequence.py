@@ -91,13 +91,13 @@ class LensSequence:
             require_sequential(t, file)
             if data.telecentric:
                 raise PrescriptionError(f"telecentric object space: {file} has no place for it")
-            others = ["afocal"] if data.afocal and not afocal else []
-            report_unheld(t, (*data.pickups, *data.solves), file, lenient=lenient, others=others)
+            flags = ["afocal"] if data.afocal and not afocal else []
+            report_unheld(t, (*data.pickups, *data.solves), file, lenient=lenient, others=flags)
             own_stop = stop_makes_pupil(t) or (aimed != "off" and stop_states_rays(t))
             report_pupil_plane(t, findings, own_stop=own_stop)
             if own_stop and data.aiming != aimed:
-                said = f"aiming = {data.aiming}: {file} does not state how rays are aimed"
-                findings.note(PrescriptionError(said), f"read back it is {aimed}")
+                problem = f"aiming = {data.aiming}: {file} does not state how rays are aimed"
+                findings.note(PrescriptionError(problem), f"read back it is {aimed}")
             surfaces = lens_surfaces(t, data.stop if own_stop else None, along_light=along_light)
         aperture = ("entrance_pupil", t.pupil_diameter)
         if own_stop and data.aperture is not None and data.aperture_value is not None:
@@ -172,8 +172,8 @@ class LensSequence:
         """Return the aperture, of one of some kinds; if lenient the diameter of the entrance pupil [m] for another."""
         if self.aperture[0] in kinds:
             return self.aperture
-        known = self.aperture[0].replace("_", " ")
-        text = f"aperture = {known}: {self.file} has no place for it"
+        aperture_name = self.aperture[0].replace("_", " ")
+        text = f"aperture = {aperture_name}: {self.file} has no place for it"
         self.leave_out(text, "written as the diameter of the entrance pupil")
         return "entrance_pupil", self.telescope.pupil_diameter
 
@@ -185,13 +185,13 @@ class LensSequence:
         """
         names: dict[Medium, str] = {}
         for medium in dict.fromkeys(m for s in self.surfaces for m in (s.before, s.after) if m != VACUUM):
-            known = catalogue_name(medium)
-            if known is not None and not set(known) & set(forbidden):
-                names[medium] = known
+            listed_name = catalogue_name(medium)
+            if listed_name is not None and not set(listed_name) & set(forbidden):
+                names[medium] = listed_name
                 continue
-            own = re.sub(r"[^A-Z0-9]", "", medium.name.upper())[:12]
-            free = own[:1].isalpha() and own not in (*names.values(), *_WORDS)
-            names[medium] = own if free else f"MEDIUM{len(names) + 1}"
+            short_name = re.sub(r"[^A-Z0-9]", "", medium.name.upper())[:12]
+            free = short_name[:1].isalpha() and short_name not in (*names.values(), *_WORDS)
+            names[medium] = short_name if free else f"MEDIUM{len(names) + 1}"
             if not isinstance(medium, ConstantIndex) and not _is_table(medium):
                 text = f"glass {medium.name or type(medium).__name__}: {self.file} has no place for its formula"
                 self.leave_out(text, f"written as {table}")

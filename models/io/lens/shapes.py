@@ -73,8 +73,8 @@ def zernike(base: Shape, terms: Sequence[float], radius: float) -> Shape:
 def total(*parts: Shape) -> Shape:
     """Return the sum of shapes, of which planes are no part."""
     curved: list[Shape] = []
-    for part in parts:
-        curved += part.parts if isinstance(part, Sum) else [part] if not isinstance(part, Plane) else []
+    for shape in parts:
+        curved += shape.parts if isinstance(shape, Sum) else [shape] if not isinstance(shape, Plane) else []
     return Sum(tuple(curved)) if len(curved) > 1 else curved[0] if curved else Plane()
 
 
@@ -102,8 +102,8 @@ def polynomial_powers(count: int) -> list[tuple[int, int]]:
 
 def square_term(parts: list[Shape]) -> tuple[float, list[Shape]]:
     """Return the coefficient of r^2 that a part of its own has, and the other parts."""
-    for part in parts:
-        terms = {(i, j): a for i, j, a in part.terms} if isinstance(part, XYPolynomial) else {}
+    for shape in parts:
+        terms = {(i, j): a for i, j, a in shape.terms} if isinstance(shape, XYPolynomial) else {}
         if set(terms) == {(2, 0), (0, 2)} and terms[2, 0] == terms[0, 2]:
-            return terms[2, 0], [p for p in parts if p is not part]
+            return terms[2, 0], [p for p in parts if p is not shape]
     return 0.0, parts

@@ -105,9 +105,9 @@ def records(text: str, source: str) -> list[Record]:
     for number, content in enumerate(text.splitlines(), start=1):
         words = content.split()
         if words:
-            keyword, *others = words
-            if keyword.upper() == "SURF" and others:
-                place = f"surface {cut_short(others[0])}"
+            keyword, *following_words = words
+            if keyword.upper() == "SURF" and following_words:
+                place = f"surface {cut_short(following_words[0])}"
             after = content.strip()[len(keyword) :].strip()
-            lines.append(Record(source, place, keyword.upper(), line=number, words=tuple(others), text=after))
+            lines.append(Record(source, place, keyword.upper(), line=number, words=tuple(following_words), text=after))
     return lines

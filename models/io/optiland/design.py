@@ -55,13 +55,13 @@ def system_items(t: Telescope, findings: Findings) -> dict[str, Any]:
         kind = _APERTURES[data.aperture]
         size = {"EPD": 1 / MM, "float_by_stop_size": 2 / MM}.get(kind, 1.0)
         aperture = {"type": kind, "value": data.aperture_value * size}
-    found = {"aperture": aperture, "fields": _fields(t, findings), "wavelengths": _wavelengths(t)}
+    items = {"aperture": aperture, "fields": _fields(t, findings), "wavelengths": _wavelengths(t)}
     if stop is not None and data.aiming != "off":
         if data.aiming == "paraxial":
-            said = PrescriptionError("aiming = paraxial: optiland aims at the radius of the real marginal ray alone")
-            findings.note(said, "read back it is real")
-        found["ray_tracer"] = {"ray_aiming_config": {"mode": "robust", "max_iter": 100, "tol": 1e-10}}
-    return found
+            problem = PrescriptionError("aiming = paraxial: optiland aims at the radius of the real marginal ray alone")
+            findings.note(problem, "read back it is real")
+        items["ray_tracer"] = {"ray_aiming_config": {"mode": "robust", "max_iter": 100, "tol": 1e-10}}
+    return items
 
 
 def _fields(t: Telescope, findings: Findings) -> dict[str, Any]:
@@ -75,9 +75,9 @@ def _fields(t: Telescope, findings: Findings) -> dict[str, Any]:
         factors = [(x, y) for _, _, x, y, _ in data.vignetting] or [(0.0, 0.0)] * len(data.fields)
         moved = next((row for row in data.vignetting if row[0] or row[1] or row[4]), None)
         if moved is not None:
-            said = f"vignetting = {list(moved)}: optiland has compressions alone, no decentre and no angle"
+            problem = f"vignetting = {list(moved)}: optiland has compressions alone, no decentre and no angle"
             # Compressions without their decentres would let other light through.
-            findings.report(PrescriptionError(said), "the factors of all fields are left out")
+            findings.report(PrescriptionError(problem), "the factors of all fields are left out")
             factors = [(0.0, 0.0)] * len(data.fields)
         rows = [
             (-x * size + 0.0, y * size, *compression, weight)

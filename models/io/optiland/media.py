@@ -87,10 +87,10 @@ def _data_medium(material: JsonObject, name: str) -> Medium:
         b, c = tuple(terms[1::2]), tuple(v * v if formula == "formula 1" else v for v in terms[2::2])
         return Sellmeier(b, c, (low, high), name=name)
     if formula == "formula 3" and len(terms) % 2:
-        found = {0.0: terms[0], **dict(zip(terms[2::2], terms[1::2], strict=True))}
+        coefficients = {0.0: terms[0], **dict(zip(terms[2::2], terms[1::2], strict=True))}
         for key, powers in SERIES.items():
-            if found.keys() <= set(powers):
-                return Dispersion(key, tuple(found.get(p, 0.0) for p in powers), (low, high), name=name)
+            if coefficients.keys() <= set(powers):
+                return Dispersion(key, tuple(coefficients.get(p, 0.0) for p in powers), (low, high), name=name)
     raise dispersion.problem(f"{formula} of {name}: expected formula 1 or 2 (Sellmeier) or 3 (powers of makers)")
 
 
@@ -103,8 +103,8 @@ def material_items(medium: Medium) -> dict[str, Any]:
         return _data_items(medium, "formula 2", [0.0, *terms], medium.wavelength_range)
     if isinstance(medium, Dispersion) and ("schott" if medium.formula == "sumita" else medium.formula) in SERIES:
         powers = SERIES["schott" if medium.formula == "sumita" else medium.formula]
-        first, *rest = medium.coefficients
-        terms = [v for a, p in zip(rest, powers[1:], strict=False) for v in (a, float(p))]
+        first, *higher_terms = medium.coefficients
+        terms = [v for a, p in zip(higher_terms, powers[1:], strict=False) for v in (a, float(p))]
         return _data_items(medium, "formula 3", [first, *terms], medium.wavelength_range)
     if isinstance(medium, TabulatedIndex) and medium.interpolation == "linear":
         table = {"wavelengths_um": [w * 1e6 for w in medium.wavelengths], "indices": list(medium.indices)}

@@ -108,8 +108,8 @@ def _fields(fields: JsonObject, lens: LensDescription) -> None:
         largest("x", "y"), FIELD_TYPES[kind], zip(columns["x"], columns["y"], strict=True) if points else [(0.0, 0.0)]
     )
     lens.state_field_weights(largest("weight"), columns["weight"])
-    none: Sequence[float] = ()
-    lens.state_vignetting(largest("vx", "vy"), none, none, columns["vx"], columns["vy"])
+    no_decentres: Sequence[float] = ()
+    lens.state_vignetting(largest("vx", "vy"), no_decentres, no_decentres, columns["vx"], columns["vy"])
     for point in points:
         point.report_rest(lens.findings)
 
@@ -181,14 +181,14 @@ def _aperture(aperture: JsonObject, findings: Findings) -> Aperture | None:
         else:
             region = ring(source, inner, outer, x, y)
     elif kind == "RectangularAperture":
-        (left, right), (low, high) = ([aperture.number(f"{a}_{end}") for end in ("min", "max")] for a in "xy")
-        half = 0.5 * (right - left) * MM, 0.5 * (high - low) * MM
-        region = rectangle(source, *half, 0.5 * (left + right) * MM, 0.5 * (low + high) * MM)
+        (x_min, x_max), (y_min, y_max) = ([aperture.number(f"{a}_{end}") for end in ("min", "max")] for a in "xy")
+        half = 0.5 * (x_max - x_min) * MM, 0.5 * (y_max - y_min) * MM
+        region = rectangle(source, *half, 0.5 * (x_min + x_max) * MM, 0.5 * (y_min + y_max) * MM)
     elif kind == "EllipticalAperture":
         region = ellipse(source, aperture.number("a") * MM, aperture.number("b") * MM, x, y)
     else:
-        known = "RadialAperture, OffsetRadialAperture, RectangularAperture or EllipticalAperture"
-        findings.report(aperture.problem(f"aperture {kind}: expected {known}"), "taken as none")
+        expected_types = "RadialAperture, OffsetRadialAperture, RectangularAperture or EllipticalAperture"
+        findings.report(aperture.problem(f"aperture {kind}: expected {expected_types}"), "taken as none")
         return None
     aperture.report_rest(findings)
     return region

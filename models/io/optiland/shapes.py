@@ -189,28 +189,28 @@ def geometry_items(shape: Shape, unit: float) -> dict[str, Any]:
     PrescriptionError if optiland has no geometry of this shape.
     """
     parts = list(shape.parts) if isinstance(shape, Sum) else [shape]
-    if all(isinstance(part, Biconic) for part in parts) and (items := _biconic_items(parts, unit)):
+    if all(isinstance(component, Biconic) for component in parts) and (items := _biconic_items(parts, unit)):
         return items
     base = next((p for p in parts if not isinstance(p, XYPolynomial | ZernikeSag)), Plane())
-    rest = [p for p in parts if p is not base]
-    square, rest = square_term(rest)
-    if square and not rest and isinstance(base, Plane | Sphere | Conic | EvenAsphere):
+    additions = [p for p in parts if p is not base]
+    square, additions = square_term(additions)
+    if square and not additions and isinstance(base, Plane | Sphere | Conic | EvenAsphere):
         head = {"radius": _length(base.curvature, unit), "conic": base.conic}
         terms = [a * unit ** (2 * i + 1) for i, a in enumerate([square, *base.coefficients])]
         return {"type": "EvenAsphere", **head, "coefficients": terms}
-    if not (square or rest):
+    if not (square or additions):
         return _alone(base, unit)
-    if square or len(rest) > 1 or not isinstance(base, Plane | Sphere | Conic):
+    if square or len(additions) > 1 or not isinstance(base, Plane | Sphere | Conic):
         raise PrescriptionError("a sum of several shapes: optiland has no geometry of this shape")
     head = {"radius": _length(base.curvature, unit), "conic": base.conic}
-    part = rest[0]
-    if isinstance(part, ZernikeSag) and not part.inner_radius:
-        terms = [a / unit for a in part.coefficients]
-        own = {"coefficients": terms, "zernike_type": "noll", "norm_radius": part.outer_radius / unit}
-        return {"type": "ZernikePolynomialGeometry", **head, **own}
-    if isinstance(part, XYPolynomial):
-        table = np.zeros((1 + max(i for i, *_ in part.terms), 1 + max(j for _, j, _ in part.terms)))
-        for i, j, a in part.terms:
+    component = additions[0]
+    if isinstance(component, ZernikeSag) and not component.inner_radius:
+        terms = [a / unit for a in component.coefficients]
+        zernike_items = {"coefficients": terms, "zernike_type": "noll", "norm_radius": component.outer_radius / unit}
+        return {"type": "ZernikePolynomialGeometry", **head, **zernike_items}
+    if isinstance(component, XYPolynomial):
+        table = np.zeros((1 + max(i for i, *_ in component.terms), 1 + max(j for _, j, _ in component.terms)))
+        for i, j, a in component.terms:
             table[i, j] = a * unit ** (i + j - 1)
         return {"type": "PolynomialGeometry", **head, "coefficients": table.tolist()}
     raise PrescriptionError("annular Zernike terms: optiland has those of the full disc")
@@ -219,13 +219,13 @@ def geometry_items(shape: Shape, unit: float) -> dict[str, Any]:
 def _biconic_items(parts: Sequence[Shape], unit: float) -> dict[str, Any]:
     """Return the dictionary of a sum of a conic in x and one in y; empty of another sum."""
     sections: dict[str, float] = {}
-    for part in parts:
-        flat = [axis for axis in "xy" if math.isinf(getattr(part, f"radius_{axis}"))]
+    for section in parts:
+        flat = [axis for axis in "xy" if math.isinf(getattr(section, f"radius_{axis}"))]
         for axis in {*"xy"} - {*flat}:
             if not flat or f"radius_{axis}" in sections:
                 return {}
-            sections |= {f"radius_{axis}": getattr(part, f"radius_{axis}") / unit}
-            sections |= {f"conic_{axis}": getattr(part, f"conic_{axis}")}
+            sections |= {f"radius_{axis}": getattr(section, f"radius_{axis}") / unit}
+            sections |= {f"conic_{axis}": getattr(section, f"conic_{axis}")}
     default = {"radius_x": math.inf, "radius_y": math.inf, "conic_x": 0.0, "conic_y": 0.0}
     return {"type": "BiconicGeometry", **default, **sections}
 
@@ -248,6 +248,6 @@ def _alone(shape: Shape, unit: float) -> dict[str, Any]:
         return {"type": kind, **head, "coefficients": [0.0, *terms] if even else terms}
     if isinstance(shape, Toroid):
         radii = {"radius_x": shape.radius_x / unit, "radius_y": shape.radius_y / unit}
-        own = {"geometry_type": "Toroidal", "conic_yz": shape.conic_y, "coeffs_poly_y": []}
-        return {"type": "ToroidalGeometry", **radii, **own}
+        meridian_items = {"geometry_type": "Toroidal", "conic_yz": shape.conic_y, "coeffs_poly_y": []}
+        return {"type": "ToroidalGeometry", **radii, **meridian_items}
     raise PrescriptionError(f"shape {type(shape).__name__}: optiland has no geometry of this shape")

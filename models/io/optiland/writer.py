@@ -39,8 +39,8 @@ def telescope_to_optiland(telescope: Telescope, *, lenient: bool = False) -> str
         require_sequential(t, "a file of optiland")
         t = with_formulas(t, material_items, findings)
         data = t.design_data
-        others = ["afocal"] if data.afocal else []
-        report_unheld(t, (*data.pickups, *data.solves), "a file of optiland", lenient=lenient, others=others)
+        flags = ["afocal"] if data.afocal else []
+        report_unheld(t, (*data.pickups, *data.solves), "a file of optiland", lenient=lenient, others=flags)
         stop, system = own_stop(t), system_items(t, findings)
         report_pupil_plane(t, findings, own_stop=stop is not None)
         first = -t.surfaces[0].vertex[2]
@@ -59,8 +59,8 @@ def telescope_to_optiland(telescope: Telescope, *, lenient: bool = False) -> str
             except PrescriptionError as error:
                 raise PrescriptionError(f"surface {surface.name}: {error}") from None
     heights = [s["geometry"]["cs"]["z"] for s in surfaces]
-    for items, here, there in zip(surfaces[1:], heights[1:], [*heights[2:], heights[-1]], strict=True):
-        items["thickness"] = (there - here) / MM
+    for items, height, next_height in zip(surfaces[1:], heights[1:], [*heights[2:], heights[-1]], strict=True):
+        items["thickness"] = (next_height - height) / MM
     for items in surfaces:
         _in_millimetres(items["geometry"]["cs"])
     content = {

@@ -99,8 +99,8 @@ def _commands(path: Path) -> Iterator[Record]:
     """Yield the commands of a file: parted by line ends and semicolons, comments from // to the end."""
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         # Texts in quotation marks hold semicolons and slashes.
-        for part in re.findall(r'(?:"[^"]*"|//.*|[^;])+', line):
-            words = re.findall(r'"[^"]*"|//.*|[^\s,"]+', part)
+        for statement in re.findall(r'(?:"[^"]*"|//.*|[^;])+', line):
+            words = re.findall(r'"[^"]*"|//.*|[^\s,"]+', statement)
             words = words[: next((i for i, w in enumerate(words) if w.startswith("//")), len(words))]
             if words:
                 yield Record(
@@ -330,8 +330,8 @@ class _Reader:
             raise command.error("a positive number")
 
     def _place(self) -> None:
-        first, *others = self.surfaces
-        last, lens = others[-1], self.description
+        first, *surfaces_behind = self.surfaces
+        last, lens = surfaces_behind[-1], self.description
         # The thickness of the image is a defocus: it counts from where the surface before it leads.
         if last.values.get("TH"):
             before = self.surfaces[-2].values
@@ -341,7 +341,7 @@ class _Reader:
         if first.get("CV"):
             command = next(first.commands[key] for key in ("RD", "CV") if key in first.commands)
             self.findings.report(command.problem(f"{command.shown}: curved objects are not read"), "taken as a plane")
-        for surface, (position, axes) in zip(others, frames, strict=True):
+        for surface, (position, axes) in zip(surfaces_behind, frames, strict=True):
             radius, commands = surface.get("AP") * lens.unit, surface.commands
             source = Source(str(self.path), surface.place)
             checked = radius and surface.checked and self.check_apertures

@@ -98,7 +98,7 @@ def _field_line(sequence: LensSequence) -> str:
     value = math.hypot(*largest) if largest[0] else largest[1]
     expected = [(0.0, fraction * value) for fraction in FRACTIONS] if value else [(0.0, 0.0)]
     met = len(sequence.fields) == len(expected) and all(
-        math.dist(one, other) <= _EQUAL * abs(value) for one, other in zip(sequence.fields, expected, strict=False)
+        math.dist(point, usual) <= _EQUAL * abs(value) for point, usual in zip(sequence.fields, expected, strict=False)
     )
     if not met:
         text = f"fields: {FILE} states one, and means 0, 0.7 and 1 times it along y"

@@ -34,8 +34,10 @@ CLASSES = {
     "schott": "SchottGlass", "ohara": "OharaGlass", "hoya": "HoyaGlass", "sumita": "SumitaGlass", "cdgm": "CDGMGlass",
     "hikari": "HikariGlass",
 }  # fmt: skip
-#: Entries that a table needs for ray-optics' cubic spline, and those that one of a formula has.
-_LEAST_ENTRIES, _ENTRIES = 4, 21
+#: Entries that a table needs for ray-optics' cubic spline.
+_LEAST_ENTRIES = 4
+#: Entries of the table of a formula.
+_ENTRIES = 21
 _MODULE = "opticalglass"
 
 
@@ -68,8 +70,8 @@ def medium_of(gap: JsonObject, lens: LensDescription, glasses: Glasses) -> Mediu
 
 def _catalogue_glass(medium: JsonObject, values: JsonObject, glasses: Glasses) -> Medium:
     name, maker = values.text("gname"), module_name(medium)
-    known = maker in MAKERS and name in GlassCatalogue.of_maker(maker)
-    entry = GlassCatalogue.of_maker(maker)[name] if known else None
+    is_bundled = maker in MAKERS and name in GlassCatalogue.of_maker(maker)
+    entry = GlassCatalogue.of_maker(maker)[name] if is_bundled else None
     terms = tuple(numbers(values, "coefs")) if "coefs" in values else ()
     formula = FORMULAS.get((maker, len(terms)))
     limits = _range(values, getattr(entry, "wavelength_range", RANGE))
@@ -144,12 +146,12 @@ def _glass_items(
     medium: Sellmeier | Dispersion, formula: str, coefficients: tuple[float, ...]
 ) -> dict[str, Any] | None:
     """Return the items of the glass of a maker with these coefficients: of its own, or one with the same formula."""
-    own_forms = {key: known for key, known in FORMULAS.items() if key != ("hikari", 6)}
-    makers = [maker for (maker, size), known in own_forms.items() if (size, known) == (len(coefficients), formula)]
+    own_forms = {key: kind for key, kind in FORMULAS.items() if key != ("hikari", 6)}
+    makers = [maker for (maker, size), kind in own_forms.items() if (size, kind) == (len(coefficients), formula)]
     if not makers:
         return None
-    own = [m for m in makers if medium.name in GlassCatalogue.of_maker(m)]
-    maker = (own or makers)[0]
+    makers_of_name = [m for m in makers if medium.name in GlassCatalogue.of_maker(m)]
+    maker = (makers_of_name or makers)[0]
     values = {"gname": medium.name, "coefs": list(coefficients)}
     return _item(maker, CLASSES[maker], values | _range_items(medium))
 

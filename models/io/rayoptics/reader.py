@@ -152,9 +152,9 @@ class _Reader:
 
     def _decenter(self, items: JsonObject) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return rotation and shift in front of a surface, and rotation and shift behind it."""
-        unit, none = np.eye(3), np.zeros(3)
+        unit, no_shift = np.eye(3), np.zeros(3)
         if "decenter" not in items:
-            return unit, none, unit, none
+            return unit, no_shift, unit, no_shift
         values = attributes(items, "decenter")
         kind = values.text(named(values, "dtype"))
         if kind not in DECENTERS:
@@ -165,12 +165,12 @@ class _Reader:
         # Alpha and beta are left-handed, as in CODE V.
         turn = rotation_matrix(angles * np.array([-1.0, -1.0, 1.0]))
         if kind == "decenter":
-            return turn, shift, unit, none
+            return turn, shift, unit, no_shift
         if kind == "reverse":
-            return unit, none, turn.T, -shift
+            return unit, no_shift, turn.T, -shift
         if kind == "dec and return":
             return turn, shift, turn.T, -shift
-        return turn, shift, turn, none
+        return turn, shift, turn, no_shift
 
     def _system(self) -> None:
         lens, system = self.description, attributes(self.model, "system_spec")

@@ -31,9 +31,9 @@ _MODULE = "rayoptics.elem.profiles"
 def shape_of(profile: JsonObject, unit: float, findings: Findings) -> Shape:
     """Return the shape of a profile, whose lengths are in a unit [m]."""
     kind, values = class_name(profile), attributes(profile)
-    known = ("Spherical", "Conic", *POLYNOMIALS)
-    if kind not in known:
-        findings.report(profile.problem(f"profile {kind}: expected one of {', '.join(known)}"), "taken as a sphere")
+    kinds = ("Spherical", "Conic", *POLYNOMIALS)
+    if kind not in kinds:
+        findings.report(profile.problem(f"profile {kind}: expected one of {', '.join(kinds)}"), "taken as a sphere")
     curvature = values.number("cv", 0.0) / unit
     constant = values.number("ec") - 1.0 if "ec" in values and "cc" not in values else values.number("cc", 0.0)
     if kind not in POLYNOMIALS:

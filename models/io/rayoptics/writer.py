@@ -31,8 +31,10 @@ APERTURES = {
     "entrance_pupil": ("object", "epd"), "object_na": ("object", "NA"), "f_number": ("image", "f/#"),
     "working_f_number": ("image", "f/#"),
 }  # fmt: skip
-#: Version of ray-optics whose form of the file this is, and its distance of an object at infinity.
-VERSION, FAR = "0.9.8", 1e10
+#: Version of ray-optics whose form of the file this is.
+VERSION = "0.9.8"
+#: Distance of an object at infinity in ray-optics [lens unit].
+FAR = 1e10
 
 
 def telescope_to_rayoptics(telescope: Telescope, *, lenient: bool = False) -> str:
@@ -79,10 +81,10 @@ def _sequence_items(sequence: LensSequence) -> dict[str, Any]:
         with error_context(subject=f"surface {surface.name}"):
             profiles[str(number)] = profile_items(Profile.of(surface.shape, unit))
         mode = {Interaction.MIRROR: "reflect", Interaction.REFRACT: "transmit"}.get(surface.interaction, "dummy")
-        own = _surface_items(surface.name, mode, str(number), (surface.semi_diameter or radius) / unit)
-        own["attributes"]["clear_apertures"] = _aperture_items(sequence, surface)
-        own["attributes"]["decenter"] = _decenter_items(surface, unit)
-        items.append(own)
+        written_surface = _surface_items(surface.name, mode, str(number), (surface.semi_diameter or radius) / unit)
+        written_surface["attributes"]["clear_apertures"] = _aperture_items(sequence, surface)
+        written_surface["attributes"]["decenter"] = _decenter_items(surface, unit)
+        items.append(written_surface)
         if surface.interaction != Interaction.DETECTOR:
             gaps.append(_gap(sequence.thickness(surface), media.items(surface.after)))
             directions.append(-directions[-1] if mode == "reflect" else directions[-1])

@@ -26,8 +26,10 @@ from ..zemax.reader import described
 
 #: Ending of the names of compressed files.
 _PACKED = ".lzw"
-#: Longest archive, and most bytes of a file in it that is unpacked.
-MAX_BYTES, MAX_UNPACKED = 100_000_000, 50_000_000
+#: Longest archive [byte].
+MAX_BYTES = 100_000_000
+#: Longest file of an archive when unpacked [byte].
+MAX_UNPACKED = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -66,8 +68,8 @@ def read_zemax_archive(path: Path, findings: Findings, catalogues: Glasses) -> L
         else:
             glasses |= {glass: catalogue[glass] for glass in catalogue}
     if len(lenses) != 1:
-        found = ", ".join(map(shown, lenses)) or "none"
-        raise PrescriptionError(f"expected one lens file (.zmx) in the archive, found {found}", file=path)
+        lens_names = ", ".join(map(shown, lenses)) or "none"
+        raise PrescriptionError(f"expected one lens file (.zmx) in the archive, found {lens_names}", file=path)
     (lens,) = lenses.values()
     return described(replace(parse_zemax_file(lens, path, findings), glasses=glasses), findings, catalogues)
 
@@ -92,7 +94,7 @@ def _members(data: bytes, path: Path) -> Iterator[tuple[str, bytes]]:
 def _unpacked(packed: bytes, source: str) -> bytes:
     """Return the bytes of a compressed file; PrescriptionError if it is damaged or too long."""
     table = [bytes([value]) for value in range(256)]
-    found = bytearray()
+    unpacked = bytearray()
     previous = b""
     buffer = bits = 0
     width = 9
@@ -112,10 +114,10 @@ def _unpacked(packed: bytes, source: str) -> bytes:
             raise PrescriptionError(f"code {code} beyond the table of {len(table)}: a damaged file", file=source)
         if previous:
             table.append(previous + entry[:1])
-        found += entry
+        unpacked += entry
         previous = entry
         if len(table) >= 1 << width:
             width += 1
-        if len(found) > MAX_UNPACKED:
+        if len(unpacked) > MAX_UNPACKED:
             raise PrescriptionError(f"more than {MAX_UNPACKED} bytes when unpacked", file=source)
-    return bytes(found)
+    return bytes(unpacked)

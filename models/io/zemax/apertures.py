@@ -22,7 +22,7 @@ def read_aperture(block: Block, unit: float, findings: Findings) -> Aperture | N
     """
     shift = block.last("OBDC")
     x, y = (shift.number(0) * unit, shift.number(1) * unit) if shift else (0.0, 0.0)
-    found: list[Aperture] = []
+    regions: list[Aperture] = []
     for keyword in ("CLAP", "FLAP", "OBSC", "SQAP", "SQOB", "ELAP", "ELOB", "SPID"):
         line = block.last(keyword)
         if line is None:
@@ -41,16 +41,16 @@ def read_aperture(block: Block, unit: float, findings: Findings) -> Aperture | N
             region = half(line, first * unit, second * unit, x, y)
         else:
             region = ring(line, first * unit, second * unit, x, y)
-        found.append(Complement(region) if keyword in ("OBSC", "SQOB", "ELOB", "SPID") else region)
+        regions.append(Complement(region) if keyword in ("OBSC", "SQOB", "ELOB", "SPID") else region)
     for keyword in ("UDAD", "USAP", "USOB", "UDAP"):
         for line in block.all(keyword)[:1]:
             try:
-                found.append(shifted(read_user_aperture(line, unit), x, y))
+                regions.append(shifted(read_user_aperture(line, unit), x, y))
             except PrescriptionError as error:
                 findings.report(error, "taken as none")
-    if len(found) > 1:
+    if len(regions) > 1:
         raise block.lines[0].error("one aperture in this surface")
-    return found[0] if found else None
+    return regions[0] if regions else None
 
 
 def aperture_lines(aperture: Aperture, unit: float) -> list[str]:
@@ -82,7 +82,7 @@ def aperture_lines(aperture: Aperture, unit: float) -> list[str]:
 
 def _is_spider(union: Union) -> bool:
     """Return whether a union is one of equal vanes from one point, at equal angles, one of them along x."""
-    vanes = [part for part in union.parts if isinstance(part, Vane) and not part.both_ways]
+    vanes = [vane for vane in union.parts if isinstance(vane, Vane) and not vane.both_ways]
     if len(vanes) != len(union.parts) or len({(v.width, v.x, v.y) for v in vanes}) != 1:
         return False
     turns = np.sort(np.mod(np.array([v.angle for v in vanes]) + 1e-9, 2 * math.pi))

@@ -59,8 +59,8 @@ class Block:
 
     def last(self, keyword: str) -> Record | None:
         """Return the last line with a keyword, or None."""
-        found = self.all(keyword)
-        return found[-1] if found else None
+        records = self.all(keyword)
+        return records[-1] if records else None
 
     def number(self, keyword: str, default: float, position: int = 0, *, infinite: bool = False) -> float:
         """Return a number of the last line with a keyword, or a default where there is no such line."""

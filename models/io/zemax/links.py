@@ -21,8 +21,10 @@ from ..lens.source import Source
 from ..lens.text import number_text
 from .file import Block
 
-#: Solve types of a curvature and of a glass that take over that of another surface.
-_CURVATURE, _GLASS = 4, 2
+#: Solve type of a curvature that takes over that of another surface.
+_CURVATURE = 4
+#: Solve type of a glass that takes over that of another surface.
+_GLASS = 2
 #: Solves of a curvature without a place in a telescope, by their numbers: rays, normals, power, focal ratio...
 _CURVATURE_SOLVES = {
     2: "marginal ray angle",
@@ -96,7 +98,7 @@ def _pickups(
         source, scale = names.get(int(curvature.number(2, 0.0))), curvature.number(3, 1.0)
         if source is not None and source != names[number] and scale:
             # Of the radius, or of the curvature.
-            yield tuple(Pickup(names[number], "radius", source, one) for one in dict.fromkeys((scale, 1.0 / scale)))
+            yield tuple(Pickup(names[number], "radius", source, f) for f in dict.fromkeys((scale, 1.0 / scale)))
     if gap is not None:
         source, scale = names.get(int(gap.number(0, 0.0))), gap.number(1, 1.0)
         if (
@@ -122,24 +124,24 @@ def add_link_lines(t: Telescope, own: Mapping[str, tuple[int, list[str]]], unit:
     left_out: list[Pickup | Solve] = []
     mirrors = dict(zip(t.surface_names, _mirrors(t.surfaces), strict=True))
     for pickup in t.design_data.pickups:
-        (number, there), lines = own[pickup.source], own[pickup.surface][1]
-        here, source = (_line(ls, _LINES.get(pickup.quantity, "")) for ls in (lines, there))
+        (number, source_lines), lines = own[pickup.source], own[pickup.surface][1]
+        follower_line, source = (_line(ls, _LINES.get(pickup.quantity, "")) for ls in (lines, source_lines))
         if pickup.quantity == "thickness":
             held = all(_is_one_line(t, name, own[name][1], unit) for name in (pickup.surface, pickup.source))
             scale, offset = _signed(mirrors, pickup.surface, pickup.source, pickup.scale, pickup.offset)
-            new = f"PZUP {number} {number_text(scale)} {number_text(offset / unit)} 0"
+            link_line = f"PZUP {number} {number_text(scale)} {number_text(offset / unit)} 0"
         elif pickup.quantity == "glass":
-            held = bool(here) and here.split()[1:2] == source.split()[1:2]
-            new = here.replace(" 0 0 ", f" {_GLASS} {number} ", 1)
+            held = bool(follower_line) and follower_line.split()[1:2] == source.split()[1:2]
+            link_line = follower_line.replace(" 0 0 ", f" {_GLASS} {number} ", 1)
         else:
-            held = bool(here and source) and abs(pickup.scale) == 1.0 and not pickup.offset
-            new = f"{here} {_CURVATURE} {number} {number_text(pickup.scale)}"
+            held = bool(follower_line and source) and abs(pickup.scale) == 1.0 and not pickup.offset
+            link_line = f"{follower_line} {_CURVATURE} {number} {number_text(pickup.scale)}"
         if not held:
             left_out.append(pickup)
         elif pickup.quantity == "thickness":
-            lines.append(new)
+            lines.append(link_line)
         else:
-            lines[lines.index(here)] = new
+            lines[lines.index(follower_line)] = link_line
     for solve in t.design_data.solves:
         lines = own[solve.surface][1]
         if solve.kind == "marginal_height" and _is_one_line(t, solve.surface, lines, unit):
@@ -170,5 +172,5 @@ def _signed(mirrors: Mapping[str, int], surface: str, source: str, scale: float,
 
     The other way round it is the same.
     """
-    here, there = (-1.0 if mirrors[name] % 2 else 1.0 for name in (surface, source))
-    return here * there * scale, here * offset
+    follower_sign, source_sign = (-1.0 if mirrors[name] % 2 else 1.0 for name in (surface, source))
+    return follower_sign * source_sign * scale, follower_sign * offset

@@ -161,15 +161,15 @@ def shape_lines(shape: Shape, unit: float) -> list[str]:
     """
     parts = list(shape.parts) if isinstance(shape, Sum) else [shape]
     base = next((p for p in parts if not isinstance(p, XYPolynomial | ZernikeSag | GridSag)), Plane())
-    rest = [p for p in parts if p is not base]
+    additions = [p for p in parts if p is not base]
     if isinstance(base, Biconic | Toroid | OddAsphere):
-        if rest:
+        if additions:
             raise PrescriptionError(f"sum with {type(base).__name__}: no type of Zemax surface has this shape")
         return _special_lines(base, unit)
     if not isinstance(base, Plane | Sphere | Conic | EvenAsphere):
         raise PrescriptionError(f"shape {type(base).__name__}: no type of Zemax surface has this shape")
-    square, rest = square_term(rest)
-    if len(rest) > 1:
+    square, additions = square_term(additions)
+    if len(additions) > 1:
         raise PrescriptionError("sum of several shapes: no type of Zemax surface has this shape")
     head = [f"CURV {number_text(base.curvature * unit)}", f"CONI {number_text(base.conic)}"]
     powers = [square, *base.coefficients]
@@ -177,16 +177,16 @@ def shape_lines(shape: Shape, unit: float) -> list[str]:
         raise PrescriptionError(f"{len(base.coefficients)} coefficients: a Zemax surface has 7 from r^4 to r^16")
     parameters = [f"PARM {i} {number_text(a * unit ** (2 * i - 1))}" for i, a in enumerate(powers, start=1)]
     curved = any(powers)
-    if not rest:
+    if not additions:
         return ["TYPE EVENASPH", *head, *parameters] if curved else ["TYPE STANDARD", *head]
-    part = rest[0]
-    if isinstance(part, ZernikeSag):
-        return ["TYPE SZERNSAG", *head, *parameters, *_zernike_lines(part, unit)]
-    if isinstance(part, GridSag):
-        return ["TYPE GRID_SAG", *head, *parameters, *_grid_lines(part, unit)]
-    if isinstance(part, XYPolynomial) and not curved:
-        return ["TYPE XPOLYNOM", *head, *_polynomial_lines(part, unit)]
-    raise PrescriptionError(f"asphere with {type(part).__name__}: no type of Zemax surface has this shape")
+    addition = additions[0]
+    if isinstance(addition, ZernikeSag):
+        return ["TYPE SZERNSAG", *head, *parameters, *_zernike_lines(addition, unit)]
+    if isinstance(addition, GridSag):
+        return ["TYPE GRID_SAG", *head, *parameters, *_grid_lines(addition, unit)]
+    if isinstance(addition, XYPolynomial) and not curved:
+        return ["TYPE XPOLYNOM", *head, *_polynomial_lines(addition, unit)]
+    raise PrescriptionError(f"asphere with {type(addition).__name__}: no type of Zemax surface has this shape")
 
 
 def _special_lines(shape: Biconic | Toroid | OddAsphere, unit: float) -> list[str]:
@@ -234,13 +234,13 @@ def _complete(count: int) -> int:
 
 
 def _polynomial_lines(part: XYPolynomial, unit: float) -> list[str]:
-    found = {(i, j): a for i, j, a in part.terms}
-    if (0, 0) in found:
+    coefficients = {(i, j): a for i, j, a in part.terms}
+    if (0, 0) in coefficients:
         raise PrescriptionError("polynomial of x and y with a constant term: a Zemax surface has none")
-    degree = max(i + j for i, j in found)
+    degree = max(i + j for i, j in coefficients)
     powers = polynomial_powers((degree + 1) * (degree + 2) // 2 - 1)
     # Lengths in units of the lens unit: the normalisation radius is one of these.
-    return _extra(len(powers), unit, [found.get(p, 0.0) * unit ** sum(p) for p in powers], unit)
+    return _extra(len(powers), unit, [coefficients.get(p, 0.0) * unit ** sum(p) for p in powers], unit)
 
 
 def _grid_lines(part: GridSag, unit: float) -> list[str]:

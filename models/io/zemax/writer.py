@@ -177,20 +177,20 @@ def _glass_names(t: Telescope) -> dict[Medium, str]:
         if name in bundled and bundled[name] == medium:
             names[medium] = name
             continue
-        own = bool(re.match("[A-Z]", name)) and name not in (*names.values(), "MIRROR") and name not in bundled
+        is_free = bool(re.match("[A-Z]", name)) and name not in (*names.values(), "MIRROR") and name not in bundled
         number = len(names) + 1
-        while not own and (f"GLASS_{number}" in names.values()):
+        while not is_free and (f"GLASS_{number}" in names.values()):
             number += 1
-        names[medium] = name if own else f"GLASS_{number}"
+        names[medium] = name if is_free else f"GLASS_{number}"
     return names
 
 
 def _catalogue_lines(glasses: dict[Medium, str]) -> Iterator[str]:
     bundled = GlassCatalogue.bundled()
-    own = {medium: name for medium, name in glasses.items() if not (name in bundled and bundled[name] == medium)}
-    if own:
+    unlisted = {medium: name for medium, name in glasses.items() if not (name in bundled and bundled[name] == medium)}
+    if unlisted:
         yield "CC Glasses of the lens file of the same name, written by pachon\n"
-    for medium, name in own.items():
+    for medium, name in unlisted.items():
         formula, coefficients, limits = _formula(medium)
         nd = float(medium.index(5.875618e-7)) if limits[0] <= 5.875618e-7 <= limits[1] else 0.0
         yield f"NM {name} {formula} 0 {nd:.6f} 0 0 0\n"
