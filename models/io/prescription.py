@@ -45,7 +45,7 @@ from .glass_catalogue import GlassCatalogue
 from .yaml.reader import MAX_BYTES, read_telescope, telescope_of
 
 if TYPE_CHECKING:
-    from .lens.read import Reader
+    from .lens.build import Reader
 
 #: Endings of lens files: Zemax and its archives, CODE V, OSLO, optiland, ray-optics.
 _LENS_FILES = (".zmx", ".zar", ".seq", ".len", ".json", ".roa")
@@ -132,7 +132,7 @@ def load_telescope(
 
         return batoid_telescope(content, path, lenient=lenient)
     if path.suffix.lower() in _LENS_FILES:
-        from .lens.read import read_lens
+        from .lens.build import read_lens
 
         reader = _lens_reader(path.suffix.lower())
         return read_lens(path, reader, lenient=lenient, glass_catalogues=glass_catalogues)

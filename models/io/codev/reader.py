@@ -414,10 +414,10 @@ class _Reader:
             with surface.commands["OBSCURED"].context():
                 regions.append((surface.commands["OBSCURED"], Complement(Circle(inner, x, y))))
         for keys, region in ((("REX", "REY"), rectangle), (("ELX", "ELY"), ellipse)):
-            command = next((surface.commands[key] for key in keys if key in surface.values), None)
-            if command is not None:
+            stated = next((surface.commands[key] for key in keys if key in surface.values), None)
+            if stated is not None:
                 half_x, half_y = (surface.get(key) * unit for key in keys)
-                regions.append((command, region(command, half_x, half_y, x, y)))
+                regions.append((stated, region(stated, half_x, half_y, x, y)))
         if len(regions) > 1:
             raise regions[1][0].error(f"one aperture of a surface, not {regions[0][0].keyword} as well")
         return regions[0][1] if regions else None

@@ -8,11 +8,14 @@ z = 0. A field of the lens at angles (tx, ty) is the field (-tx, ty) here.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
+from ....core.errors import PrescriptionError, error_context
 from ...design_data import DesignData
 from ...element_groups import element_groups
 from ...media.medium import RelativeToAir
@@ -20,15 +23,36 @@ from ...paraxial import ParaxialSurfaces, StopImage, reference_radius
 from ...shapes.shape import Plane
 from ...surface import Interaction, Surface
 from ...telescope import Telescope
+from ...thickness import impossible_thicknesses
+from ..glass_catalogue import GlassCatalogue
 from ..writable import unmet_pickup
 from .description import PUPIL_PLANE, WIDEST, LensDescription, LensSurface, StatedAperture
 from .frame import HALF_TURN, rotated_aperture, rotated_axes, rotated_shape
-from .source import Source
+from .glasses import Glasses
+from .source import Findings, Source
 
+#: Reads the description of a lens from a file.
+Reader = Callable[[Path, Findings, Glasses], LensDescription]
 #: Field radius [rad] of a file with the axis alone.
 LEAST_FIELD = math.radians(0.1)
 #: Components of unit vectors that are rounding.
 _ROUNDING = 1e-12
+
+
+def read_lens(
+    path: Path,
+    reader: Reader,
+    *,
+    lenient: bool = False,
+    glass_catalogues: Iterable[GlassCatalogue | str | os.PathLike[str]] = (),
+) -> Telescope:
+    """Read a lens file with the reader of its format."""
+    findings = Findings(lenient)
+    with error_context(file=path):
+        telescope = telescope_of(reader(path, findings, Glasses(path, glass_catalogues)))
+    for text in impossible_thicknesses(telescope):
+        findings.note(PrescriptionError(text, file=path), "read as it is: rays go back within it")
+    return telescope
 
 
 def telescope_of(lens: LensDescription) -> Telescope:

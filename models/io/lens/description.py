@@ -95,9 +95,9 @@ class StatedAperture:
 class LensDescription:
     """Surfaces and system data of a lens file.
 
-    `unit` is that of the file [m]; `object_distance` [m] counts from the first surface, `medium` is that in front of
-    it. `apertures` are those that the file states, of which the first counts. `telecentric` is a finite object's,
-    `largest_field` the largest distance of a field point from the axis in degrees or in the unit of the file.
+    `object_distance` [m] counts from the first surface, `medium` is that in front of it. `apertures` are those that the
+    file states, of which the first counts. `telecentric` is a finite object's, `largest_field` the largest distance of
+    a field point from the axis in degrees or in the unit of the file.
     Each of `pickups` has the meanings that it may have, of which the first that the surfaces meet is taken.
     """
 
@@ -106,7 +106,6 @@ class LensDescription:
     findings: Findings
     title: str = ""
     version: str = "1"
-    unit: float = 1e-3
     object_distance: float = math.inf
     medium: Medium = VACUUM
     surfaces: list[LensSurface] = field(default_factory=list)
@@ -118,6 +117,11 @@ class LensDescription:
     pickups: list[tuple[Source, tuple[Pickup, ...]]] = field(default_factory=list)
     solves: list[Solve] = field(default_factory=list)
     sources: dict[str, Source] = field(default_factory=dict)
+
+    @property
+    def unit(self) -> float:
+        """Unit of lengths of the file [m]."""
+        return self.design.unit
 
     def problem(self, text: str) -> PrescriptionError:
         """Return an error of the file as a whole."""
@@ -131,7 +135,6 @@ class LensDescription:
 
     def state_unit(self, unit: float) -> None:
         """Set the unit of lengths [m]."""
-        self.unit = unit
         name = next(name for name, size in LENGTH_UNITS.items() if size == unit)
         self.design = replace(self.design, length_unit=name)
 
