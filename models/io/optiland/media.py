@@ -43,8 +43,8 @@ def medium_of(material: JsonObject, lens: LensDescription, glasses: Glasses) -> 
         return _catalogue_glass(material, glasses, lens.findings)
     if kind == "DataMaterial":
         with material.part("definition").context():
-            # Materials without a name are numbered among the media of the lens.
-            number = len({lens.medium, *(s.after for s in lens.surfaces)} - {VACUUM}) + 1
+            # Materials without a name are numbered among the glasses of the lens.
+            number = 1 + len({m.name for m in (lens.medium, *(s.after for s in lens.surfaces)) if m != VACUUM})
             return _data_medium(material, material.text("name", "") or f"MATERIAL_{number}")
     if kind == "AbbeMaterial":
         nd, vd = material.number("index"), material.number("abbe")

@@ -58,7 +58,7 @@ def medium_of(gap: JsonObject, lens: LensDescription, glasses: Glasses) -> Mediu
         if kind == "InterpolatedMedium":
             waves, indices = numbers(values, "wvls"), numbers(values, "rndx")
             table = sorted(zip((scaled(w, -9) for w in waves), indices, strict=False))
-            number = len({lens.medium, *(s.after for s in lens.surfaces)} - {VACUUM}) + 1
+            number = 1 + len({m.name for m in (lens.medium, *(s.after for s in lens.surfaces)) if m != VACUUM})
             lengths, entries = zip(*table, strict=True) if table else ((), ())
             return TabulatedIndex(lengths, entries, name=values.text("label", "") or f"TABLE {number}")
         if "gname" in values:
