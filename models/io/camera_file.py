@@ -134,11 +134,11 @@ class CameraFile(Section):
         return LSST if self.photometry == "lsst" else CameraPhotometry()
 
     def _pixels_of(self, ccd: CcdSection) -> Any:
-        found = self.pixels if ccd.pixels is None else ccd.pixels
-        if found is None:
+        ccd_pixels = self.pixels if ccd.pixels is None else ccd.pixels
+        if ccd_pixels is None:
             key = f"ccds[{ccd.name}].pixels"
             raise PrescriptionError(f"{key}: expected [NX, NY], there or for all CCDs as pixels", key=key)
-        return found
+        return ccd_pixels
 
     def _vendors(self) -> tuple[str, ...]:
         named = [ccd.name for ccd in self.ccds if ccd.vendor is not None]

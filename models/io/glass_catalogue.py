@@ -20,7 +20,7 @@ from ..media.air import ZERO_CELSIUS, Air
 from ..media.dispersion import FORMULAS, Dispersion
 from ..media.medium import Medium, RelativeToAir, Sellmeier
 from .bundled import DATA
-from .zemax.text import Record, read_text, records
+from .lens.text import Record, read_text, records
 
 BUNDLED = DATA / "glasses.agf"
 #: Makers whose catalogues come with the package, in the order in which a glass is looked up.
@@ -197,24 +197,24 @@ def _read_glass(lines: list[Record]) -> Glass:
     if len(head.words) < 2:
         raise head.error("a name and the number of a dispersion formula")
     name = head.words[0].upper()
-    found: dict[str, Record] = {}
+    lines_by_keyword: dict[str, Record] = {}
     for line in lines[1:]:
         if line.keyword in ("CD", "TD", "LD"):
-            found[line.keyword] = line
+            lines_by_keyword[line.keyword] = line
         elif line.keyword not in IGNORED:
             raise line.error(f"CD, TD, LD or one of {', '.join(IGNORED)} in glass {name}")
-    if "CD" not in found:
+    if "CD" not in lines_by_keyword:
         raise head.problem(f"glass {name} has no line CD with its coefficients")
-    limits = found.get("LD")
+    limits = lines_by_keyword.get("LD")
     low, high = (limits.number(0), limits.number(1)) if limits else DEFAULT_RANGE
-    celsius = found["TD"].number(6, 20.0) if "TD" in found else 20.0
+    celsius = lines_by_keyword["TD"].number(6, 20.0) if "TD" in lines_by_keyword else 20.0
     try:
-        medium = _medium(head, found["CD"], (low / 1e6, high / 1e6))
+        medium = _medium(head, lines_by_keyword["CD"], (low / 1e6, high / 1e6))
     except PrescriptionError as error:
         raise (error if error.file else head.problem(f"glass {name}: {error}")) from None
     temperature = celsius + ZERO_CELSIUS
     if not 0 < temperature <= 1000:
-        raise found["TD"].error("a temperature above absolute zero and below 700 deg C as word 7")
+        raise lines_by_keyword["TD"].error("a temperature above absolute zero and below 700 deg C as word 7")
     return Glass(name, replace(medium, name=name), _index(head, 3), _index(head, 4), temperature)
 
 

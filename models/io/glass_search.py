@@ -16,17 +16,17 @@ def find_glass(name: str, first: Iterable[GlassCatalogue] = ()) -> Medium | None
     are read only where none before has the glass.
     """
     for catalogue in _all(first):
-        known = catalogue.spelling(name)
-        if known is not None:
-            return catalogue[known]
+        spelled_name = catalogue.spelling(name)
+        if spelled_name is not None:
+            return catalogue[spelled_name]
     return None
 
 
 def glass_hint(name: str, first: Iterable[GlassCatalogue] = ()) -> str:
     """Return what to do about a glass of no catalogue: the nearest names, and where its data may come from."""
     names = dict.fromkeys(glass for catalogue in _all(first) for glass in catalogue)
-    found = nearest(name, names, n=3)
-    return f"expected the catalogue of its maker (--glass-catalogue FILE.agf){f'; {found}' if found else ''}"
+    near = nearest(name, names, n=3)
+    return f"expected the catalogue of its maker (--glass-catalogue FILE.agf){f'; {near}' if near else ''}"
 
 
 def _all(first: Iterable[GlassCatalogue]) -> Iterator[GlassCatalogue]:

@@ -57,8 +57,8 @@ def fits_image(path: Path, dimensions: int) -> tuple[fits.Header, np.ndarray]:
         for signature, kind in _FOREIGN.items():
             if start.startswith(signature):
                 text = f"{kind} file, whose maps have no nodes and no unit: expected a FITS image"
-                other = "pachon.read_hdf5_map" if kind == "HDF5" else "a pachon.GridSag of its map"
-                raise PrescriptionError(f"{text}, or {other}", file=path)
+                alternative = "pachon.read_hdf5_map" if kind == "HDF5" else "a pachon.GridSag of its map"
+                raise PrescriptionError(f"{text}, or {alternative}", file=path)
         file.seek(0)
         hdus = fits.open(file, memmap=False)
         images = [(hdu.header, hdu.data) for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == dimensions]

@@ -73,19 +73,21 @@ def _values(path: Path, name: str | None) -> np.ndarray:
     except ImportError:
         raise PrescriptionError("HDF5 needs the package h5py: pip install 'pachon[hdf5]'", file=path) from None
     with parsing(path, "cannot be read as HDF5", PrescriptionError), h5py.File(path, "r") as file:
-        found: dict[str, Any] = {}
+        datasets: dict[str, Any] = {}
 
         def collect(key: str, item: Any) -> None:
             # Links to other files are not followed by visititems; datasets may lie outside the file all the same.
             if isinstance(item, h5py.Dataset) and item.ndim == 2 and item.dtype.kind in "iuf":
-                found[key] = item
+                datasets[key] = item
 
         file.visititems(collect)
-        if (name is None and len(found) != 1) or (name is not None and name not in found):
-            names = ", ".join(found) or "none"
-            which = "one dataset" if name is None else f"a dataset {name!r}"
-            raise PrescriptionError(f"expected {which} of numbers of two dimensions; the file has {names}", file=path)
-        data = found[name] if name is not None else next(iter(found.values()))
+        if (name is None and len(datasets) != 1) or (name is not None and name not in datasets):
+            names = ", ".join(datasets) or "none"
+            expected = "one dataset" if name is None else f"a dataset {name!r}"
+            raise PrescriptionError(
+                f"expected {expected} of numbers of two dimensions; the file has {names}", file=path
+            )
+        data = datasets[name] if name is not None else next(iter(datasets.values()))
         if data.external or data.is_virtual:
             raise PrescriptionError(f"dataset {data.name!r} lies in another file, which is not read", file=path)
         if data.size > _MOST:

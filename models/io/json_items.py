@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 from ...core.errors import PrescriptionError, shown
 from ...core.files import read_bytes
-from .zemax.file import Findings
+from .lens.source import Findings, Source
 
 #: Longest file [byte]: grids of sag take megabytes.
 MAX_BYTES = 50_000_000
@@ -50,6 +50,14 @@ class JsonObject:
     def problem(self, text: str) -> PrescriptionError:
         """Return an error of this object."""
         return PrescriptionError(text, file=self.source, place=self.place or None)
+
+    def at(self, key: str) -> Source:
+        """Return the source of a value."""
+        return Source(self.source, self.place, key, shown(self.content.get(key)))
+
+    def part(self, text: str) -> Source:
+        """Return the source of a part of this object, as messages name it."""
+        return Source(self.source, self.place, text)
 
     def refuse(self, key: str, expected: str) -> NoReturn:
         """Raise the error of a value that is not the expected one."""
@@ -120,8 +128,8 @@ class JsonObject:
 
     def report_rest(self, findings: Findings, ignored: Iterable[str] = ()) -> None:
         """Report every key with a value that was neither read nor is among those to ignore."""
-        known = self.used.union(ignored)
+        understood_keys = self.used.union(ignored)
         for key, value in self.content.items():
-            if key not in known and value not in (None, [], {}):
+            if key not in understood_keys and value not in (None, [], {}):
                 text = f"{shown(key)} = {shown(value)}: this key is not understood"
                 findings.report(self.problem(text))

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,7 +45,7 @@ from .glass_catalogue import GlassCatalogue
 from .yaml.reader import MAX_BYTES, read_telescope, telescope_of
 
 if TYPE_CHECKING:
-    from .zemax.file import Findings, ZemaxFile
+    from .lens.build import Reader
 
 #: Endings of lens files: Zemax and its archives, CODE V, OSLO, optiland, ray-optics.
 _LENS_FILES = (".zmx", ".zar", ".seq", ".len", ".json", ".roa")
@@ -58,13 +58,14 @@ WRITTEN = {
 ENDINGS = (".yaml", ".yml", *_LENS_FILES)
 
 
-def _parts_reader(ending: str) -> Callable[[Path, Findings], ZemaxFile]:
-    """Return the reader of the parts of lens files with an ending."""
+def _lens_reader(ending: str) -> Reader:
+    """Return the reader of lens files with an ending."""
     # Imported where they are needed, like the writers.
     if ending == ".zar":
         from .zar.reader import read_zemax_archive
 
         return read_zemax_archive
+
     if ending == ".len":
         from .oslo.reader import read_oslo_file
 
@@ -81,9 +82,9 @@ def _parts_reader(ending: str) -> Callable[[Path, Findings], ZemaxFile]:
         from .codev.reader import read_codev_file
 
         return read_codev_file
-    from .zemax.file import read_zemax_file
+    from .zemax.reader import read_zemax_lens
 
-    return read_zemax_file
+    return read_zemax_lens
 
 
 @check_arguments
@@ -131,10 +132,10 @@ def load_telescope(
 
         return batoid_telescope(content, path, lenient=lenient)
     if path.suffix.lower() in _LENS_FILES:
-        from .zemax.reader import read_lens
+        from .lens.build import read_lens
 
-        parts = _parts_reader(path.suffix.lower())
-        return read_lens(path, parts, lenient=lenient, glass_catalogues=glass_catalogues)
+        reader = _lens_reader(path.suffix.lower())
+        return read_lens(path, reader, lenient=lenient, glass_catalogues=glass_catalogues)
     if isinstance(name_or_path, os.PathLike) or len(path.parts) > 1 or path.is_file():
         raise PrescriptionError(f"expected a prescription file that ends in {', '.join(ENDINGS)}", file=path)
     raise unknown_name("telescope", text, BUNDLED)
@@ -152,13 +153,13 @@ def prescription_digest(path: str | os.PathLike[str]) -> str:
         If a file cannot be read.
     """
     path = Path(path)
-    own = hashlib.sha256(read_bytes(path, PrescriptionError)).hexdigest()
+    digest = hashlib.sha256(read_bytes(path, PrescriptionError)).hexdigest()
     if path.suffix.lower() in _LENS_FILES:
         from .user_glasses import user_catalogues
 
         named = [path.with_suffix(".agf").name, *(os.path.abspath(p) for p in user_catalogues())]
         if path.suffix.lower() == ".zmx":
-            from .zemax.text import read_text
+            from .lens.text import read_text
             from .zemax.user_apertures import named_apertures
 
             named += [os.path.abspath(p) for p in named_apertures(path, read_text(path))]
@@ -168,11 +169,14 @@ def prescription_digest(path: str | os.PathLike[str]) -> str:
     files = [name for name in named if os.path.isfile(path.parent / name)]
     for name in files:
         # A list that grows: files of meshes name no others.
-        beside = (os.path.join(os.path.dirname(name), other) for other in files_of_mesh(path.parent / name))
-        files += [other for other in beside if os.path.isfile(path.parent / other) and other not in files]
+        beside = (os.path.join(os.path.dirname(name), mesh) for mesh in files_of_mesh(path.parent / name))
+        files += [mesh for mesh in beside if os.path.isfile(path.parent / mesh) and mesh not in files]
     if not files:
-        return own
-    contents = [own, *(hashlib.sha256(read_bytes(path.parent / n, PrescriptionError)).hexdigest() for n in files)]
+        return digest
+    contents = [
+        digest,
+        *(hashlib.sha256(read_bytes(path.parent / n, PrescriptionError)).hexdigest() for n in files),
+    ]
     return hashlib.sha256("".join(contents).encode()).hexdigest()
 
 
@@ -181,8 +185,8 @@ def _texts(content: Any) -> Iterator[str]:
     if isinstance(content, str):
         yield content
     elif isinstance(content, (dict, list)):
-        for part in content.values() if isinstance(content, dict) else content:
-            yield from _texts(part)
+        for item in content.values() if isinstance(content, dict) else content:
+            yield from _texts(item)
 
 
 @cache

@@ -52,43 +52,48 @@ class Profile:
         even: dict[int, float] = {}
         terms: list[tuple[int, int, float]] = []
         base = cls(0.0, 0.0)
-        seen = 0
-        for part in parts:
-            if isinstance(part, XYPolynomial):
-                radial = _radial(part.terms)
-                terms += () if radial is not None else part.terms
+        curved_count = 0
+        for shape_part in parts:
+            if isinstance(shape_part, XYPolynomial):
+                radial = _radial(shape_part.terms)
+                terms += () if radial is not None else shape_part.terms
                 for power, a in (radial or {}).items():
                     even[power] = even.get(power, 0.0) + a * unit ** (power - 1)
-            elif isinstance(part, Plane | Sphere | Conic | EvenAsphere):
-                base, seen = cls(part.curvature * unit, part.conic), seen + (not isinstance(part, Plane))
-                for power, a in enumerate(part.coefficients, start=2):
+            elif isinstance(shape_part, Plane | Sphere | Conic | EvenAsphere):
+                base, curved_count = (
+                    cls(shape_part.curvature * unit, shape_part.conic),
+                    curved_count + (not isinstance(shape_part, Plane)),
+                )
+                for power, a in enumerate(shape_part.coefficients, start=2):
                     even[2 * power] = even.get(2 * power, 0.0) + a * unit ** (2 * power - 1)
-            elif isinstance(part, OddAsphere):
-                odd = tuple(a * unit ** (power - 1) for power, a in enumerate(part.coefficients, start=1))
-                base, seen = cls(unit / part.radius, part.conic, odd=odd), seen + 1
-            elif isinstance(part, Toroid):
-                base = cls(unit / part.radius_y, part.conic_y, curvature_x=unit / part.radius_x)
-                seen += 1
+            elif isinstance(shape_part, OddAsphere):
+                odd = tuple(a * unit ** (power - 1) for power, a in enumerate(shape_part.coefficients, start=1))
+                base, curved_count = cls(unit / shape_part.radius, shape_part.conic, odd=odd), curved_count + 1
+            elif isinstance(shape_part, Toroid):
+                base = cls(unit / shape_part.radius_y, shape_part.conic_y, curvature_x=unit / shape_part.radius_x)
+                curved_count += 1
             else:
-                raise PrescriptionError(f"shape {type(part).__name__}: expected a conic with powers of r or of x and y")
+                raise PrescriptionError(
+                    f"shape {type(shape_part).__name__}: expected a conic with powers of r or of x and y"
+                )
         special = bool(base.odd) or base.curvature_x is not None
-        if seen > 1 or (special and (even or terms)) or (any(even.values()) and terms):
-            kinds = ", ".join(type(part).__name__ for part in parts)
+        if curved_count > 1 or (special and (even or terms)) or (any(even.values()) and terms):
+            kinds = ", ".join(type(shape_part).__name__ for shape_part in parts)
             raise PrescriptionError(f"sum of {kinds}: expected a conic with powers of r, or of x and y")
         highest = max((power for power, a in even.items() if a), default=0)
-        found = tuple((i, j, a * unit ** (i + j - 1)) for i, j, a in terms)
-        return replace(base, even=tuple(even.get(p, 0.0) for p in range(2, highest + 1, 2)), terms=found)
+        polynomial_terms = tuple((i, j, a * unit ** (i + j - 1)) for i, j, a in terms)
+        return replace(base, even=tuple(even.get(p, 0.0) for p in range(2, highest + 1, 2)), terms=polynomial_terms)
 
 
 def _radial(terms: tuple[tuple[int, int, float], ...]) -> dict[int, float] | None:
     """Return the coefficients by power of r of a polynomial of x and y that is one of r^2, None for another."""
-    found = {(i, j): a for i, j, a in terms if a}
+    coefficients = {(i, j): a for i, j, a in terms if a}
     powers: dict[int, float] = {}
     expected = 0
-    for n in sorted({(i + j) // 2 for i, j in found}):
-        powers[2 * n] = found.get((2 * n, 0), 0.0)
+    for n in sorted({(i + j) // 2 for i, j in coefficients}):
+        powers[2 * n] = coefficients.get((2 * n, 0), 0.0)
         row = {(2 * i, 2 * (n - i)): powers[2 * n] * math.comb(n, i) for i in range(n + 1)}
         expected += len(row)
-        if n == 0 or any(not math.isclose(found.get(key, 0.0), a, rel_tol=_ROUNDING) for key, a in row.items()):
+        if n == 0 or any(not math.isclose(coefficients.get(key, 0.0), a, rel_tol=_ROUNDING) for key, a in row.items()):
             return None
-    return powers if expected == len(found) else None
+    return powers if expected == len(coefficients) else None

@@ -44,8 +44,8 @@ def user_catalogues() -> tuple[Path, ...]:
         If the configuration cannot be read, or names what is neither an AGF file nor a folder with some.
     """
     if VARIABLE in os.environ:
-        listed = [part for part in os.environ[VARIABLE].split(os.pathsep) if part]
-        return tuple(path for part in listed for path in _files(Path(part).expanduser(), VARIABLE))
+        listed = [entry for entry in os.environ[VARIABLE].split(os.pathsep) if entry]
+        return tuple(path for entry in listed for path in _files(Path(entry).expanduser(), VARIABLE))
     source = user_configuration_path()
     if not source.is_file():
         return ()
@@ -56,9 +56,9 @@ def user_catalogues() -> tuple[Path, ...]:
 
 def _files(place: Path, key: str) -> list[Path]:
     if place.is_dir():
-        found = sorted(path for path in place.iterdir() if path.suffix.lower() == ".agf")
+        catalogue_paths = sorted(path for path in place.iterdir() if path.suffix.lower() == ".agf")
     else:
-        found = [place] if place.is_file() else []
-    if not found:
+        catalogue_paths = [place] if place.is_file() else []
+    if not catalogue_paths:
         raise ConfigError(f"{key}: {place}: expected an AGF file, or a folder with some")
-    return found
+    return catalogue_paths

@@ -13,7 +13,7 @@ from ..media.medium import Medium
 from ..surface import Interaction
 from ..telescope import Telescope
 from ..thickness import thickness
-from .zemax.file import Findings
+from .lens.source import Findings
 
 #: Relative difference from a pickup that rounding in files makes.
 _ROUNDING = 1e-6
@@ -46,9 +46,9 @@ def report_pupil_plane(telescope: Telescope, findings: Findings, *, own_stop: bo
     if data.stop is None or own_stop:
         return
     aimed = data.aiming != "off"
-    said = f"stop = {data.stop}, aiming = {data.aiming}: the stop and the stated aperture do not make the pupil"
+    problem = f"stop = {data.stop}, aiming = {data.aiming}: the stop and the stated aperture do not make the pupil"
     instead = "a plane in front carries the stop" + (", and rays are not aimed" if aimed else "")
-    findings.note(PrescriptionError(said), instead)
+    findings.note(PrescriptionError(problem), instead)
 
 
 def with_formulas(telescope: Telescope, written: Callable[[Medium], object], findings: Findings) -> Telescope:
@@ -67,11 +67,11 @@ def with_formulas(telescope: Telescope, written: Callable[[Medium], object], fin
             written(medium)
         except PrescriptionError as error:
             fits[medium], deviation = fitted_dispersion(medium, (low, high))
-            said = PrescriptionError(f"medium {medium.name or type(medium).__name__}: {error}")
+            problem = PrescriptionError(f"medium {medium.name or type(medium).__name__}: {error}")
             instead = (
                 f"a formula is fitted, within {deviation:.1g} of its index, {low * 1e9:.4g} to {high * 1e9:.4g} nm"
             )
-            (findings.report if deviation > _LARGEST_DEVIATION else findings.note)(said, instead)
+            (findings.report if deviation > _LARGEST_DEVIATION else findings.note)(problem, instead)
     before, *after = (fits.get(medium, medium) for medium in media)
     surfaces = tuple(replace(s, medium_after=m) for s, m in zip(telescope.surfaces, after, strict=True))
     return replace(telescope, medium_before=before, surfaces=surfaces) if fits else telescope
@@ -92,11 +92,13 @@ def unmet_pickup(telescope: Telescope, pickup: Pickup) -> str | None:
         return None if follower.medium_after == source.medium_after else f"the glass of {pickup.source}"
     if pickup.quantity == "thickness":
         names = telescope.surface_names
-        here, there = (thickness(telescope, names.index(s.name)) for s in (follower, source))
+        actual, followed = (thickness(telescope, names.index(s.name)) for s in (follower, source))
     else:
         key = "conic" if pickup.quantity == "conic" else "radius"
-        here, there = (s.shape.parameters.get(key, 0.0 if key == "conic" else math.inf) for s in (follower, source))
-    wanted = pickup.scale * there + pickup.offset
-    if here == wanted or abs(here - wanted) <= _ROUNDING * max(abs(wanted), abs(here)):
+        actual, followed = (
+            s.shape.parameters.get(key, 0.0 if key == "conic" else math.inf) for s in (follower, source)
+        )
+    expected = pickup.scale * followed + pickup.offset
+    if actual == expected or abs(actual - expected) <= _ROUNDING * max(abs(expected), abs(actual)):
         return None
-    return f"{wanted:.9g}, not {here:.9g}"
+    return f"{expected:.9g}, not {actual:.9g}"

@@ -96,6 +96,6 @@ def _region_items(region: Aperture) -> dict[str, Any]:
     if isinstance(region, Polygon):
         xs, ys = zip(*region.corners, strict=True)
         return {"type": "ObscPolygon", "xs": list(xs), "ys": list(ys)}
-    found = written(OBSCURATIONS, region)
-    assert found is not None
-    return {"type": found[0]} | found[1]
+    section = written(OBSCURATIONS, region)
+    assert section is not None
+    return {"type": section[0]} | section[1]

@@ -37,7 +37,7 @@ def _steps(value: Any) -> tuple[tuple[str, Any], ...]:
     """Return the shifts and rotations of a coordinate system in the order of the file, which matters."""
     if not isinstance(value, dict):
         raise expected(f"a mapping of {', '.join(_STEPS)}")
-    found = []
+    steps = []
     for key, amount in value.items():
         if key not in _STEPS:
             raise unknown_key(key, _STEPS)
@@ -45,8 +45,8 @@ def _steps(value: Any) -> tuple[tuple[str, Any], ...]:
         numbers = [as_number(v) for v in (amount if isinstance(amount, list) else [amount])]
         if None in numbers or len(numbers) != size or isinstance(amount, list) != (size == 3):
             raise expected("a list of 3 numbers" if size == 3 else "a number", key)
-        found.append((key, np.array(numbers, dtype=np.float64)))
-    return tuple(found)
+        steps.append((key, np.array(numbers, dtype=np.float64)))
+    return tuple(steps)
 
 
 class Optic(Section):

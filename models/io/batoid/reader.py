@@ -28,8 +28,8 @@ from ...media.medium import Medium
 from ...shapes.shape import Plane
 from ...surface import IDENTITY, Interaction, Matrix, Surface, Vector
 from ...telescope import VACUUM, Telescope
+from ..lens.source import Findings
 from ..writable import require_met
-from ..zemax.file import Findings
 from . import ROOT
 from .apertures import clear_region
 from .optics import BatoidFile, Compound, Extras, Frame, Interface, Optic, Screen
@@ -76,11 +76,11 @@ def batoid_telescope(content: dict[str, Any], path: Path, *, lenient: bool = Fal
     PrescriptionError with file, key, value and expected value; with `lenient`, unknown keys are left out with a
     warning.
     """
-    known = {key: content[key] for key in (ROOT, "pachon") if key in content}
+    batoid_sections = {key: content[key] for key in (ROOT, "pachon") if key in content}
     drop = None
     if lenient:
-        known, drop = copy.deepcopy(known), Findings(lenient).report
-    file = validated(BatoidFile, known, str(path), PrescriptionError, {"folder": path.parent}, drop=drop)
+        batoid_sections, drop = copy.deepcopy(batoid_sections), Findings(lenient).report
+    file = validated(BatoidFile, batoid_sections, str(path), PrescriptionError, {"folder": path.parent}, drop=drop)
     with error_context(file=path):
         return _telescope(file, path)
 
@@ -133,13 +133,13 @@ def _with_extras(telescope: Telescope, extras: Extras) -> Telescope:
     """Return the telescope with the semi-diameters and coatings that the section of ours states."""
     sizes, coated = extras.semi_diameters, extras.coated
     for key, stated in (("semi_diameters", set(sizes)), ("coated", set(coated))):
-        if other := sorted(stated - set(telescope.surface_names)):
-            raise PrescriptionError(f"{other[0]!r}: expected the name of a surface", key=f"pachon.{key}")
+        if unknown_surfaces := sorted(stated - set(telescope.surface_names)):
+            raise PrescriptionError(f"{unknown_surfaces[0]!r}: expected the name of a surface", key=f"pachon.{key}")
     coatings = {name: section.made(name) for name, section in extras.coatings.items()}
     for name, coating in coated.items():
         if coating not in coatings:
-            wanted = f"one of {', '.join(coatings)}" if coatings else "a section coatings"
-            raise PrescriptionError(f"{coating!r}: expected {wanted}", key=f"pachon.coated.{name}")
+            expected_coating = f"one of {', '.join(coatings)}" if coatings else "a section coatings"
+            raise PrescriptionError(f"{coating!r}: expected {expected_coating}", key=f"pachon.coated.{name}")
     surfaces = tuple(
         replace(s, semi_diameter=sizes.get(s.name)).coated(coatings.get(coated.get(s.name, "")))
         for s in telescope.surfaces
@@ -153,12 +153,12 @@ def _within(
     """Yield the optics within another one in the order of the light, each before those within it."""
     for item, (item_before, item_after) in zip(compound.items, compound.media(before, after), strict=True):
         own_before = item.medium_before or item_before
-        own = _Placed(
+        placed_optic = _Placed(
             item, (*path, item.name or item.type), item.frame(frame), own_before, item.medium_after or item_after
         )
-        yield own
+        yield placed_optic
         if isinstance(item, Compound):
-            yield from _within(item, own.frame, own.before, own.after, own.path)
+            yield from _within(item, placed_optic.frame, placed_optic.before, placed_optic.after, placed_optic.path)
 
 
 def _short_names(paths: list[tuple[str, ...]]) -> dict[tuple[str, ...], str]:

@@ -123,9 +123,9 @@ def surface_items(shape: Shape) -> dict[str, Any]:
         return _zernike_items(_zernikes_of(shape), 1.0, 0.0)
     if isinstance(shape, GridSag):
         return {"type": "Bicubic", "xs": shape.x.tolist(), "ys": shape.y.tolist(), "zs": shape.values.tolist()}
-    if (found := written(SURFACES, shape)) is None:
+    if (section := written(SURFACES, shape)) is None:
         raise PrescriptionError(f"shape {type(shape).__name__}: expected one that batoid has: {', '.join(SURFACES)}")
-    return {"type": found[0]} | found[1]
+    return {"type": section[0]} | section[1]
 
 
 def _asphere_items(shape: EvenAsphere | OddAsphere, coefficients: tuple[float, ...], first: int) -> dict[str, Any]:
@@ -151,8 +151,8 @@ def _zernikes_of(shape: XYPolynomial) -> tuple[float, ...]:
     columns = []
     for j in range(count):
         terms = np.zeros((polynomial.degree + 1, polynomial.degree // 2 + 1), dtype=np.complex128)
-        one = from_zernikes((0.0,) * j + (1.0,), 1.0).terms
-        terms[: one.shape[0], : one.shape[1]] = one
+        zernike_terms = from_zernikes((0.0,) * j + (1.0,), 1.0).terms
+        terms[: zernike_terms.shape[0], : zernike_terms.shape[1]] = zernike_terms
         columns.append(np.concatenate([terms.real.ravel(), terms.imag.ravel()]))
     target = np.zeros_like(terms)
     rows, powers = (min(a, b) for a, b in zip(target.shape, polynomial.terms.shape, strict=True))

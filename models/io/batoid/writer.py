@@ -70,14 +70,14 @@ def telescope_to_batoid(telescope: Telescope) -> str:
 
 def _nested_groups(t: Telescope) -> dict[str, tuple[int, int]]:
     """Return the groups that are compound optics, outer ones first, by first surface and the one after the last."""
-    found: dict[str, tuple[int, int]] = {}
+    spans: dict[str, tuple[int, int]] = {}
     for name, members in sorted(t.groups.items(), key=lambda group: -len(group[1])):
         places = sorted(t.surface_names.index(member) for member in set(members))
         first, end = places[0], places[-1] + 1
-        apart_or_inside = all(end <= a or b <= first or (a <= first and end <= b) for a, b in found.values())
+        apart_or_inside = all(end <= a or b <= first or (a <= first and end <= b) for a, b in spans.values())
         if end - first == len(places) and apart_or_inside:
-            found[name] = (first, end)
-    return found
+            spans[name] = (first, end)
+    return spans
 
 
 def _items(t: Telescope, groups: dict[str, tuple[int, int]], first: int, end: int, frame: Frame) -> list[Any]:
@@ -91,10 +91,10 @@ def _items(t: Telescope, groups: dict[str, tuple[int, int]], first: int, end: in
             first += 1
             continue
         pivot, axes = t.group_frames[name]
-        own = np.array(pivot), np.array(axes)
+        group_frame = np.array(pivot), np.array(axes)
         inner = {n: span for n, span in groups.items() if n != name}
-        compound = {"type": "CompoundOptic", "name": name, **_coordinate_system(own, frame)}
-        items.append(compound | {"items": _items(t, inner, first, groups[name][1], own)})
+        compound = {"type": "CompoundOptic", "name": name, **_coordinate_system(group_frame, frame)}
+        items.append(compound | {"items": _items(t, inner, first, groups[name][1], group_frame)})
         first = groups[name][1]
     return items
 

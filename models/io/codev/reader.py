@@ -1,44 +1,53 @@
-"""Translate a CODE V lens file (.seq) into the terms of a Zemax file.
+"""Read a CODE V lens file (.seq) as the description of a lens.
 
 Supported commands: RDM, DIM, TITLE, EPD, FNO, NAO, WL, WTW, REF, AFO, TEM (deg C), PRE (mm of mercury), XAN YAN, XOB
 YOB, XIM YIM, XRI YRI, WTF, VUX VLX VUY VLY, before or after the surfaces SO S SI (curvature or radius, thickness,
 glass), RDY CUY THI GLA, STO, SLB, SPH CON ASP with K and A to G (r^4 to r^16), XDE YDE ZDE ADE BDE CDE with DAR, BEN
 and REV, CIR (OBS, HOL, EDG) REX REY and ELX ELY with ADX ADY, pick-ups PIK, private glasses PRV PWL END. ADE and BDE
-are left-handed, CDE is right-handed (CODE V reference manual, "Decentered surfaces"), Zemax's tilts are all right-
+are left-handed, CDE is right-handed (CODE V reference manual, "Decentered surfaces"), those of a description are right-
 handed. A glass is a name (NBK7_SCHOTT), REFL, or a number (517642). Solves are passed over where their solution is
 given. Rays are aimed at the stop, as CODE V's chief rays are.
 """
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+
+import numpy as np
 
 from ....core.errors import PrescriptionError
+from ...aperture import Aperture, Circle, Complement
 from ...media.medium import Medium
 from ...media.tabulated import TabulatedIndex
-from ..zemax.file import Block, Findings, ZemaxFile
-from ..zemax.placed import made_record
-from ..zemax.text import Record, read_text, scaled
+from ...rotation import rotation_matrix
+from ...telescope import VACUUM
+from ..lens.apertures import ellipse, rectangle, ring
+from ..lens.description import Format, LensDescription, LensSurface
+from ..lens.glasses import Glasses, numbered_glass
+from ..lens.shapes import even_asphere
+from ..lens.source import Findings, Source
+from ..lens.text import Record, read_text, scaled
 
-UNITS = {"M": "MM", "MM": "MM", "C": "CM", "CM": "CM", "I": "IN", "IN": "IN"}
-FIELDS = {
-    "XAN": ("XFLN", 0), "YAN": ("YFLN", 0), "XOB": ("XFLN", 1), "YOB": ("YFLN", 1),
-    "XIM": ("XFLN", 2), "YIM": ("YFLN", 2), "XRI": ("XFLN", 3), "YRI": ("YFLN", 3),
-}  # fmt: skip
-#: System apertures besides the f-number (FNO), which is that of the image space at the conjugates of the lens.
-APERTURES = {"EPD": "ENPD", "NAO": "OBNA"}
+FORMAT = Format("CODE V", "EPD, FNO or NAO", "WL", "STO")
+UNITS = {"M": 1e-3, "MM": 1e-3, "C": 1e-2, "CM": 1e-2, "I": 0.0254, "IN": 0.0254}
+#: Types of field points by the ending of the command, whose first letter is the axis.
+FIELDS = {"AN": "angle", "OB": "object_height", "IM": "paraxial_image_height", "RI": "real_image_height"}
+#: Commands of field points.
+POINTS = tuple(f"{axis}{ending}" for axis in "XY" for ending in FIELDS)
+#: System apertures, the first of which counts.
+APERTURES = ("EPD", "FNO", "NAO")
 #: Millimetres of mercury in an atmosphere.
 MMHG = 760.0
 #: Vignetting factors: the parts by which the upper and lower halves of the pupil shrink, along x and y.
 VIGNETTING = ("VUX", "VLX", "VUY", "VLY")
-#: Lists of numbers of the whole system.
-LISTS = ("WTW", "FNO", "TEM", "PRE", *VIGNETTING)
-SYSTEM = frozenset(("RDM", "DIM", "TIT", "WL", "WTF", "REF", "AFO", "PRV", *LISTS, *APERTURES, *FIELDS))
+#: Commands of the whole system with numbers.
+NUMERIC = ("WL", "WTW", "WTF", "TEM", "PRE", "REF", *VIGNETTING, *APERTURES, *POINTS)
+SYSTEM = frozenset(("RDM", "DIM", "TIT", "AFO", "PRV", *NUMERIC))
 LONG_NAMES = {"TITLE": "TIT", "STOP": "STO"}
 POWERS = "ABCDEFG"
 #: Numbers of surfaces.
@@ -55,6 +64,7 @@ LEN NEW DER INI GO CA CCY THC KC AC BC CC DC EC FC GC HC IC JC ADC BDC CDC XDC Y
 WTX WTY VIE DRA COM CUX THM GLC CRA POL CLS WID
 """
 IGNORED = frozenset(_IGNORED.split())
+#: Distance of the object from which it is at infinity [lens unit].
 INFINITE = 1e10
 #: Values of surfaces that other surfaces may pick up, by command.
 PICKED = {k: k for k in ("THI", "K", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", *POWERS)}
@@ -67,13 +77,13 @@ class LacksRadiusModeError(PrescriptionError):
     """A file without RDM whose surfaces cannot have the curvatures that it states."""
 
 
-def read_codev_file(path: Path, findings: Findings) -> ZemaxFile:
-    """Return the parts of a CODE V lens file in the terms of a Zemax file."""
+def read_codev_file(path: Path, findings: Findings, glasses: Glasses) -> LensDescription:
+    """Return the description of a CODE V lens file."""
     try:
-        return _Translation(path, findings).file()
+        return _Reader(path, findings, glasses).lens()
     except LacksRadiusModeError as error:
         findings.report(error, "the surfaces have radii")
-        return _Translation(path, findings, assumed_radii=True).file()
+        return _Reader(path, findings, glasses, assumed_radii=True).lens()
 
 
 def _commands(path: Path) -> Iterator[Record]:
@@ -86,44 +96,87 @@ def _commands(path: Path) -> Iterator[Record]:
             carried = text[:-1] + " "
             continue
         carried = ""
-        for part in re.split(r";(?=(?:[^']*'[^']*')*[^']*$)", text):
-            words = part.split()
+        for statement in re.split(r";(?=(?:[^']*'[^']*')*[^']*$)", text):
+            words = statement.split()
             if words:
-                after = part.strip()[len(words[0]) :].strip()
-                yield Record(str(path), first, "", words[0].upper(), tuple(words[1:]), after)
+                after = statement.strip()[len(words[0]) :].strip()
+                key = LONG_NAMES.get(words[0].upper(), words[0].upper())
+                yield Record(str(path), "", key, line=first, words=tuple(words[1:]), text=after)
 
 
-class _Translation:
-    """Lines of the same lens in a Zemax file, collected from the commands."""
+def _largest(records: list[Record], default: Source) -> Source:
+    """Return the command with the number that is farthest from zero."""
+    return max(records, key=lambda record: max(map(abs, record.numbers()), default=0.0), default=default)
 
-    def __init__(self, path: Path, findings: Findings, *, assumed_radii: bool = False) -> None:
-        self.assumed_radii = assumed_radii
-        self.path, self.findings = path, findings
-        self.header = Block(str(path))
-        self.surfaces: list[Block] = []
-        self.values: list[dict[str, float]] = []
-        self.radii = False
-        self.field_type = 0.0
-        self.afocal = False
-        self.waves: list[float] = []
-        self.lists: dict[str, list[float]] = {}
+
+@dataclass
+class _Surface:
+    """Commands of one surface: its numbers by command, and the last line of each; its glass and its name."""
+
+    place: Source
+    values: dict[str, float] = field(default_factory=lambda: {"CURV": 0.0})
+    commands: dict[str, Record] = field(default_factory=dict)
+    glass: Record | None = None
+    glass_name: str = ""
+    name: str = ""
+    stop: bool = False
+
+    def get(self, key: str) -> float:
+        """Return a number, 0 where the file has none."""
+        return self.values.get(key, 0.0)
+
+    @property
+    def mirror(self) -> bool:
+        """Whether it reflects."""
+        return self.glass_name.upper() in ("REFL", "MIRROR")
+
+
+class _Reader:
+    """System data and surfaces of a file, collected from its commands."""
+
+    def __init__(self, path: Path, findings: Findings, glasses: Glasses, *, assumed_radii: bool = False) -> None:
+        self.path, self.findings, self.glasses = path, findings, glasses
+        self.description = LensDescription(path, FORMAT, findings)
+        self.surfaces: list[_Surface] = []
+        #: Last command of each kind of the whole system.
+        self.system: dict[str, Record] = {}
+        self.radii = assumed_radii
         self.pick_ups: list[Record] = []
         self.private: dict[str, Medium] = {}
         self.private_waves: tuple[float, ...] | None = None
 
-    def file(self) -> ZemaxFile:
-        """Return the parts of the Zemax file."""
-        current, imaged = -1, False
+    def lens(self) -> LensDescription:
+        """Return the description of the lens."""
+        commands = list(_commands(self.path))
         # CODE V takes curvatures unless RDM says otherwise, wherever it stands.
-        commands = [replace(c, keyword=LONG_NAMES.get(c.keyword, c.keyword)) for c in _commands(self.path)]
         modes = [c.words for c in commands if c.keyword == "RDM"]
-        self.radii = self.assumed_radii or (bool(modes) and not (modes[-1] and modes[-1][0].upper().startswith("N")))
+        self.radii |= bool(modes) and not (modes[-1] and modes[-1][0].upper().startswith("N"))
+        imaged = self._read(commands)
+        if self.surfaces and not imaged:
+            # A lens that ends without SI has its image at the thickness of the last surface.
+            self._append()
+        if len(self.surfaces) < 3:
+            problem = f"{len(self.surfaces)} surfaces: expected SO, one S or more, and SI"
+            raise self.description.problem(problem)
+        self._check_curvatures()
+        for command in self.pick_ups:
+            self._pick_up(command)
+        self._check_solves()
+        if not any(surface.stop for surface in self.surfaces):
+            # Where a file names no stop, it is the first surface.
+            self.surfaces[1].stop = True
+        self._state_system()
+        self._place()
+        return self.description
+
+    def _read(self, commands: list[Record]) -> bool:
+        """Read all commands; return whether the last surface is the image."""
+        current, imaged = -1, False
         for command in commands:
             if self.private_waves is not None:
                 self._private(command)
             elif command.keyword in ("SO", "SI") or re.fullmatch(r"S\d*", command.keyword):
-                self.surfaces.append(Block(str(self.path), f"surface {len(self.surfaces)}"))
-                self.values.append({})
+                self._append()
                 current, imaged = len(self.surfaces) - 1, command.keyword == "SI"
                 self._start(replace(command, place=f"surface {current}"))
             elif command.keyword in SYSTEM or not self.surfaces:
@@ -131,47 +184,15 @@ class _Translation:
             elif command.keyword == "PIK":
                 self.pick_ups.append(command)
             else:
-                chosen = current
+                number = current
                 if command.words and re.fullmatch(r"[Ss](\d+|[OoIi])", command.words[0]):
-                    chosen = self._number(command)
+                    number = self._number(command)
                     command = replace(command, words=command.words[1:])
-                self._surface(replace(command, place=f"surface {chosen}"), chosen)
-        if self.surfaces and not imaged:
-            # A lens that ends without SI has its image at the thickness of the last surface.
-            self.surfaces.append(Block(str(self.path), f"surface {len(self.surfaces)}"))
-            self.values.append({"CURV": 0.0})
-        if len(self.surfaces) < 3:
-            raise self.header.problem(f"{len(self.surfaces)} surfaces: expected SO, one S or more, and SI")
-        self._check_curvatures()
-        for command in self.pick_ups:
-            self._pick_up(command)
-        self._check_solves()
-        if not any(line.keyword == "STOP" for block in self.surfaces for line in block.lines):
-            # Where a file names no stop, it is the first surface.
-            self.surfaces[1].lines.append(made_record(self.path, "surface 1", ("STOP",)))
-        # Chief rays pass the middle of the stop.
-        self._header_line("RAIM", 0, 1)
-        for f_number in self.lists.get("FNO", [])[:1]:
-            self._header_line("FNUM", f_number, int(abs(self.values[0].get("THI", 0.0)) < INFINITE))
-        if "TEM" in self.lists or "PRE" in self.lists:
-            celsius, pressure = (self.lists.get(key) or [usual] for key, usual in (("TEM", 20.0), ("PRE", MMHG)))
-            self._header_line("ENVD", celsius[0], pressure[0] / MMHG, 0)
-        weights = self.lists.get("WTW", [])
-        for i, wave in enumerate(self.waves):
-            amount = weights[i] if i < len(weights) else 1.0
-            self._header_line("WAVM", i + 1, wave, amount)
-        for axis in "XY":
-            upper, lower = (self.lists.get(f"V{half}{axis}", []) for half in "UL")
-            both = list(zip_longest(upper, lower, fillvalue=0.0))
-            if both:
-                # The pupil reaches from lower - 1 to 1 - upper.
-                self._header_line(f"VD{axis}N", *(0.5 * (low - up) for up, low in both))
-                self._header_line(f"VC{axis}N", *(0.5 * (low + up) for up, low in both))
-        self._header_line("FTYP", self.field_type, 0, 0, len(self.waves), 0, 0, float(self.afocal))
-        return ZemaxFile(self.path, self.header, self._blocks(), Block(str(self.path)), self.private, program="CODE V")
+                self._surface(replace(command, place=f"surface {number}"), self.surfaces[number])
+        return imaged
 
-    def _header_line(self, keyword: str, *values: float) -> None:
-        self.header.lines.append(made_record(self.path, "", (keyword, *values)))
+    def _append(self) -> None:
+        self.surfaces.append(_Surface(Source(str(self.path), f"surface {len(self.surfaces)}")))
 
     def _number(self, command: Record) -> int:
         word = command.words[0][1:].upper()
@@ -182,109 +203,71 @@ class _Translation:
         return number
 
     def _system(self, command: Record) -> None:
-        key, words = command.keyword, command.words
-
-        def add(keyword: str, *values: object) -> None:
-            self.header.lines.append(replace(command, keyword=keyword, words=tuple(map(str, values))))
-
-        if key == "RDM":
-            return
+        key = command.keyword
         if key == "PRV":
             self.private_waves = ()
-        elif key == "DIM":
-            unit = (words or ("M",))[0].upper()
-            if unit not in UNITS:
-                raise command.error(f"one of {', '.join(UNITS)}")
-            self.header.lines.append(replace(command, keyword="UNIT", words=(UNITS[unit],), text=UNITS[unit]))
-        elif key == "TIT":
-            self.header.lines.append(replace(command, keyword="NAME", text=command.text.strip("'\" ")))
-        elif key in APERTURES:
-            add(APERTURES[key], command.number(0))
-        elif key == "WL":
-            self.waves = [scaled(command.number(i), -3) for i in range(len(words))]
-        elif key in LISTS:
-            self.lists[key] = [command.number(i) for i in range(len(words))]
-        elif key == "WTF":
-            add("FWGN", *(repr(command.number(i)) for i in range(len(words))))
-        elif key == "REF":
-            add("PWAV", command.integer(0))
-        elif key == "AFO":
-            self.afocal = not (words and words[0].upper().startswith("N"))
-        elif key in FIELDS:
-            keyword, self.field_type = FIELDS[key]
-            add(keyword, *(repr(command.number(i)) for i in range(len(words))))
+        elif key in SYSTEM:
+            if key in NUMERIC:
+                # Faults are those of the first line with them.
+                command.numbers()
+            self.system.pop(key, None)
+            self.system[key] = command
         elif key not in IGNORED:
             self.findings.report(command.problem(f"{command.shown}: this command is not understood"))
 
     def _start(self, command: Record) -> None:
         """Read the line that begins a surface: radius or curvature, thickness, glass."""
-        values = self.values[-1]
-        values["CURV"] = self._curvature(command, 0, radius=self.radii) if command.words else 0.0
-        values["THI"] = command.number(1, 0.0, infinite=len(self.surfaces) == 1)
+        surface = self.surfaces[-1]
+        surface.commands["CURV"] = surface.commands["THI"] = command
+        surface.values["CURV"] = self._curvature(command, radius=self.radii) if command.words else 0.0
+        surface.values["THI"] = command.number(1, 0.0, infinite=len(self.surfaces) == 1)
         if len(command.words) > 2:
-            self._glass(command, command.words[2], len(self.surfaces) - 1)
+            surface.glass, surface.glass_name = command, command.words[2]
 
-    def _curvature(self, command: Record, position: int, *, radius: bool) -> float:
-        value = command.number(position)
+    def _curvature(self, command: Record, *, radius: bool) -> float:
+        value = command.number(0)
         return (1.0 / value if value else 0.0) if radius else value
 
-    def _glass(self, command: Record, name: str, number: int) -> None:
-        found = re.fullmatch(r"(\d{3})\.?(\d{3})|(\d{6})\.(\d{6})", name)
-        numbers = re.fullmatch(r"(\d\.\d+):(\d+\.?\d*)", name)
-        if name.upper() in ("REFL", "MIRROR"):
-            words: tuple[str, ...] = ("MIRROR",)
-        elif name.upper() == "AIR":
-            return
-        elif found:
-            # A number: the digits of nd - 1, then the Abbe number times ten, each with three digits or six.
-            index, abbe = (found[1], found[2]) if found[1] else (found[3], found[4])
-            words = (name, "1", "0", repr(1 + float(f"0.{index}")), repr(float(abbe) / 10 ** (len(abbe) - 2)))
-        elif numbers:
-            # Index and Abbe number as they are.
-            words = (name, "1", "0", numbers[1], numbers[2])
-        else:
-            words = (name.strip("'").split("_")[0],)
-        self.surfaces[number].lines.append(replace(command, keyword="GLAS", words=words))
-
-    def _surface(self, command: Record, number: int) -> None:
+    def _surface(self, command: Record, surface: _Surface) -> None:
         key, words = command.keyword, command.words
-        block, values = self.surfaces[number], self.values[number]
         if key in ("RDY", "CUY"):
-            values["CURV"] = self._curvature(command, 0, radius=key == "RDY")
+            surface.commands["CURV"] = command
+            surface.values["CURV"] = self._curvature(command, radius=key == "RDY")
         elif key == "GLA":
-            self._glass(command, (words or ("AIR",))[0], number)
-        elif key in ("STO", "SLB"):
-            keyword = {"STO": "STOP", "SLB": "COMM"}[key]
-            block.lines.append(replace(command, keyword=keyword, text=command.text.strip("'\" ")))
+            surface.glass, surface.glass_name = command, (words or ("AIR",))[0]
+        elif key == "STO":
+            surface.stop, surface.commands[key] = True, command
+        elif key == "SLB":
+            surface.name = command.text.strip("'\" ")
         elif key in NUMBERS:
-            values[key] = command.number(0)
+            surface.commands[key], surface.values[key] = command, command.number(0)
         elif key in ("DAR", "BEN", "REV"):
-            values[key] = 1.0
+            surface.commands[key], surface.values[key] = command, 1.0
         elif key == "CIR":
-            # Labels (L'A') tell several apertures of a kind apart; one of each kind is read.
-            names = [w.upper() for w in words if w.isalpha() or w[:2].upper() in ("L'", 'L"')]
-            radius = replace(command, words=words[len(names) :]).number(0)
-            kinds = [n for n in names if n.isalpha()] or ["CLR"]
-            if kinds[0] not in ("CLR", "OBS", "HOL", "EDG") or kinds[1:]:
-                raise command.error("CIR with one of CLR, OBS, HOL, EDG")
-            # An edge is where the glass ends and stops nothing; light that falls into a hole is lost.
-            if kinds[0] == "EDG":
-                values["EDGE"] = radius
-            else:
-                name = "CLEAR" if kinds[0] == "CLR" else "OBSCURED"
-                if name in values and (kinds[0] == "HOL" or not all(n.isalpha() for n in names)):
-                    text = f"{command.shown}: one aperture and one obscuration of a surface are read"
-                    self.findings.report(command.problem(text))
-                values[name] = radius
+            self._circle(command, surface)
         elif key == "CUF":
             if command.number(0):
                 self.findings.report(command.problem(f"{command.shown}: Fresnel surfaces are not read"))
         elif key in REFUSED:
             self.findings.report(command.problem(f"{command.shown}: {REFUSED[key]} are not read"))
         elif key == "PIM":
-            values["PIM"] = command.line
+            surface.commands[key] = command
         elif key not in IGNORED:
             self.findings.report(command.problem(f"{command.shown}: this command is not understood"))
+
+    def _circle(self, command: Record, surface: _Surface) -> None:
+        # Labels (L'A') tell several apertures of a kind apart; one of each kind is read.
+        names = [w.upper() for w in command.words if w.isalpha() or w[:2].upper() in ("L'", 'L"')]
+        radius = replace(command, words=command.words[len(names) :]).number(0)
+        kinds = [n for n in names if n.isalpha()] or ["CLR"]
+        if kinds[0] not in ("CLR", "OBS", "HOL", "EDG") or kinds[1:]:
+            raise command.error("CIR with one of CLR, OBS, HOL, EDG")
+        # An edge is where the glass ends and stops nothing; light that falls into a hole is lost.
+        key = {"CLR": "CLEAR", "EDG": "EDGE"}.get(kinds[0], "OBSCURED")
+        if key in surface.values and (kinds[0] == "HOL" or not all(n.isalpha() for n in names)) and key != "EDGE":
+            text = f"{command.shown}: one aperture and one obscuration of a surface are read"
+            self.findings.report(command.problem(text))
+        surface.commands[key], surface.values[key] = command, radius
 
     def _private(self, command: Record) -> None:
         """Read a line of the private catalogue: wavelengths PWL [nm], then a name and indices, up to END."""
@@ -292,7 +275,7 @@ class _Translation:
         if command.keyword == "END":
             self.private_waves = None
             return
-        numbers = [command.number(i) for i in range(len(command.words))]
+        numbers = command.numbers()
         if command.keyword == "PWL":
             self.private_waves = tuple(scaled(v, -9) for v in numbers)
             return
@@ -312,26 +295,28 @@ class _Translation:
         if len(words) < 4 or words[0] != words[2] or words[0] not in PICKED:
             self.findings.report(command.problem(f"{command.shown}: only pick-ups of the same value are read"))
             return
-        target, source = (self._number(replace(command, words=(words[i],))) for i in (1, 3))
-        rest = replace(command, words=tuple(words[4:]))
-        scale, offset, key = rest.number(0, 1.0), rest.number(1, 0.0), PICKED[words[0]]
-        value = self.values[source].get(key, 0.0)
+        numbers = (self._number(replace(command, words=(words[i],))) for i in (1, 3))
+        target, source = (self.surfaces[number] for number in numbers)
+        factors = replace(command, words=tuple(words[4:]))
+        scale, offset, key = factors.number(0, 1.0), factors.number(1, 0.0), PICKED[words[0]]
+        value = source.get(key)
+        target.commands[key] = command
         if words[0] == "RDY" and (scale != 1.0 or offset):
             radius = scale / value + offset if value else 0.0
-            self.values[target][key] = 1.0 / radius if radius else 0.0
+            target.values[key] = 1.0 / radius if radius else 0.0
         else:
-            self.values[target][key] = scale * value + offset
+            target.values[key] = scale * value + offset
 
     def _check_curvatures(self) -> None:
         """Refuse a file whose first curved surface would not reach the rim of the pupil: radii that lack RDM."""
-        diameter = self.header.number("ENPD", 0.0)
-        curvature = next((v["CURV"] for v in self.values[1:] if v["CURV"]), 0.0)
+        stated = self.system.get("EPD")
+        diameter = 0.0 if stated is None else stated.number(0)
+        curvature = next((s.get("CURV") for s in self.surfaces[1:] if s.get("CURV")), 0.0)
         small = f"the entrance pupil of {diameter:g}" if 0.5 * diameter * abs(curvature) > 1.0 else ""
-        for block, values in zip(self.surfaces[1:], self.values[1:], strict=True):
-            glass = any(line.keyword == "GLAS" and line.words[0] != "MIRROR" for line in block.lines)
-            bend = abs(values["CURV"] * values.get("THI", 0.0))
-            if not small and glass and bend > _LONGEST:
-                small, curvature = f"a hundredth of its glass of {values['THI']:g}", values["CURV"]
+        for surface in self.surfaces[1:]:
+            glass = not surface.mirror and surface.glass_name.upper() not in ("", "AIR")
+            if not small and glass and abs(surface.get("CURV") * surface.get("THI")) > _LONGEST:
+                small, curvature = f"a hundredth of its glass of {surface.get('THI'):g}", surface.get("CURV")
         if small and not self.radii:
             raise LacksRadiusModeError(
                 f"curvature {curvature:g}: a sphere smaller than {small}; expected RDM where surfaces have radii",
@@ -340,59 +325,155 @@ class _Translation:
 
     def _check_solves(self) -> None:
         """Refuse a paraxial image solve (PIM) whose solution does not stand in the file."""
-        for number, values in enumerate(self.values[:-1]):
-            if "PIM" in values and not values.get("THI"):
-                line = Record(str(self.path), int(values["PIM"]), f"surface {number}", "PIM", (), "")
-                raise line.problem("PIM: expected the thickness of the solve in the file; it is 0")
+        for surface in self.surfaces[:-1]:
+            if "PIM" in surface.commands and not surface.get("THI"):
+                raise surface.commands["PIM"].problem("PIM: expected the thickness of the solve in the file; it is 0")
 
-    def _blocks(self) -> list[Block]:
-        """Return the surfaces, with coordinate breaks between them where they are tilted or decentred."""
-        blocks: list[Block] = []
-        carried = self.values[-1].get("THI", 0.0)
-        for number, (block, values) in enumerate(zip(self.surfaces, self.values, strict=True)):
-            last = number == len(self.surfaces) - 1
-            thickness = 0.0 if last else values.get("THI", 0.0)
-            # The thickness of the image is a defocus: it counts from where the surface before it leads.
-            thickness += carried if number == len(self.surfaces) - 2 else 0.0
-            kind = "EVENASPH" if any(values.get(p) for p in POWERS) else "STANDARD"
-            lines: list[tuple[Any, ...]] = [("TYPE", kind), ("CURV", values["CURV"]), ("CONI", values.get("K", 0.0))]
-            lines += [("PARM", i, values.get(p, 0.0)) for i, p in enumerate(POWERS, start=2) if values.get(p)]
-            if "CLEAR" in values:
-                lines.append(("CLAP", values.get("OBSCURED", 0.0), values["CLEAR"]))
-            elif "OBSCURED" in values:
-                lines.append(("OBSC", 0.0, values["OBSCURED"]))
-            lines += [("DIAM", values["EDGE"])] if "EDGE" in values else []
-            if "REX" in values or "REY" in values:
-                lines.append(("SQAP", values.get("REX", 0.0), values.get("REY", 0.0)))
-            if "ELX" in values or "ELY" in values:
-                lines.append(("ELAP", values.get("ELX", 0.0), values.get("ELY", 0.0)))
-            if values.get("ADX") or values.get("ADY"):
-                lines.append(("OBDC", values.get("ADX", 0.0), values.get("ADY", 0.0)))
-            distance = "INFINITY" if number == 0 and abs(thickness) >= INFINITE else thickness
-            tilts = (-values.get("ADE", 0.0), -values.get("BDE", 0.0), values.get("CDE", 0.0))
-            shift = (values.get("XDE", 0.0), values.get("YDE", 0.0))
-            depth = values.get("ZDE", 0.0)
-            moved = any(tilts) or any(shift) or depth
-            after: list[Block] = []
-            if moved and (values.get("DAR") or values.get("REV")):
-                back = [*(-v for v in (*shift, *tilts)), 1]
-                after = [self._break(number, back, 0.0), self._break(number, [0.0] * 6, thickness - depth)]
-                distance = 0.0
-            elif moved and values.get("BEN"):
-                if tilts[2]:
-                    raise block.problem(f"BEN with CDE {values['CDE']:g}: not understood")
-                after, distance = [self._break(number, [0, 0, *tilts, 0], thickness)], 0.0
-            if moved and not values.get("REV"):
-                blocks += [self._break(number, [0.0] * 6, depth), self._break(number, [*shift, *tilts, 0], 0.0)]
-            if not last and not block.all("COMM"):
-                block.lines.append(made_record(self.path, f"surface {number}", ("COMM", f"S{number}")))
-            block.lines += [made_record(self.path, f"surface {number}", line) for line in (*lines, ("DISZ", distance))]
-            blocks += [block, *after]
-        return blocks
+    def _state_system(self) -> None:
+        lens, system = self.description, self.system
+        unit = system.get("DIM", Record(str(self.path), words=("M",)))
+        name = (unit.words or ("M",))[0].upper()
+        if name not in UNITS:
+            raise unit.error(f"one of {', '.join(UNITS)}")
+        lens.state_unit(UNITS[name])
+        lens.title = system["TIT"].text.strip("'\" ") if "TIT" in system else ""
+        distance = self.surfaces[0].get("THI")
+        lens.object_distance = math.inf if abs(distance) >= INFINITE else distance * lens.unit
+        self._state_spectrum()
+        self._state_fields()
+        for key in APERTURES:
+            if key in system:
+                value = system[key].number(0)
+                # The f-number is that of the image space at the conjugates of the lens.
+                focal_ratio = "working_f_number" if math.isfinite(lens.object_distance) else "f_number"
+                kind = {"EPD": "entrance_pupil", "NAO": "object_na"}.get(key, focal_ratio)
+                lens.state_aperture(system[key], kind, value * lens.unit if key == "EPD" else value)
+        # Chief rays pass the middle of the stop.
+        lens.state(Source(str(self.path)), aiming="paraxial")
+        if "AFO" in system:
+            words = system["AFO"].words
+            lens.state(system["AFO"], afocal=not (words and words[0].upper().startswith("N")))
+        air = [system.get("TEM"), system.get("PRE")]
+        celsius, pressure = (v.number(0, usual) if v else usual for v, usual in zip(air, (20.0, MMHG), strict=True))
+        for command in [v for v in air if v][:1]:
+            lens.state_air(command, celsius, pressure / MMHG)
 
-    def _break(self, number: int, parameters: Iterable[float], thickness: float) -> Block:
-        lines: list[tuple[Any, ...]] = [("TYPE", "COORDBRK"), ("DISZ", thickness)]
-        lines += [("PARM", i, v) for i, v in enumerate(parameters, start=1)]
-        return Block(
-            str(self.path), f"surface {number}", [made_record(self.path, f"surface {number}", line) for line in lines]
+    def _numbers(self, key: str) -> list[float]:
+        return self.system[key].numbers() if key in self.system else []
+
+    def _state_spectrum(self) -> None:
+        if "WL" not in self.system:
+            return
+        waves = [scaled(v, -9) for v in self._numbers("WL")]
+        reference = self.system.get("REF")
+        primary = 1 if reference is None else reference.integer(0)
+        if reference is not None and waves and not 1 <= primary <= len(waves):
+            raise reference.error(f"1 to {len(waves)}")
+        self.description.state_wavelengths(self.system["WL"], waves, self._numbers("WTW"), primary - 1)
+
+    def _state_fields(self) -> None:
+        lens = self.description
+        stated = [record for key, record in self.system.items() if key in POINTS]
+        columns = {record.keyword[0]: record.numbers() for record in stated}
+        points = list(zip_longest(columns.get("X", ()), columns.get("Y", ()), fillvalue=0.0)) or [(0.0, 0.0)]
+        kind = FIELDS[stated[-1].keyword[1:]] if stated else "angle"
+        lens.state_fields(_largest(stated, Source(str(self.path), keyword="YAN")), kind, points)
+        if "WTF" in self.system:
+            lens.state_field_weights(self.system["WTF"], self._numbers("WTF"))
+        factors = [self.system[key] for key in VIGNETTING if key in self.system]
+        lens.state_vignetted_ends(_largest(factors, Source(str(self.path))), *map(self._numbers, VIGNETTING))
+
+    def _medium(self, surface: _Surface) -> Medium:
+        name, command = surface.glass_name, surface.glass
+        if command is None or surface.mirror or name.upper() == "AIR":
+            return VACUUM
+        digits = re.fullmatch(r"(\d{3})\.?(\d{3})|(\d{6})\.(\d{6})", name)
+        numbers = re.fullmatch(r"(\d\.\d+):(\d+\.?\d*)", name)
+        if digits:
+            # A number: the digits of nd - 1, then the Abbe number times ten, each with three digits or six.
+            index, abbe = (digits[1], digits[2]) if digits[1] else (digits[3], digits[4])
+            nd, vd = 1 + float(f"0.{index}"), float(abbe) / 10 ** (len(abbe) - 2)
+            return numbered_glass(nd, vd, 0.0, name, command)
+        if numbers:
+            # Index and Abbe number as they are.
+            return numbered_glass(float(numbers[1]), float(numbers[2]), 0.0, name, command)
+        name = name.strip("'").split("_")[0].upper()
+        return self.private[name] if name in self.private else self.glasses.named(name, command)
+
+    def _aperture(self, surface: _Surface) -> Aperture | None:
+        unit = self.description.unit
+        x, y = surface.get("ADX") * unit, surface.get("ADY") * unit
+        regions: list[tuple[Record, Aperture]] = []
+        inner = surface.get("OBSCURED") * unit
+        if "CLEAR" in surface.values:
+            command, outer = surface.commands["CLEAR"], surface.get("CLEAR") * unit
+            if "OBSCURED" in surface.values and not 0 <= inner < outer:
+                raise surface.commands["OBSCURED"].error(f"a radius below that of {command.shown}")
+            regions.append((command, ring(command, inner, outer, x, y)))
+        elif inner:
+            with surface.commands["OBSCURED"].context():
+                regions.append((surface.commands["OBSCURED"], Complement(Circle(inner, x, y))))
+        for keys, region in ((("REX", "REY"), rectangle), (("ELX", "ELY"), ellipse)):
+            stated = next((surface.commands[key] for key in keys if key in surface.values), None)
+            if stated is not None:
+                half_x, half_y = (surface.get(key) * unit for key in keys)
+                regions.append((stated, region(stated, half_x, half_y, x, y)))
+        if len(regions) > 1:
+            raise regions[1][0].error(f"one aperture of a surface, not {regions[0][0].keyword} as well")
+        return regions[0][1] if regions else None
+
+    def _place(self) -> None:
+        """Add the surfaces one after the other, with the local frame of the light."""
+        lens, unit = self.description, self.description.unit
+        first, *surfaces_behind = self.surfaces
+        lens.medium = self._medium(first)
+        for key in ("XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", *POWERS):
+            if first.get(key):
+                shown = first.commands[key].shown
+                self.findings.report(first.commands[key].problem(f"{shown}: expected a flat object on the axis"))
+        # The thickness of the image is a defocus: it counts from where the surface before it leads.
+        surfaces_behind[-2].values["THI"] = surfaces_behind[-2].get("THI") + surfaces_behind[-1].get("THI")
+        surfaces_behind[-1].values["THI"] = 0.0
+        origin, axes, distance = np.zeros(3), np.eye(3), 0.0
+        for number, surface in enumerate(surfaces_behind, start=1):
+            # The first two angles are left-handed.
+            angles = (-surface.get("ADE"), -surface.get("BDE"), surface.get("CDE"))
+            shift = np.array([surface.get("XDE"), surface.get("YDE"), surface.get("ZDE")]) * unit
+            turn, moved = rotation_matrix(np.radians(angles)), any(angles) or bool(np.any(shift))
+            basis = origin, axes
+            if moved and not surface.get("REV"):
+                origin, axes, distance = origin + axes @ shift, axes @ turn, distance + float(shift[2])
+            self._add(surface, number, origin, axes, distance)
+            gap = surface.get("THI") * unit
+            distance = gap
+            if moved and (surface.get("DAR") or surface.get("REV")):
+                # The surface that undoes a decentre stands in the frame before it.
+                back = turn.T @ (0.0 - shift)
+                origin, axes = (origin + axes @ back, axes @ turn.T) if surface.get("REV") else basis
+                distance = gap - float(shift[2])
+            elif moved and surface.get("BEN"):
+                if angles[2]:
+                    raise surface.commands["BEN"].problem(f"BEN with CDE {angles[2]:g}: not understood")
+                axes = axes @ turn
+            origin = origin + axes[:, 2] * gap
+
+    def _add(self, surface: _Surface, number: int, origin: np.ndarray, axes: np.ndarray, distance: float) -> None:
+        lens, unit = self.description, self.description.unit
+        stated = [surface.commands[key] for key in ("CURV", "K", *POWERS) if key in surface.commands]
+        command = max(reversed(stated), key=lambda record: record.line) if stated else surface.place
+        powers = [0.0, *(surface.get(p) * unit ** (1 - 2 * i) for i, p in enumerate(POWERS, start=2))]
+        with command.context():
+            shape = even_asphere(surface.get("CURV") / unit, surface.get("K"), powers)
+        placed = LensSurface(
+            surface.commands.get("STO", surface.place) if surface.stop else surface.place,
+            shape,
+            origin,
+            axes,
+            name=surface.name,
+            after=self._medium(surface),
+            aperture=self._aperture(surface),
+            semi_diameter=surface.get("EDGE") * unit,
+            stop=surface.stop,
+            distance=distance,
         )
+        lens.add(placed, mirror=surface.mirror)

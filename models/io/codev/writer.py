@@ -15,9 +15,10 @@ from ...aperture import Annulus, Circle, Complement, Ellipse, Rectangle
 from ...media.medium import Medium
 from ...surface import Interaction
 from ...telescope import VACUUM, Telescope
-from ..lens_sequence import LensSequence, SequenceSurface, catalogue_name, maker_of, quoted
+from ..lens.description import LensSurface
+from ..lens.sequence import LensSequence, catalogue_name, maker_of, quoted
+from ..lens.text import number_text, scaled
 from ..profile import Profile
-from ..zemax.text import number_text, scaled
 from .reader import MMHG, POWERS
 
 FILE = "a CODE V file"
@@ -121,7 +122,7 @@ def _numbers(values: Sequence[float]) -> str:
     return " &\n  ".join(" ".join(map(number_text, row)) for row in rows)
 
 
-def _surface_lines(sequence: LensSequence, surface: SequenceSurface, words: Mapping[Medium, str]) -> Iterator[str]:
+def _surface_lines(sequence: LensSequence, surface: LensSurface, words: Mapping[Medium, str]) -> Iterator[str]:
     unit = sequence.unit
     profile = Profile.of(surface.shape, unit)
     if profile.odd or profile.terms or profile.curvature_x is not None or any(profile.even[:1]):
@@ -143,10 +144,10 @@ def _surface_lines(sequence: LensSequence, surface: SequenceSurface, words: Mapp
     elif profile.conic:
         yield "  CON"
         yield f"  K {number_text(profile.conic)}"
-    if surface.semi_diameter is not None:
+    if surface.semi_diameter:
         yield f"  CIR EDG {number_text(surface.semi_diameter / unit)}"
     if surface.off_axis:
-        x, y = (v / unit for v in surface.decentre)
+        x, y = (v / unit for v in surface.position[:2])
         # The first two angles are left-handed.
         a, b, c = (sign * math.degrees(v) for sign, v in zip((-1.0, -1.0, 1.0), surface.tilt, strict=True))
         values = zip(("XDE", "YDE", "ADE", "BDE", "CDE"), (x, y, a, b, c), strict=True)
@@ -155,7 +156,7 @@ def _surface_lines(sequence: LensSequence, surface: SequenceSurface, words: Mapp
             yield "  DAR"
 
 
-def _aperture_lines(sequence: LensSequence, surface: SequenceSurface) -> Iterator[str]:
+def _aperture_lines(sequence: LensSequence, surface: LensSurface) -> Iterator[str]:
     aperture, unit = surface.aperture, sequence.unit
     region = aperture.part if isinstance(aperture, Complement) else aperture
     clear = region is aperture

@@ -22,10 +22,10 @@ FRAMES = ("telescope", "CCS")
 
 def frame_of(metadata: Any, default: Frame, file: str | Path) -> Frame:
     """Return the frame that the metadata of a table or the header of an image name; PrescriptionError if unknown."""
-    given = next((metadata[key] for key in ("frame", "FRAME") if key in metadata), default)
-    if given not in FRAMES:
-        raise PrescriptionError(f"frame = {given!r}: expected one of {', '.join(FRAMES)}", file=file, key="frame")
-    return cast(Frame, given)
+    frame = next((metadata[key] for key in ("frame", "FRAME") if key in metadata), default)
+    if frame not in FRAMES:
+        raise PrescriptionError(f"frame = {frame!r}: expected one of {', '.join(FRAMES)}", file=file, key="frame")
+    return cast(Frame, frame)
 
 
 def in_telescope_frame(points: Sequence[np.ndarray], frame: Frame) -> np.ndarray:

@@ -32,8 +32,10 @@ ENDINGS = (".ecsv", ".fits", ".fit")
 _COVERED = 0.9
 # Larger heights [m] than this are no heights of a focal plane, but another unit.
 _LARGEST = 0.2e-3
-# Cells a side into which a CCD is divided to find gaps, and points that a cell should have.
-_MOST_CELLS, _POINTS_PER_CELL = 16, 4
+# Cells a side into which a CCD is divided to find gaps.
+_MOST_CELLS = 16
+# Points that a cell should have.
+_POINTS_PER_CELL = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,20 +66,20 @@ def read_heights(path: str | Path, camera: Camera) -> MeasuredHeights:
         if isinstance(content, Table):
             if any(name in content.colnames for name in ("DET_NAME", "ZK")):
                 surfaces, measured = zernike_heights(content, path).on(camera)
-                found = MeasuredHeights(surfaces, measured, np.full(len(camera), np.nan))
-                covered = _measured_fraction(found, camera)
+                heights = MeasuredHeights(surfaces, measured, np.full(len(camera), np.nan))
+                covered = _measured_fraction(heights, camera)
             else:
-                found, covered = _fitted(_table_points(content, path), camera)
+                heights, covered = _fitted(_table_points(content, path), camera)
         else:
             images = {name: xyz for name, xyz in content.items() if name in camera.ccd_names}
             if not images:
-                some = ", ".join(list(content)[:3])
-                raise PrescriptionError(f"images {some}: expected names such as {camera.ccd_names[0]}", file=path)
+                first = ", ".join(list(content)[:3])
+                raise PrescriptionError(f"images {first}: expected names such as {camera.ccd_names[0]}", file=path)
             _warn_of_others(path, [name for name in content if name not in images])
-            found, covered = _fitted(np.concatenate(list(images.values()), axis=1), camera)
+            heights, covered = _fitted(np.concatenate(list(images.values()), axis=1), camera)
             _check_places(images, camera)
-    _warn(path, camera, found, covered)
-    return found
+    _warn(path, camera, heights, covered)
+    return heights
 
 
 def _content(path: Path) -> Table | dict[str, np.ndarray]:
@@ -99,8 +101,8 @@ def _content(path: Path) -> Table | dict[str, np.ndarray]:
 def _table_points(table: Table, path: Path) -> np.ndarray:
     for name in "xyz":
         if name not in table.colnames:
-            wanted = f"expected x, y, z, or {', '.join(COLUMNS)}"
-            raise PrescriptionError(f"columns {', '.join(table.colnames)}: {wanted}", file=path)
+            expected_columns = f"expected x, y, z, or {', '.join(COLUMNS)}"
+            raise PrescriptionError(f"columns {', '.join(table.colnames)}: {expected_columns}", file=path)
     points = [lengths(table, name, path) for name in "xyz"]
     return in_telescope_frame(points, frame_of(table.meta, "telescope", path))
 
@@ -138,11 +140,11 @@ def _measured_fraction(found: MeasuredHeights, camera: Camera) -> np.ndarray:
 def _check_places(images: dict[str, np.ndarray], camera: Camera) -> None:
     """Raise where the pixels of an image lie on another CCD than its name says."""
     for name, (x, y, _) in images.items():
-        wanted = camera.ccd_index(name)
-        elsewhere = (ccd := camera.ccd_at(x, y)) != wanted
+        named_ccd = camera.ccd_index(name)
+        elsewhere = (ccd := camera.ccd_at(x, y)) != named_ccd
         if np.any(elsewhere & (ccd >= 0)):
-            other = camera.ccd_names[int(ccd[elsewhere & (ccd >= 0)][0])]
-            raise PrescriptionError(f"image {name}: has pixels on {other}; are coordinates and frame right?")
+            pixel_ccd = camera.ccd_names[int(ccd[elsewhere & (ccd >= 0)][0])]
+            raise PrescriptionError(f"image {name}: has pixels on {pixel_ccd}; are coordinates and frame right?")
 
 
 def _warn_of_others(path: Path, names: Sequence[str]) -> None:
@@ -153,8 +155,8 @@ def _warn_of_others(path: Path, names: Sequence[str]) -> None:
 def _warn(path: Path, camera: Camera, found: MeasuredHeights, covered: np.ndarray) -> None:
     names = np.array(camera.ccd_names)
     if not found.measured.all():
-        missing = list(names[~found.measured])
-        warnings.warn(f"{path}: no heights, taken as zero: {_some(missing)}", HeightWarning, stacklevel=4)
+        unmeasured_names = list(names[~found.measured])
+        warnings.warn(f"{path}: no heights, taken as zero: {_some(unmeasured_names)}", HeightWarning, stacklevel=4)
     gaps = np.flatnonzero(found.measured & (covered < _COVERED))
     if gaps.size:
         parts = [f"{names[i]} ({100 * covered[i]:.0f} % measured)" for i in gaps]

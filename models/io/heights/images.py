@@ -36,9 +36,9 @@ def image_points(images: Sequence[Any], primary: Any, file: Path) -> dict[str, n
         if not name or name in points:
             raise PrescriptionError(f"image {number}: EXTNAME = {name!r}: expected the name of a CCD, once", file=file)
         with error_context(file=file, place=name):
-            own = _points(hdu.data, hdu.header)
+            hdu_points = _points(hdu.data, hdu.header)
         frame = frame_of(hdu.header, frame_of(primary, "telescope", file), file)
-        points[name] = in_telescope_frame(list(own), frame)
+        points[name] = in_telescope_frame(list(hdu_points), frame)
     return points
 
 
@@ -74,6 +74,6 @@ def _averaged(values: np.ndarray, finite: np.ndarray) -> np.ndarray:
 def _number(header: Any, key: str, default: float | None = None) -> float:
     value = header.get(key, default)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        found = "is missing" if value is None else f"= {value!r}"
-        raise PrescriptionError(f"{key} {found}: expected a number, the coordinates of the pixels")
+        problem = "is missing" if value is None else f"= {value!r}"
+        raise PrescriptionError(f"{key} {problem}: expected a number, the coordinates of the pixels")
     return float(value)

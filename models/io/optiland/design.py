@@ -13,15 +13,14 @@ from ....core.errors import PrescriptionError
 from ...design_data import DesignData
 from ...paraxial import stop_states_rays
 from ...telescope import Telescope
-from ..zemax.file import Findings
-from ..zemax.text import scaled
+from ..lens.sequence import stated_wavelengths
+from ..lens.source import Findings
+from ..lens.text import scaled
 from .reader import APERTURES, FIELD_TYPES
 
 MM = 1e-3
 #: Keys of the aperture by that of the design data; a working focal ratio has none.
-_APERTURES = {"entrance_pupil": "EPD", "f_number": "imageFNO", "object_na": "objectNA", "stop": "float_by_stop_size"}
-#: Fields by the type of design data, in the order of Zemax.
-_FIELDS = {"angle": 0, "object_height": 1, "paraxial_image_height": 2, "real_image_height": 3}
+_APERTURES = {kind: key for key, kind in APERTURES.items()}
 
 
 def with_optiland_aperture(t: Telescope) -> Telescope:
@@ -54,39 +53,38 @@ def system_items(t: Telescope, findings: Findings) -> dict[str, Any]:
     aperture: dict[str, Any] = {"type": "EPD", "value": t.pupil_diameter / MM}
     if stop is not None and data.aperture is not None and data.aperture_value is not None:
         kind = _APERTURES[data.aperture]
-        assert kind in APERTURES
         size = {"EPD": 1 / MM, "float_by_stop_size": 2 / MM}.get(kind, 1.0)
         aperture = {"type": kind, "value": data.aperture_value * size}
-    found = {"aperture": aperture, "fields": _fields(t, findings), "wavelengths": _wavelengths(t)}
+    items = {"aperture": aperture, "fields": _fields(t, findings), "wavelengths": _wavelengths(t)}
     if stop is not None and data.aiming != "off":
         if data.aiming == "paraxial":
-            said = PrescriptionError("aiming = paraxial: optiland aims at the radius of the real marginal ray alone")
-            findings.note(said, "read back it is real")
-        found["ray_tracer"] = {"ray_aiming_config": {"mode": "robust", "max_iter": 100, "tol": 1e-10}}
-    return found
+            problem = PrescriptionError("aiming = paraxial: optiland aims at the radius of the real marginal ray alone")
+            findings.note(problem, "read back it is real")
+        items["ray_tracer"] = {"ray_aiming_config": {"mode": "robust", "max_iter": 100, "tol": 1e-10}}
+    return items
 
 
 def _fields(t: Telescope, findings: Findings) -> dict[str, Any]:
-    data, kind = t.design_data, 0
+    data, kind = t.design_data, "angle"
     edge = math.degrees(t.field_radius)
     rows = [(0.0, fraction * edge, 0.0, 0.0, 1.0) for fraction in (0.0, 0.7, 1.0)]
     if data.fields:
-        kind = _FIELDS[data.field_type]
-        size = math.degrees(1.0) if kind == 0 else 1 / MM
+        kind = data.field_type
+        size = math.degrees(1.0) if kind == "angle" else 1 / MM
         weights = data.field_weights or (1.0,) * len(data.fields)
         factors = [(x, y) for _, _, x, y, _ in data.vignetting] or [(0.0, 0.0)] * len(data.fields)
         moved = next((row for row in data.vignetting if row[0] or row[1] or row[4]), None)
         if moved is not None:
-            said = f"vignetting = {list(moved)}: optiland has compressions alone, no decentre and no angle"
+            problem = f"vignetting = {list(moved)}: optiland has compressions alone, no decentre and no angle"
             # Compressions without their decentres would let other light through.
-            findings.report(PrescriptionError(said), "the factors of all fields are left out")
+            findings.report(PrescriptionError(problem), "the factors of all fields are left out")
             factors = [(0.0, 0.0)] * len(data.fields)
         rows = [
             (-x * size + 0.0, y * size, *compression, weight)
             for (x, y), compression, weight in zip(data.fields, factors, weights, strict=True)
         ]
     keys = ("x", "y", "vx", "vy", "weight")
-    definition = next(name for name, number in FIELD_TYPES.items() if number == kind)
+    definition = next(name for name, field_type in FIELD_TYPES.items() if field_type == kind)
     return {
         "fields": [dict(zip(keys, row, strict=True)) for row in rows],
         "telecentric": data.telecentric,
@@ -97,7 +95,7 @@ def _fields(t: Telescope, findings: Findings) -> dict[str, Any]:
 def _wavelengths(t: Telescope) -> dict[str, Any]:
     """Return the stated wavelengths, or the default and the edges of the band."""
     data: DesignData = t.design_data
-    lengths = list(data.wavelengths or dict.fromkeys([t.default_wavelength, *(t.band or ())]))
+    lengths = stated_wavelengths(t)
     weights = data.wavelength_weights or (1.0,) * len(lengths)
     rows = [
         {

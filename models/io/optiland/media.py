@@ -1,4 +1,4 @@
-"""Materials of optiland as glasses of a lens file, and media as materials.
+"""Materials of optiland as media, and media as materials.
 
 A ``Material`` is known by the file of the refractiveindex.info database that it was taken from, whose folder is the
 maker; without one by its name. Formulas of a ``DataMaterial`` are numbered as in that database: 1 and 2 are
@@ -14,10 +14,12 @@ from ....core.errors import PrescriptionError
 from ...media.dispersion import Dispersion, model_glass
 from ...media.medium import ConstantIndex, Medium, Sellmeier
 from ...media.tabulated import TabulatedIndex
+from ...telescope import VACUUM
 from ..glass_catalogue import MAKERS, SUBSTANCES, GlassCatalogue
 from ..json_items import JsonObject
-from ..zemax.file import Findings
-from ..zemax.placed import Line, PlacedSurfaces
+from ..lens.description import LensDescription
+from ..lens.glasses import Glasses
+from ..lens.source import Findings
 
 #: Powers of the wavelength [um] in the series of makers, by the name of the formula.
 SERIES = {
@@ -30,27 +32,32 @@ SERIES = {
 WIDEST_RANGE = (0.2, 20.0)
 
 
-def glass_lines(material: JsonObject, found: PlacedSurfaces, findings: Findings) -> list[Line]:
-    """Return the line of a material, none for air."""
+def medium_of(material: JsonObject, lens: LensDescription, glasses: Glasses) -> Medium:
+    """Return the medium of a material."""
     kind = material.text("type")
     if kind == "IdealMaterial":
-        return found.constant_glass(material.number("index"))
+        index = material.number("index")
+        with material.at("index").context():
+            return VACUUM if index == 1.0 else ConstantIndex(index)
     if kind in ("Material", "MaterialFile"):
-        return _catalogue_glass(material, found, findings)
+        return _catalogue_glass(material, glasses, lens.findings)
     if kind == "DataMaterial":
-        name = material.text("name", "") or f"MATERIAL_{len(found.glasses) + 1}"
-        return found.glass(name, _data_medium(material, name))
+        with material.part("definition").context():
+            # Materials without a name are numbered among the glasses of the lens.
+            number = 1 + len({m.name for m in (lens.medium, *(s.after for s in lens.surfaces)) if m != VACUUM})
+            return _data_medium(material, material.text("name", "") or f"MATERIAL_{number}")
     if kind == "AbbeMaterial":
         nd, vd = material.number("index"), material.number("abbe")
         text = f"AbbeMaterial {nd:g}, {vd:g}: optiland's dispersion of it is not read"
-        findings.note(material.problem(text), "taken as a model glass of that index and Abbe number")
-        return found.glass(f"{nd!r} {vd!r}", model_glass(nd, vd))
+        lens.findings.note(material.problem(text), "taken as a model glass of that index and Abbe number")
+        with material.at("index").context():
+            return model_glass(nd, vd)
     raise material.problem(
         f"material_post {kind}: expected IdealMaterial, Material, MaterialFile, DataMaterial or AbbeMaterial"
     )
 
 
-def _catalogue_glass(material: JsonObject, found: PlacedSurfaces, findings: Findings) -> list[Line]:
+def _catalogue_glass(material: JsonObject, glasses: Glasses, findings: Findings) -> Medium:
     path = re.findall(r"[^/\\]+", material.text("filename", ""))
     name = path[-1].rsplit(".", 1)[0] if path else material.text("name")
     maker = (path[-2] if len(path) > 1 else material.text("reference", "")).lower()
@@ -59,11 +66,11 @@ def _catalogue_glass(material: JsonObject, found: PlacedSurfaces, findings: Find
         name, maker = f"{path[path.index('main') + 1]}_{name}", SUBSTANCES
     if maker in (*MAKERS, SUBSTANCES) and name in GlassCatalogue.of_maker(maker):
         # Several makers have glasses of one name.
-        return found.glass(f"{name} ({maker})", GlassCatalogue.of_maker(maker)[name])
+        return GlassCatalogue.of_maker(maker)[name]
     if maker:
         text = f"material {name} of {maker}: not among the bundled glasses"
         findings.report(material.problem(text), "a glass of that name is taken")
-    return [("GLAS", name)]
+    return glasses.named(name, material.at("filename" if path else "name"))
 
 
 def _data_medium(material: JsonObject, name: str) -> Medium:
@@ -80,10 +87,10 @@ def _data_medium(material: JsonObject, name: str) -> Medium:
         b, c = tuple(terms[1::2]), tuple(v * v if formula == "formula 1" else v for v in terms[2::2])
         return Sellmeier(b, c, (low, high), name=name)
     if formula == "formula 3" and len(terms) % 2:
-        found = {0.0: terms[0], **dict(zip(terms[2::2], terms[1::2], strict=True))}
+        coefficients = {0.0: terms[0], **dict(zip(terms[2::2], terms[1::2], strict=True))}
         for key, powers in SERIES.items():
-            if found.keys() <= set(powers):
-                return Dispersion(key, tuple(found.get(p, 0.0) for p in powers), (low, high), name=name)
+            if coefficients.keys() <= set(powers):
+                return Dispersion(key, tuple(coefficients.get(p, 0.0) for p in powers), (low, high), name=name)
     raise dispersion.problem(f"{formula} of {name}: expected formula 1 or 2 (Sellmeier) or 3 (powers of makers)")
 
 
@@ -96,8 +103,8 @@ def material_items(medium: Medium) -> dict[str, Any]:
         return _data_items(medium, "formula 2", [0.0, *terms], medium.wavelength_range)
     if isinstance(medium, Dispersion) and ("schott" if medium.formula == "sumita" else medium.formula) in SERIES:
         powers = SERIES["schott" if medium.formula == "sumita" else medium.formula]
-        first, *rest = medium.coefficients
-        terms = [v for a, p in zip(rest, powers[1:], strict=False) for v in (a, float(p))]
+        first, *higher_terms = medium.coefficients
+        terms = [v for a, p in zip(higher_terms, powers[1:], strict=False) for v in (a, float(p))]
         return _data_items(medium, "formula 3", [first, *terms], medium.wavelength_range)
     if isinstance(medium, TabulatedIndex) and medium.interpolation == "linear":
         table = {"wavelengths_um": [w * 1e6 for w in medium.wavelengths], "indices": list(medium.indices)}

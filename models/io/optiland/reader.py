@@ -1,4 +1,4 @@
-"""Translate a file of optiland (.json) into the terms of a Zemax file.
+"""Read a file of optiland (.json) as the description of a lens.
 
 The file is the dictionary of an ``Optic`` of optiland 0.5 and later, as ``save_optiland_file`` writes it: lengths in
 millimetres, wavelengths with a unit, angles of fields in degrees, rotations in radians about z, then y, then x of the
@@ -8,124 +8,146 @@ frame around. Places are absolute. Values of pick-ups and solves stand in the fi
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from ...aperture import Aperture, Complement
+from ...telescope import VACUUM
 from ..json_items import JsonObject
-from ..zemax.file import Findings, ZemaxFile
-from ..zemax.placed import Line, PlacedSurfaces
-from .media import glass_lines
-from .shapes import shape_lines
+from ..lens.apertures import ellipse, rectangle, ring
+from ..lens.description import INFINITE, Format, LensDescription, LensSurface
+from ..lens.glasses import Glasses
+from ..lens.source import Findings, Source
+from ..lens.text import scaled
+from .media import medium_of
+from .shapes import shape_of
 
+FORMAT = Format("optiland", "aperture", "wavelengths", "is_stop")
+MM = 1e-3
 #: Keys of the file without effect on the paths of rays.
 IGNORED = ("version", "pickups", "solves")
-APERTURES = {"EPD": "ENPD", "imageFNO": "FNUM", "objectNA": "OBNA", "float_by_stop_size": "FLOA"}
-FIELD_TYPES = {"AngleField": 0, "ObjectHeightField": 1, "ParaxialImageHeightField": 2, "RealImageHeightField": 3}
-#: Ray aiming of Zemax by that of optiland; "paraxial" aims at the paraxial entrance pupil, as Zemax does without.
-AIMING = {"paraxial": 0, "iterative": 2, "robust": 2, "cached": 2}
+#: Apertures by their types; the size of the stop is its diameter.
+APERTURES = {"EPD": "entrance_pupil", "imageFNO": "f_number", "objectNA": "object_na", "float_by_stop_size": "stop"}
+FIELD_TYPES = {
+    "AngleField": "angle", "ObjectHeightField": "object_height", "ParaxialImageHeightField": "paraxial_image_height",
+    "RealImageHeightField": "real_image_height",
+}  # fmt: skip
+#: Ray aiming by that of optiland; "paraxial" aims at the paraxial entrance pupil, as others do without.
+AIMING = {"paraxial": "off", "iterative": "real", "robust": "real", "cached": "real"}
 #: Micrometres of a unit of wavelength.
 WAVE_UNITS = {"nm": 1e-3, "um": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6}
 
 
-def read_optiland_file(path: Path, findings: Findings) -> ZemaxFile:
-    """Return the parts of a file of optiland in the terms of a Zemax file."""
+def read_optiland_file(path: Path, findings: Findings, glasses: Glasses) -> LensDescription:
+    """Return the description of a file of optiland."""
     root = JsonObject.read(path)
     if "surface_group" not in root:
         raise root.problem("expected the JSON file of an optiland Optic, with a surface_group")
     surfaces = list(root.child("surface_group").children("surfaces", "surface"))
     if len(surfaces) < 3:
         raise root.problem(f"{len(surfaces)} surfaces: expected an object, an image and one between")
-    found = PlacedSurfaces(path, "optiland")
-    found.head("UNIT", "MM")
-    found.head("NAME", root.text("name", ""))
-    stop_radius = _system(root, found, findings)
-    _object(surfaces[0], surfaces[1], found, findings)
+    lens = LensDescription(path, FORMAT, findings, title=root.text("name", "").strip('" '))
+    stop_radius = _system(root, lens)
+    _object(surfaces[0], surfaces[1], lens, glasses)
     for surface in surfaces[1:]:
-        _surface(surface, found, stop_radius, findings)
+        _surface(surface, lens, stop_radius, glasses)
     root.report_rest(findings, IGNORED)
-    return found.file()
+    return lens
 
 
-def _system(root: JsonObject, found: PlacedSurfaces, findings: Findings) -> float:
-    """Add aperture, fields and wavelengths to the header; return the semi-diameter of the stop, 0 if not stated."""
+def _system(root: JsonObject, lens: LensDescription) -> float:
+    """State aperture, fields and wavelengths; return the semi-diameter of the stop [m], 0 if not stated."""
     aperture = root.child("aperture", "aperture")
     kind = aperture.text("type")
     if kind not in APERTURES:
         aperture.refuse("type", f"one of {', '.join(APERTURES)}")
     value = aperture.number("value")
-    if APERTURES[kind] == "FLOA":
-        found.head("FLOA")
-    else:
-        found.head(APERTURES[kind], value, "0")
-    fields = root.child("fields", "fields")
-    points = list(fields.children("fields", "field"))
-    definition = fields.child("field_definition")
-    kind_of_field = definition.text("field_type")
-    if kind_of_field not in FIELD_TYPES:
-        definition.refuse("field_type", f"one of {', '.join(FIELD_TYPES)}")
+    lens.state_aperture(aperture.at("value"), APERTURES[kind], value * MM if kind == "EPD" else value)
+    _fields(root.child("fields", "fields"), lens)
     waves = list(root.child("wavelengths").children("wavelengths", "wavelength"))
-    head = (FIELD_TYPES[kind_of_field], int(fields.flag("telecentric")), len(points), len(waves))
-    found.head("FTYP", *map(str, head))
-    for keyword, key, default in (
-        *(("XFLN", "x", None), ("YFLN", "y", None), ("FWGN", "weight", 1.0)),
-        *(("VCXN", "vx", 0.0), ("VCYN", "vy", 0.0)),
-    ):
-        found.head(keyword, *(point.number(key, default) for point in points))
-    for point in points:
-        point.report_rest(findings)
-    primary = 1
-    for number, wave in enumerate(waves, start=1):
+    lengths, primary = [], 0
+    for number, wave in enumerate(waves):
         unit = wave.text("unit", "um")
         if unit not in WAVE_UNITS:
             wave.refuse("unit", f"one of {', '.join(WAVE_UNITS)}")
-        found.head("WAVM", str(number), wave.number("value") * WAVE_UNITS[unit], wave.number("weight", 1.0))
+        lengths.append(scaled(wave.number("value") * WAVE_UNITS[unit], -6))
         primary = number if wave.flag("is_primary") else primary
-    found.head("PWAV", str(primary))
-    _aiming(root, found)
-    return 0.5 * value if APERTURES[kind] == "FLOA" else 0.0
+    if waves:
+        shortest = waves[int(np.argmin(lengths))].at("value")
+        lens.state_wavelengths(shortest, lengths, [wave.number("weight", 1.0) for wave in waves], primary)
+    if "ray_tracer" in root:
+        tracer = root.child("ray_tracer", "ray_tracer")
+        if "ray_aiming_config" in tracer:
+            mode = tracer.child("ray_aiming_config").text("mode", "paraxial")
+            if mode not in AIMING:
+                raise tracer.problem(f"ray_aiming_config.mode = {mode!r}: expected one of {', '.join(AIMING)}")
+            lens.state(tracer.part("ray_aiming_config"), aiming=AIMING[mode])
+    return 0.5 * value * MM if APERTURES[kind] == "stop" else 0.0
 
 
-def _aiming(root: JsonObject, found: PlacedSurfaces) -> None:
-    if "ray_tracer" not in root:
-        return
-    tracer = root.child("ray_tracer", "ray_tracer")
-    if "ray_aiming_config" in tracer:
-        mode = tracer.child("ray_aiming_config").text("mode", "paraxial")
-        if mode not in AIMING:
-            raise tracer.problem(f"ray_aiming_config.mode = {mode!r}: expected one of {', '.join(AIMING)}")
-        found.head("RAIM", "0", str(AIMING[mode]))
+def _fields(fields: JsonObject, lens: LensDescription) -> None:
+    points = list(fields.children("fields", "field"))
+    definition = fields.child("field_definition")
+    kind = definition.text("field_type")
+    if kind not in FIELD_TYPES:
+        definition.refuse("field_type", f"one of {', '.join(FIELD_TYPES)}")
+    columns = {
+        key: [point.number(key, default) for point in points]
+        for key, default in (("x", None), ("y", None), ("weight", 1.0), ("vx", 0.0), ("vy", 0.0))
+    }
+
+    def largest(*keys: str) -> Source:
+        """Return the source of the number that is farthest from zero."""
+        rows = [(abs(v), point.at(key)) for key in keys for v, point in zip(columns[key], points, strict=True)]
+        return max(rows, key=lambda row: row[0], default=(0.0, fields.part("fields")))[1]
+
+    lens.telecentric = fields.flag("telecentric")
+    lens.state_fields(
+        largest("x", "y"), FIELD_TYPES[kind], zip(columns["x"], columns["y"], strict=True) if points else [(0.0, 0.0)]
+    )
+    lens.state_field_weights(largest("weight"), columns["weight"])
+    no_decentres: Sequence[float] = ()
+    lens.state_vignetting(largest("vx", "vy"), no_decentres, no_decentres, columns["vx"], columns["vy"])
+    for point in points:
+        point.report_rest(lens.findings)
 
 
-def _object(surface: JsonObject, first: JsonObject, found: PlacedSurfaces, findings: Findings) -> None:
+def _object(surface: JsonObject, first: JsonObject, lens: LensDescription, glasses: Glasses) -> None:
     geometry = surface.child("geometry")
     height = geometry.child("cs").number("z", infinite=True)
     place, _ = _frame(first.child("geometry").child("cs"))
-    lines = glass_lines(surface.child("material_post"), found, findings)
-    found.object(math.inf if math.isinf(height) else float(place[2]) - height, lines)
+    lens.medium = medium_of(surface.child("material_post"), lens, glasses)
+    distance = float(place[2]) - height
+    lens.object_distance = distance * MM if abs(distance) < INFINITE else math.inf
     if geometry.text("type") != "Plane":
-        findings.report(geometry.problem("geometry: curved objects are not read"))
+        lens.findings.report(geometry.problem("geometry: curved objects are not read"))
 
 
-def _surface(surface: JsonObject, found: PlacedSurfaces, stop_radius: float, findings: Findings) -> None:
-    geometry, interaction = surface.child("geometry"), surface.child("interaction_model")
+def _surface(surface: JsonObject, lens: LensDescription, stop_radius: float, glasses: Glasses) -> None:
+    geometry, interaction, findings = surface.child("geometry"), surface.child("interaction_model"), lens.findings
     kind = interaction.text("type")
     if kind != "RefractiveReflectiveModel":
         findings.report(interaction.problem(f"interaction_model {kind}: expected RefractiveReflectiveModel"))
     if "bsdf" in interaction:
         findings.report(interaction.problem("interaction_model.bsdf: scattering is not read"))
-    mirror = interaction.flag("is_reflective")
-    offset, lines = shape_lines(geometry, findings)
+    mirror, stop = interaction.flag("is_reflective"), surface.flag("is_stop")
+    offset, shape = shape_of(geometry, findings)
     position, axes = _frame(geometry.child("cs"))
-    position = position + offset * axes[:, 2]
-    name = surface.text("comment", "")
-    lines += [("COMM", name)] if name else []
-    lines += [("STOP",)] if surface.flag("is_stop") else []
-    lines += [("DIAM", stop_radius, "1")] if surface.flag("is_stop") and stop_radius else []
-    lines += _aperture_lines(surface.child("aperture"), findings) if "aperture" in surface else []
     medium = surface.child("material_post")
-    lines += [("GLAS", "MIRROR")] if mirror else glass_lines(medium, found, findings)
-    found.surface(surface.place, lines, position, axes, mirror=mirror)
+    placed = LensSurface(
+        surface.part("is_stop" if stop else ""),
+        shape,
+        position * MM + offset * axes[:, 2],
+        axes,
+        name=surface.text("comment", ""),
+        after=VACUUM if mirror else medium_of(medium, lens, glasses),
+        aperture=_aperture(surface.child("aperture"), findings) if "aperture" in surface else None,
+        semi_diameter=stop_radius if stop else 0.0,
+        stop=stop,
+    )
+    lens.add(placed, mirror=mirror)
     surface.report_rest(findings, ("type", "thickness", "surface_type", "material_post"))
 
 
@@ -147,22 +169,26 @@ def _frame(system: JsonObject) -> tuple[np.ndarray, np.ndarray]:
     return outer_origin + outer_axes @ origin, outer_axes @ axes
 
 
-def _aperture_lines(aperture: JsonObject, findings: Findings) -> list[Line]:
+def _aperture(aperture: JsonObject, findings: Findings) -> Aperture | None:
     kind = aperture.text("type")
+    source = aperture.part(f"aperture {kind}")
+    x, y = (aperture.number(f"offset_{axis}", 0.0) * MM for axis in "xy")
+    region: Aperture | None
     if kind in ("RadialAperture", "OffsetRadialAperture"):
-        inner, outer = aperture.number("r_min", 0.0), aperture.number("r_max", infinite=True)
-        lines: list[Line] = [("OBSC", 0.0, inner) if math.isinf(outer) else ("CLAP", inner, outer)]
-        x, y = aperture.number("offset_x", 0.0), aperture.number("offset_y", 0.0)
+        inner, outer = aperture.number("r_min", 0.0) * MM, aperture.number("r_max", infinite=True) * MM
+        if math.isinf(outer):
+            region = Complement(ring(source, 0.0, inner, x, y)) if inner else None
+        else:
+            region = ring(source, inner, outer, x, y)
     elif kind == "RectangularAperture":
-        (left, right), (low, high) = ([aperture.number(f"{a}_{end}") for end in ("min", "max")] for a in "xy")
-        lines = [("SQAP", 0.5 * (right - left), 0.5 * (high - low))]
-        x, y = 0.5 * (left + right), 0.5 * (low + high)
+        (x_min, x_max), (y_min, y_max) = ([aperture.number(f"{a}_{end}") for end in ("min", "max")] for a in "xy")
+        half = 0.5 * (x_max - x_min) * MM, 0.5 * (y_max - y_min) * MM
+        region = rectangle(source, *half, 0.5 * (x_min + x_max) * MM, 0.5 * (y_min + y_max) * MM)
     elif kind == "EllipticalAperture":
-        lines = [("ELAP", aperture.number("a"), aperture.number("b"))]
-        x, y = aperture.number("offset_x", 0.0), aperture.number("offset_y", 0.0)
+        region = ellipse(source, aperture.number("a") * MM, aperture.number("b") * MM, x, y)
     else:
-        known = "RadialAperture, OffsetRadialAperture, RectangularAperture or EllipticalAperture"
-        findings.report(aperture.problem(f"aperture {kind}: expected {known}"), "taken as none")
-        return []
+        expected_types = "RadialAperture, OffsetRadialAperture, RectangularAperture or EllipticalAperture"
+        findings.report(aperture.problem(f"aperture {kind}: expected {expected_types}"), "taken as none")
+        return None
     aperture.report_rest(findings)
-    return [*lines, ("OBDC", x, y)] if x or y else lines
+    return region

@@ -1,4 +1,4 @@
-"""Geometries of optiland as shapes of Zemax surfaces, and shapes as geometries.
+"""Geometries of optiland as shapes, and shapes as geometries.
 
 The sag of each, with the base conic of ``radius`` and ``conic``, ``r^2 = x^2 + y^2`` [mm]:
 
@@ -9,7 +9,7 @@ OddAsphere                   + coefficients of r, r^2...
 PolynomialGeometry           + coefficients [i][j] of x^i y^j
 ChebyshevPolynomialGeometry  + coefficients [i][j] of T_i(x / norm_x) T_j(y / norm_y)
 ZernikePolynomialGeometry    + Zernike terms of (x, y) / norm_radius, in the order of zernike_type
-BiconicGeometry              sum of a conic in x and one in y: read where one of them is flat
+BiconicGeometry              sum of a conic in x and one in y, as in optiland up to 0.6
 ToroidalGeometry             a conic in y, revolved about an axis at radius_x
 ============================ =========================================================================================
 """
@@ -17,65 +17,60 @@ ToroidalGeometry             a conic in y, revolved about an axis at radius_x
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from ....core.errors import PrescriptionError
-from ...shapes.freeform import OddAsphere, Toroid
+from ...shapes.freeform import Biconic, OddAsphere, Toroid
 from ...shapes.polynomial import XYPolynomial, ZernikeSag
 from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere
 from ...shapes.sum import Sum
 from ...zernike_polynomials import noll_to_nm
 from ..json_items import JsonObject
-from ..zemax.file import Findings
-from ..zemax.placed import Line, numbered
-from ..zemax.shapes import MOST_ODD, polynomial_powers, square_term
+from ..lens import shapes
+from ..lens.shapes import MOST_ODD, polynomial_powers, square_term
+from ..lens.source import Findings
 
+MM = 1e-3
 #: Highest degree of polynomials.
 MOST_DEGREE = 40
-#: Parameters of Zemax's even aspheres that hold coefficients.
-_PARAMETERS = 8
 
 
-def shape_lines(geometry: JsonObject, findings: Findings) -> tuple[float, list[Line]]:
-    """Return the height of the sag at the vertex [mm], and the lines of a geometry."""
+def shape_of(geometry: JsonObject, findings: Findings) -> tuple[float, Shape]:
+    """Return the height of the sag at the vertex [m], and the shape of a geometry without it."""
     kind = geometry.text("type")
     if kind not in _KINDS:
         findings.report(geometry.problem(f"geometry {kind}: expected one of {', '.join(_KINDS)}"), "taken as a plane")
-        return 0.0, [("TYPE", "STANDARD"), ("CURV", 0.0)]
-    found = _KINDS[kind](geometry, findings)
+        return 0.0, Plane()
+    with geometry.part(f"geometry {kind}").context():
+        shape = _KINDS[kind](geometry)
     geometry.report_rest(findings, ("cs", "tol", "max_iter", "geometry_type"))
-    return found
+    return shape if isinstance(shape, tuple) else (0.0, shape)
 
 
-def _base(geometry: JsonObject, kind: str) -> list[Line]:
+def _base(geometry: JsonObject) -> tuple[float, float]:
+    """Return curvature [1/m] and conic constant."""
     radius = geometry.number("radius", math.inf, infinite=True)
-    return [("TYPE", kind), ("CURV", 1.0 / radius if radius else 0.0), ("CONI", geometry.number("conic", 0.0))]
+    return (1.0 / radius if radius else 0.0) / MM, geometry.number("conic", 0.0)
 
 
-def _conic(geometry: JsonObject, findings: Findings) -> tuple[float, list[Line]]:
-    return 0.0, _base(geometry, "STANDARD")
+def _conic(geometry: JsonObject) -> Shape:
+    return shapes.conic(*_base(geometry))
 
 
-def _even(geometry: JsonObject, findings: Findings) -> tuple[float, list[Line]]:
+def _even(geometry: JsonObject) -> Shape:
     terms = geometry.numbers("coefficients")
-    if any(terms[_PARAMETERS:]):
-        # Zemax's extended asphere, over a radius of 1 mm.
-        return 0.0, [*_base(geometry, "XASPHERE"), *_extra(terms)]
-    return 0.0, [*_base(geometry, "EVENASPH"), *numbered("PARM", terms)]
+    return shapes.even_asphere(*_base(geometry), [a * MM ** (1 - 2 * i) for i, a in enumerate(terms, start=1)])
 
 
-def _odd(geometry: JsonObject, findings: Findings) -> tuple[float, list[Line]]:
+def _odd(geometry: JsonObject) -> Shape:
     terms = geometry.numbers("coefficients")
     if any(terms[MOST_ODD:]):
         geometry.refuse("coefficients", f"at most {MOST_ODD} of them")
-    return 0.0, [*_base(geometry, "ODDASPHE"), *numbered("PARM", terms)]
-
-
-def _extra(terms: list[float], radius: float = 1.0) -> list[Line]:
-    return numbered("XDAT", [float(len(terms)), radius, *terms])
+    powers = [a * MM ** (1 - i) for i, a in enumerate(terms[:MOST_ODD], start=1)]
+    return shapes.odd_asphere(*_base(geometry), powers)
 
 
 def _table(geometry: JsonObject) -> np.ndarray:
@@ -91,36 +86,39 @@ def _table(geometry: JsonObject) -> np.ndarray:
     return table
 
 
-def _polynomial(geometry: JsonObject, findings: Findings) -> tuple[float, list[Line]]:
+def _polynomial(geometry: JsonObject) -> tuple[float, Shape]:
     return _power_series(geometry, _table(geometry))
 
 
-def _chebyshev(geometry: JsonObject, findings: Findings) -> tuple[float, list[Line]]:
+def _chebyshev(geometry: JsonObject) -> tuple[float, Shape]:
     table = _table(geometry)
     for axis, key in enumerate(("norm_x", "norm_y")):
-        size = table.shape[axis]
+        size, norm = table.shape[axis], _positive(geometry, key)
         # Rows are the powers of x / norm of each Chebyshev polynomial.
         powers = np.zeros((size, size))
         for i in range(size):
             terms = np.polynomial.chebyshev.cheb2poly(np.eye(size)[i])
             powers[i, : len(terms)] = terms
-        powers = powers / geometry.number(key) ** np.arange(size)
+        powers = powers / norm ** np.arange(size)
         table = powers.T @ table if axis == 0 else table @ powers
     return _power_series(geometry, table)
 
 
-def _power_series(geometry: JsonObject, table: np.ndarray) -> tuple[float, list[Line]]:
-    """Return the lines of coefficients [i, j] of x^i y^j; the constant one moves the vertex."""
+def _positive(geometry: JsonObject, key: str) -> float:
+    value = geometry.number(key)
+    return value if value > 0 else geometry.refuse(key, "a positive number")
+
+
+def _power_series(geometry: JsonObject, table: np.ndarray) -> tuple[float, Shape]:
+    """Return the shape of coefficients [i, j] of x^i y^j; the constant one moves the vertex."""
     nx, ny = table.shape
     degree = nx + ny - 2
-    terms = [
-        float(table[i, j]) if i < nx and j < ny else 0.0
-        for i, j in polynomial_powers((degree + 1) * (degree + 2) // 2 - 1)
-    ]
-    return float(table[0, 0]), [*_base(geometry, "XPOLYNOM"), *(_extra(terms) if any(terms) else [])]
+    powers = [(i, j) for i, j in polynomial_powers((degree + 1) * (degree + 2) // 2 - 1) if i < nx and j < ny]
+    rows = [(i, j, float(table[i, j]) * MM) for i, j in powers]
+    return float(table[0, 0]) * MM, shapes.polynomial(_conic(geometry), rows, MM)
 
 
-def _zernike(geometry: JsonObject, findings: Findings) -> tuple[float, list[Line]]:
+def _zernike(geometry: JsonObject) -> Shape:
     kind = geometry.text("zernike_type")
     if kind not in _ORDERS:
         geometry.refuse("zernike_type", f"one of {', '.join(_ORDERS)}")
@@ -132,8 +130,9 @@ def _zernike(geometry: JsonObject, findings: Findings) -> tuple[float, list[Line
         if n > MOST_DEGREE:
             geometry.refuse("coefficients", f"terms of degrees up to {MOST_DEGREE}")
         size = 1.0 if normalised else math.sqrt((n + 1) * (1 if m == 0 else 2))
-        noll.append(terms.pop(number(n, m), 0.0) / size)
-    return 0.0, [*_base(geometry, "SZERNSAG"), *(_extra(noll, geometry.number("norm_radius")) if noll else [])]
+        noll.append(terms.pop(number(n, m), 0.0) / size * MM)
+    base = _conic(geometry)
+    return shapes.zernike(base, noll, _positive(geometry, "norm_radius") * MM) if noll else base
 
 
 def _fringe(n: int, m: int) -> int:
@@ -157,28 +156,21 @@ _ORDERS: dict[str, tuple[int, Callable[[int, int], int], bool]] = {
 }
 
 
-def _biconic(geometry: JsonObject, findings: Findings) -> tuple[float, list[Line]]:
-    radii = [geometry.number(f"radius_{a}", math.inf, infinite=True) or math.inf for a in "xy"]
-    if not any(map(math.isinf, radii)):
-        text = "BiconicGeometry with two curvatures: the sum of two conics is no surface of this package"
-        findings.report(geometry.problem(text), "taken as a Zemax biconic")
-    curvature = 0.0 if math.isinf(radii[1]) else 1.0 / radii[1]
-    parameters = [0.0 if math.isinf(radii[0]) else radii[0], geometry.number("conic_x", 0.0)]
-    head: list[Line] = [("TYPE", "BICONICX"), ("CURV", curvature), ("CONI", geometry.number("conic_y", 0.0))]
+def _biconic(geometry: JsonObject) -> Shape:
+    radii = [(geometry.number(f"radius_{a}", math.inf, infinite=True) or math.inf) * MM for a in "xy"]
     geometry.used |= {"radius", "conic"}
-    return 0.0, [*head, *numbered("PARM", parameters)]
+    return shapes.sum_of_conics(*radii, *(geometry.number(f"conic_{a}", 0.0) for a in "xy"))
 
 
-def _toroid(geometry: JsonObject, findings: Findings) -> tuple[float, list[Line]]:
+def _toroid(geometry: JsonObject) -> Shape:
     radius_x, radius_y = (geometry.number(f"radius_{a}", math.inf, infinite=True) or math.inf for a in "xy")
     if any(geometry.numbers("coeffs_poly_y")):
         geometry.refuse("coeffs_poly_y", "zeros")
     geometry.used |= {"radius", "conic"}
-    head: list[Line] = [("TYPE", "TOROIDAL"), ("CURV", 1.0 / radius_y), ("CONI", geometry.number("conic_yz", 0.0))]
-    return 0.0, [*head, *numbered("PARM", [0.0 if math.isinf(radius_x) else radius_x])]
+    return shapes.toroid(radius_x * MM, 1.0 / radius_y / MM, geometry.number("conic_yz", 0.0))
 
 
-_KINDS: dict[str, Callable[[JsonObject, Findings], tuple[float, list[Line]]]] = {
+_KINDS: dict[str, Callable[[JsonObject], Shape | tuple[float, Shape]]] = {
     "Plane": _conic,
     "StandardGeometry": _conic,
     "EvenAsphere": _even,
@@ -197,29 +189,45 @@ def geometry_items(shape: Shape, unit: float) -> dict[str, Any]:
     PrescriptionError if optiland has no geometry of this shape.
     """
     parts = list(shape.parts) if isinstance(shape, Sum) else [shape]
+    if all(isinstance(component, Biconic) for component in parts) and (items := _biconic_items(parts, unit)):
+        return items
     base = next((p for p in parts if not isinstance(p, XYPolynomial | ZernikeSag)), Plane())
-    rest = [p for p in parts if p is not base]
-    square, rest = square_term(rest)
-    if square and not rest and isinstance(base, Plane | Sphere | Conic | EvenAsphere):
+    additions = [p for p in parts if p is not base]
+    square, additions = square_term(additions)
+    if square and not additions and isinstance(base, Plane | Sphere | Conic | EvenAsphere):
         head = {"radius": _length(base.curvature, unit), "conic": base.conic}
         terms = [a * unit ** (2 * i + 1) for i, a in enumerate([square, *base.coefficients])]
         return {"type": "EvenAsphere", **head, "coefficients": terms}
-    if not (square or rest):
+    if not (square or additions):
         return _alone(base, unit)
-    if square or len(rest) > 1 or not isinstance(base, Plane | Sphere | Conic):
+    if square or len(additions) > 1 or not isinstance(base, Plane | Sphere | Conic):
         raise PrescriptionError("a sum of several shapes: optiland has no geometry of this shape")
     head = {"radius": _length(base.curvature, unit), "conic": base.conic}
-    part = rest[0]
-    if isinstance(part, ZernikeSag) and not part.inner_radius:
-        terms = [a / unit for a in part.coefficients]
-        own = {"coefficients": terms, "zernike_type": "noll", "norm_radius": part.outer_radius / unit}
-        return {"type": "ZernikePolynomialGeometry", **head, **own}
-    if isinstance(part, XYPolynomial):
-        table = np.zeros((1 + max(i for i, *_ in part.terms), 1 + max(j for _, j, _ in part.terms)))
-        for i, j, a in part.terms:
+    component = additions[0]
+    if isinstance(component, ZernikeSag) and not component.inner_radius:
+        terms = [a / unit for a in component.coefficients]
+        zernike_items = {"coefficients": terms, "zernike_type": "noll", "norm_radius": component.outer_radius / unit}
+        return {"type": "ZernikePolynomialGeometry", **head, **zernike_items}
+    if isinstance(component, XYPolynomial):
+        table = np.zeros((1 + max(i for i, *_ in component.terms), 1 + max(j for _, j, _ in component.terms)))
+        for i, j, a in component.terms:
             table[i, j] = a * unit ** (i + j - 1)
         return {"type": "PolynomialGeometry", **head, "coefficients": table.tolist()}
     raise PrescriptionError("annular Zernike terms: optiland has those of the full disc")
+
+
+def _biconic_items(parts: Sequence[Shape], unit: float) -> dict[str, Any]:
+    """Return the dictionary of a sum of a conic in x and one in y; empty of another sum."""
+    sections: dict[str, float] = {}
+    for section in parts:
+        flat = [axis for axis in "xy" if math.isinf(getattr(section, f"radius_{axis}"))]
+        for axis in {*"xy"} - {*flat}:
+            if not flat or f"radius_{axis}" in sections:
+                return {}
+            sections |= {f"radius_{axis}": getattr(section, f"radius_{axis}") / unit}
+            sections |= {f"conic_{axis}": getattr(section, f"conic_{axis}")}
+    default = {"radius_x": math.inf, "radius_y": math.inf, "conic_x": 0.0, "conic_y": 0.0}
+    return {"type": "BiconicGeometry", **default, **sections}
 
 
 def _length(curvature: float, unit: float) -> float:
@@ -240,6 +248,6 @@ def _alone(shape: Shape, unit: float) -> dict[str, Any]:
         return {"type": kind, **head, "coefficients": [0.0, *terms] if even else terms}
     if isinstance(shape, Toroid):
         radii = {"radius_x": shape.radius_x / unit, "radius_y": shape.radius_y / unit}
-        own = {"geometry_type": "Toroidal", "conic_yz": shape.conic_y, "coeffs_poly_y": []}
-        return {"type": "ToroidalGeometry", **radii, **own}
+        meridian_items = {"geometry_type": "Toroidal", "conic_yz": shape.conic_y, "coeffs_poly_y": []}
+        return {"type": "ToroidalGeometry", **radii, **meridian_items}
     raise PrescriptionError(f"shape {type(shape).__name__}: optiland has no geometry of this shape")

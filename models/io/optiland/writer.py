@@ -17,12 +17,12 @@ from ....core.errors import PrescriptionError, error_context
 from ...aperture import Annulus, Aperture, Circle, Complement, Ellipse, Rectangle
 from ...paraxial import with_true_aperture
 from ...rotation import rotation_angles
-from ...surface import Interaction, Surface
+from ...surface import Interaction
 from ...telescope import Telescope
+from ..lens.description import LensSurface
+from ..lens.sequence import lens_surfaces
+from ..lens.source import Findings
 from ..writable import report_pupil_plane, report_unheld, require_sequential, with_formulas
-from ..zemax.file import Findings
-from ..zemax.frame import HALF_TURN, rotated_aperture, rotated_shape
-from ..zemax.reader import PUPIL_COMMENT
 from .design import MM, own_stop, system_items, with_optiland_aperture
 from .media import material_items
 from .shapes import geometry_items
@@ -39,8 +39,8 @@ def telescope_to_optiland(telescope: Telescope, *, lenient: bool = False) -> str
         require_sequential(t, "a file of optiland")
         t = with_formulas(t, material_items, findings)
         data = t.design_data
-        others = ["afocal"] if data.afocal else []
-        report_unheld(t, (*data.pickups, *data.solves), "a file of optiland", lenient=lenient, others=others)
+        flags = ["afocal"] if data.afocal else []
+        report_unheld(t, (*data.pickups, *data.solves), "a file of optiland", lenient=lenient, others=flags)
         stop, system = own_stop(t), system_items(t, findings)
         report_pupil_plane(t, findings, own_stop=stop is not None)
         first = -t.surfaces[0].vertex[2]
@@ -53,17 +53,14 @@ def telescope_to_optiland(telescope: Telescope, *, lenient: bool = False) -> str
                 "comment": "",
             },
         ]
-        if stop is None:
-            plane = {"type": "Plane", "radius": math.inf}
-            surfaces.append(_items(_system(-t.stop_z - first), plane, before, PUPIL_COMMENT, stop=True))
-        for surface in t.surfaces:
+        for surface in lens_surfaces(t, stop):
             try:
-                surfaces.append(_surface_items(surface, first, stop=surface.name == stop))
+                surfaces.append(_surface_items(surface, first))
             except PrescriptionError as error:
                 raise PrescriptionError(f"surface {surface.name}: {error}") from None
     heights = [s["geometry"]["cs"]["z"] for s in surfaces]
-    for items, here, there in zip(surfaces[1:], heights[1:], [*heights[2:], heights[-1]], strict=True):
-        items["thickness"] = (there - here) / MM
+    for items, height, next_height in zip(surfaces[1:], heights[1:], [*heights[2:], heights[-1]], strict=True):
+        items["thickness"] = (next_height - height) / MM
     for items in surfaces:
         _in_millimetres(items["geometry"]["cs"])
     content = {
@@ -92,47 +89,24 @@ def _in_millimetres(system: dict[str, Any]) -> None:
         system[key] /= MM
 
 
-def _items(
-    system: dict[str, Any],
-    geometry: dict[str, Any],
-    material: dict[str, Any],
-    name: str,
-    *,
-    stop: bool = False,
-    mirror: bool = False,
-    aperture: dict[str, Any] | None = None,
-) -> dict[str, Any]:
+def _surface_items(surface: LensSurface, first: float) -> dict[str, Any]:
+    x, y, z = map(float, surface.position)
+    region = surface.aperture
     return {
         "type": "Surface",
         "thickness": 0.0,
-        "geometry": {**geometry, "cs": system},
-        "material_post": material,
-        "is_stop": stop,
-        "aperture": aperture,
-        "comment": name,
+        "geometry": {**geometry_items(surface.shape, MM), "cs": _system(z - first, x, y, surface.axes)},
+        "material_post": material_items(surface.after),
+        "is_stop": surface.stop,
+        "aperture": None if region is None else _aperture_items(region),
+        "comment": surface.name,
         "interaction_model": {
             "type": "RefractiveReflectiveModel",
-            "is_reflective": mirror,
+            "is_reflective": surface.interaction == Interaction.MIRROR,
             "coating": None,
             "bsdf": None,
         },
     }
-
-
-def _surface_items(surface: Surface, first: float, *, stop: bool) -> dict[str, Any]:
-    if surface.interaction == Interaction.PHASE:
-        raise PrescriptionError("phase screens cannot be written")
-    x, y, z = (float(v) for v in HALF_TURN @ np.array(surface.vertex) + 0.0)
-    axes = HALF_TURN @ surface.matrix @ HALF_TURN + 0.0
-    return _items(
-        _system(z - first, x, y, axes),
-        geometry_items(rotated_shape(surface.shape), MM),
-        material_items(surface.medium_after),
-        surface.name,
-        stop=stop,
-        mirror=surface.interaction == Interaction.MIRROR,
-        aperture=None if surface.aperture is None else _aperture_items(rotated_aperture(surface.aperture)),
-    )
 
 
 def _aperture_items(aperture: Aperture) -> dict[str, Any]:

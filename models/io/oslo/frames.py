@@ -40,8 +40,8 @@ def surface_frames(surfaces: Sequence[Mapping[str, float]]) -> list[Frame]:
         frames.append((origin, axes))
         if "RCO" in values:
             target = values["RCO"]
-            own = target in (0.0, float(number))
-            origin, axes = bases[-1] if own else _referenced(frames, target, number, "RCO")
+            returns_to_itself = target in (0.0, float(number))
+            origin, axes = bases[-1] if returns_to_itself else _referenced(frames, target, number, "RCO")
         elif values.get("BEN"):
             axes = axes @ turn
         origin = origin + values.get("TH", 0.0) * axes[:, 2]

@@ -1,4 +1,4 @@
-"""Translate a lens file of OSLO (.len) into the terms of a Zemax file.
+"""Read a lens file of OSLO (.len) as the description of a lens.
 
 Supported commands: LEN NEW, UNI (mm for each lens unit), EBR, NAO, FNO, NAP, ANG, OBH, GIH, TEM (deg C), PRE (atm), WV,
 WW and these numbered; for surfaces, parted by NXT up to END, NOT (their name), RD, CV, CVX, TH, AP (CHK), AIR, RFL, GLA
@@ -13,28 +13,37 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ....core.errors import PrescriptionError, error_context
 from ...media.dispersion import model_glass
 from ...media.medium import Medium
 from ...media.tabulated import TabulatedIndex
-from ..glass_search import find_glass
-from ..zemax.file import Findings, ZemaxFile
-from ..zemax.placed import Line, PlacedSurfaces, numbered
-from ..zemax.text import Record, read_text, scaled
+from ...shapes.shape import Shape
+from ...telescope import VACUUM
+from ..lens import shapes
+from ..lens.apertures import ring
+from ..lens.description import Format, LensDescription, LensSurface
+from ..lens.glasses import Glasses
+from ..lens.shapes import polynomial_powers, radius_of
+from ..lens.source import Findings, Source
+from ..lens.text import Record, read_text, scaled
 from .frames import surface_frames
 from .solves import AxialRay
 
-UNITS = {1.0: "MM", 10.0: "CM", 25.4: "IN", 1000.0: "METER"}
+FORMAT = Format("OSLO", "one of EBR, NAO, FNO, NAP", "WV", "AST")
+#: Units of length [m] by their millimetres.
+UNITS = {1.0: 1e-3, 10.0: 1e-2, 25.4: 0.0254, 1000.0: 1.0}
 APERTURES = ("EBR", "NAO", "FNO", "NAP")
-FIELDS = {"ANG": 0, "OBH": 1, "GIH": 2}
+FIELDS = {"ANG": "angle", "OBH": "object_height", "GIH": "paraxial_image_height"}
 #: Wavelengths [um] of a file that states none (OSLO Program Reference, "Wavelength").
 WAVELENGTHS = (0.58756, 0.48613, 0.65627)
 #: Distance of the object [lens unit] from which it is at infinity (OSLO Optics Reference, "Telecentric ray-aiming").
 INFINITE = 1e8
-#: Fields of the header, as fractions of the stated one.
+#: Terms of aspheres ASR and ARA at most.
+_MOST = 8
+#: Fields of a lens, as fractions of the stated one.
 FRACTIONS = (0.0, 0.7, 1.0)
 #: Commands of a surface with one number.
 _NUMBERS = "CC AD AE AF AG CVX DCX DCY DCZ TLA TLB TLC DT GC TOX TOY TOZ TH"
@@ -56,10 +65,11 @@ REFUSED = {
 
 @dataclass
 class _Surface:
-    """Commands of one surface: numbers by command, lines of its name, medium and aperture, pick-ups and solves."""
+    """Commands of one surface: its numbers by command, and the last line of each; medium, pick-ups and solves."""
 
     number: int
     values: dict[str, float] = field(default_factory=dict)
+    commands: dict[str, Record] = field(default_factory=dict)
     glass: Record | None = None
     waves: tuple[float, ...] = ()
     aspheric: str = "ADO"
@@ -71,51 +81,60 @@ class _Surface:
     def place(self) -> str:
         return f"surface {self.number}"
 
+    def get(self, key: str) -> float:
+        """Return a number, 0 where the file has none."""
+        return self.values.get(key, 0.0)
+
     @property
     def mirror(self) -> bool:
         return self.glass is not None and self.glass.keyword in ("RFL", "RFH")
 
 
-def read_oslo_file(path: Path, findings: Findings) -> ZemaxFile:
-    """Return the parts of an OSLO lens file in the terms of a Zemax file."""
-    return _Translation(path, findings).file()
+def read_oslo_file(path: Path, findings: Findings, glasses: Glasses) -> LensDescription:
+    """Return the description of an OSLO lens file."""
+    return _Reader(path, findings, glasses).lens()
 
 
 def _commands(path: Path) -> Iterator[Record]:
     """Yield the commands of a file: parted by line ends and semicolons, comments from // to the end."""
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         # Texts in quotation marks hold semicolons and slashes.
-        for part in re.findall(r'(?:"[^"]*"|//.*|[^;])+', line):
-            words = re.findall(r'"[^"]*"|//.*|[^\s,"]+', part)
+        for statement in re.findall(r'(?:"[^"]*"|//.*|[^;])+', line):
+            words = re.findall(r'"[^"]*"|//.*|[^\s,"]+', statement)
             words = words[: next((i for i, w in enumerate(words) if w.startswith("//")), len(words))]
             if words:
-                yield Record(str(path), number, "", words[0].upper(), tuple(words[1:]), " ".join(words[1:]))
+                yield Record(
+                    str(path), "", words[0].upper(), line=number, words=tuple(words[1:]), text=" ".join(words[1:])
+                )
 
 
-class _Translation:
+class _Reader:
     """System data and surfaces of a file, collected from its commands."""
 
-    def __init__(self, path: Path, findings: Findings) -> None:
-        self.path, self.findings = path, findings
-        self.found = PlacedSurfaces(path, "OSLO")
+    def __init__(self, path: Path, findings: Findings, glasses: Glasses) -> None:
+        self.path, self.findings, self.glasses = path, findings, glasses
+        self.description = LensDescription(path, FORMAT, findings)
         self.surfaces = [_Surface(0)]
         self.waves: list[float] = list(WAVELENGTHS)
         self.weights: list[float] = []
+        #: Last commands of the whole system.
+        self.spectrum: Source = Source(str(path), keyword="WV")
         self.aperture: Record | None = None
         self.field: Record | None = None
+        self.air: dict[str, Record] = {}
         self.stop = 1
-        self.title = ""
-        self.environment: dict[str, float] = {}
         self.check_apertures = True
+        #: Glasses that the file describes by indices, by name in capitals.
+        self.described: dict[str, Medium] = {}
 
-    def file(self) -> ZemaxFile:
-        """Return the parts of the Zemax file."""
+    def lens(self) -> LensDescription:
+        """Return the description of the lens."""
         started = ended = False
         for command in _commands(self.path):
             if command.keyword == "LEN" and not started:
                 if len(command.words) < 2 or command.words[0].upper() != "NEW":
                     raise command.error('LEN NEW "name" and two numbers')
-                started, self.title = True, command.words[1].strip('"')
+                started, self.description.title = True, command.words[1].strip('"')
             elif not started:
                 raise command.problem(f"{command.shown}: expected LEN NEW first")
             elif ended:
@@ -127,16 +146,20 @@ class _Translation:
                 self._read(command)
         if len(self.surfaces) < 3:
             problem = f"{len(self.surfaces)} surfaces: expected an object, an image and one between, parted by NXT"
-            raise self.found.header.problem(problem)
-        self._header()
+            raise self.description.problem(problem)
+        self._state_system()
+        for surface in self.surfaces:
+            name, medium = self._glass(surface)
+            self.described |= {name: medium} if medium is not None else {}
         self._resolve()
-        self._blocks()
-        return self.found.file()
+        self._place()
+        return self.description
 
     def _read(self, command: Record) -> None:
         key, current = command.keyword, self.surfaces[-1]
-        place = f"surface {current.number}"
-        command = Record(command.source, command.line, place, key, command.words, command.text)
+        place = "" if key in (*APERTURES, *FIELDS, "TEM", "PRE", "UNI") else current.place
+        command = replace(command, place=place)
+        current.commands[key] = command
         indexed = re.fullmatch(r"(WV|WW)(\d*)", key)
         if key == "NXT":
             self.surfaces.append(_Surface(current.number + 1))
@@ -145,7 +168,7 @@ class _Translation:
         elif key in FIELDS:
             self.field = command
         elif key in ("TEM", "PRE"):
-            self.environment[key] = command.number(0)
+            self.air[key] = command
         elif key == "NOT":
             current.name = " ".join(command.text.strip('"').split())
         elif key == "UNI":
@@ -190,11 +213,12 @@ class _Translation:
         value = command.number(0)
         if value not in UNITS:
             raise command.error(f"one of {', '.join(f'{v:g}' for v in UNITS)}, millimetres for each lens unit")
-        self.found.head("UNIT", UNITS[value])
+        self.description.state_unit(UNITS[value])
 
     def _spectrum(self, command: Record, kind: str, number: int) -> None:
         values = [command.number(i) for i in range(len(command.words))]
         target = self.waves if kind == "WV" else self.weights
+        self.spectrum = command if kind == "WV" else self.spectrum
         if number == 0:
             target[:] = values
         elif number <= len(target) + 1 and len(values) == 1:
@@ -236,14 +260,7 @@ class _Translation:
         """Return the index behind a surface at the primary wavelength, negative behind an odd number of mirrors."""
         if surface.mirror:
             return -before
-        lines = self._glass_lines(surface)
-        if not lines:
-            return math.copysign(1.0, before)
-        name = str(lines[0][1])
-        medium = self.found.glasses.get(name.upper()) or find_glass(name)
-        if medium is None:
-            raise PrescriptionError(f"{name}: expected a glass of the bundled or the user's catalogues, for the solves")
-        return math.copysign(float(medium.index(self.waves[0] / 1e6)), before)
+        return math.copysign(float(self._medium(surface).index(self.waves[0] / 1e6)), before)
 
     def _pick_up(self, surface: _Surface) -> None:
         """Take over values of earlier surfaces: ``PK CV n``, ``PK TH n addition``, CVM and THM with the other sign."""
@@ -274,103 +291,120 @@ class _Translation:
         """Distance of the object from the first surface [lens unit]."""
         value = self.surfaces[0].values.get("TH", math.inf)
         if value == 0:
-            raise self._problem(self.surfaces[0], "TH 0: expected a distance of the object other than 0")
+            raise self.surfaces[0].commands["TH"].problem("TH 0: expected a distance of the object other than 0")
         return math.inf if abs(value) >= INFINITE else value
 
-    def _header(self) -> None:
-        head = self.found.head
-        head("NAME", self.title)
-        self._aperture_line()
-        kind, largest = (FIELDS[self.field.keyword], self.field.number(0)) if self.field else (0, 0.0)
-        if kind == 1 and math.isinf(self.distance):
+    def _state_system(self) -> None:
+        lens = self.description
+        lens.object_distance = self.distance * lens.unit
+        lens.medium = self._medium(self.surfaces[0])
+        self._state_aperture()
+        kind, largest = (FIELDS[self.field.keyword], self.field.number(0)) if self.field else ("angle", 0.0)
+        if kind == "object_height" and math.isinf(self.distance):
             # An object height at infinity stands for its angle.
-            kind, largest = 0, math.degrees(math.atan(largest / abs(self.surfaces[0].values.get("TH", math.inf))))
-        fields = [fraction * largest for fraction in FRACTIONS] if largest else [0.0]
-        head("FTYP", str(kind), "0", str(len(fields)), str(len(self.waves)))
-        head("XFLN", *(0.0 for _ in fields))
-        head("YFLN", *fields)
-        for number, wave in enumerate(self.waves, start=1):
-            weight = self.weights[number - 1] if number <= len(self.weights) else 1.0
-            head("WAVM", str(number), wave, weight)
-        head("PWAV", "1")
-        if self.environment:
-            head("ENVD", self.environment.get("TEM", 20.0), self.environment.get("PRE", 1.0), "0")
+            distance = abs(self.surfaces[0].values.get("TH", math.inf))
+            kind, largest = "angle", math.degrees(math.atan(largest / distance))
+        points = [(0.0, fraction * largest) for fraction in FRACTIONS] if largest else [(0.0, 0.0)]
+        lens.state_fields(self.field or Source(str(self.path), keyword="ANG"), kind, points)
+        lens.state_wavelengths(self.spectrum, [scaled(wave, -6) for wave in self.waves], self.weights)
+        for command in list(self.air.values())[:1]:
+            usual = {"TEM": 20.0, "PRE": 1.0}
+            lens.state_air(command, *(self.air[k].number(0) if k in self.air else v for k, v in usual.items()))
 
-    def _aperture_line(self) -> None:
-        command, finite = self.aperture, math.isfinite(self.distance)
+    def _state_aperture(self) -> None:
+        command, lens, finite = self.aperture, self.description, math.isfinite(self.distance)
         if command is None:
-            raise self.found.header.problem(f"expected the aperture: one of {', '.join(APERTURES)}")
+            raise lens.problem(f"expected the aperture: {FORMAT.aperture}")
         value = command.number(0)
         if command.keyword == "EBR" and finite:
             # The radius of the beam at the first surface.
-            self.found.head("OBNA", math.sin(math.atan(value / abs(self.distance))))
+            lens.state_aperture(command, "object_na", math.sin(math.atan(value / abs(self.distance))))
         elif command.keyword == "EBR":
-            self.found.head("ENPD", 2.0 * value)
+            lens.state_aperture(command, "entrance_pupil", 2.0 * value * lens.unit)
         elif command.keyword == "NAO":
-            self.found.head("OBNA", value)
+            lens.state_aperture(command, "object_na", value)
         elif value > 0:
             number = value if command.keyword == "FNO" else 0.5 / value
-            self.found.head("FNUM", number, str(int(finite)))
+            lens.state_aperture(command, "working_f_number" if finite else "f_number", number)
         else:
             raise command.error("a positive number")
 
-    def _blocks(self) -> None:
-        first, *others = self.surfaces
-        last = others[-1]
+    def _place(self) -> None:
+        first, *surfaces_behind = self.surfaces
+        last, lens = surfaces_behind[-1], self.description
         # The thickness of the image is a defocus: it counts from where the surface before it leads.
         if last.values.get("TH"):
             before = self.surfaces[-2].values
             before["TH"] = before.get("TH", 0.0) + last.values["TH"]
         with error_context(file=self.path):
             frames = surface_frames([s.values for s in self.surfaces])
-        if first.values.get("CV"):
-            self.findings.report(self._problem(first, "curved objects are not read"), "taken as a plane")
-        self.found.object(self.distance, self._glass_lines(first))
-        for surface, (position, axes) in zip(others, frames, strict=True):
-            lines = [*self._shape_lines(surface), *self._glass_lines(surface)]
-            lines += [("STOP",)] if surface.number == self.stop else []
-            lines += [("COMM", surface.name)] if surface.name else []
-            radius = surface.values.get("AP", 0.0)
-            lines += [("DIAM", radius)] if radius else []
-            lines += [("CLAP", 0.0, radius)] if radius and surface.checked and self.check_apertures else []
-            self.found.surface(surface.place, lines, position, axes, mirror=surface.mirror)
+        if first.get("CV"):
+            command = next(first.commands[key] for key in ("RD", "CV") if key in first.commands)
+            self.findings.report(command.problem(f"{command.shown}: curved objects are not read"), "taken as a plane")
+        for surface, (position, axes) in zip(surfaces_behind, frames, strict=True):
+            radius, commands = surface.get("AP") * lens.unit, surface.commands
+            source = Source(str(self.path), surface.place)
+            checked = radius and surface.checked and self.check_apertures
+            placed = LensSurface(
+                commands.get("AST", source) if surface.number == self.stop else source,
+                self._shape(surface),
+                position * lens.unit,
+                axes,
+                name=surface.name,
+                after=VACUUM if surface.mirror else self._medium(surface),
+                aperture=ring(commands.get("AP", source), 0.0, radius, 0.0, 0.0) if checked else None,
+                semi_diameter=radius,
+                stop=surface.number == self.stop,
+            )
+            lens.add(placed, mirror=surface.mirror)
 
-    def _problem(self, surface: _Surface, text: str) -> PrescriptionError:
-        return PrescriptionError(text, file=str(self.path), place=surface.place)
+    def _shape(self, surface: _Surface) -> Shape:
+        """Return the shape of a surface; errors are those of the last of its commands."""
+        commands = [c for key, c in surface.commands.items() if re.fullmatch(rf"RD|CV|CC|{SHAPE}", key)]
+        source: Source = max(commands, key=lambda c: c.line, default=Source(str(self.path), surface.place))
+        with source.context():
+            shape, bare = self._series(surface)
+            if "CVX" not in surface.values:
+                return shape
+            if not bare:
+                text = "CVX: toroids with aspheric terms are not read"
+                self.findings.report(surface.commands.get("CVX", source).problem(text))
+            radius_x = radius_of(surface.get("CVX")) * self.description.unit
+            return shapes.toroid(radius_x, surface.get("CV") / self.description.unit, surface.get("CC"))
 
-    def _shape_lines(self, surface: _Surface) -> list[Line]:
-        values = surface.values
-        head: list[Line] = [("CURV", values.get("CV", 0.0)), ("CONI", values.get("CC", 0.0))]
-        general = {int(key[2:]): v for key, v in values.items() if re.fullmatch(r"AS\d+", key) and v}
-        kind = surface.aspheric
+    def _series(self, surface: _Surface) -> tuple[Shape, bool]:
+        """Return the shape of revolution, or with terms in x and y, and whether it is a conic."""
+        unit, kind = self.description.unit, surface.aspheric
+        base = surface.get("CV") / unit, surface.get("CC")
+        general = {int(key[2:]): v for key, v in surface.values.items() if re.fullmatch(r"AS\d+", key) and v}
+        count = max(general, default=0)
+        terms = [general.get(i, 0.0) for i in range(1, count + 1)]
         if kind == "ADO":
-            powers = [0.0, *(values.get(key, 0.0) for key in ("AD", "AE", "AF", "AG"))]
-            lines = [("TYPE", "EVENASPH" if any(powers) else "STANDARD"), *head, *numbered("PARM", powers)]
-        elif kind == "ASR" and max(general, default=0) <= 8 and 0 not in general:
-            lines = [("TYPE", "EVENASPH"), *head, *numbered("PARM", general)]
-        elif kind == "ARA" and max(general, default=0) <= 8 and 0 not in general:
-            lines = [("TYPE", "ODDASPHE"), *head, *numbered("PARM", general)]
-        elif kind == "ASX" and 0 not in general:
-            # 1 is x, 2 y, 3 x^2, 4 xy...: the order of Zemax's extended polynomial.
-            extra = {1: float(max(general, default=0)), 2: 1.0} | {2 + i: v for i, v in general.items()}
-            lines = [("TYPE", "XPOLYNOM"), *head, *numbered("XDAT", extra)]
-        else:
-            terms = f"ASP {kind}: expected ADO, ASR or ARA with AS1 to AS8, or ASX from AS1 on"
-            self.findings.report(self._problem(surface, terms), "taken as a conic")
-            lines = [("TYPE", "STANDARD"), *head]
-        if "CVX" in values:
-            if len(lines) > 3:
-                self.findings.report(self._problem(surface, "CVX: toroids with aspheric terms are not read"))
-            radius = 1.0 / values["CVX"] if values["CVX"] else 0.0
-            lines = [("TYPE", "TOROIDAL"), *head, *numbered("PARM", [radius])]
-        return lines
+            terms = [0.0, *(surface.get(key) for key in ("AD", "AE", "AF", "AG"))]
+        if kind == "ADO" or (kind in ("ASR", "ARA") and count <= _MOST and 0 not in general):
+            step, series = (1, shapes.odd_asphere) if kind == "ARA" else (2, shapes.even_asphere)
+            powers = [a * unit ** (1 - step * i) for i, a in enumerate(terms, start=1)]
+            return series(*base, powers), not any(terms)
+        if kind == "ASX" and 0 not in general:
+            # 1 is x, 2 y, 3 x^2, 4 xy...
+            rows = [(i, j, a * unit) for (i, j), a in zip(polynomial_powers(count), terms, strict=True)]
+            return shapes.polynomial(shapes.conic(*base), rows, unit), not terms
+        text = f"ASP {kind}: expected ADO, ASR or ARA with AS1 to AS8, or ASX from AS1 on"
+        place = surface.commands.get("ASP", Source(str(self.path), surface.place))
+        self.findings.report(place.problem(text), "taken as a conic")
+        return shapes.conic(*base), True
 
-    def _glass_lines(self, surface: _Surface) -> list[Line]:
+    def _medium(self, surface: _Surface) -> Medium:
+        command, (name, medium) = surface.glass, self._glass(surface)
+        if medium is not None or command is None or not name:
+            return medium or VACUUM
+        return self.described[name] if name in self.described else self.glasses.named(name, command)
+
+    def _glass(self, surface: _Surface) -> tuple[str, Medium | None]:
+        """Return the name of a glass in capitals, and the medium that its indices describe; no name for air."""
         command = surface.glass
-        if command is None or command.keyword in ("AIR", "AIF"):
-            return []
-        if surface.mirror:
-            return [("GLAS", "MIRROR")]
+        if command is None or command.keyword in ("AIR", "AIF") or surface.mirror:
+            return "", None
         words = [w.strip('"') for w in command.words]
         model = bool(words) and words[0].upper() == "MOD"
         words = words[1:] if model else words
@@ -381,11 +415,9 @@ class _Translation:
         if not words:
             raise command.error("the name of a glass, or its indices")
         if not indices:
-            return [("GLAS", name)]
-        try:
-            return self.found.glass(name, self._model(indices, surface, name, pair=model and len(indices) == 2))
-        except PrescriptionError as error:
-            raise command.problem(f"{command.shown}: {error}") from None
+            return name.upper(), None
+        with command.context():
+            return name.upper(), self._model(indices, surface, name, pair=model and len(indices) == 2)
 
     def _model(self, indices: list[float], surface: _Surface, name: str, *, pair: bool) -> Medium:
         """Return the glass of indices at the wavelengths, of one index, or of index and Abbe number."""

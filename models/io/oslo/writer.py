@@ -15,13 +15,15 @@ from ...aperture import Circle
 from ...media.medium import Medium
 from ...surface import Interaction
 from ...telescope import VACUUM, Telescope
-from ..lens_sequence import LensSequence, SequenceSurface, catalogue_name, quoted
+from ..lens.description import LensSurface
+from ..lens.sequence import LensSequence, catalogue_name, quoted
+from ..lens.text import number_text, scaled
 from ..profile import Profile
-from ..zemax.text import number_text, scaled
-from .reader import FRACTIONS, UNITS
+from .reader import FIELDS, FRACTIONS, UNITS
 
 FILE = "an OSLO file"
-FIELDS = {"angle": "ANG", "object_height": "OBH", "paraxial_image_height": "GIH"}
+#: Commands of field points by their type.
+_FIELDS = {kind: command for command, kind in FIELDS.items()}
 #: Coefficients of a symmetric or odd asphere (``AS1``...) that the reader takes.
 _MOST = 8
 #: Fractions of a field height, and apertures of a surface, that are equal.
@@ -35,7 +37,7 @@ def telescope_to_oslo(telescope: Telescope, *, lenient: bool = False) -> str:
     PrescriptionError, with surface and part, if a part of the telescope has no counterpart in it; if lenient, links,
     coatings, fields and formulas of glasses are left out with a warning.
     """
-    sequence = LensSequence.of(telescope, FILE, tuple(v * 1e-3 for v in UNITS), lenient=lenient)
+    sequence = LensSequence.of(telescope, FILE, tuple(UNITS.values()), lenient=lenient)
     unit = sequence.unit
     with error_context(subject=telescope.name):
         names = sequence.glass_names("its indices at the stated wavelengths")
@@ -89,14 +91,14 @@ def _system_lines(sequence: LensSequence) -> Iterator[str]:
 
 
 def _field_line(sequence: LensSequence) -> str:
-    if sequence.field_type not in FIELDS:
+    if sequence.field_type not in _FIELDS:
         raise PrescriptionError(f"field_type = {sequence.field_type}: {FILE} has none of that kind")
     largest = max(sequence.fields, key=lambda field: math.hypot(*field))
     size = 1.0 if sequence.field_type == "angle" else sequence.unit
     value = math.hypot(*largest) if largest[0] else largest[1]
     expected = [(0.0, fraction * value) for fraction in FRACTIONS] if value else [(0.0, 0.0)]
     met = len(sequence.fields) == len(expected) and all(
-        math.dist(one, other) <= _EQUAL * abs(value) for one, other in zip(sequence.fields, expected, strict=False)
+        math.dist(point, usual) <= _EQUAL * abs(value) for point, usual in zip(sequence.fields, expected, strict=False)
     )
     if not met:
         text = f"fields: {FILE} states one, and means 0, 0.7 and 1 times it along y"
@@ -105,14 +107,12 @@ def _field_line(sequence: LensSequence) -> str:
         sequence.leave_out(f"field_weights: {FILE} has no place for them", "left out")
     if any(any(row) for row in sequence.vignetting):
         sequence.leave_out(f"vignetting: {FILE} has no place for its factors", "left out")
-    return f"{FIELDS[sequence.field_type]} {number_text(value / size)}"
+    return f"{_FIELDS[sequence.field_type]} {number_text(value / size)}"
 
 
-def _medium_lines(
-    sequence: LensSequence, place: SequenceSurface | Medium, names: Mapping[Medium, str]
-) -> Iterator[str]:
+def _medium_lines(sequence: LensSequence, place: LensSurface | Medium, names: Mapping[Medium, str]) -> Iterator[str]:
     medium = place
-    if isinstance(place, SequenceSurface):
+    if isinstance(place, LensSurface):
         if place.interaction == Interaction.MIRROR:
             yield "RFL"
             return
@@ -130,7 +130,7 @@ def _medium_lines(
         yield f"GLA {model}{names[medium]} {' '.join(map(number_text, indices))}"
 
 
-def _surface_lines(sequence: LensSequence, surface: SequenceSurface, number: int) -> Iterator[str]:
+def _surface_lines(sequence: LensSequence, surface: LensSurface, number: int) -> Iterator[str]:
     unit = sequence.unit
     profile = Profile.of(surface.shape, unit)
     yield f'NOT "{quoted(surface.name, _FORBIDDEN)}"'
@@ -142,7 +142,7 @@ def _surface_lines(sequence: LensSequence, surface: SequenceSurface, number: int
     if surface.stop:
         yield "AST"
     if surface.off_axis:
-        x, y = (v / unit for v in surface.decentre)
+        x, y = (v / unit for v in surface.position[:2])
         # The first two angles are left-handed.
         a, b, c = (sign * math.degrees(v) for sign, v in zip((-1.0, -1.0, 1.0), surface.tilt, strict=True))
         for key, value in zip(("DCX", "DCY", "TLA", "TLB", "TLC"), (x, y, a, b, c), strict=True):
@@ -174,15 +174,15 @@ def _asphere_lines(profile: Profile) -> Iterator[str]:
         yield from (f"{key} {number_text(a)}" for key, a in keys if a)
 
 
-def _aperture_lines(sequence: LensSequence, surface: SequenceSurface) -> Iterator[str]:
+def _aperture_lines(sequence: LensSequence, surface: LensSurface) -> Iterator[str]:
     region, size, unit = surface.aperture, surface.semi_diameter, sequence.unit
     if isinstance(region, Circle) and not (region.x or region.y):
-        if size is not None and not math.isclose(size, region.radius, rel_tol=_EQUAL):
+        if size and not math.isclose(size, region.radius, rel_tol=_EQUAL):
             text = f"surface {surface.name}: semi-diameter beside a clear aperture: {FILE} has one AP"
             sequence.leave_out(text, "left out")
         yield f"AP CHK {number_text(region.radius / unit)}"
         return
     if region is not None:
         sequence.leave_out_aperture(surface, "discs about the vertex")
-    if size is not None:
+    if size:
         yield f"AP {number_text(size / unit)}"

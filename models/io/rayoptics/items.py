@@ -19,8 +19,8 @@ def array(values: list[float]) -> dict[str, Any]:
 
 def attributes(items: JsonObject, key: str | None = None) -> JsonObject:
     """Return the attributes of an object, or of one that stands within it under a key."""
-    found = items if key is None else items.child(key, items.place or key)
-    return found.child("attributes") if "attributes" in found else found
+    instance_items = items if key is None else items.child(key, items.place or key)
+    return instance_items.child("attributes") if "attributes" in instance_items else instance_items
 
 
 def class_name(items: JsonObject) -> str:

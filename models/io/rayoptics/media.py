@@ -1,4 +1,4 @@
-"""Media of ray-optics as glasses of a lens file, and media as items of its files.
+"""Media of the files of ray-optics, read and written.
 
 Glasses of makers hold their coefficients; their range of wavelengths is that of the bundled catalogue of the maker.
 Model glasses follow Buchdahl's formula with the coefficients in the file.
@@ -8,17 +8,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from ....core.errors import PrescriptionError
 from ...media.dispersion import Dispersion
 from ...media.medium import ConstantIndex, Medium, Sellmeier, abbe_number
 from ...media.tabulated import TabulatedIndex
 from ...telescope import VACUUM
 from ..glass_catalogue import MAKERS, GlassCatalogue
 from ..json_items import JsonObject
-from ..lens_sequence import LensSequence
-from ..zemax.file import Findings
-from ..zemax.placed import Line, PlacedSurfaces
-from ..zemax.text import scaled
+from ..lens.description import LensDescription
+from ..lens.glasses import Glasses
+from ..lens.sequence import LensSequence
+from ..lens.text import scaled
 from .items import array, attributes, class_name, instance, module_name, numbers
 
 #: Formulas of the coefficients, by maker and number of them: Sellmeier's lists those of B before those of C.
@@ -35,55 +34,52 @@ CLASSES = {
     "schott": "SchottGlass", "ohara": "OharaGlass", "hoya": "HoyaGlass", "sumita": "SumitaGlass", "cdgm": "CDGMGlass",
     "hikari": "HikariGlass",
 }  # fmt: skip
-#: Entries that a table needs for ray-optics' cubic spline, and those that one of a formula has.
-_LEAST_ENTRIES, _ENTRIES = 4, 21
+#: Entries that a table needs for ray-optics' cubic spline.
+_LEAST_ENTRIES = 4
+#: Entries of the table of a formula.
+_ENTRIES = 21
 _MODULE = "opticalglass"
 
 
-def medium_lines(gap: JsonObject, found: PlacedSurfaces, findings: Findings) -> list[Line]:
-    """Return the line of the medium of a gap, none for air."""
+def medium_of(gap: JsonObject, lens: LensDescription, glasses: Glasses) -> Medium:
+    """Return the medium of a gap."""
     medium = gap.child("medium")
     kind, values = class_name(medium), attributes(medium)
-    if kind == "Air":
-        return []
-    if kind in ("ConstantIndex", "Medium", "Glass") and "n" in values:
-        return found.constant_glass(values.number("n"))
-    if kind == "ModelGlass":
-        model = attributes(values, "bdhl_model")
-        terms = (model.number("rind0"), *numbers(model, "coefs", 2), model.number("wv0"))
-        name = f"MODEL {terms!r}"
-        return found.glass(name, Dispersion("buchdahl", terms, _range(values), name=values.text("label", "")))
-    if kind == "InterpolatedMedium":
-        waves, indices = numbers(values, "wvls"), numbers(values, "rndx")
-        table = sorted(zip((scaled(w, -9) for w in waves), indices, strict=False))
-        name = values.text("label", "") or f"TABLE {len(found.glasses) + 1}"
-        lengths, entries = zip(*table, strict=True) if table else ((), ())
-        try:
-            return found.glass(name, TabulatedIndex(lengths, entries, name=name))
-        except PrescriptionError as error:
-            raise medium.problem(f"medium {name}: {error}") from None
-    if "gname" in values:
-        return _catalogue_glass(medium, values, found)
+    with medium.part(f"medium {kind}").context():
+        if kind == "Air":
+            return VACUUM
+        if kind in ("ConstantIndex", "Medium", "Glass") and "n" in values:
+            index = values.number("n")
+            return VACUUM if index == 1.0 else ConstantIndex(index)
+        if kind == "ModelGlass":
+            model = attributes(values, "bdhl_model")
+            terms = (model.number("rind0"), *numbers(model, "coefs", 2), model.number("wv0"))
+            return Dispersion("buchdahl", terms, _range(values), name=values.text("label", ""))
+        if kind == "InterpolatedMedium":
+            waves, indices = numbers(values, "wvls"), numbers(values, "rndx")
+            table = sorted(zip((scaled(w, -9) for w in waves), indices, strict=False))
+            number = 1 + len({m.name for m in (lens.medium, *(s.after for s in lens.surfaces)) if m != VACUUM})
+            lengths, entries = zip(*table, strict=True) if table else ((), ())
+            return TabulatedIndex(lengths, entries, name=values.text("label", "") or f"TABLE {number}")
+        if "gname" in values:
+            return _catalogue_glass(medium, values, glasses)
     raise medium.problem(
         f"medium {kind}: expected Air, ConstantIndex, ModelGlass, InterpolatedMedium or the glass of a maker"
     )
 
 
-def _catalogue_glass(medium: JsonObject, values: JsonObject, found: PlacedSurfaces) -> list[Line]:
+def _catalogue_glass(medium: JsonObject, values: JsonObject, glasses: Glasses) -> Medium:
     name, maker = values.text("gname"), module_name(medium)
-    known = maker in MAKERS and name in GlassCatalogue.of_maker(maker)
-    entry = GlassCatalogue.of_maker(maker)[name] if known else None
+    is_bundled = maker in MAKERS and name in GlassCatalogue.of_maker(maker)
+    entry = GlassCatalogue.of_maker(maker)[name] if is_bundled else None
     terms = tuple(numbers(values, "coefs")) if "coefs" in values else ()
     formula = FORMULAS.get((maker, len(terms)))
     limits = _range(values, getattr(entry, "wavelength_range", RANGE))
+    if formula == "sellmeier":
+        return Sellmeier(terms[:3], terms[3:], limits, name=name)
     if formula is not None:
-        own: Medium = (
-            Sellmeier(terms[:3], terms[3:], limits, name=name)
-            if formula == "sellmeier"
-            else Dispersion(formula, terms, limits, name=name)
-        )
-        return found.glass(f"{name} ({maker})", own)
-    return [("GLAS", name)] if entry is None else found.glass(f"{name} ({maker})", entry)
+        return Dispersion(formula, terms, limits, name=name)
+    return glasses.named(name, values.at("gname")) if entry is None else entry
 
 
 def _range(values: JsonObject, usual: tuple[float, float] = RANGE) -> tuple[float, float]:
@@ -150,12 +146,12 @@ def _glass_items(
     medium: Sellmeier | Dispersion, formula: str, coefficients: tuple[float, ...]
 ) -> dict[str, Any] | None:
     """Return the items of the glass of a maker with these coefficients: of its own, or one with the same formula."""
-    own_forms = {key: known for key, known in FORMULAS.items() if key != ("hikari", 6)}
-    makers = [maker for (maker, size), known in own_forms.items() if (size, known) == (len(coefficients), formula)]
+    own_forms = {key: kind for key, kind in FORMULAS.items() if key != ("hikari", 6)}
+    makers = [maker for (maker, size), kind in own_forms.items() if (size, kind) == (len(coefficients), formula)]
     if not makers:
         return None
-    own = [m for m in makers if medium.name in GlassCatalogue.of_maker(m)]
-    maker = (own or makers)[0]
+    makers_of_name = [m for m in makers if medium.name in GlassCatalogue.of_maker(m)]
+    maker = (makers_of_name or makers)[0]
     values = {"gname": medium.name, "coefs": list(coefficients)}
     return _item(maker, CLASSES[maker], values | _range_items(medium))
 

@@ -1,4 +1,4 @@
-"""Profiles of ray-optics as shapes of Zemax surfaces.
+"""Profiles of ray-optics as shapes, and shapes as profiles.
 
 ================ ====================================================================================================
 Spherical, Conic curvature ``cv``, conic constant ``cc``
@@ -12,44 +12,42 @@ from __future__ import annotations
 from typing import Any
 
 from ....core.errors import PrescriptionError
+from ...shapes.shape import Shape
 from ..json_items import JsonObject
+from ..lens import shapes
+from ..lens.shapes import MOST_ODD
+from ..lens.source import Findings
 from ..profile import Profile
-from ..zemax.file import Findings
-from ..zemax.placed import Line, numbered
-from ..zemax.shapes import MOST_ODD
 from .items import attributes, class_name, instance, numbers
 
-#: Zemax type, and power of r of each step of the coefficients.
-POLYNOMIALS = {"EvenPolynomial": ("EVENASPH", 2), "RadialPolynomial": ("ODDASPHE", 1)}
+#: Power of r of each step of the coefficients.
+POLYNOMIALS = {"EvenPolynomial": 2, "RadialPolynomial": 1}
 #: Attributes that are copies of others or count them.
 _COPIES = ("max_nonzero_coef", *(f"coef{i}" for i in range(1, 21)), "coefs")
 _MOST_TERMS = 10
 _MODULE = "rayoptics.elem.profiles"
-#: Parameters of Zemax's even aspheres that hold coefficients.
-_PARAMETERS = 8
 
 
-def profile_lines(profile: JsonObject, findings: Findings) -> list[Line]:
-    """Return the lines of a profile."""
+def shape_of(profile: JsonObject, unit: float, findings: Findings) -> Shape:
+    """Return the shape of a profile, whose lengths are in a unit [m]."""
     kind, values = class_name(profile), attributes(profile)
-    known = ("Spherical", "Conic", *POLYNOMIALS)
-    if kind not in known:
-        findings.report(profile.problem(f"profile {kind}: expected one of {', '.join(known)}"), "taken as a sphere")
-    curvature = values.number("cv", 0.0)
-    conic = values.number("ec") - 1.0 if "ec" in values and "cc" not in values else values.number("cc", 0.0)
-    head: list[Line] = [("CURV", curvature), ("CONI", conic)]
+    kinds = ("Spherical", "Conic", *POLYNOMIALS)
+    if kind not in kinds:
+        findings.report(profile.problem(f"profile {kind}: expected one of {', '.join(kinds)}"), "taken as a sphere")
+    curvature = values.number("cv", 0.0) / unit
+    constant = values.number("ec") - 1.0 if "ec" in values and "cc" not in values else values.number("cc", 0.0)
     if kind not in POLYNOMIALS:
         values.report_rest(findings, ("c",) if kind == "Spherical" else ())
-        return [("TYPE", "STANDARD"), *head]
-    name, step = POLYNOMIALS[kind]
+        return shapes.conic(curvature, constant)
+    step = POLYNOMIALS[kind]
     terms = numbers(values, "coefs") if "coefs" in values else []
     terms = terms or [values.number(f"coef{step * i}", 0.0) for i in range(1, _MOST_TERMS + 1)]
     values.report_rest(findings, _COPIES)
     if step == 1 and any(terms[MOST_ODD:]):
         raise profile.problem(f"coefs = {len(terms)} numbers: expected at most {MOST_ODD}")
-    if step == 1 or not any(terms[_PARAMETERS:]):
-        return [("TYPE", name), *head, *numbered("PARM", terms)]
-    return [("TYPE", "XASPHERE"), *head, *numbered("XDAT", [float(len(terms)), 1.0, *terms])]
+    powers = [a * unit ** (1 - step * i) for i, a in enumerate(terms, start=1)]
+    series = shapes.even_asphere if step == 2 else shapes.odd_asphere
+    return series(curvature, constant, powers)
 
 
 def profile_items(profile: Profile) -> dict[str, Any]:

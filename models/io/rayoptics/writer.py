@@ -16,9 +16,10 @@ from ....core.errors import PrescriptionError, error_context
 from ...aperture import Circle, Ellipse, Rectangle
 from ...surface import Interaction
 from ...telescope import Telescope
-from ..lens_sequence import LensSequence, SequenceSurface
+from ..lens.description import LensSurface
+from ..lens.sequence import LensSequence
+from ..lens.text import scaled
 from ..profile import Profile
-from ..zemax.text import scaled
 from .items import array, instance
 from .media import Media
 from .reader import FIELDS, MMHG
@@ -30,9 +31,10 @@ APERTURES = {
     "entrance_pupil": ("object", "epd"), "object_na": ("object", "NA"), "f_number": ("image", "f/#"),
     "working_f_number": ("image", "f/#"),
 }  # fmt: skip
-_FIELDS = {"angle": 0, "object_height": 1, "paraxial_image_height": 2}
-#: Version of ray-optics whose form of the file this is, and its distance of an object at infinity.
-VERSION, FAR = "0.9.8", 1e10
+#: Version of ray-optics whose form of the file this is.
+VERSION = "0.9.8"
+#: Distance of an object at infinity in ray-optics [lens unit].
+FAR = 1e10
 
 
 def telescope_to_rayoptics(telescope: Telescope, *, lenient: bool = False) -> str:
@@ -79,10 +81,10 @@ def _sequence_items(sequence: LensSequence) -> dict[str, Any]:
         with error_context(subject=f"surface {surface.name}"):
             profiles[str(number)] = profile_items(Profile.of(surface.shape, unit))
         mode = {Interaction.MIRROR: "reflect", Interaction.REFRACT: "transmit"}.get(surface.interaction, "dummy")
-        own = _surface_items(surface.name, mode, str(number), (surface.semi_diameter or radius) / unit)
-        own["attributes"]["clear_apertures"] = _aperture_items(sequence, surface)
-        own["attributes"]["decenter"] = _decenter_items(surface, unit)
-        items.append(own)
+        written_surface = _surface_items(surface.name, mode, str(number), (surface.semi_diameter or radius) / unit)
+        written_surface["attributes"]["clear_apertures"] = _aperture_items(sequence, surface)
+        written_surface["attributes"]["decenter"] = _decenter_items(surface, unit)
+        items.append(written_surface)
         if surface.interaction != Interaction.DETECTOR:
             gaps.append(_gap(sequence.thickness(surface), media.items(surface.after)))
             directions.append(-directions[-1] if mode == "reflect" else directions[-1])
@@ -116,7 +118,7 @@ def _surface_items(name: str, mode: str, profile: str, radius: float) -> dict[st
     return instance("rayoptics.elem.surface", "Surface", values)
 
 
-def _aperture_items(sequence: LensSequence, surface: SequenceSurface) -> list[dict[str, Any]]:
+def _aperture_items(sequence: LensSequence, surface: LensSurface) -> list[dict[str, Any]]:
     region, unit = surface.aperture, sequence.unit
     sizes: dict[str, float]
     if isinstance(region, Circle):
@@ -134,12 +136,12 @@ def _aperture_items(sequence: LensSequence, surface: SequenceSurface) -> list[di
     return [instance("rayoptics.elem.surface", kind, values | {"rotation": 0.0})]
 
 
-def _decenter_items(surface: SequenceSurface, unit: float) -> dict[str, Any] | None:
+def _decenter_items(surface: LensSurface, unit: float) -> dict[str, Any] | None:
     if not surface.off_axis:
         return None
     # The first two angles are left-handed.
     angles = [sign * math.degrees(v) + 0.0 for sign, v in zip((-1.0, -1.0, 1.0), surface.tilt, strict=True)]
-    shift = [*(v / unit for v in surface.decentre), 0.0]
+    shift = [*(v / unit for v in surface.position[:2]), 0.0]
     values = {"_dtype": "dec and return", "dec": array(shift), "euler": array(angles), "rot_pt": array([0.0] * 3)}
     return instance("rayoptics.elem.surface", "DecenterData", values | {"rot_mat": None})
 
@@ -178,11 +180,11 @@ def _optical_items(sequence: LensSequence) -> dict[str, Any]:
 
 
 def _field_items(sequence: LensSequence) -> dict[str, Any]:
-    if sequence.field_type not in _FIELDS:
+    if sequence.field_type not in FIELDS.values():
         raise PrescriptionError(f"field_type = {sequence.field_type}: {FILE} has none of that kind")
     if any(row[4] for row in sequence.vignetting):
         raise PrescriptionError(f"vignetting: {FILE} has no angle of the pupil")
-    kind = next(words for words, number in FIELDS.items() if number == _FIELDS[sequence.field_type])
+    kind = next(words for words, field_type in FIELDS.items() if field_type == sequence.field_type)
     size = 1.0 if sequence.field_type == "angle" else sequence.unit
     points = []
     rows = zip(sequence.fields, sequence.field_weights, sequence.vignetting, strict=True)

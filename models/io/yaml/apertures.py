@@ -97,10 +97,10 @@ class ApertureKeys(Section):
     @classmethod
     def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
         super().check(content)
-        given = [key for key in ("circle", "annulus", "aperture") if key in content]
-        if len(given) > 1:
-            raise expected(f"{given[0]} or {given[1]}, not both", given[0])
-        if "centre" in content and not set(given) & {"circle", "annulus"}:
+        aperture_keys = [key for key in ("circle", "annulus", "aperture") if key in content]
+        if len(aperture_keys) > 1:
+            raise expected(f"{aperture_keys[0]} or {aperture_keys[1]}, not both", aperture_keys[0])
+        if "centre" in content and not set(aperture_keys) & {"circle", "annulus"}:
             raise expected("a circle or an annulus beside it", "centre")
 
     def clear_aperture(self) -> Aperture | None:
@@ -157,9 +157,9 @@ def aperture_items(aperture: Aperture | None) -> dict[str, Any]:
 
 
 def _region_items(region: Aperture) -> dict[str, Any]:
-    if (found := written(REGIONS, region)) is None:
+    if (section := written(REGIONS, region)) is None:
         raise PrescriptionError(f"aperture {type(region).__name__}: expected one of {', '.join(REGIONS)}")
-    return found[1]
+    return section[1]
 
 
 def obstruction_items(obstruction: Obstruction) -> dict[str, Any]:

@@ -42,9 +42,9 @@ class CoatingSection(Section):
     @classmethod
     def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
         if "layers" in content:
-            for other in content:
-                if other != "layers":
-                    raise expected("layers alone", other)
+            for sibling in content:
+                if sibling != "layers":
+                    raise expected("layers alone", sibling)
             return
         for key in ("wavelength_nm", "efficiency"):
             if key not in content:
@@ -77,11 +77,11 @@ def coating_items(coating: AnyCoating) -> dict[str, Any]:
     if isinstance(coating, LayerStack):
         pairs = zip(coating.indices, coating.thicknesses, strict=True)
         return {"layers": [{"index": n, "thickness_nm": _in_nm(d)} for n, d in pairs]}
-    found: dict[str, Any] = {"wavelength_nm": [_in_nm(w) for w in coating.wavelengths]}
+    section: dict[str, Any] = {"wavelength_nm": [_in_nm(w) for w in coating.wavelengths]}
     if isinstance(coating, CoatingTable):
-        found["angle_deg"] = [_back(a, np.rad2deg, np.deg2rad) for a in coating.angles]
-        return found | {"efficiency": [list(row) for row in coating.efficiencies]}
-    return found | {"efficiency": list(coating.efficiencies)}
+        section["angle_deg"] = [_back(a, np.rad2deg, np.deg2rad) for a in coating.angles]
+        return section | {"efficiency": [list(row) for row in coating.efficiencies]}
+    return section | {"efficiency": list(coating.efficiencies)}
 
 
 def coating_names(surfaces: Iterable[Surface]) -> dict[AnyCoating, str]:
@@ -90,8 +90,8 @@ def coating_names(surfaces: Iterable[Surface]) -> dict[AnyCoating, str]:
     numbered: Iterator[str] = (f"coating_{i}" for i in count(1))
     coatings = list(dict.fromkeys(s.coating for s in surfaces if s.coating is not None))
     for coating in coatings:
-        own = coating.name and coating.name not in names.values()
-        names[coating] = coating.name if own else next(n for n in numbered if n not in {c.name for c in coatings})
+        is_free = coating.name and coating.name not in names.values()
+        names[coating] = coating.name if is_free else next(n for n in numbered if n not in {c.name for c in coatings})
     return names
 
 

@@ -184,20 +184,20 @@ class DesignSection(Section):
 
     def data(self) -> DesignData:
         """Return the design data."""
-        found: dict[str, Any] = {}
+        stated: dict[str, Any] = {}
         if self.aperture is not None:
-            found["aperture"], found["aperture_value"] = _only(self.aperture)
+            stated["aperture"], stated["aperture_value"] = _only(self.aperture)
         if self.fields is not None:
-            found |= {"field_weights": self.fields.weights, "vignetting": self.fields.vignetting}
-            found["field_type"], found["fields"] = _only(self.fields, but=("weights", "vignetting"))
+            stated |= {"field_weights": self.fields.weights, "vignetting": self.fields.vignetting}
+            stated["field_type"], stated["fields"] = _only(self.fields, but=("weights", "vignetting"))
         if self.wavelengths is not None:
-            found |= {"wavelengths": self.wavelengths.values, "wavelength_weights": self.wavelengths.weights}
+            stated |= {"wavelengths": self.wavelengths.values, "wavelength_weights": self.wavelengths.weights}
         if self.environment is not None:
-            found |= {"temperature": self.environment.temperature_k, "pressure": self.environment.pressure_pa}
-        found |= {"telecentric": self.telecentric, "afocal": self.afocal}
-        found["pickups"] = tuple(section.pickup() for section in self.pickups)
-        found["solves"] = tuple(section.solve() for section in self.solves)
-        return DesignData(length_unit=self.length, stop=self.stop, aiming=self.aiming, **found)
+            stated |= {"temperature": self.environment.temperature_k, "pressure": self.environment.pressure_pa}
+        stated |= {"telecentric": self.telecentric, "afocal": self.afocal}
+        stated["pickups"] = tuple(section.pickup() for section in self.pickups)
+        stated["solves"] = tuple(section.solve() for section in self.solves)
+        return DesignData(length_unit=self.length, stop=self.stop, aiming=self.aiming, **stated)
 
 
 def _only(section: Section, but: tuple[str, ...] = ()) -> tuple[str, Any]:
@@ -209,32 +209,32 @@ def _only(section: Section, but: tuple[str, ...] = ()) -> tuple[str, Any]:
 def design_items(data: DesignData) -> dict[str, Any]:
     """Return the section of design data, in metres; what has its default is left out."""
     default = DesignData()
-    found: dict[str, Any] = {}
+    section: dict[str, Any] = {}
     if data.length_unit != default.length_unit:
-        found["length"] = data.length_unit
+        section["length"] = data.length_unit
     if data.aperture is not None:
-        found["aperture"] = {data.aperture: data.aperture_value}
-    found |= {key: getattr(data, key) for key in ("stop", "aiming") if getattr(data, key) != getattr(default, key)}
+        section["aperture"] = {data.aperture: data.aperture_value}
+    section |= {key: getattr(data, key) for key in ("stop", "aiming") if getattr(data, key) != getattr(default, key)}
     if data.fields:
         turn = Turn if data.field_type == "angle" else float
         fields: dict[str, Any] = {data.field_type: [[turn(v) for v in row] for row in data.fields]}
         fields |= {"weights": data.field_weights} if data.field_weights else {}
         rows = [[*row[:4], Turn(row[4])] for row in data.vignetting]
-        found["fields"] = fields | ({"vignetting": rows} if rows else {})
+        section["fields"] = fields | ({"vignetting": rows} if rows else {})
     if data.wavelengths:
-        found["wavelengths"] = {"values": [Wave(w) for w in data.wavelengths]}
-        found["wavelengths"] |= {"weights": data.wavelength_weights} if data.wavelength_weights else {}
+        section["wavelengths"] = {"values": [Wave(w) for w in data.wavelengths]}
+        section["wavelengths"] |= {"weights": data.wavelength_weights} if data.wavelength_weights else {}
     environment = {"temperature_k": data.temperature, "pressure_pa": data.pressure}
     if stated := {key: value for key, value in environment.items() if value is not None}:
-        found["environment"] = stated
-    found |= {key: True for key in ("telecentric", "afocal") if getattr(data, key)}
+        section["environment"] = stated
+    section |= {key: True for key in ("telecentric", "afocal") if getattr(data, key)}
     if data.pickups:
-        found["pickups"] = [_pickup_items(pickup) for pickup in data.pickups]
+        section["pickups"] = [_pickup_items(pickup) for pickup in data.pickups]
     if data.solves:
-        found["solves"] = [
+        section["solves"] = [
             {"surface": s.surface, s.kind: s.value} | ({"radius": s.radius} if s.radius else {}) for s in data.solves
         ]
-    return found
+    return section
 
 
 def _pickup_items(pickup: Pickup) -> dict[str, Any]:

@@ -87,10 +87,10 @@ MEDIA: dict[str, type[MediumSection]] = {
 
 
 def _kind(content: dict[str, Any]) -> str:
-    known = [*MEDIA, "C", "range", "in_air", "shift", "dispersion"]
+    kinds = [*MEDIA, "C", "range", "in_air", "shift", "dispersion"]
     for key in content:
-        if key not in known and not MEDIA.keys() & content.keys():
-            raise unknown_key(key, known)
+        if key not in kinds and not MEDIA.keys() & content.keys():
+            raise unknown_key(key, kinds)
     return next((kind for kind in MEDIA if kind in content), "B")
 
 
@@ -104,7 +104,7 @@ def medium_items(medium: Medium) -> dict[str, Any]:
     if isinstance(medium, ChangedIndex):
         factor = {"dispersion": medium.dispersion} if medium.dispersion != 1.0 else {}
         return medium_items(medium.medium) | {"shift": medium.change} | factor
-    if (found := written(MEDIA, medium)) is None:
+    if (section := written(MEDIA, medium)) is None:
         raise PrescriptionError(f"medium {type(medium).__name__}: expected one that prescription files can hold")
-    kind, items = found
+    kind, items = section
     return {kind: items[kind]} | items

@@ -86,10 +86,10 @@ class SurfaceKeys(ApertureKeys):
         self, media: dict[str, Medium], medium_before: Medium, coatings: dict[str, AnyCoating] | None = None
     ) -> Surface:
         """Return the surface."""
-        known = coatings or {}
-        if self.coating is not None and self.coating not in known:
-            wanted = one_of(known, self.coating) if known else "a section coatings"
-            raise PrescriptionError(f"coating = {self.coating!r}: expected {wanted}", key="coating")
+        coating_sections = coatings or {}
+        if self.coating is not None and self.coating not in coating_sections:
+            expected_coating = one_of(coating_sections, self.coating) if coating_sections else "a section coatings"
+            raise PrescriptionError(f"coating = {self.coating!r}: expected {expected_coating}", key="coating")
         assert isinstance(self, ShapeSection)
         return Surface(
             name=self.name,
@@ -100,7 +100,7 @@ class SurfaceKeys(ApertureKeys):
             aperture=self.clear_aperture(),
             rotation=self.rotation if self.tilt is None else _matrix(rotation_matrix(self.tilt)),
             semi_diameter=self.semi_diameter,
-        ).coated(None if self.coating is None else known[self.coating])
+        ).coated(None if self.coating is None else coating_sections[self.coating])
 
 
 def _surface_kind(content: dict[str, Any]) -> str:
@@ -195,28 +195,28 @@ class Prescription(Section):
 
     def problems(self) -> list[PachonError]:
         """Return the errors of media and surfaces that cannot be made, each by itself."""
-        found: list[PachonError] = []
+        errors: list[PachonError] = []
         media: dict[str, Medium] = {"vacuum": VACUUM}
         for name, medium in self.media.items():
             try:
                 media[name] = medium.medium(name)
             except PachonError as error:
-                found.append(error.within(key=f"media.{name}"))
+                errors.append(error.within(key=f"media.{name}"))
                 media[name] = VACUUM
         coatings: dict[str, AnyCoating] = {}
-        for name, one in self.coatings.items():
+        for name, coating_section in self.coatings.items():
             try:
-                coatings[name] = one.made(name)
+                coatings[name] = coating_section.made(name)
             except PachonError as error:
-                found.append(error)
+                errors.append(error)
         for section in self.surfaces:
             if section.coating in self.coatings and section.coating not in coatings:
                 continue
             try:
                 section.surface(media, VACUUM, coatings)
             except PachonError as error:
-                found.append(error.within(key=f"surfaces[{section.name}]"))
-        return found
+                errors.append(error.within(key=f"surfaces[{section.name}]"))
+        return errors
 
     def telescope(self) -> Telescope:
         """Return the telescope."""

@@ -166,9 +166,9 @@ SHAPES: dict[str, type[ShapeSection]] = {
 
 def shape_items(shape: Shape) -> dict[str, Any]:
     """Return the section of a shape, in metres; grids and meshes are written out, so that a file stands by itself."""
-    if (found := written(SURFACE_SHAPES, shape)) is None:
+    if (section := written(SURFACE_SHAPES, shape)) is None:
         raise PrescriptionError(f"shape {type(shape).__name__}: expected one of {', '.join(SHAPES)}")
-    kind, items = found
+    kind, items = section
     return {"shape": kind} | items
 
 

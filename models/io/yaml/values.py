@@ -71,8 +71,8 @@ def _numbers(size: int | None) -> Callable[[Any], tuple[float, ...] | None]:
     def convert(value: Any) -> tuple[float, ...] | None:
         if not isinstance(value, list) or (size is not None and len(value) != size):
             return None
-        found = tuple(n for n in map(as_number, value) if n is not None)
-        return found if len(found) == len(value) else None
+        finite_numbers = tuple(n for n in map(as_number, value) if n is not None)
+        return finite_numbers if len(finite_numbers) == len(value) else None
 
     return convert
 

@@ -56,7 +56,7 @@ def telescope_to_yaml(telescope: Telescope) -> str:
     lists = {
         "design": [(f"  {key}: ", value) for key, value in design_items(t.design_data).items()],
         "media": [(f"  {name}: ", medium_items(medium)) for medium, name in names.items() if medium != VACUUM],
-        "coatings": [(f"  {flow(name)}: ", coating_items(one)) for one, name in coated.items()],
+        "coatings": [(f"  {flow(name)}: ", coating_items(coating)) for coating, name in coated.items()],
         "groups": [(f"  {flow(name)}: ", _group_items(t, name)) for name in t.groups],
         "obstructions": [("  - ", obstruction_items(obstruction)) for obstruction in t.obstructions],
     }
@@ -82,8 +82,8 @@ def _medium_names(t: Telescope) -> dict[Medium, str]:
     names: dict[Medium, str] = {VACUUM: "vacuum"}
     numbered = (f"glass_{i}" for i in count(1))
     for medium in media:
-        own = re.fullmatch(r"[A-Za-z][\w.-]*", medium.name) and medium.name not in names.values()
-        names[medium] = medium.name if own else next(n for n in numbered if n not in {m.name for m in media})
+        is_free = re.fullmatch(r"[A-Za-z][\w.-]*", medium.name) and medium.name not in names.values()
+        names[medium] = medium.name if is_free else next(n for n in numbered if n not in {m.name for m in media})
     return names
 
 
@@ -126,16 +126,16 @@ def _found(value: Any, kind: type[float]) -> list[float]:
     if isinstance(value, kind):
         return [value]
     inner = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else ()
-    return [found for part in inner for found in _found(part, kind)]
+    return [match for inner_part in inner for match in _found(inner_part, kind)]
 
 
 def _in_unit(values: list[float], unit: str, fallback: str) -> tuple[str, dict[float, float]]:
     """Return a unit and the values in it that convert back exactly: the readable unit, or SI where it cannot."""
-    found = {}
+    converted = {}
     for value in values:
         near = value / to_si(1.0, unit)
         exact = [c for c in (float(f"{near:.{digits}g}") for digits in range(1, 18)) if to_si(c, unit) == value]
         if not exact:
             return fallback, {}
-        found[value] = exact[0]
-    return unit, found
+        converted[value] = exact[0]
+    return unit, converted

@@ -17,13 +17,19 @@ from ....core.errors import PrescriptionError, shown
 from ....core.files import read_bytes
 from ...media.medium import Medium
 from ..glass_catalogue import GlassCatalogue
-from ..zemax.file import Findings, ZemaxFile, parse_zemax_file
-from ..zemax.text import decoded
+from ..lens.description import LensDescription
+from ..lens.glasses import Glasses
+from ..lens.source import Findings
+from ..lens.text import decoded
+from ..zemax.file import parse_zemax_file
+from ..zemax.reader import described
 
 #: Ending of the names of compressed files.
 _PACKED = ".lzw"
-#: Longest archive, and most bytes of a file in it that is unpacked.
-MAX_BYTES, MAX_UNPACKED = 100_000_000, 50_000_000
+#: Longest archive [byte].
+MAX_BYTES = 100_000_000
+#: Longest file of an archive when unpacked [byte].
+MAX_UNPACKED = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -40,8 +46,8 @@ class _Layout:
 LAYOUTS = {0xEC: _Layout(0x10, 8, 0x30, "utf-16-le", 0x288), 0xEA: _Layout(0xC, 4, 0x20, "iso-8859-1", 0x14C)}
 
 
-def read_zemax_archive(path: Path, findings: Findings) -> ZemaxFile:
-    """Return the parts of the lens file of an archive; glasses of its catalogues come first.
+def read_zemax_archive(path: Path, findings: Findings, catalogues: Glasses) -> LensDescription:
+    """Return the description of the lens file of an archive; glasses of its catalogues come first.
 
     PrescriptionError if it is no archive, is damaged, or does not hold one lens file.
     """
@@ -62,10 +68,10 @@ def read_zemax_archive(path: Path, findings: Findings) -> ZemaxFile:
         else:
             glasses |= {glass: catalogue[glass] for glass in catalogue}
     if len(lenses) != 1:
-        found = ", ".join(map(shown, lenses)) or "none"
-        raise PrescriptionError(f"expected one lens file (.zmx) in the archive, found {found}", file=path)
+        lens_names = ", ".join(map(shown, lenses)) or "none"
+        raise PrescriptionError(f"expected one lens file (.zmx) in the archive, found {lens_names}", file=path)
     (lens,) = lenses.values()
-    return replace(parse_zemax_file(lens, path, findings), glasses=glasses)
+    return described(replace(parse_zemax_file(lens, path, findings), glasses=glasses), findings, catalogues)
 
 
 def _members(data: bytes, path: Path) -> Iterator[tuple[str, bytes]]:
@@ -88,7 +94,7 @@ def _members(data: bytes, path: Path) -> Iterator[tuple[str, bytes]]:
 def _unpacked(packed: bytes, source: str) -> bytes:
     """Return the bytes of a compressed file; PrescriptionError if it is damaged or too long."""
     table = [bytes([value]) for value in range(256)]
-    found = bytearray()
+    unpacked = bytearray()
     previous = b""
     buffer = bits = 0
     width = 9
@@ -108,10 +114,10 @@ def _unpacked(packed: bytes, source: str) -> bytes:
             raise PrescriptionError(f"code {code} beyond the table of {len(table)}: a damaged file", file=source)
         if previous:
             table.append(previous + entry[:1])
-        found += entry
+        unpacked += entry
         previous = entry
         if len(table) >= 1 << width:
             width += 1
-        if len(found) > MAX_UNPACKED:
+        if len(unpacked) > MAX_UNPACKED:
             raise PrescriptionError(f"more than {MAX_UNPACKED} bytes when unpacked", file=source)
-    return bytes(found)
+    return bytes(unpacked)

@@ -8,8 +8,10 @@ import numpy as np
 
 from ....core.errors import PrescriptionError
 from ...aperture import Annulus, Aperture, Circle, Complement, Ellipse, Rectangle, Union, Vane, shifted
-from .file import Block, Findings
-from .text import number_text
+from ..lens.apertures import ellipse, rectangle, ring
+from ..lens.source import Findings
+from ..lens.text import number_text
+from .file import Block
 from .user_apertures import read_user_aperture
 
 
@@ -20,7 +22,7 @@ def read_aperture(block: Block, unit: float, findings: Findings) -> Aperture | N
     """
     shift = block.last("OBDC")
     x, y = (shift.number(0) * unit, shift.number(1) * unit) if shift else (0.0, 0.0)
-    found: list[Aperture] = []
+    regions: list[Aperture] = []
     for keyword in ("CLAP", "FLAP", "OBSC", "SQAP", "SQOB", "ELAP", "ELOB", "SPID"):
         line = block.last(keyword)
         if line is None:
@@ -35,26 +37,20 @@ def read_aperture(block: Block, unit: float, findings: Findings) -> Aperture | N
             turns = (2 * math.pi * arm / int(second) for arm in range(int(second)))
             region = Union(tuple(Vane(first * unit, x, y, turn) for turn in turns))
         elif keyword in ("SQAP", "SQOB", "ELAP", "ELOB"):
-            if not (first > 0 and second > 0):
-                raise line.error("two positive half widths")
-            if keyword in ("SQAP", "SQOB"):
-                region = Rectangle(2 * first * unit, 2 * second * unit, x, y)
-            else:
-                region = Ellipse(first * unit, second * unit, x, y)
-        elif not 0 <= first < second:
-            raise line.error("a smallest and a largest radius")
+            half = rectangle if keyword in ("SQAP", "SQOB") else ellipse
+            region = half(line, first * unit, second * unit, x, y)
         else:
-            region = Annulus(first * unit, second * unit, x, y) if first else Circle(second * unit, x, y)
-        found.append(Complement(region) if keyword in ("OBSC", "SQOB", "ELOB", "SPID") else region)
+            region = ring(line, first * unit, second * unit, x, y)
+        regions.append(Complement(region) if keyword in ("OBSC", "SQOB", "ELOB", "SPID") else region)
     for keyword in ("UDAD", "USAP", "USOB", "UDAP"):
         for line in block.all(keyword)[:1]:
             try:
-                found.append(shifted(read_user_aperture(line, unit), x, y))
+                regions.append(shifted(read_user_aperture(line, unit), x, y))
             except PrescriptionError as error:
                 findings.report(error, "taken as none")
-    if len(found) > 1:
+    if len(regions) > 1:
         raise block.lines[0].error("one aperture in this surface")
-    return found[0] if found else None
+    return regions[0] if regions else None
 
 
 def aperture_lines(aperture: Aperture, unit: float) -> list[str]:
@@ -86,7 +82,7 @@ def aperture_lines(aperture: Aperture, unit: float) -> list[str]:
 
 def _is_spider(union: Union) -> bool:
     """Return whether a union is one of equal vanes from one point, at equal angles, one of them along x."""
-    vanes = [part for part in union.parts if isinstance(part, Vane) and not part.both_ways]
+    vanes = [vane for vane in union.parts if isinstance(vane, Vane) and not vane.both_ways]
     if len(vanes) != len(union.parts) or len({(v.width, v.x, v.y) for v in vanes}) != 1:
         return False
     turns = np.sort(np.mod(np.array([v.angle for v in vanes]) + 1e-9, 2 * math.pi))

@@ -6,14 +6,14 @@ and whose lines are indented, and by merit function, tolerances and configuratio
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ....core.errors import PachonError, PrescriptionError, PrescriptionWarning
+from ....core.errors import PrescriptionError
 from ...media.medium import Medium
-from .text import Record, read_text, records
+from ..lens.source import Findings
+from ..lens.text import Record, read_text, records
 
 #: Keywords of the header without effect on rays: notes, names of other files, analysis and display settings,
 #: weights. Vignetting factors (VDXN...) and ray aiming (RAIM) select the rays that Zemax launches, not their paths.
@@ -36,38 +36,21 @@ IGNORED_SURFACE = frozenset(_SURFACE.split())
 
 
 @dataclass
-class Findings:
-    """Parts of a file that are not understood: errors, or where `lenient` is set warnings."""
-
-    lenient: bool = False
-
-    def report(self, error: PachonError, instead: str = "") -> None:
-        """Raise the error or, if lenient, warn; `instead` is the assumption in its place, for the warning."""
-        if not self.lenient:
-            raise error
-        self.note(error, instead)
-
-    def note(self, error: PachonError, instead: str = "") -> None:
-        """Warn of what is read in another way, `instead`, in either mode."""
-        warnings.warn(f"{error}; {instead}" if instead else str(error), PrescriptionWarning, stacklevel=2)
-
-
-@dataclass
 class Block:
     """Lines that belong together: the header, or a surface.
 
-    `source` is the file and `place` the part of it (``"surface 3"``, empty for a header), for messages. `used` holds
+    `file` is its name and `place` the part of it (``"surface 3"``, empty for a header), for messages. `used` holds
     the keywords that have been read.
     """
 
-    source: str
+    file: str
     place: str = ""
     lines: list[Record] = field(default_factory=list)
     used: set[str] = field(default_factory=set)
 
     def problem(self, text: str) -> PrescriptionError:
         """Return an error of this block."""
-        return PrescriptionError(text, file=self.source, place=self.place or None)
+        return PrescriptionError(text, file=self.file, place=self.place or None)
 
     def all(self, keyword: str) -> list[Record]:
         """Return every line with a keyword."""
@@ -76,8 +59,8 @@ class Block:
 
     def last(self, keyword: str) -> Record | None:
         """Return the last line with a keyword, or None."""
-        found = self.all(keyword)
-        return found[-1] if found else None
+        records = self.all(keyword)
+        return records[-1] if records else None
 
     def number(self, keyword: str, default: float, position: int = 0, *, infinite: bool = False) -> float:
         """Return a number of the last line with a keyword, or a default where there is no such line."""
@@ -104,7 +87,7 @@ class Block:
 class ZemaxFile:
     """Parts of a lens file: lines before the surfaces, surfaces from the object to the image, lines after.
 
-    `glasses` are those that the file itself defines, by name in capitals; `program` wrote the file.
+    `glasses` are those of catalogues packed with it, by name in capitals.
     """
 
     path: Path
@@ -112,7 +95,6 @@ class ZemaxFile:
     surfaces: list[Block]
     trailer: Block
     glasses: Mapping[str, Medium] = field(default_factory=dict)
-    program: str = "Zemax"
 
 
 def read_zemax_file(path: Path, findings: Findings) -> ZemaxFile:

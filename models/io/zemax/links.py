@@ -7,21 +7,24 @@ the solution stands in the file; they are named in a warning.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ....core.errors import PrescriptionError
 from ...links import Pickup, Solve
-from ...surface import Interaction
+from ...surface import Interaction, Surface
 from ...telescope import Telescope
 from ...thickness import thickness
-from ..writable import unmet_pickup
-from .file import Block, Findings
-from .text import number_text
+from ..lens.build import surface_names
+from ..lens.description import LensDescription, LensSurface
+from ..lens.source import Source
+from ..lens.text import number_text
+from .file import Block
 
-#: Solve types of a curvature and of a glass that take over that of another surface.
-_CURVATURE, _GLASS = 4, 2
+#: Solve type of a curvature that takes over that of another surface.
+_CURVATURE = 4
+#: Solve type of a glass that takes over that of another surface.
+_GLASS = 2
 #: Solves of a curvature without a place in a telescope, by their numbers: rays, normals, power, focal ratio...
 _CURVATURE_SOLVES = {
     2: "marginal ray angle",
@@ -43,36 +46,28 @@ _UNKEPT = frozenset(
 _LINES = {"radius": "CURV", "glass": "GLAS"}
 
 
-def with_links(
-    telescope: Telescope, blocks: list[Block], names: Mapping[int, str], unit: float, findings: Findings
-) -> Telescope:
-    """Return a telescope with the pickups and solves of its file; `names` are those of surfaces by their numbers.
+def state_links(lens: LensDescription, blocks: list[Block]) -> None:
+    """State the pickups and solves of a file.
 
-    Pickups that the values of the file do not meet, or of values that a telescope has not, are left out with a warning,
-    as are heights of real marginal rays, those of a zone other than 0.
+    Of pickups of values that a telescope has not, and of heights of real marginal rays, those of a zone other than 0,
+    there is a warning.
     """
-    pickups, solves = [], []
+    names = dict(zip((s.number for s in lens.surfaces), surface_names(lens.surfaces), strict=True))
+    mirrors = dict(zip(names.values(), _mirrors(lens.surfaces), strict=True))
     for number, block in enumerate(blocks):
-        for choices in _pickups(telescope, block, number, names, unit):
-            kept = next((one for one in choices if unmet_pickup(telescope, one) is None), None)
-            if kept is not None:
-                pickups.append(kept)
-            else:
-                findings.note(block.problem(f"{choices[0].address}: the file has another value"), "it is not kept")
+        source = Source(block.file, block.place)
+        lens.pickups += [(source, choices) for choices in _pickups(block, number, names, mirrors, lens.unit)]
         line = block.last("MAZH")
         if line is None or number not in names or names[number] == _last_name(names):
             continue
         if zone := line.number(1, 0.0):
             text = f"MAZH: zone {zone:g} of the pupil: expected 0, the paraxial ray; its solution stands in the file"
-            findings.note(block.problem(text), "it is not kept")
+            lens.findings.note(block.problem(text), "it is not kept")
         else:
-            solves.append(Solve(names[number], "marginal_height", line.number(0, 0.0) * unit))
+            lens.solves.append(Solve(names[number], "marginal_height", line.number(0, 0.0) * lens.unit))
     if unkept := [name for number, block in enumerate(blocks) for name in _unkept(block, number)]:
         text = f"pickups and solves {', '.join(unkept)}: their solutions stand in the file"
-        findings.note(PrescriptionError(text, file=blocks[0].source), "they are not kept")
-    if not (pickups or solves):
-        return telescope
-    return telescope.with_design(pickups=tuple(pickups), solves=tuple(solves))
+        lens.findings.note(lens.problem(text), "they are not kept")
 
 
 def _unkept(block: Block, number: int) -> Iterator[str]:
@@ -93,7 +88,7 @@ def _last_name(names: Mapping[int, str]) -> str:
 
 
 def _pickups(
-    t: Telescope, block: Block, number: int, names: Mapping[int, str], unit: float
+    block: Block, number: int, names: Mapping[int, str], mirrors: Mapping[str, int], unit: float
 ) -> Iterator[tuple[Pickup, ...]]:
     """Yield the pickups of a surface, each with the meanings that it may have."""
     if number not in names:
@@ -103,7 +98,7 @@ def _pickups(
         source, scale = names.get(int(curvature.number(2, 0.0))), curvature.number(3, 1.0)
         if source is not None and source != names[number] and scale:
             # Of the radius, or of the curvature.
-            yield tuple(Pickup(names[number], "radius", source, one) for one in dict.fromkeys((scale, 1.0 / scale)))
+            yield tuple(Pickup(names[number], "radius", source, f) for f in dict.fromkeys((scale, 1.0 / scale)))
     if gap is not None:
         source, scale = names.get(int(gap.number(0, 0.0))), gap.number(1, 1.0)
         if (
@@ -112,7 +107,7 @@ def _pickups(
             and scale
             and _last_name(names) not in (source, names[number])
         ):
-            scale, offset = _signed(t, names[number], source, scale, gap.number(2, 0.0) * unit)
+            scale, offset = _signed(mirrors, names[number], source, scale, gap.number(2, 0.0) * unit)
             yield (Pickup(names[number], "thickness", source, scale, offset),)
     if glass is not None and glass.number(1, 0.0) == _GLASS:
         source = names.get(int(glass.number(2, 0.0)))
@@ -127,25 +122,26 @@ def add_link_lines(t: Telescope, own: Mapping[str, tuple[int, list[str]]], unit:
     breaks stand in, nor the glass of a mirror that is also that of a lens surface.
     """
     left_out: list[Pickup | Solve] = []
+    mirrors = dict(zip(t.surface_names, _mirrors(t.surfaces), strict=True))
     for pickup in t.design_data.pickups:
-        (number, there), lines = own[pickup.source], own[pickup.surface][1]
-        here, source = (_line(ls, _LINES.get(pickup.quantity, "")) for ls in (lines, there))
+        (number, source_lines), lines = own[pickup.source], own[pickup.surface][1]
+        follower_line, source = (_line(ls, _LINES.get(pickup.quantity, "")) for ls in (lines, source_lines))
         if pickup.quantity == "thickness":
             held = all(_is_one_line(t, name, own[name][1], unit) for name in (pickup.surface, pickup.source))
-            scale, offset = _signed(t, pickup.surface, pickup.source, pickup.scale, pickup.offset)
-            new = f"PZUP {number} {number_text(scale)} {number_text(offset / unit)} 0"
+            scale, offset = _signed(mirrors, pickup.surface, pickup.source, pickup.scale, pickup.offset)
+            link_line = f"PZUP {number} {number_text(scale)} {number_text(offset / unit)} 0"
         elif pickup.quantity == "glass":
-            held = bool(here) and here.split()[1:2] == source.split()[1:2]
-            new = here.replace(" 0 0 ", f" {_GLASS} {number} ", 1)
+            held = bool(follower_line) and follower_line.split()[1:2] == source.split()[1:2]
+            link_line = follower_line.replace(" 0 0 ", f" {_GLASS} {number} ", 1)
         else:
-            held = bool(here and source) and abs(pickup.scale) == 1.0 and not pickup.offset
-            new = f"{here} {_CURVATURE} {number} {number_text(pickup.scale)}"
+            held = bool(follower_line and source) and abs(pickup.scale) == 1.0 and not pickup.offset
+            link_line = f"{follower_line} {_CURVATURE} {number} {number_text(pickup.scale)}"
         if not held:
             left_out.append(pickup)
         elif pickup.quantity == "thickness":
-            lines.append(new)
+            lines.append(link_line)
         else:
-            lines[lines.index(here)] = new
+            lines[lines.index(follower_line)] = link_line
     for solve in t.design_data.solves:
         lines = own[solve.surface][1]
         if solve.kind == "marginal_height" and _is_one_line(t, solve.surface, lines, unit):
@@ -166,11 +162,15 @@ def _is_one_line(t: Telescope, name: str, lines: list[str], unit: float) -> bool
     return math.isclose(abs(written), abs(thickness(t, t.surface_names.index(name))), rel_tol=1e-12, abs_tol=1e-15)
 
 
-def _signed(t: Telescope, surface: str, source: str, scale: float, offset: float) -> tuple[float, float]:
+def _mirrors(surfaces: Sequence[Surface | LensSurface]) -> list[int]:
+    """Return the number of mirrors up to each surface."""
+    return np.cumsum([s.interaction == Interaction.MIRROR for s in surfaces]).tolist()
+
+
+def _signed(mirrors: Mapping[str, int], surface: str, source: str, scale: float, offset: float) -> tuple[float, float]:
     """Return scale and offset of thicknesses with the signs of a file, where they are negative behind odd mirrors.
 
     The other way round it is the same.
     """
-    mirrors = np.cumsum([s.interaction == Interaction.MIRROR for s in t.surfaces])
-    here, there = (-1.0 if mirrors[t.surface_names.index(name)] % 2 else 1.0 for name in (surface, source))
-    return here * there * scale, here * offset
+    follower_sign, source_sign = (-1.0 if mirrors[name] % 2 else 1.0 for name in (surface, source))
+    return follower_sign * source_sign * scale, follower_sign * offset

@@ -32,15 +32,17 @@ from ...shapes.polynomial import XYPolynomial, ZernikeSag
 from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere
 from ...shapes.sum import Sum
 from ...zernike_polynomials import annular_zernikes
-from .file import Block, Findings
-from .text import number_text
+from ..lens import shapes
+from ..lens.shapes import MOST_ODD, even_asphere, polynomial_powers, square_term
+from ..lens.source import Findings
+from ..lens.text import number_text
+from .file import Block
 
 TYPES = (
     *("STANDARD", "EVENASPH", "ODDASPHE", "BICONICX", "TOROIDAL"),
     *("SZERNSAG", "XPOLYNOM", "XASPHERE", "TILTSURF", "GRID_SAG", "QED_TYPE"),
 )
 MOST_TERMS = 1000
-MOST_ODD = 30
 MOST_NODES = 4_000_000
 #: Qcon terms at most: more have powers of r that cancel beyond the twelfth digit.
 MOST_Q = 10
@@ -56,85 +58,40 @@ def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
         kind = "STANDARD"
     curvature, conic = block.number("CURV", 0.0) / unit, block.number("CONI", 0.0)
     parameters = {i: v for i, v in block.table("PARM").items() if v != 0}
-    parts: list[Shape] = [_conic(curvature, conic)]
+    base = shapes.conic(curvature, conic)
     if kind in ("EVENASPH", "SZERNSAG", "GRID_SAG"):
-        powers = [parameters.pop(i, 0.0) * unit ** (1 - 2 * i) for i in range(1, 9)]
-        parts = _even_asphere(curvature, conic, powers)
+        base = even_asphere(curvature, conic, [parameters.pop(i, 0.0) * unit ** (1 - 2 * i) for i in range(1, 9)])
     elif kind == "ODDASPHE":
-        odd = tuple(_trimmed([parameters.pop(i, 0.0) * unit ** (1 - i) for i in range(1, MOST_ODD + 1)]))
-        parts = [OddAsphere(_radius(curvature), conic, odd)] if odd else parts
+        powers = [parameters.pop(i, 0.0) * unit ** (1 - i) for i in range(1, MOST_ODD + 1)]
+        base = shapes.odd_asphere(curvature, conic, powers)
     elif kind == "BICONICX":
         radius_x = parameters.pop(1, math.inf) * unit
-        parts = [Biconic(radius_x, _radius(curvature), parameters.pop(2, 0.0), conic)]
+        base = Biconic(radius_x, shapes.radius_of(curvature), parameters.pop(2, 0.0), conic)
     elif kind == "TOROIDAL":
-        radius_x = parameters.pop(1, math.inf) * unit
-        flat = curvature == 0 and math.isinf(radius_x)
-        parts = [Plane() if flat else Toroid(radius_x, _radius(curvature), conic)]
+        base = shapes.toroid(parameters.pop(1, math.inf) * unit, curvature, conic)
     elif kind == "TILTSURF":
-        parts = [XYPolynomial(((1, 0, parameters.pop(1, 0.0)), (0, 1, parameters.pop(2, 0.0))))]
+        base = XYPolynomial(((1, 0, parameters.pop(1, 0.0)), (0, 1, parameters.pop(2, 0.0))))
     elif kind == "XASPHERE":
         radius, terms = _extra_data(block, unit)
-        parts = _even_asphere(curvature, conic, [a / radius ** (2 * i) for i, a in enumerate(terms, start=1)] or [0.0])
+        base = even_asphere(curvature, conic, [a / radius ** (2 * i) for i, a in enumerate(terms, start=1)])
     elif kind == "QED_TYPE":
-        parts = _even_asphere(curvature, conic, _qcon_powers(block, unit, findings))
+        base = even_asphere(curvature, conic, _qcon_powers(block, unit, findings))
     for i, value in sorted(parameters.items()):
         findings.report(block.problem(f"PARM {i} {value:g}: not understood for TYPE {kind}"))
-    if kind in ("SZERNSAG", "TOROIDAL", "XPOLYNOM"):
-        parts += _expansion(block, kind, unit)
-    elif kind == "GRID_SAG":
-        parts.append(_grid(block, unit))
-    elif kind not in ("XASPHERE", "QED_TYPE"):
+    if kind in ("SZERNSAG", "TOROIDAL"):
+        radius, terms = _extra_data(block, unit)
+        return shapes.zernike(base, terms, radius)
+    if kind == "XPOLYNOM":
+        radius, terms = _extra_data(block, unit)
+        rows = ((i, j, a) for (i, j), a in zip(polynomial_powers(len(terms)), terms, strict=False))
+        return shapes.polynomial(base, rows, radius)
+    if kind == "GRID_SAG":
+        return shapes.total(base, _grid(block, unit))
+    if kind not in ("XASPHERE", "QED_TYPE"):
         for i, value in block.table("XDAT").items():
             if value != 0:
                 findings.report(block.problem(f"XDAT {i} {value:g}: not understood for TYPE {kind}"))
-    acting = [part for part in parts if not isinstance(part, Plane)]
-    if len(acting) > 1:
-        return Sum(tuple(acting))
-    return acting[0] if acting else Plane()
-
-
-def _radius(curvature: float) -> float:
-    return 1.0 / curvature if curvature else math.inf
-
-
-def _conic(curvature: float, conic: float) -> Shape:
-    if curvature == 0:
-        return Plane()
-    return Conic(1.0 / curvature, conic) if conic else Sphere(1.0 / curvature)
-
-
-def _trimmed(values: list[float]) -> list[float]:
-    while values and values[-1] == 0:
-        values = values[:-1]
-    return values
-
-
-def _even_asphere(curvature: float, conic: float, powers: list[float]) -> list[Shape]:
-    """Return an asphere, `powers` those of r^2, r^4...; a term in r^2 becomes a part of its own."""
-    higher = tuple(_trimmed(powers[1:]))
-    if not higher:
-        base = _conic(curvature, conic)
-    elif curvature == 0:
-        base = XYPolynomial(_flat_terms(higher))
-    else:
-        base = EvenAsphere(1.0 / curvature, conic, higher)
-    return [base, XYPolynomial(((2, 0, powers[0]), (0, 2, powers[0])))] if powers[0] else [base]
-
-
-def _flat_terms(coefficients: tuple[float, ...]) -> tuple[tuple[int, int, float], ...]:
-    """Return a sum of even powers of r, from r^4, as a polynomial of x and y: (x^2 + y^2)^n by the binomial theorem."""
-    return tuple(
-        (2 * i, 2 * (n - i), a * math.comb(n, i))
-        for n, a in enumerate(coefficients, start=2)
-        if a
-        for i in range(n + 1)
-    )
-
-
-def polynomial_powers(count: int) -> list[tuple[int, int]]:
-    """Return the powers (i, j) of x and y of the terms of an extended polynomial: x, y, x^2, xy, y^2, x^3..."""
-    powers = [(n - j, j) for n in range(1, 60) for j in range(n + 1)]
-    return powers[:count]
+    return base
 
 
 def _extra_data(block: Block, unit: float) -> tuple[float, list[float]]:
@@ -177,19 +134,6 @@ def _qcon_powers(block: Block, unit: float, findings: Findings) -> list[float]:
     return [0.0, *(a / radius ** (2 * s + 4) for s, a in enumerate(powers))]
 
 
-def _expansion(block: Block, kind: str, unit: float) -> list[Shape]:
-    """Return the polynomial that the extra data of a surface describe."""
-    radius, terms = _extra_data(block, unit)
-    if not any(terms):
-        return []
-    if kind == "XPOLYNOM":
-        powers = polynomial_powers(len(terms))
-        return [
-            XYPolynomial(tuple((i, j, a / radius ** (i + j)) for (i, j), a in zip(powers, terms, strict=False) if a))
-        ]
-    return [ZernikeSag(tuple(terms), radius)]
-
-
 def _grid(block: Block, unit: float) -> GridSag:
     size = block.last("GDAT")
     if size is None:
@@ -217,15 +161,15 @@ def shape_lines(shape: Shape, unit: float) -> list[str]:
     """
     parts = list(shape.parts) if isinstance(shape, Sum) else [shape]
     base = next((p for p in parts if not isinstance(p, XYPolynomial | ZernikeSag | GridSag)), Plane())
-    rest = [p for p in parts if p is not base]
+    additions = [p for p in parts if p is not base]
     if isinstance(base, Biconic | Toroid | OddAsphere):
-        if rest:
+        if additions:
             raise PrescriptionError(f"sum with {type(base).__name__}: no type of Zemax surface has this shape")
         return _special_lines(base, unit)
     if not isinstance(base, Plane | Sphere | Conic | EvenAsphere):
         raise PrescriptionError(f"shape {type(base).__name__}: no type of Zemax surface has this shape")
-    square, rest = square_term(rest)
-    if len(rest) > 1:
+    square, additions = square_term(additions)
+    if len(additions) > 1:
         raise PrescriptionError("sum of several shapes: no type of Zemax surface has this shape")
     head = [f"CURV {number_text(base.curvature * unit)}", f"CONI {number_text(base.conic)}"]
     powers = [square, *base.coefficients]
@@ -233,16 +177,16 @@ def shape_lines(shape: Shape, unit: float) -> list[str]:
         raise PrescriptionError(f"{len(base.coefficients)} coefficients: a Zemax surface has 7 from r^4 to r^16")
     parameters = [f"PARM {i} {number_text(a * unit ** (2 * i - 1))}" for i, a in enumerate(powers, start=1)]
     curved = any(powers)
-    if not rest:
+    if not additions:
         return ["TYPE EVENASPH", *head, *parameters] if curved else ["TYPE STANDARD", *head]
-    part = rest[0]
-    if isinstance(part, ZernikeSag):
-        return ["TYPE SZERNSAG", *head, *parameters, *_zernike_lines(part, unit)]
-    if isinstance(part, GridSag):
-        return ["TYPE GRID_SAG", *head, *parameters, *_grid_lines(part, unit)]
-    if isinstance(part, XYPolynomial) and not curved:
-        return ["TYPE XPOLYNOM", *head, *_polynomial_lines(part, unit)]
-    raise PrescriptionError(f"asphere with {type(part).__name__}: no type of Zemax surface has this shape")
+    addition = additions[0]
+    if isinstance(addition, ZernikeSag):
+        return ["TYPE SZERNSAG", *head, *parameters, *_zernike_lines(addition, unit)]
+    if isinstance(addition, GridSag):
+        return ["TYPE GRID_SAG", *head, *parameters, *_grid_lines(addition, unit)]
+    if isinstance(addition, XYPolynomial) and not curved:
+        return ["TYPE XPOLYNOM", *head, *_polynomial_lines(addition, unit)]
+    raise PrescriptionError(f"asphere with {type(addition).__name__}: no type of Zemax surface has this shape")
 
 
 def _special_lines(shape: Biconic | Toroid | OddAsphere, unit: float) -> list[str]:
@@ -259,15 +203,6 @@ def _special_lines(shape: Biconic | Toroid | OddAsphere, unit: float) -> list[st
     lines = [f"TYPE {kind}", f"CURV {number_text(unit / shape.radius_y)}", f"CONI {number_text(shape.conic_y)}"]
     lines.append(f"PARM 1 {number_text(reach(shape.radius_x))}")
     return [*lines, f"PARM 2 {number_text(shape.conic_x)}"] if isinstance(shape, Biconic) else lines
-
-
-def square_term(parts: list[Shape]) -> tuple[float, list[Shape]]:
-    """Return the coefficient of r^2 that a part of its own has, and the other parts."""
-    for part in parts:
-        terms = {(i, j): a for i, j, a in part.terms} if isinstance(part, XYPolynomial) else {}
-        if set(terms) == {(2, 0), (0, 2)} and terms[2, 0] == terms[0, 2]:
-            return terms[2, 0], [p for p in parts if p is not part]
-    return 0.0, parts
 
 
 def _extra(count: int, radius: float, terms: list[float], unit: float) -> list[str]:
@@ -299,13 +234,13 @@ def _complete(count: int) -> int:
 
 
 def _polynomial_lines(part: XYPolynomial, unit: float) -> list[str]:
-    found = {(i, j): a for i, j, a in part.terms}
-    if (0, 0) in found:
+    coefficients = {(i, j): a for i, j, a in part.terms}
+    if (0, 0) in coefficients:
         raise PrescriptionError("polynomial of x and y with a constant term: a Zemax surface has none")
-    degree = max(i + j for i, j in found)
+    degree = max(i + j for i, j in coefficients)
     powers = polynomial_powers((degree + 1) * (degree + 2) // 2 - 1)
     # Lengths in units of the lens unit: the normalisation radius is one of these.
-    return _extra(len(powers), unit, [found.get(p, 0.0) * unit ** sum(p) for p in powers], unit)
+    return _extra(len(powers), unit, [coefficients.get(p, 0.0) * unit ** sum(p) for p in powers], unit)
 
 
 def _grid_lines(part: GridSag, unit: float) -> list[str]:

@@ -1,42 +1,67 @@
-"""System data of a Zemax file: units, wavelengths, fields, aperture; and the paraxial pupils.
+"""System data of a Zemax file, read and written: units, aperture, fields, wavelengths, ray aiming and environment.
 
-Like Zemax, the paraxial trace follows the surfaces along their thicknesses and ignores coordinate breaks.
+The lists of the header are longer than the number of fields in old files; FTYP has the number.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
-from ...paraxial import ParaxialSurfaces, StopImage, reference_radius
-from .design import Fields
-from .file import Block, Findings, ZemaxFile
-from .text import scaled
+import numpy as np
 
+from ...design_data import AIMING, FIELD_TYPES, DesignData
+from ...media.air import STANDARD_ATMOSPHERE, ZERO_CELSIUS
+from ..lens.description import INFINITE, Format, LensDescription
+from ..lens.source import Source
+from ..lens.text import number_text, scaled
+from .file import Block
+
+FORMAT = Format("Zemax", "a line ENPD, FNUM or FLOA", "lines WAVM", "STOP")
 UNITS = {"MM": 1e-3, "CM": 1e-2, "IN": 0.0254, "INCH": 0.0254, "METER": 1.0, "METERS": 1.0, "M": 1.0}
-#: Field radius [rad] of a file with the axis alone.
-LEAST_FIELD = math.radians(0.1)
 #: Aperture lines of a header, the first of which counts.
 APERTURES = ("ENPD", "FNUM", "OBNA", "OBSN", "FLOA")
+#: Lists of vignetting factors in the order of :class:`DesignData`, with the older names.
+_VIGNETTING = (("VDXN", "ZVDX"), ("VDYN", "ZVDY"), ("VCXN", "ZVCX"), ("VCYN", "ZVCY"), ("VANN", "ZVAN"))
+#: Fields of a file at most.
+_MOST_FIELDS = 200
 
 
-@dataclass(frozen=True)
-class Wavelengths:
-    """Wavelengths of a file [m], their weights and the primary one."""
+def read_system(lens: LensDescription, header: Block) -> None:
+    """State the system data of a header; PrescriptionError where they are not as expected."""
+    unit = header.last("UNIT")
+    name = unit.words[0].upper() if unit is not None and unit.words else "MM"
+    if unit is not None and name not in UNITS:
+        raise unit.problem(f"UNIT {unit.words[0]}: expected one of {', '.join(UNITS)}")
+    lens.state_unit(UNITS[name])
+    lens.title, lens.version = header.text("NAME"), (header.text("VERS").split() or ["1"])[0]
+    _read_wavelengths(lens, header)
+    _read_fields(lens, header)
+    _read_apertures(lens, header)
+    aiming = header.last("RAIM")
+    if aiming is not None:
+        if not 0 <= aiming.integer(1, 0) < len(AIMING):
+            raise aiming.error("ray aiming from 0 to 2")
+        lens.state(aiming, aiming=AIMING[aiming.integer(1, 0)])
+    environment = header.last("ENVD")
+    if environment is not None:
+        air = environment.number(0), environment.number(1, 1.0)
+        lens.state_air(environment, *air)
+        if environment.number(2, 0.0) != 0 and air != (20.0, 1.0):
+            text = f"{environment.shown}: indices are not adjusted to temperature and pressure"
+            lens.findings.report(environment.problem(text))
 
-    values: tuple[float, ...]
-    weights: tuple[float, ...]
-    primary: float
 
-    def band(self, low: float, high: float) -> tuple[float, float]:
-        """Return the span of the wavelengths, at least 2 % wide, within the limits."""
-        return max(min(self.values) * 0.99, low), min(max(self.values) * 1.01, high)
+def object_distance(block: Block, unit: float) -> float:
+    """Return the distance [m] of the object, from its block, to the first surface."""
+    distance = block.number("DISZ", math.inf, infinite=True) * unit
+    # Lens files write "at infinity" as a distance of 1e10 units too.
+    return math.inf if distance >= INFINITE * unit else distance
 
 
-def read_wavelengths(header: Block) -> Wavelengths:
-    """Return the wavelengths: lines WAVM, as many as FTYP counts, or the older WAVL; PrescriptionError if none."""
+def _read_wavelengths(lens: LensDescription, header: Block) -> None:
+    """State the wavelengths: lines WAVM, as many as FTYP counts, or the older WAVL."""
     lines = header.all("WAVM")
-    listed = header.last("WAVL")
+    listed, primary = header.last("WAVL"), header.last("PWAV")
     count = header.number("FTYP", 0.0, 3) if (kind := header.last("FTYP")) and len(kind.words) > 3 else 0.0
     if lines:
         table = {line.integer(0): line.number(1) for line in lines}
@@ -48,90 +73,92 @@ def read_wavelengths(header: Block) -> Wavelengths:
         values = [table[number] for number in numbers]
         amounts = {line.integer(0): line.number(2, 1.0) for line in lines}
         weights = [amounts[number] for number in numbers]
+        source: Source = next((line for line in lines if not line.number(1) > 0), lines[0])
     elif listed is not None:
-        values = [listed.number(i) for i in range(len(listed.words))]
+        source, values = listed, listed.numbers()
         stated = header.last("WWGT")
         weights = [1.0 if stated is None else stated.number(i, 1.0) for i in range(len(values))]
     else:
-        values, weights = [], []
-    if not values or not all(0 < v < 1e4 for v in values):
-        raise header.problem(f"WAVM {values}: expected at least one positive wavelength in um")
-    primary = header.number("PWAV", 1.0)
-    if not 1 <= primary <= len(values) or primary != int(primary):
-        raise header.problem(f"PWAV {primary:g}: expected 1 to {len(values)}")
-    metres = tuple(scaled(v, -6) for v in values)
-    return Wavelengths(metres, tuple(weights), metres[int(primary) - 1])
+        return
+    number = 1 if primary is None else primary.integer(0)
+    if primary is not None and values and not 1 <= number <= len(values):
+        raise primary.error(f"1 to {len(values)}")
+    lens.state_wavelengths(source, [scaled(v, -6) for v in values], weights, number - 1)
 
 
-@dataclass(frozen=True)
-class Pupil:
-    """Entrance pupil of a file: the image of its stop, its diameter [m], and what follows from them.
+def _read_fields(lens: LensDescription, header: Block) -> None:
+    """State the field points, their weights and vignetting factors, and what the image space is like."""
+    line = header.last("FTYP")
+    kind = round(header.number("FTYP", 0.0))
+    if line is not None and not 0 <= kind < len(FIELD_TYPES):
+        raise line.problem(f"FTYP {kind}: expected 0 to {len(FIELD_TYPES) - 1}")
+    stated = int(line.number(2, 0.0)) if line is not None else 0
+    sources = [_list(header, names) for names in (("XFLN", "XFLD"), ("YFLN", "YFLD"))]
+    columns = [values for _, values in sources]
+    count = stated if 1 <= stated <= _MOST_FIELDS else max(1, *map(len, columns))
+    points = zip(*((values + [0.0] * count)[:count] for values in columns), strict=True)
+    farthest = max(sources, key=lambda column: max(map(abs, column[1]), default=-1.0))[0]
+    lens.state_fields(farthest, FIELD_TYPES[kind], points)
+    lens.state_field_weights(*_list(header, ("FWGN", "FWGT")))
+    factors = [_list(header, names) for names in _VIGNETTING]
+    source = next((source for source, values in factors if any(values)), factors[0][0])
+    lens.state_vignetting(source, *(values for _, values in factors))
+    if line is not None:
+        lens.telecentric = line.number(1, 0.0) == 1
+        lens.state(line, afocal=line.number(6, 0.0) == 1)
 
-    `aperture` is the size of the beam as the file states it, in the terms of :class:`DesignData`, `reference_radius`
-    the radius of the reference sphere [m].
+
+def _list(header: Block, names: tuple[str, str]) -> tuple[Source, list[float]]:
+    """Return the first of two lines that the header has, and its numbers."""
+    line = next((record for name in names if (record := header.last(name)) is not None), None)
+    return (Source(header.file, keyword=names[0]), []) if line is None else (line, line.numbers())
+
+
+def _read_apertures(lens: LensDescription, header: Block) -> None:
+    for keyword in APERTURES:
+        line = header.last(keyword)
+        if line is None:
+            continue
+        if keyword == "FLOA":
+            lens.state_aperture(line, "stop", 0.0)
+        elif keyword == "ENPD":
+            lens.state_aperture(line, "entrance_pupil", line.number(0, 0.0) * lens.unit)
+        elif keyword == "FNUM":
+            working = line.number(1, 0.0) == 1
+            lens.state_aperture(line, "working_f_number" if working else "f_number", line.number(0, 0.0))
+        else:
+            lens.state_aperture(line, "object_na", line.number(0, 0.0))
+
+
+def design_lines(data: DesignData, unit: float) -> list[str]:
+    """Return the lines of the header with fields and environment; `unit` is that of the file [m].
+
+    Where no fields are stated, the caller has some of its own.
     """
-
-    image: StopImage
-    diameter: float
-    aperture: tuple[str, float]
-    field_radius: float
-    reference_radius: float
-
-
-def read_pupil(
-    file: ZemaxFile, surfaces: ParaxialSurfaces, unit: float, wavelength: float, fields: Fields, findings: Findings
-) -> Pupil:
-    """Return the paraxial entrance pupil and the field of a file at its primary `wavelength` [m].
-
-    `unit` is the lens unit [m]. PrescriptionError if pupil and object are at infinity, or the pupil has no size or,
-    unless lenient, the aperture is given twice.
-    """
-    header = file.header
-    distance = file.surfaces[0].number("DISZ", math.inf, infinite=True) * unit
-    # Lens files write "at infinity" as a distance of 1e10 units too.
-    distance = math.inf if distance >= 1e9 * unit else distance
-    telecentric = fields.telecentric and math.isfinite(distance)
-    # The trace starts at the first surface; a distance to a break in front of it does not count.
-    image = StopImage.of(surfaces, wavelength, distance, telecentric=telecentric)
-    if image is None:
-        raise header.problem("the stop makes an entrance pupil at infinity (telecentric): not supported")
-    found = {keyword: aperture for keyword in APERTURES if (aperture := _aperture(header, keyword, surfaces, unit))}
-    if not found:
-        raise header.problem("expected the aperture: a line ENPD, FNUM or FLOA")
-    keyword, aperture = next(iter(found.items()))
-    diameter = image.diameter(*aperture)
-    if not 0 < diameter < math.inf:
-        raise header.problem(f"{keyword}: expected an entrance pupil of finite size, not {diameter:g} m")
-    if len(found) > 1:
-        findings.report(header.problem(f"{' and '.join(found)}: two apertures"), f"{keyword} is taken")
-    to_pupil = image.image_scale / image.image_slope if image.image_slope else math.inf
-    radius = reference_radius(to_pupil, image.focal_length, diameter)
-    return Pupil(image, diameter, aperture, _field_radius(header, fields, unit, image), radius)
+    lines = []
+    if data.fields:
+        size = math.radians(1.0) if data.field_type == "angle" else unit
+        x, y = (np.array(data.fields) / np.array([-size, size])).T
+        weights = data.field_weights or [1.0] * len(data.fields)
+        columns = [("XFLN", x), ("YFLN", y), ("FWGN", weights)]
+        if data.vignetting:
+            factors = (np.array(data.vignetting) * np.array([-1.0, 1.0, 1.0, 1.0, -math.degrees(1.0)])).T
+            columns += [(names[0], column) for names, column in zip(_VIGNETTING, factors, strict=True)]
+        lines += [f"{keyword} {' '.join(map(number_text, column))}" for keyword, column in columns]
+    celsius = 20.0 if data.temperature is None else data.temperature - ZERO_CELSIUS
+    atmospheres = 1.0 if data.pressure is None else data.pressure / STANDARD_ATMOSPHERE
+    return [*lines, f"ENVD {number_text(celsius)} {number_text(atmospheres)} 0"]
 
 
-def _aperture(header: Block, keyword: str, surfaces: ParaxialSurfaces, unit: float) -> tuple[str, float] | None:
-    """Return an aperture line of the header in the terms of :class:`DesignData`."""
-    line = header.last(keyword)
-    if line is None:
-        return None
-    if keyword == "FLOA":
-        return "stop", surfaces.stop_radius
-    value = line.number(0, 0.0)
-    if keyword == "ENPD":
-        return "entrance_pupil", value * unit
-    if keyword == "FNUM":
-        return "working_f_number" if line.number(1, 0.0) == 1 else "f_number", value
-    return "object_na", value
-
-
-def _field_radius(header: Block, fields: Fields, unit: float, image: StopImage) -> float:
-    """Return the largest field angle [rad]; heights become angles by their paraxial scales."""
-    if fields.kind == 0:
-        # As the two angles are given: the square root of the sum of their squares.
-        radius = math.radians(fields.largest)
-    else:
-        reach = abs(image.object_distance + image.z if fields.kind == 1 else image.image_scale)
-        radius = math.atan(fields.largest * unit / reach) if 0 < reach < math.inf else 0.0
-    if not radius < math.radians(89.0):
-        raise header.problem("XFLN, YFLN: expected fields within 89 degrees of the axis")
-    return max(radius, LEAST_FIELD)
+def stop_lines(data: DesignData, unit: float) -> list[str]:
+    """Return the lines of the header with the aperture as stated, and ray aiming at the stop."""
+    assert data.aperture_value is not None
+    value = data.aperture_value
+    line = {
+        "entrance_pupil": f"ENPD {number_text(value / unit)}",
+        "f_number": f"FNUM {number_text(value)} 0",
+        "working_f_number": f"FNUM {number_text(value)} 1",
+        "object_na": f"OBNA {number_text(value)} 0",
+        "stop": "FLOA",
+    }[data.aperture or ""]
+    return [line, f"RAIM 0 {AIMING.index(data.aiming)} 1 1 0 0 0 0 0 1"]

@@ -18,17 +18,21 @@ import numpy as np
 from ....core.errors import PrescriptionError, error_context
 from ....core.files import read_bytes
 from ...aperture import Aperture, Circle, Complement, Ellipse, Intersection, Polygon, Union
-from .text import Record, decoded, records
+from ..lens.text import Record, decoded, records
 
 #: Keywords of surfaces, and whether light passes within the outlines.
 KEYWORDS = {"USAP": True, "USOB": False}
 #: Folder beside a lens file in which its apertures may stand.
 _FOLDER = "apertures"
 _NAME = re.compile(r'"([^"]*\.uda)"|(\S+\.uda)(?!\S)', re.IGNORECASE)
-#: Corners, and bytes, of a file at most.
-_MOST_CORNERS, _MAX_BYTES = 20_000, 2_000_000
-#: Points of a circle, and of an edge of a polygon, by which it is told which outline stands within which.
-_POINTS, _EDGE_POINTS = 256, 16
+#: Corners of an outline at most.
+_MOST_CORNERS = 20_000
+#: Longest file [byte].
+_MAX_BYTES = 2_000_000
+#: Points of a circle by which it is told which outline stands within which.
+_POINTS = 256
+#: Points of an edge of a polygon for the same.
+_EDGE_POINTS = 16
 #: Distance of these points from the rim, over the size of the outline.
 _WITHIN = 1e-7
 
@@ -37,8 +41,8 @@ Outline = Polygon | Circle | Ellipse
 
 def aperture_name(line: str) -> str | None:
     """Return the name of a file of outlines in a line, without its folder, or None."""
-    found = _NAME.search(line)
-    return None if found is None else re.split(r"[/\\]", found[1] or found[2])[-1]
+    name_match = _NAME.search(line)
+    return None if name_match is None else re.split(r"[/\\]", name_match[1] or name_match[2])[-1]
 
 
 def aperture_file(lens: Path, name: str) -> Path | None:
@@ -61,7 +65,7 @@ def read_user_aperture(line: Record, unit: float) -> Aperture:
     name = aperture_name(line.text)
     if line.keyword not in KEYWORDS or name is None:
         raise line.problem(f"{line.shown}: user-defined apertures are read where USAP or USOB names a file NAME.uda")
-    path = aperture_file(Path(line.source), name)
+    path = aperture_file(Path(line.file), name)
     if path is None:
         raise line.problem(f"{line.shown}: expected the file {name} beside the lens file")
     text = decoded(read_bytes(path, PrescriptionError, max_bytes=_MAX_BYTES), name)
@@ -73,7 +77,7 @@ def read_user_aperture(line: Record, unit: float) -> Aperture:
 
 def _outlines(text: str, source: str, unit: float) -> list[Outline]:
     """Return the outlines of the text of a file [m]; `source` is its name for messages."""
-    found: list[Outline] = []
+    outlines: list[Outline] = []
     corners: list[tuple[float, float]] = []
 
     def end(place: int) -> None:
@@ -81,7 +85,7 @@ def _outlines(text: str, source: str, unit: float) -> list[Outline]:
             corners.pop()
         if corners:
             with error_context(file=source, place=f"before line {place}"):
-                found.append(Polygon(tuple((x * unit, y * unit) for x, y in corners)))
+                outlines.append(Polygon(tuple((x * unit, y * unit) for x, y in corners)))
             corners.clear()
 
     number = 0
@@ -104,15 +108,15 @@ def _outlines(text: str, source: str, unit: float) -> list[Outline]:
         sizes = [line.number(i) * unit for i in range({"CIR": 3, "ELI": 4}.get(line.keyword, 0))]
         with error_context(file=source, place=f"line {number}"):
             if line.keyword == "CIR":
-                found.append(Circle(sizes[2], sizes[0], sizes[1]))
+                outlines.append(Circle(sizes[2], sizes[0], sizes[1]))
             elif line.keyword == "ELI":
-                found.append(Ellipse(sizes[2], sizes[3], sizes[0], sizes[1], math.radians(line.number(4, 0.0))))
+                outlines.append(Ellipse(sizes[2], sizes[3], sizes[0], sizes[1], math.radians(line.number(4, 0.0))))
             elif line.keyword != "BRK":
                 raise PrescriptionError(f"{line.keyword}: expected LIN, BRK, CIR or ELI")
     end(number + 1)
-    if not found:
+    if not outlines:
         raise PrescriptionError("expected at least one outline", file=source)
-    return found
+    return outlines
 
 
 def _even_odd(outlines: list[Outline]) -> Aperture:
@@ -121,10 +125,10 @@ def _even_odd(outlines: list[Outline]) -> Aperture:
     for i, outline in enumerate(outlines):
         points = _rim(outline)
         inside: set[int] = set()
-        for j, other in enumerate(outlines):
+        for j, second_outline in enumerate(outlines):
             if i == j:
                 continue
-            held = other.contains(*points)
+            held = second_outline.contains(*points)
             if held.any() and not held.all():
                 raise PrescriptionError(
                     f"outlines {i + 1} and {j + 1} cross: expected them beside or within each other"

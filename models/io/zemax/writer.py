@@ -21,19 +21,18 @@ from ...design_data import FIELD_TYPES, DesignData
 from ...media.dispersion import Dispersion
 from ...media.medium import ConstantIndex, Medium, Sellmeier
 from ...paraxial import stop_states_rays, with_true_aperture
-from ...rotation import rotation_angles
-from ...surface import Interaction, Surface
+from ...surface import Interaction
 from ...telescope import VACUUM, Telescope
 from ..glass_catalogue import NUMBERED, SELLMEIER_TERMS, GlassCatalogue
+from ..lens.description import PUPIL_PLANE, LensSurface
+from ..lens.sequence import lens_surfaces, stated_wavelengths
+from ..lens.source import Findings
+from ..lens.text import number_text, scaled
 from ..writable import report_pupil_plane, report_unheld, require_met, require_sequential, with_formulas
 from .apertures import aperture_lines
-from .design import design_lines, stop_lines
-from .file import Findings
-from .frame import HALF_TURN, rotated_aperture, rotated_shape
 from .links import add_link_lines
-from .reader import PUPIL_COMMENT
 from .shapes import shape_lines
-from .text import number_text, scaled
+from .system import design_lines, stop_lines
 
 MM = 1e-3
 #: Names of the units of a file [m].
@@ -73,38 +72,33 @@ def telescope_to_zemax(telescope: Telescope, *, lenient: bool = False) -> tuple[
     blocks = [["TYPE STANDARD", "CURV 0.0", *_glass_line(t.medium_before, glasses)]]
     distance = (t.object_distance - first) / unit
     blocks[0].append(f"DISZ {number_text(distance)}" if math.isfinite(distance) else "DISZ INFINITY")
+    with error_context(subject=t.name):
+        surfaces = lens_surfaces(t, data.stop if own_stop else None)
     if not own_stop:
         # The plane of the stop, in front of all; z counts along the light, from the origin.
         blocks.append(
-            [f"COMM {PUPIL_COMMENT}", "STOP", "TYPE STANDARD", "CURV 0.0", *_glass_line(t.medium_before, glasses)]
+            [f"COMM {PUPIL_PLANE}", "STOP", "TYPE STANDARD", "CURV 0.0", *_glass_line(t.medium_before, glasses)]
         )
-    place = -first
-    before = t.medium_before
+        surfaces = surfaces[1:]
     numbered: dict[str, tuple[int, list[str]]] = {}
-    for surface in t.surfaces:
-        x, y, z = (float(v) for v in HALF_TURN @ np.array(surface.vertex))
+    for name, surface in zip(t.surface_names, surfaces, strict=True):
         if len(blocks) > 1:
-            blocks[-1].append(f"DISZ {number_text((z - place) / unit)}")
-        place = z
-        axes = HALF_TURN @ surface.matrix @ HALF_TURN
-        own = _surface_lines(surface, before, glasses, unit)
-        if own_stop and surface.name == data.stop:
-            own += [
-                "STOP",
-                *([f"DIAM {number_text((data.aperture_value or 0.0) / unit)} 1"] * (data.aperture == "stop")),
-            ]
-        if x == 0 and y == 0 and np.array_equal(axes, np.eye(3)):
-            blocks.append(own)
-            numbered[surface.name] = len(blocks) - 1, own
-        else:
-            values = [x / unit, y / unit, *np.degrees(rotation_angles(axes))]
-            medium = _glass_line(before, glasses)
-            blocks.append([*_break_lines(values, 0), *medium, "DISZ 0"])
-            blocks.append([*own, "DISZ 0"])
-            numbered[surface.name] = len(blocks) - 1, blocks[-1]
-            if surface is not t.surfaces[-1]:
-                blocks.append([*_break_lines([-v for v in values], 1), *_glass_line(surface.medium_after, glasses)])
-        before = surface.medium_after
+            blocks[-1].append(f"DISZ {number_text((surface.distance or 0.0) / unit)}")
+        lines_of_surface = _surface_lines(surface, glasses, unit)
+        if surface.stop:
+            lines_of_surface.append("STOP")
+            if data.aperture == "stop":
+                lines_of_surface.append(f"DIAM {number_text((data.aperture_value or 0.0) / unit)} 1")
+        if not surface.off_axis:
+            blocks.append(lines_of_surface)
+            numbered[name] = len(blocks) - 1, lines_of_surface
+            continue
+        values = [*(v / unit for v in surface.position[:2]), *np.degrees(surface.tilt)]
+        blocks.append([*_break_lines(values, 0), *_glass_line(surface.before, glasses), "DISZ 0"])
+        blocks.append([*lines_of_surface, "DISZ 0"])
+        numbered[name] = len(blocks) - 1, blocks[-1]
+        if surface is not surfaces[-1]:
+            blocks.append([*_break_lines([-v for v in values], 1), *_glass_line(surface.after, glasses)])
     if not blocks[-1][-1].startswith("DISZ"):
         blocks[-1].append("DISZ 0")
     left_out = add_link_lines(t, numbered, unit)
@@ -117,7 +111,7 @@ def telescope_to_zemax(telescope: Telescope, *, lenient: bool = False) -> tuple[
 
 def _field_lines(t: Telescope, unit: float) -> list[str]:
     """Return the lines of the fields: those that are stated, or three from the axis to the edge."""
-    data, waves = t.design_data, len(_wavelengths(t))
+    data, waves = t.design_data, len(stated_wavelengths(t))
     afocal = int(data.afocal)
     if data.fields:
         kind, telecentric = FIELD_TYPES.index(data.field_type), int(data.telecentric)
@@ -132,13 +126,8 @@ def _field_lines(t: Telescope, unit: float) -> list[str]:
     return [*head, *design_lines(data, unit)]
 
 
-def _wavelengths(t: Telescope) -> list[float]:
-    """Return the wavelengths that are stated, or the default and the edges of the band."""
-    return list(t.design_data.wavelengths or dict.fromkeys([t.default_wavelength, *(t.band or ())]))
-
-
 def _wavelength_lines(t: Telescope) -> list[str]:
-    waves = _wavelengths(t)
+    waves = stated_wavelengths(t)
     weights = t.design_data.wavelength_weights or [1] * len(waves)
     lines = [f"WAVM {i} {_micrometres(w)} {a!r}" for i, (w, a) in enumerate(zip(waves, weights, strict=True), start=1)]
     return [*lines, f"PWAV {waves.index(t.default_wavelength) + 1}"]
@@ -157,19 +146,17 @@ def _break_lines(values: list[float], order: int) -> list[str]:
     ]
 
 
-def _surface_lines(surface: Surface, before: Medium, glasses: dict[Medium, str], unit: float) -> list[str]:
-    lines = [f"COMM {' '.join(surface.name.split())}"]
+def _surface_lines(surface: LensSurface, glasses: dict[Medium, str], unit: float) -> list[str]:
+    lines = [f"COMM {surface.name}"]
     try:
-        if surface.interaction == Interaction.PHASE:
-            raise PrescriptionError("phase screens cannot be written")
-        lines += shape_lines(rotated_shape(surface.shape), unit)
+        lines += shape_lines(surface.shape, unit)
         if surface.interaction == Interaction.MIRROR:
             lines.append("GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0")
         elif surface.interaction != Interaction.DETECTOR:
-            lines += _glass_line(surface.medium_after, glasses)
+            lines += _glass_line(surface.after, glasses)
         if surface.aperture is not None:
-            lines += aperture_lines(rotated_aperture(surface.aperture), unit)
-        if surface.semi_diameter is not None:
+            lines += aperture_lines(surface.aperture, unit)
+        if surface.semi_diameter:
             lines.append(f"DIAM {number_text(surface.semi_diameter / unit)} 1")
     except PrescriptionError as error:
         raise PrescriptionError(f"surface {surface.name}: {error}") from None
@@ -190,20 +177,20 @@ def _glass_names(t: Telescope) -> dict[Medium, str]:
         if name in bundled and bundled[name] == medium:
             names[medium] = name
             continue
-        own = bool(re.match("[A-Z]", name)) and name not in (*names.values(), "MIRROR") and name not in bundled
+        is_free = bool(re.match("[A-Z]", name)) and name not in (*names.values(), "MIRROR") and name not in bundled
         number = len(names) + 1
-        while not own and (f"GLASS_{number}" in names.values()):
+        while not is_free and (f"GLASS_{number}" in names.values()):
             number += 1
-        names[medium] = name if own else f"GLASS_{number}"
+        names[medium] = name if is_free else f"GLASS_{number}"
     return names
 
 
 def _catalogue_lines(glasses: dict[Medium, str]) -> Iterator[str]:
     bundled = GlassCatalogue.bundled()
-    own = {medium: name for medium, name in glasses.items() if not (name in bundled and bundled[name] == medium)}
-    if own:
+    unlisted = {medium: name for medium, name in glasses.items() if not (name in bundled and bundled[name] == medium)}
+    if unlisted:
         yield "CC Glasses of the lens file of the same name, written by pachon\n"
-    for medium, name in own.items():
+    for medium, name in unlisted.items():
         formula, coefficients, limits = _formula(medium)
         nd = float(medium.index(5.875618e-7)) if limits[0] <= 5.875618e-7 <= limits[1] else 0.0
         yield f"NM {name} {formula} 0 {nd:.6f} 0 0 0\n"

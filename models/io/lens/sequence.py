@@ -14,23 +14,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...core.errors import PrescriptionError, error_context
-from ..aperture import Aperture, Complement
-from ..design_data import DesignData
-from ..media.air import STANDARD_ATMOSPHERE, ZERO_CELSIUS
-from ..media.medium import ConstantIndex, Medium
-from ..media.tabulated import TabulatedIndex
-from ..paraxial import stop_makes_pupil, stop_states_rays, with_true_aperture
-from ..rotation import rotation_angles
-from ..shapes.shape import Plane, Shape
-from ..surface import Interaction, Surface
-from ..telescope import VACUUM, Telescope
-from .glass_catalogue import MAKERS, GlassCatalogue
-from .glass_search import find_glass
-from .writable import report_pupil_plane, report_unheld, require_met, require_sequential
-from .zemax.file import Findings
-from .zemax.frame import HALF_TURN, rotated_aperture, rotated_shape
-from .zemax.reader import PUPIL_COMMENT
+from ....core.errors import PrescriptionError, error_context
+from ...aperture import Complement
+from ...design_data import DesignData
+from ...media.air import STANDARD_ATMOSPHERE, ZERO_CELSIUS
+from ...media.medium import ConstantIndex, Medium
+from ...media.tabulated import TabulatedIndex
+from ...paraxial import stop_makes_pupil, stop_states_rays, with_true_aperture
+from ...shapes.shape import Plane
+from ...surface import Interaction, Surface
+from ...telescope import VACUUM, Telescope
+from ..glass_catalogue import MAKERS, GlassCatalogue
+from ..glass_search import find_glass
+from ..writable import report_pupil_plane, report_unheld, require_met, require_sequential
+from .description import PUPIL_PLANE, LensSurface
+from .frame import HALF_TURN, rotated_aperture, rotated_shape
+from .source import Findings, Source
 
 MM = 1e-3
 #: Cosine, of the local z axis with the light, below which it is against the sense that the mirrors make.
@@ -41,32 +40,6 @@ _WORDS = ("AIR", "REFL", "MIRROR", "MOD")
 _DECIMALS = 12
 #: Newton steps to a mirror.
 _STEPS = 20
-
-
-@dataclass(frozen=True)
-class SequenceSurface:
-    """A surface of a lens file; lengths in metres, shape and aperture in its own frame with +z along the first light.
-
-    `decentre` is along x and y from the axis [m], `tilt` about x, the new y and the new z, right-handed [rad];
-    `thickness` leads to the next surface along the axis [m]. `before` and `after` are the media on either side.
-    """
-
-    name: str
-    interaction: Interaction
-    shape: Shape
-    aperture: Aperture | None
-    semi_diameter: float | None
-    decentre: tuple[float, float]
-    tilt: tuple[float, float, float]
-    thickness: float
-    before: Medium
-    after: Medium
-    stop: bool = False
-
-    @property
-    def off_axis(self) -> bool:
-        """Whether it is decentred or tilted."""
-        return any(self.decentre) or any(self.tilt)
 
 
 @dataclass(frozen=True)
@@ -83,7 +56,7 @@ class LensSequence:
     findings: Findings
     unit: float
     distance: float
-    surfaces: tuple[SequenceSurface, ...]
+    surfaces: tuple[LensSurface, ...]
     aperture: tuple[str, float]
     wavelengths: tuple[float, ...]
     wavelength_weights: tuple[float, ...]
@@ -118,18 +91,18 @@ class LensSequence:
             require_sequential(t, file)
             if data.telecentric:
                 raise PrescriptionError(f"telecentric object space: {file} has no place for it")
-            others = ["afocal"] if data.afocal and not afocal else []
-            report_unheld(t, (*data.pickups, *data.solves), file, lenient=lenient, others=others)
+            flags = ["afocal"] if data.afocal and not afocal else []
+            report_unheld(t, (*data.pickups, *data.solves), file, lenient=lenient, others=flags)
             own_stop = stop_makes_pupil(t) or (aimed != "off" and stop_states_rays(t))
             report_pupil_plane(t, findings, own_stop=own_stop)
             if own_stop and data.aiming != aimed:
-                said = f"aiming = {data.aiming}: {file} does not state how rays are aimed"
-                findings.note(PrescriptionError(said), f"read back it is {aimed}")
-            surfaces = _surfaces(t, data.stop if own_stop else None, along_light=along_light)
+                problem = f"aiming = {data.aiming}: {file} does not state how rays are aimed"
+                findings.note(PrescriptionError(problem), f"read back it is {aimed}")
+            surfaces = lens_surfaces(t, data.stop if own_stop else None, along_light=along_light)
         aperture = ("entrance_pupil", t.pupil_diameter)
         if own_stop and data.aperture is not None and data.aperture_value is not None:
             aperture = (data.aperture, data.aperture_value)
-        waves = data.wavelengths or tuple(dict.fromkeys([t.default_wavelength, *(t.band or ())]))
+        waves = stated_wavelengths(t)
         fields, size = data.fields, math.degrees(1.0) if data.field_type == "angle" else 1.0
         if not fields:
             edge = t.field_radius
@@ -154,7 +127,7 @@ class LensSequence:
     @property
     def pupil_plane(self) -> bool:
         """Whether a plane of its own in front carries the stop."""
-        return self.surfaces[0].name == PUPIL_COMMENT
+        return self.surfaces[0].name == PUPIL_PLANE
 
     @property
     def title(self) -> str:
@@ -179,15 +152,17 @@ class LensSequence:
         pascal = self.telescope.design_data.pressure
         return None if pascal is None else pascal / STANDARD_ATMOSPHERE
 
-    def thickness(self, surface: SequenceSurface) -> float:
+    def thickness(self, surface: LensSurface) -> float:
         """Return the thickness behind a surface in the unit of the file, without the rounding of heights."""
-        return round(surface.thickness / self.unit, _DECIMALS) + 0.0
+        following = self.surfaces[self.surfaces.index(surface) + 1 :]
+        gap = following[0].distance or 0.0 if following else 0.0
+        return round(gap / self.unit, _DECIMALS) + 0.0
 
     def leave_out(self, text: str, instead: str) -> None:
         """Raise the error of what the file cannot hold or, if lenient, warn; `instead` is what is written."""
         self.findings.report(PrescriptionError(text), instead)
 
-    def leave_out_aperture(self, surface: SequenceSurface, expected: str) -> None:
+    def leave_out_aperture(self, surface: LensSurface, expected: str) -> None:
         """Raise the error of a surface whose clear aperture the file cannot hold; if lenient, warn."""
         region = surface.aperture.part if isinstance(surface.aperture, Complement) else surface.aperture
         kind = f"obscuring {type(region).__name__}" if region is not surface.aperture else type(region).__name__
@@ -197,8 +172,8 @@ class LensSequence:
         """Return the aperture, of one of some kinds; if lenient the diameter of the entrance pupil [m] for another."""
         if self.aperture[0] in kinds:
             return self.aperture
-        known = self.aperture[0].replace("_", " ")
-        text = f"aperture = {known}: {self.file} has no place for it"
+        aperture_name = self.aperture[0].replace("_", " ")
+        text = f"aperture = {aperture_name}: {self.file} has no place for it"
         self.leave_out(text, "written as the diameter of the entrance pupil")
         return "entrance_pupil", self.telescope.pupil_diameter
 
@@ -210,13 +185,13 @@ class LensSequence:
         """
         names: dict[Medium, str] = {}
         for medium in dict.fromkeys(m for s in self.surfaces for m in (s.before, s.after) if m != VACUUM):
-            known = catalogue_name(medium)
-            if known is not None and not set(known) & set(forbidden):
-                names[medium] = known
+            listed_name = catalogue_name(medium)
+            if listed_name is not None and not set(listed_name) & set(forbidden):
+                names[medium] = listed_name
                 continue
-            own = re.sub(r"[^A-Z0-9]", "", medium.name.upper())[:12]
-            free = own[:1].isalpha() and own not in (*names.values(), *_WORDS)
-            names[medium] = own if free else f"MEDIUM{len(names) + 1}"
+            short_name = re.sub(r"[^A-Z0-9]", "", medium.name.upper())[:12]
+            free = short_name[:1].isalpha() and short_name not in (*names.values(), *_WORDS)
+            names[medium] = short_name if free else f"MEDIUM{len(names) + 1}"
             if not isinstance(medium, ConstantIndex) and not _is_table(medium):
                 text = f"glass {medium.name or type(medium).__name__}: {self.file} has no place for its formula"
                 self.leave_out(text, f"written as {table}")
@@ -236,6 +211,11 @@ class LensSequence:
         between = map(_tidy, np.linspace(low, high, max(entries - len(self.wavelengths), 0)).tolist())
         waves = tuple(sorted({*self.wavelengths, *(w for w in between if low <= w <= high)}))
         return waves, tuple(float(medium.index(wave)) for wave in waves)
+
+
+def stated_wavelengths(t: Telescope) -> tuple[float, ...]:
+    """Return the wavelengths that are stated, or the default and the edges of the band."""
+    return t.design_data.wavelengths or tuple(dict.fromkeys([t.default_wavelength, *(t.band or ())]))
 
 
 def catalogue_name(medium: Medium) -> str | None:
@@ -266,57 +246,53 @@ def _is_table(medium: Medium) -> bool:
     return isinstance(medium, TabulatedIndex) and medium.interpolation == "monotone"
 
 
-def _surfaces(t: Telescope, stop: str | None, *, along_light: bool) -> tuple[SequenceSurface, ...]:
-    """Return the surfaces; the plane of the stop is the first of them where no surface is the stop."""
+def lens_surfaces(t: Telescope, stop: str | None, *, along_light: bool = False) -> tuple[LensSurface, ...]:
+    """Return the surfaces in the frame of a lens; where no surface is the `stop`, its plane is the first of them.
+
+    With `along_light` local z axes are along the light in front of an even number of mirrors, against it in front of an
+    odd one. PrescriptionError for a surface that no lens file can hold.
+    """
     medium, sign = t.medium_before, 1.0
     # The ray through the middle of the entrance pupil, along the axis.
-    position, direction = HALF_TURN @ [0.0, 0.0, t.stop_z], np.array([0.0, 0.0, 1.0])
-    found: list[SequenceSurface] = []
-    heights: list[float] = []
+    start, direction = HALF_TURN @ [0.0, 0.0, t.stop_z], np.array([0.0, 0.0, 1.0])
+    written = Source("")
+    surfaces: list[LensSurface] = []
     if stop is None:
-        plane = SequenceSurface(
-            PUPIL_COMMENT, Interaction.PASS, Plane(), None, None, (0.0, 0.0), (0.0,) * 3, 0.0, medium, medium, True
-        )
-        found.append(plane)
-        heights.append(-t.stop_z)
+        plane = LensSurface(written, Plane(), np.array([0.0, 0.0, -t.stop_z]), np.eye(3), PUPIL_PLANE)
+        surfaces.append(replace(plane, before=medium, after=medium, stop=True, distance=0.0))
     for surface in t.surfaces:
         axes = HALF_TURN @ surface.matrix @ HALF_TURN + 0.0
         against = along_light and sign * float(direction @ axes[:, 2]) < _AGAINST
-        surface, axes = _reversed(surface, axes) if against else (surface, axes)
-        x, y, z = (float(v) for v in HALF_TURN @ np.array(surface.vertex) + 0.0)
-        straight = np.array_equal(axes, np.eye(3))
+        aligned, axes = _reversed(surface, axes) if against else (surface, axes)
+        position = HALF_TURN @ np.array(surface.vertex) + 0.0
         with error_context(subject=f"surface {surface.name}"):
             if surface.interaction == Interaction.PHASE:
                 raise PrescriptionError("phase screens cannot be written")
-            found.append(
-                SequenceSurface(
-                    name=" ".join(surface.name.split()),
-                    interaction=surface.interaction,
-                    shape=rotated_shape(surface.shape),
-                    aperture=None if surface.aperture is None else rotated_aperture(surface.aperture),
-                    semi_diameter=surface.semi_diameter,
-                    decentre=(x, y),
-                    tilt=(0.0, 0.0, 0.0) if straight else rotation_angles(axes),
-                    thickness=0.0,
-                    before=medium,
-                    after=surface.medium_after,
-                    stop=surface.name == stop,
-                )
+            placed = LensSurface(
+                written,
+                rotated_shape(aligned.shape),
+                position,
+                axes,
+                name=" ".join(surface.name.split()),
+                interaction=surface.interaction,
+                before=medium,
+                after=surface.medium_after,
+                aperture=None if aligned.aperture is None else rotated_aperture(aligned.aperture),
+                semi_diameter=surface.semi_diameter or 0.0,
+                stop=surface.name == stop,
+                distance=float(position[2] - surfaces[-1].position[2]) if surfaces else 0.0,
             )
-        heights.append(z)
+        surfaces.append(placed)
         medium = surface.medium_after
         if surface.interaction == Interaction.MIRROR:
-            position, direction = _reflected(position, direction, found[-1], axes, z)
+            start, direction = _reflected(start, direction, placed)
             sign = -sign
-    gaps = [*np.diff(heights).tolist(), 0.0]
-    return tuple(replace(s, thickness=gap) for s, gap in zip(found, gaps, strict=True))
+    return tuple(surfaces)
 
 
-def _reflected(
-    position: np.ndarray, direction: np.ndarray, mirror: SequenceSurface, axes: np.ndarray, z: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return where a ray meets a mirror and its direction behind it; vertex height `z` and axes are the mirror's."""
-    vertex = np.array([*mirror.decentre, z])
+def _reflected(position: np.ndarray, direction: np.ndarray, mirror: LensSurface) -> tuple[np.ndarray, np.ndarray]:
+    """Return where a ray meets a mirror and its direction behind it."""
+    vertex, axes = mirror.position, mirror.axes
     place, along = (position - vertex) @ axes, direction @ axes
     # A ray that misses the mirror, or runs along it, has no direction behind it.
     with np.errstate(all="ignore"):

@@ -1,4 +1,4 @@
-"""Text files of Zemax: their encodings, and their lines as keyword and words."""
+"""Lens files that are text: their encodings, and their lines as keyword and words."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ....core.errors import PrescriptionError, cut_short
 from ....core.files import read_bytes
+from .source import Source
 
 
 def read_text(path: Path) -> str:
@@ -45,27 +46,20 @@ def scaled(number: float, power: int) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
-    """A line of a file: its first word, the others, and these as they stand in the file.
+class Record(Source):
+    """A line of a file: its keyword, the other words, and these as they stand in the file.
 
-    `source`, `line` (from 1) and `place` (``"surface 3"``, empty in a header) are for messages.
+    `line` counts from 1.
     """
 
-    source: str
-    line: int
-    place: str
-    keyword: str
-    words: tuple[str, ...]
-    text: str
+    line: int = 1
+    words: tuple[str, ...] = ()
+    text: str = ""
 
-    def error(self, expected: str) -> PrescriptionError:
-        """Return the error of a line with other than the expected words."""
-        return self.problem(f"{self.shown}: expected {expected}")
-
-    def problem(self, text: str) -> PrescriptionError:
-        """Return an error of this line."""
-        place = f"line {self.line}" + (f", {self.place}" if self.place else "")
-        return PrescriptionError(text, file=self.source, place=place)
+    @property
+    def location(self) -> str:
+        """Line and place within the file."""
+        return f"line {self.line}" + (f", {self.place}" if self.place else "")
 
     @property
     def shown(self) -> str:
@@ -92,6 +86,10 @@ class Record:
             raise self.error(f"a number in place of {word!r}")
         return value
 
+    def numbers(self) -> list[float]:
+        """Return all words as numbers."""
+        return [self.number(i) for i in range(len(self.words))]
+
     def integer(self, position: int, default: int | None = None) -> int:
         """Return a word as a whole number."""
         value = self.number(position, default)
@@ -102,14 +100,14 @@ class Record:
 
 def records(text: str, source: str) -> list[Record]:
     """Return the lines of a file that are not empty; those from a line "SURF n" on belong to surface n."""
-    found = []
+    lines = []
     place = ""
-    for line, content in enumerate(text.splitlines(), start=1):
+    for number, content in enumerate(text.splitlines(), start=1):
         words = content.split()
         if words:
-            keyword, *rest = words
-            if keyword.upper() == "SURF" and rest:
-                place = f"surface {cut_short(rest[0])}"
+            keyword, *following_words = words
+            if keyword.upper() == "SURF" and following_words:
+                place = f"surface {cut_short(following_words[0])}"
             after = content.strip()[len(keyword) :].strip()
-            found.append(Record(source, line, place, keyword.upper(), tuple(rest), after))
-    return found
+            lines.append(Record(source, place, keyword.upper(), line=number, words=tuple(following_words), text=after))
+    return lines

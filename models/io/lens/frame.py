@@ -1,4 +1,4 @@
-"""Rotation between the axes of Zemax, where light enters along +z, and those of a telescope, where it enters along -z.
+"""Rotation between the axes of a lens, where light enters along +z, and those of a telescope, where it enters along -z.
 
 The two differ by half a turn about y: ``(x, y, z)`` in one is ``(-x, y, -z)`` in the other, for points and for the
 local axes of each surface alike. A surface that is not tilted in one is not tilted in the other; its sag changes sign
@@ -36,7 +36,7 @@ def rotated_axes(axes: np.ndarray) -> Matrix:
 
 
 def rotated_shape(shape: Shape) -> Shape:
-    """Return the shape in the rotated axes, ``-sag(-x, y)``; PrescriptionError if Zemax files have no such shape."""
+    """Return the shape in the rotated axes, ``-sag(-x, y)``; PrescriptionError if lens files have no such shape."""
     if isinstance(shape, Plane):
         return shape
     if isinstance(shape, Sphere | Conic):
@@ -52,8 +52,8 @@ def rotated_shape(shape: Shape) -> Shape:
     if isinstance(shape, GridSag):
         return GridSag(-shape.x[::-1], shape.y, -shape.values[:, ::-1])
     if isinstance(shape, Sum):
-        return Sum(tuple(rotated_shape(part) for part in shape.parts))
-    raise PrescriptionError(f"shape {type(shape).__name__}: expected one that a Zemax file can hold")
+        return Sum(tuple(rotated_shape(component) for component in shape.parts))
+    raise PrescriptionError(f"shape {type(shape).__name__}: expected one that a lens file can hold")
 
 
 def _parity(j: int) -> int:
@@ -70,7 +70,7 @@ def rotated_aperture(aperture: Aperture) -> Aperture:
     if isinstance(aperture, Complement):
         return Complement(rotated_aperture(aperture.part))
     if isinstance(aperture, Union | Intersection):
-        return type(aperture)(tuple(rotated_aperture(part) for part in aperture.parts))
+        return type(aperture)(tuple(rotated_aperture(region) for region in aperture.parts))
     if isinstance(aperture, Ellipse | Rectangle | Vane):
         aperture = replace(aperture, angle=(math.pi if isinstance(aperture, Vane) else 0.0) - aperture.angle)
     return replace(aperture, x=0.0 - aperture.x)

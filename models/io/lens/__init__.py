@@ -1,0 +1,1 @@
+"""One neutral description of a lens, between telescopes and the files of other programs."""

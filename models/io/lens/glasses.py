@@ -1,0 +1,46 @@
+"""Media of a lens file: glasses that it names, and those that it describes by numbers."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+from ....core.errors import PrescriptionError
+from ...media.dispersion import model_glass
+from ...media.medium import Medium
+from ..glass_catalogue import GlassCatalogue
+from ..glass_search import find_glass, glass_hint
+from .source import Source
+
+
+class Glasses:
+    """Catalogues in which the glasses of a lens file are looked up: stated ones, and one beside the file, first."""
+
+    def __init__(self, path: Path, catalogues: Iterable[GlassCatalogue | str | os.PathLike[str]]) -> None:
+        self.first = [c if isinstance(c, GlassCatalogue) else GlassCatalogue.read(c) for c in catalogues]
+        beside = path.with_suffix(".agf")
+        self.first += [GlassCatalogue.read(beside)] if beside.is_file() else []
+
+    def get(self, name: str) -> Medium | None:
+        """Return the glass of a name, or None."""
+        return find_glass(name.upper(), self.first)
+
+    def named(self, name: str, source: Source) -> Medium:
+        """Return the glass of a name; PrescriptionError of the statement if no catalogue has it."""
+        medium = self.get(name)
+        if medium is None:
+            raise self.missing(name, source)
+        return medium
+
+    def missing(self, name: str, source: Source) -> PrescriptionError:
+        """Return the error of a glass that no catalogue has."""
+        hint = glass_hint(name.upper(), self.first)
+        return source.problem(f"{source.shown}: the glass is in no catalogue: {hint}")
+
+
+def numbered_glass(nd: float, vd: float, deviation: float, name: str, source: Source) -> Medium:
+    """Return the model glass of an index, an Abbe number and a deviation; PrescriptionError of the statement."""
+    with source.context():
+        return replace(model_glass(nd, vd, deviation), name=name)
