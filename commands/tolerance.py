@@ -11,10 +11,9 @@ from typer import Argument, Option
 from ..core.file_names import file_name
 from ..core.terminal import print_line
 from .inputs import errors_of, load_model
-from .interrupt import interruptible
 from .options import GlassCatalogues, Json, Lenient, Model, Quiet, Threads
 from .tables import Rows, number_texts, print_json
-from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
+from .workers import DaskWorkers, Processes, Scheduler, long_work
 
 app = typer.Typer()
 #: Tolerances in the table, the costliest.
@@ -67,18 +66,12 @@ def tolerance_command(
     make_folder(folder)
     resumed = f"go on with: pachon tolerance {model} {tolerances} -o {folder} --resume"
     with (
-        interruptible(quiet, resumed) as reporter,
-        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
+        long_work(
+            quiet, resumed, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
+        ) as execution,
         errors_of(tolerances),
     ):
-        study = run_tolerances(
-            telescope,
-            file,
-            folder / "points.tolerance",
-            resume=resume,
-            workers=maker,
-            reporter=reporter,
-        )
+        study = run_tolerances(telescope, file, folder / "points.tolerance", execution=execution)
     write_tolerances(study, file, folder)
     summary = tolerance_summary(study)
     if as_json:
@@ -96,11 +89,17 @@ def _show(summary: dict[str, Any]) -> None:
     unit = f" [{summary['unit']}]" if summary["unit"] else ""
     plain = f" {summary['unit']}" if summary["unit"] else ""
     rows = []
-    for tolerance in summary["worst_offenders"][:_SHOWN]:
-        size_unit = "" if tolerance["unit"] == "1" else f" {tolerance['unit']}"
-        ends = number_texts([tolerance["lower_end"], tolerance["upper_end"]], ".5g")
-        sizes = [f"{tolerance[key]:.4g}{size_unit}" for key in ("size", "size_for_the_loss")]
-        rows.append((tolerance["name"], sizes[0], *ends, sizes[1]))
+    for offender in summary["worst_offenders"][:_SHOWN]:
+        size_unit = "" if offender["unit"] == "1" else f" {offender['unit']}"
+        ends = number_texts([offender["lower_end"], offender["upper_end"]], ".5g")
+        rows.append(
+            (
+                offender["name"],
+                f"{offender['size']:.4g}{size_unit}",
+                *ends,
+                f"{offender['size_for_the_loss']:.4g}{size_unit}",
+            )
+        )
     headings = ("tolerance", "size", f"lower end{unit}", f"upper end{unit}", f"{summary['loss_percent']:g} % loss at")
     caption = f"The costliest of {summary['tolerances']}; as designed {summary['nominal']:.5g}{plain}."
     Rows(headings, rows, caption).show()
@@ -108,6 +107,9 @@ def _show(summary: dict[str, Any]) -> None:
     lost = f"; {summary['lost']} without light" if summary["lost"] else ""
     print_line(f"{summary['draws']} telescopes, {summary['method']}: reached by {reached}{plain}{lost}")
     if "yield" in summary:
-        met = summary["yield"]
-        interval = f"{100 * met['low']:.1f} to {100 * met['high']:.1f} %"
-        print_line(f"requirement {summary['requirement']:g}{plain}: met by {100 * met['fraction']:.1f} % ({interval})")
+        yield_summary = summary["yield"]
+        interval = f"{100 * yield_summary['low']:.1f} to {100 * yield_summary['high']:.1f} %"
+        print_line(
+            f"requirement {summary['requirement']:g}{plain}: met by {100 * yield_summary['fraction']:.1f} %"
+            f" ({interval})"
+        )

@@ -238,7 +238,7 @@ def ghosts(
     """
     n_pupil = require_count(n_pupil, "n_pupil", _LEAST_RAYS)
     brightest = None if brightest is None else require_count(brightest, "brightest", 1)
-    star_field: list[ArrayLike] | None = None if field is None else [field]
+    star_field: Any = None if field is None else [field]
     request = Request.of(
         telescope,
         star_field,
