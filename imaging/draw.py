@@ -32,8 +32,10 @@ _BLOCK = 2**21
 #: rms width of the Gaussian that the seeing-free image is convolved with, and the PSF deconvolved by [pixel]. Without
 #: it, galaxies smaller than a pixel would ring through the whole image.
 _SOFTENING = 0.6
-#: Side of a tile of the seeing-free image and of the grid that it is convolved on [pixel].
-_TILE, _TILE_GRID = 480, 576
+#: Side of a tile of the seeing-free image [pixel].
+_TILE = 480
+#: Side of the grid that a tile is convolved on [pixel].
+_TILE_GRID = 576
 #: Points along a side of a tile at which amplitudes are evaluated: exact for polynomials up to the sixth order.
 _NODES = 7
 

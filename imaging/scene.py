@@ -26,8 +26,10 @@ from .wcs import CcdWcs, ccd_wcs
 #: Pixels by which stamps of stars are larger than those of the PSF: in sums of hundreds of exposures the wings of a
 #: star just below saturation stay above the noise that far out.
 STAR_ROOM = 64
-#: Side of the cutouts [arcsec], and the long exposure beside the run's [s], as in Jee & Tyson 2011, fig. 10.
-CUTOUT, DEEP = 100.0, 6000.0
+#: Side of the cutouts [arcsec], as in Jee & Tyson 2011, fig. 10.
+CUTOUT = 100.0
+#: Long exposure beside that of the run [s], as there.
+DEEP = 6000.0
 
 #: Function that gives the galaxies with xi and eta in two ranges [rad].
 GalaxiesIn = Callable[[tuple[float, float], tuple[float, float]], Sources]

@@ -15,8 +15,10 @@ if TYPE_CHECKING:
 
 #: Pixels along a side of the picture of a whole CCD, at most.
 _MOST = 1024
-#: Softening of the asinh stretch, and its upper end, in rms of the background.
-_SOFT, _TOP = 3.0, 150.0
+#: Softening of the asinh stretch [rms of the background].
+_SOFT = 3.0
+#: Upper end of the asinh stretch [rms of the background].
+_TOP = 150.0
 
 
 def draw_image(axes: Axes, image: np.ndarray, variance: np.ndarray, header: fits.Header) -> None:

@@ -30,8 +30,10 @@ from ..wavefront.chief_rays import fields_at
 TOLERANCE = 3e-4 * ARCSEC
 #: Largest order that is tried.
 _MOST = 9
-#: Points along a side of the CCD at which chief rays are traced for the fit, and for its check.
-_FIT_POINTS, _CHECK_POINTS = 12, 15
+#: Points along a side of the CCD at which chief rays are traced for the fit.
+_FIT_POINTS = 12
+#: Points along a side of the CCD at which the fit is checked, between those of the fit.
+_CHECK_POINTS = 15
 #: Steps of Newton's method from the inverse polynomial, which is good to a thousandth of a pixel.
 _NEWTON_STEPS = 3
 

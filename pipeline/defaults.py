@@ -49,11 +49,17 @@ _SITE = "cerro_pachon"
 _WITH_ATMOSPHERE = {"n_pupil": PUPIL_POINTS, "diffusion_pixels": 0.4}
 _OPTICS_ALONE = {"n_pupil": PUPIL_POINTS_STILL, "diffusion_pixels": 0.0}
 _FINE = 4
-# FWHM of the weight of the moments [arcsec] with and without an atmosphere (Jee & Tyson 2011, sec. 3); where pixels are
-# coarse, WEIGHT_PIXELS of them, or the moments would be sums over one or two pixels.
-_WEIGHT, _WEIGHT_ALONE = 0.7, 0.3
-# Sides of a stamp [arcsec], 31 pixels of the LSST and 61 fine ones; and fewest pixels.
-_SIDE, _SIDE_ALONE, _FEWEST = 6.2, 3.05, 15
+# FWHM of the weight of the moments with an atmosphere [arcsec] (Jee & Tyson 2011, sec. 3); where pixels are coarse,
+# WEIGHT_PIXELS of them, or the moments would be sums over one or two pixels.
+_WEIGHT = 0.7
+# FWHM of the weight of the moments without an atmosphere [arcsec], as above.
+_WEIGHT_ALONE = 0.3
+# Side of a stamp with an atmosphere [arcsec], 31 pixels of the LSST.
+_SIDE = 6.2
+# Side of a stamp without an atmosphere [arcsec], 61 fine pixels.
+_SIDE_ALONE = 3.05
+# Fewest pixels on a side of a stamp.
+_FEWEST = 15
 _Model = TypeVar("_Model", bound=BaseModel)
 
 

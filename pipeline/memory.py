@@ -11,12 +11,15 @@ from .experiment import Experiment
 from .resolved_values import resolved_value
 
 # Measured on runs of 0.5 to 2.6 GB (both engines, screens of 512 to 8192, 140 to 8000 stars on a CCD): the estimate is
-# 3 to 18 % above the peak. Python with its libraries and kernels while PSFs are made, and with the pictures of the
-# report, when the screens are gone.
-_BASE, _REPORT = 400_000_000, 600_000_000
-# Memory of a thread of the wave engine: fields, intensities and spectra of a star at five wavelengths; and in silicon
-# intensities and phases of three depths of each.
-_WAVE_THREAD, _SILICON_THREAD = 150_000_000, 110_000_000
+# 3 to 18 % above the peak.
+# Python with its libraries and kernels while PSFs are made [byte].
+_BASE = 400_000_000
+# The same with the pictures of the report, when the screens are gone [byte].
+_REPORT = 600_000_000
+# A thread of the wave engine: fields, intensities and spectra of a star at five wavelengths [byte].
+_WAVE_THREAD = 150_000_000
+# The same in silicon besides: intensities and phases of three depths of each [byte].
+_SILICON_THREAD = 110_000_000
 # Copies of the stamps of a CCD's stars that are held at once, in bytes a pixel.
 _STAMP_BYTES = 48
 

@@ -15,13 +15,18 @@ from .star_catalogue import bad_pixels
 #: A star is lost where bad pixels hold more than this fraction of its light above half of its peak, or of its light
 #: under the weight of the moments: what is measured would be the model rather than the star.
 MOST_MASKED = 0.5
-# Standard deviation of the weights of good neighbours [pixel], about the width of a star; and their least sum: a bad
-# pixel without any near starts as sky.
-_NEIGHBOURHOOD, _LEAST_NEIGHBOURS = 1.5, 1e-3
+# Standard deviation of the weights of good neighbours [pixel], about the width of a star.
+_NEIGHBOURHOOD = 1.5
+# Least sum of these weights: a bad pixel without any near starts as sky.
+_LEAST_NEIGHBOURS = 1e-3
 # Passes end when no centroid moves by more than this [pixel], a tenth of the error of a star of S/N 200.
-_CONVERGED, _MOST_PASSES = 1e-3, 10
-# Fewest pixels of sky; where fewer are good, this fraction of the good pixels stands in, the farthest from the centre.
-_FEWEST_SKY, _OUTERMOST = 20, 0.25
+_CONVERGED = 1e-3
+# Most passes.
+_MOST_PASSES = 10
+# Fewest pixels of sky.
+_FEWEST_SKY = 20
+# Fraction of the good pixels, the farthest from the centre, that stands in where fewer are good.
+_OUTERMOST = 0.25
 
 
 def as_bad_pixels(images: np.ndarray, masks: Any) -> np.ndarray:

@@ -26,8 +26,10 @@ from .file import SweepFile
 
 #: Keys of the configuration that apply to a telescope without a camera.
 KEYS = ("telescope", "wavelengths_nm", "changes", "seed")
-#: Rings of pupil points for compensators, and relative precision of the mean square radius.
-_RINGS, _TOLERANCE = 4, 1e-9
+#: Rings of pupil points for compensators.
+_RINGS = 4
+#: Relative precision of the mean square radius.
+_TOLERANCE = 1e-9
 
 
 def has_no_camera(sweep: SweepFile, parameters: dict[str, Any], folder: Path) -> bool:
