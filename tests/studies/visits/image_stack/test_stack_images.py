@@ -11,7 +11,7 @@ from pachon.core.units import ARCSEC
 from pachon.imaging.image_file import CcdImage
 from pachon.measure.shapes import measure_shapes
 from pachon.studies.visits.image_stack import stack_images as module
-from pachon.studies.visits.image_stack.config import ImageStackConfig
+from pachon.studies.visits.image_stack.config import ImageStackConfig, load_image_stack_configuration
 from pachon.studies.visits.image_stack.stack_images import ImageStack, stack_images
 from pachon.studies.visits.image_stack.tiles import TileSums, choose_tiles
 from pachon.studies.visits.image_stack.transfer import broadened, mean_transfer
@@ -162,6 +162,22 @@ def test_tiles_go_outwards_and_are_seen(visits_folder):
     assert [(t.column, t.row) for t in tiles[:5]] == [(0, 0), (-1, 0), (0, -1), (0, 1), (1, 0)]
     with pytest.raises(DomainError, match="no tile of 20000 pixels"):
         choose_tiles(stack.experiment, stack.frame, 20000, 1, stack.visits)
+
+
+def test_the_settings_in_the_folder_have_every_default_written_out(visits_folder, tmp_path_factory, monkeypatch):
+    folder = tmp_path_factory.mktemp("visits")
+    (folder / "config.yaml").write_bytes((visits_folder / "config.yaml").read_bytes())
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "_sums_so_far", stop)
+    settings = ImageStackConfig(side=128)
+    with pytest.raises(KeyboardInterrupt):
+        stack_images(folder, settings)
+    assert settings.faintest is None
+    written = load_image_stack_configuration(folder / "images" / "images.yaml")
+    assert written.faintest == ImageStack.of(folder, settings).settings.faintest
 
 
 def test_refusals(visits_folder, tmp_path_factory, monkeypatch, capsys):
