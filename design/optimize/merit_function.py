@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +15,7 @@ from ..metrics.spots import REFERENCES, spot_diagram
 from .merit import Beams, Merit, SpotMerit, WavefrontMerit
 
 
+@runtime_checkable
 class MeritFunction(Protocol):
     """Merit function that becomes a merit with telescope and rays."""
 
@@ -121,10 +122,11 @@ def merit_function(merit: str | MeritFunction | Merit) -> MeritFunction:
         for function in (SpotSize(), WavefrontError()):
             if merit == function.name:
                 return function
-    elif isinstance(merit, (SpotSize, WavefrontError)):
-        return merit
-    elif hasattr(merit, "derivatives") and not isinstance(merit, type):
-        return _BoundMerit(merit)
+    elif not isinstance(merit, type):
+        if isinstance(merit, MeritFunction):
+            return merit
+        if hasattr(merit, "derivatives"):
+            return _BoundMerit(merit)
     raise ConfigError(
         f"merit = {shown(merit)}: expected 'spots', 'wavefront', a SpotSize, a WavefrontError or a Merit", key="merit"
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -68,7 +68,7 @@ class MonteCarlo(Result):
         to first order [m].
     """
 
-    _table = ("merit", "deviations", "moves")
+    _table: ClassVar[tuple[str, ...]] = ("merit", "deviations", "moves")
 
     telescope: str
     criterion: Criterion
@@ -124,10 +124,10 @@ class MonteCarlo(Result):
     @check_arguments
     def at_most(self, fraction: float) -> float:
         """Return the merit that a fraction (0 to 1) of the telescopes reaches, in SI; lost ones are worst."""
-        worst = -np.inf if self.criterion.larger else np.inf
-        merits = np.where(np.isnan(self.merit), worst, self.merit)
-        quantile, method = (1.0 - fraction, "lower") if self.criterion.larger else (fraction, "higher")
-        return float(np.quantile(merits, quantile, method=method))
+        lost = np.isnan(self.merit)
+        if self.criterion.larger:
+            return float(np.quantile(np.where(lost, -np.inf, self.merit), 1.0 - fraction, method="lower"))
+        return float(np.quantile(np.where(lost, np.inf, self.merit), fraction, method="higher"))
 
     @check_arguments
     def yield_at(self, requirement: float) -> Yield:

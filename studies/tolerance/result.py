@@ -60,7 +60,7 @@ class ToleranceStudy(MonteCarlo):
     def _label(self) -> str:
         return f"{self.telescope}, {len(self.tolerances)} tolerances, {len(self.merit)} telescopes drawn"
 
-    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw the change of the merit at the ends of the costliest tolerances, and in the draws, with its error."""
         return _draw(self, ax)
 
