@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 
-from ....core.errors import DomainError, ProductError
+from ....core.errors import DomainError
 from ....core.products import Stamp, image_hdu, read_fits, write_fits
 from ....imaging.draw import SkyPixels, Window
 from ....imaging.wcs import CcdWcs
