@@ -254,7 +254,13 @@ from .reconstruction.piff.comparison import PiffComparison as PiffComparison
 from .reconstruction.piff.comparison import compare_with_piff as compare_with_piff
 from .reconstruction.piff.psf import PiffPsf as PiffPsf
 from .reconstruction.piff.psf import load_piff as load_piff
+from .reconstruction.psf_model.kriging import Kriging as Kriging
 from .reconstruction.psf_model.model import PsfModel as PsfModel
+from .reconstruction.psf_model.pixels import Pixels as Pixels
+from .reconstruction.psf_model.polynomial_fit import Polynomial as Polynomial
+from .reconstruction.psf_model.principal_components import PrincipalComponents as PrincipalComponents
+from .reconstruction.psf_model.recipe import Recipe as Recipe
+from .reconstruction.psf_model.shapelets import Shapelets as Shapelets
 from .sensing.degrees import FreedomEstimate as FreedomEstimate
 from .sensing.fit import fit_donuts as fit_donuts
 from .sensing.flags import DonutFlag as DonutFlag

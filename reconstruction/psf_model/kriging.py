@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 import scipy.linalg
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.threads import one_blas_thread
 from ..gaussian_field import inverse_from_cholesky, leave_one_out_residuals
@@ -74,6 +75,7 @@ _LEAST_NOISE = 1e-6
 FEWEST_ELECTRONS = 100.0
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Kriging(Interpolation):
     """One covariance over the CCD for all components, learnt from the shapes of the stars, with the noise of each."""

@@ -6,12 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError
 from .basis import Basis, FittedBasis, eigenvalues_of
 from .clean_stars import CleanStars
 from .file_parts import ModelParts
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Pixels(Basis):
     """Every pixel on its own: the same as all eigen-PSFs together."""

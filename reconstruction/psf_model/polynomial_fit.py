@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 import scipy.linalg
 
+from ...core.arguments import check_arguments
 from .interpolation import FittedInterpolation, Interpolation, StarField, weighted
 from .polynomial import term_count
 
@@ -15,6 +16,7 @@ from .polynomial import term_count
 _LEAST_ROOM = 1e-10
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Polynomial(Interpolation):
     """Polynomials of limited total degree, as in the paper."""

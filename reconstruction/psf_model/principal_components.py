@@ -7,11 +7,13 @@ from typing import Literal
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from .basis import COMPONENTS, Basis, FittedBasis, eigenvalues_of
 from .clean_stars import CleanStars
 from .file_parts import ModelParts
 
 
+@check_arguments
 @dataclass(frozen=True)
 class PrincipalComponents(Basis):
     """Eigen-PSFs of the stars, those of largest variance; at most as many as stars less one."""

@@ -7,7 +7,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from ...core.errors import ConfigError
+from ...core.errors import ConfigError, DomainError, shown
 from .basis import Basis
 from .checks import snr_weights
 from .interpolation import FittedInterpolation, Interpolation
@@ -51,6 +51,9 @@ class Recipe:
     weights: str = "equal"
 
     def __post_init__(self) -> None:
+        for key, kind in (("basis", Basis), ("interpolation", Interpolation)):
+            if not isinstance(getattr(self, key), kind):
+                raise DomainError(f"{key} = {shown(getattr(self, key))}: expected a {kind.__name__}", key=key)
         if self.weights not in WEIGHTS:
             raise ConfigError(f"weights = {self.weights!r}: expected one of {', '.join(WEIGHTS)}")
         if self.interpolation.needs_noise and self.weights != "equal":

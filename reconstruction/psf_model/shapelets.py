@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError
 from .basis import COMPONENTS, Basis, FittedBasis, eigenvalues_of
 from .clean_stars import CleanStars
@@ -20,6 +21,7 @@ _FOR_SCALE = 20
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Shapelets(Basis):
     """Gauss-Hermite functions by total order; they truncate the wings (Jee & Tyson 2011, sec. 3).
