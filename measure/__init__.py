@@ -1,1 +1,1 @@
-"""Shapes, star selection, correlations, diagnostics."""
+"""Shapes, correlations, star selection; objects on images and fits of galaxies."""

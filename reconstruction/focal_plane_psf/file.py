@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from astropy.io import fits
@@ -31,9 +31,6 @@ from .mosaic import Mosaic, PsfShapes
 from .optics_part import OpticsPart
 from .response import ExposureResponse, Instrument
 
-if TYPE_CHECKING:
-    from .model import FocalPlanePsf
-
 
 class ModelFields(NamedTuple):
     """Attributes of :class:`~pachon.FocalPlanePsf`, in its order."""
@@ -51,7 +48,7 @@ class ModelFields(NamedTuple):
     pca: ResidualImages | None
 
 
-def model_hdus(model: FocalPlanePsf) -> list[fits.ImageHDU | fits.BinTableHDU]:
+def model_hdus(model: ModelFields) -> list[fits.ImageHDU | fits.BinTableHDU]:
     """Return a focal-plane model as FITS extensions."""
     field = model.field
     mosaic, data = field.mosaic, field.data

@@ -27,7 +27,7 @@ from ...wavefront.atmosphere.atmosphere import Atmosphere
 from .covariance import Covariance, Places
 from .field import ShapeField
 from .field_fit import LEAST_STARS, FittedField, fit_field, height_prior, mosaic_of
-from .file import model_hdus, read_model
+from .file import ModelFields, model_hdus, read_model
 from .fit import SHAPES, ShapeData
 from .images import ResidualImages, with_shapes
 from .mosaic import Mosaic, PsfShapes
@@ -324,7 +324,8 @@ class FocalPlanePsf(Result):
     @check_arguments
     def write(self, path: str | Path) -> None:
         """Write the model as a FITS file, telescope included."""
-        write_fits(Path(path), model_hdus(self), None, [CREATOR])
+        fields = ModelFields(*(getattr(self, name) for name in ModelFields._fields))
+        write_fits(Path(path), model_hdus(fields), None, [CREATOR])
 
     @classmethod
     @check_arguments

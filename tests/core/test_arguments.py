@@ -213,4 +213,6 @@ def test_many_threads_may_make_the_first_call():
 def test_a_name_in_place_of_a_telescope_is_told_what_loads_it():
     with pytest.raises(pachon.DomainError) as caught:
         pachon.spots("lsst_v3.3_r")
-    assert str(caught.value) == "telescope = 'lsst_v3.3_r': expected a Telescope, as of pachon.load_telescope"
+    assert (
+        str(caught.value) == "telescope = 'lsst_v3.3_r': expected a Telescope, as of pachon.load_telescope or a Request"
+    )

@@ -269,7 +269,9 @@ def test_the_command_fits_one_psf_to_all_images(image, focal_plane_psf, tmp_path
 
 
 def test_kinds_of_models_that_do_not_go_together(image, focal_plane_psf, tmp_path, capsys):
-    with pytest.raises(PachonError, match="basis, interpolation and order are of models of the CCD"):
+    with pytest.raises(
+        PachonError, match="recipe, basis, interpolation, weights, n_components, order are of models of the CCD"
+    ):
         measure_image(image, psf=focal_plane_psf, order=1)
     with pytest.raises(PachonError, match="no stars on the images: there are no images"):
         focal_plane_stars([])

@@ -201,7 +201,12 @@ def test_plan_of_a_configuration(tiny):
     assert all(case == case.normalised() for case in cases)
     assert {c.basis for c in cases} == {"pca", "pixels", "shapelets"}
     assert all(c.components < c.stars for c in cases if c.basis == "pca")
-    other = tiny(reconstruction__basis="pixels", reconstruction__components=None, reconstruction__weights="softened")
+    other = tiny(
+        reconstruction__recipe="paper",
+        reconstruction__basis="pixels",
+        reconstruction__components=None,
+        reconstruction__weights="softened",
+    )
     assert make_plan(other, components=(8,)).base == Case(12, 30.0, "pixels", "softened", 1, 0)
     assert make_plan(tiny(reconstruction__interpolation="kriging")).base.interpolation == "kriging"
     assert plan.default == Case(12, 30.0, "pixels", "kriging", 4, 0)
@@ -316,6 +321,7 @@ def test_a_model_without_shapes_is_a_problem(experiment):
     seen = observe(experiment, ccd, NOISE_FREE, 0)
     case = Case(12, NOISE_FREE, components=2, order=1)
     model = fit(case, ccd, seen)
-    dark = replace(model, mean=np.zeros_like(model.mean), components=np.zeros_like(model.components))
+    basis = replace(model.basis, mean=np.zeros_like(model.mean), components=np.zeros_like(model.components))
+    dark = replace(model, basis=basis)
     with pytest.raises(DomainError, match="CCD R22_S11: the model has no shape anywhere"):
         measure_residuals(experiment, case, [ccd], [seen], [dark])

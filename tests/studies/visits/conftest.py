@@ -18,7 +18,7 @@ def visits_config():
             "psf": {"engine": "long_exposure", "n_pupil": 300},
             "focal_plane": {"raft_um": 0.0, "ccd_um": 20.0},
             "active_optics": {"residual_um": 0.3},
-            "reconstruction": {"basis": "pixels", "order": 1, "weights": "snr"},
+            "reconstruction": {"recipe": "paper", "basis": "pixels", "order": 1, "weights": "snr"},
         }
         settings = {"count": 2, "stars": 20, "places": 8, "snapshots": (1,)} | visits
         return VisitsConfig(run=configuration_of(run, "test"), visits=VisitsSection(**settings))

@@ -1,0 +1,1 @@
+"""PSF models: bases, interpolations and recipes; the whole focal plane; own stars; files of Piff."""
