@@ -113,8 +113,8 @@ def _show(result: Study) -> None:
         cases += [best for how in ways if (best := result.best_order(stars, how))]
     rows = []
     for case in dict.fromkeys(cases):
-        if (found := result.metrics.get(case)) is not None:
-            rows.append((f"{case.stars} stars, {case}", *(f"{found[key]:.1e}" for key in _COLUMNS)))
+        if (case_metrics := result.metrics.get(case)) is not None:
+            rows.append((f"{case.stars} stars, {case}", *(f"{case_metrics[key]:.1e}" for key in _COLUMNS)))
     Rows(("model", *_COLUMNS.values()), rows, _CAPTION).show()
     if result.problems:
         case, why = next(iter(result.problems.items()))

@@ -56,14 +56,14 @@ class GalaxySourceConfig(Section):
 
     def with_files(self, folder: Path) -> Self:
         """Return the section with the absolute path of its file, which starts from `folder` and must be there."""
-        given = {key: path for key in _FILES if (path := getattr(self, key)) is not None}
-        if len(given) > 1:
+        paths = {key: path for key in _FILES if (path := getattr(self, key)) is not None}
+        if len(paths) > 1:
             raise ConfigError("galaxies.catalogue and galaxies.mosaic: expected one of them")
-        for key, path in given.items():
-            given[key] = str((folder / path).resolve())
-            if not Path(given[key]).is_file():
+        for key, path in paths.items():
+            paths[key] = str((folder / path).resolve())
+            if not Path(paths[key]).is_file():
                 raise ConfigError(f"galaxies.{key} = {path}: no such file", key=f"galaxies.{key}")
-        return self.model_copy(update=given)
+        return self.model_copy(update=paths)
 
     def content(self) -> dict[str, Any]:
         """Return the content for a digest, with files by their content."""

@@ -160,11 +160,11 @@ def draw_galaxies(
         If there is no such way.
     """
     check_choice("way", way, WAYS)
-    part = Window(0, 0, wcs.shape[1], wcs.shape[0]) if window is None else window
+    area = Window(0, 0, wcs.shape[1], wcs.shape[0]) if window is None else window
     if way == "direct":
-        return _draw_direct(galaxies, electrons, psf, wcs, part, noise, threads, progress)
+        return _draw_direct(galaxies, electrons, psf, wcs, area, noise, threads, progress)
     margin = psf.stamp // 2 + 1
-    wide = part.grown(margin)
+    wide = area.grown(margin)
     scene = _draw_direct(galaxies, electrons, None, wcs, wide, noise, threads, progress)
     return _convolve_with_psf(scene, psf, wide, threads)[margin:-margin, margin:-margin].copy()
 
@@ -186,15 +186,15 @@ def grid_sizes(electrons: np.ndarray, radius: np.ndarray, profile: np.ndarray, n
     noise : float or ndarray, shape [n]
         rms noise of a pixel [electron].
     """
-    chosen = np.full(len(electrons), SIZES[-1])
+    sizes = np.full(len(electrons), SIZES[-1])
     for size in reversed(SIZES[:-1]):
         # A pixel of margin for the place of the galaxy between pixels.
         edge = size // 2 - 1
         star = profile[edge] if edge < len(profile) else 0.0
         # Ciotti & Bertin 1999: I = L / (22.665 r^2) exp(-7.669 ((R/r)^(1/4) - 1)).
         galaxy = np.exp(-7.669 * ((edge / radius) ** 0.25 - 1.0)) / (22.665 * radius**2)
-        chosen[electrons * np.maximum(star, galaxy) < _WRAPPED * noise] = size
-    return chosen
+        sizes[electrons * np.maximum(star, galaxy) < _WRAPPED * noise] = size
+    return sizes
 
 
 def add_stamps(image: np.ndarray, stamps: np.ndarray, corners: np.ndarray) -> None:
@@ -233,20 +233,22 @@ def _draw_direct(
     def blocks() -> Iterator[tuple[np.ndarray, int, np.ndarray]]:
         for size in SIZES:
             # Those whose grid touches the window.
-            own = np.flatnonzero((sizes == size) & window.contains(pixels, 0.5 * size))
-            if len(own):
+            galaxy_indices = np.flatnonzero((sizes == size) & window.contains(pixels, 0.5 * size))
+            if len(galaxy_indices):
                 basis = _softening_transform(size)[None] if psf is None else psf.transforms(size)
                 flat = np.ascontiguousarray(basis).view(np.float32).reshape(len(basis), -1)
                 count = max(1, _BLOCK // size**2)
-                yield from ((own[i : i + count], size, flat) for i in range(0, len(own), count))
+                yield from ((galaxy_indices[i : i + count], size, flat) for i in range(0, len(galaxy_indices), count))
 
     def drawn(block: tuple[np.ndarray, int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        own, size, basis = block
-        spectrum = galaxies.transform(own, jacobians[own], pixels[own] - nearest[own], size, threads=1)
+        galaxy_indices, size, basis = block
+        spectrum = galaxies.transform(
+            galaxy_indices, jacobians[galaxy_indices], pixels[galaxy_indices] - nearest[galaxy_indices], size, threads=1
+        )
         with one_blas_thread():
-            kernel = amplitudes[own] @ basis
+            kernel = amplitudes[galaxy_indices] @ basis
         spectrum *= kernel.view(np.complex64).reshape(spectrum.shape)
-        corners = nearest[own] - size // 2 - (window.x, window.y)
+        corners = nearest[galaxy_indices] - size // 2 - (window.x, window.y)
         return fft.irfft2(spectrum, s=(size, size), workers=1), corners
 
     workers, waiting = thread_count(threads), blocks()
@@ -289,15 +291,15 @@ def _convolve_with_psf(scene: np.ndarray, psf: PsfField, window: Window, threads
             maps = (along_y @ amplitudes @ along_x.T).astype(np.float32)
         for field, component in zip(maps, basis, strict=True):
             total += fft.rfft2(tile * field, s=(_TILE_GRID, _TILE_GRID), workers=1) * component
-        found = fft.irfft2(total, s=(_TILE_GRID, _TILE_GRID), workers=1)
+        tile_light = fft.irfft2(total, s=(_TILE_GRID, _TILE_GRID), workers=1)
         # What lies more than half of the spread before the tile has come round the other end of the grid.
         spread = (_TILE_GRID - _TILE) // 2
-        return np.roll(found, (spread - shift, spread - shift), axis=(0, 1)), np.array([[x - spread, y - spread]])
+        return np.roll(tile_light, (spread - shift, spread - shift), axis=(0, 1)), np.array([[x - spread, y - spread]])
 
     corners = [(x, y) for y in range(0, scene.shape[0], _TILE) for x in range(0, scene.shape[1], _TILE)]
     with ThreadPoolExecutor(thread_count(threads)) as pool:
-        for found, corner in pool.map(convolved, corners):
-            add_stamps(image, found[None], corner)
+        for tile_light, corner in pool.map(convolved, corners):
+            add_stamps(image, tile_light[None], corner)
     return image
 
 
@@ -305,6 +307,6 @@ def _lagrange_matrix(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the matrix of the polynomial through values at nodes, evaluated at points (Lagrange)."""
     matrix = np.ones((len(points), len(nodes)))
     for j, node in enumerate(nodes):
-        for other in np.delete(nodes, j):
-            matrix[:, j] *= (points - other) / (node - other)
+        for other_node in np.delete(nodes, j):
+            matrix[:, j] *= (points - other_node) / (node - other_node)
     return matrix

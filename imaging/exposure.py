@@ -76,14 +76,16 @@ class Exposure:
     def of_run(cls, experiment: Experiment, exposures: int = 1, **settings: Any) -> Exposure:
         """Return exposures with the time, the band and the pixels of a run's camera, but for other `settings`."""
         band = experiment.band
-        own: dict[str, Any] = {
+        run_values: dict[str, Any] = {
             "gain": band.gain,
             "pixel_scale": band.pixel_scale,
             "read_noise": band.read_noise,
             "dark_current": band.dark_current,
             "full_well": band.full_well,
         }
-        return cls(band.name, experiment.config.atmosphere.exposure_s, exposures, photometry=band, **(own | settings))
+        return cls(
+            band.name, experiment.config.atmosphere.exposure_s, exposures, photometry=band, **(run_values | settings)
+        )
 
     def __post_init__(self) -> None:
         if self._band.name != self.band:

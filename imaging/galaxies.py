@@ -98,13 +98,13 @@ class GalaxySource:
         return self._population(faintest).galaxies_in if self.given is None else _FixedGalaxies(self.given, faintest)
 
     def _population(self, faintest: float) -> GalaxyPopulation:
-        wanted, exposure = self.config, self.exposure
+        settings, exposure = self.config, self.exposure
         with error_context(key="galaxies"):
-            population = GalaxyPopulation(faintest, self.seed, wanted.brightest, wanted.density)
-            magnitude = np.linspace(wanted.brightest, faintest, _MAGNITUDES)
-            number = wanted.density * np.diff(counts(magnitude)) * (exposure.pixel_scale / ARCMIN) ** 2
+            population = GalaxyPopulation(faintest, self.seed, settings.brightest, settings.density)
+            magnitude = np.linspace(settings.brightest, faintest, _MAGNITUDES)
+            number = settings.density * np.diff(counts(magnitude)) * (exposure.pixel_scale / ARCMIN) ** 2
             light = number * exposure.electrons(0.5 * (magnitude[:-1] + magnitude[1:]))
-            check_density(float(light.sum()), exposure, f"density = {wanted.density:g}: ")
+            check_density(float(light.sum()), exposure, f"density = {settings.density:g}: ")
         return population
 
 
@@ -117,10 +117,12 @@ class _FixedGalaxies:
 
     def __call__(self, xi: Any, eta: Any) -> Galaxies | PlantedGalaxies:
         """Return those in two ranges that are no fainter than the limit."""
-        given = self.galaxies
-        found: Galaxies | PlantedGalaxies
-        if isinstance(given, Galaxies):
-            found = given.take(np.flatnonzero(Region.between(xi, eta).contains(given.xi, given.eta)))
+        fixed_galaxies = self.galaxies
+        galaxies_in_area: Galaxies | PlantedGalaxies
+        if isinstance(fixed_galaxies, Galaxies):
+            galaxies_in_area = fixed_galaxies.take(
+                np.flatnonzero(Region.between(xi, eta).contains(fixed_galaxies.xi, fixed_galaxies.eta))
+            )
         else:
-            found = given.galaxies_in(xi, eta)
-        return found.take(np.flatnonzero(found.magnitude <= self.faintest))
+            galaxies_in_area = fixed_galaxies.galaxies_in(xi, eta)
+        return galaxies_in_area.take(np.flatnonzero(galaxies_in_area.magnitude <= self.faintest))

@@ -58,19 +58,19 @@ class PachonOpticsBuilder(galsim.config.PhotonOpBuilder):
         """Return the photon operator of a section."""
         optional = {"position_angle": galsim.Angle, "rotator": galsim.Angle, "heights": str, "seed": int,
                     "silicon": bool, "threads": int}  # fmt: skip
-        given, _ = galsim.config.GetAllParams(config, base, req=_PLACE, opt=optional)
-        boresight, angle = given["boresight"], _angle(given, "position_angle")
-        telescope = _telescope(given["telescope"], _angle(given, "rotator"))
+        parameters, _ = galsim.config.GetAllParams(config, base, req=_PLACE, opt=optional)
+        boresight, angle = parameters["boresight"], _angle(parameters, "position_angle")
+        telescope = _telescope(parameters["telescope"], _angle(parameters, "rotator"))
         return PachonOptics(
             telescope,
             sky_pos=base["sky_pos"],
             pointing=(boresight.ra.rad, boresight.dec.rad),
             position_angle=angle,
-            focal_plane=_focal_plane(telescope.camera, given.get("heights", "nominal"), given.get("seed", 0)),
-            ccd=given["ccd"],
+            focal_plane=_focal_plane(telescope.camera, parameters.get("heights", "nominal"), parameters.get("seed", 0)),
+            ccd=parameters["ccd"],
             image_pos=base["image_pos"],
-            silicon=Silicon() if given.get("silicon") else None,
-            threads=given.get("threads"),
+            silicon=Silicon() if parameters.get("silicon") else None,
+            threads=parameters.get("threads"),
         )
 
 
@@ -80,10 +80,10 @@ class PachonWcsBuilder(galsim.config.WCSBuilder):
     def buildWCS(self, config: dict[str, Any], base: dict[str, Any], logger: Any) -> galsim.GSFitsWCS:  # noqa: N802
         """Return the WCS of a section."""
         optional = {"position_angle": galsim.Angle, "rotator": galsim.Angle}
-        given, _ = galsim.config.GetAllParams(config, base, req=_PLACE, opt=optional)
-        boresight, angle = given["boresight"], _angle(given, "position_angle")
-        telescope = _telescope(given["telescope"], _angle(given, "rotator"))
-        return _wcs(telescope, given["ccd"], (boresight.ra.rad, boresight.dec.rad), angle)
+        parameters, _ = galsim.config.GetAllParams(config, base, req=_PLACE, opt=optional)
+        boresight, angle = parameters["boresight"], _angle(parameters, "position_angle")
+        telescope = _telescope(parameters["telescope"], _angle(parameters, "rotator"))
+        return _wcs(telescope, parameters["ccd"], (boresight.ra.rad, boresight.dec.rad), angle)
 
 
 galsim.config.RegisterPhotonOpType("PachonOptics", PachonOpticsBuilder())

@@ -26,11 +26,11 @@ def cutouts_png(scene: CcdScene, *, threads: int | None = None) -> bytes:
         (f"{deep.total_time:g} s", replace(deep, noise=True)),
         ("without noise", replace(deep, noise=False)),
     ]
-    part = _middle(scene)
+    central_scene = _middle(scene)
     with styled():
         figure = new_figure(10.5, 3.9)
         for axes, (title, exposure) in zip(figure.subplots(1, 3), panels, strict=True):
-            image = part.exposed(exposure, threads=threads)
+            image = central_scene.exposed(exposure, threads=threads)
             show_stretched(
                 axes,
                 image.image - sky_level(image.header),

@@ -55,7 +55,7 @@ class CcdScene:
         settings = self.exposure if exposure is None else exposure
         ratio = float(settings.electrons(0.0) / self.exposure.electrons(0.0))
         scene = self.electrons if ratio == 1.0 else (self.electrons * ratio).astype(np.float32)
-        found = expose(scene, settings, self.seed, self.name, self.epoch, threads=threads)
+        ccd_image = expose(scene, settings, self.seed, self.name, self.epoch, threads=threads)
         header = self.wcs.to_header((self.window.x, self.window.y))
         for key, value, comment in (
             ("BUNIT", "adu", ""),
@@ -77,7 +77,7 @@ class CcdScene:
         ):
             header[key] = (value, comment)
         objects = self.objects if ratio == 1.0 else self.objects | {"FLUX": self.objects["FLUX"] * ratio}
-        return CcdImage(self.name, found.image, found.variance, found.mask, header, objects)
+        return CcdImage(self.name, ccd_image.image, ccd_image.variance, ccd_image.mask, header, objects)
 
 
 @check_arguments
@@ -153,28 +153,28 @@ def draw_ccd(
         wavelength=experiment.wavelengths[len(experiment.wavelengths) // 2],
         threads=threads,
     )
-    part = Window(0, 0, *camera.pixels[camera.ccd_index(ccd)].tolist()) if window is None else window
+    area = Window(0, 0, *camera.pixels[camera.ccd_index(ccd)].tolist()) if window is None else window
     psf = PsfField.of_run(experiment, ccd, interpolation=interpolation, threads=threads, progress=progress)
-    galaxies = galaxies_near(galaxies, wcs, part)
+    galaxies = galaxies_near(galaxies, wcs, area)
     pixels = wcs.to_pixel(np.stack([galaxies.xi, galaxies.eta], axis=1))
     electrons = exposure.electrons(galaxies.magnitude) * psf.lit_fraction(pixels)
     noise = np.full(len(galaxies), exposure.noise_rms)
-    middle = middle_window(part, exposure).contains(pixels, 0.5 * SIZES[-1])
+    middle = middle_window(area, exposure).contains(pixels, 0.5 * SIZES[-1])
     noise[middle] /= np.sqrt(max(deep_exposures(exposure) / exposure.exposures, 1.0))
-    own = part.contains(pixels)
-    check_density(float(electrons[own].sum()) / (part.width * part.height), exposure)
+    in_area = area.contains(pixels)
+    check_density(float(electrons[in_area].sum()) / (area.width * area.height), exposure)
     image = draw_galaxies(
         galaxies,
         electrons,
         psf,
         wcs,
-        window=part,
+        window=area,
         noise=noise,
         way=way,
         threads=threads,
         progress=progress,
     )
-    stars = _add_stars(image, experiment, ccd, psf, exposure, part, threads, progress)
+    stars = _add_stars(image, experiment, ccd, psf, exposure, area, threads, progress)
     tables = [
         {
             "PIXEL": stars["PIXEL"],
@@ -185,13 +185,13 @@ def draw_ccd(
             **{key: np.zeros(len(stars["MAG"])) for key in ("RADIUS", "E1", "E2")},
         },
         {
-            "PIXEL": pixels[own],
-            "SKY": np.stack([galaxies.xi, galaxies.eta], axis=1)[own],
-            "MAG": galaxies.magnitude[own],
-            "FLUX": electrons[own],
-            "STAR": np.zeros(int(own.sum()), dtype=bool),
-            "RADIUS": galaxies.radius[own] / ARCSEC,
-            **{key: values[own] for key, values in zip(("E1", "E2"), ellipticities(galaxies), strict=True)},
+            "PIXEL": pixels[in_area],
+            "SKY": np.stack([galaxies.xi, galaxies.eta], axis=1)[in_area],
+            "MAG": galaxies.magnitude[in_area],
+            "FLUX": electrons[in_area],
+            "STAR": np.zeros(int(in_area.sum()), dtype=bool),
+            "RADIUS": galaxies.radius[in_area] / ARCSEC,
+            **{key: values[in_area] for key, values in zip(("E1", "E2"), ellipticities(galaxies), strict=True)},
         },
     ]
     return CcdScene(
@@ -199,7 +199,7 @@ def draw_ccd(
         image,
         object_columns({key: np.concatenate([table[key] for table in tables]) for key in tables[0]}, wcs),
         wcs,
-        part,
+        area,
         exposure,
         experiment.telescope.name,
         config.seed,
@@ -236,8 +236,8 @@ def ellipticities(galaxies: Any) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(0), np.zeros(0)
     trace, spin = (np.add.reduceat(v, galaxies.first[:-1]) for v in (trace, spin))
     # (Q11 - Q22 + 2i Q12) / (Q11 + Q22 + 2 sqrt(det Q)), where 4 det Q = trace^2 - |spin|^2.
-    whole = spin / (trace + np.sqrt(np.maximum(trace**2 - np.abs(spin) ** 2, 0.0)))
-    return whole.real, whole.imag
+    ellipticity = spin / (trace + np.sqrt(np.maximum(trace**2 - np.abs(spin) ** 2, 0.0)))
+    return ellipticity.real, ellipticity.imag
 
 
 def _add_stars(
@@ -281,8 +281,8 @@ def _add_stars(
     electrons = exposure.electrons(magnitude) * stars.lit_fraction
     corners = nearest - stars.image.shape[1] // 2 - (window.x, window.y)
     add_stamps(image, stars.image * electrons[:, None, None].astype(np.float32), corners)
-    own = window.contains(pixels)
-    return {"PIXEL": pixels[own], "MAG": magnitude[own], "FLUX": electrons[own]}
+    in_window = window.contains(pixels)
+    return {"PIXEL": pixels[in_window], "MAG": magnitude[in_window], "FLUX": electrons[in_window]}
 
 
 def check_density(electrons: float, exposure: Exposure, start: str = "") -> None:

@@ -300,12 +300,12 @@ def wcs(
     DomainError
         If the pointing is none, a corner of the CCD lies outside the field, or no polynomial is good enough.
     """
-    chosen = telescope.camera if camera is None else camera
-    if chosen is None:
+    camera_name = telescope.camera if camera is None else camera
+    if camera_name is None:
         raise ConfigError(f"camera = None: expected a camera for {telescope.name}, which has none of its own")
     fitted = ccd_wcs(
         telescope,
-        load_camera(chosen),
+        load_camera(camera_name),
         ccd,
         pointing=pointing,
         position_angle=angle(rotation, "rotation"),
@@ -335,8 +335,8 @@ def _sip_polynomials(
 def _reproject(plane: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Reproject points [n, 2] onto another tangent plane, by the rotation of its axes; with derivatives [n, 2, 2]."""
     vectors = np.column_stack([plane, np.ones(len(plane))]) @ turn.T
-    found, ahead = vectors[:, :2] / vectors[:, 2:], vectors[:, 2, None, None]
-    return found, (turn[:2, :2] - found[:, :, None] * turn[2, :2]) / ahead
+    tangent_points, ahead = vectors[:, :2] / vectors[:, 2:], vectors[:, 2, None, None]
+    return tangent_points, (turn[:2, :2] - tangent_points[:, :, None] * turn[2, :2]) / ahead
 
 
 def _linear_part(tables: np.ndarray) -> np.ndarray:
@@ -351,9 +351,9 @@ def _fit_polynomials(points: np.ndarray, values: np.ndarray, order: int) -> np.n
     scale = 0.5 * np.ptp(points, axis=0).max()
     s, t = ((points - middle) / scale).T
     terms = _exponents(order)
-    found = np.linalg.lstsq(np.stack([s**i * t**j for i, j in terms], axis=1), values, rcond=None)[0]
+    coefficients = np.linalg.lstsq(np.stack([s**i * t**j for i, j in terms], axis=1), values, rcond=None)[0]
     tables = np.zeros((2, order + 1, order + 1))
-    for (i, j), coefficient in zip(terms, found, strict=True):
+    for (i, j), coefficient in zip(terms, coefficients, strict=True):
         tables[:, i, j] = coefficient / scale ** (i + j)
     return _shift_origin(tables, -middle)
 

@@ -129,25 +129,25 @@ class FocalPlaneConfig(Section):
     @property
     def changed(self) -> tuple[str, ...]:
         """Keys of the height budget whose values are not the default ones."""
-        before, now = FocalPlaneConfig().model_dump(by_alias=True), self.model_dump(by_alias=True)
+        defaults, values = FocalPlaneConfig().model_dump(by_alias=True), self.model_dump(by_alias=True)
         # The budget is that of the camera where none is named.
         return tuple(
             key
-            for key in now
-            if key not in ("heights", "moved") and now[key] not in (before[key], _CAMERAS_OWN.get(key))
+            for key in values
+            if key not in ("heights", "moved") and values[key] not in (defaults[key], _CAMERAS_OWN.get(key))
         )
 
     @property
     def sizes(self) -> dict[str, Any]:
         """Sizes in place of the budget's, as :class:`~.HeightBudget` has them, in SI."""
-        given = {
+        stated_sizes = {
             "global_height": self.global_um,
             "raft_height": self.raft_um,
             "ccd_height": self.ccd_um,
             "ccd_tilt": self.tilt_urad,
             "potato_chip": self.potato_chip_um,
         }
-        sizes: dict[str, Any] = {key: value * 1e-6 for key, value in given.items() if value is not None}
+        sizes: dict[str, Any] = {key: value * 1e-6 for key, value in stated_sizes.items() if value is not None}
         return sizes | ({} if self.potato_chip_cycles is None else {"potato_chip_cycles": self.potato_chip_cycles})
 
     @property
@@ -387,11 +387,11 @@ def with_options(config: _Model, **options: Any) -> _Model:
 
     Options are named by dotted key, dots written as two underscores: ``stars__truth=50``.
     """
-    given = {dotted: value for dotted, value in options.items() if value is not None}
-    if not given:
+    stated_options = {dotted: value for dotted, value in options.items() if value is not None}
+    if not stated_options:
         return config
     content = config.model_dump(by_alias=True)
-    for dotted, value in given.items():
+    for dotted, value in stated_options.items():
         *sections, key = dotted.split("__")
         target = content
         for section in sections:

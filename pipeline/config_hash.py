@@ -48,19 +48,21 @@ def hashed_content(config: Configuration) -> dict[str, Any]:
 
 def hashed_photometry(content: dict[str, Any], config: Configuration) -> dict[str, Any]:
     """Return a configuration for a hash: without photometry where it is the LSST's, and never with its source."""
-    rest = {key: value for key, value in content.items() if key != "photometry"}
+    other_sections = {key: value for key, value in content.items() if key != "photometry"}
     if config.band is not None:
         lsst = BANDS[config.band]
         if band_of(config.band, config.photometry.model_copy(update={"source": lsst.source})) == lsst:
-            return rest
-    return rest | {"photometry": {key: value for key, value in content["photometry"].items() if key != "source"}}
+            return other_sections
+    return other_sections | {
+        "photometry": {key: value for key, value in content["photometry"].items() if key != "source"}
+    }
 
 
 def hashed_camera(content: dict[str, Any]) -> dict[str, Any]:
     """Return a configuration for a hash: a camera file by its content; no key where the telescope's own is taken."""
     name = content["camera"]
-    rest = {key: value for key, value in content.items() if key != "camera"}
-    return rest if name is None else rest | {"camera": _name_or_content(name, CAMERAS, CAMERA_ENDINGS)}
+    other_keys = {key: value for key, value in content.items() if key != "camera"}
+    return other_keys if name is None else other_keys | {"camera": _name_or_content(name, CAMERAS, CAMERA_ENDINGS)}
 
 
 def hashed_heights(section: dict[str, Any]) -> dict[str, Any]:
@@ -78,8 +80,8 @@ def hashed_heights(section: dict[str, Any]) -> dict[str, Any]:
 def hashed_states(section: dict[str, Any]) -> dict[str, Any]:
     """Return the section of the active optics for a hash, as :func:`hashed_heights` does that of the focal plane."""
     name = section["states"]
-    rest = {key: value for key, value in section.items() if key != "states"}
-    return rest if name is None else rest | {"states": _name_or_content(name, (), STATE_ENDINGS)}
+    other_keys = {key: value for key, value in section.items() if key != "states"}
+    return other_keys if name is None else other_keys | {"states": _name_or_content(name, (), STATE_ENDINGS)}
 
 
 def hashed_stars(section: dict[str, Any]) -> dict[str, Any]:

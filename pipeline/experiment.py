@@ -198,18 +198,18 @@ class Experiment:
         """Return the static displacements of charge on a CCD; the rings of each CCD have a phase of their own."""
         sensor, camera = self.config.sensor, self.camera
         index = camera.ccd_index(name)
-        found: list[Displacement] = []
+        effects: list[Displacement] = []
         if sensor.tree_rings_um:
             phase = stream(self.config.seed, "tree rings", name).uniform(0.0, 2.0 * math.pi)
             along_x, along_y = (mm * 1e-3 for mm in sensor.tree_ring_center_mm)
             x, y = map(float, camera.frame(index).along_focal_plane(along_x, along_y))
-            found.append(TreeRings(sensor.tree_rings_um * 1e-6, sensor.tree_ring_period_um * 1e-6, (x, y), phase))
+            effects.append(TreeRings(sensor.tree_rings_um * 1e-6, sensor.tree_ring_period_um * 1e-6, (x, y), phase))
         if sensor.edge_rolloff_um:
             length = sensor.edge_rolloff_length_um * 1e-6
             a, b = camera.half_sizes[index].tolist()
             turn = math.radians(camera.rotation_deg[index])
-            found.append(EdgeRolloff(sensor.edge_rolloff_um * 1e-6, length, (a, b), turn))
-        return tuple(found)
+            effects.append(EdgeRolloff(sensor.edge_rolloff_um * 1e-6, length, (a, b), turn))
+        return tuple(effects)
 
     @property
     def dispersion(self) -> np.ndarray | None:

@@ -79,12 +79,12 @@ def apply_focal_plane_model(
             observed = _with_model(product.name, product.observed, model, threads)
             holdout = _with_model(product.name, product.holdout, model, threads)
             used = observed.used
-            own = slice(first, first + int(used.sum()))
+            ccd_rows = slice(first, first + int(used.sum()))
             e1, e2 = np.full((2, len(used)), np.nan)
-            e1[used], e2[used] = left_out.e1[own], left_out.e2[own]
+            e1[used], e2[used] = left_out.e1[ccd_rows], left_out.e2[ccd_rows]
             observed = replace(observed, leave_one_out_e1=e1, leave_one_out_e2=e2)
             applied.append(replace(product, observed=observed, holdout=holdout))
-            first = own.stop
+            first = ccd_rows.stop
             stage.advance(len(observed) + len(holdout))
     return applied, model
 
@@ -167,16 +167,16 @@ def write_focal_plane_model(folder: Path, products: Sequence[CcdProduct], model:
 
 def _with_model(name: str, stars: _StarsKind, model: FocalPlanePsf, threads: int | None) -> _StarsKind:
     """Return stars of a CCD with the shapes that the model has there, and those of the CCD's own model."""
-    own = of_ccd_model(stars)
+    ccd_columns = of_ccd_model(stars)
     shapes, sigma = model.predict(name, stars.x, stars.y, threads=threads)
     return replace(
         stars,
         model_e1=shapes.e1,
         model_e2=shapes.e2,
         model_size=shapes.size,
-        ccd_e1=own.model_e1,
-        ccd_e2=own.model_e2,
-        ccd_size=own.model_size,
+        ccd_e1=ccd_columns.model_e1,
+        ccd_e2=ccd_columns.model_e2,
+        ccd_size=ccd_columns.model_size,
         sigma_e1=sigma.e1,
         sigma_e2=sigma.e2,
         sigma_size=sigma.size,

@@ -33,19 +33,19 @@ def resolved_photometry(
     section: PhotometryConfig, telescope: Telescope, camera: Camera, band: BandName
 ) -> PhotometryConfig:
     """Return the section with the camera's numbers where there are none."""
-    missing = [key for key, value in section.model_dump().items() if value is None]
-    found: dict[str, float | str] = {}
-    if set(missing).intersection(_SAME):
+    open_keys = [key for key, value in section.model_dump().items() if value is None]
+    values: dict[str, float | str] = {}
+    if set(open_keys).intersection(_SAME):
         low, high = telescope.band or (0.0, 0.0)
         ends = (low, high) if high > low else BANDS[band].wavelength_range
         area = 0.25 * math.pi * telescope.pupil_diameter**2 * (1.0 - telescope.pupil_obscuration**2)
         with error_context(key="band"):
-            own = camera.photometry.band(camera.name, band, area, ends)
-        found = {key: getattr(own, name) for key, name in _SAME.items()}
-    if "pixel_arcsec" in missing:
+            camera_band = camera.photometry.band(camera.name, band, area, ends)
+        values = {key: getattr(camera_band, name) for key, name in _SAME.items()}
+    if "pixel_arcsec" in open_keys:
         # To a thousandth, as cameras state it: 0.2 for the LSST.
-        found["pixel_arcsec"] = round(pixel_angle(telescope, camera.pixel_size) / ARCSEC, 3)
-    return section.model_copy(update={key: found[key] for key in missing})
+        values["pixel_arcsec"] = round(pixel_angle(telescope, camera.pixel_size) / ARCSEC, 3)
+    return section.model_copy(update={key: values[key] for key in open_keys})
 
 
 def band_of(name: BandName, section: PhotometryConfig) -> Band:

@@ -107,8 +107,8 @@ def run(
     check_catalogue(experiment, names, strict=strict)
     if parts > 1:
         execution = replace(execution, resume=True)
-    kept = finished_ccds(folder, experiment) if execution.resume else ()
-    unfinished_ccds = tuple(name for name in names[number - 1 :: parts] if name not in kept)
+    finished_names = finished_ccds(folder, experiment) if execution.resume else ()
+    unfinished_ccds = tuple(name for name in names[number - 1 :: parts] if name not in finished_names)
     # The report of a finished run needs no screens.
     if unfinished_ccds and execution.alone:
         check_memory(experiment, threads)
@@ -116,8 +116,8 @@ def run(
         claim_run(folder, experiment, resume=execution.resume)
         if experiment.star_list is not None:
             reporter.line(experiment.star_list.text)
-        if kept:
-            reporter.line(f"{len(kept)} of {len(names)} CCDs are finished already")
+        if finished_names:
+            reporter.line(f"{len(finished_names)} of {len(names)} CCDs are finished already")
         focal_plane = submit(write_focal_plane, experiment, folder)
         submit(_load_plots)
         failed: dict[str, str] = {}
@@ -126,16 +126,16 @@ def run(
         computed = tuple(name for name in unfinished_ccds if name not in failed)
         if parts > 1:
             # Other parts may have ended meanwhile.
-            other_ccds = [name for name in names if name not in (*kept, *unfinished_ccds)]
+            other_ccds = [name for name in names if name not in (*finished_names, *unfinished_ccds)]
             finished = finished_ccds(folder, experiment, other_ccds)
             unfinished = tuple(name for name in other_ccds if name not in finished)
             if unfinished:
-                return RunResult(folder, None, {}, kept, computed, failed, unfinished)
+                return RunResult(folder, None, {}, finished_names, computed, failed, unfinished)
         with reporter.stage("focal plane"):
             focal_plane()
         summary = _summarize(experiment, folder, failed, submit, threads, reporter)
     write_json(folder / "timings.json", _timings(reporter, threads))
-    return RunResult(folder, folder / REPORT_NAME, summary, kept, computed, failed)
+    return RunResult(folder, folder / REPORT_NAME, summary, finished_names, computed, failed)
 
 
 def _summarize(

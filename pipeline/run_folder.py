@@ -24,7 +24,7 @@ def claim_run(folder: Path, experiment: Experiment, *, resume: bool) -> None:
     A run may be resumed with more CCDs than before, since no CCD depends on the others. A folder with another
     configuration's run, or one that cannot be made or written, raises ProductError.
     """
-    path, now = folder / CONFIG_NAME, experiment.config.as_dict()
+    path, settings = folder / CONFIG_NAME, experiment.config.as_dict()
     heading = (
         f"pachon {VERSION}: all that decides this run.",
         "The same bytes again: pachon run config.yaml --out OTHER",
@@ -33,12 +33,12 @@ def claim_run(folder: Path, experiment: Experiment, *, resume: bool) -> None:
     def read(path: Path) -> dict[str, Any]:
         before = load_configuration(path).as_dict()
         # No CCD depends on the others, so CCDs may be added; without one of them its product would be orphaned.
-        if resume and set(before["ccds"] or ()) <= set(now["ccds"]):
-            before["ccds"] = now["ccds"]
+        if resume and set(before["ccds"] or ()) <= set(settings["ccds"]):
+            before["ccds"] = settings["ccds"]
         return before
 
     content = to_yaml(experiment.config, heading).encode()
-    claim_folder(path, content, products="ccd_*.fits", noun="a run", now=now, read=read)
+    claim_folder(path, content, products="ccd_*.fits", noun="a run", now=settings, read=read)
 
 
 def finished_ccds(folder: Path, experiment: Experiment, names: Iterable[str] | None = None) -> tuple[str, ...]:

@@ -87,11 +87,11 @@ class StarList:
     @property
     def text(self) -> str:
         """One line that counts the stars."""
-        found = ", ".join(f"{n} {what.replace('_', ' ')}" for what, n in self.counts.items() if n)
+        counts_text = ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in self.counts.items() if n)
         note = "" if self.spectrum is None else f"; spectra from column {self.spectrum}"
         if self.unused and self.spectrum is None:
             note = f"; column {', '.join(self.unused)} is not used: name its bands ({', '.join(_SPECTRA)})"
-        return f"{self.name}: {found or 'no stars'}{note}"
+        return f"{self.name}: {counts_text or 'no stars'}{note}"
 
 
 def pointing_of(config: Configuration) -> Pointing | None:
@@ -175,9 +175,9 @@ def place_stars(
     ccd = camera.ccd_at(*places.T, margin=-RIM * camera.pixel_size)
     keep("at_the_rim_of_a_ccd", ccd >= 0)
     ccd = ccd[ccd >= 0]
-    chosen = np.isin(ccd, [camera.ccd_index(name) for name in ccds])
-    keep("on_other_ccds", chosen)
-    ccd = ccd[chosen]
+    on_ccds = np.isin(ccd, [camera.ccd_index(name) for name in ccds])
+    keep("on_other_ccds", on_ccds)
+    ccd = ccd[on_ccds]
     counts["on_the_ccds"] = len(ccd)
     if rows.spectrum is not None:
         counts["without_colour"] = int(np.isnan(kelvin).sum())
@@ -185,10 +185,10 @@ def place_stars(
     # Noise is drawn star by star: the same stars in another order of rows are the same run.
     order = np.lexsort((kelvin, stars[:, 2], stars[:, 1], stars[:, 0], ccd))
     ccd, stars, kelvin = ccd[order], stars[order], kelvin[order]
-    own = {name: ccd == camera.ccd_index(name) for name in ccds}
-    by_ccd = {name: stars[here] for name, here in own.items()}
-    known = {} if rows.spectrum is None else {name: kelvin[here] for name, here in own.items()}
-    return StarList(path.name, by_ccd, counts, rows.unused, rows.spectrum, known)
+    ccd_masks = {name: ccd == camera.ccd_index(name) for name in ccds}
+    by_ccd = {name: stars[mask] for name, mask in ccd_masks.items()}
+    temperatures = {} if rows.spectrum is None else {name: kelvin[mask] for name, mask in ccd_masks.items()}
+    return StarList(path.name, by_ccd, counts, rows.unused, rows.spectrum, temperatures)
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,31 +207,33 @@ def _read_rows(path: Path, columns: dict[str, str], band: str) -> _Rows:
     """Read places and magnitudes of all rows; ProductError if a column is missing or none of numbers."""
     table = read_columns(path)
     with error_context(file=path):
-        given = {key: _column_name(table, key, columns, band) for key in NAMES}
-        whole = [(pair, unit) for pair, unit in _PLACES if all(given[key] for key in pair)]
-        pair, unit = whole[0] if whole else _PLACES[0]
-        missing = [key for key in (*pair, "mag") if given[key] is None]
-        if missing:
-            looked = "; ".join(f"{key}: {', '.join(_column_names(key, columns, band))}" for key in missing)
-            raise ProductError(f"no column {', '.join(missing)} ({looked}); columns are {', '.join(table) or 'none'}")
-        magnitude = _column_in_unit(table, str(given["mag"]), None)
-        places = np.stack([_column_in_unit(table, str(given[key]), unit) for key in pair], axis=1)
+        column_names = {key: _column_name(table, key, columns, band) for key in NAMES}
+        complete_pairs = [(pair, unit) for pair, unit in _PLACES if all(column_names[key] for key in pair)]
+        pair, unit = complete_pairs[0] if complete_pairs else _PLACES[0]
+        absent_keys = [key for key in (*pair, "mag") if column_names[key] is None]
+        if absent_keys:
+            looked = "; ".join(f"{key}: {', '.join(_column_names(key, columns, band))}" for key in absent_keys)
+            raise ProductError(
+                f"no column {', '.join(absent_keys)} ({looked}); columns are {', '.join(table) or 'none'}"
+            )
+        magnitude = _column_in_unit(table, str(column_names["mag"]), None)
+        places = np.stack([_column_in_unit(table, str(column_names[key]), unit) for key in pair], axis=1)
         for key in _SPECTRA:
-            if key in columns and given[key] is None:
+            if key in columns and column_names[key] is None:
                 raise ProductError(f"no column {columns[key]} ({key}); columns are {', '.join(table)}")
-        spectrum = next((key for key in _SPECTRA if given[key]), None)
+        spectrum = next((key for key in _SPECTRA if column_names[key]), None)
         kelvin = np.full(len(magnitude), np.nan)
         if spectrum is not None:
-            kelvin = _star_temperatures(_column_in_unit(table, str(given[spectrum]), None), spectrum)
+            kelvin = _star_temperatures(_column_in_unit(table, str(column_names[spectrum]), None), spectrum)
     unused = tuple(name for name in _COLORS if name in table)
     return _Rows(pair[0], places, magnitude, kelvin, spectrum, unused)
 
 
 def _star_temperatures(values: np.ndarray, kind: str) -> np.ndarray:
     """Return the temperatures [K] of a column of temperatures or colours, NaN where a row has none."""
-    found = values if kind == "teff" else color_temperature(values, kind)
-    found = np.where(np.isfinite(found) & (found > 0.0), found, np.nan)
-    return np.clip(found, COOLEST, HOTTEST)
+    temperatures = values if kind == "teff" else color_temperature(values, kind)
+    temperatures = np.where(np.isfinite(temperatures) & (temperatures > 0.0), temperatures, np.nan)
+    return np.clip(temperatures, COOLEST, HOTTEST)
 
 
 def _landing_points(telescope: Telescope, slopes: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
@@ -266,8 +268,8 @@ def _column_in_unit(table: dict[str, Any], name: str, unit: u.UnitBase | None) -
     numbers = pure_numbers(column.data if isinstance(column, Column) else column, f"column {name}")
     if unit is None:
         return numbers
-    own = getattr(column, "unit", None)
-    if isinstance(own, u.UnrecognizedUnit):
-        raise ProductError(f"column {name!r} in {own}: expected a unit that converts to {unit}")
-    quantity = u.Quantity(numbers, own or unit)
+    column_unit = getattr(column, "unit", None)
+    if isinstance(column_unit, u.UnrecognizedUnit):
+        raise ProductError(f"column {name!r} in {column_unit}: expected a unit that converts to {unit}")
+    quantity = u.Quantity(numbers, column_unit or unit)
     return metres(quantity, f"column {name}") if unit == u.m else radians(quantity, f"column {name}")

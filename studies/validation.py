@@ -145,8 +145,8 @@ def file_schema(kind: str) -> dict[str, Any]:
         If there is no such kind.
     """
     check_choice("kind", kind, [k.name for k in KINDS])
-    (found,) = (k for k in KINDS if k.name == kind)
-    return json_schema(found.model, f"pachon {kind}")
+    (file_kind,) = (k for k in KINDS if k.name == kind)
+    return json_schema(file_kind.model, f"pachon {kind}")
 
 
 def _yaml_file(path: Path) -> Validation:
@@ -160,10 +160,10 @@ def _yaml_file(path: Path) -> Validation:
     kind = max(KINDS, key=lambda k: (len(set(content) & _keys(k)), -len(_keys(k))))
     if not set(content) & _keys(kind):
         raise ConfigError(f"none of the keys of a {', '.join(k.name for k in KINDS)} is in it", file=path)
-    found = _schema_problems(kind, content, path)
-    if not found:
-        found = _loading_problems(kind.load, path, HeightWarning)
-    return Validation(str(path), kind.name, tuple(_with_line(error, path) for error in found))
+    problems = _schema_problems(kind, content, path)
+    if not problems:
+        problems = _loading_problems(kind.load, path, HeightWarning)
+    return Validation(str(path), kind.name, tuple(_with_line(error, path) for error in problems))
 
 
 def _keys(kind: FileKind) -> set[str]:
@@ -177,11 +177,11 @@ def _schema_problems(kind: FileKind, content: dict[str, Any], path: Path) -> lis
     except PachonError as error:
         return [error]
     context = {"folder": path.parent}
-    found = problems_of(kind.model, prepared, str(path), kind.error, context)
-    if found or kind.model is not Prescription:
-        return found
-    made = Prescription.model_validate(prepared, context=context)
-    return [error.within(file=path) for error in made.problems()]
+    schema_problems = problems_of(kind.model, prepared, str(path), kind.error, context)
+    if schema_problems or kind.model is not Prescription:
+        return schema_problems
+    prescription = Prescription.model_validate(prepared, context=context)
+    return [error.within(file=path) for error in prescription.problems()]
 
 
 def _lens_file(path: Path) -> list[PachonError]:

@@ -108,8 +108,10 @@ def expose_ccd(
     offsets = pixel - np.rint(pixel)
     kelvin = positions.temperature
     if centered:
-        observed, again = _expose_twice(experiment, positions.observed, offsets, threads, progress, temperatures=kelvin)
-        return CcdExposure(name, positions, holdout, _require_light(observed), again)
+        observed, centered_stars = _expose_twice(
+            experiment, positions.observed, offsets, threads, progress, temperatures=kelvin
+        )
+        return CcdExposure(name, positions, holdout, _require_light(observed), centered_stars)
     observed = _expose(
         experiment, positions.observed, threads, progress, offsets=offsets, room=_SHIFT_ROOM, temperatures=kelvin
     )
@@ -204,8 +206,8 @@ def _expose(
     optical, magnification = not experiment.atmosphere_only, 1.0
     if not optical:
         ideal = ideal_telescope(telescope, _IDEAL_RATIO).with_rotator(experiment.rotator)
-        here, there = (center_focal_length(t, wavelengths) for t in (telescope, ideal))
-        telescope, magnification = ideal, there / here
+        focal_length, ideal_focal_length = (center_focal_length(t, wavelengths) for t in (telescope, ideal))
+        telescope, magnification = ideal, ideal_focal_length / focal_length
     psfs = make_psfs(
         telescope,
         fields,
@@ -245,12 +247,12 @@ def _with_static_displacements(experiment: Experiment, middles: np.ndarray, imag
         effects = experiment.displacements(camera.ccd_names[ccd])
         if not effects:
             return images
-        own = ccds == ccd
-        stamps = images[own].astype(np.float64)
-        moved = displace_stamps(stamps, effects, middles[own] - camera.centers[ccd], experiment.pixel_size)
+        on_ccd = ccds == ccd
+        stamps = images[on_ccd].astype(np.float64)
+        moved = displace_stamps(stamps, effects, middles[on_ccd] - camera.centers[ccd], experiment.pixel_size)
         # What crosses the rim of a stamp must not change the sum, which is 1, or 0 of a dark star.
         total = moved.sum(axis=(1, 2), keepdims=True)
-        images[own] = moved * (stamps.sum(axis=(1, 2), keepdims=True) / np.where(total > 0.0, total, 1.0))
+        images[on_ccd] = moved * (stamps.sum(axis=(1, 2), keepdims=True) / np.where(total > 0.0, total, 1.0))
     return images
 
 

@@ -81,16 +81,16 @@ def simulate_ccds(
             due, pending = pending, [(name, modeller.submit(model, exposure))]
             if not overlap or i == len(names):
                 due, pending = due + pending, []
-            for which, future in due:
+            for ccd, future in due:
                 try:
-                    simulated.results[which] = future.result()
+                    simulated.results[ccd] = future.result()
                 except ProductError:
                     raise
                 except PachonError as error:
                     if strict:
-                        raise error.within(subject=f"CCD {which}") from None
-                    simulated.not_modelled[which] = error.reason
-                    reporter.line(left_out_line(which, error.reason))
+                        raise error.within(subject=f"CCD {ccd}") from None
+                    simulated.not_modelled[ccd] = error.reason
+                    reporter.line(left_out_line(ccd, error.reason))
             stage.step(name, i, len(names))
     return simulated
 

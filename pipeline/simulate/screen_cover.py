@@ -47,9 +47,9 @@ def corner_fields(telescope: Telescope, camera: Camera, names: Sequence[str]) ->
                 fields([name])
             except DomainError:
                 beyond.append(name)
-        some = ", ".join(beyond[:6]) + (f" and {len(beyond) - 6} more" if len(beyond) > 6 else "")
+        listed = ", ".join(beyond[:6]) + (f" and {len(beyond) - 6} more" if len(beyond) > 6 else "")
         raise ConfigError(
-            f"ccds: {some or 'those chosen'} of {camera.name} reach beyond the field that {telescope.name} covers, "
+            f"ccds: {listed or 'those chosen'} of {camera.name} reach beyond the field that {telescope.name} covers, "
             f"{math.degrees(telescope.field_limit):g} deg from the axis: expected CCDs within it"
         ) from None
 

@@ -53,14 +53,14 @@ def add_defects(
         raise DomainError(f"full_well = {full_well}: expected a positive number of electrons")
     count, ny, nx = images.shape
     flags = np.zeros(count, dtype=np.int32)
-    for i, own in enumerate(rng.spawn(count)):
-        chance, where, ray = own.random(2), own.random((64, 2)), own.random(4)
+    for i, star_rng in enumerate(rng.spawn(count)):
+        chance, where, ray = star_rng.random(2), star_rng.random((64, 2)), star_rng.random(4)
         if chance[0] < neighbours:
             offsets = (where - 0.5) * (nx - 1, ny - 1)
             dx, dy = offsets[np.hypot(*offsets.T) > 4.0][0]
             light = images[i].sum() * 10.0 ** -ray[0]
             moved = ndimage.shift(shapes[i], (dy, dx), order=3)
-            images[i] += own.poisson(np.maximum(light * moved, 0.0))
+            images[i] += star_rng.poisson(np.maximum(light * moved, 0.0))
             flags[i] |= StarFlag.NEIGHBOUR
         if chance[1] < cosmic_rays:
             angle, length = np.pi * ray[1], 2 + int(7 * ray[2])

@@ -47,7 +47,7 @@ def choose_candidate(
         Pixels without weight, bool [n, ny, nx]; they hold what they are filled with.
     """
     kinds = iter(CANDIDATES.items())
-    chosen, options = next(kinds)
+    best_name, options = next(kinds)
     best = predict(options)
     unit = (stars / stars.sum(axis=(1, 2), keepdims=True)).reshape(len(stars), -1)
     mean = best.mean(axis=0)
@@ -69,5 +69,5 @@ def choose_candidate(
             continue
         excess = weight * (residuals(predicted) ** 2 - reference**2).mean(axis=1)
         if excess.sum() < min(least, -_ERRORS * np.sqrt(len(excess)) * excess.std(ddof=1)):
-            chosen, best, least = name, predicted, excess.sum()
-    return chosen, best
+            best_name, best, least = name, predicted, excess.sum()
+    return best_name, best

@@ -144,7 +144,7 @@ def fill_by_profiles(
         flux = (light * images[i])[good].sum() / square if square > 0.0 else 0.0
         filled[i][bad[i]] = flux * profile[bad[i]]
         core = np.where(profile > 0.5 * profile.max(), profile, 0.0)
-        lost[i] = any(part[bad[i]].sum() > MOST_MASKED * part.sum() for part in (core, light))
+        lost[i] = any(star_light[bad[i]].sum() > MOST_MASKED * star_light.sum() for star_light in (core, light))
     return filled, lost
 
 

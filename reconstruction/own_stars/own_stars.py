@@ -141,10 +141,12 @@ def fit_own_stars(
         return PsfModel.fit(stars.images[chosen], places[chosen], extent=span, **{"gain": gain, **kind})
 
     def predict(kind: Mapping[str, Any]) -> np.ndarray:
-        predicted = np.empty((len(which), size, size))
-        for part in parts:
-            rest = np.setdiff1d(np.arange(len(which)), part)
-            predicted[part] = fit(which[rest], kind).at(places[which[part]])
+        predicted = np.empty((len(used_indices), size, size))
+        for held_out_indices in parts:
+            fitted_indices = np.setdiff1d(np.arange(len(used_indices)), held_out_indices)
+            predicted[held_out_indices] = fit(used_indices[fitted_indices], kind).at(
+                places[used_indices[held_out_indices]]
+            )
         return predicted
 
     if bad.any():
@@ -171,8 +173,10 @@ def fit_own_stars(
     else:
         stars = select(filled, np.zeros(len(images), dtype=bool))
     used = stars.used
-    which = np.flatnonzero(used)
-    parts = np.array_split(stream(require_seed(seed), "held-out stars").permutation(len(which)), min(FOLDS, len(which)))
+    used_indices = np.flatnonzero(used)
+    parts = np.array_split(
+        stream(require_seed(seed), "held-out stars").permutation(len(used_indices)), min(FOLDS, len(used_indices))
+    )
     good = stars.images[used]
     weightless = stars.masks[used] if stars.masks[used].any() else None
     if options:
@@ -183,13 +187,13 @@ def fit_own_stars(
         kind = CANDIDATES[name]
     psf = predicted.mean(axis=0)
     stamps_used = good / good.sum(axis=(1, 2), keepdims=True)
-    deviations = (stamps_used - psf).reshape(len(which), -1)
+    deviations = (stamps_used - psf).reshape(len(used_indices), -1)
     filters = kriging.shape_numbers(psf, deviations, weight_sigma(scale, weight) ** 2)[1]
     # Shape numbers are twice the changes of e and of the logarithm of the size.
     sigma = 0.5 * np.sqrt(kriging.star_noise(good, deviations, psf, filters, gain, weightless))
     held_out = _spread(measure_shapes(predicted, scale, weight), used)
     sigmas = np.sqrt((sigma[:, :2] ** 2).mean(axis=1)), sigma[:, 2]
-    model = fit(which, kind)
+    model = fit(used_indices, kind)
     return OwnStars(
         model,
         places,
@@ -233,7 +237,7 @@ def _spread(shapes: Shapes, used: np.ndarray) -> Shapes:
     """Return shapes of some stars as those of all, NaN for the others."""
     values = {}
     for name, value in vars(shapes).items():
-        whole = np.full(len(used), -1 if value.dtype.kind in "iu" else np.nan, dtype=value.dtype)
-        whole[used] = value
-        values[name] = whole
+        all_stars = np.full(len(used), -1 if value.dtype.kind in "iu" else np.nan, dtype=value.dtype)
+        all_stars[used] = value
+        values[name] = all_stars
     return Shapes(**values)

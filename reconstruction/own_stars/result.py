@@ -83,29 +83,29 @@ class OwnStars(Result):
 
     def table(self) -> Table:
         """Return all stars with their shapes and residuals."""
-        one, other = self.shapes, self.held_out
+        star_shapes, model_shapes = self.shapes, self.held_out
         columns: Columns = {
             "x": (self.positions[:, 0], "", "place, in the unit of the positions"),
             "y": (self.positions[:, 1], "", "place, in the unit of the positions"),
             "snr": (self.snr, "", "signal-to-noise ratio"),
             "flags": (self.flags, "", "bits of StarFlag"),
             "used": (self.used, "", "whether the model is made of it"),
-            "e1": (one.e1, "", "ellipticity along x"),
-            "e2": (one.e2, "", "ellipticity along the diagonal x = y"),
-            "size": (one.size / ARCSEC, "arcsec", "weighted rms size"),
-            "held_out_e1": (other.e1, "", "e1 of the model made without the star"),
-            "held_out_e2": (other.e2, "", "e2 of the model made without the star"),
-            "held_out_size": (other.size / ARCSEC, "arcsec", "size of the model made without the star"),
+            "e1": (star_shapes.e1, "", "ellipticity along x"),
+            "e2": (star_shapes.e2, "", "ellipticity along the diagonal x = y"),
+            "size": (star_shapes.size / ARCSEC, "arcsec", "weighted rms size"),
+            "held_out_e1": (model_shapes.e1, "", "e1 of the model made without the star"),
+            "held_out_e2": (model_shapes.e2, "", "e2 of the model made without the star"),
+            "held_out_size": (model_shapes.size / ARCSEC, "arcsec", "size of the model made without the star"),
         }
         return described_table(columns, {})
 
     def residuals(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return e1, e2 and relative size of the used stars less those predicted without them, [n_used] each."""
-        one, other, used = self.shapes, self.held_out, self.used
+        star_shapes, model_shapes, used = self.shapes, self.held_out, self.used
         return (
-            (one.e1 - other.e1)[used],
-            (one.e2 - other.e2)[used],
-            (one.size / other.size - 1.0)[used],
+            (star_shapes.e1 - model_shapes.e1)[used],
+            (star_shapes.e2 - model_shapes.e2)[used],
+            (star_shapes.size / model_shapes.size - 1.0)[used],
         )
 
     def plot(self, title: str = "own stars", *, ax: Axes | Figure | None = None) -> Figure:
@@ -140,8 +140,8 @@ class OwnStars(Result):
     def rho_statistics(self, bins: int = 8) -> RhoStatistics:
         """Return the rho statistics of the held-out residuals; positions must be in pixels of the stamps."""
         used = self.used
-        one, other = part_of(self.shapes, used), part_of(self.held_out, used)
-        return star_rho_statistics(self.positions[used] * self.pixel_scale, one, other, bins)
+        star_shapes, model_shapes = part_of(self.shapes, used), part_of(self.held_out, used)
+        return star_rho_statistics(self.positions[used] * self.pixel_scale, star_shapes, model_shapes, bins)
 
 
 def part_of(shapes: Shapes, chosen: np.ndarray) -> Shapes:
@@ -152,14 +152,16 @@ def part_of(shapes: Shapes, chosen: np.ndarray) -> Shapes:
 def star_rho_statistics(places: np.ndarray, stars: Shapes, model: Shapes, bins: int) -> RhoStatistics:
     """Return the rho statistics of a model at stars, whose places on the sky [rad] are [n, 2]."""
     x, y = (places - places.mean(axis=0)).T
-    one, other = ([getattr(s, name) for name in ("e1", "e2", "size")] for s in (stars, model))
+    star_values, model_values = ([getattr(s, name) for name in ("e1", "e2", "size")] for s in (stars, model))
     bins = require_count(bins, "bins", 1, MOST_BINS)
     longest = float(np.hypot(np.ptp(x), np.ptp(y)))
     least = LEAST_SEPARATION * _LONGEST_OVER_SHORTEST
     if not least <= longest <= LARGEST_SEPARATION:
         limits = f"{least:g} to {LARGEST_SEPARATION:.4g} rad, with positions in pixels"
         raise DomainError(f"positions: the stars lie within {longest:g} rad; expected {limits}", key="positions")
-    return rho_statistics(x, y, *one, *other, min_sep=longest / _LONGEST_OVER_SHORTEST, max_sep=longest, n_bins=bins)
+    return rho_statistics(
+        x, y, *star_values, *model_values, min_sep=longest / _LONGEST_OVER_SHORTEST, max_sep=longest, n_bins=bins
+    )
 
 
 def _rms(*values: np.ndarray) -> float:
@@ -197,8 +199,8 @@ def _draw(own: OwnStars, title: str, ax: Axes | Figure | None) -> Figure:
             )
         ):
             axes = figure.add_subplot(grid[1, column])
-            for row, (one, color) in enumerate(zip(values, (BLUE, ORANGE), strict=False)):
-                axes.plot(snr, one, ".", color=color, label=f"e{row + 1}" if len(values) > 1 else None)
+            for row, (panel_values, color) in enumerate(zip(values, (BLUE, ORANGE), strict=False)):
+                axes.plot(snr, panel_values, ".", color=color, label=f"e{row + 1}" if len(values) > 1 else None)
             for sign in (1.0, -1.0):
                 noise_label = "noise of the stars, 1 sigma" if sign > 0.0 else None
                 axes.plot(snr[rising], sign * noise[rising], "-", color="0.4", linewidth=1.0, label=noise_label)
@@ -219,11 +221,11 @@ def _draw(own: OwnStars, title: str, ax: Axes | Figure | None) -> Figure:
         axes.set_title("rho statistics of the held-out stars", loc="left")
         axes.legend()
         _stamps(own, figure.add_subplot(grid[2, :]))
-        found = own.summary()
+        metrics = own.summary()
         figure.suptitle(
-            f"{plain_text(title)}: {found['used']} of {found['stars']} stars, FWHM {found['fwhm_arcsec']:.3g} arcsec; "
-            f"rms of e held out {100 * found['rms_e_held_out']:.2g} %, "
-            f"noise of the stars {100 * found['rms_e_noise']:.2g} %",
+            f"{plain_text(title)}: {metrics['used']} of {metrics['stars']} stars, FWHM {metrics['fwhm_arcsec']:.3g} arcsec; "
+            f"rms of e held out {100 * metrics['rms_e_held_out']:.2g} %, "
+            f"noise of the stars {100 * metrics['rms_e_noise']:.2g} %",
             fontsize=10,
         )
         return figure

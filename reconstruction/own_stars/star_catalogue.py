@@ -98,14 +98,15 @@ def load_stars(
     names = {name.lower(): name for name in columns}
     if cube is None and stamp.lower() not in names and hdus is not None:
         cube = _first_cube(hdus)
-    wanted = [x, y] if cube is not None else [x, y, stamp]
-    missing = [name for name in wanted if name.lower() not in names]
-    if missing:
-        also = " and no image of three axes" if stamp in missing and hdus is not None else ""
+    needed_columns = [x, y] if cube is not None else [x, y, stamp]
+    absent = [name for name in needed_columns if name.lower() not in names]
+    if absent:
+        also = " and no image of three axes" if stamp in absent and hdus is not None else ""
         raise ProductError(
-            f"{path}: no column {', '.join(map(repr, missing))}{also}; its columns are {', '.join(columns) or 'none'}"
-            + "".join(f"; looked for {name}: {', '.join(OTHER_NAMES[name])}" for name in missing if name in OTHER_NAMES)
-            + "; stamps are images [n, ny, nx]" * (stamp in missing)
+            f"{path}: no column {', '.join(map(repr, absent))}{also}"
+            f"; its columns are {', '.join(columns) or 'none'}"
+            + "".join(f"; looked for {name}: {', '.join(OTHER_NAMES[name])}" for name in absent if name in OTHER_NAMES)
+            + "; stamps are images [n, ny, nx]" * (stamp in absent)
         )
     positions = np.stack([_checked_column(path, name, columns[names[name.lower()]], 1) for name in (x, y)], axis=1)
     stamps = _checked_column(path, stamp, columns[names[stamp.lower()]], 3) if cube is None else cube
@@ -125,7 +126,7 @@ def bad_pixels(stamps: np.ndarray) -> np.ndarray:
 def _find_column(name: str, columns: Iterable[str]) -> str | None:
     """Return the column of a name, or of another one that programs have for it; None without one."""
     names = {column.lower(): column for column in columns}
-    return next((names[other] for other in (name.lower(), *OTHER_NAMES.get(name, ())) if other in names), None)
+    return next((names[synonym] for synonym in (name.lower(), *OTHER_NAMES.get(name, ())) if synonym in names), None)
 
 
 def _read_fits_parts(path: Path, data: bytes) -> fits.HDUList:

@@ -198,10 +198,10 @@ def _sky_variance(outer: np.ndarray, masked: np.ndarray | None = None) -> np.nda
     for _ in range(_SKY_PASSES):
         weights = 1.0 / np.maximum(variance, _LEAST_SKY * variance.max())
         weights /= weights.sum()
-        left = outer - weights @ outer
+        sky_pixels = outer - weights @ outer
         if masked is not None:
-            left = np.where(masked & ~masked.all(axis=1, keepdims=True), np.nan, left)
-        rms = 1.4826 * median(np.abs(left - median(left, axis=1)[:, None]), axis=1)
+            sky_pixels = np.where(masked & ~masked.all(axis=1, keepdims=True), np.nan, sky_pixels)
+        rms = 1.4826 * median(np.abs(sky_pixels - median(sky_pixels, axis=1)[:, None]), axis=1)
         # A star takes part in the mean that is subtracted from it.
         variance = rms**2 / np.maximum(1.0 - weights, _LEAST_OWN)
         if not variance.any():  # without noise

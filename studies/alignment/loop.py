@@ -117,7 +117,9 @@ def align(
     if not execution.alone:
         raise ConfigError("execution.workers: expected none, each visit begins with the telescope of the one before")
     scene = AlignmentScene.of(config, folder)
-    kept = None if store is None else VisitStore.claimed(store, config, scene.inputs, resume=execution.resume)
+    store_of_visits = (
+        None if store is None else VisitStore.claimed(store, config, scene.inputs, resume=execution.resume)
+    )
     errors, n = config.errors, len(scene.freedoms)
     drift = np.diag(scene.steps**2)
     covariance = errors.initial**2 * np.eye(n)
@@ -128,20 +130,20 @@ def align(
     with one_blas_thread(), reporter.stage("visits", config.visits) as stage:
         for visit in range(config.visits):
             telescope = scene.freedoms.apply(scene.telescope, state * scene.tolerances)
-            found = None if kept is None else kept.read(visit)
+            record = None if store_of_visits is None else store_of_visits.read(visit)
             # The last visit of a shorter loop has no stamps where that is not its last one.
-            if found is None or (len(found.images) == 0 and visit == config.visits - 1):
+            if record is None or (len(record.images) == 0 and visit == config.visits - 1):
                 fitted = fit(scene, expose(scene, telescope, visit, threads), threads)
-                found = VisitRecord.of(scene.quality.means(telescope, threads), fitted)
-                if kept is not None:
-                    kept.write(visit, found)
-            quality.append(found.quality)
+                record = VisitRecord.of(scene.quality.means(telescope, threads), fitted)
+                if store_of_visits is not None:
+                    store_of_visits.write(visit, record)
+            quality.append(record.quality)
             expected.append(scene.expected_wavefront(covariance))
             spreads.append(np.sqrt(np.diag(covariance)))
-            rows = np.repeat(found.usable, len(NOLL))
-            noise = scene.turbulence + _photon_noise(found)
+            rows = np.repeat(record.usable, len(NOLL))
+            noise = scene.turbulence + _photon_noise(record)
             estimate = estimate_state(
-                found.zernikes.ravel()[rows],
+                record.zernikes.ravel()[rows],
                 noise[np.ix_(rows, rows)],
                 scene.sensitivity[rows],
                 covariance,
@@ -150,8 +152,8 @@ def align(
             )
             states.append(state)
             estimates.append(estimate.state)
-            used.append(int(found.usable.sum()))
-            fits.append(found)
+            used.append(int(record.usable.sum()))
+            fits.append(record)
             del fits[1:-1]
             state = state - config.control.gain * estimate.state
             state = state + scene.steps * _normals(config.seed, "drift", visit, n)

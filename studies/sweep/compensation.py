@@ -36,10 +36,10 @@ def compensated(
     if not names:
         return experiment, {}
     telescope, camera = experiment.telescope, experiment.camera
-    chosen = [parse_change(telescope, name) for name in names]
+    compensators = [parse_change(telescope, name) for name in names]
     ccds = np.array([camera.ccd_index(name) for name in experiment.config.ccds or ()])
-    each = _PLACES if len(ccds) <= _FEW else _PLACES[:1]
-    places = camera.from_uv(ccds[:, None], each).reshape(-1, 2)
+    field_places = _PLACES if len(ccds) <= _FEW else _PLACES[:1]
+    places = camera.from_uv(ccds[:, None], field_places).reshape(-1, 2)
     wavelength = float(experiment.wavelengths[len(experiment.wavelengths) // 2])
     fields = fields_at(telescope, places, wavelength, threads=threads)
     rays = Beams.of(telescope, fields, [wavelength], n_pupil=_RINGS, threads=threads)
@@ -48,8 +48,16 @@ def compensated(
         # Spots are smallest where the light turns into charge.
         heights = heights - focus_height(telescope, experiment.silicon, wavelength, threads)
     merit = SpotMerit(telescope, rays, heights=heights)
-    found = optimize(
-        telescope, [p for p, _ in chosen], merit, fields, [wavelength], solver=LeastSquares(_TOLERANCE), threads=threads
+    optimum = optimize(
+        telescope,
+        [p for p, _ in compensators],
+        merit,
+        fields,
+        [wavelength],
+        solver=LeastSquares(_TOLERANCE),
+        threads=threads,
     )
-    values = {name: float(v / factor) for name, v, (_, factor) in zip(names, found.changes, chosen, strict=True)}
-    return replace(experiment, telescope=found.telescope), values
+    values = {
+        name: float(v / factor) for name, v, (_, factor) in zip(names, optimum.changes, compensators, strict=True)
+    }
+    return replace(experiment, telescope=optimum.telescope), values

@@ -151,9 +151,9 @@ def salvage(path: Path, out: Path) -> int:
     if not rows:
         raise ProductError("nothing can be read of it; was it a store of a sweep?", file=path)
     table = Table(meta={"what": f"saved from {path.name}"})
-    for part in range(3):
-        for name in dict.fromkeys(name for row in rows for name in row[part]):
-            values = [row[part].get(name) for row in rows]
+    for pass_number in range(3):
+        for name in dict.fromkeys(name for row in rows for name in row[pass_number]):
+            values = [row[pass_number].get(name) for row in rows]
             table[name] = [np.nan if v is None else v for v in values]
     write_table(out, table)
     return len(rows)

@@ -46,10 +46,10 @@ def point_metrics(sweep: SweepFile, parameters: dict[str, Any], folder: Path, th
     waves = None if config.wavelengths_nm is None else np.array(config.wavelengths_nm) * 1e-9
     solved = {}
     if sweep.compensators:
-        chosen = [parse_change(telescope, name, "compensators") for name in sweep.compensators]
+        parsed_compensators = [parse_change(telescope, name, "compensators") for name in sweep.compensators]
         optimum = optimize(
             telescope,
-            [parameter for parameter, _ in chosen],
+            [parameter for parameter, _ in parsed_compensators],
             "spots",
             fields,
             waves,
@@ -58,7 +58,7 @@ def point_metrics(sweep: SweepFile, parameters: dict[str, Any], folder: Path, th
             threads=threads,
         )
         telescope = optimum.telescope
-        for name, change, (_, size) in zip(sweep.compensators, optimum.changes, chosen, strict=True):
+        for name, change, (_, size) in zip(sweep.compensators, optimum.changes, parsed_compensators, strict=True):
             solved[f"solved {name}"] = float(change / size)
     scene = TelescopeScene(telescope, fields, waves, threads)
     metrics: dict[str, float] = {}

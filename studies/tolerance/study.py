@@ -149,9 +149,9 @@ def _numbers(
                     store.write(result)
                 numbers[result.number] = _number(result)
 
-        missing = [p for p in points if p.number not in finished]
-        batches = [_batch(missing[i : i + _BATCH], values) for i in range(0, len(missing), _BATCH)]
-        title = f"tolerances: {len(missing)} telescopes, {_BATCH} at a time"
+        open_points = [p for p in points if p.number not in finished]
+        batches = [_batch(open_points[i : i + _BATCH], values) for i in range(0, len(open_points), _BATCH)]
+        title = f"tolerances: {len(open_points)} telescopes, {_BATCH} at a time"
         labels = [batch.label for batch in batches]
         with execution.results(measured, labels, batches, title=title, save=save) as results:
             for _ in results:

@@ -132,17 +132,17 @@ def measure_stack(
             path = stack.folder / f"galaxies_{visits:04d}_tile_{tile.name}.fits"
             write_shapes(path, measured.galaxies, stack.stamp)
             tiles[visits].append(measured)
-    found = {
+    metrics_by_visits = {
         visits: tile_metrics(measured_tiles) | {"left_out": left_out[visits]}
         for visits, measured_tiles in tiles.items()
     }
     tests = null_tests(tiles)
     for visits, result in tests.items():
-        found[visits]["null_test"] = null_metrics(result)
+        metrics_by_visits[visits]["null_test"] = null_metrics(result)
     if tests:
         write_pictures(stack.folder, tests)
-    write_json(stack.folder / "images.json", {"stacks": {str(n): metrics for n, metrics in found.items()}})
-    return found
+    write_json(stack.folder / "images.json", {"stacks": {str(n): metrics for n, metrics in metrics_by_visits.items()}})
+    return metrics_by_visits
 
 
 def null_tests(tiles: dict[int, list[MeasuredTile]]) -> dict[int, NullTest]:

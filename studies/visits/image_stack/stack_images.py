@@ -77,15 +77,17 @@ def stack_images(
     done = min(s.visits for s in sums.values())
     if max(s.visits for s in sums.values()) > len(plan):
         raise ProductError(f"{stack.folder} holds more than the {len(plan)} visits of {folder}; remove one of them")
-    for tile, own in sums.items():
-        gone = [n for n in stack.visits.kept if n <= own.visits and not is_whole(stack.path(n, tile), stack.stamp)]
+    for tile, sums_of_tile in sums.items():
+        gone = [
+            n for n in stack.visits.kept if n <= sums_of_tile.visits and not is_whole(stack.path(n, tile), stack.stamp)
+        ]
         if gone:
             text = f"has no image of {gone[0]} visits of tile {tile.name}, and has gone on; remove it"
             raise ProductError(f"{stack.folder} {text}")
     if done:
         reporter.line(f"images of {done} of {len(plan)} visits are stacked already")
     alone, due = execution.alone, plan[done:]
-    before = {tile: own.visits for tile, own in sums.items()}
+    before = {tile: sums_of_tile.visits for tile, sums_of_tile in sums.items()}
     with execution.results(
         partial(draw_visit, stack, reporter if alone else None),
         [visit.label for visit in due],
@@ -187,10 +189,10 @@ def _truth_table(stack: ImageStack, tile: Tile, wcs: CcdWcs, exposure: Exposure)
         ),
     ):
         pixels = wcs.to_pixel(sky)
-        own = tile.inside.contains(pixels)
+        in_tile = tile.inside.contains(pixels)
         columns = {"PIXEL": pixels, "SKY": sky, "MAG": mag, "FLUX": exposure.electrons(mag)}
         columns |= {"STAR": np.full(len(sky), star), "RADIUS": radius, "E1": e1, "E2": e2}
-        tables.append({key: values[own] for key, values in columns.items()})
+        tables.append({key: values[in_tile] for key, values in columns.items()})
     return object_columns({key: np.concatenate([table[key] for table in tables]) for key in tables[0]}, wcs)
 
 
