@@ -223,7 +223,8 @@ def _draw(own: OwnStars, title: str, ax: Axes | Figure | None) -> Figure:
         _stamps(own, figure.add_subplot(grid[2, :]))
         metrics = own.summary()
         figure.suptitle(
-            f"{plain_text(title)}: {metrics['used']} of {metrics['stars']} stars, FWHM {metrics['fwhm_arcsec']:.3g} arcsec; "
+            f"{plain_text(title)}: {metrics['used']} of {metrics['stars']} stars, "
+            f"FWHM {metrics['fwhm_arcsec']:.3g} arcsec; "
             f"rms of e held out {100 * metrics['rms_e_held_out']:.2g} %, "
             f"noise of the stars {100 * metrics['rms_e_noise']:.2g} %",
             fontsize=10,
