@@ -54,8 +54,8 @@ class Recipe:
         for key, kind in (("basis", Basis), ("interpolation", Interpolation)):
             if not isinstance(getattr(self, key), kind):
                 raise DomainError(f"{key} = {shown(getattr(self, key))}: expected a {kind.__name__}", key=key)
-        if self.weights not in WEIGHTS:
-            raise ConfigError(f"weights = {self.weights!r}: expected one of {', '.join(WEIGHTS)}")
+        if not isinstance(self.weights, str) or self.weights not in WEIGHTS:
+            raise ConfigError(f"weights = {shown(self.weights)}: expected one of {', '.join(WEIGHTS)}")
         if self.interpolation.needs_noise and self.weights != "equal":
             raise ConfigError(
                 f"weights = {self.weights}: expected equal with interpolation = {self.interpolation.name}"
