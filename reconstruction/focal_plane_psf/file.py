@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any, TypeVar
 
 import numpy as np
 from astropy.io import fits
@@ -31,9 +31,12 @@ from .mosaic import Mosaic, PsfShapes
 from .optics_part import OpticsPart
 from .response import ExposureResponse, Instrument
 
+_Model = TypeVar("_Model", bound="ModelFields")
 
-class ModelFields(NamedTuple):
-    """Attributes of :class:`~pachon.FocalPlanePsf`, in its order."""
+
+@dataclass(frozen=True, eq=False)
+class ModelFields:
+    """Attributes of :class:`~pachon.FocalPlanePsf`, which describes them."""
 
     field: ShapeField
     used: np.ndarray
@@ -44,8 +47,8 @@ class ModelFields(NamedTuple):
     weight_fwhm: float
     pixel_scale: float | None
     stamp_size: int
-    mean_star: np.ndarray | None
-    pca: ResidualImages | None
+    mean_star: np.ndarray | None = None
+    pca: ResidualImages | None = None
 
 
 def model_hdus(model: ModelFields) -> list[fits.ImageHDU | fits.BinTableHDU]:
@@ -127,8 +130,8 @@ def model_hdus(model: ModelFields) -> list[fits.ImageHDU | fits.BinTableHDU]:
     return [_image_hdu("ABOUT", text, "JSON, one character of UTF-8 a pixel"), *hdus]
 
 
-def read_model(hdus: Iterable[fits.ImageHDU], path: Path) -> ModelFields:
-    """Return the fields of a model from the extensions of :func:`model_hdus`; ProductError where they are missing."""
+def read_model(kind: type[_Model], hdus: Iterable[fits.ImageHDU], path: Path) -> _Model:
+    """Return a model of a class from the extensions of :func:`model_hdus`; ProductError where they are missing."""
     extensions = {hdu.name: hdu.data for hdu in hdus}
 
     def part(name: str) -> np.ndarray:
@@ -165,7 +168,7 @@ def read_model(hdus: Iterable[fits.ImageHDU], path: Path) -> ModelFields:
         optics = None
         if "telescope" in about and camera is not None:
             optics = _optics_part(about, part, frozenset(extensions), camera)
-        return ModelFields(
+        return kind(
             field=ShapeField(
                 mosaic,
                 ShapeData(places, part("SHAPE"), part("NOISE")),

@@ -50,7 +50,7 @@ _CHI2 = (0.7, 1.4)
 
 
 @dataclass(frozen=True, eq=False)
-class FocalPlanePsf(Result):
+class FocalPlanePsf(ModelFields, Result):
     """The PSF of one exposure over the whole focal plane.
 
     Made by :meth:`fit`; shapes of the PSF are e1, e2 and the weighted rms size.
@@ -78,18 +78,6 @@ class FocalPlanePsf(Result):
     pca : ResidualImages or None
         Principal components of what the stamps differ from the model by.
     """
-
-    field: ShapeField
-    used: np.ndarray
-    leave_one_out: PsfShapes
-    chi2: dict[str, float]
-    evidence: float
-    warnings: tuple[str, ...]
-    weight_fwhm: float
-    pixel_scale: float | None
-    stamp_size: int
-    mean_star: np.ndarray | None = None
-    pca: ResidualImages | None = None
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw the shapes predicted at each star from the others."""
@@ -324,14 +312,13 @@ class FocalPlanePsf(Result):
     @check_arguments
     def write(self, path: str | Path) -> None:
         """Write the model as a FITS file, telescope included."""
-        fields = ModelFields(*(getattr(self, name) for name in ModelFields._fields))
-        write_fits(Path(path), model_hdus(fields), None, [CREATOR])
+        write_fits(Path(path), model_hdus(self), None, [CREATOR])
 
     @classmethod
     @check_arguments
     def read(cls, path: str | Path) -> FocalPlanePsf:
         """Read a model; ProductError if the file is missing, damaged or of another kind."""
-        return cls(*read_model(read_fits(Path(path)), Path(path)))
+        return read_model(cls, read_fits(Path(path)), Path(path))
 
     def _draw_places(self, places: Places, values: np.ndarray, threads: int | None) -> np.ndarray:
         """Return images of given shapes e1, e2 and ln size [n, 3]."""
