@@ -34,7 +34,7 @@ from .response import ExposureResponse, Instrument
 _Model = TypeVar("_Model", bound="ModelFields")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ModelFields:
     """Attributes of :class:`~pachon.FocalPlanePsf`, which describes them."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from astropy.io import fits
@@ -15,6 +15,9 @@ from .recipe import BASES, FITTED_INTERPOLATIONS
 
 # Images before the tables; others follow these.
 _FIRST_IMAGES = ("EIGEN", "POLY")
+
+
+_Model = TypeVar("_Model", bound=ModelFit)
 
 
 def model_hdus(model: ModelFit, name: str) -> list[fits.ImageHDU | fits.BinTableHDU]:
@@ -53,8 +56,8 @@ def _table(columns: dict[str, np.ndarray], name: str) -> fits.BinTableHDU:
     )
 
 
-def read_model(hdus: Iterable[Any], name: str) -> ModelFit:
-    """Return a model from extensions of :func:`model_hdus`; ProductError if parts are missing."""
+def read_model(model_class: type[_Model], hdus: Iterable[Any], name: str) -> _Model:
+    """Return a model of a class from extensions of :func:`model_hdus`; ProductError if parts are missing."""
     start = f"{name}_".upper()
     extensions = {hdu.name.removeprefix(start): hdu for hdu in hdus if hdu.name.startswith(start)}
 
@@ -81,7 +84,7 @@ def read_model(hdus: Iterable[Any], name: str) -> ModelFit:
         if fitted is None:
             raise ProductError(f"PSF model {name!r}: INTERP = {parts.cards.get('INTERP')!r}, which is none of pachon's")
         interpolation = fitted.of_parts(parts)
-        model = ModelFit(
+        model = model_class(
             basis,
             interpolation,
             parts.columns["coefficient"].reshape(len(stars.data), -1),

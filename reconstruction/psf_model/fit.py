@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,8 +22,12 @@ from .shape_noise import ShapeNoise
 _REPLACEMENTS = ("mean", "polynomial")
 
 
-class ModelFit(NamedTuple):
-    """Attributes of :class:`~.PsfModel`."""
+_Model = TypeVar("_Model", bound="ModelFit")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ModelFit:
+    """Attributes of :class:`~.PsfModel`, which describes them."""
 
     basis: FittedBasis
     interpolation: FittedInterpolation
@@ -32,6 +37,7 @@ class ModelFit(NamedTuple):
 
 
 def fit_stars(
+    kind: type[_Model],
     stamps: Any,
     positions: Any,
     recipe: Recipe,
@@ -43,7 +49,7 @@ def fit_stars(
     clip_sigma: float | None,
     max_iterations: int,
     replacement: str,
-) -> ModelFit:
+) -> _Model:
     """Fit basis and interpolation of a recipe to stars; arguments and errors as those of :meth:`~.PsfModel.fit`."""
     images, bad = as_stamps(stamps, masks)
     n_stars, ny, nx = images.shape
@@ -95,7 +101,7 @@ def fit_stars(
         order_terms = terms[:, : term_count(order)]
         field = StarField(points, span, order, order_terms, coefficients, star_weights, images, fitted_basis, gain)
         fitted_interpolation = interpolation.fit(field)
-    return ModelFit(fitted_basis, fitted_interpolation, coefficients, unexplained, stars.rejected.sum(axis=1))
+    return kind(fitted_basis, fitted_interpolation, coefficients, unexplained, stars.rejected.sum(axis=1))
 
 
 def _check_options(replacement: str, clip_sigma: float | None, max_iterations: int, gain: float | None) -> None:

@@ -21,10 +21,10 @@ from ...core.plotting import figure_at, styled
 from ...core.products import read_fits, write_fits
 from ...core.result import Result
 from ...core.version import CREATOR
-from .basis import Basis, FittedBasis, elbow_of
+from .basis import Basis, elbow_of
 from .file import model_hdus, read_model
 from .fit import ModelFit, fit_stars
-from .interpolation import FittedInterpolation, Interpolation
+from .interpolation import Interpolation
 from .polynomial import Extent
 from .recipe import Recipe
 
@@ -39,7 +39,7 @@ _SHOWN = 5
 
 
 @dataclass(frozen=True, eq=False)
-class PsfModel(Result):
+class PsfModel(ModelFit, Result):
     """A PSF model of one CCD: PSF = mean + sum over k of a_k(x, y) component_k.
 
     Every stamp is normalised to unit sum, so the components sum to zero and the model to one wherever it is evaluated.
@@ -61,12 +61,6 @@ class PsfModel(Result):
     """
 
     _table = ("positions", "coefficients", "unexplained", "rejected")
-
-    basis: FittedBasis
-    interpolation: FittedInterpolation
-    coefficients: np.ndarray
-    unexplained: np.ndarray
-    rejected: np.ndarray
 
     @classmethod
     @check_arguments
@@ -153,19 +147,18 @@ class PsfModel(Result):
         chosen_recipe = Recipe.of(
             recipe, basis=basis, interpolation=interpolation, n_components=n_components, scale=scale, order=order
         )
-        return cls(
-            *fit_stars(
-                stamps,
-                positions,
-                chosen_recipe,
-                weights=weights,
-                masks=masks,
-                extent=extent,
-                gain=gain,
-                clip_sigma=clip_sigma,
-                max_iterations=max_iterations,
-                replacement=replacement,
-            )
+        return fit_stars(
+            cls,
+            stamps,
+            positions,
+            chosen_recipe,
+            weights=weights,
+            masks=masks,
+            extent=extent,
+            gain=gain,
+            clip_sigma=clip_sigma,
+            max_iterations=max_iterations,
+            replacement=replacement,
         )
 
     def _label(self) -> str:
@@ -342,8 +335,7 @@ class PsfModel(Result):
             Start of the extension names, such as the CCD's name: NAME_MEAN, NAME_EIGEN, NAME_POLY, NAME_EXTENT images
             and NAME_SPECTRUM, NAME_STARS tables.
         """
-        fit = ModelFit(self.basis, self.interpolation, self.coefficients, self.unexplained, self.rejected)
-        return model_hdus(fit, name)
+        return model_hdus(self, name)
 
     @classmethod
     def from_hdus(cls, hdus: Iterable[Any], name: str = "PSF") -> PsfModel:
@@ -354,7 +346,7 @@ class PsfModel(Result):
         ProductError
             If an extension or a column is missing.
         """
-        return cls(*read_model(hdus, name))
+        return read_model(cls, hdus, name)
 
     @check_arguments
     def write(self, path: str | Path, name: str = "PSF") -> None:
