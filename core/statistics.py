@@ -1,8 +1,11 @@
-"""Means of values of which some are not finite."""
+"""Means and scatter of values of which some are not finite."""
 
 from __future__ import annotations
 
 import numpy as np
+
+#: Standard deviation of a Gaussian over its median absolute deviation.
+RMS_PER_MAD = 1.4826
 
 
 def finite_mean(values: np.ndarray) -> float:
@@ -20,3 +23,9 @@ def finite_median(values: np.ndarray) -> float:
 def rms(values: np.ndarray) -> float:
     """Return the root of the mean square of the finite values; NaN where there are none."""
     return float(np.sqrt(finite_mean(values**2)))
+
+
+def robust_rms(values: np.ndarray, axis: int | None = None) -> np.ndarray:
+    """Return the rms of Gaussian noise by the median absolute deviation from the median, NaN left out."""
+    deviations = values - np.nanmedian(values, axis=axis, keepdims=True)
+    return RMS_PER_MAD * np.asarray(np.nanmedian(np.abs(deviations), axis=axis))

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, PachonError
+from ..core.statistics import RMS_PER_MAD
 from ..core.units import ARCSEC, positive_angle
 from ..measure.catalogue.detect import detect_objects
 from ..measure.catalogue.objects import DetectedObjects
@@ -147,7 +148,7 @@ def regular_shapes(values: np.ndarray, snr: np.ndarray, positions: np.ndarray) -
     for _ in range(_PASSES):
         trend = np.linalg.lstsq((terms * weight)[good], (values * weight)[good], rcond=None)[0]
         deviation = np.abs(values - terms @ trend) * weight
-        regular = (deviation <= _DEVIATIONS * 1.4826 * np.median(deviation[good], axis=0)).all(axis=1)
+        regular = (deviation <= _DEVIATIONS * RMS_PER_MAD * np.median(deviation[good], axis=0)).all(axis=1)
         if (regular == good).all():
             break
         good = regular

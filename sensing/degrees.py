@@ -68,11 +68,9 @@ class FreedomRays:
         self._prepared, self._parameters, self._matrix = freedoms.parameter_matrix(telescope)
         self._direction, self._wavelengths = direction, wavelengths
         self.cells, self._footprint = cells, footprint
-        self._weights = np.outer(wavelength_weights, cells.weights).ravel()
-        rates = np.zeros((len(cells), 0)) if cells.rates is None else cells.rates
-        self.rates = np.kron(wavelength_weights[:, None], rates)
+        self._weights, self.rates = cells.at_wavelengths(wavelength_weights)
         self._count = len(freedoms)
-        self._shifts = np.zeros(rates.shape[1]) if shifts is None else shifts
+        self._shifts = np.zeros(self.rates.shape[1]) if shifts is None else shifts
         middle = float(wavelengths[len(wavelengths) // 2])
         #: Where the chief ray crosses the plane of the entrance pupil: that of the telescope as it is believed to be.
         self._chief = np.reshape(aimed_points(telescope, direction[None], middle, np.zeros((1, 2))), (1, 2))

@@ -83,9 +83,7 @@ class ZernikeRays:
     ) -> None:
         self._telescope, self._direction, self._wavelengths = telescope, direction, wavelengths
         self.cells, self._points = cells, cells.points
-        self._weights = np.outer(wavelength_weights, cells.weights).ravel()
-        rates = np.zeros((len(cells), 0)) if cells.rates is None else cells.rates
-        self.rates = np.kron(wavelength_weights[:, None], rates)
+        self._weights, self.rates = cells.at_wavelengths(wavelength_weights)
         middle = float(wavelengths[len(wavelengths) // 2])
         self._chief = chief_landing(telescope, direction, middle)
         #: Derivatives of the terms along x and y of the plane of the entrance pupil [1/m], [n_term, 2, n_point].

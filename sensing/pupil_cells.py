@@ -65,6 +65,14 @@ class PupilCells:
     def __len__(self) -> int:
         return len(self.weights)
 
+    def at_wavelengths(self, fractions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return weights [n_wave * n] and their rates [n_wave * n, n_shift] at wavelengths of fractions of the light.
+
+        Wavelength by wavelength; without `rates` there are no shifts.
+        """
+        rates = np.zeros((len(self), 0)) if self.rates is None else self.rates
+        return np.outer(fractions, self.weights).ravel(), np.kron(fractions[:, None], rates)
+
     @cached_property
     def smooth(self) -> PupilPolynomials:
         """Polynomials through values at the points."""

@@ -16,6 +16,7 @@ from astropy.table import Table
 
 from ..core.errors import ProductError
 from ..core.files import parsing, require_file
+from ..core.statistics import robust_rms
 from .inputs import MOST_ELECTRONS, SMALLEST_STAMP
 
 
@@ -94,7 +95,7 @@ def border_variance(image: np.ndarray) -> float:
     """
     edge = np.concatenate([image[:2].ravel(), image[-2:].ravel(), image[2:-2, :2].ravel(), image[2:-2, -2:].ravel()])
     edge = edge[np.abs(edge) < MOST_ELECTRONS]
-    return float((1.4826 * np.median(np.abs(edge - np.median(edge)))) ** 2) if edge.size else 0.0
+    return float(robust_rms(edge) ** 2) if edge.size else 0.0
 
 
 def _table(path: Path) -> Table:

@@ -8,6 +8,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, maximum_filter, median_filter, minimum_filter
 from scipy.signal import fftconvolve
 
+from ..core.statistics import RMS_PER_MAD
+
 #: A pixel this many standard deviations above its neighbours is no part of a donut, if it is as much brighter, too.
 _SIGMA = 8.0
 #: Least excess of such a pixel over the light of its neighbours.
@@ -18,8 +20,6 @@ _SMOOTHING = 1.0
 _MOSTLY_USED = 0.9
 #: Least part of the squared template that must lie on the stamp.
 _ON_STAMP = 0.1
-#: Standard deviation over the median of absolute deviations, of Gaussian noise.
-_DEVIATION_OVER_MEDIAN = 1.4826
 #: Least variance of a pixel [electron^2] in the search for donuts: pixels without any noise are not real.
 _LEAST_VARIANCE = 1.0
 
@@ -146,7 +146,7 @@ def measured_variance(pixels: Pixels) -> float:
     Their median is that of the sky where a donut covers less than half of the stamp.
     """
     steps = np.abs(np.diff(pixels.image, axis=1))[pixels.used[:, 1:] & pixels.used[:, :-1]]
-    return float((_DEVIATION_OVER_MEDIAN * np.median(steps)) ** 2 / 2.0) if steps.size else 0.0
+    return float((RMS_PER_MAD * np.median(steps)) ** 2 / 2.0) if steps.size else 0.0
 
 
 def significance_above_sky(

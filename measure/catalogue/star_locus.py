@@ -13,6 +13,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.point_plots import draw_points
 from ...core.result import Result
+from ...core.statistics import RMS_PER_MAD
 from ...core.units import real_array, require_count, require_positive
 from ..stamps import center_stamps
 from .cutouts import cut_out, first_pixel
@@ -33,8 +34,6 @@ _SIDE = (1.15, 1.75)
 _LEAST_WIDTH = 0.01
 # Margin of a stamp for the light that its Fourier shift wraps around [pixel].
 _MARGIN = 8
-# Standard deviation of a Gaussian over its median absolute deviation.
-_MAD_TO_SIGMA = 1.4826
 
 
 class StarCut(IntFlag):
@@ -263,7 +262,7 @@ def _stellar_locus(radius: np.ndarray, least: int) -> tuple[float, float]:
 def _median_and_sigma(values: np.ndarray) -> tuple[float, float]:
     """Return the median, and the standard deviation by the median absolute deviation."""
     middle = float(np.median(values))
-    return middle, _MAD_TO_SIGMA * float(np.median(np.abs(values - middle)))
+    return middle, RMS_PER_MAD * float(np.median(np.abs(values - middle)))
 
 
 def _centered_stamps(image: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> np.ndarray:

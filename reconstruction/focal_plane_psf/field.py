@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.statistics import RMS_PER_MAD
 from .covariance import Covariance, Places
 from .fit import ShapeData, columns_acting_on
 from .kriging import Neighbourhood, leave_one_out, map_on_threads, neighbourhood, neighbours_of
@@ -150,5 +151,5 @@ class ShapeField:
         deviation = np.empty((len(data), 3))
         for index, values in zip(blocks, map_on_threads(job, blocks, threads), strict=True):
             deviation[index] = values
-        typical = np.maximum(1.4826 * np.median(np.abs(deviation), axis=0), 1.0)
+        typical = np.maximum(RMS_PER_MAD * np.median(np.abs(deviation), axis=0), 1.0)
         return np.asarray((np.abs(deviation) < CLIP_SIGMA * typical).all(axis=1))

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from ...core.errors import DomainError
+from ...core.statistics import robust_rms
 from ...measure.shapes import measure_shapes
 from ...measure.stamps import fourier_shift, shift_mask
 from .star_catalogue import bad_pixels
@@ -55,11 +56,11 @@ def sky_of_stamps(images: np.ndarray, bad: np.ndarray, radius: float) -> tuple[n
     sparse = (~bad[:, outside]).sum(axis=1) < min(_FEWEST_SKY, outside.sum())
     level, rms = np.full((2, len(images)), np.nan)
     level[~sparse] = np.nanmedian(sky[~sparse], axis=1)
-    rms[~sparse] = 1.4826 * np.nanmedian(np.abs(sky[~sparse] - level[~sparse, None]), axis=1)
+    rms[~sparse] = robust_rms(sky[~sparse], axis=1)
     for i in np.flatnonzero(sparse & ~bad.all(axis=(1, 2))):
         far = ~bad[i] & (distance >= np.quantile(distance[~bad[i]], 1.0 - _OUTERMOST))
         level[i] = np.median(images[i][far])
-        rms[i] = 1.4826 * np.median(np.abs(images[i][far] - level[i]))
+        rms[i] = robust_rms(images[i][far])
     return level, rms
 
 

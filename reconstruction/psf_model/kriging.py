@@ -27,6 +27,7 @@ import scipy.linalg
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.statistics import RMS_PER_MAD
 from ...core.threads import one_blas_thread
 from ..gaussian_field import inverse_from_cholesky, leave_one_out_residuals
 from .file_parts import ModelParts
@@ -201,7 +202,7 @@ def _sky_variance(outer: np.ndarray, masked: np.ndarray | None = None) -> np.nda
         sky_pixels = outer - weights @ outer
         if masked is not None:
             sky_pixels = np.where(masked & ~masked.all(axis=1, keepdims=True), np.nan, sky_pixels)
-        rms = 1.4826 * median(np.abs(sky_pixels - median(sky_pixels, axis=1)[:, None]), axis=1)
+        rms = RMS_PER_MAD * median(np.abs(sky_pixels - median(sky_pixels, axis=1)[:, None]), axis=1)
         # A star takes part in the mean that is subtracted from it.
         variance = rms**2 / np.maximum(1.0 - weights, _LEAST_OWN)
         if not variance.any():  # without noise

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...core.statistics import RMS_PER_MAD
+
 # Standard deviation of the PSF itself within a CCD: this fraction of the geometric mean of the pixel's value and the
 # peak's. The wings may change by more of themselves than the core.
 _PSF_CHANGE = 0.04
@@ -29,8 +31,8 @@ def find_outliers(images: np.ndarray, clip_sigma: float, max_iterations: int) ->
     for _ in range(max_iterations):
         deviation = np.abs(images / flux[:, None] - mean)
         middle, high = np.percentile(deviation, (50.0, 80.0), axis=0)
-        over_stars = np.minimum(high / 1.2816, 3.0 * 1.4826 * middle)
-        over_pixels = 1.4826 * np.median(deviation, axis=1)
+        over_stars = np.minimum(high / 1.2816, 3.0 * RMS_PER_MAD * middle)
+        over_pixels = RMS_PER_MAD * np.median(deviation, axis=1)
         allowance = np.maximum(_PSF_CHANGE * np.sqrt(np.maximum(mean, 0.0) * mean.max()), _FLOOR * mean.max())
         scale = np.sqrt(over_pixels[:, None] ** 2 + over_stars**2 + allowance**2)
         before, rejected = rejected, deviation > clip_sigma * scale

@@ -1,0 +1,24 @@
+import numpy as np
+import pytest
+
+from pachon.core.statistics import finite_mean, finite_median, rms, robust_rms
+
+
+def test_values_that_are_not_finite_are_left_out():
+    values = np.array([1.0, np.nan, 3.0, np.inf, 8.0])
+    assert finite_mean(values) == 4.0
+    assert finite_median(values) == 3.0
+    assert rms(values) == pytest.approx(np.sqrt((1.0 + 9.0 + 64.0) / 3.0), rel=1e-15)
+    for statistic in (finite_mean, finite_median, rms):
+        assert np.isnan(statistic(np.array([np.nan])))
+
+
+def test_robust_rms_is_that_of_the_noise_below_outliers():
+    noise = np.random.default_rng(1).normal(5.0, 2.0, 40_000)
+    values = np.where(np.arange(len(noise)) % 100 == 0, 1e6, noise)
+    # The standard error is 1.17 / sqrt(2 n) = 0.4 %; one outlier in a hundred adds 1.6 %.
+    assert robust_rms(values) == pytest.approx(2.0, rel=0.03)
+    table = np.stack([noise[:101], np.where(np.arange(101) < 50, np.nan, noise[:101])])
+    middles = [np.median(row[np.isfinite(row)]) for row in table]
+    restated = [1.4826 * np.median(np.abs(r[np.isfinite(r)] - m)) for r, m in zip(table, middles, strict=True)]
+    assert robust_rms(table, axis=1) == pytest.approx(restated, rel=1e-15)
