@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 
 import pachon
 from pachon.core.errors import PrescriptionWarning
@@ -311,3 +312,17 @@ def test_telescopes_without_a_stop_inside_stay_as_they_are(name):
     assert following_stop(telescope) is telescope
     first = telescope.surface_names[0]
     assert pachon.apply_changes(telescope, {f"{first}.dz_m": 5e-5}) == apply(telescope, {f"{first}.dz": 5e-5})
+
+
+@pytest.mark.long
+def test_the_picture_prints_what_spots_measures(lens, optimum):
+    figure = optimum.plot()
+    printed = [
+        float(label.split()[1])
+        for axes in figure.findobj(Axes)
+        if (label := axes.get_xlabel()).startswith("rms ") and label.endswith("µm")
+    ]
+    telescopes = (lens, optimum.telescope)
+    measured = [pachon.spots(t.with_design(aiming="real")).rms_radius * 1e6 for t in telescopes]
+    # Three digits are printed.
+    assert printed == pytest.approx(np.concatenate(measured), rel=5e-3)
