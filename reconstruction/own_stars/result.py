@@ -189,7 +189,8 @@ def _draw(own: OwnStars, title: str, ax: Axes | Figure | None) -> Figure:
             margin = 0.05 * max(np.ptp(x), np.ptp(y))
             axes.set(xlim=(x.min() - margin, x.max() + margin), ylim=(y.min() - margin, y.max() + margin))
             axes.set_title(name, loc="left")
-            draw_key_whisker(axes, key, scale, 1.2)
+            if column == 0:  # one scale for all; on narrow CCDs a longer title would reach the key
+                draw_key_whisker(axes, key, scale, 1.2)
         snr = own.snr[used]
         rising = np.argsort(snr)
         for column, (label, values, noise) in enumerate(
