@@ -308,6 +308,7 @@ from .studies.visits.visits import stack_visits as stack_visits
 from .testing import assert_matches_baseline as assert_matches_baseline
 from .wavefront.aberration import ResidualWavefront as ResidualWavefront
 from .wavefront.atmosphere.atmosphere import Atmosphere as Atmosphere
+from .wavefront.atmosphere.screen_sampling import ScreenSampling as ScreenSampling
 from .wavefront.chief_rays import fields_at as fields_at
 from .wavefront.corner_stars import CornerStars as CornerStars
 from .wavefront.corner_stars import corner_stars as corner_stars

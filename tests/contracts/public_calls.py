@@ -76,7 +76,9 @@ class _Made:
 
     def make_donuts(self):
         tiny = {"stamps": pachon.Stamps(60, pixel_size=30e-6), "electrons": 1e6, "sky": 10.0}
-        air = pachon.Atmosphere.from_site("cerro_pachon", seed=2, screen_size=512, screen_length=40.0, exposure=0.1)
+        air = pachon.Atmosphere.from_site(
+            "cerro_pachon", seed=2, screens=pachon.ScreenSampling(screen_size=512, screen_length=40.0), exposure=0.1
+        )
         return pachon.draw_donuts(self.defocused, [(0.005, 0.005)], 622e-9, atmosphere=air, **tiny)
 
     def make_model(self):
@@ -131,8 +133,8 @@ class _Made:
         return pachon.DegreesOfFreedom.of_parameters(self.tel, ["M2.dz"])
 
     def make_air(self):
-        return pachon.Atmosphere.from_site("cerro_pachon", 1, exposure=0.5, time_step=0.5, screen_size=1024,
-                                           screen_length=560.0)  # fmt: skip
+        screens = pachon.ScreenSampling(screen_size=1024, screen_length=560.0)
+        return pachon.Atmosphere.from_site("cerro_pachon", 1, exposure=0.5, time_step=0.5, screens=screens)
 
     def make_correlation(self):
         return pachon.shear_correlation(**self.columns, min_sep=1e-3, max_sep=1e-1, n_bins=3)
@@ -612,8 +614,12 @@ def _methods(m, tel, w, x, y):
                                    "terms": [4, 5, 6], "linear_fraction": 0.5}),
         "ResidualWavefront.opd": (m.aberration.opd, {**xy, "slopes": (0.0, 0.0)}),
         "Atmosphere.from_site": (pachon.Atmosphere.from_site, {"site": "cerro_pachon", "seed": 1, "r0": 0.1,
-                                 "outer_scale": 30.0, "exposure": 0.5, "time_step": 0.5, "screen_size": 1024,
-                                 "screen_length": 560.0, "fine_size": 3072, "fine_pixel": 0.014, "epoch": 0}),
+                                 "outer_scale": 30.0, "exposure": 0.5, "time_step": 0.5, "epoch": 0,
+                                 "screens": pachon.ScreenSampling(1024, 560.0)}),
+        "ScreenSampling": (pachon.ScreenSampling, {"screen_size": 1024, "screen_length": 560.0, "fine_size": 3072,
+                           "fine_pixel": 0.014, "cutoff": 8.75, "fixed_modulus": False}),
+        "Site.with_layers": (pachon.load_site("cerro_pachon").with_layers, {"altitudes": [0.0, 1e3],
+                             "weights": [0.5, 0.5], "wind_speeds": [5.0, 10.0], "wind_directions": [0.0, 1.0]}),
         "Atmosphere.at_times": (m.air.at_times, {"times": [0.25, 0.75], "exposure": 1.0}),
         "Request.of": (pachon.Request.of, {"telescope": tel, "fields": np.zeros((1, 2)), "wavelengths": [w],
                        "wavelength_weights": [1.0], "sampling": "gauss", "n_pupil": 3, "projection": "zemax",
