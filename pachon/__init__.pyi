@@ -244,6 +244,8 @@ from .raytrace.rays import RayStatus as RayStatus
 from .raytrace.trace import TraceResult as TraceResult
 from .raytrace.trace import trace as trace
 from .reconstruction.focal_plane_psf.model import FocalPlanePsf as FocalPlanePsf
+from .reconstruction.focal_plane_psf.optics_prior import OpticsPrior as OpticsPrior
+from .reconstruction.focal_plane_psf.response import Instrument as Instrument
 from .reconstruction.focal_plane_psf.stars import FocalPlaneStars as FocalPlaneStars
 from .reconstruction.focal_plane_psf.static_heights import StaticHeights as StaticHeights
 from .reconstruction.focal_plane_psf.static_heights import fit_static_heights as fit_static_heights
