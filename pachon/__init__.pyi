@@ -54,6 +54,7 @@ from .design.metrics.footprint import Footprint as Footprint
 from .design.metrics.footprint import footprint as footprint
 from .design.metrics.ghosts import Ghost as Ghost
 from .design.metrics.ghosts import Ghosts as Ghosts
+from .design.metrics.ghosts import Reflectivity as Reflectivity
 from .design.metrics.ghosts import ghosts as ghosts
 from .design.metrics.principal_rays import PrincipalRays as PrincipalRays
 from .design.metrics.principal_rays import principal_rays as principal_rays

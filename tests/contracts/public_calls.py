@@ -189,16 +189,17 @@ def calls(folder):
     waves = design | {"wavelengths": [w], "wavelength_weights": [1.0]}
     mono = design | {"wavelength": w}
     one = {"telescope": tel, "wavelength": w, "projection": "zemax", "threads": 1}
-    no_fields = {k: v for k, v in one.items() if k != "fields"}
     pairs = m.columns | {"min_sep": 1e-3, "max_sep": 1e-1, "n_bins": 3, "exact": False}
     sizes = {"size": np.full(30, 1e-6), "model_e1": pairs["e1"] * 0.9, "model_e2": pairs["e2"] * 0.9,
              "model_size": np.full(30, 1.1e-6)}  # fmt: skip
     made = {
-        "fft_psf": (pachon.fft_psf, waves | {"pixel": 1e-6, "pixels": 16, "n_pupil": 48, "reference": "centroid"}),
-        "huygens_psf": (pachon.huygens_psf, waves | {"pixel": 1e-6, "pixels": 8, "sampling": "square", "n_pupil": 8,
-                                                     "reference": "centroid"}),
-        "encircled_energy": (pachon.encircled_energy, waves | {"kind": "geometric", "radii": [1e-6, 2e-6],
-                             "reference": "centroid", "sampling": "spiral", "pixels": 32, "n_pupil": 50}),
+        "fft_psf": (pachon.fft_psf, design | {"wavelengths": [w], "pixel": 1e-6, "pixels": 16, "n_pupil": 48,
+                    "reference": "centroid"}),
+        "huygens_psf": (pachon.huygens_psf, design | {"wavelengths": [w], "pixel": 1e-6, "pixels": 8,
+                        "sampling": "square", "n_pupil": 8, "reference": "centroid"}),
+        "encircled_energy": (pachon.encircled_energy, design | {"wavelengths": [w], "kind": "geometric",
+                             "radii": [1e-6, 2e-6], "reference": "centroid", "n_pupil": 50}),
+        "Reflectivity": (pachon.Reflectivity, {"lenses": {"L1_exit": 0.01}, "detector": 0.1}),
         "energy_curve": (pachon.energy_curve, {"image": m.stamps[0], "center": (7.0, 7.0), "parts": 2}),
         "mtf": (pachon.mtf, waves | {"n_pupil": 48}),
         "layout": (pachon.layout, mono),
@@ -217,7 +218,7 @@ def calls(folder):
                         "sampling": "rings", "n_pupil": 2}),
         "bar_target": (pachon.bar_target, {"pixels": 16, "bars": 2}),
         "target_image": (pachon.target_image, {"telescope": tel, "target": np.eye(4), "width": 1e-5,
-                         "field": (0.0, 0.0), "wavelengths": [w], "wavelength_weights": [1.0], "n_rays": 4,
+                         "field": (0.0, 0.0), "wavelengths": [w], "n_rays": 4,
                          "pixel": 1e-5, "pixels": 8, "projection": "zemax", "threads": 1}),
         "strehl": (pachon.strehl, design | {"wavelengths": [w], "from_psf": False, "sampling": "gauss", "n_pupil": 3}),
         "chromatic_sums": (pachon.chromatic_sums, {"telescope": tel, "wavelengths": [5e-7, w], "field": 0.005}),
@@ -226,13 +227,14 @@ def calls(folder):
         "noll_from_fringe": (pachon.noll_from_fringe, {"coefficients": [1e-9, 2e-9]}),
         "distortion": (pachon.distortion, mono | {"fields": 0.003 * np.eye(4, 2), "reference": "chief", "n_pupil": 3,
                        "sampling": "gauss"}),
-        "double_zernikes": (pachon.double_zernikes, no_fields | {"jmax": 6, "kmax": 3, "rings": 2, "n_pupil": 6,
-                            "field_radius": tel.field_radius, "pupil": "full", "sampling": "gauss"}),
+        "double_zernikes": (pachon.double_zernikes, {"telescope": tel, "wavelength": w, "jmax": 6, "kmax": 3,
+                            "rings": 2, "n_pupil": 6, "field_radius": tel.field_radius, "pupil": "full",
+                            "sampling": "gauss", "threads": 1}),
         "wavefront_zernikes": (pachon.wavefront_zernikes, mono | {"jmax": 6, "pupil": "full", "ordering": "noll",
                                "sampling": "gauss", "n_pupil": 6}),
         "footprint": (pachon.footprint, mono | {"surfaces": ["M2"], "sampling": "rings", "n_pupil": 3}),
-        "ghosts": (pachon.ghosts, {"telescope": m.lsst, "field": (0.0, 0.0), "wavelength": w, "reflectivity": 0.01,
-                   "detector_reflectivity": 0.1, "n_pupil": 400, "projection": "zemax", "threads": 1}),
+        "ghosts": (pachon.ghosts, {"telescope": m.lsst, "field": (0.0, 0.0), "wavelength": w,
+                   "reflectivity": pachon.Reflectivity(0.01), "n_pupil": 400, "projection": "zemax", "threads": 1}),
         "principal_rays": (pachon.principal_rays, mono),
         "spots": (pachon.spots, waves | {"sampling": "gauss", "n_pupil": 3, "reference": "centroid"}),
         "through_focus": (pachon.through_focus, waves | {"defocus": [-1e-5, 0.0, 1e-5], "sampling": "gauss",
@@ -417,9 +419,8 @@ def calls(folder):
                                "prior": pachon.OpticsPrior("simulated", 1e-7), "threads": 1}),
         "fields_at": (pachon.fields_at, {"telescope": tel, "positions": [(0.0, 0.0), (0.01, 0.0)], "wavelength": w,
                       "projection": "zemax", "threads": 1}),
-        "wavefront_opd": (pachon.wavefront_opd, one | {"field": (0.0, 0.0), "pupil": (x, y), "reference": "chief",
-                          "sphere_radius": 5.0}),
-        "wavefront_opds": (pachon.wavefront_opds, one | {"fields": on_axis, "grid": 8, "sphere_radius": 5.0}),
+        "wavefront_opd": (pachon.wavefront_opd, one | {"field": (0.0, 0.0), "pupil": (x, y), "reference": "chief"}),
+        "wavefront_opds": (pachon.wavefront_opds, one | {"fields": on_axis, "grid": 8}),
         "make_psfs": (pachon.make_psfs, {"telescope": tel, "fields": on_axis, "wavelengths": pachon.Light([w], [1.0]),
                       "engine": pachon.FastEngine(n_pupil=40), "stamps": pachon.Stamps(15), "atmosphere": None,
                       "threads": 1}),
@@ -626,7 +627,7 @@ def _methods(m, tel, w, x, y):
         "Atmosphere.at_times": (m.air.at_times, {"times": [0.25, 0.75], "exposure": 1.0}),
         "Request.of": (pachon.Request.of, {"telescope": tel, "fields": np.zeros((1, 2)), "wavelengths": [w],
                        "wavelength_weights": [1.0], "sampling": "gauss", "n_pupil": 3, "projection": "zemax",
-                       "threads": 1, "aiming": "off", "one_wavelength": True}),
+                       "threads": 1, "one_wavelength": True}),
         "CcdImage.read": (pachon.CcdImage.read, {"path": m.folder / "none.fits"}),
     }  # fmt: skip
     return out
