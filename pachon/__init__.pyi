@@ -235,6 +235,7 @@ from .pipeline.sensor.displacement import TreeRings as TreeRings
 from .pipeline.sensor.displacement import displace_stamps as displace_stamps
 from .pipeline.simulate.donuts import Donuts as Donuts
 from .pipeline.simulate.donuts import draw_donuts as draw_donuts
+from .pipeline.simulate.star_defects import StarDefects as StarDefects
 from .raytrace.launch import launch_rays as launch_rays
 from .raytrace.mesh import land_on_mesh as land_on_mesh
 from .raytrace.one_surface import intersect as intersect
@@ -291,6 +292,7 @@ from .studies.baseline.check import BaselineCheck as BaselineCheck
 from .studies.baseline.file import Baseline as Baseline
 from .studies.baseline.file import read_baseline as read_baseline
 from .studies.baseline.file import write_baseline as write_baseline
+from .studies.baseline.requirements import Requirements as Requirements
 from .studies.shimming.shim import Shims as Shims
 from .studies.shimming.shim import shim as shim
 from .studies.sweep.file import load_sweep as load_sweep
