@@ -188,16 +188,17 @@ def calls(folder):
     design = {"telescope": tel, "fields": on_axis, "projection": "zemax", "threads": 1}
     waves = design | {"wavelengths": [w], "wavelength_weights": [1.0]}
     mono = design | {"wavelength": w}
+    images = {"telescope": tel, "fields": on_axis, "wavelengths": [w], "threads": 1}
     one = {"telescope": tel, "wavelength": w, "projection": "zemax", "threads": 1}
     pairs = m.columns | {"min_sep": 1e-3, "max_sep": 1e-1, "n_bins": 3, "exact": False}
     sizes = {"size": np.full(30, 1e-6), "model_e1": pairs["e1"] * 0.9, "model_e2": pairs["e2"] * 0.9,
              "model_size": np.full(30, 1.1e-6)}  # fmt: skip
     made = {
-        "fft_psf": (pachon.fft_psf, design | {"wavelengths": [w], "pixel": 1e-6, "pixels": 16, "n_pupil": 48,
+        "fft_psf": (pachon.fft_psf, images | {"pixel": 1e-6, "pixels": 16, "n_pupil": 48,
                     "reference": "centroid"}),
-        "huygens_psf": (pachon.huygens_psf, design | {"wavelengths": [w], "pixel": 1e-6, "pixels": 8,
+        "huygens_psf": (pachon.huygens_psf, images | {"pixel": 1e-6, "pixels": 8,
                         "sampling": "square", "n_pupil": 8, "reference": "centroid"}),
-        "encircled_energy": (pachon.encircled_energy, design | {"wavelengths": [w], "kind": "geometric",
+        "encircled_energy": (pachon.encircled_energy, images | {"kind": "geometric",
                              "radii": [1e-6, 2e-6], "reference": "centroid", "n_pupil": 50}),
         "StarDefects": (pachon.StarDefects, {"second_stars": 0.1, "cosmic_rays": 0.1}),
         "Requirements": (pachon.Requirements, {"tolerances": ["1 %"], "limits": ["spot rms < 10 um"]}),
