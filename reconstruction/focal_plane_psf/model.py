@@ -163,13 +163,11 @@ class FocalPlanePsf(ModelFields, Result):
         data = ShapeData(places_of(mosaic, usable_stars), usable_stars.values, usable_stars.noise**2)
         instrument = heights = None
         if telescope is not None:
-            instrument = telescope
-            if isinstance(instrument, Telescope):
-                instrument = Instrument.of(instrument, camera=mosaic.camera)
-            stamps = instrument.stamps
+            believed = Instrument.of(telescope, camera=mosaic.camera) if isinstance(telescope, Telescope) else telescope
+            stamps = believed.stamps
             if catalogue.stamps is not None:
                 stamps = replace(stamps, size=catalogue.stamps.shape[1])
-            instrument = replace(instrument, stamps=stamps, weight_fwhm=weight)
+            instrument = replace(believed, stamps=stamps, weight_fwhm=weight)
             heights = height_prior(mosaic, focal_plane, prior.budget)
         stamp_size = Stamps().size if instrument is None else instrument.stamps.size
         if catalogue.stamps is not None:
