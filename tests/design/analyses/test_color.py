@@ -55,12 +55,12 @@ def test_bad_zones(paraboloid, afocal):
         pachon.chromatic_focus(afocal(fold=False))
 
 
-def test_a_request_has_telescope_and_wavelengths():
+def test_a_request_has_telescope_and_wavelengths(paraboloid):
     telescope = paraboloid()
     request = pachon.Request.of(telescope, wavelengths=LINES)
     np.testing.assert_array_equal(pachon.chromatic_focus(request).focus, pachon.chromatic_focus(telescope, LINES).focus)
     one = pachon.Request.of(telescope, wavelengths=LINES[0])
     expected = pachon.seidel_diagram(telescope, LINES[0]).coefficients
     np.testing.assert_array_equal(pachon.seidel_diagram(one).coefficients, expected)
-    with pytest.raises(ConfigError, match="wavelengths = .*: given beside a Request"):
+    with pytest.raises(ConfigError, match=r"wavelengths = .*: given beside a Request"):
         pachon.chromatic_focus(request, LINES)
