@@ -189,8 +189,8 @@ def ccd_wcs(
         The camera.
     ccd : str
         Name of the CCD.
-    pointing : (float, float), Quantity or SkyCoord
-        Right ascension and declination of the optical axis [rad].
+    pointing : (float, float), Quantity, SkyCoord or Pointing
+        Right ascension and declination of the optical axis [rad]; :class:`~pachon.Pointing` has the position angle too.
     position_angle : float or Quantity
         Angle of the telescope's +y from north through east [rad].
     wavelength : float or Quantity, optional

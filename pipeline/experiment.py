@@ -33,6 +33,7 @@ from ..sky.pointing import Pointing
 from ..wavefront.aberration import ResidualWavefront
 from ..wavefront.atmosphere.atmosphere import Atmosphere
 from ..wavefront.atmosphere.refraction import dispersion_shift
+from ..wavefront.atmosphere.screen_sampling import ScreenSampling
 from ..wavefront.chief_rays import chief_rays
 from ..wavefront.psf.engines import ENGINES
 from .config import Configuration, digest
@@ -351,8 +352,7 @@ def _atmosphere(config: Configuration, site: Site) -> Atmosphere | None:
             outer_scale=air.outer_scale_m,
             exposure=air.exposure_s,
             time_step=air.time_step_s,
-            screen_size=air.screen_size,
-            screen_length=air.screen_length_m,
+            screens=ScreenSampling(screen_size=air.screen_size, screen_length=air.screen_length_m),
             ground_lift=air.ground_lift_m,
             zenith_angle=math.radians(air.zenith_angle_deg),
             epoch=air.epoch,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arguments import check_arguments
+from ..core.arguments import check_arguments, removed_arguments
 from ..core.errors import ConfigError, DomainError, shown
 from ..core.units import metres, pure_numbers, radians
 from ..models.design_data import unvignetted, vignetted
@@ -75,6 +75,7 @@ class Request:
         )
 
     @classmethod
+    @removed_arguments(aiming="telescope=telescope.with_design(aiming=...)")
     @check_arguments
     def of(
         cls,
@@ -87,7 +88,6 @@ class Request:
         n_pupil: int | None = None,
         projection: str | None = None,
         threads: int | None = None,
-        aiming: str | None = None,
         one_wavelength: bool = False,
         default_fields: Callable[[Telescope], ArrayLike] | None = None,
     ) -> Request:
@@ -116,8 +116,6 @@ class Request:
             Meaning of the field angles, see :func:`~pachon.raytrace.rays.field_direction`; "zemax" by default.
         threads : int, optional
             Number of threads; all processors by default. Results do not depend on it.
-        aiming : {"off", "paraxial", "real"}, optional
-            Ray aiming at the stop, see :class:`~pachon.DesignData`; as the design data say by default.
         one_wavelength : bool
             Whether no wavelength means the telescope's default alone, and a request may have one only.
         default_fields : callable, optional
@@ -126,17 +124,15 @@ class Request:
         Raises
         ------
         ConfigError
-            If the sampling or the projection is unknown, or fields, wavelengths, weights, projection or aiming are
-            given beside a request.
-        PrescriptionError
-            If the aiming is unknown, or rays are to be aimed and the telescope has no stop.
+            If the sampling or the projection is unknown, or fields, wavelengths, weights or projection are given
+            beside a request.
         DomainError
             If an array has another shape, a field point or wavelength lies outside what the telescope covers, or a
             weight is negative.
         """
         if isinstance(telescope, Request):
             held = {"fields": fields, "wavelengths": wavelengths, "wavelength_weights": wavelength_weights}
-            for name, value in (held | {"projection": projection, "aiming": aiming}).items():
+            for name, value in (held | {"projection": projection}).items():
                 if value is not None:
                     raise ConfigError(f"{name} = {shown(value)}: given beside a Request, which has its own", key=name)
             if one_wavelength:
@@ -145,8 +141,6 @@ class Request:
         projection = "zemax" if projection is None else projection
         if fields is None and default_fields is not None:
             fields = default_fields(telescope)
-        if aiming is not None:
-            telescope = telescope.with_design(aiming=aiming)
         data = telescope.design_data
         points = field_points(telescope, fields, projection)
         own_waves = wavelengths is None and not one_wavelength and bool(data.wavelengths)

@@ -191,7 +191,7 @@ def lateral_color(
 
 @check_arguments
 def chromatic_focus(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     wavelengths: ArrayLike | None = None,
     *,
     zones: ArrayLike = _ZONES,
@@ -202,7 +202,7 @@ def chromatic_focus(
     Parameters
     ----------
     telescope, threads
-        As in :meth:`pachon.Request.of`.
+        As in :meth:`pachon.Request.of`; a request has the wavelengths too, and its fields are not used.
     wavelengths : array_like or Quantity, shape [n_wave], optional
         Vacuum wavelengths [m]; 33 across the band by default.
     zones : array_like, shape [n_zone]
@@ -217,6 +217,9 @@ def chromatic_focus(
     radii = np.atleast_1d(pure_numbers(zones, "zones"))
     if radii.ndim != 1 or not ((radii > 0) & (radii <= 1)).all():
         raise DomainError(f"zones = {zones!r}: expected a list of numbers above 0 and up to 1")
+    if isinstance(telescope, Request):
+        stated = Request.of(telescope, None, wavelengths, threads=threads)
+        telescope, wavelengths, threads = stated.telescope, stated.wavelengths, stated.threads
     if wavelengths is None:
         wavelengths = np.linspace(*(telescope.band or telescope.wavelength_range), _WAVELENGTHS)
     request = Request.of(telescope, (0.0, 0.0), wavelengths, sampling=CHIEF_RAY, threads=threads)

@@ -23,7 +23,7 @@ from ..experiment import Experiment
 from ..resolved_values import resolved_value
 from ..sensor.displacement import displace_stamps
 from .photometry import PROVISIONAL_FWHM, electrons, limiting_magnitude
-from .star_field import StarField, make_star_field
+from .star_field import CcdOutline, Depth, StarField, make_star_field
 
 #: Pixels by which the stamp of an observed star is larger than the final one: room to centre it on a pixel.
 _SHIFT_ROOM = 10
@@ -104,7 +104,7 @@ def expose_ccd(
     """
     positions = ccd_stars(experiment, name, PROVISIONAL_FWHM) if stars is None else stars
     holdout = expose_centered(experiment, positions.holdout, threads, progress)
-    pixel = positions.observed_pixel * (positions.pixel_size / experiment.pixel_size)
+    pixel = positions.observed_pixel * (positions.ccd.pixel_size / experiment.pixel_size)
     offsets = pixel - np.rint(pixel)
     kelvin = positions.temperature
     if centered:
@@ -256,9 +256,10 @@ def _with_static_displacements(experiment: Experiment, middles: np.ndarray, imag
     return images
 
 
-def ccd_bounds(camera: Camera, name: str) -> tuple[tuple[float, float, float, float], float]:
-    """Return the part of a CCD on which stars may stand, (xmin, xmax, ymin, ymax) [m], and its angle."""
-    return camera.rectangle(camera.ccd_index(name), _RIM * camera.pixel_size)
+def ccd_outline(camera: Camera, name: str) -> CcdOutline:
+    """Return the part of a CCD on which stars may stand."""
+    bounds, turn = camera.rectangle(camera.ccd_index(name), _RIM * camera.pixel_size)
+    return CcdOutline(name, bounds, camera.pixel_size, turn)
 
 
 def ccd_stars(experiment: Experiment, name: str, width: float, least_light: float = 1.0) -> StarField:
@@ -268,20 +269,15 @@ def ccd_stars(experiment: Experiment, name: str, width: float, least_light: floa
     """
     config, camera, listed = experiment.config, experiment.camera, experiment.star_list
     band, exposure = experiment.band, config.atmosphere.exposure_s
-    bounds, turn = ccd_bounds(camera, name)
+    faint = limiting_magnitude(config.stars.snr_min, band, exposure, width) + 2.5 * np.log10(least_light)
     drawn = make_star_field(
-        name,
-        bounds,
+        ccd_outline(camera, name),
         config.stars.truth,
         config.stars.observed if listed is None else 0,
         config.seed,
         fwhm=width,
-        band=band,
-        exposure=exposure,
-        faint=limiting_magnitude(config.stars.snr_min, band, exposure, width) + 2.5 * np.log10(least_light),
+        depth=Depth(band, exposure, faint=faint),
         margin=_MARGIN,
-        pixel_size=camera.pixel_size,
-        turn=turn,
     )
     if listed is None:
         return drawn

@@ -42,7 +42,7 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         positions.holdout,
         n_components=noise_free_components(config),
         order=config.reconstruction.truth_order,
-        extent=positions.extent,
+        extent=positions.ccd.extent,
         clip_sigma=None,
     )
 
@@ -97,7 +97,7 @@ def fit_ccd_model(
         stars.observed[used],
         recipe=recipe,
         weights=recipe.star_weights(snr[used]),
-        extent=stars.extent,
+        extent=stars.ccd.extent,
         clip_sigma=CLIP_SIGMA if noisy else None,
     )
 

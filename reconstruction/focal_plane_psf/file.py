@@ -22,6 +22,8 @@ from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
 from ...wavefront.aberration import ResidualWavefront
 from ...wavefront.atmosphere.atmosphere import Atmosphere
+from ...wavefront.psf.light import Light
+from ...wavefront.psf.stamps import Stamps
 from .covariance import Covariance, Places
 from .field import ShapeField
 from .fit import ShapeData
@@ -107,9 +109,9 @@ def model_hdus(model: ModelFields) -> list[fits.ImageHDU | fits.BinTableHDU]:
         about["seeing"] = optics.seeing
         about["degree"] = optics.prior.degree
         about["atmosphere"] = {"r0": air.r0, "outer_scale": air.outer_scale}
-        about["instrument"] = {k: getattr(instrument, k) for k in ("pixel_size", "diffusion", "jitter")}
-        if instrument.silicon is not None:
-            about["silicon"] = asdict(instrument.silicon)
+        about["instrument"] = {k: getattr(instrument.stamps, k) for k in ("pixel_size", "diffusion", "jitter")}
+        if instrument.stamps.silicon is not None:
+            about["silicon"] = asdict(instrument.stamps.silicon)
         about["radius"], about["center"] = optics.response.radius, optics.response.center
         surfaces = optics.plane.surfaces
         hdus += [
@@ -124,8 +126,9 @@ def model_hdus(model: ModelFields) -> list[fits.ImageHDU | fits.BinTableHDU]:
         ]
         if surfaces.grid is not None:
             hdus.append(_image_hdu("HEIGHT_SPLINE", surfaces.grid))
-        if instrument.dispersion is not None:
-            hdus.append(_image_hdu("DISPERSION", instrument.dispersion))
+        for name, values in (("DISPERSION", instrument.light.dispersion), ("WEIGHTS", instrument.light.weights)):
+            if values is not None:
+                hdus.append(_image_hdu(name, np.asarray(values)))
     text = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
     return [_image_hdu("ABOUT", text, "JSON, one character of UTF-8 a pixel"), *hdus]
 
@@ -197,13 +200,14 @@ def _optics_part(
 ) -> OpticsPart:
     instrument = Instrument.of(
         _telescope_from_text(about["telescope"]),
-        part("WAVELENGTHS"),
+        Light(part("WAVELENGTHS"), *(part(name) if name in names else None for name in ("WEIGHTS", "DISPERSION"))),
         Atmosphere.from_site("cerro_pachon", seed=0, **about["atmosphere"]),
-        **about["instrument"],
+        stamps=Stamps(
+            about["stamp_size"],
+            **about["instrument"],
+            silicon=Silicon(**about["silicon"]) if "silicon" in about else None,
+        ),
         weight_fwhm=about["weight_fwhm"],
-        dispersion=part("DISPERSION") if "DISPERSION" in names else None,
-        stamp_size=about["stamp_size"],
-        silicon=Silicon(**about["silicon"]) if "silicon" in about else None,
     )
     cubic = part("HEIGHT_CUBIC")
     grid = part("HEIGHT_SPLINE") if "HEIGHT_SPLINE" in names else None

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -70,6 +71,17 @@ class Baseline(Section):
     plan: Plan
     reasons: dict[str, str] = Field(description="reasons of the tolerances")
     figures: Annotated[dict[str, BaselineMetric], Field(min_length=1)] = Field(description="the metrics by name")
+
+    @check_arguments
+    def with_sources(self, sources: Mapping[str, str]) -> Baseline:
+        """Return the baseline with independent sources of metrics, by the start of their names."""
+
+        def checked(name: str, metric: BaselineMetric) -> BaselineMetric:
+            source = next((text for start, text in sources.items() if name.startswith(start)), metric.checked_against)
+            return metric.model_copy(update={"checked_against": source})
+
+        metrics = {name: checked(name, metric) for name, metric in self.figures.items()}
+        return self.model_copy(update={"figures": metrics})
 
     def __repr__(self) -> str:
         return f"<Baseline of {self.model}: {len(self.figures)} metrics>"

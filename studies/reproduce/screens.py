@@ -15,6 +15,7 @@ from ...models.io.prescription import load_telescope
 from ...models.io.site_file import load_site
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.atmosphere.refraction import dispersion_shift
+from ...wavefront.atmosphere.screen_sampling import ScreenSampling
 from ...wavefront.atmosphere.turbulence import path_variance
 from .bench import Bench
 from .figure import EcsvData, FitsData, Reproduced, figure
@@ -102,7 +103,7 @@ def _dispersion_plot(zenith: np.ndarray, spread: Mapping[str, np.ndarray]) -> by
 )
 def screens(bench: Bench) -> Reproduced:
     """Draw the screens of the six layers and compare their strength with theory (Fig. 4)."""
-    air = Atmosphere.from_site(_SITE, bench.seed, screen_size=bench.scale.screen_size)
+    air = Atmosphere.from_site(_SITE, bench.seed, screens=ScreenSampling(screen_size=bench.scale.screen_size))
     across = round(_PIECE / air.screen_pixel)
     block = -(-across // _KEPT)
     size = across // block

@@ -16,7 +16,7 @@ from ...pipeline.config import with_options
 from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_stage import fit_focal_plane_model
 from ...pipeline.resolved_values import resolved_value
-from ...pipeline.simulate.ccd_exposure import CcdExposure, ccd_bounds
+from ...pipeline.simulate.ccd_exposure import CcdExposure, ccd_outline
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_model import fit_ccd_model
 from ...pipeline.simulate.ccd_observation import Observation, collected_images, observe_ccd
@@ -207,11 +207,8 @@ def _star_fields(
         if not len(stars):
             continue
         magnitude = magnitudes_at(points.quantile[stars], bright, faint)
-        bounds, turn = ccd_bounds(camera, name)
         fields[name] = StarField(
-            ccd_name=name,
-            bounds=bounds,
-            pixel_size=camera.pixel_size,
+            ccd=ccd_outline(camera, name),
             holdout=xy[places],
             observed=xy[stars],
             magnitude=magnitude,
@@ -220,7 +217,6 @@ def _star_fields(
             exposure=seconds,
             bright=bright,
             faint=faint,
-            turn=turn,
         )
         index[name] = np.concatenate([places, stars])
     return fields, index

@@ -20,6 +20,7 @@ from pachon.measure.shapes import measure_shapes
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
 from pachon.sky.galaxies import Galaxies
+from pachon.sky.pointing import Pointing
 
 POINTING, ROLL = (0.3, 0.2), 0.7
 STAMP = Stamp("ab" * 32, 7)
@@ -38,7 +39,7 @@ def two_galaxies(xi, eta):
 @pytest.fixture(scope="module")
 def stars(small_run):
     """Scene of stars alone on the whole CCD."""
-    return draw_ccd(small_run, "R22_S11", nothing, pointing=POINTING, position_angle=ROLL)
+    return draw_ccd(small_run, "R22_S11", nothing, pointing=Pointing(*POINTING, ROLL))
 
 
 @pytest.fixture(scope="module")
@@ -47,8 +48,7 @@ def image(small_run):
         small_run,
         "R22_S11",
         two_galaxies,
-        pointing=POINTING,
-        position_angle=ROLL,
+        pointing=Pointing(*POINTING, ROLL),
         window=Window(1500, 1500, 900, 800),
         exposure=Exposure("r", 2.0, 3),
     )

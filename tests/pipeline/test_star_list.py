@@ -408,8 +408,7 @@ def test_images_have_the_stars_of_the_catalogue(catalogue, sky, places):
             experiment,
             "R22_S11",
             pachon.Galaxies.single([], [], [], []),
-            pointing=(AIM.ra, AIM.dec),
-            position_angle=AIM.position_angle,
+            pointing=AIM,
             window=pachon.Window(1500, 1500, 1200, 1200),
         )
     found = np.stack([scene.objects["RA"], scene.objects["DEC"]], axis=1)
