@@ -17,8 +17,8 @@ from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
-from ..metrics.principal_rays import principal_rays_of
-from .analysis import Analysis, Columns, band_wavelengths, line_request, require_focus, tangential_axes
+from ..metrics.principal_rays import principal_rays_of, tangential_axes
+from .analysis import Analysis, Columns, band_wavelengths, line_request, require_focus
 from .field_curvature import close_foci
 
 if TYPE_CHECKING:
