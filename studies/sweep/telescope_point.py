@@ -14,22 +14,17 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import ConfigError, unknown_name
-from ...design.optimize.optimize import optimize
-from ...design.optimize.solver import LeastSquares
 from ...models.io.bundled import BUNDLED
 from ...models.io.prescription import load_telescope
 from ...models.parameters.changes import apply_changes, parse_change
 from ...models.telescope import Telescope
 from ...pipeline.config import Configuration, configuration_of
 from ..metrics.telescope import TELESCOPE_METRICS, TelescopeScene
+from .compensation import solved_compensators
 from .file import SweepFile
 
 #: Keys of the configuration that apply to a telescope without a camera.
 KEYS = ("telescope", "wavelengths_nm", "changes", "seed")
-#: Rings of pupil points for compensators.
-_RINGS = 4
-#: Relative precision of the mean square radius.
-_TOLERANCE = 1e-9
 
 
 def has_no_camera(sweep: SweepFile, parameters: dict[str, Any], folder: Path) -> bool:
@@ -44,27 +39,14 @@ def point_metrics(sweep: SweepFile, parameters: dict[str, Any], folder: Path, th
     telescope, config = point_telescope(sweep, parameters, folder)
     fields = None if sweep.fields_deg is None else np.deg2rad(sweep.fields_deg)
     waves = None if config.wavelengths_nm is None else np.array(config.wavelengths_nm) * 1e-9
-    solved = {}
+    solved: dict[str, float] = {}
     if sweep.compensators:
-        parsed_compensators = [parse_change(telescope, name, "compensators") for name in sweep.compensators]
-        optimum = optimize(
-            telescope,
-            [parameter for parameter, _ in parsed_compensators],
-            "spots",
-            fields,
-            waves,
-            n_pupil=_RINGS,
-            solver=LeastSquares(_TOLERANCE),
-            threads=threads,
-        )
-        telescope = optimum.telescope
-        for name, change, (_, size) in zip(sweep.compensators, optimum.changes, parsed_compensators, strict=True):
-            solved[f"solved {name}"] = float(change / size)
+        telescope, solved = solved_compensators(telescope, sweep.compensators, "spots", fields, waves, threads)
     scene = TelescopeScene(telescope, fields, waves, threads)
     metrics: dict[str, float] = {}
     for name in dict.fromkeys(sweep.metrics):
         metrics |= TELESCOPE_METRICS[name].compute(scene)
-    return metrics | solved
+    return metrics | {f"solved {name}": value for name, value in solved.items()}
 
 
 def point_telescope(sweep: SweepFile, parameters: dict[str, Any], folder: Path) -> tuple[Telescope, Configuration]:

@@ -8,11 +8,6 @@ from ...core.plotting import BLUE, GREY, ORANGE, RED, new_figure, png_bytes, sty
 from .result import SHOWN, ToleranceStudy, merit_unit, name_rows, study_title
 
 
-def sensitivity_plot(study: ToleranceStudy) -> bytes:
-    """Draw :meth:`ToleranceStudy.plot` as PNG."""
-    return png_bytes(study.plot())
-
-
 def inverse_plot(study: ToleranceStudy) -> bytes:
     """Draw the size that costs the stated loss over the size of each of the costliest tolerances."""
     shown = study.offenders[:SHOWN][::-1]

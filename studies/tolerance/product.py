@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from ...core.files import write_bytes, write_json
+from ...core.plotting import png_bytes
 from ...core.products import Columns, write_ecsv
 from ...core.version import VERSION
 from .file import ToleranceFile
-from .plots import draws_plot, inverse_plot, sensitivity_plot, yield_plot
+from .plots import draws_plot, inverse_plot, yield_plot
 from .report import tolerance_page
 from .result import ToleranceStudy
 
@@ -90,7 +91,7 @@ def write_tolerances(study: ToleranceStudy, file: ToleranceFile, folder: Path) -
     write_ecsv(folder / "sensitivity.ecsv", sensitivity, {"what": "sensitivity to tolerances", **meta})
     write_ecsv(folder / "draws.ecsv", draws, {"what": f"telescopes within tolerances, {study.method}", **meta})
     pictures = {
-        "sensitivity.png": sensitivity_plot(study),
+        "sensitivity.png": png_bytes(study.plot()),
         "inverse.png": inverse_plot(study),
         "draws.png": draws_plot(study),
         "yield.png": yield_plot(study),
