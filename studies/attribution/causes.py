@@ -68,8 +68,9 @@ def _off(key: str, config: Configuration, consequence: str = "") -> str | None:
     """Return the key of a cause and its value where it is off: zero, false or null."""
     section, name = key.split(".")
     value = getattr(getattr(config, section), name)
-    shown = "null" if value is None else "false" if value is False else f"{value:g}"
-    return None if value else f"{key} = {shown}{consequence}"
+    if value:
+        return None
+    return f"{key} = {'null' if value is None else 'false' if value is False else f'{value:g}'}{consequence}"
 
 
 def _cause(key: str, value: float | bool | None) -> Cause:
