@@ -64,6 +64,8 @@ def solved_compensators(
     """Return the telescope with compensators at the smallest merit, and their values in the units of their names."""
     changes = [parse_change(telescope, name, "compensators") for name in names]
     parameters, solver = [parameter for parameter, _ in changes], LeastSquares(_TOLERANCE)
-    optimum = optimize(telescope, parameters, merit, fields, wavelengths, n_pupil=_RINGS, solver=solver, threads=threads)
+    optimum = optimize(
+        telescope, parameters, merit, fields, wavelengths, n_pupil=_RINGS, solver=solver, threads=threads
+    )
     sizes = (size for _, size in changes)
     return optimum.telescope, {n: float(v / size) for n, v, size in zip(names, optimum.changes, sizes, strict=True)}
