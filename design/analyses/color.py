@@ -68,11 +68,7 @@ class LateralColor(Analysis):
         return {
             "reference_nm": self.request.middle * 1e9,
             **self.on_image(
-                {
-                    "shift_um": self.shift * 1e6,
-                    "spread_um": self.spread * 1e6,
-                    "airy_radius_um": self.airy_radius * 1e6,
-                }
+                {"shift_um": self.shift * 1e6, "spread_um": self.spread * 1e6, "airy_radius_um": self.airy_radius * 1e6}
             ),
         }
 
@@ -191,11 +187,7 @@ def lateral_color(
 
 @check_arguments
 def chromatic_focus(
-    telescope: Telescope,
-    wavelengths: ArrayLike | None = None,
-    *,
-    zones: ArrayLike = _ZONES,
-    threads: int | None = None,
+    telescope: Telescope, wavelengths: ArrayLike | None = None, *, zones: ArrayLike = _ZONES, threads: int | None = None
 ) -> ChromaticFocus:
     """Trace the focus on the axis against the wavelength.
 

@@ -167,10 +167,7 @@ def wavefronts(telescope: Telescope, rays: Beams) -> np.ndarray:
 
 
 def _states(
-    given: tuple[DesignConfiguration, ...],
-    function: MeritFunction,
-    targets: tuple[Operand, ...],
-    threads: int | None,
+    given: tuple[DesignConfiguration, ...], function: MeritFunction, targets: tuple[Operand, ...], threads: int | None
 ) -> tuple[tuple[DesignState, ...], tuple[Beams, ...]]:
     """Return merit and operands of each configuration, and their rays."""
     if len(given) > 1 and function.of_one_telescope:
@@ -233,10 +230,7 @@ def final_telescope(telescope: Telescope, aiming: str) -> Telescope:
 
 
 def remeasured(
-    states: Sequence[DesignConfiguration],
-    telescopes: Sequence[Telescope],
-    function: MeritFunction,
-    threads: int | None,
+    states: Sequence[DesignConfiguration], telescopes: Sequence[Telescope], function: MeritFunction, threads: int | None
 ) -> tuple[float, float]:
     """Return the rms merit [m] of telescopes as they stand, of the light that arrives in each.
 

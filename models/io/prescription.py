@@ -163,10 +163,7 @@ def prescription_digest(path: str | os.PathLike[str]) -> str:
         files += [mesh for mesh in beside if os.path.isfile(path.parent / mesh) and mesh not in files]
     if not files:
         return digest
-    contents = [
-        digest,
-        *(hashlib.sha256(read_bytes(path.parent / n, PrescriptionError)).hexdigest() for n in files),
-    ]
+    contents = [digest, *(hashlib.sha256(read_bytes(path.parent / n, PrescriptionError)).hexdigest() for n in files)]
     return hashlib.sha256("".join(contents).encode()).hexdigest()
 
 

@@ -91,13 +91,7 @@ def effective_fwhm(images: np.ndarray, pixel_scale: float) -> float:
 
 
 def signal_to_noise(
-    magnitude: Any,
-    band: str | Band,
-    exposure: float,
-    fwhm: Any,
-    *,
-    pixel_scale: Any = None,
-    sky: float | None = None,
+    magnitude: Any, band: str | Band, exposure: float, fwhm: Any, *, pixel_scale: Any = None, sky: float | None = None
 ) -> np.ndarray:
     """Return the S/N of PSF photometry, ``C / sqrt(C + n_eff (sky + noise^2))`` (SMTN-002)."""
     counts = electrons(magnitude, band, exposure)
@@ -105,13 +99,7 @@ def signal_to_noise(
 
 
 def limiting_magnitude(
-    snr: float,
-    band: str | Band,
-    exposure: float,
-    fwhm: Any,
-    *,
-    pixel_scale: Any = None,
-    sky: float | None = None,
+    snr: float, band: str | Band, exposure: float, fwhm: Any, *, pixel_scale: Any = None, sky: float | None = None
 ) -> float:
     """Return the magnitude of a star of a signal-to-noise ratio: :func:`signal_to_noise` solved for C."""
     square = require_positive(snr, "snr") ** 2

@@ -136,12 +136,7 @@ class FocalPlaneStars(Result):
     @classmethod
     @check_arguments
     def from_table(
-        cls,
-        table: Any,
-        *,
-        stamps: Any = None,
-        pixel_scale: float | None = None,
-        weight_fwhm: float = 0.7 * ARCSEC,
+        cls, table: Any, *, stamps: Any = None, pixel_scale: float | None = None, weight_fwhm: float = 0.7 * ARCSEC
     ) -> FocalPlaneStars:
         """Take stars from a table, structured array or mapping.
 

@@ -90,12 +90,7 @@ def reproduce(names: Iterable[str], bench: Bench) -> dict[str, Any]:
 
 
 def reproduce_at(
-    names: Iterable[str],
-    scale: str,
-    folder: Path,
-    *,
-    seed: int = 1,
-    execution: Execution | None = None,
+    names: Iterable[str], scale: str, folder: Path, *, seed: int = 1, execution: Execution | None = None
 ) -> dict[str, Any]:
     """Reproduce figures at a scale given by name, after a line with the expected time: see :func:`reproduce`."""
     figure_names = chosen_figures(names)

@@ -346,10 +346,7 @@ def _ellipticity_merit(values: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarr
 
 
 #: Merits that are means over places.
-_VALUES: dict[str, Value] = {
-    "fwhm": _width_merit,
-    "ellipticity": _ellipticity_merit,
-}
+_VALUES: dict[str, Value] = {"fwhm": _width_merit, "ellipticity": _ellipticity_merit}
 
 
 def _state_metrics(
@@ -357,12 +354,7 @@ def _state_metrics(
 ) -> tuple[StateMetrics, Correlation]:
     """Return means of values [n, 3] at places, and the correlation of their ellipticities."""
     correlation = shear_correlation(
-        *sky.T,
-        *values[:, 1:].T,
-        min_sep=edges[0],
-        max_sep=edges[-1],
-        n_bins=len(edges) - 1,
-        weight=places.weight,
+        *sky.T, *values[:, 1:].T, min_sep=edges[0], max_sep=edges[-1], n_bins=len(edges) - 1, weight=places.weight
     )
     rms_xi = float(np.sqrt(np.nanmean(correlation.xi_plus**2)))
     rms_e = places.mean((values[:, 1:] ** 2).sum(axis=1)) ** 0.5

@@ -74,12 +74,7 @@ class Design(Section):
 
 
 #: Sections and keys of a configuration that may name a file, besides the telescope.
-_FILES = (
-    ("atmosphere", "site"),
-    ("focal_plane", "heights"),
-    ("active_optics", "states"),
-    ("stars", "catalogue"),
-)
+_FILES = (("atmosphere", "site"), ("focal_plane", "heights"), ("active_optics", "states"), ("stars", "catalogue"))
 # Parameters whose values may name files.
 _FILE_PARAMETERS = {"telescope", "camera", *(f"{section}.{key}" for section, key in _FILES)}
 

@@ -98,12 +98,7 @@ def _wavelengths(t: Telescope) -> dict[str, Any]:
     lengths = stated_wavelengths(t)
     weights = data.wavelength_weights or (1.0,) * len(lengths)
     rows = [
-        {
-            "value": scaled(length, 6),
-            "is_primary": length == t.default_wavelength,
-            "unit": "um",
-            "weight": weight,
-        }
+        {"value": scaled(length, 6), "is_primary": length == t.default_wavelength, "unit": "um", "weight": weight}
         for length, weight in zip(lengths, weights, strict=True)
     ]
     return {"wavelengths": rows, "polarization": "ignore"}

@@ -51,7 +51,7 @@ def telescope_to_optiland(telescope: Telescope, *, lenient: bool = False) -> str
                 "geometry": {"type": "Plane", "cs": _system(-t.object_distance - first), "radius": math.inf},
                 "material_post": before,
                 "comment": "",
-            },
+            }
         ]
         for surface in lens_surfaces(t, stop):
             try:
