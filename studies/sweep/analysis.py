@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import rankdata
 
-from .file import SweepFile
+from .file import Point, SweepFile
 from .table import SweepTable
 
 #: Least number of values of a parameter for a curve.
@@ -213,7 +213,7 @@ def _over_replicas(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarr
         return mean, spread, spread / np.sqrt(count)
 
 
-def _metric_at(table: SweepTable, point: dict[str, Any], seed: int, metric: str) -> float:
+def _metric_at(table: SweepTable, point: Point, seed: int, metric: str) -> float:
     """Return the metric of one point; NaN where it was not computed."""
     matching_rows = table.seed == seed
     for name, value in point.items():

@@ -33,6 +33,8 @@ from ...core.yaml_reader import read_mapping
 from ...models.io.prescription import prescription_digest
 from ...pipeline.config import digest
 
+#: Values of the parameters of one point by name.
+Point = dict[str, Any]
 #: Folder of the bundled sweeps.
 EXAMPLES = Path(__file__).parent / "examples"
 

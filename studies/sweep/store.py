@@ -18,7 +18,7 @@ from ...core.errors import ConfigError, ProductError, cut_short
 from ...core.files import make_folder, partial_path, publish_new
 from ...core.long_work import differences
 from ...core.version import VERSION
-from .file import SweepFile, read_sweep
+from .file import Point, SweepFile, read_sweep
 
 #: Format of the tables; stores of other formats are refused.
 FORMAT = 1
@@ -41,7 +41,7 @@ class SweepPoint:
     """A point to compute: its number, the values of its parameters, and the seed of its random numbers."""
 
     number: int
-    parameters: dict[str, Any]
+    parameters: Point
     seed: int
 
     @property
