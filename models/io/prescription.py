@@ -36,7 +36,7 @@ from typing import Any
 
 from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError, check_choice, unknown_name
-from ...core.files import read_bytes, write_bytes
+from ...core.files import content_hash, write_bytes
 from ...core.yaml_reader import read_mapping
 from ..mesh_file import files_of_mesh
 from ..telescope import Telescope
@@ -143,7 +143,7 @@ def prescription_digest(path: str | os.PathLike[str]) -> str:
         If a file cannot be read.
     """
     path = Path(path)
-    digest = hashlib.sha256(read_bytes(path, PrescriptionError)).hexdigest()
+    digest = content_hash(path, PrescriptionError)
     if path.suffix.lower() in _READERS:
         from .user_glasses import user_catalogues
 
@@ -161,10 +161,8 @@ def prescription_digest(path: str | os.PathLike[str]) -> str:
         # A list that grows: files of meshes name no others.
         beside = (os.path.join(os.path.dirname(name), mesh) for mesh in files_of_mesh(path.parent / name))
         files += [mesh for mesh in beside if os.path.isfile(path.parent / mesh) and mesh not in files]
-    if not files:
-        return digest
-    contents = [digest, *(hashlib.sha256(read_bytes(path.parent / n, PrescriptionError)).hexdigest() for n in files)]
-    return hashlib.sha256("".join(contents).encode()).hexdigest()
+    digests = [digest, *(content_hash(path.parent / name, PrescriptionError) for name in files)]
+    return hashlib.sha256("".join(digests).encode()).hexdigest() if files else digest
 
 
 def _texts(content: Any) -> Iterator[str]:
