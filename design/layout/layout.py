@@ -226,6 +226,11 @@ def _across_field(telescope: Telescope) -> list[list[float]]:
     return [[0.0, -edge], [0.0, 0.0], [0.0, edge]]
 
 
+def section(telescope: Telescope) -> Figure:
+    """Return the drawing of a telescope with rays of the default fields."""
+    return layout(telescope).plot()
+
+
 def draw_section(axes: Axes, layout: Layout) -> None:
     """Draw the section of a whole telescope with its rays, without legend and title."""
     drawing = _Drawing(layout)
