@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -96,11 +96,12 @@ def tolerance_plan(file: ToleranceFile, telescope: Telescope) -> TolerancePlan:
 
 
 def _same_quantity(
-    found: dict[str, tuple[DegreeOfFreedom, Tolerance]], chosen: dict[str, tuple[DegreeOfFreedom, Tolerance]]
+    section_quantities: Mapping[str, tuple[DegreeOfFreedom, Tolerance]],
+    quantities: Mapping[str, tuple[DegreeOfFreedom, Tolerance]],
 ) -> set[str]:
-    """Return the names of chosen tolerances that are of the one parameter of a tolerance that was found."""
-    parameters = {tuple(freedom.of) for freedom, _ in found.values() if len(freedom.of) == 1}
-    return {name for name, (freedom, _) in chosen.items() if tuple(freedom.of) in parameters}
+    """Return the names of tolerances that are of the one parameter of a tolerance of a section."""
+    parameters = {tuple(freedom.of) for freedom, _ in section_quantities.values() if len(freedom.of) == 1}
+    return {name for name, (freedom, _) in quantities.items() if tuple(freedom.of) in parameters}
 
 
 def _common(file: ToleranceFile, telescope: Telescope, elements: tuple[str, ...]) -> Iterator[ToleranceSection]:
