@@ -19,6 +19,7 @@ import numpy as np
 from scipy.special import erf
 
 from ...core.errors import DomainError, unknown_name
+from ...core.statistics import FWHM_PER_RMS
 from ...core.units import ARCSEC, positive_angle, require_positive
 from ...models.camera.photometry import BANDS, Band
 
@@ -122,7 +123,7 @@ def saturation_magnitude(
     The star is a Gaussian centred on the pixel. A turbulent PSF has more light in its wings and a lower peak, so the
     limit is a safe one. DomainError if the sky alone fills the well.
     """
-    sigma = positive_angle(fwhm, "fwhm") / np.sqrt(8.0 * np.log(2.0))
+    sigma = positive_angle(fwhm, "fwhm") / FWHM_PER_RMS
     band = band_named(band)
     pixel = _pixel_side(band, pixel_scale)
     background = sky_electrons_per_pixel(band, exposure, pixel, sky=sky)

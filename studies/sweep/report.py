@@ -126,7 +126,8 @@ def _budget_text(budgets: list[Budget]) -> str:
             )
     return (
         f"{_defined(budgets[0].metric)} Its change at each named value of all parameters, one by one and together "
-        "(grey, with the standard error over the replicas). Independent errors add in their squares, which xi is made of. "
+        "(grey, with the standard error over the replicas). Independent errors add in their squares, which xi is made "
+        "of. "
     ) + " ".join(texts)
 
 
