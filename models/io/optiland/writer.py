@@ -60,10 +60,8 @@ def telescope_to_optiland(telescope: Telescope, *, lenient: bool = False) -> str
             }
         ]
         for surface in lens_surfaces(t, stop):
-            try:
+            with error_context(subject=f"surface {surface.name}"):
                 surfaces.append(_surface_items(surface, first))
-            except PrescriptionError as error:
-                raise PrescriptionError(f"surface {surface.name}: {error}") from None
     heights = [s["geometry"]["cs"]["z"] for s in surfaces]
     for items, height, next_height in zip(surfaces[1:], heights[1:], [*heights[2:], heights[-1]], strict=True):
         items["thickness"] = (next_height - height) / MM
