@@ -92,8 +92,8 @@ from .design.optimize.targets import RelativeDistortion as RelativeDistortion
 from .design.optimize.targets import Target as Target
 from .design.report.report import design_report as design_report
 from .design.tolerancing.monte_carlo import MonteCarlo as MonteCarlo
+from .design.tolerancing.monte_carlo import Yield as Yield
 from .design.tolerancing.monte_carlo import monte_carlo as monte_carlo
-from .design.tolerancing.yields import Yield as Yield
 from .imaging.config import ImagesConfig as ImagesConfig
 from .imaging.config import load_images_configuration as load_images_configuration
 from .imaging.draw import Window as Window

@@ -267,8 +267,7 @@ class ReconstructionConfig(Section):
         None, description="of the stars in the polynomials: equal, snr (S/N squared), softened (snr up to about 100)"
     )
     order: Whole | None = Field(
-        None,
-        description="order of the polynomials fitted to the observed stars, 3; of the trend in kriging 4",
+        None, description="order of the polynomials fitted to the observed stars, 3; of the trend in kriging 4"
     )
     truth_order: Whole = Field(4, description="order of the polynomials fitted to the noise-free PSFs")
     weight_fwhm_arcsec: Positive | None = Field(None, description="FWHM of the weight of the moments [arcsec]")

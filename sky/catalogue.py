@@ -23,11 +23,7 @@ from .pointing import Pointing
 #: Kinds of the files that are written, by their endings.
 FORMATS = {".ecsv": "ECSV", ".fits": "FITS", ".fit": "FITS", ".parquet": "Parquet"}
 #: Names of columns, in any case; the first is the one that messages name.
-NAMES = {
-    "mag": ("mag", "magnitude"),
-    "half_light_radius": ("half_light_radius", "hlr"),
-    "n": ("n", "sersic"),
-}
+NAMES = {"mag": ("mag", "magnitude"), "half_light_radius": ("half_light_radius", "hlr"), "n": ("n", "sersic")}
 # Columns of a table of components: unit, description.
 _PER_GALAXY = {
     "xi": ("rad", "position on the tangent plane, towards east"),

@@ -15,12 +15,11 @@ from ..core.errors import ConfigError, DomainError, shown
 from ..core.units import metres, pure_numbers, radians
 from ..models.design_data import unvignetted, vignetted
 from ..models.telescope import Telescope
-from ..raytrace.aiming import pupil_coordinates
+from ..raytrace.aiming import AimedPoints, pupil_coordinates
 from ..raytrace.launch import aimed_points
 from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import Rays, RayStatus, field_direction, straight_bundles
 from ..raytrace.trace import trace
-from .aimed_start import AimedStart
 from .bundles import Bundles
 from .design_fields import design_fields
 from .pupil_sampling import PupilSampling, pupil_sampling
@@ -345,3 +344,19 @@ def relative_weights(weights: ArrayLike | None, count: int, name: str = "wavelen
     if values.shape != (count,) or not (np.isfinite(values).all() and (values >= 0).all() and values.sum() > 0):
         raise DomainError(f"{name} = {shown(weights)}: expected {count} numbers, none negative, not all zero")
     return values / values.sum()
+
+
+class AimedStart:
+    """Points of the entrance pupil that aimed rays of some directions cross, each set computed at its first use."""
+
+    def __init__(self, telescope: Telescope, directions: np.ndarray) -> None:
+        self._telescope, self._directions = telescope, directions
+        self._computed: dict[tuple[float, bytes], AimedPoints] = {}
+
+    def at(self, wavelength: float, pupil: np.ndarray) -> AimedPoints:
+        """Return those of pupil points [m], [n_pupil, 2] or [n_field, n_pupil, 2]; DomainError as `aimed_points`."""
+        key = (wavelength, pupil.tobytes())
+        if key not in self._computed:
+            points = aimed_points(self._telescope, self._directions, wavelength, pupil)
+            self._computed[key] = AimedPoints.of(self._telescope, self._directions, wavelength, pupil, points)
+        return self._computed[key]

@@ -174,8 +174,7 @@ def ghosts(
     ] = None,
     detector_reflectivity: Annotated[float, Option(min=0.0, max=1.0, help="Of the detector.")] = 0.15,
     coatings: Annotated[
-        Path | None,
-        Option(metavar="FILE", help="Coatings of lens surfaces, a file as of throughput."),
+        Path | None, Option(metavar="FILE", help="Coatings of lens surfaces, a file as of throughput.")
     ] = None,
     rays: Annotated[int, Option(min=400, max=10_000_000, help="Rays of the star.")] = 40000,
     brightest: Annotated[

@@ -17,8 +17,8 @@ from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
-from ..metrics.principal_rays import principal_rays_of
-from .analysis import Analysis, Columns, band_wavelengths, line_request, require_focus, tangential_axes
+from ..metrics.principal_rays import principal_rays_of, tangential_axes
+from .analysis import Analysis, Columns, band_wavelengths, line_request, require_focus
 from .field_curvature import close_foci
 
 if TYPE_CHECKING:
@@ -68,11 +68,7 @@ class LateralColor(Analysis):
         return {
             "reference_nm": self.request.middle * 1e9,
             **self.on_image(
-                {
-                    "shift_um": self.shift * 1e6,
-                    "spread_um": self.spread * 1e6,
-                    "airy_radius_um": self.airy_radius * 1e6,
-                }
+                {"shift_um": self.shift * 1e6, "spread_um": self.spread * 1e6, "airy_radius_um": self.airy_radius * 1e6}
             ),
         }
 

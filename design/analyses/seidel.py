@@ -61,8 +61,8 @@ class SeidelDiagram(Analysis):
         return f"Seidel diagram, field {self.field_labels()[0]}, {self._nanometres()}"
 
     @property
-    def _size(self) -> tuple[float, float]:
-        return min(max(6.5, 1.2 + 0.75 * (len(self.names) + 1)), 14.0), 4.4
+    def _panels(self) -> tuple[int, int, float, float]:
+        return 1, 1, min(max(6.5, 1.2 + 0.75 * (len(self.names) + 1)), 14.0), 4.4
 
     def _table_columns(self) -> Columns:
         columns: Columns = {"surface": (np.array(self.names), "", "mirror or lens surface")}

@@ -72,12 +72,8 @@ class TargetImage(Analysis):
         return f"geometric image of a target, {self._nanometres()}"
 
     @property
-    def _grid(self) -> tuple[int, int]:
-        return 1, 2
-
-    @property
-    def _size(self) -> tuple[float, float]:
-        return 9.0, 4.6
+    def _panels(self) -> tuple[int, int, float, float]:
+        return 1, 2, 9.0, 4.6
 
     def _table_columns(self) -> Columns:
         along = (np.arange(len(self.image)) - 0.5 * (len(self.image) - 1)) * self.pixel * 1e6

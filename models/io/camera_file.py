@@ -15,7 +15,6 @@ docs/camera.md has all keys.
 
 from __future__ import annotations
 
-import hashlib
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,7 +23,7 @@ import numpy as np
 from pydantic import Field
 
 from ...core.errors import PachonError, PrescriptionError
-from ...core.files import read_bytes
+from ...core.files import content_hash
 from ...core.schema import Count, Fraction, NotNegative, Positive, Real, Section, validated
 from ...core.yaml_reader import read_mapping
 from ..camera.camera import Camera
@@ -156,7 +155,7 @@ def is_camera_file(path: Path) -> bool:
 
 def read_camera(path: Path) -> Camera:
     """Read a camera file; PrescriptionError of one line with file, key, value and what was expected."""
-    return _read(path, hashlib.sha256(read_bytes(path, PrescriptionError)).hexdigest())
+    return _read(path, content_hash(path, PrescriptionError))
 
 
 @lru_cache(maxsize=16)

@@ -163,8 +163,5 @@ def _modelled(telescope: Telescope, model: DonutModel, psf: dict[str, Any]) -> t
     if defocus:
         telescope = telescope.perturbed(surface.name, shift=defocus * surface.matrix[:, 2])
     waves = wavelength_points(telescope, None if model.light is None else model.light.wavelengths)
-    arguments = {
-        "focal_plane": detector.focal_plane,
-        "atmosphere": model.air.exposure(float(waves[len(waves) // 2])),
-    }
+    arguments = {"focal_plane": detector.focal_plane, "atmosphere": model.air.exposure(float(waves[len(waves) // 2]))}
     return telescope, {**arguments, **psf}

@@ -103,10 +103,7 @@ class StaticHeights(Result):
             ),
             _image_float64("COVARIANCE", self.covariance, "[m2] of the Legendre coefficients of each CCD"),
         ]
-        cards = [
-            ("CAMERA", self.camera.name, "name of the camera"),
-            ("NEXPOSE", self.exposures, "number of exposures"),
-        ]
+        cards = [("CAMERA", self.camera.name, "name of the camera"), ("NEXPOSE", self.exposures, "number of exposures")]
         write_fits(Path(path), hdus, None, cards)
 
     @classmethod
