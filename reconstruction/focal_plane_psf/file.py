@@ -76,6 +76,7 @@ def model_hdus(model: ModelFields) -> list[fits.ImageHDU | fits.BinTableHDU]:
         }
         if not camera.alike:
             about["camera"]["rotation_deg"] = camera.rotation_deg.tolist()
+            about["camera"]["transposed"] = camera.transposed
     predicted = model.leave_one_out
     hdus = [
         _image_hdu("CENTERS", mosaic.centers),
@@ -152,6 +153,7 @@ def read_model(kind: type[_Model], hdus: Iterable[fits.ImageHDU], path: Path) ->
                 np.broadcast_to(described["pixels"], (len(about["ccds"]), 2)).copy(),
                 described["pixel_size"],
                 rotation_deg=np.array(described.get("rotation_deg", [0.0])),
+                transposed=described.get("transposed", False),
             )
         mosaic = Mosaic(tuple(about["ccds"]), part("CENTERS"), about["half_size"], camera)
         places = _places_of(mosaic, part("POSITION"), part("STAR_CCD"))
