@@ -206,7 +206,9 @@ class PachonOptics(galsim.PhotonOp):
 
     def _axes(self) -> tuple[float, bool]:
         """Return the angle of the CCD [deg], and whether its pixels' x and y are exchanged."""
-        return (0.0, False) if self.ccd is None else (float(self.ccd[0].rotation_deg[self.ccd[1]]), self.ccd[0].transposed)
+        return (
+            (0.0, False) if self.ccd is None else (float(self.ccd[0].rotation_deg[self.ccd[1]]), self.ccd[0].transposed)
+        )
 
     def _key(self) -> tuple[Any, ...]:
         arrays = tuple(map(float, (*self.source.ravel(), *self.origin, self.pixel_size, *self._axes())))
