@@ -107,9 +107,10 @@ def along_sky(g1: np.ndarray, g2: np.ndarray, jacobians: np.ndarray) -> tuple[np
     # The orthogonal factor, but for its norm: the first column is the direction of x.
     towards_x = np.linalg.solve(symmetric, jacobians[:, :, :1])[:, :, 0]
     direction = towards_x[:, 0] + 1j * towards_x[:, 1]
-    shape = g1 + 1j * g2
+    finite = np.isfinite(g1) & np.isfinite(g2)
+    shape = np.where(finite, g1, 0.0) + 1j * np.where(finite, g2, 0.0)
     turned = np.where(determinant > 0.0, shape, shape.conj()) * direction**2 / np.abs(direction) ** 2
-    on_sky = (turned + pixel_shear) / (1.0 + pixel_shear.conj() * turned)
+    on_sky = np.where(finite, (turned + pixel_shear) / (1.0 + pixel_shear.conj() * turned), np.nan * (1.0 + 1.0j))
     return on_sky.real, on_sky.imag
 
 

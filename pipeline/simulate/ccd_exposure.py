@@ -78,8 +78,8 @@ def expose_positions(
 
     The position of a star is that of the chief ray of the middle wavelength, at the centre of a pixel, or `offsets`
     [pixel] from it; stamps are larger than those of the run by `room` pixels, and lie along the axes of the focal plane
-    or, with `along`, the pixels' x and y of a CCD. They are blackbodies of `temperatures` [K] where these are given. DomainError if
-    no light reaches one of them.
+    or, with `along`, those of the pixels of a CCD. They are blackbodies of `temperatures` [K] where these are given.
+    DomainError if no light reaches one of them.
     """
     stars = _expose(
         experiment, positions, threads, progress, room=room, offsets=offsets, along=along, temperatures=temperatures

@@ -82,7 +82,7 @@ def test_an_unknown_convention_is_asked_for(tmp_path):
     path = save(base(e1=[0.1] * 3, e2=[0.0, 0.0, 0.1]), tmp_path / "e.ecsv")
     with pytest.raises(DomainError, match=r"e\.ecsv: column 'e2' without a convention: expected convention = galsim"):
         read_galaxies(path)
-    with pytest.raises(ConfigError, match="convention = .*des.*: expected .*galsim"):
+    with pytest.raises(ConfigError, match=r"convention = .*des.*: expected .*galsim"):
         read_galaxies(path, convention="des")
     # Round galaxies, and those along north or east, are the same in both.
     assert read_galaxies(save(base(e1=[0.1] * 3, e2=[0.0] * 3), tmp_path / "east.ecsv")).e1[0] == 0.1

@@ -1,4 +1,4 @@
-"""Shapes on the sky: against moments carried by brute force, GalSim's sky coordinates and TreeCorr's tangential shear."""
+"""Shapes on the sky, against moments by brute force, GalSim's sky coordinates and TreeCorr's tangential shear."""
 
 import numpy as np
 import pytest
@@ -46,6 +46,13 @@ def test_moments_are_carried_by_the_world_coordinates(roll, mirrored):
         sky = pachon.to_sky(shapes, wcs, [1000.0], [1000.0])
         assert np.allclose([sky.g1_sky[0], sky.g2_sky[0]], [expected.real, expected.imag], rtol=0, atol=1e-8)
         assert np.allclose(np.rad2deg([sky.ra[0], sky.dec[0]]), [RA, DEC], rtol=0, atol=1e-10)
+
+
+def test_shapes_without_a_number_have_none_and_no_shapes_are_none():
+    sky = pachon.to_sky([[np.nan, np.nan], [0.1, 0.2]], image_wcs(30.0, mirrored=True), [5.0, 6.0], [7.0, 8.0])
+    assert np.array_equal(np.isnan(sky.g1_sky), [True, False])
+    assert np.array_equal(np.isnan(sky.g2_sky), [True, False])
+    assert len(pachon.to_sky(np.zeros((0, 2)), image_wcs(0.0, mirrored=False), [], [])) == 0
 
 
 def test_galaxies_on_the_sky_are_elongated_as_the_convention_says():
