@@ -22,6 +22,7 @@ import scipy.linalg
 from astropy.io import fits
 
 from ...core.arguments import check_arguments
+from ...core.ccd_names import NAMES_CARD, refuse_mirrored_names
 from ...core.errors import DomainError, ProductError
 from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
@@ -106,6 +107,7 @@ class StaticHeights(Result):
         cards = [
             ("CAMERA", self.camera.name, "name of the camera"),
             ("NEXPOSE", self.exposures, "number of exposures"),
+            NAMES_CARD,
         ]
         write_fits(Path(path), hdus, None, cards)
 
@@ -116,6 +118,7 @@ class StaticHeights(Result):
         hdus = read_fits(Path(path))
         try:
             camera_of_file = load_camera(hdus[0].header["CAMERA"] if camera is None else camera)
+            refuse_mirrored_names(camera_of_file.ccd_names, hdus[0].header.get(NAMES_CARD[0]), path)
             grid = _hdu_array(hdus["GRID"])
             surfaces = CcdSurfaces(
                 camera_of_file.half_sizes,
