@@ -357,6 +357,8 @@ def test_a_configuration_file_draws_a_ccd(tmp_path):
     path = Path(__file__).parents[2] / "docs" / "examples" / "galsim_lsst_ccd.yaml"
     [config] = galsim.config.ReadConfig(str(path))
     side = {"type": "Random", "min": 1, "max": 200}
+    for key in ("xsize", "ysize"):
+        del config["image"][key]
     config["image"].update(size=200, nobjects=6, image_pos={"type": "XY", "x": side, "y": side}, noise=None)
     config["image"]["sky_level_pixel"] = 0.0
     del config["image"]["noise"]
