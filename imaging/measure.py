@@ -26,7 +26,7 @@ from ..reconstruction.psf_model.basis import Basis
 from ..reconstruction.psf_model.interpolation import Interpolation
 from ..reconstruction.psf_model.model import PsfModel
 from ..reconstruction.psf_model.recipe import Recipe
-from ..sky.sky_shapes import to_sky
+from ..sky.sky_shapes import SkyShapes, to_sky
 from .image_file import CcdImage
 from .image_stars import fit_image_psf, objects_and_stars, pixels_of_ccd
 
@@ -95,7 +95,7 @@ class ImageCatalogue(Result):
         """Return the galaxies as a table with sky positions, magnitudes, shapes and their errors."""
         rows, fits, header = self.galaxies, self.fits, self.image.header
         x, y = self.objects.x[rows], self.objects.y[rows]
-        sky = to_sky(fits, self.image.wcs, x, y)
+        sky = self._sky_shapes(x, y)
         columns = {
             "number": (rows + 1, "", "number of the object"),
             "ra": (np.rad2deg(sky.ra) % 360.0, "deg", "right ascension of the centroid"),
@@ -119,6 +119,13 @@ class ImageCatalogue(Result):
         if self.image.stamp is not None:
             meta |= {"CONFHASH": self.image.stamp.config_hash, "SEED": self.image.stamp.seed}
         return described_table(columns, meta)
+
+    def _sky_shapes(self, x: np.ndarray, y: np.ndarray) -> SkyShapes:
+        """Return the shapes of the galaxies on the sky; NaN where the image has no right ascension and declination."""
+        wcs = self.image.wcs
+        if not wcs.has_celestial:
+            return SkyShapes(*np.full((4, len(x)), np.nan))
+        return to_sky(self.fits, wcs, x, y)
 
     def metrics(self) -> dict[str, Any]:
         """Return numbers of objects and, against the truth of a simulated image, completeness and purity."""

@@ -96,7 +96,10 @@ def to_sky(shapes: Any, wcs: Any, x: ArrayLike, y: ArrayLike) -> SkyShapes:
 
 
 def along_sky(g1: np.ndarray, g2: np.ndarray, jacobians: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return shapes [n] in the axes that d(west, north)/d(x, y), shape [n, 2, 2], leads to."""
+    """Return shapes [n] in the axes that d(west, north)/d(x, y), [n, 2, 2], leads to; NaN where there are none."""
+    finite = np.isfinite(g1) & np.isfinite(g2) & np.isfinite(jacobians).all(axis=(1, 2))
+    finite[finite] = np.linalg.det(jacobians[finite]) != 0.0
+    jacobians = np.where(finite[:, None, None], jacobians, np.eye(2))
     square = jacobians @ jacobians.transpose(0, 2, 1)
     determinant = np.linalg.det(jacobians)
     area = np.abs(determinant)
@@ -107,7 +110,6 @@ def along_sky(g1: np.ndarray, g2: np.ndarray, jacobians: np.ndarray) -> tuple[np
     # The orthogonal factor, but for its norm: the first column is the direction of x.
     towards_x = np.linalg.solve(symmetric, jacobians[:, :, :1])[:, :, 0]
     direction = towards_x[:, 0] + 1j * towards_x[:, 1]
-    finite = np.isfinite(g1) & np.isfinite(g2)
     shape = np.where(finite, g1, 0.0) + 1j * np.where(finite, g2, 0.0)
     turned = np.where(determinant > 0.0, shape, shape.conj()) * direction**2 / np.abs(direction) ** 2
     on_sky = np.where(finite, (turned + pixel_shear) / (1.0 + pixel_shear.conj() * turned), np.nan * (1.0 + 1.0j))
