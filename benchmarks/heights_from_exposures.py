@@ -109,7 +109,8 @@ def three_rafts() -> Camera:
     keep = [i for i, name in enumerate(whole.ccd_names) if name.startswith(RAFTS)]
     rafts = np.array([RAFTS.index(whole.raft_of[i]) for i in keep])
     names = tuple(whole.ccd_names[i] for i in keep)
-    return Camera("three rafts", names, RAFTS, rafts, whole.centers[keep], whole.pixels[keep], whole.pixel_size)
+    pixels = whole.pixels[keep]
+    return Camera("three rafts", names, RAFTS, rafts, whole.centers[keep], pixels, whole.pixel_size, transposed=True)
 
 
 def nodes_of(camera: Camera) -> Places:

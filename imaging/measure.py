@@ -26,6 +26,7 @@ from ..reconstruction.psf_model.basis import Basis
 from ..reconstruction.psf_model.interpolation import Interpolation
 from ..reconstruction.psf_model.model import PsfModel
 from ..reconstruction.psf_model.recipe import Recipe
+from ..sky.sky_shapes import SkyShapes, to_sky
 from .image_file import CcdImage
 from .image_stars import fit_image_psf, objects_and_stars, pixels_of_ccd
 
@@ -94,11 +95,11 @@ class ImageCatalogue(Result):
         """Return the galaxies as a table with sky positions, magnitudes, shapes and their errors."""
         rows, fits, header = self.galaxies, self.fits, self.image.header
         x, y = self.objects.x[rows], self.objects.y[rows]
-        celestial = self.image.wcs.all_pix2world(np.stack([x, y], axis=1), 0)
+        sky = self._sky_shapes(x, y)
         columns = {
             "number": (rows + 1, "", "number of the object"),
-            "ra": (celestial[:, 0], "deg", "right ascension of the centroid"),
-            "dec": (celestial[:, 1], "deg", "declination of the centroid"),
+            "ra": (np.rad2deg(sky.ra) % 360.0, "deg", "right ascension of the centroid"),
+            "dec": (np.rad2deg(sky.dec), "deg", "declination of the centroid"),
             "x": (x, "pix", "centroid, pixel centres at integers"),
             "y": (y, "pix", "centroid, pixel centres at integers"),
             "magnitude": (self.objects.magnitude(header["ZEROPNT"])[rows], "mag", "AB, in the Kron aperture"),
@@ -106,6 +107,8 @@ class ImageCatalogue(Result):
             "snr": (fits.snr, "", "flux of the fit over its error"),
             "e1": (fits.e1, "", "(a - b)/(a + b) along x, before the PSF"),
             "e2": (fits.e2, "", "along the diagonal x = y, before the PSF"),
+            "g1_sky": (sky.g1_sky, "", "e on the sky, > 0 from east to west, as of GalSim and TreeCorr"),
+            "g2_sky": (sky.g2_sky, "", "e on the sky, > 0 from north-west to south-east"),
             "error": (fits.ellipticity_error, "", "standard error of a component"),
             "size": (fits.size, "pix", "rms width before the PSF"),
             "flags": (fits.flags, "", "of the fit, 0 is good"),
@@ -116,6 +119,13 @@ class ImageCatalogue(Result):
         if self.image.stamp is not None:
             meta |= {"CONFHASH": self.image.stamp.config_hash, "SEED": self.image.stamp.seed}
         return described_table(columns, meta)
+
+    def _sky_shapes(self, x: np.ndarray, y: np.ndarray) -> SkyShapes:
+        """Return the shapes of the galaxies on the sky; NaN where the image has no right ascension and declination."""
+        wcs = self.image.wcs
+        if not wcs.has_celestial:
+            return SkyShapes(*np.full((4, len(x)), np.nan))
+        return to_sky(self.fits, wcs, x, y)
 
     def metrics(self) -> dict[str, Any]:
         """Return numbers of objects and, against the truth of a simulated image, completeness and purity."""

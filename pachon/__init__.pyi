@@ -282,6 +282,8 @@ from .sky.mosaic import GalaxyStamps as GalaxyStamps
 from .sky.pointing import Pointing as Pointing
 from .sky.population import GalaxyPopulation as GalaxyPopulation
 from .sky.population import draw_galaxies as draw_galaxies
+from .sky.sky_shapes import SkyShapes as SkyShapes
+from .sky.sky_shapes import to_sky as to_sky
 from .studies.alignment.config import AlignConfig as AlignConfig
 from .studies.alignment.config import load_align_configuration as load_align_configuration
 from .studies.alignment.loop import Alignment as Alignment

@@ -213,6 +213,15 @@ class Experiment:
         return tuple(effects)
 
     @property
+    def zenith_direction(self) -> float:
+        """Direction of the zenith on the sky, from +x towards +y of the telescope [rad]."""
+        zenith = self.config.atmosphere.zenith_position_angle_deg
+        if zenith is None:
+            return 0.0
+        roll = 0.0 if self.config.pointing is None else self.config.pointing.position_angle_deg
+        return math.radians(90.0 + roll - zenith)
+
+    @property
     def dispersion(self) -> np.ndarray | None:
         """Shift in field angle of each wavelength by the air [rad], shape [n_wave, 2]; None without an atmosphere."""
         settings = self.config.atmosphere
@@ -223,7 +232,7 @@ class Experiment:
             self.wavelengths,
             middle,
             math.radians(settings.zenith_angle_deg),
-            math.radians(settings.parallactic_angle_deg),
+            self.zenith_direction,
             self.site.weather,
         )
 

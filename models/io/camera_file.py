@@ -24,7 +24,7 @@ from pydantic import Field
 
 from ...core.errors import PachonError, PrescriptionError
 from ...core.files import content_hash
-from ...core.schema import Count, Fraction, NotNegative, Positive, Real, Section, validated
+from ...core.schema import Count, Fraction, NotNegative, Positive, Real, Section, Switch, validated
 from ...core.yaml_reader import read_mapping
 from ..camera.camera import Camera
 from ..camera.photometry import DARK_CURRENT, FULL_WELL, LSST, READ_NOISE, THROUGHPUT, Band, CameraPhotometry
@@ -106,6 +106,7 @@ class CameraFile(Section):
     pixels: Pixels | None = None
     photometry: Literal["lsst"] | PhotometrySection | None = None
     height_budget: Literal["simulated", "specification", "flat"] = "flat"
+    transposed: Switch = False
     ccds: Annotated[tuple[CcdSection, ...], ROWS, Field(min_length=1)]
 
     def camera(self) -> Camera:
@@ -125,6 +126,7 @@ class CameraFile(Section):
             placement=placement if placement.any() else None,
             photometry=self._photometry(),
             height_budget=self.height_budget,
+            transposed=self.transposed,
         )
 
     def _photometry(self) -> CameraPhotometry:

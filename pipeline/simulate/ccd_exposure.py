@@ -78,8 +78,8 @@ def expose_positions(
 
     The position of a star is that of the chief ray of the middle wavelength, at the centre of a pixel, or `offsets`
     [pixel] from it; stamps are larger than those of the run by `room` pixels, and lie along the axes of the focal plane
-    or, with `along`, those of a CCD. They are blackbodies of `temperatures` [K] where these are given. DomainError if
-    no light reaches one of them.
+    or, with `along`, those of the pixels of a CCD. They are blackbodies of `temperatures` [K] where these are given.
+    DomainError if no light reaches one of them.
     """
     stars = _expose(
         experiment, positions, threads, progress, room=room, offsets=offsets, along=along, temperatures=temperatures
@@ -199,6 +199,10 @@ def _expose(
     """
     config, wavelengths = experiment.config, experiment.wavelengths
     fields = fields_at(experiment.telescope, positions, wavelengths[len(wavelengths) // 2], threads=threads)
+    # Stamps are drawn along the axes of the CCD's frame, and exchange x and y where its pixels do.
+    transposed = along is not None and experiment.camera.transposed
+    if transposed and offsets is not None:
+        offsets = offsets[:, ::-1]
     if along is not None:
         frame = experiment.camera.frame(experiment.camera.ccd_index(along))
         positions, experiment = np.stack(frame.along_ccd(*positions.T), axis=1), experiment.along(along)
@@ -233,7 +237,10 @@ def _expose(
         progress=progress,
     )
     image = _with_static_displacements(experiment, positions - psfs.offset * experiment.pixel_size, psfs.image)
-    return NoiseFreeStars(image, float(psfs.pixel_scale), fields, psfs.lit_fraction.mean(axis=1), psfs.offset)
+    offset = psfs.offset
+    if transposed:
+        image, offset = np.ascontiguousarray(image.swapaxes(1, 2)), offset[:, ::-1]
+    return NoiseFreeStars(image, float(psfs.pixel_scale), fields, psfs.lit_fraction.mean(axis=1), offset)
 
 
 def _with_static_displacements(experiment: Experiment, middles: np.ndarray, images: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from astropy.io import fits
 
+from ...core.ccd_names import NAMES_VERSION, refuse_mirrored_names
 from ...core.errors import ProductError
 from ...models.camera.camera import Camera
 from ...models.camera.ccd_surfaces import CcdSurfaces
@@ -71,6 +72,7 @@ def model_hdus(model: ModelFields) -> list[fits.ImageHDU | fits.BinTableHDU]:
     if camera is not None:
         about["camera"] = {
             "name": camera.name,
+            "names_version": NAMES_VERSION,
             "rafts": list(camera.raft_names),
             "raft_index": camera.raft_index.tolist(),
             "pixels": int(camera.pixels[0, 0]) if camera.alike else camera.pixels.tolist(),
@@ -78,6 +80,7 @@ def model_hdus(model: ModelFields) -> list[fits.ImageHDU | fits.BinTableHDU]:
         }
         if not camera.alike:
             about["camera"]["rotation_deg"] = camera.rotation_deg.tolist()
+            about["camera"]["transposed"] = camera.transposed
     predicted = model.leave_one_out
     hdus = [
         _image_hdu("CENTERS", mosaic.centers),
@@ -146,6 +149,7 @@ def read_model(kind: type[_Model], hdus: Iterable[fits.ImageHDU], path: Path) ->
         camera = None
         if "camera" in about:
             described = about["camera"]
+            refuse_mirrored_names(about["ccds"], described.get("names_version"), path)
             camera = Camera(
                 described["name"],
                 tuple(about["ccds"]),
@@ -155,6 +159,7 @@ def read_model(kind: type[_Model], hdus: Iterable[fits.ImageHDU], path: Path) ->
                 np.broadcast_to(described["pixels"], (len(about["ccds"]), 2)).copy(),
                 described["pixel_size"],
                 rotation_deg=np.array(described.get("rotation_deg", [0.0])),
+                transposed=described.get("transposed", False),
             )
         mosaic = Mosaic(tuple(about["ccds"]), part("CENTERS"), about["half_size"], camera)
         places = _places_of(mosaic, part("POSITION"), part("STAR_CCD"))

@@ -22,6 +22,7 @@ import scipy.linalg
 from astropy.io import fits
 
 from ...core.arguments import check_arguments, removed_arguments
+from ...core.ccd_names import NAMES_CARD, refuse_mirrored_names
 from ...core.errors import DomainError, ProductError
 from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
@@ -103,7 +104,11 @@ class StaticHeights(Result):
             ),
             _image_float64("COVARIANCE", self.covariance, "[m2] of the Legendre coefficients of each CCD"),
         ]
-        cards = [("CAMERA", self.camera.name, "name of the camera"), ("NEXPOSE", self.exposures, "number of exposures")]
+        cards = [
+            ("CAMERA", self.camera.name, "name of the camera"),
+            ("NEXPOSE", self.exposures, "number of exposures"),
+            NAMES_CARD,
+        ]
         write_fits(Path(path), hdus, None, cards)
 
     @classmethod
@@ -113,6 +118,7 @@ class StaticHeights(Result):
         hdus = read_fits(Path(path))
         try:
             camera_of_file = load_camera(hdus[0].header["CAMERA"] if camera is None else camera)
+            refuse_mirrored_names(camera_of_file.ccd_names, hdus[0].header.get(NAMES_CARD[0]), path)
             grid = _hdu_array(hdus["GRID"])
             surfaces = CcdSurfaces(
                 camera_of_file.half_sizes,

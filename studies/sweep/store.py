@@ -20,8 +20,8 @@ from ...core.long_work import differences
 from ...core.version import VERSION
 from .file import Point, SweepFile, read_sweep
 
-#: Format of the tables; stores of other formats are refused.
-FORMAT = 1
+#: Format of the tables; stores of other formats are refused. In those of 1 the CCDs of the LSST were others.
+FORMAT = 2
 _TABLES = """
 CREATE TABLE about (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE points (number INTEGER PRIMARY KEY, parameters TEXT NOT NULL, seed INTEGER NOT NULL);
@@ -104,7 +104,8 @@ class SweepStore:
             self._connection = sqlite3.connect(path, timeout=30.0)
             about = dict(self._connection.execute("SELECT key, value FROM about"))
         if about.get("format") != str(FORMAT):
-            raise ProductError(f"store of format {about.get('format')}: expected {FORMAT}", file=path)
+            reason = "; those of 1 name the CCDs of the LSST as in a mirror (docs/camera.md): make it again"
+            raise ProductError(f"store of format {about.get('format')}: expected {FORMAT}{reason}", file=path)
         self.about = about
 
     def __enter__(self) -> SweepStore:

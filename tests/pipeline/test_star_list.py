@@ -103,7 +103,8 @@ def test_columns_of_other_names_are_mapped(tmp_path, telescope, places, magnitud
 
 
 def test_stars_that_are_left_out_are_counted(tmp_path, telescope):
-    center, half = CAMERA.centers[CAMERA.ccd_index("R22_S11")], CAMERA.half_sizes[0, 0]
+    # 4004 pixels of 10 um along x.
+    center, half = CAMERA.centers[CAMERA.ccd_index("R22_S11")], 20.02e-3
     rim = half - (RIM - 0.5) * CAMERA.pixel_size
     inside = half - (RIM + 0.5) * CAMERA.pixel_size
     offsets = np.array([[0, 0], [0, 0], [0, 0], [np.nan, 0], [rim, 0], [inside, 0], [0.0211, 0], [0, 0]])

@@ -200,7 +200,7 @@ def test_failures_are_grouped_by_cause_each_once():
 def test_files_without_limits_are_those_of_an_older_pachon(plain, tmp_path):
     path = written(tmp_path / "b.baseline.json", plain)
     content = json.loads(path.read_text())
-    assert content["version"] == 1
+    assert content["version"] == 3
     name = next(n for n in content["figures"] if n.startswith("spot"))
     assert "limit" not in content["figures"][name]
     content["figures"][name]["limit"] = {"max": 1e3}  # by hand, in a file of the first version
@@ -208,7 +208,7 @@ def test_files_without_limits_are_those_of_an_older_pachon(plain, tmp_path):
     baseline = read_baseline(path)
     assert baseline.figures[name].limit == Limit(max=1e3)
     again = json.loads(baseline_text(baseline))
-    assert again["version"] == 2
+    assert again["version"] == 4
     assert again["figures"][name]["limit"] == {"max": 1e3}
 
 
