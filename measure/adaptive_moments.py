@@ -294,12 +294,12 @@ def _moments(ellipses: np.ndarray, flags: np.ndarray, covariance: np.ndarray, sc
     norm = xx + yy + 2.0 * root
     g1, g2 = (xx - yy) / norm, 2.0 * xy / norm
     flux, sigma = 2.0 * amplitude, np.sqrt(root)
-    nothing, one = np.zeros_like(xx), np.ones_like(xx)
+    zero, unity = np.zeros_like(xx), np.ones_like(xx)
     root_gradient = 0.5 * np.stack([yy, -2.0 * xy, xx], axis=1) / root[:, None]
-    norm_gradient = np.stack([one, nothing, one], axis=1) + 2.0 * root_gradient
+    norm_gradient = np.stack([unity, zero, unity], axis=1) + 2.0 * root_gradient
     gradients = (
-        (np.stack([one, nothing, -one], axis=1) - g1[:, None] * norm_gradient) / norm[:, None],
-        (np.stack([nothing, 2.0 * one, nothing], axis=1) - g2[:, None] * norm_gradient) / norm[:, None],
+        (np.stack([unity, zero, -unity], axis=1) - g1[:, None] * norm_gradient) / norm[:, None],
+        (np.stack([zero, 2.0 * unity, zero], axis=1) - g2[:, None] * norm_gradient) / norm[:, None],
         0.5 * root_gradient / sigma[:, None] * scale,
     )
     of_moments = covariance[:, 3:, 3:]

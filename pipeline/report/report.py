@@ -12,6 +12,7 @@ from ..experiment import Experiment
 from .tables import (
     MODELS_CAPTION,
     MODELS_COLUMNS,
+    MOMENTS_NOTE,
     PER_CCD_CAPTION,
     PER_CCD_COLUMNS,
     headline,
@@ -32,6 +33,7 @@ def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequ
         telescope=experiment.telescope,
         summary=summary,
         headline=headline(summary),
+        moments_note=MOMENTS_NOTE,
         caption=PER_CCD_CAPTION,
         columns=PER_CCD_COLUMNS,
         ccds=per_ccd(summary),
