@@ -152,7 +152,7 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
     if correlated_g:
         tables["correlations_g.ecsv"] = "xi of g of adaptive moments", correlation_columns(correlated_g)
         pictures["correlations_g.png"] = correlation_plot(
-            {kind: correlated_g[kind] for kind in KINDS if kind in correlated_g}, False, "g of adaptive moments"
+            {kind: correlated_g[kind] for kind in KINDS if kind in correlated_g}, False, "g, adaptive moments"
         )
     if rho_g:
         tables["rho_g.ecsv"] = "rho statistics 1 to 5 of g and T", correlation_columns(_by_name(rho_g))

@@ -76,7 +76,7 @@ def correlation_plot(
                 draw_correlation(axes, correlation, sign, *_LABELS[kind])
             log_axes(axes, f"$\\xi_{'+' if sign == 'plus' else '-'}$")
             axes.set_xlabel("separation [arcmin]")
-        panels[0].set_ylabel(f"$|\\xi|$ of the {ellipticity}")
+        panels[0].set_ylabel(f"$|\\xi|$ of {ellipticity}")
         low, high = panels[0].get_ylim()
         panels[0].set_ylim(max(low, 1e-10), high * 2)
         for value, text in _PAPER if paper else ():

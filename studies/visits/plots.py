@@ -76,8 +76,8 @@ def correlation_picture(correlated: Mapping[int, StackCorrelations], moments: st
                 draw_correlation(axes, correlations[f"{kind}{end}"], "plus", *style)
             log_axes(axes, _visits(visits))
             axes.set_xlabel("separation [arcmin]")
-        name = "g of adaptive moments" if moments == "g" else "weighted e"
-        panels[0].set_ylabel(f"$|\\xi_+|$ of the {name}: filled positive, open negative")
+        name = "g, adaptive moments" if moments == "g" else "weighted e"
+        panels[0].set_ylabel(f"$|\\xi_+|$ of {name}: filled positive, open negative")
         low, high = panels[0].get_ylim()
         panels[0].set_ylim(max(low, 1e-10), 2.0 * high)
         panels[0].legend(loc="best")
