@@ -244,9 +244,9 @@ ATTRIBUTION_COLUMNS = (
     "ξ+ holdout, beyond",
 )
 ATTRIBUTION_CAPTION = (
-    "The same stars without one cause. rms of one component of the noise-free PSFs, and of the residuals at the stars "
-    "and at the holdout positions; mean ξ+ below 10' and from there to 3 deg; change: full case less this one beyond "
-    "10', with the jackknife error over the CCDs."
+    "The same stars without one cause, in weighted e (g is about twice, its ξ+ four times as large). rms of one "
+    "component of the noise-free PSFs, and of the residuals at the stars and at the holdout positions; mean ξ+ below "
+    "10' and from there to 3 deg; change: full case less this one beyond 10', with the jackknife error over the CCDs."
 )
 
 
