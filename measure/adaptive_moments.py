@@ -63,7 +63,7 @@ class MomentFlag(IntFlag):
 
     ``CENTROID_LEFT_STAMP``: the centre lies outside the stamp. ``NO_FLUX``: the weighted sum is not positive.
     ``TOO_WIDE``: an rms width exceeds a third of the stamp, so that its edge would be measured. ``MASKED``: masked
-    pixels hold more than half of the squared weight.
+    pixels hold more than half of the squared weight, or the other ones do not determine the errors.
     """
 
     OK = 0
@@ -94,7 +94,7 @@ class AdaptiveMoments(Result):
     flags : array of int
         :class:`MomentFlag` bits.
     error_g1, error_g2 : array
-        Standard errors; NaN without weights, infinite where the pixels that count do not determine it.
+        Standard errors; NaN without weights.
     error_sigma : array
         Standard error [rad]; NaN without weights.
     error_flux : array
@@ -251,6 +251,7 @@ def adaptive_moments(
             counted = ~bad[good] if fill_masked else np.ones_like(bad[good])
             variance = np.divide(1.0, weights[rows][good], out=np.zeros(counted.shape), where=~bad[good])
             covariance[good] = _covariance(pixels[good], counted, variance, ellipses[good])
+            flags[np.isnan(covariance[:, 0, 0]) & (flags == 0)] = MomentFlag.MASKED
         parts.append(_moments(ellipses, flags, covariance, scale))
     return AdaptiveMoments(
         **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(AdaptiveMoments)}
@@ -314,7 +315,8 @@ def _covariance(pixels: np.ndarray, counted: np.ndarray, variance: np.ndarray, e
     """Return the covariance [n, 6, 6] of ln flux, x, y, Mxx, Mxy, Myy [pixel] from the variance of the pixels.
 
     The fit solves F_k = sum(G (I - a G) phi_k) = 0 over the pixels that count, phi_k being 1, x, y, x^2, x y, y^2.
-    Noise n changes F_k by sum(G n phi_k), and the parameters by -J^-1 dF, J being the derivatives of F.
+    Noise n changes F_k by sum(G n phi_k), and the parameters by -J^-1 dF, J being the derivatives of F. NaN where the
+    pixels do not determine them.
     """
     count, ny, nx = pixels.shape
     x0, y0, xx, xy, yy = (ellipses[:, i, None, None] for i in range(5))
@@ -353,5 +355,5 @@ def _covariance(pixels: np.ndarray, counted: np.ndarray, variance: np.ndarray, e
     change[:, 0, 0] = 1.0
     change[:, 0, 3:] = 0.5 * np.stack([p, 2.0 * q, r], axis=1)  # tr(M^-1 dM) = tr(M H)
     result: np.ndarray = change @ covariance @ change.transpose(0, 2, 1)
-    result[~determined] = np.where(np.eye(6), np.inf, 0.0)
+    result[~determined] = np.nan
     return result

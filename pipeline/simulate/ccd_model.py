@@ -51,7 +51,7 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         return measure_shapes(images, observed.pixel_scale, experiment.weight_fwhm)
 
     def adaptive_of(images: np.ndarray) -> AdaptiveMoments:
-        return adaptive_moments(images, observed.pixel_scale)
+        return adaptive_moments(images, observed.pixel_scale, threads=1)  # a second CCD is exposed meanwhile
 
     holdout_models, star_models = model.at(positions.holdout), model.at(stars.observed)
     left_out_models = model.leave_one_out()
