@@ -305,10 +305,23 @@ def _moments(ellipses: np.ndarray, flags: np.ndarray, covariance: np.ndarray, sc
     )
     of_moments = covariance[:, 3:, 3:]
     errors = [np.sqrt((d * (of_moments * d[:, None, :]).sum(axis=2)).sum(axis=1)) for d in gradients]
-    of_flux, of_x, of_y = (np.sqrt(covariance[:, i, i]) for i in range(3))
+    error_flux, error_x, error_y = (np.sqrt(covariance[:, i, i]) for i in range(3))
     return AdaptiveMoments(
-        g1, g2, sigma * scale, rho4, flux, x, y, flags, *errors, flux * of_flux, of_x, of_y
-    )  # fmt: skip
+        g1=g1,
+        g2=g2,
+        sigma=sigma * scale,
+        rho4=rho4,
+        flux=flux,
+        x=x,
+        y=y,
+        flags=flags,
+        error_g1=errors[0],
+        error_g2=errors[1],
+        error_sigma=errors[2],
+        error_flux=flux * error_flux,
+        error_x=error_x,
+        error_y=error_y,
+    )
 
 
 def _covariance(pixels: np.ndarray, counted: np.ndarray, variance: np.ndarray, ellipses: np.ndarray) -> np.ndarray:

@@ -35,8 +35,8 @@ _MOST_WHISKERS = 2500
 _NEAR = 0.65
 #: Where limits near the edge are moved to, as a fraction of that radius: the circle is then within the axes.
 _MARGIN = 1.02
-#: Centre of the arrows to north and east, as a fraction of the axes.
-_COMPASS_CENTER = np.array([0.11, 0.11])
+#: Place of the arrows to north and east, along x and y, as a fraction of the axes.
+_COMPASS_PLACE = 0.11
 #: Length of the arrows, as a fraction of the axes.
 _COMPASS_LENGTH = 0.06
 RESIDUAL_TITLES = {
@@ -113,14 +113,15 @@ def draw_key_whisker(axes: Axes, ellipticity: float, scale: float, width: float)
 
 def draw_compass(axes: Axes, north: np.ndarray, east: np.ndarray) -> None:
     """Draw arrows to north and east, unit vectors along the axes [2], in the lower left corner; scales are equal."""
-    for name, direction in (("N", north), ("E", east)):
-        tip = _COMPASS_CENTER + _COMPASS_LENGTH * direction
-        arrow = {"arrowstyle": "-|>", "color": RED, "linewidth": 1.0, "shrinkA": 0.0, "shrinkB": 0.0}
-        axes.annotate(
-            "", tip, xytext=_COMPASS_CENTER, xycoords="axes fraction", textcoords="axes fraction", arrowprops=arrow
+    center = (_COMPASS_PLACE, _COMPASS_PLACE)
+    for name, (x, y) in (("N", north), ("E", east)):
+        tip, label = (
+            (_COMPASS_PLACE + length * x, _COMPASS_PLACE + length * y)
+            for length in (_COMPASS_LENGTH, 1.45 * _COMPASS_LENGTH)
         )
-        at = _COMPASS_CENTER + 1.45 * _COMPASS_LENGTH * direction
-        axes.text(*at, name, transform=axes.transAxes, ha="center", va="center", fontsize=8, color=RED)
+        arrow = {"arrowstyle": "-|>", "color": RED, "linewidth": 1.0, "shrinkA": 0.0, "shrinkB": 0.0}
+        axes.annotate("", tip, xytext=center, xycoords="axes fraction", textcoords="axes fraction", arrowprops=arrow)
+        axes.text(label[0], label[1], name, transform=axes.transAxes, ha="center", va="center", fontsize=8, color=RED)
 
 
 def key_ellipticity(values: np.ndarray) -> float:

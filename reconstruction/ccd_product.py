@@ -156,6 +156,9 @@ def of_ccd_model(stars: _StarsKind) -> _StarsKind:
     """
     if stars.ccd_e1 is None or stars.ccd_e2 is None or stars.ccd_size is None:
         return stars
+    assert stars.ccd_g1 is not None
+    assert stars.ccd_g2 is not None
+    assert stars.ccd_sigma is not None
     return replace(
         stars,
         model_e1=stars.ccd_e1,

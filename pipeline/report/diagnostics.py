@@ -52,6 +52,8 @@ _MEANINGS = {
     "residual_ccd": "observed - the CCD's own model, at the stars",
     "away_ccd": "noise-free - the CCD's own model, at holdout positions",
 }
+#: Residuals of which there are rho statistics.
+_RHO_KINDS: tuple[str, ...] = ("residual", "away")
 _QUANTITIES = {
     "e1": "e1",
     "e2": "e2",
@@ -130,7 +132,7 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
     columns = _ccd_columns(products, residuals)
     correlated, correlated_g = (correlations(products, products[0].kinds, moments) for moments in MOMENTS)
     rho, rho_g = (
-        {kind: _rho_statistics(products, kind, moments) for kind in ("residual", "away") if kind in of_moments}
+        {kind: _rho_statistics(products, kind, moments) for kind in _RHO_KINDS if kind in of_moments}
         for moments, of_moments in zip(MOMENTS, (correlated, correlated_g), strict=True)
     )
     overall = _overall_metrics(products, residuals, correlated, correlated_g)
