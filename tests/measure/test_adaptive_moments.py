@@ -125,6 +125,7 @@ def test_a_masked_core_of_a_gaussian_costs_nothing():
     assert abs(zeros.g1 - whole.g1)[0] > 0.01
 
 
+@pytest.mark.long
 def test_errors_are_the_scatter_of_noisy_images():
     count, rng = 1500, np.random.default_rng(8)
     image, mask = 2e4 * star(), np.zeros((33, 33), dtype=bool)
@@ -246,7 +247,7 @@ def differences(m, theirs):
 
 def test_hsm_on_stars_noise_and_masks():
     galsim = pytest.importorskip("galsim")
-    images = psfs(galsim, 24, 1)
+    images = psfs(galsim, 12, 1)
     rng = np.random.default_rng(2)
     noisy = images + rng.normal(size=images.shape) * 0.02 * images.max(axis=(1, 2), keepdims=True)
     mask = rng.random(images.shape) < 0.05
@@ -255,7 +256,7 @@ def test_hsm_on_stars_noise_and_masks():
         (pachon.adaptive_moments(noisy, 1.0), hsm(galsim, noisy)),
         (pachon.adaptive_moments(images, 1.0, mask, fill_masked=False), hsm(galsim, images, ~mask)),
     ):
-        assert np.isfinite(theirs[0]).sum() >= 20
+        assert np.isfinite(theirs[0]).sum() >= 10
         np.testing.assert_array_equal(m.usable, np.isfinite(theirs[0]))
         assert max(differences(m, theirs).values()) < 1e-5
 
