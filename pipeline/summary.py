@@ -10,6 +10,7 @@ import numpy as np
 from ..core.statistics import finite_mean, finite_median, rms
 from ..core.units import ARCMIN, ARCSEC
 from ..measure.correlation import SEPARATION_RANGES, Correlation, shear_correlation
+from ..measure.rho_statistics import trace_of_moments
 from ..reconstruction.ccd_product import CCD_KINDS, CcdProduct, CcdStars, Stars
 
 #: Ellipticities that are correlated; ``truth`` and ``away`` (noise-free - model) are of the holdout positions.
@@ -172,6 +173,7 @@ def _common_metrics(products: Sequence[CcdProduct]) -> dict[str, Any]:
         "median_distortion_truth": _median_distortion(products),
         **{f"rms_residual_g_{name}": rms(ellipticities(products, kind, "g")) for name, kind in residuals.items()},
         "rms_scatter_g": scatter(products, "g"),
+        "rms_scatter_dt_g": size_scatter(products),
         **{f"rms_dt_g_{name}": rms(size_residuals(products, kind, "g")) for name, kind in residuals.items()},
         **chi2,
         "truth_variance_in_components": min(p.noise_free_model.explained for p in products),
@@ -187,6 +189,18 @@ def scatter(products: Sequence[CcdStars], moments: str) -> float:
         if finite.size:
             deviations.append(finite - finite.mean(axis=1, keepdims=True))
     return rms(np.concatenate(deviations, axis=1)) if deviations else np.nan
+
+
+def size_scatter(products: Sequence[CcdStars]) -> float:
+    """Return the rms of T of adaptive moments of the noise-free PSFs over the mean of their CCD, less 1."""
+    deviations = []
+    for product in products:
+        stars = product.stars("truth")
+        trace = trace_of_moments(stars.sigma, stars.g1, stars.g2)
+        finite = trace[np.isfinite(trace)]
+        if finite.size:
+            deviations.append(finite / finite.mean() - 1.0)
+    return rms(np.concatenate(deviations)) if deviations else np.nan
 
 
 def _median_distortion(products: Sequence[CcdProduct]) -> float:

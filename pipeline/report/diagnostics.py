@@ -36,6 +36,7 @@ from ..summary import (
     scatter,
     separation_bins,
     size_residuals,
+    size_scatter,
 )
 from .focal_plane_plots import residual_plot
 from .statistics_plots import correlation_plot
@@ -222,6 +223,8 @@ def _ccd_columns(products: Sequence[CcdProduct], residuals: Sequence[str]) -> di
     for moments in MOMENTS:
         values = np.array([scatter([p], moments) for p in products])
         columns[f"rms_scatter_{moments}"] = (values, "", f"rms of {moments} of noise-free PSFs about the CCD's mean")
+    values = np.array([size_scatter([p]) for p in products])
+    columns["rms_scatter_dt_g"] = (values, "", "rms of T/mean - 1 of noise-free PSFs, T of adaptive moments")
     for kind in residuals:
         rows = [_residual_moments([p], kind) for p in products]
         for key in rows[0]:
@@ -243,6 +246,7 @@ def _overall_metrics(
         "truth_psfs": sum(len(p.holdout) for p in products),
     }
     metrics |= {f"rms_scatter_{moments}": scatter(products, moments) for moments in MOMENTS}
+    metrics["rms_scatter_dt_g"] = size_scatter(products)
     for kind in residuals:
         metrics |= _residual_moments(products, kind)
     for kind, correlation in [*correlated.items(), *((f"g_{kind}", c) for kind, c in correlated_g.items())]:

@@ -39,6 +39,7 @@ def headline(summary: dict[str, Any]) -> list[tuple[str, str]]:
         ("mean |g|, weighted |e|: noise-free PSFs", _both(metrics, "mean_g_truth", "mean_e_truth")),
         ("mean |g|, weighted |e|: observed stars", _both(metrics, "mean_g_observed", "mean_e_observed")),
         (f"rms g, e of noise-free PSFs {ABOUT_MEAN}", _both(metrics, "rms_scatter_g", "rms_scatter_e")),
+        (f"rms dT/T of noise-free PSFs {ABOUT_MEAN}", _percent(metrics["rms_scatter_dt_g"])),
     ]
     for key, words in (
         ("at_stars", "at the stars"),
@@ -216,7 +217,7 @@ def diagnostics_rows(overall: dict[str, float]) -> list[tuple[str, ...]]:
         )
         for kind, name in names.items()
     ]
-    scatter = ("-", "-", power("rms_scatter_g"), "-", "-", "-", "-", power("rms_scatter_e"))
+    scatter = ("-", "-", power("rms_scatter_g"), "-", power("rms_scatter_dt_g"), "-", "-", power("rms_scatter_e"))
     return [(f"noise-free PSFs {ABOUT_MEAN}", *scatter), *rows]
 
 

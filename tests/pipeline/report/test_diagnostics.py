@@ -94,6 +94,9 @@ def test_adaptive_moments_are_those_of_stars_and_models(finished_run, diagnosed)
             q = [(1 - np.hypot(*e)) / (1 + np.hypot(*e)) for e in ((stars.g1, stars.g2), (model.g1, model.g2))]
             trace, model_trace = (s**2 * (r + 1 / r) for s, r in zip((stars.sigma, model.sigma), q, strict=True))
             assert row[f"mean_dt_g_{kind}"] == pytest.approx(np.nanmean(1.0 - model_trace / trace), rel=1e-6)
+        square = holdout.g1**2 + holdout.g2**2
+        trace = holdout.sigma**2 * (1.0 + square) / (1.0 - square)
+        assert row["rms_scatter_dt_g"] == pytest.approx(np.std(trace) / np.mean(trace), rel=1e-9)
         for moments, (e1, e2) in (("e", (holdout.e1, holdout.e2)), ("g", (holdout.g1, holdout.g2))):
             about_mean = np.sqrt(0.5 * (np.nanvar(e1) + np.nanvar(e2)))
             assert row[f"rms_scatter_{moments}"] == pytest.approx(about_mean, rel=1e-9)
