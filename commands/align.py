@@ -14,7 +14,7 @@ from .tables import Rows, print_json
 from .workers import long_work
 
 app = typer.Typer()
-_CAPTION = "Root mean squares over pupil and field; late: the second half of the visits."
+_CAPTION = "Root mean squares over pupil and field, e weighted; late: the second half of the visits."
 
 
 @app.command("align")

@@ -109,6 +109,7 @@ def _show_run(result: RunResult, report: Path, seconds: float) -> None:
     from ..pipeline.report.tables import (
         MODELS_CAPTION,
         MODELS_COLUMNS,
+        MOMENTS_NOTE,
         PER_CCD_CAPTION,
         PER_CCD_COLUMNS,
         headline,
@@ -126,6 +127,7 @@ def _show_run(result: RunResult, report: Path, seconds: float) -> None:
         Rows(headings, rows, PER_CCD_CAPTION, left=sum(not unit for _, unit in PER_CCD_COLUMNS)).show()
         console.print()
     console.print(headlines)
+    console.print(MOMENTS_NOTE)
     models = models_rows(result.summary)
     if models:
         console.print()

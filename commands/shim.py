@@ -17,7 +17,8 @@ from .tables import Rows, print_json
 app = typer.Typer()
 _CAPTION = (
     "Mean over the area of the CCDs of the long-exposure PSF, at places that the fit did not use. Focused: moved as a "
-    "whole, which needs no shims. Plane: CCDs without heights, focused. xi+: rms over logarithmic bins of separation."
+    "whole, which needs no shims. Plane: CCDs without heights, focused. xi+: rms over logarithmic bins of separation. "
+    "e is weighted: g of adaptive moments is about twice as large."
 )
 
 

@@ -17,8 +17,9 @@ from .workers import DaskWorkers, Processes, Scheduler, long_work
 app = typer.Typer()
 
 _CAPTION = (
-    "Stacks of PSFs on the sky; rms of |e|. Residual: true PSF minus the mean of the models of the visits, at the "
-    "stars and at places where no star is. Mean xi+ from 10' to 3 deg."
+    "Stacks of PSFs on the sky; rms of |g| and of (T - T model)/T of adaptive moments. Residual: true PSF minus the "
+    "mean of the models of the visits, at the stars and at places where no star is. Mean ξ+ from 10' to 3 deg. Last, "
+    "the weighted e of Jee & Tyson (2011), where no star is."
 )
 
 _NULL_CAPTION = (
@@ -115,15 +116,20 @@ def angles_of(option: str, text: str | None) -> str | tuple[float, ...] | None:
 
 
 def _show(stacks: dict[str, dict[str, float]]) -> None:
-    headings = ("visits", "points", "e of the PSF", "residual, stars", "residual, places", "xi+ of the PSF", "residual")
-    keys = ("rms_e", "rms_residual_e_stars", "rms_residual_e_places")
+    columns = {
+        "g of the PSF": "rms_g",
+        "residual, stars": "rms_residual_g_stars",
+        "residual, places": "rms_residual_g_places",
+        "dT/T": "rms_dt_g_places",
+        "ξ+ of the PSF": "xi_plus_psf_g_long",
+        "ξ+, residual": "xi_plus_residual_places_g_long",
+        "weighted e": "rms_e",
+        "e, residual": "rms_residual_e_places",
+        "ξ+ of e, residual": "xi_plus_residual_places_long",
+    }
+    headings = ("visits", "points", *columns)
     rows = [
-        (
-            visits,
-            str(stack_metrics["points"]),
-            *(f"{stack_metrics[key]:.1e}" for key in keys),
-            *(f"{stack_metrics[f'xi_plus_{k}_long']:.1e}" for k in ("psf", "residual_places")),
-        )
+        (visits, str(stack_metrics["points"]), *(f"{stack_metrics[key]:.1e}" for key in columns.values()))
         for visits, stack_metrics in stacks.items()
     ]
     Rows(headings, rows, _CAPTION).show()

@@ -46,10 +46,16 @@ def draw_points(
 
 
 def draw_shapes(
-    ax: Axes | Figure | None, e1: np.ndarray, e2: np.ndarray, size: np.ndarray, size_label: str, title: str = ""
+    ax: Axes | Figure | None,
+    e1: np.ndarray,
+    e2: np.ndarray,
+    size: np.ndarray,
+    size_label: str,
+    title: str = "",
+    labels: tuple[str, str] = ("e1", "e2"),
 ) -> Figure:
     """Draw ellipticities in their plane, coloured by the size."""
-    return draw_points(ax, e1, e2, ("e1", "e2"), color=size, color_label=size_label, equal=True, title=title)
+    return draw_points(ax, e1, e2, labels, color=size, color_label=size_label, equal=True, title=title)
 
 
 def draw_bars(

@@ -35,6 +35,10 @@ _MOST_WHISKERS = 2500
 _NEAR = 0.65
 #: Where limits near the edge are moved to, as a fraction of that radius: the circle is then within the axes.
 _MARGIN = 1.02
+#: Place of the arrows to north and east, along x and y, as a fraction of the axes.
+_COMPASS_PLACE = 0.11
+#: Length of the arrows, as a fraction of the axes.
+_COMPASS_LENGTH = 0.06
 RESIDUAL_TITLES = {
     "residual": "at the stars: observed - model",
     "left_out": "at stars left out: observed - model",
@@ -105,6 +109,19 @@ def draw_key_whisker(axes: Axes, ellipticity: float, scale: float, width: float)
         va="center",
         fontsize=8,
     )
+
+
+def draw_compass(axes: Axes, north: np.ndarray, east: np.ndarray) -> None:
+    """Draw arrows to north and east, unit vectors along the axes [2], in the lower left corner; scales are equal."""
+    center = (_COMPASS_PLACE, _COMPASS_PLACE)
+    for name, (x, y) in (("N", north), ("E", east)):
+        tip, label = (
+            (_COMPASS_PLACE + length * x, _COMPASS_PLACE + length * y)
+            for length in (_COMPASS_LENGTH, 1.45 * _COMPASS_LENGTH)
+        )
+        arrow = {"arrowstyle": "-|>", "color": RED, "linewidth": 1.0, "shrinkA": 0.0, "shrinkB": 0.0}
+        axes.annotate("", tip, xytext=center, xycoords="axes fraction", textcoords="axes fraction", arrowprops=arrow)
+        axes.text(label[0], label[1], name, transform=axes.transAxes, ha="center", va="center", fontsize=8, color=RED)
 
 
 def key_ellipticity(values: np.ndarray) -> float:

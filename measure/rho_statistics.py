@@ -13,10 +13,10 @@ With e and T the ellipticity and the size of the true PSF (of the stars, or of a
 
 The first two are of Rowe (2010, MNRAS 404, 350), whose second one is the sum of both orders and so twice ours; all five
 as Jarvis et al. (2016, MNRAS 460, 2245, sec. 3.4) write them. The statistics are of whatever e and T they are given.
-Theirs are of moments under an elliptical weight that adapts to the image, e = (a - b)/(a + b) and T = Q11 + Q22. Those
-of runs, :func:`~pachon.measure_shapes`, are under a round weight of 0.7": on PSFs of 0.56" their e
-is about half (1/1.97) of the adaptive one and their dT/T too, so that rho1 and rho2 are about a quarter (1/3.86) of
-those of surveys, rho4 and rho5 an eighth, rho3 a seventeenth (docs/conventions.md).
+Theirs are of moments under an elliptical weight that adapts to the image, e = (a - b)/(a + b) and T = Q11 + Q22: those
+of :func:`~pachon.adaptive_moments`, its g1, g2 and sigma in place of e1, e2 and size. Of
+:func:`~pachon.measure_shapes`, under a round weight of 0.7", e and dT/T of PSFs of 0.56" are about half as large, so
+that rho1 and rho2 are about a quarter (1/3.86), rho4 and rho5 an eighth, rho3 a seventeenth (docs/conventions.md).
 """
 
 from __future__ import annotations
@@ -116,9 +116,10 @@ def rho_statistics(
         Positions [rad], the axes to which ellipticities refer, as in
         :func:`~pachon.measure.correlation.shear_correlation`.
     e1, e2 : array
-        Ellipticity (a - b)/(a + b) of the stars, or of the truth.
+        Ellipticity (a - b)/(a + b) of the stars, or of the truth: g1, g2 of :class:`~.AdaptiveMoments` for the
+        statistics of Jarvis et al., or e1, e2 of :class:`~.Shapes`.
     size : array
-        Their size (Q11 Q22 - Q12^2)^(1/4), as of :class:`~.Shapes`, in any unit.
+        Their size (Q11 Q22 - Q12^2)^(1/4), sigma or size of the same class, in any unit.
     model_e1, model_e2, model_size : array
         The same of the model at these positions. A star with NaN in any column is left out of all five.
     min_sep, max_sep : float or Quantity

@@ -138,7 +138,7 @@ def measure_shapes(
     DomainError
         If an argument has the wrong shape or is not positive.
     """
-    stack = _stamp_cube(images)
+    stack = stamp_cube(images)
     scale = positive_angle(pixel_scale, "pixel_scale")
     sigma = positive_angle(weight_fwhm, "weight_fwhm") / np.sqrt(8.0 * np.log(2.0)) / scale
     if max_iterations < 1:
@@ -181,7 +181,7 @@ def fwhm(images: ArrayLike, pixel_scale: ArrayLike, *, upsampling: int = 8) -> n
     pixel_scale : float or Quantity
         Side of a pixel [rad].
     """
-    stack = _stamp_cube(images)
+    stack = stamp_cube(images)
     scale = positive_angle(pixel_scale, "pixel_scale")
     if upsampling < 2:
         raise DomainError(f"upsampling = {upsampling}: expected at least 2")
@@ -346,7 +346,7 @@ def _area_above(fine: np.ndarray, level: float) -> float:
     return float(covered.sum())
 
 
-def _stamp_cube(images: ArrayLike) -> np.ndarray:
+def stamp_cube(images: ArrayLike) -> np.ndarray:
     """Return the images as an array [n, ny, nx]."""
     numbers = real_numbers(images)
     array = np.empty(0) if numbers is None or hasattr(numbers, "unit") else np.asarray(numbers)

@@ -109,6 +109,9 @@ from .imaging.simulate import simulate_images as simulate_images
 from .imaging.wcs import CcdWcs as CcdWcs
 from .imaging.wcs import ccd_wcs as ccd_wcs
 from .imaging.wcs import wcs as wcs
+from .measure.adaptive_moments import AdaptiveMoments as AdaptiveMoments
+from .measure.adaptive_moments import MomentFlag as MomentFlag
+from .measure.adaptive_moments import adaptive_moments as adaptive_moments
 from .measure.catalogue.detect import detect_objects as detect_objects
 from .measure.catalogue.fit_galaxies import fit_galaxies as fit_galaxies
 from .measure.catalogue.fit_galaxies import fit_galaxy_stamps as fit_galaxy_stamps

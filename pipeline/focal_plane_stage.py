@@ -76,7 +76,10 @@ def apply_focal_plane_model(
         threads=threads,
         reporter=reporter,
     )
-    left_out, first, applied = model.leave_one_out, 0, []
+    left_out = model.leave_one_out
+    adaptive = model.adaptive_shapes(left_out)
+    left_out_values = np.stack([left_out.e1, left_out.e2, adaptive.g1, adaptive.g2, adaptive.sigma])
+    first, applied = 0, []
     total = sum(len(p.observed) + len(p.holdout) for p in products)
     with reporter.stage("focal-plane PSF model on the CCDs", total=total) as stage:
         for product in products:
@@ -84,9 +87,10 @@ def apply_focal_plane_model(
             holdout = _with_model(product.name, product.holdout, model, threads)
             used = observed.used
             ccd_rows = slice(first, first + int(used.sum()))
-            e1, e2 = np.full((2, len(used)), np.nan)
-            e1[used], e2[used] = left_out.e1[ccd_rows], left_out.e2[ccd_rows]
-            observed = replace(observed, leave_one_out_e1=e1, leave_one_out_e2=e2)
+            columns = np.full((5, len(used)), np.nan)
+            columns[:, used] = left_out_values[:, ccd_rows]
+            names = (f"leave_one_out_{key}" for key in ("e1", "e2", "g1", "g2", "sigma"))
+            observed = replace(observed, **dict(zip(names, columns, strict=True)))
             applied.append(replace(product, observed=observed, holdout=holdout))
             first = ccd_rows.stop
             stage.advance(len(observed) + len(holdout))
@@ -178,14 +182,21 @@ def _with_model(name: str, stars: _StarsKind, model: FocalPlanePsf, threads: int
     """Return stars of a CCD with the shapes that the model has there, and those of the CCD's own model."""
     ccd_columns = of_ccd_model(stars)
     shapes, sigma = model.predict(name, stars.x, stars.y, threads=threads)
+    adaptive = model.adaptive_shapes(shapes)
     return replace(
         stars,
         model_e1=shapes.e1,
         model_e2=shapes.e2,
         model_size=shapes.size,
+        model_g1=adaptive.g1,
+        model_g2=adaptive.g2,
+        model_sigma=adaptive.sigma,
         ccd_e1=ccd_columns.model_e1,
         ccd_e2=ccd_columns.model_e2,
         ccd_size=ccd_columns.model_size,
+        ccd_g1=ccd_columns.model_g1,
+        ccd_g2=ccd_columns.model_g2,
+        ccd_sigma=ccd_columns.model_sigma,
         sigma_e1=sigma.e1,
         sigma_e2=sigma.e2,
         sigma_size=sigma.size,

@@ -17,7 +17,7 @@ from ..core.progress import Reporter
 from ..core.second_process import Submit, second_process
 from ..core.threads import thread_count
 from ..core.version import VERSION
-from ..reconstruction.ccd_product import product_path, read_product
+from ..reconstruction.ccd_product import MOMENTS, product_path, read_product
 from .ccd_worker import compute_ccds
 from .config import Configuration
 from .experiment import Experiment
@@ -165,9 +165,9 @@ def _summarize(
         for warning in warnings:
             reporter.line(warning)
     with reporter.stage("correlations"):
-        correlated = correlations(products)
+        correlated, correlated_g = (correlations(products, moments=moments) for moments in MOMENTS)
         origin = {**stamp.meta(), "configuration": experiment.config.as_dict()}
-        metrics = run_metrics(products, correlated)
+        metrics = run_metrics(products, correlated, correlated_g)
         metrics["all"] |= chi2
         summary = {**origin, **metrics, "not_modelled": failed}
         if experiment.star_list is not None:
@@ -178,7 +178,7 @@ def _summarize(
     with reporter.stage("report"):
         from .report.pictures import draw_pictures  # matplotlib takes half a second
 
-        pictures = draw_pictures(experiment, products, correlated, submit)
+        pictures = draw_pictures(experiment, products, correlated, correlated_g, submit)
         write_bytes(folder / REPORT_NAME, build_report(experiment, summary, pictures).encode())
     return summary
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypedDict
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from ..core.statistics import finite_mean, finite_median, rms
 from ..core.units import ARCMIN, ARCSEC
 from ..measure.correlation import SEPARATION_RANGES, Correlation, shear_correlation
+from ..measure.rho_statistics import trace_of_moments
 from ..reconstruction.ccd_product import CCD_KINDS, CcdProduct, CcdStars, Stars
 
 #: Ellipticities that are correlated; ``truth`` and ``away`` (noise-free - model) are of the holdout positions.
@@ -21,14 +22,19 @@ SHORTEST_ARCMIN = 0.5
 _BINS_PER_DECADE = 6
 
 
-def correlations(products: Sequence[CcdStars], kinds: Sequence[str] | None = None) -> dict[str, Correlation]:
+def correlations(
+    products: Sequence[CcdStars], kinds: Sequence[str] | None = None, moments: str = "e"
+) -> dict[str, Correlation]:
     """Correlate ellipticities and residuals, of :data:`~.KINDS`, over all CCDs (Jee & Tyson 2011, Fig. 14).
 
-    By default those of :data:`CORRELATED` and, beside a focal-plane model, the residuals of the CCDs' own models.
+    They are those of weighted moments, e as the paper's, or of adaptive ones, g as DES, HSC and Rubin have them
+    (:data:`~.MOMENTS`). By default those of :data:`CORRELATED` and, beside a focal-plane model, the residuals of the
+    CCDs' own models.
 
     Residuals at the stars of an unweighted fit with a constant term sum to zero over each CCD, so their correlation
     between CCDs cancels for any error of the model; those at holdout positions apply to galaxies. Errors are by
-    jackknife over the CCDs where there are two or more.
+    jackknife over the CCDs where there are two or more. A kind of which fewer than two stars have adaptive moments, as
+    images of the optics alone that are narrower than a pixel, is left out.
     """
     bins = separation_bins(products)
     if kinds is None:
@@ -37,7 +43,14 @@ def correlations(products: Sequence[CcdStars], kinds: Sequence[str] | None = Non
     for kind in kinds:
         stars = [p.stars(kind) for p in products]
         x, y = np.concatenate([p.sky_positions(kind) for p in products], axis=1)
-        result[kind] = shear_correlation(x, y, *ellipticities(products, kind), patch=patches(stars), **bins)
+        values, patch = ellipticities(products, kind, moments), patches(stars)
+        if moments == "g":
+            usable = np.isfinite(values).all(axis=0)
+            if usable.sum() < 2:
+                continue
+            if patch is not None and np.ptp(patch[usable]) == 0:
+                patch = None
+        result[kind] = shear_correlation(x, y, *values, patch=patch, **bins)
     return result
 
 
@@ -46,9 +59,14 @@ def has_focal_plane_model(products: Sequence[CcdStars]) -> bool:
     return all(p.has_focal_plane_model for p in products)
 
 
-def ellipticities(products: Sequence[CcdStars], kind: str) -> np.ndarray:
-    """Return e1 and e2 of one kind on all CCDs, [2, n]."""
-    return np.concatenate([p.ellipticity(kind) for p in products], axis=1)
+def ellipticities(products: Sequence[CcdStars], kind: str, moments: str = "e") -> np.ndarray:
+    """Return both components of one kind on all CCDs, [2, n]; of weighted (e) or adaptive moments (g)."""
+    return np.concatenate([p.ellipticity(kind, moments) for p in products], axis=1)
+
+
+def size_residuals(products: Sequence[CcdStars], kind: str, moments: str = "e") -> np.ndarray:
+    """Return (T - T of the model)/T of one kind on all CCDs, [n]."""
+    return np.concatenate([p.relative_size_residual(kind, moments) for p in products])
 
 
 def patches(stars: Sequence[Stars]) -> np.ndarray | None:
@@ -91,12 +109,20 @@ def ccd_metrics(product: CcdProduct) -> dict[str, Any]:
     }
 
 
-def run_metrics(products: Sequence[CcdProduct], correlated: dict[str, Correlation]) -> dict[str, Any]:
+def run_metrics(
+    products: Sequence[CcdProduct],
+    correlated: Mapping[str, Correlation],
+    correlated_g: Mapping[str, Correlation] | None = None,
+) -> dict[str, Any]:
     """Return the metrics of a run: of each CCD, of all together, and the correlations.
 
-    ``xi_plus_..._short`` is the mean of xi+ over pairs closer than 10 arcmin, ``xi_plus_..._long`` over those from 10
-    to 180 arcmin. Beside a focal-plane model, keys that end in ``_ccd`` are of the CCDs' own models, and ``chi2_away_``
-    is the mean square of noise-free - model over its predicted uncertainty.
+    Keys with ``_g`` are of adaptive moments: g, and dt = (T - T model)/T; those with ``_e`` or neither of weighted
+    ones, as the paper's. ``distortion`` is (a^2 - b^2)/(a^2 + b^2) of adaptive moments, the e of the LSST's
+    requirements; ``scatter`` the rms of a component of the noise-free PSFs about the mean of their CCD, which is
+    what a model that is constant on each CCD would leave. ``xi_plus_..._short`` is the mean of xi+ over pairs
+    closer than 10 arcmin, ``xi_plus_..._long`` over those from 10 to 180 arcmin. Beside a focal-plane model, keys
+    that end in ``_ccd`` are of the CCDs' own models, and ``chi2_away_`` is the mean square of noise-free - model
+    over its predicted uncertainty.
     """
     fwhm = np.concatenate([p.holdout.fwhm for p in products]) / ARCSEC
     together = {
@@ -108,15 +134,33 @@ def run_metrics(products: Sequence[CcdProduct], correlated: dict[str, Correlatio
         "max_e_truth": float(np.nanmax(np.hypot(*ellipticities(products, "truth")))),
         **_common_metrics(products),
     }
-    for kind, correlation in correlated.items():
-        for name in SEPARATION_RANGES:
-            together[f"xi_plus_{kind}_{name}"] = correlation.mean_xi_plus(name)
-            together[f"error_xi_plus_{kind}_{name}"] = correlation.error_mean_xi_plus(name)
-    return {
+    together |= _mean_xi_plus(correlated, correlated, "")
+    if correlated_g is not None:
+        together |= _mean_xi_plus(correlated_g, correlated, "g_")
+    metrics = {
         "all": together,
         "ccd": {p.name: ccd_metrics(p) for p in products},
         "correlation": {kind: c.as_dict() for kind, c in correlated.items()},
     }
+    if correlated_g is not None:
+        metrics["correlation_g"] = {kind: c.as_dict() for kind, c in correlated_g.items()}
+    return metrics
+
+
+def _mean_xi_plus(correlated: Mapping[str, Correlation], kinds: Iterable[str], prefix: str) -> dict[str, float]:
+    """Return mean xi+ and errors of kinds over the ranges of separation; NaN of a kind without a correlation."""
+    metrics = {}
+    for kind in kinds:
+        for name in SEPARATION_RANGES:
+            correlation = correlated.get(kind)
+            mean, error = (
+                (np.nan, np.nan)
+                if correlation is None
+                else (correlation.mean_xi_plus(name), correlation.error_mean_xi_plus(name))
+            )
+            metrics[f"xi_plus_{prefix}{kind}_{name}"] = mean
+            metrics[f"error_xi_plus_{prefix}{kind}_{name}"] = error
+    return metrics
 
 
 def _common_metrics(products: Sequence[CcdProduct]) -> dict[str, Any]:
@@ -132,9 +176,45 @@ def _common_metrics(products: Sequence[CcdProduct]) -> dict[str, Any]:
         "stars_used": sum(int(p.observed.used.sum()) for p in products),
         **{f"mean_e_{k}": finite_mean(np.hypot(*ellipticities(products, k))) for k in ("truth", "observed")},
         **{f"rms_residual_{name}": rms(ellipticities(products, kind)) for name, kind in residuals.items()},
+        "rms_scatter_e": scatter(products, "e"),
+        **{f"mean_g_{k}": finite_mean(np.hypot(*ellipticities(products, k, "g"))) for k in ("truth", "observed")},
+        "median_distortion_truth": _median_distortion(products),
+        **{f"rms_residual_g_{name}": rms(ellipticities(products, kind, "g")) for name, kind in residuals.items()},
+        "rms_scatter_g": scatter(products, "g"),
+        "rms_scatter_dt_g": size_scatter(products),
+        **{f"rms_dt_g_{name}": rms(size_residuals(products, kind, "g")) for name, kind in residuals.items()},
         **chi2,
         "truth_variance_in_components": min(p.noise_free_model.explained for p in products),
     }
+
+
+def scatter(products: Sequence[CcdStars], moments: str) -> float:
+    """Return the rms of a component of the noise-free ellipticities about the mean of their CCD."""
+    deviations = []
+    for product in products:
+        e = np.stack(product.ellipticity("truth", moments))
+        finite = e[:, np.isfinite(e).all(axis=0)]
+        if finite.size:
+            deviations.append(finite - finite.mean(axis=1, keepdims=True))
+    return rms(np.concatenate(deviations, axis=1)) if deviations else np.nan
+
+
+def size_scatter(products: Sequence[CcdStars]) -> float:
+    """Return the rms of T of adaptive moments of the noise-free PSFs over the mean of their CCD, less 1."""
+    deviations = []
+    for product in products:
+        stars = product.stars("truth")
+        trace = trace_of_moments(stars.sigma, stars.g1, stars.g2)
+        finite = trace[np.isfinite(trace)]
+        if finite.size:
+            deviations.append(finite / finite.mean() - 1.0)
+    return rms(np.concatenate(deviations)) if deviations else np.nan
+
+
+def _median_distortion(products: Sequence[CcdProduct]) -> float:
+    """Return the median of |e| = (a^2 - b^2)/(a^2 + b^2) of the noise-free PSFs, from adaptive moments."""
+    g = np.hypot(*ellipticities(products, "truth", "g"))
+    return finite_median(2.0 * g / (1.0 + g**2))
 
 
 def _chi2_away(products: Sequence[CcdProduct], key: str) -> float:

@@ -14,9 +14,10 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from astropy.io import fits
 
-from ..core.errors import ProductError, unknown_name
+from ..core.errors import ProductError, check_choice, unknown_name
 from ..core.products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits, write_hdus
 from ..core.units import ARCSEC
+from ..measure.rho_statistics import trace_of_moments
 from .psf_model.model import PsfModel
 
 
@@ -30,6 +31,8 @@ _MODEL = "PSF"
 _NOISE_FREE_MODEL = "TRUEPSF"
 #: Ellipticities of a CCD, see :meth:`CcdProduct.ellipticity`.
 KINDS = ("truth", "observed", "residual", "left_out", "away")
+#: Ellipticities, see :meth:`CcdProduct.ellipticity`: of the weighted moments (e), and of the adaptive ones (g).
+MOMENTS = ("e", "g")
 #: Residuals of the CCD's own model in runs with a focal-plane model.
 CCD_KINDS = ("residual_ccd", "away_ccd")
 #: FITS card that says which model the columns MODEL_E1 and so on are of; only in runs with a focal-plane model.
@@ -58,30 +61,48 @@ _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
     "model_e1": ("MODEL_E1", _NONE, "ellipticity of the model there"),
     "model_e2": ("MODEL_E2", _NONE, "ellipticity of the model there"),
     "model_size": ("MODELSZ", _SEC, "weighted rms size of the model there"),
+    "g1": ("G1", _NONE, "g of adaptive moments, (a-b)/(a+b) along x"),
+    "g2": ("G2", _NONE, "g of adaptive moments along x = y"),
+    "sigma": ("SIGMA", _SEC, "size of adaptive moments, |M|^(1/4)"),
+    "adaptive_flags": ("G_FLAGS", _NONE, "flags of adaptive moments, 0 is good"),
+    "model_g1": ("MODEL_G1", _NONE, "g of the model there"),
+    "model_g2": ("MODEL_G2", _NONE, "g of the model there"),
+    "model_sigma": ("MODELSIG", _SEC, "size of adaptive moments of the model"),
+    "leave_one_out_g1": ("LOO_G1", _NONE, "of the model fitted without the star"),
+    "leave_one_out_g2": ("LOO_G2", _NONE, "of the model fitted without the star"),
+    "leave_one_out_sigma": ("LOO_SIG", _SEC, "of the model fitted without the star"),
     "leave_one_out_e1": ("LOO_E1", _NONE, "of the model fitted without the star"),
     "leave_one_out_e2": ("LOO_E2", _NONE, "of the model fitted without the star"),
     "ccd_e1": ("CCD_E1", _NONE, "ellipticity of the CCD's own model there"),
     "ccd_e2": ("CCD_E2", _NONE, "ellipticity of the CCD's own model there"),
     "ccd_size": ("CCD_SIZE", _SEC, "weighted rms size of the CCD's own model"),
+    "ccd_g1": ("CCD_G1", _NONE, "g of the CCD's own model there"),
+    "ccd_g2": ("CCD_G2", _NONE, "g of the CCD's own model there"),
+    "ccd_sigma": ("CCD_SIG", _SEC, "size of adaptive moments, CCD's own model"),
     "sigma_e1": ("SIG_E1", _NONE, "predicted uncertainty of MODEL_E1"),
     "sigma_e2": ("SIG_E2", _NONE, "predicted uncertainty of MODEL_E2"),
     "sigma_size": ("SIG_SIZE", _SEC, "predicted uncertainty of MODELSZ"),
 }
 # Columns that a focal-plane model replaces, and those with the replaced values of the CCD's own model.
 _REPLACED = frozenset(
-    ["MODEL_E1", "MODEL_E2", "MODELSZ", "LOO_E1", "LOO_E2", "SIG_E1", "SIG_E2", "SIG_SIZE", "RES_E1", "RES_E2"]
+    [f"MODEL_{key}" for key in ("E1", "E2", "G1", "G2")]
+    + [f"LOO_{key}" for key in ("E1", "E2", "G1", "G2", "SIG")]
+    + ["MODELSZ", "MODELSIG", "SIG_E1", "SIG_E2", "SIG_SIZE", "RES_E1", "RES_E2"]
 )
 _CCD_COLUMNS = {"CCD_E1": "MODEL_E1", "CCD_E2": "MODEL_E2", "CCD_SIZE": "MODELSZ"}
+_CCD_COLUMNS |= {"CCD_G1": "MODEL_G1", "CCD_G2": "MODEL_G2", "CCD_SIG": "MODELSIG"}
 
 
 @dataclass(frozen=True)
 class Stars:
     """Positions and shapes, one array element a star.
 
-    ``ra``, ``dec``, ``e1_sky`` and ``e2_sky`` are None without a pointing; the latter are e1 and e2 along the axes of
-    the sky, as :func:`~pachon.to_sky` has them. Where the model is one of the whole focal plane, ``ccd_`` has the
-    ellipticity and size [rad] of the CCD's own model, and ``sigma_`` the uncertainty (standard deviation) that the
-    focal-plane model predicts of its own; else all are None.
+    e and size are those of moments under a round weight (:func:`~.measure_shapes`), g and sigma those of adaptive
+    ones (:func:`~.adaptive_moments`), as DES, HSC and Rubin have them. ``ra``, ``dec``, ``e1_sky`` and ``e2_sky`` are
+    None without a pointing; the latter are e1 and e2 along the axes of the sky, as :func:`~pachon.to_sky` has them.
+    Where the model is one of the whole focal plane, ``ccd_`` has the ellipticity and size [rad] of the CCD's own model,
+    and ``sigma_`` the uncertainty (standard deviation) that the focal-plane model predicts of its own; else all are
+    None.
     """
 
     x: np.ndarray  #: detector position [m]
@@ -95,6 +116,13 @@ class Stars:
     model_e1: np.ndarray  #: ellipticity of the model at the position of the star
     model_e2: np.ndarray
     model_size: np.ndarray  #: weighted rms size of the model there [rad]
+    g1: np.ndarray  #: ellipticity of adaptive moments, NaN where flagged
+    g2: np.ndarray
+    sigma: np.ndarray  #: size of adaptive moments [rad]
+    adaptive_flags: np.ndarray  #: :class:`~.MomentFlag` bits, int
+    model_g1: np.ndarray  #: of the model at the position of the star
+    model_g2: np.ndarray
+    model_sigma: np.ndarray  #: [rad]
     ra: np.ndarray | None = field(default=None, kw_only=True)  #: right ascension and declination [rad]
     dec: np.ndarray | None = field(default=None, kw_only=True)
     e1_sky: np.ndarray | None = field(default=None, kw_only=True)
@@ -102,6 +130,9 @@ class Stars:
     ccd_e1: np.ndarray | None = field(default=None, kw_only=True)
     ccd_e2: np.ndarray | None = field(default=None, kw_only=True)
     ccd_size: np.ndarray | None = field(default=None, kw_only=True)
+    ccd_g1: np.ndarray | None = field(default=None, kw_only=True)
+    ccd_g2: np.ndarray | None = field(default=None, kw_only=True)
+    ccd_sigma: np.ndarray | None = field(default=None, kw_only=True)
     sigma_e1: np.ndarray | None = field(default=None, kw_only=True)
     sigma_e2: np.ndarray | None = field(default=None, kw_only=True)
     sigma_size: np.ndarray | None = field(default=None, kw_only=True)
@@ -130,14 +161,23 @@ def of_ccd_model(stars: _StarsKind) -> _StarsKind:
     """
     if stars.ccd_e1 is None or stars.ccd_e2 is None or stars.ccd_size is None:
         return stars
+    assert stars.ccd_g1 is not None
+    assert stars.ccd_g2 is not None
+    assert stars.ccd_sigma is not None
     return replace(
         stars,
         model_e1=stars.ccd_e1,
         model_e2=stars.ccd_e2,
         model_size=stars.ccd_size,
+        model_g1=stars.ccd_g1,
+        model_g2=stars.ccd_g2,
+        model_sigma=stars.ccd_sigma,
         ccd_e1=None,
         ccd_e2=None,
         ccd_size=None,
+        ccd_g1=None,
+        ccd_g2=None,
+        ccd_sigma=None,
         sigma_e1=None,
         sigma_e2=None,
         sigma_size=None,
@@ -163,6 +203,9 @@ class ObservedStars(Stars):
     defects: np.ndarray
     leave_one_out_e1: np.ndarray  #: of the model fitted without the star, at the star; NaN where it was not used
     leave_one_out_e2: np.ndarray
+    leave_one_out_g1: np.ndarray
+    leave_one_out_g2: np.ndarray
+    leave_one_out_sigma: np.ndarray  #: [rad]
 
 
 @dataclass(frozen=True)
@@ -201,20 +244,38 @@ class CcdStars:
         stars = self.stars(kind)
         return to_detector_axes(np.stack([stars.field_x, stars.field_y]), self.rotator)
 
-    def ellipticity(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return e1 and e2 of one kind, at the positions of :meth:`stars`.
+    def ellipticity(self, kind: str, moments: str = "e") -> tuple[np.ndarray, np.ndarray]:
+        """Return both components of one kind, at the positions of :meth:`stars`.
+
+        They are e1 and e2 of the weighted moments, or with ``moments="g"`` g1 and g2 of the adaptive ones.
 
         Kinds: of the noise-free PSFs (``truth``) and of the stars (``observed``); observed - model at the stars
         (``residual``) and with the model fitted without the star (``left_out``); truth - model at holdout positions
         (``away``); with a focal-plane model, ``residual_ccd`` and ``away_ccd`` of the CCD's own model. Another one
         raises UnknownNameError.
         """
+        check_choice("moments", moments, MOMENTS)
         stars = self.stars(kind)
+        first, second = (getattr(stars, f"{moments}{i}") for i in (1, 2))
         if kind in ("truth", "observed"):
-            return stars.e1, stars.e2
-        if kind == "left_out":
-            return stars.e1 - self.observed.leave_one_out_e1, stars.e2 - self.observed.leave_one_out_e2
-        return stars.residual_e1, stars.residual_e2
+            return first, second
+        model = "leave_one_out" if kind == "left_out" else "model"
+        return first - getattr(stars, f"{model}_{moments}1"), second - getattr(stars, f"{model}_{moments}2")
+
+    def relative_size_residual(self, kind: str, moments: str = "e") -> np.ndarray:
+        """Return (T - T of the model)/T, T = Q11 + Q22, of a kind of residual, at the positions of :meth:`stars`.
+
+        Products hold no weighted size of the models fitted without a star: of ``left_out`` there are adaptive moments.
+        """
+        check_choice("moments", moments, MOMENTS)
+        stars = self.stars(kind)
+        model = "leave_one_out_" if kind == "left_out" else "model_"
+        keys = ("sigma", "g1", "g2") if moments == "g" else ("size", "e1", "e2")
+        trace, model_trace = (
+            trace_of_moments(*(getattr(stars, f"{start}{key}") for key in keys)) for start in ("", model)
+        )
+        result: np.ndarray = 1.0 - model_trace / trace
+        return result
 
 
 @dataclass(frozen=True)

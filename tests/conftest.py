@@ -1,6 +1,7 @@
 import socket
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -134,6 +135,9 @@ class Plane:
 
     def predict(self, ccd, x, y, *, threads=None):
         return self.shapes(ccd, x, y), self.uncertainty(ccd, x, y)
+
+    def adaptive_shapes(self, shapes):
+        return SimpleNamespace(g1=2.0 * shapes.e1, g2=2.0 * shapes.e2, sigma=1.3 * shapes.size)
 
     def write(self, path):
         write_fits(path, [image_hdu("PLANES", self.planes, "of e1, e2, ln size")], None, [])

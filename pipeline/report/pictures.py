@@ -48,9 +48,16 @@ class _PendingPicture:
 
 
 def draw_pictures(
-    experiment: Experiment, products: Sequence[CcdProduct], correlated: dict[str, Correlation], submit: Submit
+    experiment: Experiment,
+    products: Sequence[CcdProduct],
+    correlated: dict[str, Correlation],
+    correlated_g: dict[str, Correlation],
+    submit: Submit,
 ) -> list[Picture]:
-    """Return the pictures of a run in the order of the report; no byte depends on where they are drawn."""
+    """Return the pictures of a run in the order of the report; no byte depends on where they are drawn.
+
+    Correlations are those of the weighted e, and of g of the adaptive moments.
+    """
     config, plane = experiment.config, experiment.focal_plane
     flat_plane = plane.terms == () and not (plane.measured.any() or plane.polynomial.any())
     heights = "none" if flat_plane else "measured" if config.focal_plane.heights is not None else "budget"
@@ -84,7 +91,8 @@ def draw_pictures(
         _PendingPicture(
             "Whiskers over the field",
             partial(whiskers_plot, stars, plane, radius),
-            "Each whisker is one star: its length is |e| = (a-b)/(a+b), its direction that of the elongation. All "
+            "Each whisker is one star: its length is |e| = (a-b)/(a+b) of the weighted moments, its direction that "
+            "of the elongation. All "
             "panels share one scale, given by the key above their right corner, so lengths can be compared. "
             + (
                 ""
@@ -136,14 +144,29 @@ def draw_pictures(
         _PendingPicture(
             "Ellipticity before and after",
             partial(scatter_plot, stars),
-            "Left, as in Jee & Tyson (2011): ellipticity of the observed stars, and what is left when the model is "
-            "subtracted. Right: the same for the noise-free PSFs at places where no star was fitted.",
+            "Weighted e. Left, as in Jee & Tyson (2011): ellipticity of the observed stars, and what is left when "
+            "the model is subtracted. Right: the same for the noise-free PSFs at places where no star was fitted.",
             "Fig. 13: residuals (red) far more compact than observed stars (blue), centred on zero.",
         ),
         _PendingPicture(
-            "Correlation of the ellipticity",
+            "Correlation of g",
+            partial(
+                correlation_plot,
+                {k: correlated_g[k] for k in CORRELATED if k in correlated_g},
+                False,
+                "g of adaptive moments",
+            ),
+            "Of g = (a - b)/(a + b) of adaptive moments, as DES, HSC and Rubin define it, and as requirements on "
+            "shear are meant: ξ+ and ξ- by TreeCorr; filled symbols are positive, open ones negative. Error bars are "
+            f"{errors}, cut off where they would pass zero. Triangles, away from the stars, apply to galaxies.",
+            apart=True,
+            wanted=bool(correlated_g),
+        ),
+        _PendingPicture(
+            "Correlation of the weighted e",
             partial(correlation_plot, {k: correlated[k] for k in CORRELATED}, paper),
-            "ξ+ and ξ- by TreeCorr; filled symbols are positive, open ones negative. Error bars are "
+            "The same of the weighted e, as in Jee & Tyson (2011), about a quarter of that of g: ξ+ and ξ- by "
+            "TreeCorr; filled symbols are positive, open ones negative. Error bars are "
             f"{errors}, cut off where they would pass zero. {at_stars}; "
             "triangles, away from the stars, apply to galaxies. Where the CCDs lie in a row, long pairs all point "
             "along it, and an ellipticity common to the field does not average out of ξ-.",
@@ -164,9 +187,9 @@ def draw_pictures(
         ),
         _PendingPicture(
             "Residuals of both models",
-            partial(models_plot, correlated),
-            "ξ+ of the residuals of the two models, fitted to the same stars: of the whole focal plane, which all "
-            "other plots show, and CCD by CCD. Filled symbols are positive, open ones negative."
+            partial(models_plot, correlated_g),
+            "ξ+ of g, of the residuals of the two models, fitted to the same stars: of the whole focal plane, which "
+            "all other plots show, and CCD by CCD. Filled symbols are positive, open ones negative."
             + (
                 " Residuals at the stars sum to zero over each CCD where it has a model of its own, so their "
                 "correlation between CCDs cancels whatever the error of that model is."

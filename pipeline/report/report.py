@@ -9,7 +9,16 @@ from typing import Any
 from ...core.page import Picture, render
 from ..config import ReconstructionConfig, to_yaml
 from ..experiment import Experiment
-from .tables import MODELS_CAPTION, MODELS_COLUMNS, PER_CCD_CAPTION, PER_CCD_COLUMNS, headline, models_rows, per_ccd
+from .tables import (
+    MODELS_CAPTION,
+    MODELS_COLUMNS,
+    MOMENTS_NOTE,
+    PER_CCD_CAPTION,
+    PER_CCD_COLUMNS,
+    headline,
+    models_rows,
+    per_ccd,
+)
 
 #: Templates of the reports of runs and sweeps.
 TEMPLATES = Path(__file__).parent / "templates"
@@ -24,6 +33,7 @@ def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequ
         telescope=experiment.telescope,
         summary=summary,
         headline=headline(summary),
+        moments_note=MOMENTS_NOTE,
         caption=PER_CCD_CAPTION,
         columns=PER_CCD_COLUMNS,
         ccds=per_ccd(summary),

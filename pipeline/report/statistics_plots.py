@@ -61,10 +61,12 @@ def _draw_cloud(axes: Axes, e1: np.ndarray, e2: np.ndarray, color: str, name: st
 _PAPER = ((3e-5, "paper: observed"), (1e-8, "paper: residual at the stars"))
 
 
-def correlation_plot(correlated: dict[str, Correlation], paper: bool = True) -> bytes:
+def correlation_plot(
+    correlated: Mapping[str, Correlation], paper: bool = True, ellipticity: str = "weighted e"
+) -> bytes:
     """Draw xi+ and xi- against separation (Jee & Tyson 2011, Fig. 14): filled symbols positive, open ones negative.
 
-    With ``paper`` lines are at the values of the paper, which are the LSST's.
+    `ellipticity` is what is correlated, in words. With ``paper`` lines are at the values of the paper, the LSST's.
     """
     with styled():
         figure = new_figure(11.5, 5.4)
@@ -74,7 +76,7 @@ def correlation_plot(correlated: dict[str, Correlation], paper: bool = True) -> 
                 draw_correlation(axes, correlation, sign, *_LABELS[kind])
             log_axes(axes, f"$\\xi_{'+' if sign == 'plus' else '-'}$")
             axes.set_xlabel("separation [arcmin]")
-        panels[0].set_ylabel("$|\\xi|$ of the ellipticity")
+        panels[0].set_ylabel(f"$|\\xi|$ of {ellipticity}")
         low, high = panels[0].get_ylim()
         panels[0].set_ylim(max(low, 1e-10), high * 2)
         for value, text in _PAPER if paper else ():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...measure.adaptive_moments import AdaptiveMoments, adaptive_moments
 from ...measure.shapes import Shapes, fwhm, measure_shapes
 from ...measure.star_selection import require_stars
 from ...reconstruction.ccd_product import CcdProduct, HoldoutStars, ObservedStars
@@ -54,11 +55,14 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
     def shapes_of(images: np.ndarray) -> Shapes:
         return measure_shapes(images, observed.pixel_scale, experiment.weight_fwhm)
 
-    at_holdout, at_stars = shapes_of(model.at(positions.holdout)), shapes_of(model.at(stars.observed))
+    def adaptive_of(images: np.ndarray) -> AdaptiveMoments:
+        return adaptive_moments(images, observed.pixel_scale, threads=1)  # a second CCD is exposed meanwhile
+
+    holdout_models, star_models = model.at(positions.holdout), model.at(stars.observed)
+    left_out_models = model.leave_one_out()
     x, y = experiment.camera.centers[experiment.camera.ccd_index(name)]
-    left_out = shapes_of(model.leave_one_out())
-    leave_one_out_e1, leave_one_out_e2 = np.full((2, len(used)), np.nan)
-    leave_one_out_e1[used], leave_one_out_e2[used] = left_out.e1, left_out.e2
+    # Like e, g is not that of a star with a defect.
+    clean_stars = np.where((observation.defects == 0)[:, None, None], observation.images, np.nan)
     return CcdProduct(
         name=name,
         center=(float(x), float(y)),
@@ -66,21 +70,22 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         noise=observation.noise,
         holdout=HoldoutStars(
             **_position_columns(experiment, positions.holdout, holdout.fields),
-            **_shape_columns(holdout_shapes, at_holdout),
+            **_shape_columns(holdout_shapes, shapes_of(holdout_models)),
             **_sky_columns(experiment, positions.holdout, holdout_shapes),
+            **_adaptive_columns(adaptive_of(holdout_images), adaptive_of(holdout_models)),
             fwhm=fwhm(holdout.image, holdout.pixel_scale),
         ),
         observed=ObservedStars(
             **_position_columns(experiment, stars.observed, observed.fields),
-            **_shape_columns(observation.shapes, at_stars),
+            **_shape_columns(observation.shapes, shapes_of(star_models)),
             **_sky_columns(experiment, stars.observed, observation.shapes),
+            **_adaptive_columns(adaptive_of(clean_stars), adaptive_of(star_models)),
+            **_leave_one_out_columns(used, shapes_of(left_out_models), adaptive_of(left_out_models)),
             magnitude=stars.magnitude,
             electrons=electrons,
             snr=snr,
             defects=observation.defects,
             used=used,
-            leave_one_out_e1=leave_one_out_e1,
-            leave_one_out_e2=leave_one_out_e2,
         ),
         holdout_images=holdout_images.astype(np.float32),
         observed_images=observation.images.astype(np.float32),
@@ -143,3 +148,26 @@ def _shape_columns(measured: Shapes, model: Shapes) -> dict[str, np.ndarray]:
         "model_e2": model.e2,
         "model_size": model.size,
     }
+
+
+def _adaptive_columns(measured: AdaptiveMoments, model: AdaptiveMoments) -> dict[str, np.ndarray]:
+    return {
+        "g1": measured.g1,
+        "g2": measured.g2,
+        "sigma": measured.sigma,
+        "adaptive_flags": measured.flags,
+        "model_g1": model.g1,
+        "model_g2": model.g2,
+        "model_sigma": model.sigma,
+    }
+
+
+def _leave_one_out_columns(used: np.ndarray, shapes: Shapes, adaptive: AdaptiveMoments) -> dict[str, np.ndarray]:
+    """Return shapes of models fitted without each used star in turn; NaN for the other stars."""
+    values = {"e1": shapes.e1, "e2": shapes.e2, "g1": adaptive.g1, "g2": adaptive.g2, "sigma": adaptive.sigma}
+    columns = {}
+    for key, of_used in values.items():
+        column = np.full(len(used), np.nan)
+        column[used] = of_used
+        columns[f"leave_one_out_{key}"] = column
+    return columns

@@ -14,6 +14,7 @@ from ...core.errors import ConfigError, DomainError, unknown_name
 from ...core.schema import Positive, Real, Section
 from ...core.units import ARCMIN
 from ...design.metrics.distortion import Distortion, distortion
+from ...measure.adaptive_moments import AdaptiveMoments, adaptive_moments
 from ...measure.correlation import Correlation, shear_correlation
 from ...measure.shapes import Shapes, measure_shapes
 from ...models.telescope import Telescope
@@ -170,15 +171,26 @@ class Scene:
         return measure_shapes(self.stars.image, self.stars.pixel_scale, self.camera_experiment.weight_fwhm)
 
     @cached_property
+    def adaptive(self) -> AdaptiveMoments:
+        """Adaptive moments of the noise-free stars."""
+        return adaptive_moments(self.stars.image, self.stars.pixel_scale, threads=self.threads)
+
+    @cached_property
     def correlation(self) -> Correlation:
-        """Correlation of the ellipticities of the noise-free stars, over all CCDs."""
-        fields, shapes = self.stars.fields, self.shapes
+        """Correlation of the weighted ellipticities of the noise-free stars, over all CCDs."""
+        return self._correlation_of(self.shapes.e1, self.shapes.e2)
+
+    @cached_property
+    def correlation_g(self) -> Correlation:
+        """Correlation of g of the adaptive moments of the noise-free stars, over all CCDs."""
+        return self._correlation_of(self.adaptive.g1, self.adaptive.g2)
+
+    def _correlation_of(self, first: np.ndarray, second: np.ndarray) -> Correlation:
+        fields = self.stars.fields
         longest = max(float(np.hypot(*np.ptp(fields, axis=0))), 2.0 * SHORTEST_ARCMIN * ARCMIN)
         x, y = to_detector_axes(fields.T, self.camera_experiment.rotator)
         shortest = SHORTEST_ARCMIN * ARCMIN
-        return shear_correlation(
-            x, y, shapes.e1, shapes.e2, min_sep=shortest, max_sep=longest, n_bins=_CORRELATION_BINS
-        )
+        return shear_correlation(x, y, first, second, min_sep=shortest, max_sep=longest, n_bins=_CORRELATION_BINS)
 
 
 def one_digit(value: float) -> float:

@@ -11,14 +11,17 @@ from functools import partial
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ...core.statistics import finite_mean, finite_median, rms
 from ...core.units import ARCSEC
 from ...design.images.encircled_energy import energy_curve
 from ...measure.correlation import SEPARATION_RANGES
+from ...measure.shapes import fwhm
 from ...pipeline.focal_plane_stage import apply_focal_plane_model
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_model import model_ccd
 from ...pipeline.simulate.photometry import effective_fwhm
 from ...pipeline.summary import correlations, run_metrics
+from ...reconstruction.ccd_product import MOMENTS
 from ...reconstruction.psf_model.polynomial import design_matrix
 from ...wavefront.opd import wavefront_opd
 from ...wavefront.zernike import fit_zernikes
@@ -42,28 +45,56 @@ _PAIRS = {
     for name, (low, high) in SEPARATION_RANGES.items()
 }
 _RESIDUALS = {
-    "residual": "of e at the stars: observed - model",
-    "away": "of e at holdout positions: noise-free - model",
+    "residual": "at the stars: observed - model",
+    "away": "at holdout positions: noise-free - model",
 }
 
 
 @STARS.group(
     "fwhm",
     Metric(
-        "fwhm_arcsec",
+        "effective_fwhm_arcsec",
         "arcsec",
         meaning="effective FWHM of the median star: that of the Gaussian with as many noise-equivalent pixels",
     ),
 )
 def width(scene: Scene) -> dict[str, float]:
     """Return the effective FWHM of the median star."""
-    return {"fwhm_arcsec": effective_fwhm(scene.stars.image, scene.stars.pixel_scale) / ARCSEC}
+    return {"effective_fwhm_arcsec": effective_fwhm(scene.stars.image, scene.stars.pixel_scale) / ARCSEC}
+
+
+@STARS.group(
+    "half_maximum",
+    Metric("fwhm_arcsec", "arcsec", meaning="full width at half maximum, median of the stars, as runs have it"),
+)
+def width_at_half_maximum(scene: Scene) -> dict[str, float]:
+    """Return the full width at half maximum, median of the stars."""
+    return {"fwhm_arcsec": finite_median(fwhm(scene.stars.image, scene.stars.pixel_scale)) / ARCSEC}
+
+
+@STARS.group(
+    "adaptive",
+    Metric("rms_g", meaning="rms of one component of g = (a-b)/(a+b) of adaptive moments of the noise-free stars"),
+    Metric("mean_g", meaning="mean modulus of g of adaptive moments of the noise-free stars"),
+    Metric(
+        "median_distortion",
+        meaning="median of |e| = (a^2-b^2)/(a^2+b^2) of adaptive moments, as in the LSST's requirements",
+    ),
+)
+def adaptive_ellipticity(scene: Scene) -> dict[str, float]:
+    """Return rms and mean of g, and the median of the distortion."""
+    moments = scene.adaptive
+    return {
+        "rms_g": rms(np.stack([moments.g1, moments.g2])),
+        "mean_g": finite_mean(np.hypot(moments.g1, moments.g2)),
+        "median_distortion": finite_median(np.hypot(moments.e1, moments.e2)),
+    }
 
 
 @STARS.group(
     "rms_e",
-    Metric("rms_e", meaning="rms of one component of the ellipticity e = (a-b)/(a+b) of the noise-free stars"),
-    Metric("mean_e", meaning="mean modulus of the ellipticity e = (a-b)/(a+b) of the noise-free stars"),
+    Metric("rms_e", meaning="rms of one component of the weighted e = (a-b)/(a+b) of the noise-free stars"),
+    Metric("mean_e", meaning="mean modulus of the weighted e = (a-b)/(a+b) of the noise-free stars"),
 )
 def ellipticity(scene: Scene) -> dict[str, float]:
     """Return the rms of one component of e, and the mean modulus."""
@@ -128,7 +159,8 @@ def border_jump(scene: Scene) -> dict[str, float]:
     "xi_raw",
     *(
         Metric(
-            f"xi_raw_{name}", meaning=f"mean ellipticity correlation xi+ of the noise-free stars over pairs {range_}"
+            f"xi_raw_{name}",
+            meaning=f"mean correlation xi+ of the weighted e of the noise-free stars over pairs {range_}",
         )
         for name, range_ in _PAIRS.items()
     ),
@@ -136,6 +168,18 @@ def border_jump(scene: Scene) -> dict[str, float]:
 def correlation(scene: Scene) -> dict[str, float]:
     """Return the mean of xi+ over short and long separations."""
     return {f"xi_raw_{name}": scene.correlation.mean_xi_plus(name) for name in SEPARATION_RANGES}
+
+
+@STARS.group(
+    "xi_g_raw",
+    *(
+        Metric(f"xi_g_raw_{name}", meaning=f"mean xi+ of g of adaptive moments of noise-free stars over pairs {range_}")
+        for name, range_ in _PAIRS.items()
+    ),
+)
+def correlation_of_g(scene: Scene) -> dict[str, float]:
+    """Return the mean of xi+ of g over short and long separations."""
+    return {f"xi_g_raw_{name}": scene.correlation_g.mean_xi_plus(name) for name in SEPARATION_RANGES}
 
 
 @STARS.group(
@@ -154,12 +198,19 @@ def correlation_bins(scene: Scene) -> dict[str, float]:
 @STARS.group(
     "reconstruction",
     *(
-        Metric(f"xi_{kind}_{name}", meaning=f"mean xi+ over pairs {range_} of the residuals {_RESIDUALS[kind]}")
+        Metric(f"xi_{kind}_{name}", meaning=f"mean xi+ over pairs {range_} of the residuals of e {_RESIDUALS[kind]}")
         for kind in _RESIDUALS
         for name, range_ in _PAIRS.items()
     ),
-    Metric("rms_residual_at_stars", meaning=f"rms of one component of the residuals {_RESIDUALS['residual']}"),
-    Metric("rms_residual_away", meaning=f"rms of one component of the residuals {_RESIDUALS['away']}"),
+    Metric("rms_residual_at_stars", meaning=f"rms of one component of the residuals of e {_RESIDUALS['residual']}"),
+    Metric("rms_residual_away", meaning=f"rms of one component of the residuals of e {_RESIDUALS['away']}"),
+    *(
+        Metric(f"xi_g_{kind}_{name}", meaning=f"mean xi+ over pairs {range_} of the residuals of g {words}")
+        for kind, words in _RESIDUALS.items()
+        for name, range_ in _PAIRS.items()
+    ),
+    Metric("rms_residual_g_at_stars", meaning=f"rms of one component of the residuals of g {_RESIDUALS['residual']}"),
+    Metric("rms_residual_g_away", meaning=f"rms of one component of the residuals of g {_RESIDUALS['away']}"),
 )
 def reconstruction(scene: Scene) -> dict[str, float]:
     """Return the residuals of PSF models of noisy stars, and their correlations."""
@@ -168,14 +219,16 @@ def reconstruction(scene: Scene) -> dict[str, float]:
     products = list(simulated.results.values())
     if experiment.config.reconstruction.model == "focal_plane":
         products, _ = apply_focal_plane_model(experiment, products, threads=scene.threads)
-    correlated = correlations(products, ("residual", "away"))
-    together = run_metrics(products, correlated)["all"]
+    correlated, correlated_g = (correlations(products, tuple(_RESIDUALS), moments) for moments in MOMENTS)
+    together = run_metrics(products, correlated, correlated_g)["all"]
     metrics = {
-        f"xi_{kind}_{name}": correlated[kind].mean_xi_plus(name)
-        for kind in ("residual", "away")
+        f"xi_{prefix}{kind}_{name}": float(together[f"xi_plus_{prefix}{kind}_{name}"])
+        for prefix in ("", "g_")
+        for kind in _RESIDUALS
         for name in SEPARATION_RANGES
     }
-    return metrics | {key: float(together[key]) for key in ("rms_residual_at_stars", "rms_residual_away")}
+    residuals = [f"rms_residual_{prefix}{name}" for prefix in ("", "g_") for name in ("at_stars", "away")]
+    return metrics | {key: float(together[key]) for key in residuals}
 
 
 @STARS.group(

@@ -208,7 +208,7 @@ def noise_against_density(bench: Bench) -> Reproduced:
     density = np.array([r.density for r in results.values()])
     amplitudes, shot_noises = (np.array([of(r) for r in results.values()]) for of in (amplitude, shot_noise))
     slopes = [density_slope(density, values) for values in (amplitudes, shot_noises)]
-    text = ["none" if s is None else f"{s:.2f}" for s in slopes]
+    text = ["none, of fewer than three stacks" if s is None else f"{s.value:.2f} +- {s.error:.2f}" for s in slopes]
     columns = {
         "visits": (np.array(list(results)), "", "in the stack"),
         "density": (density, "arcmin-2", "usable galaxies"),
@@ -220,8 +220,12 @@ def noise_against_density(bench: Bench) -> Reproduced:
         {"": density_picture(results)},
         {"": EcsvData(columns, {})},
         f"slope {text[0]}, of the shot noise {text[1]}",
-        abs(slopes[0] + 0.97) < 0.12 if slopes[0] is not None and last >= _ENOUGH else None,
+        abs(slopes[0].value + 0.97) < 0.12 if slopes[0] is not None and last >= _ENOUGH else None,
         "amplitudes over their shot noise: "
         + ", ".join(f"{f / n:.2f}" for f, n in zip(amplitudes, shot_noises, strict=True)),
-        {"slope": slopes[0], "slope_shot_noise": slopes[1]},
+        {
+            f"{name}{end}": value
+            for name, slope in zip(("slope", "slope_shot_noise"), slopes, strict=True)
+            for end, value in zip(("", "_error"), (None, None) if slope is None else slope, strict=True)
+        },
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -12,6 +13,9 @@ from ...measure.correlation import Correlation, jackknife_error
 from .galaxy_shapes import GalaxyShapes
 from .stack import PsfStack
 from .stack_metrics import correlations
+
+#: Fewest densities for a slope: two lie on a line whatever their errors are.
+_LEAST_DENSITIES = 3
 
 
 def shear_bias(e: np.ndarray, shear: np.ndarray) -> ShearCalibration:
@@ -170,8 +174,18 @@ def shot_noise(result: NullTest) -> float:
     return float(np.sqrt(2.0 / np.pi) * np.mean(np.sqrt(2.0) * square / np.sqrt(pairs)))
 
 
-def density_slope(density: np.ndarray, values: np.ndarray) -> float | None:
-    """Return the slope of log amplitude against log density; None of less than two densities."""
-    if len(np.unique(density)) < 2:
+class Slope(NamedTuple):
+    """Slope of a straight line, with its standard error from the scatter about the line."""
+
+    value: float
+    error: float
+
+
+def density_slope(density: np.ndarray, values: np.ndarray) -> Slope | None:
+    """Return the slope of log amplitude against log density; None of fewer than three: no error."""
+    if len(np.unique(density)) < _LEAST_DENSITIES:
         return None
-    return float(np.polyfit(np.log(density), np.log(values), 1)[0])
+    x, y = np.log(density), np.log(values)
+    value, level = np.polyfit(x, y, 1)
+    scatter = np.sum((y - level - value * x) ** 2) / (len(x) - 2)
+    return Slope(float(value), float(np.sqrt(scatter / np.sum((x - x.mean()) ** 2))))

@@ -9,7 +9,7 @@ import numpy as np
 from ...core.plotting import BLUE, GREY, ORANGE, new_figure, png_bytes, styled
 from ...core.units import ARCMIN
 from ...measure.correlation_plots import draw_correlation, log_axes
-from ...measure.focal_plane_axes import draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
+from ...measure.focal_plane_axes import draw_compass, draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
 from .null_result import NullTest, amplitude, density_slope, shot_noise
 from .stack import PsfStack
 from .stack_metrics import StackCorrelations
@@ -54,6 +54,7 @@ def ellipticity_picture(stacks: Mapping[int, PsfStack]) -> bytes:
             rms = np.sqrt(np.nanmean(e1**2 + e2**2))
             axes.set_title(f"{quantity}, {_visits(stack.visits)}: rms |e| {rms:.1e}", loc="left")
             draw_key_whisker(axes, key, scale, 1.0)
+            draw_compass(axes, *stack.sky_directions)
         for axes in axes_grid[-1]:
             axes.set_xlabel("x of the stack [arcmin]")
         for axes in axes_grid[:, 0]:
@@ -61,17 +62,22 @@ def ellipticity_picture(stacks: Mapping[int, PsfStack]) -> bytes:
         return png_bytes(figure)
 
 
-def correlation_picture(correlated: Mapping[int, StackCorrelations]) -> bytes:
-    """Draw xi+ of each stack: of the PSF, and of the residuals at stars and between them (Fig. 16)."""
+def correlation_picture(correlated: Mapping[int, StackCorrelations], moments: str = "e") -> bytes:
+    """Draw xi+ of each stack: of the PSF, and of the residuals at stars and between them (Fig. 16).
+
+    It is that of the weighted e, as in the paper, or of g of the adaptive moments.
+    """
+    end = "_g" if moments == "g" else ""
     with styled():
         figure = new_figure(4.2 * len(correlated) + 1.0, 4.8)
         panels = figure.subplots(1, len(correlated), sharex=True, sharey=True, squeeze=False)[0]
         for axes, (visits, correlations) in zip(panels, correlated.items(), strict=True):
             for kind, style in _STYLES.items():
-                draw_correlation(axes, correlations[kind], "plus", *style)
+                draw_correlation(axes, correlations[f"{kind}{end}"], "plus", *style)
             log_axes(axes, _visits(visits))
             axes.set_xlabel("separation [arcmin]")
-        panels[0].set_ylabel("$|\\xi_+|$: filled positive, open negative")
+        name = "g, adaptive moments" if moments == "g" else "weighted e"
+        panels[0].set_ylabel(f"$|\\xi_+|$ of {name}: filled positive, open negative")
         low, high = panels[0].get_ylim()
         panels[0].set_ylim(max(low, 1e-10), 2.0 * high)
         panels[0].legend(loc="best")
@@ -110,7 +116,8 @@ def density_picture(results: Mapping[int, NullTest]) -> bytes:
             label = _visits(result.visits)
             axes.annotate(label, (x, y), xytext=(ahead, -10), textcoords="offset points", ha=side, fontsize=8)
         slope = density_slope(density, amplitudes)
-        log_axes(axes, "" if slope is None else f"slope {slope:.2f}; paper: -0.97 ± 0.06")
+        title = "no slope: fewer than three stacks" if slope is None else f"slope {slope.value:.2f} ± {slope.error:.2f}"
+        log_axes(axes, f"{title}; paper: -0.97 ± 0.06")
         axes.set(xlabel="usable galaxies per arcmin²", ylabel="amplitude")
         axes.legend(loc="best")
         return png_bytes(figure)

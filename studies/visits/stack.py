@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,8 @@ from ...core.plotting import figure_at, styled
 from ...core.products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
 from ...core.result import Result
 from ...core.units import ARCMIN, ARCSEC
-from ...measure.focal_plane_axes import draw_whisker_panels
+from ...measure.adaptive_moments import AdaptiveMoments, adaptive_moments
+from ...measure.focal_plane_axes import draw_compass, draw_whisker_panels
 from ...measure.shapes import Shapes, measure_shapes
 from ...sky.sky_shapes import along_sky
 from .psf_visit import VisitPsfs
@@ -78,6 +80,8 @@ class PsfSums:
 class PsfStack(Result):
     """PSFs of the stack of a number of visits at the points that at least half of them saw.
 
+    Beside the weighted e1, e2 and size there are g and T of adaptive moments, from the images.
+
     Attributes
     ----------
     visits : int
@@ -98,20 +102,8 @@ class PsfStack(Result):
         Those of the model.
     """
 
-    _table = (
-        "xi",
-        "eta",
-        "star",
-        "count",
-        "e1",
-        "e2",
-        "size",
-        "model_e1",
-        "model_e2",
-        "model_size",
-        "e1_sky",
-        "e2_sky",
-    )
+    _table = ("xi", "eta", "star", "count", "e1", "e2", "size", "model_e1", "model_e2", "model_size",
+              "e1_sky", "e2_sky", "g1", "g2", "model_g1", "model_g2", "relative_size_residual")  # fmt: skip
     _images = ("true", "model")
 
     visits: int
@@ -140,7 +132,10 @@ class PsfStack(Result):
         with styled():
             figure = figure_at(ax, 13.0, 4.6)
             labels = "x of the stack [arcmin]", "y of the stack [arcmin]"
-            draw_whisker_panels(figure.subplots(1, 3), self.x / ARCMIN, self.y / ARCMIN, panels, labels)
+            panel_axes = figure.subplots(1, 3)
+            draw_whisker_panels(panel_axes, self.x / ARCMIN, self.y / ARCMIN, panels, labels)
+            for axes in panel_axes:
+                draw_compass(axes, *self.sky_directions)
             return figure
 
     @classmethod
@@ -213,6 +208,46 @@ class PsfStack(Result):
         jacobian = np.linalg.lstsq(along_stack, plane, rcond=None)[0].T
         return along_sky(self.e1, self.e2, np.broadcast_to(jacobian, (len(self), 2, 2)))
 
+    @cached_property
+    def adaptive(self) -> tuple[AdaptiveMoments, AdaptiveMoments]:
+        """Adaptive moments of the true PSFs and of the models; sigma in pixels of the stack."""
+        true, model = (adaptive_moments(images, 1.0) for images in (self.true, self.model))
+        return true, model
+
+    @property
+    def g1(self) -> np.ndarray:
+        """Ellipticity g of adaptive moments of the true PSF, along x of the stack."""
+        return self.adaptive[0].g1
+
+    @property
+    def g2(self) -> np.ndarray:
+        """Ellipticity g of adaptive moments of the true PSF, along x = y."""
+        return self.adaptive[0].g2
+
+    @property
+    def model_g1(self) -> np.ndarray:
+        """Ellipticity g of adaptive moments of the mean of the models, along x of the stack."""
+        return self.adaptive[1].g1
+
+    @property
+    def model_g2(self) -> np.ndarray:
+        """Ellipticity g of adaptive moments of the mean of the models, along x = y."""
+        return self.adaptive[1].g2
+
+    @property
+    def relative_size_residual(self) -> np.ndarray:
+        """(T - T of the models)/T of adaptive moments, T = Mxx + Myy."""
+        true, model = self.adaptive
+        return np.asarray(1.0 - model.T / true.T)
+
+    @property
+    def sky_directions(self) -> tuple[np.ndarray, np.ndarray]:
+        """North and east as unit vectors along the axes of the stack, [2] each."""
+        sky, places = np.stack([self.xi, self.eta], axis=1), np.stack([self.x, self.y], axis=1)
+        to_places = np.linalg.lstsq(sky, places, rcond=None)[0]  # rows: x, y of a step in xi, and in eta
+        east, north = to_places / np.linalg.norm(to_places, axis=1, keepdims=True)
+        return north, east
+
     def __len__(self) -> int:
         return len(self.xi)
 
@@ -230,7 +265,7 @@ class PsfStack(Result):
             "POINTS",
             {
                 name.upper(): (getattr(self, name) / scale if scale != 1.0 else getattr(self, name), unit, description)
-                for name, (scale, unit, description) in _COLUMNS.items()
+                for name, (scale, unit, description) in {**_COLUMNS, **_ADAPTIVE_COLUMNS}.items()
             }
             | {
                 "E1_SKY": (self.e1_sky, "", "E1, E2 on the sky, > 0 from east to west"),
@@ -266,6 +301,14 @@ _COLUMNS = {
     "model_e1": (1.0, "", "of the mean of the models"),
     "model_e2": (1.0, "", "of the mean of the models"),
     "model_size": (ARCSEC, "arcsec", "of the mean of the models"),
+}
+#: Columns that follow from the images, which a file has for its readers.
+_ADAPTIVE_COLUMNS = {
+    "g1": (1.0, "", "g of adaptive moments along x of the stack"),
+    "g2": (1.0, "", "g along x = y"),
+    "model_g1": (1.0, "", "of the mean of the models"),
+    "model_g2": (1.0, "", "of the mean of the models"),
+    "relative_size_residual": (1.0, "", "(T - T model)/T of adaptive moments"),
 }
 
 

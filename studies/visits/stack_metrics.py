@@ -10,8 +10,9 @@ from ...core.units import ARCMIN, ARCSEC
 from ...measure.correlation import SEPARATION_RANGES, Correlation, shear_correlation
 from .stack import PsfStack
 
-#: Correlations of a stack: of the true PSFs at all points, and of true minus model at stars and where no star is.
-KINDS = ("psf", "residual_stars", "residual_places")
+#: Correlations of a stack: of the true PSFs at all points, and of true minus model at stars and where no star is. With
+#: ``_g``, they are of g of the adaptive moments, else of the weighted e.
+KINDS = ("psf", "residual_stars", "residual_places", "psf_g", "residual_stars_g", "residual_places_g")
 StackCorrelations = dict[str, Correlation]
 # Smallest separation [arcmin].
 _LEAST = 1.0
@@ -28,11 +29,15 @@ def stack_correlations(stack: PsfStack, cell: float) -> StackCorrelations:
     """
     corner = [np.floor(v / (_PATCH * cell) + 0.5).astype(int) for v in (stack.x, stack.y)]
     patch = corner[0] - corner[0].min() + (np.ptp(corner[0]) + 1) * (corner[1] - corner[1].min())
-    values = {
-        "psf": (stack.e1, stack.e2, np.ones(len(stack), dtype=bool)),
-        "residual_stars": (stack.residual_e1, stack.residual_e2, stack.star),
-        "residual_places": (stack.residual_e1, stack.residual_e2, ~stack.star),
-    }
+    values = {}
+    residual_g = (stack.g1 - stack.model_g1, stack.g2 - stack.model_g2)
+    for end, psf, residual in (
+        ("", (stack.e1, stack.e2), (stack.residual_e1, stack.residual_e2)),
+        ("_g", (stack.g1, stack.g2), residual_g),
+    ):
+        values[f"psf{end}"] = (*psf, np.ones(len(stack), dtype=bool))
+        values[f"residual_stars{end}"] = (*residual, stack.star)
+        values[f"residual_places{end}"] = (*residual, ~stack.star)
     return correlations(stack.x, stack.y, values, patch)
 
 
@@ -61,9 +66,13 @@ def correlations(
 
 
 def stack_metrics(stack: PsfStack, correlated: StackCorrelations) -> dict[str, float]:
-    """Return the figures of a stack: ellipticities, sizes and mean correlations."""
+    """Return the figures of a stack: ellipticities, sizes and mean correlations.
+
+    Those with ``_g`` are of adaptive moments, the others of weighted ones.
+    """
     stars, places = stack.star, ~stack.star
     e, residual_e = (stack.e1, stack.e2), (stack.residual_e1, stack.residual_e2)
+    residual_g = (stack.g1 - stack.model_g1, stack.g2 - stack.model_g2)
     size = (stack.size - stack.model_size) / stack.size
     metrics: dict[str, float] = {
         "points": len(stack),
@@ -75,6 +84,12 @@ def stack_metrics(stack: PsfStack, correlated: StackCorrelations) -> dict[str, f
         "median_residual_e_places": _median_modulus(*(v[places] for v in residual_e)),
         "median_size_arcsec": float(np.nanmedian(stack.size) / ARCSEC),
         "rms_relative_residual_size_places": float(np.sqrt(np.nanmean(size[places] ** 2))),
+        "rms_g": _rms_modulus(stack.g1, stack.g2),
+        "rms_residual_g_stars": _rms_modulus(*(v[stars] for v in residual_g)),
+        "rms_residual_g_places": _rms_modulus(*(v[places] for v in residual_g)),
+        "median_residual_g_stars": _median_modulus(*(v[stars] for v in residual_g)),
+        "median_residual_g_places": _median_modulus(*(v[places] for v in residual_g)),
+        "rms_dt_g_places": float(np.sqrt(np.nanmean(stack.relative_size_residual[places] ** 2))),
     }
     for kind, correlation in correlated.items():
         for span in SEPARATION_RANGES:

@@ -238,4 +238,5 @@ def _write_products(
     write_json(folder / SUMMARY_NAME, summary)
     write_bytes(folder / "ellipticity.png", ellipticity_picture(stacks))
     write_bytes(folder / "correlation.png", correlation_picture(found))
+    write_bytes(folder / "correlation_g.png", correlation_picture(found, "g"))
     return summary

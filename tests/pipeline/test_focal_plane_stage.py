@@ -12,6 +12,7 @@ from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, ProductError, UnknownNameError
 from pachon.core.long_work import Execution
 from pachon.core.progress import Reporter
+from pachon.measure.adaptive_moments import adaptive_moments
 from pachon.measure.correlation import shear_correlation
 from pachon.pipeline import focal_plane_stage, run_folder
 from pachon.pipeline.config import to_yaml
@@ -30,7 +31,8 @@ CCDS = ("R22_S11", "R22_S12")
 ARCSEC = np.pi / 180.0 / 3600.0
 #: What the tables of a product hold of a model.
 OF_MODEL = {"MODEL_E1", "MODEL_E2", "MODELSZ", "RES_E1", "RES_E2", "LOO_E1", "LOO_E2"}
-ADDED = ["CCD_E1", "CCD_E2", "CCD_SIZE", "SIG_E1", "SIG_E2", "SIG_SIZE"]
+OF_MODEL |= {"MODEL_G1", "MODEL_G2", "MODELSIG", "LOO_G1", "LOO_G2", "LOO_SIG"}
+ADDED = ["CCD_E1", "CCD_E2", "CCD_SIZE", "CCD_G1", "CCD_G2", "CCD_SIG", "SIG_E1", "SIG_E2", "SIG_SIZE"]
 
 
 @pytest.fixture
@@ -91,7 +93,13 @@ def test_columns_of_the_model_are_those_of_the_focal_plane_and_the_ccds_own_stay
             assert [n for n in now.dtype.names if n in ADDED] == ADDED
             for key in set(before.dtype.names) - OF_MODEL:
                 assert now[key].tobytes() == before[key].tobytes()
-            for own, key in (("CCD_E1", "MODEL_E1"), ("CCD_E2", "MODEL_E2"), ("CCD_SIZE", "MODELSZ")):
+            for own, key in (
+                ("CCD_E1", "MODEL_E1"),
+                ("CCD_E2", "MODEL_E2"),
+                ("CCD_SIZE", "MODELSZ"),
+                ("CCD_G1", "MODEL_G1"),
+                ("CCD_SIG", "MODELSIG"),
+            ):
                 assert now[own].tobytes() == before[key].tobytes()
             x, y = now["X"].astype(float) * 1e-3, now["Y"].astype(float) * 1e-3
             shapes, sigma = model.shapes(name, x, y), model.uncertainty(name, x, y)
@@ -99,6 +107,15 @@ def test_columns_of_the_model_are_those_of_the_focal_plane_and_the_ccds_own_stay
                 # Read from its file, the model may round in another order.
                 np.testing.assert_allclose(now[f"{start}1"], found.e1, rtol=0.0, atol=1e-9)
                 np.testing.assert_allclose(now[f"{start}2"], found.e2, rtol=0.0, atol=1e-9)
+            if extension == "TRUTH":
+                # Adaptive moments of the mean star are as near to the true PSF's as those of the drawn image.
+                drawn = adaptive_moments(model.draw(name, x, y), 0.2 * ARCSEC)
+                for true, column, adaptive in (
+                    (now["G1"], now["MODEL_G1"], drawn.g1),
+                    (now["G2"], now["MODEL_G2"], drawn.g2),
+                    (np.log(now["SIGMA"] * ARCSEC), np.log(now["MODELSIG"] * ARCSEC), np.log(drawn.sigma)),
+                ):
+                    assert np.std(true - column) < 1.1 * np.std(true - adaptive)
             np.testing.assert_allclose(now["MODELSZ"] * ARCSEC, shapes.size, rtol=1e-9)
             np.testing.assert_allclose(now["SIG_SIZE"] * ARCSEC, sigma.size, rtol=1e-6)
             for i in "12":
@@ -313,7 +330,7 @@ def test_the_report_has_both_residuals_and_the_warnings(focal_plane_config, tmp_
     assert ", ".join(f"{metrics[f'chi2_away_{k}']:.2f}" for k in ("e1", "e2", "size")) in page
     for kind in ("residual", "away", *CCD_KINDS):
         assert f"{metrics[f'xi_plus_{kind}_short']:.1e} ± " in page
-    assert len(models_rows(result.summary)) == 8
+    assert len(models_rows(result.summary)) == 14
 
 
 def test_the_report_of_models_of_single_ccds_has_no_such_section(finished_run):

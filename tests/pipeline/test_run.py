@@ -354,5 +354,10 @@ def test_without_an_atmosphere_the_optics_alone_make_the_psf(tmp_path, tiny, no_
     config = Experiment.from_config(with_options(config, reconstruction__components=2)).config
     run(config, tmp_path / "optics")
     product = read_product(tmp_path / "optics" / "ccd_R22_S11.fits")
+    # These PSFs are narrower than a pixel, of which adaptive moments, GalSim's too, make nothing.
+    assert (product.holdout.adaptive_flags != 0).all()
+    summary = json.loads((tmp_path / "optics" / "summary.json").read_text())
+    assert summary["all"]["xi_plus_g_truth_short"] is None
+    assert summary["all"]["xi_plus_truth_short"] is not None
     # A tenth of an arcsecond of aberrations and no half arcsecond of seeing.
     assert np.median(product.holdout.fwhm) < np.deg2rad(0.2 / 3600)

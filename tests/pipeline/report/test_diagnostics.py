@@ -8,6 +8,7 @@ from astropy.table import Table
 
 from pachon.commands.cli import main
 from pachon.core.errors import ProductError
+from pachon.measure.adaptive_moments import adaptive_moments
 from pachon.measure.correlation_plots import rho_plot
 from pachon.measure.rho_statistics import rho_statistics
 from pachon.measure.shapes import measure_shapes
@@ -15,6 +16,7 @@ from pachon.models.camera.cameras import load_camera
 from pachon.pipeline.report import diagnostics
 from pachon.pipeline.report.diagnostics import FOLDER_NAME, diagnose
 from pachon.pipeline.report.focal_plane_plots import residual_plot
+from pachon.pipeline.summary import separation_bins
 from pachon.reconstruction.ccd_product import KINDS, product_path, read_product
 
 CCDS = ("R22_S11", "R24_S12")
@@ -69,13 +71,63 @@ def test_sizes_are_of_the_model_at_the_star(finished_run, diagnosed):
             assert row[f"rms_dt_{kind}"] == pytest.approx(np.sqrt(np.nanmean(growth**2)), rel=1e-8)
 
 
+def test_adaptive_moments_are_those_of_stars_and_models(finished_run, diagnosed):
+    for name in CCDS:
+        row = diagnosed.table[list(CCDS).index(name)]
+        product = read_product(product_path(finished_run, name))
+        observed, holdout = product.observed, product.holdout
+        # The products hold images in single precision; of the holdout positions, they were measured before.
+        star = adaptive_moments(product.observed_images, product.pixel_scale)
+        np.testing.assert_allclose(observed.g1, star.g1, atol=1e-6)
+        np.testing.assert_allclose(observed.sigma, star.sigma, rtol=1e-6)
+        np.testing.assert_allclose(
+            holdout.g2, adaptive_moments(product.holdout_images, product.pixel_scale).g2, atol=1e-6
+        )
+        left_out = adaptive_moments(product.model.leave_one_out(), product.pixel_scale)
+        np.testing.assert_allclose(observed.leave_one_out_g1[observed.used], left_out.g1, atol=1e-9)
+        for kind, stars in (("residual", observed), ("away", holdout)):
+            model = adaptive_moments(product.model.at(np.stack([stars.x, stars.y], axis=1)), product.pixel_scale)
+            np.testing.assert_allclose(stars.model_g2, model.g2, atol=1e-9)
+            np.testing.assert_allclose(stars.model_sigma, model.sigma, rtol=1e-9)
+            g = np.concatenate([stars.g1 - model.g1, stars.g2 - model.g2])
+            assert row[f"rms_g_{kind}"] == pytest.approx(np.sqrt(np.nanmean(g**2)), rel=1e-6)
+            q = [(1 - np.hypot(*e)) / (1 + np.hypot(*e)) for e in ((stars.g1, stars.g2), (model.g1, model.g2))]
+            trace, model_trace = (s**2 * (r + 1 / r) for s, r in zip((stars.sigma, model.sigma), q, strict=True))
+            assert row[f"mean_dt_g_{kind}"] == pytest.approx(np.nanmean(1.0 - model_trace / trace), rel=1e-6)
+        square = holdout.g1**2 + holdout.g2**2
+        trace = holdout.sigma**2 * (1.0 + square) / (1.0 - square)
+        assert row["rms_scatter_dt_g"] == pytest.approx(np.std(trace) / np.mean(trace), rel=1e-9)
+        for moments, (e1, e2) in (("e", (holdout.e1, holdout.e2)), ("g", (holdout.g1, holdout.g2))):
+            about_mean = np.sqrt(0.5 * (np.nanvar(e1) + np.nanvar(e2)))
+            assert row[f"rms_scatter_{moments}"] == pytest.approx(about_mean, rel=1e-9)
+
+
+def test_rho_statistics_of_g_are_of_adaptive_moments(finished_run, diagnosed):
+    products = [read_product(product_path(finished_run, name)) for name in CCDS]
+    stars = [p.holdout for p in products]
+    x, y = np.concatenate([p.sky_positions("away") for p in products], axis=1)
+    keys = ("g1", "g2", "sigma", "model_g1", "model_g2", "model_sigma")
+    columns = [np.concatenate([getattr(s, key) for s in stars]) for key in keys]
+    patch = np.repeat([0, 1], [len(s) for s in stars])
+    expected = rho_statistics(x, y, *columns, patch=patch, **separation_bins(products))
+    for name, rho in expected.items():
+        np.testing.assert_array_equal(getattr(diagnosed.rho_g["away"], name).xi_plus, rho.xi_plus)
+    np.testing.assert_allclose(
+        diagnosed.rho_g["away"].rho1.xi_plus, diagnosed.correlations_g["away"].xi_plus, rtol=1e-12
+    )
+
+
 def test_figures_of_the_whole_run_are_those_of_its_summary(finished_run, diagnosed):
     summary = json.loads((finished_run / "summary.json").read_text())
     for kind, key in (("residual", "at_stars"), ("left_out", "left_out"), ("away", "away")):
         # The file has nine digits.
         assert diagnosed.overall[f"rms_e_{kind}"] == pytest.approx(summary["all"][f"rms_residual_{key}"], rel=1e-8)
+        assert diagnosed.overall[f"rms_g_{kind}"] == pytest.approx(summary["all"][f"rms_residual_g_{key}"], rel=1e-8)
+        assert diagnosed.overall[f"rms_dt_g_{kind}"] == pytest.approx(summary["all"][f"rms_dt_g_{key}"], rel=1e-8)
     for kind, correlation in summary["correlation"].items():
         ours = diagnosed.correlations[kind]
+        in_g = np.array(summary["correlation_g"][kind]["xi_plus"], dtype=float)
+        np.testing.assert_allclose(diagnosed.correlations_g[kind].xi_plus, in_g, rtol=5e-9, atol=1e-12)
         np.testing.assert_array_equal(ours.n_pairs, correlation["pairs"])
         xi = np.array(correlation["xi_plus"], dtype=float)
         # Nine digits in the file are good to 5e-9; with patches sums go in another order.

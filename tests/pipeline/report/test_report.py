@@ -72,7 +72,7 @@ def test_the_report_refers_to_nothing_outside_itself(page):
 def test_every_picture_is_a_png_without_date_or_software(page):
     reader = Reader()
     reader.feed(page)
-    assert len(reader.images) == 9
+    assert len(reader.images) == 10
     for image in reader.images:
         data = base64.b64decode(image.partition(",")[2])
         assert data.startswith(PNG)
@@ -85,7 +85,7 @@ def test_every_picture_is_a_png_without_date_or_software(page):
 def test_each_picture_says_what_it_shows_and_what_the_paper_shows(page):
     for number in (7, 9, 11, 12, 13, 14):
         assert f"Fig. {number}" in page
-    assert page.count("<figure>") == 9
+    assert page.count("<figure>") == 10
     for word in ("arcsec", "R22_S11", "R24_S12", "seed 1", "config.yaml"):
         assert word in page
 

@@ -138,8 +138,15 @@ def test_shear_bias_is_that_of_the_measurement():
 
 def test_slope_of_a_power_law():
     density = np.array([10.0, 24.0, 42.0])
-    assert density_slope(density, 3.0 * density**-0.97) == pytest.approx(-0.97)
-    assert density_slope(density[:1], density[:1]) is None
+    slope = density_slope(density, 3.0 * density**-0.97)
+    assert slope.value == pytest.approx(-0.97)
+    assert slope.error == pytest.approx(0.0, abs=1e-12)
+    assert density_slope(density[:2], density[:2]) is None  # a line through two points has no error
+    # The error of a slope in closed form: of residuals r about a line, sqrt(sum r^2 / (n - 2) / sum (x - mean)^2).
+    x, r = np.log([1.0, 2.0, 4.0, 8.0]), np.array([0.01, -0.03, 0.03, -0.01])
+    scattered = density_slope(np.exp(x), np.exp(-0.97 * x + r))
+    assert scattered.value == pytest.approx(-0.97)
+    assert scattered.error == pytest.approx(np.sqrt(np.sum(r**2) / 2.0 / np.sum((x - x.mean()) ** 2)))
 
 
 @pytest.fixture(scope="module")

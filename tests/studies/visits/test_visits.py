@@ -2,12 +2,14 @@ import json
 
 import numpy as np
 import pytest
+from astropy.io import fits
 
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, PachonError
 from pachon.core.long_work import Execution
 from pachon.core.progress import Reporter
 from pachon.core.units import ARCSEC
+from pachon.measure.adaptive_moments import adaptive_moments
 from pachon.measure.shapes import measure_shapes
 from pachon.models.camera.lsst import lsst_camera
 from pachon.pipeline.config import Configuration, digest, with_options
@@ -65,6 +67,29 @@ def test_models_follow_the_psf(stacked):
         assert abs(np.nanmean(stack.residual_e1)) < 2e-3
     assert set(result.stacks) == {1, 2}
     assert result.stacks[2].count.max() == 2
+
+
+def test_a_stack_has_adaptive_moments_of_its_images(stacked):
+    result, folder = stacked
+    stack = PsfStack.read(stack_path(folder, 2))
+    true, model = (adaptive_moments(images, 0.2 * ARCSEC) for images in (stack.true, stack.model))
+    with fits.open(stack_path(folder, 2)) as hdus:
+        points = hdus["POINTS"].data
+        np.testing.assert_allclose(points["G1"], true.g1, atol=1e-12)
+        np.testing.assert_allclose(points["MODEL_G2"], model.g2, atol=1e-12)
+        np.testing.assert_allclose(points["RELATIVE_SIZE_RESIDUAL"], (true.T - model.T) / true.T, atol=1e-12)
+    metrics = result.summary["stacks"]["2"]
+    residual = (true.g1 - model.g1 + 1j * (true.g2 - model.g2))[~stack.star]
+    assert metrics["rms_residual_g_places"] == pytest.approx(np.sqrt(np.mean(np.abs(residual) ** 2)), rel=1e-6)
+    assert {"xi_plus_psf_g_short", "xi_plus_residual_places_g_short_error"} <= set(metrics)
+    assert (folder / "correlation_g.png").exists()
+    # North and east: unit vectors along which eta and xi grow, and the other does not.
+    (north, east), places = stack.sky_directions, np.stack([stack.x, stack.y], axis=1)
+    for direction, grows, stays in ((north, stack.eta, stack.xi), (east, stack.xi, stack.eta)):
+        assert np.linalg.norm(direction) == pytest.approx(1.0)
+        assert np.corrcoef(places @ direction, grows)[0, 1] > 0.9999
+        slope = np.linalg.lstsq(np.stack([grows, stays], axis=1), places @ direction, rcond=None)[0]
+        assert slope == pytest.approx([1.0, 0.0], abs=0.01)
 
 
 def test_the_stack_is_the_mean_of_its_visits(stacked, visits_config):

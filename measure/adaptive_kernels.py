@@ -1,0 +1,204 @@
+"""Kernel of the adaptive moments: an elliptical Gaussian that follows each image.
+
+With rho^2 = (x - x0)^T M^-1 (x - x0) and the weight G = exp(-rho^2/2), the ellipse M and its centre x0 are those under
+which sum(G I (x - x0)) = 0 and 2 sum(G I (x - x0)(x - x0)^T) = M sum(G I) (Bernstein & Jarvis 2002, sec. 3.1.2).
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from ..core.launch import FORWARD_OPTIONS
+
+wp.set_module_options(FORWARD_OPTIONS)
+
+#: Numbers of an ellipse: x, y from the centre of the stamp, Mxx, Mxy, Myy [pixel]; sum of weight times image; rho4; the
+#: masked part of the squared weight.
+ELLIPSE = 8
+#: Weighted sums over a stamp: of 1, x, y, xx, xy, yy and rho^4.
+SUMS = 7
+
+NOT_CONVERGED = wp.constant(wp.int32(1))
+NEGATIVE_MOMENTS = wp.constant(wp.int32(2))
+CENTROID_LEFT_STAMP = wp.constant(wp.int32(4))
+NO_FLUX = wp.constant(wp.int32(8))
+TOO_WIDE = wp.constant(wp.int32(16))
+
+#: Weights end at rho^2 = 36, where G is 2e-8: numbers are those of endless weights to 1e-7, in half the time.
+LARGEST_RHO2 = wp.constant(wp.float64(36.0))
+#: Longest step of centre and moments, in units of the minor axis and of its square (HSM's bound_correct_wt).
+LONGEST_STEP = wp.constant(wp.float64(0.25))
+
+sums = wp.types.vector(SUMS, wp.float64)
+
+
+@wp.struct
+class Ellipse:
+    """Centre from that of the stamp, and moments [pixel]."""
+
+    x: wp.float64
+    y: wp.float64
+    xx: wp.float64
+    xy: wp.float64
+    yy: wp.float64
+
+
+@wp.struct
+class StampSums:
+    """Weighted sums over the pixels of a stamp."""
+
+    light: sums  # weight times image, over the pixels that are not masked
+    masked: sums  # squared weight, over the masked pixels
+    squared_weight: wp.float64  # over the pixels that are not masked
+
+
+@wp.func
+def products(x: wp.float64, y: wp.float64, rho2: wp.float64) -> sums:
+    """Factors of the sums at a place from the centre of the ellipse."""
+    return sums(wp.float64(1.0), x, y, x * x, x * y, y * y, rho2 * rho2)
+
+
+@wp.func
+def first_pixel(low: wp.float64, count: wp.int32) -> wp.int32:
+    """First pixel at or beyond a coordinate from the first pixel of the stamp."""
+    return wp.int32(wp.ceil(wp.clamp(low, wp.float64(0.0), wp.float64(count))))
+
+
+@wp.func
+def last_pixel(high: wp.float64, count: wp.int32) -> wp.int32:
+    """Last pixel at or before a coordinate from the first pixel of the stamp."""
+    return wp.int32(wp.floor(wp.clamp(high, wp.float64(-1.0), wp.float64(count - 1))))
+
+
+@wp.func
+def sum_stamp(
+    image: wp.array2d(dtype=wp.float64), mask: wp.array2d(dtype=wp.uint8), masks: wp.bool, ellipse: Ellipse
+) -> StampSums:
+    """Sum weight times image, and squares of the weight, over the pixels within the ellipse."""
+    result = StampSums()
+    half = wp.float64(0.5)
+    ny = image.shape[0]
+    nx = image.shape[1]
+    det = ellipse.xx * ellipse.yy - ellipse.xy * ellipse.xy
+    a = ellipse.yy / det
+    b = -ellipse.xy / det
+    c = ellipse.xx / det
+    # Along a row G is a Gaussian: its ratios of neighbours have a constant ratio.
+    ratio = wp.exp(-a)
+    middle_y = half * wp.float64(ny - 1) + ellipse.y
+    middle_x = half * wp.float64(nx - 1) + ellipse.x
+    reach = wp.sqrt(LARGEST_RHO2 * ellipse.yy)
+    for j in range(first_pixel(middle_y - reach, ny), last_pixel(middle_y + reach, ny) + 1):
+        y = wp.float64(j) - middle_y
+        room = (LARGEST_RHO2 - y * y / ellipse.yy) / a
+        if room > wp.float64(0.0):
+            axis = -b * y / a
+            width = wp.sqrt(room)
+            start = first_pixel(middle_x + axis - width, nx)
+            end = last_pixel(middle_x + axis + width, nx) + 1
+            x = wp.float64(start) - middle_x
+            weight = wp.exp(-half * (a * x * x + wp.float64(2.0) * b * x * y + c * y * y))
+            step = wp.exp(-half * a * (wp.float64(2.0) * x + wp.float64(1.0)) - b * y)
+            for i in range(start, end):
+                rho2 = a * x * x + wp.float64(2.0) * b * x * y + c * y * y
+                factors = products(x, y, rho2)
+                if masks and mask[j, i] != wp.uint8(0):
+                    result.masked += weight * weight * factors
+                else:
+                    result.light += weight * image[j, i] * factors
+                    result.squared_weight += weight * weight
+                weight = weight * step
+                step = step * ratio
+                x = x + wp.float64(1.0)
+    return result
+
+
+@wp.func
+def bounded(step: wp.float64) -> wp.float64:
+    """Limit a step of the iteration."""
+    return wp.clamp(step, -LONGEST_STEP, LONGEST_STEP)
+
+
+@wp.kernel
+def fit_ellipses(
+    first: wp.int32,
+    images: wp.array3d(dtype=wp.float64),
+    mask: wp.array3d(dtype=wp.uint8),
+    masks: wp.bool,
+    fill: wp.bool,
+    start_sigma: wp.float64,
+    max_iterations: wp.int32,
+    tolerance: wp.float64,
+    ellipses: wp.array2d(dtype=wp.float64),
+    flags: wp.array(dtype=wp.int32),
+):
+    """Iterate the ellipse of one image (Hirata & Seljak 2003, as GalSim's FindAdaptiveMom has it).
+
+    With `fill` a masked pixel holds what the Gaussian that fits the others best has there, else nothing.
+    """
+    item = first + wp.tid()
+    image = images[item]
+    half_x = wp.float64(0.5) * wp.float64(image.shape[1] - 1)
+    half_y = wp.float64(0.5) * wp.float64(image.shape[0] - 1)
+    widest = wp.float64(image.shape[0] * image.shape[0] + image.shape[1] * image.shape[1])
+    ellipse = Ellipse()
+    ellipse.xx = start_sigma * start_sigma
+    ellipse.yy = ellipse.xx
+    zero = wp.float64(0.0)
+    two = wp.float64(2.0)
+    four = wp.float64(4.0)
+    half = wp.float64(0.5)
+    flag = NOT_CONVERGED
+    first_axis = zero
+    total = sums()
+    masked_part = zero
+    iteration = wp.int32(0)
+    while iteration < max_iterations and flag == NOT_CONVERGED:
+        stamp_sums = sum_stamp(image, mask[item], masks, ellipse)
+        total = stamp_sums.light
+        if fill and stamp_sums.masked[0] > zero and stamp_sums.squared_weight > zero:
+            total = total + (stamp_sums.light[0] / stamp_sums.squared_weight) * stamp_sums.masked
+        masked_part = stamp_sums.masked[0] / wp.max(
+            stamp_sums.masked[0] + stamp_sums.squared_weight, wp.float64(1e-300)
+        )
+        difference = wp.sqrt((ellipse.xx - ellipse.yy) * (ellipse.xx - ellipse.yy) + four * ellipse.xy * ellipse.xy)
+        minor = half * (ellipse.xx + ellipse.yy - difference)  # square of the minor axis
+        axis = wp.sqrt(wp.max(minor, zero))
+        if iteration == 0:
+            first_axis = axis
+        amplitude = total[0]
+        if not amplitude > zero:
+            flag = NO_FLUX
+        else:
+            dx = bounded(two * total[1] / (amplitude * axis))
+            dy = bounded(two * total[2] / (amplitude * axis))
+            dxx = bounded(four * (total[3] / amplitude - half * ellipse.xx) / minor)
+            dxy = bounded(four * (total[4] / amplitude - half * ellipse.xy) / minor)
+            dyy = bounded(four * (total[5] / amplitude - half * ellipse.yy) / minor)
+            shift = wp.max(wp.abs(dx), wp.abs(dy))
+            change = wp.sqrt(wp.max(shift * shift, wp.max(wp.abs(dxx), wp.max(wp.abs(dxy), wp.abs(dyy)))))
+            if axis < first_axis:
+                change = change * first_axis / axis
+            ellipse.x = ellipse.x + dx * axis
+            ellipse.y = ellipse.y + dy * axis
+            ellipse.xx = ellipse.xx + dxx * minor
+            ellipse.xy = ellipse.xy + dxy * minor
+            ellipse.yy = ellipse.yy + dyy * minor
+            if wp.abs(ellipse.x) > half_x or wp.abs(ellipse.y) > half_y:
+                flag = CENTROID_LEFT_STAMP
+            elif not (ellipse.xx > zero and ellipse.yy > zero and ellipse.xx * ellipse.yy > ellipse.xy * ellipse.xy):
+                flag = NEGATIVE_MOMENTS
+            elif ellipse.xx > widest or ellipse.yy > widest:
+                flag = TOO_WIDE
+            elif change < tolerance:
+                flag = wp.int32(0)
+        iteration = iteration + wp.int32(1)
+    flags[item] = flag
+    ellipses[item, 0] = ellipse.x
+    ellipses[item, 1] = ellipse.y
+    ellipses[item, 2] = ellipse.xx
+    ellipses[item, 3] = ellipse.xy
+    ellipses[item, 4] = ellipse.yy
+    ellipses[item, 5] = total[0]
+    ellipses[item, 6] = total[6] / total[0]
+    ellipses[item, 7] = masked_part
