@@ -15,6 +15,7 @@ from astropy.table import Table
 from ...core.arguments import check_arguments
 from ...core.errors import ProductError
 from ...core.files import parsing, read_bytes
+from ...measure.pixel_masks import bad_pixels
 
 #: Names that SExtractor and the LSST pipelines have for columns, in lower case.
 OTHER_NAMES = {
@@ -22,8 +23,6 @@ OTHER_NAMES = {
     "y": ("ywin_image", "y_image", "ypsf_image", "slot_centroid_y", "base_sdsscentroid_y"),
     "stamp": ("vignet",),
 }
-# Values at or below this are no light: SExtractor's masked pixels are -1e30.
-_MASKED = -1e29
 
 
 class StarCutouts(NamedTuple):
@@ -113,14 +112,6 @@ def load_stars(
     if len(stamps) != len(positions):
         raise ProductError(f"{len(positions)} stars in the table, {len(stamps)} stamps in the images", file=path)
     return StarCutouts(np.where(bad_pixels(stamps), np.nan, stamps), positions)
-
-
-def bad_pixels(stamps: np.ndarray) -> np.ndarray:
-    """Return the pixels that hold no light, bool, shape of the stamps.
-
-    A pixel is bad if it is not finite, or -1e29 or less, as the pixels are that SExtractor masks (-1e30).
-    """
-    return ~np.isfinite(stamps) | (stamps <= _MASKED)
 
 
 def _find_column(name: str, columns: Iterable[str]) -> str | None:

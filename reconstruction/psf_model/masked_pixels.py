@@ -43,21 +43,53 @@ def fill_masked(stars: np.ndarray, missing: np.ndarray, replaced: np.ndarray, te
     with a first guess in the masked pixels, and after; pixels in `replaced` hold the mean of all stars instead. The
     polynomial terms at the stars [n_stars, n_terms] are linearly independent.
     """
-    q, _ = np.linalg.qr(terms)
-    predictors = []
-    for j in np.flatnonzero(missing.any(axis=0)):
-        bad = missing[:, j]
-        room = np.linalg.pinv(np.eye(int(bad.sum())) - q[bad] @ q[bad].T, rcond=_LEAST_ROOM, hermitian=True)
-        predictors.append((j, np.flatnonzero(bad), np.flatnonzero(~bad), room @ q[bad] @ q[~bad].T))
+    pixels = np.flatnonzero(missing.any(axis=0))
+    bad, at_mean = missing[:, pixels], replaced[:, pixels]
+    pixel, star = np.nonzero(bad.T)
+    predictors = _predictors(terms, bad)
+    # Good pixels change with the flux of their star alone: the sum over stars is a product with the fluxes.
+    clean = np.where(bad | at_mean, 0.0, stars[:, pixels])
+    predictions_by_star = predictors * clean[:, pixel].T
+    of_middle = 1.0 - predictors.sum(axis=1)
+    beside_replaced = np.flatnonzero(at_mean.any(axis=0)[pixel])
+    good_count = np.maximum((~bad).sum(axis=0), 1)
+    scale = np.ones(len(stars))
     for _ in range(_MOST_PASSES):
-        filled = stars.copy()
-        for j, bad, good, predictor in predictors:
-            middle = stars[good, j].mean()  # a star that the others do not determine gets their mean
-            filled[bad, j] = middle + predictor @ (stars[good, j] - middle)
+        filled, values = stars.copy(), stars[:, pixels]
+        middle = np.where(bad, 0.0, values).sum(axis=0) / good_count
+        # A star that the others do not determine gets their mean.
+        predicted = of_middle * middle[pixel] + predictions_by_star @ scale
+        if len(beside_replaced):
+            means = np.where(at_mean, values, 0.0)[:, pixel[beside_replaced]].T
+            predicted[beside_replaced] += (predictors[beside_replaced] * means).sum(axis=1)
+        filled[star, pixels[pixel]] = predicted
         filled = np.where(replaced, filled.mean(axis=0), filled)
-        filled /= filled.sum(axis=1)[:, None]
+        flux = filled.sum(axis=1)
+        filled /= flux[:, None]
+        scale /= flux
         change = np.abs(filled - stars).max()
         stars = filled
         if change <= _CONVERGED * stars.max():
             break
     return stars
+
+
+def _predictors(terms: np.ndarray, bad: np.ndarray) -> np.ndarray:
+    """Return weights of the good stars in the prediction of each bad pixel, [n_bad, n_stars], pixel after pixel.
+
+    `bad` is [n_stars, n_pixels] bool. Pixels with as many bad stars are solved together.
+    """
+    q, _ = np.linalg.qr(terms)
+    predictors = np.zeros((int(bad.sum()), len(bad)))
+    count = bad.sum(axis=0)
+    first = np.cumsum(count) - count
+    order = np.argsort(~bad, axis=0, kind="stable")  # bad stars first
+    for bad_count in np.unique(count[count > 0]):
+        columns = np.flatnonzero(count == bad_count)
+        bad_terms = q[order[:bad_count, columns].T]  # [n_columns, bad_count, n_terms]
+        room = np.linalg.pinv(
+            np.eye(bad_count) - bad_terms @ bad_terms.transpose(0, 2, 1), rcond=_LEAST_ROOM, hermitian=True
+        )
+        rows = first[columns][:, None] + np.arange(bad_count)
+        predictors[rows] = np.where(bad[:, columns].T[:, None, :], 0.0, room @ (bad_terms @ q.T))
+    return predictors
