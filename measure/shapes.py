@@ -268,7 +268,7 @@ def _measure_masked(
     shapes = _measure_batch(images, scale, sigma, max_iterations, tolerance)
     lost_stars = masked[lost]
     shapes.flags[lost_stars] |= ShapeFlag.MASKED
-    for values in (shapes.e1, shapes.e2, shapes.size):
+    for values in (shapes.e1, shapes.e2, shapes.size, shapes.x, shapes.y):
         values[lost_stars] = np.nan
     return shapes
 

@@ -244,13 +244,18 @@ def _neighbour_pixels(
     peak = np.unravel_index(star.argmax(), star.shape)
     squares, norm = _correlate(variance, star**2, peak), _correlate(np.ones(star.shape), star**2, peak)
     rms, neighbours = np.sqrt(photons), np.zeros(star.shape, dtype=bool)
-    remaining = residual
+    remaining, scaled_again = residual, False
     for _ in range(_MOST_NEIGHBOURS):
         light = _correlate(remaining, star, peak)
         significance = light / np.sqrt(squares)
         place = np.unravel_index(significance.argmax(), star.shape)
         if not significance[place] > threshold:
             break
+        if star[place] > _CORE * star.max() and not scaled_again:
+            # Light in the star's own place may be its own: the scale by the wings of a faint star has an error.
+            residual = residual - star * (residual * star / photons).sum() / (star**2 / photons).sum()
+            remaining, scaled_again = np.where(neighbours, 0.0, residual), True
+            continue
         step = tuple(int(at - middle) for at, middle in zip(place, peak, strict=True))
         profile = ndimage.shift(star, step, order=0, mode="constant", prefilter=False)
         pixels = light[place] / norm[place] * profile > _FAINT * rms

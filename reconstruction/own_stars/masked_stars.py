@@ -9,13 +9,10 @@ import numpy as np
 from ...core.errors import DomainError
 from ...core.statistics import robust_rms
 from ...measure.masked_moments import MOST_MASKED
-from ...measure.pixel_masks import bad_pixels, fill_symmetric
+from ...measure.pixel_masks import bad_pixels, copied_pixels, fill_symmetric
 from ...measure.shapes import measure_shapes
 from ...measure.stamps import fourier_shift, shift_mask
 
-#: A star with a neighbour or a cosmic ray is lost where their pixels hold more than this fraction of its light under
-#: the weight of the moments, or any of its light above half of its peak: there the two cannot be told apart.
-MOST_OF_DEFECTS = 0.2
 # Passes end when no centroid moves by more than this [pixel], a tenth of the error of a star of S/N 200.
 _CONVERGED = 1e-3
 # Most passes.
@@ -27,8 +24,9 @@ _OUTERMOST = 0.25
 
 
 def as_bad_pixels(images: np.ndarray, masks: Any) -> np.ndarray:
-    """Return pixels of stamps that are masked, or bad (:mod:`~pachon.measure.pixel_masks`), bool [n, ny, nx]."""
+    """Return pixels of stamps that are masked, bad or copied (:mod:`~pachon.measure.pixel_masks`), bool [n, ny, nx]."""
     bad = bad_pixels(images)
+    bad |= copied_pixels(np.where(bad, 0.0, images))
     if masks is None:
         return bad
     masked = np.asarray(masks)
@@ -127,14 +125,15 @@ def fill_by_profiles(
 
 
 def apart_from_core(masks: np.ndarray, star: np.ndarray, sigma: float) -> np.ndarray:
-    """Return which masks of defects leave their stars enough (:data:`MOST_OF_DEFECTS`), [n] bool.
+    """Return which masks of defects leave their stars enough (`MOST_MASKED`), [n] bool.
 
     `masks` [n, ny, nx] and the median star [ny, nx] are centred on pixel (ny // 2, nx // 2); the weight of the moments
     has the rms width `sigma` [pixel].
     """
     light = _weight(star.shape, _middle_pixel(star.shape), sigma) * star
-    in_core = (masks & (star > 0.5 * star.max())).any(axis=(1, 2))
-    return np.asarray(~in_core & ((masks * light).sum(axis=(1, 2)) <= MOST_OF_DEFECTS * light.sum()))
+    core = np.where(star > 0.5 * star.max(), star, 0.0)
+    fractions = [(masks * star_light).sum(axis=(1, 2)) / star_light.sum() for star_light in (core, light)]
+    return np.asarray(np.max(fractions, axis=0) <= MOST_MASKED)
 
 
 def profiles_of_psfs(psfs: np.ndarray, star: np.ndarray, sigma: float) -> np.ndarray:

@@ -42,8 +42,8 @@ FOLDS = 5
 _SKY = 0.4
 # Rim of a stamp that a shift may bring in from the other side [pixel].
 _RIM = 2
-# Times that bad pixels are filled anew by the model of stars that were filled: a pixel's error falls by the part that
-# the model takes from the star itself, a fifth or less.
+# Times that bad pixels are filled anew by the model of stars that were filled: the error of a pixel falls by the
+# fraction of the stars in which it is bad each time.
 _MODEL_PASSES = 2
 # Defects that may be masked in a star that stays.
 _MASKABLE = StarFlag.NEIGHBOUR | StarFlag.COSMIC_RAY
@@ -65,7 +65,7 @@ def fit_own_stars(
     seed: int = 1,
     **options: Any,
 ) -> OwnStars:
-    """Centre stars, leave out those with defects, model the PSF, and predict each star from others.
+    """Centre stars, mask or leave out defects, model the PSF, and predict each star from others.
 
     The kind of model is chosen by the stars that are held out: kriging of pixels, unless pixels of order 0 to 2 or
     principal components, with the noise of each star, predict them better by two standard errors.
@@ -90,9 +90,11 @@ def fit_own_stars(
         (xmin, xmax, ymin, ymax) of the CCD in the unit of the positions; that of the stars by default.
     masks : array of bool, optional
         [n, ny, nx], True for pixels to ignore, besides those that hold no light: not finite, or -1e29 or less (-1e30 of
-        SExtractor). They are left out of the sky, of fluxes and of noise, and filled before a star is centred: by
-        the median star, then by the model at the star's place. A star is lost (``MASKED``) only where they hold more
-        than half of its light above half of its peak, or under the weight of the moments.
+        SExtractor), copies of dead columns (:func:`~pachon.measure.pixel_masks.copied_pixels`), and neighbours and
+        cosmic rays of stars. They are left out of the sky, of fluxes and of noise, and filled before a star is
+        centred: by the median star, then by the model at the star's place. A star is lost only where they hold
+        more than half of its light above half of its peak, or under the weight of the moments: with the flag of its
+        neighbour or cosmic ray, else ``MASKED``.
     seed : int
         Of the parts that are held out.
     **options
@@ -142,12 +144,7 @@ def fit_own_stars(
 
     def fit(chosen: np.ndarray, kind: Mapping[str, Any]) -> PsfModel:
         span = as_extent(extent, places[stars.used])
-        masks = stars.masks[chosen]
-        masks = masks & ~masks.all(axis=0)  # what no star shows stays as it is filled
-        given_masks = masks if masks.any() else None
-        return PsfModel.fit(
-            stars.images[chosen], places[chosen], extent=span, masks=given_masks, **{"gain": gain, **kind}
-        )
+        return PsfModel.fit(stars.images[chosen], places[chosen], extent=span, **{"gain": gain, **kind})
 
     def predict(kind: Mapping[str, Any]) -> np.ndarray:
         predicted = np.empty((len(used_indices), size, size))
@@ -232,6 +229,7 @@ def fit_own_stars(
         held_out,
         stamps_used,
         predicted,
+        stars.masks[used],
         *sigmas,
         scale,
         weight,
@@ -281,11 +279,14 @@ def _require_used(stars: _CentredStars, min_snr: float) -> None:
 
 def _signal_to_noise(stamps: np.ndarray, rms: np.ndarray, gain: float) -> np.ndarray:
     """Return the S/N of PSF photometry, [n], with the median star as the PSF; NaN where there is no light."""
-    flux = stamps.sum(axis=(1, 2))
+    total = stamps.sum(axis=(1, 2))
+    psf = np.nanmedian(stamps / np.where(total > 0.0, total, np.nan)[:, None, None], axis=0)
+    psf /= psf.sum()
+    squares = (psf**2).sum()
+    # The sum over a wide stamp has ten times the noise of the fit.
+    flux = (stamps * psf).sum(axis=(1, 2)) / squares
     flux = np.where(flux > 0.0, flux, np.nan)
-    psf = np.nanmedian(stamps / flux[:, None, None], axis=0)
-    area = psf.sum() ** 2 / (psf**2).sum()
-    return flux / np.sqrt(flux / gain + area * rms**2)
+    return flux / np.sqrt(flux / gain + rms**2 / squares)
 
 
 def _spread(shapes: Shapes, used: np.ndarray) -> Shapes:

@@ -50,11 +50,20 @@ def own(stars):
     return fit_own_stars(*stars, PIXEL)
 
 
-def test_stars_with_defects_and_faint_ones_are_left_out(own):
+def test_stars_with_defects_are_masked_and_faint_ones_left_out(own):
     assert own.flags[7] & StarFlag.NEIGHBOUR
     assert own.flags[9] & StarFlag.COSMIC_RAY
     assert own.snr[5] < 20.0
-    assert set(np.flatnonzero(~own.used)) == {5, 7, 9}
+    assert set(np.flatnonzero(~own.used)) == {5}
+    masks = own.masks[np.searchsorted(np.flatnonzero(own.used), [7, 9])]
+    centre = own.masks.shape[1] // 2
+    assert masks[0, centre + 7, centre + 4]  # the middle of the neighbour
+    assert masks[1, 12 - 16 + centre : 14 - 16 + centre, 20 - 16 + centre].all()  # the cosmic ray
+    assert not masks[:, centre, centre].any()
+    assert np.isfinite(own.held_out.e1[[7, 9]]).all()
+    table = own.table()
+    assert table["masked"][5] == -1
+    assert table["masked"][7] == masks[0].sum()
 
 
 def test_the_model_is_that_of_the_truth_between_the_stars(own):
@@ -150,13 +159,14 @@ def test_the_command_leaves_model_picture_and_table(stars, tmp_path, monkeypatch
     Table({"x": stars.positions[:, 0], "y": stars.positions[:, 1], "stamp": stamps}).write("stars.fits")
     assert main(["model", "stars.fits", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert (found["stars"], found["used"]) == (COUNT, COUNT - 4)
+    # Without the faint one, and the one whose core is masked.
+    assert (found["stars"], found["used"]) == (COUNT, COUNT - 2)
     assert (found["flagged"]["cosmic_ray"], found["flagged"]["masked"]) == (1, 1)
     assert PsfModel.read("stars_psf.fits").draw(2000.0, 2000.0).sum() == pytest.approx(1.0)
     assert (tmp_path / "stars_psf.png").read_bytes().startswith(b"\x89PNG")
     table = Table.read("stars_psf.ecsv")
     assert len(table) == COUNT
-    assert np.isnan(table["held_out_e1"][7])
+    assert np.isnan(table["held_out_e1"][5])
 
 
 @pytest.mark.parametrize(
