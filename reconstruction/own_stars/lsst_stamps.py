@@ -35,7 +35,7 @@ def read_stamp_file(hdus: fits.HDUList, path: Path) -> tuple[np.ndarray, np.ndar
     for image in images:
         if "LTV1" not in image.header or "LTV2" not in image.header:
             raise ProductError(
-                f"IMAGE {image.ver} has no cards LTV1 and LTV2, looked for the place of the stamp on its image",
+                f"IMAGE {image.ver} has no cards LTV1 and LTV2: expected the place of the stamp on its image",
                 file=path,
             )
         mask, variance = (parts.get((name, image.ver)) for name in ("MASK", "VARIANCE"))

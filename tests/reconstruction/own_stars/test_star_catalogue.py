@@ -142,17 +142,17 @@ def test_files_of_lsst_stamps(tmp_path):
     stamps, _ = stars()
     bad = bad_pixels(len(stamps))
     corners = np.random.default_rng(5).integers(0, 4000, (len(stamps), 2))
-    hdus = [fits.PrimaryHDU()]
+    hdus, names = [fits.PrimaryHDU()], ("IMAGE", "MASK", "VARIANCE")
     for i, (stamp, mask, corner) in enumerate(zip(stamps, bad, corners, strict=True), start=1):
-        place = {"LTV1": -float(corner[0]), "LTV2": -float(corner[1])}
         variance = np.where(mask & (i % 2 == 0), np.nan, 9.0)
         bits = np.where(mask & (i % 2 == 1), 1 << 8, 1 << 5).astype(np.int32)
-        parts = (
-            ("IMAGE", stamp, place),
-            ("MASK", bits, {"MP_NO_DATA": 8, "MP_DETECTED": 5}),
-            ("VARIANCE", variance, {}),
+        image, planes, noise = (
+            fits.ImageHDU(data, name=name, ver=i) for name, data in zip(names, (stamp, bits, variance), strict=True)
         )
-        hdus += [fits.ImageHDU(data, fits.Header(cards), name=name, ver=i) for name, data, cards in parts]
+        image.header.update(LTV1=-float(corner[0]), LTV2=-float(corner[1]))
+        planes.header["HIERARCH MP_NO_DATA"] = 8
+        planes.header["HIERARCH MP_DETECTED"] = 5
+        hdus += [image, planes, noise]
     fits.HDUList(hdus).writeto(tmp_path / "stamps.fits")
     loaded, places = load_stars(tmp_path / "stamps.fits")
     np.testing.assert_array_equal(loaded, np.where(bad, np.nan, stamps))
