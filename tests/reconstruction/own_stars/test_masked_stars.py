@@ -4,17 +4,16 @@ import numpy as np
 import pytest
 
 from pachon.core.errors import DomainError
+from pachon.measure.pixel_masks import bad_pixels, fill_symmetric
 from pachon.measure.shapes import measure_shapes
 from pachon.measure.stamps import center_masks, shift_mask
 from pachon.measure.star_selection import StarFlag
 from pachon.reconstruction.own_stars.masked_stars import (
     fill_by_profiles,
-    fill_symmetric,
     profiles_of_psfs,
     sky_of_stamps,
 )
 from pachon.reconstruction.own_stars.own_stars import fit_own_stars
-from pachon.reconstruction.own_stars.star_catalogue import bad_pixels
 from pachon.reconstruction.psf_model import kriging
 
 PIXEL = np.deg2rad(0.2 / 3600.0)
