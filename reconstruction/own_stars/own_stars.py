@@ -179,7 +179,7 @@ def fit_own_stars(
         images, rms = less_sky(bad)
         filled, median_star, lost, weight = fill()
         stars = select(filled, lost, stars)
-    _require_used(stars, min_snr)
+    _require_used(stars, min_snr, gain)
     if bad.any():
         masked = bad.any(axis=(1, 2))
         complete = wide.usable & ~lost
@@ -196,7 +196,7 @@ def fit_own_stars(
             )
             weight = float(np.nanmedian(fwhm(filled[complete], scale)))
             stars = select(filled, lost, stars)
-            _require_used(stars, min_snr)
+            _require_used(stars, min_snr, gain)
     used = stars.used
     used_indices = np.flatnonzero(used)
     parts = np.array_split(
@@ -262,19 +262,17 @@ class _CentredStars:
         return replace(self, apart=apart, defects=self.defects & apart[:, None, None])
 
 
-def _require_used(stars: _CentredStars, min_snr: float) -> None:
+def _require_used(stars: _CentredStars, min_snr: float, gain: float) -> None:
     """Raise DomainError, with the reasons, where fewer than :data:`FEWEST_STARS` are used."""
     faint = (stars.snr < min_snr) & (stars.flags == 0)
-    if stars.used.sum() >= FEWEST_STARS or not faint.any():
-        require_stars(stars.used, np.where(stars.used, 0, stars.flags), FEWEST_STARS)
-        return
-    require_stars(
-        stars.used,
-        np.where(stars.used, 0, stars.flags),
-        FEWEST_STARS,
-        f"{int(faint.sum())} of S/N below min_snr = {min_snr:g}, the median {np.median(stars.snr[faint]):.3g}: S/N is "
-        "by electrons, `gain` of them in a unit of the stamps",
-    )
+    reason = ""
+    if faint.any():
+        electrons = float(np.median(stars.images[faint].sum(axis=(1, 2)))) * gain
+        reason = (
+            f"{int(faint.sum())} of S/N below min_snr = {min_snr:g}, of {electrons:.3g} electrons in the median by "
+            f"gain = {gain:g}"
+        )
+    require_stars(stars.used, np.where(stars.used, 0, stars.flags), FEWEST_STARS, reason)
 
 
 def _signal_to_noise(stamps: np.ndarray, rms: np.ndarray, gain: float) -> np.ndarray:
