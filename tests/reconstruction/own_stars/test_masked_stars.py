@@ -139,6 +139,29 @@ def test_a_model_with_masked_stars_is_better_than_without_these_stars():
 
 
 @pytest.mark.long
+def test_stars_with_neighbours_stay_and_keep_their_shapes():
+    options = {"recipe": "paper", "basis": "pixels", "order": 1}
+    stamps, positions = simulated_stars(100)
+    complete = fit_own_stars(stamps, positions, PIXEL, **options)
+    rng = np.random.default_rng(50)
+    radius, angle = rng.uniform(5.0, 13.0, COUNT), rng.uniform(0.0, 2.0 * np.pi, COUNT)
+    flux = rng.uniform(0.1, 0.6, COUNT)
+    flux *= (stamps - 300.0).sum(axis=(1, 2)) * (np.arange(COUNT) % 2 == 0)
+    stamps = stamps + flux[:, None, None] * profiles(positions, radius * np.cos(angle), radius * np.sin(angle))
+    own = fit_own_stars(stamps, positions, PIXEL, **options)
+    flagged = (own.flags & StarFlag.NEIGHBOUR) > 0
+    assert (flagged | (flux == 0.0))[flux > 1e3].all()
+    kept = flagged & own.used
+    assert kept.sum() >= 0.8 * flagged.sum() >= 20
+    # What a mask leaves of a neighbour and what it takes from the star are less than the star's own noise.
+    for change, sigma in (
+        (own.shapes.e1 - complete.shapes.e1, complete.sigma_e),
+        (own.shapes.size / complete.shapes.size - 1.0, complete.sigma_size),
+    ):
+        assert np.sqrt(np.mean((change[kept] / sigma[kept[complete.used]]) ** 2)) < 0.8
+
+
+@pytest.mark.long
 def test_masks_are_the_same_as_pixels_that_are_not_finite(stars):
     bad = random_masks("wing", 7)
     own, same = (
