@@ -150,7 +150,7 @@ def test_stars_with_neighbours_stay_and_keep_their_shapes():
     stamps = stamps + flux[:, None, None] * profiles(positions, radius * np.cos(angle), radius * np.sin(angle))
     own = fit_own_stars(stamps, positions, PIXEL, **options)
     flagged = (own.flags & StarFlag.NEIGHBOUR) > 0
-    assert (flagged | (flux == 0.0))[flux > 1e3].all()
+    assert (flagged | ~own.used)[flux > 3e3].all()  # 20 standard deviations of the sky under a star
     kept = flagged & own.used
     assert kept.sum() >= 0.8 * flagged.sum() >= 20
     # What a mask leaves of a neighbour and what it takes from the star are less than the star's own noise.

@@ -188,9 +188,7 @@ def test_stars_too_faint_for_their_gain_are_told_from_bad_ones():
     rng = np.random.default_rng(1)
     light = profiles(rng.uniform(1.0, 4000.0, (20, 2)), *np.zeros((2, 20)))  # of unit flux: not in electrons
     stamps, positions = light + rng.normal(scale=1e-4, size=light.shape), rng.uniform(size=(20, 2))
-    with pytest.raises(
-        DomainError, match=r"0 of 20 stars left \(20 of S/N below min_snr = 20, of 0\.99\d elec.* gain = 1\)"
-    ):
+    with pytest.raises(DomainError, match=r"0 of 20 stars left \(20 of S/N below min_snr = 20, of 0\.99\d electrons"):
         fit_own_stars(stamps, positions, PIXEL, background=False)
     options = {"recipe": "paper", "basis": "pixels", "order": 0, "background": False}
     assert fit_own_stars(stamps, positions, PIXEL, gain=1e5, **options).used.all()
