@@ -105,7 +105,7 @@ def model_command(
         rows = [
             ("kind of model", str(summary_of_stars["kind"])),
             ("stars, used", f"{summary_of_stars['stars']}, {summary_of_stars['used']}"),
-            ("flagged", flagged or "none"),
+            ("defects, masked or left out", flagged or "none"),
             ("S/N, median", f"{summary_of_stars['median_snr']:.0f}"),
             (f"FWHM, pixels of {pixel_arcsec:.4g} arcsec", f"{summary_of_stars['fwhm_arcsec']:.3g} arcsec"),
             ("rms of e of the stars", f"{100 * summary_of_stars['rms_e']:.2f} %"),

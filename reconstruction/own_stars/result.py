@@ -252,7 +252,8 @@ def _stamps(own: OwnStars, axes: Axes) -> None:
     gallery = StampGallery(axes, own.stamps.shape[1], own.pixel_scale)
     for column, star in enumerate(order[ranks]):
         top = own.predicted[star].max()
-        images = (own.stamps[star], own.predicted[star], own.stamps[star] - own.predicted[star])
+        stamp = np.where(own.masks[star], np.nan, own.stamps[star])  # blank where there is no weight
+        images = (stamp, own.predicted[star], stamp - own.predicted[star])
         for row, image in enumerate(images):
             colours: dict[str, Any] = {"cmap": "viridis", "vmin": float(stretched(np.array(-0.02))), "vmax": 1.0}
             shown = stretched(image / top)

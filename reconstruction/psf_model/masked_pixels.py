@@ -55,7 +55,7 @@ def fill_masked(stars: np.ndarray, missing: np.ndarray, replaced: np.ndarray, te
     clean = np.where(bad | at_mean, 0.0, stars[:, pixels])
     predictions_by_star = predictors * clean[:, pixel].T
     of_middle = 1.0 - predictors.sum(axis=1)
-    beside_replaced = np.flatnonzero(at_mean.any(axis=0)[pixel])
+    beside_replaced = np.flatnonzero(np.asarray(at_mean.any(axis=0))[pixel])
     good_weights = np.where(bad, 0.0, weights[:, None])
     good_weights /= np.maximum(good_weights.sum(axis=0), np.finfo(float).tiny)
     scale = np.ones(len(stars))
