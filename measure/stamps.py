@@ -128,7 +128,7 @@ def center_stamps(
     bad = weightless_pixels(stack, weights)
     masked = bad.any(axis=(1, 2))
     if masked.any():
-        stack = fill_symmetric(stack, bad, *offsets.T)
+        stack = fill_symmetric(stack, bad, offsets[:, 0], offsets[:, 1])
     result = np.full((count, size, size), np.nan)
     for i, image in enumerate(stack):
         if not np.all(np.isfinite(offsets[i])):
@@ -138,7 +138,9 @@ def center_stamps(
         if total > 0.0:
             result[i] = stamp / total
     if masked.any():
-        result[masked] = np.where(center_masks(bad[masked], *offsets[masked].T, size), np.nan, result[masked])
+        result[masked] = np.where(
+            center_masks(bad[masked], offsets[masked, 0], offsets[masked, 1], size), np.nan, result[masked]
+        )
     return result
 
 

@@ -17,6 +17,8 @@ from ...measure.stamps import fourier_shift, shift_mask
 _CONVERGED = 1e-3
 # Most passes.
 _MOST_PASSES = 10
+# Passes with a new median star: later ones change it by less than its noise.
+_MEDIAN_PASSES = 3
 # Fewest pixels of sky.
 _FEWEST_SKY = 20
 # Fraction of the good pixels, the farthest from the centre, that stands in where fewer are good.
@@ -72,20 +74,22 @@ def fill_by_median_star(
     x, y, usable = shapes.x, shapes.y, shapes.usable
     sigma = weight_sigma(pixel_scale, weight_fwhm)
     masked, lost = np.flatnonzero(bad.any(axis=(1, 2))), np.zeros(len(images), dtype=bool)
-    star = np.zeros(images.shape[1:])
-    for _ in range(_MOST_PASSES):
+    star, moving = np.zeros(images.shape[1:]), masked
+    for number in range(_MOST_PASSES):
         if not usable.any():
             break
-        star = _median_star(filled[usable], bad[usable], x[usable], y[usable], sigma)
-        profiles = np.broadcast_to(star, (len(masked), *star.shape))
-        filled[masked], lost[masked] = fill_by_profiles(
-            images[masked], bad[masked], profiles, x[masked], y[masked], sigma
+        if number < _MEDIAN_PASSES:
+            star, moving = _median_star(filled[usable], bad[usable], x[usable], y[usable], sigma), masked
+        profiles = np.broadcast_to(star, (len(moving), *star.shape))
+        filled[moving], lost[moving] = fill_by_profiles(
+            images[moving], bad[moving], profiles, x[moving], y[moving], sigma
         )
-        shapes = measure_shapes(filled[masked], pixel_scale, weight_fwhm)
-        step = np.hypot(shapes.x - x[masked], shapes.y - y[masked])
-        x[masked], y[masked] = shapes.x, shapes.y
-        usable[masked] = shapes.usable & ~lost[masked]
-        if not (step[usable[masked]] > _CONVERGED).any():
+        shapes = measure_shapes(filled[moving], pixel_scale, weight_fwhm)
+        step = np.hypot(shapes.x - x[moving], shapes.y - y[moving])
+        x[moving], y[moving] = shapes.x, shapes.y
+        usable[moving] = shapes.usable & ~lost[moving]
+        moving = moving[usable[moving] & (step > _CONVERGED)]
+        if not len(moving):
             break
     return filled, star, lost
 
