@@ -33,9 +33,11 @@ def read_stamp_file(hdus: fits.HDUList, path: Path) -> tuple[np.ndarray, np.ndar
     ny, nx = np.min([hdu.data.shape for hdu in images], axis=0)
     stamps, positions = [], []
     for image in images:
-        if "LTV1" not in image.header or "LTV2" not in image.header:
+        place = [image.header.get(key) for key in ("LTV1", "LTV2")]
+        if not all(isinstance(value, (int, float)) and np.isfinite(value) for value in place):
             raise ProductError(
-                f"IMAGE {image.ver} has no cards LTV1 and LTV2: expected the place of the stamp on its image",
+                f"IMAGE {image.ver} has LTV1, LTV2 = {place[0]}, {place[1]}: expected numbers, minus the first pixel "
+                "of the stamp on its image",
                 file=path,
             )
         mask, variance = (parts.get((name, image.ver)) for name in ("MASK", "VARIANCE"))
@@ -49,7 +51,7 @@ def read_stamp_file(hdus: fits.HDUList, path: Path) -> tuple[np.ndarray, np.ndar
         )[0]
         first_row, first_column = (stamp.shape[0] - ny) // 2, (stamp.shape[1] - nx) // 2
         stamps.append(stamp[first_row : first_row + ny, first_column : first_column + nx])
-        corner = np.array([first_column - image.header["LTV1"], first_row - image.header["LTV2"]])
+        corner = np.array([first_column, first_row]) - np.array(place, dtype=np.float64)
         positions.append(corner + 0.5 * (np.array([nx, ny]) - 1.0))
     return np.stack(stamps), np.stack(positions)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.errors import ProductError
+from ...core.errors import ProductError, shown
 from ...measure.pixel_masks import bad_pixels
 
 #: Mask planes of LSST and HSC files whose pixels are no data; others, such as DETECTED, say nothing of their quality.
@@ -32,6 +32,8 @@ BAD_PLANES = (
 )
 # Start of the cards that name mask planes; their value is the number of the bit.
 _PLANE_CARD = "MP_"
+# Bits of a mask of whole numbers of 64 bits, without that of the sign.
+_MOST_BITS = 63
 
 
 def without_weightless(
@@ -79,7 +81,7 @@ def without_weightless(
     if variances is not None:
         bad |= ~(np.isfinite(variances) & (variances > 0.0))
     if masks is not None:
-        bad |= (masks.astype(np.int64) & _bad_bits(header)) != 0
+        bad |= (masks.astype(np.int64) & _bad_bits(header, path)) != 0
     if bad.size and bad.all():
         raise ProductError(
             f"no pixel of its {len(stamps)} stamps has weight: {names[0]} is zero, {names[1]} is set, or all are NaN",
@@ -88,10 +90,18 @@ def without_weightless(
     return np.where(bad, np.nan, stamps)
 
 
-def _bad_bits(header: Mapping[str, Any]) -> np.int64:
+def _bad_bits(header: Mapping[str, Any], path: Path) -> np.int64:
     """Return the bits of bad planes; all of them where the header names none."""
-    planes = {key[len(_PLANE_CARD) :]: header[key] for key in header if str(key).startswith(_PLANE_CARD)}
+    planes = {str(key)[len(_PLANE_CARD) :]: header[key] for key in header if str(key).startswith(_PLANE_CARD)}
     if not planes:
         return np.int64(-1)
-    bits = [int(bit) for name, bit in planes.items() if name in BAD_PLANES]
-    return np.int64(sum(1 << bit for bit in bits if 0 <= bit < 63))
+    bits = 0
+    for name, bit in planes.items():
+        if isinstance(bit, bool) or not isinstance(bit, int) or not 0 <= bit < _MOST_BITS:
+            raise ProductError(
+                f"{_PLANE_CARD}{name} = {shown(bit)}: expected the number of a bit of the mask, 0 to {_MOST_BITS - 1}",
+                file=path,
+                key=f"{_PLANE_CARD}{name}",
+            )
+        bits |= (1 << bit) * (name in BAD_PLANES)
+    return np.int64(bits)
