@@ -111,6 +111,8 @@ def fit_own_stars(
             f"stamps of shape {raw_images.shape}, {len(places)} positions: expected [n, ny, nx] and as many positions"
         )
     bad = as_bad_pixels(raw_images, masks)
+    if bad.size and bad.all():
+        raise DomainError(f"no pixel of {len(bad)} stamps has weight: all are masked, or no numbers")
     scale = positive_angle(pixel_scale, "pixel_scale")
     if not (np.isfinite(gain) and gain > 0.0):
         raise DomainError(f"gain = {gain}: expected a number of electrons above 0")

@@ -209,6 +209,12 @@ def test_masks_of_another_shape_are_named(stars):
         fit_own_stars(*stars, PIXEL, masks=np.zeros((SIZE, SIZE), dtype=bool))
 
 
+def test_stamps_without_any_weight_are_named(stars):
+    for stamps, masks in ((stars[0], np.ones(stars[0].shape, dtype=bool)), (np.full(stars[0].shape, -1e30), None)):
+        with pytest.raises(DomainError, match="no pixel of 60 stamps has weight: all are masked, or no numbers"):
+            fit_own_stars(stamps, stars[1], PIXEL, masks=masks)
+
+
 def test_what_counts_as_a_bad_pixel():
     values = np.array([0.0, -500.0, -9e28, -1e29, -1e30, np.nan, np.inf, -np.inf])
     assert list(bad_pixels(values)) == [False] * 3 + [True] * 5
