@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.terminal import print_line
-from .inputs import configured_experiment
+from .inputs import configured_experiment, warnings_shown
 from .interrupt import interruptible
 from .options import (
     Ccds,
@@ -96,6 +96,7 @@ def _compare(
     as_json: bool,
 ) -> None:
     """Compare a model of Piff with ours at the stars of a table."""
+    from ..core.errors import WcsWarning
     from ..pipeline.report.tables import PIFF_CAPTION, PIFF_COLUMNS, piff_rows
     from ..reconstruction.own_stars.star_catalogue import load_stars
     from ..reconstruction.piff.comparison import compare_with_piff
@@ -103,7 +104,9 @@ def _compare(
 
     folder = stars.with_name(f"{stars.stem}_piff") if out is None else out
     with interruptible(quiet) as reporter, reporter.stage(f"PSF of {stars.name}"):
-        piff_comparison = compare_with_piff(load_piff(piff), *load_stars(stars, **columns), **options)
+        with warnings_shown(WcsWarning):
+            psf = load_piff(piff)
+        piff_comparison = compare_with_piff(psf, *load_stars(stars, **columns), **options)
         piff_comparison.write_folder(folder)
     if as_json:
         print_json(piff_comparison.as_dict())

@@ -20,7 +20,9 @@ from .options import (
     Quiet,
     Recipe,
     StarImages,
+    StarMask,
     StarStamp,
+    StarWeight,
     StarX,
     StarY,
     Weights,
@@ -39,6 +41,8 @@ def model_command(
     x: StarX = "x",
     y: StarY = "y",
     stamp: StarStamp = "stamp",
+    weight: StarWeight = None,
+    mask: StarMask = None,
     images: StarImages = None,
     size: Annotated[int | None, Option(help="Side of the PSF [pixel], odd; that of the stamps less a rim.")] = None,
     min_snr: MinSnr = 20.0,
@@ -56,7 +60,8 @@ def model_command(
 ) -> None:
     """Model the PSF of an image from a table of its stars, and show how well it predicts stars that were held out.
 
-    Stars are centred, those with neighbours, cosmic rays and saturated cores left out. The kind of model is the one
+    Stars are centred; pixels without weight, neighbours and cosmic rays apart from a core are masked; stars with
+    saturated cores, or too little that is not masked, are left out. The kind of model is the one
     that predicts held-out stars best: kriging of pixels, unless another is clearly better, or that of the options. It
     leaves the model, STARS_psf.fits; a picture beside it, .png; and all stars with their shapes and what the model made
     without them predicts, .ecsv.
@@ -65,6 +70,7 @@ def model_command(
 
     - `pachon model stars.fits`: columns x, y, stamp, or x, y and a cube of images
     - `pachon model sextractor.cat --gain 1.7 --pixel-arcsec 0.263`: XWIN_IMAGE, YWIN_IMAGE, VIGNET
+    - `pachon model piff_stars.fits`: X, Y, IMAGE, WEIGHT
     - `pachon model stars.ecsv --images stamps.fits --x X --y Y -o psf.fits`
     """
     from ..core.files import write_bytes
@@ -79,7 +85,7 @@ def model_command(
     path = stars.with_name(f"{stars.stem}_psf.fits") if out is None else out
     with interruptible(quiet) as reporter, reporter.stage(f"PSF of {stars.name}"):
         result = fit_own_stars(
-            *load_stars(stars, x=x, y=y, stamp=stamp, images=images),
+            *load_stars(stars, x=x, y=y, stamp=stamp, weight=weight, mask=mask, images=images),
             pixel_arcsec * ARCSEC,
             size=size,
             min_snr=min_snr,
@@ -99,7 +105,7 @@ def model_command(
         rows = [
             ("kind of model", str(summary_of_stars["kind"])),
             ("stars, used", f"{summary_of_stars['stars']}, {summary_of_stars['used']}"),
-            ("flagged", flagged or "none"),
+            ("defects, masked or left out", flagged or "none"),
             ("S/N, median", f"{summary_of_stars['median_snr']:.0f}"),
             (f"FWHM, pixels of {pixel_arcsec:.4g} arcsec", f"{summary_of_stars['fwhm_arcsec']:.3g} arcsec"),
             ("rms of e of the stars", f"{100 * summary_of_stars['rms_e']:.2f} %"),

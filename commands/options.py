@@ -55,6 +55,12 @@ Picture = Annotated[
 StarX = Annotated[str, Option("--x", help="Column of x; names of SExtractor and LSST are known.")]
 StarY = Annotated[str, Option("--y", help="Column of y.")]
 StarStamp = Annotated[str, Option("--stamp", help="Column of the stamps [ny, nx].")]
+StarWeight = Annotated[
+    str | None, Option("--weight", help="Column of weights of pixels; WEIGHT, VIGNET_WEIGHT, ... by default.")
+]
+StarMask = Annotated[
+    str | None, Option("--mask", help="Column of masks of pixels, 0 where good; MASK, VIGNET_MASK, ... by default.")
+]
 StarImages = Annotated[Path | None, Option("--images", help="FITS cube of the stamps, where the table has none.")]
 MinSnr = Annotated[float, Option(help="Least S/N of a star.")]
 Gain = Annotated[float, Option(help="Electrons in a unit of the stamps.")]

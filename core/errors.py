@@ -117,6 +117,10 @@ class HeightWarning(UserWarning):
     """Measured heights with gaps, without some CCDs, or of an unlikely size."""
 
 
+class WcsWarning(UserWarning):
+    """World coordinates that are known with errors only."""
+
+
 class ConfigError(PachonError):
     """Malformed configuration file or option."""
 

@@ -65,6 +65,7 @@ def fit_image_psf(image: CcdImage, stars: StarSelection, recipe: Recipe = DEFAUL
         return PsfModel.fit(
             stars.stamps,
             stars.positions,
+            masks=_masks_of(stars),
             recipe=recipe,
             weights=recipe.star_weights(stars.snr),
             gain=image.gain,
@@ -72,6 +73,14 @@ def fit_image_psf(image: CcdImage, stars: StarSelection, recipe: Recipe = DEFAUL
         )
     except PachonError as error:
         raise error.within(subject=f"CCD {image.name}") from None
+
+
+def _masks_of(stars: StarSelection) -> np.ndarray | None:
+    """Return the pixels of stars without weight, but those that none of them shows; None without any."""
+    if stars.masks is None:
+        return None
+    masks = stars.masks & ~stars.masks.all(axis=0)
+    return masks if masks.any() else None
 
 
 def pixels_of_ccd(image: CcdImage, positions: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
@@ -21,6 +21,8 @@ from ..core.point_plots import draw_shapes
 from ..core.result import Result
 from ..core.threads import one_blas_thread
 from ..core.units import ARCSEC, positive_angle, pure_numbers, real_numbers, require_positive
+from .masked_moments import MaskedMoments, fill_by_moments
+from .pixel_masks import bad_pixels, weightless_pixels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,7 +35,8 @@ class ShapeFlag(IntFlag):
     """Failures of a shape measurement; zero for a good one.
 
     ``CENTROID_LEFT_STAMP``: the centroid came nearer to an edge than the rms width of the weight (or half-way to it,
-    where the weight is wider than that). ``NO_FLUX``: the weighted sum is not positive, or a pixel is not finite.
+    where the weight is wider than that). ``NO_FLUX``: the weighted sum is not positive. ``MASKED``: pixels without
+    weight hold more than half of the light under the weight of the moments, or above half of the maximum.
     """
 
     OK = 0
@@ -41,6 +44,7 @@ class ShapeFlag(IntFlag):
     NEGATIVE_MOMENTS = 2
     CENTROID_LEFT_STAMP = 4
     NO_FLUX = 8
+    MASKED = 16
 
 
 @dataclass(frozen=True)
@@ -92,6 +96,7 @@ def measure_shapes(
     pixel_scale: ArrayLike,
     weight_fwhm: ArrayLike,
     *,
+    weights: ArrayLike | NDArray[np.bool_] | None = None,
     background: ArrayLike = 0.0,
     max_iterations: int = 50,
     tolerance: float = 1e-6,
@@ -109,6 +114,10 @@ def measure_shapes(
     Gaussian product of rms width s pixels the relative error is about 2 exp(-2 pi^2 s^2), 1e-4 at s = 0.7 and 1e-7 at
     s = 0.9. A 0.3" weight belongs on images with pixels of 0.1" or less, a 0.7" weight works on 0.2" pixels.
 
+    Pixels without weight (not finite, -1e29 or less, or of weight zero) hold what the elliptical Gaussian of the same
+    moments has there, and what the image exceeds it by at the opposite pixel; both are iterated
+    (:func:`~pachon.measure.masked_moments.fill_by_moments`).
+
     Every image is measured on its own: splitting a batch changes no byte.
 
     Parameters
@@ -120,6 +129,9 @@ def measure_shapes(
     weight_fwhm : float or Quantity
         FWHM of the Gaussian weight [rad]: 0.3" for the optics alone, 0.7" with the atmosphere (Jee & Tyson 2011, sec.
         3).
+    weights : array, optional
+        Of the pixels, inverse variances or bool, [n, ny, nx], or [ny, nx] for all: zero and NaN for pixels to ignore.
+        Positive ones are all alike.
     background : float or array
         Level to subtract, one for all or one per image.
     max_iterations : int
@@ -136,7 +148,7 @@ def measure_shapes(
     Raises
     ------
     DomainError
-        If an argument has the wrong shape or is not positive.
+        If an argument has the wrong shape or is not positive, or weights are negative or zero everywhere.
     """
     stack = stamp_cube(images)
     scale = positive_angle(pixel_scale, "pixel_scale")
@@ -149,17 +161,17 @@ def measure_shapes(
         level = np.broadcast_to(pure_numbers(background, "background"), (count,))
     except ValueError as error:
         raise DomainError(f"background has shape {np.shape(background)}: expected one value or {count}") from error
+    weightless = None if weights is None else weightless_pixels(stack, weights)
     batch = max(1, _BATCH_PIXELS // (stack.shape[1] * stack.shape[2]))
-    parts = [
-        _measure_batch(
-            np.array(stack[i : i + batch], dtype=np.float64, order="C") - level[i : i + batch, None, None],
-            scale,
-            sigma,
-            max_iterations,
-            tolerance,
-        )
-        for i in range(0, count, batch)
-    ]
+    parts = []
+    for i in range(0, count, batch):
+        pixels = np.array(stack[i : i + batch], dtype=np.float64, order="C")
+        bad = bad_pixels(pixels) if weightless is None else weightless[i : i + batch]
+        pixels -= level[i : i + batch, None, None]
+        if bad.any():
+            parts.append(_measure_masked(pixels, bad, scale, sigma, max_iterations, tolerance))
+        else:
+            parts.append(_measure_batch(pixels, scale, sigma, max_iterations, tolerance))
     if not parts:
         no_values = np.empty(0)
         return Shapes(no_values, no_values, no_values, no_values, no_values, no_values, np.empty(0, dtype=np.int32))
@@ -240,6 +252,25 @@ def _measure_batch(images: np.ndarray, scale: float, sigma: float, max_iteration
     e2[measured[good]] = 2.0 * q12[good] / trace
     size[measured[good]] = np.sqrt(root) * scale
     return Shapes(e1, e2, size, flux, center[:, 0], center[:, 1], flags)
+
+
+def _measure_masked(
+    images: np.ndarray, bad: np.ndarray, scale: float, sigma: float, max_iterations: int, tolerance: float
+) -> Shapes:
+    """Measure a batch whose bad pixels, bool [n, ny, nx], have no weight."""
+    masked = np.flatnonzero(bad.any(axis=(1, 2)))
+
+    def moments(filled: np.ndarray) -> MaskedMoments:
+        shapes = _measure_batch(filled, scale, sigma, max_iterations, tolerance)
+        return MaskedMoments(shapes.x, shapes.y, shapes.e1, shapes.e2, shapes.size / scale)
+
+    images[masked], lost = fill_by_moments(images[masked], bad[masked], moments, sigma)
+    shapes = _measure_batch(images, scale, sigma, max_iterations, tolerance)
+    lost_stars = masked[lost]
+    shapes.flags[lost_stars] |= ShapeFlag.MASKED
+    for values in (shapes.e1, shapes.e2, shapes.size, shapes.x, shapes.y):
+        values[lost_stars] = np.nan
+    return shapes
 
 
 def _weighted_moments(

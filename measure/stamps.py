@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
 from ..core.errors import DomainError
 from ..core.units import real_array
+from .pixel_masks import fill_symmetric, weightless_pixels
 
 
 def observe_stamps(
@@ -68,13 +69,24 @@ _OVERLAP = 0.1
 
 
 def center_stamps(
-    images: ArrayLike, x: ArrayLike, y: ArrayLike, size: int = 31, *, normalize: bool = True
+    images: ArrayLike,
+    x: ArrayLike,
+    y: ArrayLike,
+    size: int = 31,
+    *,
+    normalize: bool = True,
+    weights: ArrayLike | NDArray[np.bool_] | None = None,
 ) -> np.ndarray:
     """Shift stars so that their centroid falls on the centre of a pixel, and cut stamps around it.
 
     The shift multiplies the Fourier transform by a phase: exact for a band-limited image, and it leaves white noise
     white. Light that crosses an edge comes in at the opposite one, so images should be larger than the stamps by a few
     pixels, or dark at their edges.
+
+    Pixels without weight (not finite, -1e29 or less, or of weight zero) are shifted with the value of the pixel
+    opposite the centroid, or the mean of good neighbours; pixels of the stamp that they overlap by a tenth or more are
+    NaN, which :func:`~.shapes.measure_shapes`, :func:`~.star_selection.flag_stars` and :meth:`pachon.PsfModel.fit`
+    ignore.
 
     Parameters
     ----------
@@ -86,17 +98,20 @@ def center_stamps(
     size : int
         Pixels along one side of the stamp, odd.
     normalize : bool
-        Whether to divide every stamp by its sum.
+        Whether to divide every stamp by its sum, that of stand-ins for weightless pixels included.
+    weights : array, optional
+        Of the pixels, inverse variances or bool, [n, ny, nx], or [ny, nx] for all: zero and NaN for pixels to ignore.
 
     Returns
     -------
     array
-        [n, size, size]. All NaN for an image whose centroid is NaN or whose stamp has no positive sum.
+        [n, size, size]. NaN in pixels without weight. All NaN for an image whose centroid is NaN or whose stamp has no
+        positive sum.
 
     Raises
     ------
     DomainError
-        If the size is not odd or the image is smaller than the stamp.
+        If the size is not odd, the image is smaller than the stamp, or weights are negative or zero everywhere.
     """
     stack = _stamp_cube(images, "images")
     count, ny, nx = stack.shape
@@ -110,6 +125,10 @@ def center_stamps(
         raise DomainError(f"x and y have shapes {np.shape(x)} and {np.shape(y)}: expected {count} centroids") from error
     rows, columns = _middle_pixels(size, (ny, nx))
     middle = np.array([nx // 2 - (nx - 1) / 2.0, ny // 2 - (ny - 1) / 2.0])
+    bad = weightless_pixels(stack, weights)
+    masked = bad.any(axis=(1, 2))
+    if masked.any():
+        stack = fill_symmetric(stack, bad, offsets[:, 0], offsets[:, 1])
     result = np.full((count, size, size), np.nan)
     for i, image in enumerate(stack):
         if not np.all(np.isfinite(offsets[i])):
@@ -118,6 +137,10 @@ def center_stamps(
         total = stamp.sum() if normalize else 1.0
         if total > 0.0:
             result[i] = stamp / total
+    if masked.any():
+        result[masked] = np.where(
+            center_masks(bad[masked], offsets[masked, 0], offsets[masked, 1], size), np.nan, result[masked]
+        )
     return result
 
 
@@ -132,6 +155,20 @@ def center_masks(masks: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> 
     result = np.zeros((len(masks), size, size), dtype=bool)
     for i in np.flatnonzero(masks.any(axis=(1, 2))):
         result[i] = shift_mask(masks[i], *shifts[i])[rows, columns]
+    return result
+
+
+def decenter_masks(masks: np.ndarray, x: np.ndarray, y: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Return masks of centred stamps [n, size, size] on the images of a shape (ny, nx) they were cut from.
+
+    The inverse of :func:`center_masks`: bool [n, ny, nx], False beyond the stamps.
+    """
+    rows, columns = _middle_pixels(masks.shape[1], shape)
+    shifts = np.nan_to_num(np.stack([x, y], axis=1)) - np.array([n // 2 - (n - 1) / 2.0 for n in shape[::-1]])
+    result = np.zeros((len(masks), *shape), dtype=bool)
+    for i in np.flatnonzero(masks.any(axis=(1, 2))):
+        result[i, rows, columns] = masks[i]
+        result[i] = shift_mask(result[i], *shifts[i])
     return result
 
 

@@ -12,6 +12,8 @@ from scipy import fft, ndimage
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.units import pure_numbers, real_array
+from .masked_moments import MOST_MASKED
+from .pixel_masks import bad_pixels, fill_symmetric
 
 # Standard deviation of the PSF within a CCD, as a fraction of the geometric mean of the pixel's value and the peak's.
 _PSF_CHANGE = 0.05
@@ -25,13 +27,19 @@ _CORE = 0.6
 _LOSS = 0.2
 # Fewest usable stars, for a median to compare with.
 _FEWEST = 3
+# Light of a neighbour over the noise of a pixel from which on the pixel is masked.
+_FAINT = 0.2
+# Standard deviations of the mean of 3 x 3 pixels above which they belong to the neighbour that they are connected with.
+_CONNECTED = 2.0
+# Most neighbours of a star.
+_MOST_NEIGHBOURS = 30
 
 
 class StarFlag(IntFlag):
     """Defects of a star; zero for a good one.
 
-    ``UNUSABLE``: a pixel is not finite, or there is no light to scale the median star to. ``MASKED``: masked pixels
-    hold more than half of the core or of the weighted light (:func:`~pachon.fit_own_stars`).
+    ``UNUSABLE``: there is no light to scale the median star to. ``MASKED``: masked pixels hold more than half of the
+    core, or in :func:`~pachon.fit_own_stars` of the weighted light.
     """
 
     GOOD = 0
@@ -47,7 +55,8 @@ class Selection:
     """Defects detected in n stars."""
 
     flags: np.ndarray  #: :class:`StarFlag` bits, [n]
-    #: Pixels of cosmic rays and saturated ones, [n, ny, nx] bool: a star without other defects may stay, masked.
+    #: Pixels of cosmic rays, of neighbours and saturated ones, [n, ny, nx] bool: a star may stay, masked, where they
+    #: leave enough of its core.
     masks: np.ndarray
 
     @property
@@ -67,11 +76,12 @@ class Selection:
         return self.good
 
 
-def require_stars(good: np.ndarray, flags: np.ndarray, least: int) -> None:
-    """Raise DomainError, with the number of stars of each defect, if fewer are good."""
+def require_stars(good: np.ndarray, flags: np.ndarray, least: int, reason: str = "") -> None:
+    """Raise DomainError, with the number of stars of each defect and a further reason, if fewer are good."""
     good_count = int(good.sum())
     if good_count < least:
-        counts = f" ({defect_text})" if (defect_text := _defect_counts(flags)) else ""
+        defect_text = ", ".join(text for text in (_defect_counts(flags), reason) if text)
+        counts = f" ({defect_text})" if defect_text else ""
         raise DomainError(f"{good_count} of {len(good)} stars left{counts}: expected at least {least}")
 
 
@@ -95,12 +105,15 @@ def flag_stars(
     holds more of the residual in the 3 x 3 pixels around it than the peak of a star could. A *neighbour* is a place
     where the residual, without cosmic rays, matches a star (matched filter); in the core of a bright star the allowance
     hides those that only stretch it. A *saturated* core lacks a fifth of the light that the wings promise, or reaches
-    the given level, which finds far more of them.
+    the given level, which finds far more of them. The masks of neighbours hold the pixels in which their light, by the
+    median star at their place and by what is connected above the noise, exceeds a fifth of the noise. Pixels without
+    weight (NaN, -1e29 or less) are left out.
 
     Parameters
     ----------
     stamps : array
-        [n, ny, nx] background-subtracted stars centred to a pixel or better, of any flux; most of them good.
+        [n, ny, nx] background-subtracted stars centred to a pixel or better, of any flux; most of them good. NaN for
+        pixels without weight, as of :func:`~.stamps.center_stamps`.
     noise : float or array
         rms noise of a pixel without light, one for all or [n], in the unit of the stamps.
     gain : float
@@ -131,6 +144,9 @@ def flag_stars(
             raise DomainError(f"{name} = {value}: expected positive finite numbers")
     flags = np.zeros(count, dtype=np.int32)
     masks = np.zeros(images.shape, dtype=bool)
+    bad = bad_pixels(images)
+    if bad.any():
+        images = fill_symmetric(images, bad)
     total = images.sum(axis=(1, 2))
     usable = np.isfinite(total) & (total > 0.0)
     flags[~usable] = StarFlag.UNUSABLE
@@ -142,7 +158,11 @@ def flag_stars(
     block = ndimage.uniform_filter(star, 3, mode="constant") * 9.0
     fraction = min(_SHARPER * peak / block[np.unravel_index(star.argmax(), star.shape)], 0.9)
     allowance = _PSF_CHANGE * np.sqrt(np.maximum(star, 0.0) * peak)
-    scales = np.median(images[:, wings] / star[wings], axis=1)
+    scales = _scales(images[:, wings], star[wings], bad[:, wings])
+    if bad.any():
+        flags[usable & (bad[:, core].mean(axis=1) > MOST_MASKED)] = StarFlag.MASKED
+        usable &= flags == 0
+        images = np.where(bad, np.nan_to_num(scales)[:, None, None] * star, images)
     flags[usable & ~(scales > 0.0)] = StarFlag.UNUSABLE
     usable &= scales > 0.0
     lack = 1.0 - images[:, core].sum(axis=1) / (scales * star[core].sum())
@@ -165,8 +185,10 @@ def flag_stars(
             flags[i] |= StarFlag.COSMIC_RAY
             masks[i] = struck
             residual = np.where(struck, 0.0, residual)
-        if _matched_filter(residual, variance, star) > threshold:
+        neighbours = _neighbour_pixels(residual, variance, photons, star, threshold)
+        if neighbours is not None:
             flags[i] |= StarFlag.NEIGHBOUR
+            masks[i] |= neighbours
     return Selection(flags, masks)
 
 
@@ -201,11 +223,51 @@ def _sharp_pixels(residual: np.ndarray, variance: np.ndarray, fraction: float, t
     return sharp | ndimage.binary_dilation(sharp, neighbourhood, iterations=-1, mask=bright | sharp)
 
 
-def _matched_filter(residual: np.ndarray, variance: np.ndarray, star: np.ndarray) -> float:
-    """Return the largest significance of a star in the residual."""
+def _scales(wings: np.ndarray, star: np.ndarray, bad: np.ndarray) -> np.ndarray:
+    """Return the median ratio of the stars' pixels [n, n_wings] to the median star's; NaN where all are bad."""
+    ratios = wings / star
+    if not bad.any():
+        return np.asarray(np.median(ratios, axis=1))
+    ratios[bad] = np.nan
+    scales, some_good = np.full(len(wings), np.nan), ~bad.all(axis=1)
+    scales[some_good] = np.nanmedian(ratios[some_good], axis=1)
+    return scales
+
+
+def _neighbour_pixels(
+    residual: np.ndarray, variance: np.ndarray, photons: np.ndarray, star: np.ndarray, threshold: float
+) -> np.ndarray | None:
+    """Return the pixels of neighbours [ny, nx] bool, one after the other by significance; None without any.
+
+    `variance` has the allowance for the PSF's variation in it, `photons` noise alone.
+    """
     peak = np.unravel_index(star.argmax(), star.shape)
-    light, squares = _correlate(residual, star, peak), _correlate(variance, star**2, peak)
-    return float((light / np.sqrt(squares)).max())
+    squares, norm = _correlate(variance, star**2, peak), _correlate(np.ones(star.shape), star**2, peak)
+    rms, neighbours = np.sqrt(photons), np.zeros(star.shape, dtype=bool)
+    remaining, scaled_again = residual, False
+    for _ in range(_MOST_NEIGHBOURS):
+        light = _correlate(remaining, star, peak)
+        significance = light / np.sqrt(squares)
+        place = np.unravel_index(significance.argmax(), star.shape)
+        if not significance[place] > threshold:
+            break
+        if star[place] > _CORE * star.max() and not scaled_again:
+            # Light in the star's own place may be its own: the scale by the wings of a faint star has an error.
+            residual = residual - star * (residual * star / photons).sum() / (star**2 / photons).sum()
+            remaining, scaled_again = np.where(neighbours, 0.0, residual), True
+            continue
+        step = tuple(int(at - middle) for at, middle in zip(place, peak, strict=True))
+        profile = ndimage.shift(star, step, order=0, mode="constant", prefilter=False)
+        pixels = light[place] / norm[place] * profile > _FAINT * rms
+        # What is wider than a star: pixels above the noise, smoothed, that are connected with it.
+        above = ndimage.uniform_filter(remaining, 3, mode="constant") > _CONNECTED / 3.0 * np.sqrt(variance)
+        labels, _ = ndimage.label(above)
+        if labels[place]:
+            pixels |= labels == labels[place]
+        pixels[place] = True
+        neighbours |= pixels
+        remaining = np.where(neighbours, 0.0, residual)
+    return neighbours if neighbours.any() else None
 
 
 def _correlate(image: np.ndarray, star: np.ndarray, peak: tuple[np.intp, ...]) -> np.ndarray:

@@ -7,6 +7,7 @@ from .core.errors import PrescriptionError as PrescriptionError
 from .core.errors import PrescriptionWarning as PrescriptionWarning
 from .core.errors import ProductError as ProductError
 from .core.errors import UnknownNameError as UnknownNameError
+from .core.errors import WcsWarning as WcsWarning
 from .core.long_work import Execution as Execution
 from .design.analyses.coatings import Absorption as Absorption
 from .design.analyses.coatings import Coatings as Coatings

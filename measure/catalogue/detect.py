@@ -84,8 +84,8 @@ def detect_objects(
     Raises
     ------
     DomainError
-        If shapes differ, a pixel that is not masked is not finite or has no positive variance, an option is out of
-        range, or nothing is detected.
+        If shapes differ, a pixel that is not masked has no positive variance, an option is out of range, or nothing is
+        detected.
     """
     bits = np.zeros(np.shape(image), dtype=np.int64) if mask is None else np.asarray(mask)
     if bits.dtype.kind not in "iub" or hasattr(mask, "unit"):
@@ -97,7 +97,7 @@ def detect_objects(
     if background_size is not None:
         require_count(background_size, "background_size", 1, 2**31 - 1)
     if ignored.all():
-        raise DomainError("mask: expected at least one pixel that is not masked")
+        raise DomainError("mask: expected at least one pixel that is not masked, and finite")
     data = np.where(ignored, 0.0, pixels)
     # SEP reads C arrays; masked pixels have any positive variance.
     variances = np.ascontiguousarray(np.where(ignored, 1.0, variances))

@@ -76,7 +76,8 @@ def fit_galaxies(
     psf_index : array of int, optional
         Index into `psf_images` of each galaxy's PSF, [n]: quicker than an image for each where galaxies share one.
     mask : array, optional
-        [ny, nx], not zero for pixels to ignore.
+        [ny, nx], not zero for pixels to ignore, besides those that are not finite, or -1e29 or less, or of a variance
+        that is not finite.
     segmentation : array of int, optional
         [ny, nx], 0 for sky, otherwise the number of an object: pixels of objects other than the one at (x, y) are
         ignored.
@@ -95,8 +96,8 @@ def fit_galaxies(
     Raises
     ------
     DomainError
-        If shapes differ, a pixel that is not masked is not finite or has no positive variance, a position lies outside
-        the image, or a PSF has an even side or no unit sum.
+        If shapes differ, a pixel that is not masked has no positive variance, a position lies outside the image, or a
+        PSF has an even side or no unit sum.
     """
     options = _checked_options(max_evaluations, tolerance, threads)
     pixels, variances, ignored = check_pixels(image, variance, mask)
@@ -163,7 +164,7 @@ def fit_galaxy_stamps(
     psf_index : array of int, optional
         Index into `psf_images` of each galaxy's PSF, [n].
     mask : array, optional
-        [n, ny, nx], not zero for pixels to ignore.
+        [n, ny, nx], not zero for pixels to ignore, besides those of :func:`fit_galaxies`.
     start : GalaxyFits, optional
         Earlier fits of the same galaxies, such as with other PSFs, near which to begin; by default moments of the
         stamps.

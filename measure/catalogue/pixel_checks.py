@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...core.errors import DomainError, shown
 from ...core.units import real_array
+from ..pixel_masks import bad_pixels
 
 
 def check_pixels(
@@ -17,12 +18,15 @@ def check_pixels(
     axes: str = "[ny, nx]",
     name: str = "image",
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return image and variance as float64, and the masked pixels as bool, all of one shape.
+    """Return image and variance as float64, and the pixels without weight as bool, all of one shape.
+
+    Those are masked, bad (not finite, or -1e29 or less, as of SExtractor), or of a variance that is not finite: the
+    inverse of a weight of zero.
 
     Raises
     ------
     DomainError
-        If shapes differ, or a pixel that is not masked is not finite or has no positive variance.
+        If shapes differ, or a variance is zero or negative in a pixel that is not masked.
     """
     pixels = real_array(image, f"{name}: expected real numbers {axes}")
     variances = real_array(variance, f"variance: expected real numbers {axes}")
@@ -34,10 +38,8 @@ def check_pixels(
     for array_name, array in (("variance", variances), ("mask", ignored)):
         if array.shape != pixels.shape:
             raise DomainError(f"{array_name} has shape {array.shape}: expected {pixels.shape}, that of the {name}")
-    _require_pixels(np.isfinite(pixels) | ignored, name, pixels, "finite")
-    _require_pixels(
-        (np.isfinite(variances) & (variances > 0.0)) | ignored, "variance", variances, "positive and finite"
-    )
+    ignored = ignored | bad_pixels(pixels) | ~np.isfinite(variances)
+    _require_pixels((variances > 0.0) | ignored, "variance", variances, "positive")
     return pixels, variances, ignored
 
 

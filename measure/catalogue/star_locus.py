@@ -15,6 +15,8 @@ from ...core.point_plots import draw_points
 from ...core.result import Result
 from ...core.statistics import RMS_PER_MAD
 from ...core.units import real_array, require_count, require_positive
+from ..masked_moments import MOST_MASKED
+from ..pixel_masks import bad_pixels, fill_symmetric
 from ..stamps import center_stamps
 from .cutouts import cut_out, first_pixel
 from .objects import DetectedObjects
@@ -39,7 +41,8 @@ _MARGIN = 8
 class StarCut(IntFlag):
     """Reasons for the rejection of an object as a star; zero for a selected one.
 
-    ``FLAGGED``: edge, saturated, blended or masked, or such pixels within the stamp. ``FAINT``: below the least S/N.
+    ``FLAGGED``: edge, saturated, blended or masked, or such pixels within the inner half of the stamp or most of it, or
+    a stamp that reaches beyond the image. ``FAINT``: below the least S/N.
     ``SIZE``, ``WIDTH``, ``SHAPE``: half-light radius, FWHM and ellipticity apart from those of the locus.
     ``NEIGHBOUR``: another object nearby. ``DEFECT``: a stamp that is not that of a single star.
     """
@@ -73,6 +76,8 @@ class StarSelection(Result):
     stamps : array
         The selected stars shifted to the centre of a pixel, background subtracted, in the unit of the image, [k, size,
         size].
+    masks : array of bool, optional
+        Pixels of the stamps without weight, which hold those opposite the centre, [k, size, size]; None without any.
     """
 
     _table = ("index", "positions", "snr")
@@ -85,6 +90,7 @@ class StarSelection(Result):
     positions: np.ndarray
     snr: np.ndarray
     stamps: np.ndarray
+    masks: NDArray[np.bool_] | None = None
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw the places of the selected stars, coloured by the logarithm of their S/N."""
@@ -110,6 +116,7 @@ class StarSelection(Result):
             positions=self.positions[good],
             snr=self.snr[good],
             stamps=self.stamps[good],
+            masks=None if self.masks is None else self.masks[good],
         )
 
     @check_arguments
@@ -175,7 +182,7 @@ def select_stars(
     size : int
         Side of the stamps, odd [pixel].
     mask : array, optional
-        [ny, nx], not zero for pixels that no stamp may hold; those that are not finite are among them.
+        [ny, nx], not zero for pixels without weight; those that are not finite, or -1e29 or less, are among them.
 
     Returns
     -------
@@ -194,7 +201,7 @@ def select_stars(
     masked = flagged(mask, pixels.shape)
     if masked.shape != pixels.shape:
         raise DomainError(f"mask has shape {masked.shape}: expected {pixels.shape}, that of the image")
-    bad = ~np.isfinite(pixels) | masked
+    bad = bad_pixels(pixels) | masked
     if require_count(size, "size", 1, 4096) % 2 == 0:
         raise DomainError(f"size = {size}: expected an odd number of pixels")
     for name, value in (
@@ -207,7 +214,7 @@ def select_stars(
     snr = np.where(np.isfinite(objects.half_light_radius), objects.snr, 0.0)
     radius = np.where(np.isfinite(objects.half_light_radius), objects.half_light_radius, 0.0)
     cuts = np.zeros(len(objects), dtype=np.int32)
-    spoilt = cut_out(bad, objects.x, objects.y, size, True).any(axis=(1, 2))
+    spoilt = _spoilt(bad, objects.x, objects.y, size)
     cuts[(objects.flags != 0) | spoilt | ~np.isfinite(objects.fwhm)] |= StarCut.FLAGGED
     cuts[~(snr >= min_snr)] |= StarCut.FAINT
     bright = (cuts == 0) & (snr >= bright_snr)
@@ -225,6 +232,8 @@ def select_stars(
     cuts[objects.neighbour_distance < isolation] |= StarCut.NEIGHBOUR
     index = np.flatnonzero(cuts == 0)
     x, y = objects.x[index], objects.y[index]
+    stamps = _centered_stamps(np.where(bad, np.nan, pixels - objects.background), x, y, size)
+    weightless = np.isnan(stamps)
     return StarSelection(
         index=index,
         cuts=cuts,
@@ -232,8 +241,17 @@ def select_stars(
         width=width,
         positions=np.stack([x, y], axis=1),
         snr=objects.snr[index],
-        stamps=_centered_stamps(np.where(bad, 0.0, pixels - objects.background), x, y, size),
+        stamps=fill_symmetric(stamps, weightless) if weightless.any() else stamps,
+        masks=weightless if weightless.any() else None,
     )
+
+
+def _spoilt(bad: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> np.ndarray:
+    """Return objects whose stamps reach beyond the image, or hold bad pixels in their inner half or in most of it."""
+    beyond = cut_out(np.zeros(bad.shape, dtype=bool), x, y, size, True).any(axis=(1, 2))
+    stamps = cut_out(bad, x, y, size, True)
+    inner = slice(size // 4, size - size // 4)
+    return np.asarray(beyond | stamps[:, inner, inner].any(axis=(1, 2)) | (stamps.mean(axis=(1, 2)) > MOST_MASKED))
 
 
 def _stellar_locus(radius: np.ndarray, least: int) -> tuple[float, float]:

@@ -5,25 +5,20 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
 
 from ...core.errors import DomainError
 from ...core.statistics import robust_rms
+from ...measure.masked_moments import MOST_MASKED
+from ...measure.pixel_masks import bad_pixels, copied_pixels, fill_symmetric
 from ...measure.shapes import measure_shapes
 from ...measure.stamps import fourier_shift, shift_mask
-from .star_catalogue import bad_pixels
 
-#: A star is lost where bad pixels hold more than this fraction of its light above half of its peak, or of its light
-#: under the weight of the moments: what is measured would be the model rather than the star.
-MOST_MASKED = 0.5
-# Standard deviation of the weights of good neighbours [pixel], about the width of a star.
-_NEIGHBOURHOOD = 1.5
-# Least sum of these weights: a bad pixel without any near starts as sky.
-_LEAST_NEIGHBOURS = 1e-3
 # Passes end when no centroid moves by more than this [pixel], a tenth of the error of a star of S/N 200.
 _CONVERGED = 1e-3
 # Most passes.
 _MOST_PASSES = 10
+# Passes with a new median star: later ones change it by less than its noise.
+_MEDIAN_PASSES = 3
 # Fewest pixels of sky.
 _FEWEST_SKY = 20
 # Fraction of the good pixels, the farthest from the centre, that stands in where fewer are good.
@@ -31,8 +26,9 @@ _OUTERMOST = 0.25
 
 
 def as_bad_pixels(images: np.ndarray, masks: Any) -> np.ndarray:
-    """Return pixels of stamps that are masked or bad (:func:`~.star_catalogue.bad_pixels`), bool [n, ny, nx]."""
+    """Return pixels of stamps that are masked, bad or copied (:mod:`~pachon.measure.pixel_masks`), bool [n, ny, nx]."""
     bad = bad_pixels(images)
+    bad |= copied_pixels(np.where(bad, 0.0, images))
     if masks is None:
         return bad
     masked = np.asarray(masks)
@@ -64,32 +60,13 @@ def sky_of_stamps(images: np.ndarray, bad: np.ndarray, radius: float) -> tuple[n
     return level, rms
 
 
-def fill_symmetric(images: np.ndarray, bad: np.ndarray) -> np.ndarray:
-    """Fill bad pixels by those opposite the centre, or by the mean of good neighbours: a first guess.
-
-    `images` are background-subtracted [n, ny, nx].
-    """
-    filled = np.where(bad, 0.0, images)
-    opposite = bad & ~bad[:, ::-1, ::-1]
-    filled[opposite] = images[:, ::-1, ::-1][opposite]
-    alone = bad & ~opposite
-    for i in np.flatnonzero(alone.any(axis=(1, 2))):
-        weight, light = (
-            ndimage.gaussian_filter(values, _NEIGHBOURHOOD, mode="constant")
-            for values in ((~bad[i]).astype(np.float64), np.where(bad[i], 0.0, images[i]))
-        )
-        near = alone[i] & (weight > _LEAST_NEIGHBOURS)
-        filled[i][near] = light[near] / weight[near]
-    return filled
-
-
 def fill_by_median_star(
     images: np.ndarray, bad: np.ndarray, pixel_scale: float, weight_fwhm: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fill bad pixels of background-subtracted stamps [n, ny, nx] by the median star at each star's place and flux.
 
     Places depend on the filled pixels, so both are iterated. Returns the filled stamps; the median star [ny, nx],
-    centred on pixel (ny // 2, nx // 2); and the stars of which too little is left (:data:`MOST_MASKED`), [n] bool.
+    centred on pixel (ny // 2, nx // 2); and the stars of which too little is left (`MOST_MASKED`), [n] bool.
     Stars that are lost hold the median star in their bad pixels; where no star can be measured, the first guess.
     """
     filled = fill_symmetric(images, bad)
@@ -97,20 +74,22 @@ def fill_by_median_star(
     x, y, usable = shapes.x, shapes.y, shapes.usable
     sigma = weight_sigma(pixel_scale, weight_fwhm)
     masked, lost = np.flatnonzero(bad.any(axis=(1, 2))), np.zeros(len(images), dtype=bool)
-    star = np.zeros(images.shape[1:])
-    for _ in range(_MOST_PASSES):
+    star, moving = np.zeros(images.shape[1:]), masked
+    for number in range(_MOST_PASSES):
         if not usable.any():
             break
-        star = _median_star(filled[usable], bad[usable], x[usable], y[usable], sigma)
-        profiles = np.broadcast_to(star, (len(masked), *star.shape))
-        filled[masked], lost[masked] = fill_by_profiles(
-            images[masked], bad[masked], profiles, x[masked], y[masked], sigma
+        if number < _MEDIAN_PASSES:
+            star, moving = _median_star(filled[usable], bad[usable], x[usable], y[usable], sigma), masked
+        profiles = np.broadcast_to(star, (len(moving), *star.shape))
+        filled[moving], lost[moving] = fill_by_profiles(
+            images[moving], bad[moving], profiles, x[moving], y[moving], sigma
         )
-        shapes = measure_shapes(filled[masked], pixel_scale, weight_fwhm)
-        step = np.hypot(shapes.x - x[masked], shapes.y - y[masked])
-        x[masked], y[masked] = shapes.x, shapes.y
-        usable[masked] = shapes.usable & ~lost[masked]
-        if not (step[usable[masked]] > _CONVERGED).any():
+        shapes = measure_shapes(filled[moving], pixel_scale, weight_fwhm)
+        step = np.hypot(shapes.x - x[moving], shapes.y - y[moving])
+        x[moving], y[moving] = shapes.x, shapes.y
+        usable[moving] = shapes.usable & ~lost[moving]
+        moving = moving[usable[moving] & (step > _CONVERGED)]
+        if not len(moving):
             break
     return filled, star, lost
 
@@ -133,7 +112,7 @@ def fill_by_profiles(
     Returns
     -------
     tuple of array
-        Filled stamps [n, ny, nx], and the stars that are lost (:data:`MOST_MASKED`), [n] bool.
+        Filled stamps [n, ny, nx], and the stars that are lost (`MOST_MASKED`), [n] bool.
     """
     filled, lost = images.copy(), np.zeros(len(images), dtype=bool)
     middle = _middle_pixel(images.shape[1:])
@@ -147,6 +126,18 @@ def fill_by_profiles(
         core = np.where(profile > 0.5 * profile.max(), profile, 0.0)
         lost[i] = any(star_light[bad[i]].sum() > MOST_MASKED * star_light.sum() for star_light in (core, light))
     return filled, lost
+
+
+def apart_from_core(masks: np.ndarray, star: np.ndarray, sigma: float) -> np.ndarray:
+    """Return which masks of defects leave their stars enough (`MOST_MASKED`), [n] bool.
+
+    `masks` [n, ny, nx] and the median star [ny, nx] are centred on pixel (ny // 2, nx // 2); the weight of the moments
+    has the rms width `sigma` [pixel].
+    """
+    light = _weight(star.shape, _middle_pixel(star.shape), sigma) * star
+    core = np.where(star > 0.5 * star.max(), star, 0.0)
+    fractions = [(masks * star_light).sum(axis=(1, 2)) / star_light.sum() for star_light in (core, light)]
+    return np.asarray(np.max(fractions, axis=0) <= MOST_MASKED)
 
 
 def profiles_of_psfs(psfs: np.ndarray, star: np.ndarray, sigma: float) -> np.ndarray:

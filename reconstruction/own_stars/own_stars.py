@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,8 +14,9 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.random_streams import stream
 from ...core.units import positive_angle, real_array, require_seed
+from ...measure.pixel_masks import fill_symmetric
 from ...measure.shapes import Shapes, fwhm, measure_shapes
-from ...measure.stamps import center_masks, center_stamps
+from ...measure.stamps import center_masks, center_stamps, decenter_masks
 from ...measure.star_selection import StarFlag, flag_stars, require_stars
 from ..psf_model import kriging
 from ..psf_model.checks import as_extent
@@ -23,10 +24,10 @@ from ..psf_model.model import PsfModel
 from ..psf_model.polynomial import as_positions
 from .candidates import CANDIDATES, choose_candidate
 from .masked_stars import (
+    apart_from_core,
     as_bad_pixels,
     fill_by_median_star,
     fill_by_profiles,
-    fill_symmetric,
     profiles_of_psfs,
     sky_of_stamps,
     weight_sigma,
@@ -41,9 +42,11 @@ FOLDS = 5
 _SKY = 0.4
 # Rim of a stamp that a shift may bring in from the other side [pixel].
 _RIM = 2
-# Times that bad pixels are filled anew by the model of stars that were filled: a pixel's error falls by the part that
-# the model takes from the star itself, a fifth or less.
+# Times that bad pixels are filled anew by the model of stars that were filled: the error of a pixel falls by the
+# fraction of the stars in which it is bad each time.
 _MODEL_PASSES = 2
+# Defects that may be masked in a star that stays.
+_MASKABLE = StarFlag.NEIGHBOUR | StarFlag.COSMIC_RAY
 
 
 @check_arguments
@@ -62,7 +65,7 @@ def fit_own_stars(
     seed: int = 1,
     **options: Any,
 ) -> OwnStars:
-    """Centre stars, leave out those with defects, model the PSF, and predict each star from others.
+    """Centre stars, mask or leave out defects, model the PSF, and predict each star from others.
 
     The kind of model is chosen by the stars that are held out: kriging of pixels, unless pixels of order 0 to 2 or
     principal components, with the noise of each star, predict them better by two standard errors.
@@ -87,9 +90,11 @@ def fit_own_stars(
         (xmin, xmax, ymin, ymax) of the CCD in the unit of the positions; that of the stars by default.
     masks : array of bool, optional
         [n, ny, nx], True for pixels to ignore, besides those that hold no light: not finite, or -1e29 or less (-1e30 of
-        SExtractor). They are left out of the sky, of fluxes and of noise, and filled before a star is centred: by
-        the median star, then by the model at the star's place. A star is lost (``MASKED``) only where they hold more
-        than half of its light above half of its peak, or under the weight of the moments.
+        SExtractor), copies of dead columns (:func:`~pachon.measure.pixel_masks.copied_pixels`), and neighbours and
+        cosmic rays of stars. They are left out of the sky, of fluxes and of noise, and filled before a star is
+        centred: by the median star, then by the model at the star's place. A star is lost only where they hold
+        more than half of its light above half of its peak, or under the weight of the moments: with the flag of its
+        neighbour or cosmic ray, else ``MASKED``.
     seed : int
         Of the parts that are held out.
     **options
@@ -100,41 +105,44 @@ def fit_own_stars(
     DomainError
         If stamps are too small, fewer than five stars are left, or the model cannot be made.
     """
-    images, places = real_array(stamps, "stamps: expected real numbers [n, ny, nx]"), as_positions(positions)
-    if images.ndim != 3 or len(images) != len(places):
+    raw_images, places = real_array(stamps, "stamps: expected real numbers [n, ny, nx]"), as_positions(positions)
+    if raw_images.ndim != 3 or len(raw_images) != len(places):
         raise DomainError(
-            f"stamps of shape {images.shape}, {len(places)} positions: expected [n, ny, nx] and as many positions"
+            f"stamps of shape {raw_images.shape}, {len(places)} positions: expected [n, ny, nx] and as many positions"
         )
-    bad = as_bad_pixels(images, masks)
+    bad = as_bad_pixels(raw_images, masks)
+    if bad.size and bad.all():
+        raise DomainError(f"no pixel of {len(bad)} stamps has weight: all are masked, or no numbers")
     scale = positive_angle(pixel_scale, "pixel_scale")
     if not (np.isfinite(gain) and gain > 0.0):
         raise DomainError(f"gain = {gain}: expected a number of electrons above 0")
-    side = min(images.shape[1:])
+    side = min(raw_images.shape[1:])
     if size is None:
         size = max(side - 2 * _RIM - 1 + (side % 2), 0)
     if size % 2 == 0 or not 9 <= size <= side:
         raise DomainError(f"size = {size}: expected an odd number of pixels from 9 to {side}, the side of the stamps")
-    level, rms = sky_of_stamps(images, bad, _SKY * side)
-    images = np.where(bad, 0.0, images - np.nan_to_num(level)[:, None, None] if background else images)
-    filled = fill_symmetric(images, bad)
-    wide = measure_shapes(filled, scale, 0.25 * side * scale)
-    weight = float(np.nanmedian(fwhm(filled[wide.usable], scale))) if wide.usable.any() else np.nan
-    if not np.isfinite(weight):
-        raise DomainError(f"none of {len(images)} stamps has a star in its middle")
 
-    def select(filled: np.ndarray, lost: np.ndarray, flags: np.ndarray | None = None) -> _CentredStars:
+    def less_sky(bad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        level, rms = sky_of_stamps(raw_images, bad, _SKY * side)
+        sky = np.nan_to_num(level)[:, None, None] if background else 0.0
+        return np.where(bad, 0.0, raw_images - sky), rms
+
+    def select(filled: np.ndarray, lost: np.ndarray, earlier: _CentredStars | None = None) -> _CentredStars:
         first = measure_shapes(filled, scale, weight)
         centred = center_stamps(filled, first.x, first.y, size=size, normalize=False)
-        if flags is None:
+        if earlier is None:
             noise = np.where(rms > 0.0, rms, 1.0)
-            flags = flag_stars(centred, noise, gain=gain, saturation=saturation).flags
+            selection = flag_stars(centred, noise, gain=gain, saturation=saturation)
+            flags, defects, apart = selection.flags, selection.masks, np.zeros(len(centred), dtype=bool)
+        else:
+            flags, defects, apart = earlier.flags, earlier.defects, earlier.apart
         shapes = measure_shapes(centred, scale, weight)
         flags = np.where(shapes.usable, flags, flags | StarFlag.UNUSABLE)
         flags = np.where(lost, StarFlag.MASKED, flags)
         snr = _signal_to_noise(centred, rms, gain)
-        used = (flags == 0) & (snr >= min_snr)
-        require_stars(used, flags, FEWEST_STARS)
-        return _CentredStars(first, centred, center_masks(bad, first.x, first.y, size), shapes, flags, snr, used)
+        used = ((flags == 0) | (apart & ((flags & ~_MASKABLE) == 0))) & (snr >= min_snr)
+        masks = center_masks(bad, first.x, first.y, size)
+        return _CentredStars(first, centred, masks, shapes, flags, snr, used, defects, apart)
 
     def fit(chosen: np.ndarray, kind: Mapping[str, Any]) -> PsfModel:
         span = as_extent(extent, places[stars.used])
@@ -149,14 +157,34 @@ def fit_own_stars(
             )
         return predicted
 
-    if bad.any():
-        masked = bad.any(axis=(1, 2))
+    images, rms = less_sky(bad)
+    filled, lost = fill_symmetric(images, bad), np.zeros(len(images), dtype=bool)
+    wide = measure_shapes(filled, scale, 0.25 * side * scale)
+    weight = float(np.nanmedian(fwhm(filled[wide.usable], scale))) if wide.usable.any() else np.nan
+    if not np.isfinite(weight):
+        raise DomainError(f"none of {len(images)} stamps has a star in its middle")
+
+    def fill() -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         filled, median_star, lost = fill_by_median_star(images, bad, scale, weight)
         complete = wide.usable & ~lost
         if not complete.any():
             require_stars(complete, np.where(lost, StarFlag.MASKED, StarFlag.UNUSABLE), FEWEST_STARS)
-        weight = float(np.nanmedian(fwhm(filled[complete], scale)))
-        stars = select(filled, lost)
+        return filled, median_star, lost, float(np.nanmedian(fwhm(filled[complete], scale)))
+
+    if bad.any():
+        filled, median_star, lost, weight = fill()
+    stars = select(filled, lost)
+    stars = stars.with_defects_apart(weight_sigma(scale, weight))
+    if stars.apart.any():
+        first = stars.first
+        bad = bad | decenter_masks(stars.defects, first.x, first.y, images.shape[1:])
+        images, rms = less_sky(bad)
+        filled, median_star, lost, weight = fill()
+        stars = select(filled, lost, stars)
+    _require_used(stars, min_snr, gain)
+    if bad.any():
+        masked = bad.any(axis=(1, 2))
+        complete = wide.usable & ~lost
         for _ in range(_MODEL_PASSES):
             psfs = fit(np.flatnonzero(stars.used), options).at(places[masked])
             sigma = weight_sigma(scale, weight)
@@ -169,9 +197,8 @@ def fit_own_stars(
                 sigma,
             )
             weight = float(np.nanmedian(fwhm(filled[complete], scale)))
-            stars = select(filled, lost, stars.flags)
-    else:
-        stars = select(filled, np.zeros(len(images), dtype=bool))
+            stars = select(filled, lost, stars)
+            _require_used(stars, min_snr, gain)
     used = stars.used
     used_indices = np.flatnonzero(used)
     parts = np.array_split(
@@ -204,6 +231,7 @@ def fit_own_stars(
         held_out,
         stamps_used,
         predicted,
+        stars.masks[used],
         *sigmas,
         scale,
         weight,
@@ -222,15 +250,43 @@ class _CentredStars:
     flags: np.ndarray  #: :class:`~.StarFlag` bits, [n]
     snr: np.ndarray  #: [n]
     used: np.ndarray  #: bool [n]
+    defects: np.ndarray  #: pixels of neighbours and cosmic rays, bool [n, size, size]
+    apart: np.ndarray  #: stars whose only defects are apart from their core, and masked, bool [n]
+
+    def with_defects_apart(self, sigma: float) -> _CentredStars:
+        """Return the stars with those marked whose defects are apart from their core; `sigma` as of the moments."""
+        good = self.images[self.flags == 0]
+        with_defects = (self.flags != 0) & ((self.flags & ~_MASKABLE) == 0)
+        if not len(good) or not with_defects.any():
+            return self
+        median_star = np.median(good / good.sum(axis=(1, 2), keepdims=True), axis=0)
+        apart = with_defects & apart_from_core(self.defects, median_star, sigma)
+        return replace(self, apart=apart, defects=self.defects & apart[:, None, None])
+
+
+def _require_used(stars: _CentredStars, min_snr: float, gain: float) -> None:
+    """Raise DomainError, with the reasons, where fewer than :data:`FEWEST_STARS` are used."""
+    faint = (stars.snr < min_snr) & (stars.flags == 0)
+    reason = ""
+    if faint.any():
+        electrons = float(np.median(stars.images[faint].sum(axis=(1, 2)))) * gain
+        reason = (
+            f"{int(faint.sum())} of S/N below min_snr = {min_snr:g}, of {electrons:.3g} electrons in the median by "
+            f"gain = {gain:g}"
+        )
+    require_stars(stars.used, np.where(stars.used, 0, stars.flags), FEWEST_STARS, reason)
 
 
 def _signal_to_noise(stamps: np.ndarray, rms: np.ndarray, gain: float) -> np.ndarray:
     """Return the S/N of PSF photometry, [n], with the median star as the PSF; NaN where there is no light."""
-    flux = stamps.sum(axis=(1, 2))
+    total = stamps.sum(axis=(1, 2))
+    psf = np.nanmedian(stamps / np.where(total > 0.0, total, np.nan)[:, None, None], axis=0)
+    psf /= psf.sum()
+    squares = (psf**2).sum()
+    # The sum over a wide stamp has ten times the noise of the fit.
+    flux = (stamps * psf).sum(axis=(1, 2)) / squares
     flux = np.where(flux > 0.0, flux, np.nan)
-    psf = np.nanmedian(stamps / flux[:, None, None], axis=0)
-    area = psf.sum() ** 2 / (psf**2).sum()
-    return flux / np.sqrt(flux / gain + area * rms**2)
+    return flux / np.sqrt(flux / gain + rms**2 / squares)
 
 
 def _spread(shapes: Shapes, used: np.ndarray) -> Shapes:

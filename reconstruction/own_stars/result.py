@@ -47,7 +47,8 @@ class OwnStars(Result):
     snr : ndarray
         Signal-to-noise ratio, [n].
     flags : ndarray
-        :class:`~.StarFlag` bits, [n]; stars without any, and of enough S/N, are used.
+        :class:`~.StarFlag` bits, [n]. Stars of enough S/N are used that have none, or neighbours and cosmic rays that
+        leave enough of their core.
     used : ndarray
         [n] bool.
     shapes : Shapes
@@ -56,6 +57,8 @@ class OwnStars(Result):
         Of the model made without the star and others of its part; NaN for stars that are not used.
     stamps, predicted : ndarray
         Used stars and the models made without them, unit sum, [n_used, ny, nx].
+    masks : ndarray
+        Pixels of `stamps` without weight, which hold the model in place of the star, bool [n_used, ny, nx].
     sigma_e, sigma_size : ndarray
         Noise of a component of the ellipticity, and of the relative size, of the used stars, [n_used].
     pixel_scale, weight_fwhm : float
@@ -75,6 +78,7 @@ class OwnStars(Result):
     held_out: Shapes
     stamps: np.ndarray
     predicted: np.ndarray
+    masks: NDArray[np.bool_]
     sigma_e: np.ndarray
     sigma_size: np.ndarray
     pixel_scale: float
@@ -90,6 +94,7 @@ class OwnStars(Result):
             "snr": (self.snr, "", "signal-to-noise ratio"),
             "flags": (self.flags, "", "bits of StarFlag"),
             "used": (self.used, "", "whether the model is made of it"),
+            "masked": (_of_all(self.masks.sum(axis=(1, 2)), self.used), "", "pixels without weight; -1 if not used"),
             "e1": (star_shapes.e1, "", "ellipticity along x"),
             "e2": (star_shapes.e2, "", "ellipticity along the diagonal x = y"),
             "size": (star_shapes.size / ARCSEC, "arcsec", "weighted rms size"),
@@ -162,6 +167,13 @@ def star_rho_statistics(places: np.ndarray, stars: Shapes, model: Shapes, bins: 
     return rho_statistics(
         x, y, *star_values, *model_values, min_sep=longest / _LONGEST_OVER_SHORTEST, max_sep=longest, n_bins=bins
     )
+
+
+def _of_all(counts: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Return counts of the used stars as those of all, -1 for the others."""
+    all_counts = np.full(len(used), -1)
+    all_counts[used] = counts
+    return all_counts
 
 
 def _rms(*values: np.ndarray) -> float:
@@ -240,7 +252,8 @@ def _stamps(own: OwnStars, axes: Axes) -> None:
     gallery = StampGallery(axes, own.stamps.shape[1], own.pixel_scale)
     for column, star in enumerate(order[ranks]):
         top = own.predicted[star].max()
-        images = (own.stamps[star], own.predicted[star], own.stamps[star] - own.predicted[star])
+        stamp = np.where(own.masks[star], np.nan, own.stamps[star])  # blank where there is no weight
+        images = (stamp, own.predicted[star], stamp - own.predicted[star])
         for row, image in enumerate(images):
             colours: dict[str, Any] = {"cmap": "viridis", "vmin": float(stretched(np.array(-0.02))), "vmax": 1.0}
             shown = stretched(image / top)

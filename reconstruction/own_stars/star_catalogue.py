@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,21 +15,27 @@ from astropy.table import Table
 from ...core.arguments import check_arguments
 from ...core.errors import ProductError
 from ...core.files import parsing, read_bytes
+from .lsst_stamps import is_stamp_file, read_stamp_file
+from .stamp_weights import without_weightless
 
-#: Names that SExtractor and the LSST pipelines have for columns, in lower case.
+#: Names that SExtractor, Piff and the LSST pipelines have for columns, in lower case.
 OTHER_NAMES = {
     "x": ("xwin_image", "x_image", "xpsf_image", "slot_centroid_x", "base_sdsscentroid_x"),
     "y": ("ywin_image", "y_image", "ypsf_image", "slot_centroid_y", "base_sdsscentroid_y"),
-    "stamp": ("vignet",),
+    "stamp": ("vignet", "image", "deblended"),
+    "weight": ("vignet_weight", "weights"),
+    "variance": ("vignet_variance",),
+    "mask": ("vignet_mask", "masks", "badpix"),
 }
-# Values at or below this are no light: SExtractor's masked pixels are -1e30.
-_MASKED = -1e29
+
+# Names of images that are no stamps.
+_QUALITY_NAMES = {name for kind in ("weight", "variance", "mask") for name in (kind, *OTHER_NAMES[kind])}
 
 
 class StarCutouts(NamedTuple):
     """Stars to fit a PSF model to."""
 
-    stamps: np.ndarray  #: [n, ny, nx], as they stand in the file
+    stamps: np.ndarray  #: [n, ny, nx], as they stand in the file, NaN where a pixel has no weight
     positions: np.ndarray  #: [n, 2], in the unit of the table
 
 
@@ -40,9 +46,11 @@ def load_stars(
     x: str = "x",
     y: str = "y",
     stamp: str = "stamp",
+    weight: str | None = None,
+    mask: str | None = None,
     images: str | Path | None = None,
 ) -> StarCutouts:
-    """Read stars from a FITS or ECSV table.
+    """Read stars from a FITS or ECSV table, or a file of LSST stamps.
 
     Nothing is subtracted, shifted or left out: :func:`~pachon.measure.stamps.center_stamps` centres stars,
     :func:`~pachon.measure.star_selection.flag_stars` finds those to leave out.
@@ -50,56 +58,70 @@ def load_stars(
     Parameters
     ----------
     catalogue : str or Path
-        The table; of a FITS file its first one with a position. The names of columns may be in any case.
+        The table; of a FITS file its first one with a position. The names of columns may be in any case. A table of one
+        row, each column of which holds all stars, is read too (Piff's test data). A FITS file without such a table may
+        hold stamps one by one, in extensions IMAGE, MASK and VARIANCE with EXTVER, as the LSST pipelines write them.
     x, y : str
         Columns of the positions, in any unit; for "x" and "y" names of SExtractor and of LSST stand in,
         :data:`OTHER_NAMES`.
     stamp : str
-        Column of the stamps, [ny, nx] in every row; VIGNET of SExtractor stands in for "stamp", bad pixels
-        (:func:`bad_pixels`) become NaN. Where a FITS file has none, its first image of three axes is taken.
+        Column of the stamps, [ny, nx] in every row; VIGNET of SExtractor, IMAGE and DEBLENDED stand in for "stamp".
+        Where a FITS file has none, its first image of three axes is taken.
+    weight, mask : str, optional
+        Columns of weights (zero for pixels to ignore) and masks (not zero for pixels to ignore; where the header has
+        cards such as MP_BAD, the bits of bad planes, :data:`~.stamp_weights.BAD_PLANES`). Where nothing is said,
+        columns WEIGHT, VIGNET_WEIGHT, VARIANCE, MASK and so on (:data:`OTHER_NAMES`), and images of three axes whose
+        EXTNAME is one of these.
     images : str or Path, optional
         FITS file whose first image of three axes, [n, ny, nx], holds the stamps in the order of the table.
 
     Returns
     -------
     StarCutouts
-        Stamps and positions, to be unpacked.
+        Stamps and positions, to be unpacked. Pixels without weight, and bad ones
+        (:mod:`~pachon.measure.pixel_masks`), are NaN.
 
     Raises
     ------
     ProductError
-        If a file is missing, cut short, of another kind, or lacks a column; one line that names it.
+        If a file is missing, cut short, of another kind, or lacks a column, or no pixel has weight; one line that names
+        it.
     """
     path = Path(catalogue)
     data = read_bytes(path, ProductError)
     hdus: fits.HDUList | None = None
+    header: Mapping[str, Any] = {}
     if data.startswith(b"SIMPLE"):
         hdus = _read_fits_parts(path, data)
         tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU) and not isinstance(hdu, fits.CompImageHDU)]
-        if not tables:
+        with parsing(path, "damaged or not FITS", ProductError):
+            # SExtractor's LDAC files have a table of the image's header before that of the objects.
+            table = next((t for t in tables if _find_column(x, t.columns.names)), tables[0] if tables else None)
+        if (table is None or not _find_column(x, table.columns.names)) and is_stamp_file(hdus):
+            return StarCutouts(*read_stamp_file(hdus, path))
+        if table is None:
             raise ProductError(
                 f"has no table, expected one of stars with columns {x}, {y} and their stamps, {stamp}", file=path
             )
         with parsing(path, "damaged or not FITS", ProductError):
-            # SExtractor's LDAC files have a table of the image's header before that of the objects.
-            table = next((t for t in tables if _find_column(x, t.columns.names)), tables[0])
             columns = {name: np.asarray(table.data[name]) for name in table.columns.names}
+        header = table.header
     elif data.lstrip().startswith(b"# %ECSV"):
         columns = _read_ecsv_columns(path, data)
     else:
         raise ProductError("neither FITS nor ECSV, expected a table of stars", file=path)
 
-    cube = None
-    if images is not None:
-        cube = _first_cube(_read_fits_parts(Path(images), read_bytes(Path(images), ProductError)))
-        if cube is None:
-            raise ProductError("has no image of three axes, expected the stamps [n, ny, nx]", file=images)
+    cube_hdus = hdus if images is None else _read_fits_parts(Path(images), read_bytes(Path(images), ProductError))
+    cube = None if images is None else _first_cube(cube_hdus)
+    if images is not None and cube is None:
+        raise ProductError("has no image of three axes, expected the stamps [n, ny, nx]", file=images)
     x, y, stamp = (_find_column(name, columns) or name for name in (x, y, stamp))
     names = {name.lower(): name for name in columns}
     if cube is None and stamp.lower() not in names and hdus is not None:
         cube = _first_cube(hdus)
     needed_columns = [x, y] if cube is not None else [x, y, stamp]
     absent = [name for name in needed_columns if name.lower() not in names]
+    absent += [name for name in (weight, mask) if name is not None and name.lower() not in names]
     if absent:
         also = " and no image of three axes" if stamp in absent and hdus is not None else ""
         raise ProductError(
@@ -108,19 +130,42 @@ def load_stars(
             + "".join(f"; looked for {name}: {', '.join(OTHER_NAMES[name])}" for name in absent if name in OTHER_NAMES)
             + "; stamps are images [n, ny, nx]" * (stamp in absent)
         )
+    columns = _one_row_a_star(columns, names[x.lower()])
     positions = np.stack([_checked_column(path, name, columns[names[name.lower()]], 1) for name in (x, y)], axis=1)
     stamps = _checked_column(path, stamp, columns[names[stamp.lower()]], 3) if cube is None else cube
     if len(stamps) != len(positions):
         raise ProductError(f"{len(positions)} stars in the table, {len(stamps)} stamps in the images", file=path)
-    return StarCutouts(np.where(bad_pixels(stamps), np.nan, stamps), positions)
+    finite = np.isfinite(positions).all(axis=1)
+    if not finite.all():
+        row = int(finite.argmin())
+        at = ", ".join(f"{value:g}" for value in positions[row])
+        raise ProductError(f"{x}, {y} of row {row} are {at}: expected numbers", file=path)
+    quality: dict[str, np.ndarray | None] = {}
+    for kind, column in (("weight", weight), ("variance", None), ("mask", mask)):
+        name = _find_column(kind if column is None else column, columns)
+        if name is not None and (column is not None or columns[name].ndim == 3):
+            quality[kind] = _checked_column(path, name, columns[name], 3)
+        else:
+            quality[kind] = None if cube is None else _cube_named(cube_hdus, (kind, *OTHER_NAMES[kind]))
+    return StarCutouts(
+        without_weightless(
+            stamps,
+            quality["weight"],
+            quality["mask"],
+            header,
+            path,
+            variances=quality["variance"],
+            names=(weight or "weight", mask or "mask"),
+        ),
+        positions,
+    )
 
 
-def bad_pixels(stamps: np.ndarray) -> np.ndarray:
-    """Return the pixels that hold no light, bool, shape of the stamps.
-
-    A pixel is bad if it is not finite, or -1e29 or less, as the pixels are that SExtractor masks (-1e30).
-    """
-    return ~np.isfinite(stamps) | (stamps <= _MASKED)
+def _one_row_a_star(columns: dict[str, np.ndarray], x: str) -> dict[str, np.ndarray]:
+    """Return columns with a row for each star, also where they stand in one row: positions [1, n]."""
+    if columns[x].ndim == 2 and len(columns[x]) == 1:
+        return {name: values[0] if values.ndim > 1 else values for name, values in columns.items()}
+    return columns
 
 
 def _find_column(name: str, columns: Iterable[str]) -> str | None:
@@ -156,10 +201,18 @@ def _read_ecsv_columns(path: Path, data: bytes) -> dict[str, np.ndarray]:
     return columns
 
 
-def _first_cube(hdus: fits.HDUList) -> np.ndarray | None:
+def _first_cube(hdus: fits.HDUList | None) -> np.ndarray | None:
     """Return the first image of three axes, or None."""
-    for hdu in hdus:
-        if hdu.is_image and hdu.data is not None and hdu.data.ndim == 3:
+    for hdu in hdus or ():
+        if hdu.is_image and hdu.data is not None and hdu.data.ndim == 3 and hdu.name.lower() not in _QUALITY_NAMES:
+            return np.asarray(hdu.data, dtype=np.float64)
+    return None
+
+
+def _cube_named(hdus: fits.HDUList | None, names: Iterable[str]) -> np.ndarray | None:
+    """Return the image of three axes with one of these extension names, or None."""
+    for hdu in hdus or ():
+        if hdu.is_image and hdu.data is not None and hdu.data.ndim == 3 and hdu.name.lower() in names:
             return np.asarray(hdu.data, dtype=np.float64)
     return None
 

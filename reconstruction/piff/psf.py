@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from astropy.wcs.wcsapi import BaseLowLevelWCS
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
@@ -15,13 +16,16 @@ from ...core.errors import DomainError, ProductError, shown
 from ...core.files import parsing
 from ...core.units import ARCSEC, pure_numbers, require_count
 from ..psf_model.polynomial import as_positions
+from .given_world import GivenWorld
 from .interpolants import Interpolant, read_interpolant
-from .profiles import Profile, read_profile
+from .profiles import PixelGrid, Profile, read_profile
 from .tables import PiffTables
 from .world import StarWorld
 
 #: Properties of a star that its place gives.
 _OF_PLACE = ("x", "y", "u", "v")
+#: Parameters of a PixelGrid that old files lack: one that the flux determines, and two that the centre does.
+_CONSTRAINED = (1, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +34,7 @@ class PiffChip:
 
     profile: Profile
     interpolant: Interpolant
-    world: StarWorld
+    world: StarWorld | GivenWorld
 
 
 @check_arguments
@@ -134,25 +138,34 @@ class PiffPsf:
 
 
 @check_arguments
-def load_piff(path: str | Path) -> PiffPsf:
+def load_piff(path: str | Path, *, wcs: BaseLowLevelWCS | Mapping[int, BaseLowLevelWCS] | None = None) -> PiffPsf:
     """Read a PSF model of Piff from its FITS file, without Piff and without pickle.
 
     Types Simple and SingleChip, models PixelGrid (Lanczos), Gaussian, Moffat and Kolmogorov, and interpolants
     BasisPolynomial, Polynomial and Mean are read. Piff pickles the WCS of a chip; in its place stand polynomials
-    through the world coordinates of the chip's stars, which have columns of their own.
+    through the world coordinates of the chip's stars, which have columns of their own. A :class:`~pachon.WcsWarning`
+    says their error where that is above 0.1 %, as of coordinates with small-scale structure (pixmappy's, of DES).
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    wcs : WCS or mapping of int to WCS, optional
+        Celestial world coordinates of the image, such as an :class:`astropy.wcs.WCS`, of each chip by number where
+        there are several. The tangent point is the one that puts the file's stars at their u and v.
 
     Raises
     ------
     ProductError
         If the file is a pickle or no file of Piff, or its type, model or interpolant is another: one line that names
-        it; or if its stars are too few to show the world coordinates.
+        it; or if its stars are too few to show the world coordinates, or are not where `wcs` puts them.
     """
     tables = PiffTables.read(Path(path))
     with parsing(tables.path, "damaged or no FITS file of Piff", ProductError):
-        return _psf_of(tables)
+        return _psf_of(tables, wcs)
 
 
-def _psf_of(tables: PiffTables) -> PiffPsf:
+def _psf_of(tables: PiffTables, wcs: Any) -> PiffPsf:
     settings = tables.settings()
     kind = str(settings.get("type")).removesuffix("PSF")
     if kind not in ("Simple", "SingleChip"):
@@ -165,16 +178,29 @@ def _psf_of(tables: PiffTables) -> PiffPsf:
     stars["used"] = ~np.any([np.zeros(len(of_chip), dtype=bool), *out], axis=0)
     if kind == "SingleChip":
         numbers = [int(n) for n in tables.column("chipnums", "chipnums")]
-        chips = {n: _chip_of(tables.below(str(n)), tables, n) for n in numbers}
+        chips = {n: _chip_of(tables.below(str(n)), tables, n, wcs) for n in numbers}
     else:
         numbers = sorted(set(stars["chip"].tolist()))
-        chips = {n: _chip_of(tables, tables, n) for n in numbers}
+        chips = {n: _chip_of(tables, tables, n, wcs) for n in numbers}
     return PiffPsf(chips, str(settings.get("piff_version", "unknown")), stars)
 
 
-def _chip_of(tables: PiffTables, all_stars: PiffTables, number: int) -> PiffChip:
+def _chip_of(tables: PiffTables, all_stars: PiffTables, number: int, wcs: Any) -> PiffChip:
     profile, interpolant = read_profile(tables), read_interpolant(tables)
     count = len(interpolant.coefficients)
+    if isinstance(profile, PixelGrid) and profile.n_parameters - count in _CONSTRAINED:
+        raise tables.error(
+            f"an old format: its PixelGrid of {profile.size} x {profile.size} pixels has {count} parameters; Piff "
+            "before 1.0 left out those that flux and centre determine. Expected a file that Piff 1.0 or later wrote"
+        )
     if count != profile.n_parameters:
         raise tables.error(f"interp has {count} parameters: expected {profile.n_parameters}, those of the model")
-    return PiffChip(profile, interpolant, StarWorld.fit(all_stars, number))
+    chip_wcs = wcs
+    if isinstance(wcs, Mapping):
+        if number not in wcs:
+            raise DomainError(
+                f"wcs has chips {', '.join(map(str, wcs))}: expected chip {number} of the file too", key="wcs"
+            )
+        chip_wcs = wcs[number]
+    world = StarWorld.fit(all_stars, number) if chip_wcs is None else GivenWorld.fit(all_stars, number, chip_wcs)
+    return PiffChip(profile, interpolant, world)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.errors import WcsWarning
 from ..psf_model.polynomial import design_matrix, term_count
 from .tables import PiffTables
 
@@ -17,8 +19,11 @@ _MOST = 5
 _SPARE = 3
 #: Relative error at which no higher order is tried.
 _ENOUGH = 1e-10
-#: Relative error from which on the coordinates are refused.
-_TOO_MUCH = 1e-3
+#: Relative error from which on it is told: the Jacobian's is about that of the peak of a PSF.
+_TOLD = 1e-3
+#: Relative error from which on the coordinates are refused: ten times the structure that tree rings and edges of
+#: detectors make in those of DES (pixmappy).
+_TOO_MUCH = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,11 +50,7 @@ class StarWorld:
     @classmethod
     def fit(cls, tables: PiffTables, chip: int | None) -> StarWorld:
         """Fit the stars of a file, on one chip of several, by the order with the smallest error."""
-        names = tables.table("stars").names
-        stars = np.stack([tables.column("stars", name) for name in ("x", "y", *_COLUMNS)], axis=1)
-        if chip is not None and "chipnum" in names:
-            stars = stars[tables.column("stars", "chipnum") == chip]
-        stars = stars[np.isfinite(stars).all(axis=1)]
+        stars = star_columns(tables, chip)
         if len(stars) < term_count(1) + _SPARE:
             raise tables.error(
                 f"{len(stars)} stars, which have the world coordinates: expected at least {term_count(1) + _SPARE} "
@@ -79,7 +80,16 @@ class StarWorld:
         if best.error > _TOO_MUCH:
             raise tables.error(
                 f"its {len(stars)} stars have the world coordinates with errors of {best.error:.1g}: expected more "
-                "stars (the WCS is pickled, and never read)"
+                f"stars, or wcs=, with errors below {_TOO_MUCH:g} (the WCS is pickled, and never read)"
+            )
+        if best.error > _TOLD:
+            of_chip = "" if chip is None else f" of chip {chip}"
+            percent = f"{100.0 * best.error:.1g} %"
+            warnings.warn(
+                f"{tables.path}: world coordinates{of_chip} with errors of {percent}, and so its PSFs. Polynomials "
+                f"through {len(stars)} stars do not follow their small-scale structure; wcs= does",
+                WcsWarning,
+                stacklevel=2,
             )
         return best
 
@@ -87,3 +97,11 @@ class StarWorld:
         """Return u, v [arcsec], shape [n, 2], and Jacobians [arcsec/pixel], shape [n, 2, 2], at pixels [n, 2]."""
         values = design_matrix(positions, self.extent, self.order) @ self.coefficients
         return values[:, :2], values[:, 2:].reshape(-1, 2, 2)
+
+
+def star_columns(tables: PiffTables, chip: int | None) -> np.ndarray:
+    """Return x, y [pixel], u, v [arcsec] and d(u, v)/d(x, y) [arcsec/pixel] of the stars of a chip, [n, 8]."""
+    stars = np.stack([tables.column("stars", name) for name in ("x", "y", *_COLUMNS)], axis=1)
+    if chip is not None and "chipnum" in tables.table("stars").names:
+        stars = stars[tables.column("stars", "chipnum") == chip]
+    return np.asarray(stars[np.isfinite(stars).all(axis=1)])

@@ -8,6 +8,7 @@ import numpy as np
 
 from ...core.errors import ConfigError, DomainError
 from ...core.units import real_array
+from ...measure.pixel_masks import bad_pixels
 from .polynomial import Extent, term_count
 
 #: Signal-to-noise ratio above which softened weights grow no more.
@@ -15,17 +16,20 @@ SOFTENING = 100.0
 
 
 def as_stamps(stamps: Any, masks: Any = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the stamps as finite float64, masked pixels zero, and the masks as bool, both [n, ny, nx]."""
+    """Return the stamps as finite float64, masked pixels zero, and the masks as bool, both [n, ny, nx].
+
+    Pixels that are not finite, or -1e29 or less, are masked besides those of `masks`.
+    """
     images = real_array(stamps, "stamps: expected real numbers [n, ny, nx]")
     if images.ndim != 3 or len(images) < 2:
         raise DomainError(f"stamps have shape {images.shape}: expected [n, ny, nx] with at least 2 stars")
-    bad = np.zeros(images.shape, dtype=bool)
-    if masks is not None:
-        bad = _checked_masks(masks, images.shape)
+    bad = bad_pixels(images)
+    lightless = bad.all(axis=(1, 2))
+    if lightless.any():
+        raise DomainError(f"stamps[{lightless.argmax()}] has pixels that are not finite, and no others")
+    if masks is not None or bad.any():
+        bad = _checked_masks(masks, bad)
         images = np.where(bad, 0.0, images)
-    finite = np.isfinite(images).all(axis=(1, 2))
-    if not finite.all():
-        raise DomainError(f"stamps[{finite.argmin()}] has pixels that are not finite")
     dark = images.sum(axis=(1, 2)) <= 0.0
     if dark.any():
         unmasked = " outside its mask" if bad.any() else ""
@@ -33,13 +37,15 @@ def as_stamps(stamps: Any, masks: Any = None) -> tuple[np.ndarray, np.ndarray]:
     return images, bad
 
 
-def _checked_masks(masks: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the masks as bool [n, ny, nx], True where a pixel is not to be used."""
-    bad = np.asarray(masks)
-    if bad.shape != shape or bad.dtype.kind != "b":
+def _checked_masks(masks: Any, lightless: np.ndarray) -> np.ndarray:
+    """Return the masks as bool [n, ny, nx], True where a pixel is not to be used; lightless ones are not."""
+    bad = np.zeros(lightless.shape, dtype=bool) if masks is None else np.asarray(masks)
+    if bad.shape != lightless.shape or bad.dtype.kind != "b":
         raise DomainError(
-            f"masks have shape {bad.shape} and type {bad.dtype}: expected bool {list(shape)} as the stamps, True is bad"
+            f"masks have shape {bad.shape} and type {bad.dtype}: expected bool {list(lightless.shape)} as the stamps, "
+            "True is bad"
         )
+    bad = bad | lightless
     if bad.all():
         raise DomainError("masks: every pixel of every star is masked, no star is left")
     blind = bad.all(axis=(1, 2))

@@ -83,9 +83,13 @@ def fit_stars(
             max_iterations=max_iterations,
             replacement=replacement,
         )
+        masked = bad if bad.any() else None
+        if masked is not None:
+            images = _completed(images, masked, stars)
         chosen_order, basis_weights = orders[-1], None
         if by_noise or automatic:
-            shapes = ShapeNoise.of(images, stars.deviations, stars.mean.reshape(ny, nx), _checked_gain(images, gain))
+            mean = stars.mean.reshape(ny, nx)
+            shapes = ShapeNoise.of(images, stars.deviations, mean, _checked_gain(images, gain), masked)
             if automatic:
                 counts = np.arange(1, count + 1) if basis.automatic else np.array([count])
                 chosen_order, count = choose_by_cross_validation(
@@ -99,9 +103,19 @@ def fit_stars(
         fitted_basis = basis_of(stars, basis_weights, count)
         coefficients, unexplained = fitted_basis.project(stars)
         order_terms = terms[:, : term_count(order)]
-        field = StarField(points, span, order, order_terms, coefficients, star_weights, images, fitted_basis, gain)
+        field = StarField(
+            points, span, order, order_terms, coefficients, star_weights, images, fitted_basis, gain, masked
+        )
         fitted_interpolation = interpolation.fit(field)
     return kind(fitted_basis, fitted_interpolation, coefficients, unexplained, stars.rejected.sum(axis=1))
+
+
+def _completed(images: np.ndarray, masked: np.ndarray, stars: CleanStars) -> np.ndarray:
+    """Return images [n, ny, nx] whose masked pixels hold what the stars of unit sum have there, for their flux."""
+    profiles = (stars.mean + stars.deviations).reshape(images.shape)
+    good = np.where(masked, 0.0, profiles).sum(axis=(1, 2))
+    flux = np.where(masked, 0.0, images).sum(axis=(1, 2)) / np.where(good > 0.0, good, 1.0)
+    return np.where(masked, flux[:, None, None] * profiles, images)
 
 
 def _check_options(replacement: str, clip_sigma: float | None, max_iterations: int, gain: float | None) -> None:

@@ -36,6 +36,7 @@ class StarField:
     images: np.ndarray  #: stamps, [n, ny, nx]
     basis: FittedBasis
     gain: float | None  #: electrons in a unit of the stamps; None for no photon noise
+    masked: np.ndarray | None = None  #: pixels of the stamps that are filled, [n, ny, nx]
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,7 @@ class Kriging(Interpolation):
         mean = stars.basis.mean
         deviations = stars.basis.deviations(stars.coefficients)
         numbers, filters = shape_numbers(mean, deviations)
-        noise = star_noise(stars.images, deviations, mean, filters, stars.gain)
+        noise = star_noise(stars.images, deviations, mean, filters, stars.gain, stars.masked)
         noise = np.maximum(noise, _LEAST_NOISE * (numbers**2).mean(axis=0) + np.finfo(float).tiny)
         places = mapped(stars.positions, stars.extent)
         kernel = fit_kernel(places, numbers, noise, stars.terms)

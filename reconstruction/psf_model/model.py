@@ -110,8 +110,9 @@ class PsfModel(ModelFit, Result):
             inverse of its noise and of what the polynomials leave (:mod:`~.psf_model.shape_noise`); where `order` or
             `n_components` is ``auto`` this is the default.
         masks : array of bool, optional
-            [n, ny, nx], True for pixels to ignore. They are replaced by the polynomial through the stars in which the
-            pixel is good, so that they have no influence on the fit.
+            [n, ny, nx], True for pixels to ignore, besides those that are not finite, or -1e29 or less. They are
+            replaced by the polynomial through the stars in which the pixel is good, so that they have no influence on
+            the fit, and are no sky of which noise is measured.
         n_components : int or str, optional
             Components to keep, 20 where left out: principal ones at most n - 1, of shapelets those of sum zero.
             ``auto`` takes the number, up to 65, that predicts the shapes of held-out stars best; :attr:`elbow` is the
@@ -141,8 +142,8 @@ class PsfModel(ModelFit, Result):
             If there are more components than stars less one, or more polynomial terms than stars, or an option has no
             such value.
         DomainError
-            If an array has the wrong shape, a pixel is not finite, a star has no flux, or the stars do not determine
-            the polynomials (all on a line, say).
+            If an array has the wrong shape, a star has no flux or no pixel with weight, a pixel has none in any star,
+            or the stars do not determine the polynomials (all on a line, say).
         """
         chosen_recipe = Recipe.of(
             recipe, basis=basis, interpolation=interpolation, n_components=n_components, scale=scale, order=order

@@ -55,7 +55,7 @@ def test_defects_are_found_and_named(kind):
         hit = flags > 0
         np.testing.assert_array_equal(found.flags[hit], flags[hit])
         assert np.count_nonzero(found.flags[~hit]) <= 1
-        assert found.masks[hit].any() == (kind == "cosmic_rays")
+        assert found.masks[hit].any(axis=(1, 2)).all()
 
 
 @pytest.mark.long
@@ -87,12 +87,15 @@ def test_saturated_cores():
 
 def test_unusable_stars_and_none_left():
     stamps, shapes, _ = observed(6, count=12)
-    stamps[2, 3, 3] = np.nan
+    stamps[2] = np.nan
     stamps[5] *= -1.0
+    middle = np.unravel_index(stamps[4].argmax(), stamps[4].shape)
+    stamps[4, middle[0] - 2 : middle[0] + 3, middle[1] - 2 : middle[1] + 3] = np.nan
+    stamps[6, 3, 3] = -1e30  # one pixel is no loss
     selection = flag_stars(stamps, NOISE)
-    assert selection.flags[[2, 5]].tolist() == [StarFlag.UNUSABLE] * 2
-    assert selection.keep(10).sum() == 10
-    with pytest.raises(DomainError, match=r"^10 of 12 stars left \(2 unusable\): expected at least 11$"):
+    assert selection.flags[[2, 4, 5, 6]].tolist() == [StarFlag.UNUSABLE, StarFlag.MASKED, StarFlag.UNUSABLE, 0]
+    assert selection.keep(9).sum() == 9
+    with pytest.raises(DomainError, match=r"^9 of 12 stars left \(2 unusable, 1 masked\): expected at least 11$"):
         selection.keep(11)
     hit, _ = add_defects(stamps[6:], shapes[6:], np.random.default_rng(0), cosmic_rays=1.0)
     with pytest.raises(DomainError, match=r"^0 of 6 stars left \(.*6 cosmic ray\): expected at least 1$"):

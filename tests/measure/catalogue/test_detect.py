@@ -164,10 +164,10 @@ def test_tables(found, tmp_path, ending):
     ("change", "message"),
     [
         ({"image": np.zeros((SIDE, SIDE))}, "no objects: expected 5 connected pixels above 3 standard deviations"),
-        ({"image": np.full((SIDE, SIDE), np.nan)}, r"image\[0, 0\] = nan: expected finite"),
+        ({"image": np.full((SIDE, SIDE), np.nan)}, "mask: expected at least one pixel that is not masked, and finite"),
         ({"image": np.zeros(5)}, "image has shape"),
         ({"variance": np.ones((4, 4))}, r"variance has shape \(4, 4\)"),
-        ({"variance": np.zeros((SIDE, SIDE))}, "expected positive and finite where the mask is zero"),
+        ({"variance": np.zeros((SIDE, SIDE))}, "expected positive where the mask is zero"),
         ({"mask": np.zeros((SIDE, SIDE))}, "mask has type float64: expected integers"),
         ({"mask": np.ones((SIDE, SIDE), dtype=int)}, "at least one pixel that is not masked"),
         ({"threshold": 0.0}, "threshold = 0.0: expected a positive"),

@@ -84,13 +84,32 @@ def test_stars_with_spoilt_stamps_are_left_out():
     first = pachon.select_stars(objects, IMAGE).index[:3]
     image, mask = IMAGE.copy(), np.zeros(IMAGE.shape, dtype=np.uint8)
     x, y = (np.rint(v[first]).astype(int) for v in (objects.x, objects.y))
-    image[y[0] + 12, x[0]] = np.nan
-    mask[y[1], x[1] - 12] = 8
+    image[y[0] + 6, x[0]] = np.nan
+    mask[y[1], x[1] - 6] = 8
     moved = objects.y.copy()
     moved[first[2]] = 14.0  # of 15 pixels below the middle of a stamp
     found = pachon.select_stars(replace(objects, y=moved), image, mask=mask)
     assert (found.cuts[first] == StarCut.FLAGGED).all()
     assert not set(first) & set(found.index)
+
+
+def test_stars_with_masked_pixels_far_from_them_stay():
+    objects, _ = catalogue()
+    complete = pachon.select_stars(objects, IMAGE)
+    assert complete.masks is None
+    image, star = IMAGE.copy(), complete.index[0]
+    x, y = round(objects.x[star]), round(objects.y[star])
+    image[y + 11, x - 3] = -1e30
+    masked = pachon.select_stars(objects, image)
+    assert np.array_equal(masked.index, complete.index)
+    rows, columns = np.nonzero(masked.masks[0])
+    # The stamp is shifted by up to half a pixel, and what falls on a pixel by a tenth masks it.
+    assert 1 <= len(rows) <= 4
+    assert {15 + 11} <= set(rows) <= {15 + 10, 15 + 11, 15 + 12}
+    assert {15 - 3} <= set(columns) <= {15 - 4, 15 - 3, 15 - 2}
+    assert not masked.masks[1:].any()
+    np.testing.assert_array_equal(masked.stamps, complete.stamps)  # filled from the other side: sky without noise
+    assert np.array_equal(masked.without(np.arange(len(masked)) > 0).masks, masked.masks[:1])
 
 
 def test_completeness_counts_stars_that_are_bright_enough():

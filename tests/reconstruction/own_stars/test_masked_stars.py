@@ -4,17 +4,16 @@ import numpy as np
 import pytest
 
 from pachon.core.errors import DomainError
+from pachon.measure.pixel_masks import bad_pixels, fill_symmetric
 from pachon.measure.shapes import measure_shapes
 from pachon.measure.stamps import center_masks, shift_mask
 from pachon.measure.star_selection import StarFlag
 from pachon.reconstruction.own_stars.masked_stars import (
     fill_by_profiles,
-    fill_symmetric,
     profiles_of_psfs,
     sky_of_stamps,
 )
 from pachon.reconstruction.own_stars.own_stars import fit_own_stars
-from pachon.reconstruction.own_stars.star_catalogue import bad_pixels
 from pachon.reconstruction.psf_model import kriging
 
 PIXEL = np.deg2rad(0.2 / 3600.0)
@@ -140,6 +139,29 @@ def test_a_model_with_masked_stars_is_better_than_without_these_stars():
 
 
 @pytest.mark.long
+def test_stars_with_neighbours_stay_and_keep_their_shapes():
+    options = {"recipe": "paper", "basis": "pixels", "order": 1}
+    stamps, positions = simulated_stars(100)
+    complete = fit_own_stars(stamps, positions, PIXEL, **options)
+    rng = np.random.default_rng(50)
+    radius, angle = rng.uniform(5.0, 13.0, COUNT), rng.uniform(0.0, 2.0 * np.pi, COUNT)
+    flux = rng.uniform(0.1, 0.6, COUNT)
+    flux *= (stamps - 300.0).sum(axis=(1, 2)) * (np.arange(COUNT) % 2 == 0)
+    stamps = stamps + flux[:, None, None] * profiles(positions, radius * np.cos(angle), radius * np.sin(angle))
+    own = fit_own_stars(stamps, positions, PIXEL, **options)
+    flagged = (own.flags & StarFlag.NEIGHBOUR) > 0
+    assert (flagged | ~own.used)[flux > 3e3].all()  # 20 standard deviations of the sky under a star
+    kept = flagged & own.used
+    assert kept.sum() >= 0.8 * flagged.sum() >= 20
+    # What a mask leaves of a neighbour and what it takes from the star are less than the star's own noise.
+    for change, sigma in (
+        (own.shapes.e1 - complete.shapes.e1, complete.sigma_e),
+        (own.shapes.size / complete.shapes.size - 1.0, complete.sigma_size),
+    ):
+        assert np.sqrt(np.mean((change[kept] / sigma[kept[complete.used]]) ** 2)) < 0.8
+
+
+@pytest.mark.long
 def test_masks_are_the_same_as_pixels_that_are_not_finite(stars):
     bad = random_masks("wing", 7)
     own, same = (
@@ -185,6 +207,12 @@ def test_round_stamps_are_no_loss(stars):
 def test_masks_of_another_shape_are_named(stars):
     with pytest.raises(DomainError, match=r"masks have shape \(33, 33\) and type bool: expected bool \[60, 33, 33\]"):
         fit_own_stars(*stars, PIXEL, masks=np.zeros((SIZE, SIZE), dtype=bool))
+
+
+def test_stamps_without_any_weight_are_named(stars):
+    for stamps, masks in ((stars[0], np.ones(stars[0].shape, dtype=bool)), (np.full(stars[0].shape, -1e30), None)):
+        with pytest.raises(DomainError, match="no pixel of 60 stamps has weight: all are masked, or no numbers"):
+            fit_own_stars(stamps, stars[1], PIXEL, masks=masks)
 
 
 def test_what_counts_as_a_bad_pixel():

@@ -50,11 +50,20 @@ def own(stars):
     return fit_own_stars(*stars, PIXEL)
 
 
-def test_stars_with_defects_and_faint_ones_are_left_out(own):
+def test_stars_with_defects_are_masked_and_faint_ones_left_out(own):
     assert own.flags[7] & StarFlag.NEIGHBOUR
     assert own.flags[9] & StarFlag.COSMIC_RAY
     assert own.snr[5] < 20.0
-    assert set(np.flatnonzero(~own.used)) == {5, 7, 9}
+    assert set(np.flatnonzero(~own.used)) == {5}
+    masks = own.masks[np.searchsorted(np.flatnonzero(own.used), [7, 9])]
+    centre = own.masks.shape[1] // 2
+    assert masks[0, centre + 7, centre + 4]  # the middle of the neighbour
+    assert masks[1, 12 - 16 + centre : 14 - 16 + centre, 20 - 16 + centre].all()  # the cosmic ray
+    assert not masks[:, centre, centre].any()
+    assert np.isfinite(own.held_out.e1[[7, 9]]).all()
+    table = own.table()
+    assert table["masked"][5] == -1
+    assert table["masked"][7] == masks[0].sum()
 
 
 def test_the_model_is_that_of_the_truth_between_the_stars(own):
@@ -150,13 +159,14 @@ def test_the_command_leaves_model_picture_and_table(stars, tmp_path, monkeypatch
     Table({"x": stars.positions[:, 0], "y": stars.positions[:, 1], "stamp": stamps}).write("stars.fits")
     assert main(["model", "stars.fits", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert (found["stars"], found["used"]) == (COUNT, COUNT - 4)
+    # Without the faint one, and the one whose core is masked.
+    assert (found["stars"], found["used"]) == (COUNT, COUNT - 2)
     assert (found["flagged"]["cosmic_ray"], found["flagged"]["masked"]) == (1, 1)
     assert PsfModel.read("stars_psf.fits").draw(2000.0, 2000.0).sum() == pytest.approx(1.0)
     assert (tmp_path / "stars_psf.png").read_bytes().startswith(b"\x89PNG")
     table = Table.read("stars_psf.ecsv")
     assert len(table) == COUNT
-    assert np.isnan(table["held_out_e1"][7])
+    assert np.isnan(table["held_out_e1"][5])
 
 
 @pytest.mark.parametrize(
@@ -172,6 +182,16 @@ def test_the_command_leaves_model_picture_and_table(stars, tmp_path, monkeypatch
 def test_bad_values_are_named(stars, change, message):
     with pytest.raises(DomainError, match=message):
         fit_own_stars(*stars, **({"pixel_scale": PIXEL} | change))
+
+
+def test_stars_too_faint_for_their_gain_are_told_from_bad_ones():
+    rng = np.random.default_rng(1)
+    light = profiles(rng.uniform(1.0, 4000.0, (20, 2)), *np.zeros((2, 20)))  # of unit flux: not in electrons
+    stamps, positions = light + rng.normal(scale=1e-4, size=light.shape), rng.uniform(size=(20, 2))
+    with pytest.raises(DomainError, match=r"0 of 20 stars left \(20 of S/N below min_snr = 20, of 0\.99\d electrons"):
+        fit_own_stars(stamps, positions, PIXEL, background=False)
+    options = {"recipe": "paper", "basis": "pixels", "order": 0, "background": False}
+    assert fit_own_stars(stamps, positions, PIXEL, gain=1e5, **options).used.all()
 
 
 def test_stamps_of_noise_are_no_stars():

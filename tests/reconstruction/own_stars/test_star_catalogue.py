@@ -75,7 +75,9 @@ def test_files_that_cannot_be_used(tmp_path):
     refused(r"stars\.fits: no such file")
     path = catalogue(tmp_path / "stars.fits", stamps, positions, ("ra", "y"), magnitude=np.zeros(14))
     refused(r"stars\.fits: no column 'x', 'stamp' and no image of three axes; its columns are ra, y, magnitude")
-    refused("columns are ra, y, magnitude; looked for x: xwin_image, x_image, .*; looked for stamp: vignet; stamps are")
+    refused(
+        "columns are ra, y, magnitude; looked for x: xwin_image, x_image, .*; looked for stamp: vignet, .*; stamps are"
+    )
     refused("no column 'dec'", x="ra", y="dec", stamp="y")
     refused("column 'magnitude' has shape .14,. and type .*, expected an image", x="ra", stamp="magnitude")
     whole = path.read_bytes()
@@ -92,6 +94,106 @@ def test_files_that_cannot_be_used(tmp_path):
     refused("no column 'y', 'stamp'; its columns are x, flux", ecsv)
     ecsv.write_text("".join(ecsv.read_text().splitlines(keepends=True)[:6]))
     refused(r"stars\.ecsv: damaged or no ECSV", ecsv)
+
+
+def bad_pixels(count, seed=3):
+    bad = np.zeros((count, 9, 11), dtype=bool)
+    bad[np.arange(count), np.random.default_rng(seed).integers(0, 9, count), 2] = True
+    return bad
+
+
+@pytest.mark.parametrize("name", ["WEIGHT", "VIGNET_WEIGHT", "VARIANCE", "MASK", "wgt", "flagged"])
+def test_pixels_without_weight_are_no_numbers(tmp_path, name):
+    stamps, positions = stars()
+    bad = bad_pixels(len(stamps))
+    values = {"VARIANCE": np.where(bad, np.inf, 4.0), "MASK": 8 * bad, "flagged": bad.astype(np.uint8)}
+    column = values.get(name, np.where(bad, 0.0, 0.25))
+    options = {"wgt": {"weight": "WGT"}, "flagged": {"mask": "flagged"}}.get(name, {})
+    path = catalogue(tmp_path / "stars.fits", stamps, positions, **{name: column})
+    np.testing.assert_array_equal(load_stars(path, **options).stamps, np.where(bad, np.nan, stamps))
+
+
+def test_all_stars_in_one_row_as_in_files_of_piff(tmp_path):
+    stamps, positions = stars()
+    bad = bad_pixels(len(stamps))
+    columns = {"IMAGE": stamps, "WEIGHT": np.where(bad, 0.0, 1.0), "X": positions[:, 0], "Y": positions[:, 1]}
+    Table({name: values[None] for name, values in columns.items()}).write(tmp_path / "stars.fits")
+    loaded, places = load_stars(tmp_path / "stars.fits")
+    np.testing.assert_array_equal(loaded, np.where(bad, np.nan, stamps))
+    np.testing.assert_array_equal(places, positions)
+
+
+def test_cubes_of_weights_and_planes_of_masks(tmp_path):
+    stamps, positions = stars()
+    bad = bad_pixels(len(stamps))
+    detected = np.hypot(*(np.mgrid[:9, :11] - np.array([4, 5])[:, None, None])) < 3.0
+    masks = (np.where(bad, 1 << 3, 0) | np.where(detected, 1 << 5, 0)).astype(np.int32)
+    table = fits.table_to_hdu(Table({"x": positions[:, 0], "y": positions[:, 1]}))
+    cubes = [fits.ImageHDU(stamps, name="STAMPS"), fits.ImageHDU(np.where(bad, 0.0, 1.0), name="WEIGHT")]
+    fits.HDUList([fits.PrimaryHDU(), cubes[1], cubes[0], table]).writeto(tmp_path / "cubes.fits")
+    np.testing.assert_array_equal(load_stars(tmp_path / "cubes.fits").stamps, np.where(bad, np.nan, stamps))
+    table = fits.table_to_hdu(Table({"x": positions[:, 0], "y": positions[:, 1], "deblended": stamps, "mask": masks}))
+    table.header.update({"MP_CR": 3, "HIERARCH MP_DETECTED": 5})
+    fits.HDUList([fits.PrimaryHDU(), table]).writeto(tmp_path / "planes.fits")
+    np.testing.assert_array_equal(load_stars(tmp_path / "planes.fits").stamps, np.where(bad, np.nan, stamps))
+    table.header["MP_CR"] = "three"
+    fits.HDUList([fits.PrimaryHDU(), table]).writeto(tmp_path / "planes.fits", overwrite=True)
+    with pytest.raises(ProductError, match=r"planes\.fits: MP_CR = 'three': expected the number of a bit of the mask"):
+        load_stars(tmp_path / "planes.fits")
+
+
+def test_files_of_lsst_stamps(tmp_path):
+    stamps, _ = stars()
+    bad = bad_pixels(len(stamps))
+    corners = np.random.default_rng(5).integers(0, 4000, (len(stamps), 2))
+    hdus, names = [fits.PrimaryHDU()], ("IMAGE", "MASK", "VARIANCE")
+    for i, (stamp, mask, corner) in enumerate(zip(stamps, bad, corners, strict=True), start=1):
+        variance = np.where(mask & (i % 2 == 0), np.nan, 9.0)
+        bits = np.where(mask & (i % 2 == 1), 1 << 8, 1 << 5).astype(np.int32)
+        image, planes, noise = (
+            fits.ImageHDU(data, name=name, ver=i) for name, data in zip(names, (stamp, bits, variance), strict=True)
+        )
+        image.header.update(LTV1=-float(corner[0]), LTV2=-float(corner[1]))
+        planes.header["HIERARCH MP_NO_DATA"] = 8
+        planes.header["HIERARCH MP_DETECTED"] = 5
+        hdus += [image, planes, noise]
+    fits.HDUList(hdus).writeto(tmp_path / "stamps.fits")
+    loaded, places = load_stars(tmp_path / "stamps.fits")
+    np.testing.assert_array_equal(loaded, np.where(bad, np.nan, stamps))
+    np.testing.assert_array_equal(places, corners + np.array([5.0, 4.0]))
+    del hdus[1].header["LTV1"]
+    fits.HDUList(hdus).writeto(tmp_path / "stamps.fits", overwrite=True)
+    with pytest.raises(ProductError, match=r"stamps\.fits: IMAGE 1 has LTV1, LTV2 = None, -\d+\.0: expected numbers"):
+        load_stars(tmp_path / "stamps.fits")
+
+
+@pytest.mark.parametrize(
+    ("columns", "options", "message"),
+    [
+        ({"weight": np.zeros((14, 9, 11))}, {}, r"stars\.fits: no pixel of its 14 stamps has weight: weight is zero"),
+        ({"weight": np.full((14, 9, 11), -1.0)}, {}, r"stars\.fits: weight holds -1: expected weights of zero or more"),
+        (
+            {"mask": np.ones((14, 9, 9))},
+            {},
+            r"stars\.fits: mask has shape \(14, 9, 9\): expected \(14, 9, 11\), that of",
+        ),
+        ({"weight": np.ones(14)}, {"weight": "weight"}, r"column 'weight' has shape \(14,\) .* expected an image"),
+        ({}, {"mask": "flags"}, r"stars\.fits: no column 'flags'; its columns are x, y, stamp"),
+    ],
+)
+def test_weights_that_cannot_be_used(tmp_path, columns, options, message):
+    stamps, positions = stars()
+    path = catalogue(tmp_path / "stars.fits", stamps, positions, **columns)
+    with pytest.raises(ProductError, match=message):
+        load_stars(path, **options)
+
+
+def test_a_place_that_is_no_number_is_named(tmp_path):
+    stamps, positions = stars()
+    positions[4, 1] = np.nan
+    path = catalogue(tmp_path / "stars.fits", stamps, positions)
+    with pytest.raises(ProductError, match=r"stars\.fits: x, y of row 4 are [\d.]+, nan: expected numbers"):
+        load_stars(path)
 
 
 def test_the_example_of_the_documentation_runs(tmp_path, monkeypatch):

@@ -7,13 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.wcs import WCS
 
 import pachon
 from pachon.core.errors import DomainError, PachonError, ProductError
+from pachon.reconstruction.piff.given_world import GivenWorld
 from pachon.reconstruction.piff.profiles import Gaussian, Kolmogorov, Moffat, lanczos
 from pachon.reconstruction.piff.world import StarWorld
 
 DATA = Path(__file__).parents[2] / "data" / "piff"
+DES = Path(__file__).parents[4] / "shared/data/real/D00232418_i_c19_r5006p01_piff-model.fits"
 #: Largest difference from what Piff draws, as a fraction of the peak. GalSim convolves profiles with pixels by
 #: FFT, and stores the Gaussian of no pixel as it is; the WCS of chips of the sky is a polynomial through 16 stars here.
 TOLERANCES = {"grid_color": 1e-12, "grid_chips": 1e-6, "moffat": 1e-5, "kolmogorov": 1e-5, "gaussian": 1e-12}
@@ -96,6 +99,8 @@ def test_a_kolmogorov_profile_holds_half_of_its_light_in_its_half_light_radius()
 class FewStars:
     """Stand-in for the tables of a file: stars of a curved world."""
 
+    path = Path("few.piff")
+
     def __init__(self, n, noise=0.0):
         rng = np.random.default_rng(n)
         x, y = rng.uniform(0.0, 4000.0, (2, n))
@@ -135,6 +140,98 @@ def test_too_few_stars_have_no_world_coordinates():
         StarWorld.fit(FewStars(5), None)
     with pytest.raises(ProductError, match=r"its 12 stars have the world coordinates with errors of 0\.\d+: expected"):
         StarWorld.fit(FewStars(12, noise=0.01), None)
+
+
+def test_small_scale_structure_of_world_coordinates_is_told():
+    with pytest.warns(pachon.WcsWarning, match=r"few\.piff: world coordinates with errors of .* %, and so"):
+        world = StarWorld.fit(FewStars(60, noise=2e-4), None)
+    # A scatter of 0.1 % of the scale, the largest of sixty and the error of the fit itself.
+    assert 0.002 < world.error < 0.02
+
+
+def given_wcs():
+    """A TAN projection about (150, 2) degrees, and the chip of a file in its tangent plane."""
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    wcs.wcs.crval, wcs.wcs.crpix = [150.0, 2.0], [-3000.0, 1500.0]
+    wcs.wcs.cd = np.array([[-7.3e-5, 1e-6], [2e-6, 7.3e-5]])
+    stars = FewStars(20)
+    x, y = stars.columns["x"], stars.columns["y"]
+    # The pointing is elsewhere than the reference of the WCS: GalSim's projection about it is the oracle.
+    return wcs, stars, x, y
+
+
+def test_world_coordinates_that_are_given():
+    galsim = pytest.importorskip("galsim")
+    wcs, stars, x, y = given_wcs()
+    pointing = galsim.CelestialCoord(150.4 * galsim.degrees, 1.7 * galsim.degrees)
+    theirs = galsim.AstropyWCS(wcs=wcs)
+
+    def project(x, y):
+        u, v = pointing.project(theirs.toWorld(galsim.PositionD(x, y)))
+        return u / galsim.arcsec, v / galsim.arcsec
+
+    stars.columns["u"], stars.columns["v"] = np.array([project(*place) for place in zip(x, y, strict=True)]).T
+    world = GivenWorld.fit(stars, None, wcs)
+    assert world.error < 1e-6
+    assert np.rad2deg(world.pointing) == pytest.approx([150.4, 1.7], abs=1e-8)
+    field, jacobian = world.at(np.array([[1234.0, 321.0]]))
+    assert field[0] == pytest.approx(project(1234.0, 321.0), abs=1e-6)
+    expected_jacobian = np.array(
+        [
+            (np.array(project(1234.0 + dx, 321.0 + dy)) - project(1234.0 - dx, 321.0 - dy)) / 2e-2
+            for dx, dy in ((1e-2, 0.0), (0.0, 1e-2))
+        ]
+    ).T
+    # The quotient of the oracle has the rounding of u and v over its step.
+    assert jacobian[0] == pytest.approx(expected_jacobian, abs=1e-7)
+    stars.columns["u"] = stars.columns["u"] + 30.0 * np.arange(20)
+    with pytest.raises(ProductError, match=r"few\.piff: wcs: puts stars \d+ arcsec from their u, v in the file"):
+        GivenWorld.fit(stars, None, wcs)
+
+
+def test_chips_without_a_given_wcs_are_named():
+    with pytest.raises(DomainError, match="wcs has chips 7: expected chip 1 of the file too"):
+        pachon.load_piff(DATA / "grid_chips.piff", wcs={7: given_wcs()[0]})
+
+
+def test_the_format_of_old_files_is_named(tmp_path):
+    """A DES model of 2018 has three parameters less than pixels."""
+    with fits.open(DATA / "grid_chips.piff") as hdus:
+        for name in ("psf_1_interp_solution", "psf_2_interp_solution"):
+            hdus[name] = fits.BinTableHDU(hdus[name].data[3:], name=name)
+        hdus.writeto(tmp_path / "old.piff")
+    with pytest.raises(ProductError, match=r"old\.piff: an old format: its PixelGrid of \d+ x \d+ pixels has"):
+        pachon.load_piff(tmp_path / "old.piff")
+
+
+@pytest.mark.skipif(not DES.exists(), reason="no DES model")
+@pytest.mark.filterwarnings("error")
+def test_a_model_of_des_has_the_error_of_its_world_coordinates_said():
+    with pytest.warns(pachon.WcsWarning, match=r"piff-model\.fits: world coordinates .* errors of 0\.4 %, and so"):
+        psf = pachon.load_piff(DES)
+    assert psf.draw(1000.0, 2000.0).sum() == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not DES.exists(), reason="no DES model")
+@pytest.mark.filterwarnings("ignore::pachon.WcsWarning")
+def test_a_model_of_des_is_within_half_a_percent_of_piff():
+    """Piff draws each star with the Jacobian and the place that the file has for it: its WCS needs pixmappy."""
+    piff, galsim = pytest.importorskip("piff"), pytest.importorskip("galsim")
+    psf = pachon.load_piff(DES)
+    with fits.open(DES) as hdus:
+        stars, q = hdus["psf_stars"].data, np.array(hdus["psf_interp_solution"].data["q"][0])
+    theirs = piff.SimplePSF(piff.PixelGrid(0.3, 17, interp=galsim.Lanczos(3)), piff.BasisPolynomial(3))
+    theirs.interp.q = q.reshape(289, -1)
+    for row in stars[::5]:
+        wcs = galsim.JacobianWCS(*(row[name] for name in ("dudx", "dudy", "dvdx", "dvdy")))
+        place = {"x": round(row["x"]), "y": round(row["y"]), "u": row["u"], "v": row["v"]}
+        star = theirs.interp.interpolate(piff.Star.makeTarget(wcs=wcs, stamp_size=25, **place))
+        image = theirs.model.draw(star).image.array
+        ours = psf.draw(place["x"], place["y"], size=25)
+        ours, image = ours / ours.sum(), image / image.sum()
+        assert np.abs(ours - image).max() < 0.005 * image.max()
 
 
 def changed(tmp_path, name, table, column, value):

@@ -1,0 +1,150 @@
+"""Pixels of star stamps without weight: which they are, and what stands in for them where every pixel is needed.
+
+A pixel has no weight if it is not finite, if it is -1e29 or less, as the pixels are that SExtractor masks (-1e30), or
+if its weight is zero. Positive weights are all alike for moments and shifts, as in GalSim's HSM.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from ..core.errors import DomainError
+from ..core.units import real_array
+
+# Values at or below this are no light: SExtractor's masked pixels are -1e30.
+_MASKED = -1e29
+# Fewest columns side by side that are copies of each other: two may be alike in a symmetric star without noise.
+_COPIES = 3
+# Fewest rows of theirs: of whole numbers with a noise of 1 so many agree by chance once in ten thousand stamps.
+_COPIED_LENGTH = 12
+# Standard deviation of the weights of good neighbours [pixel], about the width of a star.
+_NEIGHBOURHOOD = 1.5
+# Part of a bad pixel from which on the place opposite is no better.
+_OVERLAP = 0.1
+# Least sum of these weights: a bad pixel without any near starts as sky.
+_LEAST_NEIGHBOURS = 1e-3
+
+
+def bad_pixels(stamps: np.ndarray) -> np.ndarray:
+    """Return the pixels that hold no light, bool, shape of the stamps.
+
+    A pixel is bad if it is not finite, or -1e29 or less, as the pixels are that SExtractor masks (-1e30).
+    """
+    return ~np.isfinite(stamps) | (stamps <= _MASKED)
+
+
+def weightless_pixels(images: np.ndarray, weights: Any = None) -> np.ndarray:
+    """Return the pixels of images without weight, bool [n, ny, nx]: bad ones, and those of weight zero or NaN.
+
+    Parameters
+    ----------
+    images : array
+        [n, ny, nx].
+    weights : array, optional
+        Inverse variances or masks of good pixels, [n, ny, nx]; [ny, nx] of one image or the same for all.
+
+    Raises
+    ------
+    DomainError
+        If weights have another shape, are negative, or are zero in all pixels.
+    """
+    bad = bad_pixels(images)
+    if weights is None:
+        return bad
+    numbers = weights.astype(np.float64) if isinstance(weights, np.ndarray) and weights.dtype == bool else weights
+    values = real_array(numbers, f"weights: expected real numbers {list(images.shape)}")
+    if values.shape not in (images.shape, images.shape[1:]):
+        raise DomainError(f"weights have shape {values.shape}: expected {list(images.shape)} as the images")
+    if (values < 0.0).any():
+        raise DomainError(f"weights hold {np.nanmin(values):.4g}: expected zero or more, as inverse variances are")
+    weightless = np.broadcast_to(~(values > 0.0), images.shape)
+    if weightless.size and weightless.all():
+        raise DomainError("weights are zero in every pixel: expected positive ones where the stars are")
+    return bad | weightless
+
+
+def copied_pixels(images: np.ndarray) -> np.ndarray:
+    """Return the pixels of columns and rows that are copies of their neighbours, bool [n, ny, nx].
+
+    Pipelines fill dead columns by copies of a good one: three or more side by side hold the same values, over twelve
+    rows or more. The good one is taken to be the first or last, the one that differs less from the column beyond it.
+    Where a line is constant along itself it is no copy.
+    """
+    across_columns = _copied_columns(images)
+    across_rows = _copied_columns(images.transpose(0, 2, 1)).transpose(0, 2, 1)
+    return across_columns | across_rows
+
+
+def _copied_columns(images: np.ndarray) -> np.ndarray:
+    """Return the pixels of columns side by side that hold the same values."""
+    copied = np.zeros(images.shape, dtype=bool)
+    count, ny, nx = images.shape
+    if nx < _COPIES or ny < _COPIED_LENGTH:
+        return copied
+    alike = np.ones((count, ny, nx - _COPIES + 1), dtype=bool)
+    for step in range(1, _COPIES):
+        alike &= images[:, :, step : nx - _COPIES + 1 + step] == images[:, :, : nx - _COPIES + 1]
+    first = images[:, :, : nx - _COPIES + 1]
+    constant = np.zeros(alike.shape, dtype=bool)
+    constant[:, 1:] = first[:, 1:] == first[:, :-1]
+    alike &= ~constant
+    for i in np.flatnonzero(alike.sum(axis=1).max(axis=1) >= _COPIED_LENGTH):
+        runs = ndimage.binary_opening(alike[i], np.ones((_COPIED_LENGTH, 1)))
+        for step in range(_COPIES):
+            copied[i, :, step : nx - _COPIES + 1 + step] |= runs
+        labels, _ = ndimage.label(copied[i])
+        for block in ndimage.find_objects(labels):
+            copied[i, block[0], _good_copy(images[i, block[0]], block[1])] = False
+    return copied
+
+
+def _good_copy(rows: np.ndarray, columns: slice) -> int:
+    """Return the good one of columns that are copies: the first or the last, by the column beyond it."""
+    first, last = columns.start, columns.stop - 1
+    steps = [
+        np.square(rows[:, at] - rows[:, beyond]).sum() if 0 <= beyond < rows.shape[1] else np.inf
+        for at, beyond in ((first, first - 1), (last, last + 1))
+    ]
+    return int(first if steps[0] <= steps[1] else last)
+
+
+def fill_symmetric(images: np.ndarray, bad: np.ndarray, x: Any = 0.0, y: Any = 0.0) -> np.ndarray:
+    """Fill bad pixels by the image opposite a centre, between pixels by cubic splines, or by good neighbours' mean.
+
+    `images` are background-subtracted [n, ny, nx]; the centres x and y are counted from those of the stamps, [n] or
+    one for all [pixel]. NaN counts as zero.
+    """
+    filled = np.where(bad, 0.0, images)
+    count, ny, nx = images.shape
+    centers = np.stack([np.broadcast_to(np.nan_to_num(center), (count,)) for center in (y, x)], axis=1)
+    for i in np.flatnonzero(bad.any(axis=(1, 2))):
+        rows, columns = np.nonzero(bad[i])
+        opposite = np.stack([ny - 1 + 2.0 * centers[i, 0] - rows, nx - 1 + 2.0 * centers[i, 1] - columns])
+        near_good = _near_mean(filled[i], bad[i])
+        inside = ((opposite >= 0.0) & (opposite <= np.array([[ny - 1], [nx - 1]]))).all(axis=0)
+        badness = ndimage.map_coordinates(bad[i].astype(np.float64), opposite, order=1, mode="nearest")
+        paired = inside & (badness < _OVERLAP)
+        values = near_good[rows, columns]
+        if paired.any():
+            at = opposite[:, paired]
+            on_pixels = np.array_equal(at, np.rint(at))
+            values[paired] = (
+                images[i][tuple(at.astype(int))]
+                if on_pixels
+                else ndimage.map_coordinates(near_good, at, order=3, mode="nearest")
+            )
+        filled[i, rows, columns] = values
+    return filled
+
+
+def _near_mean(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
+    """Return an image [ny, nx] whose bad pixels hold the mean of good ones near them, zero where there are none."""
+    weight, light = (
+        ndimage.gaussian_filter(values, _NEIGHBOURHOOD, mode="constant")
+        for values in ((~bad).astype(np.float64), np.where(bad, 0.0, image))
+    )
+    near = bad & (weight > _LEAST_NEIGHBOURS)
+    return np.where(near, light / np.where(near, weight, 1.0), np.where(bad, 0.0, image))
