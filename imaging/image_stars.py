@@ -12,16 +12,29 @@ from ..core.errors import DomainError, PachonError
 from ..core.statistics import RMS_PER_MAD
 from ..core.units import ARCSEC, positive_angle
 from ..measure.catalogue.detect import detect_objects
+from ..measure.catalogue.named_stars import named_stars
 from ..measure.catalogue.objects import DetectedObjects
-from ..measure.catalogue.star_locus import StarSelection, select_stars
+from ..measure.catalogue.star_locus import StarCut, StarSelection, select_stars
 from ..measure.shapes import measure_shapes
 from ..measure.star_selection import flag_stars
 from ..reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
 from ..reconstruction.psf_model.model import PsfModel
+from ..reconstruction.psf_model.pixels import Pixels
+from ..reconstruction.psf_model.polynomial_fit import Polynomial
 from ..reconstruction.psf_model.recipe import DEFAULT, Recipe
 from .exposure import SATURATED
 from .image_file import CcdImage
 
+#: Fewest stars of a PSF. Two have no majority against a galaxy or a blend.
+FEWEST_STARS = 3
+#: Stars from which on the PSF may vary over the image: as many make a stellar locus.
+MANY_STARS = 10
+# Stars are the smallest objects but for cosmic rays: half-light radii of smaller ones, over that of a locus of few.
+_SMALLER = (0.6, 0.87)
+# Most smaller objects that such a locus may have beside it, over its own.
+_MOST_SMALLER = 0.5
+#: PSF of few stars: the mean, weighted by S/N.
+CONSTANT = Recipe(Pixels(), Polynomial(0), weights="snr")
 # Stars whose shape deviates from that of their neighbours by more of the usual deviations than this are left out.
 _DEVIATIONS = 6.0
 # A galaxy or a blend among fewer stars cannot be told from the change of the PSF.
@@ -30,21 +43,73 @@ _FEWEST = 12
 _PASSES = 5
 
 
-def objects_and_stars(image: CcdImage, min_snr: float) -> tuple[DetectedObjects, StarSelection]:
-    """Detect the objects of an image, and select its stars: those of the stellar locus whose stamps show one star.
+def detected_objects(image: CcdImage) -> DetectedObjects:
+    """Detect the objects of an image; DomainError where there are none."""
+    try:
+        return detect_objects(image.image, image.variance, image.mask, saturated=SATURATED)
+    except PachonError as error:
+        raise error.within(subject=f"CCD {image.name}") from None
+
+
+def stars_among(image: CcdImage, objects: DetectedObjects, min_snr: float) -> StarSelection:
+    """Select the stars of a locus of ten or more whose stamps show one star; DomainError where there are too few."""
+    try:
+        return _single_stars(image, select_stars(objects, image.image, mask=image.mask, min_snr=min_snr))
+    except PachonError as error:
+        raise error.within(subject=f"CCD {image.name}") from None
+
+
+def few_or_many_stars(
+    image: CcdImage, objects: DetectedObjects, min_snr: float, positions: np.ndarray | None = None
+) -> StarSelection:
+    """Select the stars of a locus, of :data:`FEWEST_STARS` where there are not ten; or those at given pixels [k, 2].
 
     Raises
     ------
     DomainError
-        If nothing is detected, or there are too few stars for a locus.
+        If fewer are good.
     """
     try:
-        objects = detect_objects(image.image, image.variance, image.mask, saturated=SATURATED)
-        stars = select_stars(objects, image.image, mask=image.mask, min_snr=min_snr)
-        noise = float(np.sqrt(sky_variance(image)))
-        return objects, stars.without(flag_stars(stars.stamps, noise, gain=image.gain).flags != 0)
+        if positions is not None:
+            stars = named_stars(objects, image.image, positions, mask=image.mask, min_snr=min_snr)
+            if len(stars) >= FEWEST_STARS:
+                stars = _single_stars(image, stars)
+        else:
+            stars = _stars_of_any_locus(image, objects, min_snr)
     except PachonError as error:
         raise error.within(subject=f"CCD {image.name}") from None
+    if len(stars) < FEWEST_STARS:
+        raise DomainError(
+            f"{len(stars)} stars are good: expected at least {FEWEST_STARS} for a PSF; or a PSF model, psf",
+            subject=f"CCD {image.name}",
+        )
+    return stars
+
+
+def _stars_of_any_locus(image: CcdImage, objects: DetectedObjects, min_snr: float) -> StarSelection:
+    """Return the stars of a locus of ten or more, or else of the fewest; all of them may make the locus then."""
+    try:
+        return _single_stars(image, select_stars(objects, image.image, mask=image.mask, min_snr=min_snr))
+    except DomainError:
+        try:
+            stars = select_stars(
+                objects, image.image, mask=image.mask, min_snr=min_snr, min_stars=FEWEST_STARS, bright_snr=min_snr
+            )
+            ratio = objects.half_light_radius / stars.half_light_radius
+            smaller = (ratio > _SMALLER[0]) & (ratio < _SMALLER[1]) & ((stars.cuts & ~StarCut.SIZE) == 0)
+            if smaller.sum() > _MOST_SMALLER * len(stars):
+                raise DomainError(
+                    f"no stellar locus: {smaller.sum()} objects are smaller than {len(stars)} of equal size"
+                )
+            return _single_stars(image, stars)
+        except DomainError as error:
+            raise error.followed_by("expected more stars, their catalogue (stars), or a PSF model (psf)") from None
+
+
+def _single_stars(image: CcdImage, stars: StarSelection) -> StarSelection:
+    """Return the selected stars whose stamps show no neighbour, cosmic ray or saturated core."""
+    noise = float(np.sqrt(sky_variance(image)))
+    return stars.without(flag_stars(stars.stamps, noise, gain=image.gain).flags != 0)
 
 
 def sky_variance(image: CcdImage) -> float:
@@ -52,8 +117,10 @@ def sky_variance(image: CcdImage) -> float:
     return float(np.median(image.variance[image.mask == 0]))
 
 
-def fit_image_psf(image: CcdImage, stars: StarSelection, recipe: Recipe = DEFAULT) -> PsfModel:
+def fit_image_psf(image: CcdImage, stars: StarSelection, recipe: Recipe | None = None) -> PsfModel:
     """Fit a PSF model of one CCD to the selected stars of its image; positions are pixels of the image.
+
+    The recipe is the default one where there are :data:`MANY_STARS`, else :data:`CONSTANT`.
 
     Raises
     ------
@@ -61,6 +128,8 @@ def fit_image_psf(image: CcdImage, stars: StarSelection, recipe: Recipe = DEFAUL
         If there are too few stars for the model.
     """
     height, width = image.image.shape
+    if recipe is None:
+        recipe = DEFAULT if len(stars) >= MANY_STARS else CONSTANT
     try:
         return PsfModel.fit(
             stars.stamps,
@@ -74,9 +143,17 @@ def fit_image_psf(image: CcdImage, stars: StarSelection, recipe: Recipe = DEFAUL
         raise error.within(subject=f"CCD {image.name}") from None
 
 
-def pixels_of_ccd(image: CcdImage, positions: np.ndarray) -> np.ndarray:
-    """Convert pixels of an image, which may be a part of the CCD, to pixels of the CCD, both [n, 2]."""
-    return np.asarray(positions + np.array([image.header.get("CCDX0", 0), image.header.get("CCDY0", 0)]))
+def few_stars_warning(image: CcdImage, stars: StarSelection) -> str:
+    """Return the words for a PSF of few stars: how many, and the standard error of its ellipticity."""
+    weight = 2.0 * stars.half_light_radius * image.pixel_scale
+    shapes = measure_shapes(stars.stamps, image.pixel_scale, weight)
+    e = np.stack([shapes.e1, shapes.e2])[:, shapes.flags == 0]
+    count = e.shape[1]
+    error = float(np.sqrt((e.var(axis=1, ddof=1)).mean() / count)) if count > 1 else np.nan
+    return (
+        f"its PSF comes from {len(stars)} stars: weighted e good to {error:.1g} a component; "
+        "a catalogue of stars (stars) or a PSF model (psf) makes it better"
+    )
 
 
 @check_arguments
@@ -110,7 +187,7 @@ def focal_plane_stars(
     ccd_stars, scale, reason = [], 0.0, "there are no images"
     for image in images:
         try:
-            _, stars = objects_and_stars(image, min_snr)
+            stars = stars_among(image, detected_objects(image), min_snr)
         except DomainError as error:
             reason = str(error)
             continue
@@ -127,7 +204,7 @@ def _ccd_stars(image: CcdImage, stars: StarSelection, weight_fwhm: float) -> Ccd
     stamps = stars.stamps / flux[:, None, None]
     shapes = measure_shapes(stamps, image.pixel_scale, weight_fwhm)
     level = sky_variance(image) * image.gain**2
-    x, y = pixels_of_ccd(image, stars.positions).T
+    x, y = image.pixels_of_ccd(stars.positions).T
     good = (flux > 0.0) & (shapes.flags == 0)
     values = np.stack([shapes.e1, shapes.e2, np.log(np.where(good, shapes.size, 1.0))], axis=1)
     good[good] = regular_shapes(values[good], stars.snr[good], stars.positions[good])
