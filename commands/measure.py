@@ -160,6 +160,5 @@ def measure_command(
             rows.append(row)
         has_truth = any("purity" in m for m in measured.metrics.values())
         columns = len(_HEADINGS) if has_truth else _COLUMNS
-        Rows(
-            _HEADINGS[:columns], [tuple((row + [""] * columns)[:columns]) for row in rows], _CAPTION if has_truth else ""
-        ).show()
+        padded_rows = [(row + [""] * columns)[:columns] for row in rows]
+        Rows(_HEADINGS[:columns], padded_rows, _CAPTION if has_truth else "").show()

@@ -15,7 +15,7 @@ from ...core.errors import ConfigError, DomainError, ProductError
 from ...core.units import ARCSEC, positive_angle, require_positive
 from ..image_file import CcdImage
 from .fits_parts import FitsPart, FitsParts
-from .header_cards import BAND_KEYS, CHIP_KEYS, EXPOSURE_KEYS, GAIN_KEYS, HeaderCards, Sourced
+from .header_cards import BAND_KEYS, CHIP_KEYS, GAIN_KEYS, HeaderCards, Sourced
 from .pixel_noise import (
     PixelVariance,
     Sky,
@@ -123,9 +123,7 @@ def image_sources(path: Path, extension: str | None = None) -> list[ImageSource]
 
 
 @check_arguments
-def load_image(
-    path: str | Path, *, extension: str | None = None, settings: ImageSettings | None = None
-) -> CcdImage:
+def load_image(path: str | Path, *, extension: str | None = None, settings: ImageSettings | None = None) -> CcdImage:
     """Read an image of a CCD from a FITS file of any program.
 
     Read are images of LSST and HSC (IMAGE, MASK, VARIANCE), of DES (SCI, MSK, WGT), those with extensions of weights,
