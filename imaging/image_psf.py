@@ -8,6 +8,7 @@ import numpy as np
 from astropy import units as u
 
 from ..core.errors import DomainError, PachonError, ProductError
+from ..measure.catalogue.star_locus import stamp_side
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ..reconstruction.piff.psf import PiffPsf, load_piff
 from ..reconstruction.psf_model.model import PsfModel
@@ -16,8 +17,8 @@ from .image_file import CcdImage
 
 #: Kinds of models that images are measured with.
 ImagePsf = PsfModel | FocalPlanePsf | PiffPsf | PsfexPsf
-#: Side of the stamps of models that are drawn at any size [pixel], as that of stars on images.
-_SIDE = 31
+#: Side of a stamp on which the half-light radius of a model is measured [pixel].
+_WIDE_SIDE = 63
 #: Readers of files, by the kind that they read.
 _READERS = {
     "PsfModel": PsfModel.read,
@@ -65,9 +66,12 @@ def psfs_on(image: CcdImage, psf: ImagePsf, places: np.ndarray, threads: int | N
             inside = np.clip(places, -0.5, np.array(image.image.shape[::-1]) - 0.5)
             stamps = psf.draw(image.name, *(image.pixels_of_ccd(inside).T * u.pix), threads=threads)
         elif isinstance(psf, PiffPsf):
-            stamps = psf.at(places + 1.0, chip=_chip_of(image, psf), size=_SIDE)
+            chip = _chip_of(image, psf)
+            wide = psf.at(places[:1] + 1.0, chip=chip, size=_WIDE_SIDE)
+            stamps = psf.at(places + 1.0, chip=chip, size=stamp_side(half_light_radius_of(wide[0])))
         else:
-            stamps = psf.at(places + 1.0, size=_SIDE)
+            wide = psf.at(places[:1] + 1.0, size=_WIDE_SIDE)
+            stamps = psf.at(places + 1.0, size=stamp_side(half_light_radius_of(wide[0])))
     except PachonError as error:
         raise error.within(subject=f"PSF model of {image.name}") from None
     total = stamps.sum(axis=(1, 2), keepdims=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,9 +13,9 @@ from ..core.errors import DomainError, PachonError
 from ..core.statistics import RMS_PER_MAD
 from ..core.units import ARCSEC, positive_angle
 from ..measure.catalogue.detect import detect_objects
-from ..measure.catalogue.named_stars import named_stars
+from ..measure.catalogue.few_stars import FEWEST_STARS, named_stars, smallest_stars
 from ..measure.catalogue.objects import DetectedObjects
-from ..measure.catalogue.star_locus import StarCut, StarSelection, select_stars
+from ..measure.catalogue.star_locus import STAMP_SIDE, StarSelection, select_stars, stamp_side
 from ..measure.shapes import measure_shapes
 from ..measure.star_selection import flag_stars
 from ..reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
@@ -25,14 +26,14 @@ from ..reconstruction.psf_model.recipe import DEFAULT, Recipe
 from .exposure import SATURATED
 from .image_file import CcdImage
 
-#: Fewest stars of a PSF. Two have no majority against a galaxy or a blend.
-FEWEST_STARS = 3
+# What else makes a PSF.
+_HINT = "or a lower min_snr, a catalogue of stars (stars), a PSF model (psf)"
 #: Stars from which on the PSF may vary over the image: as many make a stellar locus.
 MANY_STARS = 10
-# Stars are the smallest objects but for cosmic rays: half-light radii of smaller ones, over that of a locus of few.
-_SMALLER = (0.6, 0.87)
-# Most smaller objects that such a locus may have beside it, over its own.
-_MOST_SMALLER = 0.5
+# Least distance of a star to its nearest neighbour on stamps of the usual side [pixel].
+_ISOLATION = 12.0
+# Part of the bright objects that is smaller than most stars, or than small galaxies.
+_SMALL_OBJECTS = 0.25
 #: PSF of few stars: the mean, weighted by S/N.
 CONSTANT = Recipe(Pixels(), Polynomial(0), weights="snr")
 # Stars whose shape deviates from that of their neighbours by more of the usual deviations than this are left out.
@@ -54,7 +55,7 @@ def detected_objects(image: CcdImage) -> DetectedObjects:
 def stars_among(image: CcdImage, objects: DetectedObjects, min_snr: float) -> StarSelection:
     """Select the stars of a locus of ten or more whose stamps show one star; DomainError where there are too few."""
     try:
-        return _single_stars(image, select_stars(objects, image.image, mask=image.mask, min_snr=min_snr))
+        return _stars_of_locus(image, objects, min_snr)
     except PachonError as error:
         raise error.within(subject=f"CCD {image.name}") from None
 
@@ -71,8 +72,9 @@ def few_or_many_stars(
     """
     try:
         if positions is not None:
-            stars = named_stars(objects, image.image, positions, mask=image.mask, min_snr=min_snr)
-            if len(stars) >= FEWEST_STARS:
+            side = stamp_side(_usual_radius(objects, min_snr))
+            stars = named_stars(objects, image.image, positions, mask=image.mask, min_snr=min_snr, size=side)
+            if len(stars) >= MANY_STARS:
                 stars = _single_stars(image, stars)
         else:
             stars = _stars_of_any_locus(image, objects, min_snr)
@@ -80,7 +82,7 @@ def few_or_many_stars(
         raise error.within(subject=f"CCD {image.name}") from None
     if len(stars) < FEWEST_STARS:
         raise DomainError(
-            f"{len(stars)} stars are good: expected at least {FEWEST_STARS} for a PSF; or a PSF model, psf",
+            f"{len(stars)} stars are good: expected at least {FEWEST_STARS} for a PSF, {_HINT}",
             subject=f"CCD {image.name}",
         )
     return stars
@@ -89,21 +91,43 @@ def few_or_many_stars(
 def _stars_of_any_locus(image: CcdImage, objects: DetectedObjects, min_snr: float) -> StarSelection:
     """Return the stars of a locus of ten or more, or else of the fewest; all of them may make the locus then."""
     try:
-        return _single_stars(image, select_stars(objects, image.image, mask=image.mask, min_snr=min_snr))
+        return _stars_of_locus(image, objects, min_snr)
     except DomainError:
+        side = stamp_side(_usual_radius(objects, min_snr))
         try:
-            stars = select_stars(
-                objects, image.image, mask=image.mask, min_snr=min_snr, min_stars=FEWEST_STARS, bright_snr=min_snr
+            # A median of few stars is no star, with which to compare their stamps.
+            return smallest_stars(
+                objects,
+                image.image,
+                mask=image.mask,
+                min_snr=min_snr,
+                isolation=_ISOLATION * side / STAMP_SIDE,
+                size=side,
             )
-            ratio = objects.half_light_radius / stars.half_light_radius
-            smaller = (ratio > _SMALLER[0]) & (ratio < _SMALLER[1]) & ((stars.cuts & ~StarCut.SIZE) == 0)
-            if smaller.sum() > _MOST_SMALLER * len(stars):
-                raise DomainError(
-                    f"no stellar locus: {smaller.sum()} objects are smaller than {len(stars)} of equal size"
-                )
-            return _single_stars(image, stars)
         except DomainError as error:
-            raise error.followed_by("expected more stars, their catalogue (stars), or a PSF model (psf)") from None
+            raise error.followed_by(_HINT) from None
+
+
+def _stars_of_locus(image: CcdImage, objects: DetectedObjects, min_snr: float) -> StarSelection:
+    """Return the stars of a locus of ten or more whose stamps show one star."""
+    return _single_stars(image, _locus(image, objects, min_snr))
+
+
+def _locus(image: CcdImage, objects: DetectedObjects, min_snr: float, **options: Any) -> StarSelection:
+    """Return the stars of a locus, on stamps as wide as stars of the image ask for."""
+    side = stamp_side(_usual_radius(objects, min_snr))
+    isolation = _ISOLATION * side / STAMP_SIDE
+    return select_stars(
+        objects, image.image, mask=image.mask, min_snr=min_snr, isolation=isolation, size=side, **options
+    )
+
+
+def _usual_radius(objects: DetectedObjects, min_snr: float) -> float:
+    """Return about the half-light radius of the stars of an image, which are among the smallest objects [pixel]."""
+    measured = (objects.flags == 0) & np.isfinite(objects.half_light_radius) & (objects.snr > min_snr)
+    if not measured.any():
+        return np.nan
+    return float(np.quantile(objects.half_light_radius[measured], _SMALL_OBJECTS))
 
 
 def _single_stars(image: CcdImage, stars: StarSelection) -> StarSelection:

@@ -73,7 +73,8 @@ def _opened(path: Path, **options: bool) -> Iterator[fits.HDUList]:
     with warnings.catch_warnings(), parsing(path, "damaged or not FITS", ProductError):
         warnings.simplefilter("ignore", AstropyWarning)
         warnings.filterwarnings("error", message=".*truncated.*")
-        with fits.open(path, lazy_load_hdus=False, **options) as hdus:
+        # Closed here, too, where the file cannot be parsed.
+        with open(path, "rb") as opened, fits.open(opened, lazy_load_hdus=False, **options) as hdus:
             yield hdus
 
 

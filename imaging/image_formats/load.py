@@ -202,13 +202,13 @@ def _image_of(file: FitsParts, planes: PlaneNames, settings: ImageSettings) -> C
         origins["saturation"] = saturation.source
     finite = np.isfinite(image)
     bad = ~finite | (defects.bad & ~defects.saturated)
-    if bad.all():
-        raise ProductError("all pixels are masked or not finite: expected some that are good", file=path)
     plane = _noise_plane(file, planes, settings)
     if plane is not None:
+        if plane.without.all():
+            raise ProductError(f"{plane.source}: no pixel has a weight above zero", file=path)
         bad |= plane.without
-        if bad.all():
-            raise ProductError(f"{plane.source}: no good pixel has a weight above zero", file=path)
+    if (bad | defects.saturated).all():
+        raise ProductError("all pixels are masked, saturated or not finite: expected some that are good", file=path)
     sky = Sky.of(image, bad | defects.saturated, path)
     light = np.where(bad, 0.0, image - sky.level)
     gain = Sourced(settings.gain, "settings") if settings.gain is not None else cards.gain()

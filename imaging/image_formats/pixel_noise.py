@@ -32,7 +32,7 @@ _FEWEST_BRIGHT = 200
 _WITH_PHOTONS = 0.5
 #: Scatter of the slope, over the slope, below which the variance follows the light.
 _STEADY = 0.5
-#: Blur of the light of which the photon noise is taken, rms [pixel]: that of single pixels would follow their noise,
+#: Blur of faint light of which the photon noise is taken, rms [pixel]: that of single pixels would follow their noise,
 #: and bright ones count too little.
 _BLUR = 1.0
 #: Weights whose noise is further than this factor from that of the image are relative ones, as SExtractor takes them.
@@ -122,7 +122,9 @@ def photon_slope(variance: PixelVariance, light: np.ndarray, bad: np.ndarray, rm
 
 def with_photons(variance: PixelVariance, light: np.ndarray, gain: float) -> PixelVariance:
     """Return a variance of the sky with the photon noise of the light [unit of the image] added."""
-    photons = np.maximum(ndimage.gaussian_filter(light, _BLUR), 0.0) / gain
+    rms = np.sqrt(variance.values)
+    smooth = np.where(light > _BRIGHT * rms, light, ndimage.gaussian_filter(light, _BLUR))
+    photons = np.maximum(smooth, 0.0) / gain
     return PixelVariance(variance.values + photons, f"{variance.source} and photons", variance.without)
 
 

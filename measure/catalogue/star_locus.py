@@ -34,6 +34,14 @@ _SIDE = (1.15, 1.75)
 _LEAST_WIDTH = 0.01
 # Side of the stamps of stars [pixel].
 STAMP_SIDE = 31
+# Half-light radii of stars for which that side is right [pixel].
+_USUAL_RADII = (1.5, 3.5)
+# Side of other stamps [half-light radii].
+_STAMP_RADII = 9.0
+# Least side: fewer pixels leave no sky around a star.
+_LEAST_SIDE = 21
+# Largest side: more hold neighbours.
+_MOST_SIDE = 101
 # Margin of a stamp for the light that its Fourier shift wraps around [pixel].
 _MARGIN = 8
 
@@ -272,6 +280,14 @@ def _stellar_locus(radius: np.ndarray, least: int) -> tuple[float, float]:
         near = ordered[np.abs(ordered - center) < min(3.0 * max(width, _LEAST_WIDTH * center), _INTERVAL * center)]
         center, width = median_and_sigma(near)
     return center, max(width, _LEAST_WIDTH * center)
+
+
+def stamp_side(half_light_radius: float) -> int:
+    """Return the side of the stamps of stars of a half-light radius [pixel], odd: :data:`STAMP_SIDE` of most images."""
+    if np.isnan(half_light_radius) or _USUAL_RADII[0] <= half_light_radius <= _USUAL_RADII[1]:
+        return STAMP_SIDE
+    side = 2 * int(0.5 * _STAMP_RADII * half_light_radius) + 1
+    return min(max(side, _LEAST_SIDE), _MOST_SIDE)
 
 
 def median_and_sigma(values: np.ndarray) -> tuple[float, float]:
