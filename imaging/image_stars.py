@@ -91,21 +91,20 @@ def few_or_many_stars(
 def _stars_of_any_locus(image: CcdImage, objects: DetectedObjects, min_snr: float) -> StarSelection:
     """Return the stars of a locus of ten or more, or else of the fewest; all of them may make the locus then."""
     try:
-        return _stars_of_locus(image, objects, min_snr)
+        stars = _stars_of_locus(image, objects, min_snr)
     except DomainError:
-        side = stamp_side(_usual_radius(objects, min_snr))
-        try:
-            # A median of few stars is no star, with which to compare their stamps.
-            return smallest_stars(
-                objects,
-                image.image,
-                mask=image.mask,
-                min_snr=min_snr,
-                isolation=_ISOLATION * side / STAMP_SIDE,
-                size=side,
-            )
-        except DomainError as error:
-            raise error.followed_by(_HINT) from None
+        stars = None
+    if stars is not None and len(stars) >= MANY_STARS:
+        return stars
+    side = stamp_side(_usual_radius(objects, min_snr))
+    options: dict[str, Any] = {"isolation": _ISOLATION * side / STAMP_SIDE, "size": side, "mask": image.mask}
+    try:
+        # A median of few stars is no star, with which to compare their stamps.
+        return smallest_stars(objects, image.image, min_snr=min_snr, **options)
+    except DomainError as error:
+        if stars is not None and len(stars) >= FEWEST_STARS:
+            return stars
+        raise error.followed_by(_HINT) from None
 
 
 def _stars_of_locus(image: CcdImage, objects: DetectedObjects, min_snr: float) -> StarSelection:

@@ -79,7 +79,7 @@ def _table_in(path: Path) -> Table:
         warnings.simplefilter("ignore")
         if not data.startswith(b"SIMPLE"):
             kind = "ascii.ecsv" if data.lstrip().startswith(b"# %ECSV") else "ascii.csv"
-            return Table.read(io.StringIO(data.decode()), format=kind)
+            return Table.read(data.decode(), format=kind)
         with fits.open(io.BytesIO(data), lazy_load_hdus=False) as hdus:
             tables = [Table.read(hdu) for hdu in hdus if isinstance(hdu, (fits.BinTableHDU, fits.TableHDU))]
     known_names = {name for names in (*_FROM_ONE, *_FROM_ZERO, *_CELESTIAL, _CELESTIAL_RADIAN) for name in names}

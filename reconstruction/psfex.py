@@ -122,19 +122,21 @@ def load_psfex(path: str | Path) -> PsfexPsf:
                 key=key,
             )
         zero[axis] = _number(header, f"POLZERO{axis + 1}", file)
-        scale[axis] = _number(header, f"POLSCAL{axis + 1}", file)
+        scale[axis] = _number(header, f"POLSCAL{axis + 1}", file, positive=True)
     order = int(_number(header, "POLDEG1", file)) if groups else 0
     count = (order + 1) * (order + 2) // 2
-    if images.ndim != 3 or len(images) != count or not np.isfinite(images).all() or not (scale != 0.0).all():
+    if images.ndim != 3 or len(images) != count or not np.isfinite(images).all():
         raise ProductError(
             f"{_COLUMN} has shape {images.shape}: expected {count} images, those of a polynomial of order {order}",
             file=file,
         )
-    return PsfexPsf(images, _number(header, "PSF_SAMP", file), order, zero, scale)
+    return PsfexPsf(images, _number(header, "PSF_SAMP", file, positive=True), order, zero, scale)
 
 
-def _number(header: Any, key: str, file: Path, default: float | None = None) -> float:
+def _number(header: Any, key: str, file: Path, default: float | None = None, *, positive: bool = False) -> float:
     value = header.get(key, default)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
         raise ProductError(f"{key} = {shown(value)}: expected a number", file=file, key=key)
+    if positive and not value > 0.0:
+        raise ProductError(f"{key} = {shown(value)}: expected a number above 0", file=file, key=key)
     return float(value)

@@ -18,11 +18,15 @@ MATCH = 3.0
 #: Fewest stars of a PSF: two have no majority against a galaxy or a blend.
 FEWEST_STARS = 3
 #: Largest ratio of half-light radii and of FWHM of stars of one image, but for noise.
-_EQUAL = 1.08
+_EQUAL = 1.04
 #: Largest deviation by noise [standard deviations]: a galaxy would count for much among few stars.
 _SIGMA = 2.0
-#: Largest deviation of the isophotal ellipticity, as of many stars.
-_ELLIPTICITY = 0.1
+#: Largest deviation of the isophotal ellipticity, but for noise.
+_ELLIPTICITY = 0.03
+#: Least FWHM [pixel]: hot pixels and cosmic rays are alike, too.
+_LEAST_FWHM = 1.5
+#: Least part of the smallest objects that are alike: galaxies of one size have many ellipticities.
+_ALIKE = 0.6
 #: Most objects, such as cosmic rays, that are smaller than stars.
 _MOST_SMALLER = 2
 
@@ -83,8 +87,8 @@ def smallest_stars(
 ) -> StarSelection:
     """Select the smallest objects of one size, of which there are three or more, and cut out their stamps.
 
-    Stars are the smallest objects, but for a cosmic ray here and there; a few make no mode among galaxies, as
-    :func:`~pachon.select_stars` looks for.
+    Stars are the smallest objects, but for a cosmic ray here and there, and of one ellipticity; a few make no mode
+    among galaxies, as :func:`~pachon.select_stars` looks for.
 
     Parameters
     ----------
@@ -100,9 +104,11 @@ def smallest_stars(
     """
     cuts = _cuts_of_single_objects(objects, image, min_snr, size, mask, ObjectFlag.GOOD)
     cuts[objects.neighbour_distance < isolation] |= StarCut.NEIGHBOUR
+    cuts[~(objects.fwhm >= _LEAST_FWHM)] |= StarCut.WIDTH
     candidates = np.flatnonzero(cuts == 0)
     order = candidates[np.argsort(objects.half_light_radius[candidates], kind="stable")]
     radii = objects.half_light_radius[order]
+    reason = f"the smallest ones are of different sizes, expected {FEWEST_STARS} of one"
     for first in range(min(1 + _MOST_SMALLER, len(radii))):
         group = order[first : np.searchsorted(radii, _EQUAL * radii[first], side="right")]
         if len(group) < FEWEST_STARS:
@@ -111,12 +117,13 @@ def smallest_stars(
         for values, cut in ((objects.half_light_radius, StarCut.SIZE), (objects.fwhm, StarCut.WIDTH)):
             cuts[~(np.abs(values / np.median(values[group]) - 1.0) < _EQUAL - 1.0 + noise)] |= cut
         e1, e2 = (e - np.median(e[group]) for e in (objects.e1, objects.e2))
-        cuts[~(np.hypot(e1, e2) < _ELLIPTICITY)] |= StarCut.SHAPE
-        return _selection(objects, image, cuts, size, mask)
-    raise DomainError(
-        f"no stars: no {FEWEST_STARS} of the smallest of {len(order)} isolated objects of S/N above {min_snr:g} are "
-        "of one size"
-    )
+        cuts[~(np.hypot(e1, e2) < _ELLIPTICITY + noise)] |= StarCut.SHAPE
+        count, least = int((cuts == 0).sum()), max(FEWEST_STARS, int(np.ceil(_ALIKE * len(group))))
+        if count >= least:
+            return _selection(objects, image, cuts, size, mask)
+        reason = f"{count} of the {len(group)} smallest ones have one width and ellipticity, expected at least {least}"
+        break
+    raise DomainError(f"no stars: of {len(order)} isolated objects of S/N above {min_snr:g} {reason}")
 
 
 def _cuts_of_single_objects(
