@@ -87,7 +87,7 @@ class CcdImage(Result):
             draw_image(axes, self.image, self.variance, self.header)
             words = [self.name]
             if self.band is not None:
-                words.append(f"{self.band} band")
+                words.append(f"{self.band.split()[0]} band")
             if "EXPTIME" in self.header:
                 words.append(f"{self.header['EXPTIME']:g} s")
             axes.set_title(plain_text(", ".join(words)), loc="left")

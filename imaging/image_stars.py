@@ -13,7 +13,7 @@ from ..core.errors import DomainError, PachonError
 from ..core.statistics import RMS_PER_MAD
 from ..core.units import ARCSEC, positive_angle
 from ..measure.catalogue.detect import detect_objects
-from ..measure.catalogue.few_stars import FEWEST_STARS, named_stars, smallest_stars
+from ..measure.catalogue.few_stars import FEWEST_STARS, LEAST_FWHM, named_stars, smallest_stars
 from ..measure.catalogue.objects import DetectedObjects
 from ..measure.catalogue.star_locus import STAMP_SIDE, StarSelection, select_stars, stamp_side
 from ..measure.shapes import measure_shapes
@@ -124,6 +124,7 @@ def _locus(image: CcdImage, objects: DetectedObjects, min_snr: float, **options:
 def _usual_radius(objects: DetectedObjects, min_snr: float) -> float:
     """Return about the half-light radius of the stars of an image, which are among the smallest objects [pixel]."""
     measured = (objects.flags == 0) & np.isfinite(objects.half_light_radius) & (objects.snr > min_snr)
+    measured &= objects.fwhm >= LEAST_FWHM
     if not measured.any():
         return np.nan
     return float(np.quantile(objects.half_light_radius[measured], _SMALL_OBJECTS))

@@ -24,7 +24,7 @@ _SIGMA = 2.0
 #: Largest deviation of the isophotal ellipticity, but for noise.
 _ELLIPTICITY = 0.03
 #: Least FWHM [pixel]: hot pixels and cosmic rays are alike, too.
-_LEAST_FWHM = 1.5
+LEAST_FWHM = 1.5
 #: Least part of the smallest objects that are alike: galaxies of one size have many ellipticities.
 _ALIKE = 0.6
 #: Most objects, such as cosmic rays, that are smaller than stars.
@@ -104,7 +104,7 @@ def smallest_stars(
     """
     cuts = _cuts_of_single_objects(objects, image, min_snr, size, mask, ObjectFlag.GOOD)
     cuts[objects.neighbour_distance < isolation] |= StarCut.NEIGHBOUR
-    cuts[~(objects.fwhm >= _LEAST_FWHM)] |= StarCut.WIDTH
+    cuts[~(objects.fwhm >= LEAST_FWHM)] |= StarCut.WIDTH
     candidates = np.flatnonzero(cuts == 0)
     order = candidates[np.argsort(objects.half_light_radius[candidates], kind="stable")]
     radii = objects.half_light_radius[order]
