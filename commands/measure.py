@@ -150,7 +150,14 @@ def measure_command(
     elif not quiet:
         rows = []
         for name, m in measured.metrics.items():
-            row = [name, str(m["objects"]), str(m["stars"]), str(m["usable"]), f"{m['usable_per_arcmin2']:.1f}"]
+            density = m["usable_per_arcmin2"]
+            row = [
+                name,
+                str(m["objects"]),
+                str(m["stars"]),
+                str(m["usable"]),
+                "" if density is None else f"{density:.1f}",
+            ]
             if "purity" in m:
                 row += [
                     f"{m['star_completeness']:.2f}, {m['star_purity']:.2f}",

@@ -129,6 +129,11 @@ class CcdImage(Result):
         return has_celestial(self.header)
 
     @property
+    def has_scale(self) -> bool:
+        """Whether the angle of a pixel is known."""
+        return self.has_sky or "PIXSCALE" in self.header
+
+    @property
     def pixel_scale(self) -> float:
         """Angle of a pixel at the reference point of the world coordinates, or of PIXSCALE without them [rad].
 

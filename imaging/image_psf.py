@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ ImagePsf = PsfModel | FocalPlanePsf | PiffPsf | PsfexPsf
 #: Side of a stamp on which the half-light radius of a model is measured [pixel].
 _WIDE_SIDE = 63
 #: Readers of files, by the kind that they read.
-_READERS = {
+_READERS: dict[str, Callable[[Path], ImagePsf]] = {
     "PsfModel": PsfModel.read,
     "FocalPlanePsf": FocalPlanePsf.read,
     "Piff": load_piff,

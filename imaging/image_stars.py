@@ -61,7 +61,7 @@ def stars_among(image: CcdImage, objects: DetectedObjects, min_snr: float) -> St
 
 
 def few_or_many_stars(
-    image: CcdImage, objects: DetectedObjects, min_snr: float, positions: np.ndarray | None = None
+    image: CcdImage, objects: DetectedObjects, min_snr: float, positions: ArrayLike | None = None
 ) -> StarSelection:
     """Select the stars of a locus, of :data:`FEWEST_STARS` where there are not ten; or those at given pixels [k, 2].
 
@@ -167,10 +167,10 @@ def fit_image_psf(image: CcdImage, stars: StarSelection, recipe: Recipe | None =
         raise error.within(subject=f"CCD {image.name}") from None
 
 
-def few_stars_warning(image: CcdImage, stars: StarSelection) -> str:
+def few_stars_warning(stars: StarSelection) -> str:
     """Return the words for a PSF of few stars: how many, and the standard error of its ellipticity."""
-    weight = 2.0 * stars.half_light_radius * image.pixel_scale
-    shapes = measure_shapes(stars.stamps, image.pixel_scale, weight)
+    # Ellipticities have no scale: a pixel counts as an arcsec.
+    shapes = measure_shapes(stars.stamps, ARCSEC, 2.0 * stars.half_light_radius * ARCSEC)
     e = np.stack([shapes.e1, shapes.e2])[:, shapes.flags == 0]
     count = e.shape[1]
     error = float(np.sqrt((e.var(axis=1, ddof=1)).mean() / count)) if count > 1 else np.nan

@@ -144,13 +144,15 @@ class ImageCatalogue(Result):
 
     def metrics(self) -> dict[str, Any]:
         """Return numbers of objects and, against the truth of a simulated image, completeness and purity."""
-        area = float((self.image.mask == 0).sum()) * (self.image.pixel_scale / ARCMIN) ** 2
+        area = None
+        if self.image.has_scale:
+            area = float((self.image.mask == 0).sum()) * (self.image.pixel_scale / ARCMIN) ** 2
         numbers: dict[str, Any] = {
             "objects": len(self.objects),
             "stars": len(self.stars),
             "galaxies_fitted": len(self.galaxies),
             "usable": int(self.usable.sum()),
-            "usable_per_arcmin2": float(self.usable.sum() / area),
+            "usable_per_arcmin2": None if area is None else float(self.usable.sum() / area),
             "star_half_light_radius_pixel": self.stars.half_light_radius,
         }
         if self.warnings:
@@ -223,7 +225,7 @@ def measure_image(
         selected_stars = few_or_many_stars(image, objects, min_snr, stars)
         model = fit_image_psf(image, selected_stars, None if recipe is None else Recipe.of(recipe))
         if len(selected_stars) < MANY_STARS:
-            warnings = (few_stars_warning(image, selected_stars),)
+            warnings = (few_stars_warning(selected_stars),)
     else:
         model = psf
         selected_stars = _stars_beside_model(image, objects, psf, min_snr, stars)

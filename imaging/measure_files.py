@@ -107,7 +107,9 @@ class FileMeasurement:
     def __call__(self, source: ImageSource, threads: int) -> dict[str, Any] | str:
         """Measure an image, write its PSF model and its catalogue, and return its metrics, or why it has none."""
         options = self.options.of(source.path)
-        psf = None if options.psf is None else _model_in(Path(options.psf), content_hash(options.psf, ProductError))
+        psf = (
+            None if options.psf is None else _model_in(Path(options.psf), content_hash(Path(options.psf), ProductError))
+        )
         image = load_image(source.path, extension=source.extension, settings=options.settings)
         try:
             stars = None if options.stars is None else read_star_positions(Path(options.stars), image)
@@ -119,9 +121,9 @@ class FileMeasurement:
         table, metrics = catalogue.table(), catalogue.metrics()
         table.meta |= {"MEASHASH": self.digest(source), "METRICS": json.dumps(metrics)}
         if isinstance(catalogue.psf, PsfModel) and psf is None:
-            model_file = self.product(source, PSF_SUFFIX)
-            catalogue.psf.write(model_file)
-            table.meta["PSFHASH"] = content_hash(model_file, ProductError)
+            product = self.product(source, PSF_SUFFIX)
+            catalogue.psf.write(product)
+            table.meta["PSFHASH"] = content_hash(product, ProductError)
         # Last: a resumed measurement takes it for the sign of a finished image.
         write_fits(self.product(source, CATALOGUE_SUFFIX), [fits.table_to_hdu(table)], None, [])
         return metrics

@@ -397,7 +397,7 @@ def calls(folder):
                 "image": m.ccd_image,
                 "psf": None,
                 "recipe": "kriging",
-                "stars": [[12.0, 12.0]],
+                "stars": None,
                 "min_snr": 30.0,
                 "threads": 1,
             },
