@@ -310,7 +310,8 @@ def _cases(folder):
 NAMES = (
     "zmx", "seq", "len", "json", "roa", "zar", "agf", "baseline", "site", "images", "visits", "degrees",
     "heights_ecsv", "heights_fits", "galaxies_ecsv", "galaxies_fits", "stars", "mosaic", "grid", "image",
-    "foreign_image", "psfex", "psf_model", "stl", "glb", "gltf", "obj", "ply", "off", "piff", "star_list", "star_list_ecsv",
+    "foreign_image", "psfex",
+    "psf_model", "stl", "glb", "gltf", "obj", "ply", "off", "piff", "star_list", "star_list_ecsv",
     "star_list_fits", "camera", "tolerances", "optimization", "align", "image_stack", "coatings", "states", "donuts",
     "donut_table", "store",
 )  # fmt: skip
