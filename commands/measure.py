@@ -80,6 +80,9 @@ def measure_command(
     saturation: Annotated[
         float | None, Option(help="Level of saturated pixels [unit of the image], where the header has none.")
     ] = None,
+    pictures: Annotated[
+        bool, Option("--pictures", help="Also image_measured.png: objects, stellar locus, stars beside their PSF.")
+    ] = False,
     resume: Annotated[bool, Option("--resume", help="Keep whole products of images measured in the same way.")] = False,
     processes: Processes = None,
     threads: Threads = None,
@@ -143,7 +146,7 @@ def measure_command(
             fit_exposure_psf(
                 images, telescope_model, min_snr=min_snr, threads=threads, reporter=execution.reporter
             ).write(psf_file)
-        options = MeasureOptions(psf_file, ccd_recipe, stars, min_snr, settings)
+        options = MeasureOptions(psf_file, ccd_recipe, stars, min_snr, settings, pictures)
         measured = measure_files(images, out, extension=extension, options=options, execution=execution)
     if as_json:
         print_json({"images": measured.metrics, "left_out": measured.left_out})

@@ -19,7 +19,7 @@ from ..core.version import VERSION
 from ..measure.catalogue.fit_galaxies import fit_galaxies
 from ..measure.catalogue.galaxy_fits import GalaxyFits, usable_galaxies
 from ..measure.catalogue.matching import detection_rates, match_positions
-from ..measure.catalogue.objects import DetectedObjects
+from ..measure.catalogue.objects import DetectedObjects, ObjectFlag
 from ..measure.catalogue.star_locus import StarSelection
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ..reconstruction.piff.psf import PiffPsf
@@ -134,7 +134,7 @@ class ImageCatalogue(Result):
             "error": (fits.ellipticity_error, "", "standard error of a component"),
             "size": (fits.size, "pix", "rms width before the PSF"),
             "flags": (fits.flags, "", "of the fit, 0 is good"),
-            "usable": (self.usable, "", "larger than stars, error of e below 0.2"),
+            "usable": (self.usable, "", "larger than stars, error of e below 0.2, not saturated"),
         }
         # Names that fit FITS cards as well.
         meta: dict[str, Any] = {"CCD": self.image.name, "CREATOR": f"pachon {VERSION}"}
@@ -245,7 +245,9 @@ def measure_image(
         threads=threads,
     )
     radius = np.nan_to_num(objects.half_light_radius[rows])
-    usable = usable_galaxies(fits, radius, selected_stars.half_light_radius)
+    # A saturated star is as wide as a galaxy.
+    saturated = (objects.flags[rows] & ObjectFlag.SATURATED) != 0
+    usable = usable_galaxies(fits, radius, selected_stars.half_light_radius) & ~saturated
     return ImageCatalogue(image, objects, selected_stars, model, rows, fits, usable, warnings)
 
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from astropy.io import fits
 
 from ..core.errors import ConfigError, DomainError, ProductError
-from ..core.files import content_hash
+from ..core.files import content_hash, write_bytes
 from ..core.long_work import Execution
 from ..core.memory import require_bytes
 from ..core.products import read_fits, write_fits
@@ -24,10 +24,11 @@ from ..reconstruction.psf_model.recipe import DEFAULT, Recipe
 from .image_formats.load import ImageSettings, ImageSource, image_sources, image_stem, load_image
 from .image_psf import ImagePsf, load_image_psf
 from .measure import measure_image
+from .measure_picture import measured_png
 from .star_positions import read_star_positions
 
 #: What names of products add to that of an image.
-CATALOGUE_SUFFIX, PSF_SUFFIX = "_galaxies", "_psf"
+CATALOGUE_SUFFIX, PSF_SUFFIX, PICTURE_SUFFIX = "_galaxies", "_psf", "_measured"
 #: Memory that measuring an image takes, in sizes of its pixels, variance and mask: 1.3 GiB for 4096 x 4096 pixels.
 _PIXEL_SIZES = 8
 
@@ -55,6 +56,8 @@ class MeasureOptions:
         Least S/N of stars.
     settings : ImageSettings
         What headers lack.
+    pictures : bool
+        Whether a picture of each measured image is written.
     """
 
     psf: str | Path | None = None
@@ -62,6 +65,7 @@ class MeasureOptions:
     stars: str | Path | None = None
     min_snr: float = 30.0
     settings: ImageSettings = field(default_factory=ImageSettings)
+    pictures: bool = False
 
     def of(self, path: Path) -> MeasureOptions:
         """Return the options of an image, its name in those of files."""
@@ -124,6 +128,8 @@ class FileMeasurement:
             product = self.product(source, PSF_SUFFIX)
             catalogue.psf.write(product)
             table.meta["PSFHASH"] = content_hash(product, ProductError)
+        if options.pictures:
+            write_bytes(self.product(source, PICTURE_SUFFIX).with_suffix(".png"), measured_png(catalogue))
         # Last: a resumed measurement takes it for the sign of a finished image.
         write_fits(self.product(source, CATALOGUE_SUFFIX), [fits.table_to_hdu(table)], None, [])
         return metrics

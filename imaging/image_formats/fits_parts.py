@@ -85,7 +85,8 @@ def _part_of(index: int, hdu: fits.hdu.base.ExtensionHDU, primary: fits.Header) 
             if card.keyword and card.keyword not in header and card.keyword not in ("COMMENT", "HISTORY", "SIMPLE"):
                 header.append(card, end=True)
     shape = hdu.shape if isinstance(hdu, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)) else ()
-    name = str(hdu.header.get("EXTNAME", "")).strip().upper()
+    # The first files of HSC have EXTTYPE in its place.
+    name = str(hdu.header.get("EXTNAME") or hdu.header.get("EXTTYPE") or "").strip().upper()
     for keyword in _STRUCTURE:
         header.remove(keyword, ignore_missing=True, remove_all=True)
     # fpack names a nameless image so.

@@ -2,17 +2,22 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
 from drawn_fields import PSF, draw_field, gaussian, header_of
+from scipy import ndimage
 
 import pachon
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, PachonError
+from pachon.imaging.image_psf import psfs_on
 from pachon.measure.catalogue.matching import match_positions
+
+DATA = Path(__file__).parents[2] / "data"
 
 
 def loaded(field, tmp_path, name="a.fits"):
@@ -113,6 +118,26 @@ def test_a_field_of_few_stars_has_a_constant_psf(n_stars, tmp_path):
     assert abs(np.median(pull)) < 1.0
 
 
+@pytest.mark.long
+def test_saturated_stars_are_no_galaxies(field, tmp_path):
+    # A bright star that blooms is as wide as a galaxy, and only the top of it is clipped.
+    side = len(field.image)
+    empty = ndimage.distance_transform_edt(field.image < 450.0)[40:-40, 40:-40]
+    place = tuple(40 + at for at in np.unravel_index(np.argmax(empty), empty.shape))
+    yy, xx = np.indices((side, side), dtype=float)
+    star = gaussian(yy, xx, place[1], place[0], tuple(1.8 * c for c in PSF), 2e5)
+    level = 0.95 * float((field.image + star)[place])
+    image = np.minimum(field.image + star, level).astype(np.float32)
+    for name, header in (("a.fits", header_of(SATURATE=0.999 * level)), ("b.fits", header_of())):
+        fits.PrimaryHDU(image, header).writeto(tmp_path / name)
+    catalogues = [pachon.measure_image(pachon.load_image(tmp_path / name), threads=1) for name in ("a.fits", "b.fits")]
+    usable = [
+        bool(c.usable[np.hypot(c.objects.x - place[1], c.objects.y - place[0])[c.galaxies] < 2.0].any())
+        for c in catalogues
+    ]
+    assert usable == [False, True]
+
+
 @pytest.mark.parametrize("n_stars", [0, 2])
 def test_fewer_stars_than_three_are_too_few(n_stars, tmp_path):
     field = draw_field(n_stars, 20, seed=3, side=250)
@@ -205,6 +230,27 @@ def test_a_psf_model_from_a_file(image, field, catalogue, tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_a_psf_model_of_piff(image, catalogue):
+    model = pachon.load_piff(DATA / "piff" / "gaussian.piff")
+    measured = pachon.measure_image(image, psf=model, threads=1)
+    # Piff counts pixels from one.
+    places = np.array([[100.0, 50.0], [20.0, 280.0]])
+    drawn = psfs_on(image, model, places, 1)
+    direct = model.at(places + 1.0, size=drawn.shape[1])
+    np.testing.assert_allclose(drawn, direct / direct.sum(axis=(1, 2), keepdims=True), rtol=1e-12)
+    assert len(measured.stars) == len(catalogue.stars)
+    several = pachon.load_piff(DATA / "piff" / "grid_chips.piff")
+    with pytest.raises(DomainError, match=r"PSF model of a: chip = None: expected one of"):
+        psfs_on(image, several, places, 1)
+    number = next(iter(several.chips))
+    header = image.header.copy()
+    header["CCDNUM"] = number
+    assert psfs_on(replace(image, header=header), several, places, 1).shape[0] == 2
+    with pytest.raises(DomainError, match="PSF model of a: properties: expected values of"):
+        psfs_on(image, pachon.load_piff(DATA / "piff" / "grid_color.piff"), places, 1)
+
+
+@pytest.mark.slow
 def test_all_images_of_a_file(field, tmp_path, capsys):
     blank = np.random.default_rng(1).normal(100.0, 5.0, (64, 64)).astype(np.float32)
     fits.HDUList(
@@ -216,12 +262,14 @@ def test_all_images_of_a_file(field, tmp_path, capsys):
         ]
     ).writeto(tmp_path / "exposure.fits.fz")
     command = ["measure", str(tmp_path / "exposure.fits.fz"), "--json", "--quiet"]
-    assert main(command) == 0
+    assert main([*command, "--pictures"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert list(found["images"]) == ["exposure.fits.fz[N4]", "exposure.fits.fz[S4]"]
     assert "no objects" in found["left_out"]["exposure.fits.fz[F1]"]
     names = {path.name for path in tmp_path.glob("*_*.fits")}
     assert names == {f"exposure_{ccd}_{kind}.fits" for ccd in ("N4", "S4") for kind in ("galaxies", "psf")}
+    for ccd in ("N4", "S4"):
+        assert (tmp_path / f"exposure_{ccd}_measured.png").read_bytes().startswith(b"\x89PNG")
     before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*_*.fits")}
     # Products beside the images are no images; those that are whole stay.
     assert main(["measure", *map(str, sorted(tmp_path.glob("*.fits*"))), "--json", "--quiet", "--resume"]) == 0
