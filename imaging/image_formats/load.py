@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -204,8 +205,6 @@ def _image_of(file: FitsParts, planes: PlaneNames, settings: ImageSettings) -> C
     bad = ~finite | (defects.bad & ~defects.saturated)
     plane = _noise_plane(file, planes, settings)
     if plane is not None:
-        if plane.without.all():
-            raise ProductError(f"{plane.source}: no pixel has a weight above zero", file=path)
         bad |= plane.without
     if (bad | defects.saturated).all():
         raise ProductError("all pixels are masked, saturated or not finite: expected some that are good", file=path)
@@ -266,7 +265,10 @@ def _noise_plane(file: FitsParts, planes: PlaneNames, settings: ImageSettings) -
     if part is None:
         return None
     _require_shape(noise_file, part, planes.image)
-    return variance_of_plane(noise_file.pixels(part), kind, f"{noise_file.path.name} {part.name}".strip())
+    variance = variance_of_plane(noise_file.pixels(part), kind, f"{noise_file.path.name} {part.name}".strip())
+    if variance.without.all():
+        raise ProductError(f"{part.name or 'image'}: no pixel has a {kind.value} above zero", file=noise_file.path)
+    return variance
 
 
 def _require_shape(file: FitsParts, part: FitsPart, image: FitsPart) -> None:
@@ -303,8 +305,9 @@ def _add_cards(header: fits.Header, cards: HeaderCards, gain: Sourced, zero_poin
         header["EXPTIME"] = (time.value, f"[s] {time.source}")
     if (band := cards.text(BAND_KEYS)) is not None:
         header["FILTER"] = band
-    if (chip := cards.number(CHIP_KEYS)) is not None:
-        header["CCDNUM"] = (int(chip.value), chip.source)
+    # Other observatories have names there.
+    if (chip := cards.text(CHIP_KEYS)) is not None and re.fullmatch(r"\d+(\.0)?", chip):
+        header["CCDNUM"] = (int(float(chip)), "number of the CCD")
     for key in _KEPT:
         if key not in header and (text := cards.text((key,))) is not None:
             header[key] = text

@@ -47,7 +47,8 @@ def world_cards(header: fits.Header, shape: tuple[int, int], path: Path) -> fits
             corners = [(0, 0), (shape[1] - 1, 0), (0, shape[0] - 1), (shape[1] - 1, shape[0] - 1)]
             sky = np.asarray(wcs.all_pix2world(np.array(corners, dtype=float), 0))
         except Exception as error:  # wcslib raises many kinds
-            reason = cut_short(" ".join(str(error).split()), 120)
+            # wcslib begins with the line of its source.
+            reason = cut_short(re.sub(r"^ERROR \d+ in .*?: ", "", " ".join(str(error).split())), 120)
             raise ProductError(
                 f"CTYPE1 = {kinds[0]}: expected world coordinates that astropy reads ({reason})",
                 file=path,

@@ -135,6 +135,26 @@ def test_a_file_of_many_images(field, tmp_path):
         pachon.load_image(tmp_path / "m.fits", extension="S5")
 
 
+def test_pixels_without_a_value_have_no_weight(field, tmp_path):
+    data, variance = field.image.copy(), field.variance.astype(np.float32)
+    data[10:20], data[30, 30], variance[40], variance[50, 50] = np.nan, -np.inf, np.nan, 0.0
+    write(
+        tmp_path / "a.fits",
+        fits.PrimaryHDU(),
+        fits.ImageHDU(data, header_of(CCDNUM="N4"), name="SCI"),
+        fits.ImageHDU(variance, name="VAR"),
+    )
+    image = pachon.load_image(tmp_path / "a.fits")
+    for place in ((10, 3), (30, 30), (40, 7), (50, 50)):
+        assert image.mask[place] == BAD
+    assert np.isfinite(image.image).all()
+    assert (image.mask != 0).sum() == 10 * SIDE + 1 + SIDE + 1
+    # An image without noise has no sky to measure.
+    write(tmp_path / "b.fits", fits.PrimaryHDU(np.full((64, 64), 5.0), header_of()))
+    with pytest.raises(ProductError, match="its pixels have no noise"):
+        pachon.load_image(tmp_path / "b.fits")
+
+
 def test_gzip(field, tmp_path):
     path = plain(tmp_path / "a.fits", field)
     (tmp_path / "b.fits.gz").write_bytes(gzip.compress(path.read_bytes(), 1))
@@ -272,6 +292,11 @@ def changed(**cards):
         (changed(CD1_1=0.0, CD2_1=0.0), {}, r"a\.fits: CD1_1, .*: expected a matrix with an inverse"),
         (changed(CTYPE1="RA---XYZ", CTYPE2="DEC--XYZ"), {}, r"a\.fits: CTYPE1 = RA---XYZ: expected world"),
         (changed(CTYPE1="LINEAR", CTYPE2="LINEAR"), {}, r"a\.fits: no world coordinates \(CTYPE1 = 'LINEAR'"),
+        (
+            changed(CTYPE2="RA---TAN"),
+            {},
+            r"a\.fits: CTYPE1 = RA---TAN: .* reads \(Inconsistent projection",
+        ),
         (changed(SATURATE=10.0), {}, r"a\.fits: all pixels are masked, saturated or not finite"),
         (changed(), {"weight": "none.fits"}, r"none\.fits: no such file"),
     ],
@@ -296,7 +321,7 @@ def test_planes_that_do_not_fit(field, tmp_path):
     path = plain(tmp_path / "a.fits", field)
     other = tmp_path / "w.fits"
     for values, kind, text in (
-        (np.zeros(field.image.shape), "weight", r"w\.fits \(weight\): no pixel has a weight above zero"),
+        (np.zeros(field.image.shape), "weight", r"w\.fits: image: no pixel has a weight above zero"),
         (np.ones((10, 12)), "weight", r"w\.fits: image has 12 x 10 pixels: expected 320 x 320, those of the image"),
         (np.ones((10, 12)), "mask", r"w\.fits: image has 12 x 10 pixels: expected 320 x 320, those of the image"),
         (np.full(field.image.shape, 0.5), "mask", r"w\.fits: mask .*: expected whole numbers"),
