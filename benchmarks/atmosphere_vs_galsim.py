@@ -39,6 +39,7 @@ from pachon.models.ideal_telescope import ideal_telescope
 from pachon.models.telescope import Telescope
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.layer_screens import SLOPE_LAG
+from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
 
 SITE, WAVELENGTH = "cerro_pachon", 620e-9
 PIXEL, STAMP, WEIGHT_FWHM = 0.1 * ARCSEC, 61, 0.7 * ARCSEC
@@ -166,7 +167,7 @@ def through_galsim_screens(atmosphere: Atmosphere, layers: galsim.PhaseScreenLis
 def one_seed(seed: int, exposures: int, stars: int, photons: int) -> dict[str, dict[str, np.ndarray]]:
     """Return the statistics of one seed: of "pachon", "galsim", and pachon through GalSim's screens ("shared")."""
     telescope = long_paraboloid()
-    own = Atmosphere.from_site(SITE, seed, screen_size=SIZE, screen_length=LENGTH)
+    own = Atmosphere.from_site(SITE, seed, screens=ScreenSampling(screen_size=SIZE, screen_length=LENGTH))
     layers = galsim_layers(own, seed)
     atmospheres = {
         "pachon": through_screens(own, own.screens("slopes", 1)),
@@ -256,7 +257,9 @@ def compare(seeds: range, exposures: int, stars: int, photons: int, report=lambd
 def endless_widths() -> tuple[float, float]:
     """Return the FWHM of an endless exposure in the same pixels [arcsec]: in theory, and as GalSim shoots it."""
     # Waves of metres make the slopes: small screens suffice, and the wind does not matter.
-    air = Atmosphere.from_site(SITE, 0, exposure=1.0, screen_size=1024, screen_length=LENGTH / 3.0)
+    air = Atmosphere.from_site(
+        SITE, 0, exposure=1.0, screens=ScreenSampling(screen_size=1024, screen_length=LENGTH / 3.0)
+    )
     layers = galsim_layers(air, 0)
     u, v = stream(0, "places").uniform(0.0, air.screen_length, (2, 1_000_000))
     slopes = 1e-9 * np.array(layers.wavefront_gradient(u, v, 0.0))

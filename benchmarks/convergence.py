@@ -34,8 +34,8 @@ class Field:
         rng = np.random.default_rng(5)
         centers = self.focal_plane.camera.centers
         for seed in range(exposures):
-            screens = {"screen_size": size, "screen_length": size * 1300 / 8192}
-            self.atmospheres.append(pachon.Atmosphere.from_site("cerro_pachon", seed, **screens))
+            screens = pachon.ScreenSampling(screen_size=size, screen_length=size * 1300 / 8192)
+            self.atmospheres.append(pachon.Atmosphere.from_site("cerro_pachon", seed, screens=screens))
             ccds = rng.choice(np.flatnonzero(np.hypot(*centers.T) < 0.31), stars, replace=False)
             self.fields.append(pachon.fields_at(self.telescope, centers[ccds] + rng.uniform(-0.018, 0.018, (stars, 2))))
 

@@ -35,7 +35,7 @@ from pachon.raytrace.rays import field_direction
 from pachon.reconstruction.ccd_product import product_path, write_product
 
 LAYERS = {
-    n: {"altitudes": a, "weights": w, "wind_speeds": s}
+    n: pachon.load_site("cerro_pachon").with_layers(a, w, s)
     for n, a, w, s in (
         (1, [5000.0], [1.0], [10.0]),
         (3, [0.0, 5000.0, 15000.0], [0.5, 0.3, 0.2], [5.0, 10.0, 20.0]),
@@ -64,9 +64,9 @@ def time_stars(telescope, rounds, count=96):
     fields = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     atmospheres = {}
     for _, steps, _, layers in STARS:
-        profile = LAYERS.get(layers, {})
+        site = LAYERS.get(layers, "cerro_pachon")
         atmospheres[steps, layers] = pachon.Atmosphere.from_site(
-            "cerro_pachon", 1, time_step=15.0 / steps, screen_size=4096, screen_length=650.0, **profile
+            site, 1, time_step=15.0 / steps, screens=pachon.ScreenSampling(screen_size=4096, screen_length=650.0)
         )
     least = np.full(len(STARS), np.inf)
     for _ in range(rounds + 1):
@@ -99,7 +99,10 @@ def time_screens(rounds, size=4096):
     least = {}
     for fraction in (0.1, 1.0) * rounds:
         atmosphere = pachon.Atmosphere.from_site(
-            "cerro_pachon", 3, screen_size=size, screen_length=size * 1300 / 8192, exposure=5.0
+            "cerro_pachon",
+            3,
+            screens=pachon.ScreenSampling(screen_size=size, screen_length=size * 1300 / 8192),
+            exposure=5.0,
         )
         rows = np.broadcast_to(np.arange(size) < fraction * size, (6, size))
         start = time.process_time()

@@ -33,7 +33,11 @@ def main() -> None:
     noise = 0.0
     for epoch in range(EPOCHS):
         longest = pachon.Atmosphere.from_site(
-            "cerro_pachon", seed=1, epoch=epoch, exposure=TIMES[-1], screen_size=4096, screen_length=650.0
+            "cerro_pachon",
+            seed=1,
+            epoch=epoch,
+            exposure=TIMES[-1],
+            screens=pachon.ScreenSampling(screen_size=4096, screen_length=650.0),
         )
         for time in TIMES:
             steps = round(time / 0.05)

@@ -29,11 +29,11 @@ from pachon.core.units import ARCSEC
 from pachon.models.camera.camera import Camera
 from pachon.pipeline.config import Configuration
 from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.focal_plane_stage import instrument_of
 from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
 from pachon.pipeline.simulate.ccd_observation import observe_ccd
 from pachon.reconstruction.focal_plane_psf.covariance import Places
 from pachon.reconstruction.focal_plane_psf.heights import STATIC_DEGREE, HeightPrior
-from pachon.reconstruction.focal_plane_psf.response import Instrument
 from pachon.reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
 
 matplotlib.use("Agg")
@@ -109,7 +109,8 @@ def three_rafts() -> Camera:
     keep = [i for i, name in enumerate(whole.ccd_names) if name.startswith(RAFTS)]
     rafts = np.array([RAFTS.index(whole.raft_of[i]) for i in keep])
     names = tuple(whole.ccd_names[i] for i in keep)
-    return Camera("three rafts", names, RAFTS, rafts, whole.centers[keep], whole.pixels[keep], whole.pixel_size)
+    pixels = whole.pixels[keep]
+    return Camera("three rafts", names, RAFTS, rafts, whole.centers[keep], pixels, whole.pixel_size, transposed=True)
 
 
 def nodes_of(camera: Camera) -> Places:
@@ -165,21 +166,6 @@ class Kept:
         return without_plane(np.linalg.solve(root, (terms * scale).T).T, places)
 
 
-def instrument_of(experiment: Experiment) -> Instrument:
-    """Return what the fit knows of telescope, air and detector: all but heights and alignment."""
-    return Instrument.of(
-        experiment.telescope,
-        experiment.wavelengths,
-        experiment.atmosphere,
-        pixel_size=experiment.pixel_size,
-        diffusion=experiment.diffusion,
-        jitter=experiment.jitter,
-        weight_fwhm=experiment.weight_fwhm,
-        dispersion=experiment.dispersion,
-        stamp_size=experiment.stamp_size,
-    )
-
-
 def one_row(
     paths: list[Path], heights: str, folder: Path, steps: int, threads: int | None, kept: Kept
 ) -> dict[str, float]:
@@ -189,12 +175,10 @@ def one_row(
     start = time.perf_counter()
     found = pachon.fit_static_heights(
         paths,
-        experiment.telescope,
+        instrument_of(experiment),
         camera=camera,
-        instrument=instrument_of(experiment),
-        budget=budget,
         # The mean of the air near the ground over an exposure is a wavefront as well.
-        alignment_rms=float(np.hypot(ALIGNMENT_UM, 0.1)) * 1e-6,
+        prior=pachon.OpticsPrior(budget, float(np.hypot(ALIGNMENT_UM, 0.1)) * 1e-6),
         folder=folder,
         steps=steps,
         threads=threads,

@@ -27,10 +27,10 @@ import numpy as np
 import pachon
 from pachon.pipeline.config import configuration_of
 from pachon.pipeline.experiment import Experiment
-from pachon.pipeline.focal_plane_stage import fit_focal_plane_model
+from pachon.pipeline.focal_plane_stage import fit_focal_plane_model, instrument_of
 from pachon.pipeline.run_folder import SUMMARY_NAME
 from pachon.reconstruction.ccd_product import read_product
-from pachon.reconstruction.focal_plane_psf.response import Instrument, height_response
+from pachon.reconstruction.focal_plane_psf.response import height_response
 from pachon.reconstruction.focal_plane_psf.stars import FocalPlaneStars
 
 matplotlib.use("Agg")
@@ -105,18 +105,7 @@ def one_run(folder):
     mean = np.bincount(ccds["holdout"], dz["holdout"], len(camera)) / np.maximum(count, 1)
     dz = {key: values - mean[ccds[key]] for key, values in dz.items()}
     values = np.stack([truth["e1"], truth["e2"], np.log(truth["size"])], axis=1)
-    instrument = Instrument.of(
-        experiment.telescope,
-        experiment.wavelengths,
-        experiment.atmosphere,
-        pixel_size=experiment.pixel_size,
-        diffusion=experiment.diffusion,
-        silicon=experiment.silicon,
-        jitter=experiment.jitter,
-        weight_fwhm=experiment.weight_fwhm,
-        dispersion=experiment.dispersion,
-        stamp_size=experiment.stamp_size,
-    )
+    instrument = instrument_of(experiment)
     fields = instrument.fields(np.stack([truth["x"], truth["y"]], axis=1))
     change = height_response(instrument, fields, plane, None).slope(plane.height(truth["x"], truth["y"]))[:, :2]
     along = change / np.hypot(*change.T)[:, None]

@@ -37,6 +37,7 @@ from atmosphere_vs_galsim import (
 import pachon
 from pachon.core.units import ARCSEC
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
+from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
 from pachon.wavefront.psf.fast import PUPIL_POINTS
 
 PIXEL, STAMP, STARS = 0.2 * ARCSEC, 31, 64
@@ -82,9 +83,9 @@ def main() -> None:
     arguments = parser.parse_args()
     # Slightly less than the side: one sample more by rounding would double GalSim's grid.
     length = arguments.length * (1.0 - 1e-12)
-    options = {"screen_size": arguments.size, "screen_length": length}
-    atmosphere = Atmosphere.from_site(SITE, 1, **options)
-    fine = Atmosphere.from_site(SITE, 1, time_step=FINE_STEP, **options)
+    screens = ScreenSampling(screen_size=arguments.size, screen_length=length)
+    atmosphere = Atmosphere.from_site(SITE, 1, screens=screens)
+    fine = Atmosphere.from_site(SITE, 1, time_step=FINE_STEP, screens=screens)
     atmosphere.screens("slopes")
     fields = np.random.default_rng(0).uniform(-FIELD, FIELD, (STARS, 2))
     samples = PUPIL_POINTS * len(atmosphere.times)

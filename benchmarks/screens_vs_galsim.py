@@ -17,6 +17,7 @@ import numpy as np
 
 import pachon
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
+from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
 
 WAVELENGTH = 620.0
 
@@ -54,7 +55,9 @@ def main() -> None:
     arguments = parser.parse_args()
     # Slightly less than the side: one sample more by rounding would double GalSim's grid.
     length = arguments.length * (1.0 - 1e-12)
-    atmosphere = Atmosphere.from_site("cerro_pachon", 1, screen_size=arguments.size, screen_length=length)
+    atmosphere = Atmosphere.from_site(
+        "cerro_pachon", 1, screens=ScreenSampling(screen_size=arguments.size, screen_length=length)
+    )
     print(
         f"pachon {pachon.__version__}, GalSim {galsim.__version__}; {atmosphere.layer_count} screens of"
         f" {arguments.size}^2 over {arguments.length:g} m, high screens of {atmosphere.fine_size}^2"

@@ -92,10 +92,10 @@ def colours():
 
 def times():
     print("\nprocessor time a star, five wavelengths, one thread [ms]: without, with silicon, ratio")
-    air = {"screen_size": 2048, "screen_length": 327.68}
-    long = pachon.Atmosphere.from_site("cerro_pachon", seed=2, **air)
+    screens = pachon.ScreenSampling(screen_size=2048, screen_length=327.68)
+    long = pachon.Atmosphere.from_site("cerro_pachon", seed=2, screens=screens)
     # The wave engine takes its screens whole, and seconds a star.
-    short = pachon.Atmosphere.from_site("cerro_pachon", seed=2, exposure=7.0, **air)
+    short = pachon.Atmosphere.from_site("cerro_pachon", seed=2, exposure=7.0, screens=screens)
     for band in "rizy":
         telescope = pachon.load_telescope(f"lsst_v3.3_{band}")
         light = np.linspace(*telescope.band, 5)

@@ -71,6 +71,7 @@ def baseline_save(
     """
     from ..studies.baseline.baseline import make_baseline
     from ..studies.baseline.file import write_baseline
+    from ..studies.baseline.requirements import Requirements
     from ..studies.metrics.camera import CAMERA
     from ..studies.metrics.optics import OPTICS
 
@@ -83,8 +84,7 @@ def baseline_save(
             fields=field_list(field_deg),
             wavelengths=[nm / 1e9 for nm in wavelength_nm] if wavelength_nm else None,
             ccds=None if ccds is None else name_list(ccds, "--ccds"),
-            tolerances=tolerance or (),
-            limits=limit or (),
+            requirements=Requirements(tuple(tolerance or ()), tuple(limit or ())),
             threads=threads,
             progress=stage.advance,
         )

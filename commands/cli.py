@@ -15,6 +15,7 @@ import re
 import sys
 from collections.abc import Sequence
 from copy import copy
+from importlib import import_module
 from typing import Annotated, Any
 
 import typer
@@ -23,27 +24,6 @@ from typer import Option
 from ..core.errors import PachonError
 from ..core.terminal import print_line
 from ..core.version import VERSION
-from . import (
-    align,
-    baseline,
-    camera,
-    design,
-    diagnostics,
-    donuts,
-    files,
-    images,
-    measure,
-    model,
-    reproduce,
-    run,
-    shim,
-    stack_images,
-    study,
-    sweep,
-    telescope,
-    tolerance,
-    visits,
-)
 from .help_group import HelpGroup
 from .interrupt import InterruptedRunError
 from .targets import with_checked_targets
@@ -59,27 +39,11 @@ app = typer.Typer(
     rich_markup_mode="markdown",
 )
 #: The files of commands, in the order of the help.
-_GROUPS = (
-    run,
-    images,
-    measure,
-    model,
-    visits,
-    stack_images,
-    donuts,
-    reproduce,
-    diagnostics,
-    study,
-    sweep,
-    baseline,
-    design,
-    tolerance,
-    camera,
-    shim,
-    align,
-    telescope,
-    files,
+_FILES = (
+    *("run", "images", "measure", "model", "visits", "stack_images", "donuts", "reproduce", "diagnostics", "study"),
+    *("sweep", "baseline", "design", "tolerance", "camera", "shim", "align", "telescope", "files"),
 )
+_GROUPS = [import_module(f".{name}", __package__) for name in _FILES]
 _INTERRUPTED = 130
 
 

@@ -43,8 +43,7 @@ def donuts_command(
     files: Annotated[list[Path], Argument(metavar="FILE.fits ...", help="Stamps of donuts, or images of CCDs.")],
     telescope: Annotated[str, Option("--telescope", "-t", help="Bundled model, or path.")] = "lsst_v3.3_r",
     defocus_um: Annotated[
-        float,
-        Option(help="Shift of the detector, not the camera, along z [um], beside the file's: 1500 behind focus."),
+        float, Option(help="Shift of the detector, not the camera, along z [um], beside the file's: 1500 behind focus.")
     ] = 0.0,
     wavelength_nm: Annotated[
         list[float] | None,

@@ -63,8 +63,7 @@ def new_command(
 
 @app.command("validate")
 def validate_command(
-    files: Annotated[list[Path], Argument(metavar="FILE...", help="Files to check.")],
-    as_json: Json = False,
+    files: Annotated[list[Path], Argument(metavar="FILE...", help="Files to check.")], as_json: Json = False
 ) -> None:
     """Report all problems of files at once: prescriptions, configurations, sweeps, tables of heights.
 

@@ -11,18 +11,7 @@ from typer import Argument, Option
 from ..core.errors import ConfigError
 from ..core.units import ARCSEC
 from .inputs import load_model
-from .options import (
-    Basis,
-    Components,
-    Interpolation,
-    Json,
-    Order,
-    Quiet,
-    Recipe,
-    Threads,
-    Weights,
-    recipe_of_options,
-)
+from .options import Basis, Components, Interpolation, Json, Order, Quiet, Recipe, Threads, Weights, recipe_of_options
 from .tables import Rows, print_json
 from .workers import Processes, long_work
 

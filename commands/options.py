@@ -23,10 +23,7 @@ AllCcds = Annotated[bool, Option("--all", help="All CCDs of the camera.")]
 TruthStars = Annotated[int | None, Option(help="Noise-free PSFs on each CCD.")]
 ObservedStars = Annotated[int | None, Option(help="Observed stars on each CCD.")]
 Model = Annotated[str, Argument(help="Bundled model, or path of a prescription.")]
-Lenient = Annotated[
-    bool,
-    Option("--lenient", help="Lens or batoid file: warn about unknown parts, go on."),
-]
+Lenient = Annotated[bool, Option("--lenient", help="Lens or batoid file: warn about unknown parts, go on.")]
 GlassCatalogues = Annotated[
     list[Path] | None,
     Option("--glass-catalogue", metavar="FILE.agf", help="Glass catalogue of a lens file, once for each."),

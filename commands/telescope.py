@@ -54,13 +54,7 @@ def info_command(
         console.print(table)
         return
     import_modules(("pachon.models.io.prescription", "pachon.pipeline.report.info"))
-    from ..pipeline.report.info import (
-        coefficient_lines,
-        describe,
-        figure_rows,
-        surface_columns,
-        surface_rows,
-    )
+    from ..pipeline.report.info import coefficient_lines, describe, figure_rows, surface_columns, surface_rows
 
     description = describe(load_model(model, lenient, glass_catalogue or ()))
     if as_json:

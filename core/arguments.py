@@ -22,6 +22,8 @@ from .units import has_unit, in_unit, is_quantity, real_numbers
 Target = TypeVar("Target", bound=Callable[..., Any])
 #: Function of an argument's name and value: the value as the callee takes it, or a _MismatchError.
 _Check = Callable[[str, Any], Any]
+#: Attribute of a checked function with the replacements of arguments that it no longer takes.
+_REMOVED = "removed_arguments"
 #: Arms of the union that ArrayLike is; ``ArrayLike | None`` is one flat union with them.
 _ARRAY_ARMS = frozenset(get_args(ArrayLike)) or frozenset({ArrayLike})
 
@@ -41,11 +43,12 @@ def check_arguments(target: Target) -> Target:
     argument, value and what was expected. Checked are numbers, texts, paths, functions, classes, and sequences and
     mappings of them. Arguments annotated as arrays take real numbers: no boolean values, texts, times, complex numbers
     or objects. Masked ones become NaN; quantities keep their unit. Those annotated as boolean arrays take True and
-    False, and 1 and 0. A quantity where plain numbers are expected is
-    converted to the unit in square brackets of the docstring.
+    False, and 1 and 0. A quantity where plain numbers are expected is converted to the unit in square brackets of the
+    docstring.
 
-    Names of arguments are checked by Python (TypeError), and one that is a field of another argument is a ConfigError;
-    shapes, ranges and NaN by the function itself.
+    Names of arguments are checked by Python (TypeError). One that the function no longer takes, or that is a field of
+    another argument, is a ConfigError that says what replaces it (:func:`removed_arguments`). Shapes, ranges and NaN
+    are checked by the function itself.
     """
     if not inspect.isclass(target):
         return cast(Target, _checked(target, target))
@@ -60,18 +63,14 @@ def check_arguments(target: Target) -> Target:
 
 
 def removed_arguments(**replacements: str) -> Callable[[Target], Target]:
-    """Refuse arguments that a function no longer takes, with what replaces each."""
+    """Name what replaces arguments that a function no longer takes; it stands above :func:`check_arguments`.
+
+    Fields of objects that the function takes, as `size` of ``stamps=Stamps(size=...)``, need no line of their own.
+    """
 
     def decorate(function: Target) -> Target:
-        @functools.wraps(function)
-        def checked(*args: Any, **options: Any) -> Any:
-            for name in options.keys() & replacements.keys():
-                raise ConfigError(
-                    f"{name}: no argument of {function.__name__}; expected {replacements[name]}", key=name
-                )
-            return function(*args, **options)
-
-        return cast(Target, checked)
+        function.__dict__[_REMOVED].update(replacements)
+        return function
 
     return decorate
 
@@ -100,8 +99,9 @@ def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any
             for name, value in options.items():
                 if (check := parameter_checks.get(name)) is not None:
                     options[name] = check(name, value)
-                elif name not in parameter_checks:
-                    _refuse_field(function, name)
+                elif name not in parameter_checks and (replacement := _replacement(function, checked, name)):
+                    text = f"{name}: no argument of {function.__qualname__}; expected {replacement}"
+                    raise ConfigError(text, key=name)
         except _MismatchError as problem:
             name = problem.name.partition("[")[0]
             # Most calls come without quantities: what they cost is paid here, where plain numbers were expected.
@@ -116,20 +116,23 @@ def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any
             raise problem.error(text, key=problem.name) from None
         return function(*checked_args, **options)
 
+    checked.__dict__[_REMOVED] = {}
     return checked
 
 
-def _refuse_field(function: Callable[..., Any], name: str) -> None:
-    """Raise ConfigError for an unknown argument that is a field of an object that the function takes."""
+def _replacement(function: Callable[..., Any], checked: Callable[..., Any], name: str) -> str | None:
+    """Return what replaces an argument: as the function says, or an object that it takes and that has such a field."""
+    if name in checked.__dict__[_REMOVED]:
+        return str(checked.__dict__[_REMOVED][name])
     try:
         annotations = typing.get_type_hints(function)
     except NameError:
-        return
+        return None
     for parameter, annotation in annotations.items():
         for kind in (annotation, *get_args(annotation)):
             if parameter != "return" and name in getattr(kind, "__dataclass_fields__", ()):
-                text = f"{name}: expected within {parameter}, as {parameter}={kind.__name__}({name}=...)"
-                raise ConfigError(text, key=name)
+                return f"{parameter}={kind.__name__}({name}=...)"
+    return None
 
 
 def _plain_numbers(value: Any, unit: str, name: str) -> Any:

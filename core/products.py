@@ -15,6 +15,7 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.utils.exceptions import AstropyWarning
 
+from .ccd_names import NAMES_CARD, refuse_mirrored_names
 from .errors import ProductError
 from .files import parsing, read_bytes, write_bytes
 from .version import VERSION
@@ -43,6 +44,7 @@ class Stamp:
             ("CREATOR", f"pachon {self.version}", "program and version"),
             ("CONFHASH", self.config_hash, ""),
             ("SEED", self.seed, "seed of all random numbers"),
+            NAMES_CARD,
         ]
 
     def meta(self) -> dict[str, str | int]:
@@ -104,7 +106,10 @@ def read_fits(path: Path, stamp: Stamp | None = None, *, checksums: bool = True)
             parts = hdus[0].header["NPARTS"] if checksums else hdus[0].header.get("NPARTS", len(hdus))
             if len(hdus) != parts:
                 raise ProductError(f"cut short; expected {parts} parts, found {len(hdus)}", file=path)
-    if stamp is not None and not stamp.matches(hdus[0].header):
+    header = hdus[0].header
+    if "CONFHASH" in header:
+        refuse_mirrored_names([header.get("CCD", "")], header.get(NAMES_CARD[0]), path)
+    if stamp is not None and not stamp.matches(header):
         raise ProductError("was made with another version, configuration or seed", file=path)
     return hdus
 

@@ -6,6 +6,8 @@ import numpy as np
 
 #: Standard deviation of a Gaussian over its median absolute deviation.
 RMS_PER_MAD = 1.4826
+#: FWHM of a Gaussian over its standard deviation.
+FWHM_PER_RMS = float(np.sqrt(8.0 * np.log(2.0)))
 
 
 def finite_mean(values: np.ndarray) -> float:

@@ -17,19 +17,10 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
-from typing import Any, Protocol
+from typing import Any
 
 from .errors import ProductError
 from .threads import thread_count
-
-
-class Job(Protocol):
-    """Part of a computation, picklable."""
-
-    @property
-    def label(self) -> str:
-        """Name in messages: "point 3", "CCD R22_S11"."""
-
 
 #: Picklable function that does one job on a number of threads and returns its result.
 Compute = Callable[[Any, int], Any]

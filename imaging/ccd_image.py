@@ -12,6 +12,7 @@ from ..core.files import write_bytes
 from ..core.products import Stamp
 from ..pipeline.experiment import Experiment
 from ..pipeline.screen_cache import with_cached_screens
+from ..sky.pointing import Pointing
 from .config import ImagesConfig
 from .draw import Window
 from .exposure import Exposure
@@ -58,8 +59,7 @@ def draw_image(
             name,
             galaxies,
             exposure=exposure,
-            pointing=(math.radians(pointing.ra_deg), math.radians(pointing.dec_deg)),
-            position_angle=math.radians(pointing.position_angle_deg),
+            pointing=Pointing(*map(math.radians, (pointing.ra_deg, pointing.dec_deg, pointing.position_angle_deg))),
             window=window_of(config, experiment, name),
             way=config.image.way,
             interpolation=config.image.interpolation,

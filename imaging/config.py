@@ -46,6 +46,10 @@ class GalaxySourceConfig(Section):
     )
     density: Positive = Field(1.0, description="factor of the counts, of the population or of the mosaic")
     catalogue: str | None = Field(None, description="path of a catalogue in place of the population")
+    convention: Literal["galsim", "tangent_plane"] | None = Field(
+        None,
+        description="e2 of the catalogue: galsim (> 0 from north-west to south-east), tangent_plane (from north-east)",
+    )
     mosaic: str | None = Field(None, description="path of a FITS mosaic, whose galaxies are planted at random places")
     mosaic_zero_point: Real | None = Field(
         None, description="AB magnitude of one unit of the mosaic; by default that of its header"
@@ -121,7 +125,7 @@ class ImagesConfig(Section):
             run = with_options(run, psf__stamp=PSF_STAMP)
         if run.pointing not in (None, self.pointing):
             raise ConfigError("run.pointing: expected none, or that of the images, under pointing")
-        if run.stars.catalogue is not None:
+        if run.stars.catalogue is not None or run.atmosphere.zenith_position_angle_deg is not None:
             run = run.model_copy(update={"pointing": self.pointing})
         with error_context(subject="run"):
             return Experiment.from_config(run, folder)

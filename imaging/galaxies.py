@@ -71,7 +71,8 @@ class GalaxySource:
             If a value is none of a galaxy, or galaxies would cover the sky or be brighter than it.
         """
         if config.catalogue is not None:
-            return cls(config, exposure, seed, read_galaxies(config.catalogue, pointing=pointing))
+            galaxies = read_galaxies(config.catalogue, pointing=pointing, convention=config.convention)
+            return cls(config, exposure, seed, galaxies)
         if config.mosaic is None:
             return cls(config, exposure, seed, None)
         stamps = GalaxyStamps.from_mosaic(

@@ -120,9 +120,7 @@ class PachonOptics(galsim.PhotonOp):
         self.ccd = None if camera is None or ccd is None else (camera, camera.ccd_index(ccd))
         if self.ccd is not None and image_pos is not None:
             camera, index = self.ccd
-            offset = (np.array([image_pos.x, image_pos.y]) - 1.0) * camera.pixel_size
-            first = camera.from_pixel(index, np.zeros(2))
-            self.origin = first + np.stack(camera.frame(index).along_focal_plane(*offset))
+            self.origin = camera.from_pixel(index, np.array([image_pos.x, image_pos.y]) - 1.0)
 
     def applyTo(  # noqa: N802 - GalSim's name
         self, photon_array: galsim.PhotonArray, local_wcs: Any = None, rng: galsim.BaseDeviate | None = None
@@ -172,7 +170,11 @@ class PachonOptics(galsim.PhotonOp):
 
     def _along_ccd(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the components along the rows and columns of the CCD of vectors of the focal plane."""
-        return (x, y) if self.ccd is None else self.ccd[0].frame(self.ccd[1]).along_ccd(x, y)
+        if self.ccd is None:
+            return x, y
+        camera, index = self.ccd
+        along_x, along_y = np.moveaxis(camera.along_pixels(index, np.stack([x, y], axis=-1)), -1, 0)
+        return along_x, along_y
 
     def _in_silicon(
         self, landed: LandedPhotons, wavelength: np.ndarray, rng: galsim.BaseDeviate | None
@@ -202,11 +204,14 @@ class PachonOptics(galsim.PhotonOp):
             raise DomainError(f"field = {self.field!r} rad: expected an object whose chief ray reaches the detector")
         return place
 
-    def _angle(self) -> float:
-        return 0.0 if self.ccd is None else float(self.ccd[0].rotation_deg[self.ccd[1]])
+    def _axes(self) -> tuple[float, bool]:
+        """Return the angle of the CCD [deg], and whether its pixels' x and y are exchanged."""
+        return (
+            (0.0, False) if self.ccd is None else (float(self.ccd[0].rotation_deg[self.ccd[1]]), self.ccd[0].transposed)
+        )
 
     def _key(self) -> tuple[Any, ...]:
-        arrays = tuple(map(float, (*self.source.ravel(), *self.origin, self.pixel_size, self._angle())))
+        arrays = tuple(map(float, (*self.source.ravel(), *self.origin, self.pixel_size, *self._axes())))
         return self.telescope, _content(self.focal_plane), self.silicon, self.diffusion, arrays
 
     def __eq__(self, other: object) -> bool:

@@ -26,6 +26,7 @@ from ..reconstruction.piff.psf import PiffPsf
 from ..reconstruction.psf_model.model import PsfModel
 from ..reconstruction.psf_model.recipe import Recipe
 from ..reconstruction.psfex import PsfexPsf
+from ..sky.sky_shapes import STEP, SkyShapes, along_sky, jacobians_on_sky
 from .image_file import CcdImage
 from .image_psf import ImagePsf, half_light_radius_of, psfs_on
 from .image_stars import MANY_STARS, detected_objects, few_or_many_stars, few_stars_warning, fit_image_psf
@@ -107,16 +108,17 @@ class ImageCatalogue(Result):
     def table(self) -> Table:
         """Return the galaxies as a table with positions, fluxes, shapes and their errors.
 
-        Right ascension and declination are of images with world coordinates, magnitudes of those with a zero point.
+        Right ascension, declination and shapes on the sky are of images with world coordinates, magnitudes of those
+        with a zero point.
         """
         rows, fits = self.galaxies, self.fits
         x, y = self.objects.x[rows], self.objects.y[rows]
         columns: Columns = {"number": (rows + 1, "", "number of the object")}
-        if self.image.has_sky:
-            celestial = self.image.celestial(np.stack([x, y], axis=1))
+        sky = self._sky_shapes(x, y) if self.image.has_sky else None
+        if sky is not None:
             columns |= {
-                "ra": (celestial[:, 0], "deg", "right ascension of the centroid"),
-                "dec": (celestial[:, 1], "deg", "declination of the centroid"),
+                "ra": (np.rad2deg(sky.ra) % 360.0, "deg", "right ascension of the centroid"),
+                "dec": (np.rad2deg(sky.dec), "deg", "declination of the centroid"),
             }
         columns |= {
             "x": (x, "pix", "centroid, pixel centres at integers"),
@@ -131,6 +133,13 @@ class ImageCatalogue(Result):
             "snr": (fits.snr, "", "flux of the fit over its error"),
             "e1": (fits.e1, "", "(a - b)/(a + b) along x, before the PSF"),
             "e2": (fits.e2, "", "along the diagonal x = y, before the PSF"),
+        }
+        if sky is not None:
+            columns |= {
+                "g1_sky": (sky.g1_sky, "", "e on the sky, > 0 from east to west, as of GalSim and TreeCorr"),
+                "g2_sky": (sky.g2_sky, "", "e on the sky, > 0 from north-west to south-east"),
+            }
+        columns |= {
             "error": (fits.ellipticity_error, "", "standard error of a component"),
             "size": (fits.size, "pix", "rms width before the PSF"),
             "flags": (fits.flags, "", "of the fit, 0 is good"),
@@ -141,6 +150,13 @@ class ImageCatalogue(Result):
         if self.image.stamp is not None:
             meta |= {"CONFHASH": self.image.stamp.config_hash, "SEED": self.image.stamp.seed}
         return described_table(columns, meta)
+
+    def _sky_shapes(self, x: np.ndarray, y: np.ndarray) -> SkyShapes:
+        """Return the shapes of the galaxies on the sky, whatever celestial coordinates the image has."""
+        sky, jacobians = jacobians_on_sky(
+            lambda pixels: np.deg2rad(self.image.celestial(pixels)), np.stack([x, y], axis=1), STEP
+        )
+        return SkyShapes(sky[:, 0], sky[:, 1], *along_sky(self.fits.e1, self.fits.e2, jacobians))
 
     def metrics(self) -> dict[str, Any]:
         """Return numbers of objects and, against the truth of a simulated image, completeness and purity."""
@@ -233,12 +249,17 @@ def measure_image(
     if not len(rows):
         raise DomainError("all objects are stars: expected galaxies", subject=f"CCD {image.name}")
     places = np.stack([objects.x[rows], objects.y[rows]], axis=1)
+
+    def psfs_at(positions: np.ndarray) -> np.ndarray:
+        """Return PSFs of unit sum at pixels of the image."""
+        return psfs_on(image, model, positions, threads)
+
     fits = fit_galaxies(
         image.image - objects.background,
         np.where(image.mask == 0, image.variance, 1.0),
         places[:, 0],
         places[:, 1],
-        psfs_on(image, model, places, threads),
+        psfs_at(places),
         half_light_radius=np.nan_to_num(objects.half_light_radius[rows], nan=selected_stars.half_light_radius),
         mask=image.mask,
         segmentation=objects.segmentation,

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..core.arguments import check_arguments
+from ..core.arguments import check_arguments, removed_arguments
 from ..core.errors import ConfigError, DomainError, shown
 from ..core.products import Stamp, card_text
 from ..core.units import ARCSEC
@@ -80,6 +79,7 @@ class CcdScene:
         return CcdImage(self.name, ccd_image.image, ccd_image.variance, ccd_image.mask, header, objects)
 
 
+@removed_arguments(position_angle="pointing=Pointing(ra, dec, position_angle=...)")
 @check_arguments
 def draw_ccd(
     experiment: Experiment,
@@ -88,7 +88,6 @@ def draw_ccd(
     *,
     exposure: Exposure | None = None,
     pointing: Any = (0.0, 0.0),
-    position_angle: ArrayLike = 0.0,
     window: Window | None = None,
     way: str = "direct",
     interpolation: str | Interpolation = "polynomial",
@@ -112,8 +111,8 @@ def draw_ccd(
     exposure : Exposure, optional
         Band, depth and noise; by default those of the run, in one exposure. Light that the grids of galaxies do not
         hold is far below this noise, and in the middle 100 arcsec below that of 6000 s.
-    pointing, position_angle
-        As in :func:`ccd_wcs`.
+    pointing : Pointing, (float, float), Quantity or SkyCoord
+        Direction of the optical axis [rad]; :class:`~pachon.Pointing` has the position angle of the telescope too.
     window : Window, optional
         Part of the CCD; all of it by default.
     way : {"direct", "eigen"}
@@ -149,7 +148,6 @@ def draw_ccd(
         camera,
         ccd,
         pointing=pointing,
-        position_angle=position_angle,
         wavelength=experiment.wavelengths[len(experiment.wavelengths) // 2],
         threads=threads,
     )

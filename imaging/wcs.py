@@ -189,8 +189,8 @@ def ccd_wcs(
         The camera.
     ccd : str
         Name of the CCD.
-    pointing : (float, float), Quantity or SkyCoord
-        Right ascension and declination of the optical axis [rad].
+    pointing : (float, float), Quantity, SkyCoord or Pointing
+        Right ascension and declination of the optical axis [rad]; :class:`~pachon.Pointing` has the position angle too.
     position_angle : float or Quantity
         Angle of the telescope's +y from north through east [rad].
     wavelength : float or Quantity, optional
@@ -211,10 +211,14 @@ def ccd_wcs(
     middle, half = 0.5 * (pixels - 1), 0.5 * pixels
 
     def to_sky(places: np.ndarray) -> np.ndarray:
-        """Return (xi, eta) of places on the CCD, from -1 to 1 along both axes, shape [n, 2]."""
+        """Return (xi, eta) of places on the CCD, from -1 to 1 along both axes of its pixels, shape [n, 2]."""
         with error_context(subject=f"CCD {ccd}"):
             slopes = fields_at(
-                telescope, camera.from_uv(index, places), wavelength, projection="gnomonic", threads=threads
+                telescope,
+                camera.from_pixel(index, middle + half * places),
+                wavelength,
+                projection="gnomonic",
+                threads=threads,
             )
             telescope.check_field(*np.arctan(slopes.T))
         return aim.to_sky(slopes)
@@ -273,7 +277,8 @@ def wcs(
     """Return the world coordinates of a CCD as the WCS of astropy, TAN or TAN-SIP, without refraction by the air.
 
     It is :meth:`CcdWcs.astropy` of :func:`ccd_wcs`, whose directions agree with traced chief rays to
-    :data:`TOLERANCE`. The array of a CCD is a mirror image of the sky: the determinant of its CD matrix is positive.
+    :data:`TOLERANCE`. Arrays of the LSST and ComCam show the sky as it is seen: the determinant of the CD matrix is
+    negative. Those of cameras that are not transposed are mirror images, of a positive determinant.
 
     Parameters
     ----------

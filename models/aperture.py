@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -266,23 +267,37 @@ def _crossing_edges(corners: np.ndarray) -> tuple[int, int] | None:
         """Return whether a point of the line through a and b lies between them."""
         return np.all((p >= np.minimum(a, b)) & (p <= np.maximum(a, b)), axis=-1)
 
-    for i in range(n):
-        if np.array_equal(start[i], end[i]):
-            return i, (i + 1) % n
-        # An edge and the next share a corner; they cross only where the next runs back over it.
-        j = (i + 1) % n
-        forward = (end[i] - start[i]) @ (end[j] - start[j])
-        if side(start[i], end[i], end[j]) == 0 and forward < 0:
-            return i, j
-        candidates = np.array([k for k in range(i + 2, n) if (k + 1) % n != i], dtype=int)
-        a, b, c, d = start[i], end[i], start[candidates], end[candidates]
+    # An edge and the next share a corner; they cross only where the next runs back over it, or the edge has no length.
+    following = np.roll(end, -1, axis=0)
+    forward = np.sum((end - start) * (following - end), axis=1)
+    backward = np.flatnonzero(np.all(start == end, axis=1) | (side(start, end, following) == 0) & (forward < 0))
+    crossings = [(i, (i + 1) % n) for i in backward[:1].tolist()]
+    for i, j in _edges_near_each_other(start, end):
+        a, b, c, d = start[i], end[i], start[j], end[j]
         side_c, side_d, side_a, side_b = side(a, b, c), side(a, b, d), side(c, d, a), side(c, d, b)
         meet = (side_c * side_d < 0) & (side_a * side_b < 0)
         meet |= (side_c == 0) & beside(a, b, c) | (side_d == 0) & beside(a, b, d)
         meet |= (side_a == 0) & beside(c, d, a) | (side_b == 0) & beside(c, d, b)
-        if np.any(meet):
-            return i, int(candidates[np.argmax(meet)])
-    return None
+        crossings += zip(i[meet].tolist(), j[meet].tolist(), strict=True)
+    return min(crossings, default=None)
+
+
+def _edges_near_each_other(start: np.ndarray, end: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield pairs (i, j), i < j, of edges without a common corner whose bounding boxes meet, in batches of some 1e6."""
+    n = len(start)
+    lower, upper = np.minimum(start, end), np.maximum(start, end)
+    order = np.argsort(lower[:, 0], kind="stable")
+    # In order of their left ends, an edge overlaps in x with those that follow until one begins beyond its right end.
+    counts = np.searchsorted(lower[order, 0], upper[order, 0], side="right") - np.arange(n) - 1
+    batches = np.cumsum(counts) // 1_000_000
+    for positions in np.split(np.arange(n), np.flatnonzero(np.diff(batches)) + 1):
+        number = counts[positions]
+        steps = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number, number) + 1
+        one, two = order[np.repeat(positions, number)], order[np.repeat(positions, number) + steps]
+        i, j = np.minimum(one, two), np.maximum(one, two)
+        apart = (j - i > 1) & (j - i < n - 1)
+        near = apart & (lower[i, 1] <= upper[j, 1]) & (lower[j, 1] <= upper[i, 1])
+        yield i[near], j[near]
 
 
 @check_arguments

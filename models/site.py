@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -100,3 +101,32 @@ class Site:
         for key in ("r0", "outer_scale"):
             if not (np.isfinite(getattr(self, key)) and getattr(self, key) > 0):
                 raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected a positive number")
+
+    def with_layers(
+        self,
+        altitudes: Sequence[float] | None = None,
+        weights: Sequence[float] | None = None,
+        wind_speeds: Sequence[float] | None = None,
+        wind_directions: Sequence[float | None] | None = None,
+    ) -> Site:
+        """Return the site with other layers or winds.
+
+        Parameters
+        ----------
+        altitudes, weights, wind_speeds, wind_directions : sequence of float, optional
+            As in :class:`Site`; those of this site by default. Other altitudes come without directions of the wind.
+
+        Raises
+        ------
+        PrescriptionError
+            If a number is out of range, or there is not one for each layer.
+        """
+        if wind_directions is None:
+            wind_directions = self.wind_directions if altitudes is None else ()
+        return replace(
+            self,
+            altitudes=self.altitudes if altitudes is None else tuple(altitudes),
+            weights=self.weights if weights is None else tuple(weights),
+            wind_speeds=self.wind_speeds if wind_speeds is None else tuple(wind_speeds),
+            wind_directions=tuple(wind_directions),
+        )

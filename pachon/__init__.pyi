@@ -54,6 +54,7 @@ from .design.metrics.footprint import Footprint as Footprint
 from .design.metrics.footprint import footprint as footprint
 from .design.metrics.ghosts import Ghost as Ghost
 from .design.metrics.ghosts import Ghosts as Ghosts
+from .design.metrics.ghosts import Reflectivity as Reflectivity
 from .design.metrics.ghosts import ghosts as ghosts
 from .design.metrics.principal_rays import PrincipalRays as PrincipalRays
 from .design.metrics.principal_rays import principal_rays as principal_rays
@@ -91,8 +92,8 @@ from .design.optimize.targets import RelativeDistortion as RelativeDistortion
 from .design.optimize.targets import Target as Target
 from .design.report.report import design_report as design_report
 from .design.tolerancing.monte_carlo import MonteCarlo as MonteCarlo
+from .design.tolerancing.monte_carlo import Yield as Yield
 from .design.tolerancing.monte_carlo import monte_carlo as monte_carlo
-from .design.tolerancing.yields import Yield as Yield
 from .imaging.config import ImagesConfig as ImagesConfig
 from .imaging.config import load_images_configuration as load_images_configuration
 from .imaging.draw import Window as Window
@@ -236,6 +237,7 @@ from .pipeline.sensor.displacement import TreeRings as TreeRings
 from .pipeline.sensor.displacement import displace_stamps as displace_stamps
 from .pipeline.simulate.donuts import Donuts as Donuts
 from .pipeline.simulate.donuts import draw_donuts as draw_donuts
+from .pipeline.simulate.star_defects import StarDefects as StarDefects
 from .raytrace.launch import launch_rays as launch_rays
 from .raytrace.mesh import land_on_mesh as land_on_mesh
 from .raytrace.one_surface import intersect as intersect
@@ -246,6 +248,8 @@ from .raytrace.rays import RayStatus as RayStatus
 from .raytrace.trace import TraceResult as TraceResult
 from .raytrace.trace import trace as trace
 from .reconstruction.focal_plane_psf.model import FocalPlanePsf as FocalPlanePsf
+from .reconstruction.focal_plane_psf.optics_prior import OpticsPrior as OpticsPrior
+from .reconstruction.focal_plane_psf.response import Instrument as Instrument
 from .reconstruction.focal_plane_psf.stars import FocalPlaneStars as FocalPlaneStars
 from .reconstruction.focal_plane_psf.static_heights import StaticHeights as StaticHeights
 from .reconstruction.focal_plane_psf.static_heights import fit_static_heights as fit_static_heights
@@ -282,6 +286,8 @@ from .sky.mosaic import GalaxyStamps as GalaxyStamps
 from .sky.pointing import Pointing as Pointing
 from .sky.population import GalaxyPopulation as GalaxyPopulation
 from .sky.population import draw_galaxies as draw_galaxies
+from .sky.sky_shapes import SkyShapes as SkyShapes
+from .sky.sky_shapes import to_sky as to_sky
 from .studies.alignment.config import AlignConfig as AlignConfig
 from .studies.alignment.config import load_align_configuration as load_align_configuration
 from .studies.alignment.loop import Alignment as Alignment
@@ -292,6 +298,7 @@ from .studies.baseline.check import BaselineCheck as BaselineCheck
 from .studies.baseline.file import Baseline as Baseline
 from .studies.baseline.file import read_baseline as read_baseline
 from .studies.baseline.file import write_baseline as write_baseline
+from .studies.baseline.requirements import Requirements as Requirements
 from .studies.shimming.shim import Shims as Shims
 from .studies.shimming.shim import shim as shim
 from .studies.sweep.file import load_sweep as load_sweep
@@ -312,6 +319,7 @@ from .studies.visits.visits import stack_visits as stack_visits
 from .testing import assert_matches_baseline as assert_matches_baseline
 from .wavefront.aberration import ResidualWavefront as ResidualWavefront
 from .wavefront.atmosphere.atmosphere import Atmosphere as Atmosphere
+from .wavefront.atmosphere.screen_sampling import ScreenSampling as ScreenSampling
 from .wavefront.chief_rays import fields_at as fields_at
 from .wavefront.corner_stars import CornerStars as CornerStars
 from .wavefront.corner_stars import corner_stars as corner_stars

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar
@@ -15,7 +16,7 @@ import yaml
 from pydantic import BeforeValidator, Field, SerializerFunctionWrapHandler, model_serializer
 
 from ..core.arguments import check_arguments
-from ..core.errors import ConfigError
+from ..core.errors import ConfigError, shown
 from ..core.schema import (
     Count,
     Fraction,
@@ -27,6 +28,7 @@ from ..core.schema import (
     Whole,
     expected,
     plain_number,
+    problem,
     validated,
 )
 from ..core.yaml_reader import read_mapping
@@ -43,6 +45,8 @@ else:
 _Model = TypeVar("_Model", bound=Section)
 #: Values of the height budget that a resolved configuration has without their being given.
 _CAMERAS_OWN = {"budget": "simulated"}
+#: Key of the zenith as an angle from +x towards +y of the telescope, which ``zenith_position_angle_deg`` has replaced.
+_RETIRED_ANGLE = "parallactic_angle_deg"
 _Declination = Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=-90, le=90)]
 
 
@@ -200,7 +204,9 @@ class AtmosphereConfig(Section):
     zenith_angle_deg: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=0, le=80)] = Field(
         0.0, description="angle of the telescope from the zenith [deg]"
     )
-    parallactic_angle_deg: Real = Field(0.0, description="direction of the zenith from +x towards +y [deg]")
+    zenith_position_angle_deg: Real | None = Field(
+        None, description="of the zenith, from north through east [deg]; by default it lies towards the telescope's +x"
+    )
 
 
 class PsfConfig(Section):
@@ -241,6 +247,22 @@ def refuse_retired_interpolation(content: dict[str, Any]) -> None:
         raise expected(names_of(INTERPOLATIONS, GaussianProcess.name), "interpolation")
 
 
+def refuse_parallactic_angle(content: dict[str, Any]) -> None:
+    """Raise the error of a run that has the zenith as an angle from +x towards +y of the telescope."""
+    air, aim = content.get("atmosphere"), content.get("pointing")
+    if not isinstance(air, dict) or _RETIRED_ANGLE not in air:
+        return
+    angle, roll = air[_RETIRED_ANGLE], aim.get("position_angle_deg", 0.0) if isinstance(aim, dict) else 0.0
+    numbers = all(isinstance(value, (int, float)) and math.isfinite(value) for value in (angle, roll))
+    # x and y of the telescope point to the position angles roll + 90 and roll.
+    value = f"{(90.0 + roll - angle) % 360.0:g}" if numbers else "90 less the angle at no roll"
+    raise problem(
+        f".{_RETIRED_ANGLE} = {shown(angle)}: expected zenith_position_angle_deg: {value} (from north through east); "
+        "files with the old key also name CCDs of the LSST as in a mirror: see docs/camera.md",
+        "atmosphere",
+    )
+
+
 class ReconstructionConfig(Section):
     """How the PSF is measured and modelled: by a recipe, each of whose keys may be given in place of its own."""
 
@@ -267,8 +289,7 @@ class ReconstructionConfig(Section):
         None, description="of the stars in the polynomials: equal, snr (S/N squared), softened (snr up to about 100)"
     )
     order: Whole | None = Field(
-        None,
-        description="order of the polynomials fitted to the observed stars, 3; of the trend in kriging 4",
+        None, description="order of the polynomials fitted to the observed stars, 3; of the trend in kriging 4"
     )
     truth_order: Whole = Field(4, description="order of the polynomials fitted to the noise-free PSFs")
     weight_fwhm_arcsec: Positive | None = Field(None, description="FWHM of the weight of the moments [arcsec]")
@@ -335,6 +356,11 @@ class Configuration(Section):
     psf: PsfConfig = PsfConfig()
     sensor: SensorConfig = SensorConfig()
     reconstruction: ReconstructionConfig = ReconstructionConfig()
+
+    @classmethod
+    def check(cls, content: dict[str, Any]) -> None:
+        """Raise the error of a key that another one has replaced, with the value to write."""
+        refuse_parallactic_angle(content)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the configuration as plain lists, mappings and numbers, keys as in the file."""

@@ -244,15 +244,16 @@ def chosen_ccds(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
 
 
 def default_ccds(camera: Camera) -> tuple[str, ...]:
-    """Return CCDs from the centre of the field to its edge, with a neighbour on either side: a row along +x.
+    """Return CCDs from the centre of the field to its edge, with a neighbour on either side: a row along x of images.
 
-    Of the LSST it is the middle row of three rafts; a camera of few CCDs is computed whole.
+    Of the LSST it is the middle row of three rafts, R22 to R24; a camera of few CCDs is computed whole.
     """
     if len(camera) <= _FEW:
         return camera.ccd_names
-    x, y = camera.centers.T
+    order = [1, 0] if camera.transposed else [0, 1]
+    x, y = camera.centers[:, order].T
     middle = int(np.argmin(np.hypot(x, y)))
-    width, height = np.ptp(camera.corners([middle])[0], axis=0)
+    width, height = np.ptp(camera.corners([middle])[0], axis=0)[order]
     row = (np.abs(y - y[middle]) < 0.5 * height) & (x > x[middle] - 1.5 * width)
     return tuple(camera.ccd_names[i] for i in np.flatnonzero(row))
 

@@ -33,6 +33,7 @@ from ..sky.pointing import Pointing
 from ..wavefront.aberration import ResidualWavefront
 from ..wavefront.atmosphere.atmosphere import Atmosphere
 from ..wavefront.atmosphere.refraction import dispersion_shift
+from ..wavefront.atmosphere.screen_sampling import ScreenSampling
 from ..wavefront.chief_rays import chief_rays
 from ..wavefront.psf.engines import ENGINES
 from .config import Configuration, digest
@@ -212,6 +213,15 @@ class Experiment:
         return tuple(effects)
 
     @property
+    def zenith_direction(self) -> float:
+        """Direction of the zenith on the sky, from +x towards +y of the telescope [rad]."""
+        zenith = self.config.atmosphere.zenith_position_angle_deg
+        if zenith is None:
+            return 0.0
+        roll = 0.0 if self.config.pointing is None else self.config.pointing.position_angle_deg
+        return math.radians(90.0 + roll - zenith)
+
+    @property
     def dispersion(self) -> np.ndarray | None:
         """Shift in field angle of each wavelength by the air [rad], shape [n_wave, 2]; None without an atmosphere."""
         settings = self.config.atmosphere
@@ -222,7 +232,7 @@ class Experiment:
             self.wavelengths,
             middle,
             math.radians(settings.zenith_angle_deg),
-            math.radians(settings.parallactic_angle_deg),
+            self.zenith_direction,
             self.site.weather,
         )
 
@@ -351,8 +361,7 @@ def _atmosphere(config: Configuration, site: Site) -> Atmosphere | None:
             outer_scale=air.outer_scale_m,
             exposure=air.exposure_s,
             time_step=air.time_step_s,
-            screen_size=air.screen_size,
-            screen_length=air.screen_length_m,
+            screens=ScreenSampling(screen_size=air.screen_size, screen_length=air.screen_length_m),
             ground_lift=air.ground_lift_m,
             zenith_angle=math.radians(air.zenith_angle_deg),
             epoch=air.epoch,

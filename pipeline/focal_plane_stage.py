@@ -18,8 +18,12 @@ from ..core.progress import Reporter
 from ..models.camera.focal_plane import FocalPlane
 from ..reconstruction.ccd_product import CcdProduct, Stars, of_ccd_model, write_focal_plane_columns
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
+from ..reconstruction.focal_plane_psf.optics_prior import OpticsPrior
+from ..reconstruction.focal_plane_psf.response import Instrument
 from ..reconstruction.focal_plane_psf.stars import FocalPlaneStars
 from ..reconstruction.focal_plane_psf.static_heights import StaticHeights
+from ..wavefront.psf.light import Light
+from ..wavefront.psf.stamps import Stamps
 from .experiment import Experiment
 
 #: Name of the focal-plane model in the folder of a run.
@@ -136,20 +140,25 @@ def fit_focal_plane_model(
     focal = experiment.config.focal_plane
     if heights is None and focal.budget == "flat" and focal.heights is None and not focal.moved:
         heights = FocalPlane.flat(experiment.camera)
-    return FocalPlanePsf.fit(
-        stars,
+    residual = experiment.config.active_optics.residual_um * 1e-6
+    prior = OpticsPrior(experiment.focal_plane.budget, float(np.hypot(residual, _AIR_WAVEFRONT)))
+    return FocalPlanePsf.fit(stars, instrument_of(experiment), heights, prior=prior, **options)
+
+
+def instrument_of(experiment: Experiment) -> Instrument:
+    """Return telescope, light, air and detector of an experiment, all but heights and alignment."""
+    return Instrument.of(
         experiment.telescope,
-        heights,
-        wavelengths=experiment.wavelengths,
-        atmosphere=experiment.atmosphere,
-        pixel_size=experiment.pixel_size,
-        diffusion=experiment.diffusion,
-        silicon=experiment.silicon,
-        jitter=experiment.jitter,
-        dispersion=experiment.dispersion,
-        budget=experiment.focal_plane.budget,
-        alignment_rms=float(np.hypot(experiment.config.active_optics.residual_um * 1e-6, _AIR_WAVEFRONT)),
-        **options,
+        Light(experiment.wavelengths, dispersion=experiment.dispersion),
+        experiment.atmosphere,
+        stamps=Stamps(
+            experiment.stamp_size,
+            experiment.pixel_size,
+            experiment.diffusion,
+            experiment.jitter,
+            experiment.silicon,
+        ),
+        weight_fwhm=experiment.weight_fwhm,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -56,8 +56,16 @@ def patches(stars: Sequence[Stars]) -> np.ndarray | None:
     return np.repeat(np.arange(len(stars)), [len(s) for s in stars]) if len(stars) > 1 else None
 
 
-def separation_bins(products: Sequence[CcdStars]) -> dict[str, Any]:
-    """Return the bins of separation of a run, as arguments: ``min_sep`` and ``max_sep`` [rad], and ``n_bins``."""
+class SeparationBins(TypedDict):
+    """Bins of separation, as arguments: smallest and largest separation [rad], and their number."""
+
+    min_sep: float
+    max_sep: float
+    n_bins: int
+
+
+def separation_bins(products: Sequence[CcdStars]) -> SeparationBins:
+    """Return the bins of separation of a run."""
     everywhere = np.concatenate(
         [np.stack([s.field_x, s.field_y]) for p in products for s in (p.holdout, p.observed)], axis=1
     )

@@ -43,6 +43,8 @@ _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
     "field_y": ("FIELD_Y", _DEG, "field angle, slope of the light along y"),
     "ra": ("RA", _DEG, "right ascension, ICRS, without refraction"),
     "dec": ("DEC", _DEG, "declination, ICRS, without refraction"),
+    "e1_sky": ("E1_SKY", _NONE, "E1, E2 on the sky, > 0 from east to west"),
+    "e2_sky": ("E2_SKY", _NONE, "likewise, > 0 from north-west to south-east"),
     "magnitude": ("MAG", _Unit("mag", 1.0), "AB magnitude"),
     "electrons": ("ELECTRON", _Unit("electron", 1.0), "electrons of the star in the exposure"),
     "snr": ("SNR", _NONE, "signal to noise of PSF photometry"),
@@ -76,7 +78,8 @@ _CCD_COLUMNS = {"CCD_E1": "MODEL_E1", "CCD_E2": "MODEL_E2", "CCD_SIZE": "MODELSZ
 class Stars:
     """Positions and shapes, one array element a star.
 
-    ``ra`` and ``dec`` are None without a pointing. Where the model is one of the whole focal plane, ``ccd_`` has the
+    ``ra``, ``dec``, ``e1_sky`` and ``e2_sky`` are None without a pointing; the latter are e1 and e2 along the axes of
+    the sky, as :func:`~pachon.to_sky` has them. Where the model is one of the whole focal plane, ``ccd_`` has the
     ellipticity and size [rad] of the CCD's own model, and ``sigma_`` the uncertainty (standard deviation) that the
     focal-plane model predicts of its own; else all are None.
     """
@@ -94,6 +97,8 @@ class Stars:
     model_size: np.ndarray  #: weighted rms size of the model there [rad]
     ra: np.ndarray | None = field(default=None, kw_only=True)  #: right ascension and declination [rad]
     dec: np.ndarray | None = field(default=None, kw_only=True)
+    e1_sky: np.ndarray | None = field(default=None, kw_only=True)
+    e2_sky: np.ndarray | None = field(default=None, kw_only=True)
     ccd_e1: np.ndarray | None = field(default=None, kw_only=True)
     ccd_e2: np.ndarray | None = field(default=None, kw_only=True)
     ccd_size: np.ndarray | None = field(default=None, kw_only=True)

@@ -12,7 +12,7 @@ from astropy.table import Column
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
-from ..core.errors import DomainError, ProductError, error_context
+from ..core.errors import DomainError, ProductError, check_choice, error_context
 from ..core.files import write_bytes
 from ..core.products import Columns, table_hdu, write_ecsv, write_fits
 from ..core.table_files import parquet_module, read_columns
@@ -23,11 +23,7 @@ from .pointing import Pointing
 #: Kinds of the files that are written, by their endings.
 FORMATS = {".ecsv": "ECSV", ".fits": "FITS", ".fit": "FITS", ".parquet": "Parquet"}
 #: Names of columns, in any case; the first is the one that messages name.
-NAMES = {
-    "mag": ("mag", "magnitude"),
-    "half_light_radius": ("half_light_radius", "hlr"),
-    "n": ("n", "sersic"),
-}
+NAMES = {"mag": ("mag", "magnitude"), "half_light_radius": ("half_light_radius", "hlr"), "n": ("n", "sersic")}
 # Columns of a table of components: unit, description.
 _PER_GALAXY = {
     "xi": ("rad", "position on the tangent plane, towards east"),
@@ -46,8 +42,15 @@ _PER_COMPONENT = {
 }
 
 
+#: Conventions of e2: the sign that turns it into ours, > 0 along xi = eta, and what it means.
+CONVENTIONS = {
+    "galsim": (-1.0, "e2 > 0 from north-west to south-east, as of GalSim, TreeCorr, DES and Rubin"),
+    "tangent_plane": (1.0, "e2 > 0 from north-east to south-west, along xi = eta"),
+}
+
+
 @check_arguments
-def read_galaxies(path: str | Path, *, pointing: ArrayLike | None = None) -> Galaxies:
+def read_galaxies(path: str | Path, *, pointing: ArrayLike | None = None, convention: str | None = None) -> Galaxies:
     """Read galaxies from a table: ECSV, CSV, FITS (its first table) or Parquet.
 
     Columns of a catalogue, in any case; units of the file are honoured, and where it has none these hold:
@@ -56,7 +59,7 @@ def read_galaxies(path: str | Path, *, pointing: ArrayLike | None = None) -> Gal
     ``ra``, ``dec``        positions [deg], with `pointing`; or ``xi``, ``eta``, on the tangent plane [rad]
     ``mag``                AB magnitude
     ``half_light_radius``  sqrt(a b) of the isophote that holds half of the light [arcsec]
-    ``e1``, ``e2``         (a - b)/(a + b), e1 > 0 towards east, e2 > 0 towards north-east; default 0
+    ``e1``, ``e2``         (a - b)/(a + b), e1 > 0 east to west, e2 by the `convention`; default 0
     ``q``, ``pa``          instead: axis ratio b/a, and position angle from north towards east [deg]
     ``n``                  Sersic index, 0.3 to 6.2; default 1
     ====================== =======================================================================================
@@ -69,6 +72,9 @@ def read_galaxies(path: str | Path, *, pointing: ArrayLike | None = None) -> Gal
         The table.
     pointing : (float, float) or Quantity, optional
         Right ascension and declination of the pointing [rad], for ``ra`` and ``dec``.
+    convention : {"galsim", "tangent_plane"}, optional
+        Sense of a column ``e2``: > 0 from north-west to south-east ("galsim", as of GalSim, TreeCorr, DES, Rubin), or
+        from north-east to south-west ("tangent_plane", as tables of components have it). Needed where it is not 0.
 
     Returns
     -------
@@ -78,15 +84,19 @@ def read_galaxies(path: str | Path, *, pointing: ArrayLike | None = None) -> Gal
     ------
     ProductError
         If the file cannot be read, or lacks a column.
+    ConfigError
+        If the convention is unknown.
     DomainError
-        If a value is none of a galaxy.
+        If a value is none of a galaxy, or the convention of ``e2`` is not given.
     """
     path = Path(path)
+    if convention is not None:
+        check_choice("convention", convention, CONVENTIONS)
     columns = read_columns(path)
     with error_context(file=path):
         if {"galaxy", "component_radius"} <= set(columns):
             return _from_components(columns)
-        return _from_catalogue(columns, pointing)
+        return _from_catalogue(columns, pointing, convention)
 
 
 @check_arguments
@@ -175,7 +185,7 @@ def _column_values(
     return radians(u.Quantity(numbers, column_unit or unit), key)
 
 
-def _from_catalogue(columns: dict[str, Column | np.ndarray], pointing: Any) -> Galaxies:
+def _from_catalogue(columns: dict[str, Column | np.ndarray], pointing: Any, convention: str | None = None) -> Galaxies:
     """Return galaxies of one component from the columns of a catalogue."""
     if "xi" in columns or "eta" in columns:
         xi, eta = (_column_values(columns, name, u.rad) for name in ("xi", "eta"))
@@ -199,8 +209,18 @@ def _from_catalogue(columns: dict[str, Column | np.ndarray], pointing: Any) -> G
     else:
         has_ellipticity = "e1" in columns or "e2" in columns
         e1, e2 = (_column_values(columns, name, default=None if has_ellipticity else 0.0) for name in ("e1", "e2"))
+        if e2.any():
+            e2 = _sign_of(convention) * e2
     sersic = _column_values(columns, "n", default=1.0)
     return Galaxies.single(xi, eta, magnitude, radius, e1=e1, e2=e2, sersic=sersic)
+
+
+def _sign_of(convention: str | None) -> float:
+    """Return the sign that turns e2 of a convention into ours, or raise DomainError where none is given."""
+    if convention is None:
+        choices = ", or ".join(f"{name} ({meaning})" for name, (_, meaning) in CONVENTIONS.items())
+        raise DomainError(f"column 'e2' without a convention: expected convention = {choices}", key="convention")
+    return CONVENTIONS[convention][0]
 
 
 def _from_components(columns: dict[str, Column | np.ndarray]) -> Galaxies:

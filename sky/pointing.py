@@ -53,7 +53,11 @@ class Pointing:
 
     @classmethod
     def of(cls, pointing: Any, position_angle: Any = 0.0) -> Pointing:
-        """Return the pointing of a SkyCoord, or of right ascension and declination [rad] or Quantities."""
+        """Return a pointing as it is, or that of a SkyCoord, or of right ascension and declination [rad]."""
+        if isinstance(pointing, Pointing):
+            if np.any(angle(position_angle, "position_angle")):
+                raise DomainError("position_angle: given beside a Pointing, which has its own")
+            return pointing
         # A SkyCoord: astropy.coordinates takes long to import, and who has one has done so.
         if hasattr(pointing, "icrs"):
             if not pointing.isscalar:

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arguments import check_arguments
+from ..core.arguments import check_arguments, removed_arguments
 from ..core.errors import ConfigError, DomainError
-from ..core.units import field_label, length
+from ..core.units import field_label
 from ..models.camera.focal_plane import FocalPlane
 from ..models.camera.silicon import Silicon
 from ..models.telescope import Telescope
@@ -25,9 +25,13 @@ from .pupil_sampling import CHIEF_RAY
 from .reference_sphere import path_to_plane, path_to_sphere
 from .request import Request
 
+#: What replaces the radius of the sphere in a call.
+_SPHERE = "telescope=replace(telescope, reference_sphere_radius=...)"
+#: What a call of many fields cannot do without.
 _ADVICE = "; wavefront_opd can do without it, with reference='mean'"
 
 
+@removed_arguments(sphere_radius=_SPHERE)
 @check_arguments
 def wavefront_opd(
     telescope: Telescope | Request,
@@ -37,7 +41,6 @@ def wavefront_opd(
     *,
     grid: int | None = None,
     reference: str = "chief",
-    sphere_radius: ArrayLike | None = None,
     focal_plane: FocalPlane | None = None,
     silicon: Silicon | None = None,
     projection: str | None = None,
@@ -46,7 +49,8 @@ def wavefront_opd(
     """Return the optical path difference over the entrance pupil.
 
     The OPD is the path of the reference ray minus that of each ray, to a sphere centred where the chief ray meets
-    the image surface (the CCD surface, where a focal plane is given). The chief ray, through the centre of the
+    the image surface (the CCD surface, where a focal plane is given); its radius is the telescope's
+    `reference_sphere_radius`. The chief ray, through the centre of the
     entrance pupil, is traced with vignetting ignored: in an obscured telescope it is blocked.
 
     Parameters
@@ -66,8 +70,6 @@ def wavefront_opd(
     reference : {"chief", "mean"}
         "chief": sphere and zero of the path at the chief ray. "mean": sphere about the mean landing point of the
         lit rays, zero at their mean path.
-    sphere_radius : float or Quantity, optional
-        Radius of the reference sphere [m]; the telescope's own by default.
     focal_plane : FocalPlane, optional
         CCD surfaces; the nominal detector surface without it.
     silicon : Silicon, optional
@@ -95,7 +97,7 @@ def wavefront_opd(
     if len(request.fields) != 1:
         raise DomainError(f"field of shape {request.fields.shape}: expected two angles")
     x, y, inside = _pupil_points(telescope, pupil, grid)
-    radius = _sphere_radius(telescope, sphere_radius, focal_plane, silicon)
+    radius = _sphere_radius(telescope, focal_plane, silicon)
     w, index = request.wavelength, refractive_indices(telescope, request.wavelength)[-2]
     rays = request.launch(w, np.stack([x.ravel(), y.ravel()], axis=-1))
     end = trace(telescope, rays, focal_plane=focal_plane, threads=threads)
@@ -127,6 +129,7 @@ def wavefront_opd(
     )
 
 
+@removed_arguments(sphere_radius=_SPHERE)
 @check_arguments
 def wavefront_opds(
     telescope: Telescope | Request,
@@ -135,7 +138,6 @@ def wavefront_opds(
     pupil: tuple[ArrayLike, ArrayLike] | None = None,
     *,
     grid: int | None = None,
-    sphere_radius: ArrayLike | None = None,
     focal_plane: FocalPlane | None = None,
     silicon: Silicon | None = None,
     projection: str | None = None,
@@ -150,7 +152,7 @@ def wavefront_opds(
 
     Parameters
     ----------
-    telescope, wavelength, pupil, grid, sphere_radius, focal_plane, silicon, projection, threads
+    telescope, wavelength, pupil, grid, focal_plane, silicon, projection, threads
         As in :func:`wavefront_opd`; the pupil points are the same for all fields.
     fields : array_like or Quantity, shape [n_field, 2]
         Field angles [rad], in the stated projection.
@@ -171,7 +173,7 @@ def wavefront_opds(
     """
     request = Request.of(telescope, fields, wavelength, sampling=CHIEF_RAY, projection=projection, threads=threads)
     x, y, inside = _pupil_points(request.telescope, pupil, grid)
-    radius = _sphere_radius(request.telescope, sphere_radius, focal_plane, silicon)
+    radius = _sphere_radius(request.telescope, focal_plane, silicon)
     spheres = _spheres(request, radius, focal_plane)
     value = traced_opds(request, x.ravel(), y.ravel(), spheres, radius, progress).reshape(-1, *x.shape)
     value[:, ~inside] = np.nan
@@ -209,19 +211,12 @@ def _silicon_opd(request: Request, silicon: Silicon, x: np.ndarray, y: np.ndarra
     return np.asarray(0.5 * shift * (cosines**2).sum(axis=-1)).reshape(-1, *x.shape)
 
 
-def _sphere_radius(
-    telescope: Telescope, sphere_radius: ArrayLike | None, focal_plane: FocalPlane | None, silicon: Silicon | None
-) -> float:
+def _sphere_radius(telescope: Telescope, focal_plane: FocalPlane | None, silicon: Silicon | None) -> float:
     """Return the radius of reference spheres [m]; DomainError for arguments that an afocal telescope cannot have."""
-    image_arguments = {"a sphere_radius": sphere_radius, "a focal plane": focal_plane, "silicon": silicon}
+    image_arguments = {"a focal plane": focal_plane, "silicon": silicon}
     for name in (name for name, value in image_arguments.items() if value is not None):
         require_image(telescope, name)
-    if sphere_radius is None:
-        return telescope.sphere_radius
-    radius = length(sphere_radius, "sphere_radius")
-    if not radius > 0:
-        raise DomainError(f"sphere_radius = {sphere_radius!r}: expected a positive length in metres")
-    return radius
+    return telescope.sphere_radius
 
 
 def _reference_path(

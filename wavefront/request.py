@@ -10,17 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arguments import check_arguments
+from ..core.arguments import check_arguments, removed_arguments
 from ..core.errors import ConfigError, DomainError, shown
 from ..core.units import metres, pure_numbers, radians
 from ..models.design_data import unvignetted, vignetted
 from ..models.telescope import Telescope
-from ..raytrace.aiming import pupil_coordinates
+from ..raytrace.aiming import AimedPoints, pupil_coordinates
 from ..raytrace.launch import aimed_points
 from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import Rays, RayStatus, field_direction, straight_bundles
 from ..raytrace.trace import trace
-from .aimed_start import AimedStart
 from .bundles import Bundles
 from .design_fields import design_fields
 from .pupil_sampling import PupilSampling, pupil_sampling
@@ -75,6 +74,7 @@ class Request:
         )
 
     @classmethod
+    @removed_arguments(aiming="telescope=telescope.with_design(aiming=...)")
     @check_arguments
     def of(
         cls,
@@ -87,7 +87,6 @@ class Request:
         n_pupil: int | None = None,
         projection: str | None = None,
         threads: int | None = None,
-        aiming: str | None = None,
         one_wavelength: bool = False,
         default_fields: Callable[[Telescope], ArrayLike] | None = None,
     ) -> Request:
@@ -116,8 +115,6 @@ class Request:
             Meaning of the field angles, see :func:`~pachon.raytrace.rays.field_direction`; "zemax" by default.
         threads : int, optional
             Number of threads; all processors by default. Results do not depend on it.
-        aiming : {"off", "paraxial", "real"}, optional
-            Ray aiming at the stop, see :class:`~pachon.DesignData`; as the design data say by default.
         one_wavelength : bool
             Whether no wavelength means the telescope's default alone, and a request may have one only.
         default_fields : callable, optional
@@ -126,17 +123,15 @@ class Request:
         Raises
         ------
         ConfigError
-            If the sampling or the projection is unknown, or fields, wavelengths, weights, projection or aiming are
-            given beside a request.
-        PrescriptionError
-            If the aiming is unknown, or rays are to be aimed and the telescope has no stop.
+            If the sampling or the projection is unknown, or fields, wavelengths, weights or projection are given
+            beside a request.
         DomainError
             If an array has another shape, a field point or wavelength lies outside what the telescope covers, or a
             weight is negative.
         """
         if isinstance(telescope, Request):
             held = {"fields": fields, "wavelengths": wavelengths, "wavelength_weights": wavelength_weights}
-            for name, value in (held | {"projection": projection, "aiming": aiming}).items():
+            for name, value in (held | {"projection": projection}).items():
                 if value is not None:
                     raise ConfigError(f"{name} = {shown(value)}: given beside a Request, which has its own", key=name)
             if one_wavelength:
@@ -145,8 +140,6 @@ class Request:
         projection = "zemax" if projection is None else projection
         if fields is None and default_fields is not None:
             fields = default_fields(telescope)
-        if aiming is not None:
-            telescope = telescope.with_design(aiming=aiming)
         data = telescope.design_data
         points = field_points(telescope, fields, projection)
         own_waves = wavelengths is None and not one_wavelength and bool(data.wavelengths)
@@ -351,3 +344,19 @@ def relative_weights(weights: ArrayLike | None, count: int, name: str = "wavelen
     if values.shape != (count,) or not (np.isfinite(values).all() and (values >= 0).all() and values.sum() > 0):
         raise DomainError(f"{name} = {shown(weights)}: expected {count} numbers, none negative, not all zero")
     return values / values.sum()
+
+
+class AimedStart:
+    """Points of the entrance pupil that aimed rays of some directions cross, each set computed at its first use."""
+
+    def __init__(self, telescope: Telescope, directions: np.ndarray) -> None:
+        self._telescope, self._directions = telescope, directions
+        self._computed: dict[tuple[float, bytes], AimedPoints] = {}
+
+    def at(self, wavelength: float, pupil: np.ndarray) -> AimedPoints:
+        """Return those of pupil points [m], [n_pupil, 2] or [n_field, n_pupil, 2]; DomainError as `aimed_points`."""
+        key = (wavelength, pupil.tobytes())
+        if key not in self._computed:
+            points = aimed_points(self._telescope, self._directions, wavelength, pupil)
+            self._computed[key] = AimedPoints.of(self._telescope, self._directions, wavelength, pupil, points)
+        return self._computed[key]

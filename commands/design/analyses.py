@@ -164,10 +164,7 @@ def _matrix_heading(summary: dict[str, Any]) -> str:
 
 
 @design_command(
-    FIELD,
-    Column(_matrix_heading, "rms_radius_um", ".3f"),
-    Column("Airy [µm]", "airy_radius_um", ".3f"),
-    band=True,
+    FIELD, Column(_matrix_heading, "rms_radius_um", ".3f"), Column("Airy [µm]", "airy_radius_um", ".3f"), band=True
 )
 def spot_matrix(
     shared: SharedOptions,

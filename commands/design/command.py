@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ...models.telescope import Telescope
+    from ...wavefront.request import Request
 
 app = typer.Typer()
 
@@ -114,13 +115,17 @@ class SharedOptions:
         """Projection and threads, as keyword arguments."""
         return {"projection": self.projection, "threads": self.threads}
 
+    @cached_property
+    def request(self) -> Request:
+        """Telescope, field angles, wavelengths, projection and threads, with their defaults."""
+        from ...wavefront.request import Request
+
+        return Request.of(*self.first_arguments, **self.trace_options)
+
     @property
     def images(self) -> int:
         """The number of images, over fields and wavelengths."""
-        from ...wavefront.request import Request
-
-        request = Request.of(*self.first_arguments, projection=self.projection)
-        return len(request.fields) * len(request.wavelengths)
+        return len(self.request.fields) * len(self.request.wavelengths)
 
     @contextmanager
     def stage(self, title: str, total: int | None) -> Iterator[Callable[[int], None]]:

@@ -66,14 +66,7 @@ def psf(
     compute = huygens_psf if huygens else fft_psf
     pixel = None if pixel_um is None else pixel_um * 1e-6
     with shared.stage("diffraction images", shared.images) as progress:
-        result = compute(
-            *shared.first_arguments,
-            pixel=pixel,
-            pixels=pixels,
-            n_pupil=pupil_points,
-            progress=progress,
-            **shared.trace_options,
-        )
+        result = compute(shared.request, pixel=pixel, pixels=pixels, n_pupil=pupil_points, progress=progress)
     if fits is not None:
         cards = [
             ("MODEL", result.telescope, "telescope"),
@@ -110,18 +103,13 @@ def ee(
     - `pachon ee lsst_v3.3_i --wavelength-nm 750 --field-deg 0 --field-deg 1 --field-deg 1.4 --field-deg 1.75`
     - `pachon ee my_lens.zmx --geometric --across-band 5 --json`
     """
+    from ...design.images.diffraction import fft_psf
     from ...design.images.encircled_energy import encircled_energy
 
-    kind, total = ("geometric", None) if geometric else ("diffraction", shared.images)
-    with shared.stage("encircled energy", total) as progress:
-        return encircled_energy(
-            *shared.first_arguments,
-            kind=kind,
-            pixels=pixels,
-            n_pupil=None if geometric else pupil_points,
-            progress=progress,
-            **shared.trace_options,
-        )
+    if geometric:
+        return encircled_energy(shared.request, kind="geometric")
+    with shared.stage("encircled energy", shared.images) as progress:
+        return encircled_energy(fft_psf(shared.request, pixels=pixels, n_pupil=pupil_points, progress=progress))
 
 
 @design_command(
@@ -186,8 +174,7 @@ def ghosts(
     ] = None,
     detector_reflectivity: Annotated[float, Option(min=0.0, max=1.0, help="Of the detector.")] = 0.15,
     coatings: Annotated[
-        Path | None,
-        Option(metavar="FILE", help="Coatings of lens surfaces, a file as of throughput."),
+        Path | None, Option(metavar="FILE", help="Coatings of lens surfaces, a file as of throughput.")
     ] = None,
     rays: Annotated[int, Option(min=400, max=10_000_000, help="Rays of the star.")] = 40000,
     brightest: Annotated[
@@ -207,6 +194,7 @@ def ghosts(
     - `pachon ghosts lsst_v3.3_r --reflectivity Filter_exit=0.005 --reflectivity Filter_entrance=0.005 --json`
     """
     from ...design.metrics.ghost_paths import ghost_pairs
+    from ...design.metrics.ghosts import Reflectivity
     from ...design.metrics.ghosts import ghosts as compute
 
     lenses = _reflectivities(reflectivity or [])
@@ -224,9 +212,7 @@ def ghosts(
             shared.telescope,
             field,
             shared.wavelength,
-            reflectivity=lenses,
-            detector_reflectivity=detector_reflectivity,
-            coatings=coatings,
+            reflectivity=Reflectivity(lenses, detector_reflectivity, coatings),
             n_pupil=rays,
             brightest=brightest,
             progress=progress,

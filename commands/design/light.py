@@ -45,10 +45,7 @@ def illumination(
 
 
 @design_command(band=True)
-def throughput(
-    shared: SharedOptions,
-    coatings: _Coatings = None,
-) -> Outcome:
+def throughput(shared: SharedOptions, coatings: _Coatings = None) -> Outcome:
     """Draw the throughput against the wavelength: bare or coated surfaces, absorption, vignetting.
 
     Lens surfaces without a coating reflect after Fresnel; mirrors without one are perfect.

@@ -123,6 +123,7 @@ def zernikes(
     """
     from ...design.metrics.field_zernikes import double_zernikes, wavefront_zernikes
     from ...design.metrics.vignetting import field_disc
+    from ...wavefront.request import Request
 
     if sum((bool(shared.field_deg), over_field, double is not None)) > 1:
         raise ConfigError("--field-deg, --map and --double: expected one of them")
@@ -131,7 +132,10 @@ def zernikes(
         raise ConfigError("--fringe and --double: expected one of them")
     if double is not None:
         terms = double_zernikes(
-            telescope, shared.wavelength, jmax=jmax, kmax=double, pupil=pupil, **shared.trace_options
+            Request.of(telescope, None, shared.wavelength, one_wavelength=True, **shared.trace_options),
+            jmax=jmax,
+            kmax=double,
+            pupil=pupil,
         )
         return Outcome(terms, _double_rows, stem=f"double_zernikes_{file_name(telescope.name)}")
     fields = field_disc(telescope) if over_field else shared.fields

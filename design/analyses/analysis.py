@@ -55,13 +55,13 @@ class Analysis(FieldResult):
     @check_arguments
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw the result in a figure of its own, or in the place of given axes."""
-        rows, columns = self._grid
+        rows, columns, *size = self._panels
         with styled():
             if rows * columns == 1:
-                figure, axes = axes_at(ax, *self._size)
+                figure, axes = axes_at(ax, *size)
                 panels = [axes]
             else:
-                figure = figure_at(ax, *self._size)
+                figure = figure_at(ax, *size)
                 panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
             if ax is None:
                 self._titled(figure, self._title)
@@ -69,14 +69,9 @@ class Analysis(FieldResult):
             return figure
 
     @property
-    def _grid(self) -> tuple[int, int]:
-        """Rows and columns of panels."""
-        return 1, 1
-
-    @property
-    def _size(self) -> tuple[float, float]:
-        """Width and height of the picture [inches]."""
-        return 6.5, 4.6
+    def _panels(self) -> tuple[int, int, float, float]:
+        """Rows and columns of panels, width and height of the picture [inches]."""
+        return 1, 1, 6.5, 4.6
 
     @property
     @abstractmethod
@@ -149,14 +144,3 @@ def require_focus(telescope: Telescope, *values: np.ndarray) -> None:
     """Raise a DomainError where values are not finite since the light of a telescope is parallel."""
     if telescope.design_data.afocal or not all(np.isfinite(value).all() for value in values):
         raise DomainError(f"telescope {telescope.name}: expected one with a focus; its light is parallel")
-
-
-def tangential_axes(request: Request) -> np.ndarray:
-    """Return unit vectors along the field (y on the axis) and across it for each field, shape [n_field, 2, 2].
-
-    The first axis after the fields is tangential, sagittal; the last x, y of pupil and detector.
-    """
-    slopes = request.slopes
-    radius = np.hypot(*slopes.T)[:, None]
-    tangential = np.where(radius > 0, slopes / np.where(radius > 0, radius, 1.0), [0.0, 1.0])
-    return np.stack([tangential, np.stack([tangential[:, 1], -tangential[:, 0]], axis=-1)], axis=1)

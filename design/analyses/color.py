@@ -17,8 +17,8 @@ from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
-from ..metrics.principal_rays import principal_rays_of
-from .analysis import Analysis, Columns, band_wavelengths, line_request, require_focus, tangential_axes
+from ..metrics.principal_rays import principal_rays_of, tangential_axes
+from .analysis import Analysis, Columns, band_wavelengths, line_request, require_focus
 from .field_curvature import close_foci
 
 if TYPE_CHECKING:
@@ -68,11 +68,7 @@ class LateralColor(Analysis):
         return {
             "reference_nm": self.request.middle * 1e9,
             **self.on_image(
-                {
-                    "shift_um": self.shift * 1e6,
-                    "spread_um": self.spread * 1e6,
-                    "airy_radius_um": self.airy_radius * 1e6,
-                }
+                {"shift_um": self.shift * 1e6, "spread_um": self.spread * 1e6, "airy_radius_um": self.airy_radius * 1e6}
             ),
         }
 
@@ -191,7 +187,7 @@ def lateral_color(
 
 @check_arguments
 def chromatic_focus(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     wavelengths: ArrayLike | None = None,
     *,
     zones: ArrayLike = _ZONES,
@@ -202,7 +198,7 @@ def chromatic_focus(
     Parameters
     ----------
     telescope, threads
-        As in :meth:`pachon.Request.of`.
+        As in :meth:`pachon.Request.of`; a request has the wavelengths too, and its fields are not used.
     wavelengths : array_like or Quantity, shape [n_wave], optional
         Vacuum wavelengths [m]; 33 across the band by default.
     zones : array_like, shape [n_zone]
@@ -217,6 +213,9 @@ def chromatic_focus(
     radii = np.atleast_1d(pure_numbers(zones, "zones"))
     if radii.ndim != 1 or not ((radii > 0) & (radii <= 1)).all():
         raise DomainError(f"zones = {zones!r}: expected a list of numbers above 0 and up to 1")
+    if isinstance(telescope, Request):
+        stated = Request.of(telescope, None, wavelengths, threads=threads)
+        telescope, wavelengths, threads = stated.telescope, stated.wavelengths, stated.threads
     if wavelengths is None:
         wavelengths = np.linspace(*(telescope.band or telescope.wavelength_range), _WAVELENGTHS)
     request = Request.of(telescope, (0.0, 0.0), wavelengths, sampling=CHIEF_RAY, threads=threads)

@@ -24,7 +24,8 @@ from ...raytrace.rays import RayStatus
 from ...wavefront.bundles import Bundles
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
-from .analysis import Analysis, Columns, line_request, require_focus, tangential_axes
+from ..metrics.principal_rays import tangential_axes
+from .analysis import Analysis, Columns, line_request, require_focus
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -67,12 +68,8 @@ class FieldCurvature(Analysis):
         return f"field curvature and distortion, {self._nanometres()}"
 
     @property
-    def _grid(self) -> tuple[int, int]:
-        return 1, 2
-
-    @property
-    def _size(self) -> tuple[float, float]:
-        return 9.0, 4.8
+    def _panels(self) -> tuple[int, int, float, float]:
+        return 1, 2, 9.0, 4.8
 
     def _table_columns(self) -> Columns:
         return {

@@ -18,7 +18,8 @@ from ...wavefront.bundles import Bundles
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
-from .analysis import Analysis, Columns, tangential_axes
+from ..metrics.principal_rays import tangential_axes
+from .analysis import Analysis, Columns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,12 +44,8 @@ class Fans(Analysis):
     lit: np.ndarray
 
     @property
-    def _grid(self) -> tuple[int, int]:
-        return len(self.fields), 2
-
-    @property
-    def _size(self) -> tuple[float, float]:
-        return 8.5, 0.9 + 1.8 * len(self.fields)
+    def _panels(self) -> tuple[int, int, float, float]:
+        return len(self.fields), 2, 8.5, 0.9 + 1.8 * len(self.fields)
 
     def _fan_columns(self) -> Columns:
         return {

@@ -61,8 +61,8 @@ class SeidelDiagram(Analysis):
         return f"Seidel diagram, field {self.field_labels()[0]}, {self._nanometres()}"
 
     @property
-    def _size(self) -> tuple[float, float]:
-        return min(max(6.5, 1.2 + 0.75 * (len(self.names) + 1)), 14.0), 4.4
+    def _panels(self) -> tuple[int, int, float, float]:
+        return 1, 1, min(max(6.5, 1.2 + 0.75 * (len(self.names) + 1)), 14.0), 4.4
 
     def _table_columns(self) -> Columns:
         columns: Columns = {"surface": (np.array(self.names), "", "mirror or lens surface")}
@@ -112,14 +112,14 @@ class SeidelDiagram(Analysis):
 
 @check_arguments
 def seidel_diagram(
-    telescope: Telescope, wavelength: ArrayLike | None = None, *, field: ArrayLike | None = None
+    telescope: Telescope | Request, wavelength: ArrayLike | None = None, *, field: ArrayLike | None = None
 ) -> SeidelDiagram:
     """Compute third-order and chromatic aberrations of each surface of a centred telescope.
 
     Parameters
     ----------
-    telescope : Telescope
-        Prescription; its surfaces must share one axis.
+    telescope : Telescope or Request
+        Prescription; its surfaces must share one axis. A request has the wavelength too; its fields are not used.
     wavelength : float or Quantity, optional
         Vacuum wavelength of the rays and of the waves [m]; the telescope's default where not given.
     field : float or Quantity, optional
@@ -130,6 +130,9 @@ def seidel_diagram(
     DomainError
         If no surface acts, one is decentred or tilted, or the wavelength or field is not covered.
     """
+    if isinstance(telescope, Request):
+        stated = Request.of(telescope, None, wavelength, one_wavelength=True)
+        telescope, wavelength = stated.telescope, stated.wavelength
     angle = telescope.field_radius if field is None else one_angle(field, "field")
     request = Request.of(telescope, (0.0, angle), wavelength, sampling=CHIEF_RAY, one_wavelength=True)
     sums = seidel_sums(telescope, request.wavelength, angle)

@@ -70,12 +70,8 @@ class SpotMatrix(Analysis):
         return f"spots against {self.against}, about the centroid of each field"
 
     @property
-    def _grid(self) -> tuple[int, int]:
-        return len(self.fields), len(self.columns)
-
-    @property
-    def _size(self) -> tuple[float, float]:
-        return 0.6 + 1.6 * len(self.columns), 0.9 + 1.75 * len(self.fields)
+    def _panels(self) -> tuple[int, int, float, float]:
+        return len(self.fields), len(self.columns), 0.6 + 1.6 * len(self.columns), 0.9 + 1.75 * len(self.fields)
 
     def _table_columns(self) -> Columns:
         nm = self.against == "wavelength"

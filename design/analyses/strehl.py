@@ -130,8 +130,8 @@ def strehl(
         for i, lit in enumerate(bundles.lit):
             rms[i, w], ratio[i, w] = _rms_and_strehl(opd[i], lit, request, wavelength)
         if from_psf:
-            how: dict[str, Any] = {"projection": projection, "threads": threads, "pixels": 64}
-            peak[:, w] = fft_psf(telescope, request.fields, wavelength, **how).strehl
+            star = Request.of(telescope, request.fields, wavelength, projection=projection, threads=threads)
+            peak[:, w] = fft_psf(star, pixels=64).strehl
     return StrehlRatios(request, rms, ratio, peak)
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.arguments import check_arguments
+from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import DomainError
 from ...core.plotting import figure_of
 from ...core.units import angle as one_angle
@@ -72,12 +72,8 @@ class TargetImage(Analysis):
         return f"geometric image of a target, {self._nanometres()}"
 
     @property
-    def _grid(self) -> tuple[int, int]:
-        return 1, 2
-
-    @property
-    def _size(self) -> tuple[float, float]:
-        return 9.0, 4.6
+    def _panels(self) -> tuple[int, int, float, float]:
+        return 1, 2, 9.0, 4.6
 
     def _table_columns(self) -> Columns:
         along = (np.arange(len(self.image)) - 0.5 * (len(self.image) - 1)) * self.pixel * 1e6
@@ -145,6 +141,7 @@ def bar_target(pixels: int = 96, *, bars: int = 3) -> np.ndarray:
     return np.where(upright | level, 1.0, 0.0)
 
 
+@removed_arguments(wavelength_weights="telescope=Request.of(telescope, field, wavelengths, wavelength_weights=...)")
 @check_arguments
 def target_image(
     telescope: Telescope | Request,
@@ -153,7 +150,6 @@ def target_image(
     width: ArrayLike | None = None,
     field: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
-    wavelength_weights: ArrayLike | None = None,
     n_rays: int = 400,
     pixel: ArrayLike | None = None,
     pixels: int | None = None,
@@ -164,8 +160,8 @@ def target_image(
 
     Parameters
     ----------
-    telescope, wavelengths, wavelength_weights, projection, threads
-        As in :meth:`pachon.Request.of`.
+    telescope, wavelengths, projection, threads
+        As in :meth:`pachon.Request.of`; a request has weights of the wavelengths too.
     target : array_like, shape [ny, nx], optional
         Brightness on the sky, not negative, rows along +y of the field angles; :func:`bar_target` by default.
     width : float or Quantity, optional
@@ -197,7 +193,6 @@ def target_image(
         telescope,
         field,
         wavelengths,
-        wavelength_weights=wavelength_weights,
         sampling="spiral",
         default_fields=lambda telescope: (0.0, 0.0),
         n_pupil=count,

@@ -64,12 +64,8 @@ class Throughput(Analysis):
         return "throughput, unpolarised light"
 
     @property
-    def _grid(self) -> tuple[int, int]:
-        return 1, 2
-
-    @property
-    def _size(self) -> tuple[float, float]:
-        return 10.0, 0.8 + max(4.0, 0.19 * len(self.surfaces))
+    def _panels(self) -> tuple[int, int, float, float]:
+        return 1, 2, 10.0, 0.8 + max(4.0, 0.19 * len(self.surfaces))
 
     def _table_columns(self) -> Columns:
         return {

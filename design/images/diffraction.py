@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.arguments import check_arguments
+from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import DomainError, check_choice
 from ...core.threads import one_blas_thread
 from ...core.units import field_label, length, require_count
@@ -27,6 +27,8 @@ from ..metrics.spots import REFERENCES, spot_diagram
 from .diffraction_psf import DiffractionPsf, pixel_axis
 from .wavelets import WaveletLattice, Wavelets, lattice_wavelets, range_of_cosines, spot_reach, traced_wavelets
 
+#: What replaces arguments that a request has.
+_REQUEST = "telescope=Request.of(telescope, fields, wavelengths, {}=...)"
 #: Default number of pixels on a side.
 _PIXELS = 128
 #: Default number of pixels across wavelength times focal ratio.
@@ -49,18 +51,17 @@ _MOST_PLACES = 192
 _FINE = 33
 
 
+@removed_arguments(wavelength_weights=_REQUEST.format("wavelength_weights"), projection=_REQUEST.format("projection"))
 @check_arguments
 def fft_psf(
     telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
-    wavelength_weights: ArrayLike | None = None,
     pixel: ArrayLike | None = None,
     pixels: int = _PIXELS,
     n_pupil: int | None = None,
     reference: str = "centroid",
-    projection: str | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> DiffractionPsf:
@@ -68,8 +69,8 @@ def fft_psf(
 
     Parameters
     ----------
-    telescope, fields, wavelengths, wavelength_weights, projection, threads
-        As in :meth:`pachon.Request.of`.
+    telescope, fields, wavelengths, threads
+        As in :meth:`pachon.Request.of`; a request has a projection and weights of the wavelengths too.
     pixel : float or Quantity, optional
         Distance of pixel centres on the detector [m]; by default a fifth of the smallest wavelength times focal
         ratio, or more where the spots are larger than the image would be.
@@ -90,9 +91,7 @@ def fft_psf(
     DomainError
         If a number is out of range, no light passes, or the lattice is too coarse for the spots or the image.
     """
-    request = Request.of(
-        telescope, fields, wavelengths, wavelength_weights=wavelength_weights, projection=projection, threads=threads
-    )
+    request = Request.of(telescope, fields, wavelengths, threads=threads)
     telescope = request.telescope
     plan = _Plan(request, pixel, pixels, reference)
     side, unit = plan.pixel * plan.pixels, "urad" if telescope.design_data.afocal else "um"
@@ -125,19 +124,18 @@ def fft_psf(
     return plan.image("fft", waves, int(across), progress)
 
 
+@removed_arguments(wavelength_weights=_REQUEST.format("wavelength_weights"), projection=_REQUEST.format("projection"))
 @check_arguments
 def huygens_psf(
     telescope: Telescope | Request,
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
-    wavelength_weights: ArrayLike | None = None,
     pixel: ArrayLike | None = None,
     pixels: int = _PIXELS,
     sampling: str | PupilSampling = "square",
     n_pupil: int | None = None,
     reference: str = "centroid",
-    projection: str | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> DiffractionPsf:
@@ -151,10 +149,8 @@ def huygens_psf(
         telescope,
         fields,
         wavelengths,
-        wavelength_weights=wavelength_weights,
         sampling=sampling,
         n_pupil=_HUYGENS_ACROSS if n_pupil is None and sampling == "square" else n_pupil,
-        projection=projection,
         threads=threads,
     )
     plan = _Plan(request, pixel, pixels, reference)

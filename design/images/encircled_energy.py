@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import zoom
 
-from ...core.arguments import check_arguments
-from ...core.errors import DomainError, check_choice
+from ...core.arguments import check_arguments, removed_arguments
+from ...core.errors import ConfigError, DomainError, check_choice, shown
 from ...core.plotting import BLUE, ORANGE, RED, figure_at, styled
 from ...core.units import arcseconds, metres, pure_numbers, require_count
 from ...models.telescope import Telescope
-from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
 from ..drawing import FEW, field_colors, finish_axes, second_scale
 from ..metrics.spots import SpotDiagram, spots
@@ -99,20 +98,22 @@ class EncircledEnergy(FieldResult):
             return self._titled(figure, f"encircled energy {kind}, {self._nanometres()}")
 
 
+@removed_arguments(
+    pixels="telescope=fft_psf(telescope, fields, wavelengths, pixels=...)",
+    sampling="telescope=spots(telescope, fields, wavelengths, sampling=...)",
+    wavelength_weights="telescope=Request.of(telescope, fields, wavelengths, wavelength_weights=...)",
+    projection="telescope=Request.of(telescope, fields, wavelengths, projection=...)",
+)
 @check_arguments
 def encircled_energy(
-    telescope: Telescope | Request,
+    telescope: Telescope | Request | DiffractionPsf | SpotDiagram,
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
-    kind: str = "diffraction",
+    kind: str | None = None,
     radii: ArrayLike | None = None,
-    wavelength_weights: ArrayLike | None = None,
-    reference: str = "centroid",
-    sampling: str | PupilSampling = "spiral",
-    pixels: int = _PIXELS,
+    reference: str | None = None,
     n_pupil: int | None = None,
-    projection: str | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> EncircledEnergy:
@@ -120,32 +121,32 @@ def encircled_energy(
 
     Parameters
     ----------
-    telescope, fields, wavelengths, wavelength_weights, projection, threads
+    telescope : Telescope, Request, DiffractionPsf or SpotDiagram
+        The telescope; a request in place of it, its fields and wavelengths, with a projection and weights of the
+        wavelengths; or images or spots already made (:func:`pachon.fft_psf`, :func:`pachon.huygens_psf`,
+        :func:`pachon.spots`), beside which only radii are stated.
+    fields, wavelengths, threads
         As in :meth:`pachon.Request.of`.
     kind : {"diffraction", "geometric"}
-        From diffraction images (:func:`~pachon.design.images.diffraction.fft_psf`), or of the rays alone.
+        From diffraction images (:func:`pachon.fft_psf`) of 256 x 256 pixels, the default, or of the rays alone: those
+        of a spiral, on which all radii differ, so that the curves are smooth.
     radii : array_like or Quantity, shape [n_radius], optional
         Radii [m], ascending; by default from zero to the edge of the images, or beyond the farthest ray.
     reference : {"centroid", "chief"}
-        Centre of the circles: the centroid of the rays, or the chief ray of the middle wavelength.
-    sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
-        Pupil points of "geometric"; on a spiral all radii differ, so that the curves are smooth.
-    pixels : int
-        Pixels on a side of the images of "diffraction".
+        Centre of the circles: the centroid of the rays, the default, or the chief ray of the middle wavelength.
     n_pupil : int, optional
-        Number of pupil points, as in :func:`~pachon.design.images.diffraction.fft_psf` ("diffraction") or in
-        :meth:`pachon.Request.of` ("geometric").
+        Number of pupil points, as in :func:`pachon.fft_psf` ("diffraction") or in :meth:`pachon.Request.of`
+        ("geometric").
     progress : callable, optional
         Called with the number of pairs of field and wavelength done since the last call ("diffraction").
 
     Raises
     ------
     ConfigError
-        If kind or reference is unknown.
+        If kind or reference is unknown, or something is stated twice.
     DomainError
-        If radii do not ascend, or no light passes.
+        If radii do not ascend or go beyond the images, or no light passes.
     """
-    check_choice("kind", kind, KINDS)
     circle_radii = None if radii is None else np.atleast_1d(metres(radii, "radii"))
     if circle_radii is not None and not (
         circle_radii.ndim == 1
@@ -154,21 +155,32 @@ def encircled_energy(
         and (np.diff(circle_radii) > 0).all()
     ):
         raise DomainError(f"radii of shape {circle_radii.shape}: expected ascending lengths from 0, shape [n]")
-    common: dict[str, Any] = dict(
-        wavelength_weights=wavelength_weights,
-        n_pupil=n_pupil,
-        reference=reference,
-        projection=projection,
-        threads=threads,
-    )
+    if isinstance(telescope, DiffractionPsf | SpotDiagram):
+        sources = {
+            "fields": fields,
+            "wavelengths": wavelengths,
+            "kind": kind,
+            "reference": reference,
+            "n_pupil": n_pupil,
+        }
+        for name, value in sources.items():
+            if value is not None:
+                source = type(telescope).__name__
+                raise ConfigError(f"{name} = {shown(value)}: given beside a {source}, which has its own", key=name)
+        if isinstance(telescope, SpotDiagram):
+            return _of_spots(telescope, circle_radii)
+        return _of_images(telescope, circle_radii)
+    kind = "diffraction" if kind is None else kind
+    reference = "centroid" if reference is None else reference
+    check_choice("kind", kind, KINDS)
+    request = Request.of(telescope, fields, wavelengths, threads=threads)
     if kind == "geometric":
-        return _geometric(spots(telescope, fields, wavelengths, sampling=sampling, **common), circle_radii)
-    return energy_of_psf(
-        fft_psf(telescope, fields, wavelengths, pixels=pixels, progress=progress, **common), circle_radii
-    )
+        return _of_spots(spots(request, sampling="spiral", n_pupil=n_pupil, reference=reference), circle_radii)
+    images = fft_psf(request, pixels=_PIXELS, n_pupil=n_pupil, reference=reference, progress=progress)
+    return _of_images(images, circle_radii)
 
 
-def energy_of_psf(psf: DiffractionPsf, radii: np.ndarray | None = None) -> EncircledEnergy:
+def _of_images(psf: DiffractionPsf, radii: np.ndarray | None = None) -> EncircledEnergy:
     """Return the encircled energy about the middles of diffraction images, by default out to their edge [m]."""
     edge = float(psf.axis[-1])
     radius = np.linspace(0.0, edge, _RADII) if radii is None else radii
@@ -232,7 +244,7 @@ def energy_curve(
     return np.concatenate([[0.0], np.sqrt(squared[order])]), np.concatenate([[0.0], within])
 
 
-def _geometric(diagram: SpotDiagram, radii: np.ndarray | None) -> EncircledEnergy:
+def _of_spots(diagram: SpotDiagram, radii: np.ndarray | None) -> EncircledEnergy:
     distance = np.where(diagram.weight > 0, np.linalg.norm(diagram.displacement, axis=-1), np.inf)
     farthest = float(distance[np.isfinite(distance)].max(initial=0.0))
     if not farthest > 0:

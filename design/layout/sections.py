@@ -36,12 +36,7 @@ class Lens:
     index: float  #: refractive index of the glass
 
 
-def ray_paths(
-    telescope: Telescope,
-    rays: Rays,
-    top: float,
-    threads: int | None = None,
-) -> np.ndarray:
+def ray_paths(telescope: Telescope, rays: Rays, top: float, threads: int | None = None) -> np.ndarray:
     """Return the paths of the rays that arrive [m], telescope frame, shape [n_ray, n_surface + 1, 3].
 
     They start at the height `top` [m] in front of the telescope, and pass the intersections with all surfaces.

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.arguments import check_arguments
+from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, ORANGE, figure_at, figure_of, styled
 from ...core.result import Result
@@ -23,7 +23,7 @@ from ...models.telescope import Telescope
 from ...models.zernike_polynomials import NOLL_NAMES, annular_zernikes
 from ...wavefront.pupil_optics import trace_pupils
 from ...wavefront.pupil_sampling import PupilSampling, gauss_annulus
-from ...wavefront.request import Request
+from ...wavefront.request import Request, field_points
 from ..drawing import FEW, draw_field_map, field_colors, panels_of, spread_in_field
 from ..result import FieldResult
 
@@ -283,9 +283,10 @@ def _wavefronts(request: Request) -> tuple[np.ndarray, np.ndarray]:
 _MOST_RINGS = 100
 
 
+@removed_arguments(projection="telescope=Request.of(telescope, projection=...)")
 @check_arguments
 def double_zernikes(
-    telescope: Telescope,
+    telescope: Telescope | Request,
     wavelength: ArrayLike | None = None,
     *,
     jmax: int = 28,
@@ -293,17 +294,16 @@ def double_zernikes(
     rings: int = 8,
     field_radius: ArrayLike | None = None,
     pupil: str = "full",
-    sampling: str | PupilSampling = "gauss",
+    sampling: str | PupilSampling | None = None,
     n_pupil: int | None = None,
-    projection: str = "zemax",
     threads: int | None = None,
 ) -> DoubleZernikes:
     """Expand the wavefront in Zernikes of pupil and field.
 
     Parameters
     ----------
-    telescope, wavelength, jmax, pupil, sampling, n_pupil, projection, threads
-        As in :func:`wavefront_zernikes`.
+    telescope, wavelength, jmax, pupil, sampling, n_pupil, threads
+        As in :func:`wavefront_zernikes`; the field points of a request are not used.
     kmax : int
         Highest Noll index in the field.
     rings : int
@@ -317,23 +317,19 @@ def double_zernikes(
     DomainError
         If the disc is out of range, or there are too few points for the terms.
     """
+    axis = None if isinstance(telescope, Request) else np.zeros((1, 2))
+    request = Request.of(
+        telescope, axis, wavelength, sampling=sampling, n_pupil=n_pupil, threads=threads, one_wavelength=True
+    )
+    telescope = request.telescope
     radius = telescope.field_radius if field_radius is None else angle(field_radius, "field_radius")
     if not (np.isfinite(radius) and radius > 0):
         raise DomainError(f"field_radius = {field_radius!r}: expected a positive angle")
     rings = require_count(rings, "rings", 1, _MOST_RINGS)
     nodes = gauss_annulus(radius, 0.0, rings, 4 * rings)
     kmax = require_count(kmax, "kmax", 1, len(nodes))
-    at_nodes = wavefront_zernikes(
-        telescope,
-        nodes.points,
-        wavelength,
-        jmax=jmax,
-        pupil=pupil,
-        sampling=sampling,
-        n_pupil=n_pupil,
-        projection=projection,
-        threads=threads,
-    )
+    points = field_points(telescope, nodes.points, request.projection)
+    at_nodes = wavefront_zernikes(request.at_fields(points), jmax=jmax, pupil=pupil)
     terms = annular_zernikes(kmax, *(nodes.points.T / radius)).T
     root = np.sqrt(nodes.weights)[:, None]
     coefficients, *_ = np.linalg.lstsq(terms * root, at_nodes.coefficients * root, rcond=None)

@@ -62,9 +62,6 @@ class Reflectivities:
         last = telescope.surfaces[-1]
         if last.interaction == Interaction.DETECTOR:
             table[last.name] = float(detector)
-        for name, value in table.items():
-            if not 0.0 <= value <= 1.0:
-                raise DomainError(f"reflectivity of {name} = {value!r}: expected a number from 0 to 1")
         for name in coatings.surfaces:
             if name not in telescope.surface_names:
                 raise unknown_name(f"surface of {telescope.name}", name, telescope.surface_names)

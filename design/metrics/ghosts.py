@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
-from ...core.arguments import check_arguments
+from ...core.arguments import check_arguments, removed_arguments
 from ...core.docstrings import Description, described
 from ...core.errors import DomainError
 from ...core.plotting import RED, figure_at, plain_text, styled
@@ -191,14 +191,45 @@ class Ghosts(FieldResult):
 
 
 @check_arguments
+@dataclass(frozen=True)
+class Reflectivity:
+    """Light that surfaces reflect, for :func:`ghosts`.
+
+    Attributes
+    ----------
+    lenses : float or mapping of str to float, optional
+        Reflectivity of the lens surfaces at every angle, one for all or by name; bare glass by default.
+    detector : float
+        Fraction of the light that the detector reflects.
+    coatings : Coatings or path, optional
+        Coatings of lens surfaces, or their file, as in :func:`pachon.throughput`, for surfaces whose reflectivity is
+        not stated: what they do not transmit is reflected.
+
+    Raises
+    ------
+    DomainError
+        If a number is not from 0 to 1.
+    """
+
+    lenses: float | Mapping[str, float] | None = None
+    detector: float = DETECTOR_REFLECTIVITY
+    coatings: Coatings | str | os.PathLike[str] | None = None
+
+    def __post_init__(self) -> None:
+        lenses = self.lenses if isinstance(self.lenses, Mapping) else {"the lenses": self.lenses}
+        for name, value in (*lenses.items(), ("the detector", self.detector)):
+            if value is not None and not 0.0 <= value <= 1.0:
+                raise DomainError(f"reflectivity of {name} = {value!r}: expected a number from 0 to 1")
+
+
+@removed_arguments(detector_reflectivity="reflectivity=Reflectivity(detector=...)")
+@check_arguments
 def ghosts(
     telescope: Telescope | Request,
     field: ArrayLike | None = None,
     wavelength: ArrayLike | None = None,
     *,
-    reflectivity: float | Mapping[str, float] | None = None,
-    detector_reflectivity: float = DETECTOR_REFLECTIVITY,
-    coatings: Coatings | str | os.PathLike[str] | None = None,
+    reflectivity: float | Mapping[str, float] | Reflectivity | None = None,
     n_pupil: int = 40000,
     brightest: int | None = None,
     projection: str | None = None,
@@ -213,13 +244,9 @@ def ghosts(
         As in :meth:`pachon.Request.of`.
     field : (tx, ty), optional
         Field angles of the star [rad] or Quantities; half-way to the edge of the field along +y by default.
-    reflectivity : float or mapping of str to float, optional
-        Reflectivity of the lens surfaces at every angle, one for all or by name; bare glass by default.
-    detector_reflectivity : float
-        Fraction of the light that the detector reflects.
-    coatings : Coatings or path, optional
-        Coatings of lens surfaces, or their file, as in :func:`pachon.throughput`, for surfaces whose reflectivity is
-        not given: what they do not transmit is reflected. Absorption of glasses is left out.
+    reflectivity : float, mapping of str to float, or Reflectivity, optional
+        Reflectivity of the lens surfaces at every angle, one for all or by name; bare glass by default. Or
+        :class:`Reflectivity`, which has that of the detector and coatings too. Absorption of glasses is left out.
     n_pupil : int
         Rays of the star in the entrance pupil, at least 400.
     brightest : int, optional
@@ -252,8 +279,9 @@ def ghosts(
     )
     telescope, threads = request.telescope, request.threads
     require_image(telescope, "a map of ghosts")
-    telescope_coatings = Coatings.of(telescope, coatings)
-    surfaces = Reflectivities(telescope, reflectivity, detector_reflectivity, telescope_coatings, request.wavelength)
+    reflecting = reflectivity if isinstance(reflectivity, Reflectivity) else Reflectivity(reflectivity)
+    coatings = Coatings.of(telescope, reflecting.coatings)
+    surfaces = Reflectivities(telescope, reflecting.lenses, reflecting.detector, coatings, request.wavelength)
     pairs = ghost_pairs(telescope)
     if not pairs:
         raise DomainError(
@@ -290,7 +318,7 @@ def ghosts(
         irradiance += _irradiance(landing, edges, edges) / direct
     return Ghosts(
         request=request,
-        detector_reflectivity=float(detector_reflectivity),
+        detector_reflectivity=float(reflecting.detector),
         ghosts=tuple(sorted(measured_ghosts, key=lambda g: (-np.nan_to_num(g.peak), g.first, g.second))),
         star=star,
         irradiance=irradiance,

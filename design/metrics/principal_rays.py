@@ -189,11 +189,7 @@ def principal_rays_of(request: Request) -> PrincipalRays:
     telescope, wavelength = request.telescope, request.middle
     pupil = pupil_sampling(telescope, "gauss", _RINGS)
     request = replace(request, wavelengths=np.array([wavelength]), weights=np.ones(1), pupil=pupil)
-    n, slopes = len(request.fields), request.slopes
-    radius = np.hypot(*slopes.T)
-    tangential = np.where((radius > 0)[:, None], slopes / np.where(radius > 0, radius, 1.0)[:, None], [0.0, 1.0])
-    sagittal = np.stack([tangential[:, 1], -tangential[:, 0]], axis=-1)
-    axes = np.stack([tangential, sagittal], axis=1)
+    n, slopes, axes = len(request.fields), request.slopes, tangential_axes(request)
     steps = JACOBIAN_STEP * np.concatenate([np.zeros((n, 1, 2)), axes, -axes], axis=1)
     # Per field: the direction of the chief ray and four beside it; each through centre, near zone and rim of the pupil.
     near = (slopes[:, None] + steps).reshape(-1, 2)
@@ -236,6 +232,17 @@ def principal_rays_of(request: Request) -> PrincipalRays:
         exit_pupil_distance=distance,
         exit_pupil_diameter=diameter,
     )
+
+
+def tangential_axes(request: Request) -> np.ndarray:
+    """Return unit vectors along the field (y on the axis) and across it for each field, shape [n_field, 2, 2].
+
+    The first axis after the fields is tangential, sagittal; the last x, y of pupil and detector.
+    """
+    slopes = request.slopes
+    radius = np.hypot(*slopes.T)[:, None]
+    tangential = np.where(radius > 0, slopes / np.where(radius > 0, radius, 1.0), [0.0, 1.0])
+    return np.stack([tangential, np.stack([tangential[:, 1], -tangential[:, 0]], axis=-1)], axis=1)
 
 
 def _focal_ratios(request: Request, axes: np.ndarray) -> np.ndarray:

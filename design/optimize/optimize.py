@@ -11,7 +11,7 @@ from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import ConfigError, DomainError, PachonError
 from ...core.threads import one_blas_thread
 from ...models.parameters.parameters import Parameter
-from ...models.paraxial import following_stop
+from ...models.paraxial import following_stop, stop_makes_pupil, with_moved_pupil, with_true_aperture
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
 from .configuration import DesignConfiguration, configurations
@@ -21,7 +21,6 @@ from .merit_function import MeritFunction, merit_function
 from .operand import Operand, check_operands
 from .optimum import OperandChange, Optimum
 from .problem import DesignProblem, DesignState
-from .remeasured import final_telescope, remeasured
 from .solver import LeastSquares
 from .variables import Variable, free_variables, limits
 from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
@@ -168,10 +167,7 @@ def wavefronts(telescope: Telescope, rays: Beams) -> np.ndarray:
 
 
 def _states(
-    given: tuple[DesignConfiguration, ...],
-    function: MeritFunction,
-    targets: tuple[Operand, ...],
-    threads: int | None,
+    given: tuple[DesignConfiguration, ...], function: MeritFunction, targets: tuple[Operand, ...], threads: int | None
 ) -> tuple[tuple[DesignState, ...], tuple[Beams, ...]]:
     """Return merit and operands of each configuration, and their rays."""
     if len(given) > 1 and function.of_one_telescope:
@@ -220,3 +216,39 @@ def _covariance(
         parts = parts / parts[main[np.argmax(np.abs(mode[main]))]]
         combinations.append(" ".join(f"{parts[i]:+.4g} {variables[i].address}" for i in main))
     return noise * spread @ spread.T, tuple(combinations)
+
+
+def final_telescope(telescope: Telescope, aiming: str) -> Telescope:
+    """Return an optimised telescope with a stated aiming and its stop in its place.
+
+    Its entrance pupil is where the stop is imaged now. Without such a pupil rays stay aimed at the stop.
+    """
+    if telescope.design_data.aiming == aiming:
+        return with_true_aperture(telescope)
+    stated = with_moved_pupil(telescope).with_design(aiming=aiming)
+    return stated if stop_makes_pupil(stated) else with_true_aperture(telescope)
+
+
+def remeasured(
+    states: Sequence[DesignConfiguration], telescopes: Sequence[Telescope], function: MeritFunction, threads: int | None
+) -> tuple[float, float]:
+    """Return the rms merit [m] of telescopes as they stand, of the light that arrives in each.
+
+    With rays that fill the stop, and with rays as the design data of the telescopes state them; NaN without light. The
+    spots are those of :func:`~pachon.design.metrics.spots.spots`.
+    """
+
+    def rms(state: DesignConfiguration, telescope: Telescope) -> float:
+        try:
+            return function.rms(telescope, state.beams(telescope, threads))
+        except PachonError:
+            return np.nan
+
+    total = sum(state.weight for state in states)
+    squares = np.zeros(2)
+    for state, telescope in zip(states, telescopes, strict=True):
+        filled = rms(state, following_stop(telescope))
+        stated = filled if following_stop(telescope) is telescope else rms(state, telescope)
+        squares += state.weight / total * np.array([filled, stated]) ** 2
+    filled, stated = np.sqrt(squares)
+    return float(filled), float(stated)

@@ -227,11 +227,7 @@ def optimization_arguments(
                 rays = {k: common[k] if v is None else v for k, v in section.rays().items()}
                 states.append(
                     DesignConfiguration(
-                        position,
-                        **rays,
-                        weight=section.weight,
-                        operands=section.operand_list(),
-                        projection=projection,
+                        position, **rays, weight=section.weight, operands=section.operand_list(), projection=projection
                     )
                 )
         bounds = {}

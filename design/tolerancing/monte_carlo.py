@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import ConfigError, check_choice
 from ...core.plotting import BLUE, GREY, RED, figure_at, plain_text, styled
-from ...core.result import Result
+from ...core.result import Result, Values
 from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...models.parameters.tolerances import Tolerance, draw
 from ...models.telescope import Telescope
@@ -21,7 +21,6 @@ from ..optimize.merit import Beams, filling_stop
 from ..optimize.sensitivity import field_rings
 from .criterion import Criterion
 from .toleranced_merit import TolerancedMerit
-from .yields import Yield
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -268,3 +267,33 @@ def monte_carlo(
         if progress is not None:
             progress(1)
     return MonteCarlo.of(toleranced, method, deviations, merits, toleranced.traced_nominal)
+
+
+@dataclass(frozen=True)
+class Yield(Values):
+    """Fraction of telescopes that meet a requirement.
+
+    Attributes
+    ----------
+    requirement : float
+        Requirement, in the unit of the merit.
+    fraction : float
+        Fraction that meets it.
+    low, high : float
+        Limits of the fraction at one standard deviation, Wilson's score interval: E. B. Wilson, J. Am. Stat. Assoc. 22,
+        209 (1927).
+    """
+
+    requirement: float
+    fraction: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, merits: np.ndarray, requirement: float, *, larger: bool = False) -> Yield:
+        """Return the yield of merits, NaN for lost telescopes; with `larger`, at least the requirement is wanted."""
+        met = merits >= requirement if larger else merits <= requirement
+        n, p = len(merits), float(met.mean())
+        middle = (p + 0.5 / n) / (1.0 + 1.0 / n)
+        half = np.sqrt(p * (1.0 - p) / n + 0.25 / n**2) / (1.0 + 1.0 / n)
+        return cls(requirement, p, float(middle - half), float(middle + half))

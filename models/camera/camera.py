@@ -1,8 +1,9 @@
 """Cameras: where each CCD of a mosaic lies, by name, and the maps between its pixels and the focal plane.
 
 Three frames. That of the focal plane is the detector's: x, y along the telescope's, origin on the optical axis, turned
-by the rotator. That of a CCD has its origin at the centre of the CCD and x, y along its rows and columns, at the angle
-`rotation_deg` from those of the focal plane. Pixels are counted along the latter, the centre of the first at (0, 0).
+by the rotator. That of a CCD has its origin at the centre of the CCD and x, y along its sides, at the angle
+`rotation_deg` from those of the focal plane. Pixels are counted along the latter, the centre of the first at (0, 0):
+their x along its x, or, where the camera is `transposed`, along its y.
 """
 
 from __future__ import annotations
@@ -101,6 +102,8 @@ class Camera(Pictured):
     """Nominal height [m] and rotations about x and y of the focal plane [rad] of each CCD, [n_ccd, 3]; zero if None."""
     photometry: CameraPhotometry = field(default_factory=CameraPhotometry)  #: zero points, sky, noise
     height_budget: str = "flat"  #: budget that heights are drawn from by default, as :class:`~.HeightBudget` names them
+    transposed: bool = False
+    """Whether the pixels' x runs along y of the frame of the CCD, and y along x, as in LSST's images (DVCS)."""
 
     def __post_init__(self) -> None:
         n = len(self.ccd_names)
@@ -150,8 +153,8 @@ class Camera(Pictured):
 
     @cached_property
     def half_sizes(self) -> np.ndarray:
-        """Halves of the sides of each CCD along its own x and y [m], shape [n_ccd, 2]."""
-        return 0.5 * (self.pixels * self.pixel_size)
+        """Halves of the sides of each CCD along x and y of its frame [m], shape [n_ccd, 2]."""
+        return np.ascontiguousarray(self._swapped(0.5 * (self.pixels * self.pixel_size)))
 
     @cached_property
     def shortest_side(self) -> float:
@@ -274,12 +277,20 @@ class Camera(Pictured):
     def to_pixel(self, ccd: Any, xy: np.ndarray) -> np.ndarray:
         """Return the pixels of CCDs of points of the focal plane [m], shape [..., 2]."""
         local = np.stack(self.to_local(ccd, xy[..., 0], xy[..., 1]), axis=-1)
-        return local / self.pixel_size + 0.5 * (self.pixels[ccd] - 1)
+        return self._swapped(local) / self.pixel_size + 0.5 * (self.pixels[ccd] - 1)
 
     def from_pixel(self, ccd: Any, pixel: np.ndarray) -> np.ndarray:
         """Return the points of the focal plane [m] of pixels of CCDs, shape [..., 2]."""
-        local = (pixel - 0.5 * (self.pixels[ccd] - 1)) * self.pixel_size
+        local = self._swapped((pixel - 0.5 * (self.pixels[ccd] - 1)) * self.pixel_size)
         return np.stack(self.from_local(ccd, local[..., 0], local[..., 1]), axis=-1)
+
+    def along_pixels(self, ccd: Any, vectors: np.ndarray) -> np.ndarray:
+        """Return the components along the pixels' x and y of vectors of the focal plane, shape [..., 2]."""
+        return self._swapped(np.stack(self.frame(ccd).along_ccd(vectors[..., 0], vectors[..., 1]), axis=-1))
+
+    def _swapped(self, vectors: np.ndarray) -> np.ndarray:
+        """Return vectors along the axes of CCDs as vectors along their pixels' x and y, and the other way round."""
+        return vectors[..., ::-1] if self.transposed else vectors
 
     def nodes(self, cells: int, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return CCD, x and y in its frame [m] of the nodes of a grid over every CCD, shrunk by a scale; shape [n]."""

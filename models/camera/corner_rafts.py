@@ -26,8 +26,6 @@ _CAMERAS = {"wavefront": "lsst_wavefront", "guider": "lsst_guider"}
 def corner_focal_plane(kind: str = "wavefront", heights: str = "nominal") -> FocalPlane:
     """Return the focal plane of the sensors in the corners of the LSST camera.
 
-    Its CCDs are squares: of a half of a wavefront sensor the middle 20 mm, of a guider 40 mm.
-
     Parameters
     ----------
     kind : {"wavefront", "guider"}

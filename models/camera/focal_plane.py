@@ -149,8 +149,8 @@ class FocalPlane(HeightMap):
         path : str or path
             Table (.ecsv, .fits) with columns x, y, z of points, or with Zernike coefficients of each CCD as imSim has
             them (DET_NAME, ORIGIN_X..., ZK); or FITS images, one extension a CCD. Units must be stated. The frame is
-            the entry ``frame`` of the metadata: ``telescope`` (ours, heights along +z) or ``CCS`` (Rubin's camera: x
-            and y swapped, z reversed), by default CCS for Zernike coefficients and ``telescope`` for all else.
+            the entry ``frame`` of the metadata: ``telescope`` (ours, heights along +z) or ``CCS`` (Rubin's camera: z
+            reversed), by default CCS for Zernike coefficients and ``telescope`` for all else.
         camera : str or Camera
             Camera, or its name.
 

@@ -33,7 +33,8 @@ class SensorHeights:
         Raises
         ------
         DomainError
-            If no sensor is a CCD of the camera, or one does not stand where the camera has it.
+            If no sensor is a CCD of the camera, one does not stand where the camera has it, or is turned by another
+            angle than quarters.
         """
         index = {name: i for i, name in enumerate(self.names)}
         measured = np.array([name in index for name in camera.ccd_names])
@@ -45,17 +46,26 @@ class SensorHeights:
         rows = np.array([index[name] for name in camera.ccd_names if name in index])
         offset = self.center[rows] - camera.centers[measured]
         for name, off, center in zip(np.array(camera.ccd_names)[measured], offset, self.center[rows], strict=True):
-            if (np.abs(off) > camera.half_sizes[camera.ccd_index(name)]).any():
+            if (np.abs(off) > camera.half_sizes[camera.ccd_index(name)].min()).any():
                 x, y = 1e3 * (center - off)
                 raise DomainError(
                     f"{name} at (x, y) = ({1e3 * center[0]:.2f}, {1e3 * center[1]:.2f}) mm of the telescope frame: "
                     f"expected ({x:.2f}, {y:.2f}) mm as in {camera.name}; is the frame of the file right?"
                 )
-        n, sensor_surfaces = len(camera), self.surfaces.chosen(rows)
+        quarters = np.rint(camera.rotation_deg / 90.0).astype(np.int64)
+        oblique = np.flatnonzero(measured & (camera.rotation_deg != 90.0 * quarters))
+        if oblique.size:
+            i = oblique[0]
+            raise DomainError(
+                f"{camera.ccd_names[i]}: rotation_deg = {camera.rotation_deg[i]:g}: expected a multiple of 90 for "
+                "Zernike coefficients; measured points are fitted at any angle"
+            )
+        n, sensor_surfaces = len(camera), self.surfaces.chosen(rows).turned(quarters[measured])
         radius, origin = camera.half_sizes[:, 0].copy(), np.zeros((n, 2))
         coefficients = np.zeros((n, *sensor_surfaces.coefficients.shape[1:]))
         limits = np.stack([-camera.half_sizes, camera.half_sizes], axis=-1)
-        radius[measured], origin[measured] = sensor_surfaces.radius, offset
+        radius[measured] = sensor_surfaces.radius
+        origin[measured] = np.stack(camera.frame(np.flatnonzero(measured)).along_ccd(*offset.T), axis=1)
         coefficients[measured], limits[measured] = sensor_surfaces.coefficients, sensor_surfaces.limits
         zernikes = ZernikeSurfaces(radius, origin, coefficients, limits)
         return CcdSurfaces(camera.half_sizes, np.zeros((n, 10)), np.zeros((n, 2, 4)), zernikes=zernikes), measured

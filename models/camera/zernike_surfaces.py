@@ -47,6 +47,19 @@ class ZernikeSurfaces:
         """Return the surfaces of some sensors."""
         return ZernikeSurfaces(self.radius[index], self.origin[index], self.coefficients[index], self.limits[index])
 
+    def turned(self, quarters: np.ndarray) -> ZernikeSurfaces:
+        """Return the surfaces in axes turned by quarters from +x towards +y, one number each sensor, shape [n]."""
+        origin, coefficients, limits = self.origin.copy(), self.coefficients.copy(), self.limits.copy()
+        odd = np.where(np.arange(coefficients.shape[1]) % 2, -1.0, 1.0)
+        for i, quarter in enumerate(quarters % 4):
+            for _ in range(quarter):
+                # New coordinates are (y, -x): x is minus the new y, y the new x.
+                x, y = origin[i].tolist()
+                origin[i] = y, -x
+                coefficients[i] = (coefficients[i] * odd[:, None]).T
+                limits[i] = limits[i, 1].copy(), -limits[i, 0, ::-1]
+        return ZernikeSurfaces(self.radius.copy(), origin, coefficients, limits)
+
     def height(self, sensor: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
         """Return heights [m] at positions about the centres [m] of sensors of given index, all of one shape (n,)."""
         x, y = self._powers(sensor, dx, 0)[0], self._powers(sensor, dy, 1)[0]

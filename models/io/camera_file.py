@@ -15,7 +15,6 @@ docs/camera.md has all keys.
 
 from __future__ import annotations
 
-import hashlib
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,8 +23,8 @@ import numpy as np
 from pydantic import Field
 
 from ...core.errors import PachonError, PrescriptionError
-from ...core.files import read_bytes
-from ...core.schema import Count, Fraction, NotNegative, Positive, Real, Section, validated
+from ...core.files import content_hash
+from ...core.schema import Count, Fraction, NotNegative, Positive, Real, Section, Switch, validated
 from ...core.yaml_reader import read_mapping
 from ..camera.camera import Camera
 from ..camera.photometry import DARK_CURRENT, FULL_WELL, LSST, READ_NOISE, THROUGHPUT, Band, CameraPhotometry
@@ -107,6 +106,7 @@ class CameraFile(Section):
     pixels: Pixels | None = None
     photometry: Literal["lsst"] | PhotometrySection | None = None
     height_budget: Literal["simulated", "specification", "flat"] = "flat"
+    transposed: Switch = False
     ccds: Annotated[tuple[CcdSection, ...], ROWS, Field(min_length=1)]
 
     def camera(self) -> Camera:
@@ -126,6 +126,7 @@ class CameraFile(Section):
             placement=placement if placement.any() else None,
             photometry=self._photometry(),
             height_budget=self.height_budget,
+            transposed=self.transposed,
         )
 
     def _photometry(self) -> CameraPhotometry:
@@ -156,7 +157,7 @@ def is_camera_file(path: Path) -> bool:
 
 def read_camera(path: Path) -> Camera:
     """Read a camera file; PrescriptionError of one line with file, key, value and what was expected."""
-    return _read(path, hashlib.sha256(read_bytes(path, PrescriptionError)).hexdigest())
+    return _read(path, content_hash(path, PrescriptionError))
 
 
 @lru_cache(maxsize=16)

@@ -30,12 +30,13 @@ import hashlib
 import os
 from collections.abc import Iterable, Iterator
 from functools import cache
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError, check_choice, unknown_name
-from ...core.files import read_bytes, write_bytes
+from ...core.files import content_hash, write_bytes
 from ...core.yaml_reader import read_mapping
 from ..mesh_file import files_of_mesh
 from ..telescope import Telescope
@@ -44,47 +45,36 @@ from .bundled import BUNDLED, bundled_file
 from .glass_catalogue import GlassCatalogue
 from .yaml.reader import MAX_BYTES, read_telescope, telescope_of
 
-if TYPE_CHECKING:
-    from .lens.build import Reader
-
-#: Endings of lens files: Zemax and its archives, CODE V, OSLO, optiland, ray-optics.
-_LENS_FILES = (".zmx", ".zar", ".seq", ".len", ".json", ".roa")
+#: Readers of lens files by their endings: Zemax and its archives, CODE V, OSLO, optiland, ray-optics. Modules are
+#: imported where they are needed, like the writers.
+_READERS = {
+    ".zmx": "zemax.reader:read_zemax_lens",
+    ".zar": "zar.reader:read_zemax_archive",
+    ".seq": "codev.reader:read_codev_file",
+    ".len": "oslo.reader:read_oslo_file",
+    ".json": "optiland.reader:read_optiland_file",
+    ".roa": "rayoptics.reader:read_rayoptics_file",
+}
+#: Writers of lens files of one text, by their formats.
+_WRITERS = {
+    "codev": "codev.writer:telescope_to_codev",
+    "oslo": "oslo.writer:telescope_to_oslo",
+    "optiland": "optiland.writer:telescope_to_optiland",
+    "rayoptics": "rayoptics.writer:telescope_to_rayoptics",
+}
 #: Endings of files that a telescope is written to, and their formats.
 WRITTEN = {
     ".yaml": "pachon", ".yml": "pachon", ".zmx": "zemax", ".seq": "codev", ".len": "oslo", ".json": "optiland",
     ".roa": "rayoptics",
 }  # fmt: skip
 #: Endings of files that a telescope is read from.
-ENDINGS = (".yaml", ".yml", *_LENS_FILES)
+ENDINGS = (".yaml", ".yml", *_READERS)
 
 
-def _lens_reader(ending: str) -> Reader:
-    """Return the reader of lens files with an ending."""
-    # Imported where they are needed, like the writers.
-    if ending == ".zar":
-        from .zar.reader import read_zemax_archive
-
-        return read_zemax_archive
-
-    if ending == ".len":
-        from .oslo.reader import read_oslo_file
-
-        return read_oslo_file
-    if ending == ".json":
-        from .optiland.reader import read_optiland_file
-
-        return read_optiland_file
-    if ending == ".roa":
-        from .rayoptics.reader import read_rayoptics_file
-
-        return read_rayoptics_file
-    if ending == ".seq":
-        from .codev.reader import read_codev_file
-
-        return read_codev_file
-    from .zemax.reader import read_zemax_lens
-
-    return read_zemax_lens
+def _imported(reference: str) -> Any:
+    """Return the function of a module of this package, ``module:function``."""
+    module, name = reference.split(":")
+    return getattr(import_module(f".{module}", __package__), name)
 
 
 @check_arguments
@@ -131,10 +121,10 @@ def load_telescope(
         from .batoid.reader import batoid_telescope
 
         return batoid_telescope(content, path, lenient=lenient)
-    if path.suffix.lower() in _LENS_FILES:
+    if path.suffix.lower() in _READERS:
         from .lens.build import read_lens
 
-        reader = _lens_reader(path.suffix.lower())
+        reader = _imported(_READERS[path.suffix.lower()])
         return read_lens(path, reader, lenient=lenient, glass_catalogues=glass_catalogues)
     if isinstance(name_or_path, os.PathLike) or len(path.parts) > 1 or path.is_file():
         raise PrescriptionError(f"expected a prescription file that ends in {', '.join(ENDINGS)}", file=path)
@@ -153,8 +143,8 @@ def prescription_digest(path: str | os.PathLike[str]) -> str:
         If a file cannot be read.
     """
     path = Path(path)
-    digest = hashlib.sha256(read_bytes(path, PrescriptionError)).hexdigest()
-    if path.suffix.lower() in _LENS_FILES:
+    digest = content_hash(path, PrescriptionError)
+    if path.suffix.lower() in _READERS:
         from .user_glasses import user_catalogues
 
         named = [path.with_suffix(".agf").name, *(os.path.abspath(p) for p in user_catalogues())]
@@ -171,13 +161,8 @@ def prescription_digest(path: str | os.PathLike[str]) -> str:
         # A list that grows: files of meshes name no others.
         beside = (os.path.join(os.path.dirname(name), mesh) for mesh in files_of_mesh(path.parent / name))
         files += [mesh for mesh in beside if os.path.isfile(path.parent / mesh) and mesh not in files]
-    if not files:
-        return digest
-    contents = [
-        digest,
-        *(hashlib.sha256(read_bytes(path.parent / n, PrescriptionError)).hexdigest() for n in files),
-    ]
-    return hashlib.sha256("".join(contents).encode()).hexdigest()
+    digests = [digest, *(content_hash(path.parent / name, PrescriptionError) for name in files)]
+    return hashlib.sha256("".join(digests).encode()).hexdigest() if files else digest
 
 
 def _texts(content: Any) -> Iterator[str]:
@@ -247,22 +232,8 @@ def prescription_files(
         from .batoid.writer import telescope_to_batoid
 
         return {target: telescope_to_batoid(telescope)}
-    if format == "codev":
-        from .codev.writer import telescope_to_codev
-
-        return {target: telescope_to_codev(telescope, lenient=lenient)}
-    if format == "oslo":
-        from .oslo.writer import telescope_to_oslo
-
-        return {target: telescope_to_oslo(telescope, lenient=lenient)}
-    if format == "rayoptics":
-        from .rayoptics.writer import telescope_to_rayoptics
-
-        return {target: telescope_to_rayoptics(telescope, lenient=lenient)}
-    if format == "optiland":
-        from .optiland.writer import telescope_to_optiland
-
-        return {target: telescope_to_optiland(telescope, lenient=lenient)}
+    if format in _WRITERS:
+        return {target: _imported(_WRITERS[format])(telescope, lenient=lenient)}
     from .yaml.writer import telescope_to_yaml
 
     return {target: telescope_to_yaml(telescope)}

@@ -16,6 +16,7 @@ from ..site import Site, Weather
 from .bundled import DATA
 from .yaml.values import ROWS, Number, OptionalNumber, PositiveNumber, Text
 
+#: Names of the sites that come with the package.
 BUNDLED = ("cerro_pachon", "cerro_tololo", "maunakea")
 
 
@@ -56,11 +57,6 @@ class SiteFile(Section):
     outer_scale: PositiveNumber
     layers: Annotated[tuple[LayerSection, ...], ROWS]
     weather: WeatherSection
-
-
-def site_names() -> tuple[str, ...]:
-    """Return the names of the sites that come with the package."""
-    return BUNDLED
 
 
 @check_arguments

@@ -133,11 +133,7 @@ class Hdf5MapSection(Section):
     def map(self, folder: Path) -> GridSag:
         """Return the map; the path of its file starts from the folder."""
         return read_hdf5_map(
-            folder / self.file,
-            self.half_width,
-            unit=self.unit,
-            dataset=self.dataset,
-            quarter_turns=self.quarter_turns,
+            folder / self.file, self.half_width, unit=self.unit, dataset=self.dataset, quarter_turns=self.quarter_turns
         )
 
 

@@ -26,15 +26,7 @@ from ...reconstruction.ccd_product import CCD_KINDS, KINDS, CcdProduct, Stars, p
 from ..config import load_configuration
 from ..experiment import Experiment
 from ..run_folder import CONFIG_NAME, SUMMARY_NAME, stamp_of
-from ..summary import (
-    correlations,
-    ellipticities,
-    finite_mean,
-    has_focal_plane_model,
-    patches,
-    rms,
-    separation_bins,
-)
+from ..summary import correlations, ellipticities, finite_mean, has_focal_plane_model, patches, rms, separation_bins
 from .focal_plane_plots import residual_plot
 from .statistics_plots import correlation_plot
 

@@ -229,15 +229,7 @@ def draw_heights(
     """Draw the heights within limits [mm] as an image, gaps left white; the scale is that of the whole focal plane."""
     bounds = height_range(focal_plane) if bounds is None else bounds
     height, extent = _height_map(focal_plane, limits, samples)
-    return axes.imshow(
-        height,
-        extent=extent,
-        cmap="RdBu_r",
-        vmin=-bounds,
-        vmax=bounds,
-        alpha=alpha,
-        aspect="equal",
-    )
+    return axes.imshow(height, extent=extent, cmap="RdBu_r", vmin=-bounds, vmax=bounds, alpha=alpha, aspect="equal")
 
 
 @lru_cache(maxsize=1)

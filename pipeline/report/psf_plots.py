@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.colors import SymLogNorm
@@ -13,9 +12,6 @@ from ...measure.focal_plane_axes import AWAY, OBSERVED, TRUTH
 from ...reconstruction.ccd_product import CcdProduct
 from ...reconstruction.stamp_gallery import StampGallery, stretched
 from .tables import percent
-
-if TYPE_CHECKING:
-    pass
 
 #: Eigen-PSFs in a row.
 _COLUMNS = 7

@@ -9,15 +9,7 @@ from typing import Any
 from ...core.page import Picture, render
 from ..config import ReconstructionConfig, to_yaml
 from ..experiment import Experiment
-from .tables import (
-    MODELS_CAPTION,
-    MODELS_COLUMNS,
-    PER_CCD_CAPTION,
-    PER_CCD_COLUMNS,
-    headline,
-    models_rows,
-    per_ccd,
-)
+from .tables import MODELS_CAPTION, MODELS_COLUMNS, PER_CCD_CAPTION, PER_CCD_COLUMNS, headline, models_rows, per_ccd
 
 #: Templates of the reports of runs and sweeps.
 TEMPLATES = Path(__file__).parent / "templates"

@@ -23,7 +23,7 @@ from ..experiment import Experiment
 from ..resolved_values import resolved_value
 from ..sensor.displacement import displace_stamps
 from .photometry import PROVISIONAL_FWHM, electrons, limiting_magnitude
-from .star_field import StarField, make_star_field
+from .star_field import CcdOutline, Depth, StarField, make_star_field
 
 #: Pixels by which the stamp of an observed star is larger than the final one: room to centre it on a pixel.
 _SHIFT_ROOM = 10
@@ -78,8 +78,8 @@ def expose_positions(
 
     The position of a star is that of the chief ray of the middle wavelength, at the centre of a pixel, or `offsets`
     [pixel] from it; stamps are larger than those of the run by `room` pixels, and lie along the axes of the focal plane
-    or, with `along`, those of a CCD. They are blackbodies of `temperatures` [K] where these are given. DomainError if
-    no light reaches one of them.
+    or, with `along`, those of the pixels of a CCD. They are blackbodies of `temperatures` [K] where these are given.
+    DomainError if no light reaches one of them.
     """
     stars = _expose(
         experiment, positions, threads, progress, room=room, offsets=offsets, along=along, temperatures=temperatures
@@ -104,7 +104,7 @@ def expose_ccd(
     """
     positions = ccd_stars(experiment, name, PROVISIONAL_FWHM) if stars is None else stars
     holdout = expose_centered(experiment, positions.holdout, threads, progress)
-    pixel = positions.observed_pixel * (positions.pixel_size / experiment.pixel_size)
+    pixel = positions.observed_pixel * (positions.ccd.pixel_size / experiment.pixel_size)
     offsets = pixel - np.rint(pixel)
     kelvin = positions.temperature
     if centered:
@@ -199,6 +199,10 @@ def _expose(
     """
     config, wavelengths = experiment.config, experiment.wavelengths
     fields = fields_at(experiment.telescope, positions, wavelengths[len(wavelengths) // 2], threads=threads)
+    # Stamps are drawn along the axes of the CCD's frame, and exchange x and y where its pixels do.
+    transposed = along is not None and experiment.camera.transposed
+    if transposed and offsets is not None:
+        offsets = offsets[:, ::-1]
     if along is not None:
         frame = experiment.camera.frame(experiment.camera.ccd_index(along))
         positions, experiment = np.stack(frame.along_ccd(*positions.T), axis=1), experiment.along(along)
@@ -233,7 +237,10 @@ def _expose(
         progress=progress,
     )
     image = _with_static_displacements(experiment, positions - psfs.offset * experiment.pixel_size, psfs.image)
-    return NoiseFreeStars(image, float(psfs.pixel_scale), fields, psfs.lit_fraction.mean(axis=1), psfs.offset)
+    offset = psfs.offset
+    if transposed:
+        image, offset = np.ascontiguousarray(image.swapaxes(1, 2)), offset[:, ::-1]
+    return NoiseFreeStars(image, float(psfs.pixel_scale), fields, psfs.lit_fraction.mean(axis=1), offset)
 
 
 def _with_static_displacements(experiment: Experiment, middles: np.ndarray, images: np.ndarray) -> np.ndarray:
@@ -256,9 +263,10 @@ def _with_static_displacements(experiment: Experiment, middles: np.ndarray, imag
     return images
 
 
-def ccd_bounds(camera: Camera, name: str) -> tuple[tuple[float, float, float, float], float]:
-    """Return the part of a CCD on which stars may stand, (xmin, xmax, ymin, ymax) [m], and its angle."""
-    return camera.rectangle(camera.ccd_index(name), _RIM * camera.pixel_size)
+def ccd_outline(camera: Camera, name: str) -> CcdOutline:
+    """Return the part of a CCD on which stars may stand."""
+    bounds, turn = camera.rectangle(camera.ccd_index(name), _RIM * camera.pixel_size)
+    return CcdOutline(name, bounds, camera.pixel_size, turn)
 
 
 def ccd_stars(experiment: Experiment, name: str, width: float, least_light: float = 1.0) -> StarField:
@@ -268,20 +276,15 @@ def ccd_stars(experiment: Experiment, name: str, width: float, least_light: floa
     """
     config, camera, listed = experiment.config, experiment.camera, experiment.star_list
     band, exposure = experiment.band, config.atmosphere.exposure_s
-    bounds, turn = ccd_bounds(camera, name)
+    faint = limiting_magnitude(config.stars.snr_min, band, exposure, width) + 2.5 * np.log10(least_light)
     drawn = make_star_field(
-        name,
-        bounds,
+        ccd_outline(camera, name),
         config.stars.truth,
         config.stars.observed if listed is None else 0,
         config.seed,
         fwhm=width,
-        band=band,
-        exposure=exposure,
-        faint=limiting_magnitude(config.stars.snr_min, band, exposure, width) + 2.5 * np.log10(least_light),
+        depth=Depth(band, exposure, faint=faint),
         margin=_MARGIN,
-        pixel_size=camera.pixel_size,
-        turn=turn,
     )
     if listed is None:
         return drawn

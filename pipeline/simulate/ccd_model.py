@@ -8,12 +8,17 @@ from ...measure.shapes import Shapes, fwhm, measure_shapes
 from ...measure.star_selection import require_stars
 from ...reconstruction.ccd_product import CcdProduct, HoldoutStars, ObservedStars
 from ...reconstruction.psf_model.model import CLIP_SIGMA, PsfModel
+from ...sky.sky_shapes import along_sky, jacobians_on_sky
+from ...wavefront.chief_rays import fields_at
 from ..experiment import Experiment
 from ..resolved_values import least_star_count, noise_free_components
 from .ccd_exposure import CcdExposure, ccd_stars
 from .ccd_observation import Observation, collected_images, observe_ccd
 from .photometry import effective_fwhm, signal_to_noise
 from .star_field import StarField
+
+#: Step on the detector of the central differences for the axes of the sky [m]: 2 arcsec of the LSST.
+_SKY_STEP = 1e-4
 
 
 def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = True) -> CcdProduct:
@@ -42,7 +47,7 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         positions.holdout,
         n_components=noise_free_components(config),
         order=config.reconstruction.truth_order,
-        extent=positions.extent,
+        extent=positions.ccd.extent,
         clip_sigma=None,
     )
 
@@ -62,11 +67,13 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         holdout=HoldoutStars(
             **_position_columns(experiment, positions.holdout, holdout.fields),
             **_shape_columns(holdout_shapes, at_holdout),
+            **_sky_columns(experiment, positions.holdout, holdout_shapes),
             fwhm=fwhm(holdout.image, holdout.pixel_scale),
         ),
         observed=ObservedStars(
             **_position_columns(experiment, stars.observed, observed.fields),
             **_shape_columns(observation.shapes, at_stars),
+            **_sky_columns(experiment, stars.observed, observation.shapes),
             magnitude=stars.magnitude,
             electrons=electrons,
             snr=snr,
@@ -97,7 +104,7 @@ def fit_ccd_model(
         stars.observed[used],
         recipe=recipe,
         weights=recipe.star_weights(snr[used]),
-        extent=stars.extent,
+        extent=stars.ccd.extent,
         clip_sigma=CLIP_SIGMA if noisy else None,
     )
 
@@ -109,6 +116,21 @@ def _position_columns(experiment: Experiment, positions: np.ndarray, fields: np.
     if aim is not None:
         columns["ra"], columns["dec"] = aim.to_celestial(aim.to_sky(np.tan(fields))).T
     return columns
+
+
+def _sky_columns(experiment: Experiment, positions: np.ndarray, shapes: Shapes) -> dict[str, np.ndarray]:
+    """Return ellipticities along the axes of the sky at positions on the detector [m]; none without a pointing."""
+    aim, wavelengths = experiment.pointing, experiment.wavelengths
+    if aim is None:
+        return {}
+
+    def celestial_of(places: np.ndarray) -> np.ndarray:
+        fields = fields_at(experiment.telescope, places, wavelengths[len(wavelengths) // 2], threads=1)
+        return aim.to_celestial(aim.to_sky(np.tan(fields)))
+
+    _, jacobians = jacobians_on_sky(celestial_of, positions, _SKY_STEP)
+    e1, e2 = along_sky(shapes.e1, shapes.e2, jacobians)
+    return {"e1_sky": e1, "e2_sky": e2}
 
 
 def _shape_columns(measured: Shapes, model: Shapes) -> dict[str, np.ndarray]:

@@ -67,7 +67,10 @@ def collected_images(
     if config.sensor.brighter_fatter is None:
         return images
     sky = sky_electrons_per_pixel(experiment.band, config.atmosphere.exposure_s, pixel_scale)
-    return brighter_fatter(images, electrons, sensor=config.sensor.brighter_fatter, sky=sky)
+    # Columns of the CCD, along which charge is transferred, run along x of the stamps where pixels exchange x and y.
+    along_pixels = images.swapaxes(1, 2) if experiment.camera.transposed else images
+    collected = brighter_fatter(along_pixels, electrons, sensor=config.sensor.brighter_fatter, sky=sky)
+    return collected.swapaxes(1, 2) if experiment.camera.transposed else collected
 
 
 def _with_defects(

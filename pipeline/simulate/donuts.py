@@ -22,7 +22,7 @@ from ...wavefront.psf.light import Light
 from ...wavefront.psf.psf import Psfs, make_psfs
 from ...wavefront.psf.stamps import Stamps
 from ...wavefront.request import wavelength_points
-from .star_defects import add_defects
+from .star_defects import StarDefects, add_defects
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -82,8 +82,7 @@ def draw_donuts(
     electrons: ArrayLike = 1e6,
     sky: float = 0.0,
     read_noise: float = READ_NOISE,
-    second_stars: float = 0.0,
-    cosmic_rays: float = 0.0,
+    defects: StarDefects | None = None,
     seed: int = 0,
     stamps: Stamps | None = None,
     **psf: Any,
@@ -108,10 +107,8 @@ def draw_donuts(
         Electrons of each star.
     sky, read_noise : float
         Expected electrons of the sky in a pixel, which are subtracted, and rms noise without light [electrons].
-    second_stars : float
-        Fraction of the stars with a second one of 0.1 to 1 times the light on the stamp.
-    cosmic_rays : float
-        Fraction of the stars crossed by a cosmic ray.
+    defects : StarDefects, optional
+        Fractions of the stars with a second star and with a cosmic ray; none by default.
     seed : int
         Seed of places within the pixel, noise and defects, not negative. More stars leave the first as they are.
     **psf
@@ -126,7 +123,7 @@ def draw_donuts(
     ------
     ConfigError, DomainError
         As :func:`~pachon.make_psfs`, of a stamp that is too small for the donuts too; or if a number of electrons is
-        negative, a fraction not from 0 to 1, or a model has more than one defocus or seeing.
+        negative, or a model has more than one defocus or seeing.
     """
     seed = require_seed(seed)
     angles = np.atleast_2d(radians(fields, "fields"))
@@ -146,12 +143,17 @@ def draw_donuts(
             raise DomainError(f"{name} = {shown(value)}: expected 0 to {_MOST_ELECTRONS:g} electrons", key=name)
     caught = flux * np.minimum(stars.inside, 1.0)
     observed = observe_stamps(stars.image, caught, sky, read_noise, stream(seed, "donuts", "noise"))
-    images, defects = add_defects(
-        observed, stars.image, stream(seed, "donuts", "defects"), neighbours=second_stars, cosmic_rays=cosmic_rays
+    fractions = StarDefects() if defects is None else defects
+    images, flags = add_defects(
+        observed,
+        stars.image,
+        stream(seed, "donuts", "defects"),
+        neighbours=fractions.second_stars,
+        cosmic_rays=fractions.cosmic_rays,
     )
     if modelled.detector.saturation is not None:
         images = np.minimum(images, modelled.detector.saturation)
-    return Donuts(images, float(sky + read_noise**2), stars, flux.copy(), defects)
+    return Donuts(images, float(sky + read_noise**2), stars, flux.copy(), flags)
 
 
 def _modelled(telescope: Telescope, model: DonutModel, psf: dict[str, Any]) -> tuple[Telescope, dict[str, Any]]:
@@ -161,8 +163,5 @@ def _modelled(telescope: Telescope, model: DonutModel, psf: dict[str, Any]) -> t
     if defocus:
         telescope = telescope.perturbed(surface.name, shift=defocus * surface.matrix[:, 2])
     waves = wavelength_points(telescope, None if model.light is None else model.light.wavelengths)
-    arguments = {
-        "focal_plane": detector.focal_plane,
-        "atmosphere": model.air.exposure(float(waves[len(waves) // 2])),
-    }
+    arguments = {"focal_plane": detector.focal_plane, "atmosphere": model.air.exposure(float(waves[len(waves) // 2]))}
     return telescope, {**arguments, **psf}

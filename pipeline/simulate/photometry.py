@@ -19,6 +19,7 @@ import numpy as np
 from scipy.special import erf
 
 from ...core.errors import DomainError, unknown_name
+from ...core.statistics import FWHM_PER_RMS
 from ...core.units import ARCSEC, positive_angle, require_positive
 from ...models.camera.photometry import BANDS, Band
 
@@ -91,13 +92,7 @@ def effective_fwhm(images: np.ndarray, pixel_scale: float) -> float:
 
 
 def signal_to_noise(
-    magnitude: Any,
-    band: str | Band,
-    exposure: float,
-    fwhm: Any,
-    *,
-    pixel_scale: Any = None,
-    sky: float | None = None,
+    magnitude: Any, band: str | Band, exposure: float, fwhm: Any, *, pixel_scale: Any = None, sky: float | None = None
 ) -> np.ndarray:
     """Return the S/N of PSF photometry, ``C / sqrt(C + n_eff (sky + noise^2))`` (SMTN-002)."""
     counts = electrons(magnitude, band, exposure)
@@ -105,13 +100,7 @@ def signal_to_noise(
 
 
 def limiting_magnitude(
-    snr: float,
-    band: str | Band,
-    exposure: float,
-    fwhm: Any,
-    *,
-    pixel_scale: Any = None,
-    sky: float | None = None,
+    snr: float, band: str | Band, exposure: float, fwhm: Any, *, pixel_scale: Any = None, sky: float | None = None
 ) -> float:
     """Return the magnitude of a star of a signal-to-noise ratio: :func:`signal_to_noise` solved for C."""
     square = require_positive(snr, "snr") ** 2
@@ -134,7 +123,7 @@ def saturation_magnitude(
     The star is a Gaussian centred on the pixel. A turbulent PSF has more light in its wings and a lower peak, so the
     limit is a safe one. DomainError if the sky alone fills the well.
     """
-    sigma = positive_angle(fwhm, "fwhm") / np.sqrt(8.0 * np.log(2.0))
+    sigma = positive_angle(fwhm, "fwhm") / FWHM_PER_RMS
     band = band_named(band)
     pixel = _pixel_side(band, pixel_scale)
     background = sky_electrons_per_pixel(band, exposure, pixel, sky=sky)

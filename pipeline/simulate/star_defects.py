@@ -2,13 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy import ndimage
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...measure.star_selection import StarFlag
+
+
+@check_arguments
+@dataclass(frozen=True)
+class StarDefects:
+    """Defects of simulated stars, for :func:`~pachon.draw_donuts`.
+
+    Attributes
+    ----------
+    second_stars : float
+        Fraction of the stars with a second one of 0.1 to 1 times the light on the stamp.
+    cosmic_rays : float
+        Fraction of the stars crossed by a cosmic ray.
+
+    Raises
+    ------
+    DomainError
+        If a fraction is not from 0 to 1.
+    """
+
+    second_stars: float = 0.0
+    cosmic_rays: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("second_stars", "cosmic_rays"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise DomainError(f"{name} = {getattr(self, name)!r}: expected a fraction from 0 to 1")
 
 
 def add_defects(

@@ -18,35 +18,47 @@ COUNT_SLOPE = 0.2
 
 
 @dataclass(frozen=True)
-class StarField:
-    """Stars of one CCD."""
+class CcdOutline:
+    """Place of a CCD on the focal plane.
 
-    ccd_name: str
-    bounds: tuple[float, float, float, float]  #: (xmin, xmax, ymin, ymax), outer edges of the pixels, not turned [m]
-    pixel_size: float  #: [m]
-    holdout: np.ndarray  #: focal-plane positions (x, y) [m], [n, 2]
-    observed: np.ndarray  #: likewise
-    magnitude: np.ndarray  #: AB, of the observed stars
-    electrons: np.ndarray  #: of the observed stars
-    band: Band
-    exposure: float  #: [s]
-    bright: float  #: magnitude limits of the observed stars
-    faint: float
-    temperature: np.ndarray | None = None  #: of the observed stars [K]; NaN, None: flat spectra
-    turn: float = 0.0  #: angle of the CCD about its centre, quarter turns left out, from +x towards +y [rad]
+    Attributes
+    ----------
+    name : str
+        Name of the CCD.
+    bounds : tuple of float or Quantity
+        (xmin, xmax, ymin, ymax), outer edges of the pixels, not turned [m].
+    pixel_size : float or Quantity
+        Side of a pixel [m].
+    turn : float
+        Angle of the CCD about its centre, quarter turns left out, from +x towards +y [rad].
+
+    Raises
+    ------
+    DomainError
+        If the bounds are no rectangle, or the pixels have no size.
+    """
+
+    name: str
+    bounds: tuple[float, float, float, float]
+    pixel_size: float
+    turn: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "bounds", _edges_in_metres(self.bounds))
+        pixel = require_positive(metres(self.pixel_size, "pixel_size"), "pixel_size", "metres")
+        object.__setattr__(self, "pixel_size", pixel)
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
         """(xmin, xmax, ymin, ymax) that hold all of the CCD [m]."""
         xmin, xmax, ymin, ymax = self.bounds
-        corners = _rotated(np.array([(x, y) for x in (xmin, xmax) for y in (ymin, ymax)]), self.bounds, self.turn)
+        corners = self.turned(np.array([(x, y) for x in (xmin, xmax) for y in (ymin, ymax)]))
         (x0, y0), (x1, y1) = corners.min(axis=0), corners.max(axis=0)
         return float(x0), float(x1), float(y0), float(y1)
 
-    @property
-    def observed_pixel(self) -> np.ndarray:
-        """Positions of the observed stars [pixel] on the CCD, [n, 2]."""
-        return self.to_pixel(self.observed)
+    def turned(self, positions: np.ndarray) -> np.ndarray:
+        """Return positions [n, 2] within `bounds` as they stand on the turned CCD."""
+        return _rotated(positions, self.bounds, self.turn)
 
     def to_pixel(self, positions: Any) -> np.ndarray:
         """Convert focal-plane positions [m] to CCD pixels: x to the right, y up, the first pixel's centre at (0, 0).
@@ -58,22 +70,70 @@ class StarField:
         return (along - corner) / self.pixel_size - 0.5
 
 
+@dataclass(frozen=True)
+class Depth:
+    """Depth of an exposure: band, time, and magnitude limits of the stars.
+
+    Attributes
+    ----------
+    band : str or Band
+        Photometric band.
+    exposure : float
+        Exposure time [s].
+    snr : float
+        Signal-to-noise ratio at the faint limit; 30 as in Jee & Tyson 2011, sec. 4.
+    bright, faint : float, optional
+        Magnitude limits; by default the magnitude at which the brightest pixel saturates and the one at which the
+        signal-to-noise ratio is `snr`.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such band.
+    """
+
+    band: str | Band = "r"
+    exposure: float = 15.0
+    snr: float = 30.0
+    bright: float | None = None
+    faint: float | None = None
+
+    def limits(self, fwhm: Any) -> tuple[float, float]:
+        """Return the bright and the faint limit for stars of an effective FWHM [rad]; DomainError if out of order."""
+        bright, faint = self.bright, self.faint
+        if bright is None:
+            bright = photometry.saturation_magnitude(self.band, self.exposure, fwhm)
+        if faint is None:
+            faint = photometry.limiting_magnitude(self.snr, self.band, self.exposure, fwhm)
+        if not bright < faint:
+            text = f"bright = {bright:.2f}, faint = {faint:.2f}: expected a bright limit above the faint one"
+            raise DomainError(text)
+        return float(bright), float(faint)
+
+
+@dataclass(frozen=True)
+class StarField:
+    """Stars of one CCD."""
+
+    ccd: CcdOutline
+    holdout: np.ndarray  #: focal-plane positions (x, y) [m], [n, 2]
+    observed: np.ndarray  #: likewise
+    magnitude: np.ndarray  #: AB, of the observed stars
+    electrons: np.ndarray  #: of the observed stars
+    band: Band
+    exposure: float  #: [s]
+    bright: float  #: magnitude limits of the observed stars
+    faint: float
+    temperature: np.ndarray | None = None  #: of the observed stars [K]; NaN, None: flat spectra
+
+    @property
+    def observed_pixel(self) -> np.ndarray:
+        """Positions of the observed stars [pixel] on the CCD, [n, 2]."""
+        return self.ccd.to_pixel(self.observed)
+
+
 def make_star_field(
-    ccd_name: str,
-    bounds: Any,
-    n_holdout: int,
-    n_observed: int,
-    seed: int,
-    *,
-    fwhm: Any,
-    pixel_size: Any,
-    band: str | Band = "r",
-    exposure: float = 15.0,
-    snr: float = 30.0,
-    bright: float | None = None,
-    faint: float | None = None,
-    margin: int = 20,
-    turn: float = 0.0,
+    ccd: CcdOutline, n_holdout: int, n_observed: int, seed: int, *, fwhm: Any, depth: Depth, margin: int = 20
 ) -> StarField:
     """Draw the stars of one CCD, uniform over it; counts per magnitude of the observed ones go as 10^(0.2 m).
 
@@ -82,53 +142,44 @@ def make_star_field(
 
     Parameters
     ----------
-    bounds : tuple of float or Quantity
-        (xmin, xmax, ymin, ymax) of the CCD on the focal plane [m].
+    ccd : CcdOutline
+        The CCD.
+    n_holdout, n_observed : int
+        Numbers of holdout positions and of observed stars.
+    seed : int
+        Seed of the run.
     fwhm : float or Quantity
         Effective FWHM of the stars [rad], which sets the magnitude limits.
-    pixel_size : float or Quantity
-        [m].
-    exposure : float
-        [s].
-    snr : float
-        Signal-to-noise ratio at the faint limit; 30 as in Jee & Tyson 2011, sec. 4.
-    bright, faint : float, optional
-        Magnitude limits; by default the magnitude at which the brightest pixel saturates and the one at which the
-        signal-to-noise ratio is `snr`.
+    depth : Depth
+        Band, exposure time and magnitude limits.
     margin : int
         Distance of observed stars from the edge of the CCD [pixel], so that their stamps fit.
-    turn : float
-        Angle by which the CCD is turned about the centre of `bounds`, from +x towards +y [rad].
+
+    Raises
+    ------
+    DomainError
+        If a number is outside its range.
     """
-    band = photometry.band_named(band)
-    edges = _edges_in_metres(bounds)
-    pixel = require_positive(metres(pixel_size, "pixel_size"), "pixel_size", "metres")
+    band = photometry.band_named(depth.band)
+    edges, pixel = ccd.bounds, ccd.pixel_size
     for name, count in (("n_holdout", n_holdout), ("n_observed", n_observed), ("margin", margin)):
         if count < 0:
             raise DomainError(f"{name} = {count}: expected a number that is not negative")
     if 2 * margin * pixel >= min(edges[1] - edges[0], edges[3] - edges[2]):
         raise DomainError(f"margin = {margin}: expected less than half of the CCD, bounds = {edges} m")
-    if bright is None:
-        bright = photometry.saturation_magnitude(band, exposure, fwhm)
-    if faint is None:
-        faint = photometry.limiting_magnitude(snr, band, exposure, fwhm)
-    if not bright < faint:
-        raise DomainError(f"bright = {bright:.2f}, faint = {faint:.2f}: expected a bright limit above the faint one")
+    bright, faint = depth.limits(fwhm)
     inner = (edges[0] + margin * pixel, edges[1] - margin * pixel, edges[2] + margin * pixel, edges[3] - margin * pixel)
-    magnitude = draw_magnitudes(stream(seed, "stars", ccd_name, "observed", "magnitude"), n_observed, bright, faint)
+    magnitude = draw_magnitudes(stream(seed, "stars", ccd.name, "observed", "magnitude"), n_observed, bright, faint)
     return StarField(
-        ccd_name=ccd_name,
-        bounds=edges,
-        pixel_size=pixel,
-        holdout=_rotated(_uniform_positions(seed, ccd_name, "truth", n_holdout, edges), edges, turn),
-        observed=_rotated(_uniform_positions(seed, ccd_name, "observed", n_observed, inner), edges, turn),
+        ccd=ccd,
+        holdout=ccd.turned(_uniform_positions(seed, ccd.name, "truth", n_holdout, edges)),
+        observed=ccd.turned(_uniform_positions(seed, ccd.name, "observed", n_observed, inner)),
         magnitude=magnitude,
-        electrons=photometry.electrons(magnitude, band, exposure),
+        electrons=photometry.electrons(magnitude, band, depth.exposure),
         band=band,
-        exposure=float(exposure),
-        bright=float(bright),
-        faint=float(faint),
-        turn=turn,
+        exposure=float(depth.exposure),
+        bright=bright,
+        faint=faint,
     )
 
 

@@ -93,11 +93,13 @@ def fit_field(
 
 def mosaic_of(
     stars: FocalPlaneStars,
-    telescope: Telescope | None,
+    telescope: Telescope | Instrument | None,
     focal_plane: FocalPlane | StaticHeights | None,
     camera: str | Camera | None,
 ) -> Mosaic:
     """Return the CCDs of the camera, or where there is none those of the stars."""
+    if isinstance(telescope, Instrument):
+        telescope = telescope.telescope
     if camera is None and focal_plane is not None:
         camera = focal_plane.camera
     if camera is None and telescope is not None:

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from astropy.io import fits
 
+from ...core.ccd_names import NAMES_VERSION, refuse_mirrored_names
 from ...core.errors import ProductError
 from ...models.camera.camera import Camera
 from ...models.camera.ccd_surfaces import CcdSurfaces
@@ -22,6 +23,8 @@ from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
 from ...wavefront.aberration import ResidualWavefront
 from ...wavefront.atmosphere.atmosphere import Atmosphere
+from ...wavefront.psf.light import Light
+from ...wavefront.psf.stamps import Stamps
 from .covariance import Covariance, Places
 from .field import ShapeField
 from .fit import ShapeData
@@ -69,6 +72,7 @@ def model_hdus(model: ModelFields) -> list[fits.ImageHDU | fits.BinTableHDU]:
     if camera is not None:
         about["camera"] = {
             "name": camera.name,
+            "names_version": NAMES_VERSION,
             "rafts": list(camera.raft_names),
             "raft_index": camera.raft_index.tolist(),
             "pixels": int(camera.pixels[0, 0]) if camera.alike else camera.pixels.tolist(),
@@ -76,6 +80,7 @@ def model_hdus(model: ModelFields) -> list[fits.ImageHDU | fits.BinTableHDU]:
         }
         if not camera.alike:
             about["camera"]["rotation_deg"] = camera.rotation_deg.tolist()
+            about["camera"]["transposed"] = camera.transposed
     predicted = model.leave_one_out
     hdus = [
         _image_hdu("CENTERS", mosaic.centers),
@@ -107,9 +112,9 @@ def model_hdus(model: ModelFields) -> list[fits.ImageHDU | fits.BinTableHDU]:
         about["seeing"] = optics.seeing
         about["degree"] = optics.prior.degree
         about["atmosphere"] = {"r0": air.r0, "outer_scale": air.outer_scale}
-        about["instrument"] = {k: getattr(instrument, k) for k in ("pixel_size", "diffusion", "jitter")}
-        if instrument.silicon is not None:
-            about["silicon"] = asdict(instrument.silicon)
+        about["instrument"] = {k: getattr(instrument.stamps, k) for k in ("pixel_size", "diffusion", "jitter")}
+        if instrument.stamps.silicon is not None:
+            about["silicon"] = asdict(instrument.stamps.silicon)
         about["radius"], about["center"] = optics.response.radius, optics.response.center
         surfaces = optics.plane.surfaces
         hdus += [
@@ -124,8 +129,9 @@ def model_hdus(model: ModelFields) -> list[fits.ImageHDU | fits.BinTableHDU]:
         ]
         if surfaces.grid is not None:
             hdus.append(_image_hdu("HEIGHT_SPLINE", surfaces.grid))
-        if instrument.dispersion is not None:
-            hdus.append(_image_hdu("DISPERSION", instrument.dispersion))
+        for name, values in (("DISPERSION", instrument.light.dispersion), ("WEIGHTS", instrument.light.weights)):
+            if values is not None:
+                hdus.append(_image_hdu(name, np.asarray(values)))
     text = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
     return [_image_hdu("ABOUT", text, "JSON, one character of UTF-8 a pixel"), *hdus]
 
@@ -143,6 +149,7 @@ def read_model(kind: type[_Model], hdus: Iterable[fits.ImageHDU], path: Path) ->
         camera = None
         if "camera" in about:
             described = about["camera"]
+            refuse_mirrored_names(about["ccds"], described.get("names_version"), path)
             camera = Camera(
                 described["name"],
                 tuple(about["ccds"]),
@@ -152,6 +159,7 @@ def read_model(kind: type[_Model], hdus: Iterable[fits.ImageHDU], path: Path) ->
                 np.broadcast_to(described["pixels"], (len(about["ccds"]), 2)).copy(),
                 described["pixel_size"],
                 rotation_deg=np.array(described.get("rotation_deg", [0.0])),
+                transposed=described.get("transposed", False),
             )
         mosaic = Mosaic(tuple(about["ccds"]), part("CENTERS"), about["half_size"], camera)
         places = _places_of(mosaic, part("POSITION"), part("STAR_CCD"))
@@ -197,13 +205,14 @@ def _optics_part(
 ) -> OpticsPart:
     instrument = Instrument.of(
         _telescope_from_text(about["telescope"]),
-        part("WAVELENGTHS"),
+        Light(part("WAVELENGTHS"), *(part(name) if name in names else None for name in ("WEIGHTS", "DISPERSION"))),
         Atmosphere.from_site("cerro_pachon", seed=0, **about["atmosphere"]),
-        **about["instrument"],
+        stamps=Stamps(
+            about["stamp_size"],
+            **about["instrument"],
+            silicon=Silicon(**about["silicon"]) if "silicon" in about else None,
+        ),
         weight_fwhm=about["weight_fwhm"],
-        dispersion=part("DISPERSION") if "DISPERSION" in names else None,
-        stamp_size=about["stamp_size"],
-        silicon=Silicon(**about["silicon"]) if "silicon" in about else None,
     )
     cubic = part("HEIGHT_CUBIC")
     grid = part("HEIGHT_SPLINE") if "HEIGHT_SPLINE" in names else None

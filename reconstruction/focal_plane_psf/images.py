@@ -99,13 +99,7 @@ class ResidualImages:
 
     @classmethod
     def fit(
-        cls,
-        residuals: np.ndarray,
-        places: Places,
-        weight: np.ndarray,
-        mosaic: Mosaic,
-        count: int,
-        threads: int | None,
+        cls, residuals: np.ndarray, places: Places, weight: np.ndarray, mosaic: Mosaic, count: int, threads: int | None
     ) -> ResidualImages | None:
         """Fit up to `count` components to residual stamps [n, ny, nx]; None if none of them is above the noise.
 

@@ -10,20 +10,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.arguments import check_arguments
+from ...core.arguments import check_arguments, removed_arguments
 from ...core.docstrings import Description, described
 from ...core.errors import DomainError
 from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
 from ...core.result import Result
-from ...core.units import ARCSEC, length, positive_angle
+from ...core.units import ARCSEC, positive_angle
 from ...core.version import CREATOR
 from ...models.camera.camera import Camera
 from ...models.camera.focal_plane import FocalPlane
-from ...models.camera.height_budget import HeightBudget
-from ...models.camera.silicon import Silicon
 from ...models.telescope import Telescope
-from ...wavefront.atmosphere.atmosphere import Atmosphere
+from ...wavefront.psf.stamps import Stamps
 from .covariance import Covariance, Places
 from .field import ShapeField
 from .field_fit import LEAST_STARS, FittedField, fit_field, height_prior, mosaic_of
@@ -31,6 +29,7 @@ from .file import ModelFields, model_hdus, read_model
 from .fit import SHAPES, ShapeData
 from .images import ResidualImages, with_shapes
 from .mosaic import Mosaic, PsfShapes
+from .optics_prior import OpticsPrior
 from .response import Instrument
 from .stars import FocalPlaneStars, places_of, stars_of
 from .static_heights import StaticHeights
@@ -47,6 +46,9 @@ _PCA_STARS = 2000
 _EXTRA_NOISE = 1.0
 # Range of reduced chi-square outside of which there is a warning.
 _CHI2 = (0.7, 1.4)
+
+# Where arguments of earlier versions stand.
+_INSTRUMENT = "telescope=Instrument.of(telescope, {})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,25 +86,24 @@ class FocalPlanePsf(ModelFields, Result):
         return self.leave_one_out.plot(ax=ax)
 
     @classmethod
+    @removed_arguments(
+        wavelengths=_INSTRUMENT.format("wavelengths"),
+        dispersion=_INSTRUMENT.format("Light(wavelengths, dispersion=...)"),
+        atmosphere=_INSTRUMENT.format("atmosphere=..."),
+        stamp_size=_INSTRUMENT.format("stamps=Stamps(size=...)"),
+        budget="prior=OpticsPrior(budget=...)",
+        **{n: _INSTRUMENT.format(f"stamps=Stamps({n}=...)") for n in ("pixel_size", "diffusion", "silicon", "jitter")},
+    )
     @check_arguments
     def fit(
         cls,
         stars: Any,
-        telescope: Telescope | None = None,
+        telescope: Telescope | Instrument | None = None,
         focal_plane: FocalPlane | StaticHeights | None = None,
         *,
         camera: str | Camera | None = None,
-        wavelengths: ArrayLike | None = None,
-        atmosphere: Atmosphere | None = None,
-        pixel_size: ArrayLike | None = None,
-        diffusion: ArrayLike | None = None,
-        silicon: Silicon | None = None,
-        jitter: ArrayLike = 0.0,
         weight_fwhm: ArrayLike | None = None,
-        dispersion: ArrayLike | None = None,
-        budget: str | HeightBudget | None = "simulated",
-        alignment_rms: ArrayLike = 0.2e-6,
-        stamp_size: int = 31,
+        prior: OpticsPrior | None = None,
         components: int = 3,
         ccds: Sequence[str] | None = None,
         threads: int | None = None,
@@ -114,37 +115,20 @@ class FocalPlanePsf(ModelFields, Result):
         ----------
         stars : FocalPlaneStars, table, mapping or path
             The stars (:class:`~pachon.FocalPlaneStars`); or a table, the path of one, or the folder of a run.
-        telescope : Telescope, optional
-            Telescope as it is believed to be. Without it the model is turbulence, with a step, a slope and ripples of
-            each CCD, and principal components.
+        telescope : Telescope or Instrument, optional
+            Telescope as it is believed to be; or an :class:`~pachon.Instrument`, which has wavelengths, the turbulence
+            that the fit starts from, pixels, charge diffusion, silicon and jitter too, and the size of drawn images
+            where the stars have no stamps. Without it the model is turbulence, with a step, a slope and ripples of each
+            CCD, and principal components.
         focal_plane : FocalPlane or StaticHeights, optional
             Heights that are known, or learnt from other exposures (:func:`~pachon.fit_static_heights`). By default they
             are unknown.
         camera : str or Camera, optional
             By default the telescope's. Without one positions must be lengths on one detector plane.
-        wavelengths : array_like or Quantity, optional
-            Wavelengths [m]; by default five over the telescope's band.
-        atmosphere : Atmosphere, optional
-            Its Fried parameter, from which the fit starts, and its outer scale; by default those of the telescope's
-            site, or of Cerro Pachon.
-        pixel_size, diffusion : float or Quantity, optional
-            Pixel and rms charge diffusion [m]; by default the pixel of the camera and 0.4 of it.
-        silicon : Silicon, optional
-            Silicon of the CCDs; by default light turns into charge at their surface.
-        jitter : float or Quantity
-            Pointing, rms along each axis [rad].
         weight_fwhm : float or Quantity, optional
-            Weight of the moments [rad]; by default that of the stars.
-        dispersion : array_like, shape [n_wave, 2], optional
-            Shift of each wavelength by the air [rad].
-        budget : str, HeightBudget or None
-            Prior of unknown heights: "simulated", "specification", a budget of one's own, or None for a weak one of
-            coefficients of 10 um.
-        alignment_rms : float or Quantity
-            Prior rms of the residual wavefront of the exposure [m]: annular Zernike terms 4 to 11, each constant and
-            linear over the field. 0 for an aligned telescope.
-        stamp_size : int
-            Pixels on a side of drawn images; that of the stamps where there are stamps.
+            Weight of the moments [rad]; by default that of the stars. That of an instrument is not used.
+        prior : OpticsPrior, optional
+            Prior of unknown heights and of the residual wavefront; by default simulated heights and 0.2 um.
         components : int
             Most principal components of the residual stamps.
         ccds : sequence of str, optional
@@ -161,6 +145,7 @@ class FocalPlanePsf(ModelFields, Result):
             outside its range.
         """
         reporter = Reporter(quiet=True) if reporter is None else reporter
+        prior = OpticsPrior() if prior is None else prior
         catalogue = stars_of(stars)
         weight = catalogue.weight_fwhm if weight_fwhm is None else positive_angle(weight_fwhm, "weight_fwhm")
         if catalogue.pixel_scale is not None and weight < catalogue.pixel_scale:
@@ -176,27 +161,18 @@ class FocalPlanePsf(ModelFields, Result):
             )
         usable_stars = catalogue.chosen(used)
         data = ShapeData(places_of(mosaic, usable_stars), usable_stars.values, usable_stars.noise**2)
-        stamp_size = stamp_size if catalogue.stamps is None else catalogue.stamps.shape[1]
-        instrument = prior = None
+        instrument = heights = None
         if telescope is not None:
-            instrument = Instrument.of(
-                telescope,
-                wavelengths,
-                atmosphere,
-                camera=mosaic.camera,
-                pixel_size=pixel_size,
-                diffusion=diffusion,
-                silicon=silicon,
-                jitter=jitter,
-                weight_fwhm=weight,
-                dispersion=dispersion,
-                stamp_size=stamp_size,
-            )
-            prior = height_prior(mosaic, focal_plane, budget)
-        rms = length(alignment_rms, "alignment_rms")
-        if not rms >= 0.0:
-            raise DomainError(f"alignment_rms = {rms!r}: expected a length from 0")
-        fitted = fit_field(mosaic, data, instrument, prior, rms, threads, reporter)
+            believed = Instrument.of(telescope, camera=mosaic.camera) if isinstance(telescope, Telescope) else telescope
+            stamps = believed.stamps
+            if catalogue.stamps is not None:
+                stamps = replace(stamps, size=catalogue.stamps.shape[1])
+            instrument = replace(believed, stamps=stamps, weight_fwhm=weight)
+            heights = height_prior(mosaic, focal_plane, prior.budget)
+        stamp_size = Stamps().size if instrument is None else instrument.stamps.size
+        if catalogue.stamps is not None:
+            stamp_size = catalogue.stamps.shape[1]
+        fitted = fit_field(mosaic, data, instrument, heights, prior.alignment_rms, threads, reporter)
         field = fitted.field
         with reporter.stage("stars against the others"):
             good = field.inliers(threads)

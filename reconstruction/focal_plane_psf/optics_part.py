@@ -52,7 +52,7 @@ class OpticsPart:
     def pixel_scale(self) -> float:
         """Angle of a pixel of the images [rad]."""
         instrument = self.instrument
-        return instrument.pixel_size / center_focal_length(instrument.telescope, instrument.wavelengths)
+        return instrument.stamps.pixel_size / center_focal_length(instrument.telescope, instrument.wavelengths)
 
     def shapes(
         self, places: Places, threads: int | None = None, progress: Callable[[int], None] | None = None

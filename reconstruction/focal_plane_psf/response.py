@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.units import ARCSEC, angle, length, metres, positive_angle, radians
+from ...core.units import ARCSEC, metres, positive_angle, pure_numbers, radians
 from ...measure.shapes import measure_shapes
 from ...models.camera.camera import Camera
 from ...models.camera.cameras import load_camera
 from ...models.camera.focal_plane import FocalPlane
-from ...models.camera.silicon import Silicon
 from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import noll_to_nm
@@ -57,10 +57,6 @@ _FIELD_DEGREE = 6
 # Heights about the centre [m] between which these derivatives are linear.
 _LEVEL = 8e-6
 _BATCH = 2048
-# Pixels of the LSST [m].
-_PIXEL = 10e-6
-# Rms charge diffusion in them [m].
-_DIFFUSION = 4e-6
 # Points of a pupil with vanes or plates: e is good to 2e-4, a tenth of what turbulence adds, in a third of the time.
 _LATTICE_POINTS = 6000
 # For changes fewer do: the same points are lit before and after.
@@ -75,87 +71,87 @@ class Instrument:
     ----------
     telescope : Telescope
         The telescope.
-    wavelengths : ndarray, shape [n_wave]
-        Wavelengths [m].
+    light : Light
+        Wavelengths, their weights, and their shifts by the air.
     atmosphere : Atmosphere
         Fried parameter and outer scale.
-    pixel_size, diffusion : float
-        Pixel of the stamps, and rms charge diffusion [m].
-    jitter : float
-        Pointing, rms along each axis [rad].
+    stamps : Stamps
+        Pixels of the stamps, charge diffusion, jitter and silicon.
     weight_fwhm : float
         Weight of the moments [rad].
-    dispersion : ndarray, shape [n_wave, 2], or None
-        Shift of each wavelength by the air [rad].
-    stamp_size : int
-        Pixels on a side of a stamp.
-    silicon : Silicon or None
-        Silicon of the CCDs; None where all light turns into charge at their surface.
     """
 
     telescope: Telescope
-    wavelengths: np.ndarray
+    light: Light
     atmosphere: Atmosphere
-    pixel_size: float
-    diffusion: float
-    jitter: float
+    stamps: Stamps
     weight_fwhm: float
-    dispersion: np.ndarray | None
-    stamp_size: int
-    silicon: Silicon | None
 
     @classmethod
+    @check_arguments
     def of(
         cls,
         telescope: Telescope,
-        wavelengths: ArrayLike | None = None,
+        wavelengths: ArrayLike | Light | None = None,
         atmosphere: Atmosphere | None = None,
         *,
         camera: str | Camera | None = None,
-        pixel_size: ArrayLike | None = None,
-        diffusion: ArrayLike | None = None,
-        jitter: ArrayLike = 0.0,
+        stamps: Stamps | None = None,
         weight_fwhm: ArrayLike = 0.7 * ARCSEC,
-        dispersion: ArrayLike | None = None,
-        stamp_size: int = 31,
-        silicon: Silicon | None = None,
     ) -> Instrument:
         """Return an instrument of numbers in SI or quantities.
 
-        By default of five wavelengths over the band, of the turbulence of the telescope's site (Cerro Pachon), and of
-        the pixels of the camera, the telescope's unless told (10 um without one), with a charge diffusion of 0.4 of
-        them.
+        Parameters
+        ----------
+        telescope : Telescope
+            The telescope.
+        wavelengths : array_like or Quantity, shape [n_wave], or Light, optional
+            Wavelengths [m], or :class:`~pachon.Light` of one spectrum, which has weights and the shifts by the air too;
+            by default five over the telescope's band.
+        atmosphere : Atmosphere, optional
+            Fried parameter and outer scale; by default those of the telescope's site, or of Cerro Pachon.
+        camera : str or Camera, optional
+            Camera of the default stamps; by default the telescope's.
+        stamps : Stamps, optional
+            Pixels, charge diffusion, jitter and silicon; by default those of :meth:`pachon.Stamps.of_camera`.
+        weight_fwhm : float or Quantity, optional
+            Weight of the moments [rad].
+
+        Raises
+        ------
+        DomainError
+            If an array has the wrong shape, or stamps have places of stars.
         """
-        camera_or_name = telescope.camera if camera is None else camera
-        if pixel_size is None:
-            pixel_size = _PIXEL if camera_or_name is None else load_camera(camera_or_name).pixel_size
-        pixel = length(pixel_size, "pixel_size")
         if wavelengths is None:
             low, high = telescope.band or telescope.wavelength_range
             wavelengths = np.linspace(low, high, 5)
+        if stamps is None:
+            camera_or_name = telescope.camera if camera is None else camera
+            stamps = Stamps() if camera_or_name is None else Stamps.of_camera(load_camera(camera_or_name))
+        if stamps.offsets is not None or stamps.recenter is not None:
+            raise DomainError("stamps: expected no offsets and no recenter, images of a model are centred")
         return cls(
             telescope,
-            np.atleast_1d(metres(wavelengths, "wavelengths")),
+            _one_spectrum(wavelengths if isinstance(wavelengths, Light) else Light(wavelengths)),
             Atmosphere.from_site(telescope.site or "cerro_pachon", seed=0) if atmosphere is None else atmosphere,
-            pixel,
-            _DIFFUSION * (pixel / _PIXEL) if diffusion is None else length(diffusion, "diffusion"),
-            angle(jitter, "jitter"),
+            stamps,
             positive_angle(weight_fwhm, "weight_fwhm"),
-            None if dispersion is None else radians(dispersion, "dispersion"),
-            stamp_size,
-            silicon,
         )
+
+    @property
+    def wavelengths(self) -> np.ndarray:
+        """Wavelengths [m], shape [n_wave]."""
+        return np.asarray(self.light.wavelengths)
 
     @property
     def key(self) -> str:
         """SHA-256 of all parameters."""
-        air = self.atmosphere
-        numbers = (air.r0, air.outer_scale, self.pixel_size, self.diffusion, self.jitter, self.weight_fwhm)
-        arrays = (self.wavelengths, np.zeros(0) if self.dispersion is None else self.dispersion)
-        text = (
-            telescope_to_yaml(self.telescope) + repr((*numbers, self.stamp_size)) + repr([a.tolist() for a in arrays])
-        )
-        text += "" if self.silicon is None else repr(self.silicon)
+        air, stamps, light = self.atmosphere, self.stamps, self.light
+        numbers = (air.r0, air.outer_scale, stamps.pixel_size, stamps.diffusion, stamps.jitter, self.weight_fwhm)
+        arrays = [np.zeros(0) if a is None else np.asarray(a) for a in (light.wavelengths, light.dispersion)]
+        text = telescope_to_yaml(self.telescope) + repr((*numbers, stamps.size)) + repr([a.tolist() for a in arrays])
+        text += "" if stamps.silicon is None else repr(stamps.silicon)
+        text += "" if light.weights is None else repr(np.asarray(light.weights).tolist())
         return hashlib.sha256(text.encode()).hexdigest()
 
     def fields(self, xy: np.ndarray, threads: int | None = None) -> np.ndarray:
@@ -181,11 +177,11 @@ class Instrument:
         psfs = make_psfs(
             self.telescope,
             fields,
-            Light(self.wavelengths, dispersion=self.dispersion),
+            self.light,
             focal_plane=plane,
             atmosphere=atmosphere,
             aberration=aberration,
-            stamps=Stamps(self.stamp_size, self.pixel_size, self.diffusion, self.jitter, self.silicon),
+            stamps=self.stamps,
             engine=LongExposureEngine(None if has_only_annuli(self.telescope) else points),
             threads=threads,
         )
@@ -211,6 +207,15 @@ class Instrument:
             if progress is not None:
                 progress(len(images))
         return values
+
+
+def _one_spectrum(light: Light) -> Light:
+    """Return light as arrays in SI; DomainError where stars have spectra of their own."""
+    waves = np.atleast_1d(metres(light.wavelengths, "wavelengths"))
+    weights = None if light.weights is None else pure_numbers(light.weights, "weights")
+    if weights is not None and weights.shape != waves.shape:
+        raise DomainError(f"weights of shape {weights.shape}: expected one spectrum of {len(waves)} wavelengths")
+    return Light(waves, weights, None if light.dispersion is None else radians(light.dispersion, "dispersion"))
 
 
 def height_response(

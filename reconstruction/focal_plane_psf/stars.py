@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
 #: Noise of e1, e2 and ln size times the S/N, of stars as wide as the weight, where no stamps are given.
 NOISE_PER_SNR = (0.50, 0.50, 0.52)
-#: Columns of a table, in any case; those of the STARS table of ``pachon run`` are among them.
-COLUMNS = ("ccd", "x", "y", "e1", "e2", "size", "e1_noise", "e2_noise", "size_noise", "snr", "stamp", "used")
 
 
 class CcdStars(NamedTuple):
@@ -136,12 +134,7 @@ class FocalPlaneStars(Result):
     @classmethod
     @check_arguments
     def from_table(
-        cls,
-        table: Any,
-        *,
-        stamps: Any = None,
-        pixel_scale: float | None = None,
-        weight_fwhm: float = 0.7 * ARCSEC,
+        cls, table: Any, *, stamps: Any = None, pixel_scale: float | None = None, weight_fwhm: float = 0.7 * ARCSEC
     ) -> FocalPlaneStars:
         """Take stars from a table, structured array or mapping.
 

@@ -21,7 +21,8 @@ import numpy as np
 import scipy.linalg
 from astropy.io import fits
 
-from ...core.arguments import check_arguments
+from ...core.arguments import check_arguments, removed_arguments
+from ...core.ccd_names import NAMES_CARD, refuse_mirrored_names
 from ...core.errors import DomainError, ProductError
 from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
@@ -31,13 +32,13 @@ from ...models.camera.camera import Camera
 from ...models.camera.cameras import load_camera
 from ...models.camera.ccd_surfaces import CcdSurfaces
 from ...models.camera.focal_plane import FocalPlane
-from ...models.camera.height_budget import HeightBudget
 from ...models.telescope import Telescope
 from ..gaussian_field import inverse_from_cholesky
 from .fit import ExposureFit, ShapeData
 from .height_equations import ExposureState, HeightEquations
 from .heights import STATIC_DEGREE, HeightPrior
 from .mosaic import Mosaic
+from .optics_prior import OpticsPrior
 from .response import Instrument
 from .stars import places_of, stars_of
 
@@ -106,6 +107,7 @@ class StaticHeights(Result):
         cards = [
             ("CAMERA", self.camera.name, "name of the camera"),
             ("NEXPOSE", self.exposures, "number of exposures"),
+            NAMES_CARD,
         ]
         write_fits(Path(path), hdus, None, cards)
 
@@ -116,6 +118,7 @@ class StaticHeights(Result):
         hdus = read_fits(Path(path))
         try:
             camera_of_file = load_camera(hdus[0].header["CAMERA"] if camera is None else camera)
+            refuse_mirrored_names(camera_of_file.ccd_names, hdus[0].header.get(NAMES_CARD[0]), path)
             grid = _hdu_array(hdus["GRID"])
             surfaces = CcdSurfaces(
                 camera_of_file.half_sizes,
@@ -129,15 +132,14 @@ class StaticHeights(Result):
             raise ProductError(f"no product with heights ({' '.join(str(error).split())})", file=path) from None
 
 
+@removed_arguments(instrument="telescope=instrument")
 @check_arguments
 def fit_static_heights(
     exposures: Sequence[Any],
-    telescope: Telescope,
+    telescope: Telescope | Instrument,
     *,
     camera: str | Camera | None = None,
-    instrument: Instrument | None = None,
-    budget: str | HeightBudget | None = "simulated",
-    alignment_rms: float = 0.2e-6,
+    prior: OpticsPrior | None = None,
     folder: str | Path | None = None,
     steps: int = STEPS,
     threads: int | None = None,
@@ -150,16 +152,12 @@ def fit_static_heights(
     ----------
     exposures : sequence
         Stars of each, as :meth:`.FocalPlanePsf.fit` takes them; paths keep the memory at that of one exposure.
-    telescope : Telescope
-        The telescope.
+    telescope : Telescope or Instrument
+        The telescope; or an :class:`~pachon.Instrument`, which has wavelengths, atmosphere and detector too.
     camera : str or Camera, optional
         By default the telescope's.
-    instrument : Instrument, optional
-        Wavelengths, atmosphere and detector; by default those of :meth:`.FocalPlanePsf.fit`.
-    budget : str, HeightBudget or None
-        Prior of the heights; None for a weak one.
-    alignment_rms : float
-        Prior rms of the residual wavefront of each exposure [m].
+    prior : OpticsPrior, optional
+        Prior of the heights, and of the residual wavefront of each exposure; by default simulated heights and 0.2 um.
     folder : str or path, optional
         Folder with the result of each exposure, from which an interrupted fit is resumed.
     steps : int
@@ -176,24 +174,27 @@ def fit_static_heights(
     reporter = Reporter(quiet=True) if reporter is None else reporter
     if not len(exposures):
         raise DomainError("exposures: expected one or more")
-    camera_or_name = telescope.camera if camera is None else camera
+    prior = OpticsPrior() if prior is None else prior
+    believed = telescope.telescope if isinstance(telescope, Instrument) else telescope
+    camera_or_name = believed.camera if camera is None else camera
     if camera_or_name is None:
-        raise DomainError(f"camera: {telescope.name} names none, expected one with the heights of its CCDs")
+        raise DomainError(f"camera: {believed.name} names none, expected one with the heights of its CCDs")
     cam = load_camera(camera_or_name)
     degree = STATIC_DEGREE
-    prior = (
+    height_prior = (
         HeightPrior.uninformative(cam, degree=degree)
-        if budget is None
-        else HeightPrior.from_budget(cam, budget, degree)
+        if prior.budget is None
+        else HeightPrior.from_budget(cam, prior.budget, degree)
     )
-    instrument = Instrument.of(telescope, camera=cam) if instrument is None else instrument
-    heights = np.zeros(prior.n_parameter)
-    precision = np.zeros((prior.n_parameter, prior.n_parameter))
-    prior.add_to(precision)
+    instrument = telescope if isinstance(telescope, Instrument) else Instrument.of(telescope, camera=cam)
+    heights = np.zeros(height_prior.n_parameter)
+    precision = np.zeros((height_prior.n_parameter, height_prior.n_parameter))
+    height_prior.add_to(precision)
     covariance = None
     states: list[ExposureState | None] = [None] * len(exposures)
     for step in range(max(1, steps)):
-        job = _ExposureJob(instrument, prior, alignment_rms, heights, None if folder is None else Path(folder), threads)
+        saved_in = None if folder is None else Path(folder)
+        job = _ExposureJob(instrument, height_prior, prior.alignment_rms, heights, saved_in, threads)
         matrix, vector = precision.copy(), -precision @ heights
         with reporter.stage(f"heights, step {step + 1} of {steps}", total=len(exposures)) as stage:
             jobs = [(step, i, exposure, states[i]) for i, exposure in enumerate(exposures)]
@@ -210,7 +211,7 @@ def fit_static_heights(
     root, scale = covariance
     with one_blas_thread():
         full = inverse_from_cholesky(root) * scale[:, None] * scale
-        return StaticHeights(prior.focal_plane(heights), prior.per_ccd(full), len(exposures))
+        return StaticHeights(height_prior.focal_plane(heights), height_prior.per_ccd(full), len(exposures))
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,9 +95,9 @@ def _polynomial(tables: PiffTables) -> Interpolant:
     return Interpolant(("u", "v"), table.reshape(len(table), -1), functions)
 
 
-def _checked(tables: PiffTables, found: Interpolant, terms: int) -> Interpolant:
+def _checked(tables: PiffTables, interpolant: Interpolant, terms: int) -> Interpolant:
     """Return an interpolant whose number of coefficients is that of its functions, or raise ProductError."""
-    shape = found.coefficients.shape
+    shape = interpolant.coefficients.shape
     if len(shape) != 2 or shape[1] != terms:
         raise tables.error(f"interp solution of shape {shape}: expected {terms} coefficients of each parameter")
-    return found
+    return interpolant

@@ -7,6 +7,7 @@ import numpy as np
 from ...core.random_streams import stream
 from ...models.telescope import Telescope
 from ...pipeline.simulate.donuts import draw_donuts
+from ...pipeline.simulate.star_defects import StarDefects
 from ...sensing.fit import fit_donuts
 from ...sensing.model import DonutAir, DonutDetector, DonutModel
 from ...sensing.result import DonutFit
@@ -43,8 +44,7 @@ def expose(scene: AlignmentScene, telescope: Telescope, visit: int, threads: int
         electrons=donuts.electrons,
         sky=donuts.sky,
         read_noise=donuts.read_noise,
-        second_stars=donuts.second_stars,
-        cosmic_rays=donuts.cosmic_rays,
+        defects=StarDefects(donuts.second_stars, donuts.cosmic_rays),
         stamps=Stamps(donuts.stamp, diffusion=_DIFFUSION),
         seed=int(stream(seed, "alignment", "donuts", visit).integers(2**31)),
         threads=threads,

@@ -86,11 +86,7 @@ class Alignment(Result):
 
 @check_arguments
 def align(
-    config: AlignConfig,
-    *,
-    folder: Path | None = None,
-    store: Path | None = None,
-    execution: Execution | None = None,
+    config: AlignConfig, *, folder: Path | None = None, store: Path | None = None, execution: Execution | None = None
 ) -> Alignment:
     """Run an active-optics loop.
 

@@ -16,6 +16,7 @@ from ...models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
 from ...models.telescope import Telescope
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.atmosphere.mean_wavefront import mean_wavefront_covariance
+from ...wavefront.atmosphere.screen_sampling import ScreenSampling
 from ...wavefront.corner_stars import CornerStars, corner_stars
 from ...wavefront.request import wavelength_points
 from .config import AlignConfig
@@ -68,7 +69,7 @@ class AlignmentScene:
             r0=air.r0_m,
             outer_scale=air.outer_scale_m,
             exposure=air.exposure_s,
-            screen_length=max(1300.0, 25.0 * air.exposure_s),
+            screens=ScreenSampling(screen_length=max(1300.0, 25.0 * air.exposure_s)),
         )
 
         def on_sensors(heights: str) -> CornerStars:

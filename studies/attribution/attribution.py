@@ -8,8 +8,8 @@ A telescope without aberrations cannot be traced over the CCD heights. With the 
 on the sky are therefore imaged by a paraboloid so long that design, heights and residuals of the active optics have no
 effect. The effect of the design is that of the optics less that of the heights.
 
-The ground layer holds most of the turbulence. At exactly 0 m the light of all stars crosses the same part of it at
-of them at any time, and one ellipticity in common. Its case lifts the layer with the same turbulence, so far that stars
+The ground layer holds most of the turbulence. At exactly 0 m the light of all stars crosses the same part of it at any
+time, and gives them one ellipticity in common. Its case lifts the layer with the same turbulence, so far that stars
 have no more of it in common than of the next layer.
 """
 

@@ -47,14 +47,6 @@ def _no_term(term: str, config: Configuration) -> str | None:
     return _flat_heights(config) or (None if term in config.focal_plane.terms else f"focal_plane.{term} = false")
 
 
-def _no_aberration(config: Configuration) -> str | None:
-    return "active_optics.residual_um = 0" if config.active_optics.residual_um == 0.0 else None
-
-
-def _nothing_left(config: Configuration) -> str | None:
-    return None if config.atmosphere.enabled else "atmosphere.enabled = false, nothing would be left"
-
-
 def _no_atmosphere(config: Configuration) -> str | None:
     if not config.atmosphere.enabled:
         return "atmosphere.enabled = false"
@@ -72,17 +64,18 @@ def _no_ground_layer(config: Configuration) -> str | None:
     return None
 
 
-def _no_diffusion(config: Configuration) -> str | None:
-    return "psf.diffusion_pixels = 0" if config.psf.diffusion_pixels == 0.0 else None
+def _off(key: str, config: Configuration, consequence: str = "") -> str | None:
+    """Return the key of a cause and its value where it is off: zero, false or null."""
+    section, name = key.split(".")
+    value = getattr(getattr(config, section), name)
+    if value:
+        return None
+    return f"{key} = {'null' if value is None else 'false' if value is False else f'{value:g}'}{consequence}"
 
 
-def _no_silicon(config: Configuration) -> str | None:
-    return None if config.detector.silicon else "detector.silicon = false"
-
-
-def _no_effect(key: str, config: Configuration) -> str | None:
-    value = getattr(config.sensor, key)
-    return None if value else f"sensor.{key} = {'null' if value is None else f'{value:g}'}"
+def _cause(key: str, value: float | bool | None) -> Cause:
+    """Return the cause of one number or switch of the configuration, and its value without the cause."""
+    return Cause({key.replace(".", "__"): value}, partial(_off, key))
 
 
 #: All causes by name: terms of the CCD heights and all of them, residual aberration, the whole telescope, turbulence
@@ -94,15 +87,15 @@ CAUSES: dict[str, Cause] = {
         for term in ("global", "raft", "ccd", "tilt", "potato_chip")
     },
     "heights": Cause({"focal_plane__heights": None, "focal_plane__budget": "flat"}, _no_heights),
-    "active_optics": Cause({"active_optics__residual_um": 0.0}, _no_aberration),
-    OPTICS: Cause({}, _nothing_left),
+    "active_optics": _cause("active_optics.residual_um", 0.0),
+    OPTICS: Cause({}, partial(_off, "atmosphere.enabled", consequence=", nothing would be left")),
     "atmosphere": Cause({"atmosphere__enabled": False}, _no_atmosphere),
     "ground_layer": Cause({"atmosphere__ground_lift_m": GROUND_LIFT}, _no_ground_layer),
-    "diffusion": Cause({"psf__diffusion_pixels": 0.0}, _no_diffusion),
-    "absorption_depth": Cause({"detector__silicon": False}, _no_silicon),
-    "brighter_fatter": Cause({"sensor__brighter_fatter": None}, partial(_no_effect, "brighter_fatter")),
-    "tree_rings": Cause({"sensor__tree_rings_um": 0.0}, partial(_no_effect, "tree_rings_um")),
-    "edge_rolloff": Cause({"sensor__edge_rolloff_um": 0.0}, partial(_no_effect, "edge_rolloff_um")),
+    "diffusion": _cause("psf.diffusion_pixels", 0.0),
+    "absorption_depth": _cause("detector.silicon", False),
+    "brighter_fatter": _cause("sensor.brighter_fatter", None),
+    "tree_rings": _cause("sensor.tree_rings_um", 0.0),
+    "edge_rolloff": _cause("sensor.edge_rolloff_um", 0.0),
     NOISE: Cause({}, lambda _: None),
 }
 

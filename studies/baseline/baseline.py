@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arguments import check_arguments
+from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import ConfigError, PachonError
 from ...core.version import VERSION
 from ...models.io.bundled import BUNDLED
@@ -32,7 +32,7 @@ from ..metrics.optics import OPTICS
 from ..metrics.scene import Scene, make_plan
 from .check import BaselineCheck, Deviation
 from .file import Baseline, BaselineMetric, read_baseline, rounded
-from .requirements import check_used, given_limit, given_tolerance, parse_rules
+from .requirements import Requirements, check_used, given_limit, given_tolerance
 
 #: End of the names of baselines.
 SUFFIX = ".baseline.json"
@@ -46,6 +46,7 @@ def bundled_baselines() -> tuple[Path, ...]:
     return tuple(sorted(_BUNDLED.glob(f"*{SUFFIX}")))
 
 
+@removed_arguments(checked="baseline.with_sources(...) of the result")
 @check_arguments
 def make_baseline(
     model: str,
@@ -56,9 +57,7 @@ def make_baseline(
     wavelengths: Sequence[float] | None = None,
     ccds: Sequence[str] | None = None,
     pupil: Sequence[tuple[float, float]] | None = None,
-    checked: Mapping[str, str] | None = None,
-    tolerances: Sequence[str] = (),
-    limits: Sequence[str] = (),
+    requirements: Requirements | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[Baseline, dict[str, str]]:
@@ -80,13 +79,8 @@ def make_baseline(
         CCDs at whose centres the PSF is taken; the first is modelled. Five of the camera by default.
     pupil : sequence of (x, y), optional
         Points of the entrance pupil, in units of its radius; four by default.
-    checked : mapping of str to str, optional
-        Independent sources of metrics, by the start of their names.
-    tolerances : sequence of str, optional
-        Tolerances in place of those of rounding: ``1 %`` of the values of all metrics, ``spot rms = 0.1 um`` of those
-        whose names begin with these words.
-    limits : sequence of str, optional
-        Requirements: ``spot rms < 10 um``, ``vignetting > 0.5``.
+    requirements : Requirements, optional
+        Tolerances in place of those of rounding, and limits.
     threads : int, optional
         Number of threads; results do not depend on it.
     progress : callable, optional
@@ -104,7 +98,8 @@ def make_baseline(
         If the telescope or the configuration cannot be read, no metric can be computed, or a tolerance or a limit
         applies to none of them.
     """
-    tolerance_rules, limit_rules = parse_rules("tolerance", tolerances), parse_rules("limit", limits)
+    requirements = Requirements() if requirements is None else requirements
+    tolerance_rules, limit_rules = requirements.tolerance_rules, requirements.limit_rules
     telescope, folder = load_telescope(model), Path(folder)
     configuration = None if configuration is None else Path(configuration)
     experiment = None if configuration is None else _experiment(configuration, _absolute_path(model, Path()), telescope)
@@ -115,7 +110,6 @@ def make_baseline(
         raise ConfigError(f"{model}: no metric can be computed ({next(iter(left_out.values()))})")
 
     def stored(name: str, value: float, tolerance: float, metric: Metric) -> BaselineMetric:
-        against = next((text for start, text in (checked or {}).items() if name.startswith(start)), None)
         stated_tolerance = given_tolerance(tolerance_rules, name, metric.unit, value, tolerance)
         return BaselineMetric(
             # Digits of the metric's own tolerance: a given one says what matters, not what is known.
@@ -124,7 +118,6 @@ def make_baseline(
             tolerance=tolerance if stated_tolerance is None else stated_tolerance,
             limit=given_limit(limit_rules, name, metric.unit),
             reason=metric.reason if stated_tolerance is None else "given",
-            checked_against=against,
         )
 
     for rules in (tolerance_rules, limit_rules):

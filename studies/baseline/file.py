@@ -9,20 +9,24 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from ...core.arguments import check_arguments
+from ...core.ccd_names import refuse_mirrored_names
 from ...core.errors import ConfigError
 from ...core.files import read_bytes, write_bytes
 from ...core.schema import Positive, Real, Section, validated
 from ..metrics.scene import Plan
 
 FORMAT = "pachon baseline"
-#: Versions of the format: 2 has limits, which an older pachon could not read, and is written for these alone.
-VERSIONS = (1, 2)
+#: Versions of the format: 4 has limits, which an older pachon could not read, and is written for these alone. Those of
+#: 1 and 2 are 3 and 4 with the CCDs of the LSST named as in a mirror, and are read where they name none.
+VERSIONS = (3, 4)
+_OLDER_VERSIONS = (1, 2)
 
 
 class Limit(Section):
@@ -71,6 +75,17 @@ class Baseline(Section):
     reasons: dict[str, str] = Field(description="reasons of the tolerances")
     figures: Annotated[dict[str, BaselineMetric], Field(min_length=1)] = Field(description="the metrics by name")
 
+    @check_arguments
+    def with_sources(self, sources: Mapping[str, str]) -> Baseline:
+        """Return the baseline with independent sources of metrics, by the start of their names."""
+
+        def checked(name: str, metric: BaselineMetric) -> BaselineMetric:
+            source = next((text for start, text in sources.items() if name.startswith(start)), metric.checked_against)
+            return metric.model_copy(update={"checked_against": source})
+
+        metrics = {name: checked(name, metric) for name, metric in self.figures.items()}
+        return self.model_copy(update={"figures": metrics})
+
     def __repr__(self) -> str:
         return f"<Baseline of {self.model}: {len(self.figures)} metrics>"
 
@@ -89,7 +104,10 @@ def read_baseline(path: str | os.PathLike[str]) -> Baseline:
         raise ConfigError(
             f"format = {file_format!r}: expected {FORMAT!r}, as pachon baseline save writes it", file=path
         )
-    if content.get("version") not in VERSIONS:
+    if content.get("version") in _OLDER_VERSIONS:
+        plan = content.get("plan")
+        refuse_mirrored_names((plan.get("ccds") or () if isinstance(plan, dict) else ()), None, path, ConfigError)
+    elif content.get("version") not in VERSIONS:
         file_version, writer = content.get("version"), content.get("pachon")
         problem = (
             f"version = {file_version!r}: expected {VERSIONS[0]} or {VERSIONS[1]};"

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from astropy import units as u
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError
 from .file import Limit
 
@@ -55,6 +56,42 @@ class Rule:
 
     def _error(self, problem: str) -> ConfigError:
         return ConfigError(f"{self.option} = {self.text!r}: {problem}")
+
+
+@check_arguments
+@dataclass(frozen=True)
+class Requirements:
+    """Tolerances and limits of the metrics of a baseline, each a text.
+
+    Attributes
+    ----------
+    tolerances : tuple of str
+        Tolerances in place of those of rounding: ``1 %`` of the values of all metrics, ``spot rms = 0.1 um`` of those
+        whose names begin with these words.
+    limits : tuple of str
+        Requirements: ``spot rms < 10 um``, ``vignetting > 0.5``.
+
+    Raises
+    ------
+    ConfigError
+        If a text is none of these.
+    """
+
+    tolerances: tuple[str, ...] = ()
+    limits: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        _ = self.tolerance_rules, self.limit_rules
+
+    @property
+    def tolerance_rules(self) -> tuple[Rule, ...]:
+        """Rules of the tolerances, those with the most words last."""
+        return parse_rules("tolerance", self.tolerances)
+
+    @property
+    def limit_rules(self) -> tuple[Rule, ...]:
+        """Rules of the limits, those with the most words last."""
+        return parse_rules("limit", self.limits)
 
 
 def parse_rules(option: str, texts: Sequence[str]) -> tuple[Rule, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...core.errors import DomainError
+from ...design.images.diffraction import fft_psf
 from ...design.images.encircled_energy import encircled_energy
 from ...design.metrics.field_zernikes import wavefront_zernikes
 from ...design.metrics.spots import spots
@@ -90,10 +91,10 @@ def spot(scene: Scene) -> dict[str, float]:
 @OPTICS.group("ee80", Metric("ee80", "um", "curve", lambda _, value: one_digit(1e-7 * value)))
 def ee80(scene: Scene) -> dict[str, float]:
     """Return the radius of 80 % of the diffraction image's light at the middle wavelength."""
-    energy = encircled_energy(
+    images = fft_psf(
         scene.telescope, scene.fields, scene.middle, pixels=_EE_PIXELS, n_pupil=_EE_POINTS, threads=scene.threads
     )
-    radii = energy.radius_holding(0.8) * 1e6
+    radii = encircled_energy(images).radius_holding(0.8) * 1e6
     return {f"ee80 field {_pair_text(p)}": float(v) for v, p in zip(radii, scene.plan.fields_deg, strict=True)}
 
 

@@ -21,7 +21,7 @@ from ...pipeline.simulate.photometry import (
     signal_to_noise,
     sky_electrons_per_pixel,
 )
-from ...pipeline.simulate.star_field import make_star_field
+from ...pipeline.simulate.star_field import Depth, make_star_field
 from ...reconstruction.psf_model.model import CLIP_SIGMA, PsfModel
 from .plan import NOISE_FREE, Case
 
@@ -77,18 +77,8 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
     width = effective_fwhm(ccd.exposure.holdout.image, ccd.exposure.holdout.pixel_scale)
     faint = limiting_magnitude(snr_min, places.band, places.exposure, width) + 2.5 * np.log10(light.min())
     # The same stars in the same order; the limit alone changes.
-    stars = make_star_field(
-        name,
-        places.bounds,
-        0,
-        n_stars,
-        seed,
-        fwhm=width,
-        pixel_size=places.pixel_size,
-        band=places.band,
-        exposure=places.exposure,
-        faint=faint,
-    )
+    depth = Depth(places.band, places.exposure, faint=faint)
+    stars = make_star_field(places.ccd, 0, n_stars, seed, fwhm=width, depth=depth)
     sky = sky_electrons_per_pixel(places.band, places.exposure, exposed.pixel_scale)
     rng = stream(seed, "study", "noise", name, draw)
     electrons = stars.electrons * light
@@ -119,7 +109,7 @@ def fit(case: Case, ccd: SimulatedCcd, observed: ObservedCcd) -> PsfModel:
         n_components=min(case.components, int(used.sum()) - 1) if recipe.basis.ordered else None,
         weights=recipe.star_weights(observed.snr[used]),
         gain=1.0 if photons else None,
-        extent=ccd.exposure.positions.extent,
+        extent=ccd.exposure.positions.ccd.extent,
         clip_sigma=None if case.snr == NOISE_FREE else CLIP_SIGMA,  # without noise there are no outliers
     )
 

@@ -19,18 +19,21 @@ from ...core.errors import ConfigError, DomainError, PachonError
 from ...core.progress import Reporter
 from ...pipeline.config import Configuration, with_options
 from ...pipeline.experiment import Experiment
+from ...pipeline.focal_plane_stage import fit_focal_plane_model
 from ...pipeline.memory import check_memory
 from ...pipeline.resolved_values import require_drawn_stars
 from ...reconstruction.focal_plane_psf.model import FocalPlanePsf
+from ...reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
 from ...reconstruction.psf_model.model import PsfModel
 from ...reconstruction.psf_model.recipe import BASES
-from .focal_plane import fit_focal_plane
 from .plan import FOCAL_PLANE, NOISE_FREE, Case, Plan
 from .residuals import Residuals, case_metrics, measure_residuals
-from .stars import ObservedCcd, SimulatedCcd, fit, observe, simulate
+from .stars import ObservedCcd, SimulatedCcd, fit, observe, simulate, used_stars
 
 #: One in each raft along two lines through the centre of the field, from the centre to the edge.
 STUDY_CCDS = tuple(f"R{raft}_S11" for raft in ("02", "11", "13", "20", "22", "24", "31", "33", "42"))
+# Electrons of a star without noise: with them the stated noise of e is 5e-5, to which the fitted optics are right.
+_ELECTRONS = 1e8
 
 
 @dataclass(frozen=True)
@@ -155,3 +158,29 @@ def _complexity_key(case: Case) -> tuple[int, int]:
     if case.interpolation in FOCAL_PLANE:
         return 1 + [*FOCAL_PLANE].index(case.interpolation), case.components * case.terms
     return 0, (case.components or 10**6) * case.recipe().interpolation.parameter_count(case.stars)
+
+
+def fit_focal_plane(
+    case: Case,
+    experiment: Experiment,
+    ccds: Sequence[SimulatedCcd],
+    observed: Sequence[ObservedCcd],
+    threads: int | None = None,
+) -> FocalPlanePsf:
+    """Fit the focal-plane model of a case to the first stars of each CCD, all CCDs together."""
+    stars = FocalPlaneStars.of_ccds(
+        [_stars_of_ccd(case, *pair) for pair in zip(ccds, observed, strict=True)],
+        ccds[0].exposure.observed.pixel_scale,
+        experiment.weight_fwhm,
+    )
+    names = [ccd.exposure.name for ccd in ccds]
+    return fit_focal_plane_model(
+        experiment, stars, telescope=case.interpolation == "focal_plane", ccds=names, threads=threads
+    )
+
+
+def _stars_of_ccd(case: Case, ccd: SimulatedCcd, observed: ObservedCcd) -> CcdStars:
+    noisy_stars, electrons = observed.observation, np.minimum(observed.electrons, _ELECTRONS)
+    x, y = ccd.exposure.positions.observed.T
+    name, used = ccd.exposure.name, used_stars(case, observed)
+    return CcdStars(name, x, y, noisy_stars.shapes, electrons, noisy_stars.noise, noisy_stars.images, used)

@@ -16,6 +16,7 @@ from ...measure.focal_plane_axes import TRUTH, draw_key_whisker, draw_whiskers, 
 from ...measure.shapes import fwhm, measure_shapes
 from ...models.ideal_telescope import ideal_telescope
 from ...wavefront.atmosphere.atmosphere import Atmosphere
+from ...wavefront.atmosphere.screen_sampling import ScreenSampling
 from ...wavefront.atmosphere.turbulence import long_exposure_fwhm
 from ...wavefront.psf.psf import make_psfs
 from ...wavefront.psf.stamps import Stamps
@@ -61,9 +62,7 @@ def speckles(bench: Bench) -> Reproduced:
         bench.seed,
         exposure=_TIMES[-1],
         time_step=bench.scale.speckle_step,
-        screen_size=size,
-        screen_length=length,
-        fine_size=1024,
+        screens=ScreenSampling(screen_size=size, screen_length=length, fine_size=1024),
     )
     images, before = [], 0
     total = np.zeros((_SPECKLE_STAMP, _SPECKLE_STAMP))
@@ -169,7 +168,11 @@ def ellipticity(bench: Bench) -> Reproduced:
     e = np.zeros(0, dtype=complex)
     for epoch in range(scale.pair_seeds):
         air = Atmosphere.from_site(
-            _SITE, bench.seed, epoch=epoch, exposure=max(_EXPOSURES), screen_size=scale.screen_size
+            _SITE,
+            bench.seed,
+            epoch=epoch,
+            exposure=max(_EXPOSURES),
+            screens=ScreenSampling(screen_size=scale.screen_size),
         )
         for time in _EXPOSURES:
             begun = shortened_exposure(air, time, scale.time_step)

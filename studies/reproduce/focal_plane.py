@@ -240,15 +240,15 @@ def _ccd_grid(camera: Camera, per_side: int) -> np.ndarray:
 
 
 def _border_points(camera: Camera, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return points left of borders between CCDs, 1.5 mm away across them, and as far away within the CCD [m]."""
-    centers = camera.centers
-    # Gaps are narrowest within a raft; only where aberrations are strong do heights show.
-    distance, right = cKDTree(centers).query(centers + np.array([camera.shortest_side, 0.0]))
+    """Return points below borders between CCDs, 1.5 mm away across them, and as far away within the CCD [m]."""
+    centers, sides = camera.centers, 2.0 * camera.half_sizes[:, 1]
+    # Gaps are narrowest along y within a raft; only where aberrations are strong do heights show.
+    distance, above = cKDTree(centers).query(centers + sides[:, None] * np.array([0.0, 1.0]))
     radius = np.hypot(*centers.T)
     border_ccds = np.flatnonzero((distance < 1.4e-3) & (radius > 0.10) & (radius < 0.24))
     border_ccds = border_ccds[np.linspace(0, len(border_ccds) - 1, min(count, len(border_ccds))).round().astype(int)]
-    middle = 0.5 * (centers[border_ccds] + centers[right[border_ccds]])
-    step = np.array([1.5e-3, 0.0])
+    middle = 0.5 * (centers[border_ccds] + centers[above[border_ccds]])
+    step = np.array([0.0, 1.5e-3])
     return middle - 0.5 * step, middle + 0.5 * step, middle - 1.5 * step
 
 

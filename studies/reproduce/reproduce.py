@@ -20,14 +20,10 @@ def _number(figure: Figure) -> tuple[str, int]:
     return kind, int(figure.name.removeprefix(kind))
 
 
-_FOUND = [
-    each
-    for module in (optics, screens, atmosphere, focal_plane, reconstruction, visits)
-    for each in vars(module).values()
-    if isinstance(each, Figure)
-]
+_MODULES = (optics, screens, atmosphere, focal_plane, reconstruction, visits)
+_FIGURES = [value for module in _MODULES for value in vars(module).values() if isinstance(value, Figure)]
 #: Figures and tables in the order of the paper.
-FIGURES = {each.name: each for each in sorted(_FOUND, key=_number)}
+FIGURES = {figure.name: figure for figure in sorted(_FIGURES, key=_number)}
 # Approximate time of the run, of the visits and of their galaxies, at the scales `small` and `paper` [min].
 _SHARED_MINUTES = {"of_run": (0.5, 24.0), "of_visits": (0.4, 90.0), "of_galaxies": (0.6, 600.0)}
 _ALL = "all"
@@ -90,12 +86,7 @@ def reproduce(names: Iterable[str], bench: Bench) -> dict[str, Any]:
 
 
 def reproduce_at(
-    names: Iterable[str],
-    scale: str,
-    folder: Path,
-    *,
-    seed: int = 1,
-    execution: Execution | None = None,
+    names: Iterable[str], scale: str, folder: Path, *, seed: int = 1, execution: Execution | None = None
 ) -> dict[str, Any]:
     """Reproduce figures at a scale given by name, after a line with the expected time: see :func:`reproduce`."""
     figure_names = chosen_figures(names)

@@ -10,11 +10,13 @@ from matplotlib.patches import Circle
 
 from ...core.plotting import new_figure, png_bytes, styled
 from ...core.products import image_hdu, table_hdu
+from ...core.statistics import FWHM_PER_RMS
 from ...core.units import ARCSEC
 from ...models.io.prescription import load_telescope
 from ...models.io.site_file import load_site
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.atmosphere.refraction import dispersion_shift
+from ...wavefront.atmosphere.screen_sampling import ScreenSampling
 from ...wavefront.atmosphere.turbulence import path_variance
 from .bench import Bench
 from .figure import EcsvData, FitsData, Reproduced, figure
@@ -47,7 +49,7 @@ def dispersion(bench: Bench) -> Reproduced:
         spread[band] = np.abs(shift[:, 1, 0]) / ARCSEC
     at_45 = {band: float(values[45]) for band, values in spread.items()}
     # A line of length d adds d^2/12 to the variance of a round image along it.
-    variance = (_SEEING / math.sqrt(8.0 * math.log(2.0))) ** 2
+    variance = (_SEEING / FWHM_PER_RMS) ** 2
     longer = math.sqrt(1.0 + max(at_45["r"], at_45["i"]) ** 2 / 12.0 / variance)
     e = (longer - 1.0) / (longer + 1.0)
     squared = (longer**2 - 1.0) / (longer**2 + 1.0)
@@ -102,7 +104,7 @@ def _dispersion_plot(zenith: np.ndarray, spread: Mapping[str, np.ndarray]) -> by
 )
 def screens(bench: Bench) -> Reproduced:
     """Draw the screens of the six layers and compare their strength with theory (Fig. 4)."""
-    air = Atmosphere.from_site(_SITE, bench.seed, screen_size=bench.scale.screen_size)
+    air = Atmosphere.from_site(_SITE, bench.seed, screens=ScreenSampling(screen_size=bench.scale.screen_size))
     across = round(_PIECE / air.screen_pixel)
     block = -(-across // _KEPT)
     size = across // block

@@ -57,11 +57,7 @@ def image_of_the_sky(bench: Bench) -> Reproduced:
     with experiment.screens(bench.threads):
         star = expose_positions(experiment, np.zeros((1, 2)), bench.threads)
         scene = draw_ccd(
-            experiment,
-            _CCD,
-            galaxies.galaxies_in,
-            window=Window(*corner, _SIDE, _SIDE),
-            threads=bench.threads,
+            experiment, _CCD, galaxies.galaxies_in, window=Window(*corner, _SIDE, _SIDE), threads=bench.threads
         )
     width = effective_fwhm(star.image, star.pixel_scale)
     seconds = scene.exposure.time

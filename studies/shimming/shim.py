@@ -18,17 +18,19 @@ import scipy.optimize
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, check_choice
+from ...core.plotting import figure_at, styled
 from ...core.progress import Reporter
 from ...core.result import Result
 from ...measure.correlation import Correlation, shear_correlation
+from ...measure.focal_plane_axes import draw_outlines, frame_axes
 from ...models.camera.focal_plane import FocalPlane
 from ...pipeline.config import Configuration, MotionConfig
 from ...pipeline.experiment import Experiment
+from ...pipeline.report.focal_plane_plots import draw_heights
 from ...reconstruction.focal_plane_psf.height_series import HeightSeries
 from ...wavefront.chief_rays import fields_at
 from .curves import Places, focus_curves, measured
 from .pairs import PairSum, separation_edges
-from .picture import draw_shims
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -346,10 +348,7 @@ def _ellipticity_merit(values: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarr
 
 
 #: Merits that are means over places.
-_VALUES: dict[str, Value] = {
-    "fwhm": _width_merit,
-    "ellipticity": _ellipticity_merit,
-}
+_VALUES: dict[str, Value] = {"fwhm": _width_merit, "ellipticity": _ellipticity_merit}
 
 
 def _state_metrics(
@@ -357,13 +356,27 @@ def _state_metrics(
 ) -> tuple[StateMetrics, Correlation]:
     """Return means of values [n, 3] at places, and the correlation of their ellipticities."""
     correlation = shear_correlation(
-        *sky.T,
-        *values[:, 1:].T,
-        min_sep=edges[0],
-        max_sep=edges[-1],
-        n_bins=len(edges) - 1,
-        weight=places.weight,
+        *sky.T, *values[:, 1:].T, min_sep=edges[0], max_sep=edges[-1], n_bins=len(edges) - 1, weight=places.weight
     )
     rms_xi = float(np.sqrt(np.nanmean(correlation.xi_plus**2)))
     rms_e = places.mean((values[:, 1:] ** 2).sum(axis=1)) ** 0.5
     return StateMetrics(places.mean(values[:, 0]), rms_e, rms_xi), correlation
+
+
+def draw_shims(ax: Axes | Figure | None, planes: Mapping[str, FocalPlane]) -> Figure:
+    """Draw focal planes of one camera by name, on the scale of the first."""
+    first = next(iter(planes.values()))
+    camera = first.camera
+    edge = 1.04e3 * camera.reach
+    limits = (-edge, edge, -edge, edge)
+    bounds = 3e6 * float(np.std(first.height(*camera.centers.T))) or 1.0
+    with styled():
+        figure = figure_at(ax, 13.0, 4.6)
+        panels = figure.subplots(1, len(planes))
+        for i, (axes, (title, plane)) in enumerate(zip(panels, planes.items(), strict=True)):
+            image = draw_heights(axes, plane, limits, 350, bounds=bounds)
+            draw_outlines(axes, camera, range(len(camera)), "0.55", 0.3)
+            frame_axes(axes, limits, y_label=i == 0)
+            axes.set_title(title)
+        figure.colorbar(image, ax=list(panels), fraction=0.02, pad=0.01, extend="both", label="height [µm]")
+        return figure

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import rankdata
 
-from .file import SweepFile
+from .file import Point, SweepFile
 from .table import SweepTable
 
 #: Least number of values of a parameter for a curve.
@@ -120,14 +120,14 @@ def budget(table: SweepTable, sweep: SweepFile, metric: str, mark: str) -> Budge
     return Budget(metric, mark, ordered, float(sum(alone.values())), together, error)
 
 
-def allowances(found: Sequence[Curve], target: float) -> list[Allowance]:
+def allowances(metric_curves: Sequence[Curve], target: float) -> list[Allowance]:
     """Return the allowance of each parameter for a growth of the metric up to a target.
 
     The change is a power of the distance from nominal, fitted to the outer half of the curve, where it is largest. The
     error is to first order, from that of the change at the farthest point.
     """
     allowances_of_curves = []
-    for curve in found:
+    for curve in metric_curves:
         distance = np.abs(curve.value - curve.nominal)
         outer = (distance >= 0.5 * distance.max()) & (curve.change > 0)
         if outer.sum() < 2 or len(np.unique(distance[outer])) < 2:
@@ -135,7 +135,7 @@ def allowances(found: Sequence[Curve], target: float) -> list[Allowance]:
             continue
         power, intercept = np.polyfit(np.log(distance[outer]), np.log(curve.change[outer]), 1)
         bounds = []
-        for goal in (target, target / len(found)):
+        for goal in (target, target / len(metric_curves)):
             reach = float(np.exp((np.log(goal) - intercept) / power)) if power > 0 else np.nan
             # The power law holds near the computed points only.
             bounds.append(reach if reach <= 2.0 * distance.max() else np.nan)
@@ -213,7 +213,7 @@ def _over_replicas(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarr
         return mean, spread, spread / np.sqrt(count)
 
 
-def _metric_at(table: SweepTable, point: dict[str, Any], seed: int, metric: str) -> float:
+def _metric_at(table: SweepTable, point: Point, seed: int, metric: str) -> float:
     """Return the metric of one point; NaN where it was not computed."""
     matching_rows = table.seed == seed
     for name, value in point.items():

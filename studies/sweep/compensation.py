@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...design.optimize.merit import Beams, SpotMerit
 from ...design.optimize.optimize import optimize
 from ...design.optimize.solver import LeastSquares
 from ...models.parameters.changes import parse_change
+from ...models.telescope import Telescope
 from ...pipeline.experiment import Experiment
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.silicon_focus import focus_height
@@ -36,7 +38,6 @@ def compensated(
     if not names:
         return experiment, {}
     telescope, camera = experiment.telescope, experiment.camera
-    compensators = [parse_change(telescope, name) for name in names]
     ccds = np.array([camera.ccd_index(name) for name in experiment.config.ccds or ()])
     field_places = _PLACES if len(ccds) <= _FEW else _PLACES[:1]
     places = camera.from_uv(ccds[:, None], field_places).reshape(-1, 2)
@@ -48,16 +49,23 @@ def compensated(
         # Spots are smallest where the light turns into charge.
         heights = heights - focus_height(telescope, experiment.silicon, wavelength, threads)
     merit = SpotMerit(telescope, rays, heights=heights)
+    optimized, values = solved_compensators(telescope, names, merit, fields, [wavelength], threads)
+    return replace(experiment, telescope=optimized), values
+
+
+def solved_compensators(
+    telescope: Telescope,
+    names: Sequence[str],
+    merit: SpotMerit | str,
+    fields: np.ndarray | None,
+    wavelengths: ArrayLike | None,
+    threads: int | None,
+) -> tuple[Telescope, dict[str, float]]:
+    """Return the telescope with compensators at the smallest merit, and their values in the units of their names."""
+    changes = [parse_change(telescope, name, "compensators") for name in names]
+    parameters, solver = [parameter for parameter, _ in changes], LeastSquares(_TOLERANCE)
     optimum = optimize(
-        telescope,
-        [p for p, _ in compensators],
-        merit,
-        fields,
-        [wavelength],
-        solver=LeastSquares(_TOLERANCE),
-        threads=threads,
+        telescope, parameters, merit, fields, wavelengths, n_pupil=_RINGS, solver=solver, threads=threads
     )
-    values = {
-        name: float(v / factor) for name, v, (_, factor) in zip(names, optimum.changes, compensators, strict=True)
-    }
-    return replace(experiment, telescope=optimum.telescope), values
+    sizes = (size for _, size in changes)
+    return optimum.telescope, {n: float(v / size) for n, v, size in zip(names, optimum.changes, sizes, strict=True)}

@@ -13,10 +13,8 @@ from scipy.stats import norm, qmc
 from ...core.errors import ConfigError
 from ...core.files import parsing, require_file
 from ...core.random_streams import stream
-from .file import Design, SweepFile, SweptParameter
+from .file import Design, Point, SweepFile, SweptParameter
 
-#: Values of the parameters of one point by name.
-Point = dict[str, Any]
 # Half the width of a normal distribution on a grid, in standard deviations.
 _SIGMAS = 2.0
 

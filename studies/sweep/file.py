@@ -33,6 +33,8 @@ from ...core.yaml_reader import read_mapping
 from ...models.io.prescription import prescription_digest
 from ...pipeline.config import digest
 
+#: Values of the parameters of one point by name.
+Point = dict[str, Any]
 #: Folder of the bundled sweeps.
 EXAMPLES = Path(__file__).parent / "examples"
 
@@ -74,12 +76,7 @@ class Design(Section):
 
 
 #: Sections and keys of a configuration that may name a file, besides the telescope.
-_FILES = (
-    ("atmosphere", "site"),
-    ("focal_plane", "heights"),
-    ("active_optics", "states"),
-    ("stars", "catalogue"),
-)
+_FILES = (("atmosphere", "site"), ("focal_plane", "heights"), ("active_optics", "states"), ("stars", "catalogue"))
 # Parameters whose values may name files.
 _FILE_PARAMETERS = {"telescope", "camera", *(f"{section}.{key}" for section, key in _FILES)}
 

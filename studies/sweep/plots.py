@@ -151,11 +151,11 @@ def scatter_plot(table: SweepTable, metric: str, names: Sequence[str]) -> bytes:
         return png_bytes(figure)
 
 
-def correlations_plot(found: Mapping[str, Mapping[str, tuple[float, float]]]) -> bytes:
+def correlations_plot(correlations: Mapping[str, Mapping[str, tuple[float, float]]]) -> bytes:
     """Draw the rank correlation of each metric with each parameter of a random design as bars."""
     with styled():
-        figure, panels = _panels(len(found), 2, 5.2, 1.0 + 0.34 * max(map(len, found.values())))
-        for axes, (metric, metric_correlations) in zip(panels.flat, found.items(), strict=False):
+        figure, panels = _panels(len(correlations), 2, 5.2, 1.0 + 0.34 * max(map(len, correlations.values())))
+        for axes, (metric, metric_correlations) in zip(panels.flat, correlations.items(), strict=False):
             ordered = sorted(metric_correlations, key=lambda name: abs(metric_correlations[name][0]))
             rho, error = np.array([metric_correlations[name] for name in ordered]).T
             colors = [_HIGH if r > 0 else _LOW for r in rho]

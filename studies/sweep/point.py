@@ -33,7 +33,7 @@ from ..metrics.scene import Scene
 from ..metrics.stars import STARS
 from ..metrics.telescope import TELESCOPE_METRICS
 from .compensation import compensated
-from .file import SweepFile
+from .file import Point, SweepFile
 from .store import PointResult, SweepPoint
 from .telescope_point import check_telescope_sweep, has_no_camera, point_metrics
 
@@ -69,7 +69,7 @@ class PointMeasurement:
         return metrics | {f"solved {name}": value for name, value in solved.items()}
 
 
-def point_configuration(sweep: SweepFile, parameters: dict[str, Any], seed: int, folder: Path) -> Configuration:
+def point_configuration(sweep: SweepFile, parameters: Point, seed: int, folder: Path) -> Configuration:
     """Return the configuration of one point; defaults stay open."""
     if not isinstance(sweep.base, dict):
         raise ConfigError(f"base = {sweep.base!r}: expected the content of the file; see load_sweep")

@@ -109,10 +109,10 @@ def _defined(metric: str) -> str:
     return f"{metric}: {text}{f' [{unit}]' if unit else ''}." if text else f"{metric}."
 
 
-def _budget_text(found: list[Budget]) -> str:
+def _budget_text(budgets: list[Budget]) -> str:
     """Return a sentence on the sum of the effects at each mark."""
     texts = []
-    for effects in found:
+    for effects in budgets:
         if np.isfinite(effects.together) and effects.total:
             apart = abs(effects.together - effects.total)
             # Equal within two standard errors, or a tenth for one replica.
@@ -125,8 +125,9 @@ def _budget_text(found: list[Budget]) -> str:
                 + ("they add, as far as this tells." if same else "they do not simply add.")
             )
     return (
-        f"{_defined(found[0].metric)} Its change at each named value of all parameters, one by one and together (grey, "
-        "with the standard error over the replicas). Independent errors add in their squares, which xi is made of. "
+        f"{_defined(budgets[0].metric)} Its change at each named value of all parameters, one by one and together "
+        "(grey, with the standard error over the replicas). Independent errors add in their squares, which xi is made "
+        "of. "
     ) + " ".join(texts)
 
 

@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ...core.errors import ConfigError, ProductError, cut_short
-from ...core.files import make_folder, partial_path, publish_new
+from ...core.files import make_folder, partial_path, plain_values, publish_new
 from ...core.long_work import differences
 from ...core.version import VERSION
-from .file import SweepFile, read_sweep
+from .file import Point, SweepFile, read_sweep
 
-#: Format of the tables; stores of other formats are refused.
-FORMAT = 1
+#: Format of the tables; stores of other formats are refused. In those of 1 the CCDs of the LSST were others.
+FORMAT = 2
 _TABLES = """
 CREATE TABLE about (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE points (number INTEGER PRIMARY KEY, parameters TEXT NOT NULL, seed INTEGER NOT NULL);
@@ -41,7 +41,7 @@ class SweepPoint:
     """A point to compute: its number, the values of its parameters, and the seed of its random numbers."""
 
     number: int
-    parameters: dict[str, Any]
+    parameters: Point
     seed: int
 
     @property
@@ -104,7 +104,8 @@ class SweepStore:
             self._connection = sqlite3.connect(path, timeout=30.0)
             about = dict(self._connection.execute("SELECT key, value FROM about"))
         if about.get("format") != str(FORMAT):
-            raise ProductError(f"store of format {about.get('format')}: expected {FORMAT}", file=path)
+            reason = "; those of 1 name the CCDs of the LSST as in a mirror (docs/camera.md): make it again"
+            raise ProductError(f"store of format {about.get('format')}: expected {FORMAT}{reason}", file=path)
         self.about = about
 
     def __enter__(self) -> SweepStore:
@@ -281,19 +282,8 @@ def check_same_sweep(store: SweepStore, sweep: StoredStudy) -> None:
 
 def exact_json(value: Any) -> str:
     """Return canonical JSON in which every double keeps all its digits; not-a-number becomes null."""
-    return json.dumps(
-        _null_if_not_finite(value), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
-    )
-
-
-def _null_if_not_finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(k): _null_if_not_finite(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_null_if_not_finite(v) for v in value]
-    if isinstance(value, float) and value - value != 0.0:
-        return None
-    return value
+    plain = plain_values(value, digits=None)
+    return json.dumps(plain, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
 def _point_result(number: int, metrics: str | None, problem: str | None, seconds: float, worker: str) -> PointResult:

@@ -39,11 +39,7 @@ class SweepOutcome:
 
 @check_arguments
 def run_sweep(
-    sweep: SweepFile,
-    path: str | os.PathLike[str],
-    *,
-    folder: Path | None = None,
-    execution: Execution | None = None,
+    sweep: SweepFile, path: str | os.PathLike[str], *, folder: Path | None = None, execution: Execution | None = None
 ) -> SweepOutcome:
     """Compute the missing points of a sweep.
 

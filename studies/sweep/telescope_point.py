@@ -9,65 +9,46 @@ from __future__ import annotations
 from copy import deepcopy
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ...core.errors import ConfigError, unknown_name
-from ...design.optimize.optimize import optimize
-from ...design.optimize.solver import LeastSquares
 from ...models.io.bundled import BUNDLED
 from ...models.io.prescription import load_telescope
 from ...models.parameters.changes import apply_changes, parse_change
 from ...models.telescope import Telescope
 from ...pipeline.config import Configuration, configuration_of
 from ..metrics.telescope import TELESCOPE_METRICS, TelescopeScene
-from .file import SweepFile
+from .compensation import solved_compensators
+from .file import Point, SweepFile
 
 #: Keys of the configuration that apply to a telescope without a camera.
 KEYS = ("telescope", "wavelengths_nm", "changes", "seed")
-#: Rings of pupil points for compensators.
-_RINGS = 4
-#: Relative precision of the mean square radius.
-_TOLERANCE = 1e-9
 
 
-def has_no_camera(sweep: SweepFile, parameters: dict[str, Any], folder: Path) -> bool:
+def has_no_camera(sweep: SweepFile, parameters: Point, folder: Path) -> bool:
     """Return whether the telescope of a point has no camera."""
     base = sweep.base if isinstance(sweep.base, dict) else {}
     name = parameters.get("telescope", base.get("telescope"))
     return isinstance(name, str) and _without_camera(_path(name, folder))
 
 
-def point_metrics(sweep: SweepFile, parameters: dict[str, Any], folder: Path, threads: int) -> dict[str, float]:
+def point_metrics(sweep: SweepFile, parameters: Point, folder: Path, threads: int) -> dict[str, float]:
     """Return the metrics of one point, compensators solved for the smallest spots."""
     telescope, config = point_telescope(sweep, parameters, folder)
     fields = None if sweep.fields_deg is None else np.deg2rad(sweep.fields_deg)
     waves = None if config.wavelengths_nm is None else np.array(config.wavelengths_nm) * 1e-9
-    solved = {}
+    solved: dict[str, float] = {}
     if sweep.compensators:
-        parsed_compensators = [parse_change(telescope, name, "compensators") for name in sweep.compensators]
-        optimum = optimize(
-            telescope,
-            [parameter for parameter, _ in parsed_compensators],
-            "spots",
-            fields,
-            waves,
-            n_pupil=_RINGS,
-            solver=LeastSquares(_TOLERANCE),
-            threads=threads,
-        )
-        telescope = optimum.telescope
-        for name, change, (_, size) in zip(sweep.compensators, optimum.changes, parsed_compensators, strict=True):
-            solved[f"solved {name}"] = float(change / size)
+        telescope, solved = solved_compensators(telescope, sweep.compensators, "spots", fields, waves, threads)
     scene = TelescopeScene(telescope, fields, waves, threads)
     metrics: dict[str, float] = {}
     for name in dict.fromkeys(sweep.metrics):
         metrics |= TELESCOPE_METRICS[name].compute(scene)
-    return metrics | solved
+    return metrics | {f"solved {name}": value for name, value in solved.items()}
 
 
-def point_telescope(sweep: SweepFile, parameters: dict[str, Any], folder: Path) -> tuple[Telescope, Configuration]:
+def point_telescope(sweep: SweepFile, parameters: Point, folder: Path) -> tuple[Telescope, Configuration]:
     """Return the telescope and the configuration of one point; other keys are an error."""
     content = deepcopy(sweep.base) if isinstance(sweep.base, dict) else {}
     for name, value in parameters.items():
@@ -83,7 +64,7 @@ def point_telescope(sweep: SweepFile, parameters: dict[str, Any], folder: Path) 
     return apply_changes(telescope, config.changes), config
 
 
-def check_telescope_sweep(sweep: SweepFile, parameters: dict[str, Any], folder: Path) -> None:
+def check_telescope_sweep(sweep: SweepFile, parameters: Point, folder: Path) -> None:
     """Check the names of metrics and compensators, and the values of one point."""
     for name in sweep.metrics:
         if name not in TELESCOPE_METRICS:

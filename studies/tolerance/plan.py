@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ...core.errors import ConfigError, error_context, unknown_name
 from ...design.optimize.geometry_operands import clear_radius
+from ...models.element_groups import element_groups
 from ...models.media.medium import abbe_number
 from ...models.parameters.changes import ANGLES, LENGTHS, parse_change
 from ...models.parameters.degrees_of_freedom import DegreeOfFreedom, DegreesOfFreedom, SurfaceDeformation
@@ -21,7 +22,6 @@ from ...models.shapes.polynomial import ZernikeSag
 from ...models.surface import Interaction
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import noll_to_nm
-from .elements import with_elements
 from .file import ToleranceFile, ToleranceSection
 
 #: Compound tolerances: two motions of one body each.
@@ -96,11 +96,12 @@ def tolerance_plan(file: ToleranceFile, telescope: Telescope) -> TolerancePlan:
 
 
 def _same_quantity(
-    found: dict[str, tuple[DegreeOfFreedom, Tolerance]], chosen: dict[str, tuple[DegreeOfFreedom, Tolerance]]
+    section_quantities: Mapping[str, tuple[DegreeOfFreedom, Tolerance]],
+    quantities: Mapping[str, tuple[DegreeOfFreedom, Tolerance]],
 ) -> set[str]:
-    """Return the names of chosen tolerances that are of the one parameter of a tolerance that was found."""
-    parameters = {tuple(freedom.of) for freedom, _ in found.values() if len(freedom.of) == 1}
-    return {name for name, (freedom, _) in chosen.items() if tuple(freedom.of) in parameters}
+    """Return the names of tolerances that are of the one parameter of a tolerance of a section."""
+    parameters = {tuple(freedom.of) for freedom, _ in section_quantities.values() if len(freedom.of) == 1}
+    return {name for name, (freedom, _) in quantities.items() if tuple(freedom.of) in parameters}
 
 
 def _common(file: ToleranceFile, telescope: Telescope, elements: tuple[str, ...]) -> Iterator[ToleranceSection]:
@@ -210,3 +211,23 @@ class _Maker:
             member = DegreeOfFreedom(f"{section.name} Z{j}", unit, {f"{name}.Z{j}": 1.0})
             zernike_terms[member.name] = (member, Tolerance(member.name, float(size), "normal"))
         return zernike_terms
+
+
+def with_elements(telescope: Telescope) -> tuple[Telescope, tuple[str, ...]]:
+    """Return the telescope with a group for each element, and the names of these groups.
+
+    Elements are those of :func:`~pachon.models.element_groups.element_groups`. The group of one is that which the
+    telescope has, or a new one: L1, L2...
+    """
+    groups = dict(telescope.groups)
+    group_names = {members: name for name, members in groups.items()}
+    names = []
+    for members in element_groups(telescope.surfaces, telescope.medium_before).values():
+        if members not in group_names:
+            used_names = {*groups, *telescope.surface_names}
+            group_names[members] = next(
+                name for i in range(1, len(used_names) + 2) if (name := f"L{i}") not in used_names
+            )
+            groups[group_names[members]] = members
+        names.append(group_names[members])
+    return replace(telescope, groups=groups), tuple(names)

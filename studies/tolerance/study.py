@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -150,17 +150,14 @@ def _numbers(
                 numbers[result.number] = _number(result)
 
         open_points = [p for p in points if p.number not in finished]
-        batches = [_batch(open_points[i : i + _BATCH], values) for i in range(0, len(open_points), _BATCH)]
+        groups = [tuple(open_points[i : i + _BATCH]) for i in range(0, len(open_points), _BATCH)]
+        batches = [Batch(group, values[[p.number for p in group]]) for group in groups]
         title = f"tolerances: {len(open_points)} telescopes, {_BATCH} at a time"
         labels = [batch.label for batch in batches]
         with execution.results(measured, labels, batches, title=title, save=save) as results:
             for _ in results:
                 pass
     return numbers
-
-
-def _batch(points: Sequence[SweepPoint], values: np.ndarray) -> Batch:
-    return Batch(tuple(points), values[[p.number for p in points]])
 
 
 def _number(result: PointResult) -> float:

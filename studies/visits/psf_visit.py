@@ -12,11 +12,11 @@ from ...core.errors import DomainError, error_context
 from ...core.progress import Reporter
 from ...core.units import ARCSEC
 from ...models.telescope import Telescope
-from ...pipeline.config import with_options
+from ...pipeline.config import PointingConfig, with_options
 from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_stage import fit_focal_plane_model
 from ...pipeline.resolved_values import resolved_value
-from ...pipeline.simulate.ccd_exposure import CcdExposure, ccd_bounds
+from ...pipeline.simulate.ccd_exposure import CcdExposure, ccd_outline
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_model import fit_ccd_model
 from ...pipeline.simulate.ccd_observation import Observation, collected_images, observe_ccd
@@ -90,8 +90,13 @@ class _CcdResult(NamedTuple):
 
 def visit_experiment(experiment: Experiment, visit: Visit) -> Experiment:
     """Return the experiment of a visit: own turbulence, residual aberration, noise and, where it has one, rotator."""
-    visit_config = with_options(experiment.config, atmosphere__epoch=visit.epoch, rotator_deg=visit.rotator_deg)
-    return Experiment.from_config(visit_config)
+    config = with_options(experiment.config, atmosphere__epoch=visit.epoch, rotator_deg=visit.rotator_deg)
+    if config.atmosphere.zenith_position_angle_deg is not None:
+        # The zenith stands still on the sky, while the telescope rolls.
+        aim = config.pointing or PointingConfig()
+        rolled = aim.model_copy(update={"position_angle_deg": float(np.rad2deg(visit.roll))})
+        config = config.model_copy(update={"pointing": rolled})
+    return Experiment.from_config(config)
 
 
 def visit_telescope(experiment: Experiment, visit: Visit) -> Telescope:
@@ -207,11 +212,8 @@ def _star_fields(
         if not len(stars):
             continue
         magnitude = magnitudes_at(points.quantile[stars], bright, faint)
-        bounds, turn = ccd_bounds(camera, name)
         fields[name] = StarField(
-            ccd_name=name,
-            bounds=bounds,
-            pixel_size=camera.pixel_size,
+            ccd=ccd_outline(camera, name),
             holdout=xy[places],
             observed=xy[stars],
             magnitude=magnitude,
@@ -220,7 +222,6 @@ def _star_fields(
             exposure=seconds,
             bright=bright,
             faint=faint,
-            turn=turn,
         )
         index[name] = np.concatenate([places, stars])
     return fields, index

@@ -18,6 +18,7 @@ from ...core.result import Result
 from ...core.units import ARCMIN, ARCSEC
 from ...measure.focal_plane_axes import draw_whisker_panels
 from ...measure.shapes import Shapes, measure_shapes
+from ...sky.sky_shapes import along_sky
 from .psf_visit import VisitPsfs
 
 if TYPE_CHECKING:
@@ -97,7 +98,20 @@ class PsfStack(Result):
         Those of the model.
     """
 
-    _table = ("xi", "eta", "star", "count", "e1", "e2", "size", "model_e1", "model_e2", "model_size")
+    _table = (
+        "xi",
+        "eta",
+        "star",
+        "count",
+        "e1",
+        "e2",
+        "size",
+        "model_e1",
+        "model_e2",
+        "model_size",
+        "e1_sky",
+        "e2_sky",
+    )
     _images = ("true", "model")
 
     visits: int
@@ -182,6 +196,23 @@ class PsfStack(Result):
         """True minus model ellipticity, second component."""
         return self.e2 - self.model_e2
 
+    @property
+    def e1_sky(self) -> np.ndarray:
+        """Ellipticity of the true PSF on the sky, > 0 from east to west."""
+        return self._along_sky()[0]
+
+    @property
+    def e2_sky(self) -> np.ndarray:
+        """Ellipticity of the true PSF on the sky, > 0 from north-west to south-east."""
+        return self._along_sky()[1]
+
+    def _along_sky(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ellipticities of the true PSF along west and north of the tangent plane."""
+        # The axes of the stack are those of the plane, turned and mirrored.
+        along_stack, plane = np.stack([self.x, self.y], axis=1), np.stack([-self.xi, self.eta], axis=1)
+        jacobian = np.linalg.lstsq(along_stack, plane, rcond=None)[0].T
+        return along_sky(self.e1, self.e2, np.broadcast_to(jacobian, (len(self), 2, 2)))
+
     def __len__(self) -> int:
         return len(self.xi)
 
@@ -200,6 +231,10 @@ class PsfStack(Result):
             {
                 name.upper(): (getattr(self, name) / scale if scale != 1.0 else getattr(self, name), unit, description)
                 for name, (scale, unit, description) in _COLUMNS.items()
+            }
+            | {
+                "E1_SKY": (self.e1_sky, "", "E1, E2 on the sky, > 0 from east to west"),
+                "E2_SKY": (self.e2_sky, "", "likewise, > 0 from north-west to south-east"),
             },
         )
         images = [image_hdu("TRUE", self.true, "true PSFs"), image_hdu("MODEL", self.model, "PSFs of the models")]

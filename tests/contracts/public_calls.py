@@ -76,7 +76,9 @@ class _Made:
 
     def make_donuts(self):
         tiny = {"stamps": pachon.Stamps(60, pixel_size=30e-6), "electrons": 1e6, "sky": 10.0}
-        air = pachon.Atmosphere.from_site("cerro_pachon", seed=2, screen_size=512, screen_length=40.0, exposure=0.1)
+        air = pachon.Atmosphere.from_site(
+            "cerro_pachon", seed=2, screens=pachon.ScreenSampling(screen_size=512, screen_length=40.0), exposure=0.1
+        )
         return pachon.draw_donuts(self.defocused, [(0.005, 0.005)], 622e-9, atmosphere=air, **tiny)
 
     def make_model(self):
@@ -131,8 +133,8 @@ class _Made:
         return pachon.DegreesOfFreedom.of_parameters(self.tel, ["M2.dz"])
 
     def make_air(self):
-        return pachon.Atmosphere.from_site("cerro_pachon", 1, exposure=0.5, time_step=0.5, screen_size=1024,
-                                           screen_length=560.0)  # fmt: skip
+        screens = pachon.ScreenSampling(screen_size=1024, screen_length=560.0)
+        return pachon.Atmosphere.from_site("cerro_pachon", 1, exposure=0.5, time_step=0.5, screens=screens)
 
     def make_correlation(self):
         return pachon.shear_correlation(**self.columns, min_sep=1e-3, max_sep=1e-1, n_bins=3)
@@ -186,17 +188,21 @@ def calls(folder):
     design = {"telescope": tel, "fields": on_axis, "projection": "zemax", "threads": 1}
     waves = design | {"wavelengths": [w], "wavelength_weights": [1.0]}
     mono = design | {"wavelength": w}
+    images = {"telescope": tel, "fields": on_axis, "wavelengths": [w], "threads": 1}
     one = {"telescope": tel, "wavelength": w, "projection": "zemax", "threads": 1}
-    no_fields = {k: v for k, v in one.items() if k != "fields"}
     pairs = m.columns | {"min_sep": 1e-3, "max_sep": 1e-1, "n_bins": 3, "exact": False}
     sizes = {"size": np.full(30, 1e-6), "model_e1": pairs["e1"] * 0.9, "model_e2": pairs["e2"] * 0.9,
              "model_size": np.full(30, 1.1e-6)}  # fmt: skip
     made = {
-        "fft_psf": (pachon.fft_psf, waves | {"pixel": 1e-6, "pixels": 16, "n_pupil": 48, "reference": "centroid"}),
-        "huygens_psf": (pachon.huygens_psf, waves | {"pixel": 1e-6, "pixels": 8, "sampling": "square", "n_pupil": 8,
-                                                     "reference": "centroid"}),
-        "encircled_energy": (pachon.encircled_energy, waves | {"kind": "geometric", "radii": [1e-6, 2e-6],
-                             "reference": "centroid", "sampling": "spiral", "pixels": 32, "n_pupil": 50}),
+        "fft_psf": (pachon.fft_psf, images | {"pixel": 1e-6, "pixels": 16, "n_pupil": 48,
+                    "reference": "centroid"}),
+        "huygens_psf": (pachon.huygens_psf, images | {"pixel": 1e-6, "pixels": 8,
+                        "sampling": "square", "n_pupil": 8, "reference": "centroid"}),
+        "encircled_energy": (pachon.encircled_energy, images | {"kind": "geometric",
+                             "radii": [1e-6, 2e-6], "reference": "centroid", "n_pupil": 50}),
+        "StarDefects": (pachon.StarDefects, {"second_stars": 0.1, "cosmic_rays": 0.1}),
+        "Requirements": (pachon.Requirements, {"tolerances": ["1 %"], "limits": ["spot rms < 10 um"]}),
+        "Reflectivity": (pachon.Reflectivity, {"lenses": {"L1_exit": 0.01}, "detector": 0.1}),
         "energy_curve": (pachon.energy_curve, {"image": m.stamps[0], "center": (7.0, 7.0), "parts": 2}),
         "mtf": (pachon.mtf, waves | {"n_pupil": 48}),
         "layout": (pachon.layout, mono),
@@ -215,7 +221,7 @@ def calls(folder):
                         "sampling": "rings", "n_pupil": 2}),
         "bar_target": (pachon.bar_target, {"pixels": 16, "bars": 2}),
         "target_image": (pachon.target_image, {"telescope": tel, "target": np.eye(4), "width": 1e-5,
-                         "field": (0.0, 0.0), "wavelengths": [w], "wavelength_weights": [1.0], "n_rays": 4,
+                         "field": (0.0, 0.0), "wavelengths": [w], "n_rays": 4,
                          "pixel": 1e-5, "pixels": 8, "projection": "zemax", "threads": 1}),
         "strehl": (pachon.strehl, design | {"wavelengths": [w], "from_psf": False, "sampling": "gauss", "n_pupil": 3}),
         "chromatic_sums": (pachon.chromatic_sums, {"telescope": tel, "wavelengths": [5e-7, w], "field": 0.005}),
@@ -224,13 +230,14 @@ def calls(folder):
         "noll_from_fringe": (pachon.noll_from_fringe, {"coefficients": [1e-9, 2e-9]}),
         "distortion": (pachon.distortion, mono | {"fields": 0.003 * np.eye(4, 2), "reference": "chief", "n_pupil": 3,
                        "sampling": "gauss"}),
-        "double_zernikes": (pachon.double_zernikes, no_fields | {"jmax": 6, "kmax": 3, "rings": 2, "n_pupil": 6,
-                            "field_radius": tel.field_radius, "pupil": "full", "sampling": "gauss"}),
+        "double_zernikes": (pachon.double_zernikes, {"telescope": tel, "wavelength": w, "jmax": 6, "kmax": 3,
+                            "rings": 2, "n_pupil": 6, "field_radius": tel.field_radius, "pupil": "full",
+                            "sampling": "gauss", "threads": 1}),
         "wavefront_zernikes": (pachon.wavefront_zernikes, mono | {"jmax": 6, "pupil": "full", "ordering": "noll",
                                "sampling": "gauss", "n_pupil": 6}),
         "footprint": (pachon.footprint, mono | {"surfaces": ["M2"], "sampling": "rings", "n_pupil": 3}),
-        "ghosts": (pachon.ghosts, {"telescope": m.lsst, "field": (0.0, 0.0), "wavelength": w, "reflectivity": 0.01,
-                   "detector_reflectivity": 0.1, "n_pupil": 400, "projection": "zemax", "threads": 1}),
+        "ghosts": (pachon.ghosts, {"telescope": m.lsst, "field": (0.0, 0.0), "wavelength": w,
+                   "reflectivity": pachon.Reflectivity(0.01), "n_pupil": 400, "projection": "zemax", "threads": 1}),
         "principal_rays": (pachon.principal_rays, mono),
         "spots": (pachon.spots, waves | {"sampling": "gauss", "n_pupil": 3, "reference": "centroid"}),
         "through_focus": (pachon.through_focus, waves | {"defocus": [-1e-5, 0.0, 1e-5], "sampling": "gauss",
@@ -334,7 +341,7 @@ def calls(folder):
                          "wavelength": 622e-9}),
         "draw_donuts": (pachon.draw_donuts, {"telescope": m.lsst, "fields": [(0.005, 0.005)],
                         "wavelengths": 622e-9, "model": pachon.DonutModel(air=pachon.DonutAir(fwhm=3e-6)),
-                        "electrons": 1e6, "sky": 10.0, "read_noise": 5.0, "second_stars": 0.0, "cosmic_rays": 0.0,
+                        "electrons": 1e6, "sky": 10.0, "read_noise": 5.0, "defects": pachon.StarDefects(),
                         "seed": 1, "stamps": pachon.Stamps(181)}),
         "fit_donuts": (pachon.fit_donuts, {"telescope": m.defocused, "images": m.donuts.images,
                        "fields": [(0.005, 0.005)], "wavelength": 622e-9, "pixel_size": 30e-6, "sky_variance": 10.0,
@@ -368,14 +375,19 @@ def calls(folder):
         "Surface.sag": (tel.surfaces[0].sag, {"x": x, "y": y}),
         "Surface.normal": (tel.surfaces[0].normal, {"x": x, "y": y}),
         "trace": (pachon.trace, {"telescope": tel, "rays": m.rays, "threads": 1, "out": pachon.trace(tel, m.rays)}),
-        "read_galaxies": (pachon.read_galaxies, {"path": m.folder / "none.fits", "pointing": (0.0, 0.0)}),
+        "read_galaxies": (pachon.read_galaxies, {"path": m.folder / "none.fits", "pointing": (0.0, 0.0),
+                          "convention": "galsim"}),
+        "to_sky": (pachon.to_sky, {"shapes": [[0.1, 0.0]], "x": [10.0], "y": [20.0],
+                   "wcs": pachon.wcs(m.lsst, "R22_S11", (0.0, 0.0), camera="lsst")}),
         "write_galaxies": (pachon.write_galaxies, {"path": m.folder / "galaxies.ecsv", "galaxies": m.galaxies}),
         "draw_galaxies": (pachon.draw_galaxies, {"region": ((-1e-4, 1e-4), (-1e-4, 1e-4)), "faintest": 24.0, "seed": 1,
                           "brightest": 20.0, "density": 1.0}),
         "check_baseline": (pachon.check_baseline, {"path": m.folder / "none.json", "threads": 1}),
         "assert_matches_baseline": (pachon.assert_matches_baseline, {"model": m.file, "threads": 1,
                                     "baseline": m.folder / "none.json"}),
-        "make_baseline": (pachon.make_baseline, {"model": str(m.folder / "none.yaml"), "folder": m.folder}),
+        "make_baseline": (pachon.make_baseline, {"model": str(m.folder / "none.yaml"), "folder": m.folder,
+                          "requirements": pachon.Requirements()}),
+        "Baseline.with_sources": (m.baseline.with_sources, {"sources": {"opd": "a peer"}}),
         "read_baseline": (pachon.read_baseline, {"path": m.folder / "none.json"}),
         "write_baseline": (pachon.write_baseline, {"path": m.folder / "b.json", "baseline": m.baseline}),
         "load_sweep": (pachon.load_sweep, {"path": m.folder / "none.yaml"}),
@@ -415,14 +427,13 @@ def calls(folder):
             {"images": [m.ccd_image], "weight_fwhm": 0.7 / 206265.0, "min_snr": 30.0},
         ),
         "draw_ccd": (pachon.draw_ccd, {"experiment": m.experiment, "ccd": "none", "galaxies": m.galaxies,
-                     "pointing": (0.0, 0.0), "position_angle": 0.0, "threads": 1}),
+                     "pointing": (0.0, 0.0), "threads": 1}),
         "fit_static_heights": (pachon.fit_static_heights, {"exposures": [], "telescope": tel, "steps": 1,
-                               "alignment_rms": 1e-7, "threads": 1}),
+                               "prior": pachon.OpticsPrior("simulated", 1e-7), "threads": 1}),
         "fields_at": (pachon.fields_at, {"telescope": tel, "positions": [(0.0, 0.0), (0.01, 0.0)], "wavelength": w,
                       "projection": "zemax", "threads": 1}),
-        "wavefront_opd": (pachon.wavefront_opd, one | {"field": (0.0, 0.0), "pupil": (x, y), "reference": "chief",
-                          "sphere_radius": 5.0}),
-        "wavefront_opds": (pachon.wavefront_opds, one | {"fields": on_axis, "grid": 8, "sphere_radius": 5.0}),
+        "wavefront_opd": (pachon.wavefront_opd, one | {"field": (0.0, 0.0), "pupil": (x, y), "reference": "chief"}),
+        "wavefront_opds": (pachon.wavefront_opds, one | {"fields": on_axis, "grid": 8}),
         "make_psfs": (pachon.make_psfs, {"telescope": tel, "fields": on_axis, "wavelengths": pachon.Light([w], [1.0]),
                       "engine": pachon.FastEngine(n_pupil=40), "stamps": pachon.Stamps(15), "atmosphere": None,
                       "threads": 1}),
@@ -575,9 +586,12 @@ def _methods(m, tel, w, x, y):
         "Telescope.surface": (tel.surface, {"name": "M2"}),
         "Telescope.check_wavelength": (tel.check_wavelength, {"wavelength": w}),
         "Telescope.check_field": (tel.check_field, {"tx": [0.0], "ty": [0.0]}),
-        "FocalPlanePsf.fit": (pachon.FocalPlanePsf.fit, {"stars": m.stars, "telescope": tel, "camera": "lsst",
-                              "wavelengths": [w],
-                              "pixel_size": 1e-5, "diffusion": 4e-6, "jitter": 0.0, "threads": 1}),
+        "FocalPlanePsf.fit": (pachon.FocalPlanePsf.fit, {"stars": m.stars, "camera": "lsst", "threads": 1,
+                              "telescope": pachon.Instrument.of(tel, [w], stamps=pachon.Stamps(jitter=1e-7))}),
+        "Instrument.of": (pachon.Instrument.of, {"telescope": tel, "wavelengths": pachon.Light([w], [1.0]),
+                          "camera": "lsst", "weight_fwhm": 3.4e-6}),
+        "OpticsPrior": (pachon.OpticsPrior, {"budget": "simulated", "alignment_rms": 1e-7}),
+        "Stamps.of_camera": (pachon.Stamps.of_camera, {"camera": "lsst", "size": 31, "jitter": 0.0}),
         "FocalPlaneStars.from_table": (pachon.FocalPlaneStars.from_table, {"table": m.table, "weight_fwhm": 3.4e-6}),
         "Correlation.within": (m.correlation.within, {"separations": "short"}),
         "Recipe": (pachon.Recipe, {"basis": pachon.Pixels(), "interpolation": pachon.Polynomial(1),
@@ -617,12 +631,16 @@ def _methods(m, tel, w, x, y):
                                    "terms": [4, 5, 6], "linear_fraction": 0.5}),
         "ResidualWavefront.opd": (m.aberration.opd, {**xy, "slopes": (0.0, 0.0)}),
         "Atmosphere.from_site": (pachon.Atmosphere.from_site, {"site": "cerro_pachon", "seed": 1, "r0": 0.1,
-                                 "outer_scale": 30.0, "exposure": 0.5, "time_step": 0.5, "screen_size": 1024,
-                                 "screen_length": 560.0, "fine_size": 3072, "fine_pixel": 0.014, "epoch": 0}),
+                                 "outer_scale": 30.0, "exposure": 0.5, "time_step": 0.5, "epoch": 0,
+                                 "screens": pachon.ScreenSampling(1024, 560.0)}),
+        "ScreenSampling": (pachon.ScreenSampling, {"screen_size": 1024, "screen_length": 560.0, "fine_size": 3072,
+                           "fine_pixel": 0.014, "cutoff": 8.75, "fixed_modulus": False}),
+        "Site.with_layers": (pachon.load_site("cerro_pachon").with_layers, {"altitudes": [0.0, 1e3],
+                             "weights": [0.5, 0.5], "wind_speeds": [5.0, 10.0], "wind_directions": [0.0, 1.0]}),
         "Atmosphere.at_times": (m.air.at_times, {"times": [0.25, 0.75], "exposure": 1.0}),
         "Request.of": (pachon.Request.of, {"telescope": tel, "fields": np.zeros((1, 2)), "wavelengths": [w],
                        "wavelength_weights": [1.0], "sampling": "gauss", "n_pupil": 3, "projection": "zemax",
-                       "threads": 1, "aiming": "off", "one_wavelength": True}),
+                       "threads": 1, "one_wavelength": True}),
         "CcdImage.read": (pachon.CcdImage.read, {"path": m.folder / "none.fits"}),
     }  # fmt: skip
     return out

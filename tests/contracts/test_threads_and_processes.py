@@ -24,8 +24,8 @@ def telescope():
 
 @cache
 def air():
-    site = {"screen_size": 256, "screen_length": 25.6, "exposure": 0.1}
-    return pachon.Atmosphere.from_site("cerro_pachon", seed=2, **site)
+    screens = pachon.ScreenSampling(screen_size=256, screen_length=25.6)
+    return pachon.Atmosphere.from_site("cerro_pachon", seed=2, exposure=0.1, screens=screens)
 
 
 def traced():

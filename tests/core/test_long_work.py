@@ -229,7 +229,7 @@ def test_a_reporter_ends_the_work():
 
 @pytest.mark.parametrize("name", ["workers", "threads", "resume", "reporter"])
 def test_a_field_of_the_execution_is_no_argument(name, tmp_path):
-    text = rf"^{name}: expected within execution, as execution=Execution\({name}=\.\.\.\)$"
+    text = rf"^{name}: no argument of run; expected execution=Execution\({name}=\.\.\.\)$"
     with pytest.raises(ConfigError, match=text):
         pachon.run(pachon.Configuration(), tmp_path / "run", **{name: None})
 

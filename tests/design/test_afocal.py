@@ -123,7 +123,6 @@ def test_what_needs_an_image_is_refused():
         "a PSF": lambda: pachon.make_psfs(telescope, [[0.0, 0.0]], [LIGHT]),
         "a relative illumination": lambda: pachon.relative_illumination(telescope),
         "a map of ghosts": lambda: pachon.ghosts(telescope),
-        "a sphere_radius": lambda: pachon.wavefront_opd(telescope, (0.0, 0.0), LIGHT, sphere_radius=1.0),
         "a focal plane": lambda: pachon.wavefront_opd(
             telescope, (0.0, 0.0), LIGHT, focal_plane=pachon.FocalPlane.flat("lsst")
         ),

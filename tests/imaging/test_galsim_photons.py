@@ -298,7 +298,8 @@ def test_an_image_is_drawn_through_the_telescope(lsst_r, wcs):
     pupil = (radius * np.cos(angle), radius * np.sin(angle))
     rays = pachon.trace(lsst_r, pachon.launch_rays(lsst_r, op.field, 624e-9, pupil))
     chief = pachon.trace(lsst_r, pachon.launch_rays(lsst_r, op.field, 624e-9, ([0.0], [0.0])))
-    coma = (rays.position[~rays.vignetted].mean(axis=0) - chief.position[0])[:2] / 10e-6
+    # x and y of the pixels are y and x of the telescope.
+    coma = (rays.position[~rays.vignetted].mean(axis=0) - chief.position[0])[1::-1] / 10e-6
     # Four standard deviations of 2e5 photons.
     assert np.abs(centre - 23.0 - coma).max() < 4 * 1.52 / math.sqrt(2e5)
     assert np.abs(coma).max() > 0.05
@@ -356,6 +357,8 @@ def test_a_configuration_file_draws_a_ccd(tmp_path):
     path = Path(__file__).parents[2] / "docs" / "examples" / "galsim_lsst_ccd.yaml"
     [config] = galsim.config.ReadConfig(str(path))
     side = {"type": "Random", "min": 1, "max": 200}
+    for key in ("xsize", "ysize"):
+        del config["image"][key]
     config["image"].update(size=200, nobjects=6, image_pos={"type": "XY", "x": side, "y": side}, noise=None)
     config["image"]["sky_level_pixel"] = 0.0
     del config["image"]["noise"]

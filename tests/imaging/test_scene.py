@@ -20,6 +20,7 @@ from pachon.measure.shapes import measure_shapes
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
 from pachon.sky.galaxies import Galaxies
+from pachon.sky.pointing import Pointing
 
 POINTING, ROLL = (0.3, 0.2), 0.7
 STAMP = Stamp("ab" * 32, 7)
@@ -38,7 +39,7 @@ def two_galaxies(xi, eta):
 @pytest.fixture(scope="module")
 def stars(small_run):
     """Scene of stars alone on the whole CCD."""
-    return draw_ccd(small_run, "R22_S11", nothing, pointing=POINTING, position_angle=ROLL)
+    return draw_ccd(small_run, "R22_S11", nothing, pointing=Pointing(*POINTING, ROLL))
 
 
 @pytest.fixture(scope="module")
@@ -47,8 +48,7 @@ def image(small_run):
         small_run,
         "R22_S11",
         two_galaxies,
-        pointing=POINTING,
-        position_angle=ROLL,
+        pointing=Pointing(*POINTING, ROLL),
         window=Window(1500, 1500, 900, 800),
         exposure=Exposure("r", 2.0, 3),
     )
@@ -59,15 +59,16 @@ def test_stars_are_their_own_psfs_times_their_electrons(stars, small_run):
     field = ccd_stars(small_run, "R22_S11", 0.7 * ARCSEC)
     pixels = np.stack([stars.objects["X"], stars.objects["Y"]], axis=1)
     center = small_run.camera.centers[small_run.camera.ccd_index("R22_S11")]
-    assert np.allclose((field.observed - center) / 10e-6 + 2047.5, pixels, rtol=0, atol=1e-6)
+    # The pixels' x and y run along y and x of the focal plane.
+    assert np.allclose((field.observed - center)[:, ::-1] / 10e-6 + [2047.5, 2001.5], pixels, rtol=0, atol=1e-6)
     nearest = np.rint(pixels).astype(int)
-    psfs = expose_positions(small_run, field.observed, room=STAR_ROOM, offsets=pixels - nearest)
+    psfs = expose_positions(small_run, field.observed, room=STAR_ROOM, offsets=(pixels - nearest)[:, ::-1])
     checked = 0
     for i, (x, y) in enumerate(nearest):
         far = np.abs(nearest - (x, y)).max(axis=1) > 130
-        if min(x, y) < 63 or max(x, y) > 4096 - 64 or far.sum() < len(far) - 1:
+        if min(x, y) < 63 or max(x, y) > 4004 - 64 or far.sum() < len(far) - 1:
             continue
-        expected = psfs.image[i] * stars.objects["FLUX"][i]
+        expected = psfs.image[i].T * stars.objects["FLUX"][i]
         drawn = stars.electrons[y - 63 : y + 64, x - 63 : x + 64]
         assert np.abs(drawn - expected).max() < 1e-6 * expected.max()
         checked += 1
@@ -91,7 +92,7 @@ def test_header_and_table_place_stars_where_they_are(stars):
     brightest = np.argsort(objects["MAG"])
     for i in brightest[:5]:
         x, y = np.rint(pixels[i]).astype(int)
-        if min(x, y) >= 16 and max(x, y) < 4080:
+        if min(x, y) >= 16 and max(x, y) < 3988:
             stamp = image.image[y - 15 : y + 16, x - 15 : x + 16].astype(np.float64)[None]
             found = measure_shapes(stamp, 0.2 * ARCSEC, 0.7 * ARCSEC)
             assert np.hypot(x + found.x[0] - pixels[i, 0], y + found.y[0] - pixels[i, 1]) < 0.1

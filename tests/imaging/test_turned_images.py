@@ -12,6 +12,7 @@ from pachon.imaging.scene import STAR_ROOM, draw_ccd
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
 from pachon.sky.galaxies import Galaxies
+from pachon.sky.pointing import Pointing
 
 POINTING, ROLL = (0.3, 0.2), 0.7
 ARCSEC = np.pi / 648000
@@ -69,7 +70,7 @@ def test_moments_of_stamps_turn_with_the_ccd(small_run, angle):
 def test_stars_of_a_turned_ccd_are_those_of_make_psfs(small_run, angle):
     run = on_camera(small_run, angle)
     scene = draw_ccd(
-        run, "A", lambda xi, eta: Galaxies.concatenate([]), pointing=POINTING, position_angle=ROLL
+        run, "A", lambda xi, eta: Galaxies.concatenate([]), pointing=Pointing(*POINTING, ROLL)
     )  # fmt: skip
     assert scene.electrons.shape == (1200, 2000)
     field = ccd_stars(run, "A", 0.7 * ARCSEC)
@@ -120,7 +121,7 @@ def test_a_galaxy_lies_where_the_header_says_and_keeps_its_light(small_run):
     def galaxy(xi, eta):
         return Galaxies.single([np.mean(xi)], [np.mean(eta)], [18.0], [0.4 * ARCSEC], e1=[0.4], e2=[0.0])
 
-    scene = draw_ccd(run, "A", galaxy, pointing=POINTING, position_angle=ROLL, window=Window(500, 100, 1000, 1000))
+    scene = draw_ccd(run, "A", galaxy, pointing=Pointing(*POINTING, ROLL), window=Window(500, 100, 1000, 1000))
     image = scene.exposed(replace(scene.exposure, noise=False))
     row = np.flatnonzero(~image.objects["STAR"])[0]
     at = image.wcs.all_world2pix([[image.objects["RA"][row], image.objects["DEC"][row]]], 0)[0]

@@ -20,8 +20,10 @@ RA, DEC, ROLL = 1.0, -0.5, 0.4
 CCDS = ("R22_S11", "R24_S12", "R41_S20")
 #: Pixels that are not those of the fit, the very corners among them.
 PIXELS = np.concatenate(
-    [np.random.default_rng(2).uniform(-0.5, 4095.5, (40, 2)), [[-0.5, -0.5], [4095.5, -0.5], [-0.5, 4095.5]]]
+    [np.random.default_rng(2).uniform(-0.5, 3999.5, (40, 2)), [[-0.5, -0.5], [4071.5, -0.5], [-0.5, 3999.5]]]
 )
+#: Pixels along x and y of CCDs of ITL, and of E2V.
+SIZES = {"itl": (4072, 4000), "e2v": (4096, 4004)}
 
 
 @pytest.fixture(
@@ -52,10 +54,16 @@ def celestial(slopes):
     return np.stack([np.arctan2(source[:, 1], source[:, 0]), np.arcsin(source[:, 2])], axis=1)
 
 
+def places(ccd):
+    """Places of the pixels on the detector [m]: the pixels' x runs along y of the telescope, their y along x."""
+    index = CAMERA.ccd_index(ccd)
+    from_middle = PIXELS - 0.5 * (np.array(SIZES[CAMERA.vendors[index]]) - 1)
+    return CAMERA.centers[index] + from_middle[:, ::-1] * CAMERA.pixel_size
+
+
 def traced(telescope, ccd):
     """Celestial coordinates [rad] of the pixels, by chief rays."""
-    positions = CAMERA.centers[CAMERA.ccd_index(ccd)] + (PIXELS - 2047.5) * CAMERA.pixel_size
-    return celestial(fields_at(telescope, positions, projection="gnomonic"))
+    return celestial(fields_at(telescope, places(ccd), projection="gnomonic"))
 
 
 def separation(a, b):
@@ -130,16 +138,22 @@ def test_jacobians_are_derivatives(wcs):
         assert np.allclose(wcs.jacobians(PIXELS)[:, :, axis], slope, rtol=1e-6, atol=1.0)
 
 
-def test_at_no_roll_east_lies_towards_smaller_x_and_north_towards_smaller_y(lsst_r):
-    # Light of a source in the north travels towards -y, and lands there: the focal plane is an image turned by half.
+def test_at_no_roll_east_lies_towards_smaller_y_and_north_towards_smaller_x(lsst_r):
+    # Light of a source in the north travels towards -y of the telescope, along which the pixels' x runs.
     cd = ccd_wcs(lsst_r, CAMERA, "R22_S11").cd / ARCSEC
+    assert np.allclose(cd, [[0.0, -0.2], [-0.2, 0.0]], atol=1e-3)
+
+
+def test_pixels_of_a_camera_that_is_not_transposed_are_a_mirror_image(lsst_r):
+    square = pachon.Camera("square", ("A",), (), np.array([-1]), np.zeros((1, 2)), np.array([400, 400]), 10e-6)
+    cd = ccd_wcs(lsst_r, square, "A").cd / ARCSEC
     assert np.allclose(cd, [[-0.2, 0.0], [0.0, -0.2]], atol=1e-3)
 
 
 def test_the_header_of_a_part_starts_at_its_corner(wcs):
     whole, part = wcs.astropy(), wcs.astropy((100, 300))
     assert np.allclose(part.all_pix2world([[5, 7]], 0), whole.all_pix2world([[105, 307]], 0), rtol=0, atol=1e-12)
-    assert part.pixel_shape == (3996, 3796)
+    assert part.pixel_shape == (3996, 3704)
 
 
 def test_quantities_are_angles(lsst_r, wcs):
@@ -173,8 +187,7 @@ def test_the_wcs_of_astropy_is_within_a_milliarcsecond_of_the_tracer(name):
     light = telescope.wavelength_range[1]
     aim = SkyCoord(np.rad2deg(RA), np.rad2deg(DEC), unit="deg")
     wcs = pachon.wcs(telescope, "R22_S20", aim, ROLL * u.rad, camera="lsst", wavelength=light)
-    positions = CAMERA.centers[CAMERA.ccd_index("R22_S20")] + (PIXELS - 2047.5) * CAMERA.pixel_size
-    expected = celestial(fields_at(telescope, positions, light, projection="gnomonic"))
+    expected = celestial(fields_at(telescope, places("R22_S20"), light, projection="gnomonic"))
     assert separation(np.deg2rad(wcs.all_pix2world(PIXELS, 0)), expected) < 1e-3 * ARCSEC
 
 
@@ -189,12 +202,12 @@ def test_a_wcs_survives_a_fits_file(lsst_r, tmp_path):
 def test_the_camera_lies_at_the_rotation_less_the_rotator(lsst_r):
     rotator = 0.25
     wcs = pachon.wcs(lsst_r.with_rotator(rotator), "R22_S11", (RA, DEC), ROLL)
-    middle, above = wcs.pixel_to_world([2047.5, 2047.5], [2047.5, 2147.5])
-    # The image is turned by half: its +y is away from the camera's +y on the sky.
-    towards = middle.position_angle(above).rad - np.pi
+    middle, right = wcs.pixel_to_world([2047.5, 2147.5], [2001.5, 2001.5])
+    # The pixels' x runs along the camera's y, and the image is turned by half: away from the camera's +y on the sky.
+    towards = middle.position_angle(right).rad - np.pi
     # Over 20 arcsec the direction changes by the distortion of the pixels, 1e-6.
     assert np.isclose((towards - (ROLL - rotator) + np.pi) % (2 * np.pi) - np.pi, 0.0, atol=1e-5)
-    assert np.linalg.det(wcs.wcs.cd) > 0.0
+    assert np.linalg.det(wcs.wcs.cd) < 0.0
 
 
 def test_a_telescope_without_camera_is_one_line():

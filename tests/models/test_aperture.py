@@ -113,6 +113,30 @@ def test_a_polygon_that_crosses_itself_is_refused(corners):
         Polygon(tuple((float(x), float(y)) for x, y in corners))
 
 
+def test_of_many_edges_the_first_pair_that_meets_is_named():
+    def segments_meet(a, b, c, d):
+        (ux, uy), (vx, vy) = b - a, d - c
+        s, t = np.linalg.solve([[ux, -vx], [uy, -vy]], c - a)
+        return 0 <= s <= 1 and 0 <= t <= 1
+
+    rng = np.random.default_rng(4)
+    for _ in range(5):
+        angle = np.sort(rng.random(60)) * 2 * np.pi
+        outline = (1.0 + 0.3 * rng.random((60, 1))) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        Polygon(tuple(map(tuple, outline.tolist())))
+        swapped = rng.integers(58)
+        outline[[swapped, swapped + 2]] = outline[[swapped + 2, swapped]]
+        following = np.roll(outline, -1, axis=0)
+        i, j = next(
+            (i, j)
+            for i in range(60)
+            for j in range(i + 2, 60 - (i == 0))
+            if segments_meet(outline[i], following[i], outline[j], following[j])
+        )
+        with pytest.raises(PrescriptionError, match=rf"edge {i + 1}, from .* meets edge {j + 1}, from"):
+            Polygon(tuple(map(tuple, outline.tolist())))
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from pachon.core.errors import PrescriptionError, UnknownNameError
-from pachon.models.io.site_file import DATA, load_site, site_names
+from pachon.models.io.site_file import BUNDLED, DATA, load_site
 
 TEXT = (DATA / "cerro_pachon.yaml").read_text()
 DOCS = Path(__file__).parents[2] / "docs"
@@ -23,7 +23,7 @@ def test_cerro_pachon_has_the_figures_of_the_paper():
     assert max(site.wind_speeds) == site.wind_speeds[-1] == 20.0
     assert list(site.wind_speeds) == sorted(site.wind_speeds)
     assert (site.weather.pressure_mmhg, site.weather.temperature_c, site.weather.water_vapour_mmhg) == (520, 5, 8)
-    assert site_names() == ("cerro_pachon", "cerro_tololo", "maunakea")
+    assert BUNDLED == ("cerro_pachon", "cerro_tololo", "maunakea")
     assert site.wind_directions == (None,) * 6
 
 

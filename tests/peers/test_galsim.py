@@ -3,6 +3,7 @@
 import importlib.util
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from pachon.measure.shapes import fwhm
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
+from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
 
 galsim = pytest.importorskip("galsim")
 
@@ -34,12 +36,10 @@ def test_screens_have_the_structure_function_of_galsims_von_karman_profile():
     air = Atmosphere.from_site(
         "cerro_pachon",
         4,
-        screen_size=1024,
-        screen_length=163.84,
+        screens=ScreenSampling(
+            screen_size=1024, screen_length=163.84, fine_size=1024, fine_pixel=0.02, fixed_modulus=True
+        ),
         exposure=5.0,
-        fine_size=1024,
-        fine_pixel=0.02,
-        fixed_modulus=True,
     )
     profile = galsim.VonKarman(lam=500.0, r0_500=0.16, L0=25.0)
     layers = range(air.layer_count)
@@ -57,9 +57,10 @@ def test_screens_have_the_structure_function_of_galsims_von_karman_profile():
 def test_screens_are_as_strong_as_galsims_screens(study):
     """Both draw the modes up to GalSim's own cut-off, 0.2/r0 cycles a metre; only the random numbers differ."""
     size = 1024
-    options = {"screen_size": size, "screen_length": 162.5, "exposure": 5.0}
-    theirs = study.galsim_layers(Atmosphere.from_site("cerro_pachon", 4, **options), 4)
-    air = Atmosphere.from_site("cerro_pachon", 4, cutoff=2.0 * math.pi * theirs[0].kmax, **options)
+    screens = ScreenSampling(screen_size=size, screen_length=162.5)
+    theirs = study.galsim_layers(Atmosphere.from_site("cerro_pachon", 4, exposure=5.0, screens=screens), 4)
+    screens = replace(screens, cutoff=2.0 * math.pi * theirs[0].kmax)
+    air = Atmosphere.from_site("cerro_pachon", 4, exposure=5.0, screens=screens)
     u, v = np.meshgrid(*[np.arange(size) * air.screen_pixel] * 2)
     for layer in range(air.layer_count):
         ours = air.low_screen(layer, "samples").astype(float)
@@ -73,8 +74,8 @@ def test_screens_are_as_strong_as_galsims_screens(study):
 @pytest.mark.slow
 def test_stars_through_galsims_own_screens(study):
     """Light through the same air at the same time: any slip of sign, axis, wind or height would show."""
-    options = {"screen_size": 1024, "screen_length": 162.5, "exposure": 5.0, "time_step": 0.01}
-    air = Atmosphere.from_site("cerro_pachon", 4, **options)
+    screens = ScreenSampling(screen_size=1024, screen_length=162.5)
+    air = Atmosphere.from_site("cerro_pachon", 4, exposure=5.0, time_step=0.01, screens=screens)
     fields = study.FIELD * np.array([[0.0, 0.0], [1.0, 0.3], [-0.7, 0.8], [0.2, -1.0], [-0.9, -0.6], [0.6, 0.9]])
     layers = study.galsim_layers(air, 4)
     photons = 500_000

@@ -103,12 +103,12 @@ def test_stars_lie_on_a_ccd_at_any_angle(tmp_path):
         assert (np.abs(camera.to_uv(i, stars.holdout)).max(axis=0) > 0.97).all()
         assert camera.depth(i, *stars.observed.T).min() > 22 * 15e-6 * (1 - 1e-9)
         # Pixels of the star field are those of the CCD, two pixels of rim less, counted along one of its axes.
-        pixel, own = stars.to_pixel(stars.observed), camera.to_pixel(i, stars.observed)
+        pixel, own = stars.ccd.to_pixel(stars.observed), camera.to_pixel(i, stars.observed)
         quarter = round(camera.rotation_deg[i] / 90) % 4
         nx = camera.pixels[i, 0]
         expected = own if quarter == 0 else np.stack([own[:, 1], nx - 1 - own[:, 0]], axis=1)
         assert np.allclose(pixel, expected - 2, rtol=0, atol=1e-6)
-        (x0, x1, y0, y1), (bx0, bx1, by0, by1) = stars.extent, camera.bounds([i])
+        (x0, x1, y0, y1), (bx0, bx1, by0, by1) = stars.ccd.extent, camera.bounds([i])
         assert bx0 < x0 < stars.holdout[:, 0].min()
         assert stars.holdout[:, 0].max() < x1 < bx1
         assert by0 < y0 < stars.holdout[:, 1].min()

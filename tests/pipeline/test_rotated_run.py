@@ -47,14 +47,14 @@ def test_whole_turns_change_no_bit(mean_air):
 def test_field_angles_are_the_telescopes_and_pixels_the_cameras(mean_air):
     # Shifting M2 the other way round is turning the camera; the zenith too stands still in the telescope frame.
     air = {"atmosphere__zenith_angle_deg": 50.0, "atmosphere__screen_length_m": 1300.0}
-    turned = expose_positions(mean_air(**QUARTER, **air, atmosphere__parallactic_angle_deg=20.0), POSITIONS, 1)
-    still = mean_air(shift=(-900.0, -400.0), atmosphere__parallactic_angle_deg=-70.0, **air)
+    turned = expose_positions(mean_air(**QUARTER, **air, atmosphere__zenith_position_angle_deg=70.0), POSITIONS, 1)
+    still = mean_air(shift=(-900.0, -400.0), atmosphere__zenith_position_angle_deg=160.0, **air)
     expected = expose_positions(still, POSITIONS, 1)
     # Images are float32.
     assert np.abs(turned.image - expected.image).max() < 1e-6 * expected.image.max()
     x, y = expected.fields.T
     np.testing.assert_allclose(turned.fields, np.stack([-y, x], axis=1), atol=1e-12)
-    unlike = expose_positions(mean_air(atmosphere__parallactic_angle_deg=20.0, **air), POSITIONS, 1)
+    unlike = expose_positions(mean_air(atmosphere__zenith_position_angle_deg=70.0, **air), POSITIONS, 1)
     assert np.abs(unlike.image - expected.image).max() > 0.01 * expected.image.max()
 
 
@@ -62,7 +62,7 @@ def test_the_ideal_telescope_has_the_rotator_too(mean_air):
     air = {"atmosphere__zenith_angle_deg": 50.0, "atmosphere__screen_length_m": 1300.0}
     one, other = (
         dataclasses.replace(mean_air(**options, **air), atmosphere_only=True)
-        for options in (QUARTER, {"atmosphere__parallactic_angle_deg": -90.0})
+        for options in (QUARTER, {"atmosphere__zenith_position_angle_deg": 180.0})
     )
     images = [expose_positions(e, POSITIONS, 1).image for e in (one, other)]
     # The dispersion of 0.5 arcsec points to -y of the rotated camera; of the ideal telescope nothing else is left.

@@ -103,7 +103,8 @@ def test_columns_of_other_names_are_mapped(tmp_path, telescope, places, magnitud
 
 
 def test_stars_that_are_left_out_are_counted(tmp_path, telescope):
-    center, half = CAMERA.centers[CAMERA.ccd_index("R22_S11")], CAMERA.half_sizes[0, 0]
+    # 4004 pixels of 10 um along x.
+    center, half = CAMERA.centers[CAMERA.ccd_index("R22_S11")], 20.02e-3
     rim = half - (RIM - 0.5) * CAMERA.pixel_size
     inside = half - (RIM + 0.5) * CAMERA.pixel_size
     offsets = np.array([[0, 0], [0, 0], [0, 0], [np.nan, 0], [rim, 0], [inside, 0], [0.0211, 0], [0, 0]])
@@ -408,8 +409,7 @@ def test_images_have_the_stars_of_the_catalogue(catalogue, sky, places):
             experiment,
             "R22_S11",
             pachon.Galaxies.single([], [], [], []),
-            pointing=(AIM.ra, AIM.dec),
-            position_angle=AIM.position_angle,
+            pointing=AIM,
             window=pachon.Window(1500, 1500, 1200, 1200),
         )
     found = np.stack([scene.objects["RA"], scene.objects["DEC"]], axis=1)

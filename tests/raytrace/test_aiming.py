@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import root
 
 import pachon
-from pachon.core.errors import DomainError, PrescriptionError
+from pachon.core.errors import ConfigError, DomainError, PrescriptionError
 from pachon.models.design_data import DesignData
 from pachon.models.io.prescription import load_telescope
 from pachon.raytrace.aiming import stop_of
@@ -139,7 +139,11 @@ def test_a_stop_that_cannot_be_found_is_said(wide):
     with pytest.raises(PrescriptionError, match="aiming = 'true': expected one of off, paraxial, real"):
         wide.with_design(aiming="true")
     with pytest.raises(PrescriptionError, match="aiming = 'paraxial': expected a surface that is the stop"):
-        pachon.Request.of(pachon.load_telescope("auxtel"), aiming="paraxial")
+        pachon.load_telescope("auxtel").with_design(aiming="paraxial")
+    with pytest.raises(
+        ConfigError, match=r"aiming: no argument of Request\.of; expected telescope=telescope\.with_des"
+    ):
+        pachon.Request.of(wide, aiming="paraxial")
 
 
 @pytest.mark.long

@@ -46,7 +46,7 @@ def test_joint_fits_find_a_misaligned_telescope(focused):
     assert fit.chi2.max() < 1e-3 * fit.n_pixels.min()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_rims_near_the_image_move_with_the_telescope(focused):
     """At 1.9 degrees decentres of M2 and camera, whose coma cancels, shift the shadows of the camera's rims."""
     fields = np.deg2rad([(1.34, 1.34), (-1.5, -1.15)])

@@ -6,7 +6,7 @@ from astropy import units as u
 from astropy.table import MaskedColumn, Table
 from astropy.wcs import WCS
 
-from pachon.core.errors import DomainError, ProductError
+from pachon.core.errors import ConfigError, DomainError, ProductError
 from pachon.core.units import ARCMIN, ARCSEC
 from pachon.sky.catalogue import read_galaxies, tangent_plane, write_galaxies
 from pachon.sky.galaxies import Galaxies
@@ -52,7 +52,7 @@ def test_units_of_the_file_are_honoured(tmp_path):
     table.remove_column("half_light_radius")
     table["xi"], table["eta"] = table["xi"] * u.deg, table["eta"] * u.arcmin
     for ending in ("ecsv", "fits"):
-        galaxies = read_galaxies(save(table, tmp_path / f"units.{ending}"))
+        galaxies = read_galaxies(save(table, tmp_path / f"units.{ending}"), convention="tangent_plane")
         assert np.allclose(galaxies.xi, np.deg2rad([1e-4, 2e-4, -3e-4]))
         assert np.allclose(galaxies.eta, np.array([0.0, 1e-4, 2e-4]) * ARCMIN)
         assert np.allclose(galaxies.radius, np.array([0.3, 0.2, 0.1]) * ARCSEC)
@@ -66,6 +66,26 @@ def test_axis_ratio_and_position_angle(tmp_path):
     galaxies = read_galaxies(path)
     assert np.allclose(galaxies.e1, [-1 / 3, 1 / 3, 0.0], atol=1e-15)
     assert np.allclose(galaxies.e2, [0.0, 0.0, 0.6], atol=1e-15)
+
+
+def test_ellipticities_of_a_catalogue_are_in_a_named_convention(tmp_path):
+    # Elongated from north-west to south-east: position angle 135 degrees.
+    at_135 = read_galaxies(save(base(q=[0.6 / 1.4] * 3, pa=[135.0] * 3), tmp_path / "pa.ecsv"))
+    path = save(base(e1=[0.0] * 3, e2=[0.4] * 3), tmp_path / "e.ecsv")
+    galsim, ours = (read_galaxies(path, convention=name) for name in ("galsim", "tangent_plane"))
+    assert np.allclose(galsim.e2, at_135.e2, rtol=0, atol=1e-15)
+    assert np.array_equal(ours.e2, -galsim.e2)
+    assert np.array_equal(ours.e1, galsim.e1)
+
+
+def test_an_unknown_convention_is_asked_for(tmp_path):
+    path = save(base(e1=[0.1] * 3, e2=[0.0, 0.0, 0.1]), tmp_path / "e.ecsv")
+    with pytest.raises(DomainError, match=r"e\.ecsv: column 'e2' without a convention: expected convention = galsim"):
+        read_galaxies(path)
+    with pytest.raises(ConfigError, match=r"convention = .*des.*: expected .*galsim"):
+        read_galaxies(path, convention="des")
+    # Round galaxies, and those along north or east, are the same in both.
+    assert read_galaxies(save(base(e1=[0.1] * 3, e2=[0.0] * 3), tmp_path / "east.ecsv")).e1[0] == 0.1
 
 
 def test_positions_on_the_sky_are_those_of_a_tangent_wcs(tmp_path):
@@ -130,7 +150,7 @@ def without(name):
 def test_tables_with_something_wrong(tmp_path, table, error, text):
     path = save(table, tmp_path / "wrong.ecsv")
     with pytest.raises(error, match=text) as caught:
-        read_galaxies(path)
+        read_galaxies(path, convention="tangent_plane")
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
 

@@ -14,7 +14,7 @@ from pachon.pipeline.config import load_configuration
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.simulate.ccd_exposure import CcdExposure, NoiseFreeStars
 from pachon.pipeline.simulate.ccd_observation import Observation
-from pachon.pipeline.simulate.star_field import make_star_field
+from pachon.pipeline.simulate.star_field import CcdOutline, Depth, make_star_field
 from pachon.reconstruction.psf_model.polynomial import mapped
 from pachon.studies.psf_choice.plan import NOISE_FREE, PROCESSES, Case, Plan, make_plan
 from pachon.studies.psf_choice.residuals import case_metrics, measure_residuals, noise_law, residual_correlations
@@ -29,16 +29,15 @@ SCALE = 0.2 * ARCSEC
 
 def _planted(name, degree, n_stars, n_holdout, half=0.02):
     """A CCD whose PSF is a Gaussian plus two even shapes, their amplitudes polynomials of this degree; centred."""
-    places = make_star_field(
-        name, (-half, half, -half, half), n_holdout, n_stars, 3, fwhm=0.7 * ARCSEC, pixel_size=1e-5
-    )
+    outline = CcdOutline(name, (-half, half, -half, half), 1e-5)
+    places = make_star_field(outline, n_holdout, n_stars, 3, fwhm=0.7 * ARCSEC, depth=Depth())
     rng = np.random.default_rng([degree, *name.encode()])
     powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
     amplitudes = rng.normal(0.0, 0.01, (2, len(powers)))
     amplitudes[:, [i + j == degree for i, j in powers]] += 0.03  # the highest power must be there
 
     def images(positions, size):
-        u, v = mapped(positions, places.bounds).T
+        u, v = mapped(positions, places.ccd.bounds).T
         a = amplitudes @ [u**i * v**j for i, j in powers]
         y, x = np.mgrid[:size, :size] - (size - 1) / 2.0
         round_psf = np.exp(-0.5 * (x**2 + y**2) / 1.7**2)
@@ -95,8 +94,8 @@ def test_noise_leaves_what_the_law_says(experiment, order, interpolation):
     for ccd in ccds:
         seen = observe(experiment, ccd, case.snr, 0)
         weights = np.ones(60) if interpolation == "equal" else 1.0 / (seen.snr**-2 + 1e-4)
-        u, v = mapped(ccd.exposure.positions.observed, ccd.exposure.positions.bounds).T
-        at, bt = mapped(ccd.exposure.positions.holdout, ccd.exposure.positions.bounds).T
+        u, v = mapped(ccd.exposure.positions.observed, ccd.exposure.positions.ccd.bounds).T
+        at, bt = mapped(ccd.exposure.positions.holdout, ccd.exposure.positions.ccd.bounds).T
         powers = [(i, j) for i in range(order + 1) for j in range(order + 1 - i)]
         terms, there = (np.stack([x**i * y**j for i, j in powers], axis=1) for x, y in ((u, v), (at, bt)))
         solve = there @ np.linalg.solve(terms.T @ (weights[:, None] * terms), terms.T * weights)

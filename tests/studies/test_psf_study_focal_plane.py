@@ -10,12 +10,11 @@ from astropy.table import Table
 from pachon.commands.cli import main
 from pachon.core.progress import Reporter
 from pachon.pipeline import focal_plane_stage
-from pachon.studies.psf_choice.focal_plane import fit_focal_plane
 from pachon.studies.psf_choice.plan import FOCAL_PLANE, NOISE_FREE, Case, Plan, make_plan
 from pachon.studies.psf_choice.product import write_study
 from pachon.studies.psf_choice.residuals import case_metrics, measure_residuals
 from pachon.studies.psf_choice.stars import fit, observe, simulate
-from pachon.studies.psf_choice.study import Study, study, study_experiment
+from pachon.studies.psf_choice.study import Study, fit_focal_plane, study, study_experiment
 
 #: All of them need stars, of seconds.
 pytestmark = pytest.mark.long
@@ -136,7 +135,7 @@ def test_stated_noise_is_the_scatter_of_the_draws(focal_plane_config):
         stated.append(stars)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pachon.studies.psf_choice.focal_plane.fit_focal_plane_model", keep)
+        patch.setattr("pachon.studies.psf_choice.study.fit_focal_plane_model", keep)
         for seen in draws:
             fit_focal_plane(case, experiment, ccds, seen)
         fit_focal_plane(replace(case, stars=7), experiment, ccds, draws[0])

@@ -29,6 +29,7 @@ from pachon.studies.reproduce.focal_plane import optics_ellipticity
 from pachon.studies.reproduce.reproduce import FIGURES, chosen_figures, expected_minutes, reproduce
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.refraction import air_refractivity
+from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
 
 #: All of them need a finished study, of seconds.
 pytestmark = pytest.mark.long
@@ -218,9 +219,7 @@ def test_exposures_of_the_speckles_are_nested(made):
         1,
         exposure=15.0,
         time_step=TINY.speckle_step,
-        screen_size=size,
-        screen_length=length,
-        fine_size=1024,
+        screens=ScreenSampling(screen_size=size, screen_length=length, fine_size=1024),
     )
     whole = pachon.make_psfs(
         telescope,
@@ -241,7 +240,7 @@ def test_exposures_of_the_speckles_are_nested(made):
 
 
 def test_the_beginning_of_an_exposure_looks_through_the_same_air():
-    air = Atmosphere.from_site("cerro_pachon", 1, exposure=60.0, screen_size=512)
+    air = Atmosphere.from_site("cerro_pachon", 1, exposure=60.0, screens=ScreenSampling(screen_size=512))
     part = shortened_exposure(air, 5.0, 0.1)
     assert part.times[-1] < 5.0 < part.times[-1] + 0.1
     assert len(part.times) == 100

@@ -12,7 +12,7 @@ from pachon.core.errors import ConfigError
 from pachon.studies.baseline.baseline import check_baseline
 from pachon.studies.baseline.check import BROKEN, MISSING, BaselineCheck, Deviation
 from pachon.studies.baseline.file import Limit, baseline_text
-from pachon.studies.baseline.requirements import check_used, given_limit, given_tolerance, parse_rules
+from pachon.studies.baseline.requirements import Requirements, check_used, given_limit, given_tolerance, parse_rules
 from pachon.testing import assert_matches_baseline
 
 MODEL = "paul_baker"
@@ -144,8 +144,7 @@ def test_given_tolerances_are_written_with_their_reason(plain, tmp_path):
         fields=np.deg2rad([[0.3, 0.0]]),
         wavelengths=[600e-9],
         threads=1,
-        tolerances=rules,
-        limits=["ee80 < 1 mm"],
+        requirements=Requirements(rules, ["ee80 < 1 mm"]),
     )
     for name, metric in baseline.figures.items():
         kind, before = name.partition(" ")[0], plain.figures[name]
@@ -201,7 +200,7 @@ def test_failures_are_grouped_by_cause_each_once():
 def test_files_without_limits_are_those_of_an_older_pachon(plain, tmp_path):
     path = written(tmp_path / "b.baseline.json", plain)
     content = json.loads(path.read_text())
-    assert content["version"] == 1
+    assert content["version"] == 3
     name = next(n for n in content["figures"] if n.startswith("spot"))
     assert "limit" not in content["figures"][name]
     content["figures"][name]["limit"] = {"max": 1e3}  # by hand, in a file of the first version
@@ -209,7 +208,7 @@ def test_files_without_limits_are_those_of_an_older_pachon(plain, tmp_path):
     baseline = read_baseline(path)
     assert baseline.figures[name].limit == Limit(max=1e3)
     again = json.loads(baseline_text(baseline))
-    assert again["version"] == 2
+    assert again["version"] == 4
     assert again["figures"][name]["limit"] == {"max": 1e3}
 
 
@@ -239,7 +238,11 @@ def test_a_lens_file_with_several_wavelengths_has_all_its_metrics_and_limits(tmp
     lens = str(Path(__file__).parents[1] / "data" / "zmx" / "lens1.zmx")
     assert len(load_telescope(lens).design_data.wavelengths) == 3
     baseline, left_out = make_baseline(
-        lens, tmp_path, fields=np.zeros((1, 2)), tolerances=["landing = 1 um"], limits=["spot rms < 3 um"], threads=1
+        lens,
+        tmp_path,
+        fields=np.zeros((1, 2)),
+        requirements=Requirements(["landing = 1 um"], ["spot rms < 3 um"]),
+        threads=1,
     )
     assert not left_out
     kinds = {name.split()[0] for name in baseline.figures}
@@ -260,3 +263,15 @@ def test_a_field_whose_annulus_misses_the_detector_loses_its_zernikes_alone(tmp_
     assert not any("0.75" in name for name in zernikes)
     _, left_out = make_baseline("hsc", tmp_path, fields=np.radians([[0.0, 0.75]]), threads=1)
     assert "rays of the annulus miss the detector" in left_out["zernike"]
+
+
+def test_sources_are_those_of_names_that_begin_with_their_words(plain):
+    sourced = plain.with_sources({"spot rms": "a peer"}).with_sources({"landing": "a listing"})
+    expected = {"spot rms": "a peer", "landing": "a listing"}
+    for name, metric in sourced.figures.items():
+        assert metric.checked_against == next((v for k, v in expected.items() if name.startswith(k)), None)
+        assert metric.value == plain.figures[name].value
+    with pytest.raises(ConfigError, match=r"checked: no argument of make_baseline; expected baseline.with_sources"):
+        make_baseline(MODEL, checked={"opd": "a peer"})
+    with pytest.raises(ConfigError, match=r"limits: no argument of make_baseline; expected requirements=Requirements"):
+        make_baseline(MODEL, limits=[])

@@ -60,8 +60,9 @@ def test_means_over_gauss_nodes_are_those_over_the_area():
     plane = FocalPlane.flat()
     names = ("R22_S11", "R22_S12")
     places = Places.gauss(plane, names, 3)
-    assert places.mean(places.offset[:, 0] ** 2) == pytest.approx(20.48e-3**2 / 3, rel=1e-12)
-    assert places.mean(places.position[:, 0]) == pytest.approx(42.25e-3 / 2, rel=1e-12)
+    # 4004 pixels along x; R22_S12 stands beside R22_S11 along y.
+    assert places.mean(places.offset[:, 0] ** 2) == pytest.approx(20.02e-3**2 / 3, rel=1e-12)
+    assert places.mean(places.position[:, 1]) == pytest.approx(42.25e-3 / 2, rel=1e-12)
 
 
 @pytest.mark.long

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from pachon.models.aperture import Annulus
+from pachon.models.io.site_file import load_site
 from pachon.models.shapes.shape import Plane
 from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM, Telescope
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
+from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
 from pachon.wavefront.psf.engine import PsfInputs
 from pachon.wavefront.pupil_optics import PupilOptics
 
@@ -136,18 +138,10 @@ class SingleModes(Atmosphere):
 def single_modes():
     """Two high layers of one 820 m wave each, moving across in four time steps; weak enough to need no filter."""
     return SingleModes.from_site(
-        "cerro_pachon",
+        load_site("cerro_pachon").with_layers([4000.0, 9000.0], [0.5, 0.5], [30.0, 20.0], [0.3, 2.0]),
         3,
         r0=50.0,
-        cutoff=2.0,
-        altitudes=[4000.0, 9000.0],
-        weights=[0.5, 0.5],
-        wind_speeds=[30.0, 20.0],
-        wind_directions=[0.3, 2.0],
+        screens=ScreenSampling(cutoff=2.0, screen_size=2048, screen_length=819.2, fine_size=256, fine_pixel=0.02),
         exposure=0.4,
         time_step=0.1,
-        screen_size=2048,
-        screen_length=819.2,
-        fine_size=256,
-        fine_pixel=0.02,
     )

@@ -1,5 +1,6 @@
 """The OPD against Zemax, and against the rays that it belongs to."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,9 @@ def test_zemax_map(zemax_lsst, zemax_map, zemax_lattice):
 
 def test_zemax_map_on_the_sphere_of_the_exit_pupil(zemax_lsst, zemax_map, zemax_lattice):
     # Exit pupil of diameter 2189.7 mm at f/1.23: 2.7 m. What remains is the rounding of the listing.
-    opd = pachon.wavefront_opd(zemax_lsst, (0, 1.225) * u.deg, 500e-9, zemax_lattice, sphere_radius=2.7)
+    opd = pachon.wavefront_opd(
+        replace(zemax_lsst, reference_sphere_radius=2.7), (0, 1.225) * u.deg, 500e-9, zemax_lattice
+    )
     both = (zemax_map != 0) & opd.lit
     assert np.abs(opd.value - zemax_map * 500e-9)[both].max() < 0.5e-12
 
@@ -136,7 +139,7 @@ def test_a_dark_map_has_no_rms(lsst_r):
         (dict(reference="axis"), ConfigError, "chief"),
         (dict(grid=0), DomainError, "grid"),
         (dict(grid=8, pupil=([3.0], [0.0])), ConfigError, "one of them"),
-        (dict(grid=8, sphere_radius=-1.0), DomainError, "sphere_radius"),
+        (dict(grid=8, sphere_radius=1.0), ConfigError, "telescope=replace.telescope, reference_sphere_radius="),
         (dict(grid=8, field=(0.1, 0.0)), DomainError, "2.5 deg"),
         (dict(grid=8, field=[[0.0, 0.0], [0.0, 0.01]]), DomainError, "expected two angles"),
         (dict(grid=8, projection="tan"), ConfigError, "expected one of zemax, gnomonic, postel"),
@@ -202,5 +205,7 @@ def test_the_opd_does_not_jump_where_the_exit_pupil_goes_to_infinity(tmp_path):
     # The stop moves by 2 um in all, over f = 100 mm.
     assert np.ptp(list(waves.values())) < 1e-4 * waves[np.inf]
     # On a sphere of the focal length it is another wavefront.
-    short = np.ptp(pachon.wavefront_opd(mirror, field, 550e-9, pupil, sphere_radius=0.1).value) / 550e-9
+    short = (
+        np.ptp(pachon.wavefront_opd(replace(mirror, reference_sphere_radius=0.1), field, 550e-9, pupil).value) / 550e-9
+    )
     assert abs(short - waves[np.inf]) > 0.1

@@ -1,6 +1,7 @@
 """Maps of many fields at once against maps of single fields, for which all rays are traced and stored."""
 
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -47,7 +48,8 @@ def test_maps_equal_those_of_single_fields(lsst_r):
 def test_a_disturbed_telescope_and_any_pupil_points(lsst_r, annulus_points):
     tilted = lsst_r.perturbed("Camera", shift=(1e-3, 0, 1e-4), tilt=(1e-3, -2e-3, 0.3))
     tilted = tilted.with_deformation("M1", ZernikeSag((0, 0, 0, 0, 1e-7), 4.18, 2.558))
-    assert_same(tilted, field_disc(3), pupil=annulus_points(70), projection="postel", sphere_radius=3.0)
+    tilted = replace(tilted, reference_sphere_radius=3.0)
+    assert_same(tilted, field_disc(3), pupil=annulus_points(70), projection="postel")
 
 
 def test_ccds_at_their_heights(lsst_r):
@@ -103,7 +105,7 @@ def test_a_dark_map_has_no_rms(lsst_r):
         (dict(fields=[[0.0, 0.0], [0.1, 0.0]]), DomainError, "2.5 deg"),
         (dict(wavelength=5e-6), DomainError, "wavelength = 5000 nm"),
         (dict(grid=8, pupil=([3.0], [0.0])), ConfigError, "one of them"),
-        (dict(sphere_radius=-1.0), DomainError, "sphere_radius"),
+        (dict(sphere_radius=1.0), ConfigError, "telescope=replace.telescope, reference_sphere_radius="),
         (dict(projection="mercator"), ConfigError, "projection"),
     ],
 )

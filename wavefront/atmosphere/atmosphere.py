@@ -14,18 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.arguments import check_arguments
+from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import DomainError
 from ...core.units import metres, pure_numbers, require_positive
 from ...models.io.site_file import load_site
 from ...models.site import Site
 from .layer_screens import LayerScreens, screen_samples
-from .layers import check_drift, checked_layers, layer_random, line_of_sight
+from .layers import check_drift, layer_random, line_of_sight, wind_directions
 from .refraction import require_zenith_angle
+from .screen_sampling import ScreenSampling
 
-#: Default cut-off in units of 1/r0 [rad/m]. Of 1.0, 1.2, 1.4 and 2.0 this brings the fast PSF engine's ellipticities
-#: nearest to the wave engine's (docs/accuracy.md); beyond it geometric optics makes the image too wide.
-DEFAULT_CUTOFF = 1.4
 # More would fill the memory.
 _MOST_STEPS = 10_000_000
 
@@ -82,6 +80,12 @@ class Atmosphere(LayerScreens):
         )
 
     @classmethod
+    @removed_arguments(
+        altitudes="site=load_site(...).with_layers(altitudes=...)",
+        weights="site=load_site(...).with_layers(weights=...)",
+        wind_speeds="site=load_site(...).with_layers(wind_speeds=...)",
+        wind_directions="site=load_site(...).with_layers(wind_directions=...)",
+    )
     @check_arguments
     def from_site(
         cls,
@@ -92,56 +96,36 @@ class Atmosphere(LayerScreens):
         outer_scale: ArrayLike | None = None,
         exposure: float = 15.0,
         time_step: float = 0.05,
-        screen_size: int = 8192,
-        screen_length: float = 1300.0,
-        cutoff: float | None = None,
-        fine_size: int = 3072,
-        fine_pixel: float = 0.014,
         epoch: int = 0,
-        altitudes: ArrayLike | None = None,
-        weights: ArrayLike | None = None,
-        wind_speeds: ArrayLike | None = None,
-        wind_directions: ArrayLike | None = None,
         ground_lift: float = 0.0,
         zenith_angle: ArrayLike = 0.0,
-        fixed_modulus: bool = False,
+        screens: ScreenSampling | None = None,
     ) -> Atmosphere:
         """Return the atmosphere of a site for one exposure.
 
         Parameters
         ----------
         site : str or Site
-            Bundled site, path of a site file, or site.
+            Bundled site, path of a site file, or site; :meth:`Site.with_layers` gives one with other layers and winds.
+            No layer may drift farther in the exposure than its screen is long.
         seed : int
-            Seed of the run, not negative: it fixes wind directions, offsets and screens.
+            Seed of the run, not negative: it fixes offsets, screens, and those directions of the wind that the site
+            does not state.
         r0 : float or Quantity, optional
             Fried parameter at 500 nm at the zenith [m]; the site's by default.
         outer_scale : float or Quantity, optional
             Outer scale [m]; the site's by default. Screens miss the modes longer than their own side.
         exposure, time_step : float
             Length of the exposure and of a time step [s]; the step is shortened to divide the exposure evenly.
-        screen_size, screen_length : int, float
-            Samples on a side of a low screen, and its side [m].
-        cutoff : float, optional
-            Wavenumber that divides the low from the high modes [rad/m]; by default :data:`DEFAULT_CUTOFF` over the
-            Fried parameter, but at most half the Nyquist limit of the low screens.
-        fine_size, fine_pixel : int, float
-            Samples on a side of a high screen, and their distance [m].
         epoch : int
             Number of the exposure, not negative.
-        altitudes, weights, wind_speeds : array_like, optional
-            Layers in place of the site's: heights above the telescope [m], fractions of the turbulence that sum to 1
-            but for their rounding, wind [m/s]. No layer may drift farther in the exposure than its screen is long.
-        wind_directions : array_like, optional
-            Directions that the wind blows to, from +x towards +y [rad]; the site's by default, and random where it has
-            none.
         ground_lift : float
             Height given to a layer at exactly 0 [m]: at 0 all stars share one and the same patch of the ground layer.
         zenith_angle : float or Quantity
             Angle of the line of sight from the zenith [rad]: it takes the layers farther by its secant and makes the
             Fried parameter smaller by its cosine to the 3/5.
-        fixed_modulus : bool
-            Give modes a fixed modulus and a random phase only (Jee & Tyson 2011, eq. 2); not a Gaussian field.
+        screens : ScreenSampling, optional
+            Sizes and samples of the screens; by default 8192 samples over 1300 m, and 3072 of 14 mm for the high modes.
 
         Raises
         ------
@@ -152,32 +136,30 @@ class Atmosphere(LayerScreens):
         """
         if not isinstance(site, Site):
             site = load_site(site)
+        screens = ScreenSampling() if screens is None else screens
         for name, value in (("seed", seed), ("epoch", epoch)):
             if not (isinstance(value, int | np.integer) and value >= 0):
                 raise DomainError(f"{name} = {value!r}: expected a whole number from 0")
         zenith = require_zenith_angle(zenith_angle)
         fried = _length(site.r0 if r0 is None else r0, "r0") * math.cos(zenith) ** 0.6
         outer = _length(site.outer_scale if outer_scale is None else outer_scale, "outer_scale")
-        height, fraction, speed, direction = checked_layers(
-            site, altitudes, weights, wind_speeds, wind_directions, seed, epoch
-        )
         if not (math.isfinite(ground_lift) and ground_lift >= 0.0):
             raise DomainError(f"ground_lift = {ground_lift!r}: expected a height of 0 m or more")
-        height = line_of_sight(height, ground_lift, zenith)
+        height = line_of_sight(np.array(site.altitudes), ground_lift, zenith)
         exposure = require_positive(exposure, "exposure", "seconds")
         steps = max(1, math.ceil(exposure / require_positive(time_step, "time_step", "seconds") - 1e-9))
         if steps > _MOST_STEPS:
             raise DomainError(f"time_step = {time_step!r}: expected at most {_MOST_STEPS} steps in {exposure:g} s")
-        length = require_positive(screen_length, "screen_length", "metres")
+        speed, length = np.array(site.wind_speeds), float(screens.screen_length)
         check_drift(height, speed, exposure, length)
+        direction = wind_directions(site, seed, epoch)
+        weights = np.array(site.weights)
         offsets = length * np.array([layer_random(seed, epoch, n, "offset", 2) for n in range(len(height))])
         velocities = speed[:, np.newaxis] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
         times = (np.arange(steps) + 0.5) * (exposure / steps)
+        fraction = weights / float(weights.sum())
         for array in (height, fraction, velocities, offsets, times):
             array.setflags(write=False)
-        size = screen_samples(screen_size, "screen_size")
-        # Up to half the Nyquist limit: rays read slopes at the nearest sample, then at most an eighth of a wave away.
-        split = min(DEFAULT_CUTOFF / fried, 0.5 * math.pi * size / length)
         return cls(
             altitudes=height,
             weights=fraction,
@@ -187,14 +169,14 @@ class Atmosphere(LayerScreens):
             outer_scale=outer,
             exposure=exposure,
             times=times,
-            cutoff=require_positive(split if cutoff is None else cutoff, "cutoff", "radians per metre"),
-            screen_size=size,
+            cutoff=screens.cutoff_at(fried),
+            screen_size=screen_samples(screens.screen_size, "screen_size"),
             screen_length=length,
-            fine_size=screen_samples(fine_size, "fine_size"),
-            fine_pixel=require_positive(fine_pixel, "fine_pixel", "metres"),
+            fine_size=screen_samples(screens.fine_size, "fine_size"),
+            fine_pixel=float(screens.fine_pixel),
             seed=int(seed),
             epoch=int(epoch),
-            fixed_modulus=bool(fixed_modulus),
+            fixed_modulus=bool(screens.fixed_modulus),
         )
 
     @check_arguments

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
 from ...core.random_streams import stream
-from ...models.site import WEIGHT_TOLERANCE, Site
+from ...models.site import Site
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -71,42 +71,15 @@ class Layers:
         return np.asarray(x, dtype=np.float64) + shift[0], np.asarray(y, dtype=np.float64) + shift[1]
 
 
-def checked_layers(
-    site: Site,
-    altitudes: ArrayLike | None,
-    weights: ArrayLike | None,
-    wind_speeds: ArrayLike | None,
-    wind_directions: ArrayLike | None,
-    seed: int,
-    epoch: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return heights [m], weights of sum 1, wind speeds [m/s] and directions [rad] of the layers, checked."""
-    height = np.array(site.altitudes if altitudes is None else altitudes, dtype=np.float64).reshape(-1)
-    count = len(height)
-    if wind_directions is None:
-        site_directions = site.wind_directions if altitudes is None else (None,) * count
-        wind_directions = [
+def wind_directions(site: Site, seed: int, epoch: int) -> np.ndarray:
+    """Return the directions that the wind blows to in each layer [rad], drawn from the seed where a site has none."""
+    return np.array(
+        [
             2.0 * math.pi * layer_random(seed, epoch, n, "wind", 1)[0] if direction is None else direction
-            for n, direction in enumerate(site_directions)
-        ]
-    layer_values = {
-        "altitudes": height,
-        "weights": np.array(site.weights if weights is None else weights, dtype=np.float64),
-        "wind_speeds": np.array(site.wind_speeds if wind_speeds is None else wind_speeds, dtype=np.float64),
-        "wind_directions": np.array(wind_directions, dtype=np.float64),
-    }
-    for name, values in layer_values.items():
-        if values.shape != (count,) or count == 0:
-            raise DomainError(f"{name} of shape {values.shape}: expected one number for each of the {count} layers")
-        low = -math.inf if name == "wind_directions" else 0.0
-        if not np.all(np.isfinite(values) & (values >= low)):
-            raise DomainError(f"{name} = {values.tolist()}: expected finite numbers{' from 0' if low == 0.0 else ''}")
-    total = float(layer_values["weights"].sum())
-    if abs(total - 1.0) > WEIGHT_TOLERANCE:
-        raise DomainError(
-            f"weights = {layer_values['weights'].tolist()}: expected fractions that sum to 1, not {total:.6g}"
-        )
-    return height, layer_values["weights"] / total, layer_values["wind_speeds"], layer_values["wind_directions"]
+            for n, direction in enumerate(site.wind_directions)
+        ],
+        dtype=np.float64,
+    )
 
 
 def line_of_sight(heights: np.ndarray, ground_lift: float, zenith: float) -> np.ndarray:

@@ -78,12 +78,7 @@ class PupilRims:
         return out
 
     def transfer_slopes(
-        self,
-        baseline: np.ndarray,
-        wave: np.ndarray,
-        landing: np.ndarray,
-        inward: np.ndarray,
-        response: np.ndarray,
+        self, baseline: np.ndarray, wave: np.ndarray, landing: np.ndarray, inward: np.ndarray, response: np.ndarray
     ) -> np.ndarray:
         """Return derivatives of :meth:`transfer` by unknowns, shape [n_frequency, n_unknown], complex64.
 

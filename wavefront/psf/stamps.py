@@ -11,8 +11,15 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...models.camera.camera import Camera
+from ...models.camera.cameras import load_camera
 from ...models.camera.silicon import Silicon
 from .image_plane import ImagePlane
+
+#: Pixels of the LSST [m].
+_PIXEL = 10e-6
+#: Rms charge diffusion in them [m].
+_DIFFUSION = 4e-6
 
 
 @check_arguments
@@ -49,12 +56,28 @@ class Stamps:
     """
 
     size: int = 31
-    pixel_size: float = 10e-6
-    diffusion: float = 4e-6
+    pixel_size: float = _PIXEL
+    diffusion: float = _DIFFUSION
     jitter: float = 0.0
     silicon: Silicon | None = None
     offsets: ArrayLike | None = None
     recenter: Callable[[np.ndarray, float], np.ndarray] | None = None
+
+    @classmethod
+    def of_camera(
+        cls, camera: str | Camera, *, size: int = 31, jitter: float = 0.0, silicon: Silicon | None = None
+    ) -> Stamps:
+        """Return stamps of the pixels of a camera, with a charge diffusion of 0.4 of them.
+
+        Parameters
+        ----------
+        camera : str or Camera
+            The camera.
+        size, jitter, silicon
+            As in the class.
+        """
+        pixel = load_camera(camera).pixel_size
+        return cls(size, pixel, _DIFFUSION * (pixel / _PIXEL), jitter, silicon)
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.jitter) and self.jitter >= 0.0):

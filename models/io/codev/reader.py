@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
 
@@ -31,7 +31,7 @@ from ..lens.description import Format, LensDescription, LensSurface
 from ..lens.glasses import Glasses, numbered_glass
 from ..lens.shapes import even_asphere
 from ..lens.source import Findings, Source
-from ..lens.text import Record, read_text, scaled
+from ..lens.text import FileSurface, Record, read_text, scaled
 
 FORMAT = Format("CODE V", "EPD, FNO or NAO", "WL", "STO")
 UNITS = {"M": 1e-3, "MM": 1e-3, "C": 1e-2, "CM": 1e-2, "I": 0.0254, "IN": 0.0254}
@@ -110,20 +110,11 @@ def _largest(records: list[Record], default: Source) -> Source:
 
 
 @dataclass
-class _Surface:
-    """Commands of one surface: its numbers by command, and the last line of each; its glass and its name."""
+class _Surface(FileSurface):
+    """Commands of one surface, the name of its glass, and whether it is the stop."""
 
-    place: Source
-    values: dict[str, float] = field(default_factory=lambda: {"CURV": 0.0})
-    commands: dict[str, Record] = field(default_factory=dict)
-    glass: Record | None = None
     glass_name: str = ""
-    name: str = ""
     stop: bool = False
-
-    def get(self, key: str) -> float:
-        """Return a number, 0 where the file has none."""
-        return self.values.get(key, 0.0)
 
     @property
     def mirror(self) -> bool:
@@ -192,7 +183,7 @@ class _Reader:
         return imaged
 
     def _append(self) -> None:
-        self.surfaces.append(_Surface(Source(str(self.path), f"surface {len(self.surfaces)}")))
+        self.surfaces.append(_Surface(len(self.surfaces)))
 
     def _number(self, command: Record) -> int:
         word = command.words[0][1:].upper()
@@ -460,12 +451,13 @@ class _Reader:
     def _add(self, surface: _Surface, number: int, origin: np.ndarray, axes: np.ndarray, distance: float) -> None:
         lens, unit = self.description, self.description.unit
         stated = [surface.commands[key] for key in ("CURV", "K", *POWERS) if key in surface.commands]
-        command = max(reversed(stated), key=lambda record: record.line) if stated else surface.place
+        place = Source(str(self.path), surface.place)
+        command = max(reversed(stated), key=lambda record: record.line) if stated else place
         powers = [0.0, *(surface.get(p) * unit ** (1 - 2 * i) for i, p in enumerate(POWERS, start=2))]
         with command.context():
             shape = even_asphere(surface.get("CURV") / unit, surface.get("K"), powers)
         placed = LensSurface(
-            surface.commands.get("STO", surface.place) if surface.stop else surface.place,
+            surface.commands.get("STO", place) if surface.stop else place,
             shape,
             origin,
             axes,

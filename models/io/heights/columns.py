@@ -1,7 +1,7 @@
 """Frame and columns of files with heights.
 
 The frame of a file is the entry ``frame`` of its metadata, the card FRAME in FITS. ``telescope`` is pachon's. ``CCS``
-is the coordinate system of Rubin's camera: its x is our y, its y our x, and its z runs against ours.
+is the coordinate system of Rubin's camera: its x and y are ours, and its z runs against ours.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def frame_of(metadata: Any, default: Frame, file: str | Path) -> Frame:
 def in_telescope_frame(points: Sequence[np.ndarray], frame: Frame) -> np.ndarray:
     """Return x, y and z of points in the telescope frame, shape [3, n]."""
     x, y, z = points
-    return np.stack([y, x, -z] if frame == "CCS" else [x, y, z])
+    return np.stack([x, y, -z if frame == "CCS" else z])
 
 
 def lengths(table: Table, name: str, file: str | Path, rows: Sequence[str] = ()) -> np.ndarray:

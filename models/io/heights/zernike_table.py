@@ -63,10 +63,7 @@ def zernike_heights(table: Table, file: str | Path) -> SensorHeights:
     radius = column["R_OUTER"]
     surfaces = ZernikeSurfaces.from_noll(zernikes[:, 1:], radius, np.zeros_like(center), limits)
     if frame_of(table.meta, "CCS", file) == "CCS":
-        # Swapping x and y swaps the powers of x and y.
-        center, limits = center[:, ::-1].copy(), limits[:, ::-1].copy()
-        coefficients = -surfaces.coefficients.transpose(0, 2, 1).copy()
-        surfaces = ZernikeSurfaces(radius, surfaces.origin, coefficients, limits)
+        surfaces = ZernikeSurfaces(radius, surfaces.origin, -surfaces.coefficients, limits)
     return SensorHeights(names, center, surfaces)
 
 

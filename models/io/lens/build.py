@@ -35,8 +35,6 @@ from .source import Findings, Source
 Reader = Callable[[Path, Findings, Glasses], LensDescription]
 #: Field radius [rad] of a file with the axis alone.
 LEAST_FIELD = math.radians(0.1)
-#: Components of unit vectors that are rounding.
-_ROUNDING = 1e-12
 
 
 def read_lens(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
 
@@ -96,6 +96,26 @@ class Record(Source):
         if value != int(value) or abs(value) > 1e9:
             raise self.error(f"a whole number in place of {self.words[position]!r}")
         return int(value)
+
+
+@dataclass
+class FileSurface:
+    """Commands of one surface: its numbers by command, and the last line of each; its glass and its name."""
+
+    number: int
+    values: dict[str, float] = field(default_factory=dict)
+    commands: dict[str, Record] = field(default_factory=dict)
+    glass: Record | None = None
+    name: str = ""
+
+    @property
+    def place(self) -> str:
+        """Place in the file, for messages."""
+        return f"surface {self.number}"
+
+    def get(self, key: str) -> float:
+        """Return a number, 0 where the file has none."""
+        return self.values.get(key, 0.0)
 
 
 def records(text: str, source: str) -> list[Record]:

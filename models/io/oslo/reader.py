@@ -28,7 +28,7 @@ from ..lens.description import Format, LensDescription, LensSurface
 from ..lens.glasses import Glasses
 from ..lens.shapes import polynomial_powers, radius_of
 from ..lens.source import Findings, Source
-from ..lens.text import Record, read_text, scaled
+from ..lens.text import FileSurface, Record, read_text, scaled
 from .frames import surface_frames
 from .solves import AxialRay
 
@@ -64,26 +64,13 @@ REFUSED = {
 
 
 @dataclass
-class _Surface:
-    """Commands of one surface: its numbers by command, and the last line of each; medium, pick-ups and solves."""
+class _Surface(FileSurface):
+    """Commands of one surface, wavelengths of its indices, kind of its asphere, and pick-ups."""
 
-    number: int
-    values: dict[str, float] = field(default_factory=dict)
-    commands: dict[str, Record] = field(default_factory=dict)
-    glass: Record | None = None
     waves: tuple[float, ...] = ()
     aspheric: str = "ADO"
     checked: bool = False
-    name: str = ""
     pick_ups: list[Record] = field(default_factory=list)
-
-    @property
-    def place(self) -> str:
-        return f"surface {self.number}"
-
-    def get(self, key: str) -> float:
-        """Return a number, 0 where the file has none."""
-        return self.values.get(key, 0.0)
 
     @property
     def mirror(self) -> bool:

@@ -148,7 +148,7 @@ def _break_lines(values: list[float], order: int) -> list[str]:
 
 def _surface_lines(surface: LensSurface, glasses: dict[Medium, str], unit: float) -> list[str]:
     lines = [f"COMM {surface.name}"]
-    try:
+    with error_context(subject=f"surface {surface.name}"):
         lines += shape_lines(surface.shape, unit)
         if surface.interaction == Interaction.MIRROR:
             lines.append("GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0")
@@ -158,8 +158,6 @@ def _surface_lines(surface: LensSurface, glasses: dict[Medium, str], unit: float
             lines += aperture_lines(surface.aperture, unit)
         if surface.semi_diameter:
             lines.append(f"DIAM {number_text(surface.semi_diameter / unit)} 1")
-    except PrescriptionError as error:
-        raise PrescriptionError(f"surface {surface.name}: {error}") from None
     return lines
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import pachon
-from pachon.core.errors import DomainError
+from pachon.core.errors import ConfigError, DomainError
 from pachon.models.first_order import first_order
 
 LINES = np.array([486.1327e-9, 587.5618e-9, 656.2725e-9])
@@ -53,3 +53,14 @@ def test_bad_zones(paraboloid, afocal):
         pachon.chromatic_focus(paraboloid(), zones=[0.0, 1.0])
     with pytest.raises(DomainError, match="expected one with a focus"):
         pachon.chromatic_focus(afocal(fold=False))
+
+
+def test_a_request_has_telescope_and_wavelengths(paraboloid):
+    telescope = paraboloid()
+    request = pachon.Request.of(telescope, wavelengths=LINES)
+    np.testing.assert_array_equal(pachon.chromatic_focus(request).focus, pachon.chromatic_focus(telescope, LINES).focus)
+    one = pachon.Request.of(telescope, wavelengths=LINES[0])
+    expected = pachon.seidel_diagram(telescope, LINES[0]).coefficients
+    np.testing.assert_array_equal(pachon.seidel_diagram(one).coefficients, expected)
+    with pytest.raises(ConfigError, match=r"wavelengths = .*: given beside a Request"):
+        pachon.chromatic_focus(request, LINES)

@@ -171,10 +171,10 @@ def test_all_the_light_lands(paraboloid):
 def test_several_wavelengths_add_up(lsst_r):
     field = np.deg2rad([[0.0, 1.6]])
     common = dict(pixels=32, pixel=0.4e-6, reference="chief", n_pupil=128)
-    both = fft_psf(lsst_r, field, [560e-9, 690e-9], wavelength_weights=[1.0, 3.0], **common)
+    both = fft_psf(Request.of(lsst_r, field, [560e-9, 690e-9], wavelength_weights=[1.0, 3.0]), **common)
     # The middle wavelength's chief ray is the place of both.
     red = fft_psf(lsst_r, field, [690e-9], **common)
-    alone = fft_psf(lsst_r, field, [560e-9, 690e-9], wavelength_weights=[1.0, 0.0], **common)
+    alone = fft_psf(Request.of(lsst_r, field, [560e-9, 690e-9], wavelength_weights=[1.0, 0.0]), **common)
     light = 0.25 * alone.lit_fraction + 0.75 * red.lit_fraction
     total = (0.25 * alone.lit_fraction * alone.image + 0.75 * red.lit_fraction * red.image) / light
     assert both.lit_fraction == pytest.approx(light, rel=2e-3)
@@ -203,7 +203,6 @@ def test_summary_and_picture(lsst_r):
         ({"n_pupil": 4}, "n_pupil = 4"),
         ({"n_pupil": 16}, "repeats"),
         ({"pixel": 1e-4}, "points across the pupil"),
-        ({"wavelength_weights": [1.0, 1.0]}, "wavelength_weights"),
     ],
 )
 def test_what_cannot_be_had_is_an_error(lsst_r, options, text):

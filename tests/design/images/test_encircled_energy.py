@@ -10,7 +10,8 @@ from scipy.special import j1
 import pachon
 from pachon.core.errors import ConfigError, DomainError
 from pachon.design.images.diffraction import fft_psf
-from pachon.design.images.encircled_energy import encircled_energy, energy_curve, energy_of_psf
+from pachon.design.images.encircled_energy import encircled_energy, energy_curve
+from pachon.design.metrics.spots import spots
 
 WAVE = 500e-9
 
@@ -61,18 +62,18 @@ def test_rays_of_a_defocused_annulus_fill_a_ring(paraboloid):
 
 def test_light_that_falls_beside_the_image_is_missed(paraboloid):
     psf = fft_psf(paraboloid(f_number=20.0), [[0.0, 0.0]], WAVE, pixels=24)
-    energy = energy_of_psf(psf)
+    energy = encircled_energy(psf)
     assert energy.fraction[0, -1] < psf.inside[0] < 1.0
     assert np.isnan(energy.radius_holding(0.999)[0])
     with pytest.raises(DomainError, match="the images' edge"):
-        energy_of_psf(psf, np.array([1.0]))
+        encircled_energy(psf, radii=[1.0])
 
 
 @pytest.mark.long
 def test_over_the_field_of_the_lsst():
     telescope = pachon.load_telescope("lsst_v3.3_i")
     fields = np.deg2rad([[0.0, 0.0], [0.0, 0.7], [0.0, 1.0], [0.0, 1.4], [0.0, 1.75]])
-    energy = encircled_energy(telescope, fields, 750e-9, pixels=160)
+    energy = encircled_energy(fft_psf(telescope, fields, 750e-9, pixels=160))
     summary = energy.summary()
     radius = np.array(summary["ee80_radius_arcsec"])
     assert radius == pytest.approx(np.rad2deg(energy.radius_holding(0.8) * energy.plate_scale) * 3600.0)
@@ -94,3 +95,27 @@ def test_what_cannot_be_had_is_an_error(lsst_r, paraboloid):
         energy_curve(np.full((3, 3), np.nan))
     with pytest.raises(DomainError, match="expected light"):
         energy_curve(np.zeros((3, 3)))
+
+
+def test_images_and_spots_already_made_are_the_source(lsst_r):
+    fields = np.deg2rad([[0.0, 1.0]])
+    spot = spots(lsst_r, fields, WAVE, sampling="spiral", n_pupil=500)
+    again = encircled_energy(lsst_r, fields, WAVE, kind="geometric", n_pupil=500)
+    np.testing.assert_array_equal(encircled_energy(spot).fraction, again.fraction)
+    for name, value in {"fields": fields, "wavelengths": WAVE, "kind": "geometric", "n_pupil": 3}.items():
+        with pytest.raises(ConfigError, match=f"{name} = .*: given beside a SpotDiagram, which has its own"):
+            encircled_energy(spot, **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "replacement"),
+    [
+        ("pixels", "telescope=fft_psf(telescope, fields, wavelengths, pixels=...)"),
+        ("sampling", "telescope=spots(telescope, fields, wavelengths, sampling=...)"),
+        ("projection", "telescope=Request.of(telescope, fields, wavelengths, projection=...)"),
+    ],
+)
+def test_arguments_of_earlier_versions_name_their_place(lsst_r, name, replacement):
+    with pytest.raises(ConfigError) as raised:
+        encircled_energy(lsst_r, **{name: None})
+    assert str(raised.value) == f"{name}: no argument of encircled_energy; expected {replacement}"

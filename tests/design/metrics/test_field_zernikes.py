@@ -12,6 +12,7 @@ from pachon.models.first_order import seidel_sums
 from pachon.models.zernike_polynomials import annular_zernikes
 from pachon.wavefront.opd import wavefront_opd
 from pachon.wavefront.pupil_sampling import PupilSampling
+from pachon.wavefront.request import Request
 
 
 def test_coma_and_astigmatism_of_a_slow_paraboloid_are_seidels(paraboloid):
@@ -87,7 +88,7 @@ def test_zernikes_and_double_zernikes_are_those_of_batoid(lsst_r):
 
 def test_double_zernikes_of_a_centred_telescope_pair_equal_angles(lsst_r):
     # "postel" turns with the field. Pupil and field terms of different angular order do not go together then.
-    table = double_zernikes(lsst_r, jmax=11, kmax=11, projection="postel").coefficients
+    table = double_zernikes(Request.of(lsst_r, projection="postel"), jmax=11, kmax=11).coefficients
     order = np.array([0, 1, -1, 0, -2, 2, -1, 1, -3, 3, 0])
     assert np.abs(table[order[:, None] != order[None, :]]).max() < 1e-13
     assert table[3, 3] != 0

@@ -14,7 +14,7 @@ from pachon.design.metrics.ghost_paths import (
     Reflectivities,
     ghost_pairs,
 )
-from pachon.design.metrics.ghosts import ghosts
+from pachon.design.metrics.ghosts import Reflectivity, ghosts
 from pachon.models.aperture import Circle
 from pachon.models.layer_stack import LayerStack
 from pachon.models.media.medium import ConstantIndex
@@ -81,7 +81,7 @@ def test_reflectivity_from_the_angle_of_turn(before, after):
 
 
 def test_the_ghost_of_a_plate(with_plate):
-    found = ghosts(with_plate, (0.0, 0.0), detector_reflectivity=0.0)
+    found = ghosts(with_plate, (0.0, 0.0), reflectivity=Reflectivity(detector=0.0))
     plate = next(g for g in found.ghosts if (g.first, g.second) == ("back", "front"))
     # Twice more through the glass: the focus is 2 t / n nearer.
     assert plate.focus == pytest.approx(-2.0 * THICKNESS / 1.5, rel=3e-3)
@@ -97,16 +97,20 @@ def test_the_ghost_of_a_plate(with_plate):
 def test_the_ghost_of_a_coated_plate(with_plate):
     """A quarter wave of MgF2 on both sides, by its closed form at normal incidence."""
     film = LayerStack((1.38,), (5e-7 / 4 / 1.38,))
-    found = ghosts(with_plate, (0.0, 0.0), detector_reflectivity=0.0, coatings=Coatings({"front": film, "back": film}))
+    found = ghosts(
+        with_plate,
+        (0.0, 0.0),
+        reflectivity=Reflectivity(detector=0.0, coatings=Coatings({"front": film, "back": film})),
+    )
     quarter = ((1.5 - 1.38**2) / (1.5 + 1.38**2)) ** 2
     # Rays of a slow cone: the square of some degrees.
     assert found.ghosts[0].flux == pytest.approx(quarter**2, rel=5e-3)
     with pytest.raises(UnknownNameError, match="nowhere"):
-        ghosts(with_plate, coatings=Coatings({"nowhere": film}))
+        ghosts(with_plate, reflectivity=Reflectivity(coatings=Coatings({"nowhere": film})))
 
 
 def test_ghosts_by_the_detector(with_plate):
-    found = ghosts(with_plate, (0.0, 0.005), detector_reflectivity=0.2, reflectivity={"front": 0.01, "back": 0.03})
+    found = ghosts(with_plate, (0.0, 0.005), reflectivity=Reflectivity({"front": 0.01, "back": 0.03}, 0.2))
     light = {(g.first, g.second): g.flux for g in found.ghosts}
     assert light.keys() == {("back", "front"), ("detector", "front"), ("detector", "back")}
     assert light["detector", "back"] == pytest.approx(0.2 * 0.03)
@@ -136,7 +140,7 @@ def test_a_ghost_of_too_few_rays_has_no_irradiance(with_plate):
     # The beam is 5 mm in radius at the plate: of 400 rays a hole of 0.5 mm leaves four.
     plate = replace(with_plate.surfaces[2], aperture=Circle(5e-4))
     few = replace(with_plate, surfaces=(*with_plate.surfaces[:2], plate, with_plate.surfaces[3]))
-    found = ghosts(few, (0.0, 0.0), n_pupil=400, detector_reflectivity=0.0)
+    found = ghosts(few, (0.0, 0.0), n_pupil=400, reflectivity=Reflectivity(detector=0.0))
     assert np.isnan(found.ghosts[0].peak)
     assert found.ghosts[0].flux > 0.0
 
@@ -156,7 +160,7 @@ def test_the_maps_hold_the_light(lsst_r):
 
 @pytest.mark.long
 def test_the_ghosts_of_the_lsst(lsst_r):
-    found = ghosts(lsst_r, detector_reflectivity=0.3, n_pupil=10000)
+    found = ghosts(lsst_r, reflectivity=Reflectivity(detector=0.3), n_pupil=10000)
     assert len(ghost_pairs(lsst_r)) == 36
     summary = found.summary()
     brightest = next(g for g in found.ghosts if g.first.startswith("Filter") and g.second.startswith("Filter"))
@@ -255,7 +259,7 @@ def test_what_cannot_be_had_is_an_error(lsst_r, with_plate, paraboloid):
         ghosts(paraboloid())
     with pytest.raises(UnknownNameError, match="did you mean L3_exit"):
         ghosts(lsst_r, reflectivity={"L3_exxit": 0.01})
-    with pytest.raises(DomainError, match=r"reflectivity of front = 1\.5"):
+    with pytest.raises(DomainError, match=r"reflectivity of the lenses = 1\.5"):
         ghosts(with_plate, reflectivity=1.5)
     with pytest.raises(DomainError, match="n_pupil = 10"):
         ghosts(with_plate, n_pupil=10)

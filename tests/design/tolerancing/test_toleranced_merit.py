@@ -7,9 +7,8 @@ from scipy.optimize import minimize_scalar
 import pachon
 from pachon.design.optimize.merit import Beams
 from pachon.design.tolerancing.criterion import Criterion
-from pachon.design.tolerancing.monte_carlo import monte_carlo
+from pachon.design.tolerancing.monte_carlo import Yield, monte_carlo
 from pachon.design.tolerancing.toleranced_merit import TolerancedMerit
-from pachon.design.tolerancing.yields import Yield
 from pachon.models.parameters.degrees_of_freedom import DegreesOfFreedom
 from pachon.models.parameters.parameters import apply
 from pachon.models.parameters.tolerances import Tolerance

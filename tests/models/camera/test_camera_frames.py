@@ -26,6 +26,14 @@ def camera_of(ccds=CCDS, **options):
     )  # fmt: skip
 
 
+def square_camera():
+    """Return the grid of the LSST with square CCDs."""
+    lsst = lsst_camera()
+    return Camera(
+        "square", lsst.ccd_names, lsst.raft_names, lsst.raft_index, lsst.centers, np.array([4096, 4096]), 10e-6
+    )
+
+
 def turned(vector, degrees):
     """Return a vector turned from +x towards +y, by complex numbers."""
     z = complex(*vector) * np.exp(1j * np.deg2rad(degrees))
@@ -108,14 +116,31 @@ def test_outlines_hold_all_pixels_and_no_more():
 
 def test_a_square_camera_is_as_it_was():
     """Maps of an unrotated camera are those of plain differences, to the last bit."""
-    lsst, rng = lsst_camera(), np.random.default_rng(3)
+    square, rng = square_camera(), np.random.default_rng(3)
     ccd, uv = rng.integers(0, 189, 500), rng.uniform(-1, 1, (500, 2))
-    assert np.array_equal(lsst.from_uv(ccd, uv), lsst.centers[ccd] + 20.48e-3 * uv)
+    assert np.array_equal(square.from_uv(ccd, uv), square.centers[ccd] + 20.48e-3 * uv)
     xy = rng.uniform(-0.3, 0.3, (500, 2))
-    assert np.array_equal(lsst.to_uv(ccd, xy), (xy - lsst.centers[ccd]) / 20.48e-3)
-    assert np.array_equal(lsst.to_pixel(ccd, xy), (xy - lsst.centers[ccd]) / 10e-6 + 2047.5)
-    assert lsst.alike
+    assert np.array_equal(square.to_uv(ccd, xy), (xy - square.centers[ccd]) / 20.48e-3)
+    assert np.array_equal(square.to_pixel(ccd, xy), (xy - square.centers[ccd]) / 10e-6 + 2047.5)
+    assert square.alike
     assert not camera_of().alike
+
+
+@pytest.mark.parametrize("name", CCDS)
+def test_pixels_of_a_transposed_camera_exchange_x_and_y(name):
+    camera, (center, (nx, ny), angle) = camera_of(transposed=True), CCDS[name]
+    i = camera.ccd_index(name)
+    for pixel in ((0, 0), (nx - 1, 0), (0, ny - 1), (17.25, 400.0)):
+        across = (np.array(pixel) - [(nx - 1) / 2, (ny - 1) / 2]) * PIXEL
+        expected = 1e-3 * np.array(center) + turned(across[::-1], angle)
+        assert np.allclose(camera.from_pixel(i, np.array(pixel, dtype=float)), expected, rtol=0, atol=1e-16)
+        assert np.allclose(camera.to_pixel(i, expected), pixel, rtol=0, atol=1e-9)
+        assert np.allclose(camera.along_pixels(i, turned(across[::-1], angle)), across, rtol=0, atol=1e-16)
+    assert np.allclose(camera.half_sizes[i], 0.5 * PIXEL * np.array([ny, nx]), rtol=0, atol=1e-16)
+    # The corners of the CCD are those of its pixels.
+    rim = np.array([(-0.5, -0.5), (nx - 0.5, -0.5), (nx - 0.5, ny - 0.5), (-0.5, ny - 0.5)])
+    for corner in camera.from_pixel(i, rim):
+        assert np.hypot(*(camera.corners([i])[0] - corner).T).min() < 1e-15
 
 
 def test_members_are_rafts_or_ccds():

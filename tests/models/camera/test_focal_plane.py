@@ -10,20 +10,29 @@ from pachon.models.camera.height_budget import SIMULATED, SPECIFICATION, TERMS, 
 from pachon.models.camera.lsst import lsst_camera
 
 CAMERA = lsst_camera()
-HALF = 20.48e-3
 NAME = "R22_S11"
+#: Halves of the sides of CCD NAME along x and y [m]: 4004 and 4096 pixels of 10 um.
+HALF = np.array([20.02e-3, 20.48e-3])
+#: The same of every CCD, of the two kinds: 4000 and 4072 pixels of ITL's.
+HALVES = np.array([(20.0e-3, 20.36e-3) if vendor == "itl" else HALF for vendor in CAMERA.vendors])
 
 
 def points_on(names, rng, n):
-    centers = CAMERA.centers[[CAMERA.ccd_index(name) for name in names]]
-    return (np.repeat(centers, n, axis=0) + rng.uniform(-HALF, HALF, (n * len(names), 2))).T
+    ccds = np.repeat([CAMERA.ccd_index(name) for name in names], n)
+    return (CAMERA.centers[ccds] + HALVES[ccds] * rng.uniform(-1.0, 1.0, (n * len(names), 2))).T
+
+
+def on_every_ccd(u, v):
+    """Return x, y [m], shape (189, len(v), len(u)), of a grid on every CCD, in halves of its sides."""
+    x = CAMERA.centers[:, 0, None, None] + HALVES[:, 0, None, None] * u
+    y = CAMERA.centers[:, 1, None, None] + HALVES[:, 1, None, None] * v[:, None]
+    return np.broadcast_arrays(x, y)
 
 
 def dense(n=81):
     """Return x, y, shape (189, n, n), of a grid on every CCD."""
-    axis = np.linspace(-HALF, HALF, n) * (1 - 1e-12)
-    x, y = CAMERA.centers[:, 0, None, None] + axis, CAMERA.centers[:, 1, None, None] + axis[:, None]
-    return np.broadcast_arrays(x, y)
+    axis = np.linspace(-1.0, 1.0, n) * (1 - 1e-12)
+    return on_every_ccd(axis, axis)
 
 
 def test_budgets_are_the_columns_of_table_1():
@@ -45,9 +54,9 @@ def test_height_is_the_documented_polynomial_and_waves():
     rng = np.random.default_rng(2)
     for name in ("R01_S00", "R22_S11", "R43_S21"):
         i = fp.ccd_index(name)
-        dx, dy = rng.uniform(-HALF, HALF, (2, 50))
+        a, b = rng.uniform(-1.0, 1.0, (2, 50))
+        dx, dy = HALVES[i, 0] * a, HALVES[i, 1] * b
         x, y = CAMERA.centers[i, 0] + dx, CAMERA.centers[i, 1] + dy
-        a, b = dx / HALF, dy / HALF
         powers = [1 + 0 * a, a, b, a**2, a * b, b**2, a**3, a**2 * b, a * b**2, b**3]
         expected = fp.polynomial[i] @ np.array(powers)
         for amplitude, kx, ky, phase in fp.waves[i]:
@@ -89,7 +98,7 @@ def test_pistons_are_uniform_within_half_their_peak_to_valley():
 
 def test_tilts_are_uniform_about_each_axis():
     slopes = np.concatenate([FocalPlane.from_budget("lsst", seed=s, terms="tilt").polynomial for s in range(10)])
-    angles = np.arctan(slopes[:, 1:3] / HALF)
+    angles = np.arctan(slopes[:, 1:3] / np.tile(HALVES, (10, 1)))
     assert np.abs(angles).max() <= 1.25e-4
     # 1890 values: four sigma of mean and spread; the axes independent within four sigma of 1 / sqrt(n).
     assert np.abs(angles.mean(axis=0)).max() < 4 * 2.5e-4 / np.sqrt(12 * 1890)
@@ -104,7 +113,8 @@ def test_potato_chip_has_its_peak_to_valley_cycles_and_zero_mean():
     h = fp.height(x[::8], y[::8])
     # Scaled on the same number of points.
     assert np.allclose(np.ptp(h, axis=(1, 2)), 5e-6, rtol=0, atol=1e-12)
-    cycles = np.hypot(fp.waves[:, :, 1], fp.waves[:, :, 2]) * 40.96e-3 / (2 * np.pi)
+    # Along the longer side.
+    cycles = np.hypot(fp.waves[:, :, 1], fp.waves[:, :, 2]) * HALVES[:, 1:] / np.pi
     assert cycles.min() >= 1.0
     assert cycles.max() <= 2.0
     assert np.ptp(cycles) > 0.9
@@ -113,7 +123,7 @@ def test_potato_chip_has_its_peak_to_valley_cycles_and_zero_mean():
     assert np.allclose(np.sum(first * second, axis=1), 0, atol=1e-9)
     # Mean by Gauss-Legendre, exact to rounding for so few cycles.
     t, w = np.polynomial.legendre.leggauss(20)
-    x, y = CAMERA.centers[:, 0, None, None] + HALF * t, CAMERA.centers[:, 1, None, None] + HALF * t[:, None]
+    x, y = on_every_ccd(t, t)
     mean = np.einsum("i,j,nij->n", w, w, fp.height(x, y)) / 4
     assert np.abs(mean).max() < 1e-15
 
@@ -188,7 +198,7 @@ def test_measured_points_recover_a_known_surface():
     # most where points surround; a strip of 2.5 % along the rim, and corners above all, is extrapolated.
     assert np.sqrt(np.mean(error**2)) < 3e-9
     center = CAMERA.centers[CAMERA.ccd_at(px, py)].T
-    inside = np.hypot(*(np.maximum(np.abs([px, py] - center) - 0.95 * HALF, 0))) == 0
+    inside = np.hypot(*(np.maximum(np.abs([px, py] - center) - 0.95 * HALF[:, None], 0))) == 0
     assert np.abs(error[inside]).max() < 10e-9
     assert np.abs(error).max() < 200e-9
 
@@ -207,7 +217,7 @@ def test_noise_in_measured_points_averages_down():
 def test_few_points_give_a_polynomial_that_they_support(n, degree):
     rng = np.random.default_rng(n)
     x, y = points_on([NAME], rng, n)
-    u, v = x / HALF, y / HALF
+    u, v = x / HALF[0], y / HALF[1]
     z = 1e-6 * (1 + u - 2 * v)
     if degree >= 2:
         z = z + 1e-6 * (u**2 - 0.5 * u * v)
@@ -226,17 +236,17 @@ def test_points_in_a_few_rows_fall_back_to_a_lower_degree():
     u = np.tile(np.linspace(-0.9, 0.9, 15), 2)
     v = np.repeat([-0.5, 0.5], 15)
     z = 1e-6 * (2 * u - v)
-    fp = FocalPlane.from_heights({"x": u * HALF, "y": v * HALF, "z": z})
-    assert np.allclose(fp.height(u * HALF, v * HALF), z, rtol=0, atol=1e-18)
+    fp = FocalPlane.from_heights({"x": u * HALF[0], "y": v * HALF[1], "z": z})
+    assert np.allclose(fp.height(u * HALF[0], v * HALF[1]), z, rtol=0, atol=1e-18)
 
 
 def test_units_of_columns_are_honoured():
     rng = np.random.default_rng(1)
     x, y = points_on([NAME], rng, 30)
-    plain = FocalPlane.from_heights({"x": x, "y": y, "z": 1e-5 * x / HALF})
-    table = Table({"x": x * 1e3, "y": y * 1e3, "z": 10 * x / HALF}, units={"x": "mm", "y": "mm", "z": "um"})
-    quantities = {"x": x * 1e3 * u.mm, "y": y * u.m, "z": 1e4 * x / HALF * u.nm}
-    array = np.rec.fromarrays([x, y, 1e-5 * x / HALF], names="x,y,z")
+    plain = FocalPlane.from_heights({"x": x, "y": y, "z": 1e-5 * x / HALF[0]})
+    table = Table({"x": x * 1e3, "y": y * 1e3, "z": 10 * x / HALF[0]}, units={"x": "mm", "y": "mm", "z": "um"})
+    quantities = {"x": x * 1e3 * u.mm, "y": y * u.m, "z": 1e4 * x / HALF[0] * u.nm}
+    array = np.rec.fromarrays([x, y, 1e-5 * x / HALF[0]], names="x,y,z")
     for other in (table, quantities, array):
         # Same numbers but for the rounding of the conversion.
         assert np.allclose(FocalPlane.from_heights(other).polynomial, plain.polynomial, rtol=0, atol=1e-19)
@@ -305,7 +315,7 @@ def test_mesh_has_a_tile_a_ccd_facing_up_within_the_facet_error():
     assert mesh.vertices.shape == (189 * (cells + 1) ** 2, 3)
     assert np.all(mesh.face_normals[:, 2] > 0.99)
     # Tiles cover the CCDs and nothing else; slopes of 1e-3 add a part in 1e6 of area.
-    assert mesh.area == pytest.approx(189 * 40.96e-3**2, rel=2e-6)
+    assert mesh.area == pytest.approx(4.0 * HALVES.prod(axis=1).sum(), rel=2e-6)
     # Interpolate at centres and near the middles of the longest sides, off the rims by more than rounding.
     bound = np.repeat(fp.facet_error(cells), 2 * cells**2)
     corners = mesh.vertices[mesh.faces]

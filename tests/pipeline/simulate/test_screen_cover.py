@@ -42,7 +42,8 @@ def test_no_light_leaves_the_swept_length(zenith):
     config = Experiment.from_config(with_options(Configuration(), seed=3, **options)).config
     experiment = Experiment.from_config(config)
     camera = experiment.camera
-    half = (0.5 * camera.shortest_side) * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
+    # 4004 and 4096 pixels of 10 um along x and y.
+    half = np.array([20.02e-3, 20.48e-3]) * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
     corners = np.concatenate([camera.centers[camera.ccd_index(n)] + half for n in names])
     direction = field_direction(*fields_at(experiment.telescope, corners).T)
     atmosphere = experiment.atmosphere

@@ -12,6 +12,7 @@ from pachon.pipeline.sensor.brighter_fatter import brighter_fatter
 from pachon.pipeline.sensor.displacement import displace_stamps
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd, expose_positions
 from pachon.pipeline.simulate.ccd_model import model_ccd
+from pachon.pipeline.simulate.ccd_observation import collected_images
 from pachon.pipeline.simulate.photometry import sky_electrons_per_pixel
 
 NAME = "R22_S11"
@@ -115,3 +116,18 @@ def test_boundaries_of_other_pixels_are_refused(tiny):
         Experiment.from_config(with_options(tiny(), sensor__brighter_fatter="itl", psf__pixel_um=5.0))
     with pytest.raises(ConfigError, match=r"sensor.brighter_fatter"):
         with_options(tiny(), sensor__brighter_fatter="kodak")
+
+
+def test_charge_is_transferred_along_the_columns_of_the_ccd(tiny):
+    """Stamps lie along the focal plane, along whose y the rows of LSSTCam run."""
+    experiment = Experiment.from_config(tiny(sensor__brighter_fatter="itl", ccds=("R22_S11",)))
+    y, x = np.indices((31, 31)) - 15
+    image = np.exp(-0.5 * (x**2 + y**2) / 1.7**2)[None]
+    image /= image.sum()
+    collected = collected_images(experiment, image, experiment.pixel_size / 10.3, np.array([1e5]))
+    grown = [(collected[0] * axis**2).sum() - (image[0] * axis**2).sum() for axis in (x, y)]
+    level = sky_electrons_per_pixel(experiment.band, 2.0, experiment.pixel_size / 10.3)
+    along = brighter_fatter(image, np.array([1e5]), sensor="itl", sky=level)
+    serial, parallel = ((along[0] * axis**2).sum() - (image[0] * axis**2).sum() for axis in (x, y))
+    assert abs(serial - parallel) > 1e-3 * abs(serial)
+    assert grown == pytest.approx([parallel, serial], rel=1e-2)

@@ -4,14 +4,15 @@ from astropy import units as u
 
 from pachon.core.errors import DomainError, UnknownNameError
 from pachon.pipeline.simulate import photometry
-from pachon.pipeline.simulate.star_field import draw_magnitudes, make_star_field
+from pachon.pipeline.simulate.star_field import CcdOutline, Depth, draw_magnitudes, make_star_field
 
 BOUNDS = (-0.02048, 0.02048, 0.10652, 0.14748)
 FWHM = 0.7 * photometry.ARCSEC
 
 
-def field(ccd="R22_S11", n_holdout=100, n_observed=40, seed=1, **options):
-    return make_star_field(ccd, BOUNDS, n_holdout, n_observed, seed, **{"fwhm": FWHM, "pixel_size": 1e-5, **options})
+def field(ccd="R22_S11", n_holdout=100, n_observed=40, seed=1, pixel_size=1e-5, margin=20, **depth):
+    outline = CcdOutline(ccd, BOUNDS, pixel_size)
+    return make_star_field(outline, n_holdout, n_observed, seed, fwhm=FWHM, depth=Depth(**depth), margin=margin)
 
 
 def test_positions_and_pixels():
@@ -30,7 +31,7 @@ def test_positions_and_pixels():
     # The outer edges of a 4096-pixel CCD lie at -0.5 and 4095.5.
     assert pixel.min() >= 19.5
     assert pixel.max() <= 4075.5
-    np.testing.assert_allclose(stars.to_pixel([[BOUNDS[0] + 5e-6, BOUNDS[2] + 15e-6]]), [[0.0, 1.0]], atol=1e-8)
+    np.testing.assert_allclose(stars.ccd.to_pixel([[BOUNDS[0] + 5e-6, BOUNDS[2] + 15e-6]]), [[0.0, 1.0]], atol=1e-8)
     fraction = pixel % 1.0
     assert abs(fraction.mean() - 0.5) < 0.014  # sub-pixel phases are uniform: 4 sigma of 8000 numbers
     assert not np.any(np.isin(stars.holdout, stars.observed))
@@ -74,7 +75,8 @@ def test_stars_depend_on_seed_and_ccd_alone():
 
 def test_quantities():
     bounds = [v * 1e3 * u.mm for v in BOUNDS]
-    stars = make_star_field("R22_S11", bounds, 100, 40, 1, fwhm=0.7 * u.arcsec, pixel_size=10 * u.um)
+    outline = CcdOutline("R22_S11", bounds, 10 * u.um)
+    stars = make_star_field(outline, 100, 40, 1, fwhm=0.7 * u.arcsec, depth=Depth())
     np.testing.assert_allclose(stars.holdout, field().holdout, rtol=1e-12)  # the conversion's rounding
     np.testing.assert_allclose(stars.magnitude, field().magnitude, rtol=1e-12)
 
@@ -106,6 +108,6 @@ def test_bad_arguments(options, name):
 def test_bad_bounds_and_band():
     for bounds in ((0.0, 1.0, 2.0), (1.0, 0.0, 0.0, 1.0), (0.0, np.nan, 0.0, 1.0)):
         with pytest.raises(DomainError, match="bounds"):
-            make_star_field("R22_S11", bounds, 1, 1, 1, fwhm=FWHM, pixel_size=1e-5)
+            CcdOutline("R22_S11", bounds, 1e-5)
     with pytest.raises(UnknownNameError, match="band"):
         field(band="x")

@@ -25,7 +25,8 @@ def part():
         keep = [i for i, raft in enumerate(whole.raft_of) if raft in rafts][:count]
         index = np.array([rafts.index(whole.raft_of[i]) for i in keep])
         names = tuple(whole.ccd_names[i] for i in keep)
-        return Camera("part", names, rafts, index, whole.centers[keep], whole.pixels[keep], whole.pixel_size)
+        pixels = whole.pixels[keep]
+        return Camera("part", names, rafts, index, whole.centers[keep], pixels, whole.pixel_size, transposed=True)
 
     return of
 

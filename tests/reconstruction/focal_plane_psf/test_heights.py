@@ -14,7 +14,7 @@ NM = 1e-9
 
 
 def at(camera, ccd, uv):
-    return Places(camera.centers[ccd] + (0.5 * camera.shortest_side) * uv, np.asarray(ccd), uv)
+    return Places(camera.centers[ccd] + camera.half_sizes[ccd] * uv, np.asarray(ccd), uv)
 
 
 def random_places(camera, n, seed):

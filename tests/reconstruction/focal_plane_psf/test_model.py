@@ -8,15 +8,18 @@ import pytest
 from astropy import units as u
 from threadpoolctl import threadpool_limits
 
-from pachon.core.errors import DomainError, PachonError, ProductError, UnknownNameError
+from pachon.core.errors import ConfigError, DomainError, PachonError, ProductError, UnknownNameError
 from pachon.measure.shapes import measure_shapes
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.camera.silicon import Silicon
 from pachon.reconstruction.focal_plane_psf.model import FocalPlanePsf
+from pachon.reconstruction.focal_plane_psf.optics_prior import OpticsPrior
 from pachon.reconstruction.focal_plane_psf.response import Instrument
 
 UM = 1e-6
 PLANTED = "R23_S11"
+#: An aligned telescope and simulated heights.
+ALIGNED = OpticsPrior(alignment_rms=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -33,14 +36,14 @@ def few(exposure):
 
 @pytest.fixture(scope="module")
 def model(exposure, lsst_r, wavelengths):
-    return FocalPlanePsf.fit(exposure.stars(), lsst_r, camera=exposure.camera, wavelengths=wavelengths)
+    return FocalPlanePsf.fit(exposure.stars(), Instrument.of(lsst_r, wavelengths), camera=exposure.camera)
 
 
 @pytest.fixture(scope="module")
 def aligned(exposure, few, lsst_r, wavelengths):
     """Fewer stars and a telescope that is known to be aligned, on one thread."""
     return FocalPlanePsf.fit(
-        exposure.stars(few), lsst_r, camera=exposure.camera, wavelengths=wavelengths, alignment_rms=0.0, threads=1
+        exposure.stars(few), Instrument.of(lsst_r, wavelengths), camera=exposure.camera, prior=ALIGNED, threads=1
     )
 
 
@@ -135,8 +138,7 @@ def test_a_planted_height_is_found(aligned, exposure):
 
 @pytest.mark.long
 def test_known_heights_are_kept(exposure, few, lsst_r, wavelengths):
-    known = {"wavelengths": wavelengths, "alignment_rms": 0.0}
-    model = FocalPlanePsf.fit(exposure.stars(few), lsst_r, exposure.plane, **known)
+    model = FocalPlanePsf.fit(exposure.stars(few), Instrument.of(lsst_r, wavelengths), exposure.plane, prior=ALIGNED)
     x, y = exposure.xy.T
     # Coefficients are held to a nanometre, and a spline stands for the waves of the potato chips.
     np.testing.assert_allclose(model.heights.height(x, y), exposure.plane.height(x, y), atol=20e-9)
@@ -146,10 +148,9 @@ def test_known_heights_are_kept(exposure, few, lsst_r, wavelengths):
 def test_the_wrong_telescope_has_less_evidence(aligned, exposure, few, lsst_r, wavelengths):
     wrong = FocalPlanePsf.fit(
         exposure.stars(few),
-        lsst_r.perturbed("M2", shift=(2e-3, 0.0, 0.0)),
+        Instrument.of(lsst_r.perturbed("M2", shift=(2e-3, 0.0, 0.0)), wavelengths),
         camera=exposure.camera,
-        wavelengths=wavelengths,
-        alignment_rms=0.0,
+        prior=ALIGNED,
     )
     # A ratio of likelihoods of e^20 is beyond chance.
     assert wrong.evidence < aligned.evidence - 20.0
@@ -163,10 +164,9 @@ def test_a_telescope_whose_images_have_no_shape_gives_one_clear_line(exposure, f
     with pytest.raises(PachonError) as raised:
         FocalPlanePsf.fit(
             exposure.stars(few),
-            lsst_r.perturbed("M2", shift=(5e-3, 0.0, 0.0)),
+            Instrument.of(lsst_r.perturbed("M2", shift=(5e-3, 0.0, 0.0)), wavelengths),
             camera=exposure.camera,
-            wavelengths=wavelengths,
-            alignment_rms=0.0,
+            prior=ALIGNED,
         )
     assert "\n" not in str(raised.value)
 
@@ -177,7 +177,7 @@ ELSEWHERE = (["R23_S00", "R23_S11", "R23_S11", "R23_S22"], [0.09, 0.12, 0.13, 0.
 @pytest.mark.long
 def test_no_byte_depends_on_the_threads(aligned, exposure, few, lsst_r, wavelengths):
     two = FocalPlanePsf.fit(
-        exposure.stars(few), lsst_r, camera=exposure.camera, wavelengths=wavelengths, alignment_rms=0.0, threads=2
+        exposure.stars(few), Instrument.of(lsst_r, wavelengths), camera=exposure.camera, prior=ALIGNED, threads=2
     )
     assert two.evidence == aligned.evidence
     assert two.chi2 == aligned.chi2
@@ -194,7 +194,7 @@ def of_two_threads_of_blas(exposure, few, lsst_r, wavelengths):
         pytest.skip("BLAS has one thread on one processor")
     with threadpool_limits(2, user_api="blas"):
         return FocalPlanePsf.fit(
-            exposure.stars(few), lsst_r, camera=exposure.camera, wavelengths=wavelengths, alignment_rms=0.0, threads=1
+            exposure.stars(few), Instrument.of(lsst_r, wavelengths), camera=exposure.camera, prior=ALIGNED, threads=1
         )
 
 
@@ -238,7 +238,7 @@ def test_a_written_model_has_its_silicon(tmp_path, aligned):
     instrument = replace(optics.instrument, silicon=Silicon(80e-6, 180.0))
     model = replace(aligned, field=replace(aligned.field, optics=replace(optics, instrument=instrument)))
     model.write(tmp_path / "silicon.fits")
-    assert FocalPlanePsf.read(tmp_path / "silicon.fits").field.optics.instrument.silicon == Silicon(80e-6, 180.0)
+    assert FocalPlanePsf.read(tmp_path / "silicon.fits").field.optics.instrument.stamps.silicon == Silicon(80e-6, 180.0)
 
 
 def test_files_that_are_no_models_give_one_clear_line(tmp_path):
@@ -298,9 +298,24 @@ def test_few_stars_and_unknown_ccds_give_one_clear_line(blind, exposure):
     assert "\n" not in str(raised.value)
     with pytest.raises(DomainError, match="finite"):
         blind.shapes(PLANTED, np.nan, 0.0)
-    for options in ({"alignment_rms": -1e-7}, {"alignment_rms": np.nan}):
+    for rms in (-1e-7, np.nan):
         with pytest.raises(DomainError, match=r"^alignment_rms = [^\n]*$"):
-            FocalPlanePsf.fit(exposure.stars(), camera=exposure.camera, **options)
+            OpticsPrior(alignment_rms=rms)
+
+
+@pytest.mark.parametrize(
+    ("name", "replacement"),
+    [
+        ("wavelengths", "telescope=Instrument.of(telescope, wavelengths)"),
+        ("silicon", "telescope=Instrument.of(telescope, stamps=Stamps(silicon=...))"),
+        ("alignment_rms", "prior=OpticsPrior(alignment_rms=...)"),
+        ("budget", "prior=OpticsPrior(budget=...)"),
+    ],
+)
+def test_arguments_of_earlier_versions_name_their_place(name, replacement):
+    with pytest.raises(ConfigError) as raised:
+        FocalPlanePsf.fit([], **{name: None})
+    assert str(raised.value) == f"{name}: no argument of FocalPlanePsf.fit; expected {replacement}"
 
 
 @pytest.mark.long
@@ -375,10 +390,9 @@ def test_a_rotated_camera_is_fitted_as_any_other(aligned, exposure, few, lsst_r,
     # Axially symmetric optics: in the camera's own axes the stars are those of the camera that is not rotated.
     rotated = FocalPlanePsf.fit(
         exposure.stars(few),
-        lsst_r.with_rotator(0.5 * np.pi),
+        Instrument.of(lsst_r.with_rotator(0.5 * np.pi), wavelengths),
         camera=exposure.camera,
-        wavelengths=wavelengths,
-        alignment_rms=0.0,
+        prior=ALIGNED,
         threads=1,
     )
     x, y = exposure.xy.T

@@ -8,6 +8,7 @@ from pachon.reconstruction.focal_plane_psf.covariance import Places
 from pachon.reconstruction.focal_plane_psf.heights import HeightPrior, project_heights
 from pachon.reconstruction.focal_plane_psf.likelihood import fit_covariance
 from pachon.reconstruction.focal_plane_psf.model import FocalPlanePsf
+from pachon.reconstruction.focal_plane_psf.optics_prior import OpticsPrior
 from pachon.reconstruction.focal_plane_psf.response import Instrument
 
 UM = 1e-6
@@ -57,7 +58,10 @@ def camera(part):
 
 def fitted(exposure, telescope, wavelengths):
     return FocalPlanePsf.fit(
-        exposure.stars(), telescope, camera=exposure.camera, wavelengths=wavelengths, alignment_rms=0.0
+        exposure.stars(),
+        Instrument.of(telescope, wavelengths),
+        camera=exposure.camera,
+        prior=OpticsPrior(alignment_rms=0.0),
     )
 
 

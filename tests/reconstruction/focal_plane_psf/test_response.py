@@ -3,6 +3,7 @@ import pytest
 from numpy.polynomial.chebyshev import chebvander
 from numpy.polynomial.polynomial import polyvander2d
 
+from pachon.core.errors import DomainError
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.camera.silicon import Silicon
 from pachon.models.io.prescription import load_telescope
@@ -17,6 +18,7 @@ from pachon.reconstruction.focal_plane_psf.response import (
     wavefront,
 )
 from pachon.wavefront.aberration import ResidualWavefront
+from pachon.wavefront.psf.light import Light
 from pachon.wavefront.psf.psf import make_psfs
 from pachon.wavefront.psf.stamps import Stamps
 
@@ -173,7 +175,9 @@ def test_batches_change_nothing(instrument, plane, monkeypatch):
 
 def test_silicon_is_part_of_the_instrument(lsst_r, plane):
     y = load_telescope("lsst_v3.3_y")
-    without, thick, thin = (Instrument.of(y, [970e-9], silicon=s) for s in (None, Silicon(), Silicon(50e-6)))
+    without, thick, thin = (
+        Instrument.of(y, [970e-9], stamps=Stamps(silicon=s)) for s in (None, Silicon(), Silicon(50e-6))
+    )
     assert len({without.key, thick.key, thin.key}) == 3
     fields = thick.fields(stars(plane, 4, 5))
     images, _ = thick.images(fields, plane, None)
@@ -190,10 +194,31 @@ def test_silicon_is_part_of_the_instrument(lsst_r, plane):
     assert (thick.shapes(fields, plane, None) != without.shapes(fields, plane, None)).all()
 
 
+def test_stamps_of_a_camera_have_its_pixels():
+    # Pixels of the instruments' manuals: 10 um of the LSST, 15 um of HSC; 0.4 of them diffuse.
+    for camera, pixel in (("lsst", 10.0), ("hsc", 15.0)):
+        stamps = Stamps.of_camera(camera, jitter=1e-7)
+        np.testing.assert_allclose((stamps.pixel_size, stamps.diffusion), (pixel * UM, 0.4 * pixel * UM))
+        assert (stamps.size, stamps.jitter, stamps.silicon) == (31, 1e-7, None)
+
+
+def test_light_of_an_instrument_is_one_spectrum(lsst_r):
+    waves = [600e-9, 640e-9]
+    plain, weighted, shifted = (
+        Instrument.of(lsst_r, light)
+        for light in (waves, Light(waves, [1.0, 3.0]), Light(waves, dispersion=[[0.0, 0.0], [0.0, 1e-7]]))
+    )
+    assert len({plain.key, weighted.key, shifted.key}) == 3
+    with pytest.raises(DomainError, match=r"weights of shape \(1, 2\): expected one spectrum of 2 wavelengths"):
+        Instrument.of(lsst_r, Light(waves, [[1.0, 3.0]]))
+    with pytest.raises(DomainError, match="expected no offsets"):
+        Instrument.of(lsst_r, waves, stamps=Stamps(offsets=[(0.0, 0.0)]))
+
+
 @pytest.mark.long
 def test_shapes_at_heights_in_silicon(plane):
     # Silicon puts the focus 12 um to one side, so the polynomial of the heights reaches farther out of it.
-    instrument = Instrument.of(load_telescope("lsst_v3.3_y"), [970e-9], silicon=Silicon())
+    instrument = Instrument.of(load_telescope("lsst_v3.3_y"), [970e-9], stamps=Stamps(silicon=Silicon()))
     fields = instrument.fields(stars(plane, 16, 1))
     found = height_response(instrument, fields, plane, None)
     for height in np.array([-18.0, -7.0, 3.0, 16.0]) * UM:

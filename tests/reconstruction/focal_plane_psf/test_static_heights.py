@@ -9,6 +9,7 @@ from pachon.core.errors import DomainError, ProductError
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.reconstruction.focal_plane_psf.fit import ExposureFit
 from pachon.reconstruction.focal_plane_psf.heights import powers
+from pachon.reconstruction.focal_plane_psf.optics_prior import OpticsPrior
 from pachon.reconstruction.focal_plane_psf.response import Instrument
 from pachon.reconstruction.focal_plane_psf.static_heights import StaticHeights, fit_static_heights
 
@@ -25,11 +26,12 @@ def exposures(exposure_of, part):
 @pytest.fixture(scope="module")
 def fit(exposures, lsst_r, wavelengths):
     """``fit([0, 1], folder=...)``"""
-    options = {"camera": exposures[0].camera, "instrument": Instrument.of(lsst_r, wavelengths), "alignment_rms": 0.0}
+    instrument, camera = Instrument.of(lsst_r, wavelengths), exposures[0].camera
 
-    def of(which, **others):
+    def of(which, telescope=instrument, **options):
         stars = [exposures[i].stars() for i in which]
-        return fit_static_heights(stars, lsst_r, steps=STEPS, **(options | others))
+        aligned = OpticsPrior(alignment_rms=0.0)
+        return fit_static_heights(stars, telescope, camera=camera, prior=aligned, steps=STEPS, **options)
 
     return of
 
@@ -125,7 +127,7 @@ def test_files_of_another_telescope_are_computed_again(both, fit, exposures, mon
     monkeypatch.setattr(ExposureFit, "linearise", never)
     moved = Instrument.of(lsst_r.perturbed("M2", shift=(1e-3, 0.0, 0.0)), wavelengths)
     with pytest.raises(InterruptedError):
-        fit([0, 1], folder=both[1], instrument=moved)
+        fit([0, 1], folder=both[1], telescope=moved)
 
 
 @pytest.mark.long

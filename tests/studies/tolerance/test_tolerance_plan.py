@@ -9,9 +9,8 @@ import pytest
 import pachon
 from pachon.core.errors import ConfigError, DomainError, PachonError, UnknownNameError
 from pachon.models.media.medium import abbe_number
-from pachon.studies.tolerance.elements import with_elements
 from pachon.studies.tolerance.file import ToleranceFile, load_tolerances
-from pachon.studies.tolerance.plan import tolerance_plan
+from pachon.studies.tolerance.plan import tolerance_plan, with_elements
 
 LENS = Path(__file__).parents[2] / "data" / "zmx" / "lens1.zmx"
 

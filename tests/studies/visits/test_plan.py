@@ -16,8 +16,9 @@ def test_positions_are_those_of_the_world_coordinates_of_a_ccd(lsst_r):
         wcs = pachon.ccd_wcs(lsst_r, camera, ccd, position_angle=0.7, wavelength=LIGHT)
         pixels = np.array([[10.0, 20.0], [3000.0, 500.0], [2000.0, 4000.0]])
         found = Visit(1, 1, roll=0.7).on_detector(lsst_r, wcs.to_sky(pixels), LIGHT)
-        corner = camera.centers[camera.ccd_index(ccd)] - (0.5 * camera.shortest_side)
-        np.testing.assert_allclose((found - corner) / camera.pixel_size - 0.5, pixels, atol=0.006)
+        # The pixels' x and y run along y and x of the focal plane: 4096 and 4004 of them.
+        from_middle = (found - camera.centers[camera.ccd_index(ccd)])[:, ::-1]
+        np.testing.assert_allclose(from_middle / camera.pixel_size + [2047.5, 2001.5], pixels, atol=0.006)
 
 
 def test_a_visit_points_where_it_says(lsst_r):

@@ -11,17 +11,23 @@ import pytest
 from astropy import units as u
 
 from pachon.core import memory
-from pachon.core.errors import DomainError, UnknownNameError
+from pachon.core.errors import ConfigError, DomainError, PrescriptionError, UnknownNameError
 from pachon.models.io.site_file import load_site
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.layer_screens import SLOPE_LAG
+from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
 from pachon.wavefront.atmosphere.turbulence import path_variance, structure_function
 
-SMALL = {"screen_size": 512, "screen_length": 81.92, "fine_size": 512, "fine_pixel": 0.02, "exposure": 2.0}
+SMALL = {"screen_size": 512, "screen_length": 81.92, "fine_size": 512, "fine_pixel": 0.02}
+LAYERS = ("altitudes", "weights", "wind_speeds", "wind_directions")
 
 
-def small_atmosphere(seed=2, site="cerro_pachon", **options):
-    return Atmosphere.from_site(site, seed, **(SMALL | options))
+def small_atmosphere(seed=2, site="cerro_pachon", exposure=2.0, **options):
+    """Return an atmosphere of small screens; options are those of screens, layers and `from_site`."""
+    sampling = {f.name: options.pop(f.name) for f in dataclasses.fields(ScreenSampling) if f.name in options}
+    layers = {name: options.pop(name) for name in LAYERS if name in options}
+    site = (load_site(site) if isinstance(site, str) else site).with_layers(**layers)
+    return Atmosphere.from_site(site, seed, exposure=exposure, screens=ScreenSampling(**SMALL | sampling), **options)
 
 
 def test_default_atmosphere_of_the_site():
@@ -343,7 +349,7 @@ def test_screens_that_do_not_fit_in_memory_are_refused(monkeypatch):
 
 def test_quantities_and_sites_are_accepted():
     site = load_site("cerro_pachon")
-    atmosphere = Atmosphere.from_site(site, 2, r0=16.0 * u.cm, outer_scale=0.025 * u.km, **SMALL)
+    atmosphere = Atmosphere.from_site(site, 2, r0=16.0 * u.cm, outer_scale=0.025 * u.km, exposure=2.0)
     assert atmosphere.r0 == pytest.approx(0.16)
     assert atmosphere.outer_scale == pytest.approx(25.0)
 
@@ -369,15 +375,9 @@ def test_quantities_and_sites_are_accepted():
         ({"cutoff": 30.0}, "cutoff = 30 rad/m: expected between the lowest mode and the Nyquist limit of the low"),
         ({"cutoff": 0.07}, "cutoff = 0.07 rad/m"),
         ({"cutoff": 0.3}, "Nyquist limit of the high screens, 0.6136 to 157.1 rad/m"),
-        ({"weights": [1.0, 2.0]}, "weights of shape (2,): expected one number for each of the 6 layers"),
-        ({"weights": [0.0] * 6}, "weights = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0]: expected fractions that sum to 1, not 0"),
-        ({"weights": [2.0, -1.0, 0.0, 0.0, 0.0, 0.0]}, "weights = [2.0, -1.0, 0.0, 0.0, 0.0, 0.0]: expected finite"),
-        ({"weights": [0.5, 0.1, 0.1, 0.1, 0.1, 0.106]}, "expected fractions that sum to 1, not 1.006"),
-        ({"weights": [math.nan] * 6}, "weights = [nan"),
         # The fastest layer of the site, 20 m/s, comes round after 4.096 s.
         ({"exposure": 4.1}, "screen_length = 81.92: expected more than 82 m, which layer 5 at 15460 m drifts in 4.1 s"),
         ({"wind_speeds": [50.0, 0.0, 0.0, 0.0, 0.0, 0.0]}, "expected more than 100 m, which layer 0 at 0 m drifts"),
-        ({"wind_speeds": [math.nan] * 6}, "wind_speeds = [nan"),
         ({"ground_lift": -1.0}, "ground_lift = -1.0"),
         ({"zenith_angle": 1.5}, "zenith_angle = 1.5: expected 0 to 1.3963 rad"),
         ({"seed": -1}, "seed = -1"),
@@ -388,6 +388,34 @@ def test_quantities_and_sites_are_accepted():
 def test_bad_arguments_are_named(options, text):
     with pytest.raises(DomainError, match=re.escape(text)):
         small_atmosphere(**options)
+
+
+@pytest.mark.parametrize(
+    ("layers", "text"),
+    [
+        ({"weights": [1.0, 2.0]}, "expected an altitude, weight and wind for each"),
+        ({"weights": [0.0] * 6}, "weights = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0): expected fractions from 0 that sum to 1"),
+        ({"weights": [2.0, -1.0, 0.0, 0.0, 0.0, 0.0]}, "weights = (2.0, -1.0, 0.0, 0.0, 0.0, 0.0): expected fractions"),
+        ({"weights": [0.5, 0.1, 0.1, 0.1, 0.1, 0.106]}, "sum to 1, not 1.006"),
+        ({"weights": [math.nan] * 6}, "weights = (nan"),
+        ({"wind_speeds": [math.nan] * 6}, "wind_speeds = (nan"),
+        ({"altitudes": [5e3, 0.0, 1e3, 2e3, 3e3, 4e3]}, "altitudes = (5000.0, 0.0"),
+    ],
+)
+def test_bad_layers_of_a_site_are_named(layers, text):
+    with pytest.raises(PrescriptionError, match=re.escape(text)):
+        small_atmosphere(**layers)
+
+
+@pytest.mark.parametrize(
+    ("name", "replacement"),
+    [(f.name, f"screens=ScreenSampling({f.name}=...)") for f in dataclasses.fields(ScreenSampling)]
+    + [(name, f"site=load_site(...).with_layers({name}=...)") for name in LAYERS],
+)
+def test_arguments_of_earlier_versions_name_their_place(name, replacement):
+    with pytest.raises(ConfigError) as caught:
+        Atmosphere.from_site("cerro_pachon", 1, **{name: 1})
+    assert str(caught.value) == f"{name}: no argument of Atmosphere.from_site; expected {replacement}"
 
 
 def test_bad_layers_scales_and_sites_are_named():
@@ -405,7 +433,7 @@ def test_bad_layers_scales_and_sites_are_named():
 @pytest.mark.slow
 def test_full_size_screens_follow_theory():
     """The default grids, 8192 x 8192 over 1.3 km and 3072 x 3072 over 43 m, without noise."""
-    atmosphere = Atmosphere.from_site("cerro_pachon", 2, fixed_modulus=True)
+    atmosphere = Atmosphere.from_site("cerro_pachon", 2, screens=ScreenSampling(fixed_modulus=True))
     low, high = atmosphere.low_screen(0, "samples"), atmosphere.high_screen(0, "samples")
     # Two coarse pixels, 0.3174 m, and more: there the fine screens no longer change from one sample to the next.
     for lag in (2, 4, 16, 63, 157):

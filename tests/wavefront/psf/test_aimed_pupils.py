@@ -27,7 +27,7 @@ def test_every_engine_has_the_light_that_the_apertures_leave(wide, engine):
     options = {"engine": engine, "stamps": pachon.Stamps(41, pixel_size=1e-6), "threads": 1}
     if engine == "long_exposure":
         options["atmosphere"] = pachon.Atmosphere.from_site(
-            "cerro_pachon", seed=1, screen_size=512, screen_length=40.0, exposure=0.1
+            "cerro_pachon", seed=1, screens=pachon.ScreenSampling(screen_size=512, screen_length=40.0), exposure=0.1
         )
     psf = pachon.make_psfs(wide, spots.fields, [587e-9], **options)
     # Lattices of some thousand points: half a per cent of the pupil.

@@ -8,8 +8,10 @@ import scipy.fft
 
 import pachon
 from pachon.core.errors import DomainError
+from pachon.models.io.site_file import load_site
 from pachon.raytrace.rays import RayStatus
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
+from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
 from pachon.wavefront.atmosphere.turbulence import coherence, diffraction_otf, structure_function
 from pachon.wavefront.psf.psf import make_psfs
 from pachon.wavefront.psf.stamps import Stamps
@@ -26,7 +28,7 @@ def defocused(height, telescope=LSST):
 
 
 def air(r0=0.16, **options):
-    return Atmosphere.from_site("cerro_pachon", 1, r0=r0, outer_scale=25.0, **options)
+    return Atmosphere.from_site(**{"site": "cerro_pachon", "seed": 1, "r0": r0, "outer_scale": 25.0} | options)
 
 
 def brute_force(telescope, field, side, n_ray, otf_at):
@@ -114,15 +116,10 @@ def test_fast_donuts_average_to_the_long_exposure():
     telescope = defocused(0.5e-3)
     long = make_psfs(telescope, [CORNER], [WAVE], atmosphere=air(), engine="long_exposure", stamps=Stamps(71)).image[0]
     mean = np.zeros_like(long)
-    screens = {
-        "screen_size": 1024,
-        "screen_length": 162.5,
-        "wind_speeds": [5.0] * 6,
-        "time_step": 0.1,
-        "exposure": 15.0,
-    }
+    slow = load_site("cerro_pachon").with_layers(wind_speeds=[5.0] * 6)
+    screens = ScreenSampling(screen_size=1024, screen_length=162.5)
     for epoch in range(2):
-        exposure = air(epoch=epoch, **screens)
+        exposure = air(site=slow, epoch=epoch, time_step=0.1, exposure=15.0, screens=screens)
         mean += make_psfs(telescope, [CORNER], [WAVE], atmosphere=exposure, stamps=Stamps(71)).image[0] / 2
     # Each exposure differs by some 5 %; with dots in place of a donut it were 40.
     assert difference(mean, long) < 0.07

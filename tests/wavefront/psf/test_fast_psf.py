@@ -8,8 +8,10 @@ from scipy.special import j0
 
 from pachon.core.errors import DomainError
 from pachon.models.io.prescription import load_telescope
+from pachon.models.io.site_file import load_site
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.layer_screens import SLOPE_LAG
+from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
 from pachon.wavefront.atmosphere.turbulence import (
     diffraction_otf,
     long_exposure_fwhm,
@@ -116,7 +118,11 @@ def test_rays_through_the_layers_against_plain_numpy(polynomial_pupil, seed):
     optics = polynomial_pupil(defocus=1e-6, coma=0.5e-6, cut=0.7, jacobian=jacobian)
     # Screens hardly wider than the pupil, so that most reads cross a border.
     atmosphere = Atmosphere.from_site(
-        "cerro_pachon", seed, exposure=0.5, time_step=0.1, screen_size=64, screen_length=10.24, cutoff=5.0
+        "cerro_pachon",
+        seed,
+        exposure=0.5,
+        time_step=0.1,
+        screens=ScreenSampling(screen_size=64, screen_length=10.24, cutoff=5.0),
     )
     fields = np.array([[0.01, -0.02], [0.0, 0.0], [-0.015, 0.005]])
     wavelengths = np.array([550e-9, 700e-9])
@@ -186,7 +192,12 @@ def test_strong_seeing_gives_the_long_exposure_within_one_star(polynomial_pupil)
     """With the cut-off far below 1/r0 nearly all is in the filter, and one star is the ensemble mean."""
     telescope = polynomial_pupil()
     atmosphere = Atmosphere.from_site(
-        "cerro_pachon", 4, exposure=2.0, time_step=0.5, cutoff=0.7, outer_scale=5.0, screen_size=128, screen_length=64.0
+        "cerro_pachon",
+        4,
+        exposure=2.0,
+        time_step=0.5,
+        screens=ScreenSampling(cutoff=0.7, screen_size=128, screen_length=64.0),
+        outer_scale=5.0,
     )
     engine = FastEngine().renderer(telescope.inputs(ONE_WAVE, PLANE, atmosphere=atmosphere, threads=1))
     image = engine.render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
@@ -274,15 +285,11 @@ def test_mean_of_many_exposures_has_the_long_exposure_width(polynomial_pupil, cu
     fields = np.stack(np.meshgrid([-0.02, 0.0, 0.02], [-0.02, 0.02]), axis=-1).reshape(-1, 2)
     for seed in range(12):
         atmosphere = Atmosphere.from_site(
-            "cerro_pachon",
+            load_site("cerro_pachon").with_layers(wind_speeds=[10.0] * 6),
             seed,
             exposure=15.0,
             time_step=0.15,
-            cutoff=cutoff,
-            screen_size=1024,
-            screen_length=163.84,
-            wind_speeds=[10.0] * 6,
-            fine_size=512,
+            screens=ScreenSampling(cutoff=cutoff, screen_size=1024, screen_length=163.84, fine_size=512),
         )
         engine = FastEngine().renderer(telescope.inputs(ONE_WAVE, plane, atmosphere=atmosphere, threads=1))
         total += engine.render(fields, np.zeros((6, 2))).image.sum(axis=0)
@@ -304,7 +311,9 @@ def test_mean_of_many_exposures_has_the_long_exposure_width(polynomial_pupil, cu
 
 
 def test_bytes_do_not_depend_on_threads_batches_or_company(lsst_r):
-    atmosphere = Atmosphere.from_site("cerro_pachon", 5, exposure=0.5, screen_size=256, screen_length=40.96)
+    atmosphere = Atmosphere.from_site(
+        "cerro_pachon", 5, exposure=0.5, screens=ScreenSampling(screen_size=256, screen_length=40.96)
+    )
     rng = np.random.default_rng(1)
     fields, offsets = rng.uniform(-0.02, 0.02, (7, 2)), rng.uniform(-0.5, 0.5, (7, 2))
     wavelengths = np.array([550e-9, 620e-9, 690e-9])
@@ -354,15 +363,18 @@ def test_refuses_bad_sampling(options, named):
 
 
 def test_refuses_screens_narrower_than_the_pupil(polynomial_pupil):
-    atmosphere = Atmosphere.from_site("cerro_pachon", 5, screen_size=64, screen_length=8.0, exposure=0.1)
+    atmosphere = Atmosphere.from_site(
+        "cerro_pachon", 5, screens=ScreenSampling(screen_size=64, screen_length=8.0), exposure=0.1
+    )
     with pytest.raises(DomainError, match="wider than the pupil"):
         FastEngine().renderer(polynomial_pupil().inputs(ONE_WAVE, PLANE, atmosphere=atmosphere))
 
 
 def test_screens_too_coarse_for_a_small_pupil_are_refused():
     telescope = load_telescope("auxtel")  # of 1.2 m
-    coarse = {"screen_size": 256, "screen_length": 128.0, "exposure": 0.1}
-    air = Atmosphere.from_site("cerro_pachon", seed=2, **coarse)
+    air = Atmosphere.from_site(
+        "cerro_pachon", seed=2, exposure=0.1, screens=ScreenSampling(screen_size=256, screen_length=128.0)
+    )
     with pytest.raises(DomainError, match=r"screen_size = 256: expected at least 427, .* 1\.2 m has 4 samples across"):
         make_psfs(telescope, [(0.0, 0.0)], [620e-9], atmosphere=air)
 
@@ -372,7 +384,9 @@ def test_rows_of_the_screens_that_no_light_crosses_do_not_matter(n_pupil):
     telescope = load_telescope("lsst_v3.3_r")
 
     def psfs(spoil):
-        air = Atmosphere.from_site("cerro_pachon", 4, screen_size=1024, screen_length=162.5, exposure=1.0)
+        air = Atmosphere.from_site(
+            "cerro_pachon", 4, screens=ScreenSampling(screen_size=1024, screen_length=162.5), exposure=1.0
+        )
         fields = np.array([[0.004, 0.003], [0.004, 0.0031], [0.0041, 0.0029]])
         if spoil:
             # All rows but those that the light crosses hold what no screen has.

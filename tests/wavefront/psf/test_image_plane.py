@@ -7,6 +7,7 @@ from scipy.special import erf
 
 from pachon.core.errors import DomainError
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
+from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
 from pachon.wavefront.psf.image_plane import ImagePlane, focal_length, square_transfer
 from pachon.wavefront.psf.psf import make_psfs
 from pachon.wavefront.psf.stamps import Stamps
@@ -60,7 +61,10 @@ def test_focal_length_of_a_turned_and_stretched_jacobian():
 def test_jitter_adds_to_the_variance_of_an_image(lsst_r, engine):
     """Seeing of 0.5 arcsec, unweighted moments over 13 arcsec, in which all but the far wings lie."""
     atmosphere = Atmosphere.from_site(
-        "cerro_pachon", 4, exposure=0.2, screen_size=256, screen_length=40.96, fine_size=1024, fine_pixel=0.02
+        "cerro_pachon",
+        4,
+        exposure=0.2,
+        screens=ScreenSampling(screen_size=256, screen_length=40.96, fine_size=1024, fine_pixel=0.02),
     )
     sigma = 0.3
     options = {"atmosphere": atmosphere, "engine": engine, "threads": 2}

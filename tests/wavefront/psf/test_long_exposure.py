@@ -17,6 +17,7 @@ from pachon.pipeline.experiment import Experiment
 from pachon.raytrace.rays import field_direction
 from pachon.wavefront.aberration import ResidualWavefront
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
+from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
 from pachon.wavefront.atmosphere.turbulence import diffraction_otf, long_exposure_fwhm, structure_function
 from pachon.wavefront.chief_rays import fields_at
 from pachon.wavefront.psf.clear_pupil import SpokePupil, clear_edges
@@ -223,7 +224,8 @@ def test_mean_of_many_exposures_of_the_fast_engine(polynomial_pupil):
     fields = np.stack(np.meshgrid([-0.02, 0.0, 0.02], [-0.02, 0.02]), axis=-1).reshape(-1, 2)
     total = np.zeros((31, 31))
     for seed in range(8):
-        atmosphere = air(seed, exposure=15.0, time_step=0.15, cutoff=6.25, screen_size=2048, screen_length=327.68)
+        screens = ScreenSampling(2048, 327.68, cutoff=6.25)
+        atmosphere = air(seed, exposure=15.0, time_step=0.15, screens=screens)
         fast = FastEngine().renderer(telescope.inputs(ONE_WAVE, PLANE, atmosphere=atmosphere))
         total += fast.render(fields, np.zeros((6, 2))).image.sum(axis=0)
     image = renderer_for(telescope).render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]

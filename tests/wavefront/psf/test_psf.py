@@ -10,6 +10,7 @@ from pachon.core.errors import ConfigError, DomainError, PachonError
 from pachon.measure.shapes import fwhm
 from pachon.pipeline.config import Configuration
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
+from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
 from pachon.wavefront.chief_rays import fields_at
 from pachon.wavefront.psf.engines import ENGINES, psf_engine
 from pachon.wavefront.psf.psf import DARK, make_psfs
@@ -21,9 +22,10 @@ ARCSEC = np.pi / 180 / 3600
 WEIGHT_FWHM = 0.7
 
 
-def small_atmosphere(seed=4, **options):
-    small = {"exposure": 0.2, "screen_size": 512, "screen_length": 81.92, "fine_size": 1024, "fine_pixel": 0.02}
-    return Atmosphere.from_site("cerro_pachon", seed, **(small | options))
+def small_atmosphere(seed=4):
+    return Atmosphere.from_site(
+        "cerro_pachon", seed, exposure=0.2, screens=ScreenSampling(512, 81.92, fine_size=1024, fine_pixel=0.02)
+    )
 
 
 def moments(image, pixel_arcsec=0.2):
@@ -128,11 +130,9 @@ def test_engines_agree_through_the_same_screens(lsst_r):
         wavelengths=np.array([620e-9]),
         threads=2,
         seed=1,
-        cutoff=8.75,
         exposure=2.0,
         time_step=0.1,
-        screen_size=1024,
-        screen_length=163.84,
+        screens=ScreenSampling(screen_size=1024, screen_length=163.84, cutoff=8.75),
     )
     # 6e-4 for 15 s; what differs is noise of the high modes, so 2.7 times as much in a seventh of the time, and some
     # more for one wavelength and a coarse time step.
@@ -176,7 +176,9 @@ def test_engines_agree_over_the_field(lsst_r):
         ccds = rng.choice(np.flatnonzero(np.hypot(*centers.T) < 0.31), 8, replace=False)
         positions = centers[ccds] + rng.uniform(-0.018, 0.018, (8, 2))
         options = {"focal_plane": focal_plane, "stamps": Stamps(offsets=rng.uniform(-0.5, 0.5, (8, 2)))}
-        screens = Atmosphere.from_site("cerro_pachon", seed, screen_size=4096, screen_length=650.0)
+        screens = Atmosphere.from_site(
+            "cerro_pachon", seed, screens=ScreenSampling(screen_size=4096, screen_length=650.0)
+        )
         for engine, measured in e.items():
             psfs = make_psfs(
                 lsst_r, fields_at(lsst_r, positions), wavelengths, atmosphere=screens, engine=engine, **options

@@ -12,6 +12,7 @@ from pachon.models.camera.silicon import Silicon
 from pachon.raytrace.rays import RayStatus, field_direction, parallel_rays
 from pachon.raytrace.trace import trace
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
+from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
 from pachon.wavefront.chief_rays import fields_at
 from pachon.wavefront.psf.channels import Channels
 from pachon.wavefront.psf.fast import FastEngine
@@ -63,7 +64,7 @@ def summed_over_depths(engine, pupil, wavelength, silicon, **options):
 
 
 def turbulence(**options):
-    small = {"exposure": 0.2, "screen_size": 256, "screen_length": 40.96, "fine_size": 512, "fine_pixel": 0.02}
+    small = {"exposure": 0.2, "screens": ScreenSampling(256, 40.96, fine_size=512, fine_pixel=0.02)}
     return Atmosphere.from_site("cerro_pachon", 4, **(small | options))
 
 

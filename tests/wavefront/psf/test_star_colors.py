@@ -13,9 +13,9 @@ WEATHER = pachon.load_site("cerro_pachon").weather
 WAVES = np.array([560e-9, 625e-9, 690e-9])
 
 
-def air(**options):
-    given = {"exposure": 0.2, "time_step": 0.1, "screen_size": 1024, "screen_length": 120.0, "fine_size": 512}
-    return pachon.Atmosphere.from_site("cerro_pachon", 1, **(given | options))
+def air():
+    screens = pachon.ScreenSampling(screen_size=1024, screen_length=120.0, fine_size=512)
+    return pachon.Atmosphere.from_site("cerro_pachon", 1, exposure=0.2, time_step=0.1, screens=screens)
 
 
 def images(telescope, engine, waves, atmosphere, weights=None):

@@ -9,6 +9,7 @@ import pytest
 import pachon
 from pachon.core.errors import DomainError
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
+from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
 from pachon.wavefront.atmosphere.turbulence import diffraction_otf
 from pachon.wavefront.psf.engine import PsfInputs
 from pachon.wavefront.psf.image_plane import ImagePlane
@@ -22,9 +23,9 @@ STILL = np.zeros((1, 2))
 STAR = np.zeros((1, 2)), np.zeros((1, 2))
 
 
-def small_atmosphere(seed=4, **options):
-    small = {"exposure": 0.2, "screen_size": 256, "screen_length": 40.96, "fine_size": 512, "fine_pixel": 0.02}
-    return Atmosphere.from_site("cerro_pachon", seed, **(small | options))
+def small_atmosphere(seed=4, exposure=0.2, fine_pixel=0.02):
+    screens = ScreenSampling(256, 40.96, 512, fine_pixel)
+    return Atmosphere.from_site("cerro_pachon", seed, exposure=exposure, screens=screens)
 
 
 @pytest.mark.long

@@ -69,7 +69,8 @@ def test_a_tile_is_the_cubic_convolution_along_chief_rays(lsst_r, wcs_of, visit)
 
     def in_window(at):
         landing = visit.on_detector(lsst_r, at, WAVELENGTH)
-        return (landing - center) / camera.pixel_size + 2047.5 - (WINDOW.x, WINDOW.y)
+        # The pixels' x and y run along y and x of the focal plane; the CCD has 4096 x 4004 of them.
+        return (landing - center)[:, ::-1] / camera.pixel_size + [2047.5, 2001.5] - (WINDOW.x, WINDOW.y)
 
     u, v = in_window(sky).T
     step = 1e-6

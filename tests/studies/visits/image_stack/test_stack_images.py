@@ -205,7 +205,8 @@ def test_refusals(visits_folder, tmp_path_factory, monkeypatch, capsys):
 
 def test_the_limit_of_the_galaxies_follows_the_depth_and_then_stays(visits_folder, small_visits):
     stack = ImageStack.of(visits_folder, ImageStackConfig(side=128))
-    assert ImageStack.of(visits_folder, ImageStackConfig()).settings.side == 4096
+    # A square of the area of a CCD of 4096 x 4004 pixels.
+    assert ImageStack.of(visits_folder, ImageStackConfig()).settings.side == 4050
     (visits_folder / "images").mkdir()
     (visits_folder / "images" / "images.yaml").write_text(stack.settings.to_yaml())
     more = small_visits.model_copy(update={"visits": small_visits.visits.model_copy(update={"count": 32})})

@@ -1,0 +1,73 @@
+"""Position angle of the zenith: from north through east, whatever the roll; the key that it replaces is refused."""
+
+import numpy as np
+import pytest
+
+import pachon
+from pachon.core.errors import ConfigError
+from pachon.pipeline.config import load_configuration
+from pachon.pipeline.experiment import Experiment
+from pachon.studies.visits.plan import Visit
+from pachon.studies.visits.psf_visit import visit_experiment
+
+
+def blue_towards(experiment, roll):
+    """Return the position angle [deg] on the sky of blue light from red, at a roll [rad]."""
+    # Slopes are those of light; where it comes from is the pointing's business.
+    (xi, eta), *_ = pachon.Pointing(0.3, -0.4, roll).to_sky(np.tan(experiment.dispersion[:1]))
+    return np.rad2deg(np.arctan2(xi, eta)) % 360.0
+
+
+@pytest.fixture
+def low(tiny):
+    """Experiments at 50 degrees from the zenith: ``low(zenith=70.0, roll=30.0)``."""
+
+    def make(zenith, roll=None):
+        air = {"atmosphere__zenith_angle_deg": 50.0, "atmosphere__zenith_position_angle_deg": zenith}
+        air["atmosphere__screen_length_m"] = 1300.0
+        aim = {} if roll is None else {"pointing": {"ra_deg": 20.0, "dec_deg": -25.0, "position_angle_deg": roll}}
+        return Experiment.from_config(tiny(**air, **aim, wavelengths_nm=[560.0, 620.0, 680.0]))
+
+    return make
+
+
+@pytest.mark.parametrize("roll", [0.0, 30.0, 200.0])
+@pytest.mark.parametrize("zenith", [0.0, 70.0, -110.0])
+def test_blue_light_stands_nearer_to_the_zenith(low, zenith, roll):
+    assert blue_towards(low(zenith, roll), np.deg2rad(roll)) == pytest.approx(zenith % 360.0, abs=1e-6)
+
+
+def test_without_a_pointing_there_is_no_roll(low):
+    assert blue_towards(low(70.0), 0.0) == pytest.approx(70.0, abs=1e-6)
+
+
+def test_by_default_the_zenith_lies_towards_x_of_the_telescope(low):
+    # +x points to the position angle roll + 90.
+    assert blue_towards(low(None, 30.0), np.deg2rad(30.0)) == pytest.approx(120.0, abs=1e-6)
+
+
+def test_the_zenith_stands_still_while_visits_roll(low):
+    roll = np.deg2rad(130.0)
+    assert blue_towards(visit_experiment(low(70.0), Visit(1, 1, roll)), roll) == pytest.approx(70.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("angle", "roll", "value"), [("0.0", "", "90"), ("20", "{position_angle_deg: 30}", "100"), ("-90", "", "180")]
+)
+def test_the_old_key_is_refused_with_the_value_to_write(tmp_path, angle, roll, value):
+    path = tmp_path / "run.yaml"
+    pointing = f"pointing: {roll}" if roll else ""
+    path.write_text(f"atmosphere: {{parallactic_angle_deg: {angle}}}\n{pointing}\n")
+    with pytest.raises(ConfigError, match=r"atmosphere\.parallactic_angle_deg = ") as caught:
+        load_configuration(path)
+    text = str(caught.value)
+    assert text.startswith(str(path))
+    assert f"expected zenith_position_angle_deg: {value} (from north through east)" in text
+    assert "\n" not in text
+
+
+def test_the_value_means_what_the_old_one_did(low):
+    # The zenith 20 degrees from +x towards +y: of the telescope's axes on the sky, x at roll + 90, y at roll.
+    shift = low(100.0, 30.0).dispersion[0]
+    # Blue light comes from nearer to the zenith, and its slopes point away from there.
+    assert np.rad2deg(np.arctan2(-shift[1], -shift[0])) == pytest.approx(20.0, abs=1e-9)
