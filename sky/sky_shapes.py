@@ -152,8 +152,8 @@ def _celestial_of(wcs: Any) -> Callable[[np.ndarray], np.ndarray]:
     if not hasattr(astropy_wcs, "all_pix2world"):
         raise DomainError(f"wcs = {shown(wcs)}: expected a WCS of astropy, or one of pachon.ccd_wcs")
     types = getattr(getattr(astropy_wcs, "wcs", None), "ctype", ("RA", "DEC"))
-    axes = [next((i for i, t in enumerate(types) if str(t).startswith(name)), None) for name in ("RA", "DEC")]
-    if None in axes or astropy_wcs.naxis != 2:
+    axes = [i for name in ("RA", "DEC") for i, kind in enumerate(types) if str(kind).startswith(name)]
+    if len(axes) != 2 or astropy_wcs.naxis != 2:
         kinds = ", ".join(map(repr, map(str, types)))
         raise DomainError(f"wcs of axes {kinds}: expected two axes, right ascension and declination")
     return lambda pixels: np.deg2rad(np.asarray(astropy_wcs.all_pix2world(pixels, 0))[:, axes])

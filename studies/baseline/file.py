@@ -106,7 +106,7 @@ def read_baseline(path: str | os.PathLike[str]) -> Baseline:
         )
     if content.get("version") in _OLDER_VERSIONS:
         plan = content.get("plan")
-        refuse_mirrored_names((plan.get("ccds") or () if isinstance(plan, dict) else ()), None, path, ConfigError)
+        refuse_mirrored_names((plan.get("ccds") or () if isinstance(plan, dict) else ()), None, Path(path), ConfigError)
     elif content.get("version") not in VERSIONS:
         file_version, writer = content.get("version"), content.get("pachon")
         problem = (

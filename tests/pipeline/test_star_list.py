@@ -367,7 +367,8 @@ def world_coordinates(experiment):
 
 def pixels(table):
     """Pixels of the central CCD."""
-    return (np.stack([table["X"], table["Y"]], axis=1) * 1e-3 + CAMERA.half_sizes[0, 0]) / CAMERA.pixel_size - 0.5
+    # They run along y and x of the detector: 4096 and 4004 of 10 um about the axis.
+    return np.stack([table["Y"], table["X"]], axis=1) * 1e-3 / 10e-6 + [2047.5, 2001.5]
 
 
 @pytest.mark.slow

@@ -267,7 +267,8 @@ def test_a_focal_plane_model_is_fitted_to_all_ccds_of_the_plan(focal_plane_confi
     }
     assert found == {f"reconstruction R22_S12 {key}": pytest.approx(v, rel=1e-9) for key, v in expected.items()}
     own = np.sqrt(np.mean([first.holdout.residual_e1**2, first.holdout.residual_e2**2]))
-    assert abs(own - expected["rms residual away"]) > 1e-4
+    # The model of the CCD itself has another residual, by a tenth and more.
+    assert abs(own - expected["rms residual away"]) > 0.1 * own
 
 
 @pytest.mark.slow

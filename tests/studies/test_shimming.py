@@ -134,7 +134,8 @@ def test_no_motion_of_a_grid_has_a_smaller_correlation(built):
     sky, other = (fields_at(built.telescope, places.position, 620e-9) for places in (fit, check))
     positions, both = np.concatenate([fit.position, check.position]), np.concatenate([sky, other])
     longest, on_detector = (np.hypot(*np.ptp(values, axis=0)) for values in (both, positions))
-    edges = separation_edges(0.25 * 40.96e-3 * longest / on_detector, longest)
+    # A quarter of the shortest side of all CCDs, 4000 pixels.
+    edges = separation_edges(0.25 * 40.00e-3 * longest / on_detector, longest)
 
     def correlation(heights):
         return float(np.sqrt((pair_by_pair(sky, fit.weight, curves.at(heights)[:, 1:], edges) ** 2).mean()))
