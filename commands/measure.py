@@ -9,6 +9,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError
+from ..core.units import ARCSEC
 from .inputs import load_model
 from .options import Basis, Components, Interpolation, Json, Order, Quiet, Recipe, Threads, Weights, recipe_of_options
 from .tables import Rows, print_json
@@ -17,12 +18,15 @@ from .workers import Processes, long_work
 app = typer.Typer()
 
 _CAPTION = "Completeness and purity of the stars; magnitude at which half of the objects are found; purity of all."
+_HEADINGS = ("image", "objects", "stars", "usable", "per arcmin²", "complete, pure", "half [mag]", "purity")
+#: Columns of images without the truth.
+_COLUMNS = 5
 _MODELS = ("ccd", "focal_plane")
 
 
 @app.command("measure")
 def measure_command(
-    images: Annotated[list[Path], Argument(metavar="IMAGE.fits ...", help="Images of pachon images.")],
+    images: Annotated[list[Path], Argument(metavar="IMAGE.fits ...", help="FITS images of any program.")],
     out: Annotated[
         Path | None, Option("--out", "-o", help="Folder of the catalogues; by default that of each.")
     ] = None,
@@ -41,7 +45,33 @@ def measure_command(
     components: Components = None,
     weights: Weights = None,
     order: Order = None,
+    psf: Annotated[
+        str | None,
+        Option(help="File of a PSF model: of pachon, Piff or PSFEx; {stem} is the name of the image without .fits."),
+    ] = None,
+    stars: Annotated[
+        str | None, Option(help="Table of stars (x, y or ra, dec; FITS, ECSV, CSV), or {stem}..., in place of a locus.")
+    ] = None,
     min_snr: Annotated[float, Option(help="Least S/N of stars.")] = 30.0,
+    extension: Annotated[
+        str | None, Option(help="Extension of the image, name or number; by default all images of a file.")
+    ] = None,
+    weight: Annotated[str | None, Option(help="FITS file of the noise of the pixels, or {stem}....")] = None,
+    weight_kind: Annotated[
+        str, Option(help="What it holds: weight (inverse variance on any scale), variance, rms.")
+    ] = "weight",
+    mask: Annotated[str | None, Option(help="FITS file of the mask, or {stem}....")] = None,
+    gain: Annotated[float | None, Option(help="Electrons in a unit of the image, where the header has none.")] = None,
+    zero_point: Annotated[float | None, Option(help="Magnitude of a unit of the image.")] = None,
+    pixel_scale: Annotated[
+        float | None, Option(help="Side of a pixel of an image without world coordinates [arcsec].")
+    ] = None,
+    saturation: Annotated[
+        float | None, Option(help="Level of saturated pixels [unit of the image], where the header has none.")
+    ] = None,
+    pictures: Annotated[
+        bool, Option("--pictures", help="Also image_measured.png: objects, stellar locus, stars beside their PSF.")
+    ] = False,
     resume: Annotated[bool, Option("--resume", help="Keep whole products of images measured in the same way.")] = False,
     processes: Processes = None,
     threads: Threads = None,
@@ -53,7 +83,10 @@ def measure_command(
     Each image.fits leaves image_galaxies.fits, a table with sky positions, magnitudes and ellipticities before the PSF,
     and image_psf.fits, the PSF model of the CCD. With `--model focal_plane` one model of all images of an exposure
     takes its place: focal_plane_psf.fits. Simulated images know the truth: completeness and purity are printed. Images
-    without objects, or with too few stars, are reported and left out.
+    without objects, or with fewer than three stars, are reported and left out.
+
+    Images are those of pachon images, LSST, HSC, DES, or any with world coordinates and a gain, in one extension or
+    many, compressed or not; docs/measuring.md says what is read, and what the options stand for.
 
     **Examples**
 
@@ -62,13 +95,18 @@ def measure_command(
     - `pachon measure pachon_images/image_*.fits -o catalogues --resume`: go on where it was stopped
     - `pachon measure pachon_images/image_*.fits -o catalogues --recipe paper`: the PSF in the paper's way
     - `pachon measure pachon_images/image_*.fits -o catalogues --model focal_plane`: optics, heights and turbulence
+    - `pachon measure D00232418_i_c19.fits.fz --psf "{stem}_piff.fits"`: an image of DES with the PSF model of Piff
+    - `pachon measure coadd.fits --weight coadd.weight.fits --gain 2.1 --zero-point 30`: what the header lacks
     """
     from ..core.files import make_folder
     from ..imaging.exposure_psf import fit_exposure_psf
-    from ..imaging.measure_files import images_among, measure_files
+    from ..imaging.image_formats.load import ImageSettings
+    from ..imaging.measure_files import MeasureOptions, images_among, measure_files
 
     if model not in _MODELS:
         raise ConfigError(f"--model = {model!r}: expected one of {', '.join(_MODELS)}")
+    if model != "ccd" and psf is not None:
+        raise ConfigError("--psf: expected with --model ccd alone")
     if model == "ccd" and telescope is not None:
         raise ConfigError("--telescope: expected with --model focal_plane alone")
     if out is not None:
@@ -77,30 +115,49 @@ def measure_command(
     ccd_recipe = recipe_of_options(recipe, basis, interpolation, components, weights, order)
     if model != "ccd" and ccd_recipe is not None:
         raise ConfigError("--recipe and its options are of models of a CCD: expected none with --model focal_plane")
+    if psf is not None and ccd_recipe is not None:
+        raise ConfigError("--recipe and its options are of models of a CCD: expected none with --psf")
+    settings = ImageSettings(
+        weight=weight,
+        weight_kind=weight_kind,
+        mask=mask,
+        gain=gain,
+        zero_point=zero_point,
+        pixel_scale=None if pixel_scale is None else pixel_scale * ARCSEC,
+        saturation=saturation,
+    )
     hint = "catalogues that are written stay, and --resume goes on from there"
     with long_work(quiet, hint, threads=threads, resume=resume, processes=processes) as execution:
-        psf = None
+        psf_file: str | Path | None = psf
         if model == "focal_plane":
             telescope_model = None if telescope is None else load_model(telescope)
-            psf = (images[0].parent if out is None else out) / "focal_plane_psf.fits"
+            psf_file = (images[0].parent if out is None else out) / "focal_plane_psf.fits"
             fit_exposure_psf(
                 images, telescope_model, min_snr=min_snr, threads=threads, reporter=execution.reporter
-            ).write(psf)
-        measured = measure_files(images, out, psf=psf, recipe=ccd_recipe, min_snr=min_snr, execution=execution)
+            ).write(psf_file)
+        options = MeasureOptions(psf_file, ccd_recipe, stars, min_snr, settings, pictures)
+        measured = measure_files(images, out, extension=extension, options=options, execution=execution)
     if as_json:
         print_json({"images": measured.metrics, "left_out": measured.left_out})
     elif not quiet:
-        rows = [
-            (
+        rows = []
+        for name, m in measured.metrics.items():
+            density = m["usable_per_arcmin2"]
+            row = [
                 name,
                 str(m["objects"]),
                 str(m["stars"]),
-                f"{m.get('star_completeness', float('nan')):.2f}, {m.get('star_purity', float('nan')):.2f}",
-                str(m.get("magnitude_half_complete", "")),
-                f"{m.get('purity', float('nan')):.3f}",
-                f"{m['usable_per_arcmin2']:.1f}",
-            )
-            for name, m in measured.metrics.items()
-        ]
-        headings = ("image", "objects", "stars", "complete, pure", "half [mag]", "purity", "usable/arcmin²")
-        Rows(headings, rows, _CAPTION).show()
+                str(m["usable"]),
+                "" if density is None else f"{density:.1f}",
+            ]
+            if "purity" in m:
+                row += [
+                    f"{m['star_completeness']:.2f}, {m['star_purity']:.2f}",
+                    str(m["magnitude_half_complete"]),
+                    f"{m['purity']:.3f}",
+                ]
+            rows.append(row)
+        has_truth = any("purity" in m for m in measured.metrics.values())
+        columns = len(_HEADINGS) if has_truth else _COLUMNS
+        padded_rows = [(row + [""] * columns)[:columns] for row in rows]
+        Rows(_HEADINGS[:columns], padded_rows, _CAPTION if has_truth else "").show()

@@ -82,7 +82,7 @@ class PachonError(Exception):
             return self
         if file is None and not key:
             # A subject that an inner context has stated is not repeated.
-            stated = subject is not None and f"{self.subject}:".startswith(f"{subject}:")
+            stated = subject is not None and (f"{self.subject}:".startswith(f"{subject}:") or subject == self.file)
             full_subject = ": ".join(text for text in (None if stated else subject, self.subject) if text)
             return type(self)(
                 self.problem, subject=full_subject or None, file=self.file, place=self.place, key=self.key

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.wcs import WCS
 
@@ -18,7 +20,7 @@ from ..core.products import Columns, Stamp, column, read_fits, table_hdu, write_
 from ..core.result import Result
 from ..core.units import ARCSEC
 from .exposure import MASK_BITS
-from .stretch import draw_image, pixel_scale_of
+from .stretch import draw_image, has_celestial, pixel_scale_of, world_coordinates
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -64,6 +66,8 @@ class CcdImage(Result):
         Origin.
     mask_bits : dict of int to str
         Names of the bits of the mask.
+    origins : dict of str to str
+        Where gain, zero point, variance and others came from, of an image of another program.
     """
 
     name: str
@@ -74,6 +78,7 @@ class CcdImage(Result):
     objects: dict[str, np.ndarray] = field(default_factory=dict)
     stamp: Stamp | None = None
     mask_bits: dict[int, str] = field(default_factory=MASK_BITS.copy)
+    origins: dict[str, str] = field(default_factory=dict)
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw the image, binned to about a thousand pixels, with an asinh stretch, and where north and east are."""
@@ -81,8 +86,10 @@ class CcdImage(Result):
             figure, axes = axes_at(ax, 7.0, 6.6)
             draw_image(axes, self.image, self.variance, self.header)
             words = [self.name]
-            if "FILTER" in self.header:
-                words += [f"{self.header['FILTER']} band", f"{self.header['EXPTIME']:g} s"]
+            if self.band is not None:
+                words.append(f"{self.band.split()[0]} band")
+            if "EXPTIME" in self.header:
+                words.append(f"{self.header['EXPTIME']:g} s")
             axes.set_title(plain_text(", ".join(words)), loc="left")
             return figure
 
@@ -99,7 +106,7 @@ class CcdImage(Result):
     @property
     def wcs(self) -> WCS:
         """World coordinates as those of astropy."""
-        return WCS(self.header)
+        return world_coordinates(self.header)
 
     @property
     def gain(self) -> float:
@@ -107,9 +114,54 @@ class CcdImage(Result):
         return float(self.header.get("GAIN", 1.0))
 
     @property
+    def band(self) -> str | None:
+        """Filter of the header; None where it has none."""
+        return str(self.header["FILTER"]) if "FILTER" in self.header else None
+
+    @property
+    def zero_point(self) -> float | None:
+        """Magnitude of a unit of the image; None where the header has no ZEROPNT."""
+        return float(self.header["ZEROPNT"]) if "ZEROPNT" in self.header else None
+
+    @property
+    def has_sky(self) -> bool:
+        """Whether the world coordinates are celestial."""
+        return has_celestial(self.header)
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether the angle of a pixel is known."""
+        return self.has_sky or "PIXSCALE" in self.header
+
+    @property
     def pixel_scale(self) -> float:
-        """Angle of a pixel at the reference point of the world coordinates [rad]."""
+        """Angle of a pixel at the reference point of the world coordinates, or of PIXSCALE without them [rad].
+
+        ConfigError where the header has neither.
+        """
         return pixel_scale_of(self.header) * ARCSEC
+
+    def celestial(self, pixels: np.ndarray) -> np.ndarray:
+        """Return right ascension and declination (ICRS) [deg], shape [n, 2], of pixels (x, y), shape [n, 2]."""
+        wcs = self.wcs
+        if wcs.wcs.lng == 0 and wcs.wcs.radesys in ("ICRS", ""):
+            return np.asarray(wcs.all_pix2world(pixels, 0))
+        sky = wcs.celestial.pixel_to_world(*np.asarray(pixels, dtype=np.float64).T).icrs
+        return np.stack([sky.ra.deg, sky.dec.deg], axis=1)
+
+    def pixels_at(self, celestial: np.ndarray) -> np.ndarray:
+        """Return pixels (x, y), shape [n, 2], of right ascension and declination (ICRS) [deg], shape [n, 2].
+
+        NaN where the world coordinates have no inverse.
+        """
+        sky = SkyCoord(*np.asarray(celestial, dtype=np.float64).T, unit="deg")
+        with warnings.catch_warnings(), np.errstate(invalid="ignore"):
+            warnings.simplefilter("ignore")
+            return np.stack(self.wcs.celestial.world_to_pixel(sky), axis=1)
+
+    def pixels_of_ccd(self, positions: np.ndarray) -> np.ndarray:
+        """Return pixels of the CCD of pixels of the image, which may be a part of it, both [n, 2]."""
+        return np.asarray(positions + np.array([self.header.get("CCDX0", 0), self.header.get("CCDY0", 0)]))
 
     @check_arguments
     def write(self, path: str | Path) -> None:
@@ -125,7 +177,7 @@ class CcdImage(Result):
         mask = fits.ImageHDU(np.asarray(self.mask, dtype=np.int16), name="MASK")
         for bit, name in self.mask_bits.items():
             mask.header[f"MP_{name[:5]}"] = (bit.bit_length() - 1, f"number of the bit {name}")
-        columns: Columns = {key: (self.objects[key], *OBJECT_COLUMNS[key]) for key in OBJECT_COLUMNS}
+        columns: Columns = {key: (values, *OBJECT_COLUMNS[key]) for key, values in self._columns().items()}
         cards = [("CCD", self.name, "name of the CCD")]
         write_fits(Path(path), [image, variance, mask, table_hdu("TRUTH", columns)], self.stamp, cards)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,16 +13,29 @@ from ..core.errors import DomainError, PachonError
 from ..core.statistics import RMS_PER_MAD
 from ..core.units import ARCSEC, positive_angle
 from ..measure.catalogue.detect import detect_objects
+from ..measure.catalogue.few_stars import FEWEST_STARS, LEAST_FWHM, named_stars, smallest_stars
 from ..measure.catalogue.objects import DetectedObjects
-from ..measure.catalogue.star_locus import StarSelection, select_stars
+from ..measure.catalogue.star_locus import STAMP_SIDE, StarSelection, select_stars, stamp_side
 from ..measure.shapes import measure_shapes
 from ..measure.star_selection import flag_stars
 from ..reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
 from ..reconstruction.psf_model.model import PsfModel
+from ..reconstruction.psf_model.pixels import Pixels
+from ..reconstruction.psf_model.polynomial_fit import Polynomial
 from ..reconstruction.psf_model.recipe import DEFAULT, Recipe
 from .exposure import SATURATED
 from .image_file import CcdImage
 
+# What else makes a PSF.
+_HINT = "or a lower min_snr, a catalogue of stars (stars), a PSF model (psf)"
+#: Stars from which on the PSF may vary over the image: as many make a stellar locus.
+MANY_STARS = 10
+# Least distance of a star to its nearest neighbour on stamps of the usual side [pixel].
+_ISOLATION = 12.0
+# Part of the bright objects that is smaller than most stars, or than small galaxies.
+_SMALL_OBJECTS = 0.25
+#: PSF of few stars: the mean, weighted by S/N.
+CONSTANT = Recipe(Pixels(), Polynomial(0), weights="snr")
 # Stars whose shape deviates from that of their neighbours by more of the usual deviations than this are left out.
 _DEVIATIONS = 6.0
 # A galaxy or a blend among fewer stars cannot be told from the change of the PSF.
@@ -30,21 +44,96 @@ _FEWEST = 12
 _PASSES = 5
 
 
-def objects_and_stars(image: CcdImage, min_snr: float) -> tuple[DetectedObjects, StarSelection]:
-    """Detect the objects of an image, and select its stars: those of the stellar locus whose stamps show one star.
+def detected_objects(image: CcdImage) -> DetectedObjects:
+    """Detect the objects of an image; DomainError where there are none."""
+    try:
+        return detect_objects(image.image, image.variance, image.mask, saturated=SATURATED)
+    except PachonError as error:
+        raise error.within(subject=f"CCD {image.name}") from None
+
+
+def stars_among(image: CcdImage, objects: DetectedObjects, min_snr: float) -> StarSelection:
+    """Select the stars of a locus of ten or more whose stamps show one star; DomainError where there are too few."""
+    try:
+        return _stars_of_locus(image, objects, min_snr)
+    except PachonError as error:
+        raise error.within(subject=f"CCD {image.name}") from None
+
+
+def few_or_many_stars(
+    image: CcdImage, objects: DetectedObjects, min_snr: float, positions: ArrayLike | None = None
+) -> StarSelection:
+    """Select the stars of a locus, of :data:`FEWEST_STARS` where there are not ten; or those at given pixels [k, 2].
 
     Raises
     ------
     DomainError
-        If nothing is detected, or there are too few stars for a locus.
+        If fewer are good.
     """
     try:
-        objects = detect_objects(image.image, image.variance, image.mask, saturated=SATURATED)
-        stars = select_stars(objects, image.image, mask=image.mask, min_snr=min_snr)
-        noise = float(np.sqrt(sky_variance(image)))
-        return objects, stars.without(flag_stars(stars.stamps, noise, gain=image.gain).flags != 0)
+        if positions is not None:
+            side = stamp_side(_usual_radius(objects, min_snr))
+            stars = named_stars(objects, image.image, positions, mask=image.mask, min_snr=min_snr, size=side)
+            if len(stars) >= MANY_STARS:
+                stars = _single_stars(image, stars)
+        else:
+            stars = _stars_of_any_locus(image, objects, min_snr)
     except PachonError as error:
         raise error.within(subject=f"CCD {image.name}") from None
+    if len(stars) < FEWEST_STARS:
+        raise DomainError(
+            f"{len(stars)} stars are good: expected at least {FEWEST_STARS} for a PSF, {_HINT}",
+            subject=f"CCD {image.name}",
+        )
+    return stars
+
+
+def _stars_of_any_locus(image: CcdImage, objects: DetectedObjects, min_snr: float) -> StarSelection:
+    """Return the stars of a locus of ten or more, or else of the fewest; all of them may make the locus then."""
+    try:
+        stars = _stars_of_locus(image, objects, min_snr)
+    except DomainError:
+        stars = None
+    if stars is not None and len(stars) >= MANY_STARS:
+        return stars
+    side = stamp_side(_usual_radius(objects, min_snr))
+    options: dict[str, Any] = {"isolation": _ISOLATION * side / STAMP_SIDE, "size": side, "mask": image.mask}
+    try:
+        # A median of few stars is no star, with which to compare their stamps.
+        return smallest_stars(objects, image.image, min_snr=min_snr, **options)
+    except DomainError as error:
+        if stars is not None and len(stars) >= FEWEST_STARS:
+            return stars
+        raise error.followed_by(_HINT) from None
+
+
+def _stars_of_locus(image: CcdImage, objects: DetectedObjects, min_snr: float) -> StarSelection:
+    """Return the stars of a locus of ten or more whose stamps show one star."""
+    return _single_stars(image, _locus(image, objects, min_snr))
+
+
+def _locus(image: CcdImage, objects: DetectedObjects, min_snr: float, **options: Any) -> StarSelection:
+    """Return the stars of a locus, on stamps as wide as stars of the image ask for."""
+    side = stamp_side(_usual_radius(objects, min_snr))
+    isolation = _ISOLATION * side / STAMP_SIDE
+    return select_stars(
+        objects, image.image, mask=image.mask, min_snr=min_snr, isolation=isolation, size=side, **options
+    )
+
+
+def _usual_radius(objects: DetectedObjects, min_snr: float) -> float:
+    """Return about the half-light radius of the stars of an image, which are among the smallest objects [pixel]."""
+    measured = (objects.flags == 0) & np.isfinite(objects.half_light_radius) & (objects.snr > min_snr)
+    measured &= objects.fwhm >= LEAST_FWHM
+    if not measured.any():
+        return np.nan
+    return float(np.quantile(objects.half_light_radius[measured], _SMALL_OBJECTS))
+
+
+def _single_stars(image: CcdImage, stars: StarSelection) -> StarSelection:
+    """Return the selected stars whose stamps show no neighbour, cosmic ray or saturated core."""
+    noise = float(np.sqrt(sky_variance(image)))
+    return stars.without(flag_stars(stars.stamps, noise, gain=image.gain).flags != 0)
 
 
 def sky_variance(image: CcdImage) -> float:
@@ -52,8 +141,10 @@ def sky_variance(image: CcdImage) -> float:
     return float(np.median(image.variance[image.mask == 0]))
 
 
-def fit_image_psf(image: CcdImage, stars: StarSelection, recipe: Recipe = DEFAULT) -> PsfModel:
+def fit_image_psf(image: CcdImage, stars: StarSelection, recipe: Recipe | None = None) -> PsfModel:
     """Fit a PSF model of one CCD to the selected stars of its image; positions are pixels of the image.
+
+    The recipe is the default one where there are :data:`MANY_STARS`, else :data:`CONSTANT`.
 
     Raises
     ------
@@ -61,6 +152,8 @@ def fit_image_psf(image: CcdImage, stars: StarSelection, recipe: Recipe = DEFAUL
         If there are too few stars for the model.
     """
     height, width = image.image.shape
+    if recipe is None:
+        recipe = DEFAULT if len(stars) >= MANY_STARS else CONSTANT
     try:
         return PsfModel.fit(
             stars.stamps,
@@ -83,9 +176,17 @@ def _masks_of(stars: StarSelection) -> np.ndarray | None:
     return masks if masks.any() else None
 
 
-def pixels_of_ccd(image: CcdImage, positions: np.ndarray) -> np.ndarray:
-    """Convert pixels of an image, which may be a part of the CCD, to pixels of the CCD, both [n, 2]."""
-    return np.asarray(positions + np.array([image.header.get("CCDX0", 0), image.header.get("CCDY0", 0)]))
+def few_stars_warning(stars: StarSelection) -> str:
+    """Return the words for a PSF of few stars: how many, and the standard error of its ellipticity."""
+    # Ellipticities have no scale: a pixel counts as an arcsec.
+    shapes = measure_shapes(stars.stamps, ARCSEC, 2.0 * stars.half_light_radius * ARCSEC)
+    e = np.stack([shapes.e1, shapes.e2])[:, shapes.flags == 0]
+    count = e.shape[1]
+    error = float(np.sqrt((e.var(axis=1, ddof=1)).mean() / count)) if count > 1 else np.nan
+    return (
+        f"its PSF comes from {len(stars)} stars: weighted e good to {error:.1g} a component; "
+        "a catalogue of stars (stars) or a PSF model (psf) makes it better"
+    )
 
 
 @check_arguments
@@ -119,7 +220,7 @@ def focal_plane_stars(
     ccd_stars, scale, reason = [], 0.0, "there are no images"
     for image in images:
         try:
-            _, stars = objects_and_stars(image, min_snr)
+            stars = stars_among(image, detected_objects(image), min_snr)
         except DomainError as error:
             reason = str(error)
             continue
@@ -136,7 +237,7 @@ def _ccd_stars(image: CcdImage, stars: StarSelection, weight_fwhm: float) -> Ccd
     stamps = stars.stamps / flux[:, None, None]
     shapes = measure_shapes(stamps, image.pixel_scale, weight_fwhm)
     level = sky_variance(image) * image.gain**2
-    x, y = pixels_of_ccd(image, stars.positions).T
+    x, y = image.pixels_of_ccd(stars.positions).T
     good = (flux > 0.0) & (shapes.flags == 0)
     values = np.stack([shapes.e1, shapes.e2, np.log(np.where(good, shapes.size, 1.0))], axis=1)
     good[good] = regular_shapes(values[good], stars.snr[good], stars.positions[good])

@@ -6,34 +6,40 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from astropy import units as u
 from astropy.table import QTable, Table
+from numpy.typing import ArrayLike
 
-from ..core.arguments import check_arguments
-from ..core.errors import ConfigError
+from ..core.arguments import check_arguments, removed_arguments
+from ..core.errors import ConfigError, DomainError
 from ..core.plotting import BLUE, ORANGE, axes_at, styled
-from ..core.products import described_table
+from ..core.products import Columns, described_table
 from ..core.result import Result
 from ..core.units import ARCMIN
 from ..core.version import VERSION
 from ..measure.catalogue.fit_galaxies import fit_galaxies
 from ..measure.catalogue.galaxy_fits import GalaxyFits, usable_galaxies
 from ..measure.catalogue.matching import detection_rates, match_positions
-from ..measure.catalogue.objects import DetectedObjects
+from ..measure.catalogue.objects import DetectedObjects, ObjectFlag
 from ..measure.catalogue.star_locus import StarSelection
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
-from ..reconstruction.psf_model.basis import Basis
-from ..reconstruction.psf_model.interpolation import Interpolation
+from ..reconstruction.piff.psf import PiffPsf
 from ..reconstruction.psf_model.model import PsfModel
 from ..reconstruction.psf_model.recipe import Recipe
-from ..sky.sky_shapes import SkyShapes, to_sky
+from ..reconstruction.psfex import PsfexPsf
+from ..sky.sky_shapes import STEP, SkyShapes, along_sky, jacobians_on_sky
 from .image_file import CcdImage
-from .image_stars import fit_image_psf, objects_and_stars, pixels_of_ccd
+from .image_psf import ImagePsf, half_light_radius_of, psfs_on
+from .image_stars import MANY_STARS, detected_objects, few_or_many_stars, few_stars_warning, fit_image_psf
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+#: Arguments of the recipe that stood beside it.
+_REPLACED = dict.fromkeys(
+    ("basis", "interpolation", "weights", "n_components", "order"),
+    "a key of recipe, such as Recipe.of('paper', order=1)",
+)
 #: Largest distance of a detected object from a true one [pixel].
 _MATCH = 3.0
 
@@ -50,35 +56,43 @@ class ImageCatalogue(Result):
         All detected objects.
     stars : StarSelection
         Selected stars among them.
-    psf : PsfModel or FocalPlanePsf
-        Fitted to these stars, its positions pixels of the image; or the model of all CCDs that was given.
+    psf : PsfModel, FocalPlanePsf, PiffPsf or PsfexPsf
+        Fitted to these stars, its positions pixels of the image; or the model that was given.
     galaxies : ndarray of int, shape [n]
         Objects that are no selected stars.
     fits : GalaxyFits
         Elliptical Gaussians under the PSF fitted to them.
     usable : ndarray of bool, shape [n]
         Whether each is fit for shear.
+    warnings : tuple of str
+        What makes the shapes less certain than those of other images.
     """
 
     image: CcdImage
     objects: DetectedObjects
     stars: StarSelection
-    psf: PsfModel | FocalPlanePsf
+    psf: ImagePsf
     galaxies: np.ndarray
     fits: GalaxyFits
     usable: np.ndarray
+    warnings: tuple[str, ...] = ()
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw half-light radius against magnitude, selected stars in another colour."""
-        magnitude, radius = self.objects.magnitude(self.image.header["ZEROPNT"]), self.objects.half_light_radius
+        magnitude, radius = self._magnitudes(), self.objects.half_light_radius
         stars = self.stars.index
         with styled():
             figure, axes = axes_at(ax, 5.4, 4.2)
             axes.plot(magnitude, radius, ".", color=BLUE, markersize=3, label="all objects")
             axes.plot(magnitude[stars], radius[stars], ".", color=ORANGE, markersize=5, label="selected stars")
-            axes.set(xlabel="magnitude", ylabel="half-light radius [pixel]")
+            label = "magnitude" if self.image.zero_point is not None else "instrumental magnitude"
+            axes.set(xlabel=label, ylabel="half-light radius [pixel]")
             axes.legend(loc="upper left")
             return figure
+
+    def _magnitudes(self) -> np.ndarray:
+        """Return the magnitudes of the objects; without a zero point those of flux 1 are 0."""
+        return self.objects.magnitude(self.image.zero_point or 0.0)
 
     def _label(self) -> str:
         count, stars = len(self.objects), len(self.stars)
@@ -92,27 +106,44 @@ class ImageCatalogue(Result):
         return QTable(self.table())
 
     def table(self) -> Table:
-        """Return the galaxies as a table with sky positions, magnitudes, shapes and their errors."""
-        rows, fits, header = self.galaxies, self.fits, self.image.header
+        """Return the galaxies as a table with positions, fluxes, shapes and their errors.
+
+        Right ascension, declination and shapes on the sky are of images with world coordinates, magnitudes of those
+        with a zero point.
+        """
+        rows, fits = self.galaxies, self.fits
         x, y = self.objects.x[rows], self.objects.y[rows]
-        sky = self._sky_shapes(x, y)
-        columns = {
-            "number": (rows + 1, "", "number of the object"),
-            "ra": (np.rad2deg(sky.ra) % 360.0, "deg", "right ascension of the centroid"),
-            "dec": (np.rad2deg(sky.dec), "deg", "declination of the centroid"),
+        columns: Columns = {"number": (rows + 1, "", "number of the object")}
+        sky = self._sky_shapes(x, y) if self.image.has_sky else None
+        if sky is not None:
+            columns |= {
+                "ra": (np.rad2deg(sky.ra) % 360.0, "deg", "right ascension of the centroid"),
+                "dec": (np.rad2deg(sky.dec), "deg", "declination of the centroid"),
+            }
+        columns |= {
             "x": (x, "pix", "centroid, pixel centres at integers"),
             "y": (y, "pix", "centroid, pixel centres at integers"),
-            "magnitude": (self.objects.magnitude(header["ZEROPNT"])[rows], "mag", "AB, in the Kron aperture"),
+            "flux": (self.objects.flux[rows], "", "in the Kron aperture, in the unit of the image"),
+            "flux_error": (self.objects.flux_error[rows], "", "standard error"),
+        }
+        if self.image.zero_point is not None:
+            columns["magnitude"] = (self._magnitudes()[rows], "mag", "AB, in the Kron aperture")
+        columns |= {
             "half_light_radius": (self.objects.half_light_radius[rows], "pix", "PSF included"),
             "snr": (fits.snr, "", "flux of the fit over its error"),
             "e1": (fits.e1, "", "(a - b)/(a + b) along x, before the PSF"),
             "e2": (fits.e2, "", "along the diagonal x = y, before the PSF"),
-            "g1_sky": (sky.g1_sky, "", "e on the sky, > 0 from east to west, as of GalSim and TreeCorr"),
-            "g2_sky": (sky.g2_sky, "", "e on the sky, > 0 from north-west to south-east"),
+        }
+        if sky is not None:
+            columns |= {
+                "g1_sky": (sky.g1_sky, "", "e on the sky, > 0 from east to west, as of GalSim and TreeCorr"),
+                "g2_sky": (sky.g2_sky, "", "e on the sky, > 0 from north-west to south-east"),
+            }
+        columns |= {
             "error": (fits.ellipticity_error, "", "standard error of a component"),
             "size": (fits.size, "pix", "rms width before the PSF"),
             "flags": (fits.flags, "", "of the fit, 0 is good"),
-            "usable": (self.usable, "", "larger than stars, error of e below 0.2"),
+            "usable": (self.usable, "", "larger than stars, error of e below 0.2, not saturated"),
         }
         # Names that fit FITS cards as well.
         meta: dict[str, Any] = {"CCD": self.image.name, "CREATOR": f"pachon {VERSION}"}
@@ -121,32 +152,35 @@ class ImageCatalogue(Result):
         return described_table(columns, meta)
 
     def _sky_shapes(self, x: np.ndarray, y: np.ndarray) -> SkyShapes:
-        """Return the shapes of the galaxies on the sky; NaN where the image has no right ascension and declination."""
-        wcs = self.image.wcs
-        if not wcs.has_celestial:
-            return SkyShapes(*np.full((4, len(x)), np.nan))
-        return to_sky(self.fits, wcs, x, y)
+        """Return the shapes of the galaxies on the sky, whatever celestial coordinates the image has."""
+        sky, jacobians = jacobians_on_sky(
+            lambda pixels: np.deg2rad(self.image.celestial(pixels)), np.stack([x, y], axis=1), STEP
+        )
+        return SkyShapes(sky[:, 0], sky[:, 1], *along_sky(self.fits.e1, self.fits.e2, jacobians))
 
     def metrics(self) -> dict[str, Any]:
         """Return numbers of objects and, against the truth of a simulated image, completeness and purity."""
-        header, mask = self.image.header, self.image.mask
-        area = float((mask == 0).sum()) * (self.image.pixel_scale / ARCMIN) ** 2
+        area = None
+        if self.image.has_scale:
+            area = float((self.image.mask == 0).sum()) * (self.image.pixel_scale / ARCMIN) ** 2
         numbers: dict[str, Any] = {
             "objects": len(self.objects),
             "stars": len(self.stars),
             "galaxies_fitted": len(self.galaxies),
             "usable": int(self.usable.sum()),
-            "usable_per_arcmin2": float(self.usable.sum() / area),
+            "usable_per_arcmin2": None if area is None else float(self.usable.sum() / area),
             "star_half_light_radius_pixel": self.stars.half_light_radius,
         }
+        if self.warnings:
+            numbers["warnings"] = list(self.warnings)
         truth = self.image.objects
         if len(truth.get("X", ())):
             # The truth counts pixels of the CCD, of which the image may be a part.
-            x, y = np.stack([truth["X"], truth["Y"]]) - pixels_of_ccd(self.image, np.zeros(2))[:, None]
+            x, y = np.stack([truth["X"], truth["Y"]]) - self.image.pixels_of_ccd(np.zeros(2))[:, None]
             match = match_positions(self.objects.x, self.objects.y, x, y, _MATCH)
             real = match >= 0
             star = real & np.asarray(truth["STAR"], dtype=bool)[np.maximum(match, 0)]
-            magnitude = self.objects.magnitude(header["ZEROPNT"])
+            magnitude = self._magnitudes()
             edges = np.arange(np.floor(np.nanmin(magnitude)), np.ceil(np.nanmax(magnitude)) + 0.5, 0.5)
             rates = detection_rates(magnitude, match, truth["MAG"], edges)
             half = np.flatnonzero((rates.n_true > 10) & (rates.completeness < 0.5))
@@ -159,17 +193,14 @@ class ImageCatalogue(Result):
         return numbers
 
 
+@removed_arguments(**_REPLACED)
 @check_arguments
 def measure_image(
     image: CcdImage,
     *,
-    psf: FocalPlanePsf | None = None,
+    psf: PsfModel | FocalPlanePsf | PiffPsf | PsfexPsf | None = None,
     recipe: str | Recipe | None = None,
-    basis: str | Basis | None = None,
-    interpolation: str | Interpolation | None = None,
-    weights: str | None = None,
-    n_components: int | None = None,
-    order: int | None = None,
+    stars: ArrayLike | None = None,
     min_snr: float = 30.0,
     threads: int | None = None,
 ) -> ImageCatalogue:
@@ -178,16 +209,17 @@ def measure_image(
     Parameters
     ----------
     image : CcdImage
-        Image, such as one of ``pachon images``.
-    psf : FocalPlanePsf, optional
-        Model of all CCDs, such as one fitted to :func:`~pachon.focal_plane_stars` of the images of the exposure. By
-        default a model of the CCD is fitted to the stars of the image.
+        Image, such as one of ``pachon images`` or of :func:`~pachon.load_image`.
+    psf : PsfModel, FocalPlanePsf, PiffPsf or PsfexPsf, optional
+        Model of the PSF: of all CCDs, such as one fitted to :func:`~pachon.focal_plane_stars` of the images of the
+        exposure, or of this one, its positions pixels of the image. By default one is fitted to the stars of the
+        image. With a model stars are left out of the galaxies where there are any.
     recipe : str or Recipe, optional
         Kind of the model of the CCD, as of :meth:`~pachon.PsfModel.fit`: by default every pixel by kriging, which needs
-        no choice; ``paper`` for that of Jee & Tyson (2011).
-    basis, interpolation, weights, n_components, order : optional
-        Keys of the recipe to change: weights are equal, snr, softened or noise, the others as of
-        :meth:`~pachon.PsfModel.fit`.
+        no choice, and a constant for fewer than ten stars; ``paper`` for that of Jee & Tyson (2011).
+    stars : array, optional
+        Pixels (x, y) of stars, such as of a catalogue, the first pixel's centre at (0, 0), [k, 2]; by default stars are
+        selected by their size.
     min_snr : float
         Least S/N of stars.
     threads : int, optional
@@ -196,42 +228,59 @@ def measure_image(
     Raises
     ------
     ConfigError
-        If a kind of model is chosen beside a model of all CCDs.
+        If a recipe is chosen beside a model.
     DomainError
-        If nothing is detected, there are too few stars for a locus or a model, or the CCD is none of `psf`.
+        If nothing is detected, there are fewer than three stars for a model, or the CCD is none of `psf`.
     """
-    keys = {
-        "basis": basis,
-        "interpolation": interpolation,
-        "weights": weights,
-        "n_components": n_components,
-        "order": order,
-    }
-    if psf is not None and not all(value is None for value in (recipe, *keys.values())):
-        raise ConfigError(f"recipe, {', '.join(keys)} are of models of the CCD: expected none beside psf")
-    objects, stars = objects_and_stars(image, min_snr)
-    rows = np.setdiff1d(np.arange(len(objects)), stars.index)
-    places = np.stack([objects.x[rows], objects.y[rows]], axis=1)
-    model: PsfModel | FocalPlanePsf
+    if psf is not None and recipe is not None:
+        raise ConfigError("recipe is of a model of the CCD: expected none beside psf")
+    objects = detected_objects(image)
+    warnings: tuple[str, ...] = ()
+    model: ImagePsf
     if psf is None:
-        model = fitted_psf = fit_image_psf(image, stars, Recipe.of(recipe, **keys))
-        psfs = fitted_psf.at(places)
+        selected_stars = few_or_many_stars(image, objects, min_snr, stars)
+        model = fit_image_psf(image, selected_stars, None if recipe is None else Recipe.of(recipe))
+        if len(selected_stars) < MANY_STARS:
+            warnings = (few_stars_warning(selected_stars),)
     else:
         model = psf
-        # Centroids at the rim may lie outside by a part of a pixel.
-        inside = np.clip(places, -0.5, np.array(image.image.shape[::-1]) - 0.5)
-        psfs = psf.draw(image.name, *(pixels_of_ccd(image, inside).T * u.pix), threads=threads)
+        selected_stars = _stars_beside_model(image, objects, psf, min_snr, stars)
+    rows = np.setdiff1d(np.arange(len(objects)), selected_stars.index)
+    if not len(rows):
+        raise DomainError("all objects are stars: expected galaxies", subject=f"CCD {image.name}")
+    places = np.stack([objects.x[rows], objects.y[rows]], axis=1)
+
+    def psfs_at(positions: np.ndarray) -> np.ndarray:
+        """Return PSFs of unit sum at pixels of the image."""
+        return psfs_on(image, model, positions, threads)
+
     fits = fit_galaxies(
         image.image - objects.background,
         np.where(image.mask == 0, image.variance, 1.0),
         places[:, 0],
         places[:, 1],
-        psfs / psfs.sum(axis=(1, 2), keepdims=True),
-        half_light_radius=np.nan_to_num(objects.half_light_radius[rows], nan=stars.half_light_radius),
+        psfs_at(places),
+        half_light_radius=np.nan_to_num(objects.half_light_radius[rows], nan=selected_stars.half_light_radius),
         mask=image.mask,
         segmentation=objects.segmentation,
         threads=threads,
     )
     radius = np.nan_to_num(objects.half_light_radius[rows])
-    usable = usable_galaxies(fits, radius, stars.half_light_radius)
-    return ImageCatalogue(image, objects, stars, model, rows, fits, usable)
+    # A saturated star is as wide as a galaxy.
+    saturated = (objects.flags[rows] & ObjectFlag.SATURATED) != 0
+    usable = usable_galaxies(fits, radius, selected_stars.half_light_radius) & ~saturated
+    return ImageCatalogue(image, objects, selected_stars, model, rows, fits, usable, warnings)
+
+
+def _stars_beside_model(
+    image: CcdImage, objects: DetectedObjects, psf: ImagePsf, min_snr: float, positions: ArrayLike | None
+) -> StarSelection:
+    """Return the stars of an image whose PSF is known; none, with the size of the PSF, where they have no locus."""
+    try:
+        return few_or_many_stars(image, objects, min_snr, positions)
+    except DomainError:
+        if positions is not None:
+            raise
+        middle = 0.5 * (np.array(image.image.shape[::-1]) - 1.0)
+        stamp = psfs_on(image, psf, middle[None], None)[0]
+        return StarSelection.empty(len(objects), half_light_radius_of(stamp), stamp.shape)

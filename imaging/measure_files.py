@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,21 +13,24 @@ from typing import Any, NamedTuple
 from astropy.io import fits
 
 from ..core.errors import ConfigError, DomainError, ProductError
-from ..core.files import content_hash
+from ..core.files import content_hash, write_bytes
 from ..core.long_work import Execution
 from ..core.memory import require_bytes
 from ..core.products import read_fits, write_fits
 from ..core.version import VERSION
 from ..pipeline.config import digest
-from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
+from ..reconstruction.psf_model.model import PsfModel
 from ..reconstruction.psf_model.recipe import DEFAULT, Recipe
-from .image_file import CcdImage
+from .image_formats.load import ImageSettings, ImageSource, image_sources, image_stem, load_image
+from .image_psf import ImagePsf, load_image_psf
 from .measure import measure_image
+from .measure_picture import measured_png
+from .star_positions import read_star_positions
 
 #: What names of products add to that of an image.
-CATALOGUE_SUFFIX, PSF_SUFFIX = "_galaxies", "_psf"
-#: Memory that measuring an image takes, in sizes of its file: 1.3 GiB for 4096 x 4096 pixels.
-_FILE_SIZES = 8
+CATALOGUE_SUFFIX, PSF_SUFFIX, PICTURE_SUFFIX = "_galaxies", "_psf", "_measured"
+#: Memory that measuring an image takes, in sizes of its pixels, variance and mask: 1.3 GiB for 4096 x 4096 pixels.
+_PIXEL_SIZES = 8
 
 
 class MeasuredFiles(NamedTuple):
@@ -38,99 +41,161 @@ class MeasuredFiles(NamedTuple):
 
 
 @dataclass(frozen=True)
+class MeasureOptions:
+    """How images are measured; in paths of files ``{stem}`` stands for the name of the image without .fits.
+
+    Attributes
+    ----------
+    psf : str, Path or None
+        File of a PSF model: of this program, Piff or PSFEx. None for one of the stars of each image.
+    recipe : Recipe or None
+        Of the models of the images; None for the default one.
+    stars : str, Path or None
+        Table of the stars of an image, by pixels or celestial coordinates; None for stars by their size.
+    min_snr : float
+        Least S/N of stars.
+    settings : ImageSettings
+        What headers lack.
+    pictures : bool
+        Whether a picture of each measured image is written.
+    """
+
+    psf: str | Path | None = None
+    recipe: Recipe | None = None
+    stars: str | Path | None = None
+    min_snr: float = 30.0
+    settings: ImageSettings = field(default_factory=ImageSettings)
+    pictures: bool = False
+
+    def of(self, path: Path) -> MeasureOptions:
+        """Return the options of an image, its name in those of files."""
+        settings = replace(
+            self.settings, weight=_beside(self.settings.weight, path), mask=_beside(self.settings.mask, path)
+        )
+        return replace(self, psf=_beside(self.psf, path), stars=_beside(self.stars, path), settings=settings)
+
+    def keys(self) -> dict[str, Any]:
+        """Return all that decides the products of an image, files by their content."""
+        keys: dict[str, Any] = {"basis": None, "interpolation": None, "order": None, "min_snr": self.min_snr}
+        if self.recipe not in (None, DEFAULT):
+            keys |= self.recipe.keys()
+        settings = {
+            name: content_hash(Path(value), ProductError) if name in ("weight", "mask") else value
+            for name, value in vars(self.settings).items()
+            if value is not None and value != getattr(ImageSettings, name, None)
+        }
+        if self.stars is not None:
+            settings["stars"] = content_hash(Path(self.stars), ProductError)
+        return keys | settings
+
+
+def _beside(pattern: str | Path | None, path: Path) -> Path | None:
+    return None if pattern is None else Path(str(pattern).replace("{stem}", image_stem(path)))
+
+
+@dataclass(frozen=True)
 class FileMeasurement:
-    """Measure image files; a picklable function for every kind of worker.
+    """Measure images of files; a picklable function for every kind of worker.
 
     Attributes
     ----------
     folder : Path or None
         Folder of the products; None for that of each image.
-    psf : Path or None
-        File of the model of all images; None for one of each image.
-    recipe : Recipe or None
-        Of the models of the images; None for the default one.
-    min_snr : float
-        Least S/N of stars.
+    options : MeasureOptions
+        How they are measured.
     """
 
     folder: Path | None
-    psf: Path | None
-    recipe: Recipe | None
-    min_snr: float
+    options: MeasureOptions
 
-    def __call__(self, path: Path, threads: int) -> dict[str, Any] | str:
+    def __call__(self, source: ImageSource, threads: int) -> dict[str, Any] | str:
         """Measure an image, write its PSF model and its catalogue, and return its metrics, or why it has none."""
-        psf = None if self.psf is None else _model_in(self.psf, content_hash(self.psf, ProductError))
-        image = CcdImage.read(path)
+        options = self.options.of(source.path)
+        psf = (
+            None if options.psf is None else _model_in(Path(options.psf), content_hash(Path(options.psf), ProductError))
+        )
+        image = load_image(source.path, extension=source.extension, settings=options.settings)
         try:
-            catalogue = measure_image(image, psf=psf, recipe=self.recipe, min_snr=self.min_snr, threads=threads)
+            stars = None if options.stars is None else read_star_positions(Path(options.stars), image)
+            catalogue = measure_image(
+                image, psf=psf, recipe=options.recipe, stars=stars, min_snr=options.min_snr, threads=threads
+            )
         except DomainError as error:
             return str(error)
         table, metrics = catalogue.table(), catalogue.metrics()
-        table.meta |= {"MEASHASH": self.digest(path), "METRICS": json.dumps(metrics)}
-        if psf is None:
-            model_file = self.product(path, PSF_SUFFIX)
-            catalogue.psf.write(model_file)
-            table.meta["PSFHASH"] = content_hash(model_file, ProductError)
+        table.meta |= {"MEASHASH": self.digest(source), "METRICS": json.dumps(metrics)}
+        if isinstance(catalogue.psf, PsfModel) and psf is None:
+            product = self.product(source, PSF_SUFFIX)
+            catalogue.psf.write(product)
+            table.meta["PSFHASH"] = content_hash(product, ProductError)
+        if options.pictures:
+            write_bytes(self.product(source, PICTURE_SUFFIX).with_suffix(".png"), measured_png(catalogue))
         # Last: a resumed measurement takes it for the sign of a finished image.
-        write_fits(self.product(path, CATALOGUE_SUFFIX), [fits.table_to_hdu(table)], None, [])
+        write_fits(self.product(source, CATALOGUE_SUFFIX), [fits.table_to_hdu(table)], None, [])
         return metrics
 
-    def product(self, path: Path, suffix: str) -> Path:
+    def product(self, source: ImageSource, suffix: str) -> Path:
         """Return the path of a product of an image."""
-        return (path.parent if self.folder is None else self.folder) / f"{path.stem}{suffix}.fits"
+        extension = "" if source.extension is None else f"_{source.extension}"
+        folder = source.path.parent if self.folder is None else self.folder
+        return folder / f"{image_stem(source.path)}{extension}{suffix}.fits"
 
-    def digest(self, path: Path) -> str:
+    def digest(self, source: ImageSource) -> str:
         """Return the SHA-256 of all that decides the products of an image: its file, options, model, version."""
-        model = None if self.psf is None else content_hash(self.psf, ProductError)
-        image = content_hash(path, ProductError)
-        options: dict[str, Any] = {"basis": None, "interpolation": None, "order": None, "min_snr": self.min_snr}
-        if self.recipe not in (None, DEFAULT):
-            options |= self.recipe.keys()
-        return digest({"image": image, "psf": model, "options": options, "version": VERSION})
+        options = self.options.of(source.path)
+        model = None if options.psf is None else content_hash(Path(options.psf), ProductError)
+        keys: dict[str, Any] = {"image": content_hash(source.path, ProductError), "psf": model}
+        if source.extension is not None:
+            keys["extension"] = source.extension
+        return digest(keys | {"options": options.keys(), "version": VERSION})
 
-    def finished(self, path: Path) -> dict[str, Any] | None:
+    def finished(self, source: ImageSource) -> dict[str, Any] | None:
         """Return the metrics of an image that is measured already, in the same way; None if a product is damaged.
 
         The catalogue is checked by its FITS checksums, the PSF model beside it by the hash that the catalogue has.
         """
         try:
-            _, table = read_fits(self.product(path, CATALOGUE_SUFFIX))
+            _, table = read_fits(self.product(source, CATALOGUE_SUFFIX))
             if (
-                self.psf is None
-                and content_hash(self.product(path, PSF_SUFFIX), ProductError) != table.header["PSFHASH"]
+                self.options.psf is None
+                and content_hash(self.product(source, PSF_SUFFIX), ProductError) != table.header["PSFHASH"]
             ):
                 return None
-            return json.loads(table.header["METRICS"]) if table.header["MEASHASH"] == self.digest(path) else None
+            return json.loads(table.header["METRICS"]) if table.header["MEASHASH"] == self.digest(source) else None
         except (ProductError, LookupError, ValueError):
             # Of another version or program, too.
             return None
 
 
 @lru_cache(maxsize=1)
-def _model_in(path: Path, content: str) -> FocalPlanePsf:
+def _model_in(path: Path, content: str) -> ImagePsf:
     """Return the model in a file of that content; it is kept from image to image."""
-    return FocalPlanePsf.read(path)
+    return load_image_psf(path)
 
 
 def images_among(paths: Sequence[Path]) -> list[Path]:
     """Return the paths, each once, without products beside their images, which a pattern of images finds too."""
-    products = {
-        path.with_name(f"{path.stem}{added}.fits") for path in paths for added in (CATALOGUE_SUFFIX, PSF_SUFFIX)
-    }
-    return [path for path in dict.fromkeys(paths) if path not in products]
+    stems = {(path.parent, image_stem(path)) for path in paths}
+
+    def is_product(path: Path) -> bool:
+        name = image_stem(path)
+        before = [name.removesuffix(suffix) for suffix in (CATALOGUE_SUFFIX, PSF_SUFFIX) if name.endswith(suffix)]
+        # Products of one extension have its name behind that of the image.
+        starts = {start[:i] for start in before for i in range(1, len(start) + 1) if f"{start}_"[i] == "_"}
+        return any((path.parent, start) in stems for start in starts)
+
+    return [path for path in dict.fromkeys(paths) if not is_product(path)]
 
 
 def measure_files(
     images: Sequence[Path],
     folder: Path | None = None,
     *,
-    psf: Path | None = None,
-    recipe: Recipe | None = None,
-    min_snr: float = 30.0,
+    extension: str | None = None,
+    options: MeasureOptions | None = None,
     execution: Execution | None = None,
 ) -> MeasuredFiles:
-    """Measure image files, and write a catalogue and a PSF model of each.
+    """Measure the images of files, and write a catalogue and a PSF model of each.
 
     Images without objects, or with too few stars, are reported and left out. Products have the same bytes on any number
     of threads and by any workers.
@@ -138,15 +203,13 @@ def measure_files(
     Parameters
     ----------
     images : sequence of Path
-        Files of :class:`~.image_file.CcdImage`.
+        Files that :func:`~pachon.load_image` reads; all images of those that have several.
     folder : Path, optional
         Folder of the products; by default that of each image.
-    psf : Path, optional
-        File of a :class:`~pachon.FocalPlanePsf` of all images; by default a model of each image is fitted, and written.
-    recipe : Recipe, optional
-        Of the models of the images.
-    min_snr : float
-        Least S/N of stars.
+    extension : str, optional
+        Name or number of the extension of the image, in each file.
+    options : MeasureOptions, optional
+        PSF model, recipe, stars, and what headers lack.
     execution : Execution, optional
         Workers, which see the same files; threads; progress display; and whether to keep the products of images that
         were measured in the same way, where both are whole by their checksums.
@@ -156,24 +219,29 @@ def measure_files(
     PachonError
         If two products would have one name, memory is short, an image cannot be read, or none can be measured.
     """
-    names = [path.name for path in images]
-    if twice := [name for name, count in Counter(names).items() if count > 1]:
+    file_names = [path.name for path in images]
+    if twice := [name for name, count in Counter(file_names).items() if count > 1]:
         if folder is not None:
             raise ConfigError(f"{folder}: two images are called {twice[0]}; expected different names, or no --out")
-        names = [str(path) for path in images]
+        file_names = [str(path) for path in images]
+    sources = {
+        name if source.extension is None else f"{name}[{source.extension}]": source
+        for name, path in zip(file_names, images, strict=True)
+        for source in image_sources(path, extension)
+    }
     execution = execution or Execution()
-    measure = FileMeasurement(folder, psf, recipe, min_snr)
+    measure = FileMeasurement(folder, options or MeasureOptions())
     finished = measure.finished if execution.resume else lambda _: None
-    metrics = {name: finished(path) for name, path in zip(names, images, strict=True)}
-    due = {name: path for name, path in zip(names, images, strict=True) if metrics[name] is None}
-    sizes = [path.stat().st_size for path in due.values() if path.is_file()]
+    metrics = {name: finished(source) for name, source in sources.items()}
+    due = {name: source for name, source in sources.items() if metrics[name] is None}
+    size = max((source.n_bytes for source in due.values()), default=0)
     left_out = {}
     with execution.results(
         measure,
         list(due),
         due.values(),
         title=f"objects of {len(due)} images",
-        check=lambda count: require_bytes(count * _FILE_SIZES * max(sizes, default=0), f"{count} images at a time"),
+        check=lambda count: require_bytes(count * _PIXEL_SIZES * size, f"{count} images at a time"),
     ) as results:
         for name, result in zip(due, results, strict=True):
             if isinstance(result, str):
@@ -181,9 +249,11 @@ def measure_files(
                 execution.reporter.line(f"{name} is left out: {result}")
             else:
                 metrics[name] = result
-    if left_out and len(left_out) == len(images):
+                for warning in result.get("warnings", ()):
+                    execution.reporter.line(f"{name}: {warning}")
+    if left_out and len(left_out) == len(sources):
         name, reason = next(iter(left_out.items()))
-        raise DomainError(reason if len(images) == 1 else f"no image can be measured; {name}: {reason}")
+        raise DomainError(reason if len(sources) == 1 else f"no image can be measured; {name}: {reason}")
     return MeasuredFiles(
         {name: image_metrics for name, image_metrics in metrics.items() if image_metrics is not None}, left_out
     )

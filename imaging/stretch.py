@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy.io import fits
+from astropy.utils.exceptions import AstropyWarning
 from astropy.wcs import WCS
 
+from ..core.errors import ConfigError
 from ..core.plotting import ORANGE
 
 if TYPE_CHECKING:
@@ -28,7 +31,7 @@ def draw_image(axes: Axes, image: np.ndarray, variance: np.ndarray, header: fits
     ny, nx = (n // step * step for n in data.shape)
     binned = data[:ny, :nx].reshape(ny // step, step, nx // step, step).mean(axis=(1, 3))
     noise = float(np.sqrt(np.median(variance))) / step
-    if "CD1_1" in header:
+    if has_celestial(header):
         show_stretched(axes, binned, noise, pixel_scale_of(header) * step)
         draw_compass(axes, header)
     else:
@@ -40,13 +43,26 @@ def sky_level(header: fits.Header) -> float:
     return 0.0 if header.get("SKYSUB", True) else float(header["SKY"])
 
 
+def world_coordinates(header: fits.Header) -> WCS:
+    """Return the world coordinates of a header; those of other programs may have cards that astropy warns of."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AstropyWarning)
+        return WCS(header)
+
+
+def has_celestial(header: fits.Header) -> bool:
+    """Return whether a header has celestial world coordinates."""
+    return world_coordinates(header).has_celestial
+
+
 def pixel_scale_of(header: fits.Header) -> float:
-    """Return the side of a pixel at the reference point [arcsec]."""
-    return float(np.sqrt(abs(np.linalg.det(WCS(header).pixel_scale_matrix)))) * 3600.0
-
-
-def _cd(header: fits.Header) -> np.ndarray:
-    return np.array([[header[f"CD{i}_{j}"] for j in (1, 2)] for i in (1, 2)])
+    """Return the side of a pixel at the reference point, or that of PIXSCALE without world coordinates [arcsec]."""
+    wcs = world_coordinates(header)
+    if not wcs.has_celestial:
+        if "PIXSCALE" not in header:
+            raise ConfigError("the header has neither world coordinates nor PIXSCALE: expected one", key="PIXSCALE")
+        return float(header["PIXSCALE"])
+    return float(np.sqrt(abs(np.linalg.det(wcs.pixel_scale_matrix)))) * 3600.0
 
 
 def show_stretched(axes: Axes, data: np.ndarray, noise: float, scale: float, unit: str = "arcsec") -> None:
@@ -61,7 +77,9 @@ def show_stretched(axes: Axes, data: np.ndarray, noise: float, scale: float, uni
 def draw_compass(axes: Axes, header: fits.Header) -> None:
     """Draw arrows towards north and east in a corner."""
     # Columns of the inverse of CD are the steps in pixels for a step in xi (east) and in eta (north).
-    steps = np.linalg.inv(_cd(header))
+    wcs = world_coordinates(header)
+    rows = [wcs.wcs.lng, wcs.wcs.lat]
+    steps = np.linalg.inv(wcs.pixel_scale_matrix[rows])
     start, length = np.array([0.88, 0.12]), 0.07
     for label, step in zip("EN", steps.T, strict=True):
         end = start + length * step / np.hypot(*step)

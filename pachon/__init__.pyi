@@ -100,6 +100,8 @@ from .imaging.config import load_images_configuration as load_images_configurati
 from .imaging.draw import Window as Window
 from .imaging.exposure import Exposure as Exposure
 from .imaging.image_file import CcdImage as CcdImage
+from .imaging.image_formats.load import ImageSettings as ImageSettings
+from .imaging.image_formats.load import load_image as load_image
 from .imaging.image_stars import focal_plane_stars as focal_plane_stars
 from .imaging.measure import ImageCatalogue as ImageCatalogue
 from .imaging.measure import measure_image as measure_image
@@ -269,6 +271,8 @@ from .reconstruction.psf_model.polynomial_fit import Polynomial as Polynomial
 from .reconstruction.psf_model.principal_components import PrincipalComponents as PrincipalComponents
 from .reconstruction.psf_model.recipe import Recipe as Recipe
 from .reconstruction.psf_model.shapelets import Shapelets as Shapelets
+from .reconstruction.psfex import PsfexPsf as PsfexPsf
+from .reconstruction.psfex import load_psfex as load_psfex
 from .sensing.degrees import FreedomEstimate as FreedomEstimate
 from .sensing.fit import fit_donuts as fit_donuts
 from .sensing.flags import DonutFlag as DonutFlag

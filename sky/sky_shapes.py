@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 #: Step of the central differences of world coordinates [pixel]: distortions of second order cancel, and the rounding
 #: of degrees is 1e-9 of it.
-_STEP = 0.5
+STEP = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ def to_sky(shapes: Any, wcs: Any, x: ArrayLike, y: ArrayLike) -> SkyShapes:
     if not first.shape == second.shape == (len(pixels),):
         lengths = f"{first.size} and {second.size} components of shapes at {len(pixels)} places"
         raise DomainError(f"{lengths}: expected one length")
-    celestial, jacobians = jacobians_on_sky(_celestial_of(wcs), pixels, _STEP)
+    celestial, jacobians = jacobians_on_sky(_celestial_of(wcs), pixels, STEP)
     g1, g2 = along_sky(first, second, jacobians)
     return SkyShapes(celestial[:, 0], celestial[:, 1], g1, g2)
 

@@ -34,6 +34,16 @@ _CONTRAST = 3.0
 _SIDE = (1.15, 1.75)
 # Least width of the locus, relative: the PSF varies over a CCD.
 _LEAST_WIDTH = 0.01
+# Side of the stamps of stars [pixel].
+STAMP_SIDE = 31
+# Half-light radii of stars for which that side is right [pixel].
+_USUAL_RADII = (1.5, 3.5)
+# Side of other stamps [half-light radii].
+_STAMP_RADII = 9.0
+# Least side: fewer pixels leave no sky around a star.
+_LEAST_SIDE = 21
+# Largest side: more hold neighbours.
+_MOST_SIDE = 101
 # Margin of a stamp for the light that its Fourier shift wraps around [pixel].
 _MARGIN = 8
 
@@ -102,6 +112,19 @@ class StarSelection(Result):
     def __len__(self) -> int:
         return len(self.index)
 
+    @classmethod
+    def empty(cls, n_objects: int, half_light_radius: float, stamp_shape: tuple[int, ...]) -> StarSelection:
+        """Return a selection of no star of n objects, with the half-light radius of the PSF."""
+        return cls(
+            index=np.empty(0, dtype=np.int64),
+            cuts=np.full(n_objects, int(StarCut.SIZE), dtype=np.int32),
+            half_light_radius=half_light_radius,
+            width=np.nan,
+            positions=np.empty((0, 2)),
+            snr=np.empty(0),
+            stamps=np.empty((0, *stamp_shape)),
+        )
+
     @check_arguments
     def without(self, defects: NDArray[np.bool_]) -> StarSelection:
         """Return the selection without those of its stars that have defects, [k] bool."""
@@ -153,7 +176,7 @@ def select_stars(
     isolation: float = 12.0,
     min_stars: int = 10,
     radius_range: tuple[float, float] | None = None,
-    size: int = 31,
+    size: int = STAMP_SIDE,
     mask: ArrayLike | NDArray[np.bool_] | None = None,
 ) -> StarSelection:
     """Select isolated stars by the stellar locus, and cut out their stamps.
@@ -225,14 +248,14 @@ def select_stars(
     noise = 1.0 / np.maximum(snr, 1.0)
     cuts[~(np.abs(radius - center) < n_sigma * np.hypot(width, center * noise))] |= StarCut.SIZE
     locus = bright & (cuts == 0)
-    fwhm = _median_and_sigma(objects.fwhm[locus])
+    fwhm = median_and_sigma(objects.fwhm[locus])
     cuts[~(np.abs(objects.fwhm - fwhm[0]) < n_sigma * np.hypot(fwhm[1], fwhm[0] * noise))] |= StarCut.WIDTH
     e1, e2 = (e - np.median(e[locus]) for e in (objects.e1, objects.e2))
     cuts[~(np.hypot(e1, e2) < max_ellipticity)] |= StarCut.SHAPE
     cuts[objects.neighbour_distance < isolation] |= StarCut.NEIGHBOUR
     index = np.flatnonzero(cuts == 0)
     x, y = objects.x[index], objects.y[index]
-    stamps = _centered_stamps(np.where(bad, np.nan, pixels - objects.background), x, y, size)
+    stamps = centered_stamps(np.where(bad, np.nan, pixels - objects.background), x, y, size)
     weightless = np.isnan(stamps)
     return StarSelection(
         index=index,
@@ -261,7 +284,7 @@ def _stellar_locus(radius: np.ndarray, least: int) -> tuple[float, float]:
     ordered = np.sort(radius)
     inside = np.searchsorted(ordered, ordered * (1.0 + _INTERVAL), side="right") - np.arange(len(ordered))
     first, count = int(inside.argmax()), int(inside.max())
-    center, width = _median_and_sigma(ordered[first : first + count])
+    center, width = median_and_sigma(ordered[first : first + count])
     nearness = np.abs(np.log(ordered / center))
     beside = (nearness > np.log(_SIDE[0])) & (nearness < np.log(_SIDE[1]))
     galaxies = max((beside & (ordered > center)).sum(), (beside & (ordered < center)).sum())
@@ -273,17 +296,25 @@ def _stellar_locus(radius: np.ndarray, least: int) -> tuple[float, float]:
         )
     for _ in range(5):
         near = ordered[np.abs(ordered - center) < min(3.0 * max(width, _LEAST_WIDTH * center), _INTERVAL * center)]
-        center, width = _median_and_sigma(near)
+        center, width = median_and_sigma(near)
     return center, max(width, _LEAST_WIDTH * center)
 
 
-def _median_and_sigma(values: np.ndarray) -> tuple[float, float]:
+def stamp_side(half_light_radius: float) -> int:
+    """Return the side of the stamps of stars of a half-light radius [pixel], odd: :data:`STAMP_SIDE` of most images."""
+    if np.isnan(half_light_radius) or _USUAL_RADII[0] <= half_light_radius <= _USUAL_RADII[1]:
+        return STAMP_SIDE
+    side = 2 * int(0.5 * _STAMP_RADII * half_light_radius) + 1
+    return min(max(side, _LEAST_SIDE), _MOST_SIDE)
+
+
+def median_and_sigma(values: np.ndarray) -> tuple[float, float]:
     """Return the median, and the standard deviation by the median absolute deviation."""
     middle = float(np.median(values))
     return middle, RMS_PER_MAD * float(np.median(np.abs(values - middle)))
 
 
-def _centered_stamps(image: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> np.ndarray:
+def centered_stamps(image: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> np.ndarray:
     """Return stamps with stars shifted to the centre of their middle pixel."""
     side = size + 2 * _MARGIN
     around = cut_out(image, x, y, side, 0.0)

@@ -88,6 +88,25 @@ def _image(path):
     pachon.CcdImage("R22_S11", pixels, np.ones_like(pixels), mask, fits.Header(), objects).write(path)
 
 
+def _foreign_image():
+    header = fits.Header({"GAIN": 2.0, "SATURATE": 5e4, "MAGZERO": 30.0, "EXPTIME": 90.0, "FILTER": "r"})
+    for axis, kind in (("1", "RA---TAN"), ("2", "DEC--TAN")):
+        header[f"CTYPE{axis}"], header[f"CRVAL{axis}"], header[f"CDELT{axis}"] = kind, 10.0, 1e-4
+    pixels = RNG.normal(1e3, 10.0, size=(40, 40)).astype(np.float32)
+    return _fits(
+        fits.ImageHDU(pixels, header, name="SCI"),
+        fits.ImageHDU(np.zeros(pixels.shape, np.int16), name="MSK"),
+        fits.ImageHDU(np.full(pixels.shape, 0.01, np.float32), name="WGT"),
+    )
+
+
+def _psfex():
+    column = fits.Column("PSF_MASK", format="81E", dim="(9,9,1)", array=[np.ones((1, 9, 9), np.float32)])
+    table = fits.BinTableHDU.from_columns([column], name="PSF_DATA")
+    table.header.update({"POLNAXIS": 0, "PSF_SAMP": 0.7})
+    return _fits(table)
+
+
 def _use_store(path):
     try:
         pachon.load_sweep_table(path)
@@ -261,6 +280,8 @@ def _cases(folder):
         "mosaic": (".fits", _fits(_mosaic()), lambda p: read_mosaic(p, 25.0)),
         "grid": (".fits", _written(lambda p: write_grid(GRID, p), ".fits", folder), read_grid),
         "image": (".fits", _written(_image, ".fits", folder), pachon.CcdImage.read),
+        "foreign_image": (".fits", _foreign_image(), pachon.load_image),
+        "psfex": (".psf", _psfex(), pachon.load_psfex),
         "psf_model": (".fits", _written(_psf_model, ".fits", folder), pachon.PsfModel.read),
         "stl": (".stl", _mesh("stl"), lambda p: load_mesh(p, merged=True)),
         "glb": (".glb", _mesh("glb"), lambda p: load_mesh(p, merged=False)),
@@ -289,6 +310,7 @@ def _cases(folder):
 NAMES = (
     "zmx", "seq", "len", "json", "roa", "zar", "agf", "baseline", "site", "images", "visits", "degrees",
     "heights_ecsv", "heights_fits", "galaxies_ecsv", "galaxies_fits", "stars", "mosaic", "grid", "image",
+    "foreign_image", "psfex",
     "psf_model", "stl", "glb", "gltf", "obj", "ply", "off", "piff", "star_list", "star_list_ecsv",
     "star_list_fits", "camera", "tolerances", "optimization", "align", "image_stack", "coatings", "states", "donuts",
     "donut_table", "store",

@@ -23,6 +23,7 @@ from pachon.imaging.scene import draw_ccd
 from pachon.measure.catalogue.matching import match_positions
 from pachon.pipeline.experiment import Experiment
 from pachon.reconstruction.focal_plane_psf.model import FocalPlanePsf
+from pachon.reconstruction.psf_model.recipe import Recipe
 from pachon.sky.galaxies import Galaxies
 
 pytestmark = pytest.mark.long
@@ -75,7 +76,7 @@ def focal_plane_psf(image):
 def catalogues(image, catalogue, focal_plane_psf):
     return {
         "kriging": catalogue,
-        "paper": measure_image(image, recipe="paper", order=1, threads=1),
+        "paper": measure_image(image, recipe=Recipe.of("paper", order=1), threads=1),
         "focal plane": measure_image(image, psf=focal_plane_psf, threads=1),
     }
 
@@ -270,10 +271,8 @@ def test_the_command_fits_one_psf_to_all_images(image, focal_plane_psf, tmp_path
 
 
 def test_kinds_of_models_that_do_not_go_together(image, focal_plane_psf, tmp_path, capsys):
-    with pytest.raises(
-        PachonError, match="recipe, basis, interpolation, weights, n_components, order are of models of the CCD"
-    ):
-        measure_image(image, psf=focal_plane_psf, order=1)
+    with pytest.raises(PachonError, match="recipe is of a model of the CCD"):
+        measure_image(image, psf=focal_plane_psf, recipe="paper")
     with pytest.raises(PachonError, match="no stars on the images: there are no images"):
         focal_plane_stars([])
     image.write(tmp_path / "image.fits")

@@ -47,8 +47,7 @@ def test_shapes_of_galaxies_on_a_rolled_image_are_the_true_ones(tiny, transposed
         gaussian_galaxies,
         window=WINDOW,
         exposure=Exposure("r", 15.0, 100),
-        pointing=(1.0, -0.5),
-        position_angle=np.deg2rad(30.0),
+        pointing=pachon.Pointing(1.0, -0.5, np.deg2rad(30.0)),
     )
     image = scene.exposed()
     assert (np.linalg.det(image.wcs.wcs.cd) < 0.0) == transposed

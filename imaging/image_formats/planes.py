@@ -1,0 +1,161 @@
+"""Image, variance and mask of a file, by the convention of the pipeline that wrote it.
+
+A reader of a convention says which parts of a file are images, and which lie beside each: LSST and HSC (IMAGE, MASK,
+VARIANCE), DES (SCI, MSK, WGT), and any other file, whose companions have usual names or are files of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ...core.errors import ProductError
+from .fits_parts import FitsPart, FitsParts
+
+#: Planes of LSST's masks that mark an area or an object, and leave a pixel as good as any.
+_HARMLESS = frozenset(
+    {"DETECTED", "DETECTED_NEGATIVE", "NOT_DEBLENDED", "BRIGHT_OBJECT", "CROSSTALK", "INEXACT_PSF", "SENSOR_EDGE"}
+)
+#: Planes of pixels of a star that is too bright.
+_TOO_BRIGHT = frozenset({"SAT", "SATUR", "SATURATED", "SUSPECT"})
+#: Start of the cards that number the planes of a mask.
+_PLANE_CARD = "MP_"
+#: Bit of saturated pixels in DES's masks (Morganson et al. 2018, PASP 130, 074501).
+_DES_SATURATED = 2
+#: Bit of the haloes of bright stars there, which marks an area.
+_DES_STAR = 32
+
+
+class WeightKind(Enum):
+    """What a plane of noise holds: inverse variance, variance, or rms."""
+
+    WEIGHT = "weight"
+    VARIANCE = "variance"
+    RMS = "rms"
+
+
+class Defects(NamedTuple):
+    """Pixels with defects, bool [ny, nx]."""
+
+    saturated: np.ndarray
+    bad: np.ndarray
+
+
+@dataclass(frozen=True)
+class PlaneNames:
+    """Extensions of one image: the pixels, their noise, their mask; empty names where there are none."""
+
+    image: FitsPart
+    noise: FitsPart | None = None
+    kind: WeightKind = WeightKind.WEIGHT
+    mask: FitsPart | None = None
+
+
+#: Names of extensions of noise and of masks beside an image.
+_NOISE_NAMES: Mapping[str, WeightKind] = {
+    "VARIANCE": WeightKind.VARIANCE,
+    "VAR": WeightKind.VARIANCE,
+    "WGT": WeightKind.WEIGHT,
+    "WEIGHT": WeightKind.WEIGHT,
+    "WHT": WeightKind.WEIGHT,
+    "IVAR": WeightKind.WEIGHT,
+    "INVVAR": WeightKind.WEIGHT,
+    "ERR": WeightKind.RMS,
+    "ERROR": WeightKind.RMS,
+    "RMS": WeightKind.RMS,
+    "SIGMA": WeightKind.RMS,
+    "UNCERT": WeightKind.RMS,
+}
+_MASK_NAMES = ("MASK", "MSK", "DQ", "FLAGS", "DQM", "BPM")
+
+
+def planes_of(file: FitsParts, extension: str | None) -> list[PlaneNames]:
+    """Return the images of a file, or the one in an extension, each with the planes beside it.
+
+    Parameters
+    ----------
+    file : FitsParts
+        The file.
+    extension : str, optional
+        Name or number of the extension.
+
+    Raises
+    ------
+    ProductError
+        If there is no image, or no such one.
+    """
+    noise = next(((part, kind) for name, kind in _NOISE_NAMES.items() if (part := file.named(name))), None)
+    mask = file.named(*_MASK_NAMES)
+    companions = {part.index for part in (noise[0] if noise else None, mask) if part is not None}
+    images = [part for part in file.parts if part.is_image and part.index not in companions]
+    if not images:
+        raise ProductError("has no image of two axes", file=file.path)
+    if extension is not None:
+        names = ", ".join(part.name or str(part.index) for part in images)
+        images = [part for part in images if extension.upper() == part.name or extension == str(part.index)]
+        if not images:
+            raise ProductError(f"extension = {extension}: expected one of {names}", file=file.path, key="extension")
+    beside = noise is not None or mask is not None
+    if beside and len(images) > 1:
+        # IMAGE or SCI is what the planes belong to; catalogues of LSST have small images of PSFs and transmissions.
+        images = [part for part in images if part.name in ("IMAGE", "SCI")] or [
+            part for part in images if part.image_shape == (noise[0] if noise else images[0]).image_shape
+        ]
+    return [
+        PlaneNames(part, noise[0] if noise else None, noise[1] if noise else WeightKind.WEIGHT, mask) for part in images
+    ]
+
+
+def companion_in(path: Path, image: FitsPart) -> tuple[FitsParts, FitsPart]:
+    """Return the plane of a file of its own that belongs to an image: that of its name, or the only one.
+
+    Raises
+    ------
+    ProductError
+        If there is none.
+    """
+    file = FitsParts.of(path)
+    planes = [part for part in file.parts if part.is_image]
+    same_name = [part for part in planes if part.name and part.name == image.name]
+    if not same_name and len(planes) != 1:
+        raise ProductError(
+            f"has {len(planes)} images: expected one, or one called {image.name or 'as that of the image'}", file=path
+        )
+    return file, (same_name or planes)[0]
+
+
+def defects_of(values: np.ndarray, part: FitsPart, path: Path) -> Defects:
+    """Return the saturated and the bad pixels that a mask marks.
+
+    Cards MP_NAME number the planes of LSST's and of this program's masks; extensions MSK have the bits of DES. In any
+    other mask pixels that are not zero are bad: codes of other pipelines change with their versions.
+
+    Raises
+    ------
+    ProductError
+        If the mask has no whole numbers.
+    """
+    if values.dtype.kind not in "iub":
+        if not np.isfinite(values).all() or (values != np.rint(values)).any():
+            raise ProductError(f"mask {part.name} has type {values.dtype}: expected whole numbers", file=path)
+        values = values.astype(np.int64)
+    planes = {key[len(_PLANE_CARD) :]: part.header[key] for key in part.header if key.startswith(_PLANE_CARD)}
+    if planes:
+        bits = values.astype(np.int64)
+        bright = _bits(planes, _TOO_BRIGHT)
+        harmless = _bits(planes, _HARMLESS) | bright
+        return Defects((bits & bright) != 0, (bits & ~np.int64(harmless)) != 0)
+    if part.name == "MSK":
+        bits = values.astype(np.int64)
+        return Defects((bits & _DES_SATURATED) != 0, (bits & ~np.int64(_DES_SATURATED | _DES_STAR)) != 0)
+    return Defects(np.zeros(values.shape, dtype=bool), values != 0)
+
+
+def _bits(planes: Mapping[str, int], names: frozenset[str]) -> int:
+    """Return the bits of the planes of some names."""
+    return sum(1 << int(number) for name, number in planes.items() if name in names)

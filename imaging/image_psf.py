@@ -1,0 +1,99 @@
+"""PSF models of images, of whatever program: read from a file, and drawn at pixels of an image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from astropy import units as u
+
+from ..core.errors import DomainError, PachonError, ProductError
+from ..measure.catalogue.star_locus import stamp_side
+from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
+from ..reconstruction.piff.psf import PiffPsf, load_piff
+from ..reconstruction.psf_model.model import PsfModel
+from ..reconstruction.psfex import PsfexPsf, load_psfex
+from .image_file import CcdImage
+
+#: Kinds of models that images are measured with.
+ImagePsf = PsfModel | FocalPlanePsf | PiffPsf | PsfexPsf
+#: Side of a stamp on which the half-light radius of a model is measured [pixel].
+_WIDE_SIDE = 63
+#: Readers of files, by the kind that they read.
+_READERS: dict[str, Callable[[Path], ImagePsf]] = {
+    "PsfModel": PsfModel.read,
+    "FocalPlanePsf": FocalPlanePsf.read,
+    "Piff": load_piff,
+    "PSFEx": load_psfex,
+}
+#: Samples along the side of a pixel in which the half-light radius of a PSF is measured.
+_SUBPIXELS = 5
+
+
+def load_image_psf(path: Path) -> ImagePsf:
+    """Read a PSF model: one of this program, of a CCD or of the focal plane, of Piff, or of PSFEx.
+
+    Raises
+    ------
+    ProductError
+        If the file is missing, or none of these; of one that is damaged, the reason of the reader that came furthest.
+    """
+    reasons = {}
+    for name, read in _READERS.items():
+        try:
+            return read(path)
+        except ProductError as error:
+            reasons[name] = error.problem
+            if "no such file" in error.problem or "cannot be read" in error.problem:
+                raise
+    reason = "; ".join(f"{name}: {problem}" for name, problem in reasons.items())
+    raise ProductError(f"no PSF model ({reason})", file=path)
+
+
+def psfs_on(image: CcdImage, psf: ImagePsf, places: np.ndarray, threads: int | None) -> np.ndarray:
+    """Return PSF images of unit sum at pixels (x, y) of an image, the first one's centre at (0, 0), [n, m, m].
+
+    Raises
+    ------
+    DomainError
+        If the model has no such CCD, or needs properties that the image has not, such as colours.
+    """
+    try:
+        if isinstance(psf, PsfModel):
+            stamps = psf.at(places)
+        elif isinstance(psf, FocalPlanePsf):
+            # Centroids at the rim may lie outside by a part of a pixel.
+            inside = np.clip(places, -0.5, np.array(image.image.shape[::-1]) - 0.5)
+            stamps = psf.draw(image.name, *(image.pixels_of_ccd(inside).T * u.pix), threads=threads)
+        elif isinstance(psf, PiffPsf):
+            chip = _chip_of(image, psf)
+            wide = psf.at(places[:1] + 1.0, chip=chip, size=_WIDE_SIDE)
+            stamps = psf.at(places + 1.0, chip=chip, size=stamp_side(half_light_radius_of(wide[0])))
+        else:
+            wide = psf.at(places[:1] + 1.0, size=_WIDE_SIDE)
+            stamps = psf.at(places + 1.0, size=stamp_side(half_light_radius_of(wide[0])))
+    except PachonError as error:
+        raise error.within(subject=f"PSF model of {image.name}") from None
+    total = stamps.sum(axis=(1, 2), keepdims=True)
+    if not (np.isfinite(total) & (total > 0.0)).all():
+        raise DomainError(
+            f"PSF model of {image.name}: expected positive flux at all objects, such as of a model of this image"
+        )
+    return np.asarray(stamps / total)
+
+
+def _chip_of(image: CcdImage, psf: PiffPsf) -> int | None:
+    """Return the number of the chip of an image in a model of many chips; None in a model of one."""
+    return None if len(psf.chips) == 1 else image.header.get("CCDNUM")
+
+
+def half_light_radius_of(stamp: np.ndarray) -> float:
+    """Return the radius of the circle about the middle of a PSF image that has half of its light [pixel]."""
+    side = stamp.shape[0] * _SUBPIXELS
+    at = (np.arange(side) + 0.5) / _SUBPIXELS - 0.5 * stamp.shape[0]
+    radius = np.hypot(at, at[:, None]).ravel()
+    light = np.repeat(np.repeat(stamp, _SUBPIXELS, axis=0), _SUBPIXELS, axis=1).ravel()
+    order = np.argsort(radius, kind="stable")
+    growth = np.cumsum(light[order])
+    return float(radius[order][np.searchsorted(growth, 0.5 * growth[-1])])

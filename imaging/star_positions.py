@@ -1,0 +1,88 @@
+"""Positions of stars on an image, from a catalogue of pixels or of celestial coordinates."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+from astropy.table import Table
+
+from ..core.errors import DomainError, ProductError
+from ..core.files import parsing, read_bytes
+from .image_file import CcdImage
+
+#: Columns of pixels, the first one's centre at (0, 0), in small letters.
+_FROM_ZERO = (("x", "y"), ("slot_centroid_x", "slot_centroid_y"), ("base_sdsscentroid_x", "base_sdsscentroid_y"))
+#: Columns of pixels, the first one's centre at (1, 1), as SExtractor counts them.
+_FROM_ONE = (("xwin_image", "ywin_image"), ("x_image", "y_image"), ("xpsf_image", "ypsf_image"))
+#: Columns of right ascension and declination, degrees where they have no unit.
+_CELESTIAL = (
+    ("ra", "dec"), ("alphawin_j2000", "deltawin_j2000"), ("alpha_j2000", "delta_j2000"), ("raj2000", "dej2000"),
+    ("ra_icrs", "de_icrs"),
+)  # fmt: skip
+#: Columns of LSST's tables of sources, in radian where they have no unit.
+_CELESTIAL_RADIAN = ("coord_ra", "coord_dec")
+
+
+def read_star_positions(path: Path, image: CcdImage) -> np.ndarray:
+    """Return the pixels of an image, the first one's centre at (0, 0), at which a catalogue has stars, [k, 2].
+
+    Raises
+    ------
+    ProductError
+        If the file is no table (FITS, ECSV or CSV), or has no positions; or celestial ones of an image without world
+        coordinates.
+    DomainError
+        If no star of it lies on the image.
+    """
+    positions = _positions_in(_table_in(path), image, path)
+    ny, nx = image.image.shape
+    inside = np.isfinite(positions).all(axis=1)
+    inside[inside] = ((positions[inside] >= -0.5) & (positions[inside] <= np.array([nx, ny]) - 0.5)).all(axis=1)
+    if not inside.any():
+        raise DomainError(f"{path}: none of its {len(positions)} stars lies on image {image.name}")
+    return positions[inside]
+
+
+def _positions_in(table: Table, image: CcdImage, path: Path) -> np.ndarray:
+    columns = {name.lower(): name for name in table.colnames}
+
+    def values(names: tuple[str, str]) -> np.ndarray:
+        return np.stack([np.ma.filled(np.ma.asarray(table[columns[n]], dtype=float), np.nan) for n in names], axis=1)
+
+    for pairs, first in ((_FROM_ONE, 1.0), (_FROM_ZERO, 0.0)):
+        for names in pairs:
+            if set(names) <= columns.keys():
+                return values(names) - first
+    for names in (*_CELESTIAL, _CELESTIAL_RADIAN):
+        if not set(names) <= columns.keys():
+            continue
+        if not image.has_sky:
+            raise ProductError(
+                f"has {' and '.join(names)}, the image no world coordinates: expected x and y", file=path
+            )
+        units = [str(table[columns[name]].unit or "").lower() for name in names]
+        in_radian = all(unit in ("rad", "radian") or (not unit and names == _CELESTIAL_RADIAN) for unit in units)
+        sky = np.rad2deg(values(names)) if in_radian else values(names)
+        return image.pixels_at(sky)
+    expected = ", ".join(" and ".join(names) for names in (*_FROM_ZERO[:1], *_FROM_ONE[:1], *_CELESTIAL[:2]))
+    raise ProductError(f"has no positions of stars: expected columns {expected}", file=path)
+
+
+def _table_in(path: Path) -> Table:
+    """Read a table; of a FITS file the first one with a position, as LDAC files have others before it."""
+    data = read_bytes(path, ProductError)
+    with warnings.catch_warnings(), parsing(path, "no table of stars", ProductError):
+        warnings.simplefilter("ignore")
+        if not data.startswith(b"SIMPLE"):
+            kind = "ascii.ecsv" if data.lstrip().startswith(b"# %ECSV") else "ascii.csv"
+            return Table.read(data.decode(), format=kind)
+        with fits.open(io.BytesIO(data), lazy_load_hdus=False) as hdus:
+            tables = [Table.read(hdu) for hdu in hdus if isinstance(hdu, (fits.BinTableHDU, fits.TableHDU))]
+    known_names = {name for names in (*_FROM_ONE, *_FROM_ZERO, *_CELESTIAL, _CELESTIAL_RADIAN) for name in names}
+    if not tables:
+        raise ProductError("has no table of stars", file=path)
+    return next((t for t in tables if known_names & {name.lower() for name in t.colnames}), tables[0])

@@ -1,0 +1,66 @@
+"""PSFEx models against GalSim's drawing of them."""
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+import pachon
+from pachon.core.errors import ProductError
+
+
+def write_model(path, sampling=0.8, order=2, side=31, **cards):
+    rng = np.random.default_rng(1)
+    yy, xx = (np.indices((side, side)) - side // 2) * sampling
+    base = (1.0 + (xx**2 + 1.1 * yy**2) / 8.0) ** -3.0
+    base /= base.sum()
+    count = (order + 1) * (order + 2) // 2
+    terms = [0.02 * base * np.tanh(0.2 * (xx * a + yy * b + xx * yy * c)) for a, b, c in rng.normal(size=(count, 3))]
+    images = np.stack([base, *terms[1:]]).astype(np.float32)
+    column = fits.Column("PSF_MASK", format=f"{images.size}E", dim=f"({side},{side},{count})", array=[images])
+    hdu = fits.BinTableHDU.from_columns([column], name="PSF_DATA")
+    polynomial = {"POLNAXIS": 2, "POLGRP1": 1, "POLNAME1": "X_IMAGE", "POLZERO1": 1024.0, "POLSCAL1": 2000.0,
+                  "POLGRP2": 1, "POLNAME2": "Y_IMAGE", "POLZERO2": 2048.0, "POLSCAL2": 4000.0, "POLNGRP": 1,
+                  "POLDEG1": order}  # fmt: skip
+    hdu.header.update(polynomial | {"PSF_FWHM": 4.0, "PSF_SAMP": sampling, "PSFNAXIS": 3, "PSFAXIS1": side})
+    hdu.header.update({"PSFAXIS2": side, "PSFAXIS3": count} | cards)
+    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(path, overwrite=True)
+    return path
+
+
+@pytest.mark.parametrize("sampling", [0.8, 1.0, 1.3])
+def test_stamps_are_those_of_galsim(tmp_path, sampling):
+    galsim = pytest.importorskip("galsim")
+    des = pytest.importorskip("galsim.des")
+    path = write_model(tmp_path / "a.psf", sampling)
+    model, peer = pachon.load_psfex(path), des.DES_PSFEx(str(path))
+    for place in ((100.0, 300.0), (1900.0, 3000.0)):
+        image = peer.getPSF(galsim.PositionD(*place)).drawImage(nx=25, ny=25, scale=1.0, method="no_pixel").array
+        # Single precision, and GalSim's Fourier transforms.
+        np.testing.assert_allclose(model.at([place])[0], image / image.sum(), atol=1e-5 * image.max())
+
+
+@pytest.mark.parametrize(
+    ("cards", "text"),
+    [
+        ({"POLNAME1": "R_MAG"}, "POLNAME1 = 'R_MAG': expected X_IMAGE, the position in pixels"),
+        ({"POLNAXIS": 3}, "POLNAXIS = 3: expected 0, or 2"),
+        ({"POLDEG1": 3}, r"PSF_MASK has shape \(6, 31, 31\): expected 10 images"),
+        ({"PSF_SAMP": "half"}, "PSF_SAMP = 'half': expected a number"),
+        ({"PSF_SAMP": 0.0}, "PSF_SAMP = 0.0: expected a number above 0"),
+        ({"POLSCAL1": 0.0}, "POLSCAL1 = 0.0: expected a number above 0"),
+    ],
+)
+def test_what_is_no_model_of_pixels_is_one_line(tmp_path, cards, text):
+    with pytest.raises(ProductError, match=rf"a\.psf: {text}"):
+        pachon.load_psfex(write_model(tmp_path / "a.psf", **cards))
+
+
+def test_files_that_are_no_models(tmp_path):
+    with pytest.raises(ProductError, match="no such file"):
+        pachon.load_psfex(tmp_path / "none.psf")
+    fits.PrimaryHDU(np.zeros((3, 3))).writeto(tmp_path / "a.psf")
+    with pytest.raises(ProductError, match="no model of PSFEx"):
+        pachon.load_psfex(tmp_path / "a.psf")
+    (tmp_path / "a.psf").write_bytes(b"text")
+    with pytest.raises(ProductError, match="damaged or no FITS file of PSFEx"):
+        pachon.load_psfex(tmp_path / "a.psf")
