@@ -57,13 +57,13 @@ _VARIANCE_COST = 1.5
 _CONSTANT_BONUS = 1.0
 # Forms of smaller probability are left out of the mean.
 _LEAST_PROBABILITY = 1e-3
-# Logarithms of the variance of the process and of the common noise where the search starts: nearly all process, or
+# Logarithms of the variance of the process and of the common noise where the search starts: nearly all process, and
 # nearly all trend.
-_PROCESS_STARTS = ((0.0, -4.0), (-4.0, -4.0))
-# The same of the common noise without a process.
-_TREND_FLOOR = -4.0
-# The same of the trend's variance of degree 1, and its fall by degree.
-_TREND_START = (1.0, 1.0)
+_PROCESS_START = (0.0, -4.0)
+_TREND_START = (-4.0, -4.0)
+# The same of the trend's variance of degree 1, and its fall by degree: degrees 1 and 2, and every degree.
+_LOW_DEGREES = (1.0, 1.0)
+_ALL_DEGREES = (2.5, 0.5)
 # Variance of the trend's constant: as good as unknown.
 _CONSTANT = 1e4
 # More stars than this add little to the covariance, and cost their cube; the brightest are taken.
@@ -121,22 +121,25 @@ def fit_covariances(points: np.ndarray, numbers: np.ndarray, noise: np.ndarray, 
         np.concatenate([_PRIOR[:, 0], expected]),
         np.concatenate([_PRIOR[:, 1], np.full(len(degrees), _TREND_WIDTH)]),
     )
-    first, fall = _TREND_START
-    trend_start = np.where(degrees < _FIRST_HIGH_DEGREE, first - fall * (degrees - 1), expected)
+    low_degrees, all_degrees = (first - fall * (degrees - 1) for first, fall in (_LOW_DEGREES, _ALL_DEGREES))
+    low_degrees = np.where(degrees < _FIRST_HIGH_DEGREE, low_degrees, expected)
 
     def columns(process: bool, degree: int) -> np.ndarray:
         return np.concatenate([[process, process, True], degrees <= degree])
 
-    def start_at(process: float, length: float, floor: float) -> np.ndarray:
-        return np.concatenate([[process, length, floor], trend_start])
+    def start_at(variances: tuple[float, float], trend: np.ndarray) -> np.ndarray:
+        process, common_noise = variances
+        return np.concatenate([[process, _PRIOR[_LENGTH, 0], common_noise], trend])
 
     fits: list[tuple[np.ndarray, OptimizeResult]] = []
-    log_length = _PRIOR[_LENGTH, 0]
     for degree in range(min(order, _MOST_SMOOTH_DEGREE) + 1):
         present = columns(False, degree)
-        fits.append((present, posterior.minimize(start_at(_PRIOR[0, 0], log_length, _TREND_FLOOR), present)))
+        fits.append((present, posterior.minimize(start_at(_TREND_START, low_degrees), present)))
     present = columns(True, order)
-    optima = [posterior.minimize(start_at(p, log_length, floor), present) for p, floor in _PROCESS_STARTS]
+    starts = [start_at(_PROCESS_START, low_degrees), start_at(_TREND_START, low_degrees)]
+    if order >= _FIRST_HIGH_DEGREE:
+        starts.append(start_at(_TREND_START, all_degrees))
+    optima = [posterior.minimize(start, present) for start in starts]
     best = min(optima, key=lambda optimum: optimum.fun)
     if order > 1:
         # One length for all, so that the mean of all forms has one process.
