@@ -51,7 +51,7 @@ _FIRST_HIGH_DEGREE = 3
 # Highest degree of a trend without a process: fields of more structure have one.
 _MOST_SMOOTH_DEGREE = 2
 # Minus the logarithm of the prior probability of a form for each variance that it has: its maximum fits noise better
-# by about 1. Degrees above 2, of which nothing is expected, cost nothing more.
+# by about 1. A process pays for degree 1 alone: its two trends are equally probable.
 _VARIANCE_COST = 1.5
 # Logarithm of the prior odds of the constant, which is a form of its own rather than a limit of the others.
 _CONSTANT_BONUS = 1.0
@@ -157,8 +157,9 @@ def fit_covariances(points: np.ndarray, numbers: np.ndarray, noise: np.ndarray, 
 
 
 def _variance_count(present: np.ndarray) -> int:
-    """Return the number of variances of a form that are paid for: of the process and of degrees 1 and 2."""
-    return int(present[0] + present[_PROCESS_COLUMNS : _PROCESS_COLUMNS + _FIRST_HIGH_DEGREE - 1].sum())
+    """Return the number of variances that a form pays for: of the process, and of degrees 1 and 2."""
+    process, degree = bool(present[0]), int(present[_PROCESS_COLUMNS:].sum())
+    return 1 + min(degree, 1) if process else degree
 
 
 @dataclass(frozen=True, eq=False)
