@@ -125,6 +125,11 @@ class FittedInterpolation:
         """Name of the kind."""
         return self.kind.name
 
+    @property
+    def smoothness(self) -> dict[str, float]:
+        """Probability of each form of the field over the CCD by the stars; empty where none is chosen."""
+        return {}
+
     def terms(self) -> np.ndarray:
         """Return the terms of the polynomials at the stars, [n, n_terms]."""
         return design_matrix(self.positions, self.extent, self.order)

@@ -227,6 +227,15 @@ class PsfModel(ModelFit, Result):
         return self.interpolation.weights
 
     @property
+    def smoothness(self) -> dict[str, float]:
+        """Probability of each form of the PSF over the CCD, by the stars; empty for polynomials.
+
+        Kriging chooses among a constant, a linear and a quadratic field, and a process, such as turbulence leaves, on a
+        trend: ``{"constant": 0.9, "linear": 0.1}``, say. Predictions are the mean of all by these.
+        """
+        return self.interpolation.smoothness
+
+    @property
     def n_stars(self) -> int:
         """Number of stars of the fit."""
         return len(self.coefficients)

@@ -6,7 +6,8 @@ import pytest
 from pachon.core.errors import ConfigError, DomainError
 from pachon.core.threads import one_blas_thread
 from pachon.measure.shapes import measure_shapes
-from pachon.reconstruction.psf_model import kriging
+from pachon.reconstruction.psf_model import covariance, kriging
+from pachon.reconstruction.psf_model.covariance import fit_covariances
 from pachon.reconstruction.psf_model.model import PsfModel
 from pachon.reconstruction.psf_model.polynomial import design_matrix
 
@@ -69,23 +70,43 @@ def test_it_is_near_to_the_best_of_all_choices_of_polynomials(count, rough):
     assert np.exp(np.log(ratios).mean()) < 1.1
 
 
-def test_degrees_that_the_stars_do_not_show_cost_nothing_and_others_are_found():
-    # A field that is an exact quadratic, and one with terms of degree 4 as large as the linear ones.
-    rng = np.random.default_rng(2)
-    points = rng.uniform(-1.0, 1.0, (60, 2))
+def exact_fields(degree, count=60, seed=2):
+    """Shape numbers of an exact polynomial, ten times their noise a term, with places, noise and terms to degree 4."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1.0, 1.0, (count, 2))
     terms = design_matrix(points, EXTENT, 4)
-    noise = np.full((60, 3), 1e-4)
     degrees = np.repeat(np.arange(5), np.arange(1, 6))
-    for amplitudes in ([1.0, 1.0, 1.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0, 1.0]):
-        numbers = terms @ (0.1 * np.array(amplitudes)[degrees][:, None] * rng.normal(size=(15, 3)))
-        with one_blas_thread():
-            kernel = kriging.fit_kernel(points, numbers + 1e-2 * rng.normal(size=(60, 3)), noise, terms)
-        # Variances in units of the noise, 100 where there are terms; fewer than fifty numbers tell each.
-        for found, amplitude in zip(kernel[3:], amplitudes[1:], strict=True):
-            assert (10.0 < found < 1000.0) if amplitude else found < 0.1
+    numbers = terms @ (0.1 * (degrees <= degree)[:, None] * rng.normal(size=(15, 3)))
+    return points, numbers + 1e-2 * rng.normal(size=(count, 3)), np.full((count, 3), 1e-4), terms
 
 
-def test_a_process_is_found_where_there_is_one_and_hardly_any_on_a_polynomial():
+def test_the_form_of_a_field_is_found():
+    with one_blas_thread():
+        for degree, name in ((0, "constant"), (1, "linear"), (2, "quadratic")):
+            fields = [fit_covariances(*exact_fields(degree, seed=seed)) for seed in range(8)]
+            probabilities = [covariances.forms().get(name, 0.0) for covariances in fields]
+            # Chance alone gives some of the fields a further term, of about the size of its own error.
+            assert np.median(probabilities) > 0.5
+            for covariances, probability in zip(fields, probabilities, strict=True):
+                if probability < 0.5:
+                    continue
+                best = list(covariances.forms()).index(name)
+                # Variances in units of the noise, 100 where there are terms; fewer than fifty numbers tell each.
+                trend = covariances.kernels[best][3:]
+                assert ((trend[:degree] > 10.0) & (trend[:degree] < 1000.0)).all()
+                assert (trend[degree:] == 0.0).all()
+        # Degrees 3 and 4 come with a process, which is then small.
+        covariances = fit_covariances(*exact_fields(4))
+        assert covariances.forms()["quartic, process"] > 0.99
+        assert ((covariances.kernel[3:] > 10.0) & (covariances.kernel[3:] < 1000.0)).all()
+        assert covariances.kernel[0] < 1.0
+
+
+def process_probability(covariances):
+    return sum(p for name, p in covariances.forms().items() if name.endswith("process"))
+
+
+def test_a_process_is_found_where_there_is_one():
     rng = np.random.default_rng(4)
     points = rng.uniform(-1.0, 1.0, (80, 2))
     terms, noise = design_matrix(points, EXTENT, 4), np.full((80, 3), 1e-4)
@@ -93,37 +114,35 @@ def test_a_process_is_found_where_there_is_one_and_hardly_any_on_a_polynomial():
     rough = np.linalg.cholesky(np.exp(-distance / 0.5)) @ rng.normal(size=(80, 3))
     smooth = terms[:, :6] @ rng.normal(size=(6, 3)) + 1e-2 * rng.normal(size=(80, 3))
     with one_blas_thread():
+        covariances = fit_covariances(points, smooth + 5e-2 * rough, noise, terms)
         # 1e-2 of noise is the unit; the process drawn has a variance of 25.
-        assert 8.0 < kriging.fit_kernel(points, smooth + 5e-2 * rough, noise, terms)[0] < 80.0
-        kernel = kriging.fit_kernel(points, smooth, noise, terms)
-    # A hundredth of the noise of one star; degrees that are not there are left out.
-    assert kernel[0] < 0.01
-    assert (kernel[5:] == 0.0).all()
+        assert 8.0 < covariances.kernel[0] < 80.0
+        assert process_probability(covariances) > 0.999
+        assert process_probability(fit_covariances(points, smooth, noise, terms)) < 0.5
 
 
-def test_the_slope_of_the_posterior_is_its_change():
+@pytest.mark.parametrize("process", [True, False])
+def test_the_slope_of_the_posterior_is_its_change(process):
     rng = np.random.default_rng(5)
     points = rng.uniform(-1.0, 1.0, (25, 2))
     distance = np.hypot(*np.moveaxis(points[:, None] - points, -1, 0))
     terms = design_matrix(points, EXTENT, 4)
-    posterior = kriging.Posterior(
+    posterior = covariance.Posterior(
         distance, 3.0 * rng.normal(size=(25, 3)), rng.uniform(0.1, 2.0, 25), terms, np.zeros(7), np.full(7, 2.0)
     )
-    at, kept = rng.normal(size=7), np.array([True, True, True, True, True, False, True])
-    value, slope = posterior.negative_log_posterior(at, kept)
-    variance, length, floor, *trend = np.where(kept, np.exp(at), 0.0)
-    covariance = variance * np.exp(-distance / length) + np.diag(posterior.noise + floor)
-    covariance += terms @ np.diag(np.repeat([1e4, *trend], [1, 2, 3, 4, 5])) @ terms.T
-    likelihood = 1.5 * np.linalg.slogdet(covariance)[1]
-    likelihood += 0.5 * np.sum(posterior.numbers * np.linalg.solve(covariance, posterior.numbers))
-    assert value == pytest.approx(likelihood + 0.5 * ((at[kept] / 2.0) ** 2).sum(), rel=1e-10)
+    at, present = rng.normal(size=7), np.array([process, process, True, True, True, False, True])
+    value, slope = posterior.negative_log_posterior(at, present)
+    variance, length, floor, *trend = np.where(present, np.exp(at), 0.0)
+    covariance_matrix = np.diag(posterior.noise + floor) + (variance * np.exp(-distance / length) if process else 0.0)
+    covariance_matrix += terms @ np.diag(np.repeat([1e4, *trend], [1, 2, 3, 4, 5])) @ terms.T
+    likelihood = 1.5 * np.linalg.slogdet(covariance_matrix)[1]
+    likelihood += 0.5 * np.sum(posterior.numbers * np.linalg.solve(covariance_matrix, posterior.numbers))
+    assert value == pytest.approx(likelihood + 0.5 * ((at[present] / 2.0) ** 2).sum(), rel=1e-10)
     for column in range(7):
         step = np.eye(7)[column] * 1e-5
-        change = (
-            posterior.negative_log_posterior(at + step, kept)[0] - posterior.negative_log_posterior(at - step, kept)[0]
-        ) / 2e-5
+        above, below = (posterior.negative_log_posterior(at + sign * step, present)[0] for sign in (1.0, -1.0))
         # Rounding of values near 100, over the step.
-        assert slope[column] == pytest.approx(change, abs=1e-7 * abs(value))
+        assert slope[column] == pytest.approx((above - below) / 2e-5, abs=1e-7 * abs(value))
 
 
 @pytest.fixture(scope="module")
@@ -132,27 +151,32 @@ def fitted():
     return PsfModel.fit(stars, places, **OPTIONS), stars, elsewhere
 
 
-def test_trend_and_process_are_those_of_one_large_gaussian(fitted):
+def test_trend_and_process_are_the_mean_of_those_of_large_gaussians(fitted):
     model, _, elsewhere = fitted
-    variance, length, floor, *trend = model.interpolation.kernel
-    assert len(trend) == 4
-    prior = np.diag(np.repeat([1e4, *trend], [1, 2, 3, 4, 5]))
+    covariances = model.interpolation.covariances
+    assert len(covariances.kernels) > 1
+    assert covariances.probabilities.sum() == pytest.approx(1.0, abs=1e-12)
     at_stars, there = (design_matrix(p, EXTENT, 4) for p in (model.positions, elsewhere))
+    expected, alone = np.zeros((len(elsewhere), model.n_components)), {0: 0.0, 17: 0.0}
+    for (variance, length, floor, *trend), probability in covariances.weighted():
+        prior = np.diag(np.repeat([1e4, *trend], [1, 2, 3, 4, 5]))
 
-    def covariance(a, b, terms_a, terms_b):
-        distance = np.hypot(*np.moveaxis(a[:, None] - b, -1, 0))
-        return variance * np.exp(-distance / length) + terms_a @ prior @ terms_b.T
+        def signal(a, b, terms_a, terms_b, variance=variance, length=length, prior=prior):
+            distance = np.hypot(*np.moveaxis(a[:, None] - b, -1, 0))
+            return variance * np.exp(-distance / length) + terms_a @ prior @ terms_b.T
 
-    own = covariance(model.positions, model.positions, at_stars, at_stars) + np.diag(1.0 / model.weights + floor)
-    between = covariance(elsewhere, model.positions, there, at_stars)
-    expected = between @ np.linalg.solve(own, model.coefficients)
+        of_stars = signal(model.positions, model.positions, at_stars, at_stars) + np.diag(1.0 / model.weights + floor)
+        between = signal(elsewhere, model.positions, there, at_stars)
+        expected += probability * between @ np.linalg.solve(of_stars, model.coefficients)
+        # Each star predicted from the others, by solving without it.
+        for star in alone:
+            others = np.delete(np.arange(30), star)
+            weights = np.linalg.solve(of_stars[np.ix_(others, others)], of_stars[others, star])
+            alone[star] = alone[star] + probability * weights @ model.coefficients[others]
     np.testing.assert_allclose(model.amplitudes(elsewhere), expected, atol=1e-9 * np.abs(expected).max())
-    # Each star predicted from the others, by solving without it.
-    for star in (0, 17):
-        rest = np.delete(np.arange(30), star)
-        alone = own[star, rest] @ np.linalg.solve(own[np.ix_(rest, rest)], model.coefficients[rest])
+    for star, prediction in alone.items():
         left_out = model.leave_one_out()[star] - model.mean
-        np.testing.assert_allclose(left_out.ravel(), alone, atol=1e-8 * np.abs(expected).max())
+        np.testing.assert_allclose(left_out.ravel(), prediction, atol=1e-8 * np.abs(expected).max())
 
 
 def test_places_do_not_depend_on_their_batch_and_files_keep_every_digit(fitted, tmp_path):
@@ -161,6 +185,7 @@ def test_places_do_not_depend_on_their_batch_and_files_keep_every_digit(fitted, 
     assert np.array_equal(model.at(elsewhere[7])[0], together[7])
     model.write(tmp_path / "psf.fits")
     again = PsfModel.read(tmp_path / "psf.fits")
+    assert again.smoothness == model.smoothness
     assert np.array_equal(again.at(elsewhere), together)
     assert np.array_equal(again.leave_one_out(), model.leave_one_out())
     np.testing.assert_allclose(together.sum(axis=(1, 2)), 1.0, atol=1e-12)
