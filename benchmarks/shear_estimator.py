@@ -31,7 +31,7 @@ def telescope_psfs(count: int) -> np.ndarray:
     fields = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     air = pachon.Atmosphere.from_site("cerro_pachon", seed=2)
     psfs = pachon.make_psfs(
-        telescope, fields, [580e-9, 620e-9, 660e-9], atmosphere=air, engine="long_exposure", stamp_size=SIDE - 1
+        telescope, fields, [580e-9, 620e-9, 660e-9], atmosphere=air, engine="long_exposure", stamps=pachon.Stamps(SIDE - 1)
     )
     images = np.asarray(psfs.images, dtype=float)
     return images / images.sum(axis=(1, 2), keepdims=True)
@@ -117,7 +117,7 @@ def show(label: str, plus: np.ndarray, minus: np.ndarray, shear: float) -> None:
 
     def biases(sums: np.ndarray) -> np.ndarray:
         values = []
-        for k, total in enumerate(np.moveaxis(sums, -2, 0)):
+        for k, total in enumerate(np.moveaxis(sums, -3, 0)):
             response = 2 + 2 * k
             both = total[..., 0, :] + total[..., 1, :]
             difference = total[..., 0, k] - total[..., 1, k]
@@ -125,11 +125,9 @@ def show(label: str, plus: np.ndarray, minus: np.ndarray, shear: float) -> None:
         # One m of both components together.
         return np.stack([*values, 0.5 * (values[0] + values[2])], axis=-1)
 
-    pair = np.stack([plus, minus], axis=1).swapaxes(1, 2).swapaxes(1, 2)
-    pair = np.moveaxis(pair, 1, 2)  # [blocks, component, sign, 5]
+    pair = np.stack([plus, minus], axis=2)  # [blocks, component, sign, 5]
     total = pair.sum(axis=0)
-    values = biases(np.moveaxis(total[None], 1, 1))[0]
-    without = biases(total - pair)
+    values, without = biases(total), biases(total - pair)
     errors = np.sqrt((len(pair) - 1) / len(pair) * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
     m1, c1, m2, c2, m = zip(values, errors, strict=True)
     print(
