@@ -33,7 +33,7 @@ def telescope_psfs(count: int) -> np.ndarray:
     psfs = pachon.make_psfs(
         telescope, fields, [580e-9, 620e-9, 660e-9], atmosphere=air, engine="long_exposure", stamps=pachon.Stamps(SIDE - 1)
     )
-    images = np.asarray(psfs.images, dtype=float)
+    images = np.asarray(psfs.image, dtype=float)
     return images / images.sum(axis=(1, 2), keepdims=True)
 
 
