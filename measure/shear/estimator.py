@@ -245,18 +245,17 @@ class ShearEstimator:
 
 
 def renoising(covariance: np.ndarray, quarter_turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return matrices that turn normal numbers into N and A N, both [n, m, m].
+    """Return matrices that turn normal numbers z into N and A N, both [n, m, m].
 
-    N = S L z has the covariance of the noise of an image rotated by 90 degrees, S. Of T = M + n + N and D = M + n - A N
-    the covariance is C - S C A^T, zero for A = C S C^-1.
+    With C = L L^T, N = S L z has the covariance of the noise of an image rotated by 90 degrees, S. The covariance of
+    T = M + n + N and D = M + n - A N is C - S C S^T A^T: zero for A N = C S L^-T z.
     """
     scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     correlation = covariance / (scale[:, :, None] * scale[:, None])
-    factor = np.linalg.cholesky(correlation + 1e-12 * np.eye(covariance.shape[-1]))
-    added = quarter_turn @ (scale[:, :, None] * factor)
-    # A S L z = C S C^-1 S L z, and C^-1 by its factor.
-    solved = np.linalg.solve(correlation, added / scale[:, :, None]) / scale[:, :, None]
-    return added, covariance @ (quarter_turn @ solved)
+    identity = np.eye(covariance.shape[-1])
+    factor = np.linalg.cholesky(correlation + 1e-12 * identity)
+    inverse = np.linalg.solve(np.moveaxis(factor, 1, 2), np.broadcast_to(identity, factor.shape))
+    return quarter_turn @ (scale[:, :, None] * factor), covariance @ quarter_turn @ (inverse / scale[:, :, None])
 
 
 def smooth_step(snr: np.ndarray, least: float, width: float) -> tuple[np.ndarray, np.ndarray]:
