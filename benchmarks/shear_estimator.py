@@ -15,7 +15,6 @@ from scipy import fft
 
 import pachon
 from pachon.measure.shear.estimator import ShearEstimator
-from pachon.measure.shear.shear_shapes import shear_bias
 
 ARCSEC = np.pi / 648000
 SCALE = 0.2 * ARCSEC
@@ -31,7 +30,12 @@ def telescope_psfs(count: int) -> np.ndarray:
     fields = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     air = pachon.Atmosphere.from_site("cerro_pachon", seed=2)
     psfs = pachon.make_psfs(
-        telescope, fields, [580e-9, 620e-9, 660e-9], atmosphere=air, engine="long_exposure", stamps=pachon.Stamps(SIDE - 1)
+        telescope,
+        fields,
+        [580e-9, 620e-9, 660e-9],
+        atmosphere=air,
+        engine="long_exposure",
+        stamps=pachon.Stamps(SIDE - 1),
     )
     images = np.asarray(psfs.image, dtype=float)
     return images / images.sum(axis=(1, 2), keepdims=True)
@@ -187,7 +191,9 @@ def show_speed(psfs: np.ndarray, exposure: pachon.Exposure) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--galaxies", type=int, default=8192)
-    parser.add_argument("--realisations", type=int, default=8, help="of the noise for each galaxy, an even number; 0 for none")
+    parser.add_argument(
+        "--realisations", type=int, default=8, help="of the noise for each galaxy, an even number; 0 for none"
+    )
     parser.add_argument("--min-snr", type=float, nargs="*", default=[10.0])
     parser.add_argument("--shear", type=float, default=0.01)
     parser.add_argument("--faintest", type=float, default=26.0)

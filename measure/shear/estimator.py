@@ -16,7 +16,7 @@ from ...core.random_streams import stream
 from ...core.threads import one_blas_thread, thread_count
 from ...core.units import ARCSEC, positive_angle, pure_numbers, real_array, require_seed
 from ...core.warp_arrays import warp_array
-from .functionals import FUNCTIONALS, QUARTER_TURN, Frequencies, noise_covariance, psf_frequencies, weight_transforms
+from .functionals import FUNCTIONALS, QUARTER_TURN, noise_covariance, psf_frequencies, weight_transforms
 from .shear_kernels import deconvolved_functionals, weight_values
 from .shear_shapes import ShearShapes
 
