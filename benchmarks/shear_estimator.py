@@ -2,9 +2,9 @@
 
 Run: python benchmarks/shear_estimator.py [--galaxies N] [--realisations N] [--min-snr S] [--speed]
 
-Galaxies of the population of the sky, each at its sub-pixel place, beside it the same galaxy rotated by 90 degrees, under
-a shear and its opposite with the same noise: that of the sky of 100 visits, drawn on pixels, several times for each
-galaxy. With --speed, galaxies a second of the estimator, of fits of Gaussians and of GalSim's regauss, interleaved.
+Galaxies of the population of the sky, each at its sub-pixel place, beside it the same galaxy rotated by 90 degrees,
+under a shear and its opposite with the same noise: that of the sky of 100 visits, drawn on pixels, several times for
+each galaxy. With --speed, galaxies a second of the estimator, of fits of Gaussians and of GalSim's regauss, interleaved.
 """
 
 import argparse
@@ -191,9 +191,7 @@ def show_speed(psfs: np.ndarray, exposure: pachon.Exposure) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--galaxies", type=int, default=8192)
-    parser.add_argument(
-        "--realisations", type=int, default=8, help="of the noise for each galaxy, an even number; 0 for none"
-    )
+    parser.add_argument("--realisations", type=int, default=8, help="of the noise, an even number; 0 for none")
     parser.add_argument("--min-snr", type=float, nargs="*", default=[10.0])
     parser.add_argument("--shear", type=float, default=0.01)
     parser.add_argument("--faintest", type=float, default=26.0)

@@ -20,7 +20,7 @@ from .functionals import FUNCTIONALS, QUARTER_TURN, noise_covariance, psf_freque
 from .shear_kernels import deconvolved_functionals, weight_values
 from .shear_shapes import ShearShapes
 
-#: rms width of the weight before the PSF [rad]: about that of galaxies under seeing of 0.7". Narrower ones amplify noise.
+#: rms width of the weight before the PSF [rad]: in seeing of 0.7" narrower ones amplify noise, wider ones lose signal.
 WEIGHT_SIGMA = 0.52 * ARCSEC
 #: C of e = M1/(M0 + C), in standard errors of M0: keeps noise of faint galaxies from dividing by zero.
 _CONSTANT = 4.0

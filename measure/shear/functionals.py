@@ -4,13 +4,13 @@ With the Gaussian G of rms width s and peak 1, and the image f(x) before the PSF
 
     M0: G,  M1: (x^2 - y^2)/s^2 G,  M2: 2 x y/s^2 G
 
-and of the derivatives of the last two weights along a shear. A sheared image is f(S^-1 x) with a determinant of 1, so its
-functional of b(x) is that of b(S x) of the image without shear: with D1 = x d/dx - y d/dy and D2 = y d/dx + x d/dy,
+and of the derivatives of the last two weights along a shear. A sheared image is f(S^-1 x) with a determinant of 1, so
+its functional of b(x) is that of b(S x) of the image without shear: with D1 = x d/dx - y d/dy, D2 = y d/dx + x d/dy,
 
     dM/dg1 = functional of D1 b,  dM/dg2 = functional of D2 b
 
-which gives dM0/dg1 = -M1, dM0/dg2 = -M2, dM1/dg1 = M3, dM2/dg2 = M4, and dM1/dg2 = dM2/dg1 = M5. In Fourier space, where
-D1 is -(kx d/dkx - ky d/dky), all six are polynomials of u = s kx and v = s ky times the transform of G, and real.
+which gives dM0/dg1 = -M1, dM0/dg2 = -M2, dM1/dg1 = M3, dM2/dg2 = M4, and dM1/dg2 = dM2/dg1 = M5. In Fourier space,
+where D1 is -(kx d/dkx - ky d/dky), all six are polynomials of u = s kx and v = s ky times the transform of G, and real.
 """
 
 from __future__ import annotations
