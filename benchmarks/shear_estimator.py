@@ -4,7 +4,7 @@ Run: python benchmarks/shear_estimator.py [--galaxies N] [--realisations N] [--m
 
 Galaxies of the population of the sky, each at its sub-pixel place, beside it the same galaxy rotated by 90 degrees,
 under a shear and its opposite with the same noise: that of the sky of 100 visits, drawn on pixels, several times for
-each galaxy. With --speed, galaxies a second of the estimator, of fits of Gaussians and of GalSim's regauss, interleaved.
+each galaxy. With --speed, galaxies a second of the estimator, of Gaussian fits and of GalSim's regauss, interleaved.
 """
 
 import argparse

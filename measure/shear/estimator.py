@@ -16,7 +16,7 @@ from ...core.random_streams import stream
 from ...core.threads import one_blas_thread, thread_count
 from ...core.units import ARCSEC, positive_angle, pure_numbers, real_array, require_seed
 from ...core.warp_arrays import warp_array
-from .functionals import FUNCTIONALS, QUARTER_TURN, noise_covariance, psf_frequencies, weight_transforms
+from .functionals import FUNCTIONALS, noise_covariance, psf_frequencies, renoising, weight_transforms
 from .shear_kernels import deconvolved_functionals, weight_values
 from .shear_shapes import ShearShapes
 
@@ -28,6 +28,11 @@ _CONSTANT = 4.0
 LEAST_SIDE = 12.0
 #: Largest deviation of the sum of a PSF from 1.
 _PSF_SUM_TOLERANCE = 1e-3
+# M0, M1 and M2, of which ellipticities are made, and M1 to M5, which are their derivatives.
+_MEASURED = np.arange(3)
+_DERIVATIVES = np.arange(1, FUNCTIONALS)
+# Signs of the former under a rotation by 90 degrees.
+_QUARTER_TURN = np.diag([1.0, -1.0, -1.0])
 #: Stamps of a block; fixed, so that no byte depends on the number of threads.
 _BLOCK = 256
 
@@ -46,10 +51,11 @@ class ShearEstimator:
     order. Noise is not sheared with the image, so its functionals n must be kept out of the derivative: noise N of the
     same covariance, rotated by 90 degrees, is added in the space of functionals, and with
 
-    .. math:: T = M + n + N,\qquad D = M + n - A N
+    .. math:: T = M + n + N,\qquad D = M + n - X
 
-    e is that of T and the derivatives are those of D, with the matrix A for which T and D are independent (Li &
-    Mandelbaum 2023; Li et al. 2024). The rotation removes what the noise of an elliptical PSF would add to e.
+    e is that of T and the derivatives are those of D, with X, a linear function of N, for which T and D are
+    independent (Li & Mandelbaum 2023; Li et al. 2024). The rotation removes what the noise of an elliptical PSF adds
+    to e.
 
     Parameters
     ----------
@@ -102,7 +108,7 @@ class ShearEstimator:
         factors = self._frequencies.multiplicity / self._side**2
         self._weights = np.moveaxis(weights * factors, 0, -1).astype(np.float32)
         with one_blas_thread():
-            self._noise = renoising(self._covariance, np.diag(QUARTER_TURN))
+            self._noise = renoising(self._covariance, _MEASURED, _DERIVATIVES, _QUARTER_TURN)
 
     def __repr__(self) -> str:
         n = len(self._inverse)
@@ -221,14 +227,14 @@ class ShearEstimator:
         if seed is None:
             return _shapes(values, values, error, min_snr, snr_width)
         names = (key,) if isinstance(key, str) else key
-        normal = stream(require_seed(seed), *names).standard_normal(values.shape)
+        normal = stream(require_seed(seed), *names).standard_normal((len(values), len(_MEASURED)))
         added, subtracted = (np.einsum("nij,nj->ni", matrices[rows], normal) for matrices in self._noise)
-        signs = [
-            _shapes(values + sign * added, values - sign * subtracted, error, min_snr, snr_width)
-            for sign in (1.0, -1.0)
-        ]
-        columns = (0.5 * (getattr(signs[0], name) + getattr(signs[1], name)) for name in ShearShapes._table)
-        return ShearShapes(*columns)
+        pair = []
+        for sign in (1.0, -1.0):
+            measured, derivatives = values[:, _MEASURED] + sign * added, values.copy()
+            derivatives[:, _DERIVATIVES] -= sign * subtracted
+            pair.append(_shapes(measured, derivatives, error, min_snr, snr_width))
+        return ShearShapes(*(0.5 * (getattr(pair[0], name) + getattr(pair[1], name)) for name in ShearShapes._table))
 
     def _psf_rows(self, psf_index: ArrayLike | None, count: int) -> np.ndarray:
         """Return the PSF of each galaxy, [n] int."""
@@ -244,20 +250,6 @@ class ShearEstimator:
         return index.astype(np.int32)
 
 
-def renoising(covariance: np.ndarray, quarter_turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return matrices that turn normal numbers z into N and A N, both [n, m, m].
-
-    With C = L L^T, N = S L z has the covariance of the noise of an image rotated by 90 degrees, S. The covariance of
-    T = M + n + N and D = M + n - A N is C - S C S^T A^T: zero for A N = C S L^-T z.
-    """
-    scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    correlation = covariance / (scale[:, :, None] * scale[:, None])
-    identity = np.eye(covariance.shape[-1])
-    factor = np.linalg.cholesky(correlation + 1e-12 * identity)
-    inverse = np.linalg.solve(np.moveaxis(factor, 1, 2), np.broadcast_to(identity, factor.shape))
-    return quarter_turn @ (scale[:, :, None] * factor), covariance @ quarter_turn @ (inverse / scale[:, :, None])
-
-
 def smooth_step(snr: np.ndarray, least: float, width: float) -> tuple[np.ndarray, np.ndarray]:
     """Return a step from 0 to 1 with two continuous derivatives, and its derivative."""
     u = np.clip((snr - least) / width, 0.0, 1.0)
@@ -267,7 +259,7 @@ def smooth_step(snr: np.ndarray, least: float, width: float) -> tuple[np.ndarray
 def _shapes(
     total: np.ndarray, derivative: np.ndarray, error: np.ndarray, min_snr: float | None, snr_width: float
 ) -> ShearShapes:
-    """Return shapes from functionals T of the ellipticities and D of their derivatives, both [n, 6]."""
+    """Return shapes from functionals T [n, 3] of the ellipticities and D [n, 6] of their derivatives."""
     denominator = total[:, 0] + _CONSTANT * error
     e1, e2 = total[:, 1] / denominator, total[:, 2] / denominator
     snr = total[:, 0] / error

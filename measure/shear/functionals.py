@@ -24,8 +24,6 @@ from ...core.errors import DomainError
 
 #: Functionals of a galaxy.
 FUNCTIONALS = 6
-#: Signs of the functionals under a rotation by 90 degrees.
-QUARTER_TURN = np.array([1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
 #: Transform of the weight over that of the PSF below which frequencies are left out: 1e-6 of the flux is less than the
 #: rounding of single precision adds.
 _LEAST_AMPLITUDE = 1e-6
@@ -161,3 +159,35 @@ def noise_covariance(
     products = (weights[:, None] * np.conj(weights[None])).real * frequencies.multiplicity
     power = np.abs(inverse) ** 2 * (noise[:, None, None] / frequencies.side) ** 2
     return np.einsum("nyx,ijyx->nij", power, products)
+
+
+def renoising(
+    covariance: np.ndarray, measured: np.ndarray, derivatives: np.ndarray, quarter_turn: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return matrices that turn normal numbers z into noise of the functionals and of their derivatives.
+
+    N = S L z, with C = L L^T of the functionals of which ellipticities are made, has the covariance of the noise of an
+    image rotated by 90 degrees. The derivatives less X = C' S L^-T z, with the covariance C' of their noise with that
+    of the functionals, are independent of the functionals plus N: C' - <X N^T> = 0.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape [n, m, m]
+        Covariance of all functionals.
+    measured, derivatives : ndarray of int
+        Functionals of which ellipticities and weights are made, and those that are their derivatives.
+    quarter_turn : ndarray
+        S, by which a rotation of the image changes the former.
+
+    Returns
+    -------
+    ndarray, ndarray
+        Shapes [n, measured, measured] and [n, derivatives, measured].
+    """
+    square = covariance[:, measured[:, None], measured]
+    scale = np.sqrt(np.diagonal(square, axis1=1, axis2=2))
+    factor = np.linalg.cholesky(square / (scale[:, :, None] * scale[:, None]))
+    identity = np.broadcast_to(np.eye(len(measured)), factor.shape)
+    inverse = np.linalg.solve(np.moveaxis(factor, 1, 2), identity) / scale[:, :, None]
+    cross = covariance[:, derivatives[:, None], measured]
+    return quarter_turn @ (scale[:, :, None] * factor), cross @ quarter_turn @ inverse

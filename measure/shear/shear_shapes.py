@@ -13,7 +13,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.point_plots import draw_bars, draw_shapes
 from ...core.result import Result, Values
-from ...core.units import one_number
+from ...core.units import for_each, pure_numbers
 from ..correlation import jackknife_error
 
 if TYPE_CHECKING:
@@ -123,8 +123,8 @@ def mean_shear(shapes: ShearShapes, *, patch: ArrayLike | None = None) -> MeanSh
     DomainError
         If there are fewer than two galaxies or patches, or the response is not positive.
     """
-    labels = _patches(len(shapes), patch)
-    sums = patch_sums(shapes.sums, labels)
+    names, labels = np.unique(_patch_labels(len(shapes), patch), return_inverse=True)
+    sums = patch_sums(shapes.sums, labels, len(names))
     shear, shear_without_patch = shear_of_sums(sums.sum(axis=0)), shear_of_sums(sums.sum(axis=0) - sums)
     if not np.isfinite(shear).all():
         raise DomainError("shapes: their mean response is not positive; expected more galaxies, or brighter ones")
@@ -161,9 +161,9 @@ class ShearBias(Values):
 def shear_bias(
     plus: ShearShapes,
     minus: ShearShapes,
-    shear: float,
+    shear1: ArrayLike,
+    shear2: ArrayLike,
     *,
-    component: ArrayLike = 0,
     patch: ArrayLike | None = None,
     minus_patch: ArrayLike | None = None,
 ) -> ShearBias:
@@ -176,36 +176,41 @@ def shear_bias(
     ----------
     plus, minus : ShearShapes
         Galaxies under the shear and under its opposite.
-    shear : float
-        The shear.
-    component : int or array of int
-        0 where the shear is along x, 1 where it is along x = y: of all galaxies, or of each patch.
+    shear1, shear2 : float or array
+        The shear along x and along x = y, one for all or one of each patch, in the order of their labels. A patch
+        gives the bias of the component along which its shear is.
     patch, minus_patch : array of int, optional
         Patch of each galaxy under the shear and under its opposite (by default the same), with the same labels. By
         default a hundred runs of consecutive galaxies.
 
+    Returns
+    -------
+    ShearBias
+        NaN for a component along which there is no shear.
+
     Raises
     ------
     DomainError
-        If a component has no galaxies, or the number of galaxies differs without patches.
+        If the number of galaxies differs without patches, or shears are not one for each patch.
     """
     if minus_patch is None and len(plus) != len(minus):
         raise DomainError(f"plus, minus: {len(plus)} and {len(minus)} galaxies, expected as many, or patches of both")
-    shear = one_number(shear, "shear")
-    labels = _patches(len(plus), patch)
-    minus_labels = labels if minus_patch is None else _patches(len(minus), minus_patch)
+    labels = minus_labels = _patch_labels(len(plus), patch)
+    if minus_patch is not None:
+        minus_labels = _patch_labels(len(minus), minus_patch)
     names = np.union1d(labels, minus_labels)
-    sums = [
-        patch_sums(shapes.sums, np.searchsorted(names, rows), len(names))
-        for shapes, rows in ((plus, labels), (minus, minus_labels))
-    ]
-    along = np.broadcast_to(np.asarray(component, dtype=np.int64), (len(names),))
+    count, labels, minus_labels = len(names), np.searchsorted(names, labels), np.searchsorted(names, minus_labels)
+    sums = [patch_sums(s.sums, rows, count) for s, rows in ((plus, labels), (minus, minus_labels))]
+    shears = [for_each(pure_numbers(g, name), count, name) for g, name in ((shear1, "shear1"), (shear2, "shear2"))]
+    modulus = np.hypot(*shears)
     estimates = []
-    for k in range(2):
-        slope_rows = along == k
-        difference = _pair_shears(sums[0][slope_rows], sums[1][slope_rows], k, -1.0)
-        level = _pair_shears(*sums, k, 1.0)
-        estimates.append((difference[0] / shear - 1.0, difference[1] / abs(shear), *level))
+    for k, g in enumerate(shears):
+        rows = np.abs(g) > 0.5 * modulus
+        # Under a negative shear the other one of the pair is under the positive one.
+        upper, lower = (np.where((g > 0.0)[:, None], a, b)[rows] for a, b in (sums, sums[::-1]))
+        size = float(np.abs(g[rows]).mean()) if rows.any() else np.nan
+        response, error = _pair_shears(upper, lower, k, -1.0)
+        estimates.append((response / size - 1.0, error / size, *_pair_shears(*sums, k, 1.0)))
     m, m_error, c, c_error = np.array(estimates).T
     return ShearBias(m, m_error, c, c_error)
 
@@ -214,14 +219,11 @@ def _pair_shears(plus: np.ndarray, minus: np.ndarray, component: int, sign: floa
     """Return half the sum or difference of the shears of two sums by patch [p, 5], and its jackknife error."""
     if not len(plus):
         return float("nan"), float("nan")
-    half = [
+    total, without_patch = (
         0.5 * (shear_of_sums(a)[..., component] + sign * shear_of_sums(b)[..., component])
-        for a, b in (
-            (plus.sum(axis=0), minus.sum(axis=0)),
-            (plus.sum(axis=0) - plus, minus.sum(axis=0) - minus),
-        )
-    ]
-    return float(half[0]), float(jackknife_error(half[1]))
+        for a, b in ((plus.sum(axis=0), minus.sum(axis=0)), (plus.sum(axis=0) - plus, minus.sum(axis=0) - minus))
+    )
+    return float(total), float(jackknife_error(without_patch))
 
 
 def shear_of_sums(sums: np.ndarray) -> np.ndarray:
@@ -232,14 +234,13 @@ def shear_of_sums(sums: np.ndarray) -> np.ndarray:
     return np.stack([(r22 * e1 - r12 * e2) / determinant, (r11 * e2 - r12 * e1) / determinant], axis=-1)
 
 
-def patch_sums(values: np.ndarray, labels: np.ndarray, count: int | None = None) -> np.ndarray:
-    """Return the sums of values [n, k] over patches numbered by labels [n], [patches, k]."""
-    count = int(labels.max()) + 1 if count is None else count
+def patch_sums(values: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
+    """Return the sums of values [n, k] over patches numbered by labels [n], [count, k]."""
     return np.stack([np.bincount(labels, column, count) for column in values.T], axis=1)
 
 
-def _patches(count: int, patch: ArrayLike | None) -> np.ndarray:
-    """Return the numbers of the patches of galaxies, from 0 without gaps where they are not given."""
+def _patch_labels(count: int, patch: ArrayLike | None) -> np.ndarray:
+    """Return the patch of each galaxy, [count]: runs of consecutive galaxies where none are given."""
     if patch is None:
         if count < 2:
             raise DomainError(f"shapes: {count} galaxies, expected at least two")
@@ -247,7 +248,6 @@ def _patches(count: int, patch: ArrayLike | None) -> np.ndarray:
     labels = np.asarray(patch)
     if labels.shape != (count,) or labels.dtype.kind not in "iuf":
         raise DomainError(f"patch: shape {labels.shape}, expected the patch of each of {count} galaxies")
-    names, numbers = np.unique(labels, return_inverse=True)
-    if len(names) < 2:
-        raise DomainError(f"patch: {len(names)} different, expected at least two")
-    return numbers
+    if len(np.unique(labels)) < 2:
+        raise DomainError(f"patch: {len(np.unique(labels))} different, expected at least two")
+    return labels

@@ -2,7 +2,8 @@
 
 Each galaxy stands on a stamp of its own, with the true PSF of the nearest place where no star is, and the noise of the
 stack; neighbours are left out. It is measured twice, with the true PSF and with that of the models at that place: the
-difference is the systematic error of the PSF models, without the noise of galaxies and pixels.
+difference is the systematic error of the PSF models, without the noise of galaxies and pixels. Each time in two ways:
+by an elliptical Gaussian, as in the paper, and by the functionals of :class:`pachon.ShearEstimator`.
 """
 
 from __future__ import annotations
@@ -19,10 +20,17 @@ from ...imaging.draw import Sources
 from ...imaging.exposure import Exposure
 from ...measure.catalogue.fit_galaxies import fit_galaxy_stamps
 from ...measure.catalogue.galaxy_fits import GalaxyFits, usable_galaxies
+from ...measure.shear.estimator import LEAST_SIDE, WEIGHT_SIGMA, ShearEstimator
+from ...measure.shear.shear_shapes import ShearShapes
 from .stack import PsfStack
 
-#: Sides of stamps [pixel], each drawn on a grid of twice the side.
-_SIDES = (32, 64)
+#: S/N of the weighted flux from which galaxies have a weight in the shear.
+SHEAR_MIN_SNR = 10.0
+#: Sides of stamps [pixel], each drawn on a grid of twice the side: the first that the weight of the shear allows, and
+#: for large galaxies one of at least the second.
+_SIDES = (32, 64, 96, 128)
+#: Least width of the weight of the shear over the half-light radius of the widest PSF: narrower ones amplify noise.
+_WEIGHT_OVER_PSF = 1.2
 #: Half-light radius on the image over which a stamp of the first side is too small [pixel].
 _LARGE = 5.0
 #: Galaxies that are drawn and measured at a time, which bounds the memory.
@@ -47,6 +55,8 @@ class GalaxyShapes:
         Whether it is fit for shear.
     true_e1, true_e2, true_usable : ndarray, shape [n]
         The same, measured with the true PSF.
+    shear, true_shear : ShearShapes
+        Ellipticities and responses of the functionals, with the PSF of the models and with the true one.
     """
 
     index: np.ndarray
@@ -60,6 +70,8 @@ class GalaxyShapes:
     true_e1: np.ndarray
     true_e2: np.ndarray
     true_usable: np.ndarray
+    shear: ShearShapes
+    true_shear: ShearShapes
 
     def __len__(self) -> int:
         return len(self.x)
@@ -72,7 +84,8 @@ class GalaxyShapes:
     @classmethod
     def joined(cls, parts: list[GalaxyShapes]) -> GalaxyShapes:
         """Return the galaxies of several parts."""
-        return cls(*(np.concatenate([getattr(shapes, f.name) for shapes in parts]) for f in fields(cls)))
+        columns = [[getattr(shapes, f.name) for shapes in parts] for f in fields(cls)]
+        return cls(*(ShearShapes.joined(v) if isinstance(v[0], ShearShapes) else np.concatenate(v) for v in columns))
 
 
 def measure_galaxies(
@@ -118,8 +131,11 @@ def measure_galaxies(
     offset = pixels[near] - np.rint(pixels[near])
     block_fits: list[tuple[np.ndarray, GalaxyFits, GalaxyFits]] = []
     rng = stream(seed, *key)
-    for side, rows in zip(_SIDES, (on_image <= _LARGE, on_image > _LARGE), strict=True):
-        for block in _row_blocks(np.flatnonzero(rows)):
+    sigma = shear_weight_sigma(widths, exposure.pixel_scale)
+    sides = stamp_sides(sigma / exposure.pixel_scale)
+    shear_parts: list[tuple[np.ndarray, ShearShapes, ShearShapes]] = []
+    for side, rows in zip(sides, (on_image <= _LARGE, on_image > _LARGE), strict=True):
+        for number, block in enumerate(_row_blocks(np.flatnonzero(rows))):
             size = 2 * side
             used, index = np.unique(psf[block], return_inverse=True)
             spectra = galaxies.transform(
@@ -137,7 +153,33 @@ def measure_galaxies(
                 images, variances, stack.true[used], psf_index=index, start=by_model, threads=threads
             )
             block_fits.append((block, by_model, by_true))
-    return _joined_shapes(galaxies, near, pixels * exposure.pixel_scale, width, block_fits)
+            shear_pair = []
+            for psf_images in (stack.model[used], stack.true[used]):
+                estimator = ShearEstimator(psf_images, exposure.pixel_scale, exposure.noise_rms, sigma=sigma, side=side)
+                # Galaxies stand about the pixel of number side / 2, half a pixel from the centre of the stamp.
+                moments = estimator.moments(images, offset[block] + 0.5, psf_index=index, threads=threads)
+                shear_pair.append(
+                    estimator.ellipticity_and_response(
+                        moments,
+                        psf_index=index,
+                        seed=seed if exposure.noise else None,
+                        key=(*key, "moments", side, number),
+                        min_snr=SHEAR_MIN_SNR,
+                    )
+                )
+            shear_parts.append((block, *shear_pair))
+    return _joined_shapes(galaxies, near, pixels * exposure.pixel_scale, width, block_fits, shear_parts)
+
+
+def shear_weight_sigma(psf_half_light_radii: np.ndarray, pixel_scale: float) -> float:
+    """Return the rms width of the weight of the shear [rad] for PSFs of some half-light radii [pixel]."""
+    return max(WEIGHT_SIGMA, _WEIGHT_OVER_PSF * pixel_scale * float(np.max(psf_half_light_radii)))
+
+
+def stamp_sides(sigma: float) -> tuple[int, int]:
+    """Return the sides of stamps of small and of large galaxies for a weight of an rms width, all in pixels."""
+    fitting = [side for side in _SIDES if side >= LEAST_SIDE * sigma] or [_SIDES[-1]]
+    return fitting[0], max(fitting[0], _SIDES[1])
 
 
 def _row_blocks(rows: np.ndarray) -> Iterator[np.ndarray]:
@@ -169,6 +211,7 @@ def _joined_shapes(
     positions: np.ndarray,
     width: np.ndarray,
     block_fits: list[tuple[np.ndarray, GalaxyFits, GalaxyFits]],
+    shear_parts: list[tuple[np.ndarray, ShearShapes, ShearShapes]],
 ) -> GalaxyShapes:
     """Return the shapes of the fits of blocks of galaxies, in the order of the galaxies."""
     columns = {name: np.full(len(near), np.nan) for name in ("e1", "e2", "error", "true_e1", "true_e2")}
@@ -182,4 +225,15 @@ def _joined_shapes(
             if not prefix:
                 columns["error"][block] = fits.ellipticity_error
     x, y = positions[near].T
-    return GalaxyShapes(index=near, x=x, y=y, magnitude=galaxies.magnitude[near], **columns, **usable)
+    order = np.argsort(np.concatenate([np.zeros(0, dtype=np.int64), *(block for block, _, _ in shear_parts)]))
+    shear, true_shear = (ShearShapes.joined([pair[k] for pair in shear_parts]).take(order) for k in (1, 2))
+    return GalaxyShapes(
+        index=near,
+        x=x,
+        y=y,
+        magnitude=galaxies.magnitude[near],
+        **columns,
+        **usable,
+        shear=shear,
+        true_shear=true_shear,
+    )

@@ -62,7 +62,14 @@ def test_bias_is_that_of_the_shears_and_shapes_cancel_in_it():
         e = np.einsum("nij,nj->ni", response, shear) + shape
         columns = response[:, 0, 0], response[:, 0, 1], response[:, 1, 1]
         pair.append(pachon.ShearShapes(*e.T, *columns, np.ones(n), np.full(n, 20.0)))
-    found = pachon.shear_bias(*pair, g, component=np.arange(200) % 2, patch=2 * (np.arange(n) // 40) + component)
+    # Patches of one direction each; along x = y the pairs are the other way round.
+    direction = np.array([[g, 0.0], [0.0, -g]])[np.arange(200) % 2]
+    patch = 2 * (np.arange(n) // 40) + component
+    swapped = [
+        type(pair[0])(*(np.where(component == 1, getattr(b, c), getattr(a, c)) for c in a._table))
+        for a, b in (pair, pair[::-1])
+    ]
+    found = pachon.shear_bias(*swapped, *direction.T, patch=patch)
     np.testing.assert_allclose(found.m, [0.01, -0.02], atol=1e-10)
     assert found.c_error[0] == pytest.approx(0.2 / np.sqrt(n) / 0.4, rel=0.3)
     np.testing.assert_allclose(found.c, [1e-3, -2e-3], atol=4.0 * found.c_error.max())
@@ -74,10 +81,10 @@ def test_galaxies_of_unequal_numbers_by_patch():
     numbers = np.arange(900) // 9
     plus, minus = (shapes_of((s * 0.02, 0.0), responses(900, rng), rng, 0.0) for s in (1.0, -1.0))
     kept = rng.uniform(size=900) < 0.9
-    found = pachon.shear_bias(plus, minus.take(kept), 0.02, patch=numbers, minus_patch=numbers[kept])
+    found = pachon.shear_bias(plus, minus.take(kept), 0.02, 0.0, patch=numbers, minus_patch=numbers[kept])
     np.testing.assert_allclose(found.m[0], 0.0, atol=1e-10)
     with pytest.raises(DomainError, match="900 and "):
-        pachon.shear_bias(plus, minus.take(kept), 0.02)
+        pachon.shear_bias(plus, minus.take(kept), 0.02, 0.0)
 
 
 def test_bad_input_is_one_line():
