@@ -23,7 +23,7 @@ from .shear_shapes import ShearShapes
 #: rms width of the weight before the PSF [rad]: in seeing of 0.7" narrower ones amplify noise, wider ones lose signal.
 WEIGHT_SIGMA = 0.52 * ARCSEC
 #: C of e = M1/(M0 + C), in standard errors of M0: keeps noise of faint galaxies from dividing by zero.
-_CONSTANT = 4.0
+CONSTANT = 4.0
 #: Least side of a stamp over the rms width of the weight: on smaller ones the weight divided by the PSF is cut.
 LEAST_SIDE = 12.0
 #: Largest deviation of the sum of a PSF from 1.
@@ -86,14 +86,9 @@ class ShearEstimator:
         sigma: ArrayLike = WEIGHT_SIGMA,
         side: int = 64,
     ) -> None:
-        psfs = _checked_psfs(psf_images)
+        psfs = checked_psfs(psf_images)
         width = positive_angle(sigma, "sigma") / positive_angle(pixel_scale, "pixel_scale")
-        if side < LEAST_SIDE * width:
-            raise DomainError(
-                f"side = {side}: too small for a weight of sigma = {width:.2f} pixels; expected at least "
-                f"{int(np.ceil(LEAST_SIDE * width))} pixels",
-                key="side",
-            )
+        require_side(side, width)
         rms = pure_numbers(noise, "noise")
         if rms.shape not in ((), (len(psfs),)) or not np.all((rms > 0.0) & np.isfinite(rms)):
             raise DomainError(
@@ -250,6 +245,16 @@ class ShearEstimator:
         return index.astype(np.int32)
 
 
+def require_side(side: int, sigma: float) -> None:
+    """Raise DomainError for stamps that are too small for a weight of an rms width [pixel]."""
+    if side < LEAST_SIDE * sigma:
+        raise DomainError(
+            f"side = {side}: too small for a weight of sigma = {sigma:.2f} pixels; expected at least "
+            f"{int(np.ceil(LEAST_SIDE * sigma))} pixels",
+            key="side",
+        )
+
+
 def smooth_step(snr: np.ndarray, least: float, width: float) -> tuple[np.ndarray, np.ndarray]:
     """Return a step from 0 to 1 with two continuous derivatives, and its derivative."""
     u = np.clip((snr - least) / width, 0.0, 1.0)
@@ -260,7 +265,7 @@ def _shapes(
     total: np.ndarray, derivative: np.ndarray, error: np.ndarray, min_snr: float | None, snr_width: float
 ) -> ShearShapes:
     """Return shapes from functionals T [n, 3] of the ellipticities and D [n, 6] of their derivatives."""
-    denominator = total[:, 0] + _CONSTANT * error
+    denominator = total[:, 0] + CONSTANT * error
     e1, e2 = total[:, 1] / denominator, total[:, 2] / denominator
     snr = total[:, 0] / error
     r11, r22, r12, r21 = (
@@ -278,7 +283,7 @@ def _shapes(
     return ShearShapes(e1, e2, r11, 0.5 * (r12 + r21), r22, weight, snr)
 
 
-def _checked_psfs(psf_images: ArrayLike) -> np.ndarray:
+def checked_psfs(psf_images: ArrayLike) -> np.ndarray:
     """Return PSFs [n, m, m] of unit sum."""
     psfs = real_array(psf_images, "psf_images: expected real numbers [n, m, m]")
     psfs = psfs[None] if psfs.ndim == 2 else psfs
