@@ -89,10 +89,10 @@ def main() -> None:
                     rng = np.random.default_rng([arguments.seed, number, k // 2])
                     image, seed = clean, None
                     if arguments.realisations:
-                        seed = arguments.seed
+                        seed = arguments.seed + 1000 * number + k
                         image = clean + (-1) ** k * noise * rng.standard_normal(clean.shape)
                     found = pachon.detect_shear(
-                        image, psf, SCALE, noise, seed=seed, key=("image", number, k),
+                        image, psf, SCALE, noise, seed=seed,
                         min_snr=arguments.min_snr, threads=1,
                     )  # fmt: skip
                     parts[sign].append(found.shapes)

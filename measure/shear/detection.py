@@ -124,8 +124,8 @@ def detect_shear(
     *,
     psf_positions: ArrayLike | None = None,
     mask: ArrayLike | NDArray[np.bool_] | None = None,
+    sigma: ArrayLike = WEIGHT_SIGMA,
     seed: int | None = None,
-    key: str | tuple[str | int, ...] = "shear",
     min_snr: float = 10.0,
     threads: int | None = None,
 ) -> PeakShapes:
@@ -145,10 +145,11 @@ def detect_shear(
         Places (x, y) of the PSFs [pixel], [n, 2]: squares of 256 pixels have that of the nearest.
     mask : array, optional
         [ny, nx], not zero for pixels without value; peaks within four widths of the weight are left out.
+    sigma : float or Quantity
+        rms width of the weight before the PSF [rad].
     seed : int, optional
-        Seed of the noise that is added to the functionals; by default none is, for images without noise.
-    key : str or tuple
-        Name of its random stream. Images under a shear and its opposite take the same one.
+        Seed of the noise that is added to the functionals; by default none is, for images without noise. Images under
+        a shear and its opposite take the same one.
     min_snr : float
         S/N of the weighted flux from which peaks have weight; four above it all of it.
     threads : int, optional
@@ -162,17 +163,17 @@ def detect_shear(
     """
     pixels, ignored = _checked_image(image, mask)
     psfs = checked_psfs(psf_images)
-    sigma = WEIGHT_SIGMA / positive_angle(pixel_scale, "pixel_scale")
-    require_side(_COVARIANCE_SIDE, sigma)
+    width = positive_angle(sigma, "sigma") / positive_angle(pixel_scale, "pixel_scale")
+    require_side(_COVARIANCE_SIDE, width)
     rms = require_positive(noise, "noise")
     limit = require_positive(min_snr, "min_snr")
     cells = list(_cells(pixels.shape))
     psf_rows = _nearest_psfs(cells, len(psfs), psf_positions)
-    clear = _clear_pixels(ignored, int(np.ceil(_CLEARANCE * sigma)))
+    clear = _clear_pixels(ignored, int(np.ceil(_CLEARANCE * width)))
     used, index = np.unique(psf_rows, return_inverse=True)
-    detector = _Detector.of(psfs[used], sigma, rms, limit)
-    names = None if seed is None else (require_seed(seed), *((key,) if isinstance(key, str) else key))
-    measure = partial(_measure_cell, detector, np.where(ignored, 0.0, pixels), clear, names)
+    detector = _Detector.of(psfs[used], width, rms, limit)
+    noise_seed = None if seed is None else require_seed(seed)
+    measure = partial(_measure_cell, detector, np.where(ignored, 0.0, pixels), clear, noise_seed)
     with ThreadPoolExecutor(thread_count(threads)) as pool:
         parts = list(pool.map(measure, range(len(cells)), cells, index))
     x, y = (np.concatenate([np.zeros(0), *(part[k] for part in parts)]) for k in (0, 1))
@@ -275,7 +276,7 @@ def _measure_cell(
     detector: _Detector,
     image: np.ndarray,
     clear: np.ndarray,
-    names: tuple[int, ...] | None,
+    seed: int | None,
     number: int,
     cell: tuple[int, int],
     psf: int,
@@ -291,7 +292,7 @@ def _measure_cell(
     window[rows, columns] = image[low[0] : high[0], low[1] : high[1]]
     maps = detector.maps(window, psf)
     errors = detector.errors[psf]
-    reach = 0.0 if names is None else _REACH
+    reach = 0.0 if seed is None else _REACH
     flux = maps[0, _MARGIN : _MARGIN + height, _MARGIN : _MARGIN + width] / errors[0]
     bright = (flux > detector.min_snr - reach) & clear[
         first_row : first_row + height, first_column : first_column + width
@@ -303,11 +304,11 @@ def _measure_cell(
     candidates = (differences > -lowest[:, None]).all(axis=1)
     rows_in, columns_in, values = rows_in[candidates], columns_in[candidates], values[candidates]
     measured, derivatives = values[:, _MEASURED], values[:, _DERIVATIVES]
-    if names is None:
+    if seed is None:
         shapes = detector.shapes(measured, derivatives, errors)
     else:
         # A number for every pixel of the cell, so that images under a shear and its opposite have the same noise.
-        normal = stream(*names, number).standard_normal((height, width, len(_MEASURED)), np.float32)
+        normal = stream(seed, "peaks", number).standard_normal((height, width, len(_MEASURED)), np.float32)
         normal = normal[rows_in, columns_in].astype(np.float64)
         added, subtracted = (np.einsum("ij,nj->ni", matrix[psf], normal) for matrix in detector.noise)
         pair = [

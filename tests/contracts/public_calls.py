@@ -330,7 +330,7 @@ def calls(folder):
                               "shear2": [0.0, 0.01, -0.02, 0.03]}),
         "detect_shear": (pachon.detect_shear, {"image": m.image, "psf_images": m.shear_psf, "pixel_scale": 1e-6,
                          "noise": 1.0, "psf_positions": [[10.0, 10.0]], "mask": np.zeros(flat.shape, int), "seed": 1,
-                         "key": "noise", "min_snr": 10.0, "threads": 1}),
+                         "sigma": 2.6e-6, "min_snr": 10.0, "threads": 1}),
         "mean_shear": (pachon.mean_shear, {"shapes": m.shear_shapes, "patch": np.arange(12) // 3}),
         "shear_bias": (pachon.shear_bias, {"plus": m.shear_shapes, "minus": m.shear_shapes, "shear1": 0.01,
                        "shear2": 0.0, "patch": np.arange(12) // 3, "minus_patch": np.arange(12) // 3}),

@@ -15,7 +15,7 @@ from ....core.errors import DomainError
 from ....core.files import write_bytes, write_json
 from ....core.long_work import Execution
 from ....core.products import Stamp
-from ....core.random_streams import natural_number
+from ....core.random_streams import natural_number, stream
 from ....core.units import ARCMIN
 from ....imaging.image_file import CcdImage
 from ....measure.catalogue.detect import DetectedObjects, detect_objects
@@ -24,7 +24,9 @@ from ....measure.catalogue.galaxy_fits import usable_galaxies
 from ....measure.catalogue.matching import match_positions
 from ....measure.catalogue.star_locus import StarSelection, select_stars
 from ....measure.shapes import measure_shapes
-from ..galaxy_shapes import GalaxyShapes, half_light_radii, measure_galaxies
+from ....measure.shear.detection import detect_shear
+from ....measure.shear.shear_shapes import ShearShapes
+from ..galaxy_shapes import SHEAR_MIN_SNR, GalaxyShapes, half_light_radii, measure_galaxies, shear_weight_sigma
 from ..null_result import NullTest, null_metrics
 from ..null_test import FAINTEST_SNR, REACH, write_pictures, write_shapes
 from ..psf_visit import stack_limit
@@ -179,6 +181,7 @@ def measure_tile(
     variance = image.variance * np.float32(exposure.noise_rms**2 / np.median(image.variance[image.mask == 0]))
     objects = detect_objects(image.image, variance, image.mask, threshold=_THRESHOLD, background_size=None)
     truth = image.objects
+    key: tuple[str | int, ...] = ("images", psfs.visits, natural_number(tile.column), natural_number(tile.row))
     scale = pixel_scale_of(stack.frame)
     reach = REACH * cell_of(stack.experiment, stack.frame) / float(np.sqrt(stack.visits.visits.places))
     places = np.flatnonzero(~psfs.star)
@@ -209,6 +212,17 @@ def measure_tile(
         for psf_images in (psfs.model, psfs.true)
     ]
     usable = [usable_galaxies(fit, objects.half_light_radius[rows], stars.half_light_radius) for fit in fits]
+    shears = _object_shears(
+        image,
+        float(np.sqrt(np.median(variance[image.mask == 0]))),
+        [broadened(psf_images[places], transfer) for psf_images in (psfs.model, psfs.true)],
+        known_at / scale - tile.first,
+        np.stack([objects.x, objects.y], axis=1),
+        scale,
+        int(stream(stack.stamp.seed, *key, "peaks").integers(2**32)),
+        threads,
+    )
+    shears = [shapes.take(rows) for shapes in shears]
     match = match_positions(objects.x, objects.y, truth["X"], truth["Y"], MATCH_RADIUS)[rows]
     # True galaxies follow the stars of the table, in the order of the galaxies on the tile.
     index = np.where(match >= 0, match - int(truth["STAR"].sum()), -1)
@@ -225,9 +239,10 @@ def measure_tile(
         true_e1=fits[1].e1,
         true_e2=fits[1].e2,
         true_usable=usable[1],
+        shear=shears[0],
+        true_shear=shears[1],
     )
     true, axes = galaxies_on(stack.sky, tile, tile.wcs(stack.frame)), stack.frame.matrix
-    key: tuple[str | int, ...] = ("images", psfs.visits, natural_number(tile.column), natural_number(tile.row))
     options: dict[str, Any] = {"reach": reach, "threads": threads}
     drawn = np.flatnonzero(true.magnitude <= stack_limit(stack.experiment, FAINTEST_SNR, psfs.visits))
     stamps = measure_galaxies(psfs, axes, true.take(drawn), exposure, stack.stamp.seed, *key, **options)
@@ -238,6 +253,43 @@ def measure_tile(
     noise_free = replace(noise_free, index=usable_on_both[noise_free.index])
     area = float((image.mask == 0).sum()) * (scale / ARCMIN) ** 2
     return MeasuredTile(galaxies, stamps, noise_free, area, _star_metrics(stars, psfs, transfer, stack, tile))
+
+
+def _object_shears(
+    image: CcdImage,
+    noise: float,
+    psf_pair: list[np.ndarray],
+    psf_positions: np.ndarray,
+    positions: np.ndarray,
+    scale: float,
+    seed: int,
+    threads: int | None,
+) -> list[ShearShapes]:
+    """Return the shear of each object, the sums over the peaks that are nearest to it, with each of two sets of PSFs.
+
+    Peaks have their detection in the response; the objects are places of the sums alone.
+    """
+    sigma = shear_weight_sigma(half_light_radii(psf_pair[1]), scale)
+    sums = []
+    for psf_images in psf_pair:
+        peaks = detect_shear(
+            image.image,
+            psf_images / psf_images.sum(axis=(1, 2), keepdims=True),
+            scale,
+            noise,
+            psf_positions=psf_positions,
+            mask=image.mask,
+            sigma=sigma,
+            seed=seed,
+            min_snr=SHEAR_MIN_SNR,
+            threads=threads,
+        )
+        nearest = cKDTree(positions).query(np.stack([peaks.x, peaks.y], axis=1))[1]
+        columns = peaks.shapes.sums.T, peaks.weight, peaks.weight * peaks.snr
+        *totals, weight, snr = (np.bincount(nearest, v, len(positions)) for v in np.vstack(columns))
+        mean_snr = np.divide(snr, weight, out=np.zeros_like(snr), where=weight > 0.0)
+        sums.append(ShearShapes(*totals, weight, mean_snr))
+    return sums
 
 
 def selected_stars(
