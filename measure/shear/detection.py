@@ -110,6 +110,22 @@ class PeakShapes(Result):
         """M0 over its standard error."""
         return self.shapes.snr
 
+    def at_objects(self, x: ArrayLike, y: ArrayLike) -> ShearShapes:
+        """Return the sums over the peaks that are nearest to each object.
+
+        Objects are places of the sums alone: their detection changes no sum over all of them.
+
+        Parameters
+        ----------
+        x, y : array
+            Places of the objects [pixel], [n], at least one.
+        """
+        places = np.stack([real_array(v, f"{name}: expected real numbers") for v, name in ((x, "x"), (y, "y"))], axis=1)
+        nearest = cKDTree(places).query(np.stack([self.x, self.y], axis=1))[1]
+        columns = np.vstack([self.shapes.sums.T, self.weight, self.weight * self.snr])
+        *sums, weight, snr = (np.bincount(nearest, values, len(places)) for values in columns)
+        return ShearShapes(*sums, weight, np.divide(snr, weight, out=np.zeros_like(snr), where=weight > 0.0))
+
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw the ellipticities in their plane, coloured by S/N."""
         return draw_shapes(ax, self.e1, self.e2, self.snr, "S/N of M0")

@@ -25,7 +25,6 @@ from ....measure.catalogue.matching import match_positions
 from ....measure.catalogue.star_locus import StarSelection, select_stars
 from ....measure.shapes import measure_shapes
 from ....measure.shear.detection import detect_shear
-from ....measure.shear.shear_shapes import ShearShapes
 from ..galaxy_shapes import SHEAR_MIN_SNR, GalaxyShapes, half_light_radii, measure_galaxies, shear_weight_sigma
 from ..null_result import NullTest, null_metrics
 from ..null_test import FAINTEST_SNR, REACH, write_pictures, write_shapes
@@ -212,17 +211,23 @@ def measure_tile(
         for psf_images in (psfs.model, psfs.true)
     ]
     usable = [usable_galaxies(fit, objects.half_light_radius[rows], stars.half_light_radius) for fit in fits]
-    shears = _object_shears(
-        image,
-        float(np.sqrt(np.median(variance[image.mask == 0]))),
-        [broadened(psf_images[places], transfer) for psf_images in (psfs.model, psfs.true)],
-        known_at / scale - tile.first,
-        np.stack([objects.x, objects.y], axis=1),
-        scale,
-        int(stream(stack.stamp.seed, *key, "peaks").integers(2**32)),
-        threads,
-    )
-    shears = [shapes.take(rows) for shapes in shears]
+    shears = [
+        detect_shear(
+            image.image,
+            psf_images / psf_images.sum(axis=(1, 2), keepdims=True),
+            scale,
+            float(np.sqrt(np.median(variance[image.mask == 0]))),
+            psf_positions=known_at / scale - tile.first,
+            mask=image.mask,
+            sigma=shear_weight_sigma(half_light_radii(psfs.true[places]), scale),
+            seed=int(stream(stack.stamp.seed, *key, "peaks").integers(2**32)),
+            min_snr=SHEAR_MIN_SNR,
+            threads=threads,
+        )
+        .at_objects(objects.x, objects.y)
+        .take(rows)
+        for psf_images in (broadened(psfs.model[places], transfer), broadened(psfs.true[places], transfer))
+    ]
     match = match_positions(objects.x, objects.y, truth["X"], truth["Y"], MATCH_RADIUS)[rows]
     # True galaxies follow the stars of the table, in the order of the galaxies on the tile.
     index = np.where(match >= 0, match - int(truth["STAR"].sum()), -1)
@@ -253,43 +258,6 @@ def measure_tile(
     noise_free = replace(noise_free, index=usable_on_both[noise_free.index])
     area = float((image.mask == 0).sum()) * (scale / ARCMIN) ** 2
     return MeasuredTile(galaxies, stamps, noise_free, area, _star_metrics(stars, psfs, transfer, stack, tile))
-
-
-def _object_shears(
-    image: CcdImage,
-    noise: float,
-    psf_pair: list[np.ndarray],
-    psf_positions: np.ndarray,
-    positions: np.ndarray,
-    scale: float,
-    seed: int,
-    threads: int | None,
-) -> list[ShearShapes]:
-    """Return the shear of each object, the sums over the peaks that are nearest to it, with each of two sets of PSFs.
-
-    Peaks have their detection in the response; the objects are places of the sums alone.
-    """
-    sigma = shear_weight_sigma(half_light_radii(psf_pair[1]), scale)
-    sums = []
-    for psf_images in psf_pair:
-        peaks = detect_shear(
-            image.image,
-            psf_images / psf_images.sum(axis=(1, 2), keepdims=True),
-            scale,
-            noise,
-            psf_positions=psf_positions,
-            mask=image.mask,
-            sigma=sigma,
-            seed=seed,
-            min_snr=SHEAR_MIN_SNR,
-            threads=threads,
-        )
-        nearest = cKDTree(positions).query(np.stack([peaks.x, peaks.y], axis=1))[1]
-        columns = peaks.shapes.sums.T, peaks.weight, peaks.weight * peaks.snr
-        *totals, weight, snr = (np.bincount(nearest, v, len(positions)) for v in np.vstack(columns))
-        mean_snr = np.divide(snr, weight, out=np.zeros_like(snr), where=weight > 0.0)
-        sums.append(ShearShapes(*totals, weight, mean_snr))
-    return sums
 
 
 def selected_stars(
