@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import pachon
+from pachon.core.errors import DomainError
 from pachon.measure.shear import detection
 from pachon.measure.shear.detection import CELL, _Detector
 
@@ -35,7 +36,7 @@ def test_functionals_of_pixels_change_by_shear_as_their_derivatives_say(gaussian
     """Two blended Gaussians, drawn under shears of +-0.003 about a pixel."""
     detector = _Detector.of(psfs[:1], 2.6, 1.0, 10.0)
     galaxies = [((0.3, -0.2), 1.0), ((4.1, 2.3), 0.7)]
-    pixels = [(0, 0), (1, -1), (4, 3)]
+    pixels = [(0, 0), (4, 3)]
     at = functionals_at(detector, gaussian, psf_covariances[0], pixels, galaxies)
     for j, direction in enumerate(np.eye(2)):
         steps = [
@@ -81,3 +82,95 @@ def test_the_covariance_of_the_noise_of_pixels_is_that_of_drawn_noise(psfs):
     square = detector.noise[0][0] @ detector.noise[0][0].T
     block = np.ix_(detection._MEASURED, detection._MEASURED)
     np.testing.assert_allclose(square / scale[block], rotated[0][block] / scale[block], atol=1e-6)
+
+
+def blended_pairs(gaussian, psf_covariance, turn, g, cells=10, spacing=56):
+    """Pairs of Gaussians, 3 to 6 pixels apart at all angles, sheared about their middles at random places in pixels."""
+    rng = np.random.default_rng(3)
+    matrix = shear_matrix(g.real, g.imag)
+    image = np.zeros((cells * spacing,) * 2)
+    for row in range(cells):
+        for column in range(cells):
+            angle, distance = rng.uniform(0.0, np.pi) + turn, rng.uniform(3.0, 6.0)
+            apart = 0.5 * distance * np.array([np.cos(angle), np.sin(angle)])
+            middle = rng.uniform(-0.5, 0.5, 2)
+            rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+            covariance = matrix @ rotation @ GALAXY @ rotation.T @ matrix.T + psf_covariance
+            tile = np.s_[row * spacing : (row + 1) * spacing, column * spacing : (column + 1) * spacing]
+            for sign, flux in ((1.0, 1.0), (-1.0, rng.uniform(0.3, 1.0))):
+                image[tile] += flux * gaussian(covariance, spacing, *(middle + matrix @ (sign * apart)))
+    return image
+
+
+@pytest.mark.slow
+def test_blends_are_in_the_response(gaussian, psf_covariances, psfs):
+    """A hundred blended pairs without noise; half of them are one peak, and shear makes two of some of them."""
+    g, noise = 0.01, 1e-3
+    found = {
+        sign: [
+            pachon.detect_shear(
+                blended_pairs(gaussian, psf_covariances[0], turn, sign * g), psfs[0], SCALE, noise, min_snr=5.0
+            )
+            for turn in (0.0, 0.5 * np.pi)
+        ]
+        for sign in (1.0, -1.0)
+    }
+    plus, minus = (pachon.ShearShapes.joined([peaks.shapes for peaks in found[sign]]) for sign in (1.0, -1.0))
+    cell = [np.concatenate([peaks.y // 56 for peaks in found[sign]]).astype(int) for sign in (1.0, -1.0)]
+    bias = pachon.shear_bias(plus, minus, g, 0.0, patch=cell[0], minus_patch=cell[1])
+    assert bias.m_error[0] < 0.02
+    assert abs(bias.m[0]) < 3.0 * bias.m_error[0]
+    # Pixels about a peak share its weight.
+    assert 100 < plus.weight.sum() < 800
+    assert len(plus) > plus.weight.sum()
+
+
+def test_no_byte_depends_on_threads_and_masked_peaks_are_left_out(gaussian, psf_covariances, psfs):
+    rng = np.random.default_rng(4)
+    image = blended_pairs(gaussian, psf_covariances[0], 0.0, 0j, cells=6) + 1e-3 * rng.standard_normal((336, 336))
+    one, two = (pachon.detect_shear(image, psfs[0], SCALE, 1e-3, seed=1, threads=n) for n in (1, 2))
+    for name in ("x", "y", "e1", "weight"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    mask = np.zeros(image.shape, dtype=int)
+    mask[100:180, 100:180] = 1
+    masked = pachon.detect_shear(np.where(mask, np.nan, image), psfs[0], SCALE, 1e-3, mask=mask, seed=1)
+    assert 0 < len(masked) < len(one)
+    # Four widths of the weight of 2.6 pixels.
+    near = (masked.x > 89) & (masked.x < 191) & (masked.y > 89) & (masked.y < 191)
+    assert not near.any()
+    # Sums at objects keep what the peaks have.
+    sums = one.at_objects([10.0, 300.0], [10.0, 300.0])
+    np.testing.assert_allclose(sums.sums.sum(axis=0), one.shapes.sums.sum(axis=0), rtol=1e-10)
+    assert sums.weight.sum() == pytest.approx(one.weight.sum())
+
+
+def test_psfs_of_parts_of_an_image(gaussian, psf_covariances, psfs):
+    """The left and the right half of an image under two PSFs give what each gives alone."""
+    noise = 1e-3
+    halves = [blended_pairs(gaussian, c, 0.0, 0j, cells=8) for c in psf_covariances]
+    image = np.concatenate([halves[0][:, :256], halves[1][:, 256:]], axis=1)
+    places = [[100.0, 200.0], [400.0, 200.0]]
+    found = pachon.detect_shear(image, psfs, SCALE, noise, psf_positions=places)
+    for k, inside in enumerate((found.x < 220, found.x > 290)):
+        alone = pachon.detect_shear(halves[k], psfs[k], SCALE, noise)
+        rows = (alone.x < 220) if k == 0 else (alone.x > 290)
+        np.testing.assert_array_equal(found.x[inside], alone.x[rows])
+        np.testing.assert_allclose(found.e1[inside], alone.e1[rows], atol=1e-6)
+
+
+def test_bad_input_is_one_line(psfs):
+    image = np.zeros((100, 100))
+    for arguments, options, message in (
+        ((image, psfs, SCALE, 1.0), {}, "psf_positions: expected the places of 2 PSFs"),
+        ((image, psfs, SCALE, 1.0), {"psf_positions": [[0.0, 0.0]]}, "psf_positions have shape"),
+        ((image, psfs[0], SCALE, 0.0), {}, r"noise = 0\.0: expected a positive"),
+        ((image, psfs[0], SCALE, 1.0), {"mask": np.zeros((9, 9))}, "mask has shape"),
+        ((image + np.nan, psfs[0], SCALE, 1.0), {}, "image: expected finite pixels where it is not masked"),
+        ((image[0], psfs[0], SCALE, 1.0), {}, "image has shape"),
+        ((image, psfs[0], SCALE, 1.0), {"sigma": 1.2 * SCALE}, "too wide for a weight of sigma = 1.20 pixels"),
+        ((image, psfs[0], 0.05 * SCALE, 1.0), {}, "too small for a weight"),
+    ):
+        with pytest.raises(DomainError, match=message) as problem:
+            pachon.detect_shear(*arguments, **options)
+        assert "\n" not in str(problem.value)
+    assert len(pachon.detect_shear(image, psfs[0], SCALE, 1.0)) == 0
