@@ -38,9 +38,10 @@ from ...core.random_streams import stream
 from ...core.result import Result
 from ...core.threads import one_blas_thread, thread_count
 from ...core.units import positive_angle, real_array, require_positive, require_seed
-from .estimator import CONSTANT, WEIGHT_SIGMA, checked_psfs, require_side, smooth_step
+from .estimator import CONSTANT, checked_psfs, require_side, smooth_step
 from .functionals import FUNCTIONALS, Frequencies, noise_covariance, psf_frequencies, renoising, weight_transforms
 from .shear_shapes import ShearShapes
+from .weight import weight_sigma
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -140,7 +141,7 @@ def detect_shear(
     *,
     psf_positions: ArrayLike | None = None,
     mask: ArrayLike | NDArray[np.bool_] | None = None,
-    sigma: ArrayLike = WEIGHT_SIGMA,
+    sigma: ArrayLike | None = None,
     seed: int | None = None,
     min_snr: float = 10.0,
     threads: int | None = None,
@@ -161,8 +162,8 @@ def detect_shear(
         Places (x, y) of the PSFs [pixel], [n, 2]: squares of 256 pixels have that of the nearest.
     mask : array, optional
         [ny, nx], not zero for pixels without value; peaks within four widths of the weight are left out.
-    sigma : float or Quantity
-        rms width of the weight before the PSF [rad].
+    sigma : float or Quantity, optional
+        rms width of the weight before the PSF [rad]; by default as of :class:`ShearEstimator`.
     seed : int, optional
         Seed of the noise that is added to the functionals; by default none is, for images without noise. Images under
         a shear and its opposite take the same one.
@@ -179,12 +180,13 @@ def detect_shear(
     """
     pixels, ignored = _checked_image(image, mask)
     psfs = checked_psfs(psf_images)
-    width = positive_angle(sigma, "sigma") / positive_angle(pixel_scale, "pixel_scale")
+    scale = positive_angle(pixel_scale, "pixel_scale")
+    width = weight_sigma(sigma, psfs, scale) / scale
     require_side(_COVARIANCE_SIDE, width)
     rms = require_positive(noise, "noise")
     limit = require_positive(min_snr, "min_snr")
     cells = list(_cells(pixels.shape))
-    psf_rows = _nearest_psfs(cells, len(psfs), psf_positions)
+    psf_rows = _nearest_psfs(pixels.shape, len(psfs), psf_positions)
     clear = _clear_pixels(ignored, int(np.ceil(_CLEARANCE * width)))
     used, index = np.unique(psf_rows, return_inverse=True)
     detector = _Detector.of(psfs[used], width, rms, limit)
@@ -336,6 +338,12 @@ def _measure_cell(
     return x, y, shapes.take(selected)
 
 
+def cell_middles(shape: tuple[int, ...]) -> np.ndarray:
+    """Return the middles (x, y) of the squares of an image that have one PSF each, [n, 2] pixel."""
+    middles = np.array(list(_cells(shape)), dtype=np.float64)[:, ::-1] + 0.5 * (CELL - 1)
+    return np.minimum(middles, np.array(shape[::-1]) - 1.0)
+
+
 def _cells(shape: tuple[int, ...]) -> Iterator[tuple[int, int]]:
     """Yield the first row and column of each cell of an image."""
     for row in range(0, shape[0], CELL):
@@ -343,17 +351,16 @@ def _cells(shape: tuple[int, ...]) -> Iterator[tuple[int, int]]:
             yield row, column
 
 
-def _nearest_psfs(cells: list[tuple[int, int]], count: int, positions: ArrayLike | None) -> np.ndarray:
+def _nearest_psfs(shape: tuple[int, ...], count: int, positions: ArrayLike | None) -> np.ndarray:
     """Return the PSF nearest to the middle of each cell."""
     if positions is None:
         if count > 1:
             raise DomainError(f"psf_positions: expected the places of {count} PSFs", key="psf_positions")
-        return np.zeros(len(cells), dtype=np.int64)
+        return np.zeros(len(list(_cells(shape))), dtype=np.int64)
     places = real_array(positions, "psf_positions: expected real numbers [n, 2]")
     if places.shape != (count, 2) or not np.all(np.isfinite(places)):
         raise DomainError(f"psf_positions have shape {places.shape}: expected finite numbers [{count}, 2]")
-    middles = np.array(cells, dtype=np.float64)[:, ::-1] + 0.5 * (CELL - 1)
-    return np.asarray(cKDTree(places).query(middles)[1], dtype=np.int64)
+    return np.asarray(cKDTree(places).query(cell_middles(shape))[1], dtype=np.int64)
 
 
 def _clear_pixels(ignored: np.ndarray, clearance: int) -> np.ndarray:

@@ -14,14 +14,13 @@ from ...core.errors import DomainError
 from ...core.launch import launch, load_kernels
 from ...core.random_streams import stream
 from ...core.threads import one_blas_thread, thread_count
-from ...core.units import ARCSEC, positive_angle, pure_numbers, real_array, require_seed
+from ...core.units import positive_angle, pure_numbers, real_array, require_seed
 from ...core.warp_arrays import warp_array
 from .functionals import FUNCTIONALS, noise_covariance, psf_frequencies, renoising, weight_transforms
 from .shear_kernels import deconvolved_functionals, weight_values
 from .shear_shapes import ShearShapes
+from .weight import weight_sigma
 
-#: rms width of the weight before the PSF [rad]: in seeing of 0.7" narrower ones amplify noise, wider ones lose signal.
-WEIGHT_SIGMA = 0.52 * ARCSEC
 #: C of e = M1/(M0 + C), in standard errors of M0: keeps noise of faint galaxies from dividing by zero.
 CONSTANT = 4.0
 #: Least side of a stamp over the rms width of the weight: on smaller ones the weight divided by the PSF is cut.
@@ -65,8 +64,9 @@ class ShearEstimator:
         Side of a pixel [rad].
     noise : float or array
         rms of the noise of a pixel, of all or under each of the PSFs, in the unit of the stamps. White.
-    sigma : float or Quantity
-        rms width of the weight before the PSF [rad].
+    sigma : float or Quantity, optional
+        rms width of the weight before the PSF [rad]; by default 0.52 arcsec, or 1.2 half-light radii of the widest PSF
+        where that is more. Ellipticities under different weights have different responses.
     side : int
         Pixels of a side of stamps.
 
@@ -83,11 +83,12 @@ class ShearEstimator:
         pixel_scale: ArrayLike,
         noise: ArrayLike,
         *,
-        sigma: ArrayLike = WEIGHT_SIGMA,
+        sigma: ArrayLike | None = None,
         side: int = 64,
     ) -> None:
         psfs = checked_psfs(psf_images)
-        width = positive_angle(sigma, "sigma") / positive_angle(pixel_scale, "pixel_scale")
+        scale = positive_angle(pixel_scale, "pixel_scale")
+        width = weight_sigma(sigma, psfs, scale) / scale
         require_side(side, width)
         rms = pure_numbers(noise, "noise")
         if rms.shape not in ((), (len(psfs),)) or not np.all((rms > 0.0) & np.isfinite(rms)):

@@ -20,8 +20,9 @@ from ...imaging.draw import Sources
 from ...imaging.exposure import Exposure
 from ...measure.catalogue.fit_galaxies import fit_galaxy_stamps
 from ...measure.catalogue.galaxy_fits import GalaxyFits, usable_galaxies
-from ...measure.shear.estimator import LEAST_SIDE, WEIGHT_SIGMA, ShearEstimator
+from ...measure.shear.estimator import LEAST_SIDE, ShearEstimator
 from ...measure.shear.shear_shapes import ShearShapes
+from ...measure.shear.weight import half_light_radii, weight_sigma
 from .stack import PsfStack
 
 #: S/N of the weighted flux from which galaxies have a weight in the shear.
@@ -29,8 +30,6 @@ SHEAR_MIN_SNR = 10.0
 #: Sides of stamps [pixel], each drawn on a grid of twice the side: the first that the weight of the shear allows, and
 #: for large galaxies one of at least the second.
 _SIDES = (32, 64, 96, 128)
-#: Least width of the weight of the shear over the half-light radius of the widest PSF: narrower ones amplify noise.
-_WEIGHT_OVER_PSF = 1.2
 #: Half-light radius on the image over which a stamp of the first side is too small [pixel].
 _LARGE = 5.0
 #: Galaxies that are drawn and measured at a time, which bounds the memory.
@@ -131,7 +130,7 @@ def measure_galaxies(
     offset = pixels[near] - np.rint(pixels[near])
     block_fits: list[tuple[np.ndarray, GalaxyFits, GalaxyFits]] = []
     rng = stream(seed, *key)
-    sigma = shear_weight_sigma(widths, exposure.pixel_scale)
+    sigma = weight_sigma(None, stack.true[places], exposure.pixel_scale)
     sides = stamp_sides(sigma / exposure.pixel_scale)
     shear_parts: list[tuple[np.ndarray, ShearShapes, ShearShapes]] = []
     for side, rows in zip(sides, (on_image <= _LARGE, on_image > _LARGE), strict=True):
@@ -171,11 +170,6 @@ def measure_galaxies(
     return _joined_shapes(galaxies, near, pixels * exposure.pixel_scale, width, block_fits, shear_parts)
 
 
-def shear_weight_sigma(psf_half_light_radii: np.ndarray, pixel_scale: float) -> float:
-    """Return the rms width of the weight of the shear [rad] for PSFs of some half-light radii [pixel]."""
-    return max(WEIGHT_SIGMA, _WEIGHT_OVER_PSF * pixel_scale * float(np.max(psf_half_light_radii)))
-
-
 def stamp_sides(sigma: float) -> tuple[int, int]:
     """Return the sides of stamps of small and of large galaxies for a weight of an rms width, all in pixels."""
     fitting = [side for side in _SIDES if side >= LEAST_SIDE * sigma] or [_SIDES[-1]]
@@ -192,17 +186,6 @@ def _psf_transforms(psfs: np.ndarray, size: int) -> np.ndarray:
     first = size // 2 - psfs.shape[1] // 2
     wide[:, first : first + psfs.shape[1], first : first + psfs.shape[2]] = psfs
     return fft.rfft2(wide, workers=1)
-
-
-def half_light_radii(psfs: np.ndarray) -> np.ndarray:
-    """Return half-light radii of PSFs of unit sum from their growth curves [pixel]."""
-    half = psfs.shape[1] // 2
-    y, x = np.mgrid[-half : half + 1, -half : half + 1]
-    order = np.argsort(np.hypot(x, y), axis=None, kind="stable")
-    # A pixel more of area, a little more of radius: the radius of the disc that n pixels fill.
-    radius = np.sqrt(np.arange(1, order.size + 1) / np.pi)
-    growth = np.cumsum(psfs.reshape(len(psfs), -1)[:, order], axis=1)
-    return np.array([np.interp(0.5, curve, radius) for curve in np.maximum.accumulate(growth, axis=1)])
 
 
 def _joined_shapes(

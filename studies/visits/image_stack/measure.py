@@ -25,7 +25,8 @@ from ....measure.catalogue.matching import match_positions
 from ....measure.catalogue.star_locus import StarSelection, select_stars
 from ....measure.shapes import measure_shapes
 from ....measure.shear.detection import detect_shear
-from ..galaxy_shapes import SHEAR_MIN_SNR, GalaxyShapes, half_light_radii, measure_galaxies, shear_weight_sigma
+from ....measure.shear.weight import half_light_radii, weight_sigma
+from ..galaxy_shapes import SHEAR_MIN_SNR, GalaxyShapes, measure_galaxies
 from ..null_result import NullTest, null_metrics
 from ..null_test import FAINTEST_SNR, REACH, write_pictures, write_shapes
 from ..psf_visit import stack_limit
@@ -219,7 +220,7 @@ def measure_tile(
             float(np.sqrt(np.median(variance[image.mask == 0]))),
             psf_positions=known_at / scale - tile.first,
             mask=image.mask,
-            sigma=shear_weight_sigma(half_light_radii(psfs.true[places]), scale),
+            sigma=weight_sigma(None, broadened(psfs.true[places], transfer), scale),
             seed=int(stream(stack.stamp.seed, *key, "peaks").integers(2**32)),
             min_snr=SHEAR_MIN_SNR,
             threads=threads,

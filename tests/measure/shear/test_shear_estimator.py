@@ -5,8 +5,8 @@ import pytest
 
 import pachon
 from pachon.core.errors import DomainError
-from pachon.measure.shear.estimator import WEIGHT_SIGMA
 from pachon.measure.shear.functionals import renoising
+from pachon.measure.shear.weight import WEIGHT_SIGMA
 
 SIDE, SCALE = 64, 0.2 * np.pi / 648000
 #: Variance of the weight [pixel^2].
@@ -162,7 +162,12 @@ def test_bad_input_is_one_line(gaussian, psfs):
         ({"psf_images": 2.0 * psfs}, r"psf_images\[0\]: sum 2, expected 1"),
     ]
     wide = gaussian(9.0 * np.eye(2), 63)
-    cases.append(({"psf_images": wide / wide.sum()}, r"psf_images\[0\]: too wide for a weight of sigma = 2.60 pixels"))
+    wide /= wide.sum()
+    cases.append(
+        ({"psf_images": wide, "sigma": 2.6 * SCALE}, r"psf_images\[0\]: too wide for a weight of sigma = 2.60")
+    )
+    # Without a width the weight is wide enough for the PSF: 1.2 half-light radii of 3.53 pixels.
+    cases.append(({"psf_images": wide, "side": 48}, r"side = 48: too small for a weight of sigma = 4.2. pixels"))
     for change, message in cases:
         arguments = {"psf_images": psfs, "pixel_scale": SCALE, "noise": 1.0} | change
         with pytest.raises(DomainError, match=message) as problem:

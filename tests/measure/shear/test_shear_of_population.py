@@ -20,7 +20,7 @@ def biases(script, *options):
 
 @pytest.mark.slow
 def test_isolated_galaxies_at_the_depth_of_a_hundred_visits():
-    """With noise, and with a selection at S/N 10 too: issue's limit of 1e-3 with an error of at most 3e-4."""
+    """With noise, and with a selection at S/N 10 too."""
     found = biases("shear_estimator.py", "--galaxies", 16384, "--realisations", 16, "--seed", 4)
     assert len(found) == 2
     for m, error in found:
