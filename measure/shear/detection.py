@@ -38,7 +38,7 @@ from ...core.random_streams import stream
 from ...core.result import Result
 from ...core.threads import one_blas_thread, thread_count
 from ...core.units import positive_angle, real_array, require_positive, require_seed
-from .estimator import CONSTANT, checked_psfs, require_side, smooth_step
+from .estimator import CONSTANT, LEAST_SIDE, checked_psfs, smooth_step
 from .functionals import FUNCTIONALS, Frequencies, noise_covariance, psf_frequencies, renoising, weight_transforms
 from .shear_shapes import ShearShapes
 from .weight import weight_sigma
@@ -49,10 +49,9 @@ if TYPE_CHECKING:
 
 #: Sides of the cells of an image, each with the PSF that is nearest to its middle [pixel].
 CELL = 256
-# Pixels around a cell on which the weights divided by the PSF reach.
+# Least pixels around a cell to which the weights divided by the PSF reach, and to half of which the covariance of the
+# noise is summed.
 _MARGIN = 32
-# Side of the grid on which the covariance of the noise is computed [pixel].
-_COVARIANCE_SIDE = 64
 # Neighbours (dx, dy) in the order of a rotation by 90 degrees.
 _NEIGHBOURS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 # Half of the range of v/(M0 + C) in which the weight rises, times the square of the width of the weight [pixel^2]. Of a
@@ -182,7 +181,6 @@ def detect_shear(
     psfs = checked_psfs(psf_images)
     scale = positive_angle(pixel_scale, "pixel_scale")
     width = weight_sigma(sigma, psfs, scale) / scale
-    require_side(_COVARIANCE_SIDE, width)
     rms = require_positive(noise, "noise")
     limit = require_positive(min_snr, "min_snr")
     cells = list(_cells(pixels.shape))
@@ -208,13 +206,15 @@ class _Detector:
     errors: np.ndarray  #: standard errors of the functionals [n, 18]
     noise: tuple[np.ndarray, np.ndarray]  #: matrices of :func:`renoising`
     min_snr: float
+    margin: int  #: pixels around a cell
     peak_width: float  #: half of the range of v/(M0 + C) in which the weight rises
 
     @classmethod
     def of(cls, psfs: np.ndarray, sigma: float, rms: float, min_snr: float) -> _Detector:
         """Prepare the PSFs [n, m, m]."""
-        grid, inverse = psf_frequencies(psfs, CELL + 2 * _MARGIN, sigma)
-        small, small_inverse = psf_frequencies(psfs, _COVARIANCE_SIDE, sigma)
+        margin = max(_MARGIN, int(np.ceil(0.5 * LEAST_SIDE * sigma)))
+        grid, inverse = psf_frequencies(psfs, CELL + 2 * margin, sigma)
+        small, small_inverse = psf_frequencies(psfs, 2 * margin, sigma)
         weights = _peak_transforms(small, sigma)
         covariance = noise_covariance(weights, small_inverse, np.full(len(psfs), rms), small)
         # A rotation by 90 degrees changes signs of M1 and M2, and takes each neighbour to the one before it.
@@ -224,7 +224,9 @@ class _Detector:
         with one_blas_thread():
             noise = renoising(covariance, _MEASURED, _DERIVATIVES, turn)
         errors = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-        return cls(grid, weight_transforms(grid, sigma), inverse, errors, noise, min_snr, _PEAK_WIDTH / sigma**2)
+        return cls(
+            grid, weight_transforms(grid, sigma), inverse, errors, noise, min_snr, margin, _PEAK_WIDTH / sigma**2
+        )
 
     def maps(self, image: np.ndarray, psf: int) -> np.ndarray:
         """Return the maps M0 to M5, dM0/dx and dM0/dy of a square image, [8, side, side]."""
@@ -300,23 +302,23 @@ def _measure_cell(
     psf: int,
 ) -> tuple[np.ndarray, np.ndarray, ShearShapes]:
     """Return places and shapes of the candidates of one cell, whose first pixel is (row, column)."""
-    first_row, first_column = cell
+    (first_row, first_column), margin = cell, detector.margin
     height, width = (min(CELL, n - first) for n, first in zip(image.shape, cell, strict=True))
     window = np.zeros((detector.frequencies.side,) * 2)
-    low = [max(0, first - _MARGIN) for first in cell]
-    high = [min(n, first + CELL + _MARGIN) for n, first in zip(image.shape, cell, strict=True)]
-    start = [a - (first - _MARGIN) for a, first in zip(low, cell, strict=True)]
+    low = [max(0, first - margin) for first in cell]
+    high = [min(n, first + CELL + margin) for n, first in zip(image.shape, cell, strict=True)]
+    start = [a - (first - margin) for a, first in zip(low, cell, strict=True)]
     rows, columns = (slice(s, s + b - a) for s, a, b in zip(start, low, high, strict=True))
     window[rows, columns] = image[low[0] : high[0], low[1] : high[1]]
     maps = detector.maps(window, psf)
     errors = detector.errors[psf]
     reach = 0.0 if seed is None else _REACH
-    flux = maps[0, _MARGIN : _MARGIN + height, _MARGIN : _MARGIN + width] / errors[0]
+    flux = maps[0, margin : margin + height, margin : margin + width] / errors[0]
     bright = (flux > detector.min_snr - reach) & clear[
         first_row : first_row + height, first_column : first_column + width
     ]
     rows_in, columns_in = np.nonzero(bright)
-    values = detector.functionals(maps, rows_in + _MARGIN, columns_in + _MARGIN)
+    values = detector.functionals(maps, rows_in + margin, columns_in + margin)
     lowest = detector.peak_width * (values[:, 0] + (CONSTANT + reach) * errors[0])
     differences = values[:, _DIFFERENCES] + reach * errors[_DIFFERENCES]
     candidates = (differences > -lowest[:, None]).all(axis=1)
