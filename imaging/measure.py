@@ -21,12 +21,14 @@ from ..measure.catalogue.galaxy_fits import GalaxyFits, usable_galaxies
 from ..measure.catalogue.matching import detection_rates, match_positions
 from ..measure.catalogue.objects import DetectedObjects
 from ..measure.catalogue.star_locus import StarSelection
+from ..measure.shear.shear_shapes import ShearShapes, mean_shear
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ..reconstruction.psf_model.basis import Basis
 from ..reconstruction.psf_model.interpolation import Interpolation
 from ..reconstruction.psf_model.model import PsfModel
 from ..reconstruction.psf_model.recipe import Recipe
 from .image_file import CcdImage
+from .image_shear import object_shears
 from .image_stars import fit_image_psf, objects_and_stars, pixels_of_ccd
 
 if TYPE_CHECKING:
@@ -57,6 +59,8 @@ class ImageCatalogue(Result):
         Elliptical Gaussians under the PSF fitted to them.
     usable : ndarray of bool, shape [n]
         Whether each is fit for shear.
+    shear : ShearShapes
+        Weighted ellipticities and responses of the functionals, the sums over the peaks nearest to each object.
     """
 
     image: CcdImage
@@ -66,6 +70,7 @@ class ImageCatalogue(Result):
     galaxies: np.ndarray
     fits: GalaxyFits
     usable: np.ndarray
+    shear: ShearShapes
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw half-light radius against magnitude, selected stars in another colour."""
@@ -110,6 +115,12 @@ class ImageCatalogue(Result):
             "size": (fits.size, "pix", "rms width before the PSF"),
             "flags": (fits.flags, "", "of the fit, 0 is good"),
             "usable": (self.usable, "", "larger than stars, error of e below 0.2"),
+            "shear_e1": (self.shear.e1, "", "weighted M1/(M0 + C) of the functionals, along x"),
+            "shear_e2": (self.shear.e2, "", "weighted M2/(M0 + C), along x = y"),
+            "shear_r11": (self.shear.r11, "", "response of shear_e1 to g1"),
+            "shear_r12": (self.shear.r12, "", "mean response of shear_e1 to g2, shear_e2 to g1"),
+            "shear_r22": (self.shear.r22, "", "response of shear_e2 to g2"),
+            "shear_weight": (self.shear.weight, "", "sum of the weights of the peaks"),
         }
         # Names that fit FITS cards as well.
         meta: dict[str, Any] = {"CCD": self.image.name, "CREATOR": f"pachon {VERSION}"}
@@ -129,6 +140,9 @@ class ImageCatalogue(Result):
             "usable_per_arcmin2": float(self.usable.sum() / area),
             "star_half_light_radius_pixel": self.stars.half_light_radius,
         }
+        if (self.shear.weight > 0.0).sum() > 1 and min(self.shear.r11.sum(), self.shear.r22.sum()) > 0.0:
+            mean = mean_shear(self.shear)
+            numbers |= {name: getattr(mean, name) for name in ("g1", "g1_error", "g2", "g2_error")}
         truth = self.image.objects
         if len(truth.get("X", ())):
             # The truth counts pixels of the CCD, of which the image may be a part.
@@ -202,26 +216,30 @@ def measure_image(
     objects, stars = objects_and_stars(image, min_snr)
     rows = np.setdiff1d(np.arange(len(objects)), stars.index)
     places = np.stack([objects.x[rows], objects.y[rows]], axis=1)
-    model: PsfModel | FocalPlanePsf
-    if psf is None:
-        model = fitted_psf = fit_image_psf(image, stars, Recipe.of(recipe, **keys))
-        psfs = fitted_psf.at(places)
-    else:
-        model = psf
-        # Centroids at the rim may lie outside by a part of a pixel.
-        inside = np.clip(places, -0.5, np.array(image.image.shape[::-1]) - 0.5)
-        psfs = psf.draw(image.name, *(pixels_of_ccd(image, inside).T * u.pix), threads=threads)
+    model: PsfModel | FocalPlanePsf = fit_image_psf(image, stars, Recipe.of(recipe, **keys)) if psf is None else psf
+
+    def psfs_at(positions: np.ndarray) -> np.ndarray:
+        """Return PSFs of unit sum at pixels of the image."""
+        if isinstance(model, PsfModel):
+            stamps = model.at(positions)
+        else:
+            # Centroids at the rim may lie outside by a part of a pixel.
+            inside = np.clip(positions, -0.5, np.array(image.image.shape[::-1]) - 0.5)
+            stamps = model.draw(image.name, *(pixels_of_ccd(image, inside).T * u.pix), threads=threads)
+        return np.asarray(stamps / stamps.sum(axis=(1, 2), keepdims=True))
+
     fits = fit_galaxies(
         image.image - objects.background,
         np.where(image.mask == 0, image.variance, 1.0),
         places[:, 0],
         places[:, 1],
-        psfs / psfs.sum(axis=(1, 2), keepdims=True),
+        psfs_at(places),
         half_light_radius=np.nan_to_num(objects.half_light_radius[rows], nan=stars.half_light_radius),
         mask=image.mask,
         segmentation=objects.segmentation,
         threads=threads,
     )
+    shear = object_shears(image, objects, psfs_at, threads=threads).take(rows)
     radius = np.nan_to_num(objects.half_light_radius[rows])
     usable = usable_galaxies(fits, radius, stars.half_light_radius)
-    return ImageCatalogue(image, objects, stars, model, rows, fits, usable)
+    return ImageCatalogue(image, objects, stars, model, rows, fits, usable, shear)
