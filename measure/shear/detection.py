@@ -123,8 +123,9 @@ class PeakShapes(Result):
         places = np.stack([real_array(v, f"{name}: expected real numbers") for v, name in ((x, "x"), (y, "y"))], axis=1)
         nearest = cKDTree(places).query(np.stack([self.x, self.y], axis=1))[1]
         columns = np.vstack([self.shapes.sums.T, self.weight, self.weight * self.snr])
-        *sums, weight, snr = (np.bincount(nearest, values, len(places)) for values in columns)
-        return ShearShapes(*sums, weight, np.divide(snr, weight, out=np.zeros_like(snr), where=weight > 0.0))
+        e1, e2, r11, r12, r22, weight, snr = (np.bincount(nearest, values, len(places)) for values in columns)
+        mean_snr = np.divide(snr, weight, out=np.zeros_like(snr), where=weight > 0.0)
+        return ShearShapes(e1, e2, r11, r12, r22, weight, mean_snr)
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw the ellipticities in their plane, coloured by S/N."""

@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError
+from ...core.errors import DomainError, shown
 from ...core.launch import launch, load_kernels
 from ...core.random_streams import stream
 from ...core.threads import one_blas_thread, thread_count
@@ -93,7 +93,7 @@ class ShearEstimator:
         rms = pure_numbers(noise, "noise")
         if rms.shape not in ((), (len(psfs),)) or not np.all((rms > 0.0) & np.isfinite(rms)):
             raise DomainError(
-                f"noise = {noise}: expected a positive rms of the pixels, of all or of each of {len(psfs)} PSFs",
+                f"noise = {shown(noise)}: expected a positive rms of the pixels, of all or of each of {len(psfs)} PSFs",
                 key="noise",
             )
         self._side = int(side)

@@ -21,6 +21,7 @@ import numpy as np
 from scipy import fft
 
 from ...core.errors import DomainError
+from ...core.threads import one_blas_thread
 
 #: Functionals of a galaxy.
 FUNCTIONALS = 6
@@ -131,13 +132,11 @@ def psf_frequencies(psf_images: np.ndarray, side: int, sigma: float) -> tuple[Fr
 
 def _wrapped(psf_images: np.ndarray, side: int) -> np.ndarray:
     """Return PSFs with their centre on pixel 0 of a periodic grid, on which their transforms stay exact."""
-    count, width = psf_images.shape[:2]
-    at = (np.arange(width) - width // 2) % side
-    rows = np.zeros((count, side, width))
-    np.add.at(rows, (slice(None), at), psf_images)
-    periodic = np.zeros((count, side, side))
-    np.add.at(periodic, (slice(None), slice(None), at), rows)
-    return periodic
+    width = psf_images.shape[1]
+    fold = np.zeros((side, width))
+    fold[(np.arange(width) - width // 2) % side, np.arange(width)] = 1.0
+    with one_blas_thread():
+        return fold @ psf_images @ fold.T
 
 
 def noise_covariance(

@@ -131,7 +131,8 @@ def mean_shear(shapes: ShearShapes, *, patch: ArrayLike | None = None) -> MeanSh
     error = jackknife_error(shear_without_patch)
     mean = sums.sum(axis=0) / max(float(shapes.weight.sum()), np.finfo(float).tiny)
     response = np.array([[mean[2], mean[3]], [mean[3], mean[4]]])
-    return MeanShear(*map(float, (*shear, *error)), response, float(shapes.weight.sum()))
+    (g1, g2), (g1_error, g2_error) = shear.tolist(), error.tolist()
+    return MeanShear(g1, g2, g1_error, g2_error, response, float(shapes.weight.sum()))
 
 
 @dataclass(frozen=True)
@@ -200,17 +201,18 @@ def shear_bias(
         minus_labels = _patch_labels(len(minus), minus_patch)
     names = np.union1d(labels, minus_labels)
     count, labels, minus_labels = len(names), np.searchsorted(names, labels), np.searchsorted(names, minus_labels)
-    sums = [patch_sums(s.sums, rows, count) for s, rows in ((plus, labels), (minus, minus_labels))]
+    plus_sums, minus_sums = patch_sums(plus.sums, labels, count), patch_sums(minus.sums, minus_labels, count)
     shears = [for_each(pure_numbers(g, name), count, name) for g, name in ((shear1, "shear1"), (shear2, "shear2"))]
     modulus = np.hypot(*shears)
     estimates = []
     for k, g in enumerate(shears):
         rows = np.abs(g) > 0.5 * modulus
         # Under a negative shear the other one of the pair is under the positive one.
-        upper, lower = (np.where((g > 0.0)[:, None], a, b)[rows] for a, b in (sums, sums[::-1]))
+        positive = (g > 0.0)[:, None]
+        upper, lower = np.where(positive, plus_sums, minus_sums), np.where(positive, minus_sums, plus_sums)
         size = float(np.abs(g[rows]).mean()) if rows.any() else np.nan
-        response, error = _pair_shears(upper, lower, k, -1.0)
-        estimates.append((response / size - 1.0, error / size, *_pair_shears(*sums, k, 1.0)))
+        response, error = _pair_shears(upper[rows], lower[rows], k, -1.0)
+        estimates.append((response / size - 1.0, error / size, *_pair_shears(plus_sums, minus_sums, k, 1.0)))
     m, m_error, c, c_error = np.array(estimates).T
     return ShearBias(m, m_error, c, c_error)
 

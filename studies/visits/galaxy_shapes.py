@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from scipy import fft
@@ -83,8 +84,9 @@ class GalaxyShapes:
     @classmethod
     def joined(cls, parts: list[GalaxyShapes]) -> GalaxyShapes:
         """Return the galaxies of several parts."""
-        columns = [[getattr(shapes, f.name) for shapes in parts] for f in fields(cls)]
-        return cls(*(ShearShapes.joined(v) if isinstance(v[0], ShearShapes) else np.concatenate(v) for v in columns))
+        columns: dict[str, Any] = {f.name: [getattr(shapes, f.name) for shapes in parts] for f in fields(cls)}
+        shears = {name: ShearShapes.joined(columns.pop(name)) for name in ("shear", "true_shear")}
+        return cls(**{name: np.concatenate(values) for name, values in columns.items()}, **shears)
 
 
 def measure_galaxies(
@@ -152,7 +154,7 @@ def measure_galaxies(
                 images, variances, stack.true[used], psf_index=index, start=by_model, threads=threads
             )
             block_fits.append((block, by_model, by_true))
-            shear_pair = []
+            shear_pair: list[ShearShapes] = []
             for psf_images in (stack.model[used], stack.true[used]):
                 estimator = ShearEstimator(psf_images, exposure.pixel_scale, exposure.noise_rms, sigma=sigma, side=side)
                 # Galaxies stand about the pixel of number side / 2, half a pixel from the centre of the stamp.
@@ -166,7 +168,7 @@ def measure_galaxies(
                         min_snr=SHEAR_MIN_SNR,
                     )
                 )
-            shear_parts.append((block, *shear_pair))
+            shear_parts.append((block, shear_pair[0], shear_pair[1]))
     return _joined_shapes(galaxies, near, pixels * exposure.pixel_scale, width, block_fits, shear_parts)
 
 
@@ -209,7 +211,8 @@ def _joined_shapes(
                 columns["error"][block] = fits.ellipticity_error
     x, y = positions[near].T
     order = np.argsort(np.concatenate([np.zeros(0, dtype=np.int64), *(block for block, _, _ in shear_parts)]))
-    shear, true_shear = (ShearShapes.joined([pair[k] for pair in shear_parts]).take(order) for k in (1, 2))
+    shear = ShearShapes.joined([by_model for _, by_model, _ in shear_parts]).take(order)
+    true_shear = ShearShapes.joined([by_true for _, _, by_true in shear_parts]).take(order)
     return GalaxyShapes(
         index=near,
         x=x,

@@ -305,5 +305,5 @@ def _read_shapes(path: Path, stamp: Stamp) -> GalaxyShapes:
         kind: ShearShapes(*(column(table, f"{kind}_{name}".upper()) for name in _SHEAR_COLUMNS))
         for kind in ("shear", "true_shear")
     }
-    scaled = {n: v * _COLUMNS[n][0] if _COLUMNS[n][0] != 1.0 else v for n, v in columns.items()}
-    return GalaxyShapes(**scaled, **shears)
+    scaled: dict[str, Any] = {n: v * _COLUMNS[n][0] if _COLUMNS[n][0] != 1.0 else v for n, v in columns.items()}
+    return GalaxyShapes(**scaled, shear=shears["shear"], true_shear=shears["true_shear"])
