@@ -85,8 +85,9 @@ class GalaxyShapes:
     def joined(cls, parts: list[GalaxyShapes]) -> GalaxyShapes:
         """Return the galaxies of several parts."""
         columns: dict[str, Any] = {f.name: [getattr(shapes, f.name) for shapes in parts] for f in fields(cls)}
-        shears = {name: ShearShapes.joined(columns.pop(name)) for name in ("shear", "true_shear")}
-        return cls(**{name: np.concatenate(values) for name, values in columns.items()}, **shears)
+        shear, true_shear = (ShearShapes.joined(columns.pop(name)) for name in ("shear", "true_shear"))
+        arrays: dict[str, Any] = {name: np.concatenate(values) for name, values in columns.items()}
+        return cls(**arrays, shear=shear, true_shear=true_shear)
 
 
 def measure_galaxies(

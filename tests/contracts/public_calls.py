@@ -91,7 +91,8 @@ class _Made:
         return pachon.ShearEstimator(self.shear_psf, 1e-6, 0.1, sigma=2.6e-6, side=40)
 
     def make_shear_shapes(self):
-        return pachon.ShearShapes(*np.random.default_rng(6).uniform(0.1, 0.2, (7, 12)))
+        e1, e2, r11, r12, r22, weight, snr = np.random.default_rng(6).uniform(0.1, 0.2, (7, 12))
+        return pachon.ShearShapes(e1, e2, r11, 0.1 * r12, r22, weight, snr)
 
     def make_floating(self):
         return pachon.load_telescope("paul_baker").with_design(stop="M1", aperture="f_number", aperture_value=4.0)
