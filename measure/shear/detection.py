@@ -38,6 +38,7 @@ from ...core.random_streams import stream
 from ...core.result import Result
 from ...core.threads import one_blas_thread, thread_count
 from ...core.units import positive_angle, real_array, require_positive, require_seed
+from ..catalogue.pixel_checks import check_pixels
 from .estimator import CONSTANT, LEAST_SIDE, checked_psfs, smooth_step
 from .functionals import FUNCTIONALS, Frequencies, noise_covariance, psf_frequencies, renoising, weight_transforms
 from .shear_shapes import ShearShapes
@@ -62,6 +63,9 @@ _PEAK_WIDTH = 0.75
 _REACH = 5.0
 # Distance of peaks from masked pixels and from the border, in widths of the weight.
 _CLEARANCE = 4.0
+
+# Farthest place of a PSF [pixel].
+_FARTHEST = 1e9
 
 _COUNT = FUNCTIONALS + 3 * len(_NEIGHBOURS)
 _DIFFERENCES = np.arange(FUNCTIONALS, FUNCTIONALS + len(_NEIGHBOURS))
@@ -178,7 +182,7 @@ def detect_shear(
         If shapes differ, a pixel that is not masked is not finite, the noise is not positive, places of several PSFs
         are missing, or a PSF is too wide for the weight.
     """
-    pixels, ignored = _checked_image(image, mask)
+    pixels, _, ignored = check_pixels(image, 1.0, mask)
     psfs = checked_psfs(psf_images)
     scale = positive_angle(pixel_scale, "pixel_scale")
     width = weight_sigma(sigma, psfs, scale) / scale
@@ -361,8 +365,8 @@ def _nearest_psfs(shape: tuple[int, ...], count: int, positions: ArrayLike | Non
             raise DomainError(f"psf_positions: expected the places of {count} PSFs", key="psf_positions")
         return np.zeros(len(list(_cells(shape))), dtype=np.int64)
     places = real_array(positions, "psf_positions: expected real numbers [n, 2]")
-    if places.shape != (count, 2) or not np.all(np.isfinite(places)):
-        raise DomainError(f"psf_positions have shape {places.shape}: expected finite numbers [{count}, 2]")
+    if places.shape != (count, 2) or not np.all(np.abs(places) < _FARTHEST):
+        raise DomainError(f"psf_positions have shape {places.shape}: expected pixels [{count}, 2] below {_FARTHEST:g}")
     return np.asarray(cKDTree(places).query(cell_middles(shape))[1], dtype=np.int64)
 
 
@@ -371,16 +375,3 @@ def _clear_pixels(ignored: np.ndarray, clearance: int) -> np.ndarray:
     blocked = ignored.copy()
     blocked[[0, -1]] = blocked[:, [0, -1]] = True
     return np.asarray(maximum_filter(blocked, size=2 * clearance + 1, mode="constant", cval=True) == 0)
-
-
-def _checked_image(image: ArrayLike, mask: ArrayLike | NDArray[np.bool_] | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixels [ny, nx] and whether each is ignored."""
-    pixels = real_array(image, "image: expected real numbers [ny, nx]")
-    if pixels.ndim != 2 or not pixels.size:
-        raise DomainError(f"image has shape {pixels.shape}: expected [ny, nx]")
-    ignored = np.zeros(pixels.shape, dtype=bool) if mask is None else np.asarray(mask) != 0
-    if ignored.shape != pixels.shape:
-        raise DomainError(f"mask has shape {ignored.shape}: expected {pixels.shape}")
-    if not np.all(np.isfinite(pixels[~ignored])):
-        raise DomainError("image: expected finite pixels where it is not masked")
-    return pixels, ignored

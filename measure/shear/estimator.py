@@ -14,7 +14,7 @@ from ...core.errors import DomainError, shown
 from ...core.launch import launch, load_kernels
 from ...core.random_streams import stream
 from ...core.threads import one_blas_thread, thread_count
-from ...core.units import positive_angle, pure_numbers, real_array, require_seed
+from ...core.units import has_unit, positive_angle, pure_numbers, real_array, require_count, require_seed
 from ...core.warp_arrays import warp_array
 from .functionals import FUNCTIONALS, noise_covariance, psf_frequencies, renoising, weight_transforms
 from .shear_kernels import deconvolved_functionals, weight_values
@@ -25,6 +25,8 @@ from .weight import weight_sigma
 CONSTANT = 4.0
 #: Least side of a stamp over the rms width of the weight: on smaller ones the weight divided by the PSF is cut.
 LEAST_SIDE = 12.0
+#: Largest side of a stamp [pixel].
+MOST_SIDE = 4096
 #: Largest deviation of the sum of a PSF from 1.
 _PSF_SUM_TOLERANCE = 1e-3
 # M0, M1 and M2, of which ellipticities are made, and M1 to M5, which are their derivatives.
@@ -89,7 +91,7 @@ class ShearEstimator:
         psfs = checked_psfs(psf_images)
         scale = positive_angle(pixel_scale, "pixel_scale")
         width = weight_sigma(sigma, psfs, scale) / scale
-        require_side(side, width)
+        require_side(require_count(side, "side", 1, MOST_SIDE), width)
         rms = pure_numbers(noise, "noise")
         if rms.shape not in ((), (len(psfs),)) or not np.all((rms > 0.0) & np.isfinite(rms)):
             raise DomainError(
@@ -141,6 +143,8 @@ class ShearEstimator:
         DomainError
             If shapes differ or a number is not finite.
         """
+        if has_unit(stamps):
+            raise DomainError("stamps: expected numbers without a unit")
         images = np.asarray(stamps)
         if images.ndim != 3 or images.shape[1:] != (self._side, self._side):
             raise DomainError(f"stamps have shape {images.shape}: expected [n, {self._side}, {self._side}]")

@@ -13,7 +13,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.point_plots import draw_bars, draw_shapes
 from ...core.result import Result, Values
-from ...core.units import for_each, pure_numbers
+from ...core.units import for_each, pure_numbers, real_array
 from ..correlation import jackknife_error
 
 if TYPE_CHECKING:
@@ -198,7 +198,7 @@ def shear_bias(
         raise DomainError(f"plus, minus: {len(plus)} and {len(minus)} galaxies, expected as many, or patches of both")
     labels = minus_labels = _patch_labels(len(plus), patch)
     if minus_patch is not None:
-        minus_labels = _patch_labels(len(minus), minus_patch)
+        minus_labels = _patch_labels(len(minus), minus_patch, "minus_patch")
     names = np.union1d(labels, minus_labels)
     count, labels, minus_labels = len(names), np.searchsorted(names, labels), np.searchsorted(names, minus_labels)
     plus_sums, minus_sums = patch_sums(plus.sums, labels, count), patch_sums(minus.sums, minus_labels, count)
@@ -241,15 +241,15 @@ def patch_sums(values: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray
     return np.stack([np.bincount(labels, column, count) for column in values.T], axis=1)
 
 
-def _patch_labels(count: int, patch: ArrayLike | None) -> np.ndarray:
+def _patch_labels(count: int, patch: ArrayLike | None, name: str = "patch") -> np.ndarray:
     """Return the patch of each galaxy, [count]: runs of consecutive galaxies where none are given."""
     if patch is None:
         if count < 2:
             raise DomainError(f"shapes: {count} galaxies, expected at least two")
         return np.arange(count) * min(_PATCHES, count) // count
-    labels = np.asarray(patch)
-    if labels.shape != (count,) or labels.dtype.kind not in "iuf":
-        raise DomainError(f"patch: shape {labels.shape}, expected the patch of each of {count} galaxies")
+    labels = real_array(patch, f"{name}: expected the patch of each of {count} galaxies, a number")
+    if labels.shape != (count,):
+        raise DomainError(f"{name}: shape {labels.shape}, expected the patch of each of {count} galaxies")
     if len(np.unique(labels)) < 2:
-        raise DomainError(f"patch: {len(np.unique(labels))} different, expected at least two")
+        raise DomainError(f"{name}: {len(np.unique(labels))} different, expected at least two")
     return labels

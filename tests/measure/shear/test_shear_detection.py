@@ -165,7 +165,7 @@ def test_bad_input_is_one_line(psfs):
         ((image, psfs, SCALE, 1.0), {"psf_positions": [[0.0, 0.0]]}, "psf_positions have shape"),
         ((image, psfs[0], SCALE, 0.0), {}, r"noise = 0\.0: expected a positive"),
         ((image, psfs[0], SCALE, 1.0), {"mask": np.zeros((9, 9))}, "mask has shape"),
-        ((image + np.nan, psfs[0], SCALE, 1.0), {}, "image: expected finite pixels where it is not masked"),
+        ((image + np.nan, psfs[0], SCALE, 1.0), {}, "expected finite where the mask is zero"),
         ((image[0], psfs[0], SCALE, 1.0), {}, "image has shape"),
         ((image, psfs[0], SCALE, 1.0), {"sigma": 1.2 * SCALE}, "too wide for a weight of sigma = 1.20 pixels"),
     ):
