@@ -21,6 +21,7 @@ from ..measure.catalogue.galaxy_fits import GalaxyFits, usable_galaxies
 from ..measure.catalogue.matching import detection_rates, match_positions
 from ..measure.catalogue.objects import DetectedObjects, ObjectFlag
 from ..measure.catalogue.star_locus import StarSelection
+from ..measure.shear.shear_shapes import ShearShapes, mean_shear
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ..reconstruction.piff.psf import PiffPsf
 from ..reconstruction.psf_model.model import PsfModel
@@ -29,6 +30,7 @@ from ..reconstruction.psfex import PsfexPsf
 from ..sky.sky_shapes import STEP, SkyShapes, along_sky, jacobians_on_sky
 from .image_file import CcdImage
 from .image_psf import ImagePsf, half_light_radius_of, psfs_on
+from .image_shear import object_shears
 from .image_stars import MANY_STARS, detected_objects, few_or_many_stars, few_stars_warning, fit_image_psf
 
 if TYPE_CHECKING:
@@ -64,6 +66,9 @@ class ImageCatalogue(Result):
         Elliptical Gaussians under the PSF fitted to them.
     usable : ndarray of bool, shape [n]
         Whether each is fit for shear.
+    shear : ShearShapes or None
+        Weighted ellipticities and responses of the functionals, the sums over the peaks nearest to each object; None
+        where the scale of the pixels is unknown, or their PSF too wide.
     warnings : tuple of str
         What makes the shapes less certain than those of other images.
     """
@@ -75,6 +80,7 @@ class ImageCatalogue(Result):
     galaxies: np.ndarray
     fits: GalaxyFits
     usable: np.ndarray
+    shear: ShearShapes | None = None
     warnings: tuple[str, ...] = ()
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
@@ -145,6 +151,15 @@ class ImageCatalogue(Result):
             "flags": (fits.flags, "", "of the fit, 0 is good"),
             "usable": (self.usable, "", "larger than stars, error of e below 0.2, not saturated"),
         }
+        if self.shear is not None:
+            columns |= {
+                "shear_e1": (self.shear.e1, "", "weighted M1/(M0 + C) of the functionals, along x"),
+                "shear_e2": (self.shear.e2, "", "weighted M2/(M0 + C), along x = y"),
+                "shear_r11": (self.shear.r11, "", "response of shear_e1 to g1"),
+                "shear_r12": (self.shear.r12, "", "mean response of shear_e1 to g2, shear_e2 to g1"),
+                "shear_r22": (self.shear.r22, "", "response of shear_e2 to g2"),
+                "shear_weight": (self.shear.weight, "", "sum of the weights of the peaks"),
+            }
         # Names that fit FITS cards as well.
         meta: dict[str, Any] = {"CCD": self.image.name, "CREATOR": f"pachon {VERSION}"}
         if self.image.stamp is not None:
@@ -173,6 +188,13 @@ class ImageCatalogue(Result):
         }
         if self.warnings:
             numbers["warnings"] = list(self.warnings)
+        if (
+            self.shear is not None
+            and (self.shear.weight > 0.0).sum() > 1
+            and min(self.shear.r11.sum(), self.shear.r22.sum()) > 0.0
+        ):
+            mean = mean_shear(self.shear)
+            numbers |= {name: getattr(mean, name) for name in ("g1", "g1_error", "g2", "g2_error")}
         truth = self.image.objects
         if len(truth.get("X", ())):
             # The truth counts pixels of the CCD, of which the image may be a part.
@@ -269,7 +291,11 @@ def measure_image(
     # A saturated star is as wide as a galaxy.
     saturated = (objects.flags[rows] & ObjectFlag.SATURATED) != 0
     usable = usable_galaxies(fits, radius, selected_stars.half_light_radius) & ~saturated
-    return ImageCatalogue(image, objects, selected_stars, model, rows, fits, usable, warnings)
+    try:
+        shear = object_shears(image, objects, psfs_at, threads=threads).take(rows) if image.has_scale else None
+    except DomainError as error:
+        shear, warnings = None, (*warnings, f"no shear of functionals: {error.problem}")
+    return ImageCatalogue(image, objects, selected_stars, model, rows, fits, usable, shear, warnings)
 
 
 def _stars_beside_model(

@@ -138,6 +138,14 @@ from .measure.rho_statistics import rho_statistics as rho_statistics
 from .measure.shapes import ShapeFlag as ShapeFlag
 from .measure.shapes import Shapes as Shapes
 from .measure.shapes import measure_shapes as measure_shapes
+from .measure.shear.detection import PeakShapes as PeakShapes
+from .measure.shear.detection import detect_shear as detect_shear
+from .measure.shear.estimator import ShearEstimator as ShearEstimator
+from .measure.shear.shear_shapes import MeanShear as MeanShear
+from .measure.shear.shear_shapes import ShearBias as ShearBias
+from .measure.shear.shear_shapes import ShearShapes as ShearShapes
+from .measure.shear.shear_shapes import mean_shear as mean_shear
+from .measure.shear.shear_shapes import shear_bias as shear_bias
 from .measure.star_selection import StarFlag as StarFlag
 from .measure.star_selection import flag_stars as flag_stars
 from .models.aperture import Annulus as Annulus

@@ -2,13 +2,15 @@
 
 Each galaxy stands on a stamp of its own, with the true PSF of the nearest place where no star is, and the noise of the
 stack; neighbours are left out. It is measured twice, with the true PSF and with that of the models at that place: the
-difference is the systematic error of the PSF models, without the noise of galaxies and pixels.
+difference is the systematic error of the PSF models, without the noise of galaxies and pixels. Each time in two ways:
+by an elliptical Gaussian, as in the paper, and by the functionals of :class:`pachon.ShearEstimator`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from scipy import fft
@@ -19,10 +21,16 @@ from ...imaging.draw import Sources
 from ...imaging.exposure import Exposure
 from ...measure.catalogue.fit_galaxies import fit_galaxy_stamps
 from ...measure.catalogue.galaxy_fits import GalaxyFits, usable_galaxies
+from ...measure.shear.estimator import LEAST_SIDE, ShearEstimator
+from ...measure.shear.shear_shapes import ShearShapes
+from ...measure.shear.weight import half_light_radii, weight_sigma
 from .stack import PsfStack
 
-#: Sides of stamps [pixel], each drawn on a grid of twice the side.
-_SIDES = (32, 64)
+#: S/N of the weighted flux from which galaxies have a weight in the shear.
+SHEAR_MIN_SNR = 10.0
+#: Sides of stamps [pixel], each drawn on a grid of twice the side: the first that the weight of the shear allows, and
+#: for large galaxies one of at least the second.
+_SIDES = (32, 64, 96, 128)
 #: Half-light radius on the image over which a stamp of the first side is too small [pixel].
 _LARGE = 5.0
 #: Galaxies that are drawn and measured at a time, which bounds the memory.
@@ -47,6 +55,8 @@ class GalaxyShapes:
         Whether it is fit for shear.
     true_e1, true_e2, true_usable : ndarray, shape [n]
         The same, measured with the true PSF.
+    shear, true_shear : ShearShapes
+        Ellipticities and responses of the functionals, with the PSF of the models and with the true one.
     """
 
     index: np.ndarray
@@ -60,6 +70,8 @@ class GalaxyShapes:
     true_e1: np.ndarray
     true_e2: np.ndarray
     true_usable: np.ndarray
+    shear: ShearShapes
+    true_shear: ShearShapes
 
     def __len__(self) -> int:
         return len(self.x)
@@ -72,7 +84,10 @@ class GalaxyShapes:
     @classmethod
     def joined(cls, parts: list[GalaxyShapes]) -> GalaxyShapes:
         """Return the galaxies of several parts."""
-        return cls(*(np.concatenate([getattr(shapes, f.name) for shapes in parts]) for f in fields(cls)))
+        columns: dict[str, Any] = {f.name: [getattr(shapes, f.name) for shapes in parts] for f in fields(cls)}
+        shear, true_shear = (ShearShapes.joined(columns.pop(name)) for name in ("shear", "true_shear"))
+        arrays: dict[str, Any] = {name: np.concatenate(values) for name, values in columns.items()}
+        return cls(**arrays, shear=shear, true_shear=true_shear)
 
 
 def measure_galaxies(
@@ -118,8 +133,11 @@ def measure_galaxies(
     offset = pixels[near] - np.rint(pixels[near])
     block_fits: list[tuple[np.ndarray, GalaxyFits, GalaxyFits]] = []
     rng = stream(seed, *key)
-    for side, rows in zip(_SIDES, (on_image <= _LARGE, on_image > _LARGE), strict=True):
-        for block in _row_blocks(np.flatnonzero(rows)):
+    sigma = weight_sigma(None, stack.true[places], exposure.pixel_scale)
+    sides = stamp_sides(sigma / exposure.pixel_scale)
+    shear_parts: list[tuple[np.ndarray, ShearShapes, ShearShapes]] = []
+    for side, rows in zip(sides, (on_image <= _LARGE, on_image > _LARGE), strict=True):
+        for number, block in enumerate(_row_blocks(np.flatnonzero(rows))):
             size = 2 * side
             used, index = np.unique(psf[block], return_inverse=True)
             spectra = galaxies.transform(
@@ -137,7 +155,28 @@ def measure_galaxies(
                 images, variances, stack.true[used], psf_index=index, start=by_model, threads=threads
             )
             block_fits.append((block, by_model, by_true))
-    return _joined_shapes(galaxies, near, pixels * exposure.pixel_scale, width, block_fits)
+            shear_pair: list[ShearShapes] = []
+            for psf_images in (stack.model[used], stack.true[used]):
+                estimator = ShearEstimator(psf_images, exposure.pixel_scale, exposure.noise_rms, sigma=sigma, side=side)
+                # Galaxies stand about the pixel of number side / 2, half a pixel from the centre of the stamp.
+                moments = estimator.moments(images, offset[block] + 0.5, psf_index=index, threads=threads)
+                shear_pair.append(
+                    estimator.ellipticity_and_response(
+                        moments,
+                        psf_index=index,
+                        seed=seed if exposure.noise else None,
+                        key=(*key, "moments", side, number),
+                        min_snr=SHEAR_MIN_SNR,
+                    )
+                )
+            shear_parts.append((block, shear_pair[0], shear_pair[1]))
+    return _joined_shapes(galaxies, near, pixels * exposure.pixel_scale, width, block_fits, shear_parts)
+
+
+def stamp_sides(sigma: float) -> tuple[int, int]:
+    """Return the sides of stamps of small and of large galaxies for a weight of an rms width, all in pixels."""
+    fitting = [side for side in _SIDES if side >= LEAST_SIDE * sigma] or [_SIDES[-1]]
+    return fitting[0], max(fitting[0], _SIDES[1])
 
 
 def _row_blocks(rows: np.ndarray) -> Iterator[np.ndarray]:
@@ -152,23 +191,13 @@ def _psf_transforms(psfs: np.ndarray, size: int) -> np.ndarray:
     return fft.rfft2(wide, workers=1)
 
 
-def half_light_radii(psfs: np.ndarray) -> np.ndarray:
-    """Return half-light radii of PSFs of unit sum from their growth curves [pixel]."""
-    half = psfs.shape[1] // 2
-    y, x = np.mgrid[-half : half + 1, -half : half + 1]
-    order = np.argsort(np.hypot(x, y), axis=None, kind="stable")
-    # A pixel more of area, a little more of radius: the radius of the disc that n pixels fill.
-    radius = np.sqrt(np.arange(1, order.size + 1) / np.pi)
-    growth = np.cumsum(psfs.reshape(len(psfs), -1)[:, order], axis=1)
-    return np.array([np.interp(0.5, curve, radius) for curve in np.maximum.accumulate(growth, axis=1)])
-
-
 def _joined_shapes(
     galaxies: Sources,
     near: np.ndarray,
     positions: np.ndarray,
     width: np.ndarray,
     block_fits: list[tuple[np.ndarray, GalaxyFits, GalaxyFits]],
+    shear_parts: list[tuple[np.ndarray, ShearShapes, ShearShapes]],
 ) -> GalaxyShapes:
     """Return the shapes of the fits of blocks of galaxies, in the order of the galaxies."""
     columns = {name: np.full(len(near), np.nan) for name in ("e1", "e2", "error", "true_e1", "true_e2")}
@@ -182,4 +211,16 @@ def _joined_shapes(
             if not prefix:
                 columns["error"][block] = fits.ellipticity_error
     x, y = positions[near].T
-    return GalaxyShapes(index=near, x=x, y=y, magnitude=galaxies.magnitude[near], **columns, **usable)
+    order = np.argsort(np.concatenate([np.zeros(0, dtype=np.int64), *(block for block, _, _ in shear_parts)]))
+    shear = ShearShapes.joined([by_model for _, by_model, _ in shear_parts]).take(order)
+    true_shear = ShearShapes.joined([by_true for _, _, by_true in shear_parts]).take(order)
+    return GalaxyShapes(
+        index=near,
+        x=x,
+        y=y,
+        magnitude=galaxies.magnitude[near],
+        **columns,
+        **usable,
+        shear=shear,
+        true_shear=true_shear,
+    )

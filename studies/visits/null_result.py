@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from ...measure.catalogue.shear_calibration import ShearCalibration
 from ...measure.correlation import Correlation, jackknife_error
+from ...measure.shear.shear_shapes import ShearBias, ShearShapes, shear_of_sums
 from .galaxy_shapes import GalaxyShapes
 from .stack import PsfStack
 from .stack_metrics import correlations
@@ -46,36 +47,95 @@ def shear_bias(e: np.ndarray, shear: np.ndarray) -> ShearCalibration:
     return ShearCalibration(m, m_error, c, c_error, int(complete.sum()))
 
 
-def psf_leakage(stack: PsfStack, parts: list[GalaxyShapes]) -> dict[str, tuple[float, float]]:
-    """Return the part of the PSF's ellipticity that usable galaxies have, with its error, by either PSF.
+@dataclass(frozen=True)
+class AdditiveBias:
+    """Shear of galaxies without shear as a part of the ellipticity of their PSF, and of that of the models' errors.
 
-    The slope through the origin of their ellipticities against that of the true PSF (weighted moments) at the nearest
-    place without a star, with an error of a jackknife over tiles.
+    Slopes through the origin at the nearest place without a star, with errors of a jackknife over quarters of tiles:
+    each a pair of the value and its error, NaN where there are too few galaxies.
 
-    Parameters
+    Attributes
     ----------
-    stack : PsfStack
-        PSFs of the stack.
-    parts : list of GalaxyShapes
-        Galaxies of each tile.
+    alpha_model, alpha_true : (float, float)
+        Of the shear measured with the PSF of the models against the weighted e of that PSF, and with the true PSF
+        against that of the true one.
+    beta : (float, float)
+        Of the difference of both shears against that of the weighted e of the true PSF and the model.
     """
-    places = ~stack.star
-    tree = cKDTree(np.stack([stack.x, stack.y], axis=1)[places])
-    psf = (stack.e1 + 1j * stack.e2)[places]
-    nearest = [psf[tree.query(np.stack([tile_galaxies.x, tile_galaxies.y], axis=1))[1]] for tile_galaxies in parts]
-    leakage = {}
-    for kind, prefix in (("model", ""), ("true", "true_")):
-        sums = np.zeros((len(parts), 2))
-        for tile_sums, tile_galaxies, at in zip(sums, parts, nearest, strict=True):
-            e1, e2, usable = (getattr(tile_galaxies, prefix + name) for name in ("e1", "e2", "usable"))
-            e, p = (e1 + 1j * e2)[usable], at[usable]
-            tile_sums[:] = (np.conj(p) * e).real.sum(), (np.abs(p) ** 2).sum()
-        product, square = (sums.sum(axis=0) - sums).T
-        without = product / np.where(square > 0.0, square, np.nan)
-        total = sums.sum(axis=0)
-        slope = float(total[0] / total[1]) if total[1] > 0.0 else float("nan")
-        leakage[kind] = slope, float(jackknife_error(without))
-    return leakage
+
+    alpha_model: tuple[float, float]
+    alpha_true: tuple[float, float]
+    beta: tuple[float, float]
+
+    @classmethod
+    def of(cls, stack: PsfStack, parts: list[GalaxyShapes]) -> AdditiveBias:
+        """Compare the galaxies of tiles with the PSFs of a stack."""
+        places = ~stack.star
+        tree = cKDTree(np.stack([stack.x, stack.y], axis=1)[places])
+        e_model, e_true = ((a + 1j * b)[places] for a, b in ((stack.model_e1, stack.model_e2), (stack.e1, stack.e2)))
+        nearest = [tree.query(np.stack([shapes.x, shapes.y], axis=1))[1] for shapes in parts]
+        joined = GalaxyShapes.joined(parts)
+        place = np.concatenate(nearest)
+        patch = np.concatenate([4 * k + _quarters(shapes) for k, shapes in enumerate(parts)])
+        by_model, by_true = (galaxy_shears(shapes) for shapes in (joined.shear, joined.true_shear))
+        return cls(
+            _slope(by_model, e_model[place], patch),
+            _slope(by_true, e_true[place], patch),
+            _slope(by_model - by_true, (e_true - e_model)[place], patch),
+        )
+
+
+def _quarters(shapes: GalaxyShapes) -> np.ndarray:
+    """Return the quarter of a tile that each galaxy is in, 0 to 3."""
+    if not len(shapes):
+        return np.zeros(0, dtype=np.int64)
+    return (shapes.x > np.median(shapes.x)) + 2 * (shapes.y > np.median(shapes.y))
+
+
+def _slope(shear: np.ndarray, e: np.ndarray, patch: np.ndarray) -> tuple[float, float]:
+    """Return the slope of complex shears against ellipticities, and its error of a jackknife over patches."""
+    selected = np.isfinite(shear) & np.isfinite(e)
+    _, labels = np.unique(patch[selected], return_inverse=True)
+    product, square = (np.conj(e) * shear).real[selected], (np.abs(e) ** 2)[selected]
+    sums = np.stack([np.bincount(labels, values) for values in (product, square)], axis=1)
+    if len(sums) < 2:
+        return float("nan"), float("nan")
+    total = sums.sum(axis=0)
+    without = total - sums
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(total[0] / total[1]), float(jackknife_error(without[:, 0] / without[:, 1]))
+
+
+def galaxy_shears(shapes: ShearShapes) -> np.ndarray:
+    """Return weighted ellipticities over the mean response, g1 + i g2 [n], whose mean is the shear.
+
+    Galaxies that the selection leaves out are NaN; the mean is over the others.
+    """
+    selected = shapes.weight > 0.0
+    mean = shapes.sums[selected].mean(axis=0) if selected.any() else np.full(5, np.nan)
+    rows = np.where(selected[:, None], shapes.sums, np.nan)
+    rows[:, 2:] = mean[2:]
+    g1, g2 = shear_of_sums(rows).T
+    return np.asarray(g1 + 1j * g2)
+
+
+@dataclass(frozen=True)
+class ShearBiases:
+    """Biases of the shear of a null test.
+
+    Attributes
+    ----------
+    gaussian : dict of str to ShearCalibration
+        Of ellipticities of Gaussians, with the PSF of the models and with the true one.
+    functionals : dict of str to ShearBias
+        Of the functionals.
+    additive : AdditiveBias
+        Of the functionals, as a part of the ellipticity of the PSF.
+    """
+
+    gaussian: dict[str, ShearCalibration]
+    functionals: dict[str, ShearBias]
+    additive: AdditiveBias
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,39 +153,36 @@ class NullTest:
     correlations : dict of str to Correlation
         ``model``: ellipticities measured with the PSF of the models; ``true``: with the true PSF; ``difference``: of
         the two, of galaxies that are usable with either.
-    calibration : dict of str to ShearCalibration
-        Biases of the shear with the PSF of the models and the true one, where they were measured.
-    leakage : dict of str to (float, float)
-        Part of the PSF's ellipticity that galaxies have, and its error, where it was measured: :func:`psf_leakage`.
+    shear_correlations : dict of str to Correlation
+        The same of the shears of the functionals.
+    biases : ShearBiases, optional
+        Biases of the shear, where they were measured.
     """
 
     visits: int
     galaxies: GalaxyShapes
     density: float
     correlations: dict[str, Correlation]
-    calibration: dict[str, ShearCalibration] = field(default_factory=dict)
-    leakage: dict[str, tuple[float, float]] = field(default_factory=dict)
+    shear_correlations: dict[str, Correlation]
+    biases: ShearBiases | None = None
 
     @classmethod
-    def of(
-        cls,
-        visits: int,
-        parts: list[GalaxyShapes],
-        area: float,
-        calibration: dict[str, ShearCalibration] | None = None,
-        leakage: dict[str, tuple[float, float]] | None = None,
-    ) -> NullTest:
+    def of(cls, visits: int, parts: list[GalaxyShapes], area: float, biases: ShearBiases | None = None) -> NullTest:
         """Return the test of the galaxies of tiles of an area [arcmin^2], with errors of a jackknife over the tiles."""
         galaxies = GalaxyShapes.joined(parts)
-        usable_in_both = galaxies.usable_twice
         kinds = {
             "model": (galaxies.e1, galaxies.e2, galaxies.usable),
             "true": (galaxies.true_e1, galaxies.true_e2, galaxies.true_usable),
-            "difference": (galaxies.e1 - galaxies.true_e1, galaxies.e2 - galaxies.true_e2, usable_in_both),
+            "difference": (galaxies.e1 - galaxies.true_e1, galaxies.e2 - galaxies.true_e2, galaxies.usable_twice),
         }
+        by_model, by_true = (galaxy_shears(shapes) for shapes in (galaxies.shear, galaxies.true_shear))
+        shears = {"model": by_model, "true": by_true, "difference": by_model - by_true}
+        shear_kinds = {kind: (g.real, g.imag, np.isfinite(g)) for kind, g in shears.items()}
         tile = np.repeat(np.arange(len(parts)), [len(tile_galaxies) for tile_galaxies in parts])
         correlated = correlations(galaxies.x, galaxies.y, kinds, tile)
-        return cls(visits, galaxies, float(galaxies.usable.sum() / area), correlated, calibration or {}, leakage or {})
+        several = all(rows.sum() > 1 for _, _, rows in shear_kinds.values())
+        shear_correlated = correlations(galaxies.x, galaxies.y, shear_kinds, tile) if several else {}
+        return cls(visits, galaxies, float(galaxies.usable.sum() / area), correlated, shear_correlated, biases)
 
 
 def null_metrics(result: NullTest) -> dict[str, float]:
@@ -147,13 +204,37 @@ def null_metrics(result: NullTest) -> dict[str, float]:
         for span in ("short", "long"):
             metrics[f"xi_plus_{kind}_{span}"] = correlation.mean_xi_plus(span)
             metrics[f"xi_plus_{kind}_{span}_error"] = correlation.error_mean_xi_plus(span)
-    for kind, (slope, error) in result.leakage.items():
-        metrics[f"psf_leakage_{kind}"], metrics[f"psf_leakage_{kind}_error"] = slope, error
-    for kind, shear_calibration in result.calibration.items():
-        for name in ("m", "c"):
-            for k in range(2):
-                metrics[f"{name}{k + 1}_{kind}"] = float(getattr(shear_calibration, name)[k])
-                metrics[f"{name}{k + 1}_{kind}_error"] = float(getattr(shear_calibration, f"{name}_error")[k])
+    metrics |= _shear_metrics(result)
+    if result.biases is None:
+        return metrics
+    for prefix, biases in (("", result.biases.gaussian), ("shear_", result.biases.functionals)):
+        for kind, bias in biases.items():
+            for name in ("m", "c"):
+                for k in range(2):
+                    metrics[f"{prefix}{name}{k + 1}_{kind}"] = float(getattr(bias, name)[k])
+                    metrics[f"{prefix}{name}{k + 1}_{kind}_error"] = float(getattr(bias, f"{name}_error")[k])
+    for name in ("alpha_model", "alpha_true", "beta"):
+        value, error = getattr(result.biases.additive, name)
+        metrics[f"shear_{name}"], metrics[f"shear_{name}_error"] = value, error
+    return metrics
+
+
+def _shear_metrics(result: NullTest) -> dict[str, float]:
+    """Return the figures of the shears of the functionals."""
+    by_model, by_true = (galaxy_shears(shapes) for shapes in (result.galaxies.shear, result.galaxies.true_shear))
+    selected = result.galaxies.shear.weight > 0.0
+    metrics: dict[str, float] = {
+        "shear_galaxies": int(selected.sum()),
+        "rms_shear_component": float(np.sqrt(0.5 * np.nanmean(np.abs(by_model) ** 2))) if selected.any() else np.nan,
+    }
+    difference = by_model - by_true
+    finite = np.isfinite(difference)
+    for name, values in (("g1", difference.real), ("g2", difference.imag)):
+        metrics[f"mean_{name}_difference"] = float(values[finite].mean()) if finite.any() else np.nan
+    for kind, correlation in result.shear_correlations.items():
+        for span in ("short", "long"):
+            metrics[f"shear_xi_plus_{kind}_{span}"] = correlation.mean_xi_plus(span)
+            metrics[f"shear_xi_plus_{kind}_{span}_error"] = correlation.error_mean_xi_plus(span)
     return metrics
 
 

@@ -19,12 +19,14 @@ from ...core.units import ARCMIN
 from ...imaging.exposure import Exposure
 from ...imaging.galaxies import SkyGalaxies
 from ...measure.catalogue.shear_calibration import ShearCalibration
+from ...measure.shear.shear_shapes import ShearBias, ShearShapes
+from ...measure.shear.shear_shapes import shear_bias as functional_shear_bias
 from ...pipeline.run_folder import CONFIG_NAME
 from ...sky.galaxies import Galaxies
 from ...sky.mosaic import PlantedGalaxies
 from .config import STACK_STAMP, load_visits_configuration
 from .galaxy_shapes import GalaxyShapes, measure_galaxies
-from .null_result import NullTest, null_metrics, psf_leakage, shear_bias
+from .null_result import AdditiveBias, NullTest, ShearBiases, null_metrics, shear_bias
 from .plots import density_picture, null_test_picture
 from .psf_visit import StackFrame, stack_limit
 from .stack import PsfStack
@@ -34,6 +36,8 @@ from .visits import cell_of, pixel_scale_of, stack_path
 FAINTEST_SNR = 8.0
 #: Largest distance of galaxies from the nearest position with a known PSF, over the mean distance of these.
 REACH = 2.0
+#: Patches of the jackknife over the rings.
+_RING_PATCHES = 200
 #: Shear of the calibration.
 SHEAR = 0.02
 # Orientations of a ring.
@@ -113,10 +117,15 @@ def null_test(
         if (n := sum(int(shapes.usable_twice.sum()) for shapes in parts)) < 2:
             text = f"{n} of {sum(map(len, parts))} galaxies to magnitude {faintest:.2f} are usable in {visits} visits"
             raise DomainError(f"{folder}: {text}; expected two or more, of the galaxies of {CONFIG_NAME}")
-        bias = _calibration(frame.matrix, len(depth.ring_galaxies(covered_tiles, rings)), measured_rings)
+        ring_count = len(depth.ring_galaxies(covered_tiles, rings))
+        biases = ShearBiases(
+            _calibration(frame.matrix, ring_count, measured_rings),
+            _shear_calibration(frame.matrix, ring_count, measured_rings),
+            AdditiveBias.of(stack, parts),
+        )
         with execution.reporter.stage(f"correlations in {visits} visits"):
             area = len(covered_tiles) * (cell / ARCMIN) ** 2
-            tests[visits] = NullTest.of(visits, parts, area, bias, psf_leakage(stack, parts))
+            tests[visits] = NullTest.of(visits, parts, area, biases)
     write_json(folder / "null_test.json", {"stacks": {str(n): null_metrics(r) for n, r in tests.items()}})
     write_pictures(folder, tests)
     return tests
@@ -220,6 +229,30 @@ def _calibration(axes: np.ndarray, n: int, measured: list[GalaxyShapes]) -> dict
     return {kind: shear_bias(e, ellipticity_along(axes, SHEAR * _shear_along_diagonal(n))) for kind, e in along.items()}
 
 
+def _shear_calibration(axes: np.ndarray, n: int, measured: list[GalaxyShapes]) -> dict[str, ShearBias]:
+    """Return the biases of the shear of the functionals from the same rings, along the axes of the stack.
+
+    Rings are joined in patches of one direction of the shear.
+    """
+    pairs = max(1, min(_RING_PATCHES, n) // 2)
+    patch = 2 * (np.arange(n) * pairs // n) + np.arange(n) % 2
+    if n < 2 * pairs or len(np.unique(patch)) < 2:
+        return {}
+    shear = ellipticity_along(axes, SHEAR * _shear_along_diagonal(2)[np.unique(patch) % 2])
+    biases = {}
+    for kind, name in (("model", "shear"), ("true", "true_shear")):
+        sides = [
+            [shapes for (_, sign), shapes in zip(_RING_JOBS, measured, strict=True) if sign == side]
+            for side in (1.0, -1.0)
+        ]
+        plus, minus = (ShearShapes.joined([getattr(shapes, name) for shapes in side]) for side in sides)
+        labels, minus_labels = (patch[np.concatenate([shapes.index for shapes in side])] for side in sides)
+        biases[kind] = functional_shear_bias(
+            plus, minus, shear.real, shear.imag, patch=labels, minus_patch=minus_labels
+        )
+    return biases
+
+
 def ellipticity_along(axes: np.ndarray, e: np.ndarray) -> np.ndarray:
     """Return ellipticities e1 + i e2 along xi, eta in the axes of the stack, rotated or mirrored by a matrix."""
     along_sky = e if np.linalg.det(axes) > 0.0 else np.conj(e)
@@ -241,17 +274,36 @@ _COLUMNS = {
 }
 
 
+_SHEAR_COLUMNS = {
+    "e1": "weighted M1/(M0 + C) along x",
+    "e2": "weighted M2/(M0 + C) along x = y",
+    "r11": "response of e1 to g1",
+    "r12": "mean response of e1 to g2, e2 to g1",
+    "r22": "response of e2 to g2",
+    "weight": "of the selection by S/N",
+    "snr": "S/N of M0",
+}
+
+
 def write_shapes(path: Path, galaxies: GalaxyShapes, stamp: Stamp) -> None:
     """Write galaxies as a FITS table."""
     columns = {
         name.upper(): (getattr(galaxies, name) / unit if unit != 1.0 else getattr(galaxies, name), text, description)
         for name, (unit, text, description) in _COLUMNS.items()
     }
+    for kind in ("shear", "true_shear"):
+        for name, description in _SHEAR_COLUMNS.items():
+            columns[f"{kind}_{name}".upper()] = getattr(getattr(galaxies, kind), name), "", description
     write_fits(path, [table_hdu("GALAXIES", columns)], stamp, [])
 
 
 def _read_shapes(path: Path, stamp: Stamp) -> GalaxyShapes:
     """Return the galaxies of a finished tile; ProductError for a damaged one or one of another configuration."""
-    hdus = read_fits(path, stamp)
-    columns = {name: column(hdus["GALAXIES"], name.upper()) for name in _COLUMNS}
-    return GalaxyShapes(**{n: v * _COLUMNS[n][0] if _COLUMNS[n][0] != 1.0 else v for n, v in columns.items()})
+    table = read_fits(path, stamp)["GALAXIES"]
+    columns = {name: column(table, name.upper()) for name in _COLUMNS}
+    shears = {
+        kind: ShearShapes(*(column(table, f"{kind}_{name}".upper()) for name in _SHEAR_COLUMNS))
+        for kind in ("shear", "true_shear")
+    }
+    scaled: dict[str, Any] = {n: v * _COLUMNS[n][0] if _COLUMNS[n][0] != 1.0 else v for n, v in columns.items()}
+    return GalaxyShapes(**scaled, shear=shears["shear"], true_shear=shears["true_shear"])

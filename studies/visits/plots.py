@@ -85,19 +85,26 @@ def correlation_picture(correlated: Mapping[int, StackCorrelations], moments: st
 
 
 def null_test_picture(results: Mapping[int, NullTest]) -> bytes:
-    """Draw xi+ of unsheared galaxies, and the contribution of the PSF models to it (Fig. 17)."""
+    """Draw xi+ of unsheared galaxies, and the contribution of the PSF models to it (Fig. 17), by both methods."""
+    methods = {
+        "Gaussians": [result.correlations for result in results.values()],
+        "functionals": [result.shear_correlations for result in results.values()],
+    }
+    methods = {method: correlated for method, correlated in methods.items() if all(correlated)}
     with styled():
-        figure = new_figure(4.2 * len(results) + 1.0, 4.8)
-        panels = figure.subplots(1, len(results), sharex=True, sharey=True, squeeze=False)[0]
-        for axes, result in zip(panels, results.values(), strict=True):
-            for kind, style in _GALAXY_STYLES.items():
-                draw_correlation(axes, result.correlations[kind], "plus", *style)
-            log_axes(axes, f"{_visits(result.visits)}: {result.density:.0f} galaxies per arcmin²")
+        figure = new_figure(4.2 * len(results) + 1.0, 4.4 * len(methods) + 0.4)
+        panels = figure.subplots(len(methods), len(results), sharex=True, sharey=True, squeeze=False)
+        for row, (method, correlated) in zip(panels, methods.items(), strict=True):
+            for axes, result, correlation_of_kind in zip(row, results.values(), correlated, strict=True):
+                for kind, style in _GALAXY_STYLES.items():
+                    draw_correlation(axes, correlation_of_kind[kind], "plus", *style)
+                log_axes(axes, f"{method}, {_visits(result.visits)}: {result.density:.0f} usable per arcmin²")
+            row[0].set_ylabel("$|\\xi_+|$: filled positive, open negative")
+        for axes in panels[-1]:
             axes.set_xlabel("separation [arcmin]")
-        panels[0].set_ylabel("$|\\xi_+|$: filled positive, open negative")
-        low, high = panels[0].get_ylim()
-        panels[0].set_ylim(max(low, 1e-10), 2.0 * high)
-        panels[0].legend(loc="best")
+        low, high = panels[0, 0].get_ylim()
+        panels[0, 0].set_ylim(max(low, 1e-10), 2.0 * high)
+        panels[0, 0].legend(loc="best")
         return png_bytes(figure)
 
 

@@ -84,6 +84,18 @@ class _Made:
     def make_model(self):
         return pachon.PsfModel.fit(self.stamps, self.places, n_components=2, order=1)
 
+    def make_shear_psf(self):
+        y, x = np.mgrid[-7:8, -7:8]
+        psf = np.exp(-0.5 * (x * x + y * y) / 1.5**2)
+        return psf / psf.sum()
+
+    def make_estimator(self):
+        return pachon.ShearEstimator(self.shear_psf, 1e-6, 0.1, sigma=2.6e-6, side=40)
+
+    def make_shear_shapes(self):
+        e1, e2, r11, r12, r22, weight, snr = np.random.default_rng(6).uniform(0.1, 0.2, (7, 12))
+        return pachon.ShearShapes(e1, e2, r11, 0.1 * r12, r22, weight, snr)
+
     def make_floating(self):
         return pachon.load_telescope("paul_baker").with_design(stop="M1", aperture="f_number", aperture_value=4.0)
 
@@ -324,6 +336,12 @@ def calls(folder):
         "match_positions": (pachon.match_positions, {"x": x, "y": y, "true_x": x, "true_y": y, "radius": 0.1}),
         "shear_calibration": (pachon.shear_calibration, {"e1": shear, "e2": shear, "shear1": [0.0, 0.01, 0.02, 0.03],
                               "shear2": [0.0, 0.01, -0.02, 0.03]}),
+        "detect_shear": (pachon.detect_shear, {"image": m.image, "psf_images": m.shear_psf, "pixel_scale": 1e-6,
+                         "noise": 1.0, "psf_positions": [[10.0, 10.0]], "mask": np.zeros(flat.shape, int), "seed": 1,
+                         "sigma": 2.6e-6, "min_snr": 10.0, "threads": 1}),
+        "mean_shear": (pachon.mean_shear, {"shapes": m.shear_shapes, "patch": np.arange(12) // 3}),
+        "shear_bias": (pachon.shear_bias, {"plus": m.shear_shapes, "minus": m.shear_shapes, "shear1": 0.01,
+                       "shear2": 0.0, "patch": np.arange(12) // 3, "minus_patch": np.arange(12) // 3}),
         "select_stars": (pachon.select_stars, {"objects": m.objects, "image": m.image, "min_snr": 30.0,
                          "bright_snr": 60.0, "n_sigma": 4.0, "max_ellipticity": 0.1, "isolation": 5.0, "min_stars": 3,
                          "size": 15, "mask": np.zeros(flat.shape, int)}),
@@ -504,6 +522,13 @@ def _methods(m, tel, w, x, y):
         "PsfField.fit": (pachon.PsfField.fit, {"stamps": m.stamps, "positions": 100 + 50 * m.places, "pixels": 200,
                          "lit_fraction": np.full(12, 0.9), "n_components": 2, "order": 1,
                          "interpolation": "polynomial"}),
+        "ShearEstimator": (pachon.ShearEstimator, {"psf_images": m.shear_psf, "pixel_scale": 1e-6, "noise": 0.1,
+                           "sigma": 2.6e-6, "side": 40}),
+        "ShearEstimator.moments": (m.estimator.moments, {"stamps": np.ones((2, 40, 40)), "offsets": np.zeros((2, 2)),
+                                   "psf_index": [0, 0], "threads": 1}),
+        "ShearEstimator.ellipticity_and_response": (m.estimator.ellipticity_and_response, {
+            "moments": np.ones((2, 6)), "psf_index": [0, 0], "seed": 1, "key": "noise", "min_snr": 5.0,
+            "snr_width": 4.0}),
         "Annulus": (pachon.Annulus, {"inner": 1.0, "outer": 2.0, "x": 0.0, "y": 0.0}),
         "Circle": (pachon.Circle, {"radius": 1.0, "x": 0.0, "y": 0.0}),
         "Circle.contains": (pachon.Circle(1.0).contains, xy),

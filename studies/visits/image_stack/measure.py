@@ -15,7 +15,7 @@ from ....core.errors import DomainError
 from ....core.files import write_bytes, write_json
 from ....core.long_work import Execution
 from ....core.products import Stamp
-from ....core.random_streams import natural_number
+from ....core.random_streams import natural_number, stream
 from ....core.units import ARCMIN
 from ....imaging.image_file import CcdImage
 from ....measure.catalogue.detect import DetectedObjects, detect_objects
@@ -24,7 +24,9 @@ from ....measure.catalogue.galaxy_fits import usable_galaxies
 from ....measure.catalogue.matching import match_positions
 from ....measure.catalogue.star_locus import StarSelection, select_stars
 from ....measure.shapes import measure_shapes
-from ..galaxy_shapes import GalaxyShapes, half_light_radii, measure_galaxies
+from ....measure.shear.detection import detect_shear
+from ....measure.shear.weight import half_light_radii, weight_sigma
+from ..galaxy_shapes import SHEAR_MIN_SNR, GalaxyShapes, measure_galaxies
 from ..null_result import NullTest, null_metrics
 from ..null_test import FAINTEST_SNR, REACH, write_pictures, write_shapes
 from ..psf_visit import stack_limit
@@ -179,6 +181,7 @@ def measure_tile(
     variance = image.variance * np.float32(exposure.noise_rms**2 / np.median(image.variance[image.mask == 0]))
     objects = detect_objects(image.image, variance, image.mask, threshold=_THRESHOLD, background_size=None)
     truth = image.objects
+    key: tuple[str | int, ...] = ("images", psfs.visits, natural_number(tile.column), natural_number(tile.row))
     scale = pixel_scale_of(stack.frame)
     reach = REACH * cell_of(stack.experiment, stack.frame) / float(np.sqrt(stack.visits.visits.places))
     places = np.flatnonzero(~psfs.star)
@@ -209,6 +212,23 @@ def measure_tile(
         for psf_images in (psfs.model, psfs.true)
     ]
     usable = [usable_galaxies(fit, objects.half_light_radius[rows], stars.half_light_radius) for fit in fits]
+    shears = [
+        detect_shear(
+            image.image,
+            psf_images / psf_images.sum(axis=(1, 2), keepdims=True),
+            scale,
+            float(np.sqrt(np.median(variance[image.mask == 0]))),
+            psf_positions=known_at / scale - tile.first,
+            mask=image.mask,
+            sigma=weight_sigma(None, broadened(psfs.true[places], transfer), scale),
+            seed=int(stream(stack.stamp.seed, *key, "peaks").integers(2**32)),
+            min_snr=SHEAR_MIN_SNR,
+            threads=threads,
+        )
+        .at_objects(objects.x, objects.y)
+        .take(rows)
+        for psf_images in (broadened(psfs.model[places], transfer), broadened(psfs.true[places], transfer))
+    ]
     match = match_positions(objects.x, objects.y, truth["X"], truth["Y"], MATCH_RADIUS)[rows]
     # True galaxies follow the stars of the table, in the order of the galaxies on the tile.
     index = np.where(match >= 0, match - int(truth["STAR"].sum()), -1)
@@ -225,9 +245,10 @@ def measure_tile(
         true_e1=fits[1].e1,
         true_e2=fits[1].e2,
         true_usable=usable[1],
+        shear=shears[0],
+        true_shear=shears[1],
     )
     true, axes = galaxies_on(stack.sky, tile, tile.wcs(stack.frame)), stack.frame.matrix
-    key: tuple[str | int, ...] = ("images", psfs.visits, natural_number(tile.column), natural_number(tile.row))
     options: dict[str, Any] = {"reach": reach, "threads": threads}
     drawn = np.flatnonzero(true.magnitude <= stack_limit(stack.experiment, FAINTEST_SNR, psfs.visits))
     stamps = measure_galaxies(psfs, axes, true.take(drawn), exposure, stack.stamp.seed, *key, **options)

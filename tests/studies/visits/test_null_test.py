@@ -10,10 +10,12 @@ from pachon.core.errors import PachonError
 from pachon.core.long_work import Execution
 from pachon.core.units import ARCMIN, ARCSEC
 from pachon.imaging.exposure import Exposure
+from pachon.measure.shear.shear_shapes import ShearShapes
+from pachon.measure.shear.shear_shapes import shear_bias as shear_bias_of_functionals
 from pachon.sky.galaxies import Galaxies
 from pachon.studies.visits import null_test as module
 from pachon.studies.visits.galaxy_shapes import GalaxyShapes, measure_galaxies
-from pachon.studies.visits.null_result import density_slope, psf_leakage, shear_bias
+from pachon.studies.visits.null_result import AdditiveBias, density_slope, shear_bias
 from pachon.studies.visits.null_test import ellipticity_along, null_test
 from pachon.studies.visits.stack import PsfStack
 from pachon.studies.visits.visits import stack_visits
@@ -173,6 +175,11 @@ def test_the_null_test_of_a_folder(tested):
         # Elliptical Gaussians under-fit discs and spheroids by some per cent.
         assert -0.2 < metrics["m1_true"] < 0.05
         assert metrics["m1_true_error"] < 0.03
+        # The functionals have no bias beyond their error.
+        for name in ("shear_m1_true", "shear_m2_true"):
+            assert abs(metrics[name]) < 4.0 * metrics[f"{name}_error"] < 0.2
+        assert metrics["shear_galaxies"] > 10
+        assert 0.15 < metrics["rms_shear_component"] < 0.6
     assert results[2].density > results[1].density
     assert (folder / "null_test.png").read_bytes().startswith(b"\x89PNG")
 
@@ -201,38 +208,61 @@ def test_a_folder_without_visits(tmp_path, capsys):
     assert "expected the folder of pachon visits" in error
 
 
-def test_leakage_is_the_part_of_the_psf_that_galaxies_have():
+def test_additive_bias_is_the_part_of_the_psf_and_of_its_error_that_galaxies_have():
     rng = np.random.default_rng(5)
     psf = stack_of(gaussian(0.0 + 0.0j, 2.0), gaussian(0.0 + 0.0j, 2.0), places=30)
     field = 0.01 * (np.sin(psf.x / ARCMIN) + 1j * np.cos(0.7 * psf.y / ARCMIN))
-    stack = replace(psf, star=np.zeros(len(psf.x), dtype=bool), e1=field.real, e2=field.imag)
+    wrong = 0.003 * (np.cos(3.0 * psf.x / ARCMIN) - 1j * np.sin(2.0 * psf.y / ARCMIN))
+    model = {"model_e1": (field - wrong).real, "model_e2": (field - wrong).imag}
+    stack = replace(psf, star=np.zeros(len(psf.x), dtype=bool), e1=field.real, e2=field.imag, **model)
     parts = []
-    for _ in range(20):
-        own = rng.integers(0, len(psf.x), 400)
-        noise = 0.02 * (rng.normal(size=(2, 400)) + 1j * rng.normal(size=(2, 400)))
-        e = {"model": 0.3 * field[own] + noise[0], "true": 0.1 * field[own] + noise[1]}
-        # What is not usable does not count.
-        usable = rng.random(400) < 0.7
-        e = {kind: np.where(usable, values, np.nan) for kind, values in e.items()}
-        nothing = np.zeros(400)
-        parts.append(
-            GalaxyShapes(
-                own,
-                psf.x[own],
-                psf.y[own],
-                nothing,
-                e["model"].real,
-                e["model"].imag,
-                nothing,
-                usable,
-                e["true"].real,
-                e["true"].imag,
-                usable,
+    for _ in range(10):
+        places = rng.integers(0, len(psf.x), 800)
+        shape = 0.02 * (rng.normal(size=800) + 1j * rng.normal(size=800))
+        shears = {"true_shear": 0.1 * field[places] + shape}
+        shears["shear"] = shears["true_shear"] + 0.8 * wrong[places] + 1e-4 * rng.normal(size=800)
+        weight = (rng.random(800) < 0.7).astype(float)
+        nothing, flags = np.zeros(800), np.ones(800, dtype=bool)
+        # Ellipticities are shears times the response, 0.4, and nothing where galaxies are left out.
+        shapes = {
+            kind: ShearShapes(
+                *(0.4 * weight * v for v in (g.real, g.imag, np.ones(800), nothing, np.ones(800))), weight, nothing
             )
+            for kind, g in shears.items()
+        }
+        columns = psf.x[places], psf.y[places], *[nothing] * 4, flags, nothing, nothing, flags
+        parts.append(GalaxyShapes(places, *columns, **shapes))
+    bias = AdditiveBias.of(stack, parts)
+    # Of 5600 galaxies: 0.02 a component over the modulus of the PSF's ellipticity.
+    expected_error = 0.02 / np.sqrt(5600.0) / np.sqrt(np.mean(np.abs(field) ** 2))
+    assert bias.alpha_true[1] == pytest.approx(expected_error, rel=0.4)
+    assert abs(bias.alpha_true[0] - 0.1) < 3.5 * expected_error
+    # The shapes are in both and leave the difference: the slope against the error is known much better.
+    assert bias.beta[1] < 0.01
+    assert abs(bias.beta[0] - 0.8) < 4.0 * bias.beta[1]
+    of_model = np.mean(np.abs(field - wrong) ** 2)
+    slope = (np.conj(field - wrong) * (0.1 * field + 0.8 * wrong)).real.mean() / of_model
+    assert abs(bias.alpha_model[0] - slope) < 3.5 * bias.alpha_model[1]
+
+
+@pytest.mark.long
+def test_functionals_of_the_null_test_have_the_shear_without_bias():
+    """Galaxies of all kinds under a shear of 0.02 along x of the stack and its opposite, one noise."""
+    psf, many = gaussian(0.04 + 0.03j, 1.6), galaxies(120, seed=3, sersic=1.5)
+    many = Galaxies.concatenate([many, many.rotated(np.pi / 2)])
+    # The axes mirror and turn the sky: this is along x of the stack.
+    g = 0.02 * ellipticity_along(AXES, np.ones(1, dtype=complex))[0]
+    assert ellipticity_along(AXES, np.array([g]))[0] == pytest.approx(0.02)
+    stack, exposure = stack_of(psf, gaussian(0j, 1.6)), Exposure(exposures=100)
+    pair = [
+        measure_galaxies(
+            stack, AXES, many.sheared(s * g.real, s * g.imag), exposure, 1, "noise", reach=ARCMIN
         )
-    found = psf_leakage(stack, parts)
-    for kind, expected in (("model", 0.3), ("true", 0.1)):
-        value, error = found[kind]
-        assert abs(value - expected) < 3.0 * error
-        # Of 5600 galaxies: 0.02 sqrt(2) a galaxy over the PSF's rms.
-        assert error == pytest.approx(0.02 / np.sqrt(5600.0) / np.sqrt(np.mean(np.abs(field) ** 2)), rel=0.4)
+        for s in (1.0, -1.0)
+    ]  # fmt: skip
+    bias = shear_bias_of_functionals(pair[0].true_shear, pair[1].true_shear, 0.02, 0.0)
+    assert bias.m_error[0] < 3e-3
+    assert abs(bias.m[0]) < 4.0 * bias.m_error[0]
+    assert (np.abs(bias.c) < 4.0 * bias.c_error + 1e-3).all()
+    # A model without the ellipticity of the PSF leaves a part of it.
+    assert (shear_bias_of_functionals(pair[0].shear, pair[1].shear, 0.02, 0.0).c > 0.01).all()

@@ -11,6 +11,7 @@ from pachon.commands.cli import main
 from pachon.core.errors import DomainError
 from pachon.core.units import ARCMIN
 from pachon.measure.catalogue.objects import DetectedObjects
+from pachon.measure.shear.shear_shapes import ShearShapes
 from pachon.pipeline.run_folder import CONFIG_NAME
 from pachon.studies.visits.galaxy_shapes import GalaxyShapes
 from pachon.studies.visits.image_stack.measure import MeasuredTile, null_tests, selected_stars, tile_metrics
@@ -25,8 +26,21 @@ def shapes(index, e, usable):
     e = np.asarray(e)
     nothing = np.zeros(n)
     flags = np.asarray(usable, dtype=bool)
+    shear = ShearShapes(e.real, e.imag, flags + 0.0, nothing, flags + 0.0, flags + 0.0, nothing)
     return GalaxyShapes(
-        np.asarray(index), nothing, nothing, nothing, e.real, e.imag, nothing, flags, e.real, e.imag, flags
+        np.asarray(index),
+        nothing,
+        nothing,
+        nothing,
+        e.real,
+        e.imag,
+        nothing,
+        flags,
+        e.real,
+        e.imag,
+        flags,
+        shear,
+        shear,
     )
 
 

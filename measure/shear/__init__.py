@@ -1,0 +1,1 @@
+"""Shear from linear functionals of deconvolved images."""

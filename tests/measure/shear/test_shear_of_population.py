@@ -1,0 +1,45 @@
+"""Bias of the shear of the population of the sky, by the benchmarks: isolated galaxies, detection, blends."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
+NUMBER = r"([+-][\d.]+) \+- ([\d.]+)"
+
+
+def biases(script, *options):
+    """m and its error of each line that has them."""
+    command = [sys.executable, BENCHMARKS / script, *map(str, options)]
+    text = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    return [(float(m), float(error)) for m, error in re.findall(f"m = {NUMBER}", text)]
+
+
+@pytest.mark.slow
+def test_isolated_galaxies_at_the_depth_of_a_hundred_visits():
+    """With noise, and with a selection at S/N 10 too."""
+    found = biases("shear_estimator.py", "--galaxies", 16384, "--realisations", 16, "--seed", 4)
+    assert len(found) == 2
+    for m, error in found:
+        assert error < 4e-4
+        assert abs(m) < 1e-3 + 2.0 * error
+
+
+@pytest.mark.slow
+def test_isolated_galaxies_without_noise():
+    """The second order of a shear of 0.01 is all that is left: 0.5 g^2."""
+    (m, _), *_ = biases("shear_estimator.py", "--galaxies", 2048, "--realisations", 0)
+    assert 2e-5 < m < 1e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("radius", [0, 44])
+def test_detected_galaxies(radius):
+    """Detection alone, and discs of the sky with blends."""
+    options = ("--images", 6, "--discs", 24 if radius == 0 else 14, "--realisations", 2, "--shear", 0.02)
+    ((m, error),) = biases("shear_of_images.py", "--radius", radius, *options)
+    assert error < 0.01
+    assert abs(m) < 0.003 + 3.0 * error
