@@ -68,7 +68,7 @@ def made(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
         # Some hundred galaxies in place of ten thousand.
-        patch.setattr("pachon.studies.visits.null_test._FAINTEST_SNR", 60.0)
+        patch.setattr("pachon.studies.visits.null_test.FAINTEST_SNR", 60.0)
         patch.setattr("pachon.studies.reproduce.visits._FAINTEST", 25.0)
         return bench, reproduce(["all"], bench)
 
@@ -76,7 +76,7 @@ def made(tmp_path_factory):
 @pytest.fixture
 def few_galaxies(monkeypatch):
     """Some hundred galaxies in place of ten thousand."""
-    monkeypatch.setattr("pachon.studies.visits.null_test._FAINTEST_SNR", 60.0)
+    monkeypatch.setattr("pachon.studies.visits.null_test.FAINTEST_SNR", 60.0)
     monkeypatch.setattr("pachon.studies.reproduce.visits._FAINTEST", 25.0)
 
 

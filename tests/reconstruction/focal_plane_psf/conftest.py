@@ -18,15 +18,17 @@ def one_thread_of_linear_algebra():
 
 @pytest.fixture(scope="session")
 def part():
-    """A camera of some rafts of the LSST's: ``part("R22", "R23")``, or of the first few CCDs of these."""
+    """A camera of some rafts on the LSST's grid: ``part("R22", "R23")``, or of the first few CCDs of these.
+
+    CCDs are squares, and columns of the grid follow one another along x.
+    """
 
     def of(*rafts, count=None):
         whole = load_camera("lsst")
         keep = [i for i, raft in enumerate(whole.raft_of) if raft in rafts][:count]
         index = np.array([rafts.index(whole.raft_of[i]) for i in keep])
         names = tuple(whole.ccd_names[i] for i in keep)
-        pixels = whole.pixels[keep]
-        return Camera("part", names, rafts, index, whole.centers[keep], pixels, whole.pixel_size, transposed=True)
+        return Camera("part", names, rafts, index, whole.centers[keep][:, ::-1], np.array([4096, 4096]), 10e-6)
 
     return of
 
