@@ -12,6 +12,7 @@ the best weights, and on turbulent ones it is better (docs/psf_models.md).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
@@ -36,6 +37,14 @@ _SKY_PASSES = 3
 _LEAST_OWN = 0.05
 # Least noise over that of the faintest star.
 _LEAST_SKY = 1e-12
+# Lags of pixels whose noise may be correlated, as by resampling; one of each pair of opposite ones.
+_LAGS = [(dy, dx) for dy in range(3) for dx in range(-2, 3) if (dy, dx) > (0, 0)]
+# Standard errors of a correlation that counts: by chance none of the twelve lags of a CCD in a thousand.
+_SIGNIFICANT = 5.0
+# Standard deviations of sky pixels that tell the correlation.
+_CLIP = 4.0
+# Least variance over that without correlation.
+_LEAST_FACTOR = 0.1
 # Variance of a star's noise over that of its shape, at least: stars without noise would make the covariance singular.
 _LEAST_NOISE = 1e-6
 #: Stars of fewer photons are not in electrons.
@@ -169,7 +178,38 @@ def star_noise(
                 "electrons, gain in electrons a unit, or gain = None for no photon noise"
             )
         noise = noise + (filters**2 @ np.maximum(mean.ravel(), 0.0)) / electrons[:, None]
-    return noise
+    return noise * _correlation_factors(deviations.reshape(-1, *mean.shape), sky.reshape(mean.shape), masked, filters)
+
+
+def _correlation_factors(
+    deviations: np.ndarray, sky: np.ndarray, masked: np.ndarray | None, filters: np.ndarray
+) -> np.ndarray:
+    """Return the variances of the shape numbers over those of noise without correlation of pixels, [3].
+
+    The correlation of pixels of sky `sky` [ny, nx] of all stars together, deviations [n, ny, nx], counts where it is
+    significant, as after resampling.
+    """
+    pixels = deviations - np.median(deviations, axis=0)
+    pixels = (
+        pixels
+        / np.maximum(RMS_PER_MAD * np.median(np.abs(pixels[:, sky]), axis=1), np.finfo(float).tiny)[:, None, None]
+    )
+    # Cosmic rays and neighbours would correlate.
+    used = (np.abs(pixels) < _CLIP) & sky & (True if masked is None else ~masked)
+    pixels = np.where(used, pixels, 0.0)
+    ny, nx = sky.shape
+    images = filters.reshape(-1, ny, nx)
+    factors = np.ones(len(filters))
+    square = (pixels**2).sum() / max(used.sum(), 1)
+    for dy, dx in _LAGS if square > 0.0 else ():
+        first = slice(0, ny - dy), slice(max(0, -dx), nx - max(0, dx))
+        second = slice(dy, ny), slice(max(0, dx), nx + min(0, dx))
+        count = max((used[:, *first] & used[:, *second]).sum(), 1)
+        correlation = (pixels[:, *first] * pixels[:, *second]).sum() / (count * square)
+        if abs(correlation) > _SIGNIFICANT / math.sqrt(count):
+            overlap = (images[:, *first] * images[:, *second]).sum(axis=(1, 2))
+            factors += 2.0 * correlation * overlap / (images**2).sum(axis=(1, 2))
+    return np.maximum(factors, _LEAST_FACTOR)
 
 
 def _sky_variance(outer: np.ndarray, masked: np.ndarray | None = None) -> np.ndarray:
