@@ -48,6 +48,8 @@ _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
     "dec": ("DEC", _DEG, "declination, ICRS, without refraction"),
     "e1_sky": ("E1_SKY", _NONE, "E1, E2 on the sky, > 0 from east to west"),
     "e2_sky": ("E2_SKY", _NONE, "likewise, > 0 from north-west to south-east"),
+    "g1_sky": ("G1_SKY", _NONE, "G1, G2 on the sky, > 0 from east to west"),
+    "g2_sky": ("G2_SKY", _NONE, "likewise, > 0 from north-west to south-east"),
     "magnitude": ("MAG", _Unit("mag", 1.0), "AB magnitude"),
     "electrons": ("ELECTRON", _Unit("electron", 1.0), "electrons of the star in the exposure"),
     "snr": ("SNR", _NONE, "signal to noise of PSF photometry"),
@@ -98,8 +100,8 @@ class Stars:
     """Positions and shapes, one array element a star.
 
     e and size are those of moments under a round weight (:func:`~.measure_shapes`), g and sigma those of adaptive
-    ones (:func:`~.adaptive_moments`), as DES, HSC and Rubin have them. ``ra``, ``dec``, ``e1_sky`` and ``e2_sky`` are
-    None without a pointing; the latter are e1 and e2 along the axes of the sky, as :func:`~pachon.to_sky` has them.
+    ones (:func:`~.adaptive_moments`), as DES, HSC and Rubin have them. ``ra``, ``dec`` and those that end in ``_sky``
+    are None without a pointing; the latter are along the axes of the sky, as :func:`~pachon.to_sky` has them.
     Where the model is one of the whole focal plane, ``ccd_`` has the ellipticity and size [rad] of the CCD's own model,
     and ``sigma_`` the uncertainty (standard deviation) that the focal-plane model predicts of its own; else all are
     None.
@@ -127,6 +129,8 @@ class Stars:
     dec: np.ndarray | None = field(default=None, kw_only=True)
     e1_sky: np.ndarray | None = field(default=None, kw_only=True)
     e2_sky: np.ndarray | None = field(default=None, kw_only=True)
+    g1_sky: np.ndarray | None = field(default=None, kw_only=True)
+    g2_sky: np.ndarray | None = field(default=None, kw_only=True)
     ccd_e1: np.ndarray | None = field(default=None, kw_only=True)
     ccd_e2: np.ndarray | None = field(default=None, kw_only=True)
     ccd_size: np.ndarray | None = field(default=None, kw_only=True)

@@ -63,6 +63,7 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
     x, y = experiment.camera.centers[experiment.camera.ccd_index(name)]
     # Like e, g is not that of a star with a defect.
     clean_stars = np.where((observation.defects == 0)[:, None, None], observation.images, np.nan)
+    holdout_moments, star_moments = adaptive_of(holdout_images), adaptive_of(clean_stars)
     return CcdProduct(
         name=name,
         center=(float(x), float(y)),
@@ -71,15 +72,15 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         holdout=HoldoutStars(
             **_position_columns(experiment, positions.holdout, holdout.fields),
             **_shape_columns(holdout_shapes, shapes_of(holdout_models)),
-            **_sky_columns(experiment, positions.holdout, holdout_shapes),
-            **_adaptive_columns(adaptive_of(holdout_images), adaptive_of(holdout_models)),
+            **_adaptive_columns(holdout_moments, adaptive_of(holdout_models)),
+            **_sky_columns(experiment, positions.holdout, holdout_shapes, holdout_moments),
             fwhm=fwhm(holdout.image, holdout.pixel_scale),
         ),
         observed=ObservedStars(
             **_position_columns(experiment, stars.observed, observed.fields),
             **_shape_columns(observation.shapes, shapes_of(star_models)),
-            **_sky_columns(experiment, stars.observed, observation.shapes),
-            **_adaptive_columns(adaptive_of(clean_stars), adaptive_of(star_models)),
+            **_adaptive_columns(star_moments, adaptive_of(star_models)),
+            **_sky_columns(experiment, stars.observed, observation.shapes, star_moments),
             **_leave_one_out_columns(used, shapes_of(left_out_models), adaptive_of(left_out_models)),
             magnitude=stars.magnitude,
             electrons=electrons,
@@ -123,7 +124,9 @@ def _position_columns(experiment: Experiment, positions: np.ndarray, fields: np.
     return columns
 
 
-def _sky_columns(experiment: Experiment, positions: np.ndarray, shapes: Shapes) -> dict[str, np.ndarray]:
+def _sky_columns(
+    experiment: Experiment, positions: np.ndarray, shapes: Shapes, adaptive: AdaptiveMoments
+) -> dict[str, np.ndarray]:
     """Return ellipticities along the axes of the sky at positions on the detector [m]; none without a pointing."""
     aim, wavelengths = experiment.pointing, experiment.wavelengths
     if aim is None:
@@ -135,7 +138,8 @@ def _sky_columns(experiment: Experiment, positions: np.ndarray, shapes: Shapes) 
 
     _, jacobians = jacobians_on_sky(celestial_of, positions, _SKY_STEP)
     e1, e2 = along_sky(shapes.e1, shapes.e2, jacobians)
-    return {"e1_sky": e1, "e2_sky": e2}
+    g1, g2 = along_sky(adaptive.g1, adaptive.g2, jacobians)
+    return {"e1_sky": e1, "e2_sky": e2, "g1_sky": g1, "g2_sky": g2}
 
 
 def _shape_columns(measured: Shapes, model: Shapes) -> dict[str, np.ndarray]:

@@ -103,7 +103,8 @@ class PsfStack(Result):
     """
 
     _table = ("xi", "eta", "star", "count", "e1", "e2", "size", "model_e1", "model_e2", "model_size",
-              "e1_sky", "e2_sky", "g1", "g2", "model_g1", "model_g2", "relative_size_residual")  # fmt: skip
+              "e1_sky", "e2_sky", "g1", "g2", "model_g1", "model_g2", "g1_sky", "g2_sky",
+              "relative_size_residual")  # fmt: skip
     _images = ("true", "model")
 
     visits: int
@@ -194,19 +195,29 @@ class PsfStack(Result):
     @property
     def e1_sky(self) -> np.ndarray:
         """Ellipticity of the true PSF on the sky, > 0 from east to west."""
-        return self._along_sky()[0]
+        return self._along_sky(self.e1, self.e2)[0]
 
     @property
     def e2_sky(self) -> np.ndarray:
         """Ellipticity of the true PSF on the sky, > 0 from north-west to south-east."""
-        return self._along_sky()[1]
+        return self._along_sky(self.e1, self.e2)[1]
 
-    def _along_sky(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the ellipticities of the true PSF along west and north of the tangent plane."""
+    @property
+    def g1_sky(self) -> np.ndarray:
+        """Ellipticity g of adaptive moments of the true PSF on the sky, > 0 from east to west."""
+        return self._along_sky(self.g1, self.g2)[0]
+
+    @property
+    def g2_sky(self) -> np.ndarray:
+        """Ellipticity g of adaptive moments of the true PSF on the sky, > 0 from north-west to south-east."""
+        return self._along_sky(self.g1, self.g2)[1]
+
+    def _along_sky(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return ellipticities along the axes of the stack along west and north of the tangent plane."""
         # The axes of the stack are those of the plane, turned and mirrored.
         along_stack, plane = np.stack([self.x, self.y], axis=1), np.stack([-self.xi, self.eta], axis=1)
         jacobian = np.linalg.lstsq(along_stack, plane, rcond=None)[0].T
-        return along_sky(self.e1, self.e2, np.broadcast_to(jacobian, (len(self), 2, 2)))
+        return along_sky(first, second, np.broadcast_to(jacobian, (len(self), 2, 2)))
 
     @cached_property
     def adaptive(self) -> tuple[AdaptiveMoments, AdaptiveMoments]:
@@ -270,6 +281,8 @@ class PsfStack(Result):
             | {
                 "E1_SKY": (self.e1_sky, "", "E1, E2 on the sky, > 0 from east to west"),
                 "E2_SKY": (self.e2_sky, "", "likewise, > 0 from north-west to south-east"),
+                "G1_SKY": (self.g1_sky, "", "G1, G2 on the sky, > 0 from east to west"),
+                "G2_SKY": (self.g2_sky, "", "likewise, > 0 from north-west to south-east"),
             },
         )
         images = [image_hdu("TRUE", self.true, "true PSFs"), image_hdu("MODEL", self.model, "PSFs of the models")]

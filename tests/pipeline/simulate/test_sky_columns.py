@@ -1,5 +1,7 @@
 """Ellipticities on the sky in the products of a run with a pointing, against the world coordinates of its CCDs."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -17,17 +19,19 @@ def test_ellipticities_are_those_of_the_pixels_carried_by_the_wcs(tiny, ccd):
     camera, rng = experiment.camera, np.random.default_rng(1)
     index, pixels = camera.ccd_index(ccd), rng.uniform(0.0, 4000.0, (10, 2))
     e1, e2 = rng.normal(0.0, 0.05, (2, 10))
-    shapes = Shapes(e1, e2, *[np.zeros(10)] * 5)
-    columns = _sky_columns(experiment, camera.from_pixel(index, pixels), shapes)
+    g1, g2 = rng.normal(0.0, 0.1, (2, 10))
+    shapes, moments = Shapes(e1, e2, *[np.zeros(10)] * 5), SimpleNamespace(g1=g1, g2=g2)
+    columns = _sky_columns(experiment, camera.from_pixel(index, pixels), shapes, moments)
     light = experiment.wavelengths[len(experiment.wavelengths) // 2]
     center, roll = np.deg2rad([AIM["ra_deg"], AIM["dec_deg"]]), np.deg2rad(AIM["position_angle_deg"])
     wcs = pachon.wcs(experiment.telescope, ccd, center, roll, wavelength=light)
     # The pixels' x and y are y and x of the focal plane: e1 changes its sign, e2 does not.
-    expected = pachon.to_sky(np.stack([-e1, e2], axis=1), wcs, *pixels.T)
-    assert np.allclose(columns["e1_sky"], expected.g1_sky, rtol=0, atol=1e-7)
-    assert np.allclose(columns["e2_sky"], expected.g2_sky, rtol=0, atol=1e-7)
+    for kind, first, second in (("e", e1, e2), ("g", g1, g2)):
+        expected = pachon.to_sky(np.stack([-first, second], axis=1), wcs, *pixels.T)
+        assert np.allclose(columns[f"{kind}1_sky"], expected.g1_sky, rtol=0, atol=1e-7)
+        assert np.allclose(columns[f"{kind}2_sky"], expected.g2_sky, rtol=0, atol=1e-7)
 
 
 def test_without_a_pointing_there_are_none(tiny):
     experiment = Experiment.from_config(tiny(ccds=("R22_S11",)))
-    assert _sky_columns(experiment, np.zeros((1, 2)), Shapes(*np.zeros((7, 1)))) == {}
+    assert _sky_columns(experiment, np.zeros((1, 2)), Shapes(*np.zeros((7, 1))), None) == {}
