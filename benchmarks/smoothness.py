@@ -3,8 +3,8 @@
 Run: python benchmarks/smoothness.py [--stars 10,20,40,80,200] [--seeds N]
 
 Fields are constant, linear and quadratic over the CCD, and turbulent: a constant with a process that falls off
-exponentially over a quarter of the CCD. Stars are Moffat profiles, 4e3 to 4e5 electrons; polynomials have weights by the noise
-of each star. Rms errors are over all fields of a kind; the best is found with the truth.
+exponentially over a quarter of the CCD. Stars are Moffat profiles of 4e3 to 4e5 electrons; polynomials have weights by
+the noise of each star. Rms errors are over all fields of a kind; the best is found with the truth.
 """
 
 import argparse
