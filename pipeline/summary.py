@@ -105,6 +105,7 @@ def ccd_metrics(product: CcdProduct) -> dict[str, Any]:
         "pixels_rejected": product.model.n_rejected,
         "kink_observed": product.model.elbow,
         "kink_truth": product.noise_free_model.elbow,
+        **({"psf_smoothness": smoothness} if (smoothness := product.model.smoothness) else {}),
         **_common_metrics([product]),
     }
 
