@@ -9,7 +9,6 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError
-from ..core.units import ARCSEC
 from .inputs import load_model
 from .options import Basis, Components, Interpolation, Json, Order, Quiet, Recipe, Threads, Weights, recipe_of_options
 from .tables import Rows, print_json
@@ -99,6 +98,7 @@ def measure_command(
     - `pachon measure coadd.fits --weight coadd.weight.fits --gain 2.1 --zero-point 30`: what the header lacks
     """
     from ..core.files import make_folder
+    from ..core.units import ARCSEC
     from ..imaging.exposure_psf import fit_exposure_psf
     from ..imaging.image_formats.load import ImageSettings
     from ..imaging.measure_files import MeasureOptions, images_among, measure_files

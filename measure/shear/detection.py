@@ -179,7 +179,7 @@ def detect_shear(
     Raises
     ------
     DomainError
-        If shapes differ, a pixel that is not masked is not finite, the noise is not positive, places of several PSFs
+        If shapes differ, the noise is not positive, places of several PSFs
         are missing, or a PSF is too wide for the weight.
     """
     pixels, _, ignored = check_pixels(image, 1.0, mask)

@@ -82,7 +82,8 @@ class Covariances:
     @property
     def kernel(self) -> np.ndarray:
         """Mean of the kernels by probability, [n_columns], with the length that they share."""
-        return np.asarray(self.probabilities @ self.kernels)
+        # Form by form: the rounding of a product of matrices depends on how they lie in memory.
+        return np.asarray(sum(probability * kernel for kernel, probability in self.weighted()))
 
     def weighted(self) -> Iterator[tuple[np.ndarray, float]]:
         """Yield the kernel and the probability of each form."""
