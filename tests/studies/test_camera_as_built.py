@@ -100,7 +100,7 @@ def test_a_sweep_over_heights_and_silicon(tmp_path, monkeypatch):
     (tmp_path / "both.yaml").write_text(yaml.safe_dump(sweep, sort_keys=False))
     assert main(["sweep", "both.yaml", "--processes", "1", "--threads", "1", "--quiet"]) == 0
     with SweepStore(tmp_path / "both.sweep") as store:
-        found = [r.metrics["fwhm_arcsec"] for r in store.results()]
+        found = [r.metrics["effective_fwhm_arcsec"] for r in store.results()]
     assert len(found) == 4
     states = [(p, s) for p in (pachon.FocalPlane.flat(camera), plane) for s in (None, Silicon())]
     psfs = [at_centres(camera, p, s) for p, s in states]

@@ -235,7 +235,8 @@ def test_a_written_model_is_the_same(which, tmp_path, request):
 @pytest.mark.long
 def test_a_written_model_has_its_silicon(tmp_path, aligned):
     optics = aligned.field.optics
-    instrument = replace(optics.instrument, silicon=Silicon(80e-6, 180.0))
+    stamps = replace(optics.instrument.stamps, silicon=Silicon(80e-6, 180.0))
+    instrument = replace(optics.instrument, stamps=stamps)
     model = replace(aligned, field=replace(aligned.field, optics=replace(optics, instrument=instrument)))
     model.write(tmp_path / "silicon.fits")
     assert FocalPlanePsf.read(tmp_path / "silicon.fits").field.optics.instrument.stamps.silicon == Silicon(80e-6, 180.0)
