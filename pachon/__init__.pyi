@@ -132,6 +132,7 @@ from .measure.catalogue.star_locus import StarCut as StarCut
 from .measure.catalogue.star_locus import StarSelection as StarSelection
 from .measure.catalogue.star_locus import select_stars as select_stars
 from .measure.correlation import Correlation as Correlation
+from .measure.correlation import SeparationBins as SeparationBins
 from .measure.correlation import shear_correlation as shear_correlation
 from .measure.rho_statistics import RhoStatistics as RhoStatistics
 from .measure.rho_statistics import rho_statistics as rho_statistics

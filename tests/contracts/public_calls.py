@@ -149,7 +149,7 @@ class _Made:
         return pachon.Atmosphere.from_site("cerro_pachon", 1, exposure=0.5, time_step=0.5, screens=screens)
 
     def make_correlation(self):
-        return pachon.shear_correlation(**self.columns, min_sep=1e-3, max_sep=1e-1, n_bins=3)
+        return pachon.shear_correlation(**self.columns, bins=pachon.SeparationBins(1e-3, 1e-1, 3))
 
     def make_columns(self):
         rng = np.random.default_rng(4)
@@ -202,7 +202,7 @@ def calls(folder):
     mono = design | {"wavelength": w}
     images = {"telescope": tel, "fields": on_axis, "wavelengths": [w], "threads": 1}
     one = {"telescope": tel, "wavelength": w, "projection": "zemax", "threads": 1}
-    pairs = m.columns | {"min_sep": 1e-3, "max_sep": 1e-1, "n_bins": 3, "exact": False}
+    pairs = m.columns | {"bins": pachon.SeparationBins(1e-3, 1e-1, 3, exact=False)}
     sizes = {"size": np.full(30, 1e-6), "model_e1": pairs["e1"] * 0.9, "model_e2": pairs["e2"] * 0.9,
              "model_size": np.full(30, 1.1e-6)}  # fmt: skip
     made = {
@@ -346,6 +346,7 @@ def calls(folder):
                          "bright_snr": 60.0, "n_sigma": 4.0, "max_ellipticity": 0.1, "isolation": 5.0, "min_stars": 3,
                          "size": 15, "mask": np.zeros(flat.shape, int)}),
         "load_configuration": (pachon.load_configuration, {"path": m.folder / "none.yaml"}),
+        "SeparationBins": (pachon.SeparationBins, {"min_sep": 1e-3, "max_sep": 1e-1, "n_bins": 3, "exact": False}),
         "shear_correlation": (pachon.shear_correlation, pairs | {"subtract_mean": False,
                               "patch": np.repeat([0, 1, 2], 10)}),
         "rho_statistics": (pachon.rho_statistics, pairs | sizes | {"patch": np.repeat([0, 1, 2], 10)}),

@@ -170,11 +170,11 @@ def test_masked_stars_and_pixels():
     """Masked stars are left out of correlations; masked pixels of stars have no weight in moments and fits."""
     rng = np.random.default_rng(1)
     x, y, e1, e2 = rng.uniform(-0.01, 0.01, (4, 200))
-    bins = {"min_sep": 1e-3, "max_sep": 1e-2, "n_bins": 3, "exact": True}
+    bins = pachon.SeparationBins(1e-3, 1e-2, 3, exact=True)
     outlier = np.arange(200) >= 150
     spoilt = np.ma.masked_array(np.where(outlier, 100.0, e1), mask=outlier)
-    found = pachon.shear_correlation(x, y, spoilt, e2, **bins)
-    alone = pachon.shear_correlation(x[:150], y[:150], e1[:150], e2[:150], **bins)
+    found = pachon.shear_correlation(x, y, spoilt, e2, bins)
+    alone = pachon.shear_correlation(x[:150], y[:150], e1[:150], e2[:150], bins)
     np.testing.assert_array_equal(found.xi_plus, alone.xi_plus)
     grid = np.mgrid[-7:8, -7:8]
     stamps = np.stack([np.exp(-0.5 * (grid**2).sum(axis=0) / w**2) for w in (1.5, 1.8, 2.0)])
