@@ -275,6 +275,7 @@ from .reconstruction.piff.psf import PiffPsf as PiffPsf
 from .reconstruction.piff.psf import load_piff as load_piff
 from .reconstruction.psf_model.kriging import Kriging as Kriging
 from .reconstruction.psf_model.model import PsfModel as PsfModel
+from .reconstruction.psf_model.outliers import SigmaClipping as SigmaClipping
 from .reconstruction.psf_model.pixels import Pixels as Pixels
 from .reconstruction.psf_model.polynomial_fit import Polynomial as Polynomial
 from .reconstruction.psf_model.principal_components import PrincipalComponents as PrincipalComponents

@@ -1,10 +1,11 @@
 """Arguments are checked by their annotations: what passes is unchanged, what does not is one line with its name."""
 
+import inspect
 import pickle
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypedDict, Unpack
 
 import numpy as np
 import pytest
@@ -219,3 +220,24 @@ def test_a_name_in_place_of_a_telescope_is_told_what_loads_it():
     assert (
         str(caught.value) == "telescope = 'lsst_v3.3_r': expected a Telescope, as of pachon.load_telescope or a Request"
     )
+
+
+class _Sizes(TypedDict, total=False):
+    width: float | None
+    kind: Literal["round", "square"] | None
+
+
+@check_arguments
+def _area(factor: float, **sizes: Unpack[_Sizes]) -> float:
+    return factor * sizes["width"] ** 2
+
+
+def test_unpacked_keywords_are_checked_and_shown_as_parameters():
+    assert list(inspect.signature(_area).parameters) == ["factor", "width", "kind"]
+    assert _area(2.0, width=3.0, kind="round") == 18.0
+    with pytest.raises(DomainError, match=r"^width = 'wide': expected a number$"):
+        _area(2.0, width="wide")
+    with pytest.raises(ConfigError, match=r"^kind = 'oval': expected one of round, square$"):
+        _area(2.0, kind="oval")
+    with pytest.raises(TypeError, match=r"_area\(\) got an unexpected keyword argument 'height'"):
+        _area(2.0, height=1.0)
