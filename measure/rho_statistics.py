@@ -143,7 +143,7 @@ def rho_statistics(
     e, de, w = (s1, s2), (s1 - m1, s2 - m2), (s1 * growth, s2 * growth)
 
     def correlate(f: tuple[np.ndarray, np.ndarray], g: tuple[np.ndarray, np.ndarray] | None = None) -> Correlation:
-        return shear_correlation(x, y, *f, bins, other=g, patch=patch)
+        return shear_correlation(x, y, *f, bins=bins, other=g, patch=patch)
 
     return RhoStatistics(correlate(de), correlate(e, de), correlate(w), correlate(de, w), correlate(e, w))
 

@@ -50,7 +50,7 @@ def correlations(
                 continue
             if patch is not None and np.ptp(patch[usable]) == 0:
                 patch = None
-        result[kind] = shear_correlation(x, y, *values, bins, patch=patch)
+        result[kind] = shear_correlation(x, y, *values, bins=bins, patch=patch)
     return result
 
 

@@ -165,7 +165,7 @@ def star_rho_statistics(places: np.ndarray, stars: Shapes, model: Shapes, bins: 
         limits = f"{least:g} to {LARGEST_SEPARATION:.4g} rad, with positions in pixels"
         raise DomainError(f"positions: the stars lie within {longest:g} rad; expected {limits}", key="positions")
     separation_bins = SeparationBins(longest / _LONGEST_OVER_SHORTEST, longest, bins)
-    return rho_statistics(x, y, *star_values, *model_values, separation_bins)
+    return rho_statistics(x, y, *star_values, *model_values, bins=separation_bins)
 
 
 def _of_all(counts: np.ndarray, used: np.ndarray) -> np.ndarray:

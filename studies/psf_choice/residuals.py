@@ -103,7 +103,7 @@ def residual_correlations(fields: list[np.ndarray], residuals: list[np.ndarray])
     x, y = np.concatenate(fields).T
     e = np.concatenate(residuals, axis=1)[:2]
     patch = np.repeat(np.arange(len(fields)), [len(f) for f in fields])
-    correlation = shear_correlation(x, y, *e, _BINS, patch=patch)
+    correlation = shear_correlation(x, y, *e, bins=_BINS, patch=patch)
     return correlation.xi_plus, correlation.leave_one_out_plus
 
 

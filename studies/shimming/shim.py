@@ -356,7 +356,7 @@ def _state_metrics(
 ) -> tuple[StateMetrics, Correlation]:
     """Return means of values [n, 3] at places, and the correlation of their ellipticities."""
     bins = SeparationBins(edges[0], edges[-1], len(edges) - 1)
-    correlation = shear_correlation(*sky.T, *values[:, 1:].T, bins, weight=places.weight)
+    correlation = shear_correlation(*sky.T, *values[:, 1:].T, bins=bins, weight=places.weight)
     rms_xi = float(np.sqrt(np.nanmean(correlation.xi_plus**2)))
     rms_e = places.mean((values[:, 1:] ** 2).sum(axis=1)) ** 0.5
     return StateMetrics(places.mean(values[:, 0]), rms_e, rms_xi), correlation
