@@ -128,6 +128,7 @@ from .measure.catalogue.objects import DetectedObjects as DetectedObjects
 from .measure.catalogue.objects import ObjectFlag as ObjectFlag
 from .measure.catalogue.shear_calibration import ShearCalibration as ShearCalibration
 from .measure.catalogue.shear_calibration import shear_calibration as shear_calibration
+from .measure.catalogue.star_locus import LocusSearch as LocusSearch
 from .measure.catalogue.star_locus import StarCut as StarCut
 from .measure.catalogue.star_locus import StarSelection as StarSelection
 from .measure.catalogue.star_locus import select_stars as select_stars
