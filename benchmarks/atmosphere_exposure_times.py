@@ -62,7 +62,7 @@ def study(seeds: int, stars: int) -> tuple[dict, np.ndarray]:
         for (lift, t), row in table.items():
             e = ellipticities(exposed(longest, t, lift), fields)
             correlations = [
-                pachon.shear_correlation(*fields.T, e.real, e.imag, BINS, subtract_mean=subtract)
+                pachon.shear_correlation(*fields.T, e.real, e.imag, bins=BINS, subtract_mean=subtract)
                 for subtract in (False, True)
             ]
             row["mean"].append(np.mean(np.abs(e)))

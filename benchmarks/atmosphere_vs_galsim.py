@@ -131,8 +131,8 @@ def summary(fields: np.ndarray, first: np.ndarray, second: np.ndarray, width: np
     """Return the statistics of one seed from ellipticities [exposure, star], measured twice, and widths."""
     centred = [e - e.mean(axis=1, keepdims=True) for e in (first, second)]
     both = 0.5 * (first + second)
-    xi = [pachon.shear_correlation(*fields.T, e.real, e.imag, BINS) for e in both]
-    within = [pachon.shear_correlation(*fields.T, e.real, e.imag, BINS, subtract_mean=True) for e in both]
+    xi = [pachon.shear_correlation(*fields.T, e.real, e.imag, bins=BINS) for e in both]
+    within = [pachon.shear_correlation(*fields.T, e.real, e.imag, bins=BINS, subtract_mean=True) for e in both]
     return {
         "fwhm": width.mean() / ARCSEC,
         "variance": np.mean((first * second.conj()).real),

@@ -98,8 +98,8 @@ def rho_statistics(
     model_e1: ArrayLike,
     model_e2: ArrayLike,
     model_size: ArrayLike,
-    bins: SeparationBins,
     *,
+    bins: SeparationBins,
     patch: Any = None,
 ) -> RhoStatistics:
     """Compute the rho statistics 1 to 5 of a PSF model (Rowe 2010; Jarvis et al. 2016, sec. 3.4).

@@ -190,7 +190,7 @@ class Scene:
         longest = max(float(np.hypot(*np.ptp(fields, axis=0))), 2.0 * SHORTEST_ARCMIN * ARCMIN)
         x, y = to_detector_axes(fields.T, self.camera_experiment.rotator)
         bins = SeparationBins(SHORTEST_ARCMIN * ARCMIN, longest, _CORRELATION_BINS)
-        return shear_correlation(x, y, first, second, bins)
+        return shear_correlation(x, y, first, second, bins=bins)
 
 
 def one_digit(value: float) -> float:

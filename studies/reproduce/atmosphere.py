@@ -183,7 +183,7 @@ def ellipticity(bench: Bench) -> Reproduced:
                     pairs[:, 1],
                     e_pairs.real,
                     e_pairs.imag,
-                    SeparationBins(*_SEPARATIONS, _BINS),
+                    bins=SeparationBins(*_SEPARATIONS, _BINS),
                 )
             )
             mean_e[time].append(float(np.abs(e_pairs).mean()))

@@ -58,7 +58,7 @@ def correlations(
             y[rows],
             e1[rows],
             e2[rows],
-            bins,
+            bins=bins,
             patch=patch[rows] if several else None,
         )
     return correlated

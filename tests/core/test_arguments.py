@@ -174,8 +174,8 @@ def test_masked_stars_and_pixels():
     bins = pachon.SeparationBins(1e-3, 1e-2, 3, exact=True)
     outlier = np.arange(200) >= 150
     spoilt = np.ma.masked_array(np.where(outlier, 100.0, e1), mask=outlier)
-    found = pachon.shear_correlation(x, y, spoilt, e2, bins)
-    alone = pachon.shear_correlation(x[:150], y[:150], e1[:150], e2[:150], bins)
+    found = pachon.shear_correlation(x, y, spoilt, e2, bins=bins)
+    alone = pachon.shear_correlation(x[:150], y[:150], e1[:150], e2[:150], bins=bins)
     np.testing.assert_array_equal(found.xi_plus, alone.xi_plus)
     grid = np.mgrid[-7:8, -7:8]
     stamps = np.stack([np.exp(-0.5 * (grid**2).sum(axis=0) / w**2) for w in (1.5, 1.8, 2.0)])

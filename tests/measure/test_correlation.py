@@ -80,7 +80,9 @@ def test_unusable_stars_are_dropped():
 
 
 def test_empty_bins_are_nan():
-    c = shear_correlation([0.0, ARCMIN], [0.0, 0.0], [0.1, 0.1], [0.0, 0.0], SeparationBins(0.5 * ARCMIN, 50 * ARCMIN))
+    c = shear_correlation(
+        [0.0, ARCMIN], [0.0, 0.0], [0.1, 0.1], [0.0, 0.0], bins=SeparationBins(0.5 * ARCMIN, 50 * ARCMIN)
+    )
     assert (c.n_pairs == 0).sum() == 19
     for values in (c.xi_plus, c.xi_minus, c.error_plus, c.error_minus):
         assert np.isnan(values).sum() == 19
@@ -94,7 +96,7 @@ def test_shot_noise_error():
         rng = np.random.default_rng(seed)
         x, y = rng.uniform(0.0, 60 * ARCMIN, (2, 100))
         e1, e2 = rng.normal(0.0, 0.02, (2, 100))
-        results.append(shear_correlation(x, y, e1, e2, SeparationBins(10 * ARCMIN, 60 * ARCMIN, 1)))
+        results.append(shear_correlation(x, y, e1, e2, bins=SeparationBins(10 * ARCMIN, 60 * ARCMIN, 1)))
     scatter = np.std([c.xi_plus[0] for c in results])
     claimed = np.mean([c.error_plus[0] for c in results])
     assert scatter / claimed == pytest.approx(1.0, abs=0.2)  # 200 fields: 5 % each, four sigma
@@ -121,7 +123,9 @@ def test_same_bytes_again(exact):
 def test_quantities():
     x, y, e1, e2 = catalogue()
     c = shear_correlation(x, y, e1, e2, bins=BINS)
-    q = shear_correlation(x * u.rad, y * u.rad, e1, e2, SeparationBins(1.0 * u.arcmin, 60.0 * u.arcmin, BINS.n_bins))
+    q = shear_correlation(
+        x * u.rad, y * u.rad, e1, e2, bins=SeparationBins(1.0 * u.arcmin, 60.0 * u.arcmin, BINS.n_bins)
+    )
     np.testing.assert_allclose(q.xi_plus, c.xi_plus, rtol=1e-9)  # bin edges differ by rounding
 
 
@@ -279,11 +283,11 @@ for options, _ in {BEYOND_RANGES!r}:
         (pachon.rho_statistics, (e1, e2, size, 0.9 * e1, 0.9 * e2, size)),
     ):
         try:
-            call(x, y, *columns, pachon.SeparationBins(**options))
+            call(x, y, *columns, bins=pachon.SeparationBins(**options))
         except pachon.PachonError as error:
             print(error)
 # The widest range of all, with two stars at one place.
-print(pachon.shear_correlation(x, y, e1, e2, pachon.SeparationBins(1e-12, 6.28, 1000)).n_pairs.sum())
+print(pachon.shear_correlation(x, y, e1, e2, bins=pachon.SeparationBins(1e-12, 6.28, 1000)).n_pairs.sum())
 """
 
 

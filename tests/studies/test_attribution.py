@@ -72,7 +72,7 @@ def test_error_of_a_change_is_its_own_jackknife():
     e, f = rng.normal(0.0, 0.02, (2, 2, 36))
 
     def long_range(ellipticity, keep):
-        c = shear_correlation(x[keep], y[keep], *ellipticity[:, keep], bins)
+        c = shear_correlation(x[keep], y[keep], *ellipticity[:, keep], bins=bins)
         inside = (c.r_arcmin >= 10.0) & (c.r_arcmin < 180.0) & (c.n_pairs > 0)
         return np.sum(c.n_pairs[inside] * c.xi_plus[inside]) / c.n_pairs[inside].sum()
 
@@ -80,7 +80,7 @@ def test_error_of_a_change_is_its_own_jackknife():
     expected = np.sqrt(2.0 / 3.0 * np.sum((left - np.mean(left)) ** 2))
     kinds = ("truth", "observed", "residual", "away")
     keys = {f"xi_plus_{kind}_{name}": 0.0 for kind in kinds for name in SEPARATION_RANGES}
-    one, other = (dict.fromkeys(kinds, shear_correlation(x, y, *v, bins, patch=patch)) for v in (e, f))
+    one, other = (dict.fromkeys(kinds, shear_correlation(x, y, *v, bins=bins, patch=patch)) for v in (e, f))
     found = changes(keys, keys, one, other)
     assert found["error_xi_plus_away_long"] == pytest.approx(expected, rel=1e-9)  # sums in another order
     # Stars and their mates in the other case are the same: what both have in common is in no error.

@@ -113,7 +113,7 @@ def test_pair_sums_are_those_of_treecorr_and_their_derivatives_finite_difference
     pairs = PairSum.of(sky, weight, edges)
     expected = pair_by_pair(sky, weight, e, edges)
     assert pairs.xi_plus(e) == pytest.approx(expected, rel=1e-12)
-    found = shear_correlation(*sky.T, *e.T, SeparationBins(edges[0], edges[-1], 8), weight=weight)
+    found = shear_correlation(*sky.T, *e.T, bins=SeparationBins(edges[0], edges[-1], 8), weight=weight)
     # TreeCorr keeps ellipticities in single precision.
     assert found.xi_plus[found.n_pairs > 0] == pytest.approx(expected, abs=1e-7 * (e**2).sum(axis=1).mean())
     value, slope = pairs.mean_square(e)

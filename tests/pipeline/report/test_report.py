@@ -179,7 +179,7 @@ def test_lines_of_the_paper_are_for_the_lsst(monkeypatch):
     rng = np.random.default_rng(1)
     fields = rng.uniform(-0.01, 0.01, (200, 2))
     e1, e2 = 0.01 * rng.standard_normal((2, 200))
-    correlation = shear_correlation(*fields.T, e1, e2, SeparationBins(1e-4, 1e-2, 5))
+    correlation = shear_correlation(*fields.T, e1, e2, bins=SeparationBins(1e-4, 1e-2, 5))
     for paper in (True, False):
         statistics_plots.correlation_plot({"truth": correlation}, paper)
     lines = [[t.get_text() for t in f.axes[0].texts if t.get_text().startswith("paper")] for f in figures]
