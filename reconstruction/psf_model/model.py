@@ -38,6 +38,15 @@ CLIPPING = SigmaClipping()
 _SHOWN = 5
 
 
+class ModelOptions(RecipeKeys, total=False):
+    """Options of :meth:`PsfModel.fit` that hold for any stars of a CCD."""
+
+    recipe: str | Recipe | None
+    weights: Literal["noise"] | None
+    clipping: SigmaClipping | None
+    extent: ArrayLike | None
+
+
 @dataclass(frozen=True, eq=False)
 class PsfModel(ModelFit, Result):
     """A PSF model of one CCD: PSF = mean + sum over k of a_k(x, y) component_k.
