@@ -31,7 +31,7 @@ EXPOSURES = (1.0, 5.0, 15.0, 60.0)
 LIFTS = (0.0, 200.0)
 FIELD = 6.8 * ARCMIN
 PIXEL, STAMP = 0.2 * ARCSEC, 31
-BINS = {"min_sep": 0.2 * ARCMIN, "max_sep": 12.0 * ARCMIN, "n_bins": 10, "exact": True}
+BINS = pachon.SeparationBins(0.2 * ARCMIN, 12.0 * ARCMIN, 10, exact=True)
 WHISKER_STARS = 1500
 
 
@@ -62,7 +62,7 @@ def study(seeds: int, stars: int) -> tuple[dict, np.ndarray]:
         for (lift, t), row in table.items():
             e = ellipticities(exposed(longest, t, lift), fields)
             correlations = [
-                pachon.shear_correlation(*fields.T, e.real, e.imag, subtract_mean=subtract, **BINS)
+                pachon.shear_correlation(*fields.T, e.real, e.imag, bins=BINS, subtract_mean=subtract)
                 for subtract in (False, True)
             ]
             row["mean"].append(np.mean(np.abs(e)))

@@ -47,7 +47,7 @@ FIELD = 5.0 * ARCMIN
 # Wide enough for 15 s at 20 m/s, the pupil and 10 arcmin at 15 km; the pixel is that of 8192 samples over 1.3 km.
 SIZE, LENGTH = 3072, 3072 * 1300.0 / 8192
 EPOCH_STEP = 60.0
-BINS = {"min_sep": 0.5 * ARCMIN, "max_sep": 10.0 * ARCMIN, "n_bins": 6}
+BINS = pachon.SeparationBins(0.5 * ARCMIN, 10.0 * ARCMIN, 6, exact=True)
 
 
 def long_paraboloid() -> Telescope:
@@ -131,9 +131,8 @@ def summary(fields: np.ndarray, first: np.ndarray, second: np.ndarray, width: np
     """Return the statistics of one seed from ellipticities [exposure, star], measured twice, and widths."""
     centred = [e - e.mean(axis=1, keepdims=True) for e in (first, second)]
     both = 0.5 * (first + second)
-    options = BINS | {"exact": True}
-    xi = [pachon.shear_correlation(*fields.T, e.real, e.imag, **options) for e in both]
-    within = [pachon.shear_correlation(*fields.T, e.real, e.imag, subtract_mean=True, **options) for e in both]
+    xi = [pachon.shear_correlation(*fields.T, e.real, e.imag, bins=BINS) for e in both]
+    within = [pachon.shear_correlation(*fields.T, e.real, e.imag, bins=BINS, subtract_mean=True) for e in both]
     return {
         "fwhm": width.mean() / ARCSEC,
         "variance": np.mean((first * second.conj()).real),

@@ -46,6 +46,9 @@ def check_arguments(target: Target) -> Target:
     False, and 1 and 0. A quantity where plain numbers are expected is converted to the unit in square brackets of the
     docstring.
 
+    Keyword arguments annotated as ``**options: Unpack[SomeTypedDict]`` are checked, and shown in the signature, as if
+    each key of the TypedDict were a parameter.
+
     Names of arguments are checked by Python (TypeError). One that the function no longer takes, or that is a field of
     another argument, is a ConfigError that says what replaces it (:func:`removed_arguments`). Shapes, ranges and NaN
     are checked by the function itself.
@@ -79,12 +82,15 @@ def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any
     if not set(inspect.get_annotations(function)) - {"return"}:
         return function
 
+    unpacked = _unpacked_options(function)
+
     @functools.cache
     def checks() -> dict[str, _Check | None]:
         # At the first call: an annotation may name a class of a module that is imported after this one, and many
         # functions are never called.
         parameters = inspect.signature(function).parameters.values()
-        return {p.name: _parameter_check(function, p.name) for p in parameters if p.kind is not p.VAR_KEYWORD}
+        named = {p.name: _parameter_check(function, p.name) for p in parameters if p.kind is not p.VAR_KEYWORD}
+        return named | {name: _annotation_check(kind) for name, kind in unpacked.items()}
 
     @functools.wraps(function)
     def checked(*args: Any, **options: Any) -> Any:
@@ -102,6 +108,8 @@ def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any
                 elif name not in parameter_checks and (replacement := _replacement(function, checked, name)):
                     text = f"{name}: no argument of {function.__qualname__}; expected {replacement}"
                     raise ConfigError(text, key=name)
+                elif unpacked and name not in parameter_checks:
+                    raise TypeError(f"{function.__qualname__}() got an unexpected keyword argument {name!r}")
         except _MismatchError as problem:
             name = problem.name.partition("[")[0]
             # Most calls come without quantities: what they cost is paid here, where plain numbers were expected.
@@ -117,7 +125,30 @@ def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any
         return function(*checked_args, **options)
 
     checked.__dict__[_REMOVED] = {}
+    if unpacked:
+        checked.__dict__["__signature__"] = _expanded_signature(function, unpacked)
     return checked
+
+
+def _unpacked_options(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return name and type of each key of ``**options: Unpack[SomeTypedDict]`` of a function; empty without one."""
+    parameters = inspect.signature(function).parameters.values()
+    annotation = next((p.annotation for p in parameters if p.kind is p.VAR_KEYWORD), None)
+    if isinstance(annotation, str) and annotation.startswith("Unpack["):
+        annotation = eval(annotation, function.__globals__)
+    if get_origin(annotation) is not typing.Unpack:
+        return {}
+    (options,) = get_args(annotation)
+    return typing.get_type_hints(options)
+
+
+def _expanded_signature(function: Callable[..., Any], unpacked: Mapping[str, Any]) -> inspect.Signature:
+    """Return the signature of a function with a keyword for each unpacked option."""
+    signature = inspect.signature(function)
+    named = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    options = [inspect.Parameter(name, keyword, default=None, annotation=kind) for name, kind in unpacked.items()]
+    return signature.replace(parameters=[*named, *options])
 
 
 def _replacement(function: Callable[..., Any], checked: Callable[..., Any], name: str) -> str | None:

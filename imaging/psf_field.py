@@ -77,7 +77,7 @@ class PsfField:
         recipe = Recipe.of("paper", interpolation=interpolation, n_components=n_components)
         if not recipe.interpolation.needs_noise:
             recipe = recipe.changed(order=order)
-        model = PsfModel.fit(stamps, places, recipe=recipe, gain=None, extent=extent, clip_sigma=None)
+        model = PsfModel.fit(stamps, places, recipe=recipe, gain=None, extent=extent, clipping=None)
         share = 1.0 if lit_fraction is None else lit_fraction
         light = for_each(pure_numbers(share, "lit_fraction"), len(places), "lit_fraction")
         terms = design_matrix(places, extent, order)

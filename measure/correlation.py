@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from astropy.units import Quantity
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
@@ -32,6 +31,50 @@ LARGEST_SEPARATION = 2.0 * np.pi
 MOST_BINS = 1000
 #: Least width of a bin, as the logarithm of the ratio of its ends: far above the rounding of a logarithm, 1e-14.
 LEAST_BIN_WIDTH = 1e-6
+
+
+@check_arguments
+@dataclass(frozen=True)
+class SeparationBins:
+    """Logarithmic bins of separation, as `min_sep`, `max_sep`, `nbins` and `brute` of TreeCorr.
+
+    Parameters
+    ----------
+    min_sep, max_sep : float
+        Separations at which the first bin begins and the last one ends [rad], from 1e-12 to a whole turn.
+    n_bins : int
+        Number of bins, at most 1000.
+    exact : bool, optional
+        Whether to count pair by pair (time goes as the square of the number of stars) or with TreeCorr's cells, whose
+        radius may blur a bin's edges by a tenth of its width (``bin_slop=0.1``). Where left out, pair by pair up to
+        ``EXACT_LIMIT`` stars.
+
+    Raises
+    ------
+    DomainError
+        If a separation or the number of bins is out of its range, or the bins are too narrow to tell apart.
+    """
+
+    min_sep: float
+    max_sep: float
+    n_bins: int = 20
+    exact: bool | None = None
+
+    def __post_init__(self) -> None:
+        require_count(self.n_bins, "n_bins", 1, MOST_BINS)
+        low, high = angle(self.min_sep, "min_sep"), angle(self.max_sep, "max_sep")
+        ends = f"min_sep = {shown(self.min_sep)}, max_sep = {shown(self.max_sep)}"
+        for key, separation in (("min_sep", low), ("max_sep", high)):
+            if not LEAST_SEPARATION <= separation <= LARGEST_SEPARATION:
+                limits = f"{LEAST_SEPARATION:g} to {LARGEST_SEPARATION:.4g} rad"
+                raise DomainError(f"{ends}: expected separations of {limits}", key=key)
+        if not np.log(high / low) >= LEAST_BIN_WIDTH * self.n_bins:
+            least = f"a max_sep of at least {np.exp(LEAST_BIN_WIDTH * self.n_bins):.7g} min_sep"
+            raise DomainError(f"{ends}: expected {least}, for {self.n_bins} bins", key="max_sep")
+
+    def exact_for(self, n_stars: int) -> bool:
+        """Return whether pairs of a number of stars are counted one by one."""
+        return n_stars <= EXACT_LIMIT if self.exact is None else self.exact
 
 
 @dataclass(frozen=True)
@@ -163,11 +206,8 @@ def shear_correlation(
     e1: ArrayLike,
     e2: ArrayLike,
     *,
-    min_sep: float | Quantity,
-    max_sep: float | Quantity,
-    n_bins: int = 20,
+    bins: SeparationBins,
     subtract_mean: bool = False,
-    exact: bool | None = None,
     patch: Any = None,
     other: tuple[Any, Any] | None = None,
     weight: ArrayLike | None = None,
@@ -194,16 +234,10 @@ def shear_correlation(
         changes the sign of e2 and invalidates xi-.
     e1, e2 : array
         Ellipticities. A star with NaN in position or ellipticity is left out.
-    min_sep, max_sep : float or Quantity
-        Separations at which the first bin begins and the last one ends [rad], from 1e-12 to a whole turn.
-    n_bins : int
-        Logarithmic bins, at most 1000.
+    bins : SeparationBins
+        Bins of separation, such as ``SeparationBins(1e-4, 1e-2, 10)``: 10 from 1e-4 to 1e-2 rad.
     subtract_mean : bool
         Whether to take the mean ellipticity off first, which removes the constant part of xi+.
-    exact : bool, optional
-        Whether to count pair by pair (time goes as the square of the number of stars) or with TreeCorr's cells, whose
-        radius may blur a bin's edges by a tenth of its width (``bin_slop=0.1``). Where left out, pair by pair up to
-        ``EXACT_LIMIT`` stars.
     patch : array of int or str, optional
         The patch of each star, such as the name of its CCD; at least two different ones. Changes the error bars, and
         the correlations only by rounding (or, counting with cells, within the blur of the bins).
@@ -216,8 +250,8 @@ def shear_correlation(
     Raises
     ------
     DomainError
-        If shapes differ, a weight is negative or not finite, separations or bins are out of their ranges, fewer than
-        two stars are usable, or these are all of one patch.
+        If shapes differ, a weight is negative or not finite, fewer than two stars are usable, or these are all of one
+        patch.
     """
     columns = [radians(v, n) for v, n in ((x, "x"), (y, "y"))]
     if other is not None and len(other) != 2:
@@ -238,7 +272,6 @@ def shear_correlation(
         raise DomainError("patch has masked labels: expected one for each star")
     if labels is not None and labels.shape != columns[0].shape:
         raise DomainError(f"patch has shape {labels.shape}: expected {columns[0].shape}, one for each star")
-    low, high, n_bins = _bins(min_sep, max_sep, n_bins)
     usable = np.all(np.isfinite(columns), axis=0)
     n_stars = int(usable.sum())
     if n_stars < 2:
@@ -247,8 +280,6 @@ def shear_correlation(
     of_stars: dict[str, Any] = {} if weight is None else {"w": weights[usable]}
     if subtract_mean:
         g = [c - np.average(c, weights=of_stars.get("w")) for c in g]
-    if exact is None:
-        exact = n_stars <= EXACT_LIMIT
     if labels is not None:
         patch_labels, number = np.unique(labels[usable], return_inverse=True)
         if len(patch_labels) < 2:
@@ -257,11 +288,18 @@ def shear_correlation(
     import treecorr  # a tenth of a second
 
     catalogs = [treecorr.Catalog(x=px, y=py, g1=g[i], g2=g[i + 1], **of_stars) for i in range(0, len(g), 2)]
-    pairs = treecorr.GGCorrelation(min_sep=low, max_sep=high, nbins=n_bins, bin_slop=0.1, brute=exact, verbose=0)
+    pairs = treecorr.GGCorrelation(
+        min_sep=float(bins.min_sep),
+        max_sep=float(bins.max_sep),
+        nbins=int(bins.n_bins),
+        bin_slop=0.1,
+        brute=bins.exact_for(n_stars),
+        verbose=0,
+    )
     pairs.process(*catalogs, num_threads=1)
     empty = pairs.npairs == 0
     if labels is None:
-        leave_one_out_xi, leave_one_out_pairs = np.empty((2, 0, n_bins)), np.empty((0, n_bins))
+        leave_one_out_xi, leave_one_out_pairs = np.empty((2, 0, bins.n_bins)), np.empty((0, bins.n_bins))
         errors = np.sqrt(np.stack([pairs.varxip, pairs.varxim]))
     else:
         leave_one_out_xi, leave_one_out_pairs = _leave_one_out_correlations(pairs, len(patch_labels))
@@ -279,21 +317,6 @@ def shear_correlation(
         leave_one_out_plus=leave_one_out_xi[0],
         leave_one_out_pairs=np.rint(leave_one_out_pairs / len(catalogs)).astype(np.int64),
     )
-
-
-def _bins(min_sep: float | Quantity, max_sep: float | Quantity, n_bins: int) -> tuple[float, float, int]:
-    """Return both ends [rad] and number of the bins, or raise DomainError where one is out of its range."""
-    count = require_count(n_bins, "n_bins", 1, MOST_BINS)
-    low, high = angle(min_sep, "min_sep"), angle(max_sep, "max_sep")
-    ends = f"min_sep = {shown(min_sep)}, max_sep = {shown(max_sep)}"
-    for key, separation in (("min_sep", low), ("max_sep", high)):
-        if not LEAST_SEPARATION <= separation <= LARGEST_SEPARATION:
-            limits = f"{LEAST_SEPARATION:g} to {LARGEST_SEPARATION:.4g} rad"
-            raise DomainError(f"{ends}: expected separations of {limits}", key=key)
-    if not np.log(high / low) >= LEAST_BIN_WIDTH * count:
-        least = f"a max_sep of at least {np.exp(LEAST_BIN_WIDTH * count):.7g} min_sep"
-        raise DomainError(f"{ends}: expected {least}, for {count} bins", key="max_sep")
-    return low, high, count
 
 
 def jackknife_error(leave_one_out: np.ndarray) -> np.ndarray:

@@ -26,7 +26,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from astropy.units import Quantity
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
@@ -35,7 +34,7 @@ from ..core.errors import DomainError
 from ..core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, axes_at, styled
 from ..core.result import Result
 from ..core.units import real_array
-from .correlation import Correlation, draw_correlation_axes, shear_correlation
+from .correlation import Correlation, SeparationBins, draw_correlation_axes, shear_correlation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -100,10 +99,7 @@ def rho_statistics(
     model_e2: ArrayLike,
     model_size: ArrayLike,
     *,
-    min_sep: float | Quantity,
-    max_sep: float | Quantity,
-    n_bins: int = 20,
-    exact: bool | None = None,
+    bins: SeparationBins,
     patch: Any = None,
 ) -> RhoStatistics:
     """Compute the rho statistics 1 to 5 of a PSF model (Rowe 2010; Jarvis et al. 2016, sec. 3.4).
@@ -122,11 +118,7 @@ def rho_statistics(
         Their size (Q11 Q22 - Q12^2)^(1/4), sigma or size of the same class, in any unit.
     model_e1, model_e2, model_size : array
         The same of the model at these positions. A star with NaN in any column is left out of all five.
-    min_sep, max_sep : float or Quantity
-        Separations at which the first bin begins and the last one ends [rad], from 1e-12 to a whole turn.
-    n_bins : int
-        Logarithmic bins, at most 1000.
-    exact, patch
+    bins, patch
         As in :func:`~.shear_correlation`; with patches the errors are jackknife errors.
 
     Raises
@@ -151,9 +143,7 @@ def rho_statistics(
     e, de, w = (s1, s2), (s1 - m1, s2 - m2), (s1 * growth, s2 * growth)
 
     def correlate(f: tuple[np.ndarray, np.ndarray], g: tuple[np.ndarray, np.ndarray] | None = None) -> Correlation:
-        return shear_correlation(
-            x, y, *f, other=g, min_sep=min_sep, max_sep=max_sep, n_bins=n_bins, exact=exact, patch=patch
-        )
+        return shear_correlation(x, y, *f, bins=bins, other=g, patch=patch)
 
     return RhoStatistics(correlate(de), correlate(e, de), correlate(w), correlate(de, w), correlate(e, w))
 

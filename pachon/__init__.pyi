@@ -128,10 +128,12 @@ from .measure.catalogue.objects import DetectedObjects as DetectedObjects
 from .measure.catalogue.objects import ObjectFlag as ObjectFlag
 from .measure.catalogue.shear_calibration import ShearCalibration as ShearCalibration
 from .measure.catalogue.shear_calibration import shear_calibration as shear_calibration
+from .measure.catalogue.star_locus import LocusSearch as LocusSearch
 from .measure.catalogue.star_locus import StarCut as StarCut
 from .measure.catalogue.star_locus import StarSelection as StarSelection
 from .measure.catalogue.star_locus import select_stars as select_stars
 from .measure.correlation import Correlation as Correlation
+from .measure.correlation import SeparationBins as SeparationBins
 from .measure.correlation import shear_correlation as shear_correlation
 from .measure.rho_statistics import RhoStatistics as RhoStatistics
 from .measure.rho_statistics import rho_statistics as rho_statistics
@@ -274,6 +276,7 @@ from .reconstruction.piff.psf import PiffPsf as PiffPsf
 from .reconstruction.piff.psf import load_piff as load_piff
 from .reconstruction.psf_model.kriging import Kriging as Kriging
 from .reconstruction.psf_model.model import PsfModel as PsfModel
+from .reconstruction.psf_model.outliers import SigmaClipping as SigmaClipping
 from .reconstruction.psf_model.pixels import Pixels as Pixels
 from .reconstruction.psf_model.polynomial_fit import Polynomial as Polynomial
 from .reconstruction.psf_model.principal_components import PrincipalComponents as PrincipalComponents

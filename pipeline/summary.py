@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 
 from ..core.statistics import finite_mean, finite_median, rms
 from ..core.units import ARCMIN, ARCSEC
-from ..measure.correlation import SEPARATION_RANGES, Correlation, shear_correlation
+from ..measure.correlation import SEPARATION_RANGES, Correlation, SeparationBins, shear_correlation
 from ..measure.rho_statistics import trace_of_moments
 from ..reconstruction.ccd_product import CCD_KINDS, CcdProduct, CcdStars, Stars
 
@@ -50,7 +50,7 @@ def correlations(
                 continue
             if patch is not None and np.ptp(patch[usable]) == 0:
                 patch = None
-        result[kind] = shear_correlation(x, y, *values, patch=patch, **bins)
+        result[kind] = shear_correlation(x, y, *values, bins=bins, patch=patch)
     return result
 
 
@@ -74,14 +74,6 @@ def patches(stars: Sequence[Stars]) -> np.ndarray | None:
     return np.repeat(np.arange(len(stars)), [len(s) for s in stars]) if len(stars) > 1 else None
 
 
-class SeparationBins(TypedDict):
-    """Bins of separation, as arguments: smallest and largest separation [rad], and their number."""
-
-    min_sep: float
-    max_sep: float
-    n_bins: int
-
-
 def separation_bins(products: Sequence[CcdStars]) -> SeparationBins:
     """Return the bins of separation of a run."""
     everywhere = np.concatenate(
@@ -89,7 +81,7 @@ def separation_bins(products: Sequence[CcdStars]) -> SeparationBins:
     )
     longest = float(np.hypot(*np.ptp(everywhere, axis=1)))
     bins = max(4, round(_BINS_PER_DECADE * np.log10(longest / (SHORTEST_ARCMIN * ARCMIN))))
-    return {"min_sep": SHORTEST_ARCMIN * ARCMIN, "max_sep": longest, "n_bins": bins}
+    return SeparationBins(SHORTEST_ARCMIN * ARCMIN, longest, bins)
 
 
 def ccd_metrics(product: CcdProduct) -> dict[str, Any]:

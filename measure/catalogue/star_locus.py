@@ -67,6 +67,40 @@ class StarCut(IntFlag):
     DEFECT = 64
 
 
+@check_arguments
+@dataclass(frozen=True)
+class LocusSearch:
+    """Which objects determine the stellar locus.
+
+    Parameters
+    ----------
+    bright_snr : float
+        Least S/N of the objects.
+    min_stars : int
+        Fewest stars that make a locus.
+    radius_range : (float, float), optional
+        Half-light radii between which the locus is known to lie [pixel].
+
+    Raises
+    ------
+    DomainError
+        If a number is not positive.
+    """
+
+    bright_snr: float = 60.0
+    min_stars: int = 10
+    radius_range: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        require_positive(self.bright_snr, "bright_snr")
+        for radius in self.radius_range or ():
+            require_positive(radius, "radius_range")
+
+
+#: Search of the locus in most images.
+_USUAL_LOCUS = LocusSearch()
+
+
 @dataclass(frozen=True, eq=False)
 class StarSelection(Result):
     """Stars among n objects.
@@ -170,12 +204,10 @@ def select_stars(
     image: ArrayLike,
     *,
     min_snr: float = 30.0,
-    bright_snr: float = 60.0,
     n_sigma: float = 4.0,
     max_ellipticity: float = 0.1,
     isolation: float = 12.0,
-    min_stars: int = 10,
-    radius_range: tuple[float, float] | None = None,
+    locus: LocusSearch = _USUAL_LOCUS,
     size: int = STAMP_SIDE,
     mask: ArrayLike | NDArray[np.bool_] | None = None,
 ) -> StarSelection:
@@ -190,18 +222,16 @@ def select_stars(
         As of :func:`~pachon.detect_objects`.
     image : array
         The image on which they were detected, [ny, nx]; their background is subtracted here.
-    min_snr, bright_snr : float
-        Least S/N of stars, and of the objects that determine the locus.
+    min_snr : float
+        Least S/N of stars.
     n_sigma : float
         Largest deviations of half-light radius and FWHM [standard deviations of the locus and of the noise].
     max_ellipticity : float
         Largest deviation of the isophotal ellipticity.
     isolation : float
         Least distance to the nearest other object [pixel].
-    min_stars : int
-        Fewest stars that make a locus.
-    radius_range : (float, float), optional
-        Half-light radii between which the locus is known to lie [pixel].
+    locus : LocusSearch
+        Objects that determine the locus: ten or more of an S/N of 60 by default, of any size.
     size : int
         Side of the stamps, odd [pixel].
     mask : array, optional
@@ -229,7 +259,6 @@ def select_stars(
         raise DomainError(f"size = {size}: expected an odd number of pixels")
     for name, value in (
         ("min_snr", min_snr),
-        ("bright_snr", bright_snr),
         ("n_sigma", n_sigma),
         ("max_ellipticity", max_ellipticity),
     ):
@@ -240,17 +269,17 @@ def select_stars(
     spoilt = _spoilt(bad, objects.x, objects.y, size)
     cuts[(objects.flags != 0) | spoilt | ~np.isfinite(objects.fwhm)] |= StarCut.FLAGGED
     cuts[~(snr >= min_snr)] |= StarCut.FAINT
-    bright = (cuts == 0) & (snr >= bright_snr)
-    if radius_range is not None:
-        low, high = (require_positive(v, "radius_range") for v in radius_range)
+    bright = (cuts == 0) & (snr >= locus.bright_snr)
+    if locus.radius_range is not None:
+        low, high = locus.radius_range
         bright &= (radius >= low) & (radius <= high)
-    center, width = _stellar_locus(radius[bright], min_stars)
+    center, width = _stellar_locus(radius[bright], locus.min_stars)
     noise = 1.0 / np.maximum(snr, 1.0)
     cuts[~(np.abs(radius - center) < n_sigma * np.hypot(width, center * noise))] |= StarCut.SIZE
-    locus = bright & (cuts == 0)
-    fwhm = median_and_sigma(objects.fwhm[locus])
+    of_locus = bright & (cuts == 0)
+    fwhm = median_and_sigma(objects.fwhm[of_locus])
     cuts[~(np.abs(objects.fwhm - fwhm[0]) < n_sigma * np.hypot(fwhm[1], fwhm[0] * noise))] |= StarCut.WIDTH
-    e1, e2 = (e - np.median(e[locus]) for e in (objects.e1, objects.e2))
+    e1, e2 = (e - np.median(e[of_locus]) for e in (objects.e1, objects.e2))
     cuts[~(np.hypot(e1, e2) < max_ellipticity)] |= StarCut.SHAPE
     cuts[objects.neighbour_distance < isolation] |= StarCut.NEIGHBOUR
     index = np.flatnonzero(cuts == 0)

@@ -196,7 +196,7 @@ def _rho_statistics(products: Sequence[CcdProduct], kind: str, moments: str) -> 
     shape = ("g1", "g2", "sigma") if moments == "g" else ("e1", "e2", "size")
     keys = (*shape, *(f"model_{key}" for key in shape))
     columns = (np.concatenate([getattr(s, key) for s in stars]) for key in keys)
-    return rho_statistics(x, y, *columns, patch=patches(stars), **separation_bins(products))
+    return rho_statistics(x, y, *columns, bins=separation_bins(products), patch=patches(stars))
 
 
 def _residual_moments(products: Sequence[CcdProduct], kind: str) -> dict[str, float]:

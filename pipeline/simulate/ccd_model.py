@@ -8,7 +8,7 @@ from ...measure.adaptive_moments import AdaptiveMoments, adaptive_moments
 from ...measure.shapes import Shapes, fwhm, measure_shapes
 from ...measure.star_selection import require_stars
 from ...reconstruction.ccd_product import CcdProduct, HoldoutStars, ObservedStars
-from ...reconstruction.psf_model.model import CLIP_SIGMA, PsfModel
+from ...reconstruction.psf_model.model import CLIPPING, PsfModel
 from ...sky.sky_shapes import along_sky, jacobians_on_sky
 from ...wavefront.chief_rays import fields_at
 from ..experiment import Experiment
@@ -49,7 +49,7 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         n_components=noise_free_components(config),
         order=config.reconstruction.truth_order,
         extent=positions.ccd.extent,
-        clip_sigma=None,
+        clipping=None,
     )
 
     def shapes_of(images: np.ndarray) -> Shapes:
@@ -111,7 +111,7 @@ def fit_ccd_model(
         recipe=recipe,
         weights=recipe.star_weights(snr[used]),
         extent=stars.ccd.extent,
-        clip_sigma=CLIP_SIGMA if noisy else None,
+        clipping=CLIPPING if noisy else None,
     )
 
 

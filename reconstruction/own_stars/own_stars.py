@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from astropy.units import Quantity
@@ -20,7 +20,7 @@ from ...measure.stamps import center_masks, center_stamps, decenter_masks
 from ...measure.star_selection import StarFlag, flag_stars, require_stars
 from ..psf_model import kriging
 from ..psf_model.checks import as_extent
-from ..psf_model.model import PsfModel
+from ..psf_model.model import ModelOptions, PsfModel
 from ..psf_model.polynomial import as_positions
 from .candidates import CANDIDATES, choose_candidate
 from .masked_stars import (
@@ -60,10 +60,9 @@ def fit_own_stars(
     gain: float = 1.0,
     saturation: float | None = None,
     background: bool = True,
-    extent: ArrayLike | None = None,
     masks: NDArray[np.bool_] | None = None,
     seed: int = 1,
-    **options: Any,
+    **options: Unpack[ModelOptions],
 ) -> OwnStars:
     """Centre stars, mask or leave out defects, model the PSF, and predict each star from others.
 
@@ -86,8 +85,6 @@ def fit_own_stars(
         Level from which on a pixel is saturated.
     background : bool
         Whether to subtract the median of the outer pixels of each stamp.
-    extent : tuple of float, optional
-        (xmin, xmax, ymin, ymax) of the CCD in the unit of the positions; that of the stars by default.
     masks : array of bool, optional
         [n, ny, nx], True for pixels to ignore, besides those that hold no light: not finite, or -1e29 or less (-1e30 of
         SExtractor), copies of dead columns (:func:`~pachon.measure.pixel_masks.copied_pixels`), and neighbours and
@@ -98,13 +95,15 @@ def fit_own_stars(
     seed : int
         Of the parts that are held out.
     **options
-        Options of :meth:`~.PsfModel.fit`, `recipe` and its keys among them, for a kind of model without a choice.
+        Options of :meth:`~.PsfModel.fit`: `extent` of the CCD, by default that of the stars; any other, `recipe` and
+        its keys among them, is for a kind of model without a choice.
 
     Raises
     ------
     DomainError
         If stamps are too small, fewer than five stars are left, or the model cannot be made.
     """
+    extent, given_kind = options.get("extent"), {key: value for key, value in options.items() if key != "extent"}
     raw_images, places = real_array(stamps, "stamps: expected real numbers [n, ny, nx]"), as_positions(positions)
     if raw_images.ndim != 3 or len(raw_images) != len(places):
         raise DomainError(
@@ -186,7 +185,7 @@ def fit_own_stars(
         masked = bad.any(axis=(1, 2))
         complete = wide.usable & ~lost
         for _ in range(_MODEL_PASSES):
-            psfs = fit(np.flatnonzero(stars.used), options).at(places[masked])
+            psfs = fit(np.flatnonzero(stars.used), given_kind).at(places[masked])
             sigma = weight_sigma(scale, weight)
             filled[masked], lost[masked] = fill_by_profiles(
                 images[masked],
@@ -206,8 +205,8 @@ def fit_own_stars(
     )
     good = stars.images[used]
     weightless = stars.masks[used] if stars.masks[used].any() else None
-    if options:
-        name, kind = "given", options
+    if given_kind:
+        name, kind = "given", given_kind
         predicted = predict(kind)
     else:
         name, predicted = choose_candidate(predict, good, gain, weightless)

@@ -15,7 +15,7 @@ from ...core.plotting import BLUE, ORANGE, RED, figure_at, plain_text, styled
 from ...core.products import Columns, described_table
 from ...core.result import Result
 from ...core.units import ARCMIN, ARCSEC, require_count
-from ...measure.correlation import LARGEST_SEPARATION, LEAST_SEPARATION, MOST_BINS
+from ...measure.correlation import LARGEST_SEPARATION, LEAST_SEPARATION, MOST_BINS, SeparationBins
 from ...measure.focal_plane_axes import draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
 from ...measure.rho_statistics import RhoStatistics, rho_statistics
 from ...measure.shapes import Shapes, fwhm
@@ -164,9 +164,8 @@ def star_rho_statistics(places: np.ndarray, stars: Shapes, model: Shapes, bins: 
     if not least <= longest <= LARGEST_SEPARATION:
         limits = f"{least:g} to {LARGEST_SEPARATION:.4g} rad, with positions in pixels"
         raise DomainError(f"positions: the stars lie within {longest:g} rad; expected {limits}", key="positions")
-    return rho_statistics(
-        x, y, *star_values, *model_values, min_sep=longest / _LONGEST_OVER_SHORTEST, max_sep=longest, n_bins=bins
-    )
+    separation_bins = SeparationBins(longest / _LONGEST_OVER_SHORTEST, longest, bins)
+    return rho_statistics(x, y, *star_values, *model_values, bins=separation_bins)
 
 
 def _of_all(counts: np.ndarray, used: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .masked_pixels import fill_masked, mean_and_flux
-from .outliers import find_outliers, restore_predicted
+from .outliers import SigmaClipping, find_outliers, restore_predicted
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +32,9 @@ def cleaned_stars(
     images: np.ndarray,
     masked: np.ndarray,
     terms: np.ndarray,
-    *,
-    clip_sigma: float | None,
-    max_iterations: int,
-    replacement: str,
+    clipping: SigmaClipping | None,
 ) -> CleanStars:
-    """Return the stars of a CCD without outliers; options as in :meth:`~.PsfModel.fit`.
+    """Return the stars of a CCD without outliers; `clipping` as in :meth:`~.PsfModel.fit`.
 
     `images` [n_stars, ny, nx] are finite and of any flux; pixels in `masked` are not used. The polynomial terms at the
     stars [n_stars, n_terms] keep stars whose deviation the others predict, and fill masked pixels.
@@ -47,15 +44,15 @@ def cleaned_stars(
         guess, flux = mean_and_flux(pixels, filled_pixels)
         pixels = np.where(filled_pixels, flux[:, None] * guess, pixels)
     rejected = np.zeros(pixels.shape, dtype=bool)
-    if clip_sigma is not None:
-        rejected = find_outliers(pixels, clip_sigma, max_iterations) & ~filled_pixels
+    if clipping is not None:
+        rejected = find_outliers(pixels, clipping.sigma, clipping.max_iterations) & ~filled_pixels
     mean, flux = mean_and_flux(pixels, rejected)
     if rejected.any():
         rejected = restore_predicted(pixels / pixels.sum(axis=1)[:, None], mean, rejected, terms)
         mean, flux = mean_and_flux(pixels, rejected)
     deviations = np.where(rejected, 0.0, pixels / flux[:, None] - mean)
 
-    by_mean = rejected & (replacement == "mean")
+    by_mean = rejected & (clipping is not None and clipping.replacement == "mean")
     filled_pixels = filled_pixels | (rejected & ~by_mean)
     if filled_pixels.any():
         stars = fill_masked(mean + deviations, filled_pixels, by_mean, terms)

@@ -15,12 +15,10 @@ from .checks import as_extent, as_stamps, as_weights
 from .clean_stars import CleanStars, cleaned_stars
 from .cross_validation import choose_by_cross_validation
 from .interpolation import FittedInterpolation, StarField
+from .outliers import SigmaClipping
 from .polynomial import as_positions, design_matrix, term_count
 from .recipe import Recipe
 from .shape_noise import ShapeNoise
-
-_REPLACEMENTS = ("mean", "polynomial")
-
 
 _Model = TypeVar("_Model", bound="ModelFit")
 
@@ -46,9 +44,7 @@ def fit_stars(
     masks: Any,
     extent: Any,
     gain: float | None,
-    clip_sigma: float | None,
-    max_iterations: int,
-    replacement: str,
+    clipping: SigmaClipping | None,
 ) -> _Model:
     """Fit basis and interpolation of a recipe to stars; arguments and errors as those of :meth:`~.PsfModel.fit`."""
     images, bad = as_stamps(stamps, masks)
@@ -56,7 +52,7 @@ def fit_stars(
     points = as_positions(positions)
     if len(points) != n_stars:
         raise DomainError(f"positions: {len(points)} given, expected one for each of the {n_stars} stamps")
-    _check_options(replacement, clip_sigma, max_iterations, gain)
+    _check_gain(gain)
     basis, interpolation = recipe.basis, recipe.interpolation
     count = basis.component_count(n_stars, ny * nx)
     weights = recipe.star_weights() if weights is None else weights
@@ -75,14 +71,7 @@ def fit_stars(
 
     with one_blas_thread():
         interpolation.check_terms(terms[:, : term_count(needed_order)], needed_order, points, star_weights)
-        stars = cleaned_stars(
-            images,
-            bad,
-            terms[:, : term_count(interpolation.smooth_order)],
-            clip_sigma=clip_sigma,
-            max_iterations=max_iterations,
-            replacement=replacement,
-        )
+        stars = cleaned_stars(images, bad, terms[:, : term_count(interpolation.smooth_order)], clipping)
         masked = bad if bad.any() else None
         if masked is not None:
             images = _completed(images, masked, stars)
@@ -118,14 +107,8 @@ def _completed(images: np.ndarray, masked: np.ndarray, stars: CleanStars) -> np.
     return np.where(masked, flux[:, None, None] * profiles, images)
 
 
-def _check_options(replacement: str, clip_sigma: float | None, max_iterations: int, gain: float | None) -> None:
-    """Raise ConfigError for an option that is out of range."""
-    if replacement not in _REPLACEMENTS:
-        raise ConfigError(f"replacement = {replacement!r}: expected one of {', '.join(_REPLACEMENTS)}")
-    if clip_sigma is not None and not clip_sigma > 0.0:
-        raise ConfigError(f"clip_sigma = {clip_sigma}: expected a positive number or None")
-    if max_iterations < 1:
-        raise ConfigError(f"max_iterations = {max_iterations}: expected at least 1")
+def _check_gain(gain: float | None) -> None:
+    """Raise ConfigError for a gain that is out of range."""
     if gain is not None and not (np.isfinite(gain) and gain > 0.0):
         raise ConfigError(f"gain = {gain}: expected a number of electrons above 0, or None for no photon noise")
 

@@ -9,33 +9,42 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Unpack
 
 import numpy as np
 from astropy.io import fits
 from numpy.typing import ArrayLike, NDArray
 
-from ...core.arguments import check_arguments
+from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import ProductError
 from ...core.plotting import figure_at, styled
 from ...core.products import read_fits, write_fits
 from ...core.result import Result
 from ...core.version import CREATOR
-from .basis import Basis, elbow_of
+from .basis import elbow_of
 from .file import model_hdus, read_model
 from .fit import ModelFit, fit_stars
-from .interpolation import Interpolation
+from .outliers import SigmaClipping
 from .polynomial import Extent
-from .recipe import Recipe
+from .recipe import Recipe, RecipeKeys
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Pixels of noisy stars that deviate by more standard deviations are rejected.
-CLIP_SIGMA = 5.0
+#: Rejection of outliers in noisy stars.
+CLIPPING = SigmaClipping()
 # Components that are drawn beside the mean.
 _SHOWN = 5
+
+
+class ModelOptions(RecipeKeys, total=False):
+    """Options of :meth:`PsfModel.fit` that hold for any stars of a CCD."""
+
+    recipe: str | Recipe | None
+    weights: Literal["noise"] | None
+    clipping: SigmaClipping | None
+    extent: ArrayLike | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +72,7 @@ class PsfModel(ModelFit, Result):
     _table = ("positions", "coefficients", "unexplained", "rejected")
 
     @classmethod
+    @removed_arguments(clip_sigma="clipping=SigmaClipping(sigma=...), or None to reject no pixel")
     @check_arguments
     def fit(
         cls,
@@ -70,18 +80,12 @@ class PsfModel(ModelFit, Result):
         positions: ArrayLike,
         *,
         recipe: str | Recipe | None = None,
-        basis: str | Basis | None = None,
-        interpolation: str | Interpolation | None = None,
         weights: ArrayLike | Literal["noise"] | None = None,
         masks: NDArray[np.bool_] | None = None,
-        n_components: int | Literal["auto"] | None = None,
-        order: int | Literal["auto"] | None = None,
         extent: ArrayLike | None = None,
-        scale: float | None = None,
         gain: float | None = 1.0,
-        clip_sigma: float | None = CLIP_SIGMA,
-        max_iterations: int = 20,
-        replacement: Literal["mean", "polynomial"] = "mean",
+        clipping: SigmaClipping | None = CLIPPING,
+        **recipe_keys: Unpack[RecipeKeys],
     ) -> PsfModel:
         """Fit the model to the stars of one CCD.
 
@@ -128,13 +132,9 @@ class PsfModel(ModelFit, Result):
         gain : float or None
             Electrons in a unit of the stamps, for the photon noise of the stars; None for none. Kriging refuses stamps
             that are not in electrons; else their photon noise counts as unknown.
-        clip_sigma : float or None
-            Pixels that deviate by more standard deviations are rejected; with None, for noise-free stars, none is.
-        max_iterations : int
-            Most passes of the rejection.
-        replacement : str
-            Replacement of rejected pixels: the ``mean`` of the stars, as in the paper, or as for masked ones the
-            ``polynomial`` of the others.
+        clipping : SigmaClipping or None
+            Rejection of pixels that stand out, beyond five standard deviations by default; with None, for noise-free
+            stars, none is rejected.
 
         Raises
         ------
@@ -145,21 +145,16 @@ class PsfModel(ModelFit, Result):
             If an array has the wrong shape, a star has no flux or no pixel with weight, a pixel has none in any star,
             or the stars do not determine the polynomials (all on a line, say).
         """
-        chosen_recipe = Recipe.of(
-            recipe, basis=basis, interpolation=interpolation, n_components=n_components, scale=scale, order=order
-        )
         return fit_stars(
             cls,
             stamps,
             positions,
-            chosen_recipe,
+            Recipe.of(recipe, **recipe_keys),
             weights=weights,
             masks=masks,
             extent=extent,
             gain=gain,
-            clip_sigma=clip_sigma,
-            max_iterations=max_iterations,
-            replacement=replacement,
+            clipping=clipping,
         )
 
     def _label(self) -> str:

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal
+
 import numpy as np
 
+from ...core.arguments import check_arguments
+from ...core.errors import ConfigError
 from ...core.statistics import RMS_PER_MAD
 
 # Standard deviation of the PSF itself within a CCD: this fraction of the geometric mean of the pixel's value and the
@@ -13,6 +18,38 @@ _PSF_CHANGE = 0.04
 _FLOOR = 1e-4
 # A star's rejected pixels come back if the other stars' polynomials predict their deviations from the mean this well.
 _PREDICTED = 0.1
+
+
+@check_arguments
+@dataclass(frozen=True)
+class SigmaClipping:
+    """Rejection of the pixels of stars that stand out from the mean PSF.
+
+    Parameters
+    ----------
+    sigma : float
+        Pixels that deviate by more standard deviations are rejected (:func:`find_outliers`).
+    max_iterations : int
+        Most passes of the rejection.
+    replacement : str
+        What stands for rejected pixels: the ``mean`` of the stars, as in Jee & Tyson 2011, or as for masked ones the
+        ``polynomial`` of the others.
+
+    Raises
+    ------
+    ConfigError
+        If an option is out of its range.
+    """
+
+    sigma: float = 5.0
+    max_iterations: int = 20
+    replacement: Literal["mean", "polynomial"] = "mean"
+
+    def __post_init__(self) -> None:
+        if not self.sigma > 0.0:
+            raise ConfigError(f"sigma = {self.sigma}: expected a positive number of standard deviations", key="sigma")
+        if self.max_iterations < 1:
+            raise ConfigError(f"max_iterations = {self.max_iterations}: expected at least 1", key="max_iterations")
 
 
 def find_outliers(images: np.ndarray, clip_sigma: float, max_iterations: int) -> np.ndarray:

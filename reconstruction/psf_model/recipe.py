@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypedDict, TypeVar
 
 import numpy as np
 
@@ -30,6 +30,16 @@ FITTED_INTERPOLATIONS: tuple[type[FittedInterpolation], ...] = (
 )
 #: Names of weights of the stars: equal, by S/N (:func:`~.checks.snr_weights`), or by noise (:mod:`~.shape_noise`).
 WEIGHTS = ("equal", "snr", "softened", "noise")
+
+
+class RecipeKeys(TypedDict, total=False):
+    """Keys of a recipe that :meth:`~.PsfModel.fit` changes alone; None changes nothing."""
+
+    basis: str | Basis | None
+    interpolation: str | Interpolation | None
+    n_components: int | Literal["auto"] | None
+    order: int | Literal["auto"] | None
+    scale: float | None
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from ...core.schema import Positive, Real, Section
 from ...core.units import ARCMIN
 from ...design.metrics.distortion import Distortion, distortion
 from ...measure.adaptive_moments import AdaptiveMoments, adaptive_moments
-from ...measure.correlation import Correlation, shear_correlation
+from ...measure.correlation import Correlation, SeparationBins, shear_correlation
 from ...measure.shapes import Shapes, measure_shapes
 from ...models.telescope import Telescope
 from ...pipeline.experiment import Experiment
@@ -189,8 +189,8 @@ class Scene:
         fields = self.stars.fields
         longest = max(float(np.hypot(*np.ptp(fields, axis=0))), 2.0 * SHORTEST_ARCMIN * ARCMIN)
         x, y = to_detector_axes(fields.T, self.camera_experiment.rotator)
-        shortest = SHORTEST_ARCMIN * ARCMIN
-        return shear_correlation(x, y, first, second, min_sep=shortest, max_sep=longest, n_bins=_CORRELATION_BINS)
+        bins = SeparationBins(SHORTEST_ARCMIN * ARCMIN, longest, _CORRELATION_BINS)
+        return shear_correlation(x, y, first, second, bins=bins)
 
 
 def one_digit(value: float) -> float:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from ...core.errors import DomainError
 from ...core.threads import one_blas_thread
 from ...core.units import ARCMIN
-from ...measure.correlation import SEPARATION_RANGES, jackknife_error, shear_correlation
+from ...measure.correlation import SEPARATION_RANGES, SeparationBins, jackknife_error, shear_correlation
 from ...measure.shapes import Shapes, measure_shapes
 from ...pipeline.experiment import Experiment
 from ...reconstruction.focal_plane_psf.model import FocalPlanePsf
@@ -25,7 +24,7 @@ from .stars import ObservedCcd, SimulatedCcd, used_stars
 KINDS = ("at_stars", "away")
 # Two bins of equal width in the logarithm: 0.56' to 10', and 10' to 180'.
 _LOW, _HIGH = SEPARATION_RANGES["long"]
-_BINS: dict[str, Any] = {"min_sep": _LOW**2 / _HIGH * ARCMIN, "max_sep": _HIGH * ARCMIN, "n_bins": 2}
+_BINS = SeparationBins(_LOW**2 / _HIGH * ARCMIN, _HIGH * ARCMIN, 2)
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ def residual_correlations(fields: list[np.ndarray], residuals: list[np.ndarray])
     x, y = np.concatenate(fields).T
     e = np.concatenate(residuals, axis=1)[:2]
     patch = np.repeat(np.arange(len(fields)), [len(f) for f in fields])
-    correlation = shear_correlation(x, y, *e, **_BINS, patch=patch)
+    correlation = shear_correlation(x, y, *e, bins=_BINS, patch=patch)
     return correlation.xi_plus, correlation.leave_one_out_plus
 
 

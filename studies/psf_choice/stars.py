@@ -22,7 +22,7 @@ from ...pipeline.simulate.photometry import (
     sky_electrons_per_pixel,
 )
 from ...pipeline.simulate.star_field import Depth, make_star_field
-from ...reconstruction.psf_model.model import CLIP_SIGMA, PsfModel
+from ...reconstruction.psf_model.model import CLIPPING, PsfModel
 from .plan import NOISE_FREE, Case
 
 
@@ -110,7 +110,7 @@ def fit(case: Case, ccd: SimulatedCcd, observed: ObservedCcd) -> PsfModel:
         weights=recipe.star_weights(observed.snr[used]),
         gain=1.0 if photons else None,
         extent=ccd.exposure.positions.ccd.extent,
-        clip_sigma=None if case.snr == NOISE_FREE else CLIP_SIGMA,  # without noise there are no outliers
+        clipping=None if case.snr == NOISE_FREE else CLIPPING,  # without noise there are no outliers
     )
 
 

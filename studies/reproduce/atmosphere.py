@@ -11,7 +11,7 @@ from ...core.plotting import new_figure, png_bytes, styled
 from ...core.products import image_hdu, table_hdu
 from ...core.random_streams import stream
 from ...core.units import ARCMIN, ARCSEC
-from ...measure.correlation import Correlation, shear_correlation
+from ...measure.correlation import Correlation, SeparationBins, shear_correlation
 from ...measure.focal_plane_axes import TRUTH, draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
 from ...measure.shapes import fwhm, measure_shapes
 from ...models.ideal_telescope import ideal_telescope
@@ -183,9 +183,7 @@ def ellipticity(bench: Bench) -> Reproduced:
                     pairs[:, 1],
                     e_pairs.real,
                     e_pairs.imag,
-                    min_sep=_SEPARATIONS[0],
-                    max_sep=_SEPARATIONS[1],
-                    n_bins=_BINS,
+                    bins=SeparationBins(*_SEPARATIONS, _BINS),
                 )
             )
             mean_e[time].append(float(np.abs(e_pairs).mean()))

@@ -21,7 +21,7 @@ from ...core.errors import ConfigError, DomainError, check_choice
 from ...core.plotting import figure_at, styled
 from ...core.progress import Reporter
 from ...core.result import Result
-from ...measure.correlation import Correlation, shear_correlation
+from ...measure.correlation import Correlation, SeparationBins, shear_correlation
 from ...measure.focal_plane_axes import draw_outlines, frame_axes
 from ...models.camera.focal_plane import FocalPlane
 from ...pipeline.config import Configuration, MotionConfig
@@ -355,9 +355,8 @@ def _state_metrics(
     places: Places, values: np.ndarray, sky: np.ndarray, edges: np.ndarray
 ) -> tuple[StateMetrics, Correlation]:
     """Return means of values [n, 3] at places, and the correlation of their ellipticities."""
-    correlation = shear_correlation(
-        *sky.T, *values[:, 1:].T, min_sep=edges[0], max_sep=edges[-1], n_bins=len(edges) - 1, weight=places.weight
-    )
+    bins = SeparationBins(edges[0], edges[-1], len(edges) - 1)
+    correlation = shear_correlation(*sky.T, *values[:, 1:].T, bins=bins, weight=places.weight)
     rms_xi = float(np.sqrt(np.nanmean(correlation.xi_plus**2)))
     rms_e = places.mean((values[:, 1:] ** 2).sum(axis=1)) ** 0.5
     return StateMetrics(places.mean(values[:, 0]), rms_e, rms_xi), correlation

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ...core.units import ARCMIN, ARCSEC
-from ...measure.correlation import SEPARATION_RANGES, Correlation, shear_correlation
+from ...measure.correlation import SEPARATION_RANGES, Correlation, SeparationBins, shear_correlation
 from .stack import PsfStack
 
 #: Correlations of a stack: of the true PSFs at all points, and of true minus model at stars and where no star is. With
@@ -49,6 +49,7 @@ def correlations(
     Errors are those of a jackknife over patches, where there are several.
     """
     extent = float(np.hypot(np.ptp(x), np.ptp(y)))
+    bins = SeparationBins(_LEAST * ARCMIN, max(min(extent, 180.0 * ARCMIN), 2.0 * _LEAST * ARCMIN), _BINS)
     correlated = {}
     for kind, (e1, e2, rows) in values.items():
         several = len(np.unique(patch[rows])) > 1
@@ -57,9 +58,7 @@ def correlations(
             y[rows],
             e1[rows],
             e2[rows],
-            min_sep=_LEAST * ARCMIN,
-            max_sep=max(min(extent, 180.0 * ARCMIN), 2.0 * _LEAST * ARCMIN),
-            n_bins=_BINS,
+            bins=bins,
             patch=patch[rows] if several else None,
         )
     return correlated

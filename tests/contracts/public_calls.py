@@ -149,7 +149,7 @@ class _Made:
         return pachon.Atmosphere.from_site("cerro_pachon", 1, exposure=0.5, time_step=0.5, screens=screens)
 
     def make_correlation(self):
-        return pachon.shear_correlation(**self.columns, min_sep=1e-3, max_sep=1e-1, n_bins=3)
+        return pachon.shear_correlation(**self.columns, bins=pachon.SeparationBins(1e-3, 1e-1, 3))
 
     def make_columns(self):
         rng = np.random.default_rng(4)
@@ -202,7 +202,7 @@ def calls(folder):
     mono = design | {"wavelength": w}
     images = {"telescope": tel, "fields": on_axis, "wavelengths": [w], "threads": 1}
     one = {"telescope": tel, "wavelength": w, "projection": "zemax", "threads": 1}
-    pairs = m.columns | {"min_sep": 1e-3, "max_sep": 1e-1, "n_bins": 3, "exact": False}
+    pairs = m.columns | {"bins": pachon.SeparationBins(1e-3, 1e-1, 3, exact=False)}
     sizes = {"size": np.full(30, 1e-6), "model_e1": pairs["e1"] * 0.9, "model_e2": pairs["e2"] * 0.9,
              "model_size": np.full(30, 1.1e-6)}  # fmt: skip
     made = {
@@ -342,10 +342,13 @@ def calls(folder):
         "mean_shear": (pachon.mean_shear, {"shapes": m.shear_shapes, "patch": np.arange(12) // 3}),
         "shear_bias": (pachon.shear_bias, {"plus": m.shear_shapes, "minus": m.shear_shapes, "shear1": 0.01,
                        "shear2": 0.0, "patch": np.arange(12) // 3, "minus_patch": np.arange(12) // 3}),
+        "LocusSearch": (pachon.LocusSearch, {"bright_snr": 60.0, "min_stars": 3, "radius_range": (1.0, 9.0)}),
         "select_stars": (pachon.select_stars, {"objects": m.objects, "image": m.image, "min_snr": 30.0,
-                         "bright_snr": 60.0, "n_sigma": 4.0, "max_ellipticity": 0.1, "isolation": 5.0, "min_stars": 3,
+                         "n_sigma": 4.0, "max_ellipticity": 0.1, "isolation": 5.0,
+                         "locus": pachon.LocusSearch(min_stars=3),
                          "size": 15, "mask": np.zeros(flat.shape, int)}),
         "load_configuration": (pachon.load_configuration, {"path": m.folder / "none.yaml"}),
+        "SeparationBins": (pachon.SeparationBins, {"min_sep": 1e-3, "max_sep": 1e-1, "n_bins": 3, "exact": False}),
         "shear_correlation": (pachon.shear_correlation, pairs | {"subtract_mean": False,
                               "patch": np.repeat([0, 1, 2], 10)}),
         "rho_statistics": (pachon.rho_statistics, pairs | sizes | {"patch": np.repeat([0, 1, 2], 10)}),
@@ -632,7 +635,9 @@ def _methods(m, tel, w, x, y):
         "PsfModel.fit": (pachon.PsfModel.fit, {"stamps": m.stamps, "positions": m.places, "recipe": "paper",
                          "basis": "pca",
                          "interpolation": "polynomial", "weights": np.ones(12), "n_components": 2, "order": 1,
-                         "masks": np.zeros((12, 15, 15), bool), "extent": (-1.0, 1.0, -1.0, 1.0), "clip_sigma": 3.0}),
+                         "masks": np.zeros((12, 15, 15), bool), "extent": (-1.0, 1.0, -1.0, 1.0),
+                         "clipping": pachon.SigmaClipping(3.0)}),
+        "SigmaClipping": (pachon.SigmaClipping, {"sigma": 3.0, "max_iterations": 5, "replacement": "mean"}),
         "PsfModel.fit kriging": (pachon.PsfModel.fit, {"stamps": 1e4 * m.stamps, "positions": m.places,
                                  "basis": "pixels", "interpolation": "kriging", "order": 1, "gain": 1.0}),
         "PsfModel.at": (m.model.at, {"positions": m.places[:2]}),

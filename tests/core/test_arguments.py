@@ -1,10 +1,11 @@
 """Arguments are checked by their annotations: what passes is unchanged, what does not is one line with its name."""
 
+import inspect
 import pickle
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypedDict, Unpack
 
 import numpy as np
 import pytest
@@ -170,11 +171,11 @@ def test_masked_stars_and_pixels():
     """Masked stars are left out of correlations; masked pixels of stars have no weight in moments and fits."""
     rng = np.random.default_rng(1)
     x, y, e1, e2 = rng.uniform(-0.01, 0.01, (4, 200))
-    bins = {"min_sep": 1e-3, "max_sep": 1e-2, "n_bins": 3, "exact": True}
+    bins = pachon.SeparationBins(1e-3, 1e-2, 3, exact=True)
     outlier = np.arange(200) >= 150
     spoilt = np.ma.masked_array(np.where(outlier, 100.0, e1), mask=outlier)
-    found = pachon.shear_correlation(x, y, spoilt, e2, **bins)
-    alone = pachon.shear_correlation(x[:150], y[:150], e1[:150], e2[:150], **bins)
+    found = pachon.shear_correlation(x, y, spoilt, e2, bins=bins)
+    alone = pachon.shear_correlation(x[:150], y[:150], e1[:150], e2[:150], bins=bins)
     np.testing.assert_array_equal(found.xi_plus, alone.xi_plus)
     grid = np.mgrid[-7:8, -7:8]
     stamps = np.stack([np.exp(-0.5 * (grid**2).sum(axis=0) / w**2) for w in (1.5, 1.8, 2.0)])
@@ -219,3 +220,24 @@ def test_a_name_in_place_of_a_telescope_is_told_what_loads_it():
     assert (
         str(caught.value) == "telescope = 'lsst_v3.3_r': expected a Telescope, as of pachon.load_telescope or a Request"
     )
+
+
+class _Sizes(TypedDict, total=False):
+    width: float | None
+    kind: Literal["round", "square"] | None
+
+
+@check_arguments
+def _area(factor: float, **sizes: Unpack[_Sizes]) -> float:
+    return factor * sizes["width"] ** 2
+
+
+def test_unpacked_keywords_are_checked_and_shown_as_parameters():
+    assert list(inspect.signature(_area).parameters) == ["factor", "width", "kind"]
+    assert _area(2.0, width=3.0, kind="round") == 18.0
+    with pytest.raises(DomainError, match=r"^width = 'wide': expected a number$"):
+        _area(2.0, width="wide")
+    with pytest.raises(ConfigError, match=r"^kind = 'oval': expected one of round, square$"):
+        _area(2.0, kind="oval")
+    with pytest.raises(TypeError, match=r"_area\(\) got an unexpected keyword argument 'height'"):
+        _area(2.0, height=1.0)

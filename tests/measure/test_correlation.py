@@ -1,15 +1,16 @@
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from astropy import units as u
 
-from pachon.core.errors import DomainError
-from pachon.measure.correlation import EXACT_LIMIT, shear_correlation
+from pachon.core.errors import ConfigError, DomainError
+from pachon.measure.correlation import EXACT_LIMIT, SeparationBins, shear_correlation
 
 ARCMIN = np.pi / 180.0 / 60.0
-BINS = {"min_sep": 1.0 * ARCMIN, "max_sep": 60.0 * ARCMIN, "n_bins": 8}
+BINS = SeparationBins(1.0 * ARCMIN, 60.0 * ARCMIN, 8)
 
 
 def catalogue(count=300, seed=0):
@@ -23,8 +24,8 @@ def catalogue(count=300, seed=0):
 
 def test_brute_force_pair_counting():
     x, y, e1, e2 = catalogue()
-    c = shear_correlation(x, y, e1, e2, **BINS)
-    edges = np.geomspace(BINS["min_sep"], BINS["max_sep"], 9)
+    c = shear_correlation(x, y, e1, e2, bins=BINS)
+    edges = np.geomspace(BINS.min_sep, BINS.max_sep, 9)
     e = e1 + 1j * e2
     i, j = np.triu_indices(len(x), 1)
     dx, dy = x[j] - x[i], y[j] - y[i]
@@ -44,9 +45,9 @@ def test_brute_force_pair_counting():
 
 def test_constant_field():
     x, y, _, _ = catalogue()
-    c = shear_correlation(x, y, np.full(300, 0.03), np.full(300, -0.04), **BINS)
+    c = shear_correlation(x, y, np.full(300, 0.03), np.full(300, -0.04), bins=BINS)
     np.testing.assert_allclose(c.xi_plus, 0.05**2, rtol=1.2e-7)  # single precision in TreeCorr, 2^-23
-    flat = shear_correlation(x, y, np.full(300, 0.03), np.full(300, -0.04), subtract_mean=True, **BINS)
+    flat = shear_correlation(x, y, np.full(300, 0.03), np.full(300, -0.04), subtract_mean=True, bins=BINS)
     np.testing.assert_allclose(flat.xi_plus, 0.0, atol=1e-30)
 
 
@@ -56,13 +57,13 @@ def test_tangential_pattern_and_flips():
     angle = np.linspace(0.0, 2 * np.pi, 40, endpoint=False) + 0.1
     x, y = 10 * ARCMIN * np.cos(angle), 10 * ARCMIN * np.sin(angle)
     e1, e2 = -0.1 * np.cos(2 * angle), -0.1 * np.sin(2 * angle)
-    options = {"min_sep": 19.97 * ARCMIN, "max_sep": 20.03 * ARCMIN, "n_bins": 1}
+    bins = SeparationBins(19.97 * ARCMIN, 20.03 * ARCMIN, 1)
     single = 1.2e-9  # TreeCorr's single precision, 2^-23 of |e|^2
-    for c in (shear_correlation(x, y, e1, e2, **options), shear_correlation(x, -y, e1, -e2, **options)):
+    for c in (shear_correlation(x, y, e1, e2, bins=bins), shear_correlation(x, -y, e1, -e2, bins=bins)):
         assert c.n_pairs[0] == 20
         assert c.xi_minus[0] == pytest.approx(0.01, abs=single)
         assert c.xi_plus[0] == pytest.approx(0.01, abs=single)
-    wrong = shear_correlation(x, -y, e1, e2, **options)
+    wrong = shear_correlation(x, -y, e1, e2, bins=bins)
     # phi -> -phi alone: the mean of 0.01 cos(8 phi) over twenty evenly spread directions.
     assert wrong.xi_minus[0] == pytest.approx(0.0, abs=single)
     assert wrong.xi_plus[0] == pytest.approx(0.01, abs=single)
@@ -72,14 +73,16 @@ def test_unusable_stars_are_dropped():
     x, y, e1, e2 = catalogue()
     e1[7], e2[20], x[33] = np.nan, np.nan, np.nan
     keep = np.isfinite(e1 + e2 + x)
-    c = shear_correlation(x, y, e1, e2, **BINS)
-    d = shear_correlation(x[keep], y[keep], e1[keep], e2[keep], **BINS)
+    c = shear_correlation(x, y, e1, e2, bins=BINS)
+    d = shear_correlation(x[keep], y[keep], e1[keep], e2[keep], bins=BINS)
     assert c.n_stars == 297
     assert c.xi_plus.tobytes() == d.xi_plus.tobytes()
 
 
 def test_empty_bins_are_nan():
-    c = shear_correlation([0.0, ARCMIN], [0.0, 0.0], [0.1, 0.1], [0.0, 0.0], min_sep=0.5 * ARCMIN, max_sep=50 * ARCMIN)
+    c = shear_correlation(
+        [0.0, ARCMIN], [0.0, 0.0], [0.1, 0.1], [0.0, 0.0], bins=SeparationBins(0.5 * ARCMIN, 50 * ARCMIN)
+    )
     assert (c.n_pairs == 0).sum() == 19
     for values in (c.xi_plus, c.xi_minus, c.error_plus, c.error_minus):
         assert np.isnan(values).sum() == 19
@@ -93,7 +96,7 @@ def test_shot_noise_error():
         rng = np.random.default_rng(seed)
         x, y = rng.uniform(0.0, 60 * ARCMIN, (2, 100))
         e1, e2 = rng.normal(0.0, 0.02, (2, 100))
-        results.append(shear_correlation(x, y, e1, e2, min_sep=10 * ARCMIN, max_sep=60 * ARCMIN, n_bins=1))
+        results.append(shear_correlation(x, y, e1, e2, bins=SeparationBins(10 * ARCMIN, 60 * ARCMIN, 1)))
     scatter = np.std([c.xi_plus[0] for c in results])
     claimed = np.mean([c.error_plus[0] for c in results])
     assert scatter / claimed == pytest.approx(1.0, abs=0.2)  # 200 fields: 5 % each, four sigma
@@ -101,8 +104,8 @@ def test_shot_noise_error():
 
 def test_cells_agree_with_pairs():
     x, y, e1, e2 = catalogue(3000)
-    pairs = shear_correlation(x, y, e1, e2, **BINS)
-    cells = shear_correlation(x, y, e1, e2, exact=False, **BINS)
+    pairs = shear_correlation(x, y, e1, e2, bins=BINS)
+    cells = shear_correlation(x, y, e1, e2, bins=replace(BINS, exact=False))
     # bin_slop = 0.1 blurs bins of 0.5 in ln r by 5 %; the field changes by its own size over about a bin.
     np.testing.assert_allclose(cells.xi_plus, pairs.xi_plus, atol=2e-6)
     assert EXACT_LIMIT >= 189 * 40  # the observed stars of the whole focal plane are counted pair by pair
@@ -111,17 +114,17 @@ def test_cells_agree_with_pairs():
 @pytest.mark.parametrize("exact", [True, False])
 def test_same_bytes_again(exact):
     x, y, e1, e2 = catalogue(2000)
-    first = shear_correlation(x, y, e1, e2, exact=exact, **BINS)
-    second = shear_correlation(x, y, e1, e2, exact=exact, **BINS)
+    first = shear_correlation(x, y, e1, e2, bins=replace(BINS, exact=exact))
+    second = shear_correlation(x, y, e1, e2, bins=replace(BINS, exact=exact))
     assert first.xi_plus.tobytes() == second.xi_plus.tobytes()
     assert first.xi_minus.tobytes() == second.xi_minus.tobytes()
 
 
 def test_quantities():
     x, y, e1, e2 = catalogue()
-    c = shear_correlation(x, y, e1, e2, **BINS)
+    c = shear_correlation(x, y, e1, e2, bins=BINS)
     q = shear_correlation(
-        x * u.rad, y * u.rad, e1, e2, min_sep=1.0 * u.arcmin, max_sep=60.0 * u.arcmin, n_bins=BINS["n_bins"]
+        x * u.rad, y * u.rad, e1, e2, bins=SeparationBins(1.0 * u.arcmin, 60.0 * u.arcmin, BINS.n_bins)
     )
     np.testing.assert_allclose(q.xi_plus, c.xi_plus, rtol=1e-9)  # bin edges differ by rounding
 
@@ -137,12 +140,12 @@ def test_jackknife_is_delete_one_patch(cross):
     x, y, e1, e2 = catalogue()
     other = (0.3 * e2 + 0.01, 0.5 * e1) if cross else None
     patch = grid_patches(x, y)
-    c = shear_correlation(x, y, e1, e2, patch=patch, other=other, **BINS)
+    c = shear_correlation(x, y, e1, e2, patch=patch, other=other, bins=BINS)
     left = []
     for name in np.unique(patch):
         k = patch != name
         part = None if other is None else (other[0][k], other[1][k])
-        left.append(shear_correlation(x[k], y[k], e1[k], e2[k], other=part, **BINS))
+        left.append(shear_correlation(x[k], y[k], e1[k], e2[k], other=part, bins=BINS))
     for sign in ("plus", "minus"):
         xi = np.array([getattr(d, f"xi_{sign}") for d in left])
         expected = np.sqrt(8.0 / 9.0 * np.sum((xi - xi.mean(axis=0)) ** 2, axis=0))
@@ -159,21 +162,21 @@ def test_jackknife_takes_labels_not_their_numbers():
     x, y, e1, e2 = catalogue()
     patch = grid_patches(x, y)
     names, number = np.unique(patch, return_inverse=True)
-    a = shear_correlation(x, y, e1, e2, patch=patch, **BINS)
-    b = shear_correlation(x, y, e1, e2, patch=7 * number + 3, **BINS)
+    a = shear_correlation(x, y, e1, e2, patch=patch, bins=BINS)
+    b = shear_correlation(x, y, e1, e2, patch=7 * number + 3, bins=BINS)
     assert len(names) == 9
     assert a.error_plus.tobytes() == b.error_plus.tobytes()
 
 
 def test_patches_leave_the_correlation():
     x, y, e1, e2 = catalogue()
-    plain = shear_correlation(x, y, e1, e2, **BINS)
-    c = shear_correlation(x, y, e1, e2, patch=grid_patches(x, y), **BINS)
+    plain = shear_correlation(x, y, e1, e2, bins=BINS)
+    c = shear_correlation(x, y, e1, e2, patch=grid_patches(x, y), bins=BINS)
     np.testing.assert_array_equal(c.n_pairs, plain.n_pairs)
     np.testing.assert_allclose(c.xi_plus, plain.xi_plus, rtol=1e-10)  # sums in another order
     np.testing.assert_allclose(c.xi_minus, plain.xi_minus, rtol=1e-8, atol=1e-12)
     assert np.all(c.error_plus > plain.error_plus)  # patches of a smooth field are not noise
-    again = shear_correlation(x, y, e1, e2, patch=grid_patches(x, y), **BINS)
+    again = shear_correlation(x, y, e1, e2, patch=grid_patches(x, y), bins=BINS)
     assert c.error_plus.tobytes() == again.error_plus.tobytes()
 
 
@@ -186,8 +189,8 @@ def test_jackknife_of_independent_patches():
         rng = np.random.default_rng(seed)
         x, y = (np.repeat(v.ravel(), 8) + rng.uniform(0.0, 5.0 * ARCMIN, 200) for v in np.meshgrid(edge, edge))
         e1, e2 = (np.repeat(rng.normal(0.0, 0.01, 25), 8) for _ in range(2))
-        options = {"min_sep": 0.5 * ARCMIN, "max_sep": 8.0 * ARCMIN, "n_bins": 1}
-        results.append(shear_correlation(x, y, e1, e2, patch=np.repeat(np.arange(25), 8), **options))
+        bins = SeparationBins(0.5 * ARCMIN, 8.0 * ARCMIN, 1)
+        results.append(shear_correlation(x, y, e1, e2, patch=np.repeat(np.arange(25), 8), bins=bins))
     scatter = np.std([c.xi_plus[0] for c in results])
     claimed = np.sqrt(np.mean([c.error_plus[0] ** 2 for c in results]))
     assert scatter / claimed == pytest.approx(1.0, abs=0.2)  # 200 fields: 5 % each, four sigma
@@ -196,8 +199,8 @@ def test_jackknife_of_independent_patches():
 def test_no_jackknife_where_one_patch_holds_all_pairs():
     # Two patches far apart: pairs between them are gone without either.
     x = np.array([0.0, 1.0, 50.0, 51.0]) * ARCMIN
-    options = {"min_sep": 0.5 * ARCMIN, "max_sep": 60.0 * ARCMIN, "n_bins": 2}
-    c = shear_correlation(x, np.zeros(4), [0.1, 0.2, 0.1, 0.1], np.zeros(4), patch=[0, 0, 1, 1], **options)
+    bins = SeparationBins(0.5 * ARCMIN, 60.0 * ARCMIN, 2)
+    c = shear_correlation(x, np.zeros(4), [0.1, 0.2, 0.1, 0.1], np.zeros(4), patch=[0, 0, 1, 1], bins=bins)
     np.testing.assert_array_equal(c.n_pairs, [2, 4])
     # Without one patch only the pair of the other is left: 0.01 and 0.02, so sqrt((2 - 1) / 2 * 2 * 0.005^2).
     assert c.error_plus[0] == pytest.approx(0.005, rel=1e-6)  # single precision
@@ -208,8 +211,8 @@ def test_no_jackknife_where_one_patch_holds_all_pairs():
 def test_cross_correlation_counts_both_orders():
     x, y, e1, e2 = catalogue(60)
     f1, f2 = 0.01 + e2**2, -0.02 + 0.3 * e1
-    c = shear_correlation(x, y, e1, e2, other=np.stack([f1, f2]), **BINS)
-    edges = np.geomspace(BINS["min_sep"], BINS["max_sep"], 9)
+    c = shear_correlation(x, y, e1, e2, other=np.stack([f1, f2]), bins=BINS)
+    edges = np.geomspace(BINS.min_sep, BINS.max_sep, 9)
     i, j = np.triu_indices(60, 1)
     bins = np.digitize(np.hypot(x[j] - x[i], y[j] - y[i]), edges) - 1
     e, f = e1 + 1j * e2, f1 + 1j * f2
@@ -226,30 +229,34 @@ def test_cross_correlation_counts_both_orders():
 def test_bad_patches():
     x, y, e1, e2 = catalogue(10)
     with pytest.raises(DomainError, match=r"patch has shape \(3,\)"):
-        shear_correlation(x, y, e1, e2, patch=[0, 1, 2], **BINS)
+        shear_correlation(x, y, e1, e2, patch=[0, 1, 2], bins=BINS)
     with pytest.raises(DomainError, match="of patch R22_S11, expected at least 2"):
-        shear_correlation(x, y, e1, e2, patch=["R22_S11"] * 10, **BINS)
+        shear_correlation(x, y, e1, e2, patch=["R22_S11"] * 10, bins=BINS)
     with pytest.raises(DomainError, match="shapes"):
-        shear_correlation(x, y, e1, e2, other=(e1, e2[:5]), **BINS)
+        shear_correlation(x, y, e1, e2, other=(e1, e2[:5]), bins=BINS)
     with pytest.raises(DomainError, match=r"other = .*: expected a sequence of 2"):
-        shear_correlation(x, y, e1, e2, other=(e1, e2, e1), **BINS)
+        shear_correlation(x, y, e1, e2, other=(e1, e2, e1), bins=BINS)
 
 
 def test_bad_arguments():
     x, y, e1, e2 = catalogue(10)
     with pytest.raises(DomainError, match="shapes"):
-        shear_correlation(x, y[:5], e1, e2, **BINS)
+        shear_correlation(x, y[:5], e1, e2, bins=BINS)
     with pytest.raises(DomainError, match="shapes"):
-        shear_correlation(0.0, 0.0, 0.0, 0.0, **BINS)
+        shear_correlation(0.0, 0.0, 0.0, 0.0, bins=BINS)
     with pytest.raises(DomainError, match="e1 = "):
-        shear_correlation(x, y, ["a"] * 10, e2, **BINS)
+        shear_correlation(x, y, ["a"] * 10, e2, bins=BINS)
     with pytest.raises(DomainError, match="0 of 10 stars"):
-        shear_correlation(x, y, e1 * np.nan, e2, **BINS)
+        shear_correlation(x, y, e1 * np.nan, e2, bins=BINS)
     for low, high in ((0.0, 1.0), (2.0, 1.0), (np.nan, 1.0), (1.0, np.inf)):
         with pytest.raises(DomainError, match="min_sep"):
-            shear_correlation(x, y, e1, e2, min_sep=low, max_sep=high)
+            SeparationBins(low, high)
     with pytest.raises(DomainError, match="n_bins"):
-        shear_correlation(x, y, e1, e2, min_sep=0.1, max_sep=1.0, n_bins=0)
+        SeparationBins(0.1, 1.0, n_bins=0)
+    with pytest.raises(DomainError, match=r"^min_sep = 3.0 m: expected"):
+        SeparationBins(3.0 * u.m, 1.0)
+    with pytest.raises(ConfigError, match=r"^min_sep: no argument of shear_correlation; expected bins=SeparationBins"):
+        shear_correlation(x, y, e1, e2, min_sep=0.1, max_sep=1.0)
 
 
 #: Calls with separations or bins of no physical sense, and what the one line of each begins with.
@@ -276,11 +283,11 @@ for options, _ in {BEYOND_RANGES!r}:
         (pachon.rho_statistics, (e1, e2, size, 0.9 * e1, 0.9 * e2, size)),
     ):
         try:
-            call(x, y, *columns, **options)
+            call(x, y, *columns, bins=pachon.SeparationBins(**options))
         except pachon.PachonError as error:
             print(error)
 # The widest range of all, with two stars at one place.
-print(pachon.shear_correlation(x, y, e1, e2, min_sep=1e-12, max_sep=6.28, n_bins=1000).n_pairs.sum())
+print(pachon.shear_correlation(x, y, e1, e2, bins=pachon.SeparationBins(1e-12, 6.28, 1000)).n_pairs.sum())
 """
 
 
@@ -304,14 +311,14 @@ def test_whole_weights_are_stars_that_many_times():
     count = rng.integers(0, 4, 80)
     # Copies of a star are apart by less than the first bin.
     many = [np.repeat(v, count) for v in (x, y, e1, e2)]
-    one, other = shear_correlation(x, y, e1, e2, weight=count, **BINS), shear_correlation(*many, **BINS)
+    one, other = shear_correlation(x, y, e1, e2, weight=count, bins=BINS), shear_correlation(*many, bins=BINS)
     filled = other.n_pairs > 0
     assert filled.sum() > 3
     for key in ("xi_plus", "xi_minus"):
         np.testing.assert_allclose(getattr(one, key)[filled], getattr(other, key)[filled], rtol=1e-6, atol=1e-10)
-    shifted = shear_correlation(x, y, e1, e2, weight=count, subtract_mean=True, **BINS)
-    expected = shear_correlation(*many, subtract_mean=True, **BINS)
+    shifted = shear_correlation(x, y, e1, e2, weight=count, subtract_mean=True, bins=BINS)
+    expected = shear_correlation(*many, subtract_mean=True, bins=BINS)
     np.testing.assert_allclose(shifted.xi_plus[filled], expected.xi_plus[filled], rtol=1e-6, atol=1e-10)
     for wrong in (count[1:], -count - 1.0, np.full(80, np.nan)):
         with pytest.raises(DomainError, match=r"^weight: expected 80 finite numbers from 0, one for each star$"):
-            shear_correlation(x, y, e1, e2, weight=wrong, **BINS)
+            shear_correlation(x, y, e1, e2, weight=wrong, bins=BINS)

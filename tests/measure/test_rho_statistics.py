@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 
 from pachon.core.errors import DomainError
-from pachon.measure.correlation import shear_correlation
+from pachon.measure.correlation import SeparationBins, shear_correlation
 from pachon.measure.rho_statistics import rho_statistics, trace_of_moments
 from pachon.measure.shapes import measure_shapes
 
 ARCMIN = np.pi / 180.0 / 60.0
-BINS = {"min_sep": 2.0 * ARCMIN, "max_sep": 60.0 * ARCMIN, "n_bins": 5}
+BINS = SeparationBins(2.0 * ARCMIN, 60.0 * ARCMIN, 5)
 
 
 def columns(count=300, seed=0):
@@ -23,15 +23,15 @@ def columns(count=300, seed=0):
 
 def brute_force(x, y, f, g):
     """Mean of Re(f g*) over pairs in both orders, in each bin."""
-    edges = np.geomspace(BINS["min_sep"], BINS["max_sep"], BINS["n_bins"] + 1)
+    edges = np.geomspace(BINS.min_sep, BINS.max_sep, BINS.n_bins + 1)
     i, j = np.nonzero(~np.eye(len(x), dtype=bool))
     bins = np.digitize(np.hypot(x[j] - x[i], y[j] - y[i]), edges) - 1
-    return np.array([(f[i] * g[j].conj()).real[bins == b].mean() for b in range(BINS["n_bins"])])
+    return np.array([(f[i] * g[j].conj()).real[bins == b].mean() for b in range(BINS.n_bins)])
 
 
 def test_brute_force_pair_counting():
     x, y, e1, e2, size, m1, m2, model_size = columns()
-    rho = rho_statistics(x, y, e1, e2, size, m1, m2, model_size, **BINS)
+    rho = rho_statistics(x, y, e1, e2, size, m1, m2, model_size, bins=BINS)
 
     # Semi-axes from size = sqrt(a b) and |e| = (a - b)/(a + b), and T = a^2 + b^2.
     def trace(s, f1, f2):
@@ -49,7 +49,7 @@ def test_brute_force_pair_counting():
 
 def test_a_perfect_model_has_none():
     x, y, e1, e2, size, *_ = columns()
-    rho = rho_statistics(x, y, e1, e2, size, e1, e2, size, **BINS)
+    rho = rho_statistics(x, y, e1, e2, size, e1, e2, size, bins=BINS)
     for _, correlation in rho.items():
         np.testing.assert_array_equal(correlation.xi_plus, 0.0)
 
@@ -57,8 +57,8 @@ def test_a_perfect_model_has_none():
 def test_a_model_right_in_shape_and_wrong_in_size():
     # Sizes 1 % too small everywhere: dT/T = 1 - 0.99^2, so rho3 and rho5 are xi+ of the stars times its square and it.
     x, y, e1, e2, size, *_ = columns()
-    rho = rho_statistics(x, y, e1, e2, size, e1, e2, 0.99 * size, **BINS)
-    xi = shear_correlation(x, y, e1, e2, **BINS).xi_plus
+    rho = rho_statistics(x, y, e1, e2, size, e1, e2, 0.99 * size, bins=BINS)
+    xi = shear_correlation(x, y, e1, e2, bins=BINS).xi_plus
     growth = 1.0 - 0.99**2
     for name in ("rho1", "rho2", "rho4"):
         np.testing.assert_array_equal(getattr(rho, name).xi_plus, 0.0)
@@ -68,7 +68,7 @@ def test_a_model_right_in_shape_and_wrong_in_size():
 
 def test_a_model_off_by_a_constant():
     x, y, e1, e2, size, *_ = columns()
-    rho = rho_statistics(x, y, 0 * e1 + 0.05, 0 * e2, size, 0 * e1 + 0.03, 0 * e2 - 0.01, size, **BINS)
+    rho = rho_statistics(x, y, 0 * e1 + 0.05, 0 * e2, size, 0 * e1 + 0.03, 0 * e2 - 0.01, size, bins=BINS)
     np.testing.assert_allclose(rho.rho1.xi_plus, 0.02**2 + 0.01**2, rtol=1e-6)
     np.testing.assert_allclose(rho.rho2.xi_plus, 0.05 * 0.02, rtol=1e-6)
 
@@ -76,16 +76,16 @@ def test_a_model_off_by_a_constant():
 def test_rowes_sum_rule():
     # <e_m* e_m> = <e* e> - 2 <e* de> + <de* de>: the definition of the difference.
     x, y, e1, e2, size, m1, m2, model_size = columns()
-    rho = rho_statistics(x, y, e1, e2, size, m1, m2, model_size, **BINS)
-    star, model = (shear_correlation(x, y, *e, **BINS).xi_plus for e in ((e1, e2), (m1, m2)))
+    rho = rho_statistics(x, y, e1, e2, size, m1, m2, model_size, bins=BINS)
+    star, model = (shear_correlation(x, y, *e, bins=BINS).xi_plus for e in ((e1, e2), (m1, m2)))
     np.testing.assert_allclose(star - 2 * rho.rho2.xi_plus + rho.rho1.xi_plus, model, rtol=2e-6)
 
 
 def test_errors_are_those_of_a_jackknife():
     c = columns()
     patch = (c[0] > 30 * ARCMIN) * 2 + (c[1] > 30 * ARCMIN)
-    rho = rho_statistics(*c, patch=patch, **BINS)
-    left = [rho_statistics(*(v[patch != k] for v in c), **BINS) for k in range(4)]
+    rho = rho_statistics(*c, patch=patch, bins=BINS)
+    left = [rho_statistics(*(v[patch != k] for v in c), bins=BINS) for k in range(4)]
     for name, correlation in rho.items():
         xi = np.array([getattr(r, name).xi_plus for r in left])
         expected = np.sqrt(0.75 * ((xi - xi.mean(axis=0)) ** 2).sum(axis=0))
@@ -98,7 +98,7 @@ def test_one_column_takes_a_star_out_of_all():
         column[10 * i] = np.nan
     keep = np.isfinite(c).all(axis=0)
     assert keep.sum() == 292
-    rho, kept = rho_statistics(*c, **BINS), rho_statistics(*(v[keep] for v in c), **BINS)
+    rho, kept = rho_statistics(*c, bins=BINS), rho_statistics(*(v[keep] for v in c), bins=BINS)
     for name, correlation in rho.items():
         assert correlation.n_stars == 292
         assert correlation.xi_plus.tobytes() == getattr(kept, name).xi_plus.tobytes()
@@ -120,10 +120,10 @@ def test_trace_of_the_moments_of_an_image():
 def test_bad_arguments():
     c = list(columns(10))
     with pytest.raises(DomainError, match="expected \\[n\\] six times"):
-        rho_statistics(*c[:4], c[4][:5], *c[5:], **BINS)
+        rho_statistics(*c[:4], c[4][:5], *c[5:], bins=BINS)
     with pytest.raises(DomainError, match="model_size: expected positive sizes, the least is -1"):
-        rho_statistics(*c[:7], -np.ones(10), **BINS)
+        rho_statistics(*c[:7], -np.ones(10), bins=BINS)
     with pytest.raises(DomainError, match="real numbers"):
-        rho_statistics(*c[:7], ["a"] * 10, **BINS)
+        rho_statistics(*c[:7], ["a"] * 10, bins=BINS)
     with pytest.raises(DomainError, match="shapes"):
-        rho_statistics(c[0][:3], *c[1:], **BINS)
+        rho_statistics(c[0][:3], *c[1:], bins=BINS)

@@ -288,7 +288,7 @@ def test_metrics_are_of_both_models(products, focal_plane_config, plane_model):
     x_mm, y_mm, size = (np.concatenate([getattr(s, k) for s in stars]) for k in ("x", "y", "size"))
     plane = model.shapes("", x_mm, y_mm)
     patch = np.repeat([0, 1], [len(s) for s in stars])
-    expected = shear_correlation(x, y, e1 - plane.e1, e2 - plane.e2, patch=patch, **separation_bins(applied))
+    expected = shear_correlation(x, y, e1 - plane.e1, e2 - plane.e2, bins=separation_bins(applied), patch=patch)
     np.testing.assert_array_equal(correlated["away"].xi_plus, expected.xi_plus)
     for i, (key, values) in enumerate((("e1", e1 - plane.e1), ("e2", e2 - plane.e2))):
         assert together[f"chi2_away_{key}"] == pytest.approx(np.mean((values / model.scatter[i]) ** 2), rel=1e-12)

@@ -86,8 +86,7 @@ def test_correlations_take_positions_along_the_axes_of_the_ellipticities(finishe
     e = (e1 + 1j * e2) * np.exp(2j * angle)
     catalog = treecorr.Catalog(x=x, y=y, g1=e.real, g2=e.imag)
     bins = separation_bins(products)
-    bins["nbins"] = bins.pop("n_bins")
-    pairs = treecorr.GGCorrelation(**bins, brute=True)
+    pairs = treecorr.GGCorrelation(min_sep=bins.min_sep, max_sep=bins.max_sep, nbins=bins.n_bins, brute=True)
     pairs.process(catalog)
     filled = found.n_pairs > 0
     size = np.mean(np.abs(e) ** 2)

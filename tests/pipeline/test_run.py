@@ -251,7 +251,7 @@ def test_errors_of_mean_correlations_are_their_jackknife(finished_run):
         short = np.array(summary["correlation"][kind]["r_arcmin"]) < 10.0
         left = []
         for s in stars:
-            c = shear_correlation(s.field_x, s.field_y, s.e1 - s.model_e1, s.e2 - s.model_e2, **bins)
+            c = shear_correlation(s.field_x, s.field_y, s.e1 - s.model_e1, s.e2 - s.model_e2, bins=bins)
             chosen = short & (c.n_pairs > 0)
             left.append(np.average(c.xi_plus[chosen], weights=c.n_pairs[chosen]))
         expected = np.sqrt(0.5 * np.sum((np.array(left) - np.mean(left)) ** 2))

@@ -8,7 +8,7 @@ from scipy.special import j0
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, UnknownNameError
 from pachon.core.units import ARCSEC
-from pachon.measure.correlation import SEPARATION_RANGES, shear_correlation
+from pachon.measure.correlation import SEPARATION_RANGES, SeparationBins, shear_correlation
 from pachon.measure.shapes import measure_shapes
 from pachon.measure.stamps import center_stamps
 from pachon.pipeline.config import load_configuration, with_options
@@ -68,11 +68,11 @@ def test_error_of_a_change_is_its_own_jackknife():
     x = np.concatenate([k * 0.02 + rng.uniform(0.0, 0.004, 12) for k in range(3)])
     y = rng.uniform(0.0, 0.004, 36)
     patch = np.repeat(np.arange(3), 12)
-    bins = {"min_sep": 1e-4, "max_sep": 0.05, "n_bins": 8}
+    bins = SeparationBins(1e-4, 0.05, 8)
     e, f = rng.normal(0.0, 0.02, (2, 2, 36))
 
     def long_range(ellipticity, keep):
-        c = shear_correlation(x[keep], y[keep], *ellipticity[:, keep], **bins)
+        c = shear_correlation(x[keep], y[keep], *ellipticity[:, keep], bins=bins)
         inside = (c.r_arcmin >= 10.0) & (c.r_arcmin < 180.0) & (c.n_pairs > 0)
         return np.sum(c.n_pairs[inside] * c.xi_plus[inside]) / c.n_pairs[inside].sum()
 
@@ -80,7 +80,7 @@ def test_error_of_a_change_is_its_own_jackknife():
     expected = np.sqrt(2.0 / 3.0 * np.sum((left - np.mean(left)) ** 2))
     kinds = ("truth", "observed", "residual", "away")
     keys = {f"xi_plus_{kind}_{name}": 0.0 for kind in kinds for name in SEPARATION_RANGES}
-    one, other = (dict.fromkeys(kinds, shear_correlation(x, y, *v, patch=patch, **bins)) for v in (e, f))
+    one, other = (dict.fromkeys(kinds, shear_correlation(x, y, *v, bins=bins, patch=patch)) for v in (e, f))
     found = changes(keys, keys, one, other)
     assert found["error_xi_plus_away_long"] == pytest.approx(expected, rel=1e-9)  # sums in another order
     # Stars and their mates in the other case are the same: what both have in common is in no error.

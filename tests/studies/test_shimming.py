@@ -9,7 +9,7 @@ import pytest
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError
 from pachon.core.files import json_text
-from pachon.measure.correlation import shear_correlation
+from pachon.measure.correlation import SeparationBins, shear_correlation
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.pipeline.config import Configuration, load_configuration, with_options
 from pachon.pipeline.experiment import Experiment
@@ -113,7 +113,7 @@ def test_pair_sums_are_those_of_treecorr_and_their_derivatives_finite_difference
     pairs = PairSum.of(sky, weight, edges)
     expected = pair_by_pair(sky, weight, e, edges)
     assert pairs.xi_plus(e) == pytest.approx(expected, rel=1e-12)
-    found = shear_correlation(*sky.T, *e.T, min_sep=edges[0], max_sep=edges[-1], n_bins=8, weight=weight)
+    found = shear_correlation(*sky.T, *e.T, bins=SeparationBins(edges[0], edges[-1], 8), weight=weight)
     # TreeCorr keeps ellipticities in single precision.
     assert found.xi_plus[found.n_pairs > 0] == pytest.approx(expected, abs=1e-7 * (e**2).sum(axis=1).mean())
     value, slope = pairs.mean_square(e)

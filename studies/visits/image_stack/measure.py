@@ -22,7 +22,7 @@ from ....measure.catalogue.detect import DetectedObjects, detect_objects
 from ....measure.catalogue.fit_galaxies import fit_galaxies
 from ....measure.catalogue.galaxy_fits import usable_galaxies
 from ....measure.catalogue.matching import match_positions
-from ....measure.catalogue.star_locus import StarSelection, select_stars
+from ....measure.catalogue.star_locus import LocusSearch, StarSelection, select_stars
 from ....measure.shapes import measure_shapes
 from ....measure.shear.detection import detect_shear
 from ....measure.shear.weight import half_light_radii, weight_sigma
@@ -274,9 +274,7 @@ def selected_stars(
         image.image,
         mask=image.mask,
         min_snr=least * depth,
-        bright_snr=_BRIGHT_SNR * depth,
-        min_stars=_FEWEST_STARS,
-        radius_range=(_RADII[0] * radius, _RADII[1] * radius),
+        locus=LocusSearch(_BRIGHT_SNR * depth, _FEWEST_STARS, (_RADII[0] * radius, _RADII[1] * radius)),
     )
 
 

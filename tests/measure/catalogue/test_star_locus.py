@@ -151,6 +151,16 @@ def test_bad_options(options, message):
         pachon.select_stars(**({"objects": objects, "image": IMAGE} | options))
 
 
+def test_bad_searches_of_the_locus():
+    objects, _ = catalogue()
+    with pytest.raises(pachon.DomainError, match=r"^bright_snr = -1"):
+        pachon.LocusSearch(bright_snr=-1.0)
+    with pytest.raises(pachon.DomainError, match=r"^radius_range = 0"):
+        pachon.LocusSearch(radius_range=(0.0, 3.0))
+    with pytest.raises(pachon.ConfigError, match=r"^min_stars: no argument of .*; expected locus=LocusSearch\(min_s"):
+        pachon.select_stars(objects, IMAGE, min_stars=3)
+
+
 def test_truth_of_another_shape():
     objects, star = catalogue()
     with pytest.raises(pachon.DomainError, match="is_star has shape"):

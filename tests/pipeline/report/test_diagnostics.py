@@ -9,6 +9,7 @@ from astropy.table import Table
 from pachon.commands.cli import main
 from pachon.core.errors import ProductError
 from pachon.measure.adaptive_moments import adaptive_moments
+from pachon.measure.correlation import SeparationBins
 from pachon.measure.correlation_plots import rho_plot
 from pachon.measure.rho_statistics import rho_statistics
 from pachon.measure.shapes import measure_shapes
@@ -109,7 +110,7 @@ def test_rho_statistics_of_g_are_of_adaptive_moments(finished_run, diagnosed):
     keys = ("g1", "g2", "sigma", "model_g1", "model_g2", "model_sigma")
     columns = [np.concatenate([getattr(s, key) for s in stars]) for key in keys]
     patch = np.repeat([0, 1], [len(s) for s in stars])
-    expected = rho_statistics(x, y, *columns, patch=patch, **separation_bins(products))
+    expected = rho_statistics(x, y, *columns, bins=separation_bins(products), patch=patch)
     for name, rho in expected.items():
         np.testing.assert_array_equal(getattr(diagnosed.rho_g["away"], name).xi_plus, rho.xi_plus)
     np.testing.assert_allclose(
@@ -286,5 +287,5 @@ def test_picture_of_a_perfect_model():
     rng = np.random.default_rng(0)
     x, y, e1, e2 = rng.uniform(0.0, 0.01, (4, 50))
     size = np.full(50, 0.3)
-    rho = rho_statistics(x, y, e1, e2, size, e1, e2, size, min_sep=1e-3, max_sep=0.01, n_bins=4)
+    rho = rho_statistics(x, y, e1, e2, size, e1, e2, size, bins=SeparationBins(1e-3, 0.01, 4))
     assert rho_plot({"residual": rho, "away": rho}).startswith(b"\x89PNG")

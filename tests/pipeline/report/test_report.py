@@ -13,7 +13,7 @@ import pytest
 
 from pachon.core import plotting
 from pachon.core.plotting import new_figure, png_bytes
-from pachon.measure.correlation import shear_correlation
+from pachon.measure.correlation import SeparationBins, shear_correlation
 from pachon.measure.focal_plane_axes import around_field_circle, key_ellipticity, whiskers
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.pipeline.experiment import Experiment
@@ -179,7 +179,7 @@ def test_lines_of_the_paper_are_for_the_lsst(monkeypatch):
     rng = np.random.default_rng(1)
     fields = rng.uniform(-0.01, 0.01, (200, 2))
     e1, e2 = 0.01 * rng.standard_normal((2, 200))
-    correlation = shear_correlation(*fields.T, e1, e2, min_sep=1e-4, max_sep=1e-2, n_bins=5)
+    correlation = shear_correlation(*fields.T, e1, e2, bins=SeparationBins(1e-4, 1e-2, 5))
     for paper in (True, False):
         statistics_plots.correlation_plot({"truth": correlation}, paper)
     lines = [[t.get_text() for t in f.axes[0].texts if t.get_text().startswith("paper")] for f in figures]

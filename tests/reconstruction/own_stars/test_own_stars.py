@@ -177,11 +177,19 @@ def test_the_command_leaves_model_picture_and_table(stars, tmp_path, monkeypatch
         ({"gain": 0.0}, "gain = 0.0: expected a number of electrons above 0"),
         ({"min_snr": 1e6}, "0 of 60 stars left"),
         ({"pixel_scale": -1.0}, "pixel_scale"),
+        ({"extent": "wide"}, r"^extent = 'wide': expected real numbers"),
     ],
 )
 def test_bad_values_are_named(stars, change, message):
     with pytest.raises(DomainError, match=message):
         fit_own_stars(*stars, **({"pixel_scale": PIXEL} | change))
+
+
+def test_options_of_the_model_are_checked(stars):
+    with pytest.raises(ConfigError, match=r"^weights = 3\.0: expected noise$"):
+        fit_own_stars(*stars, PIXEL, weights=3.0)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'clip'"):
+        fit_own_stars(*stars, PIXEL, clip=3.0)
 
 
 def test_stars_too_faint_for_their_gain_are_told_from_bad_ones():

@@ -75,7 +75,7 @@ def test_weights_are_those_of_noise_and_what_polynomials_leave():
 def test_weighted_eigen_psfs_are_those_of_repeated_stars():
     """Twice the weight is the star twice, in mean, components and polynomials."""
     stars, places, _, _ = field(3, 30, 1)
-    model = fit(stars, places, weights="noise", order=1, n_components=4, clip_sigma=None, extent=EXTENT)
+    model = fit(stars, places, weights="noise", order=1, n_components=4, clipping=None, extent=EXTENT)
     unit = (stars / stars.sum(axis=(1, 2), keepdims=True)).reshape(30, -1)
     weights = model.weights
     assert weights.mean() == pytest.approx(1.0)
@@ -96,8 +96,8 @@ def test_weighted_eigen_psfs_are_those_of_repeated_stars():
 def test_without_noise_in_the_names_nothing_is_weighted():
     stars, places, _, _ = field(3, 30, 1)
     given = np.linspace(0.5, 2.0, 30)
-    model = fit(stars, places, weights=given, n_components=4, clip_sigma=None, extent=EXTENT)
-    plain = fit(stars, places, n_components=4, clip_sigma=None, extent=EXTENT)
+    model = fit(stars, places, weights=given, n_components=4, clipping=None, extent=EXTENT)
+    plain = fit(stars, places, n_components=4, clipping=None, extent=EXTENT)
     assert np.array_equal(model.components, plain.components)
     assert np.array_equal(model.weights, given)
 

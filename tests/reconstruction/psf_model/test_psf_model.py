@@ -11,6 +11,7 @@ import pytest
 
 from pachon.core.errors import ConfigError, DomainError, ProductError
 from pachon.reconstruction.psf_model.model import PsfModel
+from pachon.reconstruction.psf_model.outliers import SigmaClipping
 from pachon.reconstruction.psf_model.shapelets import shapelet_images
 
 #: The recipe of the paper, where a test does not say otherwise.
@@ -102,7 +103,7 @@ def test_shapelets_truncate_the_wings():
     wings = np.hypot(x, y) > 9.0
     left = {}
     for basis in ("pca", "shapelets"):
-        model = fit(stars, places, basis=basis, clip_sigma=None)
+        model = fit(stars, places, basis=basis, clipping=None)
         left[basis] = np.abs((model.at(places) - stars)[:, wings]).sum(axis=1).mean()
         np.testing.assert_allclose(model.at(places).sum(axis=(1, 2)), 1.0, rtol=1e-12)
     assert left["shapelets"] > 1e-3 > 1e4 * left["pca"]
@@ -196,6 +197,7 @@ def test_masks_cost_little_of_noisy_stars():
 def test_outliers_in_a_tenth_of_the_stars_change_the_error_by_less_than_a_tenth(replacement, snr):
     # Equal noise in as many pixels as a Gaussian star is worth, 4 pi sigma^2.
     sigma = 1.0 / (snr * np.sqrt(4.0 * np.pi) * WIDTH)
+    clipping = SigmaClipping(replacement=replacement)
     for seed in range(3):
         stamps, places = noisy(sigma=sigma, seed=seed)
         rng = np.random.default_rng(70 + seed)
@@ -206,11 +208,11 @@ def test_outliers_in_a_tenth_of_the_stars_change_the_error_by_less_than_a_tenth(
             hit[i, y : y + 3, x] += rng.uniform(0.05, 0.3, 3) * max(1.0, 300.0 / snr)
         plain, struck, spoiled = (
             rms(
-                fit(s, places, extent=EXTENT, replacement=replacement, clip_sigma=clip),
+                fit(s, places, extent=EXTENT, clipping=clip),
                 ELSEWHERE,
                 TRUTH,
             )
-            for s, clip in ((stamps, 5.0), (hit, 5.0), (hit, None))
+            for s, clip in ((stamps, clipping), (hit, clipping), (hit, None))
         )
         assert abs(struck / plain - 1.0) < 0.1
         assert spoiled > (1.2 if snr == 30.0 else 1.5) * plain
@@ -330,7 +332,11 @@ def test_bad_input_is_one_clear_line():
     refused(ConfigError, "order = 5: its 21 polynomial terms need as many stars, 20", n_components=3, order=5)
     refused(ConfigError, "basis = 'fourier': expected one of pca, pixels", basis="fourier")
     refused(ConfigError, "interpolation = 'spline'", interpolation="spline", n_components=3)
-    refused(ConfigError, "replacement = 'median'", replacement="median", n_components=3)
+    with pytest.raises(ConfigError, match=r"^replacement = 'median': expected one of mean, polynomial"):
+        SigmaClipping(replacement="median")
+    refused(ConfigError, r"^replacement: no argument of .*; expected clipping=SigmaClipping", replacement="mean")
+    refused(ConfigError, r"^clip_sigma: no argument of .*; expected clipping=SigmaClipping.* None", clip_sigma=None)
+    refused(TypeError, r"fit\(\) got an unexpected keyword argument 'degree'", degree=2)
     refused(ConfigError, "scale = 2", scale=2.0, n_components=3)
     refused(ConfigError, "scale = -1", scale=-1.0, basis="shapelets")
     refused(DomainError, "stamps have shape", stamps=stamps[:0], places=places[:0])

@@ -175,12 +175,12 @@ def test_an_interpolation_is_a_class(monkeypatch, tmp_path):
     images, places = stars()
     unit = images / images.sum(axis=(1, 2), keepdims=True)
     path = tmp_path / "psf.fits"
-    PsfModel.fit(images, places, interpolation=Nearest(), clip_sigma=None).write(path)
+    PsfModel.fit(images, places, interpolation=Nearest(), clipping=None).write(path)
     with pytest.raises(ProductError, match="INTERP = 'nearest', which is none"):
         PsfModel.read(path)
     monkeypatch.setitem(INTERPOLATIONS, "nearest", Nearest)
     monkeypatch.setattr(file, "FITTED_INTERPOLATIONS", (*file.FITTED_INTERPOLATIONS, FittedNearest))
-    model = PsfModel.fit(images, places, interpolation="nearest", clip_sigma=None)
+    model = PsfModel.fit(images, places, interpolation="nearest", clipping=None)
     np.testing.assert_allclose(model.at(places), unit, atol=1e-15)
     squares = ((places[3] - places) ** 2).sum(axis=1)
     np.testing.assert_allclose(model.leave_one_out()[3], unit[np.argsort(squares)[1]], atol=1e-15)

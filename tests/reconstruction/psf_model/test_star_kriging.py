@@ -237,7 +237,7 @@ def test_bright_stars_do_not_have_the_noise_of_faint_ones():
 def test_few_stars_noise_free_ones_and_equal_ones_are_no_trouble():
     stars, places, truth, elsewhere = field(3, 4, 0.0)
     assert error(PsfModel.fit(stars, places, **OPTIONS).at(elsewhere), truth) < 0.03
-    model = PsfModel.fit(truth, elsewhere, **OPTIONS, gain=None, clip_sigma=None)
+    model = PsfModel.fit(truth, elsewhere, **OPTIONS, gain=None, clipping=None)
     assert error(model.at(model.positions), truth) < 1e-4
     same = PsfModel.fit(np.repeat(truth[:1], 12, axis=0), elsewhere[:12], **OPTIONS, gain=None)
     np.testing.assert_allclose(same.at(elsewhere[20:22]), np.repeat(truth[:1], 2, axis=0), atol=1e-12)
