@@ -134,7 +134,9 @@ def test_every_metric_and_parameter_is_defined_in_the_report(tmp_path):
     create_store(tmp_path / "s.sweep", sweep, points := numbered_points(sweep, Path()), {})
     with SweepStore(tmp_path / "s.sweep") as store:
         for p in points:
-            store.write(PointResult(p.number, {"effective_fwhm_arcsec": 0.6 + p.parameters["M2.dz_um"]}, None, 0.1, "here"))
+            store.write(
+                PointResult(p.number, {"effective_fwhm_arcsec": 0.6 + p.parameters["M2.dz_um"]}, None, 0.1, "here")
+            )
         page = write_report(store, tmp_path / "report").read_text()
     for text in ("effective FWHM of the median star", "<td>arcsec</td>", "change of M2: shift along z"):
         assert text in page
