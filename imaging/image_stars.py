@@ -112,13 +112,11 @@ def _stars_of_locus(image: CcdImage, objects: DetectedObjects, min_snr: float) -
     return _single_stars(image, _locus(image, objects, min_snr))
 
 
-def _locus(image: CcdImage, objects: DetectedObjects, min_snr: float, **options: Any) -> StarSelection:
+def _locus(image: CcdImage, objects: DetectedObjects, min_snr: float) -> StarSelection:
     """Return the stars of a locus, on stamps as wide as stars of the image ask for."""
     side = stamp_side(_usual_radius(objects, min_snr))
     isolation = _ISOLATION * side / STAMP_SIDE
-    return select_stars(
-        objects, image.image, mask=image.mask, min_snr=min_snr, isolation=isolation, size=side, **options
-    )
+    return select_stars(objects, image.image, mask=image.mask, min_snr=min_snr, isolation=isolation, size=side)
 
 
 def _usual_radius(objects: DetectedObjects, min_snr: float) -> float:

@@ -30,6 +30,7 @@ from ..core.threads import one_blas_thread
 from ..core.units import ARCSEC, positive_angle, real_array, require_count, require_positive
 from ..core.warp_arrays import warp_array
 from .adaptive_kernels import ELLIPSE, LARGEST_RHO2, fit_ellipses
+from .pixel_masks import bad_pixels
 from .rho_statistics import trace_of_moments
 from .shapes import stamp_cube
 
@@ -41,8 +42,6 @@ if TYPE_CHECKING:
 MOST_MASKED = 0.5
 #: Largest rms width, as a part of the stamp's side: that of an even stamp without a star is 0.36 of it.
 _WIDEST = 1.0 / 3.0
-#: Pixels at or below this value hold no light, as SExtractor's (-1e30) do.
-_NO_LIGHT = -1e29
 #: Start of the iteration: rms width of the weight [pixel], that of HSM.
 _START_PIXELS = 5.0
 # 8 MB a work array: the memory used does not grow with the number of stars.
@@ -218,7 +217,7 @@ def adaptive_moments(
     for first in range(0, max(len(stack), 1), batch):
         rows = slice(first, first + batch)
         pixels = np.array(stack[rows], dtype=np.float64, order="C")
-        bad = ~np.isfinite(pixels) | (pixels <= _NO_LIGHT)
+        bad = bad_pixels(pixels)
         if masked is not None:
             bad |= masked[rows]
         if weights is not None:

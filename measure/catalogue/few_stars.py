@@ -7,11 +7,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...core.errors import DomainError
 from ...core.units import real_array
+from ..pixel_masks import bad_pixels
 from .cutouts import cut_out
 from .matching import match_positions
 from .objects import DetectedObjects, ObjectFlag
 from .pixel_checks import flagged
-from .star_locus import STAMP_SIDE, StarCut, StarSelection, centered_stamps, median_and_sigma
+from .star_locus import STAMP_SIDE, StarCut, StarSelection, median_and_sigma
 
 #: Largest distance of an object from a named star [pixel].
 MATCH = 3.0
@@ -146,7 +147,7 @@ def _cuts_of_single_objects(
 
 def _bad_pixels(image: ArrayLike, mask: ArrayLike | NDArray[np.bool_] | None) -> np.ndarray:
     pixels = real_array(image, "image: expected real numbers [ny, nx]")
-    return np.asarray(~np.isfinite(pixels) | flagged(mask, pixels.shape))
+    return bad_pixels(pixels) | flagged(mask, pixels.shape)
 
 
 def _selection(
@@ -157,16 +158,8 @@ def _selection(
     mask: ArrayLike | NDArray[np.bool_] | None,
 ) -> StarSelection:
     """Return the objects without cuts as stars."""
-    index = np.flatnonzero(cuts == 0)
-    x, y = objects.x[index], objects.y[index]
-    center, width = median_and_sigma(objects.half_light_radius[index]) if len(index) else (np.nan, np.nan)
+    radii = objects.half_light_radius[cuts == 0]
     light = np.where(_bad_pixels(image, mask), 0.0, np.asarray(image) - objects.background)
-    return StarSelection(
-        index=index,
-        cuts=cuts,
-        half_light_radius=center,
-        width=width,
-        positions=np.stack([x, y], axis=1),
-        snr=objects.snr[index],
-        stamps=centered_stamps(light, x, y, size),
+    return StarSelection.of_objects(
+        objects, cuts, median_and_sigma(radii) if len(radii) else (np.nan, np.nan), light, size
     )

@@ -147,6 +147,29 @@ class StarSelection(Result):
         return len(self.index)
 
     @classmethod
+    def of_objects(
+        cls, objects: DetectedObjects, cuts: np.ndarray, radii: tuple[float, float], light: np.ndarray, size: int
+    ) -> StarSelection:
+        """Return the objects without cuts as stars, on stamps of an image less its background, NaN without weight.
+
+        `radii`: middle and standard deviation of their half-light radii [pixel].
+        """
+        index = np.flatnonzero(cuts == 0)
+        x, y = objects.x[index], objects.y[index]
+        stamps = centered_stamps(light, x, y, size)
+        weightless = np.isnan(stamps)
+        return cls(
+            index=index,
+            cuts=cuts,
+            half_light_radius=radii[0],
+            width=radii[1],
+            positions=np.stack([x, y], axis=1),
+            snr=objects.snr[index],
+            stamps=fill_symmetric(stamps, weightless) if weightless.any() else stamps,
+            masks=weightless if weightless.any() else None,
+        )
+
+    @classmethod
     def empty(cls, n_objects: int, half_light_radius: float, stamp_shape: tuple[int, ...]) -> StarSelection:
         """Return a selection of no star of n objects, with the half-light radius of the PSF."""
         return cls(
@@ -282,20 +305,8 @@ def select_stars(
     e1, e2 = (e - np.median(e[of_locus]) for e in (objects.e1, objects.e2))
     cuts[~(np.hypot(e1, e2) < max_ellipticity)] |= StarCut.SHAPE
     cuts[objects.neighbour_distance < isolation] |= StarCut.NEIGHBOUR
-    index = np.flatnonzero(cuts == 0)
-    x, y = objects.x[index], objects.y[index]
-    stamps = centered_stamps(np.where(bad, np.nan, pixels - objects.background), x, y, size)
-    weightless = np.isnan(stamps)
-    return StarSelection(
-        index=index,
-        cuts=cuts,
-        half_light_radius=center,
-        width=width,
-        positions=np.stack([x, y], axis=1),
-        snr=objects.snr[index],
-        stamps=fill_symmetric(stamps, weightless) if weightless.any() else stamps,
-        masks=weightless if weightless.any() else None,
-    )
+    light = np.where(bad, np.nan, pixels - objects.background)
+    return StarSelection.of_objects(objects, cuts, (center, width), light, size)
 
 
 def _spoilt(bad: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> np.ndarray:
