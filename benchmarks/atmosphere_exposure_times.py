@@ -20,7 +20,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from atmosphere_vs_galsim import SITE, ellipticity, ideal_telescope, pachon_stars, through_screens
+from atmosphere_vs_galsim import SITE, ellipticity, long_paraboloid, pachon_stars, through_screens
 
 import pachon
 from pachon.core.random_streams import stream
@@ -48,7 +48,7 @@ def exposed(longest: Atmosphere, exposure: float, lift: float) -> Atmosphere:
 
 
 def ellipticities(atmosphere: Atmosphere, fields: np.ndarray) -> np.ndarray:
-    telescope = ideal_telescope()
+    telescope = long_paraboloid()
     plane = {"pixel_size": PIXEL * telescope.reference_sphere_radius, "size": STAMP}
     return ellipticity(pachon_stars(telescope, atmosphere, fields, **plane), PIXEL)
 

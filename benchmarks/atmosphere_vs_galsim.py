@@ -59,7 +59,7 @@ def through_screens(atmosphere: Atmosphere, screens: np.ndarray, **changes) -> A
     """Return an atmosphere with given slopes, packed as its own are, and other times, offsets or heights."""
 
     class Borrowing(Atmosphere):
-        def screens(self, kind, threads=None):
+        def screens(self, kind, threads=None, rows=None):
             return screens
 
     values = {f.name: getattr(atmosphere, f.name) for f in dataclasses.fields(atmosphere) if f.init}

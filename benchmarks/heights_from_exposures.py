@@ -69,7 +69,7 @@ def observed_stars(experiment: Experiment, threads: int | None) -> FocalPlaneSta
     names = experiment.config.ccds or ()
     with experiment.screens(threads):
         fields = [ccd_stars(experiment, name, 0.6 * ARCSEC) for name in names]
-        pixels = [f.observed_pixel * (f.pixel_size / experiment.pixel_size) for f in fields]
+        pixels = [f.observed_pixel * (f.ccd.pixel_size / experiment.pixel_size) for f in fields]
         offsets = np.concatenate([p - np.rint(p) for p in pixels])
         xy = np.concatenate([f.observed for f in fields])
         images = expose_positions(experiment, xy, threads, room=10, offsets=offsets)

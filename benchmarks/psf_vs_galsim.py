@@ -30,7 +30,7 @@ from atmosphere_vs_galsim import (
     ellipticity,
     galsim_layers,
     galsim_stars,
-    ideal_telescope,
+    long_paraboloid,
     through_screens,
 )
 
@@ -94,7 +94,7 @@ def main() -> None:
         f"{PUPIL_POINTS} pupil points x {len(atmosphere.times)} time steps = {samples} samples a star; six screens of"
         f" {arguments.size}^2 over {arguments.length:g} m"
     )
-    lsst, ideal = pachon.load_telescope("lsst_v3.3_r"), ideal_telescope()
+    lsst, ideal = pachon.load_telescope("lsst_v3.3_r"), long_paraboloid()
 
     def through_lsst(atmosphere, fields, **more):
         waves = np.linspace(545e-9, 703e-9, 5)

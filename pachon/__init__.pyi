@@ -121,6 +121,7 @@ from .measure.catalogue.fit_galaxies import fit_galaxy_stamps as fit_galaxy_stam
 from .measure.catalogue.galaxy_fits import GalaxyFits as GalaxyFits
 from .measure.catalogue.galaxy_fits import GalaxyFlag as GalaxyFlag
 from .measure.catalogue.galaxy_fits import usable_galaxies as usable_galaxies
+from .measure.catalogue.levenberg_marquardt import LevenbergMarquardt as LevenbergMarquardt
 from .measure.catalogue.matching import DetectionRates as DetectionRates
 from .measure.catalogue.matching import detection_rates as detection_rates
 from .measure.catalogue.matching import match_positions as match_positions

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TypedDict
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...core.arguments import check_arguments
+from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import DomainError
 from ...core.threads import one_blas_thread
-from ...core.units import pure_numbers, real_array, require_positive
+from ...core.units import pure_numbers, real_array
 from .cutouts import cut_out, first_pixel
 from .galaxy_fits import GalaxyFits, GalaxyFlag, joined
 from .gaussian_model import PARAMETERS, SIDE_STEP, GaussianStamps
-from .levenberg_marquardt import Bounds, minimize
+from .levenberg_marquardt import Bounds, LevenbergMarquardt
 from .pixel_checks import check_pixels
 
 #: Sides of the stamps of galaxies in images [pixel]; a galaxy gets the smallest that reaches over
@@ -35,6 +33,10 @@ _BATCH_NUMBERS = 1 << 23
 _PSF_SUM_TOLERANCE = 1e-4
 
 
+@removed_arguments(
+    max_evaluations="solver=LevenbergMarquardt(max_evaluations=...)",
+    tolerance="solver=LevenbergMarquardt(tolerance=...)",
+)
 @check_arguments
 def fit_galaxies(
     image: ArrayLike,
@@ -47,8 +49,7 @@ def fit_galaxies(
     psf_index: ArrayLike | None = None,
     mask: ArrayLike | NDArray[np.bool_] | None = None,
     segmentation: ArrayLike | None = None,
-    max_evaluations: int = 30,
-    tolerance: float = 1e-5,
+    solver: LevenbergMarquardt | None = None,
     threads: int | None = None,
 ) -> GalaxyFits:
     r"""Fit PSF-convolved elliptical Gaussians to the galaxies of an image by maximum likelihood.
@@ -81,10 +82,8 @@ def fit_galaxies(
     segmentation : array of int, optional
         [ny, nx], 0 for sky, otherwise the number of an object: pixels of objects other than the one at (x, y) are
         ignored.
-    max_evaluations : int
-        Most models computed for a galaxy.
-    tolerance : float
-        Largest change of the model by the last step, relative to the data, as the root of the weighted sum of squares.
+    solver : LevenbergMarquardt, optional
+        When a fit ends; 30 models at most, a change of 1e-5, by default.
     threads : int, optional
         All processors by default.
 
@@ -99,7 +98,7 @@ def fit_galaxies(
         If shapes differ, a pixel that is not masked has no positive variance, a position lies outside the image, or a
         PSF has an even side or no unit sum.
     """
-    options = _checked_options(max_evaluations, tolerance, threads)
+    solver = solver or LevenbergMarquardt()
     pixels, variances, ignored = check_pixels(image, variance, mask)
     places = _checked_positions(x, y, pixels.shape)
     count = len(places)
@@ -135,11 +134,19 @@ def fit_galaxies(
             beyond = (corner < 0).any(axis=1) | (corner + side > np.array(pixels.shape[::-1])).any(axis=1)
             flags = np.where(beyond, GalaxyFlag.EDGE, 0)
             flags[side_index[group] == len(STAMP_SIDES)] |= GalaxyFlag.CUT_OFF
-            parts.append(_fit_stamps(stamps, weights, middle, places[group], psfs, templates[group], flags, **options))
+            parts.append(
+                _fit_stamps(
+                    stamps, weights, middle, places[group], psfs, templates[group], flags, None, solver, threads
+                )
+            )
             members.append(group)
     return joined(parts, members)
 
 
+@removed_arguments(
+    max_evaluations="solver=LevenbergMarquardt(max_evaluations=...)",
+    tolerance="solver=LevenbergMarquardt(tolerance=...)",
+)
 @check_arguments
 def fit_galaxy_stamps(
     stamps: ArrayLike,
@@ -149,8 +156,7 @@ def fit_galaxy_stamps(
     psf_index: ArrayLike | None = None,
     mask: ArrayLike | NDArray[np.bool_] | None = None,
     start: GalaxyFits | None = None,
-    max_evaluations: int = 30,
-    tolerance: float = 1e-5,
+    solver: LevenbergMarquardt | None = None,
     threads: int | None = None,
 ) -> GalaxyFits:
     """Fit galaxies on given stamps, otherwise as :func:`fit_galaxies`.
@@ -179,7 +185,7 @@ def fit_galaxy_stamps(
     DomainError
         As of :func:`fit_galaxies`.
     """
-    options = _checked_options(max_evaluations, tolerance, threads)
+    solver = solver or LevenbergMarquardt()
     pixels, variances, ignored = check_pixels(stamps, variance, mask, axes="[n, ny, nx]", name="stamps")
     count, ny, nx = pixels.shape
     psfs, templates = _checked_psfs(psf_images, psf_index, count)
@@ -200,7 +206,7 @@ def fit_galaxy_stamps(
         flags = np.zeros(len(group), dtype=np.int32)
         earlier_params = None if start is None else _fit_parameters(start)[group]
         parts.append(
-            _fit_stamps(data, weights, middle, place, psfs, templates[group], flags, earlier_params, **options)
+            _fit_stamps(data, weights, middle, place, psfs, templates[group], flags, earlier_params, solver, threads)
         )
         members.append(group)
     return joined(parts, members)
@@ -218,10 +224,8 @@ def _fit_stamps(
     psfs: np.ndarray,
     templates: np.ndarray,
     flags: np.ndarray,
-    earlier_params: np.ndarray | None = None,
-    *,
-    max_evaluations: int,
-    tolerance: float,
+    earlier_params: np.ndarray | None,
+    solver: LevenbergMarquardt,
     threads: int | None,
 ) -> GalaxyFits:
     """Fit stamps [n, side, side] with middles at `middle` and galaxies near `place`, both [n, 2], and add to flags.
@@ -244,13 +248,7 @@ def _fit_stamps(
         start[usable] = shifted[usable]
     # Steps are solved by LAPACK, whose result must not depend on its threads.
     with one_blas_thread():
-        minimum = minimize(
-            fitter,
-            start,
-            bounds,
-            max_evaluations=max_evaluations,
-            tolerance=tolerance,
-        )
+        minimum = solver.minimize(fitter, start, bounds)
         covariance = _fisher_inverse(minimum.equations.matrix)
     inner = np.s_[:, side // 4 : side - side // 4, side // 4 : side - side // 4]
     n_pixels = (weight > 0.0).sum(axis=(1, 2))
@@ -333,25 +331,6 @@ def _checked_psfs(psf_images: ArrayLike, psf_index: ArrayLike | None, count: int
     if psf_index is not None:
         return psfs, index.astype(np.int64)
     return psfs, np.zeros(count, dtype=np.int64) if shared else np.arange(count)
-
-
-class _FitOptions(TypedDict):
-    """Options of the fits; see :func:`fit_galaxies`."""
-
-    max_evaluations: int
-    tolerance: float
-    threads: int | None
-
-
-def _checked_options(max_evaluations: int, tolerance: float, threads: int | None) -> _FitOptions:
-    """Return the options of the fits."""
-    if max_evaluations < 1:
-        raise DomainError(f"max_evaluations = {max_evaluations}: expected at least 1")
-    return {
-        "max_evaluations": max_evaluations,
-        "tolerance": require_positive(tolerance, "tolerance"),
-        "threads": threads,
-    }
 
 
 def _checked_positions(x: ArrayLike, y: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:

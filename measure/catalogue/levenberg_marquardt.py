@@ -12,6 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.arguments import check_arguments
+from ...core.errors import DomainError
+from ...core.units import require_positive
 from .gaussian_model import GaussianStamps, NormalEquations
 
 # Damping of the first step (Marquardt 1963, scaled by the diagonal).
@@ -85,48 +88,72 @@ class Minimum:
     evaluations: np.ndarray
 
 
-def minimize(
-    stamps: GaussianStamps, start: np.ndarray, bounds: Bounds, *, max_evaluations: int, tolerance: float
-) -> Minimum:
-    """Minimize chi-square of every galaxy.
+@check_arguments
+@dataclass(frozen=True)
+class LevenbergMarquardt:
+    """Fit galaxies by Levenberg-Marquardt steps with a learnt curvature.
 
-    A galaxy has converged once a step changes the model by less than the tolerance times the data, each measured by
-    the root of its weighted sum of squares: independent of the unit of the image and of the scale of the weights.
-    Every galaxy has its own damping and its own end, so splitting a batch changes no byte.
+    Parameters
+    ----------
+    max_evaluations : int
+        Most models computed for a galaxy.
+    tolerance : float
+        Largest change of the model by the last step, relative to the data, as the root of the weighted sum of squares.
+
+    Raises
+    ------
+    DomainError
+        If there is no evaluation, or the tolerance is not positive.
     """
-    count = len(start)
-    everything = np.arange(count)
-    params = bounds.project(start, everything)
-    first = stamps.normal_equations(params, everything)
-    chi2, right, matrix = first.chi2, first.right, first.matrix
-    damping = np.full(count, _DAMPING)
-    second = np.zeros_like(matrix)
-    converged, at_bounds = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
-    evaluations = np.ones(count, dtype=np.int32)
-    active = everything
-    for _ in range(max_evaluations - 1):
-        if not len(active):
-            break
-        before = right[active]
-        proposal = params[active] + _best_step(matrix[active], second[active], before, damping[active])
-        trial = bounds.project(proposal, active)
-        step = trial - params[active]
-        at_bounds[active] = (trial != proposal).any(axis=1)
-        change = _scalar_product(_matrix_vector(matrix[active], step), step)
-        signal = params[active, 0] ** 2 * matrix[active, 0, 0] + chi2[active]
-        trial_equations = stamps.normal_equations(trial, active)
-        evaluations[active] += 1
-        better = trial_equations.chi2 <= chi2[active]
-        accepted = active[better]
-        params[accepted], chi2[accepted] = trial[better], trial_equations.chi2[better]
-        right[accepted], matrix[accepted] = trial_equations.right[better], trial_equations.matrix[better]
-        second[active] = _updated_curvature(second[active], matrix[active], step, before - trial_equations.right)
-        # A strongly damped step is short without being near the minimum; a short one that is rejected is rounding.
-        done = (change <= tolerance**2 * signal) & (damping[active] <= _WEAK_DAMPING)
-        damping[active] *= np.where(better, 1.0 / _FACTOR, _FACTOR)
-        converged[active] = done
-        active = active[~done & (damping[active] < _MOST_DAMPING)]
-    return Minimum(params, NormalEquations(chi2, right, matrix), converged, at_bounds, evaluations)
+
+    max_evaluations: int = 30
+    tolerance: float = 1e-5
+
+    def __post_init__(self) -> None:
+        if self.max_evaluations < 1:
+            raise DomainError(f"max_evaluations = {self.max_evaluations}: expected at least 1")
+        require_positive(self.tolerance, "tolerance")
+
+    def minimize(self, stamps: GaussianStamps, start: np.ndarray, bounds: Bounds) -> Minimum:
+        """Minimize chi-square of every galaxy.
+
+        A galaxy has converged once a step changes the model by less than the tolerance times the data, each measured
+        by the root of its weighted sum of squares: independent of the unit of the image and of the scale of the
+        weights. Every galaxy has its own damping and its own end, so splitting a batch changes no byte.
+        """
+        count = len(start)
+        everything = np.arange(count)
+        params = bounds.project(start, everything)
+        first = stamps.normal_equations(params, everything)
+        chi2, right, matrix = first.chi2, first.right, first.matrix
+        damping = np.full(count, _DAMPING)
+        second = np.zeros_like(matrix)
+        converged, at_bounds = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+        evaluations = np.ones(count, dtype=np.int32)
+        active = everything
+        for _ in range(self.max_evaluations - 1):
+            if not len(active):
+                break
+            before = right[active]
+            proposal = params[active] + _best_step(matrix[active], second[active], before, damping[active])
+            trial = bounds.project(proposal, active)
+            step = trial - params[active]
+            at_bounds[active] = (trial != proposal).any(axis=1)
+            change = _scalar_product(_matrix_vector(matrix[active], step), step)
+            signal = params[active, 0] ** 2 * matrix[active, 0, 0] + chi2[active]
+            trial_equations = stamps.normal_equations(trial, active)
+            evaluations[active] += 1
+            better = trial_equations.chi2 <= chi2[active]
+            accepted = active[better]
+            params[accepted], chi2[accepted] = trial[better], trial_equations.chi2[better]
+            right[accepted], matrix[accepted] = trial_equations.right[better], trial_equations.matrix[better]
+            second[active] = _updated_curvature(second[active], matrix[active], step, before - trial_equations.right)
+            # A strongly damped step is short without being near the minimum; a short one that is rejected is rounding.
+            done = (change <= self.tolerance**2 * signal) & (damping[active] <= _WEAK_DAMPING)
+            damping[active] *= np.where(better, 1.0 / _FACTOR, _FACTOR)
+            converged[active] = done
+            active = active[~done & (damping[active] < _MOST_DAMPING)]
+        return Minimum(params, NormalEquations(chi2, right, matrix), converged, at_bounds, evaluations)
 
 
 def _scalar_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -625,6 +625,7 @@ def _methods(m, tel, w, x, y):
         "Stamps.of_camera": (pachon.Stamps.of_camera, {"camera": "lsst", "size": 31, "jitter": 0.0}),
         "FocalPlaneStars.from_table": (pachon.FocalPlaneStars.from_table, {"table": m.table, "weight_fwhm": 3.4e-6}),
         "Correlation.within": (m.correlation.within, {"separations": "short"}),
+        "LevenbergMarquardt": (pachon.LevenbergMarquardt, {"max_evaluations": 20, "tolerance": 1e-4}),
         "Recipe": (pachon.Recipe, {"basis": pachon.Pixels(), "interpolation": pachon.Polynomial(1),
                    "weights": "equal"}),
         "PrincipalComponents": (pachon.PrincipalComponents, {"n_components": 4}),

@@ -1,9 +1,11 @@
 """Bounds against eigenvalues, and steps that never raise chi-square."""
 
 import numpy as np
+import pytest
 
+import pachon
 from pachon.measure.catalogue.gaussian_model import GaussianStamps
-from pachon.measure.catalogue.levenberg_marquardt import Bounds, minimize
+from pachon.measure.catalogue.levenberg_marquardt import Bounds, LevenbergMarquardt
 
 
 def test_bounds_clip_centres_and_eigenvalues():
@@ -40,7 +42,7 @@ def test_chi_square_never_rises(psf):
         axis=1,
     )
     bounds = Bounds(np.zeros((count, 2)), 8.0, np.full(count, -0.5), 256.0)
-    runs = [minimize(stamps, start, bounds, max_evaluations=n, tolerance=1e-5) for n in range(1, 14)]
+    runs = [LevenbergMarquardt(max_evaluations=n).minimize(stamps, start, bounds) for n in range(1, 14)]
     chi2 = np.array([run.equations.chi2 for run in runs])
     assert (np.diff(chi2, axis=0) <= 0.0).all()
     assert (chi2[-1] < (data**2).sum(axis=(1, 2))).all()
@@ -48,3 +50,17 @@ def test_chi_square_never_rises(psf):
     again = stamps.normal_equations(runs[-1].params, np.arange(count))
     assert np.array_equal(again.chi2, runs[-1].equations.chi2)
     assert np.array_equal(again.matrix, runs[-1].equations.matrix)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"max_evaluations": 0}, "max_evaluations = 0"), ({"tolerance": -1.0}, "tolerance = -1")],
+)
+def test_a_solver_that_never_ends_is_refused(options, message):
+    with pytest.raises(pachon.DomainError, match=message):
+        LevenbergMarquardt(**options)
+
+
+def test_options_of_before_are_told_where_they_are():
+    with pytest.raises(pachon.ConfigError, match=r"expected solver=LevenbergMarquardt\(max_evaluations=...\)"):
+        pachon.fit_galaxy_stamps(np.zeros((1, 9, 9)), 1.0, np.ones((1, 1)), max_evaluations=2)
