@@ -229,6 +229,7 @@ from .models.site import Site as Site
 from .models.site import Weather as Weather
 from .models.star_spectrum import blackbody_photons as blackbody_photons
 from .models.star_spectrum import color_temperature as color_temperature
+from .models.star_spectrum import effective_colour as effective_colour
 from .models.starting_designs.lenses import doublet as doublet
 from .models.starting_designs.lenses import singlet as singlet
 from .models.starting_designs.lenses import triplet as triplet
@@ -274,6 +275,7 @@ from .reconstruction.piff.comparison import PiffComparison as PiffComparison
 from .reconstruction.piff.comparison import compare_with_piff as compare_with_piff
 from .reconstruction.piff.psf import PiffPsf as PiffPsf
 from .reconstruction.piff.psf import load_piff as load_piff
+from .reconstruction.psf_model.colour import ColourTerm as ColourTerm
 from .reconstruction.psf_model.kriging import Kriging as Kriging
 from .reconstruction.psf_model.model import PsfModel as PsfModel
 from .reconstruction.psf_model.outliers import SigmaClipping as SigmaClipping
