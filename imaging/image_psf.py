@@ -51,8 +51,12 @@ def load_image_psf(path: Path) -> ImagePsf:
     raise ProductError(f"no PSF model ({reason})", file=path)
 
 
-def psfs_on(image: CcdImage, psf: ImagePsf, places: np.ndarray, threads: int | None) -> np.ndarray:
+def psfs_on(
+    image: CcdImage, psf: ImagePsf, places: np.ndarray, threads: int | None, colour: np.ndarray | float | None = None
+) -> np.ndarray:
     """Return PSF images of unit sum at pixels (x, y) of an image, the first one's centre at (0, 0), [n, m, m].
+
+    They are for colours [n], or one, where the model depends on them: one of a CCD alone.
 
     Raises
     ------
@@ -61,7 +65,7 @@ def psfs_on(image: CcdImage, psf: ImagePsf, places: np.ndarray, threads: int | N
     """
     try:
         if isinstance(psf, PsfModel):
-            stamps = psf.at(places)
+            stamps = psf.at(places, colour=colour)
         elif isinstance(psf, FocalPlanePsf):
             # Centroids at the rim may lie outside by a part of a pixel.
             inside = np.clip(places, -0.5, np.array(image.image.shape[::-1]) - 0.5)

@@ -32,6 +32,7 @@ from .image_file import CcdImage
 from .image_psf import ImagePsf, half_light_radius_of, psfs_on
 from .image_shear import object_shears
 from .image_stars import MANY_STARS, detected_objects, few_or_many_stars, few_stars_warning, fit_image_psf
+from .object_colours import ObjectColours
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -186,6 +187,8 @@ class ImageCatalogue(Result):
             "usable_per_arcmin2": None if area is None else float(self.usable.sum() / area),
             "star_half_light_radius_pixel": self.stars.half_light_radius,
         }
+        if isinstance(self.psf, PsfModel) and self.psf.colour is not None:
+            numbers["colour_probability"] = self.psf.colour.probability
         if self.warnings:
             numbers["warnings"] = list(self.warnings)
         if (
@@ -223,6 +226,7 @@ def measure_image(
     psf: PsfModel | FocalPlanePsf | PiffPsf | PsfexPsf | None = None,
     recipe: str | Recipe | None = None,
     stars: ArrayLike | None = None,
+    colours: ObjectColours | None = None,
     min_snr: float = 30.0,
     threads: int | None = None,
 ) -> ImageCatalogue:
@@ -242,6 +246,10 @@ def measure_image(
     stars : array, optional
         Pixels (x, y) of stars, such as of a catalogue, the first pixel's centre at (0, 0), [k, 2]; by default stars are
         selected by their size.
+    colours : ObjectColours, optional
+        Colours of stars, to which the model of the CCD is fitted, and of galaxies, for which it is drawn: each object
+        with that of the nearest entry within 3 pixels, others with the mean. The functionals of the shear have one PSF
+        for each part of the image, that of the mean colour of its galaxies.
     min_snr : float
         Least S/N of stars.
     threads : int, optional
@@ -261,7 +269,8 @@ def measure_image(
     model: ImagePsf
     if psf is None:
         selected_stars = few_or_many_stars(image, objects, min_snr, stars)
-        model = fit_image_psf(image, selected_stars, None if recipe is None else Recipe.of(recipe))
+        star_colours = None if colours is None else colours.at(selected_stars.positions)
+        model = fit_image_psf(image, selected_stars, None if recipe is None else Recipe.of(recipe), star_colours)
         if len(selected_stars) < MANY_STARS:
             warnings = (few_stars_warning(selected_stars),)
     else:
@@ -271,17 +280,23 @@ def measure_image(
     if not len(rows):
         raise DomainError("all objects are stars: expected galaxies", subject=f"CCD {image.name}")
     places = np.stack([objects.x[rows], objects.y[rows]], axis=1)
+    galaxy_colours, mean_colour = None, None
+    if colours is not None:
+        galaxy_colours = colours.at(places)
+        known_colours = galaxy_colours[np.isfinite(galaxy_colours)]
+        mean_colour = float(known_colours.mean()) if len(known_colours) else None
+        warnings = (*warnings, *_colour_warnings(colours.at(selected_stars.positions), galaxy_colours, model))
 
     def psfs_at(positions: np.ndarray) -> np.ndarray:
-        """Return PSFs of unit sum at pixels of the image."""
-        return psfs_on(image, model, positions, threads)
+        """Return PSFs of unit sum at pixels of the image, for the mean colour of the galaxies."""
+        return psfs_on(image, model, positions, threads, mean_colour)
 
     fits = fit_galaxies(
         image.image - objects.background,
         np.where(image.mask == 0, image.variance, 1.0),
         places[:, 0],
         places[:, 1],
-        psfs_at(places),
+        psfs_on(image, model, places, threads, galaxy_colours),
         half_light_radius=np.nan_to_num(objects.half_light_radius[rows], nan=selected_stars.half_light_radius),
         mask=image.mask,
         segmentation=objects.segmentation,
@@ -296,6 +311,19 @@ def measure_image(
     except DomainError as error:
         shear, warnings = None, (*warnings, f"no shear of functionals: {error.problem}")
     return ImageCatalogue(image, objects, selected_stars, model, rows, fits, usable, shear, warnings)
+
+
+def _colour_warnings(star_colours: np.ndarray, galaxy_colours: np.ndarray, psf: ImagePsf) -> list[str]:
+    """Return words for stars and galaxies without colours, and for a model that knows of none."""
+    if not isinstance(psf, PsfModel) or psf.colour is None:
+        return ["colours change nothing: the PSF model has no dependence on them"]
+    unknown = [int(np.isnan(values).sum()) for values in (star_colours, galaxy_colours)]
+    if not any(unknown):
+        return []
+    return [
+        f"{unknown[0]} of {len(star_colours)} stars and {unknown[1]} of {len(galaxy_colours)} galaxies have no colour "
+        "and count as the mean of the stars"
+    ]
 
 
 def _stars_beside_model(

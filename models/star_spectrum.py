@@ -27,6 +27,8 @@ COLORS: dict[str, tuple[float, float, float]] = {
 }
 #: Kinds of the colours of PSF models: mean wavelength in the band, or colours of two bands.
 KINDS = ("wavelength", *COLORS)
+#: Names of columns of temperatures in catalogues, in lower case, in order of preference.
+TEMPERATURE_COLUMNS = ("teff", "teff_gspphot", "temperature")
 #: Lowest temperature that stars are taken to have [K].
 COOLEST = 2000.0
 #: Highest temperature that stars are taken to have [K].
@@ -143,6 +145,17 @@ def effective_colour(wavelengths: ArrayLike, photons: ArrayLike, kind: str = "wa
 def blackbody_color(temperature: np.ndarray, bands: str) -> np.ndarray:
     """Return the colours [mag] of blackbodies of temperatures [K], as :func:`color_temperature` takes them."""
     return _ab_colors(np.log(temperature), bands) + COLORS[bands][2]
+
+
+def psf_colours(values: np.ndarray, column: str) -> np.ndarray:
+    """Return the values of a column of a catalogue as colours in which PSFs are nearly linear.
+
+    Temperatures, by the name of their column, become the g - i of blackbodies; anything else is as it stands.
+    """
+    if column.lower() not in TEMPERATURE_COLUMNS:
+        return values
+    kelvin = np.where(np.isfinite(values) & (values > 0.0), values, np.nan)
+    return blackbody_color(np.clip(kelvin, COOLEST, HOTTEST), "g_i")
 
 
 def _log_temperatures() -> np.ndarray:

@@ -105,6 +105,7 @@ from .imaging.image_formats.load import load_image as load_image
 from .imaging.image_stars import focal_plane_stars as focal_plane_stars
 from .imaging.measure import ImageCatalogue as ImageCatalogue
 from .imaging.measure import measure_image as measure_image
+from .imaging.object_colours import ObjectColours as ObjectColours
 from .imaging.psf_field import PsfField as PsfField
 from .imaging.scene import CcdScene as CcdScene
 from .imaging.scene import draw_ccd as draw_ccd

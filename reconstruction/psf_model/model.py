@@ -48,6 +48,12 @@ class ModelOptions(RecipeKeys, total=False):
     extent: ArrayLike | None
 
 
+class StarOptions(ModelOptions, total=False):
+    """Options of :meth:`PsfModel.fit` and colours of stars."""
+
+    colour: ArrayLike | None
+
+
 @dataclass(frozen=True, eq=False)
 class PsfModel(ModelFit, Result):
     """A PSF model of one CCD: PSF = mean + sum over k of a_k(x, y) component_k.
