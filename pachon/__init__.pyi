@@ -285,6 +285,7 @@ from .reconstruction.psf_model.polynomial_fit import Polynomial as Polynomial
 from .reconstruction.psf_model.principal_components import PrincipalComponents as PrincipalComponents
 from .reconstruction.psf_model.recipe import Recipe as Recipe
 from .reconstruction.psf_model.shapelets import Shapelets as Shapelets
+from .reconstruction.psf_model.spectrum import psf_of_spectrum as psf_of_spectrum
 from .reconstruction.psfex import PsfexPsf as PsfexPsf
 from .reconstruction.psfex import load_psfex as load_psfex
 from .sensing.degrees import FreedomEstimate as FreedomEstimate

@@ -66,6 +66,11 @@ class _Made:
     def make_places(self):
         return np.random.default_rng(1).uniform(-1.0, 1.0, (12, 2))
 
+    def make_coloured(self):
+        return pachon.PsfModel.fit(
+            self.stamps, self.places, recipe="paper", n_components=2, order=0, colour=np.linspace(605e-9, 635e-9, 12)
+        )
+
     def make_own(self):
         y, x = np.mgrid[-8:9, -8:9]
         star = 2e3 * np.exp(-0.5 * (x * x + y * y) / 1.6**2)
@@ -649,6 +654,8 @@ def _methods(m, tel, w, x, y):
         "ColourTerm": (pachon.ColourTerm, {"order": 1}),
         "PsfModel.at": (m.model.at, {"positions": m.places[:2], "colour": [0.1, 0.2]}),
         "PsfModel.draw": (m.model.draw, {"x": 0.0, "y": 0.0, "colour": 0.5}),
+        "psf_of_spectrum": (pachon.psf_of_spectrum, {"model": m.coloured, "positions": m.places[:2],
+                            "light": pachon.Light([600e-9, 640e-9]), "pixel_scale": 1e-6}),
         "PsfModel.truncated": (m.model.truncated, {"n_components": 1}),
         "PsfModel.read": (pachon.PsfModel.read, {"path": m.folder / "none.fits", "name": "PSF"}),
         "EdgeRolloff": (pachon.EdgeRolloff, {"amplitude": 1e-6, "length": 1e-4, "half_size": 0.02}),
