@@ -1,6 +1,6 @@
 """What it costs to ignore the colours of stars and galaxies in PSF models, in r and i, and what a colour term leaves.
 
-    python benchmarks/colour.py [--field 0.5,0.3] [--zenith 45] [--draws 20]
+    python benchmarks/colour.py [--field 0.5,0.3] [--zenith 45] [--draws 20] [--without-silicon]
 
 PSFs of the LSST averaged over all turbulence, 24 wavelengths a band, in silicon, light spread by the air along x. Stars
 are blackbodies of 3500 to 10 000 K, evenly in the logarithm. Galaxies stand at redshifts 0 to 1: old ones are
@@ -56,7 +56,7 @@ def centroids(images, pixel_scale):
     return np.stack([found.x, found.y], axis=1)
 
 
-def psfs(band, fields, photons, waves, zenith):
+def psfs(band, fields, photons, waves, zenith, silicon):
     """PSFs of unit sum of spectra at fields."""
     air = pachon.Atmosphere.from_site("cerro_pachon", seed=1, zenith_angle=zenith)
     images = pachon.make_psfs(
@@ -65,7 +65,7 @@ def psfs(band, fields, photons, waves, zenith):
         light_of(photons, waves, zenith),
         atmosphere=air,
         engine="long_exposure",
-        stamps=pachon.Stamps(PSF_SIDE, silicon=pachon.Silicon(), recenter=centroids),
+        stamps=pachon.Stamps(PSF_SIDE, silicon=silicon, recenter=centroids),
         threads=1,
     ).image.astype(float)
     return images / images.sum(axis=(1, 2), keepdims=True)
@@ -126,7 +126,7 @@ def noisy(images, rng):
     return light + rng.normal(size=light.shape) * np.sqrt(SKY_RMS**2 + np.maximum(light, 0.0))
 
 
-def study(band, zenith_degrees, field_degrees, draws):
+def study(band, zenith_degrees, field_degrees, draws, silicon):
     telescope, zenith = pachon.load_telescope(f"lsst_v3.3_{band}"), np.deg2rad(zenith_degrees)
     low, high = telescope.band
     waves = low + (np.arange(WAVELENGTHS) + 0.5) / WAVELENGTHS * (high - low)
@@ -134,7 +134,10 @@ def study(band, zenith_degrees, field_degrees, draws):
     fields = middle + np.deg2rad(rng.uniform(-0.1, 0.1, (40, 2)))
     kelvin = np.exp(rng.uniform(np.log(COOL), np.log(HOT), 40))
     star_photons = pachon.blackbody_photons(kelvin, waves)
-    stars, colour = psfs(band, fields, star_photons, waves, zenith), pachon.effective_colour(waves, star_photons)
+    stars, colour = (
+        psfs(band, fields, star_photons, waves, zenith, silicon),
+        pachon.effective_colour(waves, star_photons),
+    )
     kinds = {
         "stars, 3500 and 10 000 K": pachon.blackbody_photons([COOL, HOT], waves),
         "old galaxies": np.stack([galaxy_photons(waves, z, young=False) for z in REDSHIFTS]),
@@ -143,7 +146,7 @@ def study(band, zenith_degrees, field_degrees, draws):
     spectra = np.concatenate(list(kinds.values()))
     ends = np.cumsum([len(photons) for photons in kinds.values()])[:-1]
     places, asked = np.repeat(middle[None], len(spectra), axis=0), pachon.effective_colour(waves, spectra)
-    true = psfs(band, places, spectra, waves, zenith)
+    true = psfs(band, places, spectra, waves, zenith, silicon)
     model = pachon.PsfModel.fit(stars, fields, gain=None, clipping=None, colour=colour)
     plain = pachon.PsfModel.fit(stars, fields, gain=None, clipping=None)
     print(
@@ -186,12 +189,14 @@ def main():
     parser.add_argument("--field", default="0.5,0.3", help="place in the field [deg]")
     parser.add_argument("--zenith", type=float, default=45.0, help="zenith angle beside 0 [deg]")
     parser.add_argument("--draws", type=int, default=20, help="draws of the noise of stars")
+    parser.add_argument("--without-silicon", action="store_true", help="all light turns into charge at the surface")
     arguments = parser.parse_args()
+    silicon = None if arguments.without_silicon else pachon.Silicon()
     field = [float(value) for value in arguments.field.split(",")]
     print(f"pachon {pachon.__version__}")
     for band in "ri":
         for zenith in (0.0, arguments.zenith):
-            study(band, zenith, field, arguments.draws)
+            study(band, zenith, field, arguments.draws, silicon)
 
 
 if __name__ == "__main__":

@@ -75,6 +75,4 @@ def read_object_colours(path: Path, column: str, image: CcdImage) -> ObjectColou
     if values.dtype.kind not in "fiu" or values.ndim != 1:
         raise ProductError(f"column {column!r} has type {values.dtype}: expected a number in every row", file=path)
     colours = np.ma.filled(values.astype(float), np.nan)
-    return ObjectColours(
-        positions_in(table, image, path), psf_colours(np.where(np.isfinite(colours), colours, np.nan), column)
-    )
+    return ObjectColours(positions_in(table, image, path), psf_colours(colours, column))

@@ -29,6 +29,8 @@ COLORS: dict[str, tuple[float, float, float]] = {
 KINDS = ("wavelength", *COLORS)
 #: Names of columns of temperatures in catalogues, in lower case, in order of preference.
 TEMPERATURE_COLUMNS = ("teff", "teff_gspphot", "temperature")
+#: Catalogues have -99, -999 and the like for colours that are missing; no colour of stars is so low in any unit.
+MISSING = -90.0
 #: Lowest temperature that stars are taken to have [K].
 COOLEST = 2000.0
 #: Highest temperature that stars are taken to have [K].
@@ -150,11 +152,13 @@ def blackbody_color(temperature: np.ndarray, bands: str) -> np.ndarray:
 def psf_colours(values: np.ndarray, column: str) -> np.ndarray:
     """Return the values of a column of a catalogue as colours in which PSFs are nearly linear.
 
-    Temperatures, by the name of their column, become the g - i of blackbodies; anything else is as it stands.
+    Temperatures, by the name of their column, become the g - i of blackbodies; anything else is as it stands. Values
+    that are not finite, or :data:`MISSING` or less, become NaN.
     """
+    known = np.isfinite(values) & (values > MISSING)
     if column.lower() not in TEMPERATURE_COLUMNS:
-        return values
-    kelvin = np.where(np.isfinite(values) & (values > 0.0), values, np.nan)
+        return np.where(known, values, np.nan)
+    kelvin = np.where(known & (values > 0.0), values, np.nan)
     return blackbody_color(np.clip(kelvin, COOLEST, HOTTEST), "g_i")
 
 

@@ -6,7 +6,7 @@ dispersion: the air spreads the light of a spectrum S along a line, by the covar
 .. math:: C_S = \langle R R^T \rangle_S - \langle R \rangle_S \langle R \rangle_S^T
 
 of the shifts R of its wavelengths, each by its photons. That of the stars, taken as blackbodies, is in the model as far
-as it is linear in their mean wavelengths; the excess of a spectrum is known, and is convolved with the model's PSF
+as it is linear in their mean wavelengths and the model depends on these; the excess of a spectrum is known, and is convolved with the model's PSF
 (where it is negative the inverse, which is small against the pixel).
 """
 
@@ -79,7 +79,9 @@ def psf_of_spectrum(model: PsfModel, positions: ArrayLike, light: Light, pixel_s
     blackbodies = blackbody_photons(kelvin, waves)
     of_stars = [np.interp(star_waves, effective_colour(waves, blackbodies), c) for c in _spread(blackbodies, shifts).T]
     lines = [np.polyfit(star_waves - model.colour.mean, spread, 1) for spread in of_stars]
-    linear = np.stack([np.polyval(line, colours - model.colour.mean) for line in lines], axis=1)
+    # The less the stars ask for a dependence, the less of it is in the model.
+    deviation = model.colour.probability * (colours - model.colour.mean)
+    linear = np.stack([np.polyval(line, deviation) for line in lines], axis=1)
     return _convolved(images, _spread(np.atleast_2d(photons), shifts) - linear)
 
 

@@ -56,6 +56,8 @@ def test_a_column_of_colours_is_read_beside_the_stars(catalogue):
     # Temperatures become the g - i of blackbodies, as good as the table behind them.
     np.testing.assert_allclose(psf_colours(table["teff"], "Teff"), table["G_I"], atol=2e-4)
     np.testing.assert_array_equal(psf_colours(table["G_I"], "g_i"), table["G_I"])
+    strange = psf_colours(np.array([0.3, -99.0, np.inf, -9999.0, -0.4]), "r_i")
+    np.testing.assert_array_equal(strange, [0.3, np.nan, np.nan, np.nan, -0.4])
 
 
 @pytest.mark.parametrize(
