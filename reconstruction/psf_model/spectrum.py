@@ -6,8 +6,8 @@ dispersion: the air spreads the light of a spectrum S along a line, by the covar
 .. math:: C_S = \langle R R^T \rangle_S - \langle R \rangle_S \langle R \rangle_S^T
 
 of the shifts R of its wavelengths, each by its photons. That of the stars, taken as blackbodies, is in the model as far
-as it is linear in their mean wavelengths and the model depends on these; the excess of a spectrum is known, and is convolved with the model's PSF
-(where it is negative the inverse, which is small against the pixel).
+as it is linear in their mean wavelengths and the model depends on these. The excess of a spectrum is known, and is
+convolved with the model's PSF (where it is negative the inverse, which is small against the pixel).
 """
 
 from __future__ import annotations
