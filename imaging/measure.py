@@ -248,7 +248,8 @@ def measure_image(
         selected by their size.
     colours : ObjectColours, optional
         Colours of stars, to which the model of the CCD is fitted, and of galaxies, for which it is drawn: each object
-        with that of the nearest entry within 3 pixels, others with the mean. The functionals of the shear have one PSF
+        with that of the nearest entry within 3 pixels, others with the mean. A model of Piff with one property takes
+        them too. The functionals of the shear have one PSF
         for each part of the image, that of the mean colour of its galaxies.
     min_snr : float
         Least S/N of stars.
@@ -315,14 +316,15 @@ def measure_image(
 
 def _colour_warnings(star_colours: np.ndarray, galaxy_colours: np.ndarray, psf: ImagePsf) -> list[str]:
     """Return words for stars and galaxies without colours, and for a model that knows of none."""
-    if not isinstance(psf, PsfModel) or psf.colour is None:
+    of_piff = isinstance(psf, PiffPsf) and len(psf.property_names) == 1
+    if not of_piff and not (isinstance(psf, PsfModel) and psf.colour is not None):
         return ["colours change nothing: the PSF model has no dependence on them"]
     unknown = [int(np.isnan(values).sum()) for values in (star_colours, galaxy_colours)]
     if not any(unknown):
         return []
     return [
         f"{unknown[0]} of {len(star_colours)} stars and {unknown[1]} of {len(galaxy_colours)} galaxies have no colour "
-        "and count as the mean of the stars"
+        "and count as the mean"
     ]
 
 

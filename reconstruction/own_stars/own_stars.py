@@ -191,7 +191,7 @@ def fit_own_stars(
         stars = select(filled, lost, stars)
     _require_used(stars, min_snr, gain)
     if bad.any():
-        masked = bad.any(axis=(1, 2))
+        masked = np.asarray(bad.any(axis=(1, 2)))
         complete = wide.usable & ~lost
         for _ in range(_MODEL_PASSES):
             psfs = fit(np.flatnonzero(stars.used), given_kind).at(places[masked], colour=colours_of(masked))

@@ -80,7 +80,7 @@ def test_round_galaxies_are_round_under_the_psf_of_their_colour(field):
             assert catalogue.metrics()["colour_probability"] > 0.99
             assert catalogue.warnings == (
                 f"1 of {len(catalogue.stars)} stars and 0 of {len(catalogue.galaxies)} galaxies have no colour and "
-                "count as the mean of the stars",
+                "count as the mean",
             )
     mean, standard_error = means["colours"]
     assert abs(mean) < 3.5 * standard_error
