@@ -72,6 +72,8 @@ class ImageCatalogue(Result):
         where the scale of the pixels is unknown, or their PSF too wide.
     warnings : tuple of str
         What makes the shapes less certain than those of other images.
+    colours : ObjectColours or None
+        Colours of stars and galaxies, where they were given.
     """
 
     image: CcdImage
@@ -83,6 +85,7 @@ class ImageCatalogue(Result):
     usable: np.ndarray
     shear: ShearShapes | None = None
     warnings: tuple[str, ...] = ()
+    colours: ObjectColours | None = None
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw half-light radius against magnitude, selected stars in another colour."""
@@ -276,16 +279,16 @@ def measure_image(
             warnings = (few_stars_warning(selected_stars),)
     else:
         model = psf
-        selected_stars = _stars_beside_model(image, objects, psf, min_snr, stars)
+        selected_stars = _stars_beside_model(image, objects, psf, min_snr, stars, colours)
     rows = np.setdiff1d(np.arange(len(objects)), selected_stars.index)
     if not len(rows):
         raise DomainError("all objects are stars: expected galaxies", subject=f"CCD {image.name}")
     places = np.stack([objects.x[rows], objects.y[rows]], axis=1)
-    galaxy_colours, mean_colour = None, None
+    galaxy_colours: np.ndarray | None = None
+    mean_colour: float | None = None
     if colours is not None:
         galaxy_colours = colours.at(places)
-        known_colours = galaxy_colours[np.isfinite(galaxy_colours)]
-        mean_colour = float(known_colours.mean()) if len(known_colours) else None
+        mean_colour = ObjectColours(places, galaxy_colours).mean
         warnings = (*warnings, *_colour_warnings(colours.at(selected_stars.positions), galaxy_colours, model))
 
     def psfs_at(positions: np.ndarray) -> np.ndarray:
@@ -311,7 +314,7 @@ def measure_image(
         shear = object_shears(image, objects, psfs_at, threads=threads).take(rows) if image.has_scale else None
     except DomainError as error:
         shear, warnings = None, (*warnings, f"no shear of functionals: {error.problem}")
-    return ImageCatalogue(image, objects, selected_stars, model, rows, fits, usable, shear, warnings)
+    return ImageCatalogue(image, objects, selected_stars, model, rows, fits, usable, shear, warnings, colours)
 
 
 def _colour_warnings(star_colours: np.ndarray, galaxy_colours: np.ndarray, psf: ImagePsf) -> list[str]:
@@ -329,7 +332,12 @@ def _colour_warnings(star_colours: np.ndarray, galaxy_colours: np.ndarray, psf: 
 
 
 def _stars_beside_model(
-    image: CcdImage, objects: DetectedObjects, psf: ImagePsf, min_snr: float, positions: ArrayLike | None
+    image: CcdImage,
+    objects: DetectedObjects,
+    psf: ImagePsf,
+    min_snr: float,
+    positions: ArrayLike | None,
+    colours: ObjectColours | None,
 ) -> StarSelection:
     """Return the stars of an image whose PSF is known; none, with the size of the PSF, where they have no locus."""
     try:
@@ -338,5 +346,5 @@ def _stars_beside_model(
         if positions is not None:
             raise
         middle = 0.5 * (np.array(image.image.shape[::-1]) - 1.0)
-        stamp = psfs_on(image, psf, middle[None], None)[0]
+        stamp = psfs_on(image, psf, middle[None], None, None if colours is None else colours.mean)[0]
         return StarSelection.empty(len(objects), half_light_radius_of(stamp), stamp.shape)

@@ -47,6 +47,12 @@ class ObjectColours:
         if np.isinf(self.values).any():
             raise DomainError("values are infinite: expected colours, or NaN where unknown", key="values")
 
+    @property
+    def mean(self) -> float:
+        """Mean of the known colours; NaN where there are none."""
+        known_values = self.values[np.isfinite(self.values)]
+        return float(known_values.mean()) if len(known_values) else float("nan")
+
     def at(self, places: np.ndarray) -> np.ndarray:
         """Return the colours of the nearest entries within :data:`MATCH` pixels of places [n, 2], NaN without one."""
         known = np.isfinite(self.values) & np.isfinite(self.positions).all(axis=1)

@@ -58,6 +58,7 @@ def test_objects_have_the_colour_of_the_nearest_entry(field):
     np.testing.assert_array_equal(found, np.ma.filled(known, np.nan))
     assert np.isnan(colours.at(places + 2.5)).all()
     assert colours.at(np.empty((0, 2))).shape == (0,)
+    assert colours.mean == pytest.approx(known.mean(), abs=1e-14)
     with pytest.raises(ProductError, match=r"c\.fits: no column 'r_i'; its columns are RA, DEC, G_I, name"):
         read_object_colours(folder / "c.fits", "r_i", image)
     with pytest.raises(ProductError, match=r"column 'name' has type .*: expected a number in every row"):
@@ -98,11 +99,12 @@ def test_the_command_takes_colours_from_a_table(field, tmp_path, capsys):
     arguments += ["--order", "0", "--quiet"]
     table, stars = str(folder / "c.fits"), str(folder / "s.fits")
     usable = []
-    for options in (["--colours", table, "--stars", stars], ["--stars", stars]):
+    for options in (["--colours", table, "--stars", stars, "--pictures"], ["--stars", stars]):
         assert main([*arguments, *options, "--colour-column", "g_i", "--json"]) == 0
         metrics = json.loads(capsys.readouterr().out)["images"]["image.fits"]
         assert metrics["colour_probability"] > 0.99
         usable.append(Table.read(tmp_path / "image_galaxies.fits"))
+    assert (tmp_path / "image_measured.png").exists()
     # Without colours of galaxies these have the PSF of the mean star.
     assert "84 of 84 galaxies have no colour" in metrics["warnings"][0]
     e1 = [table["e1"][table["usable"]].mean() for table in usable]
