@@ -10,7 +10,19 @@ from typer import Argument, Option
 
 from ..core.errors import ConfigError
 from .inputs import load_model
-from .options import Basis, Components, Interpolation, Json, Order, Quiet, Recipe, Threads, Weights, recipe_of_options
+from .options import (
+    Basis,
+    ColourColumn,
+    Components,
+    Interpolation,
+    Json,
+    Order,
+    Quiet,
+    Recipe,
+    Threads,
+    Weights,
+    recipe_of_options,
+)
 from .tables import Rows, print_json
 from .workers import Processes, long_work
 
@@ -51,6 +63,11 @@ def measure_command(
     stars: Annotated[
         str | None, Option(help="Table of stars (x, y or ra, dec; FITS, ECSV, CSV), or {stem}..., in place of a locus.")
     ] = None,
+    colours: Annotated[
+        str | None,
+        Option(help="Table with the colours of stars and galaxies, or {stem}...; that of --stars by default."),
+    ] = None,
+    colour_column: ColourColumn = None,
     min_snr: Annotated[float, Option(help="Least S/N of stars.")] = 30.0,
     extension: Annotated[
         str | None, Option(help="Extension of the image, name or number; by default all images of a file.")
@@ -95,6 +112,7 @@ def measure_command(
     - `pachon measure pachon_images/image_*.fits -o catalogues --recipe paper`: the PSF in the paper's way
     - `pachon measure pachon_images/image_*.fits -o catalogues --model focal_plane`: optics, heights and turbulence
     - `pachon measure D00232418_i_c19.fits.fz --psf "{stem}_piff.fits"`: an image of DES with the PSF model of Piff
+    - `pachon measure coadd.fits --colours catalogue.fits --colour-column g_i`: a PSF for the colour of each galaxy
     - `pachon measure coadd.fits --weight coadd.weight.fits --gain 2.1 --zero-point 30`: what the header lacks
     """
     from ..core.files import make_folder
@@ -115,6 +133,12 @@ def measure_command(
     ccd_recipe = recipe_of_options(recipe, basis, interpolation, components, weights, order)
     if model != "ccd" and ccd_recipe is not None:
         raise ConfigError("--recipe and its options are of models of a CCD: expected none with --model focal_plane")
+    if colour_column is not None and model != "ccd":
+        raise ConfigError("--colour-column: expected with --model ccd alone")
+    if colours is not None and colour_column is None:
+        raise ConfigError("--colours: expected --colour-column, the name of its column")
+    if colour_column is not None and colours is None and stars is None:
+        raise ConfigError("--colour-column: expected --colours or --stars, the table that has it")
     if psf is not None and ccd_recipe is not None:
         raise ConfigError("--recipe and its options are of models of a CCD: expected none with --psf")
     settings = ImageSettings(
@@ -135,7 +159,16 @@ def measure_command(
             fit_exposure_psf(
                 images, telescope_model, min_snr=min_snr, threads=threads, reporter=execution.reporter
             ).write(psf_file)
-        options = MeasureOptions(psf_file, ccd_recipe, stars, min_snr, settings, pictures)
+        options = MeasureOptions(
+            psf_file,
+            ccd_recipe,
+            stars,
+            (stars if colours is None else colours) if colour_column is not None else None,
+            colour_column,
+            min_snr,
+            settings,
+            pictures,
+        )
         measured = measure_files(images, out, extension=extension, options=options, execution=execution)
     if as_json:
         print_json({"images": measured.metrics, "left_out": measured.left_out})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Argument, Option
@@ -11,6 +11,7 @@ from typer import Argument, Option
 from .interrupt import interruptible
 from .options import (
     Basis,
+    ColourColumn,
     Components,
     Gain,
     Interpolation,
@@ -30,6 +31,9 @@ from .options import (
 )
 from .tables import Rows, print_json
 
+if TYPE_CHECKING:
+    from ..reconstruction.psf_model.colour import FittedColour
+
 app = typer.Typer()
 
 
@@ -44,6 +48,7 @@ def model_command(
     weight: StarWeight = None,
     mask: StarMask = None,
     images: StarImages = None,
+    colour_column: ColourColumn = None,
     size: Annotated[int | None, Option(help="Side of the PSF [pixel], odd; that of the stamps less a rim.")] = None,
     min_snr: MinSnr = 20.0,
     gain: Gain = 1.0,
@@ -71,12 +76,14 @@ def model_command(
     - `pachon model stars.fits`: columns x, y, stamp, or x, y and a cube of images
     - `pachon model sextractor.cat --gain 1.7 --pixel-arcsec 0.263`: XWIN_IMAGE, YWIN_IMAGE, VIGNET
     - `pachon model piff_stars.fits`: X, Y, IMAGE, WEIGHT
+    - `pachon model stars.fits --colour-column g_i`: the PSF may depend on the colours of the stars
     - `pachon model stars.ecsv --images stamps.fits --x X --y Y -o psf.fits`
     """
     from ..core.files import write_bytes
     from ..core.plotting import png_bytes
     from ..core.table_files import write_table
     from ..core.units import ARCSEC
+    from ..models.star_spectrum import psf_colours
     from ..reconstruction.own_stars.own_stars import fit_own_stars
     from ..reconstruction.own_stars.star_catalogue import load_stars
 
@@ -84,8 +91,13 @@ def model_command(
     options: dict[str, Any] = {} if chosen_recipe is None else {"recipe": chosen_recipe}
     path = stars.with_name(f"{stars.stem}_psf.fits") if out is None else out
     with interruptible(quiet) as reporter, reporter.stage(f"PSF of {stars.name}"):
+        cutouts = load_stars(
+            stars, x=x, y=y, stamp=stamp, weight=weight, mask=mask, images=images, colour=colour_column
+        )
+        if cutouts.colour is not None:
+            options["colour"] = psf_colours(cutouts.colour, colour_column or "")
         result = fit_own_stars(
-            *load_stars(stars, x=x, y=y, stamp=stamp, weight=weight, mask=mask, images=images),
+            *cutouts,
             pixel_arcsec * ARCSEC,
             size=size,
             min_snr=min_snr,
@@ -115,4 +127,14 @@ def model_command(
             ("... of which noise of the stars", f"{100 * summary_of_stars['rms_size_noise']:.2f} %"),
             ("model, picture, stars", f"{path}, .png, .ecsv"),
         ]
+        if colour_column is not None:
+            rows.insert(1, ("dependence on colour", _colour_text(colour_column, result.model.colour)))
         Rows(("", ""), rows, left=2).show()
+
+
+def _colour_text(column: str, colour: FittedColour | None) -> str:
+    """Return the words for what the stars say of their colours."""
+    if colour is None:
+        return f"{column}: none, or colours do not differ"
+    without = f", {colour.stars.n_unknown} without count as the mean" if colour.stars.n_unknown else ""
+    return f"{column}: probability {colour.probability:.2g}{without}"

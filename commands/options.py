@@ -61,6 +61,9 @@ StarWeight = Annotated[
 StarMask = Annotated[
     str | None, Option("--mask", help="Column of masks of pixels, 0 where good; MASK, VIGNET_MASK, ... by default.")
 ]
+ColourColumn = Annotated[
+    str | None, Option(help="Column of colours of stars, such as g_i; teff [K] counts as g - i of blackbodies.")
+]
 StarImages = Annotated[Path | None, Option("--images", help="FITS cube of the stamps, where the table has none.")]
 MinSnr = Annotated[float, Option(help="Least S/N of a star.")]
 Gain = Annotated[float, Option(help="Electrons in a unit of the stamps.")]

@@ -27,6 +27,7 @@ def psf_object(
     ccd: str | None = None,
     x: float | None = None,
     y: float | None = None,
+    colour: float | None = None,
     wcs: galsim.BaseWCS | float | None = None,
     flux: float = 1.0,
     **options: Any,
@@ -46,6 +47,8 @@ def psf_object(
         Name of the CCD, for a model of the focal plane.
     x, y : float, optional
         Position, for a model: in the unit of its fit, or [m] for one of the focal plane.
+    colour : float, optional
+        Colour, for a model of a CCD that depends on it; the mean of its stars by default.
     wcs : galsim.LocalWCS, galsim.JacobianWCS or float, optional
         World coordinates of a pixel of the stamp: local WCS of the image at the star, or the side of a pixel [arcsec],
         along the axes of the detector then; by default that of the images.
@@ -70,7 +73,7 @@ def psf_object(
         needed = "ccd, x and y" if isinstance(psf, FocalPlanePsf) else "x and y"
         raise DomainError(f"{needed}: expected the place of the PSF")
     elif isinstance(psf, PsfModel):
-        stamp = psf.draw(x, y)
+        stamp = psf.draw(x, y, colour=colour)
     else:
         assert ccd is not None
         stamp, scale = psf.draw(ccd, x, y)[0], psf.pixel_scale and psf.pixel_scale / ARCSEC

@@ -51,8 +51,12 @@ def load_image_psf(path: Path) -> ImagePsf:
     raise ProductError(f"no PSF model ({reason})", file=path)
 
 
-def psfs_on(image: CcdImage, psf: ImagePsf, places: np.ndarray, threads: int | None) -> np.ndarray:
+def psfs_on(
+    image: CcdImage, psf: ImagePsf, places: np.ndarray, threads: int | None, colour: np.ndarray | float | None = None
+) -> np.ndarray:
     """Return PSF images of unit sum at pixels (x, y) of an image, the first one's centre at (0, 0), [n, m, m].
+
+    They are for colours [n], or one, where the model depends on them: one of a CCD, or Piff's with one property.
 
     Raises
     ------
@@ -61,15 +65,18 @@ def psfs_on(image: CcdImage, psf: ImagePsf, places: np.ndarray, threads: int | N
     """
     try:
         if isinstance(psf, PsfModel):
-            stamps = psf.at(places)
+            stamps = psf.at(places, colour=colour)
         elif isinstance(psf, FocalPlanePsf):
             # Centroids at the rim may lie outside by a part of a pixel.
             inside = np.clip(places, -0.5, np.array(image.image.shape[::-1]) - 0.5)
             stamps = psf.draw(image.name, *(image.pixels_of_ccd(inside).T * u.pix), threads=threads)
         elif isinstance(psf, PiffPsf):
             chip = _chip_of(image, psf)
-            wide = psf.at(places[:1] + 1.0, chip=chip, size=_WIDE_SIDE)
-            stamps = psf.at(places + 1.0, chip=chip, size=stamp_side(half_light_radius_of(wide[0])))
+            properties = _properties_of(psf, colour, len(places))
+            first = None if properties is None else {key: values[:1] for key, values in properties.items()}
+            wide = psf.at(places[:1] + 1.0, chip=chip, size=_WIDE_SIDE, properties=first)
+            side = stamp_side(half_light_radius_of(wide[0]))
+            stamps = psf.at(places + 1.0, chip=chip, size=side, properties=properties)
         else:
             wide = psf.at(places[:1] + 1.0, size=_WIDE_SIDE)
             stamps = psf.at(places + 1.0, size=stamp_side(half_light_radius_of(wide[0])))
@@ -81,6 +88,17 @@ def psfs_on(image: CcdImage, psf: ImagePsf, places: np.ndarray, threads: int | N
             f"PSF model of {image.name}: expected positive flux at all objects, such as of a model of this image"
         )
     return np.asarray(stamps / total)
+
+
+def _properties_of(psf: PiffPsf, colour: np.ndarray | float | None, count: int) -> dict[str, np.ndarray] | None:
+    """Return colours of objects as the one property of a model of Piff, unknown ones as the mean of the others."""
+    if colour is None or len(psf.property_names) != 1:
+        return None
+    values = np.broadcast_to(np.asarray(colour, dtype=np.float64), (count,))
+    known_values = values[np.isfinite(values)]
+    if not len(known_values):
+        return None
+    return {psf.property_names[0]: np.where(np.isfinite(values), values, known_values.mean())}
 
 
 def _chip_of(image: CcdImage, psf: PiffPsf) -> int | None:

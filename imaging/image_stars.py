@@ -139,10 +139,13 @@ def sky_variance(image: CcdImage) -> float:
     return float(np.median(image.variance[image.mask == 0]))
 
 
-def fit_image_psf(image: CcdImage, stars: StarSelection, recipe: Recipe | None = None) -> PsfModel:
+def fit_image_psf(
+    image: CcdImage, stars: StarSelection, recipe: Recipe | None = None, colour: np.ndarray | None = None
+) -> PsfModel:
     """Fit a PSF model of one CCD to the selected stars of its image; positions are pixels of the image.
 
-    The recipe is the default one where there are :data:`MANY_STARS`, else :data:`CONSTANT`.
+    The recipe is the default one where there are :data:`MANY_STARS`, else :data:`CONSTANT`. The stars may have colours
+    [n].
 
     Raises
     ------
@@ -161,6 +164,7 @@ def fit_image_psf(image: CcdImage, stars: StarSelection, recipe: Recipe | None =
             weights=recipe.star_weights(stars.snr),
             gain=image.gain,
             extent=(-0.5, width - 0.5, -0.5, height - 0.5),
+            colour=colour,
         )
     except PachonError as error:
         raise error.within(subject=f"CCD {image.name}") from None

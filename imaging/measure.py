@@ -32,6 +32,7 @@ from .image_file import CcdImage
 from .image_psf import ImagePsf, half_light_radius_of, psfs_on
 from .image_shear import object_shears
 from .image_stars import MANY_STARS, detected_objects, few_or_many_stars, few_stars_warning, fit_image_psf
+from .object_colours import ObjectColours
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,6 +72,8 @@ class ImageCatalogue(Result):
         where the scale of the pixels is unknown, or their PSF too wide.
     warnings : tuple of str
         What makes the shapes less certain than those of other images.
+    colours : ObjectColours or None
+        Colours of stars and galaxies, where they were given.
     """
 
     image: CcdImage
@@ -82,6 +85,7 @@ class ImageCatalogue(Result):
     usable: np.ndarray
     shear: ShearShapes | None = None
     warnings: tuple[str, ...] = ()
+    colours: ObjectColours | None = None
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw half-light radius against magnitude, selected stars in another colour."""
@@ -186,6 +190,8 @@ class ImageCatalogue(Result):
             "usable_per_arcmin2": None if area is None else float(self.usable.sum() / area),
             "star_half_light_radius_pixel": self.stars.half_light_radius,
         }
+        if isinstance(self.psf, PsfModel) and self.psf.colour is not None:
+            numbers["colour_probability"] = self.psf.colour.probability
         if self.warnings:
             numbers["warnings"] = list(self.warnings)
         if (
@@ -223,6 +229,7 @@ def measure_image(
     psf: PsfModel | FocalPlanePsf | PiffPsf | PsfexPsf | None = None,
     recipe: str | Recipe | None = None,
     stars: ArrayLike | None = None,
+    colours: ObjectColours | None = None,
     min_snr: float = 30.0,
     threads: int | None = None,
 ) -> ImageCatalogue:
@@ -242,6 +249,11 @@ def measure_image(
     stars : array, optional
         Pixels (x, y) of stars, such as of a catalogue, the first pixel's centre at (0, 0), [k, 2]; by default stars are
         selected by their size.
+    colours : ObjectColours, optional
+        Colours of stars, to which the model of the CCD is fitted, and of galaxies, for which it is drawn: each object
+        with that of the nearest entry within 3 pixels, others with the mean. A model of Piff with one property takes
+        them too. The functionals of the shear have one PSF
+        for each part of the image, that of the mean colour of its galaxies.
     min_snr : float
         Least S/N of stars.
     threads : int, optional
@@ -261,27 +273,34 @@ def measure_image(
     model: ImagePsf
     if psf is None:
         selected_stars = few_or_many_stars(image, objects, min_snr, stars)
-        model = fit_image_psf(image, selected_stars, None if recipe is None else Recipe.of(recipe))
+        star_colours = None if colours is None else colours.at(selected_stars.positions)
+        model = fit_image_psf(image, selected_stars, None if recipe is None else Recipe.of(recipe), star_colours)
         if len(selected_stars) < MANY_STARS:
             warnings = (few_stars_warning(selected_stars),)
     else:
         model = psf
-        selected_stars = _stars_beside_model(image, objects, psf, min_snr, stars)
+        selected_stars = _stars_beside_model(image, objects, psf, min_snr, stars, colours)
     rows = np.setdiff1d(np.arange(len(objects)), selected_stars.index)
     if not len(rows):
         raise DomainError("all objects are stars: expected galaxies", subject=f"CCD {image.name}")
     places = np.stack([objects.x[rows], objects.y[rows]], axis=1)
+    galaxy_colours: np.ndarray | None = None
+    mean_colour: float | None = None
+    if colours is not None:
+        galaxy_colours = colours.at(places)
+        mean_colour = ObjectColours(places, galaxy_colours).mean
+        warnings = (*warnings, *_colour_warnings(colours.at(selected_stars.positions), galaxy_colours, model))
 
     def psfs_at(positions: np.ndarray) -> np.ndarray:
-        """Return PSFs of unit sum at pixels of the image."""
-        return psfs_on(image, model, positions, threads)
+        """Return PSFs of unit sum at pixels of the image, for the mean colour of the galaxies."""
+        return psfs_on(image, model, positions, threads, mean_colour)
 
     fits = fit_galaxies(
         image.image - objects.background,
         np.where(image.mask == 0, image.variance, 1.0),
         places[:, 0],
         places[:, 1],
-        psfs_at(places),
+        psfs_on(image, model, places, threads, galaxy_colours),
         half_light_radius=np.nan_to_num(objects.half_light_radius[rows], nan=selected_stars.half_light_radius),
         mask=image.mask,
         segmentation=objects.segmentation,
@@ -295,11 +314,30 @@ def measure_image(
         shear = object_shears(image, objects, psfs_at, threads=threads).take(rows) if image.has_scale else None
     except DomainError as error:
         shear, warnings = None, (*warnings, f"no shear of functionals: {error.problem}")
-    return ImageCatalogue(image, objects, selected_stars, model, rows, fits, usable, shear, warnings)
+    return ImageCatalogue(image, objects, selected_stars, model, rows, fits, usable, shear, warnings, colours)
+
+
+def _colour_warnings(star_colours: np.ndarray, galaxy_colours: np.ndarray, psf: ImagePsf) -> list[str]:
+    """Return words for stars and galaxies without colours, and for a model that knows of none."""
+    of_piff = isinstance(psf, PiffPsf) and len(psf.property_names) == 1
+    if not of_piff and not (isinstance(psf, PsfModel) and psf.colour is not None):
+        return ["colours change nothing: the PSF model has no dependence on them"]
+    unknown = [int(np.isnan(values).sum()) for values in (star_colours, galaxy_colours)]
+    if not any(unknown):
+        return []
+    return [
+        f"{unknown[0]} of {len(star_colours)} stars and {unknown[1]} of {len(galaxy_colours)} galaxies have no colour "
+        "and count as the mean"
+    ]
 
 
 def _stars_beside_model(
-    image: CcdImage, objects: DetectedObjects, psf: ImagePsf, min_snr: float, positions: ArrayLike | None
+    image: CcdImage,
+    objects: DetectedObjects,
+    psf: ImagePsf,
+    min_snr: float,
+    positions: ArrayLike | None,
+    colours: ObjectColours | None,
 ) -> StarSelection:
     """Return the stars of an image whose PSF is known; none, with the size of the PSF, where they have no locus."""
     try:
@@ -308,5 +346,5 @@ def _stars_beside_model(
         if positions is not None:
             raise
         middle = 0.5 * (np.array(image.image.shape[::-1]) - 1.0)
-        stamp = psfs_on(image, psf, middle[None], None)[0]
+        stamp = psfs_on(image, psf, middle[None], None, None if colours is None else colours.mean)[0]
         return StarSelection.empty(len(objects), half_light_radius_of(stamp), stamp.shape)

@@ -21,10 +21,12 @@ from ..core.version import VERSION
 from ..pipeline.config import digest
 from ..reconstruction.psf_model.model import PsfModel
 from ..reconstruction.psf_model.recipe import DEFAULT, Recipe
+from .image_file import CcdImage
 from .image_formats.load import ImageSettings, ImageSource, image_sources, image_stem, load_image
 from .image_psf import ImagePsf, load_image_psf
 from .measure import measure_image
 from .measure_picture import measured_png
+from .object_colours import ObjectColours, read_object_colours
 from .star_positions import read_star_positions
 
 #: What names of products add to that of an image.
@@ -52,6 +54,10 @@ class MeasureOptions:
         Of the models of the images; None for the default one.
     stars : str, Path or None
         Table of the stars of an image, by pixels or celestial coordinates; None for stars by their size.
+    colours : str, Path or None
+        Table of the colours of stars and galaxies, by pixels or celestial coordinates; None to know none.
+    colour_column : str or None
+        Its column.
     min_snr : float
         Least S/N of stars.
     settings : ImageSettings
@@ -63,6 +69,8 @@ class MeasureOptions:
     psf: str | Path | None = None
     recipe: Recipe | None = None
     stars: str | Path | None = None
+    colours: str | Path | None = None
+    colour_column: str | None = None
     min_snr: float = 30.0
     settings: ImageSettings = field(default_factory=ImageSettings)
     pictures: bool = False
@@ -72,7 +80,19 @@ class MeasureOptions:
         settings = replace(
             self.settings, weight=_beside(self.settings.weight, path), mask=_beside(self.settings.mask, path)
         )
-        return replace(self, psf=_beside(self.psf, path), stars=_beside(self.stars, path), settings=settings)
+        return replace(
+            self,
+            psf=_beside(self.psf, path),
+            stars=_beside(self.stars, path),
+            colours=_beside(self.colours, path),
+            settings=settings,
+        )
+
+    def object_colours(self, image: CcdImage) -> ObjectColours | None:
+        """Return the colours of the objects of an image; None where no table has them."""
+        if self.colours is None or self.colour_column is None:
+            return None
+        return read_object_colours(Path(self.colours), self.colour_column, image)
 
     def keys(self) -> dict[str, Any]:
         """Return all that decides the products of an image, files by their content."""
@@ -86,6 +106,9 @@ class MeasureOptions:
         }
         if self.stars is not None:
             settings["stars"] = content_hash(Path(self.stars), ProductError)
+        if self.colours is not None:
+            settings["colours"] = content_hash(Path(self.colours), ProductError)
+            settings["colour_column"] = self.colour_column
         return keys | settings
 
 
@@ -118,7 +141,13 @@ class FileMeasurement:
         try:
             stars = None if options.stars is None else read_star_positions(Path(options.stars), image)
             catalogue = measure_image(
-                image, psf=psf, recipe=options.recipe, stars=stars, min_snr=options.min_snr, threads=threads
+                image,
+                psf=psf,
+                recipe=options.recipe,
+                stars=stars,
+                colours=options.object_colours(image),
+                min_snr=options.min_snr,
+                threads=threads,
             )
         except DomainError as error:
             return str(error)

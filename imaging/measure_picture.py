@@ -88,7 +88,12 @@ def _draw_mean_star(row: list[Axes], catalogue: ImageCatalogue) -> None:
     stamps = stars.stamps[brightest]
     # By flux: faint stars have their noise, and a galaxy among them.
     flux = stamps.sum(axis=(1, 2))
-    psfs = psfs_on(catalogue.image, catalogue.psf, stars.positions[brightest], None) * flux[:, None, None]
+    places, colours = stars.positions[brightest], catalogue.colours
+    star_colours: np.ndarray | float | None = None
+    if colours is not None:
+        star_colours = colours.at(places)
+        star_colours = colours.mean if np.isnan(star_colours).all() else star_colours
+    psfs = psfs_on(catalogue.image, catalogue.psf, places, None, star_colours) * flux[:, None, None]
     side = min(stamps.shape[1], psfs.shape[1])
     mean_star, mean_psf = (_middle(images.sum(axis=0), side) / flux.sum() for images in (stamps, psfs))
     peak = float(mean_psf.max())

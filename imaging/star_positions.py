@@ -38,7 +38,7 @@ def read_star_positions(path: Path, image: CcdImage) -> np.ndarray:
     DomainError
         If no star of it lies on the image.
     """
-    positions = _positions_in(_table_in(path), image, path)
+    positions = positions_in(table_in(path), image, path)
     ny, nx = image.image.shape
     inside = np.isfinite(positions).all(axis=1)
     inside[inside] = ((positions[inside] >= -0.5) & (positions[inside] <= np.array([nx, ny]) - 0.5)).all(axis=1)
@@ -47,7 +47,8 @@ def read_star_positions(path: Path, image: CcdImage) -> np.ndarray:
     return positions[inside]
 
 
-def _positions_in(table: Table, image: CcdImage, path: Path) -> np.ndarray:
+def positions_in(table: Table, image: CcdImage, path: Path) -> np.ndarray:
+    """Return the pixels of an image at which the rows of a table of a file are, [n, 2]; ProductError without any."""
     columns = {name.lower(): name for name in table.colnames}
 
     def values(names: tuple[str, str]) -> np.ndarray:
@@ -72,7 +73,7 @@ def _positions_in(table: Table, image: CcdImage, path: Path) -> np.ndarray:
     raise ProductError(f"has no positions of stars: expected columns {expected}", file=path)
 
 
-def _table_in(path: Path) -> Table:
+def table_in(path: Path) -> Table:
     """Read a table; of a FITS file the first one with a position, as LDAC files have others before it."""
     data = read_bytes(path, ProductError)
     with warnings.catch_warnings(), parsing(path, "no table of stars", ProductError):

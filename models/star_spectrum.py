@@ -25,6 +25,12 @@ COLORS: dict[str, tuple[float, float, float]] = {
     "r_i": (616.6e-9, 748.0e-9, 0.0),
     "bp_rp": (511.0e-9, 776.9e-9, 0.3406),
 }
+#: Kinds of the colours of PSF models: mean wavelength in the band, or colours of two bands.
+KINDS = ("wavelength", *COLORS)
+#: Names of columns of temperatures in catalogues, in lower case, in order of preference.
+TEMPERATURE_COLUMNS = ("teff", "teff_gspphot", "temperature")
+#: Catalogues have -99, -999 and the like for colours that are missing; no colour of stars is so low in any unit.
+MISSING = -90.0
 #: Lowest temperature that stars are taken to have [K].
 COOLEST = 2000.0
 #: Highest temperature that stars are taken to have [K].
@@ -86,12 +92,86 @@ def color_temperature(color: ArrayLike, bands: str = "g_r") -> np.ndarray:
         Between 2000 and 50 000 K: redder and bluer stars are taken as the coolest and the hottest.
     """
     check_choice("bands", bands, COLORS)
-    first, second, zero = COLORS[bands]
-    log_kelvin = np.linspace(math.log(HOTTEST), math.log(COOLEST), _STEPS)
+    log_kelvin = _log_temperatures()
+    ab_colors = pure_numbers(color, "color") - COLORS[bands][2]
+    return np.asarray(np.exp(np.interp(ab_colors, _ab_colors(log_kelvin, bands), log_kelvin)))
+
+
+@check_arguments
+def effective_colour(wavelengths: ArrayLike, photons: ArrayLike, kind: str = "wavelength") -> np.ndarray:
+    """Return the colours of spectra within a band, as PSF models take them.
+
+    The PSF of a spectrum is the mean of those of its wavelengths, each by its photons: as far as these are linear in
+    the wavelength it is that of the mean wavelength. Another `kind` of colour is that of the blackbody of the same mean
+    wavelength, so that a model whose stars have g - i predicts the PSF of a galaxy's spectrum.
+
+    Parameters
+    ----------
+    wavelengths : array_like or Quantity, shape [n_wave]
+        Wavelengths in steps of equal size, of the band alone [m].
+    photons : array_like, shape [n_wave] or [n, n_wave]
+        Relative numbers of photons per unit of wavelength, such as :func:`blackbody_photons` gives; times the
+        throughput where that varies over the band.
+    kind : {"wavelength", "g_r", "g_i", "r_i", "bp_rp"}
+        Mean wavelength [m], or colour [mag] as in :func:`color_temperature`.
+
+    Returns
+    -------
+    ndarray, shape [n]
+        Colours, one of each spectrum. Magnitudes are those of blackbodies of 2000 to 50 000 K: redder and bluer spectra
+        have those of the coolest and the hottest one.
+
+    Raises
+    ------
+    DomainError
+        If shapes differ, numbers of photons are negative, or a spectrum has none.
+    """
+    check_choice("kind", kind, KINDS)
+    waves = np.atleast_1d(metres(wavelengths, "wavelengths"))
+    if waves.ndim != 1 or not (np.isfinite(waves) & (waves > 0.0)).all():
+        raise DomainError("wavelengths: expected one or more positive lengths in metres")
+    spectra = np.atleast_2d(pure_numbers(photons, "photons"))
+    if spectra.ndim != 2 or spectra.shape[1] != len(waves):
+        raise DomainError(f"photons have shape {np.shape(photons)}: expected [{len(waves)}] or [n, {len(waves)}]")
+    light = spectra.sum(axis=1)
+    if not (np.isfinite(light) & (light > 0.0) & (spectra >= 0.0).all(axis=1)).all():
+        raise DomainError("photons: expected numbers from 0, in each spectrum some above 0")
+    mean = (spectra * waves).sum(axis=1) / light
+    if kind == "wavelength":
+        return np.asarray(mean)
+    log_kelvin = _log_temperatures()
+    blackbodies = blackbody_photons(np.exp(log_kelvin), waves)
+    return blackbody_color(np.exp(np.interp(mean, (blackbodies * waves).mean(axis=1), log_kelvin)), kind)
+
+
+def blackbody_color(temperature: np.ndarray, bands: str) -> np.ndarray:
+    """Return the colours [mag] of blackbodies of temperatures [K], as :func:`color_temperature` takes them."""
+    return _ab_colors(np.log(temperature), bands) + COLORS[bands][2]
+
+
+def psf_colours(values: np.ndarray, column: str) -> np.ndarray:
+    """Return the values of a column of a catalogue as colours in which PSFs are nearly linear.
+
+    Temperatures, by the name of their column, become the g - i of blackbodies; anything else is as it stands. Values
+    that are not finite, or :data:`MISSING` or less, become NaN.
+    """
+    known = np.isfinite(values) & (values > MISSING)
+    if column.lower() not in TEMPERATURE_COLUMNS:
+        return np.where(known, values, np.nan)
+    kelvin = np.where(known & (values > 0.0), values, np.nan)
+    return blackbody_color(np.clip(kelvin, COOLEST, HOTTEST), "g_i")
+
+
+def _log_temperatures() -> np.ndarray:
+    """Return logarithms of temperatures [K] from the hottest to the coolest: colours and mean wavelengths rise."""
+    return np.linspace(math.log(HOTTEST), math.log(COOLEST), _STEPS)
+
+
+def _ab_colors(log_kelvin: np.ndarray, bands: str) -> np.ndarray:
+    """Return the colours of blackbodies by the logarithms of their temperatures [K], AB magnitudes."""
+    first, second, _ = COLORS[bands]
     inverse = _RADIATION * np.exp(-log_kelvin)
-    # Colours rise as the temperature falls.
-    colors = 7.5 * math.log10(first / second) + 2.5 * (
-        np.log10(np.expm1(inverse / first)) - np.log10(np.expm1(inverse / second))
+    return np.asarray(
+        7.5 * math.log10(first / second)
+        + 2.5 * (np.log10(np.expm1(inverse / first)) - np.log10(np.expm1(inverse / second)))
     )
-    ab_colors = pure_numbers(color, "color") - zero
-    return np.asarray(np.exp(np.interp(ab_colors, colors, log_kelvin)))

@@ -105,6 +105,7 @@ from .imaging.image_formats.load import load_image as load_image
 from .imaging.image_stars import focal_plane_stars as focal_plane_stars
 from .imaging.measure import ImageCatalogue as ImageCatalogue
 from .imaging.measure import measure_image as measure_image
+from .imaging.object_colours import ObjectColours as ObjectColours
 from .imaging.psf_field import PsfField as PsfField
 from .imaging.scene import CcdScene as CcdScene
 from .imaging.scene import draw_ccd as draw_ccd
@@ -230,6 +231,7 @@ from .models.site import Site as Site
 from .models.site import Weather as Weather
 from .models.star_spectrum import blackbody_photons as blackbody_photons
 from .models.star_spectrum import color_temperature as color_temperature
+from .models.star_spectrum import effective_colour as effective_colour
 from .models.starting_designs.lenses import doublet as doublet
 from .models.starting_designs.lenses import singlet as singlet
 from .models.starting_designs.lenses import triplet as triplet
@@ -275,6 +277,7 @@ from .reconstruction.piff.comparison import PiffComparison as PiffComparison
 from .reconstruction.piff.comparison import compare_with_piff as compare_with_piff
 from .reconstruction.piff.psf import PiffPsf as PiffPsf
 from .reconstruction.piff.psf import load_piff as load_piff
+from .reconstruction.psf_model.colour import ColourTerm as ColourTerm
 from .reconstruction.psf_model.kriging import Kriging as Kriging
 from .reconstruction.psf_model.model import PsfModel as PsfModel
 from .reconstruction.psf_model.outliers import SigmaClipping as SigmaClipping
@@ -283,6 +286,7 @@ from .reconstruction.psf_model.polynomial_fit import Polynomial as Polynomial
 from .reconstruction.psf_model.principal_components import PrincipalComponents as PrincipalComponents
 from .reconstruction.psf_model.recipe import Recipe as Recipe
 from .reconstruction.psf_model.shapelets import Shapelets as Shapelets
+from .reconstruction.psf_model.spectrum import psf_of_spectrum as psf_of_spectrum
 from .reconstruction.psfex import PsfexPsf as PsfexPsf
 from .reconstruction.psfex import load_psfex as load_psfex
 from .sensing.degrees import FreedomEstimate as FreedomEstimate

@@ -16,7 +16,7 @@ from ..core.errors import ConfigError, ProductError, error_context
 from ..core.table_files import read_columns
 from ..core.units import metres, pure_numbers, radians
 from ..models.camera.camera import Camera
-from ..models.star_spectrum import COOLEST, HOTTEST, color_temperature
+from ..models.star_spectrum import COOLEST, HOTTEST, TEMPERATURE_COLUMNS, color_temperature
 from ..models.telescope import Telescope
 from ..raytrace.rays import RayStatus, field_direction
 from ..sky.pointing import Pointing
@@ -32,7 +32,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "x": ("x_m",),
     "y": ("y_m",),
     "mag": ("mag", "{band}", "mag_{band}", "{band}_mag", "{band}mag", "magnitude"),
-    "teff": ("teff", "teff_gspphot", "temperature"),
+    "teff": TEMPERATURE_COLUMNS,
     "bp_rp": ("bp_rp", "bp-rp"),
     "g_r": ("g_r", "g-r"),
     "g_i": ("g_i", "g-i"),

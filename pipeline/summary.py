@@ -98,8 +98,18 @@ def ccd_metrics(product: CcdProduct) -> dict[str, Any]:
         "kink_observed": product.model.elbow,
         "kink_truth": product.noise_free_model.elbow,
         **({"psf_smoothness": smoothness} if (smoothness := product.model.smoothness) else {}),
+        **_colour_metrics(product),
         **_common_metrics([product]),
     }
+
+
+def _colour_metrics(product: CcdProduct) -> dict[str, Any]:
+    """Return what the stars of a CCD say of a dependence on their colours; nothing where they have no spectra."""
+    if product.observed.colour is None:
+        return {}
+    colour, values = product.model.colour, product.observed.colour[product.observed.used]
+    probability = 0.0 if colour is None else colour.probability
+    return {"psf_colour_probability": probability, "stars_without_colour": int(np.isnan(values).sum())}
 
 
 def run_metrics(

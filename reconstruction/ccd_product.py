@@ -52,6 +52,7 @@ _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
     "g2_sky": ("G2_SKY", _NONE, "likewise, > 0 from north-west to south-east"),
     "magnitude": ("MAG", _Unit("mag", 1.0), "AB magnitude"),
     "electrons": ("ELECTRON", _Unit("electron", 1.0), "electrons of the star in the exposure"),
+    "colour": ("COLOUR", _Unit("nm", 1e-9), "mean wavelength of the star in the band"),
     "snr": ("SNR", _NONE, "signal to noise of PSF photometry"),
     "e1": ("E1", _NONE, "ellipticity (a-b)/(a+b) along x"),
     "e2": ("E2", _NONE, "ellipticity along x = y"),
@@ -210,6 +211,8 @@ class ObservedStars(Stars):
     leave_one_out_g1: np.ndarray
     leave_one_out_g2: np.ndarray
     leave_one_out_sigma: np.ndarray  #: [rad]
+    #: Mean wavelength in the band [m], NaN where the spectrum is unknown; None where all are.
+    colour: np.ndarray | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,7 @@ def stamps_plot(products: Sequence[CcdProduct], per_ccd: int = 3) -> bytes:
         gallery = StampGallery(axes, products[0].observed_images.shape[1], products[0].pixel_scale)
         for column, (product, i) in enumerate(shown_stars):
             stars, position = product.observed, np.array([[product.observed.x[i], product.observed.y[i]]])
-            model = product.model.at(position)[0]
+            model = product.model.at(position, colour=None if stars.colour is None else stars.colour[i])[0]
             observed = np.asarray(product.observed_images[i], dtype=np.float64)
             sky, rms = product.noise
             sigma = np.sqrt(np.maximum(stars.electrons[i] * model, 0.0) + sky + rms**2)

@@ -7,6 +7,7 @@ import numpy as np
 from ...measure.adaptive_moments import AdaptiveMoments, adaptive_moments
 from ...measure.shapes import Shapes, fwhm, measure_shapes
 from ...measure.star_selection import require_stars
+from ...models.star_spectrum import blackbody_photons, effective_colour
 from ...reconstruction.ccd_product import CcdProduct, HoldoutStars, ObservedStars
 from ...reconstruction.psf_model.model import CLIPPING, PsfModel
 from ...sky.sky_shapes import along_sky, jacobians_on_sky
@@ -58,7 +59,10 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
     def adaptive_of(images: np.ndarray) -> AdaptiveMoments:
         return adaptive_moments(images, observed.pixel_scale, threads=1)  # a second CCD is exposed meanwhile
 
-    holdout_models, star_models = model.at(positions.holdout), model.at(stars.observed)
+    # Noise-free PSFs are those of flat spectra.
+    colours, flat = star_colours(experiment, stars), float(experiment.wavelengths.mean())
+    holdout_models = model.at(positions.holdout, colour=flat)
+    star_models = model.at(stars.observed, colour=colours)
     left_out_models = model.leave_one_out()
     x, y = experiment.camera.centers[experiment.camera.ccd_index(name)]
     # Like e, g is not that of a star with a defect.
@@ -87,6 +91,7 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
             snr=snr,
             defects=observation.defects,
             used=used,
+            colour=colours,
         ),
         holdout_images=holdout_images.astype(np.float32),
         observed_images=observation.images.astype(np.float32),
@@ -102,7 +107,7 @@ def fit_ccd_model(
     """Fit the PSF model of the configuration to the observed stars of one CCD, S/N [n], that can be used."""
     recipe, used = experiment.config.reconstruction.psf_recipe(), observation.used
     require_stars(used, observation.defects, least_star_count(experiment.config))
-    images = observation.images[used]
+    images, colours = observation.images[used], star_colours(experiment, stars)
     if recipe.interpolation.needs_noise:  # in electrons
         images = images * stars.electrons[used, None, None]
     return PsfModel.fit(
@@ -112,7 +117,16 @@ def fit_ccd_model(
         weights=recipe.star_weights(snr[used]),
         extent=stars.ccd.extent,
         clipping=CLIPPING if noisy else None,
+        colour=None if colours is None else colours[used],
     )
+
+
+def star_colours(experiment: Experiment, stars: StarField) -> np.ndarray | None:
+    """Return the mean wavelengths in the band of observed stars [m], NaN without a spectrum; None without any."""
+    kelvin, wavelengths = stars.temperature, experiment.wavelengths
+    if kelvin is None:
+        return None
+    return np.where(np.isnan(kelvin), np.nan, effective_colour(wavelengths, blackbody_photons(kelvin, wavelengths)))
 
 
 def _position_columns(experiment: Experiment, positions: np.ndarray, fields: np.ndarray) -> dict[str, np.ndarray]:

@@ -20,7 +20,8 @@ from ...measure.stamps import center_masks, center_stamps, decenter_masks
 from ...measure.star_selection import StarFlag, flag_stars, require_stars
 from ..psf_model import kriging
 from ..psf_model.checks import as_extent
-from ..psf_model.model import ModelOptions, PsfModel
+from ..psf_model.colour import as_colours
+from ..psf_model.model import PsfModel, StarOptions
 from ..psf_model.polynomial import as_positions
 from .candidates import CANDIDATES, choose_candidate
 from .masked_stars import (
@@ -62,7 +63,7 @@ def fit_own_stars(
     background: bool = True,
     masks: NDArray[np.bool_] | None = None,
     seed: int = 1,
-    **options: Unpack[ModelOptions],
+    **options: Unpack[StarOptions],
 ) -> OwnStars:
     """Centre stars, mask or leave out defects, model the PSF, and predict each star from others.
 
@@ -95,20 +96,22 @@ def fit_own_stars(
     seed : int
         Of the parts that are held out.
     **options
-        Options of :meth:`~.PsfModel.fit`: `extent` of the CCD, by default that of the stars; any other, `recipe` and
-        its keys among them, is for a kind of model without a choice.
+        Options of :meth:`~.PsfModel.fit`: `extent` of the CCD, by default that of the stars; `colour` of the stars,
+        [n]; any other, `recipe` and its keys among them, is for a kind of model without a choice.
 
     Raises
     ------
     DomainError
         If stamps are too small, fewer than five stars are left, or the model cannot be made.
     """
-    extent, given_kind = options.get("extent"), {key: value for key, value in options.items() if key != "extent"}
+    extent, colour = options.get("extent"), options.get("colour")
+    given_kind = {key: value for key, value in options.items() if key not in ("extent", "colour")}
     raw_images, places = real_array(stamps, "stamps: expected real numbers [n, ny, nx]"), as_positions(positions)
     if raw_images.ndim != 3 or len(raw_images) != len(places):
         raise DomainError(
             f"stamps of shape {raw_images.shape}, {len(places)} positions: expected [n, ny, nx] and as many positions"
         )
+    colours = None if colour is None else np.broadcast_to(as_colours(colour, len(places)), (len(places),))
     bad = as_bad_pixels(raw_images, masks)
     if bad.size and bad.all():
         raise DomainError(f"no pixel of {len(bad)} stamps has weight: all are masked, or no numbers")
@@ -145,14 +148,20 @@ def fit_own_stars(
 
     def fit(chosen: np.ndarray, kind: Mapping[str, Any]) -> PsfModel:
         span = as_extent(extent, places[stars.used])
-        return PsfModel.fit(stars.images[chosen], places[chosen], extent=span, **{"gain": gain, **kind})
+        return PsfModel.fit(
+            stars.images[chosen], places[chosen], extent=span, colour=colours_of(chosen), **{"gain": gain, **kind}
+        )
+
+    def colours_of(chosen: np.ndarray) -> np.ndarray | None:
+        return None if colours is None else colours[chosen]
 
     def predict(kind: Mapping[str, Any]) -> np.ndarray:
         predicted = np.empty((len(used_indices), size, size))
         for held_out_indices in parts:
             fitted_indices = np.setdiff1d(np.arange(len(used_indices)), held_out_indices)
+            predicted_indices = used_indices[held_out_indices]
             predicted[held_out_indices] = fit(used_indices[fitted_indices], kind).at(
-                places[used_indices[held_out_indices]]
+                places[predicted_indices], colour=colours_of(predicted_indices)
             )
         return predicted
 
@@ -182,10 +191,10 @@ def fit_own_stars(
         stars = select(filled, lost, stars)
     _require_used(stars, min_snr, gain)
     if bad.any():
-        masked = bad.any(axis=(1, 2))
+        masked = np.asarray(bad.any(axis=(1, 2)))
         complete = wide.usable & ~lost
         for _ in range(_MODEL_PASSES):
-            psfs = fit(np.flatnonzero(stars.used), given_kind).at(places[masked])
+            psfs = fit(np.flatnonzero(stars.used), given_kind).at(places[masked], colour=colours_of(masked))
             sigma = weight_sigma(scale, weight)
             filled[masked], lost[masked] = fill_by_profiles(
                 images[masked],

@@ -140,7 +140,15 @@ class OwnStars(Result):
             "rms_e_noise": _rms(self.sigma_e),
             "rms_size_held_out": _rms(size),
             "rms_size_noise": _rms(self.sigma_size),
+            **self._colour_summary(),
         }
+
+    def _colour_summary(self) -> dict[str, Any]:
+        """Return what the stars say of a dependence on their colours; nothing where they have none that differ."""
+        colour = self.model.colour
+        if colour is None:
+            return {}
+        return {"colour_probability": colour.probability, "without_colour": colour.stars.n_unknown}
 
     def rho_statistics(self, bins: int = 8) -> RhoStatistics:
         """Return the rho statistics of the held-out residuals; positions must be in pixels of the stamps."""

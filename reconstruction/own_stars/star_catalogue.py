@@ -32,11 +32,31 @@ OTHER_NAMES = {
 _QUALITY_NAMES = {name for kind in ("weight", "variance", "mask") for name in (kind, *OTHER_NAMES[kind])}
 
 
-class StarCutouts(NamedTuple):
-    """Stars to fit a PSF model to."""
+class _Cutouts(NamedTuple):
+    stamps: np.ndarray
+    positions: np.ndarray
 
-    stamps: np.ndarray  #: [n, ny, nx], as they stand in the file, NaN where a pixel has no weight
-    positions: np.ndarray  #: [n, 2], in the unit of the table
+
+class StarCutouts(_Cutouts):
+    """Stars to fit a PSF model to, to be unpacked as stamps and positions.
+
+    Parameters
+    ----------
+    stamps : ndarray
+        As they stand in the file, NaN where a pixel has no weight, [n, ny, nx].
+    positions : ndarray
+        In the unit of the table, [n, 2].
+    colour : ndarray or None
+        Colours, NaN where a row has none, [n]; None where no column is named.
+    """
+
+    colour: np.ndarray | None
+
+    def __new__(cls, stamps: np.ndarray, positions: np.ndarray, colour: np.ndarray | None = None) -> StarCutouts:
+        """Return stamps and positions with colours."""
+        cutouts = super().__new__(cls, stamps, positions)
+        cutouts.colour = colour
+        return cutouts
 
 
 @check_arguments
@@ -49,6 +69,7 @@ def load_stars(
     weight: str | None = None,
     mask: str | None = None,
     images: str | Path | None = None,
+    colour: str | None = None,
 ) -> StarCutouts:
     """Read stars from a FITS or ECSV table, or a file of LSST stamps.
 
@@ -74,12 +95,14 @@ def load_stars(
         EXTNAME is one of these.
     images : str or Path, optional
         FITS file whose first image of three axes, [n, ny, nx], holds the stamps in the order of the table.
+    colour : str, optional
+        Column of the colours of the stars, such as g_i.
 
     Returns
     -------
     StarCutouts
-        Stamps and positions, to be unpacked. Pixels without weight, and bad ones
-        (:mod:`~pachon.measure.pixel_masks`), are NaN.
+        Stamps and positions, to be unpacked, and ``colour`` where a column is named. Pixels without weight, and bad
+        ones (:mod:`~pachon.measure.pixel_masks`), are NaN.
 
     Raises
     ------
@@ -98,6 +121,8 @@ def load_stars(
             # SExtractor's LDAC files have a table of the image's header before that of the objects.
             table = next((t for t in tables if _find_column(x, t.columns.names)), tables[0] if tables else None)
         if (table is None or not _find_column(x, table.columns.names)) and is_stamp_file(hdus):
+            if colour is not None:
+                raise ProductError(f"has stamps without a table, expected one with a column {colour!r}", file=path)
             return StarCutouts(*read_stamp_file(hdus, path))
         if table is None:
             raise ProductError(
@@ -121,7 +146,7 @@ def load_stars(
         cube = _first_cube(hdus)
     needed_columns = [x, y] if cube is not None else [x, y, stamp]
     absent = [name for name in needed_columns if name.lower() not in names]
-    absent += [name for name in (weight, mask) if name is not None and name.lower() not in names]
+    absent += [name for name in (weight, mask, colour) if name is not None and name.lower() not in names]
     if absent:
         also = " and no image of three axes" if stamp in absent and hdus is not None else ""
         raise ProductError(
@@ -158,6 +183,7 @@ def load_stars(
             names=(weight or "weight", mask or "mask"),
         ),
         positions,
+        None if colour is None else _checked_column(path, colour, columns[names[colour.lower()]], 1),
     )
 
 

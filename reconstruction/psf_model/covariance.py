@@ -11,6 +11,9 @@ process nor trend, a linear field the degree 1 alone. Each of these forms has th
 probability, and predictions are the mean of those of all forms, each by its probability (Bayesian model averaging,
 Hoeting et al. 1999).
 
+Where the stars have colours c, of mean 0 and variance 1, each form stands with and without a term of covariance
+:math:`t_c^2 c_i c_j`, times polynomials of the position where these vary it.
+
 Variances are in units of the noise of the middle star.
 """
 
@@ -31,7 +34,8 @@ if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
 #: Fewest columns of a kernel: variance and length of the process, noise that all stars have, variances of the
-#: trend's terms of degree 1 and 2, and so on to its order. Lengths where the extent is 2 wide.
+#: trend's terms of degree 1 and 2, and so on to its order. Lengths where the extent is 2 wide. A last column holds the
+#: variance of the colour terms, of stars with colours.
 COLUMNS = 5
 #: Columns before those of the trend.
 _PROCESS_COLUMNS = 3
@@ -43,6 +47,8 @@ _LENGTH = 1
 _PRIOR = np.array([(-1.0, 1.5), (math.log(0.7), 0.7), (-8.0, 1.5)])
 # Prior standard deviation of the logarithms of the trend's variances.
 _TREND_WIDTH = 2.0
+# Prior mean of the logarithm of the variance of the colour terms, with the same width, and where the search starts.
+_COLOUR_PRIOR = 0.0
 # The search ends so far from the prior mean: stars without noise have variances of 10^6 in units of theirs.
 _REACH = 24.0
 # Prior means of the logarithms: of degree 1 and 2 the variance falls by e each; nothing is expected of higher degrees,
@@ -78,6 +84,12 @@ class Covariances:
 
     kernels: np.ndarray  #: columns as in :data:`COLUMNS`, [n_forms, n_columns]
     probabilities: np.ndarray  #: of the forms, of sum 1, [n_forms]
+    coloured: bool = False  #: whether kernels have a column of colour terms
+
+    @property
+    def colour_probability(self) -> float:
+        """Probability that values depend on the colour."""
+        return float(self.probabilities[self.kernels[:, -1] > 0.0].sum()) if self.coloured else 0.0
 
     @property
     def kernel(self) -> np.ndarray:
@@ -91,70 +103,95 @@ class Covariances:
 
     def forms(self) -> dict[str, float]:
         """Return the probability of each form by its name, such as ``constant`` or ``linear, process``."""
-        names = [form_name(kernel) for kernel in self.kernels]
+        names = [form_name(kernel, coloured=self.coloured) for kernel in self.kernels]
         return {name: float(self.probabilities[[n == name for n in names]].sum()) for name in dict.fromkeys(names)}
 
 
-def form_name(kernel: np.ndarray) -> str:
-    """Return the name of a kernel's form: that of its trend, and the process if there is one."""
-    degree = int(np.flatnonzero(np.concatenate([[1.0], kernel[_PROCESS_COLUMNS:]])).max())
+def form_name(kernel: np.ndarray, *, coloured: bool = False) -> str:
+    """Return the name of a kernel's form: that of its trend, and process and colour terms if there are any."""
+    columns = kernel[_PROCESS_COLUMNS : len(kernel) - coloured]
+    degree = int(np.flatnonzero(np.concatenate([[1.0], columns])).max())
     trend = _TREND_NAMES[degree] if degree < len(_TREND_NAMES) else f"order {degree}"
-    return f"{trend}, process" if kernel[0] > 0.0 else trend
+    with_process = f"{trend}, process" if kernel[0] > 0.0 else trend
+    return f"{with_process}, colour" if coloured and kernel[-1] > 0.0 else with_process
 
 
-def fit_covariances(points: np.ndarray, numbers: np.ndarray, noise: np.ndarray, terms: np.ndarray) -> Covariances:
+def fit_covariances(
+    points: np.ndarray, numbers: np.ndarray, noise: np.ndarray, terms: np.ndarray, *, colour_count: int = 0
+) -> Covariances:
     """Return the forms that are probable for shape numbers [n, 3], each with its most probable kernel.
 
     They are: trends of degree 0, 1 and 2 without a process, and a process on the linear trend and on that of all
-    degrees, as far as the terms reach. `points` [n, 2] are mapped to [-1, 1], `noise` [n, 3] are the variances of the
-    numbers, `terms` [n, n_terms] those of the trend.
+    degrees, as far as the terms reach; where there are colour terms, each without and with them. `points` [n, 2] are
+    mapped to [-1, 1], `noise` [n, 3] are the variances of the numbers, `terms` [n, n_terms] those of the trend, the
+    last `colour_count` of which are colour terms.
     """
     unit = np.median(noise, axis=0)
     brightest = np.sort(np.argsort(noise.sum(axis=1), kind="stable")[:_MOST_STARS])
-    order = order_of(terms.shape[1])
+    order = order_of(terms.shape[1] - colour_count)
     degrees = np.arange(1, max(order, COLUMNS - _PROCESS_COLUMNS) + 1)
     expected = np.where(degrees < _FIRST_HIGH_DEGREE, 1.0 - degrees, 3.0 - 3.0 * degrees)
+    colour_prior = [_COLOUR_PRIOR] * (colour_count > 0)
+    middle = np.concatenate([_PRIOR[:, 0], expected, colour_prior])
     posterior = Posterior(
         pair_distances(points[brightest], points[brightest]),
         numbers[brightest] / np.sqrt(unit),
         (noise[brightest] / unit).mean(axis=1),
         terms[brightest],
-        np.concatenate([_PRIOR[:, 0], expected]),
-        np.concatenate([_PRIOR[:, 1], np.full(len(degrees), _TREND_WIDTH)]),
+        middle,
+        np.concatenate([_PRIOR[:, 1], np.full(len(middle) - len(_PRIOR), _TREND_WIDTH)]),
+        colour_count,
     )
     low_degrees, all_degrees = (first - fall * (degrees - 1) for first, fall in (_LOW_DEGREES, _ALL_DEGREES))
     low_degrees = np.where(degrees < _FIRST_HIGH_DEGREE, low_degrees, expected)
 
-    def columns(process: bool, degree: int) -> np.ndarray:
-        return np.concatenate([[process, process, True], degrees <= degree])
-
     def start_at(variances: tuple[float, float], trend: np.ndarray) -> np.ndarray:
         process, common_noise = variances
-        return np.concatenate([[process, _PRIOR[_LENGTH, 0], common_noise], trend])
+        return np.concatenate([[process, _PRIOR[_LENGTH, 0], common_noise], trend, colour_prior])
 
     fits: list[tuple[np.ndarray, OptimizeResult]] = []
-    for degree in range(min(order, _MOST_SMOOTH_DEGREE) + 1):
-        present = columns(False, degree)
-        fits.append((present, posterior.minimize(start_at(_TREND_START, low_degrees), present)))
-    present = columns(True, order)
-    starts = [start_at(_PROCESS_START, low_degrees), start_at(_TREND_START, low_degrees)]
-    if order >= _FIRST_HIGH_DEGREE:
-        starts.append(start_at(_TREND_START, all_degrees))
-    optima = [posterior.minimize(start, present) for start in starts]
-    best = min(optima, key=lambda optimum: optimum.fun)
-    if order > 1:
-        # One length for all, so that the mean of all forms has one process.
-        linear = columns(True, 1)
-        fits.append((linear, posterior.minimize(best.x, linear, fixed_length=True)))
-    fits.append((present, best))
-    costs = np.array([optimum.fun + _VARIANCE_COST * _variance_count(present) for present, optimum in fits])
-    costs[0] -= _CONSTANT_BONUS
-    probabilities = np.exp(costs.min() - costs)
+    costs: list[float] = []
+    processes: list[OptimizeResult] = []
+    colour_kinds = (False, True) if colour_count else (False,)
+
+    def columns(process: bool, degree: int, colour: bool) -> np.ndarray:
+        shared = np.array([process, process, True])
+        return np.concatenate([shared, degrees <= degree, np.full(len(colour_prior), colour)])
+
+    def add(present: np.ndarray, optimum: OptimizeResult, colour: bool, bonus: float = 0.0) -> None:
+        variances = _variance_count(present[: len(present) - (colour_count > 0)]) + colour
+        fits.append((present, optimum))
+        costs.append(optimum.fun + _VARIANCE_COST * variances - bonus)
+
+    for colour in colour_kinds:
+        starts = [start_at(_PROCESS_START, low_degrees), start_at(_TREND_START, low_degrees)]
+        if order >= _FIRST_HIGH_DEGREE:
+            starts.append(start_at(_TREND_START, all_degrees))
+        optima = [posterior.minimize(start, columns(True, order, colour)) for start in starts]
+        processes.append(min(optima, key=lambda optimum: optimum.fun))
+    # One length for all, so that the mean of all forms has one process.
+    length = min(processes, key=lambda optimum: optimum.fun).x[_LENGTH]
+    for colour, best in zip(colour_kinds, processes, strict=True):
+        for degree in range(min(order, _MOST_SMOOTH_DEGREE) + 1):
+            present = columns(False, degree, colour)
+            optimum = posterior.minimize(start_at(_TREND_START, low_degrees), present)
+            add(present, optimum, colour, _CONSTANT_BONUS if degree == 0 else 0.0)
+        start, present = best.x.copy(), columns(True, order, colour)
+        start[_LENGTH] = length
+        if order > 1:
+            linear = columns(True, 1, colour)
+            add(linear, posterior.minimize(start, linear, fixed_length=True), colour)
+        if best.x[_LENGTH] != length:
+            best = posterior.minimize(start, present, fixed_length=True)
+        add(present, best, colour)
+    probabilities = np.exp(min(costs) - np.array(costs))
     probabilities /= probabilities.sum()
     probable = probabilities >= _LEAST_PROBABILITY
     kernels = np.stack([posterior.kernel(optimum.x, present) for present, optimum in fits])
-    kernels[:, _LENGTH] = math.exp(best.x[_LENGTH])
-    return Covariances(kernels[probable], probabilities[probable] / probabilities[probable].sum())
+    kernels[:, _LENGTH] = math.exp(length)
+    return Covariances(
+        kernels[probable], probabilities[probable] / probabilities[probable].sum(), coloured=colour_count > 0
+    )
 
 
 def _variance_count(present: np.ndarray) -> int:
@@ -173,10 +210,15 @@ class Posterior:
     terms: np.ndarray  #: of the trend, [n, n_terms]
     middle: np.ndarray  #: mean of the prior, [n_columns]
     width: np.ndarray  #: its standard deviation, [n_columns]
+    colour_count: int = 0  #: terms at the end that are of the colours
 
     def kernel(self, logarithms: np.ndarray, present: np.ndarray) -> np.ndarray:
         """Return the columns, those that are not present as 0 but for the length."""
         return np.where(present | (np.arange(len(present)) == _LENGTH), np.exp(logarithms), 0.0)
+
+    def covariance(self, kernel: np.ndarray) -> np.ndarray:
+        """Return the covariance of the stars under a kernel, [n, n]."""
+        return kernel_covariance(kernel, self.distance, self.terms, self.noise, self.colour_count)
 
     def negative_log_posterior(self, logarithms: np.ndarray, present: np.ndarray) -> tuple[float, np.ndarray]:
         """Return minus the logarithm of the posterior, but for a constant, and its derivatives [n_columns]."""
@@ -186,14 +228,14 @@ class Posterior:
         # A change dC of the covariance changes the value by half the sum of count C^-1 - C^-1 y y' C^-1 times dC.
         try:
             if kernel[0] > 0.0:
-                root = np.linalg.cholesky(kernel_covariance(kernel, self.distance, self.terms, self.noise))
+                root = np.linalg.cholesky(self.covariance(kernel))
                 inverse = inverse_from_cholesky(root)
                 solved, inverse_terms = inverse @ self.numbers, inverse @ self.terms
                 precision, log_determinant = np.diagonal(inverse), 2.0 * np.log(np.diagonal(root)).sum()
                 process = (count * inverse - solved @ solved.T) * (kernel[0] * np.exp(-self.distance / kernel[1]))
                 slope[:2] = process.sum(), (process * self.distance).sum() / kernel[1]
             else:
-                smooth = SmoothCovariance.of(kernel, self.terms, self.noise)
+                smooth = SmoothCovariance.of(kernel, self.terms, self.noise, self.colour_count)
                 solved, inverse_terms = smooth.solve(self.numbers), smooth.solve(self.terms)
                 precision, log_determinant = smooth.precision, smooth.log_determinant
         except np.linalg.LinAlgError:
@@ -201,9 +243,11 @@ class Posterior:
         value = 0.5 * ((solved * self.numbers).sum() + count * log_determinant)
         slope[2] = kernel[2] * (count * precision.sum() - (solved**2).sum())
         change = count * (inverse_terms * self.terms).sum(axis=0) - ((solved.T @ self.terms) ** 2).sum(axis=0)
-        trend = trend_variances(kernel, self.terms.shape[1]) * change
-        for degree in range(1, order_of(len(trend)) + 1):
+        trend = trend_variances(kernel, self.terms.shape[1], self.colour_count) * change
+        for degree in range(1, order_of(len(trend) - self.colour_count) + 1):
             slope[2 + degree] = trend[term_count(degree - 1) : term_count(degree)].sum()
+        if self.colour_count:
+            slope[-1] = trend[-self.colour_count :].sum()
         away = np.where(present, (logarithms - self.middle) / self.width, 0.0)
         return float(value + 0.5 * (away @ away)), 0.5 * slope + away / self.width
 
@@ -234,10 +278,10 @@ class SmoothCovariance:
     log_determinant: float
 
     @classmethod
-    def of(cls, kernel: np.ndarray, terms: np.ndarray, noise: np.ndarray) -> SmoothCovariance:
-        """Return it for a kernel, terms of the trend [n, n_terms] and noise [n]."""
+    def of(cls, kernel: np.ndarray, terms: np.ndarray, noise: np.ndarray, colour_count: int = 0) -> SmoothCovariance:
+        """Return it for a kernel, terms of the trend [n, n_terms], the last ones of colours, and noise [n]."""
         variance = noise + kernel[2]
-        variances = trend_variances(kernel, terms.shape[1])
+        variances = trend_variances(kernel, terms.shape[1], colour_count)
         scaled = terms[:, variances > 0.0] * np.sqrt(variances[variances > 0.0])
         root = np.linalg.cholesky(np.eye(scaled.shape[1]) + scaled.T @ (scaled / variance[:, None]))
         half = scipy.linalg.solve_triangular(root, (scaled / variance[:, None]).T, lower=True, check_finite=False)
@@ -254,27 +298,39 @@ class SmoothCovariance:
 
 
 def krige(
-    points: np.ndarray, values: np.ndarray, terms: np.ndarray, kernel: np.ndarray, noise: np.ndarray
+    points: np.ndarray,
+    values: np.ndarray,
+    terms: np.ndarray,
+    kernel: np.ndarray,
+    noise: np.ndarray,
+    *,
+    colour_count: int = 0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Solve for trend and process of values [n, k] under one covariance, and predict each star from the others.
 
     Returns the coefficients of the terms [n_terms, k]; the inverse covariance times the values [n, k], the weights of
     :func:`predict`; and each value minus its prediction by the others [n, k] (Dubrule 1983). `noise` [n] is in units of
-    the middle star's.
+    the middle star's. The last `colour_count` of the terms are of colours.
     """
     if kernel[0] > 0.0:
-        covariance = kernel_covariance(kernel, pair_distances(points, points), terms, noise)
+        covariance = kernel_covariance(kernel, pair_distances(points, points), terms, noise, colour_count)
         inverse = scipy.linalg.inv(covariance, check_finite=False)
         weights, precision = inverse @ values, np.diagonal(inverse)
     else:
-        smooth = SmoothCovariance.of(kernel, terms, noise)
+        smooth = SmoothCovariance.of(kernel, terms, noise, colour_count)
         weights, precision = smooth.solve(values), smooth.precision
-    trend = trend_variances(kernel, terms.shape[1])[:, None] * (terms.T @ weights)
+    trend = trend_variances(kernel, terms.shape[1], colour_count)[:, None] * (terms.T @ weights)
     return trend, weights, weights / precision[:, None]
 
 
 def krige_mean(
-    points: np.ndarray, values: np.ndarray, terms: np.ndarray, covariances: Covariances, noise: np.ndarray
+    points: np.ndarray,
+    values: np.ndarray,
+    terms: np.ndarray,
+    covariances: Covariances,
+    noise: np.ndarray,
+    *,
+    colour_count: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean of trend [n_terms, k] and weights [n, k] of :func:`krige` over covariances by probability.
 
@@ -282,7 +338,7 @@ def krige_mean(
     """
     trend, pull = np.zeros((terms.shape[1], values.shape[1])), np.zeros(values.shape)
     for kernel, probability in covariances.weighted():
-        kernel_trend, weights, _ = krige(points, values, terms, kernel, noise)
+        kernel_trend, weights, _ = krige(points, values, terms, kernel, noise, colour_count=colour_count)
         trend += probability * kernel_trend
         pull += probability * kernel[0] * weights
     variance = covariances.kernel[0]
@@ -303,19 +359,25 @@ def predict(points: np.ndarray, at: np.ndarray, kernel: np.ndarray, weights: np.
     return result
 
 
-def kernel_covariance(kernel: np.ndarray, distance: np.ndarray, terms: np.ndarray, noise: np.ndarray) -> np.ndarray:
+def kernel_covariance(
+    kernel: np.ndarray, distance: np.ndarray, terms: np.ndarray, noise: np.ndarray, colour_count: int = 0
+) -> np.ndarray:
     """Return the covariance [n, n] of values at stars of given distances, terms of the trend and noise."""
     variance, length, floor = kernel[:_PROCESS_COLUMNS]
     covariance = variance * np.exp(-distance / length)
-    covariance += (terms * trend_variances(kernel, terms.shape[1])) @ terms.T
+    covariance += (terms * trend_variances(kernel, terms.shape[1], colour_count)) @ terms.T
     covariance[np.diag_indices(len(noise))] += noise + floor
     return np.asarray(covariance)
 
 
-def trend_variances(kernel: np.ndarray, count: int) -> np.ndarray:
-    """Return the variance of each term of the trend, [n_terms]: terms stand by degree, d + 1 of degree d."""
-    order = order_of(count)
-    return np.repeat([_CONSTANT, *kernel[_PROCESS_COLUMNS : _PROCESS_COLUMNS + order]], np.arange(1, order + 2))
+def trend_variances(kernel: np.ndarray, count: int, colour_count: int = 0) -> np.ndarray:
+    """Return the variance of each term of the trend, [n_terms].
+
+    Terms stand by degree, d + 1 of degree d; the last `colour_count` are those of colours.
+    """
+    order = order_of(count - colour_count)
+    variances = np.repeat([_CONSTANT, *kernel[_PROCESS_COLUMNS : _PROCESS_COLUMNS + order]], np.arange(1, order + 2))
+    return np.concatenate([variances, np.full(colour_count, kernel[-1])]) if colour_count else variances
 
 
 def order_of(count: int) -> int:

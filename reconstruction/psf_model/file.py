@@ -98,6 +98,7 @@ def read_model(model_class: type[_Model], hdus: Iterable[Any], name: str) -> _Mo
         basis.components.shape[1:] != basis.mean.shape
         or interpolation.polynomial.shape[1:] != (k,)
         or model.coefficients.shape[1] != k
+        or (interpolation.colour is not None and interpolation.colour.slope.shape[1:] != (k,))
     ):
         raise ProductError(f"PSF model {name!r}: mean, components and polynomials have shapes that do not fit together")
     return model

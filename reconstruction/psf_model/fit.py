@@ -45,6 +45,7 @@ def fit_stars(
     extent: Any,
     gain: float | None,
     clipping: SigmaClipping | None,
+    colour: Any = None,
 ) -> _Model:
     """Fit basis and interpolation of a recipe to stars; arguments and errors as those of :meth:`~.PsfModel.fit`."""
     images, bad = as_stamps(stamps, masks)
@@ -65,13 +66,20 @@ def fit_stars(
     by_noise = isinstance(weights, str) or (automatic and star_weights is None)
     span = as_extent(extent, points)
     terms = design_matrix(points, span, max(orders[-1], needed_order))
+    colours = None if colour is None or recipe.colour is None else recipe.colour.of_stars(colour, n_stars)
+    smooth_terms = terms[:, : term_count(interpolation.smooth_order)]
+    if colours is not None:
+        # A star of an extreme colour is no outlier.
+        coloured_terms = np.hstack([smooth_terms, colours.terms(points, span)])
+        if np.linalg.matrix_rank(coloured_terms) == coloured_terms.shape[1]:
+            smooth_terms = coloured_terms
 
     def basis_of(stars: CleanStars, weights: np.ndarray | None, count: int) -> FittedBasis:
         return basis.fit(stars, (ny, nx), count, weights)
 
     with one_blas_thread():
         interpolation.check_terms(terms[:, : term_count(needed_order)], needed_order, points, star_weights)
-        stars = cleaned_stars(images, bad, terms[:, : term_count(interpolation.smooth_order)], clipping)
+        stars = cleaned_stars(images, bad, smooth_terms, clipping)
         masked = bad if bad.any() else None
         if masked is not None:
             images = _completed(images, masked, stars)
@@ -93,7 +101,7 @@ def fit_stars(
         coefficients, unexplained = fitted_basis.project(stars)
         order_terms = terms[:, : term_count(order)]
         field = StarField(
-            points, span, order, order_terms, coefficients, star_weights, images, fitted_basis, gain, masked
+            points, span, order, order_terms, coefficients, star_weights, images, fitted_basis, gain, masked, colours
         )
         fitted_interpolation = interpolation.fit(field)
     return kind(fitted_basis, fitted_interpolation, coefficients, unexplained, stars.rejected.sum(axis=1))

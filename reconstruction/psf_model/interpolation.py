@@ -7,7 +7,7 @@ the stars, with its part of a FITS file. A new kind is one file, and an entry in
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -16,6 +16,7 @@ from ...core.errors import ConfigError
 from ...core.threads import one_blas_thread
 from .basis import FittedBasis
 from .checks import check_distinct_positions, check_terms
+from .colour import FittedColour, StarColours
 from .file_parts import ModelParts
 from .polynomial import MOST_ORDER, Extent, automatic_orders, design_matrix
 
@@ -37,6 +38,22 @@ class StarField:
     basis: FittedBasis
     gain: float | None  #: electrons in a unit of the stamps; None for no photon noise
     masked: np.ndarray | None = None  #: pixels of the stamps that are filled, [n, ny, nx]
+    colours: StarColours | None = None  #: of the stars, where they differ
+
+    @property
+    def colour_terms(self) -> np.ndarray:
+        """Terms of the colours at the stars, [n, n_colour_terms]; none without colours."""
+        if self.colours is None:
+            return np.empty((len(self.positions), 0))
+        return self.colours.terms(self.positions, self.extent)
+
+    def with_colour_terms(self) -> np.ndarray:
+        """Return the terms of the polynomials and, behind them, of the colours, [n, n_terms + n_colour_terms]."""
+        return self.terms if self.colours is None else np.hstack([self.terms, self.colour_terms])
+
+    def fitted_colour(self, slope: np.ndarray, probability: float) -> FittedColour | None:
+        """Return the dependence on the colour of coefficients [n_colour_terms, k]; None without colours."""
+        return None if self.colours is None else FittedColour(self.colours, slope, probability)
 
 
 @dataclass(frozen=True)
@@ -115,6 +132,7 @@ class FittedInterpolation:
     order: int  #: total degree of the polynomials
     polynomial: np.ndarray  #: coefficients of their terms, [n_terms, k]
     weights: np.ndarray | None  #: of the stars, [n]; under a process their inverse variances over the middle star's
+    colour: FittedColour | None = field(default=None, kw_only=True)  #: dependence on the colour of stars that have one
 
     def __init_subclass__(cls, kind: type[Interpolation]) -> None:
         super().__init_subclass__()
@@ -131,8 +149,11 @@ class FittedInterpolation:
         return {}
 
     def terms(self) -> np.ndarray:
-        """Return the terms of the polynomials at the stars, [n, n_terms]."""
-        return design_matrix(self.positions, self.extent, self.order)
+        """Return the terms of the polynomials at the stars and those of their colours, [n, n_terms]."""
+        terms = design_matrix(self.positions, self.extent, self.order)
+        if self.colour is None:
+            return terms
+        return np.hstack([terms, self.colour.stars.terms(self.positions, self.extent)])
 
     def leverage(self) -> np.ndarray:
         """Return the diagonal of the polynomials' hat matrix, [n]."""
@@ -141,12 +162,19 @@ class FittedInterpolation:
         return np.asarray((q**2).sum(axis=1))
 
     def at(self, positions: Any) -> np.ndarray:
-        """Evaluate the coefficients at positions [m, 2], [m, k]; no batch size matters."""
+        """Evaluate the coefficients at positions [m, 2] for the mean colour, [m, k]; no batch size matters."""
         terms = design_matrix(positions, self.extent, self.order)
         values = np.zeros((len(terms), self.polynomial.shape[1]))
         for column, row in zip(terms.T, self.polynomial, strict=True):  # no BLAS: its sums depend on the batch
             values += column[:, None] * row
         return values
+
+    def with_colour(self, positions: Any, colour: np.ndarray | None) -> np.ndarray:
+        """Evaluate the coefficients at positions [m, 2] for colours [m] or one, [m, k]; None for the mean."""
+        values = self.at(positions)
+        if self.colour is None or colour is None:
+            return values
+        return np.asarray(values + self.colour.at(positions, self.extent, colour))
 
     def leave_one_out(self, coefficients: np.ndarray) -> np.ndarray:
         """Return coefficients [n, k] of the stars less their prediction by the other stars; NaN where there is none."""
@@ -154,14 +182,17 @@ class FittedInterpolation:
 
     def truncated(self, count: int) -> Self:
         """Return the interpolation of the first components only."""
-        return replace(self, polynomial=self.polynomial[:, :count])
+        colour = None if self.colour is None else self.colour.truncated(count)
+        return replace(self, polynomial=self.polynomial[:, :count], colour=colour)
 
     def parts(self) -> ModelParts:
         """Return what the interpolation has in a FITS file."""
         cards: dict[str, Any] = {"ORDER": (self.order, "total degree of the polynomials")}
         if self.kernel_columns is None:
             cards["INTERP"] = (self.name, "interpolation over the CCD")
-        return ModelParts(cards, {"POLY": self.polynomial}, {} if self.weights is None else {"weight": self.weights})
+        columns = {} if self.weights is None else {"weight": self.weights}
+        parts = ModelParts(cards, {"POLY": self.polynomial}, columns)
+        return parts if self.colour is None else self.colour.add_to(parts)
 
     @classmethod
     def reads(cls, parts: ModelParts) -> bool:
@@ -180,6 +211,7 @@ class FittedInterpolation:
             parts.image("POLY"),
             parts.columns.get("weight"),
             **cls._fields_of(parts),
+            colour=FittedColour.in_parts(parts),
         )
 
     @classmethod

@@ -22,6 +22,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.statistics import RMS_PER_MAD
 from ...core.threads import one_blas_thread
+from .colour import FittedColour
 from .covariance import COLUMNS, Covariances, fit_covariances, krige, krige_mean, predict
 from .file_parts import ModelParts
 from .interpolation import FittedInterpolation, Interpolation, StarField
@@ -70,17 +71,28 @@ class Kriging(Interpolation):
         noise = star_noise(stars.images, deviations, mean, filters, stars.gain, stars.masked)
         noise = np.maximum(noise, _LEAST_NOISE * (numbers**2).mean(axis=0) + np.finfo(float).tiny)
         places = mapped(stars.positions, stars.extent)
-        covariances = fit_covariances(places, numbers, noise, stars.terms)
+        terms, colour_count = stars.with_colour_terms(), stars.colour_terms.shape[1]
+        covariances = fit_covariances(places, numbers, noise, terms, colour_count=colour_count)
         of_stars = (noise / np.median(noise, axis=0)).mean(axis=1)
-        polynomial, alpha = krige_mean(places, stars.coefficients, stars.terms, covariances, of_stars)
-        return FittedKriging(stars.positions, stars.extent, stars.order, polynomial, 1.0 / of_stars, covariances, alpha)
+        trend, alpha = krige_mean(places, stars.coefficients, terms, covariances, of_stars, colour_count=colour_count)
+        count = stars.terms.shape[1]
+        return FittedKriging(
+            stars.positions,
+            stars.extent,
+            stars.order,
+            trend[:count],
+            1.0 / of_stars,
+            covariances,
+            alpha,
+            colour=stars.fitted_colour(trend[count:], covariances.colour_probability),
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class FittedKriging(FittedInterpolation, kind=Kriging):
     """A trend and a process, the mean of those of all probable covariances."""
 
-    kernel_columns = range(COLUMNS, COLUMNS + MOST_ORDER)
+    kernel_columns = range(COLUMNS, COLUMNS + MOST_ORDER + 1)
 
     covariances: Covariances  #: learnt from the stars
     alpha: np.ndarray  #: dual coefficients of the process of mean variance, [n, k]
@@ -105,8 +117,9 @@ class FittedKriging(FittedInterpolation, kind=Kriging):
         points = mapped(self.positions, self.extent)
         noise = 1.0 / (np.ones(len(points)) if self.weights is None else self.weights)
         with one_blas_thread():
+            terms, colour_count = self.terms(), 0 if self.colour is None else len(self.colour.slope)
             residuals = (
-                probability * krige(points, coefficients, self.terms(), kernel, noise)[2]
+                probability * krige(points, coefficients, terms, kernel, noise, colour_count=colour_count)[2]
                 for kernel, probability in self.covariances.weighted()
             )
             return np.asarray(sum(residuals))
@@ -127,7 +140,8 @@ class FittedKriging(FittedInterpolation, kind=Kriging):
         forms = parts.images.get("FORMS")
         if forms is None:
             forms = np.concatenate([[1.0], parts.image("KERNEL")[0]])[None]
-        return {"covariances": Covariances(forms[:, 1:], forms[:, 0]), "alpha": parts.columns["pull"]}
+        coloured = FittedColour.in_parts(parts) is not None
+        return {"covariances": Covariances(forms[:, 1:], forms[:, 0], coloured), "alpha": parts.columns["pull"]}
 
 
 def shape_numbers(

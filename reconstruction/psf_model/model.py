@@ -22,10 +22,11 @@ from ...core.products import read_fits, write_fits
 from ...core.result import Result
 from ...core.version import CREATOR
 from .basis import elbow_of
+from .colour import FittedColour, as_colours
 from .file import model_hdus, read_model
 from .fit import ModelFit, fit_stars
 from .outliers import SigmaClipping
-from .polynomial import Extent
+from .polynomial import Extent, as_positions
 from .recipe import Recipe, RecipeKeys
 
 if TYPE_CHECKING:
@@ -45,6 +46,12 @@ class ModelOptions(RecipeKeys, total=False):
     weights: Literal["noise"] | None
     clipping: SigmaClipping | None
     extent: ArrayLike | None
+
+
+class StarOptions(ModelOptions, total=False):
+    """Options of :meth:`PsfModel.fit` and colours of stars."""
+
+    colour: ArrayLike | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +92,7 @@ class PsfModel(ModelFit, Result):
         extent: ArrayLike | None = None,
         gain: float | None = 1.0,
         clipping: SigmaClipping | None = CLIPPING,
+        colour: ArrayLike | None = None,
         **recipe_keys: Unpack[RecipeKeys],
     ) -> PsfModel:
         """Fit the model to the stars of one CCD.
@@ -135,6 +143,10 @@ class PsfModel(ModelFit, Result):
         clipping : SigmaClipping or None
             Rejection of pixels that stand out, beyond five standard deviations by default; with None, for noise-free
             stars, none is rejected.
+        colour : array, optional
+            Colours of the stars, [n], of any kind and unit: effective wavelengths (:func:`~pachon.effective_colour`),
+            g - i, temperatures. The PSF may be linear in them, as far as the stars ask for it (:attr:`colour`); NaN
+            counts as the mean of the others. Colours that do not differ change nothing.
 
         Raises
         ------
@@ -155,6 +167,7 @@ class PsfModel(ModelFit, Result):
             extent=extent,
             gain=gain,
             clipping=clipping,
+            colour=colour,
         )
 
     def _label(self) -> str:
@@ -231,6 +244,15 @@ class PsfModel(ModelFit, Result):
         return self.interpolation.smoothness
 
     @property
+    def colour(self) -> FittedColour | None:
+        """Dependence on the colour with its probability by the stars; None where they have no colours that differ.
+
+        Polynomials have none, either, where the stars do not ask for it. ``model.colour.mean`` is the colour of
+        predictions without one.
+        """
+        return self.interpolation.colour
+
+    @property
     def n_stars(self) -> int:
         """Number of stars of the fit."""
         return len(self.coefficients)
@@ -273,7 +295,7 @@ class PsfModel(ModelFit, Result):
         return self.interpolation.leverage()
 
     @check_arguments
-    def at(self, positions: ArrayLike) -> np.ndarray:
+    def at(self, positions: ArrayLike, *, colour: ArrayLike | None = None) -> np.ndarray:
         """Evaluate the PSF at positions, [m, ny, nx], unit sum.
 
         Outside the extent polynomials are extrapolated. Positions are evaluated on their own: no batch changes a byte.
@@ -282,18 +304,25 @@ class PsfModel(ModelFit, Result):
         ----------
         positions : array
             [m, 2], or one position [2], in the unit of the fit.
+        colour : array, optional
+            Colours of what is observed there, [m], or one for all, as those of the fit; of a spectrum
+            :func:`~pachon.effective_colour`. The mean colour of the stars where it is left out or NaN. It has no effect
+            in a model without :attr:`colour`.
         """
-        return self.basis.at(self.interpolation.at(positions))
+        return self.basis.at(self.amplitudes(positions, colour=colour))
 
     @check_arguments
-    def draw(self, x: float, y: float) -> np.ndarray:
-        """Evaluate the PSF at one position, [ny, nx], unit sum."""
-        return self.at((x, y))[0]
+    def draw(self, x: float, y: float, *, colour: float | None = None) -> np.ndarray:
+        """Evaluate the PSF at one position, [ny, nx], unit sum; for a colour as :meth:`at` does."""
+        return self.at((x, y), colour=colour)[0]
 
     @check_arguments
-    def amplitudes(self, positions: ArrayLike) -> np.ndarray:
-        """Evaluate the amplitudes of the components at positions, [m, k]."""
-        return self.interpolation.at(positions)
+    def amplitudes(self, positions: ArrayLike, *, colour: ArrayLike | None = None) -> np.ndarray:
+        """Evaluate the amplitudes of the components at positions, [m, k]; for colours as :meth:`at` does."""
+        if colour is None:
+            return self.interpolation.at(positions)
+        points = as_positions(positions)
+        return self.interpolation.with_colour(points, as_colours(colour, len(points)))
 
     def reconstruct(self) -> np.ndarray:
         """Return the stars from their own projections on the components, without the polynomials, [n, ny, nx]."""

@@ -1,8 +1,8 @@
-"""Recipes of PSF models: a basis, an interpolation and weights of the stars; the tables of all kinds by name."""
+"""Recipes of PSF models: basis, interpolation, weights and colours of the stars; the tables of all kinds by name."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, TypedDict, TypeVar
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from ...core.errors import ConfigError, DomainError, shown
 from .basis import Basis
 from .checks import snr_weights
+from .colour import ColourTerm
 from .interpolation import FittedInterpolation, Interpolation
 from .kriging import Kriging
 from .pixels import Pixels
@@ -54,16 +55,21 @@ class Recipe:
         Between the stars, with its options.
     weights : str
         Of the stars in polynomials, one of :data:`WEIGHTS`.
+    colour : ColourTerm or None
+        Dependence on the colours of stars that have one; None to ignore them.
     """
 
     basis: Basis
     interpolation: Interpolation
     weights: str = "equal"
+    colour: ColourTerm | None = field(default_factory=ColourTerm)
 
     def __post_init__(self) -> None:
         for key, kind in (("basis", Basis), ("interpolation", Interpolation)):
             if not isinstance(getattr(self, key), kind):
                 raise DomainError(f"{key} = {shown(getattr(self, key))}: expected a {kind.__name__}", key=key)
+        if self.colour is not None and not isinstance(self.colour, ColourTerm):
+            raise DomainError(f"colour = {shown(self.colour)}: expected a ColourTerm or None", key="colour")
         if not isinstance(self.weights, str) or self.weights not in WEIGHTS:
             raise ConfigError(f"weights = {shown(self.weights)}: expected one of {', '.join(WEIGHTS)}")
         if self.interpolation.needs_noise and self.weights != "equal":
@@ -110,6 +116,7 @@ class Recipe:
             replace(new_basis, **{key: value for key, value in options.items() if value is not None}),
             new_interpolation if order is None else replace(new_interpolation, order=order),
             self.weights if weights is None else weights,
+            self.colour,
         )
 
     def keys(self) -> dict[str, Any]:
@@ -121,6 +128,7 @@ class Recipe:
             "interpolation": self.interpolation.name,
             "order": self.interpolation.order,
             "weights": self.weights,
+            **({} if self.colour == ColourTerm() else {"colour": None if self.colour is None else self.colour.order}),
         }
 
     def star_weights(self, snr: np.ndarray | None = None) -> np.ndarray | Literal["noise"] | None:

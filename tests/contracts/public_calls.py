@@ -66,6 +66,11 @@ class _Made:
     def make_places(self):
         return np.random.default_rng(1).uniform(-1.0, 1.0, (12, 2))
 
+    def make_coloured(self):
+        return pachon.PsfModel.fit(
+            self.stamps, self.places, recipe="paper", n_components=2, order=0, colour=np.linspace(605e-9, 635e-9, 12)
+        )
+
     def make_own(self):
         y, x = np.mgrid[-8:9, -8:9]
         star = 2e3 * np.exp(-0.5 * (x * x + y * y) / 1.6**2)
@@ -434,10 +439,12 @@ def calls(folder):
                 "psf": None,
                 "recipe": "kriging",
                 "stars": None,
+                "colours": None,
                 "min_snr": 30.0,
                 "threads": 1,
             },
         ),
+        "ObjectColours": (pachon.ObjectColours, {"positions": np.zeros((2, 2)), "values": np.array([0.5, np.nan])}),
         "ImageSettings": (pachon.ImageSettings, {"weight": m.folder / "none.fits", "weight_kind": "rms",
                           "mask": m.folder / "none.fits", "gain": 2.0, "zero_point": 30.0, "pixel_scale": 1e-6,
                           "saturation": 5e4}),
@@ -462,6 +469,8 @@ def calls(folder):
                       "engine": pachon.FastEngine(n_pupil=40), "stamps": pachon.Stamps(15), "atmosphere": None,
                       "threads": 1}),
         "blackbody_photons": (pachon.blackbody_photons, {"temperature": [3500.0, 6000.0], "wavelengths": [w]}),
+        "effective_colour": (pachon.effective_colour, {"wavelengths": [600e-9, w], "photons": [[1.0, 2.0], [1.0, 1.0]],
+                             "kind": "g_i"}),
         "color_temperature": (pachon.color_temperature, {"color": [0.4, 1.2], "bands": "g_r"}),
         "pupil_sampling": (pachon.pupil_sampling, {"telescope": tel, "sampling": "gauss", "n_pupil": 3}),
         "field_points": (pachon.field_points, {"telescope": tel, "fields": on_axis}),
@@ -641,8 +650,13 @@ def _methods(m, tel, w, x, y):
         "SigmaClipping": (pachon.SigmaClipping, {"sigma": 3.0, "max_iterations": 5, "replacement": "mean"}),
         "PsfModel.fit kriging": (pachon.PsfModel.fit, {"stamps": 1e4 * m.stamps, "positions": m.places,
                                  "basis": "pixels", "interpolation": "kriging", "order": 1, "gain": 1.0}),
-        "PsfModel.at": (m.model.at, {"positions": m.places[:2]}),
-        "PsfModel.draw": (m.model.draw, {"x": 0.0, "y": 0.0}),
+        "PsfModel.fit colour": (pachon.PsfModel.fit, {"stamps": m.stamps, "positions": m.places, "recipe": "paper",
+                                "n_components": 2, "order": 1, "colour": np.linspace(0.0, 2.0, 12)}),
+        "ColourTerm": (pachon.ColourTerm, {"order": 1}),
+        "PsfModel.at": (m.model.at, {"positions": m.places[:2], "colour": [0.1, 0.2]}),
+        "PsfModel.draw": (m.model.draw, {"x": 0.0, "y": 0.0, "colour": 0.5}),
+        "psf_of_spectrum": (pachon.psf_of_spectrum, {"model": m.coloured, "positions": m.places[:2],
+                            "light": pachon.Light([600e-9, 640e-9]), "pixel_scale": 1e-6}),
         "PsfModel.truncated": (m.model.truncated, {"n_components": 1}),
         "PsfModel.read": (pachon.PsfModel.read, {"path": m.folder / "none.fits", "name": "PSF"}),
         "EdgeRolloff": (pachon.EdgeRolloff, {"amplitude": 1e-6, "length": 1e-4, "half_size": 0.02}),

@@ -426,6 +426,11 @@ def test_models_of_psfs_become_objects(gaussian):
     psf = pachon.galsim.psf_object(model, x=0.5, y=-0.4, wcs=0.2)
     _, moments = covariance(psf.drawImage(nx=31, ny=31, scale=0.2, method="no_pixel").array)
     assert moments == pytest.approx(np.array([[4.5, -0.2], [-0.2, 4.0]]), abs=0.05)
+    model = pachon.PsfModel.fit(stamps, places, n_components=3, order=0, colour=places[:, 0])
+    psf = pachon.galsim.psf_object(model, x=0.5, y=-0.4, colour=0.7, wcs=0.2)
+    drawn = psf.drawImage(nx=31, ny=31, scale=0.2, method="no_pixel").array
+    # The interpolant passes through the pixels.
+    np.testing.assert_allclose(drawn, model.draw(0.5, -0.4, colour=0.7), atol=1e-5 * drawn.max())
     for options, message in (({}, "x and y: expected the place"), ({"x": 0.0, "y": 0.0}, "wcs = None")):
         with pytest.raises(DomainError, match=message):
             pachon.galsim.psf_object(model, **options)

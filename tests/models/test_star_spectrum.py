@@ -64,3 +64,30 @@ def test_bad_input_is_one_line(call, words):
     with pytest.raises(pachon.PachonError, match=words) as caught:
         call()
     assert "\n" not in str(caught.value)
+
+
+def test_effective_colours_are_mean_wavelengths_and_those_of_blackbodies():
+    waves = np.linspace(552e-9, 691e-9, 200)
+    kelvin = np.array([2500.0, 4500.0, 9000.0])
+    photons = pachon.blackbody_photons(kelvin, waves)
+    mean = [np.average(waves, weights=spectrum) for spectrum in photons]
+    np.testing.assert_allclose(pachon.effective_colour(waves, 3.0 * photons), mean, rtol=1e-12)
+    np.testing.assert_allclose(pachon.effective_colour(waves * u.m, photons[0]), mean[:1], rtol=1e-12)
+    for kind in COLORS:
+        colours = pachon.effective_colour(waves, photons, kind)
+        # The table of temperatures has steps of 0.8 %.
+        np.testing.assert_allclose(pachon.color_temperature(colours, kind), kelvin, rtol=2e-4)
+
+
+def test_spectra_without_light_have_no_colour():
+    waves = [600e-9, 650e-9]
+    for photons, match in (
+        ([1.0, 2.0, 3.0], r"photons have shape \(3,\): expected \[2\] or \[n, 2\]"),
+        ([[1.0, 1.0], [0.0, 0.0]], "photons: expected numbers from 0, in each spectrum some above 0"),
+        ([2.0, -1.0], "photons: expected numbers from 0"),
+        ([2.0, np.nan], "photons: expected numbers from 0"),
+    ):
+        with pytest.raises(pachon.DomainError, match=match):
+            pachon.effective_colour(waves, photons)
+    with pytest.raises(pachon.PachonError, match="kind = 'z_y'"):
+        pachon.effective_colour(waves, [1.0, 1.0], "z_y")

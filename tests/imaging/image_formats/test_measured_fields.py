@@ -253,6 +253,17 @@ def test_a_psf_model_of_piff(image, catalogue):
         psfs_on(image, pachon.load_piff(DATA / "piff" / "grid_color.piff"), places, 1)
 
 
+def test_a_psf_model_of_piff_takes_colours(image):
+    model = pachon.load_piff(DATA / "piff" / "grid_color.piff")
+    (name,) = model.property_names
+    places = np.array([[100.0, 50.0], [20.0, 280.0], [30.0, 40.0]])
+    drawn = psfs_on(image, model, places, 1, np.array([0.5, 1.5, np.nan]))
+    direct = model.at(places + 1.0, size=drawn.shape[1], properties={name: [0.5, 1.5, 1.0]})
+    np.testing.assert_allclose(drawn, direct / direct.sum(axis=(1, 2), keepdims=True), rtol=1e-12)
+    with pytest.raises(DomainError, match="properties: expected values of"):
+        psfs_on(image, model, places, 1, np.nan)
+
+
 @pytest.mark.slow
 def test_all_images_of_a_file(field, tmp_path, capsys):
     blank = np.random.default_rng(1).normal(100.0, 5.0, (64, 64)).astype(np.float32)
