@@ -209,7 +209,7 @@ def save_telescope(
         If the name has none of these endings, or the file cannot be written or hold the telescope.
     """
     for file, text in prescription_files(telescope, path, format=format, lenient=lenient).items():
-        write_bytes(file, text.encode(), PrescriptionError)
+        write_bytes(file, text.encode("utf-8", "replace"), PrescriptionError)
 
 
 def prescription_files(

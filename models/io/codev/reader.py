@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from ....core.errors import PrescriptionError
+from ....core.files import text_lines
 from ...aperture import Aperture, Circle, Complement
 from ...media.medium import Medium
 from ...media.tabulated import TabulatedIndex
@@ -61,7 +62,7 @@ REFUSED = {
 #: and drawing.
 _IGNORED = """
 LEN NEW DER INI GO CA CCY THC KC AC BC CC DC EC FC GC HC IC JC ADC BDC CDC XDC YDC ZDC CUM UMY SPH CON ASP RDM
-WTX WTY VIE DRA COM CUX THM GLC CRA POL CLS WID
+WTX WTY VIE DRA COM CUX THM GLC CRA POL CLS WID UID DOR
 """
 IGNORED = frozenset(_IGNORED.split())
 #: Distance of the object from which it is at infinity [lens unit].
@@ -89,7 +90,7 @@ def read_codev_file(path: Path, findings: Findings, glasses: Glasses) -> LensDes
 def _commands(path: Path) -> Iterator[Record]:
     """Yield the commands of a file: parted by line ends and semicolons, carried on by &, comments from ! to the end."""
     carried, first = "", 1
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(text_lines(read_text(path)), start=1):
         first = first if carried else number
         text = carried + line.split("!")[0].rstrip()
         if text.endswith("&"):
@@ -388,8 +389,8 @@ class _Reader:
         if numbers:
             # Index and Abbe number as they are.
             return numbered_glass(float(numbers[1]), float(numbers[2]), 0.0, name, command)
-        name = name.strip("'").split("_")[0].upper()
-        return self.private[name] if name in self.private else self.glasses.named(name, command)
+        name, *makers = name.strip("'").upper().split("_")
+        return self.private[name] if name in self.private else self.glasses.named(name, command, makers)
 
     def _aperture(self, surface: _Surface) -> Aperture | None:
         unit = self.description.unit

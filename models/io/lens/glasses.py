@@ -11,7 +11,7 @@ from ....core.errors import PrescriptionError
 from ...media.dispersion import model_glass
 from ...media.medium import Medium
 from ..glass_catalogue import GlassCatalogue
-from ..glass_search import find_glass, glass_hint
+from ..glass_search import find_glass, glass_hint, makers_in, readable_catalogues
 from .source import Source
 
 
@@ -21,15 +21,15 @@ class Glasses:
     def __init__(self, path: Path, catalogues: Iterable[GlassCatalogue | str | os.PathLike[str]]) -> None:
         self.first = [c if isinstance(c, GlassCatalogue) else GlassCatalogue.read(c) for c in catalogues]
         beside = path.with_suffix(".agf")
-        self.first += [GlassCatalogue.read(beside)] if beside.is_file() else []
+        self.first += readable_catalogues([beside]) if beside.is_file() else []
 
-    def get(self, name: str) -> Medium | None:
-        """Return the glass of a name, or None."""
-        return find_glass(name.upper(), self.first)
+    def get(self, name: str, catalogues: Iterable[str] = ()) -> Medium | None:
+        """Return the glass of a name, or None; `catalogues` are the names of those that the file states."""
+        return find_glass(name.upper(), self.first, makers_in(catalogues))
 
-    def named(self, name: str, source: Source) -> Medium:
+    def named(self, name: str, source: Source, catalogues: Iterable[str] = ()) -> Medium:
         """Return the glass of a name; PrescriptionError of the statement if no catalogue has it."""
-        medium = self.get(name)
+        medium = self.get(name, catalogues)
         if medium is None:
             raise self.missing(name, source)
         return medium

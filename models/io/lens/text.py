@@ -8,7 +8,7 @@ from decimal import Decimal
 from pathlib import Path
 
 from ....core.errors import PrescriptionError, cut_short
-from ....core.files import read_bytes
+from ....core.files import read_bytes, text_lines
 from .source import Source
 
 
@@ -122,7 +122,7 @@ def records(text: str, source: str) -> list[Record]:
     """Return the lines of a file that are not empty; those from a line "SURF n" on belong to surface n."""
     lines = []
     place = ""
-    for number, content in enumerate(text.splitlines(), start=1):
+    for number, content in enumerate(text_lines(text), start=1):
         words = content.split()
         if words:
             keyword, *following_words = words

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ....core.errors import PrescriptionError, error_context
+from ....core.files import text_lines
 from ...media.dispersion import model_glass
 from ...media.medium import Medium
 from ...media.tabulated import TabulatedIndex
@@ -84,7 +85,7 @@ def read_oslo_file(path: Path, findings: Findings, glasses: Glasses) -> LensDesc
 
 def _commands(path: Path) -> Iterator[Record]:
     """Yield the commands of a file: parted by line ends and semicolons, comments from // to the end."""
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(text_lines(read_text(path)), start=1):
         # Texts in quotation marks hold semicolons and slashes.
         for statement in re.findall(r'(?:"[^"]*"|//.*|[^;])+', line):
             words = re.findall(r'"[^"]*"|//.*|[^\s,"]+', statement)

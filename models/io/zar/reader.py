@@ -64,7 +64,7 @@ def read_zemax_archive(path: Path, findings: Findings, catalogues: Glasses) -> L
         try:
             catalogue = GlassCatalogue.parse(text, name)
         except PrescriptionError as error:
-            findings.report(error, "this catalogue is left out")
+            findings.note(error, "this catalogue is left out")
         else:
             glasses |= {glass: catalogue[glass] for glass in catalogue}
     if len(lenses) != 1:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ....core.errors import PrescriptionError
+from ....core.files import text_lines
 from ...media.medium import Medium
 from ..lens.source import Findings
 from ..lens.text import Record, read_text, records
@@ -20,7 +21,7 @@ from ..lens.text import Record, read_text, records
 _HEADER = """
 VERS MODE NAME AUTH NOTE IWDP PFIL LANG GFAC GCAT RAIM PUSH SDMA OMMA ROPD HYPR PICB FWGN FWGT FCOM VDXN VDYN VCXN
 VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDSX VDSY WWGT WWGN POLS GLRS GSTD NSCD COFN LUID EERA OPDX PUPD EFFL DMFS CONF
-PMAG TOTR TRAC MNCA MNEA MNCG MNEG MXCA MXCG RGLA TCMM ISNA STAG SSAG XPIX YPIX FTIT DFLT RSCE DBDT STUD
+PMAG TOTR TRAC TOLE MNCA MNEA MNCG MNEG MXCA MXCG RGLA TCMM ISNA STAG SSAG XPIX YPIX FTIT DFLT RSCE DBDT STUD
 """
 #: Keywords of a surface without effect on rays: comments, coatings, scatter, drawing and tolerancing settings,
 #: automatic semi-diameters, and solves, variables and pick-ups, whose solution stands in the file.
@@ -30,7 +31,7 @@ VDSZ VPAR VCON VGLA VXDT VDIA PZUP PCUP PPAR PXDT PCOP PDIA PGLA PKUP CPKP MAZH 
 RSCE TRAC FNOT BRKS SPAC ROWC SCOL STUD OEMA
 """
 #: Keywords that only stand after the surfaces, for files without indentation.
-TRAILER = ("BLNK", "TOL", "MNUM", "MOFF")
+TRAILER = ("BLNK", "TOL", "TOLE", "MNUM", "MOFF")
 IGNORED_HEADER = frozenset(_HEADER.split())
 IGNORED_SURFACE = frozenset(_SURFACE.split())
 
@@ -105,7 +106,7 @@ def read_zemax_file(path: Path, findings: Findings) -> ZemaxFile:
 def parse_zemax_file(text: str, path: Path, findings: Findings) -> ZemaxFile:
     """Return the parts of the text of a lens file, as :func:`read_zemax_file` does; `path` is for messages."""
     source = str(path)
-    indented = {i for i, line in enumerate(text.splitlines(), start=1) if line[:1].isspace()}
+    indented = {i for i, line in enumerate(text_lines(text), start=1) if line[:1].isspace()}
     header = trailer = Block(source)
     current = header
     surfaces: list[Block] = []

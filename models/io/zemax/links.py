@@ -42,6 +42,8 @@ _CURVATURE_SOLVES = {
 _UNKEPT = frozenset(
     ("PCUP", "PPAR", "PXDT", "PCOP", "PGLA", "PKUP", "CPKP", "MARG", "CHAZ", "CHAA", "POSI", "COMP", "CURF", "GLCZ")
 )
+#: Lines of pickups and solves of a thickness.
+_THICKNESS = frozenset(("PZUP", "MAZH"))
 #: Lines that pickups of Zemax files stand in, by the quantity; a thickness has one of its own.
 _LINES = {"radius": "CURV", "glass": "GLAS"}
 
@@ -72,8 +74,10 @@ def state_links(lens: LensDescription, blocks: list[Block]) -> None:
 
 def _unkept(block: Block, number: int) -> Iterator[str]:
     """Yield the names of pickups and solves of a surface that a telescope has no place for."""
-    # Coordinate breaks become places of surfaces, whatever their parameters follow.
+    # Coordinate breaks become places of surfaces, whatever their parameters follow; the thickness behind one is part
+    # of that of a surface.
     if block.text("TYPE").upper() == "COORDBRK":
+        yield from dict.fromkeys(f"S{number} {line.keyword}" for line in block.lines if line.keyword in _THICKNESS)
         return
     curvature = block.last("CURV")
     kind = 0 if curvature is None else int(curvature.number(1, 0.0))

@@ -157,13 +157,13 @@ class _LensReader:
         # The second word: 1 is a model glass, defined by the numbers that follow and not by its name; 2 a glass picked
         # up from another surface, a model glass too where it has no name.
         solve = line.number(1, 0.0)
-        model = nd > 1 and (solve == 1 or (solve == 2 and name == NO_NAME))
+        model = nd > 0 and (solve == 1 or (solve == 2 and name == NO_NAME))
         if not model:
-            medium = self.glasses.get(name)
+            medium = self.glasses.get(name, self.file.header.text("GCAT").split())
             if medium is not None:
                 return False, medium
             error = self.glasses.missing(name, line)
-            if nd <= 1 or (nd, vd) == PLACEHOLDER:
+            if nd <= 0 or (nd, vd) == PLACEHOLDER:
                 raise error
             self.findings.report(error, "taken as a model glass of its indices")
         return False, numbered_glass(nd, vd, deviation, name, line)
