@@ -66,6 +66,10 @@ class Findings:
             raise error
         self._warn(error, instead, PrescriptionWarning)
 
+    def doubt(self, error: PachonError, instead: str = "") -> None:
+        """Warn of what is likely a fault of the file and read as it is, in either mode."""
+        self._warn(error, instead, PrescriptionWarning)
+
     def note(self, error: PachonError, instead: str = "") -> None:
         """Say what is read in another way, `instead`, in either mode."""
         self._warn(error, instead, PrescriptionNote)

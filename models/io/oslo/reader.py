@@ -25,13 +25,13 @@ from ...shapes.shape import Shape
 from ...telescope import VACUUM
 from ..lens import shapes
 from ..lens.apertures import ring
+from ..lens.axial_ray import AxialRay
 from ..lens.description import Format, LensDescription, LensSurface
 from ..lens.glasses import Glasses
 from ..lens.shapes import polynomial_powers, radius_of
 from ..lens.source import Findings, Source
 from ..lens.text import FileSurface, Record, read_text, scaled
 from .frames import surface_frames
-from .solves import AxialRay
 
 FORMAT = Format("OSLO", "one of EBR, NAO, FNO, NAP", "WV", "AST")
 #: Units of length [m] by their millimetres.

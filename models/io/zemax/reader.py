@@ -12,13 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ...media.medium import Medium
+from ...media.medium import LINE_D, Medium, abbe_number, with_index_change
 from ...rotation import rotation_matrix
+from ...surface import Interaction
 from ...telescope import VACUUM
+from ..lens.axial_ray import AxialRay
 from ..lens.description import LensDescription, LensSurface
 from ..lens.glasses import Glasses, numbered_glass
 from ..lens.source import Findings, Source
+from ..lens.text import Record
 from .apertures import read_aperture
+from .configurations import with_configuration
 from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, ZemaxFile, read_zemax_file
 from .links import state_links
 from .shapes import read_shape
@@ -26,18 +30,24 @@ from .system import FORMAT, object_distance, read_system
 
 #: Name of a glass without a name.
 NO_NAME = "___BLANK"
+#: Solve of a glass whose index and Abbe number differ from those of the catalogue.
+_OFFSET = 4
 #: Index and Abbe number that Zemax writes behind the name of a catalogue glass, whatever the glass.
 PLACEHOLDER = (1.5, 40.0)
 
 
-def read_zemax_lens(path: Path, findings: Findings, glasses: Glasses) -> LensDescription:
-    """Return the description of a Zemax lens file."""
-    return described(read_zemax_file(path, findings), findings, glasses)
+def read_zemax_lens(
+    path: Path, findings: Findings, glasses: Glasses, configuration: int | None = None
+) -> LensDescription:
+    """Return the description of a Zemax lens file, of several configurations by default of the one it was saved in."""
+    return described(read_zemax_file(path), findings, glasses, configuration)
 
 
-def described(file: ZemaxFile, findings: Findings, glasses: Glasses) -> LensDescription:
+def described(
+    file: ZemaxFile, findings: Findings, glasses: Glasses, configuration: int | None = None
+) -> LensDescription:
     """Return the description of the parts of a lens file."""
-    return _LensReader(file, findings, glasses).lens()
+    return _LensReader(with_configuration(file, configuration, findings), findings, glasses).lens()
 
 
 class _LensReader:
@@ -51,6 +61,8 @@ class _LensReader:
         self.origin, self.axes = np.zeros(3), np.eye(3)
         #: Distance along the axis from the last surface [m].
         self.distance = 0.0
+        #: The paraxial marginal ray, where thicknesses are solved for.
+        self.axial_ray: AxialRay | None = None
         #: Whether a coordinate break is marked as the stop, which the next surface is then.
         self.stop_ahead = False
 
@@ -60,6 +72,8 @@ class _LensReader:
         read_system(lens, header)
         lens.object_distance = object_distance(first, lens.unit)
         lens.medium = self._glass(first)[1]
+        if self.file.solved and lens.design.wavelengths:
+            self.axial_ray = self._axial_ray()
         for number, block in enumerate(self.file.surfaces[1:], start=1):
             self._surface(number, block)
             block.report_rest(IGNORED_SURFACE, self.findings)
@@ -85,8 +99,31 @@ class _LensReader:
         else:
             self._tilt(block)
             self._acting(number, block)
+        if self.axial_ray is not None:
+            if number in self.file.solved and not last:
+                with Source(block.file, block.place).context():
+                    thickness = self.axial_ray.solved_thickness(0.0, "MAZH")
+            self.axial_ray.advance(thickness)
         self.distance += thickness
         self.origin = self.origin + self.axes[:, 2] * thickness
+
+    def _axial_ray(self) -> AxialRay:
+        """Return the marginal ray in front of the first surface, of any height."""
+        lens = self.description
+        index = float(lens.medium.index(lens.primary_wavelength))
+        finite = math.isfinite(lens.object_distance)
+        ray = AxialRay(0.0, 1.0, index, scaled=False) if finite else AxialRay(1.0, 0.0, index, scaled=False)
+        ray.advance(lens.object_distance if finite else 0.0)
+        return ray
+
+    def _pass_axial_ray(self) -> None:
+        """Refract or reflect the marginal ray at the last surface."""
+        if self.axial_ray is None:
+            return
+        surface, before = self.description.surfaces[-1], self.axial_ray.index
+        index = float(surface.after.index(self.description.primary_wavelength))
+        after = -before if surface.interaction == Interaction.MIRROR else math.copysign(index, before)
+        self.axial_ray.pass_surface(surface.shape.curvatures[1], after)
 
     def _break(self, block: Block) -> None:
         values = block.table("PARM")
@@ -141,6 +178,7 @@ class _LensReader:
             number=number,
         )
         lens.add(surface, mirror=mirror)
+        self._pass_axial_ray()
         self.stop_ahead, self.distance = False, 0.0
 
     def _glass(self, block: Block) -> tuple[bool, Medium]:
@@ -161,9 +199,23 @@ class _LensReader:
         if not model:
             medium = self.glasses.get(name, self.file.header.text("GCAT").split())
             if medium is not None:
-                return False, medium
+                return False, _offset(medium, line) if solve == _OFFSET else medium
             error = self.glasses.missing(name, line)
             if nd <= 0 or (nd, vd) == PLACEHOLDER:
                 raise error
             self.findings.report(error, "taken as a model glass of its indices")
         return False, numbered_glass(nd, vd, deviation, name, line)
+
+
+def _offset(medium: Medium, line: Record) -> Medium:
+    """Return a glass with the differences of index and Abbe number that stand at the end of its line."""
+    index_change, abbe_change = line.number(9, 0.0), line.number(10, 0.0)
+    if not (index_change or abbe_change):
+        return medium
+    with line.context():
+        nd, abbe = float(medium.index(LINE_D * 1e-6)), abbe_number(medium)
+        if not abbe + abbe_change > 0:
+            raise line.error("an Abbe number above 0")
+        # The Abbe number is that of the changed index.
+        dispersion = (nd - 1.0 + index_change) / (nd - 1.0) * abbe / (abbe + abbe_change)
+        return with_index_change(medium, index_change, dispersion)

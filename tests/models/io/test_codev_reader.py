@@ -173,7 +173,7 @@ def test_surfaces_may_be_named_by_number(tmp_path):
         ("  STO", "  STO; CIR 4; CIR OBS 5", "line 20, surface 5: CIR OBS 5: expected a radius below that of CIR 4"),
         ("  SLB 'flint'", "  K -1; A 1e300", "line 17, surface 3: A 1e300: coefficients"),
         ("SO    0.0 0.1e14", "SO 0.0 0.1e14\n  ADE 3", "surface 0: ADE 3: expected a flat object on the axis"),
-        ("648338", "1.0:33", "line 16, surface 3: S -12.* 1.0:33: "),
+        ("648338", "0.0:33", "line 16, surface 3: S -12.* 0.0:33: "),
         ("SO    0.0 0.1e14", "SO    0.0 nan", "surface 0: SO 0.0 nan: expected a number"),
     ],
 )
