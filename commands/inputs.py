@@ -45,9 +45,7 @@ def load_model(
     from ..models.io.prescription import load_telescope
 
     with warnings_shown(PrescriptionWarning):
-        return load_telescope(
-            model, lenient=lenient, glass_catalogues=glass_catalogues, configuration=configuration
-        )
+        return load_telescope(model, lenient=lenient, glass_catalogues=glass_catalogues, configuration=configuration)
 
 
 @contextmanager

@@ -13,7 +13,15 @@ from typing import Any
 from pydantic import BaseModel
 
 from ..core.arguments import check_arguments
-from ..core.errors import ConfigError, HeightWarning, PachonError, PrescriptionError, PrescriptionNote, PrescriptionWarning, check_choice
+from ..core.errors import (
+    ConfigError,
+    HeightWarning,
+    PachonError,
+    PrescriptionError,
+    PrescriptionNote,
+    PrescriptionWarning,
+    check_choice,
+)
 from ..core.json_schema import json_schema
 from ..core.schema import problems_of
 from ..core.yaml_reader import line_of, read_mapping

@@ -55,6 +55,8 @@ IGNORED = ("CC", "GC", "ED", "OD", "IT", "BD", "MD")
 _DATA = ("CD", "TD", "LD")
 #: Number that begins a line.
 _NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)(E[-+]?\d+)?"
+#: Hyphens of names, and what other programs have for them.
+_HYPHENS = str.maketrans("", "", "-_")
 #: Temperature [K] of reference of a glass whose catalogue states none.
 USUAL_TEMPERATURE = 20.0 + ZERO_CELSIUS
 
@@ -88,7 +90,7 @@ class GlassCatalogue:
 
     def __init__(self, glasses: Mapping[str, Glass], source: str) -> None:
         self._glasses = dict(glasses)
-        self._without_hyphens = {name.replace("-", ""): name for name in self._glasses}
+        self._without_hyphens = {name.translate(_HYPHENS): name for name in self._glasses}
         self.source = source
 
     @classmethod
@@ -168,8 +170,8 @@ class GlassCatalogue:
         return len(self._glasses)
 
     def spelling(self, name: str) -> str | None:
-        """Return the name here of a glass, which may be written without its hyphens (CODE V: NBK7); None if unknown."""
-        return name.upper() if name in self else self._without_hyphens.get(name.upper())
+        """Return the name here of a glass, whose hyphens may lack (CODE V: NBK7) or be underscores; None if unknown."""
+        return name.upper() if name in self else self._without_hyphens.get(name.upper().translate(_HYPHENS))
 
     def entry(self, name: str) -> Glass:
         """Return the entry of a glass.

@@ -45,9 +45,7 @@ def find_glass(name: str, first: Iterable[GlassCatalogue] = (), makers: Iterable
 def makers_in(words: Iterable[str]) -> tuple[str, ...]:
     """Return the bundled catalogues that the names of catalogues in a lens file stand for, in their order."""
     makers = dict.fromkeys(maker for word in words for key, maker in _WORDS.items() if key in word.upper())
-    return tuple(
-        catalogue for maker in makers for catalogue in ((maker, OBSOLETE) if maker == MAKERS[0] else (maker,))
-    )
+    return tuple(catalogue for maker in makers for catalogue in ((maker, OBSOLETE) if maker == MAKERS[0] else (maker,)))
 
 
 def maker_of(medium: Medium) -> str | None:

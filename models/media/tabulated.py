@@ -66,7 +66,10 @@ class TabulatedIndex(Medium):
         return self.wavelengths[0], self.wavelengths[-1]
 
     def index(self, wavelength: ArrayLike) -> np.ndarray:  # noqa: D102
-        w = np.clip(wavelengths_within(wavelength, self.wavelength_range, medium_label(self.name, "table")), *self.wavelength_range)
+        w = np.clip(
+            wavelengths_within(wavelength, self.wavelength_range, medium_label(self.name, "table")),
+            *self.wavelength_range,
+        )
         if self.interpolation == "linear":
             return np.asarray(np.interp(w, self.wavelengths, self.indices))
         return np.asarray(self._cubic(w))

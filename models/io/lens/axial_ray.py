@@ -42,7 +42,9 @@ class AxialRay:
     def solved_thickness(self, height: float, keyword: str = "PY") -> float:
         """Return the distance at which the ray has a height; `keyword` is that of the solve, for messages."""
         if self.slope == 0 or (height != 0 and not self.scaled):
-            raise PrescriptionError(f"{keyword} {height:g}: expected an axial ray of known height and a slope other than 0")
+            raise PrescriptionError(
+                f"{keyword} {height:g}: expected an axial ray of known height and a slope other than 0"
+            )
         return (height - self.height) / self.slope
 
     def advance(self, thickness: float) -> None:

@@ -12,6 +12,10 @@ from ....core.files import read_bytes, text_lines
 from .source import Source
 
 
+#: Beginnings of files in UTF-16.
+BYTE_ORDER_MARKS = (b"\xff\xfe", b"\xfe\xff")
+
+
 def read_text(path: Path) -> str:
     """Return the text of a file in UTF-16 (with a byte order mark), UTF-8 or Windows-1252."""
     return decoded(read_bytes(path, PrescriptionError), str(path))
@@ -19,7 +23,7 @@ def read_text(path: Path) -> str:
 
 def decoded(raw: bytes, source: str) -> str:
     """Return the text of the bytes of a file, as :func:`read_text` does; `source` is its name for messages."""
-    wide = raw.startswith((b"\xff\xfe", b"\xfe\xff"))
+    wide = raw.startswith(BYTE_ORDER_MARKS)
     try:
         text = raw.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError:

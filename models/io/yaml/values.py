@@ -179,7 +179,9 @@ def _quoted(text: str) -> str:
     if quoted.isprintable():
         return quoted
     # Unlike JSON's, escapes of YAML have eight digits beyond the first plane.
-    return "".join(c if c.isprintable() else f"\\u{ord(c):04x}" if c <= "\uffff" else f"\\U{ord(c):08x}" for c in quoted)
+    return "".join(
+        c if c.isprintable() else f"\\u{ord(c):04x}" if c <= "\uffff" else f"\\U{ord(c):08x}" for c in quoted
+    )
 
 
 def flow(value: Any, number: Callable[[float], str] = number_text) -> str:

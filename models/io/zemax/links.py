@@ -41,7 +41,23 @@ _CURVATURE_SOLVES = {
 }
 #: Lines of pickups and solves without a place in a telescope; PDIA and PZUP of drawing sizes and thicknesses apart.
 _UNKEPT = frozenset(
-    ("PCUP", "PPAR", "PXDT", "PCOP", "PGLA", "PKUP", "CPKP", "MARG", "CHAZ", "CHAA", "POSI", "COMP", "CURF", "GLCZ", "TOLE")
+    (
+        "PCUP",
+        "PPAR",
+        "PXDT",
+        "PCOP",
+        "PGLA",
+        "PKUP",
+        "CPKP",
+        "MARG",
+        "CHAZ",
+        "CHAA",
+        "POSI",
+        "COMP",
+        "CURF",
+        "GLCZ",
+        "TOLE",
+    )
 )
 #: Lines of pickups and solves of a thickness.
 _THICKNESS = frozenset(("PZUP", "MAZH", "TCOM", "TOLE"))
