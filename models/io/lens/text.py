@@ -11,7 +11,6 @@ from ....core.errors import PrescriptionError, cut_short
 from ....core.files import read_bytes, text_lines
 from .source import Source
 
-
 #: Beginnings of files in UTF-16.
 BYTE_ORDER_MARKS = (b"\xff\xfe", b"\xfe\xff")
 

@@ -1,7 +1,7 @@
 """Configurations of a Zemax lens file: the lines of its header and surfaces with the values of one of them.
 
-Behind the surfaces stand ``MNUM count active`` and rows of operands, ``THIC surface configuration value ...``. The values
-of the lines before them are those of the active configuration, in which the file was saved.
+Behind the surfaces stand ``MNUM count active`` and rows of operands, ``THIC surface configuration value ...``. The
+values of the lines before them are those of the active configuration, in which the file was saved.
 """
 
 from __future__ import annotations

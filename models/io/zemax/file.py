@@ -1,7 +1,7 @@
 """Parts of a Zemax lens file (.zmx): header, surfaces, and the keywords that are ignored.
 
 A file is a list of lines "KEYWORD words". The header is followed by one block for each surface, which begins with SURF
-and whose lines are indented, and by merit function, tolerances, which are not read, and configurations (see `configurations`).
+and whose lines are indented, by merit function and tolerances, which are not read, and by `configurations`.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ PMAG TOTR TRAC TOLE TCOM MNCA MNEA MNCG MNEG MXCA MXCG RGLA TCMM ISNA STAG SSAG 
 #: automatic semi-diameters, and solves, variables and pick-ups, whose solution stands in the file.
 _SURFACE = """
 COMM SSID SLAB HIDE MIRR POPS COAT FIMP SCAT STRE MEMA DIAM EDGE TCED TCEC TCMM EXPN LBLK CHZN BORE PICK CCOM VCUR
-VDSZ VPAR VCON VGLA VXDT VDIA PZUP PCUP PPAR PXDT PCOP PDIA PGLA PKUP CPKP MAZH MARG CHAZ CHAA POSI COMP CURF GLCZ TCOM TOLE
-RSCE TRAC FNOT BRKS SPAC ROWC SCOL STUD OEMA
+VDSZ VPAR VCON VGLA VXDT VDIA PZUP PCUP PPAR PXDT PCOP PDIA PGLA PKUP CPKP MAZH MARG CHAZ CHAA POSI COMP CURF GLCZ
+TCOM TOLE RSCE TRAC FNOT BRKS SPAC ROWC SCOL STUD OEMA
 """
 #: Keywords that only stand after the surfaces, for files without indentation.
-TRAILER = ("BLNK", "TOL", "TOLE", "MNUM", "MOFF")
+TRAILER = ("BLNK", "TOL", "MNUM", "MOFF")
 IGNORED_HEADER = frozenset(_HEADER.split())
 IGNORED_SURFACE = frozenset(_SURFACE.split())
 

@@ -1,7 +1,7 @@
 """Pickups and solves of a Zemax file: radius, thickness and glass of another surface, and a paraxial back focus.
 
-``CURV value 4 surface scale``, ``PZUP surface scale offset``, ``GLAS name 2 surface``, ``MAZH height zone``, and as a pickup ``TCOM surface sum``. Of others
-the solution stands in the file; they are named in a warning.
+``CURV value 4 surface scale``, ``PZUP surface scale offset``, ``GLAS name 2 surface``, ``MAZH height zone``, and, as a
+pickup, ``TCOM surface sum``. Of others the solution stands in the file; they are named in a note.
 """
 
 from __future__ import annotations

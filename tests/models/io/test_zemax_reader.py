@@ -381,7 +381,6 @@ def test_fields_are_angles_or_heights(tmp_path, kind, distance, expected):
         ("  DIAM 50", "  NEWK 3 4\n  DIAM 50", "surface 2: NEWK 3 4: this keyword is not understood"),
         ("ENVD 20 1 0", "ENVD 20 1 0\nNEWH 3", "line 7: NEWH 3: this keyword is not understood"),
         ("ENVD 20 1 0", "ENVD 5 0.7 1", "ENVD 5 0.7 1: indices are not adjusted"),
-        ("MNUM 1 1", "MNUM 3 1", "MNUM 3: one configuration is read"),
         ("  DIAM 50", "  SCBD 1 1 0 0 0 5 0 0\n  DIAM 50", "surface 2: SCBD .*only a tilt before the surface"),
         ("  DIAM 50", "  CLAP 30 20\n  DIAM 50", "surface 2: CLAP 30 20: expected a smallest and a largest radius"),
         ("TYPE STANDARD\n  CURV -0.001", "TYPE COORDBRK\n  PARM 9 1", "surface 2: PARM 9 1"),
