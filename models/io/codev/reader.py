@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from pathlib import Path
 
@@ -56,8 +56,10 @@ NUMBERS = {*["THI", "K", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "REX", "REY",
 #: Surfaces that are not read.
 REFUSED = {
     "DIF": "diffractive surfaces", "GRT": "diffractive surfaces", "XTO": "toroids", "YTO": "toroids",
-    "CYL": "cylinders", "RDX": "surfaces of two radii", "NSS": "non-sequential parts", "GRD": "gradient-index media",
+    "CYL": "cylinders", "ZOO": "zoom positions", "RDX": "surfaces of two radii", "NSS": "non-sequential parts", "GRD": "gradient-index media",
 }  # fmt: skip
+#: Values that may be solved for, and what they are, by the command of the solve.
+SOLVED = {"CUY": ("CURV", "curvature"), "RDY": ("CURV", "radius"), "THI": ("THI", "thickness"), "PIM": ("THI", "thickness")}
 #: Commands without effect on rays: names, variables and couplings, weights, solves, whose solution stands in the file,
 #: and drawing.
 _IGNORED = """
@@ -112,10 +114,11 @@ def _largest(records: list[Record], default: Source) -> Source:
 
 @dataclass
 class _Surface(FileSurface):
-    """Commands of one surface, the name of its glass, and whether it is the stop."""
+    """Commands of one surface, the name of its glass, whether it is the stop, and the solves of its values."""
 
     glass_name: str = ""
     stop: bool = False
+    solves: list[Record] = field(default_factory=list)
 
     @property
     def mirror(self) -> bool:
@@ -204,6 +207,8 @@ class _Reader:
                 command.numbers()
             self.system.pop(key, None)
             self.system[key] = command
+        elif key in REFUSED:
+            self.findings.report(command.problem(f"{command.shown}: {REFUSED[key]} are not read"))
         elif key not in IGNORED:
             self.findings.report(command.problem(f"{command.shown}: this command is not understood"))
 
@@ -222,7 +227,10 @@ class _Reader:
 
     def _surface(self, command: Record, surface: _Surface) -> None:
         key, words = command.keyword, command.words
-        if key in ("RDY", "CUY"):
+        if key in SOLVED and words and words[0].isalpha():
+            # The solve of a value, whose solution stands at the beginning of the surface: CUY UMY -0.1.
+            surface.solves.append(command)
+        elif key in ("RDY", "CUY"):
             surface.commands["CURV"] = command
             surface.values["CURV"] = self._curvature(command, radius=key == "RDY")
         elif key == "GLA":
@@ -243,7 +251,7 @@ class _Reader:
         elif key in REFUSED:
             self.findings.report(command.problem(f"{command.shown}: {REFUSED[key]} are not read"))
         elif key == "PIM":
-            surface.commands[key] = command
+            surface.solves.append(command)
         elif key not in IGNORED:
             self.findings.report(command.problem(f"{command.shown}: this command is not understood"))
 
@@ -316,10 +324,13 @@ class _Reader:
             )
 
     def _check_solves(self) -> None:
-        """Refuse a paraxial image solve (PIM) whose solution does not stand in the file."""
+        """Refuse a solve whose solution does not stand in the file: PIM is that of a thickness."""
         for surface in self.surfaces[:-1]:
-            if "PIM" in surface.commands and not surface.get("THI"):
-                raise surface.commands["PIM"].problem("PIM: expected the thickness of the solve in the file; it is 0")
+            for command in surface.solves:
+                key, name = SOLVED[command.keyword]
+                if not surface.get(key):
+                    solve = command.keyword if command.keyword == "PIM" else command.shown
+                    raise command.problem(f"{solve}: expected the {name} of the solve in the file; it is 0")
 
     def _state_system(self) -> None:
         lens, system = self.description, self.system
