@@ -59,7 +59,12 @@ REFUSED = {
     "CYL": "cylinders", "ZOO": "zoom positions", "RDX": "surfaces of two radii", "NSS": "non-sequential parts", "GRD": "gradient-index media",
 }  # fmt: skip
 #: Values that may be solved for, and what they are, by the command of the solve.
-SOLVED = {"CUY": ("CURV", "curvature"), "RDY": ("CURV", "radius"), "THI": ("THI", "thickness"), "PIM": ("THI", "thickness")}
+SOLVED = {
+    "CUY": ("CURV", "curvature"),
+    "RDY": ("CURV", "radius"),
+    "THI": ("THI", "thickness"),
+    "PIM": ("THI", "thickness"),
+}
 #: Commands without effect on rays: names, variables and couplings, weights, solves, whose solution stands in the file,
 #: and drawing.
 _IGNORED = """

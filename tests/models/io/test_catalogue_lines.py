@@ -52,7 +52,11 @@ def written(tmp_path, text, name="mine.agf"):
         ("NM BAD 1 0 1.5 60\nLD 0.3 2\n", "line 4: glass BAD has no line CD", {"GOOD"}),
         ("NM BAD 1 0 1.5 60\nCD two\n", "line 5: CD two: expected a number", {"GOOD"}),
         ("NM\nCD 2.25\n", "line 4: NM: expected a name", {"GOOD"}),
-        ("NM USED 1 0 1.5 60\nCD 2.25\nXX 3\n", "line 6: XX 3: expected CD, TD, LD or .* in glass USED", {"GOOD", "USED"}),
+        (
+            "NM USED 1 0 1.5 60\nCD 2.25\nXX 3\n",
+            "line 6: XX 3: expected CD, TD, LD or .* in glass USED",
+            {"GOOD", "USED"},
+        ),
         ("NM USED 1 0 1.5 60\nCD 2.25\nXX 3\n4 5\n", "line 6: XX 3", {"GOOD", "USED"}),
         ("NM USED 1 0 1.5 60\nCD 2.25\nTD 0 0 0 0 0 0 -300\n", "line 6: TD .*absolute zero", {"GOOD", "USED"}),
     ],
