@@ -56,7 +56,8 @@ NUMBERS = {*["THI", "K", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "REX", "REY",
 #: Surfaces that are not read.
 REFUSED = {
     "DIF": "diffractive surfaces", "GRT": "diffractive surfaces", "XTO": "toroids", "YTO": "toroids",
-    "CYL": "cylinders", "ZOO": "zoom positions", "RDX": "surfaces of two radii", "NSS": "non-sequential parts", "GRD": "gradient-index media",
+    "CYL": "cylinders", "RDX": "surfaces of two radii", "NSS": "non-sequential parts", "GRD": "gradient-index media",
+    "ZOO": "zoom positions",
 }  # fmt: skip
 #: Values that may be solved for, and what they are, by the command of the solve.
 SOLVED = {

@@ -72,7 +72,8 @@ def test_a_line_that_cannot_be_read_is_left_out(tmp_path, lines, expected, names
 
 @pytest.mark.parametrize("break_at", [1, 3, 5])
 def test_numbers_may_go_on_in_the_next_lines(tmp_path, break_at):
-    numbers = "1.03961212E+00 6.00069867E-03 2.31792344E-01 2.00179144E-02 1.01046945E+00 1.03560653E+02".split()
+    sellmeier = "1.03961212E+00 6.00069867E-03 2.31792344E-01 2.00179144E-02 1.01046945E+00 1.03560653E+02"
+    numbers = sellmeier.split()
     coefficients = " ".join(numbers[:break_at]), " ".join(numbers[break_at:])
     for second in (coefficients[1], f"CD {coefficients[1]}"):
         text = f"NM MYBK7 2 0 1.5168 64.17\nCD {coefficients[0]}\n  {second}\nIT 0.4 0.99\n 0.5 0.99\nLD 0.3\n 2.5\n"
