@@ -14,7 +14,7 @@ from .glass_catalogue import CATALOGUES, MAKERS, OBSOLETE, GlassCatalogue
 from .lens.source import Findings
 
 #: Words in the names of catalogues, as lens files state them, by the maker: Nikon's glasses are Hikari's.
-_WORDS = {"NIKON": "hikari"} | {maker.upper(): maker for maker in MAKERS}
+_WORDS = {"NIKON": "hikari", "SCHO": "schott"} | {maker.upper(): maker for maker in MAKERS}
 #: Difference of the indices of one glass in two editions of its maker's catalogue.
 _SAME = 1e-8
 #: Catalogues of users that are kept in memory.

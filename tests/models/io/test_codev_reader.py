@@ -323,7 +323,7 @@ def test_solves_whose_solution_stands_in_the_file_are_passed_over(tmp_path):
     assert lens.surfaces[1].shape.parameters["radius"] == pytest.approx(-1.1757)
     (tmp_path / "lens.seq").write_text(text.format(0))
     with pytest.raises(
-        PrescriptionError, match="CUY UMY -0.1: expected the curvature of the solve in the file; it is 0"
+        PrescriptionError, match=r"CUY UMY -0\.1: expected the curvature of the solve in the file; it is 0"
     ):
         load_telescope(tmp_path / "lens.seq")
     (tmp_path / "lens.seq").write_text(text.format(1175.7).replace("DIM M", "DIM M\nZOO 3"))
