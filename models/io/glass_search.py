@@ -10,11 +10,11 @@ import numpy as np
 
 from ...core.errors import PrescriptionError, nearest
 from ..media.medium import LINE_C, LINE_D, LINE_F, Medium
-from .glass_catalogue import CATALOGUES, MAKERS, OBSOLETE, GlassCatalogue
+from .glass_catalogue import CATALOGUES, MAKERS, OBSOLETE, SUBSTANCES, GlassCatalogue
 from .lens.source import Findings
 
-#: Words in the names of catalogues, as lens files state them, by the maker: Nikon's glasses are Hikari's.
-_WORDS = {"NIKON": "hikari", "SCHO": "schott"} | {maker.upper(): maker for maker in MAKERS}
+#: Words in the names of catalogues, as lens files state them, by the bundled catalogue: Nikon's glasses are Hikari's.
+_WORDS = {"NIKON": "hikari", "SCHO": "schott", "INFRARED": SUBSTANCES} | {maker.upper(): maker for maker in MAKERS}
 #: Difference of the indices of one glass in two editions of its maker's catalogue.
 _SAME = 1e-8
 #: Catalogues of users that are kept in memory.

@@ -6,7 +6,7 @@ import pytest
 import pachon
 from pachon.models.first_order import first_order
 from pachon.models.io.glass_catalogue import OBSOLETE, GlassCatalogue
-from pachon.models.io.glass_search import find_glass
+from pachon.models.io.glass_search import find_glass, makers_in
 
 LINE_D, LINE_F, LINE_C = 0.5875618e-6, 0.4861327e-6, 0.6562725e-6
 OLD = GlassCatalogue.of_maker(OBSOLETE)
@@ -74,6 +74,18 @@ def test_the_catalogues_that_a_file_states_come_first(tmp_path):
         # CODE V's names have their makers.
         pachon.save_telescope(lens.with_design(aiming="paraxial"), tmp_path / "lens.seq")
         assert pachon.load_telescope(tmp_path / "lens.seq").surfaces[2].medium_after == expected
+
+
+def test_crystals_go_by_the_names_of_opticstudio():
+    """Barium fluoride at 0.5893 um, magnesium fluoride and sapphire (ordinary rays) at d, silicon at 4 um: handbooks."""
+    figures_of = {"BAF2": (0.5893, 1.4744, 1e-4), "MGF2": (0.58756, 1.3777, 1e-4), "SAPPHIRE": (0.58756, 1.7682, 1e-4),
+                  "SILICON": (4.0, 3.4255, 1e-3), "GERMANIUM": (10.0, 4.0032, 1.5e-3), "LIF": (0.5893, 1.3921, 1e-4),
+                  "ZNSE": (10.6, 2.4028, 5e-4), "WATER": (0.58926, 1.33335, 5e-5)}  # fmt: skip
+    for name, (micrometres, index, near) in figures_of.items():
+        medium = find_glass(name, makers=makers_in(["INFRARED"]))
+        assert float(medium.index(micrometres * 1e-6)) == pytest.approx(index, abs=near), name
+    # Without a catalogue the flint of CDGM has that name.
+    assert float(find_glass("BAF2").index(LINE_D)) == pytest.approx(1.5697, abs=1e-4)
 
 
 def test_common_glasses_stay_what_they_are_where_their_maker_is_stated():
