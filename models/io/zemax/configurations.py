@@ -69,7 +69,7 @@ def with_configuration(file: ZemaxFile, number: int | None, findings: Findings) 
     if stated.count == 1:
         return file
     changed = _Changes(file, findings if number != stated.active else None)
-    for line in _rows(file.trailer):
+    for line in _rows(file.trailer, strict=number != stated.active):
         if line.integer(1) == number:
             changed.apply(line)
     if number == stated.active:
@@ -77,14 +77,16 @@ def with_configuration(file: ZemaxFile, number: int | None, findings: Findings) 
     return with_links_followed(changed.file, file, findings)
 
 
-def _rows(trailer: Block) -> Iterator[Record]:
-    """Yield the operands of all configurations, which stand behind MNUM."""
+def _rows(trailer: Block, *, strict: bool) -> Iterator[Record]:
+    """Yield the operands of all configurations, which stand behind MNUM; rows that are none are errors if `strict`."""
     start = next(i for i, line in enumerate(trailer.lines) if line.keyword == "MNUM")
     for line in trailer.lines[start + 1 :]:
         if line.keyword not in (*_IGNORED, *TRAILER):
-            if len(line.words) < 3:
+            is_row = len(line.words) > 2 and line.words[1].isdigit()
+            if strict and not is_row:
                 raise line.error("a number, that of a configuration, and a value")
-            yield line
+            if is_row:
+                yield line
 
 
 class _Changes:
@@ -108,12 +110,14 @@ class _Changes:
             if keyword != "GLAS" or block.last("GLAS") is not None:
                 set_word(block, keyword, place, operand.words[2])
         elif kind in ("GLSS", "PRAM"):
-            (self._glass if kind == "GLSS" else self._parameter)(operand)
+            # Glasses and parameters of the configuration of the file stand in its surfaces.
+            if self.findings is not None:
+                (self._glass if kind == "GLSS" else self._parameter)(operand)
         elif kind == "STPS":
             for block in self.file.surfaces:
                 block.lines[:] = [line for line in block.lines if line.keyword != "STOP"]
-            chosen_stop = self._surface(replace(operand, words=(operand.words[2], *operand.words[1:])))
-            chosen_stop.lines.append(replace(operand, keyword="STOP", words=(), text=""))
+            stop_block = self._surface(replace(operand, words=(operand.words[2], *operand.words[1:])))
+            stop_block.lines.append(replace(operand, keyword="STOP", words=(), text=""))
         elif kind == "APER" and (stated := [key for key in _APERTURES if header.last(key) is not None]):
             set_word(header, stated[0], 0, operand.words[2])
         elif kind in _SYSTEM:
@@ -125,7 +129,8 @@ class _Changes:
             set_word(header, keyword, operand.integer(0) - 1, operand.words[2], filler)
         elif kind in _WAVES:
             wave = operand.integer(0)
-            set_word(header, "WAVM", _WAVES[kind], operand.words[2], chosen=lambda line: line.integer(0) == wave)
+            if self.findings is not None or any(line.integer(0) == wave for line in header.all("WAVM")):
+                set_word(header, "WAVM", _WAVES[kind], operand.words[2], matches=lambda line: line.integer(0) == wave)
         elif self.findings is not None:
             text = f"{operand.shown}: this operand of a configuration is not understood"
             self.findings.report(operand.problem(text), "the value of the configuration the file was saved in is taken")
@@ -150,4 +155,4 @@ class _Changes:
         same = [line for line in block.lines if line.keyword == "PARM" and line.integer(0) == number]
         if not same:
             block.lines.append(replace(operand, keyword="PARM", words=(str(number), "0"), text="", place=block.place))
-        set_word(block, "PARM", 1, operand.words[2], chosen=lambda line: line.integer(0) == number)
+        set_word(block, "PARM", 1, operand.words[2], matches=lambda line: line.integer(0) == number)

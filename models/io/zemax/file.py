@@ -136,11 +136,16 @@ def parse_zemax_file(text: str, path: Path) -> ZemaxFile:
 
 
 def set_word(
-    block: Block, keyword: str, place: int, word: str, filler: str = "0", chosen: Callable[[Record], bool] | None = None
+    block: Block,
+    keyword: str,
+    place: int,
+    word: str,
+    filler: str = "0",
+    matches: Callable[[Record], bool] | None = None,
 ) -> None:
-    """Put a word in its place in the last line with a keyword that is chosen, or in a new line where there is none."""
-    places = [i for i, line in enumerate(block.lines) if line.keyword == keyword and (chosen is None or chosen(line))]
-    if place < 0 or (chosen is not None and not places):
+    """Put a word in its place in the last line with a keyword that matches, or in a new line where there is none."""
+    places = [i for i, line in enumerate(block.lines) if line.keyword == keyword and (matches is None or matches(line))]
+    if place < 0 or (matches is not None and not places):
         raise block.problem(f"{keyword}: {cut_short(word)}: expected a field or wavelength that the file has")
     if not places:
         block.lines.append(Record(block.file, block.place, keyword))

@@ -169,7 +169,12 @@ def test_a_total_thickness_and_a_stop_follow(tmp_path):
         (2, "TCOM 2 30.0", "CHAZ 2", "surface 3: CHAZ 2: this solve is not made anew"),
         (2, "CURV 0.005 4 1", "CURV 0.005 2 1", "surface 4: CURV 0.005 2 1 .*: this solve is not made anew"),
         (2, "THIC 2 2 12.0", "THIC 2 2 twelve", "surface 2: DISZ twelve: expected a number"),
-        (2, "THIC 2 2 12.0", "THIC 2 x 12.0", "THIC 2 x 12.0 .*: expected a number"),
+        (
+            2,
+            "THIC 2 2 12.0",
+            "THIC 2 x 12.0",
+            "THIC 2 x 12.0 .*: expected a number, that of a configuration, and a value",
+        ),
         (2, "WAVE 1 2", "WAVE 5 2", "WAVM: 0.55: expected a field or wavelength that the file has"),
     ],
 )
