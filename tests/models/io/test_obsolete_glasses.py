@@ -77,7 +77,7 @@ def test_the_catalogues_that_a_file_states_come_first(tmp_path):
 
 
 def test_crystals_go_by_the_names_of_opticstudio():
-    """Barium fluoride at 0.5893 um, magnesium fluoride and sapphire (ordinary rays) at d, silicon at 4 um: handbooks."""
+    """Barium fluoride at 0.5893 um, magnesium fluoride and sapphire (ordinary rays) at d, silicon at 4 um..."""
     figures_of = {"BAF2": (0.5893, 1.4744, 1e-4), "MGF2": (0.58756, 1.3777, 1e-4), "SAPPHIRE": (0.58756, 1.7682, 1e-4),
                   "SILICON": (4.0, 3.4255, 1e-3), "GERMANIUM": (10.0, 4.0032, 1.5e-3), "LIF": (0.5893, 1.3921, 1e-4),
                   "ZNSE": (10.6, 2.4028, 5e-4), "WATER": (0.58926, 1.33335, 5e-5)}  # fmt: skip
