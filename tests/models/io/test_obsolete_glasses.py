@@ -10,7 +10,7 @@ from pachon.models.io.glass_search import find_glass, makers_in
 
 LINE_D, LINE_F, LINE_C = 0.5875618e-6, 0.4861327e-6, 0.6562725e-6
 OLD = GlassCatalogue.of_maker(OBSOLETE)
-#: n_d and V_d of Schott's catalogues on paper ("Optical Glass", 1992 to 1996), which state five and two decimals.
+#: n_d and V_d as Schott's catalogues print them, with five and two decimals.
 PUBLISHED = {
     "SK5": (1.58913, 61.27), "SK1": (1.61025, 56.71), "KF9": (1.52341, 51.49), "PSK3": (1.55232, 63.46),
     "LAKN6": (1.64250, 57.96), "LAKN7": (1.65160, 58.52), "BALKN3": (1.51849, 60.25), "LASF14A": (1.82223, 37.45),
