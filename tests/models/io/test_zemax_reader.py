@@ -108,7 +108,7 @@ def test_lens_units(tmp_path, unit):
     assert telescope.pupil_diameter == pytest.approx(100 * float(metres), rel=1e-15)
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "iso-8859-1"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "iso-8859-1"])
 def test_encodings(tmp_path, encoding):
     text = MIRROR.replace("NAME one mirror", "NAME Größe Ø").replace("\n", "\r\n")
     assert load_telescope(written(tmp_path, text, encoding)).description == "Größe Ø"
