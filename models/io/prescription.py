@@ -68,13 +68,6 @@ WRITTEN = {
     ".yaml": "pachon", ".yml": "pachon", ".zmx": "zemax", ".seq": "codev", ".len": "oslo", ".json": "optiland",
     ".roa": "rayoptics",
 }  # fmt: skip
-#: Hints at files of other programs that are not read, by their endings.
-_HINTS = {
-    ".zos": "OpticStudio's binary format: save it there as .zmx; ",
-    ".ses": "settings of OpticStudio, without a lens; ",
-    ".cfg": "settings of OpticStudio, without a lens; ",
-    ".zda": "analyses of OpticStudio, without a lens; ",
-}
 #: Endings of lens files of several configurations.
 _CONFIGURED = (".zmx", ".zar")
 #: Endings of files that a telescope is read from.
@@ -147,8 +140,7 @@ def load_telescope(
         telescope = read_lens(path, reader, lenient=lenient, glass_catalogues=glass_catalogues)
         return telescope if configuration is None else replace(telescope, name=f"{telescope.name}_{configuration}")
     if isinstance(name_or_path, os.PathLike) or len(path.parts) > 1 or path.is_file():
-        hint = _HINTS.get(path.suffix.lower(), "")
-        raise PrescriptionError(f"{hint}expected a prescription file that ends in {', '.join(ENDINGS)}", file=path)
+        raise PrescriptionError(f"expected a prescription file that ends in {', '.join(ENDINGS)}", file=path)
     raise unknown_name("telescope", text, BUNDLED)
 
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ....core.errors import PrescriptionError, error_context
-from ....core.files import read_bytes, text_lines
+from ....core.files import text_lines
 from ...media.dispersion import model_glass
 from ...media.medium import Medium
 from ...media.tabulated import TabulatedIndex
@@ -30,7 +30,7 @@ from ..lens.description import Format, LensDescription, LensSurface
 from ..lens.glasses import Glasses
 from ..lens.shapes import polynomial_powers, radius_of
 from ..lens.source import Findings, Source
-from ..lens.text import BYTE_ORDER_MARKS, FileSurface, Record, decoded, scaled
+from ..lens.text import FileSurface, Record, read_text, scaled
 from .frames import surface_frames
 
 FORMAT = Format("OSLO", "one of EBR, NAO, FNO, NAP", "WV", "AST")
@@ -56,9 +56,6 @@ _IGNORED = """
 DES LMO LMN LME DRW LDP CBK CALLBACK GPRT TCE ELMDF1 ELMDF2 BDI BDD VX PF TLR COA CTG RDF THF TEX
 """
 IGNORED = frozenset(_IGNORED.split())
-#: First commands of CODE V's files.
-_CODEV = ("RDM", "TITLE", "TIT", "EPD", "DIM", "WL")
-_CODEV_HINT = "; CODE V's sequences end in .seq"
 #: Surfaces that are not read, where their value is not zero.
 REFUSED = {
     "PFL": "perfect lenses", "GSP": "gratings", "GOR": "gratings", "DOE": "diffractive surfaces",
@@ -88,10 +85,7 @@ def read_oslo_file(path: Path, findings: Findings, glasses: Glasses) -> LensDesc
 
 def _commands(path: Path) -> Iterator[Record]:
     """Yield the commands of a file: parted by line ends and semicolons, comments from // to the end."""
-    raw = read_bytes(path, PrescriptionError)
-    if not raw.startswith(BYTE_ORDER_MARKS) and b"\0" in raw:
-        raise PrescriptionError("a binary file, such as CODE V's .len: save it there as a sequence (.seq)", file=path)
-    for number, line in enumerate(text_lines(decoded(raw, str(path))), start=1):
+    for number, line in enumerate(text_lines(read_text(path)), start=1):
         # Texts in quotation marks hold semicolons and slashes.
         for statement in re.findall(r'(?:"[^"]*"|//.*|[^;])+', line):
             words = re.findall(r'"[^"]*"|//.*|[^\s,"]+', statement)
@@ -127,12 +121,10 @@ class _Reader:
         for command in _commands(self.path):
             if command.keyword == "LEN" and not started:
                 if len(command.words) < 2 or command.words[0].upper() != "NEW":
-                    hint = "" if command.words else _CODEV_HINT
-                    raise command.error(f'LEN NEW "name" and two numbers{hint}')
+                    raise command.error('LEN NEW "name" and two numbers')
                 started, self.description.title = True, command.words[1].strip('"')
             elif not started:
-                hint = _CODEV_HINT if command.keyword in _CODEV else ""
-                raise command.problem(f"{command.shown}: expected LEN NEW first{hint}")
+                raise command.problem(f"{command.shown}: expected LEN NEW first")
             elif ended:
                 if command.keyword == "CFG":
                     self.findings.report(command.problem("CFG: one configuration is read, the first"))
