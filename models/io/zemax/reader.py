@@ -12,15 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ...media.medium import LINE_D, Medium, abbe_number, with_index_change
+from ...media.medium import Medium
 from ...rotation import rotation_matrix
 from ...surface import Interaction
 from ...telescope import VACUUM
 from ..lens.axial_ray import AxialRay
 from ..lens.description import LensDescription, LensSurface
-from ..lens.glasses import Glasses, numbered_glass
+from ..lens.glasses import Glasses, numbered_glass, offset_glass
 from ..lens.source import Findings, Source
-from ..lens.text import Record
 from .apertures import read_aperture
 from .configurations import with_configuration
 from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, ZemaxFile, read_zemax_file
@@ -199,23 +198,11 @@ class _LensReader:
         if not model:
             medium = self.glasses.get(name, self.file.header.text("GCAT").split())
             if medium is not None:
-                return False, _offset(medium, line) if solve == _OFFSET else medium
+                return False, offset_glass(
+                    medium, line.number(9, 0.0), line.number(10, 0.0), line
+                ) if solve == _OFFSET else medium
             error = self.glasses.missing(name, line)
             if nd <= 0 or (nd, vd) == PLACEHOLDER:
                 raise error
             self.findings.report(error, "taken as a model glass of its indices")
         return False, numbered_glass(nd, vd, deviation, name, line)
-
-
-def _offset(medium: Medium, line: Record) -> Medium:
-    """Return a glass with the differences of index and Abbe number that stand at the end of its line."""
-    index_change, abbe_change = line.number(9, 0.0), line.number(10, 0.0)
-    if not (index_change or abbe_change):
-        return medium
-    with line.context():
-        nd, abbe = float(medium.index(LINE_D * 1e-6)), abbe_number(medium)
-        if not abbe + abbe_change > 0:
-            raise line.error("an Abbe number above 0")
-        # The Abbe number is that of the changed index.
-        dispersion = (nd - 1.0 + index_change) / (nd - 1.0) * abbe / (abbe + abbe_change)
-        return with_index_change(medium, index_change, dispersion)
