@@ -78,8 +78,10 @@ def _read_wavelengths(lens: LensDescription, header: Block) -> None:
         source, values = listed, listed.numbers()
         stated = weight_lists[lists.index(listed)]
         # WAVN is as long as the longest list that there may be.
-        if listed is lists[0] and 1 <= count <= len(values):
-            values = values[: int(count)]
+        if listed is lists[0]:
+            values = values[: int(count)] if 1 <= count <= len(values) else values
+            while len(values) > 1 and values[-1] == 0:
+                values.pop()
         weights = [1.0 if stated is None else stated.number(i, 1.0) for i in range(len(values))]
     else:
         return
