@@ -31,8 +31,10 @@ MAKERS = ("schott", "ohara", "hoya", "hikari", "sumita", "cdgm")
 OBSOLETE = "schott_obsolete"
 #: Catalogue of crystals, semiconductors and liquids, whose names are NAME_AUTHOR.
 SUBSTANCES = "substances"
+#: Further makers, whose catalogues are small or old; they are looked up behind the others.
+FURTHER_MAKERS = ("corning", "lzos", "heraeus")
 #: Bundled catalogues, in the order in which a glass is looked up.
-CATALOGUES = (MAKERS[0], OBSOLETE, *MAKERS[1:], SUBSTANCES)
+CATALOGUES = (MAKERS[0], OBSOLETE, *MAKERS[1:], *FURTHER_MAKERS, SUBSTANCES)
 DEFAULT_RANGE = (0.3, 2.5)
 
 #: Formula numbers of the format; 2, 6 and 11 are Sellmeier's formula with three, four and five terms.
@@ -137,9 +139,9 @@ class GlassCatalogue:
 
         Parameters
         ----------
-        maker : {"schott", "schott_obsolete", "ohara", "hoya", "hikari", "sumita", "cdgm", "substances"}
-            The maker; "schott_obsolete" are Schott's glasses that are no longer made, such as ``"SK5"``, "substances"
-            crystals, semiconductors and liquids, such as ``"CAF2_DAIMON-20"``.
+        maker : {"schott", "schott_obsolete", "ohara", "hoya", "hikari", "sumita", "cdgm", "corning", "lzos", ...}
+            The maker, also "heraeus"; "schott_obsolete" are Schott's glasses that are no longer made, such as
+            ``"SK5"``, "substances" crystals, semiconductors and liquids, such as ``"CAF2_DAIMON-20"``.
 
         Raises
         ------

@@ -10,11 +10,14 @@ import numpy as np
 
 from ...core.errors import PrescriptionError, nearest
 from ..media.medium import LINE_C, LINE_D, LINE_F, Medium
-from .glass_catalogue import CATALOGUES, MAKERS, OBSOLETE, SUBSTANCES, GlassCatalogue
+from .glass_catalogue import CATALOGUES, FURTHER_MAKERS, MAKERS, OBSOLETE, SUBSTANCES, GlassCatalogue
 from .lens.source import Findings
 
 #: Words in the names of catalogues, as lens files state them, by the bundled catalogue: Nikon's glasses are Hikari's.
-_WORDS = {"NIKON": "hikari", "SCHO": "schott", "INFRARED": SUBSTANCES} | {maker.upper(): maker for maker in MAKERS}
+_WORDS = {
+    "NIKON": "hikari", "SCHO": "schott", "CORN": "corning", "INFRARED": SUBSTANCES,
+    **{maker.upper(): maker for maker in (*MAKERS, *FURTHER_MAKERS)},
+}  # fmt: skip
 #: Difference of the indices of one glass in two editions of its maker's catalogue.
 _SAME = 1e-8
 #: Catalogues of users that are kept in memory.

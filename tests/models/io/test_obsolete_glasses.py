@@ -184,3 +184,12 @@ def test_a_lens_of_each_glass_has_the_focal_length_of_its_index(tmp_path, name):
     power = (nd - 1) * (2 / radius - (nd - 1) * thickness / (nd * radius**2))
     for lens in opened(tmp_path, Design([(radius, thickness, name), (-radius, 70, "")], 0, 0, 10, 1)):
         assert first_order(lens).focal_length * 1e3 == pytest.approx(1 / power, rel=3e-5)
+
+
+def test_glasses_of_further_makers():
+    """Lines of LZOS's catalogue at F, C, s and 1.529 um; Corning France's code C20-60 is index and Abbe number."""
+    bf1 = find_glass("LZ_BF1")
+    for micrometres, index in ((0.48613, 1.531447), (0.65627, 1.521897), (0.8521, 1.51681), (1.5296, 1.50793)):
+        assert float(bf1.index(micrometres * 1e-6)) == pytest.approx(index, abs=5e-5)
+    nd, vd = figures(find_glass("C20-60", makers=makers_in(["OLD_CORN"])))
+    assert (round(nd, 2), round(vd)) == (1.62, 60)
