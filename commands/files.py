@@ -68,7 +68,7 @@ def validate_command(
     """Report all problems of files at once: prescriptions, configurations, sweeps, tables of heights.
 
     What a file is, its ending and its keys tell. Each problem is a line, with the number of the line in the file where
-    it is known. Exit status 2 if there is one.
+    it is known. Exit status 2 if there is one; notes on how a lens file is read leave it at 0.
 
     **Examples**
 
@@ -83,6 +83,8 @@ def validate_command(
     for report in reports if not as_json else []:
         for problem in report.problems:
             print_line(str(problem))
+        for note in report.notes:
+            print_line(f"{note} (a note, no fault of the file)")
         if not report.problems:
             print_line(f"{report.path}: {report.kind}, no problems")
     if any(report.problems for report in reports):

@@ -38,12 +38,14 @@ def configured_experiment(config: Path | None, *, paper_model: bool = False, **o
         raise error.within(file=config) from None
 
 
-def load_model(model: str, lenient: bool = False, glass_catalogues: Sequence[Path] = ()) -> Telescope:
+def load_model(
+    model: str, lenient: bool = False, glass_catalogues: Sequence[Path] = (), configuration: int | None = None
+) -> Telescope:
     """Return the telescope of that name or file; warnings of a lenient reader go to standard error, a line each."""
     from ..models.io.prescription import load_telescope
 
     with warnings_shown(PrescriptionWarning):
-        return load_telescope(model, lenient=lenient, glass_catalogues=glass_catalogues)
+        return load_telescope(model, lenient=lenient, glass_catalogues=glass_catalogues, configuration=configuration)
 
 
 @contextmanager

@@ -24,6 +24,10 @@ TruthStars = Annotated[int | None, Option(help="Noise-free PSFs on each CCD.")]
 ObservedStars = Annotated[int | None, Option(help="Observed stars on each CCD.")]
 Model = Annotated[str, Argument(help="Bundled model, or path of a prescription.")]
 Lenient = Annotated[bool, Option("--lenient", help="Lens or batoid file: warn about unknown parts, go on.")]
+Configuration = Annotated[
+    int | None,
+    Option(help="Number of one of several configurations of a Zemax file; by default the one it was saved in."),
+]
 GlassCatalogues = Annotated[
     list[Path] | None,
     Option("--glass-catalogue", metavar="FILE.agf", help="Glass catalogue of a lens file, once for each."),

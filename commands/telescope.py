@@ -12,7 +12,7 @@ from ..core.errors import PrescriptionWarning
 from ..core.terminal import print_line
 from .imports import import_modules
 from .inputs import load_model, warnings_shown
-from .options import GlassCatalogues, Json, Lenient, Model
+from .options import Configuration, GlassCatalogues, Json, Lenient, Model
 from .tables import Rows, plain_table, print_json, wide_console
 
 app = typer.Typer()
@@ -25,6 +25,7 @@ def info_command(
     model: Annotated[str | None, Argument(help="Bundled model, or path of a prescription.")] = None,
     glass_catalogue: GlassCatalogues = None,
     lenient: Lenient = False,
+    configuration: Configuration = None,
     as_json: Json = False,
 ) -> None:
     """Show the lens table and the first-order properties of a telescope; without a model, list the bundled ones.
@@ -56,7 +57,7 @@ def info_command(
     import_modules(("pachon.models.io.prescription", "pachon.pipeline.report.info"))
     from ..pipeline.report.info import coefficient_lines, describe, figure_rows, surface_columns, surface_rows
 
-    description = describe(load_model(model, lenient, glass_catalogue or ()))
+    description = describe(load_model(model, lenient, glass_catalogue or (), configuration))
     if as_json:
         print_json(description)
         return
@@ -88,6 +89,7 @@ def convert_command(
     ] = "",
     glass_catalogue: GlassCatalogues = None,
     lenient: Lenient = False,
+    configuration: Configuration = None,
 ) -> None:
     """Write a telescope in another format: ours, batoid's, or that of a lens design program.
 
@@ -104,12 +106,13 @@ def convert_command(
     - `pachon convert lens.zmx lens.yaml --glass-catalogue schott.agf --lenient`
     - `pachon convert lsst_v3.3_r lsst.zmx`
     - `pachon convert doublet.len doublet.json`
+    - `pachon convert zoom.zmx tele.yaml --configuration 3`
     - `pachon convert lens.zmx lens.roa`
     - `pachon convert lsst_v3.3_r LSST_r.yaml --format batoid`
     """
     from ..models.io.prescription import save_telescope
 
-    telescope = load_model(model, lenient, glass_catalogue or ())
+    telescope = load_model(model, lenient, glass_catalogue or (), configuration)
     with warnings_shown(PrescriptionWarning):
         save_telescope(telescope, out, format=format, lenient=lenient)
     print_line(f"{telescope.name}: {len(telescope.surfaces)} surfaces written to {out}")

@@ -113,6 +113,10 @@ class PrescriptionWarning(UserWarning):
     """Part of a lens file that is not understood and left out."""
 
 
+class PrescriptionNote(PrescriptionWarning):
+    """How a part of a lens file is read that other programs read otherwise; no fault of the file."""
+
+
 class HeightWarning(UserWarning):
     """Measured heights with gaps, without some CCDs, or of an unlikely size."""
 

@@ -167,6 +167,16 @@ def read_bytes(path: Path, error: type[PachonError], *, max_bytes: int | None = 
     return data
 
 
+def text_lines(text: str) -> list[str]:
+    """Return the lines of the text of a file, which end in line feeds, carriage returns or both.
+
+    Form feeds, NEL (U+0085) and the separators of Unicode, at which :meth:`str.splitlines` divides too, stand within
+    lines: editors and other programs do not count lines there.
+    """
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    return lines[:-1] if lines[-1] == "" else lines
+
+
 def content_hash(path: Path, error: type[PachonError]) -> str:
     """Return the SHA-256 of the content of a file, in hexadecimal; errors as of :func:`read_bytes`."""
     return hashlib.sha256(read_bytes(path, error)).hexdigest()

@@ -15,7 +15,7 @@ from astropy.table import Column, Table
 from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
 
 from .errors import ConfigError, PachonError, ProductError
-from .files import parsing, read_bytes, write_bytes
+from .files import parsing, read_bytes, text_lines, write_bytes
 from .products import card_text
 
 #: Formats of astropy, or Parquet, by the ending of the file.
@@ -46,7 +46,7 @@ def read_columns(path: Path) -> dict[str, Column | np.ndarray]:
                 content = parquet_module(path, ProductError).read_table(io.BytesIO(data))
                 return {name.lower(): content[name].to_numpy() for name in content.column_names}
             # Numbers of a CSV file that are left out are masked.
-            source: Any = io.BytesIO(data) if kind == "fits" else data.decode().splitlines()
+            source: Any = io.BytesIO(data) if kind == "fits" else text_lines(data.decode())
             table = Table.read(source, format=kind)
     return {name.lower(): table[name] for name in table.colnames}
 

@@ -4,6 +4,7 @@ from .core.errors import DomainError as DomainError
 from .core.errors import HeightWarning as HeightWarning
 from .core.errors import PachonError as PachonError
 from .core.errors import PrescriptionError as PrescriptionError
+from .core.errors import PrescriptionNote as PrescriptionNote
 from .core.errors import PrescriptionWarning as PrescriptionWarning
 from .core.errors import ProductError as ProductError
 from .core.errors import UnknownNameError as UnknownNameError

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import ConfigError, error_context
-from ..core.files import parsing, read_bytes
+from ..core.files import parsing, read_bytes, text_lines
 from ..models.telescope import Telescope
 
 #: Endings of files of states.
@@ -36,7 +36,7 @@ def with_active_optics_state(telescope: Telescope, path: str, visit: int) -> Tel
     file = Path(path)
     text = read_bytes(file, ConfigError)
     with parsing(file, "expected a table of states (ECSV)", ConfigError):
-        table = QTable.read(text.decode().splitlines(), format="ascii.ecsv")
+        table = QTable.read(text_lines(text.decode()), format="ascii.ecsv")
     with error_context(file=file):
         if "visit" not in table.colnames or len(table.colnames) < 2:
             raise ConfigError("columns: expected visit, and degrees of freedom such as M2_dz")

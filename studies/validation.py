@@ -13,7 +13,15 @@ from typing import Any
 from pydantic import BaseModel
 
 from ..core.arguments import check_arguments
-from ..core.errors import ConfigError, HeightWarning, PachonError, PrescriptionError, PrescriptionWarning, check_choice
+from ..core.errors import (
+    ConfigError,
+    HeightWarning,
+    PachonError,
+    PrescriptionError,
+    PrescriptionNote,
+    PrescriptionWarning,
+    check_choice,
+)
 from ..core.json_schema import json_schema
 from ..core.schema import problems_of
 from ..core.yaml_reader import line_of, read_mapping
@@ -84,11 +92,14 @@ class Validation:
         What it was taken for, by its ending and keys: a name of :data:`KINDS`, "lens file" or "heights".
     problems : tuple of PachonError
         Every problem, with the line in :attr:`~pachon.PachonError.place` where it is known.
+    notes : tuple of str
+        How parts of a lens file are read that are no faults of it, such as solves that are not kept.
     """
 
     path: str
     kind: str
     problems: tuple[PachonError, ...]
+    notes: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, Any]:
         """Return the problems as JSON has them."""
@@ -96,6 +107,7 @@ class Validation:
             "file": self.path,
             "kind": self.kind,
             "problems": [{"place": p.place, "key": p.key, "problem": p.problem} for p in self.problems],
+            "notes": list(self.notes),
         }
 
 
@@ -123,9 +135,9 @@ def validate_file(path: str | os.PathLike[str]) -> Validation:
     if ending in _YAML:
         return _yaml_file(file)
     if ending in ENDINGS:
-        return Validation(str(file), "lens file", tuple(_lens_file(file)))
+        return _lens_file(file)
     if ending in _TABLES:
-        return Validation(str(file), "heights", tuple(_loading_problems(FocalPlane.from_file, file, HeightWarning)))
+        return Validation(str(file), "heights", tuple(_loading_problems(FocalPlane.from_file, file)))
     raise ConfigError(f"expected a file that ends in {', '.join((*ENDINGS, *_TABLES))}", file=file)
 
 
@@ -155,14 +167,14 @@ def _yaml_file(path: Path) -> Validation:
     except PachonError as error:
         return Validation(str(path), "YAML", (error,))
     if "opticalSystem" in content:
-        return Validation(str(path), "lens file", tuple(_lens_file(path)))
+        return _lens_file(path)
     # Where two kinds have the keys, the one with fewer others.
     kind = max(KINDS, key=lambda k: (len(set(content) & _keys(k)), -len(_keys(k))))
     if not set(content) & _keys(kind):
         raise ConfigError(f"none of the keys of a {', '.join(k.name for k in KINDS)} is in it", file=path)
     problems = _schema_problems(kind, content, path)
     if not problems:
-        problems = _loading_problems(kind.load, path, HeightWarning)
+        problems = _loading_problems(kind.load, path)
     return Validation(str(path), kind.name, tuple(_with_line(error, path) for error in problems))
 
 
@@ -184,21 +196,31 @@ def _schema_problems(kind: FileKind, content: dict[str, Any], path: Path) -> lis
     return [error.within(file=path) for error in prescription.problems()]
 
 
-def _lens_file(path: Path) -> list[PachonError]:
-    """Return the warnings of a lenient reader, and the error that ends it."""
-    return _loading_problems(lambda file: load_telescope(file, lenient=True), path, PrescriptionWarning)
-
-
-def _loading_problems(load: Callable[[Path], Any], path: Path, warning: type[Warning]) -> list[PachonError]:
-    """Return warnings of a kind, and the error that ends the loading of a file."""
+def _lens_file(path: Path) -> Validation:
+    """Return the warnings of a lenient reader, and the error that ends it; its notes apart."""
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", warning)
+        warnings.simplefilter("always", PrescriptionWarning)
+        error: list[PachonError] = []
+        try:
+            load_telescope(path, lenient=True)
+        except PachonError as problem:
+            error = [problem]
+    prescription_warnings = [w for w in caught if issubclass(w.category, PrescriptionWarning)]
+    notes = [w for w in prescription_warnings if issubclass(w.category, PrescriptionNote)]
+    faults = [PrescriptionError(str(w.message)) for w in prescription_warnings if w not in notes]
+    return Validation(str(path), "lens file", (*faults, *error), tuple(str(w.message) for w in notes))
+
+
+def _loading_problems(load: Callable[[Path], Any], path: Path) -> list[PachonError]:
+    """Return warnings of heights, and the error that ends the loading of a file."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", HeightWarning)
         error: list[PachonError] = []
         try:
             load(path)
         except PachonError as problem:
             error = [problem]
-    return [*(PrescriptionError(str(w.message)) for w in caught if issubclass(w.category, warning)), *error]
+    return [*(PrescriptionError(str(w.message)) for w in caught if issubclass(w.category, HeightWarning)), *error]
 
 
 def _with_line(error: PachonError, path: Path) -> PachonError:

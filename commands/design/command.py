@@ -86,11 +86,12 @@ class SharedOptions:
     glass_catalogue: Sequence[Path] | None = None
     lenient: bool = False
     threads: int | None = None
+    configuration: int | None = None
 
     @cached_property
     def telescope(self) -> Telescope:
         """The telescope."""
-        telescope = load_model(self.model, self.lenient, self.glass_catalogue or ())
+        telescope = load_model(self.model, self.lenient, self.glass_catalogue or (), self.configuration)
         return telescope if self.aiming is None else telescope.with_design(aiming=self.aiming)
 
     @cached_property
@@ -201,6 +202,7 @@ def _parameters(compute: Callable[..., Any], band: bool, picture: Any) -> tuple[
         "aiming": (options.Aiming, None),
         "glass_catalogue": (options.GlassCatalogues, None),
         "lenient": (options.Lenient, False),
+        "configuration": (options.Configuration, None),
         "picture": (picture, None),
         "threads": (options.Threads, None),
         "as_json": (options.Json, False),

@@ -33,7 +33,7 @@ from pydantic import Field
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, error_context
-from ...core.files import read_bytes
+from ...core.files import read_bytes, text_lines
 from ...core.schema import Section, either, expected, one_of
 from ...core.schema import validated as validated_file
 from ...core.units import metres
@@ -186,7 +186,7 @@ def _two_columns(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return wavelength [nm] and efficiency of a text file; lines that begin with # are comments."""
     rows = []
     text = read_bytes(path, ConfigError, max_bytes=_MAX_BYTES).decode("utf-8", errors="replace")
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(text_lines(text), 1):
         words = line.partition("#")[0].replace(",", " ").split()
         if not words:
             continue

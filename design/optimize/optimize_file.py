@@ -159,6 +159,7 @@ class ConfigurationSection(StateSection):
     """A further telescope that shares the variables."""
 
     telescope: str
+    configuration: Count | None = None
     weight: Positive = 1.0
 
 
@@ -220,7 +221,9 @@ def optimization_arguments(
         for i, section in enumerate(file.configurations):
             with error_context(key=f"configurations.{i}"):
                 beside = path.parent / section.telescope
-                position = load_telescope(beside if beside.is_file() else section.telescope)
+                position = load_telescope(
+                    beside if beside.is_file() else section.telescope, configuration=section.configuration
+                )
                 if position.name in [s.telescope.name for s in states] and beside.is_file():
                     # Positions of a zoom lens, saved from one telescope, have its name.
                     position = dataclasses.replace(position, name=beside.stem)

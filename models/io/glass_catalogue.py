@@ -8,6 +8,7 @@ has the space between the surfaces. :meth:`GlassCatalogue.in_vacuum` gives the i
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -15,18 +16,25 @@ from itertools import pairwise
 from pathlib import Path
 
 from ...core.arguments import check_arguments
-from ...core.errors import PrescriptionError, unknown_name
+from ...core.errors import PrescriptionError, cut_short, unknown_name
 from ..media.air import ZERO_CELSIUS, Air
 from ..media.dispersion import FORMULAS, Dispersion
 from ..media.medium import Medium, RelativeToAir, Sellmeier
 from .bundled import DATA
+from .lens.source import Findings
 from .lens.text import Record, read_text, records
 
 BUNDLED = DATA / "glasses.agf"
 #: Makers whose catalogues come with the package, in the order in which a glass is looked up.
 MAKERS = ("schott", "ohara", "hoya", "hikari", "sumita", "cdgm")
+#: Catalogue of Schott's glasses that are no longer made; it is looked up behind Schott's present one.
+OBSOLETE = "schott_obsolete"
 #: Catalogue of crystals, semiconductors and liquids, whose names are NAME_AUTHOR.
 SUBSTANCES = "substances"
+#: Further makers, whose catalogues are small or old; they are looked up behind the others.
+FURTHER_MAKERS = ("corning", "lzos", "heraeus")
+#: Bundled catalogues, in the order in which a glass is looked up.
+CATALOGUES = (MAKERS[0], OBSOLETE, *MAKERS[1:], *FURTHER_MAKERS, SUBSTANCES)
 DEFAULT_RANGE = (0.3, 2.5)
 
 #: Formula numbers of the format; 2, 6 and 11 are Sellmeier's formula with three, four and five terms.
@@ -45,6 +53,14 @@ NUMBERED = {
 SELLMEIER_TERMS = {2: 3, 6: 4, 11: 5}
 #: Lines without effect on the index: comments, expansion, cost and resistance, transmission, stress, mechanics.
 IGNORED = ("CC", "GC", "ED", "OD", "IT", "BD", "MD")
+#: Lines with numbers: coefficients of the formula, thermal ones, limits of the wavelength.
+_DATA = ("CD", "TD", "LD")
+#: Number that begins a line.
+_NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)(E[-+]?\d+)?"
+#: Hyphens of names, and what other programs have for them.
+_HYPHENS = str.maketrans("", "", "-_")
+#: Temperature [K] of reference of a glass whose catalogue states none.
+USUAL_TEMPERATURE = 20.0 + ZERO_CELSIUS
 
 
 @dataclass(frozen=True)
@@ -76,17 +92,20 @@ class GlassCatalogue:
 
     def __init__(self, glasses: Mapping[str, Glass], source: str) -> None:
         self._glasses = dict(glasses)
-        self._without_hyphens = {name.replace("-", ""): name for name in self._glasses}
+        self._without_hyphens = {name.translate(_HYPHENS): name for name in self._glasses}
         self.source = source
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> GlassCatalogue:
         """Read a catalogue in AGF format, in UTF-8, UTF-16 or ISO 8859-1.
 
+        A line that cannot be read is left out, and with it its glass where it needs the line; a PrescriptionNote
+        names file, line, glass and keyword.
+
         Raises
         ------
         PrescriptionError
-            If the file cannot be read or has no glass, or a line is not understood: file, line, glass and keyword.
+            If the file cannot be read, or has no glass that can be.
         """
         return cls.parse(read_text(Path(path)), str(path))
 
@@ -94,15 +113,20 @@ class GlassCatalogue:
     def parse(cls, text: str, source: str) -> GlassCatalogue:
         """Return the catalogue of a text in AGF format; `source` is its name for messages.
 
+        Of lines that cannot be read there are warnings, as in :meth:`read`.
+
         Raises
         ------
         PrescriptionError
             As those of :meth:`read`.
         """
-        glasses = {g.name: g for g in _read_glasses(records(text, source))}
+        glasses, problems = _read_glasses(records(text, source))
         if not glasses:
-            raise PrescriptionError("expected a glass catalogue, with lines that begin with NM", file=source)
-        return cls(glasses, source)
+            wrong = PrescriptionError("expected a glass catalogue, with lines that begin with NM", file=source)
+            raise problems[0] if problems else wrong
+        for problem in problems:
+            Findings().note(problem, "left out")
+        return cls({glass.name: glass for glass in glasses}, source)
 
     @classmethod
     def bundled(cls) -> GlassCatalogue:
@@ -115,16 +139,17 @@ class GlassCatalogue:
 
         Parameters
         ----------
-        maker : {"schott", "ohara", "hoya", "hikari", "sumita", "cdgm", "substances"}
-            The maker; "substances" are crystals, semiconductors and liquids, such as ``"CAF2_DAIMON-20"``.
+        maker : {"schott", "schott_obsolete", "ohara", "hoya", "hikari", "sumita", "cdgm", "corning", "lzos", ...}
+            The maker, also "heraeus"; "schott_obsolete" are Schott's glasses that are no longer made, such as
+            ``"SK5"``, "substances" crystals, semiconductors and liquids, such as ``"CAF2_DAIMON-20"``.
 
         Raises
         ------
         UnknownNameError
             If there is none of that maker.
         """
-        if maker not in (*MAKERS, SUBSTANCES):
-            raise unknown_name("glass maker", maker, (*MAKERS, SUBSTANCES))
+        if maker not in CATALOGUES:
+            raise unknown_name("glass maker", maker, CATALOGUES)
         return _of_maker(maker)
 
     def __getitem__(self, name: str) -> Medium:
@@ -147,8 +172,8 @@ class GlassCatalogue:
         return len(self._glasses)
 
     def spelling(self, name: str) -> str | None:
-        """Return the name here of a glass, which may be written without its hyphens (CODE V: NBK7); None if unknown."""
-        return name.upper() if name in self else self._without_hyphens.get(name.upper())
+        """Return the name here of a glass, whose hyphens may lack (CODE V: NBK7) or be underscores; None if unknown."""
+        return name.upper() if name in self else self._without_hyphens.get(name.upper().translate(_HYPHENS))
 
     def entry(self, name: str) -> Glass:
         """Return the entry of a glass.
@@ -182,40 +207,70 @@ def _bundled() -> GlassCatalogue:
 @cache
 def _of_maker(maker: str) -> GlassCatalogue:
     catalogue = GlassCatalogue.read(DATA / "glasses" / f"{maker}.agf")
-    catalogue.source = f"the catalogue of {maker}"
+    catalogue.source = "Schott's catalogue of obsolete glasses" if maker == OBSOLETE else f"the catalogue of {maker}"
     return catalogue
 
 
-def _read_glasses(lines: list[Record]) -> Iterator[Glass]:
+def _read_glasses(lines: list[Record]) -> tuple[list[Glass], list[PrescriptionError]]:
+    """Return the glasses of a catalogue, and the problems of lines that cannot be read, which are left out."""
     starts = [i for i, line in enumerate(lines) if line.keyword == "NM"]
+    glasses: list[Glass] = []
+    problems: list[PrescriptionError] = []
     for start, end in pairwise([*starts, len(lines)]):
-        yield _read_glass(lines[start:end])
+        try:
+            glasses.append(_read_glass(lines[start], _data_lines(lines[start:end], problems), problems))
+        except PrescriptionError as error:
+            problems.append(error)
+    return glasses, problems
 
 
-def _read_glass(lines: list[Record]) -> Glass:
-    head = lines[0]
+def _data_lines(lines: list[Record], problems: list[PrescriptionError]) -> dict[str, Record]:
+    """Return the lines of a glass with numbers, by keyword; of several lines with one keyword, their numbers in a row.
+
+    A line that begins with a number goes on with the line before it.
+    """
+    data: dict[str, Record] = {}
+    keyword = ""
+    for line in lines[1:]:
+        is_number = re.fullmatch(_NUMBER, line.keyword) is not None
+        keyword, words = (keyword, (line.keyword, *line.words)) if is_number else (line.keyword, line.words)
+        if keyword in _DATA:
+            first = data.get(keyword)
+            data[keyword] = line if first is None else replace(first, words=(*first.words, *words))
+        elif keyword not in IGNORED:
+            name = cut_short(" ".join(lines[0].words[:1]))
+            # Numbers on the next lines are those of this one.
+            keyword = IGNORED[0]
+            problems.append(line.error(f"{', '.join(_DATA)} or one of {', '.join(IGNORED)} in glass {name}"))
+    return data
+
+
+def _read_glass(head: Record, data: Mapping[str, Record], problems: list[PrescriptionError]) -> Glass:
     if len(head.words) < 2:
         raise head.error("a name and the number of a dispersion formula")
     name = head.words[0].upper()
-    lines_by_keyword: dict[str, Record] = {}
-    for line in lines[1:]:
-        if line.keyword in ("CD", "TD", "LD"):
-            lines_by_keyword[line.keyword] = line
-        elif line.keyword not in IGNORED:
-            raise line.error(f"CD, TD, LD or one of {', '.join(IGNORED)} in glass {name}")
-    if "CD" not in lines_by_keyword:
+    if "CD" not in data:
         raise head.problem(f"glass {name} has no line CD with its coefficients")
-    limits = lines_by_keyword.get("LD")
+    limits = data.get("LD")
     low, high = (limits.number(0), limits.number(1)) if limits else DEFAULT_RANGE
-    celsius = lines_by_keyword["TD"].number(6, 20.0) if "TD" in lines_by_keyword else 20.0
     try:
-        medium = _medium(head, lines_by_keyword["CD"], (low / 1e6, high / 1e6))
+        medium = _medium(head, data["CD"], (low / 1e6, high / 1e6))
     except PrescriptionError as error:
         raise (error if error.file else head.problem(f"glass {name}: {error}")) from None
-    temperature = celsius + ZERO_CELSIUS
-    if not 0 < temperature <= 1000:
-        raise lines_by_keyword["TD"].error("a temperature above absolute zero and below 700 deg C as word 7")
+    temperature = USUAL_TEMPERATURE
+    try:
+        temperature = _temperature(data["TD"]) if "TD" in data else temperature
+    except PrescriptionError as error:
+        problems.append(error)
     return Glass(name, replace(medium, name=name), _index(head, 3), _index(head, 4), temperature)
+
+
+def _temperature(line: Record) -> float:
+    """Return the temperature [K] of reference."""
+    temperature = line.number(6, USUAL_TEMPERATURE - ZERO_CELSIUS) + ZERO_CELSIUS
+    if not 0 < temperature <= 1000:
+        raise line.error("a temperature above absolute zero and below 700 deg C as word 7")
+    return temperature
 
 
 def _index(head: Record, position: int) -> float:

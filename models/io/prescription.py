@@ -29,7 +29,8 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterable, Iterator
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -67,6 +68,8 @@ WRITTEN = {
     ".yaml": "pachon", ".yml": "pachon", ".zmx": "zemax", ".seq": "codev", ".len": "oslo", ".json": "optiland",
     ".roa": "rayoptics",
 }  # fmt: skip
+#: Endings of lens files of several configurations.
+_CONFIGURED = (".zmx", ".zar")
 #: Endings of files that a telescope is read from.
 ENDINGS = (".yaml", ".yml", *_READERS)
 
@@ -83,6 +86,7 @@ def load_telescope(
     *,
     lenient: bool = False,
     glass_catalogues: Iterable[GlassCatalogue | str | os.PathLike[str]] = (),
+    configuration: int | None = None,
 ) -> Telescope:
     """Load a bundled prescription by name, or any prescription by the path of its file.
 
@@ -96,6 +100,9 @@ def load_telescope(
     glass_catalogues : iterable of GlassCatalogue or path
         AGF catalogues to look up the glasses of a lens file in, first of all; then comes one beside the file that has
         its name and ends in .agf, then the bundled ones, then those that the user has configured.
+    configuration : int, optional
+        Number from 1 of one of several configurations of a Zemax file, such as the positions of a zoom lens; by default
+        the one in which the file was saved. The number is added to the name of the telescope.
 
     Returns
     -------
@@ -110,6 +117,9 @@ def load_telescope(
         If the file cannot be read, or is malformed: one line with file, key, value and expected value.
     """
     text = os.fspath(name_or_path)
+    if configuration is not None and Path(text).suffix.lower() not in _CONFIGURED:
+        problem = f"configuration = {configuration}: expected a file that ends in {' or '.join(_CONFIGURED)}"
+        raise PrescriptionError(problem, subject=text)
     if text in BUNDLED:
         return _bundled(text)
     path = Path(text)
@@ -125,7 +135,10 @@ def load_telescope(
         from .lens.build import read_lens
 
         reader = _imported(_READERS[path.suffix.lower()])
-        return read_lens(path, reader, lenient=lenient, glass_catalogues=glass_catalogues)
+        if configuration is not None:
+            reader = partial(reader, configuration=configuration)
+        telescope = read_lens(path, reader, lenient=lenient, glass_catalogues=glass_catalogues)
+        return telescope if configuration is None else replace(telescope, name=f"{telescope.name}_{configuration}")
     if isinstance(name_or_path, os.PathLike) or len(path.parts) > 1 or path.is_file():
         raise PrescriptionError(f"expected a prescription file that ends in {', '.join(ENDINGS)}", file=path)
     raise unknown_name("telescope", text, BUNDLED)
@@ -209,7 +222,7 @@ def save_telescope(
         If the name has none of these endings, or the file cannot be written or hold the telescope.
     """
     for file, text in prescription_files(telescope, path, format=format, lenient=lenient).items():
-        write_bytes(file, text.encode(), PrescriptionError)
+        write_bytes(file, text.encode("utf-8", "replace"), PrescriptionError)
 
 
 def prescription_files(

@@ -13,9 +13,10 @@ Paths are absolute, or relative to the folder of the configuration.
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
 
-from ...core.errors import ConfigError
+from ...core.errors import ConfigError, PrescriptionNote
 from ...core.schema import Section, validated
 from ...core.yaml_reader import read_mapping
 
@@ -38,10 +39,13 @@ def user_configuration_path() -> Path:
 def user_catalogues() -> tuple[Path, ...]:
     """Return the paths of the AGF files that the user has configured, in their order.
 
+    Of an entry that is neither an AGF file nor a folder with some there is a PrescriptionNote: the lenses whose
+    glasses stand elsewhere do not need it.
+
     Raises
     ------
     ConfigError
-        If the configuration cannot be read, or names what is neither an AGF file nor a folder with some.
+        If the configuration cannot be read.
     """
     if VARIABLE in os.environ:
         listed = [entry for entry in os.environ[VARIABLE].split(os.pathsep) if entry]
@@ -55,10 +59,11 @@ def user_catalogues() -> tuple[Path, ...]:
 
 
 def _files(place: Path, key: str) -> list[Path]:
-    if place.is_dir():
+    if place.is_dir() and os.access(place, os.R_OK):
         catalogue_paths = sorted(path for path in place.iterdir() if path.suffix.lower() == ".agf")
     else:
         catalogue_paths = [place] if place.is_file() else []
     if not catalogue_paths:
-        raise ConfigError(f"{key}: {place}: expected an AGF file, or a folder with some")
+        problem = f"{key}: {place}: expected an AGF file, or a folder with some; it is left out"
+        warnings.warn(problem, PrescriptionNote, stacklevel=2)
     return catalogue_paths

@@ -40,6 +40,7 @@ from .medium import (
     ConstantIndex,
     Medium,
     check_wavelength_range,
+    medium_label,
     real_index,
     wavelengths_within,
 )
@@ -122,7 +123,7 @@ class Dispersion(Medium):
         check_wavelength_range(self.wavelength_range)
 
     def index(self, wavelength: ArrayLike) -> np.ndarray:  # noqa: D102
-        w = wavelengths_within(wavelength, self.wavelength_range, "this glass")
+        w = wavelengths_within(wavelength, self.wavelength_range, medium_label(self.name, "glass"))
         formula = FORMULAS[self.formula]
         padded = (*self.coefficients, *[0.0] * (formula.size - len(self.coefficients)))
         with np.errstate(all="ignore"):
@@ -132,6 +133,10 @@ class Dispersion(Medium):
 
 #: Coefficient of w^2 [um^-2] in Schott's formula, about the mean of common glasses: their infrared absorption.
 INFRARED_TERM = -0.0128
+#: Index below which a model glass is a gas: no glass or liquid has less.
+_LEAST_SOLID = 1.2
+#: Wavelengths [m] of the formula of gases, which have no strong absorption near the visible.
+GAS_RANGE = (0.15e-6, 20e-6)
 
 
 @check_arguments
@@ -144,10 +149,13 @@ def model_glass(nd: float, vd: float, partial_dispersion: float = 0.0) -> Disper
     approximation, and not the unpublished one of Zemax: against eight catalogue glasses of common kinds it is good to
     5e-4 at 0.40 um, 4e-6 at 0.55 um, 3e-4 at 0.71 um, 8e-4 at 1 um and 2e-3 at 1.55 um.
 
+    Below an index of 1.2, of gases, which may be below 1 where it is relative to air, there is no absorption near the
+    visible: ``n = a + c / w^3.5`` (Conrady's formula without its middle term) of ``n_d`` and ``n_F - n_C``.
+
     Parameters
     ----------
     nd : float
-        Index at the d line, 587.5618 nm; above 1.
+        Index at the d line, 587.5618 nm; positive.
     vd : float
         Abbe number; positive. Zero stands for a glass without dispersion.
     partial_dispersion : float
@@ -159,11 +167,14 @@ def model_glass(nd: float, vd: float, partial_dispersion: float = 0.0) -> Disper
         If the numbers are not those of a glass.
     """
     wrong = PrescriptionError(f"nd, vd, dPgF = {nd!r}, {vd!r}, {partial_dispersion!r}: expected the numbers of a glass")
-    if not (1 < nd < 10 and 0 <= vd < 1e4 and abs(partial_dispersion) < 1):
+    if not (0 < nd < 10 and 0 <= vd < 1e4 and abs(partial_dispersion) < 1):
         raise wrong
     if vd == 0:
         return ConstantIndex(nd)
     spread = (nd - 1.0) / vd
+    if nd < _LEAST_SOLID:
+        c = spread / (LINE_F**-3.5 - LINE_C**-3.5)
+        return Dispersion("conrady", (nd - c * LINE_D**-3.5, 0.0, c), GAS_RANGE)
     target = np.array([nd, spread, (0.6438 - 0.001682 * vd + partial_dispersion) * spread])
     w = np.array([LINE_D, LINE_F, LINE_C, LINE_G])
     terms = np.stack([np.ones(4), w**-2, w**-4], axis=1)

@@ -46,6 +46,11 @@ def wavelengths_within(wavelength: ArrayLike, wavelength_range: tuple[float, flo
     return w
 
 
+def medium_label(name: str, kind: str) -> str:
+    """Return what a medium of a kind is called in messages: by its name, where it has one."""
+    return f"{kind} {name}" if name else f"this {kind}"
+
+
 @check_arguments
 class Medium(ABC):
     """A refractive medium: immutable and hashable.
@@ -148,7 +153,7 @@ class Sellmeier(Medium):
         check_wavelength_range(self.wavelength_range)
 
     def index(self, wavelength: ArrayLike) -> np.ndarray:  # noqa: D102
-        w = wavelengths_within(wavelength, self.wavelength_range, "this glass")
+        w = wavelengths_within(wavelength, self.wavelength_range, medium_label(self.name, "glass"))
         squared = (w * 1e6) ** 2
         with np.errstate(all="ignore"):
             terms = (b * squared / (squared - c) for b, c in zip(self.B, self.C, strict=True))

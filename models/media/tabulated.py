@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError
-from .medium import Medium, wavelengths_within
+from .medium import Medium, medium_label, wavelengths_within
 
 # A third of a second to import: only where there is such a table.
 if TYPE_CHECKING:
@@ -66,7 +66,10 @@ class TabulatedIndex(Medium):
         return self.wavelengths[0], self.wavelengths[-1]
 
     def index(self, wavelength: ArrayLike) -> np.ndarray:  # noqa: D102
-        w = np.clip(wavelengths_within(wavelength, self.wavelength_range, "this table"), *self.wavelength_range)
+        w = np.clip(
+            wavelengths_within(wavelength, self.wavelength_range, medium_label(self.name, "table")),
+            *self.wavelength_range,
+        )
         if self.interpolation == "linear":
             return np.asarray(np.interp(w, self.wavelengths, self.indices))
         return np.asarray(self._cubic(w))

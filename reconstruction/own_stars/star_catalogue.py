@@ -14,7 +14,7 @@ from astropy.table import Table
 
 from ...core.arguments import check_arguments
 from ...core.errors import ProductError
-from ...core.files import parsing, read_bytes
+from ...core.files import parsing, read_bytes, text_lines
 from .lsst_stamps import is_stamp_file, read_stamp_file
 from .stamp_weights import without_weightless
 
@@ -217,7 +217,7 @@ def _read_fits_parts(path: Path, data: bytes) -> fits.HDUList:
 def _read_ecsv_columns(path: Path, data: bytes) -> dict[str, np.ndarray]:
     """Return the columns of an ECSV table; values left empty are NaN."""
     with parsing(path, "damaged or no ECSV table", ProductError):
-        table = Table.read(data.decode().splitlines(), format="ascii.ecsv")
+        table = Table.read(text_lines(data.decode()), format="ascii.ecsv")
     columns = {}
     for name in table.colnames:
         values = table[name]

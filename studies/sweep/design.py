@@ -11,7 +11,7 @@ from astropy.table import Table
 from scipy.stats import norm, qmc
 
 from ...core.errors import ConfigError
-from ...core.files import parsing, require_file
+from ...core.files import parsing, read_bytes, text_lines
 from ...core.random_streams import stream
 from .file import Design, Point, SweepFile, SweptParameter
 
@@ -112,9 +112,9 @@ def _quantiles(parameter: SweptParameter, u: np.ndarray) -> list[Any]:
 
 def _from_table(path: Path) -> list[Point]:
     """Return the rows of an ECSV table as points."""
-    require_file(path, ConfigError)
+    data = read_bytes(path, ConfigError)
     with parsing(path, "no ECSV table", ConfigError):
-        table = Table.read(path, format="ascii.ecsv")
+        table = Table.read(text_lines(data.decode()), format="ascii.ecsv")
     if not len(table):
         raise ConfigError("no rows; expected at least one point", file=path)
     points = []

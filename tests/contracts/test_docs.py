@@ -70,6 +70,8 @@ def test_the_page_of_lens_files_runs_on_lenses(tmp_path, monkeypatch):
     shutil.copy(LENSES / "lens1.zmx", tmp_path / "lens.zmx")
     shutil.copy(GLASSES, tmp_path / "schott.agf")
     shutil.copy(OPTILAND, tmp_path / "lens.json")
+    zoom = (LENSES.parent / "lenses" / "triplet.zmx").read_text()
+    (tmp_path / "zoom.zmx").write_text(zoom + "MNUM 3 1\nTHIC 2 3 5\n")
     (tmp_path / "lens.len").write_text(
         'LEN NEW "singlet" 100 2\nEBR 5\nANG 1\nTH 1e20\nNXT\nGLA N-BK7\nRD 50\nTH 3\nNXT\nTH 90\nNXT\nEND 3\n'
     )

@@ -14,13 +14,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 
 from ....core.errors import PrescriptionError
+from ....core.files import text_lines
 from ...aperture import Aperture, Circle, Complement
 from ...media.medium import Medium
 from ...media.tabulated import TabulatedIndex
@@ -56,12 +57,20 @@ NUMBERS = {*["THI", "K", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "REX", "REY",
 REFUSED = {
     "DIF": "diffractive surfaces", "GRT": "diffractive surfaces", "XTO": "toroids", "YTO": "toroids",
     "CYL": "cylinders", "RDX": "surfaces of two radii", "NSS": "non-sequential parts", "GRD": "gradient-index media",
+    "ZOO": "zoom positions",
 }  # fmt: skip
+#: Values that may be solved for, and what they are, by the command of the solve.
+SOLVED = {
+    "CUY": ("CURV", "curvature"),
+    "RDY": ("CURV", "radius"),
+    "THI": ("THI", "thickness"),
+    "PIM": ("THI", "thickness"),
+}
 #: Commands without effect on rays: names, variables and couplings, weights, solves, whose solution stands in the file,
 #: and drawing.
 _IGNORED = """
 LEN NEW DER INI GO CA CCY THC KC AC BC CC DC EC FC GC HC IC JC ADC BDC CDC XDC YDC ZDC CUM UMY SPH CON ASP RDM
-WTX WTY VIE DRA COM CUX THM GLC CRA POL CLS WID
+WTX WTY VIE DRA COM CUX THM GLC CRA POL CLS WID UID DOR
 """
 IGNORED = frozenset(_IGNORED.split())
 #: Distance of the object from which it is at infinity [lens unit].
@@ -89,7 +98,7 @@ def read_codev_file(path: Path, findings: Findings, glasses: Glasses) -> LensDes
 def _commands(path: Path) -> Iterator[Record]:
     """Yield the commands of a file: parted by line ends and semicolons, carried on by &, comments from ! to the end."""
     carried, first = "", 1
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(text_lines(read_text(path)), start=1):
         first = first if carried else number
         text = carried + line.split("!")[0].rstrip()
         if text.endswith("&"):
@@ -111,10 +120,11 @@ def _largest(records: list[Record], default: Source) -> Source:
 
 @dataclass
 class _Surface(FileSurface):
-    """Commands of one surface, the name of its glass, and whether it is the stop."""
+    """Commands of one surface, the name of its glass, whether it is the stop, and the solves of its values."""
 
     glass_name: str = ""
     stop: bool = False
+    solves: list[Record] = field(default_factory=list)
 
     @property
     def mirror(self) -> bool:
@@ -203,6 +213,8 @@ class _Reader:
                 command.numbers()
             self.system.pop(key, None)
             self.system[key] = command
+        elif key in REFUSED:
+            self.findings.report(command.problem(f"{command.shown}: {REFUSED[key]} are not read"))
         elif key not in IGNORED:
             self.findings.report(command.problem(f"{command.shown}: this command is not understood"))
 
@@ -221,7 +233,10 @@ class _Reader:
 
     def _surface(self, command: Record, surface: _Surface) -> None:
         key, words = command.keyword, command.words
-        if key in ("RDY", "CUY"):
+        if key in SOLVED and words and words[0].isalpha():
+            # The solve of a value, whose solution stands at the beginning of the surface: CUY UMY -0.1.
+            surface.solves.append(command)
+        elif key in ("RDY", "CUY"):
             surface.commands["CURV"] = command
             surface.values["CURV"] = self._curvature(command, radius=key == "RDY")
         elif key == "GLA":
@@ -242,7 +257,7 @@ class _Reader:
         elif key in REFUSED:
             self.findings.report(command.problem(f"{command.shown}: {REFUSED[key]} are not read"))
         elif key == "PIM":
-            surface.commands[key] = command
+            surface.solves.append(command)
         elif key not in IGNORED:
             self.findings.report(command.problem(f"{command.shown}: this command is not understood"))
 
@@ -315,10 +330,13 @@ class _Reader:
             )
 
     def _check_solves(self) -> None:
-        """Refuse a paraxial image solve (PIM) whose solution does not stand in the file."""
+        """Refuse a solve whose solution does not stand in the file: PIM is that of a thickness."""
         for surface in self.surfaces[:-1]:
-            if "PIM" in surface.commands and not surface.get("THI"):
-                raise surface.commands["PIM"].problem("PIM: expected the thickness of the solve in the file; it is 0")
+            for command in surface.solves:
+                key, name = SOLVED[command.keyword]
+                if not surface.get(key):
+                    solve = command.keyword if command.keyword == "PIM" else command.shown
+                    raise command.problem(f"{solve}: expected the {name} of the solve in the file; it is 0")
 
     def _state_system(self) -> None:
         lens, system = self.description, self.system
@@ -388,8 +406,8 @@ class _Reader:
         if numbers:
             # Index and Abbe number as they are.
             return numbered_glass(float(numbers[1]), float(numbers[2]), 0.0, name, command)
-        name = name.strip("'").split("_")[0].upper()
-        return self.private[name] if name in self.private else self.glasses.named(name, command)
+        name, *makers = name.strip("'").upper().split("_")
+        return self.private[name] if name in self.private else self.glasses.named(name, command, makers)
 
     def _aperture(self, surface: _Surface) -> Aperture | None:
         unit = self.description.unit

@@ -15,8 +15,9 @@ from ...aperture import Annulus, Circle, Complement, Ellipse, Rectangle
 from ...media.medium import Medium
 from ...surface import Interaction
 from ...telescope import VACUUM, Telescope
+from ..glass_search import maker_of
 from ..lens.description import LensSurface
-from ..lens.sequence import LensSequence, catalogue_name, maker_of, quoted
+from ..lens.sequence import LensSequence, catalogue_name, quoted
 from ..lens.text import number_text, scaled
 from ..profile import Profile
 from .reader import MMHG, POWERS
@@ -44,8 +45,8 @@ def telescope_to_codev(telescope: Telescope, *, lenient: bool = False) -> str:
     # CODE V's chief rays pass the middle of the stop.
     sequence = LensSequence.of(telescope, FILE, tuple(UNITS), aimed="paraxial", lenient=lenient, afocal=True)
     with error_context(subject=telescope.name):
-        names = sequence.glass_names("a private glass, a table of indices", "_")
-        words = {medium: _glass_word(name) for medium, name in names.items()}
+        names = sequence.glass_names("a private glass, a table of indices", "_", stated_maker=True)
+        words = {medium: _glass_word(medium, name) for medium, name in names.items()}
         unit = sequence.unit
         lines = ["RDM;LEN", f"TITLE '{quoted(sequence.title, _FORBIDDEN)}'", f"DIM {UNITS[unit]}"]
         lines += [*_system_lines(sequence), *_field_lines(sequence), *_private_lines(sequence, names)]
@@ -59,9 +60,9 @@ def telescope_to_codev(telescope: Telescope, *, lenient: bool = False) -> str:
     return "\n".join([*lines, "GO"]) + "\n"
 
 
-def _glass_word(name: str) -> str:
+def _glass_word(medium: Medium, name: str) -> str:
     """Return the name of a glass without hyphens and with its maker, as CODE V has it."""
-    maker = maker_of(name)
+    maker = maker_of(medium) if name == medium.name else None
     return f"{name.replace('-', '')}_{maker.upper()}" if maker else name
 
 
@@ -106,7 +107,7 @@ def _field_lines(sequence: LensSequence) -> Iterator[str]:
 
 def _private_lines(sequence: LensSequence, names: Mapping[Medium, str]) -> Iterator[str]:
     for medium, name in names.items():
-        if name == catalogue_name(medium):
+        if name == catalogue_name(medium, stated_maker=True):
             continue
         # From long wavelengths to short ones, as CODE V lists them.
         waves, indices = (row[::-1] for row in sequence.index_table(medium, _ENTRIES))

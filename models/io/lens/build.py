@@ -49,7 +49,7 @@ def read_lens(
     with error_context(file=path):
         telescope = telescope_of(reader(path, findings, Glasses(path, glass_catalogues)))
     for text in impossible_thicknesses(telescope):
-        findings.note(PrescriptionError(text, file=path), "read as it is: rays go back within it")
+        findings.doubt(PrescriptionError(text, file=path), "read as it is: rays go back within it")
     return telescope
 
 
@@ -261,7 +261,7 @@ def _linked(telescope: Telescope, lens: LensDescription) -> Telescope:
             pickups.append(met)
         else:
             text = f"{choices[0].address}: the file has another value"
-            lens.findings.note(source.problem(text), "it is not kept")
+            lens.findings.doubt(source.problem(text), "it is not kept")
     if not (pickups or lens.solves):
         return telescope
     return telescope.with_design(pickups=tuple(pickups), solves=tuple(lens.solves))

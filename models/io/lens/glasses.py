@@ -9,9 +9,9 @@ from pathlib import Path
 
 from ....core.errors import PrescriptionError
 from ...media.dispersion import model_glass
-from ...media.medium import Medium
+from ...media.medium import LINE_D, Medium, abbe_number, with_index_change
 from ..glass_catalogue import GlassCatalogue
-from ..glass_search import find_glass, glass_hint
+from ..glass_search import find_glass, glass_hint, makers_in, readable_catalogues
 from .source import Source
 
 
@@ -21,15 +21,15 @@ class Glasses:
     def __init__(self, path: Path, catalogues: Iterable[GlassCatalogue | str | os.PathLike[str]]) -> None:
         self.first = [c if isinstance(c, GlassCatalogue) else GlassCatalogue.read(c) for c in catalogues]
         beside = path.with_suffix(".agf")
-        self.first += [GlassCatalogue.read(beside)] if beside.is_file() else []
+        self.first += readable_catalogues([beside]) if beside.is_file() else []
 
-    def get(self, name: str) -> Medium | None:
-        """Return the glass of a name, or None."""
-        return find_glass(name.upper(), self.first)
+    def get(self, name: str, catalogues: Iterable[str] = ()) -> Medium | None:
+        """Return the glass of a name, or None; `catalogues` are the names of those that the file states."""
+        return find_glass(name.upper(), self.first, makers_in(catalogues))
 
-    def named(self, name: str, source: Source) -> Medium:
+    def named(self, name: str, source: Source, catalogues: Iterable[str] = ()) -> Medium:
         """Return the glass of a name; PrescriptionError of the statement if no catalogue has it."""
-        medium = self.get(name)
+        medium = self.get(name, catalogues)
         if medium is None:
             raise self.missing(name, source)
         return medium
@@ -44,3 +44,16 @@ def numbered_glass(nd: float, vd: float, deviation: float, name: str, source: So
     """Return the model glass of an index, an Abbe number and a deviation; PrescriptionError of the statement."""
     with source.context():
         return replace(model_glass(nd, vd, deviation), name=name)
+
+
+def offset_glass(medium: Medium, index_change: float, abbe_change: float, source: Source) -> Medium:
+    """Return a glass with another index and Abbe number at the d line; PrescriptionError of the statement."""
+    if not (index_change or abbe_change):
+        return medium
+    with source.context():
+        nd, abbe = float(medium.index(LINE_D * 1e-6)), abbe_number(medium)
+        if not abbe + abbe_change > 0:
+            raise source.error("an Abbe number above 0")
+        # The Abbe number is that of the changed index.
+        dispersion = (nd - 1.0 + index_change) / (nd - 1.0) * abbe / (abbe + abbe_change)
+        return with_index_change(medium, index_change, dispersion)

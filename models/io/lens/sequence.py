@@ -24,8 +24,8 @@ from ...paraxial import stop_makes_pupil, stop_states_rays, with_true_aperture
 from ...shapes.shape import Plane
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope
-from ..glass_catalogue import MAKERS, GlassCatalogue
-from ..glass_search import find_glass
+from ..glass_catalogue import CATALOGUES, GlassCatalogue
+from ..glass_search import find_glass, maker_of, makers_in
 from ..writable import report_pupil_plane, report_unheld, require_met, require_sequential
 from .description import PUPIL_PLANE, LensSurface
 from .frame import HALF_TURN, rotated_aperture, rotated_shape
@@ -177,15 +177,16 @@ class LensSequence:
         self.leave_out(text, "written as the diameter of the entrance pupil")
         return "entrance_pupil", self.telescope.pupil_diameter
 
-    def glass_names(self, table: str, forbidden: str = "") -> Mapping[Medium, str]:
+    def glass_names(self, table: str, forbidden: str = "", *, stated_maker: bool = False) -> Mapping[Medium, str]:
         """Return a name for each medium but air; those of catalogues are theirs, the others are in capitals and new.
 
-        Names of catalogues with a `forbidden` character are not taken. Unless lenient, PrescriptionError for a
+        Names of catalogues with a `forbidden` character are not taken; with `stated_maker` the file has that of the
+        maker too. Unless lenient, PrescriptionError for a
         dispersion that the file has to hold as a table, `table` of its kind.
         """
         names: dict[Medium, str] = {}
         for medium in dict.fromkeys(m for s in self.surfaces for m in (s.before, s.after) if m != VACUUM):
-            listed_name = catalogue_name(medium)
+            listed_name = catalogue_name(medium, stated_maker=stated_maker)
             if listed_name is not None and not set(listed_name) & set(forbidden):
                 names[medium] = listed_name
                 continue
@@ -218,18 +219,17 @@ def stated_wavelengths(t: Telescope) -> tuple[float, ...]:
     return t.design_data.wavelengths or tuple(dict.fromkeys([t.default_wavelength, *(t.band or ())]))
 
 
-def catalogue_name(medium: Medium) -> str | None:
-    """Return the name under which the reader of lens files finds a medium in the bundled catalogues, or None."""
+def catalogue_name(medium: Medium, *, stated_maker: bool = False) -> str | None:
+    """Return the name under which the reader of lens files finds a medium in the bundled catalogues, or None.
+
+    With `stated_maker` the file has the name of its maker beside that of the glass.
+    """
     name = medium.name
-    for catalogue in (GlassCatalogue.bundled(), *map(GlassCatalogue.of_maker, MAKERS)):
-        if name in catalogue:
-            return name if find_glass(name) == medium else None
-    return None
-
-
-def maker_of(name: str) -> str | None:
-    """Return the maker whose bundled catalogue has a glass."""
-    return next((maker for maker in MAKERS if name in GlassCatalogue.of_maker(maker)), None)
+    # Substances are not written by name: other programs have none of these.
+    if not any(name in c for c in (GlassCatalogue.bundled(), *map(GlassCatalogue.of_maker, CATALOGUES[:-1]))):
+        return None
+    makers = makers_in([maker_of(medium) or ""]) if stated_maker else ()
+    return name if find_glass(name, makers=makers) == medium else None
 
 
 def quoted(text: str, forbidden: str) -> str:

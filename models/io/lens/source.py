@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from ....core.errors import PachonError, PrescriptionError, PrescriptionWarning
+from ....core.errors import PachonError, PrescriptionError, PrescriptionNote, PrescriptionWarning
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +64,15 @@ class Findings:
         """Raise the error or, if lenient, warn; `instead` is the assumption in its place, for the warning."""
         if not self.lenient:
             raise error
-        self.note(error, instead)
+        self._warn(error, instead, PrescriptionWarning)
+
+    def doubt(self, error: PachonError, instead: str = "") -> None:
+        """Warn of what is likely a fault of the file and read as it is, in either mode."""
+        self._warn(error, instead, PrescriptionWarning)
 
     def note(self, error: PachonError, instead: str = "") -> None:
-        """Warn of what is read in another way, `instead`, in either mode."""
-        warnings.warn(f"{error}; {instead}" if instead else str(error), PrescriptionWarning, stacklevel=2)
+        """Say what is read in another way, `instead`, in either mode."""
+        self._warn(error, instead, PrescriptionNote)
+
+    def _warn(self, error: PachonError, instead: str, category: type[PrescriptionWarning]) -> None:
+        warnings.warn(f"{error}; {instead}" if instead else str(error), category, stacklevel=3)

@@ -8,20 +8,27 @@ from decimal import Decimal
 from pathlib import Path
 
 from ....core.errors import PrescriptionError, cut_short
-from ....core.files import read_bytes
+from ....core.files import read_bytes, text_lines
 from .source import Source
+
+#: Beginnings of files in UTF-16.
+BYTE_ORDER_MARKS = (b"\xff\xfe", b"\xfe\xff")
+#: Characters at the beginning of a file by which UTF-16 without such a mark is known.
+_BEGINNING = 16
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file in UTF-16 (with a byte order mark), UTF-8 or Windows-1252."""
+    """Return the text of a file in UTF-16, UTF-8 or Windows-1252."""
     return decoded(read_bytes(path, PrescriptionError), str(path))
 
 
 def decoded(raw: bytes, source: str) -> str:
     """Return the text of the bytes of a file, as :func:`read_text` does; `source` is its name for messages."""
-    wide = raw.startswith((b"\xff\xfe", b"\xfe\xff"))
+    # Without a byte order mark each second byte of a text in English tells.
+    unmarked = len(raw) > 2 * _BEGINNING and not any(raw[1 : 2 * _BEGINNING : 2]) and all(raw[: 2 * _BEGINNING : 2])
+    wide = unmarked or raw.startswith(BYTE_ORDER_MARKS)
     try:
-        text = raw.decode("utf-16" if wide else "utf-8-sig")
+        text = raw.decode("utf-16-le" if unmarked else "utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError:
         if wide:
             raise PrescriptionError("not a UTF-16 text file, although it begins like one", file=source) from None
@@ -122,7 +129,7 @@ def records(text: str, source: str) -> list[Record]:
     """Return the lines of a file that are not empty; those from a line "SURF n" on belong to surface n."""
     lines = []
     place = ""
-    for number, content in enumerate(text.splitlines(), start=1):
+    for number, content in enumerate(text_lines(text), start=1):
         words = content.split()
         if words:
             keyword, *following_words = words

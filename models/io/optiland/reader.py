@@ -34,6 +34,10 @@ FIELD_TYPES = {
     "AngleField": "angle", "ObjectHeightField": "object_height", "ParaxialImageHeightField": "paraxial_image_height",
     "RealImageHeightField": "real_image_height",
 }  # fmt: skip
+#: Types of fields of files of versions before 0.5.
+_EARLY_FIELD_TYPES = {kind: kind for kind in ("angle", "object_height", "paraxial_image_height", "real_image_height")}
+#: Interaction of surfaces that is read.
+_INTERACTION = "RefractiveReflectiveModel"
 #: Ray aiming by that of optiland; "paraxial" aims at the paraxial entrance pupil, as others do without.
 AIMING = {"paraxial": "off", "iterative": "real", "robust": "real", "cached": "real"}
 #: Micrometres of a unit of wavelength.
@@ -89,10 +93,13 @@ def _system(root: JsonObject, lens: LensDescription) -> float:
 
 def _fields(fields: JsonObject, lens: LensDescription) -> None:
     points = list(fields.children("fields", "field"))
-    definition = fields.child("field_definition")
+    # Before version 0.5 the fields themselves have their kind, in other words.
+    early = "field_definition" not in fields
+    definition = fields if early else fields.child("field_definition")
+    kinds = _EARLY_FIELD_TYPES if early else FIELD_TYPES
     kind = definition.text("field_type")
-    if kind not in FIELD_TYPES:
-        definition.refuse("field_type", f"one of {', '.join(FIELD_TYPES)}")
+    if kind not in kinds:
+        definition.refuse("field_type", f"one of {', '.join(kinds)}")
     columns = {
         key: [point.number(key, default) for point in points]
         for key, default in (("x", None), ("y", None), ("weight", 1.0), ("vx", 0.0), ("vy", 0.0))
@@ -105,13 +112,13 @@ def _fields(fields: JsonObject, lens: LensDescription) -> None:
 
     lens.telecentric = fields.flag("telecentric")
     lens.state_fields(
-        largest("x", "y"), FIELD_TYPES[kind], zip(columns["x"], columns["y"], strict=True) if points else [(0.0, 0.0)]
+        largest("x", "y"), kinds[kind], zip(columns["x"], columns["y"], strict=True) if points else [(0.0, 0.0)]
     )
     lens.state_field_weights(largest("weight"), columns["weight"])
     no_decentres: Sequence[float] = ()
     lens.state_vignetting(largest("vx", "vy"), no_decentres, no_decentres, columns["vx"], columns["vy"])
     for point in points:
-        point.report_rest(lens.findings)
+        point.report_rest(lens.findings, ("field_type",) if early else ())
 
 
 def _object(surface: JsonObject, first: JsonObject, lens: LensDescription, glasses: Glasses) -> None:
@@ -126,9 +133,12 @@ def _object(surface: JsonObject, first: JsonObject, lens: LensDescription, glass
 
 
 def _surface(surface: JsonObject, lens: LensDescription, stop_radius: float, glasses: Glasses) -> None:
-    geometry, interaction, findings = surface.child("geometry"), surface.child("interaction_model"), lens.findings
-    kind = interaction.text("type")
-    if kind != "RefractiveReflectiveModel":
+    geometry, findings = surface.child("geometry"), lens.findings
+    # Before version 0.5 the surface itself has what its interaction states.
+    early = "interaction_model" not in surface
+    interaction = surface if early else surface.child("interaction_model")
+    kind = _INTERACTION if early else interaction.text("type")
+    if kind != _INTERACTION:
         findings.report(interaction.problem(f"interaction_model {kind}: expected RefractiveReflectiveModel"))
     if "bsdf" in interaction:
         findings.report(interaction.problem("interaction_model.bsdf: scattering is not read"))
@@ -148,7 +158,7 @@ def _surface(surface: JsonObject, lens: LensDescription, stop_radius: float, gla
         stop=stop,
     )
     lens.add(placed, mirror=mirror)
-    surface.report_rest(findings, ("type", "thickness", "surface_type", "material_post"))
+    surface.report_rest(findings, ("type", "thickness", "surface_type", "material_post", "material_pre"))
 
 
 def _frame(system: JsonObject) -> tuple[np.ndarray, np.ndarray]:

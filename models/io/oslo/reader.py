@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ....core.errors import PrescriptionError, error_context
+from ....core.files import text_lines
 from ...media.dispersion import model_glass
 from ...media.medium import Medium
 from ...media.tabulated import TabulatedIndex
@@ -24,13 +25,13 @@ from ...shapes.shape import Shape
 from ...telescope import VACUUM
 from ..lens import shapes
 from ..lens.apertures import ring
+from ..lens.axial_ray import AxialRay
 from ..lens.description import Format, LensDescription, LensSurface
 from ..lens.glasses import Glasses
 from ..lens.shapes import polynomial_powers, radius_of
 from ..lens.source import Findings, Source
 from ..lens.text import FileSurface, Record, read_text, scaled
 from .frames import surface_frames
-from .solves import AxialRay
 
 FORMAT = Format("OSLO", "one of EBR, NAO, FNO, NAP", "WV", "AST")
 #: Units of length [m] by their millimetres.
@@ -84,7 +85,7 @@ def read_oslo_file(path: Path, findings: Findings, glasses: Glasses) -> LensDesc
 
 def _commands(path: Path) -> Iterator[Record]:
     """Yield the commands of a file: parted by line ends and semicolons, comments from // to the end."""
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(text_lines(read_text(path)), start=1):
         # Texts in quotation marks hold semicolons and slashes.
         for statement in re.findall(r'(?:"[^"]*"|//.*|[^;])+', line):
             words = re.findall(r'"[^"]*"|//.*|[^\s,"]+', statement)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import textwrap
 
+from ....core.files import text_lines
+
 #: What a key of the header is, for somebody who sees such a file for the first time.
 KEYS = {
     "units": "of all numbers in this file",
@@ -29,7 +31,7 @@ def with_comments(text: str, *paragraphs: str) -> str:
     """Return the text of a prescription file with paragraphs at its head, and a comment at each key of its header."""
     head = [f"# {line}" for p in (*paragraphs, FRAME) for line in textwrap.wrap(p, _WIDTH)]
     body = []
-    for line in text.splitlines():
+    for line in text_lines(text):
         note = KEYS.get(line.partition(":")[0])
         body.append(f"{line}  # {note}" if note else line)
     return "\n".join([*head, *body]) + "\n"

@@ -173,6 +173,17 @@ def number_text(value: float) -> str:
     return "flat" if math.isinf(value) else re.sub(r"^(-?\d+)e", r"\1.0e", repr(float(value) + 0.0))
 
 
+def _quoted(text: str) -> str:
+    """Return a text in quotation marks, with escapes for what YAML refuses or takes for the end of a line."""
+    quoted = json.dumps(text.encode("utf-8", "replace").decode(), ensure_ascii=False)
+    if quoted.isprintable():
+        return quoted
+    # Unlike JSON's, escapes of YAML have eight digits beyond the first plane.
+    return "".join(
+        c if c.isprintable() else f"\\u{ord(c):04x}" if c <= "\uffff" else f"\\U{ord(c):08x}" for c in quoted
+    )
+
+
 def flow(value: Any, number: Callable[[float], str] = number_text) -> str:
     """Return a value in YAML's flow style, on one line; `number` gives the text of a float."""
     if isinstance(value, Mapping):
@@ -185,5 +196,5 @@ def flow(value: Any, number: Callable[[float], str] = number_text) -> str:
         return value
     if isinstance(value, str):
         plain = re.fullmatch(r"[A-Za-z_][A-Za-z0-9_.()/;+ -]*", value) and value == value.strip()
-        return value if plain and yaml.safe_load(value) == value else json.dumps(value, ensure_ascii=False)
+        return value if plain and yaml.safe_load(value) == value else _quoted(value)
     return number(value)

@@ -46,7 +46,9 @@ class _Layout:
 LAYOUTS = {0xEC: _Layout(0x10, 8, 0x30, "utf-16-le", 0x288), 0xEA: _Layout(0xC, 4, 0x20, "iso-8859-1", 0x14C)}
 
 
-def read_zemax_archive(path: Path, findings: Findings, catalogues: Glasses) -> LensDescription:
+def read_zemax_archive(
+    path: Path, findings: Findings, catalogues: Glasses, configuration: int | None = None
+) -> LensDescription:
     """Return the description of the lens file of an archive; glasses of its catalogues come first.
 
     PrescriptionError if it is no archive, is damaged, or does not hold one lens file.
@@ -64,14 +66,15 @@ def read_zemax_archive(path: Path, findings: Findings, catalogues: Glasses) -> L
         try:
             catalogue = GlassCatalogue.parse(text, name)
         except PrescriptionError as error:
-            findings.report(error, "this catalogue is left out")
+            findings.note(error, "this catalogue is left out")
         else:
             glasses |= {glass: catalogue[glass] for glass in catalogue}
     if len(lenses) != 1:
         lens_names = ", ".join(map(shown, lenses)) or "none"
         raise PrescriptionError(f"expected one lens file (.zmx) in the archive, found {lens_names}", file=path)
     (lens,) = lenses.values()
-    return described(replace(parse_zemax_file(lens, path, findings), glasses=glasses), findings, catalogues)
+    file = replace(parse_zemax_file(lens, path), glasses=glasses)
+    return described(file, findings, catalogues, configuration)
 
 
 def _members(data: bytes, path: Path) -> Iterator[tuple[str, bytes]]:

@@ -1,16 +1,17 @@
 """Parts of a Zemax lens file (.zmx): header, surfaces, and the keywords that are ignored.
 
 A file is a list of lines "KEYWORD words". The header is followed by one block for each surface, which begins with SURF
-and whose lines are indented, and by merit function, tolerances and configurations, which are not read.
+and whose lines are indented, by merit function and tolerances, which are not read, and by `configurations`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ....core.errors import PrescriptionError
+from ....core.errors import PrescriptionError, cut_short
+from ....core.files import text_lines
 from ...media.medium import Medium
 from ..lens.source import Findings
 from ..lens.text import Record, read_text, records
@@ -20,14 +21,14 @@ from ..lens.text import Record, read_text, records
 _HEADER = """
 VERS MODE NAME AUTH NOTE IWDP PFIL LANG GFAC GCAT RAIM PUSH SDMA OMMA ROPD HYPR PICB FWGN FWGT FCOM VDXN VDYN VCXN
 VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDSX VDSY WWGT WWGN POLS GLRS GSTD NSCD COFN LUID EERA OPDX PUPD EFFL DMFS CONF
-PMAG TOTR TRAC MNCA MNEA MNCG MNEG MXCA MXCG RGLA TCMM ISNA STAG SSAG XPIX YPIX FTIT DFLT RSCE DBDT STUD
+PMAG TOTR TRAC TOLE TCOM MNCA MNEA MNCG MNEG MXCA MXCG RGLA TCMM ISNA STAG SSAG XPIX YPIX FTIT DFLT RSCE DBDT STUD
 """
 #: Keywords of a surface without effect on rays: comments, coatings, scatter, drawing and tolerancing settings,
 #: automatic semi-diameters, and solves, variables and pick-ups, whose solution stands in the file.
 _SURFACE = """
 COMM SSID SLAB HIDE MIRR POPS COAT FIMP SCAT STRE MEMA DIAM EDGE TCED TCEC TCMM EXPN LBLK CHZN BORE PICK CCOM VCUR
 VDSZ VPAR VCON VGLA VXDT VDIA PZUP PCUP PPAR PXDT PCOP PDIA PGLA PKUP CPKP MAZH MARG CHAZ CHAA POSI COMP CURF GLCZ
-RSCE TRAC FNOT BRKS SPAC ROWC SCOL STUD OEMA
+TCOM TOLE RSCE TRAC FNOT BRKS SPAC ROWC SCOL STUD OEMA
 """
 #: Keywords that only stand after the surfaces, for files without indentation.
 TRAILER = ("BLNK", "TOL", "MNUM", "MOFF")
@@ -87,7 +88,8 @@ class Block:
 class ZemaxFile:
     """Parts of a lens file: lines before the surfaces, surfaces from the object to the image, lines after.
 
-    `glasses` are those of catalogues packed with it, by name in capitals.
+    `glasses` are those of catalogues packed with it, by name in capitals. The thickness of surfaces with a number in
+    `solved` is that at which the paraxial marginal ray meets the axis, and not the one that is stated.
     """
 
     path: Path
@@ -95,17 +97,18 @@ class ZemaxFile:
     surfaces: list[Block]
     trailer: Block
     glasses: Mapping[str, Medium] = field(default_factory=dict)
+    solved: frozenset[int] = frozenset()
 
 
-def read_zemax_file(path: Path, findings: Findings) -> ZemaxFile:
+def read_zemax_file(path: Path) -> ZemaxFile:
     """Return the parts of a lens file; PrescriptionError if it is not sequential or has fewer than three surfaces."""
-    return parse_zemax_file(read_text(path), path, findings)
+    return parse_zemax_file(read_text(path), path)
 
 
-def parse_zemax_file(text: str, path: Path, findings: Findings) -> ZemaxFile:
+def parse_zemax_file(text: str, path: Path) -> ZemaxFile:
     """Return the parts of the text of a lens file, as :func:`read_zemax_file` does; `path` is for messages."""
     source = str(path)
-    indented = {i for i, line in enumerate(text.splitlines(), start=1) if line[:1].isspace()}
+    indented = {i for i, line in enumerate(text_lines(text), start=1) if line[:1].isspace()}
     header = trailer = Block(source)
     current = header
     surfaces: list[Block] = []
@@ -129,8 +132,25 @@ def parse_zemax_file(text: str, path: Path, findings: Findings) -> ZemaxFile:
     file = ZemaxFile(path, header, surfaces, trailer)
     if trailer is header:
         file.trailer = Block(source)
-    configurations = file.trailer.number("MNUM", 1.0)
-    if configurations > 1:
-        text = f"MNUM {configurations:.0f}: one configuration is read, the one the file was saved in"
-        findings.report(header.problem(text))
     return file
+
+
+def set_word(
+    block: Block,
+    keyword: str,
+    place: int,
+    word: str,
+    filler: str = "0",
+    matches: Callable[[Record], bool] | None = None,
+) -> None:
+    """Put a word in its place in the last line with a keyword that matches, or in a new line where there is none."""
+    places = [i for i, line in enumerate(block.lines) if line.keyword == keyword and (matches is None or matches(line))]
+    if place < 0 or (matches is not None and not places):
+        raise block.problem(f"{keyword}: {cut_short(word)}: expected a field or wavelength that the file has")
+    if not places:
+        block.lines.append(Record(block.file, block.place, keyword))
+        places = [len(block.lines) - 1]
+    line = block.lines[places[-1]]
+    words = [*line.words, *[filler] * (place + 1 - len(line.words))]
+    words[place] = word
+    block.lines[places[-1]] = replace(line, words=tuple(words), text=" ".join(words))

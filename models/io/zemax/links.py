@@ -1,13 +1,14 @@
 """Pickups and solves of a Zemax file: radius, thickness and glass of another surface, and a paraxial back focus.
 
-``CURV value 4 surface scale``, ``PZUP surface scale offset``, ``GLAS name 2 surface``, ``MAZH height zone``. Of others
-the solution stands in the file; they are named in a warning.
+``CURV value 4 surface scale``, ``PZUP surface scale offset``, ``GLAS name 2 surface``, ``MAZH height zone``, and, as a
+pickup, ``TCOM surface sum``. Of others the solution stands in the file; they are named in a note.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -40,8 +41,26 @@ _CURVATURE_SOLVES = {
 }
 #: Lines of pickups and solves without a place in a telescope; PDIA and PZUP of drawing sizes and thicknesses apart.
 _UNKEPT = frozenset(
-    ("PCUP", "PPAR", "PXDT", "PCOP", "PGLA", "PKUP", "CPKP", "MARG", "CHAZ", "CHAA", "POSI", "COMP", "CURF", "GLCZ")
+    (
+        "PCUP",
+        "PPAR",
+        "PXDT",
+        "PCOP",
+        "PGLA",
+        "PKUP",
+        "CPKP",
+        "MARG",
+        "CHAZ",
+        "CHAA",
+        "POSI",
+        "COMP",
+        "CURF",
+        "GLCZ",
+        "TOLE",
+    )
 )
+#: Lines of pickups and solves of a thickness.
+_THICKNESS = frozenset(("PZUP", "MAZH", "TCOM", "TOLE"))
 #: Lines that pickups of Zemax files stand in, by the quantity; a thickness has one of its own.
 _LINES = {"radius": "CURV", "glass": "GLAS"}
 
@@ -72,8 +91,10 @@ def state_links(lens: LensDescription, blocks: list[Block]) -> None:
 
 def _unkept(block: Block, number: int) -> Iterator[str]:
     """Yield the names of pickups and solves of a surface that a telescope has no place for."""
-    # Coordinate breaks become places of surfaces, whatever their parameters follow.
+    # Coordinate breaks become places of surfaces, whatever their parameters follow; the thickness behind one is part
+    # of that of a surface.
     if block.text("TYPE").upper() == "COORDBRK":
+        yield from dict.fromkeys(f"S{number} {line.keyword}" for line in block.lines if line.keyword in _THICKNESS)
         return
     curvature = block.last("CURV")
     kind = 0 if curvature is None else int(curvature.number(1, 0.0))
@@ -94,6 +115,10 @@ def _pickups(
     if number not in names:
         return
     curvature, gap, glass = block.last("CURV"), block.last("PZUP"), block.last("GLAS")
+    if gap is None and (compensator := block.last("TCOM")) is not None:
+        # The sum of two thicknesses is kept.
+        words = (str(compensator.integer(0)), "-1.0", number_text(compensator.number(1)))
+        gap = replace(compensator, words=words)
     if curvature is not None and curvature.number(1, 0.0) == _CURVATURE:
         source, scale = names.get(int(curvature.number(2, 0.0))), curvature.number(3, 1.0)
         if source is not None and source != names[number] and scale:

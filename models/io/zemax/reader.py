@@ -14,11 +14,14 @@ import numpy as np
 
 from ...media.medium import Medium
 from ...rotation import rotation_matrix
+from ...surface import Interaction
 from ...telescope import VACUUM
+from ..lens.axial_ray import AxialRay
 from ..lens.description import LensDescription, LensSurface
-from ..lens.glasses import Glasses, numbered_glass
+from ..lens.glasses import Glasses, numbered_glass, offset_glass
 from ..lens.source import Findings, Source
 from .apertures import read_aperture
+from .configurations import with_configuration
 from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, ZemaxFile, read_zemax_file
 from .links import state_links
 from .shapes import read_shape
@@ -26,18 +29,24 @@ from .system import FORMAT, object_distance, read_system
 
 #: Name of a glass without a name.
 NO_NAME = "___BLANK"
+#: Solve of a glass whose index and Abbe number differ from those of the catalogue.
+_OFFSET = 4
 #: Index and Abbe number that Zemax writes behind the name of a catalogue glass, whatever the glass.
 PLACEHOLDER = (1.5, 40.0)
 
 
-def read_zemax_lens(path: Path, findings: Findings, glasses: Glasses) -> LensDescription:
-    """Return the description of a Zemax lens file."""
-    return described(read_zemax_file(path, findings), findings, glasses)
+def read_zemax_lens(
+    path: Path, findings: Findings, glasses: Glasses, configuration: int | None = None
+) -> LensDescription:
+    """Return the description of a Zemax lens file, of several configurations by default of the one it was saved in."""
+    return described(read_zemax_file(path), findings, glasses, configuration)
 
 
-def described(file: ZemaxFile, findings: Findings, glasses: Glasses) -> LensDescription:
+def described(
+    file: ZemaxFile, findings: Findings, glasses: Glasses, configuration: int | None = None
+) -> LensDescription:
     """Return the description of the parts of a lens file."""
-    return _LensReader(file, findings, glasses).lens()
+    return _LensReader(with_configuration(file, configuration, findings), findings, glasses).lens()
 
 
 class _LensReader:
@@ -51,6 +60,8 @@ class _LensReader:
         self.origin, self.axes = np.zeros(3), np.eye(3)
         #: Distance along the axis from the last surface [m].
         self.distance = 0.0
+        #: The paraxial marginal ray, where thicknesses are solved for.
+        self.axial_ray: AxialRay | None = None
         #: Whether a coordinate break is marked as the stop, which the next surface is then.
         self.stop_ahead = False
 
@@ -60,6 +71,8 @@ class _LensReader:
         read_system(lens, header)
         lens.object_distance = object_distance(first, lens.unit)
         lens.medium = self._glass(first)[1]
+        if self.file.solved and lens.design.wavelengths:
+            self.axial_ray = self._axial_ray()
         for number, block in enumerate(self.file.surfaces[1:], start=1):
             self._surface(number, block)
             block.report_rest(IGNORED_SURFACE, self.findings)
@@ -85,8 +98,31 @@ class _LensReader:
         else:
             self._tilt(block)
             self._acting(number, block)
+        if self.axial_ray is not None:
+            if number in self.file.solved and not last:
+                with Source(block.file, block.place).context():
+                    thickness = self.axial_ray.solved_thickness(0.0, "MAZH")
+            self.axial_ray.advance(thickness)
         self.distance += thickness
         self.origin = self.origin + self.axes[:, 2] * thickness
+
+    def _axial_ray(self) -> AxialRay:
+        """Return the marginal ray in front of the first surface, of any height."""
+        lens = self.description
+        index = float(lens.medium.index(lens.primary_wavelength))
+        finite = math.isfinite(lens.object_distance)
+        ray = AxialRay(0.0, 1.0, index, scaled=False) if finite else AxialRay(1.0, 0.0, index, scaled=False)
+        ray.advance(lens.object_distance if finite else 0.0)
+        return ray
+
+    def _pass_axial_ray(self) -> None:
+        """Refract or reflect the marginal ray at the last surface."""
+        if self.axial_ray is None:
+            return
+        surface, before = self.description.surfaces[-1], self.axial_ray.index
+        index = float(surface.after.index(self.description.primary_wavelength))
+        after = -before if surface.interaction == Interaction.MIRROR else math.copysign(index, before)
+        self.axial_ray.pass_surface(surface.shape.curvatures[1], after)
 
     def _break(self, block: Block) -> None:
         values = block.table("PARM")
@@ -141,6 +177,7 @@ class _LensReader:
             number=number,
         )
         lens.add(surface, mirror=mirror)
+        self._pass_axial_ray()
         self.stop_ahead, self.distance = False, 0.0
 
     def _glass(self, block: Block) -> tuple[bool, Medium]:
@@ -157,13 +194,15 @@ class _LensReader:
         # The second word: 1 is a model glass, defined by the numbers that follow and not by its name; 2 a glass picked
         # up from another surface, a model glass too where it has no name.
         solve = line.number(1, 0.0)
-        model = nd > 1 and (solve == 1 or (solve == 2 and name == NO_NAME))
+        model = nd > 0 and (solve == 1 or (solve == 2 and name == NO_NAME))
         if not model:
-            medium = self.glasses.get(name)
+            medium = self.glasses.get(name, self.file.header.text("GCAT").split())
             if medium is not None:
-                return False, medium
+                return False, offset_glass(
+                    medium, line.number(9, 0.0), line.number(10, 0.0), line
+                ) if solve == _OFFSET else medium
             error = self.glasses.missing(name, line)
-            if nd <= 1 or (nd, vd) == PLACEHOLDER:
+            if nd <= 0 or (nd, vd) == PLACEHOLDER:
                 raise error
             self.findings.report(error, "taken as a model glass of its indices")
         return False, numbered_glass(nd, vd, deviation, name, line)

@@ -59,9 +59,9 @@ def object_distance(block: Block, unit: float) -> float:
 
 
 def _read_wavelengths(lens: LensDescription, header: Block) -> None:
-    """State the wavelengths: lines WAVM, as many as FTYP counts, or the older WAVL."""
-    lines = header.all("WAVM")
-    listed, primary = header.last("WAVL"), header.last("PWAV")
+    """State the wavelengths: lines WAVM, as many as FTYP counts, or the older lists WAVN and WAVL."""
+    lines, primary = header.all("WAVM"), header.last("PWAV")
+    lists, weight_lists = ([header.last(name) for name in names] for names in (("WAVN", "WAVL"), ("WWGN", "WWGT")))
     count = header.number("FTYP", 0.0, 3) if (kind := header.last("FTYP")) and len(kind.words) > 3 else 0.0
     if lines:
         table = {line.integer(0): line.number(1) for line in lines}
@@ -74,9 +74,14 @@ def _read_wavelengths(lens: LensDescription, header: Block) -> None:
         amounts = {line.integer(0): line.number(2, 1.0) for line in lines}
         weights = [amounts[number] for number in numbers]
         source: Source = next((line for line in lines if not line.number(1) > 0), lines[0])
-    elif listed is not None:
+    elif (listed := lists[0] or lists[1]) is not None:
         source, values = listed, listed.numbers()
-        stated = header.last("WWGT")
+        stated = weight_lists[lists.index(listed)]
+        # WAVN is as long as the longest list that there may be.
+        if listed is lists[0]:
+            values = values[: int(count)] if 1 <= count <= len(values) else values
+            while len(values) > 1 and values[-1] == 0:
+                values.pop()
         weights = [1.0 if stated is None else stated.number(i, 1.0) for i in range(len(values))]
     else:
         return
@@ -109,8 +114,8 @@ def _read_fields(lens: LensDescription, header: Block) -> None:
 
 
 def _list(header: Block, names: tuple[str, str]) -> tuple[Source, list[float]]:
-    """Return the first of two lines that the header has, and its numbers."""
-    line = next((record for name in names if (record := header.last(name)) is not None), None)
+    """Return the first of two lines that the header has, and its numbers; the other one is an older form of it."""
+    line = next((record for record in [header.last(name) for name in names] if record is not None), None)
     return (Source(header.file, keyword=names[0]), []) if line is None else (line, line.numbers())
 
 

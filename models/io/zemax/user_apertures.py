@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ....core.errors import PrescriptionError, error_context
-from ....core.files import read_bytes
+from ....core.files import read_bytes, text_lines
 from ...aperture import Aperture, Circle, Complement, Ellipse, Intersection, Polygon, Union
 from ..lens.text import Record, decoded, records
 
@@ -56,7 +56,7 @@ def aperture_file(lens: Path, name: str) -> Path | None:
 
 def named_apertures(lens: Path, text: str) -> list[Path]:
     """Return the files of outlines that the text of a lens file names and that are there."""
-    names = dict.fromkeys(name for line in text.splitlines() if (name := aperture_name(line)) is not None)
+    names = dict.fromkeys(name for line in text_lines(text) if (name := aperture_name(line)) is not None)
     return [path for name in names if (path := aperture_file(lens, name)) is not None]
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,8 @@ from .system import design_lines, stop_lines
 MM = 1e-3
 #: Names of the units of a file [m].
 UNIT_NAMES = {1e-3: "MM", 1e-2: "CM", 0.0254: "IN", 1.0: "METER"}
+#: Distance from an axis, over the distance from the origin, that is rounding.
+_ROUNDING = 1e-15
 #: AGF coefficients of a glass of constant index: Schott's formula with its first term alone.
 CONSTANT_FORMULA = 1
 
@@ -81,9 +83,15 @@ def telescope_to_zemax(telescope: Telescope, *, lenient: bool = False) -> tuple[
         )
         surfaces = surfaces[1:]
     numbered: dict[str, tuple[int, list[str]]] = {}
-    for name, surface in zip(t.surface_names, surfaces, strict=True):
-        if len(blocks) > 1:
-            blocks[-1].append(f"DISZ {number_text((surface.distance or 0.0) / unit)}")
+    chains = _chains(t, surfaces)
+    for place, (name, surface) in enumerate(zip(t.surface_names, surfaces, strict=True)):
+        chain = chains[place]
+        if place and chain == chains[place - 1]:
+            # Thicknesses within a chain are along its own axis.
+            blocks[-1].append(f"DISZ {number_text(_along(surfaces[place - 1], surface) / unit)}")
+        elif len(blocks) > 1:
+            gap = surface.position[2] - surfaces[chains[place - 1]].position[2] if place else surface.distance or 0.0
+            blocks[-1].append(f"DISZ {number_text(float(gap) / unit)}")
         lines_of_surface = _surface_lines(surface, glasses, unit)
         if surface.stop:
             lines_of_surface.append("STOP")
@@ -93,12 +101,16 @@ def telescope_to_zemax(telescope: Telescope, *, lenient: bool = False) -> tuple[
             blocks.append(lines_of_surface)
             numbered[name] = len(blocks) - 1, lines_of_surface
             continue
-        values = [*(v / unit for v in surface.position[:2]), *np.degrees(surface.tilt)]
-        blocks.append([*_break_lines(values, 0), *_glass_line(surface.before, glasses), "DISZ 0"])
-        blocks.append([*lines_of_surface, "DISZ 0"])
+        first_of_chain = surfaces[chain]
+        values = [*(v / unit for v in first_of_chain.position[:2]), *np.degrees(first_of_chain.tilt)]
+        if chain == place:
+            blocks.append([*_break_lines(values, 0), *_glass_line(surface.before, glasses), "DISZ 0"])
+        blocks.append(lines_of_surface)
         numbered[name] = len(blocks) - 1, blocks[-1]
-        if surface is not surfaces[-1]:
-            blocks.append([*_break_lines([-v for v in values], 1), *_glass_line(surface.after, glasses)])
+        if chain not in chains[place + 1 :]:
+            blocks[-1].append(f"DISZ {number_text(_along(surface, first_of_chain) / unit)}")
+            if surface is not surfaces[-1]:
+                blocks.append([*_break_lines([-v for v in values], 1), *_glass_line(surface.after, glasses)])
     if not blocks[-1][-1].startswith("DISZ"):
         blocks[-1].append("DISZ 0")
     left_out = add_link_lines(t, numbered, unit)
@@ -107,6 +119,31 @@ def telescope_to_zemax(telescope: Telescope, *, lenient: bool = False) -> tuple[
     for number, block in enumerate(blocks):
         lines += [f"SURF {number}", *(f"  {line}" for line in block)]
     return "\n".join(lines) + "\n", "".join(_catalogue_lines(glasses))
+
+
+def _along(surface: LensSurface, following: LensSurface) -> float:
+    """Return the distance of the vertex of a surface from that of another along the axis of the latter [m]."""
+    return 0.0 if following is surface else float((following.position - surface.position) @ surface.axes[:, 2])
+
+
+def _chains(t: Telescope, surfaces: Sequence[LensSurface]) -> list[int]:
+    """Return for each surface the first one of its chain, which stands on one tilted or decentred axis.
+
+    Where a thickness off the axis follows another one or is solved for, the surfaces on either side of it make a chain;
+    all others stand between coordinate breaks of their own.
+    """
+    data = t.design_data
+    linked = {solve.surface for solve in data.solves}
+    linked |= {name for p in data.pickups if p.quantity == "thickness" for name in (p.surface, p.source)}
+    chains: list[int] = []
+    for place, surface in enumerate(surfaces):
+        previous = surfaces[place - 1] if place else surface
+        is_linked = bool(place) and t.surface_names[place - 1] in linked and surface.off_axis and previous.off_axis
+        aside = surface.position - previous.position - previous.axes[:, 2] * _along(previous, surface)
+        size = max(float(np.abs(s.position).max()) for s in (previous, surface))
+        is_aligned = np.array_equal(surface.axes, previous.axes) and float(np.abs(aside).max()) <= _ROUNDING * size
+        chains.append(chains[-1] if is_linked and is_aligned else place)
+    return chains
 
 
 def _field_lines(t: Telescope, unit: float) -> list[str]:

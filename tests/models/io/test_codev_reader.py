@@ -173,7 +173,7 @@ def test_surfaces_may_be_named_by_number(tmp_path):
         ("  STO", "  STO; CIR 4; CIR OBS 5", "line 20, surface 5: CIR OBS 5: expected a radius below that of CIR 4"),
         ("  SLB 'flint'", "  K -1; A 1e300", "line 17, surface 3: A 1e300: coefficients"),
         ("SO    0.0 0.1e14", "SO 0.0 0.1e14\n  ADE 3", "surface 0: ADE 3: expected a flat object on the axis"),
-        ("648338", "1.0:33", "line 16, surface 3: S -12.* 1.0:33: "),
+        ("648338", "0.0:33", "line 16, surface 3: S -12.* 0.0:33: "),
         ("SO    0.0 0.1e14", "SO    0.0 nan", "surface 0: SO 0.0 nan: expected a number"),
     ],
 )
@@ -312,3 +312,20 @@ def test_radii_without_rdm_are_read_when_lenient(tmp_path, aperture):
     )
     assert d == pytest.approx(1.5168, abs=1e-9)
     assert (d - 1.0) / (f - c) == pytest.approx(64.17, rel=1e-6)
+
+
+def test_solves_whose_solution_stands_in_the_file_are_passed_over(tmp_path):
+    """CODE V writes the solved curvature at the beginning of the surface, and the solve behind it."""
+    text = "RDM;LEN\nEPD 20\nDIM M\nWL 500\nSO 0 1e13\nS 50 5 1.5:60\n  STO\nS {} 96.5\n  CUY UMY -0.1\n  PIM\nSI 0 0\n"
+    text += "  UID '9D3F'; DOR 1\nGO\n"
+    (tmp_path / "lens.seq").write_text(text.format(1175.7))
+    lens = load_telescope(tmp_path / "lens.seq")
+    assert lens.surfaces[1].shape.parameters["radius"] == pytest.approx(-1.1757)
+    (tmp_path / "lens.seq").write_text(text.format(0))
+    with pytest.raises(
+        PrescriptionError, match=r"CUY UMY -0\.1: expected the curvature of the solve in the file; it is 0"
+    ):
+        load_telescope(tmp_path / "lens.seq")
+    (tmp_path / "lens.seq").write_text(text.format(1175.7).replace("DIM M", "DIM M\nZOO 3"))
+    with pytest.raises(PrescriptionError, match="ZOO 3: zoom positions are not read"):
+        load_telescope(tmp_path / "lens.seq")

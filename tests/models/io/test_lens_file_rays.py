@@ -351,3 +351,23 @@ def test_a_floating_stop_is_read_with_a_warning(tmp_path):
     path = changed(DATA / "sasian_triplet.roa", tmp_path / "a.roa", *keys, value=None)
     with pytest.warns(PrescriptionWarning, match="stop_surface is null.*; the first surface is the stop"):
         assert pachon.load_telescope(path).stop_z == pytest.approx(0.0, abs=1e-15)
+
+
+def test_files_of_optiland_before_version_0_5(tmp_path):
+    """Fields had their kind themselves, surfaces whether they reflect; there was no interaction model."""
+    content = json.loads((DATA / "cooke_triplet.json").read_text())
+    del content["fields"]["field_definition"]
+    for point in content["fields"]["fields"]:
+        point["field_type"] = "angle"
+    content["fields"] |= {"field_type": "angle", "object_space_telecentric": False}
+    for surface in content["surface_group"]["surfaces"]:
+        interaction = surface.pop("interaction_model", {})
+        surface |= {key: interaction.get(key) for key in ("is_reflective", "coating", "bsdf")}
+        surface["material_pre"] = {"type": "IdealMaterial", "index": 1.0, "absorp": 0.0}
+    (tmp_path / "cooke_triplet.json").write_text(json.dumps(content))
+    early = pachon.load_telescope(tmp_path / "cooke_triplet.json")
+    assert early == pachon.load_telescope(DATA / "cooke_triplet.json")
+    content["fields"]["field_type"] = "theodolite"
+    (tmp_path / "cooke_triplet.json").write_text(json.dumps(content))
+    with pytest.raises(PrescriptionError, match="field_type = 'theodolite': expected one of angle, object_height"):
+        pachon.load_telescope(tmp_path / "cooke_triplet.json")

@@ -211,3 +211,33 @@ def test_what_is_not_kept_of_a_zemax_file_is_named(tmp_path):
     words = r"pickups and solves S\d CURV \(f-number\), S\d PPAR: their solutions stand in the file; they are not kept"
     with pytest.warns(PrescriptionWarning, match=words):
         pachon.load_telescope(tmp_path / "lens.zmx")
+
+
+@pytest.mark.parametrize("move", ["PARM 3 5", "PARM 1 2", "PARM 3 -7\n  PARM 4 4\n  PARM 2 0.5"])
+def test_a_back_focus_off_the_axis_is_written_back(tmp_path, move):
+    """A lens behind a coordinate break keeps its solve, and the places of its surfaces."""
+    path, again = tmp_path / "lens.zmx", tmp_path / "again.zmx"
+    lines = SYMMETRIC.splitlines(keepends=True)
+    start = next(i for i, line in enumerate(lines) if line.startswith("SURF 1"))
+    moved = [line if line[:4] != "SURF" else f"SURF {int(line[5:]) + 1}\n" for line in lines[start:]]
+    moved = "".join(moved).replace("PZUP 1 1", "PZUP 2 1").replace("GLAS N-BK7 2 1", "GLAS N-BK7 2 2")
+    moved = moved.replace("4 2 -1.", "4 3 -1.").replace("4 1 -2.0", "0 0 0")
+    tilt = f"SURF 1\n  TYPE COORDBRK\n  CURV 0\n  {move}\n  DISZ 0\n"
+    path.write_text("".join(lines[:start]) + tilt + moved)
+    lens = pachon.load_telescope(path)
+    assert [s.kind for s in lens.design_data.solves] == ["marginal_height"]
+    pachon.save_telescope(lens, again)
+    back = pachon.load_telescope(again)
+    assert back.design_data.solves == lens.design_data.solves
+    assert set(back.design_data.pickups) == set(lens.design_data.pickups)
+    for surface, other in zip(lens.surfaces, back.surfaces, strict=True):
+        assert surface.vertex == pytest.approx(other.vertex, abs=1e-16)
+        assert surface.matrix.ravel() == pytest.approx(other.matrix.ravel(), abs=1e-15)
+
+
+def test_a_solve_on_a_coordinate_break_is_said(tmp_path):
+    path = tmp_path / "lens.zmx"
+    break_lines = "SURF 5\n  TYPE COORDBRK\n  CURV 0\n  PARM 3 5\n  DISZ 10\n  MAZH 0 0\nSURF 6\n"
+    path.write_text(SYMMETRIC.replace("  MAZH 0 0\n", "").replace("SURF 5\n", break_lines))
+    with pytest.warns(PrescriptionWarning, match="S5 MAZH: their solutions stand in the file"):
+        pachon.load_telescope(path)

@@ -76,10 +76,8 @@ def test_the_glasses_of_an_archive_come_first(tmp_path):
     glass = next(s.medium_after for s in found if s.medium_after.name == "LAK9")
     assert float(glass.index(550e-9)) == pytest.approx(1.6, rel=1e-15)
     broken = written(tmp_path, member("SCHOTT.AGF", b"NM A 99\nCD 1 2\n"), member("a.zmx", LENS.read_bytes()))
-    with pytest.raises(PrescriptionError, match=r"archive.zar: SCHOTT.AGF, line 1: .* expected a dispersion formula"):
-        pachon.load_telescope(broken)
-    with pytest.warns(PrescriptionWarning, match="this catalogue is left out"):
-        assert pachon.load_telescope(broken, lenient=True).surfaces == pachon.load_telescope(LENS).surfaces
+    with pytest.warns(PrescriptionWarning, match=r"SCHOTT.AGF, line 1: .* expected a dispersion .*is left out"):
+        assert pachon.load_telescope(broken).surfaces == pachon.load_telescope(LENS).surfaces
 
 
 def test_damaged_archives_are_refused(tmp_path, monkeypatch):

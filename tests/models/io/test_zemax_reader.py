@@ -108,7 +108,7 @@ def test_lens_units(tmp_path, unit):
     assert telescope.pupil_diameter == pytest.approx(100 * float(metres), rel=1e-15)
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "iso-8859-1"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "iso-8859-1"])
 def test_encodings(tmp_path, encoding):
     text = MIRROR.replace("NAME one mirror", "NAME Größe Ø").replace("\n", "\r\n")
     assert load_telescope(written(tmp_path, text, encoding)).description == "Größe Ø"
@@ -381,7 +381,6 @@ def test_fields_are_angles_or_heights(tmp_path, kind, distance, expected):
         ("  DIAM 50", "  NEWK 3 4\n  DIAM 50", "surface 2: NEWK 3 4: this keyword is not understood"),
         ("ENVD 20 1 0", "ENVD 20 1 0\nNEWH 3", "line 7: NEWH 3: this keyword is not understood"),
         ("ENVD 20 1 0", "ENVD 5 0.7 1", "ENVD 5 0.7 1: indices are not adjusted"),
-        ("MNUM 1 1", "MNUM 3 1", "MNUM 3: one configuration is read"),
         ("  DIAM 50", "  SCBD 1 1 0 0 0 5 0 0\n  DIAM 50", "surface 2: SCBD .*only a tilt before the surface"),
         ("  DIAM 50", "  CLAP 30 20\n  DIAM 50", "surface 2: CLAP 30 20: expected a smallest and a largest radius"),
         ("TYPE STANDARD\n  CURV -0.001", "TYPE COORDBRK\n  PARM 9 1", "surface 2: PARM 9 1"),
@@ -574,3 +573,21 @@ def test_the_f_number_of_a_cylinder_is_that_of_its_curved_section(tmp_path):
     cylinder = "  TYPE BICONICX\n  PARM 1 0\n  PARM 2 0\n  CURV -0.001"
     text = MIRROR.replace("  TYPE STANDARD\n  CURV -0.001", cylinder).replace("ENPD 100", "FNUM 5 0")
     assert load_telescope(written(tmp_path, text)).pupil_diameter == pytest.approx(0.1, rel=1e-14)
+
+
+@pytest.mark.parametrize("count", ["FTYP 0 0 3 3", "FTYP 0"])
+def test_lists_of_fields_and_wavelengths_of_old_files(tmp_path, count):
+    """``XFLD``, ``YFLD``, ``WAVL`` of the first files, and ``WAVN``, filled up to its longest; ``TOLE`` is no datum."""
+    lines = {
+        "FTYP 0 0 2 1 0 0 0\nXFLN 0 0.3 0\nYFLN 0 0.4 0\n": f"{count}\nXFLD 0 0.3 0\nYFLD 0 0.4 0.5\nTOLE 1 2\n",
+        "WAVM 1 0.55 1\nWAVM 2 0.7 1\nPWAV 1\n": "WAVL 0.5 0.6 0.7\nWWGT 1 1 1\nWAVN 0.51 0.61 0.71 0 0 0\n"
+        "WWGN 1 2 1 1 1 1\nPWAV 2\n",
+    }
+    text = MIRROR
+    for old, new in lines.items():
+        assert old in text
+        text = text.replace(old, new)
+    data = load_telescope(written(tmp_path, text)).design_data
+    assert data.wavelengths == pytest.approx((0.51e-6, 0.61e-6, 0.71e-6))
+    assert data.wavelength_weights == (1.0, 2.0, 1.0)
+    assert np.rad2deg(data.fields) == pytest.approx(np.array([[0, 0], [-0.3, 0.4], [0, 0.5]]), abs=1e-12)

@@ -156,7 +156,7 @@ def test_a_model_glass_without_dispersion_is_constant():
     assert model_glass(1.5, 0.0) == ConstantIndex(1.5)
 
 
-@pytest.mark.parametrize("figures", [(1.0, 60.0, 0.0), (float("nan"), 60.0, 0.0), (1.5, -3.0, 0.0), (1.5, 60.0, 5.0)])
+@pytest.mark.parametrize("figures", [(0.0, 60.0, 0.0), (float("nan"), 60.0, 0.0), (1.5, -3.0, 0.0), (1.5, 60.0, 5.0)])
 def test_a_model_glass_of_impossible_figures_is_refused(figures):
     with pytest.raises(PrescriptionError, match="expected the numbers of a glass"):
         model_glass(*figures)

@@ -1,7 +1,8 @@
-"""Solves of OSLO files for the paraxial axial ray, at the primary wavelength.
+"""Solves of lens files for the paraxial axial ray, at the primary wavelength.
 
-``PU`` makes the curvature of a surface such that the slope behind it is the stated one, ``PY`` the thickness such that
-the height at the next surface is. With heights y, slopes u and indices n, negative behind an odd number of mirrors::
+OSLO's ``PU`` makes the curvature of a surface such that the slope behind it is the stated one, ``PY``, and Zemax's
+``MAZH``, the thickness such that the height at the next surface is. With heights y, slopes u and indices n, negative
+behind an odd number of mirrors::
 
     n' u' = n u - y c (n' - n)        y_next = y + u' t
 """
@@ -38,10 +39,12 @@ class AxialRay:
         self.slope = (self.index * self.slope - power) / index_after
         self.index = index_after
 
-    def solved_thickness(self, height: float) -> float:
-        """Return the distance at which the ray has a height."""
+    def solved_thickness(self, height: float, keyword: str = "PY") -> float:
+        """Return the distance at which the ray has a height; `keyword` is that of the solve, for messages."""
         if self.slope == 0 or (height != 0 and not self.scaled):
-            raise PrescriptionError(f"PY {height:g}: expected an axial ray of known height and a slope other than 0")
+            raise PrescriptionError(
+                f"{keyword} {height:g}: expected an axial ray of known height and a slope other than 0"
+            )
         return (height - self.height) / self.slope
 
     def advance(self, thickness: float) -> None:
