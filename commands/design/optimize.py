@@ -91,6 +91,8 @@ def sensitivity(
     return Outcome(result, notes=notes)
 
 
+#: Relative difference between focal length and scale on the detector from which on it is said.
+_SAME_SCALE = 1e-3
 #: Units in which operands are shown that are small beside the lens, as in files.
 _SMALL = {"rms_spot": ("µm", 1e-6), "rms_wavefront": ("nm", 1e-9), "sag": ("µm", 1e-6)}
 
@@ -101,6 +103,8 @@ def _shown_unit(result: Any, unit: str) -> tuple[str, float]:
 
 
 def _operand_unit(result: Any, operand: Operand) -> tuple[str, float]:
+    if operand.stated is not None:
+        return operand.stated.unit or "1", operand.stated.size
     if operand.unit == "rad":
         return "deg", math.radians(1.0)
     return _SMALL.get(operand.kind, _shown_unit(result, operand.unit))
@@ -257,8 +261,31 @@ def _notes(result: Any) -> list[str]:
         owner = f" of {evaluation.configuration}" if several else ""
         label, goal = evaluation.operand.label, evaluation.operand.goal_text(size)
         lines.append(f"{label}{owner}: {evaluation.start / size:.6g} -> {evaluation.end / size:.6g}{unit} ({goal})")
+    lines += _focal_length_notes(optimum)
     lines += [f"glass: {start_glass} -> {end_glass}" for start_glass, end_glass in s.get("glasses", {}).items()]
     return lines + [f"collinear: {combination}" for combination in s["collinear"]]
+
+
+def _focal_length_notes(optimum: Any) -> list[str]:
+    """Return a line where `focal_length` or `f_number` was another number in earlier files, of a defocused detector."""
+    from ...core.errors import PachonError
+    from ...design.optimize.targets import FNumber, FocalLength, ImageScale
+
+    kinds = [c.operand.kind for c in optimum.operands if isinstance(c.operand, FocalLength | FNumber)]
+    stated_kinds = [c.operand.kind for c in optimum.operands if c.operand.kind in kinds and c.operand.stated is None]
+    if not stated_kinds:
+        return []
+    name, size = optimum.telescope.length_unit
+    try:
+        scale, focal_length = (cls(0.0).measure(optimum.telescope) for cls in (ImageScale, FocalLength))
+    except PachonError:
+        return []
+    if abs(scale - abs(focal_length)) <= _SAME_SCALE * scale:
+        return []
+    return [
+        f"{stated_kinds[0]}: that of the paraxial focal length, {focal_length / size:.6g} {name}; the scale on the "
+        f"detector, its meaning in earlier files, is image_scale, {scale / size:.6g} {name}"
+    ]
 
 
 def _from_to(pair: Any) -> str:

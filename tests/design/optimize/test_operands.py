@@ -155,7 +155,7 @@ def test_limits_have_no_effect_inside():
 def test_operands_have_names_and_kinds():
     assert pachon.EdgeThickness("L1", 0.02, minimum=1e-3).label == "edge_thickness(L1, 0.02)"
     assert pachon.ChiefRay(EDGE, value=0.0).label == "chief_ray(0 12 deg, y)"
-    assert len(OPERANDS) == 14
+    assert len(OPERANDS) == 15
     for kind, cls in OPERANDS.items():
         assert cls.kind == kind
         assert cls.unit in ("m", "rad", "1")
