@@ -102,11 +102,11 @@ def test_real_rays_are_those_of_optiland(triplet, field, pupil, surface, expecte
 
 
 def test_focal_length_is_paraxial_wherever_the_detector_is(triplet):
-    moved = apply(triplet, {"Image.dz": -2e-4})
+    moved = apply(triplet, {"Image.dz": -1e-3})
     expected = first_order(triplet).focal_length
     assert pachon.FocalLength(1.0).measure(moved) == pytest.approx(expected, rel=1e-12)
     # The chief rays leave the exit pupil, 21.9 mm in front of the detector, and spread further.
-    assert pachon.ImageScale(1.0).measure(moved) / expected - 1.0 > 5e-3
+    assert pachon.ImageScale(1.0).measure(moved) / expected - 1.0 > 3e-2
     assert pachon.FNumber(1.0).measure(moved) == pytest.approx(expected / triplet.pupil_diameter, rel=1e-12)
 
 
@@ -129,8 +129,10 @@ def test_focal_length_of_a_folded_telescope(paraboloid):
     straight = paraboloid(2.0, 10.0)
     tilt = np.sqrt(0.5)
     axes = ((1.0, 0.0, 0.0), (0.0, tilt, tilt), (0.0, -tilt, tilt))
-    fold = Surface("Fold", Interaction.MIRROR, Plane(), (0.0, 0.0, 1.5), VACUUM, matrix=axes)
-    detector = replace(straight.surfaces[-1], vertex=(0.0, -0.5, 1.5), matrix=((1.0, 0, 0), (0, 0, 1.0), (0, -1.0, 0)))
+    fold = Surface("Fold", Interaction.MIRROR, Plane(), (0.0, 0.0, 1.5), VACUUM, rotation=axes)
+    detector = replace(
+        straight.surfaces[-1], vertex=(0.0, -0.5, 1.5), rotation=((1.0, 0, 0), (0, 0, 1.0), (0, -1.0, 0))
+    )
     folded = replace(straight, surfaces=(straight.surfaces[0], fold, detector))
     for meridian in ("x", "y"):
         found = abs(pachon.FocalLength(1.0, meridian=meridian).measure(folded))
@@ -220,7 +222,7 @@ def test_rays_and_paths_against_the_chief_ray(triplet):
 def test_fans_have_the_transverse_aberration(triplet):
     fans = pachon.ray_fans(triplet, [EDGE], [triplet.default_wavelength], n_points=5)
     found = [measured("TRAY", triplet, field=EDGE, pupil=(0.0, p)) for p in (-1.0, -0.5, 0.5, 1.0)]
-    assert found == pytest.approx(list(fans.tangential[0, 0, [0, 1, 3, 4]]), rel=1e-8)
+    assert found == pytest.approx(list(fans.along[0, 0, 0, [0, 1, 3, 4]]), rel=1e-8)
 
 
 def test_foci_of_a_field_point_are_those_of_the_analysis(triplet):
@@ -287,8 +289,8 @@ def test_an_optimum_holds_named_operands(biconvex):
         pachon.operand("CTGT", 7e-3, surface="S1", weight=10.0),
         pachon.operand("PIMH", maximum=1.0),
     ]
-    variables = ["S1.radius", "S2.radius", "S1.thickness", "S2.thickness"]
-    result = pachon.optimize(biconvex, variables, targets=targets, n_pupil=3)
+    variables = ["S1.radius", "S1.thickness", "S2.thickness"]
+    result = pachon.optimize(biconvex, variables, targets=targets, n_pupil=3, solver=pachon.LeastSquares(max_steps=20))
     ends = {change.operand.label: change.end for change in result.operands}
     assert ends["EFFL"] == pytest.approx(first_order(result.telescope).focal_length, rel=1e-10)
     assert ends["EFFL"] == pytest.approx(45e-3, rel=1e-4)
