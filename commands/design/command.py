@@ -18,11 +18,10 @@ from typing import TYPE_CHECKING, Any, Protocol, TypedDict
 import typer
 
 from ...core.errors import PachonError
-from ...core.file_names import file_name
 from ...core.terminal import print_line
 from .. import options
 from ..imports import import_modules
-from ..inputs import load_model
+from ..inputs import load_model, output_stem
 from ..interrupt import interruptible
 from ..tables import Column, Rows, numbers_of, print_json
 
@@ -92,6 +91,11 @@ class SharedOptions:
         """The telescope."""
         telescope = load_model(self.model, self.lenient, self.glass_catalogue or ())
         return telescope if self.aiming is None else telescope.with_design(aiming=self.aiming)
+
+    @cached_property
+    def stem(self) -> str:
+        """Last part of the names of pictures and files."""
+        return output_stem(self.model, self.telescope)
 
     @cached_property
     def fields(self) -> np.ndarray | None:
@@ -174,7 +178,7 @@ def design_command(
                 option = next((key for key in option_names if error.key == _ARGUMENTS.get(key, key)), None)
                 raise error if option is None else error.renamed(f"--{option.replace('_', '-')}") from None
             outcome = result if isinstance(result, Outcome) else Outcome(result)
-            path = picture or Path(f"{outcome.stem or f'{name}_{file_name(shared.telescope.name)}'}.png")
+            path = picture or Path(f"{outcome.stem or f'{name}_{shared.stem}'}.png")
             _deliver(outcome, outcome.table or rows, path, kind, as_json)
 
         # Typer reads the options of a command from its signature.

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -82,7 +84,7 @@ def sensitivity(
     else:
         variables = usual_parameters(telescope) if parameters is None else name_list(parameters, "--parameters")
     result = compute(telescope, variables, *where, n_zernike=zernikes, **shared.trace_options)
-    path = out or Path(f"sensitivity_{file_name(telescope.name)}.fits")
+    path = out or Path(f"sensitivity_{shared.stem}.fits")
     write_sensitivity(path, result)
     values, _ = result.modes()
     notes = [f"singular values: {values[0]:.3g} to {values[-1]:.3g}", f"matrix: {path.resolve()}"]
@@ -187,9 +189,13 @@ def optimize(
             threads=shared.threads,
         )
     optimum = _optimum(result)
-    paths = [out or Path(f"optimized_{file_name(telescope.name)}.yaml") for telescope in optimum.telescopes]
+    several = len(optimum.telescopes) > 1
+    stems = [file_name(t.name) for t in optimum.telescopes] if several else [shared.stem]
+    paths = [out or Path(f"{_optimized_name(stem)}.yaml") for stem in stems]
     with warnings_shown(PrescriptionWarning):
-        for telescope, path in zip(optimum.telescopes, paths, strict=True):
+        for solved, path in zip(optimum.telescopes, paths, strict=True):
+            # Analyses of the optimised lens have names of their own, beside those of its source.
+            telescope = replace(solved, name=path.stem)
             try:
                 save_telescope(telescope, path, lenient=shared.lenient)
             except PrescriptionError as error:
@@ -198,6 +204,12 @@ def optimize(
                 save_telescope(telescope, yaml_path)
                 raise error.within(subject=f"{path}, in place of which {yaml_path.name} was written") from None
     return Outcome(result, notes=[*_notes(result), *(f"prescription: {path.resolve()}" for path in paths)])
+
+
+def _optimized_name(stem: str) -> str:
+    """Return the name of an optimised telescope: optimized_lens, then optimized_2_lens of that, and so on."""
+    again = re.fullmatch(r"optimized_(?:(\d+)_)?(.+)", stem)
+    return f"optimized_{int(again[1] or 1) + 1}_{again[2]}" if again else f"optimized_{stem}"
 
 
 def _check_out(shared: SharedOptions, out: Path | None, *, several: bool = False) -> None:
@@ -262,8 +274,19 @@ def _notes(result: Any) -> list[str]:
         label, goal = evaluation.operand.label, evaluation.operand.goal_text(size)
         lines.append(f"{label}{owner}: {evaluation.start / size:.6g} -> {evaluation.end / size:.6g}{unit} ({goal})")
     lines += _focal_length_notes(optimum)
-    lines += [f"glass: {start_glass} -> {end_glass}" for start_glass, end_glass in s.get("glasses", {}).items()]
+    lines += _glass_notes(result)
     return lines + [f"collinear: {combination}" for combination in s["collinear"]]
+
+
+def _glass_notes(result: Any) -> list[str]:
+    """Return the chosen glasses, each with all that were tried and the rms that they reach, the best first."""
+    lines = []
+    unit = "µrad" if _optimum(result).in_angles else "µm"
+    for start_glass, end_glass in getattr(result, "glasses", {}).items():
+        trials = sorted((t for t in result.trials if t.glass == start_glass), key=lambda trial: trial.rms)
+        texts = [f"{t.name} {1e6 * t.rms:.4g}" if math.isfinite(t.rms) else f"{t.name} without light" for t in trials]
+        lines += [f"glass: {start_glass} -> {end_glass}", f"  tried, rms with operands in {unit}: {', '.join(texts)}"]
+    return lines
 
 
 def _focal_length_notes(optimum: Any) -> list[str]:
