@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Hashable
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -143,6 +144,29 @@ class _StrictLoader(yaml.composer.Composer, _Parser, yaml.constructor.SafeConstr
             unique_keys.add(key)
 
 
+class WrittenFloat(float):
+    """A float of a file with more digits than a float has: the number as it is written, for an exact change of unit."""
+
+    decimal: Decimal
+
+    def __new__(cls, text: str) -> WrittenFloat:
+        """Return the float of a text."""
+        number = super().__new__(cls, text)
+        number.decimal = Decimal(text)
+        return number
+
+
+def _written_float(loader: _StrictLoader, node: yaml.ScalarNode) -> float:
+    value = float(loader.construct_yaml_float(node))
+    text = node.value.replace("_", "")
+    try:
+        more_digits = math.isfinite(value) and Decimal(text) != Decimal(repr(value))
+    except ArithmeticError:
+        # Base 60 of YAML 1.1.
+        return value
+    return WrittenFloat(text) if more_digits else value
+
+
 def _short_integer(loader: _StrictLoader, node: yaml.ScalarNode) -> int:
     if len(node.value) > MAX_DIGITS:
         text = f"integer of {len(node.value)} characters: expected at most {MAX_DIGITS}"
@@ -157,6 +181,7 @@ def _mapping_without_repeats(loader: _StrictLoader, node: yaml.MappingNode) -> d
 
 _StrictLoader.add_constructor("tag:yaml.org,2002:map", _mapping_without_repeats)
 _StrictLoader.add_constructor("tag:yaml.org,2002:int", _short_integer)
+_StrictLoader.add_constructor("tag:yaml.org,2002:float", _written_float)
 
 
 def read_mapping(
@@ -225,7 +250,7 @@ def as_number(value: Any) -> float | None:
     if isinstance(value, bool) or not (text_of_number or isinstance(value, (int, float))):
         return None
     try:
-        number = float(value)
+        number = value if isinstance(value, float) else float(value)
     except (ValueError, OverflowError):
         return None
     return number if math.isfinite(number) else None

@@ -166,6 +166,7 @@ def optimize(
     - `pachon optimize triplet.zmx --config opt.yaml --out better.yaml`
     """
     from ...design.optimize.targets import FocalLength
+    from ...models.digits import with_optimised_digits
     from ...models.io.prescription import save_telescope
 
     if (config is None) == (variables is None):
@@ -195,7 +196,7 @@ def optimize(
     with warnings_shown(PrescriptionWarning):
         for solved, path in zip(optimum.telescopes, paths, strict=True):
             # Analyses of the optimised lens have names of their own, beside those of its source.
-            telescope = replace(solved, name=path.stem)
+            telescope = replace(with_optimised_digits(solved), name=path.stem)
             try:
                 save_telescope(telescope, path, lenient=shared.lenient)
             except PrescriptionError as error:

@@ -67,6 +67,13 @@ WRITTEN = {
     ".yaml": "pachon", ".yml": "pachon", ".zmx": "zemax", ".seq": "codev", ".len": "oslo", ".json": "optiland",
     ".roa": "rayoptics",
 }  # fmt: skip
+#: What to do with files of other programs whose format is not published, by their ending.
+_OTHER_PROGRAMS = {
+    ".zos": "a session of Zemax OpticStudio: save the lens there as .zmx",
+    ".zprj": "a project of Zemax OpticStudio: save the lens there as .zmx",
+    ".zda": "an analysis of Zemax OpticStudio: save the lens there as .zmx",
+    ".otx": "a lens of OpTaliX: export it there to CODE V, as .seq",
+}
 #: Endings of files that a telescope is read from.
 ENDINGS = (".yaml", ".yml", *_READERS)
 
@@ -126,6 +133,8 @@ def load_telescope(
 
         reader = _imported(_READERS[path.suffix.lower()])
         return read_lens(path, reader, lenient=lenient, glass_catalogues=glass_catalogues)
+    if (hint := _OTHER_PROGRAMS.get(path.suffix.lower())) is not None:
+        raise PrescriptionError(hint, file=path)
     if isinstance(name_or_path, os.PathLike) or len(path.parts) > 1 or path.is_file():
         raise PrescriptionError(f"expected a prescription file that ends in {', '.join(ENDINGS)}", file=path)
     raise unknown_name("telescope", text, BUNDLED)
