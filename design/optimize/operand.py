@@ -77,8 +77,9 @@ class Operand:
         if self.weight <= 0:
             raise DomainError(f"operand {self.label}: weight = {self.weight!r}: expected a positive number")
         if self.minimum is not None and self.maximum is not None and not self.minimum < self.maximum:
+            size = 1.0 if self.stated is None else self.stated.size
             raise DomainError(
-                f"operand {self.label}: minimum = {self.minimum:g}, maximum = {self.maximum:g}: "
+                f"operand {self.label}: minimum = {self.minimum / size:g}, maximum = {self.maximum / size:g}: "
                 "expected the minimum below the maximum"
             )
 
@@ -235,6 +236,11 @@ def _degrees(field: tuple[float, float]) -> str:
     return " ".join(f"{np.rad2deg(v):.4g}" for v in field) + " deg"
 
 
+def _nanometres(wavelengths: float | tuple[float, ...]) -> str:
+    numbers = wavelengths if isinstance(wavelengths, tuple) else (wavelengths,)
+    return " ".join(f"{1e9 * v:.5g}" for v in numbers) + " nm"
+
+
 def _per_millimetre(frequency: float) -> str:
     return f"{1e-3 * frequency:.4g}/mm"
 
@@ -246,4 +252,9 @@ def _shown(value: Any) -> str:
 
 
 #: Texts of fields that have a unit of their own in labels.
-_FIELD_TEXTS: dict[str, Callable[[Any], str]] = {"field": _degrees, "frequency": _per_millimetre}
+_FIELD_TEXTS: dict[str, Callable[[Any], str]] = {
+    "field": _degrees,
+    "frequency": _per_millimetre,
+    "wavelength": _nanometres,
+    "wavelengths": _nanometres,
+}

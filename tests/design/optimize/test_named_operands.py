@@ -11,7 +11,7 @@ from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, PachonError, UnknownNameError
 from pachon.design.optimize.jacobian import ParameterColumns
 from pachon.design.optimize.operand import check_operands
-from pachon.design.optimize.operand_names import NAMES
+from pachon.design.optimize.operand_names import NAMES, entry_fields
 from pachon.models.first_order import first_order
 from pachon.models.parameters.parameters import apply, parse_parameters
 
@@ -387,3 +387,22 @@ def test_the_command_measures_what_needs_no_keys(capsys):
     # A telescope of mirrors has no glass: the reason stands in place of a number.
     assert rows["MNCG"]["number"] is None
     assert "expected glass" in rows["MNCG"]["definition"]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("address", ["S1.curvature", "S3.thickness"])
+def test_numbers_are_smooth_where_derivatives_are_differences(triplet, address):
+    """Central differences of two steps agree: no noise and no jumps at the size of the solver's steps."""
+    numbers = {"surface": "S3", "field": EDGE, "pupil": (0.1, 0.7), "first": "S3", "last": "S4"}
+    step = {"S1.curvature": 1e-3, "S3.thickness": 1e-6}[address]
+    for name, entry in NAMES.items():
+        if name.startswith("MTF"):
+            continue
+        keys = {k: v for k, v in numbers.items() if k in entry_fields(entry)}
+        if name in ("MNCA", "MNEA", "MXCA", "MXEA"):
+            keys |= {"last": "S6"}
+        operand = pachon.operand(name, 0.0, **keys)
+        moved = [operand.measure(apply(triplet, {address: sign * step * f})) for f in (1.0, 0.5) for sign in (1, -1)]
+        wide, narrow = (moved[0] - moved[1]) / (2.0 * step), (moved[2] - moved[3]) / step
+        # Third order of the steps, and rounding of 1e-14 of the number over the step.
+        assert wide == pytest.approx(narrow, rel=1e-4, abs=1e-12 * max(1e-3, abs(moved[0])) / step), name
