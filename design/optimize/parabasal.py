@@ -7,7 +7,6 @@ length is ``-2 n h / (n' dd)``. The error goes with h^2; two heights remove it.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from ...models.telescope import Telescope
 from ...raytrace.adjoint.backward_pass import direction_gradient
 from ...raytrace.adjoint.forward_pass import forward_pass
 from ...raytrace.aiming import entrance_points
-from ...raytrace.rays import Rays, field_direction, straight_bundles
+from ...raytrace.rays import Rays, field_direction
 from ...raytrace.trace import trace
 from .jacobian import ParameterColumns
 
@@ -57,9 +56,10 @@ def _power(columns: ParameterColumns, wavelength: float, meridian: str) -> tuple
     offsets = np.outer(heights, np.array([1.0, 0.0] if meridian == "x" else [0.0, 1.0]))
     light = field_direction(0.0, 0.0)[None]
     chief = entrance_points(telescope, light, wavelength, _AXIS).reshape(1, 2)
-    # The focal length is that of a distant object, wherever the object is.
-    distant = replace(telescope, object_distance=math.inf)
-    rays = straight_bundles(distant, light, wavelength, chief + offsets)
+    # The focal length is that of a distant object, wherever the object is: light along the axis, from above everything.
+    height = max(s.vertex[2] for s in telescope.surfaces) + telescope.launch_distance
+    start = np.column_stack([chief + offsets, np.full(len(offsets), height)])
+    rays = Rays(start, np.repeat(light, len(offsets), axis=0), np.zeros(len(offsets)), wavelength)
     forward = forward_pass(telescope, rays, threads=1)
     if not forward.arrived.all():
         raise DomainError(f"telescope {telescope.name}: expected rays close to the axis that reach the image")

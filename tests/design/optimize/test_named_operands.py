@@ -406,3 +406,10 @@ def test_numbers_are_smooth_where_derivatives_are_differences(triplet, address):
         wide, narrow = (moved[0] - moved[1]) / (2.0 * step), (moved[2] - moved[3]) / step
         # Third order of the steps, and rounding of 1e-14 of the number over the step.
         assert wide == pytest.approx(narrow, rel=1e-4, abs=1e-12 * max(1e-3, abs(moved[0])) / step), name
+
+
+def test_focal_length_of_a_lens_for_a_near_object():
+    """That of parallel light all the same; this lens states a numerical aperture, which a distant object has not."""
+    near = pachon.load_telescope("tests/data/zmx/US05831776-1.zmx")
+    # The power of 40 surfaces almost cancels: a hundredth of that of its elements.
+    assert measured("EFFL", near) == pytest.approx(first_order(near).focal_length, rel=1e-8)
