@@ -83,9 +83,13 @@ def _numbers(telescope: Telescope, texts: list[str]) -> list[dict[str, Any]]:
         with error_context(subject=f"--operand {text}"):
             item = operand_of_text(text)
         name = item.stated.name if item.stated is not None else ""
-        stated.append((item, NAMES[name].definition if name in NAMES else type(item).__doc__.partition("\n")[0]))
+        stated.append(
+            (item, NAMES[name].definition if name in NAMES else (type(item).__doc__ or "").partition("\n")[0])
+        )
     if not texts:
-        stated = [(operand(n, 0.0), entry.definition) for n, entry in NAMES.items() if _alone(entry, entry_fields)]
+        # The names of CODE V are second ones.
+        alone = [e for e in NAMES.values() if not any(entry_fields(e).values()) and "CODE V" not in e.definition]
+        stated = [(operand(entry.name, 0.0), entry.definition) for entry in alone]
     rows = []
     for item, definition in stated:
         unit, size = item.shown_unit
@@ -98,8 +102,3 @@ def _numbers(telescope: Telescope, texts: list[str]) -> list[dict[str, Any]]:
             number, definition = None, error.problem
         rows.append({"operand": item.label, "number": number, "unit": unit, "definition": definition})
     return rows
-
-
-def _alone(entry: Any, entry_fields: Any) -> bool:
-    """Return whether a name needs no further keys, and is not that of a limit or a second name."""
-    return not any(entry_fields(entry).values()) and not entry.definition.startswith("CODE V")

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from ...core.arguments import check_arguments
-from ...core.errors import ConfigError, unknown_name
+from ...core.errors import ConfigError, UnknownNameError, unknown_name
 from .geometry_operands import (
     BackFocus,
     CenterThickness,
@@ -107,19 +107,19 @@ def _bounded(
 
 def _thickness_limits() -> list[OperandName]:
     """Return the names of least and largest thicknesses."""
-    media: tuple[tuple[str, str, str], ...] = (
-        ("A", "air", "air"),
-        ("G", "glass", "glass"),
-        ("T", "any", "glass and air"),
+    extremes: tuple[tuple[str, str, Literal["minimum", "maximum"]], ...] = (
+        ("MN", "least", "minimum"),
+        ("MX", "largest", "maximum"),
     )
+    media = (("A", "air", "air"), ("G", "glass", "glass"), ("T", "any", "glass and air"))
     places = (("C", "center", "on the axis"), ("E", "edge", "at the edge"))
     names = []
-    for prefix, extreme, target in (("MN", "least", "minimum"), ("MX", "largest", "maximum")):
+    for prefix, extreme, target in extremes:
         for letter, place, where in places:
-            for end, medium, what in media:
-                implied = {"extreme": extreme, "place": place, "medium": medium}
-                text = f"{extreme} thickness of {what} {where}, of the surfaces first to last"
-                names.append(OperandName(prefix + letter + end, ThicknessLimit, text, implied, target))  # type: ignore[arg-type]
+            for end, medium, content in media:
+                implied: dict[str, str | None] = {"extreme": extreme, "place": place, "medium": medium}
+                text = f"{extreme} thickness of {content} {where}, of the surfaces first to last"
+                names.append(OperandName(prefix + letter + end, ThicknessLimit, text, implied, target))
     return names
 
 
@@ -252,8 +252,8 @@ def operand(
     for key, required in keys.items():
         if required and key not in numbers:
             raise ConfigError(f"operand {name}: {key} is missing")
-    goal = goal_of(entry, value, minimum, maximum)
-    return entry.kind(**goal, weight=weight, **entry.implied, **numbers, stated=entry.stated(entry.unit))
+    fields: dict[str, Any] = {**goal_of(entry, value, minimum, maximum), **entry.implied, **numbers}
+    return entry.kind(**fields, weight=weight, stated=entry.stated(entry.unit))
 
 
 def entry_fields(entry: OperandName) -> dict[str, bool]:
@@ -278,7 +278,7 @@ def goal_of(
     return goal
 
 
-def unknown_operand(text: str) -> Exception:
+def unknown_operand(text: str) -> UnknownNameError:
     """Return the error for an unknown kind or name of an operand, with the nearest ones."""
     spellings = [
         kind if cls.unit == "1" else f"{kind}_{'mm' if cls.unit == 'm' else 'deg'}" for kind, cls in OPERANDS.items()
