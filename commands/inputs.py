@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.errors import HeightWarning, PachonError, PrescriptionWarning
-from ..core.file_names import file_name
 from ..core.terminal import print_warning
 
 if TYPE_CHECKING:
@@ -45,15 +44,6 @@ def load_model(model: str, lenient: bool = False, glass_catalogues: Sequence[Pat
 
     with warnings_shown(PrescriptionWarning):
         return load_telescope(model, lenient=lenient, glass_catalogues=glass_catalogues)
-
-
-def output_stem(model: str, telescope: Telescope) -> str:
-    """Return the name of files that are made of a model: that of its own file, which may be one of several of a name.
-
-    An optimised telescope, for example, has the name of its source in files that were edited by hand.
-    """
-    path = Path(model)
-    return file_name(path.stem if path.is_file() and path.stem else telescope.name)
 
 
 @contextmanager

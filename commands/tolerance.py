@@ -8,8 +8,9 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from ..core.file_names import file_name
 from ..core.terminal import print_line
-from .inputs import errors_of, load_model, output_stem
+from .inputs import errors_of, load_model
 from .options import GlassCatalogues, Json, Lenient, Model, Quiet, Threads
 from .tables import Rows, number_texts, print_json
 from .workers import DaskWorkers, Processes, Scheduler, long_work
@@ -61,7 +62,7 @@ def tolerance_command(
     telescope = load_model(model, lenient, glass_catalogue or ())
     source = model if model in BUNDLED else str(Path(model).resolve())
     file = with_settings(load_tolerances(tolerances, source), method=method, draws=draws, seed=seed)
-    folder = out or Path(f"tolerance_{output_stem(model, telescope)}")
+    folder = out or Path(f"tolerance_{file_name(telescope.name)}")
     make_folder(folder)
     resumed = f"go on with: pachon tolerance {model} {tolerances} -o {folder} --resume"
     with (

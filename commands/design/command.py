@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Any, Protocol, TypedDict
 import typer
 
 from ...core.errors import PachonError
+from ...core.file_names import file_name
 from ...core.terminal import print_line
 from .. import options
 from ..imports import import_modules
-from ..inputs import load_model, output_stem
+from ..inputs import load_model
 from ..interrupt import interruptible
 from ..tables import Column, Rows, numbers_of, print_json
 
@@ -95,7 +96,7 @@ class SharedOptions:
     @cached_property
     def stem(self) -> str:
         """Last part of the names of pictures and files."""
-        return output_stem(self.model, self.telescope)
+        return file_name(self.telescope.name)
 
     @cached_property
     def fields(self) -> np.ndarray | None:

@@ -190,9 +190,7 @@ def optimize(
             threads=shared.threads,
         )
     optimum = _optimum(result)
-    several = len(optimum.telescopes) > 1
-    stems = [file_name(t.name) for t in optimum.telescopes] if several else [shared.stem]
-    paths = [out or Path(f"{_optimized_name(stem)}.yaml") for stem in stems]
+    paths = [out or Path(f"{_optimized_name(file_name(telescope.name))}.yaml") for telescope in optimum.telescopes]
     with warnings_shown(PrescriptionWarning):
         for solved, path in zip(optimum.telescopes, paths, strict=True):
             # Analyses of the optimised lens have names of their own, beside those of its source.
