@@ -59,18 +59,15 @@ def _list_names(as_json: bool) -> None:
     from ...design.optimize.operand_names import NAMES
     from ...design.optimize.optimize_file import file_keys
 
-    entries = [
-        {"operand": name, "unit": entry.unit, "keys": file_keys(entry), "definition": entry.definition}
-        for name, entry in NAMES.items()
-    ]
+    headings = ("operand", "unit", "keys", "definition")
+    rows = [(name, entry.unit, ", ".join(file_keys(entry)), entry.definition) for name, entry in NAMES.items()]
     if as_json:
-        print_json({"operands": entries})
+        print_json({"operands": [dict(zip(headings, row, strict=True)) for row in rows]})
         return
-    rows = [[e["operand"], e["unit"], ", ".join(e["keys"]), e["definition"]] for e in entries]
     caption = (
         "In files {kind: EFFL, target: 50}, or min and max. Keys with * are needed. More kinds: docs/optimisation.md."
     )
-    Rows(["operand", "unit", "keys", "definition"], rows, caption, left=4).show()
+    Rows(headings, rows, caption, left=4).show()
 
 
 def _numbers(telescope: Telescope, texts: list[str]) -> list[dict[str, Any]]:

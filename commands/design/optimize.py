@@ -143,7 +143,7 @@ def optimize(
     shared: SharedOptions,
     variables: Annotated[str | None, Option(help=f"{_ADDRESSES}, L1.thickness, silica.abbe.")] = None,
     merit: Annotated[str | None, Option(help="Merit function to minimise: spots (by default) or wavefront.")] = None,
-    focal_length: Annotated[float | None, Option(help="Focal length to be held [m].")] = None,
+    focal_length: Annotated[float | None, Option(help="Paraxial focal length to be held [m].")] = None,
     bounds: Annotated[
         list[str] | None,
         Option(metavar="ADDRESS=LOW:HIGH", help="Limits of a variable; of a motion those of its change."),

@@ -38,7 +38,7 @@ _DETECTOR = "#0b6b3a"
 _BAFFLE = "#6b4a2b"
 _STOP = "#000000"
 #: Length of the bars beside the stop, over its diameter.
-_STOP_BAR = 0.15
+_STOP_BAR = 0.1
 #: Lenses and detector have a panel of their own below this fraction of the whole size.
 _SMALL = 0.4
 
