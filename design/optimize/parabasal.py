@@ -46,7 +46,10 @@ def parabasal_focal_length(
         power, change = _power(columns, wavelength, axis)
         if abs(power) * 0.5 * columns.telescope.pupil_diameter >= _PARALLEL:
             return 1.0 / power, -change / power**2
-    raise DomainError(f"telescope {columns.telescope.name}: expected one with a focus, its power is {power:.3g} 1/m")
+    afocal = "; of an afocal one the operands are image_scale and AMAG" if columns.telescope.design_data.afocal else ""
+    raise DomainError(
+        f"telescope {columns.telescope.name}: expected one with a focus, its power is {power:.3g} 1/m{afocal}"
+    )
 
 
 def _power(columns: ParameterColumns, wavelength: float, meridian: str) -> tuple[float, np.ndarray]:

@@ -140,7 +140,8 @@ class FNumber(_ExactOperand):
 class ImageScale(_ExactOperand):
     """Scale on the detector: distance of two chief rays near the axis over the tangent of their angle.
 
-    It differs from the paraxial focal length where the detector is not in the paraxial focus.
+    It differs from the paraxial focal length where the detector is not in the paraxial focus. Of an afocal telescope it
+    is the size of the angular magnification.
 
     Parameters
     ----------
