@@ -57,8 +57,9 @@ _Parser: Any = _parser()
 class _StrictLoader(yaml.composer.Composer, _Parser, yaml.constructor.SafeConstructor, yaml.resolver.Resolver):
     """Safe loader of bounded content, checked before any value is made."""
 
-    def __init__(self, text: str, max_size: int) -> None:
+    def __init__(self, text: str, max_size: int, *, exact: bool = False) -> None:
         _Parser.__init__(self, text)
+        self.exact = exact
         yaml.composer.Composer.__init__(self)
         yaml.constructor.SafeConstructor.__init__(self)
         yaml.resolver.Resolver.__init__(self)
@@ -158,6 +159,8 @@ class WrittenFloat(float):
 
 def _written_float(loader: _StrictLoader, node: yaml.ScalarNode) -> float:
     value = float(loader.construct_yaml_float(node))
+    if not loader.exact:
+        return value
     text = node.value.replace("_", "")
     try:
         more_digits = math.isfinite(value) and Decimal(text) != Decimal(repr(value))
@@ -185,15 +188,19 @@ _StrictLoader.add_constructor("tag:yaml.org,2002:float", _written_float)
 
 
 def read_mapping(
-    path: Path, error: type[PachonError] = PrescriptionError, *, max_bytes: int = MAX_BYTES
+    path: Path, error: type[PachonError] = PrescriptionError, *, max_bytes: int = MAX_BYTES, exact: bool = False
 ) -> dict[str, Any]:
     """Return the top level of a YAML file in UTF-8 of at most `max_bytes` [byte].
+
+    With `exact`, numbers with more digits than a float has are :class:`WrittenFloat`.
 
     Raises `error` if the file cannot be read, is longer, deeper (:data:`MAX_DEPTH`) or has more values and aliases than
     a file of that length, is not YAML, or is not a mapping.
     """
     try:
-        content = _StrictLoader(read_bytes(path, error, max_bytes=max_bytes).decode(), max_bytes).get_single_data()
+        content = _StrictLoader(
+            read_bytes(path, error, max_bytes=max_bytes).decode(), max_bytes, exact=exact
+        ).get_single_data()
     except UnicodeDecodeError:
         raise error("not a UTF-8 text file", file=path) from None
     except yaml.MarkedYAMLError as problem:

@@ -207,8 +207,8 @@ def optimize(
 
 def _optimized_name(stem: str) -> str:
     """Return the name of an optimised telescope: optimized_lens, then optimized_2_lens of that, and so on."""
-    again = re.fullmatch(r"optimized_(?:(\d+)_)?(.+)", stem)
-    return f"optimized_{int(again[1] or 1) + 1}_{again[2]}" if again else f"optimized_{stem}"
+    optimized = re.fullmatch(r"optimized_(?:(\d+)_)?(.+)", stem)
+    return f"optimized_{int(optimized[1] or 1) + 1}_{optimized[2]}" if optimized else f"optimized_{stem}"
 
 
 def _check_out(shared: SharedOptions, out: Path | None, *, several: bool = False) -> None:

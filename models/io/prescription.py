@@ -121,7 +121,7 @@ def load_telescope(
         return _bundled(text)
     path = Path(text)
     if path.suffix.lower() in (".yaml", ".yml"):
-        content = read_mapping(path, max_bytes=MAX_BYTES)
+        content = read_mapping(path, max_bytes=MAX_BYTES, exact=True)
         if BATOID_ROOT not in content:
             return telescope_of(content, path)
         # Imported where it is needed, like the writer: the sections of the format take time to make.

@@ -29,13 +29,14 @@ def test_every_float_comes_back_equal(tmp_path):
         texts = [length_text(Metres(v, power), "mm") for v in values]
         path = tmp_path / f"{power}.yaml"
         path.write_text("\n".join(f"k{i}: {text}" for i, text in enumerate(texts)))
-        read = [scaled(v, -3 * power) for v in read_mapping(path).values()]
+        read = [scaled(v, -3 * power) for v in read_mapping(path, exact=True).values()]
         assert read == values.tolist()
 
 
 def test_more_digits_than_a_float_has_are_kept(tmp_path):
     (tmp_path / "a.yaml").write_text("long: 12.3456789012345678901\nshort: 0.1\nsixty: 1:30.5\n")
-    read = read_mapping(tmp_path / "a.yaml")
+    read = read_mapping(tmp_path / "a.yaml", exact=True)
+    assert type(read_mapping(tmp_path / "a.yaml")["long"]) is float
     assert isinstance(read["long"], WrittenFloat)
     assert read["long"].decimal == Decimal("12.3456789012345678901")
     assert type(read["short"]) is float
