@@ -217,6 +217,11 @@ def read_mapping(
     return content
 
 
+def loaded(text: str, *, max_bytes: int = MAX_BYTES) -> Any:
+    """Return the content of a YAML text that this program has written, with :class:`WrittenFloat`."""
+    return _StrictLoader(text, max_bytes, exact=True).get_single_data()
+
+
 def line_of(path: Path, key: str) -> int | None:
     """Return the line of a YAML file, from 1, at which a key stands, such as ``surfaces[M1].radius``.
 

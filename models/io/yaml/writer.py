@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import suppress
 from itertools import count
+from pathlib import Path
 from typing import Any
 
+from ....core.errors import PachonError
+from ....core.yaml_reader import loaded
 from ...coating import AnyCoating
 from ...media.medium import Medium
 from ...surface import IDENTITY, Surface
@@ -16,7 +20,7 @@ from .apertures import aperture_items, obstruction_items
 from .coatings import coating_items, coating_names
 from .design import design_items
 from .media import medium_items
-from .reader import INTERACTIONS
+from .reader import INTERACTIONS, MAX_BYTES, telescope_of
 from .shapes import shape_items
 from .values import Bare, Metres, Turn, Wave, flow, in_metres, length_text, number_text, to_si
 
@@ -30,7 +34,19 @@ def telescope_to_yaml(telescope: Telescope) -> str:
     of its pickup.
     """
     t = require_met(telescope)
-    return _text(t, "mm" if t.length_unit[0] == "mm" else "m")
+    metres = _text(t, "m")
+    if t.length_unit[0] != "mm":
+        return metres
+    # A shape or region whose lengths are not all written in the file's unit would be another one: then metres.
+    millimetres = _text(t, "mm")
+    with suppress(PachonError, ValueError):
+        if _read(millimetres) == _read(metres):
+            return millimetres
+    return metres
+
+
+def _read(text: str) -> Telescope:
+    return telescope_of(loaded(text, max_bytes=MAX_BYTES), Path("written.yaml"))
 
 
 def _text(t: Telescope, length_unit: str) -> str:

@@ -10,6 +10,7 @@ import pytest
 
 import pachon
 from pachon.core.yaml_reader import WrittenFloat, read_mapping
+from pachon.models.aperture import Annulus, Circle, Complement, Polygon, Rectangle, Union, Vane
 from pachon.models.digits import with_few_digits, with_optimised_digits
 from pachon.models.io.yaml.values import Metres, length_text, scaled
 from pachon.models.io.yaml.writer import telescope_to_yaml
@@ -59,6 +60,26 @@ def test_lenses_in_mm_are_written_in_mm(tmp_path):
         (tmp_path / "lens.yaml").write_text(text)
         assert pachon.load_telescope(tmp_path / "lens.yaml") == changed
     assert "units: {length: m," in telescope_to_yaml(pachon.load_telescope("paul_baker"))
+
+
+def test_regions_are_in_the_unit_of_the_lens(tmp_path):
+    lens = pachon.load_telescope(LENSES / "lens1.zmx")
+    corners = ((0.0, 0.001), (0.0011 / 3.0, 0.0), (0.0, -0.0007))
+    regions = Union((Polygon(corners), Circle(0.001 / 3.0, x=1e-4), Vane(1e-4, x=2e-4), Rectangle(1e-3, 2e-3)))
+    for aperture in (regions, Complement(regions), Annulus(1e-4 / 3.0, 2e-3)):
+        front = replace(lens.surfaces[0], aperture=aperture, semi_diameter=0.002 / 3.0)
+        changed = replace(lens, surfaces=(front, *lens.surfaces[1:]))
+        text = telescope_to_yaml(changed)
+        assert "units: {length: mm," in text
+        (tmp_path / "lens.yaml").write_text(text)
+        assert pachon.load_telescope(tmp_path / "lens.yaml") == changed
+
+
+def test_what_would_not_come_back_in_mm_is_written_in_metres(monkeypatch):
+    lens = pachon.load_telescope(LENSES / "lens1.zmx")
+    # As if the lengths of a shape were not marked as such.
+    monkeypatch.setattr("pachon.models.io.yaml.writer.shape_items", lambda shape: {"shape": "sphere", "radius": 0.05})
+    assert "units: {length: m," in telescope_to_yaml(lens)
 
 
 def test_new_lenses_have_few_digits():
