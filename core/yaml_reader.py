@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Hashable
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +57,9 @@ _Parser: Any = _parser()
 class _StrictLoader(yaml.composer.Composer, _Parser, yaml.constructor.SafeConstructor, yaml.resolver.Resolver):
     """Safe loader of bounded content, checked before any value is made."""
 
-    def __init__(self, text: str, max_size: int) -> None:
+    def __init__(self, text: str, max_size: int, *, exact: bool = False) -> None:
         _Parser.__init__(self, text)
+        self.exact = exact
         yaml.composer.Composer.__init__(self)
         yaml.constructor.SafeConstructor.__init__(self)
         yaml.resolver.Resolver.__init__(self)
@@ -143,6 +145,31 @@ class _StrictLoader(yaml.composer.Composer, _Parser, yaml.constructor.SafeConstr
             unique_keys.add(key)
 
 
+class WrittenFloat(float):
+    """A float of a file with more digits than a float has: the number as it is written, for an exact change of unit."""
+
+    decimal: Decimal
+
+    def __new__(cls, text: str) -> WrittenFloat:
+        """Return the float of a text."""
+        number = super().__new__(cls, text)
+        number.decimal = Decimal(text)
+        return number
+
+
+def _written_float(loader: _StrictLoader, node: yaml.ScalarNode) -> float:
+    value = float(loader.construct_yaml_float(node))
+    if not loader.exact:
+        return value
+    text = node.value.replace("_", "")
+    try:
+        more_digits = math.isfinite(value) and Decimal(text) != Decimal(repr(value))
+    except ArithmeticError:
+        # Base 60 of YAML 1.1.
+        return value
+    return WrittenFloat(text) if more_digits else value
+
+
 def _short_integer(loader: _StrictLoader, node: yaml.ScalarNode) -> int:
     if len(node.value) > MAX_DIGITS:
         text = f"integer of {len(node.value)} characters: expected at most {MAX_DIGITS}"
@@ -157,18 +184,23 @@ def _mapping_without_repeats(loader: _StrictLoader, node: yaml.MappingNode) -> d
 
 _StrictLoader.add_constructor("tag:yaml.org,2002:map", _mapping_without_repeats)
 _StrictLoader.add_constructor("tag:yaml.org,2002:int", _short_integer)
+_StrictLoader.add_constructor("tag:yaml.org,2002:float", _written_float)
 
 
 def read_mapping(
-    path: Path, error: type[PachonError] = PrescriptionError, *, max_bytes: int = MAX_BYTES
+    path: Path, error: type[PachonError] = PrescriptionError, *, max_bytes: int = MAX_BYTES, exact: bool = False
 ) -> dict[str, Any]:
     """Return the top level of a YAML file in UTF-8 of at most `max_bytes` [byte].
+
+    With `exact`, numbers with more digits than a float has are :class:`WrittenFloat`.
 
     Raises `error` if the file cannot be read, is longer, deeper (:data:`MAX_DEPTH`) or has more values and aliases than
     a file of that length, is not YAML, or is not a mapping.
     """
     try:
-        content = _StrictLoader(read_bytes(path, error, max_bytes=max_bytes).decode(), max_bytes).get_single_data()
+        content = _StrictLoader(
+            read_bytes(path, error, max_bytes=max_bytes).decode(), max_bytes, exact=exact
+        ).get_single_data()
     except UnicodeDecodeError:
         raise error("not a UTF-8 text file", file=path) from None
     except yaml.MarkedYAMLError as problem:
@@ -183,6 +215,11 @@ def read_mapping(
     if not isinstance(content, dict):
         raise error(f"expected a mapping of keys to values, not {cut_short(repr(content))}", file=path)
     return content
+
+
+def loaded(text: str, *, max_bytes: int = MAX_BYTES) -> Any:
+    """Return the content of a YAML text that this program has written, with :class:`WrittenFloat`."""
+    return _StrictLoader(text, max_bytes, exact=True).get_single_data()
 
 
 def line_of(path: Path, key: str) -> int | None:
@@ -225,7 +262,7 @@ def as_number(value: Any) -> float | None:
     if isinstance(value, bool) or not (text_of_number or isinstance(value, (int, float))):
         return None
     try:
-        number = float(value)
+        number = value if isinstance(value, float) else float(value)
     except (ValueError, OverflowError):
         return None
     return number if math.isfinite(number) else None

@@ -76,6 +76,7 @@ from .design.optimize.glass_choice import GlassChoice as GlassChoice
 from .design.optimize.glass_choice import choose_glasses as choose_glasses
 from .design.optimize.merit_function import SpotSize as SpotSize
 from .design.optimize.merit_function import WavefrontError as WavefrontError
+from .design.optimize.operand_names import operand as operand
 from .design.optimize.optimize import optimize as optimize
 from .design.optimize.optimize_file import load_optimization as load_optimization
 from .design.optimize.optimum import Optimum as Optimum
@@ -90,6 +91,7 @@ from .design.optimize.solver import LeastSquares as LeastSquares
 from .design.optimize.targets import ChiefRay as ChiefRay
 from .design.optimize.targets import FNumber as FNumber
 from .design.optimize.targets import FocalLength as FocalLength
+from .design.optimize.targets import ImageScale as ImageScale
 from .design.optimize.targets import RelativeDistortion as RelativeDistortion
 from .design.optimize.targets import Target as Target
 from .design.report.report import design_report as design_report

@@ -95,6 +95,11 @@ class SharedOptions:
         return telescope if self.aiming is None else telescope.with_design(aiming=self.aiming)
 
     @cached_property
+    def stem(self) -> str:
+        """Last part of the names of pictures and files."""
+        return file_name(self.telescope.name)
+
+    @cached_property
     def fields(self) -> np.ndarray | None:
         """Field angles [rad], shape [n, 2]; None where none are given."""
         return options.field_list([self.field_deg] if isinstance(self.field_deg, str) else self.field_deg)
@@ -175,7 +180,7 @@ def design_command(
                 option = next((key for key in option_names if error.key == _ARGUMENTS.get(key, key)), None)
                 raise error if option is None else error.renamed(f"--{option.replace('_', '-')}") from None
             outcome = result if isinstance(result, Outcome) else Outcome(result)
-            path = picture or Path(f"{outcome.stem or f'{name}_{file_name(shared.telescope.name)}'}.png")
+            path = picture or Path(f"{outcome.stem or f'{name}_{shared.stem}'}.png")
             _deliver(outcome, outcome.table or rows, path, kind, as_json)
 
         # Typer reads the options of a command from its signature.

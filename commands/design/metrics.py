@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Option
 
 from ...core.errors import ConfigError
-from ...core.file_names import file_name
 from ..tables import FIELD, Column, Rows, field_headings, number_texts, numbers_of
 from .command import Outcome, SharedOptions, Study, design_command
 
@@ -137,7 +136,7 @@ def zernikes(
             kmax=double,
             pupil=pupil,
         )
-        return Outcome(terms, _double_rows, stem=f"double_zernikes_{file_name(telescope.name)}")
+        return Outcome(terms, _double_rows, stem=f"double_zernikes_{shared.stem}")
     fields = field_disc(telescope) if over_field else shared.fields
     ordering = "fringe" if fringe else "noll"
     coefficients = wavefront_zernikes(

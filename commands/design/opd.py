@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Option
 
-from ...core.file_names import file_name
 from ..options import degrees_pair
 from ..tables import Column
 from .command import Outcome, SharedOptions, design_command
@@ -116,5 +115,5 @@ def opd(
     wavelength = telescope.default_wavelength if shared.wavelength is None else shared.wavelength
     wavefront = wavefront_opd(telescope, tuple(np.deg2rad([x, y])), wavelength, grid=grid, **shared.trace_options)
     fit = fit_zernikes(wavefront, 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration, zernikes)
-    stem = f"opd_{file_name(telescope.name)}_{x:g}_{y:g}_{wavefront.wavelength * 1e9:g}nm"
+    stem = f"opd_{shared.stem}_{x:g}_{y:g}_{wavefront.wavelength * 1e9:g}nm"
     return Outcome(FittedOpd(telescope, (x, y), wavefront, fit), stem=stem)

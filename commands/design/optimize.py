@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -82,7 +84,7 @@ def sensitivity(
     else:
         variables = usual_parameters(telescope) if parameters is None else name_list(parameters, "--parameters")
     result = compute(telescope, variables, *where, n_zernike=zernikes, **shared.trace_options)
-    path = out or Path(f"sensitivity_{file_name(telescope.name)}.fits")
+    path = out or Path(f"sensitivity_{shared.stem}.fits")
     write_sensitivity(path, result)
     values, _ = result.modes()
     notes = [f"singular values: {values[0]:.3g} to {values[-1]:.3g}", f"matrix: {path.resolve()}"]
@@ -91,6 +93,8 @@ def sensitivity(
     return Outcome(result, notes=notes)
 
 
+#: Relative difference between focal length and scale on the detector from which on it is said.
+_SAME_SCALE = 1e-3
 #: Units in which operands are shown that are small beside the lens, as in files.
 _SMALL = {"rms_spot": ("µm", 1e-6), "rms_wavefront": ("nm", 1e-9), "sag": ("µm", 1e-6)}
 
@@ -101,6 +105,8 @@ def _shown_unit(result: Any, unit: str) -> tuple[str, float]:
 
 
 def _operand_unit(result: Any, operand: Operand) -> tuple[str, float]:
+    if operand.stated is not None:
+        return operand.stated.unit or "1", operand.stated.size
     if operand.unit == "rad":
         return "deg", math.radians(1.0)
     return _SMALL.get(operand.kind, _shown_unit(result, operand.unit))
@@ -137,7 +143,7 @@ def optimize(
     shared: SharedOptions,
     variables: Annotated[str | None, Option(help=f"{_ADDRESSES}, L1.thickness, silica.abbe.")] = None,
     merit: Annotated[str | None, Option(help="Merit function to minimise: spots (by default) or wavefront.")] = None,
-    focal_length: Annotated[float | None, Option(help="Focal length to be held [m].")] = None,
+    focal_length: Annotated[float | None, Option(help="Paraxial focal length to be held [m].")] = None,
     bounds: Annotated[
         list[str] | None,
         Option(metavar="ADDRESS=LOW:HIGH", help="Limits of a variable; of a motion those of its change."),
@@ -160,6 +166,7 @@ def optimize(
     - `pachon optimize triplet.zmx --config opt.yaml --out better.yaml`
     """
     from ...design.optimize.targets import FocalLength
+    from ...models.digits import with_optimised_digits
     from ...models.io.prescription import save_telescope
 
     if (config is None) == (variables is None):
@@ -183,9 +190,11 @@ def optimize(
             threads=shared.threads,
         )
     optimum = _optimum(result)
-    paths = [out or Path(f"optimized_{file_name(telescope.name)}.yaml") for telescope in optimum.telescopes]
+    paths = [out or Path(f"{_optimized_name(file_name(telescope.name))}.yaml") for telescope in optimum.telescopes]
     with warnings_shown(PrescriptionWarning):
-        for telescope, path in zip(optimum.telescopes, paths, strict=True):
+        for solved, path in zip(optimum.telescopes, paths, strict=True):
+            # Analyses of the optimised lens have names of their own, beside those of its source.
+            telescope = replace(with_optimised_digits(solved), name=path.stem)
             try:
                 save_telescope(telescope, path, lenient=shared.lenient)
             except PrescriptionError as error:
@@ -194,6 +203,12 @@ def optimize(
                 save_telescope(telescope, yaml_path)
                 raise error.within(subject=f"{path}, in place of which {yaml_path.name} was written") from None
     return Outcome(result, notes=[*_notes(result), *(f"prescription: {path.resolve()}" for path in paths)])
+
+
+def _optimized_name(stem: str) -> str:
+    """Return the name of an optimised telescope: optimized_lens, then optimized_2_lens of that, and so on."""
+    optimized = re.fullmatch(r"optimized_(?:(\d+)_)?(.+)", stem)
+    return f"optimized_{int(optimized[1] or 1) + 1}_{optimized[2]}" if optimized else f"optimized_{stem}"
 
 
 def _check_out(shared: SharedOptions, out: Path | None, *, several: bool = False) -> None:
@@ -257,8 +272,42 @@ def _notes(result: Any) -> list[str]:
         owner = f" of {evaluation.configuration}" if several else ""
         label, goal = evaluation.operand.label, evaluation.operand.goal_text(size)
         lines.append(f"{label}{owner}: {evaluation.start / size:.6g} -> {evaluation.end / size:.6g}{unit} ({goal})")
-    lines += [f"glass: {start_glass} -> {end_glass}" for start_glass, end_glass in s.get("glasses", {}).items()]
+    lines += _focal_length_notes(optimum)
+    lines += _glass_notes(result)
     return lines + [f"collinear: {combination}" for combination in s["collinear"]]
+
+
+def _glass_notes(result: Any) -> list[str]:
+    """Return the chosen glasses, each with all that were tried and the rms that they reach, the best first."""
+    lines = []
+    unit = "µrad" if _optimum(result).in_angles else "µm"
+    for start_glass, end_glass in getattr(result, "glasses", {}).items():
+        trials = sorted((t for t in result.trials if t.glass == start_glass), key=lambda trial: trial.rms)
+        texts = [f"{t.name} {1e6 * t.rms:.4g}" if math.isfinite(t.rms) else f"{t.name} without light" for t in trials]
+        lines += [f"glass: {start_glass} -> {end_glass}", f"  tried, rms with operands in {unit}: {', '.join(texts)}"]
+    return lines
+
+
+def _focal_length_notes(optimum: Any) -> list[str]:
+    """Return a line where `focal_length` or `f_number` was another number in earlier files, of a defocused detector."""
+    from ...core.errors import PachonError
+    from ...design.optimize.targets import FNumber, FocalLength, ImageScale
+
+    kinds = [c.operand.kind for c in optimum.operands if isinstance(c.operand, FocalLength | FNumber)]
+    stated_kinds = [c.operand.kind for c in optimum.operands if c.operand.kind in kinds and c.operand.stated is None]
+    if not stated_kinds:
+        return []
+    name, size = optimum.telescope.length_unit
+    try:
+        scale, focal_length = (cls(0.0).measure(optimum.telescope) for cls in (ImageScale, FocalLength))
+    except PachonError:
+        return []
+    if abs(scale - abs(focal_length)) <= _SAME_SCALE * scale:
+        return []
+    return [
+        f"{stated_kinds[0]}: that of the paraxial focal length, {focal_length / size:.6g} {name}; the scale on the "
+        f"detector, its meaning in earlier files, is image_scale, {scale / size:.6g} {name}"
+    ]
 
 
 def _from_to(pair: Any) -> str:

@@ -7,7 +7,6 @@ from typing import Annotated
 
 from typer import Option
 
-from ...core.file_names import file_name
 from ...core.terminal import print_line
 from ..interrupt import interruptible
 from ..options import AcrossBand, FieldsDeg, Lenient, Model, Quiet, Threads, WavelengthsNm
@@ -39,7 +38,7 @@ def design_report_command(
 
     shared = SharedOptions(model, field_deg, wavelength_nm, across_band, lenient=lenient)
     telescope, fields, wavelengths = shared.first_arguments
-    path = out or Path(f"design_report_{file_name(telescope.name)}.html")
+    path = out or Path(f"design_report_{shared.stem}.html")
     require_writable(path, file=True)
     with interruptible(quiet) as reporter, reporter.stage("design report", STEPS) as stage:
         page = design_report(telescope, fields, wavelengths, threads=threads, progress=stage.advance)

@@ -15,7 +15,7 @@ from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
 from ..drawing import field_text, legend_below
-from .sections import Lens, drawn_radii, even_edges, find_lenses, ray_paths, surface_section
+from .sections import Lens, drawn_radii, even_edges, find_lenses, ray_paths, stop_rims, surface_section
 
 if TYPE_CHECKING:
     import trimesh
@@ -36,6 +36,9 @@ _GLASS_RIM = "#3f7d99"
 _MIRROR = "#1a1a1a"
 _DETECTOR = "#0b6b3a"
 _BAFFLE = "#6b4a2b"
+_STOP = "#000000"
+#: Length of the bars beside the stop, over its diameter.
+_STOP_BAR = 0.1
 #: Lenses and detector have a panel of their own below this fraction of the whole size.
 _SMALL = 0.4
 
@@ -62,6 +65,8 @@ class Layout(Result):
         Arriving rays of each field through the line x = 0 of the pupil, from above the telescope on [m].
     bundles : tuple of ndarray, shape [n_ray, n_point, 3]
         Arriving rays of each field all around the pupil [m].
+    stop : ndarray, shape [2, 3], optional
+        The rim of the stop in the section x = 0 [m], telescope frame; None where no surface is stated to be it.
     """
 
     _row_type = Surface
@@ -74,6 +79,7 @@ class Layout(Result):
     lenses: tuple[Lens, ...]
     fans: tuple[np.ndarray, ...]
     bundles: tuple[np.ndarray, ...]
+    stop: np.ndarray | None = None
 
     @property
     def dark(self) -> list[int]:
@@ -217,6 +223,7 @@ def layout(
         lenses=lenses,
         fans=rays((np.zeros_like(across), across)),
         bundles=rays(around),
+        stop=stop_rims(request),
     )
 
 
@@ -298,6 +305,12 @@ def _draw(axes: Axes, drawing: _Drawing, box: np.ndarray, named: set[str], *, be
     for obstruction in layout.telescope.obstructions:
         segments = drawing(_cut(obstruction.triangles.astype(np.float64))) * scale
         axes.add_collection(LineCollection(list(segments), colors=_BAFFLE, linewidths=1.0, zorder=3))
+    stop = layout.stop if beams or layout.telescope.design_data.stop in named else None
+    if stop is not None:
+        # The symbol of a stop: two bars that end at its rim.
+        ends = drawing(stop) * scale
+        bars = [[rim, rim + _STOP_BAR * (rim - opposite)] for rim, opposite in (ends, ends[::-1])]
+        axes.add_collection(LineCollection(bars, colors=_STOP, linewidths=2.2, zorder=5))
     if beams:
         start = np.concatenate([drawing(fan[:, 0]) for fan in layout.fans] or [box]) * scale
         if len(start):
@@ -308,7 +321,11 @@ def _draw(axes: Axes, drawing: _Drawing, box: np.ndarray, named: set[str], *, be
     axes.set_ylabel(f"y [{unit}]" if drawing.lying else f"z, towards the sky [{unit}]")
     axes.grid(True, color="0.94", linewidth=0.6)
     axes.set_axisbelow(True)
-    _write_names(axes, _labels(drawing, named, scale, (low, high)), drawing.lying)
+    labels = _labels(drawing, named, scale, (low, high))
+    if stop is not None:
+        side = 1 if drawing.lying else 0
+        labels.append(("stop", max((bar[1] for bar in bars), key=lambda point: float(point[side]))))
+    _write_names(axes, labels, drawing.lying)
 
 
 def _labels(

@@ -129,7 +129,8 @@ def _apart(front: Surface, back: Surface, reach: float) -> bool:
 def drawn_radii(request: Request) -> dict[str, float]:
     """Return the radius to which each surface is drawn [m]: its rim, its semi-diameter, or the light of all fields.
 
-    The light is that of the fields of the request and, where the telescope states none, of the edge of its field.
+    A semi-diameter smaller than the light that arrives at the detector gives way to it. The light is that of the fields
+    of the request and, where the telescope states none, of the edge of its field.
     """
     telescope, threads = request.telescope, request.threads
     edge = telescope.field_radius * np.array([[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]])
@@ -137,24 +138,44 @@ def drawn_radii(request: Request) -> dict[str, float]:
     angle = 2.0 * np.pi * np.arange(16) / 16
     radius = 0.5 * telescope.pupil_diameter
     rim = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    lit = np.zeros(len(telescope.surfaces))
+    lit, arrived = np.zeros((2, len(telescope.surfaces)))
     for field_request in requests:
         rays = field_request.launch(request.wavelength, rim)
-        for k, met in enumerate(trace(telescope, rays, "all", threads=threads)):
+        results = trace(telescope, rays, "all", threads=threads)
+        arrives = results[-1].status == RayStatus.OK
+        for k, met in enumerate(results):
             local = telescope.surfaces[k].to_local(met.position)
             # Vignetted light counts too, where there is nothing else.
             away = np.hypot(local[:, 0], local[:, 1])
             lit[k] = max(lit[k], float(np.nanmax(away, initial=0.0)) if np.isfinite(away).any() else 0.0)
+            arrived[k] = max(arrived[k], float(np.max(away[arrives], initial=0.0)))
     radii = {}
-    for surface, light in zip(telescope.surfaces, lit, strict=True):
+    for surface, light, drawn_light in zip(telescope.surfaces, lit, arrived, strict=True):
         bound = outer_radius(surface.aperture)
         if surface.interaction == Interaction.PASS:
             blocked = outer_radius(surface.aperture.part) if isinstance(surface.aperture, Complement) else np.inf
             bound = blocked if np.isfinite(blocked) else _RIM * (bound if np.isfinite(bound) else light)
         if np.isinf(bound):
-            bound = surface.semi_diameter or _BEYOND * max(light, 1e-3 * radius)
+            # A semi-diameter stops no light: no ray is drawn that bends outside the glass.
+            stated = max(surface.semi_diameter, drawn_light) if surface.semi_diameter else 0.0
+            bound = stated or _BEYOND * max(light, 1e-3 * radius)
         radii[surface.name] = bound
     return radii
+
+
+def stop_rims(request: Request) -> np.ndarray | None:
+    """Return the two points of the rim of the stop in the section x = 0 [m], [2, 3]; None where none is known.
+
+    They are where the light of the axis ends.
+    """
+    telescope, name = request.telescope, request.telescope.design_data.stop
+    if name is None:
+        return None
+    axis = Request.of(telescope, [(0.0, 0.0)], request.wavelength, threads=request.threads, one_wavelength=True)
+    height = 0.5 * telescope.pupil_diameter
+    rays = axis.launch(request.wavelength, np.array([[0.0, -height], [0.0, height]]))
+    met = trace(telescope, rays, "all", threads=request.threads)[telescope.surface_names.index(name)]
+    return met.position if np.isfinite(met.position).all() else None
 
 
 def find_lenses(telescope: Telescope, wavelength: float) -> tuple[Lens, ...]:

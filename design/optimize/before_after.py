@@ -36,7 +36,8 @@ def draw_before_after(
     middle = float(wavelengths[len(wavelengths) // 2])
     for axes, telescope, name in zip(sections.subplots(1, 2), telescopes, ("before", "after"), strict=True):
         draw_section(axes, layout(*with_fields(telescope, shown, factors), middle))
-        axes.set_title(name)
+        # A title would stand among the names of the surfaces.
+        axes.set_ylabel(f"{name}\n{axes.get_ylabel()}")
     stated = [with_fields(t, shown, factors) for t in telescopes]
     diagrams = [spot_diagram(Request.of(*args, wavelengths, sampling="rings", n_pupil=_RINGS)) for args in stated]
     # Rings are to look at: their rms is one to two per cent off that of the analysis of spots.

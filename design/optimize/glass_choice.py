@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, PachonError, check_unique, unknown_name
@@ -18,8 +19,10 @@ from ...models.parameters.parameters import Parameter
 from ...models.telescope import VACUUM, Telescope
 from .configuration import DesignConfiguration
 from .merit_function import MeritFunction
+from .operand import Operand
 from .optimize import optimize
 from .optimum import Optimum
+from .solver import LeastSquares
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -88,6 +91,18 @@ class GlassChoice(Result):
         return {**self.optimum.summary(), "glasses": self.glasses, **model, "glass_trials": trials}
 
 
+class GlassOptions(TypedDict, total=False):
+    """Further arguments of :func:`choose_glasses`, those of :func:`~.optimize.optimize`."""
+
+    fields: ArrayLike | None
+    wavelengths: ArrayLike | None
+    bounds: Mapping[str, tuple[float, float]] | None
+    targets: Sequence[Operand]
+    n_pupil: int | None
+    solver: LeastSquares | None
+    threads: int | None
+
+
 @check_arguments
 def choose_glasses(
     telescope: Telescope | DesignConfiguration,
@@ -97,7 +112,7 @@ def choose_glasses(
     *,
     catalogue: GlassCatalogue | None = None,
     nearest: int = 4,
-    **options: Any,
+    **options: Unpack[GlassOptions],
 ) -> GlassChoice:
     """Optimise a telescope together with its glasses.
 

@@ -16,22 +16,39 @@ from ...models.telescope import Telescope
 from ...raytrace.rays import field_direction
 from .jacobian import ParameterColumns
 
-#: Classes of operands by their kinds, as in files.
+#: Classes of operands by their kinds, as in files; :mod:`~.operand_names` has the names of Zemax and CODE V.
 OPERANDS: dict[str, type[GoalOperand]] = {}
+#: Units that numbers are shown in, by their unit in SI.
+_MESSAGE_UNITS = {"m": ("mm", 1e-3), "rad": ("deg", float(np.deg2rad(1.0)))}
 #: Fields of the goal, and of how it is computed; the others say which number it is.
 _GOAL = ("value", "minimum", "maximum", "weight", "step")
 _Kind = TypeVar("_Kind", bound="type[GoalOperand]")
 
 
-def operand_kind(kind: str, unit: str) -> Callable[[_Kind], _Kind]:
-    """Return a decorator that registers a class of operands under a kind, with the unit of its number."""
+def operand_kind(kind: str, unit: str, *, in_files: bool = True) -> Callable[[_Kind], _Kind]:
+    """Return a decorator that registers a class of operands under a kind, with the unit of its number.
+
+    Those that are not `in_files` have other names there.
+    """
 
     def register(cls: _Kind) -> _Kind:
         cls.kind, cls.unit = kind, unit
-        OPERANDS[kind] = cls
+        if in_files:
+            OPERANDS[kind] = cls
         return cls
 
     return register
+
+
+@dataclass(frozen=True)
+class StatedName:
+    """Name of an operand in another program, and the unit of its number with its size in SI."""
+
+    name: str
+    unit: str
+    size: float
+    #: Fields of the operand that the name implies.
+    implied: tuple[str, ...] = ()
 
 
 class Operand:
@@ -44,6 +61,8 @@ class Operand:
     minimum: float | None
     maximum: float | None
     weight: float
+    #: Name under which it was stated, where that is not its kind.
+    stated: StatedName | None = None
     #: Effect [m] on wavefront or spots of the step of a variable, where derivatives are taken by differences.
     step: float = 1e-6
 
@@ -58,8 +77,9 @@ class Operand:
         if self.weight <= 0:
             raise DomainError(f"operand {self.label}: weight = {self.weight!r}: expected a positive number")
         if self.minimum is not None and self.maximum is not None and not self.minimum < self.maximum:
+            size = 1.0 if self.stated is None else self.stated.size
             raise DomainError(
-                f"operand {self.label}: minimum = {self.minimum:g}, maximum = {self.maximum:g}: "
+                f"operand {self.label}: minimum = {self.minimum / size:g}, maximum = {self.maximum / size:g}: "
                 "expected the minimum below the maximum"
             )
 
@@ -72,9 +92,10 @@ class Operand:
     @property
     def label(self) -> str:
         """Name in messages and tables, such as "edge_thickness(L1)"."""
-        stated = [(name, v) for name, v in self.quantity if v is not None and not callable(v)]
-        texts = [_degrees(v) if name == "field" else _shown(v) for name, v in stated]
-        return f"{self.kind}({', '.join(texts)})" if texts else self.kind
+        name, implied = (self.kind, ()) if self.stated is None else (self.stated.name, self.stated.implied)
+        fields = [(key, v) for key, v in self.quantity if v is not None and not callable(v) and key not in implied]
+        texts = [_FIELD_TEXTS.get(key, _shown)(v) for key, v in fields]
+        return f"{name}({', '.join(texts)})" if texts else name
 
     def goal_text(self, unit: float = 1.0) -> str:
         """Return the wanted value or the limits as text, in a unit of a size in SI."""
@@ -82,6 +103,19 @@ class Operand:
             return f"= {self.value / unit:.6g}"
         limits = ((">=", self.minimum), ("<=", self.maximum))
         return ", ".join(f"{sign} {number / unit:.6g}" for sign, number in limits if number is not None)
+
+    @property
+    def shown_unit(self) -> tuple[str, float]:
+        """Unit that the number is shown in, and its size in SI: the stated one, or mm and degrees."""
+        if self.stated is not None:
+            return self.stated.unit, self.stated.size
+        return _MESSAGE_UNITS.get(self.unit, ("" if self.unit == "1" else self.unit, 1.0))
+
+    @property
+    def message_goal(self) -> str:
+        """Name with the wanted value or the limits, in the unit that it is shown in."""
+        unit, size = self.shown_unit
+        return f"{self.label} {self.goal_text(size)} {unit}".rstrip()
 
     @property
     def exact(self) -> bool:
@@ -146,16 +180,36 @@ class GoalOperand(Operand):
     minimum: float | None = None
     maximum: float | None = None
     weight: float = 1.0
+    stated: StatedName | None = dataclasses.field(default=None, repr=False, compare=False, kw_only=True)
 
 
 def check_operands(operands: tuple[Operand, ...]) -> None:
-    """Raise a ConfigError where two operands state one number."""
-    keys: list[tuple[Any, ...]] = []
+    """Raise a ConfigError where two operands state one number twice, or goals that no telescope can meet at once.
+
+    A minimum and a maximum of one number may stand in two operands.
+    """
+    by_number: dict[tuple[Any, ...], list[Operand]] = {}
     for operand in operands:
-        key = (operand.kind, operand.quantity)
-        if key in keys:
-            raise ConfigError(f"operand {operand.label} is given twice: expected each number once")
-        keys.append(key)
+        previous_operands = by_number.setdefault((operand.kind, operand.quantity), [])
+        for previous in previous_operands:
+            intervals = [_interval(previous), _interval(operand)]
+            if max(low for low, _ in intervals) > min(high for _, high in intervals):
+                raise ConfigError(
+                    f"operands {previous.message_goal} and {operand.message_goal} contradict each other: "
+                    "expected goals that one telescope can meet"
+                )
+            pairs = [(getattr(previous, name), getattr(operand, name)) for name in ("minimum", "maximum")]
+            if None not in (previous.value, operand.value) or any(None not in pair for pair in pairs):
+                raise ConfigError(f"operand {operand.label} is given twice: expected each number once")
+        previous_operands.append(operand)
+
+
+def _interval(operand: Operand) -> tuple[float, float]:
+    """Return the range that the goal of an operand allows."""
+    if operand.value is not None:
+        return operand.value, operand.value
+    low = -np.inf if operand.minimum is None else operand.minimum
+    return low, np.inf if operand.maximum is None else operand.maximum
 
 
 def direction_of(field: ArrayLike, telescope: Telescope) -> np.ndarray:
@@ -182,7 +236,25 @@ def _degrees(field: tuple[float, float]) -> str:
     return " ".join(f"{np.rad2deg(v):.4g}" for v in field) + " deg"
 
 
+def _nanometres(wavelengths: float | tuple[float, ...]) -> str:
+    numbers = wavelengths if isinstance(wavelengths, tuple) else (wavelengths,)
+    return " ".join(f"{1e9 * v:.5g}" for v in numbers) + " nm"
+
+
+def _per_millimetre(frequency: float) -> str:
+    return f"{1e-3 * frequency:.4g}/mm"
+
+
 def _shown(value: Any) -> str:
     if isinstance(value, tuple):
         return " ".join(_shown(v) for v in value)
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+#: Texts of fields that have a unit of their own in labels.
+_FIELD_TEXTS: dict[str, Callable[[Any], str]] = {
+    "field": _degrees,
+    "frequency": _per_millimetre,
+    "wavelength": _nanometres,
+    "wavelengths": _nanometres,
+}

@@ -8,7 +8,7 @@
     fields_deg: [[0, 0], [0, 8.5], [0, 12]]
     wavelengths_nm: [486.1, 587.6, 656.3]
     operands:
-      - {kind: focal_length_mm, target: 25}
+      - {kind: EFFL, target: 25}
       - {kind: edge_thickness_mm, surface: S1, min: 0.5}
       - {kind: distortion_percent, field_deg: [0, 12], min: -1, max: 1}
     configurations:
@@ -17,7 +17,8 @@
     glass_catalogue: schott
     restarts: 10
 
-An operand has one of the kinds of :data:`~.operand.OPERANDS`, with the unit of its numbers at the end of the name.
+An operand has one of the kinds of :data:`~.operand.OPERANDS`, with the unit of its numbers at the end of the name; or a
+name of Zemax or CODE V (:data:`~.operand_names.NAMES`), in mm, degrees, percent, waves.
 Bounds have the unit at the end of the address. The telescope of the command is the first configuration;
 `configurations` are further ones, which share the variables.
 """
@@ -34,15 +35,15 @@ from pydantic import Field
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, error_context, unknown_name
 from ...core.schema import Count, Positive, Real, Section, Whole, validated
-from ...core.yaml_reader import read_mapping
+from ...core.yaml_reader import as_number, read_mapping
 from ...models.io.glass_catalogue import GlassCatalogue
 from ...models.io.prescription import load_telescope
 from ...models.parameters.changes import ANGLES, LENGTHS, parse_change
 from ...models.telescope import Telescope
-from . import geometry_operands, ray_operands, targets
 from .configuration import DesignConfiguration
 from .merit_function import SpotSize, WavefrontError
 from .operand import OPERANDS, GoalOperand, Operand
+from .operand_names import NAMES, OperandName, entry_fields, goal_of, unknown_operand
 from .solver import LeastSquares
 
 _DEGREE = ANGLES["deg"]
@@ -57,8 +58,6 @@ _KEYS = {
 }
 #: Units at the end of kinds, by the unit of the number.
 _UNITS = {"m": LENGTHS, "rad": ANGLES, "1": {"": 1.0, "percent": 0.01}}
-#: Modules whose operands files can name; importing them registers the kinds.
-_MODULES = (targets, geometry_operands, ray_operands)
 
 Pair = tuple[Real, Real]
 Pairs = Annotated[tuple[Pair, ...], Field(min_length=1)]
@@ -88,25 +87,75 @@ class OperandSection(Section):
 
     def operand(self) -> Operand:
         """Return the operand; ConfigError or DomainError where its numbers do not fit together."""
-        cls, size = _kind(self.kind)
-        names = [f.name for f in dataclasses.fields(cls) if f.repr]
-        key_units = {n: _KEYS.get(n, (n, None)) for n in names if n not in ("value", "minimum", "maximum", "weight")}
+        entry, unit = named_operand(self.kind)
+        cls, size = (entry.kind, entry.units[unit]) if entry is not None else _kind(self.kind)
+        implied = {} if entry is None else entry.implied
+        names = [f.name for f in dataclasses.fields(cls) if f.repr and f.name not in implied]
+        key_units = {name: _KEYS.get(name, (name, None)) for name in names}
+        key_units = {name: pair for name, pair in key_units.items() if pair[0] in _OPERAND_KEYS}
         keys = [key for key, _ in key_units.values()]
-        for key in self.model_fields_set - {"kind", "target", "min", "max", "weight"}:
+        for key in self.model_fields_set & _OPERAND_KEYS:
             if key not in keys:
                 raise unknown_name(f"key of operand {self.kind}", key, keys)
-        values: dict[str, Any] = {"weight": self.weight}
-        for name, (key, unit) in key_units.items():
+        values: dict[str, Any] = {"weight": self.weight, **implied}
+        for name, (key, key_unit) in key_units.items():
             if (value := getattr(self, key)) is not None:
-                values[name] = value if unit is None else _scaled(value, unit)
-        for name, number in (("value", self.target), ("minimum", self.min), ("maximum", self.max)):
-            if number is not None:
-                values[name] = number * size
+                values[name] = value if key_unit is None else _scaled(value, key_unit)
+        stated = {"value": self.target, "minimum": self.min, "maximum": self.max}
+        if entry is not None:
+            stated = goal_of(entry, self.target, self.min, self.max)
+            values["stated"] = entry.stated(unit)
+        values |= {name: number * size for name, number in stated.items() if number is not None}
         needed = [f for f in dataclasses.fields(cls) if f.default is dataclasses.MISSING]
         for required in needed:
             if required.name not in values:
                 raise ConfigError(f"operand {self.kind}: {key_units[required.name][0]} is missing")
         return cls(**values)
+
+
+#: Keys of operands that say which number it is.
+_OPERAND_KEYS = set(OperandSection.model_fields) - {"kind", "target", "min", "max", "weight"}
+
+
+def operand_of_text(text: str) -> Operand:
+    """Return the operand of a text such as "REAY surface=S3 field_deg=0,9", with the keys of files; without a goal.
+
+    Raises
+    ------
+    ConfigError, UnknownNameError
+        If the kind or a key does not exist, a key is missing, or a value is not as expected.
+    """
+    kind, *pairs = text.split() or [""]
+    content: dict[str, Any] = {"kind": kind, "target": 0.0}
+    for pair in pairs:
+        key, equals, value = pair.partition("=")
+        if not equals or key in ("kind", "target", "min", "max", "weight"):
+            raise ConfigError(f"{pair!r}: expected KEY=VALUE, such as surface=S3 or field_deg=0,9")
+        numbers = [as_number(item) for item in value.split(",")]
+        if None in numbers:
+            content[key] = value
+        else:
+            content[key] = numbers if len(numbers) > 1 else numbers[0]
+    return validated(OperandSection, content, f"operand {kind}").operand()
+
+
+def file_keys(entry: OperandName) -> list[str]:
+    """Return the keys of a named operand in files, with a star behind those that it needs."""
+    required = entry_fields(entry)
+    return [_KEYS.get(name, (name, None))[0] + ("*" if required[name] else "") for name in required]
+
+
+def named_operand(text: str) -> tuple[OperandName | None, str]:
+    """Return the name of Zemax or CODE V that a text begins with, and the unit behind it; None where there is none."""
+    name, _, unit = text.partition("_")
+    entry = NAMES.get(name)
+    if entry is None:
+        return None, ""
+    if unit and unit not in entry.units:
+        raise ConfigError(
+            f"operand {text!r}: expected its unit at the end, one of {', '.join(filter(None, entry.units))}"
+        )
+    return entry, unit or entry.unit
 
 
 def _kind(text: str) -> tuple[type[GoalOperand], float]:
@@ -118,10 +167,7 @@ def _kind(text: str) -> tuple[type[GoalOperand], float]:
             if unit in units:
                 return cls, units[unit]
             raise ConfigError(f"operand {text!r}: expected its unit at the end, one of {', '.join(units)}")
-    spellings = [
-        kind if cls.unit == "1" else f"{kind}_{'mm' if cls.unit == 'm' else 'deg'}" for kind, cls in OPERANDS.items()
-    ]
-    raise unknown_name("operand", text, spellings)
+    raise unknown_operand(text)
 
 
 def _scaled(value: Any, unit: float) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import ClassVar, Literal, NamedTuple, Protocol, Self
 
 import numpy as np
 
@@ -24,6 +24,52 @@ from .operand import GoalOperand, angles_of, direction_of, operand_kind, wavelen
 
 #: Points across the pupil for the modulation transfer.
 _ACROSS = 32
+
+
+class RayAtSurface(NamedTuple):
+    """A ray where it meets a surface: position [m] and unit directions, telescope frame, shape [3]."""
+
+    position: np.ndarray
+    direction_before: np.ndarray
+    direction_behind: np.ndarray
+
+
+class RayOperand(Protocol):
+    """Operand of one ray: surface, field angles [rad], pupil point in units of its radius, wavelength [m]."""
+
+    @property
+    def label(self) -> str:
+        """Name in messages."""
+
+    @property
+    def surface(self) -> str:
+        """Name of the surface."""
+
+    @property
+    def field(self) -> tuple[float, float]:
+        """Field angles [rad]."""
+
+    @property
+    def pupil(self) -> tuple[float, float]:
+        """Pupil point."""
+
+    @property
+    def wavelength(self) -> float | None:
+        """Vacuum wavelength [m]."""
+
+
+def ray_at_surface(operand: RayOperand, telescope: Telescope) -> RayAtSurface:
+    """Return the ray of an operand at its surface; DomainError where it does not get there."""
+    place = telescope.surface_names.index(telescope.surface(operand.surface).name)
+    point = 0.5 * telescope.pupil_diameter * np.array([operand.pupil], dtype=np.float64)
+    light = direction_of(operand.field, telescope)
+    rays = launch_bundles(telescope, light, wavelength_of(operand.wavelength, telescope), point)
+    results = trace(telescope, rays, surfaces="all", threads=1)
+    landed = results[place]
+    if landed.status[0] > RayStatus.VIGNETTED:
+        raise DomainError(f"operand {operand.label}: the ray does not reach the surface")
+    before = results[place - 1].direction[0] if place else rays.direction[0]
+    return RayAtSurface(landed.position[0], before, landed.direction[0])
 
 
 @operand_kind("incidence_angle", "rad")
@@ -55,16 +101,9 @@ class IncidenceAngle(GoalOperand):
 
     def measure(self, telescope: Telescope) -> float:  # noqa: D102
         surface = telescope.surface(self.surface)
-        point = 0.5 * telescope.pupil_diameter * np.array([self.pupil], dtype=np.float64)
-        light = direction_of(self.field, telescope)
-        rays = launch_bundles(telescope, light, wavelength_of(self.wavelength, telescope), point)
-        results = trace(telescope, rays, surfaces="all", threads=1)
-        i = telescope.surface_names.index(surface.name)
-        landed = results[i]
-        if landed.status[0] > RayStatus.VIGNETTED:
-            raise DomainError(f"operand {self.label}: the ray does not reach the surface")
-        ray = landed.direction[0] if self.behind else (results[i - 1].direction[0] if i else rays.direction[0])
-        x, y, _ = surface.to_local(landed.position[0])
+        landed = ray_at_surface(self, telescope)
+        ray = landed.direction_behind if self.behind else landed.direction_before
+        x, y, _ = surface.to_local(landed.position)
         slope_x, slope_y = surface.shape.gradient(x, y)
         normal = surface.matrix @ np.array([-float(slope_x), -float(slope_y), 1.0])
         # The arc tangent stays exact for small angles.
@@ -78,6 +117,64 @@ class ExitAngle(IncidenceAngle):
     """Angle [rad] between a ray and the normal of a surface, behind the surface; see :class:`IncidenceAngle`."""
 
     behind: ClassVar[bool] = True
+
+
+@operand_kind("ray_coordinate", "m", in_files=False)
+@check_arguments
+@dataclass(frozen=True, kw_only=True)
+class RayCoordinate(GoalOperand):
+    """Coordinate [m] at which a ray meets a surface, in the axes that the surface has in a lens file.
+
+    These have z along the light that enters; they are the telescope's own ``(-x, y, -z)``, and a field ``(tx, ty)`` is
+    ``(-tx, ty)`` there. "r" is the distance from the axis of the surface.
+
+    Parameters
+    ----------
+    axis : {"x", "y", "z", "r"}
+        The coordinate.
+    surface, field, pupil, wavelength
+        As of :class:`IncidenceAngle`.
+    value, minimum, maximum, weight : float
+        As in :class:`~.operand.GoalOperand` [m].
+    """
+
+    axis: Literal["x", "y", "z", "r"]
+    surface: str
+    field: tuple[float, float] = (0.0, 0.0)
+    pupil: tuple[float, float] = (0.0, 0.0)
+    wavelength: float | None = None
+
+    def measure(self, telescope: Telescope) -> float:  # noqa: D102
+        x, y, z = telescope.surface(self.surface).to_local(ray_at_surface(self, telescope).position)
+        return float({"x": -x, "y": y, "z": -z, "r": np.hypot(x, y)}[self.axis]) + 0.0
+
+
+@operand_kind("ray_cosine", "1", in_files=False)
+@check_arguments
+@dataclass(frozen=True, kw_only=True)
+class RayCosine(GoalOperand):
+    """Direction cosine of a ray behind a surface, in the axes of :class:`RayCoordinate`.
+
+    Parameters
+    ----------
+    axis : {"x", "y", "z"}
+        The axis.
+    surface, field, pupil, wavelength
+        As of :class:`IncidenceAngle`.
+    value, minimum, maximum, weight : float
+        As in :class:`~.operand.GoalOperand`.
+    """
+
+    axis: Literal["x", "y", "z"]
+    surface: str
+    field: tuple[float, float] = (0.0, 0.0)
+    pupil: tuple[float, float] = (0.0, 0.0)
+    wavelength: float | None = None
+
+    def measure(self, telescope: Telescope) -> float:  # noqa: D102
+        direction = ray_at_surface(self, telescope).direction_behind
+        x, y, z = telescope.surface(self.surface).along(direction)
+        return float({"x": -x, "y": y, "z": -z}[self.axis]) + 0.0
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -18,8 +18,9 @@ from ...wavefront.request import Request
 from .aimed_rays import AimedRays, pupil_diameter
 from .jacobian import ParameterColumns
 from .operand import GoalOperand, Operand, angles_of, operand_kind, wavelength_of
+from .parabasal import group_focal_length, parabasal_focal_length
 
-#: Angle [rad] between the two chief rays of the focal length; distortion enters as its square.
+#: Angle [rad] between the two chief rays of the image scale; distortion enters as its square.
 _SMALL_FIELD = 1e-4
 
 
@@ -61,15 +62,91 @@ class _ExactOperand(GoalOperand):
 @check_arguments
 @dataclass(frozen=True)
 class FocalLength(_ExactOperand):
-    """Focal length: distance on the detector of two chief rays near the axis over the tangent of their angle.
+    """Effective focal length, of parallel rays close to the axis: the paraxial one, wherever the detector is.
 
-    This is the scale on the detector. It differs from the paraxial focal length if the detector is not in the paraxial
-    focus.
+    Of a telescope whose surfaces do not share one axis it is that about the chief ray of the axis. :class:`ImageScale`
+    is the scale on a detector that may be out of focus.
 
     Parameters
     ----------
     value : float, optional
-        Wanted focal length [m].
+        Wanted focal length [m]; negative where the image of a distant object is upright.
+    weight : float
+        An error of 1 mm counts as `weight` times 1 mm of rms spot or wavefront.
+    wavelength : float, optional
+        Vacuum wavelength [m]; the telescope's own by default.
+    meridian : {"x", "y"}, optional
+        Plane of the rays; by default that of y, or of x where there is no power along y.
+    first, last : str, optional
+        Names of the surfaces between which, both included, it is the focal length; of all by default. These surfaces
+        share one axis, and derivatives are taken by differences.
+    minimum, maximum : float, optional
+        Limits [m], in place of a value.
+    """
+
+    value: float | None = None
+    weight: float = 1.0
+    wavelength: float | None = None
+    meridian: Literal["x", "y"] | None = dataclasses.field(default=None, kw_only=True)
+    first: str | None = dataclasses.field(default=None, kw_only=True)
+    last: str | None = dataclasses.field(default=None, kw_only=True)
+
+    @property
+    def exact(self) -> bool:  # noqa: D102
+        return self.first is None and self.last is None
+
+    def measure(self, telescope: Telescope) -> float:  # noqa: D102
+        if self.exact:
+            return super().measure(telescope)
+        wavelength = wavelength_of(self.wavelength, telescope)
+        return group_focal_length(telescope, (self.first, self.last), wavelength, self.meridian)
+
+    def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
+        return parabasal_focal_length(columns, wavelength_of(self.wavelength, columns.telescope), self.meridian)
+
+
+@operand_kind("f_number", "1")
+@check_arguments
+@dataclass(frozen=True)
+class FNumber(_ExactOperand):
+    """Focal ratio: :class:`FocalLength` over the diameter of the entrance pupil, the image of a stop of stated size.
+
+    Parameters
+    ----------
+    value : float, optional
+        Wanted focal ratio.
+    weight : float
+        An error of 1 counts as `weight` times 1 m of rms spot or wavefront.
+    wavelength : float, optional
+        Vacuum wavelength [m]; the telescope's own by default.
+    minimum, maximum : float, optional
+        Limits, in place of a value.
+    """
+
+    value: float | None = None
+    weight: float = 1.0
+    wavelength: float | None = None
+
+    def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
+        length, change = parabasal_focal_length(columns, wavelength_of(self.wavelength, columns.telescope))
+        diameter, by_diameter = pupil_diameter(columns)
+        number = length / diameter
+        return number, change / diameter - number * by_diameter / diameter
+
+
+@operand_kind("image_scale", "m")
+@check_arguments
+@dataclass(frozen=True)
+class ImageScale(_ExactOperand):
+    """Scale on the detector: distance of two chief rays near the axis over the tangent of their angle.
+
+    It differs from the paraxial focal length where the detector is not in the paraxial focus. Of an afocal telescope it
+    is the size of the angular magnification.
+
+    Parameters
+    ----------
+    value : float, optional
+        Wanted scale [m].
     weight : float
         An error of 1 mm counts as `weight` times 1 mm of rms spot or wavefront.
     wavelength : float, optional
@@ -85,19 +162,6 @@ class FocalLength(_ExactOperand):
     def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
         wavelength = wavelength_of(self.wavelength, columns.telescope)
         return _scale(*_landing(columns, _near_axis(), wavelength))
-
-
-@operand_kind("f_number", "1")
-@check_arguments
-@dataclass(frozen=True)
-class FNumber(FocalLength):
-    """Focal ratio: :class:`FocalLength` over the diameter of the entrance pupil, the image of a stop of stated size."""
-
-    def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
-        length, change = super().gradient(columns)
-        diameter, by_diameter = pupil_diameter(columns)
-        number = length / diameter
-        return number, change / diameter - number * by_diameter / diameter
 
 
 @operand_kind("chief_ray", "m")

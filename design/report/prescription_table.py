@@ -50,7 +50,7 @@ def prescription_rows(telescope: Telescope, wavelength: float, semi_diameters: d
         rows.append(
             [
                 surface.name,
-                _TYPES[surface.interaction],
+                _TYPES[surface.interaction] + (", stop" if surface.name == telescope.design_data.stop else ""),
                 _number(-1.0 / shape.curvature / unit) if shape.curvature else "flat",
                 _number(thickness),
                 name,

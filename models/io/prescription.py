@@ -70,6 +70,13 @@ WRITTEN = {
 }  # fmt: skip
 #: Endings of lens files of several configurations.
 _CONFIGURED = (".zmx", ".zar")
+#: What to do with files of other programs whose format is not published, by their ending.
+_OTHER_PROGRAMS = {
+    ".zos": "a session of Zemax OpticStudio: save the lens there as .zmx",
+    ".zprj": "a project of Zemax OpticStudio: save the lens there as .zmx",
+    ".zda": "an analysis of Zemax OpticStudio: save the lens there as .zmx",
+    ".otx": "a lens of OpTaliX: export it there to CODE V, as .seq",
+}
 #: Endings of files that a telescope is read from.
 ENDINGS = (".yaml", ".yml", *_READERS)
 
@@ -124,7 +131,7 @@ def load_telescope(
         return _bundled(text)
     path = Path(text)
     if path.suffix.lower() in (".yaml", ".yml"):
-        content = read_mapping(path, max_bytes=MAX_BYTES)
+        content = read_mapping(path, max_bytes=MAX_BYTES, exact=True)
         if BATOID_ROOT not in content:
             return telescope_of(content, path)
         # Imported where it is needed, like the writer: the sections of the format take time to make.
@@ -139,6 +146,8 @@ def load_telescope(
             reader = partial(reader, configuration=configuration)
         telescope = read_lens(path, reader, lenient=lenient, glass_catalogues=glass_catalogues)
         return telescope if configuration is None else replace(telescope, name=f"{telescope.name}_{configuration}")
+    if (hint := _OTHER_PROGRAMS.get(path.suffix.lower())) is not None:
+        raise PrescriptionError(hint, file=path)
     if isinstance(name_or_path, os.PathLike) or len(path.parts) > 1 or path.is_file():
         raise PrescriptionError(f"expected a prescription file that ends in {', '.join(ENDINGS)}", file=path)
     raise unknown_name("telescope", text, BUNDLED)

@@ -8,6 +8,7 @@ from typing import Any
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
+from ..digits import with_few_digits
 from ..io.yaml.comments import with_comments
 from ..io.yaml.writer import telescope_to_yaml
 from ..paul_baker import paul_baker
@@ -89,7 +90,7 @@ def new_telescope(
 
 def new_prescription(kind: str, **options: Any) -> tuple[Telescope, str]:
     """Return a new telescope and the text of its prescription file, with comments; arguments as `new_telescope`."""
-    telescope = new_telescope(kind, **options)
+    telescope = with_few_digits(new_telescope(kind, **options))
     make = KINDS[kind]
     note = _NOTES[make.func if isinstance(make, partial) else make]
     return telescope, with_comments(telescope_to_yaml(telescope), f"{telescope.description}.", note)

@@ -156,11 +156,11 @@ def surface_columns(description: dict[str, Any]) -> list[str]:
 
 def surface_rows(description: dict[str, Any]) -> list[tuple[str, ...]]:
     """Return the lens table as text, in the columns of :func:`surface_columns`."""
-    unit = LENGTH_UNITS[description["length_unit"]]
+    unit, stop = LENGTH_UNITS[description["length_unit"]], description["design"]["stop"]
     return [
         (
             s["name"],
-            s["type"] + (" (tilted)" if s["tilted"] else ""),
+            ", ".join([s["type"], *(["stop"] if s["name"] == stop else [])]) + (" (tilted)" if s["tilted"] else ""),
             "flat" if s["radius_m"] is None else f"{s['radius_m'] / unit:.7g}",
             f"{s['conic']:g}" if s["conic"] else "",
             "" if s["thickness_m"] is None else f"{s['thickness_m'] / unit:.7g}",

@@ -83,7 +83,9 @@ def outside(tmp_path, here):
 
 
 def test_every_design_command_is_tried():
-    assert {command.name for command in design_app.registered_commands} | {"tolerance"} == set(COMMANDS)
+    # The one that lists operands writes no file.
+    names = {command.name for command in design_app.registered_commands} - {"operands"}
+    assert names | {"tolerance"} == set(COMMANDS)
 
 
 @pytest.mark.long

@@ -96,7 +96,7 @@ def test_draw_says_which_fields_are_lost(in_folder, capsys):
     assert "--aiming paraxial" in out
 
 
-def test_info_is_in_the_unit_of_the_file(capsys):
+def test_info_is_in_the_unit_of_the_file(tmp_path, capsys):
     assert main(["info", LENS]) == 0
     out = capsys.readouterr().out
     row = next(line.split() for line in out.splitlines() if line.startswith("S1 "))
@@ -108,7 +108,12 @@ def test_info_is_in_the_unit_of_the_file(capsys):
     assert main(["info", FINITE]) == 0
     out = capsys.readouterr().out
     assert "real image height  0, 0 mm; 0, 8 mm; 0, 12 mm" in out
-    # A semi-diameter that stops no light stands in brackets.
+    # A semi-diameter that stops no light stands in brackets; one that is automatic follows the light.
+    assert not next(line.split() for line in out.splitlines() if line.startswith("S39 "))[-1].endswith(")")
+    fixed = tmp_path / "fixed.zmx"
+    fixed.write_text(Path(FINITE).read_text(encoding="utf-8").replace("E+1 0 0 0 1", "E+1 1 0 0 1"), encoding="utf-8")
+    assert main(["info", str(fixed)]) == 0
+    out = capsys.readouterr().out
     assert next(line.split() for line in out.splitlines() if line.startswith("S39 "))[-1] == "(77.2242)"
     assert "it stops no light" in out
 

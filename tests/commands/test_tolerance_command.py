@@ -109,8 +109,10 @@ def test_an_optimization_from_a_file(capsys, in_folder, written):
     for words in (
         "rms of spots: ",
         "with operands: ",
-        "focal_length: 24.",
+        "focal_length: 25 -> ",
         " mm (= 25)",
+        # The scale on the detector, which is out of focus, is another number.
+        "is image_scale, 24.",
         "edge_thickness(S1): ",
         "(>= 0.5)",
     ):
@@ -161,3 +163,31 @@ def test_an_optimum_that_its_format_cannot_hold_is_not_lost(capsys, written, in_
     assert "better.seq, in place of which better.yaml was written: " in capsys.readouterr().err
     better = pachon.load_telescope(in_folder / "better.yaml")
     assert better.surface(name).medium_after != telescope.surface(name).medium_after
+
+
+@pytest.mark.slow
+def test_glasses_that_were_tried_are_shown(capsys, in_folder, written):
+    config = written(
+        "opt.yaml",
+        "{variables: [S7.radius], glasses: [N-SF2], nearest_glasses: 2, max_steps: 2, n_pupil: 2}",
+    )
+    assert main(["optimize", LENS, "--config", config]) == 0
+    out = capsys.readouterr().out
+    tried = out.partition("tried, rms with operands in µm: ")[2].partition("\n")[0]
+    assert len(tried.split(", ")) == 2
+    # The best stands first, and it is the one that was chosen.
+    assert f"glass: N-SF2 -> {tried.split()[0]}\n" in out
+
+
+@pytest.mark.slow
+def test_files_of_an_optimised_lens_leave_those_of_its_source(capsys, in_folder):
+    command = ["--variables", "S7.thickness"]
+    assert main(["optimize", LENS, *command]) == 0
+    assert pachon.load_telescope("optimized_lens1.yaml").name == "optimized_lens1"
+    before = (in_folder / "optimize_lens1.png").read_bytes()
+    assert main(["optimize", "optimized_lens1.yaml", *command]) == 0
+    assert main(["spots", "optimized_lens1.yaml", "--json"]) == 0
+    assert (in_folder / "optimize_lens1.png").read_bytes() == before
+    names = {path.name for path in in_folder.iterdir()}
+    assert {"optimized_2_lens1.yaml", "optimize_optimized_lens1.png"} <= names
+    assert "spots_optimized_lens1.png" in names

@@ -266,6 +266,7 @@ def calls(folder):
         "optimize": (pachon.optimize, {"telescope": tel, "fields": on_axis, "wavelengths": [w], "threads": 1,
                      "variables": ["M2.dz"], "merit": "spots", "n_pupil": 3, "bounds": {"M2.dz": (-1e-3, 1e-3)},
                      "targets": []}),
+        "operand": (pachon.operand, {"name": "EFLY", "value": 10.0, "weight": 1.0}),
         "SpotSize": (pachon.SpotSize, {"reference": "chief"}),
         "WavefrontError": (pachon.WavefrontError, {"goal": np.zeros((1, 1, 3))}),
         "LeastSquares": (pachon.LeastSquares, {"tolerance": 1e-9, "max_steps": 5, "restarts": 1, "spread": 0.2,
@@ -487,6 +488,7 @@ def _methods(m, tel, w, x, y):
     xy = {"x": x, "y": y}
     out = {
         "FocalLength": (pachon.FocalLength, {"value": 10.0, "weight": 1.0, "wavelength": w}),
+        "ImageScale": (pachon.ImageScale, {"value": 10.0, "weight": 1.0, "wavelength": w}),
         "FNumber": (pachon.FNumber, {"value": 4.0, "weight": 1.0, "wavelength": w}),
         "ChiefRay": (pachon.ChiefRay, {"field": (0.0, 0.001), "axis": "y", "wavelength": w, "value": 0.03}),
         "RelativeDistortion": (pachon.RelativeDistortion, {"field": (0.0, 0.001), "wavelength": w, "maximum": 0.01}),

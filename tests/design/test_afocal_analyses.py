@@ -205,7 +205,9 @@ def test_an_expander_out_of_adjustment_is_optimised(merit, tmp_path):
 
 def test_operands_hold_angles():
     telescope = expander(moved=1e-4)
-    magnification = pachon.FocalLength(value=4.9)
+    with pytest.raises(DomainError, match=r"expected one with a focus.*AMAG"):
+        pachon.FocalLength(value=4.9).measure(expander())
+    magnification = pachon.ImageScale(value=4.9)
     assert magnification.measure(expander()) == pytest.approx(LONG / SHORT, rel=1e-6)
     found = pachon.optimize(
         telescope, ["M2.dz", "M2.curvature"], "spots", [[0.0, 0.0]], targets=[magnification], threads=1

@@ -129,3 +129,10 @@ def test_first_order_data_of_an_off_axis_parabola():
     lengths = re.findall(r"[0-9.]+", rows["effective focal lengths"])
     assert [float(v) for v in lengths[:2]] == pytest.approx([190.6, 190.6], rel=1e-6)
     assert "back focus" not in rows
+
+
+def test_the_stop_stands_in_the_table():
+    lens = pachon.load_telescope(DATA / "lens1.zmx")
+    rows = {row[0]: row[1] for row in prescription_rows(lens, 587.6e-9, {})}
+    assert rows["S5"] == "baffle, stop"
+    assert rows["S4"] == "lens surface"

@@ -224,7 +224,8 @@ def _placed(surface: LensSurface, name: str, z0: float) -> Surface:
             medium_after=surface.after,
             aperture=None if surface.aperture is None else rotated_aperture(surface.aperture),
             rotation=rotated_axes(surface.axes),
-            semi_diameter=surface.semi_diameter if surface.semi_diameter > 0 else None,
+            # What follows the light is computed where it is shown, of the lens as it has become.
+            semi_diameter=surface.semi_diameter if surface.semi_diameter > 0 and not surface.automatic else None,
         )
 
 

@@ -54,7 +54,8 @@ class LensSurface:
 
     `position` [m] and `axes` (columns, [3, 3]) are in the frame of the lens, `distance` is that along the axis of the
     light from the surface before it [m], negative behind an odd number of mirrors; None if its file states places
-    alone. `before` and `after` are the media on either side; `number` is that of the file.
+    alone. `before` and `after` are the media on either side; `number` is that of the file. An `automatic` semi-diameter
+    is that of the light of the lens as it stands in the file.
     """
 
     source: Source
@@ -67,6 +68,7 @@ class LensSurface:
     after: Medium = VACUUM
     aperture: Aperture | None = None
     semi_diameter: float = 0.0
+    automatic: bool = False
     stop: bool = False
     distance: float | None = None
     number: int = 0

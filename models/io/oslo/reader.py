@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ....core.errors import PrescriptionError, error_context
-from ....core.files import text_lines
+from ....core.files import read_bytes, text_lines
 from ...media.dispersion import model_glass
 from ...media.medium import Medium
 from ...media.tabulated import TabulatedIndex
@@ -30,7 +30,7 @@ from ..lens.description import Format, LensDescription, LensSurface
 from ..lens.glasses import Glasses
 from ..lens.shapes import polynomial_powers, radius_of
 from ..lens.source import Findings, Source
-from ..lens.text import FileSurface, Record, read_text, scaled
+from ..lens.text import FileSurface, Record, decoded, read_text, scaled
 from .frames import surface_frames
 
 FORMAT = Format("OSLO", "one of EBR, NAO, FNO, NAP", "WV", "AST")
@@ -42,6 +42,8 @@ FIELDS = {"ANG": "angle", "OBH": "object_height", "GIH": "paraxial_image_height"
 WAVELENGTHS = (0.58756, 0.48613, 0.65627)
 #: Distance of the object [lens unit] from which it is at infinity (OSLO Optics Reference, "Telecentric ray-aiming").
 INFINITE = 1e8
+#: Beginnings of texts in UTF-16.
+_BYTE_ORDER_MARKS = (b"\xff\xfe", b"\xfe\xff")
 #: Terms of aspheres ASR and ARA at most.
 _MOST = 8
 #: Fields of a lens, as fractions of the stated one.
@@ -80,6 +82,14 @@ class _Surface(FileSurface):
 
 def read_oslo_file(path: Path, findings: Findings, glasses: Glasses) -> LensDescription:
     """Return the description of an OSLO lens file."""
+    raw = read_bytes(path, PrescriptionError)
+    if b"\0" in raw and not raw.startswith(_BYTE_ORDER_MARKS):
+        raise PrescriptionError(
+            "a binary file, as of CODE V, not one of OSLO: write the lens there as a sequence (WRL) and open the .seq",
+            file=path,
+        )
+    if re.match(r"\s*RDM\b", decoded(raw, str(path))):
+        raise PrescriptionError("a sequence of CODE V, not a file of OSLO: rename it, to end in .seq", file=path)
     return _Reader(path, findings, glasses).lens()
 
 

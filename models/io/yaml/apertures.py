@@ -39,6 +39,7 @@ from .values import (
     Text,
     decoded,
     encoded,
+    in_metres,
 )
 
 
@@ -67,7 +68,9 @@ _PARTS = Annotated[
     tuple[Annotated[Any, _REGION], ...], ROWS, WrittenAs(lambda parts: [_region_items(part) for part in parts])
 ]
 _CORNERS = Annotated[
-    tuple[Point, ...], checked(lambda v: v if isinstance(v, list) else None, "a list of corners [x, y]")
+    tuple[Point, ...],
+    checked(lambda v: v if isinstance(v, list) else None, "a list of corners [x, y]"),
+    WrittenAs(in_metres),
 ]
 _CENTRE, _ANGLE = (Point, (0.0, 0.0)), (Angle, 0.0)
 REGIONS |= {

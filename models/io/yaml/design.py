@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator
+from pydantic import BeforeValidator
 
 from ....core.schema import Section, checked, expected
 from ....core.yaml_reader import as_number
@@ -34,6 +34,7 @@ from .values import (
     Flag,
     Info,
     Length,
+    Metres,
     Number,
     Numbers,
     OptionalLength,
@@ -60,20 +61,20 @@ def _rows(size: int) -> Callable[[Any], Rows | None]:
     return convert
 
 
-def _in_si(quantity: str, first: int = 0) -> AfterValidator:
+def _in_si(quantity: str, first: int = 0) -> BeforeValidator:
     """Return the conversion of the numbers of each row from the one of index `first` on."""
 
     def convert(rows: Rows, info: Info) -> Rows:
         unit = unit_of(quantity, info)
         return tuple((*row[:first], *(to_si(v, unit) for v in row[first:])) for row in rows)
 
-    return AfterValidator(convert)
+    return BeforeValidator(convert)
 
 
 _POINTS = checked(_rows(2), "a list of pairs of numbers")
-Angles = Annotated[Rows, _POINTS, _in_si("angle")]
-Heights = Annotated[Rows, _POINTS, _in_si("length")]
-Vignetting = Annotated[Rows, checked(_rows(5), "a list of rows of five numbers"), _in_si("angle", 4)]
+Angles = Annotated[Rows, _in_si("angle"), _POINTS]
+Heights = Annotated[Rows, _in_si("length"), _POINTS]
+Vignetting = Annotated[Rows, _in_si("angle", 4), checked(_rows(5), "a list of rows of five numbers")]
 
 
 class ApertureSection(Section):
@@ -213,10 +214,12 @@ def design_items(data: DesignData) -> dict[str, Any]:
     if data.length_unit != default.length_unit:
         section["length"] = data.length_unit
     if data.aperture is not None:
-        section["aperture"] = {data.aperture: data.aperture_value}
+        value = data.aperture_value
+        lengths = value is not None and data.aperture in ("entrance_pupil", "stop")
+        section["aperture"] = {data.aperture: Metres(value) if lengths and value is not None else value}
     section |= {key: getattr(data, key) for key in ("stop", "aiming") if getattr(data, key) != getattr(default, key)}
     if data.fields:
-        turn = Turn if data.field_type == "angle" else float
+        turn = Turn if data.field_type == "angle" else Metres
         fields: dict[str, Any] = {data.field_type: [[turn(v) for v in row] for row in data.fields]}
         fields |= {"weights": data.field_weights} if data.field_weights else {}
         rows = [[*row[:4], Turn(row[4])] for row in data.vignetting]
@@ -232,7 +235,8 @@ def design_items(data: DesignData) -> dict[str, Any]:
         section["pickups"] = [_pickup_items(pickup) for pickup in data.pickups]
     if data.solves:
         section["solves"] = [
-            {"surface": s.surface, s.kind: s.value} | ({"radius": s.radius} if s.radius else {}) for s in data.solves
+            {"surface": s.surface, s.kind: Metres(s.value)} | ({"radius": Metres(s.radius)} if s.radius else {})
+            for s in data.solves
         ]
     return section
 
@@ -241,4 +245,6 @@ def _pickup_items(pickup: Pickup) -> dict[str, Any]:
     offset = "conic_offset" if pickup.quantity == "conic" else "offset"
     items: dict[str, Any] = {"surface": pickup.surface, pickup.quantity: pickup.source}
     items |= {"scale": pickup.scale} if pickup.scale != 1.0 else {}
-    return items | ({offset: pickup.offset} if pickup.offset else {})
+    if not pickup.offset:
+        return items
+    return items | {offset: Metres(pickup.offset) if pickup.quantity != "conic" else pickup.offset}

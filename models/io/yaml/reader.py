@@ -264,7 +264,7 @@ MAX_BYTES = 64_000_000
 
 def read_telescope(path: Path) -> Telescope:
     """Read a prescription file; PrescriptionError of one line with file, key, value and expected value."""
-    return telescope_of(read_mapping(path, max_bytes=MAX_BYTES), path)
+    return telescope_of(read_mapping(path, max_bytes=MAX_BYTES, exact=True), path)
 
 
 def telescope_of(content: dict[str, Any], path: Path) -> Telescope:

@@ -40,45 +40,47 @@ from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere
 from ...shapes.sum import Sum
 from ..grid_file import read_grid
 from .values import (
+    LIST,
     ROWS,
     Bare,
     Flag,
     Info,
     Length,
     Lengths,
+    Metres,
     Number,
-    Numbers,
     OptionalFile,
     PositiveNumber,
     Radius,
     decoded,
     encoded,
-    to_si,
-    unit_of,
+    in_metres,
+    power_of_length,
+    scaled,
 )
 
 
-def _powers(powers: range) -> AfterValidator:
-    """Return the conversion of coefficients of powers of the radius: lengths over lengths to these powers."""
+def _coefficients(powers: range) -> Any:
+    """Return the type of coefficients of powers of the radius: lengths over lengths to these powers."""
 
     def convert(coefficients: tuple[float, ...], info: Info) -> tuple[float, ...]:
-        unit = to_si(1.0, unit_of("length", info))
-        pairs = zip(powers, coefficients, strict=False)
-        return tuple(a if unit == 1.0 else a * unit ** (1 - n) for n, a in pairs)
+        return tuple(scaled(a, power_of_length(1 - n, info)) for n, a in zip(powers, coefficients, strict=False))
 
-    return AfterValidator(convert)
+    def write(coefficients: tuple[float, ...]) -> list[Metres]:
+        return [Metres(a, 1 - n) for n, a in zip(powers, coefficients, strict=False)]
+
+    return Annotated[tuple[float, ...], BeforeValidator(convert), LIST, WrittenAs(write)]
 
 
 def _terms(value: Any, info: Info) -> tuple[tuple[int, int, float], ...]:
     if not isinstance(value, list) or not value:
         raise expected("a list of [power of x, power of y, coefficient]")
-    unit = to_si(1.0, unit_of("length", info))
     terms = []
     for row in value:
         i, j, a = map(as_number, row) if isinstance(row, list) and len(row) == 3 else (None, None, None)
         if i is None or j is None or a is None or i % 1 or j % 1 or i < 0 or j < 0:
             raise expected(f"[power of x, power of y, coefficient], not {row!r}")
-        terms.append((int(i), int(j), a if unit == 1.0 else a * unit ** (1 - i - j)))
+        terms.append((int(i), int(j), scaled(a, power_of_length(1 - int(i) - int(j), info))))
     return tuple(terms)
 
 
@@ -88,7 +90,11 @@ def _equal_rows(values: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...
     return values
 
 
-_TERMS = Annotated[Any, BeforeValidator(_terms), WrittenAs(lambda terms: [(Bare(i), Bare(j), a) for i, j, a in terms])]
+_TERMS = Annotated[
+    Any,
+    BeforeValidator(_terms),
+    WrittenAs(lambda terms: [(Bare(i), Bare(j), Metres(a, 1 - i - j)) for i, j, a in terms]),
+]
 _ROW = "three numbers a row, in base 64"
 
 
@@ -109,6 +115,7 @@ class GridSection(ShapeSection):
     values: Annotated[
         tuple[Lengths, ...],
         checked(lambda v: v if isinstance(v, list) else None, "a list of rows of numbers"),
+        WrittenAs(in_metres),
         AfterValidator(_equal_rows),
     ] = ()
 
@@ -150,10 +157,10 @@ SHAPES: dict[str, type[ShapeSection]] = {
     "conic": ShapeSection.of(Conic, radius=Length, conic=Number),
     "paraboloid": ShapeSection.of(lambda radius: Conic(radius, -1.0), radius=Length),
     "even_asphere": ShapeSection.of(
-        EvenAsphere, radius=Radius, conic=(Number, 0.0), coefficients=Annotated[Numbers, _powers(range(4, 1000, 2))]
+        EvenAsphere, radius=Radius, conic=(Number, 0.0), coefficients=_coefficients(range(4, 1000, 2))
     ),
     "odd_asphere": ShapeSection.of(
-        OddAsphere, radius=Radius, conic=(Number, 0.0), coefficients=Annotated[Numbers, _powers(range(1, 1000))]
+        OddAsphere, radius=Radius, conic=(Number, 0.0), coefficients=_coefficients(range(1, 1000))
     ),
     "biconic": ShapeSection.of(Biconic, radius_x=Radius, radius_y=Radius, conic_x=(Number, 0.0), conic_y=(Number, 0.0)),
     "toroid": ShapeSection.of(Toroid, radius_x=Radius, radius_y=Radius, conic_y=(Number, 0.0)),

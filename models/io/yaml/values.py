@@ -19,18 +19,35 @@ import yaml
 from pydantic import AfterValidator, BeforeValidator, ValidationInfo
 
 from ....core.schema import Section, WrittenAs, checked
-from ....core.yaml_reader import as_number
+from ....core.yaml_reader import WrittenFloat, as_number
 from ...surface import Matrix
 
 #: Context of the validators: the folder of the file, and its units.
 Info = ValidationInfo[dict[str, Any]]
+#: Powers of ten, the last excluded, of numbers that are written without an exponent, as Python's own.
+_PLAIN_EXPONENTS = (-4, 16)
 #: Units but for degrees, as powers of ten of the SI unit.
 _POWERS = {"m": 0, "rad": 0, "mm": -3, "um": -6, "nm": -9}
 
 
 def to_si(value: float, unit: str) -> float:
     """Return a value in SI; the decimal point of the number as written is moved: 0.545 um is the float 545e-9 m."""
-    return math.radians(value) if unit == "deg" else float(Decimal(repr(value)).scaleb(_POWERS[unit]))
+    return math.radians(value) if unit == "deg" else scaled(value, _POWERS[unit])
+
+
+def scaled(value: float, power: int) -> float:
+    """Return a number times a power of ten, its decimal point moved, with all digits of a file."""
+    return float(written_decimal(value).scaleb(power))
+
+
+def written_decimal(value: float) -> Decimal:
+    """Return a number as a file has it, or as the shortest decimal that is equal to the float."""
+    return value.decimal if isinstance(value, WrittenFloat) else Decimal(repr(float(value)))
+
+
+def power_of_length(power: int, info: Info) -> int:
+    """Return the power of ten from a power of the file's unit of length to that of the metre."""
+    return power * _POWERS[unit_of("length", info)]
 
 
 class UnitsSection(Section):
@@ -61,6 +78,18 @@ class Turn(float):
 
 class Wave(float):
     """Wavelength [m] to be written in the file's unit."""
+
+
+class Metres(float):
+    """Length [m], or a power of it, to be written in the file's unit."""
+
+    power: int
+
+    def __new__(cls, value: float, power: int = 1) -> Metres:
+        """Return the length to a power."""
+        number = super().__new__(cls, value)
+        number.power = power
+        return number
 
 
 class Bare(str):
@@ -110,12 +139,24 @@ def decoded(kind: str, shape: tuple[int, ...], text: str) -> BeforeValidator:
     return checked(decode, text)
 
 
-def _converted(quantity: str) -> AfterValidator:
+def _converted(quantity: str) -> BeforeValidator:
+    """Return the conversion to SI; it stands in front of the validator of the numbers, and is applied after that.
+
+    The numbers have all digits of the file then.
+    """
+
     def convert(value: Any, info: Info) -> Any:
         unit = unit_of(quantity, info)
         return tuple(to_si(v, unit) for v in value) if isinstance(value, tuple) else to_si(value, unit)
 
-    return AfterValidator(convert)
+    return BeforeValidator(convert)
+
+
+def in_metres(value: Any) -> Any:
+    """Return lengths within lists as :class:`Metres`; None stays."""
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return tuple(in_metres(v) for v in value)
+    return Metres(value) if isinstance(value, (float, int)) else value
 
 
 ROWS = checked(
@@ -131,10 +172,11 @@ _BESIDE_IF_FILE = AfterValidator(
 )
 _NAMES = checked(names, "a list of names")
 _NUMBER, _POSITIVE = checked(as_number, "a number"), checked(_positive, "a positive number")
-_LIST, _PAIR, _TRIPLE = (
+LIST, _PAIR, _TRIPLE = (
     checked(_numbers(size), f"a list of {size} numbers" if size else "a list of numbers") for size in (None, 2, 3)
 )
 _LENGTH, _ANGLE, _WAVELENGTH = (_converted(quantity) for quantity in ("length", "angle", "wavelength"))
+_METRES = WrittenAs(in_metres)
 _WAVES = WrittenAs(lambda waves: [Wave(w) for w in waves])
 
 Text = Annotated[str, _TEXT]
@@ -148,23 +190,34 @@ Flag = Annotated[bool, checked(lambda v: v if isinstance(v, bool) else None, "tr
 Number = Annotated[float, _NUMBER]
 OptionalNumber = Annotated[float | None, _NUMBER]
 PositiveNumber = Annotated[float, _POSITIVE]
-Numbers = Annotated[tuple[float, ...], _LIST]
+Numbers = Annotated[tuple[float, ...], LIST]
 Rotation = Annotated[Matrix, checked(_matrix, "three rows of three numbers")]
-Length = Annotated[float, _NUMBER, _LENGTH]
-OptionalLength = Annotated[float | None, _NUMBER, _LENGTH]
-PositiveLength = Annotated[float, _POSITIVE, _LENGTH]
-Radius = Annotated[float, checked(lambda v: math.inf if v == "flat" else as_number(v), "a number"), _LENGTH]
-Lengths = Annotated[tuple[float, ...], _LIST, _LENGTH]
-Point = Annotated[tuple[float, float], _PAIR, _LENGTH]
-OptionalPoint = Annotated[tuple[float, float] | None, _PAIR, _LENGTH]
-OptionalPlace = Annotated[tuple[float, float, float] | None, _TRIPLE, _LENGTH]
-Angle = Annotated[float, _NUMBER, _ANGLE, WrittenAs(Turn)]
-PositiveAngle = Annotated[float, _POSITIVE, _ANGLE, WrittenAs(Turn)]
-OptionalAngles = Annotated[tuple[float, float, float] | None, _TRIPLE, _ANGLE]
-Wavelength = Annotated[float, _POSITIVE, _WAVELENGTH, WrittenAs(Wave)]
-Wavelengths = Annotated[tuple[float, ...], _LIST, _WAVELENGTH, _WAVES]
-Band = Annotated[tuple[float, float], _PAIR, _WAVELENGTH, _WAVES]
-OptionalBand = Annotated[tuple[float, float] | None, _PAIR, _WAVELENGTH, _WAVES]
+Length = Annotated[float, _LENGTH, _NUMBER, _METRES]
+OptionalLength = Annotated[float | None, _LENGTH, _NUMBER, _METRES]
+PositiveLength = Annotated[float, _LENGTH, _POSITIVE, _METRES]
+Radius = Annotated[float, _LENGTH, checked(lambda v: math.inf if v == "flat" else as_number(v), "a number"), _METRES]
+Lengths = Annotated[tuple[float, ...], _LENGTH, LIST, _METRES]
+Point = Annotated[tuple[float, float], _LENGTH, _PAIR, _METRES]
+OptionalPoint = Annotated[tuple[float, float] | None, _LENGTH, _PAIR, _METRES]
+OptionalPlace = Annotated[tuple[float, float, float] | None, _LENGTH, _TRIPLE, _METRES]
+Angle = Annotated[float, _ANGLE, _NUMBER, WrittenAs(Turn)]
+PositiveAngle = Annotated[float, _ANGLE, _POSITIVE, WrittenAs(Turn)]
+OptionalAngles = Annotated[tuple[float, float, float] | None, _ANGLE, _TRIPLE]
+Wavelength = Annotated[float, _WAVELENGTH, _POSITIVE, WrittenAs(Wave)]
+Wavelengths = Annotated[tuple[float, ...], _WAVELENGTH, LIST, _WAVES]
+Band = Annotated[tuple[float, float], _WAVELENGTH, _PAIR, _WAVES]
+OptionalBand = Annotated[tuple[float, float] | None, _WAVELENGTH, _PAIR, _WAVES]
+
+
+def length_text(value: float, unit: str) -> str:
+    """Return a length [m], or a power of it, in a unit as the decimal that converts back equal."""
+    power = value.power if isinstance(value, Metres) else 1
+    if math.isinf(value) or _POWERS[unit] == 0:
+        return number_text(value)
+    number = Decimal(repr(float(value) + 0.0)).scaleb(-power * _POWERS[unit])
+    if Decimal(repr(float(number))) == number:
+        return number_text(float(number))
+    return f"{number:f}" if _PLAIN_EXPONENTS[0] <= number.adjusted() < _PLAIN_EXPONENTS[1] else f"{number:E}"
 
 
 def number_text(value: float) -> str:

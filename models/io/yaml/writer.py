@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import suppress
 from itertools import count
+from pathlib import Path
 from typing import Any
 
+from ....core.errors import PachonError
+from ....core.yaml_reader import loaded
 from ...coating import AnyCoating
 from ...media.medium import Medium
 from ...surface import IDENTITY, Surface
@@ -16,9 +20,9 @@ from .apertures import aperture_items, obstruction_items
 from .coatings import coating_items, coating_names
 from .design import design_items
 from .media import medium_items
-from .reader import INTERACTIONS
+from .reader import INTERACTIONS, MAX_BYTES, telescope_of
 from .shapes import shape_items
-from .values import Bare, Turn, Wave, flow, number_text, to_si
+from .values import Bare, Metres, Turn, Wave, flow, in_metres, length_text, number_text, to_si
 
 INTERACTION_NAMES = {value: name for name, value in INTERACTIONS.items()}
 
@@ -26,9 +30,26 @@ INTERACTION_NAMES = {value: name for name, value in INTERACTIONS.items()}
 def telescope_to_yaml(telescope: Telescope) -> str:
     """Return the text of the prescription file of a telescope; it loads back equal to the last bit.
 
-    PrescriptionError if a value is not that of its pickup.
+    Lengths are in mm where the telescope's unit of length is, else in metres. PrescriptionError if a value is not that
+    of its pickup.
     """
     t = require_met(telescope)
+    metres = _text(t, "m")
+    if t.length_unit[0] != "mm":
+        return metres
+    # A shape or region whose lengths are not all written in the file's unit would be another one: then metres.
+    millimetres = _text(t, "mm")
+    with suppress(PachonError, ValueError):
+        if _read(millimetres) == _read(metres):
+            return millimetres
+    return metres
+
+
+def _read(text: str) -> Telescope:
+    return telescope_of(loaded(text, max_bytes=MAX_BYTES), Path("written.yaml"))
+
+
+def _text(t: Telescope, length_unit: str) -> str:
     names, coated = _medium_names(t), coating_names(t.surfaces)
     low, high = t.band or t.wavelength_range
     head: dict[str, Any] = {
@@ -37,18 +58,18 @@ def telescope_to_yaml(telescope: Telescope) -> str:
         # A file must have both; a telescope that is built by hand need not.
         "source": t.source or "not stated",
         "version": t.version or "not stated",
-        "units": {"length": "m"},
-        "stop": {"z": t.stop_z},
-        "pupil": {"diameter": t.pupil_diameter, "obscuration": t.pupil_obscuration},
-        "launch_distance": t.launch_distance,
-        "reference_sphere_radius": t.reference_sphere_radius,
+        "units": {"length": length_unit},
+        "stop": {"z": Metres(t.stop_z)},
+        "pupil": {"diameter": Metres(t.pupil_diameter), "obscuration": t.pupil_obscuration},
+        "launch_distance": Metres(t.launch_distance),
+        "reference_sphere_radius": Metres(t.reference_sphere_radius),
         "field": {"radius": Turn(t.field_radius), "limit": Turn(t.field_limit)},
         "wavelengths": {
             "range": [Wave(w) for w in t.wavelength_range],
             "default": Wave(t.default_wavelength),
             "band": [Wave(low), Wave(high)],
         },
-        "object_distance": t.object_distance if math.isfinite(t.object_distance) else None,
+        "object_distance": Metres(t.object_distance) if math.isfinite(t.object_distance) else None,
         "camera": t.camera,
         "site": t.site,
         "medium_before": names[t.medium_before] if t.medium_before != VACUUM else None,
@@ -66,8 +87,13 @@ def telescope_to_yaml(telescope: Telescope) -> str:
     wave, shown = _in_unit(waves, "um", "m")
     head["units"] |= {"angle": angle, "wavelength": wave}
 
+    def number(value: float) -> str:
+        if isinstance(value, Metres):
+            return length_text(value, length_unit)
+        return number_text({Turn: turned, Wave: shown}.get(type(value), {}).get(value, value))
+
     def text(value: Any) -> str:
-        return flow(value, lambda v: number_text({Turn: turned, Wave: shown}.get(type(v), {}).get(v, v)))
+        return flow(value, number)
 
     lines = [f"{key}: {text(value)}" for key, value in head.items() if value not in ("", None)]
     for key, entries in lists.items():
@@ -91,18 +117,18 @@ def _group_items(t: Telescope, name: str) -> Any:
     members, (pivot, axes) = t.groups[name], t.group_frames[name]
     first = t.surface(members[0])
     framed = (pivot, axes) != (first.vertex, first.rotation)
-    return {"surfaces": members, "pivot": pivot, "rotation": axes} if framed else members
+    return {"surfaces": members, "pivot": in_metres(pivot), "rotation": axes} if framed else members
 
 
 def _surface_items(surface: Surface, names: dict[Medium, str], coated: dict[AnyCoating, str]) -> dict[str, Any]:
     x, y, z = surface.vertex
     shape = shape_items(surface.shape)
     kind = INTERACTION_NAMES[surface.interaction]
-    items = {"name": surface.name, "type": kind, "shape": shape.pop("shape"), "z": z}
-    items |= {key: value for key, value in (("x", x), ("y", y)) if value != 0}
+    items = {"name": surface.name, "type": kind, "shape": shape.pop("shape"), "z": Metres(z)}
+    items |= {key: Metres(value) for key, value in (("x", x), ("y", y)) if value != 0}
     items |= {} if surface.rotation == IDENTITY else {"rotation": surface.rotation}
     items |= shape | aperture_items(surface.aperture)
-    items |= {} if surface.semi_diameter is None else {"semi_diameter": surface.semi_diameter}
+    items |= {} if surface.semi_diameter is None else {"semi_diameter": Metres(surface.semi_diameter)}
     items |= {} if surface.coating is None else {"coating": coated[surface.coating]}
     return items | ({"medium": Bare(names[surface.medium_after])} if kind == "refract" else {})
 

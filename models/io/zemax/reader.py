@@ -172,6 +172,7 @@ class _LensReader:
             after=medium,
             aperture=aperture,
             semi_diameter=block.number("DIAM", 0.0) * lens.unit,
+            automatic=_automatic_semi_diameter(block),
             stop=self.stop_ahead,
             distance=self.distance,
             number=number,
@@ -206,3 +207,9 @@ class _LensReader:
                 raise error
             self.findings.report(error, "taken as a model glass of its indices")
         return False, numbered_glass(nd, vd, deviation, name, line)
+
+
+def _automatic_semi_diameter(block: Block) -> bool:
+    """Return whether Zemax computes the semi-diameter of a surface, of the light as it is: DIAM with 0 behind it."""
+    line = block.last("DIAM")
+    return line is not None and len(line.words) > 1 and line.number(1) == 0

@@ -152,3 +152,27 @@ def test_bundled_telescopes_can_be_drawn(name):
     found = layout(pachon.load_telescope(name))
     assert png_bytes(found.plot()).startswith(b"\x89PNG")
     assert all(len(fan) for fan in found.fans)
+
+
+def test_the_stop_is_drawn_where_the_light_of_the_axis_ends(request):
+    lens = pachon.load_telescope(request.config.rootpath / "tests/data/zmx/lens1.zmx")
+    drawing = layout(lens)
+    # The marginal ray of the axis, through the rim of the entrance pupil, crosses the plane of the stop, S5.
+    rim = 0.5 * lens.pupil_diameter
+    rays = pachon.launch_rays(lens, (0.0, 0.0), lens.default_wavelength, ([0.0], [rim]))
+    crossing = pachon.trace(lens, rays, surfaces="all")[4].position[0]
+    assert np.sort(drawing.stop[:, 1]) == pytest.approx([-crossing[1], crossing[1]], rel=1e-12)
+    assert drawing.stop[:, 2] == pytest.approx([lens.surface("S5").vertex[2]] * 2)
+    figure = drawing.plot()
+    assert "stop" in [text.get_text() for axes in figure.axes for text in axes.texts]
+    assert layout(pachon.load_telescope("paul_baker")).stop is None
+
+
+def test_no_ray_is_drawn_outside_the_glass(request):
+    """A semi-diameter that is smaller than the light gives way to it; it stops none."""
+    lens = pachon.load_telescope(request.config.rootpath / "tests/data/zmx/lens1.zmx")
+    small = replace(lens, surfaces=tuple(replace(s, semi_diameter=1e-3) for s in lens.surfaces))
+    drawing = layout(small)
+    for place, surface in enumerate(small.surfaces):
+        heights = [np.abs(fan[:, place + 1, 1]).max() for fan in drawing.fans]
+        assert drawing.reach[surface.name] >= max(heights) - 1e-12, surface.name

@@ -124,6 +124,7 @@ def test_transfer_of_a_triplet(triplet):
     [
         pachon.FocalLength(0.025),
         pachon.FNumber(3.0),
+        pachon.ImageScale(0.025),
         pachon.ChiefRay(EDGE, "y", value=0.005),
         pachon.RelativeDistortion(EDGE, value=0.0),
         pachon.RmsSpot(FIELD, (486e-9, 656e-9), n_pupil=3, value=0.0),
@@ -155,7 +156,7 @@ def test_limits_have_no_effect_inside():
 def test_operands_have_names_and_kinds():
     assert pachon.EdgeThickness("L1", 0.02, minimum=1e-3).label == "edge_thickness(L1, 0.02)"
     assert pachon.ChiefRay(EDGE, value=0.0).label == "chief_ray(0 12 deg, y)"
-    assert len(OPERANDS) == 14
+    assert len(OPERANDS) == 15
     for kind, cls in OPERANDS.items():
         assert cls.kind == kind
         assert cls.unit in ("m", "rad", "1")
@@ -185,7 +186,12 @@ def test_contradictions(make, error, words):
 @pytest.mark.parametrize(
     ("operands", "error", "words"),
     [
-        ([pachon.FocalLength(0.02), pachon.FocalLength(0.03)], ConfigError, "focal_length is given twice"),
+        ([pachon.FocalLength(0.02), pachon.FocalLength(0.02)], ConfigError, "focal_length is given twice"),
+        (
+            [pachon.FocalLength(0.02), pachon.FocalLength(0.03)],
+            ConfigError,
+            "= 20 mm and focal_length = 30 mm contradict",
+        ),
         ([pachon.EdgeThickness("L9", minimum=1e-3)], UnknownNameError, "L9.*S1"),
         ([pachon.EdgeThickness("S3", 0.2, minimum=1e-3)], DomainError, r"edge_thickness\(S3, 0.2\).*no edge"),
         ([pachon.SagAt("S3", 0.2, value=1e-3)], DomainError, "does not reach 0.2 m"),

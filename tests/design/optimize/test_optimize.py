@@ -10,7 +10,7 @@ from pachon.core.errors import ConfigError, DomainError, UnknownNameError
 from pachon.design.optimize.jacobian import ParameterColumns
 from pachon.design.optimize.merit import Beams, SpotMerit, WavefrontMerit
 from pachon.design.optimize.optimize import optimize, wavefronts
-from pachon.design.optimize.targets import FocalLength, Target
+from pachon.design.optimize.targets import FocalLength, ImageScale, Target
 from pachon.models.first_order import first_order
 from pachon.models.parameters.parameters import apply, parse_parameters
 from pachon.models.shapes.shape import Conic
@@ -119,14 +119,16 @@ def test_compensators_and_bounds(paul_baker):
 
 def test_focal_length(lsst_r, paul_baker, slope):
     # Chief rays 1e-4 rad apart land 3e-3 m apart, good to 1e-15 m; distortion goes as the square of the angle.
-    assert abs(FocalLength(33.6, weight=2.0).residuals(paul_baker)[0]) < 2 * 1e-7 * 33.6
+    assert abs(ImageScale(33.6, weight=2.0).residuals(paul_baker)[0]) < 2 * 1e-7 * 33.6
+    assert abs(FocalLength(33.6, weight=2.0).residuals(paul_baker)[0]) < 1e-11
     # The LSST's detector is a little out of the paraxial focus, which changes its scale by some 1e-5.
     length = first_order(lsst_r).focal_length
-    assert abs(FocalLength(length).residuals(lsst_r)[0]) < 3e-5 * length
+    assert abs(FocalLength(length).residuals(lsst_r)[0]) < 1e-11
+    assert 1e-6 * length < abs(ImageScale(length).residuals(lsst_r)[0]) < 3e-5 * length
     parameters = parse_parameters(["M2.radius", "M3.dz"], paul_baker)
-    _, found = FocalLength(30.0).derivatives(ParameterColumns.at(paul_baker, parameters))
+    _, found = ImageScale(30.0).derivatives(ParameterColumns.at(paul_baker, parameters))
     for i, parameter in enumerate(parameters):
-        numeric = slope(lambda h, p=parameter: FocalLength(30.0).residuals(apply(paul_baker, {p: h})), 1e-3)
+        numeric = slope(lambda h, p=parameter: ImageScale(30.0).residuals(apply(paul_baker, {p: h})), 1e-3)
         # 1e-15 m on 3 mm over steps of 1e-3, some 1e-8 of slopes near 1.
         assert found[0, i] == pytest.approx(numeric[0], rel=1e-6)
 

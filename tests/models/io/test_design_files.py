@@ -43,7 +43,7 @@ SURF 1
   CURV 0.1
   DISZ 1
   GLAS N-BK7
-  DIAM 3 0
+  DIAM 3 1
 SURF 2
   COMM back
   TYPE STANDARD
@@ -84,6 +84,19 @@ def test_a_zemax_file_keeps_what_its_designer_stated(tmp_path):
     assert (data.temperature, data.pressure) == (288.15, 50662.5)
     assert [s.semi_diameter for s in telescope.surfaces] == [0.03, None, 0.01, None]
     assert all(s.aperture is None for s in telescope.surfaces)
+
+
+def test_an_automatic_semi_diameter_is_that_of_the_light(tmp_path):
+    """DIAM with 0 behind it: what Zemax computed of the lens in the file is not that of a lens that changes."""
+    path = tmp_path / "lens.zmx"
+    path.write_text(LENS.format(kind=0, aperture="FLOA", distance="INFINITY").replace("DIAM 3 1", "DIAM 3 0"))
+    telescope = load_telescope(path)
+    assert [s.semi_diameter for s in telescope.surfaces] == [None, None, 0.01, None]
+    path.write_text(path.read_text().replace("DIAM 1 1", "DIAM 1 0"))
+    floating = load_telescope(path)
+    # The size of the stop, which floats the pupil, is stated all the same.
+    assert floating.pupil_diameter == telescope.pupil_diameter
+    assert floating.surface("iris").semi_diameter is None
 
 
 @pytest.mark.parametrize(

@@ -251,3 +251,27 @@ def test_lenient_warns_of_what_is_left_out(tmp_path):
     first, second = (str(w.message).split(": ", 1)[1] for w in caught)
     assert first.startswith("GIZMO 1: this command is not understood")
     assert second.startswith("CFG: one configuration is read")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"\x01\x00\x00\x00LEN\x00\x10CODE V\x00\x00", "a binary file, as of CODE V.*as a sequence .WRL."),
+        (b'RDM;LEN "a lens"\nEPD 10\n', "a sequence of CODE V.*end in .seq"),
+    ],
+)
+def test_a_file_of_another_program_is_named(tmp_path, content, words):
+    path = tmp_path / "lens.len"
+    path.write_bytes(content)
+    with pytest.raises(PrescriptionError, match=words) as caught:
+        pachon.load_telescope(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_sessions_of_other_programs_say_what_to_save(tmp_path):
+    path = tmp_path / "lens.zos"
+    path.write_bytes(b"PK")
+    with pytest.raises(
+        PrescriptionError, match=r"lens.zos: a session of Zemax OpticStudio: save the lens there as .zmx"
+    ):
+        pachon.load_telescope(path)
