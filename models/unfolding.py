@@ -102,6 +102,14 @@ def unfolded_axis(telescope: Telescope) -> UnfoldedAxis:
     return UnfoldedAxis(tuple(surfaces), heights)
 
 
+def axial_heights(telescope: Telescope) -> dict[str, float]:
+    """Return the heights of all surfaces [m]: on the unfolded axis, or in the telescope frame where there is none."""
+    try:
+        return unfolded_axis(telescope).heights
+    except DomainError:
+        return {surface.name: surface.vertex[2] for surface in telescope.surfaces}
+
+
 def is_flat(shape: Shape) -> bool:
     """Return whether a shape is a plane, however it is stated."""
     return isinstance(shape, Rotational) and shape.curvature == 0.0 and not any(shape.coefficients)

@@ -1,8 +1,8 @@
 """Prescription and first-order data as tables of text, in a unit of length and with the signs of lens design.
 
-The z axis points along the incoming light, as in Zemax: a thickness is the distance to the next vertex along it,
-negative after a mirror, and a positive radius has its centre behind the surface. In the telescope frame z points the
-other way.
+The z axis points along the incoming light, as in Zemax: a thickness is the distance to the next vertex along it, negative
+after a mirror that is no flat fold, and a positive radius has its centre behind the surface. In the telescope frame z
+points the other way.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ...models.parabasal import parabasal_optics
 from ...models.shapes.shape import Rotational
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
-from ...models.unfolding import unfolded_axis
+from ...models.unfolding import axial_heights, unfolded_axis
 from ..metrics.principal_rays import principal_rays
 
 COLUMNS = ("surface", "type", "radius", "thickness", "medium", "index", "semi-diameter", "conic", "coefficients, place")
@@ -40,11 +40,12 @@ def prescription_rows(telescope: Telescope, wavelength: float, semi_diameters: d
     Semi-diameters are in metres by name of the surface; the wavelength [m] is that of the indices.
     """
     _, unit = telescope.length_unit
-    surfaces = telescope.surfaces
+    surfaces, heights = telescope.surfaces, axial_heights(telescope)
     rows = []
     for i, surface in enumerate(surfaces):
         shape, mirror = surface.shape, surface.interaction == Interaction.MIRROR
-        thickness = (surface.vertex[2] - surfaces[i + 1].vertex[2]) / unit if i + 1 < len(surfaces) else math.nan
+        following = surfaces[i + 1].name if i + 1 < len(surfaces) else None
+        thickness = math.nan if following is None else (heights[surface.name] - heights[following]) / unit
         medium = surface.medium_after
         index = float(medium.index(wavelength))
         bare = isinstance(medium, ConstantIndex) and not medium.name

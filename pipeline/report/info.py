@@ -23,7 +23,7 @@ from ...models.parabasal import parabasal_optics
 from ...models.shapes.shape import Rotational
 from ...models.surface import Surface
 from ...models.telescope import Telescope
-from ...models.unfolding import unfolded_axis
+from ...models.unfolding import axial_heights, unfolded_axis
 
 #: First-order properties, which only a centred telescope has.
 FIRST_ORDER_KEYS = (
@@ -76,6 +76,7 @@ def describe(telescope: Telescope) -> dict[str, Any]:
     wavelength = telescope.default_wavelength
     low, high = telescope.band or telescope.wavelength_range
     centred = any(value is not None for value in first.values())
+    heights = axial_heights(telescope)
     return {
         "name": telescope.name,
         "description": telescope.description,
@@ -98,8 +99,8 @@ def describe(telescope: Telescope) -> dict[str, Any]:
         "length_unit": telescope.length_unit[0],
         "design": asdict(telescope.design_data),
         "surfaces": [
-            _surface_entry(surface, following, wavelength)
-            for surface, following in zip_longest(telescope.surfaces, telescope.surfaces[1:])
+            _surface_entry(surface, heights[surface.name], None if name is None else heights[name], wavelength)
+            for surface, name in zip_longest(telescope.surfaces, telescope.surface_names[1:])
         ],
     }
 
@@ -123,7 +124,8 @@ def _parabasal(telescope: Telescope) -> dict[str, list[float | None]] | None:
     return {key: [float(v) if math.isfinite(v) else None for v in pair] for key, pair in pairs.items()}
 
 
-def _surface_entry(surface: Surface, following: Surface | None, wavelength: float) -> dict[str, Any]:
+def _surface_entry(surface: Surface, height: float, following: float | None, wavelength: float) -> dict[str, Any]:
+    """Return a row of the lens table; the heights [m] are those of the surface and the next on the unfolded axis."""
     shape, medium = surface.shape, surface.medium_after
     curvature = shape.curvature
     x, y, z = surface.vertex
@@ -137,8 +139,8 @@ def _surface_entry(surface: Surface, following: Surface | None, wavelength: floa
         "x_m": x,
         "y_m": y,
         "z_m": z,
-        # Along the light as it comes in: negative behind an odd number of mirrors, as in lens files.
-        "thickness_m": None if following is None else z - following.vertex[2],
+        # Along the light as it comes in: negative behind an odd number of mirrors, as in lens files, but for folds.
+        "thickness_m": None if following is None else height - following,
         "glass": "" if isinstance(medium, ConstantIndex) and medium.n == 1.0 else medium.name,
         "semi_diameter_m": surface.semi_diameter,
         "tilted": not np.array_equal(surface.matrix, np.eye(3)),
