@@ -1,8 +1,8 @@
 """Prescription and first-order data as tables of text, in a unit of length and with the signs of lens design.
 
-The z axis points along the incoming light, as in Zemax: a thickness is the distance to the next vertex along it, negative
-after a mirror that is no flat fold, and a positive radius has its centre behind the surface. In the telescope frame z
-points the other way.
+The z axis points along the incoming light, as in Zemax: a thickness is the distance to the next vertex along it,
+negative after a mirror that is no flat fold, and a positive radius has its centre behind the surface. In the telescope
+frame z points the other way.
 """
 
 from __future__ import annotations
