@@ -1,6 +1,6 @@
 """The kernel that traces packets of rays through a telescope.
 
-It has two variants (`kernel_pair`): code for rare kinds of surfaces slows the loop by a seventh even where no surface
+It has variants (`kernel_pair`): code for rare kinds of surfaces slows the loop by a seventh even where no surface
 is of that kind, because it takes registers and prevents the compiler from inlining functions.
 """
 
@@ -79,7 +79,8 @@ AHEAD = wp.constant(wp.float64(1.0e-9))
 class PackedSurfaces:
     """A telescope as tables, a row per surface; see :mod:`pachon.raytrace.pack.surfaces`.
 
-    ``special`` is 1 where the loop over its surfaces needs more than the plain one has.
+    ``special`` is 1 where the loop over its surfaces needs more than the plain one has, 2 where apertures choose
+    between crossings.
     """
 
     special: wp.int32
@@ -245,8 +246,8 @@ def start_by_aperture(
     return t
 
 
-def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
-    """Return the loop over the surfaces of a telescope, for plain telescopes or for any.
+def surface_loop(special: int, chromatic: bool = False) -> wp.Function:
+    """Return the loop over the surfaces of a telescope: plain (0), any (1), any with a choice of crossings (2).
 
     Plain telescopes have conics with even powers, discs and rings as apertures, no phase screens, no obstructions.
     The ``indices`` are a row of numbers, before the first surface and after each; in a chromatic loop, where every ray
@@ -293,7 +294,7 @@ def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
             terms = surfaces.kinds[s, TERMS]
             first_curvature = surfaces.numbers[s, FIRST_CURVATURE]
             t = conic_distance(first_curvature, k, surfaces.numbers[s, SIGN_CHANGE], x, y, z, u, v, w)
-            if wp.static(special):
+            if wp.static(special == 2):
                 if surfaces.kinds[s, CHOSEN] > 0:
                     if reaches_twice(w, surfaces.numbers[s, TWO_CROSSINGS]):
                         t = start_by_aperture(surfaces, s, x, y, z, u, v, w, t)
@@ -419,13 +420,13 @@ def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
     return through_telescope
 
 
-#: The loop for plain telescopes, and that for any; the same for rays of a wavelength each.
-LOOPS = (surface_loop(False), surface_loop(True))
-CHROMATIC_LOOPS = (surface_loop(False, chromatic=True), surface_loop(True, chromatic=True))
+#: The loops of the variants of `kernel_pair`; the same for rays of a wavelength each.
+LOOPS = (surface_loop(0), surface_loop(1), surface_loop(2))
+CHROMATIC_LOOPS = tuple(surface_loop(special, chromatic=True) for special in range(3))
 
 
 @kernel_pair
-def trace_rays(special: bool, module: wp.Module) -> wp.Kernel:
+def trace_rays(special: int, module: wp.Module) -> wp.Kernel:
     """Return the kernel that traces given rays."""
     through_telescope = LOOPS[special]
 

@@ -172,8 +172,8 @@ def pack_surfaces(telescope: Telescope | SurfaceSequence, device: str = "cpu") -
         ]
         before = s.medium_after
     packed = PackedSurfaces()
-    unusual = kinds[:, [DEFORMED, OBSTRUCTED, CHOSEN]].any() or np.any(kinds[:, STOPPED] == 2)
-    packed.special = int(unusual or np.any(kinds[:, INTERACTION] == PHASE))
+    unusual = kinds[:, DEFORMED].any() or kinds[:, OBSTRUCTED].any() or np.any(kinds[:, STOPPED] == 2)
+    packed.special = 2 if kinds[:, CHOSEN].any() else int(unusual or np.any(kinds[:, INTERACTION] == PHASE))
     packed.numbers = warp_array(numbers, device=device)
     packed.kinds = warp_array(kinds, wp.int32, device=device)
     packed.coefficients = warp_array(coefficients, device=device)
