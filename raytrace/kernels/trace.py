@@ -373,6 +373,12 @@ def surface_loop(special: int, chromatic: bool = False) -> wp.Function:
                         nx = -wp.cw_mul(radial, x) - wp.cw_mul(sag_x, lanes(ONE) - ((ONE + k) * c) * b)
                         ny = -wp.cw_mul(radial, y) - wp.cw_mul(sag_y, lanes(ONE) - ((ONE + k) * c) * b)
                 nz = lanes(ONE) - ((ONE + k) * c) * b
+                for i in range(LANES):
+                    # The other sheet of a hyperboloid, or the half of an ellipsoid beyond its equator, is no surface.
+                    status[i] = wp.where(nz[i] > ZERO, status[i], wp.where(status[i] <= VIGNETTED, MISSED, status[i]))
+                    x[i] = wp.where(nz[i] > ZERO, x[i], NAN)
+                    y[i] = wp.where(nz[i] > ZERO, y[i], NAN)
+                    z[i] = wp.where(nz[i] > ZERO, z[i], NAN)
                 if interaction == MIRROR:
                     u, v, w = reflected(u, v, w, nx, ny, nz)
                 else:

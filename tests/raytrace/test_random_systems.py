@@ -17,6 +17,8 @@ WAVELENGTH = 587.5618e-9
 #: Fields [deg] and the radius of the entrance pupil [mm].
 FIELDS = ((0.0, 0.0), (1.5, -2.0))
 PUPIL = 3.0
+#: Radius [mm] that the surfaces are made to: beyond it powers of the radius may turn back, and rays cross them twice.
+SIZE = 12.0
 LONG = np.longdouble
 HEAD = f"""VERS 190513 30 123457 L123457
 MODE SEQ
@@ -177,7 +179,6 @@ def file_text(elements):
 
 
 def axis_rotation(axis, degrees):
-    angle = LONG(degrees) * LONG(np.pi) / 180
     angle = np.radians(LONG(degrees))
     c, s = np.cos(angle), np.sin(angle)
     i, j = [(1, 2), (2, 0), (0, 1)][axis]
@@ -224,11 +225,13 @@ def landed(sag, place, direction):
 
 
 def traced(elements, place, direction):
-    """Return rays [3, n] at the image, and their optical path, all in the frame of surface 1 [mm]."""
+    """Return rays [3, n] at the image, their optical path and largest radius, all in the frame of surface 1 [mm]."""
     origin, axes = np.array([0, 0, 10], dtype=LONG), np.eye(3, dtype=LONG)
     place, direction = place.astype(LONG), direction.astype(LONG)
     index, path = LONG(1), np.zeros(place.shape[1], dtype=LONG)
-    for element in [*elements, Element("STANDARD", 0.0, {"c": 0.0, "k": 0.0}, 1.0)]:
+    reach = np.zeros(place.shape[1])
+    image = Element("STANDARD", 0.0, {"c": 0.0, "k": 0.0}, 1.0)
+    for element in [*elements, image]:
         if element.kind == "COORDBRK":
             dx, dy, *tilts, order = (element.numbers[i] for i in range(1, 7))
             rotations = [axis_rotation(i, tilt) for i, tilt in enumerate(tilts)]
@@ -246,15 +249,16 @@ def traced(elements, place, direction):
             path = path + index * t
             after = index if element.index_after is None else LONG(element.index_after)
             deflect = DEFLECTIONS["mirror" if element.index_after is None else "lens"]
-            last = element is not elements[-1] and element not in elements
-            travel = travel if last else deflect(travel, normal, index, after)
+            if element is not image:
+                travel = deflect(travel, normal, index, after)
+                reach = np.maximum(reach, np.hypot(local[0], local[1]).astype(float))
             place, direction, index = axes @ local + origin[:, None], axes @ travel, after
         origin = origin + axes[:, 2] * LONG(element.thickness)
-    return place, direction, path
+    return place, direction, path, reach
 
 
 def compare(seed, folder):
-    """Return the numbers of rays that arrive in both tracers, and the largest difference [m] of places and paths."""
+    """Return the number of rays that arrive, and the largest difference [m] of the two tracers over its rounding."""
     elements = random_system(seed)
     path = folder / f"random_{seed}.zmx"
     path.write_text(file_text(elements))
@@ -263,35 +267,40 @@ def compare(seed, folder):
     size = PUPIL * 1e-3 * np.sqrt((np.arange(9) + 0.5) / 9)
     pupil = size * np.cos(angle), size * np.sin(angle)
     start_z = telescope.surfaces[0].vertex[2]
+    # From the telescope frame to that of surface 1, in mm.
+    flip = np.array([[-1.0], [1.0], [-1.0]])
     arrived, worst = 0, 0.0
     for tx, ty in np.radians(FIELDS):
         rays = pachon.launch_rays(telescope, (-tx, ty), WAVELENGTH, pupil)
-        result = pachon.trace(telescope, rays)
-        # From the telescope frame to that of surface 1, in mm.
-        flip = np.array([[-1.0], [1.0], [-1.0]])
-        place = 1e3 * flip * (rays.position - [0.0, 0.0, start_z]).T
+        results = pachon.trace(telescope, rays, "all")
+        place, direction = 1e3 * flip * (rays.position - [0.0, 0.0, start_z]).T, flip * rays.direction.T
         with np.errstate(all="ignore"):
-            end, direction, length = traced(elements, place, flip * rays.direction.T)
-        reached = np.isfinite(end.astype(float)).all(axis=0)
-        ours = result.status == RayStatus.OK
-        assert (ours == reached).all(), f"seed {seed}: statuses {result.status}, expected {reached}"
-        here = 1e3 * flip * (result.position - [0.0, 0.0, start_z]).T
-        differences = [
-            np.abs(here - end)[:, reached] / 1e3,
-            np.abs(1e3 * result.path_length - length)[reached] / 1e3,
-            # Over a millimetre.
-            1e-3 * np.abs(flip * result.direction.T - direction)[:, reached],
-        ]
-        worst = max([worst, *(float(d.max(initial=0.0)) for d in differences)])
+            *expected, reach = traced(elements, place, direction)
+            moved = traced(elements, place * (1 + 1e-13), direction)[:3]
+        reached = np.isfinite(expected[0].astype(float)).all(axis=0) & (reach < SIZE)
+        end = results[-1]
+        assert (end.status == RayStatus.OK)[reached].all(), f"seed {seed}: statuses {end.status}, expected {reached}"
+        traces = 1e3 * flip * (end.position - [0.0, 0.0, start_z]).T, flip * end.direction.T, 1e3 * end.path_length
+        for ours, theirs, beside in zip(traces, expected, moved, strict=True):
+            # How much the system magnifies what double precision rounds, of places of 10 cm.
+            rounding = 1e-14 + 0.01 * np.abs(beside - theirs)[..., reached].max(initial=0.0)
+            difference = np.abs(ours - theirs)[..., reached].max(initial=0.0)
+            worst = max(worst, float(difference / 1e3 / rounding))
         arrived += int(reached.sum())
+        for result, surface in zip(results, telescope.surfaces, strict=True):
+            lit = result.status == RayStatus.OK
+            x, y, z = surface.to_local(result.position[lit]).T
+            height = (z - surface.sag(x, y)) * surface.normal(x, y)[:, 2]
+            # Where rays go astray, places of metres.
+            assert (np.abs(height) < 1e-12 * np.maximum(1.0, np.hypot(x, y))).all(), f"seed {seed}: {surface.name}"
     return arrived, worst
 
 
 def check(seeds, folder):
     counts, worst = zip(*(compare(seed, folder) for seed in seeds), strict=True)
     assert sum(counts) > 9 * len(seeds)
-    # Lengths of 0.2 m in double precision, through a few curved surfaces.
-    assert max(worst) < 1e-12, f"seed {seeds[int(np.argmax(worst))]}: {max(worst)} m"
+    # Each of some surfaces rounds once more.
+    assert max(worst) < 30.0, f"seed {seeds[int(np.argmax(worst))]}: {max(worst)} times the rounding"
 
 
 def test_random_systems(tmp_path):
