@@ -194,8 +194,7 @@ def _chief_start(telescope: Telescope, wavelength: float) -> _Ray:
     They are parallel to it, displaced along x and y, and of other directions along x and y through the same point.
     """
     sides = np.eye(3)[:, :2]
-    none = np.zeros((3, 2))
-    moved, turned = np.hstack([sides, none]), np.hstack([none, sides])
+    moved, turned = np.hstack([sides, np.zeros((3, 2))]), np.hstack([np.zeros((3, 2)), sides])
     start = _Ray(np.array([0.0, 0.0, telescope.stop_z]), np.array([0.0, 0.0, -1.0]), moved, turned)
     data = telescope.design_data
     if data.aiming == "off" or data.stop is None or data.telecentric:
@@ -241,10 +240,8 @@ def _landed(surface: Surface, ray: _Ray, telescope: Telescope, row: int) -> _Ray
     if not candidates:
         raise DomainError(f"the chief ray of {telescope.name} does not meet surface {surface.name}")
     points = np.array([ray.place + t * ray.direction for t in candidates])
-    chosen_index = 0
-    if len(candidates) == 2:
-        chosen_index = _meant(surface, ray, points, telescope, row)
-    ahead = ray.advanced(candidates[chosen_index])
+    index = _meant(surface, ray, points, telescope, row) if len(candidates) > 1 else 0
+    ahead = ray.advanced(candidates[index])
     normal = _normal(surface, ahead.place)
     # The neighbours meet the surface farther or nearer.
     steps = -(normal @ ahead.moved) / (normal @ ahead.direction)
@@ -280,7 +277,7 @@ def _crossings(surface: Surface, ray: _Ray) -> list[float]:
                 break
         at = ray.place + t * ray.direction
         on_sheet = abs(float(at[2] - shape.sag(at[0], at[1]))) < _FAILED if math.isfinite(t) else False
-        if on_sheet and not any(abs(t - other) < _FAILED for other in distances):
+        if on_sheet and not any(abs(t - crossing) < _FAILED for crossing in distances):
             distances.append(t)
     return distances
 

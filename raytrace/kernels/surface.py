@@ -76,7 +76,7 @@ def conic_distance(
 
 
 @wp.func
-def other_conic_distance(
+def second_conic_distance(
     c: wp.float64,
     k: wp.float64,
     sign_change: wp.float64,
@@ -132,12 +132,15 @@ def aspheric_distance(
     w: lanes,
     start: lanes,
 ):
-    """Distance to the asphere by Newton's method from ``start``, and which lanes did not converge.
+    """Distance to the asphere by Newton's method from ``start`` or the vertex plane, and which lanes did not converge.
 
     With b = z - (a_4 r^4 + ...), what is left must lie on the conic, G = c (r^2 + (1 + k) b^2) - 2 b = 0: the
     implicit form takes neither a root nor a division per evaluation.
     """
-    t = start
+    t = wp.cw_div(-z, w)
+    for i in range(LANES):
+        # Where the ray misses the conic it starts from the vertex plane: the asphere may bend away from the conic.
+        t[i] = wp.where(wp.abs(start[i]) < FAR, start[i], t[i])
     running = lanes(ONE)
     busy = wp.float64(1.0)
     steps = int(0)

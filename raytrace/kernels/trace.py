@@ -28,10 +28,10 @@ from .surface import (
     ZERO,
     aspheric_distance,
     conic_distance,
-    other_conic_distance,
     polynomial,
     reflected,
     refracted,
+    second_conic_distance,
 )
 
 wp.set_module_options(FORWARD_OPTIONS)
@@ -225,24 +225,24 @@ def start_by_aperture(
     rank; else ``start``, the one by the sign of w.
     """
     first_curvature = surfaces.numbers[s, FIRST_CURVATURE]
-    other = other_conic_distance(
+    second_start = second_conic_distance(
         first_curvature, surfaces.numbers[s, CONIC], surfaces.numbers[s, SIGN_CHANGE], x, y, z, u, v, w
     )
     distance, rank = landing(surfaces, s, x, y, z, u, v, w, start)
-    other_distance, other_rank = landing(surfaces, s, x, y, z, u, v, w, other)
+    second_distance, second_rank = landing(surfaces, s, x, y, z, u, v, w, second_start)
     centred = surfaces.kinds[s, STOPPED] == 1
     if surfaces.numbers[s, APERTURE] != ZERO or surfaces.numbers[s, APERTURE + 1] != ZERO:
         centred = False
     least = wp.where(centred, ZERO, ONE)
     t = lanes()
     for i in range(LANES):
-        better = wp.where(other_rank[i] > rank[i], ONE, ZERO)
+        better = wp.where(second_rank[i] > rank[i], ONE, ZERO)
         ahead = wp.where(distance[i] > AHEAD, ONE, ZERO)
-        other_ahead = wp.where(other_distance[i] > AHEAD, ONE, ZERO)
-        both = wp.min(rank[i], other_rank[i]) >= least and surfaces.numbers[s, APERTURE + 3] < FAR
-        better = wp.where(both and ahead != other_ahead, other_ahead, better)
-        t[i] = wp.where(better > ZERO, other[i], start[i])
-        t[i] = wp.where(wp.max(rank[i], other_rank[i]) < ZERO, NAN, t[i])
+        second_ahead = wp.where(second_distance[i] > AHEAD, ONE, ZERO)
+        alike = wp.min(rank[i], second_rank[i]) >= least and surfaces.numbers[s, APERTURE + 3] < FAR
+        better = wp.where(alike and ahead != second_ahead, second_ahead, better)
+        t[i] = wp.where(better > ZERO, second_start[i], start[i])
+        t[i] = wp.where(wp.max(rank[i], second_rank[i]) < ZERO, NAN, t[i])
     return t
 
 

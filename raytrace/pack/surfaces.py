@@ -98,6 +98,8 @@ def steepest_cosine(surface: Surface) -> float:
     if surface.aperture is None:
         return 1.0
     x, y, radius = enclosing_circle(surface.aperture)
+    if not math.isfinite(radius):
+        return 1.0
     shape = surface.shape
     if isinstance(shape, Rotational) and not shape.coefficients:
         x, y = np.array([math.hypot(x, y) + radius]), np.zeros(1)
@@ -105,8 +107,6 @@ def steepest_cosine(surface: Surface) -> float:
         # A shape may be steeper between these points, and the conic that the search starts from is another one.
         angle, size = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False), radius * np.linspace(0.0, 1.0, 9)[:, None]
         x, y = x + size * np.cos(angle), y + size * np.sin(angle)
-    if not math.isfinite(radius):
-        return 1.0
     slope = float(np.hypot(*shape.gradient(x, y)).max())
     if not isinstance(shape, Rotational) or shape.coefficients:
         slope *= SLOPE_MARGIN

@@ -343,3 +343,20 @@ def test_derivatives_of_a_wide_relay(slope, rng):
 
         # As in test_perpendicular_rays: rounding of 0.1 m over steps of 1e-5, and slopes of 4.
         assert np.abs(slope(landed, 1e-5) - motion[k][:, axis]).max() < 2e-9
+
+
+def test_an_asphere_is_found_where_its_conic_is_missed(rng):
+    """Near the rim of an asphere that bends back, rays pass beside the sphere that it departs from."""
+    shape = EvenAsphere(0.05, 0.0, (-5000.0,))
+    size, angle = rng.uniform(0.036, 0.043, 500), rng.uniform(0, 2 * np.pi, 500)
+    x, y = size * np.cos(angle), size * np.sin(angle)
+    points = np.stack([x, y, shape.sag(x, y)], axis=1)
+    direction = np.stack([-np.sin(angle), np.cos(angle), -0.6 * np.ones(500)], axis=1) / np.sqrt(1.36)
+    start = points - 0.03 * direction
+    offset = start - [0.0, 0.0, 0.05]
+    beside = ((offset * direction).sum(axis=1)) ** 2 < (offset**2).sum(axis=1) - 0.05**2
+    assert beside.sum() > 400
+    telescope = system(replace(detector(0.0, 0.0, 0.0), shape=shape))
+    result = pachon.trace(telescope, rays_of(start, direction))
+    assert (result.status[beside] == RayStatus.OK).all()
+    assert np.abs(result.position - points)[beside].max() < ON_SURFACE
