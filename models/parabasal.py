@@ -183,9 +183,9 @@ def _distances(height: np.ndarray, turn: np.ndarray, axes: np.ndarray) -> np.nda
     first = int(np.argmax(np.abs(vectors.T @ axes[:, 0])))
     ordered = values[[first, 1 - first]]
     if not from_height:
-        return -ordered
+        return 0.0 - ordered
     parallel = np.abs(ordered) < _SINGULAR * float(np.abs(ratio).max(initial=1e-30))
-    return np.where(parallel, math.inf, -1.0 / np.where(parallel, 1.0, ordered))
+    return np.where(parallel, math.inf, -1.0 / np.where(parallel, 1.0, ordered)) + 0.0
 
 
 def _chief_start(telescope: Telescope, wavelength: float) -> _Ray:

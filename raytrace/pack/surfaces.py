@@ -70,9 +70,9 @@ def crossings(surfaces: Sequence[Surface], row: int, shape: SplitShape) -> Cross
     """Return the choice between crossings at a surface.
 
     By the sign of w a ray lands on the crossing nearer to the vertex. A ray that passes between two points of the sheet
-    is no steeper than the sheet at the farther of them, so beyond that slope at the rim there is no choice. A disc or
-    ring about the vertex holds the nearer crossing wherever it holds the farther one, but for rays that start or end
-    between the two, which only steep mirrors have; any other aperture says which of them is meant.
+    is no steeper than the sheet at the farther of them, so beyond that slope at the rim there is no choice. An aperture
+    about the vertex holds the nearer crossing wherever it holds the farther one, but for rays that start or end between
+    the two, which only steep mirrors have; any other aperture says which of them is meant.
     """
     surface = surfaces[row]
     flat = shape.first_curvature == 0.0 or isinstance(surface.shape, MeshSurface)
@@ -80,11 +80,12 @@ def crossings(surfaces: Sequence[Surface], row: int, shape: SplitShape) -> Cross
         return Crossings(0.0, 0.0, by_aperture=0)
     limit = steepest_cosine(surface)
     change = sign_change(surface, surfaces[row + 1 :], shape)
-    ring = clear_annulus(surface.aperture)
-    centred = ring is not None and ring[:2] == (0.0, 0.0)
+    by_aperture = 0
     steep = surface.interaction == Interaction.MIRROR and limit > STEEP
-    reflector = steep and ring is not None and ring[3] < FAR
-    by_aperture = int(surface.aperture is not None and (not centred or reflector))
+    if surface.aperture is not None:
+        x, y, rim = enclosing_circle(surface.aperture)
+        centred = not math.isfinite(rim) or math.hypot(x, y) <= ROUNDING * rim
+        by_aperture = int(not centred or (steep and math.isfinite(rim)))
     if by_aperture and steep and limit > GRAZING and not shape.parts and not shape.base.coefficients:
         by_aperture = 2
     return Crossings(math.copysign(min(abs(change), limit), change), limit, by_aperture)

@@ -304,9 +304,9 @@ def check(seeds, folder):
 
 
 def test_random_systems(tmp_path):
-    check(range(12), tmp_path)
+    check(range(6), tmp_path)
 
 
 @pytest.mark.slow
 def test_many_random_systems(tmp_path):
-    check(range(12, 900), tmp_path)
+    check(range(6, 900), tmp_path)

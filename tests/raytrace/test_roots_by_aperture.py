@@ -63,7 +63,7 @@ def conic_sag(x, y, radius, conic):
     return s / radius / (1 + np.sqrt(1 - (1 + conic) * s / radius**2))
 
 
-def chords(radius, conic, rng, count=6000):
+def chords(radius, conic, rng, count=4000):
     """Return lines through two points of the sheet at the vertex: starts anywhere on them, directions, both points."""
     reach = min(1.6, 0.98 / np.sqrt(1 + conic) if conic > -1 else 1.6) * abs(radius)
     size, angle = reach * np.sqrt(rng.uniform(size=(2, count))), rng.uniform(0, 2 * np.pi, (2, count))
@@ -92,7 +92,7 @@ def test_of_two_crossings_the_one_within_the_aperture(radius, conic, aperture, r
     within = aperture.contains(*np.moveaxis(points[..., :2], -1, 0))
     one = within[0] != within[1]
     expected = np.where(within[0][:, None], points[0], points[1])[one]
-    assert one.sum() > 20
+    assert one.sum() > 10
     for interaction in (Interaction.MIRROR, Interaction.PASS):
         surface = replace(mirror("M", Conic(radius, conic), (0.0, 0.0, 0.0), aperture), interaction=interaction)
         telescope = system(surface, detector(0.3, -0.2, 0.4))
@@ -155,12 +155,12 @@ def test_a_wide_relay_past_90_degrees(first_axes, second_axes, rng):
 )
 def test_searches_start_from_the_crossing_within_the_aperture(shape, rng):
     telescope = relay(second=shape, size=0.03)
-    first, second, image = pachon.trace(telescope, beam(telescope, rng), "all")
+    first, second, image = pachon.trace(telescope, beam(telescope, rng, 150), "all")
     x, y, z = (second.position - [0.0, -0.1, 0.1]).T
     lit = image.status == RayStatus.OK
     assert np.abs(z - shape.sag(x, y))[lit].max() < ON_SURFACE
     # Brute force: steps along each ray until it passes the surface within the aperture.
-    steps = np.linspace(0.02, 0.4, 4001)[:, None, None]
+    steps = np.linspace(0.02, 0.4, 2001)[:, None, None]
     start = first.position - [0.0, -0.1, 0.1]
     x, y, z = np.moveaxis(start + steps * first.direction, -1, 0)
     above = z - shape.sag(x, y)
