@@ -103,14 +103,13 @@ def steepest_cosine(surface: Surface) -> float:
         return 1.0
     shape = surface.shape
     if isinstance(shape, Rotational) and not shape.coefficients:
-        x, y = np.array([math.hypot(x, y) + radius]), np.zeros(1)
+        slope = float(np.hypot(*shape.gradient(math.hypot(x, y) + radius, 0.0)))
     else:
         # A shape may be steeper between these points, and the conic that the search starts from is another one.
         angle, size = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False), radius * np.linspace(0.0, 1.0, 9)[:, None]
-        x, y = x + size * np.cos(angle), y + size * np.sin(angle)
-    slope = float(np.hypot(*shape.gradient(x, y)).max())
-    if not isinstance(shape, Rotational) or shape.coefficients:
-        slope *= SLOPE_MARGIN
+        slope = SLOPE_MARGIN * float(
+            np.hypot(*shape.gradient(x + size * np.cos(angle), y + size * np.sin(angle))).max()
+        )
     return math.sin(math.atan(slope)) if math.isfinite(slope) else 1.0
 
 

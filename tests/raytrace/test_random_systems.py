@@ -20,6 +20,9 @@ PUPIL = 3.0
 #: Radius [mm] that the surfaces are made to: beyond it powers of the radius may turn back, and rays cross them twice.
 SIZE = 12.0
 LONG = np.longdouble
+#: Newton's method for freeforms ends at steps of 2e-13 m, with the slopes of the place before: with second derivatives
+#: of 200 / m that is 4e-11 rad, over 15 cm of path to the image 6e-12 m.
+SLOPES = 6e-12
 HEAD = f"""VERS 190513 30 123457 L123457
 MODE SEQ
 UNIT MM X W X CM MR CPMM
@@ -261,7 +264,7 @@ def traced(elements, place, direction):
 
 
 def compare(seed, folder):
-    """Return the number of rays that arrive, and the largest difference [m] of the two tracers over its rounding."""
+    """Return the number of rays that arrive, and the largest difference of the two tracers over what is allowed."""
     elements = random_system(seed)
     path = folder / f"random_{seed}.zmx"
     path.write_text(file_text(elements))
@@ -285,10 +288,10 @@ def compare(seed, folder):
         assert (end.status == RayStatus.OK)[reached].all(), f"seed {seed}: statuses {end.status}, expected {reached}"
         traces = 1e3 * flip * (end.position - [0.0, 0.0, start_z]).T, flip * end.direction.T, 1e3 * end.path_length
         for ours, theirs, beside in zip(traces, expected, moved, strict=True):
-            # How much the system magnifies what double precision rounds, of places of 10 cm.
-            rounding = 1e-14 + 0.01 * np.abs(beside - theirs)[..., reached].max(initial=0.0)
+            # How much the system magnifies what double precision rounds, at each of its surfaces.
+            rounding = 30 * (1e-14 + 0.01 * np.abs(beside - theirs)[..., reached].max(initial=0.0))
             difference = np.abs(ours - theirs)[..., reached].max(initial=0.0)
-            worst = max(worst, float(difference / 1e3 / rounding))
+            worst = max(worst, float(difference / (1e3 * (SLOPES + rounding))))
         arrived += int(reached.sum())
         for result, surface in zip(results, telescope.surfaces, strict=True):
             lit = result.status == RayStatus.OK
@@ -302,8 +305,7 @@ def compare(seed, folder):
 def check(seeds, folder):
     counts, worst = zip(*(compare(seed, folder) for seed in seeds), strict=True)
     assert sum(counts) > 9 * len(seeds)
-    # Each of some surfaces rounds once more.
-    assert max(worst) < 30.0, f"seed {seeds[int(np.argmax(worst))]}: {max(worst)} times the rounding"
+    assert max(worst) < 1.0, f"seed {seeds[int(np.argmax(worst))]}: {max(worst)} times the tolerance"
 
 
 @pytest.mark.long
