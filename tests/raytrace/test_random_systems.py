@@ -288,10 +288,10 @@ def compare(seed, folder):
         assert (end.status == RayStatus.OK)[reached].all(), f"seed {seed}: statuses {end.status}, expected {reached}"
         traces = 1e3 * flip * (end.position - [0.0, 0.0, start_z]).T, flip * end.direction.T, 1e3 * end.path_length
         for ours, theirs, beside in zip(traces, expected, moved, strict=True):
-            # How much the system magnifies what double precision rounds, at each of its surfaces.
-            rounding = 30 * (1e-14 + 0.01 * np.abs(beside - theirs)[..., reached].max(initial=0.0))
-            difference = np.abs(ours - theirs)[..., reached].max(initial=0.0)
-            worst = max(worst, float(difference / (1e3 * (SLOPES + rounding))))
+            # What a thousand roundings become that the system magnifies.
+            rounding = np.abs(beside - theirs)[..., reached].max(initial=0.0) / 1e3
+            difference = np.abs(ours - theirs)[..., reached].max(initial=0.0) / 1e3
+            worst = max(worst, float(difference / (SLOPES + rounding)))
         arrived += int(reached.sum())
         for result, surface in zip(results, telescope.surfaces, strict=True):
             lit = result.status == RayStatus.OK
