@@ -350,3 +350,24 @@ def shifted(aperture: Aperture, x: float, y: float) -> Aperture:
     if isinstance(aperture, Polygon):
         return Polygon(tuple((a + x, b + y) for a, b in aperture.corners))
     return replace(aperture, x=aperture.x + x, y=aperture.y + y)
+
+
+def enclosing_circle(aperture: Aperture) -> tuple[float, float, float]:
+    """Return centre x, y and radius [m] of a circle that holds an aperture; a radius of infinity where none does."""
+    if isinstance(aperture, Circle | Annulus):
+        return aperture.x, aperture.y, aperture.radius if isinstance(aperture, Circle) else aperture.outer
+    if isinstance(aperture, Ellipse):
+        return aperture.x, aperture.y, max(aperture.semi_x, aperture.semi_y)
+    if isinstance(aperture, Rectangle):
+        return aperture.x, aperture.y, 0.5 * math.hypot(aperture.width, aperture.height)
+    if isinstance(aperture, Polygon):
+        corners = np.array(aperture.corners)
+        x, y = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+        return float(x), float(y), float(np.hypot(*(corners - [x, y]).T).max())
+    if isinstance(aperture, Intersection):
+        return min((enclosing_circle(region) for region in aperture.parts), key=lambda circle: circle[2])
+    if isinstance(aperture, Union):
+        circles = [enclosing_circle(region) for region in aperture.parts]
+        x, y = (float(np.mean([circle[i] for circle in circles])) for i in range(2))
+        return x, y, max(math.hypot(cx - x, cy - y) + radius for cx, cy, radius in circles)
+    return 0.0, 0.0, math.inf

@@ -1,7 +1,8 @@
 """First-order properties and Seidel sums of a centred telescope, from a paraxial trace.
 
-The trace unfolds the telescope along the light: ``s`` runs with the incoming light (``s = -z``), so a thickness is
-negative after an odd number of mirrors, and so is the index ``n``. At each surface of curvature ``c`` (along ``s``)::
+Flat folding mirrors cost nothing: the telescope is first unfolded about them (:mod:`pachon.models.unfolding`). Then
+``s`` runs with the incoming light (``s = -z``), so a thickness is negative after an odd number of mirrors, and so is
+the index ``n``. At each surface of curvature ``c`` (along ``s``)::
 
     n' u' = n u - h c (n' - n)        h_next = h + u' t
 
@@ -26,9 +27,10 @@ from ..core.plotting import BLUE, RED, axes_at, styled
 from ..core.point_plots import draw_bars
 from ..core.result import Result, Values
 from ..core.units import ARCSEC, length, metres
-from .paraxial import curvatures_across, require_on_axis
-from .surface import Interaction, Surface
+from .paraxial import require_on_axis
+from .surface import Interaction
 from .telescope import Telescope
+from .unfolding import AxialSurface, unfolded_axis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,6 +41,9 @@ if TYPE_CHECKING:
 class FirstOrder(Values):
     """First-order properties of a telescope.
 
+    Heights count in the telescope frame; behind flat folding mirrors on the axis as it would go on without them, which
+    is also how lengths are measured.
+
     Parameters
     ----------
     wavelength : float
@@ -48,13 +53,13 @@ class FirstOrder(Values):
     f_number : float
         Focal length over the diameter of the entrance pupil.
     back_focus : float
-        From the last mirror or lens surface to the paraxial focus, along the light [m].
+        From the last mirror or lens surface that is no fold to the paraxial focus, along the light [m].
     focus_z : float
-        Height of the paraxial focus [m], telescope frame.
+        Height of the paraxial focus [m].
     plate_scale : float
         Angle on the sky over length at the focus [rad/m].
     entrance_pupil_z, exit_pupil_z : float
-        Heights of the pupils [m], telescope frame; infinite where the exit pupil is.
+        Heights of the pupils [m]; infinite where the exit pupil is.
     entrance_pupil_diameter, exit_pupil_diameter : float
         Diameters of the pupils [m].
     effective_area : float
@@ -63,7 +68,7 @@ class FirstOrder(Values):
         Slope of the chief ray behind the telescope over that in front of it, both along the light; of an afocal
         telescope its magnifying power, negative where the image is upside down. Infinite in a telecentric object space.
     image_z : float
-        Height of the paraxial image of the object [m], telescope frame: the focus of an object at infinity.
+        Height of the paraxial image of the object [m]: the focus of an object at infinity.
     magnification : float
         Height of that image over that of the object, 0 of one at infinity.
     working_f_number : float
@@ -171,7 +176,7 @@ class _Trace:
     """The marginal and a chief ray (last axis) at each surface: heights [m], slopes and indices on either side."""
 
     wavelength: float
-    surfaces: tuple[Surface, ...]
+    surfaces: tuple[AxialSurface, ...]
     curvature: np.ndarray
     n: np.ndarray
     n_after: np.ndarray
@@ -187,7 +192,8 @@ def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> Fi
     Parameters
     ----------
     telescope : Telescope
-        Prescription; its surfaces must share one axis.
+        Prescription; its surfaces must share one axis, which flat mirrors may fold. Of others
+        :func:`~pachon.parabasal_optics` has focal lengths and pupils in two planes.
     wavelength : float or Quantity, optional
         Vacuum wavelength [m]; the telescope's default where not given.
 
@@ -198,8 +204,9 @@ def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> Fi
     """
     radius = 0.5 * telescope.pupil_diameter
     trace = _trace(telescope, wavelength, 1.0, section=True)
-    last_z = trace.surfaces[-1].vertex[2]
-    n, (h, hb), (u, ub) = float(trace.n_after[-1]), map(float, trace.h[-1]), map(float, trace.u_after[-1])
+    last = [i for i, surface in enumerate(trace.surfaces) if not surface.fold][-1]
+    last_z = trace.surfaces[last].z
+    n, (h, hb), (u, ub) = float(trace.n_after[last]), map(float, trace.h[last]), map(float, trace.u_after[last])
     power = -n * u / (abs(float(trace.n[0])) * radius)
     parallel = abs(power) * radius < 1e-9
     slope = _marginal(telescope)
@@ -211,8 +218,8 @@ def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> Fi
     focal_length, to_focus = (math.inf, math.inf) if parallel else (1.0 / power, -h / u)
     to_pupil = -hb / ub if ub != 0 else math.inf
     marginal_trace = _trace(telescope, wavelength, 1.0, section=True, marginal=slope)
-    behind = 0.0 if parallel and not slope else float(marginal_trace.u_after[-1, 0])
-    height = float(marginal_trace.h[-1, 0])
+    behind = 0.0 if parallel and not slope else float(marginal_trace.u_after[last, 0])
+    height = float(marginal_trace.h[last, 0])
     return FirstOrder(
         wavelength=trace.wavelength,
         focal_length=focal_length,
@@ -240,7 +247,7 @@ def footprints(telescope: Telescope, field: float, wavelength: ArrayLike | None 
 
 @check_arguments
 def seidel_sums(telescope: Telescope, wavelength: ArrayLike | None = None, field: float | None = None) -> SeidelSums:
-    """Return the Seidel sums of a centred telescope.
+    """Return the Seidel sums of a centred telescope; those of flat folding mirrors are zero.
 
     Parameters
     ----------
@@ -268,7 +275,7 @@ def seidel_sums(telescope: Telescope, wavelength: ArrayLike | None = None, field
     # This form of the fifth sum stays finite where the marginal ray meets the surface at right angles (a = 0).
     s5 = -(b**3) * h * square + b * hb * c * (2 * h * b - hb * a) * flat
     # Aspheric term k c^3 + 8 a_4 of each surface; along s it changes sign.
-    aspheric = -8 * np.array([s.shape.fourth_order for s in trace.surfaces]) * (n2 - n)
+    aspheric = -8 * np.array([s.fourth_order for s in trace.surfaces]) * (n2 - n)
     from_aspheric = np.stack([h**4, h**3 * hb, h**2 * hb**2, np.zeros_like(h), h * hb**3]) * aspheric
     contributions = np.stack([s1, s2, s3, s4, s5]) + from_aspheric
     return SeidelSums(tuple(s.name for s in trace.surfaces), contributions.T)
@@ -283,7 +290,7 @@ def chromatic_sums(
     Parameters
     ----------
     telescope : Telescope
-        Prescription; its surfaces must share one axis.
+        Prescription; its surfaces must share one axis, which flat mirrors may fold.
     field : float, optional
         Field angle of the chief ray [rad]; the radius of the field by default.
     wavelengths : array_like or Quantity, shape [2], optional
@@ -320,12 +327,15 @@ def paraxial_rays(telescope: Telescope, surface: str) -> tuple[tuple[float, floa
     rim, marginal = 0.5 * telescope.pupil_diameter, _marginal(telescope)
     chief = math.tan(telescope.field_radius)
     trace = _trace(telescope, None, chief, section=True, marginal=marginal)
+    for acting_surface in trace.surfaces:
+        # Solves move surfaces along z, which is not the axis behind a fold.
+        require_on_axis(telescope.surface(acting_surface.name), telescope.name)
     names = telescope.surface_names
     acting = [i for i, s in enumerate(trace.surfaces) if names.index(s.name) <= names.index(surface)]
     if not acting:
         return (telescope.stop_z, rim, marginal), (telescope.stop_z, 0.0, chief)
     last = acting[-1]
-    z = trace.surfaces[last].vertex[2]
+    z = trace.surfaces[last].z
     (h, hb), (u, ub) = map(float, trace.h[last]), map(float, trace.u_after[last])
     return (z, h, u), (z, hb, ub)
 
@@ -345,14 +355,12 @@ def _trace(
     """
     w = length(telescope.default_wavelength if wavelength is None else wavelength, "wavelength")
     telescope.check_wavelength(w)
-    surfaces = tuple(s for s in telescope.surfaces if s.interaction in (Interaction.MIRROR, Interaction.REFRACT))
-    if not surfaces:
+    surfaces = unfolded_axis(telescope).surfaces
+    if all(surface.fold for surface in surfaces):
         raise DomainError(f"telescope {telescope.name}: expected at least one mirror or lens surface")
-    for surface in surfaces:
-        require_on_axis(surface, telescope.name)
-    curvature = -np.array([s.shape.curvature for s in surfaces])
+    curvature = -np.array([s.curvature for s in surfaces])
     if section:
-        along_x, along_y = -np.array([curvatures_across(s) for s in surfaces]).T
+        along_x, along_y = -np.array([s.curvatures for s in surfaces]).T
         curvature = along_y if along_y.any() else along_x
     # In a telecentric object space the chief ray is parallel to the axis, at the height of the object.
     height = -slope * (telescope.object_distance - telescope.stop_z) if telescope.design_data.telecentric else 0.0
@@ -360,11 +368,11 @@ def _trace(
     z, index = telescope.stop_z, float(telescope.medium_before.index(w))
     rows = []
     for surface, c in zip(surfaces, curvature, strict=True):
-        mirror = surface.interaction == Interaction.MIRROR
+        mirror = surface.interaction == Interaction.MIRROR and not surface.fold
         glass = float(surface.medium_after.index(w))
         index_after = -index if mirror else np.copysign(glass, index)
-        h = h + u * (z - surface.vertex[2])
+        h = h + u * (z - surface.z)
         u_after = (index * u - h * c * (index_after - index)) / index_after
         rows.append((index, index_after, h, u, u_after))
-        index, u, z = index_after, u_after, surface.vertex[2]
+        index, u, z = index_after, u_after, surface.z
     return _Trace(w, surfaces, curvature, *(np.array(v, dtype=np.float64) for v in zip(*rows, strict=True)))

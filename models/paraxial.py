@@ -349,11 +349,12 @@ def require_on_axis(surface: Surface, name: str) -> None:
         raise DomainError(f"surface {surface.name} of {name}: expected one on the axis, not perturbed")
 
 
-def curvatures_across(surface: Surface) -> tuple[float, float]:
-    """Return the curvatures [1/m] of a surface on the axis along x and y of the telescope."""
+def curvatures_across(surface: Surface, axes: np.ndarray | None = None) -> tuple[float, float]:
+    """Return the curvatures [1/m] of a surface on the axis along x and y of the telescope; `axes` are its own there."""
     shape_curvatures = surface.shape.curvatures
     if shape_curvatures[0] == shape_curvatures[1]:
         return shape_curvatures
     # Euler's theorem: squares of the cosines between the axes weight the curvatures of the surface.
-    along_x, along_y = surface.matrix[:2, :2] ** 2 @ np.array(shape_curvatures)
+    frame = surface.matrix if axes is None else axes
+    along_x, along_y = frame[:2, :2] ** 2 @ np.array(shape_curvatures)
     return float(along_x), float(along_y)

@@ -206,6 +206,8 @@ from .models.media.medium import RelativeToAir as RelativeToAir
 from .models.media.medium import Sellmeier as Sellmeier
 from .models.media.tabulated import TabulatedIndex as TabulatedIndex
 from .models.obstruction import Obstruction as Obstruction
+from .models.parabasal import ParabasalOptics as ParabasalOptics
+from .models.parabasal import parabasal_optics as parabasal_optics
 from .models.parameters.changes import apply_changes as apply_changes
 from .models.parameters.degrees_of_freedom import DegreeOfFreedom as DegreeOfFreedom
 from .models.parameters.degrees_of_freedom import DegreesOfFreedom as DegreesOfFreedom

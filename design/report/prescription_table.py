@@ -1,8 +1,8 @@
 """Prescription and first-order data as tables of text, in a unit of length and with the signs of lens design.
 
 The z axis points along the incoming light, as in Zemax: a thickness is the distance to the next vertex along it,
-negative after a mirror, and a positive radius has its centre behind the surface. In the telescope frame z points the
-other way.
+negative after a mirror that is no flat fold, and a positive radius has its centre behind the surface. In the telescope
+frame z points the other way.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ from ...core.errors import DomainError, PachonError
 from ...core.units import ARCSEC
 from ...models.first_order import first_order, seidel_sums
 from ...models.media.medium import ConstantIndex
+from ...models.parabasal import parabasal_optics
 from ...models.shapes.shape import Rotational
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
+from ...models.unfolding import axial_heights, unfolded_axis
 from ..metrics.principal_rays import principal_rays
 
 COLUMNS = ("surface", "type", "radius", "thickness", "medium", "index", "semi-diameter", "conic", "coefficients, place")
@@ -38,11 +40,12 @@ def prescription_rows(telescope: Telescope, wavelength: float, semi_diameters: d
     Semi-diameters are in metres by name of the surface; the wavelength [m] is that of the indices.
     """
     _, unit = telescope.length_unit
-    surfaces = telescope.surfaces
+    surfaces, heights = telescope.surfaces, axial_heights(telescope)
     rows = []
     for i, surface in enumerate(surfaces):
         shape, mirror = surface.shape, surface.interaction == Interaction.MIRROR
-        thickness = (surface.vertex[2] - surfaces[i + 1].vertex[2]) / unit if i + 1 < len(surfaces) else math.nan
+        following = surfaces[i + 1].name if i + 1 < len(surfaces) else None
+        thickness = math.nan if following is None else (heights[surface.name] - heights[following]) / unit
         medium = surface.medium_after
         index = float(medium.index(wavelength))
         bare = isinstance(medium, ConstantIndex) and not medium.name
@@ -104,7 +107,8 @@ def first_order_rows(telescope: Telescope, wavelength: float) -> list[tuple[str,
     stated = len(rows)
     with contextlib.suppress(DomainError):
         optics = first_order(telescope, wavelength)
-        detector = telescope.surfaces[-1].vertex[2]
+        axis = unfolded_axis(telescope)
+        detector = axis.heights[telescope.surfaces[-1].name]
         lens = [
             ("effective focal length", text(optics.focal_length)),
             ("focal ratio", f"f/{abs(optics.f_number):.6g}"),
@@ -112,12 +116,12 @@ def first_order_rows(telescope: Telescope, wavelength: float) -> list[tuple[str,
             ("plate scale", f"{abs(optics.plate_scale) / ARCSEC * unit:.6g} arcsec/{name}"),
         ]
         if math.isfinite(telescope.object_distance):
-            last = [s for s in telescope.surfaces if s.interaction in (Interaction.MIRROR, Interaction.REFRACT)][-1]
+            last = [s for s in axis.surfaces if not s.fold][-1]
             lens = [
                 ("effective focal length", text(optics.focal_length)),
                 ("magnification", f"{optics.magnification:.8g}"),
                 ("working focal ratio", f"f/{optics.working_f_number:.6g}"),
-                ("paraxial image", f"{text(abs(optics.image_z - last.vertex[2]))} from the last surface"),
+                ("paraxial image", f"{text(abs(optics.image_z - last.z))} from the last surface"),
             ]
         if telescope.design_data.afocal:
             lens = [("angular magnification", f"{optics.angular_magnification:.8g}")]
@@ -128,27 +132,39 @@ def first_order_rows(telescope: Telescope, wavelength: float) -> list[tuple[str,
             ("Petzval radius", text(_petzval_radius(telescope, wavelength))),
             ("effective area", f"{optics.effective_area / unit**2:.6g} {name}²"),
         ]
-    return rows if len(rows) > stated else [*rows, *_real_ray_rows(telescope, wavelength)]
+    return rows if len(rows) > stated else [*rows, *_parabasal_rows(telescope, wavelength)]
 
 
-def _real_ray_rows(telescope: Telescope, wavelength: float) -> list[tuple[str, str]]:
-    """Return focal lengths and focal ratios of real rays about the chief ray of the axis; none without a focus."""
+def _parabasal_rows(telescope: Telescope, wavelength: float) -> list[tuple[str, str]]:
+    """Return first-order data about the chief ray, in two planes, and focal ratios of real rays; none without a focus.
+
+    The ratios are what sets the diffraction limit.
+    """
     if math.isfinite(telescope.object_distance) or telescope.design_data.afocal:
         return []
     try:
+        optics = parabasal_optics(telescope, wavelength)
         rays = principal_rays(telescope, [(0.0, 0.0)], wavelength)
     except PachonError:
         return []
     name, unit = telescope.length_unit
-    lengths, ratios = 1.0 / rays.plate_scale[0], rays.f_number[0]
-    if not (np.isfinite(lengths).all() and np.isfinite(ratios).all()):
+    if not (np.isfinite(optics.focal_length).all() and np.isfinite(rays.f_number[0]).all()):
         return []
-    about = "of real rays about the chief ray of the axis, in the plane of y and z, and across it"
-    scales = ", ".join(f"{v / ARCSEC * unit:.6g}" for v in rays.plate_scale[0])
+
+    def both(pair: np.ndarray, size: float = unit, digits: int = 8) -> str:
+        return ", ".join(f"{v / size:.{digits}g}" if math.isfinite(v) else "at infinity" for v in pair)
+
+    about = "about the chief ray of the axis, in the plane of y and z, and across it"
     return [
-        ("effective focal lengths", f"{', '.join(f'{v / unit:.8g}' for v in lengths)} {name}, {about}"),
-        ("working focal ratios", ", ".join(f"f/{v:.6g}" for v in ratios)),
-        ("plate scales", f"{scales} arcsec/{name}"),
+        ("effective focal lengths", f"{both(optics.focal_length)} {name}, {about}"),
+        ("focal ratios", ", ".join(f"f/{v:.6g}" for v in optics.f_number)),
+        ("working focal ratios", ", ".join(f"f/{v:.6g}" for v in rays.f_number[0])),
+        ("plate scales", f"{both(optics.plate_scale, ARCSEC / unit, 6)} arcsec/{name}"),
+        ("foci", f"{both(optics.back_focus)} {name} behind the last mirror or lens surface"),
+        (
+            "exit pupils",
+            f"{both(optics.exit_pupil_distance)} {name} behind it, diameters {both(optics.exit_pupil_diameter)} {name}",
+        ),
     ]
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.errors import DomainError
+from ...core.errors import DomainError, PachonError
 from ...core.units import ARCSEC
 from ...models.aperture import Annulus, Circle, Complement
 from ...models.design_data import LENGTH_UNITS
@@ -19,9 +19,11 @@ from ...models.io.yaml.apertures import aperture_items
 from ...models.io.yaml.values import Turn, flow
 from ...models.io.yaml.writer import INTERACTION_NAMES
 from ...models.media.medium import ConstantIndex
+from ...models.parabasal import parabasal_optics
 from ...models.shapes.shape import Rotational
 from ...models.surface import Surface
 from ...models.telescope import Telescope
+from ...models.unfolding import axial_heights, unfolded_axis
 
 #: First-order properties, which only a centred telescope has.
 FIRST_ORDER_KEYS = (
@@ -41,10 +43,13 @@ FIRST_ORDER_KEYS = (
 def describe(telescope: Telescope) -> dict[str, Any]:
     """Return the lens table and the first-order properties of a telescope; keys end in their unit.
 
-    The first-order properties of a telescope whose surfaces do not share one axis, as built or folded, are None.
+    Of a telescope whose surfaces do not share one axis, as built or off-axis, the first-order properties are None, and
+    "parabasal" has those about the chief ray; of any other this is None.
     """
     first: dict[str, float | None] = dict.fromkeys(FIRST_ORDER_KEYS)
+    folds: list[str] = []
     with contextlib.suppress(DomainError):
+        folds = [s.name for s in unfolded_axis(telescope).surfaces if s.fold]
         optics = first_order(telescope)
         first = {
             "focal_length_m": optics.focal_length,
@@ -70,6 +75,8 @@ def describe(telescope: Telescope) -> dict[str, Any]:
         first = {key: value if value is None or math.isfinite(value) else None for key, value in first.items()}
     wavelength = telescope.default_wavelength
     low, high = telescope.band or telescope.wavelength_range
+    centred = any(value is not None for value in first.values())
+    heights = axial_heights(telescope)
     return {
         "name": telescope.name,
         "description": telescope.description,
@@ -78,6 +85,8 @@ def describe(telescope: Telescope) -> dict[str, Any]:
         "wavelength_nm": wavelength * 1e9,
         "band_nm": [low * 1e9, high * 1e9],
         **first,
+        "folds": folds,
+        "parabasal": None if centred else _parabasal(telescope),
         "pupil_diameter_m": telescope.pupil_diameter,
         "pupil_obscuration": telescope.pupil_obscuration,
         "effective_area_m2": 0.25 * math.pi * telescope.pupil_diameter**2 * (1.0 - telescope.pupil_obscuration**2),
@@ -90,13 +99,33 @@ def describe(telescope: Telescope) -> dict[str, Any]:
         "length_unit": telescope.length_unit[0],
         "design": asdict(telescope.design_data),
         "surfaces": [
-            _surface_entry(surface, following, wavelength)
-            for surface, following in zip_longest(telescope.surfaces, telescope.surfaces[1:])
+            _surface_entry(surface, heights[surface.name], None if name is None else heights[name], wavelength)
+            for surface, name in zip_longest(telescope.surfaces, telescope.surface_names[1:])
         ],
     }
 
 
-def _surface_entry(surface: Surface, following: Surface | None, wavelength: float) -> dict[str, Any]:
+def _parabasal(telescope: Telescope) -> dict[str, list[float | None]] | None:
+    """Return first-order properties about the chief ray, of two planes each; None where light stays parallel."""
+    try:
+        optics = parabasal_optics(telescope)
+    except PachonError:
+        return None
+    if not np.isfinite(optics.focal_length).all():
+        return None
+    pairs = {
+        "focal_length_m": optics.focal_length,
+        "f_number": optics.f_number,
+        "plate_scale_arcsec_per_um": optics.arcsec_per_um,
+        "back_focus_m": optics.back_focus,
+        "exit_pupil_distance_m": optics.exit_pupil_distance,
+        "exit_pupil_diameter_m": optics.exit_pupil_diameter,
+    }
+    return {key: [float(v) if math.isfinite(v) else None for v in pair] for key, pair in pairs.items()}
+
+
+def _surface_entry(surface: Surface, height: float, following: float | None, wavelength: float) -> dict[str, Any]:
+    """Return a row of the lens table; the heights [m] are those of the surface and the next on the unfolded axis."""
     shape, medium = surface.shape, surface.medium_after
     curvature = shape.curvature
     x, y, z = surface.vertex
@@ -110,8 +139,8 @@ def _surface_entry(surface: Surface, following: Surface | None, wavelength: floa
         "x_m": x,
         "y_m": y,
         "z_m": z,
-        # Along the light as it comes in: negative behind an odd number of mirrors, as in lens files.
-        "thickness_m": None if following is None else z - following.vertex[2],
+        # Along the light as it comes in: negative behind an odd number of mirrors, as in lens files, but for folds.
+        "thickness_m": None if following is None else height - following,
         "glass": "" if isinstance(medium, ConstantIndex) and medium.n == 1.0 else medium.name,
         "semi_diameter_m": surface.semi_diameter,
         "tilted": not np.array_equal(surface.matrix, np.eye(3)),
@@ -204,8 +233,10 @@ def figure_rows(description: dict[str, Any]) -> list[tuple[str, str]]:
             ("working focal ratio", f"f/{d['working_f_number']:.4f}"),
         ]
         image = [pupil, ("paraxial image", f"z = {length(d['image_z_m'])}")]
+    elif d["parabasal"] is not None:
+        lens, image = _parabasal_rows(d["parabasal"], unit, name), []
     elif d["focal_length_m"] is None:
-        why = "the surfaces do not share one axis, or there is no focus; pachon rays has those of real rays"
+        why = "the chief ray is lost, or there is no focus; pachon rays has those of real rays"
         lens, image = [("first-order figures", f"none: {why}")], []
     else:
         lens = [
@@ -223,9 +254,27 @@ def figure_rows(description: dict[str, Any]) -> list[tuple[str, str]]:
         ("collecting area", f"{d['effective_area_m2'] / unit**2:.6g} {name}²"),
         *image,
         ("field of view", f"radius {d['field_radius_deg']:g}°, model good to {d['field_limit_deg']:g}°"),
+        *([("heights", f"on the axis unfolded about {', '.join(d['folds'])}")] if d["folds"] else []),
         ("band", "{:g} to {:g} nm".format(*(round(w, 3) for w in d["band_nm"]))),
         ("camera", d["camera"] or "none"),
         *_stated_rows(d["design"], unit, name),
+    ]
+
+
+def _parabasal_rows(pairs: dict[str, list[float | None]], unit: float, name: str) -> list[tuple[str, str]]:
+    """Return first-order properties about the chief ray as text."""
+
+    def both(key: str, size: float = 1.0, digits: int = 7, prefix: str = "") -> str:
+        return ", ".join("at infinity" if v is None else f"{prefix}{v / size:.{digits}g}" for v in pairs[key])
+
+    return [
+        ("about the chief ray", "in the plane of y and z, and across it"),
+        ("focal lengths", f"{both('focal_length_m', unit)} {name}"),
+        ("focal ratios", both("f_number", digits=5, prefix="f/")),
+        ("plate scales", f'{both("plate_scale_arcsec_per_um", digits=6)} "/µm'),
+        ("foci", f"{both('back_focus_m', unit)} {name} behind the last mirror or lens surface"),
+        ("exit pupils", f"{both('exit_pupil_distance_m', unit)} {name} behind it"),
+        ("their diameters", f"{both('exit_pupil_diameter_m', unit)} {name}"),
     ]
 
 

@@ -217,12 +217,12 @@ def backward_loop(special: bool) -> wp.Function:
     return backward_through
 
 
-#: The loop for plain telescopes, and that for any.
-BACKWARD_LOOPS = (backward_loop(False), backward_loop(True))
+#: The loops of the variants of `kernel_pair`: rays that go back have no crossings to choose between.
+BACKWARD_LOOPS = (backward_loop(False), *[backward_loop(True)] * 2)
 
 
 @kernel_pair
-def backward_rays(special: bool, module: wp.Module) -> wp.Kernel:
+def backward_rays(special: int, module: wp.Module) -> wp.Kernel:
     """Return the kernel of the backward pass."""
     backward_through = BACKWARD_LOOPS[special]
 

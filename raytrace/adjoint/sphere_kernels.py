@@ -24,7 +24,7 @@ SPHERE_COLUMNS = 4
 
 
 @kernel_pair
-def sphere_paths(special: bool, module: wp.Module) -> wp.Kernel:
+def sphere_paths(special: int, module: wp.Module) -> wp.Kernel:
     """Return the kernel of both passes."""
     through_telescope = LOOPS[special]
     backward_through = BACKWARD_LOOPS[special]

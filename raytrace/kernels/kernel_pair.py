@@ -1,4 +1,4 @@
-"""Kernels in two variants, for plain telescopes and for any."""
+"""Kernels in variants: for plain telescopes, for any, and for any whose apertures choose between crossings."""
 
 from __future__ import annotations
 
@@ -13,24 +13,29 @@ from ...core.launch import FORWARD_OPTIONS
 
 @dataclass(frozen=True)
 class KernelPair:
-    """A kernel in two variants of one source, for plain telescopes and for any, each compiled at its first use.
+    """A kernel in variants of one source, for plain telescopes and for any, each compiled at its first use.
 
-    Code that a plain telescope does not need slows the loop over its surfaces even where it does not run.
+    Code that a plain telescope does not need slows the loop over its surfaces even where it does not run; so does, in
+    any telescope, the choice between two crossings by the aperture, which has a variant of its own.
     """
 
     plain: wp.Kernel
     special: wp.Kernel
+    choosing: wp.Kernel
 
     def variant_for(self, surfaces: Any) -> wp.Kernel:
         """Return the variant for a telescope's ``PackedSurfaces``."""
-        return self.special if surfaces.special else self.plain
+        return (self.plain, self.special, self.choosing)[surfaces.special]
 
 
-def kernel_pair(make: Callable[[bool, wp.Module], wp.Kernel]) -> KernelPair:
-    """Return both variants of the kernel that ``make(special, module)`` defines in a module."""
+def kernel_pair(make: Callable[[int, wp.Module], wp.Kernel]) -> KernelPair:
+    """Return the variants of the kernel that ``make(special, module)`` defines in a module.
+
+    ``special`` is 0 for plain telescopes, 1 for any, 2 for any with a choice between crossings.
+    """
     variants = []
-    for special in (False, True):
-        module = wp.get_module(f"{make.__module__}_{'special' if special else 'plain'}")
+    for special, name in enumerate(("plain", "special", "choosing")):
+        module = wp.get_module(f"{make.__module__}_{name}")
         wp.set_module_options(FORWARD_OPTIONS, module=module)
         variants.append(make(special, module))
     return KernelPair(*variants)

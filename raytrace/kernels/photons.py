@@ -14,7 +14,7 @@ wp.set_module_options(FORWARD_OPTIONS)
 
 
 @kernel_pair
-def trace_photons(special: bool, module: wp.Module) -> wp.Kernel:
+def trace_photons(special: int, module: wp.Module) -> wp.Kernel:
     """Return the kernel that traces photons."""
     through_telescope = CHROMATIC_LOOPS[special]
 

@@ -76,6 +76,34 @@ def conic_distance(
 
 
 @wp.func
+def second_conic_distance(
+    c: wp.float64,
+    k: wp.float64,
+    sign_change: wp.float64,
+    x: lanes,
+    y: lanes,
+    z: lanes,
+    u: lanes,
+    v: lanes,
+    w: lanes,
+):
+    """Distance along each ray to the crossing that :func:`conic_distance` does not return; NaN or infinite if none."""
+    a = c * (lanes(ONE) + k * wp.cw_mul(w, w))
+    b = w - c * (wp.cw_mul(x, u) + wp.cw_mul(y, v) + (ONE + k) * wp.cw_mul(z, w))
+    e = c * (wp.cw_mul(x, x) + wp.cw_mul(y, y) + (ONE + k) * wp.cw_mul(z, z)) - TWO * z
+    r = lanes_sqrt(wp.cw_mul(b, b) - wp.cw_mul(a, e))
+    top = lanes()
+    bottom = lanes()
+    for i in range(LANES):
+        # The root of the other sign, in the form that does not cancel.
+        signed = wp.where(w[i] < sign_change, r[i], -r[i])
+        same = wp.where(w[i] < sign_change, b[i], -b[i]) >= ZERO
+        top[i] = wp.where(same, e[i], b[i] - signed)
+        bottom[i] = wp.where(same, b[i] + signed, a[i])
+    return wp.cw_div(top, bottom)
+
+
+@wp.func
 def polynomial(coefficients: wp.array2d(dtype=wp.float64), surface: wp.int32, terms: wp.int32, r2: lanes):
     """Aspheric part of the sag, a_4 r^4 + a_6 r^6 + ... [m], and its slope divided by r [1/m]."""
     value = lanes(ZERO)
@@ -104,12 +132,15 @@ def aspheric_distance(
     w: lanes,
     start: lanes,
 ):
-    """Distance to the asphere by Newton's method from ``start``, and which lanes did not converge.
+    """Distance to the asphere by Newton's method from ``start`` or the vertex plane, and which lanes did not converge.
 
     With b = z - (a_4 r^4 + ...), what is left must lie on the conic, G = c (r^2 + (1 + k) b^2) - 2 b = 0: the
     implicit form takes neither a root nor a division per evaluation.
     """
-    t = start
+    t = wp.cw_div(-z, w)
+    for i in range(LANES):
+        # Where the ray misses the conic it starts from the vertex plane: the asphere may bend away from the conic.
+        t[i] = wp.where(wp.abs(start[i]) < FAR, start[i], t[i])
     running = lanes(ONE)
     busy = wp.float64(1.0)
     steps = int(0)

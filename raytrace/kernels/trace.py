@@ -1,6 +1,6 @@
 """The kernel that traces packets of rays through a telescope.
 
-It has two variants (`kernel_pair`): code for rare kinds of surfaces slows the loop by a seventh even where no surface
+It has variants (`kernel_pair`): code for rare kinds of surfaces slows the loop by a seventh even where no surface
 is of that kind, because it takes registers and prevents the compiler from inlining functions.
 """
 
@@ -16,7 +16,7 @@ from .kernel_pair import kernel_pair
 from .mesh import PackedMeshes, mesh_distance
 from .obstruction import PackedObstructions, obstructed_status
 from .packet import LANES, RayPackets, components, lane_flags, lanes
-from .shape import PackedDeformations, deformed_distance, through_screen
+from .shape import NAN, PackedDeformations, deformed_distance, through_screen
 from .surface import (
     FAR,
     MISSED,
@@ -31,6 +31,7 @@ from .surface import (
     polynomial,
     reflected,
     refracted,
+    second_conic_distance,
 )
 
 wp.set_module_options(FORWARD_OPTIONS)
@@ -41,9 +42,11 @@ PHASE = wp.constant(4)
 
 
 # Columns of the table of numbers, a row per surface: curvature [1/m], conic constant, vertex [m] (3), rotation (9,
-# row by row), clear aperture: centre x, y, inner and outer radius [m]; the curvature of the conic that the search for a
-# landing starts from, another one where the surface has no conic of its own; the direction cosine w, 0 or close to it,
-# at which rays change from one intersection with that conic to the other.
+# row by row), clear aperture: centre x, y, inner and outer radius [m] (0 of one that is neither disc nor ring, but an
+# outer radius of FAR where it is unbounded); the curvature of the conic that the search for a landing starts from,
+# another one where the surface has no conic of its own; the direction cosine w, 0 or close to it, at which rays change
+# from one intersection with that conic to the other; the largest cosine, of either sign, at which both may lie on the
+# sheet within the rim.
 CURVATURE = wp.constant(0)
 CONIC = wp.constant(1)
 VERTEX = wp.constant(2)
@@ -51,10 +54,12 @@ ROTATION = wp.constant(5)
 APERTURE = wp.constant(14)
 FIRST_CURVATURE = wp.constant(18)
 SIGN_CHANGE = wp.constant(19)
-NUMBERS = 20
+TWO_CROSSINGS = wp.constant(20)
+NUMBERS = 21
 # Columns of the table of kinds: interaction, number of aspheric coefficients, whether rotated, whether stopped down
 # (0 no, 1 by a disc or ring, 2 by another aperture), whether obstructions lie on the way to it, whether its shape has
-# parts besides the conic and its even powers (1) or is a mesh (2), which of the distinct media lies before and after.
+# parts besides the conic and its even powers (1) or is a mesh (2), which of the distinct media lies before and after,
+# whether its aperture says which of two crossings is meant (1), and of a conic at grazing incidence (2).
 INTERACTION = wp.constant(0)
 TERMS = wp.constant(1)
 ROTATED = wp.constant(2)
@@ -63,14 +68,19 @@ OBSTRUCTED = wp.constant(4)
 DEFORMED = wp.constant(5)
 MEDIUM_BEFORE = wp.constant(6)
 MEDIUM_AFTER = wp.constant(7)
-KINDS = 8
+CHOSEN = wp.constant(8)
+KINDS = 9
+
+#: A ray meets a crossing farther ahead than this [m]: above the rounding of places, below any thickness.
+AHEAD = wp.constant(wp.float64(1.0e-9))
 
 
 @wp.struct
 class PackedSurfaces:
     """A telescope as tables, a row per surface; see :mod:`pachon.raytrace.pack.surfaces`.
 
-    ``special`` is 1 where the loop over its surfaces needs more than the plain one has.
+    ``special`` is 1 where the loop over its surfaces needs more than the plain one has, 2 where apertures choose
+    between crossings.
     """
 
     special: wp.int32
@@ -134,8 +144,110 @@ def statuses(status: lanes):
     return out
 
 
-def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
-    """Return the loop over the surfaces of a telescope, for plain telescopes or for any.
+@wp.func
+def reaches_twice(w: lanes, limit: wp.float64):
+    """Whether the direction cosine of a lane is within a limit."""
+    count = wp.int32(0)
+    for i in range(LANES):
+        count += wp.where(wp.abs(w[i]) <= limit, 1, 0)
+    return count > 0
+
+
+@wp.func
+def landing(
+    surfaces: PackedSurfaces,
+    s: wp.int32,
+    x: lanes,
+    y: lanes,
+    z: lanes,
+    u: lanes,
+    v: lanes,
+    w: lanes,
+    start: lanes,
+):
+    """Distance to surface ``s`` by the search from ``start``, and the rank of the crossing there.
+
+    The rank is 2 within the aperture, 1 in the hole of a ring, 0 beside it, and -1 where the conic has its other sheet,
+    or no crossing is.
+    """
+    c = surfaces.numbers[s, CURVATURE]
+    k = surfaces.numbers[s, CONIC]
+    terms = surfaces.kinds[s, TERMS]
+    t = start
+    sag = lanes(ZERO)
+    if surfaces.kinds[s, DEFORMED] == 1:
+        t, sag, _sag_x, _sag_y, _running = deformed_distance(
+            surfaces.deformations, c, k, surfaces.coefficients, s, terms, x, y, z, u, v, w, start, 0
+        )
+    elif terms > 0:
+        t, _running = aspheric_distance(c, k, surfaces.coefficients, s, terms, x, y, z, u, v, w, start)
+    px = x + wp.cw_mul(t, u)
+    py = y + wp.cw_mul(t, v)
+    b = z + wp.cw_mul(t, w) - sag
+    if terms > 0:
+        even, _slope = polynomial(surfaces.coefficients, s, terms, wp.cw_mul(px, px) + wp.cw_mul(py, py))
+        b = b - even
+    ax = px - lanes(surfaces.numbers[s, APERTURE])
+    ay = py - lanes(surfaces.numbers[s, APERTURE + 1])
+    a2 = wp.cw_mul(ax, ax) + wp.cw_mul(ay, ay)
+    inner = surfaces.numbers[s, APERTURE + 2]
+    outer = surfaces.numbers[s, APERTURE + 3]
+    status = lanes(OK)
+    if surfaces.kinds[s, STOPPED] == 2:
+        status = through_aperture(surfaces.apertures, s, px, py, status)
+    rank = lanes(ZERO)
+    for i in range(LANES):
+        within = wp.where(a2[i] < outer * outer, ONE, ZERO)
+        rank[i] = within + wp.where(a2[i] >= inner * inner, within, ZERO)
+        if surfaces.kinds[s, STOPPED] == 2:
+            rank[i] = wp.where(status[i] == OK, wp.float64(2.0), ZERO)
+        # A NaN fails the comparison.
+        rank[i] = wp.where(ONE - (ONE + k) * c * b[i] > ZERO, rank[i], -ONE)
+    return t, rank
+
+
+@wp.func
+def start_by_aperture(
+    surfaces: PackedSurfaces,
+    s: wp.int32,
+    x: lanes,
+    y: lanes,
+    z: lanes,
+    u: lanes,
+    v: lanes,
+    w: lanes,
+    start: lanes,
+):
+    """Distance to that crossing of the first conic which the aperture of surface ``s`` means; NaN where none is on it.
+
+    Of two crossings within a rim, one of them behind the ray, it is the one ahead, and about the axis without regard to
+    the rim: a ray that leaves through the opening of a reflector does not come back. Else it is that of the higher
+    rank; else ``start``, the one by the sign of w.
+    """
+    first_curvature = surfaces.numbers[s, FIRST_CURVATURE]
+    second_start = second_conic_distance(
+        first_curvature, surfaces.numbers[s, CONIC], surfaces.numbers[s, SIGN_CHANGE], x, y, z, u, v, w
+    )
+    distance, rank = landing(surfaces, s, x, y, z, u, v, w, start)
+    second_distance, second_rank = landing(surfaces, s, x, y, z, u, v, w, second_start)
+    centred = surfaces.kinds[s, STOPPED] == 1
+    if surfaces.numbers[s, APERTURE] != ZERO or surfaces.numbers[s, APERTURE + 1] != ZERO:
+        centred = False
+    least = wp.where(centred, ZERO, ONE)
+    t = lanes()
+    for i in range(LANES):
+        better = wp.where(second_rank[i] > rank[i], ONE, ZERO)
+        ahead = wp.where(distance[i] > AHEAD, ONE, ZERO)
+        second_ahead = wp.where(second_distance[i] > AHEAD, ONE, ZERO)
+        alike = wp.min(rank[i], second_rank[i]) >= least and surfaces.numbers[s, APERTURE + 3] < FAR
+        better = wp.where(alike and ahead != second_ahead, second_ahead, better)
+        t[i] = wp.where(better > ZERO, second_start[i], start[i])
+        t[i] = wp.where(wp.max(rank[i], second_rank[i]) < ZERO, NAN, t[i])
+    return t
+
+
+def surface_loop(special: int, chromatic: bool = False) -> wp.Function:
+    """Return the loop over the surfaces of a telescope: plain (0), any (1), any with a choice of crossings (2).
 
     Plain telescopes have conics with even powers, discs and rings as apertures, no phase screens, no obstructions.
     The ``indices`` are a row of numbers, before the first surface and after each; in a chromatic loop, where every ray
@@ -182,6 +294,13 @@ def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
             terms = surfaces.kinds[s, TERMS]
             first_curvature = surfaces.numbers[s, FIRST_CURVATURE]
             t = conic_distance(first_curvature, k, surfaces.numbers[s, SIGN_CHANGE], x, y, z, u, v, w)
+            if wp.static(special == 2):
+                if surfaces.kinds[s, CHOSEN] > 0:
+                    if reaches_twice(w, surfaces.numbers[s, TWO_CROSSINGS]):
+                        t = start_by_aperture(surfaces, s, x, y, z, u, v, w, t)
+                    if surfaces.kinds[s, CHOSEN] == 2:
+                        # At grazing incidence the closed form has lost digits, which a step of Newton's method finds.
+                        t, _running = aspheric_distance(c, k, surfaces.coefficients, s, 0, x, y, z, u, v, w, t)
             if terms > 0:
                 t, running = aspheric_distance(c, k, surfaces.coefficients, s, terms, x, y, z, u, v, w, t)
                 for i in range(LANES):
@@ -254,6 +373,12 @@ def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
                         nx = -wp.cw_mul(radial, x) - wp.cw_mul(sag_x, lanes(ONE) - ((ONE + k) * c) * b)
                         ny = -wp.cw_mul(radial, y) - wp.cw_mul(sag_y, lanes(ONE) - ((ONE + k) * c) * b)
                 nz = lanes(ONE) - ((ONE + k) * c) * b
+                for i in range(LANES):
+                    # The other sheet of a hyperboloid, or the half of an ellipsoid beyond its equator, is no surface.
+                    status[i] = wp.where(nz[i] > ZERO, status[i], wp.where(status[i] <= VIGNETTED, MISSED, status[i]))
+                    x[i] = wp.where(nz[i] > ZERO, x[i], NAN)
+                    y[i] = wp.where(nz[i] > ZERO, y[i], NAN)
+                    z[i] = wp.where(nz[i] > ZERO, z[i], NAN)
                 if interaction == MIRROR:
                     u, v, w = reflected(u, v, w, nx, ny, nz)
                 else:
@@ -301,13 +426,13 @@ def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
     return through_telescope
 
 
-#: The loop for plain telescopes, and that for any; the same for rays of a wavelength each.
-LOOPS = (surface_loop(False), surface_loop(True))
-CHROMATIC_LOOPS = (surface_loop(False, chromatic=True), surface_loop(True, chromatic=True))
+#: The loops of the variants of `kernel_pair`; the same for rays of a wavelength each.
+LOOPS = (surface_loop(0), surface_loop(1), surface_loop(2))
+CHROMATIC_LOOPS = tuple(surface_loop(special, chromatic=True) for special in range(3))
 
 
 @kernel_pair
-def trace_rays(special: bool, module: wp.Module) -> wp.Kernel:
+def trace_rays(special: int, module: wp.Module) -> wp.Kernel:
     """Return the kernel that traces given rays."""
     through_telescope = LOOPS[special]
 

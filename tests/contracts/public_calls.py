@@ -314,6 +314,7 @@ def calls(folder):
         "validate_file": (pachon.validate_file, {"path": m.folder / "none.yaml"}),
         "file_schema": (pachon.file_schema, {"kind": "site"}),
         "first_order": (pachon.first_order, {"telescope": tel, "wavelength": w}),
+        "parabasal_optics": (pachon.parabasal_optics, {"telescope": tel, "wavelength": w}),
         "with_floating_pupil": (pachon.with_floating_pupil, {"telescope": m.floating}),
         "seidel_sums": (pachon.seidel_sums, {"telescope": tel, "wavelength": w, "field": 0.01}),
         "corner_sensors": (pachon.corner_sensors, {"name": "lsstcam"}),

@@ -95,9 +95,13 @@ def test_a_page_without_most_sections(folded, monkeypatch):
     assert steps == [1] * 4
     check(page)
     assert "axis tilted by 45°" in page
+    # A flat costs neither first-order data nor Seidel sums.
+    assert re.search(r"effective focal length.*2000 mm", page, re.DOTALL)
+    assert page.count("<img") == 3
+    off_axis = replace(folded, surfaces=(folded.surfaces[0].moved(shift=(0.1, 0.0, 0.0)), *folded.surfaces[1:]))
     # Seidel sums need a common axis: the report says so.
-    assert re.search(r"Seidel diagram: surface flat of paraboloid: expected one on the axis", page)
-    assert page.count("<img") == 2
+    page = pachon.design_report(off_axis, [(0.0, 0.0)])
+    assert re.search(r"Seidel diagram: surface \w+ of paraboloid: expected one on the axis", page)
 
 
 @pytest.mark.long

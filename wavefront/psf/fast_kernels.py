@@ -45,7 +45,7 @@ def scheduled_channel(channel: wp.array3d(dtype=wp.int32), wave: wp.int32, t: wp
 
 
 @kernel_pair
-def deposit_rays(special: bool, module: wp.Module) -> wp.Kernel:
+def deposit_rays(special: int, module: wp.Module) -> wp.Kernel:
     """Return the kernel that deposits rays; the special one is that of wavelengths with several channels."""
     channel_of = scheduled_channel if special else single_channel
 
