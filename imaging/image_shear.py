@@ -11,6 +11,7 @@ from ..measure.catalogue.objects import DetectedObjects
 from ..measure.shear.detection import cell_middles, detect_shear
 from ..measure.shear.shear_shapes import ShearShapes
 from .image_file import CcdImage
+from .image_stars import sky_variance
 
 #: PSFs [n, m, m] at pixels (x, y) of an image, [n, 2].
 PsfsAt = Callable[[np.ndarray], np.ndarray]
@@ -42,8 +43,7 @@ def object_shears(
     """
     places = cell_middles(image.image.shape)
     good = (image.mask == 0) & (image.variance > 0.0)
-    # Of the sky: half of the pixels have hardly any light of objects.
-    noise = float(np.sqrt(np.median(image.variance[good]))) if good.any() else float("nan")
+    noise = float(np.sqrt(sky_variance(image)))
     peaks = detect_shear(
         image.image - objects.background,
         psfs_at(places),

@@ -140,9 +140,9 @@ def _wrapped(psf_images: np.ndarray, side: int) -> np.ndarray:
 
 
 def noise_covariance(
-    weights: np.ndarray, inverse: np.ndarray, noise: np.ndarray, frequencies: Frequencies
+    weights: np.ndarray, inverse: np.ndarray, noise_power: np.ndarray, frequencies: Frequencies
 ) -> np.ndarray:
-    """Return the covariance of functionals under white noise, [n, m, m].
+    """Return the covariance of functionals under noise of a power spectrum, [n, m, m].
 
     Parameters
     ----------
@@ -150,13 +150,13 @@ def noise_covariance(
         Transforms of the weights.
     inverse : ndarray of complex, shape [n, ny, nx]
         Inverse transforms of PSFs.
-    noise : ndarray, shape [n]
-        rms of a pixel under each of the PSFs.
+    noise_power : ndarray, shape [n, ny, nx] or [n, 1, 1]
+        Power of the noise under each of the PSFs: of white noise the variance of a pixel.
     frequencies : Frequencies
         Those of the transforms.
     """
     products = (weights[:, None] * np.conj(weights[None])).real * frequencies.multiplicity
-    power = np.abs(inverse) ** 2 * (noise[:, None, None] / frequencies.side) ** 2
+    power = np.abs(inverse) ** 2 * noise_power / frequencies.side**2
     return np.einsum("nyx,ijyx->nij", power, products)
 
 

@@ -23,9 +23,9 @@ from ....measure.catalogue.fit_galaxies import fit_galaxies
 from ....measure.catalogue.galaxy_fits import usable_galaxies
 from ....measure.catalogue.matching import match_positions
 from ....measure.catalogue.star_locus import LocusSearch, StarSelection, select_stars
-from ....measure.shapes import measure_shapes
+from ....measure.shapes import half_light_radii, measure_shapes
 from ....measure.shear.detection import detect_shear
-from ....measure.shear.weight import half_light_radii, weight_sigma
+from ....measure.shear.weight import weight_sigma
 from ..galaxy_shapes import SHEAR_MIN_SNR, GalaxyShapes, measure_galaxies
 from ..null_result import NullTest, null_metrics
 from ..null_test import FAINTEST_SNR, REACH, write_pictures, write_shapes
