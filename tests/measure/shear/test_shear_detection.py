@@ -73,7 +73,8 @@ def test_the_covariance_of_the_noise_of_pixels_is_that_of_drawn_noise(psfs):
     drawn = np.cov(values.T)
     frequencies, inverse = detection.psf_frequencies(psfs[:1], 64, 2.6)
     weights = detection._peak_transforms(frequencies, 2.6)
-    covariance = detection.noise_covariance(weights, inverse, np.ones((1, 1, 1)), frequencies)[0]
+    white = np.ones((1, 1, 1))
+    covariance = detection.noise_covariance(weights, inverse, white, frequencies)[0]
     scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
     np.testing.assert_allclose(drawn / scale, covariance / scale, atol=5.0 * np.sqrt(2.0 / len(values)))
     # Of an image rotated by 90 degrees, under the PSF rotated.
