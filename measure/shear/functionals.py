@@ -109,7 +109,7 @@ def psf_frequencies(psf_images: np.ndarray, side: int, sigma: float) -> tuple[Fr
         If a PSF amplifies noise beyond reason: it is too wide for the weight.
     """
     full = Frequencies(side, (side - 1) // 2)
-    transforms = full.of(_wrapped(psf_images, side))
+    transforms = psf_transforms(full, psf_images)
     k = np.hypot(full.kx, full.ky)
     with np.errstate(divide="ignore"):
         amplitude = np.exp(-0.5 * (sigma * k) ** 2) / np.abs(transforms)
@@ -128,6 +128,11 @@ def psf_frequencies(psf_images: np.ndarray, side: int, sigma: float) -> tuple[Fr
     cut = np.s_[:, full.most - most : full.most + most + 1, : most + 1]
     inverse = np.where(inside, 1.0 / np.where(inside, transforms, 1.0), 0.0)
     return Frequencies(side, most), inverse[cut]
+
+
+def psf_transforms(frequencies: Frequencies, psf_images: np.ndarray) -> np.ndarray:
+    """Return the transforms of PSFs [n, m, m], m odd, about their middle pixel, [n, ny, nx]."""
+    return frequencies.of(_wrapped(psf_images, frequencies.side))
 
 
 def _wrapped(psf_images: np.ndarray, side: int) -> np.ndarray:

@@ -28,6 +28,7 @@ from .config import STACK_STAMP, load_visits_configuration
 from .galaxy_shapes import GalaxyShapes, measure_galaxies
 from .null_result import AdditiveBias, NullTest, ShearBiases, null_metrics, shear_bias
 from .plots import density_picture, null_test_picture
+from .psf_errors import PsfAtGalaxies, PsfErrorResponse
 from .psf_visit import StackFrame, stack_limit
 from .stack import PsfStack
 from .visits import cell_of, pixel_scale_of, stack_path
@@ -117,15 +118,16 @@ def null_test(
         if (n := sum(int(shapes.usable_twice.sum()) for shapes in parts)) < 2:
             text = f"{n} of {sum(map(len, parts))} galaxies to magnitude {faintest:.2f} are usable in {visits} visits"
             raise DomainError(f"{folder}: {text}; expected two or more, of the galaxies of {CONFIG_NAME}")
-        ring_count = len(depth.ring_galaxies(covered_tiles, rings))
-        biases = ShearBiases(
-            _calibration(frame.matrix, ring_count, measured_rings),
-            _shear_calibration(frame.matrix, ring_count, measured_rings),
-            AdditiveBias.of(stack, parts),
-        )
+        ring_galaxies = depth.ring_galaxies(covered_tiles, rings)
         with execution.reporter.stage(f"correlations in {visits} visits"):
+            psfs = PsfAtGalaxies.of(stack, GalaxyShapes.joined(parts), depth.psf_error_response(ring_galaxies))
+            biases = ShearBiases(
+                _calibration(frame.matrix, len(ring_galaxies), measured_rings),
+                _shear_calibration(frame.matrix, len(ring_galaxies), measured_rings),
+                AdditiveBias.of(psfs, parts),
+            )
             area = len(covered_tiles) * (cell / ARCMIN) ** 2
-            tests[visits] = NullTest.of(visits, parts, area, biases)
+            tests[visits] = NullTest.of(visits, parts, area, biases, psfs)
     write_json(folder / "null_test.json", {"stacks": {str(n): null_metrics(r) for n, r in tests.items()}})
     write_pictures(folder, tests)
     return tests
@@ -185,6 +187,14 @@ class _StackMeasurement:
         kind: Any = type(parts[0])
         galaxies = kind.concatenate(parts)
         return galaxies.take(np.arange(min(rings, len(galaxies))))
+
+    def psf_error_response(self, galaxies: Galaxies | PlantedGalaxies) -> PsfErrorResponse:
+        """Return the response of the shear of galaxies, of all orientations of the rings, to errors of the PSF."""
+        kind: Any = type(galaxies)
+        rings = kind.concatenate([galaxies.rotated(np.pi * k / _ORIENTATIONS) for k in range(_ORIENTATIONS)])
+        return PsfErrorResponse.of(
+            self.stack, rings, self.axes, self.exposure, self.seed, "PSF errors", self.stack.visits
+        )
 
     def _job(self, galaxies: Any, key: tuple[str | int, ...]) -> dict[str, Any]:
         at = np.stack([galaxies.xi, galaxies.eta], axis=1) @ self.axes.T * self.exposure.pixel_scale
