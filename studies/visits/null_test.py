@@ -191,7 +191,7 @@ class _StackMeasurement:
         return galaxies.take(np.arange(min(count, len(galaxies))))
 
     def psf_error_response(self, tiles: list[tuple[int, int]]) -> PsfErrorResponse:
-        """Return the response of the shear of galaxies of tiles, each with itself at 90 degrees, to errors of the PSF."""
+        """Return the response of the shear of galaxies, each beside itself at 90 degrees, to errors of the PSF."""
         galaxies = self.first_galaxies(tiles, _RESPONSE_GALAXIES)
         kind: Any = type(galaxies)
         pairs = kind.concatenate([galaxies, galaxies.rotated(0.5 * np.pi)])
