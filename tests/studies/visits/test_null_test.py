@@ -180,6 +180,8 @@ def test_the_null_test_of_a_folder(tested):
             assert abs(metrics[name]) < 4.0 * metrics[f"{name}_error"] < 0.2
         assert metrics["shear_galaxies"] > 10
         assert 0.1 < metrics["shear_beta_expected"] < 2.0
+        # What galaxies have of the errors of the models is what these leave to first order.
+        assert metrics["shear_agreement"] == pytest.approx(1.0, abs=0.1 + 3.0 * metrics["shear_agreement_error"])
         assert 0.15 < metrics["rms_shear_component"] < 0.6
     assert results[2].density > results[1].density
     assert (folder / "null_test.png").read_bytes().startswith(b"\x89PNG")
