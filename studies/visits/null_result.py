@@ -194,7 +194,8 @@ class NullTest:
         if psfs is not None:
             # At the galaxies that the difference has.
             measured = np.where(np.isfinite(shears["difference"]), 1.0, np.nan)
-            shears |= {"expected": measured * psfs.expected_shear, "psf_error": measured * (psfs.true - psfs.model)}
+            of_psfs = {"expected": measured * psfs.expected_shear, "psf_error": measured * (psfs.true - psfs.model)}
+            shears |= {kind: g for kind, g in of_psfs.items() if np.isfinite(g).sum() > 1}
         shear_kinds = {kind: (g.real, g.imag, np.isfinite(g)) for kind, g in shears.items()}
         tile = np.repeat(np.arange(len(parts)), [len(tile_galaxies) for tile_galaxies in parts])
         correlated = correlations(galaxies.x, galaxies.y, kinds, tile)

@@ -32,11 +32,9 @@ from ...measure.shear.functionals import (
 )
 from ...measure.shear.shear_shapes import shear_of_sums
 from ...measure.shear.weight import weight_sigma
-from .galaxy_shapes import SHEAR_MIN_SNR, GalaxyShapes
+from .galaxy_shapes import SHEAR_MIN_SNR, GalaxyShapes, stamp_sides
 from .stack import PsfStack
 
-#: Pixels of a side of the grid of the transforms: of stamps that hold large galaxies.
-_SIDE = 64
 #: Galaxies, or PSFs, whose transforms are in memory at a time.
 _BLOCK = 512
 #: Steps of the functionals for derivatives of the ellipticity, in standard errors: it is smooth over several.
@@ -51,11 +49,14 @@ class PsfErrorResponse:
     ----------
     sigma : float
         rms width of the weight [pixel].
+    side : int
+        Pixels of a side of the grid of the frequencies.
     kernel : ndarray of complex, shape [2, ny, nx]
         Change of g1 and g2 by P/Q - 1 at each frequency, of those of all pixels of the grid.
     """
 
     sigma: float
+    side: int
     kernel: np.ndarray
 
     @classmethod
@@ -79,16 +80,16 @@ class PsfErrorResponse:
         """
         true = stack.true[~stack.star].astype(np.float64)
         sigma = weight_sigma(None, true, exposure.pixel_scale) / exposure.pixel_scale
-        mean_psf = true.mean(axis=0)
+        mean_psf, side = true.mean(axis=0), stamp_sides(sigma)[1]
         estimator = ShearEstimator(
             mean_psf / mean_psf.sum(),
             exposure.pixel_scale,
             exposure.noise_rms,
             sigma=sigma * exposure.pixel_scale,
-            side=_SIDE,
+            side=side,
         )
-        frequencies = Frequencies(_SIDE, (_SIDE - 1) // 2)
-        weights = weight_transforms(frequencies, sigma) * frequencies.multiplicity / _SIDE**2
+        frequencies = Frequencies(side, (side - 1) // 2)
+        weights = weight_transforms(frequencies, sigma) * frequencies.multiplicity / side**2
         error = np.sqrt(np.diag(estimator.covariance[0]))
         noise_factor = np.linalg.cholesky(estimator.covariance[0] / np.outer(error, error)) * error[:, None]
         kernel, sums = np.zeros((2, *weights.shape[1:]), dtype=np.complex128), np.zeros(5)
@@ -116,13 +117,7 @@ class PsfErrorResponse:
                 step[j] = _STEP * error[j]
                 slopes = (shapes_at(moments + step) - shapes_at(moments - step))[:, :2] / (2.0 * step[j])
                 kernel += np.einsum("ni,nyx->iyx", slopes, spectra) * weights[j]
-        # Sums of the change of e1 and e2 at every frequency, over the sums of the responses.
-        e_changes = np.moveaxis(kernel, 0, -1)
-        responses = np.broadcast_to(sums[2:], (*e_changes.shape[:2], 3))
-        shears = [
-            shear_of_sums(np.concatenate([part, responses], axis=-1)) for part in (e_changes.real, e_changes.imag)
-        ]
-        return cls(sigma, np.moveaxis(shears[0] + 1j * shears[1], -1, 0))
+        return cls(sigma, side, _shear_changes(kernel, sums))
 
     def shears(self, true: np.ndarray, model: np.ndarray) -> np.ndarray:
         """Return the mean shear of galaxies with a true PSF, measured with a model, g1 + i g2 [n].
@@ -133,10 +128,10 @@ class PsfErrorResponse:
             PSFs of unit sum.
         """
         shears = np.zeros(len(true), dtype=np.complex128)
-        middle = (_SIDE - 1) // 2
+        middle = (self.side - 1) // 2
         for first in range(0, len(true), _BLOCK):
             block = slice(first, first + _BLOCK)
-            frequencies, inverse = psf_frequencies(model[block].astype(np.float64), _SIDE, self.sigma)
+            frequencies, inverse = psf_frequencies(model[block].astype(np.float64), self.side, self.sigma)
             transforms = psf_transforms(frequencies, true[block].astype(np.float64))
             errors = np.where(inverse == 0.0, 0.0, transforms * inverse - 1.0)
             most = frequencies.most
@@ -144,6 +139,16 @@ class PsfErrorResponse:
             g1, g2 = np.einsum("nyx,iyx->in", errors, kernel).real
             shears[block] = g1 + 1j * g2
         return shears
+
+
+def _shear_changes(e_changes: np.ndarray, sums: np.ndarray) -> np.ndarray:
+    """Return changes of g1 and g2 of those of e1 and e2, complex [2, ny, nx], and sums of e1, e2, r11, r12, r22."""
+    by_frequency = np.moveaxis(e_changes, 0, -1)
+    responses = np.broadcast_to(sums[2:], (*by_frequency.shape[:2], 3))
+    real, imaginary = (
+        shear_of_sums(np.concatenate([part, responses], axis=-1)) for part in (by_frequency.real, by_frequency.imag)
+    )
+    return np.moveaxis(real + 1j * imaginary, -1, 0)
 
 
 def _centred_spectra(galaxies: Sources, rows: np.ndarray, axes: np.ndarray, frequencies: Frequencies) -> np.ndarray:

@@ -21,9 +21,9 @@ def biases(script, *options):
 @pytest.mark.slow
 def test_isolated_galaxies_at_the_depth_of_a_hundred_visits():
     """With noise, and with a selection at S/N 10 too."""
-    found = biases("shear_estimator.py", "--galaxies", 16384, "--realisations", 16, "--seed", 4)
-    assert len(found) == 2
-    for m, error in found:
+    all_and_bright = biases("shear_estimator.py", "--galaxies", 16384, "--realisations", 16, "--seed", 4)
+    assert len(all_and_bright) == 2
+    for m, error in all_and_bright:
         assert error < 4e-4
         assert abs(m) < 1e-3 + 2.0 * error
 
@@ -40,6 +40,7 @@ def test_isolated_galaxies_without_noise():
 def test_detected_galaxies(radius):
     """Detection alone, and discs of the sky with blends."""
     options = ("--images", 6, "--discs", 24 if radius == 0 else 14, "--realisations", 2, "--shear", 0.02)
-    ((m, error),) = biases("shear_of_images.py", "--radius", radius, *options)
+    # The last of those after every second image.
+    m, error = biases("shear_of_images.py", "--radius", radius, *options)[-1]
     assert error < 0.01
     assert abs(m) < 0.003 + 3.0 * error
