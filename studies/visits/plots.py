@@ -23,7 +23,7 @@ _GALAXY_STYLES = {
     "model": (BLUE, "o", "galaxies, PSF of the models"),
     "true": (GREY, "s", "galaxies, true PSF"),
     "difference": (ORANGE, "^", "difference of the two"),
-    "expected": ("black", "D", "expected of the errors of the models"),
+    "expected": ("black", "D", "expected from the errors of the models"),
 }
 #: Most whiskers of a panel.
 _MOST = 2500
