@@ -40,7 +40,7 @@ def test_selection_adds_no_ellipticity_of_the_psf(name):
 
 @pytest.mark.slow
 def test_correlated_noise_leaves_no_bias():
-    """Noise of pixels that are resampled by half a pixel along both axes: neighbours are correlated by 0.57."""
+    """Noise of pixels that are resampled by half a pixel along both axes: neighbours are correlated by 0.38."""
     options = ("--galaxies", 8192, "--realisations", 8, "--noise", "resampled", "--min-snr", 10, "--seed", 4)
     for m, error in biases("shear_estimator.py", *options):
         assert error < 1.5e-3
