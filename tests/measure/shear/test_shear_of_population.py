@@ -35,7 +35,7 @@ def test_isolated_galaxies_at_the_depth_of_a_hundred_visits():
 @pytest.mark.slow
 def test_selection_adds_no_ellipticity_of_the_psf():
     """Of four PSFs with g of 0.004 to 0.03, at S/N 10, whose M0 is correlated with M1 and M2 by up to 0.015."""
-    options = ("--galaxies", 8192, "--realisations", 256, "--noise", "functionals", "--min-snr", 10)
+    options = ("--galaxies", 8192, "--realisations", 512, "--noise", "functionals", "--min-snr", 10)
     for line in biases("shear_estimator.py", *options):
         for c, error in (line["c1"], line["c2"]):
             assert error < 4e-5
