@@ -1,10 +1,12 @@
 """Bias and speed of the shear estimator on isolated galaxies under the PSFs of telescope and atmosphere.
 
-Run: python benchmarks/shear_estimator.py [--galaxies N] [--realisations N] [--min-snr S] [--speed]
+Run: python benchmarks/shear_estimator.py [--galaxies N] [--realisations N] [--min-snr S] [--noise KIND] [--speed]
 
-Galaxies of the population of the sky, each at its sub-pixel place, beside it the same galaxy rotated by 90 degrees,
-under a shear and its opposite with the same noise: that of the sky of 100 visits, drawn on pixels, several times for
-each galaxy. With --speed, galaxies a second of the estimator, of Gaussian fits and of GalSim's regauss, interleaved.
+Galaxies of the population of the sky, each at its sub-pixel place, beside it the same galaxy and place rotated by 90
+degrees, under a shear and its opposite with the same noise: that of the sky of 100 visits, several times for each
+galaxy. It is drawn on pixels: white, or "resampled" by half a pixel along both axes by cubic convolution, which
+"resampled_as_white" takes for white noise of the same variance; or as the "functionals" of white noise. With --speed,
+galaxies a second of the estimator, of Gaussian fits and of GalSim's regauss, interleaved.
 """
 
 import argparse
@@ -70,11 +72,31 @@ def paired_shapes(estimator, stamps, offsets, psf_index, noise_moments, seed, mi
     return [type(shapes[0]).joined(shapes) for shapes in pairs]
 
 
+class PixelNoise:
+    """Noise of stamps: white, or resampled by half a pixel along both axes by cubic convolution."""
+
+    def __init__(self, rms: float, resampled: bool) -> None:
+        self.weights = (np.array([-1.0, 9.0, 9.0, -1.0]) / 16.0 if resampled else np.ones(1)).astype(np.float32)
+        along_axis = np.correlate(self.weights, self.weights, "full")
+        self.white_rms, self.rms = np.float32(rms), rms * float(along_axis.max())
+        self.correlation = np.outer(along_axis, along_axis) / along_axis.max() ** 2
+
+    def stamps(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Noise [count, side, side]."""
+        wide = SIDE + len(self.weights) - 1
+        white = self.white_rms * rng.standard_normal((count, wide, wide), np.float32)
+        along_x = sum(w * white[:, :, i : i + SIDE] for i, w in enumerate(self.weights))
+        return sum(w * along_x[:, i : i + SIDE] for i, w in enumerate(self.weights))
+
+
 def show_bias(arguments, psfs: np.ndarray, exposure: pachon.Exposure) -> None:
-    noise = exposure.noise_rms
+    pixel_noise = PixelNoise(exposure.noise_rms, arguments.noise.startswith("resampled"))
+    correlated = pachon.CorrelatedNoise(pixel_noise.rms, pixel_noise.correlation)
+    noise = correlated if arguments.noise == "resampled" else pixel_noise.rms
     estimator = ShearEstimator(psfs, SCALE, noise)
-    amplitude = [np.sqrt(estimator.covariance[:, 0, 0]) / noise]
-    print(f"{len(psfs)} PSFs, noise of M0 {amplitude[0].mean():.1f} that of a pixel; {exposure.exposures} exposures")
+    amplitude = np.sqrt(estimator.covariance[:, 0, 0]).mean() / pixel_noise.rms
+    print(f"{len(psfs)} PSFs, noise of M0 {amplitude:.1f} that of a pixel; {exposure.exposures} exposures")
+    factors = np.linalg.cholesky(estimator.covariance)
     population = pachon.draw_galaxies(arguments.field * ARCSEC, arguments.faintest, arguments.seed)
     rng = np.random.default_rng(arguments.seed)
     rows = rng.permutation(len(population))[: arguments.galaxies // 2]
@@ -87,7 +109,9 @@ def show_bias(arguments, psfs: np.ndarray, exposure: pachon.Exposure) -> None:
         count = len(galaxies)
         along_diagonal = np.tile(np.arange(len(half)) % 2, 2)
         g = arguments.shear * np.where(along_diagonal, 1j, 1.0)
-        offsets, psf_index = rng.uniform(-0.5, 0.5, (count, 2)), rng.integers(0, len(psfs), count)
+        offset = rng.uniform(-0.5, 0.5, (len(half), 2))
+        offsets = np.concatenate([offset, offset[:, ::-1] * (-1.0, 1.0)])
+        psf_index = np.tile(rng.integers(0, len(psfs), len(half)), 2)
         electrons = exposure.electrons(galaxies.magnitude).astype(np.float32)[:, None, None]
         stamps = [
             drawn(galaxies.sheared(s * g.real, s * g.imag), offsets, psfs, psf_index) * electrons for s in (1, -1)
@@ -97,8 +121,11 @@ def show_bias(arguments, psfs: np.ndarray, exposure: pachon.Exposure) -> None:
         if arguments.realisations:
             noise_moments = []
             for _ in range(arguments.realisations // 2):
-                pixels = np.float32(noise) * rng.standard_normal((count, SIDE, SIDE), np.float32)
-                moments = estimator.moments(pixels, offsets + 0.5, psf_index=psf_index, threads=1)
+                if arguments.noise == "functionals":
+                    moments = np.einsum("nij,nj->ni", factors[psf_index], rng.standard_normal((count, 6)))
+                else:
+                    pixels = pixel_noise.stamps(count, rng)
+                    moments = estimator.moments(pixels, offsets + 0.5, psf_index=psf_index, threads=1)
                 # Noise and its negative are equally likely, and their mean scatters less.
                 noise_moments += [moments, -moments]
         for cut in cuts:
@@ -192,6 +219,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--galaxies", type=int, default=8192)
     parser.add_argument("--realisations", type=int, default=8, help="of the noise, an even number; 0 for none")
+    kinds = ("white", "resampled", "resampled_as_white", "functionals")
+    parser.add_argument("--noise", choices=kinds, default="white")
     parser.add_argument("--min-snr", type=float, nargs="*", default=[10.0])
     parser.add_argument("--shear", type=float, default=0.01)
     parser.add_argument("--faintest", type=float, default=26.0)

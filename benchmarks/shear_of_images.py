@@ -98,16 +98,19 @@ def main() -> None:
                     parts[sign].append(found.shapes)
                     labels[sign].append(number * arguments.discs + discs.row_of(found.y))
                     peaks += float(found.weight.sum())
+        if number % 2 or number + 1 == arguments.images:
+            show(arguments, parts, labels, f"{number + 1} images, {galaxies} galaxies to {arguments.faintest}", peaks)
+    print(f"{time.perf_counter() - start:.0f} s")
+
+
+def show(arguments, parts: dict, labels: dict, heading: str, peaks: float) -> None:
+    """Print the bias of the images so far, of which every other one is sheared along x = y."""
     plus, minus = (type(parts[1][0]).joined(parts[sign]) for sign in (1, -1))
     patch, minus_patch = (np.concatenate(labels[sign]) for sign in (1, -1))
     image_of_patch = np.union1d(patch, minus_patch) // arguments.discs
     directions = arguments.shear * np.eye(2)[image_of_patch % 2]
     bias = pachon.shear_bias(plus, minus, *directions.T, patch=patch, minus_patch=minus_patch)
-    runs = 4 * max(1, arguments.realisations)
-    print(
-        f"{arguments.images} images, {galaxies} galaxies to {arguments.faintest}, {peaks / runs:.0f} peaks above S/N "
-        f"{arguments.min_snr:g}, {peaks:.0f} in all, g = {arguments.shear}, {time.perf_counter() - start:.0f} s"
-    )
+    print(f"{heading}, {peaks:.0f} peaks above S/N {arguments.min_snr:g}, g = {arguments.shear}")
     print(f"m = {bias.m.mean():+.4f} +- {0.5 * np.hypot(*bias.m_error):.4f}; {bias}", flush=True)
 
 

@@ -195,8 +195,21 @@ def null_test_command(
 
 
 def _show_shears(metrics_by_visits: dict[str, dict[str, float]]) -> None:
-    headings = ("visits", "galaxies", "difference < 10'", "> 10'", "m1 true", "c1 true", "alpha true", "beta")
-    names = ("xi_plus_difference_short", "xi_plus_difference_long", "m1_true", "c1_true", "alpha_true", "beta")
+    headings = (
+        "visits",
+        "galaxies",
+        "difference < 10'",
+        "> 10'",
+        "m1 true",
+        "c1 true",
+        "alpha true",
+        "beta",
+        "expected",
+    )
+    names = (
+        *("xi_plus_difference_short", "xi_plus_difference_long", "m1_true", "c1_true", "alpha_true"),
+        *("beta", "beta_expected"),
+    )
     rows = []
     for visits, metrics in metrics_by_visits.items():
         figures = [

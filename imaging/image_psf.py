@@ -10,6 +10,7 @@ from astropy import units as u
 
 from ..core.errors import DomainError, PachonError, ProductError
 from ..measure.catalogue.star_locus import stamp_side
+from ..measure.shapes import half_light_radii
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ..reconstruction.piff.psf import PiffPsf, load_piff
 from ..reconstruction.psf_model.model import PsfModel
@@ -27,8 +28,6 @@ _READERS: dict[str, Callable[[Path], ImagePsf]] = {
     "Piff": load_piff,
     "PSFEx": load_psfex,
 }
-#: Samples along the side of a pixel in which the half-light radius of a PSF is measured.
-_SUBPIXELS = 5
 
 
 def load_image_psf(path: Path) -> ImagePsf:
@@ -75,11 +74,11 @@ def psfs_on(
             properties = _properties_of(psf, colour, len(places))
             first = None if properties is None else {key: values[:1] for key, values in properties.items()}
             wide = psf.at(places[:1] + 1.0, chip=chip, size=_WIDE_SIDE, properties=first)
-            side = stamp_side(half_light_radius_of(wide[0]))
+            side = stamp_side(half_light_radii(wide)[0])
             stamps = psf.at(places + 1.0, chip=chip, size=side, properties=properties)
         else:
             wide = psf.at(places[:1] + 1.0, size=_WIDE_SIDE)
-            stamps = psf.at(places + 1.0, size=stamp_side(half_light_radius_of(wide[0])))
+            stamps = psf.at(places + 1.0, size=stamp_side(half_light_radii(wide)[0]))
     except PachonError as error:
         raise error.within(subject=f"PSF model of {image.name}") from None
     total = stamps.sum(axis=(1, 2), keepdims=True)
@@ -104,14 +103,3 @@ def _properties_of(psf: PiffPsf, colour: np.ndarray | float | None, count: int) 
 def _chip_of(image: CcdImage, psf: PiffPsf) -> int | None:
     """Return the number of the chip of an image in a model of many chips; None in a model of one."""
     return None if len(psf.chips) == 1 else image.header.get("CCDNUM")
-
-
-def half_light_radius_of(stamp: np.ndarray) -> float:
-    """Return the radius of the circle about the middle of a PSF image that has half of its light [pixel]."""
-    side = stamp.shape[0] * _SUBPIXELS
-    at = (np.arange(side) + 0.5) / _SUBPIXELS - 0.5 * stamp.shape[0]
-    radius = np.hypot(at, at[:, None]).ravel()
-    light = np.repeat(np.repeat(stamp, _SUBPIXELS, axis=0), _SUBPIXELS, axis=1).ravel()
-    order = np.argsort(radius, kind="stable")
-    growth = np.cumsum(light[order])
-    return float(radius[order][np.searchsorted(growth, 0.5 * growth[-1])])

@@ -135,8 +135,10 @@ def _single_stars(image: CcdImage, stars: StarSelection) -> StarSelection:
 
 
 def sky_variance(image: CcdImage) -> float:
-    """Return the variance of a pixel without objects, of sky and read noise [ADU^2]."""
-    return float(np.median(image.variance[image.mask == 0]))
+    """Return the variance of a pixel without objects, of sky and read noise [ADU^2]; NaN where none has a variance."""
+    good = (image.mask == 0) & (image.variance > 0.0)
+    # Half of the pixels have hardly any light of objects.
+    return float(np.median(image.variance[good])) if good.any() else np.nan
 
 
 def fit_image_psf(

@@ -21,6 +21,7 @@ from ..measure.catalogue.galaxy_fits import GalaxyFits, usable_galaxies
 from ..measure.catalogue.matching import detection_rates, match_positions
 from ..measure.catalogue.objects import DetectedObjects, ObjectFlag
 from ..measure.catalogue.star_locus import StarSelection
+from ..measure.shapes import half_light_radii
 from ..measure.shear.shear_shapes import ShearShapes, mean_shear
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ..reconstruction.piff.psf import PiffPsf
@@ -29,7 +30,7 @@ from ..reconstruction.psf_model.recipe import Recipe
 from ..reconstruction.psfex import PsfexPsf
 from ..sky.sky_shapes import STEP, SkyShapes, along_sky, jacobians_on_sky
 from .image_file import CcdImage
-from .image_psf import ImagePsf, half_light_radius_of, psfs_on
+from .image_psf import ImagePsf, psfs_on
 from .image_shear import object_shears
 from .image_stars import MANY_STARS, detected_objects, few_or_many_stars, few_stars_warning, fit_image_psf
 from .object_colours import ObjectColours
@@ -346,5 +347,5 @@ def _stars_beside_model(
         if positions is not None:
             raise
         middle = 0.5 * (np.array(image.image.shape[::-1]) - 1.0)
-        stamp = psfs_on(image, psf, middle[None], None, None if colours is None else colours.mean)[0]
-        return StarSelection.empty(len(objects), half_light_radius_of(stamp), stamp.shape)
+        stamps = psfs_on(image, psf, middle[None], None, None if colours is None else colours.mean)
+        return StarSelection.empty(len(objects), float(half_light_radii(stamps)[0]), stamps.shape[1:])

@@ -148,6 +148,7 @@ from .measure.shapes import measure_shapes as measure_shapes
 from .measure.shear.detection import PeakShapes as PeakShapes
 from .measure.shear.detection import detect_shear as detect_shear
 from .measure.shear.estimator import ShearEstimator as ShearEstimator
+from .measure.shear.noise import CorrelatedNoise as CorrelatedNoise
 from .measure.shear.shear_shapes import MeanShear as MeanShear
 from .measure.shear.shear_shapes import ShearBias as ShearBias
 from .measure.shear.shear_shapes import ShearShapes as ShearShapes

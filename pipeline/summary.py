@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -193,25 +193,23 @@ def _common_metrics(products: Sequence[CcdProduct]) -> dict[str, Any]:
 
 def scatter(products: Sequence[CcdStars], moments: str) -> float:
     """Return the rms of a component of the noise-free ellipticities about the mean of their CCD."""
-    deviations = []
-    for product in products:
-        e = np.stack(product.ellipticity("truth", moments))
-        finite = e[:, np.isfinite(e).all(axis=0)]
-        if finite.size:
-            deviations.append(finite - finite.mean(axis=1, keepdims=True))
-    return rms(np.concatenate(deviations, axis=1)) if deviations else np.nan
+    ellipticity = [np.stack(product.ellipticity("truth", moments)) for product in products]
+    return _rms_within_ccds(ellipticity, lambda e: e - e.mean(axis=1, keepdims=True))
 
 
 def size_scatter(products: Sequence[CcdStars]) -> float:
     """Return the rms of T of adaptive moments of the noise-free PSFs over the mean of their CCD, less 1."""
-    deviations = []
-    for product in products:
-        stars = product.stars("truth")
-        trace = trace_of_moments(stars.sigma, stars.g1, stars.g2)
-        finite = trace[np.isfinite(trace)]
-        if finite.size:
-            deviations.append(finite / finite.mean() - 1.0)
-    return rms(np.concatenate(deviations)) if deviations else np.nan
+    stars = [product.stars("truth") for product in products]
+    traces = [trace_of_moments(s.sigma, s.g1, s.g2)[None] for s in stars]
+    return _rms_within_ccds(traces, lambda trace: trace / trace.mean() - 1.0)
+
+
+def _rms_within_ccds(values: Sequence[np.ndarray], deviations: Callable[[np.ndarray], np.ndarray]) -> float:
+    """Return the rms of the deviations of the finite values [k, n] of each CCD."""
+    finite = [v[:, np.isfinite(v).all(axis=0)] for v in values]
+    if not any(v.size for v in finite):
+        return np.nan
+    return rms(np.concatenate([deviations(v) for v in finite if v.size], axis=1))
 
 
 def _median_distortion(products: Sequence[CcdProduct]) -> float:

@@ -41,6 +41,7 @@ from ...core.units import positive_angle, real_array, require_positive, require_
 from ..catalogue.pixel_checks import check_pixels
 from .estimator import CONSTANT, LEAST_SIDE, checked_psfs, smooth_step
 from .functionals import FUNCTIONALS, Frequencies, noise_covariance, psf_frequencies, renoising, weight_transforms
+from .noise import CorrelatedNoise, noise_power
 from .shear_shapes import ShearShapes
 from .weight import weight_sigma
 
@@ -141,7 +142,7 @@ def detect_shear(
     image: ArrayLike,
     psf_images: ArrayLike,
     pixel_scale: ArrayLike,
-    noise: float,
+    noise: float | CorrelatedNoise,
     *,
     psf_positions: ArrayLike | None = None,
     mask: ArrayLike | NDArray[np.bool_] | None = None,
@@ -160,8 +161,8 @@ def detect_shear(
         PSFs [n, m, m], or one [m, m]: unit sum, m odd, centred on a pixel, pixel included.
     pixel_scale : float or Quantity
         Side of a pixel [rad].
-    noise : float
-        rms of the noise of a pixel, white, in the unit of the image.
+    noise : float or CorrelatedNoise
+        White noise: rms of a pixel, in the unit of the image. Or noise with correlations of pixels.
     psf_positions : array, optional
         Places (x, y) of the PSFs [pixel], [n, 2]: squares of 256 pixels have that of the nearest.
     mask : array, optional
@@ -186,13 +187,14 @@ def detect_shear(
     psfs = checked_psfs(psf_images)
     scale = positive_angle(pixel_scale, "pixel_scale")
     width = weight_sigma(sigma, psfs, scale) / scale
-    rms = require_positive(noise, "noise")
+    if not isinstance(noise, CorrelatedNoise):
+        require_positive(noise, "noise")
     limit = require_positive(min_snr, "min_snr")
     cells = list(_cells(pixels.shape))
     psf_rows = _nearest_psfs(pixels.shape, len(psfs), psf_positions)
     clear = _clear_pixels(ignored, int(np.ceil(_CLEARANCE * width)))
     used, index = np.unique(psf_rows, return_inverse=True)
-    detector = _Detector.of(psfs[used], width, rms, limit)
+    detector = _Detector.of(psfs[used], width, noise, limit)
     noise_seed = None if seed is None else require_seed(seed)
     measure = partial(_measure_cell, detector, np.where(ignored, 0.0, pixels), clear, noise_seed)
     with ThreadPoolExecutor(thread_count(threads)) as pool:
@@ -215,22 +217,30 @@ class _Detector:
     peak_width: float  #: half of the range of v/(M0 + C) in which the weight rises
 
     @classmethod
-    def of(cls, psfs: np.ndarray, sigma: float, rms: float, min_snr: float) -> _Detector:
+    def of(cls, psfs: np.ndarray, sigma: float, noise: float | CorrelatedNoise, min_snr: float) -> _Detector:
         """Prepare the PSFs [n, m, m]."""
         margin = max(_MARGIN, int(np.ceil(0.5 * LEAST_SIDE * sigma)))
         grid, inverse = psf_frequencies(psfs, CELL + 2 * margin, sigma)
         small, small_inverse = psf_frequencies(psfs, 2 * margin, sigma)
         weights = _peak_transforms(small, sigma)
-        covariance = noise_covariance(weights, small_inverse, np.full(len(psfs), rms), small)
+        power = noise_power(noise, len(psfs), small)
+        covariance = noise_covariance(weights, small_inverse, power, small)
         # A rotation by 90 degrees changes signs of M1 and M2, and takes each neighbour to the one before it.
         turn = np.zeros((len(_MEASURED), len(_MEASURED)))
         turn[np.arange(3), np.arange(3)] = 1.0, -1.0, -1.0
         turn[3 + np.arange(4), 3 + (np.arange(4) - 1) % 4] = 1.0
         with one_blas_thread():
-            noise = renoising(covariance, _MEASURED, _DERIVATIVES, turn)
+            noise_matrices = renoising(covariance, _MEASURED, _DERIVATIVES, turn)
         errors = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         return cls(
-            grid, weight_transforms(grid, sigma), inverse, errors, noise, min_snr, margin, _PEAK_WIDTH / sigma**2
+            grid,
+            weight_transforms(grid, sigma),
+            inverse,
+            errors,
+            noise_matrices,
+            min_snr,
+            margin,
+            _PEAK_WIDTH / sigma**2,
         )
 
     def maps(self, image: np.ndarray, psf: int) -> np.ndarray:

@@ -10,13 +10,14 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError, shown
+from ...core.errors import DomainError
 from ...core.launch import launch, load_kernels
 from ...core.random_streams import stream
 from ...core.threads import one_blas_thread, thread_count
-from ...core.units import has_unit, positive_angle, pure_numbers, real_array, require_count, require_seed
+from ...core.units import has_unit, positive_angle, real_array, require_count, require_seed
 from ...core.warp_arrays import warp_array
 from .functionals import FUNCTIONALS, noise_covariance, psf_frequencies, renoising, weight_transforms
+from .noise import CorrelatedNoise, noise_power
 from .shear_kernels import deconvolved_functionals, weight_values
 from .shear_shapes import ShearShapes
 from .weight import weight_sigma
@@ -40,7 +41,7 @@ _BLOCK = 256
 
 @check_arguments
 class ShearEstimator:
-    r"""Estimator of shear without models of galaxies, unbiased under white noise.
+    r"""Estimator of shear without models of galaxies, unbiased under noise.
 
     With the functionals M0 to M5 of the image before the PSF (their weights are a round Gaussian G, (x^2 - y^2) G,
     2 x y G, and the derivatives of these along a shear), the ellipticity and its response to shear are
@@ -64,8 +65,9 @@ class ShearEstimator:
         PSFs [n, m, m], or one [m, m]: unit sum, m odd, centred on a pixel, pixel included.
     pixel_scale : float or Quantity
         Side of a pixel [rad].
-    noise : float or array
-        rms of the noise of a pixel, of all or under each of the PSFs, in the unit of the stamps. White.
+    noise : float, array or CorrelatedNoise
+        White noise: rms of a pixel, of all or under each of the PSFs, in the unit of the stamps. Or noise with
+        correlations of pixels, as of resampled images.
     sigma : float or Quantity, optional
         rms width of the weight before the PSF [rad]; by default 0.52 arcsec, or 1.2 half-light radii of the widest PSF
         where that is more. Ellipticities under different weights have different responses.
@@ -83,7 +85,7 @@ class ShearEstimator:
         self,
         psf_images: ArrayLike,
         pixel_scale: ArrayLike,
-        noise: ArrayLike,
+        noise: ArrayLike | CorrelatedNoise,
         *,
         sigma: ArrayLike | None = None,
         side: int = 64,
@@ -92,17 +94,12 @@ class ShearEstimator:
         scale = positive_angle(pixel_scale, "pixel_scale")
         width = weight_sigma(sigma, psfs, scale) / scale
         require_side(require_count(side, "side", 1, MOST_SIDE), width)
-        rms = pure_numbers(noise, "noise")
-        if rms.shape not in ((), (len(psfs),)) or not np.all((rms > 0.0) & np.isfinite(rms)):
-            raise DomainError(
-                f"noise = {shown(noise)}: expected a positive rms of the pixels, of all or of each of {len(psfs)} PSFs",
-                key="noise",
-            )
         self._side = int(side)
         self._frequencies, inverse = psf_frequencies(psfs, self._side, width)
         self._inverse = inverse.astype(np.complex64)
         weights = weight_transforms(self._frequencies, width)
-        self._covariance = noise_covariance(weights, inverse, np.broadcast_to(rms, (len(psfs),)), self._frequencies)
+        power = noise_power(noise, len(psfs), self._frequencies)
+        self._covariance = noise_covariance(weights, inverse, power, self._frequencies)
         factors = self._frequencies.multiplicity / self._side**2
         self._weights = np.moveaxis(weights * factors, 0, -1).astype(np.float32)
         with one_blas_thread():

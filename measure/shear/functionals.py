@@ -109,7 +109,7 @@ def psf_frequencies(psf_images: np.ndarray, side: int, sigma: float) -> tuple[Fr
         If a PSF amplifies noise beyond reason: it is too wide for the weight.
     """
     full = Frequencies(side, (side - 1) // 2)
-    transforms = full.of(_wrapped(psf_images, side))
+    transforms = psf_transforms(full, psf_images)
     k = np.hypot(full.kx, full.ky)
     with np.errstate(divide="ignore"):
         amplitude = np.exp(-0.5 * (sigma * k) ** 2) / np.abs(transforms)
@@ -130,6 +130,11 @@ def psf_frequencies(psf_images: np.ndarray, side: int, sigma: float) -> tuple[Fr
     return Frequencies(side, most), inverse[cut]
 
 
+def psf_transforms(frequencies: Frequencies, psf_images: np.ndarray) -> np.ndarray:
+    """Return the transforms of PSFs [n, m, m], m odd, about their middle pixel, [n, ny, nx]."""
+    return frequencies.of(_wrapped(psf_images, frequencies.side))
+
+
 def _wrapped(psf_images: np.ndarray, side: int) -> np.ndarray:
     """Return PSFs with their centre on pixel 0 of a periodic grid, on which their transforms stay exact."""
     width = psf_images.shape[1]
@@ -140,9 +145,9 @@ def _wrapped(psf_images: np.ndarray, side: int) -> np.ndarray:
 
 
 def noise_covariance(
-    weights: np.ndarray, inverse: np.ndarray, noise: np.ndarray, frequencies: Frequencies
+    weights: np.ndarray, inverse: np.ndarray, noise_power: np.ndarray, frequencies: Frequencies
 ) -> np.ndarray:
-    """Return the covariance of functionals under white noise, [n, m, m].
+    """Return the covariance of functionals under noise of a power spectrum, [n, m, m].
 
     Parameters
     ----------
@@ -150,13 +155,13 @@ def noise_covariance(
         Transforms of the weights.
     inverse : ndarray of complex, shape [n, ny, nx]
         Inverse transforms of PSFs.
-    noise : ndarray, shape [n]
-        rms of a pixel under each of the PSFs.
+    noise_power : ndarray, shape [n, ny, nx] or [n, 1, 1]
+        Power of the noise under each of the PSFs: of white noise the variance of a pixel.
     frequencies : Frequencies
         Those of the transforms.
     """
     products = (weights[:, None] * np.conj(weights[None])).real * frequencies.multiplicity
-    power = np.abs(inverse) ** 2 * (noise[:, None, None] / frequencies.side) ** 2
+    power = np.abs(inverse) ** 2 * noise_power / frequencies.side**2
     return np.einsum("nyx,ijyx->nij", power, products)
 
 

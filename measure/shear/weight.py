@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.units import ARCSEC, positive_angle
+from ..shapes import half_light_radii
 
 #: Least rms width of the weight before the PSF [rad]: in seeing of 0.7" narrower ones amplify noise, wider ones lose
 #: signal.
@@ -19,14 +20,3 @@ def weight_sigma(sigma: ArrayLike | None, psf_images: np.ndarray, pixel_scale: f
     if sigma is not None:
         return positive_angle(sigma, "sigma")
     return max(WEIGHT_SIGMA, _WEIGHT_OVER_PSF * pixel_scale * float(np.max(half_light_radii(psf_images))))
-
-
-def half_light_radii(psfs: np.ndarray) -> np.ndarray:
-    """Return half-light radii of PSFs of unit sum from their growth curves [pixel]."""
-    half = psfs.shape[1] // 2
-    y, x = np.mgrid[-half : half + 1, -half : half + 1]
-    order = np.argsort(np.hypot(x, y), axis=None, kind="stable")
-    # A pixel more of area, a little more of radius: the radius of the disc that n pixels fill.
-    radius = np.sqrt(np.arange(1, order.size + 1) / np.pi)
-    growth = np.cumsum(psfs.reshape(len(psfs), -1)[:, order], axis=1)
-    return np.array([np.interp(0.5, curve, radius) for curve in np.maximum.accumulate(growth, axis=1)])

@@ -21,9 +21,10 @@ from ...imaging.draw import Sources
 from ...imaging.exposure import Exposure
 from ...measure.catalogue.fit_galaxies import fit_galaxy_stamps
 from ...measure.catalogue.galaxy_fits import GalaxyFits, usable_galaxies
+from ...measure.shapes import half_light_radii
 from ...measure.shear.estimator import LEAST_SIDE, ShearEstimator
 from ...measure.shear.shear_shapes import ShearShapes
-from ...measure.shear.weight import half_light_radii, weight_sigma
+from ...measure.shear.weight import weight_sigma
 from .stack import PsfStack
 
 #: S/N of the weighted flux from which galaxies have a weight in the shear.

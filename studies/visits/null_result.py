@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ...measure.catalogue.shear_calibration import ShearCalibration
 from ...measure.correlation import Correlation, jackknife_error
 from ...measure.shear.shear_shapes import ShearBias, ShearShapes, shear_of_sums
 from .galaxy_shapes import GalaxyShapes
-from .stack import PsfStack
+from .psf_errors import PsfAtGalaxies
 from .stack_metrics import correlations
 
 #: Fewest densities for a slope: two lie on a line whatever their errors are.
@@ -52,36 +51,43 @@ class AdditiveBias:
     """Shear of galaxies without shear as a part of the ellipticity of their PSF, and of that of the models' errors.
 
     Slopes through the origin at the nearest place without a star, with errors of a jackknife over quarters of tiles:
-    each a pair of the value and its error, NaN where there are too few galaxies.
+    each a pair of the value and its error, NaN where there are too few galaxies. Ellipticities of PSFs are g of
+    adaptive moments.
 
     Attributes
     ----------
     alpha_model, alpha_true : (float, float)
-        Of the shear measured with the PSF of the models against the weighted e of that PSF, and with the true PSF
-        against that of the true one.
+        Of the shear measured with the PSF of the models against the g of that PSF, and with the true PSF against that
+        of the true one.
     beta : (float, float)
-        Of the difference of both shears against that of the weighted e of the true PSF and the model.
+        Of the difference of both shears against that of the g of the true PSF and the model.
+    beta_expected : (float, float)
+        Of the shear that the errors of the models leave to first order against the same.
+    agreement : (float, float)
+        Of the difference of both shears against the shear that the errors leave to first order: 1.
     """
 
     alpha_model: tuple[float, float]
     alpha_true: tuple[float, float]
     beta: tuple[float, float]
+    beta_expected: tuple[float, float]
+    agreement: tuple[float, float]
 
     @classmethod
-    def of(cls, stack: PsfStack, parts: list[GalaxyShapes]) -> AdditiveBias:
-        """Compare the galaxies of tiles with the PSFs of a stack."""
-        places = ~stack.star
-        tree = cKDTree(np.stack([stack.x, stack.y], axis=1)[places])
-        e_model, e_true = ((a + 1j * b)[places] for a, b in ((stack.model_e1, stack.model_e2), (stack.e1, stack.e2)))
-        nearest = [tree.query(np.stack([shapes.x, shapes.y], axis=1))[1] for shapes in parts]
+    def of(cls, psfs: PsfAtGalaxies, parts: list[GalaxyShapes]) -> AdditiveBias:
+        """Compare the galaxies of tiles with their PSFs."""
         joined = GalaxyShapes.joined(parts)
-        place = np.concatenate(nearest)
         patch = np.concatenate([4 * k + _quarters(shapes) for k, shapes in enumerate(parts)])
         by_model, by_true = (galaxy_shears(shapes) for shapes in (joined.shear, joined.true_shear))
+        difference, psf_error = by_model - by_true, psfs.true - psfs.model
+        # At the galaxies that the difference has.
+        expected = np.where(np.isfinite(difference), psfs.expected_shear, np.nan)
         return cls(
-            _slope(by_model, e_model[place], patch),
-            _slope(by_true, e_true[place], patch),
-            _slope(by_model - by_true, (e_true - e_model)[place], patch),
+            _slope(by_model, psfs.model, patch),
+            _slope(by_true, psfs.true, patch),
+            _slope(difference, psf_error, patch),
+            _slope(expected, psf_error, patch),
+            _slope(difference, psfs.expected_shear, patch),
         )
 
 
@@ -154,7 +160,8 @@ class NullTest:
         ``model``: ellipticities measured with the PSF of the models; ``true``: with the true PSF; ``difference``: of
         the two, of galaxies that are usable with either.
     shear_correlations : dict of str to Correlation
-        The same of the shears of the functionals.
+        The same of the shears of the functionals; where their PSFs are known, ``expected``: of the shears that errors
+        of the models leave to first order, and ``psf_error``: of the errors of g of the PSFs at these galaxies.
     biases : ShearBiases, optional
         Biases of the shear, where they were measured.
     """
@@ -167,7 +174,14 @@ class NullTest:
     biases: ShearBiases | None = None
 
     @classmethod
-    def of(cls, visits: int, parts: list[GalaxyShapes], area: float, biases: ShearBiases | None = None) -> NullTest:
+    def of(
+        cls,
+        visits: int,
+        parts: list[GalaxyShapes],
+        area: float,
+        biases: ShearBiases | None = None,
+        psfs: PsfAtGalaxies | None = None,
+    ) -> NullTest:
         """Return the test of the galaxies of tiles of an area [arcmin^2], with errors of a jackknife over the tiles."""
         galaxies = GalaxyShapes.joined(parts)
         kinds = {
@@ -177,6 +191,11 @@ class NullTest:
         }
         by_model, by_true = (galaxy_shears(shapes) for shapes in (galaxies.shear, galaxies.true_shear))
         shears = {"model": by_model, "true": by_true, "difference": by_model - by_true}
+        if psfs is not None:
+            # At the galaxies that the difference has.
+            measured = np.where(np.isfinite(shears["difference"]), 1.0, np.nan)
+            of_psfs = {"expected": measured * psfs.expected_shear, "psf_error": measured * (psfs.true - psfs.model)}
+            shears |= {kind: g for kind, g in of_psfs.items() if np.isfinite(g).sum() > 1}
         shear_kinds = {kind: (g.real, g.imag, np.isfinite(g)) for kind, g in shears.items()}
         tile = np.repeat(np.arange(len(parts)), [len(tile_galaxies) for tile_galaxies in parts])
         correlated = correlations(galaxies.x, galaxies.y, kinds, tile)
@@ -213,7 +232,7 @@ def null_metrics(result: NullTest) -> dict[str, float]:
                 for k in range(2):
                     metrics[f"{prefix}{name}{k + 1}_{kind}"] = float(getattr(bias, name)[k])
                     metrics[f"{prefix}{name}{k + 1}_{kind}_error"] = float(getattr(bias, f"{name}_error")[k])
-    for name in ("alpha_model", "alpha_true", "beta"):
+    for name in ("alpha_model", "alpha_true", "beta", "beta_expected", "agreement"):
         value, error = getattr(result.biases.additive, name)
         metrics[f"shear_{name}"], metrics[f"shear_{name}_error"] = value, error
     return metrics

@@ -28,6 +28,7 @@ from .config import STACK_STAMP, load_visits_configuration
 from .galaxy_shapes import GalaxyShapes, measure_galaxies
 from .null_result import AdditiveBias, NullTest, ShearBiases, null_metrics, shear_bias
 from .plots import density_picture, null_test_picture
+from .psf_errors import PsfAtGalaxies, PsfErrorResponse
 from .psf_visit import StackFrame, stack_limit
 from .stack import PsfStack
 from .visits import cell_of, pixel_scale_of, stack_path
@@ -38,6 +39,8 @@ FAINTEST_SNR = 8.0
 REACH = 2.0
 #: Patches of the jackknife over the rings.
 _RING_PATCHES = 200
+#: Galaxies of the response to errors of the PSF: of four hundred, most too faint for a weight, it is 10 % off.
+_RESPONSE_GALAXIES = 10_000
 #: Shear of the calibration.
 SHEAR = 0.02
 # Orientations of a ring.
@@ -117,15 +120,16 @@ def null_test(
         if (n := sum(int(shapes.usable_twice.sum()) for shapes in parts)) < 2:
             text = f"{n} of {sum(map(len, parts))} galaxies to magnitude {faintest:.2f} are usable in {visits} visits"
             raise DomainError(f"{folder}: {text}; expected two or more, of the galaxies of {CONFIG_NAME}")
-        ring_count = len(depth.ring_galaxies(covered_tiles, rings))
-        biases = ShearBiases(
-            _calibration(frame.matrix, ring_count, measured_rings),
-            _shear_calibration(frame.matrix, ring_count, measured_rings),
-            AdditiveBias.of(stack, parts),
-        )
+        ring_count = len(depth.first_galaxies(covered_tiles, rings))
         with execution.reporter.stage(f"correlations in {visits} visits"):
+            psfs = PsfAtGalaxies.of(stack, GalaxyShapes.joined(parts), depth.psf_error_response(covered_tiles))
+            biases = ShearBiases(
+                _calibration(frame.matrix, ring_count, measured_rings),
+                _shear_calibration(frame.matrix, ring_count, measured_rings),
+                AdditiveBias.of(psfs, parts),
+            )
             area = len(covered_tiles) * (cell / ARCMIN) ** 2
-            tests[visits] = NullTest.of(visits, parts, area, biases)
+            tests[visits] = NullTest.of(visits, parts, area, biases, psfs)
     write_json(folder / "null_test.json", {"stacks": {str(n): null_metrics(r) for n, r in tests.items()}})
     write_pictures(folder, tests)
     return tests
@@ -168,23 +172,32 @@ class _StackMeasurement:
         for tile in todo:
             key: tuple[str | int, ...] = ("null test", self.stack.visits, *map(natural_number, tile))
             yield self._job(self.galaxies_in(*_tile_ranges(tile, self.cell)), key)
-        galaxies = self.ring_galaxies(tiles, rings)
+        galaxies = self.first_galaxies(tiles, rings)
         shear = SHEAR * _shear_along_diagonal(len(galaxies))
         for k, sign in _RING_JOBS:
             rotated = galaxies.rotated(np.pi * k / _ORIENTATIONS)
             sheared = rotated.sheared(sign * shear.real, sign * shear.imag)
             yield self._job(sheared, ("shear", self.stack.visits, k))
 
-    def ring_galaxies(self, tiles: list[tuple[int, int]], rings: int) -> Galaxies | PlantedGalaxies:
-        """Return galaxies for so many rings, those of the first tiles that have them."""
+    def first_galaxies(self, tiles: list[tuple[int, int]], count: int) -> Galaxies | PlantedGalaxies:
+        """Return so many galaxies, those of the first tiles that have them."""
         parts = [self.galaxies_in(*_tile_ranges(tiles[0], self.cell))]
         for tile in tiles[1:]:
-            if sum(map(len, parts)) >= rings:
+            if sum(map(len, parts)) >= count:
                 break
             parts.append(self.galaxies_in(*_tile_ranges(tile, self.cell)))
         kind: Any = type(parts[0])
         galaxies = kind.concatenate(parts)
-        return galaxies.take(np.arange(min(rings, len(galaxies))))
+        return galaxies.take(np.arange(min(count, len(galaxies))))
+
+    def psf_error_response(self, tiles: list[tuple[int, int]]) -> PsfErrorResponse:
+        """Return the response of the shear of galaxies, each beside itself at 90 degrees, to errors of the PSF."""
+        galaxies = self.first_galaxies(tiles, _RESPONSE_GALAXIES)
+        kind: Any = type(galaxies)
+        pairs = kind.concatenate([galaxies, galaxies.rotated(0.5 * np.pi)])
+        return PsfErrorResponse.of(
+            self.stack, pairs, self.axes, self.exposure, self.seed, "PSF errors", self.stack.visits
+        )
 
     def _job(self, galaxies: Any, key: tuple[str | int, ...]) -> dict[str, Any]:
         at = np.stack([galaxies.xi, galaxies.eta], axis=1) @ self.axes.T * self.exposure.pixel_scale

@@ -23,6 +23,7 @@ _GALAXY_STYLES = {
     "model": (BLUE, "o", "galaxies, PSF of the models"),
     "true": (GREY, "s", "galaxies, true PSF"),
     "difference": (ORANGE, "^", "difference of the two"),
+    "expected": ("black", "D", "expected from the errors of the models"),
 }
 #: Most whiskers of a panel.
 _MOST = 2500
@@ -97,14 +98,16 @@ def null_test_picture(results: Mapping[int, NullTest]) -> bytes:
         for row, (method, correlated) in zip(panels, methods.items(), strict=True):
             for axes, result, correlation_of_kind in zip(row, results.values(), correlated, strict=True):
                 for kind, style in _GALAXY_STYLES.items():
-                    draw_correlation(axes, correlation_of_kind[kind], "plus", *style)
+                    if kind in correlation_of_kind:
+                        draw_correlation(axes, correlation_of_kind[kind], "plus", *style)
                 log_axes(axes, f"{method}, {_visits(result.visits)}: {result.density:.0f} usable per arcmin²")
             row[0].set_ylabel("$|\\xi_+|$: filled positive, open negative")
         for axes in panels[-1]:
             axes.set_xlabel("separation [arcmin]")
         low, high = panels[0, 0].get_ylim()
         panels[0, 0].set_ylim(max(low, 1e-10), 2.0 * high)
-        panels[0, 0].legend(loc="best")
+        for row in panels:
+            row[0].legend(loc="best")
         return png_bytes(figure)
 
 

@@ -346,6 +346,9 @@ def calls(folder):
         "detect_shear": (pachon.detect_shear, {"image": m.image, "psf_images": m.shear_psf, "pixel_scale": 1e-6,
                          "noise": 1.0, "psf_positions": [[10.0, 10.0]], "mask": np.zeros(flat.shape, int), "seed": 1,
                          "sigma": 2.6e-6, "min_snr": 10.0, "threads": 1}),
+        "CorrelatedNoise": (pachon.CorrelatedNoise, {"rms": 1.0, "correlation": [[0, 0.1, 0], [0, 1, 0], [0, 0.1, 0]]}),
+        "CorrelatedNoise.of_image": (pachon.CorrelatedNoise.of_image, {
+            "image": np.random.default_rng(1).standard_normal((40, 40)), "mask": np.zeros((40, 40), int), "reach": 1}),
         "mean_shear": (pachon.mean_shear, {"shapes": m.shear_shapes, "patch": np.arange(12) // 3}),
         "shear_bias": (pachon.shear_bias, {"plus": m.shear_shapes, "minus": m.shear_shapes, "shear1": 0.01,
                        "shear2": 0.0, "patch": np.arange(12) // 3, "minus_patch": np.arange(12) // 3}),

@@ -23,9 +23,10 @@ from ....measure.catalogue.fit_galaxies import fit_galaxies
 from ....measure.catalogue.galaxy_fits import usable_galaxies
 from ....measure.catalogue.matching import match_positions
 from ....measure.catalogue.star_locus import LocusSearch, StarSelection, select_stars
-from ....measure.shapes import measure_shapes
+from ....measure.shapes import half_light_radii, measure_shapes
 from ....measure.shear.detection import detect_shear
-from ....measure.shear.weight import half_light_radii, weight_sigma
+from ....measure.shear.noise import CorrelatedNoise
+from ....measure.shear.weight import weight_sigma
 from ..galaxy_shapes import SHEAR_MIN_SNR, GalaxyShapes, measure_galaxies
 from ..null_result import NullTest, null_metrics
 from ..null_test import FAINTEST_SNR, REACH, write_pictures, write_shapes
@@ -36,7 +37,7 @@ from .image_stack import ImageStack
 from .picture import stacks_png
 from .stack_images import galaxies_on
 from .tiles import Tile
-from .transfer import broadened, mean_transfer
+from .transfer import broadened, mean_noise_correlation, mean_transfer
 
 #: Largest distance of a detected object from a true one [pixel].
 MATCH_RADIUS = 3.0
@@ -188,6 +189,9 @@ def measure_tile(
     at = np.stack([objects.x, objects.y], axis=1) + tile.first
     images = [ccd for _, wcs in stack.wcs(stack.plan[: psfs.visits], threads) for ccd in wcs.values()]
     transfer = mean_transfer(tile, stack.frame, images)
+    noise = CorrelatedNoise(
+        float(np.sqrt(np.median(image.variance[image.mask == 0]))), mean_noise_correlation(tile, stack.frame, images)
+    )
     known_at = np.stack([psfs.x, psfs.y], axis=1)[places]
     near = places[tile.inside.contains(known_at / scale - tile.first)]
     modelled = broadened(psfs.model[near if len(near) else places], transfer)
@@ -217,7 +221,7 @@ def measure_tile(
             image.image,
             psf_images / psf_images.sum(axis=(1, 2), keepdims=True),
             scale,
-            float(np.sqrt(np.median(variance[image.mask == 0]))),
+            noise,
             psf_positions=known_at / scale - tile.first,
             mask=image.mask,
             sigma=weight_sigma(None, broadened(psfs.true[places], transfer), scale),

@@ -4,11 +4,14 @@ Cubic convolution of an image at a fraction s of a pixel multiplies its componen
 T(k) = sum over j of w_j(s) exp(2 pi i k (j - 1 - s)), w_j being the weights of the four neighbours j = 0 to 3. T is 1
 where s is 0, as in the middle of the stamps of PSFs. Its mean over all s is the Fourier transform of the kernel, which
 falls as 1 - O(k^4): peaks become lower, second moments stay.
+
+The noise of resampled pixels x and x' is correlated by the sum over the pixels p of the image of K(x - p) K(x' - p),
+with the kernel K of cubic convolution.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy import fft
@@ -21,6 +24,8 @@ from .tiles import Tile
 _NODES = 10
 #: Pixels along a side of the grid on which PSFs are broadened.
 GRID = 48
+#: Farthest distance of correlated pixels of a tile along its axes: kernels of +-2 pixels, at 45 degrees to the axes.
+CORRELATION_REACH = 5
 
 
 def mean_transfer(tile: Tile, frame: StackFrame, images: Sequence[SkyPixels]) -> np.ndarray:
@@ -40,23 +45,52 @@ def mean_transfer(tile: Tile, frame: StackFrame, images: Sequence[SkyPixels]) ->
     ndarray of complex64, shape [GRID, GRID // 2 + 1]
         At the frequencies of ``rfft2``.
     """
-    # Nodes of the middle of a step, so that they fall on all fractions where scales differ by little.
-    line = np.floor((np.arange(_NODES) + 0.5) * tile.side / _NODES)
-    to_sky = np.linalg.inv(frame.matrix)
-    sky = (np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2) + tile.first) @ to_sky.T
     frequency = np.stack(np.meshgrid(np.fft.rfftfreq(GRID), np.fft.fftfreq(GRID)), axis=-1).reshape(-1, 2)
     total, count = np.zeros(len(frequency), dtype=np.complex128), 0
-    for wcs in images:
-        pixels = wcs.to_pixel(sky)
-        pixels = pixels[Window(0, 0, wcs.shape[1], wcs.shape[0]).contains(pixels)]
-        if not len(pixels):
-            continue
-        to_frame = np.linalg.inv(wcs.jacobians(pixels[:1])[0] @ to_sky)
-        along = frequency @ to_frame
+    for pixels, to_image in _nodes_on(tile, frame, images):
+        along = frequency @ np.linalg.inv(to_image)
         s = pixels - np.floor(pixels)
         total += (_fraction_transfer(along[:, 0], s[:, 0]) * _fraction_transfer(along[:, 1], s[:, 1])).sum(axis=0)
         count += len(pixels)
     return (total / max(count, 1)).reshape(GRID, GRID // 2 + 1).astype(np.complex64)
+
+
+def mean_noise_correlation(tile: Tile, frame: StackFrame, images: Sequence[SkyPixels]) -> np.ndarray:
+    """Return the mean correlation of the noise of pixels of a tile by their distance, [m, m] with m odd.
+
+    Parameters
+    ----------
+    tile, frame, images
+        As of :func:`mean_transfer`.
+    """
+    line = np.arange(-CORRELATION_REACH, CORRELATION_REACH + 1)
+    distance = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    total = np.zeros(len(distance))
+    for pixels, to_image in _nodes_on(tile, frame, images):
+        neighbours = np.floor(pixels)[:, None] + np.arange(-1, 3)[:, None]  # [nodes, 4, axes]
+        at_node = _keys(pixels[:, None] - neighbours)
+        moved = pixels[:, None] + distance @ to_image.T  # [nodes, distances, axes]
+        at_moved = _keys(moved[:, :, None] - neighbours[:, None])
+        total += (at_node[:, None] * at_moved).sum(axis=2).prod(axis=2).sum(axis=0)
+    covariance = total.reshape(len(line), len(line))
+    covariance = covariance + covariance[::-1, ::-1]
+    variance = covariance[CORRELATION_REACH, CORRELATION_REACH]
+    if variance == 0.0:
+        return np.ones((1, 1))
+    return np.asarray(covariance / variance)
+
+
+def _nodes_on(tile: Tile, frame: StackFrame, images: Sequence[SkyPixels]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield the places of nodes of a tile on each image that has any [n, 2], and d(pixels)/d(pixels of the tile)."""
+    # Nodes of the middle of a step, so that they fall on all fractions where scales differ by little.
+    line = np.floor((np.arange(_NODES) + 0.5) * tile.side / _NODES)
+    to_sky = np.linalg.inv(frame.matrix)
+    sky = (np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2) + tile.first) @ to_sky.T
+    for wcs in images:
+        pixels = wcs.to_pixel(sky)
+        pixels = pixels[Window(0, 0, wcs.shape[1], wcs.shape[0]).contains(pixels)]
+        if len(pixels):
+            yield pixels, wcs.jacobians(pixels[:1])[0] @ to_sky
 
 
 def broadened(psfs: np.ndarray, transfer: np.ndarray) -> np.ndarray:
@@ -78,3 +112,11 @@ def _fraction_transfer(frequency: np.ndarray, s: np.ndarray) -> np.ndarray:
     )
     terms = (w * np.exp(2j * np.pi * frequency * (j - 1 - t)) for j, w in enumerate(weights))
     return np.asarray(sum(terms))
+
+
+def _keys(s: np.ndarray) -> np.ndarray:
+    """Return the kernel of cubic convolution at distances [pixel] (Keys 1981, a = -1/2)."""
+    a = np.abs(s)
+    inner = 1.0 + a**2 * (1.5 * a - 2.5)
+    outer = 2.0 + a * (-4.0 + a * (2.5 - 0.5 * a))
+    return np.where(a < 1.0, inner, np.where(a < 2.0, outer, 0.0))

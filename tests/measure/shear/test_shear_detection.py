@@ -73,12 +73,15 @@ def test_the_covariance_of_the_noise_of_pixels_is_that_of_drawn_noise(psfs):
     drawn = np.cov(values.T)
     frequencies, inverse = detection.psf_frequencies(psfs[:1], 64, 2.6)
     weights = detection._peak_transforms(frequencies, 2.6)
-    covariance = detection.noise_covariance(weights, inverse, np.ones(1), frequencies)[0]
+    white = np.ones((1, 1, 1))
+    covariance = detection.noise_covariance(weights, inverse, white, frequencies)[0]
     scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
     np.testing.assert_allclose(drawn / scale, covariance / scale, atol=5.0 * np.sqrt(2.0 / len(values)))
     # Of an image rotated by 90 degrees, under the PSF rotated.
     turned = detection.psf_frequencies(np.rot90(psfs[:1], axes=(1, 2)), 64, 2.6)
-    rotated = detection.noise_covariance(detection._peak_transforms(turned[0], 2.6), turned[1], np.ones(1), turned[0])
+    rotated = detection.noise_covariance(
+        detection._peak_transforms(turned[0], 2.6), turned[1], np.ones((1, 1, 1)), turned[0]
+    )
     square = detector.noise[0][0] @ detector.noise[0][0].T
     block = np.ix_(detection._MEASURED, detection._MEASURED)
     np.testing.assert_allclose(square / scale[block], rotated[0][block] / scale[block], atol=1e-6)

@@ -1,5 +1,4 @@
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from pachon.studies.visits import null_test as module
 from pachon.studies.visits.galaxy_shapes import GalaxyShapes, measure_galaxies
 from pachon.studies.visits.null_result import AdditiveBias, density_slope, shear_bias
 from pachon.studies.visits.null_test import ellipticity_along, null_test
+from pachon.studies.visits.psf_errors import PsfAtGalaxies
 from pachon.studies.visits.stack import PsfStack
 from pachon.studies.visits.visits import stack_visits
 
@@ -179,6 +179,9 @@ def test_the_null_test_of_a_folder(tested):
         for name in ("shear_m1_true", "shear_m2_true"):
             assert abs(metrics[name]) < 4.0 * metrics[f"{name}_error"] < 0.2
         assert metrics["shear_galaxies"] > 10
+        assert 0.1 < metrics["shear_beta_expected"] < 2.0
+        # What galaxies have of the errors of the models is what these leave to first order.
+        assert metrics["shear_agreement"] == pytest.approx(1.0, abs=0.1 + 3.0 * metrics["shear_agreement_error"])
         assert 0.15 < metrics["rms_shear_component"] < 0.6
     assert results[2].density > results[1].density
     assert (folder / "null_test.png").read_bytes().startswith(b"\x89PNG")
@@ -213,11 +216,8 @@ def test_additive_bias_is_the_part_of_the_psf_and_of_its_error_that_galaxies_hav
     psf = stack_of(gaussian(0.0 + 0.0j, 2.0), gaussian(0.0 + 0.0j, 2.0), places=30)
     field = 0.01 * (np.sin(psf.x / ARCMIN) + 1j * np.cos(0.7 * psf.y / ARCMIN))
     wrong = 0.003 * (np.cos(3.0 * psf.x / ARCMIN) - 1j * np.sin(2.0 * psf.y / ARCMIN))
-    model = {"model_e1": (field - wrong).real, "model_e2": (field - wrong).imag}
-    stack = replace(psf, star=np.zeros(len(psf.x), dtype=bool), e1=field.real, e2=field.imag, **model)
-    parts = []
-    for _ in range(10):
-        places = rng.integers(0, len(psf.x), 800)
+    parts, nearest = [], rng.integers(0, len(psf.x), (10, 800))
+    for places in nearest:
         shape = 0.02 * (rng.normal(size=800) + 1j * rng.normal(size=800))
         shears = {"true_shear": 0.1 * field[places] + shape}
         shears["shear"] = shears["true_shear"] + 0.8 * wrong[places] + 1e-4 * rng.normal(size=800)
@@ -232,7 +232,8 @@ def test_additive_bias_is_the_part_of_the_psf_and_of_its_error_that_galaxies_hav
         }
         columns = psf.x[places], psf.y[places], *[nothing] * 4, flags, nothing, nothing, flags
         parts.append(GalaxyShapes(places, *columns, **shapes))
-    bias = AdditiveBias.of(stack, parts)
+    at = nearest.ravel()
+    bias = AdditiveBias.of(PsfAtGalaxies(field[at], (field - wrong)[at], 0.75 * wrong[at]), parts)
     # Of 5600 galaxies: 0.02 a component over the modulus of the PSF's ellipticity.
     expected_error = 0.02 / np.sqrt(5600.0) / np.sqrt(np.mean(np.abs(field) ** 2))
     assert bias.alpha_true[1] == pytest.approx(expected_error, rel=0.4)
@@ -240,6 +241,8 @@ def test_additive_bias_is_the_part_of_the_psf_and_of_its_error_that_galaxies_hav
     # The shapes are in both and leave the difference: the slope against the error is known much better.
     assert bias.beta[1] < 0.01
     assert abs(bias.beta[0] - 0.8) < 4.0 * bias.beta[1]
+    assert bias.beta_expected[0] == pytest.approx(0.75)
+    assert bias.agreement[0] == pytest.approx(bias.beta[0] / 0.75)
     of_model = np.mean(np.abs(field - wrong) ** 2)
     slope = (np.conj(field - wrong) * (0.1 * field + 0.8 * wrong)).real.mean() / of_model
     assert abs(bias.alpha_model[0] - slope) < 3.5 * bias.alpha_model[1]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pachon.studies.visits.image_stack.tiles import Tile
-from pachon.studies.visits.image_stack.transfer import GRID, broadened, mean_transfer
+from pachon.studies.visits.image_stack.transfer import GRID, broadened, mean_noise_correlation, mean_transfer
 from pachon.studies.visits.psf_visit import StackFrame
 
 FRAME, TILE = StackFrame(np.eye(2), 31), Tile(0, 0, 512)
@@ -61,3 +61,48 @@ def test_a_broadened_psf_is_the_resampled_one():
     assert np.allclose(found, expected, rtol=0, atol=1e-4 * psf.max())
     assert found.max() == pytest.approx(expected.max(), rel=1e-4)
     assert found.max() < 0.99 * psf.max()
+
+
+def test_the_correlation_of_noise_has_the_closed_form():
+    assert np.allclose(mean_noise_correlation(TILE, FRAME, [Shifted((0.0, 0.0))]), np.pad([[1.0]], 5), atol=1e-12)
+    # Weights -1/16, 9/16, 9/16, -1/16 at half a pixel along x.
+    weights = np.array([-1.0, 9.0, 9.0, -1.0]) / 16.0
+    along_x = np.correlate(weights, weights, "full") / (weights**2).sum()
+    correlation = mean_noise_correlation(TILE, FRAME, [Shifted((0.5, 0.0))])
+    assert np.allclose(correlation[5, 2:9], along_x, rtol=0, atol=1e-12)
+    assert np.allclose(np.delete(correlation, 5, axis=0), 0.0, rtol=0, atol=1e-12)
+
+
+class Rotated(Shifted):
+    """Pixels of an image that is rotated by 0.5 rad against the tile."""
+
+    turn = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
+
+    def to_pixel(self, sky):
+        return sky @ self.turn.T + 2000.5 + self.shift
+
+    def jacobians(self, pixels):
+        return np.broadcast_to(self.turn, (len(pixels), 2, 2))
+
+
+def test_the_correlation_of_noise_is_that_of_resampled_noise():
+    """White noise, resampled by hand along the axes of a rotated image."""
+    rng, wcs = np.random.default_rng(1), Rotated((0.2, 0.3))
+    x, y = np.meshgrid(np.arange(300.0), np.arange(300.0))
+    pixels = np.stack([x, y], axis=-1).reshape(-1, 2) @ Rotated.turn.T + 200.0
+    noise, first = rng.standard_normal((700, 700)), np.floor(pixels).astype(int)
+    resampled = np.zeros(len(pixels))
+    for i in range(-1, 3):
+        for j in range(-1, 3):
+            a, b = np.abs(pixels - first - np.array([i, j])).T
+            along_x, along_y = (
+                np.where(d < 1.0, 1.5 * d**3 - 2.5 * d**2 + 1.0, -0.5 * d**3 + 2.5 * d**2 - 4.0 * d + 2.0)
+                for d in (a, b)
+            )
+            resampled += along_x * along_y * noise[first[:, 1] + j, first[:, 0] + i]
+    image = resampled.reshape(300, 300)
+    correlation = mean_noise_correlation(TILE, FRAME, [wcs])
+    for dx, dy in ((1, 0), (0, 1), (1, 1), (-1, 1), (2, 0), (0, 3)):
+        one, two = image[: 300 - dy, max(0, -dx) : 300 - max(0, dx)], image[dy:, max(0, dx) : 300 + min(0, dx)]
+        # 90 000 pixels; a hundred nodes stand for all fractions.
+        assert (one * two).mean() / (image**2).mean() == pytest.approx(correlation[5 + dy, 5 + dx], abs=0.02)
