@@ -98,12 +98,11 @@ def test_the_result_has_the_aiming_of_the_file(lens, optimum):
     assert not np.isclose(after.stop_z, lens.stop_z, rtol=0, atol=5e-4)
     assert after.pupil_diameter == lens.pupil_diameter
     assert optimum.filled_stops == ("S4",)
-    assert optimum.remeasured[:, 0] == pytest.approx(optimum.merits, rel=1e-9)
+    assert np.array_equal(optimum.remeasured[:, 0], optimum.merits)
     for telescope, found in zip((lens, after), optimum.remeasured[:, 1], strict=True):
         plain = pachon.spots(telescope, n_pupil=RINGS).rms_radius
         assert found == pytest.approx(np.sqrt(np.mean(plain**2)), rel=1e-12)
     assert optimum.is_better
-    assert optimum.is_as_measured
     summary = optimum.summary()
     assert summary["rays_fill"] == ["S4"]
     assert summary["rms_end_without_aiming_m"] == optimum.remeasured[1, 1]
