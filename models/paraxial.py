@@ -214,10 +214,10 @@ def with_floating_pupil(telescope: Telescope) -> Telescope:
     DomainError
         If the design data have no stop or no aperture, a surface is off the axis, or the pupil has no finite size.
     """
-    return _floating(telescope)
+    return floating_pupil(telescope)
 
 
-def _floating(telescope: Telescope, *, tilted: bool = False) -> Telescope:
+def floating_pupil(telescope: Telescope, *, tilted: bool = False) -> Telescope:
     """Return :func:`with_floating_pupil`; with `tilted` of surfaces off the axis too, as if they were on it."""
     data = telescope.design_data
     image = stop_image(telescope, front=data.aperture not in ("f_number", "working_f_number"), tilted=tilted)
@@ -273,7 +273,7 @@ def with_moved_pupil(t: Telescope) -> Telescope:
             farther = (t.object_distance - height) / (t.object_distance - t.stop_z)
             diameter = t.pupil_diameter * (abs(farther) if math.isfinite(t.object_distance) else 1.0)
             stated = t.with_design(aperture="entrance_pupil", aperture_value=diameter)
-        return _floating(stated, tilted=True)
+        return floating_pupil(stated, tilted=True)
     return t
 
 
@@ -282,7 +282,7 @@ def stop_makes_pupil(t: Telescope) -> bool:
     if t.design_data.stop is None or t.design_data.aperture is None:
         return False
     try:
-        floating = _floating(t, tilted=True)
+        floating = floating_pupil(t, tilted=True)
     except DomainError:
         return False
     close = {"rel_tol": _ROUNDING, "abs_tol": _ROUNDING * t.pupil_diameter}
@@ -336,7 +336,7 @@ def with_true_aperture(telescope: Telescope) -> Telescope:
 def _states_diameter(t: Telescope) -> bool:
     """Return whether the stated aperture makes the diameter of the pupil, or cannot be compared with it."""
     try:
-        floating = _floating(t, tilted=True)
+        floating = floating_pupil(t, tilted=True)
     except DomainError:
         return True
     return math.isclose(floating.pupil_diameter, t.pupil_diameter, rel_tol=_ROUNDING)

@@ -10,6 +10,7 @@ from ...core.errors import PrescriptionError
 from ..links import Pickup, Solve
 from ..media.fitted import fitted_dispersion
 from ..media.medium import Medium
+from ..paraxial import floating_pupil, stop_makes_pupil
 from ..surface import Interaction
 from ..telescope import Telescope
 from ..thickness import thickness
@@ -74,7 +75,11 @@ def with_formulas(telescope: Telescope, written: Callable[[Medium], object], fin
             (findings.report if deviation > _LARGEST_DEVIATION else findings.note)(problem, instead)
     before, *after = (fits.get(medium, medium) for medium in media)
     surfaces = tuple(replace(s, medium_after=m) for s, m in zip(telescope.surfaces, after, strict=True))
-    return replace(telescope, medium_before=before, surfaces=surfaces) if fits else telescope
+    if not fits:
+        return telescope
+    fitted = replace(telescope, medium_before=before, surfaces=surfaces)
+    # Indices in their last digits change the focal length, and so the pupil of a focal ratio.
+    return floating_pupil(fitted, tilted=True) if stop_makes_pupil(telescope) else fitted
 
 
 def require_met(telescope: Telescope) -> Telescope:
