@@ -9,7 +9,7 @@ from itertools import chain
 import numpy as np
 
 from ...core.errors import DomainError
-from ...models.paraxial import following_stop, stop_makes_pupil, with_moved_pupil, with_true_aperture
+from ...models.paraxial import following_pupil, following_stop, stop_makes_pupil, with_true_aperture
 from ...models.telescope import Telescope
 from .design_task import DesignTask
 from .held_operands import HeldOperand, allowed_deviation
@@ -58,7 +58,7 @@ def settle(
     for count in range(_ROUNDS + 1):
         solved = problem.telescopes(changes)
         telescopes = tuple(
-            final_telescope(lens, configuration.telescope.design_data.aiming)
+            final_telescope(lens, configuration.telescope)
             for lens, configuration in zip(solved, task.configured, strict=True)
         )
         merit = float(np.linalg.norm(problem.merit_part(problem.residuals(changes))))
@@ -127,12 +127,13 @@ def _operand_changes(
     return tuple(changes)
 
 
-def final_telescope(telescope: Telescope, aiming: str) -> Telescope:
-    """Return an optimised telescope with a stated aiming and its stop in its place.
+def final_telescope(solved: Telescope, start: Telescope) -> Telescope:
+    """Return an optimised telescope with the aiming of the start and its stop in its place.
 
     Its entrance pupil is where the stop is imaged now. Without such a pupil rays stay aimed at the stop.
     """
-    if telescope.design_data.aiming == aiming:
-        return with_true_aperture(telescope)
-    stated = with_moved_pupil(telescope).with_design(aiming=aiming)
-    return stated if stop_makes_pupil(stated) else with_true_aperture(telescope)
+    aiming = start.design_data.aiming
+    if solved.design_data.aiming == aiming:
+        return with_true_aperture(solved)
+    stated = following_pupil(solved, start).with_design(aiming=aiming)
+    return stated if stop_makes_pupil(stated) else with_true_aperture(solved)

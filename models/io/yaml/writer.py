@@ -38,7 +38,7 @@ def telescope_to_yaml(telescope: Telescope) -> str:
         "source": t.source or "not stated",
         "version": t.version or "not stated",
         "units": {"length": "m"},
-        "stop": {"z": t.stop_z},
+        "stop": {"z": t.stop_z} | ({"center": list(t.pupil_center)} if any(t.pupil_center) else {}),
         "pupil": {"diameter": t.pupil_diameter, "obscuration": t.pupil_obscuration},
         "launch_distance": t.launch_distance,
         "reference_sphere_radius": t.reference_sphere_radius,
