@@ -41,9 +41,18 @@ def report_unheld(
         Findings(lenient).report(PrescriptionError(f"{names}: {file} has no place for it"), "left out")
 
 
-def report_pupil_plane(telescope: Telescope, findings: Findings, *, own_stop: bool) -> None:
-    """Warn where a plane in front has to carry the stop of a telescope."""
+def report_pupil_plane(telescope: Telescope, findings: Findings, *, own_stop: bool, aimed: str = "off") -> None:
+    """Warn where a plane in front has to carry the stop of a telescope, or its pupil is off the axis.
+
+    `aimed` is the aiming of the program of the file.
+    """
     data = telescope.design_data
+    if any(telescope.pupil_center) and aimed == data.aiming == "off":
+        x, y = (f"{1e3 * v:.6g}" for v in telescope.pupil_center)
+        problem = f"centre of the entrance pupil ({x}, {y}) mm: the file has no place for it"
+        findings.note(
+            PrescriptionError(problem), "read back it is on the axis, but for aimed rays"
+        )
     if data.stop is None or own_stop:
         return
     aimed = data.aiming != "off"
