@@ -293,10 +293,15 @@ def following_pupil(changed: Telescope, unchanged: Telescope) -> Telescope:
     """Return a changed telescope whose entrance pupil has moved with the image of its stop, sideways too.
 
     Where the stop is inside, the pupil moves along the axis as :func:`with_moved_pupil` says. Off the axis it moves by
-    as much as the ray along the axis that passes the middle of the stop.
+    as much as the ray along the axis that passes the middle of the stop. In a telecentric object space it keeps the
+    stated aperture.
     """
+    if changed.design_data.telecentric:
+        with suppress(DomainError):
+            return floating_pupil(changed, tilted=True) if stop_makes_pupil(unchanged) else changed
+        return changed
     moved = with_moved_pupil(changed)
-    if changed.design_data.telecentric or not stop_is_inside(changed):
+    if not stop_is_inside(changed):
         return moved
     with suppress(DomainError):
         if moved is not changed and not stop_makes_pupil(unchanged):

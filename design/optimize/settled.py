@@ -133,6 +133,8 @@ def final_telescope(solved: Telescope, start: Telescope) -> Telescope:
     Its entrance pupil is where the stop is imaged now. Without such a pupil rays stay aimed at the stop.
     """
     aiming = start.design_data.aiming
+    if start.design_data.telecentric:
+        return following_pupil(solved, start)
     if solved.design_data.aiming == aiming:
         return with_true_aperture(solved)
     stated = following_pupil(solved, start).with_design(aiming=aiming)
