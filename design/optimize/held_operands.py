@@ -83,11 +83,6 @@ class HeldOperand:
         if slow and self.heavier == _MOST_FACTORS:
             self.given_up, self.shift, self.factor = True, 0.0, 1.0
             return
-        if slow:
-            self.heavier += 1
-            self.factor *= _HEAVIER
-            # The force on the variables, weight squared times shift, stays.
-            self.shift /= _HEAVIER**2
         if self.stated.value is not None:
             self.shift -= off
         elif self.shift > 0.0 or off < 0.0:
@@ -96,3 +91,8 @@ class HeldOperand:
         elif self.shift < 0.0 or off > 0.0:
             assert self.stated.maximum is not None
             self.shift = min(0.0, self.shift + self.stated.maximum - number)
+        if slow:
+            self.heavier += 1
+            self.factor *= _HEAVIER
+            # The force on the variables, weight squared times shift, stays.
+            self.shift /= _HEAVIER**2

@@ -65,9 +65,11 @@ def written(telescope, path):
 def test_the_reported_merit_is_that_of_every_saved_file(name, tmp_path):
     start = pachon.load_telescope(DATA / name)
     variables = [*(f"{s.name}.radius" for s in curved(start)[:8]), f"{start.surfaces[-2].name}.thickness"]
-    focal_length = pachon.FocalLength(pachon.FocalLength(1.0).measure(following_stop(start)))
+    # Field angles of a near object, and so scales by them, change with the pupil.
+    far = np.isinf(start.object_distance)
+    targets = [pachon.FocalLength(pachon.FocalLength(1.0).measure(following_stop(start)))] if far else []
     optimum = pachon.optimize(
-        start, variables, targets=[focal_length], solver=pachon.LeastSquares(max_steps=15, tolerance=1e-4)
+        start, variables, targets=targets, solver=pachon.LeastSquares(max_steps=15, tolerance=1e-4)
     )
     assert optimum.merits[0] == pytest.approx(rms_of_spots(start), rel=1e-2)
     assert optimum.is_better
