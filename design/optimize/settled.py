@@ -20,6 +20,8 @@ from .problem import DesignProblem, DesignState
 _DIFFERENT = 1e-2
 #: The same, of the merit at the start: the rounding of paths and landing points.
 _ROUNDING = 1e-9
+#: Kinds of fields whose angles change with the telescope.
+_IMAGE_HEIGHTS = ("paraxial_image_height", "real_image_height")
 #: Most solutions after the first one.
 _ROUNDS = 8
 
@@ -77,9 +79,13 @@ def settle(
         changes = resume(problem, changes)
     if not same:
         name = ", ".join(t.name for t in telescopes)
+        heights = any(t.design_data.fields and t.design_data.field_type in _IMAGE_HEIGHTS for t in telescopes)
+        advice = (
+            "; fields are image heights: hold focal length or magnification" if heights else "; limit the variables"
+        )
         raise DomainError(
             f"{name}: the rays of the optimisation have a merit of {merit:.6g} m at its end, and the telescope as it "
-            f"would be saved {measured:.6g} m: expected them within {_DIFFERENT:.0%}; limit the variables"
+            f"would be saved {measured:.6g} m: expected them within {_DIFFERENT:.0%}{advice}"
         )
     stated = tuple(tuple(HeldOperand(goal.stated) for goal in goals) for goals in held)
     return Settled(

@@ -50,9 +50,7 @@ def report_pupil_plane(telescope: Telescope, findings: Findings, *, own_stop: bo
     if any(telescope.pupil_center) and aimed == data.aiming == "off":
         x, y = (f"{1e3 * v:.6g}" for v in telescope.pupil_center)
         problem = f"centre of the entrance pupil ({x}, {y}) mm: the file has no place for it"
-        findings.note(
-            PrescriptionError(problem), "read back it is on the axis, but for aimed rays"
-        )
+        findings.note(PrescriptionError(problem), "read back it is on the axis, but for aimed rays")
     if data.stop is None or own_stop:
         return
     aimed = data.aiming != "off"

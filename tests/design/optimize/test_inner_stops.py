@@ -32,7 +32,7 @@ LENSES = [
 UNHELD = (
     r"telecentric object space: .* has no place for it|.* means 0, 0.7 and 1 times it along y|"
     r"glass .* has no place for its formula|aperture = .* has no place for it|real_image_height|"
-    r"fields = .*: an? .* file has no place for them|field_weights: "
+    r"fields = .*: an? .* file has no place for them"
 )
 
 
@@ -60,10 +60,18 @@ def written(telescope, path):
     return None
 
 
+def load(name):
+    """The lens of a file; fields of the relay are heights of the object, not of an image whose size may change."""
+    telescope = pachon.load_telescope(DATA / name)
+    if telescope.design_data.field_type != "paraxial_image_height":
+        return telescope
+    return telescope.with_design(field_type="object_height", fields=((0.0, 0.0), (0.0, 0.004)), field_weights=())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LENSES)
 def test_the_reported_merit_is_that_of_every_saved_file(name, tmp_path):
-    start = pachon.load_telescope(DATA / name)
+    start = load(name)
     variables = [*(f"{s.name}.radius" for s in curved(start)[:8]), f"{start.surfaces[-2].name}.thickness"]
     # Field angles of a near object, and so scales by them, change with the pupil.
     far = np.isinf(start.object_distance)
@@ -92,7 +100,7 @@ def test_the_reported_merit_is_that_of_every_saved_file(name, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LENSES)
 def test_a_stop_stays_on_its_surface_in_every_format(name, tmp_path):
-    start = pachon.load_telescope(DATA / name)
+    start = load(name)
     first = curved(start)[0].name
     for lens in (start, pachon.apply_changes(start, {f"{first}.curvature": 1.0, f"{first}.dz_um": 20.0})):
         for ending in WRITTEN:
@@ -114,7 +122,7 @@ def test_a_stop_stays_on_its_surface_in_every_format(name, tmp_path):
 @pytest.mark.parametrize("name", LENSES)
 def test_exact_derivatives_are_differences_of_lenses_with_pupils_of_their_own(name):
     """Central differences of landing points of aimed rays, each lens with a new search, to 1e-6 of the largest."""
-    start = following_stop(pachon.load_telescope(DATA / name))
+    start = following_stop(load(name))
     front = curved(start)[0].name
     steps = {f"{front}.curvature": 1e-2, f"{front}.dz": 1e-5, f"{front}.dy": 1e-5, f"{front}.rx": 1e-4}
     request = pachon.Request.of(start, n_pupil=2)
