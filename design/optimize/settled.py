@@ -11,6 +11,7 @@ import numpy as np
 from ...core.errors import DomainError
 from ...models.paraxial import following_pupil, following_stop, stop_makes_pupil, with_true_aperture
 from ...models.telescope import Telescope
+from ...wavefront.vignetting_factors import with_vignetting_factors
 from .design_task import DesignTask
 from .held_operands import HeldOperand, allowed_deviation
 from .optimum import OperandChange
@@ -139,6 +140,9 @@ def final_telescope(solved: Telescope, start: Telescope) -> Telescope:
     Its entrance pupil is where the stop is imaged now. Without such a pupil rays stay aimed at the stop.
     """
     aiming = start.design_data.aiming
+    if start.design_data.remake_vignetting and start.design_data.fields:
+        # Lens files hold the factors alone.
+        solved = with_vignetting_factors(solved)
     if start.design_data.telecentric:
         return following_pupil(solved, start)
     if solved.design_data.aiming == aiming:
