@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -142,3 +143,23 @@ def test_exact_derivatives_are_differences_of_lenses_with_pupils_of_their_own(na
         numeric = (8 * (sides[1] - sides[-1]) - (sides[2] - sides[-2])) / (12 * step)
         largest = np.abs(numeric).max()
         assert np.abs(exact[..., column] - numeric).max() < 1e-6 * largest + 1e-13 / step, address
+
+
+@pytest.mark.slow
+def test_positions_of_a_zoom_lens_have_a_pupil_each(tmp_path):
+    """Radii are shared, a thickness in front of the stop is that of one position."""
+    near = load("lensfiles/stop_inside.zmx")
+    far = replace(pachon.apply_changes(near, {"S2.thickness_mm": 2.0}), name="far")
+    variables = ["S1.radius", "S6.radius", "stop_inside:S2.thickness", "far:S6.thickness", "stop_inside:S6.thickness"]
+    found = pachon.optimize([near, far], variables, n_pupil=4, solver=pachon.LeastSquares(max_steps=8))
+    squares, planes = [], []
+    for position in found.telescopes:
+        path = tmp_path / f"{position.name}.zmx"
+        pachon.save_telescope(position, path)
+        again = pachon.load_telescope(path)
+        assert again.design_data.stop == "S4"
+        squares.append(rms_of_spots(again, n_pupil=4) ** 2)
+        planes.append(again.stop_z)
+    assert found.merits[1] == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-8)
+    assert found.is_better
+    assert abs(planes[0] - planes[1]) > 1e-5
