@@ -40,7 +40,7 @@ def allowed_deviation(operand: Operand, number: float, relative: float, length_u
     return relative * (abs(goal) or (length_unit if operand.unit == "m" else 1.0))
 
 
-@dataclass
+@dataclass(eq=False)
 class HeldOperand:
     """An operand with a goal that moves until its number is the stated one.
 
