@@ -141,8 +141,8 @@ class Telescope(Pictured):
         for key in ("pupil_diameter", "launch_distance", "reference_sphere_radius", "field_radius", "field_limit"):
             if not (np.isfinite(getattr(self, key)) and getattr(self, key) > 0):
                 raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected a positive number")
-        for key, values in (("stop_z", [self.stop_z]), ("pupil_center", self.pupil_center)):
-            if not np.isfinite(values).all():
+        for key in ("stop_z", "pupil_center"):
+            if not np.isfinite(getattr(self, key)).all():
                 raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected a finite number")
         if not 0 <= self.pupil_obscuration < 1:
             raise PrescriptionError(f"pupil_obscuration = {self.pupil_obscuration!r}: expected 0 <= value < 1")

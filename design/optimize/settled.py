@@ -128,9 +128,9 @@ def _operand_changes(
     for configuration, operands, end in zip(task.configured, task.operands, telescopes, strict=True):
         ends = [following_stop(lens) for lens in (configuration.telescope, end)]
         for operand in operands:
-            numbers = [operand.bound(lens).measure(lens) for lens in ends]
-            allowed = allowed_deviation(operand, numbers[1], tolerance, end.length_unit[1])
-            changes.append(OperandChange(operand, end.name, *numbers, allowed))
+            before, after = (operand.bound(lens).measure(lens) for lens in ends)
+            allowed = allowed_deviation(operand, after, tolerance, end.length_unit[1])
+            changes.append(OperandChange(operand, end.name, before, after, allowed))
     return tuple(changes)
 
 

@@ -53,9 +53,8 @@ def report_pupil_plane(telescope: Telescope, findings: Findings, *, own_stop: bo
         findings.note(PrescriptionError(problem), "read back it is on the axis, but for aimed rays")
     if data.stop is None or own_stop:
         return
-    aimed = data.aiming != "off"
     problem = f"stop = {data.stop}, aiming = {data.aiming}: the stop and the stated aperture do not make the pupil"
-    instead = "a plane in front carries the stop" + (", and rays are not aimed" if aimed else "")
+    instead = "a plane in front carries the stop" + (", and rays are not aimed" if data.aiming != "off" else "")
     findings.note(PrescriptionError(problem), instead)
 
 
