@@ -3,11 +3,10 @@
 Run: python benchmarks/optimize_vs_optiland.py [name...]
 
 Starts are optiland's own sample systems. Variables are the radii of all curved surfaces and the last thickness, the
-merit the rms spot radius over the fields at the primary wavelength with the paraxial focal length held, tolerance 1e-6, at most
-60 steps. pachon
-and optiland's LeastSquares take turns, one thread each. Both results are measured by pachon, with rays that fill the
-stop ("spots --aiming real"). Optiland takes part with its default paraxial pupil, and with "robust" aiming where asked
-(--aimed), which fills the stop as pachon does.
+merit the rms spot radius over the fields at the primary wavelength with the paraxial focal length held, tolerance 1e-6,
+at most 60 steps. pachon and optiland's LeastSquares take turns, one thread each. Both results are measured by pachon,
+with rays that fill the stop ("spots --aiming real"). Optiland takes part with its default paraxial pupil, and with
+"robust" aiming where asked (--aimed), which fills the stop as pachon does.
 """
 
 import os
