@@ -73,6 +73,9 @@ class DesignData:
         Radii, conic constants, thicknesses and glasses that follow those of other surfaces.
     solves : tuple of Solve
         Thicknesses that are solved for.
+    remake_vignetting : bool
+        Whether vignetting factors are made anew from the clear apertures of the telescope as it is, in place of those
+        that are stated.
 
     Raises
     ------
@@ -97,6 +100,7 @@ class DesignData:
     afocal: bool = False
     pickups: tuple[Pickup, ...] = ()
     solves: tuple[Solve, ...] = ()
+    remake_vignetting: bool = False
 
     def __post_init__(self) -> None:
         for key, choices in (

@@ -17,6 +17,7 @@ import numpy as np
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
+from .axis_ray import stop_center_point
 from .media.medium import Medium
 from .surface import Interaction, Surface
 from .telescope import Telescope
@@ -28,6 +29,8 @@ _ROUNDING = 1e-12
 #: Largest radius of a reference sphere [m]; paths to a sphere that large are those to a plane, to 1e-10 m at a blur of
 #: a millimetre.
 _LARGEST_SPHERE = 1e4
+#: Cosine of the angle between an axis of a surface and that of the telescope below which the light is folded.
+_FOLDED = 0.9
 #: Smallest radius of a reference sphere, over the diameter of the entrance pupil.
 _SMALLEST_SPHERE = 1e-2
 
@@ -49,21 +52,30 @@ class ParaxialSurfaces:
     def of(cls, telescope: Telescope, stop: str, *, front: bool = False, tilted: bool = False) -> ParaxialSurfaces:
         """Return the surfaces of a telescope, with one of them as the stop; DomainError if one is off the axis.
 
-        With `front` they end with the stop; with `tilted` they may be off the axis, as for Zemax.
+        With `front` they end with the stop; with `tilted` they may be off the axis, as for Zemax, and fold mirrors are
+        unfolded.
         """
         paraxial, medium = cls(), telescope.medium_before
-        z = telescope.surfaces[0].vertex[2]
+        folded = tilted and any(abs(surface.matrix[2, 2]) < _FOLDED for surface in telescope.surfaces)
+        place, axis = np.array(telescope.surfaces[0].vertex), np.array([0.0, 0.0, -1.0])
         for surface in telescope.surfaces:
             if not tilted:
                 require_on_axis(surface, telescope.name)
-            paraxial.advance(z - surface.vertex[2])
-            z = surface.vertex[2]
+            # Counted along the light in front of an even number of mirrors, and against it in front of an odd one.
+            ahead = np.array(surface.vertex) - place
+            paraxial.advance(float(axis @ ahead) if folded else -float(ahead[2]))
+            place = place + axis * (axis @ ahead) if folded else np.array(surface.vertex)
             if surface.name == stop:
                 paraxial.mark_stop(0.0)
+            mirror = surface.interaction == Interaction.MIRROR
+            sign = math.copysign(1.0, axis @ surface.matrix[:, 2])
             x, y = curvatures_across(surface)
-            paraxial.add((-x, -y), medium, surface.medium_after, mirror=surface.interaction == Interaction.MIRROR)
+            paraxial.add((sign * x, sign * y), medium, surface.medium_after, mirror=mirror)
             if front and surface.name == stop:
                 break
+            if mirror and folded:
+                normal = surface.matrix[:, 2]
+                axis = 2.0 * (axis @ normal) * normal - axis
             medium = surface.medium_after
         return paraxial
 
@@ -214,10 +226,10 @@ def with_floating_pupil(telescope: Telescope) -> Telescope:
     DomainError
         If the design data have no stop or no aperture, a surface is off the axis, or the pupil has no finite size.
     """
-    return _floating(telescope)
+    return floating_pupil(telescope)
 
 
-def _floating(telescope: Telescope, *, tilted: bool = False) -> Telescope:
+def floating_pupil(telescope: Telescope, *, tilted: bool = False) -> Telescope:
     """Return :func:`with_floating_pupil`; with `tilted` of surfaces off the axis too, as if they were on it."""
     data = telescope.design_data
     image = stop_image(telescope, front=data.aperture not in ("f_number", "working_f_number"), tilted=tilted)
@@ -273,8 +285,38 @@ def with_moved_pupil(t: Telescope) -> Telescope:
             farther = (t.object_distance - height) / (t.object_distance - t.stop_z)
             diameter = t.pupil_diameter * (abs(farther) if math.isfinite(t.object_distance) else 1.0)
             stated = t.with_design(aperture="entrance_pupil", aperture_value=diameter)
-        return _floating(stated, tilted=True)
+        return floating_pupil(stated, tilted=True)
     return t
+
+
+def following_pupil(changed: Telescope, unchanged: Telescope) -> Telescope:
+    """Return a changed telescope whose entrance pupil has moved with the image of its stop, sideways too.
+
+    Where the stop is inside, the pupil moves along the axis as :func:`with_moved_pupil` says. Off the axis it moves by
+    as much as the ray along the axis that passes the middle of the stop. In a telecentric object space it keeps the
+    stated aperture.
+    """
+    if changed.design_data.telecentric:
+        with suppress(DomainError):
+            return floating_pupil(changed, tilted=True) if stop_makes_pupil(unchanged) else changed
+        return changed
+    moved = with_moved_pupil(changed)
+    if not stop_is_inside(changed):
+        return moved
+    with suppress(DomainError):
+        if moved is not changed and not stop_makes_pupil(unchanged):
+            # The stop makes a pupil that is not the one stated: both move by the same.
+            planes = [
+                floating_pupil(t.with_design(aperture="entrance_pupil", aperture_value=t.pupil_diameter), tilted=True)
+                for t in (changed, unchanged)
+            ]
+            moved = replace(changed, stop_z=changed.stop_z + planes[0].stop_z - planes[1].stop_z)
+    with suppress(DomainError):
+        shift = stop_center_point(moved) - stop_center_point(unchanged)
+        if shift.any():
+            x, y = (float(v) for v in unchanged.pupil_center + shift)
+            moved = replace(moved, pupil_center=(x, y))
+    return moved
 
 
 def stop_makes_pupil(t: Telescope) -> bool:
@@ -282,7 +324,7 @@ def stop_makes_pupil(t: Telescope) -> bool:
     if t.design_data.stop is None or t.design_data.aperture is None:
         return False
     try:
-        floating = _floating(t, tilted=True)
+        floating = floating_pupil(t, tilted=True)
     except DomainError:
         return False
     close = {"rel_tol": _ROUNDING, "abs_tol": _ROUNDING * t.pupil_diameter}
@@ -336,7 +378,7 @@ def with_true_aperture(telescope: Telescope) -> Telescope:
 def _states_diameter(t: Telescope) -> bool:
     """Return whether the stated aperture makes the diameter of the pupil, or cannot be compared with it."""
     try:
-        floating = _floating(t, tilted=True)
+        floating = floating_pupil(t, tilted=True)
     except DomainError:
         return True
     return math.isclose(floating.pupil_diameter, t.pupil_diameter, rel_tol=_ROUNDING)

@@ -83,6 +83,8 @@ class Telescope(Pictured):
         Aperture, fields, wavelengths and stop as the designer stated them, the defaults of calculations.
     site : str, optional
         Name of the site, or path of its file.
+    pupil_center : tuple of float, shape (2,)
+        Centre of the entrance pupil in its plane [m]; off the axis where changes have moved the image of a stop there.
     """
 
     #: Function that error messages name to whoever gives a name in place of a telescope.
@@ -111,6 +113,7 @@ class Telescope(Pictured):
     object_distance: float = math.inf
     design_data: DesignData = field(default_factory=DesignData)
     site: str | None = None
+    pupil_center: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         names = [s.name for s in self.surfaces]
@@ -138,8 +141,9 @@ class Telescope(Pictured):
         for key in ("pupil_diameter", "launch_distance", "reference_sphere_radius", "field_radius", "field_limit"):
             if not (np.isfinite(getattr(self, key)) and getattr(self, key) > 0):
                 raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected a positive number")
-        if not np.isfinite(self.stop_z):
-            raise PrescriptionError(f"stop_z = {self.stop_z!r}: expected a finite number")
+        for key in ("stop_z", "pupil_center"):
+            if not np.isfinite(getattr(self, key)).all():
+                raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected a finite number")
         if not 0 <= self.pupil_obscuration < 1:
             raise PrescriptionError(f"pupil_obscuration = {self.pupil_obscuration!r}: expected 0 <= value < 1")
         if math.isnan(self.object_distance) or self.object_distance == self.stop_z:

@@ -366,6 +366,7 @@ from .wavefront.pupil_sampling import pupil_sampling as pupil_sampling
 from .wavefront.request import Request as Request
 from .wavefront.request import field_points as field_points
 from .wavefront.silicon_focus import focus_height as focus_height
+from .wavefront.vignetting_factors import with_vignetting_factors as with_vignetting_factors
 from .wavefront.zernike import fit_zernikes as fit_zernikes
 
 __version__: str

@@ -37,14 +37,14 @@ def entrance_points(telescope: Telescope, directions: np.ndarray, wavelength: fl
     """Return where rays of pupil points [m] cross the plane of the entrance pupil, [n_pupil, 2] or by direction.
 
     The arguments are those of :func:`~pachon.raytrace.rays.straight_bundles`. Without aiming the points are returned as
-    they are; else their shape is [n_direction, n_pupil, 2], NaN where no ray reaches the point of the stop, and where
-    none does so through its middle.
+    they are, about the centre of the pupil; else their shape is [n_direction, n_pupil, 2], NaN where no ray reaches the
+    point of the stop, and where none does so through its middle.
     """
     data = telescope.design_data
     if data.telecentric:
         return object_points(telescope, directions)[:, None, :2] + pupil
     if data.aiming == "off":
-        return pupil
+        return pupil + telescope.pupil_center if any(telescope.pupil_center) else pupil
     stop = stop_of(telescope)
     relative = pupil / (0.5 * telescope.pupil_diameter)
     relative = np.broadcast_to(relative, (len(directions), *pupil.shape[-2:]))
@@ -141,7 +141,7 @@ def pupil_coordinates(telescope: Telescope, direction: np.ndarray, wavelength: f
     if telescope.design_data.telecentric:
         return points - object_points(telescope, direction[None])[:, :2]
     if telescope.design_data.aiming == "off":
-        return points
+        return points - telescope.pupil_center if any(telescope.pupil_center) else points
     stop = stop_of(telescope)
     rays = straight_bundles(telescope, direction[None], wavelength, points)
     return stop.relative(rays) * (0.5 * telescope.pupil_diameter)

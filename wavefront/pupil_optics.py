@@ -146,7 +146,7 @@ def trace_pupils(
 
     aimed = [request.entrance_points(float(w), pupil) for w in waves]
     if aimed[0].ndim == 2:
-        x, y, traced_path, status = traced(slice(None), np.arange(n_wave), pupil)
+        x, y, traced_path, status = traced(slice(None), np.arange(n_wave), aimed[0])
     else:
         # Every star has pupil points of its own.
         pieces = [

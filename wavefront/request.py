@@ -23,6 +23,7 @@ from ..raytrace.trace import trace
 from .bundles import Bundles
 from .design_fields import design_fields
 from .pupil_sampling import PupilSampling, pupil_sampling
+from .vignetting_factors import made_factors
 
 #: Rays in one part of a request: 15 float64 numbers each, so some 60 MB.
 RAYS_AT_ONCE = 1 << 19
@@ -150,6 +151,8 @@ class Request:
         pupil = pupil_sampling(telescope, "gauss" if sampling is None else sampling, n_pupil)
         primary = telescope.default_wavelength if own_waves else None
         vignetting = np.array(data.vignetting) if fields is None and data.vignetting else None
+        if fields is None and data.fields and data.remake_vignetting:
+            vignetting = made_factors(telescope, design_fields(telescope))
         stated = np.array(data.field_weights) if fields is None and data.field_weights else None
         request = cls(telescope, points, waves, weights, pupil, projection, threads, primary, vignetting, stated)
         _ = request.directions  # an unknown projection is an error of the request, not of its first use

@@ -255,13 +255,11 @@ def _notes(result: Any) -> list[str]:
     s, optimum = result.summary(), _optimum(result)
     unit, (start, end) = "µrad" if optimum.in_angles else "µm", 1e6 * optimum.merits
     lines = [f"rms of {s['merit']}: {start:.6g} -> {end:.6g} {unit}, {s['steps']} steps"]
-    filled, stated = 1e6 * optimum.remeasured.T
+    stated = 1e6 * optimum.remeasured[:, 1]
     if stops := ", ".join(optimum.filled_stops):
         lines.append(f"rays fill the stop {stops}, as with --aiming real; without: {_from_to(stated)} {unit}")
-    if not optimum.is_as_measured:
-        lines.append(f"measured anew on the saved lens, of its light and fields: {_from_to(filled)} {unit}")
     if not optimum.is_better:
-        lines.append(f"not better than the start: {s['merit']} of {_from_to(filled)} {unit}")
+        lines.append(f"not better than the start: {s['merit']} of {_from_to((start, end))} {unit}")
     if s["operands"]:
         start, end = 1e6 * optimum.history[[0, -1]]
         lines.append(f"with operands: {start:.6g} -> {end:.6g} {unit}")
@@ -271,7 +269,10 @@ def _notes(result: Any) -> list[str]:
         unit = "" if name == "1" else f" {name}"
         owner = f" of {evaluation.configuration}" if several else ""
         label, goal = evaluation.operand.label, evaluation.operand.goal_text(size)
-        lines.append(f"{label}{owner}: {evaluation.start / size:.6g} -> {evaluation.end / size:.6g}{unit} ({goal})")
+        off = "" if evaluation.holds else f": not held, off by {evaluation.deviation / size:.3g}{unit}"
+        lines.append(
+            f"{label}{owner}: {evaluation.start / size:.6g} -> {evaluation.end / size:.6g}{unit} ({goal}){off}"
+        )
     lines += _focal_length_notes(optimum)
     lines += _glass_notes(result)
     return lines + [f"collinear: {combination}" for combination in s["collinear"]]

@@ -197,7 +197,7 @@ def _cones_through_the_pupil(request: Request, points: np.ndarray) -> np.ndarray
     The étendue is that of neighbouring fields through one point of the entrance pupil.
     """
     telescope, wavelength, element = request.telescope, request.wavelength, np.ones(len(points))
-    if request.vignetting is not None or telescope.design_data.aiming != "off":
+    if request.vignetting is not None or telescope.design_data.aiming != "off" or any(telescope.pupil_center):
         # The area that an element of the pupil of the request fills in the plane of the entrance pupil.
         step = 0.5 * _STEP * telescope.pupil_diameter
         around = np.concatenate([points, *(points + step * s for s in _STEPS)])
@@ -205,7 +205,8 @@ def _cones_through_the_pupil(request: Request, points: np.ndarray) -> np.ndarray
         element = _determinant(np.array(moved)) / (2.0 * step) ** 2
     # Rays are not aimed again.
     straight = request.at_fields(request.slopes + _STEP * _STEPS)
-    beside = replace(straight, telescope=telescope.with_design(aiming="off"), projection="gnomonic")
+    unaimed = replace(telescope.with_design(aiming="off"), pupil_center=(0.0, 0.0))
+    beside = replace(straight, telescope=unaimed, projection="gnomonic")
     landing = beside.bundles(wavelength, points).landing()
     cosines = beside.launch(wavelength, points).direction.reshape(4, -1, 3)[..., :2]
     # Both over the same change of the field: their ratio is per metre of the detector.

@@ -8,19 +8,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments, removed_arguments
-from ...core.errors import ConfigError, DomainError, PachonError
+from ...core.errors import DomainError
 from ...core.threads import one_blas_thread
 from ...models.parameters.parameters import Parameter
-from ...models.paraxial import following_stop, stop_makes_pupil, with_moved_pupil, with_true_aperture
+from ...models.paraxial import following_stop
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
 from .configuration import DesignConfiguration, configurations
+from .design_task import DesignTask
 from .jacobian import ParameterColumns
 from .merit import Beams, Merit
 from .merit_function import MeritFunction, merit_function
-from .operand import Operand, check_operands
-from .optimum import OperandChange, Optimum
-from .problem import DesignProblem, DesignState
+from .operand import Operand
+from .optimum import Optimum
+from .problem import DesignProblem
+from .settled import settle
 from .solver import LeastSquares
 from .variables import Variable, free_variables, limits
 from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
@@ -89,30 +91,39 @@ def optimize(
         If a variable has no effect, a bound excludes the start, or no ray reaches the image.
     ConfigError, UnknownNameError
         If a merit or variable does not exist, or an operand is given twice.
+    DomainError
+        If the lens that the solver ends with has another merit, measured as it is saved, than that of the solver.
     """
-    function = merit_function(merit)
-    configured = configurations(telescope, fields, wavelengths, n_pupil)
-    states, beams = _states(configured, function, tuple(targets), threads)
+    task = DesignTask(
+        configurations(telescope, fields, wavelengths, n_pupil), merit_function(merit), tuple(targets), threads
+    )
+    solver = solver or LeastSquares()
+    states = task.states()
     telescopes = [state.telescope for state in states]
     problem = DesignProblem(states, free_variables(telescopes, variables))
     box = limits(telescopes, problem.variables, bounds or {})
     start, slopes = problem.linear(np.zeros(len(problem.variables)))
     effect = np.linalg.norm(slopes, axis=0)
     _check_effects(problem, effect)
-    solution = (solver or LeastSquares()).solve(problem, box, bounds or {}, start, effect)
-    values, slopes = problem.linear(solution.changes)
-    if (end := float(np.linalg.norm(values))) != solution.history[-1]:
-        solution.history.append(end)
-    rate = np.array([v.rate(x) for v, x in zip(problem.variables, solution.changes, strict=True)])
+    solution = solver.solve(problem, box, bounds or {}, start, effect)
+
+    def resume(changed: DesignProblem, changes: np.ndarray) -> np.ndarray:
+        return solver.resume(changed, box, changes, effect)
+
+    end = settle(task, problem, solution.changes, resume, solver.constraint_tolerance)
+    values, slopes = end.problem.linear(end.changes)
+    history = np.array([*solution.history, np.linalg.norm(values)])
+    rate = np.array([v.rate(x) for v, x in zip(problem.variables, end.changes, strict=True)])
     covariance, collinear = _covariance(values, slopes, problem.variables, rate)
-    changes = np.array([v.change(x) for v, x in zip(problem.variables, solution.changes, strict=True)])
+    changes = np.array([v.change(x) for v, x in zip(problem.variables, end.changes, strict=True)])
     start_values = np.array([v.start for v in problem.variables])
-    started, solved = tuple(state.telescope for state in configured), problem.telescopes(solution.changes)
-    ended = tuple(
-        final_telescope(after, stated.design_data.aiming) for after, stated in zip(solved, started, strict=True)
+    beams = [state.beams for state in end.problem.states]
+    started = tuple(configuration.telescope for configuration in task.configured)
+    remeasured = np.array(
+        [[task.measured(lenses, filled=filled) for filled in (True, False)] for lenses in (started, end.telescopes)]
     )
     return Optimum(
-        telescopes=ended,
+        telescopes=end.telescopes,
         start_telescopes=started,
         fields=tuple(b.request.fields for b in beams),
         wavelengths=tuple(b.request.wavelengths for b in beams),
@@ -121,11 +132,11 @@ def optimize(
         changes=changes,
         start_values=start_values,
         values=start_values + changes,
-        merit_name=function.name,
-        merits=np.array([np.linalg.norm(problem.merit_part(residuals)) for residuals in (start, values)]),
-        remeasured=np.array([remeasured(configured, lenses, function, threads) for lenses in (started, ended)]),
-        history=np.array(solution.history),
-        operands=_operand_changes(states, solved),
+        merit_name=task.function.name,
+        merits=remeasured[:, 0],
+        remeasured=remeasured,
+        history=history if history[-1] != history[-2] else history[:-1],
+        operands=end.operands,
         effect=np.linalg.norm(slopes, axis=0) / np.abs(rate),
         covariance=covariance,
         collinear=collinear,
@@ -142,14 +153,6 @@ def _check_effects(problem: DesignProblem, effect: np.ndarray) -> None:
             raise DomainError(f"variable {variable.address} has no effect on the merit: leave it out")
 
 
-def _operand_changes(states: Sequence[DesignState], solved: Sequence[Telescope]) -> tuple[OperandChange, ...]:
-    return tuple(
-        OperandChange(operand, state.telescope.name, operand.measure(state.telescope), operand.measure(after))
-        for state, after in zip(states, solved, strict=True)
-        for operand in state.operands
-    )
-
-
 def wavefronts(telescope: Telescope, rays: Beams) -> np.ndarray:
     """Return the wavefronts of a telescope [m], shape [n_field, n_wave, n_pupil], NaN where not lit.
 
@@ -164,37 +167,6 @@ def wavefronts(telescope: Telescope, rays: Beams) -> np.ndarray:
     return np.stack(
         [np.concatenate(FieldWavefronts(columns, request, float(w)).map(lit)) for w in request.wavelengths], axis=1
     )
-
-
-def _states(
-    given: tuple[DesignConfiguration, ...], function: MeritFunction, targets: tuple[Operand, ...], threads: int | None
-) -> tuple[tuple[DesignState, ...], tuple[Beams, ...]]:
-    """Return merit and operands of each configuration, and their rays."""
-    if len(given) > 1 and function.of_one_telescope:
-        raise ConfigError(f"{len(given)} configurations: expected no goal, and the merit 'spots' or 'wavefront'")
-    total, states, beams = sum(configuration.weight for configuration in given), [], []
-    for configuration in given:
-        telescope = following_stop(configuration.telescope)
-        rays = configuration.beams(telescope, threads)
-        operands = (*targets, *configuration.operands)
-        check_operands(operands)
-        bound = []
-        for operand in operands:
-            # An operand that the telescope does not have is an error of the input, not a step that goes too far.
-            bound.append(operand.bound(telescope))
-            _check_start(bound[-1], telescope)
-        states.append(DesignState(telescope, function.of(telescope, rays), tuple(bound), configuration.weight / total))
-        beams.append(rays)
-    return tuple(states), tuple(beams)
-
-
-def _check_start(operand: Operand, telescope: Telescope) -> None:
-    try:
-        number = operand.measure(telescope)
-    except PachonError as error:
-        raise error.within(subject=f"operand {operand.label} of {telescope.name}") from None
-    if not np.isfinite(number):
-        raise DomainError(f"operand {operand.label} of {telescope.name} = {number!r}: expected a finite number")
 
 
 def _covariance(
@@ -216,39 +188,3 @@ def _covariance(
         parts = parts / parts[main[np.argmax(np.abs(mode[main]))]]
         combinations.append(" ".join(f"{parts[i]:+.4g} {variables[i].address}" for i in main))
     return noise * spread @ spread.T, tuple(combinations)
-
-
-def final_telescope(telescope: Telescope, aiming: str) -> Telescope:
-    """Return an optimised telescope with a stated aiming and its stop in its place.
-
-    Its entrance pupil is where the stop is imaged now. Without such a pupil rays stay aimed at the stop.
-    """
-    if telescope.design_data.aiming == aiming:
-        return with_true_aperture(telescope)
-    stated = with_moved_pupil(telescope).with_design(aiming=aiming)
-    return stated if stop_makes_pupil(stated) else with_true_aperture(telescope)
-
-
-def remeasured(
-    states: Sequence[DesignConfiguration], telescopes: Sequence[Telescope], function: MeritFunction, threads: int | None
-) -> tuple[float, float]:
-    """Return the rms merit [m] of telescopes as they stand, of the light that arrives in each.
-
-    With rays that fill the stop, and with rays as the design data of the telescopes state them; NaN without light. The
-    spots are those of :func:`~pachon.design.metrics.spots.spots`.
-    """
-
-    def rms(state: DesignConfiguration, telescope: Telescope) -> float:
-        try:
-            return function.rms(telescope, state.beams(telescope, threads))
-        except PachonError:
-            return np.nan
-
-    total = sum(state.weight for state in states)
-    squares = np.zeros(2)
-    for state, telescope in zip(states, telescopes, strict=True):
-        filled = rms(state, following_stop(telescope))
-        stated = filled if following_stop(telescope) is telescope else rms(state, telescope)
-        squares += state.weight / total * np.array([filled, stated]) ** 2
-    filled, stated = np.sqrt(squares)
-    return float(filled), float(stated)

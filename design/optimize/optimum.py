@@ -13,10 +13,9 @@ from ...models.parameters.parameters import Parameter
 from ...models.paraxial import following_stop
 from ...models.telescope import Telescope
 from .before_after import draw_before_after
+from .held_operands import deviation
 from .operand import Operand
 
-#: Relative difference of the merit measured anew above which it is said.
-_DIFFERENT = 1e-2
 #: Relative difference of two merits that rounding makes.
 _ROUNDING = 1e-9
 
@@ -37,17 +36,30 @@ class OperandChange(Values):
         Name of the telescope.
     start, end : float
         Number before and after, in SI.
+    allowed : float
+        Deviation from value or limit within which the operand is held, in SI.
     """
 
     operand: Operand
     configuration: str
     start: float
     end: float
+    allowed: float
 
     @property
     def goal(self) -> str:
         """Wanted value or limits as text."""
         return self.operand.goal_text()
+
+    @property
+    def deviation(self) -> float:
+        """By how much the number after is above the value or the maximum, negative below the minimum."""
+        return deviation(self.operand, self.end)
+
+    @property
+    def holds(self) -> bool:
+        """Whether the number after is the wanted value, or within the limits."""
+        return abs(self.deviation) <= self.allowed
 
 
 @dataclass(frozen=True)
@@ -75,10 +87,10 @@ class Optimum(Result):
     merit_name : str
         "spots" or "wavefront".
     merits : ndarray, shape [2]
-        Rms of the merit alone [m], without operands, before and after.
+        Rms of the merit alone [m], without operands, before and after: measured on the telescopes as they are saved,
+        of the light that arrives in each, with rays that fill the stop. Spots are those of :func:`pachon.spots`.
     remeasured : ndarray, shape [2, 2]
-        The same of the telescopes as they stand, of the light that arrives in each: before and after, with rays that
-        fill the stop and with rays as the design data state them; NaN where no light arrives.
+        The same, and behind it that with rays as the design data state them; NaN where no light arrives.
     history : ndarray, shape [n_step + 1]
         Rms of merit and operands [m] before the first step and after each.
     operands : tuple of OperandChange
@@ -131,13 +143,13 @@ class Optimum(Result):
 
     @property
     def is_better(self) -> bool:
-        """Whether the merit alone of the telescopes, measured anew with the stop filled, is not above the start's."""
-        return bool(self.remeasured[1, 0] <= (1.0 + _ROUNDING) * self.remeasured[0, 0])
+        """Whether the merit alone is not above that of the start."""
+        return bool(self.merits[1] <= (1.0 + _ROUNDING) * self.merits[0])
 
     @property
-    def is_as_measured(self) -> bool:
-        """Whether the merit, measured anew, is that of the solver within 1 %."""
-        return bool(abs(self.remeasured[1, 0] - self.merits[1]) <= _DIFFERENT * self.merits[1])
+    def operands_not_held(self) -> tuple[OperandChange, ...]:
+        """Operands that are off their value or limits at the end."""
+        return tuple(change for change in self.operands if not change.holds)
 
     @property
     def uncertainty(self) -> np.ndarray:
@@ -193,22 +205,23 @@ class Optimum(Result):
                     "goal": change.goal,
                     "start": change.start,
                     "end": change.end,
+                    "deviation": change.deviation,
+                    "holds": change.holds,
                 }
                 for change in self.operands
             ],
+            "operands_not_held": [change.operand.label for change in self.operands_not_held],
             "collinear": list(self.collinear),
             "message": self.message,
         }
 
     def _remeasured_items(self) -> dict[str, Any]:
-        """Return the merit measured anew where rays fill a stop inside, or where it says something else."""
-        items: dict[str, Any] = {"rays_fill": list(self.filled_stops)} if self.filled_stops else {}
-        if self.filled_stops or not (self.is_better and self.is_as_measured):
-            kinds = ("remeasured", "without_aiming")[: 2 if self.filled_stops else 1]
-            for column, kind in enumerate(kinds):
-                for end, value in zip(("start", "end"), self.remeasured[:, column], strict=True):
-                    items[f"rms_{end}_{kind}_{self._unit}"] = value
-        return items
+        """Return which stops inside rays fill, and the merit of rays that the design data state."""
+        if not self.filled_stops:
+            return {}
+        start, end = self.remeasured[:, 1]
+        unaimed = {f"rms_start_without_aiming_{self._unit}": start, f"rms_end_without_aiming_{self._unit}": end}
+        return {"rays_fill": list(self.filled_stops), **unaimed}
 
     def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw merit and effects of the variables, and the telescope with its spots before and after."""

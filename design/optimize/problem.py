@@ -11,16 +11,17 @@ from ...core.errors import PachonError
 from ...models.parameters.parameters import apply
 from ...models.telescope import Telescope
 from .jacobian import ParameterColumns
-from .merit import Merit
+from .merit import Beams, Merit
 from .operand import Operand
 from .variables import Variable
 
 
 @dataclass(frozen=True)
 class DesignState:
-    """A telescope with its merit, operands and weight in the mean square."""
+    """A telescope with its merit, the rays of it, operands and weight in the mean square."""
 
     telescope: Telescope
+    beams: Beams
     merit: Merit
     operands: tuple[Operand, ...]
     weight: float

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from ...core.arguments import check_arguments
+from ...core.errors import DomainError
 from ...core.units import require_count
 from .problem import DesignProblem
 from .variables import random_starts
 
 #: Effect of the longest first step, in units of the merit at the start.
 _FIRST_STEP = 100.0
+#: Tolerance of solutions that begin at another one: operands are held more exactly than merits are minimised.
+_RESUMED = 1e-8
+#: Most evaluations of such a solution, which is near its start.
+_RESUMED_STEPS = 25
 
 
 @dataclass(frozen=True)
@@ -44,6 +49,9 @@ class LeastSquares:
         between them.
     seed : int
         Seed of the random starts.
+    constraint_tolerance : float
+        Deviation from the value or limit of an operand within which it is held, relative to it; at a goal of zero in
+        the unit of the lens. Infinite: operands are held as their weights do it.
     """
 
     tolerance: float = 1e-10
@@ -51,9 +59,12 @@ class LeastSquares:
     restarts: int = 0
     spread: float = 0.3
     seed: int = 0
+    constraint_tolerance: float = 1e-6
 
     def __post_init__(self) -> None:
         require_count(self.restarts, "restarts", 0)
+        if not self.constraint_tolerance > 0.0:
+            raise DomainError(f"constraint_tolerance = {self.constraint_tolerance!r}: expected a positive number")
 
     def solve(
         self,
@@ -78,7 +89,7 @@ class LeastSquares:
         effect : ndarray, shape [n_variable]
             Rms change of the residuals by each variable, which scales it [m per unit].
         """
-        scale = np.divide(1.0, effect, out=np.ones_like(effect), where=effect > 0)
+        scale = _scale(effect)
         best, history = self._descend(problem, box, np.zeros(len(effect)), residuals, scale)
         for start in random_starts(problem.variables, bounded, box, self.spread, self.seed, self.restarts):
             start_residuals = problem.residuals(start)
@@ -87,6 +98,15 @@ class LeastSquares:
                 if end.cost < best.cost:
                     best, history = end, end_history
         return Solution(best.x * scale, history, str(best.message))
+
+    def resume(
+        self, problem: DesignProblem, box: tuple[np.ndarray, np.ndarray], changes: np.ndarray, effect: np.ndarray
+    ) -> np.ndarray:
+        """Return the solution of a problem that begins at the changes of another one, a little different."""
+        scale, start = _scale(effect), np.clip(changes, *box)
+        finer = replace(self, tolerance=min(self.tolerance, _RESUMED), max_steps=min(self.max_steps, _RESUMED_STEPS))
+        end, _ = finer._descend(problem, box, start, problem.residuals(start), scale)
+        return np.asarray(end.x * scale)
 
     def _descend(
         self,
@@ -119,3 +139,8 @@ class LeastSquares:
             max_nfev=self.max_steps,
         )
         return solution, history
+
+
+def _scale(effect: np.ndarray) -> np.ndarray:
+    """Return the size of each variable that has an effect of 1 m."""
+    return np.divide(1.0, effect, out=np.ones_like(effect), where=effect > 0)

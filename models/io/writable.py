@@ -10,6 +10,7 @@ from ...core.errors import PrescriptionError
 from ..links import Pickup, Solve
 from ..media.fitted import fitted_dispersion
 from ..media.medium import Medium
+from ..paraxial import floating_pupil, stop_makes_pupil
 from ..surface import Interaction
 from ..telescope import Telescope
 from ..thickness import thickness
@@ -40,14 +41,20 @@ def report_unheld(
         Findings(lenient).report(PrescriptionError(f"{names}: {file} has no place for it"), "left out")
 
 
-def report_pupil_plane(telescope: Telescope, findings: Findings, *, own_stop: bool) -> None:
-    """Warn where a plane in front has to carry the stop of a telescope."""
+def report_pupil_plane(telescope: Telescope, findings: Findings, *, own_stop: bool, aimed: str = "off") -> None:
+    """Warn where a plane in front has to carry the stop of a telescope, or its pupil is off the axis.
+
+    `aimed` is the aiming of the program of the file.
+    """
     data = telescope.design_data
+    if any(telescope.pupil_center) and aimed == data.aiming == "off":
+        x, y = (f"{1e3 * v:.6g}" for v in telescope.pupil_center)
+        problem = f"centre of the entrance pupil ({x}, {y}) mm: the file has no place for it"
+        findings.note(PrescriptionError(problem), "read back it is on the axis, but for aimed rays")
     if data.stop is None or own_stop:
         return
-    aimed = data.aiming != "off"
     problem = f"stop = {data.stop}, aiming = {data.aiming}: the stop and the stated aperture do not make the pupil"
-    instead = "a plane in front carries the stop" + (", and rays are not aimed" if aimed else "")
+    instead = "a plane in front carries the stop" + (", and rays are not aimed" if data.aiming != "off" else "")
     findings.note(PrescriptionError(problem), instead)
 
 
@@ -74,7 +81,11 @@ def with_formulas(telescope: Telescope, written: Callable[[Medium], object], fin
             (findings.report if deviation > _LARGEST_DEVIATION else findings.note)(problem, instead)
     before, *after = (fits.get(medium, medium) for medium in media)
     surfaces = tuple(replace(s, medium_after=m) for s, m in zip(telescope.surfaces, after, strict=True))
-    return replace(telescope, medium_before=before, surfaces=surfaces) if fits else telescope
+    if not fits:
+        return telescope
+    fitted = replace(telescope, medium_before=before, surfaces=surfaces)
+    # Indices in their last digits change the focal length, and so the pupil of a focal ratio.
+    return floating_pupil(fitted, tilted=True) if stop_makes_pupil(telescope) else fitted
 
 
 def require_met(telescope: Telescope) -> Telescope:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError
-from ..paraxial import with_moved_pupil
+from ..paraxial import following_pupil
 from ..telescope import Telescope
 from .parameters import Parameter, apply
 
@@ -26,7 +26,8 @@ ANGLES = {
 def apply_changes(telescope: Telescope, changes: Mapping[str, float]) -> Telescope:
     """Return a telescope with changes applied.
 
-    Where the stop has mirrors or lenses in front of it, the entrance pupil moves to where they image it now.
+    Where the stop has mirrors or lenses in front of it, the entrance pupil moves to where they image it now, along the
+    axis and sideways.
 
     Parameters
     ----------
@@ -50,7 +51,7 @@ def apply_changes(telescope: Telescope, changes: Mapping[str, float]) -> Telesco
         if parameter in values:
             raise ConfigError(f"changes.{name}: {parameter.address} is changed twice; expected each once")
         values[parameter] = float(value) * factor
-    return with_moved_pupil(apply(telescope, values)) if values else telescope
+    return following_pupil(apply(telescope, values), telescope) if values else telescope
 
 
 def parse_change(telescope: Telescope, name: str, section: str = "changes") -> tuple[Parameter, float]:

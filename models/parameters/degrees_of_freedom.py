@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, PachonError, check_unique, unknown_name
 from ...core.units import pure_numbers
+from ..paraxial import following_pupil
 from ..shapes.shape import Shape
 from ..shapes.sum import Sum
 from ..telescope import Telescope
@@ -207,7 +208,7 @@ class DegreesOfFreedom:
 
         Deformations are added to the surfaces first, then other parameters change, then bodies move, groups before
         their members: each rotates about its vertex (a group about its pivot) and then shifts. Contributions of several
-        degrees of freedom to one parameter are summed before.
+        degrees of freedom to one parameter are summed before. The entrance pupil follows a stop inside.
 
         Parameters
         ----------
@@ -224,7 +225,8 @@ class DegreesOfFreedom:
             return telescope
         used = self.select(name for name, value in zip(self.names, vector, strict=True) if value)
         prepared, parameters, matrix = used.parameter_matrix(telescope)
-        return apply(prepared, dict(zip(parameters, matrix @ vector[vector != 0.0], strict=True)))
+        changed = apply(prepared, dict(zip(parameters, matrix @ vector[vector != 0.0], strict=True)))
+        return following_pupil(changed, telescope)
 
     def parameter_matrix(self, telescope: Telescope) -> tuple[Telescope, tuple[Parameter, ...], np.ndarray]:
         """Return the matrix from degrees of freedom to parameters.

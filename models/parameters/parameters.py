@@ -33,6 +33,7 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, check_unique, error_context, unknown_name
 from ..media.medium import Medium, abbe_number, with_index_change
+from ..paraxial import following_pupil
 from ..rotation import rotation_matrix
 from ..shapes.shape import Shape
 from ..surface import Interaction
@@ -169,8 +170,12 @@ class ParameterVector:
         return tuple(p.unit or "1" for p in self.parameters)
 
     def apply(self, telescope: Telescope, values: ArrayLike) -> Telescope:
-        """Return the telescope with a vector of changes applied, each in the unit of its parameter."""
-        return apply(telescope, dict(zip(self.parameters, np.asarray(values, dtype=np.float64), strict=True)))
+        """Return the telescope with a vector of changes applied, each in the unit of its parameter.
+
+        The entrance pupil follows a stop inside.
+        """
+        changes = dict(zip(self.parameters, np.asarray(values, dtype=np.float64), strict=True))
+        return following_pupil(apply(telescope, changes), telescope)
 
 
 def parse_parameters(texts: Iterable[str | Parameter], telescope: Telescope) -> tuple[Parameter, ...]:

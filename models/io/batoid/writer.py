@@ -17,7 +17,8 @@ from ...media.medium import Medium
 from ...rotation import rotation_angles
 from ...surface import Interaction, Surface
 from ...telescope import Telescope
-from ..writable import require_sequential
+from ..lens.source import Findings
+from ..writable import report_pupil_plane, require_sequential
 from ..yaml.coatings import coating_items, coating_names
 from ..yaml.design import design_items
 from . import ROOT
@@ -47,6 +48,7 @@ def telescope_to_batoid(telescope: Telescope) -> str:
         require_sequential(t, "a batoid file")
         if math.isfinite(t.object_distance):
             raise PrescriptionError(f"object_distance = {t.object_distance!r}: a batoid file has no object but the sky")
+        report_pupil_plane(t, Findings(), own_stop=True)
         nested = _nested_groups(t)
         system = {
             "type": "CompoundOptic",

@@ -94,7 +94,7 @@ class LensSequence:
             flags = ["afocal"] if data.afocal and not afocal else []
             report_unheld(t, (*data.pickups, *data.solves), file, lenient=lenient, others=flags)
             own_stop = stop_makes_pupil(t) or (aimed != "off" and stop_states_rays(t))
-            report_pupil_plane(t, findings, own_stop=own_stop)
+            report_pupil_plane(t, findings, own_stop=own_stop, aimed=aimed)
             if own_stop and data.aiming != aimed:
                 problem = f"aiming = {data.aiming}: {file} does not state how rays are aimed"
                 findings.note(PrescriptionError(problem), f"read back it is {aimed}")

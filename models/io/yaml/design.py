@@ -12,6 +12,7 @@
       environment: {temperature_k: 293.15, pressure_pa: 101325}
       telecentric: false
       afocal: false
+      remake_vignetting: false
       pickups:                                      # scale times the value of another surface, plus an offset
         - {surface: S7, radius: S1, scale: -1}       # or conic (with conic_offset), thickness, glass
       solves:
@@ -75,6 +76,8 @@ _POINTS = checked(_rows(2), "a list of pairs of numbers")
 Angles = Annotated[Rows, _in_si("angle"), _POINTS]
 Heights = Annotated[Rows, _in_si("length"), _POINTS]
 Vignetting = Annotated[Rows, _in_si("angle", 4), checked(_rows(5), "a list of rows of five numbers")]
+#: Keys of design data that are true or false.
+_FLAGS = ("telecentric", "afocal", "remake_vignetting")
 
 
 class ApertureSection(Section):
@@ -180,6 +183,7 @@ class DesignSection(Section):
     environment: EnvironmentSection | None = None
     telecentric: Flag = False
     afocal: Flag = False
+    remake_vignetting: Flag = False
     pickups: Annotated[tuple[PickupSection, ...], ROWS] = ()
     solves: Annotated[tuple[SolveSection, ...], ROWS] = ()
 
@@ -195,7 +199,7 @@ class DesignSection(Section):
             stated |= {"wavelengths": self.wavelengths.values, "wavelength_weights": self.wavelengths.weights}
         if self.environment is not None:
             stated |= {"temperature": self.environment.temperature_k, "pressure": self.environment.pressure_pa}
-        stated |= {"telecentric": self.telecentric, "afocal": self.afocal}
+        stated |= {name: getattr(self, name) for name in _FLAGS}
         stated["pickups"] = tuple(section.pickup() for section in self.pickups)
         stated["solves"] = tuple(section.solve() for section in self.solves)
         return DesignData(length_unit=self.length, stop=self.stop, aiming=self.aiming, **stated)
@@ -230,7 +234,7 @@ def design_items(data: DesignData) -> dict[str, Any]:
     environment = {"temperature_k": data.temperature, "pressure_pa": data.pressure}
     if stated := {key: value for key, value in environment.items() if value is not None}:
         section["environment"] = stated
-    section |= {key: True for key in ("telecentric", "afocal") if getattr(data, key)}
+    section |= {key: True for key in _FLAGS if getattr(data, key)}
     if data.pickups:
         section["pickups"] = [_pickup_items(pickup) for pickup in data.pickups]
     if data.solves:

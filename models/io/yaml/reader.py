@@ -115,9 +115,10 @@ _BY_SHAPE = Tagged.by_value("shape", {name: section for name, section in _SURFAC
 
 
 class StopSection(Section):
-    """Plane of the entrance pupil."""
+    """Plane of the entrance pupil, and its centre."""
 
     z: Length
+    center: tuple[Length, Length] = (0.0, 0.0)
 
 
 class PupilSection(Section):
@@ -238,6 +239,7 @@ class Prescription(Section):
             version=self.version,
             surfaces=tuple(surfaces),
             stop_z=self.stop.z,
+            pupil_center=self.stop.center,
             pupil_diameter=self.pupil.diameter,
             pupil_obscuration=self.pupil.obscuration,
             launch_distance=self.launch_distance,

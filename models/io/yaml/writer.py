@@ -59,7 +59,8 @@ def _text(t: Telescope, length_unit: str) -> str:
         "source": t.source or "not stated",
         "version": t.version or "not stated",
         "units": {"length": length_unit},
-        "stop": {"z": Metres(t.stop_z)},
+        "stop": {"z": Metres(t.stop_z)}
+        | ({"center": [Metres(v) for v in t.pupil_center]} if any(t.pupil_center) else {}),
         "pupil": {"diameter": Metres(t.pupil_diameter), "obscuration": t.pupil_obscuration},
         "launch_distance": Metres(t.launch_distance),
         "reference_sphere_radius": Metres(t.reference_sphere_radius),

@@ -198,7 +198,11 @@ def test_a_changed_lens_keeps_its_stop_inside(tmp_path, ending, change):
     # The first vertex is the origin of what is read.
     shift = read.surfaces[0].vertex[2] - changed.surfaces[0].vertex[2]
     assert read.stop_z == pytest.approx(changed.stop_z + shift, abs=1e-15)
-    assert_same_rays(changed, read)
+    # Files of lenses have no place for a pupil off the axis; CODE V aims its rays at the stop.
+    assert any(changed.pupil_center) == ("S2.thickness_mm" not in change)
+    said = "centre of the entrance pupil (" in warnings_of(changed, path)
+    assert said == (any(changed.pupil_center) and ending not in (".seq", ".yaml"))
+    assert_same_rays(changed if ending == ".yaml" else replace(changed, pupil_center=(0.0, 0.0)), read)
 
 
 @pytest.mark.parametrize("name", ["lsst_v3.3_r", "paul_baker"])

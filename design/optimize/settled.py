@@ -1,0 +1,151 @@
+"""End of an optimisation: telescopes whose merit is the measured one, and whose operands are held."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+
+import numpy as np
+
+from ...core.errors import DomainError
+from ...models.paraxial import following_pupil, following_stop, stop_makes_pupil, with_true_aperture
+from ...models.telescope import Telescope
+from ...wavefront.vignetting_factors import with_vignetting_factors
+from .design_task import DesignTask
+from .held_operands import HeldOperand, allowed_deviation
+from .optimum import OperandChange
+from .problem import DesignProblem, DesignState
+
+#: Relative difference of the merit of the solver from the measured one that is an error.
+_DIFFERENT = 1e-2
+#: The same, of the merit at the start: the rounding of paths and landing points.
+_ROUNDING = 1e-9
+#: Kinds of fields whose angles change with the telescope.
+_IMAGE_HEIGHTS = ("paraxial_image_height", "real_image_height")
+#: Most solutions after the first one.
+_ROUNDS = 8
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Problem, changes, telescopes and operands at the end of an optimisation."""
+
+    problem: DesignProblem
+    changes: np.ndarray
+    telescopes: tuple[Telescope, ...]
+    operands: tuple[OperandChange, ...]
+
+
+def settle(
+    task: DesignTask,
+    problem: DesignProblem,
+    changes: np.ndarray,
+    resume: Callable[[DesignProblem, np.ndarray], np.ndarray],
+    tolerance: float,
+) -> Settled:
+    """Solve again until the measured merit is that of the solver and operands are held.
+
+    Rays, fields and what operands take from a telescope are those of the start at first. They are made anew from the
+    solution where its merit, measured on the telescopes as they are saved, is another one: where apertures cut other
+    rays, or image heights are the fields and the magnification changes. `resume` solves a changed problem from changes.
+
+    Raises
+    ------
+    DomainError
+        If the measured merit differs from that of the solver by more than one per cent all the same.
+    """
+    start = task.measured([state.telescope for state in problem.states], filled=True)
+    held = tuple(tuple(map(HeldOperand, operands)) for operands in task.operands)
+    weighted_end = changes
+    for count in range(_ROUNDS + 1):
+        solved = problem.telescopes(changes)
+        telescopes = tuple(
+            final_telescope(lens, configuration.telescope)
+            for lens, configuration in zip(solved, task.configured, strict=True)
+        )
+        merit = float(np.linalg.norm(problem.merit_part(problem.residuals(changes))))
+        measured = task.measured(telescopes, filled=True)
+        same = abs(measured - merit) <= _DIFFERENT * merit + _ROUNDING * start
+        operands = _operand_changes(task, telescopes, tolerance)
+        moved = _moved_goals(held, operands)
+        if count == _ROUNDS or (same and not moved):
+            break
+        if any(goal.given_up for goal in moved):
+            # What cannot be reached has drawn the telescope away from the others' solution.
+            changes = weighted_end
+            solved = problem.telescopes(changes)
+        states = problem.states if same else task.remade(solved)
+        problem = DesignProblem(_with_operands(states, held, solved), problem.variables)
+        changes = resume(problem, changes)
+    if not same:
+        name = ", ".join(t.name for t in telescopes)
+        heights = any(t.design_data.fields and t.design_data.field_type in _IMAGE_HEIGHTS for t in telescopes)
+        advice = (
+            "; fields are image heights: hold focal length or magnification" if heights else "; limit the variables"
+        )
+        raise DomainError(
+            f"{name}: the rays of the optimisation have a merit of {merit:.6g} m at its end, and the telescope as it "
+            f"would be saved {measured:.6g} m: expected them within {_DIFFERENT:.0%}{advice}"
+        )
+    stated = tuple(tuple(HeldOperand(goal.stated) for goal in goals) for goals in held)
+    return Settled(
+        DesignProblem(_with_operands(problem.states, stated, solved), problem.variables), changes, telescopes, operands
+    )
+
+
+def _moved_goals(held: tuple[tuple[HeldOperand, ...], ...], operands: tuple[OperandChange, ...]) -> list[HeldOperand]:
+    """Move the goals of operands that are not held; return those that have moved or were given up."""
+    moved = []
+    for goal, change in zip(chain.from_iterable(held), operands, strict=True):
+        if goal.given_up or change.holds:
+            continue
+        goal.move(change.end, change.allowed)
+        moved.append(goal)
+    if moved:
+        for goal, change in zip(chain.from_iterable(held), operands, strict=True):
+            if goal not in moved and goal.shift:
+                # Goals that are farther than they need to be come back.
+                goal.move(change.end, change.allowed)
+    return moved
+
+
+def _with_operands(
+    states: Sequence[DesignState], held: tuple[tuple[HeldOperand, ...], ...], solved: Sequence[Telescope]
+) -> tuple[DesignState, ...]:
+    """Return states with operands of moved goals, and with what these take from solved telescopes."""
+    return tuple(
+        replace(state, operands=tuple(goal.shifted.bound(telescope) for goal in goals))
+        for state, goals, telescope in zip(states, held, solved, strict=True)
+    )
+
+
+def _operand_changes(
+    task: DesignTask, telescopes: tuple[Telescope, ...], tolerance: float
+) -> tuple[OperandChange, ...]:
+    """Return the operands of the telescopes at the start and as they are saved, with rays that fill the stop."""
+    changes = []
+    for configuration, operands, end in zip(task.configured, task.operands, telescopes, strict=True):
+        ends = [following_stop(lens) for lens in (configuration.telescope, end)]
+        for operand in operands:
+            before, after = (operand.bound(lens).measure(lens) for lens in ends)
+            allowed = allowed_deviation(operand, after, tolerance, end.length_unit[1])
+            changes.append(OperandChange(operand, end.name, before, after, allowed))
+    return tuple(changes)
+
+
+def final_telescope(solved: Telescope, start: Telescope) -> Telescope:
+    """Return an optimised telescope with the aiming of the start and its stop in its place.
+
+    Its entrance pupil is where the stop is imaged now. Without such a pupil rays stay aimed at the stop.
+    """
+    aiming = start.design_data.aiming
+    if start.design_data.remake_vignetting and start.design_data.fields:
+        # Lens files hold the factors alone.
+        solved = with_vignetting_factors(solved)
+    if start.design_data.telecentric:
+        return following_pupil(solved, start)
+    if solved.design_data.aiming == aiming:
+        return with_true_aperture(solved)
+    stated = following_pupil(solved, start).with_design(aiming=aiming)
+    return stated if stop_makes_pupil(stated) else with_true_aperture(solved)

@@ -1,0 +1,73 @@
+"""Operands at the end of an optimisation: held exactly, or said not to be; merits that are the measured ones."""
+
+import numpy as np
+import pytest
+
+import pachon
+from pachon.core.errors import DomainError
+from pachon.design.optimize import design_task
+from pachon.models.parameters.parameters import apply
+from pachon.models.thickness import thickness
+
+FIELD = [[0.0, 0.0]]
+
+
+@pytest.fixture
+def singlet(lens):
+    return lens([(50.0, 5.0, "N-BK7"), (-60.0, 50.0, "")], pupil=10.0, field_deg=1.0)
+
+
+def optimized(telescope, variables, targets, **solver):
+    return pachon.optimize(
+        telescope, variables, "spots", FIELD, targets=targets, n_pupil=2, solver=pachon.LeastSquares(**solver)
+    )
+
+
+@pytest.mark.long
+def test_a_weak_limit_is_held_exactly(singlet):
+    """The spots would have the glass thicker; a weight of 1e-3 alone leaves it above its limit."""
+    free = ["S1.curvature", "S2.thickness", "S1.thickness"]
+    focal = pachon.FocalLength(0.05)
+    most = pachon.CenterThickness("S1", maximum=8e-3, weight=1e-3)
+    by_weight = optimized(singlet, free, [focal, most], constraint_tolerance=np.inf)
+    held = optimized(singlet, free, [focal, most])
+    assert thickness(by_weight.telescope, 0) > 8.01e-3
+    assert 7.999e-3 < thickness(held.telescope, 0) <= (1.0 + 1e-6) * 8e-3
+    assert focal.measure(held.telescope) == pytest.approx(0.05, rel=1e-6)
+    assert held.operands_not_held == ()
+    # The optimum on the limit itself: the glass is as thick as that, and no variable.
+    start = apply(singlet, {"S1.thickness": 3e-3})
+    expected = optimized(start, free[:2], [focal])
+    assert held.merits[1] == pytest.approx(expected.merits[1], rel=1e-4)
+    assert held.merits[1] == pytest.approx(pachon.spots(held.telescope, FIELD, n_pupil=2).rms_radius[0], rel=1e-12)
+
+
+@pytest.mark.long
+def test_operands_that_no_lens_has_are_said(singlet):
+    """Both mean one number: what weights make of them stays, and neither is held."""
+    both = [pachon.CenterThickness("S1", value=6e-3), pachon.TotalLength("S1", "S2", maximum=5e-3)]
+    one = optimized(singlet, ["S2.thickness", "S1.thickness"], both)
+    plain = optimized(singlet, ["S2.thickness", "S1.thickness"], both, constraint_tolerance=np.inf)
+    assert one.operands_not_held == one.operands
+    # Equal weights meet in the middle, but for the pull of the spots.
+    assert [c.deviation for c in one.operands] == pytest.approx([-0.5e-3, 0.5e-3], rel=0.01)
+    assert one.merits[1] == pytest.approx(plain.merits[1], rel=1e-4)
+    summary = one.summary()
+    assert summary["operands_not_held"] == ["center_thickness(S1)", "total_length(S1, S2)"]
+    assert [(o["holds"], o["deviation"]) for o in summary["operands"]] == [(False, c.deviation) for c in one.operands]
+
+
+def test_a_merit_that_is_not_that_of_the_lens_is_an_error(singlet, monkeypatch):
+    """However the difference comes about."""
+    measured = design_task.DesignTask.measured
+    monkeypatch.setattr(design_task.DesignTask, "measured", lambda *args, **options: 1.02 * measured(*args, **options))
+    with pytest.raises(DomainError, match=r"^lens: the rays of the optimisation have a merit of .* within 1%"):
+        optimized(singlet, ["S2.thickness"], [])
+    monkeypatch.setattr(design_task.DesignTask, "measured", lambda *args, **options: 1.005 * measured(*args, **options))
+    optimized(singlet, ["S2.thickness"], [])
+
+
+@pytest.mark.parametrize("tolerance", [0.0, -1.0, np.nan])
+def test_a_tolerance_is_positive(tolerance):
+    with pytest.raises(DomainError, match="constraint_tolerance"):
+        pachon.LeastSquares(constraint_tolerance=tolerance)
