@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 #: trend's terms of degree 1 and 2, and so on to its order. Lengths where the extent is 2 wide.
 COLUMNS = 5
 #: Columns before those of the trend.
-_PROCESS_COLUMNS = 3
+PROCESS_COLUMNS = 3
 #: Column of the length of the process.
 _LENGTH = 1
 # Prior mean and standard deviation of the logarithms of variance and length of the process, and of the noise that all
@@ -97,7 +97,7 @@ class Covariances:
 
 def form_name(kernel: np.ndarray) -> str:
     """Return the name of a kernel's form: that of its trend, and the process if there is one."""
-    degree = int(np.flatnonzero(np.concatenate([[1.0], kernel[_PROCESS_COLUMNS:]])).max())
+    degree = int(np.flatnonzero(np.concatenate([[1.0], kernel[PROCESS_COLUMNS:]])).max())
     trend = _TREND_NAMES[degree] if degree < len(_TREND_NAMES) else f"order {degree}"
     return f"{trend}, process" if kernel[0] > 0.0 else trend
 
@@ -112,7 +112,7 @@ def fit_covariances(points: np.ndarray, numbers: np.ndarray, noise: np.ndarray, 
     unit = np.median(noise, axis=0)
     brightest = np.sort(np.argsort(noise.sum(axis=1), kind="stable")[:_MOST_STARS])
     order = order_of(terms.shape[1])
-    degrees = np.arange(1, max(order, COLUMNS - _PROCESS_COLUMNS) + 1)
+    degrees = np.arange(1, max(order, COLUMNS - PROCESS_COLUMNS) + 1)
     expected = np.where(degrees < _FIRST_HIGH_DEGREE, 1.0 - degrees, 3.0 - 3.0 * degrees)
     posterior = Posterior(
         pair_distances(points[brightest], points[brightest]),
@@ -159,7 +159,7 @@ def fit_covariances(points: np.ndarray, numbers: np.ndarray, noise: np.ndarray, 
 
 def _variance_count(present: np.ndarray) -> int:
     """Return the number of variances that a form pays for: of the process, and of degrees 1 and 2."""
-    process, degree = bool(present[0]), int(present[_PROCESS_COLUMNS:].sum())
+    process, degree = bool(present[0]), int(present[PROCESS_COLUMNS:].sum())
     return 1 + min(degree, 1) if process else degree
 
 
@@ -305,7 +305,7 @@ def predict(points: np.ndarray, at: np.ndarray, kernel: np.ndarray, weights: np.
 
 def kernel_covariance(kernel: np.ndarray, distance: np.ndarray, terms: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Return the covariance [n, n] of values at stars of given distances, terms of the trend and noise."""
-    variance, length, floor = kernel[:_PROCESS_COLUMNS]
+    variance, length, floor = kernel[:PROCESS_COLUMNS]
     covariance = variance * np.exp(-distance / length)
     covariance += (terms * trend_variances(kernel, terms.shape[1])) @ terms.T
     covariance[np.diag_indices(len(noise))] += noise + floor
@@ -315,7 +315,7 @@ def kernel_covariance(kernel: np.ndarray, distance: np.ndarray, terms: np.ndarra
 def trend_variances(kernel: np.ndarray, count: int) -> np.ndarray:
     """Return the variance of each term of the trend, [n_terms]: terms stand by degree, d + 1 of degree d."""
     order = order_of(count)
-    return np.repeat([_CONSTANT, *kernel[_PROCESS_COLUMNS : _PROCESS_COLUMNS + order]], np.arange(1, order + 2))
+    return np.repeat([_CONSTANT, *kernel[PROCESS_COLUMNS : PROCESS_COLUMNS + order]], np.arange(1, order + 2))
 
 
 def order_of(count: int) -> int:

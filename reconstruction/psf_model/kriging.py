@@ -1,10 +1,10 @@
 """Kriging of the PSF over a CCD, with the noise of each star.
 
-Every pixel of the stamps is interpolated by one linear rule, the best one for a Gaussian field with the covariances of
+Stars are interpolated by linear rules, the best ones for Gaussian fields with the covariances of
 :mod:`~.psf_model.covariance`: a polynomial trend and an exponential process, each as far as the stars show it. What
 counts is the shape, so these are learnt from three numbers of each star, linear in its pixels: the two components of
-the ellipticity and the size. Most pixels have no signal, and hardly constrain them. The noise of a star is that of its
-outer pixels and of its photons.
+the ellipticity and the size. The pixels follow these numbers, and vary by what they show besides
+(:mod:`~.psf_model.pixel_fields`). The noise of a star is that of its outer pixels and of its photons.
 
 Nothing is left to choose: on constant, linear and quadratic fields this comes near to the best of the polynomials, with
 the best weights, and on turbulent ones it is better (docs/psf_models.md).
@@ -25,6 +25,7 @@ from ...core.threads import one_blas_thread
 from .covariance import COLUMNS, Covariances, fit_covariances, krige, krige_mean, predict
 from .file_parts import ModelParts
 from .interpolation import FittedInterpolation, Interpolation, StarField
+from .pixel_fields import PixelFields, SignalCovariance, fit_pixel_fields, krige_residuals, residuals_left_out
 from .polynomial import MOST_ORDER, mapped
 
 #: Degree of the trend by default.
@@ -72,8 +73,20 @@ class Kriging(Interpolation):
         places = mapped(stars.positions, stars.extent)
         covariances = fit_covariances(places, numbers, noise, stars.terms)
         of_stars = (noise / np.median(noise, axis=0)).mean(axis=1)
-        polynomial, alpha = krige_mean(places, stars.coefficients, stars.terms, covariances, of_stars)
-        return FittedKriging(stars.positions, stars.extent, stars.order, polynomial, 1.0 / of_stars, covariances, alpha)
+        fields = None
+        if stars.basis.kind.has_components:
+            polynomial, alpha = krige_mean(places, stars.coefficients, stars.terms, covariances, of_stars)
+        else:
+            trend, dual = krige_mean(places, numbers, stars.terms, covariances, of_stars)
+            signal = SignalCovariance.of(covariances.kernel, places, stars.terms)
+            at_stars = stars.terms @ trend + predict(places, places, covariances.kernel, dual)
+            pixel_noise = middle_star_noise(stars.images, deviations, mean, of_stars, stars.gain, stars.masked)
+            fields = fit_pixel_fields(mean, deviations, filters, of_stars, pixel_noise, at_stars, signal)
+            residual_trend, residual_dual = krige_residuals(fields.split(deviations)[1], fields, signal, of_stars)
+            polynomial, alpha = trend @ fields.response + residual_trend, dual @ fields.response + residual_dual
+        return FittedKriging(
+            stars.positions, stars.extent, stars.order, polynomial, 1.0 / of_stars, covariances, alpha, fields
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +97,7 @@ class FittedKriging(FittedInterpolation, kind=Kriging):
 
     covariances: Covariances  #: learnt from the stars
     alpha: np.ndarray  #: dual coefficients of the process of mean variance, [n, k]
+    fields: PixelFields | None = None  #: of pixels; None where components are kriged each by the same covariance
 
     @property
     def kernel(self) -> np.ndarray:
@@ -104,12 +118,22 @@ class FittedKriging(FittedInterpolation, kind=Kriging):
         """Return coefficients [n, k] of the stars less their prediction by the others under the same covariances."""
         points = mapped(self.positions, self.extent)
         noise = 1.0 / (np.ones(len(points)) if self.weights is None else self.weights)
-        with one_blas_thread():
-            residuals = (
-                probability * krige(points, coefficients, self.terms(), kernel, noise)[2]
+        terms = self.terms()
+
+        def differences(values: np.ndarray) -> np.ndarray:
+            by_form = (
+                probability * krige(points, values, terms, kernel, noise)[2]
                 for kernel, probability in self.covariances.weighted()
             )
-            return np.asarray(sum(residuals))
+            return np.asarray(sum(by_form))
+
+        with one_blas_thread():
+            if self.fields is None:
+                return differences(coefficients)
+            numbers, residuals = self.fields.split(coefficients)
+            signal = SignalCovariance.of(self.kernel, points, terms)
+            shape_differences = differences(numbers) @ self.fields.response
+            return shape_differences + residuals_left_out(residuals, self.fields, signal, noise)
 
     def truncated(self, count: int) -> Self:
         """Return the interpolation of the first components only."""
@@ -120,6 +144,8 @@ class FittedKriging(FittedInterpolation, kind=Kriging):
         images = {"KERNEL": np.tile(self.kernel, (self.polynomial.shape[1], 1))}
         if len(self.covariances.kernels) > 1:
             images["FORMS"] = np.column_stack([self.covariances.probabilities, self.covariances.kernels])
+        if self.fields is not None:
+            images["FIELDS"] = self.fields.rows()
         return super().parts().extended(images, {"pull": self.alpha})
 
     @classmethod
@@ -127,7 +153,9 @@ class FittedKriging(FittedInterpolation, kind=Kriging):
         forms = parts.images.get("FORMS")
         if forms is None:
             forms = np.concatenate([[1.0], parts.image("KERNEL")[0]])[None]
-        return {"covariances": Covariances(forms[:, 1:], forms[:, 0]), "alpha": parts.columns["pull"]}
+        rows = parts.images.get("FIELDS")
+        fields = None if rows is None else PixelFields.of_rows(rows)
+        return {"covariances": Covariances(forms[:, 1:], forms[:, 0]), "alpha": parts.columns["pull"], "fields": fields}
 
 
 def shape_numbers(
@@ -166,10 +194,8 @@ def star_noise(
     from the mean [ny, nx]. Without gain there is no photon noise. Pixels in `masked` [n, ny, nx], which are filled and
     have no noise of their own, are left out of the scatter of the sky.
     """
-    y, x = np.indices(mean.shape) - np.array(mean.shape)[:, None, None] // 2
-    sky = (np.hypot(x, y) > _SKY * min(mean.shape)).ravel()
-    outer = None if masked is None else masked.reshape(len(images), -1)[:, sky]
-    noise = _sky_variance(deviations[:, sky], outer)[:, None] * (filters**2).sum(axis=1)
+    sky = _sky_pixels(mean.shape)
+    noise = _sky_of_stars(deviations, mean.shape, masked)[:, None] * (filters**2).sum(axis=1)
     if gain is not None:
         electrons = images.sum(axis=(1, 2)) * gain
         if np.median(electrons) < FEWEST_ELECTRONS:
@@ -179,6 +205,34 @@ def star_noise(
             )
         noise = noise + (filters**2 @ np.maximum(mean.ravel(), 0.0)) / electrons[:, None]
     return noise * _correlation_factors(deviations.reshape(-1, *mean.shape), sky.reshape(mean.shape), masked, filters)
+
+
+def middle_star_noise(
+    images: np.ndarray,
+    deviations: np.ndarray,
+    mean: np.ndarray,
+    noise: np.ndarray,
+    gain: float | None,
+    masked: np.ndarray | None = None,
+) -> np.ndarray:
+    """Return the variance of the noise of pixels, [n_pixels], of the star of middle `noise` [n]."""
+    star = int(np.argsort(noise, kind="stable")[len(noise) // 2])
+    sky = _sky_of_stars(deviations, mean.shape, masked)[star]
+    photons = 0.0 if gain is None else np.maximum(mean.ravel(), 0.0) / (images[star].sum() * gain)
+    return np.asarray(sky + photons + np.zeros(mean.size))
+
+
+def _sky_pixels(shape: tuple[int, ...]) -> np.ndarray:
+    """Return the pixels of a stamp that are sky, bool [n_pixels]."""
+    y, x = np.indices(shape) - np.array(shape)[:, None, None] // 2
+    return np.asarray(np.hypot(x, y) > _SKY * min(shape)).ravel()
+
+
+def _sky_of_stars(deviations: np.ndarray, shape: tuple[int, ...], masked: np.ndarray | None) -> np.ndarray:
+    """Return the variance of a pixel of sky of each star, [n], from deviations [n, n_pixels]."""
+    sky = _sky_pixels(shape)
+    outer = None if masked is None else masked.reshape(len(deviations), -1)[:, sky]
+    return _sky_variance(deviations[:, sky], outer)
 
 
 def _correlation_factors(
