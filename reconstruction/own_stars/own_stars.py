@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Unpack
+from typing import Unpack
 
 import numpy as np
 from astropy.units import Quantity
@@ -22,7 +21,6 @@ from ..psf_model import kriging
 from ..psf_model.checks import as_extent
 from ..psf_model.model import ModelOptions, PsfModel
 from ..psf_model.polynomial import as_positions
-from .candidates import CANDIDATES, choose_candidate
 from .masked_stars import (
     apart_from_core,
     as_bad_pixels,
@@ -34,6 +32,8 @@ from .masked_stars import (
 )
 from .result import OwnStars
 
+#: Name of the model where no options are given.
+DEFAULT_KIND = "kriging of pixels"
 #: Fewest stars that a model is made of.
 FEWEST_STARS = 5
 #: Parts of the stars that are held out one after the other.
@@ -103,7 +103,7 @@ def fit_own_stars(
     DomainError
         If stamps are too small, fewer than five stars are left, or the model cannot be made.
     """
-    extent, given_kind = options.get("extent"), {key: value for key, value in options.items() if key != "extent"}
+    extent, model_options = options.get("extent"), {key: value for key, value in options.items() if key != "extent"}
     raw_images, places = real_array(stamps, "stamps: expected real numbers [n, ny, nx]"), as_positions(positions)
     if raw_images.ndim != 3 or len(raw_images) != len(places):
         raise DomainError(
@@ -143,17 +143,15 @@ def fit_own_stars(
         masks = center_masks(bad, first.x, first.y, size)
         return _CentredStars(first, centred, masks, shapes, flags, snr, used, defects, apart)
 
-    def fit(chosen: np.ndarray, kind: Mapping[str, Any]) -> PsfModel:
+    def fit(chosen: np.ndarray) -> PsfModel:
         span = as_extent(extent, places[stars.used])
-        return PsfModel.fit(stars.images[chosen], places[chosen], extent=span, **{"gain": gain, **kind})
+        return PsfModel.fit(stars.images[chosen], places[chosen], extent=span, **{"gain": gain, **model_options})
 
-    def predict(kind: Mapping[str, Any]) -> np.ndarray:
+    def predict() -> np.ndarray:
         predicted = np.empty((len(used_indices), size, size))
         for held_out_indices in parts:
             fitted_indices = np.setdiff1d(np.arange(len(used_indices)), held_out_indices)
-            predicted[held_out_indices] = fit(used_indices[fitted_indices], kind).at(
-                places[used_indices[held_out_indices]]
-            )
+            predicted[held_out_indices] = fit(used_indices[fitted_indices]).at(places[used_indices[held_out_indices]])
         return predicted
 
     images, rms = less_sky(bad)
@@ -185,7 +183,7 @@ def fit_own_stars(
         masked = bad.any(axis=(1, 2))
         complete = wide.usable & ~lost
         for _ in range(_MODEL_PASSES):
-            psfs = fit(np.flatnonzero(stars.used), given_kind).at(places[masked])
+            psfs = fit(np.flatnonzero(stars.used)).at(places[masked])
             sigma = weight_sigma(scale, weight)
             filled[masked], lost[masked] = fill_by_profiles(
                 images[masked],
@@ -205,12 +203,7 @@ def fit_own_stars(
     )
     good = stars.images[used]
     weightless = stars.masks[used] if stars.masks[used].any() else None
-    if given_kind:
-        name, kind = "given", given_kind
-        predicted = predict(kind)
-    else:
-        name, predicted = choose_candidate(predict, good, gain, weightless)
-        kind = CANDIDATES[name]
+    predicted = predict()
     psf = predicted.mean(axis=0)
     stamps_used = good / good.sum(axis=(1, 2), keepdims=True)
     deviations = (stamps_used - psf).reshape(len(used_indices), -1)
@@ -219,7 +212,7 @@ def fit_own_stars(
     sigma = 0.5 * np.sqrt(kriging.star_noise(good, deviations, psf, filters, gain, weightless))
     held_out = _spread(measure_shapes(predicted, scale, weight), used)
     sigmas = np.sqrt((sigma[:, :2] ** 2).mean(axis=1)), sigma[:, 2]
-    model = fit(used_indices, kind)
+    model = fit(used_indices)
     return OwnStars(
         model,
         places,
@@ -234,7 +227,7 @@ def fit_own_stars(
         *sigmas,
         scale,
         weight,
-        name,
+        "given" if model_options else DEFAULT_KIND,
     )
 
 

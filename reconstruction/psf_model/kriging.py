@@ -194,8 +194,9 @@ def star_noise(
     from the mean [ny, nx]. Without gain there is no photon noise. Pixels in `masked` [n, ny, nx], which are filled and
     have no noise of their own, are left out of the scatter of the sky.
     """
-    sky = _sky_pixels(mean.shape)
-    noise = _sky_of_stars(deviations, mean.shape, masked)[:, None] * (filters**2).sum(axis=1)
+    correlations = _noise_correlations(deviations.reshape(-1, *mean.shape), masked)
+    sky_noise = (filters**2).sum(axis=1) * _correlation_factors(correlations, filters, mean.shape)
+    noise = _sky_of_stars(deviations, mean.shape, masked)[:, None] * sky_noise
     if gain is not None:
         electrons = images.sum(axis=(1, 2)) * gain
         if np.median(electrons) < FEWEST_ELECTRONS:
@@ -203,8 +204,10 @@ def star_noise(
                 f"gain = {gain:g}: the middle star has {np.median(electrons):.3g} electrons; expected stamps in "
                 "electrons, gain in electrons a unit, or gain = None for no photon noise"
             )
-        noise = noise + (filters**2 @ np.maximum(mean.ravel(), 0.0)) / electrons[:, None]
-    return noise * _correlation_factors(deviations.reshape(-1, *mean.shape), sky.reshape(mean.shape), masked, filters)
+        photons = filters * np.sqrt(np.maximum(mean.ravel(), 0.0))
+        photon_noise = (photons**2).sum(axis=1) * _correlation_factors(correlations, photons, mean.shape)
+        noise = noise + photon_noise / electrons[:, None]
+    return noise
 
 
 def middle_star_noise(
@@ -235,14 +238,13 @@ def _sky_of_stars(deviations: np.ndarray, shape: tuple[int, ...], masked: np.nda
     return _sky_variance(deviations[:, sky], outer)
 
 
-def _correlation_factors(
-    deviations: np.ndarray, sky: np.ndarray, masked: np.ndarray | None, filters: np.ndarray
-) -> np.ndarray:
-    """Return the variances of the shape numbers over those of noise without correlation of pixels, [3].
+def _noise_correlations(deviations: np.ndarray, masked: np.ndarray | None) -> dict[tuple[int, int], float]:
+    """Return the correlation of the noise of pixels by their lag (rows, columns), where it is significant.
 
-    The correlation of pixels of sky `sky` [ny, nx] of all stars together, deviations [n, ny, nx], counts where it is
-    significant, as after resampling.
+    It is that of pixels of sky of all stars together, deviations [n, ny, nx], as resampling leaves.
     """
+    ny, nx = deviations.shape[1:]
+    sky = _sky_pixels((ny, nx)).reshape(ny, nx)
     pixels = deviations - np.median(deviations, axis=0)
     pixels = (
         pixels
@@ -251,19 +253,34 @@ def _correlation_factors(
     # Cosmic rays and neighbours would correlate.
     used = (np.abs(pixels) < _CLIP) & sky & (True if masked is None else ~masked)
     pixels = np.where(used, pixels, 0.0)
-    ny, nx = sky.shape
-    images = filters.reshape(-1, ny, nx)
-    factors = np.ones(len(filters))
     square = (pixels**2).sum() / max(used.sum(), 1)
+    correlations = {}
     for dy, dx in _LAGS if square > 0.0 else ():
-        first = slice(0, ny - dy), slice(max(0, -dx), nx - max(0, dx))
-        second = slice(dy, ny), slice(max(0, dx), nx + min(0, dx))
+        first, second = _lagged(ny, nx, dy, dx)
         count = max((used[:, *first] & used[:, *second]).sum(), 1)
-        correlation = (pixels[:, *first] * pixels[:, *second]).sum() / (count * square)
+        correlation = float((pixels[:, *first] * pixels[:, *second]).sum() / (count * square))
         if abs(correlation) > _SIGNIFICANT / math.sqrt(count):
-            overlap = (images[:, *first] * images[:, *second]).sum(axis=(1, 2))
-            factors += 2.0 * correlation * overlap / (images**2).sum(axis=(1, 2))
+            correlations[dy, dx] = correlation
+    return correlations
+
+
+def _correlation_factors(
+    correlations: dict[tuple[int, int], float], filters: np.ndarray, shape: tuple[int, ...]
+) -> np.ndarray:
+    """Return the variances of filtered noise, filters [3, n_pixels], over those without correlation of pixels, [3]."""
+    images = filters.reshape(-1, *shape)
+    factors = np.ones(len(images))
+    for lag, correlation in correlations.items():
+        first, second = _lagged(*images.shape[1:], *lag)
+        overlap = (images[:, *first] * images[:, *second]).sum(axis=(1, 2))
+        factors += 2.0 * correlation * overlap / (images**2).sum(axis=(1, 2))
     return np.maximum(factors, _LEAST_FACTOR)
+
+
+def _lagged(ny: int, nx: int, dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Return pixels of an image, and those that are dy rows and dx columns on."""
+    first = slice(0, ny - dy), slice(max(0, -dx), nx - max(0, dx))
+    return first, (slice(dy, ny), slice(max(0, dx), nx + min(0, dx)))
 
 
 def _sky_variance(outer: np.ndarray, masked: np.ndarray | None = None) -> np.ndarray:

@@ -29,6 +29,8 @@ _LEAST_NOISE = 1e-6
 # Factors of the variance of signal over that of noise, in the mean of all stars, of the pixel where it is largest:
 # from what a thousand stars would not show to stars without noise.
 _FACTORS = 4.0 ** np.arange(-8.0, 13.0)
+# Logarithm of the odds from which on evidence counts: twenty to one.
+_LEAST_EVIDENCE = 3.0
 # Stars whose evidence is taken at most, the brightest: the axes cost the cube of their number.
 _MOST_STARS = 300
 
@@ -64,7 +66,7 @@ class PixelFields:
 
 @dataclass(frozen=True, eq=False)
 class SignalCovariance:
-    """Covariance of stars by a kernel, without their noise and without the constant, which is unknown."""
+    """Covariance of stars by a kernel, without noise and without the constant, which is unknown."""
 
     terms: np.ndarray  #: of the trend, [n, n_terms]
     trend_variances: np.ndarray  #: of these terms, 0 for the constant, [n_terms]
@@ -73,10 +75,9 @@ class SignalCovariance:
     @classmethod
     def of(cls, kernel: np.ndarray, points: np.ndarray, terms: np.ndarray) -> SignalCovariance:
         """Return it for a kernel (:data:`~.covariance.COLUMNS`), points [n, 2] and terms [n, n_terms]."""
-        variance, length, common_noise = kernel[:PROCESS_COLUMNS]
+        variance, length, _ = kernel[:PROCESS_COLUMNS]
         variances = np.where(np.arange(terms.shape[1]) == 0, 0.0, trend_variances(kernel, terms.shape[1]))
         covariance = variance * np.exp(-pair_distances(points, points) / length) + (terms * variances) @ terms.T
-        covariance[np.diag_indices(len(points))] += common_noise
         return cls(terms, variances, covariance)
 
 
@@ -110,19 +111,21 @@ class Contrasts:
     def scale_of(self, values: np.ndarray, relative: np.ndarray) -> float:
         """Return the factor of the variances `relative` [k], 1 at most, of values [n, k] that has the largest evidence.
 
-        Values have the same variance of noise, which is unknown. Zero where no factor has more evidence than none.
+        The variance of the noise of each column is unknown. Zero where no factor has the evidence that counts.
         """
         mean_variance = float(self.variances.mean()) if len(self.variances) else 0.0
         if not mean_variance > 0.0:
             return 0.0
         squares = (self.axes.T @ values) ** 2
         spectrum = self.variances[:, None] / mean_variance * relative
-        evidence = [-0.5 * squares.size * np.log(max(squares.sum(), np.finfo(float).tiny))]
-        for factor in _FACTORS:
+        factors = np.concatenate([[0.0], _FACTORS])
+        evidence = np.empty(len(factors))
+        for i, factor in enumerate(factors):
             variance = 1.0 + factor * spectrum
-            power = max((squares / variance).sum(), np.finfo(float).tiny)
-            evidence.append(-0.5 * (np.log(variance).sum() + squares.size * np.log(power)))
-        return float(np.concatenate([[0.0], _FACTORS])[int(np.argmax(evidence))]) / mean_variance
+            power = np.maximum((squares / variance).sum(axis=0), np.finfo(float).tiny)
+            evidence[i] = -0.5 * (np.log(variance).sum() + len(squares) * np.log(power).sum())
+        best = int(np.argmax(evidence))
+        return float(factors[best]) / mean_variance if evidence[best] > evidence[0] + _LEAST_EVIDENCE else 0.0
 
 
 def fit_pixel_fields(

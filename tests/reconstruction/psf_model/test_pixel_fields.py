@@ -63,7 +63,7 @@ def test_residuals_are_kriged_with_a_variance_of_each_pixel(bright):
     """Universal kriging of each pixel with Lagrange's multiplier for its constant, then without shape and flux."""
     model, _, elsewhere = bright
     interpolation = model.interpolation
-    fields, (variance, length, floor, *trend) = interpolation.fields, interpolation.kernel
+    fields, (variance, length, _, *trend) = interpolation.fields, interpolation.kernel
     assert (fields.variances > 0.0).all()
     residuals = fields.split(model.coefficients)[1]
     prior = np.diag(np.repeat([0.0, *trend], np.arange(1, len(trend) + 2)))
@@ -75,7 +75,7 @@ def test_residuals_are_kriged_with_a_variance_of_each_pixel(bright):
         )
 
     places, count = model.positions, model.n_stars
-    of_stars, between = signal(places, places) + floor * np.eye(count), signal(elsewhere, places)
+    of_stars, between = signal(places, places), signal(elsewhere, places)
 
     def predicted(stars, covariances):
         expected = np.empty((len(covariances), model.n_components))
@@ -111,7 +111,8 @@ def test_what_varies_beside_the_shape_is_learnt(bright):
         rms(images.reshape(len(truth), -1)[:, tail], truth.reshape(len(truth), -1)[:, tail])
         for images in (model.at(elsewhere), PsfModel.fit(stars, places, recipe=constant, extent=EXTENT).at(elsewhere))
     ]
-    assert errors[0] < 0.15 * errors[1]
+    # What is left is shrinkage and the noise of forty stars.
+    assert errors[0] < 0.2 * errors[1]
 
 
 @pytest.mark.long
