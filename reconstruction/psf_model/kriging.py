@@ -194,9 +194,10 @@ def star_noise(
     from the mean [ny, nx]. Without gain there is no photon noise. Pixels in `masked` [n, ny, nx], which are filled and
     have no noise of their own, are left out of the scatter of the sky.
     """
-    correlations = _noise_correlations(deviations.reshape(-1, *mean.shape), masked)
+    sky_variance = _sky_of_stars(deviations, mean.shape, masked)
+    correlations = _noise_correlations(deviations.reshape(-1, *mean.shape), sky_variance, masked)
     sky_noise = (filters**2).sum(axis=1) * _correlation_factors(correlations, filters, mean.shape)
-    noise = _sky_of_stars(deviations, mean.shape, masked)[:, None] * sky_noise
+    noise = sky_variance[:, None] * sky_noise
     if gain is not None:
         electrons = images.sum(axis=(1, 2)) * gain
         if np.median(electrons) < FEWEST_ELECTRONS:
@@ -238,14 +239,21 @@ def _sky_of_stars(deviations: np.ndarray, shape: tuple[int, ...], masked: np.nda
     return _sky_variance(deviations[:, sky], outer)
 
 
-def _noise_correlations(deviations: np.ndarray, masked: np.ndarray | None) -> dict[tuple[int, int], float]:
+def _noise_correlations(
+    deviations: np.ndarray, sky_variance: np.ndarray, masked: np.ndarray | None
+) -> dict[tuple[int, int], float]:
     """Return the correlation of the noise of pixels by their lag (rows, columns), where it is significant.
 
-    It is that of pixels of sky of all stars together, deviations [n, ny, nx], as resampling leaves.
+    It is that of pixels of sky of all stars together, deviations [n, ny, nx], as resampling leaves. `sky_variance` [n]
+    is that of a pixel of each star.
     """
+    if not sky_variance.max() > 0.0:
+        return {}
     ny, nx = deviations.shape[1:]
     sky = _sky_pixels((ny, nx)).reshape(ny, nx)
-    pixels = deviations - np.median(deviations, axis=0)
+    # A mean of stars keeps the correlation, their median does not.
+    weights = 1.0 / np.maximum(sky_variance, _LEAST_SKY * sky_variance.max())
+    pixels = deviations - np.tensordot(weights / weights.sum(), deviations, axes=1)
     pixels = (
         pixels
         / np.maximum(RMS_PER_MAD * np.median(np.abs(pixels[:, sky]), axis=1), np.finfo(float).tiny)[:, None, None]
