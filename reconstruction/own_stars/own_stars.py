@@ -66,8 +66,8 @@ def fit_own_stars(
 ) -> OwnStars:
     """Centre stars, mask or leave out defects, model the PSF, and predict each star from others.
 
-    The kind of model is chosen by the stars that are held out: kriging of pixels, unless pixels of order 0 to 2 or
-    principal components, with the noise of each star, predict them better by two standard errors.
+    The model is kriging of pixels, which learns from the stars how smooth the PSF is, a constant included, or that of
+    the options.
 
     Parameters
     ----------
@@ -95,8 +95,7 @@ def fit_own_stars(
     seed : int
         Of the parts that are held out.
     **options
-        Options of :meth:`~.PsfModel.fit`: `extent` of the CCD, by default that of the stars; any other, `recipe` and
-        its keys among them, is for a kind of model without a choice.
+        Options of :meth:`~.PsfModel.fit`, such as `recipe`; the `extent` of the CCD is by default that of the stars.
 
     Raises
     ------
