@@ -29,8 +29,9 @@ _LEAST_NOISE = 1e-6
 # Factors of the variance of signal over that of noise, in the mean of all stars, of the pixel where it is largest:
 # from what a thousand stars would not show to stars without noise.
 _FACTORS = 4.0 ** np.arange(-8.0, 13.0)
-# Logarithm of the odds from which on evidence counts: twenty to one.
-_LEAST_EVIDENCE = 3.0
+# Logarithm of the odds from which on evidence counts: pixels count as independent, and the noise of two in three may
+# be that of their neighbours.
+_LEAST_EVIDENCE = 10.0
 # Stars whose evidence is taken at most, the brightest: the axes cost the cube of their number.
 _MOST_STARS = 300
 
