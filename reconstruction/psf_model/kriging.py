@@ -30,6 +30,9 @@ from .polynomial import MOST_ORDER, mapped
 
 #: Degree of the trend by default.
 ORDER = 4
+# Variance of a second weight under which pixels keep the shape of the model, over that of the first: near to the
+# weights of adaptive moments and of the paper, while the first, wide one has the least noise of all fields.
+_NARROW = 0.4
 # Distance from the centre beyond which a stamp is sky, as a fraction of its side.
 _SKY = 0.35
 # Passes after which the noise of the sky, and the mean of stars that are weighted by it, change no more.
@@ -77,11 +80,13 @@ class Kriging(Interpolation):
         if stars.basis.kind.has_components:
             polynomial, alpha = krige_mean(places, stars.coefficients, stars.terms, covariances, of_stars)
         else:
-            trend, dual = krige_mean(places, numbers, stars.terms, covariances, of_stars)
+            narrow_filters = shape_numbers(mean, deviations, _NARROW * core_variance(mean))[1]
+            all_filters = np.concatenate([filters, narrow_filters])
+            trend, dual = krige_mean(places, deviations @ all_filters.T, stars.terms, covariances, of_stars)
             signal = SignalCovariance.of(covariances.kernel, places, stars.terms)
             at_stars = stars.terms @ trend + predict(places, places, covariances.kernel, dual)
             pixel_noise = middle_star_noise(stars.images, deviations, mean, of_stars, stars.gain, stars.masked)
-            fields = fit_pixel_fields(mean, deviations, filters, of_stars, pixel_noise, at_stars, signal)
+            fields = fit_pixel_fields(mean, deviations, all_filters, of_stars, pixel_noise, at_stars, signal)
             residual_trend, residual_dual = krige_residuals(fields.split(deviations)[1], fields, signal, of_stars)
             polynomial, alpha = trend @ fields.response + residual_trend, dual @ fields.response + residual_dual
         return FittedKriging(
@@ -170,14 +175,20 @@ def shape_numbers(
     y, x = np.indices(mean.shape) - np.array(mean.shape)[:, None, None] // 2
     square = x * x + y * y
     if variance is None:
-        # Wings and noise of the outer pixels would make it that of the stamp.
-        core = np.where(mean > 0.1 * mean.max(), mean, 0.0)
-        variance = (core * square).sum() / core.sum()
+        variance = core_variance(mean)
     weight = np.exp(-0.5 * square / variance)
     light = (weight * mean).sum()
     size = (weight * square * mean).sum() / light
     filters = np.stack([x * x - y * y, 2.0 * x * y, square - size]).reshape(3, -1) * (weight.ravel() / (size * light))
     return deviations @ filters.T, filters
+
+
+def core_variance(mean: np.ndarray) -> float:
+    """Return the mean square of the distance from the centre of a PSF's light above a tenth of its peak [pixel^2]."""
+    y, x = np.indices(mean.shape) - np.array(mean.shape)[:, None, None] // 2
+    # Wings and noise of the outer pixels would make it that of the stamp.
+    core = np.where(mean > 0.1 * mean.max(), mean, 0.0)
+    return float((core * (x * x + y * y)).sum() / core.sum())
 
 
 def star_noise(

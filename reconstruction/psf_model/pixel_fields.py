@@ -22,6 +22,8 @@ import numpy as np
 
 from .covariance import PROCESS_COLUMNS, pair_distances, trend_variances
 
+# Shape numbers to which pixels respond as to a stretch and a magnification; they come first.
+_SHAPE_NUMBERS = 3
 # Variance of a pixel is in proportion to its light, and at least that of this fraction of the brightest one's.
 _FAINTEST = 1e-4
 # Least variance of the noise of a pixel over that of the noisiest: stars without sky noise have dark pixels without.
@@ -40,22 +42,23 @@ _MOST_STARS = 300
 class PixelFields:
     """Split of the pixels' deviations into what follows the shape numbers and residuals."""
 
-    filters: np.ndarray  #: shape numbers of the pixels, [3, n_pixels]
-    response: np.ndarray  #: of the pixels to the shape numbers, [3, n_pixels]
+    filters: np.ndarray  #: shape numbers of the pixels, [m, n_pixels]: three, and those under other weights
+    response: np.ndarray  #: of the pixels to the shape numbers, [m, n_pixels]
     profile: np.ndarray  #: direction along which residuals are made to sum to zero, of unit sum, [n_pixels]
     variances: np.ndarray  #: of residuals, in units of the kernel of the shape numbers, [n_pixels]; 0 for a constant
 
     def rows(self) -> np.ndarray:
-        """Return filters, response, profile and variances as rows of a file, [8, n_pixels]."""
+        """Return filters, response, profile and variances as rows of a file, [2 m + 2, n_pixels]."""
         return np.concatenate([self.filters, self.response, self.profile[None], self.variances[None]])
 
     @classmethod
     def of_rows(cls, rows: np.ndarray) -> PixelFields:
         """Return the fields in the rows of a file."""
-        return cls(rows[:3], rows[3:6], rows[6], rows[7])
+        filters, response = np.split(rows[:-2], 2)
+        return cls(filters, response, rows[-2], rows[-1])
 
     def split(self, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return shape numbers [n, 3] and residuals [n, n_pixels] of deviations [n, n_pixels]."""
+        """Return shape numbers [n, m] and residuals [n, n_pixels] of deviations [n, n_pixels]."""
         numbers = deviations @ self.filters.T
         return numbers, deviations - numbers @ self.response
 
@@ -144,23 +147,26 @@ def fit_pixel_fields(
     ----------
     mean, deviations, filters : array
         Mean PSF [ny, nx] of unit sum, the stars' deviations from it [n, n_pixels], and the filters of their shape
-        numbers [3, n_pixels].
+        numbers [m, n_pixels].
     noise : array
         Variance of each star's noise, in units of the middle star's, [n].
     pixel_noise : array
         Variance of the noise of the middle star's pixels, [n_pixels].
     shapes : array
-        Shape numbers of the model at the stars, [n, 3].
+        Shape numbers of the model at the stars, [n, m].
     signal : SignalCovariance
         Of the shape numbers of the stars.
     """
     weights = 1.0 / noise
     star = mean + (weights @ deviations / weights.sum()).reshape(mean.shape)
-    response = shape_response(star)
-    response = np.linalg.solve(response @ filters.T, response)
     noise_floor = np.maximum(pixel_noise, max(_LEAST_NOISE * pixel_noise.max(), np.finfo(float).tiny))
     relative = np.maximum(star, _FAINTEST * star.max()).ravel() / noise_floor
     relative /= relative.max()
+    # What the further filters see beside the shape is as broad as they are.
+    beside_shape = filters[_SHAPE_NUMBERS:] * noise_floor
+    beside_shape = beside_shape - beside_shape.sum(axis=1, keepdims=True) * star.ravel()
+    response = np.concatenate([shape_response(star), beside_shape])
+    response = np.linalg.solve(response @ filters.T, response)
     fields = PixelFields(filters, response, star.ravel(), np.zeros(star.size))
     brightest = np.sort(np.argsort(noise, kind="stable")[:_MOST_STARS])
 
@@ -169,12 +175,13 @@ def fit_pixel_fields(
         return relative * contrasts.scale_of(residuals[brightest] / np.sqrt(noise_floor), relative)
 
     residuals = fields.split(deviations)[1]
+    shapes = shapes[:, :_SHAPE_NUMBERS]
     shape_covariance = shapes @ shapes.T
     variances = variances_of(residuals, shape_covariance)
     if variances.any():
         weights_of_stars = Contrasts.of(shape_covariance, noise).dual(residuals, variances)
-        correction = fields.shapeless(variances * (shapes.T @ weights_of_stars))
-        fields = PixelFields(filters, response + correction, star.ravel(), fields.variances)
+        response[:_SHAPE_NUMBERS] += fields.shapeless(variances * (shapes.T @ weights_of_stars))
+        fields = PixelFields(filters, response, star.ravel(), fields.variances)
         residuals = fields.split(deviations)[1]
     return PixelFields(filters, fields.response, fields.profile, variances_of(residuals, signal.covariance))
 

@@ -159,7 +159,7 @@ def test_shape_numbers_have_the_mean_trend_and_process_of_large_gaussians(fitted
     assert len(covariances.kernels) > 1
     assert covariances.probabilities.sum() == pytest.approx(1.0, abs=1e-12)
     at_stars, there = (design_matrix(p, EXTENT, 4) for p in (model.positions, elsewhere))
-    expected, alone = np.zeros((len(elsewhere), 3)), {0: 0.0, 17: 0.0}
+    expected, alone = np.zeros((len(elsewhere), len(filters))), {0: 0.0, 17: 0.0}
     for (variance, length, floor, *trend), probability in covariances.weighted():
         prior = np.diag(np.repeat([1e4, *trend], [1, 2, 3, 4, 5]))
 
