@@ -66,10 +66,9 @@ def model_command(
     """Model the PSF of an image from a table of its stars, and show how well it predicts stars that were held out.
 
     Stars are centred; pixels without weight, neighbours and cosmic rays apart from a core are masked; stars with
-    saturated cores, or too little that is not masked, are left out. The kind of model is the one
-    that predicts held-out stars best: kriging of pixels, unless another is clearly better, or that of the options. It
-    leaves the model, STARS_psf.fits; a picture beside it, .png; and all stars with their shapes and what the model made
-    without them predicts, .ecsv.
+    saturated cores, or too little that is not masked, are left out. The model is kriging of pixels, as smooth as the
+    stars say, or that of the options. It leaves the model, STARS_psf.fits; a picture beside it, .png; and all stars
+    with their shapes and what the model made without them predicts, .ecsv.
 
     **Examples**
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import DomainError
-from ...core.statistics import robust_rms
+from ...core.statistics import masked_median, robust_rms
 from ...measure.masked_moments import MOST_MASKED
 from ...measure.pixel_masks import bad_pixels, copied_pixels, fill_symmetric
 from ...measure.shapes import measure_shapes
@@ -168,7 +168,7 @@ def _median_star(images: np.ndarray, bad: np.ndarray, x: np.ndarray, y: np.ndarr
         star = fourier_shift(images[i], *(middle - place))
         stars[i], masks[i] = star / (weight * star).sum(), shift_mask(bad[i], *(middle - place))
     masks[:, masks.all(axis=0)] = False  # a pixel that is bad in all stars has no better median
-    return np.asarray(np.nanmedian(np.where(masks, np.nan, stars), axis=0))
+    return masked_median(stars, masks)
 
 
 def _middle_pixel(shape: tuple[int, ...]) -> np.ndarray:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Unpack
+from typing import Unpack
 
 import numpy as np
 from astropy.units import Quantity
@@ -23,7 +22,6 @@ from ..psf_model.checks import as_extent
 from ..psf_model.colour import as_colours
 from ..psf_model.model import PsfModel, StarOptions
 from ..psf_model.polynomial import as_positions
-from .candidates import CANDIDATES, choose_candidate
 from .masked_stars import (
     apart_from_core,
     as_bad_pixels,
@@ -35,6 +33,8 @@ from .masked_stars import (
 )
 from .result import OwnStars
 
+#: Name of the model where no options are given.
+DEFAULT_KIND = "kriging of pixels"
 #: Fewest stars that a model is made of.
 FEWEST_STARS = 5
 #: Parts of the stars that are held out one after the other.
@@ -67,8 +67,8 @@ def fit_own_stars(
 ) -> OwnStars:
     """Centre stars, mask or leave out defects, model the PSF, and predict each star from others.
 
-    The kind of model is chosen by the stars that are held out: kriging of pixels, unless pixels of order 0 to 2 or
-    principal components, with the noise of each star, predict them better by two standard errors.
+    The model is kriging of pixels, which learns from the stars how smooth the PSF is, a constant included, or that of
+    the options.
 
     Parameters
     ----------
@@ -96,8 +96,8 @@ def fit_own_stars(
     seed : int
         Of the parts that are held out.
     **options
-        Options of :meth:`~.PsfModel.fit`: `extent` of the CCD, by default that of the stars; `colour` of the stars,
-        [n]; any other, `recipe` and its keys among them, is for a kind of model without a choice.
+        Options of :meth:`~.PsfModel.fit`, such as `recipe`, and `colour` of the stars, [n]; the `extent` of the CCD is
+        by default that of the stars.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def fit_own_stars(
         If stamps are too small, fewer than five stars are left, or the model cannot be made.
     """
     extent, colour = options.get("extent"), options.get("colour")
-    given_kind = {key: value for key, value in options.items() if key not in ("extent", "colour")}
+    model_options = {key: value for key, value in options.items() if key not in ("extent", "colour")}
     raw_images, places = real_array(stamps, "stamps: expected real numbers [n, ny, nx]"), as_positions(positions)
     if raw_images.ndim != 3 or len(raw_images) != len(places):
         raise DomainError(
@@ -146,21 +146,25 @@ def fit_own_stars(
         masks = center_masks(bad, first.x, first.y, size)
         return _CentredStars(first, centred, masks, shapes, flags, snr, used, defects, apart)
 
-    def fit(chosen: np.ndarray, kind: Mapping[str, Any]) -> PsfModel:
+    def fit(chosen: np.ndarray) -> PsfModel:
         span = as_extent(extent, places[stars.used])
         return PsfModel.fit(
-            stars.images[chosen], places[chosen], extent=span, colour=colours_of(chosen), **{"gain": gain, **kind}
+            stars.images[chosen],
+            places[chosen],
+            extent=span,
+            colour=colours_of(chosen),
+            **{"gain": gain, **model_options},
         )
 
     def colours_of(chosen: np.ndarray) -> np.ndarray | None:
         return None if colours is None else colours[chosen]
 
-    def predict(kind: Mapping[str, Any]) -> np.ndarray:
+    def predict() -> np.ndarray:
         predicted = np.empty((len(used_indices), size, size))
         for held_out_indices in parts:
             fitted_indices = np.setdiff1d(np.arange(len(used_indices)), held_out_indices)
             predicted_indices = used_indices[held_out_indices]
-            predicted[held_out_indices] = fit(used_indices[fitted_indices], kind).at(
+            predicted[held_out_indices] = fit(used_indices[fitted_indices]).at(
                 places[predicted_indices], colour=colours_of(predicted_indices)
             )
         return predicted
@@ -194,7 +198,7 @@ def fit_own_stars(
         masked = np.asarray(bad.any(axis=(1, 2)))
         complete = wide.usable & ~lost
         for _ in range(_MODEL_PASSES):
-            psfs = fit(np.flatnonzero(stars.used), given_kind).at(places[masked], colour=colours_of(masked))
+            psfs = fit(np.flatnonzero(stars.used)).at(places[masked], colour=colours_of(masked))
             sigma = weight_sigma(scale, weight)
             filled[masked], lost[masked] = fill_by_profiles(
                 images[masked],
@@ -214,12 +218,7 @@ def fit_own_stars(
     )
     good = stars.images[used]
     weightless = stars.masks[used] if stars.masks[used].any() else None
-    if given_kind:
-        name, kind = "given", given_kind
-        predicted = predict(kind)
-    else:
-        name, predicted = choose_candidate(predict, good, gain, weightless)
-        kind = CANDIDATES[name]
+    predicted = predict()
     psf = predicted.mean(axis=0)
     stamps_used = good / good.sum(axis=(1, 2), keepdims=True)
     deviations = (stamps_used - psf).reshape(len(used_indices), -1)
@@ -228,7 +227,7 @@ def fit_own_stars(
     sigma = 0.5 * np.sqrt(kriging.star_noise(good, deviations, psf, filters, gain, weightless))
     held_out = _spread(measure_shapes(predicted, scale, weight), used)
     sigmas = np.sqrt((sigma[:, :2] ** 2).mean(axis=1)), sigma[:, 2]
-    model = fit(used_indices, kind)
+    model = fit(used_indices)
     return OwnStars(
         model,
         places,
@@ -243,7 +242,7 @@ def fit_own_stars(
         *sigmas,
         scale,
         weight,
-        name,
+        "given" if model_options else DEFAULT_KIND,
     )
 
 

@@ -64,7 +64,7 @@ class OwnStars(Result):
     pixel_scale, weight_fwhm : float
         Of the stamps [rad], and of the weight of the moments [rad].
     kind : str
-        Kind of model that was chosen, one of :data:`~.own_stars.candidates.CANDIDATES`; ``given`` where options said.
+        ``kriging of pixels``, the default, or ``given`` where there were options of the model.
     """
 
     _images = ("stamps", "predicted")

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 #: variance of the colour terms, of stars with colours.
 COLUMNS = 5
 #: Columns before those of the trend.
-_PROCESS_COLUMNS = 3
+PROCESS_COLUMNS = 3
 #: Column of the length of the process.
 _LENGTH = 1
 # Prior mean and standard deviation of the logarithms of variance and length of the process, and of the noise that all
@@ -109,7 +109,7 @@ class Covariances:
 
 def form_name(kernel: np.ndarray, *, coloured: bool = False) -> str:
     """Return the name of a kernel's form: that of its trend, and process and colour terms if there are any."""
-    columns = kernel[_PROCESS_COLUMNS : len(kernel) - coloured]
+    columns = kernel[PROCESS_COLUMNS : len(kernel) - coloured]
     degree = int(np.flatnonzero(np.concatenate([[1.0], columns])).max())
     trend = _TREND_NAMES[degree] if degree < len(_TREND_NAMES) else f"order {degree}"
     with_process = f"{trend}, process" if kernel[0] > 0.0 else trend
@@ -129,7 +129,7 @@ def fit_covariances(
     unit = np.median(noise, axis=0)
     brightest = np.sort(np.argsort(noise.sum(axis=1), kind="stable")[:_MOST_STARS])
     order = order_of(terms.shape[1] - colour_count)
-    degrees = np.arange(1, max(order, COLUMNS - _PROCESS_COLUMNS) + 1)
+    degrees = np.arange(1, max(order, COLUMNS - PROCESS_COLUMNS) + 1)
     expected = np.where(degrees < _FIRST_HIGH_DEGREE, 1.0 - degrees, 3.0 - 3.0 * degrees)
     colour_prior = [_COLOUR_PRIOR] * (colour_count > 0)
     middle = np.concatenate([_PRIOR[:, 0], expected, colour_prior])
@@ -196,7 +196,7 @@ def fit_covariances(
 
 def _variance_count(present: np.ndarray) -> int:
     """Return the number of variances that a form pays for: of the process, and of degrees 1 and 2."""
-    process, degree = bool(present[0]), int(present[_PROCESS_COLUMNS:].sum())
+    process, degree = bool(present[0]), int(present[PROCESS_COLUMNS:].sum())
     return 1 + min(degree, 1) if process else degree
 
 
@@ -363,7 +363,7 @@ def kernel_covariance(
     kernel: np.ndarray, distance: np.ndarray, terms: np.ndarray, noise: np.ndarray, colour_count: int = 0
 ) -> np.ndarray:
     """Return the covariance [n, n] of values at stars of given distances, terms of the trend and noise."""
-    variance, length, floor = kernel[:_PROCESS_COLUMNS]
+    variance, length, floor = kernel[:PROCESS_COLUMNS]
     covariance = variance * np.exp(-distance / length)
     covariance += (terms * trend_variances(kernel, terms.shape[1], colour_count)) @ terms.T
     covariance[np.diag_indices(len(noise))] += noise + floor
@@ -376,7 +376,7 @@ def trend_variances(kernel: np.ndarray, count: int, colour_count: int = 0) -> np
     Terms stand by degree, d + 1 of degree d; the last `colour_count` are those of colours.
     """
     order = order_of(count - colour_count)
-    variances = np.repeat([_CONSTANT, *kernel[_PROCESS_COLUMNS : _PROCESS_COLUMNS + order]], np.arange(1, order + 2))
+    variances = np.repeat([_CONSTANT, *kernel[PROCESS_COLUMNS : PROCESS_COLUMNS + order]], np.arange(1, order + 2))
     return np.concatenate([variances, np.full(colour_count, kernel[-1])]) if colour_count else variances
 
 

@@ -1,10 +1,10 @@
 """Kriging of the PSF over a CCD, with the noise of each star.
 
-Every pixel of the stamps is interpolated by one linear rule, the best one for a Gaussian field with the covariances of
+Stars are interpolated by linear rules, the best ones for Gaussian fields with the covariances of
 :mod:`~.psf_model.covariance`: a polynomial trend and an exponential process, each as far as the stars show it. What
 counts is the shape, so these are learnt from three numbers of each star, linear in its pixels: the two components of
-the ellipticity and the size. Most pixels have no signal, and hardly constrain them. The noise of a star is that of its
-outer pixels and of its photons.
+the ellipticity and the size. The pixels follow these numbers, and vary by what they show besides
+(:mod:`~.psf_model.pixel_fields`). The noise of a star is that of its outer pixels and of its photons.
 
 Nothing is left to choose: on constant, linear and quadratic fields this comes near to the best of the polynomials, with
 the best weights, and on turbulent ones it is better (docs/psf_models.md).
@@ -26,10 +26,14 @@ from .colour import FittedColour
 from .covariance import COLUMNS, Covariances, fit_covariances, krige, krige_mean, predict
 from .file_parts import ModelParts
 from .interpolation import FittedInterpolation, Interpolation, StarField
+from .pixel_fields import PixelFields, SignalCovariance, fit_pixel_fields, krige_residuals, residuals_left_out
 from .polynomial import MOST_ORDER, mapped
 
 #: Degree of the trend by default.
 ORDER = 4
+# Variance of a second weight under which pixels keep the shape of the model, over that of the first: near to the
+# weights of adaptive moments and of the paper, while the first, wide one has the least noise of all fields.
+_NARROW = 0.4
 # Distance from the centre beyond which a stamp is sky, as a fraction of its side.
 _SKY = 0.35
 # Passes after which the noise of the sky, and the mean of stars that are weighted by it, change no more.
@@ -74,8 +78,22 @@ class Kriging(Interpolation):
         terms, colour_count = stars.with_colour_terms(), stars.colour_terms.shape[1]
         covariances = fit_covariances(places, numbers, noise, terms, colour_count=colour_count)
         of_stars = (noise / np.median(noise, axis=0)).mean(axis=1)
-        trend, alpha = krige_mean(places, stars.coefficients, terms, covariances, of_stars, colour_count=colour_count)
-        count = stars.terms.shape[1]
+        fields, count = None, stars.terms.shape[1]
+        if stars.basis.kind.has_components:
+            trend, alpha = krige_mean(
+                places, stars.coefficients, terms, covariances, of_stars, colour_count=colour_count
+            )
+        else:
+            narrow_filters = shape_numbers(mean, deviations, _NARROW * core_variance(mean))[1]
+            all_filters = np.concatenate([filters, narrow_filters])
+            shapes = deviations @ all_filters.T
+            shape_trend, dual = krige_mean(places, shapes, terms, covariances, of_stars, colour_count=colour_count)
+            signal = SignalCovariance.of(covariances.kernel, places, terms, colour_count)
+            at_stars = terms @ shape_trend + predict(places, places, covariances.kernel, dual)
+            pixel_noise = middle_star_noise(stars.images, deviations, mean, of_stars, stars.gain, stars.masked)
+            fields = fit_pixel_fields(mean, deviations, all_filters, of_stars, pixel_noise, at_stars, signal)
+            residual_trend, residual_dual = krige_residuals(fields.split(deviations)[1], fields, signal, of_stars)
+            trend, alpha = shape_trend @ fields.response + residual_trend, dual @ fields.response + residual_dual
         return FittedKriging(
             stars.positions,
             stars.extent,
@@ -84,6 +102,7 @@ class Kriging(Interpolation):
             1.0 / of_stars,
             covariances,
             alpha,
+            fields,
             colour=stars.fitted_colour(trend[count:], covariances.colour_probability),
         )
 
@@ -96,6 +115,7 @@ class FittedKriging(FittedInterpolation, kind=Kriging):
 
     covariances: Covariances  #: learnt from the stars
     alpha: np.ndarray  #: dual coefficients of the process of mean variance, [n, k]
+    fields: PixelFields | None = None  #: of pixels; None where components are kriged each by the same covariance
 
     @property
     def kernel(self) -> np.ndarray:
@@ -116,13 +136,22 @@ class FittedKriging(FittedInterpolation, kind=Kriging):
         """Return coefficients [n, k] of the stars less their prediction by the others under the same covariances."""
         points = mapped(self.positions, self.extent)
         noise = 1.0 / (np.ones(len(points)) if self.weights is None else self.weights)
-        with one_blas_thread():
-            terms, colour_count = self.terms(), 0 if self.colour is None else len(self.colour.slope)
-            residuals = (
-                probability * krige(points, coefficients, terms, kernel, noise, colour_count=colour_count)[2]
+        terms, colour_count = self.terms(), 0 if self.colour is None else len(self.colour.slope)
+
+        def differences(values: np.ndarray) -> np.ndarray:
+            by_form = (
+                probability * krige(points, values, terms, kernel, noise, colour_count=colour_count)[2]
                 for kernel, probability in self.covariances.weighted()
             )
-            return np.asarray(sum(residuals))
+            return np.asarray(sum(by_form))
+
+        with one_blas_thread():
+            if self.fields is None:
+                return differences(coefficients)
+            numbers, residuals = self.fields.split(coefficients)
+            signal = SignalCovariance.of(self.kernel, points, terms, colour_count)
+            shape_differences = differences(numbers) @ self.fields.response
+            return shape_differences + residuals_left_out(residuals, self.fields, signal, noise)
 
     def truncated(self, count: int) -> Self:
         """Return the interpolation of the first components only."""
@@ -133,6 +162,8 @@ class FittedKriging(FittedInterpolation, kind=Kriging):
         images = {"KERNEL": np.tile(self.kernel, (self.polynomial.shape[1], 1))}
         if len(self.covariances.kernels) > 1:
             images["FORMS"] = np.column_stack([self.covariances.probabilities, self.covariances.kernels])
+        if self.fields is not None:
+            images["FIELDS"] = self.fields.rows()
         return super().parts().extended(images, {"pull": self.alpha})
 
     @classmethod
@@ -140,8 +171,10 @@ class FittedKriging(FittedInterpolation, kind=Kriging):
         forms = parts.images.get("FORMS")
         if forms is None:
             forms = np.concatenate([[1.0], parts.image("KERNEL")[0]])[None]
-        coloured = FittedColour.in_parts(parts) is not None
-        return {"covariances": Covariances(forms[:, 1:], forms[:, 0], coloured), "alpha": parts.columns["pull"]}
+        rows, coloured = parts.images.get("FIELDS"), FittedColour.in_parts(parts) is not None
+        fields = None if rows is None else PixelFields.of_rows(rows)
+        covariances = Covariances(forms[:, 1:], forms[:, 0], coloured)
+        return {"covariances": covariances, "alpha": parts.columns["pull"], "fields": fields}
 
 
 def shape_numbers(
@@ -156,14 +189,20 @@ def shape_numbers(
     y, x = np.indices(mean.shape) - np.array(mean.shape)[:, None, None] // 2
     square = x * x + y * y
     if variance is None:
-        # Wings and noise of the outer pixels would make it that of the stamp.
-        core = np.where(mean > 0.1 * mean.max(), mean, 0.0)
-        variance = (core * square).sum() / core.sum()
+        variance = core_variance(mean)
     weight = np.exp(-0.5 * square / variance)
     light = (weight * mean).sum()
     size = (weight * square * mean).sum() / light
     filters = np.stack([x * x - y * y, 2.0 * x * y, square - size]).reshape(3, -1) * (weight.ravel() / (size * light))
     return deviations @ filters.T, filters
+
+
+def core_variance(mean: np.ndarray) -> float:
+    """Return the mean square of the distance from the centre of a PSF's light above a tenth of its peak [pixel^2]."""
+    y, x = np.indices(mean.shape) - np.array(mean.shape)[:, None, None] // 2
+    # Wings and noise of the outer pixels would make it that of the stamp.
+    core = np.where(mean > 0.1 * mean.max(), mean, 0.0)
+    return float((core * (x * x + y * y)).sum() / core.sum())
 
 
 def star_noise(
@@ -180,10 +219,10 @@ def star_noise(
     from the mean [ny, nx]. Without gain there is no photon noise. Pixels in `masked` [n, ny, nx], which are filled and
     have no noise of their own, are left out of the scatter of the sky.
     """
-    y, x = np.indices(mean.shape) - np.array(mean.shape)[:, None, None] // 2
-    sky = (np.hypot(x, y) > _SKY * min(mean.shape)).ravel()
-    outer = None if masked is None else masked.reshape(len(images), -1)[:, sky]
-    noise = _sky_variance(deviations[:, sky], outer)[:, None] * (filters**2).sum(axis=1)
+    sky_variance = _sky_of_stars(deviations, mean.shape, masked)
+    correlations = _noise_correlations(deviations.reshape(-1, *mean.shape), sky_variance, masked)
+    sky_noise = (filters**2).sum(axis=1) * _correlation_factors(correlations, filters, mean.shape)
+    noise = sky_variance[:, None] * sky_noise
     if gain is not None:
         electrons = images.sum(axis=(1, 2)) * gain
         if np.median(electrons) < FEWEST_ELECTRONS:
@@ -191,19 +230,55 @@ def star_noise(
                 f"gain = {gain:g}: the middle star has {np.median(electrons):.3g} electrons; expected stamps in "
                 "electrons, gain in electrons a unit, or gain = None for no photon noise"
             )
-        noise = noise + (filters**2 @ np.maximum(mean.ravel(), 0.0)) / electrons[:, None]
-    return noise * _correlation_factors(deviations.reshape(-1, *mean.shape), sky.reshape(mean.shape), masked, filters)
+        photons = filters * np.sqrt(np.maximum(mean.ravel(), 0.0))
+        photon_noise = (photons**2).sum(axis=1) * _correlation_factors(correlations, photons, mean.shape)
+        noise = noise + photon_noise / electrons[:, None]
+    return noise
 
 
-def _correlation_factors(
-    deviations: np.ndarray, sky: np.ndarray, masked: np.ndarray | None, filters: np.ndarray
+def middle_star_noise(
+    images: np.ndarray,
+    deviations: np.ndarray,
+    mean: np.ndarray,
+    noise: np.ndarray,
+    gain: float | None,
+    masked: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the variances of the shape numbers over those of noise without correlation of pixels, [3].
+    """Return the variance of the noise of pixels, [n_pixels], of the star of middle `noise` [n]."""
+    star = int(np.argsort(noise, kind="stable")[len(noise) // 2])
+    sky = _sky_of_stars(deviations, mean.shape, masked)[star]
+    photons = 0.0 if gain is None else np.maximum(mean.ravel(), 0.0) / (images[star].sum() * gain)
+    return np.asarray(sky + photons + np.zeros(mean.size))
 
-    The correlation of pixels of sky `sky` [ny, nx] of all stars together, deviations [n, ny, nx], counts where it is
-    significant, as after resampling.
+
+def _sky_pixels(shape: tuple[int, ...]) -> np.ndarray:
+    """Return the pixels of a stamp that are sky, bool [n_pixels]."""
+    y, x = np.indices(shape) - np.array(shape)[:, None, None] // 2
+    return np.asarray(np.hypot(x, y) > _SKY * min(shape)).ravel()
+
+
+def _sky_of_stars(deviations: np.ndarray, shape: tuple[int, ...], masked: np.ndarray | None) -> np.ndarray:
+    """Return the variance of a pixel of sky of each star, [n], from deviations [n, n_pixels]."""
+    sky = _sky_pixels(shape)
+    outer = None if masked is None else masked.reshape(len(deviations), -1)[:, sky]
+    return _sky_variance(deviations[:, sky], outer)
+
+
+def _noise_correlations(
+    deviations: np.ndarray, sky_variance: np.ndarray, masked: np.ndarray | None
+) -> dict[tuple[int, int], float]:
+    """Return the correlation of the noise of pixels by their lag (rows, columns), where it is significant.
+
+    It is that of pixels of sky of all stars together, deviations [n, ny, nx], as resampling leaves. `sky_variance` [n]
+    is that of a pixel of each star.
     """
-    pixels = deviations - np.median(deviations, axis=0)
+    if not sky_variance.max() > 0.0:
+        return {}
+    ny, nx = deviations.shape[1:]
+    sky = _sky_pixels((ny, nx)).reshape(ny, nx)
+    # A mean of stars keeps the correlation, their median does not.
+    weights = 1.0 / np.maximum(sky_variance, _LEAST_SKY * sky_variance.max())
+    pixels = deviations - np.tensordot(weights / weights.sum(), deviations, axes=1)
     pixels = (
         pixels
         / np.maximum(RMS_PER_MAD * np.median(np.abs(pixels[:, sky]), axis=1), np.finfo(float).tiny)[:, None, None]
@@ -211,19 +286,34 @@ def _correlation_factors(
     # Cosmic rays and neighbours would correlate.
     used = (np.abs(pixels) < _CLIP) & sky & (True if masked is None else ~masked)
     pixels = np.where(used, pixels, 0.0)
-    ny, nx = sky.shape
-    images = filters.reshape(-1, ny, nx)
-    factors = np.ones(len(filters))
     square = (pixels**2).sum() / max(used.sum(), 1)
+    correlations = {}
     for dy, dx in _LAGS if square > 0.0 else ():
-        first = slice(0, ny - dy), slice(max(0, -dx), nx - max(0, dx))
-        second = slice(dy, ny), slice(max(0, dx), nx + min(0, dx))
+        first, second = _lagged(ny, nx, dy, dx)
         count = max((used[:, *first] & used[:, *second]).sum(), 1)
-        correlation = (pixels[:, *first] * pixels[:, *second]).sum() / (count * square)
+        correlation = float((pixels[:, *first] * pixels[:, *second]).sum() / (count * square))
         if abs(correlation) > _SIGNIFICANT / math.sqrt(count):
-            overlap = (images[:, *first] * images[:, *second]).sum(axis=(1, 2))
-            factors += 2.0 * correlation * overlap / (images**2).sum(axis=(1, 2))
+            correlations[dy, dx] = correlation
+    return correlations
+
+
+def _correlation_factors(
+    correlations: dict[tuple[int, int], float], filters: np.ndarray, shape: tuple[int, ...]
+) -> np.ndarray:
+    """Return the variances of filtered noise, filters [3, n_pixels], over those without correlation of pixels, [3]."""
+    images = filters.reshape(-1, *shape)
+    factors = np.ones(len(images))
+    for lag, correlation in correlations.items():
+        first, second = _lagged(*images.shape[1:], *lag)
+        overlap = (images[:, *first] * images[:, *second]).sum(axis=(1, 2))
+        factors += 2.0 * correlation * overlap / (images**2).sum(axis=(1, 2))
     return np.maximum(factors, _LEAST_FACTOR)
+
+
+def _lagged(ny: int, nx: int, dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Return pixels of an image, and those that are dy rows and dx columns on."""
+    first = slice(0, ny - dy), slice(max(0, -dx), nx - max(0, dx))
+    return first, (slice(dy, ny), slice(max(0, dx), nx + min(0, dx)))
 
 
 def _sky_variance(outer: np.ndarray, masked: np.ndarray | None = None) -> np.ndarray:

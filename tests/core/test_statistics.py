@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pachon.core.statistics import finite_mean, finite_median, rms, robust_rms
+from pachon.core.statistics import finite_mean, finite_median, masked_median, rms, robust_rms
 
 
 def test_values_that_are_not_finite_are_left_out():
@@ -22,3 +22,14 @@ def test_robust_rms_is_that_of_the_noise_below_outliers():
     middles = [np.median(row[np.isfinite(row)]) for row in table]
     restated = [1.4826 * np.median(np.abs(r[np.isfinite(r)] - m)) for r, m in zip(table, middles, strict=True)]
     assert robust_rms(table, axis=1) == pytest.approx(restated, rel=1e-15)
+
+
+@pytest.mark.parametrize("count", [1, 6, 7])
+def test_masked_median_is_that_of_the_other_values(count):
+    rng = np.random.default_rng(count)
+    values, masks = rng.normal(size=(count, 4, 5)), rng.random((count, 4, 5)) < 0.3
+    values[0, 1, 1], masks[:, 2, 2] = np.nan, True
+    medians = masked_median(values, masks)
+    for at in np.ndindex(4, 5):
+        good = values[:, *at][~masks[:, *at] & ~np.isnan(values[:, *at])]
+        assert np.array_equal(medians[at], np.median(good) if len(good) else np.nan, equal_nan=True)

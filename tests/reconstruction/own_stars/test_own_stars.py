@@ -13,7 +13,6 @@ from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError
 from pachon.measure.shapes import measure_shapes
 from pachon.measure.star_selection import StarFlag
-from pachon.reconstruction.own_stars.candidates import CANDIDATES, choose_candidate
 from pachon.reconstruction.own_stars.own_stars import fit_own_stars
 from pachon.reconstruction.own_stars.star_catalogue import StarCutouts, load_stars
 
@@ -100,40 +99,6 @@ def test_the_parts_held_out_are_those_of_the_seed(stars, own):
     assert not np.array_equal(other.predicted, one.predicted)
     assert (one.kind, own.kind) == ("given", "kriging of pixels")
     assert (one.model.order, one.model.interpolation.name) == (1, "polynomial")
-
-
-def predictions(residuals):
-    """Stars of unit sum with residuals of e1 and so on from each kind of model, by name."""
-    rng = np.random.default_rng(0)
-    x = np.indices((SIZE, SIZE))[1] - SIZE // 2
-    mean = profiles(np.full((1, 2), 2000.0), np.zeros(1), np.zeros(1))[0]
-    stars = np.repeat(mean[None], 40, axis=0) * 1e5
-    stars += rng.normal(size=stars.shape) * np.sqrt(SKY**2 + stars)
-    found = {name: stars / stars.sum(axis=(1, 2), keepdims=True) for name in CANDIDATES}
-    shape = mean * (np.abs(x) > 2) - mean * (np.abs(x) <= 2)
-    return stars, {name: images - residuals[name][:, None, None] * shape for name, images in found.items()}
-
-
-@pytest.mark.parametrize(("size", "chosen"), [(0.5, "pixels, order 1"), (0.97, "kriging of pixels")])
-def test_another_kind_must_be_better_by_two_standard_errors(size, chosen):
-    rng = np.random.default_rng(3)
-    residuals = {name: 0.02 * rng.normal(size=40) for name in CANDIDATES}
-    residuals = {name: values / values.std() * 0.02 for name, values in residuals.items()}
-    residuals["pixels, order 1"] = size * residuals["pixels, order 1"]
-    stars, found = predictions(residuals)
-    tried = []
-
-    def predict(options):
-        name = next(name for name, each in CANDIDATES.items() if each is options)
-        tried.append(name)
-        if name == "principal components":
-            raise ConfigError("too few stars")
-        return found[name]
-
-    name, predicted = choose_candidate(predict, stars, 1.0)
-    assert name == chosen
-    assert predicted is found[chosen]
-    assert tried == list(CANDIDATES)
 
 
 def test_names_of_columns_of_sextractor(stars, tmp_path):

@@ -84,7 +84,6 @@ def test_a_constant_is_no_worse_and_turbulence_much_better(kind):
 @pytest.mark.parametrize("count", [10, 20, 40, 80, 200])
 @pytest.mark.parametrize("kind", [*KINDS])
 def test_the_default_is_within_a_twentieth_of_the_best(kind, count, correlated):
-    seeds = range(100, 100 + {10: 60, 20: 60, 40: 40, 80: 30, 200: 20}[count])
-    # The noise of shapes is known less well where that of the pixels is correlated.
-    most = 1.1 if correlated else 1.05
-    assert (ratios(kind, count, seeds, correlated=correlated) < most).all()
+    # Sixty fields of ten stars are good to 0.03 only.
+    seeds = range(100, 100 + {10: 240, 20: 120, 40: 40, 80: 30, 200: 20}[count])
+    assert (ratios(kind, count, seeds, correlated=correlated) < 1.05).all()

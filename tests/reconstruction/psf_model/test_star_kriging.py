@@ -151,13 +151,15 @@ def fitted():
     return PsfModel.fit(stars, places, **OPTIONS), stars, elsewhere
 
 
-def test_trend_and_process_are_the_mean_of_those_of_large_gaussians(fitted):
+def test_shape_numbers_have_the_mean_trend_and_process_of_large_gaussians(fitted):
     model, _, elsewhere = fitted
+    filters = model.interpolation.fields.filters
+    numbers = model.coefficients @ filters.T
     covariances = model.interpolation.covariances
     assert len(covariances.kernels) > 1
     assert covariances.probabilities.sum() == pytest.approx(1.0, abs=1e-12)
     at_stars, there = (design_matrix(p, EXTENT, 4) for p in (model.positions, elsewhere))
-    expected, alone = np.zeros((len(elsewhere), model.n_components)), {0: 0.0, 17: 0.0}
+    expected, alone = np.zeros((len(elsewhere), len(filters))), {0: 0.0, 17: 0.0}
     for (variance, length, floor, *trend), probability in covariances.weighted():
         prior = np.diag(np.repeat([1e4, *trend], [1, 2, 3, 4, 5]))
 
@@ -167,16 +169,16 @@ def test_trend_and_process_are_the_mean_of_those_of_large_gaussians(fitted):
 
         of_stars = signal(model.positions, model.positions, at_stars, at_stars) + np.diag(1.0 / model.weights + floor)
         between = signal(elsewhere, model.positions, there, at_stars)
-        expected += probability * between @ np.linalg.solve(of_stars, model.coefficients)
+        expected += probability * between @ np.linalg.solve(of_stars, numbers)
         # Each star predicted from the others, by solving without it.
         for star in alone:
             others = np.delete(np.arange(30), star)
             weights = np.linalg.solve(of_stars[np.ix_(others, others)], of_stars[others, star])
-            alone[star] = alone[star] + probability * weights @ model.coefficients[others]
-    np.testing.assert_allclose(model.amplitudes(elsewhere), expected, atol=1e-9 * np.abs(expected).max())
+            alone[star] = alone[star] + probability * weights @ numbers[others]
+    np.testing.assert_allclose(model.amplitudes(elsewhere) @ filters.T, expected, atol=1e-9 * np.abs(expected).max())
     for star, prediction in alone.items():
         left_out = model.leave_one_out()[star] - model.mean
-        np.testing.assert_allclose(left_out.ravel(), prediction, atol=1e-8 * np.abs(expected).max())
+        np.testing.assert_allclose(filters @ left_out.ravel(), prediction, atol=1e-8 * np.abs(expected).max())
 
 
 def test_places_do_not_depend_on_their_batch_and_files_keep_every_digit(fitted, tmp_path):
