@@ -105,9 +105,11 @@ def test_no_dependence_is_found_where_there_is_none(recipe):
     assert np.exp(np.mean(np.log(ratios))) < 1.03
 
 
-def test_kriging_with_colours_is_the_mean_of_large_gaussians():
+def test_shape_numbers_with_colours_are_the_mean_of_large_gaussians():
     images, places, colour = stars(3, count=25)
     model = fit(KRIGING, images, places, colour)
+    filters = model.interpolation.fields.filters
+    numbers = model.coefficients @ filters.T
     elsewhere = np.random.default_rng(4).uniform(-1.0, 1.0, (30, 2))
     asked = np.linspace(-0.5, 3.0, 30)
 
@@ -127,12 +129,13 @@ def test_kriging_with_colours_is_the_mean_of_large_gaussians():
 
         of_stars = signal(places, places, at_stars, at_stars) + np.diag(1.0 / model.weights + floor)
         between = signal(elsewhere, places, there, at_stars)
-        expected = expected + probability * between @ np.linalg.solve(of_stars, model.coefficients)
+        expected = expected + probability * between @ np.linalg.solve(of_stars, numbers)
         weights = np.linalg.solve(of_stars[np.ix_(others, others)], of_stars[others, 7])
-        alone = alone + probability * weights @ model.coefficients[others]
+        alone = alone + probability * weights @ numbers[others]
     scale = np.abs(expected).max()
-    np.testing.assert_allclose(model.amplitudes(elsewhere, colour=asked), expected, atol=1e-9 * scale)
-    np.testing.assert_allclose(model.leave_one_out()[7].ravel(), model.mean.ravel() + alone, atol=1e-8 * scale)
+    np.testing.assert_allclose(model.amplitudes(elsewhere, colour=asked) @ filters.T, expected, atol=1e-9 * scale)
+    left_out = (model.leave_one_out()[7] - model.mean).ravel()
+    np.testing.assert_allclose(filters @ left_out, alone, atol=1e-8 * scale)
 
 
 def test_polynomials_with_colours_are_least_squares():
