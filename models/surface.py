@@ -15,6 +15,7 @@ from ..core.errors import DomainError, PrescriptionError
 from ..core.units import metres, pure_numbers
 from .aperture import Aperture
 from .coating import AnyCoating
+from .grating import Grating
 from .layer_stack import LayerStack
 from .media.medium import Medium
 from .shapes.shape import Plane, Shape
@@ -62,6 +63,8 @@ class Surface:
         Radius [m] that the surface is made or drawn to; it stops no light.
     coating : Coating, CoatingTable or LayerStack, optional
         Coating, for throughput, illumination and ghosts; rays do not depend on it. Layers are those of lens surfaces.
+    grating : Grating, optional
+        Grooves of a mirror or lens surface.
     """
 
     name: str
@@ -73,12 +76,15 @@ class Surface:
     rotation: Matrix = IDENTITY
     semi_diameter: float | None = None
     coating: AnyCoating | None = None
+    grating: Grating | None = None
 
     def __post_init__(self) -> None:
         if len(self.vertex) != 3 or not np.all(np.isfinite(self.vertex)):
             raise PrescriptionError(f"vertex = {self.vertex!r}: expected three finite numbers")
         if self.semi_diameter is not None and not 0 < self.semi_diameter < np.inf:
             raise PrescriptionError(f"semi_diameter = {self.semi_diameter!r}: expected a positive number")
+        if self.grating is not None and self.interaction not in (Interaction.MIRROR, Interaction.REFRACT):
+            raise PrescriptionError("grating: expected a mirror or a lens surface", key="grating")
         axes = np.array(self.rotation, dtype=np.float64)
         # 1e-9 admits what many rotations accumulate in rounding, and no scaling or reflection.
         if self.rotation != IDENTITY and (

@@ -180,6 +180,7 @@ from .models.first_order import seidel_sums as seidel_sums
 from .models.fringe_zernikes import fringe_from_noll as fringe_from_noll
 from .models.fringe_zernikes import fringe_zernikes as fringe_zernikes
 from .models.fringe_zernikes import noll_from_fringe as noll_from_fringe
+from .models.grating import Grating as Grating
 from .models.io.glass_catalogue import GlassCatalogue as GlassCatalogue
 from .models.io.grid_file import read_grid as read_grid
 from .models.io.hdf5_map import read_hdf5_map as read_hdf5_map

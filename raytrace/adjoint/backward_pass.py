@@ -92,7 +92,7 @@ def backward_pass(
         outputs * count,
         [
             packed,
-            warp_array(packets.indices),
+            warp_array(packets.light),
             count,
             packets.start,
             packets.end,

@@ -18,6 +18,7 @@ from .obstruction import PackedObstructions, obstructed_status
 from .packet import LANES, RayPackets, components, lane_flags, lanes
 from .shape import PackedDeformations, deformed_distance, through_screen
 from .surface import (
+    EVANESCENT,
     FAR,
     MISSED,
     NOT_CONVERGED,
@@ -28,6 +29,7 @@ from .surface import (
     ZERO,
     aspheric_distance,
     conic_distance,
+    diffracted,
     polynomial,
     reflected,
     refracted,
@@ -38,12 +40,15 @@ wp.set_module_options(FORWARD_OPTIONS)
 MIRROR = wp.constant(0)
 REFRACT = wp.constant(1)
 PHASE = wp.constant(4)
+#: What grooves do in place of reflection or refraction.
+DIFFRACT = wp.constant(5)
 
 
 # Columns of the table of numbers, a row per surface: curvature [1/m], conic constant, vertex [m] (3), rotation (9,
 # row by row), clear aperture: centre x, y, inner and outer radius [m]; the curvature of the conic that the search for a
 # landing starts from, another one where the surface has no conic of its own; the direction cosine w, 0 or close to it,
-# at which rays change from one intersection with that conic to the other.
+# at which rays change from one intersection with that conic to the other; the path that the grooves of a grating add
+# along x and y, for each metre of wavelength [1/m].
 CURVATURE = wp.constant(0)
 CONIC = wp.constant(1)
 VERTEX = wp.constant(2)
@@ -51,10 +56,12 @@ ROTATION = wp.constant(5)
 APERTURE = wp.constant(14)
 FIRST_CURVATURE = wp.constant(18)
 SIGN_CHANGE = wp.constant(19)
-NUMBERS = 20
+GROOVES = wp.constant(20)
+NUMBERS = 22
 # Columns of the table of kinds: interaction, number of aspheric coefficients, whether rotated, whether stopped down
 # (0 no, 1 by a disc or ring, 2 by another aperture), whether obstructions lie on the way to it, whether its shape has
-# parts besides the conic and its even powers (1) or is a mesh (2), which of the distinct media lies before and after.
+# parts besides the conic and its even powers (1) or is a mesh (2), which of the distinct media lies before and after,
+# whether grooves are ruled on it.
 INTERACTION = wp.constant(0)
 TERMS = wp.constant(1)
 ROTATED = wp.constant(2)
@@ -63,7 +70,8 @@ OBSTRUCTED = wp.constant(4)
 DEFORMED = wp.constant(5)
 MEDIUM_BEFORE = wp.constant(6)
 MEDIUM_AFTER = wp.constant(7)
-KINDS = 8
+RULED = wp.constant(8)
+KINDS = 9
 
 
 @wp.struct
@@ -137,9 +145,10 @@ def statuses(status: lanes):
 def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
     """Return the loop over the surfaces of a telescope, for plain telescopes or for any.
 
-    Plain telescopes have conics with even powers, discs and rings as apertures, no phase screens, no obstructions.
-    The ``indices`` are a row of numbers, before the first surface and after each; in a chromatic loop, where every ray
-    has its own wavelength, packets of indices [medium, packet], and optical paths are left out.
+    Plain telescopes have conics with even powers, discs and rings as apertures, no phase screens, gratings or
+    obstructions. The ``indices`` are a row of numbers, before the first surface and after each, and the wavelength [m]
+    as the last of the row; in a chromatic loop, where every ray has its own wavelength, packets of indices
+    [medium, packet] and of the wavelength behind them, and optical paths are left out.
     """
 
     @wp.func
@@ -254,9 +263,37 @@ def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
                         nx = -wp.cw_mul(radial, x) - wp.cw_mul(sag_x, lanes(ONE) - ((ONE + k) * c) * b)
                         ny = -wp.cw_mul(radial, y) - wp.cw_mul(sag_y, lanes(ONE) - ((ONE + k) * c) * b)
                 nz = lanes(ONE) - ((ONE + k) * c) * b
+                if wp.static(special):
+                    if surfaces.kinds[s, RULED] == 1:
+                        if wp.static(chromatic):
+                            n = indices[surfaces.kinds[s, MEDIUM_AFTER], packet]
+                            ratio = wp.cw_div(indices[surfaces.kinds[s, MEDIUM_BEFORE], packet], n)
+                            length = wp.cw_div(indices[indices.shape[0] - 1, packet], n)
+                        else:
+                            ratio = lanes(before / after)
+                            length = lanes(indices[row, indices.shape[1] - 1] / after)
+                            path = path + after * wp.cw_mul(
+                                length, surfaces.numbers[s, GROOVES] * x + surfaces.numbers[s, GROOVES + 1] * y
+                            )
+                        u, v, w = diffracted(
+                            ratio,
+                            wp.where(interaction == MIRROR, -ONE, ONE),
+                            surfaces.numbers[s, GROOVES] * length,
+                            surfaces.numbers[s, GROOVES + 1] * length,
+                            u,
+                            v,
+                            w,
+                            nx,
+                            ny,
+                            nz,
+                        )
+                        for i in range(LANES):
+                            lost = wp.where(status[i] <= VIGNETTED, EVANESCENT, status[i])
+                            status[i] = wp.where(wp.abs(u[i]) < FAR, status[i], lost)
+                        interaction = DIFFRACT
                 if interaction == MIRROR:
                     u, v, w = reflected(u, v, w, nx, ny, nz)
-                else:
+                elif interaction == REFRACT:
                     if wp.static(chromatic):
                         ratio = wp.cw_div(
                             indices[surfaces.kinds[s, MEDIUM_BEFORE], packet],

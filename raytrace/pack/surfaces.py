@@ -18,7 +18,7 @@ from ...models.shapes.mesh import MeshSurface
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
 from ..kernels.surface import FAR
-from ..kernels.trace import DEFORMED, INTERACTION, KINDS, NUMBERS, OBSTRUCTED, PHASE, STOPPED, PackedSurfaces
+from ..kernels.trace import DEFORMED, INTERACTION, KINDS, NUMBERS, OBSTRUCTED, PHASE, RULED, STOPPED, PackedSurfaces
 from .apertures import pack_apertures
 from .meshes import pack_meshes
 from .obstructions import obstruction_table, pack_obstructions
@@ -86,7 +86,8 @@ def pack_surfaces(telescope: Telescope | SurfaceSequence, device: str = "cpu") -
         stopped = 2 if ring is None else int(s.aperture is not None)
         frame = (*s.vertex, *s.matrix.ravel())
         first = shapes[row].first_curvature, sign_change(s, surfaces[row + 1 :], shapes[row])
-        numbers[row] = [base.curvature, base.conic, *frame, *(ring or (0.0,) * 4), *first]
+        grooves = (0.0, 0.0) if s.grating is None else s.grating.path_gradient
+        numbers[row] = [base.curvature, base.conic, *frame, *(ring or (0.0,) * 4), *first, *grooves]
         kinds[row] = [
             int(s.interaction),
             len(terms),
@@ -96,10 +97,11 @@ def pack_surfaces(telescope: Telescope | SurfaceSequence, device: str = "cpu") -
             2 if isinstance(s.shape, MeshSurface) else int(bool(shapes[row].parts)),
             media.index(before),
             media.index(s.medium_after),
+            s.grating is not None,
         ]
         before = s.medium_after
     packed = PackedSurfaces()
-    unusual = kinds[:, DEFORMED].any() or kinds[:, OBSTRUCTED].any() or np.any(kinds[:, STOPPED] == 2)
+    unusual = kinds[:, [DEFORMED, OBSTRUCTED, RULED]].any() or np.any(kinds[:, STOPPED] == 2)
     packed.special = int(unusual or np.any(kinds[:, INTERACTION] == PHASE))
     packed.numbers = warp_array(numbers, device=device)
     packed.kinds = warp_array(kinds, wp.int32, device=device)
@@ -132,6 +134,11 @@ def refractive_indices(telescope: Telescope, wavelength: float) -> np.ndarray:
     telescope.check_wavelength(wavelength)
     media = [telescope.medium_before, *(s.medium_after for s in telescope.surfaces)]
     return np.array([_medium_index(medium, float(wavelength)) for medium in media], dtype=np.float64)
+
+
+def indices_and_wavelength(telescope: Telescope, wavelength: float) -> np.ndarray:
+    """Return :func:`refractive_indices` and the wavelength [m] behind them, as kernels read them, [n_surface + 2]."""
+    return np.append(refractive_indices(telescope, wavelength), float(wavelength))
 
 
 @lru_cache(maxsize=256)
