@@ -13,7 +13,7 @@ An order exists where d' can have unit length; elsewhere it is evanescent.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ..core.arguments import check_arguments
 from ..core.errors import PrescriptionError
@@ -24,8 +24,8 @@ from ..core.errors import PrescriptionError
 class Grating:
     """Grooves of a surface, and the order of the light behind it.
 
-    The component of a ray's direction along ``(-sin angle, cos angle)`` of the surface's axes, times the index, grows
-    by ``order`` wavelengths times `lines_per_mm`, for mirrors and lens surfaces alike.
+    The component of a ray's direction across the grooves, ``(-sin angle, cos angle)`` in x and y of the surface, times
+    the index grows by ``order`` wavelengths times the grooves per length, for mirrors and lens surfaces alike.
 
     Parameters
     ----------
@@ -63,3 +63,7 @@ class Grating:
         scale = 1e3 * self.lines_per_mm * self.order
         x, y = self.across
         return scale * x + 0.0, scale * y + 0.0
+
+    def rotated(self) -> Grating:
+        """Return the grating in axes turned by half a turn about y, those of a lens file."""
+        return replace(self, groove_angle=0.0 - self.groove_angle)

@@ -24,12 +24,13 @@ class SphereAdjoint:
     :func:`~pachon.raytrace.adjoint.backward_pass.backward_pass`, but the rays stay in the processor's cache.
 
     ``directions`` [n_field, 3] are unit vectors of the light's travel, ``light`` [n_surface + 2] the refractive index
-    before the first surface and after each, and the wavelength [m], ``pupil`` entrance-pupil coordinates [m], [n_pupil, 2] or by field point,
-    [n_field, n_pupil, 2]. The spheres have one ``radius`` [m] and a ``center`` each [m], [3, n_field], telescope frame;
-    ``path`` [n_field] is the optical path [m] of the chief ray to the sphere, which is subtracted. ``columns`` and
-    ``polynomials`` are as in `backward_pass`, with four columns left free from ``sphere_column`` on: the path less
-    ``path`` [m], and its derivatives with respect to the landing point, which are opposite to those with respect to the
-    centre. With ``lit_only`` all is zero for vignetted rays. A mesh among the surfaces is a DomainError.
+    before the first surface and after each, and the wavelength [m], ``pupil`` entrance-pupil coordinates [m],
+    [n_pupil, 2] or by field point, [n_field, n_pupil, 2]. The spheres have one ``radius`` [m] and a ``center`` each
+    [m], [3, n_field], telescope frame; ``path`` [n_field] is the optical path [m] of the chief ray to the sphere, which
+    is subtracted. ``columns`` and ``polynomials`` are as in `backward_pass`, with four columns left free from
+    ``sphere_column`` on: the path less ``path`` [m], and its derivatives with respect to the landing point, which are
+    opposite to those with respect to the centre. With ``lit_only`` all is zero for vignetted rays. A mesh among the
+    surfaces is a DomainError.
     """
 
     def __init__(

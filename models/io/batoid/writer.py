@@ -101,6 +101,8 @@ def _items(t: Telescope, groups: dict[str, tuple[int, int]], first: int, end: in
 
 def _optic(surface: Surface, before: Medium, frame: Frame) -> dict[str, Any]:
     with error_context(subject=f"surface {surface.name}"):
+        if surface.grating is not None:
+            raise PrescriptionError("grating: a batoid file has none")
         items: dict[str, Any] = {"type": _TYPES[surface.interaction], "name": surface.name}
         items |= _coordinate_system((np.array(surface.vertex), surface.matrix), frame)
         sag = surface_items(surface.shape)

@@ -3,7 +3,8 @@
 Supported commands: RDM, DIM, TITLE, EPD, FNO, NAO, WL, WTW, REF, AFO, TEM (deg C), PRE (mm of mercury), XAN YAN, XOB
 YOB, XIM YIM, XRI YRI, WTF, VUX VLX VUY VLY, before or after the surfaces SO S SI (curvature or radius, thickness,
 glass), RDY CUY THI GLA, STO, SLB, SPH CON ASP with K and A to G (r^4 to r^16), XDE YDE ZDE ADE BDE CDE with DAR, BEN
-and REV, CIR (OBS, HOL, EDG) REX REY and ELX ELY with ADX ADY, pick-ups PIK, private glasses PRV PWL END. ADE and BDE
+and REV, CIR (OBS, HOL, EDG) REX REY and ELX ELY with ADX ADY, linear gratings GRT with GRO, GRS and GRX GRY GRZ (order,
+spacing, vector across the grooves), pick-ups PIK, private glasses PRV PWL END. ADE and BDE
 are left-handed, CDE is right-handed (CODE V reference manual, "Decentered surfaces"), those of a description are right-
 handed. A glass is a name (NBK7_SCHOTT), REFL, or a number (517642). Solves are passed over where their solution is
 given. Rays are aimed at the stop, as CODE V's chief rays are.
@@ -22,6 +23,7 @@ import numpy as np
 
 from ....core.errors import PrescriptionError
 from ...aperture import Aperture, Circle, Complement
+from ...grating import Grating
 from ...media.medium import Medium
 from ...media.tabulated import TabulatedIndex
 from ...rotation import rotation_matrix
@@ -52,10 +54,14 @@ LONG_NAMES = {"TITLE": "TIT", "STOP": "STO"}
 POWERS = "ABCDEFG"
 #: Numbers of surfaces.
 NUMBERS = {*["THI", "K", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "REX", "REY", "ELX", "ELY", "ADX", "ADY"], *POWERS}
+#: Numbers of gratings.
+GROOVES = ("GRO", "GRS", "GRX", "GRY", "GRZ")
+NUMBERS |= {*GROOVES}
 #: Surfaces that are not read.
 REFUSED = {
-    "DIF": "diffractive surfaces", "GRT": "diffractive surfaces", "XTO": "toroids", "YTO": "toroids",
+    "DIF": "diffractive surfaces", "HOE": "holograms", "XTO": "toroids", "YTO": "toroids",
     "CYL": "cylinders", "RDX": "surfaces of two radii", "NSS": "non-sequential parts", "GRD": "gradient-index media",
+    "GRN": "gradient-index media", "GRC": "gradient-index media", "BIR": "birefringent media",
 }  # fmt: skip
 #: Commands without effect on rays: names, variables and couplings, weights, solves, whose solution stands in the file,
 #: and drawing.
@@ -232,6 +238,8 @@ class _Reader:
             surface.name = command.text.strip("'\" ")
         elif key in NUMBERS:
             surface.commands[key], surface.values[key] = command, command.number(0)
+        elif key == "GRT" or (key == "DIF" and [w.upper() for w in words] == ["GRT"]):
+            surface.commands["GRT"] = command
         elif key in ("DAR", "BEN", "REV"):
             surface.commands[key], surface.values[key] = command, 1.0
         elif key == "CIR":
@@ -413,6 +421,26 @@ class _Reader:
             raise regions[1][0].error(f"one aperture of a surface, not {regions[0][0].keyword} as well")
         return regions[0][1] if regions else None
 
+    def _grating(self, surface: _Surface) -> Grating | None:
+        """Return the grooves of a surface: parallel planes along its z axis, a spacing apart."""
+        ruled = surface.commands.get("GRT")
+        stated = [surface.commands[key] for key in GROOVES if key in surface.values]
+        if ruled is None:
+            if stated:
+                text = f"{stated[0].shown}: expected a grating (GRT)"
+                self.findings.report(stated[0].problem(text), "taken as no grating")
+            return None
+        order, spacing = surface.get("GRO"), surface.get("GRS") * self.description.unit
+        if order != int(order):
+            raise surface.commands["GRO"].error("a whole number, the order of the grating")
+        across = [surface.values.get(key, default) for key, default in (("GRX", 0.0), ("GRY", 1.0), ("GRZ", 0.0))]
+        if across[2] or not any(across):
+            source = surface.commands.get("GRZ", ruled)
+            raise source.error("a vector GRX GRY across the grooves, GRZ 0")
+        if order and not spacing > 0:
+            raise surface.commands.get("GRS", ruled).error("a positive spacing GRS of the grooves")
+        return Grating(int(order), 1e-3 / spacing, math.atan2(-across[0], across[1])) if order else None
+
     def _place(self) -> None:
         """Add the surfaces one after the other, with the local frame of the light."""
         lens, unit = self.description, self.description.unit
@@ -464,6 +492,7 @@ class _Reader:
             name=surface.name,
             after=self._medium(surface),
             aperture=self._aperture(surface),
+            grating=self._grating(surface),
             semi_diameter=surface.get("EDGE") * unit,
             stop=surface.stop,
             distance=distance,

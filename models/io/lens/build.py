@@ -225,6 +225,7 @@ def _placed(surface: LensSurface, name: str, z0: float) -> Surface:
             aperture=None if surface.aperture is None else rotated_aperture(surface.aperture),
             rotation=rotated_axes(surface.axes),
             semi_diameter=surface.semi_diameter if surface.semi_diameter > 0 else None,
+            grating=None if surface.grating is None else surface.grating.rotated(),
         )
 
 

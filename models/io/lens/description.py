@@ -19,6 +19,7 @@ import numpy as np
 from ....core.errors import PrescriptionError
 from ...aperture import Aperture
 from ...design_data import LENGTH_UNITS, DesignData
+from ...grating import Grating
 from ...links import Pickup, Solve
 from ...media.air import STANDARD_ATMOSPHERE, ZERO_CELSIUS
 from ...media.medium import Medium
@@ -54,7 +55,7 @@ class LensSurface:
 
     `position` [m] and `axes` (columns, [3, 3]) are in the frame of the lens, `distance` is that along the axis of the
     light from the surface before it [m], negative behind an odd number of mirrors; None if its file states places
-    alone. `before` and `after` are the media on either side; `number` is that of the file.
+    alone. `before` and `after` are the media on either side; `number` is that of the file. Grooves are in its own axes.
     """
 
     source: Source
@@ -70,6 +71,7 @@ class LensSurface:
     stop: bool = False
     distance: float | None = None
     number: int = 0
+    grating: Grating | None = None
 
     @property
     def off_axis(self) -> bool:
@@ -195,7 +197,7 @@ class LensDescription:
         """Add a surface in the order of the light; what is in front of it, and behind a mirror, follows."""
         before = self.surfaces[-1].after if self.surfaces else self.medium
         after = before if mirror else surface.after
-        passing = Interaction.PASS if after == before else Interaction.REFRACT
+        passing = Interaction.PASS if after == before and surface.grating is None else Interaction.REFRACT
         followed = replace(
             surface,
             name=" ".join(surface.name.split()),

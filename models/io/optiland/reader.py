@@ -21,6 +21,7 @@ from ..lens.description import INFINITE, Format, LensDescription, LensSurface
 from ..lens.glasses import Glasses
 from ..lens.source import Findings, Source
 from ..lens.text import scaled
+from .gratings import MODEL, PHASE_MODEL, grating_of, phase_grating
 from .media import medium_of
 from .shapes import shape_of
 
@@ -128,8 +129,11 @@ def _object(surface: JsonObject, first: JsonObject, lens: LensDescription, glass
 def _surface(surface: JsonObject, lens: LensDescription, stop_radius: float, glasses: Glasses) -> None:
     geometry, interaction, findings = surface.child("geometry"), surface.child("interaction_model"), lens.findings
     kind = interaction.text("type")
-    if kind != "RefractiveReflectiveModel":
-        findings.report(interaction.problem(f"interaction_model {kind}: expected RefractiveReflectiveModel"))
+    grating = grating_of(geometry)
+    if kind == PHASE_MODEL and geometry.text("type") == "Plane":
+        grating = phase_grating(interaction.child("phase_profile"))
+    elif kind not in ("RefractiveReflectiveModel", MODEL):
+        findings.report(interaction.problem(f"interaction_model {kind}: expected RefractiveReflectiveModel or {MODEL}"))
     if "bsdf" in interaction:
         findings.report(interaction.problem("interaction_model.bsdf: scattering is not read"))
     mirror, stop = interaction.flag("is_reflective"), surface.flag("is_stop")
@@ -146,6 +150,7 @@ def _surface(surface: JsonObject, lens: LensDescription, stop_radius: float, gla
         aperture=_aperture(surface.child("aperture"), findings) if "aperture" in surface else None,
         semi_diameter=stop_radius if stop else 0.0,
         stop=stop,
+        grating=grating,
     )
     lens.add(placed, mirror=mirror)
     surface.report_rest(findings, ("type", "thickness", "surface_type", "material_post"))

@@ -11,6 +11,8 @@ ChebyshevPolynomialGeometry  + coefficients [i][j] of T_i(x / norm_x) T_j(y / no
 ZernikePolynomialGeometry    + Zernike terms of (x, y) / norm_radius, in the order of zernike_type
 BiconicGeometry              sum of a conic in x and one in y, as in optiland up to 0.6
 ToroidalGeometry             a conic in y, revolved about an axis at radius_x
+PlaneGrating                 a plane with grooves (`gratings`)
+StandardGratingGeometry      the conic with grooves
 ============================ =========================================================================================
 """
 
@@ -32,6 +34,7 @@ from ..json_items import JsonObject
 from ..lens import shapes
 from ..lens.shapes import MOST_ODD, polynomial_powers, square_term
 from ..lens.source import Findings
+from .gratings import GRATINGS, GROOVES
 
 MM = 1e-3
 #: Highest degree of polynomials.
@@ -46,7 +49,7 @@ def shape_of(geometry: JsonObject, findings: Findings) -> tuple[float, Shape]:
         return 0.0, Plane()
     with geometry.part(f"geometry {kind}").context():
         shape = _KINDS[kind](geometry)
-    geometry.report_rest(findings, ("cs", "tol", "max_iter", "geometry_type"))
+    geometry.report_rest(findings, ("cs", "tol", "max_iter", "geometry_type", *(GROOVES if kind in GRATINGS else ())))
     return shape if isinstance(shape, tuple) else (0.0, shape)
 
 
@@ -173,6 +176,7 @@ def _toroid(geometry: JsonObject) -> Shape:
 _KINDS: dict[str, Callable[[JsonObject], Shape | tuple[float, Shape]]] = {
     "Plane": _conic,
     "StandardGeometry": _conic,
+    **dict.fromkeys(GRATINGS, _conic),
     "EvenAsphere": _even,
     "OddAsphere": _odd,
     "PolynomialGeometry": _polynomial,

@@ -25,6 +25,7 @@ from ..lens.sequence import lens_surfaces, stated_wavelengths
 from ..lens.source import Findings
 from ..lens.text import scaled
 from ..writable import report_pupil_plane, report_unheld, require_sequential, with_formulas
+from .gratings import MODEL, grating_items
 from .media import material_items
 from .reader import APERTURES, FIELD_TYPES
 from .shapes import geometry_items
@@ -95,17 +96,18 @@ def _in_millimetres(system: dict[str, Any]) -> None:
 
 def _surface_items(surface: LensSurface, first: float) -> dict[str, Any]:
     x, y, z = map(float, surface.position)
-    region = surface.aperture
+    region, grating = surface.aperture, surface.grating
+    geometry = geometry_items(surface.shape, MM) if grating is None else grating_items(grating, surface.shape, MM)
     return {
         "type": "Surface",
         "thickness": 0.0,
-        "geometry": {**geometry_items(surface.shape, MM), "cs": _system(z - first, x, y, surface.axes)},
+        "geometry": {**geometry, "cs": _system(z - first, x, y, surface.axes)},
         "material_post": material_items(surface.after),
         "is_stop": surface.stop,
         "aperture": None if region is None else _aperture_items(region),
         "comment": surface.name,
         "interaction_model": {
-            "type": "RefractiveReflectiveModel",
+            "type": "RefractiveReflectiveModel" if grating is None else MODEL,
             "is_reflective": surface.interaction == Interaction.MIRROR,
             "coating": None,
             "bsdf": None,

@@ -13,6 +13,7 @@ from ....core.errors import PachonError, PrescriptionError, error_context
 from ....core.schema import Section, Tagged, expected, one_of, validated
 from ....core.yaml_reader import read_mapping
 from ...coating import AnyCoating
+from ...grating import Grating
 from ...media.medium import Medium
 from ...obstruction import Obstruction
 from ...rotation import rotation_matrix
@@ -26,6 +27,7 @@ from .media import AnyMedium
 from .shapes import SURFACE_SHAPES, ShapeSection
 from .values import (
     ROWS,
+    Angle,
     Band,
     FileUnits,
     Length,
@@ -39,9 +41,11 @@ from .values import (
     OptionalText,
     PositiveAngle,
     PositiveLength,
+    PositiveNumber,
     Rotation,
     Text,
     Wavelength,
+    WholeNumber,
     names,
 )
 
@@ -52,6 +56,24 @@ INTERACTIONS = {
     "baffle": Interaction.PASS,
     "phase": Interaction.PHASE,
 }
+
+
+class GratingSection(Section):
+    """Grooves of a surface and the order of the light behind it."""
+
+    order: WholeNumber
+    lines_per_mm: PositiveNumber
+    groove_angle: Angle = 0.0
+
+    @classmethod
+    def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
+        for key, text in (("order", "a whole number"), ("lines_per_mm", "a positive number")):
+            if key not in content:
+                raise expected(text, key)
+
+    def grating(self) -> Grating:
+        """Return the grating."""
+        return Grating(self.order, self.lines_per_mm, self.groove_angle)
 
 
 class SurfaceKeys(ApertureKeys):
@@ -67,6 +89,7 @@ class SurfaceKeys(ApertureKeys):
     medium: OptionalText = None
     semi_diameter: OptionalLength = None
     coating: OptionalText = None
+    grating: GratingSection | None = None
 
     @classmethod
     def keys(cls) -> list[str]:
@@ -100,6 +123,7 @@ class SurfaceKeys(ApertureKeys):
             aperture=self.clear_aperture(),
             rotation=self.rotation if self.tilt is None else _matrix(rotation_matrix(self.tilt)),
             semi_diameter=self.semi_diameter,
+            grating=None if self.grating is None else self.grating.grating(),
         ).coated(None if self.coating is None else coating_sections[self.coating])
 
 

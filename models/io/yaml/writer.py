@@ -8,6 +8,7 @@ from itertools import count
 from typing import Any
 
 from ...coating import AnyCoating
+from ...grating import Grating
 from ...media.medium import Medium
 from ...surface import IDENTITY, Surface
 from ...telescope import VACUUM, Telescope
@@ -104,7 +105,13 @@ def _surface_items(surface: Surface, names: dict[Medium, str], coated: dict[AnyC
     items |= shape | aperture_items(surface.aperture)
     items |= {} if surface.semi_diameter is None else {"semi_diameter": surface.semi_diameter}
     items |= {} if surface.coating is None else {"coating": coated[surface.coating]}
+    items |= {} if surface.grating is None else {"grating": _grating_items(surface.grating)}
     return items | ({"medium": Bare(names[surface.medium_after])} if kind == "refract" else {})
+
+
+def _grating_items(grating: Grating) -> dict[str, Any]:
+    items: dict[str, Any] = {"order": Bare(grating.order), "lines_per_mm": grating.lines_per_mm}
+    return items | ({"groove_angle": Turn(grating.groove_angle)} if grating.groove_angle else {})
 
 
 def _aligned(rows: list[dict[str, str]]) -> list[str]:

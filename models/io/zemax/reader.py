@@ -21,7 +21,7 @@ from ..lens.source import Findings, Source
 from .apertures import read_aperture
 from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, ZemaxFile, read_zemax_file
 from .links import state_links
-from .shapes import read_shape
+from .shapes import read_grating, read_shape
 from .system import FORMAT, object_distance, read_system
 
 #: Name of a glass without a name.
@@ -126,6 +126,7 @@ class _LensReader:
         with source.context():
             shape = read_shape(block, lens.unit, self.findings)
             aperture = read_aperture(block, lens.unit, self.findings)
+            grating = read_grating(block)
         mirror, medium = self._glass(block)
         surface = LensSurface(
             source,
@@ -139,6 +140,7 @@ class _LensReader:
             stop=self.stop_ahead,
             distance=self.distance,
             number=number,
+            grating=grating,
         )
         lens.add(surface, mirror=mirror)
         self.stop_ahead, self.distance = False, 0.0

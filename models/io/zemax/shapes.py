@@ -13,6 +13,7 @@ SZERNSAG  as EVENASPH + sum of XDAT (2 + j) Z_j(x / R, y / R), Noll, R = XDAT 2,
 XPOLYNOM  conic + sum of XDAT (2 + i) times x, y, x^2, xy, y^2, x^3... of x / R, y / R, R = XDAT 2, XDAT 1 terms
 XASPHERE  conic + sum of XDAT (2 + i) (r / R)^(2 i), R = XDAT 2, XDAT 1 terms
 TILTSURF  the plane x PARM 1 + y PARM 2
+DGRATING  as STANDARD, with PARM 1 grooves a micrometre along the local y axis and the order PARM 2 (`read_grating`)
 GRID_SAG  as EVENASPH + a grid of nodes (GDAT nx ny dx dy; GARR i sag ...), interpolated by bicubics
 QED_TYPE  conic + (r / R)^4 sum of XDAT (3 + m) Q_(m - 1)((r / R)^2), R = XDAT 3, XDAT 2 terms; Q those of Forbes (Qcon,
           XDAT 1 is 1): Jacobi polynomials P^(0, 4)(2 x - 1), so an even asphere (2007, Opt. Express 15, 5218)
@@ -26,6 +27,7 @@ import math
 import numpy as np
 
 from ....core.errors import PrescriptionError
+from ...grating import Grating
 from ...shapes.freeform import Biconic, OddAsphere, Toroid
 from ...shapes.grid import GridSag
 from ...shapes.polynomial import XYPolynomial, ZernikeSag
@@ -35,13 +37,20 @@ from ...zernike_polynomials import annular_zernikes
 from ..lens import shapes
 from ..lens.shapes import MOST_ODD, even_asphere, polynomial_powers, square_term
 from ..lens.source import Findings
-from ..lens.text import number_text
+from ..lens.text import number_text, scaled
 from .file import Block
 
 TYPES = (
     *("STANDARD", "EVENASPH", "ODDASPHE", "BICONICX", "TOROIDAL"),
-    *("SZERNSAG", "XPOLYNOM", "XASPHERE", "TILTSURF", "GRID_SAG", "QED_TYPE"),
+    *("SZERNSAG", "XPOLYNOM", "XASPHERE", "TILTSURF", "GRID_SAG", "QED_TYPE", "DGRATING"),
 )
+#: What types of surfaces are, by the beginnings of their names, that have no counterpart here.
+REFUSED = {
+    "GRINSUR": "gradient-index media", "GRIN": "gradient-index media", "GRADIUM": "gradient-index media",
+    "HOLOGRM": "holograms", "OPTHOLO": "holograms", "TORHOLO": "holograms", "BIREFRIN": "birefringent media",
+    "BINARY": "phase profiles", "NONSEQ": "non-sequential parts", "NSC": "non-sequential parts",
+    "USERSURF": "user-defined surfaces",
+}  # fmt: skip
 MOST_TERMS = 1000
 MOST_NODES = 4_000_000
 #: Qcon terms at most: more have powers of r that cancel beyond the twelfth digit.
@@ -53,11 +62,16 @@ def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
     kind = block.text("TYPE").split()[0].upper() if block.text("TYPE") else "STANDARD"
     kind = "GRID_SAG" if kind == "GRIDSAG" else kind
     if kind not in TYPES:
-        findings.report(block.problem(f"TYPE {kind}: expected one of {', '.join(TYPES)}"), "taken as STANDARD")
+        refused = next((text for name, text in REFUSED.items() if kind.startswith(name)), None)
+        reason = f"{refused} are not read" if refused else f"expected one of {', '.join(TYPES)}"
+        findings.report(block.problem(f"TYPE {kind}: {reason}"), "taken as STANDARD")
         block.used |= {"PARM", "XDAT", "GDAT", "GARR"}
         kind = "STANDARD"
     curvature, conic = block.number("CURV", 0.0) / unit, block.number("CONI", 0.0)
     parameters = {i: v for i, v in block.table("PARM").items() if v != 0}
+    if kind == "DGRATING":
+        # The grooves are those of read_grating.
+        parameters = {i: v for i, v in parameters.items() if i > 2}
     base = shapes.conic(curvature, conic)
     if kind in ("EVENASPH", "SZERNSAG", "GRID_SAG"):
         base = even_asphere(curvature, conic, [parameters.pop(i, 0.0) * unit ** (1 - 2 * i) for i in range(1, 9)])
@@ -92,6 +106,18 @@ def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
             if value != 0:
                 findings.report(block.problem(f"XDAT {i} {value:g}: not understood for TYPE {kind}"))
     return base
+
+
+def read_grating(block: Block) -> Grating | None:
+    """Return the grooves of a surface; None without them. A negative number of them reverses the order."""
+    if not block.text("TYPE").upper().startswith("DGRATING"):
+        return None
+    numbers = {line.integer(0): line for line in block.all("PARM")}
+    lines = numbers[1].number(1) if 1 in numbers else 0.0
+    order = numbers[2].number(1) if 2 in numbers else 0.0
+    if order != int(order):
+        raise numbers[2].error("a whole number, the order of the grating")
+    return Grating(int(math.copysign(1.0, lines)) * int(order), scaled(abs(lines), 3)) if lines and order else None
 
 
 def _extra_data(block: Block, unit: float) -> tuple[float, list[float]]:
