@@ -201,7 +201,7 @@ def test_formats_without_gratings_say_so(tmp_path):
         telescope = spectrograph()
         with pytest.raises(PrescriptionError, match="surface back: grating: a batoid file has none"):
             pachon.save_telescope(telescope, tmp_path / "batoid.yaml", format="batoid")
-        with pytest.raises(PrescriptionError, match="surface back: grating: .* is written without them"):
+        with pytest.raises(PrescriptionError, match=r"surface back: grating: .* is written without them"):
             pachon.save_telescope(telescope, tmp_path / "lens.len")
         with pytest.raises(PrescriptionError, match="surface ruled: grating on Conic: a ray-optics file has"):
             pachon.save_telescope(telescope, tmp_path / "lens.roa")
