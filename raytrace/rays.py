@@ -41,6 +41,10 @@ class RayStatus(IntEnum):
     EVANESCENT = int(surface_kernels.EVANESCENT)
 
 
+#: Statuses of rays that do not reach the image, with positions of NaN.
+LOST = (RayStatus.MISSED, RayStatus.TOTAL_REFLECTION, RayStatus.NOT_CONVERGED, RayStatus.EVANESCENT)
+
+
 PROJECTIONS = ("zemax", "gnomonic", "postel")
 
 
