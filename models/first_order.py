@@ -350,6 +350,8 @@ def _trace(
         raise DomainError(f"telescope {telescope.name}: expected at least one mirror or lens surface")
     for surface in surfaces:
         require_on_axis(surface, telescope.name)
+        if surface.grating is not None:
+            raise DomainError(f"surface {surface.name} of {telescope.name}: expected one without grooves on the axis")
     curvature = -np.array([s.shape.curvature for s in surfaces])
     if section:
         along_x, along_y = -np.array([curvatures_across(s) for s in surfaces]).T

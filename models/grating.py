@@ -52,6 +52,11 @@ class Grating:
         if not math.isfinite(self.groove_angle):
             raise PrescriptionError(f"groove_angle = {self.groove_angle!r}: expected a finite number")
 
+    def __str__(self) -> str:
+        angle = math.degrees(self.groove_angle)
+        turned = f", grooves at {angle:.6g}°" if angle else ""
+        return f"grating, order {self.order}, {self.lines_per_mm:.8g} lines/mm{turned}"
+
     @property
     def across(self) -> tuple[float, float]:
         """Unit vector across the grooves, x and y of the surface."""

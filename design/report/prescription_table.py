@@ -68,7 +68,7 @@ def _number(value: float, digits: int = 8) -> str:
 
 
 def _more(surface: Surface, unit: float) -> str:
-    """Return coefficients, kind of shape, decentre and tilt of a surface as text."""
+    """Return coefficients, kind of shape, grating, decentre and tilt of a surface as text."""
     shape, parts = surface.shape, []
     if isinstance(shape, Rotational):
         # Lengths over powers of lengths; z has the other sign.
@@ -77,6 +77,8 @@ def _more(surface: Surface, unit: float) -> str:
         parts += [f"r^{n}: {-a * unit ** (n - 1):.6g}" for n, a in pairs if a]
     else:
         parts.append(type(shape).__name__)
+    if surface.grating is not None:
+        parts.append(str(surface.grating))
     x, y, _ = surface.vertex
     if x or y:
         parts.append(f"decentred by x {x / unit:.6g}, y {y / unit:.6g}")
