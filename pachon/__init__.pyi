@@ -220,6 +220,7 @@ from .models.shapes.mesh import MeshSurface as MeshSurface
 from .models.shapes.modes import GridModes as GridModes
 from .models.shapes.polynomial import XYPolynomial as XYPolynomial
 from .models.shapes.polynomial import ZernikeSag as ZernikeSag
+from .models.shapes.qbfs import QbfsAsphere as QbfsAsphere
 from .models.shapes.shape import Conic as Conic
 from .models.shapes.shape import EvenAsphere as EvenAsphere
 from .models.shapes.shape import Plane as Plane

@@ -23,7 +23,6 @@ import numpy as np
 
 from ....core.errors import PrescriptionError
 from ...aperture import Aperture, Circle, Complement
-from ...grating import Grating
 from ...media.medium import Medium
 from ...media.tabulated import TabulatedIndex
 from ...rotation import rotation_matrix
@@ -34,6 +33,7 @@ from ..lens.glasses import Glasses, numbered_glass
 from ..lens.shapes import even_asphere
 from ..lens.source import Findings, Source
 from ..lens.text import FileSurface, Record, read_text, scaled
+from .gratings import GROOVES, grating_of
 
 FORMAT = Format("CODE V", "EPD, FNO or NAO", "WL", "STO")
 UNITS = {"M": 1e-3, "MM": 1e-3, "C": 1e-2, "CM": 1e-2, "I": 0.0254, "IN": 0.0254}
@@ -54,8 +54,6 @@ LONG_NAMES = {"TITLE": "TIT", "STOP": "STO"}
 POWERS = "ABCDEFG"
 #: Numbers of surfaces.
 NUMBERS = {*["THI", "K", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "REX", "REY", "ELX", "ELY", "ADX", "ADY"], *POWERS}
-#: Numbers of gratings.
-GROOVES = ("GRO", "GRS", "GRX", "GRY", "GRZ")
 NUMBERS |= {*GROOVES}
 #: Surfaces that are not read.
 REFUSED = {
@@ -421,26 +419,6 @@ class _Reader:
             raise regions[1][0].error(f"one aperture of a surface, not {regions[0][0].keyword} as well")
         return regions[0][1] if regions else None
 
-    def _grating(self, surface: _Surface) -> Grating | None:
-        """Return the grooves of a surface: parallel planes along its z axis, a spacing apart."""
-        ruled = surface.commands.get("GRT")
-        stated = [surface.commands[key] for key in GROOVES if key in surface.values]
-        if ruled is None:
-            if stated:
-                text = f"{stated[0].shown}: expected a grating (GRT)"
-                self.findings.report(stated[0].problem(text), "taken as no grating")
-            return None
-        order, spacing = surface.get("GRO"), surface.get("GRS") * self.description.unit
-        if order != int(order):
-            raise surface.commands["GRO"].error("a whole number, the order of the grating")
-        across = [surface.values.get(key, default) for key, default in (("GRX", 0.0), ("GRY", 1.0), ("GRZ", 0.0))]
-        if across[2] or not any(across):
-            source = surface.commands.get("GRZ", ruled)
-            raise source.error("a vector GRX GRY across the grooves, GRZ 0")
-        if order and not spacing > 0:
-            raise surface.commands.get("GRS", ruled).error("a positive spacing GRS of the grooves")
-        return Grating(int(order), 1e-3 / spacing, math.atan2(-across[0], across[1])) if order else None
-
     def _place(self) -> None:
         """Add the surfaces one after the other, with the local frame of the light."""
         lens, unit = self.description, self.description.unit
@@ -492,7 +470,7 @@ class _Reader:
             name=surface.name,
             after=self._medium(surface),
             aperture=self._aperture(surface),
-            grating=self._grating(surface),
+            grating=grating_of(surface, unit, self.findings),
             semi_diameter=surface.get("EDGE") * unit,
             stop=surface.stop,
             distance=distance,

@@ -10,7 +10,8 @@ PolynomialGeometry           + coefficients [i][j] of x^i y^j
 ChebyshevPolynomialGeometry  + coefficients [i][j] of T_i(x / norm_x) T_j(y / norm_y)
 ZernikePolynomialGeometry    + Zernike terms of (x, y) / norm_radius, in the order of zernike_type
 BiconicGeometry              sum of a conic in x and one in y, as in optiland up to 0.6
-ToroidalGeometry             a conic in y, revolved about an axis at radius_x
+ToroidalGeometry             a conic in y with coefficients of y^2, y^4..., revolved about an axis at radius_x
+ForbesQNormalSlopeGeometry   + Forbes's Qbfs terms of (r / norm_radius)^2
 PlaneGrating                 a plane with grooves (`gratings`)
 StandardGratingGeometry      the conic with grooves
 ============================ =========================================================================================
@@ -27,6 +28,7 @@ import numpy as np
 from ....core.errors import PrescriptionError
 from ...shapes.freeform import Biconic, OddAsphere, Toroid
 from ...shapes.polynomial import XYPolynomial, ZernikeSag
+from ...shapes.qbfs import QbfsAsphere
 from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere
 from ...shapes.sum import Sum
 from ...zernike_polynomials import noll_to_nm
@@ -167,10 +169,26 @@ def _biconic(geometry: JsonObject) -> Shape:
 
 def _toroid(geometry: JsonObject) -> Shape:
     radius_x, radius_y = (geometry.number(f"radius_{a}", math.inf, infinite=True) or math.inf for a in "xy")
-    if any(geometry.numbers("coeffs_poly_y")):
-        geometry.refuse("coeffs_poly_y", "zeros")
+    powers = [a * MM ** (1 - 2 * i) for i, a in enumerate(geometry.numbers("coeffs_poly_y"), start=1)]
     geometry.used |= {"radius", "conic"}
-    return shapes.toroid(radius_x * MM, 1.0 / radius_y / MM, geometry.number("conic_yz", 0.0))
+    return shapes.toroid(radius_x * MM, 1.0 / radius_y / MM, geometry.number("conic_yz", 0.0), powers)
+
+
+def _qbfs(geometry: JsonObject) -> Shape:
+    config = geometry.child("surface_config")
+    curvature, constant = _base(config)
+    terms = config.child("terms") if "terms" in config else JsonObject({}, config.source, config.place)
+    orders = {key: int(key) for key in terms.content if key.isdecimal() and int(key) <= MOST_DEGREE}
+    if set(orders) != set(terms.content):
+        config.refuse("terms", f"orders from 0 to {MOST_DEGREE}")
+    coefficients = [0.0] * (1 + max(orders.values(), default=-1))
+    for key, order in orders.items():
+        coefficients[order] = terms.number(key) * MM
+    geometry.used |= {"solver_config"}
+    if not any(coefficients):
+        return shapes.conic(curvature, constant)
+    radius = _positive(config, "norm_radius") * MM
+    return QbfsAsphere(shapes.radius_of(curvature), constant, radius, shapes.trimmed(coefficients))
 
 
 _KINDS: dict[str, Callable[[JsonObject], Shape | tuple[float, Shape]]] = {
@@ -184,6 +202,8 @@ _KINDS: dict[str, Callable[[JsonObject], Shape | tuple[float, Shape]]] = {
     "ZernikePolynomialGeometry": _zernike,
     "BiconicGeometry": _biconic,
     "ToroidalGeometry": _toroid,
+    "ForbesQNormalSlopeGeometry": _qbfs,
+    "ForbesQbfsGeometry": _qbfs,
 }
 
 
@@ -252,6 +272,12 @@ def _alone(shape: Shape, unit: float) -> dict[str, Any]:
         return {"type": kind, **head, "coefficients": [0.0, *terms] if even else terms}
     if isinstance(shape, Toroid):
         radii = {"radius_x": shape.radius_x / unit, "radius_y": shape.radius_y / unit}
-        meridian_items = {"geometry_type": "Toroidal", "conic_yz": shape.conic_y, "coeffs_poly_y": []}
+        powers = [a * unit ** (2 * i - 1) for i, a in enumerate(shape.coefficients, start=1)]
+        meridian_items = {"geometry_type": "Toroidal", "conic_yz": shape.conic_y, "coeffs_poly_y": powers}
         return {"type": "ToroidalGeometry", **radii, **meridian_items}
+    if isinstance(shape, QbfsAsphere):
+        terms_by_order = {str(m): a / unit for m, a in enumerate(shape.coefficients)}
+        head = {"radius": shape.radius / unit, "conic": shape.conic}
+        config = {**head, "terms": terms_by_order, "norm_radius": shape.norm_radius / unit}
+        return {"type": "ForbesQNormalSlopeGeometry", "surface_config": config, "solver_config": {}}
     raise PrescriptionError(f"shape {type(shape).__name__}: optiland has no geometry of this shape")
