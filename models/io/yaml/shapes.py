@@ -11,8 +11,7 @@ mappings under ``shape``, each written the same way. Parameters are lengths in t
 ``even_asphere``  ``radius``, ``conic``, ``coefficients`` of r^4, r^6, r^8...; a radius may be ``flat``
 ``odd_asphere``   ``radius``, ``conic``, ``coefficients`` of r^1, r^2, r^3...; a radius may be ``flat``
 ``biconic``       ``radius_x``, ``radius_y``, ``conic_x``, ``conic_y``; a radius may be ``flat``
-``toroid``        ``radius_x`` , ``radius_y``, ``conic_y``, ``coefficients`` of y^2, y^4...; a
-                  radius may be ``flat``
+``toroid``        ``radius_x``, ``radius_y``, ``conic_y``, ``coefficients`` of y^2, y^4...; a radius may be ``flat``
 ``qbfs``          ``radius``, ``conic``, ``norm_radius``, ``coefficients`` of Forbes's Q_0, Q_1...; a ``flat`` radius
 ``xy_polynomial`` ``terms``: a list of [power of x, power of y, coefficient]
 ``zernike``       ``coefficients`` (Noll order from j = 1), ``outer_radius``, ``inner_radius``

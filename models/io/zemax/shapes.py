@@ -17,8 +17,8 @@ TILTSURF  the plane x PARM 1 + y PARM 2
 DGRATING  as STANDARD, with PARM 1 grooves a micrometre along the local y axis and the order PARM 2
 GRID_SAG  as EVENASPH + a grid of nodes (GDAT nx ny dx dy; GARR i sag ...), interpolated by bicubics
 QED_TYPE  conic + (r / R)^4 sum of XDAT (3 + m) Q_(m - 1)((r / R)^2), R = XDAT 3, XDAT 2 terms; Q those of Forbes (Qcon,
-          XDAT 1 is 1): Jacobi polynomials P^(0, 4)(2 x - 1), so an even asphere (2007, Opt. Express 15, 5218); or, XDAT 1
-          is 0, his Qbfs terms on a sphere (`QbfsAsphere`)
+          XDAT 1 is 1): Jacobi polynomials P^(0, 4)(2 x - 1), so an even asphere (2007, Opt. Express 15, 5218); or his
+          Qbfs terms on a sphere where XDAT 1 is 0 (`QbfsAsphere`)
 ========= ===================================================================================================
 """
 
