@@ -276,8 +276,5 @@ def _alone(shape: Shape, unit: float) -> dict[str, Any]:
         meridian_items = {"geometry_type": "Toroidal", "conic_yz": shape.conic_y, "coeffs_poly_y": powers}
         return {"type": "ToroidalGeometry", **radii, **meridian_items}
     if isinstance(shape, QbfsAsphere):
-        terms_by_order = {str(m): a / unit for m, a in enumerate(shape.coefficients)}
-        head = {"radius": shape.radius / unit, "conic": shape.conic}
-        config = {**head, "terms": terms_by_order, "norm_radius": shape.norm_radius / unit}
-        return {"type": "ForbesQNormalSlopeGeometry", "surface_config": config, "solver_config": {}}
+        raise PrescriptionError("Qbfs terms: optiland does not open files with them, its own included")
     raise PrescriptionError(f"shape {type(shape).__name__}: optiland has no geometry of this shape")

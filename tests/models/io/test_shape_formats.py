@@ -1,5 +1,6 @@
 """Shapes written as lens files and read again: Qbfs aspheres, toroids with powers, Fringe sags."""
 
+import json
 import warnings
 
 import numpy as np
@@ -38,8 +39,7 @@ def landing(telescope):
     return telescope.surfaces[-1].to_local(end.position)
 
 
-@pytest.mark.parametrize("ending", ["zmx", "json"])
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize(("name", "ending"), [*((name, "zmx") for name in SHAPES), ("toroid", "json")])
 def test_written_and_read_again(name, ending, tmp_path):
     telescope, path = singlet(SHAPES[name]), tmp_path / f"lens.{ending}"
     with warnings.catch_warnings():
@@ -49,6 +49,29 @@ def test_written_and_read_again(name, ending, tmp_path):
     assert type(back.surfaces[0].shape) is type(SHAPES[name])
     # Rounding of coefficients in millimetres.
     assert np.abs(landing(telescope) - landing(back)).max() < 1e-15
+
+
+def test_qbfs_terms_of_optiland(tmp_path):
+    """Orders are texts in its JSON, which optiland itself does not read: its files are read here, and not written."""
+    telescope, path = singlet(pachon.Conic(0.2, -0.5)), tmp_path / "lens.json"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PrescriptionWarning)
+        pachon.save_telescope(telescope, path)
+        content = json.loads(path.read_text())
+        front = next(s for s in content["surface_group"]["surfaces"] if s["comment"] == "front")
+        config = {"radius": 200.0, "conic": -0.5, "norm_radius": 20.0, "terms": {"0": 0.02, "2": -0.01}}
+        for kind in ("ForbesQNormalSlopeGeometry", "ForbesQbfsGeometry"):
+            items = {"type": kind, "surface_config": config, "solver_config": {"tol": 1e-6}}
+            front["geometry"] = items | {"cs": front["geometry"]["cs"]}
+            path.write_text(json.dumps(content))
+            shape = pachon.load_telescope(path).surfaces[0].shape
+            assert shape == pachon.QbfsAsphere(-0.2, -0.5, 0.02, (-2e-5, 0.0, 1e-5))
+        front["geometry"]["surface_config"] = config | {"terms": {"0": 0.02, "x": -0.01}}
+        path.write_text(json.dumps(content))
+        with pytest.raises(PrescriptionError, match=r"terms = .*expected orders from 0 to 40"):
+            pachon.load_telescope(path)
+        with pytest.raises(PrescriptionError, match="surface front: Qbfs terms: optiland does not open"):
+            pachon.save_telescope(singlet(SHAPES["qbfs"]), path)
 
 
 @pytest.mark.parametrize("ending", ["seq", "len", "roa"])
