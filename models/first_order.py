@@ -345,7 +345,8 @@ def _trace(
     """
     w = length(telescope.default_wavelength if wavelength is None else wavelength, "wavelength")
     telescope.check_wavelength(w)
-    surfaces = tuple(s for s in telescope.surfaces if s.interaction in (Interaction.MIRROR, Interaction.REFRACT))
+    acting = (Interaction.MIRROR, Interaction.REFRACT, Interaction.THIN_LENS)
+    surfaces = tuple(s for s in telescope.surfaces if s.interaction in acting)
     if not surfaces:
         raise DomainError(f"telescope {telescope.name}: expected at least one mirror or lens surface")
     for surface in surfaces:
@@ -367,6 +368,8 @@ def _trace(
         index_after = -index if mirror else np.copysign(glass, index)
         h = h + u * (z - surface.vertex[2])
         u_after = (index * u - h * c * (index_after - index)) / index_after
+        if surface.thin_lens is not None:
+            u_after = u_after - h / (surface.thin_lens.focal_length * index_after)
         rows.append((index, index_after, h, u, u_after))
         index, u, z = index_after, u_after, surface.vertex[2]
     return _Trace(w, surfaces, curvature, *(np.array(v, dtype=np.float64) for v in zip(*rows, strict=True)))

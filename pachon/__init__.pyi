@@ -241,6 +241,7 @@ from .models.starting_designs.two_mirror import two_mirror as two_mirror
 from .models.surface import Interaction as Interaction
 from .models.surface import Surface as Surface
 from .models.telescope import Telescope as Telescope
+from .models.thin_lens import ThinLens as ThinLens
 from .models.zernike_polynomials import annular_zernikes as annular_zernikes
 from .pipeline.config import Configuration as Configuration
 from .pipeline.config import load_configuration as load_configuration

@@ -29,6 +29,7 @@ _TYPES = {
     Interaction.DETECTOR: "detector",
     Interaction.PASS: "baffle",
     Interaction.PHASE: "phase screen",
+    Interaction.THIN_LENS: "thin lens",
 }
 
 
@@ -77,6 +78,8 @@ def _more(surface: Surface, unit: float) -> str:
         parts += [f"r^{n}: {-a * unit ** (n - 1):.6g}" for n, a in pairs if a]
     else:
         parts.append(type(shape).__name__)
+    if surface.thin_lens is not None:
+        parts.append(f"focal length {surface.thin_lens.focal_length / unit:.8g}")
     if surface.grating is not None:
         parts.append(str(surface.grating))
     x, y, _ = surface.vertex

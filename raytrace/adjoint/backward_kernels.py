@@ -30,15 +30,19 @@ from ..kernels.kernel_pair import kernel_pair
 from ..kernels.packet import LANES, RayPackets, components, lanes, lanes_sqrt
 from ..kernels.shape_derivatives import added_derivatives
 from ..kernels.surface import ONE, TWO, ZERO
+from ..kernels.thin_lens import thin_lens_adjoint
 from ..kernels.trace import (
     DEFORMED,
     GROOVES,
     INTERACTION,
     MIRROR,
     PHASE,
+    POWER,
     REFRACT,
     ROTATED,
     RULED,
+    THIN_LENS,
+    VERGENCE,
     VERTEX,
     PackedSurfaces,
     to_local,
@@ -220,6 +224,14 @@ def backward_loop(special: bool) -> wp.Function:
                 if ruled == 1:
                     hx = hx + groove_x * per_path
                     hy = hy + groove_y * per_path
+                if interaction == THIN_LENS:
+                    power = surfaces.numbers[s, POWER]
+                    vergence = surfaces.numbers[s, VERGENCE]
+                    ex, ey, fx, fy, fz = thin_lens_adjoint(
+                        power, vergence, before, after, x, y, u, v, w, bx, by, bz, per_path
+                    )
+                    hx = hx + ex
+                    hy = hy + ey
             height = wp.cw_div(dot(hx, hy, az, u, v, w) + before * per_path, along)
             # With respect to the ray in front, its position anywhere along it and its direction about the intersection.
             ex = hx - wp.cw_mul(height, nx)

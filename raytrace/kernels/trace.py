@@ -34,21 +34,24 @@ from .surface import (
     reflected,
     refracted,
 )
+from .thin_lens import through_thin_lens
 
 wp.set_module_options(FORWARD_OPTIONS)
 
 MIRROR = wp.constant(0)
 REFRACT = wp.constant(1)
 PHASE = wp.constant(4)
+THIN_LENS = wp.constant(5)
 #: What grooves do in place of reflection or refraction.
-DIFFRACT = wp.constant(5)
+DIFFRACT = wp.constant(-1)
 
 
 # Columns of the table of numbers, a row per surface: curvature [1/m], conic constant, vertex [m] (3), rotation (9,
 # row by row), clear aperture: centre x, y, inner and outer radius [m]; the curvature of the conic that the search for a
 # landing starts from, another one where the surface has no conic of its own; the direction cosine w, 0 or close to it,
 # at which rays change from one intersection with that conic to the other; the path that the grooves of a grating add
-# along x and y, for each metre of wavelength [1/m].
+# along x and y, for each metre of wavelength [1/m]; the power of a thin lens, and one over the distance of the object
+# for which paths through it are equal [1/m].
 CURVATURE = wp.constant(0)
 CONIC = wp.constant(1)
 VERTEX = wp.constant(2)
@@ -57,7 +60,9 @@ APERTURE = wp.constant(14)
 FIRST_CURVATURE = wp.constant(18)
 SIGN_CHANGE = wp.constant(19)
 GROOVES = wp.constant(20)
-NUMBERS = 22
+POWER = wp.constant(22)
+VERGENCE = wp.constant(23)
+NUMBERS = 24
 # Columns of the table of kinds: interaction, number of aspheric coefficients, whether rotated, whether stopped down
 # (0 no, 1 by a disc or ring, 2 by another aperture), whether obstructions lie on the way to it, whether its shape has
 # parts besides the conic and its even powers (1) or is a mesh (2), which of the distinct media lies before and after,
@@ -145,9 +150,9 @@ def statuses(status: lanes):
 def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
     """Return the loop over the surfaces of a telescope, for plain telescopes or for any.
 
-    Plain telescopes have conics with even powers, discs and rings as apertures, no phase screens, gratings or
-    obstructions. The ``indices`` are a row of numbers, before the first surface and after each, and the wavelength [m]
-    as the last of the row; in a chromatic loop, where every ray has its own wavelength, packets of indices
+    Plain telescopes have conics with even powers, discs and rings as apertures, no phase screens, gratings, thin lenses
+    or obstructions. The ``indices`` are a row of numbers, before the first surface and after each, and the wavelength
+    [m] as the last of the row; in a chromatic loop, where every ray has its own wavelength, packets of indices
     [medium, packet] and of the wavelength behind them, and optical paths are left out.
     """
 
@@ -316,6 +321,19 @@ def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
                     for i in range(LANES):
                         total = wp.where(status[i] <= VIGNETTED, TOTAL_REFLECTION, status[i])
                         status[i] = wp.where(wp.abs(w[i]) < FAR, status[i], total)
+
+                if interaction == THIN_LENS:
+                    if wp.static(chromatic):
+                        n = indices[surfaces.kinds[s, MEDIUM_BEFORE], packet]
+                        behind = indices[surfaces.kinds[s, MEDIUM_AFTER], packet]
+                    else:
+                        n = lanes(before)
+                        behind = lanes(after)
+                    power = surfaces.numbers[s, POWER]
+                    vergence = surfaces.numbers[s, VERGENCE]
+                    u, v, w, added = through_thin_lens(power, vergence, n, behind, x, y, u, v, w)
+                    if wp.static(not chromatic):
+                        path = path + added
 
             if rotated == 1:
                 x, y, z = to_telescope(surfaces, s, x, y, z)

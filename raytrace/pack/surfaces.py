@@ -18,7 +18,18 @@ from ...models.shapes.mesh import MeshSurface
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
 from ..kernels.surface import FAR
-from ..kernels.trace import DEFORMED, INTERACTION, KINDS, NUMBERS, OBSTRUCTED, PHASE, RULED, STOPPED, PackedSurfaces
+from ..kernels.trace import (
+    DEFORMED,
+    INTERACTION,
+    KINDS,
+    NUMBERS,
+    OBSTRUCTED,
+    PHASE,
+    RULED,
+    STOPPED,
+    THIN_LENS,
+    PackedSurfaces,
+)
 from .apertures import pack_apertures
 from .meshes import pack_meshes
 from .obstructions import obstruction_table, pack_obstructions
@@ -87,7 +98,9 @@ def pack_surfaces(telescope: Telescope | SurfaceSequence, device: str = "cpu") -
         frame = (*s.vertex, *s.matrix.ravel())
         first = shapes[row].first_curvature, sign_change(s, surfaces[row + 1 :], shapes[row])
         grooves = (0.0, 0.0) if s.grating is None else s.grating.path_gradient
-        numbers[row] = [base.curvature, base.conic, *frame, *(ring or (0.0,) * 4), *first, *grooves]
+        thin = s.thin_lens
+        lens = (0.0, 0.0) if thin is None else (1.0 / thin.focal_length, 1.0 / thin.object_distance)
+        numbers[row] = [base.curvature, base.conic, *frame, *(ring or (0.0,) * 4), *first, *grooves, *lens]
         kinds[row] = [
             int(s.interaction),
             len(terms),
@@ -102,7 +115,7 @@ def pack_surfaces(telescope: Telescope | SurfaceSequence, device: str = "cpu") -
         before = s.medium_after
     packed = PackedSurfaces()
     unusual = kinds[:, [DEFORMED, OBSTRUCTED, RULED]].any() or np.any(kinds[:, STOPPED] == 2)
-    packed.special = int(unusual or np.any(kinds[:, INTERACTION] == PHASE))
+    packed.special = int(unusual or np.isin(kinds[:, INTERACTION], (PHASE, THIN_LENS)).any())
     packed.numbers = warp_array(numbers, device=device)
     packed.kinds = warp_array(kinds, wp.int32, device=device)
     packed.coefficients = warp_array(coefficients, device=device)

@@ -27,6 +27,7 @@ from ...rotation import rotation_angles
 from ...shapes.shape import Shape
 from ...surface import Interaction
 from ...telescope import VACUUM
+from ...thin_lens import ThinLens
 from .source import Findings, Source
 
 #: Name of the plane that writers put in front to carry the entrance pupil.
@@ -72,6 +73,7 @@ class LensSurface:
     distance: float | None = None
     number: int = 0
     grating: Grating | None = None
+    thin_lens: ThinLens | None = None
 
     @property
     def off_axis(self) -> bool:
@@ -198,6 +200,8 @@ class LensDescription:
         before = self.surfaces[-1].after if self.surfaces else self.medium
         after = before if mirror else surface.after
         passing = Interaction.PASS if after == before and surface.grating is None else Interaction.REFRACT
+        if surface.thin_lens is not None:
+            passing = Interaction.THIN_LENS
         followed = replace(
             surface,
             name=" ".join(surface.name.split()),

@@ -98,6 +98,9 @@ class LensSequence:
             if own_stop and data.aiming != aimed:
                 problem = f"aiming = {data.aiming}: {file} does not state how rays are aimed"
                 findings.note(PrescriptionError(problem), f"read back it is {aimed}")
+            for surface in t.surfaces:
+                if surface.thin_lens is not None:
+                    raise PrescriptionError(f"surface {surface.name}: thin lens: {file} is written without them")
             surfaces = lens_surfaces(t, data.stop if own_stop else None, along_light=along_light)
         aperture = ("entrance_pupil", t.pupil_diameter)
         if own_stop and data.aperture is not None and data.aperture_value is not None:
@@ -282,6 +285,7 @@ def lens_surfaces(t: Telescope, stop: str | None, *, along_light: bool = False) 
                 stop=surface.name == stop,
                 distance=float(position[2] - surfaces[-1].position[2]) if surfaces else 0.0,
                 grating=None if aligned.grating is None else aligned.grating.rotated(),
+                thin_lens=surface.thin_lens,
             )
         surfaces.append(placed)
         medium = surface.medium_after

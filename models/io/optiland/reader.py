@@ -15,6 +15,7 @@ import numpy as np
 
 from ...aperture import Aperture, Complement
 from ...telescope import VACUUM
+from ...thin_lens import ThinLens
 from ..json_items import JsonObject
 from ..lens.apertures import ellipse, rectangle, ring
 from ..lens.description import INFINITE, Format, LensDescription, LensSurface
@@ -27,6 +28,8 @@ from .shapes import shape_of
 
 FORMAT = Format("optiland", "aperture", "wavelengths", "is_stop")
 MM = 1e-3
+#: Interaction of light with an ideal thin lens.
+THIN_LENS_MODEL = "ThinLensInteractionModel"
 #: Keys of the file without effect on the paths of rays.
 IGNORED = ("version", "pickups", "solves")
 #: Apertures by their types; the size of the stop is its diameter.
@@ -129,9 +132,11 @@ def _object(surface: JsonObject, first: JsonObject, lens: LensDescription, glass
 def _surface(surface: JsonObject, lens: LensDescription, stop_radius: float, glasses: Glasses) -> None:
     geometry, interaction, findings = surface.child("geometry"), surface.child("interaction_model"), lens.findings
     kind = interaction.text("type")
-    grating = grating_of(geometry)
+    grating, thin_lens = grating_of(geometry), None
     if kind == PHASE_MODEL and geometry.text("type") == "Plane":
         grating = phase_grating(interaction.child("phase_profile"))
+    elif kind == THIN_LENS_MODEL and geometry.text("type") == "Plane" and not interaction.flag("is_reflective"):
+        thin_lens = ThinLens(interaction.number("focal_length") * MM)
     elif kind not in ("RefractiveReflectiveModel", MODEL):
         findings.report(interaction.problem(f"interaction_model {kind}: expected RefractiveReflectiveModel or {MODEL}"))
     if "bsdf" in interaction:
@@ -151,6 +156,7 @@ def _surface(surface: JsonObject, lens: LensDescription, stop_radius: float, gla
         semi_diameter=stop_radius if stop else 0.0,
         stop=stop,
         grating=grating,
+        thin_lens=thin_lens,
     )
     lens.add(placed, mirror=mirror)
     surface.report_rest(findings, ("type", "thickness", "surface_type", "material_post"))

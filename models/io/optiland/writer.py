@@ -27,7 +27,7 @@ from ..lens.text import scaled
 from ..writable import report_pupil_plane, report_unheld, require_sequential, with_formulas
 from .gratings import MODEL, grating_items
 from .media import material_items
-from .reader import APERTURES, FIELD_TYPES
+from .reader import APERTURES, FIELD_TYPES, THIN_LENS_MODEL
 from .shapes import geometry_items
 
 MM = 1e-3
@@ -107,12 +107,19 @@ def _surface_items(surface: LensSurface, first: float) -> dict[str, Any]:
         "aperture": None if region is None else _aperture_items(region),
         "comment": surface.name,
         "interaction_model": {
-            "type": "RefractiveReflectiveModel" if grating is None else MODEL,
+            **_model(surface),
             "is_reflective": surface.interaction == Interaction.MIRROR,
             "coating": None,
             "bsdf": None,
         },
     }
+
+
+def _model(surface: LensSurface) -> dict[str, Any]:
+    """Return the type of interaction of light with a surface, and the focal length of a thin lens."""
+    if surface.thin_lens is not None:
+        return {"type": THIN_LENS_MODEL, "focal_length": surface.thin_lens.focal_length / MM}
+    return {"type": "RefractiveReflectiveModel" if surface.grating is None else MODEL}
 
 
 def _aperture_items(aperture: Aperture) -> dict[str, Any]:

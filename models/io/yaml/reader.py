@@ -19,6 +19,7 @@ from ...obstruction import Obstruction
 from ...rotation import rotation_matrix
 from ...surface import IDENTITY, Interaction, Matrix, Surface
 from ...telescope import VACUUM, Telescope
+from ...thin_lens import ThinLens
 from ..writable import require_met
 from .apertures import ApertureKeys, ObstructionSection
 from .coatings import CoatingSection
@@ -55,6 +56,7 @@ INTERACTIONS = {
     "detector": Interaction.DETECTOR,
     "baffle": Interaction.PASS,
     "phase": Interaction.PHASE,
+    "thin_lens": Interaction.THIN_LENS,
 }
 
 
@@ -76,11 +78,27 @@ class GratingSection(Section):
         return Grating(self.order, self.lines_per_mm, self.groove_angle)
 
 
+class ThinLensSection(Section):
+    """Ideal thin lens."""
+
+    focal_length: Length
+    object_distance: Length = math.inf
+
+    @classmethod
+    def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
+        if "focal_length" not in content:
+            raise expected("a number", "focal_length")
+
+    def lens(self) -> ThinLens:
+        """Return the lens."""
+        return ThinLens(self.focal_length, self.object_distance)
+
+
 class SurfaceKeys(ApertureKeys):
     """Keys of a surface beside those of its shape."""
 
     name: Text
-    type: Literal["mirror", "refract", "detector", "baffle", "phase"]
+    type: Literal["mirror", "refract", "detector", "baffle", "phase", "thin_lens"]
     x: Length = 0.0
     y: Length = 0.0
     z: Length
@@ -90,6 +108,7 @@ class SurfaceKeys(ApertureKeys):
     semi_diameter: OptionalLength = None
     coating: OptionalText = None
     grating: GratingSection | None = None
+    thin_lens: ThinLensSection | None = None
 
     @classmethod
     def keys(cls) -> list[str]:
@@ -124,6 +143,7 @@ class SurfaceKeys(ApertureKeys):
             rotation=self.rotation if self.tilt is None else _matrix(rotation_matrix(self.tilt)),
             semi_diameter=self.semi_diameter,
             grating=None if self.grating is None else self.grating.grating(),
+            thin_lens=None if self.thin_lens is None else self.thin_lens.lens(),
         ).coated(None if self.coating is None else coating_sections[self.coating])
 
 

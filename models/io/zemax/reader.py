@@ -21,7 +21,7 @@ from ..lens.source import Findings, Source
 from .apertures import read_aperture
 from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, ZemaxFile, read_zemax_file
 from .links import state_links
-from .shapes import read_grating, read_shape
+from .shapes import read_grating, read_shape, read_thin_lens
 from .system import FORMAT, object_distance, read_system
 
 #: Name of a glass without a name.
@@ -126,8 +126,10 @@ class _LensReader:
         with source.context():
             shape = read_shape(block, lens.unit, self.findings)
             aperture = read_aperture(block, lens.unit, self.findings)
-            grating = read_grating(block)
+            grating, thin_lens = read_grating(block), read_thin_lens(block, lens.unit)
         mirror, medium = self._glass(block)
+        if thin_lens is not None and mirror:
+            raise block.problem("TYPE PARAXIAL, GLAS MIRROR: a thin lens that reflects is not read")
         surface = LensSurface(
             source,
             shape,
@@ -141,6 +143,7 @@ class _LensReader:
             distance=self.distance,
             number=number,
             grating=grating,
+            thin_lens=thin_lens,
         )
         lens.add(surface, mirror=mirror)
         self.stop_ahead, self.distance = False, 0.0

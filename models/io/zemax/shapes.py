@@ -15,6 +15,7 @@ XPOLYNOM  conic + sum of XDAT (2 + i) times x, y, x^2, xy, y^2, x^3... of x / R,
 XASPHERE  conic + sum of XDAT (2 + i) (r / R)^(2 i), R = XDAT 2, XDAT 1 terms
 TILTSURF  the plane x PARM 1 + y PARM 2
 DGRATING  as STANDARD, with PARM 1 grooves a micrometre along the local y axis and the order PARM 2
+PARAXIAL  a plane with an ideal thin lens of the focal length PARM 1; PARM 2, its mode of paths, is not used
 GRID_SAG  as EVENASPH + a grid of nodes (GDAT nx ny dx dy; GARR i sag ...), interpolated by bicubics
 QED_TYPE  conic + (r / R)^4 sum of XDAT (3 + m) Q_(m - 1)((r / R)^2), R = XDAT 3, XDAT 2 terms; Q those of Forbes (Qcon,
           XDAT 1 is 1): Jacobi polynomials P^(0, 4)(2 x - 1), so an even asphere (2007, Opt. Express 15, 5218); or his
@@ -37,6 +38,7 @@ from ...shapes.polynomial import XYPolynomial, ZernikeSag
 from ...shapes.qbfs import QbfsAsphere
 from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere
 from ...shapes.sum import Sum
+from ...thin_lens import ThinLens
 from ...zernike_polynomials import annular_zernikes
 from ..lens import shapes
 from ..lens.shapes import MOST_ODD, even_asphere, polynomial_powers, square_term
@@ -46,7 +48,7 @@ from .file import Block
 
 TYPES = (
     *("STANDARD", "EVENASPH", "ODDASPHE", "BICONICX", "TOROIDAL"),
-    *("SZERNSAG", "FZERNSAG", "XPOLYNOM", "XASPHERE", "TILTSURF", "GRID_SAG", "QED_TYPE", "DGRATING"),
+    *("PARAXIAL", "SZERNSAG", "FZERNSAG", "XPOLYNOM", "XASPHERE", "TILTSURF", "GRID_SAG", "QED_TYPE", "DGRATING"),
 )
 #: What types of surfaces are, by the beginnings of their names, that have no counterpart here.
 REFUSED = {
@@ -73,8 +75,8 @@ def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
         kind = "STANDARD"
     curvature, conic = block.number("CURV", 0.0) / unit, block.number("CONI", 0.0)
     parameters = {i: v for i, v in block.table("PARM").items() if v != 0}
-    if kind == "DGRATING":
-        # The grooves are those of read_grating.
+    if kind in ("DGRATING", "PARAXIAL"):
+        # They are those of read_grating and read_thin_lens.
         parameters = {i: v for i, v in parameters.items() if i > 2}
     base = shapes.conic(curvature, conic)
     if kind in ("EVENASPH", "SZERNSAG", "FZERNSAG", "GRID_SAG"):
@@ -90,6 +92,8 @@ def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
         base = shapes.toroid(parameters.pop(1, math.inf) * unit, curvature, conic, powers)
     elif kind == "TILTSURF":
         base = XYPolynomial(((1, 0, parameters.pop(1, 0.0)), (0, 1, parameters.pop(2, 0.0))))
+    elif kind == "PARAXIAL":
+        return Plane()
     elif kind == "XASPHERE":
         radius, terms = _extra_data(block, unit)
         base = even_asphere(curvature, conic, [a / radius ** (2 * i) for i, a in enumerate(terms, start=1)])
@@ -115,6 +119,14 @@ def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
             if value != 0:
                 findings.report(block.problem(f"XDAT {i} {value:g}: not understood for TYPE {kind}"))
     return base
+
+
+def read_thin_lens(block: Block, unit: float) -> ThinLens | None:
+    """Return the ideal thin lens of a surface PARAXIAL; None of another one, or of an infinite focal length."""
+    if block.text("TYPE").upper().split()[:1] != ["PARAXIAL"]:
+        return None
+    focal_length = block.table("PARM").get(1, 0.0) * unit
+    return ThinLens(focal_length) if focal_length else None
 
 
 def read_grating(block: Block) -> Grating | None:

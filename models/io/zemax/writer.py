@@ -150,7 +150,11 @@ def _break_lines(values: list[float], order: int) -> list[str]:
 def _surface_lines(surface: LensSurface, glasses: dict[Medium, str], unit: float) -> list[str]:
     lines = [f"COMM {surface.name}"]
     with error_context(subject=f"surface {surface.name}"):
-        lines += shape_lines(surface.shape, unit) if surface.grating is None else grating_lines(surface, unit)
+        if surface.thin_lens is not None:
+            focal_length = number_text(surface.thin_lens.focal_length / unit)
+            lines += ["TYPE PARAXIAL", "CURV 0.0", f"PARM 1 {focal_length}", "PARM 2 1"]
+        else:
+            lines += shape_lines(surface.shape, unit) if surface.grating is None else grating_lines(surface, unit)
         if surface.interaction == Interaction.MIRROR:
             lines.append("GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0")
         elif surface.interaction != Interaction.DETECTOR:
