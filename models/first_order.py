@@ -270,7 +270,8 @@ def seidel_sums(telescope: Telescope, wavelength: ArrayLike | None = None, field
     # Aspheric term k c^3 + 8 a_4 of each surface; along s it changes sign.
     aspheric = -8 * np.array([s.shape.fourth_order for s in trace.surfaces]) * (n2 - n)
     from_aspheric = np.stack([h**4, h**3 * hb, h**2 * hb**2, np.zeros_like(h), h * hb**3]) * aspheric
-    contributions = np.stack([s1, s2, s3, s4, s5]) + from_aspheric
+    ideal = np.array([s.thin_lens is not None for s in trace.surfaces])
+    contributions = np.where(ideal, 0.0, np.stack([s1, s2, s3, s4, s5]) + from_aspheric)
     return SeidelSums(tuple(s.name for s in trace.surfaces), contributions.T)
 
 

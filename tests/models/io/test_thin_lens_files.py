@@ -7,7 +7,7 @@ import pytest
 
 import pachon
 from pachon.core.errors import PrescriptionError, PrescriptionWarning
-from pachon.models.first_order import first_order
+from pachon.models.first_order import first_order, seidel_sums
 
 
 def zemax_file(folder, *blocks, distance="INFINITY", fields=("0", "5")):
@@ -36,6 +36,7 @@ def test_a_paraxial_lens_of_zemax(tmp_path):
     telescope = pachon.load_telescope(zemax_file(tmp_path, paraxial(80.0, 80.0, "STOP"), IMAGE))
     assert telescope.surfaces[0].thin_lens == pachon.ThinLens(0.08)
     assert first_order(telescope).focal_length == pytest.approx(0.08, rel=1e-14)
+    assert not seidel_sums(telescope).contributions.any()
     for field in telescope.design_data.fields:
         opd = pachon.wavefront_opd(telescope, field, 550e-9, grid=16)
         assert np.nanmax(np.abs(opd.value)) < 1e-15
