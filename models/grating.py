@@ -69,6 +69,11 @@ class Grating:
         x, y = self.across
         return scale * x + 0.0, scale * y + 0.0
 
+    def path_derivative(self, name: str) -> tuple[float, float]:
+        """Return the derivative of `path_gradient` by "lines_per_mm" or "groove_angle"."""
+        x, y = self.path_gradient
+        return (x / self.lines_per_mm, y / self.lines_per_mm) if name == "lines_per_mm" else (-y, x)
+
     def rotated(self) -> Grating:
         """Return the grating in axes turned by half a turn about y, those of a lens file."""
         return replace(self, groove_angle=0.0 - self.groove_angle)

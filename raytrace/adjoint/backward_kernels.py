@@ -48,7 +48,17 @@ from ..kernels.trace import (
     to_local,
     to_telescope,
 )
-from .column_kernels import INDEX, INTERSECTION, SAG, dot, polynomial_columns, sag_derivatives, write_column, write_gap
+from .column_kernels import (
+    GROOVE,
+    INDEX,
+    INTERSECTION,
+    SAG,
+    dot,
+    polynomial_columns,
+    sag_derivatives,
+    write_column,
+    write_gap,
+)
 
 wp.set_module_options(FORWARD_OPTIONS)
 
@@ -212,6 +222,10 @@ def backward_loop(special: bool) -> wp.Function:
                     fz = bz + by_along - wp.cw_mul(by_root, ez)
                     by_grooves = dot(fx, fy, fz, u, v, w)
                     by_after = dot(fx, fy, fz, ex, ey, ez)
+                    by_groove = wavelength * ((ONE / after) * fx + wp.cw_mul(per_path, x))
+                    write_column(columns, s, GROOVE, o, p, by_groove, matrix)
+                    by_groove = wavelength * ((ONE / after) * fy + wp.cw_mul(per_path, y))
+                    write_column(columns, s, GROOVE + 1, o, p, by_groove, matrix)
                     fx = mu * fx
                     fy = mu * fy
                     fz = mu * fz

@@ -8,11 +8,14 @@ import pytest
 import pachon
 from pachon.core.errors import PrescriptionError
 from pachon.models.media.medium import ConstantIndex
+from pachon.models.parameters.parameters import apply
 from pachon.models.rotation import rotation_matrix
+from pachon.raytrace.adjoint.adjoint_matrix import column_table
 from pachon.raytrace.adjoint.backward_pass import backward_pass, landing_gradient, position_gradient
 from pachon.raytrace.adjoint.forward_pass import forward_pass
 
 WAVELENGTH = 550e-9
+QUANTITIES = ("sag", "index", "intersection", "gap", "grooves")
 GLASS = ConstantIndex(1.5168)
 AIR = ConstantIndex(1.0)
 WATER = ConstantIndex(1.33)
@@ -177,7 +180,8 @@ def responses(spectrograph):
         direction=np.zeros((4, 3, 20)),
         path=np.array([0.0, 0.0, 0.0, 1.0]),
     )
-    return start, backward_pass(forward, four), four
+    table = column_table(spectrograph, [*((s, name) for s in range(4) for name in QUANTITIES), (4, "gap")])
+    return start, backward_pass(forward, four, table), four
 
 
 def outputs(optics, start):
@@ -256,6 +260,21 @@ def test_derivatives_by_indices(spectrograph, responses):
 
     numeric = slope(air, 1e-4)
     assert np.abs(expected - numeric).max() < 1e-11
+
+
+@pytest.mark.parametrize("name", ["back", "mirror"])
+@pytest.mark.parametrize(("quantity", "step"), [("lines_per_mm", 0.5), ("groove_angle", 3e-3)])
+def test_derivatives_by_grooves(spectrograph, responses, name, quantity, step):
+    start, adjoint, _ = responses
+    by_grooves = adjoint.grooves(spectrograph.surface_names.index(name))
+    derivative = spectrograph.surface(name).grating.path_derivative(quantity)
+    expected = np.einsum("ojn,j->on", by_grooves, derivative)
+
+    def changed(h):
+        return outputs(apply(spectrograph, {f"{name}.{quantity}": h}), start)
+
+    numeric = slope(changed, step)
+    assert np.abs(expected - numeric).max() < 1e-8 * np.abs(numeric).max()
 
 
 def test_landing_derivatives_are_those_of_paths(spectrograph, responses):

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 import pachon
+from pachon.design.optimize.targets import ChiefRay
+from pachon.models.parameters.parameters import apply
 from pachon.models.rotation import rotation_matrix
 from pachon.models.telescope import VACUUM
+from pachon.wavefront.pupil_sampling import pupil_sampling
 
 WAVELENGTH = 550e-9
 
@@ -263,3 +266,40 @@ def test_a_lost_order_is_dark_and_does_not_spoil_others():
     end = pachon.trace(steep, pachon.launch_rays(steep, (0.0, 0.0), 900e-9, ([0.0], [0.0])))
     assert end.status[0] == pachon.RayStatus.EVANESCENT
     assert np.isnan(end.position).all()
+
+
+def test_sensitivities_by_grooves():
+    """Turned grooves are a turned sphere; the terms by lines are those of differences."""
+    telescope, _ = rowland()
+    pupil = pupil_sampling(telescope, "square", 16)
+    names = ["grating.lines_per_mm", "grating.groove_angle", "grating.rz"]
+    found = pachon.sensitivity(telescope, names, np.zeros((1, 2)), sampling=pupil, n_zernike=11)
+    lines, angle, turn = np.moveaxis(found.matrix[0], -1, 0)
+    assert np.abs(angle - turn)[3:].max() < 1e-10 * np.abs(turn[3:]).max()
+
+    def terms(h):
+        moved = apply(telescope, {"grating.lines_per_mm": h})
+        return pachon.sensitivity(moved, names[:1], np.zeros((1, 2)), sampling=pupil, n_zernike=11).zernikes[0]
+
+    step = 1.0
+    near, far = ((terms(k * step) - terms(-k * step)) / (2 * k * step) for k in (1.0, 2.0))
+    numeric = (4.0 * near - far) / 3.0
+    assert np.abs(lines - numeric).max() < 1e-7 * np.abs(numeric).max()
+
+
+@pytest.mark.long
+def test_an_optimisation_finds_the_lines_of_a_grating():
+    """Lines and their direction are those that bring the light back to the middle of the detector."""
+    telescope, _ = rowland()
+    ruled = replace(telescope.surfaces[0], grating=pachon.Grating(1, 1197.0, 0.002))
+    start = replace(telescope, surfaces=(ruled, *telescope.surfaces[1:]))
+    names = ["grating.lines_per_mm", "grating.groove_angle"]
+    targets = [ChiefRay((0.0, 0.0), axis, value=0.0, weight=100.0) for axis in ("x", "y")]
+    found = pachon.optimize(start, names, "spots", np.zeros((1, 2)), targets=targets)
+    assert found.values == pytest.approx([1200.0, 0.0], abs=1e-5)
+
+
+def test_only_gratings_have_grooves():
+    telescope, _ = rowland()
+    with pytest.raises(pachon.PachonError, match=r"'Detector\.lines_per_mm': expected a surface with a grating"):
+        apply(telescope, {"Detector.lines_per_mm": 1.0})
