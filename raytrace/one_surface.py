@@ -73,8 +73,9 @@ def _at_surface(
             raise DomainError(f"refractive index = {index!r}: expected a positive number")
     if isinstance(surface, Shape):
         surface = Surface(type(surface).__name__, interaction, surface, (0.0, 0.0, 0.0), VACUUM)
-    bare = {"coating": None, "grating": None, "thin_lens": None}
-    surface = replace(surface, interaction=interaction, shape=surface.meeting_shape, **bare)
+    surface = replace(
+        surface, interaction=interaction, shape=surface.meeting_shape, coating=None, grating=None, thin_lens=None
+    )
     packed = pack_surfaces(SurfaceSequence((surface,)))
     # Without grooves the rays depend on no wavelength.
     end = launch_trace(packed, np.array([n1, n2, np.nan]), rays, 1).end

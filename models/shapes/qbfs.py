@@ -168,7 +168,7 @@ class QbfsAsphere(Shape):
             return replace(self, coefficients=with_coefficient(self.coefficients, int(name[1:]), value))
         if name == "curvature":
             return replace(self, radius=1.0 / value if value else math.inf)
-        return replace(self, **{name: value})
+        return replace(self, conic=value) if name == "conic" else replace(self, radius=value)
 
 
 def _recurrence(count: int) -> tuple[list[float], list[float], list[float]]:

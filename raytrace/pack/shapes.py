@@ -112,9 +112,11 @@ def _encoded_parts(shapes: Sequence[Shape]) -> list[tuple[int, tuple[int, int], 
             numbers = np.array([cx, cy, (1.0 + shape.conic_y) * cy**2, *shape.coefficients])
             encoded.append((int(TOROID), (len(shape.coefficients), 0), numbers))
         elif isinstance(shape, QbfsAsphere):
-            c, series = 1.0 / shape.radius, shape.series
-            head = [shape.conic * c**2, (1.0 + shape.conic) * c**2, 1.0 / shape.norm_radius**2]
-            encoded.append((int(QBFS), (len(series), 0), np.array([*head, *series])))
+            square, series = 1.0 / shape.radius**2, shape.series
+            numbers = np.array(
+                [shape.conic * square, (1.0 + shape.conic) * square, 1.0 / shape.norm_radius**2, *series]
+            )
+            encoded.append((int(QBFS), (len(series), 0), numbers))
         elif isinstance(shape, GridSag):
             head = [shape.x[0], shape.y[0], *(1.0 / step for step in shape.step)]
             numbers = np.concatenate([head, shape.nodes.ravel()])
