@@ -277,7 +277,8 @@ def seidel_sums(telescope: Telescope, wavelength: ArrayLike | None = None, field
     # Aspheric term k c^3 + 8 a_4 of each surface; along s it changes sign.
     aspheric = -8 * np.array([s.fourth_order for s in trace.surfaces]) * (n2 - n)
     from_aspheric = np.stack([h**4, h**3 * hb, h**2 * hb**2, np.zeros_like(h), h * hb**3]) * aspheric
-    contributions = np.stack([s1, s2, s3, s4, s5]) + from_aspheric
+    ideal = np.array([s.thin_lens is not None for s in trace.surfaces])
+    contributions = np.where(ideal, 0.0, np.stack([s1, s2, s3, s4, s5]) + from_aspheric)
     return SeidelSums(tuple(s.name for s in trace.surfaces), contributions.T)
 
 
@@ -373,6 +374,8 @@ def _trace(
         index_after = -index if mirror else np.copysign(glass, index)
         h = h + u * (z - surface.z)
         u_after = (index * u - h * c * (index_after - index)) / index_after
+        if surface.thin_lens is not None:
+            u_after = u_after - h / (surface.thin_lens.focal_length * index_after)
         rows.append((index, index_after, h, u, u_after))
         index, u, z = index_after, u_after, surface.z
     return _Trace(w, surfaces, curvature, *(np.array(v, dtype=np.float64) for v in zip(*rows, strict=True)))

@@ -43,6 +43,7 @@ class ParaxialSurfaces:
     """
 
     rows: list[tuple[tuple[float, float], Medium, Medium, bool]] = field(default_factory=list)
+    powers: list[float] = field(default_factory=list)
     distances: list[float] = field(default_factory=list)
     stop: int = 0
     stop_radius: float = 0.0
@@ -70,7 +71,9 @@ class ParaxialSurfaces:
             mirror = surface.interaction == Interaction.MIRROR
             sign = math.copysign(1.0, axis @ surface.matrix[:, 2])
             x, y = curvatures_across(surface)
-            paraxial.add((sign * x, sign * y), medium, surface.medium_after, mirror=mirror)
+            lens = surface.thin_lens
+            power = 0.0 if lens is None else 1.0 / lens.focal_length
+            paraxial.add((sign * x, sign * y), medium, surface.medium_after, mirror=mirror, power=power)
             if front and surface.name == stop:
                 break
             if mirror and folded:
@@ -79,8 +82,11 @@ class ParaxialSurfaces:
             medium = surface.medium_after
         return paraxial
 
-    def add(self, curvatures: tuple[float, float], before: Medium, after: Medium, *, mirror: bool) -> None:
-        """Add a surface of given curvatures along x and y."""
+    def add(
+        self, curvatures: tuple[float, float], before: Medium, after: Medium, *, mirror: bool, power: float = 0.0
+    ) -> None:
+        """Add a surface of given curvatures along x and y, or a thin lens of a power [1/m]."""
+        self.powers.append(power)
         self.rows.append((curvatures, before, after, mirror))
         self.distances.append(self._ahead)
         self._ahead = 0.0
@@ -98,14 +104,30 @@ class ParaxialSurfaces:
         heights = []
         n = float(self.rows[0][1].index(wavelength))
         axis = 1 if any(curvatures[1] for curvatures, *_ in self.rows) else 0
-        for (curvatures, _, after, mirror), distance in zip(self.rows, self.distances, strict=True):
+        for (curvatures, _, after, mirror), power, distance in zip(self.rows, self.powers, self.distances, strict=True):
             height += slope * distance
             heights.append(height)
             glass = float(after.index(wavelength))
             n_after = -n if mirror else math.copysign(glass, n)
-            slope = (n * slope - height * curvatures[axis] * (n_after - n)) / n_after
+            slope = (n * slope - height * curvatures[axis] * (n_after - n) - height * power) / n_after
             n = n_after
         return np.array(heights), slope
+
+    def object_distance_at(self, place: int, wavelength: float, object_distance: float) -> float:
+        """Return the distance along the light of the image of the object that a surface has in front of it [m].
+
+        `object_distance` [m] is that from the object to the first surface; the result is negative where the image is
+        behind the surface.
+        """
+        height, slope = (1.0, 0.0) if math.isinf(object_distance) else (object_distance, 1.0)
+        side = 1.0
+        if place:
+            front = ParaxialSurfaces(self.rows[:place], self.powers[:place], self.distances[:place])
+            heights, slope = front.trace(height, slope, wavelength)
+            height = float(heights[-1])
+            side = -1.0 if sum(mirror for *_, mirror in front.rows) % 2 else 1.0
+        height += slope * self.distances[place]
+        return side * height / slope if slope else math.inf
 
 
 @dataclass(frozen=True)
@@ -253,7 +275,7 @@ def stop_is_inside(t: Telescope) -> bool:
     if t.design_data.stop is None:
         return False
     front = t.surfaces[: t.surface_names.index(t.design_data.stop)]
-    return any(s.interaction in (Interaction.MIRROR, Interaction.REFRACT) for s in front)
+    return any(s.interaction in (Interaction.MIRROR, Interaction.REFRACT, Interaction.THIN_LENS) for s in front)
 
 
 def following_stop(t: Telescope) -> Telescope:

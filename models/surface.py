@@ -15,9 +15,11 @@ from ..core.errors import DomainError, PrescriptionError
 from ..core.units import metres, pure_numbers
 from .aperture import Aperture
 from .coating import AnyCoating
+from .grating import Grating
 from .layer_stack import LayerStack
 from .media.medium import Medium
 from .shapes.shape import Plane, Shape
+from .thin_lens import ThinLens
 
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
@@ -35,6 +37,8 @@ class Interaction(IntEnum):
     #: Thin phase screen on the plane z = 0: the shape is a map of optical path [m], which is added to the path of the
     #: ray; its slopes are added to the ray's components along x and y, times the index.
     PHASE = 4
+    #: Ideal thin lens on the plane z = 0.
+    THIN_LENS = 5
 
 
 @check_arguments
@@ -47,7 +51,7 @@ class Surface:
     name : str
         Name, unique within its telescope.
     interaction : Interaction
-        Mirror, refracting interface, detector, surface without effect, or phase screen.
+        Mirror, refracting interface, detector, surface without effect, phase screen, or ideal thin lens.
     shape : Shape
         Shape in the surface's own frame; for a phase screen, the map of optical path [m].
     vertex : tuple of float, shape (3,)
@@ -62,6 +66,10 @@ class Surface:
         Radius [m] that the surface is made or drawn to; it stops no light.
     coating : Coating, CoatingTable or LayerStack, optional
         Coating, for throughput, illumination and ghosts; rays do not depend on it. Layers are those of lens surfaces.
+    grating : Grating, optional
+        Grooves of a mirror or lens surface.
+    thin_lens : ThinLens, optional
+        The lens that an ideal thin lens is, on a plane.
     """
 
     name: str
@@ -73,12 +81,20 @@ class Surface:
     rotation: Matrix = IDENTITY
     semi_diameter: float | None = None
     coating: AnyCoating | None = None
+    grating: Grating | None = None
+    thin_lens: ThinLens | None = None
 
     def __post_init__(self) -> None:
         if len(self.vertex) != 3 or not np.all(np.isfinite(self.vertex)):
             raise PrescriptionError(f"vertex = {self.vertex!r}: expected three finite numbers")
         if self.semi_diameter is not None and not 0 < self.semi_diameter < np.inf:
             raise PrescriptionError(f"semi_diameter = {self.semi_diameter!r}: expected a positive number")
+        if self.grating is not None and self.interaction not in (Interaction.MIRROR, Interaction.REFRACT):
+            raise PrescriptionError("grating: expected a mirror or a lens surface", key="grating")
+        if (self.thin_lens is not None) != (self.interaction == Interaction.THIN_LENS):
+            raise PrescriptionError("thin_lens: expected one of a thin lens, and of that alone", key="thin_lens")
+        if self.thin_lens is not None and not isinstance(self.shape, Plane):
+            raise PrescriptionError(f"shape {type(self.shape).__name__}: expected a plane of a thin lens", key="shape")
         axes = np.array(self.rotation, dtype=np.float64)
         # 1e-9 admits what many rotations accumulate in rounding, and no scaling or reflection.
         if self.rotation != IDENTITY and (

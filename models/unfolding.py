@@ -16,6 +16,7 @@ from .paraxial import curvatures_across, require_on_axis
 from .shapes.shape import Rotational, Shape
 from .surface import Interaction, Surface
 from .telescope import Telescope
+from .thin_lens import ThinLens
 
 #: Distance from the axis, over the size of the system, and tilt [rad] that rounding of folded frames leaves.
 _ROUNDING = 1e-9
@@ -36,6 +37,7 @@ class AxialSurface:
     fourth_order: float
     medium_after: Medium
     fold: bool = False  #: a flat mirror that turns the axis, and does nothing else
+    thin_lens: ThinLens | None = None
 
 
 @dataclass(frozen=True)
@@ -66,8 +68,10 @@ def unfolded_axis(telescope: Telescope) -> UnfoldedAxis:
         vertex = reflection @ np.array(surface.vertex) + offset if folded else np.array(surface.vertex)
         axes = reflection @ surface.matrix
         heights[surface.name] = float(vertex[2])
-        if surface.interaction not in (Interaction.MIRROR, Interaction.REFRACT):
+        if surface.interaction not in (Interaction.MIRROR, Interaction.REFRACT, Interaction.THIN_LENS):
             continue
+        if surface.grating is not None:
+            raise DomainError(f"surface {surface.name} of {telescope.name}: expected one without grooves on the axis")
         normal = axes[:, 2]
         tilt = float(np.hypot(*normal[:2]))
         if surface.interaction == Interaction.MIRROR and is_flat(surface.shape) and tilt > (_ROUNDING if folded else 0):
@@ -97,6 +101,7 @@ def unfolded_axis(telescope: Telescope) -> UnfoldedAxis:
                 (along_x, along_y),
                 sense * surface.shape.fourth_order,
                 surface.medium_after,
+                thin_lens=surface.thin_lens,
             )
         )
     return UnfoldedAxis(tuple(surfaces), heights)

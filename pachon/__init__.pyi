@@ -186,6 +186,7 @@ from .models.first_order import seidel_sums as seidel_sums
 from .models.fringe_zernikes import fringe_from_noll as fringe_from_noll
 from .models.fringe_zernikes import fringe_zernikes as fringe_zernikes
 from .models.fringe_zernikes import noll_from_fringe as noll_from_fringe
+from .models.grating import Grating as Grating
 from .models.io.glass_catalogue import GlassCatalogue as GlassCatalogue
 from .models.io.grid_file import read_grid as read_grid
 from .models.io.hdf5_map import read_hdf5_map as read_hdf5_map
@@ -227,6 +228,7 @@ from .models.shapes.mesh import MeshSurface as MeshSurface
 from .models.shapes.modes import GridModes as GridModes
 from .models.shapes.polynomial import XYPolynomial as XYPolynomial
 from .models.shapes.polynomial import ZernikeSag as ZernikeSag
+from .models.shapes.qbfs import QbfsAsphere as QbfsAsphere
 from .models.shapes.shape import Conic as Conic
 from .models.shapes.shape import EvenAsphere as EvenAsphere
 from .models.shapes.shape import Plane as Plane
@@ -248,6 +250,7 @@ from .models.starting_designs.two_mirror import two_mirror as two_mirror
 from .models.surface import Interaction as Interaction
 from .models.surface import Surface as Surface
 from .models.telescope import Telescope as Telescope
+from .models.thin_lens import ThinLens as ThinLens
 from .models.zernike_polynomials import annular_zernikes as annular_zernikes
 from .pipeline.config import Configuration as Configuration
 from .pipeline.config import load_configuration as load_configuration

@@ -18,7 +18,7 @@ from ..core.units import metres, pure_numbers, radians
 from ..models.camera.camera import Camera
 from ..models.star_spectrum import COOLEST, HOTTEST, TEMPERATURE_COLUMNS, color_temperature
 from ..models.telescope import Telescope
-from ..raytrace.rays import RayStatus, field_direction
+from ..raytrace.rays import LOST, field_direction
 from ..sky.pointing import Pointing
 from ..wavefront.chief_rays import chief_rays
 from .config import Configuration
@@ -242,7 +242,7 @@ def _landing_points(telescope: Telescope, slopes: np.ndarray, wavelength: float)
         inside = np.flatnonzero(np.hypot(*np.arctan(slopes).T) <= telescope.field_limit)
     light = field_direction(slopes[inside, 0], slopes[inside, 1], "gnomonic")
     end = chief_rays(telescope, light, wavelength)
-    lost = np.isin(end.status, (RayStatus.MISSED, RayStatus.TOTAL_REFLECTION, RayStatus.NOT_CONVERGED))
+    lost = np.isin(end.status, LOST)
     places = np.full(slopes.shape, np.nan)
     places[inside[~lost]] = telescope.surfaces[-1].to_local(end.position)[~lost, :2]
     return places, np.isfinite(places[:, 0])

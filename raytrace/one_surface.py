@@ -26,7 +26,7 @@ def intersect(surface: Surface | Shape, rays: Rays | TraceResult, *, n: float = 
     ----------
     surface : Surface or Shape
         The surface at its place in the telescope frame, whatever its own interaction; a shape alone has its vertex at
-        the origin. A phase screen is its plane.
+        the origin. A phase screen is its plane; a grating is a surface without its grooves.
     rays : Rays or TraceResult
         Rays in the telescope frame; those at another surface, from this function or :func:`~pachon.trace`, go on from
         there and keep their status.
@@ -73,9 +73,12 @@ def _at_surface(
             raise DomainError(f"refractive index = {index!r}: expected a positive number")
     if isinstance(surface, Shape):
         surface = Surface(type(surface).__name__, interaction, surface, (0.0, 0.0, 0.0), VACUUM)
-    surface = replace(surface, interaction=interaction, shape=surface.meeting_shape, coating=None)
+    surface = replace(
+        surface, interaction=interaction, shape=surface.meeting_shape, coating=None, grating=None, thin_lens=None
+    )
     packed = pack_surfaces(SurfaceSequence((surface,)))
-    end = launch_trace(packed, np.array([n1, n2]), rays, 1).end
+    # Without grooves the rays depend on no wavelength.
+    end = launch_trace(packed, np.array([n1, n2, np.nan]), rays, 1).end
     count = len(rays.path_length)
     position, direction = (from_packets(vectors, count)[0].T for vectors in (end.position, end.direction))
     path, status = (from_packets(numbers, count)[0] for numbers in (end.path, end.status))

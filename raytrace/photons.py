@@ -102,10 +102,11 @@ def land_photons(
 
 
 def _media_indices(telescope: Telescope, wavelength: np.ndarray) -> np.ndarray:
-    """Return the refractive index of each distinct medium at each wavelength [m], [medium, n]."""
+    """Return the refractive index of each distinct medium at each wavelength [m], and these, [medium + 1, n]."""
     telescope.check_wavelength(wavelength)
     media = distinct_media(telescope)
-    indices = np.empty((len(media), len(wavelength)))
-    for row, medium in zip(indices, media, strict=True):
+    indices = np.empty((len(media) + 1, len(wavelength)))
+    for row, medium in zip(indices, media, strict=False):
         row[:] = medium.n if isinstance(medium, ConstantIndex) else medium.index(wavelength)
+    indices[-1] = wavelength
     return indices

@@ -37,6 +37,12 @@ class RayStatus(IntEnum):
     NOT_CONVERGED = int(surface_kernels.NOT_CONVERGED)
     #: Landed between the CCDs (only when traced to a focal plane of CCDs).
     GAP = 5
+    #: The order of a grating does not exist for its direction and wavelength; directions are NaN from there on.
+    EVANESCENT = int(surface_kernels.EVANESCENT)
+
+
+#: Statuses of rays that do not reach the image, with positions of NaN.
+LOST = (RayStatus.MISSED, RayStatus.TOTAL_REFLECTION, RayStatus.NOT_CONVERGED, RayStatus.EVANESCENT)
 
 
 PROJECTIONS = ("zemax", "gnomonic", "postel")

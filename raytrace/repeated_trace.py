@@ -12,7 +12,7 @@ from ..core.warp_arrays import warp_array
 from ..models.telescope import Telescope
 from .kernels.packet import LANES, RayPackets, from_packets, lanes, packet_count, ray_packets
 from .kernels.trace import trace_rays
-from .pack.surfaces import leading_surfaces, pack_surfaces, refractive_indices
+from .pack.surfaces import indices_and_wavelength, leading_surfaces, pack_surfaces
 from .rays import Rays
 
 #: Rays that several threads trace faster than one.
@@ -28,7 +28,7 @@ class RepeatedTrace:
 
     def __init__(self, telescope: Telescope, wavelength: float, surface: int) -> None:
         self._packed = leading_surfaces(pack_surfaces(telescope), surface + 1)
-        self._indices = warp_array(refractive_indices(telescope, wavelength)[None])
+        self._indices = warp_array(indices_and_wavelength(telescope, wavelength)[None])
         self._kernel = trace_rays.variant_for(self._packed)
         load_kernels(self._kernel)
         self._room = 0

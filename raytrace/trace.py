@@ -18,7 +18,7 @@ from ..models.telescope import Telescope
 from .detector import land_on_ccds
 from .kernels.packet import RayPackets, from_packets, lanes, packet_count, ray_packets, to_packets
 from .kernels.trace import trace_rays
-from .pack.surfaces import pack_surfaces, refractive_indices
+from .pack.surfaces import indices_and_wavelength, pack_surfaces, refractive_indices
 from .rays import Rays, RayStatus
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ class TraceResult(Result):
 class PacketTrace:
     """Packets of rays before the first surface and after the last ones."""
 
-    indices: np.ndarray  #: refractive index before the first surface and after each, [n_surface + 1]
+    light: np.ndarray  #: refractive index before the first surface and after each, and the wavelength [n_surface + 2]
     start: Any  #: RayPackets before the first surface, as one surface
     end: Any  #: RayPackets after each of the last surfaces
 
@@ -104,20 +104,20 @@ def trace_packets(
 
     They are stored in the RayPackets ``out`` where these are given.
     """
-    indices = refractive_indices(telescope, rays.wavelength)
-    return launch_trace(pack_surfaces(telescope), indices, rays, n_stored, threads=threads, out=out)
+    light = indices_and_wavelength(telescope, rays.wavelength)
+    return launch_trace(pack_surfaces(telescope), light, rays, n_stored, threads=threads, out=out)
 
 
 def launch_trace(
     packed: Any,
-    indices: np.ndarray,
+    light: np.ndarray,
     rays: Rays | TraceResult,
     n_stored: int,
     *,
     threads: int | None = None,
     out: Any = None,
 ) -> PacketTrace:
-    """Trace as :func:`trace_packets` through packed surfaces, with the indices before the first and after each."""
+    """Trace as :func:`trace_packets` through packed surfaces, with their :func:`indices_and_wavelength`."""
     count = packet_count(len(rays.path_length))
     # The status of the start is not read.
     start, end = RayPackets(), ray_packets(n_stored, count) if out is None else out
@@ -126,8 +126,8 @@ def launch_trace(
     start.path = warp_array(to_packets(rays.path_length[None]), lanes)
     # Of few rays, threads cost more than the trace.
     threads = 1 if count <= _ONE_THREAD else threads
-    launch(trace_rays.variant_for(packed), count, [packed, warp_array(indices[None]), start, end], threads=threads)
-    return PacketTrace(indices, start, end)
+    launch(trace_rays.variant_for(packed), count, [packed, warp_array(light[None]), start, end], threads=threads)
+    return PacketTrace(light, start, end)
 
 
 @overload

@@ -12,7 +12,7 @@ from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..raytrace.ideal_lens import image_points
 from ..raytrace.launch import launch_bundles
-from ..raytrace.rays import RayStatus, field_angles, field_direction, require_distant_object
+from ..raytrace.rays import LOST, Rays, RayStatus, field_angles, field_direction, require_distant_object
 from ..raytrace.trace import TraceResult, trace
 from .request import Request
 
@@ -55,13 +55,23 @@ def reference_rays(
     """
     rays = request.launch(wavelength, np.zeros((1, 2)))
     end = trace(request.telescope, rays, focal_plane=focal_plane, threads=request.threads)
-    lost = np.isin(end.status, (RayStatus.MISSED, RayStatus.TOTAL_REFLECTION, RayStatus.NOT_CONVERGED))
+    lost = np.isin(end.status, LOST)
     if lost.any():
+        if (end.status[lost][0]) == RayStatus.EVANESCENT:
+            advice = f": {_evanescent_order(request.telescope, rays)}"
         raise DomainError(f"{field_label(request.fields[lost][0])}: the chief ray does not reach the image{advice}")
     if end.ccd is not None and (end.ccd < 0).any():
         name = field_label(request.fields[end.ccd < 0][0])
         raise DomainError(f"{name}: the chief ray lands between the CCDs; expected a point on a CCD")
     return end
+
+
+def _evanescent_order(telescope: Telescope, rays: Rays) -> str:
+    """Return which order of which grating is the first that does not exist for one of the rays."""
+    met = trace(telescope, rays, "all")
+    surface = next(s for s, m in zip(telescope.surfaces, met, strict=True) if (m.status == RayStatus.EVANESCENT).any())
+    order = surface.grating.order if surface.grating else 0
+    return f"order {order} of the grating {surface.name} does not exist at {rays.wavelength * 1e9:.6g} nm"
 
 
 def image_jacobians(

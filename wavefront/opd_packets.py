@@ -11,7 +11,7 @@ from ..core.buffers import empty
 from ..core.launch import launch
 from ..core.warp_arrays import warp_array
 from ..raytrace.kernels.packet import LANES, lane_flags, lanes, packet_count, ray_packets, to_packets
-from ..raytrace.pack.surfaces import leading_surfaces, pack_surfaces, refractive_indices
+from ..raytrace.pack.surfaces import indices_and_wavelength, leading_surfaces, pack_surfaces
 from ..raytrace.rays import object_points
 from .opd_kernels import trace_opds
 from .request import Request
@@ -45,7 +45,7 @@ def traced_opds(
     if stop is not None and stop + 1 < len(telescope.surfaces):
         stages.insert(0, leading_surfaces(all_surfaces, stop + 1))
     start = object_points(telescope, directions) if np.isfinite(telescope.object_distance) else np.empty((0, 3))
-    indices = warp_array(refractive_indices(telescope, request.wavelength)[None])
+    indices = warp_array(indices_and_wavelength(telescope, request.wavelength)[None])
     # From the centre outwards, so that a central obscuration or a rim stops whole packets.
     order = np.argsort(np.hypot(x, y), kind="stable")
     points = request.entrance_points(request.wavelength, np.stack([x, y], axis=-1)[order])

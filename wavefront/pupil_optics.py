@@ -19,7 +19,7 @@ from ..models.telescope import Telescope
 from ..raytrace.ideal_lens import require_image
 from ..raytrace.kernels.packet import LANES, lane_flags, lanes, packet_count, ray_packets, to_packets
 from ..raytrace.kernels.pupil import trace_pupils as trace_pupils_kernel
-from ..raytrace.pack.surfaces import pack_surfaces, refractive_indices
+from ..raytrace.pack.surfaces import indices_and_wavelength, pack_surfaces
 from ..raytrace.rays import RayStatus, require_distant_object
 from ..raytrace.trace import trace
 from .aberration import ResidualWavefront
@@ -96,7 +96,7 @@ def trace_pupils(
     direction, waves = request.directions, request.wavelengths
     pupil = np.asarray(pupil, dtype=np.float64)
     n_star, n_wave, n_pupil = len(direction), len(waves), len(pupil)
-    indices = np.array([refractive_indices(telescope, w) for w in waves])
+    light = np.array([indices_and_wavelength(telescope, w) for w in waves])
 
     chief = reference_rays(request, request.middle, focal_plane)
     reference_points = np.array(chief.position)
@@ -111,7 +111,7 @@ def trace_pupils(
 
     radius = telescope.reference_sphere_radius
     chief_path = np.empty((n_star, n_wave))
-    for w, index in enumerate(indices[:, -2]):
+    for w, index in enumerate(light[:, -3]):
         end = trace(telescope, request.launch(float(waves[w]), np.zeros((1, 2))), threads=threads)
         chief_path[:, w] = path_to_sphere(end.path_length, index, end.position, end.direction, reference_points, radius)
 
@@ -129,7 +129,7 @@ def trace_pupils(
             [
                 packed,
                 count,
-                warp_array(indices),
+                warp_array(light),
                 warp_array(np.tile(waves, len(direction[stars])), wp.int32),
                 warp_array(np.repeat(direction[stars], len(waves), axis=0)),
                 warp_array(to_packets(points.T), lanes),

@@ -29,9 +29,10 @@ from ..analyses.fresnel import fresnel_reflectivity, refracted_reflectivity
 def ghost_pairs(telescope: Telescope) -> list[tuple[int, int]]:
     """Return the pairs (first, second) of indices of surfaces that can make a ghost.
 
-    The first is a lens surface or the detector, the second a lens surface before it.
+    The first is a lens surface or the detector, the second a lens surface before it. Gratings, whose light goes into
+    other orders too, are none of them.
     """
-    lenses = [i for i, s in enumerate(telescope.surfaces) if s.interaction == Interaction.REFRACT]
+    lenses = [i for i, s in enumerate(telescope.surfaces) if s.interaction == Interaction.REFRACT and not s.grating]
     last = len(telescope.surfaces) - 1
     ends = [*lenses, last] if telescope.surfaces[last].interaction == Interaction.DETECTOR else lenses
     return [(j, i) for j in ends for i in lenses if i < j]
@@ -51,7 +52,7 @@ class Reflectivities:
         coatings: Coatings,
         wavelength: float,
     ) -> None:
-        lenses = [s.name for s in telescope.surfaces if s.interaction == Interaction.REFRACT]
+        lenses = [s.name for s in telescope.surfaces if s.interaction == Interaction.REFRACT and not s.grating]
         if isinstance(stated, Mapping):
             for name in stated:
                 if name not in lenses:
@@ -191,7 +192,7 @@ class GhostTrace:
             turn = np.einsum("ij,ij->j", coming.T, met.direction.T)
             if turns and k == 0:
                 weight = weight * self._coatings.reflected(place, turn, n_behind, n)
-            elif surfaces[k].interaction == Interaction.REFRACT:
+            elif surfaces[k].interaction == Interaction.REFRACT and surfaces[k].grating is None:
                 weight = weight * (1.0 - self._coatings.refracted(place, turn, n, n_behind))
             weight = np.where(met.status == RayStatus.OK, weight, 0.0)
             coming = met.direction

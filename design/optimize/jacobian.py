@@ -8,7 +8,15 @@ import numpy as np
 
 from ...models.media.medium import LINE_D
 from ...models.parameters.links import has_links, without_links
-from ...models.parameters.parameters import Parameter, apply, index_surfaces, linked, shapes_with_terms, twists
+from ...models.parameters.parameters import (
+    Parameter,
+    apply,
+    grating_of,
+    index_surfaces,
+    linked,
+    shapes_with_terms,
+    twists,
+)
 from ...models.parameters.shape_terms import term_polynomial
 from ...models.shapes.polar_polynomial import PolarPolynomial
 from ...models.telescope import Telescope
@@ -74,8 +82,10 @@ class ParameterColumns:
         runs = {p: index_surfaces(telescope, q.target) for p, q in enumerate(parameters) if q.kind in _MEDIA}
         behind = {(s, "index") for run in runs.values() for s in run}
         before = {(s + 1, "index") for run in runs.values() for s in run if s + 1 < len(names)}
+        ruled = [(p, names.index(q.target), q) for p, q in enumerate(parameters) if q.kind == "grating"]
+        grooves = {(s, "grooves") for _, s, _ in ruled}
         gaps = {(int(g), "gap") for g in np.flatnonzero(motion.any(axis=(0, 2)))}
-        direct = column_table(telescope, behind | before | gaps, first)
+        direct = column_table(telescope, behind | before | gaps | grooves, first)
         table = np.maximum(intermediate, direct)
 
         # Rays need only terms that are not zero; derivatives need all terms of the parameters.
@@ -103,10 +113,12 @@ class ParameterColumns:
 
         total = np.zeros((used + len(added_terms), len(parameters)))
         for g in np.flatnonzero(motion.any(axis=(0, 2))):
-            total[table[g, 7:]] = motion[:, g].T
+            total[table[g, 7:13]] = motion[:, g].T
         for p, run in runs.items():
             total[table[run, 4], p] = 1.0
             total[[table[s + 1, 3] for s in run if s + 1 < len(names)], p] = 1.0
+        for p, s, parameter in ruled:
+            total[table[s, 13:15], p] = grating_of(moved, parameter).path_derivative(parameter.name)
         for *_, columns, weights in blocks:
             total[columns[columns >= 0]] = weights
         for i, (p, _, _) in enumerate(added_terms):

@@ -167,7 +167,7 @@ def _given(variable: Variable, pair: tuple[float, float]) -> tuple[float, float]
 
 def _usual(telescopes: Sequence[Telescope], variable: Variable) -> tuple[float, float]:
     parameter = next(p for p in variable.parameters if p)
-    if parameter.kind == "thickness":
+    if parameter.kind == "thickness" or parameter.name == "lines_per_mm":
         return 0.0, np.inf
     if parameter.kind in _GLASSES:
         return _GLASSES[parameter.kind]

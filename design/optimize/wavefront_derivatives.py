@@ -107,7 +107,7 @@ class FieldWavefronts:
             self._rays = SphereAdjoint(
                 telescope,
                 request.directions,
-                chief.indices,
+                chief.packets.light,
                 self._aimed.points,
                 chief.position,
                 self._chief_path,

@@ -31,6 +31,7 @@ _TYPES = {
     Interaction.DETECTOR: "detector",
     Interaction.PASS: "baffle",
     Interaction.PHASE: "phase screen",
+    Interaction.THIN_LENS: "thin lens",
 }
 
 
@@ -71,7 +72,7 @@ def _number(value: float, digits: int = 8) -> str:
 
 
 def _more(surface: Surface, unit: float) -> str:
-    """Return coefficients, kind of shape, decentre and tilt of a surface as text."""
+    """Return coefficients, kind of shape, grating, decentre and tilt of a surface as text."""
     shape, parts = surface.shape, []
     if isinstance(shape, Rotational):
         # Lengths over powers of lengths; z has the other sign.
@@ -80,6 +81,10 @@ def _more(surface: Surface, unit: float) -> str:
         parts += [f"r^{n}: {-a * unit ** (n - 1):.6g}" for n, a in pairs if a]
     else:
         parts.append(type(shape).__name__)
+    if surface.thin_lens is not None:
+        parts.append(f"focal length {surface.thin_lens.focal_length / unit:.8g}")
+    if surface.grating is not None:
+        parts.append(str(surface.grating))
     x, y, _ = surface.vertex
     if x or y:
         parts.append(f"decentred by x {x / unit:.6g}, y {y / unit:.6g}")

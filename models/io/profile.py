@@ -69,6 +69,8 @@ class Profile:
             elif isinstance(shape_part, OddAsphere):
                 odd = tuple(a * unit ** (power - 1) for power, a in enumerate(shape_part.coefficients, start=1))
                 base, curved_count = cls(unit / shape_part.radius, shape_part.conic, odd=odd), curved_count + 1
+            elif isinstance(shape_part, Toroid) and shape_part.coefficients:
+                raise PrescriptionError("toroid with powers of y: expected one of a conic")
             elif isinstance(shape_part, Toroid):
                 base = cls(unit / shape_part.radius_y, shape_part.conic_y, curvature_x=unit / shape_part.radius_x)
                 curved_count += 1

@@ -10,6 +10,8 @@ address                    meaning                                      unit
 ``silica.n``               refractive index of a medium, wherever it is
 ``L1_entrance.n``          refractive index behind one surface
 ``silica.abbe``            Abbe number, the index at the d line stays
+``G.lines_per_mm``         grooves of a grating                         1/mm
+``G.groove_angle``         direction of its grooves                     rad
 ``L1_entrance.thickness``  distance to the next surface, along the light m
 ``L1.thickness``           the same of an element, a group of two         m
 ========================== ============================================ ======
@@ -32,6 +34,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, check_unique, error_context, unknown_name
+from ..grating import Grating
 from ..media.medium import Medium, abbe_number, with_index_change
 from ..paraxial import following_pupil
 from ..rotation import rotation_matrix
@@ -44,6 +47,8 @@ from .shape_terms import shape_with_term, term_unit, with_changes
 
 _OF_MEDIA = ("n", "abbe")
 MOTIONS = ("dx", "dy", "dz", "rx", "ry", "rz")
+#: Units of the parameters of a grating.
+GROOVES = {"lines_per_mm": "1/mm", "groove_angle": "rad"}
 
 
 @check_arguments
@@ -56,8 +61,8 @@ class Parameter:
     address, target : str
         Address, and the surface, group or medium in it.
     name : str
-        A motion, a term of the shape, "n", "abbe" or "thickness".
-    kind : {"motion", "shape", "index", "abbe", "thickness"}
+        A motion, a term of the shape, "n", "abbe", "thickness", "lines_per_mm" or "groove_angle".
+    kind : {"motion", "shape", "index", "abbe", "thickness", "grating"}
         Kind of the parameter.
     unit : str
         Unit of its values; empty for a pure number.
@@ -66,7 +71,7 @@ class Parameter:
     address: str
     target: str
     name: str
-    kind: Literal["motion", "shape", "index", "abbe", "thickness"]
+    kind: Literal["motion", "shape", "index", "abbe", "thickness", "grating"]
     unit: str
 
     @classmethod
@@ -109,6 +114,10 @@ class Parameter:
             if surface.interaction != Interaction.REFRACT:
                 raise DomainError(f"parameter {text!r}: expected a refracting surface")
             return cls._of_medium(text, target, name, telescope)
+        if name in GROOVES:
+            if surface.grating is None:
+                raise DomainError(f"parameter {text!r}: expected a surface with a grating")
+            return cls(text, target, name, "grating", GROOVES[name])
         return cls(text, target, name, "shape", term_unit(shape_with_term(surface, name), name))
 
     @classmethod
@@ -132,6 +141,8 @@ class Parameter:
         if self.kind in ("index", "abbe"):
             medium = telescope.surfaces[index_surfaces(telescope, self.target)[0]].medium_after
             return abbe_number(medium) if self.kind == "abbe" else float(medium.index(telescope.default_wavelength))
+        if self.kind == "grating":
+            return float(getattr(grating_of(telescope, self), self.name))
         return float(telescope.surface(self.target).shape.parameters.get(self.name, 0.0))
 
 
@@ -276,12 +287,17 @@ def _apply_alone(telescope: Telescope, values: Mapping[Parameter, float]) -> Tel
     telescope = with_shape_terms(telescope, [p for p, v in zip(parameters, changes, strict=True) if v])
     shapes: dict[str, Shape] = {}
     media: dict[int, Medium] = {}
+    gratings: dict[str, Grating] = {}
     changed_terms: dict[str, list[tuple[str, float]]] = {}
     for parameter, change in zip(parameters, changes, strict=True):
         if not change:
             continue
         if parameter.kind == "shape":
             changed_terms.setdefault(parameter.target, []).append((parameter.name, change))
+        elif parameter.kind == "grating":
+            ruled = gratings.get(parameter.target) or grating_of(telescope, parameter)
+            changed_value = getattr(ruled, parameter.name) + change
+            gratings[parameter.target] = replace(ruled, **{parameter.name: changed_value})
         elif parameter.kind in ("index", "abbe"):
             addition, factor = change, 1.0
             if parameter.kind == "abbe":
@@ -293,10 +309,15 @@ def _apply_alone(telescope: Telescope, values: Mapping[Parameter, float]) -> Tel
                 media[i] = with_index_change(media.get(i, telescope.surfaces[i].medium_after), addition, factor)
     for target, terms in changed_terms.items():
         shapes[target] = with_changes(telescope.surface(target).shape, terms)
-    if shapes or media:
+    if shapes or media or gratings:
         changed = tuple(
-            replace(s, shape=shapes.get(s.name, s.shape), medium_after=media.get(i, s.medium_after))
-            if s.name in shapes or i in media
+            replace(
+                s,
+                shape=shapes.get(s.name, s.shape),
+                medium_after=media.get(i, s.medium_after),
+                grating=gratings.get(s.name, s.grating),
+            )
+            if s.name in shapes or i in media or s.name in gratings
             else s
             for i, s in enumerate(telescope.surfaces)
         )
@@ -307,6 +328,14 @@ def _apply_alone(telescope: Telescope, values: Mapping[Parameter, float]) -> Tel
     moves = zip(parameters, changes, strict=True)
     thicknesses = [(front_surface(start, p.target), v) for p, v in moves if p.kind == "thickness" and v]
     return with_thicknesses(telescope, start, thicknesses) if thicknesses else telescope
+
+
+def grating_of(telescope: Telescope, parameter: Parameter) -> Grating:
+    """Return the grating that a parameter is of."""
+    grating = telescope.surface(parameter.target).grating
+    if grating is None:
+        raise DomainError(f"parameter {parameter.address!r}: expected a surface with a grating")
+    return grating
 
 
 def _media(telescope: Telescope) -> set[str]:

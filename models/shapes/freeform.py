@@ -142,7 +142,7 @@ class _TwoRadii(Shape):
 
     @property
     def parameters(self) -> dict[str, float]:
-        fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        fields = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "coefficients"}
         return fields | {"curvature_x": 1.0 / self.radius_x, "curvature_y": 1.0 / self.radius_y}
 
     def _changed(self, name: str, value: float) -> Shape:
@@ -235,26 +235,49 @@ class Biconic(_TwoRadii):
 @check_arguments
 @dataclass(frozen=True)
 class Toroid(_TwoRadii):
-    """A conic of the y, z plane rotated about an axis parallel to y, `radius_x` [m] from the vertex.
+    """A curve of the y, z plane rotated about an axis parallel to y, `radius_x` [m] from the vertex.
 
-    With g(y) the conic of radius `radius_y` [m] and constant `conic_y`, ``cx = 1 / radius_x`` (0: a cylinder)::
+    With g(y) the conic of radius `radius_y` [m] and constant `conic_y`, plus `coefficients` of y^2, y^4, y^6... [m^-1,
+    m^-3...], and ``cx = 1 / radius_x`` (0: a cylinder)::
 
         z = g + q x^2 / (1 + sqrt(1 - q^2 x^2)),    q = cx / (1 - cx g)
     """
 
     conic_y: float = 0.0
+    coefficients: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_coefficients(self.coefficients)
+
+    @property
+    def curvatures(self) -> tuple[float, float]:  # noqa: D102
+        return 1.0 / self.radius_x, 1.0 / self.radius_y + 2 * (*self.coefficients, 0.0)[0]
 
     @property
     def fourth_order(self) -> float:  # noqa: D102
-        # z = cx x^2/2 + cy y^2/2 + cx^3 x^4/8 + (1 + ky) cy^3 y^4/8 + cx^2 cy x^2 y^2/4 + ...; means as for a biconic.
-        cx, cy = 1.0 / self.radius_x, 1.0 / self.radius_y
-        return (3 * cx**3 + 3 * (1 + self.conic_y) * cy**3 + 2 * cx**2 * cy) / 64 - self.curvature**3 / 8
+        # z = cx x^2/2 + g(y) + cx^3 x^4/8 + cx^2 g''(0) x^2 y^2/4 + ...; means as for a biconic.
+        cx, cy = self.curvatures
+        y4 = (1 + self.conic_y) / self.radius_y**3 + 8 * (*self.coefficients, 0.0, 0.0)[1]
+        return (3 * cx**3 + 3 * y4 + 2 * cx**2 * cy) / 64 - self.curvature**3 / 8
+
+    @property
+    def parameters(self) -> dict[str, float]:  # noqa: D102
+        return super().parameters | {f"y{2 * i}": a for i, a in enumerate(self.coefficients, start=1)}
+
+    def _changed(self, name: str, value: float) -> Shape:
+        if name.startswith("y"):
+            return replace(self, coefficients=with_coefficient(self.coefficients, int(name[1:]) // 2 - 1, value))
+        return super()._changed(name, value)
 
     def _pieces(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the sag and the pieces of its derivatives: q, w, g', g'', h_q and h_qq, with h the sag less g."""
         cx, cy = 1.0 / self.radius_x, 1.0 / self.radius_y
         b = root(1.0 - (1.0 + self.conic_y) * cy**2 * y * y)
         g, g1, g2 = cy * y * y / (1 + b), cy * y / b, cy / b**3
+        for power, a in zip(range(2, 1000, 2), self.coefficients, strict=False):
+            g, g1 = g + a * y**power, g1 + power * a * y ** (power - 1)
+            g2 = g2 + power * (power - 1) * a * y ** (power - 2)
         q = cx / (1.0 - cx * g)
         w = root(1.0 - q * q * x * x)
         h = q * x * x / (1 + w)
@@ -279,10 +302,14 @@ class Toroid(_TwoRadii):
         if name == "curvature_x":
             # dq/dcx = 1 / (1 - cx g)^2
             cx = 1.0 / self.radius_x
-            g = Toroid(np.inf, self.radius_y, self.conic_y).sag(x, y)
+            g = replace(self, radius_x=np.inf).sag(x, y)
             q_c = 1.0 / (1.0 - cx * g) ** 2
             return h_q * q_c, x / w**3 * q_c, g1 * (h_qq * q**2 + 2 * h_q * q) * q_c
-        change, slope = conic_derivative(1.0 / self.radius_y, self.conic_y, name.removesuffix("_y"), y * y)
-        change_y = 2 * y * slope
+        if name.startswith("y"):
+            power = int(name[1:])
+            change, change_y = y**power, power * y ** (power - 1)
+        else:
+            change, slope = conic_derivative(1.0 / self.radius_y, self.conic_y, name.removesuffix("_y"), y * y)
+            change_y = 2 * y * slope
         along_y = change_y * (1 + h_q * q**2) + change * g1 * (h_qq * q**4 + 2 * h_q * q**3)
         return change * (1 + h_q * q**2), x / w**3 * q**2 * change, along_y

@@ -148,6 +148,7 @@ def _surface_entry(surface: Surface, height: float, following: float | None, wav
         "medium_after": "" if isinstance(medium, ConstantIndex) else "glass",
         "clear_m": _clear_radii(surface),
         "aperture": flow(aperture_items(surface.aperture), _degrees)[1:-1],
+        "grating": None if surface.grating is None else str(surface.grating),
     }
 
 
@@ -203,12 +204,14 @@ def surface_rows(description: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def coefficient_lines(description: dict[str, Any]) -> list[str]:
-    """Return the coefficients of the aspheres as text, a line each."""
+    """Return the coefficients of the aspheres, and the gratings, as text, a line each."""
     unit, lines = LENGTH_UNITS[description["length_unit"]], []
     for s in description["surfaces"]:
         terms = [(4 + 2 * i, c * unit ** (3 + 2 * i)) for i, c in enumerate(s["coefficients"])]
         if any(c for _, c in terms):
             lines.append(f"{s['name']}: " + ", ".join(f"{c:.9g} r^{power}" for power, c in terms if c))
+        if s["grating"]:
+            lines.append(f"{s['name']}: {s['grating']}")
     return lines
 
 

@@ -15,7 +15,7 @@ import warp as wp
 
 from ...core.warp_arrays import warp_array
 from ...models.telescope import Telescope
-from .column_kernels import FORCE, INDEX, INTERSECTION, QUANTITIES, SAG
+from .column_kernels import FORCE, GROOVE, INDEX, INTERSECTION, QUANTITIES, SAG
 
 #: Quantities of a surface by name: the first and how many.
 _QUANTITIES = {
@@ -23,7 +23,10 @@ _QUANTITIES = {
     "index": (int(INDEX), 2),
     "intersection": (int(INTERSECTION), 2),
     "gap": (int(FORCE), 6),
+    "grooves": (int(GROOVE), 2),
 }
+#: Quantities of every surface.
+_GENERAL = ("sag", "index", "intersection", "gap")
 
 #: Surfaces with polynomial sags: surface, length scale of x and y [m], degree, column of each term or -1.
 Polynomials = Sequence[tuple[int, float, int, np.ndarray]]
@@ -33,7 +36,7 @@ Polynomials = Sequence[tuple[int, float, int, np.ndarray]]
 class AdjointMatrix:
     """Derivatives of each output of each ray, with columns per surface."""
 
-    columns: np.ndarray  #: column of each quantity of each surface, -1 where not computed, [n_surface + 1, 13]
+    columns: np.ndarray  #: column of each quantity of each surface, -1 where not computed, [n_surface + 1, 15]
     values: np.ndarray  #: the columns, [n_output, n_column, n]
     #: Derivatives by position [1/m] and direction of the ray at its start, telescope frame, [n_output, 6, n].
     start: np.ndarray | None = None
@@ -64,6 +67,10 @@ class AdjointMatrix:
         """Return derivatives by the refractive index before and after the surface, shape [n_output, 2, n]."""
         return self._quantity(surface, "index")
 
+    def grooves(self, surface: int) -> np.ndarray:
+        """Return derivatives by the path that grooves add along x and y for a metre of wavelength, [n_output, 2, n]."""
+        return self._quantity(surface, "grooves")
+
     def intersection(self, surface: int) -> np.ndarray:
         """Return intersections of the rays with the surface, in its own x and y [m], shape [2, n]."""
         return self._quantity(surface, "intersection")[0]
@@ -72,15 +79,15 @@ class AdjointMatrix:
 def column_table(
     telescope: Telescope, quantities: Iterable[tuple[int, str]] | None = None, first: int = 0
 ) -> np.ndarray:
-    """Return the table of columns for some quantities, shape [n_surface + 1, 13]; -1 stands for none.
+    """Return the table of columns for some quantities, shape [n_surface + 1, 15]; -1 stands for none.
 
-    ``quantities`` are pairs (index of a surface, name), all of them by default: "sag", "index", "intersection", or
-    "gap" for the gap in front of it; the gap behind the last surface belongs to the index after that. The first column
-    has the number ``first``.
+    ``quantities`` are pairs (index of a surface, name), by default all but the last: "sag", "index", "intersection",
+    "gap" for the gap in front of it, "grooves" of a grating; the gap behind the last surface belongs to the index after
+    that. The first column has the number ``first``.
     """
     count = len(telescope.surfaces)
     if quantities is None:
-        quantities = [*((s, name) for s in range(count) for name in _QUANTITIES), (count, "gap")]
+        quantities = [*((s, name) for s in range(count) for name in _GENERAL), (count, "gap")]
     table = np.full((count + 1, QUANTITIES), -1, dtype=np.int32)
     column = first
     for surface, name in sorted(set(quantities)):

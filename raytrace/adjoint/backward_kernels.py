@@ -11,6 +11,8 @@ the surface::
     refraction    d' = mu d + g N,  g = (root - mu a) / S,  root = sign(a) sqrt((1 - mu^2) S + mu^2 a^2)
     mirror        the same with mu = 1 and root = -a
     path          dL = n dt + t dn
+    grooves       d' = e + g N,  e = mu d + p / n',  g = (root - e.N) / S,  root = +-sqrt((e.N)^2 + (1 - e.e) S)
+                  dL = p.dQ                          p: the gradient of the path that the grooves add
 
 A backward pass takes about as long as a forward pass, whatever the number of parameters.
 
@@ -28,19 +30,35 @@ from ..kernels.kernel_pair import kernel_pair
 from ..kernels.packet import LANES, RayPackets, components, lanes, lanes_sqrt
 from ..kernels.shape_derivatives import added_derivatives
 from ..kernels.surface import ONE, TWO, ZERO
+from ..kernels.thin_lens import thin_lens_adjoint
 from ..kernels.trace import (
     DEFORMED,
+    GROOVES,
     INTERACTION,
     MIRROR,
     PHASE,
+    POWER,
     REFRACT,
     ROTATED,
+    RULED,
+    THIN_LENS,
+    VERGENCE,
     VERTEX,
     PackedSurfaces,
     to_local,
     to_telescope,
 )
-from .column_kernels import INDEX, INTERSECTION, SAG, dot, polynomial_columns, sag_derivatives, write_column, write_gap
+from .column_kernels import (
+    GROOVE,
+    INDEX,
+    INTERSECTION,
+    SAG,
+    dot,
+    polynomial_columns,
+    sag_derivatives,
+    write_column,
+    write_gap,
+)
 
 wp.set_module_options(FORWARD_OPTIONS)
 
@@ -170,12 +188,64 @@ def backward_loop(special: bool) -> wp.Function:
                     cx = (-ONE / before) * fx
                     cy = (-ONE / before) * fy
                     by_value = per_path
+            by_grooves = lanes(ZERO)
+            by_after = lanes(ZERO)
+            groove_x = ZERO
+            groove_y = ZERO
+            ruled = int(0)
+            if wp.static(special):
+                ruled = surfaces.kinds[s, RULED]
+                if ruled == 1:
+                    # d' = e + g N with e = mu d + grooves / n': by e.N, N.N and e.e in place of d.N, N.N and mu.
+                    wavelength = indices[indices.shape[0] - 1]
+                    groove_x = wavelength * surfaces.numbers[s, GROOVES]
+                    groove_y = wavelength * surfaces.numbers[s, GROOVES + 1]
+                    mu = before / after
+                    ex = mu * u + lanes(groove_x / after)
+                    ey = mu * v + lanes(groove_y / after)
+                    ez = mu * w
+                    e_along = dot(ex, ey, ez, nx, ny, nz)
+                    spare = lanes(ONE) - dot(ex, ey, ez, ex, ey, ez)
+                    root = lanes_sqrt(wp.cw_mul(e_along, e_along) + wp.cw_mul(spare, square))
+                    sense = wp.where(interaction == MIRROR, -ONE, ONE)
+                    for i in range(LANES):
+                        root[i] = wp.where(sense * along[i] < ZERO, -root[i], root[i])
+                    by_root = wp.cw_div(b_normal, root)
+                    g = wp.cw_mul(root - e_along, inverse)
+                    by_along = wp.cw_mul(wp.cw_mul(e_along, by_root) - b_normal, inverse)
+                    by_square = wp.cw_mul(wp.cw_mul(spare, by_root) - TWO * wp.cw_mul(g, b_normal), inverse)
+                    cx = wp.cw_mul(by_along, ex) + wp.cw_mul(by_square, nx) + wp.cw_mul(g, bx)
+                    cy = wp.cw_mul(by_along, ey) + wp.cw_mul(by_square, ny) + wp.cw_mul(g, by)
+                    # With respect to e.
+                    fx = bx + wp.cw_mul(by_along, nx) - wp.cw_mul(by_root, ex)
+                    fy = by + wp.cw_mul(by_along, ny) - wp.cw_mul(by_root, ey)
+                    fz = bz + by_along - wp.cw_mul(by_root, ez)
+                    by_grooves = dot(fx, fy, fz, u, v, w)
+                    by_after = dot(fx, fy, fz, ex, ey, ez)
+                    by_groove = wavelength * ((ONE / after) * fx + wp.cw_mul(per_path, x))
+                    write_column(columns, s, GROOVE, o, p, by_groove, matrix)
+                    by_groove = wavelength * ((ONE / after) * fy + wp.cw_mul(per_path, y))
+                    write_column(columns, s, GROOVE + 1, o, p, by_groove, matrix)
+                    fx = mu * fx
+                    fy = mu * fy
+                    fz = mu * fz
             # With respect to the intersection, along the surface and the ray; a screen's map adds to the path there.
             hx = ax - wp.cw_mul(sxx, cx) - wp.cw_mul(sxy, cy)
             hy = ay - wp.cw_mul(sxy, cx) - wp.cw_mul(syy, cy)
             if wp.static(special):
                 hx = hx + wp.cw_mul(by_value, sx)
                 hy = hy + wp.cw_mul(by_value, sy)
+                if ruled == 1:
+                    hx = hx + groove_x * per_path
+                    hy = hy + groove_y * per_path
+                if interaction == THIN_LENS:
+                    power = surfaces.numbers[s, POWER]
+                    vergence = surfaces.numbers[s, VERGENCE]
+                    ex, ey, fx, fy, fz = thin_lens_adjoint(
+                        power, vergence, before, after, x, y, u, v, w, bx, by, bz, per_path
+                    )
+                    hx = hx + ex
+                    hy = hy + ey
             height = wp.cw_div(dot(hx, hy, az, u, v, w) + before * per_path, along)
             # With respect to the ray in front, its position anywhere along it and its direction about the intersection.
             ex = hx - wp.cw_mul(height, nx)
@@ -196,10 +266,17 @@ def backward_loop(special: bool) -> wp.Function:
             if wp.static(special):
                 if interaction == PHASE:
                     by_mu = wp.cw_mul(cx, sx) + wp.cw_mul(cy, sy)
+                if ruled == 1:
+                    by_mu = by_grooves
+                    if interaction == MIRROR:
+                        # One medium on both sides.
+                        by_mu = by_grooves - by_after
             write_column(columns, s, INDEX, o, p, wp.cw_mul(per_path, t) + (ONE / after) * by_mu, matrix)
             if wp.static(special):
                 if interaction == PHASE:
                     by_mu = lanes(ZERO)
+                if ruled == 1:
+                    by_mu = wp.where(interaction == MIRROR, ZERO, after / before) * by_after
             write_column(columns, s, INDEX + 1, o, p, (-before / (after * after)) * by_mu, matrix)
 
             ax = ex

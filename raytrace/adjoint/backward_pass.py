@@ -18,7 +18,7 @@ from ..kernels.packet import LANES, from_packets, lanes
 from ..pack.surfaces import pack_surfaces
 from .adjoint_matrix import AdjointMatrix, Polynomials, column_count, column_table, polynomial_tables
 from .backward_kernels import backward_rays
-from .column_kernels import FORCE, INDEX
+from .column_kernels import FORCE, GROOVE, INDEX
 from .forward_pass import ForwardPass
 
 
@@ -77,7 +77,7 @@ def backward_pass(
 ) -> AdjointMatrix:
     """Carry the gradient of outputs back through all surfaces.
 
-    ``columns`` [n_surface + 1, 13] are those to compute, from :func:`column_table`; all by default. Each of
+    ``columns`` [n_surface + 1, 15] are those to compute, from :func:`column_table`; all by default. Each of
     ``polynomials`` (surface, scale, degree, columns) adds derivatives by polynomial sags of a surface: the column of
     each term of :func:`polynomial_terms`, -1 for terms left out, with x and y in units of the scale [m]; its "sag" and
     "intersection" must be among the columns. With ``start``, derivatives by the start of the rays are returned too.
@@ -92,7 +92,7 @@ def backward_pass(
         outputs * count,
         [
             packed,
-            warp_array(packets.indices),
+            warp_array(packets.light),
             count,
             packets.start,
             packets.end,
@@ -111,7 +111,7 @@ def backward_pass(
         values[:, columns[-2, INDEX]] += gradient.index
     if gradient.own_frame and columns[-1, FORCE] >= 0:
         # The frame of the outputs moves with the last surface, and so does the gap behind it.
-        values[:, columns[-1, FORCE:]] = 0.0
+        values[:, columns[-1, FORCE:GROOVE]] = 0.0
     return AdjointMatrix(columns, values, from_packets(at_start, forward.n_rays) if start else None)
 
 

@@ -12,13 +12,15 @@ from ..kernels.trace import CONIC, CURVATURE, TERMS, PackedSurfaces
 wp.set_module_options(FORWARD_OPTIONS)
 
 # Quantities of a surface, a column each: a change of its sag and the slopes of that change; the index before and after;
-# the intersection itself; force and torque in the gap in front of it. One surface more holds the gap behind the last.
+# the intersection itself; force and torque in the gap in front of it; the grooves of a grating (those of the table of
+# numbers, GROOVES). One surface more holds the gap behind the last.
 SAG = wp.constant(0)
 INDEX = wp.constant(3)
 INTERSECTION = wp.constant(5)
 FORCE = wp.constant(7)
 TORQUE = wp.constant(10)
-QUANTITIES = 13
+GROOVE = wp.constant(13)
+QUANTITIES = 15
 
 
 @wp.func

@@ -28,7 +28,7 @@ class ForwardPass:
     @property
     def indices(self) -> np.ndarray:
         """Refractive index before the first surface and after each, shape [n_surface + 1]."""
-        return self.packets.indices
+        return self.packets.light[:-1]
 
     def _last(self, values: wp.array) -> np.ndarray:
         return from_packets(values, self.n_rays)[-1]

@@ -23,20 +23,21 @@ class SphereAdjoint:
     Equal to :func:`~pachon.raytrace.adjoint.forward_pass.forward_pass` followed by
     :func:`~pachon.raytrace.adjoint.backward_pass.backward_pass`, but the rays stay in the processor's cache.
 
-    ``directions`` [n_field, 3] are unit vectors of the light's travel, ``indices`` [n_surface + 1] the refractive index
-    before the first surface and after each, ``pupil`` entrance-pupil coordinates [m], [n_pupil, 2] or by field point,
-    [n_field, n_pupil, 2]. The spheres have one ``radius`` [m] and a ``center`` each [m], [3, n_field], telescope frame;
-    ``path`` [n_field] is the optical path [m] of the chief ray to the sphere, which is subtracted. ``columns`` and
-    ``polynomials`` are as in `backward_pass`, with four columns left free from ``sphere_column`` on: the path less
-    ``path`` [m], and its derivatives with respect to the landing point, which are opposite to those with respect to the
-    centre. With ``lit_only`` all is zero for vignetted rays. A mesh among the surfaces is a DomainError.
+    ``directions`` [n_field, 3] are unit vectors of the light's travel, ``light`` [n_surface + 2] the refractive index
+    before the first surface and after each, and the wavelength [m], ``pupil`` entrance-pupil coordinates [m],
+    [n_pupil, 2] or by field point, [n_field, n_pupil, 2]. The spheres have one ``radius`` [m] and a ``center`` each
+    [m], [3, n_field], telescope frame; ``path`` [n_field] is the optical path [m] of the chief ray to the sphere, which
+    is subtracted. ``columns`` and ``polynomials`` are as in `backward_pass`, with four columns left free from
+    ``sphere_column`` on: the path less ``path`` [m], and its derivatives with respect to the landing point, which are
+    opposite to those with respect to the centre. With ``lit_only`` all is zero for vignetted rays. A mesh among the
+    surfaces is a DomainError.
     """
 
     def __init__(
         self,
         telescope: Telescope,
         directions: np.ndarray,
-        indices: np.ndarray,
+        light: np.ndarray,
         pupil: np.ndarray,
         center: np.ndarray,
         path: np.ndarray,
@@ -55,8 +56,8 @@ class SphereAdjoint:
         distant = not np.isfinite(telescope.object_distance)
         self._inputs = [
             pack_surfaces(telescope),
-            warp_array(indices[None]),
-            warp_array(indices),
+            warp_array(light[None]),
+            warp_array(light),
             warp_array(np.column_stack([directions, center.T, path])),
             warp_array(np.empty((0, 3)) if distant else object_points(telescope, directions)),
             warp_array(points, lanes),

@@ -32,8 +32,9 @@ hermite_slopes = wp.func(bicubic.hermite_slope)
 POLAR = wp.constant(0)  #: (offset, degree, highest m): two numbers for s^k (x + iy)^m, m and k running down
 ODD = wp.constant(1)  #: (offset, terms): coefficients of r^1, r^3, r^5...
 BICONIC = wp.constant(2)  #: (offset): curvatures along x, y; (1 + k) c^2 along x, y
-TOROID = wp.constant(3)  #: (offset): curvature along x; curvature and (1 + k) c^2 along y
+TOROID = wp.constant(3)  #: (offset, terms): curvature along x; curvature and (1 + k) c^2 along y; powers y^2, y^4...
 GRID = wp.constant(4)  #: (offset, nx, ny): first node x, y; 1 / step x, y; then four numbers a node
+QBFS = wp.constant(5)  #: (offset, terms): k c^2, (1 + k) c^2, 1 / norm radius^2; coefficients of Forbes's P_m
 PART_COLUMNS = 4
 GRID_HEAD = wp.constant(4)
 
@@ -150,15 +151,30 @@ def biconic_sag(numbers: wp.array(dtype=wp.float64), offset: wp.int32, x: lanes,
 
 
 @wp.func
-def toroid_pieces(numbers: wp.array(dtype=wp.float64), offset: wp.int32, x: lanes, y: lanes):
-    """Root b and sag g of the conic g(y), q, the root w, h = q x^2 / (1 + w), and dh/dq."""
+def toroid_powers(numbers: wp.array(dtype=wp.float64), offset: wp.int32, terms: wp.int32, y: lanes):
+    """Sum of a_1 y^2 + a_2 y^4 + ..., and its derivative and second derivative by s = y^2."""
+    s = wp.cw_mul(y, y)
+    value = lanes(ZERO)
+    slope = lanes(ZERO)
+    second = lanes(ZERO)
+    for j in range(terms):
+        second = wp.cw_mul(second, s) + wp.float64(2.0) * slope
+        slope = wp.cw_mul(slope, s) + value
+        value = wp.cw_mul(value, s) + lanes(numbers[offset + 2 + terms - j])
+    # One power of s more.
+    return wp.cw_mul(value, s), wp.cw_mul(slope, s) + value, wp.cw_mul(second, s) + wp.float64(2.0) * slope
+
+
+@wp.func
+def toroid_pieces(numbers: wp.array(dtype=wp.float64), offset: wp.int32, added: lanes, x: lanes, y: lanes):
+    """Root b of the conic in y, sag g of the curve, q, the root w, h = q x^2 / (1 + w), and dh/dq."""
     cx = numbers[offset]
     cy = numbers[offset + 1]
     py = numbers[offset + 2]
     yy = wp.cw_mul(y, y)
     xx = wp.cw_mul(x, x)
     b = lanes_sqrt(lanes(ONE) - py * yy)
-    g = wp.cw_div(cy * yy, lanes(ONE) + b)
+    g = wp.cw_div(cy * yy, lanes(ONE) + b) + added
     q = wp.cw_div(lanes(cx), lanes(ONE) - cx * g)
     w = lanes_sqrt(lanes(ONE) - wp.cw_mul(wp.cw_mul(q, q), xx))
     h = wp.cw_div(wp.cw_mul(q, xx), lanes(ONE) + w)
@@ -167,11 +183,70 @@ def toroid_pieces(numbers: wp.array(dtype=wp.float64), offset: wp.int32, x: lane
 
 
 @wp.func
-def toroid_sag(numbers: wp.array(dtype=wp.float64), offset: wp.int32, x: lanes, y: lanes):
-    """Sag and slopes of g + q x^2 / (1 + w), g(y) a conic, q = cx / (1 - cx g), w = sqrt(1 - q^2 x^2)."""
-    b, g, q, w, h, h_q = toroid_pieces(numbers, offset, x, y)
-    slope_y = wp.cw_mul(wp.cw_div(numbers[offset + 1] * y, b), lanes(ONE) + wp.cw_mul(h_q, wp.cw_mul(q, q)))
+def toroid_sag(numbers: wp.array(dtype=wp.float64), offset: wp.int32, terms: wp.int32, x: lanes, y: lanes):
+    """Sag and slopes of g + q x^2 / (1 + w), q = cx / (1 - cx g), w = sqrt(1 - q^2 x^2); g(y) a conic and powers."""
+    added, added_s, _ = toroid_powers(numbers, offset, terms, y)
+    b, g, q, w, h, h_q = toroid_pieces(numbers, offset, added, x, y)
+    along = wp.cw_div(numbers[offset + 1] * y, b) + wp.float64(2.0) * wp.cw_mul(y, added_s)
+    slope_y = wp.cw_mul(along, lanes(ONE) + wp.cw_mul(h_q, wp.cw_mul(q, q)))
     return g + h, wp.cw_div(wp.cw_mul(q, x), w), slope_y
+
+
+@wp.func
+def qbfs_derivatives_by_s(numbers: wp.array(dtype=wp.float64), offset: wp.int32, terms: wp.int32, x: lanes, y: lanes):
+    """Sag of Forbes's Qbfs terms and its two derivatives by s = r^2, as in `models.shapes.qbfs`."""
+    along = numbers[offset]
+    beneath = numbers[offset + 1]
+    scale = numbers[offset + 2]
+    two = wp.float64(2.0)
+    s = wp.cw_mul(x, x) + wp.cw_mul(y, y)
+    t = scale * s
+    factor = lanes(two) - wp.float64(4.0) * t
+    p = lanes(ZERO)
+    p1 = lanes(ZERO)
+    p2 = lanes(ZERO)
+    r = lanes(ZERO)
+    r1 = lanes(ZERO)
+    r2 = lanes(ZERO)
+    for j in range(terms):
+        b = numbers[offset + 2 + terms - j]
+        next0 = lanes(b) + wp.cw_mul(factor, p) - r
+        next1 = wp.cw_mul(factor, p1) - wp.float64(4.0) * p - r1
+        next2 = wp.cw_mul(factor, p2) - wp.float64(8.0) * p1 - r2
+        r = p
+        r1 = p1
+        r2 = p2
+        p = next0
+        p1 = next1
+        p2 = next2
+    p = two * (p + r)
+    p1 = two * (p1 + r1)
+    p2 = two * (p2 + r2)
+    bump = wp.cw_mul(t, lanes(ONE) - t)
+    bump1 = lanes(ONE) - two * t
+    value = wp.cw_mul(bump, p)
+    slope = scale * (wp.cw_mul(bump, p1) + wp.cw_mul(bump1, p))
+    second = (scale * scale) * (wp.cw_mul(bump, p2) + two * wp.cw_mul(bump1, p1) - two * p)
+    top = lanes(ONE) - along * s
+    bottom = lanes(ONE) - beneath * s
+    secant = lanes_sqrt(wp.cw_div(top, bottom))
+    la = wp.cw_div(lanes(along), top)
+    lb = wp.cw_div(lanes(beneath), bottom)
+    log1 = wp.float64(0.5) * (lb - la)
+    log2 = wp.float64(0.5) * (wp.cw_mul(lb, lb) - wp.cw_mul(la, la))
+    return (
+        wp.cw_mul(secant, value),
+        wp.cw_mul(secant, slope + wp.cw_mul(value, log1)),
+        wp.cw_mul(secant, second + two * wp.cw_mul(slope, log1) + wp.cw_mul(value, wp.cw_mul(log1, log1) + log2)),
+    )
+
+
+@wp.func
+def qbfs_sag(numbers: wp.array(dtype=wp.float64), offset: wp.int32, terms: wp.int32, x: lanes, y: lanes):
+    """Sag and slopes of Forbes's Qbfs terms."""
+    value, slope, _ = qbfs_derivatives_by_s(numbers, offset, terms, x, y)
+    slope = wp.float64(2.0) * slope
+    return value, wp.cw_mul(slope, x), wp.cw_mul(slope, y)
 
 
 @wp.func
@@ -257,7 +332,9 @@ def added_sag(deformations: PackedDeformations, s: wp.int32, x: lanes, y: lanes)
         elif kind == BICONIC:
             dz, dx, dy = biconic_sag(deformations.numbers, offset, x, y)
         elif kind == TOROID:
-            dz, dx, dy = toroid_sag(deformations.numbers, offset, x, y)
+            dz, dx, dy = toroid_sag(deformations.numbers, offset, a, x, y)
+        elif kind == QBFS:
+            dz, dx, dy = qbfs_sag(deformations.numbers, offset, a, x, y)
         elif kind == GRID:
             dz, dx, dy, beyond = grid_sag(deformations.numbers, offset, a, b, x, y)
             outside = outside + beyond

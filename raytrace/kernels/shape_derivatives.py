@@ -13,6 +13,7 @@ from .shape import (
     GRID_HEAD,
     ODD,
     POLAR,
+    QBFS,
     TOROID,
     PackedDeformations,
     biconic_sag,
@@ -21,7 +22,9 @@ from .shape import (
     grid_cell,
     hermite_slopes,
     hermite_weights,
+    qbfs_derivatives_by_s,
     toroid_pieces,
+    toroid_powers,
 )
 from .surface import ONE, TWO, ZERO
 
@@ -150,13 +153,30 @@ def biconic_derivatives(numbers: wp.array(dtype=wp.float64), offset: wp.int32, x
 
 
 @wp.func
-def toroid_derivatives(numbers: wp.array(dtype=wp.float64), offset: wp.int32, x: lanes, y: lanes):
+def qbfs_derivatives(numbers: wp.array(dtype=wp.float64), offset: wp.int32, terms: wp.int32, x: lanes, y: lanes):
+    """Return derivatives x, y, xx, xy, yy of Forbes's Qbfs terms, functions of s = r^2."""
+    _value, slope, second = qbfs_derivatives_by_s(numbers, offset, terms, x, y)
+    along = TWO * slope
+    twist = FOUR * second
+    return (
+        wp.cw_mul(along, x),
+        wp.cw_mul(along, y),
+        along + wp.cw_mul(twist, wp.cw_mul(x, x)),
+        wp.cw_mul(twist, wp.cw_mul(x, y)),
+        along + wp.cw_mul(twist, wp.cw_mul(y, y)),
+    )
+
+
+@wp.func
+def toroid_derivatives(numbers: wp.array(dtype=wp.float64), offset: wp.int32, terms: wp.int32, x: lanes, y: lanes):
     """Return derivatives x, y, xx, xy, yy of g + h(q, x), dq/dg = q^2, as in `models.shapes.freeform.Toroid`."""
     cy = numbers[offset + 1]
     xx = wp.cw_mul(x, x)
-    b, _g, q, w, h, h_q = toroid_pieces(numbers, offset, x, y)
-    g1 = wp.cw_div(cy * y, b)
+    added, added_s, added_ss = toroid_powers(numbers, offset, terms, y)
+    b, _g, q, w, h, h_q = toroid_pieces(numbers, offset, added, x, y)
+    g1 = wp.cw_div(cy * y, b) + TWO * wp.cw_mul(y, added_s)
     g2 = wp.cw_div(lanes(cy), wp.cw_mul(b, wp.cw_mul(b, b)))
+    g2 = g2 + TWO * added_s + FOUR * wp.cw_mul(wp.cw_mul(y, y), added_ss)
     qq = wp.cw_mul(q, q)
     h_qq = wp.cw_mul(h_q, wp.cw_div(wp.cw_mul(q, xx), wp.cw_mul(w, w)) + wp.cw_div(h, w))
     cube = wp.cw_mul(w, wp.cw_mul(w, w))
@@ -252,7 +272,9 @@ def added_derivatives(deformations: PackedDeformations, s: wp.int32, x: lanes, y
         elif kind == BICONIC:
             a, b, c, d, e = biconic_derivatives(deformations.numbers, offset, x, y)
         elif kind == TOROID:
-            a, b, c, d, e = toroid_derivatives(deformations.numbers, offset, x, y)
+            a, b, c, d, e = toroid_derivatives(deformations.numbers, offset, n, x, y)
+        elif kind == QBFS:
+            a, b, c, d, e = qbfs_derivatives(deformations.numbers, offset, n, x, y)
         elif kind == GRID:
             a, b, c, d, e = grid_derivatives(deformations.numbers, offset, n, m, x, y)
         zx = zx + a

@@ -31,6 +31,7 @@ VIGNETTED = wp.constant(wp.float64(1.0))
 MISSED = wp.constant(wp.float64(2.0))
 TOTAL_REFLECTION = wp.constant(wp.float64(3.0))
 NOT_CONVERGED = wp.constant(wp.float64(4.0))
+EVANESCENT = wp.constant(wp.float64(6.0))
 
 ZERO = wp.constant(wp.float64(0.0))
 ONE = wp.constant(wp.float64(1.0))
@@ -206,3 +207,36 @@ def refracted(mu: lanes, u: lanes, v: lanes, w: lanes, nx: lanes, ny: lanes, nz:
         wp.cw_mul(mu, v) + wp.cw_mul(g, ny),
         wp.cw_mul(mu, w) + wp.cw_mul(g, nz),
     )
+
+
+@wp.func
+def diffracted(
+    mu: lanes,
+    sense: wp.float64,
+    p: lanes,
+    q: lanes,
+    u: lanes,
+    v: lanes,
+    w: lanes,
+    nx: lanes,
+    ny: lanes,
+    nz: lanes,
+):
+    """Directions behind grooves, for normals N of any length; NaN where the order is evanescent.
+
+    d' = e + g N with e = mu d + (p, q, 0), the gradient of the added path over the index behind, and
+    g = (+-sqrt((e.N)^2 + (1 - e.e) N.N) - e.N) / N.N, the sign that of d.N times ``sense``: 1 for lenses, -1 for
+    mirrors.
+    """
+    a = wp.cw_mul(mu, u) + p
+    b = wp.cw_mul(mu, v) + q
+    c = wp.cw_mul(mu, w)
+    along = wp.cw_mul(a, nx) + wp.cw_mul(b, ny) + wp.cw_mul(c, nz)
+    square = wp.cw_mul(nx, nx) + wp.cw_mul(ny, ny) + wp.cw_mul(nz, nz)
+    size = wp.cw_mul(a, a) + wp.cw_mul(b, b) + wp.cw_mul(c, c)
+    side = wp.cw_mul(u, nx) + wp.cw_mul(v, ny) + wp.cw_mul(w, nz)
+    root = lanes_sqrt(wp.cw_mul(along, along) + wp.cw_mul(lanes(ONE) - size, square))
+    for i in range(LANES):
+        root[i] = wp.where(sense * side[i] < ZERO, -root[i], root[i])
+    g = wp.cw_div(root - along, square)
+    return a + wp.cw_mul(g, nx), b + wp.cw_mul(g, ny), c + wp.cw_mul(g, nz)

@@ -18,6 +18,7 @@ from .obstruction import PackedObstructions, obstructed_status
 from .packet import LANES, RayPackets, components, lane_flags, lanes
 from .shape import NAN, PackedDeformations, deformed_distance, through_screen
 from .surface import (
+    EVANESCENT,
     FAR,
     MISSED,
     NOT_CONVERGED,
@@ -28,25 +29,32 @@ from .surface import (
     ZERO,
     aspheric_distance,
     conic_distance,
+    diffracted,
     polynomial,
     reflected,
     refracted,
     second_conic_distance,
 )
+from .thin_lens import through_thin_lens
 
 wp.set_module_options(FORWARD_OPTIONS)
 
 MIRROR = wp.constant(0)
 REFRACT = wp.constant(1)
 PHASE = wp.constant(4)
+THIN_LENS = wp.constant(5)
+#: What grooves do in place of reflection or refraction.
+DIFFRACT = wp.constant(-1)
 
 
 # Columns of the table of numbers, a row per surface: curvature [1/m], conic constant, vertex [m] (3), rotation (9,
 # row by row), clear aperture: centre x, y, inner and outer radius [m] (0 of one that is neither disc nor ring, but an
 # outer radius of FAR where it is unbounded); the curvature of the conic that the search for a landing starts from,
 # another one where the surface has no conic of its own; the direction cosine w, 0 or close to it, at which rays change
-# from one intersection with that conic to the other; the largest cosine, of either sign, at which both may lie on the
-# sheet within the rim.
+# from one intersection with that conic to the other; the path that the grooves of a grating add along x and y, for each
+# metre of wavelength [1/m]; the power of a thin lens, and one over the distance of the object for which paths through
+# it are equal [1/m]; the largest direction cosine, of either sign, at which both intersections may lie on the sheet
+# within the rim.
 CURVATURE = wp.constant(0)
 CONIC = wp.constant(1)
 VERTEX = wp.constant(2)
@@ -54,12 +62,16 @@ ROTATION = wp.constant(5)
 APERTURE = wp.constant(14)
 FIRST_CURVATURE = wp.constant(18)
 SIGN_CHANGE = wp.constant(19)
-TWO_CROSSINGS = wp.constant(20)
-NUMBERS = 21
+GROOVES = wp.constant(20)
+POWER = wp.constant(22)
+VERGENCE = wp.constant(23)
+TWO_CROSSINGS = wp.constant(24)
+NUMBERS = 25
 # Columns of the table of kinds: interaction, number of aspheric coefficients, whether rotated, whether stopped down
 # (0 no, 1 by a disc or ring, 2 by another aperture), whether obstructions lie on the way to it, whether its shape has
 # parts besides the conic and its even powers (1) or is a mesh (2), which of the distinct media lies before and after,
-# whether its aperture says which of two crossings is meant (1), and of a conic at grazing incidence (2).
+# whether grooves are ruled on it, whether its aperture says which of two crossings is meant (1), and of a conic at
+# grazing incidence (2).
 INTERACTION = wp.constant(0)
 TERMS = wp.constant(1)
 ROTATED = wp.constant(2)
@@ -68,8 +80,9 @@ OBSTRUCTED = wp.constant(4)
 DEFORMED = wp.constant(5)
 MEDIUM_BEFORE = wp.constant(6)
 MEDIUM_AFTER = wp.constant(7)
-CHOSEN = wp.constant(8)
-KINDS = 9
+RULED = wp.constant(8)
+CHOSEN = wp.constant(9)
+KINDS = 10
 
 #: A ray meets a crossing farther ahead than this [m]: above the rounding of places, below any thickness.
 AHEAD = wp.constant(wp.float64(1.0e-9))
@@ -249,9 +262,10 @@ def start_by_aperture(
 def surface_loop(special: int, chromatic: bool = False) -> wp.Function:
     """Return the loop over the surfaces of a telescope: plain (0), any (1), any with a choice of crossings (2).
 
-    Plain telescopes have conics with even powers, discs and rings as apertures, no phase screens, no obstructions.
-    The ``indices`` are a row of numbers, before the first surface and after each; in a chromatic loop, where every ray
-    has its own wavelength, packets of indices [medium, packet], and optical paths are left out.
+    Plain telescopes have conics with even powers, discs and rings as apertures, no phase screens, gratings, thin lenses
+    or obstructions. The ``indices`` are a row of numbers, before the first surface and after each, and the wavelength
+    [m] as the last of the row; in a chromatic loop, where every ray has its own wavelength, packets of indices
+    [medium, packet] and of the wavelength behind them, and optical paths are left out.
     """
 
     @wp.func
@@ -379,9 +393,37 @@ def surface_loop(special: int, chromatic: bool = False) -> wp.Function:
                     x[i] = wp.where(nz[i] > ZERO, x[i], NAN)
                     y[i] = wp.where(nz[i] > ZERO, y[i], NAN)
                     z[i] = wp.where(nz[i] > ZERO, z[i], NAN)
+                if wp.static(special):
+                    if surfaces.kinds[s, RULED] == 1:
+                        if wp.static(chromatic):
+                            n = indices[surfaces.kinds[s, MEDIUM_AFTER], packet]
+                            ratio = wp.cw_div(indices[surfaces.kinds[s, MEDIUM_BEFORE], packet], n)
+                            length = wp.cw_div(indices[indices.shape[0] - 1, packet], n)
+                        else:
+                            ratio = lanes(before / after)
+                            length = lanes(indices[row, indices.shape[1] - 1] / after)
+                            path = path + after * wp.cw_mul(
+                                length, surfaces.numbers[s, GROOVES] * x + surfaces.numbers[s, GROOVES + 1] * y
+                            )
+                        u, v, w = diffracted(
+                            ratio,
+                            wp.where(interaction == MIRROR, -ONE, ONE),
+                            surfaces.numbers[s, GROOVES] * length,
+                            surfaces.numbers[s, GROOVES + 1] * length,
+                            u,
+                            v,
+                            w,
+                            nx,
+                            ny,
+                            nz,
+                        )
+                        for i in range(LANES):
+                            lost = wp.where(status[i] <= VIGNETTED, EVANESCENT, status[i])
+                            status[i] = wp.where(wp.abs(u[i]) < FAR, status[i], lost)
+                        interaction = DIFFRACT
                 if interaction == MIRROR:
                     u, v, w = reflected(u, v, w, nx, ny, nz)
-                else:
+                elif interaction == REFRACT:
                     if wp.static(chromatic):
                         ratio = wp.cw_div(
                             indices[surfaces.kinds[s, MEDIUM_BEFORE], packet],
@@ -404,6 +446,19 @@ def surface_loop(special: int, chromatic: bool = False) -> wp.Function:
                     for i in range(LANES):
                         total = wp.where(status[i] <= VIGNETTED, TOTAL_REFLECTION, status[i])
                         status[i] = wp.where(wp.abs(w[i]) < FAR, status[i], total)
+
+                if interaction == THIN_LENS:
+                    if wp.static(chromatic):
+                        n = indices[surfaces.kinds[s, MEDIUM_BEFORE], packet]
+                        behind = indices[surfaces.kinds[s, MEDIUM_AFTER], packet]
+                    else:
+                        n = lanes(before)
+                        behind = lanes(after)
+                    power = surfaces.numbers[s, POWER]
+                    vergence = surfaces.numbers[s, VERGENCE]
+                    u, v, w, added = through_thin_lens(power, vergence, n, behind, x, y, u, v, w)
+                    if wp.static(not chromatic):
+                        path = path + added
 
             if rotated == 1:
                 x, y, z = to_telescope(surfaces, s, x, y, z)

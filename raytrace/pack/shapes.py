@@ -16,9 +16,10 @@ from ...models.shapes.grid import GridSag
 from ...models.shapes.mesh import MeshSurface
 from ...models.shapes.polar_polynomial import PolarPolynomial, from_even_powers
 from ...models.shapes.polynomial import XYPolynomial, ZernikeSag
+from ...models.shapes.qbfs import QbfsAsphere
 from ...models.shapes.shape import Plane, Rotational, Shape
 from ...models.shapes.sum import Sum
-from ..kernels.shape import BICONIC, GRID, ODD, PART_COLUMNS, POLAR, TOROID, PackedDeformations
+from ..kernels.shape import BICONIC, GRID, ODD, PART_COLUMNS, POLAR, QBFS, TOROID, PackedDeformations
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class SplitShape:
     """A shape as a conic with even powers of the radius, and added parts."""
 
     base: Rotational  #: conic with even powers; a plane where the shape has none of its own
-    parts: tuple[Shape, ...]  #: shapes added to it; of an odd asphere only its powers
+    parts: tuple[Shape, ...]  #: shapes added to it; of an odd or a Q-type asphere only its terms
     #: Curvature [1/m] of the surface that the search for a ray's landing starts from: that of the base, or of the
     #: sphere that a shape without a base resembles.
     first_curvature: float
@@ -52,10 +53,10 @@ def split_shape(shape: Shape, *, screen: bool = False) -> SplitShape:
 
 
 def _flattened_terms(shape: Shape) -> Sequence[Shape]:
-    """Return the terms of a sum, of sums within it too; an odd asphere comes after its own conic."""
+    """Return the terms of a sum, of sums within it too; an odd or a Q-type asphere comes after its own conic."""
     if isinstance(shape, Sum):
         return [term for summand in shape.parts for term in _flattened_terms(summand)]
-    return [shape.base, shape] if isinstance(shape, OddAsphere) else [shape]
+    return [shape.base, shape] if isinstance(shape, OddAsphere | QbfsAsphere) else [shape]
 
 
 def pack_deformations(shapes: Sequence[SplitShape], device: str = "cpu") -> Any:
@@ -108,7 +109,14 @@ def _encoded_parts(shapes: Sequence[Shape]) -> list[tuple[int, tuple[int, int], 
             encoded.append((int(BICONIC), (0, 0), np.concatenate([c, k * c**2])))
         elif isinstance(shape, Toroid):
             cx, cy = 1.0 / shape.radius_x, 1.0 / shape.radius_y
-            encoded.append((int(TOROID), (0, 0), np.array([cx, cy, (1.0 + shape.conic_y) * cy**2])))
+            numbers = np.array([cx, cy, (1.0 + shape.conic_y) * cy**2, *shape.coefficients])
+            encoded.append((int(TOROID), (len(shape.coefficients), 0), numbers))
+        elif isinstance(shape, QbfsAsphere):
+            square, series = 1.0 / shape.radius**2, shape.series
+            numbers = np.array(
+                [shape.conic * square, (1.0 + shape.conic) * square, 1.0 / shape.norm_radius**2, *series]
+            )
+            encoded.append((int(QBFS), (len(series), 0), numbers))
         elif isinstance(shape, GridSag):
             head = [shape.x[0], shape.y[0], *(1.0 / step for step in shape.step)]
             numbers = np.concatenate([head, shape.nodes.ravel()])

@@ -20,7 +20,19 @@ from ...models.shapes.shape import Rotational
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
 from ..kernels.surface import FAR
-from ..kernels.trace import CHOSEN, DEFORMED, INTERACTION, KINDS, NUMBERS, OBSTRUCTED, PHASE, STOPPED, PackedSurfaces
+from ..kernels.trace import (
+    CHOSEN,
+    DEFORMED,
+    INTERACTION,
+    KINDS,
+    NUMBERS,
+    OBSTRUCTED,
+    PHASE,
+    RULED,
+    STOPPED,
+    THIN_LENS,
+    PackedSurfaces,
+)
 from .apertures import pack_apertures
 from .meshes import pack_meshes
 from .obstructions import obstruction_table, pack_obstructions
@@ -157,8 +169,11 @@ def pack_surfaces(telescope: Telescope | SurfaceSequence, device: str = "cpu") -
         stopped = 2 if ring is None else int(s.aperture is not None)
         frame = (*s.vertex, *s.matrix.ravel())
         choice = crossings(surfaces, row, shapes[row])
-        first = shapes[row].first_curvature, choice.sign_change, choice.two_crossings
-        numbers[row] = [base.curvature, base.conic, *frame, *rim, *first]
+        first = shapes[row].first_curvature, choice.sign_change
+        grooves = (0.0, 0.0) if s.grating is None else s.grating.path_gradient
+        thin = s.thin_lens
+        lens = (0.0, 0.0) if thin is None else (1.0 / thin.focal_length, 1.0 / thin.object_distance)
+        numbers[row] = [base.curvature, base.conic, *frame, *rim, *first, *grooves, *lens, choice.two_crossings]
         kinds[row] = [
             int(s.interaction),
             len(terms),
@@ -168,12 +183,14 @@ def pack_surfaces(telescope: Telescope | SurfaceSequence, device: str = "cpu") -
             2 if isinstance(s.shape, MeshSurface) else int(bool(shapes[row].parts)),
             media.index(before),
             media.index(s.medium_after),
+            s.grating is not None,
             choice.by_aperture,
         ]
         before = s.medium_after
     packed = PackedSurfaces()
-    unusual = kinds[:, DEFORMED].any() or kinds[:, OBSTRUCTED].any() or np.any(kinds[:, STOPPED] == 2)
-    packed.special = 2 if kinds[:, CHOSEN].any() else int(unusual or np.any(kinds[:, INTERACTION] == PHASE))
+    unusual = kinds[:, [DEFORMED, OBSTRUCTED, RULED]].any() or np.any(kinds[:, STOPPED] == 2)
+    unusual = unusual or np.isin(kinds[:, INTERACTION], (PHASE, THIN_LENS)).any()
+    packed.special = 2 if kinds[:, CHOSEN].any() else int(unusual)
     packed.numbers = warp_array(numbers, device=device)
     packed.kinds = warp_array(kinds, wp.int32, device=device)
     packed.coefficients = warp_array(coefficients, device=device)
@@ -205,6 +222,11 @@ def refractive_indices(telescope: Telescope, wavelength: float) -> np.ndarray:
     telescope.check_wavelength(wavelength)
     media = [telescope.medium_before, *(s.medium_after for s in telescope.surfaces)]
     return np.array([_medium_index(medium, float(wavelength)) for medium in media], dtype=np.float64)
+
+
+def indices_and_wavelength(telescope: Telescope, wavelength: float) -> np.ndarray:
+    """Return :func:`refractive_indices` and the wavelength [m] behind them, as kernels read them, [n_surface + 2]."""
+    return np.append(refractive_indices(telescope, wavelength), float(wavelength))
 
 
 @lru_cache(maxsize=256)

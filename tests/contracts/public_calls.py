@@ -600,6 +600,12 @@ def _methods(m, tel, w, x, y):
         "GridSag": (pachon.GridSag, {"x": np.arange(5.0), "y": np.arange(5.0), "values": np.zeros((5, 5))}),
         "MeshSurface": (pachon.MeshSurface, {"vertices": np.eye(3), "faces": np.array([[0, 1, 2]]), "smooth": False}),
         "MeshSurface.from_file": (pachon.MeshSurface.from_file, {"path": m.folder / "none.stl", "scale": 1.0}),
+        "QbfsAsphere": (
+            pachon.QbfsAsphere,
+            {"radius": 5.0, "conic": 0.0, "norm_radius": 1.0, "coefficients": (1e-3, 2e-4)},
+        ),
+        "ThinLens": (pachon.ThinLens, {"focal_length": 0.1, "object_distance": 0.3}),
+        "Grating": (pachon.Grating, {"order": 1, "lines_per_mm": 1200.0, "groove_angle": 0.0}),
         "Conic": (pachon.Conic, {"radius": 5.0, "conic": 0.0}),
         "Conic.sag": (pachon.Conic(5.0).sag, xy),
         "Conic.gradient": (pachon.Conic(5.0).gradient, xy),

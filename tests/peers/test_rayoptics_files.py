@@ -9,7 +9,10 @@ import pytest
 import pachon
 from pachon.core.errors import DomainError
 from pachon.models.first_order import first_order
-from pachon.models.media.medium import Sellmeier
+from pachon.models.media.medium import ConstantIndex, Sellmeier
+from pachon.models.rotation import rotation_matrix
+from pachon.models.surface import Interaction
+from pachon.models.telescope import VACUUM
 
 rayoptics = pytest.importorskip("rayoptics")
 
@@ -191,3 +194,36 @@ def test_rays_of_a_file(name):
             ray = trace.trace(sequence, start, direction, nm)[0]
             # 1 nm is what was asked for, 4e-14 m what is found.
             assert np.allclose(ours, ray[-1][0], rtol=0, atol=1e-12 * unit)
+
+
+GRATINGS = [
+    (Interaction.MIRROR, (12.0, -7.0, 20.0), pachon.Grating(2, 300.0, 0.4), 0.0),
+    (Interaction.MIRROR, (0.0, 6.0, 0.0), pachon.Grating(-40, 31.6), 0.0),
+    (Interaction.REFRACT, (5.0, 3.0, 0.0), pachon.Grating(-1, 600.0, -0.7), 0.0),
+    (Interaction.REFRACT, (5.0, 3.0, 0.0), pachon.Grating(3, 100.0, 1.3), 1.6),
+]
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(("interaction", "tilt", "grating", "index"), GRATINGS)
+def test_plane_gratings(tmp_path, interaction, tilt, grating, index):
+    """Its orders have the opposite sign in transmission."""
+    from rayoptics.gui.appcmds import open_model
+
+    after = ConstantIndex(index) if index else VACUUM
+    turn = tuple(map(tuple, rotation_matrix(np.radians(tilt)).tolist()))
+    place = (0.0, 0.0, 0.2 if interaction == Interaction.MIRROR else -0.2)
+    surfaces = (
+        pachon.Surface("ruled", interaction, pachon.Plane(), (0.0, 0.0, 0.0), after, rotation=turn, grating=grating),
+        pachon.Surface("Detector", Interaction.DETECTOR, pachon.Plane(), place, after),
+    )
+    telescope = pachon.Telescope(
+        "spectrograph", surfaces, stop_z=0.0, pupil_diameter=0.03, pupil_obscuration=0.0, launch_distance=2.0,
+        reference_sphere_radius=1.0, field_radius=0.01, field_limit=0.2, wavelength_range=(4e-7, 8e-7),
+        default_wavelength=550e-9, band=(5e-7, 6e-7),
+    )  # fmt: skip
+    path = tmp_path / "ours.roa"
+    pachon.save_telescope(telescope, path)
+    compare_rays(telescope, open_model(str(path)), 0.0)
+    back = pachon.load_telescope(path)
+    assert back.surfaces[0].grating.order == grating.order

@@ -15,6 +15,7 @@ from pachon.models.shapes.freeform import Biconic, OddAsphere, Toroid
 from pachon.models.shapes.grid import GridSag
 from pachon.models.shapes.mesh import MeshSurface
 from pachon.models.shapes.polynomial import XYPolynomial, ZernikeSag
+from pachon.models.shapes.qbfs import QbfsAsphere
 from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sphere
 from pachon.models.shapes.sum import Sum
 from pachon.models.surface import Interaction, Surface
@@ -39,6 +40,9 @@ SHAPES = {
     "biconic": Biconic(4.0, -6.0, -0.3, 0.8),
     "cylinder": Biconic(4.0, np.inf),
     "toroid": Toroid(4.0, 6.0, -0.7),
+    "toroid with powers": Toroid(4.0, -6.0, -0.7, (2e-3, -1e-3, 3e-4)),
+    "qbfs": QbfsAsphere(5.0, 0.4, 1.2, (1e-2, -4e-3, 2e-3, 1e-3, -5e-4)),
+    "flat qbfs": QbfsAsphere(np.inf, 0.0, 1.3, (1e-2, -4e-3)),
     "xy polynomial": XYPolynomial(((1, 0, 1e-3), (2, 1, 3e-3), (0, 5, -1e-3), (3, 3, 2e-3))),
     "zernikes": ZERNIKES,
     "grid": GRID,

@@ -103,6 +103,10 @@ def _items(t: Telescope, groups: dict[str, tuple[int, int]], first: int, end: in
 
 def _optic(surface: Surface, before: Medium, frame: Frame) -> dict[str, Any]:
     with error_context(subject=f"surface {surface.name}"):
+        if surface.grating is not None:
+            raise PrescriptionError("grating: a batoid file has none")
+        if surface.thin_lens is not None:
+            raise PrescriptionError("thin lens: a batoid file has none")
         items: dict[str, Any] = {"type": _TYPES[surface.interaction], "name": surface.name}
         items |= _coordinate_system((np.array(surface.vertex), surface.matrix), frame)
         sag = surface_items(surface.shape)

@@ -3,7 +3,8 @@
 Supported commands: RDM, DIM, TITLE, EPD, FNO, NAO, WL, WTW, REF, AFO, TEM (deg C), PRE (mm of mercury), XAN YAN, XOB
 YOB, XIM YIM, XRI YRI, WTF, VUX VLX VUY VLY, before or after the surfaces SO S SI (curvature or radius, thickness,
 glass), RDY CUY THI GLA, STO, SLB, SPH CON ASP with K and A to G (r^4 to r^16), XDE YDE ZDE ADE BDE CDE with DAR, BEN
-and REV, CIR (OBS, HOL, EDG) REX REY and ELX ELY with ADX ADY, pick-ups PIK, private glasses PRV PWL END. ADE and BDE
+and REV, CIR (OBS, HOL, EDG) REX REY and ELX ELY with ADX ADY, linear gratings GRT with GRO, GRS and GRX GRY GRZ (order,
+spacing, vector across the grooves), pick-ups PIK, private glasses PRV PWL END. ADE and BDE
 are left-handed, CDE is right-handed (CODE V reference manual, "Decentered surfaces"), those of a description are right-
 handed. A glass is a name (NBK7_SCHOTT), REFL, or a number (517642). Solves are passed over where their solution is
 given. Rays are aimed at the stop, as CODE V's chief rays are.
@@ -33,6 +34,7 @@ from ..lens.glasses import Glasses, numbered_glass
 from ..lens.shapes import even_asphere
 from ..lens.source import Findings, Source
 from ..lens.text import FileSurface, Record, read_text, scaled
+from .gratings import GROOVES, grating_of
 
 FORMAT = Format("CODE V", "EPD, FNO or NAO", "WL", "STO")
 UNITS = {"M": 1e-3, "MM": 1e-3, "C": 1e-2, "CM": 1e-2, "I": 0.0254, "IN": 0.0254}
@@ -53,11 +55,13 @@ LONG_NAMES = {"TITLE": "TIT", "STOP": "STO"}
 POWERS = "ABCDEFG"
 #: Numbers of surfaces.
 NUMBERS = {*["THI", "K", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "REX", "REY", "ELX", "ELY", "ADX", "ADY"], *POWERS}
+NUMBERS |= {*GROOVES}
 #: Surfaces that are not read.
 REFUSED = {
-    "DIF": "diffractive surfaces", "GRT": "diffractive surfaces", "XTO": "toroids", "YTO": "toroids",
+    "DIF": "diffractive surfaces", "HOE": "holograms", "XTO": "toroids", "YTO": "toroids",
     "CYL": "cylinders", "RDX": "surfaces of two radii", "NSS": "non-sequential parts", "GRD": "gradient-index media",
     "ZOO": "zoom positions",
+    "GRN": "gradient-index media", "GRC": "gradient-index media", "BIR": "birefringent media",
 }  # fmt: skip
 #: Values that may be solved for, and what they are, by the command of the solve.
 SOLVED = {
@@ -247,6 +251,8 @@ class _Reader:
             surface.name = command.text.strip("'\" ")
         elif key in NUMBERS:
             surface.commands[key], surface.values[key] = command, command.number(0)
+        elif key == "GRT" or (key == "DIF" and [w.upper() for w in words] == ["GRT"]):
+            surface.commands["GRT"] = command
         elif key in ("DAR", "BEN", "REV"):
             surface.commands[key], surface.values[key] = command, 1.0
         elif key == "CIR":
@@ -482,6 +488,7 @@ class _Reader:
             name=surface.name,
             after=self._medium(surface),
             aperture=self._aperture(surface),
+            grating=grating_of(surface, unit, self.findings),
             semi_diameter=surface.get("EDGE") * unit,
             stop=surface.stop,
             distance=distance,

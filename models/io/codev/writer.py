@@ -145,6 +145,11 @@ def _surface_lines(sequence: LensSequence, surface: LensSurface, words: Mapping[
     elif profile.conic:
         yield "  CON"
         yield f"  K {number_text(profile.conic)}"
+    if surface.grating is not None:
+        # The vector across the grooves, and their spacing.
+        (x, y), spacing = surface.grating.across, 1e-3 / surface.grating.lines_per_mm / unit
+        yield f"  GRT; GRO {surface.grating.order}; GRS {number_text(spacing)}"
+        yield f"  GRX {number_text(x)}; GRY {number_text(y)}; GRZ 0.0"
     if surface.semi_diameter:
         yield f"  CIR EDG {number_text(surface.semi_diameter / unit)}"
     if surface.off_axis:

@@ -35,6 +35,8 @@ from .source import Findings, Source
 Reader = Callable[[Path, Findings, Glasses], LensDescription]
 #: Field radius [rad] of a file with the axis alone.
 LEAST_FIELD = math.radians(0.1)
+#: Distance of an object from a thin lens below which it is in the lens [m].
+LEAST_DISTANCE = 1e-9
 
 
 def read_lens(
@@ -62,6 +64,7 @@ def telescope_of(lens: LensDescription) -> Telescope:
         raise lens.problem(f"expected the wavelengths: {lens.format.wavelengths}")
     surfaces = _in_order(lens)
     pupil = _pupil(lens, surfaces)
+    surfaces = _with_conjugates(lens, surfaces, pupil.image.surfaces)
     names = surface_names(surfaces)
     stop = next((i for i in range(len(surfaces) - 1, -1, -1) if surfaces[i].stop), 0)
     pupil_plane = stop == 0 and surfaces[0].stop and surfaces[0].name == PUPIL_PLANE
@@ -161,7 +164,8 @@ def _pupil(lens: LensDescription, surfaces: Sequence[LensSurface]) -> _Pupil:
             paraxial.mark_stop(surface.semi_diameter)
             stop_source = surface.source
         mirror = surface.interaction == Interaction.MIRROR
-        paraxial.add(surface.shape.curvatures, surface.before, surface.after, mirror=mirror)
+        power = 0.0 if surface.thin_lens is None else 1.0 / surface.thin_lens.focal_length
+        paraxial.add(surface.shape.curvatures, surface.before, surface.after, mirror=mirror, power=power)
     if not any(surface.stop for surface in surfaces):
         lens.findings.report(lens.problem(f"no surface is the stop ({lens.format.stop})"), "the first is taken")
         paraxial.mark_stop(0.0, first=True)
@@ -183,6 +187,20 @@ def _pupil(lens: LensDescription, surfaces: Sequence[LensSurface]) -> _Pupil:
     to_pupil = image.image_scale / image.image_slope if image.image_slope else math.inf
     radius = reference_radius(to_pupil, image.focal_length, diameter)
     return _Pupil(image, diameter, replace(aperture, value=value), _field_radius(lens, image), radius)
+
+
+def _with_conjugates(
+    lens: LensDescription, surfaces: list[LensSurface], paraxial: ParaxialSurfaces
+) -> list[LensSurface]:
+    """Return the surfaces with thin lenses whose paths are equal from the object on the axis to its image."""
+    placed = list(surfaces)
+    for i, surface in enumerate(surfaces):
+        if surface.thin_lens is not None:
+            distance = paraxial.object_distance_at(i, lens.primary_wavelength, lens.object_distance)
+            # An object in the lens itself has no such paths.
+            distance = distance if abs(distance) > LEAST_DISTANCE else math.inf
+            placed[i] = replace(surface, thin_lens=replace(surface.thin_lens, object_distance=distance))
+    return placed
 
 
 def _field_radius(lens: LensDescription, image: StopImage) -> float:
@@ -226,13 +244,16 @@ def _placed(surface: LensSurface, name: str, z0: float) -> Surface:
             rotation=rotated_axes(surface.axes),
             # What follows the light is computed where it is shown, of the lens as it has become.
             semi_diameter=surface.semi_diameter if surface.semi_diameter > 0 and not surface.automatic else None,
+            grating=None if surface.grating is None else surface.grating.rotated(),
+            thin_lens=surface.thin_lens,
         )
 
 
 def _first_power(surfaces: Sequence[LensSurface]) -> float:
     """Return where along the axis the first curved mirror or lens surface is, or else the first flat one."""
-    acting = [s for s in surfaces if s.interaction in (Interaction.MIRROR, Interaction.REFRACT)]
-    curved = [s for s in acting if not isinstance(s.shape, Plane)]
+    powerful = (Interaction.MIRROR, Interaction.REFRACT, Interaction.THIN_LENS)
+    acting = [s for s in surfaces if s.interaction in powerful]
+    curved = [s for s in acting if not isinstance(s.shape, Plane) or s.thin_lens is not None]
     return float((curved or acting or surfaces)[0].position[2])
 
 

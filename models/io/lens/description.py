@@ -19,6 +19,7 @@ import numpy as np
 from ....core.errors import PrescriptionError
 from ...aperture import Aperture
 from ...design_data import LENGTH_UNITS, DesignData
+from ...grating import Grating
 from ...links import Pickup, Solve
 from ...media.air import STANDARD_ATMOSPHERE, ZERO_CELSIUS
 from ...media.medium import Medium
@@ -26,6 +27,7 @@ from ...rotation import rotation_angles
 from ...shapes.shape import Shape
 from ...surface import Interaction
 from ...telescope import VACUUM
+from ...thin_lens import ThinLens
 from .source import Findings, Source
 
 #: Name of the plane that writers put in front to carry the entrance pupil.
@@ -55,7 +57,7 @@ class LensSurface:
     `position` [m] and `axes` (columns, [3, 3]) are in the frame of the lens, `distance` is that along the axis of the
     light from the surface before it [m], negative behind an odd number of mirrors; None if its file states places
     alone. `before` and `after` are the media on either side; `number` is that of the file. An `automatic` semi-diameter
-    is that of the light of the lens as it stands in the file.
+    is that of the light of the lens as it stands in the file. Grooves are in its own axes.
     """
 
     source: Source
@@ -72,6 +74,8 @@ class LensSurface:
     stop: bool = False
     distance: float | None = None
     number: int = 0
+    grating: Grating | None = None
+    thin_lens: ThinLens | None = None
 
     @property
     def off_axis(self) -> bool:
@@ -197,7 +201,9 @@ class LensDescription:
         """Add a surface in the order of the light; what is in front of it, and behind a mirror, follows."""
         before = self.surfaces[-1].after if self.surfaces else self.medium
         after = before if mirror else surface.after
-        passing = Interaction.PASS if after == before else Interaction.REFRACT
+        passing = Interaction.PASS if after == before and surface.grating is None else Interaction.REFRACT
+        if surface.thin_lens is not None:
+            passing = Interaction.THIN_LENS
         followed = replace(
             surface,
             name=" ".join(surface.name.split()),

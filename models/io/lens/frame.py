@@ -18,6 +18,7 @@ from ...aperture import Aperture, Complement, Ellipse, Intersection, Polygon, Re
 from ...shapes.freeform import Biconic, OddAsphere, Toroid
 from ...shapes.grid import GridSag
 from ...shapes.polynomial import XYPolynomial, ZernikeSag
+from ...shapes.qbfs import QbfsAsphere
 from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere
 from ...shapes.sum import Sum
 from ...surface import IDENTITY, Matrix
@@ -41,10 +42,13 @@ def rotated_shape(shape: Shape) -> Shape:
         return shape
     if isinstance(shape, Sphere | Conic):
         return replace(shape, radius=-shape.radius)
-    if isinstance(shape, EvenAsphere | OddAsphere):
+    if isinstance(shape, EvenAsphere | OddAsphere | QbfsAsphere):
         return replace(shape, radius=-shape.radius, coefficients=tuple(-a for a in shape.coefficients))
-    if isinstance(shape, Biconic | Toroid):
+    if isinstance(shape, Biconic):
         return replace(shape, radius_x=-shape.radius_x, radius_y=-shape.radius_y)
+    if isinstance(shape, Toroid):
+        powers = tuple(-a for a in shape.coefficients)
+        return replace(shape, radius_x=-shape.radius_x, radius_y=-shape.radius_y, coefficients=powers)
     if isinstance(shape, XYPolynomial):
         return XYPolynomial(tuple((i, j, a if i % 2 else -a) for i, j, a in shape.terms))
     if isinstance(shape, ZernikeSag):

@@ -98,6 +98,9 @@ class LensSequence:
             if own_stop and data.aiming != aimed:
                 problem = f"aiming = {data.aiming}: {file} does not state how rays are aimed"
                 findings.note(PrescriptionError(problem), f"read back it is {aimed}")
+            for surface in t.surfaces:
+                if surface.thin_lens is not None:
+                    raise PrescriptionError(f"surface {surface.name}: thin lens: {file} is written without them")
             surfaces = lens_surfaces(t, data.stop if own_stop else None, along_light=along_light)
         aperture = ("entrance_pupil", t.pupil_diameter)
         if own_stop and data.aperture is not None and data.aperture_value is not None:
@@ -281,17 +284,21 @@ def lens_surfaces(t: Telescope, stop: str | None, *, along_light: bool = False) 
                 semi_diameter=surface.semi_diameter or 0.0,
                 stop=surface.name == stop,
                 distance=float(position[2] - surfaces[-1].position[2]) if surfaces else 0.0,
+                grating=None if aligned.grating is None else aligned.grating.rotated(),
+                thin_lens=surface.thin_lens,
             )
         surfaces.append(placed)
         medium = surface.medium_after
         if surface.interaction == Interaction.MIRROR:
-            start, direction = _reflected(start, direction, placed)
+            start, direction = _reflected(start, direction, placed, t.default_wavelength)
             sign = -sign
     return tuple(surfaces)
 
 
-def _reflected(position: np.ndarray, direction: np.ndarray, mirror: LensSurface) -> tuple[np.ndarray, np.ndarray]:
-    """Return where a ray meets a mirror and its direction behind it."""
+def _reflected(
+    position: np.ndarray, direction: np.ndarray, mirror: LensSurface, wavelength: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return where a ray of a wavelength [m] meets a mirror and its direction behind it."""
     vertex, axes = mirror.position, mirror.axes
     place, along = (position - vertex) @ axes, direction @ axes
     # A ray that misses the mirror, or runs along it, has no direction behind it.
@@ -300,10 +307,20 @@ def _reflected(position: np.ndarray, direction: np.ndarray, mirror: LensSurface)
             gradient = np.array([*(-float(v) for v in mirror.shape.gradient(*place[:2])), 1.0])
             place = place - along * (place[2] - float(mirror.shape.sag(*place[:2]))) / (along @ gradient)
     normal = gradient / np.linalg.norm(gradient)
-    return vertex + axes @ place, axes @ (along - 2.0 * (along @ normal) * normal)
+    if mirror.grating is None:
+        return vertex + axes @ place, axes @ (along - 2.0 * (along @ normal) * normal)
+    grooves = np.array([*mirror.grating.path_gradient, 0.0]) * wavelength / float(mirror.before.index(wavelength))
+    sideways = along + grooves
+    sideways = sideways - (sideways @ normal) * normal
+    # Of an evanescent order there is none either.
+    with np.errstate(invalid="ignore"):
+        outward = np.sqrt(1.0 - sideways @ sideways) * np.sign(along @ normal)
+    return vertex + axes @ place, axes @ (sideways - outward * normal)
 
 
 def _reversed(surface: Surface, axes: np.ndarray) -> tuple[Surface, np.ndarray]:
     """Return the same surface with its own axes rotated by half a turn about its y axis, and these axes."""
     aperture = None if surface.aperture is None else rotated_aperture(surface.aperture)
-    return replace(surface, shape=rotated_shape(surface.shape), aperture=aperture), axes @ HALF_TURN
+    grating = None if surface.grating is None else surface.grating.rotated()
+    turned = replace(surface, shape=rotated_shape(surface.shape), aperture=aperture, grating=grating)
+    return turned, axes @ HALF_TURN

@@ -44,10 +44,11 @@ def odd_asphere(curvature: float, constant: float, powers: Sequence[float]) -> S
     return OddAsphere(radius_of(curvature), constant, terms) if terms else conic(curvature, constant)
 
 
-def toroid(radius_x: float, curvature_y: float, constant: float) -> Shape:
-    """Return a conic in y, revolved about an axis at a radius [m] along x, which may be infinite."""
-    flat = curvature_y == 0 and math.isinf(radius_x)
-    return Plane() if flat else Toroid(radius_x, radius_of(curvature_y), constant)
+def toroid(radius_x: float, curvature_y: float, constant: float, powers: Sequence[float] = ()) -> Shape:
+    """Return a conic in y with coefficients [m] of y^2, y^4..., revolved about an axis at a radius [m] along x."""
+    terms = trimmed(powers)
+    flat = curvature_y == 0 and math.isinf(radius_x) and not terms
+    return Plane() if flat else Toroid(radius_x, radius_of(curvature_y), constant, terms)
 
 
 def sum_of_conics(radius_x: float, radius_y: float, constant_x: float, constant_y: float) -> Shape:

@@ -15,17 +15,21 @@ import numpy as np
 
 from ...aperture import Aperture, Complement
 from ...telescope import VACUUM
+from ...thin_lens import ThinLens
 from ..json_items import JsonObject
 from ..lens.apertures import ellipse, rectangle, ring
 from ..lens.description import INFINITE, Format, LensDescription, LensSurface
 from ..lens.glasses import Glasses
 from ..lens.source import Findings, Source
 from ..lens.text import scaled
+from .gratings import MODEL, PHASE_MODEL, grating_of, phase_grating
 from .media import medium_of
 from .shapes import shape_of
 
 FORMAT = Format("optiland", "aperture", "wavelengths", "is_stop")
 MM = 1e-3
+#: Interaction of light with an ideal thin lens.
+THIN_LENS_MODEL = "ThinLensInteractionModel"
 #: Keys of the file without effect on the paths of rays.
 IGNORED = ("version", "pickups", "solves")
 #: Apertures by their types; the size of the stop is its diameter.
@@ -138,8 +142,13 @@ def _surface(surface: JsonObject, lens: LensDescription, stop_radius: float, gla
     early = "interaction_model" not in surface
     interaction = surface if early else surface.child("interaction_model")
     kind = _INTERACTION if early else interaction.text("type")
-    if kind != _INTERACTION:
-        findings.report(interaction.problem(f"interaction_model {kind}: expected RefractiveReflectiveModel"))
+    grating, thin_lens = grating_of(geometry), None
+    if kind == PHASE_MODEL and geometry.text("type") == "Plane":
+        grating = phase_grating(interaction.child("phase_profile"))
+    elif kind == THIN_LENS_MODEL and geometry.text("type") == "Plane" and not interaction.flag("is_reflective"):
+        thin_lens = ThinLens(interaction.number("focal_length") * MM)
+    elif kind not in (_INTERACTION, MODEL):
+        findings.report(interaction.problem(f"interaction_model {kind}: expected {_INTERACTION} or {MODEL}"))
     if "bsdf" in interaction:
         findings.report(interaction.problem("interaction_model.bsdf: scattering is not read"))
     mirror, stop = interaction.flag("is_reflective"), surface.flag("is_stop")
@@ -156,6 +165,8 @@ def _surface(surface: JsonObject, lens: LensDescription, stop_radius: float, gla
         aperture=_aperture(surface.child("aperture"), findings) if "aperture" in surface else None,
         semi_diameter=stop_radius if stop else 0.0,
         stop=stop,
+        grating=grating,
+        thin_lens=thin_lens,
     )
     lens.add(placed, mirror=mirror)
     surface.report_rest(findings, ("type", "thickness", "surface_type", "material_post", "material_pre"))

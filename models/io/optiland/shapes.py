@@ -10,7 +10,10 @@ PolynomialGeometry           + coefficients [i][j] of x^i y^j
 ChebyshevPolynomialGeometry  + coefficients [i][j] of T_i(x / norm_x) T_j(y / norm_y)
 ZernikePolynomialGeometry    + Zernike terms of (x, y) / norm_radius, in the order of zernike_type
 BiconicGeometry              sum of a conic in x and one in y, as in optiland up to 0.6
-ToroidalGeometry             a conic in y, revolved about an axis at radius_x
+ToroidalGeometry             a conic in y with coefficients of y^2, y^4..., revolved about an axis at radius_x
+ForbesQNormalSlopeGeometry   + Forbes's Qbfs terms of (r / norm_radius)^2
+PlaneGrating                 a plane with grooves (`gratings`)
+StandardGratingGeometry      the conic with grooves
 ============================ =========================================================================================
 """
 
@@ -25,6 +28,7 @@ import numpy as np
 from ....core.errors import PrescriptionError
 from ...shapes.freeform import Biconic, OddAsphere, Toroid
 from ...shapes.polynomial import XYPolynomial, ZernikeSag
+from ...shapes.qbfs import QbfsAsphere
 from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere
 from ...shapes.sum import Sum
 from ...zernike_polynomials import noll_to_nm
@@ -32,6 +36,7 @@ from ..json_items import JsonObject
 from ..lens import shapes
 from ..lens.shapes import MOST_ODD, polynomial_powers, square_term
 from ..lens.source import Findings
+from .gratings import GRATINGS, GROOVES
 
 MM = 1e-3
 #: Highest degree of polynomials.
@@ -46,7 +51,7 @@ def shape_of(geometry: JsonObject, findings: Findings) -> tuple[float, Shape]:
         return 0.0, Plane()
     with geometry.part(f"geometry {kind}").context():
         shape = _KINDS[kind](geometry)
-    geometry.report_rest(findings, ("cs", "tol", "max_iter", "geometry_type"))
+    geometry.report_rest(findings, ("cs", "tol", "max_iter", "geometry_type", *(GROOVES if kind in GRATINGS else ())))
     return shape if isinstance(shape, tuple) else (0.0, shape)
 
 
@@ -164,15 +169,32 @@ def _biconic(geometry: JsonObject) -> Shape:
 
 def _toroid(geometry: JsonObject) -> Shape:
     radius_x, radius_y = (geometry.number(f"radius_{a}", math.inf, infinite=True) or math.inf for a in "xy")
-    if any(geometry.numbers("coeffs_poly_y")):
-        geometry.refuse("coeffs_poly_y", "zeros")
+    powers = [a * MM ** (1 - 2 * i) for i, a in enumerate(geometry.numbers("coeffs_poly_y"), start=1)]
     geometry.used |= {"radius", "conic"}
-    return shapes.toroid(radius_x * MM, 1.0 / radius_y / MM, geometry.number("conic_yz", 0.0))
+    return shapes.toroid(radius_x * MM, 1.0 / radius_y / MM, geometry.number("conic_yz", 0.0), powers)
+
+
+def _qbfs(geometry: JsonObject) -> Shape:
+    config = geometry.child("surface_config")
+    curvature, constant = _base(config)
+    terms = config.child("terms") if "terms" in config else JsonObject({}, config.source, config.place)
+    orders = {key: int(key) for key in terms.content if key.isdecimal() and int(key) <= MOST_DEGREE}
+    if set(orders) != set(terms.content):
+        config.refuse("terms", f"orders from 0 to {MOST_DEGREE}")
+    coefficients = [0.0] * (1 + max(orders.values(), default=-1))
+    for key, order in orders.items():
+        coefficients[order] = terms.number(key) * MM
+    geometry.used |= {"solver_config"}
+    if not any(coefficients):
+        return shapes.conic(curvature, constant)
+    radius = _positive(config, "norm_radius") * MM
+    return QbfsAsphere(shapes.radius_of(curvature), constant, radius, shapes.trimmed(coefficients))
 
 
 _KINDS: dict[str, Callable[[JsonObject], Shape | tuple[float, Shape]]] = {
     "Plane": _conic,
     "StandardGeometry": _conic,
+    **dict.fromkeys(GRATINGS, _conic),
     "EvenAsphere": _even,
     "OddAsphere": _odd,
     "PolynomialGeometry": _polynomial,
@@ -180,6 +202,8 @@ _KINDS: dict[str, Callable[[JsonObject], Shape | tuple[float, Shape]]] = {
     "ZernikePolynomialGeometry": _zernike,
     "BiconicGeometry": _biconic,
     "ToroidalGeometry": _toroid,
+    "ForbesQNormalSlopeGeometry": _qbfs,
+    "ForbesQbfsGeometry": _qbfs,
 }
 
 
@@ -248,6 +272,9 @@ def _alone(shape: Shape, unit: float) -> dict[str, Any]:
         return {"type": kind, **head, "coefficients": [0.0, *terms] if even else terms}
     if isinstance(shape, Toroid):
         radii = {"radius_x": shape.radius_x / unit, "radius_y": shape.radius_y / unit}
-        meridian_items = {"geometry_type": "Toroidal", "conic_yz": shape.conic_y, "coeffs_poly_y": []}
+        powers = [a * unit ** (2 * i - 1) for i, a in enumerate(shape.coefficients, start=1)]
+        meridian_items = {"geometry_type": "Toroidal", "conic_yz": shape.conic_y, "coeffs_poly_y": powers}
         return {"type": "ToroidalGeometry", **radii, **meridian_items}
+    if isinstance(shape, QbfsAsphere):
+        raise PrescriptionError("Qbfs terms: optiland does not open files with them, its own included")
     raise PrescriptionError(f"shape {type(shape).__name__}: optiland has no geometry of this shape")

@@ -25,8 +25,9 @@ from ..lens.sequence import lens_surfaces, stated_wavelengths
 from ..lens.source import Findings
 from ..lens.text import scaled
 from ..writable import report_pupil_plane, report_unheld, require_sequential, with_formulas
+from .gratings import MODEL, grating_items
 from .media import material_items
-from .reader import APERTURES, FIELD_TYPES
+from .reader import APERTURES, FIELD_TYPES, THIN_LENS_MODEL
 from .shapes import geometry_items
 
 MM = 1e-3
@@ -95,22 +96,30 @@ def _in_millimetres(system: dict[str, Any]) -> None:
 
 def _surface_items(surface: LensSurface, first: float) -> dict[str, Any]:
     x, y, z = map(float, surface.position)
-    region = surface.aperture
+    region, grating = surface.aperture, surface.grating
+    geometry = geometry_items(surface.shape, MM) if grating is None else grating_items(grating, surface.shape, MM)
     return {
         "type": "Surface",
         "thickness": 0.0,
-        "geometry": {**geometry_items(surface.shape, MM), "cs": _system(z - first, x, y, surface.axes)},
+        "geometry": {**geometry, "cs": _system(z - first, x, y, surface.axes)},
         "material_post": material_items(surface.after),
         "is_stop": surface.stop,
         "aperture": None if region is None else _aperture_items(region),
         "comment": surface.name,
         "interaction_model": {
-            "type": "RefractiveReflectiveModel",
+            **_model(surface),
             "is_reflective": surface.interaction == Interaction.MIRROR,
             "coating": None,
             "bsdf": None,
         },
     }
+
+
+def _model(surface: LensSurface) -> dict[str, Any]:
+    """Return the type of interaction of light with a surface, and the focal length of a thin lens."""
+    if surface.thin_lens is not None:
+        return {"type": THIN_LENS_MODEL, "focal_length": surface.thin_lens.focal_length / MM}
+    return {"type": "RefractiveReflectiveModel" if surface.grating is None else MODEL}
 
 
 def _aperture_items(aperture: Aperture) -> dict[str, Any]:

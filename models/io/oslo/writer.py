@@ -132,6 +132,8 @@ def _medium_lines(sequence: LensSequence, place: LensSurface | Medium, names: Ma
 
 def _surface_lines(sequence: LensSequence, surface: LensSurface, number: int) -> Iterator[str]:
     unit = sequence.unit
+    if surface.grating is not None:
+        raise PrescriptionError(f"grating: {FILE} is written without them")
     profile = Profile.of(surface.shape, unit)
     yield f'NOT "{quoted(surface.name, _FORBIDDEN)}"'
     yield f"RD {number_text(profile.radius)}"

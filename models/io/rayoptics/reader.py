@@ -22,6 +22,7 @@ from ..lens.description import INFINITE, Format, LensDescription, LensSurface
 from ..lens.glasses import Glasses
 from ..lens.source import Findings
 from ..lens.text import scaled
+from .gratings import grating_of
 from .items import attributes, class_name, named, numbers
 from .media import medium_of
 from .shapes import shape_of
@@ -98,13 +99,13 @@ class _Reader:
         if kind != "Surface" or mode not in INTERACTIONS:
             text = f"{kind}, interact_mode {mode}: expected a Surface with one of {', '.join(INTERACTIONS)}"
             self.findings.report(surface.problem(text), "taken as its profile")
-        if "phase_element" in items:
-            self.findings.report(surface.problem("phase_element: diffractive surfaces are not read"))
         profile = self._profile(items, surface)
         with profile.part(f"profile {class_name(profile)}").context():
             shape = shape_of(profile, lens.unit, self.findings)
         radius = items.number("max_aperture", 0.0)
-        mirror = mode == "reflect"
+        mirror, grating = mode == "reflect", None
+        if "phase_element" in items:
+            grating = grating_of(items.child("phase_element"), shape, self.findings, mirror=mirror)
         inside = not mirror and number < len(self.gaps)
         placed = LensSurface(
             self.sequence.at("stop_surface") if stop else surface.part(""),
@@ -116,6 +117,7 @@ class _Reader:
             aperture=self._aperture(items, surface),
             semi_diameter=radius * lens.unit if radius < INFINITE else 0.0,
             stop=stop,
+            grating=grating,
         )
         lens.add(placed, mirror=mirror)
 

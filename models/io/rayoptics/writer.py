@@ -20,6 +20,7 @@ from ..lens.description import LensSurface
 from ..lens.sequence import LensSequence
 from ..lens.text import scaled
 from ..profile import Profile
+from .gratings import grating_items
 from .items import array, instance
 from .media import Media
 from .reader import FIELDS, MMHG
@@ -84,6 +85,10 @@ def _sequence_items(sequence: LensSequence) -> dict[str, Any]:
         written_surface = _surface_items(surface.name, mode, str(number), (surface.semi_diameter or radius) / unit)
         written_surface["attributes"]["clear_apertures"] = _aperture_items(sequence, surface)
         written_surface["attributes"]["decenter"] = _decenter_items(surface, unit)
+        if surface.grating is not None:
+            with error_context(subject=f"surface {surface.name}"):
+                element = grating_items(surface.grating, surface.shape, mode)
+            written_surface["attributes"]["phase_element"] = element
         items.append(written_surface)
         if surface.interaction != Interaction.DETECTOR:
             gaps.append(_gap(sequence.thickness(surface), media.items(surface.after)))

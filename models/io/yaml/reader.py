@@ -13,11 +13,13 @@ from ....core.errors import PachonError, PrescriptionError, error_context
 from ....core.schema import Section, Tagged, expected, one_of, validated
 from ....core.yaml_reader import read_mapping
 from ...coating import AnyCoating
+from ...grating import Grating
 from ...media.medium import Medium
 from ...obstruction import Obstruction
 from ...rotation import rotation_matrix
 from ...surface import IDENTITY, Interaction, Matrix, Surface
 from ...telescope import VACUUM, Telescope
+from ...thin_lens import ThinLens
 from ..writable import require_met
 from .apertures import ApertureKeys, ObstructionSection
 from .coatings import CoatingSection
@@ -26,6 +28,7 @@ from .media import AnyMedium
 from .shapes import SURFACE_SHAPES, ShapeSection
 from .values import (
     ROWS,
+    Angle,
     Band,
     FileUnits,
     Length,
@@ -39,9 +42,11 @@ from .values import (
     OptionalText,
     PositiveAngle,
     PositiveLength,
+    PositiveNumber,
     Rotation,
     Text,
     Wavelength,
+    WholeNumber,
     names,
 )
 
@@ -51,14 +56,49 @@ INTERACTIONS = {
     "detector": Interaction.DETECTOR,
     "baffle": Interaction.PASS,
     "phase": Interaction.PHASE,
+    "thin_lens": Interaction.THIN_LENS,
 }
+
+
+class GratingSection(Section):
+    """Grooves of a surface and the order of the light behind it."""
+
+    order: WholeNumber
+    lines_per_mm: PositiveNumber
+    groove_angle: Angle = 0.0
+
+    @classmethod
+    def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
+        for key, text in (("order", "a whole number"), ("lines_per_mm", "a positive number")):
+            if key not in content:
+                raise expected(text, key)
+
+    def grating(self) -> Grating:
+        """Return the grating."""
+        return Grating(self.order, self.lines_per_mm, self.groove_angle)
+
+
+class ThinLensSection(Section):
+    """Ideal thin lens."""
+
+    focal_length: Length
+    object_distance: Length = math.inf
+
+    @classmethod
+    def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
+        if "focal_length" not in content:
+            raise expected("a number", "focal_length")
+
+    def lens(self) -> ThinLens:
+        """Return the lens."""
+        return ThinLens(self.focal_length, self.object_distance)
 
 
 class SurfaceKeys(ApertureKeys):
     """Keys of a surface beside those of its shape."""
 
     name: Text
-    type: Literal["mirror", "refract", "detector", "baffle", "phase"]
+    type: Literal["mirror", "refract", "detector", "baffle", "phase", "thin_lens"]
     x: Length = 0.0
     y: Length = 0.0
     z: Length
@@ -67,6 +107,8 @@ class SurfaceKeys(ApertureKeys):
     medium: OptionalText = None
     semi_diameter: OptionalLength = None
     coating: OptionalText = None
+    grating: GratingSection | None = None
+    thin_lens: ThinLensSection | None = None
 
     @classmethod
     def keys(cls) -> list[str]:
@@ -100,6 +142,8 @@ class SurfaceKeys(ApertureKeys):
             aperture=self.clear_aperture(),
             rotation=self.rotation if self.tilt is None else _matrix(rotation_matrix(self.tilt)),
             semi_diameter=self.semi_diameter,
+            grating=None if self.grating is None else self.grating.grating(),
+            thin_lens=None if self.thin_lens is None else self.thin_lens.lens(),
         ).coated(None if self.coating is None else coating_sections[self.coating])
 
 

@@ -11,7 +11,8 @@ mappings under ``shape``, each written the same way. Parameters are lengths in t
 ``even_asphere``  ``radius``, ``conic``, ``coefficients`` of r^4, r^6, r^8...; a radius may be ``flat``
 ``odd_asphere``   ``radius``, ``conic``, ``coefficients`` of r^1, r^2, r^3...; a radius may be ``flat``
 ``biconic``       ``radius_x``, ``radius_y``, ``conic_x``, ``conic_y``; a radius may be ``flat``
-``toroid``        ``radius_x`` (from the axis of revolution), ``radius_y``, ``conic_y``; a radius may be ``flat``
+``toroid``        ``radius_x``, ``radius_y``, ``conic_y``, ``coefficients`` of y^2, y^4...; a radius may be ``flat``
+``qbfs``          ``radius``, ``conic``, ``norm_radius``, ``coefficients`` of Forbes's Q_0, Q_1...; a ``flat`` radius
 ``xy_polynomial`` ``terms``: a list of [power of x, power of y, coefficient]
 ``zernike``       ``coefficients`` (Noll order from j = 1), ``outer_radius``, ``inner_radius``
 ``grid``          ``file``, a FITS image, or ``nodes_x``, ``nodes_y`` and ``values``, a row of x for each y
@@ -36,6 +37,7 @@ from ...shapes.freeform import Biconic, OddAsphere, Toroid
 from ...shapes.grid import GridSag
 from ...shapes.mesh import MeshSurface
 from ...shapes.polynomial import XYPolynomial, ZernikeSag
+from ...shapes.qbfs import QbfsAsphere
 from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere
 from ...shapes.sum import Sum
 from ..grid_file import read_grid
@@ -50,6 +52,7 @@ from .values import (
     Metres,
     Number,
     OptionalFile,
+    PositiveLength,
     PositiveNumber,
     Radius,
     decoded,
@@ -163,7 +166,16 @@ SHAPES: dict[str, type[ShapeSection]] = {
         OddAsphere, radius=Radius, conic=(Number, 0.0), coefficients=_coefficients(range(1, 1000))
     ),
     "biconic": ShapeSection.of(Biconic, radius_x=Radius, radius_y=Radius, conic_x=(Number, 0.0), conic_y=(Number, 0.0)),
-    "toroid": ShapeSection.of(Toroid, radius_x=Radius, radius_y=Radius, conic_y=(Number, 0.0)),
+    "toroid": ShapeSection.of(
+        Toroid,
+        radius_x=Radius,
+        radius_y=Radius,
+        conic_y=(Number, 0.0),
+        coefficients=(_coefficients(range(2, 1000, 2)), ()),
+    ),
+    "qbfs": ShapeSection.of(
+        QbfsAsphere, radius=Radius, conic=(Number, 0.0), norm_radius=PositiveLength, coefficients=Lengths
+    ),
     "xy_polynomial": ShapeSection.of(XYPolynomial, terms=_TERMS),
     "zernike": ShapeSection.of(ZernikeSag, coefficients=Lengths, outer_radius=Length, inner_radius=(Length, 0.0)),
     "grid": GridSection,

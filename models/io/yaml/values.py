@@ -116,6 +116,11 @@ def _positive(value: Any) -> float | None:
     return number if number is not None and number > 0 else None
 
 
+def _whole(value: Any) -> int | None:
+    number = as_number(value)
+    return int(number) if number is not None and number == int(number) else None
+
+
 def names(value: Any) -> tuple[str, ...] | None:
     """Return a list of names that is not empty as a tuple, and None for other values."""
     named = isinstance(value, list) and value and all(isinstance(v, str) for v in value)
@@ -190,6 +195,7 @@ Flag = Annotated[bool, checked(lambda v: v if isinstance(v, bool) else None, "tr
 Number = Annotated[float, _NUMBER]
 OptionalNumber = Annotated[float | None, _NUMBER]
 PositiveNumber = Annotated[float, _POSITIVE]
+WholeNumber = Annotated[int, checked(_whole, "a whole number")]
 Numbers = Annotated[tuple[float, ...], LIST]
 Rotation = Annotated[Matrix, checked(_matrix, "three rows of three numbers")]
 Length = Annotated[float, _LENGTH, _NUMBER, _METRES]

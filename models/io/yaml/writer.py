@@ -12,9 +12,11 @@ from typing import Any
 from ....core.errors import PachonError
 from ....core.yaml_reader import loaded
 from ...coating import AnyCoating
+from ...grating import Grating
 from ...media.medium import Medium
 from ...surface import IDENTITY, Surface
 from ...telescope import VACUUM, Telescope
+from ...thin_lens import ThinLens
 from ..writable import require_met
 from .apertures import aperture_items, obstruction_items
 from .coatings import coating_items, coating_names
@@ -131,7 +133,22 @@ def _surface_items(surface: Surface, names: dict[Medium, str], coated: dict[AnyC
     items |= shape | aperture_items(surface.aperture)
     items |= {} if surface.semi_diameter is None else {"semi_diameter": Metres(surface.semi_diameter)}
     items |= {} if surface.coating is None else {"coating": coated[surface.coating]}
-    return items | ({"medium": Bare(names[surface.medium_after])} if kind == "refract" else {})
+    items |= {} if surface.grating is None else {"grating": _grating_items(surface.grating)}
+    items |= {} if surface.thin_lens is None else {"thin_lens": _thin_lens_items(surface.thin_lens)}
+    named = kind == "refract" or (kind == "thin_lens" and surface.medium_after != VACUUM)
+    return items | ({"medium": Bare(names[surface.medium_after])} if named else {})
+
+
+def _grating_items(grating: Grating) -> dict[str, Any]:
+    items: dict[str, Any] = {"order": Bare(grating.order), "lines_per_mm": grating.lines_per_mm}
+    return items | ({"groove_angle": Turn(grating.groove_angle)} if grating.groove_angle else {})
+
+
+def _thin_lens_items(lens: ThinLens) -> dict[str, Any]:
+    distant = math.isinf(lens.object_distance)
+    return {"focal_length": Metres(lens.focal_length)} | (
+        {} if distant else {"object_distance": Metres(lens.object_distance)}
+    )
 
 
 def _aligned(rows: list[dict[str, str]]) -> list[str]:

@@ -24,7 +24,7 @@ from .apertures import read_aperture
 from .configurations import with_configuration
 from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, ZemaxFile, read_zemax_file
 from .links import state_links
-from .shapes import read_shape
+from .shapes import read_grating, read_shape, read_thin_lens
 from .system import FORMAT, object_distance, read_system
 
 #: Name of a glass without a name.
@@ -162,7 +162,10 @@ class _LensReader:
         with source.context():
             shape = read_shape(block, lens.unit, self.findings)
             aperture = read_aperture(block, lens.unit, self.findings)
+            grating, thin_lens = read_grating(block), read_thin_lens(block, lens.unit)
         mirror, medium = self._glass(block)
+        if thin_lens is not None and mirror:
+            raise block.problem("TYPE PARAXIAL, GLAS MIRROR: a thin lens that reflects is not read")
         surface = LensSurface(
             source,
             shape,
@@ -176,6 +179,8 @@ class _LensReader:
             stop=self.stop_ahead,
             distance=self.distance,
             number=number,
+            grating=grating,
+            thin_lens=thin_lens,
         )
         lens.add(surface, mirror=mirror)
         self._pass_axial_ray()

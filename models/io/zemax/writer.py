@@ -30,6 +30,7 @@ from ..lens.source import Findings
 from ..lens.text import number_text, scaled
 from ..writable import report_pupil_plane, report_unheld, require_met, require_sequential, with_formulas
 from .apertures import aperture_lines
+from .gratings import grating_lines, with_grooves_along_x
 from .links import add_link_lines
 from .shapes import shape_lines
 from .system import design_lines, stop_lines
@@ -75,7 +76,7 @@ def telescope_to_zemax(telescope: Telescope, *, lenient: bool = False) -> tuple[
     distance = (t.object_distance - first) / unit
     blocks[0].append(f"DISZ {number_text(distance)}" if math.isfinite(distance) else "DISZ INFINITY")
     with error_context(subject=t.name):
-        surfaces = lens_surfaces(t, data.stop if own_stop else None)
+        surfaces = tuple(map(with_grooves_along_x, lens_surfaces(t, data.stop if own_stop else None)))
     if not own_stop:
         # The plane of the stop, in front of all; z counts along the light, from the origin.
         blocks.append(
@@ -186,7 +187,11 @@ def _break_lines(values: list[float], order: int) -> list[str]:
 def _surface_lines(surface: LensSurface, glasses: dict[Medium, str], unit: float) -> list[str]:
     lines = [f"COMM {surface.name}"]
     with error_context(subject=f"surface {surface.name}"):
-        lines += shape_lines(surface.shape, unit)
+        if surface.thin_lens is not None:
+            focal_length = number_text(surface.thin_lens.focal_length / unit)
+            lines += ["TYPE PARAXIAL", "CURV 0.0", f"PARM 1 {focal_length}", "PARM 2 1"]
+        else:
+            lines += shape_lines(surface.shape, unit) if surface.grating is None else grating_lines(surface, unit)
         if surface.interaction == Interaction.MIRROR:
             lines.append("GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0")
         elif surface.interaction != Interaction.DETECTOR:

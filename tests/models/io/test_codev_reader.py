@@ -146,7 +146,7 @@ def test_surfaces_may_be_named_by_number(tmp_path):
     [
         ("DIM   M", "DIM   K", "line 5: DIM K: expected one of M, MM, C, CM, I, IN"),
         ("EPD   8", "EPX   8", "line 4: EPX .*this command is not understood"),
-        ("  STO", "  DIF GRT", "surface 5: DIF GRT: diffractive surfaces are not read"),
+        ("  STO", "  DIF DOE", "surface 5: DIF DOE: diffractive surfaces are not read"),
         ("  STO", "  STO\n  ADE x", "surface 5: ADE x: expected a number in place of 'x'"),
         ("  STO", "  STO\n  THI S77 3", "THI S77 3: expected a surface from 0"),
         ("RDM;LEN", "LEN", "curvature 12.4398: a sphere smaller than the entrance pupil of 8.33333; expected RDM"),

@@ -1,4 +1,4 @@
-"""Q-type aspheres of Zemax files: Qcon terms as an even asphere, against Jacobi polynomials; Qbfs are refused."""
+"""Q-type aspheres of Zemax files: Qcon terms as an even asphere, against Jacobi polynomials; Qbfs terms."""
 
 from pathlib import Path
 
@@ -8,6 +8,7 @@ from scipy.special import eval_jacobi
 
 import pachon
 from pachon.core.errors import PrescriptionError, PrescriptionWarning
+from pachon.models.shapes.qbfs import QbfsAsphere
 from pachon.models.shapes.shape import Conic, EvenAsphere
 
 LENS = (Path(__file__).parents[2] / "data" / "lenses" / "doublet.zmx").read_text()
@@ -51,13 +52,20 @@ def test_no_terms_are_a_conic(tmp_path):
     assert (shape.radius, shape.conic) == (pytest.approx(-61.47e-3, rel=1e-14), CONIC)
 
 
-def test_what_is_refused(tmp_path):
-    with pytest.raises(
-        PrescriptionError, match=r"surface 1: XDAT 1 0: Q-type asphere of Forbes's Qbfs terms; expected Qcon"
-    ):
+def test_qbfs_terms_are_those_of_forbes(tmp_path):
+    """On a sphere; beside a conic constant they are refused by name."""
+    with pytest.raises(PrescriptionError, match=r"surface 1: CONI -0.4: expected 0 beside Qbfs terms"):
         loaded(tmp_path, [1e-3], kind=0)
-    with pytest.warns(PrescriptionWarning, match="Qbfs terms; expected Qcon .1.; taken as its conic"):
-        assert isinstance(loaded(tmp_path, [1e-3], kind=0, lenient=True).surfaces[0].shape, Conic)
+    with pytest.warns(PrescriptionWarning, match=r"CONI -0.4: expected 0 beside Qbfs terms; taken as the conic under"):
+        shape = loaded(tmp_path, [1e-3, 0.0], kind=0, lenient=True).surfaces[0].shape
+    assert isinstance(shape, QbfsAsphere)
+    assert (shape.radius, shape.norm_radius) == (pytest.approx(-61.47e-3), pytest.approx(1e-3 * RADIUS))
+    assert (shape.conic, shape.coefficients) == (CONIC, (-1e-6,))
+
+
+def test_what_is_refused(tmp_path):
+    with pytest.raises(PrescriptionError, match=r"XDAT 1 2 .*expected 0 .Qbfs. or 1 .Qcon. as XDAT 1"):
+        loaded(tmp_path, [1e-3], kind=2)
     with pytest.raises(PrescriptionError, match="expected up to 10 Qcon terms as XDAT 2, not 11"):
         loaded(tmp_path, [1e-3] * 11)
     with pytest.raises(PrescriptionError, match="expected a positive normalisation radius as XDAT 3"):

@@ -12,6 +12,7 @@ from pachon.models.shapes.freeform import Biconic, OddAsphere, Toroid
 from pachon.models.shapes.grid import GridSag
 from pachon.models.shapes.mesh import MeshSurface
 from pachon.models.shapes.polynomial import XYPolynomial, ZernikeSag
+from pachon.models.shapes.qbfs import QbfsAsphere
 from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sphere
 from pachon.models.shapes.sum import Sum
 from pachon.models.surface import Interaction
@@ -26,6 +27,9 @@ SHAPES = [
     OddAsphere(4.0, -1.0, (0.0, 0.1)),
     Biconic(1.0, np.inf, -1.0),
     Toroid(1.0, -2.0, 0.5),
+    Toroid(1.0, -2.0, 0.5, (1e-3, 0.0, 2e-5)),
+    QbfsAsphere(3.0, -1.0, 0.9, (1e-5, -2e-6)),
+    QbfsAsphere(np.inf, 0.0, 0.9, (1e-5,)),
     XYPolynomial(((0, 0, 1e-8), (2, 1, 3.0))),
     ZernikeSag((0.0, 0.0, 0.0, 1e-7), 0.8, 0.3),
     GRID,

@@ -17,6 +17,7 @@ from pachon.models.io.glass_catalogue import GlassCatalogue
 from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.shapes.freeform import Biconic, OddAsphere, Toroid
 from pachon.models.shapes.grid import GridSag
+from pachon.models.shapes.qbfs import QbfsAsphere
 from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sphere
 from pachon.models.shapes.sum import Sum
 from pachon.models.surface import IDENTITY, Interaction
@@ -123,6 +124,11 @@ def conic_sag(c, k, r2):
     return c * r2 / (1 + np.sqrt(1 - (1 + k) * c**2 * r2))
 
 
+def turned(g, radius):
+    """A point g of the curve in y on its circle about an axis: radius - sqrt((radius - g)^2 - x^2)."""
+    return g + X**2 / (radius - g + np.sqrt((radius - g) ** 2 - X**2))
+
+
 SHAPES = {
     "standard": (["TYPE STANDARD", "CURV -0.01", "CONI -1.5"], conic_sag(-0.01, -1.5, R2), Conic),
     "flat": (["TYPE STANDARD", "CURV 0.0"], 0 * X, Plane),
@@ -157,6 +163,11 @@ SHAPES = {
         200 - np.sqrt((200 - conic_sag(0.01, -0.3, Y**2)) ** 2 - X**2),
         Toroid,
     ),
+    "toroid with powers": (
+        ["TYPE TOROIDAL", "CURV 0.01", "PARM 1 200", "PARM 2 1e-3", "PARM 4 2e-7", "XDAT 1 0"],
+        turned(conic_sag(0.01, 0, Y**2) + 1e-3 * Y**2 + 2e-7 * Y**6, 200),
+        Toroid,
+    ),
     "cylinder": (["TYPE TOROIDAL", "CURV 0.01", "PARM 1 0"], conic_sag(0.01, 0, Y**2), Toroid),
     "Zernike sag": (
         # Z2 = 2 x, Z3 = 2 y, Z4 = sqrt 3 (2 r^2 - 1), Z7 = sqrt 8 (3 r^2 - 2) y, Z10 = sqrt 8 (x^3 - 3 x y^2).
@@ -180,6 +191,36 @@ SHAPES = {
         + 0.04 * np.sqrt(8) * (3 * R2 / 400 - 2) * Y / 20
         + 0.05 * np.sqrt(8) * (X**3 - 3 * X * Y**2) / 20**3,
         Sum,
+    ),
+    "Fringe Zernike sag": (
+        # Z2 = x, Z4 = 2 r^2 - 1, Z5 = x^2 - y^2, Z8 = (3 r^2 - 2) y, Z9 = 6 r^4 - 6 r^2 + 1.
+        [
+            "TYPE FZERNSAG",
+            "CURV 0.01",
+            "CONI 0.2",
+            "PARM 2 1e-6",
+            "XDAT 1 9 0 0 1 0 0",
+            "XDAT 2 20",
+            "XDAT 4 0.01",
+            "XDAT 6 0.02",
+            "XDAT 7 0.03",
+            "XDAT 10 0.04",
+            "XDAT 11 0.05",
+        ],
+        conic_sag(0.01, 0.2, R2)
+        + 1e-6 * R2**2
+        + 0.01 * X / 20
+        + 0.02 * (2 * R2 / 400 - 1)
+        + 0.03 * (X**2 - Y**2) / 400
+        + 0.04 * (3 * R2 / 400 - 2) * Y / 20
+        + 0.05 * (6 * R2**2 / 400**2 - 6 * R2 / 400 + 1),
+        Sum,
+    ),
+    "Qbfs": (
+        ["TYPE QED_TYPE", "CURV 0.01", "XDAT 1 0", "XDAT 2 2", "XDAT 3 12", "XDAT 4 0.02", "XDAT 5 -0.01"],
+        conic_sag(0.01, 0, R2)
+        + R2 / 144 * (1 - R2 / 144) / np.sqrt(1 - 1e-4 * R2) * (0.02 - 0.01 * (13 - 16 * R2 / 144) / np.sqrt(19)),
+        QbfsAsphere,
     ),
     "extended asphere": (
         ["TYPE XASPHERE", "CURV 0.01", "CONI 0.5", "XDAT 1 3", "XDAT 2 10", "XDAT 4 0.01", "XDAT 5 0.02"],

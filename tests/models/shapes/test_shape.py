@@ -7,6 +7,7 @@ from pachon.core.errors import PrescriptionError, UnknownNameError
 from pachon.models.shapes.freeform import Biconic, OddAsphere, Toroid
 from pachon.models.shapes.grid import GridSag
 from pachon.models.shapes.polynomial import XYPolynomial, ZernikeSag
+from pachon.models.shapes.qbfs import QbfsAsphere
 from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sphere
 from pachon.models.shapes.sum import Sum
 from pachon.models.zernike_polynomials import annular_zernikes
@@ -27,6 +28,11 @@ SHAPES = {
     "biconic cylinder": Biconic(4.0, np.inf),
     "toroid": Toroid(4.0, 6.0, -0.7),
     "toroid cylinder": Toroid(np.inf, 5.0),
+    "toroid with powers": Toroid(4.0, -6.0, -0.7, (2e-3, -1e-3, 3e-4)),
+    "powers alone": Toroid(np.inf, np.inf, 0.0, (2e-2, -1e-3)),
+    "qbfs": QbfsAsphere(5.0, 0.0, 1.6, (1e-2, -4e-3, 2e-3, 1e-3, -5e-4)),
+    "qbfs on a conic": QbfsAsphere(-5.0, 0.4, 1.6, (1e-2, -4e-3, 2e-3)),
+    "flat qbfs": QbfsAsphere(np.inf, 0.0, 1.5, (1e-2, -4e-3)),
     "xy polynomial": XYPolynomial(((1, 0, 1e-3), (2, 1, 3e-3), (0, 5, -1e-3), (3, 3, 2e-3))),
     "zernikes": ZernikeSag(tuple(1e-3 * RNG.normal(size=28)), 1.0, 0.4),
     "grid": GRID,
@@ -53,6 +59,38 @@ def test_cylinders_are_flat_along_their_axis():
     for shape in (Toroid(3.0, np.inf), Biconic(3.0, np.inf)):
         assert np.allclose(shape.sag(X, Y), profile, rtol=0, atol=1e-15)
     assert np.allclose(Toroid(np.inf, 3.0).sag(Y, X), profile, rtol=0, atol=1e-15)
+
+
+def test_toroids_with_powers_revolve_their_curve():
+    toroid = Toroid(4.0, 1.5, -0.3, (0.02, -0.01))
+    curve = Conic(1.5, -0.3).sag(0.0, Y) + 0.02 * Y**2 - 0.01 * Y**4
+    assert np.allclose(np.hypot(4.0 - toroid.sag(X, Y), X), 4.0 - curve, rtol=0, atol=1e-14)
+
+
+def test_the_first_qbfs_terms_are_those_of_forbes():
+    """Forbes (2007), equations 2.11; the departure is along the normal of a sphere."""
+    a = np.array([3e-3, -2e-3, 1e-3, 4e-4])
+    v = (X**2 + Y**2) / 2.5**2
+    q = [
+        np.ones_like(v),
+        (13 - 16 * v) / np.sqrt(19),
+        np.sqrt(2 / 95) * (29 - 4 * v * (25 - 19 * v)),
+        np.sqrt(2 / 2545) * (207 - 4 * v * (315 - v * (577 - 320 * v))),
+    ]
+    expected = Sphere(3.0).sag(X, Y) + v * (1 - v) * (a @ np.array(q).reshape(4, -1)).reshape(v.shape) / np.sqrt(
+        1 - (X**2 + Y**2) / 9.0
+    )
+    found = QbfsAsphere(3.0, 0.0, 2.5, tuple(a)).sag(X, Y)
+    assert np.allclose(found, expected, rtol=0, atol=1e-16)
+
+
+def test_qbfs_terms_have_orthogonal_slopes():
+    """Their slopes are orthonormal with the weight 1 / sqrt(1 - u^2) over the aperture, however many."""
+    # Gauss-Chebyshev nodes.
+    u = np.cos(np.pi * (np.arange(200) + 0.5) / 400)
+    flat = [QbfsAsphere(np.inf, 0.0, 1.0, (0.0,) * m + (1.0,)).gradient(u, 0.0 * u)[0] for m in range(24)]
+    products = np.mean(np.array(flat)[:, None] * np.array(flat)[None], axis=-1)
+    assert np.allclose(products, products[0, 0] * np.eye(24), rtol=0, atol=1e-12)
 
 
 def test_polynomials_are_their_terms():

@@ -142,7 +142,7 @@ def test_indices(forward, responses, rays, slope, k, monkeypatch, center, crooke
     """The index behind surface k, changed in the kernel's own table: of the next one it is the index in front."""
     from pachon.raytrace import trace as module
 
-    plain = module.refractive_indices
+    plain = module.indices_and_wavelength
 
     def outputs(h):
         def changed(telescope, wavelength):
@@ -150,11 +150,11 @@ def test_indices(forward, responses, rays, slope, k, monkeypatch, center, crooke
             index[k + 1] += h
             return index
 
-        monkeypatch.setattr(module, "refractive_indices", changed)
+        monkeypatch.setattr(module, "indices_and_wavelength", changed)
         end = pachon.trace(crooked, rays)
-        monkeypatch.setattr(module, "refractive_indices", plain)
+        monkeypatch.setattr(module, "indices_and_wavelength", plain)
         landing = crooked.surfaces[-1].to_local(end.position)[:, :2].T
-        last = changed(crooked, WAVELENGTH)[-2]
+        last = changed(crooked, WAVELENGTH)[-3]
         return np.stack([*landing, path_to_sphere(end.path_length, last, end.position, end.direction, center, RADIUS)])
 
     found = both(responses, k, "index")[:, 1] + both(responses, k + 1, "index")[:, 0]
@@ -280,7 +280,7 @@ def test_one_kernel_equals_forward_and_backward_pass(crooked, annulus_points, fo
     centers, zeros = np.stack([forward.position[:, 5], center], axis=1), np.array([3.0, 17.0])
     pupil = np.stack(annulus_points(45, seed=4), axis=1)
     one_go = SphereAdjoint(
-        stopped, directions, forward.indices, pupil, centers, zeros, RADIUS, rows, first, lit_only=lit_only
+        stopped, directions, forward.packets.light, pupil, centers, zeros, RADIUS, rows, first, lit_only=lit_only
     )
     one = [one_go.matrix(slice(0, 2), threads=n) for n in (1, 2, 5)]
     for response, status in one[1:]:
