@@ -40,9 +40,10 @@ _PARALLEL = 1e-9
 _SINGULAR = 1e-12
 #: Steps in which the chief ray is aimed at the middle of the stop, and the relative distance at which it is there.
 _AIMING_STEPS = 20
-_AIMED = 1e-12
+_AIMED = 1e-14
 #: A mirror whose axis is within this cosine of perpendicular to a ray may be crossed twice on one sheet.
 _PERPENDICULAR = 0.1
+_ACTING = (Interaction.MIRROR, Interaction.REFRACT, Interaction.THIN_LENS)
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ def parabasal_optics(telescope: Telescope, wavelength: ArrayLike | None = None) 
     """
     w = length(telescope.default_wavelength if wavelength is None else wavelength, "wavelength")
     telescope.check_wavelength(w)
-    acting = [i for i, s in enumerate(telescope.surfaces) if s.interaction in (Interaction.MIRROR, Interaction.REFRACT)]
+    acting = [i for i, s in enumerate(telescope.surfaces) if s.interaction in _ACTING]
     if not acting:
         raise DomainError(f"telescope {telescope.name}: expected at least one mirror or lens surface")
     rays = _traced(telescope, w, _chief_start(telescope, w))
@@ -188,26 +189,54 @@ def _distances(height: np.ndarray, turn: np.ndarray, axes: np.ndarray) -> np.nda
     return np.where(parallel, math.inf, -1.0 / np.where(parallel, 1.0, ordered)) + 0.0
 
 
+def stop_center_point(telescope: Telescope, wavelength: float) -> np.ndarray:
+    """Return where the ray along the axis through the middle of the stop crosses z = ``stop_z`` [m], shape [2].
+
+    Of an object at a finite distance it comes from its point on the axis. DomainError where the design data name no
+    stop, or no such ray reaches it.
+    """
+    stop = telescope.design_data.stop
+    if stop is None:
+        raise DomainError(f"{telescope.name}: expected a surface that is the stop (design data: stop)")
+    count = telescope.surface_names.index(stop) + 1
+    point = np.array(telescope.pupil_center, dtype=np.float64)
+    for _ in range(_AIMING_STEPS):
+        ray = _traced(telescope, wavelength, _axis_ray(telescope, point), count)[-1]
+        at_stop = ray.within(telescope.surfaces[count - 1])
+        missed = at_stop.place[:2]
+        if np.linalg.norm(missed) <= _AIMED * telescope.pupil_diameter:
+            return point
+        by_point = at_stop.moved[:2, :2]
+        if not np.linalg.det(by_point):
+            break
+        point = point - np.linalg.solve(by_point, missed)
+    raise DomainError(f"{telescope.name}: no ray on the axis passes the middle of the stop {stop!r}")
+
+
+def _axis_ray(telescope: Telescope, point: np.ndarray) -> _Ray:
+    """Return the ray of the object on the axis through a point [2] at z = ``stop_z``, with neighbours beside it."""
+    place, direction, turned = np.array([*point, telescope.stop_z]), np.array([0.0, 0.0, -1.0]), np.zeros((3, 2))
+    sides = np.eye(3)[:, :2]
+    if math.isfinite(telescope.object_distance):
+        away = place - [0.0, 0.0, telescope.object_distance]
+        distance = -math.copysign(float(np.linalg.norm(away)), away[2])
+        direction = away / distance
+        turned = (sides - np.outer(direction, direction @ sides)) / distance
+    return _Ray(place, direction, sides, turned)
+
+
 def _chief_start(telescope: Telescope, wavelength: float) -> _Ray:
     """Return the chief ray of the axis at the entrance pupil, with neighbours.
 
     They are parallel to it, displaced along x and y, and of other directions along x and y through the same point.
     """
+    data, point = telescope.design_data, np.array(telescope.pupil_center, dtype=np.float64)
+    if data.aiming != "off" and data.stop is not None and not data.telecentric:
+        point = stop_center_point(telescope, wavelength)
     sides = np.eye(3)[:, :2]
-    moved, turned = np.hstack([sides, np.zeros((3, 2))]), np.hstack([np.zeros((3, 2)), sides])
-    start = _Ray(np.array([0.0, 0.0, telescope.stop_z]), np.array([0.0, 0.0, -1.0]), moved, turned)
-    data = telescope.design_data
-    if data.aiming == "off" or data.stop is None or data.telecentric:
-        return start
-    stop = telescope.surface_names.index(data.stop)
-    for _ in range(_AIMING_STEPS):
-        at_stop = _traced(telescope, wavelength, start, count=stop + 1)[-1].within(telescope.surfaces[stop])
-        missed = at_stop.place[:2]
-        if np.linalg.norm(missed) <= _AIMED * telescope.pupil_diameter:
-            break
-        step = np.linalg.lstsq(at_stop.moved[:2, :2], -missed, rcond=None)[0]
-        start = _Ray(start.place + sides @ step, start.direction, moved, turned)
-    return start
+    none = np.zeros((3, 2))
+    place = np.array([*point, telescope.stop_z])
+    return _Ray(place, np.array([0.0, 0.0, -1.0]), np.hstack([sides, none]), np.hstack([none, sides]))
 
 
 def _traced(telescope: Telescope, wavelength: float, start: _Ray, count: int | None = None) -> list[_Ray]:
@@ -219,10 +248,10 @@ def _traced(telescope: Telescope, wavelength: float, start: _Ray, count: int | N
         index_after = float(surface.medium_after.index(wavelength))
         local = ray.within(surface)
         local = _landed(surface, local, telescope, row)
-        if surface.interaction == Interaction.MIRROR:
-            local = _deflected(surface, local, None, telescope.name)
-        elif surface.interaction == Interaction.REFRACT:
-            local = _deflected(surface, local, index / index_after, telescope.name)
+        if surface.interaction in (Interaction.MIRROR, Interaction.REFRACT):
+            local = _deflected(surface, local, index, index_after, wavelength, telescope.name)
+        elif surface.thin_lens is not None:
+            local = _through_thin_lens(surface.thin_lens.focal_length, local, index, index_after)
         elif surface.interaction not in (Interaction.DETECTOR, Interaction.PASS, Interaction.PHASE):
             raise DomainError(f"surface {surface.name} of {telescope.name}: expected a mirror or lens surface")
         ray, index = local.out_of(surface), index_after
@@ -304,24 +333,42 @@ def _normal(surface: Surface, point: np.ndarray) -> np.ndarray:
     return np.array([-float(slope_x), -float(slope_y), 1.0])
 
 
-def _deflected(surface: Surface, ray: _Ray, mu: float | None, name: str) -> _Ray:
-    """Return a ray behind a surface, refracted with the ratio `mu` of indices, or reflected without one."""
+def _deflected(surface: Surface, ray: _Ray, index: float, index_after: float, wavelength: float, name: str) -> _Ray:
+    """Return a ray behind a mirror or lens surface, which may be a grating."""
     normal = _normal(surface, ray.place)
     xx, xy, yy = (float(v) for v in surface.meeting_shape.hessian(ray.place[0], ray.place[1]))
     normal_change = -np.vstack([np.array([[xx, xy], [xy, yy]]) @ ray.moved[:2], np.zeros(ray.moved.shape[1])])
-    along, square = float(ray.direction @ normal), float(normal @ normal)
-    along_change = normal @ ray.turned + ray.direction @ normal_change
-    square_change = 2.0 * normal @ normal_change
-    if mu is None:
-        mu, root, root_change = 1.0, -along, -along_change
-    else:
-        inside = (1.0 - mu * mu) * square + (mu * along) ** 2
-        if inside <= 0.0:
-            raise DomainError(f"the chief ray of {name} is totally reflected at surface {surface.name}")
-        root = math.copysign(math.sqrt(inside), along)
-        root_change = ((1.0 - mu * mu) * square_change + 2.0 * mu * mu * along * along_change) / (2.0 * root)
-    g = (root - mu * along) / square
-    g_change = (root_change - mu * along_change) / square - g * square_change / square
-    direction = mu * ray.direction + g * normal
-    turned = mu * ray.turned + np.outer(normal, g_change) + g * normal_change
+    square, square_change = float(normal @ normal), 2.0 * normal @ normal_change
+    mirror = surface.interaction == Interaction.MIRROR
+    mu = 1.0 if mirror else index / index_after
+    # Grooves add to the part of the direction along the surface; what is along the normal keeps it a unit vector.
+    added = np.zeros(3)
+    if surface.grating is not None:
+        added[:2] = np.multiply(surface.grating.path_gradient, wavelength / index_after)
+    incoming, incoming_change = mu * ray.direction + added, mu * ray.turned
+    along, along_change = float(incoming @ normal), normal @ incoming_change + incoming @ normal_change
+    spare, spare_change = 1.0 - float(incoming @ incoming), -2.0 * incoming @ incoming_change
+    inside = spare * square + along**2
+    if inside <= 0.0:
+        loss = "is totally reflected at" if surface.grating is None else "has no such order of the grating"
+        raise DomainError(f"the chief ray of {name} {loss} surface {surface.name}")
+    root = math.copysign(math.sqrt(inside), (-1.0 if mirror else 1.0) * float(ray.direction @ normal))
+    root_change = (spare_change * square + spare * square_change + 2.0 * along * along_change) / (2.0 * root)
+    g = (root - along) / square
+    g_change = (root_change - along_change) / square - g * square_change / square
+    turned = incoming_change + np.outer(normal, g_change) + g * normal_change
+    return _Ray(ray.place, incoming + g * normal, ray.moved, turned)
+
+
+def _through_thin_lens(focal_length: float, ray: _Ray, index: float, index_after: float) -> _Ray:
+    """Return a ray behind an ideal thin lens, ``n' t' = n t - P / focal_length`` of its slopes t."""
+    sense, depth = math.copysign(1.0, ray.direction[2]), abs(ray.direction[2])
+    slopes = ray.direction[:2] / depth
+    slopes_change = (ray.turned[:2] - np.outer(slopes, sense * ray.turned[2])) / depth
+    slopes = (index * slopes - ray.place[:2] / focal_length) / index_after
+    slopes_change = (index * slopes_change - ray.moved[:2] / focal_length) / index_after
+    length = math.sqrt(1.0 + float(slopes @ slopes))
+    direction = np.array([*slopes, sense]) / length
+    change = np.vstack([slopes_change, np.zeros(slopes_change.shape[1])])
+    turned = change / length - np.outer(direction, slopes @ slopes_change) / length**2
     return _Ray(ray.place, direction, ray.moved, turned)

@@ -17,8 +17,8 @@ import numpy as np
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
-from .axis_ray import stop_center_point
 from .media.medium import Medium
+from .parabasal import stop_center_point
 from .surface import Interaction, Surface
 from .telescope import Telescope
 
@@ -334,7 +334,9 @@ def following_pupil(changed: Telescope, unchanged: Telescope) -> Telescope:
             ]
             moved = replace(changed, stop_z=changed.stop_z + planes[0].stop_z - planes[1].stop_z)
     with suppress(DomainError):
-        shift = stop_center_point(moved) - stop_center_point(unchanged)
+        shift = stop_center_point(moved, moved.default_wavelength) - stop_center_point(
+            unchanged, unchanged.default_wavelength
+        )
         if shift.any():
             x, y = (float(v) for v in unchanged.pupil_center + shift)
             moved = replace(moved, pupil_center=(x, y))
