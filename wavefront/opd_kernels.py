@@ -13,7 +13,8 @@ from ..raytrace.kernels.packet import LANES, RayPackets, lane_flags, lanes
 from ..raytrace.kernels.pupil import direction_from_point, plane_wave_start
 from ..raytrace.kernels.sphere import sphere_distance
 from ..raytrace.kernels.surface import OK, ZERO
-from ..raytrace.kernels.trace import LOOPS, PackedSurfaces
+from ..raytrace.kernels.surface_table import PackedSurfaces
+from ..raytrace.kernels.trace import LOOPS
 
 wp.set_module_options(FORWARD_OPTIONS)
 

@@ -30,8 +30,7 @@ from ..kernels.kernel_pair import kernel_pair
 from ..kernels.packet import LANES, RayPackets, components, lanes, lanes_sqrt
 from ..kernels.shape_derivatives import added_derivatives
 from ..kernels.surface import ONE, TWO, ZERO
-from ..kernels.thin_lens import thin_lens_adjoint
-from ..kernels.trace import (
+from ..kernels.surface_table import (
     DEFORMED,
     GROOVES,
     INTERACTION,
@@ -48,6 +47,7 @@ from ..kernels.trace import (
     to_local,
     to_telescope,
 )
+from ..kernels.thin_lens import thin_lens_adjoint
 from .column_kernels import (
     GROOVE,
     INDEX,

@@ -7,7 +7,7 @@ import warp as wp
 from ...core.launch import FORWARD_OPTIONS
 from ..kernels.packet import lanes, lanes_sqrt
 from ..kernels.surface import ONE, TWO, ZERO
-from ..kernels.trace import CONIC, CURVATURE, TERMS, PackedSurfaces
+from ..kernels.surface_table import CONIC, CURVATURE, TERMS, PackedSurfaces
 
 wp.set_module_options(FORWARD_OPTIONS)
 

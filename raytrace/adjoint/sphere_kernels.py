@@ -13,7 +13,8 @@ from ..kernels.packet import LANES, RayPackets, lane_flags, lanes
 from ..kernels.pupil import direction_from_point, plane_wave_start
 from ..kernels.sphere import sphere_distance
 from ..kernels.surface import OK, ONE, ZERO
-from ..kernels.trace import LOOPS, PackedSurfaces, statuses
+from ..kernels.surface_table import PackedSurfaces
+from ..kernels.trace import LOOPS, statuses
 from .backward_kernels import BACKWARD_LOOPS
 from .column_kernels import INDEX, polynomial_columns
 

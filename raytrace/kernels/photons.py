@@ -8,7 +8,8 @@ from ...core.launch import FORWARD_OPTIONS
 from .kernel_pair import kernel_pair
 from .packet import RayPackets, lane_flags, lanes, lanes_sqrt
 from .surface import ONE
-from .trace import CHROMATIC_LOOPS, VERTEX, PackedSurfaces, statuses, to_local
+from .surface_table import VERTEX, PackedSurfaces, to_local
+from .trace import CHROMATIC_LOOPS, statuses
 
 wp.set_module_options(FORWARD_OPTIONS)
 

@@ -13,7 +13,8 @@ from .kernel_pair import kernel_pair
 from .packet import RayPackets, lane_flags, lanes, lanes_sqrt
 from .sphere import sphere_distance
 from .surface import ONE, ZERO
-from .trace import LOOPS, PackedSurfaces, statuses
+from .surface_table import PackedSurfaces
+from .trace import LOOPS, statuses
 
 wp.set_module_options(FORWARD_OPTIONS)
 

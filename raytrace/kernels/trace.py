@@ -11,12 +11,13 @@ from typing import Any
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
-from .aperture import PackedApertures, through_aperture
+from .aperture import through_aperture
+from .crossings import reaches_twice, start_by_aperture
 from .kernel_pair import kernel_pair
-from .mesh import PackedMeshes, mesh_distance
-from .obstruction import PackedObstructions, obstructed_status
+from .mesh import mesh_distance
+from .obstruction import obstructed_status
 from .packet import LANES, RayPackets, components, lane_flags, lanes
-from .shape import NAN, PackedDeformations, deformed_distance, through_screen
+from .shape import NAN, deformed_distance, through_screen
 from .surface import (
     EVANESCENT,
     FAR,
@@ -33,99 +34,40 @@ from .surface import (
     polynomial,
     reflected,
     refracted,
-    second_conic_distance,
+)
+from .surface_table import (
+    APERTURE,
+    CHOSEN,
+    CONIC,
+    CURVATURE,
+    DEFORMED,
+    DIFFRACT,
+    FIRST_CURVATURE,
+    GROOVES,
+    INTERACTION,
+    MEDIUM_AFTER,
+    MEDIUM_BEFORE,
+    MIRROR,
+    OBSTRUCTED,
+    PHASE,
+    POWER,
+    REFRACT,
+    ROTATED,
+    RULED,
+    SIGN_CHANGE,
+    STOPPED,
+    TERMS,
+    THIN_LENS,
+    TWO_CROSSINGS,
+    VERGENCE,
+    VERTEX,
+    PackedSurfaces,
+    to_local,
+    to_telescope,
 )
 from .thin_lens import through_thin_lens
 
 wp.set_module_options(FORWARD_OPTIONS)
-
-MIRROR = wp.constant(0)
-REFRACT = wp.constant(1)
-PHASE = wp.constant(4)
-THIN_LENS = wp.constant(5)
-#: What grooves do in place of reflection or refraction.
-DIFFRACT = wp.constant(-1)
-
-
-# Columns of the table of numbers, a row per surface: curvature [1/m], conic constant, vertex [m] (3), rotation (9,
-# row by row), clear aperture: centre x, y, inner and outer radius [m] (0 of one that is neither disc nor ring, but an
-# outer radius of FAR where it is unbounded); the curvature of the conic that the search for a landing starts from,
-# another one where the surface has no conic of its own; the direction cosine w, 0 or close to it, at which rays change
-# from one intersection with that conic to the other; the path that the grooves of a grating add along x and y, for each
-# metre of wavelength [1/m]; the power of a thin lens, and one over the distance of the object for which paths through
-# it are equal [1/m]; the largest direction cosine, of either sign, at which both intersections may lie on the sheet
-# within the rim.
-CURVATURE = wp.constant(0)
-CONIC = wp.constant(1)
-VERTEX = wp.constant(2)
-ROTATION = wp.constant(5)
-APERTURE = wp.constant(14)
-FIRST_CURVATURE = wp.constant(18)
-SIGN_CHANGE = wp.constant(19)
-GROOVES = wp.constant(20)
-POWER = wp.constant(22)
-VERGENCE = wp.constant(23)
-TWO_CROSSINGS = wp.constant(24)
-NUMBERS = 25
-# Columns of the table of kinds: interaction, number of aspheric coefficients, whether rotated, whether stopped down
-# (0 no, 1 by a disc or ring, 2 by another aperture), whether obstructions lie on the way to it, whether its shape has
-# parts besides the conic and its even powers (1) or is a mesh (2), which of the distinct media lies before and after,
-# whether grooves are ruled on it, whether its aperture says which of two crossings is meant (1), and of a conic at
-# grazing incidence (2).
-INTERACTION = wp.constant(0)
-TERMS = wp.constant(1)
-ROTATED = wp.constant(2)
-STOPPED = wp.constant(3)
-OBSTRUCTED = wp.constant(4)
-DEFORMED = wp.constant(5)
-MEDIUM_BEFORE = wp.constant(6)
-MEDIUM_AFTER = wp.constant(7)
-RULED = wp.constant(8)
-CHOSEN = wp.constant(9)
-KINDS = 10
-
-#: A ray meets a crossing farther ahead than this [m]: above the rounding of places, below any thickness.
-AHEAD = wp.constant(wp.float64(1.0e-9))
-
-
-@wp.struct
-class PackedSurfaces:
-    """A telescope as tables, a row per surface; see :mod:`pachon.raytrace.pack.surfaces`.
-
-    ``special`` is 1 where the loop over its surfaces needs more than the plain one has, 2 where apertures choose
-    between crossings.
-    """
-
-    special: wp.int32
-    numbers: wp.array2d(dtype=wp.float64)
-    kinds: wp.array2d(dtype=wp.int32)
-    coefficients: wp.array2d(dtype=wp.float64)
-    deformations: PackedDeformations
-    meshes: PackedMeshes
-    apertures: PackedApertures
-    obstructions: PackedObstructions
-
-
-@wp.func
-def to_local(surfaces: PackedSurfaces, s: wp.int32, x: lanes, y: lanes, z: lanes):
-    """Components along the axes of surface ``s``, the columns of its rotation, of vectors of the telescope frame."""
-    table = surfaces.numbers
-    return (
-        table[s, ROTATION] * x + table[s, ROTATION + 3] * y + table[s, ROTATION + 6] * z,
-        table[s, ROTATION + 1] * x + table[s, ROTATION + 4] * y + table[s, ROTATION + 7] * z,
-        table[s, ROTATION + 2] * x + table[s, ROTATION + 5] * y + table[s, ROTATION + 8] * z,
-    )
-
-
-@wp.func
-def to_telescope(surfaces: PackedSurfaces, s: wp.int32, x: lanes, y: lanes, z: lanes):
-    """Components in the telescope frame of vectors along the axes of surface ``s``."""
-    table = surfaces.numbers
-    return (
-        table[s, ROTATION] * x + table[s, ROTATION + 1] * y + table[s, ROTATION + 2] * z,
-        table[s, ROTATION + 3] * x + table[s, ROTATION + 4] * y + table[s, ROTATION + 5] * z,
-        table[s, ROTATION + 6] * x + table[s, ROTATION + 7] * y + table[s, ROTATION + 8] * z,
-    )
 
 
 @wp.func
@@ -155,108 +97,6 @@ def statuses(status: lanes):
     for i in range(LANES):
         out[i] = wp.int32(status[i])
     return out
-
-
-@wp.func
-def reaches_twice(w: lanes, limit: wp.float64):
-    """Whether the direction cosine of a lane is within a limit."""
-    count = wp.int32(0)
-    for i in range(LANES):
-        count += wp.where(wp.abs(w[i]) <= limit, 1, 0)
-    return count > 0
-
-
-@wp.func
-def landing(
-    surfaces: PackedSurfaces,
-    s: wp.int32,
-    x: lanes,
-    y: lanes,
-    z: lanes,
-    u: lanes,
-    v: lanes,
-    w: lanes,
-    start: lanes,
-):
-    """Distance to surface ``s`` by the search from ``start``, and the rank of the crossing there.
-
-    The rank is 2 within the aperture, 1 in the hole of a ring, 0 beside it, and -1 where the conic has its other sheet,
-    or no crossing is.
-    """
-    c = surfaces.numbers[s, CURVATURE]
-    k = surfaces.numbers[s, CONIC]
-    terms = surfaces.kinds[s, TERMS]
-    t = start
-    sag = lanes(ZERO)
-    if surfaces.kinds[s, DEFORMED] == 1:
-        t, sag, _sag_x, _sag_y, _running = deformed_distance(
-            surfaces.deformations, c, k, surfaces.coefficients, s, terms, x, y, z, u, v, w, start, 0
-        )
-    elif terms > 0:
-        t, _running = aspheric_distance(c, k, surfaces.coefficients, s, terms, x, y, z, u, v, w, start)
-    px = x + wp.cw_mul(t, u)
-    py = y + wp.cw_mul(t, v)
-    b = z + wp.cw_mul(t, w) - sag
-    if terms > 0:
-        even, _slope = polynomial(surfaces.coefficients, s, terms, wp.cw_mul(px, px) + wp.cw_mul(py, py))
-        b = b - even
-    ax = px - lanes(surfaces.numbers[s, APERTURE])
-    ay = py - lanes(surfaces.numbers[s, APERTURE + 1])
-    a2 = wp.cw_mul(ax, ax) + wp.cw_mul(ay, ay)
-    inner = surfaces.numbers[s, APERTURE + 2]
-    outer = surfaces.numbers[s, APERTURE + 3]
-    status = lanes(OK)
-    if surfaces.kinds[s, STOPPED] == 2:
-        status = through_aperture(surfaces.apertures, s, px, py, status)
-    rank = lanes(ZERO)
-    for i in range(LANES):
-        within = wp.where(a2[i] < outer * outer, ONE, ZERO)
-        rank[i] = within + wp.where(a2[i] >= inner * inner, within, ZERO)
-        if surfaces.kinds[s, STOPPED] == 2:
-            rank[i] = wp.where(status[i] == OK, wp.float64(2.0), ZERO)
-        # A NaN fails the comparison.
-        rank[i] = wp.where(ONE - (ONE + k) * c * b[i] > ZERO, rank[i], -ONE)
-    return t, rank
-
-
-@wp.func
-def start_by_aperture(
-    surfaces: PackedSurfaces,
-    s: wp.int32,
-    x: lanes,
-    y: lanes,
-    z: lanes,
-    u: lanes,
-    v: lanes,
-    w: lanes,
-    start: lanes,
-):
-    """Distance to that crossing of the first conic which the aperture of surface ``s`` means; NaN where none is on it.
-
-    Of two crossings within a rim, one of them behind the ray, it is the one ahead, and about the axis without regard to
-    the rim: a ray that leaves through the opening of a reflector does not come back. Else it is that of the higher
-    rank; else ``start``, the one by the sign of w.
-    """
-    first_curvature = surfaces.numbers[s, FIRST_CURVATURE]
-    second_start = second_conic_distance(
-        first_curvature, surfaces.numbers[s, CONIC], surfaces.numbers[s, SIGN_CHANGE], x, y, z, u, v, w
-    )
-    distance, rank = landing(surfaces, s, x, y, z, u, v, w, start)
-    second_distance, second_rank = landing(surfaces, s, x, y, z, u, v, w, second_start)
-    centred = surfaces.kinds[s, STOPPED] == 1
-    if surfaces.numbers[s, APERTURE] != ZERO or surfaces.numbers[s, APERTURE + 1] != ZERO:
-        centred = False
-    least = wp.where(centred, ZERO, ONE)
-    t = lanes()
-    for i in range(LANES):
-        better = wp.where(second_rank[i] > rank[i], ONE, ZERO)
-        ahead = wp.where(distance[i] > AHEAD, ONE, ZERO)
-        second_ahead = wp.where(second_distance[i] > AHEAD, ONE, ZERO)
-        alike = wp.min(rank[i], second_rank[i]) >= least and surfaces.numbers[s, APERTURE + 3] < FAR
-        better = wp.where(alike and ahead != second_ahead, second_ahead, better)
-        t[i] = wp.where(better > ZERO, second_start[i], start[i])
-        t[i] = wp.where(wp.max(rank[i], second_rank[i]) < ZERO, NAN, t[i])
-    return t
 
 
 def surface_loop(special: int, chromatic: bool = False) -> wp.Function:

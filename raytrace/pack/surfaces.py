@@ -20,7 +20,7 @@ from ...models.shapes.shape import Rotational
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
 from ..kernels.surface import FAR
-from ..kernels.trace import (
+from ..kernels.surface_table import (
     CHOSEN,
     DEFORMED,
     INTERACTION,

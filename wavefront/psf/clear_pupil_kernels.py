@@ -5,7 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
-from ...raytrace.kernels.trace import APERTURE, ROTATION, STOPPED, VERTEX, PackedSurfaces
+from ...raytrace.kernels.surface_table import APERTURE, ROTATION, STOPPED, VERTEX, PackedSurfaces
 
 wp.set_module_options(FORWARD_OPTIONS)
 

@@ -231,8 +231,9 @@ def test_configurations_share_variables_and_have_their_own(zoom):
 
 def test_restarts_keep_the_best_and_depend_on_the_seed_alone(doublet):
     how = dict(merit="spots", fields=[[0.0, 0.0]], targets=[pachon.FocalLength(0.1)], n_pupil=2)
-    alone = optimize(doublet, ACHROMAT, solver=pachon.LeastSquares(max_steps=4), **how)
-    solver = pachon.LeastSquares(max_steps=4, restarts=2, seed=3, spread=0.5)
+    # Goals held beyond their weights are those of the best end, after the restarts: left to the weights.
+    alone = optimize(doublet, ACHROMAT, solver=pachon.LeastSquares(max_steps=4, constraint_tolerance=np.inf), **how)
+    solver = pachon.LeastSquares(max_steps=4, restarts=2, seed=3, spread=0.5, constraint_tolerance=np.inf)
     found, again = (optimize(doublet, ACHROMAT, solver=solver, **how) for _ in range(2))
     assert np.array_equal(found.changes, again.changes)
     assert found.history[-1] <= alone.history[-1]

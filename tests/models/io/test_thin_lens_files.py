@@ -99,7 +99,7 @@ def test_refused_in_one_line(tmp_path):
     pachon.save_telescope(telescope, path)
     text = path.read_text()
     for old, new, message in (
-        ("focal_length: 0.08", "focal_length: 0.0", "focal_length"),
+        ("focal_length: 80.0", "focal_length: 0.0", "focal_length"),
         ("thin_lens: {", "lens: {", "lens"),
     ):
         assert old in text
