@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import pachon
-from pachon.models.paraxial import following_pupil
 from pachon.core.errors import PachonError
+from pachon.models.paraxial import following_pupil
 from pachon.studies.metrics.telescope import TELESCOPE_METRICS, TelescopeScene
 from pachon.studies.sweep.file import read_sweep
 from pachon.studies.sweep.sweep import run_sweep
