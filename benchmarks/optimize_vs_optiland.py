@@ -59,7 +59,7 @@ def ours(telescope, variables, focal_length):
         variables,
         "spots",
         wavelengths=telescope.default_wavelength,
-        targets=[pachon.Target(paraxial_focal_length, 1e-3 * focal_length)],
+        targets=[pachon.FocalLength(1e-3 * focal_length)],
         n_pupil=RINGS,
         solver=pachon.LeastSquares(tolerance=TOLERANCE, max_steps=STEPS),
         threads=1,

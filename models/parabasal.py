@@ -43,6 +43,8 @@ _AIMING_STEPS = 20
 _AIMED = 1e-14
 #: A mirror whose axis is within this cosine of perpendicular to a ray may be crossed twice on one sheet.
 _PERPENDICULAR = 0.1
+#: Distance [m] and slope of the chief ray from the axis of a thin lens that rounding leaves.
+_CENTRED = 1e-9
 _ACTING = (Interaction.MIRROR, Interaction.REFRACT, Interaction.THIN_LENS)
 
 
@@ -251,6 +253,9 @@ def _traced(telescope: Telescope, wavelength: float, start: _Ray, count: int | N
         if surface.interaction in (Interaction.MIRROR, Interaction.REFRACT):
             local = _deflected(surface, local, index, index_after, wavelength, telescope.name)
         elif surface.thin_lens is not None:
+            # Off its axis the rays behind an ideal lens are no more those of a wavefront: no planes, no foci.
+            if np.abs([local.place[:2], local.direction[:2]]).max() > _CENTRED:
+                raise DomainError(f"thin lens {surface.name} of {telescope.name}: expected one about the chief ray")
             local = _through_thin_lens(surface.thin_lens.focal_length, local, index, index_after)
         elif surface.interaction not in (Interaction.DETECTOR, Interaction.PASS, Interaction.PHASE):
             raise DomainError(f"surface {surface.name} of {telescope.name}: expected a mirror or lens surface")
@@ -361,14 +366,8 @@ def _deflected(surface: Surface, ray: _Ray, index: float, index_after: float, wa
 
 
 def _through_thin_lens(focal_length: float, ray: _Ray, index: float, index_after: float) -> _Ray:
-    """Return a ray behind an ideal thin lens, ``n' t' = n t - P / focal_length`` of its slopes t."""
-    sense, depth = math.copysign(1.0, ray.direction[2]), abs(ray.direction[2])
-    slopes = ray.direction[:2] / depth
-    slopes_change = (ray.turned[:2] - np.outer(slopes, sense * ray.turned[2])) / depth
-    slopes = (index * slopes - ray.place[:2] / focal_length) / index_after
-    slopes_change = (index * slopes_change - ray.moved[:2] / focal_length) / index_after
-    length = math.sqrt(1.0 + float(slopes @ slopes))
-    direction = np.array([*slopes, sense]) / length
-    change = np.vstack([slopes_change, np.zeros(slopes_change.shape[1])])
-    turned = change / length - np.outer(direction, slopes @ slopes_change) / length**2
-    return _Ray(ray.place, direction, ray.moved, turned)
+    """Return the ray along the axis of an ideal thin lens behind it, ``n' t' = n t - P / focal_length`` of slopes t."""
+    turned = index * ray.turned
+    turned[:2] -= ray.moved[:2] / focal_length
+    turned /= index_after
+    return _Ray(ray.place, ray.direction, ray.moved, turned)

@@ -10,12 +10,15 @@ from test_first_order import SYSTEMS, telescope_of
 import pachon
 from pachon.core.errors import DomainError
 from pachon.models.first_order import first_order
+from pachon.models.grating import Grating
 from pachon.models.parabasal import parabasal_optics
 from pachon.models.shapes.freeform import Biconic, Toroid
 from pachon.models.shapes.polynomial import XYPolynomial
 from pachon.models.shapes.shape import Conic, Plane, Sphere
 from pachon.models.shapes.sum import Sum
-from pachon.models.surface import Interaction
+from pachon.models.surface import Interaction, Surface
+from pachon.models.telescope import VACUUM
+from pachon.models.thin_lens import ThinLens
 from pachon.pipeline.report.info import describe, figure_rows
 from pachon.raytrace.rays import Rays
 
@@ -105,8 +108,38 @@ def neighbours(telescope, step):
     return chief, change
 
 
-def test_real_rays_near_the_chief_ray():
+def ruled():
+    """The same with grooves on a mirror and on a side of the plate."""
     telescope = off_axis()
+    first, second, front, back = telescope.surfaces
+    grooves = Grating(-1, 40.0, 0.3), Grating(2, 30.0, -0.4)
+    surfaces = replace(first, grating=grooves[0]), second, replace(front, grating=grooves[1]), back
+    return replace(telescope, surfaces=surfaces)
+
+
+def test_a_thin_lens_behind_a_tilted_mirror():
+    """Two powers and their distance: 1/f = 1/f1 + 1/f2 - d / (f1 f2), f1 those of Coddington."""
+    mirror = turned_about_x(telescope_of([(0.0, 4.0, 0.0, None)], stop_z=0.5, diameter=0.1), "s0", 0.25 * np.pi)
+    normal = mirror.surfaces[0].matrix[:, 2]
+    light = np.array([0.0, 0.0, -1.0]) + 2.0 * normal[2] * normal  # behind the mirror
+    axes = np.column_stack([[1.0, 0.0, 0.0], np.cross(light, [1.0, 0.0, 0.0]), light])
+    rotation = tuple(tuple(row) for row in axes.tolist())
+    for side in (0.0, 0.01):
+        place = tuple((0.3 * light + [side, 0.0, 0.0]).tolist())
+        lens = Surface("lens", Interaction.THIN_LENS, Plane(), place, VACUUM, None, rotation, thin_lens=ThinLens(0.4))
+        telescope = replace(mirror, surfaces=(*mirror.surfaces, lens))
+        if side:
+            with pytest.raises(DomainError, match="thin lens lens of test: expected one about the chief ray"):
+                parabasal_optics(telescope)
+        else:
+            first = 2.0 * np.array([np.sqrt(0.5), np.sqrt(2.0)])
+            expected = 1.0 / (1.0 / first + 1.0 / 0.4 - 0.3 / (first * 0.4))
+            assert parabasal_optics(telescope).focal_length == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("make", [off_axis, ruled])
+def test_real_rays_near_the_chief_ray(make):
+    telescope = make()
     optics = parabasal_optics(telescope)
     _, change = neighbours(telescope, 1e-5)
     # Errors of the differences: squares of 1e-5, and rounding of 1e-16 over it.
@@ -164,3 +197,6 @@ def test_what_has_no_chief_ray_is_an_error():
     glass = glass.with_shape("s1", Sphere(9.0))
     with pytest.raises(DomainError, match="totally reflected at surface s1"):
         parabasal_optics(turned_about_x(glass, "s1", 0.9))
+    mirror = replace(telescope.surfaces[0], grating=Grating(1, 3000.0))
+    with pytest.raises(DomainError, match="has no such order of the grating surface s0"):
+        parabasal_optics(replace(telescope, surfaces=(mirror,)))
