@@ -91,6 +91,7 @@ def describe(telescope: Telescope) -> dict[str, Any]:
         "pupil_obscuration": telescope.pupil_obscuration,
         "effective_area_m2": 0.25 * math.pi * telescope.pupil_diameter**2 * (1.0 - telescope.pupil_obscuration**2),
         "entrance_pupil_z_m": telescope.stop_z,
+        "entrance_pupil_center_m": list(telescope.pupil_center),
         "field_radius_deg": math.degrees(telescope.field_radius),
         "field_limit_deg": math.degrees(telescope.field_limit),
         "object_distance_m": telescope.object_distance if math.isfinite(telescope.object_distance) else None,
@@ -248,11 +249,12 @@ def figure_rows(description: dict[str, Any]) -> list[tuple[str, str]]:
             ("plate scale", f'{d["plate_scale_arcsec_per_um"]:.6f}"/µm'),
         ]
         image = [pupil, ("paraxial focus", f"z = {length(d['focus_z_m'])}")]
-    far = d["object_distance_m"]
+    far, center = d["object_distance_m"], d["entrance_pupil_center_m"]
+    aside = "".join(f"{axis} = {length(v)}, " for axis, v in zip("xy", center, strict=True)) if any(center) else ""
     return [
         *lens,
         ("object", "at infinity" if far is None else f"z = {length(far)}"),
-        ("entrance pupil", f"{length(d['pupil_diameter_m'])} at z = {length(d['entrance_pupil_z_m'])}"),
+        ("entrance pupil", f"{length(d['pupil_diameter_m'])} at {aside}z = {length(d['entrance_pupil_z_m'])}"),
         ("central obscuration", f"{d['pupil_obscuration']:g} of the diameter"),
         ("collecting area", f"{d['effective_area_m2'] / unit**2:.6g} {name}²"),
         *image,

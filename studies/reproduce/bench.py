@@ -63,9 +63,9 @@ class Scale:
     rings: int
 
 
-#: The middle CCD of each raft, and its right-hand neighbour in the middle row: pairs from within a CCD to 3 degrees.
-_SOME_CCDS = tuple(f"R{row}{column}_S11" for row in range(5) for column in range(5) if {row, column} - {0, 4}) + tuple(
-    f"R2{column}_S12" for column in range(5)
+#: The middle CCD of each raft, and a neighbour of it in the rafts R20 to R24: pairs from within a CCD to 3 degrees.
+_SOME_CCDS = tuple(f"R{a}{b}_S11" for a in range(5) for b in range(5) if {a, b} - {0, 4}) + tuple(
+    f"R2{b}_S12" for b in range(5)
 )
 
 SMALL = Scale(
