@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 from astropy.units import Quantity
@@ -105,7 +105,7 @@ def fit_own_stars(
         If stamps are too small, fewer than five stars are left, or the model cannot be made.
     """
     extent, colour = options.get("extent"), options.get("colour")
-    model_options = {key: value for key, value in options.items() if key not in ("extent", "colour")}
+    model_options: dict[str, Any] = {key: value for key, value in options.items() if key not in ("extent", "colour")}
     raw_images, places = real_array(stamps, "stamps: expected real numbers [n, ny, nx]"), as_positions(positions)
     if raw_images.ndim != 3 or len(raw_images) != len(places):
         raise DomainError(
@@ -153,7 +153,7 @@ def fit_own_stars(
             places[chosen],
             extent=span,
             colour=colours_of(chosen),
-            **{"gain": gain, **model_options},
+            **({"gain": gain} | model_options),
         )
 
     def colours_of(chosen: np.ndarray) -> np.ndarray | None:

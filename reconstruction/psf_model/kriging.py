@@ -230,8 +230,8 @@ def star_noise(
                 f"gain = {gain:g}: the middle star has {np.median(electrons):.3g} electrons; expected stamps in "
                 "electrons, gain in electrons a unit, or gain = None for no photon noise"
             )
-        photons = filters * np.sqrt(np.maximum(mean.ravel(), 0.0))
-        photon_noise = (photons**2).sum(axis=1) * _correlation_factors(correlations, photons, mean.shape)
+        light = np.maximum(mean.ravel(), 0.0)
+        photon_noise = (filters**2 @ light) * _correlation_factors(correlations, filters * np.sqrt(light), mean.shape)
         noise = noise + photon_noise / electrons[:, None]
     return noise
 
@@ -304,7 +304,7 @@ def _correlation_factors(
     images = filters.reshape(-1, *shape)
     factors = np.ones(len(images))
     for lag, correlation in correlations.items():
-        first, second = _lagged(*images.shape[1:], *lag)
+        first, second = _lagged(images.shape[1], images.shape[2], *lag)
         overlap = (images[:, *first] * images[:, *second]).sum(axis=(1, 2))
         factors += 2.0 * correlation * overlap / (images**2).sum(axis=(1, 2))
     return np.maximum(factors, _LEAST_FACTOR)

@@ -15,8 +15,12 @@ from .file import Block, ZemaxFile, set_word
 
 #: Lines of solves and pickups that are not followed.
 _OTHERS = ("PCUP", "PPAR", "PXDT", "PCOP", "PKUP", "CPKP", "MARG", "CHAZ", "CHAA", "POSI", "COMP", "CURF", "GLCZ")
-#: Kinds of solves: of a curvature and a glass that are picked up, and of a curvature that is fixed or a variable.
-_CURVATURE, _GLASS, _FREE = 4, 2, (0, 1)
+#: Kind of solve of a curvature that is picked up.
+_CURVATURE = 4
+#: Kind of solve of a glass that is picked up.
+_GLASS = 2
+#: Kinds of a curvature that is fixed, or a variable.
+_FREE = (0, 1)
 
 
 def with_links_followed(file: ZemaxFile, saved: ZemaxFile, findings: Findings) -> ZemaxFile:
