@@ -18,6 +18,7 @@ from astropy.utils.exceptions import AstropyWarning
 from .ccd_names import NAMES_CARD, refuse_mirrored_names
 from .errors import ProductError
 from .files import parsing, read_bytes, write_bytes
+from .fits_files import unpacked_bytes
 from .version import VERSION
 
 #: Comment of CHECKSUM and DATASUM. astropy's default is the time of day, with which no two runs have the same bytes.
@@ -96,6 +97,7 @@ def read_fits(path: Path, stamp: Stamp | None = None, *, checksums: bool = True)
     with warnings.catch_warnings():
         warnings.simplefilter("error", AstropyWarning)
         with parsing(path, "damaged or no FITS product" if checksums else "damaged or not FITS", ProductError):
+            data = unpacked_bytes(path, data, ProductError)
             hdus = fits.open(io.BytesIO(data), lazy_load_hdus=False)
             for hdu in hdus:
                 if problem := _checksum_problem(hdu, data, required=checksums):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import warnings
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from astropy.table import Table
 
 from ..core.errors import DomainError, ProductError
 from ..core.files import parsing, read_bytes, text_lines
+from ..core.fits_files import open_fits
 from .image_file import CcdImage
 
 #: Columns of pixels, the first one's centre at (0, 0), in small letters.
@@ -81,7 +81,7 @@ def table_in(path: Path) -> Table:
         if not data.startswith(b"SIMPLE"):
             kind = "ascii.ecsv" if data.lstrip().startswith(b"# %ECSV") else "ascii.csv"
             return Table.read(text_lines(data.decode()), format=kind)
-        with fits.open(io.BytesIO(data), lazy_load_hdus=False) as hdus:
+        with open_fits(path, ProductError, content=data, lazy_load_hdus=False) as hdus:
             tables = [Table.read(hdu) for hdu in hdus if isinstance(hdu, (fits.BinTableHDU, fits.TableHDU))]
     known_names = {name for names in (*_FROM_ONE, *_FROM_ZERO, *_CELESTIAL, _CELESTIAL_RADIAN) for name in names}
     if not tables:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import ProductError, shown
 from ..core.files import parsing, require_file
+from ..core.fits_files import open_fits
 from ..core.units import require_count
 from .psf_model.polynomial import as_positions
 
@@ -101,7 +102,7 @@ def load_psfex(path: str | Path) -> PsfexPsf:
     require_file(file, ProductError)
     with warnings.catch_warnings(), parsing(file, "damaged or no FITS file of PSFEx", ProductError):
         warnings.simplefilter("ignore")
-        with fits.open(file, lazy_load_hdus=False) as hdus:
+        with open_fits(file, ProductError, lazy_load_hdus=False) as hdus:
             tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU) and _COLUMN in hdu.columns.names]
             if not tables:
                 raise ProductError(f"no model of PSFEx (no table with {_COLUMN})", file=file)

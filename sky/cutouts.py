@@ -13,7 +13,8 @@ from astropy.utils.exceptions import AstropyWarning
 from astropy.wcs import WCS
 
 from ..core.errors import ProductError
-from ..core.files import parsing, require_file
+from ..core.files import parsing
+from ..core.fits_files import open_fits
 from ..core.memory import require_bytes
 from ..core.random_streams import stream
 from ..core.units import ARCMIN
@@ -77,11 +78,12 @@ def read_mosaic(path: str | Path, zero_point: float | str | None = None) -> Mosa
     ProductError
         If the file cannot be read, or has no image, celestial coordinates or zero point.
     """
-    require_file(Path(path), ProductError)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AstropyWarning)
-        with parsing(path, "cannot be read as FITS", ProductError), open(path, "rb") as file:
-            hdus = fits.open(file, memmap=False)
+        with (
+            parsing(path, "cannot be read as FITS", ProductError),
+            open_fits(Path(path), ProductError, memmap=False) as hdus,
+        ):
             first_image = next(((h.data, h.header) for h in hdus if h.is_image and np.ndim(h.data) == 2), None)
         if first_image is None:
             raise ProductError("has no image of two axes, expected a mosaic of the sky", file=path)

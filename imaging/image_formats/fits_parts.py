@@ -14,6 +14,7 @@ from astropy.utils.exceptions import AstropyWarning
 
 from ...core.errors import ProductError
 from ...core.files import parsing, require_file
+from ...core.fits_files import open_fits
 
 #: Cards that other programs write on the file, or on the compression of a part, and not on the image.
 _STRUCTURE = ("CHECKSUM", "DATASUM", "ZHECKSUM", "ZDATASUM", "EXTNAME", "EXTVER", "INHERIT", "XTENSION", "EXTEND")
@@ -73,8 +74,7 @@ def _opened(path: Path, **options: bool) -> Iterator[fits.HDUList]:
     with warnings.catch_warnings(), parsing(path, "damaged or not FITS", ProductError):
         warnings.simplefilter("ignore", AstropyWarning)
         warnings.filterwarnings("error", message=".*truncated.*")
-        # Closed here, too, where the file cannot be parsed.
-        with open(path, "rb") as opened, fits.open(opened, lazy_load_hdus=False, **options) as hdus:
+        with open_fits(path, ProductError, lazy_load_hdus=False, **options) as hdus:
             yield hdus
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError, error_context
 from ...core.files import parsing, require_file, write_bytes
+from ...core.fits_files import open_fits
 from ..shapes.grid import GridSag
 from .hdf5_map import SIGNATURE
 
@@ -49,8 +50,6 @@ def read_grid(path: str | os.PathLike[str]) -> GridSag:
 
 def fits_image(path: Path, dimensions: int) -> tuple[fits.Header, np.ndarray]:
     """Return header and float64 data of the first image of a number of dimensions in a FITS file; PrescriptionError."""
-    from astropy.io import fits  # few prescriptions have a grid
-
     require_file(path, PrescriptionError)
     with parsing(path, "cannot be read as FITS", PrescriptionError), open(path, "rb") as file:
         start = file.read(max(map(len, _FOREIGN)))
@@ -59,8 +58,10 @@ def fits_image(path: Path, dimensions: int) -> tuple[fits.Header, np.ndarray]:
                 text = f"{kind} file, whose maps have no nodes and no unit: expected a FITS image"
                 alternative = "pachon.read_hdf5_map" if kind == "HDF5" else "a pachon.GridSag of its map"
                 raise PrescriptionError(f"{text}, or {alternative}", file=path)
-        file.seek(0)
-        hdus = fits.open(file, memmap=False)
+    with (
+        parsing(path, "cannot be read as FITS", PrescriptionError),
+        open_fits(path, PrescriptionError, memmap=False) as hdus,
+    ):
         images = [(hdu.header, hdu.data) for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == dimensions]
     if not images:
         number = {2: "two", 4: "four"}[dimensions]

@@ -15,6 +15,7 @@ from astropy.table import Table
 from ...core.arguments import check_arguments
 from ...core.errors import ProductError
 from ...core.files import parsing, read_bytes, text_lines
+from ...core.fits_files import unpacked_bytes
 from .lsst_stamps import is_stamp_file, read_stamp_file
 from .stamp_weights import without_weightless
 
@@ -205,7 +206,7 @@ def _read_fits_parts(path: Path, data: bytes) -> fits.HDUList:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         with parsing(path, "damaged or not FITS", ProductError):
-            hdus = fits.open(io.BytesIO(data), lazy_load_hdus=False)
+            hdus = fits.open(io.BytesIO(unpacked_bytes(path, data, ProductError)), lazy_load_hdus=False)
             for hdu in hdus:
                 hdu.data  # noqa: B018 - reads it now, within the checks
     cut = [str(w.message) for w in caught if "truncated" in str(w.message).lower()]

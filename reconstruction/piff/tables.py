@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import warnings
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from astropy.io import fits
 
 from ...core.errors import ProductError, shown
 from ...core.files import parsing, read_bytes
+from ...core.fits_files import open_fits
 
 #: First bytes of the pickles of protocol 2 and later, as versions of Piff before its FITS files had them.
 _PICKLE = b"\x80"
@@ -35,8 +35,10 @@ class PiffTables:
             raise ProductError("a pickle, which is never read; expected a FITS file of Piff", file=path)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            with parsing(path, "damaged or no FITS file of Piff", ProductError):
-                hdus = fits.open(io.BytesIO(data), lazy_load_hdus=False)
+            with (
+                parsing(path, "damaged or no FITS file of Piff", ProductError),
+                open_fits(path, ProductError, content=data, lazy_load_hdus=False) as hdus,
+            ):
                 binary_tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)]
                 tables = {hdu.name.lower(): hdu.data for hdu in binary_tables}
         return cls(path, tables)

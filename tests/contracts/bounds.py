@@ -18,14 +18,14 @@ class Hang(BaseException):
 
 
 @contextmanager
-def bounded(memory=MEMORY):
+def bounded(memory=MEMORY, processor_seconds=SECONDS):
     """Limit time and memory of a block; Hang, or MemoryError."""
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     limits = resource.getrlimit(resource.RLIMIT_AS)
     with ExitStack() as after:
         for name, timer, seconds in (
-            (signal.SIGPROF, signal.ITIMER_PROF, SECONDS),
-            (signal.SIGALRM, signal.ITIMER_REAL, PATIENCE),
+            (signal.SIGPROF, signal.ITIMER_PROF, processor_seconds),
+            (signal.SIGALRM, signal.ITIMER_REAL, PATIENCE * processor_seconds / SECONDS),
         ):
             after.callback(signal.signal, name, signal.signal(name, _stop))
             after.callback(signal.setitimer, timer, 0.0)

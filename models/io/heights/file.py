@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from astropy.io import fits
 from astropy.table import Table
 from astropy.utils.exceptions import AstropyUserWarning
 
 from ....core.errors import HeightWarning, PrescriptionError, error_context
 from ....core.files import parsing, require_file, text_lines
+from ....core.fits_files import open_fits
 from ...camera.camera import Camera
 from ...camera.ccd_surfaces import CcdSurfaces
 from ...camera.height_fit import fit_heights
@@ -90,7 +90,7 @@ def _content(path: Path) -> Table | dict[str, np.ndarray]:
     with parsing(path, "cannot be read", PrescriptionError):
         if path.suffix.lower() == ".ecsv":
             return Table.read(text_lines(path.read_text(encoding="utf-8")), format="ascii.ecsv")
-        with warnings.catch_warnings(), open(path, "rb") as file, fits.open(file, memmap=False) as hdus:
+        with warnings.catch_warnings(), open_fits(path, PrescriptionError, memmap=False) as hdus:
             warnings.filterwarnings("error", ".*truncated", AstropyUserWarning)
             images = [hdu for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == 2]
             if not images:

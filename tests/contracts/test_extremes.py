@@ -1,0 +1,168 @@
+"""Public functions called with one number at an extreme: an error of pachon, or a result that is finite or flagged.
+
+``pytest -m slow tests/contracts/test_extremes.py -s`` makes every call and prints the counts by outcome; the short run
+makes some thousand.
+"""
+
+import dataclasses
+import inspect
+import warnings
+import zlib
+from collections import Counter
+
+import numpy as np
+import pytest
+from bounds import CHARACTERS, LINES, MEMORY_OF_CALL, Hang, bounded
+from public_calls import calls
+from test_wrong_arguments import is_numbers
+
+from pachon.core.errors import PachonError
+
+#: One of so many calls is made in the short run.
+SHARE = 40
+#: Processor time of a call [s].
+SECONDS = 10.0
+#: Sizes of numbers, with both signs.
+SIZES = (0.0, 5e-324, 1e-300, 1e-100, 1e-30, 1e-15, 1e-9, 1e-6, 1e6, 1e9, 1e15, 1e30, 1e100, 1e300)
+#: Factors of the valid value.
+FACTORS = (1e-12, 1e-6, 1e-3, 1e3, 1e6, 1e12)
+#: Depth to which results are searched.
+DEPTH = 4
+#: Words in the names of attributes that say which results hold.
+FLAGS = ("flag", "status", "usable", "valid", "lit", "converged", "weight", "mask", "reason", "lost", "vignetted")
+
+
+def extremes(value):
+    """Values of the right kind at the ends of what numbers can be."""
+    array = np.asarray(value)
+    if array.dtype.kind in "iu":
+        for number in (0, -1, -(2**31), 2**31, 2**63 - 1, -(2**63)):
+            yield f"{number}", np.full_like(array, number, dtype=np.int64) if array.ndim else number
+        yield "int8", array.astype(np.int8) if array.ndim else np.int8(array)
+        return
+    numbers = [sign * size for size in SIZES for sign in ((1, -1) if size else (1,))] + [np.nan, np.inf, -np.inf]
+    for number in numbers:
+        yield f"{number:g}", np.full_like(array, number) if array.ndim else float(number)
+        if array.size > 1 and not isinstance(value, tuple):
+            spoilt = array.copy()
+            spoilt[(0,) * array.ndim] = number
+            yield f"first {number:g}", spoilt
+    for factor in FACTORS:
+        yield f"times {factor:g}", array * factor if array.ndim else float(value) * factor
+    if not array.ndim:
+        yield "float32", np.float32(value)
+        yield "array", np.asarray(value)
+    elif not isinstance(value, tuple):
+        yield "float32", array.astype(np.float32)
+        yield "float16", array.astype(np.float16)
+        yield "big endian", array.astype(">f8")
+        yield "backwards", np.ascontiguousarray(array[::-1])[::-1]
+        yield "read only", _read_only(array)
+        yield "endless", np.broadcast_to(array, (10**9, *array.shape))
+        yield "many", np.broadcast_to(array.ravel()[0], (10**9, *array.shape[1:]))
+
+
+def _read_only(array):
+    frozen = array.copy()
+    frozen.setflags(write=False)
+    return frozen
+
+
+def numbers_of(result, depth=DEPTH):
+    """Yield the name and numbers of every array and number of a result."""
+    if isinstance(result, (float, np.floating, np.ndarray)):
+        if np.asarray(result).dtype.kind == "f":
+            yield "", np.asarray(result)
+    elif depth and isinstance(result, (tuple, list)):
+        for element in result[:20]:
+            yield from numbers_of(element, depth - 1)
+    elif depth and isinstance(result, dict):
+        for name, element in list(result.items())[:40]:
+            yield from ((f"{name}.{inner}", a) for inner, a in numbers_of(element, depth - 1))
+    elif depth and dataclasses.is_dataclass(result) and not isinstance(result, type):
+        for field in dataclasses.fields(result):
+            element = getattr(result, field.name, None)
+            yield from ((f"{field.name}.{inner}", a) for inner, a in numbers_of(element, depth - 1))
+
+
+def flags_of(result):
+    """Return the values of what says which results hold, as texts."""
+    names = [n for n in dir(result) if not n.startswith("_") and any(word in n for word in FLAGS)]
+    values = {}
+    for name in names:
+        try:
+            value = getattr(result, name)
+        except Exception:
+            continue
+        if not callable(value):
+            values[name] = np.array2string(np.asarray(value)) if np.size(value) < 1000 else str(np.sum(value))
+    return values
+
+
+def outcome(function, arguments):
+    """Return the kind of a call's outcome, what it said, the numbers that are not finite, and its flags."""
+    try:
+        with bounded(MEMORY_OF_CALL, SECONDS), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            result = function(**arguments)
+            spoilt = {name for name, array in numbers_of(result) if not np.isfinite(array).all()}
+            return "finite", "", spoilt, flags_of(result)
+    except PachonError as error:
+        text = str(error)
+        return ("refused" if len(text.splitlines()) <= LINES and len(text) <= CHARACTERS else "long"), text, set(), {}
+    except Hang:
+        return "hang", "", set(), {}
+    except Exception as error:
+        return "raw", f"{type(error).__name__}: {str(error)[:200]}", set(), {}
+
+
+def outcomes(label, function, arguments, chosen):
+    """Yield kind and description of the calls that are chosen by their number."""
+    valid = outcome(function, arguments)
+    number = 0
+    for name, value in arguments.items():
+        if not is_numbers(value) or isinstance(value, bool):
+            continue
+        for change, extreme in extremes(value):
+            number += 1
+            if not chosen(number):
+                continue
+            kind, text, spoilt, flags = outcome(function, arguments | {name: extreme})
+            if kind == "finite" and spoilt - valid[2]:
+                kind = "flagged" if flags != valid[3] else "silent"
+                text = ", ".join(sorted(spoilt - valid[2]))
+            if kind == valid[0] and text == valid[1] and text:
+                kind = "refused"
+            yield kind, f"{kind:9s}{label}({name}={change}): {text[:300]}"
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    return calls(tmp_path_factory.mktemp("calls"))
+
+
+#: What may come of an extreme.
+GOOD = ("refused", "finite", "flagged")
+
+
+def check(table, chosen):
+    counts, bad = Counter(), []
+    for label, (function, arguments) in table.items():
+        if inspect.ismethod(function) or callable(function):
+            for kind, text in outcomes(label, function, arguments, lambda n, label=label: chosen(label, n)):
+                counts[kind] += 1
+                if kind not in GOOD:
+                    bad.append(text)
+                    print(text, flush=True)
+    print(dict(counts))
+    assert not bad, "\n".join(bad)
+
+
+@pytest.mark.long
+def test_some_extremes(table):
+    check(table, lambda label, n: zlib.crc32(label.encode()) % SHARE == n % SHARE)
+
+
+@pytest.mark.slow
+def test_all_extremes(table):
+    check(table, lambda label, n: True)
