@@ -122,7 +122,11 @@ def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any
                 return checked(*args, **options)
             text = f"{problem.name} = {shown(problem.value)}: expected {problem.expected}"
             raise problem.error(text, key=problem.name) from None
-        return function(*checked_args, **options)
+        try:
+            return function(*checked_args, **options)
+        except MemoryError as problem:
+            reason = str(problem) or "not enough memory"
+            raise DomainError(f"{function.__qualname__}: {reason}; expected arguments that need less") from None
 
     checked.__dict__[_REMOVED] = {}
     if unpacked:

@@ -7,6 +7,7 @@ or finds the disk full leaves no partial file under the final name.
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import platform
@@ -165,6 +166,16 @@ def read_bytes(path: Path, error: type[PachonError], *, max_bytes: int | None = 
     if max_bytes is not None and len(data) > max_bytes:
         raise error(f"expected a file of at most {max_bytes} bytes", file=path)
     return data
+
+
+def read_arrays(path: Path, problem: str, error: type[PachonError]) -> dict[str, np.ndarray]:
+    """Return the arrays of a NumPy file (.npz) by name, or raise `error` with a problem where it is not whole.
+
+    The checksum of each array is checked; NumPy and zipfile raise all kinds of errors for a damaged table of contents.
+    """
+    data = read_bytes(path, error)
+    with parsing(path, problem, error), np.load(io.BytesIO(data), allow_pickle=False) as content:
+        return dict(content)
 
 
 def text_lines(text: str) -> list[str]:

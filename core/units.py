@@ -112,6 +112,15 @@ def require_positive(value: Any, name: str, unit: str = "") -> float:
     return number
 
 
+def require_within(value: Any, name: str, least: float, most: float, unit: str = "") -> float:
+    """Return a float from `least` to `most`, or raise :class:`DomainError` naming the argument and the limits."""
+    number = require_positive(value, name, unit)
+    if not least <= number <= most:
+        text = f"{name} = {shown(value)}: expected {least:g} to {most:g} {unit}"
+        raise DomainError(text.rstrip(), key=name)
+    return number
+
+
 def require_all_positive(**values: Any) -> None:
     """Raise :class:`DomainError` that names the first of the arguments that is no finite, positive number."""
     for name, value in values.items():

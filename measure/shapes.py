@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+#: Size under the weight, in units of that of the weight, from which on light does not fall off: 22 times as wide.
+_WIDEST = 0.999
 _BATCH_PIXELS = 1 << 20  # 8 MB a work array: the memory used does not grow with the number of stars
 
 
@@ -37,6 +39,7 @@ class ShapeFlag(IntFlag):
     ``CENTROID_LEFT_STAMP``: the centroid came nearer to an edge than the rms width of the weight (or half-way to it,
     where the weight is wider than that). ``NO_FLUX``: the weighted sum is not positive. ``MASKED``: pixels without
     weight hold more than half of the light under the weight of the moments, or above half of the maximum.
+    ``NO_SOURCE``: the light does not fall off under the weight (a constant), or before the edge of the stamp (a slope).
     """
 
     OK = 0
@@ -45,6 +48,7 @@ class ShapeFlag(IntFlag):
     CENTROID_LEFT_STAMP = 4
     NO_FLUX = 8
     MASKED = 16
+    NO_SOURCE = 32
 
 
 @dataclass(frozen=True)
@@ -257,6 +261,9 @@ def _measure_batch(images: np.ndarray, scale: float, sigma: float, max_iteration
     determinant = q11 * q22 - q12**2
     good = (determinant > 0.0) & (q11 > 0.0)
     flags[measured[~good]] |= ShapeFlag.NEGATIVE_MOMENTS
+    endless = (determinant > _WIDEST**4 * sigma**4) | _rises_to_an_edge(images[measured], center[measured], sigma)
+    flags[measured[endless & good]] |= ShapeFlag.NO_SOURCE
+    good &= ~endless
     e1, e2, size = (np.full(count, np.nan) for _ in range(3))
     root = np.sqrt(determinant[good])
     trace = q11[good] + q22[good] + 2.0 * root
@@ -283,6 +290,22 @@ def _measure_masked(
     for values in (shapes.e1, shapes.e2, shapes.size, shapes.x, shapes.y):
         values[lost_stars] = np.nan
     return shapes
+
+
+def _rises_to_an_edge(images: np.ndarray, center: np.ndarray, sigma: float) -> np.ndarray:
+    """Return whether an edge within two rms widths of the weight is brighter than the mean under the weight, [n]."""
+    rises = np.zeros(len(images), dtype=bool)
+    reach = 2.0 * sigma
+    half = 0.5 * np.array([images.shape[2] - 1.0, images.shape[1] - 1.0])
+    for i in np.flatnonzero((np.abs(center) > half - reach).any(axis=1)):
+        offsets = [np.arange(2.0 * h + 1.0) - h - c for h, c in zip(half, center[i], strict=True)]
+        weights = [np.exp(-0.5 * (offset / sigma) ** 2) for offset in offsets]
+        weight_x, weight_y = (weight / weight.sum() for weight in weights)
+        columns, rows = weight_y @ images[i], images[i] @ weight_x
+        mean = columns @ weight_x
+        for line, offset in ((columns, offsets[0]), (rows, offsets[1])):
+            rises[i] |= any(abs(offset[end]) < reach and line[end] > mean for end in (0, -1))
+    return rises
 
 
 def _weighted_moments(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
+from ...core.errors import DomainError
 from ...core.plotting import BLUE
 from ...core.units import length, require_count, require_positive
 from ...models.telescope import Telescope
@@ -249,7 +250,10 @@ def opd_fans(
         radius = length(sphere_radius, "sphere_radius")
         require_positive(abs(radius), "sphere_radius", "metres")
     value = np.stack([b.opd(radius) for b in bundles], axis=1).reshape(len(request.fields), len(bundles), 2, -1)
-    return OpdFans(request, pupil, _lit(bundles), value, radius)
+    lit = _lit(bundles)
+    if lit.any() and not np.isfinite(value[lit]).any():
+        raise DomainError(f"sphere_radius = {radius:g} m: no ray meets the sphere; expected a larger one")
+    return OpdFans(request, pupil, lit, value, radius)
 
 
 def _traced(

@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import DomainError, check_choice
+from ...core.memory import require_bytes
 from ...core.threads import one_blas_thread
-from ...core.units import field_label, length, require_count
+from ...core.units import field_label, length, require_count, require_within
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling, pupil_sampling
 from ...wavefront.request import Request, relative_weights
@@ -29,6 +30,10 @@ from .wavelets import WaveletLattice, Wavelets, lattice_wavelets, range_of_cosin
 
 #: What replaces arguments that a request has.
 _REQUEST = "telescope=Request.of(telescope, fields, wavelengths, {}=...)"
+#: Sides of pixels [m]: from a hundredth of an atom to a metre.
+_PIXEL_SIDES = (1e-12, 1.0)
+#: Bytes for each sample of the irradiance: of a complex number, of its square and of one more of both.
+_BYTES_OF_SAMPLE = 48
 #: Default number of pixels on a side.
 _PIXELS = 128
 #: Default number of pixels across wavelength times focal ratio.
@@ -215,9 +220,9 @@ class _Plan:
             # Where the spots are far larger than an Airy disc, they set the scale.
             self.pixel = max(self.wave_over_range / _PER_AIRY, 1.25 * self.spread / self.pixels)
         else:
-            self.pixel = length(pixel, "pixel")
-            if not (np.isfinite(self.pixel) and self.pixel > 0):
-                raise DomainError(f"pixel = {pixel!r}: expected a positive length in metres")
+            self.pixel = require_within(length(pixel, "pixel"), "pixel", *_PIXEL_SIDES, "m")
+        samples = self.pixels * self._samples_across()
+        require_bytes(_BYTES_OF_SAMPLE * samples**2, f"pixel = {self.pixel:g} m: {samples} samples across the image")
 
     @one_blas_thread()
     def image(
@@ -263,9 +268,12 @@ class _Plan:
 
         The pattern has no period below wavelength times focal ratio: samples at that distance sum to the light.
         """
-        across = int(np.ceil(self.pixel / self.wave_over_range - 1e-9))
+        across = self._samples_across()
         offsets = (np.arange(across) + 0.5) / across - 0.5
         return (pixel_axis(self.pixel, self.pixels)[:, None] + self.pixel * offsets).ravel()
+
+    def _samples_across(self) -> int:
+        return max(1, int(np.ceil(self.pixel / self.wave_over_range - 1e-9)))
 
     def _on_pixels(self, irradiance: np.ndarray) -> np.ndarray:
         """Return the mean of the samples of each pixel."""

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 #: Parts of a pixel along each axis, for the fraction of it within a circle.
 _PARTS = 4
+#: Distance of a centre from an image, beyond which no light is told from other light [pixels].
+_FARTHEST = 1e9
 #: Factor of the interpolated pixels along each axis; diffraction images are band-limited.
 _FINER = 3
 #: Default number of radii.
@@ -233,6 +235,8 @@ def energy_curve(
         if not total > 0:
             raise DomainError(f"image of sum {total:.6g}: expected light, to have a centroid")
         center = float(light.sum(axis=0) @ x / total), float(light.sum(axis=1) @ y / total)
+    if not max(map(abs, center)) <= _FARTHEST:
+        raise DomainError(f"center = {shown(center)}: expected pixels within {_FARTHEST:g} of the image")
     parts = require_count(parts, "parts", 1, 100)
     inside = (np.arange(parts) + 0.5) / parts - 0.5
     across, along = (np.add.outer(v - c, inside).ravel() for v, c in zip((x, y), center, strict=True))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError
+from ...core.errors import DomainError, shown
 from ...core.plotting import figure_at, styled
 from ...core.threads import one_blas_thread
 from ...core.units import field_label, metres
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 #: Heights where none are given.
 _HEIGHTS = 61
+#: Largest defocus [m]; the distance to the exit pupil, where that is less.
+_FARTHEST = 1e4
 
 
 @dataclass(frozen=True)
@@ -166,6 +168,9 @@ def through_focus(
         heights = common + reach * np.linspace(-1.0, 1.0, _HEIGHTS)
     else:
         heights = np.atleast_1d(metres(defocus, "defocus"))
+        farthest = min(abs(request.telescope.sphere_radius), _FARTHEST)
+        if heights.size and not np.abs(heights).max() <= farthest:
+            raise DomainError(f"defocus = {shown(defocus)}: expected at most {farthest:g} m on either side")
         if heights.ndim != 1 or not (np.isfinite(heights).all() and (np.diff(heights) > 0).all() and len(heights)):
             raise DomainError(f"defocus = {defocus!r}: expected ascending heights of the detector in metres")
     wavefront, strehl = _wavefronts(request, bundles, heights)

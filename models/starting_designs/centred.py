@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import DomainError
+from ...core.units import require_within
 from ..aperture import Aperture, Circle
 from ..first_order import first_order, footprints
 from ..media.medium import Medium
@@ -22,6 +23,15 @@ from ..telescope import VACUUM, Telescope
 CLEAR = 1.05
 #: Lines F, d and C [m].
 LINES = (486.1327e-9, 587.5618e-9, 656.2725e-9)
+#: Diameters of apertures [m], focal ratios and radii of fields [rad] that designs are made for.
+_DIAMETERS, _FOCAL_RATIOS, _FIELD_RADII = (1e-6, 1e3), (0.1, 1e6), (1e-9, 1.5)
+
+
+def require_design(diameter: float, f_number: float, field_radius: float) -> None:
+    """Raise :class:`DomainError` where aperture, focal ratio or field of a design is out of range."""
+    require_within(diameter, "diameter", *_DIAMETERS, "m")
+    require_within(f_number, "f_number", *_FOCAL_RATIOS)
+    require_within(field_radius, "field_radius", *_FIELD_RADII, "rad")
 
 
 def mirror(name: str, shape: Shape, z: float, aperture: Aperture | None = None) -> Surface:

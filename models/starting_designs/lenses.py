@@ -17,7 +17,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...core.arguments import check_arguments
-from ...core.units import require_all_positive
 from ..aperture import Circle
 from ..first_order import chromatic_sums, first_order, footprints, seidel_sums
 from ..io.glass_catalogue import GlassCatalogue
@@ -25,7 +24,7 @@ from ..media.medium import Medium
 from ..shapes.shape import Plane, Sphere
 from ..surface import Surface
 from ..telescope import VACUUM, Telescope
-from .centred import LINES, centred, cleared, detector, focused, interface, solved
+from .centred import LINES, centred, cleared, detector, focused, interface, require_design, solved
 
 SOURCE = "thin-lens start; curvatures at which sums of third order vanish"
 #: Petzval sum of the triplet over its power: a flatter field needs steeper surfaces.
@@ -107,7 +106,7 @@ def singlet(diameter: float = 0.02, f_number: float = 10.0, *, field_radius: flo
     DomainError
         If a number is out of range, or there is no such lens.
     """
-    require_all_positive(diameter=diameter, f_number=f_number, field_radius=field_radius)
+    require_design(diameter, f_number, field_radius)
     f = f_number * diameter
     glass = GlassCatalogue.bundled()["N-BK7"]
     n = float(glass.index(LINES[1]))
@@ -146,7 +145,7 @@ def doublet(diameter: float = 0.05, f_number: float = 8.0, *, field_radius: floa
     DomainError
         If a number is out of range, or there is no such lens.
     """
-    require_all_positive(diameter=diameter, f_number=f_number, field_radius=field_radius)
+    require_design(diameter, f_number, field_radius)
     f = f_number * diameter
     glasses = [GlassCatalogue.bundled()[name] for name in ("N-BK7", "F2")]
     gaps = [0.08 * diameter + 0.35 * diameter**2 / f, 0.06 * diameter]
@@ -188,7 +187,7 @@ def triplet(diameter: float = 0.01, f_number: float = 5.0, *, field_radius: floa
     DomainError
         If a number is out of range.
     """
-    require_all_positive(diameter=diameter, f_number=f_number, field_radius=field_radius)
+    require_design(diameter, f_number, field_radius)
     f = f_number * diameter
     crown, flint = (GlassCatalogue.bundled()[name] for name in ("N-SK16", "F2"))
     media = [crown, VACUUM, flint, VACUUM, crown, VACUUM]

@@ -12,13 +12,12 @@ import math
 from dataclasses import replace
 
 from ...core.arguments import check_arguments
-from ...core.units import require_all_positive
 from ..aperture import Circle
 from ..first_order import seidel_sums
 from ..io.glass_catalogue import GlassCatalogue
 from ..shapes.shape import EvenAsphere, Plane, Sphere
 from ..telescope import VACUUM, Telescope
-from .centred import centred, cleared, detector, focused, interface, mirror
+from .centred import centred, cleared, detector, focused, interface, mirror, require_design
 
 #: Thickness of the plate over its diameter.
 _THICKNESS = 0.03
@@ -48,7 +47,7 @@ def schmidt(diameter: float = 0.5, f_number: float = 2.5, *, field_radius: float
     DomainError
         If a number is out of range.
     """
-    require_all_positive(diameter=diameter, f_number=f_number, field_radius=field_radius)
+    require_design(diameter, f_number, field_radius)
     f, rim = f_number * diameter, 0.5 * diameter
     thickness, center = _THICKNESS * diameter, 2.0 * f
     glass = GlassCatalogue.bundled()["N-BK7"]

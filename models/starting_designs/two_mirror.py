@@ -26,7 +26,7 @@ from ..first_order import footprints
 from ..shapes.shape import Conic, Plane
 from ..surface import Interaction, Surface
 from ..telescope import VACUUM, Telescope
-from .centred import CLEAR, centred, cleared, detector, focused, mirror
+from .centred import CLEAR, centred, cleared, detector, focused, mirror, require_design
 
 SOURCE = "third-order formulas of Schroeder, Astronomical Optics (2nd ed.), section 6.2"
 Kind = Literal["ritchey-chretien", "cassegrain", "dall-kirkham", "gregorian"]
@@ -134,7 +134,7 @@ def newtonian(diameter: float = 0.2, f_number: float = 5.0, *, field_radius: flo
     DomainError
         If a number is out of range, or the flat covers the primary.
     """
-    require_all_positive(diameter=diameter, f_number=f_number, field_radius=field_radius)
+    require_design(diameter, f_number, field_radius)
     f, radius = f_number * diameter, 0.5 * diameter
     # The focus stands a tenth of the diameter outside the tube.
     before = 0.6 * diameter

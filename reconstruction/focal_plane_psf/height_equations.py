@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from ...core.files import make_folder, write_bytes
+from ...core.errors import ProductError
+from ...core.files import make_folder, read_arrays, write_bytes
 from ...core.threads import one_blas_thread
 from .covariance import Covariance
 from .fit import BlockEquations, ExposureFit
@@ -80,19 +81,19 @@ class HeightEquations(NamedTuple):
         if not path.exists():
             return None
         try:
-            arrays = np.load(path)
+            arrays = read_arrays(path, "damaged", ProductError)
             if str(arrays["key"]) != key:
                 return None
             blocks, covariances = [], []
-            for i in range(sum(name.startswith("block_used_") for name in arrays.files)):
+            for i in range(sum(name.startswith("block_used_") for name in arrays)):
                 used = arrays[f"block_used_{i}"]
                 lower = np.zeros((len(used), len(used)))
                 lower[np.tril_indices(len(used))] = arrays[f"block_matrix_{i}"]
                 blocks.append((used, lower + np.tril(lower, -1).T))
-            for i in range(sum(name.startswith("constant_") for name in arrays.files)):
+            for i in range(sum(name.startswith("constant_") for name in arrays)):
                 amplitude, matrix, ccd = (arrays[f"{name}_{i}"] for name in ("amplitude", "matrix", "ccd"))
                 constant, nugget = float(arrays[f"constant_{i}"]), float(arrays[f"nugget_{i}"])
                 covariances.append(Covariance(constant, amplitude, matrix, ccd, nugget))
             return cls(blocks, arrays["factor"], arrays["vector"], ExposureState(arrays["exposure"], covariances))
-        except (OSError, ValueError, KeyError):
+        except (ProductError, ValueError, KeyError, TypeError, IndexError):
             return None

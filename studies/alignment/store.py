@@ -7,12 +7,11 @@ import json
 from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
 from ...core.errors import ProductError
-from ...core.files import write_bytes
+from ...core.files import read_arrays, write_bytes
 from ...core.long_work import claim_folder
 from ...sensing.result import DonutFit
 from .config import AlignConfig, load_align_configuration
@@ -109,14 +108,14 @@ class VisitStore:
     def read(self, visit: int) -> VisitRecord | None:
         """Return a visit, or None where it is not there; one that is damaged, or of other inputs, is a ProductError."""
         path = self._path(visit)
-        try:
-            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as content:
-                quality = FieldMeans(*(float(v) for v in content["quality"]))
-                before = dict(json.loads(str(content["inputs"])))
-                record = VisitRecord(quality, *(content[name] for name in _ARRAYS))
-        except FileNotFoundError:
+        if not path.exists():
             return None
-        except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
+        try:
+            content = read_arrays(path, "expected a visit of a loop; delete it, and go on", ProductError)
+            quality = FieldMeans(*(float(v) for v in content["quality"]))
+            before = dict(json.loads(str(content["inputs"])))
+            record = VisitRecord(quality, *(content[name] for name in _ARRAYS))
+        except (ValueError, KeyError, TypeError) as error:
             raise ProductError(f"{path}: expected a visit of a loop ({error}); delete it, and go on") from None
         changed = [key for key, value in self.inputs.items() if before.get(key) != value]
         if changed:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import DomainError
-from ...core.units import metres, pure_numbers, require_positive
+from ...core.units import metres, pure_numbers, require_positive, require_within
 from ...models.io.site_file import load_site
 from ...models.site import Site
 from .layer_screens import LayerScreens, screen_samples
@@ -26,6 +26,8 @@ from .screen_sampling import ScreenSampling
 
 # More would fill the memory.
 _MOST_STEPS = 10_000_000
+#: Fried parameters at 500 nm [m]: images of 100" across to no turbulence.
+_FRIED_PARAMETERS = (1e-3, 1e9)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -141,7 +143,8 @@ class Atmosphere(LayerScreens):
             if not (isinstance(value, int | np.integer) and value >= 0):
                 raise DomainError(f"{name} = {value!r}: expected a whole number from 0")
         zenith = require_zenith_angle(zenith_angle)
-        fried = _length(site.r0 if r0 is None else r0, "r0") * math.cos(zenith) ** 0.6
+        fried = require_within(_length(site.r0 if r0 is None else r0, "r0"), "r0", *_FRIED_PARAMETERS, "m")
+        fried *= math.cos(zenith) ** 0.6
         outer = _length(site.outer_scale if outer_scale is None else outer_scale, "outer_scale")
         if not (math.isfinite(ground_lift) and ground_lift >= 0.0):
             raise DomainError(f"ground_lift = {ground_lift!r}: expected a height of 0 m or more")
