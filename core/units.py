@@ -127,6 +127,13 @@ def require_all_positive(**values: Any) -> None:
         require_positive(value, name)
 
 
+def finite(values: np.ndarray, name: str) -> np.ndarray:
+    """Return numbers that are all finite, or raise :class:`DomainError` naming the argument."""
+    if not np.isfinite(values).all():
+        raise DomainError(f"{name} = {shown(values)}: expected finite numbers", key=name)
+    return values
+
+
 def radians(value: Any, name: str) -> np.ndarray:
     """Return an angle in radians as a float64 array; plain numbers are radians already."""
     return in_unit(value, "rad", name)

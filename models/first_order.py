@@ -26,7 +26,7 @@ from ..core.errors import DomainError
 from ..core.plotting import BLUE, RED, axes_at, styled
 from ..core.point_plots import draw_bars
 from ..core.result import Result, Values
-from ..core.units import ARCSEC, length, metres
+from ..core.units import ARCSEC, angle, finite, length, metres
 from .paraxial import require_on_axis
 from .surface import Interaction
 from .telescope import Telescope
@@ -261,8 +261,8 @@ def seidel_sums(telescope: Telescope, wavelength: ArrayLike | None = None, field
     DomainError
         If no surface acts, one is decentred or tilted, or the wavelength is not covered.
     """
-    angle = telescope.field_radius if field is None else field
-    trace = _trace(telescope, wavelength, np.tan(angle), marginal=_marginal(telescope))
+    slope = np.tan(telescope.field_radius if field is None else angle(field, "field"))
+    trace = _trace(telescope, wavelength, float(finite(slope, "field")), marginal=_marginal(telescope))
     c, n, n2 = trace.curvature, trace.n, trace.n_after
     h, hb = trace.h.T
     u, ub = trace.u.T
@@ -307,8 +307,8 @@ def chromatic_sums(
     if ends.shape != (2,):
         raise DomainError(f"wavelengths of shape {ends.shape}: expected the shortest and the longest")
     telescope.check_wavelength(ends)
-    angle = telescope.field_radius if field is None else field
-    trace = _trace(telescope, None, np.tan(angle), marginal=_marginal(telescope))
+    slope = np.tan(telescope.field_radius if field is None else angle(field, "field"))
+    trace = _trace(telescope, None, float(finite(slope, "field")), marginal=_marginal(telescope))
     media = (telescope.medium_before, *(s.medium_after for s in trace.surfaces))
     # Dispersion over index is the same for light that goes back.
     relative = np.array([float(m.index(ends[0]) - m.index(ends[1])) for m in media]) / np.abs(

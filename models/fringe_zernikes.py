@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
-from ..core.units import metres, require_count
+from ..core.units import finite, metres, require_count
 from .zernike_polynomials import annular_zernikes, noll_to_nm
 
 #: Number of terms.
@@ -71,6 +71,7 @@ def fringe_zernikes(jmax: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     Returns
     -------
     ndarray, shape [jmax, ...]
+        NaN where a coordinate is NaN, or so large that its powers are.
 
     Raises
     ------
@@ -100,9 +101,9 @@ def fringe_from_noll(coefficients: ArrayLike) -> np.ndarray:
     Raises
     ------
     DomainError
-        If a coefficient that is not zero belongs to a term that the Fringe order does not have.
+        If a coefficient is not finite, or one that is not zero belongs to a term that the Fringe order does not have.
     """
-    noll = np.atleast_1d(metres(coefficients, "coefficients"))
+    noll = np.atleast_1d(finite(metres(coefficients, "coefficients"), "coefficients"))
     if not (count := noll.shape[-1]):
         raise DomainError(f"coefficients of shape {noll.shape}: expected at least one")
     absent_terms = np.setdiff1d(np.arange(count), _INDEX - 1)
@@ -130,9 +131,9 @@ def noll_from_fringe(coefficients: ArrayLike) -> np.ndarray:
     Raises
     ------
     DomainError
-        If there are more than 37 coefficients.
+        If a coefficient is not finite, or there are more than 37.
     """
-    fringe = np.atleast_1d(metres(coefficients, "coefficients"))
+    fringe = np.atleast_1d(finite(metres(coefficients, "coefficients"), "coefficients"))
     count = require_count(fringe.shape[-1], "number of coefficients", 1, FRINGE_TERMS)
     noll = np.zeros((*fringe.shape[:-1], int(_INDEX[:count].max())))
     noll[..., _INDEX[:count] - 1] = fringe / _NORM[:count]

@@ -20,20 +20,25 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
-from ..core.errors import ConfigError, DomainError
+from ..core.errors import ConfigError, DomainError, shown
 from ..core.units import pure_numbers, require_positive
 from .media.medium import wavelengths_within
 
 #: Largest refractive index that is taken for one.
 _HIGHEST_INDEX = 100.0
+#: Rounding of the cosines of rays beyond 1.
+_ROUNDING = 1e-9
 
 
 def checked_cosines(cosine: ArrayLike, n1: float, n2: float) -> np.ndarray:
-    """Return cosines of angles of incidence as an array; DomainError if an index is none of a medium."""
+    """Return cosines of angles of incidence as an array; DomainError if one is beyond 1, or an index is none."""
     for name, index in (("n1", n1), ("n2", n2)):
         if not 0.0 < index <= _HIGHEST_INDEX:
             raise DomainError(f"{name} = {index!r}: expected a refractive index above 0, at most {_HIGHEST_INDEX:g}")
-    return pure_numbers(cosine, "cosine")
+    cosines = pure_numbers(cosine, "cosine")
+    if np.any(np.abs(cosines) > 1.0 + _ROUNDING):
+        raise DomainError(f"cosine = {shown(cosine)}: expected -1 to 1, or NaN", key="cosine")
+    return cosines
 
 
 def check_wavelengths(wavelengths: tuple[float, ...], name: str) -> None:

@@ -10,7 +10,7 @@ from scipy.optimize import OptimizeResult, least_squares
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.units import require_count
+from ...core.units import require_count, require_positive, require_within
 from .problem import DesignProblem
 from .variables import random_starts
 
@@ -63,6 +63,8 @@ class LeastSquares:
 
     def __post_init__(self) -> None:
         require_count(self.restarts, "restarts", 0)
+        require_positive(self.tolerance, "tolerance")
+        require_within(self.spread, "spread", 0.0, 1e3)
         if not self.constraint_tolerance > 0.0:
             raise DomainError(f"constraint_tolerance = {self.constraint_tolerance!r}: expected a positive number")
 

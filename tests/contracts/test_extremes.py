@@ -29,7 +29,20 @@ FACTORS = (1e-12, 1e-6, 1e-3, 1e3, 1e6, 1e12)
 #: Depth to which results are searched.
 DEPTH = 4
 #: Words in the names of attributes that say which results hold.
-FLAGS = ("flag", "status", "usable", "valid", "lit", "converged", "weight", "mask", "reason", "lost", "vignetted")
+FLAGS = (
+    "pairs",
+    "flag",
+    "status",
+    "usable",
+    "valid",
+    "lit",
+    "converged",
+    "weight",
+    "mask",
+    "reason",
+    "lost",
+    "vignetted",
+)
 
 
 def extremes(value):
@@ -129,7 +142,8 @@ def outcomes(label, function, arguments, chosen):
                 continue
             kind, text, spoilt, flags = outcome(function, arguments | {name: extreme})
             if kind == "finite" and spoilt - valid[2]:
-                kind = "flagged" if flags != valid[3] else "silent"
+                documented = "NaN" in (inspect.getdoc(function) or "")
+                kind = "flagged" if flags != valid[3] else "documented" if documented else "silent"
                 text = ", ".join(sorted(spoilt - valid[2]))
             if kind == valid[0] and text == valid[1] and text:
                 kind = "refused"
@@ -141,8 +155,8 @@ def table(tmp_path_factory):
     return calls(tmp_path_factory.mktemp("calls"))
 
 
-#: What may come of an extreme.
-GOOD = ("refused", "finite", "flagged")
+#: What may come of an extreme: NaN where results say which of them hold, or where the documentation speaks of it.
+GOOD = ("refused", "finite", "flagged", "documented")
 
 
 def check(table, chosen):
