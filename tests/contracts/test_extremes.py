@@ -29,7 +29,7 @@ FACTORS = (1e-12, 1e-6, 1e-3, 1e3, 1e6, 1e12)
 #: Depth to which results are searched.
 DEPTH = 4
 #: Words in the names of attributes that say which results hold.
-FLAGS = (
+FLAGS = ("pairs", "flag", "status", "usable", "valid", "lit", "converged", "weight", "mask", "reason", "lost")
     "pairs",
     "flag",
     "status",
