@@ -30,19 +30,6 @@ FACTORS = (1e-12, 1e-6, 1e-3, 1e3, 1e6, 1e12)
 DEPTH = 4
 #: Words in the names of attributes that say which results hold.
 FLAGS = ("pairs", "flag", "status", "usable", "valid", "lit", "converged", "weight", "mask", "reason", "lost")
-    "pairs",
-    "flag",
-    "status",
-    "usable",
-    "valid",
-    "lit",
-    "converged",
-    "weight",
-    "mask",
-    "reason",
-    "lost",
-    "vignetted",
-)
 
 
 def extremes(value):
