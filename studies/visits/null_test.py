@@ -116,7 +116,7 @@ def null_test(
                 write_shapes(paths[tile], next(results), stamp)
             measured_rings = list(results)
         # Read from the files, as by a resumed test, so that both have the same numbers.
-        parts = [_read_shapes(path, stamp) for path in paths.values()]
+        parts = [read_shapes(path, stamp) for path in paths.values()]
         if (n := sum(int(shapes.usable_twice.sum()) for shapes in parts)) < 2:
             text = f"{n} of {sum(map(len, parts))} galaxies to magnitude {faintest:.2f} are usable in {visits} visits"
             raise DomainError(f"{folder}: {text}; expected two or more, of the galaxies of {CONFIG_NAME}")
@@ -310,7 +310,7 @@ def write_shapes(path: Path, galaxies: GalaxyShapes, stamp: Stamp) -> None:
     write_fits(path, [table_hdu("GALAXIES", columns)], stamp, [])
 
 
-def _read_shapes(path: Path, stamp: Stamp) -> GalaxyShapes:
+def read_shapes(path: Path, stamp: Stamp) -> GalaxyShapes:
     """Return the galaxies of a finished tile; ProductError for a damaged one or one of another configuration."""
     table = read_fits(path, stamp)["GALAXIES"]
     columns = {name: column(table, name.upper()) for name in _COLUMNS}
@@ -319,4 +319,8 @@ def _read_shapes(path: Path, stamp: Stamp) -> GalaxyShapes:
         for kind in ("shear", "true_shear")
     }
     scaled: dict[str, Any] = {n: v * _COLUMNS[n][0] if _COLUMNS[n][0] != 1.0 else v for n, v in columns.items()}
-    return GalaxyShapes(**scaled, shear=shears["shear"], true_shear=shears["true_shear"])
+    shapes = GalaxyShapes(**scaled, shear=shears["shear"], true_shear=shears["true_shear"])
+    for name in ("x", "y", "magnitude", "e1", "e2", "error", "true_e1", "true_e2"):
+        if not np.isfinite(getattr(shapes, name)[shapes.usable_twice]).all():
+            raise ProductError(f"{name.upper()} of usable galaxies is not finite; delete it, and go on", file=path)
+    return shapes

@@ -5,8 +5,9 @@ import pytest
 from scipy.special import ndtri
 
 from pachon.commands.cli import main
-from pachon.core.errors import PachonError
+from pachon.core.errors import PachonError, ProductError
 from pachon.core.long_work import Execution
+from pachon.core.products import Stamp
 from pachon.core.units import ARCMIN, ARCSEC
 from pachon.imaging.exposure import Exposure
 from pachon.measure.shear.shear_shapes import ShearShapes
@@ -15,7 +16,7 @@ from pachon.sky.galaxies import Galaxies
 from pachon.studies.visits import null_test as module
 from pachon.studies.visits.galaxy_shapes import GalaxyShapes, measure_galaxies
 from pachon.studies.visits.null_result import AdditiveBias, density_slope, shear_bias
-from pachon.studies.visits.null_test import ellipticity_along, null_test
+from pachon.studies.visits.null_test import ellipticity_along, null_test, read_shapes, write_shapes
 from pachon.studies.visits.psf_errors import PsfAtGalaxies
 from pachon.studies.visits.stack import PsfStack
 from pachon.studies.visits.visits import stack_visits
@@ -269,3 +270,23 @@ def test_functionals_of_the_null_test_have_the_shear_without_bias():
     assert (np.abs(bias.c) < 4.0 * bias.c_error + 1e-3).all()
     # A model without the ellipticity of the PSF leaves a part of it.
     assert (shear_bias_of_functionals(pair[0].shear, pair[1].shear, 0.02, 0.0).c > 0.01).all()
+
+
+def test_a_tile_with_numbers_that_are_not_finite_is_refused(tmp_path):
+    rng = np.random.default_rng(3)
+    shear = ShearShapes(*rng.uniform(0.1, 0.2, (7, 5)))
+    numbers = [rng.uniform(0.1, 0.2, 5) for _ in range(6)]
+    yes = np.ones(5, dtype=bool)
+    e1 = np.array([0.1, np.nan, 0.2, 0.0, -0.1])
+    stamp, path = Stamp("hash", 1), tmp_path / "tile.fits"
+    for usable in (yes, yes & np.isfinite(e1)):
+        x, y, magnitude, e2, error, true = numbers
+        galaxies = GalaxyShapes(
+            np.arange(5), x, y, magnitude, e1, e2, error, usable, true, true, yes, shear=shear, true_shear=shear
+        )
+        write_shapes(path, galaxies, stamp)
+        if usable is yes:
+            with pytest.raises(ProductError, match=r"tile\.fits: E1 of usable galaxies is not finite"):
+                read_shapes(path, stamp)
+        else:
+            np.testing.assert_array_equal(read_shapes(path, stamp).usable, usable)
