@@ -107,3 +107,18 @@ def test_the_lowest_versions_are_tested_by_the_documented_commands():
     assert any("--resolution lowest-direct" in line for line in documented)
     python = next(step["with"]["python-version"] for step in steps if "python-version" in step.get("with", {}))
     assert PROJECT["project"]["requires-python"] == f">={python}"
+
+
+def test_releases_are_built_from_pinned_and_hashed_packages():
+    lines = (ROOT / ".github" / "requirements" / "build.txt").read_text(encoding="utf-8")
+    entries = re.findall(
+        r"^([\w.\[\]-]+)==(\S+) \\\n((?:    --hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)", lines, flags=re.M
+    )
+    pinned = {name: Version(number) for name, number, _ in entries}
+    assert len(pinned) == len(re.findall(r"^\w\S*==", lines, flags=re.M))
+    asked = (ROOT / ".github" / "requirements" / "build.in").read_text(encoding="utf-8").splitlines()
+    assert {line for line in asked if line and not line.startswith("#")} <= set(pinned)
+    assert all(pinned[requirement.name] >= _bound(requirement) for requirement in REQUIREMENTS["build"])
+    workflow = (ROOT / ".github" / "workflows" / "build.yml").read_text(encoding="utf-8")
+    assert "--require-hashes -r .github/requirements/build.txt" in workflow
+    assert "build --no-isolation" in workflow
