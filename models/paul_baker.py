@@ -21,7 +21,7 @@ from dataclasses import replace
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
-from ..core.units import require_all_positive
+from ..core.units import require_within
 from .aperture import Annulus, Circle
 from .first_order import footprints
 from .shapes.shape import Conic, Plane, Sphere
@@ -67,7 +67,9 @@ def paul_baker(
     DomainError
         If an argument is out of range, or the mirrors leave nothing of the primary.
     """
-    require_all_positive(diameter=diameter, focal_ratio=focal_ratio, field_radius=field_radius)
+    require_within(diameter, "diameter", 1e-6, 1e3, "m")
+    require_within(focal_ratio, "focal_ratio", 0.1, 1e6)
+    require_within(field_radius, "field_radius", 1e-9, 1.5, "rad")
     if not 0 < beam_compression < 0.5:
         raise DomainError(f"beam_compression = {beam_compression!r}: expected between 0 and 0.5")
     m = beam_compression

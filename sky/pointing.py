@@ -77,21 +77,21 @@ class Pointing:
 
     @check_arguments
     def to_sky(self, slopes: ArrayLike) -> np.ndarray:
-        """Return (xi, eta) [rad] of the sources of light of gnomonic slopes (tx, ty), both shape [n, 2]."""
+        """Return (xi, eta) [rad] of the sources of light of gnomonic slopes (tx, ty), both shape [n, 2]; NaN of NaN."""
         x, y = -_angle_pairs(slopes, "slopes").T
         cosine, sine = np.cos(self.position_angle), np.sin(self.position_angle)
         return np.stack([x * cosine + y * sine, y * cosine - x * sine], axis=1)
 
     @check_arguments
     def to_slopes(self, sky: ArrayLike) -> np.ndarray:
-        """Return the gnomonic slopes (tx, ty) of the light of sources at (xi, eta) [rad], both shape [n, 2]."""
+        """Return the gnomonic slopes (tx, ty) of the light of sources at (xi, eta) [rad], both [n, 2]; NaN of NaN."""
         xi, eta = _angle_pairs(sky, "sky").T
         cosine, sine = np.cos(self.position_angle), np.sin(self.position_angle)
         return np.stack([eta * sine - xi * cosine, -xi * sine - eta * cosine], axis=1)
 
     @check_arguments
     def to_celestial(self, sky: ArrayLike) -> np.ndarray:
-        """Return right ascension, from 0 to 2 pi, and declination [rad] of (xi, eta) [rad], both shape [n, 2]."""
+        """Return right ascension, from 0 to 2 pi, and declination [rad] of (xi, eta) [rad], both [n, 2]; NaN of NaN."""
         xi, eta = _angle_pairs(sky, "sky").T
         along = np.cos(self.dec) - eta * np.sin(self.dec)
         alpha = self.ra + np.arctan2(xi, along)

@@ -27,10 +27,11 @@ LINES = (486.1327e-9, 587.5618e-9, 656.2725e-9)
 _DIAMETERS, _FOCAL_RATIOS, _FIELD_RADII = (1e-6, 1e3), (0.1, 1e6), (1e-9, 1.5)
 
 
-def require_design(diameter: float, f_number: float, field_radius: float) -> None:
-    """Raise :class:`DomainError` where aperture, focal ratio or field of a design is out of range."""
+def require_design(diameter: float, f_number: float, field_radius: float, **focal_ratios: float) -> None:
+    """Raise :class:`DomainError` where aperture, a focal ratio or the field of a design is out of range."""
     require_within(diameter, "diameter", *_DIAMETERS, "m")
-    require_within(f_number, "f_number", *_FOCAL_RATIOS)
+    for name, value in {"f_number": f_number, **focal_ratios}.items():
+        require_within(value, name, *_FOCAL_RATIOS)
     require_within(field_radius, "field_radius", *_FIELD_RADII, "rad")
 
 

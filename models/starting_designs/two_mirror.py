@@ -20,7 +20,6 @@ from typing import Literal
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.units import require_all_positive
 from ..aperture import Annulus, Circle, Complement
 from ..first_order import footprints
 from ..shapes.shape import Conic, Plane
@@ -74,9 +73,7 @@ def two_mirror(
     DomainError
         If a number is out of range, or the mirrors leave nothing of the primary.
     """
-    require_all_positive(
-        diameter=diameter, f_number=f_number, field_radius=field_radius, primary_f_number=primary_f_number
-    )
+    require_design(diameter, f_number, field_radius, primary_f_number=primary_f_number)
     if not primary_f_number < f_number:
         raise DomainError(f"primary_f_number = {primary_f_number!r}: expected below f_number = {f_number:g}")
     f1, radius = primary_f_number * diameter, 0.5 * diameter

@@ -85,18 +85,28 @@ def numbers_of(result, depth=DEPTH):
             yield from ((f"{field.name}.{inner}", a) for inner, a in numbers_of(element, depth - 1))
 
 
-def flags_of(result):
-    """Return the values of what says which results hold, as texts."""
-    names = [n for n in dir(result) if not n.startswith("_") and any(word in n for word in FLAGS)]
+def flags_of(result, depth=3):
+    """Return the values of what says which results hold, as texts, by name."""
+    if isinstance(result, dict):
+        members = list(result.items())[:40]
+    elif isinstance(result, (tuple, list)):
+        members = [(str(i), element) for i, element in enumerate(result[:20])]
+    else:
+        members = [(name, _attribute(result, name)) for name in dir(result) if not name.startswith("_")]
     values = {}
-    for name in names:
-        try:
-            value = getattr(result, name)
-        except Exception:
-            continue
-        if not callable(value):
+    for name, value in members:
+        if any(word in str(name) for word in FLAGS) and not callable(value):
             values[name] = np.array2string(np.asarray(value)) if np.size(value) < 1000 else str(np.sum(value))
+        elif depth and (isinstance(value, (dict, tuple, list)) or dataclasses.is_dataclass(value)):
+            values |= {f"{name}.{inner}": text for inner, text in flags_of(value, depth - 1).items()}
     return values
+
+
+def _attribute(result, name):
+    try:
+        return getattr(result, name)
+    except Exception:
+        return None
 
 
 def outcome(function, arguments):
