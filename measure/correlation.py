@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 SEPARATION_RANGES = {"short": (0.0, 10.0), "long": (10.0, 180.0)}
 EXACT_LIMIT = 10_000
 """Largest number of stars whose pairs are counted exactly by default: a second on one core."""
+#: Largest ellipticity, or product of one and a size, that is correlated.
+_LARGEST = 1e3
 #: Least separation [rad], 0.2 microarcseconds. The square of 1e-200 is zero: TreeCorr ends by a segmentation fault.
 LEAST_SEPARATION = 1e-12
 #: Largest separation [rad]: a whole turn.
@@ -277,6 +279,8 @@ def shear_correlation(
     if n_stars < 2:
         raise DomainError(f"e1, e2: {n_stars} of {len(usable)} stars are usable, expected at least 2")
     px, py, *g = (c[usable] for c in columns)
+    if max(float(np.abs(c).max()) for c in g) > _LARGEST:
+        raise DomainError(f"e1, e2: expected ellipticities of at most {_LARGEST:g}")
     of_stars: dict[str, Any] = {} if weight is None else {"w": weights[usable]}
     if subtract_mean:
         g = [c - np.average(c, weights=of_stars.get("w")) for c in g]

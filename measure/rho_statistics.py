@@ -40,6 +40,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+#: Largest ratio of the sizes of a star and its model.
+_MOST_TIMES = 30.0
+
 
 @dataclass(frozen=True)
 class RhoStatistics(Result):
@@ -124,7 +127,8 @@ def rho_statistics(
     Raises
     ------
     DomainError
-        If shapes differ, a size is not positive, or what
+        If shapes differ, a size is not positive, an ellipticity not below 1, sizes of star and model differ by more than
+        thirty times, or what
         :func:`~pachon.measure.correlation.shear_correlation` raises it for.
     """
     names = ("e1", "e2", "size", "model_e1", "model_e2", "model_size")
@@ -138,6 +142,16 @@ def rho_statistics(
     # One NaN in one of them takes the star out of all: every statistic is of the same stars.
     good = np.all(np.isfinite(columns), axis=0)
     s1, s2, s, m1, m2, m = (np.where(good, c, np.nan) for c in columns)
+    for name, values in (("e1, e2", (s1, s2)), ("model_e1, model_e2", (m1, m2))):
+        if good.any() and not np.nanmax(np.hypot(*values)) < 1.0:
+            raise DomainError(
+                f"{name}: expected ellipticities below 1, the largest is {np.nanmax(np.hypot(*values)):g}"
+            )
+    ratio = np.nanmax(np.abs(np.log(s / m))) if good.any() else 0.0
+    if ratio > np.log(_MOST_TIMES):
+        raise DomainError(
+            f"size, model_size: expected a ratio of at most {_MOST_TIMES:g}, the largest is {np.exp(ratio):g}"
+        )
     trace, model_trace = trace_of_moments(s, s1, s2), trace_of_moments(m, m1, m2)
     growth = (trace - model_trace) / trace
     e, de, w = (s1, s2), (s1 - m1, s2 - m2), (s1 * growth, s2 * growth)
