@@ -127,9 +127,8 @@ def rho_statistics(
     Raises
     ------
     DomainError
-        If shapes differ, a size is not positive, an ellipticity not below 1, sizes of star and model differ by more than
-        thirty times, or what
-        :func:`~pachon.measure.correlation.shear_correlation` raises it for.
+        If shapes differ, a size is not positive, an ellipticity is not below 1, sizes of star and model differ by more
+        than thirty times, or what :func:`~pachon.measure.correlation.shear_correlation` raises it for.
     """
     names = ("e1", "e2", "size", "model_e1", "model_e2", "model_size")
     expectation = f"{', '.join(names)}: expected arrays of real numbers"
