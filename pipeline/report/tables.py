@@ -247,10 +247,10 @@ ATTRIBUTION_COLUMNS = (
     "rms e [%]",
 )
 ATTRIBUTION_CAPTION = (
-    "The same stars without one cause, in g and T of adaptive moments. rms of one component of the noise-free PSFs, and "
-    "of the residuals at the stars and at the holdout positions; mean ξ+ below 10' and from there to 3 deg; change: "
-    "full case less this one beyond 10', with the jackknife error over the CCDs. Last, rms of the noise-free PSFs in "
-    "the weighted e of Jee & Tyson (2011)."
+    "The same stars without one cause, in g and T of adaptive moments. rms of one component of the noise-free PSFs, "
+    "and of the residuals at the stars and at the holdout positions; mean ξ+ below 10' and from there to 3 deg; "
+    "change: full case less this one beyond 10', with the jackknife error over the CCDs. Last, rms of the noise-free "
+    "PSFs in the weighted e of Jee & Tyson (2011)."
 )
 
 

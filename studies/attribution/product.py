@@ -31,7 +31,9 @@ def write_attribution(result: Attribution, folder: Path, config: Configuration) 
     correlation_tables = {
         file: (
             f"xi of {words}, of each case",
-            correlation_columns({f"{case} {kind}": xi for case, kinds in by_case.items() for kind, xi in kinds.items()}),
+            correlation_columns(
+                {f"{case} {kind}": xi for case, kinds in by_case.items() for kind, xi in kinds.items()}
+            ),
         )
         for file, words, by_case in (
             ("correlations_g.ecsv", "g of adaptive moments", result.correlations_g),

@@ -8,7 +8,7 @@ from scipy.special import j0
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, UnknownNameError
 from pachon.core.units import ARCSEC
-from pachon.measure.correlation import SEPARATION_RANGES, SeparationBins, shear_correlation
+from pachon.measure.correlation import SeparationBins, shear_correlation
 from pachon.measure.shapes import measure_shapes
 from pachon.measure.stamps import center_stamps
 from pachon.pipeline.config import load_configuration, with_options
@@ -19,7 +19,7 @@ from pachon.pipeline.simulate.ccd_model import model_ccd
 from pachon.pipeline.summary import correlations
 from pachon.reconstruction.ccd_product import CCD_KINDS, KINDS
 from pachon.studies.attribution import attribution
-from pachon.studies.attribution.attribution import attribute, change_errors, changes, without_cause
+from pachon.studies.attribution.attribution import attribute, change_errors, without_cause
 from pachon.studies.attribution.causes import CAUSES, FULL, GROUND_LIFT, NOISE, OPTICS, checked_causes, without
 from pachon.studies.attribution.product import write_attribution
 from pachon.wavefront.atmosphere.turbulence import structure_function
