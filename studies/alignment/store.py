@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from contextlib import suppress
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -111,7 +111,10 @@ class VisitStore:
         path = self._path(visit)
         try:
             with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as content:
-                quality = FieldMeans(*(float(v) for v in content["quality"]))
+                means = [float(value) for value in content["quality"]]
+                if len(means) != len(fields(FieldMeans)):
+                    raise ValueError(f"{len(means)} means over the field, not {len(fields(FieldMeans))}")
+                quality = FieldMeans(*means)
                 before = dict(json.loads(str(content["inputs"])))
                 record = VisitRecord(quality, *(content[name] for name in _ARRAYS))
         except FileNotFoundError:

@@ -1,10 +1,10 @@
 """Motions of rafts or CCDs that make the images of a focal plane sharpest, roundest or least correlated.
 
 At Gauss-Legendre nodes of each CCD the long-exposure engine gives FWHM, g and T of adaptive moments, and the weighted e
-of the PSF as functions of the height. Piston, tip and tilt of each part then follow from a minimum of the mean over its nodes, with exact
-derivatives; parts do not influence each other, but for the correlation of ellipticities, of which all are found
-together. First the focal plane as a whole is focused, which the camera's hexapod does without any shim: gains are
-counted from there. Results are checked with the engine at other places, and correlated there by TreeCorr.
+of the PSF as functions of the height. Piston, tip and tilt of each part then follow from a minimum of the mean over its
+nodes, with exact derivatives; parts do not influence each other, but for the correlation of ellipticities, of which all
+are found together. First the focal plane as a whole is focused, which the camera's hexapod does without any shim: gains
+are counted from there. Results are checked with the engine at other places, and correlated there by TreeCorr.
 """
 
 from __future__ import annotations
