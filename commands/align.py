@@ -14,7 +14,10 @@ from .tables import Rows, print_json
 from .workers import long_work
 
 app = typer.Typer()
-_CAPTION = "Root mean squares over pupil and field, e weighted; late: the second half of the visits."
+_CAPTION = (
+    "Root mean squares over pupil and field; late: the second half of the visits. g and T = Mxx + Myy are of adaptive "
+    "moments, added to T of the telescope as designed; last, the weighted e of Jee & Tyson (2011), about half of g."
+)
 
 
 @app.command("align")
@@ -85,6 +88,10 @@ def align_command(
     print_line(f"alignment: {out.resolve()}")
 
 
+#: Cells of rows that have no images.
+_NO_IMAGES = ("",) * 4
+
+
 def _show(summary: dict[str, Any]) -> None:
     rows = [
         (
@@ -92,25 +99,37 @@ def _show(summary: dict[str, Any]) -> None:
             f"{summary['designed_wavefront_nm']:.0f}",
             "0",
             "0.0",
+            "0.0",
+            f"{1e3 * summary['designed_rms_g']:.2f}",
             f"{1e3 * summary['designed_rms_e']:.2f}",
         ),
-        ("floor", f"{summary['floor_wavefront_nm']:.0f}", f"{summary['floor_added_nm']:.0f}", "", ""),
+        ("floor", f"{summary['floor_wavefront_nm']:.0f}", f"{summary['floor_added_nm']:.0f}", *_NO_IMAGES),
         (
             "late visits",
             f"{summary['late_wavefront_nm']:.0f}",
             f"{summary['late_added_nm']:.0f}",
             f"{summary['late_fwhm_added_mas']:.1f}",
+            f"{100 * summary['late_t_added_arcsec2'] / summary['designed_t_arcsec2']:.1f}",
+            f"{1e3 * summary['late_rms_g']:.2f}",
             f"{1e3 * summary['late_rms_e']:.2f}",
         ),
         (
             "worst late visit",
             f"{summary['late_worst_wavefront_nm']:.0f}",
             f"{summary['late_worst_added_nm']:.0f}",
-            "",
-            "",
+            *_NO_IMAGES,
         ),
     ]
-    Rows(("", "wavefront [nm]", "added [nm]", "FWHM added [mas]", "rms e [1e-3]"), rows, _CAPTION).show()
+    headings = (
+        "",
+        "wavefront [nm]",
+        "added [nm]",
+        "FWHM added [mas]",
+        "T added [%]",
+        "rms g [1e-3]",
+        "rms e [1e-3]",
+    )
+    Rows(headings, rows, _CAPTION).show()
     first = summary["first_visit_within_1.2_floors"]
     print_line(
         "not within 1.2 times the floor" if first is None else f"within 1.2 times the floor from visit {first} on"

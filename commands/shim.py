@@ -17,8 +17,8 @@ from .tables import Rows, print_json
 app = typer.Typer()
 _CAPTION = (
     "Mean over the area of the CCDs of the long-exposure PSF, at places that the fit did not use. Focused: moved as a "
-    "whole, which needs no shims. Plane: CCDs without heights, focused. xi+: rms over logarithmic bins of separation. "
-    "e is weighted: g of adaptive moments is about twice as large."
+    "whole, which needs no shims. Plane: CCDs without heights, focused. g and T = Mxx + Myy are of adaptive moments, "
+    "xi+ of g: rms over logarithmic bins of separation. Last, the weighted e of Jee & Tyson (2011), about half of g."
 )
 
 
@@ -31,7 +31,7 @@ def shim_command(
         str | None, Option(help="Measured heights: lsstcam, or an ECSV or FITS file; those of the configuration.")
     ] = None,
     merit: Annotated[
-        str, Option("--minimise", "--merit", help="fwhm (mean), ellipticity (rms) or xi (its correlation, rms).")
+        str, Option("--minimise", "--merit", help="fwhm (mean), ellipticity (rms of g) or xi (its correlation, rms).")
     ] = "fwhm",
     parts: Annotated[str, Option(help="rafts or ccds.")] = "rafts",
     out: Annotated[Path, Option("--out", "-o", help="Folder to write to.")] = Path("pachon_shims"),
@@ -71,13 +71,23 @@ def shim_command(
                 state,
                 f"{m.fwhm:.4f}",
                 f"{1e3 * (m.fwhm - reference):+.2f}",
+                f"{m.size:.4f}",
+                f"{1e3 * m.rms_g:.2f}",
+                f"{1e6 * m.rms_xi_g:.2f}",
                 f"{1e3 * m.rms_e:.2f}",
-                f"{1e6 * m.rms_xi:.2f}",
             )
             for state, m in ((state, shims.checked[state]) for state in STATES)
         ]
         Rows(
-            ("focal plane", "mean FWHM [arcsec]", "less focused [mas]", "rms e [1e-3]", "rms xi+ [1e-6]"),
+            (
+                "focal plane",
+                "mean FWHM [arcsec]",
+                "less focused [mas]",
+                "mean T [arcsec²]",
+                "rms g [1e-3]",
+                "rms xi+ of g [1e-6]",
+                "rms e [1e-3]",
+            ),
             rows,
             _CAPTION,
         ).show()

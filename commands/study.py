@@ -22,17 +22,18 @@ app = typer.Typer()
 
 _Number = TypeVar("_Number", int, float)
 _COLUMNS = {
-    "rms_e_at_stars": "at stars: rms e",
-    "rms_e_away": "holdout: rms e",
-    "rms_size_away": "rms size",
-    "mean_e_away": "mean e of a CCD",
-    "xi_plus_away_long": "ξ+ beyond 10'",
+    "rms_g_at_stars": "at stars: rms g",
+    "rms_g_away": "holdout: rms g",
+    "rms_dt_g_away": "rms dT/T",
+    "mean_g_away": "mean g of a CCD",
+    "xi_plus_g_away_long": "ξ+ of g beyond 10'",
+    "rms_e_away": "rms e",
 }
 _CAPTION = (
-    "Residuals of the base, the default, the recommended model, and the best order of each number of stars. Rms of one "
-    "component of e: observed - model at the stars of the fit, which is too small; noise-free - model at holdout "
-    "positions. Also at holdout positions: rms of the relative size, rms over CCDs of the mean e, and mean ξ+ from 10' "
-    "to 3 deg."
+    "Residuals of the base, the default, the recommended model, and the best order of each number of stars, in g and T "
+    "of adaptive moments. Rms of one component of g: observed - model at the stars of the fit, which is too small; "
+    "noise-free - model at holdout positions. Also at holdout positions: rms of dT/T, rms over CCDs of the mean g, "
+    "mean ξ+ from 10' to 3 deg, and rms in the weighted e of Jee & Tyson (2011)."
 )
 
 
@@ -124,10 +125,10 @@ def _show(result: Study) -> None:
     if best_case is None:
         console.print(f"no model of {plan.base.stars} stars could be fitted")
         return
-    error = result.metrics[best_case]["error_rms_e_away"]
+    error = result.metrics[best_case]["error_rms_g_away"]
     console.print(
-        f"recommended for {plan.base.stars} stars of S/N {plan.base.snr:g} and more: {best_case}; residual of e at "
-        f"holdout positions {result.metrics[best_case]['rms_e_away']:.2e} ± {error:.0e}",
+        f"recommended for {plan.base.stars} stars of S/N {plan.base.snr:g} and more: {best_case}; residual of g at "
+        f"holdout positions {result.metrics[best_case]['rms_g_away']:.2e} ± {error:.0e}",
         highlight=False,
     )
 

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from ...core.units import ARCSEC
+from ...measure.adaptive_moments import adaptive_moments
 from ...measure.shapes import fwhm, measure_shapes
 from ...models.telescope import Telescope
 from ...wavefront.atmosphere.atmosphere import Atmosphere
@@ -22,7 +23,7 @@ FIELDS = 30
 RINGS = 7
 #: Spokes of the pupil.
 SPOKES = 28
-#: FWHM of the weight of the moments [rad].
+#: FWHM of the round weight of the paper's moments [rad].
 _WEIGHT = 0.7 * ARCSEC
 
 
@@ -33,7 +34,9 @@ class FieldMeans:
     wavefront: float  #: rms of the wavefront over pupil and field, without piston and tilt [m]
     added: float  #: rms of what it has beyond the telescope as designed [m]
     fwhm: float  #: mean FWHM under the mean of turbulence [arcsec]
-    ellipticity: float  #: rms of the ellipticity, both components together
+    rms_g: float  #: rms of g of adaptive moments, both components together
+    size: float  #: mean T of adaptive moments [arcsec^2]
+    rms_e: float  #: rms of the weighted e, both components together
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,12 +84,15 @@ class FieldQuality:
             stamps=Stamps(41),
             threads=threads,
         )
+        moments = adaptive_moments(stars.image, stars.pixel_scale, threads=threads)
         shapes = measure_shapes(stars.image, stars.pixel_scale, _WEIGHT)
         return FieldMeans(
             wavefront=_rms(wavefront),
             added=_rms(wavefront - self._designed),
             fwhm=float(np.mean(fwhm(stars.image, stars.pixel_scale))) / ARCSEC,
-            ellipticity=float(np.sqrt(np.mean(shapes.e1**2 + shapes.e2**2))),
+            rms_g=float(np.sqrt(np.mean(moments.g1**2 + moments.g2**2))),
+            size=float(np.mean(moments.T)) / ARCSEC**2,
+            rms_e=float(np.sqrt(np.mean(shapes.e1**2 + shapes.e2**2))),
         )
 
 

@@ -32,12 +32,18 @@ def alignment_summary(alignment: Alignment) -> dict[str, Any]:
     # The second half of the visits, after the loop has settled.
     late = slice(len(added) // 2, None)
     widths = np.array([v.fwhm for v in alignment.visits]) - alignment.designed.fwhm
-    ellipticity = np.array([v.ellipticity for v in alignment.visits])
+    sizes = np.array([v.size for v in alignment.visits]) - alignment.designed.size
+
+    def late_rms(key: str) -> float:
+        return float(np.sqrt(np.mean([getattr(v, key) ** 2 for v in alignment.visits[late]])))
+
     return {
         "visits": len(added),
         "designed_wavefront_nm": 1e9 * alignment.designed.wavefront,
         "designed_fwhm_arcsec": alignment.designed.fwhm,
-        "designed_rms_e": alignment.designed.ellipticity,
+        "designed_rms_g": alignment.designed.rms_g,
+        "designed_t_arcsec2": alignment.designed.size,
+        "designed_rms_e": alignment.designed.rms_e,
         "floor_added_nm": 1e9 * alignment.floor,
         "floor_wavefront_nm": 1e9 * floor,
         "first_added_nm": 1e9 * added[0],
@@ -47,7 +53,9 @@ def alignment_summary(alignment: Alignment) -> dict[str, Any]:
         "late_added_nm": 1e9 * float(np.sqrt(np.mean(added[late] ** 2))),
         "late_worst_added_nm": 1e9 * float(added[late].max()),
         "late_fwhm_added_mas": 1e3 * float(widths[late].mean()),
-        "late_rms_e": float(np.sqrt(np.mean(ellipticity[late] ** 2))),
+        "late_rms_g": late_rms("rms_g"),
+        "late_t_added_arcsec2": float(sizes[late].mean()),
+        "late_rms_e": late_rms("rms_e"),
     }
 
 
@@ -63,7 +71,9 @@ def write_alignment(alignment: Alignment, folder: Path) -> tuple[str, ...]:
         "added": (1e9 * np.array([v.added for v in alignment.visits]), "nm", "rms beyond the telescope as designed"),
         "expected": (1e9 * alignment.expected, "nm", "rms of what is added that the covariance of the states expects"),
         "fwhm": (np.array([v.fwhm for v in alignment.visits]), "arcsec", "mean FWHM under the mean of turbulence"),
-        "rms_e": (np.array([v.ellipticity for v in alignment.visits]), "", "rms ellipticity, both components"),
+        "rms_g": (np.array([v.rms_g for v in alignment.visits]), "", "rms g of adaptive moments, both components"),
+        "t": (np.array([v.size for v in alignment.visits]), "arcsec2", "mean T of adaptive moments"),
+        "rms_e": (np.array([v.rms_e for v in alignment.visits]), "", "rms weighted e, both components"),
         "donuts": (alignment.donuts, "", "donuts used"),
     }
     tables = {"visits.ecsv": ("visits of an active-optics loop", columns)}
@@ -99,7 +109,7 @@ def quality_picture(alignment: Alignment) -> bytes:
     panels = (
         ("wavefront added [nm rms]", [1e9 * v.added for v in alignment.visits]),
         ("FWHM added [mas]", [1e3 * (v.fwhm - designed.fwhm) for v in alignment.visits]),
-        ("rms ellipticity [1e-3]", [1e3 * v.ellipticity for v in alignment.visits]),
+        ("rms g of adaptive moments [1e-3]", [1e3 * v.rms_g for v in alignment.visits]),
     )
     with styled():
         figure = new_figure(7.0, 8.0)
@@ -117,9 +127,7 @@ def quality_picture(alignment: Alignment) -> bytes:
         panel_axes[1].set_yscale("symlog", linthresh=10.0)
         panel_axes[1].yaxis.set_major_formatter(PLAIN)
         panel_axes[1].axhline(0.0, color=GREY, linewidth=0.8, linestyle="--", label="as designed")
-        panel_axes[2].axhline(
-            1e3 * designed.ellipticity, color=GREY, linewidth=0.8, linestyle="--", label="as designed"
-        )
+        panel_axes[2].axhline(1e3 * designed.rms_g, color=GREY, linewidth=0.8, linestyle="--", label="as designed")
         for axes in panel_axes:
             axes.legend(fontsize=8)
         panel_axes[1].set_ylim(bottom=-5.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from contextlib import suppress
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -112,7 +112,10 @@ class VisitStore:
             return None
         try:
             content = read_arrays(path, "expected a visit of a loop; delete it, and go on", ProductError)
-            quality = FieldMeans(*(float(v) for v in content["quality"]))
+            means = [float(value) for value in content["quality"]]
+            if len(means) != len(fields(FieldMeans)):
+                raise ValueError(f"{len(means)} means over the field, not {len(fields(FieldMeans))}")
+            quality = FieldMeans(*means)
             before = dict(json.loads(str(content["inputs"])))
             record = VisitRecord(quality, *(content[name] for name in _ARRAYS))
         except (ValueError, KeyError, TypeError) as error:

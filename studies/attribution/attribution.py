@@ -32,25 +32,29 @@ from ...pipeline.memory import check_memory
 from ...pipeline.simulate.ccd_exposure import CcdExposure
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_model import model_ccd
-from ...pipeline.summary import correlations, ellipticities, has_focal_plane_model
-from ...reconstruction.ccd_product import CCD_KINDS, CcdProduct, CcdStars
+from ...pipeline.summary import correlations, ellipticities, has_focal_plane_model, size_residuals
+from ...reconstruction.ccd_product import CCD_KINDS, MOMENTS, CcdProduct, CcdStars
 from .causes import FULL, NOISE, OPTICS, checked_causes, without
 
 _XI = ("truth", "observed", "residual", "away")
+#: What keys of metrics have before the kind, by moments.
+_PREFIX = {"e": "", "g": "g_"}
 
 
 @dataclass(frozen=True)
 class Attribution:
     """Metrics with all causes (``full``), and without each.
 
-    Metrics are rms of e and of its residuals, median FWHM, and the mean xi+ of noise-free PSFs, observed stars and
-    residuals, over short and long separations. ``change_`` and a key is the effect of the cause, the full case less
-    this one; ``error_`` and a key of xi+ its jackknife error over the CCDs. With a focal-plane model there are those of
-    the CCDs' own models too, with ``_ccd`` in their keys.
+    Metrics are the rms of one component of the ellipticity and of its residuals, the rms of dT/T of the residuals,
+    median FWHM, and the mean xi+ of noise-free PSFs, observed stars and residuals, over short and long separations.
+    Keys with ``_g`` are of g and T of adaptive moments; the others of the weighted e, as the paper's. ``change_`` and
+    a key is the effect of the cause, the full case less this one; ``error_`` and a key of xi+ its jackknife error over
+    the CCDs. With a focal-plane model there are those of the CCDs' own models too, with ``_ccd`` in their keys.
     """
 
     metrics: dict[str, dict[str, float]]  #: by case
-    correlations: dict[str, dict[str, Correlation]]  #: by case and kind
+    correlations: dict[str, dict[str, Correlation]]  #: of the weighted e, by case and kind
+    correlations_g: dict[str, dict[str, Correlation]]  #: of g, by case and kind; none where images have no moments
     left_out: dict[str, str]  #: reason by CCD that cannot be modelled in some case, and is left out of all
 
 
@@ -93,15 +97,18 @@ def attribute(
     if not stars[FULL].keys() - left_out:
         name, reason = next(iter(left_out.items()))
         raise DomainError(f"{reason}; no CCD can be modelled in all cases", subject=f"CCD {name}")
-    correlated, metrics = {}, {}
-    order = (FULL, *cause_names)
-    for case in order:
+    correlated: dict[str, dict[str, dict[str, Correlation]]] = {moments: {} for moments in MOMENTS}
+    metrics = {}
+    for case in (FULL, *cause_names):
         common_stars = [ccd_stars for name, ccd_stars in stars[case].items() if name not in left_out]
-        correlated[case] = correlations(common_stars, common_stars[0].kinds)
-        metrics[case] = _case_metrics(common_stars, correlated[case])
+        for moments in MOMENTS:
+            correlated[moments][case] = correlations(common_stars, common_stars[0].kinds, moments)
+        metrics[case] = _case_metrics(common_stars, {moments: correlated[moments][case] for moments in MOMENTS})
     for case in cause_names:
-        metrics[case] |= changes(metrics[FULL], metrics[case], correlated[FULL], correlated[case])
-    return Attribution(metrics, correlated, left_out)
+        metrics[case] |= changes(metrics[FULL], metrics[case])
+        for moments in MOMENTS:
+            metrics[case] |= change_errors(correlated[moments][FULL], correlated[moments][case], moments)
+    return Attribution(metrics, correlated["e"], correlated["g"], left_out)
 
 
 def without_cause(full: Experiment, cause: str) -> Experiment:
@@ -138,40 +145,56 @@ def _stars_by_case(
     return stars_by_kind, simulated.not_modelled
 
 
-def _case_metrics(stars: Sequence[CcdStars], correlated: dict[str, Correlation]) -> dict[str, float]:
+def _case_metrics(stars: Sequence[CcdStars], correlated: dict[str, dict[str, Correlation]]) -> dict[str, float]:
+    """Return the metrics of a case from its stars, and from their correlations by moments and kind."""
     residuals = {"at_stars": "residual", "left_out": "left_out", "away": "away"}
     if has_focal_plane_model(stars):
         residuals |= {"at_stars_ccd": "residual_ccd", "away_ccd": "away_ccd"}
-    metrics = {"rms_e_truth": rms(ellipticities(stars, "truth"))}
-    metrics |= {f"rms_residual_{name}": rms(ellipticities(stars, kind)) for name, kind in residuals.items()}
+    metrics = {}
+    for moments, prefix in _PREFIX.items():
+        metrics[f"rms_{moments}_truth"] = rms(ellipticities(stars, "truth", moments))
+        for name, kind in residuals.items():
+            metrics[f"rms_residual_{prefix}{name}"] = rms(ellipticities(stars, kind, moments))
+    for name, kind in residuals.items():
+        metrics[f"rms_dt_g_{name}"] = rms(size_residuals(stars, kind, "g"))
     metrics["fwhm_arcsec"] = float(np.nanmedian(np.concatenate([s.holdout.fwhm for s in stars]))) / ARCSEC
-    for kind in (k for k in (*_XI, *CCD_KINDS) if k in correlated):
-        for name in SEPARATION_RANGES:
-            metrics[f"xi_plus_{kind}_{name}"] = correlated[kind].mean_xi_plus(name)
+    for moments, prefix in _PREFIX.items():
+        # A correlation of g is absent where images have no adaptive moments; that of e is not.
+        for kind in (k for k in (*_XI, *CCD_KINDS) if k in correlated["e"]):
+            for name in SEPARATION_RANGES:
+                correlation = correlated[moments].get(kind)
+                mean = np.nan if correlation is None else correlation.mean_xi_plus(name)
+                metrics[f"xi_plus_{prefix}{kind}_{name}"] = mean
     return metrics
 
 
-def changes(
-    full: Mapping[str, float],
-    case: Mapping[str, float],
-    with_all: Mapping[str, Correlation],
-    without: Mapping[str, Correlation],
-) -> dict[str, float]:
-    """Return the metrics of the full case less those of another, with jackknife errors of xi+.
+def changes(full: Mapping[str, float], case: Mapping[str, float]) -> dict[str, float]:
+    """Return the metrics of the full case less those of another."""
+    return {f"change_{key}": full[key] - case[key] for key in case}
 
-    The stars are the same in both, so that errors in common cancel.
+
+def change_errors(
+    with_all: Mapping[str, Correlation], without: Mapping[str, Correlation], moments: str = "e"
+) -> dict[str, float]:
+    """Return jackknife errors of the changes of xi+ of e, or of g, between the full case and another.
+
+    The stars are the same in both, so that errors in common cancel. NaN where the CCDs of both are not the same.
     """
-    change_metrics = {f"change_{key}": full[key] - case[key] for key in case}
+    errors = {}
     for kind in (k for k in (*_XI, *CCD_KINDS) if k in with_all):
         for name in SEPARATION_RANGES:
-            full_correlation, case_correlation = with_all[kind], without[kind]
+            full_correlation, case_correlation = with_all[kind], without.get(kind)
             error = np.nan
-            if full_correlation.n_patches and full_correlation.n_patches == case_correlation.n_patches:
+            if (
+                case_correlation is not None
+                and full_correlation.n_patches
+                and full_correlation.n_patches == case_correlation.n_patches
+            ):
                 error = float(
                     jackknife_error(
                         full_correlation.leave_one_out_mean_xi_plus(name)
                         - case_correlation.leave_one_out_mean_xi_plus(name)
                     )
                 )
-            change_metrics[f"error_xi_plus_{kind}_{name}"] = error
-    return change_metrics
+            errors[f"error_xi_plus_{_PREFIX[moments]}{kind}_{name}"] = error
+    return errors

@@ -28,18 +28,26 @@ def write_attribution(result: Attribution, folder: Path, config: Configuration) 
     for key in keys:
         values = np.array([case.get(key, np.nan) for case in result.metrics.values()])
         columns[key] = (values, "arcsec" if key.endswith("arcsec") else "", _metric_description(key))
-    xi = {
-        f"{case} {kind}": correlation
-        for case, case_correlations in result.correlations.items()
-        for kind, correlation in case_correlations.items()
+    correlation_tables = {
+        file: (
+            f"xi of {words}, of each case",
+            correlation_columns(
+                {f"{case} {kind}": xi for case, kinds in by_case.items() for kind, xi in kinds.items()}
+            ),
+        )
+        for file, words, by_case in (
+            ("correlations_g.ecsv", "g of adaptive moments", result.correlations_g),
+            ("correlations.ecsv", "the weighted e", result.correlations),
+        )
+        if any(by_case.values())
     }
     return write_products(
         folder,
         {
             "attribution.ecsv": ("the same stars without one cause", columns),
-            "correlations.ecsv": ("xi of each case", correlation_columns(xi)),
+            **correlation_tables,
         },
-        {"attribution.png": attribution_plot(result.metrics, result.correlations)},
+        {"attribution.png": attribution_plot(result.metrics, result.correlations_g)},
         {"attribution.json": {"figures": result.metrics, "left_out": result.left_out}},
         stamp_of(Experiment.from_config(config)).meta(),
         config,
@@ -53,15 +61,23 @@ def _metric_description(key: str) -> str:
             return words + _metric_description(key.removeprefix(start))
     if key.startswith("xi_plus_"):
         low, high = SEPARATION_RANGES[key.rpartition("_")[2]]
-        kind = key.removeprefix("xi_plus_").rpartition("_")[0].replace("_ccd", " of the CCDs' own models")
-        return f"mean xi+ of {kind}, {low:g} to {high:g} arcmin"
-    return "median FWHM" if key == "fwhm_arcsec" else key.replace("_", " ") + ", one component"
+        kind = key.removeprefix("xi_plus_").rpartition("_")[0]
+        ellipticity = "g" if kind.startswith("g_") else "the weighted e"
+        kind = kind.removeprefix("g_").replace("_ccd", " of the CCDs' own models")
+        return f"mean xi+ of {ellipticity}, {kind}, {low:g} to {high:g} arcmin"
+    if key == "fwhm_arcsec":
+        return "median FWHM"
+    if key.startswith("rms_dt_g_"):
+        return f"rms of (T - T model)/T of adaptive moments, {key.removeprefix('rms_dt_g_').replace('_', ' ')}"
+    ellipticity = "g of adaptive moments" if key.startswith(("rms_g_", "rms_residual_g_")) else "the weighted e"
+    words = key.removeprefix("rms_").replace("residual_g_", "residual_").removeprefix("g_").removeprefix("e_")
+    return f"rms of one component of {ellipticity}, {words.replace('_', ' ')}"
 
 
 def attribution_plot(
     metrics: Mapping[str, Mapping[str, float]], correlations: Mapping[str, Mapping[str, Correlation]]
 ) -> bytes:
-    """Draw rms ellipticities and residuals as bars, and xi+ as curves, for each case."""
+    """Draw rms of g and of its residuals as bars, and xi+ of g as curves, for each case."""
     cases = list(metrics)
     colors = dict(zip(cases, matplotlib.colormaps["tab10"](np.arange(len(cases)) % 10), strict=True)) | {FULL: "black"}
     with styled():
@@ -70,23 +86,25 @@ def attribution_plot(
         for axes, keys in zip(
             panels[0],
             (
-                (("rms_e_truth", TRUTH, "noise-free PSFs"),),
+                (("rms_g_truth", TRUTH, "noise-free PSFs"),),
                 (
-                    ("rms_residual_at_stars", RESIDUAL, "observed - model, at the stars"),
-                    ("rms_residual_away", AWAY, "noise-free - model, at holdout positions"),
+                    ("rms_residual_g_at_stars", RESIDUAL, "observed - model, at the stars"),
+                    ("rms_residual_g_away", AWAY, "noise-free - model, at holdout positions"),
                 ),
             ),
             strict=True,
         ):
             _draw_bars(axes, metrics, keys)
-        panels[0, 0].set_title("rms of one component of e: noise-free PSFs", loc="left")
-        panels[0, 1].set_title("rms of one component of the residual", loc="left")
+        panels[0, 0].set_title("rms of one component of g: noise-free PSFs", loc="left")
+        panels[0, 1].set_title("rms of one component of the residual of g", loc="left")
         for axes, kind, title in (
-            (panels[1, 0], "truth", "$|\\xi_+|$ of the noise-free PSFs"),
-            (panels[1, 1], "away", "$|\\xi_+|$ of noise-free - model, at holdout positions"),
+            (panels[1, 0], "truth", "$|\\xi_+|$ of g, noise-free PSFs"),
+            (panels[1, 1], "away", "$|\\xi_+|$ of g, noise-free - model, at holdout positions"),
         ):
             for case, case_correlations in correlations.items():
-                _draw_curve(axes, case_correlations[kind], colors[case], case)
+                # Images narrower than a pixel have no adaptive moments, and so no correlation of g.
+                if kind in case_correlations:
+                    _draw_curve(axes, case_correlations[kind], colors[case], case)
             log_axes(axes, f"{title}; open: negative")
             axes.set_xlabel("separation [arcmin]")
         handles, labels = panels[1, 0].get_legend_handles_labels()

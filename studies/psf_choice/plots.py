@@ -25,14 +25,14 @@ _HOW = {
     "focal_plane": ("#c2307f", "v", FOCAL_PLANE["focal_plane"]),
 }
 _BASIS = dict(zip(BASES, ((OBSERVED, "o"), (AWAY, "s"), (LEFT_OUT, "D")), strict=False))
-_RMS = "rms of one component of e, no star"
+_RMS = "rms of one component of g, no star"
 # Upper limit of the axis over the base: fits with as many terms as stars diverge.
 _LIMIT = 4.0
 _QUIET = (0, (1, 1.5))
 
 
 def stars_plot(result: Study) -> bytes:
-    """Draw the residual of e at the holdout positions against the number of stars, by order and weighting."""
+    """Draw the residual of g at the holdout positions against the number of stars, by order and weighting."""
     plan = result.plan
     colors = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.88, len(plan.orders)))
     with styled():
@@ -41,11 +41,11 @@ def stars_plot(result: Study) -> bytes:
         for axes, how in zip(panels, POLYNOMIALS, strict=True):
             for order, color in zip(plan.orders, colors, strict=True):
                 cases = [(n, replace(plan.base, stars=n, order=order, interpolation=how)) for n in plan.stars]
-                _draw_line(axes, result, cases, "rms_e_away", color, "o", f"order {order}")
-                _draw_line(axes, result, cases, "noise_law_away", color, "", None, (0, (4, 2)))
+                _draw_line(axes, result, cases, "rms_g_away", color, "o", f"order {order}")
+                _draw_line(axes, result, cases, "noise_law_g_away", color, "", None, (0, (4, 2)))
                 if how == "equal":
                     quiet = [(n, replace(c, snr=NOISE_FREE)) for n, c in cases]
-                    _draw_line(axes, result, quiet, "rms_e_away", color, "", None, _QUIET)
+                    _draw_line(axes, result, quiet, "rms_g_away", color, "", None, _QUIET)
             _logarithmic_axes(axes, plan.stars, "stars of a CCD", _HOW[how][2])
         panels[0].set_ylabel(_RMS)
         _limit_axis(panels[0], result)
@@ -67,8 +67,8 @@ def choices_plot(result: Study) -> bytes:
         _draw_bases(panels[0, 2], result)
         _draw_snrs(panels[0, 3], result)
         for axes, key, ylabel in (
-            (panels[1, 0], "rms_e_away", _RMS),
-            (panels[1, 1], "rms_size_away", "rms of the relative size, no star"),
+            (panels[1, 0], "rms_g_away", _RMS),
+            (panels[1, 1], "rms_dt_g_away", "rms of dT/T, no star"),
         ):
             for how in (*POLYNOMIALS, *plan.without_polynomials):
                 color, marker, label = _HOW[how]
@@ -79,16 +79,18 @@ def choices_plot(result: Study) -> bytes:
             _draw_line(axes, result, by_default, key, RESIDUAL, "*", f"default: {plan.default}")
             paper = [(n, replace(base, stars=n)) for n in plan.stars]
             _draw_line(axes, result, paper, key, TRUTH, "x", f"{_HOW[base.interpolation][2]}, order {base.order}")
-            _logarithmic_axes(
-                axes, plan.stars, "stars of a CCD", "interpolation" + (": size" if "size" in key else ": e")
-            )
+            _logarithmic_axes(axes, plan.stars, "stars of a CCD", "interpolation" + (": T" if "dt" in key else ": g"))
             axes.set_ylabel(ylabel)
         _limit_axis(panels[1, 0], result)
         _draw_common_residuals(
-            panels[1, 2], result, "mean_e", "rms over CCDs of their mean of e", "what a CCD has in common"
+            panels[1, 2], result, "mean_g", "rms over CCDs of their mean of g", "what a CCD has in common"
         )
         _draw_common_residuals(
-            panels[1, 3], result, "xi_plus", "$|\\xi_+|$, 10' to 3 deg; open: negative", "correlation between CCDs"
+            panels[1, 3],
+            result,
+            "xi_plus_g",
+            "$|\\xi_+|$ of g, 10' to 3 deg; open: negative",
+            "correlation between CCDs",
         )
         for axes in panels.flat:
             # Room for the legend above the curves, on a logarithmic scale.
@@ -106,13 +108,15 @@ def _draw_orders(axes: Axes, result: Study) -> None:
         ("at_stars", RESIDUAL, "D", "observed", "at the stars"),
         ("away", AWAY, "^", "truth", "no star"),
     ):
-        _draw_line(axes, result, cases, f"rms_e_{kind}", color, marker, f"{observed_or_truth} - model, {where}")
-        _draw_line(axes, result, cases, f"noise_law_{kind}", color, "", f"noise alone, {where}, in theory", (0, (4, 2)))
+        _draw_line(axes, result, cases, f"rms_g_{kind}", color, marker, f"{observed_or_truth} - model, {where}")
+        _draw_line(
+            axes, result, cases, f"noise_law_g_{kind}", color, "", f"noise alone, {where}, in theory", (0, (4, 2))
+        )
     quiet = [(order, replace(c, snr=NOISE_FREE)) for order, c in cases]
-    _draw_line(axes, result, quiet, "rms_e_away", TRUTH, "", "truth - model, stars without noise", _QUIET)
+    _draw_line(axes, result, quiet, "rms_g_away", TRUTH, "", "truth - model, stars without noise", _QUIET)
     _log_values(axes)
     axes.set_xticks(plan.orders)
-    axes.set(xlabel="order of the polynomials", ylabel="rms of one component of e")
+    axes.set(xlabel="order of the polynomials", ylabel="rms of one component of g")
     axes.set_title(f"order: {base.stars} stars, {_HOW[base.interpolation][2]}", loc="left")
     axes.grid(True, which="major", color="0.9", linewidth=0.6)
 
@@ -121,7 +125,7 @@ def _draw_components(axes: Axes, result: Study) -> None:
     plan, base = result.plan, result.plan.base
     _draw_against(axes, result, "components", plan.components)
     quiet = [(k, replace(base, components=k, snr=NOISE_FREE)) for k in plan.components]
-    _draw_line(axes, result, quiet, "rms_e_away", TRUTH, "", f"order {base.order}, stars without noise", _QUIET)
+    _draw_line(axes, result, quiet, "rms_g_away", TRUTH, "", f"order {base.order}, stars without noise", _QUIET)
     _logarithmic_axes(axes, plan.components, "components", f"components: {base.stars} stars")
     axes.set_ylabel(_RMS)
 
@@ -143,7 +147,7 @@ def _draw_against(axes: Axes, result: Study, key: str, values: Sequence[float]) 
             way = replace(base, order=order, interpolation=how)
             cases = [(v, replace(way, **{key: v})) for v in values]  # type: ignore[arg-type]
             text = f"{label}, order {order}" if how in POLYNOMIALS else label
-            _draw_line(axes, result, cases, "rms_e_away", color, marker, text, line)
+            _draw_line(axes, result, cases, "rms_g_away", color, marker, text, line)
 
 
 def _draw_bases(axes: Axes, result: Study) -> None:
@@ -151,9 +155,9 @@ def _draw_bases(axes: Axes, result: Study) -> None:
     for basis in BASES:
         color, marker = _BASIS[basis]
         cases = [(n, replace(base, basis=basis, stars=n)) for n in plan.stars]
-        _draw_line(axes, result, cases, "rms_e_away", color, marker, basis)
+        _draw_line(axes, result, cases, "rms_g_away", color, marker, basis)
         quiet = [(n, replace(c, snr=NOISE_FREE)) for n, c in cases]
-        _draw_line(axes, result, quiet, "rms_e_away", color, "", f"{basis}, stars without noise", _QUIET)
+        _draw_line(axes, result, quiet, "rms_g_away", color, "", f"{basis}, stars without noise", _QUIET)
     _logarithmic_axes(axes, plan.stars, "stars of a CCD", f"basis: {_HOW[base.interpolation][2]}, order {base.order}")
     axes.set_ylabel(_RMS)
     _limit_axis(axes, result)
@@ -171,7 +175,7 @@ def _draw_common_residuals(axes: Axes, result: Study, key: str, label: str, titl
     for name, (way, line) in ways.items():
         cases = [(n, replace(way, stars=n)) for n in plan.stars]
         for kind, color, marker, where in (("at_stars", RESIDUAL, "D", "at the stars"), ("away", AWAY, "^", "no star")):
-            ending = "_long" if key == "xi_plus" else ""
+            ending = "_long" if key == "xi_plus_g" else ""
             _draw_line(axes, result, cases, f"{key}_{kind}{ending}", color, marker, f"{where}: {name}", line)
     _logarithmic_axes(axes, plan.stars, "stars of a CCD", title)
     axes.set_ylabel(label)
@@ -244,4 +248,4 @@ def _limit_axis(axes: Axes, result: Study) -> None:
     base = result.metrics.get(result.plan.base)
     low, high = axes.get_ylim()
     if base is not None:
-        axes.set_ylim(low, min(high, _LIMIT * base["rms_e_away"]))
+        axes.set_ylim(low, min(high, _LIMIT * base["rms_g_away"]))

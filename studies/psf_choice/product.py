@@ -79,14 +79,19 @@ def _metric_description(key: str) -> str:
         return "standard error over the CCDs: " + _metric_description(key.removeprefix("error_"))
     where = "observed - model, at the stars" if "at_stars" in key else "truth - model, where no star is"
     descriptions = {
-        "rms_e": "rms of one component of e",
-        "rms_size": "rms of the relative size",
-        "mean_e": "rms over CCDs of their mean of one component of e",
-        "noise_law": "rms of one component of e that noise alone should leave",
+        "rms_g": "rms of one component of g of adaptive moments",
+        "rms_dt_g": "rms of dT/T of adaptive moments",
+        "mean_g": "rms over CCDs of their mean of one component of g",
+        "noise_law_g": "rms of one component of g that noise alone should leave",
+        "rms_e": "rms of one component of the weighted e",
+        "rms_size": "rms of the relative weighted size",
+        "mean_e": "rms over CCDs of their mean of one component of the weighted e",
+        "noise_law": "rms of one component of the weighted e that noise alone should leave",
         "lost": "places whose model has no shape",
     }
     if key.startswith("xi_plus"):
         low, high = SEPARATION_RANGES["long"]
         span = f"below {low:g}" if key.endswith("short") else f"{low:g} to {high:g}"
-        return f"xi+ {span} arcmin, {where}"
+        ellipticity = "g" if key.startswith("xi_plus_g_") else "the weighted e"
+        return f"xi+ of {ellipticity} {span} arcmin, {where}"
     return next(f"{words}, {where}" for start, words in descriptions.items() if key.startswith(start))

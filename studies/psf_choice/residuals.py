@@ -8,20 +8,32 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...core.errors import DomainError
+from ...core.statistics import finite_mean
 from ...core.threads import one_blas_thread
 from ...core.units import ARCMIN
+from ...measure.adaptive_moments import AdaptiveMoments
 from ...measure.correlation import SEPARATION_RANGES, SeparationBins, jackknife_error, shear_correlation
+from ...measure.rho_statistics import trace_of_moments
 from ...measure.shapes import Shapes, measure_shapes
 from ...pipeline.experiment import Experiment
+from ...reconstruction.focal_plane_psf.adaptive_shapes import AdaptiveShapes
 from ...reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ...reconstruction.focal_plane_psf.mosaic import PsfShapes
 from ...reconstruction.psf_model.model import PsfModel
 from ...reconstruction.psf_model.polynomial import Extent, design_matrix
 from .plan import POLYNOMIALS, Case
-from .stars import ObservedCcd, SimulatedCcd, used_stars
+from .stars import ObservedCcd, SimulatedCcd, star_moments, used_stars
 
 #: Residuals: observed - model at the stars, and noise-free PSF - model at the holdout positions.
 KINDS = ("at_stars", "away")
+#: Rows of the residuals of a CCD: weighted e1 and e2.
+_E = slice(0, 2)
+#: Row of the relative weighted size.
+_SIZE = 2
+#: Rows of g1 and g2 of adaptive moments.
+_G = slice(3, 5)
+#: Row of dT/T of adaptive moments.
+_DT = 5
 # Two bins of equal width in the logarithm: 0.56' to 10', and 10' to 180'.
 _LOW, _HIGH = SEPARATION_RANGES["long"]
 _BINS = SeparationBins(_LOW**2 / _HIGH * ARCMIN, _HIGH * ARCMIN, 2)
@@ -31,11 +43,11 @@ _BINS = SeparationBins(_LOW**2 / _HIGH * ARCMIN, _HIGH * ARCMIN, 2)
 class Residuals:
     """Residuals of one case and one draw of the noise, for each of :data:`KINDS`."""
 
-    square: np.ndarray  #: [n_ccd, kind, 2] mean squares of one component of e, and of the relative size
-    mean: np.ndarray  #: [n_ccd, kind, 2] means of e1 and e2
-    law: np.ndarray  #: [n_ccd, kind] mean squares of e by :func:`noise_law`
-    xi: np.ndarray  #: [kind, 2] xi+ of short and long separations, of all CCDs
-    xi_left: np.ndarray  #: [kind, n_ccd, 2] the same without each CCD
+    square: np.ndarray  #: [n_ccd, kind, 4] mean squares of one component of e, of the relative size, of g, of dT/T
+    mean: np.ndarray  #: [n_ccd, kind, 4] means of e1, e2, g1 and g2
+    law: np.ndarray  #: [n_ccd, kind, 2] mean squares of e and of g by :func:`noise_law`
+    xi: np.ndarray  #: [kind, 2, 2] xi+ of e and of g, of short and long separations, of all CCDs
+    xi_left: np.ndarray  #: [kind, 2, n_ccd, 2] the same without each CCD
     lost: int  #: holdout positions at which the model has no shape
 
 
@@ -50,7 +62,8 @@ def measure_residuals(
     """Measure the residuals of the models of all CCDs, one for each."""
     residuals: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     fields: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
-    law = np.full((len(ccds), 2), np.nan)
+    lost = 0
+    law = np.full((len(ccds), 2, 2), np.nan)
     for i, (ccd, stars, model) in enumerate(zip(ccds, observed, models, strict=True)):
         if isinstance(model, PsfModel) and model.basis.kind.ordered:
             model = model.truncated(min(case.components, model.n_components))
@@ -60,46 +73,76 @@ def measure_residuals(
             (
                 places.observed[used],
                 Shapes(*(v[used] for v in vars(stars.observation.shapes).values())),
+                stars.moments,
                 exposure.observed,
                 used,
             ),
-            (places.holdout, ccd.holdout, exposure.holdout, np.ones(len(places.holdout), dtype=bool)),
+            (
+                places.holdout,
+                ccd.holdout,
+                ccd.holdout_moments,
+                exposure.holdout,
+                np.ones(len(places.holdout), dtype=bool),
+            ),
         )
-        for k, (at, shapes, exposed, star_mask) in enumerate(jobs):
+        for k, (at, shapes, moments, exposed, star_mask) in enumerate(jobs):
             model_shapes: Shapes | PsfShapes
+            model_moments: AdaptiveMoments | AdaptiveShapes
             if isinstance(model, PsfModel):
-                model_shapes = measure_shapes(model.at(at), exposed.pixel_scale, experiment.weight_fwhm)
+                images = model.at(at)
+                model_shapes = measure_shapes(images, exposed.pixel_scale, experiment.weight_fwhm)
+                model_moments = star_moments(images, exposed.pixel_scale, threads)
             else:
                 model_shapes = model.shapes(exposure.name, *at.T, threads=threads)
+                model_moments = model.adaptive_shapes(model_shapes)
             if not np.isfinite(model_shapes.e1).any():
                 raise DomainError(f"CCD {exposure.name}: the model has no shape anywhere")
+            trace, model_trace = (trace_of_moments(m.sigma, m.g1, m.g2) for m in (moments, model_moments))
             residuals[k].append(
                 np.stack(
-                    [shapes.e1 - model_shapes.e1, shapes.e2 - model_shapes.e2, shapes.size / model_shapes.size - 1.0]
+                    [
+                        shapes.e1 - model_shapes.e1,
+                        shapes.e2 - model_shapes.e2,
+                        shapes.size / model_shapes.size - 1.0,
+                        moments.g1[star_mask] - model_moments.g1,
+                        moments.g2[star_mask] - model_moments.g2,
+                        1.0 - model_trace / trace[star_mask],
+                    ]
                 )
             )
             fields[k].append(exposed.fields[star_mask])
+            if k == 1:
+                lost += int((np.isnan(model_shapes.e1) | (np.isnan(model_moments.g1) & moments.usable)).sum())
         if isinstance(model, PsfModel) and case.interpolation in POLYNOMIALS:
-            law[i] = noise_law(
-                places.observed[used], places.holdout, stars.variance[used], model.weights, case.order, model.extent
+            laws = (
+                noise_law(places.observed[used], places.holdout, v[used], model.weights, case.order, model.extent)
+                for v in (stars.variance, stars.variance_g)
             )
-    correlated = [residual_correlations(*pair) for pair in zip(fields, residuals, strict=True)]
+            law[i] = np.transpose([*laws])
+    correlated = [
+        [residual_correlations(field, [r[rows] for r in kind]) for rows in (_E, _G)]
+        for field, kind in zip(fields, residuals, strict=True)
+    ]
     return Residuals(
         square=np.stack(
-            [[[np.nanmean(r[:2] ** 2), np.nanmean(r[2] ** 2)] for r in kind] for kind in residuals], axis=1
+            [[[finite_mean(r[rows] ** 2) for rows in (_E, _SIZE, _G, _DT)] for r in kind] for kind in residuals],
+            axis=1,
         ),
-        mean=np.stack([[np.nanmean(r[:2], axis=1) for r in kind] for kind in residuals], axis=1),
+        mean=np.stack([[[finite_mean(v) for v in (*r[_E], *r[_G])] for r in kind] for kind in residuals], axis=1),
         law=law,
-        xi=np.stack([c[0] for c in correlated]),
-        xi_left=np.stack([c[1] for c in correlated]),
-        lost=sum(int(np.isnan(r[0]).sum()) for r in residuals[1]),
+        xi=np.array([[c[0] for c in kind] for kind in correlated]),
+        xi_left=np.array([[c[1] for c in kind] for kind in correlated]),
+        lost=lost,
     )
 
 
 def residual_correlations(fields: list[np.ndarray], residuals: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return xi+ of residuals below and beyond 10', [2], and without each CCD, [n_ccd, 2]; NaN of one CCD."""
-    if len(fields) < 2:
-        return np.full(2, np.nan), np.full((1, 2), np.nan)
+    """Return xi+ of residuals below and beyond 10', [2], and without each CCD, [n_ccd, 2].
+
+    NaN of one CCD, and where a CCD has no residual: images narrower than a pixel have no adaptive moments.
+    """
+    if len(fields) < 2 or not all(np.isfinite(r).all(axis=0).any() for r in residuals):
+        return np.full(2, np.nan), np.full((len(fields), 2), np.nan)
     x, y = np.concatenate(fields).T
     e = np.concatenate(residuals, axis=1)[:2]
     patch = np.repeat(np.arange(len(fields)), [len(f) for f in fields])
@@ -122,13 +165,18 @@ def case_metrics(samples: Sequence[Residuals]) -> dict[str, float]:
         result[f"error_{name}"] = float(0.5 * error / value) if value > 0.0 else np.nan
 
     for k, kind in enumerate(KINDS):
+        root(f"rms_g_{kind}", square[:, :, k, 2])
+        root(f"rms_dt_g_{kind}", square[:, :, k, 3])
+        root(f"mean_g_{kind}", (mean[:, :, k, 2:] ** 2).mean(axis=-1))
         root(f"rms_e_{kind}", square[:, :, k, 0])
         root(f"rms_size_{kind}", square[:, :, k, 1])
-        root(f"mean_e_{kind}", (mean[:, :, k] ** 2).mean(axis=-1))
-        result[f"noise_law_{kind}"] = float(np.sqrt(law[:, :, k].mean()))
-        for b, name in enumerate(SEPARATION_RANGES):
-            result[f"xi_plus_{kind}_{name}"] = float(xi[:, k, b].mean())
-            result[f"error_xi_plus_{kind}_{name}"] = float(jackknife_error(xi_without[:, k, :, b].mean(axis=0)))
+        root(f"mean_e_{kind}", (mean[:, :, k, :2] ** 2).mean(axis=-1))
+        for m, prefix in ((1, "g_"), (0, "")):
+            result[f"noise_law_{prefix}{kind}"] = float(np.sqrt(law[:, :, k, m].mean()))
+            for b, name in enumerate(SEPARATION_RANGES):
+                result[f"xi_plus_{prefix}{kind}_{name}"] = float(xi[:, k, m, b].mean())
+                error = jackknife_error(xi_without[:, k, m, :, b].mean(axis=0))
+                result[f"error_xi_plus_{prefix}{kind}_{name}"] = float(error)
     result["lost"] = float(sum(s.lost for s in samples))
     return result
 

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from ...core.progress import Reporter
 from ...core.random_streams import stream
+from ...core.statistics import finite_mean
+from ...core.units import ARCSEC
+from ...measure.adaptive_moments import AdaptiveMoments, adaptive_moments
 from ...measure.shapes import Shapes, measure_shapes
 from ...measure.stamps import observe_stamps
 from ...pipeline.experiment import Experiment
@@ -25,6 +29,9 @@ from ...pipeline.simulate.star_field import Depth, make_star_field
 from ...reconstruction.psf_model.model import CLIPPING, PsfModel
 from .plan import NOISE_FREE, Case
 
+#: Start of the adaptive moments [rad], near the width of stars: a third of the steps from that of HSM.
+_START = 0.3 * ARCSEC
+
 
 @dataclass(frozen=True)
 class SimulatedCcd:
@@ -34,15 +41,27 @@ class SimulatedCcd:
     holdout: Shapes  #: of the PSFs at the holdout positions
     noise_free: Observation  #: of the stars to be observed
 
+    @cached_property
+    def holdout_moments(self) -> AdaptiveMoments:
+        """Adaptive moments of the PSFs at the holdout positions."""
+        return star_moments(self.exposure.holdout.image, self.exposure.holdout.pixel_scale)
+
+    @cached_property
+    def noise_free_moments(self) -> AdaptiveMoments:
+        """Adaptive moments of the stars to be observed."""
+        return star_moments(self.noise_free.images, self.exposure.observed.pixel_scale)
+
 
 @dataclass(frozen=True)
 class ObservedCcd:
-    """Stars of a CCD with noise: the observation, and electrons, S/N and variance of one component of e of each."""
+    """Stars of a CCD with noise."""
 
     observation: Observation
+    moments: AdaptiveMoments  #: of the centred stamps
     electrons: np.ndarray
     snr: np.ndarray
-    variance: np.ndarray
+    variance: np.ndarray  #: of the noise of one component of the weighted e
+    variance_g: np.ndarray  #: of the noise of one component of g
 
 
 def simulate(experiment: Experiment, threads: int | None, reporter: Reporter) -> list[SimulatedCcd]:
@@ -72,7 +91,8 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
     n_stars = len(exposed.image)
     if snr_min == NOISE_FREE:
         unlimited = np.full(n_stars, np.inf)
-        return ObservedCcd(ccd.noise_free, unlimited, unlimited, np.zeros(n_stars))
+        nothing = np.zeros(n_stars)
+        return ObservedCcd(ccd.noise_free, ccd.noise_free_moments, unlimited, unlimited, nothing, nothing)
     seed, light = experiment.config.seed, exposed.lit_fraction
     width = effective_fwhm(ccd.exposure.holdout.image, ccd.exposure.holdout.pixel_scale)
     faint = limiting_magnitude(snr_min, places.band, places.exposure, width) + 2.5 * np.log10(light.min())
@@ -86,11 +106,19 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
     images = observe_stamps(collected, electrons, sky, instrument_noise(places.band, places.exposure), rng)
     observation = _centered_and_measured(experiment, ccd.exposure, images)
     snr = signal_to_noise(stars.magnitude - 2.5 * np.log10(light), places.band, places.exposure, width)
-    # The noise of e is proportional to 1/(S/N); the factor is that of all stars together.
+    moments, noise_free = star_moments(observation.images, exposed.pixel_scale), ccd.noise_free_moments
+    # The noise of e and of g is proportional to 1/(S/N); the factor is that of all stars together.
     noise = np.stack(
         [observation.shapes.e1 - ccd.noise_free.shapes.e1, observation.shapes.e2 - ccd.noise_free.shapes.e2]
     )
-    return ObservedCcd(observation, electrons, snr, np.mean((noise * snr)[:, observation.used] ** 2) / snr**2)
+    noise_g = np.stack([moments.g1 - noise_free.g1, moments.g2 - noise_free.g2])
+    variance, variance_g = (finite_mean((v * snr)[:, observation.used] ** 2) / snr**2 for v in (noise, noise_g))
+    return ObservedCcd(observation, moments, electrons, snr, variance, variance_g)
+
+
+def star_moments(images: np.ndarray, pixel_scale: float, threads: int | None = 1) -> AdaptiveMoments:
+    """Return the adaptive moments of images of stars."""
+    return adaptive_moments(images, pixel_scale, start_sigma=_START, threads=threads)
 
 
 def fit(case: Case, ccd: SimulatedCcd, observed: ObservedCcd) -> PsfModel:

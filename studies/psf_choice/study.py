@@ -40,14 +40,17 @@ _ELECTRONS = 1e8
 class Study:
     """Result of the study of PSF models, for the cases of a plan.
 
-    Metrics of each fitted case are ``rms_e_`` and ``rms_size_`` (one component of e; relative size), ``mean_e_`` (rms
-    over the CCDs of the mean of one component), ``noise_law_`` (rms of e by noise alone) and ``xi_plus_..._short``,
-    ``_long`` (below and beyond 10') of each of :data:`~pachon.studies.psf_choice.residuals.KINDS`, with an ``error_``
-    over the CCDs where it is defined; and ``lost``, holdout positions at which the model has no shape, over all draws.
+    Metrics of each fitted case, of adaptive moments, are ``rms_g_`` and ``rms_dt_g_`` (one component of g; dT/T),
+    ``mean_g_`` (rms over the CCDs of the mean of one component), ``noise_law_g_`` (rms of g by noise alone) and
+    ``xi_plus_g_..._short``, ``_long`` (below and beyond 10') of each of
+    :data:`~pachon.studies.psf_choice.residuals.KINDS`, with an ``error_`` over the CCDs where it is defined; of the
+    weighted e as the paper's ``rms_e_``, ``rms_size_``, ``mean_e_``, ``noise_law_`` and ``xi_plus_``; and ``lost``,
+    holdout positions at which the model has no shape, over all draws.
 
-    `holdout_square` is the mean square residual at the holdout positions of each CCD, [n_ccd]: of e1, e2 and the
-    relative size together, which are commensurate for a PSF of axes a and b: ln a = ln size + |e|, ln b = ln size - |e|
-    to first order.
+    `holdout_square` is the mean square residual at the holdout positions of each CCD, [n_ccd]: of g1, g2 and the
+    relative sigma, half of dT/T, together, which are commensurate for a PSF of axes a and b: ln a = ln sigma + |g|,
+    ln b = ln sigma - |g| to first order. Where images narrower than a pixel have no adaptive moments it is of the
+    weighted e1, e2 and size.
     """
 
     plan: Plan
@@ -130,8 +133,15 @@ def study(config: Configuration, plan: Plan, *, threads: int | None = None, repo
     if not fitted_cases:
         raise DomainError(f"no model could be fitted: {problems[cases[0]]}")
     metrics = {case: case_metrics(samples[case]) for case in fitted_cases}
-    squares = {case: np.mean([s.square[:, 1] @ (2.0, 1.0) for s in samples[case]], axis=0) for case in fitted_cases}
+    squares = {case: np.mean([_holdout_square(s) for s in samples[case]], axis=0) for case in fitted_cases}
     return Study(plan, metrics, {case: problems[case] for case in cases if case in problems}, squares)
+
+
+def _holdout_square(residuals: Residuals) -> np.ndarray:
+    """Return the mean square of two components and of the size of each CCD, [n_ccd]; see :class:`Study`."""
+    at_holdout = residuals.square[:, 1]
+    of_g = at_holdout[:, 2:] @ (2.0, 0.25)
+    return np.where(np.isfinite(of_g), of_g, at_holdout[:, :2] @ (2.0, 1.0))
 
 
 def _models_of_ccds(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...core.units import ARCSEC
+from ...measure.adaptive_moments import adaptive_moments
 from ...measure.shapes import fwhm, measure_shapes
 from ...models.camera.focal_plane import FocalPlane
 from ...pipeline.experiment import Experiment
@@ -15,6 +16,12 @@ from ...reconstruction.focal_plane_psf.height_series import HeightSeries
 
 #: Chebyshev nodes of the height: the widths of the engine are met to 1e-4 over +-40 um.
 _NODES = 9
+#: Columns of :func:`measured`: g1 and g2 of the adaptive moments.
+G = slice(1, 3)
+#: Column of the size T of the adaptive moments.
+T = 3
+#: Columns of the weighted e1 and e2.
+E = slice(4, 6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,14 +58,19 @@ class Places:
 
 
 def focus_curves(experiment: Experiment, places: Places, reach: float, threads: int | None = None) -> HeightSeries:
-    """Return FWHM [arcsec], e1 and e2 at places as series of the height within `reach` [m] of zero."""
+    """Return the quantities of :func:`measured` as series of the height within `reach` [m] of zero."""
     return HeightSeries.of(
         lambda level: measured(experiment, level, places, threads), experiment.focal_plane, reach, _NODES
     )
 
 
 def measured(experiment: Experiment, focal_plane: FocalPlane, places: Places, threads: int | None = None) -> np.ndarray:
-    """Return FWHM [arcsec], e1 and e2 of the PSFs at places of a focal plane, shape [n, 3]."""
+    """Measure the PSFs at places of a focal plane, shape [n, 6].
+
+    FWHM [arcsec]; g1, g2 and T [arcsec^2] of adaptive moments; e1 and e2 of weighted ones.
+    """
     stars = expose_positions(replace(experiment, focal_plane=focal_plane), places.position, threads)
+    moments = adaptive_moments(stars.image, stars.pixel_scale, threads=threads)
     shapes = measure_shapes(stars.image, stars.pixel_scale, experiment.weight_fwhm)
-    return np.stack([fwhm(stars.image, stars.pixel_scale) / ARCSEC, shapes.e1, shapes.e2], axis=1)
+    width = fwhm(stars.image, stars.pixel_scale) / ARCSEC
+    return np.stack([width, moments.g1, moments.g2, moments.T / ARCSEC**2, shapes.e1, shapes.e2], axis=1)

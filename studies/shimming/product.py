@@ -24,7 +24,14 @@ def shim_metrics(shims: Shims) -> dict[str, Any]:
 
     def states(metrics: Mapping[str, StateMetrics]) -> dict[str, dict[str, float]]:
         return {
-            state: {"mean_fwhm_arcsec": m.fwhm, "rms_e": m.rms_e, "rms_xi_plus": m.rms_xi}
+            state: {
+                "mean_fwhm_arcsec": m.fwhm,
+                "rms_g": m.rms_g,
+                "rms_xi_plus_g": m.rms_xi_g,
+                "mean_t_arcsec2": m.size,
+                "rms_e": m.rms_e,
+                "rms_xi_plus": m.rms_xi,
+            }
             for state, m in metrics.items()
         }
 
@@ -52,7 +59,10 @@ def write_shims(shims: Shims, folder: Path, experiment: Experiment) -> tuple[str
         folder,
         {
             "shims.ecsv": ("motions beside the focus of the whole focal plane", columns),
-            "correlations.ecsv": ("xi of the ellipticities of each state", correlation_columns(shims.correlations)),
+            "correlations.ecsv": (
+                "xi of g of adaptive moments, of each state",
+                correlation_columns(shims.correlations),
+            ),
         },
         {"shims.png": png_bytes(shims.plot())},
         {"shims.json": shim_metrics(shims)},

@@ -1,10 +1,10 @@
 """Motions of rafts or CCDs that make the images of a focal plane sharpest, roundest or least correlated.
 
-At Gauss-Legendre nodes of each CCD the long-exposure engine gives the width and the ellipticity of the PSF as functions
-of the height. Piston, tip and tilt of each part then follow from a minimum of the mean over its nodes, with exact
-derivatives; parts do not influence each other, but for the correlation of ellipticities, of which all are found
-together. First the focal plane as a whole is focused, which the camera's hexapod does without any shim: gains are
-counted from there. Results are checked with the engine at other places, and correlated there by TreeCorr.
+At Gauss-Legendre nodes of each CCD the long-exposure engine gives FWHM, g and T of adaptive moments, and the weighted e
+of the PSF as functions of the height. Piston, tip and tilt of each part then follow from a minimum of the mean over its
+nodes, with exact derivatives; parts do not influence each other, but for the correlation of ellipticities, of which all
+are found together. First the focal plane as a whole is focused, which the camera's hexapod does without any shim: gains
+are counted from there. Results are checked with the engine at other places, and correlated there by TreeCorr.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ...pipeline.experiment import Experiment
 from ...pipeline.report.focal_plane_plots import draw_heights
 from ...reconstruction.focal_plane_psf.height_series import HeightSeries
 from ...wavefront.chief_rays import fields_at
-from .curves import Places, focus_curves, measured
+from .curves import E, G, Places, T, focus_curves, measured
 from .pairs import PairSum, separation_edges
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ _FIT = {"fwhm": 3, "ellipticity": 3, "xi": 5}
 _CHECK = 4
 # Room for motions beyond the largest height [m].
 _ROOM = 10e-6
-#: Merit at each place and its derivative with respect to the height there, of values and slopes [n, 3].
+#: Merit at each place and its derivative with respect to the height there, of values and slopes [n, 6].
 Value = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 # Lengths of which motions are multiples in the fit [m]: of the piston, and of a tilt at the rim of a part.
 _UNIT = 1e-6
@@ -75,8 +75,11 @@ class StateMetrics:
     """Means over the area of the CCDs."""
 
     fwhm: float  #: mean FWHM [arcsec]
-    rms_e: float  #: rms of the ellipticity, both components together
-    rms_xi: float  #: rms over logarithmic bins of separation of xi+ of the ellipticity; 0 where there are no pairs
+    rms_g: float  #: rms of g of adaptive moments, both components together
+    rms_xi_g: float  #: rms over logarithmic bins of separation of xi+ of g; 0 where there are no pairs
+    size: float  #: mean T of adaptive moments [arcsec^2]
+    rms_e: float  #: rms of the weighted e, both components together
+    rms_xi: float  #: of xi+ of the weighted e, as `rms_xi_g`
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +97,7 @@ class Shims(Result):
     fitted, checked : dict of str to StateMetrics
         By state, from the curves at the nodes of the fit, and from the engine at other places.
     correlations : dict of str to Correlation
-        By state, of the ellipticities at these other places, weighted by their shares of the area.
+        By state, of g at these other places, weighted by their shares of the area.
     focused, focal_plane : FocalPlane
         Focused as a whole, and shimmed.
     """
@@ -140,8 +143,8 @@ def shim(
     experiment : Experiment
         Telescope, atmosphere and heights, with the long_exposure engine; the CCDs of its configuration are used.
     merit : str
-        "fwhm" (mean FWHM over the area), "ellipticity" (rms) or "xi" (rms over logarithmic bins of separation of xi+ of
-        the ellipticity; from the motions of the smallest rms ellipticity to the next minimum).
+        "fwhm" (mean FWHM over the area), "ellipticity" (rms of g of adaptive moments) or "xi" (rms over logarithmic
+        bins of separation of xi+ of g; from the motions of the smallest rms of g to the next minimum).
     parts : str
         "rafts" or "ccds".
     threads : int, optional
@@ -285,8 +288,8 @@ def _best_motions(
 
         def value(values: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             # All places in the order of the pairs; in units of 1e-6, of order one for the minimiser.
-            total, change = pairs.mean_square(1e3 * values[order, 1:])
-            slope = np.einsum("nk,nk->n", change[rows], 1e3 * slopes[:, 1:]) / places.weight[rows]
+            total, change = pairs.mean_square(1e3 * values[order, G])
+            slope = np.einsum("nk,nk->n", change[rows], 1e3 * slopes[:, G]) / places.weight[rows]
             return np.full(len(rows), total), slope
 
         rows = np.concatenate([rows for _, rows in parts])
@@ -343,8 +346,8 @@ def _width_merit(values: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np
 
 def _ellipticity_merit(values: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     # In units of 1e-3, so that the minimiser has numbers of order one.
-    e, change = 1e3 * values[:, 1:], 1e3 * slopes[:, 1:]
-    return (e**2).sum(axis=1), 2.0 * (e * change).sum(axis=1)
+    g, change = 1e3 * values[:, G], 1e3 * slopes[:, G]
+    return (g**2).sum(axis=1), 2.0 * (g * change).sum(axis=1)
 
 
 #: Merits that are means over places.
@@ -354,12 +357,20 @@ _VALUES: dict[str, Value] = {"fwhm": _width_merit, "ellipticity": _ellipticity_m
 def _state_metrics(
     places: Places, values: np.ndarray, sky: np.ndarray, edges: np.ndarray
 ) -> tuple[StateMetrics, Correlation]:
-    """Return means of values [n, 3] at places, and the correlation of their ellipticities."""
+    """Return means of values [n, 6] at places, and the correlation of their g."""
     bins = SeparationBins(edges[0], edges[-1], len(edges) - 1)
-    correlation = shear_correlation(*sky.T, *values[:, 1:].T, bins=bins, weight=places.weight)
-    rms_xi = float(np.sqrt(np.nanmean(correlation.xi_plus**2)))
-    rms_e = places.mean((values[:, 1:] ** 2).sum(axis=1)) ** 0.5
-    return StateMetrics(places.mean(values[:, 0]), rms_e, rms_xi), correlation
+    of_g, of_e = (shear_correlation(*sky.T, *values[:, c].T, bins=bins, weight=places.weight) for c in (G, E))
+    rms_g, rms_e = (places.mean((values[:, c] ** 2).sum(axis=1)) ** 0.5 for c in (G, E))
+    rms_xi_g, rms_xi = (float(np.sqrt(np.nanmean(c.xi_plus**2))) for c in (of_g, of_e))
+    metrics = StateMetrics(
+        fwhm=places.mean(values[:, 0]),
+        rms_g=rms_g,
+        rms_xi_g=rms_xi_g,
+        size=places.mean(values[:, T]),
+        rms_e=rms_e,
+        rms_xi=rms_xi,
+    )
+    return metrics, of_g
 
 
 def draw_shims(ax: Axes | Figure | None, planes: Mapping[str, FocalPlane]) -> Figure:

@@ -8,7 +8,7 @@ from scipy.special import j0
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, UnknownNameError
 from pachon.core.units import ARCSEC
-from pachon.measure.correlation import SEPARATION_RANGES, SeparationBins, shear_correlation
+from pachon.measure.correlation import SeparationBins, shear_correlation
 from pachon.measure.shapes import measure_shapes
 from pachon.measure.stamps import center_stamps
 from pachon.pipeline.config import load_configuration, with_options
@@ -19,11 +19,12 @@ from pachon.pipeline.simulate.ccd_model import model_ccd
 from pachon.pipeline.summary import correlations
 from pachon.reconstruction.ccd_product import CCD_KINDS, KINDS
 from pachon.studies.attribution import attribution
-from pachon.studies.attribution.attribution import attribute, changes, without_cause
+from pachon.studies.attribution.attribution import attribute, change_errors, without_cause
 from pachon.studies.attribution.causes import CAUSES, FULL, GROUND_LIFT, NOISE, OPTICS, checked_causes, without
 from pachon.studies.attribution.product import write_attribution
 from pachon.wavefront.atmosphere.turbulence import structure_function
 
+RESIDUALS = ("at_stars", "left_out", "away")
 #: All of them need a finished study, of seconds.
 pytestmark = pytest.mark.long
 
@@ -36,11 +37,14 @@ def attributed(tiny):
 def test_the_full_case_is_the_run(finished_run, attributed):
     summary = json.loads((finished_run / "summary.json").read_text())["all"]
     full = attributed.metrics[FULL]
-    for key in ("rms_residual_at_stars", "rms_residual_left_out", "rms_residual_away", "fwhm_arcsec"):
+    residuals = [f"{start}{end}" for start in ("rms_residual_", "rms_residual_g_", "rms_dt_g_") for end in RESIDUALS]
+    for key in (*residuals, "fwhm_arcsec"):
         assert full[key] == pytest.approx(summary[key], rel=1e-8)  # nine digits in the file
     # Below 10' the summary averages the same pairs; with patches sums go in another order.
-    for kind in ("truth", "observed", "residual", "away"):
+    for kind in ("truth", "observed", "residual", "away", "g_truth", "g_observed", "g_residual", "g_away"):
         assert full[f"xi_plus_{kind}_short"] == pytest.approx(summary[f"xi_plus_{kind}_short"], rel=1e-8)
+    # g is about twice the weighted e of this seeing.
+    assert 1.5 < full["rms_g_truth"] / full["rms_e_truth"] < 2.5
 
 
 def test_a_case_is_a_run_without_the_cause(tiny, attributed):
@@ -49,8 +53,12 @@ def test_a_case_is_a_run_without_the_cause(tiny, attributed):
     products = [model_ccd(experiment, expose_ccd(experiment, name, threads=1)) for name in names]
     e = np.concatenate([[p.holdout.e1, p.holdout.e2] for p in products], axis=1)
     assert attributed.metrics["tilt"]["rms_e_truth"] == np.sqrt(np.mean(e**2))
+    g = np.concatenate([[p.holdout.g1, p.holdout.g2] for p in products], axis=1)
+    assert attributed.metrics["tilt"]["rms_g_truth"] == np.sqrt(np.mean(g**2))
     for kind, expected in correlations(products, KINDS).items():
         assert attributed.correlations["tilt"][kind].xi_plus.tobytes() == expected.xi_plus.tobytes()
+    for kind, expected in correlations(products, KINDS, "g").items():
+        assert attributed.correlations_g["tilt"][kind].xi_plus.tobytes() == expected.xi_plus.tobytes()
     assert attributed.metrics["tilt"]["rms_e_truth"] != attributed.metrics[FULL]["rms_e_truth"]
 
 
@@ -60,7 +68,8 @@ def test_changes_are_differences(attributed):
     for case in ("tilt", "diffusion", "atmosphere", NOISE):
         figures = attributed.metrics[case]
         for key in full:
-            assert figures[f"change_{key}"] == full[key] - figures[key]
+            # NaN without turbulence: images narrower than a pixel have no adaptive moments.
+            np.testing.assert_equal(figures[f"change_{key}"], full[key] - figures[key])
 
 
 def test_error_of_a_change_is_its_own_jackknife():
@@ -79,12 +88,14 @@ def test_error_of_a_change_is_its_own_jackknife():
     left = [long_range(e, patch != k) - long_range(f, patch != k) for k in range(3)]
     expected = np.sqrt(2.0 / 3.0 * np.sum((left - np.mean(left)) ** 2))
     kinds = ("truth", "observed", "residual", "away")
-    keys = {f"xi_plus_{kind}_{name}": 0.0 for kind in kinds for name in SEPARATION_RANGES}
     one, other = (dict.fromkeys(kinds, shear_correlation(x, y, *v, bins=bins, patch=patch)) for v in (e, f))
-    found = changes(keys, keys, one, other)
+    found = change_errors(one, other)
     assert found["error_xi_plus_away_long"] == pytest.approx(expected, rel=1e-9)  # sums in another order
+    assert change_errors(one, other, "g")["error_xi_plus_g_away_long"] == found["error_xi_plus_away_long"]
     # Stars and their mates in the other case are the same: what both have in common is in no error.
-    assert changes(keys, keys, one, one)["error_xi_plus_away_long"] == 0.0
+    assert change_errors(one, one)["error_xi_plus_away_long"] == 0.0
+    # A case whose images have no adaptive moments has no correlation of g.
+    assert np.isnan(change_errors(one, {}, "g")["error_xi_plus_g_away_long"])
 
 
 def test_without_noise_the_truth_stays(attributed):
@@ -221,6 +232,17 @@ def test_files_hold_what_was_returned(tiny, attributed, tmp_path):
     xi = Table.read(tmp_path / "correlations.ecsv")
     rows = xi[xi["kind"] == "diffusion away"]
     np.testing.assert_array_equal(rows["xi_plus"], attributed.correlations["diffusion"]["away"].xi_plus)
+    xi = Table.read(tmp_path / "correlations_g.ecsv")
+    rows = xi[xi["kind"] == "diffusion away"]
+    np.testing.assert_array_equal(rows["xi_plus"], attributed.correlations_g["diffusion"]["away"].xi_plus)
+    for key, words in (
+        ("rms_g_truth", "rms of one component of g of adaptive moments, truth"),
+        ("rms_residual_g_at_stars", "rms of one component of g of adaptive moments, residual at stars"),
+        ("rms_residual_away", "rms of one component of the weighted e, residual away"),
+        ("rms_dt_g_away", "rms of (T - T model)/T of adaptive moments, away"),
+        ("xi_plus_g_truth_long", "mean xi+ of g, truth, 10 to 180 arcmin"),
+    ):
+        assert table[key].description == words
     assert (tmp_path / "attribution.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -283,8 +305,8 @@ def test_cases_have_the_focal_plane_model_that_a_run_has(focal_plane_config, pla
     assert "atmosphere" not in checked_causes(config)
     write_attribution(result, tmp_path, config)
     table = Table.read(tmp_path / "attribution.ecsv")
-    assert table[key].description == "mean xi+ of away of the CCDs' own models, 0 to 10 arcmin"
-    assert table["xi_plus_away_short"].description == "mean xi+ of away, 0 to 10 arcmin"
+    assert table[key].description == "mean xi+ of the weighted e, away of the CCDs' own models, 0 to 10 arcmin"
+    assert table["xi_plus_away_short"].description == "mean xi+ of the weighted e, away, 0 to 10 arcmin"
 
 
 SENSORS = {

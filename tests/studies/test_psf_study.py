@@ -77,7 +77,10 @@ def test_a_cubic_field_is_recovered_by_order_three(experiment):
     # Exact but for rounding: amplitudes are linear in the stamps, and two components span them.
     assert found["rms_e_away"] < 1e-10
     assert found["rms_size_away"] < 1e-10
-    assert found["noise_law_away"] == 0.0
+    assert found["noise_law_away"] == found["noise_law_g_away"] == 0.0
+    # To the last step of the adaptive moments.
+    assert found["rms_g_away"] < 1e-6
+    assert found["rms_dt_g_away"] < 1e-6
     assert _figures(experiment, replace(case, order=2), ccds, 1)["rms_e_away"] > 1e-3
     assert _figures(experiment, replace(case, order=4), ccds, 1)["rms_e_away"] < 1e-10
 
@@ -106,11 +109,40 @@ def test_noise_leaves_what_the_law_says(experiment, order, interpolation):
     assert found["rms_e_away"] == pytest.approx(found["noise_law_away"], rel=3.0 * sigma + 0.03)
     # 50 degrees of freedom and fewer in place of 10: 2 % at 3 sigma, and the same 3 %.
     assert found["rms_e_at_stars"] == pytest.approx(found["noise_law_at_stars"], rel=0.05)
+    assert found["rms_g_away"] == pytest.approx(found["noise_law_g_away"], rel=3.0 * sigma + 0.03)
+    assert found["rms_g_at_stars"] == pytest.approx(found["noise_law_g_at_stars"], rel=0.05)
     assert found["lost"] == 0
     # The residuals at the stars sum to zero over each CCD, whatever the error of the model: the flattery. In pixels
     # exactly; in e nearly, which is not quite linear in them.
     if interpolation == "equal":
         assert found["mean_e_at_stars"] < 0.1 * found["mean_e_away"]
+
+
+def test_residuals_of_g_are_those_of_hsm(experiment):
+    """GalSim's adaptive moments of truth and model at each holdout position, one CCD at a time."""
+    galsim = pytest.importorskip("galsim")
+    ccds, case = [_planted(name, 2, 24, 12) for name in ("R22_S11", "R24_S12")], Case(24, components=4, order=1)
+    found = _figures(experiment, case, ccds, 1)
+
+    def moments(images):
+        hsm = [galsim.hsm.FindAdaptiveMom(galsim.Image(np.asarray(image, dtype=float))) for image in images]
+        g = np.array([[m.observed_shape.g1, m.observed_shape.g2] for m in hsm]).T
+        square = (g**2).sum(axis=0)
+        return g, np.array([m.moments_sigma for m in hsm]) ** 2 * (1.0 + square) / (1.0 - square)
+
+    squares, changes, means = [], [], []
+    for ccd in ccds:
+        model = fit(case, ccd, observe(experiment, ccd, case.snr, 0))
+        (true, size), (g, model_size) = (
+            moments(v) for v in (ccd.exposure.holdout.image, model.at(ccd.exposure.positions.holdout))
+        )
+        squares.append(np.mean((true - g) ** 2))
+        changes.append(np.mean((1.0 - model_size / size) ** 2))
+        means.append(np.mean((true - g).mean(axis=1) ** 2))
+    # To the last steps of both iterations.
+    assert found["rms_g_away"] == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-3)
+    assert found["rms_dt_g_away"] == pytest.approx(np.sqrt(np.mean(changes)), rel=1e-3)
+    assert found["mean_g_away"] == pytest.approx(np.sqrt(np.mean(means)), rel=1e-3)
 
 
 def test_noise_law_is_p_over_n():
@@ -232,6 +264,7 @@ def test_every_case_has_figures_or_a_problem(small):
     for case, found in result.metrics.items():
         assert np.isfinite(found["rms_e_away"]), case
         assert np.isnan(found["noise_law_away"]) == (case.interpolation in PROCESSES)
+        assert np.isfinite(found["rms_g_away"]), case
 
 
 def test_a_case_is_what_its_parts_give(small, tiny):
@@ -273,7 +306,11 @@ def test_command_line(settings_file, tmp_path, capsys, monkeypatch):
         & (table["snr"] == 30.0)
         & (table["components"] == 4)
     ]
-    assert list(row["rms_e_away"]) == [pytest.approx(base["figures"]["rms_e_away"], rel=1e-8)]  # nine digits in JSON
+    for key in ("rms_e_away", "rms_g_away", "xi_plus_g_away_short"):
+        assert list(row[key]) == [pytest.approx(base["figures"][key], rel=1e-8)]  # nine digits in JSON
+    words = "rms of one component of g of adaptive moments, truth - model, where no star is"
+    assert table["rms_g_away"].description == words
+    assert table["noise_law_at_stars"].description.startswith("rms of one component of the weighted e that noise alone")
     for name in ("study_choices.png", "study_stars.png"):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
     # One CCD has no correlations and no errors over CCDs, but all the rest. The written configuration is the study's.

@@ -9,11 +9,13 @@ import pytest
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError
 from pachon.core.files import json_text
+from pachon.core.units import ARCSEC
 from pachon.measure.correlation import SeparationBins, shear_correlation
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.pipeline.config import Configuration, load_configuration, with_options
 from pachon.pipeline.experiment import Experiment
-from pachon.studies.shimming.curves import Places, focus_curves, measured
+from pachon.pipeline.simulate.ccd_exposure import expose_positions
+from pachon.studies.shimming.curves import E, G, Places, T, focus_curves, measured
 from pachon.studies.shimming.pairs import PairSum, separation_edges
 from pachon.studies.shimming.product import shim_metrics
 from pachon.studies.shimming.shim import STATES, Motion, moved_parts, shim, shimmed_configuration
@@ -48,8 +50,10 @@ def test_curves_are_the_engine_at_any_height(built):
         plane = FocalPlane.flat(camera).with_moved("R34", dz=heights[i])
         direct = measured(built, plane, places)[i]
         assert values[i, 0] == pytest.approx(direct[0], abs=2e-4)
-        # One in a hundred of the ellipticities of some 1e-2 at these heights.
-        assert values[i, 1:] == pytest.approx(direct[1:], abs=2e-4)
+        # One in a hundred of the weighted ellipticities of some 1e-2 at these heights; g is twice as large.
+        assert values[i, E] == pytest.approx(direct[E], abs=2e-4)
+        assert values[i, G] == pytest.approx(direct[G], abs=4e-4)
+        assert values[i, T] == pytest.approx(direct[T], rel=1e-3)
     step = 1e-8
     differences = (curves.at(heights + step) - curves.at(heights - step)) / (2 * step)
     assert np.allclose(slopes, differences, rtol=1e-5, atol=1e-3)
@@ -138,12 +142,12 @@ def test_no_motion_of_a_grid_has_a_smaller_correlation(built):
     edges = separation_edges(0.25 * 40.00e-3 * longest / on_detector, longest)
 
     def correlation(heights):
-        return float(np.sqrt((pair_by_pair(sky, fit.weight, curves.at(heights)[:, 1:], edges) ** 2).mean()))
+        return float(np.sqrt((pair_by_pair(sky, fit.weight, curves.at(heights)[:, G], edges) ** 2).mean()))
 
     heights = fit.heights(found.focal_plane)
     best = correlation(heights)
     # Single precision of TreeCorr, and a series that spans other heights.
-    assert found.fitted["shimmed"].rms_xi == pytest.approx(best, rel=2e-3)
+    assert found.fitted["shimmed"].rms_xi_g == pytest.approx(best, rel=2e-3)
     assert best < correlation(fit.heights(shim(built, merit="ellipticity", threads=1).focal_plane))
     x, y = (fit.position - fit.position.mean(axis=0)).T
     steps = np.array([-6.0, -2.0, 0.0, 2.0, 6.0]) * 1e-6
@@ -159,6 +163,10 @@ def test_gains_are_in_order_and_checked_elsewhere(built, shims):
         assert states["as built"].fwhm > states["focused"].fwhm - 1e-6
         assert states["focused"].fwhm > states["shimmed"].fwhm - 1e-5
         assert states["shimmed"].fwhm > states["plane"].fwhm
+        for state in states.values():
+            # The round weight makes PSFs rounder: that of 0.7" halves g of this seeing.
+            assert 1.5 < state.rms_g / state.rms_e < 2.5
+            assert 2.0 < state.rms_xi_g / state.rms_xi < 6.0
     ccds = shim(built, parts="ccds", threads=1)
     assert len(ccds.motions) == 3
     assert ccds.fitted["shimmed"].fwhm < shims.fitted["shimmed"].fwhm
@@ -206,3 +214,19 @@ def test_bad_arguments_are_one_line(capsys):
         shim(experiment_of(psf__engine="fast"))
     assert main(["shim", "--heights", "nowhere"]) == 2
     assert "focal_plane.heights = nowhere: expected lsstcam" in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_measured_shapes_are_those_of_hsm(built):
+    """GalSim's adaptive moments of the same images; T of its sigma, which is that of the determinant."""
+    galsim = pytest.importorskip("galsim")
+    places = Places.gauss(built.focal_plane, ("R34_S11",), 2)
+    values = measured(built, built.focal_plane, places, 1)
+    stars = expose_positions(built, places.position, 1)
+    for row, image in zip(values, stars.image, strict=True):
+        found = galsim.hsm.FindAdaptiveMom(galsim.Image(np.asarray(image, dtype=float)))
+        g = found.observed_shape
+        # As in the tests of adaptive moments: the two stop at other iterations.
+        assert row[G] == pytest.approx([g.g1, g.g2], abs=2e-6)
+        sigma = found.moments_sigma * stars.pixel_scale / ARCSEC
+        assert row[T] == pytest.approx(2.0 * sigma**2 * (1.0 + g.g**2) / (1.0 - g.g**2), rel=1e-5)

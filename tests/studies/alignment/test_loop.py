@@ -10,6 +10,7 @@ import pachon
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, ProductError, UnknownNameError
 from pachon.core.long_work import Execution
+from pachon.core.units import ARCSEC
 from pachon.models.io.yaml.writer import telescope_to_yaml
 from pachon.pipeline.config_hash import hashed_states
 from pachon.pipeline.experiment import Experiment
@@ -18,6 +19,7 @@ from pachon.studies.alignment.config import AlignConfig, load_align_configuratio
 from pachon.studies.alignment.loop import align
 from pachon.studies.alignment.product import write_alignment
 from pachon.studies.alignment.scene import AlignmentScene
+from pachon.studies.alignment.store import VisitStore
 
 QUIET = {"wavefront": False}
 
@@ -50,6 +52,38 @@ def test_what_is_added_over_the_field_is_what_the_response_expects():
     found = scene.quality.means(moved)
     assert found.added == pytest.approx(scene.expected_wavefront(np.outer(state, state)), rel=0.06)
     assert scene.quality.means(scene.telescope).added == 0.0
+
+
+def test_shapes_over_the_field_are_those_of_hsm():
+    """GalSim's adaptive moments of the same images, and the round weight of 0.7 arcsec, which halves g."""
+    galsim = pytest.importorskip("galsim")
+    scene = AlignmentScene.of(config())
+    quality = scene.quality
+    found = quality.means(scene.telescope)
+    stars = pachon.make_psfs(
+        scene.telescope,
+        quality.fields,
+        scene.wavelengths,
+        atmosphere=scene.atmosphere,
+        engine="long_exposure",
+        stamps=pachon.Stamps(41),
+    )
+    moments = [galsim.hsm.FindAdaptiveMom(galsim.Image(np.asarray(image, dtype=float))) for image in stars.image]
+    g = np.array([m.observed_shape.g for m in moments])
+    sigma = np.array([m.moments_sigma for m in moments]) * stars.pixel_scale
+    # To the last steps of both iterations.
+    assert found.rms_g == pytest.approx(np.sqrt(np.mean(g**2)), rel=1e-3)
+    size = np.mean(2.0 * sigma**2 * (1.0 + g**2) / (1.0 - g**2)) / ARCSEC**2
+    assert found.size == pytest.approx(size, rel=1e-5)
+    assert 1.5 < found.rms_g / found.rms_e < 2.5
+
+
+def test_visits_of_an_earlier_version_are_refused_in_one_line(tmp_path):
+    store = VisitStore(tmp_path, {})
+    arrays = dict.fromkeys(("zernikes", "covariance", "usable", "images", "model"), np.zeros(1))
+    np.savez(tmp_path / "visit_00000.npz", quality=np.zeros(4), inputs=np.array("{}"), **arrays)
+    with pytest.raises(ProductError, match=r"visit_00000\.npz: expected a visit of a loop \(4 means"):
+        store.read(0)
 
 
 @pytest.mark.long
