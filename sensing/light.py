@@ -134,7 +134,8 @@ class Instrument:
             response = (probe.depth - light.depth) / step
             if abs(response) > _RESPONSE:
                 moved = telescope.perturbed(name, shift=-2.0 * light.depth / response * axis)
-                return self._through(moved, light.direction)
+                # The unknown shifts of rims stay those of the light that was given.
+                return replace(self._through(moved, light.direction), rims=light.rims)
         moved = telescope.perturbed(detector.name, shift=2.0 * light.depth * detector.matrix[:, 2])
         return replace(light, telescope=moved, depth=-light.depth)
 

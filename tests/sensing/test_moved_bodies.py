@@ -123,6 +123,14 @@ def test_the_other_side_of_focus_is_that_of_the_body(name, bodies, shift):
         assert moved == set(telescope.groups.get(body, (body,)))
 
 
+def test_the_other_side_of_focus_has_the_same_unknowns(focused):
+    """At 1.77 degrees a rim of L2 vignettes the star on one side of focus alone."""
+    direction = field_direction(*np.deg2rad([[1.25], [1.25]]), "zemax")[0]
+    instrument = instrument_of(focused, pachon.DonutDetector(moved="Camera"))
+    light = instrument.light(direction, 1.5e-3)
+    assert [rim.name for rim in instrument.mirrored(light).rims] == [rim.name for rim in light.rims]
+
+
 def test_heights_stay_those_of_the_detector(focused):
     """A CCD that stands 30 um high on a moved camera: the camera moved, and the detector 30 um farther."""
     plane = pachon.FocalPlane.flat("lsst").with_moved("R32", dz=30e-6).with_moved("R33", dz=30e-6)
