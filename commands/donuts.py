@@ -43,8 +43,12 @@ def donuts_command(
     files: Annotated[list[Path], Argument(metavar="FILE.fits ...", help="Stamps of donuts, or images of CCDs.")],
     telescope: Annotated[str, Option("--telescope", "-t", help="Bundled model, or path.")] = "lsst_v3.3_r",
     defocus_um: Annotated[
-        float, Option(help="Shift of the detector, not the camera, along z [um], beside the file's: 1500 behind focus.")
+        float, Option(help="Shift along z of what --moved names [um], beside the file's: 1500 behind focus.")
     ] = 0.0,
+    moved: Annotated[
+        str | None,
+        Option(help="Surface or group that defocus moves: Detector, Camera, M2, ...; the file's, else Detector."),
+    ] = None,
     wavelength_nm: Annotated[
         list[float] | None,
         Option("--wavelength-nm", help="Wavelength [nm], once for each; the model's own by default."),
@@ -89,18 +93,20 @@ def donuts_command(
 
     A file holds a cube of stamps and a table with their fields (field_x, field_y [deg], defocus_um), one stamp an
     extension with keywords FIELD_X, FIELD_Y and DEFOC_UM, or the image of a CCD, with --positions. Stamps have x and y
-    along those of the detector, and no sky. Bad donuts are flagged with the reason.
+    along those of the detector, and no sky. Bad donuts are flagged with the reason. A defocus moves the detector, or
+    what --moved, a keyword MOVED or a column moved names: Camera (full-array mode of the LSST), M2 (AuxTel).
 
     **Examples**
 
     - `pachon donuts donuts.fits --defocus-um 1500 -o wavefronts.ecsv --picture donuts.png`
+    - `pachon donuts full_array.fits --moved Camera --defocus-um 1500`
     - `pachon donuts corner_*.fits -t rubin_v3.14_i --degrees-of-freedom lsst --json`
     - `pachon donuts ccd.fits --positions stars.ecsv --stamp 200 --defocus-um -1500`
     """
     from ..models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
     from ..sensing.fit import fit_donuts
     from ..sensing.freedom_fit import TelescopeFreedoms
-    from ..sensing.model import DonutAir, DonutDetector, DonutModel
+    from ..sensing.model import DETECTOR, DonutAir, DonutDetector, DonutModel
     from ..sensing.stamp_files import border_variance
     from ..sensing.wavefront_fits import SingleDonuts
     from ..wavefront.atmosphere.atmosphere import Atmosphere
@@ -112,11 +118,16 @@ def donuts_command(
     if degrees_of_freedom is not None:
         wavefront = TelescopeFreedoms(load_degrees_of_freedom(degrees_of_freedom), noll=noll)
     atmosphere = None if exposure_s is None else Atmosphere.from_site(site, 0, exposure=exposure_s)
-    images, fields, defocus = _stamps(files, positions, stamp, field_deg)
+    images, fields, defocus, body = _stamps(files, positions, stamp, field_deg)
     images = [gain * image for image in images]
     model = DonutModel(
         air=DonutAir(outer_scale=outer_scale_m, atmosphere=atmosphere),
-        detector=DonutDetector(pixel_um * 1e-6, defocus=defocus + 1e-6 * defocus_um, saturation=saturation),
+        detector=DonutDetector(
+            pixel_um * 1e-6,
+            defocus=defocus + 1e-6 * defocus_um,
+            moved=moved or body or DETECTOR,
+            saturation=saturation,
+        ),
         diffraction=diffraction,
     )
     with (
@@ -154,14 +165,14 @@ def _output_kind(table: Path | None, picture: Path | None) -> str:
 
 def _stamps(
     files: list[Path], positions: Path | None, size: int, field_deg: str | None
-) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-    """Return the stamps of files, their field angles [rad] and shifts of their detectors [m]."""
+) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, str | None]:
+    """Return the stamps of files, their field angles [rad], shifts [m] and what is shifted, where the files say."""
     import numpy as np
 
-    from ..sensing.stamp_files import read_stamps
+    from ..sensing.stamp_files import one_body, read_stamps
 
     field = None if field_deg is None else np.deg2rad(degrees_pair(field_deg, "--field-deg"))
-    images, fields, defocus = [], [], []
+    images, fields, defocus, bodies = [], [], [], []
     for path in files:
         stamps = read_stamps(path, positions, size)
         places = field if stamps.fields is None else stamps.fields
@@ -172,7 +183,8 @@ def _stamps(
         images += stamps.images
         fields.append(np.broadcast_to(places, (len(stamps), 2)))
         defocus.append(stamps.defocus)
-    return images, np.concatenate(fields), np.concatenate(defocus)
+        bodies.append(stamps.moved or "")
+    return images, np.concatenate(fields), np.concatenate(defocus), one_body(bodies, files[-1])
 
 
 def _write(fit: DonutFit, table: Path | None, picture: Path | None, kind: str) -> None:

@@ -60,6 +60,7 @@ def fit_donuts(
     wavelength: ArrayLike | Light | None = None,
     *,
     pixel_size: ArrayLike | None = None,
+    moved: str | None = None,
     sky_variance: ArrayLike = 0.0,
     noll: Iterable[int] | None = None,
     degrees_of_freedom: DegreesOfFreedom | None = None,
@@ -81,8 +82,9 @@ def fit_donuts(
     Parameters
     ----------
     telescope : Telescope
-        Telescope as it is believed to be, defocus included: ``tel.perturbed("Detector", shift=(0, 0, 1.5e-3))`` is
-        behind focus; ``"Camera"`` in its place where the camera moves, as in full-array mode.
+        Telescope as it is believed to be, in focus where `model` has the defocus of each image, or defocus included:
+        ``tel.perturbed("Detector", shift=(0, 0, 1.5e-3))`` is behind focus; ``"Camera"`` in its place where the camera
+        moves, as in full-array mode.
     images : array_like, shape [n, ny, nx], or sequence of n arrays
         Stamps [electrons], sky subtracted, ``[iy, ix]`` along +y and +x of the detector, each centred on its donut
         within a few pixels.
@@ -93,6 +95,9 @@ def fit_donuts(
         or the telescope's own by default.
     pixel_size : float or Quantity, optional
         Side of a pixel [m], in place of that of the model, which is 10 um by default.
+    moved : str, optional
+        Surface or group that the defocus of `model` moves, in place of that of the model, which is the detector by
+        default; see :class:`~pachon.DonutDetector`.
     sky_variance : float or array, shapes [n] or [n, ny, nx]
         Variance of sky and readout [electron^2 a pixel].
     noll : iterable of int, optional
@@ -126,7 +131,7 @@ def fit_donuts(
         If an array has the wrong shape, the wavelength is not covered, or a number is outside its range. A bad donut is
         no error: it is flagged, with NaN for results, and the others go on.
     """
-    model = (model or DonutModel()).with_light(wavelength).with_pixel_size(pixel_size)
+    model = (model or DonutModel()).with_light(wavelength).with_pixel_size(pixel_size).with_moved(moved)
     fit = _wavefront_fit(fit, noll, degrees_of_freedom)
     observed = ObservedStars.of(images, fields, sky_variance, mask, projection)
     instrument = Instrument.of(telescope, model, fit.terms(telescope, model.air.atmosphere))

@@ -336,7 +336,7 @@ class _StarFitter:
         """Return whether the image fits a detector on the other side of focus better."""
         if solution.loss / stamp.used.sum() < _MISFIT:
             return False
-        mirrored = self.stamp(self._light.mirrored(), pixels)
+        mirrored = self.stamp(self._instrument.mirrored(self._light), pixels)
         start, _ = self.start(mirrored, self.template(mirrored))
         return _explains_more(self.solve(mirrored, start, tolerance=COARSE), solution)
 

@@ -43,6 +43,10 @@ _LEAST_ERROR = 0.5e-9
 _SPACING = 0.5
 #: FWHM of the blur in cells of the grid beyond which the cells resolve it.
 _RESOLVED = 1.9
+#: Shift of a body over the distance of the focus from the detector, by which its effect on the focus is measured.
+_PROBE = 1e-2
+#: Least motion of the focus over that of a body that counts as one that focuses: a filter's is 0.
+_RESPONSE = 0.05
 #: Finest grid, in cells along a pixel.
 _FINEST = 5
 #: FWHM of the blur in binned pixels.
@@ -90,6 +94,7 @@ class Instrument:
     def of(cls, telescope: Telescope, model: DonutModel, terms: WavefrontTerms) -> Instrument:
         """Return the instrument of a model; light that the telescope does not cover is a DomainError."""
         light, detector = model.light or Light(telescope.default_wavelength), model.detector
+        detector.body(telescope)
         if light.dispersion is not None:
             raise ConfigError("dispersion of the light: expected none in fits of donuts")
         waves = wavelength_points(telescope, light.wavelengths)
@@ -113,11 +118,29 @@ class Instrument:
         return float(self.wavelengths[len(self.wavelengths) // 2])
 
     def light(self, direction: np.ndarray, defocus: float) -> StarLight:
-        """Return the light of a star that travels along a direction [3], on its detector moved by a defocus [m].
+        """Return the light of a star that travels along a direction [3], with a defocus [m] of the body that it moves.
 
         A chief ray that reaches no CCD, and a dark pupil, are a DomainError.
         """
-        telescope = self._with_detector(direction, defocus)
+        return self._through(self._with_detector(direction, defocus), direction)
+
+    def mirrored(self, light: StarLight) -> StarLight:
+        """Return the light with what a defocus moves where the best focus is as far on the detector's other side."""
+        telescope, detector = light.telescope, light.telescope.surfaces[-1]
+        name, axis = self.model.detector.body(telescope)
+        if name != detector.name:
+            step = _PROBE * light.depth
+            probe = self._through(telescope.perturbed(name, shift=step * axis), light.direction)
+            response = (probe.depth - light.depth) / step
+            if abs(response) > _RESPONSE:
+                moved = telescope.perturbed(name, shift=-2.0 * light.depth / response * axis)
+                # The unknown shifts of rims stay those of the light that was given.
+                return replace(self._through(moved, light.direction), rims=light.rims)
+        moved = telescope.perturbed(detector.name, shift=2.0 * light.depth * detector.matrix[:, 2])
+        return replace(light, telescope=moved, depth=-light.depth)
+
+    def _through(self, telescope: Telescope, direction: np.ndarray) -> StarLight:
+        """Return the light of a star through a telescope with its detector in place."""
         along = (np.arange(_SURVEY) - 0.5 * (_SURVEY - 1)) * telescope.pupil_diameter / _SURVEY
         points = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
         ends = trace(telescope, launch_bundles(telescope, direction[None], self.middle, points), "all", threads=1)
@@ -138,9 +161,11 @@ class Instrument:
         return StarLight(telescope, direction, diameter, depth, jacobian, rims, diffracting)
 
     def _with_detector(self, direction: np.ndarray, defocus: float) -> Telescope:
-        """Return the telescope with its detector in the tangent plane of the chief ray's CCD, moved by a defocus."""
-        telescope, detector = self.telescope, self.telescope.surfaces[-1]
-        height, tilt = defocus, (0.0, 0.0, 0.0)
+        """Return the telescope with a defocus, its detector in the tangent plane of the chief ray's CCD."""
+        telescope, height, tilt = self.telescope, defocus, (0.0, 0.0, 0.0)
+        if self.model.detector.body(telescope)[0] != telescope.surfaces[-1].name:
+            telescope, height = self.model.detector.defocused(telescope, defocus), 0.0
+        detector = telescope.surfaces[-1]
         place = chief_landing(telescope, direction, self.middle)
         focal_plane = self.model.detector.focal_plane
         if focal_plane is not None:
@@ -260,10 +285,3 @@ class StarLight:
     def scale(self) -> float:
         """Distance on the detector over angle on the sky [m]."""
         return math.sqrt(abs(float(np.linalg.det(self.jacobian))))
-
-    def mirrored(self) -> StarLight:
-        """Return the light with the detector as far on the other side of the best focus."""
-        detector = self.telescope.surfaces[-1]
-        shift = 2.0 * self.depth * detector.matrix[:, 2]
-        moved = self.telescope.perturbed(detector.name, shift=shift)
-        return replace(self, telescope=moved, depth=-self.depth)

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
-from ..core.errors import ConfigError, DomainError, shown
+from ..core.errors import ConfigError, DomainError, UnknownNameError, shown
 from ..core.units import ARCSEC, angle, metres, radians, require_count, require_positive
 from ..models.camera.focal_plane import FocalPlane
+from ..models.telescope import Telescope
 from ..wavefront.atmosphere.atmosphere import Atmosphere
 from ..wavefront.psf.light import Light
 from .inputs import one_for_each, outer_scale_of, small_length
@@ -28,6 +29,8 @@ _MOST_DEFOCUS = 0.1
 _FEWEST_CELLS = 8
 #: Largest number of cells across the pupil: 4 million of them.
 _MOST_CELLS = 2000
+#: Body that a defocus moves by default: the last surface of a telescope, whatever it is called there.
+DETECTOR = "Detector"
 
 
 @check_arguments
@@ -95,8 +98,13 @@ class DonutDetector:
     focal_plane : FocalPlane, optional
         Heights of the CCDs; the nominal flat plane by default.
     defocus : float or array, shape [n]
-        Shift of the detector, not of the camera, of each image along its z, beside that of the telescope [m]: 0 for all
-        in one plane, or 1.5 mm and 0 for donuts and in-focus stars, which then share one likelihood.
+        Shift of the body that `moved` names, of each image, along its z, beside that of the telescope [m]: 0 for all in
+        one plane, or 1.5 mm and 0 for donuts and in-focus stars, which then share one likelihood.
+    moved : str
+        Surface or group of the telescope that `defocus` moves, in one piece: ``"Detector"`` (the last surface, as focus
+        chips and corner rafts stand out of focus), ``"Camera"`` (full-array mode of the LSST), ``"M2"`` (AuxTel). Its z
+        is that of the surface, or of the first one of a group; of a group with the detector, that of the detector.
+        Heights of `focal_plane` are the detector's, whatever moves.
     saturation : float, optional
         Level from which on pixels are saturated [electrons]. Many pixels of the same greatest value are taken to be
         saturated without it.
@@ -111,6 +119,7 @@ class DonutDetector:
     diffusion: ArrayLike = 0.0
     focal_plane: FocalPlane | None = None
     defocus: ArrayLike = 0.0
+    moved: str = DETECTOR
     saturation: float | None = None
 
     def __post_init__(self) -> None:
@@ -132,6 +141,27 @@ class DonutDetector:
     def shifts(self, count: int) -> np.ndarray:
         """Return the shift of each of so many images along z [m]."""
         return one_for_each(metres(self.defocus, "defocus"), count, "defocus")
+
+    def body(self, telescope: Telescope) -> tuple[str, np.ndarray]:
+        """Return the name of what a defocus moves and its z axis, or raise UnknownNameError."""
+        detector = telescope.surfaces[-1]
+        if self.moved in telescope.groups:
+            with_detector = detector.name in telescope.groups[self.moved]
+            axes = detector.matrix if with_detector else np.asarray(telescope.group_frames[self.moved][1])
+            return self.moved, axes[:, 2]
+        name = detector.name if self.moved == DETECTOR else self.moved
+        if name not in telescope.surface_names:
+            groups = ", ".join(telescope.groups) or "it has none"
+            raise UnknownNameError(
+                f"moved = {shown(self.moved)}: expected a group of {telescope.name} ({groups}) or one of its surfaces "
+                f"({', '.join(telescope.surface_names)})"
+            )
+        return name, telescope.surface(name).matrix[:, 2]
+
+    def defocused(self, telescope: Telescope, shift: float) -> Telescope:
+        """Return the telescope with what a defocus moves shifted along its z [m]."""
+        name, axis = self.body(telescope)
+        return telescope.perturbed(name, shift=shift * axis) if shift else telescope
 
 
 @check_arguments
@@ -182,3 +212,7 @@ class DonutModel:
         if pixel_size is None:
             return self
         return replace(self, detector=replace(self.detector, pixel_size=pixel_size))
+
+    def with_moved(self, moved: str | None) -> DonutModel:
+        """Return the model with another body that a defocus moves; the same one without."""
+        return self if moved is None else replace(self, detector=replace(self.detector, moved=moved))

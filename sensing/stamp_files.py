@@ -2,11 +2,13 @@
 
 Field angles stand in columns ``field_x`` and ``field_y`` [deg] of the first table of the file or of a file of
 positions, one row a stamp, or in keywords ``FIELD_X`` and ``FIELD_Y`` of each image. ``defocus_um`` (keyword
-``DEFOC_UM``) is the shift of the detector along z; pixels ``x`` and ``y``, from 0, are the donuts' places on an image.
+``DEFOC_UM``) is the shift along z of the body that ``moved`` (keyword ``MOVED``) names, by default the detector; pixels
+``x`` and ``y``, from 0, are the donuts' places on an image.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,12 +33,15 @@ class DonutStamps:
     fields : ndarray, shape [n, 2], or None
         Field angles [rad]; None where the file has none.
     defocus : ndarray, shape [n]
-        Shifts of the detector [m]; 0 where the file has none.
+        Shifts of the body that moves [m]; 0 where the file has none.
+    moved : str, optional
+        Surface or group that moves, of all stamps; None where the file does not name it.
     """
 
     images: list[np.ndarray]
     fields: np.ndarray | None
     defocus: np.ndarray
+    moved: str | None = None
 
     def __len__(self) -> int:
         return len(self.images)
@@ -66,21 +71,31 @@ def read_stamps(path: Path, positions: Path | None = None, size: int = 180) -> D
             for unit in units
             if unit.is_image and unit.data is not None
         ]
+        named = [str(unit.header["MOVED"]).strip() for unit in units if unit.is_image and "MOVED" in unit.header]
         tables = [Table.read(unit) for unit in units if isinstance(unit, fits.BinTableHDU)]
     table = _table(positions) if positions is not None else tables[0] if tables else None
+    moved = one_body([*named, *(_texts(table, "moved") if table is not None else ())], path)
     stacks = [data for _, data in images]
     if not stacks or any(d.ndim not in (2, 3) or min(d.shape[-2:]) < SMALLEST_STAMP for d in stacks):
         raise ProductError("expected images: a cube [n, ny, nx], stamps, or one image of a CCD", file=path)
     if len(stacks) == 1 and stacks[0].ndim == 2 and table is not None and {"x", "y"} <= _names(table):
         cut = [_cut(stacks[0], *place, size) for place in zip(_column(table, "x"), _column(table, "y"), strict=True)]
-        return DonutStamps(cut, *_places(table, len(cut), positions or path))
+        return DonutStamps(cut, *_places(table, len(cut), positions or path), moved)
     stamps = [stamp for data in stacks for stamp in (data if data.ndim == 3 else data[None])]
     if table is not None:
-        return DonutStamps(stamps, *_places(table, len(stamps), positions or path))
+        return DonutStamps(stamps, *_places(table, len(stamps), positions or path), moved)
     headers = [header for header, data in images for _ in range(len(data) if data.ndim == 3 else 1)]
     have_fields = all("FIELD_X" in h and "FIELD_Y" in h for h in headers)
     fields = np.deg2rad([[h["FIELD_X"], h["FIELD_Y"]] for h in headers]) if have_fields else None
-    return DonutStamps(stamps, fields, np.array([1e-6 * h.get("DEFOC_UM", 0.0) for h in headers]))
+    return DonutStamps(stamps, fields, np.array([1e-6 * h.get("DEFOC_UM", 0.0) for h in headers]), moved)
+
+
+def one_body(names: Iterable[str], file: Path) -> str | None:
+    """Return the one body that stamps name as moved, None without any; ProductError where they name several."""
+    bodies = sorted({name for name in names if name})
+    if len(bodies) > 1:
+        raise ProductError(f"moved = {', '.join(bodies)}: expected one body for all stamps", file=file)
+    return bodies[0] if bodies else None
 
 
 def _described(header: fits.Header) -> dict[str, float]:
@@ -116,8 +131,14 @@ def _column(table: Table, name: str) -> np.ndarray:
     return values.astype(np.float64)
 
 
+def _texts(table: Table, name: str) -> list[str]:
+    """Return a column of texts by its name in any case; none where there is no such column."""
+    columns = [column for column in table.colnames if column.lower() == name]
+    return [str(text).strip() for text in table[columns[0]]] if columns else []
+
+
 def _places(table: Table, count: int, file: Path) -> tuple[np.ndarray | None, np.ndarray]:
-    """Return field angles [rad], None without columns, and shifts of the detector [m]."""
+    """Return field angles [rad], None without columns, and shifts of the body that moves [m]."""
     names = _names(table)
     if len(table) != count:
         raise ProductError(f"table of {len(table)} rows for {count} stamps: expected one row a stamp", file=file)

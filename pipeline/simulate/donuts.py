@@ -97,9 +97,9 @@ def draw_donuts(
     fields, wavelengths
         As in :func:`~pachon.make_psfs`; wavelengths may be those of the model.
     model : DonutModel, optional
-        What the images are made of, as :func:`~pachon.fit_donuts` takes it: light, heights, one defocus, pixels,
-        diffusion and saturation of the detector; air of a known seeing, or its exposure, unless ``atmosphere`` is
-        given.
+        What the images are made of, as :func:`~pachon.fit_donuts` takes it: light, heights, one defocus and the body
+        that it moves, pixels, diffusion and saturation of the detector; air of a known seeing, or its exposure, unless
+        ``atmosphere`` is given.
     stamps : Stamps, optional
         Size of the stamps, jitter and places; by default 181 x 181 pixels. Where it has no ``offsets``, stars stand
         anywhere within a pixel of the middle one. With a model, pixels and charge diffusion are those of its detector.
@@ -158,10 +158,8 @@ def draw_donuts(
 
 def _modelled(telescope: Telescope, model: DonutModel, psf: dict[str, Any]) -> tuple[Telescope, dict[str, Any]]:
     """Return the telescope with the defocus of a model, and the arguments of its images where none are given."""
-    detector, surface = model.detector, telescope.surfaces[-1]
-    defocus = length(detector.defocus, "defocus")
-    if defocus:
-        telescope = telescope.perturbed(surface.name, shift=defocus * surface.matrix[:, 2])
+    detector = model.detector
+    telescope = detector.defocused(telescope, length(detector.defocus, "defocus"))
     waves = wavelength_points(telescope, None if model.light is None else model.light.wavelengths)
     arguments = {"focal_plane": detector.focal_plane, "atmosphere": model.air.exposure(float(waves[len(waves) // 2]))}
     return telescope, {**arguments, **psf}
