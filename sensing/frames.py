@@ -183,6 +183,11 @@ def stamp_matrix(stamp_axes: str) -> np.ndarray:
     return np.array([_AXES[name] for name in names])
 
 
+def stamp_axes_text(matrix: np.ndarray) -> str:
+    """Return the axes of a matrix of :func:`stamp_matrix` as text."""
+    return ",".join(next(name for name, axis in _AXES.items() if np.allclose(axis, row)) for row in matrix)
+
+
 def along_camera(image: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """Return an image with rows along +y and columns along +x of the camera.
 

@@ -135,6 +135,15 @@ class ObservatoryZernikes(Result):
         table.meta.update(self.description())
         return table
 
+    def in_table(self, table: QTable) -> QTable:
+        """Return a table of the same donuts with its fields and Zernikes in this frame and convention."""
+        converted = self.to_table()
+        merged = table.copy()
+        for name in converted.colnames:
+            merged[name] = converted[name]
+        merged.meta.update(converted.meta)
+        return merged
+
     def description(self) -> dict[str, Any]:
         """Return frame, convention and unit by name, for headers of tables and JSON."""
         waves = {} if np.isnan(self.wave) else {"wave_nm": self.wave * 1e9}
