@@ -2,35 +2,47 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Argument, Option
 
-from ..core.errors import ConfigError
+from ..core.errors import ConfigError, check_choice
+from ..core.terminal import print_line, print_warning
+from .donut_inputs import (
+    DEFAULT_PIXEL_UM,
+    DEFAULT_TELESCOPE,
+    FrameOptions,
+    StampFiles,
+    donut_inputs,
+)
+from .donut_report import motion_rows, observatory_summary, orientation_text
 from .inputs import load_model
 from .interrupt import interruptible
-from .options import (
-    GlassCatalogues,
-    Json,
-    Lenient,
-    Projection,
-    Quiet,
-    Threads,
-    degrees_pair,
-    picture_kind,
-    wavelength_list,
-)
+from .options import GlassCatalogues, Json, Lenient, Projection, Quiet, Threads, picture_kind, wavelength_list
 from .tables import Rows, print_json
 
 if TYPE_CHECKING:
-    import numpy as np
-
+    from ..sensing.observatory_zernikes import BodyMotions, ObservatoryZernikes
     from ..sensing.result import DonutFit
+    from ..sensing.stamp_headers import HeaderValues
     from ..sensing.wavefront_fits import WavefrontFit
 
 app = typer.Typer()
+
+#: Panels of the help.
+_FILES = "Files and their planes"
+_TELESCOPE = "Telescope, light, detector"
+_FRAMES = "Frames and conventions"
+_FIT = "Fit"
+_OUTPUT = "Output"
+#: Field angle from which on a donut tells its orientation, as a fraction of the telescope's field.
+_OFF_AXIS = 0.25
+#: Donuts that are enough for a check of orientation wherever they stand.
+_SEVERAL = 3
 
 _CAPTION = (
     "Wavefront beyond the telescope's own: root of the summed squares of the Zernikes, and its error; the largest "
@@ -41,48 +53,155 @@ _CAPTION = (
 @app.command("donuts")
 def donuts_command(
     files: Annotated[list[Path], Argument(metavar="FILE.fits ...", help="Stamps of donuts, or images of CCDs.")],
-    telescope: Annotated[str, Option("--telescope", "-t", help="Bundled model, or path.")] = "lsst_v3.3_r",
+    telescope: Annotated[
+        str | None,
+        Option(
+            "--telescope",
+            "-t",
+            help="Bundled model, or path; that of the headers' camera and band, or lsst_v3.3_r.",
+            rich_help_panel=_TELESCOPE,
+        ),
+    ] = None,
     defocus_um: Annotated[
-        float, Option(help="Shift along z of what --moved names [um], beside the file's: 1500 behind focus.")
+        float,
+        Option(
+            help="Shift along z of what --moved names [um], beside the file's: 1500 behind focus.",
+            rich_help_panel=_TELESCOPE,
+        ),
     ] = 0.0,
     moved: Annotated[
         str | None,
-        Option(help="Surface or group that defocus moves: Detector, Camera, M2, ...; the file's, else Detector."),
+        Option(
+            help="Surface or group that defocus moves: Detector, Camera, M2, ...; the file's or its camera's own.",
+            rich_help_panel=_TELESCOPE,
+        ),
     ] = None,
     wavelength_nm: Annotated[
         list[float] | None,
-        Option("--wavelength-nm", help="Wavelength [nm], once for each; the model's own by default."),
+        Option(
+            "--wavelength-nm",
+            help="Wavelength [nm], once for each; the header's or the model's own by default.",
+            rich_help_panel=_TELESCOPE,
+        ),
     ] = None,
     field_deg: Annotated[
-        str | None, Option("--field-deg", metavar="X,Y", help="Field angle of all stamps [deg], where files have none.")
+        str | None,
+        Option(
+            "--field-deg",
+            metavar="X,Y",
+            help="Field angle of all stamps [deg], where files have none.",
+            rich_help_panel=_FILES,
+        ),
     ] = None,
     positions: Annotated[
-        Path | None, Option(help="Table with field_x, field_y [deg], and for the image of a CCD x, y [pixels].")
+        Path | None,
+        Option(
+            help="Table with field_x, field_y [deg], and for the image of a CCD x, y [pixels].", rich_help_panel=_FILES
+        ),
     ] = None,
-    stamp: Annotated[int, Option(min=16, help="Side of the stamps cut from the image of a CCD [pixels].")] = 180,
-    pixel_um: Annotated[float, Option(help="Side of a pixel [um].")] = 10.0,
-    gain: Annotated[float, Option(help="Electrons per unit of the images.")] = 1.0,
+    stamp: Annotated[
+        int, Option(min=16, help="Side of the stamps cut from the image of a CCD [pixels].", rich_help_panel=_FILES)
+    ] = 180,
+    mask: Annotated[
+        Path | None, Option(help="FITS file of masks: pixels other than 0 are left out.", rich_help_panel=_FILES)
+    ] = None,
+    variance: Annotated[
+        Path | None, Option(help="FITS file of variances, in the square of the unit.", rich_help_panel=_FILES)
+    ] = None,
+    pixel_um: Annotated[
+        float | None,
+        Option(help="Side of a pixel [um]; that of the headers' camera, or 10.", rich_help_panel=_TELESCOPE),
+    ] = None,
+    gain: Annotated[
+        float | None,
+        Option(help="Electrons per unit of the images; GAIN of the header, or 1.", rich_help_panel=_FILES),
+    ] = None,
     sky_variance: Annotated[
-        float | None, Option(help="Variance of sky and readout [electron^2]; from the edges of the stamps by default.")
+        float | None,
+        Option(
+            help="Variance of sky and readout [electron^2]; of the variance plane, or of the edges of the stamps.",
+            rich_help_panel=_FIT,
+        ),
     ] = None,
-    saturation: Annotated[float | None, Option(help="Level of saturated pixels [electrons].")] = None,
-    terms: Annotated[int, Option("--zernikes", min=4, max=78, help="Highest Noll index.")] = 22,
-    higher_order_nm: Annotated[float, Option(help="Rms of each Zernike of the next radial degree [nm].")] = 10.0,
+    saturation: Annotated[
+        float | None, Option(help="Level of saturated pixels [electrons].", rich_help_panel=_TELESCOPE)
+    ] = None,
+    terms: Annotated[int, Option("--zernikes", min=4, max=78, help="Highest Noll index.", rich_help_panel=_FIT)] = 22,
+    higher_order_nm: Annotated[
+        float, Option(help="Rms of each Zernike of the next radial degree [nm].", rich_help_panel=_FIT)
+    ] = 10.0,
     exposure_s: Annotated[
         float | None,
-        Option(help="Length of the exposure [s]: its turbulence adds to errors, and its higher terms are fitted."),
+        Option(
+            help="Length of the exposure [s]: its turbulence adds to errors, and its higher terms are fitted.",
+            rich_help_panel=_FIT,
+        ),
     ] = None,
-    site: Annotated[str, Option(help="Site whose turbulence and winds --exposure-s is about.")] = "cerro_pachon",
+    site: Annotated[
+        str, Option(help="Site whose turbulence and winds --exposure-s is about.", rich_help_panel=_FIT)
+    ] = "cerro_pachon",
     degrees_of_freedom: Annotated[
-        str | None, Option(help="Fit degrees of freedom to all donuts: lsst, or a YAML file.")
+        str | None,
+        Option(
+            help="Fit degrees of freedom to all donuts: lsst, or a YAML file; prints hexapod corrections.",
+            rich_help_panel=_FIT,
+        ),
     ] = None,
-    outer_scale_m: Annotated[float, Option(help="Outer scale of the turbulence [m]; inf for Kolmogorov's.")] = 25.0,
+    outer_scale_m: Annotated[
+        float, Option(help="Outer scale of the turbulence [m]; inf for Kolmogorov's.", rich_help_panel=_FIT)
+    ] = 25.0,
     diffraction: Annotated[
-        bool, Option(help="Diffraction at the rims of the pupil: not in images made of rays alone.")
+        bool,
+        Option(help="Diffraction at the rims of the pupil: not in images made of rays alone.", rich_help_panel=_FIT),
+    ] = True,
+    stamp_axes: Annotated[
+        str | None,
+        Option(
+            metavar="X,Y",
+            help="Axes of the camera along columns and rows of stamps: x,y, -y,x...; DVCS (LSST's images, y,x). "
+            "By default those of the headers' detector, or x,y.",
+            rich_help_panel=_FRAMES,
+        ),
+    ] = None,
+    rotator_deg: Annotated[
+        float | None,
+        Option(
+            help="Camera from +x towards +y of the telescope (rotTelPos) [deg]; the header's, or 0.",
+            rich_help_panel=_FRAMES,
+        ),
+    ] = None,
+    parallactic_deg: Annotated[
+        float | None,
+        Option(
+            help="Position angle of the telescope's +y, north through east: Rubin's parallactic angle [deg].",
+            rich_help_panel=_FRAMES,
+        ),
+    ] = None,
+    field_frame: Annotated[
+        str, Option(help="Frame of field angles given: OCS, CCS, DVCS, ZCS, sky.", rich_help_panel=_FRAMES)
+    ] = "OCS",
+    frame: Annotated[
+        str, Option(help="Frame of results: OCS (telescope), CCS, DVCS, ZCS, sky.", rich_help_panel=_FRAMES)
+    ] = "OCS",
+    convention: Annotated[
+        str,
+        Option(
+            help="Zernikes of results: pachon (nm), ts_wep (um), donut (DECam's, circular, waves of 700 nm).",
+            rich_help_panel=_FRAMES,
+        ),
+    ] = "pachon",
+    orientation_check: Annotated[
+        bool,
+        Option(help="Warn where mirrored or turned stamps fit better; 1 to 3 s.", rich_help_panel=_FRAMES),
     ] = True,
     projection: Projection = "zemax",
-    out: Annotated[Path | None, Option("--out", "-o", help="Table: .ecsv, .fits, .csv or .parquet.")] = None,
-    picture: Annotated[Path | None, Option(help="Picture of the first six donuts: .png, .pdf or .svg.")] = None,
+    out: Annotated[
+        Path | None, Option("--out", "-o", help="Table: .ecsv, .fits, .csv or .parquet.", rich_help_panel=_OUTPUT)
+    ] = None,
+    picture: Annotated[
+        Path | None,
+        Option(help="Picture of the first six donuts: .png, .pdf or .svg.", rich_help_panel=_OUTPUT),
+    ] = None,
     glass_catalogue: GlassCatalogues = None,
     lenient: Lenient = False,
     threads: Threads = None,
@@ -92,9 +211,12 @@ def donuts_command(
     """Measure the wavefront of out-of-focus stars (donuts): annular Zernikes beyond those of the telescope.
 
     A file holds a cube of stamps and a table with their fields (field_x, field_y [deg], defocus_um), one stamp an
-    extension with keywords FIELD_X, FIELD_Y and DEFOC_UM, or the image of a CCD, with --positions. Stamps have x and y
-    along those of the detector, and no sky. Bad donuts are flagged with the reason. A defocus moves the detector, or
-    what --moved, a keyword MOVED or a column moved names: Camera (full-array mode of the LSST), M2 (AuxTel).
+    extension with keywords FIELD_X, FIELD_Y and DEFOC_UM, or the image of a CCD, with --positions. Of LSSTCam, ComCam,
+    LATISS and DECam, and of ts_wep's DonutStamps, headers give camera, detector, pixel, angles, band and gain, and
+    extensions MASK, VARIANCE (DQ, WEIGHT) are read. Stamps have x and y along those of the camera, unless --stamp-axes
+    or the header's detector says otherwise. A defocus moves what --moved, a keyword MOVED or a column moved names, or
+    the header's camera: Camera (full-array mode of LSSTCam), M2 (AuxTel), otherwise the detector. Bad donuts are flagged
+    with the reason.
 
     **Examples**
 
@@ -102,55 +224,115 @@ def donuts_command(
     - `pachon donuts full_array.fits --moved Camera --defocus-um 1500`
     - `pachon donuts corner_*.fits -t rubin_v3.14_i --degrees-of-freedom lsst --json`
     - `pachon donuts ccd.fits --positions stars.ecsv --stamp 200 --defocus-um -1500`
+    - `pachon donuts donutStamps.fits --frame CCS --convention ts_wep` (as LSST's zk_deviation_CCS)
+    - `pachon donuts DECam_*.stamp.fits --defocus-um 2000 --convention donut`
+    - `pachon donuts stamps.fits --stamp-axes DVCS --rotator-deg 12.3 --degrees-of-freedom lsst --frame ZCS`
     """
     from ..models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
     from ..sensing.fit import fit_donuts
+    from ..sensing.flags import DonutFlag
     from ..sensing.freedom_fit import TelescopeFreedoms
     from ..sensing.model import DETECTOR, DonutAir, DonutDetector, DonutModel
-    from ..sensing.stamp_files import border_variance
+    from ..sensing.observatory_zernikes import CONVENTIONS, hexapod_corrections
+    from ..sensing.orientation import check_orientation
     from ..sensing.wavefront_fits import SingleDonuts
     from ..wavefront.atmosphere.atmosphere import Atmosphere
 
     kind = _output_kind(out, picture)
-    believed = load_model(telescope, lenient, glass_catalogue or ())
+    check_choice("--convention", convention, CONVENTIONS)
+    files_read = StampFiles.read(files, positions, stamp, mask, variance)
+    header = files_read.header()
+    options = FrameOptions(rotator_deg, parallactic_deg, stamp_axes, field_frame, field_deg, projection)
+    frames = options.frames(header)
+    frames.axes(frame)
+    believed = frames.telescope(
+        load_model(telescope or header.model or DEFAULT_TELESCOPE, lenient, glass_catalogue or ())
+    )
     noll = range(4, terms + 1)
     wavefront: WavefrontFit = SingleDonuts(noll, higher_order=higher_order_nm * 1e-9)
     if degrees_of_freedom is not None:
         wavefront = TelescopeFreedoms(load_degrees_of_freedom(degrees_of_freedom), noll=noll)
     atmosphere = None if exposure_s is None else Atmosphere.from_site(site, 0, exposure=exposure_s)
-    images, fields, defocus, body = _stamps(files, positions, stamp, field_deg)
-    images = [gain * image for image in images]
+    inputs = donut_inputs(files_read, options, frames, believed, _electrons(gain, header))
     model = DonutModel(
         air=DonutAir(outer_scale=outer_scale_m, atmosphere=atmosphere),
         detector=DonutDetector(
-            pixel_um * 1e-6,
-            defocus=defocus + 1e-6 * defocus_um,
-            moved=moved or body or DETECTOR,
+            _pixel_um(pixel_um, header) * 1e-6,
+            defocus=inputs.defocus + 1e-6 * defocus_um,
+            moved=moved or files_read.moved() or DETECTOR,
             saturation=saturation,
         ),
         diffraction=diffraction,
     )
+    light = wavelength_list(believed, wavelength_nm, None)
+    if wavelength_nm is None and header.wavelength is not None:
+        light = [header.wavelength]
+    sky = inputs.variances if sky_variance is None else [sky_variance] * len(inputs.images)
+    if not quiet and header.text:
+        print_line(f"{files[0]}: {header.text} of its header; {believed.name}", error=True)
+    orientation = None
     with (
         interruptible(quiet) as reporter,
-        reporter.stage(f"wavefronts of {len(images)} donuts", total=len(images)) as stage,
+        reporter.stage(f"wavefronts of {len(inputs.images)} donuts", total=len(inputs.images)) as stage,
     ):
         fit = fit_donuts(
             believed,
-            images,
-            fields,
-            wavelength_list(believed, wavelength_nm, None),
-            sky_variance=[border_variance(image) for image in images] if sky_variance is None else sky_variance,
+            inputs.images,
+            inputs.fields,
+            light,
+            sky_variance=sky,
             model=model,
             fit=wavefront,
+            mask=inputs.masks if any(m.any() for m in inputs.masks) else None,
             projection=projection,
             threads=threads,
             progress=stage.advance,
         )
-    _write(fit, out, picture, kind)
+        usable = [int(i) for i in fit.usable.nonzero()[0]]
+        off_axis = (abs(inputs.fields[usable]) > _OFF_AXIS * believed.field_radius).any()
+        if orientation_check and usable and (len(usable) >= _SEVERAL or off_axis):
+            shifts = model.detector.shifts(len(inputs.images))[usable]
+            orientation = check_orientation(
+                believed,
+                [inputs.images[i] for i in usable],
+                inputs.fields[usable],
+                light,
+                sky_variance=[sky[i] for i in usable],
+                model=replace(model, detector=replace(model.detector, defocus=shifts)),
+                mask=[inputs.masks[i] for i in usable],
+                projection=projection,
+                threads=threads,
+            )
+    if orientation is not None and orientation.doubtful:
+        fit = replace(fit, flags=fit.flags | fit.usable * int(DonutFlag.ORIENTATION))
+        print_warning(orientation_text(orientation, inputs))
+    converted = fit.zernikes_in(convention, frame, frames=frames)
+    motions = None
+    if fit.degrees_of_freedom is not None:
+        motions = hexapod_corrections(fit.degrees_of_freedom, frame="OCS" if frame == "DVCS" else frame, frames=frames)
+    _write(fit, converted, out, picture, kind)
     if as_json:
-        print_json(fit.summary())
+        print_json(fit.summary() | observatory_summary(frames, converted, motions, orientation))
     elif not quiet:
-        _show(fit)
+        _show(fit, converted, motions)
+
+
+def _electrons(gain: float | None, header: HeaderValues) -> float:
+    """Return electrons of a unit of the images: of the option, the header, or 1."""
+    if gain is None:
+        return 1.0 if header.gain is None else header.gain
+    if not (isfinite(gain) and gain > 0.0):
+        raise ConfigError(f"--gain = {gain}: expected electrons of a unit, above 0")
+    return gain
+
+
+def _pixel_um(pixel_um: float | None, header: HeaderValues) -> float:
+    """Return the side of a pixel [um]: of the option, the camera of the header, or that of the LSST."""
+    from ..models.camera.cameras import load_camera
+
+    if pixel_um is not None:
+        return pixel_um
+    return DEFAULT_PIXEL_UM if header.camera is None else 1e6 * load_camera(header.camera).pixel_size
 
 
 def _output_kind(table: Path | None, picture: Path | None) -> str:
@@ -163,55 +345,47 @@ def _output_kind(table: Path | None, picture: Path | None) -> str:
     return kind
 
 
-def _stamps(
-    files: list[Path], positions: Path | None, size: int, field_deg: str | None
-) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, str | None]:
-    """Return the stamps of files, their field angles [rad], shifts [m] and what is shifted, where the files say."""
-    import numpy as np
-
-    from ..sensing.stamp_files import one_body, read_stamps
-
-    field = None if field_deg is None else np.deg2rad(degrees_pair(field_deg, "--field-deg"))
-    images, fields, defocus, bodies = [], [], [], []
-    for path in files:
-        stamps = read_stamps(path, positions, size)
-        places = field if stamps.fields is None else stamps.fields
-        if places is None:
-            raise ConfigError(
-                "no field angles: expected FIELD_X and FIELD_Y, a table with them, or --field-deg", file=path
-            )
-        images += stamps.images
-        fields.append(np.broadcast_to(places, (len(stamps), 2)))
-        defocus.append(stamps.defocus)
-        bodies.append(stamps.moved or "")
-    return images, np.concatenate(fields), np.concatenate(defocus), one_body(bodies, files[-1])
-
-
-def _write(fit: DonutFit, table: Path | None, picture: Path | None, kind: str) -> None:
+def _write(fit: DonutFit, converted: ObservatoryZernikes, table: Path | None, picture: Path | None, kind: str) -> None:
     """Write the table and the picture of a fit, where they are asked for."""
     from ..core.files import write_bytes
     from ..core.plotting import picture_bytes
     from ..core.table_files import write_table
 
     if table is not None:
-        write_table(table, fit.to_table())
+        # The default is a table without a word of frames.
+        plain = converted.convention == "pachon" and converted.frame == "OCS"
+        write_table(table, fit.to_table() if plain else converted.in_table(fit.to_table()))
     if picture is not None:
         write_bytes(picture, picture_bytes(fit.plot(), kind))
 
 
-def _show(fit: DonutFit) -> None:
+def _show(fit: DonutFit, converted: ObservatoryZernikes, motions: BodyMotions | None) -> None:
     import numpy as np
 
+    scale, unit, form = {"pachon": (1e9, "nm", ".0f"), "ts_wep": (1.0, "um", ".3f")}.get(
+        converted.convention, (1.0, "waves", ".3f")
+    )
     rows = []
-    for i, (x, y) in enumerate(np.rad2deg(fit.fields)):
+    for i, (x, y) in enumerate(np.rad2deg(converted.fields)):
         if not fit.usable[i]:
             rows.append((f"{x:.4g}, {y:.4g}", fit.reasons[i], *[""] * 5))
             continue
-        nm, error = fit.zernikes[i] * 1e9, fit.errors[i] * 1e9
-        largest = ", ".join(f"Z{fit.noll[k]} {nm[k]:+.0f}" for k in np.argsort(-np.abs(nm))[:3])
+        values, error = converted.values[i] * scale, converted.errors[i] * scale
+        largest = ", ".join(f"Z{fit.noll[k]} {values[k]:+{form}}" for k in np.argsort(-np.abs(values))[:3])
         seeing = np.rad2deg(fit.fwhm[i]) * 3600.0
         quality = fit.chi2[i] / fit.n_pixels[i]
-        sizes = f"{np.linalg.norm(nm):.0f}", f"{np.linalg.norm(error):.0f}"
+        sizes = f"{np.linalg.norm(values):{form}}", f"{np.linalg.norm(error):{form}}"
         rows.append((f"{x:.4g}, {y:.4g}", fit.reasons[i] or "ok", *sizes, largest, f"{seeing:.2f}", f"{quality:.2f}"))
-    headings = ("field [deg]", "flags", "rms [nm]", "error [nm]", "largest [nm]", 'FWHM ["]', "chi2 a pixel")
-    Rows(headings, rows, _CAPTION, left=2).show()
+    headings = (
+        "field [deg]",
+        "flags",
+        f"rms [{unit}]",
+        f"error [{unit}]",
+        f"largest [{unit}]",
+        'FWHM ["]',
+        "chi2 a pixel",
+    )
+    caption = f"{_CAPTION} Frame {converted.frame}, convention {converted.convention}."
+    Rows(headings, rows, caption, left=2).show()
+    if motions is not None:
+        Rows(*motion_rows(motions), left=1).show()

@@ -301,10 +301,16 @@ from .reconstruction.psfex import load_psfex as load_psfex
 from .sensing.degrees import FreedomEstimate as FreedomEstimate
 from .sensing.fit import fit_donuts as fit_donuts
 from .sensing.flags import DonutFlag as DonutFlag
+from .sensing.frames import DonutFrames as DonutFrames
 from .sensing.freedom_fit import TelescopeFreedoms as TelescopeFreedoms
 from .sensing.model import DonutAir as DonutAir
 from .sensing.model import DonutDetector as DonutDetector
 from .sensing.model import DonutModel as DonutModel
+from .sensing.observatory_zernikes import BodyMotions as BodyMotions
+from .sensing.observatory_zernikes import ObservatoryZernikes as ObservatoryZernikes
+from .sensing.observatory_zernikes import hexapod_corrections as hexapod_corrections
+from .sensing.orientation import OrientationCheck as OrientationCheck
+from .sensing.orientation import check_orientation as check_orientation
 from .sensing.result import DonutFit as DonutFit
 from .sensing.wavefront_fits import FieldTerms as FieldTerms
 from .sensing.wavefront_fits import SingleDonuts as SingleDonuts

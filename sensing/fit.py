@@ -245,4 +245,5 @@ def _result(
         double_zernikes=fitted.double_zernikes,
         double_zernike_covariance=fitted.double_zernike_covariance,
         degrees_of_freedom=fitted.degrees_of_freedom,
+        projection=observed.projection,
     )

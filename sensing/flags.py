@@ -9,7 +9,8 @@ class DonutFlag(IntFlag):
     """Outcome of the fit of one donut; zero for a clean one.
 
     ``BLENDED`` (a second star was fitted too), ``CLIPPED`` (pixels far off the model, cosmic rays for example, were
-    left out) and ``POOR_FIT`` (chi-square is far above the number of pixels, so that errors are larger than claimed)
+    left out), ``POOR_FIT`` (chi-square is far above the number of pixels, so that errors are larger than claimed)
+    and ``ORIENTATION`` (stamps of the exposure fit better as mirror images, or turned by quarters; set by the command)
     are remarks: there are results. With any other flag the results of the donut are NaN.
 
     ``NO_DONUT``: nothing like a donut stands on the stamp. ``CUT_OFF``: more than a twentieth of the light falls beside
@@ -32,11 +33,12 @@ class DonutFlag(IntFlag):
     NOT_FINITE = 512
     NOT_CONVERGED = 1024
     POOR_FIT = 2048
+    ORIENTATION = 65536
 
     @property
     def usable(self) -> bool:
         """Whether the donut has results."""
-        return not self & ~(DonutFlag.BLENDED | DonutFlag.CLIPPED | DonutFlag.POOR_FIT)
+        return not self & ~(DonutFlag.BLENDED | DonutFlag.CLIPPED | DonutFlag.POOR_FIT | DonutFlag.ORIENTATION)
 
     @property
     def reasons(self) -> str:

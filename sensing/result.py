@@ -16,10 +16,15 @@ from ..design.drawing import field_colors
 from ..design.metrics.field_zernikes import name_terms
 from .degrees import FreedomEstimate
 from .flags import DonutFlag
+from .frames import DonutFrames
+from .observatory_zernikes import ObservatoryZernikes, observatory_zernikes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike
+
+    from ..models.telescope import Telescope
 
 #: Donuts of one picture unless others are asked for.
 _SHOWN = 6
@@ -92,6 +97,8 @@ class DonutFit(Result):
         Coefficients over the field and the pupil [m], and their covariance in that order, flattened.
     degrees_of_freedom : FreedomEstimate or None
         Degrees of freedom of the telescope.
+    projection : str
+        Meaning of the field angles.
     """
 
     zernikes: np.ndarray
@@ -119,6 +126,7 @@ class DonutFit(Result):
     double_zernikes: np.ndarray | None = None
     double_zernike_covariance: np.ndarray | None = None
     degrees_of_freedom: FreedomEstimate | None = None
+    projection: str = "zemax"
 
     def __len__(self) -> int:
         """Return the number of donuts."""
@@ -148,6 +156,43 @@ class DonutFit(Result):
     def rms(self) -> np.ndarray:
         """Root of the summed squares of the Zernikes [m], shape [n]."""
         return np.sqrt((self.zernikes**2).sum(axis=1))
+
+    def zernikes_in(
+        self,
+        convention: str = "pachon",
+        frame: str = "OCS",
+        *,
+        frames: DonutFrames | None = None,
+        design: Telescope | None = None,
+        wave: ArrayLike | None = None,
+    ) -> ObservatoryZernikes:
+        """Return the wavefronts in the convention and the frame of an observatory.
+
+        Parameters
+        ----------
+        convention : {"pachon", "ts_wep", "donut"}
+            Annular Zernikes [m]; the same [um], as LSST's `zk_deviation`; or circular ones in waves, as DECam's Donut.
+        frame : {"OCS", "CCS", "DVCS", "ZCS", "sky"}
+            Frame of the pupil's axes and of field angles.
+        frames : DonutFrames, optional
+            Angles of rotator and sky; zero by default.
+        design : Telescope, optional
+            Telescope in focus whose own wavefront is added: LSST's `zk` in place of `zk_deviation`.
+        wave : float or Quantity, optional
+            Length of a wave of ``donut`` [m]; 700 nm by default.
+
+        Returns
+        -------
+        ObservatoryZernikes
+
+        Raises
+        ------
+        ConfigError
+            If a convention or a frame is unknown, or the frame lacks the parallactic angle.
+        DomainError
+            If a turned term lacks its partner of the same order among the fitted ones.
+        """
+        return observatory_zernikes(self, convention, frame, frames or DonutFrames(), design, wave)
 
     def _label(self) -> str:
         return f"{len(self)} donuts, {int(self.usable.sum())} with results, Zernikes {self.noll[0]} to {self.noll[-1]}"

@@ -4,12 +4,15 @@ Field angles stand in columns ``field_x`` and ``field_y`` [deg] of the first tab
 positions, one row a stamp, or in keywords ``FIELD_X`` and ``FIELD_Y`` of each image. ``defocus_um`` (keyword
 ``DEFOC_UM``) is the shift along z of the body that ``moved`` (keyword ``MOVED``) names, by default the detector; pixels
 ``x`` and ``y``, from 0, are the donuts' places on an image.
+Without field angles, detector and pixel are those of the headers of observatories (:mod:`.stamp_headers`). Extensions
+with masks, variances or weights go with the images in their order.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +23,23 @@ from ..core.errors import ProductError
 from ..core.files import parsing, require_file
 from ..core.statistics import robust_rms
 from .inputs import MOST_ELECTRONS, SMALLEST_STAMP
+from .stamp_headers import HeaderValues, corner_of, defocus_of, detector_of, header_values, pixel_of, stamp_header
+
+#: Kinds of planes that go with images, by the names of their extensions without numbers.
+_PLANES = {
+    "mask": r"MASK|MSK|DQ|QUALITY|FLAGS|BPM",
+    "variance": r"VARIANCE|VAR",
+    "weight": r"WEIGHT|WGT|WHT|WTMAP|IVAR|INVVAR",
+}
+#: Planes of LSST's masks whose pixels have no measured light; its headers number them by MP_<name>.
+_BAD_PLANES = ("BAD", "SAT", "INTRP", "CR", "EDGE", "NO_DATA", "SUSPECT", "UNMASKEDNAN")
+#: Columns that make a table one of stamps or positions.
+_COLUMNS = {"field_x", "field_y", "x", "y", "defocus_um"}
 
 
 @dataclass(frozen=True)
 class DonutStamps:
-    """Stamps with their places in the field.
+    """Stamps with their places in the field or on the camera.
 
     Attributes
     ----------
@@ -34,6 +49,18 @@ class DonutStamps:
         Field angles [rad]; None where the file has none.
     defocus : ndarray, shape [n]
         Shifts of the body that moves [m]; 0 where the file has none.
+    masks : list of ndarray of bool
+        Pixels to leave out.
+    variances : list of ndarray, or None
+        Variance planes, in the square of the images' unit; None where the file has none.
+    detectors : list of str, int or None
+        Names or numbers of the detectors.
+    pixels : ndarray, shape [n, 2]
+        Pixels of the detector, from 0, in the middles of the stamps; NaN where the file does not say.
+    has_defocus : ndarray of bool, shape [n]
+        Whether the file says how far the body was moved.
+    header : HeaderValues
+        What its headers say of the exposure.
     moved : str, optional
         Surface or group that moves, of all stamps; None where the file does not name it.
     """
@@ -41,13 +68,36 @@ class DonutStamps:
     images: list[np.ndarray]
     fields: np.ndarray | None
     defocus: np.ndarray
+    masks: list[np.ndarray]
+    variances: list[np.ndarray] | None
+    detectors: list[str | int | None]
+    pixels: np.ndarray
+    has_defocus: np.ndarray
+    header: HeaderValues = field(default_factory=HeaderValues)
     moved: str | None = None
 
     def __len__(self) -> int:
         return len(self.images)
 
 
-def read_stamps(path: Path, positions: Path | None = None, size: int = 180) -> DonutStamps:
+@dataclass(frozen=True)
+class _Image:
+    """Image of one stamp or CCD with its mask, variance and header."""
+
+    data: np.ndarray
+    mask: np.ndarray
+    variance: np.ndarray | None
+    header: fits.Header
+
+
+def read_stamps(
+    path: Path,
+    positions: Path | None = None,
+    size: int = 180,
+    *,
+    mask: Path | None = None,
+    variance: Path | None = None,
+) -> DonutStamps:
     """Read the stamps of a FITS file.
 
     Parameters
@@ -58,36 +108,47 @@ def read_stamps(path: Path, positions: Path | None = None, size: int = 180) -> D
         Table (ECSV, CSV or FITS) of donuts: of their places on one image, or of the stamps of a cube.
     size : int
         Side of the stamps cut out of an image [pixels].
+    mask, variance : Path, optional
+        FITS files with masks, pixels other than 0 left out, and variances of the images, in their order.
 
     Raises
     ------
     ProductError
-        If a file cannot be read, has no images, or a table lacks a column or has another number of rows.
+        If a file cannot be read, has no images, a plane does not go with the images, or a table lacks a column or has
+        another number of rows.
     """
-    require_file(path, ProductError)
-    with parsing(path, "cannot be read as FITS", ProductError), fits.open(path, memmap=False) as units:
-        images = [
-            (_described(unit.header), np.asarray(unit.data, dtype=np.float64))
-            for unit in units
-            if unit.is_image and unit.data is not None
-        ]
-        named = [str(unit.header["MOVED"]).strip() for unit in units if unit.is_image and "MOVED" in unit.header]
-        tables = [Table.read(unit) for unit in units if isinstance(unit, fits.BinTableHDU)]
+    units = _units(path)
+    primary = units[0][0] if units else fits.Header()
+    images = _with_planes(units, path, primary, mask, variance)
+    tables = [data for _, data in units if isinstance(data, Table) and _names(data) & _COLUMNS]
     table = _table(positions) if positions is not None else tables[0] if tables else None
-    moved = one_body([*named, *(_texts(table, "moved") if table is not None else ())], path)
-    stacks = [data for _, data in images]
-    if not stacks or any(d.ndim not in (2, 3) or min(d.shape[-2:]) < SMALLEST_STAMP for d in stacks):
+    if not images or any(i.data.ndim not in (2, 3) or min(i.data.shape[-2:]) < SMALLEST_STAMP for i in images):
         raise ProductError("expected images: a cube [n, ny, nx], stamps, or one image of a CCD", file=path)
-    if len(stacks) == 1 and stacks[0].ndim == 2 and table is not None and {"x", "y"} <= _names(table):
-        cut = [_cut(stacks[0], *place, size) for place in zip(_column(table, "x"), _column(table, "y"), strict=True)]
-        return DonutStamps(cut, *_places(table, len(cut), positions or path), moved)
-    stamps = [stamp for data in stacks for stamp in (data if data.ndim == 3 else data[None])]
+    values = header_values([image.header for image in images], path)
+    named = [str(image.header["MOVED"]).strip() for image in images if "MOVED" in image.header]
+    moved = one_body([*named, *(_texts(table, "moved") if table is not None else ())], path)
+    if len(images) == 1 and images[0].data.ndim == 2 and table is not None and {"x", "y"} <= _names(table):
+        return replace(_cut_stamps(images[0], table, size, positions or path, values, path), moved=moved)
+    single = [stamp for image in images for stamp in _split(image)]
+    described = [(defocus_of(i.header, path), _field_of(i.header, path)) for i in single]
+    shifts = np.array([shift for shift, _ in described])
+    fields = np.array([place for _, place in described])
+    known_fields = None if np.isnan(fields).any() else np.deg2rad(fields)
     if table is not None:
-        return DonutStamps(stamps, *_places(table, len(stamps), positions or path), moved)
-    headers = [header for header, data in images for _ in range(len(data) if data.ndim == 3 else 1)]
-    have_fields = all("FIELD_X" in h and "FIELD_Y" in h for h in headers)
-    fields = np.deg2rad([[h["FIELD_X"], h["FIELD_Y"]] for h in headers]) if have_fields else None
-    return DonutStamps(stamps, fields, np.array([1e-6 * h.get("DEFOC_UM", 0.0) for h in headers]), moved)
+        known_fields, table_shifts = _places(table, len(single), positions or path)
+        shifts = shifts if table_shifts is None else table_shifts
+    return DonutStamps(
+        images=[i.data for i in single],
+        fields=known_fields,
+        defocus=np.nan_to_num(shifts),
+        masks=[i.mask for i in single],
+        variances=_all_variances(single),
+        detectors=[detector_of(i.header) for i in single],
+        pixels=np.array([pixel_of(i.header, i.data.shape, path) for i in single]),
+        has_defocus=np.isfinite(shifts),
+        header=values,
+        moved=moved,
+    )
 
 
 def one_body(names: Iterable[str], file: Path) -> str | None:
@@ -98,9 +159,133 @@ def one_body(names: Iterable[str], file: Path) -> str | None:
     return bodies[0] if bodies else None
 
 
-def _described(header: fits.Header) -> dict[str, float]:
-    """Return the place and the defocus of a stamp, as far as its header has them."""
-    return {key: float(header[key]) for key in ("FIELD_X", "FIELD_Y", "DEFOC_UM") if key in header}
+def _cut_stamps(
+    image: _Image, table: Table, size: int, positions: Path, values: HeaderValues, path: Path
+) -> DonutStamps:
+    """Return stamps cut out of the image of a CCD about the places of a table."""
+    centers = np.stack([_column(table, "x"), _column(table, "y")], axis=-1)
+    fields, shifts = _places(table, len(centers), positions)
+    if shifts is None:
+        shifts = np.full(len(centers), defocus_of(image.header, path))
+
+    def cut(plane: np.ndarray, outside: float | bool) -> list[np.ndarray]:
+        return [_cut(plane, *center, size, outside) for center in centers]
+
+    middles = np.round(centers) + 0.5 * (size - 1) - size // 2 + np.array(corner_of(image.header, path))
+    return DonutStamps(
+        images=cut(image.data, np.nan),
+        fields=fields,
+        defocus=np.nan_to_num(shifts),
+        masks=cut(image.mask, False),
+        variances=None if image.variance is None else cut(image.variance, np.nan),
+        detectors=[detector_of(image.header)] * len(centers),
+        pixels=middles,
+        has_defocus=np.isfinite(shifts),
+        header=values,
+    )
+
+
+def _units(path: Path) -> list[tuple[fits.Header, np.ndarray | Table | None]]:
+    """Return headers and contents of the units of a FITS file: images, tables, or nothing."""
+    require_file(path, ProductError)
+    contents: list[tuple[fits.Header, np.ndarray | Table | None]] = []
+    with parsing(path, "cannot be read as FITS", ProductError), fits.open(path, memmap=False) as units:
+        for unit in units:
+            if unit.is_image:
+                contents.append((unit.header, None if unit.data is None else np.asarray(unit.data)))
+            elif isinstance(unit, fits.BinTableHDU) and not unit.header.get("EXTNAME", "").startswith("ARCHIVE"):
+                contents.append((unit.header, Table.read(unit)))
+    return contents
+
+
+def _with_planes(
+    units: Sequence[tuple[fits.Header, np.ndarray | Table | None]],
+    path: Path,
+    primary: fits.Header,
+    mask: Path | None,
+    variance: Path | None,
+) -> list[_Image]:
+    """Return the images of a file with their masks and variances, those of files of their own before its own."""
+    planes: dict[str, list[tuple[fits.Header, np.ndarray]]] = {"image": [], **{kind: [] for kind in _PLANES}}
+    for header, data in units:
+        if isinstance(data, np.ndarray):
+            planes[_kind_of(header)].append((header, data))
+    for kind, file in (("mask", mask), ("variance", variance)):
+        if file is not None:
+            planes[kind] = [(header, data) for header, data in _units(file) if isinstance(data, np.ndarray)]
+    images = planes["image"]
+    for kind, listed in planes.items():
+        file = {"mask": mask, "variance": variance}.get(kind) or path
+        if kind != "image" and listed and [d.shape for _, d in listed] != [d.shape for _, d in images]:
+            shapes, expected = ([list(d.shape) for _, d in part[:1]] for part in (listed, images))
+            counts = f"{len(listed)} of shape {shapes[0]} for {len(images)} images" + (
+                f" of {expected[0]}" if expected else ""
+            )
+            raise ProductError(f"planes of {kind}: {counts}: expected one for each image, as large", file=file)
+    out = []
+    for k, (header, data) in enumerate(images):
+        own_mask = _bad_pixels(*planes["mask"][k]) if planes["mask"] else np.zeros(data.shape, dtype=bool)
+        own_variance = None
+        if planes["variance"]:
+            own_variance = np.asarray(planes["variance"][k][1], dtype=np.float64)
+        elif planes["weight"]:
+            weight = np.asarray(planes["weight"][k][1], dtype=np.float64)
+            own_variance = np.where(weight > 0.0, 1.0 / np.where(weight > 0.0, weight, 1.0), np.nan)
+        if own_variance is not None:
+            own_mask = own_mask | ~(np.isfinite(own_variance) & (own_variance > 0.0))
+        merged = stamp_header(primary, header, k) if header is not primary else header
+        out.append(_Image(np.asarray(data, dtype=np.float64), own_mask, own_variance, merged))
+    return out
+
+
+def _kind_of(header: fits.Header) -> str:
+    """Return what the pixels of an image are: image, mask, variance or weight."""
+    name = str(header.get("EXTNAME", "")).strip().upper()
+    return next((k for k, names in _PLANES.items() if re.fullmatch(rf"({names})[_ ]?\d*", name)), "image")
+
+
+def _bad_pixels(header: fits.Header, values: np.ndarray) -> np.ndarray:
+    """Return pixels to leave out: bad planes of LSST's masks where the header names planes, else all but 0."""
+    numbers = {c.keyword[3:].upper(): c.value for c in header.cards if c.keyword.upper().startswith("MP_")}
+    if not numbers or values.dtype.kind not in "iu":
+        return np.asarray(values != 0)
+    bits = sum(1 << int(numbers[name]) for name in _BAD_PLANES if name in numbers)
+    return np.asarray((values.astype(np.int64) & bits) != 0)
+
+
+def _split(image: _Image) -> list[_Image]:
+    """Return the stamps of a cube, or the image itself."""
+    if image.data.ndim == 2:
+        return [image]
+    variances = [None] * len(image.data) if image.variance is None else list(image.variance)
+    return [
+        _Image(data, mask, variance, image.header)
+        for data, mask, variance in zip(image.data, image.mask, variances, strict=True)
+    ]
+
+
+def _all_variances(images: Sequence[_Image]) -> list[np.ndarray] | None:
+    variances = [i.variance for i in images if i.variance is not None]
+    return variances if len(variances) == len(images) else None
+
+
+def _field_of(header: fits.Header, file: Path) -> tuple[float, float]:
+    """Return the field angles of a stamp [deg]; NaN where its header has none."""
+    try:
+        return tuple(float(header[key]) if key in header else float("nan") for key in ("FIELD_X", "FIELD_Y"))  # type: ignore[return-value]
+    except (TypeError, ValueError):
+        raise ProductError("FIELD_X, FIELD_Y: expected numbers [deg]", file=file, key="FIELD_X") from None
+
+
+def sky_of_variance(variance: np.ndarray, masked: np.ndarray) -> float:
+    """Return the variance of sky and readout of a stamp: the median of its variance plane along the edge.
+
+    The star's own photons, which a variance plane has in it too, are those of the model.
+    """
+    edge = np.zeros(variance.shape, dtype=bool)
+    edge[:2], edge[-2:], edge[:, :2], edge[:, -2:] = True, True, True, True
+    usable = edge & ~masked & np.isfinite(variance)
+    return float(np.median(variance[usable])) if usable.any() else 0.0
 
 
 def border_variance(image: np.ndarray) -> float:
@@ -137,21 +322,21 @@ def _texts(table: Table, name: str) -> list[str]:
     return [str(text).strip() for text in table[columns[0]]] if columns else []
 
 
-def _places(table: Table, count: int, file: Path) -> tuple[np.ndarray | None, np.ndarray]:
-    """Return field angles [rad], None without columns, and shifts of the body that moves [m]."""
+def _places(table: Table, count: int, file: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Return field angles [rad] and shifts of the body that moves [m]; None without columns."""
     names = _names(table)
     if len(table) != count:
         raise ProductError(f"table of {len(table)} rows for {count} stamps: expected one row a stamp", file=file)
     fields = None
     if {"field_x", "field_y"} <= names:
         fields = np.deg2rad(np.stack([_column(table, "field_x"), _column(table, "field_y")], axis=-1))
-    defocus = 1e-6 * _column(table, "defocus_um") if "defocus_um" in names else np.zeros(count)
+    defocus = 1e-6 * _column(table, "defocus_um") if "defocus_um" in names else None
     return fields, defocus
 
 
-def _cut(image: np.ndarray, x: float, y: float, size: int) -> np.ndarray:
-    """Return a stamp about a place; pixels beside the image are NaN."""
-    stamp = np.full((size, size), np.nan)
+def _cut(image: np.ndarray, x: float, y: float, size: int, outside: float | bool) -> np.ndarray:
+    """Return a stamp about a place, with a value of its own for pixels beside the image."""
+    stamp = np.full((size, size), outside)
     first = np.array([round(y), round(x)]) - size // 2
     low, high = np.maximum(first, 0), np.minimum(first + size, image.shape)
     if (high > low).all():

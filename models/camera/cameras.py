@@ -12,7 +12,7 @@ from .lsst import lsst_camera, lsst_guider_camera, lsst_wavefront_camera
 
 #: Cameras that are computed, and files of those that are listed.
 _MADE = {"lsst": lsst_camera, "lsst_wavefront": lsst_wavefront_camera, "lsst_guider": lsst_guider_camera}
-_FILES = ("comcam", "auxtel", "hsc", "decam")
+_FILES = ("comcam", "auxtel", "hsc", "decam", "decam_focus")
 #: Names of the cameras that come with the package.
 CAMERAS = (*_MADE, *_FILES)
 #: Endings of files that a camera is read from.
@@ -27,7 +27,8 @@ def load_camera(camera: str | os.PathLike[str] | Camera) -> Camera:
     Parameters
     ----------
     camera : str, path or Camera
-        "lsst", "lsst_wavefront", "lsst_guider", "comcam", "auxtel", "hsc" or "decam"; or the path of a ``.yaml`` file.
+        "lsst", "lsst_wavefront", "lsst_guider", "comcam", "auxtel", "hsc", "decam" or "decam_focus"; or the path of a
+        ``.yaml`` file.
 
     Raises
     ------

@@ -1,0 +1,199 @@
+"""Stamps of files as the fit of donuts takes them: planes, angles and places from headers and options."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..core.errors import ConfigError, ProductError
+from .options import degrees_pair
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ..models.telescope import Telescope
+    from ..sensing.frames import DonutFrames
+    from ..sensing.stamp_files import DonutStamps
+    from ..sensing.stamp_headers import HeaderValues
+
+#: Telescope where neither option nor header names one.
+DEFAULT_TELESCOPE = "lsst_v3.3_r"
+#: Side of a pixel where neither option nor header says it [um].
+DEFAULT_PIXEL_UM = 10.0
+#: Body that each camera's telescope moves out of focus, of those that do not move their detector.
+_MOVED = {"lsst": "Camera", "comcam": "Camera", "auxtel": "M2"}
+#: Difference of angles of one exposure that is rounding of its headers [rad].
+_SAME_ANGLE = 1e-3
+
+
+@dataclass(frozen=True)
+class FrameOptions:
+    """Options of frames.
+
+    Attributes
+    ----------
+    rotator_deg, parallactic_deg : float or None
+        Angles in place of those of headers.
+    stamp_axes : str or None
+        Axes of stamps in place of those of headers.
+    field_frame : str
+        Frame of field angles of files and options.
+    field_deg : str or None
+        Field angle of all stamps where files have none.
+    projection : str
+        Meaning of field angles.
+    """
+
+    rotator_deg: float | None
+    parallactic_deg: float | None
+    stamp_axes: str | None
+    field_frame: str
+    field_deg: str | None
+    projection: str
+
+    def frames(self, header: HeaderValues) -> DonutFrames:
+        """Return angles and axes, those of headers where no option gives them."""
+        import numpy as np
+
+        from ..sensing.frames import DonutFrames
+
+        rotator = header.rotator or 0.0 if self.rotator_deg is None else np.deg2rad(self.rotator_deg)
+        parallactic = header.parallactic_angle if self.parallactic_deg is None else np.deg2rad(self.parallactic_deg)
+        return DonutFrames(rotator, parallactic, self.stamp_axes or "x,y")
+
+
+@dataclass(frozen=True)
+class StampFiles:
+    """Contents of files of stamps.
+
+    Attributes
+    ----------
+    paths : sequence of Path
+        The files.
+    stamps : sequence of DonutStamps
+        Stamps of each.
+    """
+
+    paths: Sequence[Path]
+    stamps: Sequence[DonutStamps]
+
+    @classmethod
+    def read(
+        cls, paths: Sequence[Path], positions: Path | None, size: int, mask: Path | None, variance: Path | None
+    ) -> StampFiles:
+        """Read files; ConfigError where a plane of its own goes with several of them."""
+        from ..sensing.stamp_files import read_stamps
+
+        for option, plane in (("--mask", mask), ("--variance", variance)):
+            if plane is not None and len(paths) > 1:
+                raise ConfigError(f"{option} = {plane} for {len(paths)} files: expected one file of stamps with it")
+        return cls(paths, [read_stamps(path, positions, size, mask=mask, variance=variance) for path in paths])
+
+    def header(self) -> HeaderValues:
+        """Return what the headers say; ProductError where files are of different cameras or angles."""
+        import numpy as np
+
+        first = self.stamps[0].header
+        for path, stamps in zip(self.paths, self.stamps, strict=True):
+            header = stamps.header
+            angles = [(v.rotator, v.parallactic_angle) for v in (first, header)]
+            same = all(
+                (a is None) == (b is None) and (a is None or b is None or abs(a - b) < _SAME_ANGLE)
+                for a, b in zip(*angles, strict=True)
+            )
+            if (first.camera, first.band) != (header.camera, header.band) or not same:
+                text = f"{header.text or 'no header'}: expected that of {self.paths[0]}, {first.text or 'no header'}"
+                raise ProductError(f"{text}; give files of one exposure", file=path)
+            if not (first.wavelength is None or np.isclose(first.wavelength, header.wavelength or 0.0)):
+                raise ProductError("filter: expected that of the other files", file=path)
+        return first
+
+    def moved(self) -> str | None:
+        """Return the body that moves: the one that the files name, or that of their camera; None where it is not known.
+
+        LSST's corner detectors and DECam's focus chips stand out of focus, as moved detectors.
+        """
+        from ..sensing.stamp_files import one_body
+
+        named = one_body([stamps.moved or "" for stamps in self.stamps], self.paths[-1])
+        detectors = [str(name) for stamps in self.stamps for name in stamps.detectors]
+        if named is not None or any("_SW" in name for name in detectors):
+            return named
+        return _MOVED.get(self.stamps[0].header.camera or "")
+
+
+@dataclass(frozen=True)
+class DonutInputs:
+    """Stamps as the fit takes them.
+
+    Attributes
+    ----------
+    images, masks : list of ndarray
+        Stamps [electrons] along the axes of the camera, and pixels to leave out.
+    fields : ndarray, shape [n, 2]
+        Field angles in the telescope frame [rad].
+    defocus : ndarray, shape [n]
+        Shifts of the body that moves [m].
+    variances : list of float
+        Variance of sky and readout [electron^2].
+    axes : list of ndarray
+        Axes of the stamps of the files in the frame of the camera.
+    """
+
+    images: list[np.ndarray]
+    masks: list[np.ndarray]
+    fields: np.ndarray
+    defocus: np.ndarray
+    variances: list[float]
+    axes: list[np.ndarray]
+
+
+def donut_inputs(
+    files: StampFiles, options: FrameOptions, frames: DonutFrames, telescope: Telescope, gain: float
+) -> DonutInputs:
+    """Return the stamps of files for a telescope with its camera at the angle of the rotator."""
+    import numpy as np
+
+    from ..sensing.frames import along_camera, stamp_matrix
+    from ..sensing.stamp_files import border_variance, sky_of_variance
+    from ..sensing.stamp_places import on_camera, stamp_places
+
+    inputs = DonutInputs([], [], np.empty((0, 2)), np.empty(0), [], [])
+    fields, defocus = [], []
+    for path, stamps in zip(files.paths, files.stamps, strict=True):
+        places = stamp_places(stamps, telescope, path, options.projection) if on_camera(stamps) else None
+        fields.append(_fields(path, stamps, options, frames, None if places is None else places.fields))
+        heights = np.zeros(len(stamps)) if places is None else places.heights
+        defocus.append(np.where(stamps.has_defocus, stamps.defocus, heights))
+        for k, (image, mask) in enumerate(zip(stamps.images, stamps.masks, strict=True)):
+            given = options.stamp_axes is not None or places is None
+            matrix = stamp_matrix(frames.stamp_axes) if given or places is None else places.axes[k]
+            inputs.images.append(along_camera(gain * image, matrix))
+            inputs.masks.append(along_camera(mask, matrix))
+            inputs.axes.append(matrix)
+            measured = None if stamps.variances is None else sky_of_variance(stamps.variances[k], mask)
+            inputs.variances.append(
+                border_variance(gain * np.where(mask, np.nan, image)) if measured is None else gain**2 * measured
+            )
+    return DonutInputs(
+        inputs.images, inputs.masks, np.concatenate(fields), np.concatenate(defocus), inputs.variances, inputs.axes
+    )
+
+
+def _fields(
+    path: Path, stamps: DonutStamps, options: FrameOptions, frames: DonutFrames, on_ccds: np.ndarray | None
+) -> np.ndarray:
+    """Return field angles in the telescope frame: those of the file, of its CCDs, or of the option."""
+    import numpy as np
+
+    if stamps.fields is not None:
+        angles = stamps.fields
+    elif on_ccds is not None:
+        return on_ccds
+    elif options.field_deg is not None:
+        angles = np.tile(np.deg2rad(degrees_pair(options.field_deg, "--field-deg")), (len(stamps), 1))
+    else:
+        raise ConfigError("no field angles: expected FIELD_X and FIELD_Y, a table with them, or --field-deg", file=path)
+    return frames.fields_of_telescope(angles, options.field_frame, projection=options.projection)

@@ -1,0 +1,207 @@
+"""Check of the orientation of stamps against its mirror image and its quarter turns.
+
+A wavefront is free to take any image of a donut near the axis. Away from it, vignetting, shadows of obstructions and
+what the design itself does to a wavefront point to the axis, and stamps that are mirrored or turned about fit worse at
+the same field angles. Fields and stamps that are mirrored together fit as well as before: no image tells that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..core.arguments import check_arguments
+from ..core.result import Result
+from ..models.telescope import Telescope
+from ..wavefront.psf.light import Light
+from .fit import fit_donuts
+from .frames import along_camera, stamp_matrix
+from .inputs import ObservedStars
+from .model import DonutModel
+from .wavefront_fits import SingleDonuts
+
+#: Axes of columns and rows of stamps, the given ones first: four turns, and their mirror images.
+ORIENTATIONS = ("x,y", "y,x", "-x,y", "x,-y", "-y,-x", "-x,-y", "-y,x", "y,-x")
+#: Fit of the wavefront: terms up to the fourth degree are enough for shadows.
+_FIT = SingleDonuts(range(4, 12), left_out=0.0)
+#: Pixels across a stamp: more are added up to squares.
+_PIXELS = 60
+#: Cells across the pupil.
+_CELLS = 40
+#: Least gain in chi-square, over that of a pixel of the best fit, with which another orientation is better.
+_LEAST_GAIN = 100.0
+#: Least gain as a fraction of the number of pixels, where the best fit is good.
+_LEAST_FRACTION = 0.02
+#: The same of a poor fit, whose residuals are correlated over many pixels.
+_LEAST_FRACTION_POOR = 0.1
+#: Chi-square a pixel above which a fit is poor.
+_POOR = 1.5
+#: Least gains with which a first donut settles that the orientation is right.
+_SETTLED = 3.0
+#: Least light of a donut, as a fraction of the brightest one's.
+_LEAST_LIGHT = 0.1
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OrientationCheck(Result):
+    """How well donuts fit in the orientation given, mirrored and turned about by quarters.
+
+    Attributes
+    ----------
+    stamp_axes : ndarray of str, shape [8]
+        Axes that columns and rows of the stamps would run along, in terms of those given; ``x,y`` is as given.
+    excess : ndarray, shape [8]
+        Chi-square over that of the best orientation, in units of the best one's chi-square of a pixel.
+    chi2 : ndarray, shape [8]
+        Chi-square a pixel.
+    donuts : ndarray of int
+        Indices of the donuts that were fitted.
+    n_pixels : int
+        Pixels of them.
+    """
+
+    _table = ("stamp_axes", "excess", "chi2")
+
+    stamp_axes: np.ndarray
+    excess: np.ndarray
+    chi2: np.ndarray
+    donuts: np.ndarray
+    n_pixels: int
+
+    @property
+    def best(self) -> str:
+        """Axes of the best orientation, ``x,y`` where the one given is the best."""
+        return str(self.stamp_axes[int(np.argmin(self.excess))])
+
+    @property
+    def threshold(self) -> float:
+        """Excess from which on an orientation is worse than the best one."""
+        poor = self.n_pixels > 0 and self.chi2.min() > _POOR
+        return max(_LEAST_GAIN, (_LEAST_FRACTION_POOR if poor else _LEAST_FRACTION) * self.n_pixels)
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether another orientation fits significantly better than the one given."""
+        return bool(self.excess[0] > self.threshold)
+
+    @property
+    def decided(self) -> bool:
+        """Whether every other orientation fits significantly worse than the best one."""
+        return int((self.excess <= self.threshold).sum()) == 1
+
+    def _label(self) -> str:
+        state = "another fits better" if self.doubtful else "confirmed" if self.decided else "not decided"
+        return f"orientation of stamps: {state}, best {self.best}, {len(self.donuts)} donuts"
+
+
+@check_arguments
+def check_orientation(
+    telescope: Telescope,
+    images: ArrayLike | Sequence[ArrayLike],
+    fields: ArrayLike,
+    wavelength: ArrayLike | Light | None = None,
+    *,
+    sky_variance: ArrayLike = 0.0,
+    model: DonutModel | None = None,
+    mask: NDArray[np.bool_] | Sequence[NDArray[np.bool_]] | None = None,
+    projection: str = "zemax",
+    donuts: int = 3,
+    threads: int | None = None,
+) -> OrientationCheck:
+    """Compare the fit of donuts with that of their mirror images and quarter turns.
+
+    Parameters
+    ----------
+    telescope, images, fields, wavelength, sky_variance, model, mask, projection, threads
+        As in :func:`~pachon.fit_donuts`. Stamps are fitted as rays, in coarse pixels.
+    donuts : int
+        Largest number of donuts that are fitted, from the one farthest from the axis on; fewer where they settle that
+        the orientation is right.
+
+    Returns
+    -------
+    OrientationCheck
+    """
+    model = (model or DonutModel()).with_light(wavelength)
+    observed = ObservedStars.of(images, fields, sky_variance, mask, projection)
+    shifts = model.detector.shifts(len(observed))
+    telling_donuts = _telling(observed, donuts)
+    matrices = [stamp_matrix(axes) for axes in ORIENTATIONS]
+    chi2, n_pixels = np.empty((2, len(ORIENTATIONS), 0))
+    check = _compared(chi2, n_pixels, telling_donuts[:0])
+    for count, index in enumerate(telling_donuts, start=1):
+        star = observed.star(int(index))
+        side = max(1, min(star.image.shape) // _PIXELS)
+        image, variance, masked = _binned(star.image, star.variance, star.masked, side)
+        turned = [[along_camera(plane, matrix) for matrix in matrices] for plane in (image, masked)]
+        level = float(np.median(variance))
+        fit = fit_donuts(
+            telescope,
+            turned[0],
+            np.tile(star.field, (len(matrices), 1)),
+            sky_variance=level,
+            model=_coarse(model, side, float(shifts[index])),
+            fit=_FIT,
+            mask=turned[1],
+            projection=projection,
+            threads=threads,
+        )
+        chi2 = np.column_stack([chi2, fit.chi2])
+        n_pixels = np.column_stack([n_pixels, fit.n_pixels])
+        check = _compared(chi2, n_pixels, telling_donuts[:count])
+        if np.sort(check.excess)[1] > _SETTLED * check.threshold and not check.excess[0]:
+            break
+    return check
+
+
+def _coarse(model: DonutModel, side: int, defocus: float) -> DonutModel:
+    """Return the model of one donut of rays, in squares of so many pixels."""
+    saturation = model.detector.saturation
+    detector = replace(
+        model.detector,
+        pixel_size=model.detector.pixel() * side,
+        defocus=defocus,
+        saturation=None if saturation is None else saturation * side**2,
+    )
+    air = replace(model.air, fwhm=None, atmosphere=None)
+    return replace(model, detector=detector, air=air, diffraction=False, neighbours=False, n_pupil=_CELLS)
+
+
+def _compared(chi2: np.ndarray, n_pixels: np.ndarray, donuts: np.ndarray) -> OrientationCheck:
+    """Return the check of chi-squares of orientations and donuts, shape [8, n]; NaN where a fit has no result."""
+    per_pixel = chi2 / np.where(n_pixels > 0, n_pixels, 1)
+    fitted = np.isfinite(per_pixel).any(axis=0)
+    per_pixel, pixels = per_pixel[:, fitted], n_pixels.max(axis=0)[fitted]
+    # No result in one orientation is as bad as the worst one.
+    per_pixel = np.where(np.isfinite(per_pixel), per_pixel, np.nanmax(per_pixel, axis=0, initial=0.0))
+    least = np.maximum(per_pixel.min(axis=0), 1.0)
+    total = (per_pixel / least * pixels).sum(axis=1)
+    count = int(pixels.sum())
+    return OrientationCheck(
+        stamp_axes=np.array(ORIENTATIONS),
+        excess=total - total.min(),
+        chi2=(per_pixel * pixels).sum(axis=1) / max(count, 1),
+        donuts=donuts[fitted],
+        n_pixels=count,
+    )
+
+
+def _telling(observed: ObservedStars, most: int) -> np.ndarray:
+    """Return indices of the donuts farthest from the axis that are not much fainter than the brightest."""
+    light = np.array([np.nansum(np.where(m, 0.0, i)) for i, m in zip(observed.images, observed.masked, strict=True)])
+    bright = np.flatnonzero(light > _LEAST_LIGHT * light.max())
+    return bright[np.argsort(-np.hypot(*observed.fields[bright].T), kind="stable")][:most]
+
+
+def _binned(
+    image: np.ndarray, variance: np.ndarray, masked: np.ndarray, side: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return sums over squares of pixels of an image and its variance, and squares with a masked pixel."""
+    ny, nx = (n // side for n in image.shape)
+    unusable = masked | ~np.isfinite(image)
+    planes = (np.where(unusable, 0.0, image), variance, unusable.astype(np.int64))
+    total = [v[: ny * side, : nx * side].reshape(ny, side, nx, side).sum(axis=(1, 3)) for v in planes]
+    return total[0], total[1], total[2] > 0
