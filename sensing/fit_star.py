@@ -192,7 +192,7 @@ class _StarFitter:
         # Second stars may stand anywhere beside the stamp.
         reach = light.diameter * (1.0 if blended else 0.5) if pixels.side > 1 else 0.0
         rays = self._of(light, max(sampling.across, self._across))
-        return self._instrument.stamp(light, pixels, rays, sampling.oversampling, reach)
+        return self._instrument.stamp(light, pixels, rays, sampling.sharp, reach)
 
     def _side(self, fwhm: float) -> int:
         """Return how many pixels are summed along each axis for the last fits in a seeing [rad]."""
@@ -235,7 +235,7 @@ class _StarFitter:
                 return last
             pixels, sampling = self._sampling(fwhm, min(self._side(fwhm), last.pixels.side), error)
         rays = self._of(light, sampling.across)
-        stamp = instrument.stamp(light, pixels, rays, sampling.oversampling, light.diameter if blended else 0.0)
+        stamp = instrument.stamp(light, pixels, rays, sampling.sharp, light.diameter if blended else 0.0)
         return _Fine(stamp, pixels, sampling)
 
     def _sampling(self, fwhm: float, side: int, error: float = math.inf) -> tuple[Pixels, Sampling]:
@@ -247,7 +247,7 @@ class _StarFitter:
         if fine.pixels.side == 1:
             return fine.stamp
         rays, grid = self._of(self._light, fine.sampling.across), fine.stamp.grid
-        return self._instrument.stamp(self._light, self._clean, rays, 1, grid.reach)
+        return self._instrument.stamp(self._light, self._clean, rays, False, grid.reach)
 
     def template(self, stamp: Stamp) -> np.ndarray:
         """Return the image of a star of unit flux at the centre of the stamp."""
