@@ -62,6 +62,10 @@ _CLIP = 7.0
 _ROUNDS = 3
 #: Most scales of the last fits.
 _SCALES = 3
+#: Fraction of the seeing that a search starts from below which that of a first solution is taken in its place.
+_MUCH_SHARPER = 0.5
+#: Cells across the pupil beyond those of a first search from which on it has some of its own.
+_SHARED = 2.0
 #: Cells across the pupil over those that are needed.
 _ENOUGH = 1.25
 
@@ -191,7 +195,8 @@ class _StarFitter:
         sampling = self._instrument.sampling(light, pixels, self._fwhm)
         # Second stars may stand anywhere beside the stamp.
         reach = light.diameter * (1.0 if blended else 0.5) if pixels.side > 1 else 0.0
-        rays = self._of(light, max(sampling.across, self._across))
+        shared = self._across if self._across < _SHARED * sampling.across else 0
+        rays = self._of(light, max(sampling.across, shared))
         return self._instrument.stamp(light, pixels, rays, sampling.sharp, reach)
 
     def _side(self, fwhm: float) -> int:
@@ -224,7 +229,12 @@ class _StarFitter:
         """Return a stamp fine enough for the seeing of a solution: the last one if that is, nearly."""
         instrument, light = self._instrument, self._light
         if last is None:
-            pixels, sampling = self._sampling(self._fwhm, self._side(self._fwhm))
+            fwhm = self._fwhm
+            if not instrument.known_seeing:
+                # An image that is far sharper than the start of the search is not summed for that.
+                sharper = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
+                fwhm = sharper if sharper < _MUCH_SHARPER * fwhm else fwhm
+            pixels, sampling = self._sampling(fwhm, self._side(fwhm))
         else:
             fwhm = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
             wave = slice(len(instrument.noll)) if len(solution.shared) else slice(0)

@@ -36,6 +36,8 @@ FLUX, X, Y, BACKGROUND, STRENGTH, RATIO = range(6)
 _EXPONENT_GROWTH = 5.0 / 3.0
 #: Exponent of the air at Nyquist's frequency below which a Gaussian is all of it.
 _NO_AIR = 6e-4
+#: The same below which that of the wavefront's derivatives is: 3 % of the light, wide and smooth, stays where it is.
+_THIN_AIR = 0.2
 
 
 @dataclass(frozen=True)
@@ -232,10 +234,20 @@ class ImageGrid:
         strength = float(unknowns[STRENGTH])
         parts = []
         if self._core is None or self._edge(strength) > _NO_AIR or light.at_rims is not None:
-            parts.append(self._pixels(self._spectra(unknowns, light, response, rates)))
+            thin = self._core is not None and self._edge(strength) < _THIN_AIR and response is not None
+            few = response[..., :0] if thin and light.at_rims is None else response
+            parts.append(self._pixels(self._spectra(unknowns, light, few, rates)))
         if self._core is not None:
             parts.append(self._core_columns(unknowns, light, response, rates))
-        return parts[0] if len(parts) == 1 else parts[0] + parts[1]
+        if len(parts) == 1:
+            return parts[0]
+        if parts[0].shape == parts[1].shape:
+            return parts[0] + parts[1]
+        smooth, columns = parts
+        n = len(unknowns)
+        columns[..., :n] += smooth[..., :n]
+        columns[..., columns.shape[-1] - (smooth.shape[-1] - n) :] += smooth[..., n:]
+        return columns
 
     def _core_columns(
         self, unknowns: np.ndarray, light: LandedLight, response: np.ndarray | None, rates: np.ndarray | None
