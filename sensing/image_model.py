@@ -17,11 +17,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import fft
-from scipy.sparse import csc_array
 
 from ..wavefront.psf.image_plane import square_transfer
 from ..wavefront.psf.pupil_rims import PupilRims
-from .pixel_kernel import Orders, SharpCore, deposit
+from .pixel_kernel import Deposit, SharpCore
 from .rim_light import RimLight, RimsAt
 from .seeing import Seeing
 from .stamps import Pixels
@@ -166,8 +165,8 @@ class ImageGrid:
         """Return places (x, y) of light [n, 2] that lands about the chief ray [m], in pixels from the centre."""
         return landing / self.pixel + (unknowns[[X, Y]] / self.scale + self.offset)
 
-    def _splines(self, points: np.ndarray, spread: np.ndarray, orders: Orders) -> list[csc_array]:
-        """Return the cubic B-spline at points [n, 2] on the grid, and derivatives [1/pixel], as sparse matrices."""
+    def _splines(self, points: np.ndarray, spread: np.ndarray) -> Deposit:
+        """Return the cubic B-spline at points [n, 2] on the grid, and derivatives [1/pixel]."""
         taps, indices = [], []
         for axis in (0, 1):
             place = self._middle[1 - axis] + points[:, axis]
@@ -177,7 +176,7 @@ class ImageGrid:
             # The spline and its first three derivatives, shape [4, n]: long rows are quick.
             taps.append([_SPLINES[k].T @ powers[: 4 - k] for k in range(4)])
             indices.append((low.astype(np.int32) + np.arange(-1, 3, dtype=np.int32)[:, None]) % self._size[1 - axis])
-        return deposit((taps[0], taps[1]), (indices[0], indices[1]), self._size, spread, orders)
+        return Deposit((taps[0], taps[1]), (indices[0], indices[1]), self._size, spread)
 
     def _pixels(self, spectra: np.ndarray) -> np.ndarray:
         """Return the pixels of spectra [ky, kx, n], shape [ny, nx, n]."""
@@ -260,43 +259,38 @@ class ImageGrid:
         weights = amplitude * light.weights.astype(np.float32)[:, None]
         points, spread = self.places(unknowns, light.landing), light.spread / self.pixel**2
         variance = 5.0 / 3.0 * edge / math.pi**2
-        orders: Orders = ((0, 0),) if response is None else ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))
 
         def of_one_star(places: np.ndarray) -> list[np.ndarray]:
             """Return the light of one star, then its derivatives by x, y, strength, wave and rims."""
             assert self._core is not None
-            splines = self._core.deposit(places, spread, variance, orders)
-            star = splines[0] @ weights
+            deposit = self._core.deposit(places, spread, variance)
+            splines = deposit.matrix(0, 0)
+            star = splines @ weights
             if response is None or rates is None:
                 return [star]
-            along_x, along_y, *bends = splines[1:]
-            bend = sum(spline @ weights for spline in bends)
-            growth = np.float32(-edge * _EXPONENT_GROWTH / max(strength, 1e-12) / 6.0) * (
-                star - np.float32(5.0 / math.pi**2) * bend
-            )
-            moved = response.astype(np.float32, copy=False) * (weights / np.float32(self.pixel))
-            wave = along_x @ moved[0] + along_y @ moved[1]
-            return [
-                star,
-                along_x @ weights,
-                along_y @ weights,
-                growth,
-                wave,
-                splines[0] @ (amplitude * rates).astype(np.float32),
-            ]
+            gradient = deposit.gradient(weights[:, 0])
+            ones = np.ones(len(weights), dtype=np.float32)
+            along = gradient @ np.kron(np.eye(2, dtype=np.float32), ones).T
+            growth = np.zeros_like(star)
+            if edge > 0.0:
+                bend = np.float32(5.0 / math.pi**2) * (deposit.laplacian() @ weights)
+                growth = np.float32(-edge * _EXPONENT_GROWTH / strength / 6.0) * (star - bend)
+            moved = response.astype(np.float32, copy=False).reshape(2 * len(weights), -1)
+            wave = gradient @ moved / np.float32(self.pixel)
+            return [star, along, growth, wave, splines @ (amplitude * rates).astype(np.float32)]
 
         first = of_one_star(points)
         extra: list[np.ndarray] = []
         if len(unknowns) > RATIO:
             ratio = np.float32(unknowns[RATIO])
             second = of_one_star(points + unknowns[RATIO + 1 :] / self.scale)
-            extra = [second[0], *(ratio / np.float32(self.scale) * v for v in second[1:3])]
+            extra = [second[0], ratio / np.float32(self.scale) * second[1]]
             first = [a + ratio * b for a, b in zip(first, second, strict=True)]
         if response is None:
             return self._core.pixels(first[0])
-        star, along_x, along_y, growth, wave, shifts = first
+        star, along, growth, wave, shifts = first
         return self._core.pixels(
-            np.concatenate([star, along_x, along_y, np.zeros_like(star), growth, *extra, wave, shifts], axis=1)
+            np.concatenate([star, along, np.zeros_like(star), growth, *extra, wave, shifts], axis=1)
         )
 
     def _spectra(
@@ -308,15 +302,15 @@ class ImageGrid:
     ) -> np.ndarray:
         """Return spectra of :meth:`_columns`, without the core of a sharp image."""
         weights = light.weights.astype(np.float32)[:, None]
-        orders: Orders = ((0, 0),) if response is None else ((0, 0), (1, 0), (0, 1))
-        splines = self._splines(self.places(unknowns, light.landing), light.spread / self.pixel**2, orders)
-        deposits = [spline @ weights for spline in splines]
+        splines = self._splines(self.places(unknowns, light.landing), light.spread / self.pixel**2)
+        star = splines.matrix(0, 0)
+        deposits = [star @ weights]
         if response is not None and rates is not None:
-            _, along_x, along_y = splines
+            along_x, along_y = splines.matrix(1, 0), splines.matrix(0, 1)
             moved = response.astype(np.float32, copy=False) * (weights / np.float32(self.pixel))
-            deposits.append(along_x @ moved[0] + along_y @ moved[1])
+            deposits += [along_x @ weights, along_y @ weights, along_x @ moved[0] + along_y @ moved[1]]
             if rates.shape[1]:
-                deposits.append(splines[0] @ rates.astype(np.float32))
+                deposits.append(star @ rates.astype(np.float32))
         spectra = fft.rfft2(np.concatenate(deposits, axis=1).reshape(*self._size, -1), axes=(0, 1))
         whole, growth = (v.astype(np.float32)[..., None] for v in self._on_grid(float(unknowns[STRENGTH])))
         grown = growth * spectra[..., :1]

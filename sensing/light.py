@@ -38,7 +38,7 @@ _SMALL = 0.2
 #: Power of the error by which the number of cells goes, from the two figures of :data:`_CELLS_LEAVE`.
 _FALL = 0.55
 #: Error of the photons [m] below which cells become no smaller.
-_LEAST_ERROR = 0.5e-9
+_LEAST_ERROR = 1.5e-9
 #: Spacing of landing points over the FWHM of the blur, which smooths what cells on rims leave.
 _SPACING = 0.5
 #: FWHM of the blur in pixels beyond which the pixels resolve it.
@@ -159,14 +159,16 @@ class Instrument:
     def sampling(self, light: StarLight, pixels: Pixels, fwhm: float, error: float = math.inf) -> Sampling:
         """Return how finely images of a star in a seeing [rad] are sampled on given pixels.
 
-        A wavefront known to an error [m] that the cells would add to has more of them.
+        A wavefront known to an error [m] that the cells would add to has more of them; images sharper than their pixels
+        have as many as they need anyway.
         """
         width = self._width(light, pixels, fwhm)
         distance = pixels.side * self.pixel
         spacing = _SPACING * max(width, distance)
-        finer = max((_CELLS_LEAVE / (_SMALL * max(error, _LEAST_ERROR))) ** _FALL, 1.0)
+        sharp = width < _RESOLVED * distance
+        finer = 1.0 if sharp else max((_CELLS_LEAVE / (_SMALL * max(error, _LEAST_ERROR))) ** _FALL, 1.0)
         across = self.model.n_pupil or min(max(math.ceil(finer * light.diameter / spacing), _FEWEST), _MOST)
-        return Sampling(width < _RESOLVED * distance, across)
+        return Sampling(sharp, across)
 
     def binning(self, light: StarLight, pixels: Pixels, fwhm: float) -> int:
         """Return how many pixels along each axis are summed for the fit of a star in a seeing [rad].

@@ -16,8 +16,6 @@ from scipy.signal import fftconvolve
 from scipy.sparse import csc_array
 from scipy.special import ndtr
 
-#: Orders of derivatives along x and y.
-Orders = tuple[tuple[int, int], ...]
 #: Places within a pixel at which kernels are tabulated: rounding moves a cell by 3e-4 pixels rms.
 _PHASES = 1024
 #: Widths of the Gaussian beyond which its light is left out: 1e-4 of it.
@@ -106,8 +104,8 @@ class SharpCore:
         self._mixed = (footprint @ footprint.T)[0, 1] / 12.0 * np.array([[0.0, 1.0], [1.0, 0.0]])
         self._variance, self._kernels = -1.0, [PixelKernel(c, width, rms) for c in self._cell]
 
-    def deposit(self, points: np.ndarray, spread: np.ndarray, variance: float, orders: Orders) -> list[csc_array]:
-        """Return what points add to the pixels of the stamp and of a margin, as :func:`deposit`.
+    def deposit(self, points: np.ndarray, spread: np.ndarray, variance: float) -> Deposit:
+        """Return what points add to the pixels of the stamp and of a margin.
 
         Points are places (x, y) from the centre of the stamp, spreads their second moments beside the footprint, and
         the variance is that of a further Gaussian blur, all in pixels.
@@ -124,7 +122,7 @@ class SharpCore:
             # Light beside the stamp stays in its margin.
             index = first + np.arange(len(values[0]), dtype=np.int32)[:, None]
             indices.append(np.clip(index, 0, count - 1))
-        return deposit((taps[0], taps[1]), (indices[0], indices[1]), self._size, spread + self._moments, orders)
+        return Deposit((taps[0], taps[1]), (indices[0], indices[1]), self._size, spread + self._moments)
 
     def pixels(self, deposited: np.ndarray) -> np.ndarray:
         """Return the pixels of the stamp [ny, nx, k] of sums of deposits [n_cell, k]."""
@@ -145,14 +143,8 @@ class SharpCore:
         return self._shape[0] + 2 * down, self._shape[1] + 2 * across
 
 
-def deposit(
-    taps: tuple[list[np.ndarray], list[np.ndarray]],
-    indices: tuple[np.ndarray, np.ndarray],
-    size: tuple[int, int],
-    spread: np.ndarray,
-    orders: Orders,
-) -> list[csc_array]:
-    """Return what points add to the cells of a grid, as sparse matrices [n_cell, n]: derivatives of given orders.
+class Deposit:
+    """What points add to the cells of a grid: products of kernels along x and y.
 
     Parameters
     ----------
@@ -164,24 +156,43 @@ def deposit(
         Rows and columns of the grid.
     spread : ndarray, shape [n, 2, 2]
         Second moments of the points beside those of the kernel, which change it by half its second derivatives.
-    orders : tuple of (int, int)
-        Orders of the derivatives along x and y. Those of 2 leave out the spread.
     """
-    x, y = taps
-    count = len(spread)
-    cells = _by_point(indices[1][:, None] * np.int32(size[1]) + indices[0])
-    per_point = cells.size // max(count, 1)
-    starts = np.arange(0, cells.size + 1, max(per_point, 1), dtype=np.int32)
-    half_xx, xy, half_yy = (spread[:, [0, 0, 1], [0, 1, 1]] * [0.5, 1.0, 0.5]).astype(np.float32).T
 
-    def derivative(i: int, j: int) -> csc_array:
-        if max(i, j) > 1:
-            return csc_array((_by_point(y[j][:, None] * x[i]), cells, starts), shape=(size[0] * size[1], count))
-        values = (y[j] + half_yy * y[j + 2])[:, None] * (x[i] + half_xx * x[i + 2])
-        values += y[j + 1][:, None] * (xy * x[i + 1])
-        return csc_array((_by_point(values), cells, starts), shape=(size[0] * size[1], count))
+    def __init__(
+        self,
+        taps: tuple[list[np.ndarray], list[np.ndarray]],
+        indices: tuple[np.ndarray, np.ndarray],
+        size: tuple[int, int],
+        spread: np.ndarray,
+    ) -> None:
+        (self._x, self._y), self._cell_count, self._count = taps, size[0] * size[1], len(spread)
+        self._cells = _by_point(indices[1][:, None] * np.int32(size[1]) + indices[0])
+        self._taps = len(indices[0]) * len(indices[1])
+        self._spread = (spread[:, [0, 0, 1], [0, 1, 1]] * [0.5, 1.0, 0.5]).astype(np.float32).T
 
-    return [derivative(i, j) for i, j in orders]
+    def matrix(self, i: int, j: int) -> csc_array:
+        """Return the derivative of order i along x and j along y, 0 or 1, as a sparse matrix [n_cell, n]."""
+        return self._matrix(self._values(i, j, 1))
+
+    def gradient(self, weights: np.ndarray) -> csc_array:
+        """Return the derivatives along x and then along y of weighted points, shape [n_cell, 2 * n]."""
+        return self._matrix(self._values(1, 0, weights), self._values(0, 1, weights))
+
+    def laplacian(self) -> csc_array:
+        """Return the sum of the second derivatives, without the spreads, shape [n_cell, n]."""
+        return self._matrix(_by_point(self._y[0][:, None] * self._x[2] + self._y[2][:, None] * self._x[0]))
+
+    def _values(self, i: int, j: int, weights: np.ndarray | int) -> np.ndarray:
+        x, y, (half_xx, xy, half_yy) = self._x, self._y, self._spread
+        values = ((y[j] + half_yy * y[j + 2]) * weights)[:, None] * (x[i] + half_xx * x[i + 2])
+        values += (y[j + 1] * (xy * weights))[:, None] * x[i + 1]
+        return _by_point(values)
+
+    def _matrix(self, *parts: np.ndarray) -> csc_array:
+        n = len(parts) * self._count
+        starts = np.arange(n + 1, dtype=np.int32) * np.int32(self._taps)
+        values, cells = (v[0] if len(parts) == 1 else np.concatenate(v) for v in (parts, len(parts) * (self._cells,)))
+        return csc_array((values, cells, starts), shape=(self._cell_count, n))
 
 
 def _by_point(taps: np.ndarray) -> np.ndarray:
