@@ -336,7 +336,7 @@ class ImageGrid:
         light = self.rim_light
         assert light is not None
         strength = float(unknowns[STRENGTH])
-        transfer = light.transfer(strength, rims)
+        transfer, slopes = light.transfer(strength, rims)
         # Frequencies of the grid count from its first cell.
         place = self.places(unknowns, np.zeros(2)) + np.array(self._middle[::-1])
         turn = np.exp(-1j * self.pixel * (light.wave @ place)).astype(np.complex64)
@@ -350,7 +350,7 @@ class ImageGrid:
             return
         for axis in (0, 1):
             spectra[light.where, 1 + axis] -= 1j * (light.wave[:, axis] * self.pixel).astype(np.float32) * diffracted
-        spectra[light.where, 3 : 3 + rims.response.shape[2]] += light.slopes(rims) * turn[:, None]
+        spectra[light.where, 3 : 3 + rims.response.shape[2]] += slopes * turn[:, None]
 
 
 # Cubic B-spline at t - 1 ... t + 2 by powers of t, 0 <= t < 1, and its derivatives with respect to the point's place.

@@ -164,7 +164,7 @@ class Instrument:
         """
         width = self._width(light, pixels, fwhm)
         distance = pixels.side * self.pixel
-        spacing = _SPACING * max(width, distance)
+        spacing = _SPACING * (math.hypot(width, distance) if width < _RESOLVED * distance else width)
         sharp = width < _RESOLVED * distance
         finer = 1.0 if sharp else max((_CELLS_LEAVE / (_SMALL * max(error, _LEAST_ERROR))) ** _FALL, 1.0)
         across = self.model.n_pupil or min(max(math.ceil(finer * light.diameter / spacing), _FEWEST), _MOST)
