@@ -62,6 +62,10 @@ _CLIP = 7.0
 _ROUNDS = 3
 #: Most scales of the last fits.
 _SCALES = 3
+#: Fraction of the seeing that a search starts from below which that of a first solution is taken in its place.
+_MUCH_SHARPER = 0.5
+#: Cells across the pupil beyond those of a first search from which on it has some of its own.
+_SHARED = 2.0
 #: Cells across the pupil over those that are needed.
 _ENOUGH = 1.25
 
@@ -191,8 +195,9 @@ class _StarFitter:
         sampling = self._instrument.sampling(light, pixels, self._fwhm)
         # Second stars may stand anywhere beside the stamp.
         reach = light.diameter * (1.0 if blended else 0.5) if pixels.side > 1 else 0.0
-        rays = self._of(light, max(sampling.across, self._across))
-        return self._instrument.stamp(light, pixels, rays, sampling.oversampling, reach)
+        shared = self._across if self._across < _SHARED * sampling.across else 0
+        rays = self._of(light, max(sampling.across, shared))
+        return self._instrument.stamp(light, pixels, rays, sampling.sharp, reach)
 
     def _side(self, fwhm: float) -> int:
         """Return how many pixels are summed along each axis for the last fits in a seeing [rad]."""
@@ -224,7 +229,12 @@ class _StarFitter:
         """Return a stamp fine enough for the seeing of a solution: the last one if that is, nearly."""
         instrument, light = self._instrument, self._light
         if last is None:
-            pixels, sampling = self._sampling(self._fwhm, self._side(self._fwhm))
+            fwhm = self._fwhm
+            if not instrument.known_seeing:
+                # An image that is far sharper than the start of the search is not summed for that.
+                sharper = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
+                fwhm = sharper if sharper < _MUCH_SHARPER * fwhm else fwhm
+            pixels, sampling = self._sampling(fwhm, self._side(fwhm))
         else:
             fwhm = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
             wave = slice(len(instrument.noll)) if len(solution.shared) else slice(0)
@@ -235,7 +245,7 @@ class _StarFitter:
                 return last
             pixels, sampling = self._sampling(fwhm, min(self._side(fwhm), last.pixels.side), error)
         rays = self._of(light, sampling.across)
-        stamp = instrument.stamp(light, pixels, rays, sampling.oversampling, light.diameter if blended else 0.0)
+        stamp = instrument.stamp(light, pixels, rays, sampling.sharp, light.diameter if blended else 0.0)
         return _Fine(stamp, pixels, sampling)
 
     def _sampling(self, fwhm: float, side: int, error: float = math.inf) -> tuple[Pixels, Sampling]:
@@ -247,7 +257,7 @@ class _StarFitter:
         if fine.pixels.side == 1:
             return fine.stamp
         rays, grid = self._of(self._light, fine.sampling.across), fine.stamp.grid
-        return self._instrument.stamp(self._light, self._clean, rays, 1, grid.reach)
+        return self._instrument.stamp(self._light, self._clean, rays, False, grid.reach)
 
     def template(self, stamp: Stamp) -> np.ndarray:
         """Return the image of a star of unit flux at the centre of the stamp."""

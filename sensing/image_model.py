@@ -4,6 +4,9 @@ Light lands at points :math:`x_n` with weights :math:`w_n`. Each point is deposi
 transform of the grid is divided by that of the spline, and multiplied by those of pixel, detector and atmosphere: the
 image at the centres of the pixels, integrated over them. Columns of derivatives go the same way, with the gradient of
 the spline and :math:`w_n\, \partial x_n / \partial a`: they are the derivatives of the image itself.
+
+Images sharper than their pixels resolve have a core, a Gaussian with the transfer of the air at Nyquist's frequency,
+whose light is integrated over the pixels themselves (:mod:`.pixel_kernel`); what it leaves of the air is smooth.
 """
 
 from __future__ import annotations
@@ -14,10 +17,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import fft
-from scipy.sparse import csc_array
 
 from ..wavefront.psf.image_plane import square_transfer
 from ..wavefront.psf.pupil_rims import PupilRims
+from .pixel_kernel import Deposit, SharpCore
 from .rim_light import RimLight, RimsAt
 from .seeing import Seeing
 from .stamps import Pixels
@@ -28,6 +31,12 @@ NUISANCES = ("flux", "x", "y", "background", "strength")
 #: Further unknowns where there is a second star: its flux over that of the first, and its offset [pixels].
 COMPANION = ("ratio", "offset_x", "offset_y")
 FLUX, X, Y, BACKGROUND, STRENGTH, RATIO = range(6)
+#: Power of the strength of the turbulence that the exponent of its transfer function goes by.
+_EXPONENT_GROWTH = 5.0 / 3.0
+#: Exponent of the air at Nyquist's frequency below which a Gaussian is all of it.
+_NO_AIR = 6e-4
+#: The same below which that of the wavefront's derivatives is: 3 % of the light, wide and smooth, stays where it is.
+_THIN_AIR = 0.2
 
 
 @dataclass(frozen=True)
@@ -69,8 +78,8 @@ class ImageGrid:
         Rms of a Gaussian blur along each axis [m].
     footprint : ndarray, shape [2, 2]
         Sides of the image of a cell of the pupil [m], columns of a matrix.
-    oversampling : int
-        Cells of the grid along a pixel.
+    sharp : bool
+        Whether the image may have more detail than its pixels resolve.
     reach : float
         Distance from the stamp within which light is kept from wrapping around [m].
     rims : PupilRims or None
@@ -85,32 +94,31 @@ class ImageGrid:
         jacobian: np.ndarray,
         blur: float,
         footprint: np.ndarray,
-        oversampling: int,
-        reach: float,
+        sharp: bool = False,
+        reach: float = 0.0,
         rims: PupilRims | None = None,
     ) -> None:
         shape, pixel = (pixels.image.shape[0], pixels.image.shape[1]), side * pixels.side
         self.shape, self.pixel, self.footprint = shape, pixel, footprint
         #: Pixels of the detector along one of the stamp, and the centre of its stamp from that of this one [pixels].
         self.scale, self.offset = float(pixels.side), np.array(pixels.offset)
-        self.oversampling, self.reach = oversampling, reach
+        self.sharp, self.reach = sharp, reach
         margin = max(8, math.ceil(reach / pixel))
-        self._size = tuple(fft.next_fast_len(oversampling * (n + margin), real=True) for n in shape)
+        self._size = tuple(fft.next_fast_len(n + margin, real=True) for n in shape)
         #: Place of the centre of the stamp on the grid, (y, x) cells.
-        self._middle = [0.5 * (n - 1) * oversampling for n in shape]
-        turns = [fft.fftfreq(self._size[0]), fft.rfftfreq(self._size[1])]  # cycles a cell
+        self._middle = [0.5 * (n - 1) for n in shape]
+        turns = [fft.fftfreq(self._size[0]), fft.rfftfreq(self._size[1])]  # cycles a pixel
         y, x = np.meshgrid(*turns, indexing="ij", sparse=True)
         frequencies = np.stack(np.broadcast_arrays(x, y))
-        self._phase = -2.0 * math.pi * oversampling / pixels.side * frequencies  # for shifts in detector pixels
-        wave = 2.0 * math.pi * oversampling / pixel * frequencies  # rad/m
-        baseline = np.tensordot(jacobian.T, wave, axes=1) * seeing.wavelength / (2.0 * math.pi)
+        self._phase = -2.0 * math.pi / pixels.side * frequencies  # for shifts in detector pixels
+        wave = 2.0 * math.pi / pixel * frequencies  # rad/m
+        scale = seeing.wavelength / (2.0 * math.pi)
+        baseline = np.tensordot(jacobian.T, wave, axes=1) * scale
         self._exponent = seeing.exponent(np.hypot(*baseline))
         spline = np.sinc(x) ** 4 * np.sinc(y) ** 4
         cell = np.prod(np.sinc(np.tensordot(footprint.T, wave, axes=1) / (2.0 * math.pi)), axis=0)
-        # A cell of the grid holds less light than a pixel.
         self._detector = (
-            oversampling**2
-            * square_transfer(wave[0, :1], wave[1, :, :1], side * pixels.width)
+            square_transfer(wave[0, :1], wave[1, :, :1], side * pixels.width)
             * np.exp(-0.5 * blur**2 * wave[0, :1] ** 2)
             * np.exp(-0.5 * blur**2 * wave[1, :, :1] ** 2)
             * cell
@@ -118,6 +126,11 @@ class ImageGrid:
         )
         # The filter has the images of cells, and the spline, which light of rims has not.
         self.rim_light = None if rims is None else RimLight(rims, side, wave, baseline, cell / spline, self._filter)
+        # Squared frequencies over that of Nyquist, and the exponent of the air there.
+        self._square = 4.0 * (x * x + y * y)
+        edge = math.sqrt(abs(float(np.linalg.det(jacobian)))) * math.pi / pixel * scale
+        self._edge_exponent = float(seeing.exponent(np.array([edge]))[0])
+        self._core = SharpCore(shape, pixels.width / pixels.side, blur / pixel, footprint / pixel) if sharp else None
 
     def with_rims(self, rims: PupilRims) -> ImageGrid:
         """Return the grid for other rims of the pupil."""
@@ -129,50 +142,51 @@ class ImageGrid:
         """Return the transfer function of air and detector."""
         return np.asarray(self._detector * np.exp(-self._exponent * strength ** (5.0 / 3.0)))
 
+    def _edge(self, strength: float) -> float:
+        """Return the exponent of the air at Nyquist's frequency."""
+        return float(self._edge_exponent * strength ** (5.0 / 3.0))
+
+    def _on_grid(self, strength: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the transfer function of what the grid holds, and its derivative by the strength of the turbulence.
+
+        Of sharp images that is what a Gaussian with the air's transfer and slope at Nyquist's frequency, the core,
+        leaves: it is smooth.
+        """
+        whole = self._filter(strength)
+        growth = -5.0 / 3.0 * self._exponent * strength ** (2.0 / 3.0) * whole
+        if self._core is not None:
+            edge = self._edge(strength)
+            core = self._detector * np.exp(-edge / 6.0 * (1.0 + 5.0 * self._square))
+            whole = whole - core
+            growth += edge * _EXPONENT_GROWTH / max(strength, 1e-12) / 6.0 * (1.0 + 5.0 * self._square) * core
+        return whole, growth
+
     def places(self, unknowns: np.ndarray, landing: np.ndarray) -> np.ndarray:
         """Return places (x, y) of light [n, 2] that lands about the chief ray [m], in pixels from the centre."""
         return landing / self.pixel + (unknowns[[X, Y]] / self.scale + self.offset)
 
-    def _deposit(self, points: np.ndarray, spread: np.ndarray, derivatives: bool) -> list[csc_array]:
-        """Return the spline at points [n, 2], and its derivatives along x and y [1/pixel], as sparse matrices.
-
-        Spreads [n, 2, 2] of the points, in pixels as they are, change the spline by half its second derivatives.
-        """
-        values, indices = [], []
+    def _splines(self, points: np.ndarray, spread: np.ndarray) -> Deposit:
+        """Return the cubic B-spline at points [n, 2] on the grid, and derivatives [1/pixel]."""
+        taps, indices = [], []
         for axis in (0, 1):
-            place = self._middle[1 - axis] + self.oversampling * points[:, axis]
+            place = self._middle[1 - axis] + points[:, axis]
             low = np.floor(place)
             t = (place - low).astype(np.float32)
             powers = np.stack([np.ones_like(t), t, t * t, t * t * t])
-            # The spline and its first three derivatives, per pixel, shape [4, n]: long rows are quick.
-            values.append([(self.oversampling**k * _SPLINES[k]).T @ powers[: 4 - k] for k in range(4)])
+            # The spline and its first three derivatives, shape [4, n]: long rows are quick.
+            taps.append([_SPLINES[k].T @ powers[: 4 - k] for k in range(4)])
             indices.append((low.astype(np.int32) + np.arange(-1, 3, dtype=np.int32)[:, None]) % self._size[1 - axis])
-        cells = _by_point(indices[1][:, None] * np.int32(self._size[1]) + indices[0])
-        starts = np.arange(0, cells.size + 1, 16, dtype=np.int32)
-        shape = (self._size[0] * self._size[1], len(points))
-        x, y = values
-        half_xx, xy, half_yy = (spread[:, [0, 0, 1], [0, 1, 1]] * [0.5, 1.0, 0.5]).astype(np.float32).T
-
-        def spline(i: int, j: int) -> csc_array:
-            """Return the derivative of order i along x and j along y."""
-            taps = (y[j] + half_yy * y[j + 2])[:, None] * (x[i] + half_xx * x[i + 2])
-            taps += y[j + 1][:, None] * (xy * x[i + 1])
-            return csc_array((_by_point(taps), cells, starts), shape=shape)
-
-        return [spline(i, j) for i, j in (((0, 0), (1, 0), (0, 1)) if derivatives else ((0, 0),))]
+        return Deposit((taps[0], taps[1]), (indices[0], indices[1]), self._size, spread)
 
     def _pixels(self, spectra: np.ndarray) -> np.ndarray:
         """Return the pixels of spectra [ky, kx, n], shape [ny, nx, n]."""
         images = fft.irfft2(spectra, s=self._size, axes=(0, 1))
-        step = self.oversampling
-        return np.asarray(images[: self.shape[0] * step : step, : self.shape[1] * step : step])
+        return np.asarray(images[: self.shape[0], : self.shape[1]])
 
     def image(self, unknowns: np.ndarray, light: LandedLight) -> np.ndarray:
         """Return the image [electrons], shape [ny, nx]; arguments as in :meth:`derivatives`."""
-        spectrum, shift = self._spectra(unknowns, light)
-        if shift is not None:
-            spectrum *= 1.0 + unknowns[RATIO] * shift
-        star = self._pixels(spectrum)[..., 0].astype(np.float64)
+        columns = self._columns(unknowns, light)
+        star = columns[..., 0].astype(np.float64)
         return np.asarray(unknowns[FLUX] * star + unknowns[BACKGROUND] * self.scale**2)
 
     def derivatives(
@@ -200,76 +214,143 @@ class ImageGrid:
         scales : ndarray, shape [n_unknown + n_wave + n_shift]
             Scales of the columns.
         """
-        flux, strength = unknowns[FLUX], unknowns[STRENGTH]
-        spectra, shift = self._spectra(unknowns, light, response, rates)
-        star, moved = spectra[..., :1], spectra[..., 1:]
-        extra = []
-        if shift is not None:
-            second = star * shift
-            turns = [(1j * unknowns[RATIO] * p).astype(np.complex64)[..., None] for p in self._phase]
-            extra = [second, *(turn * second for turn in turns)]
-            both_stars = 1.0 + np.float32(unknowns[RATIO]) * shift
-            star, moved = star * both_stars, moved * both_stars
-        uniform = np.zeros_like(star)
-        uniform[0, 0] = self._size[0] * self._size[1]
-        growth = (-5.0 / 3.0 * self._exponent * strength ** (2.0 / 3.0)).astype(np.float32)[..., None]
-        columns = self._pixels(
-            np.concatenate([star, moved[..., :2], uniform, growth * star, *extra, moved[..., 2:]], axis=-1)
-        )
-        scales = np.full(columns.shape[-1], flux)
+        columns = self._columns(unknowns, light, response, rates)
+        columns[..., BACKGROUND] = 1.0
+        scales = np.full(columns.shape[-1], unknowns[FLUX])
         scales[[FLUX, BACKGROUND]] = 1.0, self.scale**2
         scales[[X, Y]] /= self.scale
         level = unknowns[BACKGROUND] * self.scale**2
-        return flux * columns[..., FLUX].astype(np.float64) + level, columns, scales
+        return unknowns[FLUX] * columns[..., FLUX].astype(np.float64) + level, columns, scales
 
-    def _spectra(
+    def _columns(
         self,
         unknowns: np.ndarray,
         light: LandedLight,
         response: np.ndarray | None = None,
         rates: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return spectra of a star of unit flux, its derivatives by x, y, wave and rims, and a second one's shift."""
-        points = self.places(unknowns, light.landing)
-        splines = self._deposit(points, light.spread / self.pixel**2, response is not None)
-        weights = light.weights.astype(np.float32)[:, None]
-        deposits = [spline @ weights for spline in splines]
-        if response is not None:
-            _, along_x, along_y = splines
-            moved = response.astype(np.float32, copy=False) * (weights / np.float32(self.pixel))
-            deposits.append(along_x @ moved[0] + along_y @ moved[1])
-        if rates is not None and rates.shape[1]:
-            deposits.append(splines[0] @ rates.astype(np.float32))
-        spectra = fft.rfft2(np.concatenate(deposits, axis=1).reshape(*self._size, -1), axes=(0, 1))
-        if light.at_rims is not None:
-            self._diffract(spectra, unknowns, light.at_rims)
-        spectra *= self._filter(unknowns[STRENGTH]).astype(np.float32)[..., None]
-        if len(unknowns) <= RATIO:
-            return spectra, None
-        turn = np.exp(1j * np.tensordot(unknowns[RATIO + 1 :], self._phase, axes=1))
-        return spectra, turn.astype(np.complex64)[..., None]
+    ) -> np.ndarray:
+        """Return the image of a star of unit flux and, with a response, its derivatives over their scales."""
+        strength = float(unknowns[STRENGTH])
+        parts = []
+        if self._core is None or self._edge(strength) > _NO_AIR or light.at_rims is not None:
+            thin = self._core is not None and self._edge(strength) < _THIN_AIR and response is not None
+            few = response[..., :0] if thin and light.at_rims is None else response
+            parts.append(self._pixels(self._spectra(unknowns, light, few, rates)))
+        if self._core is not None:
+            parts.append(self._core_columns(unknowns, light, response, rates))
+        if len(parts) == 1:
+            return parts[0]
+        if parts[0].shape == parts[1].shape:
+            return parts[0] + parts[1]
+        smooth, columns = parts
+        n = len(unknowns)
+        columns[..., :n] += smooth[..., :n]
+        columns[..., columns.shape[-1] - (smooth.shape[-1] - n) :] += smooth[..., n:]
+        return columns
 
-    def _diffract(self, spectra: np.ndarray, unknowns: np.ndarray, rims: RimsAt) -> None:
-        """Add what is diffracted at the rims to the spectra of the star and of its derivatives by x, y and wave."""
+    def _core_columns(
+        self, unknowns: np.ndarray, light: LandedLight, response: np.ndarray | None, rates: np.ndarray | None
+    ) -> np.ndarray:
+        """Return what the core adds to :meth:`_columns`."""
+        assert self._core is not None
+        strength = float(unknowns[STRENGTH])
+        edge = self._edge(strength)
+        amplitude = np.float32(math.exp(-edge / 6.0))
+        weights = amplitude * light.weights.astype(np.float32)[:, None]
+        points, spread = self.places(unknowns, light.landing), light.spread / self.pixel**2
+        variance = 5.0 / 3.0 * edge / math.pi**2
+
+        def of_one_star(places: np.ndarray) -> list[np.ndarray]:
+            """Return the light of one star, then its derivatives by x, y, strength, wave and rims."""
+            assert self._core is not None
+            deposit = self._core.deposit(places, spread, variance)
+            splines = deposit.matrix(0, 0)
+            star = splines @ weights
+            if response is None or rates is None:
+                return [star]
+            gradient = deposit.gradient(weights[:, 0])
+            ones = np.ones(len(weights), dtype=np.float32)
+            along = gradient @ np.kron(np.eye(2, dtype=np.float32), ones).T
+            growth = np.zeros_like(star)
+            if edge > 0.0:
+                bend = np.float32(5.0 / math.pi**2) * (deposit.laplacian() @ weights)
+                growth = np.float32(-edge * _EXPONENT_GROWTH / strength / 6.0) * (star - bend)
+            moved = response.astype(np.float32, copy=False).reshape(2 * len(weights), -1)
+            wave = gradient @ moved / np.float32(self.pixel)
+            return [star, along, growth, wave, splines @ (amplitude * rates).astype(np.float32)]
+
+        first = of_one_star(points)
+        extra: list[np.ndarray] = []
+        if len(unknowns) > RATIO:
+            ratio = np.float32(unknowns[RATIO])
+            second = of_one_star(points + unknowns[RATIO + 1 :] / self.scale)
+            extra = [second[0], ratio / np.float32(self.scale) * second[1]]
+            first = [a + ratio * b for a, b in zip(first, second, strict=True)]
+        if response is None:
+            return self._core.pixels(first[0])
+        star, along, growth, wave, shifts = first
+        return self._core.pixels(
+            np.concatenate([star, along, np.zeros_like(star), growth, *extra, wave, shifts], axis=1)
+        )
+
+    def _spectra(
+        self,
+        unknowns: np.ndarray,
+        light: LandedLight,
+        response: np.ndarray | None,
+        rates: np.ndarray | None,
+    ) -> np.ndarray:
+        """Return spectra of :meth:`_columns`, without the core of a sharp image."""
+        weights = light.weights.astype(np.float32)[:, None]
+        splines = self._splines(self.places(unknowns, light.landing), light.spread / self.pixel**2)
+        star = splines.matrix(0, 0)
+        deposits = [star @ weights]
+        if response is not None and rates is not None:
+            along_x, along_y = splines.matrix(1, 0), splines.matrix(0, 1)
+            moved = response.astype(np.float32, copy=False) * (weights / np.float32(self.pixel))
+            deposits += [along_x @ weights, along_y @ weights, along_x @ moved[0] + along_y @ moved[1]]
+            if rates.shape[1]:
+                deposits.append(star @ rates.astype(np.float32))
+        spectra = fft.rfft2(np.concatenate(deposits, axis=1).reshape(*self._size, -1), axes=(0, 1))
+        whole, growth = (v.astype(np.float32)[..., None] for v in self._on_grid(float(unknowns[STRENGTH])))
+        grown = growth * spectra[..., :1]
+        spectra *= whole
+        if light.at_rims is not None:
+            self._diffract(spectra, grown, unknowns, light.at_rims)
+        extra = []
+        if len(unknowns) > RATIO:
+            turn = np.exp(1j * np.tensordot(unknowns[RATIO + 1 :], self._phase, axes=1))
+            shift = turn.astype(np.complex64)[..., None]
+            second = spectra[..., :1] * shift
+            turns = [(1j * unknowns[RATIO] * p).astype(np.complex64)[..., None] for p in self._phase]
+            extra = [second, *(turn * second for turn in turns)]
+            both_stars = 1.0 + np.float32(unknowns[RATIO]) * shift
+            spectra, grown = spectra * both_stars, grown * both_stars
+        if response is None:
+            return spectra
+        uniform = np.zeros_like(grown)
+        return np.concatenate([spectra[..., :3], uniform, grown, *extra, spectra[..., 3:]], axis=-1)
+
+    def _diffract(self, spectra: np.ndarray, grown: np.ndarray, unknowns: np.ndarray, rims: RimsAt) -> None:
+        """Add what is diffracted at the rims to the spectra of the star and of its derivatives."""
         light = self.rim_light
         assert light is not None
-        transfer = light.transfer(float(unknowns[STRENGTH]), rims)
+        strength = float(unknowns[STRENGTH])
+        transfer, slopes = light.transfer(strength, rims)
         # Frequencies of the grid count from its first cell.
-        middle = np.array(self._middle[::-1]) / self.oversampling
-        place = self.places(unknowns, np.zeros(2)) + middle
+        place = self.places(unknowns, np.zeros(2)) + np.array(self._middle[::-1])
         turn = np.exp(-1j * self.pixel * (light.wave @ place)).astype(np.complex64)
+        turn *= self._filter(strength)[light.where].astype(np.float32)
         diffracted = transfer * turn
         spectra[light.where, 0] += diffracted
+        grown[light.where, 0] += (
+            -5.0 / 3.0 * self._exponent[light.where] * strength ** (2.0 / 3.0) * diffracted
+        ).astype(np.complex64)
         if spectra.shape[-1] == 1:
             return
         for axis in (0, 1):
             spectra[light.where, 1 + axis] -= 1j * (light.wave[:, axis] * self.pixel).astype(np.float32) * diffracted
-        spectra[light.where, 3 : 3 + rims.response.shape[2]] += light.slopes(rims) * turn[:, None]
-
-
-def _by_point(taps: np.ndarray) -> np.ndarray:
-    """Return values of the 4 x 4 cells of n points, shape [4, 4, n], point by point, flat."""
-    return np.ascontiguousarray(taps.reshape(16, -1).T).ravel()
+        spectra[light.where, 3 : 3 + rims.response.shape[2]] += slopes * turn[:, None]
 
 
 # Cubic B-spline at t - 1 ... t + 2 by powers of t, 0 <= t < 1, and its derivatives with respect to the point's place.

@@ -38,17 +38,15 @@ _SMALL = 0.2
 #: Power of the error by which the number of cells goes, from the two figures of :data:`_CELLS_LEAVE`.
 _FALL = 0.55
 #: Error of the photons [m] below which cells become no smaller.
-_LEAST_ERROR = 0.5e-9
+_LEAST_ERROR = 1.5e-9
 #: Spacing of landing points over the FWHM of the blur, which smooths what cells on rims leave.
 _SPACING = 0.5
-#: FWHM of the blur in cells of the grid beyond which the cells resolve it.
+#: FWHM of the blur in pixels beyond which the pixels resolve it.
 _RESOLVED = 1.9
 #: Shift of a body over the distance of the focus from the detector, by which its effect on the focus is measured.
 _PROBE = 1e-2
 #: Least motion of the focus over that of a body that counts as one that focuses: a filter's is 0.
 _RESPONSE = 0.05
-#: Finest grid, in cells along a pixel.
-_FINEST = 5
 #: FWHM of the blur in binned pixels.
 _BINNED = 1.95
 #: Most pixels along a binned one.
@@ -186,16 +184,16 @@ class Instrument:
     def sampling(self, light: StarLight, pixels: Pixels, fwhm: float, error: float = math.inf) -> Sampling:
         """Return how finely images of a star in a seeing [rad] are sampled on given pixels.
 
-        A wavefront known to an error [m] that the cells would add to has more of them.
+        A wavefront known to an error [m] that the cells would add to has more of them; images sharper than their pixels
+        have as many as they need anyway.
         """
         width = self._width(light, pixels, fwhm)
         distance = pixels.side * self.pixel
-        oversampling = min(max(math.ceil(_RESOLVED * distance / max(width, 1e-12)), 1), _FINEST)
-        # A lattice as fine as the grid leaves no pattern where nothing else blurs it.
-        spacing = _SPACING * width if oversampling == 1 else distance / oversampling
-        finer = max((_CELLS_LEAVE / (_SMALL * max(error, _LEAST_ERROR))) ** _FALL, 1.0)
+        spacing = _SPACING * (math.hypot(width, distance) if width < _RESOLVED * distance else width)
+        sharp = width < _RESOLVED * distance
+        finer = 1.0 if sharp else max((_CELLS_LEAVE / (_SMALL * max(error, _LEAST_ERROR))) ** _FALL, 1.0)
         across = self.model.n_pupil or min(max(math.ceil(finer * light.diameter / spacing), _FEWEST), _MOST)
-        return Sampling(oversampling, across)
+        return Sampling(sharp, across)
 
     def binning(self, light: StarLight, pixels: Pixels, fwhm: float) -> int:
         """Return how many pixels along each axis are summed for the fit of a star in a seeing [rad].
@@ -223,27 +221,25 @@ class Instrument:
             light.telescope, light.direction, self.wavelengths, self.wavelength_weights, cells, self.noll
         )
 
-    def stamp(
-        self, light: StarLight, pixels: Pixels, rays: ZernikeRays, oversampling: int, reach: float = 0.0
-    ) -> Stamp:
+    def stamp(self, light: StarLight, pixels: Pixels, rays: ZernikeRays, sharp: bool, reach: float = 0.0) -> Stamp:
         """Return a stamp with its model: light within a reach [m] beside it does not wrap around."""
         blur = math.hypot(self.diffusion, pixels.blur * self.pixel)
         grid = ImageGrid(
-            pixels, self.pixel, self.seeing, light.jacobian, blur, rays.footprint, oversampling, reach, light.pupil_rims
+            pixels, self.pixel, self.seeing, light.jacobian, blur, rays.footprint, sharp, reach, light.pupil_rims
         )
         return Stamp(pixels.image, pixels.variance, pixels.used, grid, rays)
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """Cells of the image grid along a pixel, and cells of the pupil across its diameter."""
+    """Whether the image is sharper than its pixels resolve, and cells of the pupil across its diameter."""
 
-    oversampling: int
+    sharp: bool
     across: int
 
     def finer_than(self, other: Sampling) -> bool:
-        """Return whether the grid or the cells are smaller."""
-        return self.oversampling > other.oversampling or self.across > other.across
+        """Return whether this one has more detail of the image or of the pupil."""
+        return self.sharp > other.sharp or self.across > other.across
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -17,8 +18,8 @@ _SHARPER = 0.9
 #: Distance by which landing points may move before the transfer function is computed again [side of a pixel]. Images
 #: that are 0.05 pixels off at the rims made 25 nm of coma in a joint fit.
 _MOVED = 2e-3
-#: The same for its derivatives [side of a pixel].
-_BENT = 0.2
+#: The same where derivatives follow the points: their second order is then a thousandth of the light of the rims.
+_BENT = 0.07
 
 
 @dataclass(frozen=True)
@@ -69,10 +70,9 @@ class RimLight:
         self.rims = rims
         self._side, self._grid, self._lattice, self._filter = side, (baseline, wave), lattice, air_and_detector
         self._strength = np.inf
-        self._landing, self._bent = np.full((1, 2), np.inf), np.full((1, 2), np.inf)
+        self._last: _Expansion | None = None
         #: Frequencies of the grid where something of the diffracted light is left, and their wave vectors [n, 2].
         self.where, self.wave = np.zeros(lattice.shape, dtype=bool), np.zeros((0, 2))
-        self._transfer, self._slopes = np.zeros(0, dtype=np.complex64), np.zeros((0, 0), dtype=np.complex64)
 
     def of(self, rims: PupilRims) -> RimLight:
         """Return the same for other rims."""
@@ -81,36 +81,63 @@ class RimLight:
         light.release()
         return light
 
-    def transfer(self, strength: float, at: RimsAt) -> np.ndarray:
-        """Return the transfer function about the chief ray at :attr:`where`, shape [n]; turbulence of a strength."""
+    def transfer(self, strength: float, at: RimsAt) -> tuple[np.ndarray, np.ndarray]:
+        """Return the transfer function about the chief ray, and its derivatives by the unknowns of the wavefront.
+
+        At :attr:`where`, shapes [n] and [n, n_wave], for turbulence of a strength. Rims that moved little since the
+        last time are followed by the derivatives of then.
+        """
         if strength < self._strength:
             self._strength = _SHARPER * strength
             self.where = np.abs(self._filter(self._strength)) > _DARK
             self.wave = self._at_where(self._grid[1])
-            self._landing, self._bent = np.full((2, 1, 2), np.inf)
-        if self._far(at.landing, self._landing, _MOVED):
-            diffracted = self.rims.transfer(self._at_where(self._grid[0]), self.wave, at.landing, at.inward)
-            self._transfer, self._landing = self._over_lattice(diffracted[:, None])[:, 0], at.landing
-        return self._transfer
-
-    def slopes(self, at: RimsAt) -> np.ndarray:
-        """Return derivatives of the last :meth:`transfer` by the unknowns of the wavefront, shape [n, n_wave]."""
-        if self._far(at.landing, self._bent, _BENT) or self._slopes.shape[1] != at.response.shape[2]:
-            frequencies = self._at_where(self._grid[0])
-            derivatives = self.rims.transfer_slopes(frequencies, self.wave, at.landing, at.inward, at.response)
-            self._slopes, self._bent = self._over_lattice(derivatives), at.landing
-        return self._slopes
+            self._last = None
+        last = self._last
+        follows = None if last is None else last.change(at, self._side)
+        if last is None or follows is None:
+            frequencies, count = self._at_where(self._grid[0]), at.response.shape[2]
+            if count:
+                parts = self.rims.transfer_slopes(frequencies, self.wave, at.landing, at.inward, at.response)
+            else:
+                parts = self.rims.transfer(frequencies, self.wave, at.landing, at.inward), np.zeros((len(self.wave), 0))
+            over = self._lattice[self.where]
+            values, slopes = parts[0] / over, parts[1] / over[:, None]
+            last = self._last = _Expansion(at, values.astype(np.complex64), slopes.astype(np.complex64))
+            follows = np.zeros(count)
+        if not follows.any():
+            return last.values, last.slopes
+        return last.values + last.slopes @ follows.astype(np.float32), last.slopes
 
     def release(self) -> None:
         """Free the transfer function and its derivatives."""
-        self._landing, self._bent = np.full((2, 1, 2), np.inf)
-        self._transfer, self._slopes = np.zeros(0, dtype=np.complex64), np.zeros((0, 0), dtype=np.complex64)
+        self._last = None
 
     def _at_where(self, values: np.ndarray) -> np.ndarray:
         return np.asarray(values[:, self.where].T)
 
-    def _over_lattice(self, values: np.ndarray) -> np.ndarray:
-        return np.asarray((values / self._lattice[self.where, None]).astype(np.complex64))
 
-    def _far(self, landing: np.ndarray, last: np.ndarray, distance: float) -> bool:
-        return landing.shape != last.shape or bool(np.abs(landing - last).max() > distance * self._side)
+class _Expansion:
+    """Transfer function [n] of rims at one place, and its derivatives [n, n_wave] by the unknowns of the wavefront."""
+
+    def __init__(self, at: RimsAt, values: np.ndarray, slopes: np.ndarray) -> None:
+        self.values, self.slopes, self._at = values, slopes, at
+
+    @cached_property
+    def _inverse(self) -> np.ndarray:
+        """Unknowns by the shifts of the landing points."""
+        response = self._at.response
+        return np.linalg.pinv(response.reshape(-1, response.shape[2]), rcond=1e-6)
+
+    def change(self, at: RimsAt, side: float) -> np.ndarray | None:
+        """Return the unknowns [n_wave] that lead from here to other rims; None where these are too far for that."""
+        count = self._at.response.shape[2]
+        if at.landing.shape != self._at.landing.shape or at.response.shape[2] not in (0, count):
+            return None
+        shift = (at.landing - self._at.landing).T
+        if np.abs(shift).max() <= (_MOVED * side if not count else 0.0):
+            return np.zeros(count)
+        if not count or np.abs(shift).max() > _BENT * side:
+            return None
+        unknowns = np.asarray(self._inverse @ shift.ravel())
+        unexplained = shift.ravel() - self._at.response.reshape(-1, count) @ unknowns
+        return unknowns if np.abs(unexplained).max() <= _MOVED * side else None

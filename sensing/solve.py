@@ -24,6 +24,8 @@ STEPS = 25
 _NEAR = 1.0
 #: Damping of the first step, in units of the curvature.
 _DAMPING = 1e-3
+#: Least strength of the turbulence [1/m].
+_LEAST_STRENGTH = 1e-3
 #: Damping beyond which no step is tried: none gains anything.
 _LARGEST_DAMPING = 1e6
 
@@ -118,11 +120,12 @@ def solve(
     damping, converged, predicted = _DAMPING, False, np.inf
     for _ in range(steps if np.isfinite(state.loss) else 0):
         step = np.zeros_like(joined)
-        curvature = state.curvature[np.ix_(~held, ~held)]
+        free = ~held & ~_pressed(joined, state.gradient, sizes)
+        curvature = state.curvature[np.ix_(free, free)]
         scale = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
         normalized = curvature / np.outer(scale, scale)
         normalized[np.diag_indices_from(normalized)] = 1.0 + damping
-        step[~held] = _solved(normalized, state.gradient[~held] / scale) / scale
+        step[free] = _solved(normalized, state.gradient[free] / scale) / scale
         predicted = float(state.gradient @ step)
         trial = _bounded(joined + step, sizes, held)
         if predicted < tolerance * max(1.0, state.loss / pixels):
@@ -202,13 +205,22 @@ def _linearize(group: Group, joined: np.ndarray, sizes: list[int], pool: Executo
     return _Linearized(curvature, gradient, np.array([e.chi2 for e in star_equations]), loss)
 
 
+def _pressed(joined: np.ndarray, gradient: np.ndarray, sizes: list[int]) -> np.ndarray:
+    """Return which unknowns stand at their least value and would fall: turbulence of images without any, shape [n]."""
+    pressed = np.zeros(len(joined), dtype=bool)
+    for first in np.cumsum([0, *sizes[:-1]]):
+        at = first + STRENGTH
+        pressed[at] = joined[at] <= _LEAST_STRENGTH and gradient[at] < 0.0
+    return pressed
+
+
 def _bounded(joined: np.ndarray, sizes: list[int], held: np.ndarray) -> np.ndarray:
     """Return unknowns with positive fluxes and turbulence."""
     starts = np.cumsum([0, *sizes[:-1]])
     for first, size in zip(starts, sizes, strict=True):
         joined[first + FLUX] = max(joined[first + FLUX], 1e-3)
         if not held[first + STRENGTH]:
-            joined[first + STRENGTH] = np.clip(joined[first + STRENGTH], 1e-3, 100.0)
+            joined[first + STRENGTH] = np.clip(joined[first + STRENGTH], _LEAST_STRENGTH, 100.0)
         if size > RATIO:
             joined[first + RATIO] = max(joined[first + RATIO], 0.0)
     return joined

@@ -32,7 +32,7 @@ def stamp_of(tel, across, *, blur=0.0, size=SIZE, outer_scale=25.0, image=None, 
     seeing = Seeing(WAVELENGTH, outer_scale)
     image = np.zeros((size, size)) if image is None else image
     pixels = Pixels(image, np.full(image.shape, 500.0), np.ones(image.shape, dtype=bool)).binned(side)
-    grid = ImageGrid(pixels, PIXEL, seeing, jacobian, blur, rays.footprint, 1, reach, rims)
+    grid = ImageGrid(pixels, PIXEL, seeing, jacobian, blur, rays.footprint, False, reach, rims)
     return Stamp(pixels.image, pixels.variance, pixels.used, grid, rays)
 
 

@@ -29,8 +29,8 @@ from .clear_pupil import clear_edges
 
 #: Pieces of each rim: two pixels of a donut of 120.
 _PIECES = 192
-# Frequencies at a time.
-_CHUNK = 2048
+# Frequencies at a time: their strips stay in the processor's cache.
+_CHUNK = 256
 
 
 @dataclass(frozen=True)
@@ -79,18 +79,19 @@ class PupilRims:
 
     def transfer_slopes(
         self, baseline: np.ndarray, wave: np.ndarray, landing: np.ndarray, inward: np.ndarray, response: np.ndarray
-    ) -> np.ndarray:
-        """Return derivatives of :meth:`transfer` by unknowns, shape [n_frequency, n_unknown], complex64.
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return :meth:`transfer` and its derivatives by unknowns [n_frequency, n_unknown], both complex64.
 
         ``response`` has those of the landing points [m], shape [2, n, n_unknown]. Those of ``inward`` are left out.
         """
-        out = np.empty((len(wave), response.shape[2]), dtype=np.complex64)
+        values, out = (np.empty((len(wave), *shape), dtype=np.complex64) for shape in ((), response.shape[2:]))
         moved = response.astype(np.float32)
         for piece, k, width, phase in self._strips(baseline, wave, landing, inward):
             cosine, sine = width * np.cos(phase), width * np.sin(phase)
+            values[piece].real, values[piece].imag = cosine.sum(axis=1), -sine.sum(axis=1)
             out[piece].real = sum(-k[:, i, None] * (sine @ moved[i]) for i in (0, 1))
             out[piece].imag = sum(-k[:, i, None] * (cosine @ moved[i]) for i in (0, 1))
-        return out
+        return values, out
 
     def _strips(
         self, baseline: np.ndarray, wave: np.ndarray, landing: np.ndarray, inward: np.ndarray

@@ -116,7 +116,8 @@ def test_slopes_of_the_transfer_are_central_differences():
     baseline, wave = rng.uniform(-0.3, 0.3, (30, 2)), rng.uniform(-1e5, 1e5, (30, 2))
     landing, inward = 1.5e-4 * rims.points, 1.5e-4 * rims.normals
     response = rng.standard_normal((2, count, 3))
-    found = rims.transfer_slopes(baseline, wave, landing, inward, response)
+    values, found = rims.transfer_slopes(baseline, wave, landing, inward, response)
+    np.testing.assert_allclose(values, rims.transfer(baseline, wave, landing, inward), atol=1e-6)
     for k in range(3):
         moved = [landing + sign * step * response[:, :, k].T for sign in (1.0, -1.0)]
         ends = [rims.transfer(baseline, wave, m, inward) for m in moved]
