@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +15,7 @@ from .flags import DonutFlag
 from .image_model import FLUX, NUISANCES, RATIO, STRENGTH, X, Y
 from .light import Instrument, Sampling, StarLight
 from .likelihood import Stamp, model_image, pulls
+from .rim_search import RimFit, with_all_rims, with_moved_rims
 from .solve import COARSE, FINE, STEPS, Group, Solution, solve
 from .stamps import (
     Match,
@@ -38,6 +41,8 @@ _GAIN = 100.0
 _LEFT = 0.5
 #: Loss a coarse pixel from which on the other side of focus is tried; photons leave 0.1, since smoothed noise is small.
 _MISFIT = 0.15
+#: Standard deviations of the loss a fine pixel from which on rims are searched for elsewhere.
+_BY_CHANCE = 3.0
 #: Loss a coarse pixel from which on second stars are searched for around the first.
 _POOR = 1.0
 #: Distances of such second stars over the diameter of the donut.
@@ -132,6 +137,9 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
     if flags:
         return StarFit(flags)
     best = fitter.solve(coarse, start, tolerance=COARSE if donut else FINE)
+    if donut and wavefront:
+        # Light beside a rim looks like a second star otherwise, and like a cosmic ray.
+        fitter, coarse, best = fitter.with_all_rims(coarse, best, start, small)
     if donut and instrument.model.neighbours:
         best = fitter.with_companion(small, coarse, best, start, template)
     if donut and fitter.other_focus_is_better(small, coarse, best):
@@ -143,6 +151,8 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
     finest = fitter.finest(best)
     if (finest.full.used != pixels.used).any():
         flags |= DonutFlag.CLIPPED
+    if finest.light.free_rims.bodies:
+        flags |= DonutFlag.RIM_MOVED
     if len(finest.solution.stars[0]) > RATIO:
         flags |= DonutFlag.BLENDED
     if not (finest.solution.converged and np.isfinite(finest.model).all()):
@@ -165,17 +175,77 @@ class _StarFitter:
     def __init__(
         self, instrument: Instrument, light: StarLight, clean: Pixels, strength: float, wavefront: bool
     ) -> None:
-        self._instrument, self._light, self._clean = instrument, light, clean
+        self._instrument, self._clean, self._wavefront = instrument, clean, wavefront
         self._donut = light.diameter > SMALLEST_DONUT * instrument.pixel
         self._strength = strength
         self._fwhm = float(instrument.seeing.fwhm(np.asarray(strength)))
-        self._precision = np.concatenate([instrument.terms.precision, light.shift_precision])
-        n = len(self._precision)
-        self._map = np.eye(n)[None] if wavefront else np.zeros((1, n, 0))
-        self._rays: dict[int, ZernikeRays] = {}
+        self._set_light(light)
         self._binned: dict[int, Pixels] = {}
         #: Cells across the pupil that the last fits are expected to need, so that the first ones share them.
         self._across = self._sampling(self._fwhm, self._side(self._fwhm))[1].across
+
+    @property
+    def light(self) -> StarLight:
+        """Light of the star."""
+        return self._light
+
+    def _set_light(self, light: StarLight) -> None:
+        terms = self._instrument.terms
+        self._light = light
+        self._precision = np.concatenate([terms.precision, light.shift_precision])
+        self._mean = np.concatenate([np.zeros(len(terms.precision)), light.shift_mean])
+        n = len(self._precision)
+        self._map = np.eye(n)[None] if self._wavefront else np.zeros((1, n, 0))
+        self._rays: dict[int, ZernikeRays] = {}
+
+    def with_light(self, light: StarLight) -> _StarFitter:
+        """Return the same for the light of the star with its rims elsewhere."""
+        fitter = copy(self)
+        fitter._set_light(light)
+        return fitter
+
+    def with_all_rims(
+        self, stamp: Stamp, best: Solution, first: np.ndarray, pixels: Pixels
+    ) -> tuple[_StarFitter, Stamp, Solution]:
+        """Return the fit of coarse pixels with rims free that stand elsewhere; see :func:`with_all_rims`."""
+        begun = replace(best, stars=(first,), shared=np.zeros_like(best.shared))
+        solved = self._solver(COARSE, lambda moved: moved.stamp(moved.light, pixels))
+        return self._adopted(
+            with_all_rims(self._instrument, RimFit(self._light, stamp, best), begun, _MISFIT, solved), stamp
+        )
+
+    def with_moved_rims(
+        self,
+        stamp: Stamp,
+        best: Solution,
+        noise: float,
+        tolerance: float,
+        stamp_of: Callable[[_StarFitter], Stamp],
+    ) -> tuple[_StarFitter, Stamp, Solution]:
+        """Return the fit with rims free that the residuals say stand elsewhere; see :func:`with_moved_rims`."""
+        solved = self._solver(tolerance, stamp_of)
+        return self._adopted(
+            with_moved_rims(self._instrument, RimFit(self._light, stamp, best), noise, solved), stamp
+        )
+
+    def _adopted(self, fit: RimFit, stamp: Stamp) -> tuple[_StarFitter, Stamp, Solution]:
+        if fit.light is self._light:
+            return self, stamp, fit.solution
+        return self.with_light(fit.light), fit.stamp, fit.solution
+
+    def _solver(
+        self, tolerance: float, stamp_of: Callable[[_StarFitter], Stamp]
+    ) -> Callable[[StarLight, Solution], RimFit]:
+        """Return the function that fits light with its rims elsewhere, from the unknowns of a solution."""
+
+        def solved(light: StarLight, start: Solution) -> RimFit:
+            fitter = self.with_light(light)
+            moved_stamp = stamp_of(fitter)
+            held = len(light.rims) * 2 + len(self._instrument.noll)
+            shared = np.concatenate([start.shared[:held], np.zeros(len(light.free_rims))])
+            return RimFit(light, moved_stamp, fitter.solve(moved_stamp, start.stars[0], shared, tolerance))
+
+        return solved
 
     def _of(self, light: StarLight, across: int) -> ZernikeRays:
         """Return the light through at least so many cells across the pupil, and at most a quarter more."""
@@ -208,6 +278,28 @@ class _StarFitter:
                 break
             fine, best = finer, self.solve(finer.stamp, best.stars[0], best.shared)
         assert fine is not None
+        if self._donut and self._wavefront:
+            sampled = fine
+            reach = fine.stamp.grid.reach
+            noise = 1.0 + _BY_CHANCE * math.sqrt(2.0 / fine.stamp.used.sum())
+            fitter, stamp, best = self.with_moved_rims(
+                fine.stamp,
+                best,
+                noise,
+                FINE,
+                lambda moved: self._instrument.stamp(
+                    moved.light,
+                    sampled.pixels,
+                    moved._of(moved.light, sampled.sampling.across),
+                    sampled.sampling.oversampling,
+                    reach,
+                ),
+            )
+            return fitter._clipped(replace(fine, stamp=stamp), best)
+        return self._clipped(fine, best)
+
+    def _clipped(self, fine: _Fine, best: Solution) -> StarSolution:
+        """Return the best model without pixels far off it."""
         stamp, full = fine.stamp, self.every_pixel(fine)
         model = model_image(full, best.stars[0], best.waves[0])
         for _ in range(_ROUNDS):
@@ -279,7 +371,9 @@ class _StarFitter:
     ) -> Solution:
         """Return the best unknowns from a start."""
         n = self._map.shape[2]
-        group = Group((stamp,), self._map, self._precision[:n], self._instrument.known_seeing)
+        group = Group(
+            (stamp,), self._map, self._precision[:n], self._instrument.known_seeing, prior_mean=self._mean[:n]
+        )
         return solve(group, [star], np.zeros(n) if shared is None else shared, tolerance=tolerance, steps=steps)
 
     def with_companion(

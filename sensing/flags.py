@@ -9,8 +9,9 @@ class DonutFlag(IntFlag):
     """Outcome of the fit of one donut; zero for a clean one.
 
     ``BLENDED`` (a second star was fitted too), ``CLIPPED`` (pixels far off the model, cosmic rays for example, were
-    left out) and ``POOR_FIT`` (chi-square is far above the number of pixels, so that errors are larger than claimed)
-    are remarks: there are results. With any other flag the results of the donut are NaN.
+    left out), ``POOR_FIT`` (chi-square is far above the number of pixels, so that errors are larger than claimed) and
+    ``RIM_MOVED`` (a rim or a spider stands elsewhere than the prescription has it, and was fitted too) are remarks: there
+    are results. With any other flag the results of the donut are NaN.
 
     ``NO_DONUT``: nothing like a donut stands on the stamp. ``CUT_OFF``: more than a twentieth of the light falls beside
     the stamp. ``SATURATED``: too many pixels are saturated. ``DEFOCUS_SIGN``: the image fits the other side of focus
@@ -32,11 +33,12 @@ class DonutFlag(IntFlag):
     NOT_FINITE = 512
     NOT_CONVERGED = 1024
     POOR_FIT = 2048
+    RIM_MOVED = 4096
 
     @property
     def usable(self) -> bool:
         """Whether the donut has results."""
-        return not self & ~(DonutFlag.BLENDED | DonutFlag.CLIPPED | DonutFlag.POOR_FIT)
+        return not self & ~(DonutFlag.BLENDED | DonutFlag.CLIPPED | DonutFlag.POOR_FIT | DonutFlag.RIM_MOVED)
 
     @property
     def reasons(self) -> str:

@@ -139,7 +139,7 @@ def cells_with_rims(
     np.add.at(joined, place, np.column_stack([weights, rates]))
     significant = (np.abs(joined) > 1e-9 * np.abs(joined).max(axis=0)).any(axis=1)
     first, joined = first[significant], joined[significant]
-    return PupilCells(points[first], joined[:, 0], moments[first], cells.side, cells.center, joined[:, 1:])
+    return replace(cells, points=points[first], weights=joined[:, 0], moments=moments[first], rates=joined[:, 1:])
 
 
 def _with_shifted_rim(telescope: Telescope, name: str, x: float, y: float) -> Telescope:
