@@ -15,7 +15,7 @@ from .flags import DonutFlag
 from .image_model import FLUX, NUISANCES, RATIO, STRENGTH, X, Y
 from .light import Instrument, Sampling, StarLight
 from .likelihood import Stamp, model_image, pulls
-from .rim_search import RimFit, with_all_rims, with_moved_rims
+from .rim_search import RimFit, with_moved_rims
 from .solve import COARSE, FINE, STEPS, Group, Solution, solve
 from .stamps import (
     Match,
@@ -139,7 +139,8 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
     best = fitter.solve(coarse, start, tolerance=COARSE if donut else FINE)
     if donut and wavefront:
         # Light beside a rim looks like a second star otherwise, and like a cosmic ray.
-        fitter, coarse, best = fitter.with_all_rims(coarse, best, start, small)
+        solved = fitter.rim_solver(COARSE, lambda moved: moved.stamp(moved.light, small))
+        fitter, coarse, best = fitter.with_moved_rims(coarse, best, _MISFIT, solved, start)
     if donut and instrument.model.neighbours:
         best = fitter.with_companion(small, coarse, best, start, template)
     if donut and fitter.other_focus_is_better(small, coarse, best):
@@ -167,6 +168,10 @@ class _Fine:
     stamp: Stamp
     pixels: Pixels
     sampling: Sampling
+
+    def of(self, fitter: _StarFitter) -> Stamp:
+        """Return the stamp sampled alike for the light of a fitter."""
+        return fitter.sampled_stamp(self.pixels, self.sampling, self.stamp.grid.reach)
 
 
 class _StarFitter:
@@ -204,36 +209,20 @@ class _StarFitter:
         fitter._set_light(light)
         return fitter
 
-    def with_all_rims(
-        self, stamp: Stamp, best: Solution, first: np.ndarray, pixels: Pixels
-    ) -> tuple[_StarFitter, Stamp, Solution]:
-        """Return the fit of coarse pixels with rims free that stand elsewhere; see :func:`with_all_rims`."""
-        begun = replace(best, stars=(first,), shared=np.zeros_like(best.shared))
-        solved = self._solver(COARSE, lambda moved: moved.stamp(moved.light, pixels))
-        return self._adopted(
-            with_all_rims(self._instrument, RimFit(self._light, stamp, best), begun, _MISFIT, solved), stamp
-        )
-
     def with_moved_rims(
         self,
         stamp: Stamp,
         best: Solution,
         noise: float,
-        tolerance: float,
-        stamp_of: Callable[[_StarFitter], Stamp],
+        solved: Callable[[StarLight, Solution], RimFit],
+        first: np.ndarray | None = None,
     ) -> tuple[_StarFitter, Stamp, Solution]:
-        """Return the fit with rims free that the residuals say stand elsewhere; see :func:`with_moved_rims`."""
-        solved = self._solver(tolerance, stamp_of)
-        return self._adopted(
-            with_moved_rims(self._instrument, RimFit(self._light, stamp, best), noise, solved), stamp
-        )
+        """Return the fit with rims free that the residuals say stand elsewhere, with the stamp of its light."""
+        begun = None if first is None else replace(best, stars=(first,), shared=np.zeros_like(best.shared))
+        fit = with_moved_rims(self._instrument, RimFit(self._light, stamp, best), noise, solved, begun)
+        return self if fit.light is self._light else self.with_light(fit.light), fit.stamp, fit.solution
 
-    def _adopted(self, fit: RimFit, stamp: Stamp) -> tuple[_StarFitter, Stamp, Solution]:
-        if fit.light is self._light:
-            return self, stamp, fit.solution
-        return self.with_light(fit.light), fit.stamp, fit.solution
-
-    def _solver(
+    def rim_solver(
         self, tolerance: float, stamp_of: Callable[[_StarFitter], Stamp]
     ) -> Callable[[StarLight, Solution], RimFit]:
         """Return the function that fits light with its rims elsewhere, from the unknowns of a solution."""
@@ -264,6 +253,11 @@ class _StarFitter:
         rays = self._of(light, max(sampling.across, self._across))
         return self._instrument.stamp(light, pixels, rays, sampling.oversampling, reach)
 
+    def sampled_stamp(self, pixels: Pixels, sampling: Sampling, reach: float) -> Stamp:
+        """Return the stamp of pixels that are sampled so, with room for light beside it [m]."""
+        rays = self._of(self._light, sampling.across)
+        return self._instrument.stamp(self._light, pixels, rays, sampling.oversampling, reach)
+
     def _side(self, fwhm: float) -> int:
         """Return how many pixels are summed along each axis for the last fits in a seeing [rad]."""
         return self._instrument.binning(self._light, self._clean, fwhm) if self._donut else 1
@@ -279,22 +273,9 @@ class _StarFitter:
             fine, best = finer, self.solve(finer.stamp, best.stars[0], best.shared)
         assert fine is not None
         if self._donut and self._wavefront:
-            sampled = fine
-            reach = fine.stamp.grid.reach
             noise = 1.0 + _BY_CHANCE * math.sqrt(2.0 / fine.stamp.used.sum())
-            fitter, stamp, best = self.with_moved_rims(
-                fine.stamp,
-                best,
-                noise,
-                FINE,
-                lambda moved: self._instrument.stamp(
-                    moved.light,
-                    sampled.pixels,
-                    moved._of(moved.light, sampled.sampling.across),
-                    sampled.sampling.oversampling,
-                    reach,
-                ),
-            )
+            solved = self.rim_solver(FINE, fine.of)
+            fitter, stamp, best = self.with_moved_rims(fine.stamp, best, noise, solved)
             return fitter._clipped(replace(fine, stamp=stamp), best)
         return self._clipped(fine, best)
 
@@ -326,8 +307,7 @@ class _StarFitter:
             if not self._sampling(_ENOUGH * fwhm, last.pixels.side, _ENOUGH * error)[1].finer_than(last.sampling):
                 return last
             pixels, sampling = self._sampling(fwhm, min(self._side(fwhm), last.pixels.side), error)
-        rays = self._of(light, sampling.across)
-        stamp = instrument.stamp(light, pixels, rays, sampling.oversampling, light.diameter if blended else 0.0)
+        stamp = self.sampled_stamp(pixels, sampling, light.diameter if blended else 0.0)
         return _Fine(stamp, pixels, sampling)
 
     def _sampling(self, fwhm: float, side: int, error: float = math.inf) -> tuple[Pixels, Sampling]:

@@ -20,7 +20,7 @@ from .donut_rays import ZernikeRays, chief_landing
 from .image_model import ImageGrid
 from .likelihood import Stamp
 from .model import DonutModel
-from .moving_rims import FreeRims, PupilShadows, cells_with_lines
+from .moving_rims import FreeRims
 from .pupil_cells import PupilCells
 from .seeing import Seeing
 from .stamps import Pixels
@@ -195,10 +195,9 @@ class Instrument:
 
     def rays(self, light: StarLight, across: int) -> ZernikeRays:
         """Return the light of a star through so many cells across the pupil."""
-        cells = cells_with_rims(light.telescope, light.direction, self.middle, across, light.rims)
-        if light.free_rims.bodies:
-            shadows = PupilShadows(light.telescope, light.direction, self.middle, cells)
-            cells = cells_with_lines(cells, shadows.lines(light.free_rims.bodies), light.free_rims.free)
+        cells = cells_with_rims(
+            light.telescope, light.direction, self.middle, across, light.rims, light.free_rims
+        )
         return self.rays_of(light, cells)
 
     def rays_of(self, light: StarLight, cells: PupilCells) -> ZernikeRays:

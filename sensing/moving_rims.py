@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..models.aperture import Circle
+from ..models.aperture import Circle, enclosing_circle
 from ..models.telescope import Telescope
 from ..raytrace.rays import RayStatus, parallel_rays
 from ..raytrace.trace import TraceResult, trace
@@ -21,16 +21,18 @@ from ..wavefront.pupil_polynomials import PupilPolynomials
 from .pupil_cells import PupilCells
 from .rim_outlines import MOTIONS, RimMotion, Simple, is_vane, moved_aperture, outline, simple_regions, vane_width
 
-#: Standard deviation of the shift and of the growth of a rim over the diameter of the beam: 5 pixels of a donut of 120.
-_SHIFT = 0.04
+#: Standard deviation of the shift and of the growth of a rim over its own size, and most of it over the diameter of the
+#: beam: 5 pixels of a donut of 120.
+_OF_RADIUS = 0.02
+_OF_BEAM = 0.04
 #: The same of the shift of a spider.
 _SPIDER_SHIFT = 0.01
 #: Standard deviation of the turn of a spider [rad]: two degrees.
 _SPIDER_TURN = 0.035
 #: Standard deviation of what a side of a vane is offset by, over its width: a fifth of the width in all.
 _THICKNESS = 0.1
-#: Most standard deviations that a rim is moved by: vanes do not vanish.
-_MOST = 4.0
+#: Most standard deviations that a rim is moved by at once.
+_MOST = 3.0
 #: Radii and centres that differ by less, over the radius, are of one body: both faces of a lens, a baffle and its mirror.
 _ALIKE = 5e-3
 #: Points across the pupil for the places of the light on the surfaces.
@@ -43,6 +45,8 @@ _FEWEST = 90
 _BESIDE = 0.02
 #: Steps by which places on the pupil are found.
 _STEPS = 8
+#: Step over the radius of the pupil after which they are found.
+_CLOSE = 1e-7
 #: Fewest pieces of a rim that matter.
 _FEWEST_PIECES = 3
 
@@ -113,7 +117,7 @@ class FreeRims:
     def moved(self, steps: np.ndarray) -> FreeRims:
         """Return the rims moved by steps of the free motions [n], within a few standard deviations."""
         values, limit = self.values.copy(), _MOST * self.spreads
-        values[self.free] = np.clip(values[self.free] + steps, -limit, limit)
+        values[self.free] += np.clip(steps, -limit, limit)
         return replace(self, values=values)
 
     def applied(self, telescope: Telescope) -> Telescope:
@@ -181,6 +185,13 @@ def rim_bodies(telescope: Telescope) -> list[RimBody]:
             else:
                 members.append((i, k))
     return [RimBody(tuple(members), (0.0,) * MOTIONS, is_vane(region)) for region, members in groups]
+
+
+def rim_of_surface(telescope: Telescope, name: str, spread: float) -> RimBody:
+    """Return the rims of a surface as one body, which shifts by a standard deviation along each axis [m]."""
+    surface = telescope.surface_names.index(name)
+    count = len(simple_regions(telescope.surfaces[surface].aperture))
+    return RimBody(tuple((surface, region) for region in range(count)), (spread, spread, 0.0, 0.0))
 
 
 def _alike(first: Simple, second: Simple) -> bool:
@@ -254,10 +265,9 @@ class PupilShadows:
         if not near.any():
             return nothing
         back = np.linalg.pinv(slope[:2])
-        start, middle, end = (
-            self._on_pupil(smooth, places, (values[near] - slope[2]) @ back + self._middle, values[near])
-            for values in (rim.start, rim.middle, rim.end)
-        )
+        targets = np.concatenate([values[near] for values in (rim.start, rim.middle, rim.end)])
+        begin = (targets - slope[2]) @ back + self._middle
+        start, middle, end = np.split(self._on_pupil(smooth, places, begin, targets), 3)
         along, motion = end - start, rim.motion[near]
         length = np.hypot(*along.T)
         fine = np.isfinite(middle).all(axis=1) & (length > 0.0) & (length < 10.0 * self._cells.side)
@@ -295,7 +305,7 @@ class PupilShadows:
                 # Beyond the survey polynomials say nothing.
                 outside = np.hypot(*(points - self._middle).T) > 1.1 * self._half
                 points = np.where(outside[:, None], np.nan, points)
-                if not np.isfinite(points).any():
+                if not (np.abs(step) > _CLOSE * self._half).any(where=np.isfinite(points)):
                     break
         return points
 
@@ -333,9 +343,10 @@ class PupilShadows:
         surface, region = body.members[0]
         places = self._places(surface, self._ends)[self._ends[-1].status == RayStatus.OK]
         diameter = 2.0 * float(np.hypot(*(places - places.mean(axis=0)).T).max())
-        if not body.spider:
-            return replace(body, spreads=(_SHIFT * diameter,) * 3 + (0.0,))
         aperture = self._telescope.surfaces[surface].aperture
+        if not body.spider:
+            radius = enclosing_circle(simple_regions(aperture)[region])[2]
+            return replace(body, spreads=(min(_OF_RADIUS * radius, _OF_BEAM * diameter),) * 3 + (0.0,))
         shift, width = _SPIDER_SHIFT * diameter, vane_width(simple_regions(aperture)[region])
         return replace(body, spreads=(shift, shift, _THICKNESS * width, _SPIDER_TURN))
 

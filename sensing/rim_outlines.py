@@ -24,6 +24,8 @@ from ..models.aperture import (
 
 #: Length over width from which on a rectangle is a vane.
 _SLENDER = 4.0
+#: Least size of a region that shrinks, over what it was.
+_LEAST = 0.1
 #: Fewest and most pieces of a curve.
 _FEWEST_PIECES = 12
 _MOST_PIECES = 4000
@@ -138,15 +140,20 @@ def _moved_region(region: Simple, motion: RimMotion) -> Simple:
     x, y = _turn(motion.rotation) @ [region.x, region.y] + motion[:2]
     place = {"x": float(x), "y": float(y)}
     if isinstance(region, Circle):
-        return replace(region, radius=region.radius + growth, **place)
+        return replace(region, radius=_grown(region.radius, growth), **place)
     angle = region.angle + motion.rotation
     if isinstance(region, Ellipse):
-        sides = {"semi_x": region.semi_x + growth, "semi_y": region.semi_y + growth}
+        sides = {"semi_x": _grown(region.semi_x, growth), "semi_y": _grown(region.semi_y, growth)}
     elif isinstance(region, Rectangle):
-        sides = {"width": region.width + 2.0 * growth, "height": region.height + 2.0 * growth}
+        sides = {"width": _grown(region.width, 2.0 * growth), "height": _grown(region.height, 2.0 * growth)}
     else:
-        return replace(region, width=region.width + 2.0 * growth, angle=angle, **place)
+        return replace(region, width=_grown(region.width, 2.0 * growth), angle=angle, **place)
     return replace(region, angle=angle, **sides, **place)
+
+
+def _grown(size: float, growth: float) -> float:
+    """Return a length that has grown; regions do not vanish."""
+    return max(size + growth, _LEAST * size)
 
 
 def _turn(angle: float) -> np.ndarray:

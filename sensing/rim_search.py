@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +11,6 @@ from .image_model import STRENGTH
 from .light import Instrument, StarLight
 from .likelihood import Stamp, normal_equations
 from .moving_rims import FreeRims, PupilShadows, RimBody, cells_with_lines
-from .rim_outlines import MOTIONS
 from .solve import Solution
 
 #: Least gain of twice the logarithm of the likelihood by a rim elsewhere, over the loss a pixel where that is above 1.
@@ -21,6 +19,9 @@ _GAIN = 50.0
 _MOST_BODIES = 4
 #: Rims that are tried in vain before the search ends.
 _MOST_FAILURES = 2
+#: Times that this is done for each rim in the search, and for the best of them.
+_FIRST_STEPS = 2
+_FINISHED = 2
 #: Times that the shadows of a rim are computed again where it is found to stand.
 _OUTER = 8
 #: Shift of a shadow over the side of a cell that is small enough to be linear.
@@ -36,81 +37,12 @@ class RimFit:
     solution: Solution
 
 
-def with_all_rims(
-    instrument: Instrument,
-    best: RimFit,
-    first: Solution,
-    noise: float,
-    solved: Callable[[StarLight, Solution], RimFit],
-) -> RimFit:
-    """Return the fit with the rims free that matter, of coarse pixels, if that is much better.
-
-    All rims are free first: the wavefront of a fit whose rims are held has taken up where they stand.
-
-    Parameters
-    ----------
-    instrument : Instrument
-        Telescope and model of the images.
-    best : RimFit
-        Best fit with rims where they are believed to be.
-    first : Solution
-        Unknowns from which that fit began.
-    noise : float
-        Loss a pixel that noise alone makes.
-    solved : callable
-        Returns the best fit of light with other rims from the unknowns of a solution, with zeros for shifts.
-    """
-    loss = best.solution.loss / best.stamp.used.sum()
-    if loss < noise:
-        return best
-    threshold = _GAIN * max(1.0, loss)
-    bodies, gains = rim_gains(instrument, best)
-    if not bodies:
-        return best
-    rims = FreeRims(tuple(bodies), np.zeros((len(bodies), MOTIONS)))
-    trial = _settled(instrument, best.light, rims, first, solved)
-    if best.solution.loss - trial.solution.loss < threshold:
-        return best
-    return _pruned(instrument, trial, solved)
-
-
-def _pruned(instrument: Instrument, fit: RimFit, solved: Callable[[StarLight, Solution], RimFit]) -> RimFit:
-    """Return the fit without the free rims that gain little, one after the other."""
-    needed: set[tuple[tuple[int, int], ...]] = set()
-    while True:
-        threshold = _GAIN * max(1.0, fit.solution.loss / fit.stamp.used.sum())
-        rims = fit.light.free_rims
-        gains = _wald(instrument, fit)
-        gains = np.where([body.members in needed for body in rims.bodies], np.inf, gains)
-        k = int(np.argmin(gains)) if len(gains) else -1
-        if k < 0 or gains[k] > 4.0 * threshold:
-            return fit
-        trial = _settled(instrument, fit.light, rims.without(k), fit.solution, solved)
-        if trial.solution.loss - fit.solution.loss < threshold:
-            fit = trial
-        else:
-            needed.add(rims.bodies[k].members)
-
-
-def _wald(instrument: Instrument, fit: RimFit) -> np.ndarray:
-    """Return about what twice the logarithm of the likelihood loses without each free rim."""
-    rims = fit.light.free_rims
-    narrow = len(instrument.noll) + 2 * len(fit.light.rims)
-    values = rims.values[rims.free] + fit.solution.waves[0][narrow:]
-    covariance = fit.solution.shared_covariance[narrow:, narrow:]
-    number = np.nonzero(rims.free)[0]
-    gains = np.zeros(len(rims.bodies))
-    for k in range(len(gains)):
-        motions = number == k
-        gains[k] = values[motions] @ np.linalg.solve(covariance[np.ix_(motions, motions)], values[motions])
-    return gains
-
-
 def with_moved_rims(
     instrument: Instrument,
     best: RimFit,
     noise: float,
     solved: Callable[[StarLight, Solution], RimFit],
+    first: Solution | None = None,
 ) -> RimFit:
     """Return the fit with rims free that the residuals say stand elsewhere.
 
@@ -124,11 +56,13 @@ def with_moved_rims(
         Loss a pixel that noise alone makes.
     solved : callable
         Returns the best fit of light with other rims from the unknowns of a solution, with zeros for shifts.
+    first : Solution, optional
+        Unknowns from which the best fit began: all rims are then tried from these, since the wavefront of a fit whose
+        rims are held has taken up where they stand.
     """
     failed: list[RimBody] = []
-    count = int(best.stamp.used.sum())
     while len(best.light.free_rims.bodies) < _MOST_BODIES and len(failed) < _MOST_FAILURES:
-        loss = best.solution.loss / count
+        loss = best.solution.loss / best.stamp.used.sum()
         if loss < noise:
             break
         threshold = _GAIN * max(1.0, loss)
@@ -137,13 +71,37 @@ def with_moved_rims(
         gains = np.where([body.members in moved for body in bodies], 0.0, gains)
         if not gains.max(initial=0.0) > threshold:
             break
+        if first is not None:
+            trial = _best_single(instrument, best, bodies, first, solved)
+            first = None
+            if best.solution.loss - trial.solution.loss > threshold:
+                best = trial
+            continue
         body = bodies[int(np.argmax(gains))]
-        trial = _settled(instrument, best.light, best.light.free_rims.with_body(body), best.solution, solved)
+        rims = best.light.free_rims.with_body(body)
+        trial = _settled(instrument, solved(best.light.with_free_rims(rims, instrument.middle), best.solution), solved)
         if best.solution.loss - trial.solution.loss > threshold:
             best, failed = trial, []
         else:
             failed.append(body)
     return best
+
+
+def _best_single(
+    instrument: Instrument,
+    fit: RimFit,
+    bodies: Sequence[RimBody],
+    first: Solution,
+    solved: Callable[[StarLight, Solution], RimFit],
+) -> RimFit:
+    """Return the best of the fits with one of some bodies free: after a few steps, those that lead nowhere are known."""
+    trials = []
+    for body in bodies:
+        light = fit.light.with_free_rims(FreeRims().with_body(body), instrument.middle)
+        trials.append(_settled(instrument, solved(light, first), solved, _FIRST_STEPS))
+    trials.sort(key=lambda trial: trial.solution.loss)
+    finished = [_settled(instrument, trial, solved) for trial in trials[:_FINISHED]]
+    return min(finished, key=lambda trial: trial.solution.loss)
 
 
 def rim_gains(instrument: Instrument, fit: RimFit) -> tuple[list[RimBody], np.ndarray]:
@@ -189,23 +147,18 @@ def rim_gains(instrument: Instrument, fit: RimFit) -> tuple[list[RimBody], np.nd
 
 
 def _settled(
-    instrument: Instrument,
-    light: StarLight,
-    rims: FreeRims,
-    start: Solution,
-    solved: Callable[[StarLight, Solution], RimFit],
+    instrument: Instrument, best: RimFit, solved: Callable[[StarLight, Solution], RimFit], steps: int = _OUTER
 ) -> RimFit:
-    """Return the best fit with rims free, their shadows where they are found to stand."""
-    narrow = len(instrument.noll) + 2 * len(light.rims)
-    best, solution = None, start
-    for _ in range(_OUTER):
-        light = light.with_free_rims(rims, instrument.middle)
-        fit = solved(light, solution)
-        if best is not None and not fit.solution.loss < math.inf:
+    """Return the best fit with the same rims free, their shadows where they are found to stand, after so many steps."""
+    first = len(instrument.noll) + 2 * len(best.light.rims)
+    factor = 1.0
+    for _ in range(steps):
+        rims, shift = best.light.free_rims, factor * best.solution.waves[0][first:]
+        if np.all(np.abs(shift) < _SMALL * rims.spreads):
             break
-        steps = fit.solution.waves[0][narrow:]
-        rims, best, solution = rims.moved(steps), fit, fit.solution
-        if np.all(np.abs(steps) < _SMALL * rims.spreads):
-            break
-    assert best is not None
+        light = best.light.with_free_rims(rims.moved(shift), instrument.middle)
+        trial = solved(light, best.solution)
+        # Light that a shadow uncovers lies beside the line that stands for it, so that steps may be too long.
+        better = trial.solution.loss < best.solution.loss
+        best, factor = (trial, 1.0) if better else (best, 0.5 * factor)
     return best
