@@ -41,8 +41,6 @@ _GAIN = 100.0
 _LEFT = 0.5
 #: Loss a coarse pixel from which on the other side of focus is tried; photons leave 0.1, since smoothed noise is small.
 _MISFIT = 0.15
-#: Standard deviations of the loss a fine pixel from which on rims are searched for elsewhere.
-_BY_CHANCE = 3.0
 #: Loss a coarse pixel from which on second stars are searched for around the first.
 _POOR = 1.0
 #: Distances of such second stars over the diameter of the donut.
@@ -273,9 +271,8 @@ class _StarFitter:
             fine, best = finer, self.solve(finer.stamp, best.stars[0], best.shared)
         assert fine is not None
         if self._donut and self._wavefront:
-            noise = 1.0 + _BY_CHANCE * math.sqrt(2.0 / fine.stamp.used.sum())
             solved = self.rim_solver(FINE, fine.of)
-            fitter, stamp, best = self.with_moved_rims(fine.stamp, best, noise, solved)
+            fitter, stamp, best = self.with_moved_rims(fine.stamp, best, 0.0, solved)
             return fitter._clipped(replace(fine, stamp=stamp), best)
         return self._clipped(fine, best)
 

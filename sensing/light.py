@@ -195,9 +195,7 @@ class Instrument:
 
     def rays(self, light: StarLight, across: int) -> ZernikeRays:
         """Return the light of a star through so many cells across the pupil."""
-        cells = cells_with_rims(
-            light.telescope, light.direction, self.middle, across, light.rims, light.free_rims
-        )
+        cells = cells_with_rims(light.telescope, light.direction, self.middle, across, light.rims, light.free_rims)
         return self.rays_of(light, cells)
 
     def rays_of(self, light: StarLight, cells: PupilCells) -> ZernikeRays:
@@ -281,9 +279,7 @@ class StarLight:
         prescribed = self.prescribed or self.telescope
         telescope = rims.applied(prescribed)
         diffracting = None if self.pupil_rims is None else pupil_rims(telescope, self.direction, wavelength)
-        return replace(
-            self, telescope=telescope, pupil_rims=diffracting, free_rims=rims, prescribed=prescribed
-        )
+        return replace(self, telescope=telescope, pupil_rims=diffracting, free_rims=rims, prescribed=prescribed)
 
     @property
     def scale(self) -> float:

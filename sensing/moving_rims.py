@@ -359,20 +359,21 @@ def _near(points: np.ndarray, places: np.ndarray, margin: float) -> np.ndarray:
 
 def cells_with_lines(cells: PupilCells, lines: RimLines, free: np.ndarray) -> PupilCells:
     """Return cells with the shadows of rims among them: no light of their own, but rates by the free motions."""
-    area = cells.side**2 * cells.area
-    line_rates = lines.rates(free) / area
+    shadows = line_cells(cells, lines, free)
+    assert shadows.rates is not None
     # The light of all cells sums to 1 wherever the rims stand.
-    rates = np.concatenate([-np.outer(cells.weights, line_rates.sum(axis=0)), line_rates])
-    count = len(lines.points)
-    narrow = np.zeros((len(cells), 0)) if cells.rates is None else cells.rates
-    narrow = np.concatenate([narrow, np.zeros((count, narrow.shape[1]))])
-    moments = lines.along[:, :, None] * lines.along[:, None, :] / 12.0
-    return PupilCells(
-        np.concatenate([cells.points, lines.points]),
-        np.concatenate([cells.weights, np.zeros(count)]),
-        np.concatenate([cells.moments, moments]),
-        cells.side,
-        cells.center,
-        np.concatenate([narrow, rates], axis=1),
-        cells.area,
+    rates = np.concatenate([-np.outer(cells.weights, shadows.rates.sum(axis=0)), shadows.rates])
+    return replace(
+        cells,
+        points=np.concatenate([cells.points, shadows.points]),
+        weights=np.concatenate([cells.weights, shadows.weights]),
+        moments=np.concatenate([cells.moments, shadows.moments]),
+        rates=rates,
     )
+
+
+def line_cells(cells: PupilCells, lines: RimLines, free: np.ndarray) -> PupilCells:
+    """Return the shadows of rims as cells without light, with rates of change by the free motions [n_body, 4]."""
+    moments = lines.along[:, :, None] * lines.along[:, None, :] / 12.0
+    rates = lines.rates(free) / (cells.side**2 * cells.area)
+    return replace(cells, points=lines.points, weights=np.zeros(len(lines.points)), moments=moments, rates=rates)

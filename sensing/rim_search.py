@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..wavefront.psf.pupil_rims import PupilRims
+from .donut_rays import ZernikeRays, spread_of
 from .image_model import STRENGTH
 from .light import Instrument, StarLight
 from .likelihood import Stamp, normal_equations
-from .moving_rims import FreeRims, PupilShadows, RimBody, cells_with_lines
+from .moving_rims import PupilShadows, RimBody, line_cells
+from .rim_light import RimsAt
 from .solve import Solution
 
-#: Least gain of twice the logarithm of the likelihood by a rim elsewhere, over the loss a pixel where that is above 1.
-_GAIN = 50.0
+#: Least gain of twice the logarithm of the likelihood by a rim elsewhere: noise makes one in 1e5 of three motions.
+_GAIN = 25.0
+#: The same for each unit of loss a pixel above 1: what else the model lacks is alike over several pixels.
+_MISFIT = 100.0
+#: Gain over the largest one from which on other rims are tried, too.
+_LIKELY = 0.4
+#: Loss by which fits with other rims are no worse: these are then free together.
+_ALIKE = 9.0
 #: Most rims that are freed.
 _MOST_BODIES = 4
 #: Rims that are tried in vain before the search ends.
@@ -65,43 +75,49 @@ def with_moved_rims(
         loss = best.solution.loss / best.stamp.used.sum()
         if loss < noise:
             break
-        threshold = _GAIN * max(1.0, loss)
+        threshold = _GAIN + _MISFIT * max(loss - 1.0, 0.0)
         bodies, gains = rim_gains(instrument, best)
         moved = {body.members for body in (*best.light.free_rims.bodies, *failed)}
         gains = np.where([body.members in moved for body in bodies], 0.0, gains)
         if not gains.max(initial=0.0) > threshold:
             break
-        if first is not None:
-            trial = _best_single(instrument, best, bodies, first, solved)
-            first = None
-            if best.solution.loss - trial.solution.loss > threshold:
-                best = trial
-            continue
-        body = bodies[int(np.argmax(gains))]
-        rims = best.light.free_rims.with_body(body)
-        trial = _settled(instrument, solved(best.light.with_free_rims(rims, instrument.middle), best.solution), solved)
-        if best.solution.loss - trial.solution.loss > threshold:
-            best, failed = trial, []
+        if first is None:
+            likely = gains > _LIKELY * gains.max()
+            trials = _each_freed(instrument, best, list(itertools.compress(bodies, likely)), best.solution, solved)
         else:
-            failed.append(body)
+            trials = _each_freed(instrument, best, bodies, first, solved)
+        trial = trials[0]
+        if best.solution.loss - trial.solution.loss < threshold:
+            if first is None:
+                failed += itertools.compress(bodies, likely)
+            first = None
+            continue
+        first, failed = None, []
+        for other in trials[1:]:
+            if other.solution.loss - trial.solution.loss < _ALIKE:
+                # Either may have moved: both are free.
+                rims = trial.light.free_rims.with_body(other.light.free_rims.bodies[-1])
+                light = trial.light.with_free_rims(rims, instrument.middle)
+                trial = _settled(instrument, solved(light, trial.solution), solved)
+        best = trial
     return best
 
 
-def _best_single(
+def _each_freed(
     instrument: Instrument,
     fit: RimFit,
     bodies: Sequence[RimBody],
-    first: Solution,
+    start: Solution,
     solved: Callable[[StarLight, Solution], RimFit],
-) -> RimFit:
-    """Return the best of the fits with one of some bodies free: after a few steps, those that lead nowhere are known."""
+) -> list[RimFit]:
+    """Return fits with one more of some bodies free, best first: those that lead nowhere end after a few steps."""
     trials = []
     for body in bodies:
-        light = fit.light.with_free_rims(FreeRims().with_body(body), instrument.middle)
-        trials.append(_settled(instrument, solved(light, first), solved, _FIRST_STEPS))
+        light = fit.light.with_free_rims(fit.light.free_rims.with_body(body), instrument.middle)
+        trials.append(_settled(instrument, solved(light, start), solved, _FIRST_STEPS))
     trials.sort(key=lambda trial: trial.solution.loss)
     finished = [_settled(instrument, trial, solved) for trial in trials[:_FINISHED]]
-    return min(finished, key=lambda trial: trial.solution.loss)
+    return sorted(finished, key=lambda trial: trial.solution.loss)
 
 
 def rim_gains(instrument: Instrument, fit: RimFit) -> tuple[list[RimBody], np.ndarray]:
@@ -109,31 +125,25 @@ def rim_gains(instrument: Instrument, fit: RimFit) -> tuple[list[RimBody], np.nd
 
     It is that of a score test, with the wavefront and all else free.
     """
-    light, star = fit.light, fit.solution.stars[0]
-    cells = fit.stamp.rays.cells
-    bodies, lines = PupilShadows(light.telescope, light.direction, instrument.middle, cells).candidates()
+    light, (star, wave) = fit.light, (fit.solution.stars[0], fit.solution.waves[0])
+    rays = fit.stamp.rays
+    assert isinstance(rays, ZernikeRays)
+    bodies, lines = PupilShadows(light.telescope, light.direction, instrument.middle, rays.cells).candidates()
     if not bodies:
         return [], np.zeros(0)
     free = np.array([body.free for body in bodies])
-    rays = instrument.rays_of(light, cells_with_lines(cells, lines, free))
+    shadows = instrument.rays_of(light, line_cells(rays.cells, lines, free))
     spreads = np.array([body.spreads for body in bodies])[free]
-    wave = np.concatenate([fit.solution.waves[0], np.zeros(len(spreads))])
-    equations = normal_equations(replace(fit.stamp, rays=rays), star, wave)
-    # Unknowns of a fit without wavefront, or with known seeing, are held.
-    n_wave = len(fit.solution.waves[0])
-    precision = np.concatenate([instrument.terms.precision, light.shift_precision])
-    held = np.zeros(len(star) + n_wave, dtype=bool)
-    held[STRENGTH] = instrument.known_seeing
-    held[len(star) :] = len(fit.solution.shared) == 0
-    first = np.flatnonzero(~held)
-    last = len(star) + n_wave + np.arange(len(spreads))
-    inner = equations.curvature[np.ix_(first, first)]
-    prior = np.concatenate([np.zeros(len(star)), precision])[first]
-    inner = inner + np.diag(prior)
-    cross = equations.curvature[np.ix_(first, last)]
-    deviation = np.concatenate([np.zeros(len(star) + n_wave - len(light.shift_mean)), light.shift_mean])
-    values = np.concatenate([np.zeros(len(star)), fit.solution.waves[0]])
-    slope = equations.gradient[first] - prior * (values - deviation)[first]
+    stamp = replace(fit.stamp, rays=_RaysWithShadows(rays, shadows, len(wave)))
+    equations = normal_equations(stamp, star, np.concatenate([wave, np.zeros(len(spreads))]))
+    first, last = len(star) + len(wave), len(star) + len(wave) + np.arange(len(spreads))
+    fitted = np.flatnonzero(np.arange(first) != (STRENGTH if instrument.known_seeing else -1))
+    precision = np.concatenate([np.zeros(len(star)), instrument.terms.precision, light.shift_precision])
+    mean = np.concatenate([np.zeros(first - len(light.shift_mean)), light.shift_mean])
+    values = np.concatenate([np.zeros(len(star)), wave])
+    inner = (equations.curvature[:first, :first] + np.diag(precision))[np.ix_(fitted, fitted)]
+    cross = equations.curvature[np.ix_(fitted, last)]
+    slope = (equations.gradient[:first] - precision * (values - mean))[fitted]
     scale = np.sqrt(np.maximum(np.diag(inner), 1e-300))
     projected = np.linalg.lstsq(inner / np.outer(scale, scale), cross / scale[:, None], rcond=1e-12)[0] / scale[:, None]
     gradient = equations.gradient[last] - projected.T @ slope
@@ -141,9 +151,42 @@ def rim_gains(instrument: Instrument, fit: RimFit) -> tuple[list[RimBody], np.nd
     number = np.nonzero(free)[0]
     gains = np.zeros(len(bodies))
     for k in range(len(bodies)):
-        own = number == k
-        gains[k] = gradient[own] @ np.linalg.solve(curvature[np.ix_(own, own)], gradient[own])
+        motions = number == k
+        gains[k] = gradient[motions] @ np.linalg.solve(curvature[np.ix_(motions, motions)], gradient[motions])
     return bodies, gains
+
+
+class _RaysWithShadows:
+    """Light of a star and the shadows of rims, which have no light: unknowns are those of the light, then motions."""
+
+    def __init__(self, light: ZernikeRays, shadows: ZernikeRays, count: int) -> None:
+        self.cells, self._light, self._shadows, self._count = light.cells, light, shadows, count
+        self._size = len(light.rates)
+        lost = -np.outer(light.weights(np.zeros(count)), shadows.rates.sum(axis=0))
+        self.rates = np.block(
+            [[light.rates, lost], [np.zeros((len(shadows.rates), light.rates.shape[1])), shadows.rates]]
+        )
+
+    def weights(self, unknowns: np.ndarray) -> np.ndarray:
+        return np.concatenate([self._light.weights(unknowns[: self._count]), np.zeros(len(self._shadows.rates))])
+
+    def landing(self, unknowns: np.ndarray) -> np.ndarray:
+        return np.concatenate([rays.landing(unknowns[: self._count]) for rays in (self._light, self._shadows)])
+
+    def spread(self, landing: np.ndarray) -> np.ndarray:
+        # The shadows are too few to tell what a cell's image is like: they have the footprint of the light.
+        spread = spread_of(self._shadows.cells, landing[self._size :], self._light.footprint)
+        return np.concatenate([self._light.spread(landing[: self._size]), spread])
+
+    def at_rims(self, rims: PupilRims, landing: np.ndarray, response: np.ndarray | None) -> RimsAt:
+        return self._light.at_rims(rims, landing[: self._size], response)
+
+    def response(self, unknowns: np.ndarray) -> np.ndarray:
+        light = self._light.response(unknowns)
+        return np.concatenate([light, np.zeros((2, len(self._shadows.rates), light.shape[2]), light.dtype)], axis=1)
+
+    def release(self) -> None:
+        self._light.release()
 
 
 def _settled(

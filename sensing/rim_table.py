@@ -66,7 +66,11 @@ def moved_rims(instrument: Instrument, star: StarSolution) -> list[MovedRim]:
     moved = []
     for k, body in enumerate(rims.bodies):
         block = slice(MOTIONS * k, MOTIONS * (k + 1))
-        moved.append(_moved_rim(_name(light.telescope.surface_names, body), values[k], covariance[block, block], lines, k, pixels))
+        moved.append(
+            _moved_rim(
+                _name(light.telescope.surface_names, body), values[k], covariance[block, block], lines, k, pixels
+            )
+        )
     return moved
 
 
