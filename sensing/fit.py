@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +24,7 @@ from .light import Instrument
 from .likelihood import pulls
 from .model import DonutModel
 from .result import DonutFit
+from .rim_table import moved_rims, rim_table
 from .stamps import Pixels
 from .wavefront_fits import NOLL, FittedStars, SingleDonuts, UsableStars, WavefrontFit
 
@@ -152,7 +154,9 @@ def fit_donuts(
         usable = UsableStars(instrument, list(solutions.values()), observed.fields[list(solutions)], projection)
         fitted = fit.solved(usable, pool)
     flags = np.array([int(star.flags) for star in stars], dtype=np.int64)
-    return _result(instrument, observed, flags, np.array(list(solutions), dtype=np.int64), fitted)
+    rims = {i: moved_rims(instrument, solution) for i, solution in solutions.items()}
+    result = _result(instrument, observed, flags, np.array(list(solutions), dtype=np.int64), fitted)
+    return replace(result, rims=rim_table(rims))
 
 
 def _wavefront_fit(

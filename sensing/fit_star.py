@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +15,7 @@ from .flags import DonutFlag
 from .image_model import FLUX, NUISANCES, RATIO, STRENGTH, X, Y
 from .light import Instrument, Sampling, StarLight
 from .likelihood import Stamp, model_image, pulls
+from .rim_search import RimFit, with_moved_rims
 from .solve import COARSE, FINE, STEPS, Group, Solution, solve
 from .stamps import (
     Match,
@@ -136,6 +139,10 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
     if flags:
         return StarFit(flags)
     best = fitter.solve(coarse, start, tolerance=COARSE if donut else FINE)
+    if donut and wavefront:
+        # Light beside a rim looks like a second star otherwise, and like a cosmic ray.
+        solved = fitter.rim_solver(COARSE, lambda moved: moved.stamp(moved.light, small))
+        fitter, coarse, best = fitter.with_moved_rims(coarse, best, _MISFIT, solved, start)
     if donut and instrument.model.neighbours:
         best = fitter.with_companion(small, coarse, best, start, template)
     if donut and fitter.other_focus_is_better(small, coarse, best):
@@ -147,6 +154,8 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
     finest = fitter.finest(best)
     if (finest.full.used != pixels.used).any():
         flags |= DonutFlag.CLIPPED
+    if finest.light.free_rims.bodies:
+        flags |= DonutFlag.RIM_MOVED
     if len(finest.solution.stars[0]) > RATIO:
         flags |= DonutFlag.BLENDED
     if not (finest.solution.converged and np.isfinite(finest.model).all()):
@@ -162,6 +171,10 @@ class _Fine:
     pixels: Pixels
     sampling: Sampling
 
+    def of(self, fitter: _StarFitter) -> Stamp:
+        """Return the stamp sampled alike for the light of a fitter."""
+        return fitter.sampled_stamp(self.pixels, self.sampling, self.stamp.grid.reach)
+
 
 class _StarFitter:
     """Solutions for one star on stamps of several scales."""
@@ -169,17 +182,61 @@ class _StarFitter:
     def __init__(
         self, instrument: Instrument, light: StarLight, clean: Pixels, strength: float, wavefront: bool
     ) -> None:
-        self._instrument, self._light, self._clean = instrument, light, clean
+        self._instrument, self._clean, self._wavefront = instrument, clean, wavefront
         self._donut = light.diameter > SMALLEST_DONUT * instrument.pixel
         self._strength = strength
         self._fwhm = float(instrument.seeing.fwhm(np.asarray(strength)))
-        self._precision = np.concatenate([instrument.terms.precision, light.shift_precision])
-        n = len(self._precision)
-        self._map = np.eye(n)[None] if wavefront else np.zeros((1, n, 0))
-        self._rays: dict[int, ZernikeRays] = {}
+        self._set_light(light)
         self._binned: dict[int, Pixels] = {}
         #: Cells across the pupil that the last fits are expected to need, so that the first ones share them.
         self._across = self._sampling(self._fwhm, self._side(self._fwhm))[1].across
+
+    @property
+    def light(self) -> StarLight:
+        """Light of the star."""
+        return self._light
+
+    def _set_light(self, light: StarLight) -> None:
+        terms = self._instrument.terms
+        self._light = light
+        self._precision = np.concatenate([terms.precision, light.shift_precision])
+        self._mean = np.concatenate([np.zeros(len(terms.precision)), light.shift_mean])
+        n = len(self._precision)
+        self._map = np.eye(n)[None] if self._wavefront else np.zeros((1, n, 0))
+        self._rays: dict[int, ZernikeRays] = {}
+
+    def with_light(self, light: StarLight) -> _StarFitter:
+        """Return the same for the light of the star with its rims elsewhere."""
+        fitter = copy(self)
+        fitter._set_light(light)
+        return fitter
+
+    def with_moved_rims(
+        self,
+        stamp: Stamp,
+        best: Solution,
+        noise: float,
+        solved: Callable[[StarLight, Solution], RimFit],
+        first: np.ndarray | None = None,
+    ) -> tuple[_StarFitter, Stamp, Solution]:
+        """Return the fit with rims free that the residuals say stand elsewhere, with the stamp of its light."""
+        begun = None if first is None else replace(best, stars=(first,), shared=np.zeros_like(best.shared))
+        fit = with_moved_rims(self._instrument, RimFit(self._light, stamp, best), noise, solved, begun)
+        return self if fit.light is self._light else self.with_light(fit.light), fit.stamp, fit.solution
+
+    def rim_solver(
+        self, tolerance: float, stamp_of: Callable[[_StarFitter], Stamp]
+    ) -> Callable[[StarLight, Solution], RimFit]:
+        """Return the function that fits light with its rims elsewhere, from the unknowns of a solution."""
+
+        def solved(light: StarLight, start: Solution) -> RimFit:
+            fitter = self.with_light(light)
+            moved_stamp = stamp_of(fitter)
+            held = len(light.rims) * 2 + len(self._instrument.noll)
+            shared = np.concatenate([start.shared[:held], np.zeros(len(light.free_rims))])
+            return RimFit(light, moved_stamp, fitter.solve(moved_stamp, start.stars[0], shared, tolerance))
+
+        return solved
 
     def _of(self, light: StarLight, across: int) -> ZernikeRays:
         """Return the light through at least so many cells across the pupil, and at most a quarter more."""
@@ -199,6 +256,11 @@ class _StarFitter:
         rays = self._of(light, max(sampling.across, shared))
         return self._instrument.stamp(light, pixels, rays, sampling.sharp, reach)
 
+    def sampled_stamp(self, pixels: Pixels, sampling: Sampling, reach: float) -> Stamp:
+        """Return the stamp of pixels that are sampled so, with room for light beside it [m]."""
+        rays = self._of(self._light, sampling.across)
+        return self._instrument.stamp(self._light, pixels, rays, sampling.sharp, reach)
+
     def _side(self, fwhm: float) -> int:
         """Return how many pixels are summed along each axis for the last fits in a seeing [rad]."""
         return self._instrument.binning(self._light, self._clean, fwhm) if self._donut else 1
@@ -213,6 +275,14 @@ class _StarFitter:
                 break
             fine, best = finer, self.solve(finer.stamp, best.stars[0], best.shared)
         assert fine is not None
+        if self._donut and self._wavefront:
+            solved = self.rim_solver(FINE, fine.of)
+            fitter, stamp, best = self.with_moved_rims(fine.stamp, best, 0.0, solved)
+            return fitter._clipped(replace(fine, stamp=stamp), best)
+        return self._clipped(fine, best)
+
+    def _clipped(self, fine: _Fine, best: Solution) -> StarSolution:
+        """Return the best model without pixels far off it."""
         stamp, full = fine.stamp, self.every_pixel(fine)
         model = model_image(full, best.stars[0], best.waves[0])
         for _ in range(_ROUNDS):
@@ -244,8 +314,7 @@ class _StarFitter:
             if not self._sampling(_ENOUGH * fwhm, last.pixels.side, _ENOUGH * error)[1].finer_than(last.sampling):
                 return last
             pixels, sampling = self._sampling(fwhm, min(self._side(fwhm), last.pixels.side), error)
-        rays = self._of(light, sampling.across)
-        stamp = instrument.stamp(light, pixels, rays, sampling.sharp, light.diameter if blended else 0.0)
+        stamp = self.sampled_stamp(pixels, sampling, light.diameter if blended else 0.0)
         return _Fine(stamp, pixels, sampling)
 
     def _sampling(self, fwhm: float, side: int, error: float = math.inf) -> tuple[Pixels, Sampling]:
@@ -289,7 +358,9 @@ class _StarFitter:
     ) -> Solution:
         """Return the best unknowns from a start."""
         n = self._map.shape[2]
-        group = Group((stamp,), self._map, self._precision[:n], self._instrument.known_seeing)
+        group = Group(
+            (stamp,), self._map, self._precision[:n], self._instrument.known_seeing, prior_mean=self._mean[:n]
+        )
         return solve(group, [star], np.zeros(n) if shared is None else shared, tolerance=tolerance, steps=steps)
 
     def with_companion(

@@ -9,9 +9,10 @@ class DonutFlag(IntFlag):
     """Outcome of the fit of one donut; zero for a clean one.
 
     ``BLENDED`` (a second star was fitted too), ``CLIPPED`` (pixels far off the model, cosmic rays for example, were
-    left out), ``POOR_FIT`` (chi-square is far above the number of pixels, so that errors are larger than claimed)
-    and ``ORIENTATION`` (stamps of the exposure fit better as mirror images, or turned by quarters; set by the command)
-    are remarks: there are results. With any other flag the results of the donut are NaN.
+    left out), ``POOR_FIT`` (chi-square is far above the number of pixels, so that errors are larger than claimed),
+    ``ORIENTATION`` (stamps of the exposure fit better as mirror images, or turned by quarters; set by the command) and
+    ``RIM_MOVED`` (a rim or a spider stands elsewhere than the prescription has it, and was fitted too) are remarks:
+    there are results. With any other flag the results of the donut are NaN.
 
     ``NO_DONUT``: nothing like a donut stands on the stamp. ``CUT_OFF``: more than a twentieth of the light falls beside
     the stamp. ``SATURATED``: too many pixels are saturated. ``DEFOCUS_SIGN``: the image fits the other side of focus
@@ -33,14 +34,19 @@ class DonutFlag(IntFlag):
     NOT_FINITE = 512
     NOT_CONVERGED = 1024
     POOR_FIT = 2048
+    RIM_MOVED = 16384
     ORIENTATION = 65536
 
     @property
     def usable(self) -> bool:
         """Whether the donut has results."""
-        return not self & ~(DonutFlag.BLENDED | DonutFlag.CLIPPED | DonutFlag.POOR_FIT | DonutFlag.ORIENTATION)
+        return not self & ~_REMARKS
 
     @property
     def reasons(self) -> str:
         """Names of the flags, lower case, with commas between them."""
         return ", ".join((flag.name or "").lower().replace("_", " ") for flag in type(self) if flag and flag in self)
+
+
+#: Flags with which the results hold.
+_REMARKS = DonutFlag.BLENDED | DonutFlag.CLIPPED | DonutFlag.POOR_FIT | DonutFlag.RIM_MOVED | DonutFlag.ORIENTATION

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,6 +20,8 @@ from .donut_rays import ZernikeRays, chief_landing
 from .image_model import ImageGrid
 from .likelihood import Stamp
 from .model import DonutModel
+from .moving_rims import FreeRims
+from .pupil_cells import PupilCells
 from .seeing import Seeing
 from .stamps import Pixels
 from .terms import WavefrontTerms
@@ -216,7 +218,11 @@ class Instrument:
 
     def rays(self, light: StarLight, across: int) -> ZernikeRays:
         """Return the light of a star through so many cells across the pupil."""
-        cells = cells_with_rims(light.telescope, light.direction, self.middle, across, light.rims)
+        cells = cells_with_rims(light.telescope, light.direction, self.middle, across, light.rims, light.free_rims)
+        return self.rays_of(light, cells)
+
+    def rays_of(self, light: StarLight, cells: PupilCells) -> ZernikeRays:
+        """Return the light of a star through given cells of the pupil."""
         return ZernikeRays(
             light.telescope, light.direction, self.wavelengths, self.wavelength_weights, cells, self.noll
         )
@@ -262,6 +268,10 @@ class StarLight:
         Rims that stand aside by an unknown amount.
     pupil_rims : PupilRims or None
         Rims of the clear pupil, where they diffract.
+    free_rims : FreeRims
+        Rims that are free beside these, and where the telescope has them.
+    prescribed : Telescope or None
+        The telescope with these where the prescription has them; None where none is free.
     """
 
     telescope: Telescope
@@ -271,11 +281,26 @@ class StarLight:
     jacobian: np.ndarray
     rims: tuple[MovableRim, ...]
     pupil_rims: PupilRims | None = None
+    free_rims: FreeRims = field(default_factory=FreeRims)
+    prescribed: Telescope | None = None
 
     @property
     def shift_precision(self) -> np.ndarray:
-        """Inverse variances of the shifts of the rims along x and y [1/m^2], shape [n_shift]."""
-        return np.full(2 * len(self.rims), shift_spread(self.telescope) ** -2.0)
+        """Inverse variances of the shifts of the rims along x and y and of the motions of free ones, [n_shift]."""
+        shifts = np.full(2 * len(self.rims), shift_spread(self.telescope) ** -2.0)
+        return np.concatenate([shifts, self.free_rims.spreads**-2.0])
+
+    @property
+    def shift_mean(self) -> np.ndarray:
+        """Means of the priors of the shifts, from where the telescope has the rims, shape [n_shift]."""
+        return np.concatenate([np.zeros(2 * len(self.rims)), -self.free_rims.values[self.free_rims.free]])
+
+    def with_free_rims(self, rims: FreeRims, wavelength: float) -> StarLight:
+        """Return the light of the telescope with rims where these stand; its middle wavelength [m]."""
+        prescribed = self.prescribed or self.telescope
+        telescope = rims.applied(prescribed)
+        diffracting = None if self.pupil_rims is None else pupil_rims(telescope, self.direction, wavelength)
+        return replace(self, telescope=telescope, pupil_rims=diffracting, free_rims=rims, prescribed=prescribed)
 
     @property
     def scale(self) -> float:

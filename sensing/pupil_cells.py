@@ -53,6 +53,8 @@ class PupilCells:
         Middle of the lattice [m].
     rates : ndarray, shape [n, n_shift], optional
         Derivatives of the weights by shifts of rims [1/m]; cells of zero weight may have them.
+    area : float
+        Lit area, in areas of a cell.
     """
 
     points: np.ndarray
@@ -61,6 +63,7 @@ class PupilCells:
     side: float
     center: np.ndarray
     rates: np.ndarray | None = None
+    area: float = 1.0
 
     def __len__(self) -> int:
         return len(self.weights)
@@ -131,7 +134,9 @@ def pupil_cells(telescope: Telescope, direction: np.ndarray, wavelength: float, 
         area[rim], offset, moments[rim] = _lit_parts(lit, centers[rim], side, upright)
         centers[rim] += offset
     lit_cells = area > 0.0
-    return PupilCells(centers[lit_cells], area[lit_cells] / max(area.sum(), 1e-300), moments[lit_cells], side, center)
+    total = max(float(area.sum()), 1e-300)
+    weights = area[lit_cells] / total
+    return PupilCells(centers[lit_cells], weights, moments[lit_cells], side, center, area=total)
 
 
 def _beam(telescope: Telescope, direction: np.ndarray, wavelength: float) -> tuple[np.ndarray, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from .degrees import FreedomEstimate
 from .flags import DonutFlag
 from .frames import DonutFrames
 from .observatory_zernikes import ObservatoryZernikes, observatory_zernikes
+from .rim_table import rim_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -99,6 +100,10 @@ class DonutFit(Result):
         Degrees of freedom of the telescope.
     projection : str
         Meaning of the field angles.
+    rims : QTable
+        Rims and spiders that stand elsewhere than the prescription has them, one a row: number of the donut, surfaces,
+        shift towards more light on the surface and on the image, and motions, with errors. Of joint fits, those of each
+        donut by itself.
     """
 
     zernikes: np.ndarray
@@ -127,6 +132,7 @@ class DonutFit(Result):
     double_zernike_covariance: np.ndarray | None = None
     degrees_of_freedom: FreedomEstimate | None = None
     projection: str = "zemax"
+    rims: QTable = field(default_factory=lambda: rim_table({}))
 
     def __len__(self) -> int:
         """Return the number of donuts."""
@@ -242,6 +248,12 @@ class DonutFit(Result):
             "chi2": self.chi2,
             "n_pixels": self.n_pixels,
             "companion_ratio": self.companion[:, 0],
+            "moved_rims": [
+                {"donut": int(row["donut"]), "rim": str(row["rim"])}
+                | {f"{name}_mm": float(row[name].to_value("mm")) for name in ("outward", "outward_err")}
+                | {name: float(row[name].value) for name in ("pixels", "pixels_err")}
+                for row in self.rims
+            ],
         }
         if self.double_zernikes is not None:
             out["double_zernike_nm"] = self.double_zernikes * 1e9

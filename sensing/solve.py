@@ -41,12 +41,14 @@ class Group:
     maps : sequence of n_star ndarray, each of shape [n_wave, n_shared]
         Unknowns of each star's wavefront, and shifts of its rims, by the shared ones.
     precision : ndarray, shape [n_shared]
-        Inverse variances of Gaussian priors about zero; 0 for none.
+        Inverse variances of Gaussian priors; 0 for none.
     fixed_strength : bool
         Whether the strengths of the turbulence are held.
     transient : bool
         Whether what the model of a star can compute again is freed after each of its normal equations: memory then
         hardly grows with the number of stars.
+    prior_mean : ndarray, shape [n_shared], optional
+        Means of the priors; zero by default.
     """
 
     stamps: tuple[Stamp, ...]
@@ -54,6 +56,7 @@ class Group:
     precision: np.ndarray
     fixed_strength: bool = False
     transient: bool = False
+    prior_mean: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -184,7 +187,8 @@ def _linearize(group: Group, joined: np.ndarray, sizes: list[int], pool: Executo
     curvature, gradient = np.zeros((len(joined), len(joined))), np.zeros(len(joined))
     # The prior has a likelihood of its own.
     curvature[range(n_star, len(joined)), range(n_star, len(joined))] = group.precision
-    gradient[n_star:] = -group.precision * shared
+    deviation = shared if group.prior_mean is None else shared - group.prior_mean
+    gradient[n_star:] = -group.precision * deviation
     for i, equations in enumerate(star_equations):
         star, size = slice(bounds[i], bounds[i + 1]), sizes[i]
         inner, cross, outer = (
@@ -198,7 +202,7 @@ def _linearize(group: Group, joined: np.ndarray, sizes: list[int], pool: Executo
         curvature[n_star:, n_star:] += outer
         gradient[star] = equations.gradient[:size]
         gradient[n_star:] += group.maps[i].T @ equations.gradient[size:]
-    loss = sum(e.loss for e in star_equations) + float(group.precision @ shared**2)
+    loss = sum(e.loss for e in star_equations) + float(group.precision @ deviation**2)
     if not (np.isfinite(loss) and np.isfinite(curvature).all() and np.isfinite(gradient).all()):
         # No step starts there, and none leads there.
         curvature, gradient, loss = np.zeros_like(curvature), np.zeros_like(gradient), np.inf

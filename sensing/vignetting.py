@@ -9,22 +9,21 @@ of the telescope are fitted, the shifts follow from them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from ..models.aperture import shifted
 from ..models.telescope import Telescope
 from ..raytrace.rays import RayStatus, parallel_rays
 from ..raytrace.trace import TraceResult, trace
+from .moving_rims import FreeRims, PupilShadows, cells_with_lines, rim_of_surface
 from .pupil_cells import PupilCells, pupil_cells
+from .rim_outlines import MOTIONS
 
 #: Rms of the shift of a rim along each axis over the diameter of the pupil: 0.5 mm for the LSST.
 _SHIFT = 6e-5
 #: Least rms of the shift over the diameter of the beam at the rim: a twentieth of a pixel across a donut of 120.
 _LEAST = 4e-4
-#: Shift for differences, in the image of a cell at the rim.
-_STEP = 0.3
 
 
 def shift_spread(telescope: Telescope) -> float:
@@ -104,47 +103,26 @@ def rim_shifts(
 
 
 def cells_with_rims(
-    telescope: Telescope, direction: np.ndarray, wavelength: float, across: int, rims: Sequence[MovableRim]
+    telescope: Telescope,
+    direction: np.ndarray,
+    wavelength: float,
+    across: int,
+    rims: Sequence[MovableRim],
+    free_rims: FreeRims | None = None,
 ) -> PupilCells:
-    """Return the cells of a pupil with their rates of change by shifts of rims along x and y of their surfaces."""
+    """Return the cells of a pupil with their rates of change by rims.
+
+    Those by shifts of rims along x and y of their surfaces come first, then those by the motions of free ones, which
+    the telescope has where they stand.
+    """
     cells = pupil_cells(telescope, direction, wavelength, across)
-    cell_sets, columns = [cells], []
-    for rim in rims:
-        step = _STEP * rim.diameter / across
-        for axis in np.eye(2):
-            ends = [
-                pupil_cells(
-                    _with_shifted_rim(telescope, rim.name, *(sign * step * axis)), direction, wavelength, across
-                )
-                for sign in (1.0, -1.0)
-            ]
-            cell_sets += ends
-            columns.append(step)
-    if not columns:
+    free_rims = FreeRims() if free_rims is None else free_rims
+    if not (rims or free_rims.bodies):
         return cells
-    sizes = [len(cell_set) for cell_set in cell_sets]
-    starts = np.cumsum([0, *sizes])
-    rates = np.zeros((starts[-1], len(columns)))
-    for k, step in enumerate(columns):
-        for sign, index in ((1.0, 2 * k + 1), (-1.0, 2 * k + 2)):
-            rates[starts[index] : starts[index + 1], k] = sign * cell_sets[index].weights / (2.0 * step)
-    weights = np.concatenate([cells.weights, np.zeros(starts[-1] - sizes[0])])
-    points = np.concatenate([cell_set.points for cell_set in cell_sets])
-    moments = np.concatenate([cell_set.moments for cell_set in cell_sets])
-    # Cells that no shift changes stand in all sets.
-    keys = np.concatenate([points, moments.reshape(-1, 4)], axis=1)
-    _, first, place = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    place = place.ravel()
-    joined = np.zeros((len(first), 1 + len(columns)))
-    np.add.at(joined, place, np.column_stack([weights, rates]))
-    significant = (np.abs(joined) > 1e-9 * np.abs(joined).max(axis=0)).any(axis=1)
-    first, joined = first[significant], joined[significant]
-    return PupilCells(points[first], joined[:, 0], moments[first], cells.side, cells.center, joined[:, 1:])
-
-
-def _with_shifted_rim(telescope: Telescope, name: str, x: float, y: float) -> Telescope:
-    surfaces = tuple(
-        replace(s, aperture=shifted(s.aperture, x, y)) if s.name == name and s.aperture is not None else s
-        for s in telescope.surfaces
+    bodies = [rim_of_surface(telescope, rim.name, shift_spread(telescope)) for rim in rims]
+    lines = PupilShadows(telescope, direction, wavelength, cells).lines([*bodies, *free_rims.bodies])
+    return cells_with_lines(
+        cells,
+        lines,
+        np.concatenate([np.array([b.free for b in bodies], dtype=bool).reshape(-1, MOTIONS), free_rims.free]),
     )
-    return replace(telescope, surfaces=surfaces)

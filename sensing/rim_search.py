@@ -1,0 +1,207 @@
+"""Search for rims and spiders that stand elsewhere than the prescription has them, by the residuals of a fit."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..wavefront.psf.pupil_rims import PupilRims
+from .donut_rays import ZernikeRays, spread_of
+from .image_model import STRENGTH
+from .light import Instrument, StarLight
+from .likelihood import Stamp, normal_equations
+from .moving_rims import PupilShadows, RimBody, line_cells
+from .rim_light import RimsAt
+from .solve import Solution
+
+#: Least gain of twice the logarithm of the likelihood by a rim elsewhere: noise makes one in 1e5 of three motions.
+_GAIN = 25.0
+#: The same for each unit of loss a pixel above 1: what else the model lacks is alike over several pixels.
+_MISFIT = 100.0
+#: Gain over the largest one from which on other rims are tried, too.
+_LIKELY = 0.4
+#: Loss by which fits with other rims are no worse: these are then free together.
+_ALIKE = 9.0
+#: Most rims that are freed.
+_MOST_BODIES = 4
+#: Rims that are tried in vain before the search ends.
+_MOST_FAILURES = 2
+#: Times that this is done for each rim in the search, and for the best of them.
+_FIRST_STEPS = 2
+_FINISHED = 2
+#: Times that the shadows of a rim are computed again where it is found to stand.
+_OUTER = 8
+#: Shift of a shadow over the side of a cell that is small enough to be linear.
+_SMALL = 0.05
+
+
+@dataclass(frozen=True)
+class RimFit:
+    """Light of a star with its rims, the pixels it is compared with, and the best unknowns."""
+
+    light: StarLight
+    stamp: Stamp
+    solution: Solution
+
+
+def with_moved_rims(
+    instrument: Instrument,
+    best: RimFit,
+    noise: float,
+    solved: Callable[[StarLight, Solution], RimFit],
+    first: Solution | None = None,
+) -> RimFit:
+    """Return the fit with rims free that the residuals say stand elsewhere.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        Telescope and model of the images.
+    best : RimFit
+        Best fit with rims where they are believed to be.
+    noise : float
+        Loss a pixel that noise alone makes.
+    solved : callable
+        Returns the best fit of light with other rims from the unknowns of a solution, with zeros for shifts.
+    first : Solution, optional
+        Unknowns from which the best fit began: all rims are then tried from these, since the wavefront of a fit whose
+        rims are held has taken up where they stand.
+    """
+    failed: list[RimBody] = []
+    while len(best.light.free_rims.bodies) < _MOST_BODIES and len(failed) < _MOST_FAILURES:
+        loss = best.solution.loss / best.stamp.used.sum()
+        if loss < noise:
+            break
+        threshold = _GAIN + _MISFIT * max(loss - 1.0, 0.0)
+        bodies, gains = rim_gains(instrument, best)
+        moved = {body.members for body in (*best.light.free_rims.bodies, *failed)}
+        gains = np.where([body.members in moved for body in bodies], 0.0, gains)
+        if not gains.max(initial=0.0) > threshold:
+            break
+        if first is None:
+            likely = gains > _LIKELY * gains.max()
+            trials = _each_freed(instrument, best, list(itertools.compress(bodies, likely)), best.solution, solved)
+        else:
+            trials = _each_freed(instrument, best, bodies, first, solved)
+        trial = trials[0]
+        if best.solution.loss - trial.solution.loss < threshold:
+            if first is None:
+                failed += itertools.compress(bodies, likely)
+            first = None
+            continue
+        first, failed = None, []
+        for other in trials[1:]:
+            if other.solution.loss - trial.solution.loss < _ALIKE:
+                # Either may have moved: both are free.
+                rims = trial.light.free_rims.with_body(other.light.free_rims.bodies[-1])
+                light = trial.light.with_free_rims(rims, instrument.middle)
+                trial = _settled(instrument, solved(light, trial.solution), solved)
+        best = trial
+    return best
+
+
+def _each_freed(
+    instrument: Instrument,
+    fit: RimFit,
+    bodies: Sequence[RimBody],
+    start: Solution,
+    solved: Callable[[StarLight, Solution], RimFit],
+) -> list[RimFit]:
+    """Return fits with one more of some bodies free, best first: those that lead nowhere end after a few steps."""
+    trials = []
+    for body in bodies:
+        light = fit.light.with_free_rims(fit.light.free_rims.with_body(body), instrument.middle)
+        trials.append(_settled(instrument, solved(light, start), solved, _FIRST_STEPS))
+    trials.sort(key=lambda trial: trial.solution.loss)
+    finished = [_settled(instrument, trial, solved) for trial in trials[:_FINISHED]]
+    return sorted(finished, key=lambda trial: trial.solution.loss)
+
+
+def rim_gains(instrument: Instrument, fit: RimFit) -> tuple[list[RimBody], np.ndarray]:
+    """Return the rims that bound the light, and the gain of twice the logarithm of the likelihood by freeing each.
+
+    It is that of a score test, with the wavefront and all else free.
+    """
+    light, (star, wave) = fit.light, (fit.solution.stars[0], fit.solution.waves[0])
+    rays = fit.stamp.rays
+    assert isinstance(rays, ZernikeRays)
+    bodies, lines = PupilShadows(light.telescope, light.direction, instrument.middle, rays.cells).candidates()
+    if not bodies:
+        return [], np.zeros(0)
+    free = np.array([body.free for body in bodies])
+    shadows = instrument.rays_of(light, line_cells(rays.cells, lines, free))
+    spreads = np.array([body.spreads for body in bodies])[free]
+    stamp = replace(fit.stamp, rays=_RaysWithShadows(rays, shadows, len(wave)))
+    equations = normal_equations(stamp, star, np.concatenate([wave, np.zeros(len(spreads))]))
+    first, last = len(star) + len(wave), len(star) + len(wave) + np.arange(len(spreads))
+    fitted = np.flatnonzero(np.arange(first) != (STRENGTH if instrument.known_seeing else -1))
+    precision = np.concatenate([np.zeros(len(star)), instrument.terms.precision, light.shift_precision])
+    mean = np.concatenate([np.zeros(first - len(light.shift_mean)), light.shift_mean])
+    values = np.concatenate([np.zeros(len(star)), wave])
+    inner = (equations.curvature[:first, :first] + np.diag(precision))[np.ix_(fitted, fitted)]
+    cross = equations.curvature[np.ix_(fitted, last)]
+    slope = (equations.gradient[:first] - precision * (values - mean))[fitted]
+    scale = np.sqrt(np.maximum(np.diag(inner), 1e-300))
+    projected = np.linalg.lstsq(inner / np.outer(scale, scale), cross / scale[:, None], rcond=1e-12)[0] / scale[:, None]
+    gradient = equations.gradient[last] - projected.T @ slope
+    curvature = equations.curvature[np.ix_(last, last)] - cross.T @ projected + np.diag(spreads**-2.0)
+    number = np.nonzero(free)[0]
+    gains = np.zeros(len(bodies))
+    for k in range(len(bodies)):
+        motions = number == k
+        gains[k] = gradient[motions] @ np.linalg.solve(curvature[np.ix_(motions, motions)], gradient[motions])
+    return bodies, gains
+
+
+class _RaysWithShadows:
+    """Light of a star and the shadows of rims, which have no light: unknowns are those of the light, then motions."""
+
+    def __init__(self, light: ZernikeRays, shadows: ZernikeRays, count: int) -> None:
+        self.cells, self._light, self._shadows, self._count = light.cells, light, shadows, count
+        self._size = len(light.rates)
+        lost = -np.outer(light.weights(np.zeros(count)), shadows.rates.sum(axis=0))
+        self.rates = np.block(
+            [[light.rates, lost], [np.zeros((len(shadows.rates), light.rates.shape[1])), shadows.rates]]
+        )
+
+    def weights(self, unknowns: np.ndarray) -> np.ndarray:
+        return np.concatenate([self._light.weights(unknowns[: self._count]), np.zeros(len(self._shadows.rates))])
+
+    def landing(self, unknowns: np.ndarray) -> np.ndarray:
+        return np.concatenate([rays.landing(unknowns[: self._count]) for rays in (self._light, self._shadows)])
+
+    def spread(self, landing: np.ndarray) -> np.ndarray:
+        # The shadows are too few to tell what a cell's image is like: they have the footprint of the light.
+        spread = spread_of(self._shadows.cells, landing[self._size :], self._light.footprint)
+        return np.concatenate([self._light.spread(landing[: self._size]), spread])
+
+    def at_rims(self, rims: PupilRims, landing: np.ndarray, response: np.ndarray | None) -> RimsAt:
+        return self._light.at_rims(rims, landing[: self._size], response)
+
+    def response(self, unknowns: np.ndarray) -> np.ndarray:
+        light = self._light.response(unknowns)
+        return np.concatenate([light, np.zeros((2, len(self._shadows.rates), light.shape[2]), light.dtype)], axis=1)
+
+    def release(self) -> None:
+        self._light.release()
+
+
+def _settled(
+    instrument: Instrument, best: RimFit, solved: Callable[[StarLight, Solution], RimFit], steps: int = _OUTER
+) -> RimFit:
+    """Return the best fit with the same rims free, their shadows where they are found to stand, after so many steps."""
+    first = len(instrument.noll) + 2 * len(best.light.rims)
+    factor = 1.0
+    for _ in range(steps):
+        rims, shift = best.light.free_rims, factor * best.solution.waves[0][first:]
+        if np.all(np.abs(shift) < _SMALL * rims.spreads):
+            break
+        light = best.light.with_free_rims(rims.moved(shift), instrument.middle)
+        trial = solved(light, best.solution)
+        # Light that a shadow uncovers lies beside the line that stands for it, so that steps may be too long.
+        better = trial.solution.loss < best.solution.loss
+        best, factor = (trial, 1.0) if better else (best, 0.5 * factor)
+    return best
