@@ -8,15 +8,18 @@ from enum import IntFlag
 class DonutFlag(IntFlag):
     """Outcome of the fit of one donut; zero for a clean one.
 
-    ``BLENDED`` (a second star was fitted too), ``CLIPPED`` (pixels far off the model, cosmic rays for example, were
-    left out) and ``POOR_FIT`` (chi-square is far above the number of pixels, so that errors are larger than claimed)
-    are remarks: there are results. With any other flag the results of the donut are NaN.
+    Five flags are remarks: the results hold. ``BLENDED``: neighbours were fitted too. ``CLIPPED``: pixels far off the
+    model, not finite or saturated were left out, cosmic rays for example. ``CUT_OFF``: a twentieth of the light or more
+    falls beside the stamp or on regions of it that are not used; errors are those of what remains. ``POOR_FIT``:
+    chi-square is far above the number of pixels, so that errors are larger than claimed. ``OTHER_SIZE``: the donut is
+    larger or smaller than that of the telescope by more than 8 %, as with another defocus or pixel size.
 
-    ``NO_DONUT``: nothing like a donut stands on the stamp. ``CUT_OFF``: more than a twentieth of the light falls beside
-    the stamp. ``SATURATED``: too many pixels are saturated. ``DEFOCUS_SIGN``: the image fits the other side of focus
-    better. ``OUTSIDE_FIELD``: the telescope does not cover the field. ``NO_LIGHT``: no light passes the telescope
-    there, or the chief ray does not reach a CCD. ``TOO_FEW_PHOTONS``: fewer photons than unknowns.
-    ``NOT_FINITE``: an unmasked pixel is not a finite number. ``NOT_CONVERGED``: the fit did not converge.
+    With any other flag the results of the donut are NaN. ``NO_DONUT``: nothing like a donut stands on the stamp.
+    ``MOSTLY_LOST``: more than 55 % of the light falls beside the stamp or on pixels that are not used. ``SATURATED``,
+    ``NOT_FINITE``: pixels that are saturated or not finite are the reason why the remaining ones have no result.
+    ``DEFOCUS_SIGN``: the image fits the other side of focus better. ``OUTSIDE_FIELD``: the telescope does not cover the
+    field. ``NO_LIGHT``: no light passes the telescope there, or the chief ray does not reach a CCD.
+    ``TOO_FEW_PHOTONS``: fewer photons than unknowns. ``NOT_CONVERGED``: the fit did not converge.
     """
 
     OK = 0
@@ -32,13 +35,19 @@ class DonutFlag(IntFlag):
     NOT_FINITE = 512
     NOT_CONVERGED = 1024
     POOR_FIT = 2048
+    MOSTLY_LOST = 4096
+    OTHER_SIZE = 8192
 
     @property
     def usable(self) -> bool:
         """Whether the donut has results."""
-        return not self & ~(DonutFlag.BLENDED | DonutFlag.CLIPPED | DonutFlag.POOR_FIT)
+        return not self & ~_REMARKS
 
     @property
     def reasons(self) -> str:
         """Names of the flags, lower case, with commas between them."""
         return ", ".join((flag.name or "").lower().replace("_", " ") for flag in type(self) if flag and flag in self)
+
+
+#: Flags with which the results hold.
+_REMARKS = DonutFlag.BLENDED | DonutFlag.CLIPPED | DonutFlag.CUT_OFF | DonutFlag.POOR_FIT | DonutFlag.OTHER_SIZE

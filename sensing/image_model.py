@@ -23,11 +23,19 @@ from .seeing import Seeing
 from .stamps import Pixels
 
 #: Unknowns of every star before those of its wavefront: flux [electrons], x and y of the chief ray from the centre of
-#: the detector's stamp [its pixels], background [electrons a pixel of these], strength of the turbulence [1/m].
-NUISANCES = ("flux", "x", "y", "background", "strength")
-#: Further unknowns where there is a second star: its flux over that of the first, and its offset [pixels].
-COMPANION = ("ratio", "offset_x", "offset_y")
-FLUX, X, Y, BACKGROUND, STRENGTH, RATIO = range(6)
+#: the detector's stamp [its pixels], background there [electrons a pixel of these], strength of the turbulence [1/m],
+#: slopes of the background along x and y [electrons a pixel, per pixel].
+NUISANCES = ("flux", "x", "y", "background", "strength", "slope_x", "slope_y")
+#: Further unknowns of each neighbour: its flux over that of the star, and its place from it [pixels].
+NEIGHBOUR = ("ratio", "offset_x", "offset_y")
+#: Most neighbours of a star.
+MOST_NEIGHBOURS = 5
+FLUX, X, Y, BACKGROUND, STRENGTH, SLOPE_X, SLOPE_Y, RATIO = range(8)
+
+
+def neighbours_of(unknowns: np.ndarray) -> np.ndarray:
+    """Return a view of the unknowns of the neighbours of a star, shape [n_neighbour, 3]."""
+    return unknowns[RATIO:].reshape(-1, len(NEIGHBOUR))
 
 
 @dataclass(frozen=True)
@@ -107,6 +115,12 @@ class ImageGrid:
         self._exponent = seeing.exponent(np.hypot(*baseline))
         spline = np.sinc(x) ** 4 * np.sinc(y) ** 4
         cell = np.prod(np.sinc(np.tensordot(footprint.T, wave, axes=1) / (2.0 * math.pi)), axis=0)
+        columns, rows = (
+            self.scale * (np.arange(n) - 0.5 * (n - 1) - shift)
+            for n, shift in zip(shape[::-1], pixels.offset, strict=True)
+        )
+        #: Derivatives of the image by level and slopes of the background, over the area of a pixel.
+        self._plane = np.stack(np.broadcast_arrays(1.0, columns, rows[:, None]), axis=-1).astype(np.float32)
         # A cell of the grid holds less light than a pixel.
         self._detector = (
             oversampling**2
@@ -169,11 +183,15 @@ class ImageGrid:
 
     def image(self, unknowns: np.ndarray, light: LandedLight) -> np.ndarray:
         """Return the image [electrons], shape [ny, nx]; arguments as in :meth:`derivatives`."""
-        spectrum, shift = self._spectra(unknowns, light)
-        if shift is not None:
-            spectrum *= 1.0 + unknowns[RATIO] * shift
+        spectrum, shifts = self._spectra(unknowns, light)
+        if len(shifts):
+            spectrum *= _all_stars(unknowns, shifts)
         star = self._pixels(spectrum)[..., 0].astype(np.float64)
-        return np.asarray(unknowns[FLUX] * star + unknowns[BACKGROUND] * self.scale**2)
+        return np.asarray(unknowns[FLUX] * star + self._background(unknowns))
+
+    def _background(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return the plane under the stars [electrons], shape [ny, nx]."""
+        return np.asarray(self.scale**2 * (self._plane @ unknowns[[BACKGROUND, SLOPE_X, SLOPE_Y]]))
 
     def derivatives(
         self, unknowns: np.ndarray, light: LandedLight, response: np.ndarray, rates: np.ndarray
@@ -182,8 +200,8 @@ class ImageGrid:
 
         Parameters
         ----------
-        unknowns : ndarray, shape [5] or [8]
-            Values of :data:`NUISANCES`, and of :data:`COMPANION` where there is a second star.
+        unknowns : ndarray, shape [7 + 3 n_neighbour]
+            Values of :data:`NUISANCES`, and of :data:`NEIGHBOUR` for each neighbour.
         light : LandedLight
             Landing points of the light.
         response : ndarray, shape [2, n, n_wave]
@@ -201,26 +219,28 @@ class ImageGrid:
             Scales of the columns.
         """
         flux, strength = unknowns[FLUX], unknowns[STRENGTH]
-        spectra, shift = self._spectra(unknowns, light, response, rates)
+        spectra, shifts = self._spectra(unknowns, light, response, rates)
         star, moved = spectra[..., :1], spectra[..., 1:]
         extra = []
-        if shift is not None:
-            second = star * shift
-            turns = [(1j * unknowns[RATIO] * p).astype(np.complex64)[..., None] for p in self._phase]
-            extra = [second, *(turn * second for turn in turns)]
-            both_stars = 1.0 + np.float32(unknowns[RATIO]) * shift
-            star, moved = star * both_stars, moved * both_stars
-        uniform = np.zeros_like(star)
-        uniform[0, 0] = self._size[0] * self._size[1]
+        for (ratio, *_), shift in zip(neighbours_of(unknowns), shifts, strict=True):
+            neighbour = star * shift
+            turns = [(1j * ratio * p).astype(np.complex64)[..., None] for p in self._phase]
+            extra += [neighbour, *(turn * neighbour for turn in turns)]
+        if extra:
+            all_stars = _all_stars(unknowns, shifts)
+            star, moved = star * all_stars, moved * all_stars
         growth = (-5.0 / 3.0 * self._exponent * strength ** (2.0 / 3.0)).astype(np.float32)[..., None]
-        columns = self._pixels(
-            np.concatenate([star, moved[..., :2], uniform, growth * star, *extra, moved[..., 2:]], axis=-1)
+        light_columns = self._pixels(
+            np.concatenate([star, moved[..., :2], growth * star, *extra, moved[..., 2:]], axis=-1)
         )
+        of_star, of_growth, others = np.split(light_columns, [BACKGROUND, BACKGROUND + 1], axis=-1)
+        level, slopes = np.split(self._plane, [1], axis=-1)
+        columns = np.concatenate([of_star, level, of_growth, slopes, others], axis=-1)
         scales = np.full(columns.shape[-1], flux)
-        scales[[FLUX, BACKGROUND]] = 1.0, self.scale**2
+        scales[FLUX] = 1.0
+        scales[[BACKGROUND, SLOPE_X, SLOPE_Y]] = self.scale**2
         scales[[X, Y]] /= self.scale
-        level = unknowns[BACKGROUND] * self.scale**2
-        return flux * columns[..., FLUX].astype(np.float64) + level, columns, scales
+        return flux * columns[..., FLUX].astype(np.float64) + self._background(unknowns), columns, scales
 
     def _spectra(
         self,
@@ -228,8 +248,8 @@ class ImageGrid:
         light: LandedLight,
         response: np.ndarray | None = None,
         rates: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return spectra of a star of unit flux, its derivatives by x, y, wave and rims, and a second one's shift."""
+    ) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Return spectra of a star of unit flux, its derivatives by x, y, wave and rims, and its neighbours' shifts."""
         points = self.places(unknowns, light.landing)
         splines = self._deposit(points, light.spread / self.pixel**2, response is not None)
         weights = light.weights.astype(np.float32)[:, None]
@@ -244,10 +264,8 @@ class ImageGrid:
         if light.at_rims is not None:
             self._diffract(spectra, unknowns, light.at_rims)
         spectra *= self._filter(unknowns[STRENGTH]).astype(np.float32)[..., None]
-        if len(unknowns) <= RATIO:
-            return spectra, None
-        turn = np.exp(1j * np.tensordot(unknowns[RATIO + 1 :], self._phase, axes=1))
-        return spectra, turn.astype(np.complex64)[..., None]
+        turns = [np.exp(1j * np.tensordot(offset, self._phase, axes=1)) for _, *offset in neighbours_of(unknowns)]
+        return spectra, [turn.astype(np.complex64)[..., None] for turn in turns]
 
     def _diffract(self, spectra: np.ndarray, unknowns: np.ndarray, rims: RimsAt) -> None:
         """Add what is diffracted at the rims to the spectra of the star and of its derivatives by x, y and wave."""
@@ -265,6 +283,12 @@ class ImageGrid:
         for axis in (0, 1):
             spectra[light.where, 1 + axis] -= 1j * (light.wave[:, axis] * self.pixel).astype(np.float32) * diffracted
         spectra[light.where, 3 : 3 + rims.response.shape[2]] += light.slopes(rims) * turn[:, None]
+
+
+def _all_stars(unknowns: np.ndarray, shifts: list[np.ndarray]) -> np.ndarray:
+    """Return the transfer function of a star and its neighbours over that of the star."""
+    ratios = neighbours_of(unknowns)[:, 0].astype(np.float32)
+    return np.asarray(1.0 + sum(ratio * shift for ratio, shift in zip(ratios, shifts, strict=True)))
 
 
 def _by_point(taps: np.ndarray) -> np.ndarray:
