@@ -215,8 +215,8 @@ def donuts_command(
     LATISS and DECam, and of ts_wep's DonutStamps, headers give camera, detector, pixel, angles, band and gain, and
     extensions MASK, VARIANCE (DQ, WEIGHT) are read. Stamps have x and y along those of the camera, unless --stamp-axes
     or the header's detector says otherwise. A defocus moves what --moved, a keyword MOVED or a column moved names, or
-    the header's camera: Camera (full-array mode of LSSTCam), M2 (AuxTel), else the detector. Bad donuts are flagged with
-    the reason.
+    the header's camera: Camera (full-array mode of LSSTCam), M2 (AuxTel), else the detector. Bad donuts are flagged
+    with the reason.
 
     **Examples**
 

@@ -15,10 +15,23 @@ from ..core.threads import one_blas_thread, thread_count
 from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ..models.telescope import Telescope
 from ..wavefront.psf.light import Light
+from .bad_pixels import grown
 from .fit_star import SMALLEST_DONUT, StarFit, fit_star
 from .flags import DonutFlag
 from .freedom_fit import TelescopeFreedoms
-from .image_model import BACKGROUND, COMPANION, FLUX, NUISANCES, RATIO, STRENGTH, X, Y
+from .image_model import (
+    BACKGROUND,
+    FLUX,
+    MOST_NEIGHBOURS,
+    NEIGHBOUR,
+    NUISANCES,
+    RATIO,
+    SLOPE_X,
+    SLOPE_Y,
+    STRENGTH,
+    X,
+    Y,
+)
 from .inputs import ObservedStar, ObservedStars
 from .light import Instrument
 from .likelihood import pulls
@@ -28,8 +41,9 @@ from .rim_table import moved_rims, rim_table
 from .stamps import Pixels
 from .wavefront_fits import NOLL, FittedStars, SingleDonuts, UsableStars, WavefrontFit
 
-#: Saturated pixels from which on a donut is flagged, as a fraction of the stamp; fewer are left out.
-_SATURATED = 0.002
+#: Pixels, as a fraction of the stamp, from which on those of one greatest value are saturated, and those that are not
+#: finite or saturated may be the reason why there is no result.
+_SEVERAL = 0.002
 #: Electrons up to which pixels of equal value are no sign of saturation.
 _FAINT = 100.0
 #: Chi-square a pixel above which a fit is poor.
@@ -174,35 +188,40 @@ def _wavefront_fit(
 
 def _fit_alone(instrument: Instrument, star: ObservedStar, defocus: float, strength: float, joint: bool) -> StarFit:
     """Fit one star by itself, or say why not."""
-    masked = star.masked
-    if not np.isfinite(star.image[~masked]).all():
-        return StarFit(DonutFlag.NOT_FINITE)
     if np.hypot(*star.field) > instrument.telescope.field_limit * (1.0 + 1e-12):
         return StarFit(DonutFlag.OUTSIDE_FIELD)
-    saturation, allowed = instrument.model.detector.saturation, max(_SATURATED * star.image.size, 1.0)
-    if saturation is not None:
-        high = (star.image >= saturation) & ~masked
-        if high.sum() > allowed:
-            return StarFit(DonutFlag.SATURATED)
-        masked = masked | high
-    if _plateau(star.image[~masked]) > allowed:
-        return StarFit(DonutFlag.SATURATED)
     try:
         light = instrument.light(star.direction, defocus)
     except DomainError:
         return StarFit(DonutFlag.NO_LIGHT)
+    not_finite = ~np.isfinite(star.image) & ~star.masked
+    masked = star.masked | not_finite
+    saturated = _saturated(np.where(masked, 0.0, star.image), masked, instrument.model.detector.saturation)
+    masked = masked | grown(saturated)
     pixels = Pixels(np.where(masked, 0.0, star.image), star.variance, ~masked)
     wavefront = not joint or light.diameter > SMALLEST_DONUT * instrument.pixel
-    return fit_star(instrument, light, pixels, strength, wavefront=wavefront)
+    fitted = fit_star(instrument, light, pixels, strength, wavefront=wavefront)
+    # Few such pixels are no reason for anything.
+    causes, allowed = DonutFlag.OK, max(_SEVERAL * star.image.size, 1.0)
+    for bad, flag in ((saturated, DonutFlag.SATURATED), (not_finite, DonutFlag.NOT_FINITE)):
+        causes |= flag if bad.sum() > allowed else DonutFlag.OK
+    if fitted.flags.usable:
+        return replace(fitted, flags=fitted.flags | DonutFlag.CLIPPED) if (saturated | not_finite).any() else fitted
+    return replace(fitted, flags=causes) if causes else fitted
 
 
-def _plateau(values: np.ndarray) -> int:
-    """Return how many pixels have the greatest value, where that is far above the noise of single electrons.
+def _saturated(image: np.ndarray, masked: np.ndarray, level: float | None) -> np.ndarray:
+    """Return the saturated pixels: from a level on, or without one those of the greatest value where many have it.
 
     Pixels with noise hardly agree unless they are saturated.
     """
-    top = values.max(initial=0.0)
-    return int((values == top).sum()) if top > _FAINT else 0
+    if level is not None:
+        high = (image >= level) & ~masked
+        if high.any():
+            return high
+    top = image.max(initial=0.0, where=~masked)
+    plateau = (image == top) & ~masked
+    return plateau if top > _FAINT and plateau.sum() > max(_SEVERAL * image.size, 1.0) else np.zeros_like(masked)
 
 
 def _result(
@@ -211,7 +230,7 @@ def _result(
     """Return the result of a fit: rows of the usable stars, and NaN for the others."""
     count, n_noll = len(observed), len(instrument.terms.requested)
     zernikes, covariance = np.full((count, n_noll), np.nan), np.full((count, n_noll, n_noll), np.nan)
-    values, errors = np.full((2, count, len(NUISANCES) + len(COMPANION)), np.nan)
+    values, errors = np.full((2, count, len(NUISANCES) + MOST_NEIGHBOURS * len(NEIGHBOUR)), np.nan)
     chi2, n_pixels = np.full(count, np.nan), np.zeros(count, dtype=np.int64)
     model, used = np.full(observed.images.shape, np.nan), np.zeros(observed.images.shape, dtype=bool)
     for i, star in zip(usable, fitted.stars, strict=True):
@@ -232,12 +251,13 @@ def _result(
         center=values[:, [X, Y]],
         center_error=errors[:, [X, Y]],
         background=values[:, BACKGROUND],
+        background_slope=values[:, [SLOPE_X, SLOPE_Y]],
         fwhm=width,
         fwhm_error=width * errors[:, STRENGTH] / np.where(strength > 0.0, strength, 1.0),
         chi2=chi2,
         n_pixels=n_pixels,
         flags=flags | poor * int(DonutFlag.POOR_FIT),
-        companion=values[:, RATIO:],
+        companions=values[:, RATIO:].reshape(count, MOST_NEIGHBOURS, len(NEIGHBOUR)),
         images=observed.images,
         model=model,
         used=used,

@@ -1,4 +1,4 @@
-"""Fit of one star: start from a template, coarse and fine pixels, second star, wrong side of focus, cosmic rays."""
+"""Fit of one star: start from a template, coarse and fine pixels, neighbours, wrong side of focus, bad pixels."""
 
 from __future__ import annotations
 
@@ -8,59 +8,40 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import maximum_filter
 
+from ..core.statistics import RMS_PER_MAD
+from .bad_pixels import unused_regions, without_bad_pixels, without_outliers
 from .donut_rays import ZernikeRays
 from .flags import DonutFlag
-from .image_model import FLUX, NUISANCES, RATIO, STRENGTH, X, Y
+from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, SLOPE_X, SLOPE_Y, STRENGTH, X, Y
 from .light import Instrument, Sampling, StarLight
 from .likelihood import Stamp, model_image, pulls
+from .neighbours import NeighbourSearch, explains_more
 from .rim_search import RimFit, with_moved_rims
 from .solve import COARSE, FINE, STEPS, Group, Solution, solve
-from .stamps import (
-    Match,
-    Pixels,
-    match_template,
-    measured_variance,
-    significance_above_sky,
-    without_cosmic_rays,
-)
+from .stamps import Match, Pixels, match_template, measured_variance, plane_basis
 
 #: Images wider than this are donuts [pixels].
 SMALLEST_DONUT = 24.0
 #: Pixels across a donut in the coarse fit, about.
 _COARSE_DIAMETER = 30.0
-#: Signal over noise of a template that is found.
-_FOUND = 8.0
-#: The same above a uniform sky of any level, which is less; the noise of a sky reaches 4 somewhere on a stamp.
-_ABOVE_SKY = 6.0
-#: Least gain of twice the logarithm of the likelihood by a second star or another focus.
-_GAIN = 100.0
-#: Largest fraction of the misfit that they may leave: what turbulence and missing terms do to an image, neither
-#: explains.
-_LEFT = 0.5
+#: Signal over noise of a donut above a plane background of any level; the noise of a sky reaches 4 somewhere on a
+#: stamp.
+_FOUND = 6.0
 #: Loss a coarse pixel from which on the other side of focus is tried; photons leave 0.1, since smoothed noise is small.
 _MISFIT = 0.15
-#: Loss a coarse pixel from which on second stars are searched for around the first.
-_POOR = 1.0
-#: Distances of such second stars over the diameter of the donut.
-_NEAR_RADII = (0.08, 0.2)
-#: Directions from the first star in which they are searched for.
-_NEAR_ANGLES = 6
-#: Steps from each of these places.
-_FIRST_STEPS = 4
-#: Number of the best of these solutions that are finished.
-_FINISHED = 2
-#: Loss a coarse pixel from which on a second star is searched for without the wavefront of the first, too.
-_MISTAKEN = 3.0
-#: Least flux of a second star over that of the first.
-_LEAST_RATIO = 0.01
-#: Fraction of the light that may fall beside the stamp.
-_BESIDE = 0.05
+#: Fraction of the light beside the stamp or on unused regions from which on a donut is cut off.
+_CUT_OFF = 0.05
+#: Fraction of the light beside the stamp or on unused pixels from which on a donut is lost: a little more than half.
+_LOST = 0.55
 #: Least fraction of the variance of the image that the model explains.
 _EXPLAINED = 0.5
 #: Pulls of pixels that are clipped, over that of typical pixels.
 _CLIP = 7.0
+#: Light over the brightest, above which a pixel of the model is one of the donut.
+_BRIGHT = 0.2
+#: Sizes of donuts over that of the telescope's own between which nothing is said of them: by 120 um of 1500 of defocus.
+_SIZES = (0.92, 1.08)
 #: Rounds of clipping.
 _ROUNDS = 3
 #: Most scales of the last fits.
@@ -125,32 +106,34 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
     """
     across = light.diameter / instrument.pixel
     donut = across > SMALLEST_DONUT
-    clean = without_cosmic_rays(pixels) if donut else pixels
-    fitter = _StarFitter(instrument, light, clean, strength, wavefront)
-    small = clean.smoothed(max(1, round(across / _COARSE_DIAMETER)) if donut else 1)
-    coarse = fitter.stamp(light, small)
-    template = fitter.template(coarse)
-    start, match = fitter.start(coarse, template)
+    fitter = _StarFitter(instrument, light, without_bad_pixels(pixels) if donut else pixels, strength, wavefront)
+    start = fitter.start()
     flags = DonutFlag.OK
-    if not match.significance >= _FOUND or not fitter.significance(coarse, template) >= _ABOVE_SKY:
+    if not start.match.significance >= _FOUND:
         flags |= DonutFlag.NO_DONUT
-    if match.flux < len(NUISANCES) + (len(instrument.noll) if wavefront else 0):
+    if start.match.flux < len(NUISANCES) + (len(instrument.noll) if wavefront else 0):
         flags |= DonutFlag.TOO_FEW_PHOTONS
     if flags:
         return StarFit(flags)
-    best = fitter.solve(coarse, start, tolerance=COARSE if donut else FINE)
+    best = fitter.solve(start.stamp, start.unknowns, tolerance=COARSE if donut else FINE)
+    if donut and _misfit(start.stamp, best) > _MISFIT:
+        thinned = fitter.without_bad_lines(best)
+        if thinned is not fitter:
+            fitter, start = thinned, thinned.start()
+            best = fitter.solve(start.stamp, start.unknowns, tolerance=COARSE)
     if donut and wavefront:
         # Light beside a rim looks like a second star otherwise, and like a cosmic ray.
-        solved = fitter.rim_solver(COARSE, lambda moved: moved.stamp(moved.light, small))
-        fitter, coarse, best = fitter.with_moved_rims(coarse, best, _MISFIT, solved, start)
+        solved = fitter.rim_solver(COARSE, lambda moved: moved.stamp(moved.light, start.pixels))
+        fitter, moved_stamp, best = fitter.with_moved_rims(start.stamp, best, _MISFIT, solved, start.unknowns)
+        start = replace(start, stamp=moved_stamp)
     if donut and instrument.model.neighbours:
-        best = fitter.with_companion(small, coarse, best, start, template)
-    if donut and fitter.other_focus_is_better(small, coarse, best):
+        best = fitter.with_neighbours(start, best)
+    if donut and fitter.other_focus_is_better(start, best):
         return StarFit(DonutFlag.DEFOCUS_SIGN)
-    if not _explained(coarse, best):
+    if not _explained(start.stamp, best):
         return StarFit(DonutFlag.NO_DONUT)
-    if _beside(coarse, best) > _BESIDE:
-        return StarFit(DonutFlag.CUT_OFF)
+    if fitter.lost_light(start.stamp, best).any_pixel > _LOST:
+        return StarFit(DonutFlag.MOSTLY_LOST)
     finest = fitter.finest(best)
     if (finest.full.used != pixels.used).any():
         flags |= DonutFlag.CLIPPED
@@ -159,8 +142,34 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
     if len(finest.solution.stars[0]) > RATIO:
         flags |= DonutFlag.BLENDED
     if not (finest.solution.converged and np.isfinite(finest.model).all()):
-        flags |= DonutFlag.NOT_CONVERGED
+        return StarFit(flags | DonutFlag.NOT_CONVERGED, finest)
+    lost = fitter.lost_light(finest.full, finest.solution)
+    if lost.any_pixel > _LOST:
+        return StarFit(DonutFlag.MOSTLY_LOST)
+    if lost.regions > _CUT_OFF:
+        flags |= DonutFlag.CUT_OFF
+    if not _SIZES[0] < _size(finest.stamp, finest.solution.waves[0]) < _SIZES[1]:
+        flags |= DonutFlag.OTHER_SIZE
     return StarFit(flags, finest)
+
+
+@dataclass(frozen=True)
+class _Start:
+    """Start of a search in coarse pixels: these, their stamp, the template on it, where it fits, and unknowns."""
+
+    pixels: Pixels
+    stamp: Stamp
+    template: np.ndarray
+    match: Match
+    unknowns: np.ndarray
+
+
+@dataclass(frozen=True)
+class _LostLight:
+    """Fractions of a star's light beside the stamp and on unused pixels, and on regions of these alone."""
+
+    any_pixel: float
+    regions: float
 
 
 @dataclass(frozen=True)
@@ -247,10 +256,16 @@ class _StarFitter:
                 return rays
         return self._rays.setdefault(across, self._instrument.rays(light, across))
 
+    def with_used(self, used: np.ndarray) -> _StarFitter:
+        """Return the same without some of the pixels."""
+        fitter = copy(self)
+        fitter._clean, fitter._binned = replace(self._clean, image=self._clean.image * used, used=used), {}
+        return fitter
+
     def stamp(self, light: StarLight, pixels: Pixels, *, blended: bool = False) -> Stamp:
-        """Return the stamp of a star's light in coarse pixels; a second star needs room beside it."""
+        """Return the stamp of a star's light in coarse pixels; neighbours need room beside it."""
         sampling = self._instrument.sampling(light, pixels, self._fwhm)
-        # Second stars may stand anywhere beside the stamp.
+        # Neighbours may stand anywhere beside the stamp.
         reach = light.diameter * (1.0 if blended else 0.5) if pixels.side > 1 else 0.0
         shared = self._across if self._across < _SHARED * sampling.across else 0
         rays = self._of(light, max(sampling.across, shared))
@@ -286,7 +301,8 @@ class _StarFitter:
         stamp, full = fine.stamp, self.every_pixel(fine)
         model = model_image(full, best.stars[0], best.waves[0])
         for _ in range(_ROUNDS):
-            used = _clipped(full, model, best.loss / stamp.used.sum())
+            pull = pulls(full, model)
+            used = without_outliers(pull, full.image, model, full.used, _CLIP * _typical(pull, model, full.used))
             if (used == full.used).all():
                 break
             full = replace(full, used=used)
@@ -328,25 +344,51 @@ class _StarFitter:
         rays, grid = self._of(self._light, fine.sampling.across), fine.stamp.grid
         return self._instrument.stamp(self._light, self._clean, rays, False, grid.reach)
 
-    def template(self, stamp: Stamp) -> np.ndarray:
-        """Return the image of a star of unit flux at the centre of the stamp."""
+    def start(self) -> _Start:
+        """Return where the template of a star without aberrations fits best, in coarse pixels."""
+        across = self._light.diameter / self._instrument.pixel
+        pixels = self._clean.smoothed(max(1, round(across / _COARSE_DIAMETER)) if self._donut else 1)
+        stamp = self.stamp(self._light, pixels)
+        return self.start_on(pixels, stamp)
+
+    def start_on(self, pixels: Pixels, stamp: Stamp) -> _Start:
+        """Return the start of a search on a stamp of coarse pixels."""
+        grid = stamp.grid
         unknowns = np.zeros(len(NUISANCES))
         unknowns[[FLUX, STRENGTH]] = 1.0, self._strength
-        unknowns[[X, Y]] = -stamp.grid.scale * stamp.grid.offset
-        return model_image(stamp, unknowns, np.zeros(len(self._precision)))
+        unknowns[[X, Y]] = -grid.scale * grid.offset
+        template = model_image(stamp, unknowns, np.zeros(len(self._precision)))
+        measured = grid.scale**2 * measured_variance(self._clean)
+        match = match_template(stamp.image, stamp.used, stamp.variance, template, measured)
+        unknowns[FLUX] = max(match.flux, 1.0)
+        unknowns[[X, Y]] += grid.scale * np.array([match.x, match.y])
+        level, *slopes = match.plane / grid.scale**2
+        unknowns[[SLOPE_X, SLOPE_Y]] = np.array(slopes) / grid.scale
+        # The middle of the stamp is that of its coarse pixels but for those that are left over.
+        unknowns[BACKGROUND] = level + grid.scale * (grid.offset @ unknowns[[SLOPE_X, SLOPE_Y]])
+        return _Start(pixels, stamp, template, match, unknowns)
 
-    def significance(self, stamp: Stamp, template: np.ndarray) -> float:
-        """Return the signal over noise of a star anywhere on the stamp, above a uniform sky."""
-        measured = stamp.grid.scale**2 * measured_variance(self._clean)
-        return significance_above_sky(stamp.image, stamp.used, stamp.variance, template, measured)
+    def without_bad_lines(self, solution: Solution) -> _StarFitter:
+        """Return the same without scattered pixels and lines far off a first model; itself where there are none."""
+        rays = self._of(self._light, self._across)
+        full = self._instrument.stamp(self._light, self._clean, rays, sharp=False)
+        model = model_image(full, solution.stars[0], solution.waves[0])
+        pull = pulls(full, model)
+        limit = _CLIP * _typical(pull, model, full.used)
+        used = without_outliers(pull, full.image, model, full.used, limit, lines_only=True)
+        return self if (used == full.used).all() else self.with_used(used)
 
-    def start(self, stamp: Stamp, template: np.ndarray) -> tuple[np.ndarray, Match]:
-        """Return unknowns of the star where its template fits best."""
-        match = match_template(stamp.image, stamp.used, stamp.variance, template)
-        unknowns = np.zeros(len(NUISANCES))
-        unknowns[[FLUX, STRENGTH]] = max(match.flux, 1.0), self._strength
-        unknowns[[X, Y]] = ([match.x, match.y] - stamp.grid.offset) * stamp.grid.scale
-        return unknowns, match
+    def lost_light(self, stamp: Stamp, solution: Solution) -> _LostLight:
+        """Return the fractions of the star's light that land beside the stamp and on unused pixels."""
+        used, star, wave = self._clean.used, solution.stars[0], solution.waves[0]
+        used = stamp.used if stamp.used.shape == used.shape else used
+        landing, weights = stamp.rays.landing(wave), stamp.rays.weights(wave)
+        middle = 0.5 * (np.array(used.shape[::-1]) - 1.0)
+        place = np.rint(landing / self._instrument.pixel + star[[X, Y]] + middle).astype(np.int64)
+        outside = ((place < 0) | (place >= used.shape[::-1])).any(axis=1)
+        column, row = np.where(outside[:, None], 0, place).T
+        lost, cut = (outside | pixels[row, column] for pixels in (~used, unused_regions(used)))
+        return _LostLight(float(weights @ lost), float(weights @ cut))
 
     def solve(
         self,
@@ -363,102 +405,47 @@ class _StarFitter:
         )
         return solve(group, [star], np.zeros(n) if shared is None else shared, tolerance=tolerance, steps=steps)
 
-    def with_companion(
-        self, pixels: Pixels, stamp: Stamp, single: Solution, first: np.ndarray, template: np.ndarray
-    ) -> Solution:
-        """Return the solution with a second star if there is one, else that without."""
-        wave = single.waves[0]
-        best, misfit = single, single.loss / stamp.used.sum()
-        roomy = None
-        starts = [(single.stars[0], wave, single.shared)]
-        if misfit > _MISTAKEN:
-            starts.append((first, np.zeros_like(wave), np.zeros_like(single.shared)))
-        for star, aberration, shared in starts:
-            residual_image = stamp.image - model_image(stamp, star, aberration)
-            second = match_template(residual_image, stamp.used, stamp.variance, template)
-            if not second.significance >= _FOUND:
-                continue
-            place = ([second.x, second.y] - stamp.grid.offset) * stamp.grid.scale
-            if roomy is None:
-                roomy = self.stamp(self._light, pixels, blended=True)
-            trial = self.solve(
-                roomy, np.array([*star, second.flux / star[FLUX], *(place - star[[X, Y]])]), shared, COARSE
-            )
-            if _explains_more(trial, best) and trial.stars[0][RATIO] > _LEAST_RATIO:
-                best = trial
-        if best.loss / stamp.used.sum() > _POOR:
-            best = self._with_near_companion(roomy or self.stamp(self._light, pixels, blended=True), best, first)
-        return _central_first(best)
-
-    def _with_near_companion(self, stamp: Stamp, best: Solution, first: np.ndarray) -> Solution:
-        """Return the best solution with a second star that overlaps most of the first, if that explains much more.
-
-        A fit of one star takes two for one that is larger and oddly shaped, so that the residuals do not show where
-        the second stands: places around the first are tried, without aberrations.
-        """
+    def with_neighbours(self, start: _Start, single: Solution) -> Solution:
+        """Return the solution with neighbours if there are any, else that without."""
+        room = self.stamp(self._light, start.pixels, blended=True)
         diameter = self._light.diameter / self._instrument.pixel
-        nothing, trials = np.zeros_like(best.shared), []
-        for radius in _NEAR_RADII:
-            for angle in np.arange(_NEAR_ANGLES) * 2.0 * np.pi / _NEAR_ANGLES:
-                offset = radius * diameter * np.array([np.cos(angle), np.sin(angle)])
-                star = np.array([*first, 1.0, *offset])
-                star[FLUX] *= 0.5
-                # The template stands in the middle of the two.
-                star[[X, Y]] -= 0.5 * offset
-                trials.append(self.solve(stamp, star, nothing, COARSE, _FIRST_STEPS))
-        # After a few steps the places that lead nowhere are known.
-        for begun in sorted(trials, key=lambda trial: trial.loss)[:_FINISHED]:
-            trial = self.solve(stamp, begun.stars[0], begun.shared, COARSE)
-            if _explains_more(trial, best) and trial.stars[0][RATIO] > _LEAST_RATIO:
-                best = trial
-        return best
+        return NeighbourSearch(room, self.solve, start.unknowns, start.template, diameter).from_single(single)
 
-    def other_focus_is_better(self, pixels: Pixels, stamp: Stamp, solution: Solution) -> bool:
+    def other_focus_is_better(self, start: _Start, solution: Solution) -> bool:
         """Return whether the image fits a detector on the other side of focus better."""
-        if solution.loss / stamp.used.sum() < _MISFIT:
+        if _misfit(start.stamp, solution) < _MISFIT:
             return False
-        mirrored = self.stamp(self._instrument.mirrored(self._light), pixels)
-        start, _ = self.start(mirrored, self.template(mirrored))
-        return _explains_more(self.solve(mirrored, start, tolerance=COARSE), solution)
+        mirrored_light = self._instrument.mirrored(self._light)
+        mirrored = self.start_on(start.pixels, self.stamp(mirrored_light, start.pixels))
+        return explains_more(self.solve(mirrored.stamp, mirrored.unknowns, tolerance=COARSE), solution)
 
 
-def _explains_more(trial: Solution, other: Solution) -> bool:
-    """Return whether a solution is better than another beyond what could be chance or a wavefront without its terms."""
-    return other.loss - trial.loss > _GAIN and trial.loss < _LEFT * other.loss
+def _misfit(stamp: Stamp, solution: Solution) -> float:
+    return solution.loss / max(int(stamp.used.sum()), 1)
 
 
-def _central_first(solution: Solution) -> Solution:
-    """Return a solution whose first star is the one nearer to the centre of the stamp."""
-    star = solution.stars[0]
-    if len(star) <= RATIO or np.hypot(*star[[X, Y]]) <= np.hypot(*(star[[X, Y]] + star[RATIO + 1 :])):
-        return solution
-    star = star.copy()
-    star[FLUX] *= star[RATIO]
-    star[[X, Y]] += star[RATIO + 1 :]
-    star[RATIO], star[RATIO + 1 :] = 1.0 / star[RATIO], -star[RATIO + 1 :]
-    return replace(solution, stars=(star,))
+def _typical(pull: np.ndarray, model: np.ndarray, used: np.ndarray) -> float:
+    """Return the size of a typical pull on a donut, at least 1: turbulence and missing terms make it larger."""
+    low = float(model[used].min(initial=np.inf))
+    bright = used & (model - low > _BRIGHT * (model.max() - low))
+    return max(1.0, float(RMS_PER_MAD * np.median(np.abs(pull[bright])))) if bright.any() else 1.0
+
+
+def _size(stamp: Stamp, wave: np.ndarray) -> float:
+    """Return the rms radius of a donut over that without the wavefront beside the telescope's."""
+    weights = stamp.rays.weights(wave)
+
+    def radius(landing: np.ndarray) -> float:
+        return float(np.sqrt(weights @ ((landing - weights @ landing) ** 2).sum(axis=1)))
+
+    return radius(stamp.rays.landing(wave)) / max(radius(stamp.rays.landing(np.zeros_like(wave))), 1e-12)
 
 
 def _explained(stamp: Stamp, solution: Solution) -> bool:
-    """Return whether the model explains most of what stands out from a uniform background."""
-    image = stamp.image[stamp.used]
-    variance = stamp.variance[stamp.used] + np.maximum(image, 0.0)
-    weight = 1.0 / np.maximum(variance, 1.0)
-    uniform = float(weight @ (image - (weight @ image) / weight.sum()) ** 2)
+    """Return whether the model explains most of what stands out from a plane background."""
+    used, image = stamp.used, stamp.image[stamp.used]
+    root = 1.0 / np.sqrt(np.maximum(stamp.variance[used] + np.maximum(image, 0.0), 1.0))
+    columns = np.stack([plane[used] for plane in plane_basis(used)], axis=-1) * root[:, None]
+    residual = root * image - columns @ np.linalg.lstsq(columns, root * image, rcond=None)[0]
     count = len(image)
-    return (solution.loss - count) < (1.0 - _EXPLAINED) * max(uniform - count, 0.0)
-
-
-def _beside(stamp: Stamp, solution: Solution) -> float:
-    """Return the fraction of the star's light that lands beside the stamp."""
-    star, wave = solution.stars[0], solution.waves[0]
-    place = stamp.grid.places(star, stamp.rays.landing(wave))
-    outside = np.abs(place) > 0.5 * np.array(stamp.grid.shape[::-1])
-    return float(stamp.rays.weights(wave) @ outside.any(axis=1))
-
-
-def _clipped(full: Stamp, model: np.ndarray, misfit: float) -> np.ndarray:
-    """Return the pixels without those far off the model, cosmic rays and dead ones, and their neighbours."""
-    pull = np.where(full.used, pulls(full, model), 0.0)
-    far = np.abs(pull) > _CLIP * max(1.0, float(np.sqrt(misfit)))
-    return full.used & ~maximum_filter(far, 3) if far.any() else full.used
+    return (solution.loss - count) < (1.0 - _EXPLAINED) * max(float(residual @ residual) - count, 0.0)

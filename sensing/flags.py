@@ -8,17 +8,20 @@ from enum import IntFlag
 class DonutFlag(IntFlag):
     """Outcome of the fit of one donut; zero for a clean one.
 
-    ``BLENDED`` (a second star was fitted too), ``CLIPPED`` (pixels far off the model, cosmic rays for example, were
-    left out), ``POOR_FIT`` (chi-square is far above the number of pixels, so that errors are larger than claimed),
-    ``ORIENTATION`` (stamps of the exposure fit better as mirror images, or turned by quarters; set by the command) and
-    ``RIM_MOVED`` (a rim or a spider stands elsewhere than the prescription has it, and was fitted too) are remarks:
-    there are results. With any other flag the results of the donut are NaN.
+    Seven flags are remarks: the results hold. ``BLENDED``: neighbours were fitted too. ``CLIPPED``: pixels far off the
+    model, not finite or saturated were left out, cosmic rays for example. ``CUT_OFF``: a twentieth of the light or more
+    falls beside the stamp or on regions of it that are not used; errors are those of what remains. ``POOR_FIT``:
+    chi-square is far above the number of pixels, so that errors are larger than claimed. ``OTHER_SIZE``: the donut is
+    larger or smaller than that of the telescope by more than 8 %, as with another defocus or pixel size. ``RIM_MOVED``:
+    a rim or a spider stands elsewhere than the prescription has it, and was fitted too. ``ORIENTATION``: stamps of the
+    exposure fit better as mirror images, or turned by quarters (set by the command).
 
-    ``NO_DONUT``: nothing like a donut stands on the stamp. ``CUT_OFF``: more than a twentieth of the light falls beside
-    the stamp. ``SATURATED``: too many pixels are saturated. ``DEFOCUS_SIGN``: the image fits the other side of focus
-    better. ``OUTSIDE_FIELD``: the telescope does not cover the field. ``NO_LIGHT``: no light passes the telescope
-    there, or the chief ray does not reach a CCD. ``TOO_FEW_PHOTONS``: fewer photons than unknowns.
-    ``NOT_FINITE``: an unmasked pixel is not a finite number. ``NOT_CONVERGED``: the fit did not converge.
+    With any other flag the results of the donut are NaN. ``NO_DONUT``: nothing like a donut stands on the stamp.
+    ``MOSTLY_LOST``: more than 55 % of the light falls beside the stamp or on pixels that are not used. ``SATURATED``,
+    ``NOT_FINITE``: pixels that are saturated or not finite are the reason why the remaining ones have no result.
+    ``DEFOCUS_SIGN``: the image fits the other side of focus better. ``OUTSIDE_FIELD``: the telescope does not cover the
+    field. ``NO_LIGHT``: no light passes the telescope there, or the chief ray does not reach a CCD.
+    ``TOO_FEW_PHOTONS``: fewer photons than unknowns. ``NOT_CONVERGED``: the fit did not converge.
     """
 
     OK = 0
@@ -34,6 +37,8 @@ class DonutFlag(IntFlag):
     NOT_FINITE = 512
     NOT_CONVERGED = 1024
     POOR_FIT = 2048
+    MOSTLY_LOST = 4096
+    OTHER_SIZE = 8192
     RIM_MOVED = 16384
     ORIENTATION = 65536
 
@@ -49,4 +54,12 @@ class DonutFlag(IntFlag):
 
 
 #: Flags with which the results hold.
-_REMARKS = DonutFlag.BLENDED | DonutFlag.CLIPPED | DonutFlag.POOR_FIT | DonutFlag.RIM_MOVED | DonutFlag.ORIENTATION
+_REMARKS = (
+    DonutFlag.BLENDED
+    | DonutFlag.CLIPPED
+    | DonutFlag.CUT_OFF
+    | DonutFlag.POOR_FIT
+    | DonutFlag.OTHER_SIZE
+    | DonutFlag.RIM_MOVED
+    | DonutFlag.ORIENTATION
+)

@@ -26,17 +26,25 @@ from .seeing import Seeing
 from .stamps import Pixels
 
 #: Unknowns of every star before those of its wavefront: flux [electrons], x and y of the chief ray from the centre of
-#: the detector's stamp [its pixels], background [electrons a pixel of these], strength of the turbulence [1/m].
-NUISANCES = ("flux", "x", "y", "background", "strength")
-#: Further unknowns where there is a second star: its flux over that of the first, and its offset [pixels].
-COMPANION = ("ratio", "offset_x", "offset_y")
-FLUX, X, Y, BACKGROUND, STRENGTH, RATIO = range(6)
+#: the detector's stamp [its pixels], background there [electrons a pixel of these], strength of the turbulence [1/m],
+#: slopes of the background along x and y [electrons a pixel, per pixel].
+NUISANCES = ("flux", "x", "y", "background", "strength", "slope_x", "slope_y")
+#: Further unknowns of each neighbour: its flux over that of the star, and its place from it [pixels].
+NEIGHBOUR = ("ratio", "offset_x", "offset_y")
+#: Most neighbours of a star.
+MOST_NEIGHBOURS = 5
+FLUX, X, Y, BACKGROUND, STRENGTH, SLOPE_X, SLOPE_Y, RATIO = range(8)
 #: Power of the strength of the turbulence that the exponent of its transfer function goes by.
 _EXPONENT_GROWTH = 5.0 / 3.0
 #: Exponent of the air at Nyquist's frequency below which a Gaussian is all of it.
 _NO_AIR = 6e-4
 #: The same below which that of the wavefront's derivatives is: 3 % of the light, wide and smooth, stays where it is.
 _THIN_AIR = 0.2
+
+
+def neighbours_of(unknowns: np.ndarray) -> np.ndarray:
+    """Return a view of the unknowns of the neighbours of a star, shape [n_neighbour, 3]."""
+    return unknowns[RATIO:].reshape(-1, len(NEIGHBOUR))
 
 
 @dataclass(frozen=True)
@@ -117,6 +125,12 @@ class ImageGrid:
         self._exponent = seeing.exponent(np.hypot(*baseline))
         spline = np.sinc(x) ** 4 * np.sinc(y) ** 4
         cell = np.prod(np.sinc(np.tensordot(footprint.T, wave, axes=1) / (2.0 * math.pi)), axis=0)
+        columns, rows = (
+            self.scale * (np.arange(n) - 0.5 * (n - 1) - shift)
+            for n, shift in zip(shape[::-1], pixels.offset, strict=True)
+        )
+        #: Derivatives of the image by level and slopes of the background, over the area of a pixel.
+        self._plane = np.stack(np.broadcast_arrays(1.0, columns, rows[:, None]), axis=-1).astype(np.float32)
         self._detector = (
             square_transfer(wave[0, :1], wave[1, :, :1], side * pixels.width)
             * np.exp(-0.5 * blur**2 * wave[0, :1] ** 2)
@@ -187,7 +201,11 @@ class ImageGrid:
         """Return the image [electrons], shape [ny, nx]; arguments as in :meth:`derivatives`."""
         columns = self._columns(unknowns, light)
         star = columns[..., 0].astype(np.float64)
-        return np.asarray(unknowns[FLUX] * star + unknowns[BACKGROUND] * self.scale**2)
+        return np.asarray(unknowns[FLUX] * star + self._background(unknowns))
+
+    def _background(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return the plane under the stars [electrons], shape [ny, nx]."""
+        return np.asarray(self.scale**2 * (self._plane @ unknowns[[BACKGROUND, SLOPE_X, SLOPE_Y]]))
 
     def derivatives(
         self, unknowns: np.ndarray, light: LandedLight, response: np.ndarray, rates: np.ndarray
@@ -196,8 +214,8 @@ class ImageGrid:
 
         Parameters
         ----------
-        unknowns : ndarray, shape [5] or [8]
-            Values of :data:`NUISANCES`, and of :data:`COMPANION` where there is a second star.
+        unknowns : ndarray, shape [7 + 3 n_neighbour]
+            Values of :data:`NUISANCES`, and of :data:`NEIGHBOUR` for each neighbour.
         light : LandedLight
             Landing points of the light.
         response : ndarray, shape [2, n, n_wave]
@@ -215,12 +233,13 @@ class ImageGrid:
             Scales of the columns.
         """
         columns = self._columns(unknowns, light, response, rates)
-        columns[..., BACKGROUND] = 1.0
+        columns[..., [BACKGROUND, SLOPE_X, SLOPE_Y]] = self._plane
         scales = np.full(columns.shape[-1], unknowns[FLUX])
-        scales[[FLUX, BACKGROUND]] = 1.0, self.scale**2
+        scales[FLUX] = 1.0
+        scales[[BACKGROUND, SLOPE_X, SLOPE_Y]] = self.scale**2
         scales[[X, Y]] /= self.scale
-        level = unknowns[BACKGROUND] * self.scale**2
-        return unknowns[FLUX] * columns[..., FLUX].astype(np.float64) + level, columns, scales
+        image = unknowns[FLUX] * columns[..., FLUX].astype(np.float64) + self._background(unknowns)
+        return image, columns, scales
 
     def _columns(
         self,
@@ -279,19 +298,19 @@ class ImageGrid:
             wave = gradient @ moved / np.float32(self.pixel)
             return [star, along, growth, wave, splines @ (amplitude * rates).astype(np.float32)]
 
-        first = of_one_star(points)
+        stars = of_one_star(points)
         extra: list[np.ndarray] = []
-        if len(unknowns) > RATIO:
-            ratio = np.float32(unknowns[RATIO])
-            second = of_one_star(points + unknowns[RATIO + 1 :] / self.scale)
-            extra = [second[0], ratio / np.float32(self.scale) * second[1]]
-            first = [a + ratio * b for a, b in zip(first, second, strict=True)]
+        for flux_ratio, *offset in neighbours_of(unknowns):
+            ratio = np.float32(flux_ratio)
+            neighbour = of_one_star(points + np.array(offset) / self.scale)
+            if response is not None:
+                extra += [neighbour[0], ratio / np.float32(self.scale) * neighbour[1]]
+            stars = [a + ratio * b for a, b in zip(stars, neighbour, strict=True)]
         if response is None:
-            return self._core.pixels(first[0])
-        star, along, growth, wave, shifts = first
-        return self._core.pixels(
-            np.concatenate([star, along, np.zeros_like(star), growth, *extra, wave, shifts], axis=1)
-        )
+            return self._core.pixels(stars[0])
+        star, along, growth, wave, shifts = stars
+        level, slopes = np.zeros_like(star), np.zeros_like(along)
+        return self._core.pixels(np.concatenate([star, along, level, growth, slopes, *extra, wave, shifts], axis=1))
 
     def _spectra(
         self,
@@ -317,19 +336,19 @@ class ImageGrid:
         spectra *= whole
         if light.at_rims is not None:
             self._diffract(spectra, grown, unknowns, light.at_rims)
-        extra = []
-        if len(unknowns) > RATIO:
-            turn = np.exp(1j * np.tensordot(unknowns[RATIO + 1 :], self._phase, axes=1))
-            shift = turn.astype(np.complex64)[..., None]
-            second = spectra[..., :1] * shift
-            turns = [(1j * unknowns[RATIO] * p).astype(np.complex64)[..., None] for p in self._phase]
-            extra = [second, *(turn * second for turn in turns)]
-            both_stars = 1.0 + np.float32(unknowns[RATIO]) * shift
-            spectra, grown = spectra * both_stars, grown * both_stars
+        extra, all_stars = [], None
+        for ratio, *offset in neighbours_of(unknowns):
+            shift = np.exp(1j * np.tensordot(offset, self._phase, axes=1)).astype(np.complex64)[..., None]
+            neighbour = spectra[..., :1] * shift
+            turns = [(1j * ratio * p).astype(np.complex64)[..., None] for p in self._phase]
+            extra += [neighbour, *(turn * neighbour for turn in turns)]
+            all_stars = (1.0 if all_stars is None else all_stars) + np.float32(ratio) * shift
+        if all_stars is not None:
+            spectra, grown = spectra * all_stars, grown * all_stars
         if response is None:
             return spectra
-        uniform = np.zeros_like(grown)
-        return np.concatenate([spectra[..., :3], uniform, grown, *extra, spectra[..., 3:]], axis=-1)
+        level, slopes = np.zeros_like(grown), np.zeros_like(spectra[..., :2])
+        return np.concatenate([spectra[..., :3], level, grown, slopes, *extra, spectra[..., 3:]], axis=-1)
 
     def _diffract(self, spectra: np.ndarray, grown: np.ndarray, unknowns: np.ndarray, rims: RimsAt) -> None:
         """Add what is diffracted at the rims to the spectra of the star and of its derivatives."""

@@ -33,7 +33,7 @@ _SPIDER_TURN = 0.035
 _THICKNESS = 0.1
 #: Most standard deviations that a rim is moved by at once.
 _MOST = 3.0
-#: Radii and centres that differ by less, over the radius, are of one body: both faces of a lens, a baffle and its mirror.
+#: Radii and centres that differ by less, over the radius, are of one body, such as both faces of a lens.
 _ALIKE = 5e-3
 #: Points across the pupil for the places of the light on the surfaces.
 _SURVEY = 32

@@ -41,11 +41,14 @@ _MEANINGS = {
     "flux": "light of the star",
     "x": "place of the chief ray from the centre of the stamp",
     "y": "place of the chief ray from the centre of the stamp",
-    "background": "uniform level left on the stamp",
+    "background": "level of the background at the centre of the stamp",
+    "background_slope_x": "slope of the background along x",
+    "background_slope_y": "slope of the background along y",
     "fwhm": "full width at half maximum of the long exposure",
     "chi2": "sum of squares of the residuals over their variance",
     "n_pixels": "number of the pixels in that sum",
-    "companion_ratio": "flux of the second star of a blend over that of the first",
+    "n_companions": "number of neighbours that were fitted too",
+    "companion_ratio": "flux of the brightest neighbour over that of the star",
 }
 
 
@@ -69,7 +72,9 @@ class DonutFit(Result):
     center, center_error : ndarray, shape [n, 2]
         Place (x, y) of the chief ray from the centre of the stamp [pixels].
     background : ndarray, shape [n]
-        Uniform level left on the stamp [electrons a pixel].
+        Background at the centre of the stamp [electrons a pixel].
+    background_slope : ndarray, shape [n, 2]
+        Slopes of the background along x and y [electrons a pixel, per pixel].
     fwhm, fwhm_error : ndarray, shape [n]
         Full width at half maximum of the long exposure [rad]; of zero error where it was given.
     chi2 : ndarray, shape [n]
@@ -78,8 +83,9 @@ class DonutFit(Result):
         Number of the pixels in that sum.
     flags : ndarray of int, shape [n]
         :class:`DonutFlag` bits.
-    companion : ndarray, shape [n, 3]
-        Second star of a blend: flux over that of the first, and place (x, y) from it [pixels]; else NaN.
+    companions : ndarray, shape [n, 5, 3]
+        Neighbours of a blend, the brightest first: flux over that of the star, and place (x, y) from it [pixels]; NaN
+        beyond those found.
     images, model : ndarray, shape [n, ny, nx]
         Stamps and their best models [electrons]; NaN beside smaller stamps, and models of flagged donuts are NaN.
     used : ndarray of bool, shape [n, ny, nx]
@@ -114,12 +120,13 @@ class DonutFit(Result):
     center: np.ndarray
     center_error: np.ndarray
     background: np.ndarray
+    background_slope: np.ndarray
     fwhm: np.ndarray
     fwhm_error: np.ndarray
     chi2: np.ndarray
     n_pixels: np.ndarray
     flags: np.ndarray
-    companion: np.ndarray
+    companions: np.ndarray
     images: np.ndarray
     model: np.ndarray
     used: np.ndarray
@@ -212,9 +219,12 @@ class DonutFit(Result):
         for axis, name in enumerate("xy"):
             table[name], table[f"{name}_err"] = self.center[:, axis] * u.pix, self.center_error[:, axis] * u.pix
         table["background"] = self.background * u.electron / u.pix
+        for axis, name in enumerate("xy"):
+            table[f"background_slope_{name}"] = self.background_slope[:, axis] * u.electron / u.pix**2
         table["fwhm"], table["fwhm_err"] = arcseconds(self.fwhm) * u.arcsec, arcseconds(self.fwhm_error) * u.arcsec
         table["chi2"], table["n_pixels"] = self.chi2, self.n_pixels
-        table["companion_ratio"] = self.companion[:, 0]
+        table["n_companions"] = np.isfinite(self.companions[:, :, 0]).sum(axis=1)
+        table["companion_ratio"] = self.companions[:, 0, 0]
         for k, j in enumerate(self.noll):
             table[f"Z{j}"], table[f"Z{j}_err"] = self.zernikes[:, k] * 1e9 * u.nm, self.errors[:, k] * 1e9 * u.nm
         for name in table.colnames:
@@ -247,7 +257,8 @@ class DonutFit(Result):
             "fwhm_arcsec": arcseconds(self.fwhm),
             "chi2": self.chi2,
             "n_pixels": self.n_pixels,
-            "companion_ratio": self.companion[:, 0],
+            "background_slope_electrons": self.background_slope,
+            "companions": self.companions,
             "moved_rims": [
                 {"donut": int(row["donut"]), "rim": str(row["rim"])}
                 | {f"{name}_mm": float(row[name].to_value("mm")) for name in ("outward", "outward_err")}

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from .image_model import FLUX, RATIO, STRENGTH
+from .image_model import FLUX, STRENGTH, neighbours_of
 from .likelihood import NormalEquations, Stamp, normal_equations
 
 #: A step that is to lower twice the negative logarithm of the likelihood by less, per unit of chi-square a pixel, is
@@ -225,8 +225,8 @@ def _bounded(joined: np.ndarray, sizes: list[int], held: np.ndarray) -> np.ndarr
         joined[first + FLUX] = max(joined[first + FLUX], 1e-3)
         if not held[first + STRENGTH]:
             joined[first + STRENGTH] = np.clip(joined[first + STRENGTH], _LEAST_STRENGTH, 100.0)
-        if size > RATIO:
-            joined[first + RATIO] = max(joined[first + RATIO], 0.0)
+        ratios = neighbours_of(joined[first : first + size])[:, 0]
+        np.maximum(ratios, 0.0, out=ratios)
     return joined
 
 

@@ -1,23 +1,23 @@
-"""Pixels of stamps: smoothing, cosmic rays on donuts, and the search for donuts by their template."""
+"""Pixels of stamps: smoothing, sums, and the search for donuts by their template."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d, maximum_filter, median_filter, minimum_filter
+from scipy.ndimage import gaussian_filter1d
 from scipy.signal import fftconvolve
 
 from ..core.statistics import RMS_PER_MAD
 
-#: A pixel this many standard deviations above its neighbours is no part of a donut, if it is as much brighter, too.
-_SIGMA = 8.0
-#: Least excess of such a pixel over the light of its neighbours.
-_CONTRAST = 1.0
 #: Rms of the Gaussian before sampling, in new pixels.
 _SMOOTHING = 1.0
-#: Least part of its weight on used pixels.
+#: Weight of the Gaussian on used pixels from which on their mean is a value of its centre.
 _MOSTLY_USED = 0.9
+#: The same where the used pixels lie all around the centre, as between scattered bad ones.
+_HALF_USED = 0.5
+#: Distance of the mean of such pixels from the centre [new pixels]: at straight edges it is 0.3 at a weight of 0.8.
+_OFF_CENTRE = 0.1
 #: Least part of the squared template that must lie on the stamp.
 _ON_STAMP = 0.1
 #: Least variance of a pixel [electron^2] in the search for donuts: pixels without any noise are not real.
@@ -78,6 +78,10 @@ class Pixels:
         ]
         # Near the edges of the stamp and of masked regions values are those of places farther in.
         used = weight > _MOSTLY_USED
+        if not self.used.all() and min(weight.shape) > 1:
+            # The mean place of a Gaussian's weight goes with the gradient of that weight.
+            slopes = np.gradient(weight)
+            used |= (weight > _HALF_USED) & (_SMOOTHING**2 * np.hypot(*slopes) < _OFF_CENTRE * weight)
         offset = (lost[1], lost[0])
         even = bool((self.variance == self.variance[0, 0]).all())
         variance = self.variance[0, 0] * weight if even else sampled(self.variance)
@@ -97,47 +101,103 @@ class Pixels:
         return Pixels(image, variance, unused == 0, side, side, 0.0, (offset[0], offset[1]))
 
 
-def without_cosmic_rays(pixels: Pixels) -> Pixels:
-    """Return the pixels of a donut without those far above all of their neighbourhood."""
-    # A median is no less than the least value: where nothing stands out beyond that, there is no cosmic ray.
-    least = np.maximum(maximum_filter(minimum_filter(pixels.image, 5, mode="nearest"), 5), 0.0)
-    if not (pixels.image > (1.0 + _CONTRAST) * least + _SIGMA * np.sqrt(least + pixels.variance)).any():
-        return pixels
-    middle = median_filter(pixels.image, 5, mode="nearest")
-    # A donut is as bright nearby as here; a median over its edge is fainter.
-    level = np.maximum(maximum_filter(middle, 5), 0.0)
-    noise = np.sqrt(level + pixels.variance)
-    high = pixels.image > (1.0 + _CONTRAST) * level + _SIGMA * noise
-    used = pixels.used & ~maximum_filter(high, 3)
-    return Pixels(np.where(used, pixels.image, 0.0), pixels.variance, used)
+def plane_basis(used: np.ndarray) -> np.ndarray:
+    """Return orthonormal planes over the used pixels of an image, zero elsewhere, shape [3, ny, nx]."""
+    ny, nx = used.shape
+    y, x = np.meshgrid(np.linspace(-1.0, 1.0, ny), np.linspace(-1.0, 1.0, nx), indexing="ij")
+    basis = np.zeros((3, ny, nx))
+    if used.sum() >= len(basis):
+        basis[:, used] = np.linalg.qr(np.stack([np.ones_like(x), x, y], axis=-1)[used])[0].T
+    return basis
 
 
 @dataclass(frozen=True)
 class Match:
-    """Place where a template fits best: offset (x, y) [pixels], flux [electrons] and signal over noise."""
+    """Place where a template fits best above a plane.
+
+    Attributes
+    ----------
+    x, y : float
+        Offset of the template [pixels].
+    flux : float
+        Its flux [electrons].
+    significance : float
+        Signal over noise.
+    plane : ndarray, shape [3]
+        Level at the middle of the image, and slopes along x and y [electrons a pixel, and per pixel].
+    """
 
     x: float
     y: float
     flux: float
     significance: float
+    plane: np.ndarray
 
 
-def match_template(image: np.ndarray, used: np.ndarray, variance: np.ndarray, template: np.ndarray) -> Match:
-    """Return the whole-pixel place of a template of unit flux on an image, and its flux by least squares."""
-    mirrored = template[::-1, ::-1]
-    overlap = fftconvolve(used.astype(np.float64), mirrored**2)
-    product = fftconvolve(np.where(used, image, 0.0), mirrored)
-    enough = overlap > _ON_STAMP * float((template**2).sum())
+def match_template(
+    image: np.ndarray,
+    used: np.ndarray,
+    variance: np.ndarray,
+    template: np.ndarray,
+    measured: float = 0.0,
+    least_on_stamp: float = _ON_STAMP,
+) -> Match:
+    """Return the whole-pixel place of a template of unit flux, its flux and the plane under it by least squares.
+
+    Parameters
+    ----------
+    image, used, variance, template : ndarray, shape [ny, nx]
+        Pixels, those that count, the variance claimed for them [electron^2], and the template in the middle.
+    measured : float
+        Variance of a pixel by the image itself [electron^2], which counts where it is the larger one.
+    least_on_stamp : float
+        Least part of the squared template on used pixels.
+    """
+    nothing = Match(0.0, 0.0, 0.0, 0.0, np.zeros(3))
+    if not used.any():
+        return nothing
+    mirrored, basis = template[::-1, ::-1], plane_basis(used)
+    whole = float((template**2).sum())
+    pixels = np.where(used, image, 0.0)
+    residual = pixels - np.tensordot(np.tensordot(basis, pixels, 2), basis, 1)
+    # What of the template is no plane tells it from the background.
+    contrast = fftconvolve(used.astype(np.float64), mirrored**2)
+    contrast -= sum(fftconvolve(plane, mirrored) ** 2 for plane in basis)
+    enough = contrast > least_on_stamp * whole
     if not enough.any():
-        return Match(0.0, 0.0, 0.0, 0.0)
-    score = np.where(enough, product / np.sqrt(np.where(enough, overlap, 1.0)), -np.inf)
+        return nothing
+    product = fftconvolve(residual, mirrored)
+    contrast = np.where(enough, contrast, 1.0)
+    score = np.where(enough, product / np.sqrt(contrast), -np.inf)
+    ny, nx = image.shape
     row, column = np.unravel_index(int(np.argmax(score)), score.shape)
-    flux = float(product[row, column] / overlap[row, column])
+    flux = float(product[row, column] / contrast[row, column])
+    place = (int(row) - ny + 1, int(column) - nx + 1)
     # Of the sky and of the star's own light, by the pixels of the template; an image without either has none.
     photons = max(flux, 0.0) * float((template**2).sum() / template.sum())
-    noise = np.sqrt(max(float(np.mean(variance)) + photons, 1e-30))
-    ny, nx = image.shape
-    return Match(float(column - nx + 1), float(row - ny + 1), flux, float(score[row, column] / noise))
+    noise = np.sqrt(max(float(np.mean(variance)) + photons, measured, _LEAST_VARIANCE))
+    background = _plane_of(np.tensordot(basis, pixels - flux * moved(template, *place) * used, 2), basis, used)
+    return Match(float(place[1]), float(place[0]), flux, float(score[row, column] / noise), background)
+
+
+def moved(image: np.ndarray, down: int, right: int) -> np.ndarray:
+    """Return an image moved by whole pixels, zero where nothing comes from."""
+    out = np.zeros_like(image)
+    (to_y, from_y), (to_x, from_x) = (
+        (slice(max(step, 0), n + min(step, 0)), slice(max(-step, 0), n - max(step, 0)))
+        for step, n in zip((down, right), image.shape, strict=True)
+    )
+    out[to_y, to_x] = image[from_y, from_x]
+    return out
+
+
+def _plane_of(components: np.ndarray, basis: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Return level in the middle of an image, and slopes a pixel, of a plane by components on a basis."""
+    values = np.tensordot(components, basis, 1)[used]
+    y, x = np.nonzero(used)
+    middle_y, middle_x = (0.5 * (n - 1) for n in used.shape)
+    columns = np.stack([np.ones(len(x)), x - middle_x, y - middle_y], axis=-1)
+    return np.asarray(np.linalg.lstsq(columns, values, rcond=None)[0])
 
 
 def measured_variance(pixels: Pixels) -> float:
@@ -147,28 +207,3 @@ def measured_variance(pixels: Pixels) -> float:
     """
     steps = np.abs(np.diff(pixels.image, axis=1))[pixels.used[:, 1:] & pixels.used[:, :-1]]
     return float((RMS_PER_MAD * np.median(steps)) ** 2 / 2.0) if steps.size else 0.0
-
-
-def significance_above_sky(
-    image: np.ndarray, used: np.ndarray, variance: np.ndarray, template: np.ndarray, measured: float
-) -> float:
-    """Return the signal over noise of a template where it stands out most from a uniform background of any level.
-
-    Least squares of template and background at every whole-pixel place; :func:`match_template` takes sky that was
-    left in for light of the star. The variance of a pixel is that claimed, or the measured one where that is larger.
-    """
-    mirrored, count = template[::-1, ::-1], int(used.sum())
-    if not count:
-        return 0.0
-    pixels = np.where(used, image - image[used].mean(), 0.0)
-    squared, area = (fftconvolve(used.astype(np.float64), mirrored**power) for power in (2, 1))
-    contrast = squared - area**2 / count
-    enough = np.minimum(squared, contrast) > _ON_STAMP * float((template**2).sum())
-    product = np.where(enough, fftconvolve(pixels, mirrored), 0.0)
-    contrast = np.where(enough, contrast, 1.0)
-    score = product / np.sqrt(contrast)
-    best = int(np.argmax(score))
-    flux = max(float(product.ravel()[best] / contrast.ravel()[best]), 0.0)
-    photons = flux * float((template**2).sum() / template.sum())
-    claimed = float(np.mean(variance)) + photons
-    return float(score.ravel()[best] / np.sqrt(max(claimed, measured, _LEAST_VARIANCE)))

@@ -213,7 +213,7 @@ def test_second_stars_are_survived(behind_focus, wave, ratio, offset):
     )
     # Brute force has noise of its own, which for two bright stars is enough for a remark on chi-square.
     assert fit.reasons[0] in ("blended", "blended, poor fit")
-    assert fit.companion[0, 0] == pytest.approx(ratio, abs=0.02)
+    assert fit.companions[0, 0, 0] == pytest.approx(ratio, abs=0.02)
     error = fit.zernikes[0] - wave[3:]
     assert rss(error) < 4.0 * rss(fit.errors[0])
 
@@ -235,8 +235,8 @@ def test_second_stars_are_not_searched_for_where_there_are_none(behind_focus, wa
         )
         for neighbours in (True, False)
     ]
-    assert fits[0].companion[0, 0] == pytest.approx(0.3, abs=0.03)
-    assert np.isnan(fits[1].companion).all()
+    assert fits[0].companions[0, 0, 0] == pytest.approx(0.3, abs=0.03)
+    assert np.isnan(fits[1].companions).all()
     # What one star does not explain: a second of 30 % of the light, a hundred times the noise.
     assert not fits[1].flags[0] & pachon.DonutFlag.BLENDED
 
