@@ -121,15 +121,19 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
         if thinned is not fitter:
             fitter, start = thinned, thinned.start()
             best = fitter.solve(start.stamp, start.unknowns, tolerance=COARSE)
-    if donut and wavefront:
-        # Light beside a rim looks like a second star otherwise, and like a cosmic ray.
-        solved = fitter.rim_solver(COARSE, lambda moved: moved.stamp(moved.light, start.pixels))
-        fitter, moved_stamp, best = fitter.with_moved_rims(start.stamp, best, _MISFIT, solved, start.unknowns)
-        start = replace(start, stamp=moved_stamp)
+    single = best
     if donut and instrument.model.neighbours:
-        best = fitter.with_neighbours(start, best)
+        best = fitter.with_neighbours(start, single)
     if donut and fitter.other_focus_is_better(start, best):
         return StarFit(DonutFlag.DEFOCUS_SIGN)
+    if donut and wavefront and _misfit(start.stamp, best) > _MISFIT:
+        # A neighbour is quicker to find, but light beside a rim looks like one, and like a cosmic ray.
+        solved = fitter.rim_solver(COARSE, lambda moved: moved.stamp(moved.light, start.pixels))
+        moved, moved_stamp, with_rims = fitter.with_moved_rims(start.stamp, single, _MISFIT, solved, start.unknowns)
+        if with_rims.loss < best.loss:
+            fitter, start, best = moved, replace(start, stamp=moved_stamp), with_rims
+            if instrument.model.neighbours and _misfit(moved_stamp, best) > _MISFIT:
+                best = fitter.with_neighbours(start, best)
     if not _explained(start.stamp, best):
         return StarFit(DonutFlag.NO_DONUT)
     if fitter.lost_light(start.stamp, best).any_pixel > _LOST:
