@@ -39,7 +39,7 @@ def checked_cosines(cosine: ArrayLike) -> np.ndarray:
 
 
 def cosines_at(cosine: ArrayLike, n1: float, n2: float) -> np.ndarray:
-    """Return cosines of angles of incidence as an array; DomainError if one is beyond 1, or an index is of no medium."""
+    """Return cosines of angles of incidence as an array; DomainError if one is beyond 1, or an index is none."""
     for name, index in (("n1", n1), ("n2", n2)):
         if not 0.0 < index <= _HIGHEST_INDEX:
             raise DomainError(f"{name} = {index!r}: expected a refractive index above 0, at most {_HIGHEST_INDEX:g}")
