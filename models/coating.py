@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError
-from .layer_stack import CoatingTable, LayerStack, check_wavelengths, checked_cosines, within_table
+from .layer_stack import CoatingTable, LayerStack, check_wavelengths, cosines_at, within_table
 
 
 @check_arguments
@@ -51,7 +51,7 @@ class Coating:
         n1, n2 : float
             Refractive indices before and behind.
         """
-        return np.full(checked_cosines(cosine, n1, n2).shape, self.at(wavelength))
+        return np.full(cosines_at(cosine, n1, n2).shape, self.at(wavelength))
 
     def at(self, wavelength: ArrayLike) -> np.ndarray:
         """Return the efficiency at wavelengths [m]; a DomainError outside the table."""

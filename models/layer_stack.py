@@ -30,15 +30,20 @@ _HIGHEST_INDEX = 100.0
 _ROUNDING = 1e-9
 
 
-def checked_cosines(cosine: ArrayLike, n1: float, n2: float) -> np.ndarray:
-    """Return cosines of angles of incidence as an array; DomainError if one is beyond 1, or an index is none."""
-    for name, index in (("n1", n1), ("n2", n2)):
-        if not 0.0 < index <= _HIGHEST_INDEX:
-            raise DomainError(f"{name} = {index!r}: expected a refractive index above 0, at most {_HIGHEST_INDEX:g}")
+def checked_cosines(cosine: ArrayLike) -> np.ndarray:
+    """Return cosines of angles of incidence as an array; DomainError if one is beyond 1."""
     cosines = pure_numbers(cosine, "cosine")
     if np.any(np.abs(cosines) > 1.0 + _ROUNDING):
         raise DomainError(f"cosine = {shown(cosine)}: expected -1 to 1, or NaN", key="cosine")
     return cosines
+
+
+def cosines_at(cosine: ArrayLike, n1: float, n2: float) -> np.ndarray:
+    """Return cosines of angles of incidence as an array; DomainError if one is beyond 1, or an index is none."""
+    for name, index in (("n1", n1), ("n2", n2)):
+        if not 0.0 < index <= _HIGHEST_INDEX:
+            raise DomainError(f"{name} = {index!r}: expected a refractive index above 0, at most {_HIGHEST_INDEX:g}")
+    return checked_cosines(cosine)
 
 
 def check_wavelengths(wavelengths: tuple[float, ...], name: str) -> None:
@@ -102,7 +107,7 @@ class CoatingTable:
         n1, n2 : float
             Refractive indices before and behind.
         """
-        cosines = checked_cosines(cosine, n1, n2)
+        cosines = cosines_at(cosine, n1, n2)
         w = within_table(wavelength, self.wavelengths, self.name)
         table = np.array(self.efficiencies)
         row = np.array([np.interp(w, self.wavelengths, column) for column in table.T])
@@ -160,7 +165,7 @@ class LayerStack:
             If an index or the wavelength is not positive.
         """
         require_positive(wavelength, "wavelength", "metres")
-        first = checked_cosines(cosine, n1, n2).astype(np.complex128)
+        first = cosines_at(cosine, n1, n2).astype(np.complex128)
         order = 1 if n1 <= n2 else -1
         films = list(zip(self.indices, self.thicknesses, strict=True))[::order]
         # Beyond the angle of total reflection cosines are imaginary.

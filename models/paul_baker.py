@@ -28,6 +28,9 @@ from .shapes.shape import Conic, Plane, Sphere
 from .surface import Aperture, Interaction, Shape, Surface
 from .telescope import VACUUM, Telescope
 
+#: Least radius of the beam at the secondary over that at the primary.
+_LEAST_COMPRESSION = 1e-3
+
 COPLANAR = 2.0 - math.sqrt(3.0)
 
 
@@ -70,8 +73,8 @@ def paul_baker(
     require_within(diameter, "diameter", 1e-6, 1e3, "m")
     require_within(focal_ratio, "focal_ratio", 0.1, 1e6)
     require_within(field_radius, "field_radius", 1e-9, 1.5, "rad")
-    if not 0 < beam_compression < 0.5:
-        raise DomainError(f"beam_compression = {beam_compression!r}: expected between 0 and 0.5")
+    if not _LEAST_COMPRESSION <= beam_compression < 0.5:
+        raise DomainError(f"beam_compression = {beam_compression!r}: expected {_LEAST_COMPRESSION:g} to 0.5")
     m = beam_compression
     focal_length = focal_ratio * diameter
     f1 = focal_length * (1 - m)

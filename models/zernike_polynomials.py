@@ -76,6 +76,7 @@ def annular_zernikes(jmax: int, x: np.ndarray, y: np.ndarray, obscuration: float
     Returns
     -------
     ndarray, shape [jmax, ...]
+        NaN where a coordinate is NaN, or so large that its powers are.
 
     Raises
     ------

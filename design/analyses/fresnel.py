@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
+from ...core.errors import DomainError
 from ...models.layer_stack import checked_cosines
 
 
@@ -35,7 +36,9 @@ def fresnel_transmission(cosine: ArrayLike, n1: float, n2: float) -> np.ndarray:
     DomainError
         If a cosine is beyond 1, or an index is not positive.
     """
-    return 1.0 - fresnel_reflectivity(checked_cosines(cosine, n1, n2), n1, n2)
+    if not (0 < n1 < np.inf and 0 < n2 < np.inf):
+        raise DomainError(f"n1 = {n1!r}, n2 = {n2!r}: expected positive refractive indices")
+    return 1.0 - fresnel_reflectivity(checked_cosines(cosine), n1, n2)
 
 
 def fresnel_reflectivity(cosine: np.ndarray, before: float, after: float) -> np.ndarray:

@@ -251,8 +251,8 @@ def opd_fans(
         require_positive(abs(radius), "sphere_radius", "metres")
     value = np.stack([b.opd(radius) for b in bundles], axis=1).reshape(len(request.fields), len(bundles), 2, -1)
     lit = _lit(bundles)
-    if lit.any() and not np.isfinite(value[lit]).any():
-        raise DomainError(f"sphere_radius = {radius:g} m: no ray meets the sphere; expected a larger one")
+    if not np.isfinite(value[lit]).all():
+        raise DomainError(f"sphere_radius = {radius:g} m: rays miss the sphere; expected a larger one")
     return OpdFans(request, pupil, lit, value, radius)
 
 

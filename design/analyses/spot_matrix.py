@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 #: Heights of the detector where none are given.
 _HEIGHTS = 5
+#: Most heights of the detector.
+_MOST_HEIGHTS = 1000
 #: Largest of these heights, in depths of focus.
 _DEPTHS = 2.0
 
@@ -175,6 +177,8 @@ def spot_matrix(
         heights = depth * np.linspace(-_DEPTHS, _DEPTHS, _HEIGHTS)
     else:
         heights = np.atleast_1d(metres(defocus, "defocus"))
+    if heights.size > _MOST_HEIGHTS:
+        raise DomainError(f"defocus: {heights.size} heights, expected at most {_MOST_HEIGHTS}")
     if heights.ndim != 1 or not (len(heights) and np.isfinite(heights).all()):
         raise DomainError(f"defocus = {defocus!r}: expected finite heights of the detector in metres")
     weight = np.stack([np.where(b.lit, request.pupil.weights, 0.0) for b in bundles], axis=1)

@@ -34,8 +34,9 @@ if TYPE_CHECKING:
 
 #: Heights where none are given.
 _HEIGHTS = 61
-#: Largest defocus [m]; the distance to the exit pupil, where that is less.
-_FARTHEST = 1e4
+#: Largest defocus over the distance of the exit pupil, and in metres where that is at infinity.
+_FARTHEST = 0.1
+_FARTHEST_AT_INFINITY = 1e4
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,7 @@ def through_focus(
         heights = common + reach * np.linspace(-1.0, 1.0, _HEIGHTS)
     else:
         heights = np.atleast_1d(metres(defocus, "defocus"))
-        farthest = min(abs(request.telescope.sphere_radius), _FARTHEST)
+        farthest = min(_FARTHEST * abs(request.telescope.sphere_radius), _FARTHEST_AT_INFINITY)
         if heights.size and not np.abs(heights).max() <= farthest:
             raise DomainError(f"defocus = {shown(defocus)}: expected at most {farthest:g} m on either side")
         if heights.ndim != 1 or not (np.isfinite(heights).all() and (np.diff(heights) > 0).all() and len(heights)):

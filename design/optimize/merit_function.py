@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, check_choice, shown
+from ...core.units import finite, metres
 from ...models.telescope import Telescope
 from ..metrics.spots import REFERENCES, spot_diagram
 from .merit import Beams, Merit, SpotMerit, WavefrontMerit
@@ -80,6 +81,10 @@ class WavefrontError:
     name: ClassVar[str] = "wavefront"
 
     goal: ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        if self.goal is not None:
+            finite(metres(self.goal, "goal"), "goal")
 
     @property
     def of_one_telescope(self) -> bool:

@@ -21,6 +21,8 @@ from .pixel_checks import check_pixels
 
 # Radius over which the Kron radius is averaged, as in SExtractor [rms axes].
 _KRON_LIMIT = 6.0
+#: Largest value of a pixel: the squares of sums of larger ones are no numbers of SEP, which has single precision.
+_BRIGHTEST = 1e15
 # Radius of the aperture over the Kron radius, as in SExtractor.
 _KRON_FACTOR = 2.5
 # Least radius of the aperture, as in SExtractor [rms axes].
@@ -99,6 +101,8 @@ def detect_objects(
     if ignored.all():
         raise DomainError("mask: expected at least one pixel that is not masked, and finite")
     data = np.where(ignored, 0.0, pixels)
+    if max(float(np.abs(data).max()), float(np.where(ignored, 0.0, variances).max())) > _BRIGHTEST:
+        raise DomainError(f"image, variance: expected numbers of at most {_BRIGHTEST:g}")
     # SEP reads C arrays; masked pixels have any positive variance.
     variances = np.ascontiguousarray(np.where(ignored, 1.0, variances))
     with _sep_memory(data.size):
