@@ -103,9 +103,8 @@ def main() -> None:
         return
     experiment = experiment_of(("all",), *COARSE)
     positions, e = ellipticities(experiment)
-    radius = np.rad2deg(
-        np.hypot(*positions.T) / experiment.field_radius_on_detector * experiment.telescope.field_radius
-    )
+    scale = experiment.telescope.field_radius / experiment.field_radius_on_detector
+    radius = np.rad2deg(scale * np.hypot(*positions.T))
     for low, high in ((0.0, 0.3), (0.9, 1.1), (1.5, 1.7), (1.75, 2.2)):
         ring = np.abs(e[(radius >= low) & (radius < high)])
         print(f"{low:g} to {high:g} deg: mean |e| {ring.mean():.1%}, 95 % below {np.quantile(ring, 0.95):.1%}")
