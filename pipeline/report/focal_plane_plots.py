@@ -43,7 +43,7 @@ _MOST_WHISKERS = 200
 #: Width over height from which on CCDs lie in a row along x; its inverse for y.
 _ROW = 1.6
 #: Letters of a title on an inch of a narrow panel, at most.
-_LETTERS_OF_AN_INCH = 15.0
+_LETTERS_OF_AN_INCH = 17.0
 #: Fewest letters of a line of a title.
 _SHORTEST_LINE = 12
 #: Height of a row of a close-up over the width of its panels, least and most.
