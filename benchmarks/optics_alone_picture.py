@@ -67,7 +67,7 @@ def ellipticities(experiment: Experiment) -> tuple[np.ndarray, np.ndarray]:
 
 def in_turbulence() -> tuple[Experiment, np.ndarray, np.ndarray]:
     """Return the experiment of LSSTCam as built, positions [m], [n, 2], and g1 + i g2 of its PSFs, [n]."""
-    options = {"ccds": ("all",), "focal_plane__heights": "lsstcam", "psf__engine": "long_exposure", "stars__truth": 12}
+    options = {"ccds": ("all",), "focal_plane__heights": "lsstcam", "psf__engine": "long_exposure", "stars__truth": 15}
     experiment = Experiment.from_config(with_options(Configuration(), **options))
     experiment = replace(experiment, focal_plane=moved_whole(experiment.focal_plane, FOCUS))
     positions = np.concatenate([holdout_positions(experiment, name) for name in experiment.config.ccds or ()])
