@@ -98,7 +98,7 @@ def draw(experiment: Experiment, positions: np.ndarray, e: np.ndarray, title: st
     key = key_ellipticity(np.abs(e))
     scale = 0.012 * 2.0 * edge / key
     with styled():
-        figure = new_figure(9.0, 8.3)
+        figure = new_figure(9.0, 8.3, "compressed")
         axes = figure.subplots()
         image = draw_heights(axes, plane, limits, 900, alpha=0.35, bounds=height_range(plane))
         draw_outlines(axes, camera, range(len(camera)), "0.5", 0.5)
