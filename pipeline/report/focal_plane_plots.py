@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 
@@ -39,6 +40,12 @@ from ..summary import ellipticities
 _MANY = 30
 #: Whiskers on one CCD, and a fifth of them where CCDs are many: more make one dark mass.
 _MOST_WHISKERS = 200
+#: Width over height from which on CCDs lie in a row along x; its inverse for y.
+_ROW = 1.6
+#: Letters of a title on an inch of a narrow panel, at most.
+_LETTERS_OF_AN_INCH = 17.0
+#: Fewest letters of a line of a title.
+_SHORTEST_LINE = 12
 #: Height of a row of a close-up over the width of its panels, least and most.
 _TALL = (0.6, 1.6)
 
@@ -89,10 +96,15 @@ def whiskers_plot(
     scale = max(0.33 * half, 0.012 * max(sides)) / key
     across = sides[0] / sides[1]
     with styled():
-        # Panels go under each other where the CCDs lie in a row or are many, beside each other where they do not.
-        stacked = across > 1.6 or len(products) > _MANY
+        # Panels go under each other where CCDs lie in a row along x or are many, beside each other where they do not.
+        stacked = across > _ROW or len(products) > _MANY
+        tall = not stacked and across < 1.0 / _ROW
         wide = 9.0 if len(products) > _MANY else 12.0
-        if stacked:
+        panel_width = (wide - 1.6) * across
+        if tall:
+            figure = new_figure(len(kinds) * (panel_width + 0.35) + 1.6, wide, "compressed")
+            panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
+        elif stacked:
             figure = new_figure(wide, len(kinds) * ((wide - 1.4) / across + 0.45) + 0.3, "compressed")
             panels = figure.subplots(len(kinds), 1, sharex=True, squeeze=False)[:, 0]
         else:
@@ -107,7 +119,12 @@ def whiskers_plot(
             for product in products:
                 _draw_kind(axes, product, kind, scale, 0.8 if len(products) <= _MANY else 0.5, whisker_limit)
             frame_axes(axes, limits, x_label=not stacked or i == len(kinds) - 1, y_label=stacked or i == 0)
-            axes.set_title(_title_with_count(_TITLES[kind], products, kind, whisker_limit), loc="left")
+            title = _title_with_count(_TITLES[kind], products, kind, whisker_limit)
+            if tall:  # above the key, in as many lines as it takes
+                width = max(int(_LETTERS_OF_AN_INCH * panel_width), _SHORTEST_LINE)
+                axes.set_title(textwrap.fill(title, width), loc="left", fontsize=8.0, pad=20.0)
+            else:
+                axes.set_title(title, loc="left")
             draw_key_whisker(axes, key, scale, 1.0)
         _add_height_scale(figure, image, panels, focal_plane, 30)
         return png_bytes(figure)

@@ -6,6 +6,7 @@ import json
 import re
 import struct
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import matplotlib
 import numpy as np
@@ -185,3 +186,31 @@ def test_lines_of_the_paper_are_for_the_lsst(monkeypatch):
     lines = [[t.get_text() for t in f.axes[0].texts if t.get_text().startswith("paper")] for f in figures]
     assert lines[0]
     assert not lines[1]
+
+
+def test_whiskers_of_a_column_of_ccds_fit_on_a_page(monkeypatch):
+    """Nine CCDs along y, as of the default run, were drawn 32 inches tall."""
+    figures = []
+    monkeypatch.setattr(focal_plane_plots, "png_bytes", lambda figure: figures.append(figure) or b"")
+    plane = FocalPlane.flat()
+    names = [name for name, (x, y) in zip(plane.camera.ccd_names, plane.camera.centers, strict=True) if abs(x) < 1e-3]
+
+    class Stars:
+        def __init__(self, center):
+            self.x, self.y = center[:, None] + np.linspace(-0.01, 0.01, 3)
+
+        def __len__(self):
+            return 3
+
+    def product(name):
+        stars = Stars(plane.camera.centers[plane.camera.ccd_index(name)])
+        return SimpleNamespace(
+            name=name, stars=lambda kind: stars, ellipticity=lambda kind, moments="e": np.full((2, 3), 0.01)
+        )
+
+    focal_plane_plots.whiskers_plot([product(name) for name in names[-9:]], plane, 0.317)
+    width, height = figures[0].get_size_inches()
+    assert 4.0 < width < height <= 12.0
+    panels = figures[0].axes[:3]
+    assert len({axes.get_ylim() for axes in panels}) == 1
+    assert panels[2].get_title(loc="left").count("\n") == 1
