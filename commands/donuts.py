@@ -27,6 +27,8 @@ from .tables import Rows, print_json
 if TYPE_CHECKING:
     import numpy as np
 
+    from ..models.telescope import Telescope
+    from ..sensing.model import DonutModel
     from ..sensing.result import DonutFit
     from ..sensing.wavefront_fits import WavefrontFit
 
@@ -81,6 +83,22 @@ def donuts_command(
         bool, Option(help="Diffraction at the rims of the pupil: not in images made of rays alone.")
     ] = True,
     projection: Projection = "zemax",
+    simulate: Annotated[
+        bool, Option("--simulate", help="Write FILE.fits with donuts of the telescope instead.")
+    ] = False,
+    perturb: Annotated[
+        list[str] | None,
+        Option(metavar="BODY.MOTION=SIZE", help="Of --simulate, what is wrong with the telescope: M2.dx=200um."),
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Of --simulate: stars, layout (random, corners), sides (1, 2), seeing_arcsec, electrons, sky, "
+            "read_noise, stamp, seed.",
+        ),
+    ] = None,
     out: Annotated[Path | None, Option("--out", "-o", help="Table: .ecsv, .fits, .csv or .parquet.")] = None,
     picture: Annotated[Path | None, Option(help="Picture of the first six donuts: .png, .pdf or .svg.")] = None,
     glass_catalogue: GlassCatalogues = None,
@@ -100,6 +118,8 @@ def donuts_command(
 
     - `pachon donuts donuts.fits --defocus-um 1500 -o wavefronts.ecsv --picture donuts.png`
     - `pachon donuts full_array.fits --moved Camera --defocus-um 1500`
+    - `pachon donuts try.fits --simulate --moved Camera --defocus-um 1500 --perturb M2.dx=200um --set stars=8`, then
+      `pachon donuts try.fits`: without data of your own; true_Z4 ... stand in the file's table
     - `pachon donuts corner_*.fits -t rubin_v3.14_i --degrees-of-freedom lsst --json`
     - `pachon donuts ccd.fits --positions stars.ecsv --stamp 200 --defocus-um -1500`
     """
@@ -111,6 +131,21 @@ def donuts_command(
     from ..sensing.wavefront_fits import SingleDonuts
     from ..wavefront.atmosphere.atmosphere import Atmosphere
 
+    if simulate:
+        detector = DonutDetector(pixel_um * 1e-6, defocus=1e-6 * defocus_um, moved=moved or DETECTOR)
+        air = DonutAir(outer_scale=outer_scale_m)
+        _simulate(
+            files,
+            load_model(telescope, lenient, glass_catalogue or ()),
+            DonutModel(air=air, detector=detector),
+            (perturb or [], settings or []),
+            wavelength_nm,
+            field_deg,
+            quiet,
+        )
+        return
+    if perturb or settings:
+        raise ConfigError("--perturb, --set: expected them with --simulate alone")
     kind = _output_kind(out, picture)
     believed = load_model(telescope, lenient, glass_catalogue or ())
     noll = range(4, terms + 1)
@@ -151,6 +186,32 @@ def donuts_command(
         print_json(fit.summary())
     elif not quiet:
         _show(fit)
+
+
+def _simulate(
+    files: list[Path],
+    telescope: Telescope,
+    model: DonutModel,
+    texts: tuple[list[str], list[str]],
+    wavelength_nm: list[float] | None,
+    field_deg: str | None,
+    quiet: bool,
+) -> None:
+    """Write a file of donuts: telescope as it is believed to be, model, and texts of its errors and of the scene."""
+    import numpy as np
+
+    from ..pipeline.simulate.donut_file import DonutScene, changed_telescope, simulate_donuts, write_donuts
+
+    if len(files) != 1 or files[0].suffix.lower() not in (".fits", ".fit"):
+        raise ConfigError("--simulate: expected one FILE.fits to write", file=files[-1])
+    scene, true = DonutScene.of(texts[1]), changed_telescope(telescope, texts[0])
+    model = model.with_light(wavelength_list(telescope, wavelength_nm, None))
+    field = None if field_deg is None else np.deg2rad(degrees_pair(field_deg, "--field-deg"))
+    with interruptible(quiet) as reporter, reporter.stage("donuts"):
+        donuts = simulate_donuts(telescope, true, scene, model, field)
+    write_donuts(files[0], donuts, scene, model, telescope.name)
+    if not quiet:
+        typer.echo(f"{files[0]}: {len(donuts.fields)} donuts, moved: {model.detector.moved}")
 
 
 def _output_kind(table: Path | None, picture: Path | None) -> str:
