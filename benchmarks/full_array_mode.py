@@ -1,13 +1,13 @@
-"""A donut on each CCD: the detector moved 1.5 mm out of focus, to one side and the other, as in full-array mode.
+"""A donut on each CCD: the camera moved 1.5 mm out of focus, to one side and the other, as in full-array mode.
 
-Run: python benchmarks/full_array_mode.py [CCDs] [sides] [picture.png] [electrons]
+Run: python benchmarks/full_array_mode.py [CCDs] [sides] [picture.png] [electrons] [moved]
 
 The LSST (r band), off by twice the tolerances of ``pachon align`` in each of fifty degrees of freedom, exposes one
 star (5e6 electrons by default) on each of so many CCDs (all by default), with the heights of the camera as built, its
-detector 1.5 mm behind the focus, and with ``sides`` 2 (the default) in front of it too. The observatory moves the
-camera instead, which differs by up to 350 nm (docs/donuts.md, "Which body moves"). All donuts together give the degrees
-of freedom (``fit_donuts(fit=TelescopeFreedoms(...))``). Printed: the wavefront over the field before and after they are
-taken off, what the covariance of the fit expects, and processor time and memory.
+camera moved by +1.5 mm, and with ``sides`` 2 (the default) by -1.5 mm too; ``moved`` names another body (Detector), in
+the images and in the fit. All donuts together give the degrees of freedom
+(``fit_donuts(fit=TelescopeFreedoms(...))``). Printed: the wavefront over the field before and after they are taken off,
+what the covariance of the fit expects, and processor time and memory.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ from pachon.studies.alignment.scene import AlignmentScene
 
 COUNT = int(sys.argv[1]) if len(sys.argv) > 1 else 189
 SIDES = int(sys.argv[2]) if len(sys.argv) > 2 else 2
-PICTURE = sys.argv[3] if len(sys.argv) > 3 else None
+PICTURE = sys.argv[3] if len(sys.argv) > 3 and sys.argv[3] != "-" else None
 ELECTRONS = float(sys.argv[4]) if len(sys.argv) > 4 else 5e6
+MOVED = sys.argv[5] if len(sys.argv) > 5 else "Camera"
 DEFOCUS, SKY, READ_NOISE, DIFFUSION = 1.5e-3, 300.0, 8.8, 4e-6
 
 
@@ -47,7 +48,7 @@ def main() -> None:
     images, defocus = [], []
     start = time.process_time()
     for side in (1.0, -1.0)[:SIDES]:
-        moved = true.perturbed("Detector", shift=(0.0, 0.0, side * DEFOCUS))
+        moved = true.perturbed(MOVED, shift=(0.0, 0.0, side * DEFOCUS))
         images.append(
             pachon.draw_donuts(
                 moved,
@@ -74,7 +75,9 @@ def main() -> None:
         scene.wavelengths,
         sky_variance=SKY + READ_NOISE**2,
         model=pachon.DonutModel(
-            detector=pachon.DonutDetector(diffusion=DIFFUSION, focal_plane=heights, defocus=np.concatenate(defocus)),
+            detector=pachon.DonutDetector(
+                diffusion=DIFFUSION, focal_plane=heights, defocus=np.concatenate(defocus), moved=MOVED
+            ),
             diffraction=True,
         ),
         fit=pachon.TelescopeFreedoms(freedoms, prior=prior),
@@ -85,7 +88,7 @@ def main() -> None:
     expected = scene.expected_wavefront(found.covariance / np.outer(scene.tolerances, scene.tolerances))
     before, after = (1e9 * scene.quality.means(t).added for t in (true, left))
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    print(f"pachon {pachon.__version__}; {fit.usable.sum()} of {SIDES * count} donuts used")
+    print(f"pachon {pachon.__version__}; {MOVED} moved; {fit.usable.sum()} of {SIDES * count} donuts used")
     error = found.values - state * scene.tolerances
     quality = error @ np.linalg.solve(found.covariance, error) / len(error)
     print(f"chi-square of the errors: {quality:.2f} a degree of freedom")

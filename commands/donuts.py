@@ -20,6 +20,7 @@ from .donut_inputs import (
     donut_inputs,
 )
 from .donut_report import motion_rows, observatory_summary, orientation_text
+from .donut_simulation import simulate_file
 from .inputs import load_model
 from .interrupt import interruptible
 from .options import GlassCatalogues, Json, Lenient, Projection, Quiet, Threads, picture_kind, wavelength_list
@@ -38,6 +39,7 @@ _FILES = "Files and their planes"
 _TELESCOPE = "Telescope, light, detector"
 _FRAMES = "Frames and conventions"
 _FIT = "Fit"
+_SIMULATION = "Simulated donuts"
 _OUTPUT = "Output"
 #: Field angle from which on a donut tells its orientation, as a fraction of the telescope's field.
 _OFF_AXIS = 0.25
@@ -195,6 +197,28 @@ def donuts_command(
         Option(help="Warn where mirrored or turned stamps fit better; 1 to 3 s.", rich_help_panel=_FRAMES),
     ] = True,
     projection: Projection = "zemax",
+    simulate: Annotated[
+        bool,
+        Option("--simulate", help="Write FILE.fits with donuts of the telescope instead.", rich_help_panel=_SIMULATION),
+    ] = False,
+    perturb: Annotated[
+        list[str] | None,
+        Option(
+            metavar="BODY.MOTION=SIZE",
+            help="Of --simulate, what is wrong with the telescope: M2.dx=200um.",
+            rich_help_panel=_SIMULATION,
+        ),
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Of --simulate: stars, layout (random, corners), sides (1, 2), seeing_arcsec, electrons, sky, "
+            "read_noise, stamp, seed.",
+            rich_help_panel=_SIMULATION,
+        ),
+    ] = None,
     out: Annotated[
         Path | None, Option("--out", "-o", help="Table: .ecsv, .fits, .csv or .parquet.", rich_help_panel=_OUTPUT)
     ] = None,
@@ -222,6 +246,8 @@ def donuts_command(
 
     - `pachon donuts donuts.fits --defocus-um 1500 -o wavefronts.ecsv --picture donuts.png`
     - `pachon donuts full_array.fits --moved Camera --defocus-um 1500`
+    - `pachon donuts try.fits --simulate --moved Camera --defocus-um 1500 --perturb M2.dx=200um --set stars=8`, then
+      `pachon donuts try.fits`: without data of your own; true_Z4 ... stand in the file's table
     - `pachon donuts corner_*.fits -t rubin_v3.14_i --degrees-of-freedom lsst --json`
     - `pachon donuts ccd.fits --positions stars.ecsv --stamp 200 --defocus-um -1500`
     - `pachon donuts donutStamps.fits --frame CCS --convention ts_wep` (as LSST's zk_deviation_CCS)
@@ -238,6 +264,22 @@ def donuts_command(
     from ..sensing.wavefront_fits import SingleDonuts
     from ..wavefront.atmosphere.atmosphere import Atmosphere
 
+    if simulate:
+        side = (pixel_um or DEFAULT_PIXEL_UM) * 1e-6
+        detector = DonutDetector(side, defocus=1e-6 * defocus_um, moved=moved or DETECTOR)
+        air = DonutAir(outer_scale=outer_scale_m)
+        simulate_file(
+            files,
+            load_model(telescope or DEFAULT_TELESCOPE, lenient, glass_catalogue or ()),
+            DonutModel(air=air, detector=detector),
+            (perturb or [], settings or []),
+            wavelength_nm,
+            field_deg,
+            quiet,
+        )
+        return
+    if perturb or settings:
+        raise ConfigError("--perturb, --set: expected them with --simulate alone")
     kind = _output_kind(out, picture)
     check_choice("--convention", convention, CONVENTIONS)
     files_read = StampFiles.read(files, positions, stamp, mask, variance)

@@ -95,6 +95,17 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
         (["plain.fits", "--picture", "a.gif"], "expected a name that ends in .png"),
         (["plain.fits", "-t", "no_such_telescope"], "no_such_telescope"),
         (["plain.fits", "--positions", "text.fits"], "text.fits: cannot be read as a table"),
+        (
+            ["plain.fits", "--field-deg", "0,1", "--moved", "Mirror"],
+            "moved = 'Mirror': expected a group of lsst_v3.3_r (",
+        ),
+        (["plain.fits", "--perturb", "M2.dx=1um"], "--perturb, --set: expected them with --simulate"),
+        (["new.fits", "--simulate"], "--defocus-um = 0: expected a shift that makes donuts"),
+        (["new.fits", "--simulate", "--perturb", "M2.dx"], "--perturb = 'M2.dx': expected a parameter and its change"),
+        (["new.fits", "--simulate", "--perturb", "M2.dx=1arcsec"], "--perturb = 'M2.dx=1arcsec': expected a size in m"),
+        (["new.fits", "--simulate", "--set", "star=2"], "--set: unknown key star = 2"),
+        (["new.fits", "--simulate", "--set", "stars"], "--set = 'stars': expected key=value"),
+        (["new.txt", "--simulate"], "new.txt: --simulate: expected one FILE.fits"),
     ],
 )
 def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, part):
@@ -109,3 +120,35 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, part):
     assert captured.err.startswith("pachon: error: ")
     assert part in captured.err
     assert captured.err.count("\n") == 1
+
+
+@pytest.mark.long
+def test_a_simulated_file_is_one_that_the_command_reads(tmp_path, monkeypatch, capsys):
+    """A decentred M2 under a moved camera: file and fit know what moved, and the file has the truth."""
+    monkeypatch.chdir(tmp_path)
+    simulate = ["donuts", "try.fits", "--simulate", "--moved", "Camera", "--defocus-um", "-1500", "--pixel-um", "20"]
+    scene = ["--perturb", "M2.dx=0.2mm", "--set", "stars=1", "--set", "stamp=91", "--set", "seed=3"]
+    assert main([*simulate, *scene, "--quiet"]) == 0
+    assert main(["donuts", "try.fits", "--pixel-um", "20", "--zernikes", "11", "--higher-order-nm", "0", "--json"]) == 0
+    fitted = json.loads(capsys.readouterr().out)
+    assert fitted["reasons"] == [""]
+    row = Table.read("try.fits", hdu=1)[0]
+    assert row["moved"] == "Camera"
+    assert row["defocus_um"] == -1500.0
+    # The truth by tracing, in the words of the API.
+    believed = pachon.load_telescope("lsst_v3.3_r")
+    field = np.deg2rad([[row["field_x"], row["field_y"]]])
+    before, after = (
+        pachon.wavefront_zernikes(t, field, jmax=22).coefficients[0]
+        for t in (believed, believed.perturbed("M2", shift=(2e-4, 0.0, 0.0)))
+    )
+    truth = np.array([row[f"true_Z{j}"] for j in range(4, 23)])
+    np.testing.assert_allclose(truth, 1e9 * (after - before)[3:22], atol=1e-6)
+    assert np.linalg.norm(truth) > 100.0
+    # A moved detector would be wrong by some 100 nm, photons leave some 40.
+    error, claimed = np.array(fitted["zernike_nm"][0]) - truth[:8], np.array(fitted["zernike_error_nm"][0])
+    assert np.linalg.norm(error) < 2.5 * np.linalg.norm(claimed)
+    # The same seed makes the same bytes.
+    first = (tmp_path / "try.fits").read_bytes()
+    assert main([*simulate, *scene, "--quiet"]) == 0
+    assert (tmp_path / "try.fits").read_bytes() == first

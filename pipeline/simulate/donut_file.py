@@ -1,0 +1,212 @@
+"""A file of simulated donuts with their true wavefronts, as ``pachon donuts`` reads it.
+
+The file has a cube of stamps [electrons, sky subtracted] and the table DONUTS, one row a stamp: field angles, defocus
+and what it moves, electrons, and Z4 to Z22 of the wavefront beyond the telescope as it is believed to be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from astropy.io import fits
+from astropy.table import Table
+from pydantic import Field
+
+from ...core.errors import ConfigError
+from ...core.products import write_hdus
+from ...core.random_streams import stream
+from ...core.schema import Count, NotNegative, Positive, Section, Whole, validated
+from ...core.units import ARCSEC
+from ...core.yaml_reader import as_number
+from ...design.metrics.field_zernikes import wavefront_zernikes
+from ...models.camera.photometry import READ_NOISE
+from ...models.parameters.parameters import Parameter, apply
+from ...models.telescope import Telescope
+from ...sensing.model import DonutModel
+from ...wavefront.corner_stars import corner_stars
+from ...wavefront.psf.stamps import Stamps
+from ...wavefront.request import wavelength_points
+from .donuts import STAMP_SIZE, draw_donuts
+
+#: Noll indices of the true wavefront.
+_NOLL = np.arange(4, 23)
+#: Fraction of the radius of the field within which stars stand at random: donuts beyond lose light to rims.
+_WITHIN = 0.95
+
+
+class DonutScene(Section):
+    """Stars of a simulated file, the air before them and their noise."""
+
+    stars: Count = Field(6, description="number of stars, at random within 0.95 of the field's radius")
+    layout: Literal["random", "corners"] = Field(
+        "random",
+        description="random, or corners: a star on each of the LSST's eight wavefront sensors, at their heights",
+    )
+    sides: Annotated[int, Field(strict=True, ge=1, le=2)] = Field(
+        1, description="1, or 2: each star is exposed behind and in front of focus"
+    )
+    seeing_arcsec: Positive = Field(0.8, description="FWHM of the long exposure [arcsec]")
+    electrons: Positive = Field(2e6, description="electrons of each star")
+    sky: NotNegative = Field(300.0, description="expected electrons of the sky in a pixel, which are subtracted")
+    read_noise: NotNegative = Field(READ_NOISE, description="rms noise without light [electrons]")
+    stamp: Annotated[int, Field(strict=True, ge=31, le=2001)] = Field(
+        STAMP_SIZE, description="side of a stamp [pixels]"
+    )
+    seed: Whole = Field(1, description="seed of places and noise")
+
+    @classmethod
+    def of(cls, settings: Sequence[str]) -> DonutScene:
+        """Return the scene of texts such as ``stars=8``; ConfigError for one that is malformed."""
+        content: dict[str, object] = {}
+        for text in settings:
+            key, equals, value = text.partition("=")
+            if not equals:
+                raise ConfigError(f"--set = {text!r}: expected key=value, with a key of {', '.join(cls.keys())}")
+            number = as_number(value.strip())
+            whole = number is not None and float(number).is_integer() and "." not in value and "e" not in value.lower()
+            content[key.strip()] = value.strip() if number is None else int(number) if whole else number
+        return validated(cls, content, "--set")
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedDonuts:
+    """Donuts of a telescope that is not the one believed in.
+
+    Attributes
+    ----------
+    images : ndarray, shape [n, ny, nx]
+        Electrons, sky subtracted.
+    fields : ndarray, shape [n, 2]
+        Field angles [rad].
+    defocus : ndarray, shape [n]
+        Shift of the body that moves [m].
+    zernikes : ndarray, shape [n, 19]
+        Z4 to Z22 beyond the telescope that is believed in [m].
+    """
+
+    images: np.ndarray
+    fields: np.ndarray
+    defocus: np.ndarray
+    zernikes: np.ndarray
+
+
+def changed_telescope(telescope: Telescope, changes: Sequence[str]) -> Telescope:
+    """Return a telescope with changes such as ``M2.dx=200um`` or ``Camera.rx=5arcsec``; bare numbers are m and rad.
+
+    Raises
+    ------
+    ConfigError, UnknownNameError
+        If a text is no change of a parameter of the telescope, or its unit is another one's.
+    """
+    from astropy import units as u
+
+    values: dict[Parameter, float] = {}
+    for text in changes:
+        address, equals, size = text.partition("=")
+        if not equals:
+            raise ConfigError(f"--perturb = {text!r}: expected a parameter and its change, such as M2.dx=200um")
+        parameter = Parameter.parse(address.strip(), telescope)
+        try:
+            quantity = u.Quantity(size.strip())
+            unit = u.Unit(parameter.unit or "")
+            change = float(quantity.value if quantity.unit == u.dimensionless_unscaled else quantity.to_value(unit))
+        except (TypeError, ValueError, u.UnitConversionError):
+            raise ConfigError(
+                f"--perturb = {text!r}: expected a size in {parameter.unit or 'pure numbers'}, as 200um or 5arcsec"
+            ) from None
+        values[parameter] = values.get(parameter, 0.0) + change
+    return apply(telescope, values)
+
+
+def simulate_donuts(
+    telescope: Telescope, true: Telescope, scene: DonutScene, model: DonutModel, field: np.ndarray | None = None
+) -> SimulatedDonuts:
+    """Expose the stars of a scene.
+
+    Parameters
+    ----------
+    telescope, true : Telescope
+        Telescope as it is believed to be and as it is, both in focus.
+    scene : DonutScene
+        The stars.
+    model : DonutModel
+        Light, pixels, one defocus and the body that it moves; the seeing is that of the scene.
+    field : ndarray, shape [2], optional
+        Field angles of all stars [rad]; by the layout of the scene otherwise.
+
+    Raises
+    ------
+    ConfigError
+        If nothing is out of focus, or the layout is not for the telescope.
+    """
+    shift = float(np.reshape(model.detector.shifts(1), ()))
+    model = replace(model, air=replace(model.air, fwhm=scene.seeing_arcsec * ARCSEC))
+    if scene.layout == "corners":
+        corners = corner_stars(telescope)
+        fields, defocus = corners.fields, corners.heights + shift
+    else:
+        if not shift:
+            raise ConfigError("--defocus-um = 0: expected a shift that makes donuts, such as 1500 for the LSST")
+        fields = _random_fields(telescope, scene) if field is None else np.tile(field, (scene.stars, 1))
+        defocus = np.full(len(fields), shift)
+        if scene.sides == 2:
+            fields, defocus = np.tile(fields, (2, 1)), np.concatenate([defocus, -defocus])
+    images = np.empty((len(fields), scene.stamp, scene.stamp), dtype=np.float32)
+    for k, height in enumerate(np.unique(defocus)):
+        rows = np.flatnonzero(defocus == height)
+        images[rows] = draw_donuts(
+            true,
+            fields[rows],
+            model=replace(model, detector=replace(model.detector, defocus=height)),
+            electrons=scene.electrons,
+            sky=scene.sky,
+            read_noise=scene.read_noise,
+            seed=int(stream(scene.seed, "donut file", k).integers(2**31)),
+            stamps=Stamps(scene.stamp),
+        ).images
+    waves = wavelength_points(telescope, None if model.light is None else model.light.wavelengths)
+    before, after = (
+        wavefront_zernikes(t, fields, float(waves[len(waves) // 2]), jmax=int(_NOLL[-1])).coefficients
+        for t in (telescope, true)
+    )
+    return SimulatedDonuts(images, fields, defocus, (after - before)[:, _NOLL - 1])
+
+
+def write_donuts(path: Path, donuts: SimulatedDonuts, scene: DonutScene, model: DonutModel, telescope: str) -> None:
+    """Write simulated donuts as a FITS file that ``pachon donuts`` reads."""
+    columns: dict[str, tuple[np.ndarray | list[str], str, str]] = {
+        "field_x": (np.rad2deg(donuts.fields[:, 0]), "deg", "field angle along x"),
+        "field_y": (np.rad2deg(donuts.fields[:, 1]), "deg", "field angle along y"),
+        "defocus_um": (1e6 * donuts.defocus, "um", "shift along z of what moved"),
+        "moved": ([model.detector.moved] * len(donuts.fields), "", "what the defocus moved"),
+    }
+    for j, values in zip(_NOLL, donuts.zernikes.T, strict=True):
+        columns[f"true_Z{j}"] = (1e9 * values, "nm", "true wavefront beyond the telescope believed in")
+    table = Table({name: values for name, (values, _, _) in columns.items()})
+    for name, (_, unit, meaning) in columns.items():
+        table[name].unit, table[name].description = unit or None, meaning
+    cube = fits.PrimaryHDU(donuts.images)
+    cards: Mapping[str, tuple[object, str]] = {
+        "BUNIT": ("electron", "sky subtracted"),
+        "MODEL": (telescope, "telescope that is believed in"),
+        "MOVED": (model.detector.moved, "what the defocus moved"),
+        "PIXEL_UM": (1e6 * model.detector.pixel(), "side of a pixel [um]"),
+        "SKYVAR": (scene.sky + scene.read_noise**2, "variance of sky and readout [electron^2]"),
+        "SEEING": (scene.seeing_arcsec, "FWHM of the long exposure [arcsec]"),
+        "SEED": (scene.seed, "seed of all random numbers"),
+    }
+    for key, (value, comment) in cards.items():
+        cube.header[key] = (value, comment)
+    unit = fits.BinTableHDU(table, name="DONUTS")
+    write_hdus(path, fits.HDUList([cube, unit]))
+
+
+def _random_fields(telescope: Telescope, scene: DonutScene) -> np.ndarray:
+    """Return field angles evenly over a disc [rad], shape [n, 2]; more stars leave the first as they are."""
+    radius, turn = stream(scene.seed, "donut file", "fields").random((scene.stars, 2)).T
+    distance, angle = _WITHIN * telescope.field_radius * np.sqrt(radius), 2.0 * np.pi * turn
+    return np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=-1)
