@@ -104,7 +104,8 @@ def header_values(headers: Iterable[fits.Header], file: Path) -> HeaderValues:
     parallactic = next((q for h in listed if (q := _parallactic_angle(h, file)) is not None), None)
     band, wavelength = next(((b, w) for h in listed for b, w in [_band(h)] if b is not None), (None, None))
     rotator = None
-    if parallactic is not None and camera != "decam":
+    # On the Nasmyth platform of LATISS and on DECam's equatorial mount the relation is another one.
+    if parallactic is not None and camera in ("lsst", "comcam"):
         rotation = next((r for h in listed if (r := _sky_rotation(h, file)) is not None), None)
         if rotation is not None:
             # Images' +y has the position angle q - rotator - 90 deg.
