@@ -40,6 +40,8 @@ _HORIZON_KEYS = (("BORE-AZ", "BORE-ALT"), ("AZSTART", "ELSTART"), ("AZ", "EL"))
 _ROTATION_KEYS = ("ROTPA", "BORE-ROTANG")
 #: Latitude of Cerro Pachon, where a header has none [deg].
 _LATITUDE = -30.244639
+#: Keywords that are copied from header to header.
+_KEYWORD = re.compile(r"[A-Z0-9_-]+( [A-Z0-9_-]+)*")
 #: Mean wavelength and width [angstrom] at the end of DECam's names of filters.
 _DECAM_FILTER = re.compile(r"^\s*(\w+)\s+DECam\s.*?\s(\d{4,5}(?:\.\d*)?)\s+\d+(?:\.\d*)?\s*$")
 
@@ -168,10 +170,18 @@ def stamp_header(primary: fits.Header, header: fits.Header, index: int) -> fits.
         values.setdefault(card.keyword, []).append(card.value)
     merged = fits.Header()
     for key, listed in values.items():
-        if key and key not in ("COMMENT", "HISTORY", "SIMPLE", "BITPIX", "NAXIS", "EXTEND", "EXTNAME"):
+        if _KEYWORD.fullmatch(key) and key not in (
+            "COMMENT",
+            "HISTORY",
+            "SIMPLE",
+            "BITPIX",
+            "NAXIS",
+            "EXTEND",
+            "EXTNAME",
+        ):
             merged[_card_name(key)] = listed[index] if len(listed) > index else listed[0]
     for card in header.cards:
-        if card.keyword and card.keyword not in ("COMMENT", "HISTORY"):
+        if _KEYWORD.fullmatch(card.keyword) and card.keyword not in ("COMMENT", "HISTORY"):
             merged[_card_name(card.keyword)] = card.value
     return merged
 

@@ -81,7 +81,8 @@ def test_corner_stamps_turn_as_ts_wep_turns_them(corner_file, focused):
     # Corner sensors stand where their names say: the first digit grows with the telescope's x, the second with its y.
     assert (np.sign(places.fields[:2]) == [(-1, -1), (-1, 1)]).all()
     np.testing.assert_allclose(np.rad2deg(np.hypot(*places.fields[:2].T)), 1.65, atol=0.2)
-    np.testing.assert_allclose(places.fields[2], 0.0, atol=1e-5)
+    # 2.5 pixels along y and 12.5 along x of DVCS from the middle of 4096 x 4004, x and y of the telescope; 10.31 m.
+    np.testing.assert_allclose(places.fields[2], np.array([-2.5, -12.5]) * 10e-6 / 10.31, rtol=2e-3)
     np.testing.assert_allclose(places.heights, [1.5e-3, -1.5e-3, 0.0])
 
 
