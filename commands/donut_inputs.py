@@ -61,7 +61,13 @@ class FrameOptions:
 
         rotator = header.rotator or 0.0 if self.rotator_deg is None else np.deg2rad(self.rotator_deg)
         parallactic = header.parallactic_angle if self.parallactic_deg is None else np.deg2rad(self.parallactic_deg)
-        return DonutFrames(rotator, parallactic, self.stamp_axes or "x,y")
+        for option, value in (("--rotator-deg", rotator), ("--parallactic-deg", parallactic)):
+            if value is not None and not np.isfinite(value):
+                raise ConfigError(f"{option} = {value}: expected a finite number of degrees")
+        try:
+            return DonutFrames(rotator, parallactic, self.stamp_axes or "x,y")
+        except ConfigError as error:
+            raise error.renamed("--stamp-axes") from None
 
 
 @dataclass(frozen=True)

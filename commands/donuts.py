@@ -257,6 +257,7 @@ def donuts_command(
     from ..models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
     from ..sensing.fit import fit_donuts
     from ..sensing.flags import DonutFlag
+    from ..sensing.frames import FRAMES
     from ..sensing.freedom_fit import TelescopeFreedoms
     from ..sensing.model import DETECTOR, DonutAir, DonutDetector, DonutModel
     from ..sensing.observatory_zernikes import CONVENTIONS, hexapod_corrections
@@ -281,12 +282,18 @@ def donuts_command(
     if perturb or settings:
         raise ConfigError("--perturb, --set: expected them with --simulate alone")
     kind = _output_kind(out, picture)
-    check_choice("--convention", convention, CONVENTIONS)
+    for option, name, names in (
+        ("--convention", convention, CONVENTIONS),
+        ("--frame", frame, FRAMES),
+        ("--field-frame", field_frame, FRAMES),
+    ):
+        check_choice(option, name, names)
     files_read = StampFiles.read(files, positions, stamp, mask, variance)
     header = files_read.header()
     options = FrameOptions(rotator_deg, parallactic_deg, stamp_axes, field_frame, field_deg, projection)
     frames = options.frames(header)
-    frames.axes(frame)
+    if "sky" in (frame, field_frame) and frames.parallactic_angle is None:
+        raise ConfigError("frame sky without a parallactic angle: expected --parallactic-deg")
     believed = frames.telescope(
         load_model(telescope or header.model or DEFAULT_TELESCOPE, lenient, glass_catalogue or ())
     )

@@ -18,7 +18,7 @@ image (``DonutEngine.cc``, ``Zernike.cc``), so that its pupil is not turned to t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from astropy import units as u
@@ -27,13 +27,18 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError, check_choice
+from ..core.plotting import axes_at, plain_text, styled
 from ..core.result import Result
 from ..core.units import ARCSEC, length
-from ..design.metrics.field_zernikes import wavefront_zernikes
+from ..design.metrics.field_zernikes import name_terms, wavefront_zernikes
 from ..models.telescope import Telescope
 from ..models.zernike_polynomials import annular_zernikes, noll_to_nm
 from .degrees import FreedomEstimate
 from .frames import DonutFrames, zernike_matrix
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Wavelength of the waves that Donut counts by default [m].
 DONUT_WAVELENGTH = 700e-9
@@ -152,6 +157,17 @@ class ObservatoryZernikes(Result):
             "zernike_obscuration": self.obscuration
         }
 
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the Zernikes of all donuts with their errors, in the unit of the convention."""
+        with styled():
+            figure, axes = axes_at(ax, 8.0, 4.0)
+            steps = 0.6 * (np.arange(len(self.values)) + 0.5) / max(len(self.values), 1) - 0.3
+            for step, row, errors in zip(steps, self.values, self.errors, strict=True):
+                axes.errorbar(self.noll + step, row, errors, fmt="o", markersize=3)
+            name_terms(axes, self.noll)
+            axes.set_ylabel(f"coefficient [{self.unit or 'waves'}], {self.convention}, {self.frame}")
+        return figure
+
     def _summary(self) -> dict[str, Any]:
         return {
             **self.description(),
@@ -241,6 +257,22 @@ class BodyMotions(Result):
     shift_error: np.ndarray
     tilt: np.ndarray
     tilt_error: np.ndarray
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw shifts [um] and tilts [arcsec] of each body with their errors."""
+        with styled():
+            figure, axes = axes_at(ax, 6.0, 4.0)
+            for k, body in enumerate(self.body):
+                values, errors = (np.concatenate(v) for v in ((self.shift[k], self.tilt[k]), self._errors(k)))
+                axes.errorbar(np.arange(6) + 0.1 * k, values, errors, fmt="o", markersize=4, label=plain_text(body))
+            axes.axhline(0.0, color="0.3", linewidth=0.7)
+            axes.set_xticks(range(6), ["dx", "dy", "dz", "rx", "ry", "rz"])
+            axes.set_ylabel(f"correction [um, arcsec], {self.frame}")
+            axes.legend()
+        return figure
+
+    def _errors(self, body: int) -> tuple[np.ndarray, np.ndarray]:
+        return self.shift_error[body], self.tilt_error[body]
 
 
 @check_arguments

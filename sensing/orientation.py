@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.arguments import check_arguments
+from ..core.plotting import BLUE, axes_at, styled
 from ..core.result import Result
 from ..models.telescope import Telescope
 from ..wavefront.psf.light import Light
@@ -22,6 +24,10 @@ from .frames import along_camera, stamp_matrix
 from .inputs import ObservedStars
 from .model import DonutModel
 from .wavefront_fits import SingleDonuts
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Axes of columns and rows of stamps, the given ones first: four turns, and their mirror images.
 ORIENTATIONS = ("x,y", "y,x", "-x,y", "x,-y", "-y,-x", "-x,-y", "-y,x", "y,-x")
@@ -91,6 +97,16 @@ class OrientationCheck(Result):
     def decided(self) -> bool:
         """Whether every other orientation fits significantly worse than the best one."""
         return int((self.excess <= self.threshold).sum()) == 1
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw chi-square a pixel of the eight orientations."""
+        with styled():
+            figure, axes = axes_at(ax, 5.0, 3.5)
+            axes.bar(range(len(self.chi2)), self.chi2, color=BLUE)
+            axes.set_xticks(range(len(self.chi2)), [f"({names})" for names in self.stamp_axes], rotation=45)
+            axes.set_xlabel("axes of the stamps, as given first")
+            axes.set_ylabel("chi-square a pixel")
+        return figure
 
     def _label(self) -> str:
         state = "another fits better" if self.doubtful else "confirmed" if self.decided else "not decided"

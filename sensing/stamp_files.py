@@ -117,9 +117,21 @@ def read_stamps(
         If a file cannot be read, has no images, a plane does not go with the images, or a table lacks a column or has
         another number of rows.
     """
-    units = _units(path)
+    # Values of damaged headers fail where they are read.
+    with parsing(path, "cannot be read as FITS", ProductError):
+        return _stamps_of(_units(path), path, positions, size, (mask, variance))
+
+
+def _stamps_of(
+    units: Sequence[tuple[fits.Header, np.ndarray | Table | None]],
+    path: Path,
+    positions: Path | None,
+    size: int,
+    planes: tuple[Path | None, Path | None],
+) -> DonutStamps:
+    """Return the stamps of the units of a file, with files of masks and variances; see :func:`read_stamps`."""
     primary = units[0][0] if units else fits.Header()
-    images = _with_planes(units, path, primary, mask, variance)
+    images = _with_planes(units, path, primary, *planes)
     tables = [data for _, data in units if isinstance(data, Table) and _names(data) & _COLUMNS]
     table = _table(positions) if positions is not None else tables[0] if tables else None
     if not images or any(i.data.ndim not in (2, 3) or min(i.data.shape[-2:]) < SMALLEST_STAMP for i in images):

@@ -40,6 +40,8 @@ _HORIZON_KEYS = (("BORE-AZ", "BORE-ALT"), ("AZSTART", "ELSTART"), ("AZ", "EL"))
 _ROTATION_KEYS = ("ROTPA", "BORE-ROTANG")
 #: Latitude of Cerro Pachon, where a header has none [deg].
 _LATITUDE = -30.244639
+#: Keywords that are copied from header to header.
+_KEYWORD = re.compile(r"[A-Z0-9_-]+( [A-Z0-9_-]+)*")
 #: Mean wavelength and width [angstrom] at the end of DECam's names of filters.
 _DECAM_FILTER = re.compile(r"^\s*(\w+)\s+DECam\s.*?\s(\d{4,5}(?:\.\d*)?)\s+\d+(?:\.\d*)?\s*$")
 
@@ -104,7 +106,8 @@ def header_values(headers: Iterable[fits.Header], file: Path) -> HeaderValues:
     parallactic = next((q for h in listed if (q := _parallactic_angle(h, file)) is not None), None)
     band, wavelength = next(((b, w) for h in listed for b, w in [_band(h)] if b is not None), (None, None))
     rotator = None
-    if parallactic is not None and camera != "decam":
+    # On the Nasmyth platform of LATISS and on DECam's equatorial mount the relation is another one.
+    if parallactic is not None and camera in ("lsst", "comcam"):
         rotation = next((r for h in listed if (r := _sky_rotation(h, file)) is not None), None)
         if rotation is not None:
             # Images' +y has the position angle q - rotator - 90 deg.
@@ -167,10 +170,18 @@ def stamp_header(primary: fits.Header, header: fits.Header, index: int) -> fits.
         values.setdefault(card.keyword, []).append(card.value)
     merged = fits.Header()
     for key, listed in values.items():
-        if key and key not in ("COMMENT", "HISTORY", "SIMPLE", "BITPIX", "NAXIS", "EXTEND", "EXTNAME"):
+        if _KEYWORD.fullmatch(key) and key not in (
+            "COMMENT",
+            "HISTORY",
+            "SIMPLE",
+            "BITPIX",
+            "NAXIS",
+            "EXTEND",
+            "EXTNAME",
+        ):
             merged[_card_name(key)] = listed[index] if len(listed) > index else listed[0]
     for card in header.cards:
-        if card.keyword and card.keyword not in ("COMMENT", "HISTORY"):
+        if _KEYWORD.fullmatch(card.keyword) and card.keyword not in ("COMMENT", "HISTORY"):
             merged[_card_name(card.keyword)] = card.value
     return merged
 

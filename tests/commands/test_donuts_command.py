@@ -106,6 +106,17 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
         (["new.fits", "--simulate", "--set", "star=2"], "--set: unknown key star = 2"),
         (["new.fits", "--simulate", "--set", "stars"], "--set = 'stars': expected key=value"),
         (["new.txt", "--simulate"], "new.txt: --simulate: expected one FILE.fits"),
+        (["plain.fits", "--frame", "XYZ"], "--frame = 'XYZ': expected"),
+        (["plain.fits", "--field-frame", "ocs"], "--field-frame = 'ocs': expected"),
+        (["plain.fits", "--convention", "noll"], "--convention = 'noll': expected"),
+        (["plain.fits", "--stamp-axes", "x,x"], "--stamp-axes = 'x,x': expected DVCS, CCS, or axes"),
+        (["plain.fits", "--rotator-deg", "nan"], "--rotator-deg = nan: expected a finite number of degrees"),
+        (["plain.fits", "--frame", "sky"], "frame sky without a parallactic angle: expected --parallactic-deg"),
+        (["plain.fits", "--gain", "0", "--field-deg", "0,0"], "--gain = 0.0: expected electrons of a unit, above 0"),
+        (["plain.fits", "--mask", "rows.fits", "--field-deg", "0,0"], "1 of shape [3, 16, 16] for 1 images of [2, 16"),
+        (["plain.fits", "plain.fits", "--mask", "plain.fits"], "for 2 files: expected one file of stamps with it"),
+        (["lsst.fits"], "lsst.fits: unknown CCD of lsst 'R22_S99'"),
+        (["plain.fits", "lsst.fits", "--field-deg", "0,0"], "lsst.fits: lsst, band r: expected that of plain.fits"),
     ],
 )
 def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, part):
@@ -114,6 +125,10 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, part):
     fits.PrimaryHDU(np.zeros((2, 16, 16))).writeto("plain.fits")
     table = fits.BinTableHDU(Table({"field_x": [0.0], "field_y": [0.0]}))
     fits.HDUList([fits.PrimaryHDU(np.zeros((2, 16, 16))), table]).writeto("rows.fits")
+    if "rows.fits" in arguments and "--mask" in arguments:
+        fits.PrimaryHDU(np.zeros((3, 16, 16))).writeto("rows.fits", overwrite=True)
+    lsst = {"CAM_NAME": "LSSTCam", "DET_NAME": "R22_S99", "CENT_X": 5.0, "CENT_Y": 5.0, "BANDPASS": "r"}
+    fits.PrimaryHDU(np.zeros((16, 16)), fits.Header(lsst)).writeto("lsst.fits")
     assert main(["donuts", *arguments]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -152,3 +167,55 @@ def test_a_simulated_file_is_one_that_the_command_reads(tmp_path, monkeypatch, c
     first = (tmp_path / "try.fits").read_bytes()
     assert main([*simulate, *scene, "--quiet"]) == 0
     assert (tmp_path / "try.fits").read_bytes() == first
+
+
+@pytest.mark.long
+def test_stamps_of_the_lsst_come_out_in_its_frame_and_convention(tmp_path, monkeypatch, capsys, stamp):
+    """The image of a donut as LSST stores it: transposed, on a CCD of its name, with its angles and planes."""
+    monkeypatch.chdir(tmp_path)
+    # At no rotation and FIELD (0.6, 0.9) deg the light lands on R31_S22 or beside: found by its position.
+    tel, camera = pachon.load_telescope("lsst_v3.3_r"), pachon.load_camera("lsst")
+    end = pachon.trace(tel, pachon.launch_rays(tel, np.deg2rad(FIELD), 622e-9, (0.0, 0.0)))
+    place = end.position.reshape(-1, 3)[0, :2]
+    ccd = int(camera.ccd_at(*place))
+    x, y = camera.to_pixel(ccd, place)
+    header = fits.Header({"CAM_NAME": "LSSTCam", "DET_NAME": camera.ccd_names[ccd], "CENT_X": x, "CENT_Y": y})
+    header.update({"DFC_TYPE": "extra", "DFC_DIST": 1.5, "BANDPASS": "r"})
+    # q - rotation of the sky - 90 deg is the rotator: zero.
+    header["HIERARCH BORESIGHT_ROT_ANGLE_RAD"], header["HIERARCH BORESIGHT_PAR_ANGLE_RAD"] = 0.5, 0.5 + np.pi / 2.0
+    stored = stamp.T.astype(np.float32)
+    bad = np.zeros(stored.shape, np.int32)
+    bad[40, 50], stored[40, 50] = 2, 1e6
+    mask = fits.Header({"EXTNAME": "MASK", "MP_BAD": 0, "MP_SAT": 1})
+    planes = [fits.ImageHDU(bad, mask), fits.ImageHDU(np.full(stored.shape, 300.0, np.float32), name="VARIANCE")]
+    fits.HDUList([fits.PrimaryHDU(header=header), fits.ImageHDU(stored, name="IMAGE"), *planes]).writeto("stamps.fits")
+    common = [*OPTIONS[2:], "-t", "lsst_v3.3_r", "--json"]
+    assert main(["donuts", "stamps.fits", *common, "--frame", "CCS", "--convention", "ts_wep", "--quiet"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    plain = fits.Header({"FIELD_X": FIELD[0], "FIELD_Y": FIELD[1], "DEFOC_UM": 1500.0})
+    fits.PrimaryHDU(stamp, plain).writeto("plain.fits")
+    plain_stamps = ["donuts", "plain.fits", *common, "--sky-variance", "300", "--no-orientation-check", "--quiet"]
+    assert main([*plain_stamps, "--moved", "Camera"]) == 0
+    expected = json.loads(capsys.readouterr().out)
+    lsst = result["observatory"]
+    assert (lsst["frame"], lsst["convention"], lsst["zernike_unit"]) == ("CCS", "ts_wep", "um")
+    assert lsst["rotator_deg"] == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(lsst["field_deg"][0], FIELD, atol=2e-5)
+    # One pixel is left out.
+    errors = np.array(expected["zernike_error_nm"][0])
+    assert (np.abs(np.array(lsst["zernikes"][0]) * 1e3 - expected["zernike_nm"][0]) < 0.3 * errors).all()
+    assert not result["orientation"]["doubtful"]
+    assert result["flags"] == [0]
+
+
+@pytest.mark.slow
+def test_transposed_stamps_are_said_to_be(tmp_path, monkeypatch, capsys, stamp):
+    monkeypatch.chdir(tmp_path)
+    header = fits.Header({"FIELD_X": FIELD[0], "FIELD_Y": FIELD[1], "DEFOC_UM": 1500.0})
+    fits.PrimaryHDU(stamp.T, header).writeto("d.fits")
+    assert main(["donuts", "d.fits", *OPTIONS[2:], "--sky-variance", "300"]) == 0
+    captured = capsys.readouterr()
+    assert "try --stamp-axes=y,x" in captured.err
+    assert "orientation" in captured.out
+    assert main(["donuts", "d.fits", *OPTIONS[2:], "--sky-variance", "300", "--stamp-axes", "DVCS"]) == 0
+    assert "try" not in capsys.readouterr().err

@@ -86,6 +86,10 @@ class _Made:
         )
         return pachon.draw_donuts(self.defocused, [(0.005, 0.005)], 622e-9, atmosphere=air, **tiny)
 
+    def make_estimate(self):
+        n = len(self.dofs)
+        return pachon.FreedomEstimate(self.dofs, np.zeros(n), np.eye(n), np.ones(n))
+
     def make_model(self):
         return pachon.PsfModel.fit(self.stamps, self.places, n_components=2, order=1)
 
@@ -388,6 +392,14 @@ def calls(folder):
         "DonutAir": (pachon.DonutAir, {"fwhm": [3e-6], "outer_scale": 25.0, "atmosphere": None}),
         "DonutDetector": (pachon.DonutDetector, {"pixel_size": 30e-6, "diffusion": 0.0, "focal_plane": None,
                           "defocus": [0.0], "saturation": 1e7, "moved": "M2"}),
+        "DonutFrames": (pachon.DonutFrames, {"rotator": 0.1, "parallactic_angle": 0.2, "stamp_axes": "y,x"}),
+        "hexapod_corrections": (pachon.hexapod_corrections, {"degrees_of_freedom": m.estimate, "frame": "ZCS",
+                                "frames": pachon.DonutFrames()}),
+        "check_orientation": (pachon.check_orientation, {"telescope": m.defocused, "images": m.donuts.images,
+                              "fields": [(0.005, 0.005)], "wavelength": 622e-9, "sky_variance": 10.0,
+                              "model": pachon.DonutModel(detector=pachon.DonutDetector(pixel_size=30e-6)),
+                              "mask": [np.zeros(i.shape, bool) for i in m.donuts.images], "projection": "zemax",
+                              "donuts": 1, "threads": 1}),
         "SingleDonuts": (pachon.SingleDonuts, {"noll": (4, 5), "left_out": 0.0, "higher_order": 0.0}),
         "FieldTerms": (pachon.FieldTerms, {"field_noll": (1, 2), "noll": (4, 5), "higher_order": 0.0}),
         "TelescopeFreedoms": (pachon.TelescopeFreedoms, {"freedoms": m.dofs, "prior": None, "noll": (4, 5)}),
