@@ -316,7 +316,8 @@ class ImageGrid:
         grown = growth * spectra[..., :1]
         spectra *= whole
         if light.at_rims is not None:
-            self._diffract(spectra, grown, unknowns, light.at_rims)
+            air_and_detector = whole[..., 0] if self._core is None else self._filter(float(unknowns[STRENGTH]))
+            self._diffract(spectra, grown, unknowns, light.at_rims, air_and_detector)
         extra = []
         if len(unknowns) > RATIO:
             turn = np.exp(1j * np.tensordot(unknowns[RATIO + 1 :], self._phase, axes=1))
@@ -331,7 +332,9 @@ class ImageGrid:
         uniform = np.zeros_like(grown)
         return np.concatenate([spectra[..., :3], uniform, grown, *extra, spectra[..., 3:]], axis=-1)
 
-    def _diffract(self, spectra: np.ndarray, grown: np.ndarray, unknowns: np.ndarray, rims: RimsAt) -> None:
+    def _diffract(
+        self, spectra: np.ndarray, grown: np.ndarray, unknowns: np.ndarray, rims: RimsAt, air_and_detector: np.ndarray
+    ) -> None:
         """Add what is diffracted at the rims to the spectra of the star and of its derivatives."""
         light = self.rim_light
         assert light is not None
@@ -340,7 +343,7 @@ class ImageGrid:
         # Frequencies of the grid count from its first cell.
         place = self.places(unknowns, np.zeros(2)) + np.array(self._middle[::-1])
         turn = np.exp(-1j * self.pixel * (light.wave @ place)).astype(np.complex64)
-        turn *= self._filter(strength)[light.where].astype(np.float32)
+        turn *= air_and_detector[light.where].astype(np.float32)
         diffracted = transfer * turn
         spectra[light.where, 0] += diffracted
         grown[light.where, 0] += (
