@@ -74,8 +74,9 @@ def donuts_command(
     ] = None,
     outer_scale_m: Annotated[float, Option(help="Outer scale of the turbulence [m]; inf for Kolmogorov's.")] = 25.0,
     diffraction: Annotated[
-        bool, Option(help="Diffraction at the rims of the pupil: not in images made of rays alone.")
-    ] = True,
+        bool | None,
+        Option(help="Diffraction at the rims of the pupil: by default where it fits the images better than rays do."),
+    ] = None,
     projection: Projection = "zemax",
     out: Annotated[Path | None, Option("--out", "-o", help="Table: .ecsv, .fits, .csv or .parquet.")] = None,
     picture: Annotated[Path | None, Option(help="Picture of the first six donuts: .png, .pdf or .svg.")] = None,

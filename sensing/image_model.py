@@ -98,6 +98,7 @@ class ImageGrid:
         reach: float = 0.0,
         rims: PupilRims | None = None,
     ) -> None:
+        self._arguments = (pixels, side, seeing, jacobian, blur, footprint, sharp, reach)
         shape, pixel = (pixels.image.shape[0], pixels.image.shape[1]), side * pixels.side
         self.shape, self.pixel, self.footprint = shape, pixel, footprint
         #: Pixels of the detector along one of the stamp, and the centre of its stamp from that of this one [pixels].
@@ -131,6 +132,10 @@ class ImageGrid:
         edge = math.sqrt(abs(float(np.linalg.det(jacobian)))) * math.pi / pixel * scale
         self._edge_exponent = float(seeing.exponent(np.array([edge]))[0])
         self._core = SharpCore(shape, pixels.width / pixels.side, blur / pixel, footprint / pixel) if sharp else None
+
+    def diffracting(self, rims: PupilRims) -> ImageGrid:
+        """Return the grid of a model of rays with diffraction at rims of the pupil."""
+        return ImageGrid(*self._arguments, rims)
 
     def with_rims(self, rims: PupilRims) -> ImageGrid:
         """Return the grid for other rims of the pupil."""

@@ -92,6 +92,8 @@ class DonutFit(Result):
         Coefficients over the field and the pupil [m], and their covariance in that order, flattened.
     degrees_of_freedom : FreedomEstimate or None
         Degrees of freedom of the telescope.
+    diffraction : bool
+        Whether the model has light diffracted at the rims of the pupil.
     """
 
     zernikes: np.ndarray
@@ -119,6 +121,7 @@ class DonutFit(Result):
     double_zernikes: np.ndarray | None = None
     double_zernike_covariance: np.ndarray | None = None
     degrees_of_freedom: FreedomEstimate | None = None
+    diffraction: bool = False
 
     def __len__(self) -> int:
         """Return the number of donuts."""
@@ -174,6 +177,7 @@ class DonutFit(Result):
             telescope=self.telescope,
             wavelength_nm=(self.wavelengths * 1e9).tolist(),
             obscuration=self.obscuration,
+            diffraction=self.diffraction,
             zernikes="annular, Noll, on the entrance pupil; positive where the wavefront leads",
         )
         return table
@@ -184,6 +188,7 @@ class DonutFit(Result):
             "telescope": self.telescope,
             "wavelength_nm": self.wavelengths * 1e9,
             "obscuration": self.obscuration,
+            "diffraction": self.diffraction,
             "noll": self.noll,
             "field_deg": np.rad2deg(self.fields),
             "flags": self.flags,
