@@ -4,9 +4,10 @@ Run: python benchmarks/donut_times.py [--blur PIXELS ...] [--repeats N] [--photo
 
 Images are photons: rays through random points of the pupil of the bundled LSST (r band, M2 decentred by 0.2 mm), 1.5
 mm behind focus unless said, each moved by a Gaussian of the blur and counted in pixels of 10 um, with a sky of 500
-electrons. The fit knows the blur, or takes it for a seeing that it fits ("free"). Sizes are those of donuts 3 and 4.5 mm
-behind focus, and of DECam's (1.5 mm, pixels of 15 um, spiders). Diffraction is fitted to donuts of the long-exposure
-engine. Each row is the least of some repeats, on one thread, in turns; errors are those of Z4 to Z22 together.
+electrons. The fit knows the blur, or takes it for a seeing that it fits ("free"). Sizes are those of donuts 3 and 4.5
+mm behind focus, and of DECam's (1.5 mm, pixels of 15 um, spiders). Diffraction is fitted to donuts of the long-exposure
+engine. danish fits the image of the last blur. Each row is the least of some repeats, on one thread, in turns; errors
+are those of Z4 to Z22 together.
 """
 
 from __future__ import annotations

@@ -235,6 +235,9 @@ class _StarFitter:
                 sharper = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
                 fwhm = sharper if sharper < _MUCH_SHARPER * fwhm else fwhm
             pixels, sampling = self._sampling(fwhm, self._side(fwhm))
+            if sampling.sharp and not instrument.known_seeing and instrument.model.n_pupil is None:
+                # Few large cells find the seeing, of which a sharp image says much.
+                sampling = replace(sampling, across=sampling.across // 2)
         else:
             fwhm = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
             wave = slice(len(instrument.noll)) if len(solution.shared) else slice(0)
@@ -297,7 +300,7 @@ class _StarFitter:
     ) -> Solution:
         """Return the solution with a second star if there is one, else that without."""
         wave = single.waves[0]
-        best, misfit = single, single.loss / stamp.used.sum()
+        best, misfit = single, _misfit(pixels, stamp, single)
         roomy = None
         starts = [(single.stars[0], wave, single.shared)]
         if misfit > _MISTAKEN:
@@ -315,7 +318,7 @@ class _StarFitter:
             )
             if _explains_more(trial, best) and trial.stars[0][RATIO] > _LEAST_RATIO:
                 best = trial
-        if best.loss / stamp.used.sum() > _POOR:
+        if _misfit(pixels, stamp, best) > _POOR:
             best = self._with_near_companion(roomy or self.stamp(self._light, pixels, blended=True), best, first)
         return _central_first(best)
 
@@ -344,11 +347,16 @@ class _StarFitter:
 
     def other_focus_is_better(self, pixels: Pixels, stamp: Stamp, solution: Solution) -> bool:
         """Return whether the image fits a detector on the other side of focus better."""
-        if solution.loss / stamp.used.sum() < _MISFIT:
+        if _misfit(pixels, stamp, solution) < _MISFIT:
             return False
         mirrored = self.stamp(self._light.mirrored(), pixels)
         start, _ = self.start(mirrored, self.template(mirrored))
         return _explains_more(self.solve(mirrored, start, tolerance=COARSE), solution)
+
+
+def _misfit(pixels: Pixels, stamp: Stamp, solution: Solution) -> float:
+    """Return the loss a pixel, beyond that of the noise of pixels of small donuts, which are not smoothed."""
+    return float(solution.loss / stamp.used.sum()) - (0.0 if pixels.blur else 1.0)
 
 
 def _explains_more(trial: Solution, other: Solution) -> bool:
