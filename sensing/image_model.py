@@ -33,6 +33,10 @@ COMPANION = ("ratio", "offset_x", "offset_y")
 FLUX, X, Y, BACKGROUND, STRENGTH, RATIO = range(6)
 #: Power of the strength of the turbulence that the exponent of its transfer function goes by.
 _EXPONENT_GROWTH = 5.0 / 3.0
+#: Relative step of the difference that the core follows the strength of the turbulence by.
+_STRONGER = 1e-2
+#: Exponent of the air at Nyquist's frequency beyond which an image has no core.
+_SMOOTH = 6.0
 #: Exponent of the air at Nyquist's frequency below which a Gaussian is all of it.
 _NO_AIR = 6e-4
 #: The same below which that of the wavefront's derivatives is: 3 % of the light, wide and smooth, stays where it is.
@@ -131,7 +135,10 @@ class ImageGrid:
         self._square = 4.0 * (x * x + y * y)
         edge = math.sqrt(abs(float(np.linalg.det(jacobian)))) * math.pi / pixel * scale
         self._edge_exponent = float(seeing.exponent(np.array([edge]))[0])
-        self._core = SharpCore(shape, pixels.width / pixels.side, blur / pixel, footprint / pixel) if sharp else None
+        self._core: SharpCore | None = None
+        if sharp:
+            core = pixels.width / pixels.side, blur / pixel, footprint / pixel
+            self._core = SharpCore(shape, *core, _variance(_SMOOTH))
 
     def diffracting(self, rims: PupilRims) -> ImageGrid:
         """Return the grid of a model of rays with diffraction at rims of the pupil."""
@@ -151,6 +158,15 @@ class ImageGrid:
         """Return the exponent of the air at Nyquist's frequency."""
         return float(self._edge_exponent * strength ** (5.0 / 3.0))
 
+    def _has_core(self, strength: float) -> bool:
+        """Return whether some of the image is sharper than the grid."""
+        return self._core is not None and self._edge(strength) < _SMOOTH
+
+    def _gaussian(self, strength: float) -> tuple[np.float32, float]:
+        """Return the light of the core of the air's image, and its variance [pixels^2]."""
+        edge = self._edge(strength)
+        return np.float32(math.exp(-edge / 6.0)), _variance(edge)
+
     def _on_grid(self, strength: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the transfer function of what the grid holds, and its derivative by the strength of the turbulence.
 
@@ -159,7 +175,7 @@ class ImageGrid:
         """
         whole = self._filter(strength)
         growth = -5.0 / 3.0 * self._exponent * strength ** (2.0 / 3.0) * whole
-        if self._core is not None:
+        if self._has_core(strength):
             edge = self._edge(strength)
             core = self._detector * np.exp(-edge / 6.0 * (1.0 + 5.0 * self._square))
             whole = whole - core
@@ -236,12 +252,12 @@ class ImageGrid:
     ) -> np.ndarray:
         """Return the image of a star of unit flux and, with a response, its derivatives over their scales."""
         strength = float(unknowns[STRENGTH])
-        parts = []
-        if self._core is None or self._edge(strength) > _NO_AIR or light.at_rims is not None:
-            thin = self._core is not None and self._edge(strength) < _THIN_AIR and response is not None
-            few = response[..., :0] if thin and light.at_rims is None else response
+        parts, sharp = [], self._has_core(strength)
+        if not sharp or self._edge(strength) > _NO_AIR or light.at_rims is not None:
+            thin = sharp and self._edge(strength) < _THIN_AIR and light.at_rims is None
+            few = response[..., :0] if thin and response is not None else response
             parts.append(self._pixels(self._spectra(unknowns, light, few, rates)))
-        if self._core is not None:
+        if sharp:
             parts.append(self._core_columns(unknowns, light, response, rates))
         if len(parts) == 1:
             return parts[0]
@@ -257,18 +273,15 @@ class ImageGrid:
         self, unknowns: np.ndarray, light: LandedLight, response: np.ndarray | None, rates: np.ndarray | None
     ) -> np.ndarray:
         """Return what the core adds to :meth:`_columns`."""
-        assert self._core is not None
-        strength = float(unknowns[STRENGTH])
-        edge = self._edge(strength)
-        amplitude = np.float32(math.exp(-edge / 6.0))
-        weights = amplitude * light.weights.astype(np.float32)[:, None]
+        core, strength = self._core, float(unknowns[STRENGTH])
+        assert core is not None
         points, spread = self.places(unknowns, light.landing), light.spread / self.pixel**2
-        variance = 5.0 / 3.0 * edge / math.pi**2
+        amplitude, variance = self._gaussian(strength)
+        weights = amplitude * light.weights.astype(np.float32)[:, None]
 
         def of_one_star(places: np.ndarray) -> list[np.ndarray]:
             """Return the light of one star, then its derivatives by x, y, strength, wave and rims."""
-            assert self._core is not None
-            deposit = self._core.deposit(places, spread, variance)
+            deposit = core.deposit(places, spread, variance)
             splines = deposit.matrix(0, 0)
             star = splines @ weights
             if response is None or rates is None:
@@ -277,9 +290,10 @@ class ImageGrid:
             ones = np.ones(len(weights), dtype=np.float32)
             along = gradient @ np.kron(np.eye(2, dtype=np.float32), ones).T
             growth = np.zeros_like(star)
-            if edge > 0.0:
-                bend = np.float32(5.0 / math.pi**2) * (deposit.laplacian() @ weights)
-                growth = np.float32(-edge * _EXPONENT_GROWTH / strength / 6.0) * (star - bend)
+            if strength > 0.0:
+                stronger, wider = self._gaussian((1.0 + _STRONGER) * strength)
+                grown = core.deposit(places, spread, wider).matrix(0, 0) @ (stronger / amplitude * weights)
+                growth = (grown - star) / np.float32(_STRONGER * strength)
             moved = response.astype(np.float32, copy=False).reshape(2 * len(weights), -1)
             wave = gradient @ moved / np.float32(self.pixel)
             return [star, along, growth, wave, splines @ (amplitude * rates).astype(np.float32)]
@@ -289,7 +303,7 @@ class ImageGrid:
         if len(unknowns) > RATIO:
             ratio = np.float32(unknowns[RATIO])
             second = of_one_star(points + unknowns[RATIO + 1 :] / self.scale)
-            extra = [second[0], ratio / np.float32(self.scale) * second[1]]
+            extra = [] if response is None else [second[0], ratio / np.float32(self.scale) * second[1]]
             first = [a + ratio * b for a, b in zip(first, second, strict=True)]
         if response is None:
             return self._core.pixels(first[0])
@@ -359,6 +373,11 @@ class ImageGrid:
         for axis in (0, 1):
             spectra[light.where, 1 + axis] -= 1j * (light.wave[:, axis] * self.pixel).astype(np.float32) * diffracted
         spectra[light.where, 3 : 3 + rims.response.shape[2]] += slopes * turn[:, None]
+
+
+def _variance(edge: float) -> float:
+    """Return the variance [pixels^2] of the core of an image, from the exponent of the air at Nyquist's frequency."""
+    return 5.0 / 3.0 * edge / math.pi**2
 
 
 # Cubic B-spline at t - 1 ... t + 2 by powers of t, 0 <= t < 1, and its derivatives with respect to the point's place.
