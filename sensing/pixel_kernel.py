@@ -42,32 +42,32 @@ class PixelKernel:
 
     def __init__(self, cell: float, width: float, rms: float) -> None:
         cell, rms = max(cell, _NARROW), max(rms, _NARROW)
-        #: Second moment of the kernel beyond that of an evenly lit cell, pixel and blur [pixels^2].
-        self.excess = _MORE_BOXES * cell**2 / 12.0
         # Second derivatives are those of a point that is divided in two.
         step = max(round(0.5 * cell * _PHASES), 1)
-        half = math.ceil(0.5 * width + 0.5 * (1 + _MORE_BOXES) * cell + _REACH * rms - 1e-9)
+        half = math.ceil(0.5 * width + 0.5 * (2 + _MORE_BOXES) * cell + _REACH * rms - 1e-9)
         box = np.full(max(round(cell * _PHASES), 1), 1.0)
         smooth = box / box.sum()
         for _ in range(_MORE_BOXES - 1):
             smooth = np.convolve(smooth, box / box.sum())
-        beyond = step + len(smooth) // 2 + 1
+        beyond = 2 * step + len(smooth) // 2 + 1
         # From the pixels about a point to it.
-        away = (np.arange(2 * half * _PHASES + 2 * beyond) - beyond + 0.5 * (1 + len(smooth) % 2)) / _PHASES - half
+        away = (np.arange(2 * half * _PHASES + 2 * beyond) - beyond + 0.5) / _PHASES - half
         z = (away[:, None] + 0.5 * np.array([width + cell, width - cell, cell - width, -width - cell])) / rms
         steps = ndtr(z)
         integral = rms * (z * steps + np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi))
         signs = np.array([1.0, -1.0, -1.0, 1.0]) / (cell * width)
-        inside = slice(beyond, beyond + 2 * half * _PHASES)
+
+        def bent(line: np.ndarray) -> np.ndarray:
+            return (np.roll(line, step) - 2.0 * line + np.roll(line, -step)) * (_PHASES / step) ** 2
+
+        # Less half of its second derivative for the second moment of the further boxes.
+        excess = _MORE_BOXES * cell**2 / 12.0
         value, slope = (fftconvolve(v @ signs, smooth, mode="same") for v in (integral, steps))
-        bends = [
-            (v[beyond + step :][: 2 * half * _PHASES] - 2.0 * v[inside] + v[beyond - step :][: 2 * half * _PHASES])
-            * (_PHASES / step) ** 2
-            for v in (value, slope)
-        ]
+        lines = [line - 0.5 * excess * bent(line) for line in (value, slope)]
         self._half = half
         self._tables = [
-            v.reshape(2 * half, _PHASES)[::-1].astype(np.float32) for v in (value[inside], slope[inside], *bends)
+            line[beyond : beyond + 2 * half * _PHASES].reshape(2 * half, _PHASES)[::-1].astype(np.float32)
+            for line in (*lines, *map(bent, lines))
         ]
 
     @property
@@ -119,16 +119,15 @@ class SharpCore:
         Points are places (x, y) from the centre of the stamp, spreads their second moments beside the footprint, and
         the variance is that of a further Gaussian blur, all in pixels.
         """
-        taps, indices, kernels = [], [], self._at(variance)
-        for axis, kernel in enumerate(kernels):
+        taps, indices = [], []
+        for axis, kernel in enumerate(self._at(variance)):
             count = self._size[1 - axis]
             values, first = kernel.taps(np.clip(points[:, axis] + 0.5 * (count - 1), -1.0, count))
             taps.append(values)
             # Light beside the stamp stays in its margin.
             index = first + np.arange(len(values[0]), dtype=np.int32)[:, None]
             indices.append(np.clip(index, 0, count - 1))
-        moments = spread + (self._mixed - np.diag([kernel.excess for kernel in kernels]))
-        return Deposit((taps[0], taps[1]), (indices[0], indices[1]), self._size, moments)
+        return Deposit((taps[0], taps[1]), (indices[0], indices[1]), self._size, spread + self._mixed)
 
     def pixels(self, deposited: np.ndarray) -> np.ndarray:
         """Return the pixels of the stamp [ny, nx, k] of sums of deposits [n_cell, k]."""
