@@ -103,7 +103,7 @@ def fit_donuts(
         Degrees of freedom of the telescope; short for ``fit=TelescopeFreedoms(degrees_of_freedom)``.
     model : DonutModel, optional
         What the images are made of: light, air, detector (defocus and heights among it), diffraction, second stars; by
-        default rays through air of unknown seeing, in one plane.
+        default light through air of unknown seeing, in one plane, with diffraction where that fits better.
     fit : SingleDonuts, FieldTerms or TelescopeFreedoms, optional
         Unknowns of the wavefront, with the options of their fit: Zernikes of each donut (the default), double Zernikes
         over the field, or degrees of freedom of the telescope for all donuts together.
