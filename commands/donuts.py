@@ -153,9 +153,12 @@ def donuts_command(
         float, Option(help="Outer scale of the turbulence [m]; inf for Kolmogorov's.", rich_help_panel=_FIT)
     ] = 25.0,
     diffraction: Annotated[
-        bool,
-        Option(help="Diffraction at the rims of the pupil: not in images made of rays alone.", rich_help_panel=_FIT),
-    ] = True,
+        bool | None,
+        Option(
+            help="Diffraction at the rims of the pupil: by default where it fits the images better than rays do.",
+            rich_help_panel=_FIT,
+        ),
+    ] = None,
     stamp_axes: Annotated[
         str | None,
         Option(

@@ -10,6 +10,7 @@ are exact for a wavefront of any size. Where rays are aimed, Zernikes are functi
 from __future__ import annotations
 
 from copy import copy
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -140,8 +141,9 @@ class ZernikeRays:
         return spread_of(self.cells, landing, self.footprint)
 
     def at_rims(self, rims: PupilRims, landing: np.ndarray, response: np.ndarray | None) -> RimsAt:
-        """Return the rims on the detector, always with their response; see :class:`LightRays`."""
-        return self._rims.at(rims, landing)
+        """Return the rims on the detector; see :class:`LightRays`."""
+        at = self._rims.at(rims, landing)
+        return at if response is not None else replace(at, response=at.response[..., :0])
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the response at zero coefficients, the same to 1e-3 for all; see :class:`LightRays`."""

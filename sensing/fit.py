@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -37,6 +37,7 @@ from .light import Instrument
 from .likelihood import pulls
 from .model import DonutModel
 from .result import DonutFit
+from .rim_amplitude import VOTERS, RimAmplitude, rim_amplitude, waves_fit_better
 from .rim_table import moved_rims, rim_table
 from .stamps import Pixels
 from .wavefront_fits import NOLL, FittedStars, SingleDonuts, UsableStars, WavefrontFit
@@ -122,7 +123,7 @@ def fit_donuts(
         Degrees of freedom of the telescope; short for ``fit=TelescopeFreedoms(degrees_of_freedom)``.
     model : DonutModel, optional
         What the images are made of: light, air, detector (defocus and heights among it), diffraction, second stars; by
-        default rays through air of unknown seeing, in one plane.
+        default light through air of unknown seeing, in one plane, with diffraction where that fits better.
     fit : SingleDonuts, FieldTerms or TelescopeFreedoms, optional
         Unknowns of the wavefront, with the options of their fit: Zernikes of each donut (the default), double Zernikes
         over the field, or degrees of freedom of the telescope for all donuts together.
@@ -155,13 +156,21 @@ def fit_donuts(
     strengths = model.air.strengths(instrument.seeing, len(observed))
 
     def fitted_alone(index: int) -> StarFit:
-        star = _fit_alone(instrument, observed.star(index), float(shifts[index]), float(strengths[index]), fit.joint)
+        return _fit_alone(instrument, observed.star(index), float(shifts[index]), float(strengths[index]), fit.joint)
+
+    def prepared(index: int) -> StarFit:
+        star = of_rays.get(index) or fitted_alone(index)
         if progress is not None:
             progress(1)
         return fit.prepared(instrument, star)
 
     with one_blas_thread(), ThreadPoolExecutor(thread_count(threads)) as pool:
-        stars = list(pool.map(fitted_alone, range(len(observed))))
+        of_rays: dict[int, StarFit] = {}
+        if model.diffraction is None:
+            of_rays, diffraction = _by_rays(instrument, fitted_alone, len(observed), pool)
+            of_rays = {} if diffraction else of_rays
+            instrument = replace(instrument, model=replace(model, diffraction=diffraction))
+        stars = list(pool.map(prepared, range(len(observed))))
         solutions = {i: star.usable for i, star in enumerate(stars) if star.usable is not None}
         if fit.joint and not solutions:
             raise DomainError(f"no usable donut: {stars[0].flags.reasons if stars else 'no images'}")
@@ -184,6 +193,23 @@ def _wavefront_fit(
         if value is not None:
             raise ConfigError(f"{name} and fit are both given: expected it in fit={type(fit).__name__}(...)", key=name)
     return fit
+
+
+def _by_rays(
+    instrument: Instrument, fitted: Callable[[int], StarFit], count: int, pool: Executor
+) -> tuple[dict[int, StarFit], bool]:
+    """Return fits by rays of the first stars by their index, and whether diffraction lowers their chi-square."""
+    stars: dict[int, StarFit] = {}
+    amplitudes: list[RimAmplitude] = []
+    for first in range(0, count, VOTERS):
+        indices = range(first, min(first + VOTERS, count))
+        stars.update(zip(indices, pool.map(fitted, indices), strict=True))
+        usable = [stars[i].usable for i in indices]
+        votes = [rim_amplitude(instrument, star) for star in usable if star is not None]
+        amplitudes += [vote for vote in votes if vote is not None]
+        if len(amplitudes) >= VOTERS:
+            break
+    return stars, waves_fit_better(amplitudes)
 
 
 def _fit_alone(instrument: Instrument, star: ObservedStar, defocus: float, strength: float, joint: bool) -> StarFit:
@@ -270,4 +296,5 @@ def _result(
         double_zernike_covariance=fitted.double_zernike_covariance,
         degrees_of_freedom=fitted.degrees_of_freedom,
         projection=observed.projection,
+        diffraction=bool(instrument.model.diffraction),
     )

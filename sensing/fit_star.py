@@ -116,7 +116,7 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
     if flags:
         return StarFit(flags)
     best = fitter.solve(start.stamp, start.unknowns, tolerance=COARSE if donut else FINE)
-    if donut and _misfit(start.stamp, best) > _MISFIT:
+    if donut and _misfit(start.pixels, start.stamp, best) > _MISFIT:
         thinned = fitter.without_bad_lines(best)
         if thinned is not fitter:
             fitter, start = thinned, thinned.start()
@@ -126,13 +126,13 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
         best = fitter.with_neighbours(start, single)
     if donut and fitter.other_focus_is_better(start, best):
         return StarFit(DonutFlag.DEFOCUS_SIGN)
-    if donut and wavefront and _misfit(start.stamp, best) > _MISFIT:
+    if donut and wavefront and _misfit(start.pixels, start.stamp, best) > _MISFIT:
         # A neighbour is quicker to find, but light beside a rim looks like one, and like a cosmic ray.
         solved = fitter.rim_solver(COARSE, lambda moved: moved.stamp(moved.light, start.pixels))
         moved, moved_stamp, with_rims = fitter.with_moved_rims(start.stamp, single, _MISFIT, solved, start.unknowns)
         if with_rims.loss < best.loss:
             fitter, start, best = moved, replace(start, stamp=moved_stamp), with_rims
-            if instrument.model.neighbours and _misfit(moved_stamp, best) > _MISFIT:
+            if instrument.model.neighbours and _misfit(start.pixels, moved_stamp, best) > _MISFIT:
                 best = fitter.with_neighbours(start, best)
     if not _explained(start.stamp, best):
         return StarFit(DonutFlag.NO_DONUT)
@@ -325,6 +325,9 @@ class _StarFitter:
                 sharper = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
                 fwhm = sharper if sharper < _MUCH_SHARPER * fwhm else fwhm
             pixels, sampling = self._sampling(fwhm, self._side(fwhm))
+            if sampling.sharp and not instrument.known_seeing and instrument.model.n_pupil is None:
+                # Few large cells find the seeing, of which a sharp image says much.
+                sampling = replace(sampling, across=sampling.across // 2)
         else:
             fwhm = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
             wave = slice(len(instrument.noll)) if len(solution.shared) else slice(0)
@@ -413,19 +416,27 @@ class _StarFitter:
         """Return the solution with neighbours if there are any, else that without."""
         room = self.stamp(self._light, start.pixels, blended=True)
         diameter = self._light.diameter / self._instrument.pixel
-        return NeighbourSearch(room, self.solve, start.unknowns, start.template, diameter).from_single(single)
+        return NeighbourSearch(
+            room, self.solve, start.unknowns, start.template, diameter, _noise(start.pixels)
+        ).from_single(single)
 
     def other_focus_is_better(self, start: _Start, solution: Solution) -> bool:
         """Return whether the image fits a detector on the other side of focus better."""
-        if _misfit(start.stamp, solution) < _MISFIT:
+        if _misfit(start.pixels, start.stamp, solution) < _MISFIT:
             return False
         mirrored_light = self._instrument.mirrored(self._light)
         mirrored = self.start_on(start.pixels, self.stamp(mirrored_light, start.pixels))
         return explains_more(self.solve(mirrored.stamp, mirrored.unknowns, tolerance=COARSE), solution)
 
 
-def _misfit(stamp: Stamp, solution: Solution) -> float:
-    return solution.loss / max(int(stamp.used.sum()), 1)
+def _misfit(pixels: Pixels, stamp: Stamp, solution: Solution) -> float:
+    """Return the loss a pixel, beyond that of the noise of pixels of small donuts, which are not smoothed."""
+    return float(solution.loss) / max(int(stamp.used.sum()), 1) - _noise(pixels)
+
+
+def _noise(pixels: Pixels) -> float:
+    """Return the loss a pixel that noise makes: next to nothing where pixels are smoothed."""
+    return 0.0 if pixels.blur else 1.0
 
 
 def _typical(pull: np.ndarray, model: np.ndarray, used: np.ndarray) -> float:

@@ -36,6 +36,10 @@ MOST_NEIGHBOURS = 5
 FLUX, X, Y, BACKGROUND, STRENGTH, SLOPE_X, SLOPE_Y, RATIO = range(8)
 #: Power of the strength of the turbulence that the exponent of its transfer function goes by.
 _EXPONENT_GROWTH = 5.0 / 3.0
+#: Relative step of the difference that the core follows the strength of the turbulence by.
+_STRONGER = 1e-2
+#: Exponent of the air at Nyquist's frequency beyond which an image has no core.
+_SMOOTH = 6.0
 #: Exponent of the air at Nyquist's frequency below which a Gaussian is all of it.
 _NO_AIR = 6e-4
 #: The same below which that of the wavefront's derivatives is: 3 % of the light, wide and smooth, stays where it is.
@@ -106,6 +110,7 @@ class ImageGrid:
         reach: float = 0.0,
         rims: PupilRims | None = None,
     ) -> None:
+        self._arguments = (pixels, side, seeing, jacobian, blur, footprint, sharp, reach)
         shape, pixel = (pixels.image.shape[0], pixels.image.shape[1]), side * pixels.side
         self.shape, self.pixel, self.footprint = shape, pixel, footprint
         #: Pixels of the detector along one of the stamp, and the centre of its stamp from that of this one [pixels].
@@ -144,7 +149,14 @@ class ImageGrid:
         self._square = 4.0 * (x * x + y * y)
         edge = math.sqrt(abs(float(np.linalg.det(jacobian)))) * math.pi / pixel * scale
         self._edge_exponent = float(seeing.exponent(np.array([edge]))[0])
-        self._core = SharpCore(shape, pixels.width / pixels.side, blur / pixel, footprint / pixel) if sharp else None
+        self._core: SharpCore | None = None
+        if sharp:
+            core = pixels.width / pixels.side, blur / pixel, footprint / pixel
+            self._core = SharpCore(shape, *core, _variance(_SMOOTH))
+
+    def diffracting(self, rims: PupilRims) -> ImageGrid:
+        """Return the grid of a model of rays with diffraction at rims of the pupil."""
+        return ImageGrid(*self._arguments, rims)
 
     def with_rims(self, rims: PupilRims) -> ImageGrid:
         """Return the grid for other rims of the pupil."""
@@ -160,6 +172,15 @@ class ImageGrid:
         """Return the exponent of the air at Nyquist's frequency."""
         return float(self._edge_exponent * strength ** (5.0 / 3.0))
 
+    def _has_core(self, strength: float) -> bool:
+        """Return whether some of the image is sharper than the grid."""
+        return self._core is not None and self._edge(strength) < _SMOOTH
+
+    def _gaussian(self, strength: float) -> tuple[np.float32, float]:
+        """Return the light of the core of the air's image, and its variance [pixels^2]."""
+        edge = self._edge(strength)
+        return np.float32(math.exp(-edge / 6.0)), _variance(edge)
+
     def _on_grid(self, strength: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the transfer function of what the grid holds, and its derivative by the strength of the turbulence.
 
@@ -168,7 +189,7 @@ class ImageGrid:
         """
         whole = self._filter(strength)
         growth = -5.0 / 3.0 * self._exponent * strength ** (2.0 / 3.0) * whole
-        if self._core is not None:
+        if self._has_core(strength):
             edge = self._edge(strength)
             core = self._detector * np.exp(-edge / 6.0 * (1.0 + 5.0 * self._square))
             whole = whole - core
@@ -250,12 +271,12 @@ class ImageGrid:
     ) -> np.ndarray:
         """Return the image of a star of unit flux and, with a response, its derivatives over their scales."""
         strength = float(unknowns[STRENGTH])
-        parts = []
-        if self._core is None or self._edge(strength) > _NO_AIR or light.at_rims is not None:
-            thin = self._core is not None and self._edge(strength) < _THIN_AIR and response is not None
-            few = response[..., :0] if thin and light.at_rims is None else response
+        parts, sharp = [], self._has_core(strength)
+        if not sharp or self._edge(strength) > _NO_AIR or light.at_rims is not None:
+            thin = sharp and self._edge(strength) < _THIN_AIR and light.at_rims is None
+            few = response[..., :0] if thin and response is not None else response
             parts.append(self._pixels(self._spectra(unknowns, light, few, rates)))
-        if self._core is not None:
+        if sharp:
             parts.append(self._core_columns(unknowns, light, response, rates))
         if len(parts) == 1:
             return parts[0]
@@ -271,18 +292,15 @@ class ImageGrid:
         self, unknowns: np.ndarray, light: LandedLight, response: np.ndarray | None, rates: np.ndarray | None
     ) -> np.ndarray:
         """Return what the core adds to :meth:`_columns`."""
-        assert self._core is not None
-        strength = float(unknowns[STRENGTH])
-        edge = self._edge(strength)
-        amplitude = np.float32(math.exp(-edge / 6.0))
-        weights = amplitude * light.weights.astype(np.float32)[:, None]
+        core, strength = self._core, float(unknowns[STRENGTH])
+        assert core is not None
         points, spread = self.places(unknowns, light.landing), light.spread / self.pixel**2
-        variance = 5.0 / 3.0 * edge / math.pi**2
+        amplitude, variance = self._gaussian(strength)
+        weights = amplitude * light.weights.astype(np.float32)[:, None]
 
         def of_one_star(places: np.ndarray) -> list[np.ndarray]:
             """Return the light of one star, then its derivatives by x, y, strength, wave and rims."""
-            assert self._core is not None
-            deposit = self._core.deposit(places, spread, variance)
+            deposit = core.deposit(places, spread, variance)
             splines = deposit.matrix(0, 0)
             star = splines @ weights
             if response is None or rates is None:
@@ -291,9 +309,10 @@ class ImageGrid:
             ones = np.ones(len(weights), dtype=np.float32)
             along = gradient @ np.kron(np.eye(2, dtype=np.float32), ones).T
             growth = np.zeros_like(star)
-            if edge > 0.0:
-                bend = np.float32(5.0 / math.pi**2) * (deposit.laplacian() @ weights)
-                growth = np.float32(-edge * _EXPONENT_GROWTH / strength / 6.0) * (star - bend)
+            if strength > 0.0:
+                stronger, wider = self._gaussian((1.0 + _STRONGER) * strength)
+                grown = core.deposit(places, spread, wider).matrix(0, 0) @ (stronger / amplitude * weights)
+                growth = (grown - star) / np.float32(_STRONGER * strength)
             moved = response.astype(np.float32, copy=False).reshape(2 * len(weights), -1)
             wave = gradient @ moved / np.float32(self.pixel)
             return [star, along, growth, wave, splines @ (amplitude * rates).astype(np.float32)]
@@ -335,7 +354,8 @@ class ImageGrid:
         grown = growth * spectra[..., :1]
         spectra *= whole
         if light.at_rims is not None:
-            self._diffract(spectra, grown, unknowns, light.at_rims)
+            air_and_detector = whole[..., 0] if self._core is None else self._filter(float(unknowns[STRENGTH]))
+            self._diffract(spectra, grown, unknowns, light.at_rims, air_and_detector)
         extra, all_stars = [], None
         for ratio, *offset in neighbours_of(unknowns):
             shift = np.exp(1j * np.tensordot(offset, self._phase, axes=1)).astype(np.complex64)[..., None]
@@ -350,7 +370,9 @@ class ImageGrid:
         level, slopes = np.zeros_like(grown), np.zeros_like(spectra[..., :2])
         return np.concatenate([spectra[..., :3], level, grown, slopes, *extra, spectra[..., 3:]], axis=-1)
 
-    def _diffract(self, spectra: np.ndarray, grown: np.ndarray, unknowns: np.ndarray, rims: RimsAt) -> None:
+    def _diffract(
+        self, spectra: np.ndarray, grown: np.ndarray, unknowns: np.ndarray, rims: RimsAt, air_and_detector: np.ndarray
+    ) -> None:
         """Add what is diffracted at the rims to the spectra of the star and of its derivatives."""
         light = self.rim_light
         assert light is not None
@@ -359,7 +381,7 @@ class ImageGrid:
         # Frequencies of the grid count from its first cell.
         place = self.places(unknowns, np.zeros(2)) + np.array(self._middle[::-1])
         turn = np.exp(-1j * self.pixel * (light.wave @ place)).astype(np.complex64)
-        turn *= self._filter(strength)[light.where].astype(np.float32)
+        turn *= air_and_detector[light.where].astype(np.float32)
         diffracted = transfer * turn
         spectra[light.where, 0] += diffracted
         grown[light.where, 0] += (
@@ -370,6 +392,11 @@ class ImageGrid:
         for axis in (0, 1):
             spectra[light.where, 1 + axis] -= 1j * (light.wave[:, axis] * self.pixel).astype(np.float32) * diffracted
         spectra[light.where, 3 : 3 + rims.response.shape[2]] += slopes * turn[:, None]
+
+
+def _variance(edge: float) -> float:
+    """Return the variance [pixels^2] of the core of an image, from the exponent of the air at Nyquist's frequency."""
+    return 5.0 / 3.0 * edge / math.pi**2
 
 
 # Cubic B-spline at t - 1 ... t + 2 by powers of t, 0 <= t < 1, and its derivatives with respect to the point's place.

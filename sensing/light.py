@@ -35,6 +35,12 @@ _FEWEST = 48
 _MOST = 800
 #: Error that 60 cells across the pupil leave in a wavefront [m]; 120 leave 0.9 nm (LSST, 1.5 mm, 0.8").
 _CELLS_LEAVE = 2.9e-9
+#: FWHM of the blur in pixels below which an image has none: cells half a pixel wide then leave an error of 1.5 nm, and
+#: 0.4 nm with more blur.
+_BARE = 0.25
+#: The error that more cells are taken for in an image without blur [m], and that below which they are no more.
+_BARE_LEAVE = 1e-9
+_BARE_ERROR = 0.5e-9
 #: Fraction of the error of the photons that the error by the cells may be.
 _SMALL = 0.2
 #: Power of the error by which the number of cells goes, from the two figures of :data:`_CELLS_LEAVE`.
@@ -186,14 +192,17 @@ class Instrument:
     def sampling(self, light: StarLight, pixels: Pixels, fwhm: float, error: float = math.inf) -> Sampling:
         """Return how finely images of a star in a seeing [rad] are sampled on given pixels.
 
-        A wavefront known to an error [m] that the cells would add to has more of them; images sharper than their pixels
-        have as many as they need anyway.
+        A wavefront known to an error [m] that the cells would add to has more of them; where a little blurs images
+        that are sharper than their pixels they have as many as they need anyway.
         """
         width = self._width(light, pixels, fwhm)
         distance = pixels.side * self.pixel
         spacing = _SPACING * (math.hypot(width, distance) if width < _RESOLVED * distance else width)
         sharp = width < _RESOLVED * distance
-        finer = 1.0 if sharp else max((_CELLS_LEAVE / (_SMALL * max(error, _LEAST_ERROR))) ** _FALL, 1.0)
+        leave, least = (_CELLS_LEAVE, _LEAST_ERROR) if not sharp else (_BARE_LEAVE, _BARE_ERROR)
+        finer = max((leave / (_SMALL * max(error, least))) ** _FALL, 1.0)
+        if sharp and width > _BARE * distance:
+            finer = 1.0
         across = self.model.n_pupil or min(max(math.ceil(finer * light.diameter / spacing), _FEWEST), _MOST)
         return Sampling(sharp, across)
 

@@ -179,11 +179,11 @@ class DonutModel:
         Pixels, charge diffusion, heights, defocus and saturation.
     neighbours : bool
         Whether a second star may stand on a stamp. It is searched for, and fitted too.
-    diffraction : bool
+    diffraction : bool, optional
         Whether light is diffracted at the rims of the pupil, as that of real stars is: it takes light from strips along
         the rims of the image. A fit of rays takes their lack for 35 to 45 nm of wavefront, most of it Z11 (LSST, 1.5
-        mm, 620 nm, 0.8"), and a wider seeing. Images made of rays alone, without diffraction, have none (the default).
-        Images are drawn as their engine has it.
+        mm, 620 nm, 0.8"), and a wider seeing. Images made of rays alone have none. By default it is on where it lowers
+        chi-square of the first donuts; ``fit.diffraction`` says so. Images are drawn as their engine has it.
     n_pupil : int, optional
         Cells across the pupil of a fit; by default as many as an image needs.
     """
@@ -192,7 +192,7 @@ class DonutModel:
     air: DonutAir = field(default_factory=DonutAir)
     detector: DonutDetector = field(default_factory=DonutDetector)
     neighbours: bool = True
-    diffraction: bool = False
+    diffraction: bool | None = None
     n_pupil: int | None = None
 
     def __post_init__(self) -> None:

@@ -62,6 +62,8 @@ class NeighbourSearch:
         Image of a star of unit flux without aberrations in the middle of the stamp.
     diameter : float
         Diameter of the donut [pixels of the detector].
+    noise : float
+        Loss a pixel that noise makes.
     """
 
     stamp: Stamp
@@ -69,6 +71,7 @@ class NeighbourSearch:
     first: np.ndarray
     template: np.ndarray
     diameter: float
+    noise: float
 
     def from_single(self, single: Solution) -> Solution:
         """Return the best solution with neighbours if there are any, else that without.
@@ -86,7 +89,7 @@ class NeighbourSearch:
         return _central_first(best)
 
     def _misfit(self, solution: Solution) -> float:
-        return solution.loss / max(int(self.stamp.used.sum()), 1)
+        return solution.loss / max(int(self.stamp.used.sum()), 1) - self.noise
 
     def _extended(self, solution: Solution) -> Solution:
         """Return a solution with the neighbours that its residuals show, one after the other."""

@@ -16,8 +16,8 @@ from scipy.signal import fftconvolve
 from scipy.sparse import csc_array
 from scipy.special import ndtr
 
-#: Places within a pixel at which kernels are tabulated: rounding moves a cell by 3e-4 pixels rms.
-_PHASES = 1024
+#: Places within a pixel at which kernels are tabulated; between them they are straight.
+_PHASES = 256
 #: Widths of the Gaussian beyond which its light is left out: 1e-4 of it.
 _REACH = 3.7
 #: Boxes that an evenly lit cell is convolved with: with two, cells whose images stand a few per cent nearer to each
@@ -42,32 +42,32 @@ class PixelKernel:
 
     def __init__(self, cell: float, width: float, rms: float) -> None:
         cell, rms = max(cell, _NARROW), max(rms, _NARROW)
-        #: Second moment of the kernel beyond that of an evenly lit cell, pixel and blur [pixels^2].
-        self.excess = _MORE_BOXES * cell**2 / 12.0
         # Second derivatives are those of a point that is divided in two.
         step = max(round(0.5 * cell * _PHASES), 1)
-        half = math.ceil(0.5 * width + 0.5 * (1 + _MORE_BOXES) * cell + _REACH * rms - 1e-9)
+        half = math.ceil(0.5 * width + 0.5 * (2 + _MORE_BOXES) * cell + _REACH * rms - 1e-9)
         box = np.full(max(round(cell * _PHASES), 1), 1.0)
         smooth = box / box.sum()
         for _ in range(_MORE_BOXES - 1):
             smooth = np.convolve(smooth, box / box.sum())
-        beyond = step + len(smooth) // 2 + 1
+        beyond = 2 * step + len(smooth) // 2 + 1
         # From the pixels about a point to it.
-        away = (np.arange(2 * half * _PHASES + 2 * beyond) - beyond + 0.5 * (1 + len(smooth) % 2)) / _PHASES - half
+        away = (np.arange(2 * half * _PHASES + 2 * beyond) - beyond + 0.5) / _PHASES - half
         z = (away[:, None] + 0.5 * np.array([width + cell, width - cell, cell - width, -width - cell])) / rms
         steps = ndtr(z)
         integral = rms * (z * steps + np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi))
         signs = np.array([1.0, -1.0, -1.0, 1.0]) / (cell * width)
-        inside = slice(beyond, beyond + 2 * half * _PHASES)
+
+        def bent(line: np.ndarray) -> np.ndarray:
+            return (np.roll(line, step) - 2.0 * line + np.roll(line, -step)) * (_PHASES / step) ** 2
+
+        # Less half of its second derivative for the second moment of the further boxes.
+        excess = _MORE_BOXES * cell**2 / 12.0
         value, slope = (fftconvolve(v @ signs, smooth, mode="same") for v in (integral, steps))
-        bends = [
-            (v[beyond + step :][: 2 * half * _PHASES] - 2.0 * v[inside] + v[beyond - step :][: 2 * half * _PHASES])
-            * (_PHASES / step) ** 2
-            for v in (value, slope)
-        ]
+        lines = [line - 0.5 * excess * bent(line) for line in (value, slope)]
         self._half = half
         self._tables = [
-            v.reshape(2 * half, _PHASES)[::-1].astype(np.float32) for v in (value[inside], slope[inside], *bends)
+            line[beyond : beyond + 2 * half * _PHASES].reshape(2 * half, _PHASES)[::-1].astype(np.float32)
+            for line in (*lines, *map(bent, lines))
         ]
 
     @property
@@ -78,8 +78,14 @@ class PixelKernel:
     def taps(self, places: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
         """Return the kernel and its first three derivatives [n_tap, n] at places, and the first pixel of each [n]."""
         low = np.floor(places)
-        phase = np.minimum(((places - low) * _PHASES).astype(np.int32), _PHASES - 1)
-        return [table[:, phase] for table in self._tables], low.astype(np.int32) - (self._half - 1)
+        within = (places - low) * _PHASES
+        phase = np.minimum(within.astype(np.int32), _PHASES - 1)
+        value, slope, bend, twist = (table[:, phase] for table in self._tables)
+        # Rounding alone would make likelihoods as rough as their last steps.
+        beyond = ((within - phase - 0.5) / _PHASES).astype(np.float32)
+        value += beyond * slope
+        slope += beyond * bend
+        return [value, slope, bend, twist], low.astype(np.int32) - (self._half - 1)
 
 
 class SharpCore:
@@ -95,14 +101,17 @@ class SharpCore:
         Rms of the blur of the detector along each axis [pixels].
     footprint : ndarray, shape [2, 2]
         Sides of the image of a cell [pixels], columns of a matrix.
+    widest : float
+        Largest variance of a further Gaussian blur [pixels^2].
     """
 
-    def __init__(self, shape: tuple[int, int], width: float, rms: float, footprint: np.ndarray) -> None:
+    def __init__(self, shape: tuple[int, int], width: float, rms: float, footprint: np.ndarray, widest: float) -> None:
         self._shape, self._width, self._rms = shape, width, rms
         # A rectangle along the axes with the second moments of the cell but for the mixed one, which is a spread.
         self._cell = np.hypot(*footprint.T)
         self._mixed = (footprint @ footprint.T)[0, 1] / 12.0 * np.array([[0.0, 1.0], [1.0, 0.0]])
-        self._variance, self._kernels = -1.0, [PixelKernel(c, width, rms) for c in self._cell]
+        self._margin = max(kernel.margin for kernel in self._at(widest))
+        self._size = (shape[0] + 2 * self._margin, shape[1] + 2 * self._margin)
 
     def deposit(self, points: np.ndarray, spread: np.ndarray, variance: float) -> Deposit:
         """Return what points add to the pixels of the stamp and of a margin.
@@ -110,37 +119,25 @@ class SharpCore:
         Points are places (x, y) from the centre of the stamp, spreads their second moments beside the footprint, and
         the variance is that of a further Gaussian blur, all in pixels.
         """
-        if variance != self._variance:
-            rms = math.hypot(self._rms, math.sqrt(variance))
-            self._variance, self._kernels = variance, [PixelKernel(c, self._width, rms) for c in self._cell]
         taps, indices = [], []
-        for axis, kernel in enumerate(self._kernels):
-            margin, count = self._margins[1 - axis], self._size[1 - axis]
-            place = np.clip(points[:, axis] + (0.5 * (self._shape[1 - axis] - 1) + margin), -1.0, count)
-            values, first = kernel.taps(place)
+        for axis, kernel in enumerate(self._at(variance)):
+            count = self._size[1 - axis]
+            values, first = kernel.taps(np.clip(points[:, axis] + 0.5 * (count - 1), -1.0, count))
             taps.append(values)
             # Light beside the stamp stays in its margin.
             index = first + np.arange(len(values[0]), dtype=np.int32)[:, None]
             indices.append(np.clip(index, 0, count - 1))
-        return Deposit((taps[0], taps[1]), (indices[0], indices[1]), self._size, spread + self._moments)
+        return Deposit((taps[0], taps[1]), (indices[0], indices[1]), self._size, spread + self._mixed)
 
     def pixels(self, deposited: np.ndarray) -> np.ndarray:
         """Return the pixels of the stamp [ny, nx, k] of sums of deposits [n_cell, k]."""
-        rows, columns = (slice(m, m + n) for m, n in zip(self._margins, self._shape, strict=True))
-        return deposited.reshape(*self._size, -1)[rows, columns]
+        rows, columns = (slice(self._margin, self._margin + n) for n in self._shape)
+        return np.asarray(deposited.reshape(*self._size, -1)[rows, columns])
 
-    @property
-    def _moments(self) -> np.ndarray:
-        return np.asarray(self._mixed - np.diag([kernel.excess for kernel in self._kernels]))
-
-    @property
-    def _margins(self) -> tuple[int, int]:
-        return self._kernels[1].margin, self._kernels[0].margin
-
-    @property
-    def _size(self) -> tuple[int, int]:
-        down, across = self._margins
-        return self._shape[0] + 2 * down, self._shape[1] + 2 * across
+    def _at(self, variance: float) -> list[PixelKernel]:
+        """Return the kernels along x and y under a further blur."""
+        rms = math.hypot(self._rms, math.sqrt(variance))
+        return [PixelKernel(cell, self._width, rms) for cell in self._cell]
 
 
 class Deposit:
@@ -177,10 +174,6 @@ class Deposit:
     def gradient(self, weights: np.ndarray) -> csc_array:
         """Return the derivatives along x and then along y of weighted points, shape [n_cell, 2 * n]."""
         return self._matrix(self._values(1, 0, weights), self._values(0, 1, weights))
-
-    def laplacian(self) -> csc_array:
-        """Return the sum of the second derivatives, without the spreads, shape [n_cell, n]."""
-        return self._matrix(_by_point(self._y[0][:, None] * self._x[2] + self._y[2][:, None] * self._x[0]))
 
     def _values(self, i: int, j: int, weights: np.ndarray | int) -> np.ndarray:
         x, y, (half_xx, xy, half_yy) = self._x, self._y, self._spread

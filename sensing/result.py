@@ -110,6 +110,8 @@ class DonutFit(Result):
         Rims and spiders that stand elsewhere than the prescription has them, one a row: number of the donut, surfaces,
         shift towards more light on the surface and on the image, and motions, with errors. Of joint fits, those of each
         donut by itself.
+    diffraction : bool
+        Whether the model has light diffracted at the rims of the pupil.
     """
 
     zernikes: np.ndarray
@@ -140,6 +142,7 @@ class DonutFit(Result):
     degrees_of_freedom: FreedomEstimate | None = None
     projection: str = "zemax"
     rims: QTable = field(default_factory=lambda: rim_table({}))
+    diffraction: bool = False
 
     def __len__(self) -> int:
         """Return the number of donuts."""
@@ -235,6 +238,7 @@ class DonutFit(Result):
             telescope=self.telescope,
             wavelength_nm=(self.wavelengths * 1e9).tolist(),
             obscuration=self.obscuration,
+            diffraction=self.diffraction,
             zernikes="annular, Noll, on the entrance pupil; positive where the wavefront leads",
         )
         return table
@@ -245,6 +249,7 @@ class DonutFit(Result):
             "telescope": self.telescope,
             "wavelength_nm": self.wavelengths * 1e9,
             "obscuration": self.obscuration,
+            "diffraction": self.diffraction,
             "noll": self.noll,
             "field_deg": np.rad2deg(self.fields),
             "flags": self.flags,

@@ -13,6 +13,8 @@ from ..wavefront.psf.pupil_rims import PupilRims
 
 #: Transfer of air and detector below which diffraction is left out.
 _DARK = 2e-3
+#: The same below which its derivatives are left out.
+_DIM = 2e-2
 #: Fraction of the strength of the turbulence that this transfer is computed for, so that a little less of it fits too.
 _SHARPER = 0.9
 #: Distance by which landing points may move before the transfer function is computed again [side of a pixel]. Images
@@ -73,6 +75,7 @@ class RimLight:
         self._last: _Expansion | None = None
         #: Frequencies of the grid where something of the diffracted light is left, and their wave vectors [n, 2].
         self.where, self.wave = np.zeros(lattice.shape, dtype=bool), np.zeros((0, 2))
+        self._bright = np.zeros(0, dtype=bool)
 
     def of(self, rims: PupilRims) -> RimLight:
         """Return the same for other rims."""
@@ -89,20 +92,27 @@ class RimLight:
         """
         if strength < self._strength:
             self._strength = _SHARPER * strength
-            self.where = np.abs(self._filter(self._strength)) > _DARK
+            passed = np.abs(self._filter(self._strength))
+            self.where = passed > _DARK
+            self._bright = passed[self.where] > _DIM
             self.wave = self._at_where(self._grid[1])
             self._last = None
         last = self._last
         follows = None if last is None else last.change(at, self._side)
         if last is None or follows is None:
-            frequencies, count = self._at_where(self._grid[0]), at.response.shape[2]
+            baseline, wave, bright = self._at_where(self._grid[0]), self.wave, self._bright
+            places, count = (at.landing, at.inward), at.response.shape[2]
+            values = np.empty(len(wave), dtype=np.complex64)
+            slopes = np.zeros((len(wave), count), dtype=np.complex64)
             if count:
-                parts = self.rims.transfer_slopes(frequencies, self.wave, at.landing, at.inward, at.response)
-            else:
-                parts = self.rims.transfer(frequencies, self.wave, at.landing, at.inward), np.zeros((len(self.wave), 0))
-            over = self._lattice[self.where]
-            values, slopes = parts[0] / over, parts[1] / over[:, None]
-            last = self._last = _Expansion(at, values.astype(np.complex64), slopes.astype(np.complex64))
+                values[bright], slopes[bright] = self.rims.transfer_slopes(
+                    baseline[bright], wave[bright], *places, at.response
+                )
+            dim = ~bright if count else np.ones(len(wave), dtype=bool)
+            values[dim] = self.rims.transfer(baseline[dim], wave[dim], *places)
+            over = self._lattice[self.where].astype(np.float32)
+            values, slopes = values / over, slopes / over[:, None]
+            last = self._last = _Expansion(at, values, slopes)
             follows = np.zeros(count)
         if not follows.any():
             return last.values, last.slopes

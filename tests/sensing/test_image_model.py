@@ -10,8 +10,9 @@ import pachon
 from pachon.raytrace.rays import field_direction
 from pachon.sensing.degrees import FreedomRays
 from pachon.sensing.donut_rays import ZernikeRays
-from pachon.sensing.image_model import ImageGrid, LandedLight
+from pachon.sensing.image_model import STRENGTH, ImageGrid, LandedLight
 from pachon.sensing.likelihood import Stamp, model_image, normal_equations
+from pachon.sensing.pixel_kernel import PixelKernel
 from pachon.sensing.pupil_cells import pupil_cells
 from pachon.sensing.seeing import Seeing
 from pachon.sensing.solve import Group, solve
@@ -24,7 +25,9 @@ NOLL = np.arange(4, 12)
 FIELD = np.deg2rad([1.2, 0.4])
 
 
-def stamp_of(tel, across, *, blur=0.0, size=SIZE, outer_scale=25.0, image=None, reach=0.0, side=1, rims=None):
+def stamp_of(
+    tel, across, *, blur=0.0, size=SIZE, outer_scale=25.0, image=None, reach=0.0, side=1, rims=None, sharp=False
+):
     direction = field_direction(*FIELD)
     cells = pupil_cells(tel, direction, WAVELENGTH, across)
     rays = ZernikeRays(tel, direction, np.array([WAVELENGTH]), np.ones(1), cells, NOLL)
@@ -32,7 +35,7 @@ def stamp_of(tel, across, *, blur=0.0, size=SIZE, outer_scale=25.0, image=None, 
     seeing = Seeing(WAVELENGTH, outer_scale)
     image = np.zeros((size, size)) if image is None else image
     pixels = Pixels(image, np.full(image.shape, 500.0), np.ones(image.shape, dtype=bool)).binned(side)
-    grid = ImageGrid(pixels, PIXEL, seeing, jacobian, blur, rays.footprint, False, reach, rims)
+    grid = ImageGrid(pixels, PIXEL, seeing, jacobian, blur, rays.footprint, sharp, reach, rims)
     return Stamp(pixels.image, pixels.variance, pixels.used, grid, rays)
 
 
@@ -105,6 +108,68 @@ def test_derivatives_are_central_differences(behind_focus, companion, diffracted
         # columns leave that out. Without derivatives of the rims' places, those of a diffracted image are 18 % off.
         bound = 3e-2 if diffracted else 2e-2
         assert np.linalg.norm(columns[..., k] * scales[k] - expected) < bound * np.linalg.norm(expected)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("strength", "blur", "companion"), [(0.0, 0.0, ()), (1.0, 0.0, ()), (2.5, 0.4, (0.3, 12.0, -7.5))]
+)
+def test_derivatives_of_sharp_images_are_central_differences(behind_focus, strength, blur, companion):
+    stamp = stamp_of(behind_focus, 120, blur=blur * PIXEL, reach=60 * PIXEL, sharp=True)
+    star, wave = np.array([1e6, 1.2, -0.7, 3.0, strength, *companion]), 60e-9 * np.cos(np.arange(len(NOLL)))
+    joined = np.concatenate([star, wave])
+    steps = np.concatenate([[1e3, 3e-2, 3e-2, 1.0, 0.05], np.full(len(companion), 0.02), np.full(len(NOLL), 2e-8)])
+    landing, response = stamp.rays.landing(wave), stamp.rays.response(wave)
+    light = LandedLight(landing, stamp.rays.weights(wave), stamp.rays.spread(landing))
+    image, columns, scales = stamp.grid.derivatives(star, light, response, stamp.rays.rates)
+    np.testing.assert_allclose(image, model_image(stamp, star, wave), atol=1e-6 * image.max())
+    # All light is on the stamp, but for the air's wings.
+    assert (image - 3.0).sum() == pytest.approx(1e6 * (1.3 if companion else 1.0), rel=2e-3)
+    for k, step in enumerate(steps):
+        if k == STRENGTH and strength == 0.0:
+            continue
+        ends = [
+            model_image(stamp, *np.split(joined + sign * step * np.eye(len(joined))[k], [len(star)]))
+            for sign in (1.0, -1.0)
+        ]
+        expected = (ends[0] - ends[1]) / (2.0 * step)
+        # Kernels without air have corners, that of pixels and cells, over which differences are means.
+        assert np.linalg.norm(columns[..., k] * scales[k] - expected) < 0.06 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("strength", [0.0, 0.6, 2.5])
+def test_sharp_images_summed_in_pairs_are_those_of_summed_pixels(behind_focus, strength):
+    """The core and the smooth rest of the air add up: images of one grid are those of another."""
+    star, wave = np.array([1e6, 1.2, -0.7, 0.0, strength]), 60e-9 * np.cos(np.arange(len(NOLL)))
+    stamp = stamp_of(behind_focus, 180, size=90, sharp=True)
+    single = model_image(stamp, star, wave)
+    pixels = Pixels(np.zeros((90, 90)), np.full((90, 90), 500.0), np.ones((90, 90), dtype=bool)).binned(2)
+    jacobian = image_jacobians(behind_focus, field_direction(*FIELD)[None], WAVELENGTH)[0]
+    grid = ImageGrid(pixels, PIXEL, Seeing(WAVELENGTH, 25.0), jacobian, 0.0, stamp.rays.footprint, sharp=True)
+    summed = model_image(replace(stamp, grid=grid, image=pixels.image), star, wave)
+    expected = single.reshape(45, 2, 45, 2).sum(axis=(1, 3))
+    np.testing.assert_allclose(summed, expected, atol=5e-3 * expected.max())
+
+
+@pytest.mark.parametrize(("cell", "rms"), [(0.6, 0.0), (0.3, 0.4)])
+def test_kernels_of_pixels_have_the_moments_of_evenly_lit_cells(cell, rms):
+    """Sum, mean and variance of a cell, a pixel and a blur, from many places of the cell in a pixel."""
+    places = 5.0 + (np.arange(200) + 0.5) / 200
+    values, first = PixelKernel(cell, 1.0, rms).taps(places)
+    away = first + np.arange(len(values[0]))[:, None] - places
+    np.testing.assert_allclose(values[0].sum(axis=0), 1.0, atol=2e-4)
+    assert (values[0] * away).sum(axis=0).mean() == pytest.approx(0.0, abs=1e-4)
+    variance = (values[0] * away**2).sum(axis=0).mean()
+    assert variance == pytest.approx(cell**2 / 12.0 + 1.0 / 12.0 + rms**2, abs=1e-3)
+
+
+def test_evenly_spaced_cells_light_pixels_evenly():
+    """A few per cent nearer to each other than the kernels have it, too: 3 % of light by single boxes."""
+    places = 20.0 + 0.52 * np.arange(100)
+    values, first = PixelKernel(0.5, 1.0, 0.0).taps(places)
+    pixels = np.zeros(100)
+    np.add.at(pixels, first + np.arange(len(values[0]))[:, None], values[0])
+    np.testing.assert_allclose(pixels[25:65] * 0.52, 1.0, atol=2e-3)
 
 
 @pytest.mark.long

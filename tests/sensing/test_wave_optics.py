@@ -1,7 +1,9 @@
 """Donuts of waves: squared Fourier transforms of the pupil under a long exposure, fitted with diffraction."""
 
+import donut_images
 import numpy as np
 import pytest
+from donut_images import donut, noisy
 from scipy import fft
 from scipy.ndimage import map_coordinates
 
@@ -11,6 +13,8 @@ from pachon.wavefront.atmosphere.turbulence import coherence, long_exposure_fwhm
 from pachon.wavefront.chief_rays import image_jacobians
 
 WAVELENGTH, PIXEL, SIZE, OUTER_SCALE = 620e-9, 10e-6, 161, 25.0
+#: Fields of donuts drawn by other means, and the wavelength of those of rays.
+FIELDS, RAYS_WAVELENGTH = np.deg2rad([(0.6, 0.9), (1.0, -0.7)]), donut_images.WAVELENGTH
 #: Points of the field along a side, and their distance on the pupil [m].
 COUNT, STEP = 4096, 4e-3
 
@@ -60,10 +64,42 @@ def test_diffraction_is_not_taken_for_wavefront(behind_focus, on_axis, r0, left,
             model=pachon.DonutModel(air=pachon.DonutAir(outer_scale=OUTER_SCALE), diffraction=diffraction),
             threads=1,
         )
-        for diffraction in (False, True)
+        for diffraction in (False, True, None)
     }
     rss = {key: float(np.linalg.norm(fit.zernikes[0])) for key, fit in found.items()}
     assert rss[True] < left
     assert rss[False] > of_rays
     seeing = long_exposure_fwhm(WAVELENGTH, r0, OUTER_SCALE)
     assert abs(found[True].fwhm[0] - seeing) < abs(found[False].fwhm[0] - seeing)
+    # Told from the image itself, and the same then.
+    assert (found[False].diffraction, found[True].diffraction, found[None].diffraction) == (False, True, True)
+    np.testing.assert_array_equal(found[None].zernikes, found[True].zernikes)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("blur", [0.0, 0.7, 1.5])
+def test_images_of_rays_are_told_from_those_of_waves(behind_focus, blur):
+    """Of dense rays, under a blur that is no Kolmogorov's either."""
+    images = np.stack([noisy(donut(behind_focus, field, blur=blur), 500.0, 2) for field in FIELDS])
+    fit = pachon.fit_donuts(
+        behind_focus, images, FIELDS, RAYS_WAVELENGTH, sky_variance=500.0, pixel_size=20e-6, threads=1
+    )
+    assert fit.diffraction is False
+    assert fit.usable.all()
+    assert fit.summary()["diffraction"] is False
+
+
+@pytest.mark.long
+def test_donuts_of_waves_are_told_from_those_of_rays(behind_focus):
+    air = pachon.Atmosphere.from_site("cerro_pachon", seed=1)
+    images = 5e6 * pachon.draw_donuts(behind_focus, FIELDS, [WAVELENGTH], atmosphere=air).psf.image
+    images = np.random.default_rng(1).poisson(images + 500.0) - 500.0
+    seen = []
+    fit = pachon.fit_donuts(
+        behind_focus, images, FIELDS, WAVELENGTH, sky_variance=500.0, threads=1, progress=seen.append
+    )
+    assert fit.diffraction is True
+    assert seen == [1] * len(FIELDS)
+    # By rays alone 50 nm, and a chi-square of 1.13.
+    assert (fit.chi2 / fit.n_pixels).max() < 1.03
+    assert np.linalg.norm(fit.zernikes, axis=1).max() < 50e-9

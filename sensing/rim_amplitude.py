@@ -1,0 +1,79 @@
+r"""Whether images of donuts have light that is diffracted at the rims of the pupil, from the images themselves.
+
+A fit of rays tells how much chi-square would fall by an amount a of the diffracted light, 0 for rays and 1 for waves:
+with its image r, the derivatives A of all else, their prior P, the residuals d and the variance V, the best amount is
+:math:`\hat a = \tilde r^T V^{-1} d / \tilde r^T V^{-1} r` with :math:`\tilde r` the part of r that A does not explain.
+Chi-square with a = 1 is lower than with a = 0 where :math:`\hat a > 1/2`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..wavefront.psf.pupil_rims import pupil_rims
+from .fit_star import SMALLEST_DONUT, StarSolution
+from .image_model import STRENGTH, LandedLight
+from .light import Instrument
+
+#: Donuts that are asked.
+VOTERS = 3
+#: Smallest variance of a pixel [electron^2].
+_LEAST_VARIANCE = 1.0
+
+
+@dataclass(frozen=True)
+class RimAmplitude:
+    """Amount of diffracted light in an image, 1 for waves and 0 for rays, and the inverse of its variance."""
+
+    value: float
+    precision: float
+
+
+def rim_amplitude(instrument: Instrument, star: StarSolution) -> RimAmplitude | None:
+    """Return how much diffracted light an image has; None for stars in focus and images without air.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        Telescope and model of the images, of rays.
+    star : StarSolution
+        Best model by rays.
+    """
+    stamp, solution, light = star.stamp, star.solution, star.light
+    unknowns, wave = solution.stars[0], solution.waves[0]
+    if unknowns[STRENGTH] == 0.0 or light.diameter < SMALLEST_DONUT * instrument.pixel:
+        return None
+    rims = pupil_rims(light.telescope, light.direction, instrument.middle)
+    landing, response = stamp.rays.landing(wave), stamp.rays.response(wave)
+    landed = LandedLight(landing, stamp.rays.weights(wave), stamp.rays.spread(landing))
+    model, columns, scales = stamp.grid.derivatives(unknowns, landed, response, stamp.rays.rates)
+    waves = LandedLight(landed.landing, landed.weights, landed.spread, stamp.rays.at_rims(rims, landing, None))
+    diffracted = stamp.grid.diffracting(rims).image(unknowns, waves) - model
+    used = stamp.used
+    root = 1.0 / np.sqrt(np.maximum(model + stamp.variance, _LEAST_VARIANCE)[used])
+    derivatives = columns[used].astype(np.float64) * root[:, None] * scales
+    if instrument.known_seeing:
+        derivatives[:, STRENGTH] = 0.0
+    light_column, residual = diffracted[used] * root, (stamp.image - model)[used] * root
+    prior = np.zeros(derivatives.shape[1])
+    precision = np.concatenate([instrument.terms.precision, light.shift_precision])
+    prior[len(unknowns) :] = precision
+    state = np.concatenate([np.zeros(len(unknowns)), wave])
+    curvature = derivatives.T @ derivatives + np.diag(prior)
+    scale = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
+    cross, gradient = derivatives.T @ light_column / scale, (derivatives.T @ residual - prior * state) / scale
+    solved = np.linalg.pinv(curvature / np.outer(scale, scale), rcond=1e-12, hermitian=True) @ np.stack(
+        [cross, gradient], axis=1
+    )
+    information = float(light_column @ light_column - cross @ solved[:, 0])
+    if not information > 0.0:
+        return None
+    return RimAmplitude(float(light_column @ residual - cross @ solved[:, 1]) / information, information)
+
+
+def waves_fit_better(amplitudes: Sequence[RimAmplitude]) -> bool:
+    """Return whether donuts together have less chi-square with diffraction than without."""
+    return sum((2.0 * a.value - 1.0) * a.precision for a in amplitudes) > 0.0
