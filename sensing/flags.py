@@ -10,8 +10,8 @@ class DonutFlag(IntFlag):
 
     ``BLENDED`` (a second star was fitted too), ``CLIPPED`` (pixels far off the model, cosmic rays for example, were
     left out), ``POOR_FIT`` (chi-square is far above the number of pixels, so that errors are larger than claimed) and
-    ``RIM_MOVED`` (a rim or a spider stands elsewhere than the prescription has it, and was fitted too) are remarks: there
-    are results. With any other flag the results of the donut are NaN.
+    ``RIM_MOVED`` (a rim or a spider stands elsewhere than the prescription has it, and was fitted too) are remarks:
+    there are results. With any other flag the results of the donut are NaN.
 
     ``NO_DONUT``: nothing like a donut stands on the stamp. ``CUT_OFF``: more than a twentieth of the light falls beside
     the stamp. ``SATURATED``: too many pixels are saturated. ``DEFOCUS_SIGN``: the image fits the other side of focus

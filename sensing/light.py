@@ -53,6 +53,8 @@ _BINNED = 1.95
 _MOST_BINNED = 4
 #: Least fraction of the pixels in use that binning keeps.
 _KEPT = 0.95
+#: Shift of a rim that is free by itself, over that of others.
+_HELD = 1e-3
 #: Full width at half maximum of a Gaussian over its rms.
 _FWHM_PER_RMS = 2.354820045
 
@@ -266,7 +268,10 @@ class StarLight:
     @property
     def shift_precision(self) -> np.ndarray:
         """Inverse variances of the shifts of the rims along x and y and of the motions of free ones, [n_shift]."""
-        shifts = np.full(2 * len(self.rims), shift_spread(self.telescope) ** -2.0)
+        names = self.free_rims.surfaces(self.telescope)
+        # A rim that is free by itself has no further shift.
+        spreads = [shift_spread(self.telescope) * (_HELD if rim.name in names else 1.0) for rim in self.rims]
+        shifts = np.repeat(spreads, 2) ** -2.0
         return np.concatenate([shifts, self.free_rims.spreads**-2.0])
 
     @property

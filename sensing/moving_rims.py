@@ -33,7 +33,7 @@ _SPIDER_TURN = 0.035
 _THICKNESS = 0.1
 #: Most standard deviations that a rim is moved by at once.
 _MOST = 3.0
-#: Radii and centres that differ by less, over the radius, are of one body: both faces of a lens, a baffle and its mirror.
+#: Radii and centres that differ by less, over the radius, are of one body: both faces of a lens, a mirror's baffle.
 _ALIKE = 5e-3
 #: Points across the pupil for the places of the light on the surfaces.
 _SURVEY = 32
@@ -47,6 +47,8 @@ _BESIDE = 0.02
 _STEPS = 8
 #: Step over the radius of the pupil after which they are found.
 _CLOSE = 1e-7
+#: Longest piece of a rim, in sides of a cell.
+_LONGEST = 10.0
 #: Fewest pieces of a rim that matter.
 _FEWEST_PIECES = 3
 
@@ -104,6 +106,10 @@ class FreeRims:
     def spreads(self) -> np.ndarray:
         """Standard deviations of the free motions, shape [n]."""
         return np.array([body.spreads for body in self.bodies]).reshape(-1, MOTIONS)[self.free]
+
+    def surfaces(self, telescope: Telescope) -> set[str]:
+        """Return the names of the surfaces whose rims are free."""
+        return {telescope.surface_names[surface] for body in self.bodies for surface, _ in body.members}
 
     def with_body(self, body: RimBody) -> FreeRims:
         """Return these and one more, where the prescription has it."""
@@ -228,6 +234,7 @@ class PupilShadows:
         self._survey = middle + lattice[np.hypot(*lattice.T) <= 1.1 * half]
         self._middle, self._half = middle, half
         self._ends = self._traced(self._survey)
+        self._polynomials: dict[bytes, PupilPolynomials] = {}
 
     def _traced(self, points: np.ndarray) -> list[TraceResult]:
         """Return rays through points of the pupil [n, 2] at all surfaces."""
@@ -239,55 +246,69 @@ class PupilShadows:
 
     def lines(self, bodies: Sequence[RimBody]) -> RimLines:
         """Return the shadows of bodies where they bound the light."""
-        pieces = [
-            (number, *self._shadow(surface, region))
-            for number, body in enumerate(bodies)
-            for surface, region in body.members
-        ]
-        numbers = np.concatenate([np.full(len(points), number) for number, points, *_ in pieces])
-        return RimLines(*(np.concatenate(values) for values in list(zip(*pieces, strict=True))[1:]), numbers)
+        regions: dict[int, dict[int, int]] = {}
+        for number, body in enumerate(bodies):
+            for surface, region in body.members:
+                regions.setdefault(surface, {})[region] = number
+        shadows = [self._shadows(surface, numbers) for surface, numbers in regions.items()]
+        points, along, shift, slope, numbers, surfaces = (np.concatenate(v) for v in zip(*shadows, strict=True))
+        length = np.hypot(*along.T)
+        normal = np.stack([along[:, 1], -along[:, 0]], axis=-1) / length[:, None]
+        towards = self._lit_side(surfaces, points, normal)
+        bounds = towards != 0.0
+        dark = -normal[bounds] * towards[bounds, None]
+        # Gradients on the surface go with the transpose of the inverse.
+        on_surface = np.einsum("nji,nj->ni", slope[bounds], dark)
+        on_surface /= np.hypot(*on_surface.T)[:, None]
+        across = np.einsum("nij,nmj,ni->nm", slope[bounds], shift[bounds], dark)
+        outward = np.einsum("nmi,ni->nm", shift[bounds], on_surface)
+        return RimLines(points[bounds], along[bounds], across, outward, numbers[bounds])
 
-    def _shadow(self, surface: int, region: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return points, vectors along, distances across on the pupil and on the surface of one rim's shadow."""
-        nothing = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, MOTIONS)), np.zeros((0, MOTIONS))
+    def _smooth(self, surface: int) -> tuple[PupilPolynomials, np.ndarray] | None:
+        """Return polynomials of the places of the light on a surface, and these [n, 2]; None where too little does."""
         places = self._places(surface, self._ends)
         reached = np.isfinite(places).all(axis=1)
         if reached.sum() < _FEWEST:
-            return nothing
-        points, places = self._survey[reached], places[reached]
-        smooth = PupilPolynomials(points, self._middle, self._half)
-        slope = np.linalg.lstsq(np.column_stack([points - self._middle, np.ones(len(points))]), places, rcond=None)[0]
-        scale = np.sqrt(abs(float(np.linalg.det(slope[:2]))))
+            return None
+        key = reached.tobytes()
+        if key not in self._polynomials:
+            self._polynomials[key] = PupilPolynomials(self._survey[reached], self._middle, self._half)
+        return self._polynomials[key], places[reached]
+
+    def _shadows(self, surface: int, numbers: dict[int, int]) -> tuple[np.ndarray, ...]:
+        """Return the outlines of some regions of a surface on the pupil, lit or not; each region has a number.
+
+        Middles of their pieces [n, 2], vectors along them, shifts of the rim on its surface by each motion [n, 4, 2],
+        derivatives of the place on the pupil by that on the surface [n, 2, 2], numbers, and that of the surface.
+        """
+        nothing = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, MOTIONS, 2)), np.zeros((0, 2, 2))
+        none = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        polynomials = self._smooth(surface)
+        if polynomials is None:
+            return *nothing, *none
+        smooth, places = polynomials
+        # A linear map from the surface to the pupil is where the search for the places there begins.
+        center, linear = (values[0] for values in smooth.at(self._middle[None], places))
         reach = float(np.hypot(*places.T).max())
-        spacing = max(self._cells.side * scale, 1e-6 * reach)
-        rim = outline(simple_regions(self._telescope.surfaces[surface].aperture)[region], spacing, reach)
-        near = _near(rim.middle, places, 2.0 * spacing)
+        spacing = max(self._cells.side * np.sqrt(abs(float(np.linalg.det(linear)))), 1e-6 * reach)
+        regions = simple_regions(self._telescope.surfaces[surface].aperture)
+        rims = [outline(regions[region], spacing, reach) for region in numbers]
+        middle, along, motion = (
+            np.concatenate(v) for v in zip(*((r.middle, r.end - r.start, r.motion) for r in rims), strict=True)
+        )
+        number = np.repeat(list(numbers.values()), [len(rim.middle) for rim in rims])
+        near = _near(middle, places, 2.0 * spacing)
         if not near.any():
-            return nothing
-        back = np.linalg.pinv(slope[:2])
-        targets = np.concatenate([values[near] for values in (rim.start, rim.middle, rim.end)])
-        begin = (targets - slope[2]) @ back + self._middle
-        start, middle, end = np.split(self._on_pupil(smooth, places, begin, targets), 3)
-        along, motion = end - start, rim.motion[near]
+            return *nothing, *none
+        begin = (middle[near] - center) @ np.linalg.pinv(linear).T + self._middle
+        points = self._on_pupil(smooth, places, begin, middle[near])
+        reached = np.isfinite(points).all(axis=1)
+        points, along, motion, number = points[reached], *(v[near][reached] for v in (along, motion, number))
+        slope = np.linalg.inv(smooth.at(points, places)[1])
+        along = np.einsum("nij,nj->ni", slope, along)
         length = np.hypot(*along.T)
-        fine = np.isfinite(middle).all(axis=1) & (length > 0.0) & (length < 10.0 * self._cells.side)
-        if not fine.any():
-            return nothing
-        middle, along, motion, length = (v[fine] for v in (middle, along, motion, length))
-        normal = np.stack([along[:, 1], -along[:, 0]], axis=-1) / length[:, None]
-        towards = self._lit_side(surface, middle, normal)
-        bounds = towards != 0.0
-        if not bounds.any():
-            return nothing
-        middle, along, motion = (v[bounds] for v in (middle, along, motion))
-        dark = -normal[bounds] * towards[bounds, None]
-        jacobian = smooth.at(middle, places)[1]  # place on the surface by place on the pupil
-        shift = np.einsum("nij,nmj->nmi", np.linalg.inv(jacobian), motion)
-        across = np.einsum("nmi,ni->nm", shift, dark)
-        # The normal of the rim on its surface: gradients go with the transpose of the inverse.
-        on_surface = np.einsum("nji,nj->ni", np.linalg.inv(jacobian), dark)
-        on_surface /= np.hypot(*on_surface.T)[:, None]
-        return middle, along, across, np.einsum("nmi,ni->nm", motion, on_surface)
+        fine = (length > 0.0) & (length < _LONGEST * self._cells.side)
+        return tuple(v[fine] for v in (points, along, motion, slope, number, np.full(len(points), surface)))
 
     def _on_pupil(
         self, smooth: PupilPolynomials, places: np.ndarray, start: np.ndarray, target: np.ndarray
@@ -309,24 +330,28 @@ class PupilShadows:
                     break
         return points
 
-    def _lit_side(self, surface: int, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Return on which side of a rim light passes, 1 along the normals and -1 against them; 0 if not one alone.
+    def _lit_side(self, surfaces: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """Return on which side of rims light passes, 1 along the normals and -1 against them; 0 if not one alone.
 
-        The dark side has to be that of this surface: of rims in one place, the first that the light meets.
+        The dark side has to be that of the rim's own surface: of rims in one place, the first that the light meets.
         """
-        step = _BESIDE * self._cells.side
-        ends = [self._traced(points + sign * step * normal) for sign in (1.0, -1.0)]
-        lit = [end[-1].status == RayStatus.OK for end in ends]
-        stopped = [
-            (end[surface].status == RayStatus.VIGNETTED)
-            & (True if surface == 0 else end[surface - 1].status != RayStatus.VIGNETTED)
-            for end in ends
-        ]
-        return np.where(lit[0] & stopped[1], 1.0, np.where(lit[1] & stopped[0], -1.0, 0.0))
+        if not len(points):
+            return np.zeros(0)
+        step = _BESIDE * self._cells.side * normal
+        ends = self._traced(np.concatenate([points + step, points - step]))
+        stopped = np.full(2 * len(points), -1)
+        for number, end in reversed(list(enumerate(ends))):
+            stopped[end.status == RayStatus.VIGNETTED] = number
+        lit = ends[-1].status == RayStatus.OK
+        first, second = np.split(lit, 2)
+        dark_first, dark_second = np.split(stopped == np.tile(surfaces, 2), 2)
+        return np.where(first & dark_second, 1.0, np.where(second & dark_first, -1.0, 0.0))
 
     def candidates(self) -> tuple[list[RimBody], RimLines]:
         """Return the bodies whose rims bound the light, with how far they may move, and their shadows."""
         bodies = rim_bodies(self._telescope)
+        if not bodies:
+            return [], RimLines(np.zeros((0, 2)), np.zeros((0, 2)), *np.zeros((2, 0, MOTIONS)), np.zeros(0, dtype=int))
         lines = self.lines(bodies)
         count = np.bincount(lines.body, minlength=len(bodies))
         kept = np.flatnonzero(count >= _FEWEST_PIECES)

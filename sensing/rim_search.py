@@ -163,9 +163,8 @@ class _RaysWithShadows:
         self.cells, self._light, self._shadows, self._count = light.cells, light, shadows, count
         self._size = len(light.rates)
         lost = -np.outer(light.weights(np.zeros(count)), shadows.rates.sum(axis=0))
-        self.rates = np.block(
-            [[light.rates, lost], [np.zeros((len(shadows.rates), light.rates.shape[1])), shadows.rates]]
-        )
+        still = np.zeros((len(shadows.rates), light.rates.shape[1]))
+        self.rates = np.block([[light.rates, lost], [still, shadows.rates]])
 
     def weights(self, unknowns: np.ndarray) -> np.ndarray:
         return np.concatenate([self._light.weights(unknowns[: self._count]), np.zeros(len(self._shadows.rates))])
