@@ -305,6 +305,7 @@ from .sensing.freedom_fit import TelescopeFreedoms as TelescopeFreedoms
 from .sensing.model import DonutAir as DonutAir
 from .sensing.model import DonutDetector as DonutDetector
 from .sensing.model import DonutModel as DonutModel
+from .sensing.model import DonutRims as DonutRims
 from .sensing.result import DonutFit as DonutFit
 from .sensing.wavefront_fits import FieldTerms as FieldTerms
 from .sensing.wavefront_fits import SingleDonuts as SingleDonuts

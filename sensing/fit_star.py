@@ -135,7 +135,7 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
     if flags:
         return StarFit(flags)
     best = fitter.solve(coarse, start, tolerance=COARSE if donut else FINE)
-    if donut and wavefront:
+    if donut and wavefront and instrument.model.rims.search:
         # Light beside a rim looks like a second star otherwise, and like a cosmic ray.
         solved = fitter.rim_solver(COARSE, lambda moved: moved.stamp(moved.light, small))
         fitter, coarse, best = fitter.with_moved_rims(coarse, best, _MISFIT, solved, start)
@@ -150,7 +150,7 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
     finest = fitter.finest(best)
     if (finest.full.used != pixels.used).any():
         flags |= DonutFlag.CLIPPED
-    if finest.light.free_rims.bodies:
+    if any(body.moved for body in finest.light.free_rims.bodies):
         flags |= DonutFlag.RIM_MOVED
     if len(finest.solution.stars[0]) > RATIO:
         flags |= DonutFlag.BLENDED
@@ -270,7 +270,7 @@ class _StarFitter:
                 break
             fine, best = finer, self.solve(finer.stamp, best.stars[0], best.shared)
         assert fine is not None
-        if self._donut and self._wavefront:
+        if self._donut and self._wavefront and self._instrument.model.rims.search:
             solved = self.rim_solver(FINE, fine.of)
             fitter, stamp, best = self.with_moved_rims(fine.stamp, best, 0.0, solved)
             return fitter._clipped(replace(fine, stamp=stamp), best)

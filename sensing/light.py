@@ -20,7 +20,7 @@ from .donut_rays import ZernikeRays, chief_landing
 from .image_model import ImageGrid
 from .likelihood import Stamp
 from .model import DonutModel
-from .moving_rims import FreeRims
+from .moving_rims import FreeRims, rims_of_other_size
 from .pupil_cells import PupilCells
 from .seeing import Seeing
 from .stamps import Pixels
@@ -139,7 +139,11 @@ class Instrument:
         diameter = 2.0 * float(np.hypot(*place.T).max()) * (1.0 + 1.0 / _SURVEY)
         diffracting = pupil_rims(telescope, direction, self.middle) if self.model.diffraction else None
         rims = movable_rims(telescope, points, ends)
-        return StarLight(telescope, direction, diameter, depth, jacobian, rims, diffracting)
+        light = StarLight(telescope, direction, diameter, depth, jacobian, rims, diffracting)
+        if not self.model.rims.size:
+            return light
+        free = rims_of_other_size(telescope, direction, self.middle, _FEWEST, self.model.rims.size)
+        return light.with_free_rims(free, self.middle)
 
     def _with_detector(self, direction: np.ndarray, defocus: float) -> Telescope:
         """Return the telescope with its detector in the tangent plane of the chief ray's CCD, moved by a defocus."""

@@ -18,7 +18,7 @@ from ..models.telescope import Telescope
 from ..raytrace.rays import RayStatus, parallel_rays
 from ..raytrace.trace import TraceResult, trace
 from ..wavefront.pupil_polynomials import PupilPolynomials
-from .pupil_cells import PupilCells
+from .pupil_cells import PupilCells, pupil_cells
 from .rim_outlines import MOTIONS, RimMotion, Simple, is_vane, moved_aperture, outline, simple_regions, vane_width
 
 #: Standard deviation of the shift and of the growth of a rim over its own size, and most of it over the diameter of the
@@ -77,6 +77,11 @@ class RimBody:
         """Which motions are free, shape [4]."""
         return np.array(self.spreads) > 0.0
 
+    @property
+    def moved(self) -> bool:
+        """Whether it may stand elsewhere, and does not only have another size."""
+        return self.spreads[0] > 0.0
+
 
 @dataclass(frozen=True, eq=False)
 class FreeRims:
@@ -112,13 +117,12 @@ class FreeRims:
         return {telescope.surface_names[surface] for body in self.bodies for surface, _ in body.members}
 
     def with_body(self, body: RimBody) -> FreeRims:
-        """Return these and one more, where the prescription has it."""
-        return FreeRims((*self.bodies, body), np.concatenate([self.values, np.zeros((1, MOTIONS))]))
-
-    def without(self, number: int) -> FreeRims:
-        """Return these without one body."""
-        bodies = self.bodies[:number] + self.bodies[number + 1 :]
-        return FreeRims(bodies, np.delete(self.values, number, axis=0))
+        """Return these and one more, where the prescription has it; one that is among them takes its place."""
+        others = [k for k, free in enumerate(self.bodies) if free.members != body.members]
+        same = [k for k in range(len(self.bodies)) if k not in others]
+        value = self.values[same] if same else np.zeros((1, MOTIONS))
+        bodies = tuple(self.bodies[k] for k in others)
+        return FreeRims((*bodies, body), np.concatenate([self.values[others], value]))
 
     def moved(self, steps: np.ndarray) -> FreeRims:
         """Return the rims moved by steps of the free motions [n], within a few standard deviations."""
@@ -395,6 +399,25 @@ def cells_with_lines(cells: PupilCells, lines: RimLines, free: np.ndarray) -> Pu
         moments=np.concatenate([cells.moments, shadows.moments]),
         rates=rates,
     )
+
+
+def rims_of_other_size(
+    telescope: Telescope, direction: np.ndarray, wavelength: float, across: int, spread: float
+) -> FreeRims:
+    """Return the rims that bound the light, with a relative standard deviation of their sizes alone.
+
+    The direction [3] is that of the light, of a wavelength [m]; so many cells stand across the pupil.
+    """
+    cells = pupil_cells(telescope, direction, wavelength, across)
+    if not len(cells):
+        return FreeRims()
+    rims = FreeRims()
+    for body in PupilShadows(telescope, direction, wavelength, cells).candidates()[0]:
+        surface, region = body.members[0]
+        if not body.spider:
+            radius = enclosing_circle(simple_regions(telescope.surfaces[surface].aperture)[region])[2]
+            rims = rims.with_body(replace(body, spreads=(0.0, 0.0, spread * radius, 0.0)))
+    return rims
 
 
 def line_cells(cells: PupilCells, lines: RimLines, free: np.ndarray) -> PupilCells:

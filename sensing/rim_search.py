@@ -34,6 +34,10 @@ _FIRST_STEPS = 2
 _FINISHED = 2
 #: Times that the shadows of a rim are computed again where it is found to stand.
 _OUTER = 8
+#: Loss over that of the best from which on they are not.
+_CLOSE = 2.0
+#: Change of the loss, in units of that of a pixel, with which they end.
+_SETTLED = 1.0
 #: Shift of a shadow over the side of a cell that is small enough to be linear.
 _SMALL = 0.05
 
@@ -71,13 +75,14 @@ def with_moved_rims(
         rims are held has taken up where they stand.
     """
     failed: list[RimBody] = []
-    while len(best.light.free_rims.bodies) < _MOST_BODIES and len(failed) < _MOST_FAILURES:
+    while sum(body.moved for body in best.light.free_rims.bodies) < _MOST_BODIES and len(failed) < _MOST_FAILURES:
         loss = best.solution.loss / best.stamp.used.sum()
         if loss < noise:
             break
         threshold = _GAIN + _MISFIT * max(loss - 1.0, 0.0)
         bodies, gains = rim_gains(instrument, best)
-        moved = {body.members for body in (*best.light.free_rims.bodies, *failed)}
+        free = [body for body in best.light.free_rims.bodies if body.moved]
+        moved = {body.members for body in (*free, *failed)}
         gains = np.where([body.members in moved for body in bodies], 0.0, gains)
         if not gains.max(initial=0.0) > threshold:
             break
@@ -116,7 +121,8 @@ def _each_freed(
         light = fit.light.with_free_rims(fit.light.free_rims.with_body(body), instrument.middle)
         trials.append(_settled(instrument, solved(light, start), solved, _FIRST_STEPS))
     trials.sort(key=lambda trial: trial.solution.loss)
-    finished = [_settled(instrument, trial, solved) for trial in trials[:_FINISHED]]
+    close = [trial for trial in trials if trial.solution.loss < _CLOSE * trials[0].solution.loss]
+    finished = [_settled(instrument, trial, solved) for trial in close[:_FINISHED]]
     return sorted(finished, key=lambda trial: trial.solution.loss)
 
 
@@ -201,6 +207,8 @@ def _settled(
         light = best.light.with_free_rims(rims.moved(shift), instrument.middle)
         trial = solved(light, best.solution)
         # Light that a shadow uncovers lies beside the line that stands for it, so that steps may be too long.
-        better = trial.solution.loss < best.solution.loss
-        best, factor = (trial, 1.0) if better else (best, 0.5 * factor)
+        gain = best.solution.loss - trial.solution.loss
+        best, factor = (trial, 1.0) if gain > 0.0 else (best, 0.5 * factor)
+        if abs(gain) < _SETTLED * max(1.0, best.solution.loss / best.stamp.used.sum()):
+            break
     return best
