@@ -22,6 +22,7 @@ from .likelihood import Stamp
 from .model import DonutModel
 from .moving_rims import FreeRims, rims_of_other_size
 from .pupil_cells import PupilCells
+from .rim_outlines import concentric
 from .seeing import Seeing
 from .stamps import Pixels
 from .terms import WavefrontTerms
@@ -287,7 +288,11 @@ class StarLight:
         """Return the light of the telescope with rims where these stand; its middle wavelength [m]."""
         prescribed = self.prescribed or self.telescope
         telescope = rims.applied(prescribed)
-        diffracting = None if self.pupil_rims is None else pupil_rims(telescope, self.direction, wavelength)
+        diffracting = self.pupil_rims
+        if diffracting is not None:
+            # Rings alone diffract: a hole that stands aside does so about the centre, a part of a pixel away.
+            rings = tuple(replace(s, aperture=concentric(s.aperture)) for s in telescope.surfaces)
+            diffracting = pupil_rims(replace(telescope, surfaces=rings), self.direction, wavelength)
         return replace(self, telescope=telescope, pupil_rims=diffracting, free_rims=rims, prescribed=prescribed)
 
     @property

@@ -8,6 +8,7 @@ has :math:`-l\, n \cdot J^{-1} \delta q` of the pupil's area.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -118,11 +119,10 @@ class FreeRims:
 
     def with_body(self, body: RimBody) -> FreeRims:
         """Return these and one more, where the prescription has it; one that is among them takes its place."""
-        others = [k for k, free in enumerate(self.bodies) if free.members != body.members]
-        same = [k for k in range(len(self.bodies)) if k not in others]
-        value = self.values[same] if same else np.zeros((1, MOTIONS))
-        bodies = tuple(self.bodies[k] for k in others)
-        return FreeRims((*bodies, body), np.concatenate([self.values[others], value]))
+        same = np.array([free.members == body.members for free in self.bodies], dtype=bool)
+        value = self.values[same] if same.any() else np.zeros((1, MOTIONS))
+        bodies = tuple(itertools.compress(self.bodies, ~same))
+        return FreeRims((*bodies, body), np.concatenate([self.values[~same], value]))
 
     def moved(self, steps: np.ndarray) -> FreeRims:
         """Return the rims moved by steps of the free motions [n], within a few standard deviations."""
@@ -285,11 +285,11 @@ class PupilShadows:
         Middles of their pieces [n, 2], vectors along them, shifts of the rim on its surface by each motion [n, 4, 2],
         derivatives of the place on the pupil by that on the surface [n, 2, 2], numbers, and that of the surface.
         """
-        nothing = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, MOTIONS, 2)), np.zeros((0, 2, 2))
-        none = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        numberless = np.zeros((2, 0), dtype=np.int64)
+        empty = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, MOTIONS, 2)), np.zeros((0, 2, 2)), *numberless
         polynomials = self._smooth(surface)
         if polynomials is None:
-            return *nothing, *none
+            return empty
         smooth, places = polynomials
         # A linear map from the surface to the pupil is where the search for the places there begins.
         center, linear = (values[0] for values in smooth.at(self._middle[None], places))
@@ -303,7 +303,7 @@ class PupilShadows:
         number = np.repeat(list(numbers.values()), [len(rim.middle) for rim in rims])
         near = _near(middle, places, 2.0 * spacing)
         if not near.any():
-            return *nothing, *none
+            return empty
         begin = (middle[near] - center) @ np.linalg.pinv(linear).T + self._middle
         points = self._on_pupil(smooth, places, begin, middle[near])
         reached = np.isfinite(points).all(axis=1)
@@ -358,14 +358,13 @@ class PupilShadows:
             return [], RimLines(np.zeros((0, 2)), np.zeros((0, 2)), *np.zeros((2, 0, MOTIONS)), np.zeros(0, dtype=int))
         lines = self.lines(bodies)
         count = np.bincount(lines.body, minlength=len(bodies))
-        kept = np.flatnonzero(count >= _FEWEST_PIECES)
+        bounding = np.flatnonzero(count >= _FEWEST_PIECES)
         place = np.full(len(bodies), -1)
-        place[kept] = np.arange(len(kept))
-        mine = place[lines.body] >= 0
-        shadows = RimLines(
-            lines.points[mine], lines.along[mine], lines.across[mine], lines.outward[mine], place[lines.body[mine]]
-        )
-        return [self._with_spreads(bodies[k]) for k in kept], shadows
+        place[bounding] = np.arange(len(bounding))
+        shadow = place[lines.body] >= 0
+        values = (lines.points, lines.along, lines.across, lines.outward, place[lines.body])
+        shadows = RimLines(*(v[shadow] for v in values))
+        return [self._with_spreads(bodies[k]) for k in bounding], shadows
 
     def _with_spreads(self, body: RimBody) -> RimBody:
         """Return a body with the standard deviations of its motions."""
