@@ -306,6 +306,7 @@ from .sensing.freedom_fit import TelescopeFreedoms as TelescopeFreedoms
 from .sensing.model import DonutAir as DonutAir
 from .sensing.model import DonutDetector as DonutDetector
 from .sensing.model import DonutModel as DonutModel
+from .sensing.model import DonutRims as DonutRims
 from .sensing.observatory_zernikes import BodyMotions as BodyMotions
 from .sensing.observatory_zernikes import ObservatoryZernikes as ObservatoryZernikes
 from .sensing.observatory_zernikes import hexapod_corrections as hexapod_corrections

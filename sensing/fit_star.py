@@ -126,7 +126,7 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
         best = fitter.with_neighbours(start, single)
     if donut and fitter.other_focus_is_better(start, best):
         return StarFit(DonutFlag.DEFOCUS_SIGN)
-    if donut and wavefront and _misfit(start.pixels, start.stamp, best) > _MISFIT:
+    if donut and wavefront and instrument.model.rims.search and _misfit(start.pixels, start.stamp, best) > _MISFIT:
         # A neighbour is quicker to find, but light beside a rim looks like one, and like a cosmic ray.
         solved = fitter.rim_solver(COARSE, lambda moved: moved.stamp(moved.light, start.pixels))
         moved, moved_stamp, with_rims = fitter.with_moved_rims(start.stamp, single, _MISFIT, solved, start.unknowns)
@@ -141,7 +141,7 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
     finest = fitter.finest(best)
     if (finest.full.used != pixels.used).any():
         flags |= DonutFlag.CLIPPED
-    if finest.light.free_rims.bodies:
+    if any(body.moved for body in finest.light.free_rims.bodies):
         flags |= DonutFlag.RIM_MOVED
     if len(finest.solution.stars[0]) > RATIO:
         flags |= DonutFlag.BLENDED
@@ -294,7 +294,7 @@ class _StarFitter:
                 break
             fine, best = finer, self.solve(finer.stamp, best.stars[0], best.shared)
         assert fine is not None
-        if self._donut and self._wavefront:
+        if self._donut and self._wavefront and self._instrument.model.rims.search:
             solved = self.rim_solver(FINE, fine.of)
             fitter, stamp, best = self.with_moved_rims(fine.stamp, best, 0.0, solved)
             return fitter._clipped(replace(fine, stamp=stamp), best)

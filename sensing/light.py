@@ -20,8 +20,9 @@ from .donut_rays import ZernikeRays, chief_landing
 from .image_model import ImageGrid
 from .likelihood import Stamp
 from .model import DonutModel
-from .moving_rims import FreeRims
+from .moving_rims import FreeRims, rims_of_other_size
 from .pupil_cells import PupilCells
+from .rim_outlines import concentric
 from .seeing import Seeing
 from .stamps import Pixels
 from .terms import WavefrontTerms
@@ -61,6 +62,8 @@ _BINNED = 1.95
 _MOST_BINNED = 4
 #: Least fraction of the pixels in use that binning keeps.
 _KEPT = 0.95
+#: Shift of a rim that is free by itself, over that of others.
+_HELD = 1e-3
 #: Full width at half maximum of a Gaussian over its rms.
 _FWHM_PER_RMS = 2.354820045
 
@@ -164,7 +167,11 @@ class Instrument:
         diameter = 2.0 * float(np.hypot(*place.T).max()) * (1.0 + 1.0 / _SURVEY)
         diffracting = pupil_rims(telescope, direction, self.middle) if self.model.diffraction else None
         rims = movable_rims(telescope, points, ends)
-        return StarLight(telescope, direction, diameter, depth, jacobian, rims, diffracting)
+        light = StarLight(telescope, direction, diameter, depth, jacobian, rims, diffracting)
+        if not self.model.rims.size:
+            return light
+        free = rims_of_other_size(telescope, direction, self.middle, _FEWEST, self.model.rims.size)
+        return light.with_free_rims(free, self.middle)
 
     def _with_detector(self, direction: np.ndarray, defocus: float) -> Telescope:
         """Return the telescope with a defocus, its detector in the tangent plane of the chief ray's CCD."""
@@ -296,7 +303,10 @@ class StarLight:
     @property
     def shift_precision(self) -> np.ndarray:
         """Inverse variances of the shifts of the rims along x and y and of the motions of free ones, [n_shift]."""
-        shifts = np.full(2 * len(self.rims), shift_spread(self.telescope) ** -2.0)
+        names = self.free_rims.surfaces(self.telescope)
+        # A rim that is free by itself has no further shift.
+        spreads = [shift_spread(self.telescope) * (_HELD if rim.name in names else 1.0) for rim in self.rims]
+        shifts = np.repeat(spreads, 2) ** -2.0
         return np.concatenate([shifts, self.free_rims.spreads**-2.0])
 
     @property
@@ -308,7 +318,11 @@ class StarLight:
         """Return the light of the telescope with rims where these stand; its middle wavelength [m]."""
         prescribed = self.prescribed or self.telescope
         telescope = rims.applied(prescribed)
-        diffracting = None if self.pupil_rims is None else pupil_rims(telescope, self.direction, wavelength)
+        diffracting = self.pupil_rims
+        if diffracting is not None:
+            # Rings alone diffract: a hole that stands aside does so about the centre, a part of a pixel away.
+            rings = tuple(replace(s, aperture=concentric(s.aperture)) for s in telescope.surfaces)
+            diffracting = pupil_rims(replace(telescope, surfaces=rings), self.direction, wavelength)
         return replace(self, telescope=telescope, pupil_rims=diffracting, free_rims=rims, prescribed=prescribed)
 
     @property

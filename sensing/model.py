@@ -25,6 +25,8 @@ _START_FWHM = 0.8 * ARCSEC
 _MOST_FWHM = 60.0 * ARCSEC
 #: Largest defocus of an image [m].
 _MOST_DEFOCUS = 0.1
+#: Largest relative standard deviation of the radii of rims.
+_MOST_SIZE = 0.1
 #: Least number of cells across the pupil that make an image of it.
 _FEWEST_CELLS = 8
 #: Largest number of cells across the pupil: 4 million of them.
@@ -166,6 +168,33 @@ class DonutDetector:
 
 @check_arguments
 @dataclass(frozen=True, eq=False)
+class DonutRims:
+    """How far rims and spiders are trusted, of a :class:`DonutModel`.
+
+    Attributes
+    ----------
+    search : bool
+        Whether rims and spiders that the residuals say stand elsewhere than the prescription has them are fitted too.
+    size : float
+        Relative standard deviation of the radii of the rims that bound the light: 0.01 where a mirror's hole is known
+        to a hundredth. One donut hardly tells a radius from its wavefront; errors have what is not known of it.
+
+    Raises
+    ------
+    DomainError
+        If the size is negative or above 0.1.
+    """
+
+    search: bool = True
+    size: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.size <= _MOST_SIZE:
+            raise DomainError(f"size = {shown(self.size)}: expected 0 to {_MOST_SIZE:g}", key="size")
+
+
+@check_arguments
+@dataclass(frozen=True, eq=False)
 class DonutModel:
     """What images of donuts are made of, for :func:`~pachon.fit_donuts` and :func:`~pachon.draw_donuts`.
 
@@ -177,6 +206,8 @@ class DonutModel:
         Seeing and turbulence.
     detector : DonutDetector
         Pixels, charge diffusion, heights, defocus and saturation.
+    rims : DonutRims
+        How far rims and spiders are trusted.
     neighbours : bool
         Whether a second star may stand on a stamp. It is searched for, and fitted too.
     diffraction : bool, optional
@@ -191,6 +222,7 @@ class DonutModel:
     light: Light | None = None
     air: DonutAir = field(default_factory=DonutAir)
     detector: DonutDetector = field(default_factory=DonutDetector)
+    rims: DonutRims = field(default_factory=DonutRims)
     neighbours: bool = True
     diffraction: bool | None = None
     n_pupil: int | None = None

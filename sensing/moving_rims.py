@@ -8,6 +8,7 @@ has :math:`-l\, n \cdot J^{-1} \delta q` of the pupil's area.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -18,7 +19,7 @@ from ..models.telescope import Telescope
 from ..raytrace.rays import RayStatus, parallel_rays
 from ..raytrace.trace import TraceResult, trace
 from ..wavefront.pupil_polynomials import PupilPolynomials
-from .pupil_cells import PupilCells
+from .pupil_cells import PupilCells, pupil_cells
 from .rim_outlines import MOTIONS, RimMotion, Simple, is_vane, moved_aperture, outline, simple_regions, vane_width
 
 #: Standard deviation of the shift and of the growth of a rim over its own size, and most of it over the diameter of the
@@ -33,7 +34,7 @@ _SPIDER_TURN = 0.035
 _THICKNESS = 0.1
 #: Most standard deviations that a rim is moved by at once.
 _MOST = 3.0
-#: Radii and centres that differ by less, over the radius, are of one body, such as both faces of a lens.
+#: Radii and centres that differ by less, over the radius, are of one body: both faces of a lens, a mirror's baffle.
 _ALIKE = 5e-3
 #: Points across the pupil for the places of the light on the surfaces.
 _SURVEY = 32
@@ -47,6 +48,8 @@ _BESIDE = 0.02
 _STEPS = 8
 #: Step over the radius of the pupil after which they are found.
 _CLOSE = 1e-7
+#: Longest piece of a rim, in sides of a cell.
+_LONGEST = 10.0
 #: Fewest pieces of a rim that matter.
 _FEWEST_PIECES = 3
 
@@ -74,6 +77,11 @@ class RimBody:
     def free(self) -> np.ndarray:
         """Which motions are free, shape [4]."""
         return np.array(self.spreads) > 0.0
+
+    @property
+    def moved(self) -> bool:
+        """Whether it may stand elsewhere, and does not only have another size."""
+        return self.spreads[0] > 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,14 +113,16 @@ class FreeRims:
         """Standard deviations of the free motions, shape [n]."""
         return np.array([body.spreads for body in self.bodies]).reshape(-1, MOTIONS)[self.free]
 
-    def with_body(self, body: RimBody) -> FreeRims:
-        """Return these and one more, where the prescription has it."""
-        return FreeRims((*self.bodies, body), np.concatenate([self.values, np.zeros((1, MOTIONS))]))
+    def surfaces(self, telescope: Telescope) -> set[str]:
+        """Return the names of the surfaces whose rims are free."""
+        return {telescope.surface_names[surface] for body in self.bodies for surface, _ in body.members}
 
-    def without(self, number: int) -> FreeRims:
-        """Return these without one body."""
-        bodies = self.bodies[:number] + self.bodies[number + 1 :]
-        return FreeRims(bodies, np.delete(self.values, number, axis=0))
+    def with_body(self, body: RimBody) -> FreeRims:
+        """Return these and one more, where the prescription has it; one that is among them takes its place."""
+        same = np.array([free.members == body.members for free in self.bodies], dtype=bool)
+        value = self.values[same] if same.any() else np.zeros((1, MOTIONS))
+        bodies = tuple(itertools.compress(self.bodies, ~same))
+        return FreeRims((*bodies, body), np.concatenate([self.values[~same], value]))
 
     def moved(self, steps: np.ndarray) -> FreeRims:
         """Return the rims moved by steps of the free motions [n], within a few standard deviations."""
@@ -228,6 +238,7 @@ class PupilShadows:
         self._survey = middle + lattice[np.hypot(*lattice.T) <= 1.1 * half]
         self._middle, self._half = middle, half
         self._ends = self._traced(self._survey)
+        self._polynomials: dict[bytes, PupilPolynomials] = {}
 
     def _traced(self, points: np.ndarray) -> list[TraceResult]:
         """Return rays through points of the pupil [n, 2] at all surfaces."""
@@ -239,55 +250,69 @@ class PupilShadows:
 
     def lines(self, bodies: Sequence[RimBody]) -> RimLines:
         """Return the shadows of bodies where they bound the light."""
-        pieces = [
-            (number, *self._shadow(surface, region))
-            for number, body in enumerate(bodies)
-            for surface, region in body.members
-        ]
-        numbers = np.concatenate([np.full(len(points), number) for number, points, *_ in pieces])
-        return RimLines(*(np.concatenate(values) for values in list(zip(*pieces, strict=True))[1:]), numbers)
+        regions: dict[int, dict[int, int]] = {}
+        for number, body in enumerate(bodies):
+            for surface, region in body.members:
+                regions.setdefault(surface, {})[region] = number
+        shadows = [self._shadows(surface, numbers) for surface, numbers in regions.items()]
+        points, along, shift, slope, numbers, surfaces = (np.concatenate(v) for v in zip(*shadows, strict=True))
+        length = np.hypot(*along.T)
+        normal = np.stack([along[:, 1], -along[:, 0]], axis=-1) / length[:, None]
+        towards = self._lit_side(surfaces, points, normal)
+        bounds = towards != 0.0
+        dark = -normal[bounds] * towards[bounds, None]
+        # Gradients on the surface go with the transpose of the inverse.
+        on_surface = np.einsum("nji,nj->ni", slope[bounds], dark)
+        on_surface /= np.hypot(*on_surface.T)[:, None]
+        across = np.einsum("nij,nmj,ni->nm", slope[bounds], shift[bounds], dark)
+        outward = np.einsum("nmi,ni->nm", shift[bounds], on_surface)
+        return RimLines(points[bounds], along[bounds], across, outward, numbers[bounds])
 
-    def _shadow(self, surface: int, region: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return points, vectors along, distances across on the pupil and on the surface of one rim's shadow."""
-        nothing = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, MOTIONS)), np.zeros((0, MOTIONS))
+    def _smooth(self, surface: int) -> tuple[PupilPolynomials, np.ndarray] | None:
+        """Return polynomials of the places of the light on a surface, and these [n, 2]; None where too little does."""
         places = self._places(surface, self._ends)
         reached = np.isfinite(places).all(axis=1)
         if reached.sum() < _FEWEST:
-            return nothing
-        points, places = self._survey[reached], places[reached]
-        smooth = PupilPolynomials(points, self._middle, self._half)
-        slope = np.linalg.lstsq(np.column_stack([points - self._middle, np.ones(len(points))]), places, rcond=None)[0]
-        scale = np.sqrt(abs(float(np.linalg.det(slope[:2]))))
+            return None
+        key = reached.tobytes()
+        if key not in self._polynomials:
+            self._polynomials[key] = PupilPolynomials(self._survey[reached], self._middle, self._half)
+        return self._polynomials[key], places[reached]
+
+    def _shadows(self, surface: int, numbers: dict[int, int]) -> tuple[np.ndarray, ...]:
+        """Return the outlines of some regions of a surface on the pupil, lit or not; each region has a number.
+
+        Middles of their pieces [n, 2], vectors along them, shifts of the rim on its surface by each motion [n, 4, 2],
+        derivatives of the place on the pupil by that on the surface [n, 2, 2], numbers, and that of the surface.
+        """
+        numberless = np.zeros((2, 0), dtype=np.int64)
+        empty = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, MOTIONS, 2)), np.zeros((0, 2, 2)), *numberless
+        polynomials = self._smooth(surface)
+        if polynomials is None:
+            return empty
+        smooth, places = polynomials
+        # A linear map from the surface to the pupil is where the search for the places there begins.
+        center, linear = (values[0] for values in smooth.at(self._middle[None], places))
         reach = float(np.hypot(*places.T).max())
-        spacing = max(self._cells.side * scale, 1e-6 * reach)
-        rim = outline(simple_regions(self._telescope.surfaces[surface].aperture)[region], spacing, reach)
-        near = _near(rim.middle, places, 2.0 * spacing)
+        spacing = max(self._cells.side * np.sqrt(abs(float(np.linalg.det(linear)))), 1e-6 * reach)
+        regions = simple_regions(self._telescope.surfaces[surface].aperture)
+        rims = [outline(regions[region], spacing, reach) for region in numbers]
+        middle, along, motion = (
+            np.concatenate(v) for v in zip(*((r.middle, r.end - r.start, r.motion) for r in rims), strict=True)
+        )
+        number = np.repeat(list(numbers.values()), [len(rim.middle) for rim in rims])
+        near = _near(middle, places, 2.0 * spacing)
         if not near.any():
-            return nothing
-        back = np.linalg.pinv(slope[:2])
-        targets = np.concatenate([values[near] for values in (rim.start, rim.middle, rim.end)])
-        begin = (targets - slope[2]) @ back + self._middle
-        start, middle, end = np.split(self._on_pupil(smooth, places, begin, targets), 3)
-        along, motion = end - start, rim.motion[near]
+            return empty
+        begin = (middle[near] - center) @ np.linalg.pinv(linear).T + self._middle
+        points = self._on_pupil(smooth, places, begin, middle[near])
+        reached = np.isfinite(points).all(axis=1)
+        points, along, motion, number = points[reached], *(v[near][reached] for v in (along, motion, number))
+        slope = np.linalg.inv(smooth.at(points, places)[1])
+        along = np.einsum("nij,nj->ni", slope, along)
         length = np.hypot(*along.T)
-        fine = np.isfinite(middle).all(axis=1) & (length > 0.0) & (length < 10.0 * self._cells.side)
-        if not fine.any():
-            return nothing
-        middle, along, motion, length = (v[fine] for v in (middle, along, motion, length))
-        normal = np.stack([along[:, 1], -along[:, 0]], axis=-1) / length[:, None]
-        towards = self._lit_side(surface, middle, normal)
-        bounds = towards != 0.0
-        if not bounds.any():
-            return nothing
-        middle, along, motion = (v[bounds] for v in (middle, along, motion))
-        dark = -normal[bounds] * towards[bounds, None]
-        jacobian = smooth.at(middle, places)[1]  # place on the surface by place on the pupil
-        shift = np.einsum("nij,nmj->nmi", np.linalg.inv(jacobian), motion)
-        across = np.einsum("nmi,ni->nm", shift, dark)
-        # The normal of the rim on its surface: gradients go with the transpose of the inverse.
-        on_surface = np.einsum("nji,nj->ni", np.linalg.inv(jacobian), dark)
-        on_surface /= np.hypot(*on_surface.T)[:, None]
-        return middle, along, across, np.einsum("nmi,ni->nm", motion, on_surface)
+        fine = (length > 0.0) & (length < _LONGEST * self._cells.side)
+        return tuple(v[fine] for v in (points, along, motion, slope, number, np.full(len(points), surface)))
 
     def _on_pupil(
         self, smooth: PupilPolynomials, places: np.ndarray, start: np.ndarray, target: np.ndarray
@@ -309,34 +334,37 @@ class PupilShadows:
                     break
         return points
 
-    def _lit_side(self, surface: int, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Return on which side of a rim light passes, 1 along the normals and -1 against them; 0 if not one alone.
+    def _lit_side(self, surfaces: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """Return on which side of rims light passes, 1 along the normals and -1 against them; 0 if not one alone.
 
-        The dark side has to be that of this surface: of rims in one place, the first that the light meets.
+        The dark side has to be that of the rim's own surface: of rims in one place, the first that the light meets.
         """
-        step = _BESIDE * self._cells.side
-        ends = [self._traced(points + sign * step * normal) for sign in (1.0, -1.0)]
-        lit = [end[-1].status == RayStatus.OK for end in ends]
-        stopped = [
-            (end[surface].status == RayStatus.VIGNETTED)
-            & (True if surface == 0 else end[surface - 1].status != RayStatus.VIGNETTED)
-            for end in ends
-        ]
-        return np.where(lit[0] & stopped[1], 1.0, np.where(lit[1] & stopped[0], -1.0, 0.0))
+        if not len(points):
+            return np.zeros(0)
+        step = _BESIDE * self._cells.side * normal
+        ends = self._traced(np.concatenate([points + step, points - step]))
+        stopped = np.full(2 * len(points), -1)
+        for number, end in reversed(list(enumerate(ends))):
+            stopped[end.status == RayStatus.VIGNETTED] = number
+        lit = ends[-1].status == RayStatus.OK
+        first, second = np.split(lit, 2)
+        dark_first, dark_second = np.split(stopped == np.tile(surfaces, 2), 2)
+        return np.where(first & dark_second, 1.0, np.where(second & dark_first, -1.0, 0.0))
 
     def candidates(self) -> tuple[list[RimBody], RimLines]:
         """Return the bodies whose rims bound the light, with how far they may move, and their shadows."""
         bodies = rim_bodies(self._telescope)
+        if not bodies:
+            return [], RimLines(np.zeros((0, 2)), np.zeros((0, 2)), *np.zeros((2, 0, MOTIONS)), np.zeros(0, dtype=int))
         lines = self.lines(bodies)
         count = np.bincount(lines.body, minlength=len(bodies))
-        kept = np.flatnonzero(count >= _FEWEST_PIECES)
+        bounding = np.flatnonzero(count >= _FEWEST_PIECES)
         place = np.full(len(bodies), -1)
-        place[kept] = np.arange(len(kept))
-        mine = place[lines.body] >= 0
-        shadows = RimLines(
-            lines.points[mine], lines.along[mine], lines.across[mine], lines.outward[mine], place[lines.body[mine]]
-        )
-        return [self._with_spreads(bodies[k]) for k in kept], shadows
+        place[bounding] = np.arange(len(bounding))
+        shadow = place[lines.body] >= 0
+        values = (lines.points, lines.along, lines.across, lines.outward, place[lines.body])
+        shadows = RimLines(*(v[shadow] for v in values))
+        return [self._with_spreads(bodies[k]) for k in bounding], shadows
 
     def _with_spreads(self, body: RimBody) -> RimBody:
         """Return a body with the standard deviations of its motions."""
@@ -370,6 +398,25 @@ def cells_with_lines(cells: PupilCells, lines: RimLines, free: np.ndarray) -> Pu
         moments=np.concatenate([cells.moments, shadows.moments]),
         rates=rates,
     )
+
+
+def rims_of_other_size(
+    telescope: Telescope, direction: np.ndarray, wavelength: float, across: int, spread: float
+) -> FreeRims:
+    """Return the rims that bound the light, with a relative standard deviation of their sizes alone.
+
+    The direction [3] is that of the light, of a wavelength [m]; so many cells stand across the pupil.
+    """
+    cells = pupil_cells(telescope, direction, wavelength, across)
+    if not len(cells):
+        return FreeRims()
+    rims = FreeRims()
+    for body in PupilShadows(telescope, direction, wavelength, cells).candidates()[0]:
+        surface, region = body.members[0]
+        if not body.spider:
+            radius = enclosing_circle(simple_regions(telescope.surfaces[surface].aperture)[region])[2]
+            rims = rims.with_body(replace(body, spreads=(0.0, 0.0, spread * radius, 0.0)))
+    return rims
 
 
 def line_cells(cells: PupilCells, lines: RimLines, free: np.ndarray) -> PupilCells:

@@ -86,7 +86,7 @@ def simple_regions(aperture: Aperture | None) -> list[Simple]:
     if aperture is None:
         return []
     if isinstance(aperture, Union | Intersection):
-        return [region for part in aperture.parts for region in simple_regions(part)]
+        return [simple for region in aperture.parts for simple in simple_regions(region)]
     if isinstance(aperture, Complement):
         return simple_regions(aperture.part)
     if isinstance(aperture, Annulus):
@@ -101,12 +101,21 @@ def moved_aperture(aperture: Aperture, motions: Mapping[int, RimMotion]) -> Aper
     return _moved(aperture, motions, 0)[0]
 
 
+def concentric(aperture: Aperture | None) -> Aperture | None:
+    """Return a ring whose hole has moved as one about the centre of its rim; any other aperture as it is."""
+    if isinstance(aperture, Intersection) and len(aperture.parts) == 2:
+        outer, hole = aperture.parts
+        if isinstance(outer, Circle) and isinstance(hole, Complement) and isinstance(hole.part, Circle):
+            return Annulus(min(hole.part.radius, 0.999 * outer.radius), outer.radius, outer.x, outer.y)
+    return aperture
+
+
 def _moved(aperture: Aperture, motions: Mapping[int, RimMotion], first: int) -> tuple[Aperture, int]:
     """Return the moved aperture, and the number of the next region."""
     if isinstance(aperture, Union | Intersection):
         regions = []
-        for part in aperture.parts:
-            region, first = _moved(part, motions, first)
+        for unmoved in aperture.parts:
+            region, first = _moved(unmoved, motions, first)
             regions.append(region)
         return type(aperture)(tuple(regions)), first
     if isinstance(aperture, Complement):
@@ -207,9 +216,9 @@ def _oval(region: Circle | Ellipse, spacing: float) -> Outline:
 
 def _motion(places: np.ndarray, growth: np.ndarray) -> np.ndarray:
     """Return the change of places [n, 2] by each motion, [n, 4, 2]."""
-    ones = np.ones((len(places), 1))
+    unit = np.ones((len(places), 1))
     turn = np.stack([-places[:, 1], places[:, 0]], axis=-1)
-    return np.stack([ones * [1.0, 0.0], ones * [0.0, 1.0], growth, turn], axis=1)
+    return np.stack([unit * [1.0, 0.0], unit * [0.0, 1.0], growth, turn], axis=1)
 
 
 def _corners(region: Rectangle | Vane, reach: float) -> np.ndarray:

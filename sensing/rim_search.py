@@ -19,8 +19,10 @@ from .solve import Solution
 
 #: Least gain of twice the logarithm of the likelihood by a rim elsewhere: noise makes one in 1e5 of three motions.
 _GAIN = 25.0
-#: The same for each unit of loss a pixel above 1: what else the model lacks is alike over several pixels.
-_MISFIT = 100.0
+#: The same over the loss beyond noise: rims that explain less are no match for what else a model lacks.
+_MISFIT = 0.1
+#: Gain of a score test over these from which on a rim is tried: one that stands far off gains more in the end.
+_PROMISING = 0.5
 #: Gain over the largest one from which on other rims are tried, too.
 _LIKELY = 0.4
 #: Loss by which fits with other rims are no worse: these are then free together.
@@ -33,7 +35,13 @@ _MOST_FAILURES = 2
 _FIRST_STEPS = 2
 _FINISHED = 2
 #: Times that the shadows of a rim are computed again where it is found to stand.
-_OUTER = 8
+_OUTER = 6
+#: Loss over that of the best from which on they are not.
+_CLOSE = 2.0
+#: Change of the loss, in units of that of a pixel, with which they end.
+_SETTLED = 1.0
+#: Fraction of a step that is not shortened further.
+_SHORTEST = 0.2
 #: Shift of a shadow over the side of a cell that is small enough to be linear.
 _SMALL = 0.05
 
@@ -71,15 +79,16 @@ def with_moved_rims(
         rims are held has taken up where they stand.
     """
     failed: list[RimBody] = []
-    while len(best.light.free_rims.bodies) < _MOST_BODIES and len(failed) < _MOST_FAILURES:
+    while sum(body.moved for body in best.light.free_rims.bodies) < _MOST_BODIES and len(failed) < _MOST_FAILURES:
         loss = best.solution.loss / best.stamp.used.sum()
         if loss < noise:
             break
-        threshold = _GAIN + _MISFIT * max(loss - 1.0, 0.0)
+        threshold = _GAIN + _MISFIT * max(loss - 1.0, 0.0) * best.stamp.used.sum()
         bodies, gains = rim_gains(instrument, best)
-        moved = {body.members for body in (*best.light.free_rims.bodies, *failed)}
+        free = [body for body in best.light.free_rims.bodies if body.moved]
+        moved = {body.members for body in (*free, *failed)}
         gains = np.where([body.members in moved for body in bodies], 0.0, gains)
-        if not gains.max(initial=0.0) > threshold:
+        if not gains.max(initial=0.0) > _PROMISING * threshold:
             break
         if first is None:
             likely = gains > _LIKELY * gains.max()
@@ -93,10 +102,10 @@ def with_moved_rims(
             first = None
             continue
         first, failed = None, []
-        for other in trials[1:]:
-            if other.solution.loss - trial.solution.loss < _ALIKE:
+        for rival in trials[1:]:
+            if rival.solution.loss - trial.solution.loss < _ALIKE:
                 # Either may have moved: both are free.
-                rims = trial.light.free_rims.with_body(other.light.free_rims.bodies[-1])
+                rims = trial.light.free_rims.with_body(rival.light.free_rims.bodies[-1])
                 light = trial.light.with_free_rims(rims, instrument.middle)
                 trial = _settled(instrument, solved(light, trial.solution), solved)
         best = trial
@@ -116,7 +125,8 @@ def _each_freed(
         light = fit.light.with_free_rims(fit.light.free_rims.with_body(body), instrument.middle)
         trials.append(_settled(instrument, solved(light, start), solved, _FIRST_STEPS))
     trials.sort(key=lambda trial: trial.solution.loss)
-    finished = [_settled(instrument, trial, solved) for trial in trials[:_FINISHED]]
+    close = [trial for trial in trials if trial.solution.loss < _CLOSE * trials[0].solution.loss]
+    finished = [_settled(instrument, trial, solved) for trial in close[:_FINISHED]]
     return sorted(finished, key=lambda trial: trial.solution.loss)
 
 
@@ -163,9 +173,8 @@ class _RaysWithShadows:
         self.cells, self._light, self._shadows, self._count = light.cells, light, shadows, count
         self._size = len(light.rates)
         lost = -np.outer(light.weights(np.zeros(count)), shadows.rates.sum(axis=0))
-        self.rates = np.block(
-            [[light.rates, lost], [np.zeros((len(shadows.rates), light.rates.shape[1])), shadows.rates]]
-        )
+        still = np.zeros((len(shadows.rates), light.rates.shape[1]))
+        self.rates = np.block([[light.rates, lost], [still, shadows.rates]])
 
     def weights(self, unknowns: np.ndarray) -> np.ndarray:
         return np.concatenate([self._light.weights(unknowns[: self._count]), np.zeros(len(self._shadows.rates))])
@@ -202,6 +211,8 @@ def _settled(
         light = best.light.with_free_rims(rims.moved(shift), instrument.middle)
         trial = solved(light, best.solution)
         # Light that a shadow uncovers lies beside the line that stands for it, so that steps may be too long.
-        better = trial.solution.loss < best.solution.loss
-        best, factor = (trial, 1.0) if better else (best, 0.5 * factor)
+        gain = best.solution.loss - trial.solution.loss
+        best, factor = (trial, 1.0) if gain > 0.0 else (best, 0.5 * factor)
+        if factor < _SHORTEST or abs(gain) < _SETTLED * max(1.0, best.solution.loss / best.stamp.used.sum()):
+            break
     return best

@@ -66,11 +66,8 @@ def moved_rims(instrument: Instrument, star: StarSolution) -> list[MovedRim]:
     moved = []
     for k, body in enumerate(rims.bodies):
         block = slice(MOTIONS * k, MOTIONS * (k + 1))
-        moved.append(
-            _moved_rim(
-                _name(light.telescope.surface_names, body), values[k], covariance[block, block], lines, k, pixels
-            )
-        )
+        name = _name(light.telescope.surface_names, body)
+        moved.append(_moved_rim(name, values[k], covariance[block, block], lines, k, pixels))
     return moved
 
 

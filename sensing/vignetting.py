@@ -121,8 +121,5 @@ def cells_with_rims(
         return cells
     bodies = [rim_of_surface(telescope, rim.name, shift_spread(telescope)) for rim in rims]
     lines = PupilShadows(telescope, direction, wavelength, cells).lines([*bodies, *free_rims.bodies])
-    return cells_with_lines(
-        cells,
-        lines,
-        np.concatenate([np.array([b.free for b in bodies], dtype=bool).reshape(-1, MOTIONS), free_rims.free]),
-    )
+    free = np.array([body.free for body in bodies], dtype=bool).reshape(-1, MOTIONS)
+    return cells_with_lines(cells, lines, np.concatenate([free, free_rims.free]))
