@@ -189,7 +189,7 @@ def _fit_alone(instrument: Instrument, star: ObservedStar, defocus: float, stren
     not_finite = ~np.isfinite(star.image) & ~star.masked
     masked = star.masked | not_finite
     saturated = _saturated(np.where(masked, 0.0, star.image), masked, instrument.model.detector.saturation)
-    masked = masked | grown(saturated)
+    masked = masked | grown(saturated, ~masked)
     pixels = Pixels(np.where(masked, 0.0, star.image), star.variance, ~masked)
     wavefront = not joint or light.diameter > SMALLEST_DONUT * instrument.pixel
     fitted = fit_star(instrument, light, pixels, strength, wavefront=wavefront)
