@@ -414,10 +414,11 @@ def _misfit(stamp: Stamp, solution: Solution) -> float:
 
 
 def _typical(pull: np.ndarray, model: np.ndarray, used: np.ndarray) -> float:
-    """Return the size of a typical pull on a donut, at least 1: turbulence and missing terms make it larger."""
+    """Return the size of a typical pull, at least 1, on a donut or beside it: turbulence and noise make it larger."""
     low = float(model[used].min(initial=np.inf))
-    bright = used & (model - low > _BRIGHT * (model.max() - low))
-    return max(1.0, float(RMS_PER_MAD * np.median(np.abs(pull[bright])))) if bright.any() else 1.0
+    bright = model - low > _BRIGHT * (model.max() - low)
+    sides = [np.abs(pull[used & side]) for side in (bright, ~bright)]
+    return max([1.0, *(float(RMS_PER_MAD * np.median(pulls)) for pulls in sides if pulls.size)])
 
 
 def _is_between(value: float, limits: tuple[float, float]) -> bool:
