@@ -40,9 +40,11 @@ from .result import DonutFit
 from .stamps import Pixels
 from .wavefront_fits import NOLL, FittedStars, SingleDonuts, UsableStars, WavefrontFit
 
-#: Pixels, as a fraction of the stamp, from which on those of one greatest value are saturated, and those that are not
-#: finite or saturated may be the reason why there is no result.
+#: Pixels, as a fraction of the stamp, from which on those of one greatest value are saturated, and saturated ones the
+#: reason why there is no result.
 _SEVERAL = 0.002
+#: The same of pixels that are not finite.
+_MOST = 0.5
 #: Electrons up to which pixels of equal value are no sign of saturation.
 _FAINT = 100.0
 #: Chi-square a pixel above which a fit is poor.
@@ -193,13 +195,13 @@ def _fit_alone(instrument: Instrument, star: ObservedStar, defocus: float, stren
     pixels = Pixels(np.where(masked, 0.0, star.image), star.variance, ~masked)
     wavefront = not joint or light.diameter > SMALLEST_DONUT * instrument.pixel
     fitted = fit_star(instrument, light, pixels, strength, wavefront=wavefront)
-    # Few such pixels are no reason for anything.
-    causes, allowed = DonutFlag.OK, max(_SEVERAL * star.image.size, 1.0)
-    for bad, flag in ((saturated, DonutFlag.SATURATED), (not_finite, DonutFlag.NOT_FINITE)):
-        causes |= flag if bad.sum() > allowed else DonutFlag.OK
     if fitted.flags.usable:
         return replace(fitted, flags=fitted.flags | DonutFlag.CLIPPED) if (saturated | not_finite).any() else fitted
-    return replace(fitted, flags=causes) if causes else fitted
+    if saturated.sum() > max(_SEVERAL * star.image.size, 1.0):
+        return StarFit(DonutFlag.SATURATED)
+    if not_finite.any() and (DonutFlag.MOSTLY_LOST in fitted.flags or not_finite.mean() > _MOST):
+        return StarFit(DonutFlag.NOT_FINITE)
+    return fitted
 
 
 def _saturated(image: np.ndarray, masked: np.ndarray, level: float | None) -> np.ndarray:
