@@ -35,8 +35,8 @@ class DonutFlag(IntFlag):
     NOT_FINITE = 512
     NOT_CONVERGED = 1024
     POOR_FIT = 2048
-    MOSTLY_LOST = 4096
     OTHER_SIZE = 8192
+    MOSTLY_LOST = 32768
 
     @property
     def usable(self) -> bool:
