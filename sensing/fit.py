@@ -92,8 +92,8 @@ def fit_donuts(
     The model traces points of the entrance pupil, with all vignetting and spiders, to the detector; the unknown
     wavefront W turns the light at each point by :math:`-\nabla W`, and the rays are traced again with their own changed
     directions. Landing points are convolved with the pixel and the mean of turbulence, a long exposure (Roddier 1981,
-    sec. 4). Unknown are also flux, place, background and seeing of each star. Noise is that of the photons of the model
-    and the sky; steps are those of Levenberg and Marquardt.
+    sec. 4). Unknown are also flux, place, plane of background and seeing of each star. Noise is that of the photons of
+    the model and the sky; steps are those of Levenberg and Marquardt.
 
     Parameters
     ----------
@@ -101,8 +101,8 @@ def fit_donuts(
         Telescope as it is believed to be, defocus included: ``tel.perturbed("Detector", shift=(0, 0, 1.5e-3))`` is
         behind focus; ``"Camera"`` in its place where the camera moves, as in full-array mode.
     images : array_like, shape [n, ny, nx], or sequence of n arrays
-        Stamps [electrons], sky subtracted, ``[iy, ix]`` along +y and +x of the detector, each centred on its donut
-        within a few pixels.
+        Stamps [electrons], ``[iy, ix]`` along +y and +x of the detector, each with its donut nearest to the centre. A
+        plane of sky may be left in; pixels that are not finite are left out.
     fields : array_like or Quantity, shape [n, 2]
         Field angles [rad], of the light's own travel.
     wavelength : array_like, Quantity or Light, optional
@@ -123,7 +123,7 @@ def fit_donuts(
         Unknowns of the wavefront, with the options of their fit: Zernikes of each donut (the default), double Zernikes
         over the field, or degrees of freedom of the telescope for all donuts together.
     mask : array_like of bool, as `images`, optional
-        True at pixels to leave out.
+        True, or 1, at pixels to leave out.
     projection : {"zemax", "gnomonic", "postel"}
         Meaning of the field angles.
     threads : int, optional
