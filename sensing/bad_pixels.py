@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import binary_opening, label, maximum_filter, median_filter, minimum_filter
 
-from .stamps import Pixels
+from .stamps import Pixels, measured_variance
 
 #: A pixel this many standard deviations off its neighbours is no part of a donut, if it is as far off by contrast, too.
 _SIGMA = 8.0
@@ -19,10 +19,14 @@ _DARK_CONTRAST = 0.5
 _NEIGHBOURS = 5
 #: Part of the pixels beside a line of equal ones that have its value, from which on these are no gap in the image.
 _SAME = 0.5
+#: Percentile of the differences of neighbours that stands for the noise: bright and bad pixels have larger ones.
+_QUIET = 20.0
 #: Percentile of the pixels that stands for the background.
-_BACKGROUND = 5.0
+_BACKGROUND = 30.0
 #: Part of a stamp up to which pixels beside bad ones are left out, too: of scattered ones nothing would remain.
 _FEW = 0.1
+#: Pixels of bad ones and those beside them over the bad ones, up to which these are lines and patches.
+_COMPACT = 3.0
 #: Distance by which rims of telescopes differ from their models [pixels].
 _RIM_SHIFT = 3
 #: Connected pixels from which on they may be a strip along a rim.
@@ -35,10 +39,11 @@ _LINE = 3
 _REGION = 6
 
 
-def grown(bad: np.ndarray) -> np.ndarray:
-    """Return bad pixels with those beside them, unless they are too many."""
+def grown(bad: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Return bad pixels with those beside them, unless they are scattered and many."""
     wider = maximum_filter(bad, 3)
-    return wider if wider.mean() < _FEW else bad
+    scattered = ~used & ~unused_regions(used)
+    return wider if (wider | scattered).mean() < _FEW or wider.sum() < _COMPACT * bad.sum() else bad
 
 
 def without_bad_pixels(pixels: Pixels) -> Pixels:
@@ -46,16 +51,19 @@ def without_bad_pixels(pixels: Pixels) -> Pixels:
     pixels = _without(pixels, _gaps(pixels.image, pixels.used))
     if not pixels.used.any():
         return pixels
-    image = pixels.image - np.percentile(pixels.image[pixels.used], _BACKGROUND) * pixels.used
+    background = float(np.percentile(pixels.image[pixels.used], _BACKGROUND))
+    image = pixels.image - background * pixels.used
+    # Sky that was left in has noise, and so have images for which none is claimed.
+    variance = np.maximum(pixels.variance + max(background, 0.0), measured_variance(pixels, _QUIET))
     # A median is no less than the least value, and no more than the greatest: without a pixel beyond these by far
     # there is no median beyond which one is.
     least, most = minimum_filter(image, _NEIGHBOURS, mode="nearest"), maximum_filter(image, _NEIGHBOURS, mode="nearest")
-    bright, dark = _outstanding(image, pixels.variance, least, most)
+    bright, dark = _outstanding(image, variance, least, most)
     if not (bright | dark).any():
         return pixels
     middle = median_filter(image, _NEIGHBOURS, mode="nearest")
-    bright, dark = _outstanding(image, pixels.variance, middle, middle)
-    return _without(pixels, grown((bright | dark) & pixels.used))
+    bright, dark = _outstanding(image, variance, middle, middle)
+    return _without(pixels, grown((bright | dark) & pixels.used, pixels.used))
 
 
 def _outstanding(
@@ -125,7 +133,7 @@ def without_outliers(
     sizes = np.bincount(components.ravel(), minlength=count + 1)
     along_rim = np.bincount(components.ravel(), weights=at_rim.ravel(), minlength=count + 1)
     strips = (sizes >= _STRIP) & (along_rim > _MOSTLY * sizes)
-    return used & ~grown(far & ~strips[components])
+    return used & ~grown(far & ~strips[components], used)
 
 
 def unused_regions(used: np.ndarray) -> np.ndarray:

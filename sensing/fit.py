@@ -42,9 +42,11 @@ from .rim_table import moved_rims, rim_table
 from .stamps import Pixels
 from .wavefront_fits import NOLL, FittedStars, SingleDonuts, UsableStars, WavefrontFit
 
-#: Pixels, as a fraction of the stamp, from which on those of one greatest value are saturated, and those that are not
-#: finite or saturated may be the reason why there is no result.
+#: Pixels, as a fraction of the stamp, from which on those of one greatest value are saturated, and saturated ones the
+#: reason why there is no result.
 _SEVERAL = 0.002
+#: The same of pixels that are not finite.
+_MOST = 0.5
 #: Electrons up to which pixels of equal value are no sign of saturation.
 _FAINT = 100.0
 #: Chi-square a pixel above which a fit is poor.
@@ -93,8 +95,8 @@ def fit_donuts(
     The model traces points of the entrance pupil, with all vignetting and spiders, to the detector; the unknown
     wavefront W turns the light at each point by :math:`-\nabla W`, and the rays are traced again with their own changed
     directions. Landing points are convolved with the pixel and the mean of turbulence, a long exposure (Roddier 1981,
-    sec. 4). Unknown are also flux, place, background and seeing of each star. Noise is that of the photons of the model
-    and the sky; steps are those of Levenberg and Marquardt.
+    sec. 4). Unknown are also flux, place, plane of background and seeing of each star. Noise is that of the photons of
+    the model and the sky; steps are those of Levenberg and Marquardt.
 
     Parameters
     ----------
@@ -103,8 +105,8 @@ def fit_donuts(
         ``tel.perturbed("Detector", shift=(0, 0, 1.5e-3))`` is behind focus; ``"Camera"`` in its place where the camera
         moves, as in full-array mode.
     images : array_like, shape [n, ny, nx], or sequence of n arrays
-        Stamps [electrons], sky subtracted, ``[iy, ix]`` along +y and +x of the detector, each centred on its donut
-        within a few pixels.
+        Stamps [electrons], ``[iy, ix]`` along +y and +x of the detector, each with its donut nearest to the centre. A
+        plane of sky may be left in; pixels that are not finite are left out.
     fields : array_like or Quantity, shape [n, 2]
         Field angles [rad], of the light's own travel.
     wavelength : array_like, Quantity or Light, optional
@@ -128,7 +130,7 @@ def fit_donuts(
         Unknowns of the wavefront, with the options of their fit: Zernikes of each donut (the default), double Zernikes
         over the field, or degrees of freedom of the telescope for all donuts together.
     mask : array_like of bool, as `images`, optional
-        True at pixels to leave out.
+        True, or 1, at pixels to leave out.
     projection : {"zemax", "gnomonic", "postel"}
         Meaning of the field angles.
     threads : int, optional
@@ -223,17 +225,17 @@ def _fit_alone(instrument: Instrument, star: ObservedStar, defocus: float, stren
     not_finite = ~np.isfinite(star.image) & ~star.masked
     masked = star.masked | not_finite
     saturated = _saturated(np.where(masked, 0.0, star.image), masked, instrument.model.detector.saturation)
-    masked = masked | grown(saturated)
+    masked = masked | grown(saturated, ~masked)
     pixels = Pixels(np.where(masked, 0.0, star.image), star.variance, ~masked)
     wavefront = not joint or light.diameter > SMALLEST_DONUT * instrument.pixel
     fitted = fit_star(instrument, light, pixels, strength, wavefront=wavefront)
-    # Few such pixels are no reason for anything.
-    causes, allowed = DonutFlag.OK, max(_SEVERAL * star.image.size, 1.0)
-    for bad, flag in ((saturated, DonutFlag.SATURATED), (not_finite, DonutFlag.NOT_FINITE)):
-        causes |= flag if bad.sum() > allowed else DonutFlag.OK
     if fitted.flags.usable:
         return replace(fitted, flags=fitted.flags | DonutFlag.CLIPPED) if (saturated | not_finite).any() else fitted
-    return replace(fitted, flags=causes) if causes else fitted
+    if saturated.sum() > max(_SEVERAL * star.image.size, 1.0):
+        return StarFit(DonutFlag.SATURATED)
+    if not_finite.any() and (DonutFlag.MOSTLY_LOST in fitted.flags or not_finite.mean() > _MOST):
+        return StarFit(DonutFlag.NOT_FINITE)
+    return fitted
 
 
 def _saturated(image: np.ndarray, masked: np.ndarray, level: float | None) -> np.ndarray:

@@ -38,6 +38,17 @@ _LOST = 0.55
 _EXPLAINED = 0.5
 #: Pulls of pixels that are clipped, over that of typical pixels.
 _CLIP = 7.0
+#: Loss a coarse pixel from which on what the model lacks may be a patch of the stamp that is no star, and something of
+#: another size is no donut.
+_POOR = 1.0
+#: Sizes over that of the telescope's donut between which something that fits badly may still be one.
+_LIKE_DONUTS = (0.7, 1.35)
+#: Largest part of the misfit that a search without patches may leave.
+_LEFT = 0.5
+#: Fraction of the light that may be lost by such patches.
+_MASKED = 0.4
+#: Light over the brightest, below which a pixel of the model is none of the donut.
+_DARK = 0.01
 #: Light over the brightest, above which a pixel of the model is one of the donut.
 _BRIGHT = 0.2
 #: Sizes of donuts over that of the telescope's own between which nothing is said of them: by 120 um of 1500 of defocus.
@@ -115,25 +126,18 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
         flags |= DonutFlag.TOO_FEW_PHOTONS
     if flags:
         return StarFit(flags)
-    best = fitter.solve(start.stamp, start.unknowns, tolerance=COARSE if donut else FINE)
-    if donut and _misfit(start.pixels, start.stamp, best) > _MISFIT:
-        thinned = fitter.without_bad_lines(best)
-        if thinned is not fitter:
-            fitter, start = thinned, thinned.start()
-            best = fitter.solve(start.stamp, start.unknowns, tolerance=COARSE)
-    single = best
-    if donut and instrument.model.neighbours:
-        best = fitter.with_neighbours(start, single)
-    if donut and fitter.other_focus_is_better(start, best):
+    search = fitter.search(start)
+    if donut and search.misfit > _POOR:
+        search = search.fitter.masked_search(search)
+    if donut and search.misfit > _POOR and not _is_between(_size(search.start.stamp, search.best), _LIKE_DONUTS):
+        return StarFit(DonutFlag.NO_DONUT | DonutFlag.OTHER_SIZE)
+    explained = _explained(search.start.stamp, search.best)
+    # Before rims are free, with which the wrong side of focus fits much.
+    if donut and explained and search.fitter.other_focus_is_better(search.start, search.best):
         return StarFit(DonutFlag.DEFOCUS_SIGN)
-    if donut and wavefront and instrument.model.rims.search and _misfit(start.pixels, start.stamp, best) > _MISFIT:
-        # A neighbour is quicker to find, but light beside a rim looks like one, and like a cosmic ray.
-        solved = fitter.rim_solver(COARSE, lambda moved: moved.stamp(moved.light, start.pixels))
-        moved, moved_stamp, with_rims = fitter.with_moved_rims(start.stamp, single, _MISFIT, solved, start.unknowns)
-        if with_rims.loss < best.loss:
-            fitter, start, best = moved, replace(start, stamp=moved_stamp), with_rims
-            if instrument.model.neighbours and _misfit(start.pixels, moved_stamp, best) > _MISFIT:
-                best = fitter.with_neighbours(start, best)
+    if donut and wavefront and instrument.model.rims.search:
+        search = search.fitter.search_of_rims(search)
+    fitter, start, best = search.fitter, search.start, search.best
     if not _explained(start.stamp, best):
         return StarFit(DonutFlag.NO_DONUT)
     if fitter.lost_light(start.stamp, best).any_pixel > _LOST:
@@ -152,7 +156,7 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
         return StarFit(DonutFlag.MOSTLY_LOST)
     if lost.regions > _CUT_OFF:
         flags |= DonutFlag.CUT_OFF
-    if not _SIZES[0] < _size(finest.stamp, finest.solution.waves[0]) < _SIZES[1]:
+    if not _is_between(_size(finest.stamp, finest.solution), _SIZES):
         flags |= DonutFlag.OTHER_SIZE
     return StarFit(flags, finest)
 
@@ -166,6 +170,21 @@ class _Start:
     template: np.ndarray
     match: Match
     unknowns: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Best coarse solution, from a start, on the pixels of a fitter, and that without neighbours."""
+
+    fitter: _StarFitter
+    start: _Start
+    best: Solution
+    single: Solution
+
+    @property
+    def misfit(self) -> float:
+        """Loss a coarse pixel, beyond that of noise."""
+        return _misfit(self.start.pixels, self.start.stamp, self.best)
 
 
 @dataclass(frozen=True)
@@ -337,8 +356,14 @@ class _StarFitter:
             if not self._sampling(_ENOUGH * fwhm, last.pixels.side, _ENOUGH * error)[1].finer_than(last.sampling):
                 return last
             pixels, sampling = self._sampling(fwhm, min(self._side(fwhm), last.pixels.side), error)
-        stamp = self.sampled_stamp(pixels, sampling, light.diameter if blended else 0.0)
+        stamp = self.sampled_stamp(pixels, sampling, light.diameter if blended else self._overhang(solution))
         return _Fine(stamp, pixels, sampling)
+
+    def _overhang(self, solution: Solution) -> float:
+        """Return how far the light of a star reaches beyond the stamp [m]."""
+        middle = 0.5 * self._instrument.pixel * np.array(self._clean.image.shape[::-1])
+        place = self._instrument.pixel * np.abs(solution.stars[0][[X, Y]])
+        return float(np.clip(place + 0.5 * self._light.diameter - middle, 0.0, self._light.diameter).max())
 
     def _sampling(self, fwhm: float, side: int, error: float = math.inf) -> tuple[Pixels, Sampling]:
         pixels = self._binned.get(side) or self._binned.setdefault(side, self._clean.binned(side))
@@ -375,15 +400,76 @@ class _StarFitter:
         unknowns[BACKGROUND] = level + grid.scale * (grid.offset @ unknowns[[SLOPE_X, SLOPE_Y]])
         return _Start(pixels, stamp, template, match, unknowns)
 
-    def without_bad_lines(self, solution: Solution) -> _StarFitter:
-        """Return the same without scattered pixels and lines far off a first model; itself where there are none."""
-        rays = self._of(self._light, self._across)
-        full = self._instrument.stamp(self._light, self._clean, rays, sharp=False)
-        model = model_image(full, solution.stars[0], solution.waves[0])
+    def search(self, start: _Start) -> _Search:
+        """Return the best coarse solution, with neighbours, and without lines of pixels far off a first one."""
+        best = self.solve(start.stamp, start.unknowns, tolerance=COARSE if self._donut else FINE)
+        search = _Search(self, start, best, best)
+        if not self._donut:
+            return search
+        if search.misfit > _MISFIT:
+            used = self._without_outliers(best.stars[0], best.waves[0], lines_only=True)
+            if (used != self._clean.used).any():
+                fitter = self.with_used(used)
+                start = fitter.start()
+                best = fitter.solve(start.stamp, start.unknowns, tolerance=COARSE)
+                search = _Search(fitter, start, best, best)
+        if self._instrument.model.neighbours:
+            search = replace(search, best=search.fitter.with_neighbours(search.start, search.best))
+        return search
+
+    def search_of_rims(self, search: _Search) -> _Search:
+        """Return a search with rims free that the residuals say stand elsewhere, if it explains more.
+
+        Neighbours are quicker to find, so that they are searched for first; but light beside a rim looks like one, and
+        like a cosmic ray, so that rims are searched for without those.
+        """
+        if search.misfit <= _MISFIT:
+            return search
+        start = search.start
+        solved = self.rim_solver(COARSE, lambda moved: moved.stamp(moved.light, start.pixels))
+        limit = _MISFIT + _noise(start.pixels)
+        fitter, stamp, best = self.with_moved_rims(start.stamp, search.single, limit, solved, start.unknowns)
+        if not best.loss < search.best.loss:
+            return search
+        trial = _Search(fitter, replace(start, stamp=stamp), best, best)
+        if trial.misfit > _MISFIT and self._instrument.model.neighbours:
+            trial = replace(trial, best=fitter.with_neighbours(trial.start, best))
+        return trial
+
+    def masked_search(self, search: _Search) -> _Search:
+        """Return a search without patches of pixels far off the template, if these are what it does not explain."""
+        template = self._robust_template(search.start)
+        used = self._without_outliers(template, np.zeros(len(self._precision)))
+        if (used == self._clean.used).all():
+            return search
+        fitter = self.with_used(used)
+        start = fitter.start()
+        trial = fitter.search(start)
+        lost = trial.fitter.lost_light(start.stamp, trial.best).any_pixel
+        return trial if trial.misfit < _LEFT * search.misfit and lost < _MASKED else search
+
+    def _robust_template(self, start: _Start) -> np.ndarray:
+        """Return unknowns of a star without aberrations by the typical pixels on the donut and beside it."""
+        stamp, unknowns = start.stamp, start.unknowns.copy()
+        model = model_image(stamp, unknowns, np.zeros(len(self._precision)))
+        unknowns[[BACKGROUND, SLOPE_X, SLOPE_Y]] = 0.0
+        light = model_image(stamp, unknowns, np.zeros(len(self._precision)))
+        bright, dark = (stamp.used & side for side in (light > _BRIGHT * light.max(), light < _DARK * light.max()))
+        unknowns[[BACKGROUND, SLOPE_X, SLOPE_Y]] = start.unknowns[[BACKGROUND, SLOPE_X, SLOPE_Y]]
+        if dark.any():
+            level = float(np.median((stamp.image - model + light)[dark]))
+            unknowns[[BACKGROUND, SLOPE_X, SLOPE_Y]] = level / stamp.grid.scale**2, 0.0, 0.0
+            if bright.any():
+                unknowns[FLUX] *= max(float(np.median((stamp.image - level)[bright] / light[bright])), 1e-3)
+        return unknowns
+
+    def _without_outliers(self, star: np.ndarray, wave: np.ndarray, *, lines_only: bool = False) -> np.ndarray:
+        """Return the used pixels without those far off a model."""
+        full = self._instrument.stamp(self._light, self._clean, self._of(self._light, self._across), sharp=False)
+        model = model_image(full, star, wave)
         pull = pulls(full, model)
         limit = _CLIP * _typical(pull, model, full.used)
-        used = without_outliers(pull, full.image, model, full.used, limit, lines_only=True)
-        return self if (used == full.used).all() else self.with_used(used)
+        return without_outliers(pull, full.image, model, full.used, limit, lines_only=lines_only)
 
     def lost_light(self, stamp: Stamp, solution: Solution) -> _LostLight:
         """Return the fractions of the star's light that land beside the stamp and on unused pixels."""
@@ -391,9 +477,9 @@ class _StarFitter:
         used = stamp.used if stamp.used.shape == used.shape else used
         landing, weights = stamp.rays.landing(wave), stamp.rays.weights(wave)
         middle = 0.5 * (np.array(used.shape[::-1]) - 1.0)
-        place = np.rint(landing / self._instrument.pixel + star[[X, Y]] + middle).astype(np.int64)
-        outside = ((place < 0) | (place >= used.shape[::-1])).any(axis=1)
-        column, row = np.where(outside[:, None], 0, place).T
+        place = np.rint(landing / self._instrument.pixel + star[[X, Y]] + middle)
+        outside = ~((place >= 0) & (place < used.shape[::-1])).all(axis=1)
+        column, row = np.where(outside[:, None], 0, place).astype(np.int64).T
         lost, cut = (outside | pixels[row, column] for pixels in (~used, unused_regions(used)))
         return _LostLight(float(weights @ lost), float(weights @ cut))
 
@@ -440,14 +526,20 @@ def _noise(pixels: Pixels) -> float:
 
 
 def _typical(pull: np.ndarray, model: np.ndarray, used: np.ndarray) -> float:
-    """Return the size of a typical pull on a donut, at least 1: turbulence and missing terms make it larger."""
+    """Return the size of a typical pull, at least 1, on a donut or beside it: turbulence and noise make it larger."""
     low = float(model[used].min(initial=np.inf))
-    bright = used & (model - low > _BRIGHT * (model.max() - low))
-    return max(1.0, float(RMS_PER_MAD * np.median(np.abs(pull[bright])))) if bright.any() else 1.0
+    bright = model - low > _BRIGHT * (model.max() - low)
+    sides = [np.abs(pull[used & side]) for side in (bright, ~bright)]
+    return max([1.0, *(float(RMS_PER_MAD * np.median(pulls)) for pulls in sides if pulls.size)])
 
 
-def _size(stamp: Stamp, wave: np.ndarray) -> float:
+def _is_between(value: float, limits: tuple[float, float]) -> bool:
+    return limits[0] < value < limits[1]
+
+
+def _size(stamp: Stamp, solution: Solution) -> float:
     """Return the rms radius of a donut over that without the wavefront beside the telescope's."""
+    wave = solution.waves[0]
     weights = stamp.rays.weights(wave)
 
     def radius(landing: np.ndarray) -> float:

@@ -37,9 +37,9 @@ class DonutFlag(IntFlag):
     NOT_FINITE = 512
     NOT_CONVERGED = 1024
     POOR_FIT = 2048
-    MOSTLY_LOST = 4096
+    RIM_MOVED = 4096
     OTHER_SIZE = 8192
-    RIM_MOVED = 16384
+    MOSTLY_LOST = 32768
     ORIENTATION = 65536
 
     @property

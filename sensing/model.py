@@ -209,7 +209,7 @@ class DonutModel:
     rims : DonutRims
         How far rims and spiders are trusted.
     neighbours : bool
-        Whether a second star may stand on a stamp. It is searched for, and fitted too.
+        Whether up to five neighbours may stand on a stamp or beside it. They are searched for, and fitted too.
     diffraction : bool, optional
         Whether light is diffracted at the rims of the pupil, as that of real stars is: it takes light from strips along
         the rims of the image. A fit of rays takes their lack for 35 to 45 nm of wavefront, most of it Z11 (LSST, 1.5

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import fftconvolve
-
-from ..core.statistics import RMS_PER_MAD
+from scipy.special import ndtri
 
 #: Rms of the Gaussian before sampling, in new pixels.
 _SMOOTHING = 1.0
@@ -200,10 +200,12 @@ def _plane_of(components: np.ndarray, basis: np.ndarray, used: np.ndarray) -> np
     return np.asarray(np.linalg.lstsq(columns, values, rcond=None)[0])
 
 
-def measured_variance(pixels: Pixels) -> float:
+def measured_variance(pixels: Pixels, percentile: float = 50.0) -> float:
     """Return the variance of a pixel [electron^2] by differences of neighbours, in which smooth light cancels.
 
-    Their median is that of the sky where a donut covers less than half of the stamp.
+    Their median is that of the sky where a donut covers less than half of the stamp; a lower percentile bears more
+    bright and bad pixels.
     """
     steps = np.abs(np.diff(pixels.image, axis=1))[pixels.used[:, 1:] & pixels.used[:, :-1]]
-    return float((RMS_PER_MAD * np.median(steps)) ** 2 / 2.0) if steps.size else 0.0
+    of_normal = math.sqrt(2.0) * float(ndtri(0.5 + 0.005 * percentile))
+    return float((np.percentile(steps, percentile) / of_normal) ** 2) if steps.size else 0.0

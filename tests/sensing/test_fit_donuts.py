@@ -264,13 +264,12 @@ def test_fits_with_more_than_the_noise_that_is_claimed_are_flagged(behind_focus,
 @pytest.mark.long
 def test_bad_donuts_are_flagged_and_others_go_on(focused, behind_focus, clean):
     sky = noisy(np.zeros_like(clean), 500.0, 5)
-    not_finite = clean.copy()
-    not_finite[5, 5] = np.nan
+    not_finite = np.where(np.arange(SIZE) < 55, np.nan, clean)
     saturated = np.minimum(4.0 * clean, 2.0 * clean.max())
     wrong_side = donut(focused.perturbed("Detector", shift=(0.0, 0.0, -1.5e-3)), np.deg2rad([0.9, 1.3]))
-    cut_off = np.zeros_like(clean)
-    cut_off[:, :-28] = clean[:, 28:]
-    images = [clean, not_finite, sky, saturated, cut_off, clean, wrong_side, clean * 1e-6]
+    mostly_lost = np.zeros_like(clean)
+    mostly_lost[:, :-50] = clean[:, 50:]
+    images = [clean, not_finite, sky, saturated, mostly_lost, clean, wrong_side, clean * 1e-6]
     fields = np.array([FIELD] * 8)
     fields[5] = np.deg2rad([3.0, 1.0])
     fields[6] = np.deg2rad([0.9, 1.3])
@@ -288,7 +287,7 @@ def test_bad_donuts_are_flagged_and_others_go_on(focused, behind_focus, clean):
         flag.NOT_FINITE,
         flag.NO_DONUT,
         flag.SATURATED,
-        flag.CUT_OFF,
+        flag.MOSTLY_LOST,
         flag.OUTSIDE_FIELD,
         flag.DEFOCUS_SIGN,
     ]
