@@ -57,9 +57,11 @@ def donuts_command(
     ] = None,
     stamp: Annotated[int, Option(min=16, help="Side of the stamps cut from the image of a CCD [pixels].")] = 180,
     pixel_um: Annotated[float, Option(help="Side of a pixel [um].")] = 10.0,
-    gain: Annotated[float, Option(help="Electrons per unit of the images.")] = 1.0,
+    gain: Annotated[
+        float, Option(help="Electrons per unit of the images; it matters with --sky-variance, and to fluxes.")
+    ] = 1.0,
     sky_variance: Annotated[
-        float | None, Option(help="Variance of sky and readout [electron^2]; from the edges of the stamps by default.")
+        float | None, Option(help="Variance of sky and readout [electron^2]; measured by default, and the gain.")
     ] = None,
     saturation: Annotated[float | None, Option(help="Level of saturated pixels [electrons].")] = None,
     terms: Annotated[int, Option("--zernikes", min=4, max=78, help="Highest Noll index.")] = 22,
@@ -89,7 +91,7 @@ def donuts_command(
 
     A file holds a cube of stamps and a table with their fields (field_x, field_y [deg], defocus_um), one stamp an
     extension with keywords FIELD_X, FIELD_Y and DEFOC_UM, or the image of a CCD, with --positions. Stamps have x and y
-    along those of the detector, and no sky. Bad donuts are flagged with the reason.
+    along those of the detector. Bad donuts are flagged with the reason.
 
     **Examples**
 
@@ -101,7 +103,6 @@ def donuts_command(
     from ..sensing.fit import fit_donuts
     from ..sensing.freedom_fit import TelescopeFreedoms
     from ..sensing.model import DonutAir, DonutDetector, DonutModel
-    from ..sensing.stamp_files import border_variance
     from ..sensing.wavefront_fits import SingleDonuts
     from ..wavefront.atmosphere.atmosphere import Atmosphere
 
@@ -128,7 +129,7 @@ def donuts_command(
             images,
             fields,
             wavelength_list(believed, wavelength_nm, None),
-            sky_variance=[border_variance(image) for image in images] if sky_variance is None else sky_variance,
+            sky_variance=sky_variance,
             model=model,
             fit=wavefront,
             projection=projection,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,8 +23,10 @@ from .inputs import ObservedStar, ObservedStars
 from .light import Instrument
 from .likelihood import pulls
 from .model import DonutModel
+from .noise import faint_level, measured_noise, smoothed
 from .result import DonutFit
 from .stamps import Pixels
+from .star_errors import ErrorParts
 from .wavefront_fits import NOLL, FittedStars, SingleDonuts, UsableStars, WavefrontFit
 
 #: Saturated pixels from which on a donut is flagged, as a fraction of the stamp; fewer are left out.
@@ -34,6 +37,10 @@ _FAINT = 100.0
 _POOR = 1.2
 #: Standard deviations of the noise's own chi-square that a poor fit has beyond that.
 _BY_CHANCE = 5.0
+#: Ratio of the noise that a fit leaves to that which it assumed, up to which its search holds.
+_NOISE_AGREES = 2.0
+#: Most fits of a star whose noise is measured.
+_NOISE_FITS = 2
 
 
 @removed_arguments(
@@ -60,7 +67,7 @@ def fit_donuts(
     wavelength: ArrayLike | Light | None = None,
     *,
     pixel_size: ArrayLike | None = None,
-    sky_variance: ArrayLike = 0.0,
+    sky_variance: ArrayLike | None = None,
     noll: Iterable[int] | None = None,
     degrees_of_freedom: DegreesOfFreedom | None = None,
     model: DonutModel | None = None,
@@ -84,8 +91,8 @@ def fit_donuts(
         Telescope as it is believed to be, defocus included: ``tel.perturbed("Detector", shift=(0, 0, 1.5e-3))`` is
         behind focus; ``"Camera"`` in its place where the camera moves, as in full-array mode.
     images : array_like, shape [n, ny, nx], or sequence of n arrays
-        Stamps [electrons], sky subtracted, ``[iy, ix]`` along +y and +x of the detector, each centred on its donut
-        within a few pixels.
+        Stamps, ``[iy, ix]`` along +y and +x of the detector, each centred on its donut within a few pixels: electrons
+        without sky where `sky_variance` is given, else of any unit, with or without sky.
     fields : array_like or Quantity, shape [n, 2]
         Field angles [rad], of the light's own travel.
     wavelength : array_like, Quantity or Light, optional
@@ -93,8 +100,9 @@ def fit_donuts(
         or the telescope's own by default.
     pixel_size : float or Quantity, optional
         Side of a pixel [m], in place of that of the model, which is 10 um by default.
-    sky_variance : float or array, shapes [n] or [n, ny, nx]
-        Variance of sky and readout [electron^2 a pixel].
+    sky_variance : float or array, shapes [n] or [n, ny, nx], optional
+        Variance of sky and readout [electron^2 a pixel]; light then has the noise of electrons. By default both are
+        measured from each image and what its fit leaves, whatever the unit of the images; sky may be left in.
     noll : iterable of int, optional
         Noll indices of the wavefront, from 4; those up to 22 by default. Short for the ``noll`` of a `fit`.
     degrees_of_freedom : DegreesOfFreedom, optional
@@ -147,7 +155,8 @@ def fit_donuts(
         usable = UsableStars(instrument, list(solutions.values()), observed.fields[list(solutions)], projection)
         fitted = fit.solved(usable, pool)
     flags = np.array([int(star.flags) for star in stars], dtype=np.int64)
-    return _result(instrument, observed, flags, np.array(list(solutions), dtype=np.int64), fitted)
+    scales = np.array([(star.unit, star.level) for star in stars])
+    return _result(instrument, observed, flags, scales, np.array(list(solutions), dtype=np.int64), fitted)
 
 
 def _wavefront_fit(
@@ -182,9 +191,22 @@ def _fit_alone(instrument: Instrument, star: ObservedStar, defocus: float, stren
         light = instrument.light(star.direction, defocus)
     except DomainError:
         return StarFit(DonutFlag.NO_LIGHT)
-    pixels = Pixels(np.where(masked, 0.0, star.image), star.variance, ~masked)
     wavefront = not joint or light.diameter > SMALLEST_DONUT * instrument.pixel
-    return fit_star(instrument, light, pixels, strength, wavefront=wavefront)
+    image = np.where(masked, 0.0, star.image)
+    if star.known_noise:
+        return fit_star(instrument, light, Pixels(image, star.variance, ~masked), strength, wavefront=wavefront)
+    smooth = smoothed(image, ~masked)
+    level = faint_level(smooth, ~masked)
+    image = np.where(masked, 0.0, star.image - level)
+    noise = measured_noise(image, smooth - level, ~masked, level)
+    for _ in range(_NOISE_FITS):
+        unit = noise.photon
+        pixels = Pixels(image / unit, np.full(image.shape, noise.sky / unit**2), ~masked)
+        fitted = fit_star(instrument, light, pixels, strength, wavefront=wavefront, sky_level=level / unit)
+        if 1.0 / _NOISE_AGREES < fitted.unit < _NOISE_AGREES:
+            break
+        noise = replace(noise, sky=noise.sky * fitted.unit, photon=unit * fitted.unit)
+    return replace(fitted, unit=unit * fitted.unit, level=level)
 
 
 def _plateau(values: np.ndarray) -> int:
@@ -197,19 +219,34 @@ def _plateau(values: np.ndarray) -> int:
 
 
 def _result(
-    instrument: Instrument, observed: ObservedStars, flags: np.ndarray, usable: np.ndarray, fitted: FittedStars
+    instrument: Instrument,
+    observed: ObservedStars,
+    flags: np.ndarray,
+    scales: np.ndarray,
+    usable: np.ndarray,
+    fitted: FittedStars,
 ) -> DonutFit:
     """Return the result of a fit: rows of the usable stars, and NaN for the others."""
+    units, levels = scales.T
     count, n_noll = len(observed), len(instrument.terms.requested)
     zernikes, covariance = np.full((count, n_noll), np.nan), np.full((count, n_noll, n_noll), np.nan)
     values, errors = np.full((2, count, len(NUISANCES) + len(COMPANION)), np.nan)
+    parts = {name: np.full_like(covariance, np.nan) for name in ErrorParts.__dataclass_fields__}
+    noise = np.full(count, np.nan)
     chi2, n_pixels = np.full(count, np.nan), np.zeros(count, dtype=np.int64)
     model, used = np.full(observed.images.shape, np.nan), np.zeros(observed.images.shape, dtype=bool)
     for i, star in zip(usable, fitted.stars, strict=True):
         n, (ny, nx) = len(star.unknowns), star.model.shape
         values[i, :n], errors[i, :n] = star.unknowns, np.sqrt(np.diag(star.covariance))
-        zernikes[i], covariance[i] = star.zernikes, star.zernike_covariance
-        model[i, :ny, :nx], used[i, :ny, :nx] = star.model, star.pixels.used
+        # Fluxes of neighbours are relative ones.
+        values[i, [FLUX, BACKGROUND]] *= units[i]
+        errors[i, [FLUX, BACKGROUND]] *= units[i]
+        values[i, BACKGROUND] += levels[i]
+        zernikes[i], covariance[i] = star.zernikes, star.errors.total
+        for name, part in parts.items():
+            part[i] = getattr(star.errors, name)
+        model[i, :ny, :nx], used[i, :ny, :nx] = units[i] * star.model + levels[i], star.pixels.used
+        noise[i] = units[i] ** 2 * np.median(star.pixels.variance)
         chi2[i] = (pulls(star.pixels, star.model)[star.pixels.used] ** 2).sum()
         n_pixels[i] = star.pixels.used.sum()
     poor = chi2 > _POOR * n_pixels + _BY_CHANCE * np.sqrt(2.0 * n_pixels)
@@ -217,6 +254,7 @@ def _result(
     return DonutFit(
         zernikes=zernikes,
         covariance=covariance,
+        error_parts=ErrorParts(**parts),
         noll=instrument.terms.requested,
         flux=values[:, FLUX],
         flux_error=errors[:, FLUX],
@@ -227,6 +265,8 @@ def _result(
         fwhm_error=width * errors[:, STRENGTH] / np.where(strength > 0.0, strength, 1.0),
         chi2=chi2,
         n_pixels=n_pixels,
+        sky_variance=noise,
+        photon_variance=np.where(np.isfinite(noise), units, np.nan),
         flags=flags | poor * int(DonutFlag.POOR_FIT),
         companion=values[:, RATIO:],
         images=observed.images,

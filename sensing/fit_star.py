@@ -10,9 +10,10 @@ from scipy.ndimage import maximum_filter
 
 from .donut_rays import ZernikeRays
 from .flags import DonutFlag
-from .image_model import FLUX, NUISANCES, RATIO, STRENGTH, X, Y
+from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, STRENGTH, X, Y
 from .light import Instrument, Sampling, StarLight
 from .likelihood import Stamp, model_image, pulls
+from .noise import measured_noise
 from .solve import COARSE, FINE, STEPS, Group, Solution, solve
 from .stamps import (
     Match,
@@ -93,10 +94,22 @@ class StarSolution:
 
 @dataclass(frozen=True)
 class StarFit:
-    """Outcome of the fit of one star by itself: flags, and its best model unless it failed."""
+    """Outcome of the fit of one star by itself.
+
+    Attributes
+    ----------
+    flags : DonutFlag
+        What is to be said of it.
+    best : StarSolution, optional
+        Its best model, unless it failed.
+    unit, level : float
+        The image is that of the solution, whose light has the noise of electrons, times a unit, above a level.
+    """
 
     flags: DonutFlag
     best: StarSolution | None = None
+    unit: float = 1.0
+    level: float = 0.0
 
     @property
     def usable(self) -> StarSolution | None:
@@ -104,7 +117,15 @@ class StarFit:
         return self.best if self.flags.usable else None
 
 
-def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength: float, *, wavefront: bool) -> StarFit:
+def fit_star(
+    instrument: Instrument,
+    light: StarLight,
+    pixels: Pixels,
+    strength: float,
+    *,
+    wavefront: bool,
+    sky_level: float | None = None,
+) -> StarFit:
     """Fit one star.
 
     Parameters
@@ -115,6 +136,9 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
         Strength of the turbulence [1/m]: a start, or the value where the seeing is known.
     wavefront : bool
         Whether the wavefront is fitted; where not, it is zero.
+    sky_level : float, optional
+        Light of the sky that was taken off, where noise is not known: that of the result is what the fit leaves, in a
+        unit in which light has the noise of electrons.
     """
     across = light.diameter / instrument.pixel
     donut = across > SMALLEST_DONUT
@@ -147,6 +171,8 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
         flags |= DonutFlag.BLENDED
     if not (finest.solution.converged and np.isfinite(finest.model).all()):
         flags |= DonutFlag.NOT_CONVERGED
+    if sky_level is not None and flags.usable:
+        return StarFit(flags, *fitter.with_measured_noise(finest, sky_level))
     return StarFit(flags, finest)
 
 
@@ -219,6 +245,28 @@ class _StarFitter:
             best = self.solve(stamp, best.stars[0], best.shared)
             model = model_image(full, best.stars[0], best.waves[0])
         return StarSolution(self._light, stamp, full, best, model)
+
+    def with_measured_noise(self, star: StarSolution, sky_level: float) -> tuple[StarSolution, float]:
+        """Return a solution in the unit in which what it leaves has the noise of electrons, and that unit."""
+        unknowns, wave = star.solution.stars[0], star.solution.waves[0]
+        level = model_image(star.full, np.where(np.arange(len(unknowns)) == FLUX, 0.0, unknowns), wave)
+        noise = measured_noise(
+            star.full.image - star.model, star.model - level, star.full.used, sky_level, correlated=True
+        )
+        unit, sky = noise.photon, noise.sky / noise.photon**2
+
+        def rescaled(stamp: Stamp) -> Stamp:
+            return replace(
+                stamp,
+                image=stamp.image / unit,
+                variance=np.full(stamp.image.shape, sky * stamp.grid.scale**2),
+            )
+
+        unknowns = unknowns.copy()
+        unknowns[[FLUX, BACKGROUND]] /= unit
+        stamp, full = rescaled(star.stamp), rescaled(star.full)
+        best = self.solve(stamp, unknowns, star.solution.shared)
+        return StarSolution(self._light, stamp, full, best, model_image(full, best.stars[0], best.waves[0])), unit
 
     def sampled(self, solution: Solution, blended: bool, last: _Fine | None) -> _Fine:
         """Return a stamp fine enough for the seeing of a solution: the last one if that is, nearly."""

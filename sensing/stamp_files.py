@@ -16,8 +16,7 @@ from astropy.table import Table
 
 from ..core.errors import ProductError
 from ..core.files import parsing, require_file
-from ..core.statistics import robust_rms
-from .inputs import MOST_ELECTRONS, SMALLEST_STAMP
+from .inputs import SMALLEST_STAMP
 
 
 @dataclass(frozen=True)
@@ -86,16 +85,6 @@ def read_stamps(path: Path, positions: Path | None = None, size: int = 180) -> D
 def _described(header: fits.Header) -> dict[str, float]:
     """Return the place and the defocus of a stamp, as far as its header has them."""
     return {key: float(header[key]) for key in ("FIELD_X", "FIELD_Y", "DEFOC_UM") if key in header}
-
-
-def border_variance(image: np.ndarray) -> float:
-    """Return the variance of the pixels along the edge of a stamp, by their median absolute deviation.
-
-    Pixels that are not finite, or that no detector counts, are left out.
-    """
-    edge = np.concatenate([image[:2].ravel(), image[-2:].ravel(), image[2:-2, :2].ravel(), image[2:-2, -2:].ravel()])
-    edge = edge[np.abs(edge) < MOST_ELECTRONS]
-    return float(robust_rms(edge) ** 2) if edge.size else 0.0
 
 
 def _table(path: Path) -> Table:
