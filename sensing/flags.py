@@ -9,8 +9,8 @@ class DonutFlag(IntFlag):
     """Outcome of the fit of one donut; zero for a clean one.
 
     ``BLENDED`` (a second star was fitted too), ``CLIPPED`` (pixels far off the model, cosmic rays for example, were
-    left out) and ``POOR_FIT`` (chi-square is far above the number of pixels, so that errors are larger than claimed)
-    are remarks: there are results. With any other flag the results of the donut are NaN.
+    left out) and ``POOR_FIT`` (chi-square is far above the number of pixels: the model lacks something, and errors have
+    what the residuals say of it) are remarks: there are results. With any other flag the results of the donut are NaN.
 
     ``NO_DONUT``: nothing like a donut stands on the stamp. ``CUT_OFF``: more than a twentieth of the light falls beside
     the stamp. ``SATURATED``: too many pixels are saturated. ``DEFOCUS_SIGN``: the image fits the other side of focus
