@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +26,11 @@ _INDEPENDENT = 5.0
 
 
 def cross_checked(
-    fields: np.ndarray, zernikes: np.ndarray, parts: Sequence[ErrorParts], air: np.ndarray, measured_air: bool
+    fields: np.ndarray,
+    zernikes: np.ndarray,
+    parts: Sequence[ErrorParts],
+    air: Callable[[], np.ndarray],
+    measured_air: bool,
 ) -> list[ErrorParts]:
     """Return the errors of donuts that are fitted each by itself, after a check against their scatter.
 
@@ -40,8 +44,8 @@ def cross_checked(
         Wavefronts [m].
     parts : sequence of n ErrorParts
         Their errors.
-    air : ndarray, shape [n_noll, n_noll]
-        Covariance of unit trace that unexplained scatter has.
+    air : callable
+        Covariance of unit trace that unexplained scatter has, [n_noll, n_noll].
     measured_air : bool
         Whether the air's part is measured from the residuals, not known by the exposure.
     """
@@ -56,35 +60,34 @@ def cross_checked(
     scatter = float(((values - basis @ (basis.T @ values)) ** 2).sum())
     noise, lacking, in_air = (
         float(sum(w * np.trace(of(parts[i])) for w, i in zip(free, group, strict=True)))
-        for of in (_noise, _lacking, lambda part: part.air)
+        for of in (_noise, _lacking, lambda errors: errors.air)
     )
     excess, freedom = scatter - noise - lacking, count - terms
     if excess > _MOST_SCATTER**2 * freedom:
         return checked
     if excess > _SIGNIFICANT * (noise + lacking) * np.sqrt(2.0 / (freedom * _INDEPENDENT)):
-        added = excess / freedom * air
-        return [_with_repeats(replace(part, floor=part.floor + added)) for part in checked]
+        added = excess / freedom * air()
+        return [_with_repeats(replace(errors, floor=errors.floor + added)) for errors in checked]
     unseen = max(scatter - noise, 0.0)
     share = min(unseen / lacking, 1.0) if lacking > 0.0 else 1.0
     # What stars do not share of the air is a part of the scatter.
     calm = min(unseen / (_AIR_OF_ITS_OWN * in_air), 1.0) if measured_air and in_air > 0.0 else 1.0
     for i in group:
-        part = parts[i]
-        repeats = _noise(part) + share * _lacking(part)
-        checked[i] = replace(part, air=calm * part.air, repeats=repeats)
+        repeats = _noise(parts[i]) + share * _lacking(parts[i])
+        checked[i] = replace(parts[i], air=calm * parts[i].air, repeats=repeats)
     return checked
 
 
-def _noise(part: ErrorParts) -> np.ndarray:
-    return part.photons + part.floor
+def _noise(errors: ErrorParts) -> np.ndarray:
+    return errors.photons + errors.floor
 
 
-def _lacking(part: ErrorParts) -> np.ndarray:
-    return part.residuals + part.air
+def _lacking(errors: ErrorParts) -> np.ndarray:
+    return errors.residuals + errors.air
 
 
-def _with_repeats(part: ErrorParts) -> ErrorParts:
-    return replace(part, repeats=part.total)
+def _with_repeats(errors: ErrorParts) -> ErrorParts:
+    return replace(errors, repeats=errors.total)
 
 
 def _smooth_field(fields: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -243,8 +243,8 @@ def _result(
         errors[i, [FLUX, BACKGROUND]] *= units[i]
         values[i, BACKGROUND] += levels[i]
         zernikes[i], covariance[i] = star.zernikes, star.errors.total
-        for name, part in parts.items():
-            part[i] = getattr(star.errors, name)
+        for cause, covariances in parts.items():
+            covariances[i] = getattr(star.errors, cause)
         model[i, :ny, :nx], used[i, :ny, :nx] = units[i] * star.model + levels[i], star.pixels.used
         noise[i] = units[i] ** 2 * np.median(star.pixels.variance)
         chi2[i] = (pulls(star.pixels, star.model)[star.pixels.used] ** 2).sum()

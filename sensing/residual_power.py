@@ -37,6 +37,10 @@ _LIGHT_LENGTH = 0.35
 _SIGNIFICANT = 3.0
 #: The same that a further field must explain.
 _NEEDED = 3.0
+#: Fields whose power in the residuals decides whether there is any beyond that of noise.
+_SCREENED = ("white", "noise_0.8", "brightness", "rims")
+#: Largest number of pixels; beyond, squares of them are summed.
+_MOST_PIXELS = 17_000
 #: Ridge of the normal equations of the strengths, over their diagonal: fields that differ little share the power.
 _RIDGE = 1e-6
 
@@ -101,17 +105,45 @@ def residual_power(
     scale = np.where(spreads > 0.0, spreads, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    columns = linearized.columns @ (linearized.scales[:, None] * root).astype(np.float32)
-    residuals = _Residuals(linearized.pulls.astype(np.float32), columns)
-    fields = _fields(linearized, resolution)
-    strengths: dict[str, float] = {}
-    if max(residuals.excess(of_field) for of_field in fields.values()) > _SIGNIFICANT:
-        fields |= {name: LowRankField(values) for name, values in further().items()}
-        strengths = residuals.strengths(fields)
-    power = sum(
-        (s * columns.T @ fields[name].times(columns) for name, s in strengths.items()), start=np.zeros_like(root)
-    )
-    return ResidualPower(root, power, strengths)
+    squares = _Squares(linearized.used)
+    columns = squares.of(linearized.columns @ (linearized.scales[:, None] * root).astype(np.float32))
+    residuals = _Residuals(squares.of(linearized.pulls.astype(np.float32)[:, None])[:, 0], columns)
+    fields = _fields(linearized, squares, resolution)
+    if max(residuals.excess(fields[name]) for name in _SCREENED) < _SIGNIFICANT:
+        return ResidualPower(root, np.zeros_like(root))
+    fields |= {name: LowRankField(squares.of(patterns)) for name, patterns in further().items()}
+    return ResidualPower(root, *residuals.power(fields))
+
+
+class _Squares:
+    """Squares of pixels of a stamp, few enough for quick sums: single pixels of a small one.
+
+    Sums over a square of so many pixels are divided by its side, so that white noise keeps its variance.
+    """
+
+    def __init__(self, used: np.ndarray) -> None:
+        self._used, self.side = used, 1
+        while used.size / self.side**2 > _MOST_PIXELS and min(used.shape) >= 4 * self.side:
+            self.side *= 2
+        self.used = self._cut(used[..., None])[..., 0].all(axis=(1, 3))
+
+    def _cut(self, images: np.ndarray) -> np.ndarray:
+        """Return images [ny, nx, n] by squares, [ny, side, nx, side, n]."""
+        ny, nx = (n // self.side for n in images.shape[:2])
+        whole_squares = images[: ny * self.side, : nx * self.side]
+        return whole_squares.reshape(ny, self.side, nx, self.side, -1)
+
+    def of(self, columns: np.ndarray) -> np.ndarray:
+        """Return columns of pixels in use [n_pixel, n] as those of squares, [n_square, n]."""
+        if self.side == 1:
+            return columns
+        images = np.zeros((*self._used.shape, columns.shape[1]), dtype=columns.dtype)
+        images[self._used] = columns
+        return np.asarray(self._cut(images).sum(axis=(1, 3))[self.used] / self.side)
+
+    def mean(self, image: np.ndarray) -> np.ndarray:
+        """Return an image [ny, nx] by the means of squares."""
+        return np.asarray(self._cut(image[..., None])[..., 0].mean(axis=(1, 3)))
 
 
 class _Residuals:
@@ -119,7 +151,6 @@ class _Residuals:
 
     def __init__(self, pulls: np.ndarray, columns: np.ndarray) -> None:
         self._pulls, self._columns = pulls, columns
-        self._gram = columns.T @ columns
 
     def _surplus(self, of_field: Field, of_columns: np.ndarray) -> float:
         """Return the power of the residuals in a field beyond that of noise."""
@@ -130,9 +161,9 @@ class _Residuals:
         """Return the surplus in a field in standard deviations of noise."""
         return self._surplus(of_field, of_field.times(self._columns)) / np.sqrt(2.0 * of_field.product(of_field))
 
-    def strengths(self, fields: Mapping[str, Field]) -> dict[str, float]:
-        """Return the strengths of the fields that the residuals need."""
-        listed = list(fields.values())
+    def power(self, fields: Mapping[str, Field]) -> tuple[np.ndarray, dict[str, float]]:
+        """Return the power of the fields that the residuals need in the unknowns, [n, n], and their strengths."""
+        listed, names = list(fields.values()), list(fields)
         of_columns = [of_field.times(self._columns) for of_field in listed]
         inner = [self._columns.T @ values for values in of_columns]
         surplus = np.array([self._surplus(*pair) for pair in zip(listed, of_columns, strict=True)])
@@ -141,10 +172,11 @@ class _Residuals:
             for b in range(a + 1):
                 removed = float((inner[a] * inner[b]).sum()) - 2.0 * float(np.vdot(of_columns[a], of_columns[b]))
                 products[a, b] = products[b, a] = listed[a].product(listed[b]) + removed
-        freedom = self._pulls.size - float(np.trace(self._gram))
+        freedom = self._pulls.size - float(np.trace(self._columns.T @ self._columns))
         level = max(float(self._pulls @ self._pulls) / max(freedom, 1.0), 1.0)
-        names = list(fields)
-        return {names[k]: s for k, s in _needed_strengths(products, surplus, level).items() if s > 0.0}
+        strengths = {k: s for k, s in _needed_strengths(products, surplus, level).items() if s > 0.0}
+        power = sum((s * inner[k] for k, s in strengths.items()), start=np.zeros_like(inner[0]))
+        return power, {names[k]: s for k, s in strengths.items()}
 
 
 class WhiteField:
@@ -219,15 +251,16 @@ class StationaryField:
         return float((self._correlation * other._correlation * overlap).sum())
 
 
-def _fields(linearized: Linearized, resolution: float) -> dict[str, Field]:
+def _fields(linearized: Linearized, squares: _Squares, resolution: float) -> dict[str, Field]:
     """Return the fields of every donut: white and correlated noise, brightness, rims."""
-    used, noise = linearized.used, np.sqrt(linearized.variance)
-    brightness = np.maximum(linearized.brightness, 0.0)
+    used, noise = squares.used, np.sqrt(squares.mean(linearized.variance))
+    brightness = np.maximum(squares.mean(linearized.brightness), 0.0)
     slope = np.hypot(*np.gradient(brightness))
+    length = _LIGHT_LENGTH * resolution / squares.side
     fields: dict[str, Field] = {"white": WhiteField(int(used.sum()))}
     fields |= {f"noise_{x:g}": StationaryField(used, np.ones(used.shape), x) for x in _NOISE_LENGTHS}
-    for name, amplitude in (("brightness", brightness / noise), ("rims", slope / noise)):
-        fields[name] = StationaryField(used, amplitude, _LIGHT_LENGTH * resolution)
+    fields |= {"brightness": StationaryField(used, brightness / noise, length)}
+    fields |= {"rims": StationaryField(used, slope / noise, length)}
     return fields
 
 

@@ -83,7 +83,7 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
     """Return the errors of a star that was fitted by itself."""
     solution, terms = star.solution, instrument.terms
     n_star, n = len(solution.stars[0]), len(terms.requested)
-    asked = slice(n_star, n_star + n)
+    wavefront = slice(n_star, n_star + n)
     photons, air = solution.covariance, terms.air
     residuals = np.zeros_like(photons)
     point = linearized(star.stamp, solution.stars[0], solution.waves[0])
@@ -93,10 +93,10 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
         residuals = power.covariance
         strength = power.strengths.get(_AIR, 0.0)
         if strength > 0.0:
-            taken, with_air = (strength * values for values in beside.air(photons))
-            residuals, air = residuals - taken, air + with_air[asked, asked]
+            speckles, turbulence = (strength * values for values in beside.air(photons))
+            residuals, air = residuals - speckles, air + turbulence[wavefront, wavefront]
     zernikes = solution.shared[:n]
-    parts = ErrorParts.of(photons[asked, asked], residuals[asked, asked], air, model_floor(zernikes))
+    parts = ErrorParts.of(photons[wavefront, wavefront], residuals[wavefront, wavefront], air, model_floor(zernikes))
     return StarErrors(solution.star_covariance(0) + residuals[:n_star, :n_star], parts)
 
 
@@ -167,15 +167,24 @@ class _TermsBeside:
 
     def __init__(self, instrument: Instrument, star: StarSolution, point: Linearized) -> None:
         self._instrument, self._star, self._point = instrument, star, point
-        terms = instrument.terms
-        self._beyond = np.setdiff1d(np.arange(4, _AIR_TERMS + 1), terms.every)
-        last = max(_AIR_TERMS, int(terms.every.max()))
-        shape = _UNIT**2 * _air_of(instrument, last)
-        low, high = terms.requested - 4, np.concatenate([terms.further, self._beyond]) - 4
-        self._low = shape[np.ix_(low, low)]
-        self._root = np.linalg.cholesky(shape[np.ix_(high, high)] + np.diag(np.full(len(high), _LEAST * _UNIT**2)))
-        #: Covariance of the roots' combinations with the terms asked for, [m, n].
-        self._cross = solve_triangular(self._root, shape[np.ix_(high, low)], lower=True)
+        self._beyond = np.setdiff1d(np.arange(4, _AIR_TERMS + 1), instrument.terms.every)
+
+    @cached_property
+    def _shape(self) -> np.ndarray:
+        """Covariance of Z4 to the last term by air of unit size [m^2]."""
+        last = max(_AIR_TERMS, int(self._instrument.terms.every.max()))
+        return _UNIT**2 * _air_of(self._instrument, last)
+
+    @cached_property
+    def _high(self) -> np.ndarray:
+        """Terms beside those asked for, by their place in the covariance."""
+        return np.concatenate([self._instrument.terms.further, self._beyond]) - 4
+
+    @cached_property
+    def _root(self) -> np.ndarray:
+        """Root of the covariance of the terms beside those asked for [m], [m, m]."""
+        least = np.diag(np.full(len(self._high), _LEAST * _UNIT**2))
+        return np.linalg.cholesky(self._shape[np.ix_(self._high, self._high)] + least)
 
     @cached_property
     def _columns(self) -> np.ndarray:
@@ -199,18 +208,19 @@ class _TermsBeside:
 
     def fields(self) -> Mapping[str, np.ndarray]:
         """Return the columns of the fields by name, [n_pixel, m]."""
-        return {_AIR: self._columns @ self._root.astype(np.float32)}
+        return {_AIR: self._columns @ self._root.astype(np.float32)} if len(self._high) else {}
 
     def air(self, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the covariance of the unknowns by air of unit size: by its further terms, and with its own.
 
         Its own terms are those asked for, which no donut tells from the telescope's.
         """
-        n_star = len(self._star.solution.stars[0])
+        n_star, low = len(self._star.solution.stars[0]), self._instrument.terms.requested - 4
         scaled = self._point.columns.T @ (self._columns @ self._root.astype(np.float32))
         moved = covariance @ (self._point.scales[:, None] * scaled)
-        taken = moved @ moved.T
-        asked = slice(n_star, n_star + len(self._low))
-        whole, together = taken.copy(), moved[asked] @ self._cross
-        whole[asked, asked] += self._low + together + together.T
-        return taken, whole
+        speckles = moved @ moved.T
+        turbulence, wavefront = speckles.copy(), slice(n_star, n_star + len(low))
+        # What the air's further terms move goes with its low ones, which have a covariance with them.
+        together = moved[wavefront] @ solve_triangular(self._root, self._shape[np.ix_(self._high, low)], lower=True)
+        turbulence[wavefront, wavefront] += self._shape[np.ix_(low, low)] + together + together.T
+        return speckles, turbulence

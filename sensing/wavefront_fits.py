@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -179,7 +180,7 @@ class SingleDonuts(WavefrontFit):
             usable.fields / instrument.telescope.field_radius,
             zernikes,
             [star_error.parts for star_error in errors],
-            air_of_terms(instrument),
+            partial(air_of_terms, instrument),
             measured_air=instrument.model.air.atmosphere is None,
         )
         return FittedStars(
