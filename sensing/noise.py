@@ -24,12 +24,18 @@ _GROUPS = 12
 _FEWEST = 30
 #: Rms of the Gaussian that smooths an image to its local brightness [pixels].
 _SMOOTHING = 2.0
+#: The same of what is no noise beside a star [pixels].
+_SMOOTH = 6.0
 #: Deviations beyond which differences are no noise.
 _OUTLYING = 4.0
-#: Variance of a normal distribution cut at that many deviations.
-_CUT = 0.9989
+#: Fraction of the differences that are no outliers, whatever their distribution.
+_COMMON = 0.98
 #: Ratio of the variance of pixels beside the star to that by differences, from which on noise is correlated.
 _CORRELATED = 1.2
+#: Variance over the largest one below which a group weighs no more: single electrons have no normal distribution.
+_FAINTEST = 1e-2
+#: Level over its own noise from which on it is that of a sky, of more than ten electrons.
+_SKY_LEFT_IN = 3.0
 #: Faintest fraction of the pixels: they lie beside the star.
 _BESIDE = 0.25
 
@@ -83,20 +89,21 @@ def measured_noise(
     growth = _correlation(residual, used, brightness, float(variance[0])) if correlated else 1.0
     # Weights by the variance of a smooth line, since that of a group has an error itself.
     for _ in range(3):
-        weight = 1.0 / np.maximum(sky + slope * np.maximum(level, 0.0), 1e-6 * max(variance.max(), 1e-300)) ** 2
+        weight = 1.0 / np.maximum(sky + slope * np.maximum(level, 0.0), _FAINTEST * max(variance.max(), 1e-300)) ** 2
         sky, slope = _line(np.maximum(level, 0.0), variance, weight)
     # Light of a sky that is left in has noise too, and no more than all that of the sky.
-    if sky_level > 0.0:
-        slope = min(slope, float(variance[faint].mean()) / sky_level)
+    of_sky = float(variance[faint].mean())
+    if sky_level > _SKY_LEFT_IN * np.sqrt(of_sky):
+        slope = min(slope, of_sky / sky_level)
         sky = max(float((variance - slope * level)[faint].mean()), 0.0)
     slope = float(np.clip(growth * slope, *_PHOTON_LIMITS))
     return PixelNoise(growth * sky, slope)
 
 
-def smoothed(image: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Return an image that is smoothed over its used pixels."""
-    weight = gaussian_filter(used.astype(np.float64), _SMOOTHING)
-    return np.asarray(gaussian_filter(np.where(used, image, 0.0), _SMOOTHING) / np.maximum(weight, 1e-12))
+def smoothed(image: np.ndarray, used: np.ndarray, rms: float = _SMOOTHING) -> np.ndarray:
+    """Return an image that is smoothed over its used pixels by a Gaussian of that rms [pixels]."""
+    weight = gaussian_filter(used.astype(np.float64), rms)
+    return np.asarray(gaussian_filter(np.where(used, image, 0.0), rms) / np.maximum(weight, 1e-12))
 
 
 def faint_level(smooth: np.ndarray, used: np.ndarray) -> float:
@@ -127,18 +134,17 @@ def _means(image: np.ndarray) -> np.ndarray:
 
 
 def _variance(values: np.ndarray) -> float:
-    """Return the variance of differences without those far from zero."""
-    spread = RMS_PER_MAD * float(np.median(np.abs(values)))
-    if spread == 0.0:
-        # Hardly any light: most differences are of nothing.
-        return float(np.mean(np.minimum(np.abs(values), np.quantile(np.abs(values), 0.99)) ** 2))
-    inside = values[np.abs(values) < _OUTLYING * spread]
-    return float(np.mean(inside**2)) / _CUT
+    """Return the variance of differences; those far from zero count as if they were less far."""
+    sizes = np.abs(values)
+    # Where there is hardly any light most differences are of nothing, and their median is zero.
+    most = max(_OUTLYING * RMS_PER_MAD * float(np.median(sizes)), float(np.quantile(sizes, _COMMON)))
+    return float(np.mean(np.minimum(sizes, most) ** 2))
 
 
 def _correlation(residual: np.ndarray, used: np.ndarray, brightness: np.ndarray, by_differences: float) -> float:
     """Return the variance of pixels beside the star over that by differences: 1 where it is much the same."""
-    pixels = residual[used]
+    # Wings and gradients that a fit leaves are smooth.
+    pixels = (residual - smoothed(residual, used, _SMOOTH))[used]
     beside = pixels[brightness[used] <= np.quantile(brightness[used], _BESIDE)]
     variance = (RMS_PER_MAD * float(np.median(np.abs(beside - np.median(beside))))) ** 2
     ratio = variance / by_differences if by_differences > 0.0 else 1.0

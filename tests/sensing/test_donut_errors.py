@@ -42,6 +42,14 @@ def test_noise_is_a_line_of_the_brightness(gain, sky_level):
     assert noise.sky == pytest.approx(300.0 * gain, rel=0.12)
 
 
+def test_noise_of_light_without_a_sky():
+    star = np.maximum(0.1 * hill() - 10.0, 0.0)
+    counts = np.random.default_rng(4).poisson(star).astype(float)
+    noise = measured_noise(counts - star, star, np.ones(star.shape, bool), 0.0, correlated=True)
+    assert noise.photon == pytest.approx(1.0, rel=0.12)
+    assert noise.sky < 0.5
+
+
 def test_noise_that_is_correlated_is_as_large_as_its_pixels_scatter():
     white = np.random.default_rng(2).normal(size=(80, 80))
     noise = gaussian_filter(white, 0.8, mode="wrap")
