@@ -142,8 +142,8 @@ class DonutInputs:
         Field angles in the telescope frame [rad].
     defocus : ndarray, shape [n]
         Shifts of the body that moves [m].
-    variances : list of float
-        Variance of sky and readout [electron^2].
+    variances : list of float or None
+        Variance of sky and readout [electron^2] of variance planes; None where there is none.
     axes : list of ndarray
         Axes of the stamps of the files in the frame of the camera.
     """
@@ -152,7 +152,7 @@ class DonutInputs:
     masks: list[np.ndarray]
     fields: np.ndarray
     defocus: np.ndarray
-    variances: list[float]
+    variances: list[float | None]
     axes: list[np.ndarray]
 
 
@@ -163,7 +163,7 @@ def donut_inputs(
     import numpy as np
 
     from ..sensing.frames import along_camera, stamp_matrix
-    from ..sensing.stamp_files import border_variance, sky_of_variance
+    from ..sensing.stamp_files import sky_of_variance
     from ..sensing.stamp_places import on_camera, stamp_places
 
     inputs = DonutInputs([], [], np.empty((0, 2)), np.empty(0), [], [])
@@ -179,10 +179,8 @@ def donut_inputs(
             inputs.images.append(along_camera(gain * image, matrix))
             inputs.masks.append(along_camera(mask, matrix))
             inputs.axes.append(matrix)
-            measured = None if stamps.variances is None else sky_of_variance(stamps.variances[k], mask)
-            inputs.variances.append(
-                border_variance(gain * np.where(mask, np.nan, image)) if measured is None else gain**2 * measured
-            )
+            plane = None if stamps.variances is None else sky_of_variance(stamps.variances[k], mask)
+            inputs.variances.append(None if plane is None else gain**2 * plane)
     return DonutInputs(
         inputs.images, inputs.masks, np.concatenate(fields), np.concatenate(defocus), inputs.variances, inputs.axes
     )

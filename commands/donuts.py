@@ -121,7 +121,7 @@ def donuts_command(
     sky_variance: Annotated[
         float | None,
         Option(
-            help="Variance of sky and readout [electron^2]; of the variance plane, or of the edges of the stamps.",
+            help="Variance of sky and readout [electron^2]; of the variance plane, or measured, and the gain.",
             rich_help_panel=_FIT,
         ),
     ] = None,
@@ -319,7 +319,10 @@ def donuts_command(
     light = wavelength_list(believed, wavelength_nm, None)
     if wavelength_nm is None and header.wavelength is not None:
         light = [header.wavelength]
-    sky = inputs.variances if sky_variance is None else [sky_variance] * len(inputs.images)
+    planes = [variance for variance in inputs.variances if variance is not None]
+    sky = planes if len(planes) == len(inputs.images) else None
+    if sky_variance is not None:
+        sky = [sky_variance] * len(inputs.images)
     if not quiet and header.text:
         print_line(f"{files[0]}: {header.text} of its header; {believed.name}", error=True)
     orientation = None
@@ -349,7 +352,7 @@ def donuts_command(
                 [inputs.images[i] for i in usable],
                 inputs.fields[usable],
                 light,
-                sky_variance=[sky[i] for i in usable],
+                sky_variance=None if sky is None else [sky[i] for i in usable],
                 model=replace(model, detector=replace(model.detector, defocus=shifts)),
                 mask=[inputs.masks[i] for i in usable],
                 projection=projection,

@@ -33,13 +33,15 @@ from .image_model import (
     Y,
 )
 from .inputs import ObservedStar, ObservedStars
-from .light import Instrument
+from .light import Instrument, StarLight
 from .likelihood import pulls
 from .model import DonutModel
+from .noise import faint_level, measured_noise, smoothed
 from .result import DonutFit
 from .rim_amplitude import VOTERS, RimAmplitude, rim_amplitude, waves_fit_better
 from .rim_table import moved_rims, rim_table
 from .stamps import Pixels
+from .star_errors import ErrorParts
 from .wavefront_fits import NOLL, FittedStars, SingleDonuts, UsableStars, WavefrontFit
 
 #: Pixels, as a fraction of the stamp, from which on those of one greatest value are saturated, and saturated ones the
@@ -53,6 +55,10 @@ _FAINT = 100.0
 _POOR = 1.2
 #: Standard deviations of the noise's own chi-square that a poor fit has beyond that.
 _BY_CHANCE = 5.0
+#: Ratio of the noise that a fit leaves to that which it assumed, up to which its search holds.
+_NOISE_AGREES = 2.0
+#: Most fits of a star whose noise is measured.
+_NOISE_FITS = 2
 
 
 @removed_arguments(
@@ -80,7 +86,7 @@ def fit_donuts(
     *,
     pixel_size: ArrayLike | None = None,
     moved: str | None = None,
-    sky_variance: ArrayLike = 0.0,
+    sky_variance: ArrayLike | None = None,
     noll: Iterable[int] | None = None,
     degrees_of_freedom: DegreesOfFreedom | None = None,
     model: DonutModel | None = None,
@@ -105,8 +111,8 @@ def fit_donuts(
         ``tel.perturbed("Detector", shift=(0, 0, 1.5e-3))`` is behind focus; ``"Camera"`` in its place where the camera
         moves, as in full-array mode.
     images : array_like, shape [n, ny, nx], or sequence of n arrays
-        Stamps [electrons], ``[iy, ix]`` along +y and +x of the detector, each with its donut nearest to the centre. A
-        plane of sky may be left in; pixels that are not finite are left out.
+        Stamps, ``[iy, ix]`` along +y and +x of the detector, each with its donut nearest to the centre: electrons where
+        `sky_variance` is given, else of any unit. A plane of sky may be left in; pixels not finite are left out.
     fields : array_like or Quantity, shape [n, 2]
         Field angles [rad], of the light's own travel.
     wavelength : array_like, Quantity or Light, optional
@@ -117,8 +123,9 @@ def fit_donuts(
     moved : str, optional
         Surface or group that the defocus of `model` moves, in place of that of the model, which is the detector by
         default; see :class:`~pachon.DonutDetector`.
-    sky_variance : float or array, shapes [n] or [n, ny, nx]
-        Variance of sky and readout [electron^2 a pixel].
+    sky_variance : float or array, shapes [n] or [n, ny, nx], optional
+        Variance of sky and readout [electron^2 a pixel]; light then has the noise of electrons. By default both are
+        measured from each image and what its fit leaves, whatever the unit of the images; sky may be left in.
     noll : iterable of int, optional
         Noll indices of the wavefront, from 4; those up to 22 by default. Short for the ``noll`` of a `fit`.
     degrees_of_freedom : DegreesOfFreedom, optional
@@ -180,7 +187,8 @@ def fit_donuts(
         fitted = fit.solved(usable, pool)
     flags = np.array([int(star.flags) for star in stars], dtype=np.int64)
     rims = {i: moved_rims(instrument, solution) for i, solution in solutions.items()}
-    result = _result(instrument, observed, flags, np.array(list(solutions), dtype=np.int64), fitted)
+    scales = np.array([(star.unit, star.level) for star in stars])
+    result = _result(instrument, observed, flags, scales, np.array(list(solutions), dtype=np.int64), fitted)
     return replace(result, rims=rim_table(rims))
 
 
@@ -226,9 +234,8 @@ def _fit_alone(instrument: Instrument, star: ObservedStar, defocus: float, stren
     masked = star.masked | not_finite
     saturated = _saturated(np.where(masked, 0.0, star.image), masked, instrument.model.detector.saturation)
     masked = masked | grown(saturated, ~masked)
-    pixels = Pixels(np.where(masked, 0.0, star.image), star.variance, ~masked)
     wavefront = not joint or light.diameter > SMALLEST_DONUT * instrument.pixel
-    fitted = fit_star(instrument, light, pixels, strength, wavefront=wavefront)
+    fitted = _fit_with_noise(instrument, light, star, ~masked, strength, wavefront)
     if fitted.flags.usable:
         return replace(fitted, flags=fitted.flags | DonutFlag.CLIPPED) if (saturated | not_finite).any() else fitted
     if saturated.sum() > max(_SEVERAL * star.image.size, 1.0):
@@ -236,6 +243,27 @@ def _fit_alone(instrument: Instrument, star: ObservedStar, defocus: float, stren
     if not_finite.any() and (DonutFlag.MOSTLY_LOST in fitted.flags or not_finite.mean() > _MOST):
         return StarFit(DonutFlag.NOT_FINITE)
     return fitted
+
+
+def _fit_with_noise(
+    instrument: Instrument, light: StarLight, star: ObservedStar, used: np.ndarray, strength: float, wavefront: bool
+) -> StarFit:
+    """Fit the used pixels of one star with its known noise, or with noise and sky level that are measured."""
+    image = np.where(used, star.image, 0.0)
+    if star.known_noise:
+        return fit_star(instrument, light, Pixels(image, star.variance, used), strength, wavefront=wavefront)
+    smooth = smoothed(image, used)
+    level = faint_level(smooth, used)
+    image = np.where(used, star.image - level, 0.0)
+    noise = measured_noise(image, smooth - level, used, level)
+    for _ in range(_NOISE_FITS):
+        unit = noise.photon
+        pixels = Pixels(image / unit, np.full(image.shape, noise.sky / unit**2), used)
+        fitted = fit_star(instrument, light, pixels, strength, wavefront=wavefront, sky_level=level / unit)
+        if 1.0 / _NOISE_AGREES < fitted.unit < _NOISE_AGREES:
+            break
+        noise = replace(noise, sky=noise.sky * fitted.unit, photon=unit * fitted.unit)
+    return replace(fitted, unit=unit * fitted.unit, level=level)
 
 
 def _saturated(image: np.ndarray, masked: np.ndarray, level: float | None) -> np.ndarray:
@@ -253,19 +281,34 @@ def _saturated(image: np.ndarray, masked: np.ndarray, level: float | None) -> np
 
 
 def _result(
-    instrument: Instrument, observed: ObservedStars, flags: np.ndarray, usable: np.ndarray, fitted: FittedStars
+    instrument: Instrument,
+    observed: ObservedStars,
+    flags: np.ndarray,
+    scales: np.ndarray,
+    usable: np.ndarray,
+    fitted: FittedStars,
 ) -> DonutFit:
     """Return the result of a fit: rows of the usable stars, and NaN for the others."""
+    units, levels = scales.T
     count, n_noll = len(observed), len(instrument.terms.requested)
     zernikes, covariance = np.full((count, n_noll), np.nan), np.full((count, n_noll, n_noll), np.nan)
     values, errors = np.full((2, count, len(NUISANCES) + MOST_NEIGHBOURS * len(NEIGHBOUR)), np.nan)
+    parts = {name: np.full_like(covariance, np.nan) for name in ErrorParts.__dataclass_fields__}
+    noise = np.full(count, np.nan)
     chi2, n_pixels = np.full(count, np.nan), np.zeros(count, dtype=np.int64)
     model, used = np.full(observed.images.shape, np.nan), np.zeros(observed.images.shape, dtype=bool)
     for i, star in zip(usable, fitted.stars, strict=True):
         n, (ny, nx) = len(star.unknowns), star.model.shape
         values[i, :n], errors[i, :n] = star.unknowns, np.sqrt(np.diag(star.covariance))
-        zernikes[i], covariance[i] = star.zernikes, star.zernike_covariance
-        model[i, :ny, :nx], used[i, :ny, :nx] = star.model, star.pixels.used
+        # Fluxes of neighbours are relative ones.
+        values[i, [FLUX, BACKGROUND, SLOPE_X, SLOPE_Y]] *= units[i]
+        errors[i, [FLUX, BACKGROUND, SLOPE_X, SLOPE_Y]] *= units[i]
+        values[i, BACKGROUND] += levels[i]
+        zernikes[i], covariance[i] = star.zernikes, star.errors.total
+        for cause, covariances in parts.items():
+            covariances[i] = getattr(star.errors, cause)
+        model[i, :ny, :nx], used[i, :ny, :nx] = units[i] * star.model + levels[i], star.pixels.used
+        noise[i] = units[i] ** 2 * np.median(star.pixels.variance)
         chi2[i] = (pulls(star.pixels, star.model)[star.pixels.used] ** 2).sum()
         n_pixels[i] = star.pixels.used.sum()
     poor = chi2 > _POOR * n_pixels + _BY_CHANCE * np.sqrt(2.0 * n_pixels)
@@ -273,6 +316,7 @@ def _result(
     return DonutFit(
         zernikes=zernikes,
         covariance=covariance,
+        error_parts=ErrorParts(**parts),
         noll=instrument.terms.requested,
         flux=values[:, FLUX],
         flux_error=errors[:, FLUX],
@@ -284,6 +328,8 @@ def _result(
         fwhm_error=width * errors[:, STRENGTH] / np.where(strength > 0.0, strength, 1.0),
         chi2=chi2,
         n_pixels=n_pixels,
+        sky_variance=noise,
+        photon_variance=np.where(np.isfinite(noise), units, np.nan),
         flags=flags | poor * int(DonutFlag.POOR_FIT),
         companions=values[:, RATIO:].reshape(count, MOST_NEIGHBOURS, len(NEIGHBOUR)),
         images=observed.images,

@@ -17,6 +17,7 @@ from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, SLOPE_X, SLOPE_Y, S
 from .light import Instrument, Sampling, StarLight
 from .likelihood import Stamp, model_image, pulls
 from .neighbours import NeighbourSearch, explains_more
+from .noise import measured_noise
 from .rim_search import RimFit, with_moved_rims
 from .solve import COARSE, FINE, STEPS, Group, Solution, solve
 from .stamps import Match, Pixels, match_template, measured_variance, plane_basis
@@ -92,10 +93,22 @@ class StarSolution:
 
 @dataclass(frozen=True)
 class StarFit:
-    """Outcome of the fit of one star by itself: flags, and its best model unless it failed."""
+    """Outcome of the fit of one star by itself.
+
+    Attributes
+    ----------
+    flags : DonutFlag
+        What is to be said of it.
+    best : StarSolution, optional
+        Its best model, unless it failed.
+    unit, level : float
+        The image is that of the solution, whose light has the noise of electrons, times a unit, above a level.
+    """
 
     flags: DonutFlag
     best: StarSolution | None = None
+    unit: float = 1.0
+    level: float = 0.0
 
     @property
     def usable(self) -> StarSolution | None:
@@ -103,7 +116,15 @@ class StarFit:
         return self.best if self.flags.usable else None
 
 
-def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength: float, *, wavefront: bool) -> StarFit:
+def fit_star(
+    instrument: Instrument,
+    light: StarLight,
+    pixels: Pixels,
+    strength: float,
+    *,
+    wavefront: bool,
+    sky_level: float | None = None,
+) -> StarFit:
     """Fit one star.
 
     Parameters
@@ -114,6 +135,9 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
         Strength of the turbulence [1/m]: a start, or the value where the seeing is known.
     wavefront : bool
         Whether the wavefront is fitted; where not, it is zero.
+    sky_level : float, optional
+        Light of the sky that was taken off, where noise is not known: that of the result is what the fit leaves, in a
+        unit in which light has the noise of electrons.
     """
     across = light.diameter / instrument.pixel
     donut = across > SMALLEST_DONUT
@@ -158,6 +182,8 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
         flags |= DonutFlag.CUT_OFF
     if not _is_between(_size(finest.stamp, finest.solution), _SIZES):
         flags |= DonutFlag.OTHER_SIZE
+    if sky_level is not None and flags.usable:
+        return StarFit(flags, *fitter.with_measured_noise(finest, sky_level))
     return StarFit(flags, finest)
 
 
@@ -333,6 +359,30 @@ class _StarFitter:
             best = self.solve(stamp, best.stars[0], best.shared)
             model = model_image(full, best.stars[0], best.waves[0])
         return StarSolution(self._light, stamp, full, best, model)
+
+    def with_measured_noise(self, star: StarSolution, sky_level: float) -> tuple[StarSolution, float]:
+        """Return a solution in the unit in which what it leaves has the noise of electrons, and that unit."""
+        if star.light is not self._light:
+            return self.with_light(star.light).with_measured_noise(star, sky_level)
+        unknowns, wave = star.solution.stars[0], star.solution.waves[0]
+        level = model_image(star.full, np.where(np.arange(len(unknowns)) == FLUX, 0.0, unknowns), wave)
+        noise = measured_noise(
+            star.full.image - star.model, star.model - level, star.full.used, sky_level, correlated=True
+        )
+        unit, sky = noise.photon, noise.sky / noise.photon**2
+
+        def rescaled(stamp: Stamp) -> Stamp:
+            return replace(
+                stamp,
+                image=stamp.image / unit,
+                variance=np.full(stamp.image.shape, sky * stamp.grid.scale**2),
+            )
+
+        unknowns = unknowns.copy()
+        unknowns[[FLUX, BACKGROUND, SLOPE_X, SLOPE_Y]] /= unit
+        stamp, full = rescaled(star.stamp), rescaled(star.full)
+        best = self.solve(stamp, unknowns, star.solution.shared)
+        return StarSolution(self._light, stamp, full, best, model_image(full, best.stars[0], best.waves[0])), unit
 
     def sampled(self, solution: Solution, blended: bool, last: _Fine | None) -> _Fine:
         """Return a stamp fine enough for the seeing of a solution: the last one if that is, nearly."""

@@ -11,7 +11,7 @@ class DonutFlag(IntFlag):
     Seven flags are remarks: the results hold. ``BLENDED``: neighbours were fitted too. ``CLIPPED``: pixels far off the
     model, not finite or saturated were left out, cosmic rays for example. ``CUT_OFF``: a twentieth of the light or more
     falls beside the stamp or on regions of it that are not used; errors are those of what remains. ``POOR_FIT``:
-    chi-square is far above the number of pixels, so that errors are larger than claimed. ``OTHER_SIZE``: the donut is
+    chi-square is far above the number of pixels, and errors have what the residuals say. ``OTHER_SIZE``: the donut is
     larger or smaller than that of the telescope by more than 8 %, as with another defocus or pixel size. ``RIM_MOVED``:
     a rim or a spider stands elsewhere than the prescription has it, and was fitted too. ``ORIENTATION``: stamps of the
     exposure fit better as mirror images, or turned by quarters (set by the command).

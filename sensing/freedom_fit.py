@@ -25,6 +25,7 @@ from .light import Instrument
 from .pupil_cells import PupilCells
 from .solve import Group, solve
 from .stamps import Pixels
+from .star_errors import by_residuals
 from .vignetting import cells_with_rims, rim_shifts
 from .wavefront_fits import NOLL, FittedStars, UsableStars, WavefrontFit, joint_results
 
@@ -97,6 +98,7 @@ class TelescopeFreedoms(WavefrontFit):
             change, shared, unknowns = joint.shared - shared, joint.shared, list(joint.stars)
             if float(change @ np.linalg.solve(joint.shared_covariance, change)) < _SETTLED * len(change):
                 break
+        lacking = by_residuals(instrument, stars, group, joint)
         after = freedoms.apply(telescope, joint.shared)
         believed, estimated = (
             wavefront_zernikes(t, fields, wavelength, jmax=last, projection=projection).coefficients[:, noll - 1]
@@ -105,8 +107,10 @@ class TelescopeFreedoms(WavefrontFit):
         many = max(last, _MANY_TERMS)
         response = sensitivity(after, freedoms, fields, wavelength, n_zernike=many, projection=projection)
         return FittedStars(
-            joint_results(stars, joint, estimated - believed, response.matrix[:, noll - 1]),
-            degrees_of_freedom=FreedomEstimate(freedoms, joint.shared, joint.shared_covariance, spreads),
+            joint_results(stars, joint, lacking, estimated - believed, response.matrix[:, noll - 1]),
+            degrees_of_freedom=FreedomEstimate(
+                freedoms, joint.shared, joint.shared_covariance + lacking.shared_covariance, spreads
+            ),
         )
 
     def _rim_shifts(self, usable: UsableStars, spreads: np.ndarray) -> list[np.ndarray]:

@@ -23,13 +23,17 @@ SMALLEST_STAMP = 8
 
 @dataclass(frozen=True)
 class ObservedStar:
-    """Stamp of one star: image and variance of the sky, masked pixels, field angles [2], direction of the light [3]."""
+    """Stamp of one star: image and variance of the sky, masked pixels, field angles [2], direction of the light [3].
+
+    Without a known noise the variance is zero, and to be measured.
+    """
 
     image: np.ndarray
     variance: np.ndarray
     masked: np.ndarray
     field: np.ndarray
     direction: np.ndarray
+    known_noise: bool
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,8 @@ class ObservedStars:
         Unit vectors along which the light travels.
     projection : str
         Meaning of the field angles.
+    known_noise : bool
+        Whether the variance of sky and readout is given, and images are electrons.
     """
 
     images: np.ndarray
@@ -61,6 +67,7 @@ class ObservedStars:
     fields: np.ndarray
     directions: np.ndarray
     projection: str
+    known_noise: bool
 
     @classmethod
     def of(
@@ -84,8 +91,8 @@ class ObservedStars:
             if mask_shapes != shapes:
                 expected = f"those of the images, {stack.shape}"
                 raise DomainError(f"mask of shape {masked.shape}: expected {expected}", key="mask")
-        variance = sky_variances(sky_variance, stack.shape)
-        return cls(stack, variance, masked, shapes, angles, directions, projection)
+        variance = sky_variances(0.0 if sky_variance is None else sky_variance, stack.shape)
+        return cls(stack, variance, masked, shapes, angles, directions, projection, sky_variance is not None)
 
     def __len__(self) -> int:
         return len(self.images)
@@ -94,7 +101,7 @@ class ObservedStars:
         """Return one star, without what stands beside its stamp."""
         ny, nx = self.shapes[index]
         image, variance, masked = (v[index, :ny, :nx] for v in (self.images, self.variance, self.masked))
-        return ObservedStar(image, variance, masked, self.fields[index], self.directions[index])
+        return ObservedStar(image, variance, masked, self.fields[index], self.directions[index], self.known_noise)
 
 
 def padded(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .donut_rays import LightRays
-from .image_model import ImageGrid, LandedLight
+from .image_model import FLUX, ImageGrid, LandedLight
 
 #: Smallest variance of a pixel [electron^2], where model and sky are next to nothing.
 _LEAST_VARIANCE = 1.0
@@ -73,24 +73,67 @@ class NormalEquations:
     chi2: float
 
 
-def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> NormalEquations:
-    """Return the normal equations of one star; unknowns are those of the star, then of its wavefront."""
+@dataclass(frozen=True)
+class Linearized:
+    """Residuals of a stamp and derivatives of its model at one point, over the standard deviation of the noise.
+
+    Attributes
+    ----------
+    model, variance : ndarray, shape [ny, nx]
+        Model of the image [electron] and variance of its noise [electron^2].
+    brightness : ndarray, shape [ny, nx]
+        Light of the star and its neighbours in the model [electron].
+    used : ndarray of bool, shape [ny, nx]
+        Pixels that count.
+    residual : ndarray, shape [n_pixel]
+        Residuals of the pixels in use [electron].
+    pulls : ndarray, shape [n_pixel]
+        The same over their standard deviations.
+    columns : ndarray of float32, shape [n_pixel, n]
+        Derivatives with respect to the unknowns of the star and its wavefront, over their scales.
+    scales : ndarray, shape [n]
+        Scales of the columns.
+    """
+
+    model: np.ndarray
+    variance: np.ndarray
+    brightness: np.ndarray
+    used: np.ndarray
+    residual: np.ndarray
+    pulls: np.ndarray
+    columns: np.ndarray
+    scales: np.ndarray
+
+
+def linearized(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> Linearized | None:
+    """Return the linear model of a stamp about unknowns; None where light has no direction or misses the telescope."""
     landing = stamp.rays.landing(wave)
     if not np.isfinite(landing).all():
-        n = len(unknowns) + len(wave)
-        return NormalEquations(np.zeros((n, n)), np.zeros(n), np.inf, np.inf)
+        return None
     response = stamp.rays.response(wave)
     light = _landed(stamp, wave, landing, response)
     model, columns, scales = stamp.grid.derivatives(unknowns, light, response, stamp.rays.rates)
     # A slice where all pixels are used, since that is no copy.
     used = stamp.used if not stamp.used.all() else np.s_[:, :]
-    variance = _variance(stamp, model)[used].ravel()
+    variance = _variance(stamp, model)
     residual = (stamp.image - model)[used].ravel()
-    root = (1.0 / np.sqrt(variance)).astype(np.float32)
+    root = (1.0 / np.sqrt(variance[used].ravel())).astype(np.float32)
     scaled = columns[used].reshape(len(root), -1) * root[:, None]
-    curvature = scaled.T @ scaled * np.outer(scales, scales)
-    gradient = scaled.T @ (residual * root) * scales
-    return NormalEquations(curvature, gradient, _loss(residual, variance), float(residual @ (residual / variance)))
+    brightness = unknowns[FLUX] * columns[..., FLUX].astype(np.float64)
+    return Linearized(model, variance, brightness, stamp.used, residual, residual * root, scaled, scales)
+
+
+def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> NormalEquations:
+    """Return the normal equations of one star; unknowns are those of the star, then of its wavefront."""
+    point = linearized(stamp, unknowns, wave)
+    if point is None:
+        n = len(unknowns) + len(wave)
+        return NormalEquations(np.zeros((n, n)), np.zeros(n), np.inf, np.inf)
+    curvature = point.columns.T @ point.columns * np.outer(point.scales, point.scales)
+    gradient = point.columns.T @ point.pulls * point.scales
+    variance = point.variance[point.used]
+    chi2 = float(point.residual @ (point.residual / variance))
+    return NormalEquations(curvature, gradient, _loss(point.residual, variance), chi2)
 
 
 def model_image(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ from .flags import DonutFlag
 from .frames import DonutFrames
 from .observatory_zernikes import ObservatoryZernikes, observatory_zernikes
 from .rim_table import rim_table
+from .star_errors import ErrorParts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,6 +50,16 @@ _MEANINGS = {
     "n_pixels": "number of the pixels in that sum",
     "n_companions": "number of neighbours that were fitted too",
     "companion_ratio": "flux of the brightest neighbour over that of the star",
+    **{
+        f"error_{name}": f"root of the summed variances of the Zernikes by {cause}"
+        for name, cause in (
+            ("photons", "photons and terms fitted beside"),
+            ("residuals", "what the model lacks"),
+            ("air", "turbulence"),
+            ("floor", "accuracy of the model and scatter of the donuts"),
+            ("repeats", "what differs between donuts of the exposure, no part of the sum"),
+        )
+    },
 }
 
 
@@ -63,8 +74,11 @@ class DonutFit(Result):
         :func:`~pachon.wavefront_opd` of the true telescope minus those of the telescope given; positive where the
         wavefront leads.
     covariance : ndarray, shape [n, n_noll, n_noll]
-        Covariance of `zernikes` [m^2]: the inverse of Fisher's information, the Cramer-Rao bound; with
-        ``turbulence``, and the covariance of the air's own wavefront.
+        Covariance of `zernikes` [m^2], of photons, what the residuals say that the model lacks, air and the accuracy of
+        the model.
+    error_parts : ErrorParts
+        The same by cause: ``photons``, the Cramer-Rao bound, ``residuals``, ``air``, ``floor``; and ``repeats``, the
+        covariance of a donut about the others of its exposure.
     noll : ndarray of int, shape [n_noll]
         Noll indices.
     flux, flux_error : ndarray, shape [n]
@@ -81,6 +95,9 @@ class DonutFit(Result):
         Sum of squares of the residuals over their variance.
     n_pixels : ndarray of int, shape [n]
         Number of the pixels in that sum.
+    sky_variance, photon_variance : ndarray, shape [n]
+        Variance of a pixel without a star [squared electrons], and of light over its amount [electrons], which is 1 but
+        where noise is measured and images are in other units.
     flags : ndarray of int, shape [n]
         :class:`DonutFlag` bits.
     companions : ndarray, shape [n, 5, 3]
@@ -116,6 +133,7 @@ class DonutFit(Result):
 
     zernikes: np.ndarray
     covariance: np.ndarray
+    error_parts: ErrorParts
     noll: np.ndarray
     flux: np.ndarray
     flux_error: np.ndarray
@@ -127,6 +145,8 @@ class DonutFit(Result):
     fwhm_error: np.ndarray
     chi2: np.ndarray
     n_pixels: np.ndarray
+    sky_variance: np.ndarray
+    photon_variance: np.ndarray
     flags: np.ndarray
     companions: np.ndarray
     images: np.ndarray
@@ -165,8 +185,13 @@ class DonutFit(Result):
 
     @property
     def errors(self) -> np.ndarray:
-        """Standard deviations of the Zernikes [m], shape [n, n_noll]: the Cramer-Rao bound of each."""
+        """Standard deviations of the Zernikes [m], shape [n, n_noll], of all causes."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+    @property
+    def repeat_errors(self) -> np.ndarray:
+        """Standard deviations of the Zernikes about those of other donuts of the exposure [m], shape [n, n_noll]."""
+        return np.sqrt(np.diagonal(self.error_parts.repeats, axis1=1, axis2=2))
 
     @property
     def rms(self) -> np.ndarray:
@@ -210,6 +235,12 @@ class DonutFit(Result):
         """
         return observatory_zernikes(self, convention, frame, frames or DonutFrames(), design, wave)
 
+    def _error_sizes(self) -> dict[str, np.ndarray]:
+        """Return the root of the summed variances of the Zernikes by cause [m], shape [n]."""
+        names = ("photons", "residuals", "air", "floor", "repeats")
+        traces = {name: np.trace(getattr(self.error_parts, name), axis1=1, axis2=2) for name in names}
+        return {name: np.sqrt(np.maximum(trace, 0.0)) for name, trace in traces.items()}
+
     def _label(self) -> str:
         return f"{len(self)} donuts, {int(self.usable.sum())} with results, Zernikes {self.noll[0]} to {self.noll[-1]}"
 
@@ -228,6 +259,8 @@ class DonutFit(Result):
         table["chi2"], table["n_pixels"] = self.chi2, self.n_pixels
         table["n_companions"] = np.isfinite(self.companions[:, :, 0]).sum(axis=1)
         table["companion_ratio"] = self.companions[:, 0, 0]
+        for name, size in self._error_sizes().items():
+            table[f"error_{name}"] = size * 1e9 * u.nm
         for k, j in enumerate(self.noll):
             table[f"Z{j}"], table[f"Z{j}_err"] = self.zernikes[:, k] * 1e9 * u.nm, self.errors[:, k] * 1e9 * u.nm
         for name in table.colnames:
@@ -256,6 +289,7 @@ class DonutFit(Result):
             "reasons": self.reasons,
             "zernike_nm": self.zernikes * 1e9,
             "zernike_error_nm": self.errors * 1e9,
+            "error_parts_nm": {name: 1e9 * size for name, size in self._error_sizes().items()},
             "flux_electrons": self.flux,
             "center_pixels": self.center,
             "background_electrons": self.background,

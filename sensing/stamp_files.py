@@ -21,8 +21,7 @@ from astropy.table import Table
 
 from ..core.errors import ProductError
 from ..core.files import parsing, require_file
-from ..core.statistics import robust_rms
-from .inputs import MOST_ELECTRONS, SMALLEST_STAMP
+from .inputs import SMALLEST_STAMP
 from .stamp_headers import HeaderValues, corner_of, defocus_of, detector_of, header_values, pixel_of, stamp_header
 
 #: Kinds of planes that go with images, by the names of their extensions without numbers.
@@ -298,16 +297,6 @@ def sky_of_variance(variance: np.ndarray, masked: np.ndarray) -> float:
     edge[:2], edge[-2:], edge[:, :2], edge[:, -2:] = True, True, True, True
     usable = edge & ~masked & np.isfinite(variance)
     return float(np.median(variance[usable])) if usable.any() else 0.0
-
-
-def border_variance(image: np.ndarray) -> float:
-    """Return the variance of the pixels along the edge of a stamp, by their median absolute deviation.
-
-    Pixels that are not finite, or that no detector counts, are left out.
-    """
-    edge = np.concatenate([image[:2].ravel(), image[-2:].ravel(), image[2:-2, :2].ravel(), image[2:-2, -2:].ravel()])
-    edge = edge[np.abs(edge) < MOST_ELECTRONS]
-    return float(robust_rms(edge) ** 2) if edge.size else 0.0
 
 
 def _table(path: Path) -> Table:

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -16,6 +17,7 @@ from ..core.errors import ConfigError, DomainError
 from ..models.telescope import Telescope
 from ..models.zernike_polynomials import annular_zernikes
 from ..wavefront.atmosphere.atmosphere import Atmosphere
+from .cross_check import cross_checked
 from .degrees import FreedomEstimate
 from .donut_rays import ZernikeRays
 from .fit_star import StarFit, StarSolution
@@ -23,6 +25,7 @@ from .inputs import noll_indices, small_length
 from .light import Instrument
 from .likelihood import Stamp, model_image
 from .solve import Group, Solution, solve
+from .star_errors import ErrorParts, air_of_terms, by_residuals, model_floor, star_errors
 from .terms import WavefrontTerms
 
 #: Noll indices of the wavefront that are fitted by default: up to the fifth radial degree.
@@ -78,14 +81,14 @@ class UsableStars:
 
 @dataclass(frozen=True)
 class FittedStar:
-    """Result of one star: its pixels, best model [electrons], unknowns, wavefront [m], and their covariances."""
+    """Result of a star: pixels, best model [electrons], unknowns and their covariance, wavefront [m] and its errors."""
 
     pixels: Stamp
     model: np.ndarray
     unknowns: np.ndarray
     covariance: np.ndarray
     zernikes: np.ndarray
-    zernike_covariance: np.ndarray
+    errors: ErrorParts
 
 
 @dataclass(frozen=True)
@@ -142,9 +145,9 @@ class SingleDonuts(WavefrontFit):
         Rms of each term from Z4 to Z22 that `noll` leaves out [m]. These are fitted too, with that prior, those up to
         Z28 with a tenth of it, and not returned: errors of `zernikes` have what is not known of them. 0 is none.
     higher_order : float or Quantity
-        Rms of each further Zernike, of the next radial degree at every azimuthal order of `noll` [m]: 10 nm, say, for
-        what turbulence leaves in 15 s. They are fitted too, with that prior, and not returned. Without them (0, the
-        default) light that they move is taken for low orders, which is worst on an annulus.
+        Rms of each further Zernike, of the next radial degree at every azimuthal order of `noll` [m]: 10 nm, by
+        default, are what turbulence leaves in 15 s. They are fitted too, with that prior, and not returned. Without
+        them (0) light that they move is taken for low orders, which is worst on an annulus.
 
     Raises
     ------
@@ -156,7 +159,7 @@ class SingleDonuts(WavefrontFit):
 
     noll: Iterable[int] = NOLL
     left_out: ArrayLike = 200e-9
-    higher_order: ArrayLike = 0.0
+    higher_order: ArrayLike = 10e-9
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "noll", tuple(noll_indices(self.noll, "noll", 4)))
@@ -170,19 +173,20 @@ class SingleDonuts(WavefrontFit):
 
     def solved(self, usable: UsableStars, pool: Executor) -> FittedStars:
         """Return the results of the stars as each fit has them."""
-        terms = usable.instrument.terms
-        n = len(terms.requested)
+        instrument, n = usable.instrument, len(usable.instrument.terms.requested)
+        errors = [star_errors(instrument, star) for star in usable.stars]
+        zernikes = np.array([star.solution.shared[:n] for star in usable.stars]).reshape(-1, n)
+        parts = cross_checked(
+            usable.fields / instrument.telescope.field_radius,
+            zernikes,
+            [star_error.parts for star_error in errors],
+            partial(air_of_terms, instrument),
+            measured_air=instrument.model.air.atmosphere is None,
+        )
         return FittedStars(
             [
-                FittedStar(
-                    star.full,
-                    star.model,
-                    star.solution.stars[0],
-                    star.solution.star_covariance(0),
-                    star.solution.shared[:n],
-                    star.solution.shared_covariance[:n, :n] + terms.air,
-                )
-                for star in usable.stars
+                FittedStar(star.full, star.model, star.solution.stars[0], star_error.covariance, *of_wavefront)
+                for star, star_error, *of_wavefront in zip(usable.stars, errors, zernikes, parts, strict=True)
             ]
         )
 
@@ -199,7 +203,7 @@ class FieldTerms(WavefrontFit):
     noll : iterable of int
         Noll indices of the wavefront, from 4; terms that are left out are taken to be zero.
     higher_order : float or Quantity
-        As in :class:`SingleDonuts`.
+        As in :class:`SingleDonuts`; 0 by default.
 
     Raises
     ------
@@ -238,15 +242,21 @@ class FieldTerms(WavefrontFit):
         solution = solve(group, usable.unknowns, usable.start(maps, precision), pool=pool)
         n = len(instrument.terms.requested)
         requested = (n_noll * np.arange(n_field)[:, None] + np.arange(n)).ravel()
+        lacking = by_residuals(instrument, stars, group, solution)
+        shared_covariance = solution.shared_covariance + lacking.shared_covariance
         return FittedStars(
-            joint_results(stars, solution, np.array(solution.waves)[:, :n], maps[:, :n]),
+            joint_results(stars, solution, lacking, np.array(solution.waves)[:, :n], maps[:, :n]),
             solution.shared[requested].reshape(-1, n),
-            solution.shared_covariance[np.ix_(requested, requested)],
+            shared_covariance[np.ix_(requested, requested)],
         )
 
 
 def joint_results(
-    stars: Sequence[StarSolution], solution: Solution, zernikes: np.ndarray, zernike_maps: np.ndarray
+    stars: Sequence[StarSolution],
+    solution: Solution,
+    lacking: Solution,
+    zernikes: np.ndarray,
+    zernike_maps: np.ndarray,
 ) -> list[FittedStar]:
     """Return the results of stars that share unknowns.
 
@@ -256,6 +266,8 @@ def joint_results(
         The stars with their last stamps.
     solution : Solution
         Unknowns of all stars and the shared ones.
+    lacking : Solution
+        The same with the covariance by what the model lacks.
     zernikes : ndarray, shape [n_star, n_noll]
         Wavefront of each star [m].
     zernike_maps : ndarray, shape [n_star, n_noll, n_shared]
@@ -266,9 +278,14 @@ def joint_results(
         pixels = replace(star.full, rays=star.stamp.rays)
         model = model_image(pixels, solution.stars[i], solution.waves[i])
         pixels.release()
-        spread = zernike_maps[i] @ solution.shared_covariance @ zernike_maps[i].T
-        covariance = solution.star_covariance(i)
-        results.append(FittedStar(pixels, model, solution.stars[i], covariance, zernikes[i], spread))
+        spread, lack = (
+            zernike_maps[i] @ shared @ zernike_maps[i].T
+            for shared in (solution.shared_covariance, lacking.shared_covariance)
+        )
+        covariance = solution.star_covariance(i) + lacking.star_covariance(i)
+        floor = model_floor(zernikes[i])
+        parts = ErrorParts.of(spread, lack, np.zeros_like(spread), floor)
+        results.append(FittedStar(pixels, model, solution.stars[i], covariance, zernikes[i], parts))
     return results
 
 

@@ -11,6 +11,7 @@ from ...pipeline.simulate.star_defects import StarDefects
 from ...sensing.fit import fit_donuts
 from ...sensing.model import DonutAir, DonutDetector, DonutModel
 from ...sensing.result import DonutFit
+from ...sensing.wavefront_fits import SingleDonuts
 from ...wavefront.aberration import StarWavefronts
 from ...wavefront.psf.stamps import Stamps
 from .scene import NOLL, AlignmentScene
@@ -65,7 +66,7 @@ def fit(scene: AlignmentScene, images: np.ndarray, threads: int | None = None) -
         stars.fields,
         scene.wavelengths,
         sky_variance=donuts.sky + donuts.read_noise**2,
-        noll=NOLL,
         model=model,
+        fit=SingleDonuts(NOLL, higher_order=0.0),
         threads=threads,
     )

@@ -49,7 +49,8 @@ class VisitRecord:
     def of(cls, quality: FieldMeans, fit: DonutFit) -> VisitRecord:
         """Keep what a loop needs of the fit of a visit."""
         images, model = (v.astype(np.float32) for v in (fit.images, fit.model))
-        return cls(quality, fit.zernikes, fit.covariance, np.asarray(fit.usable), images, model)
+        # The filter has the covariance of the turbulence itself.
+        return cls(quality, fit.zernikes, fit.error_parts.photons, np.asarray(fit.usable), images, model)
 
     @property
     def residuals(self) -> np.ndarray:

@@ -135,14 +135,16 @@ def test_errors_have_the_terms_that_are_left_out(behind_focus, wave, clean):
         for fit in (pachon.SingleDonuts(range(4, 9), left_out=rms) for rms in (200e-9, 0.0))
     )
 
-    def chi2(fit):
+    def chi2(fit, covariance):
         error = fit.zernikes[0] - wave[3:8]
-        return float(error @ np.linalg.solve(fit.covariance[0], error))
+        return float(error @ np.linalg.solve(covariance[0], error))
 
     assert honest.zernikes.shape == (1, 5)
-    # Without noise, a part of the five that noise would make; 1500 where the rest is taken to be zero.
-    assert chi2(honest) < 5.0
-    assert chi2(bare) > 100.0
+    # Without noise, a part of the five that noise would make; 1500 by photons where the rest is taken to be zero, which
+    # the residuals show.
+    assert chi2(honest, honest.covariance) < 5.0
+    assert chi2(bare, bare.error_parts.photons) > 100.0
+    assert chi2(bare, bare.covariance) < 10.0
 
 
 @pytest.mark.long
@@ -191,9 +193,10 @@ def test_higher_terms_of_the_air_are_fitted_and_its_own_are_an_error(behind_focu
     assert aware.zernikes.shape == (1, 19)
     assert rss(aware.zernikes[0]) < 0.5 * rss(plain.zernikes[0])
     # The air's covariance and, beside it, the photons' with free higher terms.
-    rest = aware.covariance[0] - closed[:19, :19]
-    assert np.linalg.eigvalsh(rest).min() > 0.0
-    assert 1.0 < np.sqrt(np.trace(rest)) / rss(plain.errors) < 3.0
+    np.testing.assert_allclose(aware.error_parts.air[0], closed[:19, :19], rtol=1e-12)
+    beside = aware.covariance[0] - closed[:19, :19]
+    assert np.linalg.eigvalsh(beside).min() > 0.0
+    assert 1.0 < np.sqrt(np.trace(beside) / np.trace(plain.error_parts.photons[0])) < 3.0
 
 
 @pytest.mark.parametrize(

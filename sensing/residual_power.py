@@ -1,0 +1,298 @@
+r"""Power of the residuals of a donut beyond its noise, and the errors that it makes.
+
+Let :math:`e` be the residuals over the standard deviation of their noise, A the derivatives of the model over it, and
+:math:`F = A^T A + P` the curvature with the priors' P. What the model lacks is taken for random fields with the
+covariance :math:`\sum_k \theta_k R_k`: noise of some correlation length, light that moves as under a wavefront of more
+terms, brightness and rims that differ. A fit removes from the residuals what its unknowns take up, so that the
+covariance of the residuals is
+
+.. math:: M \Big(I + \sum_k \theta_k R_k\Big) M + A F^{-1} P F^{-1} A^T, \qquad M = I - A F^{-1} A^T.
+
+The strengths :math:`\theta_k \ge 0` are those whose covariance is nearest to :math:`e e^T` (minimum norm quadratic
+estimation; Rao 1971, J. Multivariate Anal. 1, 257), of as few fields as the residuals ask for. Errors of the unknowns
+have the sandwich covariance :math:`F^{-1} + F^{-1} A^T (\sum_k \theta_k R_k) A F^{-1}`, which is never less than that
+of the noise alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from scipy import fft
+from scipy.linalg import cho_factor, solve_triangular
+from scipy.optimize import nnls
+
+from .likelihood import Linearized
+
+#: Correlation lengths of noise [pixels of the fit].
+_NOISE_LENGTHS = (0.5, 0.8, 1.5)
+#: Correlation length of brightness and rims over the resolution of the image: a Gaussian of nearly its width. Longer
+#: ones take up most of what the unknowns do, and claim more than is seen of wrong spiders and rims.
+_LIGHT_LENGTH = 0.35
+#: Standard deviations beyond those of noise that the power of the residuals has at least, to be more than chance.
+_SIGNIFICANT = 3.0
+#: The same that a further field must explain.
+_NEEDED = 3.0
+#: Fields whose power in the residuals decides whether there is any beyond that of noise.
+_SCREENED = ("white", "noise_0.8", "brightness", "rims")
+#: Largest number of pixels; beyond, squares of them are summed.
+_MOST_PIXELS = 17_000
+#: Ridge of the normal equations of the strengths, over their diagonal: fields that differ little share the power.
+_RIDGE = 1e-6
+
+
+@dataclass(frozen=True)
+class ResidualPower:
+    """What the residuals of a donut say about the errors of its unknowns.
+
+    Attributes
+    ----------
+    root : ndarray, shape [n, n]
+        Root of the covariance of the unknowns by noise and priors.
+    power : ndarray, shape [n, n]
+        Power of what the model lacks, in combinations of the unknowns that are independent of unit variance.
+    strengths : dict of float
+        Strengths of the fields by their names.
+    """
+
+    root: np.ndarray
+    power: np.ndarray
+    strengths: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance of the unknowns by what the model lacks, shape [n, n]."""
+        return np.asarray(self.root @ self.power @ self.root.T)
+
+
+class Field(Protocol):
+    """Random field of residuals over their noise, of unit strength."""
+
+    trace: float  #: of its covariance
+
+    def times(self, columns: np.ndarray) -> np.ndarray:
+        """Return the covariance times columns, shape [n_pixel, n]."""
+
+    def product(self, other: Field) -> float:
+        """Return the trace of the product of the covariances of two fields."""
+
+
+def residual_power(
+    linearized: Linearized,
+    covariance: np.ndarray,
+    resolution: float,
+    further: Callable[[], Mapping[str, np.ndarray]] = dict,
+) -> ResidualPower:
+    """Return what the residuals of a donut say about the errors of its unknowns.
+
+    Parameters
+    ----------
+    linearized : Linearized
+        Residuals and derivatives of the model at the solution.
+    covariance : ndarray, shape [n, n]
+        Covariance of the unknowns by noise and priors, zero for those that are held.
+    resolution : float
+        Width of the finest detail of the image [pixels].
+    further : callable
+        Further fields by name: columns [n_pixel, m] over the noise, whose squares are their covariances. It is called
+        where the residuals have more power than noise.
+    """
+    spreads = np.sqrt(np.diag(covariance))
+    scale = np.where(spreads > 0.0, spreads, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    squares = _Squares(linearized.used)
+    columns = squares.of(linearized.columns @ (linearized.scales[:, None] * root).astype(np.float32))
+    residuals = _Residuals(squares.of(linearized.pulls.astype(np.float32)[:, None])[:, 0], columns)
+    fields = _fields(linearized, squares, resolution)
+    if max(residuals.excess(fields[name]) for name in _SCREENED) < _SIGNIFICANT:
+        return ResidualPower(root, np.zeros_like(root))
+    fields |= {name: LowRankField(squares.of(patterns)) for name, patterns in further().items()}
+    return ResidualPower(root, *residuals.power(fields))
+
+
+class _Squares:
+    """Squares of pixels of a stamp, few enough for quick sums: single pixels of a small one.
+
+    Sums over a square of so many pixels are divided by its side, so that white noise keeps its variance.
+    """
+
+    def __init__(self, used: np.ndarray) -> None:
+        self._used, self.side = used, 1
+        while used.size / self.side**2 > _MOST_PIXELS and min(used.shape) >= 4 * self.side:
+            self.side *= 2
+        self.used = self._cut(used[..., None])[..., 0].all(axis=(1, 3))
+
+    def _cut(self, images: np.ndarray) -> np.ndarray:
+        """Return images [ny, nx, n] by squares, [ny, side, nx, side, n]."""
+        ny, nx = (n // self.side for n in images.shape[:2])
+        whole_squares = images[: ny * self.side, : nx * self.side]
+        return whole_squares.reshape(ny, self.side, nx, self.side, -1)
+
+    def of(self, columns: np.ndarray) -> np.ndarray:
+        """Return columns of pixels in use [n_pixel, n] as those of squares, [n_square, n]."""
+        if self.side == 1:
+            return columns
+        images = np.zeros((*self._used.shape, columns.shape[1]), dtype=columns.dtype)
+        images[self._used] = columns
+        return np.asarray(self._cut(images).sum(axis=(1, 3))[self.used] / self.side)
+
+    def mean(self, image: np.ndarray) -> np.ndarray:
+        """Return an image [ny, nx] by the means of squares."""
+        return np.asarray(self._cut(image[..., None])[..., 0].mean(axis=(1, 3)))
+
+
+class _Residuals:
+    """Residuals over their noise [n_pixel], and changes of the image by independent unknowns [n_pixel, n]."""
+
+    def __init__(self, pulls: np.ndarray, columns: np.ndarray) -> None:
+        self._pulls, self._columns = pulls, columns
+
+    def _surplus(self, of_field: Field, of_columns: np.ndarray) -> float:
+        """Return the power of the residuals in a field beyond that of noise."""
+        energy = float(self._pulls @ of_field.times(self._pulls[:, None])[:, 0])
+        return energy - of_field.trace + float((self._columns * of_columns).sum())
+
+    def excess(self, of_field: Field) -> float:
+        """Return the surplus in a field in standard deviations of noise."""
+        return self._surplus(of_field, of_field.times(self._columns)) / np.sqrt(2.0 * of_field.product(of_field))
+
+    def power(self, fields: Mapping[str, Field]) -> tuple[np.ndarray, dict[str, float]]:
+        """Return the power of the fields that the residuals need in the unknowns, [n, n], and their strengths."""
+        listed, names = list(fields.values()), list(fields)
+        of_columns = [of_field.times(self._columns) for of_field in listed]
+        inner = [self._columns.T @ values for values in of_columns]
+        surplus = np.array([self._surplus(*pair) for pair in zip(listed, of_columns, strict=True)])
+        products = np.zeros((len(listed), len(listed)))
+        for a in range(len(listed)):
+            for b in range(a + 1):
+                removed = float((inner[a] * inner[b]).sum()) - 2.0 * float(np.vdot(of_columns[a], of_columns[b]))
+                products[a, b] = products[b, a] = listed[a].product(listed[b]) + removed
+        freedom = self._pulls.size - float(np.trace(self._columns.T @ self._columns))
+        level = max(float(self._pulls @ self._pulls) / max(freedom, 1.0), 1.0)
+        strengths = {k: s for k, s in _needed_strengths(products, surplus, level).items() if s > 0.0}
+        power = sum((s * inner[k] for k, s in strengths.items()), start=np.zeros_like(inner[0]))
+        return power, {names[k]: s for k, s in strengths.items()}
+
+
+class WhiteField:
+    """Noise of pixels of its own."""
+
+    def __init__(self, count: int) -> None:
+        self.trace = float(count)
+
+    def times(self, columns: np.ndarray) -> np.ndarray:
+        """Return the columns; see :class:`Field`."""
+        return columns
+
+    def product(self, other: Field) -> float:
+        """Return the trace of the other field; see :class:`Field`."""
+        return other.trace
+
+
+class LowRankField:
+    """Field of few patterns, columns [n_pixel, m]."""
+
+    def __init__(self, columns: np.ndarray) -> None:
+        self._columns = columns.astype(np.float32)
+        self.trace = float((self._columns**2).sum())
+
+    def times(self, columns: np.ndarray) -> np.ndarray:
+        """Return the covariance times columns; see :class:`Field`."""
+        return np.asarray(self._columns @ (self._columns.T @ columns))
+
+    def product(self, other: Field) -> float:
+        """Return the trace of the product of the covariances; see :class:`Field`."""
+        return float((self._columns * other.times(self._columns)).sum())
+
+
+class StationaryField:
+    """Field that is stationary but for its amplitude, with Gaussian correlations.
+
+    Parameters
+    ----------
+    used : ndarray of bool, shape [ny, nx]
+        Pixels that count.
+    amplitude : ndarray, shape [ny, nx]
+        Rms of the field in units of itself: it is scaled to a mean square of 1.
+    length : float
+        Correlation length [pixels].
+    """
+
+    def __init__(self, used: np.ndarray, amplitude: np.ndarray, length: float) -> None:
+        self._used = used
+        size = np.sqrt((amplitude[used] ** 2).mean())
+        self._amplitude = np.where(used, amplitude, 0.0) / (size if size > 0.0 else 1.0)
+        y, x = (fft.fftfreq(n, 1.0 / n) for n in used.shape)
+        self._correlation = np.exp(-0.5 * (x**2 + y[:, None] ** 2) / length**2)
+        self.trace = float((self._amplitude**2).sum())
+
+    @cached_property
+    def _spectrum(self) -> np.ndarray:
+        return np.maximum(fft.rfft2(self._correlation).real, 0.0).astype(np.float32)
+
+    def times(self, columns: np.ndarray) -> np.ndarray:
+        """Return the covariance times columns; see :class:`Field`."""
+        amplitude = self._amplitude[self._used][:, None].astype(np.float32)
+        images = np.zeros((*self._used.shape, columns.shape[1]), dtype=np.float32)
+        images[self._used] = columns * amplitude
+        spectra = fft.rfft2(images, axes=(0, 1)) * self._spectrum[..., None]
+        return np.asarray(fft.irfft2(spectra, s=self._used.shape, axes=(0, 1))[self._used] * amplitude)
+
+    def product(self, other: Field) -> float:
+        """Return the trace of the product of the covariances; see :class:`Field`."""
+        if not isinstance(other, StationaryField):
+            return other.product(self)
+        overlap = fft.irfft2(np.abs(fft.rfft2(self._amplitude * other._amplitude)) ** 2, s=self._used.shape)
+        return float((self._correlation * other._correlation * overlap).sum())
+
+
+def _fields(linearized: Linearized, squares: _Squares, resolution: float) -> dict[str, Field]:
+    """Return the fields of every donut: white and correlated noise, brightness, rims."""
+    used, noise = squares.used, np.sqrt(squares.mean(linearized.variance))
+    brightness = np.maximum(squares.mean(linearized.brightness), 0.0)
+    slope = np.hypot(*np.gradient(brightness))
+    length = _LIGHT_LENGTH * resolution / squares.side
+    fields: dict[str, Field] = {"white": WhiteField(int(used.sum()))}
+    fields |= {f"noise_{x:g}": StationaryField(used, np.ones(used.shape), x) for x in _NOISE_LENGTHS}
+    fields |= {"brightness": StationaryField(used, brightness / noise, length)}
+    fields |= {"rims": StationaryField(used, slope / noise, length)}
+    return fields
+
+
+def _needed_strengths(products: np.ndarray, surplus: np.ndarray, level: float) -> dict[int, float]:
+    """Return strengths of the fewest fields whose covariance is near to that of the residuals.
+
+    Fields are added as long as one explains more than chance; `level` is the power of the residuals over that of noise,
+    by which their own power scatters.
+    """
+    strengths: dict[int, float] = {}
+    gain = 0.0
+    while True:
+        trials = []
+        for k in np.flatnonzero(surplus > 0.0):
+            if int(k) not in strengths:
+                trial = [*strengths, int(k)]
+                values = _strengths(products[np.ix_(trial, trial)], surplus[trial])
+                explained = float(2.0 * surplus[trial] @ values - values @ products[np.ix_(trial, trial)] @ values)
+                trials.append((explained, dict(zip(trial, map(float, values), strict=True))))
+        if not trials:
+            return strengths
+        best, values = max(trials, key=lambda trial: trial[0])
+        if best - gain < 2.0 * (_NEEDED * level) ** 2:
+            return strengths
+        gain, strengths = best, values
+
+
+def _strengths(products: np.ndarray, surplus: np.ndarray) -> np.ndarray:
+    """Return strengths from zero of fields whose covariance is nearest to that of the residuals."""
+    scale = np.sqrt(np.diag(products))
+    normalized = products / np.outer(scale, scale)
+    normalized[np.diag_indices_from(normalized)] += _RIDGE
+    factor = np.tril(cho_factor(normalized, lower=True)[0])
+    strengths, _ = nnls(factor.T, solve_triangular(factor, surplus / scale, lower=True))
+    return np.asarray(strengths / scale)

@@ -1,0 +1,226 @@
+"""Errors of the wavefront of one donut: photons, residuals, air, and the model's own accuracy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from .air_shape import air_shape
+from .donut_rays import ZernikeRays
+from .fit_star import StarSolution
+from .image_model import STRENGTH
+from .light import Instrument
+from .likelihood import Linearized, linearized
+from .residual_power import residual_power
+from .solve import Group, Solution
+
+#: Terms up to the eleventh radial degree: what the mean wavefront of the air has beyond is lost in the seeing.
+_AIR_TERMS = 78
+#: Name of the field of the air's wavefront of unknown size.
+_AIR = "air"
+#: Rms of the wavefront of the air of unit strength, Z4 to Z22 together [m].
+_UNIT = 1e-7
+#: Least variance of a term of the air over that of all from Z4 to Z22.
+_LEAST = 1e-9
+#: Full width at half maximum of a Gaussian over its rms.
+_FWHM_PER_RMS = 2.354820045
+#: Error of the model of the image by cells of the pupil and pixels, all terms together [m].
+_MODEL_ERROR = 3e-9
+#: Difference of the wavefront by landing points from that of the optical path, over the wavefront itself.
+_RELATIVE_ERROR = 3e-3
+
+
+@dataclass(frozen=True)
+class ErrorParts:
+    """Covariance of wavefronts by cause, each of shape [n_noll, n_noll] or [n, n_noll, n_noll] [m^2].
+
+    Attributes
+    ----------
+    photons : ndarray
+        Noise of the pixels, and terms that are fitted beside those asked for: the Cramer-Rao bound.
+    residuals : ndarray
+        What the model lacks, by the power of the residuals beyond the noise.
+    air : ndarray
+        Mean wavefront of the turbulence of the exposure.
+    floor : ndarray
+        Accuracy of the model, and the scatter of the donuts of an exposure about a smooth field beyond all else.
+    repeats : ndarray
+        No part of the sum: covariance of a donut about the others of its exposure, which have the same errors of the
+        model in common. The sum, where there are none to compare.
+    """
+
+    photons: np.ndarray
+    residuals: np.ndarray
+    air: np.ndarray
+    floor: np.ndarray
+    repeats: np.ndarray
+
+    @classmethod
+    def of(cls, photons: np.ndarray, residuals: np.ndarray, air: np.ndarray, floor: np.ndarray) -> ErrorParts:
+        """Return the parts of a donut that is compared with no other."""
+        return cls(photons, residuals, air, floor, photons + residuals + air + floor)
+
+    @property
+    def total(self) -> np.ndarray:
+        """Sum of all."""
+        return np.asarray(self.photons + self.residuals + self.air + self.floor)
+
+
+@dataclass(frozen=True)
+class StarErrors:
+    """Covariance of the unknowns of a star beside its wavefront, and that of its wavefront by cause."""
+
+    covariance: np.ndarray
+    parts: ErrorParts
+
+
+def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
+    """Return the errors of a star that was fitted by itself."""
+    solution, terms = star.solution, instrument.terms
+    n_star, n = len(solution.stars[0]), len(terms.requested)
+    wavefront = slice(n_star, n_star + n)
+    photons, air = solution.covariance, terms.air
+    residuals = np.zeros_like(photons)
+    point = linearized(star.stamp, solution.stars[0], solution.waves[0])
+    if point is not None and len(solution.shared):
+        beside = _TermsBeside(instrument, star, point)
+        power = residual_power(point, photons, _resolution(instrument, star), beside.fields)
+        residuals = power.covariance
+        strength = power.strengths.get(_AIR, 0.0)
+        if strength > 0.0:
+            speckles, turbulence = (strength * values for values in beside.air(photons))
+            residuals, air = residuals - speckles, air + turbulence[wavefront, wavefront]
+    zernikes = solution.shared[:n]
+    parts = ErrorParts.of(photons[wavefront, wavefront], residuals[wavefront, wavefront], air, model_floor(zernikes))
+    return StarErrors(solution.star_covariance(0) + residuals[:n_star, :n_star], parts)
+
+
+def model_floor(zernikes: np.ndarray) -> np.ndarray:
+    """Return the covariance of a wavefront [m] by the accuracy of the model, shape [n, n]."""
+    return np.diag(_MODEL_ERROR**2 / len(zernikes) + (_RELATIVE_ERROR * zernikes) ** 2)
+
+
+def air_of_terms(instrument: Instrument) -> np.ndarray:
+    """Return the covariance of the terms asked for in the mean wavefront of an exposure, of unit trace, [n, n]."""
+    low = instrument.terms.requested - 4
+    covariance = _air_of(instrument, max(_AIR_TERMS, int(instrument.terms.requested.max())))[np.ix_(low, low)]
+    return np.asarray(covariance / np.trace(covariance))
+
+
+def _air_of(instrument: Instrument, last: int) -> np.ndarray:
+    """Return the covariance of Z4 to a last term in the mean wavefront of an exposure, of unit trace up to Z22."""
+    telescope = instrument.telescope
+    outer_scale = float(instrument.model.air.outer_scale) / (0.5 * telescope.pupil_diameter)
+    return air_shape(last, round(telescope.pupil_obscuration, 4), outer_scale)
+
+
+def by_residuals(instrument: Instrument, stars: Sequence[StarSolution], group: Group, solution: Solution) -> Solution:
+    """Return a joint solution whose covariance is that by what the model lacks, as the residuals of its stars say.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        Telescope and model of the images.
+    stars : sequence of StarSolution
+        The stars, each by itself.
+    group : Group
+        The same as they were fitted together.
+    solution : Solution
+        Their joint solution.
+    """
+    covariance = np.zeros_like(solution.covariance)
+    first, n_shared = 0, len(solution.shared)
+    shared = np.arange(len(covariance) - n_shared, len(covariance))
+    for i, stamp in enumerate(group.stamps):
+        n_star = len(solution.stars[i])
+        unknowns = np.concatenate([first + np.arange(n_star), shared])
+        first += n_star
+        point = linearized(stamp, solution.stars[i], solution.waves[i])
+        if point is not None:
+            columns = point.columns * point.scales.astype(np.float32)
+            joined = np.concatenate(
+                [columns[:, :n_star], columns[:, n_star:] @ group.maps[i].astype(np.float32)], axis=1
+            )
+            point = replace(point, columns=joined, scales=np.ones(n_star + n_shared))
+            block = np.ix_(unknowns, unknowns)
+            covariance[block] += residual_power(
+                point, solution.covariance[block], _resolution(instrument, stars[i])
+            ).covariance
+        if group.transient:
+            stamp.release()
+    return replace(solution, covariance=covariance)
+
+
+def _resolution(instrument: Instrument, star: StarSolution) -> float:
+    """Return the width of the finest detail of an image [pixels of the fit]."""
+    seeing = float(instrument.seeing.fwhm(star.solution.stars[0][STRENGTH])) * star.light.scale
+    return max(math.hypot(seeing, _FWHM_PER_RMS * instrument.diffusion) / star.stamp.grid.pixel, 1.0)
+
+
+class _TermsBeside:
+    """Terms of the wavefront up to Z78 beside those asked for, and the light that they move."""
+
+    def __init__(self, instrument: Instrument, star: StarSolution, point: Linearized) -> None:
+        self._instrument, self._star, self._point = instrument, star, point
+        self._beyond = np.setdiff1d(np.arange(4, _AIR_TERMS + 1), instrument.terms.every)
+
+    @cached_property
+    def _shape(self) -> np.ndarray:
+        """Covariance of Z4 to the last term by air of unit size [m^2]."""
+        last = max(_AIR_TERMS, int(self._instrument.terms.every.max()))
+        return _UNIT**2 * _air_of(self._instrument, last)
+
+    @cached_property
+    def _high(self) -> np.ndarray:
+        """Terms beside those asked for, by their place in the covariance."""
+        return np.concatenate([self._instrument.terms.further, self._beyond]) - 4
+
+    @cached_property
+    def _root(self) -> np.ndarray:
+        """Root of the covariance of the terms beside those asked for [m], [m, m]."""
+        least = np.diag(np.full(len(self._high), _LEAST * _UNIT**2))
+        return np.linalg.cholesky(self._shape[np.ix_(self._high, self._high)] + least)
+
+    @cached_property
+    def _columns(self) -> np.ndarray:
+        """Derivatives of the model by the terms beside those asked for, over the noise [1/m], [n_pixel, m]."""
+        star, terms = self._star, self._instrument.terms
+        unknowns, wave = star.solution.stars[0], star.solution.waves[0]
+        n_star, n, n_fitted = len(unknowns), len(terms.requested), len(terms.every)
+        rays = ZernikeRays(
+            star.light.telescope,
+            star.light.direction,
+            self._instrument.wavelengths,
+            self._instrument.wavelength_weights,
+            star.stamp.rays.cells,
+            np.concatenate([terms.every, self._beyond]),
+        )
+        padded_wave = np.concatenate([wave[:n_fitted], np.zeros(len(self._beyond)), wave[n_fitted:]])
+        point = linearized(replace(star.stamp, rays=rays), unknowns, padded_wave)
+        assert point is not None
+        beside = slice(n_star + n, n_star + n_fitted + len(self._beyond))
+        return np.asarray(point.columns[:, beside] * point.scales[beside].astype(np.float32))
+
+    def fields(self) -> Mapping[str, np.ndarray]:
+        """Return the columns of the fields by name, [n_pixel, m]."""
+        return {_AIR: self._columns @ self._root.astype(np.float32)} if len(self._high) else {}
+
+    def air(self, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the covariance of the unknowns by air of unit size: by its further terms, and with its own.
+
+        Its own terms are those asked for, which no donut tells from the telescope's.
+        """
+        n_star, low = len(self._star.solution.stars[0]), self._instrument.terms.requested - 4
+        scaled = self._point.columns.T @ (self._columns @ self._root.astype(np.float32))
+        moved = covariance @ (self._point.scales[:, None] * scaled)
+        speckles = moved @ moved.T
+        turbulence, wavefront = speckles.copy(), slice(n_star, n_star + len(low))
+        # What the air's further terms move goes with its low ones, which have a covariance with them.
+        together = moved[wavefront] @ solve_triangular(self._root, self._shape[np.ix_(self._high, low)], lower=True)
+        turbulence[wavefront, wavefront] += self._shape[np.ix_(low, low)] + together + together.T
+        return speckles, turbulence

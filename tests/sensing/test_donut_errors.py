@@ -1,0 +1,227 @@
+"""Errors of donuts: noise measured from images, power of residuals, air of unknown exposure, scatter of repeats."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from donut_images import PIXEL, WAVELENGTH, donut
+from scipy.ndimage import gaussian_filter
+
+import pachon
+from pachon.models.aperture import Circle
+from pachon.sensing.air_shape import air_shape
+from pachon.sensing.cross_check import cross_checked
+from pachon.sensing.likelihood import Linearized
+from pachon.sensing.noise import measured_noise
+from pachon.sensing.residual_power import residual_power
+from pachon.sensing.star_errors import ErrorParts
+from pachon.wavefront.atmosphere.mean_wavefront import mean_wavefront_covariance
+
+FIELD = np.deg2rad([0.6, 0.9])
+#: The blur of :func:`donut`, a pixel.
+BLUR = pachon.DonutModel(
+    air=pachon.DonutAir(fwhm=0.0), detector=pachon.DonutDetector(pixel_size=PIXEL, diffusion=PIXEL)
+)
+OPTIONS = {"model": BLUR, "threads": 1}
+SKY = 500.0
+
+
+def hill(size=80):
+    """A smooth star of 1000 units a pixel at most."""
+    x, y = np.meshgrid(*2 * [np.linspace(-3.0, 3.0, size)])
+    return 1000.0 * np.exp(-0.5 * (x**2 + y**2))
+
+
+@pytest.mark.parametrize(("gain", "sky_level"), [(1.0, 0.0), (0.4, 0.0), (0.4, 300.0)])
+def test_noise_is_a_line_of_the_brightness(gain, sky_level):
+    """Closed form: counts in electrons over a gain have a variance of their amount over it."""
+    star = hill()
+    counts = np.random.default_rng(1).poisson((star + 300.0) / gain) * gain
+    noise = measured_noise(counts - star, star, np.ones(star.shape, bool), sky_level, correlated=True)
+    assert noise.photon == pytest.approx(gain, rel=0.12)
+    assert noise.sky == pytest.approx(300.0 * gain, rel=0.12)
+
+
+def test_noise_of_light_without_a_sky():
+    star = np.maximum(0.1 * hill() - 10.0, 0.0)
+    counts = np.random.default_rng(4).poisson(star).astype(float)
+    noise = measured_noise(counts - star, star, np.ones(star.shape, bool), 0.0, correlated=True)
+    assert noise.photon == pytest.approx(1.0, rel=0.12)
+    assert noise.sky < 0.5
+
+
+def test_noise_that_is_correlated_is_as_large_as_its_pixels_scatter():
+    white = np.random.default_rng(2).normal(size=(80, 80))
+    noise = gaussian_filter(white, 0.8, mode="wrap")
+    noise *= 10.0 / noise.std()
+    measured = measured_noise(noise, np.zeros((80, 80)), np.ones((80, 80), bool), 0.0, correlated=True)
+    assert measured.sky == pytest.approx(100.0, rel=0.15)
+
+
+def smooth_columns(size):
+    """Derivatives of a smooth star by six unknowns, over noise of unit variance."""
+    x, y = np.meshgrid(*2 * [np.linspace(-1.0, 1.0, size)])
+    bell = np.exp(-2.0 * (x**2 + y**2))
+    return np.stack([bell * f for f in (np.ones_like(x), x, y, x * y, x * x, y * y)], axis=-1).reshape(-1, 6)
+
+
+# The last one is summed over squares of pixels.
+@pytest.mark.parametrize(
+    ("blur", "variance", "size"), [(0.0, 1.0, 32), (0.0, 1.7, 32), (0.8, 1.0, 32), (0.0, 1.7, 140)]
+)
+def test_errors_have_the_power_of_the_residuals(blur, variance, size):
+    """Oracle: the sandwich covariance of the noise that was drawn, F^-1 A^T R A F^-1."""
+    rng = np.random.default_rng(3)
+    columns, used = smooth_columns(size), np.ones((size, size), bool)
+    covariance = np.linalg.inv(columns.T @ columns)
+
+    def correlated(images):
+        if not blur:
+            return np.sqrt(variance) * images
+        point = np.zeros((size, size))
+        point[size // 2, size // 2] = 1.0
+        norm = np.sqrt((gaussian_filter(point, blur, mode="wrap") ** 2).sum())
+        smooth = [gaussian_filter(v, blur, mode="wrap") for v in images.reshape(-1, size, size)]
+        return np.sqrt(variance) * np.array(smooth).reshape(images.shape) / norm
+
+    gained = covariance @ np.stack([correlated(c.reshape(size, size)).ravel() for c in columns.T])
+    true = np.trace(gained @ gained.T)
+    claimed = []
+    for _ in range(8 if size < 100 else 2):
+        noise = correlated(rng.normal(size=(size, size))).ravel()
+        residual = noise - columns @ (covariance @ (columns.T @ noise))
+        point = Linearized(
+            np.ones((size, size)),
+            np.ones((size, size)),
+            np.abs(columns[:, 0]).reshape(size, size),
+            used,
+            residual,
+            residual,
+            columns.astype(np.float32),
+            np.ones(6),
+        )
+        power = residual_power(point, covariance, 4.0).covariance
+        assert np.linalg.eigvalsh(power).min() > -1e-9 * np.trace(covariance)
+        claimed.append(np.trace(covariance + power))
+    assert np.mean(claimed) == pytest.approx(true, rel=0.25)
+
+
+@pytest.mark.long
+def test_air_of_a_long_exposure_has_one_shape():
+    """Peer: the closed form of given winds, from which its shape differs by their direction alone."""
+    air = pachon.Atmosphere.from_site("cerro_pachon", 3, exposure=60.0)
+    noll = np.array([4, 5, 6, 7, 8, 11])
+    of_winds = mean_wavefront_covariance(air, [(0.0, 0.0)], noll, 8.36, 0.61)[0, :, 0]
+    shape = air_shape(78, 0.61, 25.0 / 4.18)[np.ix_(noll - 4, noll - 4)]
+    of_winds, shape = of_winds / np.trace(of_winds), shape / np.trace(shape)
+    # Sums over cosine and sine do not depend on the direction of the wind.
+    for terms in ([0], [1, 2], [3, 4], [5]):
+        assert of_winds.diagonal()[terms].sum() == pytest.approx(shape.diagonal()[terms].sum(), rel=0.05)
+    assert of_winds[0, 5] == pytest.approx(shape[0, 5], rel=0.05)
+
+
+def parts_of(photons, residuals=0.0):
+    """Errors of equal variance of 19 terms, of that root of the sum [m]."""
+    photon, residual = (np.eye(19) * rms**2 / 19 for rms in (photons, residuals))
+    return ErrorParts.of(photon, residual, 0.0 * photon, 0.0 * photon)
+
+
+def test_scatter_of_donuts_beyond_their_errors_is_claimed():
+    rng = np.random.default_rng(5)
+    fields = rng.uniform(-0.7, 0.7, (30, 2))
+    smooth = np.column_stack([np.ones(30), fields]) @ rng.normal(0.0, 100e-9, (3, 19))
+    scatter = rng.normal(0.0, 80e-9 / np.sqrt(19), (30, 19))
+    checked = cross_checked(
+        fields, smooth + scatter, [parts_of(20e-9)] * 30, lambda: np.eye(19) / 19, measured_air=True
+    )
+    assert np.sqrt(np.trace(checked[0].total)) == pytest.approx(80e-9, rel=0.1)
+    # Too different to be of one exposure of one telescope.
+    unrelated = rng.normal(0.0, 300e-9 / np.sqrt(19), (30, 19))
+    apart = cross_checked(fields, unrelated, [parts_of(20e-9)] * 30, lambda: np.eye(19) / 19, measured_air=True)
+    assert np.sqrt(np.trace(apart[0].total)) == pytest.approx(20e-9)
+
+
+def test_repeats_of_one_chip_differ_by_less_than_what_the_model_lacks_in_all_of_them():
+    rng = np.random.default_rng(6)
+    fields = 0.3 + rng.uniform(-0.02, 0.02, (4, 2))
+    values = rng.normal(0.0, 100e-9, 19) + rng.normal(0.0, 30e-9 / np.sqrt(19), (4, 19))
+    checked = cross_checked(fields, values, [parts_of(5e-9, 200e-9)] * 4, lambda: np.eye(19) / 19, measured_air=True)
+    assert np.sqrt(np.trace(checked[0].total)) == pytest.approx(200e-9, rel=0.01)
+    assert np.sqrt(np.trace(checked[0].repeats)) == pytest.approx(30e-9, rel=0.3)
+
+
+@pytest.mark.long
+def test_noise_and_unit_of_images_need_not_be_known(behind_focus):
+    image = donut(behind_focus, FIELD, rays=400, flux=2e6)
+    counts = np.random.default_rng(7).poisson(image + SKY).astype(float)
+    stamps = [counts - SKY, counts / 2.5]
+    fit = pachon.fit_donuts(behind_focus, stamps, [FIELD] * 2, WAVELENGTH, **OPTIONS)
+    known_noise = pachon.fit_donuts(behind_focus, stamps[:1], [FIELD], WAVELENGTH, sky_variance=SKY, **OPTIONS)
+    assert fit.reasons == ["", ""]
+    np.testing.assert_allclose(fit.photon_variance, [1.0, 0.4], rtol=0.15)
+    np.testing.assert_allclose(fit.background, [0.0, SKY / 2.5], atol=1.0)
+    np.testing.assert_allclose(fit.chi2 / fit.n_pixels, 1.0, atol=0.1)
+    for zernikes, errors in zip(fit.zernikes, fit.errors, strict=True):
+        assert (np.abs(zernikes - known_noise.zernikes[0]) < 0.2 * errors).all()
+        np.testing.assert_allclose(errors, known_noise.errors[0], rtol=0.1)
+
+
+CASES = ("noise", "correlated noise", "gain 1.7", "sky left in", "chord", "air unknown")
+
+
+def true_wavefront(case, rng, air_root):
+    """Wavefront of 200 nm of Z4 to Z22 [m], from j = 1, and what the air adds."""
+    wave = np.zeros(78)
+    wave[3:22] = rng.normal(size=19)
+    wave *= 200e-9 / np.linalg.norm(wave)
+    seen = wave.copy()
+    if case == "air unknown":
+        seen[3:] += air_root @ rng.normal(size=75)
+    return wave[3:22], seen
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_calibration(behind_focus, case):
+    """Squared error over claimed variance of ten donuts of brute force; with -s it is printed."""
+    rng = np.random.default_rng(CASES.index(case))
+    # 110 nm: an exposure of 15 s at Cerro Pachon.
+    air_root = 110e-9 * np.linalg.cholesky(air_shape(78, 0.61, 25.0 / 4.18) + 1e-9 * np.eye(75))
+    vignetting = replace(
+        behind_focus,
+        surfaces=tuple(
+            replace(s, aperture=Circle(s.aperture.radius + 8e-3)) if s.name.startswith("Filter") else s
+            for s in behind_focus.surfaces
+        ),
+    )
+    squares, variances, chi2 = [], [], []
+    for _ in range(10):
+        radius = 1.745 if case == "chord" else 1.7 * np.sqrt(rng.uniform())
+        angle = rng.uniform(0.0, 2.0 * np.pi)
+        field = np.deg2rad(radius * np.array([np.cos(angle), np.sin(angle)]))
+        true, seen = true_wavefront(case, rng, air_root)
+        light = donut(
+            vignetting if case == "chord" else behind_focus,
+            field,
+            zernikes=seen,
+            rays=700,
+            flux=2e6,
+            shift=rng.uniform(-0.5, 0.5, 2),
+        )
+        noise = rng.normal(size=light.shape)
+        if case == "correlated noise":
+            noise = gaussian_filter(noise, 0.8)
+            noise /= noise.std()
+        image = light + noise * np.sqrt((light + SKY) * (1.7 if case == "gain 1.7" else 1.0))
+        image += SKY if case == "sky left in" else 0.0
+        variance = None if case == "sky left in" else SKY
+        fit = pachon.fit_donuts(behind_focus, image[None], [field], WAVELENGTH, sky_variance=variance, **OPTIONS)
+        error = fit.zernikes[0] - true
+        squares.append(error @ error)
+        variances.append(np.trace(fit.covariance[0]))
+        chi2.append(error @ np.linalg.solve(fit.covariance[0], error) / 19)
+    ratio = np.mean(squares) / np.mean(variances)
+    rms = 1e9 * np.sqrt([np.mean(squares), np.mean(variances)])
+    print(f"\n{case}: error {rms[0]:.0f} nm, claimed {rms[1]:.0f}, ratio {ratio:.2f}, chi-square {np.mean(chi2):.2f}")
+    # Ten wavefronts have some fifty independent errors: 20 % by chance alone. A rim 8 mm off is for the fit of rims.
+    assert 0.4 < ratio < (6.0 if case == "chord" else 1.6)
