@@ -72,6 +72,9 @@ def donuts_command(
     degrees_of_freedom: Annotated[
         str | None, Option(help="Fit degrees of freedom to all donuts: lsst, or a YAML file.")
     ] = None,
+    each_alone: Annotated[
+        bool, Option("--each-alone", help="Fit each donut alone, even where several are given of one exposure.")
+    ] = False,
     outer_scale_m: Annotated[float, Option(help="Outer scale of the turbulence [m]; inf for Kolmogorov's.")] = 25.0,
     diffraction: Annotated[
         bool, Option(help="Diffraction at the rims of the pupil: not in images made of rays alone.")
@@ -89,7 +92,8 @@ def donuts_command(
 
     A file holds a cube of stamps and a table with their fields (field_x, field_y [deg], defocus_um), one stamp an
     extension with keywords FIELD_X, FIELD_Y and DEFOC_UM, or the image of a CCD, with --positions. Stamps have x and y
-    along those of the detector, and no sky. Bad donuts are flagged with the reason.
+    along those of the detector, and no sky. Bad donuts are flagged with the reason. Two donuts or more are taken to be
+    of one exposure, or of both sides of focus: they are fitted together (--each-alone: not).
 
     **Examples**
 
@@ -98,6 +102,7 @@ def donuts_command(
     - `pachon donuts ccd.fits --positions stars.ecsv --stamp 200 --defocus-um -1500`
     """
     from ..models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
+    from ..sensing.exposure_fit import ExposureDonuts
     from ..sensing.fit import fit_donuts
     from ..sensing.freedom_fit import TelescopeFreedoms
     from ..sensing.model import DonutAir, DonutDetector, DonutModel
@@ -108,12 +113,15 @@ def donuts_command(
     kind = _output_kind(out, picture)
     believed = load_model(telescope, lenient, glass_catalogue or ())
     noll = range(4, terms + 1)
-    wavefront: WavefrontFit = SingleDonuts(noll, higher_order=higher_order_nm * 1e-9)
-    if degrees_of_freedom is not None:
-        wavefront = TelescopeFreedoms(load_degrees_of_freedom(degrees_of_freedom), noll=noll)
     atmosphere = None if exposure_s is None else Atmosphere.from_site(site, 0, exposure=exposure_s)
     images, fields, defocus = _stamps(files, positions, stamp, field_deg)
     images = [gain * image for image in images]
+    higher_order = higher_order_nm * 1e-9
+    wavefront: WavefrontFit = ExposureDonuts(noll=noll, higher_order=higher_order)
+    if degrees_of_freedom is not None:
+        wavefront = TelescopeFreedoms(load_degrees_of_freedom(degrees_of_freedom), noll=noll)
+    elif each_alone or len(images) < 2:
+        wavefront = SingleDonuts(noll, higher_order=higher_order)
     model = DonutModel(
         air=DonutAir(outer_scale=outer_scale_m, atmosphere=atmosphere),
         detector=DonutDetector(pixel_um * 1e-6, defocus=defocus + 1e-6 * defocus_um, saturation=saturation),
@@ -203,3 +211,29 @@ def _show(fit: DonutFit) -> None:
         rows.append((f"{x:.4g}, {y:.4g}", fit.reasons[i] or "ok", *sizes, largest, f"{seeing:.2f}", f"{quality:.2f}"))
     headings = ("field [deg]", "flags", "rms [nm]", "error [nm]", "largest [nm]", 'FWHM ["]', "chi2 a pixel")
     Rows(headings, rows, _CAPTION, left=2).show()
+    for line in _remarks(fit):
+        typer.echo(line)
+
+
+def _remarks(fit: DonutFit) -> list[str]:
+    """Return what is to be said of all donuts together, in sentences."""
+    from ..sensing.flags import DonutFlag
+
+    remarks, exposure = [], fit.exposure
+    wrong, ambiguous = (
+        int(sum(bool(flag & bit) for flag in fit.flags)) for bit in (DonutFlag.DEFOCUS_SIGN, DonutFlag.AMBIGUOUS_SIDE)
+    )
+    if wrong:
+        remarks.append(f"{wrong} of {len(fit)} donuts fit the other side of focus: the sign of their defocus is wrong.")
+    if ambiguous:
+        remarks.append(
+            f"{ambiguous} of {len(fit)} donuts fit both sides of focus: results are those of the side given."
+        )
+    if exposure is not None:
+        remarks.append(
+            f"{int(fit.usable.sum())} donuts are fitted as of one telescope (--each-alone: each by itself). By their "
+            f"scatter the air has {1e9 * exposure.air_rms:.0f} nm rms, which the errors include, and the fits "
+            f"{exposure.noise_scale:.2g} times the variance that they claim."
+        )
+        remarks += [notice[0].upper() + notice[1:] + "." for notice in exposure.notices]
+    return remarks

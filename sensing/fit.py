@@ -102,9 +102,10 @@ def fit_donuts(
     model : DonutModel, optional
         What the images are made of: light, air, detector (defocus and heights among it), diffraction, second stars; by
         default rays through air of unknown seeing, in one plane.
-    fit : SingleDonuts, FieldTerms or TelescopeFreedoms, optional
-        Unknowns of the wavefront, with the options of their fit: Zernikes of each donut (the default), double Zernikes
-        over the field, or degrees of freedom of the telescope for all donuts together.
+    fit : SingleDonuts, ExposureDonuts, FieldTerms or TelescopeFreedoms, optional
+        Unknowns of the wavefront, with the options of their fit: Zernikes of each donut (the default), the same
+        with what donuts of an exposure have in common, double Zernikes over the field, or degrees of freedom of the
+        telescope for all donuts together.
     mask : array_like of bool, as `images`, optional
         True at pixels to leave out.
     projection : {"zemax", "gnomonic", "postel"}
@@ -141,13 +142,17 @@ def fit_donuts(
 
     with one_blas_thread(), ThreadPoolExecutor(thread_count(threads)) as pool:
         stars = list(pool.map(fitted_alone, range(len(observed))))
+        stars = fit.sided(instrument, stars, observed.fields)
         solutions = {i: star.usable for i, star in enumerate(stars) if star.usable is not None}
         if fit.joint and not solutions:
             raise DomainError(f"no usable donut: {stars[0].flags.reasons if stars else 'no images'}")
-        usable = UsableStars(instrument, list(solutions.values()), observed.fields[list(solutions)], projection)
+        index = np.array(list(solutions), dtype=np.int64)
+        usable = UsableStars(
+            instrument, list(solutions.values()), observed.fields[index], projection, observed.fields, index
+        )
         fitted = fit.solved(usable, pool)
     flags = np.array([int(star.flags) for star in stars], dtype=np.int64)
-    return _result(instrument, observed, flags, np.array(list(solutions), dtype=np.int64), fitted)
+    return _result(instrument, observed, flags, index, fitted)
 
 
 def _wavefront_fit(
@@ -240,4 +245,5 @@ def _result(
         double_zernikes=fitted.double_zernikes,
         double_zernike_covariance=fitted.double_zernike_covariance,
         degrees_of_freedom=fitted.degrees_of_freedom,
+        exposure=None if fitted.exposure is None else fitted.exposure.at(usable, count),
     )

@@ -8,11 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import maximum_filter
 
+from ..models.zernike_polynomials import noll_to_nm
 from .donut_rays import ZernikeRays
 from .flags import DonutFlag
 from .image_model import FLUX, NUISANCES, RATIO, STRENGTH, X, Y
 from .light import Instrument, Sampling, StarLight
 from .likelihood import Stamp, model_image, pulls
+from .sides import BothSides, SideFit
 from .solve import COARSE, FINE, STEPS, Group, Solution, solve
 from .stamps import (
     Match,
@@ -46,6 +48,8 @@ _NEAR_RADII = (0.08, 0.2)
 _NEAR_ANGLES = 6
 #: Steps from each of these places.
 _FIRST_STEPS = 4
+#: Steps of the fit on the other side of focus.
+_MIRRORED_STEPS = 8
 #: Number of the best of these solutions that are finished.
 _FINISHED = 2
 #: Loss a coarse pixel from which on a second star is searched for without the wavefront of the first, too.
@@ -93,10 +97,11 @@ class StarSolution:
 
 @dataclass(frozen=True)
 class StarFit:
-    """Outcome of the fit of one star by itself: flags, and its best model unless it failed."""
+    """Outcome of the fit of one star by itself: flags, best model unless it failed, and both sides of focus."""
 
     flags: DonutFlag
     best: StarSolution | None = None
+    sides: BothSides | None = None
 
     @property
     def usable(self) -> StarSolution | None:
@@ -134,8 +139,9 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
     best = fitter.solve(coarse, start, tolerance=COARSE if donut else FINE)
     if donut and instrument.model.neighbours:
         best = fitter.with_companion(small, coarse, best, start, template)
+    sides = fitter.both_sides(small, coarse, best) if donut and wavefront else None
     if donut and fitter.other_focus_is_better(small, coarse, best):
-        return StarFit(DonutFlag.DEFOCUS_SIGN)
+        return StarFit(DonutFlag.DEFOCUS_SIGN, sides=sides)
     if not _explained(coarse, best):
         return StarFit(DonutFlag.NO_DONUT)
     if _beside(coarse, best) > _BESIDE:
@@ -147,7 +153,9 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
         flags |= DonutFlag.BLENDED
     if not (finest.solution.converged and np.isfinite(finest.model).all()):
         flags |= DonutFlag.NOT_CONVERGED
-    return StarFit(flags, finest)
+    if sides is not None and sides.ambiguous:
+        flags |= DonutFlag.AMBIGUOUS_SIDE
+    return StarFit(flags, finest, sides)
 
 
 @dataclass(frozen=True)
@@ -331,6 +339,31 @@ class _StarFitter:
             if _explains_more(trial, best) and trial.stars[0][RATIO] > _LEAST_RATIO:
                 best = trial
         return best
+
+    def both_sides(self, pixels: Pixels, stamp: Stamp, solution: Solution) -> BothSides | None:
+        """Return the fits on the side of focus that is given and on the other one; None for blends.
+
+        About the axis a wavefront W of one side of focus and -W turned by 180 degrees of the other make one image: the
+        search starts there.
+        """
+        star = solution.stars[0]
+        if len(star) > RATIO:
+            return None
+        noll = self._instrument.noll
+        mirrored = self.stamp(self._light.mirrored(), pixels)
+        shared = np.zeros_like(solution.shared)
+        even = np.array([noll_to_nm(int(j))[0] % 2 == 0 for j in noll])
+        shared[: len(noll)] = np.where(even, -1.0, 1.0) * solution.shared[: len(noll)]
+        other = self.solve(mirrored, star, shared, COARSE, _MIRRORED_STEPS)
+        # What no side explains is in units of what is left.
+        least = min(solution.loss, other.loss) / stamp.used.sum()
+        scale = 1.0 / max(1.0, least / _MISFIT)
+        n = len(self._instrument.terms.requested)
+        given, turned = (
+            SideFit(scale * side.loss, side.shared[:n], side.shared_covariance[:n, :n] / scale)
+            for side in (solution, other)
+        )
+        return BothSides(given, turned, self._light.depth)
 
     def other_focus_is_better(self, pixels: Pixels, stamp: Stamp, solution: Solution) -> bool:
         """Return whether the image fits a detector on the other side of focus better."""

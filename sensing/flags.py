@@ -12,6 +12,9 @@ class DonutFlag(IntFlag):
     left out) and ``POOR_FIT`` (chi-square is far above the number of pixels, so that errors are larger than claimed)
     are remarks: there are results. With any other flag the results of the donut are NaN.
 
+    So is ``AMBIGUOUS_SIDE``: the image fits as well on the other side of focus, with another wavefront. Results are
+    those of the side that is given.
+
     ``NO_DONUT``: nothing like a donut stands on the stamp. ``CUT_OFF``: more than a twentieth of the light falls beside
     the stamp. ``SATURATED``: too many pixels are saturated. ``DEFOCUS_SIGN``: the image fits the other side of focus
     better. ``OUTSIDE_FIELD``: the telescope does not cover the field. ``NO_LIGHT``: no light passes the telescope
@@ -32,11 +35,12 @@ class DonutFlag(IntFlag):
     NOT_FINITE = 512
     NOT_CONVERGED = 1024
     POOR_FIT = 2048
+    AMBIGUOUS_SIDE = 16384
 
     @property
     def usable(self) -> bool:
         """Whether the donut has results."""
-        return not self & ~(DonutFlag.BLENDED | DonutFlag.CLIPPED | DonutFlag.POOR_FIT)
+        return not self & ~(DonutFlag.BLENDED | DonutFlag.CLIPPED | DonutFlag.POOR_FIT | DonutFlag.AMBIGUOUS_SIDE)
 
     @property
     def reasons(self) -> str:

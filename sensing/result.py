@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from .exposure_fit import ExposureWavefront
+
 #: Donuts of one picture unless others are asked for.
 _SHOWN = 6
 #: Range of the residuals over their standard deviation.
@@ -92,6 +94,8 @@ class DonutFit(Result):
         Coefficients over the field and the pupil [m], and their covariance in that order, flattened.
     degrees_of_freedom : FreedomEstimate or None
         Degrees of freedom of the telescope.
+    exposure : ExposureWavefront or None
+        Wavefronts of the light of the donuts, air and both sides of focus, of :class:`~pachon.ExposureDonuts`.
     """
 
     zernikes: np.ndarray
@@ -119,6 +123,7 @@ class DonutFit(Result):
     double_zernikes: np.ndarray | None = None
     double_zernike_covariance: np.ndarray | None = None
     degrees_of_freedom: FreedomEstimate | None = None
+    exposure: ExposureWavefront | None = None
 
     def __len__(self) -> int:
         """Return the number of donuts."""
@@ -202,6 +207,8 @@ class DonutFit(Result):
             out["double_zernike_nm"] = self.double_zernikes * 1e9
         if self.degrees_of_freedom is not None:
             out["degrees_of_freedom"] = self.degrees_of_freedom.summary()
+        if self.exposure is not None:
+            out["exposure"] = self.exposure.summary()
         return out
 
     def plot(self, donuts: slice | list[int] | None = None, *, ax: Axes | Figure | None = None) -> Figure:

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +24,9 @@ from .light import Instrument
 from .likelihood import Stamp, model_image
 from .solve import Group, Solution, solve
 from .terms import WavefrontTerms
+
+if TYPE_CHECKING:
+    from .exposure_fit import ExposureWavefront
 
 #: Noll indices of the wavefront that are fitted by default: up to the fifth radial degree.
 NOLL = tuple(range(4, 23))
@@ -43,12 +46,18 @@ class UsableStars:
         Field angles [rad].
     projection : str
         Their meaning.
+    every_field : ndarray, shape [n, 2]
+        Field angles of all stars of the exposure [rad].
+    index : ndarray of int, shape [n_star]
+        Numbers of these stars among them.
     """
 
     instrument: Instrument
     stars: Sequence[StarSolution]
     fields: np.ndarray
     projection: str
+    every_field: np.ndarray
+    index: np.ndarray
 
     @property
     def unknowns(self) -> list[np.ndarray]:
@@ -90,12 +99,13 @@ class FittedStar:
 
 @dataclass(frozen=True)
 class FittedStars:
-    """Results of all usable stars, and what they share: double Zernikes and their covariance, degrees of freedom."""
+    """Results of all usable stars, and what they share: double Zernikes, degrees of freedom, their exposure."""
 
     stars: Sequence[FittedStar]
     double_zernikes: np.ndarray | None = None
     double_zernike_covariance: np.ndarray | None = None
     degrees_of_freedom: FreedomEstimate | None = None
+    exposure: ExposureWavefront | None = None
 
 
 class WavefrontFit(ABC):
@@ -123,6 +133,10 @@ class WavefrontFit(ABC):
     def prepared(self, instrument: Instrument, star: StarFit) -> StarFit:
         """Return a star that was fitted by itself, made ready for :meth:`solved`."""
         return star
+
+    def sided(self, instrument: Instrument, stars: Sequence[StarFit], fields: np.ndarray) -> list[StarFit]:
+        """Return the stars with flags by the side of focus that they say together, where they are compared."""
+        return list(stars)
 
     @abstractmethod
     def solved(self, usable: UsableStars, pool: Executor) -> FittedStars:

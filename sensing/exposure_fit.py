@@ -1,0 +1,342 @@
+"""Fit of all donuts of an exposure: the telescope's wavefront over the field, and each donut's own about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..core.arguments import check_arguments
+from ..core.errors import DomainError
+from ..core.result import Result
+from ..core.units import radians
+from ..design.metrics.field_zernikes import wavefront_zernikes
+from ..design.optimize.sensitivity import sensitivity
+from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
+from ..models.parameters.tolerances import Tolerance
+from ..models.telescope import Telescope
+from ..models.zernike_polynomials import annular_zernikes, noll_to_nm
+from ..wavefront.atmosphere.atmosphere import Atmosphere
+from .air_shape import air_shape
+from .degrees import FreedomEstimate, prior_spreads
+from .fit_star import StarFit
+from .flags import DonutFlag
+from .hierarchy import Basis, Hierarchy, Observations, fit_hierarchy, star_numbers
+from .image_model import STRENGTH
+from .inputs import noll_indices, small_length
+from .light import Instrument
+from .sides import SideAgreement, SideFit, decide_sides, pair_agreement
+from .terms import WavefrontTerms
+from .wavefront_fits import NOLL, FittedStar, FittedStars, UsableStars, WavefrontFit
+
+#: Terms over the field: up to the second degree.
+_FIELD_NOLL = tuple(range(1, 7))
+#: Terms up to the eleventh radial degree, which the air has beside those asked for.
+_AIR_TERMS = 78
+#: Rms of the air's wavefront whose higher terms are fitted, Z4 to Z22 together: that of 4 s [m]. Errors through real
+#: screens fall with it up to there, since speckles are more than the mean wavefront has.
+_SHORT_EXPOSURE = 300e-9
+#: Distance within which donuts on both sides of focus are of one star, if no names are given [rad]: 36 arcsec.
+_SAME_STAR = np.deg2rad(0.01)
+#: Root of the summed squares of the donuts' own wavefronts beyond which they are of no one exposure [m].
+_UNLIKE = 500e-9
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureWavefront(Result):
+    """What the donuts of an exposure say together, beside the telescope's wavefront of each.
+
+    Attributes
+    ----------
+    noll : ndarray of int, shape [n_noll]
+        Noll indices.
+    total : ndarray, shape [n, n_noll]
+        Wavefront of the light of each donut, of telescope and air [m]; NaN where a donut has no result.
+    total_covariance : ndarray, shape [n, n_noll, n_noll]
+        Its covariance [m^2].
+    own : ndarray, shape [n, n_noll]
+        What each donut has beside the telescope's wavefront: `total` less the `zernikes` of the fit [m].
+    air_rms : float
+        Rms of the air's wavefront, Z4 to Z22 together, by the scatter of the donuts [m].
+    noise_scale : float
+        Variance of the errors of the single fits over that claimed by them, by the scatter of the donuts.
+    sides : SideAgreement or None
+        How well both sides of focus agree; None where all donuts are on one.
+    notices : tuple of str
+        What a user should know of the exposure, in sentences.
+    """
+
+    _table: ClassVar[tuple[str, ...]] = ("total", "own")
+
+    noll: np.ndarray
+    total: np.ndarray
+    total_covariance: np.ndarray
+    own: np.ndarray
+    air_rms: float
+    noise_scale: float
+    sides: SideAgreement | None
+    notices: tuple[str, ...]
+
+    def _label(self) -> str:
+        return f"{len(self.total)} donuts, air {1e9 * self.air_rms:.0f} nm rms"
+
+    def _summary(self) -> dict[str, Any]:
+        """Return the results by name and unit, of plain numbers and lists."""
+        sides = self.sides
+        return {
+            "noll": self.noll,
+            "total_nm": 1e9 * self.total,
+            "total_error_nm": 1e9 * np.sqrt(np.diagonal(self.total_covariance, axis1=1, axis2=2)),
+            "own_nm": 1e9 * self.own,
+            "air_rms_nm": 1e9 * self.air_rms,
+            "noise_scale": self.noise_scale,
+            "sides": None
+            if sides is None
+            else {
+                "n_pairs": sides.n_pairs,
+                "rms_nm": 1e9 * sides.rms,
+                "chi2": sides.chi2,
+                "chi2_claimed": sides.chi2_claimed,
+            },
+            "notices": list(self.notices),
+        }
+
+    def at(self, rows: np.ndarray, count: int) -> ExposureWavefront:
+        """Return the same with NaN for the donuts of an exposure of so many that are not among some rows."""
+        n = len(self.noll)
+        total, own, covariance = (
+            np.full((count, n), np.nan),
+            np.full((count, n), np.nan),
+            np.full((count, n, n), np.nan),
+        )
+        total[rows], own[rows], covariance[rows] = self.total, self.own, self.total_covariance
+        return replace(self, total=total, own=own, total_covariance=covariance)
+
+
+@check_arguments
+@dataclass(frozen=True, eq=False)
+class ExposureDonuts(WavefrontFit):
+    """Fit of the donuts of an exposure: the telescope's wavefront, and the air's of each about it.
+
+    For :func:`~pachon.fit_donuts`. Each donut is fitted by itself, with higher terms as the air has them; what their
+    wavefronts have in common over the field is the telescope's, and their scatter about it is the air's. Variances of
+    both are fitted (empirical Bayes). Results are the telescope's wavefront at each donut, with errors that have the
+    air's part; the light's own wavefronts stand in ``fit.exposure``. Donuts of one star on both sides of focus are two
+    exposures and share what the telescope has there. The side of focus is decided by all donuts of a side together.
+
+    Attributes
+    ----------
+    field_noll : iterable of int
+        Noll indices of terms over the field, from 1, whose radius is that of the telescope: those up to the second
+        degree by default. Variances of all but the uniform one are fitted.
+    noll : iterable of int
+        Noll indices of the wavefront, from 4.
+    higher_order : float or Quantity
+        Rms of each further Zernike [m], beside the air's, as in :class:`SingleDonuts`.
+    freedoms : DegreesOfFreedom, optional
+        Degrees of freedom of the telescope in place of terms over the field.
+    prior : array_like, mapping or tolerances, optional
+        Their standard deviations, as in :class:`TelescopeFreedoms`.
+    stars : sequence of int, optional
+        A number for each image, the same for donuts of one star; those within 36 arcsec are of one by default.
+
+    Raises
+    ------
+    DomainError
+        If indices repeat or are too low, or a number is outside its range.
+    """
+
+    joint: ClassVar[bool] = False
+
+    field_noll: Iterable[int] = _FIELD_NOLL
+    noll: Iterable[int] = NOLL
+    higher_order: ArrayLike = 10e-9
+    freedoms: DegreesOfFreedom | None = None
+    prior: ArrayLike | Mapping[str, Any] | Sequence[Tolerance] | None = None
+    stars: Sequence[int] | None = None
+
+    def __post_init__(self) -> None:
+        for name, least in (("field_noll", 1), ("noll", 4)):
+            object.__setattr__(self, name, tuple(noll_indices(getattr(self, name), name, least)))
+        small_length(self.higher_order, "higher_order")
+
+    def terms(self, telescope: Telescope, atmosphere: Atmosphere | None) -> WavefrontTerms:
+        """Return the terms of the wavefront of each star, with the higher ones of the air."""
+        spread, requested = small_length(self.higher_order, "higher_order"), np.array(self.noll)
+        if atmosphere is not None:
+            return replace(
+                WavefrontTerms.of(requested, 200e-9, spread, telescope, atmosphere),
+                air=np.zeros((len(requested), len(requested))),
+            )
+        terms = WavefrontTerms.of(requested, 200e-9, spread)
+        noll = np.arange(4, max(_AIR_TERMS, int(terms.every.max())) + 1)
+        shape = air_shape(int(noll[-1]), telescope.pupil_obscuration, np.inf)
+        further = np.concatenate([terms.further, np.setdiff1d(noll, terms.every)])
+        variance = _SHORT_EXPOSURE**2 * np.diag(shape)[further - 4]
+        low = len(terms.further)
+        variance[:low] += 1.0 / terms.precision[len(requested) :]
+        precision = np.concatenate([np.zeros(len(requested)), 1.0 / variance])
+        return WavefrontTerms(requested, further, precision, terms.air)
+
+    def sided(self, instrument: Instrument, stars: Sequence[StarFit], fields: np.ndarray) -> list[StarFit]:
+        """Return the stars with flags by the side of focus that all of them together say."""
+        donuts = [star.sides for star in stars]
+
+        def smoothness(numbers: np.ndarray, fits: Sequence[SideFit]) -> float:
+            star = self._stars(fields)[numbers]
+            observations = Observations(
+                np.array([fit.zernikes for fit in fits]),
+                np.array([fit.covariance for fit in fits]),
+                star,
+                np.zeros(len(star), dtype=np.int64),
+            )
+            return fit_hierarchy(observations, self._field_basis(instrument, fields[numbers]), _shape(instrument)).loss
+
+        decision = decide_sides(donuts, smoothness)
+        changed = []
+        for star, wrong, decided in zip(stars, decision.wrong, decision.decided, strict=True):
+            if wrong:
+                changed.append(StarFit(DonutFlag.DEFOCUS_SIGN, sides=star.sides))
+            else:
+                changed.append(replace(star, flags=star.flags & ~DonutFlag.AMBIGUOUS_SIDE) if decided else star)
+        return changed
+
+    def solved(self, usable: UsableStars, pool: Executor) -> FittedStars:
+        """Return the telescope's wavefront at each star, with what the scatter of all says of the air."""
+        instrument = usable.instrument
+        n, count = len(instrument.terms.requested), len(usable.stars)
+        zernikes = np.array([star.solution.shared[:n] for star in usable.stars]).reshape(count, n)
+        covariance = np.array([star.solution.shared_covariance[:n, :n] for star in usable.stars]).reshape(count, n, n)
+        if count < 2:
+            return FittedStars(_results(usable, zernikes, covariance))
+        behind = np.array([star.light.depth > 0.0 for star in usable.stars])
+        star = self._stars(usable.every_field)[usable.index]
+        paired = [len(set(behind[star == number])) > 1 for number in np.unique(star)]
+        exposure = behind.astype(np.int64) if any(paired) else np.zeros(count, dtype=np.int64)
+        observations, shape = Observations(zernikes, covariance, star, exposure), _shape(instrument)
+        air = (
+            1e-12 if instrument.known_seeing and not any(s.solution.stars[0][STRENGTH] for s in usable.stars) else None
+        )
+        freedoms = None
+        double: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
+        if self.freedoms is None:
+            basis = self._field_basis(instrument, usable.fields)
+            hierarchy = fit_hierarchy(observations, basis, shape, air)
+            double = hierarchy.terms.reshape(-1, n), hierarchy.term_covariance
+        else:
+            hierarchy, basis, freedoms = self._freedoms(usable, observations, shape, air)
+        sides = None
+        if behind.any() and not behind.all():
+            sizes = hierarchy.sizes
+            sides = pair_agreement(zernikes, covariance, star, behind, sizes.noise, sizes.air**2 * shape)
+            sides = sides or _sides_apart(observations, basis, shape, air, behind)
+        exposure_result = ExposureWavefront(
+            instrument.terms.requested,
+            hierarchy.total,
+            hierarchy.total_covariance,
+            hierarchy.total - hierarchy.telescope,
+            0.0 if air is not None else hierarchy.sizes.air,
+            hierarchy.sizes.noise,
+            sides,
+            _notices(hierarchy, sides),
+        )
+        return FittedStars(
+            _results(usable, hierarchy.telescope, hierarchy.telescope_covariance),
+            *double,
+            degrees_of_freedom=freedoms,
+            exposure=exposure_result,
+        )
+
+    def _stars(self, fields: np.ndarray) -> np.ndarray:
+        """Return the numbers of the stars of all images."""
+        if self.stars is not None and len(self.stars) != len(fields):
+            raise DomainError(f"stars of length {len(self.stars)}: expected a number for each of {len(fields)} images")
+        return star_numbers(fields, _SAME_STAR, self.stars)
+
+    def _field_basis(self, instrument: Instrument, fields: np.ndarray) -> Basis:
+        """Return double Zernikes, term by term over the field."""
+        field_noll, noll = np.array(self.field_noll), instrument.terms.requested
+        places = radians(fields, "fields").T / instrument.telescope.field_radius
+        over_field = annular_zernikes(int(field_noll.max()), *places)[field_noll - 1].T
+        columns = np.einsum("ik,ab->iakb", over_field, np.eye(len(noll))).reshape(len(fields), len(noll), -1)
+        field_degree, pupil_degree = (np.array([noll_to_nm(int(j))[0] for j in js]) for js in (field_noll, noll))
+        return Basis(columns, np.repeat(field_degree, len(noll)), np.tile(pupil_degree, len(field_noll)))
+
+    def _freedoms(
+        self, usable: UsableStars, observations: Observations, shape: np.ndarray, air: float | None
+    ) -> tuple[Hierarchy, Basis, FreedomEstimate]:
+        """Return the wavefronts where the telescope's is made by degrees of freedom, linear about their estimate."""
+        assert self.freedoms is not None
+        instrument, freedoms = usable.instrument, self.freedoms
+        telescope, wavelength, noll = instrument.telescope, instrument.middle, instrument.terms.requested
+        spreads = prior_spreads(freedoms, self.prior, telescope, wavelength)
+        last, where = int(noll.max()), {"fields": usable.fields, "wavelength": wavelength}
+        values = np.zeros(len(freedoms))
+        believed, made = None, np.zeros_like(observations.zernikes)
+        for _ in range(2):
+            state = freedoms.apply(telescope, values)
+            response = sensitivity(state, freedoms, n_zernike=last, projection=usable.projection, **where)
+            columns = response.matrix[:, noll - 1] * spreads
+            coefficients = wavefront_zernikes(state, jmax=last, projection=usable.projection, **where).coefficients
+            believed = coefficients if believed is None else believed
+            made = (coefficients - believed)[:, noll - 1] - columns @ (values / spreads)
+            basis = Basis(columns, variance=np.ones(len(spreads)))
+            hierarchy = fit_hierarchy(replace(observations, zernikes=observations.zernikes - made), basis, shape, air)
+            values = hierarchy.terms * spreads
+        hierarchy = replace(hierarchy, telescope=hierarchy.telescope + made, total=hierarchy.total + made)
+        covariance = hierarchy.term_covariance * np.outer(spreads, spreads)
+        return hierarchy, basis, FreedomEstimate(freedoms, values, covariance, spreads)
+
+
+def _shape(instrument: Instrument) -> np.ndarray:
+    """Return the covariance of the air's terms over that of Z4 to Z22 together."""
+    noll, telescope = instrument.terms.requested, instrument.telescope
+    outer_scale = instrument.model.air.outer_scale / (0.5 * telescope.pupil_diameter)
+    shape = air_shape(max(22, int(noll.max())), telescope.pupil_obscuration, outer_scale)
+    return shape[np.ix_(noll - 4, noll - 4)]
+
+
+def _results(usable: UsableStars, zernikes: np.ndarray, covariance: np.ndarray) -> list[FittedStar]:
+    """Return the results of stars whose images are those of their single fits."""
+    return [
+        FittedStar(star.full, star.model, star.solution.stars[0], star.solution.star_covariance(0), values, spread)
+        for star, values, spread in zip(usable.stars, zernikes, covariance, strict=True)
+    ]
+
+
+def _sides_apart(
+    observations: Observations, basis: Basis, shape: np.ndarray, air: float | None, behind: np.ndarray
+) -> SideAgreement:
+    """Return the agreement of donuts of different stars on both sides, by a step between them beside the basis."""
+    n = observations.zernikes.shape[1]
+    step = np.where(behind, 0.5, -0.5)[:, None, None] * np.eye(n)
+    columns = np.concatenate([basis.columns, step], axis=2)
+    if basis.variance is not None:
+        wider = Basis(columns, variance=np.concatenate([basis.variance, np.full(n, 1e-6**2)]))
+    else:
+        assert basis.field_degree is not None
+        assert basis.pupil_degree is not None
+        field_degree = np.concatenate([basis.field_degree, np.zeros(n, dtype=np.int64)])
+        wider = Basis(columns, field_degree, np.concatenate([basis.pupil_degree, basis.pupil_degree[:n]]))
+    hierarchy = fit_hierarchy(observations, wider, shape, air)
+    difference, spread = hierarchy.terms[-n:], hierarchy.term_covariance[-n:, -n:]
+    chi2 = float(difference @ np.linalg.solve(spread, difference)) / n
+    return SideAgreement(0, float(np.linalg.norm(difference)), np.nan, chi2)
+
+
+def _notices(hierarchy: Hierarchy, sides: SideAgreement | None) -> tuple[str, ...]:
+    """Return what a user should know of the exposure."""
+    notices = []
+    own = float(np.sqrt(np.mean(((hierarchy.total - hierarchy.telescope) ** 2).sum(axis=1))))
+    if own > _UNLIKE:
+        notices.append(
+            f"the donuts scatter by {1e9 * own:.0f} nm about a wavefront that is smooth over the field, more than air "
+            "does: they may not be of one exposure, and belong fitted each alone then"
+        )
+    if sides is not None:
+        notices.append(str(sides))
+    return tuple(notices)
