@@ -15,13 +15,12 @@ from ..core.units import arcseconds
 from ..design.drawing import field_colors
 from ..design.metrics.field_zernikes import name_terms
 from .degrees import FreedomEstimate
+from .exposure import ExposureWavefront
 from .flags import DonutFlag
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from .exposure_fit import ExposureWavefront
 
 #: Donuts of one picture unless others are asked for.
 _SHOWN = 6

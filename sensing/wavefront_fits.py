@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,15 +18,13 @@ from ..models.zernike_polynomials import annular_zernikes
 from ..wavefront.atmosphere.atmosphere import Atmosphere
 from .degrees import FreedomEstimate
 from .donut_rays import ZernikeRays
+from .exposure import ExposureWavefront
 from .fit_star import StarFit, StarSolution
 from .inputs import noll_indices, small_length
 from .light import Instrument
 from .likelihood import Stamp, model_image
 from .solve import Group, Solution, solve
 from .terms import WavefrontTerms
-
-if TYPE_CHECKING:
-    from .exposure_fit import ExposureWavefront
 
 #: Noll indices of the wavefront that are fitted by default: up to the fifth radial degree.
 NOLL = tuple(range(4, 23))
