@@ -37,9 +37,12 @@ from .wavefront_fits import NOLL, FittedStar, FittedStars, UsableStars, Wavefron
 _FIELD_NOLL = tuple(range(1, 7))
 #: Terms up to the eleventh radial degree, which the air has beside those asked for.
 _AIR_TERMS = 78
-#: Rms of the air's wavefront whose higher terms are fitted, Z4 to Z22 together: that of 4 s [m]. Errors through real
-#: screens fall with it up to there, since speckles are more than the mean wavefront has.
-_SHORT_EXPOSURE = 300e-9
+#: Rms of terms up to Z22 that are left out, as in single fits [m].
+_LEFT_OUT = 200e-9
+#: Least rms of the air's wavefront, Z4 to Z22 together, whose higher terms are fitted [m]: they raise the noise.
+_SLIGHT_AIR = 60e-9
+#: Largest rms of the air's wavefront of the prior of its higher terms [m].
+_MOST_AIR = 400e-9
 #: Distance within which donuts on both sides of focus are of one star, if no names are given [rad]: 36 arcsec.
 _SAME_STAR = np.deg2rad(0.01)
 #: Root of the summed squares of the donuts' own wavefronts beyond which they are of no one exposure [m].
@@ -51,11 +54,12 @@ _UNLIKE = 500e-9
 class ExposureDonuts(WavefrontFit):
     """Fit of the donuts of an exposure: the telescope's wavefront, and the air's of each about it.
 
-    For :func:`~pachon.fit_donuts`. Each donut is fitted by itself, with higher terms as the air has them; what their
-    wavefronts have in common over the field is the telescope's, and their scatter about it is the air's. Variances of
-    both are fitted (empirical Bayes). Results are the telescope's wavefront at each donut, with errors that have the
-    air's part; the light's own wavefronts stand in ``fit.exposure``. Donuts of one star on both sides of focus are two
-    exposures and share what the telescope has there. The side of focus is decided by all donuts of a side together.
+    For :func:`~pachon.fit_donuts`. Each donut is fitted by itself; what their wavefronts have in common over the field
+    is the telescope's, and their scatter about it is the air's. Variances of both are fitted (empirical Bayes), and
+    where the air has much, each donut is fitted once more with the higher terms that such air has. Results are the
+    telescope's wavefront at each donut, with errors that have the air's part; the light's own wavefronts stand in
+    ``fit.exposure``. Donuts of one star on both sides of focus are two exposures and share what the telescope has
+    there. The side of focus is decided by all donuts of a side together.
 
     Attributes
     ----------
@@ -94,36 +98,39 @@ class ExposureDonuts(WavefrontFit):
         small_length(self.higher_order, "higher_order")
 
     def terms(self, telescope: Telescope, atmosphere: Atmosphere | None) -> WavefrontTerms:
-        """Return the terms of the wavefront of each star, with the higher ones of the air."""
+        """Return the terms of the wavefront of each star, those of :class:`SingleDonuts`."""
         spread, requested = small_length(self.higher_order, "higher_order"), np.array(self.noll)
-        if atmosphere is not None:
-            return replace(
-                WavefrontTerms.of(requested, 200e-9, spread, telescope, atmosphere),
-                air=np.zeros((len(requested), len(requested))),
-            )
-        terms = WavefrontTerms.of(requested, 200e-9, spread)
+        terms = WavefrontTerms.of(requested, _LEFT_OUT, spread, telescope, atmosphere)
+        # The air's part is shared, and is added to the errors of all stars together.
+        return replace(terms, air=np.zeros_like(terms.air))
+
+    def refined(self, instrument: Instrument, fitted: FittedStars) -> WavefrontTerms | None:
+        """Return terms with the higher ones of the air where the scatter of the stars says that there is some."""
+        exposure, known = fitted.exposure, instrument.model.air.atmosphere is not None
+        if known or exposure is None or exposure.air_rms < _SLIGHT_AIR:
+            return None
+        terms, telescope = instrument.terms, instrument.telescope
         noll = np.arange(4, max(_AIR_TERMS, int(terms.every.max())) + 1)
-        shape = air_shape(int(noll[-1]), telescope.pupil_obscuration, np.inf)
         further = np.concatenate([terms.further, np.setdiff1d(noll, terms.every)])
-        variance = _SHORT_EXPOSURE**2 * np.diag(shape)[further - 4]
-        low = len(terms.further)
-        variance[:low] += 1.0 / terms.precision[len(requested) :]
-        precision = np.concatenate([np.zeros(len(requested)), 1.0 / variance])
-        return WavefrontTerms(requested, further, precision, terms.air)
+        variance = np.diag(air_shape(int(noll[-1]), telescope.pupil_obscuration, _outer_scale(instrument)))
+        variance = min(exposure.air_rms, _MOST_AIR) ** 2 * variance[further - 4]
+        variance[: len(terms.further)] += 1.0 / terms.precision[len(terms.requested) :]
+        precision = np.concatenate([np.zeros(len(terms.requested)), 1.0 / variance])
+        return WavefrontTerms(terms.requested, further, precision, terms.air)
 
     def sided(self, instrument: Instrument, stars: Sequence[StarFit], fields: np.ndarray) -> list[StarFit]:
         """Return the stars with flags by the side of focus that all of them together say."""
-        donuts = [star.sides for star in stars]
+        donuts, numbers = [star.sides for star in stars], self._stars(fields)
 
-        def smoothness(numbers: np.ndarray, fits: Sequence[SideFit]) -> float:
-            star = self._stars(fields)[numbers]
+        def smoothness(index: np.ndarray, fits: Sequence[SideFit]) -> float:
+            star = numbers[index]
             observations = Observations(
                 np.array([fit.zernikes for fit in fits]),
                 np.array([fit.covariance for fit in fits]),
                 star,
                 np.zeros(len(star), dtype=np.int64),
             )
-            return fit_hierarchy(observations, self._field_basis(instrument, fields[numbers]), _shape(instrument)).loss
+            return fit_hierarchy(observations, self._field_basis(instrument, fields[index]), _shape(instrument)).loss
 
         decision = decide_sides(donuts, smoothness)
         changed = []
@@ -224,9 +231,13 @@ class ExposureDonuts(WavefrontFit):
 def _shape(instrument: Instrument) -> np.ndarray:
     """Return the covariance of the air's terms over that of Z4 to Z22 together."""
     noll, telescope = instrument.terms.requested, instrument.telescope
-    outer_scale = instrument.model.air.outer_scale / (0.5 * telescope.pupil_diameter)
-    shape = air_shape(max(22, int(noll.max())), telescope.pupil_obscuration, outer_scale)
+    shape = air_shape(max(22, int(noll.max())), telescope.pupil_obscuration, _outer_scale(instrument))
     return shape[np.ix_(noll - 4, noll - 4)]
+
+
+def _outer_scale(instrument: Instrument) -> float:
+    """Return the outer scale of the turbulence over the radius of the pupil."""
+    return float(instrument.model.air.outer_scale) / (0.5 * instrument.telescope.pupil_diameter)
 
 
 def _results(usable: UsableStars, zernikes: np.ndarray, covariance: np.ndarray) -> list[FittedStar]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -134,25 +135,40 @@ def fit_donuts(
     shifts = model.detector.shifts(len(observed))
     strengths = model.air.strengths(instrument.seeing, len(observed))
 
-    def fitted_alone(index: int) -> StarFit:
-        star = _fit_alone(instrument, observed.star(index), float(shifts[index]), float(strengths[index]), fit.joint)
-        if progress is not None:
-            progress(1)
-        return fit.prepared(instrument, star)
-
     with one_blas_thread(), ThreadPoolExecutor(thread_count(threads)) as pool:
-        stars = list(pool.map(fitted_alone, range(len(observed))))
-        stars = fit.sided(instrument, stars, observed.fields)
-        solutions = {i: star.usable for i, star in enumerate(stars) if star.usable is not None}
-        if fit.joint and not solutions:
-            raise DomainError(f"no usable donut: {stars[0].flags.reasons if stars else 'no images'}")
-        index = np.array(list(solutions), dtype=np.int64)
-        usable = UsableStars(
-            instrument, list(solutions.values()), observed.fields[index], projection, observed.fields, index
-        )
-        fitted = fit.solved(usable, pool)
-    flags = np.array([int(star.flags) for star in stars], dtype=np.int64)
-    return _result(instrument, observed, flags, index, fitted)
+
+        def fitted_stars(instrument: Instrument, report: Callable[[int], None] | None) -> _Fitted:
+            def fitted_alone(i: int) -> StarFit:
+                star = _fit_alone(instrument, observed.star(i), float(shifts[i]), float(strengths[i]), fit.joint)
+                if report is not None:
+                    report(1)
+                return fit.prepared(instrument, star)
+
+            stars = fit.sided(instrument, list(pool.map(fitted_alone, range(len(observed)))), observed.fields)
+            solutions = {i: star.usable for i, star in enumerate(stars) if star.usable is not None}
+            if fit.joint and not solutions:
+                raise DomainError(f"no usable donut: {stars[0].flags.reasons if stars else 'no images'}")
+            index = np.array(list(solutions), dtype=np.int64)
+            usable = UsableStars(
+                instrument, list(solutions.values()), observed.fields[index], projection, observed.fields, index
+            )
+            flags = np.array([int(star.flags) for star in stars], dtype=np.int64)
+            return _Fitted(flags, index, fit.solved(usable, pool))
+
+        fitted = fitted_stars(instrument, progress)
+        terms = fit.refined(instrument, fitted.stars)
+        if terms is not None:
+            instrument = Instrument.of(telescope, model, terms)
+            fitted = fitted_stars(instrument, None)
+    return _result(instrument, observed, fitted.flags, fitted.usable, fitted.stars)
+
+
+class _Fitted(NamedTuple):
+    """Flags of all stars [n], numbers of the usable ones, and their results."""
+
+    flags: np.ndarray
+    usable: np.ndarray
+    stars: FittedStars
 
 
 def _wavefront_fit(

@@ -136,6 +136,10 @@ class WavefrontFit(ABC):
         """Return the stars with flags by the side of focus that they say together, where they are compared."""
         return list(stars)
 
+    def refined(self, instrument: Instrument, fitted: FittedStars) -> WavefrontTerms | None:
+        """Return terms with which all stars are fitted once more, by what a first fit has found; None for no other."""
+        return None
+
     @abstractmethod
     def solved(self, usable: UsableStars, pool: Executor) -> FittedStars:
         """Return the results of the usable stars."""
