@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from ..core.plotting import BLUE, figure_at, styled
 from ..core.result import Result
+from ..design.metrics.field_zernikes import name_terms
 from .sides import SideAgreement
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +75,21 @@ class ExposureWavefront(Result):
             },
             "notices": list(self.notices),
         }
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw what each donut has beside the telescope's wavefront, with the errors of its light's wavefront."""
+        errors = np.sqrt(np.diagonal(self.total_covariance, axis1=1, axis2=2))
+        with styled():
+            figure = figure_at(ax, 8.0, 4.0)
+            bars = figure.subplots()
+            width = 0.8 / max(len(self.own), 1)
+            for k, (own, error) in enumerate(zip(self.own, errors, strict=True)):
+                place = self.noll + (k - 0.5 * (len(self.own) - 1)) * width
+                bars.errorbar(place, own * 1e9, error * 1e9, fmt=".", color=BLUE, markersize=3, linewidth=0.7)
+            bars.axhline(0.0, color="0.3", linewidth=0.7)
+            name_terms(bars, self.noll)
+            bars.set_ylabel("donut less telescope [nm]")
+            return figure
 
     def at(self, rows: np.ndarray, count: int) -> ExposureWavefront:
         """Return the same with NaN for the donuts of an exposure of so many that are not among some rows."""
