@@ -149,6 +149,14 @@ def donuts_command(
             rich_help_panel=_FIT,
         ),
     ] = None,
+    each_alone: Annotated[
+        bool,
+        Option(
+            "--each-alone",
+            help="Fit each donut alone, even where several are given of one exposure.",
+            rich_help_panel=_FIT,
+        ),
+    ] = False,
     outer_scale_m: Annotated[
         float, Option(help="Outer scale of the turbulence [m]; inf for Kolmogorov's.", rich_help_panel=_FIT)
     ] = 25.0,
@@ -243,7 +251,8 @@ def donuts_command(
     extensions MASK, VARIANCE (DQ, WEIGHT) are read. Stamps have x and y along those of the camera, unless --stamp-axes
     or the header's detector says otherwise. A defocus moves what --moved, a keyword MOVED or a column moved names, or
     the header's camera: Camera (full-array mode of LSSTCam), M2 (AuxTel), else the detector. Bad donuts are flagged
-    with the reason.
+    with the reason. Two donuts or more are taken to be of one exposure, or of both sides of focus: they are fitted
+    together (--each-alone: not).
 
     **Examples**
 
@@ -258,6 +267,7 @@ def donuts_command(
     - `pachon donuts stamps.fits --stamp-axes DVCS --rotator-deg 12.3 --degrees-of-freedom lsst --frame ZCS`
     """
     from ..models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
+    from ..sensing.exposure_fit import ExposureDonuts
     from ..sensing.fit import fit_donuts
     from ..sensing.flags import DonutFlag
     from ..sensing.frames import FRAMES
@@ -301,11 +311,14 @@ def donuts_command(
         load_model(telescope or header.model or DEFAULT_TELESCOPE, lenient, glass_catalogue or ())
     )
     noll = range(4, terms + 1)
-    wavefront: WavefrontFit = SingleDonuts(noll, higher_order=higher_order_nm * 1e-9)
-    if degrees_of_freedom is not None:
-        wavefront = TelescopeFreedoms(load_degrees_of_freedom(degrees_of_freedom), noll=noll)
     atmosphere = None if exposure_s is None else Atmosphere.from_site(site, 0, exposure=exposure_s)
     inputs = donut_inputs(files_read, options, frames, believed, _electrons(gain, header))
+    higher_order = higher_order_nm * 1e-9
+    wavefront: WavefrontFit = ExposureDonuts(noll=noll, higher_order=higher_order)
+    if degrees_of_freedom is not None:
+        wavefront = TelescopeFreedoms(load_degrees_of_freedom(degrees_of_freedom), noll=noll)
+    elif each_alone or len(inputs.images) < 2:
+        wavefront = SingleDonuts(noll, higher_order=higher_order)
     model = DonutModel(
         air=DonutAir(outer_scale=outer_scale_m, atmosphere=atmosphere),
         detector=DonutDetector(
@@ -444,3 +457,29 @@ def _show(fit: DonutFit, converted: ObservatoryZernikes, motions: BodyMotions | 
     Rows(headings, rows, caption, left=2).show()
     if motions is not None:
         Rows(*motion_rows(motions), left=1).show()
+    for line in _remarks(fit):
+        typer.echo(line)
+
+
+def _remarks(fit: DonutFit) -> list[str]:
+    """Return what is to be said of all donuts together, in sentences."""
+    from ..sensing.flags import DonutFlag
+
+    remarks, exposure = [], fit.exposure
+    wrong, ambiguous = (
+        int(sum(bool(flag & bit) for flag in fit.flags)) for bit in (DonutFlag.DEFOCUS_SIGN, DonutFlag.AMBIGUOUS_SIDE)
+    )
+    if wrong:
+        remarks.append(f"{wrong} of {len(fit)} donuts fit the other side of focus: the sign of their defocus is wrong.")
+    if ambiguous:
+        remarks.append(
+            f"{ambiguous} of {len(fit)} donuts fit both sides of focus: results are those of the side given."
+        )
+    if exposure is not None:
+        remarks.append(
+            f"{int(fit.usable.sum())} donuts are fitted as of one telescope (--each-alone: each by itself). By their "
+            f"scatter the air has {1e9 * exposure.air_rms:.0f} nm rms, which the errors include, and the fits "
+            f"{exposure.noise_scale:.2g} times the variance that they claim."
+        )
+        remarks += [notice[0].upper() + notice[1:] + "." for notice in exposure.notices]
+    return remarks

@@ -299,6 +299,8 @@ from .reconstruction.psf_model.spectrum import psf_of_spectrum as psf_of_spectru
 from .reconstruction.psfex import PsfexPsf as PsfexPsf
 from .reconstruction.psfex import load_psfex as load_psfex
 from .sensing.degrees import FreedomEstimate as FreedomEstimate
+from .sensing.exposure import ExposureWavefront as ExposureWavefront
+from .sensing.exposure_fit import ExposureDonuts as ExposureDonuts
 from .sensing.fit import fit_donuts as fit_donuts
 from .sensing.flags import DonutFlag as DonutFlag
 from .sensing.frames import DonutFrames as DonutFrames

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +17,7 @@ from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ..models.telescope import Telescope
 from ..wavefront.psf.light import Light
 from .bad_pixels import grown
-from .fit_star import SMALLEST_DONUT, StarFit, fit_star
+from .fit_star import SMALLEST_DONUT, StarFit, StarSolution, fit_star
 from .flags import DonutFlag
 from .freedom_fit import TelescopeFreedoms
 from .image_model import (
@@ -133,9 +134,10 @@ def fit_donuts(
     model : DonutModel, optional
         What the images are made of: light, air, detector (defocus and heights among it), diffraction, second stars; by
         default light through air of unknown seeing, in one plane, with diffraction where that fits better.
-    fit : SingleDonuts, FieldTerms or TelescopeFreedoms, optional
-        Unknowns of the wavefront, with the options of their fit: Zernikes of each donut (the default), double Zernikes
-        over the field, or degrees of freedom of the telescope for all donuts together.
+    fit : SingleDonuts, ExposureDonuts, FieldTerms or TelescopeFreedoms, optional
+        Unknowns of the wavefront, with the options of their fit: Zernikes of each donut (the default), the same
+        with what donuts of an exposure have in common, double Zernikes over the field, or degrees of freedom of the
+        telescope for all donuts together.
     mask : array_like of bool, as `images`, optional
         True, or 1, at pixels to leave out.
     projection : {"zemax", "gnomonic", "postel"}
@@ -164,32 +166,50 @@ def fit_donuts(
     shifts = model.detector.shifts(len(observed))
     strengths = model.air.strengths(instrument.seeing, len(observed))
 
-    def fitted_alone(index: int) -> StarFit:
-        return _fit_alone(instrument, observed.star(index), float(shifts[index]), float(strengths[index]), fit.joint)
-
-    def prepared(index: int) -> StarFit:
-        star = of_rays.get(index) or fitted_alone(index)
-        if progress is not None:
-            progress(1)
-        return fit.prepared(instrument, star)
-
     with one_blas_thread(), ThreadPoolExecutor(thread_count(threads)) as pool:
-        of_rays: dict[int, StarFit] = {}
+
+        def alone(instrument: Instrument, i: int) -> StarFit:
+            return _fit_alone(instrument, observed.star(i), float(shifts[i]), float(strengths[i]), fit.joint)
+
+        def fitted_stars(
+            instrument: Instrument, ready: dict[int, StarFit], report: Callable[[int], None] | None
+        ) -> _Fitted:
+            def prepared(i: int) -> StarFit:
+                star = ready.get(i) or alone(instrument, i)
+                if report is not None:
+                    report(1)
+                return fit.prepared(instrument, star)
+
+            stars = fit.sided(instrument, list(pool.map(prepared, range(len(observed)))), observed.fields)
+            solutions = {i: star.usable for i, star in enumerate(stars) if star.usable is not None}
+            if fit.joint and not solutions:
+                raise DomainError(f"no usable donut: {stars[0].flags.reasons if stars else 'no images'}")
+            index = np.array(list(solutions), dtype=np.int64)
+            usable = UsableStars(
+                instrument, list(solutions.values()), observed.fields[index], projection, observed.fields, index
+            )
+            return _Fitted(stars, solutions, fit.solved(usable, pool))
+
+        ready: dict[int, StarFit] = {}
         if model.diffraction is None:
-            of_rays, diffraction = _by_rays(instrument, fitted_alone, len(observed), pool)
-            of_rays = {} if diffraction else of_rays
-            instrument = replace(instrument, model=replace(model, diffraction=diffraction))
-        stars = list(pool.map(prepared, range(len(observed))))
-        solutions = {i: star.usable for i, star in enumerate(stars) if star.usable is not None}
-        if fit.joint and not solutions:
-            raise DomainError(f"no usable donut: {stars[0].flags.reasons if stars else 'no images'}")
-        usable = UsableStars(instrument, list(solutions.values()), observed.fields[list(solutions)], projection)
-        fitted = fit.solved(usable, pool)
-    flags = np.array([int(star.flags) for star in stars], dtype=np.int64)
-    rims = {i: moved_rims(instrument, solution) for i, solution in solutions.items()}
-    scales = np.array([(star.unit, star.level) for star in stars])
-    result = _result(instrument, observed, flags, scales, np.array(list(solutions), dtype=np.int64), fitted)
-    return replace(result, rims=rim_table(rims))
+            ready, diffraction = _by_rays(instrument, lambda i: alone(instrument, i), len(observed), pool)
+            ready = {} if diffraction else ready
+            model = replace(model, diffraction=diffraction)
+            instrument = replace(instrument, model=model)
+        fitted = fitted_stars(instrument, ready, progress)
+        terms = fit.refined(instrument, fitted.results)
+        if terms is not None:
+            instrument = Instrument.of(telescope, model, terms)
+            fitted = fitted_stars(instrument, {}, None)
+    return _result(instrument, observed, fitted)
+
+
+class _Fitted(NamedTuple):
+    """Outcomes of all stars, solutions of the usable ones by their numbers, and the results of these."""
+
+    stars: list[StarFit]
+    solutions: dict[int, StarSolution]
+    results: FittedStars
 
 
 def _wavefront_fit(
@@ -280,16 +300,11 @@ def _saturated(image: np.ndarray, masked: np.ndarray, level: float | None) -> np
     return plateau if top > _FAINT and plateau.sum() > max(_SEVERAL * image.size, 1.0) else np.zeros_like(masked)
 
 
-def _result(
-    instrument: Instrument,
-    observed: ObservedStars,
-    flags: np.ndarray,
-    scales: np.ndarray,
-    usable: np.ndarray,
-    fitted: FittedStars,
-) -> DonutFit:
+def _result(instrument: Instrument, observed: ObservedStars, fits: _Fitted) -> DonutFit:
     """Return the result of a fit: rows of the usable stars, and NaN for the others."""
-    units, levels = scales.T
+    fitted, usable = fits.results, np.array(list(fits.solutions), dtype=np.int64)
+    flags = np.array([int(star.flags) for star in fits.stars], dtype=np.int64)
+    units, levels = np.array([(star.unit, star.level) for star in fits.stars]).T
     count, n_noll = len(observed), len(instrument.terms.requested)
     zernikes, covariance = np.full((count, n_noll), np.nan), np.full((count, n_noll, n_noll), np.nan)
     values, errors = np.full((2, count, len(NUISANCES) + MOST_NEIGHBOURS * len(NEIGHBOUR)), np.nan)
@@ -345,4 +360,6 @@ def _result(
         degrees_of_freedom=fitted.degrees_of_freedom,
         projection=observed.projection,
         diffraction=bool(instrument.model.diffraction),
+        rims=rim_table({i: moved_rims(instrument, solution) for i, solution in fits.solutions.items()}),
+        exposure=None if fitted.exposure is None else fitted.exposure.at(usable, count),
     )

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..core.statistics import RMS_PER_MAD
+from ..models.zernike_polynomials import noll_to_nm
 from .bad_pixels import unused_regions, without_bad_pixels, without_outliers
 from .donut_rays import ZernikeRays
 from .flags import DonutFlag
@@ -19,6 +20,7 @@ from .likelihood import Stamp, model_image, pulls
 from .neighbours import NeighbourSearch, explains_more
 from .noise import measured_noise
 from .rim_search import RimFit, with_moved_rims
+from .sides import BothSides, SideFit
 from .solve import COARSE, FINE, STEPS, Group, Solution, solve
 from .stamps import Match, Pixels, match_template, measured_variance, plane_basis
 
@@ -35,6 +37,8 @@ _MISFIT = 0.15
 _CUT_OFF = 0.05
 #: Fraction of the light beside the stamp or on unused pixels from which on a donut is lost: a little more than half.
 _LOST = 0.55
+#: Steps of the fit on the other side of focus.
+_MIRRORED_STEPS = 8
 #: Least fraction of the variance of the image that the model explains.
 _EXPLAINED = 0.5
 #: Pulls of pixels that are clipped, over that of typical pixels.
@@ -103,12 +107,15 @@ class StarFit:
         Its best model, unless it failed.
     unit, level : float
         The image is that of the solution, whose light has the noise of electrons, times a unit, above a level.
+    sides : BothSides, optional
+        Fits on both sides of focus.
     """
 
     flags: DonutFlag
     best: StarSolution | None = None
     unit: float = 1.0
     level: float = 0.0
+    sides: BothSides | None = None
 
     @property
     def usable(self) -> StarSolution | None:
@@ -155,10 +162,11 @@ def fit_star(
         search = search.fitter.masked_search(search)
     if donut and search.misfit > _POOR and not _is_between(_size(search.start.stamp, search.best), _LIKE_DONUTS):
         return StarFit(DonutFlag.NO_DONUT | DonutFlag.OTHER_SIZE)
+    sides = search.fitter.both_sides(search.start, search.best) if donut and wavefront else None
     explained = _explained(search.start.stamp, search.best)
     # Before rims are free, with which the wrong side of focus fits much.
     if donut and explained and search.fitter.other_focus_is_better(search.start, search.best):
-        return StarFit(DonutFlag.DEFOCUS_SIGN)
+        return StarFit(DonutFlag.DEFOCUS_SIGN, sides=sides)
     if donut and wavefront and instrument.model.rims.search:
         search = search.fitter.search_of_rims(search)
     fitter, start, best = search.fitter, search.start, search.best
@@ -182,9 +190,11 @@ def fit_star(
         flags |= DonutFlag.CUT_OFF
     if not _is_between(_size(finest.stamp, finest.solution), _SIZES):
         flags |= DonutFlag.OTHER_SIZE
+    if sides is not None and sides.ambiguous:
+        flags |= DonutFlag.AMBIGUOUS_SIDE
     if sky_level is not None and flags.usable:
-        return StarFit(flags, *fitter.with_measured_noise(finest, sky_level))
-    return StarFit(flags, finest)
+        return StarFit(flags, *fitter.with_measured_noise(finest, sky_level), sides=sides)
+    return StarFit(flags, finest, sides=sides)
 
 
 @dataclass(frozen=True)
@@ -555,6 +565,31 @@ class _StarFitter:
         return NeighbourSearch(
             room, self.solve, start.unknowns, start.template, diameter, _noise(start.pixels)
         ).from_single(single)
+
+    def both_sides(self, start: _Start, solution: Solution) -> BothSides | None:
+        """Return the fits on the side of focus that is given and on the other one; None for blends.
+
+        About the axis a wavefront W of one side of focus and -W turned by 180 degrees of the other make one image: the
+        search starts there.
+        """
+        star = solution.stars[0]
+        if len(star) > RATIO:
+            return None
+        noll = self._instrument.noll
+        mirrored = self.stamp(self._instrument.mirrored(self._light), start.pixels)
+        shared = np.zeros_like(solution.shared)
+        even = np.array([noll_to_nm(int(j))[0] % 2 == 0 for j in noll])
+        shared[: len(noll)] = np.where(even, -1.0, 1.0) * solution.shared[: len(noll)]
+        other = self.solve(mirrored, star, shared, COARSE, _MIRRORED_STEPS)
+        # What no side explains is in units of what is left.
+        least = min(solution.loss, other.loss) / start.stamp.used.sum()
+        scale = 1.0 / max(1.0, least / _MISFIT)
+        n = len(self._instrument.terms.requested)
+        given, turned = (
+            SideFit(scale * side.loss, side.shared[:n], side.shared_covariance[:n, :n] / scale)
+            for side in (solution, other)
+        )
+        return BothSides(given, turned, self._light.depth)
 
     def other_focus_is_better(self, start: _Start, solution: Solution) -> bool:
         """Return whether the image fits a detector on the other side of focus better."""

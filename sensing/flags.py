@@ -16,6 +16,9 @@ class DonutFlag(IntFlag):
     a rim or a spider stands elsewhere than the prescription has it, and was fitted too. ``ORIENTATION``: stamps of the
     exposure fit better as mirror images, or turned by quarters (set by the command).
 
+    So is ``AMBIGUOUS_SIDE``: the image fits as well on the other side of focus, with another wavefront; results are
+    those of the side that is given.
+
     With any other flag the results of the donut are NaN. ``NO_DONUT``: nothing like a donut stands on the stamp.
     ``MOSTLY_LOST``: more than 55 % of the light falls beside the stamp or on pixels that are not used. ``SATURATED``,
     ``NOT_FINITE``: pixels that are saturated or not finite are the reason why the remaining ones have no result.
@@ -39,6 +42,7 @@ class DonutFlag(IntFlag):
     POOR_FIT = 2048
     RIM_MOVED = 4096
     OTHER_SIZE = 8192
+    AMBIGUOUS_SIDE = 16384
     MOSTLY_LOST = 32768
     ORIENTATION = 65536
 
@@ -61,5 +65,6 @@ _REMARKS = (
     | DonutFlag.POOR_FIT
     | DonutFlag.OTHER_SIZE
     | DonutFlag.RIM_MOVED
+    | DonutFlag.AMBIGUOUS_SIDE
     | DonutFlag.ORIENTATION
 )

@@ -15,6 +15,7 @@ from ..core.units import arcseconds
 from ..design.drawing import field_colors
 from ..design.metrics.field_zernikes import name_terms
 from .degrees import FreedomEstimate
+from .exposure import ExposureWavefront
 from .flags import DonutFlag
 from .frames import DonutFrames
 from .observatory_zernikes import ObservatoryZernikes, observatory_zernikes
@@ -129,6 +130,8 @@ class DonutFit(Result):
         donut by itself.
     diffraction : bool
         Whether the model has light diffracted at the rims of the pupil.
+    exposure : ExposureWavefront or None
+        Wavefronts of the light of the donuts, air and both sides of focus, of :class:`~pachon.ExposureDonuts`.
     """
 
     zernikes: np.ndarray
@@ -163,6 +166,7 @@ class DonutFit(Result):
     projection: str = "zemax"
     rims: QTable = field(default_factory=lambda: rim_table({}))
     diffraction: bool = False
+    exposure: ExposureWavefront | None = None
 
     def __len__(self) -> int:
         """Return the number of donuts."""
@@ -309,6 +313,8 @@ class DonutFit(Result):
             out["double_zernike_nm"] = self.double_zernikes * 1e9
         if self.degrees_of_freedom is not None:
             out["degrees_of_freedom"] = self.degrees_of_freedom.summary()
+        if self.exposure is not None:
+            out["exposure"] = self.exposure.summary()
         return out
 
     def plot(self, donuts: slice | list[int] | None = None, *, ax: Axes | Figure | None = None) -> Figure:

@@ -65,6 +65,12 @@ class ErrorParts:
         """Return the parts of a donut that is compared with no other."""
         return cls(photons, residuals, air, floor, photons + residuals + air + floor)
 
+    def divided(self, total: np.ndarray) -> ErrorParts:
+        """Return a covariance [n_noll, n_noll] of another fit of the donut, its causes in the shares of these ones."""
+        causes = (self.photons, self.residuals, self.air, self.floor)
+        shares = np.array([np.trace(cause) for cause in causes]) / np.trace(self.total)
+        return ErrorParts.of(*(share * total for share in shares))
+
     @property
     def total(self) -> np.ndarray:
         """Sum of all."""

@@ -20,6 +20,7 @@ from ..wavefront.atmosphere.atmosphere import Atmosphere
 from .cross_check import cross_checked
 from .degrees import FreedomEstimate
 from .donut_rays import ZernikeRays
+from .exposure import ExposureWavefront
 from .fit_star import StarFit, StarSolution
 from .inputs import noll_indices, small_length
 from .light import Instrument
@@ -46,12 +47,18 @@ class UsableStars:
         Field angles [rad].
     projection : str
         Their meaning.
+    every_field : ndarray, shape [n, 2]
+        Field angles of all stars of the exposure [rad].
+    index : ndarray of int, shape [n_star]
+        Numbers of these stars among them.
     """
 
     instrument: Instrument
     stars: Sequence[StarSolution]
     fields: np.ndarray
     projection: str
+    every_field: np.ndarray
+    index: np.ndarray
 
     @property
     def unknowns(self) -> list[np.ndarray]:
@@ -93,12 +100,13 @@ class FittedStar:
 
 @dataclass(frozen=True)
 class FittedStars:
-    """Results of all usable stars, and what they share: double Zernikes and their covariance, degrees of freedom."""
+    """Results of all usable stars, and what they share: double Zernikes, degrees of freedom, their exposure."""
 
     stars: Sequence[FittedStar]
     double_zernikes: np.ndarray | None = None
     double_zernike_covariance: np.ndarray | None = None
     degrees_of_freedom: FreedomEstimate | None = None
+    exposure: ExposureWavefront | None = None
 
 
 class WavefrontFit(ABC):
@@ -126,6 +134,14 @@ class WavefrontFit(ABC):
     def prepared(self, instrument: Instrument, star: StarFit) -> StarFit:
         """Return a star that was fitted by itself, made ready for :meth:`solved`."""
         return star
+
+    def sided(self, instrument: Instrument, stars: Sequence[StarFit], fields: np.ndarray) -> list[StarFit]:
+        """Return the stars with flags by the side of focus that they say together, where they are compared."""
+        return list(stars)
+
+    def refined(self, instrument: Instrument, fitted: FittedStars) -> WavefrontTerms | None:
+        """Return terms with which all stars are fitted once more, by what a first fit has found; None for no other."""
+        return None
 
     @abstractmethod
     def solved(self, usable: UsableStars, pool: Executor) -> FittedStars:

@@ -402,6 +402,8 @@ def calls(folder):
                               "mask": [np.zeros(i.shape, bool) for i in m.donuts.images], "projection": "zemax",
                               "donuts": 1, "threads": 1}),
         "SingleDonuts": (pachon.SingleDonuts, {"noll": (4, 5), "left_out": 0.0, "higher_order": 0.0}),
+        "ExposureDonuts": (pachon.ExposureDonuts, {"field_noll": (1, 2), "noll": (4, 5), "higher_order": 0.0,
+                           "freedoms": m.dofs, "prior": None, "stars": [0, 0]}),
         "FieldTerms": (pachon.FieldTerms, {"field_noll": (1, 2), "noll": (4, 5), "higher_order": 0.0}),
         "TelescopeFreedoms": (pachon.TelescopeFreedoms, {"freedoms": m.dofs, "prior": None, "noll": (4, 5)}),
         "align": (pachon.align, {"config": pachon.AlignConfig(telescope="none.yaml"), "execution": m.execution}),

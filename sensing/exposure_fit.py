@@ -1,0 +1,288 @@
+"""Fit of all donuts of an exposure: the telescope's wavefront over the field, and each donut's own about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..core.arguments import check_arguments
+from ..core.errors import DomainError
+from ..core.units import radians
+from ..design.metrics.field_zernikes import wavefront_zernikes
+from ..design.optimize.sensitivity import sensitivity
+from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
+from ..models.parameters.tolerances import Tolerance
+from ..models.telescope import Telescope
+from ..models.zernike_polynomials import annular_zernikes, noll_to_nm
+from ..wavefront.atmosphere.atmosphere import Atmosphere
+from .air_shape import air_shape
+from .degrees import FreedomEstimate, prior_spreads
+from .exposure import ExposureWavefront
+from .fit_star import StarFit
+from .flags import DonutFlag
+from .hierarchy import Basis, Hierarchy, Observations, fit_hierarchy, star_numbers
+from .image_model import STRENGTH
+from .inputs import noll_indices, small_length
+from .light import Instrument
+from .sides import SideAgreement, SideFit, decide_sides, pair_agreement
+from .star_errors import StarErrors, star_errors
+from .terms import WavefrontTerms
+from .wavefront_fits import NOLL, FittedStar, FittedStars, UsableStars, WavefrontFit
+
+#: Terms over the field: up to the second degree.
+_FIELD_NOLL = tuple(range(1, 7))
+#: Terms up to the eleventh radial degree, which the air has beside those asked for.
+_AIR_TERMS = 78
+#: Rms of terms up to Z22 that are left out, as in single fits [m].
+_LEFT_OUT = 200e-9
+#: Least rms of the air's wavefront, Z4 to Z22 together, whose higher terms are fitted [m]: they raise the noise.
+_SLIGHT_AIR = 60e-9
+#: Largest rms of the air's wavefront of the prior of its higher terms [m].
+_MOST_AIR = 400e-9
+#: Distance within which donuts on both sides of focus are of one star, if no names are given [rad]: 36 arcsec.
+_SAME_STAR = np.deg2rad(0.01)
+#: Root of the summed squares of the donuts' own wavefronts beyond which they are of no one exposure [m].
+_UNLIKE = 500e-9
+
+
+@check_arguments
+@dataclass(frozen=True, eq=False)
+class ExposureDonuts(WavefrontFit):
+    """Fit of the donuts of an exposure: the telescope's wavefront, and the air's of each about it.
+
+    For :func:`~pachon.fit_donuts`. Each donut is fitted by itself; what their wavefronts have in common over the field
+    is the telescope's, and their scatter about it is the air's. Variances of both are fitted (empirical Bayes), and
+    where the air has much, each donut is fitted once more with the higher terms that such air has. Results are the
+    telescope's wavefront at each donut, with errors that have the air's part; the light's own wavefronts stand in
+    ``fit.exposure``. Donuts of one star on both sides of focus are two exposures and share what the telescope has
+    there. The side of focus is decided by all donuts of a side together.
+
+    Attributes
+    ----------
+    field_noll : iterable of int
+        Noll indices of terms over the field, from 1, whose radius is that of the telescope: those up to the second
+        degree by default. Variances of all but the uniform one are fitted.
+    noll : iterable of int
+        Noll indices of the wavefront, from 4.
+    higher_order : float or Quantity
+        Rms of each further Zernike [m], beside the air's, as in :class:`SingleDonuts`.
+    freedoms : DegreesOfFreedom, optional
+        Degrees of freedom of the telescope in place of terms over the field.
+    prior : array_like, mapping or tolerances, optional
+        Their standard deviations, as in :class:`TelescopeFreedoms`.
+    stars : sequence of int, optional
+        A number for each image, the same for donuts of one star; those within 36 arcsec are of one by default.
+
+    Raises
+    ------
+    DomainError
+        If indices repeat or are too low, or a number is outside its range.
+    """
+
+    joint: ClassVar[bool] = False
+
+    field_noll: Iterable[int] = _FIELD_NOLL
+    noll: Iterable[int] = NOLL
+    higher_order: ArrayLike = 10e-9
+    freedoms: DegreesOfFreedom | None = None
+    prior: ArrayLike | Mapping[str, Any] | Sequence[Tolerance] | None = None
+    stars: Sequence[int] | None = None
+
+    def __post_init__(self) -> None:
+        for name, least in (("field_noll", 1), ("noll", 4)):
+            object.__setattr__(self, name, tuple(noll_indices(getattr(self, name), name, least)))
+        small_length(self.higher_order, "higher_order")
+
+    def terms(self, telescope: Telescope, atmosphere: Atmosphere | None) -> WavefrontTerms:
+        """Return the terms of the wavefront of each star, those of :class:`SingleDonuts`."""
+        spread, requested = small_length(self.higher_order, "higher_order"), np.array(self.noll)
+        terms = WavefrontTerms.of(requested, _LEFT_OUT, spread, telescope, atmosphere)
+        # The air's part is shared, and is added to the errors of all stars together.
+        return replace(terms, air=np.zeros_like(terms.air))
+
+    def refined(self, instrument: Instrument, fitted: FittedStars) -> WavefrontTerms | None:
+        """Return terms with the higher ones of the air where the scatter of the stars says that there is some."""
+        exposure, known = fitted.exposure, instrument.model.air.atmosphere is not None
+        if known or exposure is None or exposure.air_rms < _SLIGHT_AIR:
+            return None
+        terms, telescope = instrument.terms, instrument.telescope
+        noll = np.arange(4, max(_AIR_TERMS, int(terms.every.max())) + 1)
+        further = np.concatenate([terms.further, np.setdiff1d(noll, terms.every)])
+        variance = np.diag(air_shape(int(noll[-1]), telescope.pupil_obscuration, _outer_scale(instrument)))
+        variance = min(exposure.air_rms, _MOST_AIR) ** 2 * variance[further - 4]
+        variance[: len(terms.further)] += 1.0 / terms.precision[len(terms.requested) :]
+        precision = np.concatenate([np.zeros(len(terms.requested)), 1.0 / variance])
+        return WavefrontTerms(terms.requested, further, precision, terms.air)
+
+    def sided(self, instrument: Instrument, stars: Sequence[StarFit], fields: np.ndarray) -> list[StarFit]:
+        """Return the stars with flags by the side of focus that all of them together say."""
+        donuts, numbers = [star.sides for star in stars], self._stars(fields)
+
+        def smoothness(index: np.ndarray, fits: Sequence[SideFit]) -> float:
+            star = numbers[index]
+            observations = Observations(
+                np.array([fit.zernikes for fit in fits]),
+                np.array([fit.covariance for fit in fits]),
+                star,
+                np.zeros(len(star), dtype=np.int64),
+            )
+            return fit_hierarchy(observations, self._field_basis(instrument, fields[index]), _shape(instrument)).loss
+
+        decision = decide_sides(donuts, smoothness)
+        changed = []
+        for star, wrong, decided in zip(stars, decision.wrong, decision.decided, strict=True):
+            if wrong:
+                changed.append(StarFit(DonutFlag.DEFOCUS_SIGN, sides=star.sides))
+            else:
+                changed.append(replace(star, flags=star.flags & ~DonutFlag.AMBIGUOUS_SIDE) if decided else star)
+        return changed
+
+    def solved(self, usable: UsableStars, pool: Executor) -> FittedStars:
+        """Return the telescope's wavefront at each star, with what the scatter of all says of the air."""
+        instrument = usable.instrument
+        n, count = len(instrument.terms.requested), len(usable.stars)
+        zernikes = np.array([star.solution.shared[:n] for star in usable.stars]).reshape(count, n)
+        errors = [star_errors(instrument, star) for star in usable.stars]
+        covariance = np.array([star.parts.total for star in errors]).reshape(count, n, n)
+        if count < 2:
+            return FittedStars(_results(usable, errors, zernikes, covariance))
+        behind = np.array([star.light.depth > 0.0 for star in usable.stars])
+        star = self._stars(usable.every_field)[usable.index]
+        paired = [len(set(behind[star == number])) > 1 for number in np.unique(star)]
+        exposure = behind.astype(np.int64) if any(paired) else np.zeros(count, dtype=np.int64)
+        observations, shape = Observations(zernikes, covariance, star, exposure), _shape(instrument)
+        air = (
+            1e-12 if instrument.known_seeing and not any(s.solution.stars[0][STRENGTH] for s in usable.stars) else None
+        )
+        freedoms = None
+        double: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
+        if self.freedoms is None:
+            basis = self._field_basis(instrument, usable.fields)
+            hierarchy = fit_hierarchy(observations, basis, shape, air)
+            double = hierarchy.terms.reshape(-1, n), hierarchy.term_covariance
+        else:
+            hierarchy, basis, freedoms = self._freedoms(usable, observations, shape, air)
+        sides = None
+        if behind.any() and not behind.all():
+            sizes = hierarchy.sizes
+            sides = pair_agreement(zernikes, covariance, star, behind, sizes.noise, sizes.air**2 * shape)
+            sides = sides or _sides_apart(observations, basis, shape, air, behind)
+        exposure_result = ExposureWavefront(
+            instrument.terms.requested,
+            hierarchy.total,
+            hierarchy.total_covariance,
+            hierarchy.total - hierarchy.telescope,
+            0.0 if air is not None else hierarchy.sizes.air,
+            hierarchy.sizes.noise,
+            sides,
+            _notices(hierarchy, sides),
+        )
+        return FittedStars(
+            _results(usable, errors, hierarchy.telescope, hierarchy.telescope_covariance),
+            *double,
+            degrees_of_freedom=freedoms,
+            exposure=exposure_result,
+        )
+
+    def _stars(self, fields: np.ndarray) -> np.ndarray:
+        """Return the numbers of the stars of all images."""
+        if self.stars is not None and len(self.stars) != len(fields):
+            raise DomainError(f"stars of length {len(self.stars)}: expected a number for each of {len(fields)} images")
+        return star_numbers(fields, _SAME_STAR, self.stars)
+
+    def _field_basis(self, instrument: Instrument, fields: np.ndarray) -> Basis:
+        """Return double Zernikes, term by term over the field."""
+        field_noll, noll = np.array(self.field_noll), instrument.terms.requested
+        places = radians(fields, "fields").T / instrument.telescope.field_radius
+        over_field = annular_zernikes(int(field_noll.max()), *places)[field_noll - 1].T
+        columns = np.einsum("ik,ab->iakb", over_field, np.eye(len(noll))).reshape(len(fields), len(noll), -1)
+        field_degree, pupil_degree = (np.array([noll_to_nm(int(j))[0] for j in js]) for js in (field_noll, noll))
+        return Basis(columns, np.repeat(field_degree, len(noll)), np.tile(pupil_degree, len(field_noll)))
+
+    def _freedoms(
+        self, usable: UsableStars, observations: Observations, shape: np.ndarray, air: float | None
+    ) -> tuple[Hierarchy, Basis, FreedomEstimate]:
+        """Return the wavefronts where the telescope's is made by degrees of freedom, linear about their estimate."""
+        assert self.freedoms is not None
+        instrument, freedoms = usable.instrument, self.freedoms
+        telescope, wavelength, noll = instrument.telescope, instrument.middle, instrument.terms.requested
+        spreads = prior_spreads(freedoms, self.prior, telescope, wavelength)
+        last, where = int(noll.max()), {"fields": usable.fields, "wavelength": wavelength}
+        values = np.zeros(len(freedoms))
+        believed, made = None, np.zeros_like(observations.zernikes)
+        for _ in range(2):
+            state = freedoms.apply(telescope, values)
+            response = sensitivity(state, freedoms, n_zernike=last, projection=usable.projection, **where)
+            columns = response.matrix[:, noll - 1] * spreads
+            coefficients = wavefront_zernikes(state, jmax=last, projection=usable.projection, **where).coefficients
+            believed = coefficients if believed is None else believed
+            made = (coefficients - believed)[:, noll - 1] - columns @ (values / spreads)
+            basis = Basis(columns, variance=np.ones(len(spreads)))
+            hierarchy = fit_hierarchy(replace(observations, zernikes=observations.zernikes - made), basis, shape, air)
+            values = hierarchy.terms * spreads
+        hierarchy = replace(hierarchy, telescope=hierarchy.telescope + made, total=hierarchy.total + made)
+        covariance = hierarchy.term_covariance * np.outer(spreads, spreads)
+        return hierarchy, basis, FreedomEstimate(freedoms, values, covariance, spreads)
+
+
+def _shape(instrument: Instrument) -> np.ndarray:
+    """Return the covariance of the air's terms over that of Z4 to Z22 together."""
+    noll, telescope = instrument.terms.requested, instrument.telescope
+    shape = air_shape(max(22, int(noll.max())), telescope.pupil_obscuration, _outer_scale(instrument))
+    return shape[np.ix_(noll - 4, noll - 4)]
+
+
+def _outer_scale(instrument: Instrument) -> float:
+    """Return the outer scale of the turbulence over the radius of the pupil."""
+    return float(instrument.model.air.outer_scale) / (0.5 * instrument.telescope.pupil_diameter)
+
+
+def _results(
+    usable: UsableStars, errors: Sequence[StarErrors], zernikes: np.ndarray, covariance: np.ndarray
+) -> list[FittedStar]:
+    """Return the results of stars whose images are those of their single fits."""
+    return [
+        FittedStar(
+            star.full, star.model, star.solution.stars[0], alone.covariance, values, alone.parts.divided(wavefront)
+        )
+        for star, alone, values, wavefront in zip(usable.stars, errors, zernikes, covariance, strict=True)
+    ]
+
+
+def _sides_apart(
+    observations: Observations, basis: Basis, shape: np.ndarray, air: float | None, behind: np.ndarray
+) -> SideAgreement:
+    """Return the agreement of donuts of different stars on both sides, by a step between them beside the basis."""
+    n = observations.zernikes.shape[1]
+    step = np.where(behind, 0.5, -0.5)[:, None, None] * np.eye(n)
+    columns = np.concatenate([basis.columns, step], axis=2)
+    if basis.variance is not None:
+        wider = Basis(columns, variance=np.concatenate([basis.variance, np.full(n, 1e-6**2)]))
+    else:
+        assert basis.field_degree is not None
+        assert basis.pupil_degree is not None
+        field_degree = np.concatenate([basis.field_degree, np.zeros(n, dtype=np.int64)])
+        wider = Basis(columns, field_degree, np.concatenate([basis.pupil_degree, basis.pupil_degree[:n]]))
+    hierarchy = fit_hierarchy(observations, wider, shape, air)
+    difference, spread = hierarchy.terms[-n:], hierarchy.term_covariance[-n:, -n:]
+    chi2 = float(difference @ np.linalg.solve(spread, difference)) / n
+    return SideAgreement(0, float(np.linalg.norm(difference)), np.nan, chi2)
+
+
+def _notices(hierarchy: Hierarchy, sides: SideAgreement | None) -> tuple[str, ...]:
+    """Return what a user should know of the exposure."""
+    notices = []
+    own = float(np.sqrt(np.mean(((hierarchy.total - hierarchy.telescope) ** 2).sum(axis=1))))
+    if own > _UNLIKE:
+        notices.append(
+            f"the donuts scatter by {1e9 * own:.0f} nm about a wavefront that is smooth over the field, more than air "
+            "does: they may not be of one exposure, and belong fitted each alone then"
+        )
+    if sides is not None:
+        notices.append(str(sides))
+    return tuple(notices)

@@ -1,0 +1,335 @@
+r"""Wavefronts of the donuts of an exposure as a smooth part over the field and what each has about it.
+
+Donut i of star g(i), in exposure e(i), has a fitted wavefront
+
+.. math:: y_i = X_i u + l_{g(i)} + a_{e(i)} + b_i + n_i, \qquad n_i \sim N(0, \alpha C_i),
+
+with the covariance C of its own fit. What X u and l have is the telescope's: terms over the field or degrees of freedom
+u, and l that donuts of one star on both sides of focus share. What a and b have is the air's: layers near the ground,
+which all donuts of an exposure share, and layers above, of which donuts apart have nothing in common. All are Gaussian;
+their variances are those that make the wavefronts most likely, with wide priors on them (empirical Bayes; of terms with
+a flat prior this is restricted maximum likelihood, Patterson & Thompson 1971, Biometrika 58, 545).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize
+
+#: Part of the air's variance in layers near the ground, which all donuts of an exposure share (Cerro Pachon).
+GROUND = 2.0 / 3.0
+#: Rms of the air's wavefront about which its prior lies, that of 15 s under median seeing, Z4 to Z22 [m].
+AIR_RMS = 110e-9
+#: Largest air that can be told from wavefronts that have nothing in common [m].
+MOST_AIR = 3e-6
+#: Standard deviation of the logarithm of the air's variance, and of those of the telescope.
+_WIDE = 2.0
+#: The same of the scale of the covariances of the fits.
+_SCALE_SPREAD = 0.7
+#: Rms of a linear term over the field of the lowest pupil terms about which its prior lies [m].
+_LINEAR_RMS = 150e-9
+#: Fall of the variance of field terms with each degree over field or pupil, about which its prior lies.
+_FALL = 4.0
+#: Standard deviation of the logarithm of the logarithm of that fall.
+_FALL_SPREAD = 0.5
+#: Rms of what stars have of their own in the telescope's wavefront, about which its prior lies [m].
+_LOCAL_RMS = 10e-9
+#: Rms of terms that are uniform over the field: nearly no prior [m].
+_UNIFORM_RMS = 30e-6
+#: Metres of one unit of the algebra.
+_UNIT = 1e-9
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Fitted wavefronts of donuts.
+
+    Attributes
+    ----------
+    zernikes : ndarray, shape [n, n_noll]
+        Wavefronts [m].
+    covariance : ndarray, shape [n, n_noll, n_noll]
+        Covariances of the fits [m^2].
+    star : ndarray of int, shape [n]
+        Number of the star of each: donuts of the same star share what the telescope has there.
+    exposure : ndarray of int, shape [n]
+        Number of its exposure.
+    """
+
+    zernikes: np.ndarray
+    covariance: np.ndarray
+    star: np.ndarray
+    exposure: np.ndarray
+
+    @property
+    def repeated(self) -> bool:
+        """Whether a star has several donuts."""
+        return len(np.unique(self.star)) < len(self.star)
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Terms of the telescope's wavefront.
+
+    Attributes
+    ----------
+    columns : ndarray, shape [m, n_noll, n_term]
+        Wavefronts at m places per unit of each term [m]; the first places are those of the observations.
+    field_degree, pupil_degree : ndarray of int, shape [n_term], optional
+        Radial degrees of double Zernikes, whose variances are fitted.
+    variance : ndarray, shape [n_term], optional
+        Variances of the terms in place of these.
+    """
+
+    columns: np.ndarray
+    field_degree: np.ndarray | None = None
+    pupil_degree: np.ndarray | None = None
+    variance: np.ndarray | None = None
+
+    def variances(self, linear: float, fall: float) -> np.ndarray:
+        """Return variances of the terms by the rms of linear ones [m] and the fall with each degree, shape [n_term]."""
+        if self.variance is not None:
+            return self.variance
+        assert self.field_degree is not None
+        assert self.pupil_degree is not None
+        steps = (self.field_degree - 1) + (self.pupil_degree - self.pupil_degree.min())
+        return np.where(self.field_degree == 0, _UNIFORM_RMS**2, linear**2 * fall ** -steps.astype(float))
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Variances of the parts, fitted to the wavefronts.
+
+    Attributes
+    ----------
+    noise : float
+        Variance of the fits' errors over that claimed.
+    air : float
+        Rms of the air's wavefront, Z4 to Z22 [m].
+    linear : float
+        Rms of a linear field term of the lowest pupil terms [m].
+    fall : float
+        Fall of the variances of field terms with each degree.
+    local : float
+        Rms of what each star has of its own in the telescope's wavefront [m].
+    """
+
+    noise: float
+    air: float
+    linear: float
+    fall: float
+    local: float
+
+
+@dataclass(frozen=True)
+class Hierarchy:
+    """Wavefronts of telescope and air.
+
+    Attributes
+    ----------
+    sizes : Sizes
+        Variances of the parts.
+    loss : float
+        Twice the negative logarithm of the likelihood of the wavefronts and of the priors of the sizes.
+    terms : ndarray, shape [n_term]
+        Terms of the telescope.
+    term_covariance : ndarray, shape [n_term, n_term]
+        Their covariance, the air's part included.
+    telescope : ndarray, shape [m, n_noll]
+        The telescope's wavefront at the places of the basis [m].
+    telescope_covariance : ndarray, shape [m, n_noll, n_noll]
+        Its covariance, the air's part included [m^2].
+    total, total_covariance : ndarray, shapes [n, n_noll], [n, n_noll, n_noll]
+        Wavefront of the light of each donut, telescope and air, and its covariance [m], [m^2].
+    """
+
+    sizes: Sizes
+    loss: float
+    terms: np.ndarray
+    term_covariance: np.ndarray
+    telescope: np.ndarray
+    telescope_covariance: np.ndarray
+    total: np.ndarray
+    total_covariance: np.ndarray
+
+
+def fit_hierarchy(observations: Observations, basis: Basis, shape: np.ndarray, air: float | None = None) -> Hierarchy:
+    """Return the wavefronts of telescope and air that are most likely.
+
+    Parameters
+    ----------
+    observations : Observations
+        Fitted wavefronts.
+    basis : Basis
+        Terms of the telescope's wavefront.
+    shape : ndarray, shape [n_noll, n_noll]
+        Covariance of the air's terms over that of Z4 to Z22 together.
+    air : float, optional
+        Rms of the air's wavefront, Z4 to Z22 [m]; fitted by default.
+    """
+    model = _Model(observations, basis, shape)
+    free = [True, air is None, basis.variance is None, basis.variance is None, observations.repeated]
+    middle = np.array([0.0, math.log(air or AIR_RMS), math.log(_LINEAR_RMS), math.log(math.log(_FALL)), 0.0])
+    middle[4] = math.log(_LOCAL_RMS if observations.repeated else 1e-3 * _UNIT)
+    # Standard deviations of the logarithms of rms are half of those of variances.
+    spread = np.array([_SCALE_SPREAD, 0.5 * _WIDE, 0.5 * _WIDE, _FALL_SPREAD, 0.5 * _WIDE])
+    least = middle - 4.0 * spread
+    most = np.where(np.arange(5) == 1, math.log(MOST_AIR), middle + 4.0 * spread)
+    index = np.flatnonzero(free)
+
+    def sizes(values: np.ndarray) -> Sizes:
+        logarithms = middle.copy()
+        logarithms[index] = values
+        noise, rms, linear, fall, local = np.exp(logarithms)
+        return Sizes(noise, rms, linear, math.exp(fall), local)
+
+    def loss(values: np.ndarray) -> float:
+        prior = float((((values - middle[index]) / spread[index]) ** 2).sum())
+        return model.loss(sizes(values)) + prior
+
+    bounds = list(zip(least[index], most[index], strict=True))
+    best = minimize(loss, middle[index], method="L-BFGS-B", bounds=bounds, options={"eps": 1e-3, "maxiter": 40})
+    return model.solved(sizes(best.x), float(best.fun))
+
+
+class _Model:
+    """Gaussian algebra of observations, in nanometres."""
+
+    def __init__(self, observations: Observations, basis: Basis, shape: np.ndarray) -> None:
+        self._basis, self._shape = basis, shape
+        self._count, self._n = observations.zernikes.shape
+        self._values = observations.zernikes / _UNIT
+        self._noise = observations.covariance / _UNIT**2
+        columns = basis.columns / _UNIT
+        exposures = np.unique(observations.exposure)
+        shared = (observations.exposure[:, None] == exposures)[:, None, :, None] * np.eye(self._n)[None, :, None, :]
+        self._n_shared = shared[0, 0].size
+        self._design = np.concatenate([columns[: self._count], shared.reshape(self._count, self._n, -1)], axis=2)
+        self._places = columns
+        numbers = [np.flatnonzero(observations.star == star) for star in np.unique(observations.star)]
+        #: Donuts of stars with as many of them each, shape [n_star, n_donut].
+        self._groups = [np.array([g for g in numbers if len(g) == size]) for size in sorted({len(g) for g in numbers})]
+
+    def _blocks(self, group: np.ndarray, sizes: Sizes) -> np.ndarray:
+        """Return the covariances of the wavefronts of stars but for the terms, [n_star, size n_noll, size n_noll]."""
+        n_star, size = group.shape
+        blocks = np.zeros((n_star, size, self._n, size, self._n))
+        above = (1.0 - GROUND) * (sizes.air / _UNIT) ** 2 * self._shape
+        for k in range(size):
+            blocks[:, k, :, k, :] = sizes.noise * self._noise[group[:, k]] + above
+        blocks += self._local(sizes)[None, None, :, None, :]
+        return blocks.reshape(n_star, size * self._n, size * self._n)
+
+    def _local(self, sizes: Sizes) -> np.ndarray:
+        """Return the covariance of what each star has of its own in the telescope's wavefront."""
+        return np.asarray((sizes.local / _UNIT) ** 2 * self._shape)
+
+    def _precision(self, sizes: Sizes) -> tuple[np.ndarray, float]:
+        """Return the inverse of the covariance of the terms and the ground's air, and the logarithm of its determinant.
+
+        Degrees of freedom have units of their own; terms over the field are in metres.
+        """
+        variance = self._basis.variances(sizes.linear, sizes.fall)
+        ground = GROUND * (sizes.air / _UNIT) ** 2 * self._shape
+        ground = ground + 1e-12 * np.trace(ground) * np.eye(self._n)
+        precision = np.diag(np.concatenate([1.0 / variance, np.zeros(self._n_shared)]))
+        first, logarithm = len(variance), float(np.log(variance).sum())
+        for start in range(first, first + self._n_shared, self._n):
+            precision[start : start + self._n, start : start + self._n] = np.linalg.inv(ground)
+            logarithm += float(np.linalg.slogdet(ground)[1])
+        return precision, logarithm
+
+    def _normal(self, sizes: Sizes) -> tuple[np.ndarray, np.ndarray, float, list[np.ndarray]]:
+        """Return curvature and gradient of the terms, the loss without them, and inverse blocks of each group."""
+        curvature, loss = self._precision(sizes)
+        gradient, inverses = np.zeros(len(curvature)), []
+        for group in self._groups:
+            n_star, size = group.shape
+            blocks = self._blocks(group, sizes)
+            inverse = np.linalg.inv(blocks)
+            design = self._design[group].reshape(n_star, size * self._n, -1)
+            values = self._values[group].reshape(n_star, -1)
+            weighted = inverse @ design
+            curvature = curvature + design.reshape(-1, design.shape[2]).T @ weighted.reshape(-1, design.shape[2])
+            gradient = gradient + np.einsum("gaq,ga->q", weighted, values)
+            loss += float(np.linalg.slogdet(blocks)[1].sum()) + float(np.einsum("ga,gab,gb->", values, inverse, values))
+            inverses.append(inverse)
+        return curvature, gradient, loss, inverses
+
+    def loss(self, sizes: Sizes) -> float:
+        """Return twice the negative logarithm of the likelihood, the terms integrated over."""
+        curvature, gradient, loss, _ = self._normal(sizes)
+        scale = 1.0 / np.sqrt(np.diag(curvature))
+        try:
+            factor = cho_factor(curvature * np.outer(scale, scale), lower=True)
+        except np.linalg.LinAlgError:
+            return 1e30
+        scaled = scale * gradient
+        determinant = 2.0 * float(np.log(np.diag(factor[0])).sum() - np.log(scale).sum())
+        return loss + determinant - float(scaled @ cho_solve(factor, scaled))
+
+    def solved(self, sizes: Sizes, loss: float) -> Hierarchy:
+        """Return the wavefronts for sizes of the parts."""
+        curvature, gradient, _, inverses = self._normal(sizes)
+        scale = 1.0 / np.sqrt(np.diag(curvature))
+        normalized = curvature * np.outer(scale, scale)
+        covariance = np.linalg.pinv(normalized, hermitian=True) * np.outer(scale, scale)
+        terms = covariance @ gradient
+        n_term = self._places.shape[2]
+        of_terms = covariance[:n_term, :n_term]
+        telescope = self._places @ terms[:n_term]
+        telescope_covariance = np.einsum("maq,qr,mbr->mab", self._places, of_terms, self._places, optimize=True)
+        total = np.zeros_like(self._values)
+        total_covariance = np.zeros_like(self._noise)
+        local = self._local(sizes)
+        above = (1.0 - GROUND) * (sizes.air / _UNIT) ** 2 * self._shape
+        for group, inverse in zip(self._groups, inverses, strict=True):
+            n_star, size = group.shape
+            design = self._design[group].reshape(n_star, size * self._n, -1)
+            residual = self._values[group].reshape(n_star, -1) - design @ terms
+            for k in range(size):
+                donuts = group[:, k]
+                # Covariances of what a donut has beside the terms with the wavefronts of its star.
+                of_star = np.tile(local, size)
+                of_light = of_star.copy()
+                of_light[:, k * self._n : (k + 1) * self._n] += above
+                fixed = self._places[donuts], np.zeros((n_star, self._n, self._n_shared))
+                for own, columns, variance, values, covariances in (
+                    (of_star, np.concatenate(fixed, axis=2), local, telescope, telescope_covariance),
+                    (of_light, self._design[donuts], local + above, total, total_covariance),
+                ):
+                    gain = own @ inverse
+                    change = columns - gain @ design
+                    values[donuts] = columns @ terms + np.einsum("gab,gb->ga", gain, residual)
+                    covariances[donuts] = (
+                        variance
+                        - gain @ own.T
+                        + np.einsum("gaq,qr,gbr->gab", change, covariance, change, optimize=True)
+                    )
+        return Hierarchy(
+            sizes,
+            loss,
+            terms[:n_term],
+            of_terms,
+            telescope * _UNIT,
+            telescope_covariance * _UNIT**2,
+            total * _UNIT,
+            total_covariance * _UNIT**2,
+        )
+
+
+def star_numbers(fields: np.ndarray, within: float, names: Sequence[int] | None = None) -> np.ndarray:
+    """Return the number of the star of each donut: the same for fields [rad] within a distance, or for equal names."""
+    if names is not None:
+        return np.unique(np.asarray(names), return_inverse=True)[1]
+    numbers = np.full(len(fields), -1)
+    for i in range(len(fields)):
+        if numbers[i] < 0:
+            near = (np.hypot(*(fields - fields[i]).T) <= within) & (numbers < 0)
+            numbers[near] = i
+    return np.unique(numbers, return_inverse=True)[1]

@@ -1,0 +1,95 @@
+"""Donuts of an exposure fitted together: pairs on both sides of focus, and the side of focus, on brute-force images."""
+
+import numpy as np
+import pytest
+from donut_images import PIXEL, WAVELENGTH, donut, noisy
+
+import pachon
+from pachon.core.errors import DomainError
+
+DEFOCUS, SKY = 1.5e-3, 500.0
+FIELDS = np.deg2rad([(0.1, 0.2), (0.9, 0.7)])
+OPTIONS = {"pixel_size": PIXEL, "sky_variance": SKY, "threads": 1}
+
+
+@pytest.fixture(scope="module")
+def true(focused):
+    return focused.perturbed("M2", shift=(1.5e-4, 0.0, 0.0)).perturbed("Camera", shift=(0.0, 3e-4, 8e-6))
+
+
+@pytest.fixture(scope="module")
+def truth(focused, true):
+    before, after = (
+        pachon.wavefront_zernikes(t, FIELDS, WAVELENGTH, jmax=22).coefficients[:, 3:] for t in (focused, true)
+    )
+    return after - before
+
+
+@pytest.fixture(scope="module")
+def pairs(true):
+    """Both stars behind focus, then in front of it."""
+    sides = [true.perturbed("Detector", shift=(0.0, 0.0, side * DEFOCUS)) for side in (1.0, -1.0)]
+    return [noisy(donut(tel, field), SKY, 7 * i) for i, tel in enumerate(sides) for field in FIELDS]
+
+
+def of_sides(*signs):
+    return pachon.DonutModel(
+        detector=pachon.DonutDetector(pixel_size=PIXEL, defocus=DEFOCUS * np.array(signs)), neighbours=False
+    )
+
+
+def rss(values):
+    return np.sqrt((values**2).sum(axis=-1))
+
+
+@pytest.mark.slow
+def test_pairs_share_one_wavefront(focused, pairs, truth):
+    single, joint = (
+        pachon.fit_donuts(
+            focused, pairs, np.tile(FIELDS, (2, 1)), WAVELENGTH, model=of_sides(1, 1, -1, -1), fit=fit, **OPTIONS
+        )
+        for fit in (pachon.SingleDonuts(higher_order=10e-9), pachon.ExposureDonuts())
+    )
+    # Alone, a donut near the axis fits both sides of focus; together they tell.
+    ambiguous = pachon.DonutFlag.AMBIGUOUS_SIDE
+    assert [bool(flag & ambiguous) for flag in single.flags] == [True, False, True, False]
+    assert not (joint.flags & ambiguous).any()
+    assert joint.usable.all()
+    # One wavefront of each star.
+    np.testing.assert_allclose(joint.zernikes[:2], joint.zernikes[2:], atol=1e-15)
+    expected = np.tile(truth, (2, 1))
+    assert rss(rss(joint.zernikes - expected)) < 0.8 * rss(rss(single.zernikes - expected))
+    assert (rss(joint.zernikes - expected) < 3.0 * rss(joint.errors)).all()
+    sides = joint.exposure.sides
+    assert sides.n_pairs == 2
+    # Restated: differences of single fits of the same terms.
+    assert sides.rms < 100e-9
+    assert 0.2 < sides.chi2 < 3.0
+    assert "both sides of focus (2 pairs) differ by" in joint.exposure.notices[0]
+    np.testing.assert_allclose(joint.exposure.own, joint.exposure.total - joint.zernikes)
+
+
+@pytest.mark.long
+def test_a_wrong_side_is_said_by_all_donuts_together(focused, pairs):
+    """The star beyond 0.8 degrees knows the side; the one near the axis would fit either."""
+    behind = {"images": pairs[:2], "fields": FIELDS, "wavelength": WAVELENGTH, "model": of_sides(-1, -1)}
+    wrong = pachon.DonutFlag.DEFOCUS_SIGN
+    alone = pachon.fit_donuts(focused, fit=pachon.SingleDonuts(), **behind, **OPTIONS)
+    assert alone.flags[0] & pachon.DonutFlag.AMBIGUOUS_SIDE
+    assert alone.usable.tolist() == [True, False]
+    assert alone.flags[1] == wrong
+    together = pachon.fit_donuts(focused, fit=pachon.ExposureDonuts(), **behind, **OPTIONS)
+    assert together.flags.tolist() == [wrong, wrong]
+    assert np.isnan(together.zernikes).all()
+
+
+def test_stars_have_a_number_each(focused):
+    with pytest.raises(DomainError, match="stars of length 3: expected a number for each of 2 images"):
+        pachon.fit_donuts(
+            focused,
+            np.zeros((2, 9, 9)),
+            FIELDS,
+            WAVELENGTH,
+            fit=pachon.ExposureDonuts(stars=[1, 2, 3]),
+            model=of_sides(1, -1),
+        )

@@ -1,0 +1,114 @@
+"""Telescope and air from wavefronts of donuts: against dense algebra restated here, and against drawn truths."""
+
+import numpy as np
+import pytest
+
+from pachon.models.zernike_polynomials import annular_zernikes, noll_to_nm
+from pachon.sensing.air_shape import air_shape
+from pachon.sensing.hierarchy import GROUND, Basis, Observations, fit_hierarchy, star_numbers
+
+NOLL = np.arange(4, 12)
+
+
+def field_basis(places, last=3):
+    over_field = annular_zernikes(last, *places.T)[:last].T
+    n = len(NOLL)
+    columns = np.einsum("ik,ab->iakb", over_field, np.eye(n)).reshape(len(places), n, -1)
+    field, pupil = (np.array([noll_to_nm(int(j))[0] for j in js]) for js in (range(1, last + 1), NOLL))
+    return Basis(columns, np.repeat(field, n), np.tile(pupil, last))
+
+
+def shape():
+    return air_shape(22, 0.61, np.inf)[: len(NOLL), : len(NOLL)]
+
+
+def drawn(rng, places, *, star, exposure, air, noise=8e-9, scale=1.0, linear=150e-9, local=0.0):
+    """Return observations, and the telescope's and the light's wavefronts."""
+    n, basis = len(NOLL), field_basis(places)
+    factor = np.linalg.cholesky(shape())
+    falls = 4.0 ** -(0.5 * (basis.field_degree - 1 + basis.pupil_degree - 2))
+    terms = np.where(basis.field_degree == 0, 200e-9, linear * falls) * rng.normal(size=basis.columns.shape[2])
+    telescope = basis.columns @ terms
+    telescope = telescope + local * (rng.normal(size=(star.max() + 1, n)) @ factor.T)[star]
+    ground = air * GROUND**0.5 * rng.normal(size=(exposure.max() + 1, n)) @ factor.T
+    total = telescope + ground[exposure] + air * (1.0 - GROUND) ** 0.5 * rng.normal(size=(len(places), n)) @ factor.T
+    mixing = noise * (np.eye(n) + 0.3 * rng.normal(size=(len(places), n, n)))
+    covariance = mixing @ mixing.transpose(0, 2, 1)
+    observed = total + scale**0.5 * np.einsum("iab,ib->ia", mixing, rng.normal(size=total.shape))
+    return Observations(observed, covariance, star, exposure), telescope, total
+
+
+def places_of(rng, count):
+    return np.sqrt(rng.uniform(0.0, 1.0, count))[:, None] * np.array(
+        [[np.cos(a), np.sin(a)] for a in rng.uniform(0.0, 2.0 * np.pi, count)]
+    )
+
+
+@pytest.mark.long
+def test_posterior_is_that_of_dense_algebra():
+    """Conditional mean and covariance of one big Gaussian, for the variances that the fit has found."""
+    rng = np.random.default_rng(3)
+    places = np.repeat(places_of(rng, 4), 2, axis=0)[:7]
+    star, exposure = np.array([0, 0, 1, 1, 2, 2, 3]), np.array([0, 1, 0, 1, 0, 1, 0])
+    observations, _, _ = drawn(rng, places, star=star, exposure=exposure, air=60e-9, local=20e-9)
+    basis = field_basis(places)
+    fit = fit_hierarchy(observations, basis, shape())
+    sizes, n, count = fit.sizes, len(NOLL), len(places)
+    prior = np.diag(basis.variances(sizes.linear, sizes.fall))
+    columns = basis.columns.reshape(count * n, -1)
+    telescope = columns @ prior @ columns.T + np.kron(star[:, None] == star, sizes.local**2 * shape())
+    shared = GROUND * (exposure[:, None] == exposure) + (1.0 - GROUND) * np.eye(count)
+    total = telescope + np.kron(shared, sizes.air**2 * shape())
+    noise = np.zeros_like(total)
+    for i, block in enumerate(observations.covariance):
+        noise[n * i : n * (i + 1), n * i : n * (i + 1)] = sizes.noise * block
+    for covariance, values, errors in (
+        (telescope, fit.telescope, fit.telescope_covariance),
+        (total, fit.total, fit.total_covariance),
+    ):
+        gain = np.linalg.solve(total + noise, covariance).T
+        np.testing.assert_allclose(values.ravel(), gain @ observations.zernikes.ravel(), atol=1e-13)
+        posterior = covariance - gain @ covariance.T
+        blocks = np.array([posterior[n * i : n * (i + 1), n * i : n * (i + 1)] for i in range(count)])
+        np.testing.assert_allclose(errors, blocks, atol=1e-4 * np.abs(blocks).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("air", "scale"), [(100e-9, 1.0), (5e-9, 3.0)])
+def test_errors_are_those_claimed(air, scale):
+    """Chi-square of the telescope's and of the light's wavefronts over exposures: nearly 1 a term."""
+    squares = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        places, star, exposure = places_of(rng, 12), np.arange(12), np.zeros(12, dtype=int)
+        observations, telescope, total = drawn(rng, places, star=star, exposure=exposure, air=air, scale=scale)
+        fit = fit_hierarchy(observations, field_basis(places), shape())
+        squares.append(
+            [
+                np.mean([e @ np.linalg.solve(c, e) for e, c in zip(error, covariance, strict=True)]) / len(NOLL)
+                for error, covariance in (
+                    (fit.telescope - telescope, fit.telescope_covariance),
+                    (fit.total - total, fit.total_covariance),
+                )
+            ]
+        )
+        # What single fits leave is more.
+        assert np.linalg.norm(fit.telescope - telescope) < np.linalg.norm(observations.zernikes - telescope)
+    # Eight terms of twelve exposures, much the same at all donuts of one: 15 %.
+    np.testing.assert_allclose(np.mean(squares, axis=0), 1.0, atol=0.35)
+
+
+@pytest.mark.long
+def test_sizes_are_those_drawn():
+    rng = np.random.default_rng(1)
+    places, star, exposure = places_of(rng, 60), np.arange(60), np.zeros(60, dtype=int)
+    observations, _, _ = drawn(rng, places, star=star, exposure=exposure, air=90e-9, scale=2.0)
+    sizes = fit_hierarchy(observations, field_basis(places), shape()).sizes
+    assert sizes.air == pytest.approx(90e-9, rel=0.15)
+    assert sizes.noise == pytest.approx(2.0, rel=0.2)
+
+
+def test_donuts_of_one_star_stand_within_a_distance_or_have_one_name():
+    fields = np.array([[0.0, 0.0], [1e-3, 0.0], [1e-5, 0.0], [1e-3, 1e-5]])
+    assert star_numbers(fields, 1e-4).tolist() == [0, 1, 0, 1]
+    assert star_numbers(fields, 1e-4, [7, 7, 3, 3]).tolist() == [1, 1, 0, 0]
