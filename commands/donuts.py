@@ -254,7 +254,9 @@ def donuts_command(
     model = DonutModel(
         air=DonutAir(outer_scale=outer_scale_m, atmosphere=atmosphere),
         detector=DonutDetector(
-            _pixel_um(pixel_um, header) * 1e-6, defocus=inputs.defocus + 1e-6 * defocus_um, saturation=saturation
+            _pixel_um(pixel_um, header) * 1e-6,
+            defocus=inputs.defocus + inputs.heights + 1e-6 * defocus_um,
+            saturation=saturation,
         ),
         diffraction=diffraction,
     )
