@@ -141,7 +141,9 @@ class DonutInputs:
     fields : ndarray, shape [n, 2]
         Field angles in the telescope frame [rad].
     defocus : ndarray, shape [n]
-        Shifts of the body that moves [m].
+        Shifts of what was moved for the exposure [m].
+    heights : ndarray, shape [n]
+        Distances behind the focus of sensors that stand out of it, such as LSSTCam's corner sensors [m].
     variances : list of float or None
         Variance of sky and readout [electron^2] of variance planes; None where there is none.
     axes : list of ndarray
@@ -152,6 +154,7 @@ class DonutInputs:
     masks: list[np.ndarray]
     fields: np.ndarray
     defocus: np.ndarray
+    heights: np.ndarray
     variances: list[float | None]
     axes: list[np.ndarray]
 
@@ -166,23 +169,27 @@ def donut_inputs(
     from ..sensing.stamp_files import sky_of_variance
     from ..sensing.stamp_places import on_camera, stamp_places
 
-    inputs = DonutInputs([], [], np.empty((0, 2)), np.empty(0), [], [])
-    fields, defocus = [], []
+    images, masks, variances, axes = [], [], [], []
+    fields, defocus, heights = [], [], []
     for path, stamps in zip(files.paths, files.stamps, strict=True):
         places = stamp_places(stamps, telescope, path, options.projection) if on_camera(stamps) else None
         fields.append(_fields(path, stamps, options, frames, None if places is None else places.fields))
-        heights = np.zeros(len(stamps)) if places is None else places.heights
-        defocus.append(np.where(stamps.has_defocus, stamps.defocus, heights))
+        nominal = np.zeros(len(stamps)) if places is None else places.heights
+        # Of a sensor that stands out of focus files say how far: nothing was moved.
+        heights.append(np.where((nominal != 0.0) & stamps.has_defocus, stamps.defocus, nominal))
+        defocus.append(np.where(nominal != 0.0, 0.0, stamps.defocus))
         for k, (image, mask) in enumerate(zip(stamps.images, stamps.masks, strict=True)):
-            given = options.stamp_axes is not None or places is None
-            matrix = stamp_matrix(frames.stamp_axes) if given or places is None else places.axes[k]
-            inputs.images.append(along_camera(gain * image, matrix))
-            inputs.masks.append(along_camera(mask, matrix))
-            inputs.axes.append(matrix)
+            if places is None or options.stamp_axes is not None:
+                matrix = stamp_matrix(frames.stamp_axes)
+            else:
+                matrix = places.axes[k]
+            images.append(along_camera(gain * image, matrix))
+            masks.append(along_camera(mask, matrix))
+            axes.append(matrix)
             plane = None if stamps.variances is None else sky_of_variance(stamps.variances[k], mask)
-            inputs.variances.append(None if plane is None else gain**2 * plane)
+            variances.append(None if plane is None else gain**2 * plane)
     return DonutInputs(
-        inputs.images, inputs.masks, np.concatenate(fields), np.concatenate(defocus), inputs.variances, inputs.axes
+        images, masks, np.concatenate(fields), np.concatenate(defocus), np.concatenate(heights), variances, axes
     )
 
 

@@ -323,7 +323,7 @@ def donuts_command(
         air=DonutAir(outer_scale=outer_scale_m, atmosphere=atmosphere),
         detector=DonutDetector(
             _pixel_um(pixel_um, header) * 1e-6,
-            defocus=inputs.defocus + 1e-6 * defocus_um,
+            defocus=inputs.defocus + inputs.heights + 1e-6 * defocus_um,
             moved=moved or files_read.moved() or DETECTOR,
             saturation=saturation,
         ),

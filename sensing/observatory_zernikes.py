@@ -221,15 +221,15 @@ def reexpansion(noll: np.ndarray, obscuration: float, target: float) -> np.ndarr
     """
     if obscuration == target:
         return np.eye(len(noll))
-    most = int(noll.max())
-    degree = noll_to_nm(most)[0]
+    highest = int(noll.max())
+    degree = noll_to_nm(highest)[0]
     # Gauss's rule in rho^2 and even angles: exact for products of the terms.
     nodes, weights = np.polynomial.legendre.leggauss(degree + 2)
     radius = np.sqrt(target**2 + 0.5 * (1.0 - target**2) * (nodes + 1.0))
     angle = 2.0 * np.pi * np.arange(2 * degree + 3) / (2 * degree + 3)
     x, y = radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)
     weight = 0.5 * weights[:, None] / len(angle)
-    source, result = (annular_zernikes(most, x, y, o)[noll - 1] for o in (obscuration, target))
+    source, result = (annular_zernikes(highest, x, y, o)[noll - 1] for o in (obscuration, target))
     return np.asarray(np.einsum("krt,jrt,rt->kj", result, source, np.broadcast_to(weight, x.shape)))
 
 

@@ -228,7 +228,7 @@ def _with_planes(
     for kind, listed in planes.items():
         file = {"mask": mask, "variance": variance}.get(kind) or path
         if kind != "image" and listed and [d.shape for _, d in listed] != [d.shape for _, d in images]:
-            shapes, expected = ([list(d.shape) for _, d in part[:1]] for part in (listed, images))
+            shapes, expected = ([list(d.shape) for _, d in units_of[:1]] for units_of in (listed, images))
             counts = f"{len(listed)} of shape {shapes[0]} for {len(images)} images" + (
                 f" of {expected[0]}" if expected else ""
             )

@@ -48,8 +48,8 @@ class StampPlaces:
 
 def on_camera(stamps: DonutStamps) -> bool:
     """Return whether headers name a known camera, and detector and pixel of each stamp."""
-    known = stamps.header.camera is not None and all(d is not None for d in _detectors(stamps))
-    return known and bool(np.isfinite(stamps.pixels).all())
+    on_detectors = stamps.header.camera is not None and all(d is not None for d in _detectors(stamps))
+    return on_detectors and bool(np.isfinite(stamps.pixels).all())
 
 
 def stamp_places(stamps: DonutStamps, telescope: Telescope, file: Path, projection: str) -> StampPlaces:
