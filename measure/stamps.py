@@ -204,6 +204,18 @@ def fourier_shift(image: np.ndarray, dx: float, dy: float) -> np.ndarray:
     return fft.irfft2(fft.rfft2(image) * phase_y[:, None] * phase_x, s=(ny, nx))
 
 
+def fourier_shifts(images: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+    """Return images [n, ny, nx] each moved as by :func:`fourier_shift`, dx and dy [n], to rounding: all at once."""
+    ny, nx = images.shape[1:]
+    phase_x = np.exp(-2j * np.pi * fft.rfftfreq(nx) * dx[:, None])
+    phase_y = np.exp(-2j * np.pi * fft.fftfreq(ny) * dy[:, None])
+    if nx % 2 == 0:
+        phase_x[:, -1] = np.cos(np.pi * dx)
+    if ny % 2 == 0:
+        phase_y[:, ny // 2] = np.cos(np.pi * dy)
+    return fft.irfft2(fft.rfft2(images) * phase_y[:, :, None] * phase_x[:, None], s=(ny, nx))
+
+
 def _stamp_cube(images: ArrayLike, name: str) -> np.ndarray:
     """Return the images as a float64 array [n, ny, nx]."""
     array = real_array(images, f"{name}: expected real numbers [n, ny, nx]")

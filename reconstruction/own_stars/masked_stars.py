@@ -10,8 +10,8 @@ from ...core.errors import DomainError
 from ...core.statistics import masked_median, robust_rms
 from ...measure.masked_moments import MOST_MASKED
 from ...measure.pixel_masks import bad_pixels, copied_pixels, fill_symmetric
-from ...measure.shapes import measure_shapes
-from ...measure.stamps import fourier_shift, shift_mask
+from ...measure.shapes import Shapes, measure_shapes
+from ...measure.stamps import fourier_shifts, shift_mask
 
 # Passes end when no centroid moves by more than this [pixel], a tenth of the error of a star of S/N 200.
 _CONVERGED = 1e-3
@@ -19,6 +19,8 @@ _CONVERGED = 1e-3
 _MOST_PASSES = 10
 # Passes with a new median star: later ones change it by less than its noise.
 _MEDIAN_PASSES = 3
+# Pixels beyond the stamp of the PSF on each side that shifts may bring in from the other side, or masks move.
+_ROOM = 8
 # Fewest pixels of sky.
 _FEWEST_SKY = 20
 # Fraction of the good pixels, the farthest from the centre, that stands in where fewer are good.
@@ -58,6 +60,17 @@ def sky_of_stamps(images: np.ndarray, bad: np.ndarray, radius: float) -> tuple[n
         level[i] = np.median(images[i][far])
         rms[i] = robust_rms(images[i][far])
     return level, rms
+
+
+def inner_pixels(shape: tuple[int, ...], size: int, wide: Shapes) -> tuple[slice, slice, slice]:
+    """Return rows and columns of stamps of a shape (ny, nx) that have an influence on PSFs of a size, as an index.
+
+    The rest is sky, which costs time. `wide` has the centroids of the stars. The middle stays the middle.
+    """
+    offsets = np.abs(np.stack([wide.x[wide.usable], wide.y[wide.usable]]))
+    room = _ROOM + int(np.ceil(offsets.max(initial=0.0)))
+    cuts = [max((n - size) // 2 - room, 0) for n in shape]
+    return np.s_[:, cuts[0] : shape[0] - cuts[0], cuts[1] : shape[1] - cuts[1]]
 
 
 def fill_by_median_star(
@@ -114,17 +127,18 @@ def fill_by_profiles(
     tuple of array
         Filled stamps [n, ny, nx], and the stars that are lost (`MOST_MASKED`), [n] bool.
     """
-    filled, lost = images.copy(), np.zeros(len(images), dtype=bool)
-    middle = _middle_pixel(images.shape[1:])
-    for i, place in enumerate(np.nan_to_num(np.stack([x, y], axis=1))):
-        profile = fourier_shift(profiles[i], *(place - middle))
-        light = _weight(profile.shape, place, sigma) * profile
-        good = ~bad[i]
-        square = (light * profile)[good].sum()
-        flux = (light * images[i])[good].sum() / square if square > 0.0 else 0.0
-        filled[i][bad[i]] = flux * profile[bad[i]]
-        core = np.where(profile > 0.5 * profile.max(), profile, 0.0)
-        lost[i] = any(star_light[bad[i]].sum() > MOST_MASKED * star_light.sum() for star_light in (core, light))
+    places = np.nan_to_num(np.stack([x, y], axis=1))
+    at_places = fourier_shifts(profiles, *(places - _middle_pixel(images.shape[1:])).T)
+    light = _weights(images.shape[1:], places, sigma) * at_places
+    good_light = np.where(bad, 0.0, light)
+    square, weighted_sum = ((good_light * values).sum(axis=(1, 2)) for values in (at_places, images))
+    flux = np.divide(weighted_sum, square, out=np.zeros(len(images)), where=square > 0.0)
+    filled = np.where(bad, flux[:, None, None] * at_places, images)
+    core = np.where(at_places > 0.5 * at_places.max(axis=(1, 2), keepdims=True), at_places, 0.0)
+    lost = np.zeros(len(images), dtype=bool)
+    for star_light in (core, light):
+        masked_light = np.where(bad, star_light, 0.0).sum(axis=(1, 2))
+        lost |= masked_light > MOST_MASKED * star_light.sum(axis=(1, 2))
     return filled, lost
 
 
@@ -162,11 +176,10 @@ def _median_star(images: np.ndarray, bad: np.ndarray, x: np.ndarray, y: np.ndarr
     """Return the median of stars scaled to their light under the weight, centred on pixel (ny // 2, nx // 2)."""
     shape = images.shape[1:]
     middle = _middle_pixel(shape)
-    weight = _weight(shape, middle, sigma)
-    stars, masks = np.empty(images.shape), np.empty(images.shape, dtype=bool)
-    for i, place in enumerate(np.stack([x, y], axis=1)):
-        star = fourier_shift(images[i], *(middle - place))
-        stars[i], masks[i] = star / (weight * star).sum(), shift_mask(bad[i], *(middle - place))
+    shifts = middle - np.stack([x, y], axis=1)
+    stars = fourier_shifts(images, *shifts.T)
+    stars /= (_weight(shape, middle, sigma) * stars).sum(axis=(1, 2), keepdims=True)
+    masks = np.stack([shift_mask(mask, *shift) for mask, shift in zip(bad, shifts, strict=True)])
     masks[:, masks.all(axis=0)] = False  # a pixel that is bad in all stars has no better median
     return masked_median(stars, masks)
 
@@ -178,5 +191,11 @@ def _middle_pixel(shape: tuple[int, ...]) -> np.ndarray:
 
 def _weight(shape: tuple[int, ...], place: np.ndarray, sigma: float) -> np.ndarray:
     """Return a round Gaussian on pixels about a place from the centre of the stamp [pixel]."""
-    y, x = (np.arange(n) - (n - 1) / 2.0 - at for n, at in zip(shape, place[::-1], strict=True))
-    return np.asarray(np.exp(-0.5 * (y[:, None] ** 2 + x**2) / sigma**2))
+    return _weights(shape, place[None], sigma)[0]
+
+
+def _weights(shape: tuple[int, ...], places: np.ndarray, sigma: float) -> np.ndarray:
+    """Return a round Gaussian on pixels about each of places [n, 2] from the centre of the stamp [pixel]."""
+    y, x = (np.arange(n) - (n - 1) / 2.0 - at[:, None] for n, at in zip(shape, places.T[::-1], strict=True))
+    along_y, along_x = (np.exp(-0.5 * (distance / sigma) ** 2) for distance in (y, x))
+    return np.asarray(along_y[:, :, None] * along_x[:, None])

@@ -27,6 +27,7 @@ from .masked_stars import (
     as_bad_pixels,
     fill_by_median_star,
     fill_by_profiles,
+    inner_pixels,
     profiles_of_psfs,
     sky_of_stamps,
     weight_sigma,
@@ -68,7 +69,8 @@ def fit_own_stars(
     """Centre stars, mask or leave out defects, model the PSF, and predict each star from others.
 
     The model is kriging of pixels, which learns from the stars how smooth the PSF is, a constant included, or that of
-    the options.
+    the options. A fifth of the stars at a time is predicted by the others; by kriging of pixels under the covariances
+    and the response of the pixels to the shape of all stars, by other models with a fit of its own.
 
     Parameters
     ----------
@@ -127,7 +129,7 @@ def fit_own_stars(
     def less_sky(bad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         level, rms = sky_of_stamps(raw_images, bad, _SKY * side)
         sky = np.nan_to_num(level)[:, None, None] if background else 0.0
-        return np.where(bad, 0.0, raw_images - sky), rms
+        return np.where(bad, 0.0, raw_images - sky)[inner], rms
 
     def select(filled: np.ndarray, lost: np.ndarray, earlier: _CentredStars | None = None) -> _CentredStars:
         first = measure_shapes(filled, scale, weight)
@@ -143,41 +145,55 @@ def fit_own_stars(
         flags = np.where(lost, StarFlag.MASKED, flags)
         snr = _signal_to_noise(centred, rms, gain)
         used = ((flags == 0) | (apart & ((flags & ~_MASKABLE) == 0))) & (snr >= min_snr)
-        masks = center_masks(bad, first.x, first.y, size)
+        masks = center_masks(bad[inner], first.x, first.y, size)
         return _CentredStars(first, centred, masks, shapes, flags, snr, used, defects, apart)
 
-    def fit(chosen: np.ndarray) -> PsfModel:
+    def fit(chosen: np.ndarray, **further_options: Any) -> PsfModel:
         span = as_extent(extent, places[stars.used])
         return PsfModel.fit(
             stars.images[chosen],
             places[chosen],
             extent=span,
             colour=colours_of(chosen),
-            **({"gain": gain} | model_options),
+            **({"gain": gain} | model_options | further_options),
         )
+
+    def fit_again(model: PsfModel | None) -> PsfModel:
+        """Fit the used stars, by the covariances of an earlier model of nearly the same ones."""
+        interpolation = None if model is None else model.interpolation
+        if not isinstance(interpolation, kriging.FittedKriging):
+            return fit(np.flatnonzero(stars.used))
+        options = {"order": interpolation.order, "covariances": interpolation.covariances}
+        return fit(np.flatnonzero(stars.used), interpolation=kriging.KrigingOfCovariances(**options))
 
     def colours_of(chosen: np.ndarray) -> np.ndarray | None:
         return None if colours is None else colours[chosen]
 
-    def predict() -> np.ndarray:
+    def predict(model: PsfModel) -> np.ndarray:
         predicted = np.empty((len(used_indices), size, size))
         for held_out_indices in parts:
-            fitted_indices = np.setdiff1d(np.arange(len(used_indices)), held_out_indices)
+            interpolation = model.interpolation.without(held_out_indices, model.coefficients)
+            if interpolation is None:
+                fitted_indices = np.setdiff1d(np.arange(len(used_indices)), held_out_indices)
+                part_model = fit(used_indices[fitted_indices])
+            else:
+                part_model = replace(model, interpolation=interpolation)
             predicted_indices = used_indices[held_out_indices]
-            predicted[held_out_indices] = fit(used_indices[fitted_indices]).at(
-                places[predicted_indices], colour=colours_of(predicted_indices)
-            )
+            predicted[held_out_indices] = part_model.at(places[predicted_indices], colour=colours_of(predicted_indices))
         return predicted
 
+    inner = np.s_[:, :, :]
     images, rms = less_sky(bad)
     filled, lost = fill_symmetric(images, bad), np.zeros(len(images), dtype=bool)
     wide = measure_shapes(filled, scale, 0.25 * side * scale)
+    inner = inner_pixels(images.shape[1:], size, wide)
+    images, filled = images[inner], filled[inner]
     weight = float(np.nanmedian(fwhm(filled[wide.usable], scale))) if wide.usable.any() else np.nan
     if not np.isfinite(weight):
         raise DomainError(f"none of {len(images)} stamps has a star in its middle")
 
     def fill() -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        filled, median_star, lost = fill_by_median_star(images, bad, scale, weight)
+        filled, median_star, lost = fill_by_median_star(images, bad[inner], scale, weight)
         complete = wide.usable & ~lost
         if not complete.any():
             require_stars(complete, np.where(lost, StarFlag.MASKED, StarFlag.UNUSABLE), FEWEST_STARS)
@@ -189,7 +205,7 @@ def fit_own_stars(
     stars = stars.with_defects_apart(weight_sigma(scale, weight))
     if stars.apart.any():
         first = stars.first
-        bad = bad | decenter_masks(stars.defects, first.x, first.y, images.shape[1:])
+        bad = bad | decenter_masks(stars.defects, first.x, first.y, bad.shape[1:])
         images, rms = less_sky(bad)
         filled, median_star, lost, weight = fill()
         stars = select(filled, lost, stars)
@@ -197,12 +213,14 @@ def fit_own_stars(
     if bad.any():
         masked = np.asarray(bad.any(axis=(1, 2)))
         complete = wide.usable & ~lost
+        filling_model: PsfModel | None = None
         for _ in range(_MODEL_PASSES):
-            psfs = fit(np.flatnonzero(stars.used)).at(places[masked], colour=colours_of(masked))
+            filling_model = fit_again(filling_model)
+            psfs = filling_model.at(places[masked], colour=colours_of(masked))
             sigma = weight_sigma(scale, weight)
             filled[masked], lost[masked] = fill_by_profiles(
                 images[masked],
-                bad[masked],
+                bad[inner][masked],
                 profiles_of_psfs(psfs, median_star, sigma),
                 stars.first.x[masked],
                 stars.first.y[masked],
@@ -218,7 +236,8 @@ def fit_own_stars(
     )
     good = stars.images[used]
     weightless = stars.masks[used] if stars.masks[used].any() else None
-    predicted = predict()
+    model = fit(used_indices)
+    predicted = predict(model)
     psf = predicted.mean(axis=0)
     stamps_used = good / good.sum(axis=(1, 2), keepdims=True)
     deviations = (stamps_used - psf).reshape(len(used_indices), -1)
@@ -227,7 +246,6 @@ def fit_own_stars(
     sigma = 0.5 * np.sqrt(kriging.star_noise(good, deviations, psf, filters, gain, weightless))
     held_out = _spread(measure_shapes(predicted, scale, weight), used)
     sigmas = np.sqrt((sigma[:, :2] ** 2).mean(axis=1)), sigma[:, 2]
-    model = fit(used_indices)
     return OwnStars(
         model,
         places,

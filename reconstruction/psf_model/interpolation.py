@@ -180,6 +180,13 @@ class FittedInterpolation:
         """Return coefficients [n, k] of the stars less their prediction by the other stars; NaN where there is none."""
         raise NotImplementedError
 
+    def without(self, held_out: np.ndarray, coefficients: np.ndarray) -> Self | None:
+        """Return the interpolation of all stars but some for their predictions; None where it takes another fit.
+
+        `held_out` are indices of the stars that are left out, `coefficients` [n, k] those of all stars.
+        """
+        return None
+
     def truncated(self, count: int) -> Self:
         """Return the interpolation of the first components only."""
         colour = None if self.colour is None else self.colour.truncated(count)

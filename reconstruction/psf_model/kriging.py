@@ -67,6 +67,12 @@ class Kriging(Interpolation):
 
     order: int | Literal["auto"] = ORDER
 
+    def covariances_of(
+        self, places: np.ndarray, numbers: np.ndarray, noise: np.ndarray, terms: np.ndarray, colour_count: int
+    ) -> Covariances:
+        """Return the covariances that stars show; arguments as those of :func:`~.covariance.fit_covariances`."""
+        return fit_covariances(places, numbers, noise, terms, colour_count=colour_count)
+
     def fit(self, stars: StarField) -> FittedKriging:
         """Krige the coefficients of stars by the covariances of their shapes."""
         mean = stars.basis.mean
@@ -76,7 +82,7 @@ class Kriging(Interpolation):
         noise = np.maximum(noise, _LEAST_NOISE * (numbers**2).mean(axis=0) + np.finfo(float).tiny)
         places = mapped(stars.positions, stars.extent)
         terms, colour_count = stars.with_colour_terms(), stars.colour_terms.shape[1]
-        covariances = fit_covariances(places, numbers, noise, terms, colour_count=colour_count)
+        covariances = self.covariances_of(places, numbers, noise, terms, colour_count)
         of_stars = (noise / np.median(noise, axis=0)).mean(axis=1)
         fields, count = None, stars.terms.shape[1]
         if stars.basis.kind.has_components:
@@ -105,6 +111,21 @@ class Kriging(Interpolation):
             fields,
             colour=stars.fitted_colour(trend[count:], covariances.colour_probability),
         )
+
+
+@dataclass(frozen=True)
+class KrigingOfCovariances(Kriging):
+    """Kriging by covariances that other stars of the CCD have shown: the search for them is most of a fit's time."""
+
+    covariances: Covariances | None = None
+
+    def covariances_of(
+        self, places: np.ndarray, numbers: np.ndarray, noise: np.ndarray, terms: np.ndarray, colour_count: int
+    ) -> Covariances:
+        """Return the covariances, or those that the stars show where there are none."""
+        if self.covariances is not None and self.covariances.coloured == (colour_count > 0):
+            return self.covariances
+        return super().covariances_of(places, numbers, noise, terms, colour_count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +173,36 @@ class FittedKriging(FittedInterpolation, kind=Kriging):
             signal = SignalCovariance.of(self.kernel, points, terms, colour_count)
             shape_differences = differences(numbers) @ self.fields.response
             return shape_differences + residuals_left_out(residuals, self.fields, signal, noise)
+
+    def without(self, held_out: np.ndarray, coefficients: np.ndarray) -> Self | None:
+        """Return the interpolation of all stars but some; arguments as those of the base class.
+
+        Covariances, the response of the pixels to the shape, and the noise are those of all stars, as in
+        :meth:`leave_one_out`; the search for them is most of a fit's time. None where the components are not pixels:
+        principal ones hold the stars that are left out.
+        """
+        if self.fields is None or self.weights is None:
+            return None
+        fitted = np.setdiff1d(np.arange(len(coefficients)), held_out)
+        points = mapped(self.positions[fitted], self.extent)
+        noise, terms = 1.0 / self.weights[fitted], self.terms()[fitted]
+        colour_count = 0 if self.colour is None else len(self.colour.slope)
+        count = terms.shape[1] - colour_count
+        with one_blas_thread():
+            numbers, residuals = self.fields.split(coefficients[fitted])
+            shape_trend, dual = krige_mean(points, numbers, terms, self.covariances, noise, colour_count=colour_count)
+            signal = SignalCovariance.of(self.kernel, points, terms, colour_count)
+            residual_trend, residual_dual = krige_residuals(residuals, self.fields, signal, noise)
+            trend = shape_trend @ self.fields.response + residual_trend
+            alpha = dual @ self.fields.response + residual_dual
+        return replace(
+            self,
+            positions=self.positions[fitted],
+            weights=self.weights[fitted],
+            polynomial=trend[:count],
+            alpha=alpha,
+            colour=None if self.colour is None else replace(self.colour, slope=trend[count:]),
+        )
 
     def truncated(self, count: int) -> Self:
         """Return the interpolation of the first components only."""

@@ -3,7 +3,7 @@ import pytest
 
 from pachon.core.errors import DomainError
 from pachon.measure.shapes import measure_shapes
-from pachon.measure.stamps import center_stamps, observe_stamps
+from pachon.measure.stamps import center_stamps, fourier_shift, fourier_shifts, observe_stamps
 
 ARCSEC = np.pi / 180.0 / 3600.0
 PIXEL = 0.2 * ARCSEC
@@ -169,3 +169,11 @@ def test_bad_arguments():
         center_stamps(np.zeros(4), 0.0, 0.0)
     with pytest.raises(DomainError, match="images"):
         center_stamps("stars", 0.0, 0.0)
+
+
+@pytest.mark.parametrize("shape", [(9, 9), (10, 12)])
+def test_images_shifted_together_are_those_shifted_one_by_one(shape):
+    rng = np.random.default_rng(4)
+    images, shifts = rng.normal(size=(3, *shape)), rng.uniform(-2.0, 2.0, (3, 2))
+    expected = [fourier_shift(image, *shift) for image, shift in zip(images, shifts, strict=True)]
+    np.testing.assert_allclose(fourier_shifts(images, *shifts.T), expected, rtol=0.0, atol=1e-12)
