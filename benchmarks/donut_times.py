@@ -1,4 +1,4 @@
-"""Processor time of fits of donuts, by blur, size, telescope and diffraction; and danish's where it is installed.
+"""Processor time of fits of donuts, by blur, size, telescope and diffraction.
 
 Run: python benchmarks/donut_times.py [--blur PIXELS ...] [--repeats N] [--photons N]
 
@@ -6,7 +6,7 @@ Images are photons: rays through random points of the pupil of the bundled LSST 
 mm behind focus unless said, each moved by a Gaussian of the blur and counted in pixels of 10 um, with a sky of 500
 electrons. The fit knows the blur, or takes it for a seeing that it fits ("free"). Sizes are those of donuts 3 and 4.5
 mm behind focus, and of DECam's (1.5 mm, pixels of 15 um, spiders). Diffraction is fitted to donuts of the long-exposure
-engine. danish fits the image of the last blur. Each row is the least of some repeats, on one thread, in turns; errors
+engine. Each row is the least of some repeats, on one thread, in turns; errors
 are those of Z4 to Z22 together.
 """
 
@@ -24,11 +24,6 @@ import numpy as np
 import scipy
 
 import pachon
-
-try:
-    import danish
-except ImportError:
-    danish = None
 
 WAVELENGTH, SKY = 622e-9, 500.0
 FIELD = np.deg2rad([0.6, 0.9])
@@ -130,8 +125,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--photons", type=int, default=5_000_000)
     options = parser.parse_args()
-    print(f"pachon {pachon.__version__}, numpy {np.__version__}, scipy {scipy.__version__}", end="")
-    print(f", danish {danish.__version__}" if danish is not None else ", no danish")
+    print(f"pachon {pachon.__version__}, numpy {np.__version__}, scipy {scipy.__version__}")
     lsst = "lsst_v3.3_r"
     fit(photons(lsst, 200, 2.0, 1_000_000), known(2.0, 10e-6))  # compiles
     for blur in options.blur:

@@ -36,12 +36,14 @@ _FEWEST = 48
 _MOST = 800
 #: Error that 60 cells across the pupil leave in a wavefront [m]; 120 leave 0.9 nm (LSST, 1.5 mm, 0.8").
 _CELLS_LEAVE = 2.9e-9
-#: FWHM of the blur in pixels below which an image has none: cells half a pixel wide then leave an error of 1.5 nm, and
-#: 0.4 nm with more blur.
+#: FWHM of the blur in pixels below which an image has none.
 _BARE = 0.25
-#: The error that more cells are taken for in an image without blur [m], and that below which they are no more.
+#: Error that more cells are taken for in an image without blur [m]: cells of half a pixel leave 1.6 nm.
 _BARE_LEAVE = 1e-9
-_BARE_ERROR = 0.5e-9
+#: The same in one that is blurred and sharper than its pixels resolve: the first cells leave 0.5 nm.
+_SHARP_LEAVE = 0.2e-9
+#: Error of the photons [m] below which cells of such images become no smaller.
+_SHARP_ERROR = 0.5e-9
 #: Fraction of the error of the photons that the error by the cells may be.
 _SMALL = 0.2
 #: Power of the error by which the number of cells goes, from the two figures of :data:`_CELLS_LEAVE`.
@@ -199,17 +201,16 @@ class Instrument:
     def sampling(self, light: StarLight, pixels: Pixels, fwhm: float, error: float = math.inf) -> Sampling:
         """Return how finely images of a star in a seeing [rad] are sampled on given pixels.
 
-        A wavefront known to an error [m] that the cells would add to has more of them; where a little blurs images
-        that are sharper than their pixels they have as many as they need anyway.
+        A wavefront known to an error [m] that the cells would add to has more of them.
         """
         width = self._width(light, pixels, fwhm)
         distance = pixels.side * self.pixel
         spacing = _SPACING * (math.hypot(width, distance) if width < _RESOLVED * distance else width)
         sharp = width < _RESOLVED * distance
-        leave, least = (_CELLS_LEAVE, _LEAST_ERROR) if not sharp else (_BARE_LEAVE, _BARE_ERROR)
+        leave, least = _CELLS_LEAVE, _LEAST_ERROR
+        if sharp:
+            leave, least = _BARE_LEAVE if width < _BARE * distance else _SHARP_LEAVE, _SHARP_ERROR
         finer = max((leave / (_SMALL * max(error, least))) ** _FALL, 1.0)
-        if sharp and width > _BARE * distance:
-            finer = 1.0
         across = self.model.n_pupil or min(max(math.ceil(finer * light.diameter / spacing), _FEWEST), _MOST)
         return Sampling(sharp, across)
 
