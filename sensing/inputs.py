@@ -74,7 +74,7 @@ class ObservedStars:
         cls,
         images: ArrayLike | Sequence[ArrayLike],
         fields: ArrayLike,
-        sky_variance: ArrayLike,
+        sky_variance: ArrayLike | None,
         mask: NDArray[np.bool_] | Sequence[NDArray[np.bool_]] | None,
         projection: str,
     ) -> ObservedStars:

@@ -84,12 +84,14 @@ def measured_noise(
     groups = [order[first : first + size] for first in range(0, differences.size - size + 1, size)]
     level = np.array([light[group].mean() for group in groups])
     variance = np.array([_variance(differences[group]) for group in groups])
+    if not variance.max() > 0.0:
+        return PixelNoise(0.0, 1.0)
     faint = slice(max(len(groups) // 4, 1))
     sky, slope = variance[faint].mean(), 1.0
     growth = _correlation(residual, used, brightness, float(variance[0])) if correlated else 1.0
     # Weights by the variance of a smooth line, since that of a group has an error itself.
     for _ in range(3):
-        weight = 1.0 / np.maximum(sky + slope * np.maximum(level, 0.0), _FAINTEST * max(variance.max(), 1e-300)) ** 2
+        weight = 1.0 / np.maximum(sky + slope * np.maximum(level, 0.0), _FAINTEST * variance.max()) ** 2
         sky, slope = _line(np.maximum(level, 0.0), variance, weight)
     # Light of a sky that is left in has noise too, and no more than all that of the sky.
     of_sky = float(variance[faint].mean())

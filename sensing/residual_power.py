@@ -125,7 +125,7 @@ class _Squares:
         self._used, self.side = used, 1
         while used.size / self.side**2 > _MOST_PIXELS and min(used.shape) >= 4 * self.side:
             self.side *= 2
-        self.used = self._cut(used[..., None])[..., 0].all(axis=(1, 3))
+        self.used = np.asarray(self._cut(used[..., None])[..., 0].all(axis=(1, 3)))
 
     def _cut(self, images: np.ndarray) -> np.ndarray:
         """Return images [ny, nx, n] by squares, [ny, side, nx, side, n]."""
@@ -282,10 +282,10 @@ def _needed_strengths(products: np.ndarray, surplus: np.ndarray, level: float) -
                 trials.append((explained, dict(zip(trial, map(float, values), strict=True))))
         if not trials:
             return strengths
-        best, values = max(trials, key=lambda trial: trial[0])
+        best, best_strengths = max(trials, key=lambda trial: trial[0])
         if best - gain < 2.0 * (_NEEDED * level) ** 2:
             return strengths
-        gain, strengths = best, values
+        gain, strengths = best, best_strengths
 
 
 def _strengths(products: np.ndarray, surplus: np.ndarray) -> np.ndarray:

@@ -201,8 +201,8 @@ class SingleDonuts(WavefrontFit):
         )
         return FittedStars(
             [
-                FittedStar(star.full, star.model, star.solution.stars[0], star_error.covariance, *of_wavefront)
-                for star, star_error, *of_wavefront in zip(usable.stars, errors, zernikes, parts, strict=True)
+                FittedStar(star.full, star.model, star.solution.stars[0], star_error.covariance, wavefront, causes)
+                for star, star_error, wavefront, causes in zip(usable.stars, errors, zernikes, parts, strict=True)
             ]
         )
 
