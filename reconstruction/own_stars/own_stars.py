@@ -163,8 +163,10 @@ def fit_own_stars(
         interpolation = None if model is None else model.interpolation
         if not isinstance(interpolation, kriging.FittedKriging):
             return fit(np.flatnonzero(stars.used))
-        options = {"order": interpolation.order, "covariances": interpolation.covariances}
-        return fit(np.flatnonzero(stars.used), interpolation=kriging.KrigingOfCovariances(**options))
+        same_covariances = kriging.KrigingOfCovariances(
+            order=interpolation.order, covariances=interpolation.covariances
+        )
+        return fit(np.flatnonzero(stars.used), interpolation=same_covariances)
 
     def colours_of(chosen: np.ndarray) -> np.ndarray | None:
         return None if colours is None else colours[chosen]

@@ -84,6 +84,6 @@ def test_a_constant_is_no_worse_and_turbulence_much_better(kind):
 @pytest.mark.parametrize("count", [10, 20, 40, 80, 200])
 @pytest.mark.parametrize("kind", [*KINDS])
 def test_the_default_is_within_a_twentieth_of_the_best(kind, count, correlated):
-    # Sixty fields of ten stars are good to 0.03 only.
-    seeds = range(100, 100 + {10: 240, 20: 120, 40: 40, 80: 30, 200: 20}[count])
+    # Sixty fields of ten stars, and forty of forty, are good to 0.03 only.
+    seeds = range(100, 100 + {10: 240, 20: 120, 40: 120, 80: 30, 200: 20}[count])
     assert (ratios(kind, count, seeds, correlated=correlated) < 1.05).all()
