@@ -82,6 +82,10 @@ def decide_sides(
     pairs = [donut for donut in donuts if donut is not None]
     if len(pairs) < 2:
         return SideDecision(wrong, decided)
+    if all(donut.mirrored.loss - donut.given.loss > CONTRADICTED for donut in pairs):
+        # Each image decides by itself.
+        decided[fitted] = True
+        return SideDecision(wrong, decided)
     behind = np.array([donut.depth > 0.0 for donut in pairs])
     groups = [members for members in (behind, ~behind) if members.any()]
     combinations = list(itertools.product((False, True), repeat=len(groups)))
