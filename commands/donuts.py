@@ -218,6 +218,8 @@ def donuts_command(
     - `pachon donuts DECam_*.stamp.fits --defocus-um 2000 --convention donut`
     - `pachon donuts stamps.fits --stamp-axes DVCS --rotator-deg 12.3 --degrees-of-freedom lsst --frame ZCS`
     """
+    import numpy as np
+
     from ..models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
     from ..sensing.fit import fit_donuts
     from ..sensing.flags import DonutFlag
@@ -262,7 +264,7 @@ def donuts_command(
     )
     light = wavelength_list(believed, wavelength_nm, None)
     if wavelength_nm is None and header.wavelength is not None:
-        light = [header.wavelength]
+        light = np.array([header.wavelength])
     sky = inputs.variances if sky_variance is None else [sky_variance] * len(inputs.images)
     if not quiet and header.text:
         print_line(f"{files[0]}: {header.text} of its header; {believed.name}", error=True)
