@@ -31,12 +31,17 @@ def observatory_summary(
     orientation: OrientationCheck | None,
 ) -> dict[str, Any]:
     """Return results in the frame and the convention asked for, by name."""
+    import numpy as np
+
     from ..core.files import plain_values
 
     angles = {"rotator_deg": frames.rotator, "parallactic_deg": frames.parallactic_angle}
     summary: dict[str, Any] = {
         "observatory": converted.summary()
-        | {name: None if angle is None else degrees(float(angle)) for name, angle in angles.items()}
+        | {
+            name: None if angle is None else degrees(float(np.asarray(angle, dtype=np.float64)))
+            for name, angle in angles.items()
+        }
     }
     if motions is not None:
         summary["hexapod_corrections"] = {

@@ -266,6 +266,8 @@ def donuts_command(
     - `pachon donuts DECam_*.stamp.fits --defocus-um 2000 --convention donut`
     - `pachon donuts stamps.fits --stamp-axes DVCS --rotator-deg 12.3 --degrees-of-freedom lsst --frame ZCS`
     """
+    import numpy as np
+
     from ..models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
     from ..sensing.exposure_fit import ExposureDonuts
     from ..sensing.fit import fit_donuts
@@ -331,7 +333,7 @@ def donuts_command(
     )
     light = wavelength_list(believed, wavelength_nm, None)
     if wavelength_nm is None and header.wavelength is not None:
-        light = [header.wavelength]
+        light = np.array([header.wavelength])
     planes = [variance for variance in inputs.variances if variance is not None]
     sky = planes if len(planes) == len(inputs.images) else None
     if sky_variance is not None:

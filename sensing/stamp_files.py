@@ -180,7 +180,7 @@ def _cut_stamps(
         shifts = np.full(len(centers), defocus_of(image.header, path))
 
     def cut(plane: np.ndarray, outside: float | bool) -> list[np.ndarray]:
-        return [_cut(plane, *center, size, outside) for center in centers]
+        return [_cut(plane, float(x), float(y), size, outside) for x, y in centers]
 
     middles = np.round(centers) + 0.5 * (size - 1) - size // 2 + np.array(corner_of(image.header, path))
     return DonutStamps(
