@@ -135,14 +135,19 @@ def fit_star(instrument: Instrument, light: StarLight, pixels: Pixels, strength:
     if flags:
         return StarFit(flags)
     best = fitter.solve(coarse, start, tolerance=COARSE if donut else FINE)
-    if donut and wavefront and instrument.model.rims.search:
-        # Light beside a rim looks like a second star otherwise, and like a cosmic ray.
-        solved = fitter.rim_solver(COARSE, lambda moved: moved.stamp(moved.light, small))
-        fitter, coarse, best = fitter.with_moved_rims(coarse, best, _MISFIT, solved, start)
-    if donut and instrument.model.neighbours:
+    single, neighbours = best, donut and instrument.model.neighbours
+    if neighbours:
         best = fitter.with_companion(small, coarse, best, start, template)
     if donut and fitter.other_focus_is_better(small, coarse, best):
         return StarFit(DonutFlag.DEFOCUS_SIGN)
+    if donut and wavefront and instrument.model.rims.search and best.loss > _MISFIT * coarse.used.sum():
+        # Light beside a rim looks like a second star, and later like a cosmic ray.
+        solved = fitter.rim_solver(COARSE, lambda moved: moved.stamp(moved.light, small))
+        moved, moved_stamp, trial = fitter.with_moved_rims(coarse, single, _MISFIT, solved, start)
+        if trial.loss < best.loss:
+            fitter, coarse, best = moved, moved_stamp, trial
+            if neighbours:
+                best = fitter.with_companion(small, coarse, best, start, template)
     if not _explained(coarse, best):
         return StarFit(DonutFlag.NO_DONUT)
     if _beside(coarse, best) > _BESIDE:
