@@ -17,7 +17,7 @@ from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ..models.telescope import Telescope
 from ..wavefront.psf.light import Light
 from .bad_pixels import grown
-from .fit_star import SMALLEST_DONUT, StarFit, StarSolution, fit_star
+from .fit_star import StarFit, fit_star
 from .flags import DonutFlag
 from .freedom_fit import TelescopeFreedoms
 from .image_model import (
@@ -43,6 +43,7 @@ from .rim_amplitude import VOTERS, RimAmplitude, rim_amplitude, waves_fit_better
 from .rim_table import moved_rims, rim_table
 from .stamps import Pixels
 from .star_errors import ErrorParts
+from .star_fitter import SMALLEST_DONUT, StarSolution
 from .wavefront_fits import NOLL, FittedStars, SingleDonuts, UsableStars, WavefrontFit
 
 #: Pixels, as a fraction of the stamp, from which on those of one greatest value are saturated, and saturated ones the

@@ -18,7 +18,7 @@ from ..models.parameters.tolerances import Tolerance
 from ..raytrace.launch import aimed_points
 from ..wavefront.psf.pupil_rims import pupil_rims
 from .degrees import FreedomEstimate, FreedomRays, prior_spreads
-from .fit_star import StarFit, StarSolution
+from .fit_star import StarFit
 from .image_model import STRENGTH
 from .inputs import noll_indices
 from .light import Instrument
@@ -26,6 +26,7 @@ from .pupil_cells import PupilCells
 from .solve import Group, solve
 from .stamps import Pixels
 from .star_errors import by_residuals
+from .star_fitter import StarSolution
 from .vignetting import cells_with_rims, rim_shifts
 from .wavefront_fits import NOLL, FittedStars, UsableStars, WavefrontFit, joint_results
 

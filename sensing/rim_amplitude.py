@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..wavefront.psf.pupil_rims import pupil_rims
-from .fit_star import SMALLEST_DONUT, StarSolution
 from .image_model import STRENGTH, LandedLight
 from .light import Instrument
+from .star_fitter import SMALLEST_DONUT, StarSolution
 
 #: Donuts that are asked.
 VOTERS = 3

@@ -9,10 +9,10 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable
 
-from .fit_star import StarSolution
 from .light import Instrument
 from .moving_rims import PupilShadows, RimBody, RimLines
 from .rim_outlines import MOTIONS, RimMotion
+from .star_fitter import StarSolution
 
 _MEANINGS = {
     "donut": "number of the donut, from 0",

@@ -12,12 +12,12 @@ from scipy.linalg import solve_triangular
 
 from .air_shape import air_shape
 from .donut_rays import ZernikeRays
-from .fit_star import StarSolution
 from .image_model import STRENGTH
 from .light import Instrument
 from .likelihood import Linearized, linearized
 from .residual_power import residual_power
 from .solve import Group, Solution
+from .star_fitter import StarSolution
 
 #: Terms up to the eleventh radial degree: what the mean wavefront of the air has beyond is lost in the seeing.
 _AIR_TERMS = 78

@@ -21,12 +21,13 @@ from .cross_check import cross_checked
 from .degrees import FreedomEstimate
 from .donut_rays import ZernikeRays
 from .exposure import ExposureWavefront
-from .fit_star import StarFit, StarSolution
+from .fit_star import StarFit
 from .inputs import noll_indices, small_length
 from .light import Instrument
 from .likelihood import Stamp, model_image
 from .solve import Group, Solution, solve
 from .star_errors import ErrorParts, air_of_terms, by_residuals, model_floor, star_errors
+from .star_fitter import StarSolution
 from .terms import WavefrontTerms
 
 #: Noll indices of the wavefront that are fitted by default: up to the fifth radial degree.

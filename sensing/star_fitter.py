@@ -1,0 +1,355 @@
+"""Solutions for one star on stamps of several scales."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..core.statistics import RMS_PER_MAD
+from .bad_pixels import unused_regions, without_outliers
+from .donut_rays import ZernikeRays
+from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, SLOPE_X, SLOPE_Y, STRENGTH, X, Y
+from .light import Instrument, Sampling, StarLight
+from .likelihood import Stamp, model_image, pulls
+from .noise import measured_noise
+from .rim_search import RimFit, with_moved_rims
+from .solve import FINE, STEPS, Group, Solution, solve
+from .stamps import Match, Pixels, match_template, measured_variance
+
+#: Images wider than this are donuts [pixels].
+SMALLEST_DONUT = 24.0
+#: Pixels across a donut in the coarse fit, about.
+_COARSE_DIAMETER = 30.0
+#: Pulls of pixels that are clipped, over that of typical pixels.
+_CLIP = 7.0
+#: Light over the brightest, above which a pixel of the model is one of the donut.
+BRIGHT = 0.2
+#: Rounds of clipping.
+_ROUNDS = 3
+#: Most scales of the last fits.
+_SCALES = 3
+#: Fraction of the seeing that a search starts from below which that of a first solution is taken in its place.
+_MUCH_SHARPER = 0.5
+#: Cells across the pupil beyond those of a first search from which on it has some of its own.
+_SHARED = 2.0
+#: Cells across the pupil over those that are needed.
+_ENOUGH = 1.25
+
+
+@dataclass(frozen=True)
+class StarSolution:
+    """Best model of one star by itself.
+
+    Attributes
+    ----------
+    light : StarLight
+        Light of the star.
+    stamp : Stamp
+        Pixels and model of the last fit.
+    full : Stamp
+        All pixels of the detector, of which those of the fit may be sums.
+    solution : Solution
+        Its unknowns.
+    model : ndarray
+        Best image of all pixels [electrons].
+    """
+
+    light: StarLight
+    stamp: Stamp
+    full: Stamp
+    solution: Solution
+    model: np.ndarray
+
+
+@dataclass(frozen=True)
+class Start:
+    """Start of a search in coarse pixels: these, their stamp, the template on it, where it fits, and unknowns."""
+
+    pixels: Pixels
+    stamp: Stamp
+    template: np.ndarray
+    match: Match
+    unknowns: np.ndarray
+
+
+@dataclass(frozen=True)
+class LostLight:
+    """Fractions of a star's light beside the stamp and on unused pixels, and on regions of these alone."""
+
+    any_pixel: float
+    regions: float
+
+
+@dataclass(frozen=True)
+class _Fine:
+    """A stamp for the last fits, and how it is sampled."""
+
+    stamp: Stamp
+    pixels: Pixels
+    sampling: Sampling
+
+    def of(self, fitter: StarFitter) -> Stamp:
+        """Return the stamp sampled alike for the light of a fitter."""
+        return fitter.sampled_stamp(self.pixels, self.sampling, self.stamp.grid.reach)
+
+
+class StarFitter:
+    """Solutions for one star on stamps of several scales."""
+
+    def __init__(
+        self, instrument: Instrument, light: StarLight, clean: Pixels, strength: float, wavefront: bool
+    ) -> None:
+        self.instrument, self.clean, self._wavefront = instrument, clean, wavefront
+        self.donut = light.diameter > SMALLEST_DONUT * instrument.pixel
+        self._strength = strength
+        self._fwhm = float(instrument.seeing.fwhm(np.asarray(strength)))
+        self._set_light(light)
+        self._binned: dict[int, Pixels] = {}
+        #: Cells across the pupil that the last fits are expected to need, so that the first ones share them.
+        self._across = self._sampling(self._fwhm, self._side(self._fwhm))[1].across
+
+    @property
+    def light(self) -> StarLight:
+        """Light of the star."""
+        return self._light
+
+    def _set_light(self, light: StarLight) -> None:
+        terms = self.instrument.terms
+        self._light = light
+        self.precision = np.concatenate([terms.precision, light.shift_precision])
+        self._mean = np.concatenate([np.zeros(len(terms.precision)), light.shift_mean])
+        n = len(self.precision)
+        self._map = np.eye(n)[None] if self._wavefront else np.zeros((1, n, 0))
+        self._rays: dict[int, ZernikeRays] = {}
+
+    def with_light(self, light: StarLight) -> StarFitter:
+        """Return the same for the light of the star with its rims elsewhere."""
+        fitter = copy(self)
+        fitter._set_light(light)
+        return fitter
+
+    def with_moved_rims(
+        self,
+        stamp: Stamp,
+        best: Solution,
+        noise: float,
+        solved: Callable[[StarLight, Solution], RimFit],
+        first: np.ndarray | None = None,
+    ) -> tuple[StarFitter, Stamp, Solution]:
+        """Return the fit with rims free that the residuals say stand elsewhere, with the stamp of its light."""
+        begun = None if first is None else replace(best, stars=(first,), shared=np.zeros_like(best.shared))
+        fit = with_moved_rims(self.instrument, RimFit(self._light, stamp, best), noise, solved, begun)
+        return self if fit.light is self._light else self.with_light(fit.light), fit.stamp, fit.solution
+
+    def rim_solver(
+        self, tolerance: float, stamp_of: Callable[[StarFitter], Stamp]
+    ) -> Callable[[StarLight, Solution], RimFit]:
+        """Return the function that fits light with its rims elsewhere, from the unknowns of a solution."""
+
+        def solved(light: StarLight, start: Solution) -> RimFit:
+            fitter = self.with_light(light)
+            moved_stamp = stamp_of(fitter)
+            held = len(light.rims) * 2 + len(self.instrument.noll)
+            shared = np.concatenate([start.shared[:held], np.zeros(len(light.free_rims))])
+            return RimFit(light, moved_stamp, fitter.solve(moved_stamp, start.stars[0], shared, tolerance))
+
+        return solved
+
+    def _of(self, light: StarLight, across: int) -> ZernikeRays:
+        """Return the light through at least so many cells across the pupil, and at most a quarter more."""
+        if light is not self._light:
+            return self.instrument.rays(light, across)
+        for cells, rays in self._rays.items():
+            if across <= cells <= _ENOUGH * across:
+                return rays
+        return self._rays.setdefault(across, self.instrument.rays(light, across))
+
+    def with_used(self, used: np.ndarray) -> StarFitter:
+        """Return the same without some of the pixels."""
+        fitter = copy(self)
+        fitter.clean, fitter._binned = replace(self.clean, image=self.clean.image * used, used=used), {}
+        return fitter
+
+    def stamp(self, light: StarLight, pixels: Pixels, *, blended: bool = False) -> Stamp:
+        """Return the stamp of a star's light in coarse pixels; neighbours need room beside it."""
+        sampling = self.instrument.sampling(light, pixels, self._fwhm)
+        # Neighbours may stand anywhere beside the stamp.
+        reach = light.diameter * (1.0 if blended else 0.5) if pixels.side > 1 else 0.0
+        shared = self._across if self._across < _SHARED * sampling.across else 0
+        rays = self._of(light, max(sampling.across, shared))
+        return self.instrument.stamp(light, pixels, rays, sampling.sharp, reach)
+
+    def sampled_stamp(self, pixels: Pixels, sampling: Sampling, reach: float) -> Stamp:
+        """Return the stamp of pixels that are sampled so, with room for light beside it [m]."""
+        rays = self._of(self._light, sampling.across)
+        return self.instrument.stamp(self._light, pixels, rays, sampling.sharp, reach)
+
+    def _side(self, fwhm: float) -> int:
+        """Return how many pixels are summed along each axis for the last fits in a seeing [rad]."""
+        return self.instrument.binning(self._light, self.clean, fwhm) if self.donut else 1
+
+    def finest(self, coarse: Solution) -> StarSolution:
+        """Return the best model in pixels as fine as the seeing needs, without those far off it."""
+        best, blended, fine = coarse, len(coarse.stars[0]) > RATIO, None
+        # The seeing of a solution decides how finely the next one is sampled.
+        for _ in range(_SCALES):
+            finer = self.sampled(best, blended, fine)
+            if finer is fine:
+                break
+            fine, best = finer, self.solve(finer.stamp, best.stars[0], best.shared)
+        assert fine is not None
+        if self.donut and self._wavefront and self.instrument.model.rims.search:
+            solved = self.rim_solver(FINE, fine.of)
+            fitter, stamp, best = self.with_moved_rims(fine.stamp, best, 0.0, solved)
+            return fitter._clipped(replace(fine, stamp=stamp), best)
+        return self._clipped(fine, best)
+
+    def _clipped(self, fine: _Fine, best: Solution) -> StarSolution:
+        """Return the best model without pixels far off it."""
+        stamp, full = fine.stamp, self.every_pixel(fine)
+        model = model_image(full, best.stars[0], best.waves[0])
+        for _ in range(_ROUNDS):
+            pull = pulls(full, model)
+            used = without_outliers(pull, full.image, model, full.used, _CLIP * _typical(pull, model, full.used))
+            if (used == full.used).all():
+                break
+            full = replace(full, used=used)
+            stamp = replace(stamp, used=replace(self.clean, used=used).binned(fine.pixels.side).used)
+            best = self.solve(stamp, best.stars[0], best.shared)
+            model = model_image(full, best.stars[0], best.waves[0])
+        return StarSolution(self._light, stamp, full, best, model)
+
+    def with_measured_noise(self, star: StarSolution, sky_level: float) -> tuple[StarSolution, float]:
+        """Return a solution in the unit in which what it leaves has the noise of electrons, and that unit."""
+        if star.light is not self._light:
+            return self.with_light(star.light).with_measured_noise(star, sky_level)
+        unknowns, wave = star.solution.stars[0], star.solution.waves[0]
+        level = model_image(star.full, np.where(np.arange(len(unknowns)) == FLUX, 0.0, unknowns), wave)
+        noise = measured_noise(
+            star.full.image - star.model, star.model - level, star.full.used, sky_level, correlated=True
+        )
+        unit, sky = noise.photon, noise.sky / noise.photon**2
+
+        def rescaled(stamp: Stamp) -> Stamp:
+            return replace(
+                stamp,
+                image=stamp.image / unit,
+                variance=np.full(stamp.image.shape, sky * stamp.grid.scale**2),
+            )
+
+        unknowns = unknowns.copy()
+        unknowns[[FLUX, BACKGROUND, SLOPE_X, SLOPE_Y]] /= unit
+        stamp, full = rescaled(star.stamp), rescaled(star.full)
+        best = self.solve(stamp, unknowns, star.solution.shared)
+        return StarSolution(self._light, stamp, full, best, model_image(full, best.stars[0], best.waves[0])), unit
+
+    def sampled(self, solution: Solution, blended: bool, last: _Fine | None) -> _Fine:
+        """Return a stamp fine enough for the seeing of a solution: the last one if that is, nearly."""
+        instrument, light = self.instrument, self._light
+        if last is None:
+            fwhm = self._fwhm
+            if not instrument.known_seeing:
+                # An image that is far sharper than the start of the search is not summed for that.
+                sharper = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
+                fwhm = sharper if sharper < _MUCH_SHARPER * fwhm else fwhm
+            pixels, sampling = self._sampling(fwhm, self._side(fwhm))
+            if sampling.sharp and not instrument.known_seeing and instrument.model.n_pupil is None:
+                # Few large cells find the seeing, of which a sharp image says much.
+                sampling = replace(sampling, across=sampling.across // 2)
+        else:
+            fwhm = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
+            wave = slice(len(instrument.noll)) if len(solution.shared) else slice(0)
+            # Pixels without noise, whatever variance is claimed for them, know the wavefront better than claimed.
+            noise = min(solution.loss / last.stamp.used.sum(), 1.0)
+            error = math.sqrt(noise * np.trace(solution.shared_covariance[wave, wave])) or math.inf
+            if not self._sampling(_ENOUGH * fwhm, last.pixels.side, _ENOUGH * error)[1].finer_than(last.sampling):
+                return last
+            pixels, sampling = self._sampling(fwhm, min(self._side(fwhm), last.pixels.side), error)
+        stamp = self.sampled_stamp(pixels, sampling, light.diameter if blended else self._overhang(solution))
+        return _Fine(stamp, pixels, sampling)
+
+    def _overhang(self, solution: Solution) -> float:
+        """Return how far the light of a star reaches beyond the stamp [m]."""
+        middle = 0.5 * self.instrument.pixel * np.array(self.clean.image.shape[::-1])
+        place = self.instrument.pixel * np.abs(solution.stars[0][[X, Y]])
+        return float(np.clip(place + 0.5 * self._light.diameter - middle, 0.0, self._light.diameter).max())
+
+    def _sampling(self, fwhm: float, side: int, error: float = math.inf) -> tuple[Pixels, Sampling]:
+        pixels = self._binned.get(side) or self._binned.setdefault(side, self.clean.binned(side))
+        return pixels, self.instrument.sampling(self._light, pixels, fwhm, error)
+
+    def every_pixel(self, fine: _Fine) -> Stamp:
+        """Return the stamp with all pixels of the detector."""
+        if fine.pixels.side == 1:
+            return fine.stamp
+        rays, grid = self._of(self._light, fine.sampling.across), fine.stamp.grid
+        return self.instrument.stamp(self._light, self.clean, rays, False, grid.reach)
+
+    def start(self) -> Start:
+        """Return where the template of a star without aberrations fits best, in coarse pixels."""
+        across = self._light.diameter / self.instrument.pixel
+        pixels = self.clean.smoothed(max(1, round(across / _COARSE_DIAMETER)) if self.donut else 1)
+        stamp = self.stamp(self._light, pixels)
+        return self.start_on(pixels, stamp)
+
+    def start_on(self, pixels: Pixels, stamp: Stamp) -> Start:
+        """Return the start of a search on a stamp of coarse pixels."""
+        grid = stamp.grid
+        unknowns = np.zeros(len(NUISANCES))
+        unknowns[[FLUX, STRENGTH]] = 1.0, self._strength
+        unknowns[[X, Y]] = -grid.scale * grid.offset
+        template = model_image(stamp, unknowns, np.zeros(len(self.precision)))
+        measured = grid.scale**2 * measured_variance(self.clean)
+        match = match_template(stamp.image, stamp.used, stamp.variance, template, measured)
+        unknowns[FLUX] = max(match.flux, 1.0)
+        unknowns[[X, Y]] += grid.scale * np.array([match.x, match.y])
+        level, *slopes = match.plane / grid.scale**2
+        unknowns[[SLOPE_X, SLOPE_Y]] = np.array(slopes) / grid.scale
+        # The middle of the stamp is that of its coarse pixels but for those that are left over.
+        unknowns[BACKGROUND] = level + grid.scale * (grid.offset @ unknowns[[SLOPE_X, SLOPE_Y]])
+        return Start(pixels, stamp, template, match, unknowns)
+
+    def without_outliers(self, star: np.ndarray, wave: np.ndarray, *, lines_only: bool = False) -> np.ndarray:
+        """Return the used pixels without those far off a model."""
+        full = self.instrument.stamp(self._light, self.clean, self._of(self._light, self._across), sharp=False)
+        model = model_image(full, star, wave)
+        pull = pulls(full, model)
+        limit = _CLIP * _typical(pull, model, full.used)
+        return without_outliers(pull, full.image, model, full.used, limit, lines_only=lines_only)
+
+    def lost_light(self, stamp: Stamp, solution: Solution) -> LostLight:
+        """Return the fractions of the star's light that land beside the stamp and on unused pixels."""
+        used, star, wave = self.clean.used, solution.stars[0], solution.waves[0]
+        used = stamp.used if stamp.used.shape == used.shape else used
+        landing, weights = stamp.rays.landing(wave), stamp.rays.weights(wave)
+        middle = 0.5 * (np.array(used.shape[::-1]) - 1.0)
+        place = np.rint(landing / self.instrument.pixel + star[[X, Y]] + middle)
+        outside = ~((place >= 0) & (place < used.shape[::-1])).all(axis=1)
+        column, row = np.where(outside[:, None], 0, place).astype(np.int64).T
+        lost, cut = (outside | pixels[row, column] for pixels in (~used, unused_regions(used)))
+        return LostLight(float(weights @ lost), float(weights @ cut))
+
+    def solve(
+        self,
+        stamp: Stamp,
+        star: np.ndarray,
+        shared: np.ndarray | None = None,
+        tolerance: float = FINE,
+        steps: int = STEPS,
+    ) -> Solution:
+        """Return the best unknowns from a start."""
+        n = self._map.shape[2]
+        group = Group((stamp,), self._map, self.precision[:n], self.instrument.known_seeing, prior_mean=self._mean[:n])
+        return solve(group, [star], np.zeros(n) if shared is None else shared, tolerance=tolerance, steps=steps)
+
+
+def _typical(pull: np.ndarray, model: np.ndarray, used: np.ndarray) -> float:
+    """Return the size of a typical pull, at least 1, on a donut or beside it: turbulence and noise make it larger."""
+    low = float(model[used].min(initial=np.inf))
+    bright = model - low > BRIGHT * (model.max() - low)
+    sides = [np.abs(pull[used & side]) for side in (bright, ~bright)]
+    return max([1.0, *(float(RMS_PER_MAD * np.median(pulls)) for pulls in sides if pulls.size)])
