@@ -118,7 +118,7 @@ def fit_star(
     # Before rims are free, with which the wrong side of focus fits much.
     if donut and explained and _other_focus_is_better(search.fitter, search.start, search.best):
         return StarFit(DonutFlag.DEFOCUS_SIGN, sides=sides)
-    if donut and wavefront and instrument.model.rims.search:
+    if fitter.searches_rims:
         search = _search_of_rims(search.fitter, search)
     fitter, start, best = search.fitter, search.start, search.best
     if not _explained(start.stamp, best):

@@ -174,7 +174,8 @@ class DonutRims:
     Attributes
     ----------
     search : bool
-        Whether rims and spiders that the residuals say stand elsewhere than the prescription has them are fitted too.
+        Whether rims and spiders that the residuals say stand elsewhere than the prescription has them are fitted too;
+        not where terms of Z4 to Z22 are neither asked for nor expected.
     size : float
         Relative standard deviation of the radii of the rims that bound the light: 0.01 where a mirror's hole is known
         to a hundredth. One donut hardly tells a radius from its wavefront; errors have what is not known of it.

@@ -120,7 +120,7 @@ def check_orientation(
     fields: ArrayLike,
     wavelength: ArrayLike | Light | None = None,
     *,
-    sky_variance: ArrayLike = 0.0,
+    sky_variance: ArrayLike | None = None,
     model: DonutModel | None = None,
     mask: NDArray[np.bool_] | Sequence[NDArray[np.bool_]] | None = None,
     projection: str = "zemax",
@@ -153,7 +153,7 @@ def check_orientation(
         side = max(1, min(star.image.shape) // _PIXELS)
         image, variance, masked = _binned(star.image, star.variance, star.masked, side)
         turned = [[along_camera(plane, matrix) for matrix in matrices] for plane in (image, masked)]
-        level = float(np.median(variance))
+        level = float(np.median(variance)) if observed.known_noise else None
         fit = fit_donuts(
             telescope,
             turned[0],
@@ -183,7 +183,8 @@ def _coarse(model: DonutModel, side: int, defocus: float) -> DonutModel:
         saturation=None if saturation is None else saturation * side**2,
     )
     air = replace(model.air, fwhm=None, atmosphere=None)
-    return replace(model, detector=detector, air=air, diffraction=False, neighbours=False, n_pupil=_CELLS)
+    rims = replace(model.rims, search=False)
+    return replace(model, detector=detector, air=air, diffraction=False, neighbours=False, rims=rims, n_pupil=_CELLS)
 
 
 def _compared(chi2: np.ndarray, n_pixels: np.ndarray, donuts: np.ndarray) -> OrientationCheck:

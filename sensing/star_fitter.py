@@ -38,6 +38,8 @@ _MUCH_SHARPER = 0.5
 _SHARED = 2.0
 #: Cells across the pupil over those that are needed.
 _ENOUGH = 1.25
+#: Noll indices without which rims are not searched for.
+_TERMS_FOR_RIMS = np.arange(4, 23)
 
 
 @dataclass(frozen=True)
@@ -126,6 +128,12 @@ class StarFitter:
         self._map = np.eye(n)[None] if self._wavefront else np.zeros((1, n, 0))
         self._rays: dict[int, ZernikeRays] = {}
 
+    @property
+    def searches_rims(self) -> bool:
+        """Whether rims may be free: light of terms that are not fitted would be taken for that of rims."""
+        all_terms = bool(np.isin(_TERMS_FOR_RIMS, self.instrument.terms.every).all())
+        return bool(self.donut and self._wavefront and self.instrument.model.rims.search and all_terms)
+
     def with_light(self, light: StarLight) -> StarFitter:
         """Return the same for the light of the star with its rims elsewhere."""
         fitter = copy(self)
@@ -202,7 +210,7 @@ class StarFitter:
                 break
             fine, best = finer, self.solve(finer.stamp, best.stars[0], best.shared)
         assert fine is not None
-        if self.donut and self._wavefront and self.instrument.model.rims.search:
+        if self.searches_rims:
             solved = self.rim_solver(FINE, fine.of)
             fitter, stamp, best = self.with_moved_rims(fine.stamp, best, 0.0, solved)
             return fitter._clipped(replace(fine, stamp=stamp), best)

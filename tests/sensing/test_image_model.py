@@ -116,9 +116,11 @@ def test_derivatives_are_central_differences(behind_focus, companion, diffracted
 )
 def test_derivatives_of_sharp_images_are_central_differences(behind_focus, strength, blur, companion):
     stamp = stamp_of(behind_focus, 120, blur=blur * PIXEL, reach=60 * PIXEL, sharp=True)
-    star, wave = np.array([1e6, 1.2, -0.7, 3.0, strength, *companion]), 60e-9 * np.cos(np.arange(len(NOLL)))
+    star, wave = np.array([1e6, 1.2, -0.7, 3.0, strength, 0.1, -0.2, *companion]), 60e-9 * np.cos(np.arange(len(NOLL)))
     joined = np.concatenate([star, wave])
-    steps = np.concatenate([[1e3, 3e-2, 3e-2, 1.0, 0.05], np.full(len(companion), 0.02), np.full(len(NOLL), 2e-8)])
+    steps = np.concatenate(
+        [[1e3, 3e-2, 3e-2, 1.0, 0.05, 0.1, 0.1], np.full(len(companion), 0.02), np.full(len(NOLL), 2e-8)]
+    )
     landing, response = stamp.rays.landing(wave), stamp.rays.response(wave)
     light = LandedLight(landing, stamp.rays.weights(wave), stamp.rays.spread(landing))
     image, columns, scales = stamp.grid.derivatives(star, light, response, stamp.rays.rates)
@@ -140,7 +142,7 @@ def test_derivatives_of_sharp_images_are_central_differences(behind_focus, stren
 @pytest.mark.parametrize("strength", [0.0, 0.6, 2.5])
 def test_sharp_images_summed_in_pairs_are_those_of_summed_pixels(behind_focus, strength):
     """The core and the smooth rest of the air add up: images of one grid are those of another."""
-    star, wave = np.array([1e6, 1.2, -0.7, 0.0, strength]), 60e-9 * np.cos(np.arange(len(NOLL)))
+    star, wave = np.array([1e6, 1.2, -0.7, 0.0, strength, 0.0, 0.0]), 60e-9 * np.cos(np.arange(len(NOLL)))
     stamp = stamp_of(behind_focus, 180, size=90, sharp=True)
     single = model_image(stamp, star, wave)
     pixels = Pixels(np.zeros((90, 90)), np.full((90, 90), 500.0), np.ones((90, 90), dtype=bool)).binned(2)
