@@ -76,7 +76,7 @@ class Canvas:
         return np.array(neighbours)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_three_neighbours_are_fitted_too(behind_focus):
     """One beside the stamp, one that overlaps the star, and a faint one."""
     wave = wave_of(1, 260e-9)

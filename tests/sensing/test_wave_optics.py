@@ -77,7 +77,9 @@ def test_diffraction_is_not_taken_for_wavefront(behind_focus, on_axis, r0, left,
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("blur", [0.0, 0.7, 1.5])
+@pytest.mark.parametrize(
+    "blur", [pytest.param(0.0, marks=pytest.mark.slow), 0.7, pytest.param(1.5, marks=pytest.mark.slow)]
+)
 def test_images_of_rays_are_told_from_those_of_waves(behind_focus, blur):
     """Of dense rays, under a blur that is no Kolmogorov's either."""
     images = np.stack([noisy(donut(behind_focus, field, blur=blur), 500.0, 2) for field in FIELDS])
