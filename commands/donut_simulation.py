@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
-
 from ..core.errors import ConfigError
+from ..core.terminal import print_line
 from .interrupt import interruptible
 from .options import degrees_pair, wavelength_list
 
@@ -39,4 +38,4 @@ def simulate_file(
         donuts = simulate_donuts(telescope, true, scene, model, field)
     write_donuts(files[0], donuts, scene, model, telescope.name)
     if not quiet:
-        typer.echo(f"{files[0]}: {len(donuts.fields)} donuts, moved: {model.detector.moved}")
+        print_line(f"{files[0]}: {len(donuts.fields)} donuts, moved: {model.detector.moved}")

@@ -460,7 +460,7 @@ def _show(fit: DonutFit, converted: ObservatoryZernikes, motions: BodyMotions | 
     if motions is not None:
         Rows(*motion_rows(motions), left=1).show()
     for line in _remarks(fit):
-        typer.echo(line)
+        print_line(line)
 
 
 def _remarks(fit: DonutFit) -> list[str]:

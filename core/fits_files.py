@@ -7,10 +7,10 @@ import gzip
 import io
 import lzma
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
 
 from .errors import PachonError
 from .files import require_file
@@ -31,7 +31,7 @@ _PIECE = 2**20
 
 @contextmanager
 def open_fits(
-    path: Path, error: type[PachonError], *, content: bytes | None = None, **options: bool
+    path: Path, error: type[PachonError], *, content: bytes | None = None, **options: Any
 ) -> Iterator[fits.HDUList]:
     """Open a FITS file that may be compressed by gzip, bzip2, xz, zip or fpack, or its content.
 
@@ -65,7 +65,12 @@ def _unpacked(path: Path, packed: IO[bytes], error: type[PachonError]) -> io.Byt
     start = packed.read(6)
     size = packed.seek(0, io.SEEK_END)
     packed.seek(0)
-    openers = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zXZ\0": lzma.open, b"PK\x03\x04": _first_member}
+    openers: dict[bytes, Callable[[Any], Any]] = {
+        b"\x1f\x8b": gzip.open,
+        b"BZh": bz2.open,
+        b"\xfd7zXZ\0": lzma.open,
+        b"PK\x03\x04": _first_member,
+    }
     opener = next((opener for signature, opener in openers.items() if start.startswith(signature)), None)
     if opener is None:
         return None

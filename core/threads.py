@@ -11,8 +11,6 @@ from functools import lru_cache
 
 from threadpoolctl import ThreadpoolController
 
-from .units import require_count
-
 #: More threads than any machine has processors only take memory.
 _MOST_THREADS = 128
 _LOCK = threading.RLock()
@@ -21,6 +19,8 @@ _LOCK = threading.RLock()
 def thread_count(threads: int | None) -> int:
     """Return the number of threads to use: the given number, or the processors this process may run on."""
     if threads is not None:
+        from .units import require_count  # with NumPy, which `--help` does without
+
         return min(require_count(threads, "threads", 1), _MOST_THREADS)
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

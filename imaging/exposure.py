@@ -127,7 +127,7 @@ class Exposure:
         return float(np.sqrt(self.background + self.exposures * self.read_noise**2))
 
     def electrons(self, magnitude: ArrayLike) -> np.ndarray:
-        """Return the electrons of sources of AB magnitudes above the atmosphere."""
+        """Return the electrons of sources of AB magnitudes above the atmosphere; NaN of NaN."""
         return self.total_time * 10.0 ** (0.4 * (self._band.zero_point - pure_numbers(magnitude, "magnitude")))
 
     @property

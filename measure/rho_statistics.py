@@ -141,16 +141,13 @@ def rho_statistics(
     # One NaN in one of them takes the star out of all: every statistic is of the same stars.
     good = np.all(np.isfinite(columns), axis=0)
     s1, s2, s, m1, m2, m = (np.where(good, c, np.nan) for c in columns)
-    for name, values in (("e1, e2", (s1, s2)), ("model_e1, model_e2", (m1, m2))):
-        if good.any() and not np.nanmax(np.hypot(*values)) < 1.0:
-            raise DomainError(
-                f"{name}: expected ellipticities below 1, the largest is {np.nanmax(np.hypot(*values)):g}"
-            )
-    ratio = np.nanmax(np.abs(np.log(s / m))) if good.any() else 0.0
-    if ratio > np.log(_MOST_TIMES):
-        raise DomainError(
-            f"size, model_size: expected a ratio of at most {_MOST_TIMES:g}, the largest is {np.exp(ratio):g}"
-        )
+    for name, pair in (("e1, e2", (s1, s2)), ("model_e1, model_e2", (m1, m2))):
+        largest = np.hypot(*pair)[good].max(initial=0.0)
+        if not largest < 1.0:
+            raise DomainError(f"{name}: expected ellipticities below 1, the largest is {largest:g}")
+    ratio = np.exp(np.abs(np.log(s / m)[good]).max(initial=0.0))
+    if ratio > _MOST_TIMES:
+        raise DomainError(f"size, model_size: expected a ratio of at most {_MOST_TIMES:g}, the largest is {ratio:g}")
     trace, model_trace = trace_of_moments(s, s1, s2), trace_of_moments(m, m1, m2)
     growth = (trace - model_trace) / trace
     e, de, w = (s1, s2), (s1 - m1, s2 - m2), (s1 * growth, s2 * growth)

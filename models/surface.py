@@ -119,7 +119,7 @@ class Surface:
         return self.meeting_shape.sag(x, y)
 
     def normal(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
-        """Return the unit normals on the +z side at x, y [m], all in the surface's own frame, shape [..., 3].
+        """Return the unit normals on the +z side at x, y [m], in the surface's own frame, [..., 3]; NaN beyond the rim.
 
         Where rays meet a surface, and how they leave it: :func:`pachon.intersect`, :func:`pachon.reflect` and
         :func:`pachon.refract`.

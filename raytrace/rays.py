@@ -91,7 +91,7 @@ class Rays(Result):
     Attributes
     ----------
     position : ndarray, shape [n, 3]
-        Starting points [m].
+        Starting points [m]; a ray that starts at NaN has no place on any surface, which its status says.
     direction : ndarray, shape [n, 3]
         Unit vectors of travel.
     path_length : ndarray, shape [n]

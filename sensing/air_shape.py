@@ -39,7 +39,7 @@ def air_shape(last: int, obscuration: float, outer_scale: float) -> np.ndarray:
         Outer scale over the radius of the pupil; may be infinite.
     """
     noll = np.arange(4, last + 1)
-    degrees = [noll_to_nm(j) for j in noll]
+    degrees = [noll_to_nm(int(j)) for j in noll]
     edges = np.linspace(obscuration, 1.0, _RADII + 1)
     radii = 0.5 * (edges[1:] + edges[:-1])
     frequencies = np.geomspace(_LOWEST, _HIGHEST, _FREQUENCIES)

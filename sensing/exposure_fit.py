@@ -212,14 +212,18 @@ class ExposureDonuts(WavefrontFit):
         instrument, freedoms = usable.instrument, self.freedoms
         telescope, wavelength, noll = instrument.telescope, instrument.middle, instrument.terms.requested
         spreads = prior_spreads(freedoms, self.prior, telescope, wavelength)
-        last, where = int(noll.max()), {"fields": usable.fields, "wavelength": wavelength}
+        last, fields = int(noll.max()), usable.fields
         values = np.zeros(len(freedoms))
         believed, made = None, np.zeros_like(observations.zernikes)
         for _ in range(2):
             state = freedoms.apply(telescope, values)
-            response = sensitivity(state, freedoms, n_zernike=last, projection=usable.projection, **where)
+            response = sensitivity(
+                state, freedoms, fields=fields, wavelength=wavelength, n_zernike=last, projection=usable.projection
+            )
             columns = response.matrix[:, noll - 1] * spreads
-            coefficients = wavefront_zernikes(state, jmax=last, projection=usable.projection, **where).coefficients
+            coefficients = wavefront_zernikes(
+                state, fields, wavelength, jmax=last, projection=usable.projection
+            ).coefficients
             believed = coefficients if believed is None else believed
             made = (coefficients - believed)[:, noll - 1] - columns @ (values / spreads)
             basis = Basis(columns, variance=np.ones(len(spreads)))

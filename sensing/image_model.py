@@ -326,10 +326,10 @@ class ImageGrid:
                 extra += [neighbour[0], ratio / np.float32(self.scale) * neighbour[1]]
             stars = [a + ratio * b for a, b in zip(stars, neighbour, strict=True)]
         if response is None:
-            return self._core.pixels(stars[0])
+            return core.pixels(stars[0])
         star, along, growth, wave, shifts = stars
         level, slopes = np.zeros_like(star), np.zeros_like(along)
-        return self._core.pixels(np.concatenate([star, along, level, growth, slopes, *extra, wave, shifts], axis=1))
+        return core.pixels(np.concatenate([star, along, level, growth, slopes, *extra, wave, shifts], axis=1))
 
     def _spectra(
         self,

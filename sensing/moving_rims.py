@@ -355,7 +355,8 @@ class PupilShadows:
         """Return the bodies whose rims bound the light, with how far they may move, and their shadows."""
         bodies = rim_bodies(self._telescope)
         if not bodies:
-            return [], RimLines(np.zeros((0, 2)), np.zeros((0, 2)), *np.zeros((2, 0, MOTIONS)), np.zeros(0, dtype=int))
+            none, motionless = np.zeros((0, 2)), np.zeros((0, MOTIONS))
+            return [], RimLines(none, none, motionless, motionless, np.zeros(0, dtype=np.int64))
         lines = self.lines(bodies)
         count = np.bincount(lines.body, minlength=len(bodies))
         bounding = np.flatnonzero(count >= _FEWEST_PIECES)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -91,7 +91,7 @@ def simple_regions(aperture: Aperture | None) -> list[Simple]:
         return simple_regions(aperture.part)
     if isinstance(aperture, Annulus):
         # A ring without a hole has an outline of no length there.
-        discs = [Circle(aperture.outer, aperture.x, aperture.y)]
+        discs: list[Simple] = [Circle(aperture.outer, aperture.x, aperture.y)]
         return discs + ([Circle(aperture.inner, aperture.x, aperture.y)] if aperture.inner > 0.0 else [])
     return [aperture]
 
@@ -147,12 +147,12 @@ def _moved_region(region: Simple, motion: RimMotion) -> Simple:
         scaled = middle + (corners - middle) * (1.0 + growth / _mean_radius(corners))
         return Polygon(tuple((float(x), float(y)) for x, y in scaled @ _turn(motion.rotation).T + motion[:2]))
     x, y = _turn(motion.rotation) @ [region.x, region.y] + motion[:2]
-    place = {"x": float(x), "y": float(y)}
+    place: dict[str, Any] = {"x": float(x), "y": float(y)}
     if isinstance(region, Circle):
         return replace(region, radius=_grown(region.radius, growth), **place)
     angle = region.angle + motion.rotation
     if isinstance(region, Ellipse):
-        sides = {"semi_x": _grown(region.semi_x, growth), "semi_y": _grown(region.semi_y, growth)}
+        sides: dict[str, Any] = {"semi_x": _grown(region.semi_x, growth), "semi_y": _grown(region.semi_y, growth)}
     elif isinstance(region, Rectangle):
         sides = {"width": _grown(region.width, 2.0 * growth), "height": _grown(region.height, 2.0 * growth)}
     else:

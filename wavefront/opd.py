@@ -62,7 +62,7 @@ def wavefront_opd(
     wavelength : float or Quantity
         Vacuum wavelength [m].
     pupil : (px, py), optional
-        Entrance-pupil coordinates [m], arrays of one shape.
+        Entrance-pupil coordinates [m], arrays of one shape. Results are NaN where no light passes.
     grid : int, optional
         In place of ``pupil``: cells across the pupil diameter of a square grid. 64 when neither is given. Points of
         the grid outside the pupil are dark (:func:`~pachon.wavefront.pupil_grid.pupil_grid`); those of ``pupil`` are

@@ -221,8 +221,6 @@ class _Plan:
             self.pixel = max(self.wave_over_range / _PER_AIRY, 1.25 * self.spread / self.pixels)
         else:
             self.pixel = require_within(length(pixel, "pixel"), "pixel", *_PIXEL_SIDES, "m")
-        samples = self.pixels * self._samples_across()
-        require_bytes(_BYTES_OF_SAMPLE * samples**2, f"pixel = {self.pixel:g} m: {samples} samples across the image")
 
     @one_blas_thread()
     def image(
@@ -233,6 +231,8 @@ class _Plan:
         progress: Callable[[int], None] | None,
     ) -> DiffractionPsf:
         """Return the images of all field points from a function that returns wavelets and their sum."""
+        across = self.pixels * self._samples_across()
+        require_bytes(_BYTES_OF_SAMPLE * across**2, f"pixel = {self.pixel:g} m: {across} samples across the image")
         finer = self._samples()
         images, lit, strehl = [], [], []
         for i, center in enumerate(self.spots.reference_point):

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, check_choice, shown
-from ...core.units import finite, metres
 from ...models.telescope import Telescope
 from ..metrics.spots import REFERENCES, spot_diagram
 from .merit import Beams, Merit, SpotMerit, WavefrontMerit
@@ -75,16 +74,13 @@ class WavefrontError:
     Parameters
     ----------
     goal : array_like, shape [n_field, n_wave, n_pupil], optional
-        Target wavefronts [m] of one telescope, such as those of :func:`~.optimize.wavefronts`; zero by default.
+        Target wavefronts [m] of one telescope, such as those of :func:`~.optimize.wavefronts`: NaN where no light
+        passes; zero by default.
     """
 
     name: ClassVar[str] = "wavefront"
 
     goal: ArrayLike | None = None
-
-    def __post_init__(self) -> None:
-        if self.goal is not None:
-            finite(metres(self.goal, "goal"), "goal")
 
     @property
     def of_one_telescope(self) -> bool:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from astropy.io import fits
@@ -69,7 +70,7 @@ class FitsParts:
 
 
 @contextmanager
-def _opened(path: Path, **options: bool) -> Iterator[fits.HDUList]:
+def _opened(path: Path, **options: Any) -> Iterator[fits.HDUList]:
     """Open a file; cards beyond the standard, which many observatories write, are no error."""
     with warnings.catch_warnings(), parsing(path, "damaged or not FITS", ProductError):
         warnings.simplefilter("ignore", AstropyWarning)

@@ -71,11 +71,11 @@ class Shape(ABC):
         return self._sag(*coordinates(x, y))
 
     def gradient(self, x: ArrayLike, y: ArrayLike) -> Pair:
-        """Return the slopes dz/dx and dz/dy."""
+        """Return the slopes dz/dx and dz/dy; NaN beyond the rim of the shape."""
         return self._gradient(*coordinates(x, y))
 
     def normal(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
-        """Return the unit normals on the +z side, shape [..., 3]."""
+        """Return the unit normals on the +z side, shape [..., 3]; NaN beyond the rim of the shape."""
         along_x, along_y = self.gradient(x, y)
         normal = np.stack([-along_x, -along_y, np.ones_like(along_x)], axis=-1)
         return normal / np.linalg.norm(normal, axis=-1, keepdims=True)

@@ -38,7 +38,7 @@ def traced_donuts():
         stamps = np.random.default_rng(3).poisson(100.0, (count, 9, 9)).astype(float)
         return SimpleNamespace(
             zernikes=zernikes - _zernikes(scene.telescope, scene) + noise,
-            covariance=np.tile(PHOTONS**2 * np.eye(size), (count, 1, 1)),
+            error_parts=SimpleNamespace(photons=np.tile(PHOTONS**2 * np.eye(size), (count, 1, 1))),
             usable=np.ones(count, dtype=bool),
             images=stamps,
             model=np.full(stamps.shape, 100.0),
