@@ -19,8 +19,9 @@ from .solve import Solution
 
 #: Least gain of twice the logarithm of the likelihood by a rim elsewhere: noise makes one in 1e5 of three motions.
 _GAIN = 25.0
-#: The same over the loss beyond noise: rims that explain less are no match for what else a model lacks.
-_MISFIT = 0.1
+#: Least part of the misfit beyond noise that a rim elsewhere explains: where the model lacks other things, or the noise
+#: is larger than given, a rim explains a tenth or two by chance.
+_MISFIT = 0.5
 #: Gain of a score test over these from which on a rim is tried: one that stands far off gains more in the end.
 _PROMISING = 0.5
 #: Gain over the largest one from which on other rims are tried, too.
@@ -83,7 +84,7 @@ def with_moved_rims(
         loss = best.solution.loss / best.stamp.used.sum()
         if loss < noise:
             break
-        threshold = _GAIN + _MISFIT * max(loss - 1.0, 0.0) * best.stamp.used.sum()
+        threshold = _GAIN + _MISFIT * max(loss - (noise or 1.0), 0.0) * best.stamp.used.sum()
         bodies, gains = rim_gains(instrument, best)
         free = [body for body in best.light.free_rims.bodies if body.moved]
         moved = {body.members for body in (*free, *failed)}

@@ -120,7 +120,7 @@ def assert_found(believed, changes, degrees, wave, *, nanometres=60e-9, noise=10
     fit = pachon.fit_donuts(
         believed, image[None], [field], WAVELENGTH, sky_variance=noise, model=model, pixel_size=PIXEL, threads=1
     )
-    assert fit.reasons == ["rim moved"]
+    assert fit.reasons[0] in ("rim moved", "clipped, rim moved")
     error = fit.zernikes[0] - wave[3:]
     assert np.sqrt((error**2).sum()) < nanometres
     # Of 19 degrees of freedom: 2.6 is five standard deviations.
