@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError, UnknownNameError, shown
-from ..core.units import ARCSEC, angle, metres, radians, require_count, require_positive
+from ..core.units import ARCSEC, angle, metres, radians, require_count, require_positive, require_within
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..wavefront.atmosphere.atmosphere import Atmosphere
@@ -23,6 +23,8 @@ _SITE = "cerro_pachon"
 _START_FWHM = 0.8 * ARCSEC
 #: Largest seeing [rad]: no image of a star is as wide.
 _MOST_FWHM = 60.0 * ARCSEC
+#: Sides of pixels of detectors [m].
+_PIXEL_SIDES = (1e-6, 1e-2)
 #: Largest defocus of an image [m].
 _MOST_DEFOCUS = 0.1
 #: Largest relative standard deviation of the radii of rims.
@@ -134,7 +136,7 @@ class DonutDetector:
 
     def pixel(self) -> float:
         """Return the side of a pixel [m]."""
-        return require_positive(metres(self.pixel_size, "pixel_size"), "pixel_size", "metres")
+        return require_within(metres(self.pixel_size, "pixel_size"), "pixel_size", *_PIXEL_SIDES, "m")
 
     def blur(self) -> float:
         """Return the rms of the charge diffusion [m]."""

@@ -21,6 +21,7 @@ from astropy.table import Table
 
 from ..core.errors import ProductError
 from ..core.files import parsing, require_file
+from ..core.fits_files import open_fits
 from .inputs import SMALLEST_STAMP
 from .stamp_headers import HeaderValues, corner_of, defocus_of, detector_of, header_values, pixel_of, stamp_header
 
@@ -200,7 +201,7 @@ def _units(path: Path) -> list[tuple[fits.Header, np.ndarray | Table | None]]:
     """Return headers and contents of the units of a FITS file: images, tables, or nothing."""
     require_file(path, ProductError)
     contents: list[tuple[fits.Header, np.ndarray | Table | None]] = []
-    with parsing(path, "cannot be read as FITS", ProductError), fits.open(path, memmap=False) as units:
+    with parsing(path, "cannot be read as FITS", ProductError), open_fits(path, ProductError, memmap=False) as units:
         for unit in units:
             if unit.is_image:
                 contents.append((unit.header, None if unit.data is None else np.asarray(unit.data)))

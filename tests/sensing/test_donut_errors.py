@@ -228,3 +228,9 @@ def test_calibration(behind_focus, case):
     # Ten wavefronts have some fifty independent errors: 20 % by chance alone. Rims and air are seen by what they leave
     # in the residuals alone: 1.4 and 1.6 were measured, where photons claim a tenth of the square.
     assert 0.4 < ratio < (2.0 if case in ("chord", "air unknown") else 1.6)
+
+
+@pytest.mark.parametrize("side", [3e-17, 3e-11, 3e-8, 1.0])
+def test_pixels_of_no_detector_are_refused(side):
+    with pytest.raises(pachon.PachonError, match=r"pixel_size = .*: expected 1e-06 to 0\.01 m"):
+        pachon.DonutDetector(pixel_size=side)
