@@ -74,12 +74,14 @@ def _unpacked(path: Path, packed: IO[bytes], error: type[PachonError]) -> io.Byt
     opener = next((opener for signature, opener in openers.items() if start.startswith(signature)), None)
     if opener is None:
         return None
-    most = max(_UNPACKED, _RATIO * size)
+    size_limit = max(_UNPACKED, _RATIO * size)
     content = io.BytesIO()
     with opener(packed) as stream:
         while piece := stream.read(_PIECE):
-            if content.tell() + len(piece) > most:
-                text = f"compressed file of {readable(size)} that unpacks to more than {readable(most)}: unpack it"
+            if content.tell() + len(piece) > size_limit:
+                text = (
+                    f"compressed file of {readable(size)} that unpacks to more than {readable(size_limit)}: unpack it"
+                )
                 raise error(text, file=path)
             content.write(piece)
     content.seek(0)

@@ -121,12 +121,6 @@ def require_within(value: Any, name: str, least: float, most: float, unit: str =
     return number
 
 
-def require_all_positive(**values: Any) -> None:
-    """Raise :class:`DomainError` that names the first of the arguments that is no finite, positive number."""
-    for name, value in values.items():
-        require_positive(value, name)
-
-
 def finite(values: np.ndarray, name: str) -> np.ndarray:
     """Return numbers that are all finite, or raise :class:`DomainError` naming the argument."""
     if not np.isfinite(values).all():
