@@ -9,6 +9,7 @@ no command, after the help; 130: interrupted.
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import re
@@ -26,6 +27,7 @@ from ..core.terminal import print_line
 from ..core.version import VERSION
 from .help_group import HelpGroup
 from .interrupt import InterruptedRunError
+from .panels import sort_into_panels
 from .targets import with_checked_targets
 
 # The error of bad arguments is a class of typer or of click, depending on the version of typer.
@@ -40,8 +42,8 @@ app = typer.Typer(
 )
 #: The files of commands, in the order of the help.
 _FILES = (
-    *("run", "images", "measure", "model", "visits", "stack_images", "donuts", "reproduce", "diagnostics", "study"),
-    *("sweep", "baseline", "design", "tolerance", "camera", "shim", "align", "telescope", "files"),
+    *("run", "images", "visits", "stack_images", "reproduce", "diagnostics", "measure", "model", "study", "design"),
+    *("tolerance", "sweep", "baseline", "camera", "shim", "donuts", "align", "telescope", "files"),
 )
 _GROUPS = [import_module(f".{name}", __package__) for name in _FILES]
 _INTERRUPTED = 130
@@ -51,6 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line with arguments, by default those of the process, and return its exit status."""
     # It reports a cache that it cannot write, and then uses a temporary one.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    _show_notices()
+    _show_all_characters()
     command_line = sys.argv[1:] if arguments is None else list(arguments)
     try:
         status = _app_with(command_line[0] if command_line else "")(
@@ -65,9 +69,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except _UsageError as error:
         return _fail(_usage_text(error))
     except BrokenPipeError:
-        # The reader of our output has gone; Python would complain once more when it closes the stream.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return _reader_has_gone()
+    except SystemExit as end:
+        # Rich ends the program where the reader of its output has gone.
+        if isinstance(end.__context__, BrokenPipeError):
+            return _reader_has_gone()
+        raise
     except PachonError as error:
         return _fail(str(error))
     except OSError as error:
@@ -101,6 +108,35 @@ def _usage_text(error: Any) -> str:
     return f"{text} For example: {example[1]}" if lacks_argument and example else text
 
 
+def _reader_has_gone() -> int:
+    """Send what is left of the output nowhere: Python would complain once more when it closes the stream."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
+
+
+def _show_all_characters() -> None:
+    """Let streams that cannot encode a character, such as those of an ASCII terminal, show a question mark."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="replace")
+
+
+class _NoticeHandler(logging.Handler):
+    """Shows notices of the library on standard error, each on a line."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print one notice."""
+        print_line(record.getMessage(), error=True)
+
+
+def _show_notices() -> None:
+    """Let the command line show what the library has to say, once."""
+    logger = logging.getLogger("pachon")
+    if not any(isinstance(handler, _NoticeHandler) for handler in logger.handlers):
+        logger.addHandler(_NoticeHandler())
+        logger.setLevel(logging.INFO)
+
+
 def _fail(text: str, status: int = 2) -> int:
     print_line(f"pachon: error: {' '.join(text.split())}", error=True)
     return status
@@ -123,6 +159,7 @@ def _common(
 
 for _group in _GROUPS:
     app.add_typer(_group.app)
+sort_into_panels(app)
 with_checked_targets(app)
 
 

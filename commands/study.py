@@ -134,8 +134,9 @@ def _show(result: Study) -> None:
 
 
 def _numbers(text: str, option: str, kind: type[_Number]) -> tuple[_Number, ...]:
+    names = name_list(text, option)
     try:
-        return tuple(kind(number) for number in name_list(text, option))
+        return tuple(kind(name) for name in names)
     except ValueError:
         expected = "whole numbers" if kind is int else "numbers"
         raise ConfigError(f"{option} = {text!r}: expected {expected} separated by commas, such as 20,40") from None

@@ -1,4 +1,7 @@
-"""Exceptions for bad input: each a subclass of :class:`PachonError` with a text of one line."""
+"""Exceptions for bad input: each a subclass of :class:`PachonError` with a text of one line.
+
+Errors of values are ValueErrors too, those of names KeyErrors: code that catches the built-in ones need not know these.
+"""
 
 from __future__ import annotations
 
@@ -105,7 +108,7 @@ class PachonError(Exception):
         return type(self)(problem, subject=self.subject, file=self.file, place=self.place, key=key)
 
 
-class PrescriptionError(PachonError):
+class PrescriptionError(PachonError, ValueError):
     """Malformed prescription or site file."""
 
 
@@ -125,15 +128,15 @@ class WcsWarning(UserWarning):
     """World coordinates that are known with errors only."""
 
 
-class ConfigError(PachonError):
+class ConfigError(PachonError, ValueError):
     """Malformed configuration file or option."""
 
 
-class UnknownNameError(PachonError):
+class UnknownNameError(PachonError, KeyError):
     """Unknown name of a model, surface, CCD or site."""
 
 
-class DomainError(PachonError):
+class DomainError(PachonError, ValueError):
     """Value outside the domain of a model."""
 
 

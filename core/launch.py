@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import logging
 import os
 import platform
 import shutil
@@ -17,10 +18,12 @@ from typing import Any
 import warp as wp
 
 from .errors import ProductError
-from .terminal import print_line
 from .threads import thread_count
 
 wp.config.log_level = wp.LOG_ERROR
+
+#: Notices of the library: compilations at level INFO, a cache that cannot be written as a warning. Commands show both.
+LOGGER = logging.getLogger("pachon")
 
 #: Compiler flags of every kernel module: full-width SIMD where the processor has it, and a stack on which no such
 #: vector lies across two cache lines, which is worth a tenth of the time.
@@ -57,12 +60,12 @@ def start_warp() -> None:
             os.close(saved_stderr)
             os.close(null_device)
         if cache_warning:
-            print_line(cache_warning, error=True)
+            LOGGER.warning(cache_warning)
         _started.append(True)
 
 
 def load_kernels(kernel: wp.Kernel, device: str = "cpu") -> None:
-    """Load the module of a kernel; a compilation, once per machine and version, is announced on standard error."""
+    """Load the module of a kernel; a compilation, once per machine and version, goes to the logger ``pachon``."""
     start_warp()
     key = (kernel.module.name, device)
     if key in _loaded:
@@ -74,10 +77,10 @@ def load_kernels(kernel: wp.Kernel, device: str = "cpu") -> None:
         block = 1 if device == "cpu" else 256
         if not (Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(block)).exists():
             name = kernel.module.name.rpartition(".")[2]
-            print_line(f"compiling {name} for this machine (once)", error=True)
+            LOGGER.info("compiling %s for this machine (once)", name)
         cache_warning = _with_kernel_cache(lambda: wp.load_module(kernel.module, device=device, block_dim=block))
         if cache_warning:
-            print_line(cache_warning, error=True)
+            LOGGER.warning(cache_warning)
         _loaded.add(key)
 
 

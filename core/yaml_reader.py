@@ -197,10 +197,9 @@ def read_mapping(
     Raises `error` if the file cannot be read, is longer, deeper (:data:`MAX_DEPTH`) or has more values and aliases than
     a file of that length, is not YAML, or is not a mapping.
     """
+    raw = read_bytes(path, error, max_bytes=max_bytes)
     try:
-        content = _StrictLoader(
-            read_bytes(path, error, max_bytes=max_bytes).decode(), max_bytes, exact=exact
-        ).get_single_data()
+        content = _StrictLoader(raw.decode(), max_bytes, exact=exact).get_single_data()
     except UnicodeDecodeError:
         raise error("not a UTF-8 text file", file=path) from None
     except yaml.MarkedYAMLError as problem:

@@ -161,8 +161,9 @@ def measure_shapes(
         raise DomainError(f"max_iterations = {max_iterations}: expected at least 1")
     tolerance = require_positive(tolerance, "tolerance", "pixels")
     count = len(stack)
+    levels = pure_numbers(background, "background")
     try:
-        level = np.broadcast_to(pure_numbers(background, "background"), (count,))
+        level = np.broadcast_to(levels, (count,))
     except ValueError as error:
         raise DomainError(f"background has shape {np.shape(background)}: expected one value or {count}") from error
     weightless = None if weights is None else weightless_pixels(stack, weights)

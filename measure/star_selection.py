@@ -135,8 +135,9 @@ def flag_stars(
     """
     images = _stamp_cube(stamps)
     count = len(images)
+    noises = pure_numbers(noise, "noise")
     try:
-        rms = np.broadcast_to(pure_numbers(noise, "noise"), (count,))
+        rms = np.broadcast_to(noises, (count,))
     except (TypeError, ValueError) as error:
         raise DomainError(f"noise = {noise!r}: expected one number or {count}") from error
     for name, value in (("noise", rms), ("gain", gain), ("threshold", threshold), ("saturation", saturation)):

@@ -44,8 +44,9 @@ def files_of_mesh(path: Path) -> list[str]:
     """Return the files that a GLTF file names beside itself: buffers and pictures; other formats name none."""
     if path.suffix.lower() != ".gltf":
         return []
+    raw = read_bytes(path, PrescriptionError, max_bytes=MAX_MESH_BYTES)
     try:
-        content = json.loads(read_bytes(path, PrescriptionError, max_bytes=MAX_MESH_BYTES))
+        content = json.loads(raw)
         named = [entry.get("uri") for key in ("buffers", "images") for entry in content.get(key, ())]
     except (ValueError, AttributeError, TypeError, RecursionError):
         # Not JSON, or no GLTF: what reads the mesh says so.

@@ -112,6 +112,8 @@ def padded(
         sequence: Any = values
         read = _numbers if kind is np.float64 else lambda stamp, _: np.asarray(stamp, dtype=kind)
         listed: list[np.ndarray] = [read(stamp, name) for stamp in sequence]
+    except DomainError:
+        raise
     except (TypeError, ValueError):
         raise DomainError(f"{name}: expected an array of shape [n, ny, nx], or n arrays of two dimensions") from None
     if not listed or any(v.ndim != 2 or min(v.shape) < SMALLEST_STAMP for v in listed):

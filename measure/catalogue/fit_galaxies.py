@@ -102,8 +102,9 @@ def fit_galaxies(
     pixels, variances, ignored = check_pixels(image, variance, mask)
     places = _checked_positions(x, y, pixels.shape)
     count = len(places)
+    radii = pure_numbers(half_light_radius, "half_light_radius")
     try:
-        radius = np.broadcast_to(pure_numbers(half_light_radius, "half_light_radius"), (count,))
+        radius = np.broadcast_to(radii, (count,))
     except (TypeError, ValueError) as error:
         raise DomainError(f"half_light_radius: expected one number or {count}") from error
     radius = np.where(np.isnan(radius), 0.5 * STAMP_SIDES[0] / STAMP_RADII, radius)

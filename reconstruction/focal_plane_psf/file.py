@@ -13,7 +13,7 @@ import numpy as np
 from astropy.io import fits
 
 from ...core.ccd_names import NAMES_VERSION, refuse_mirrored_names
-from ...core.errors import ProductError
+from ...core.errors import ProductError, UnknownNameError
 from ...models.camera.camera import Camera
 from ...models.camera.ccd_surfaces import CcdSurfaces
 from ...models.camera.focal_plane import FocalPlane
@@ -196,6 +196,8 @@ def read_model(kind: type[_Model], hdus: Iterable[fits.ImageHDU], path: Path) ->
             mean_star=part("MEAN") if "MEAN" in extensions else None,
             pca=pca,
         )
+    except UnknownNameError:
+        raise
     except KeyError as error:
         raise ProductError(f"no focal-plane PSF model ({error.args[0]} is missing)", file=path) from None
 

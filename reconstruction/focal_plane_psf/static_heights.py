@@ -23,7 +23,7 @@ from astropy.io import fits
 
 from ...core.arguments import check_arguments, removed_arguments
 from ...core.ccd_names import NAMES_CARD, refuse_mirrored_names
-from ...core.errors import DomainError, ProductError
+from ...core.errors import DomainError, ProductError, UnknownNameError
 from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
 from ...core.result import Result
@@ -128,6 +128,8 @@ class StaticHeights(Result):
             )
             plane = FocalPlane(camera_of_file, surfaces, np.ones(len(camera_of_file), dtype=bool))
             return cls(plane, _hdu_array(hdus["COVARIANCE"]), int(hdus[0].header["NEXPOSE"]))
+        except UnknownNameError:
+            raise
         except KeyError as error:
             raise ProductError(f"no product with heights ({' '.join(str(error).split())})", file=path) from None
 

@@ -93,8 +93,9 @@ class Baseline(Section):
 @check_arguments
 def read_baseline(path: str | os.PathLike[str]) -> Baseline:
     """Read a baseline; ConfigError if it is no JSON, no baseline or of another version of the format."""
+    raw = read_bytes(Path(path), ConfigError)
     try:
-        content = json.loads(read_bytes(Path(path), ConfigError).decode(), object_pairs_hook=_mapping)
+        content = json.loads(raw.decode(), object_pairs_hook=_mapping)
     except json.JSONDecodeError as error:
         raise ConfigError(f"no JSON (line {error.lineno}, column {error.colno}: {error.msg})", file=path) from None
     except (ValueError, RecursionError) as error:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from ...core.errors import ConfigError, ProductError, cut_short
+from ...core.errors import ConfigError, PachonError, ProductError, cut_short
 from ...core.files import make_folder, partial_path, plain_values, publish_new
 from ...core.long_work import differences
 from ...core.version import VERSION
@@ -169,6 +169,8 @@ class SweepStore:
             yield
         except sqlite3.Error as error:
             raise _store_error(self.path, error, self.kind) from None
+        except PachonError:
+            raise
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
             raise _damaged_error(self.path, error, self.kind) from None
 

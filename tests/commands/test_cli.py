@@ -2,6 +2,7 @@
 
 import gc
 import json
+import logging
 import os
 import re
 import shutil
@@ -338,3 +339,34 @@ def test_shells_complete_commands_and_options(tmp_path):
     shown = ["bash", "-c", '"$@"; exit $?', "bash", *command, "--show-completion", "bash"]
     script = subprocess.run(shown, capture_output=True, text=True)
     assert "complete -o default -F _pachon_completion pachon" in script.stdout
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("arguments", [("info", "hsc"), ("info", "hsc", "--json"), ("--help",), ("operands",)])
+def test_a_reader_that_leaves_ends_a_command_quietly(arguments):
+    # Two commands of a shell: "pachon info hsc | head -1", with the status of the first.
+    code = "import sys; from pachon.commands.cli import main; sys.exit(main())"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        process.stdout.close()
+        err = process.stderr.read()
+    assert process.returncode == 0
+    assert err == b""
+
+
+@pytest.mark.long
+def test_a_terminal_that_knows_ascii_alone_shows_question_marks():
+    code = "import sys; from pachon.commands.cli import main; sys.exit(main(['info', 'hsc']))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONIOENCODING": "ascii:strict"}, capture_output=True
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"radius 0.75?" in done.stdout
+
+
+def test_notices_of_the_library_are_shown_once(capsys):
+    for _ in range(2):
+        assert main(["--version"]) == 0
+    logging.getLogger("pachon").info("compiling %s", "trace\x1b[31m")
+    assert capsys.readouterr().err == "compiling trace\\x1b[31m\n"

@@ -1,11 +1,14 @@
 """``pachon sweep`` and ``pachon baseline``: their own commands, the word that may be left out, and mistyped words."""
 
 import json
+import re
 
 import pytest
+import typer
 from astropy.table import Table
 
-from pachon.commands.cli import main
+from pachon.commands.cli import app, main
+from pachon.commands.panels import PANELS
 from pachon.studies.sweep.file import read_sweep
 from pachon.studies.sweep.store import PointResult, SweepPoint, SweepStore, create_store
 
@@ -111,3 +114,13 @@ def test_exports_of_a_store_and_of_what_is_left_of_a_damaged_one(capsys, store):
     assert 100 < saved["points"] < 299
     assert saved["damaged"].startswith("small.sweep: damaged")
     assert len(Table.read("saved.csv", format="ascii.csv", comment="#")) == saved["points"]
+
+
+def test_each_command_stands_in_one_panel_of_the_help(capsys):
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    panels = re.findall(r"^╭─ (.*?) ─+╮$", text, re.MULTILINE)
+    assert panels == ["Options", *PANELS]
+    names = [name for line in PANELS.values() for name in line.split()]
+    assert len(names) == len(set(names))
+    assert set(names) == set(typer.main.get_command(app).commands)

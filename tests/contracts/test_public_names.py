@@ -45,5 +45,5 @@ def test_tracing_is_silent():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == ""
-    # A first compilation says so in one line of ours; nothing else, no banner, no warning about CUDA.
-    assert all(line.startswith("compiling ") for line in done.stderr.splitlines())
+    # No banner, no warning about CUDA; that a kernel is compiled goes to the logger, at a level that is not shown.
+    assert done.stderr == ""

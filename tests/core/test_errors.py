@@ -4,7 +4,15 @@ import pickle
 
 import pytest
 
-from pachon.core.errors import ConfigError, PachonError, PrescriptionError, error_context
+from pachon.core.errors import (
+    ConfigError,
+    DomainError,
+    PachonError,
+    PrescriptionError,
+    ProductError,
+    UnknownNameError,
+    error_context,
+)
 
 
 def test_the_text_has_subject_file_place_and_problem():
@@ -50,3 +58,16 @@ def test_a_key_can_have_the_name_of_an_option():
 def test_fields_survive_a_process():
     error = pickle.loads(pickle.dumps(ConfigError("k = 1", file="a.yaml", key="k")))
     assert (str(error), error.file, error.key) == ("a.yaml: k = 1", "a.yaml", "k")
+
+
+def test_errors_of_values_and_names_are_the_built_in_ones_too():
+    for kind in (ConfigError, PrescriptionError, DomainError):
+        assert issubclass(kind, PachonError)
+        assert issubclass(kind, ValueError)
+    assert issubclass(UnknownNameError, KeyError)
+    assert not issubclass(ProductError, (ValueError, KeyError))
+    # A KeyError's own text would stand in quotes.
+    assert str(UnknownNameError("unknown CCD 'R99'")) == "unknown CCD 'R99'"
+    with pytest.raises(KeyError):
+        raise UnknownNameError("unknown CCD 'R99'")
+    assert str(pickle.loads(pickle.dumps(UnknownNameError("no such band", file="a.yaml")))) == "a.yaml: no such band"

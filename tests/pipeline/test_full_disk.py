@@ -66,7 +66,7 @@ def test_a_kernel_cache_that_cannot_be_written_is_one_line(tmp_path):
     done = subprocess.run([sys.executable, "-c", code], env=where, capture_output=True, text=True, check=True)
     # The kernels go to a temporary folder, where they are compiled.
     assert done.stdout == "1\n"
-    told = [line for line in done.stderr.splitlines() if not line.startswith("compiling ")]
+    told = done.stderr.splitlines()
     assert len(told) == 1
     assert told[0].startswith("cannot write compiled kernels to")
     assert "WARP_CACHE_PATH names another folder" in told[0]

@@ -1,0 +1,27 @@
+"""Panels of ``pachon --help``: which commands stand together."""
+
+from __future__ import annotations
+
+import typer
+
+#: Commands of each panel, in the order of the help.
+PANELS = {
+    "Runs and images": "run images visits null-test stack-images reproduce diagnose attribute",
+    "Stars and PSF models": "measure model study",
+    "Design analyses": "spots focus zernikes rays fans opd-fans field-curvature lateral-color focal-shift seidel "
+    "spot-matrix illumination throughput strehl target distortion vignetting footprint draw psf ee mtf ghosts opd "
+    "design-report",
+    "Optimise, tolerance, sweep": "optimize operands sensitivity tolerance sweep baseline check",
+    "Camera and alignment": "camera shim donuts align",
+    "Files": "info convert new validate schema",
+}
+
+
+def sort_into_panels(app: typer.Typer) -> None:
+    """Set the panels of the commands and groups in the groups of an app."""
+    panel_of = {name: panel for panel, names in PANELS.items() for name in names.split()}
+    for group in app.registered_groups:
+        if group.typer_instance is not None:
+            commands = (*group.typer_instance.registered_commands, *group.typer_instance.registered_groups)
+            for command in commands:
+                command.rich_help_panel = panel_of[str(command.name)]
