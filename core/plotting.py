@@ -15,6 +15,7 @@ from .errors import ConfigError, DomainError, shown
 # Matplotlib takes a third of a second to import: only where something is drawn.
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 #: The palette, in the order in which curves of one picture take it; all differ in lightness too.
@@ -151,6 +152,15 @@ def png_bytes(figure: Figure) -> bytes:
 def plain_text(name: str) -> str:
     """Return a name as pictures draw it letter by letter; matplotlib takes text between dollar signs for maths."""
     return name.replace("$", r"\$")
+
+
+def label_log_axis(axis: Axis) -> None:
+    """Put plain numbers at 1, 2 and 5 of each decade of a logarithmic axis; more would overlap where it is short."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def figure_of(axes: Axes) -> Figure:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, check_choice, shown
-from ..core.plotting import BLUE, ORANGE, axes_at, styled
+from ..core.plotting import BLUE, ORANGE, axes_at, label_log_axis, styled
 from ..core.result import Result
 from ..core.units import ARCMIN, angle, radians, real_array, require_count
 
@@ -189,14 +189,9 @@ class Correlation(Result):
 
 def draw_correlation_axes(axes: Axes) -> None:
     """Draw zero, labels and legend of correlations against separation."""
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-
     axes.axhline(0.0, color="0.5", linewidth=0.7)
     axes.set(xscale="log", xlabel="separation [arcmin]", ylabel="correlation of ellipticities")
-    # Over little more than a decade, names of all ticks would overlap.
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    label_log_axis(axes.xaxis)
     axes.ticklabel_format(axis="y", style="sci", scilimits=(0, 0))
     axes.legend(loc="best")
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.plotting import BLUE, ORANGE, RED, figure_at, plain_text, styled
+from ...core.plotting import BLUE, ORANGE, RED, figure_at, label_log_axis, plain_text, styled
 from ...core.products import Columns, described_table
 from ...core.result import Result
 from ...core.units import ARCMIN, ARCSEC, require_count
@@ -226,6 +226,7 @@ def _draw(own: OwnStars, title: str, ax: Axes | Figure | None) -> Figure:
                 axes.plot(snr[rising], sign * noise[rising], "-", color="0.4", linewidth=1.0, label=noise_label)
             limit = 4.0 * float(np.nanstd(values))
             axes.set(xscale="log", xlabel="S/N", ylim=(-limit, limit))
+            label_log_axis(axes.xaxis)
             axes.axhline(0.0, color="0.7", linewidth=0.6)
             axes.set_title(f"{label}; stars held out", loc="left")
             axes.legend()
@@ -237,6 +238,7 @@ def _draw(own: OwnStars, title: str, ax: Axes | Figure | None) -> Figure:
             axes.errorbar(theta, correlation.xi_plus, correlation.error_plus, fmt=".-", color=color, label=name)
         axes.axhline(0.0, color="0.7", linewidth=0.6)
         axes.set(xscale="log", xlabel="separation [arcmin]")
+        label_log_axis(axes.xaxis)
         axes.ticklabel_format(axis="y", style="sci", scilimits=(0, 0))
         axes.set_title("rho statistics of the held-out stars", loc="left")
         axes.legend()

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from ...core.files import write_bytes, write_json
-from ...core.plotting import BLUE, GREY, ORANGE, RED, new_figure, plain_text, png_bytes, styled
+from ...core.plotting import BLUE, GREY, ORANGE, RED, label_log_axis, new_figure, plain_text, png_bytes, styled
 from ...core.products import Columns, write_ecsv
 from ...core.version import VERSION
 from .loop import Alignment
@@ -119,9 +119,7 @@ def quality_picture(alignment: Alignment) -> bytes:
             axes.set_ylabel(label)
         for axes in panel_axes[[0, 2]]:
             axes.set_yscale("log")
-            axes.yaxis.set_major_formatter(PLAIN)
-            axes.yaxis.set_minor_formatter(NullFormatter())
-            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            label_log_axis(axes.yaxis)
         panel_axes[0].plot(visit, 1e9 * alignment.expected, color=ORANGE, label="expected from the covariance")
         panel_axes[0].axhline(1e9 * alignment.floor, color=GREY, linewidth=0.8, linestyle="--", label="floor")
         panel_axes[1].set_yscale("symlog", linthresh=10.0)

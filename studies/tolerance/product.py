@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...core.files import write_bytes, write_json
-from ...core.plotting import BLUE, GREY, ORANGE, RED, new_figure, png_bytes, styled
+from ...core.plotting import BLUE, GREY, ORANGE, RED, label_log_axis, new_figure, png_bytes, styled
 from ...core.products import Columns, write_ecsv
 from ...core.version import VERSION
 from .file import ToleranceFile
@@ -112,8 +112,6 @@ def inverse_plot(study: ToleranceStudy) -> bytes:
     shown = study.offenders[:SHOWN][::-1]
     ratio = study.inverse[shown] / np.array([study.tolerances[i].size for i in shown])
     finite = np.isfinite(ratio)
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
     with styled():
         figure = new_figure(8.4, 1.4 + 0.24 * len(shown))
         axes = figure.subplots()
@@ -124,9 +122,7 @@ def inverse_plot(study: ToleranceStudy) -> bytes:
             axes.text(1.0, row, " no size costs as much", va="center", fontsize=7)
         name_rows(axes, study, shown)
         axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
+        label_log_axis(axes.xaxis)
         axes.axvline(1.0, color=GREY, linewidth=0.8)
         axes.grid(True, axis="x", color="0.93", linewidth=0.5)
         axes.set_xlabel(f"size that costs {100 * study.loss:g} % of the {study.criterion.title}, over the tolerance")
