@@ -26,9 +26,11 @@ REQUIREMENTS = {
 
 
 def test_citation_project_and_package_agree():
-    assert PROJECT["project"]["version"] == VERSION
+    source = PROJECT["tool"]["hatch"]["version"]
+    assert re.findall(source["pattern"], (ROOT / source["path"]).read_text(encoding="utf-8")) == [VERSION]
+    assert version("pachon") == VERSION
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    assert str(citation["version"]) == PROJECT["project"]["version"]
+    assert str(citation["version"]) == VERSION
     assert citation["license"] == PROJECT["project"]["license"]
     assert citation["references"][0]["doi"] in (ROOT / "README.md").read_text(encoding="utf-8")
 
@@ -36,7 +38,9 @@ def test_citation_project_and_package_agree():
 def test_workflows_run_what_is_there():
     for path in (ROOT / ".github" / "workflows").glob("*.yml"):
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        steps = [step for job in content["jobs"].values() for step in job["steps"]]
+        jobs = content["jobs"].values()
+        assert all((ROOT / job["uses"]).is_file() for job in jobs if "uses" in job)
+        steps = [step for job in jobs for step in job.get("steps", [])]
         assert steps
         for command in (step["run"] for step in steps if step.get("run", "").startswith((".ci/", "pytest"))):
             target = command.split()[-1] if command.startswith("pytest") else command
@@ -122,3 +126,17 @@ def test_releases_are_built_from_pinned_and_hashed_packages():
     workflow = (ROOT / ".github" / "workflows" / "build.yml").read_text(encoding="utf-8")
     assert "--require-hashes -r .github/requirements/build.txt" in workflow
     assert "build --no-isolation" in workflow
+
+
+def test_the_recipe_for_conda_asks_for_what_the_package_asks_for():
+    recipe = yaml.safe_load((ROOT / "release" / "recipe.yaml").read_text(encoding="utf-8"))
+    names = {"matplotlib": "matplotlib-base", "lazy_loader": "lazy-loader"}
+    asked = {f"{names.get(r.name, r.name)} {r.specifier}" for r in REQUIREMENTS[""]}
+    assert asked == {line for line in recipe["requirements"]["run"] if not line.startswith("python ")}
+    assert recipe["context"]["version"] == VERSION
+
+
+def test_the_source_archive_keeps_the_pictures_of_the_readme():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    kept = {line[1:] for line in PROJECT["tool"]["hatch"]["build"]["targets"]["sdist"]["exclude"] if line[0] == "!"}
+    assert set(re.findall(r"\((docs/images/\S+?)\)", readme)) == kept
