@@ -267,7 +267,8 @@ WORK = {
     ),
     "donuts": Work(
         "donuts {here}/donuts.fits --zernikes 6 --no-diffraction --higher-order-nm 0 --each-alone"
-        f" --no-orientation-check -o {{out}}/out.ecsv --picture {{out}}/donuts.png {ON_ONE}", _write_donuts, resumes=False,
+        f" --no-orientation-check -o {{out}}/out.ecsv --picture {{out}}/donuts.png {ON_ONE}",
+        _write_donuts, resumes=False,
     ),
     "model": Work("model {here}/stars.fits --pixel-arcsec 0.2 --min-snr 5 --out {out}/psf.fits --quiet", _write_stars,
                   resumes=False),
