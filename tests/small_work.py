@@ -193,7 +193,7 @@ def _static_heights(here, out, resume):
     ]  # fmt: skip
     out.mkdir(exist_ok=True)
     heights = pachon.fit_static_heights(
-        exposures, instrument, camera=camera, prior=OpticsPrior(alignment_rms=0.0), steps=2, folder=out, threads=1
+        exposures, instrument, camera=camera, prior=OpticsPrior(alignment_rms=0.0), steps=1, folder=out, threads=1
     )
     heights.write(out / "heights.fits")
 

@@ -15,7 +15,7 @@ import pytest
 from small_work import WORK, content
 
 #: Disks of each, as fractions of what the work writes.
-ROOMS = (0.02, 0.35, 0.65, 0.95)
+ROOMS = (0.05, 0.5, 0.95)
 #: Room of a disk for all of it [kB].
 AMPLE = 1_000_000
 NAMES = ("run", "null-test", "stack-images", "model", "donuts", "optimize", "sweep", "tolerance", "measure", "shim",
