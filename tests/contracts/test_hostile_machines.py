@@ -79,7 +79,8 @@ def test_work_under_a_clock_that_jumps_leaves_the_same_bytes(name, tmp_path, mon
 @pytest.mark.parametrize("name", ["run", "sweep"])
 @pytest.mark.parametrize("stopped", ["worker", "all workers", "driver"])
 def test_processes_that_are_stopped_and_go_on_lose_nothing(name, stopped, tmp_path):
-    settings = {"run": RUN, "sweep": SWEEP}[name]
+    # Long enough for both workers to be seen at work.
+    settings = {"run": RUN, "sweep": SWEEP | {"design": {"kind": "latin_hypercube", "points": 30}}}[name]
     (tmp_path / "file.yaml").write_text(yaml.safe_dump(settings))
     out = {"run": "{}", "sweep": "{}/s.sweep"}[name]
     for folder in ("alone", "stopped"):
