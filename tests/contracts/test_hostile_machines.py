@@ -86,7 +86,8 @@ def test_processes_that_are_stopped_and_go_on_lose_nothing(name, stopped, tmp_pa
     for folder in ("alone", "stopped"):
         (tmp_path / folder).mkdir()
     driver = start(tmp_path, name, "file.yaml", "--out", out.format("alone/out"), "--processes", "1", "--quiet")
-    assert driver.wait() == 0, driver.stderr.read()
+    said = driver.communicate()[1]
+    assert (driver.returncode, said) == (0, "")
     driver = start(tmp_path, name, "file.yaml", "--out", out.format("stopped/out"), "--processes", "2", "--quiet")
     ready = wait_for(lambda: len(workers(driver)) == 2 and workers(driver), driver)
     for process in {"worker": ready[:1], "all workers": ready, "driver": [driver.pid]}[stopped]:
