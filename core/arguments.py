@@ -241,6 +241,8 @@ _LONGEST_PATH = 4096
 #: Longest name of a file or folder of common systems [characters].
 _LONGEST_NAME = 255
 _SEQUENCES = (tuple, list, Sequence, Iterable)
+#: Most elements of a sequence that are checked one by one: an array of some bytes may show a number a billion times.
+_MOST_ELEMENTS = 10**7
 
 
 def _class_check(accepted: tuple[Any, ...], expected: str) -> _Check:
@@ -349,6 +351,8 @@ def _sequence_check(kind: Any, elements: tuple[Any, ...]) -> _Check:
         if not isinstance(value, (list, tuple, np.ndarray)):
             # An iterator can be used once only.
             return value
+        if len(value) > _MOST_ELEMENTS:
+            raise _MismatchError(name, value, f"{expected} of at most {_MOST_ELEMENTS}")
         if fixed and len(value) != len(checks):
             raise _MismatchError(name, value, expected)
         element_checks = checks if fixed else checks * len(value)

@@ -71,8 +71,10 @@ def dask_client(address: str, security: Any = None) -> Iterator[Any]:
     _require_distributed("--scheduler")
     if not re.fullmatch(r"(tcp|tls|ws|wss|ucx)://\S+:\d+", address):
         raise ConfigError(f"--scheduler = {address}: expected an address such as tcp://host:8786 or tls://host:8786")
-    from distributed import Client
+    from distributed import Client, Security
 
+    security = Security() if security is None else security
+    _require_certificates(address, security)
     with _quiet_dask():
         try:
             client = Client(address, timeout=CONNECT_SECONDS, security=security, set_as_default=False)
@@ -126,6 +128,26 @@ def _quiet_dask() -> Iterator[None]:
     finally:
         for name, level in before.items():
             logging.getLogger(name).setLevel(level)
+
+
+def _require_certificates(address: str, security: Any) -> None:
+    """Refuse an address that the certificates of this side do not fit, which Dask finds out late and in many lines."""
+    try:
+        arguments = security.get_connection_args("client")
+    except (OSError, ValueError, TypeError) as error:
+        raise ConfigError(
+            f"--scheduler = {address}: the certificates of distributed.comm.tls cannot be used ({_first_line(error)})"
+        ) from None
+    encrypted = address.startswith(("tls", "wss"))
+    if encrypted and arguments.get("ssl_context") is None:
+        raise ConfigError(
+            f"--scheduler = {address}: expected distributed.comm.tls in Dask's configuration: ca-file, and cert and "
+            "key of the client"
+        )
+    if not encrypted and arguments.get("require_encryption"):
+        raise ConfigError(
+            f"--scheduler = {address}: Dask's configuration requires encryption; expected an address with tls://"
+        )
 
 
 def _require_distributed(option: str) -> None:

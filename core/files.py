@@ -29,7 +29,7 @@ _PROBE = 4096
 
 def write_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError) -> None:
     """Write a file whole, or raise `error` with the path and the system's reason and leave nothing behind."""
-    _write(path, data, error, os.replace)
+    _write(path, data, error, _publish)
 
 
 def write_new_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError) -> bool:
@@ -89,16 +89,34 @@ def _write(path: Path, data: bytes, error: type[PachonError], publish: Callable[
         raise error(f"cannot write {path}: {problem.strerror or problem}") from None
 
 
+def _publish(partial: Path, path: Path) -> None:
+    """Give a temporary file its final name."""
+    content = os.stat(partial)
+    try:
+        os.replace(partial, path)
+    except FileNotFoundError:
+        # A network file system repeats a request whose answer it lost, and finds it done.
+        if not (path.exists() and os.path.samestat(content, os.stat(path))):
+            raise
+
+
 def publish_new(partial: Path, path: Path) -> None:
     """Give a temporary file its final name, or raise FileExistsError where there is one already."""
     try:
         os.link(partial, path)
     except FileExistsError:
-        raise
+        # As of a rename: an answer may be lost of a link that was made.
+        if not os.path.samefile(partial, path):
+            raise
     except OSError:
         # File systems without hard links, such as FAT.
         with open(path, "xb") as file:
-            file.write(partial.read_bytes())
+            try:
+                file.write(partial.read_bytes())
+                file.flush()
+            except OSError:
+                path.unlink()
+                raise
 
 
 @contextmanager

@@ -15,6 +15,8 @@ ARCSEC = np.pi / 648000
 ARCMIN = 60.0 * ARCSEC
 #: Largest number, so that its powers stay finite.
 _LARGEST = 1e50
+#: Most numbers of one argument: 8 GB, and seconds for each look at all of them.
+_MOST_NUMBERS = 10**9
 
 
 def is_quantity(value: Any) -> bool:
@@ -123,6 +125,8 @@ def require_within(value: Any, name: str, least: float, most: float, unit: str =
 
 def finite(values: np.ndarray, name: str) -> np.ndarray:
     """Return numbers that are all finite, or raise :class:`DomainError` naming the argument."""
+    if np.size(values) > _MOST_NUMBERS:
+        raise DomainError(f"{name} = {shown(values)}: expected at most {_MOST_NUMBERS} numbers", key=name)
     if not np.isfinite(values).all():
         raise DomainError(f"{name} = {shown(values)}: expected finite numbers", key=name)
     return values

@@ -22,6 +22,8 @@ from ..pipeline.simulate.photometry import band_named, sky_electrons_per_pixel
 SATURATED = 1
 #: Names of the bits of the mask, by their value.
 MASK_BITS = {SATURATED: "SATURATED"}
+#: Brightest and faintest sky that is taken for one [AB mag/arcsec^2].
+_MOST_MAGNITUDES = 100.0
 #: Rows of a band of the image; each band has its own random stream.
 _ROWS = 128
 
@@ -97,8 +99,9 @@ class Exposure:
         for name in ("read_noise", "dark_current"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
                 raise DomainError(f"{name} = {getattr(self, name)}: expected a number that is not negative")
-        if self.sky is not None and not np.isfinite(self.sky):
-            raise DomainError(f"sky = {self.sky}: expected a finite brightness in AB mag/arcsec^2")
+        if self.sky is not None and not abs(self.sky) < _MOST_MAGNITUDES:
+            limits = f"{-_MOST_MAGNITUDES:g} to {_MOST_MAGNITUDES:g}"
+            raise DomainError(f"sky = {self.sky}: expected a finite brightness in AB mag/arcsec^2, {limits}")
         if self.background >= self.exposures * self.full_well:
             raise DomainError(
                 f"sky = {self._brightness:.2f}: its {self.background / self.exposures:.0f} electrons a pixel fill the "

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 #: Size under the weight, in units of that of the weight, from which on light does not fall off: 22 times as wide.
 _WIDEST = 0.999
+#: Most images of one call: more would take days.
+_MOST_IMAGES = 10**8
 _BATCH_PIXELS = 1 << 20  # 8 MB a work array: the memory used does not grow with the number of stars
 
 
@@ -424,4 +426,6 @@ def stamp_cube(images: ArrayLike) -> np.ndarray:
             f"images have shape {np.shape(images)} and type {array.dtype}: "
             "expected real numbers [n, ny, nx] or [ny, nx], at least 3 x 3"
         )
+    if len(array) > _MOST_IMAGES:
+        raise DomainError(f"images have shape {array.shape}: expected at most {_MOST_IMAGES} of them")
     return array

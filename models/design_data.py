@@ -125,6 +125,9 @@ class DesignData:
             if not (row[2] < 1 and row[3] < 1):
                 _refuse(f"vignetting = {list(row)}: expected compressions below 1")
         _check_weights("field_weights", self.field_weights, "fields", self.fields)
+        for wavelength in self.wavelengths:
+            if not 0 < wavelength < math.inf:
+                _refuse(f"wavelengths: {wavelength!r} m: expected positive numbers")
         _check_weights("wavelength_weights", self.wavelength_weights, "wavelengths", self.wavelengths)
         if self.field_type == "angle" and any(abs(v) >= 0.5 * math.pi for row in self.fields for v in row):
             _refuse("fields: expected angles within 90 degrees of the axis")

@@ -21,11 +21,15 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError, shown
-from ..core.units import pure_numbers, require_positive
+from ..core.units import pure_numbers, require_within
 from .media.medium import wavelengths_within
 
 #: Largest refractive index that is taken for one.
 _HIGHEST_INDEX = 100.0
+#: Lowest refractive index that is taken for one: X-rays and plasmas are close to 1, metals above a hundredth.
+_LOWEST_INDEX = 1e-3
+#: Vacuum wavelengths of stacks of films [m]: X-rays to radio waves.
+_WAVELENGTHS = (1e-12, 1.0)
 #: Rounding of the cosines of rays beyond 1.
 _ROUNDING = 1e-9
 
@@ -41,8 +45,9 @@ def checked_cosines(cosine: ArrayLike) -> np.ndarray:
 def cosines_at(cosine: ArrayLike, n1: float, n2: float) -> np.ndarray:
     """Return cosines of angles of incidence as an array; DomainError if one is beyond 1, or an index is none."""
     for name, index in (("n1", n1), ("n2", n2)):
-        if not 0.0 < index <= _HIGHEST_INDEX:
-            raise DomainError(f"{name} = {index!r}: expected a refractive index above 0, at most {_HIGHEST_INDEX:g}")
+        if not _LOWEST_INDEX <= index <= _HIGHEST_INDEX:
+            limits = f"{_LOWEST_INDEX:g} to {_HIGHEST_INDEX:g}"
+            raise DomainError(f"{name} = {index!r}: expected a refractive index of {limits}")
     return checked_cosines(cosine)
 
 
@@ -164,7 +169,7 @@ class LayerStack:
         DomainError
             If an index or the wavelength is not positive.
         """
-        require_positive(wavelength, "wavelength", "metres")
+        require_within(wavelength, "wavelength", *_WAVELENGTHS, "metres")
         first = cosines_at(cosine, n1, n2).astype(np.complex128)
         order = 1 if n1 <= n2 else -1
         films = list(zip(self.indices, self.thicknesses, strict=True))[::order]

@@ -36,8 +36,8 @@ class Weather:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.pressure_mmhg) and self.pressure_mmhg > 0):
             raise PrescriptionError(f"pressure_mmhg = {self.pressure_mmhg!r}: expected a positive number")
-        if not self.temperature_c > -273.15:
-            raise PrescriptionError(f"temperature_c = {self.temperature_c!r}: expected above -273.15")
+        if not -273.15 < self.temperature_c < np.inf:
+            raise PrescriptionError(f"temperature_c = {self.temperature_c!r}: expected above -273.15 and finite")
         if not 0 <= self.water_vapour_mmhg <= self.pressure_mmhg:
             raise PrescriptionError(f"water_vapour_mmhg = {self.water_vapour_mmhg!r}: expected 0 to the pressure")
 

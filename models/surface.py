@@ -133,7 +133,7 @@ class Surface:
         return replace(self, coating=coating)
 
     def to_local(self, points: ArrayLike) -> np.ndarray:
-        """Return points [m], shape (..., 3), of the telescope frame in the surface's own frame."""
+        """Return points [m], shape (..., 3), of the telescope frame in the surface's own frame; NaN where they are."""
         # Added, so that no negative zeros of symmetric systems are left.
         offset = _points(points) + (0.0 - np.array(self.vertex))
         return offset if self.rotation == IDENTITY else offset @ self.matrix
@@ -143,7 +143,7 @@ class Surface:
         return directions + 0.0 if self.rotation == IDENTITY else directions @ self.matrix
 
     def to_telescope(self, points: ArrayLike) -> np.ndarray:
-        """Return points [m], shape (..., 3), of the surface's own frame in the telescope frame."""
+        """Return points [m], shape (..., 3), of the surface's own frame in the telescope frame; NaN where they are."""
         return _points(points) @ self.matrix.T + np.array(self.vertex)
 
     def moved(

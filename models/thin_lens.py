@@ -24,7 +24,8 @@ class ThinLens:
     focal_length : float
         Focal length in vacuum [m]; negative for a diverging lens.
     object_distance : float
-        From the object to the lens along the light [m], of which paths are equal; negative behind the lens.
+        From the object to the lens along the light [m], of which paths are equal; negative behind the lens,
+        infinite by default.
 
     Raises
     ------

@@ -12,6 +12,7 @@ from ..core.errors import ConfigError, DomainError
 from ..core.launch import launch
 from ..core.plotting import BLUE, axes_at, plain_text, styled
 from ..core.result import Result
+from ..core.threads import thread_count
 from ..core.warp_arrays import warp_array
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
@@ -125,7 +126,7 @@ def launch_trace(
     start.direction = warp_array(to_packets(rays.direction.T[None]), lanes)
     start.path = warp_array(to_packets(rays.path_length[None]), lanes)
     # Of few rays, threads cost more than the trace.
-    threads = 1 if count <= _ONE_THREAD else threads
+    threads = min(thread_count(threads), 1 if count <= _ONE_THREAD else count)
     launch(trace_rays.variant_for(packed), count, [packed, warp_array(light[None]), start, end], threads=threads)
     return PacketTrace(light, start, end)
 

@@ -273,7 +273,9 @@ class StarFitter:
             wave = slice(len(instrument.noll)) if len(solution.shared) else slice(0)
             # Pixels without noise, whatever variance is claimed for them, know the wavefront better than claimed.
             noise = min(solution.loss / last.stamp.used.sum(), 1.0)
-            error = math.sqrt(noise * np.trace(solution.shared_covariance[wave, wave])) or math.inf
+            variance = noise * np.trace(solution.shared_covariance[wave, wave])
+            # Rounding may leave a negative one of donuts far brighter than detectors have.
+            error = math.sqrt(variance) if variance > 0.0 else math.inf
             if not self._sampling(_ENOUGH * fwhm, last.pixels.side, _ENOUGH * error)[1].finer_than(last.sampling):
                 return last
             pixels, sampling = self._sampling(fwhm, min(self._side(fwhm), last.pixels.side), error)

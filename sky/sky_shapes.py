@@ -78,7 +78,8 @@ def to_sky(shapes: Any, wcs: Any, x: ArrayLike, y: ArrayLike) -> SkyShapes:
     Returns
     -------
     SkyShapes
-        For TreeCorr: ``Catalog(ra=s.ra, dec=s.dec, g1=s.g1_sky, g2=s.g2_sky, ra_units="rad", dec_units="rad")``.
+        NaN where a shape is, or where the world coordinates have no sky, far outside the image. For TreeCorr:
+        ``Catalog(ra=s.ra, dec=s.dec, g1=s.g1_sky, g2=s.g2_sky, ra_units="rad", dec_units="rad")``.
 
     Raises
     ------

@@ -162,11 +162,15 @@ class ResidualWavefront:
         Returns
         -------
         ndarray, shape [..., n_pupil]
+            NaN where the powers of a coordinate have no number.
         """
         return _sum_of_terms(self.at(slopes), self._basis(annular_zernikes, x, y))
 
     def gradient(self, x: ArrayLike, y: ArrayLike, slopes: ArrayLike = (0.0, 0.0)) -> np.ndarray:
-        """Return the derivatives of :meth:`opd` along x and y of the pupil [rad], shape [..., n_pupil, 2]."""
+        """Return the derivatives of :meth:`opd` along x and y of the pupil [rad], shape [..., n_pupil, 2].
+
+        They are NaN where the powers of a coordinate have no number.
+        """
         basis = self._basis(annular_zernike_gradients, x, y) / (0.5 * self.pupil_diameter)
         return _sum_of_terms(self.at(slopes), np.moveaxis(basis, 1, -1))
 

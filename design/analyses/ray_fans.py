@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.plotting import BLUE
-from ...core.units import length, require_count, require_positive
+from ...core.units import length, require_count, require_within
 from ...models.telescope import Telescope
 from ...raytrace.ideal_lens import require_image
 from ...wavefront.bundles import Bundles
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 FANS = ("tangential", "sagittal")
+#: Radii of reference spheres of fans, with either sign [m].
+_SPHERE_RADII = (1e-6, 1e15)
 
 
 @dataclass(frozen=True)
@@ -248,7 +250,7 @@ def opd_fans(
     if sphere_radius is not None:
         require_image(telescope, "a sphere_radius")
         radius = length(sphere_radius, "sphere_radius")
-        require_positive(abs(radius), "sphere_radius", "metres")
+        require_within(abs(radius), "sphere_radius", *_SPHERE_RADII, "metres")
     value = np.stack([b.opd(radius) for b in bundles], axis=1).reshape(len(request.fields), len(bundles), 2, -1)
     lit = _lit(bundles)
     if not np.isfinite(value[lit]).all():

@@ -74,6 +74,10 @@ class Operand:
             number = getattr(self, name)
             if number is not None and not np.isfinite(number):
                 raise DomainError(f"operand {self.label}: {name} = {number!r}: expected a finite number")
+        for name, numbers in self.quantity:
+            floats = [n for n in (numbers if isinstance(numbers, tuple) else (numbers,)) if isinstance(n, float)]
+            if not np.isfinite(floats).all():
+                raise DomainError(f"operand {self.label}: {name} = {numbers!r}: expected finite numbers")
         if self.weight <= 0:
             raise DomainError(f"operand {self.label}: weight = {self.weight!r}: expected a positive number")
         if self.minimum is not None and self.maximum is not None and not self.minimum < self.maximum:

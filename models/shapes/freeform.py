@@ -238,7 +238,7 @@ class Toroid(_TwoRadii):
     """A curve of the y, z plane rotated about an axis parallel to y, `radius_x` [m] from the vertex.
 
     With g(y) the conic of radius `radius_y` [m] and constant `conic_y`, plus `coefficients` of y^2, y^4, y^6... [m^-1,
-    m^-3...], and ``cx = 1 / radius_x`` (0: a cylinder)::
+    m^-3...], and ``cx = 1 / radius_x`` (0, of an infinite radius: a cylinder)::
 
         z = g + q x^2 / (1 + sqrt(1 - q^2 x^2)),    q = cx / (1 - cx g)
     """

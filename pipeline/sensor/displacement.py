@@ -26,7 +26,7 @@ class Displacement(ABC):
     def at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the displacement (dx, dy) [m] of the light that lands at x, y [m] from the centre of the CCD.
 
-        Its shape is that of x and y, broadcast, with an axis of two at the end.
+        Its shape is that of x and y, broadcast, with an axis of two at the end; NaN where these are not finite.
         """
 
 
@@ -61,7 +61,7 @@ class TreeRings(Displacement):
             raise DomainError(f"tree rings = {numbers!r}: expected finite numbers, and a period above 0")
 
     def at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
-        """Return the displacement, as :meth:`Displacement.at` says."""
+        """Return the displacement, as :meth:`Displacement.at` says; NaN where x or y is not finite."""
         along = np.stack(plane_points(x, y), axis=-1) - np.array(self.center)
         radius = np.hypot(along[..., 0], along[..., 1])[..., None]
         size = self.amplitude * np.cos(2.0 * np.pi * radius / self.period + self.phase)
@@ -101,7 +101,7 @@ class EdgeRolloff(Displacement):
             raise DomainError(f"edge roll-off = {numbers!r}: expected finite numbers, and lengths above 0")
 
     def at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
-        """Return the displacement, as :meth:`Displacement.at` says."""
+        """Return the displacement, as :meth:`Displacement.at` says; NaN where x or y is not finite."""
         place = self._rotated(np.stack(plane_points(x, y), axis=-1), -self.turn)
         # Beyond an edge, where the rim of a stamp may lie, it stays that of the edge.
         upper, lower = (np.maximum(self.half_size - sign * place, 0.0) for sign in (1.0, -1.0))

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.errors import DomainError
 from .covariance import PROCESS_COLUMNS, pair_distances, trend_variances
 
 # Shape numbers to which pixels respond as to a stretch and a magnification; they come first.
@@ -170,7 +171,10 @@ def fit_pixel_fields(
     beside_shape = filters[_SHAPE_NUMBERS:] * noise_floor
     beside_shape = beside_shape - beside_shape.sum(axis=1, keepdims=True) * star.ravel()
     response = np.concatenate([shape_response(star), beside_shape])
-    response = np.linalg.solve(response @ filters.T, response)
+    try:
+        response = np.linalg.solve(response @ filters.T, response)
+    except np.linalg.LinAlgError:
+        raise DomainError("stamps: expected stars; these have no light, or the same in all pixels") from None
     fields = PixelFields(filters, response, star.ravel(), np.zeros(star.size))
     brightest = np.sort(np.argsort(noise, kind="stable")[:_MOST_STARS])
 

@@ -6,7 +6,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 #: Times that a call may take before it counts as a hang [s]: of the processor, and by the clock of a busy machine.
-SECONDS, PATIENCE = 2.0, 20.0
+SECONDS, PATIENCE = 2.0, 60.0
 #: Memory for a file, and for a call with its threads [byte].
 MEMORY, MEMORY_OF_CALL = 500_000_000, 2_000_000_000
 #: Longest error message [lines, characters].

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from astropy import units as u
 from bounds import CHARACTERS, LINES, MEMORY_OF_CALL, Hang, bounded
-from public_calls import calls
 
 import pachon
 from pachon.core.errors import PachonError
@@ -175,11 +174,6 @@ def outcomes(label, function, arguments, chosen):
         if kind == "accepted" and must and (name, change) not in FINE:
             kind = "silent"
         yield kind, f"{kind:9s}{label}({name}={change}): {text[:300]}"
-
-
-@pytest.fixture(scope="module")
-def table(tmp_path_factory):
-    return calls(tmp_path_factory.mktemp("calls"))
 
 
 #: What may come of a wrong argument: refused by name, told what is wrong (for a value out of range), or a result.
