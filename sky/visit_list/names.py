@@ -22,7 +22,7 @@ QUANTITIES = {
     "ra": ListedQuantity("right ascension", "deg", ("fieldra", "ra", "s_ra", "rightascension")),
     "dec": ListedQuantity("declination", "deg", ("fielddec", "dec", "s_dec", "declination")),
     "midpoint": ListedQuantity("middle of the exposure", "d", ("exp_midpt_mjd", "expmidptmjd", "mjd")),
-    "start": ListedQuantity("start of the visit", "d", ("observationstartmjd", "obs_start_mjd", "obsstartmjd", "expmjd")),
+    "start": ListedQuantity("start of the visit", "d", ("observationstartmjd", "obs_start_mjd", "expmjd")),
     "exposure": ListedQuantity("exposure time", "s", ("visitexposuretime", "exp_time", "exptime", "visitexptime")),
     "visit_time": ListedQuantity("time of an instance catalogue", "s", ("vistime",)),
     "snaps": ListedQuantity("number of snaps", "", ("numexposures", "nsnap", "snaps")),
@@ -40,7 +40,7 @@ QUANTITIES = {
     "psf_seeing": ListedQuantity("rms width at the zenith and 500 nm", "pixel", ("seeing_zenith_500nm_median",)),
     "outer_scale": ListedQuantity("outer scale", "m", ("outer_scale_m", "outer_scale", "l0")),
     "wind_speed": ListedQuantity("speed of the wind on the ground", "m/s", ("wind_speed", "windspeed")),
-    "wind_azimuth": ListedQuantity("azimuth that the wind blows from", "deg", ("wind_dir", "winddir", "wind_direction")),
+    "wind_azimuth": ListedQuantity("azimuth that the wind blows from", "deg", ("wind_dir", "wind_direction")),
     "sky": ListedQuantity("sky", "mag", ("skybrightness", "sky_brightness", "filtskybrightness", "sky_mag")),
     "epoch": ListedQuantity("epoch", "", ("epoch",)),
     "weight": ListedQuantity("weight", "", ("weight", "inverse_variance")),
@@ -48,6 +48,7 @@ QUANTITIES = {
 }
 #: Words that the header of an instance catalogue may begin with.
 HEADER_WORDS = frozenset(
-    """rightascension declination mjd altitude azimuth filter rotskypos rottelpos dist2moon moonalt moondec moonphase
-    moonra nsnap obshistid seed seeing sunalt vistime seqnum minsource exptime camconfig""".split()
-)
+    ("rightascension", "declination", "mjd", "altitude", "azimuth", "filter", "rotskypos", "rottelpos", "dist2moon",
+     "moonalt", "moondec", "moonphase", "moonra", "nsnap", "obshistid", "seed", "seeing", "sunalt", "vistime", "seqnum",
+     "minsource", "exptime", "camconfig")
+)  # fmt: skip

@@ -143,7 +143,7 @@ class ListColumns:
         return ListColumns(values, self.source, self.kind, self.all_names, self.remarks)
 
     def require(self, *keys: str) -> str:
-        """Return the first of some quantities that the list has; ProductError names the columns that were looked for."""
+        """Return the first of some quantities that the list has; ProductError names the columns looked for."""
         for key in keys:
             if key in self.values:
                 return key
