@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError, PachonError, ProductError, error_context
+from ...core.errors import DomainError, PachonError, ProductError
 from ...core.files import make_folder
 from ...core.long_work import Execution, claim_folder
 from ...core.products import Stamp
@@ -179,21 +180,22 @@ def claim_night(folder: Path, config: NightConfig, *, resume: bool) -> None:
 
     ProductError if it is not.
     """
-
-    def read(path: Path) -> dict[str, Any]:
-        before = load_night_configuration(path)
-        if before.visits.digest != config.visits.digest:
-            count = f"visits.list = {config.visits.list}"
-            raise ProductError(f"{count}: the list has changed, or other visits of it are taken")
-        return before.as_dict()
-
-    with error_context():
-        claim_folder(
-            folder / CONFIG_NAME,
-            config.to_yaml().encode(),
-            products=f"{VISITS_FOLDER}/visit_*.fits",
-            noun="a night",
-            now=config.as_dict(),
-            read=read,
-            wanted=resume,
+    path = folder / CONFIG_NAME
+    before: NightConfig | None = None
+    if resume and path.is_file():
+        with suppress(PachonError):  # claim_folder says what is wrong with the file
+            before = load_night_configuration(path)
+    if before is not None and before.visits.digest != config.visits.digest:
+        raise ProductError(
+            f"{folder} holds a night of another list: {config.visits.list} has changed, or other visits of it are "
+            "taken; choose another --out"
         )
+    claim_folder(
+        path,
+        config.to_yaml().encode(),
+        products=f"{VISITS_FOLDER}/visit_*.fits",
+        noun="a night",
+        now=config.as_dict(),
+        read=lambda path: load_night_configuration(path).as_dict(),
+        wanted=resume,
+    )
