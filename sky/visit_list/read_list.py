@@ -174,11 +174,9 @@ class ListColumns:
     def visit_error(self, wrong: np.ndarray, value: str, expected: str, name: str) -> DomainError:
         """Return the error of the first of some visits."""
         number = self.values["visit"][wrong[0]] if "visit" in self.values else wrong[0] + 1
-        extent = f"so are {len(wrong)} of {len(self)} visits; " if len(wrong) > 1 else ""
+        extent = f"{len(wrong)} of {len(self)} visits are so; " if len(wrong) > 1 else ""
         return DomainError(
-            f"{value}: expected {expected}; {extent}leave them out by a condition (where)",
-            place=f"visit {number}",
-            key=name,
+            f"visit {number}: {value}: expected {expected}; {extent}leave them out by a condition (where)", key=name
         )
 
 
