@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.errors import ConfigError, DomainError, error_context
+from ..core.errors import ConfigError, PachonError, error_context
 from ..core.products import Card
 from ..models.camera.camera import Camera
 from ..models.io.bundled import BUNDLED
@@ -24,6 +24,8 @@ _INSTRUMENTS = {"lsst": "LSSTCam", "comcam": "LSSTComCam", "auxtel": "LATISS", "
 #: Band in the name of a model, such as lsst_v3.3_r.
 _BAND_OF_NAME = re.compile(r"_([ugrizy])(?=_|$)")
 _SECONDS_A_DAY = 86400.0
+#: Visits of a band of which one must have an experiment: others may lie too low, or have other values out of range.
+_TRIED = 3
 
 
 def telescope_of_band(name: str | None, band: str, folder: Path | None = None) -> str | None:
@@ -115,15 +117,18 @@ def visit_experiment(config: Configuration, visit: ListedVisit, folder: Path | N
 
 
 def check_bands(config: Configuration, visits: VisitList, folder: Path | None = None) -> None:
-    """Raise an error that names the file if the telescope has not a band of a list; one visit of each is tried."""
+    """Raise the error of a band of a list that the telescope has not: that of its first visit, where three fail."""
     for band in np.unique(visits.band):
         of_band = np.flatnonzero(visits.band == band)
-        try:
-            visit_experiment(config, visits[int(of_band[0])], folder)
-        except DomainError:
-            continue  # of this visit, not of the band
-        except ConfigError as error:
-            raise error.within(subject=f"band {band}, {len(of_band)} visits of {visits.source}") from None
+        errors: list[PachonError] = []
+        for index in of_band[:_TRIED]:
+            try:
+                visit_experiment(config, visits[int(index)], folder)
+                break
+            except PachonError as error:
+                errors.append(error)
+        else:
+            raise errors[0].within(subject=f"band {band}, {len(of_band)} visits of {visits.source}")
 
 
 def visit_cards(experiment: Experiment, ccd: str) -> list[Card]:

@@ -54,7 +54,7 @@ COLUMNS = {
     "modelDeltaSizeRms": ("pixel", "rms of the trace radius of the noise-free PSF less the model's where no star is"),
 }
 #: Columns of the model, NaN without one.
-MODEL_COLUMNS = tuple(name for name in COLUMNS if name.startswith(("psfStar", "modelDelta")))
+MODEL_COLUMNS = tuple(name for name in COLUMNS if name.startswith(("nPsfStar", "psfStar", "modelDelta")))
 #: Geometric FWHM of nominal seeing [arcsec] by band, for effTime (SMTN-002, table 2).
 _NOMINAL_FWHM = {"u": 0.81, "g": 0.77, "r": 0.73, "i": 0.71, "z": 0.69, "y": 0.68}
 #: S/N of the limiting magnitude.

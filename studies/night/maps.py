@@ -128,5 +128,6 @@ def _write(path: Path, content: Any, unit: str, stamp: Stamp) -> None:
     with TemporaryDirectory() as place, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         file = Path(place) / path.name
-        content.write(str(file))
+        # Compressed files have the time of day in them.
+        content.write(str(file), nocompress=True)
         write_bytes(path, file.read_bytes())
