@@ -138,14 +138,16 @@ def _database_table(connection: sqlite3.Connection, path: Path) -> ListTable:
         if name is None:
             raise unknown_name("table of visits", "observations", tables or ["none"]).within(file=path)
         columns = tuple(row[1].lower() for row in connection.execute(f'PRAGMA table_info("{name}")'))
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeError) as error:
         raise ProductError(f"cannot be read ({error})", file=path) from None
     return ListTable(connection, name, columns, {}, "sqlite")
 
 
 def _fill(connection: sqlite3.Connection, columns: Mapping[str, Any]) -> tuple[str, ...]:
     """Make a table of columns in memory; those with more than one number a row are left out. Return their names."""
-    scalars = {name.replace('"', "'"): values for name, values in columns.items() if np.ndim(values) == 1}
+    scalars = {
+        name.replace('"', "'").replace("\0", " "): values for name, values in columns.items() if np.ndim(values) == 1
+    }
     if scalars:
         names = ", ".join(f'"{name}"' for name in scalars)
         marks = ", ".join("?" * len(scalars))

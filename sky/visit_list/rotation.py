@@ -9,12 +9,9 @@ With q the position angle of the zenith, the angle on the sky is
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from .read_list import ListColumns
+from .list_columns import ListColumns
 
 #: Largest typical difference with which a list follows a convention [rad]: q of schedulers lacks precession.
 _TOLERANCE = np.deg2rad(2.0)
