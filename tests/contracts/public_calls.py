@@ -437,7 +437,7 @@ def calls(folder):
         "Surface.normal": (tel.surfaces[0].normal, {"x": x, "y": y}),
         "trace": (pachon.trace, {"telescope": tel, "rays": m.rays, "threads": 1, "out": pachon.trace(tel, m.rays)}),
         "read_galaxies": (pachon.read_galaxies, {"path": m.folder / "none.fits", "pointing": (0.0, 0.0),
-                          "convention": "galsim"}),
+                          "convention": "galsim", "band": "r"}),
         "to_sky": (pachon.to_sky, {"shapes": [[0.1, 0.0]], "x": [10.0], "y": [20.0],
                    "wcs": pachon.wcs(m.lsst, "R22_S11", (0.0, 0.0), camera="lsst")}),
         "write_galaxies": (pachon.write_galaxies, {"path": m.folder / "galaxies.ecsv", "galaxies": m.galaxies}),
