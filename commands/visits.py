@@ -53,6 +53,9 @@ def visits_command(
     where: Where = None,
     band: Bands = None,
     night: Night = None,
+    stack: Annotated[
+        bool, Option("--stack", help="Of a list of one field and band: stack its PSFs, as without a list.")
+    ] = False,
     models: Annotated[
         bool | None, Option("--models/--no-models", help="Of a list: with PSF models, or without.")
     ] = None,
@@ -88,6 +91,7 @@ def visits_command(
     - `pachon visits my_visits.yaml`
     - `pachon visits --list baseline.db --where "night = 5" --band r,i --all -o night5`: the visits of a scheduler, each
       with its own pointing, angles, band, time and air; a table of PSF and depth, and maps of the sky
+    - `pachon visits --list ddf.db --band r --stack -o ddf`, `pachon null-test ddf`: the visits to one field, stacked
     - `pachon visits --list visits.csv -o night --part 3/8`: one of eight jobs of a batch system, all in one folder
 
     my_visits.yaml may read
@@ -99,15 +103,22 @@ def visits_command(
         visits: {count: 30, dither_deg: 0.3}
     """
     from ..pipeline.config import with_options
+    from ..studies.night.config import ListSection
     from ..studies.visits.config import VisitsConfig, load_visits_configuration
     from ..studies.visits.visits import stack_visits
 
     names = chosen_ccds(ccds, raft, all_ccds)
-    if visit_list is not None or (config is not None and names_list(config)):
+    if stack:
+        require_list(("--stack", None if visit_list is not None else stack))
+        excluded = (("--nside", nside), ("--part", part), ("--products", products or None), ("--models", models))
+        excluded += (("--count", count), ("--dither-deg", dither_deg), ("--roll", roll), ("--rotator", rotator))
+        if stated := [option for option, value in excluded if value is not None]:
+            raise ConfigError(f"{stated[0]} with --stack: expected none")
+    elif visit_list is not None or (config is not None and names_list(config)):
         stack_options = {"--count": count, "--dither-deg": dither_deg, "--roll": roll, "--rotator": rotator}
         if stated := [option for option, value in stack_options.items() if value is not None]:
             raise ConfigError(f"{stated[0]} with a list: expected none, visits of a list have their own")
-        settings = night_settings(
+        night_config = night_settings(
             config,
             run__ccds=names,
             run__seed=seed,
@@ -124,12 +135,13 @@ def visits_command(
             quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
         ) as execution:
             base_folder = None if config is None else config.parent
-            show_night(settings, out, base_folder, part_of(part), execution, quiet=quiet, as_json=as_json)
+            show_night(night_config, out, base_folder, part_of(part), execution, quiet=quiet, as_json=as_json)
         return
-    require_list(
-        *(("--where", where), ("--band", band), ("--night", night), ("--nside", nside), ("--part", part)),
-        *(("--products", products or None), ("--models", models)),
-    )
+    if not stack:
+        require_list(
+            *(("--where", where), ("--band", band), ("--night", night), ("--nside", nside), ("--part", part)),
+            *(("--products", products or None), ("--models", models)),
+        )
     base = VisitsConfig() if config is None else load_visits_configuration(config)
     settings = with_options(
         base,
@@ -140,6 +152,9 @@ def visits_command(
         visits__roll_deg=angles_of("--roll", roll),
         visits__rotator_deg=angles_of("--rotator", rotator),
     )
+    if stack:
+        section = ListSection(list=str(visit_list), where=where, band=band, night=night)
+        settings = settings.with_list(section)
     experiment = settings.experiment(None if config is None else config.parent)
     hint = f"finished visits are in {out}, and --resume goes on from there"
     with long_work(

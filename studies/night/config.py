@@ -78,20 +78,7 @@ class NightConfig(Section):
         if self.run.reconstruction.model != "ccd":
             text = f"run.reconstruction.model = {self.run.reconstruction.model}: expected ccd for visits of a list"
             raise ConfigError(text, key="run.reconstruction.model")
-        path = (folder or Path()) / self.visits.list
-        settings = self.visits
-        visits = read_visit_list(
-            path,
-            where=settings.where,
-            band=settings.band,
-            night=settings.night,
-            camera=self.run.camera or ("comcam" if "comcam" in (self.run.telescope or "") else "lsst"),
-            site=_site_of(self.run),
-            airmass_law=settings.airmass_law,
-        )
-        if settings.digest not in (None, visits.digest):
-            raise ProductError("the list has changed: expected the visits of visits.digest", file=path)
-        return visits
+        return read_section(self.visits, self.run, folder)
 
     def started(self, visits: VisitList, experiment: Experiment, folder: Path | None = None) -> NightConfig:
         """Return the settings with the CCDs of an experiment, an absolute path and the digest of the list."""
@@ -122,6 +109,26 @@ def load_night_configuration(path: Path) -> NightConfig:
     ConfigError if a file cannot be read, is not YAML, or has an unknown key or a value out of range.
     """
     return validated(NightConfig, with_run(read_mapping(path, ConfigError), path), str(path))
+
+
+def read_section(settings: ListSection, run: Configuration, folder: Path | None = None) -> VisitList:
+    """Read the list of a section for the telescope of a run; a relative path starts from `folder`.
+
+    PachonError if it cannot be read, or its visits are not those of the digest.
+    """
+    path = (folder or Path()) / str(settings.list)
+    visits = read_visit_list(
+        path,
+        where=settings.where,
+        band=settings.band,
+        night=settings.night,
+        camera=run.camera or ("comcam" if "comcam" in (run.telescope or "") else "lsst"),
+        site=_site_of(run),
+        airmass_law=settings.airmass_law,
+    )
+    if settings.digest not in (None, visits.digest):
+        raise ProductError("the list has changed: expected the visits of the digest of the configuration", file=path)
+    return visits
 
 
 def _site_of(run: Configuration) -> str:
