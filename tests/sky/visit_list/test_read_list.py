@@ -94,6 +94,7 @@ def test_r0_of_seeing_by_opsim(write_list):
     np.testing.assert_allclose(width, column("seeingFwhm500") * growth, rtol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("r0", "scale"), [(0.08, 25.0), (0.15, 25.0), (0.15, 50.0), (0.25, 20.0)])
 def test_widths_are_those_of_von_karman_profiles(r0, scale):
     galsim = pytest.importorskip("galsim")
