@@ -81,12 +81,19 @@ def run_command(
     from ..pipeline.simulate.ccd_loop import left_out_line
 
     names = chosen_ccds(ccds, raft, all_ccds)
-    options = {"ccds": names, "seed": seed, "stars__truth": truth_stars, "stars__observed": observed_stars}
     if visit_list is None:
         require_list(("--visit", visit), ("--where", where), ("--band", band), ("--night", night))
-        experiment = configured_experiment(config, **options)
+        experiment = configured_experiment(
+            config, ccds=names, seed=seed, stars__truth=truth_stars, stars__observed=observed_stars
+        )
     else:
-        base = with_options(Configuration() if config is None else load_configuration(config), **options)
+        base = with_options(
+            Configuration() if config is None else load_configuration(config),
+            ccds=names,
+            seed=seed,
+            stars__truth=truth_stars,
+            stars__observed=observed_stars,
+        )
         listed = listed_visit(base, visit_list, visit, where, band, night)
         experiment = listed_experiment(base, listed, None if config is None else config.parent)
     hint = f"finished CCDs are in {out}, and --resume goes on from there"

@@ -110,9 +110,14 @@ def visits_command(
     names = chosen_ccds(ccds, raft, all_ccds)
     if stack:
         require_list(("--stack", None if visit_list is not None else stack))
-        excluded = (("--nside", nside), ("--part", part), ("--products", products or None), ("--models", models))
-        excluded += (("--count", count), ("--dither-deg", dither_deg), ("--roll", roll), ("--rotator", rotator))
-        if stated := [option for option, value in excluded if value is not None]:
+        excluded: dict[str, object] = {
+            "--nside": nside,
+            "--part": part,
+            "--products": products or None,
+            "--models": models,
+        }
+        excluded |= {"--count": count, "--dither-deg": dither_deg, "--roll": roll, "--rotator": rotator}
+        if stated := [option for option, value in excluded.items() if value is not None]:
             raise ConfigError(f"{stated[0]} with --stack: expected none")
     elif visit_list is not None or (config is not None and names_list(config)):
         stack_options = {"--count": count, "--dither-deg": dither_deg, "--roll": roll, "--rotator": rotator}

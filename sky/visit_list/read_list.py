@@ -289,7 +289,8 @@ def _fried_parameters(
         along_sight = fried_parameter(seeing * growth, outer_scale)
     except DomainError as error:
         wrong = _unallowed(seeing * growth, outer_scale)
-        raise columns.visit_error(wrong, *error.problem.split(": expected ", 1), columns.source[key]) from None
+        value, _, expected = error.problem.partition(": expected ")
+        raise columns.visit_error(wrong, value, expected, columns.source[key]) from None
     return along_sight * growth
 
 

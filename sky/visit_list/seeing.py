@@ -38,7 +38,7 @@ def fried_parameter(fwhm: np.ndarray, outer_scale: np.ndarray) -> np.ndarray:
     fwhm, outer_scale = np.broadcast_arrays(np.asarray(fwhm, dtype=np.float64), outer_scale)
     high = LARGEST_RATIO * outer_scale
     least = seeing_width(high, outer_scale)
-    wrong = np.flatnonzero(~((fwhm >= least) & (fwhm < seeing_width(_SMALLEST, outer_scale))))
+    wrong = np.flatnonzero(~((fwhm >= least) & (fwhm < seeing_width(np.array(_SMALLEST), outer_scale))))
     if wrong.size:
         raise DomainError(
             f"seeing = {fwhm[wrong[0]] / ARCSEC:.3g} arcsec: expected at least {least[wrong[0]] / ARCSEC:.3g} arcsec "

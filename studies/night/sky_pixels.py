@@ -26,7 +26,7 @@ _MARGIN = 1.05
 class SkyPixels(NamedTuple):
     """PSF of a visit at the centres of HEALPix pixels, nested, on its CCDs."""
 
-    index: np.ndarray  #: of the pixels, [n]
+    pixel: np.ndarray  #: nested indices, [n]
     ccd: np.ndarray  #: of the camera, [n]
     xy: np.ndarray  #: centres of the pixels on the focal plane [m], [n, 2]
 
