@@ -9,6 +9,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.terminal import print_line
+from .night import Bands, ListFile, Night, VisitNumber, Where, listed_visit, require_list
 from .options import AllCcds, Ccds, Json, Quiet, Raft, Threads, chosen_ccds
 from .tables import Rows, print_json
 from .workers import DaskWorkers, Processes, Scheduler, long_work
@@ -32,6 +33,11 @@ def images_command(
     ] = None,
     noise: Annotated[bool | None, Option("--noise/--no-noise", help="With noise, or the expected image.")] = None,
     faintest: Annotated[float | None, Option(help="Faintest galaxy [AB mag].")] = None,
+    visit_list: ListFile = None,
+    visit: VisitNumber = None,
+    where: Where = None,
+    band: Bands = None,
+    night: Night = None,
     seed: Annotated[int | None, Option(help="Seed of all random numbers.")] = None,
     quick: Annotated[
         bool, Option("--quick", help="The middle of each CCD, galaxies to magnitude 26, long-exposure PSF: seconds.")
@@ -59,6 +65,7 @@ def images_command(
     - `pachon images --ccds R22_S11 --exposures 400 -o deep`: 400 exposures of 15 s
     - `pachon images --ccds R22_S11 --no-noise --way eigen -o expected`
     - `pachon images my_images.yaml -o field --resume`: go on where it was stopped
+    - `pachon images --list baseline.db --visit 1004 --ccds R22_S11 -o visit1004`: a visit of a scheduler's list
     - `pachon images my_images.yaml -o field --scheduler tcp://login1:8786`: on a Dask cluster, or `--processes 4`
 
     my_images.yaml may read
@@ -82,7 +89,12 @@ def images_command(
         "galaxies__faintest": faintest,
     }
     settings = with_options(with_options(base, **(_QUICK if quick else {})), **options)
-    experiment = settings.experiment(None if config is None else config.parent)
+    folder = None if config is None else config.parent
+    if visit_list is None:
+        require_list(("--visit", visit), ("--where", where), ("--band", band), ("--night", night))
+    else:
+        settings = settings.of_visit(listed_visit(settings.run, visit_list, visit, where, band, night), folder)
+    experiment = settings.experiment(folder)
     hint = f"finished CCDs are in {out}, and --resume goes on from there"
     with long_work(
         quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers

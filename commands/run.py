@@ -8,9 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Option
 
-from ..core.errors import ConfigError
 from ..core.terminal import print_line
 from .inputs import configured_experiment
+from .night import (
+    Bands,
+    ListFile,
+    Night,
+    VisitNumber,
+    Where,
+    listed_experiment,
+    listed_visit,
+    part_of,
+    require_list,
+)
 from .options import AllCcds, Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, chosen_ccds
 from .tables import Rows, plain_table, print_json, wide_console
 from .workers import DaskWorkers, Processes, Scheduler, long_work
@@ -37,6 +47,11 @@ def run_command(
     processes: Processes = None,
     scheduler: Scheduler = None,
     workers: DaskWorkers = None,
+    visit_list: ListFile = None,
+    visit: VisitNumber = None,
+    where: Where = None,
+    band: Bands = None,
+    night: Night = None,
     truth_stars: TruthStars = None,
     observed_stars: ObservedStars = None,
     threads: Threads = None,
@@ -59,19 +74,33 @@ def run_command(
     - `pachon run --all --out full --resume`: go on where a run was stopped
     - `pachon run --all --out full --scheduler tcp://login1:8786`: on a Dask cluster
     - `pachon run --all --out full --part 3/8`: one of eight jobs of a batch system, with one folder for all
+    - `pachon run --list baseline.db --visit 1004 --out visit1004`: a visit of a scheduler's list
     """
+    from ..pipeline.config import Configuration, load_configuration, with_options
     from ..pipeline.run import run
     from ..pipeline.simulate.ccd_loop import left_out_line
 
     names = chosen_ccds(ccds, raft, all_ccds)
-    experiment = configured_experiment(
-        config, ccds=names, seed=seed, stars__truth=truth_stars, stars__observed=observed_stars
-    )
+    if visit_list is None:
+        require_list(("--visit", visit), ("--where", where), ("--band", band), ("--night", night))
+        experiment = configured_experiment(
+            config, ccds=names, seed=seed, stars__truth=truth_stars, stars__observed=observed_stars
+        )
+    else:
+        base = with_options(
+            Configuration() if config is None else load_configuration(config),
+            ccds=names,
+            seed=seed,
+            stars__truth=truth_stars,
+            stars__observed=observed_stars,
+        )
+        listed = listed_visit(base, visit_list, visit, where, band, night)
+        experiment = listed_experiment(base, listed, None if config is None else config.parent)
     hint = f"finished CCDs are in {out}, and --resume goes on from there"
     with long_work(
         quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
     ) as execution:
-        result = run(experiment, out, strict=strict, part=_part(part), execution=execution)
+        result = run(experiment, out, strict=strict, part=part_of(part), execution=execution)
     if quiet:  # the reporter has printed nothing
         for name, reason in result.not_modelled.items():
             print_line(f"pachon: {left_out_line(name, reason)}", error=True)
@@ -85,15 +114,6 @@ def run_command(
             _show_run(result, result.report, sum(execution.reporter.seconds.values()))
         else:
             _show_part(result)
-
-
-def _part(text: str | None) -> tuple[int, int]:
-    """Return the two numbers of a part such as 3/8; all is 1/1."""
-    try:
-        number, parts = (1, 1) if text is None else (int(word) for word in text.split("/"))
-    except ValueError:
-        raise ConfigError(f"--part = {text}: expected I/N, such as 3/8") from None
-    return number, parts
 
 
 def _show_part(result: RunResult) -> None:

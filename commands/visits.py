@@ -10,6 +10,7 @@ from typer import Argument, Option
 
 from ..core.errors import ConfigError
 from ..core.terminal import print_line
+from .night import Bands, ListFile, Night, Where, names_list, night_settings, part_of, require_list, show_night
 from .options import AllCcds, Ccds, Json, Quiet, Raft, Threads, chosen_ccds
 from .tables import Rows, print_json
 from .workers import DaskWorkers, Processes, Scheduler, long_work
@@ -48,8 +49,23 @@ def visits_command(
         str | None, Option(help="Angles of the camera against the telescope [deg]: random, or one for each visit.")
     ] = None,
     out: Annotated[Path, Option("--out", "-o", help="Folder of the stacks.")] = Path("pachon_visits"),
+    visit_list: ListFile = None,
+    where: Where = None,
+    band: Bands = None,
+    night: Night = None,
+    stack: Annotated[
+        bool, Option("--stack", help="Of a list of one field and band: stack its PSFs, as without a list.")
+    ] = False,
+    models: Annotated[
+        bool | None, Option("--models/--no-models", help="Of a list: with PSF models, or without.")
+    ] = None,
+    products: Annotated[bool, Option("--products", help="Of a list: keep stars, PSFs and models of each CCD.")] = False,
+    nside: Annotated[int | None, Option(min=0, help="Of a list: HEALPix resolution of the maps, 0 for none.")] = None,
+    part: Annotated[
+        str | None, Option(metavar="I/N", help="Of a list: compute the I-th of N parts; all share the folder.")
+    ] = None,
     seed: Annotated[int | None, Option(help="Seed of all random numbers.")] = None,
-    resume: Annotated[bool, Option("--resume", help="Go on after the visits that are stacked already.")] = False,
+    resume: Annotated[bool, Option("--resume", help="Go on after the visits that are finished already.")] = False,
     processes: Processes = None,
     scheduler: Scheduler = None,
     workers: DaskWorkers = None,
@@ -73,6 +89,10 @@ def visits_command(
     - `pachon visits --rotator random`: the camera turned against the telescope too, by up to 90 degrees
     - `pachon visits -n 2 --roll 0,0 --rotator 0,45`: a telescope that stands still on the sky, its camera turned
     - `pachon visits my_visits.yaml`
+    - `pachon visits --list baseline.db --where "night = 5" --band r,i --all -o night5`: the visits of a scheduler, each
+      with its own pointing, angles, band, time and air; a table of PSF and depth, and maps of the sky
+    - `pachon visits --list ddf.db --band r --stack -o ddf`, `pachon null-test ddf`: the visits to one field, stacked
+    - `pachon visits --list visits.csv -o night --part 3/8`: one of eight jobs of a batch system, all in one folder
 
     my_visits.yaml may read
 
@@ -83,10 +103,50 @@ def visits_command(
         visits: {count: 30, dither_deg: 0.3}
     """
     from ..pipeline.config import with_options
+    from ..studies.night.config import ListSection
     from ..studies.visits.config import VisitsConfig, load_visits_configuration
     from ..studies.visits.visits import stack_visits
 
     names = chosen_ccds(ccds, raft, all_ccds)
+    if stack:
+        require_list(("--stack", None if visit_list is not None else stack))
+        excluded: dict[str, object] = {
+            "--nside": nside,
+            "--part": part,
+            "--products": products or None,
+            "--models": models,
+        }
+        excluded |= {"--count": count, "--dither-deg": dither_deg, "--roll": roll, "--rotator": rotator}
+        if stated := [option for option, value in excluded.items() if value is not None]:
+            raise ConfigError(f"{stated[0]} with --stack: expected none")
+    elif visit_list is not None or (config is not None and names_list(config)):
+        stack_options = {"--count": count, "--dither-deg": dither_deg, "--roll": roll, "--rotator": rotator}
+        if stated := [option for option, value in stack_options.items() if value is not None]:
+            raise ConfigError(f"{stated[0]} with a list: expected none, visits of a list have their own")
+        night_config = night_settings(
+            config,
+            run__ccds=names,
+            run__seed=seed,
+            visits__list=None if visit_list is None else str(visit_list.resolve()),
+            visits__where=where,
+            visits__band=band,
+            visits__night=night,
+            maps__nside=nside,
+            models=models,
+            products=products or None,
+        )
+        hint = f"finished visits are in {out}, and --resume goes on from there"
+        with long_work(
+            quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
+        ) as execution:
+            base_folder = None if config is None else config.parent
+            show_night(night_config, out, base_folder, part_of(part), execution, quiet=quiet, as_json=as_json)
+        return
+    if not stack:
+        require_list(
+            *(("--where", where), ("--band", band), ("--night", night), ("--nside", nside), ("--part", part)),
+            *(("--products", products or None), ("--models", models)),
+        )
     base = VisitsConfig() if config is None else load_visits_configuration(config)
     settings = with_options(
         base,
@@ -97,6 +157,9 @@ def visits_command(
         visits__roll_deg=angles_of("--roll", roll),
         visits__rotator_deg=angles_of("--rotator", rotator),
     )
+    if stack:
+        section = ListSection(list=str(visit_list), where=where, band=band, night=night)
+        settings = settings.with_list(section)
     experiment = settings.experiment(None if config is None else config.parent)
     hint = f"finished visits are in {out}, and --resume goes on from there"
     with long_work(

@@ -25,6 +25,8 @@ from .version import VERSION
 _WHEN = "FITS checksum"
 #: FITS formats of columns by kind of NumPy type.
 _FORMATS = {"f": "D", "i": "J", "b": "L"}
+#: Largest whole number of the format J.
+_LARGEST_INT = np.iinfo(np.int32).max
 #: Columns of a table in order, by name: values, unit in FITS notation (empty for pure numbers), description.
 Columns = dict[str, tuple[np.ndarray, str, str]]
 #: Keyword, value and comment of a line of a FITS header.
@@ -157,7 +159,7 @@ def table_hdu(name: str, columns: Columns) -> fits.BinTableHDU:
     """Return a FITS table."""
     table = fits.BinTableHDU.from_columns(
         [
-            fits.Column(name=key, array=values, format=_FORMATS[values.dtype.kind], unit=unit or None)
+            fits.Column(name=key, array=values, format=_format_of(values), unit=unit or None)
             for key, (values, unit, _) in columns.items()
         ],
         name=name,
@@ -165,6 +167,12 @@ def table_hdu(name: str, columns: Columns) -> fits.BinTableHDU:
     for index, (key, (_, _, description)) in enumerate(columns.items(), start=1):
         table.header.set(f"TTYPE{index}", key, description)
     return table
+
+
+def _format_of(values: np.ndarray) -> str:
+    """Return the FITS format of a column; whole numbers of 64 bits only where they need them."""
+    kind = values.dtype.kind
+    return "K" if kind == "i" and np.abs(values).max(initial=0) > _LARGEST_INT else _FORMATS[kind]
 
 
 def image_hdu(name: str, image: np.ndarray, comment: str) -> fits.ImageHDU:

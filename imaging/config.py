@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -31,6 +32,8 @@ from ..pipeline.config import (
     with_run,
 )
 from ..pipeline.experiment import Experiment
+from ..pipeline.listed_visit import visit_experiment
+from ..sky.visit_list.visit_list import ListedVisit
 
 #: Pixels along a side of the PSF's stamps where the run leaves them open: wings down to 1e-6 of the light.
 PSF_STAMP = 63
@@ -120,15 +123,25 @@ class ImagesConfig(Section):
 
     def experiment(self, folder: Path | None = None) -> Experiment:
         """Return the experiment of the run; relative paths in its configuration start from `folder`."""
-        run = self.run
-        if run.psf.stamp is None:
-            run = with_options(run, psf__stamp=PSF_STAMP)
+        run = self._with_stamp()
         if run.pointing not in (None, self.pointing):
             raise ConfigError("run.pointing: expected none, or that of the images, under pointing")
         if run.stars.catalogue is not None or run.atmosphere.zenith_position_angle_deg is not None:
             run = run.model_copy(update={"pointing": self.pointing})
         with error_context(subject="run"):
             return Experiment.from_config(run, folder)
+
+    def _with_stamp(self) -> Configuration:
+        """Return the configuration of the run, with larger stamps where it leaves them open."""
+        return self.run if self.run.psf.stamp is not None else with_options(self.run, psf__stamp=PSF_STAMP)
+
+    def of_visit(self, visit: ListedVisit, folder: Path | None = None) -> ImagesConfig:
+        """Return the settings of a visit of a list: its run, pointing and sky."""
+        run = visit_experiment(self._with_stamp(), visit, folder).config
+        image = self.image
+        if math.isfinite(visit.sky):
+            image = image.model_copy(update={"sky_mag": visit.sky})
+        return self.model_copy(update={"run": run, "pointing": run.pointing, "image": image})
 
     def resolved(self, experiment: Experiment) -> ImagesConfig:
         """Return the configuration with that of the experiment, every default filled in, for its run."""

@@ -71,7 +71,9 @@ class GalaxySource:
             If a value is none of a galaxy, or galaxies would cover the sky or be brighter than it.
         """
         if config.catalogue is not None:
-            galaxies = read_galaxies(config.catalogue, pointing=pointing, convention=config.convention)
+            galaxies = read_galaxies(
+                config.catalogue, pointing=pointing, convention=config.convention, band=exposure.band
+            )
             return cls(config, exposure, seed, galaxies)
         if config.mosaic is None:
             return cls(config, exposure, seed, None)

@@ -326,6 +326,9 @@ from .sky.population import GalaxyPopulation as GalaxyPopulation
 from .sky.population import draw_galaxies as draw_galaxies
 from .sky.sky_shapes import SkyShapes as SkyShapes
 from .sky.sky_shapes import to_sky as to_sky
+from .sky.visit_list.read_list import read_visit_list as read_visit_list
+from .sky.visit_list.visit_list import ListedVisit as ListedVisit
+from .sky.visit_list.visit_list import VisitList as VisitList
 from .studies.alignment.config import AlignConfig as AlignConfig
 from .studies.alignment.config import load_align_configuration as load_align_configuration
 from .studies.alignment.loop import Alignment as Alignment
@@ -337,6 +340,10 @@ from .studies.baseline.file import Baseline as Baseline
 from .studies.baseline.file import read_baseline as read_baseline
 from .studies.baseline.file import write_baseline as write_baseline
 from .studies.baseline.requirements import Requirements as Requirements
+from .studies.night.config import NightConfig as NightConfig
+from .studies.night.config import load_night_configuration as load_night_configuration
+from .studies.night.night import NightResult as NightResult
+from .studies.night.night import run_night as run_night
 from .studies.shimming.shim import Shims as Shims
 from .studies.shimming.shim import shim as shim
 from .studies.sweep.file import load_sweep as load_sweep

@@ -104,6 +104,14 @@ class MotionConfig(Section):
     ry_urad: Real = Field(0.0, description="about y; positive lowers the side at larger x [urad]")
 
 
+class ListedVisitConfig(Section):
+    """Visit of a list, for the headers of products."""
+
+    number: Whole = Field(description="number of the visit")
+    mid_mjd: Real = Field(description="middle of the exposure [MJD, TAI]")
+    snaps: Count = Field(1, description="exposures that the time is divided into")
+
+
 class FocalPlaneConfig(Section):
     """Heights of the CCD surfaces (Jee & Tyson 2011, Table 1)."""
 
@@ -207,6 +215,15 @@ class AtmosphereConfig(Section):
     zenith_position_angle_deg: Real | None = Field(
         None, description="of the zenith, from north through east [deg]; by default it lies towards the telescope's +x"
     )
+    ground_wind_m_s: tuple[Real, Real] | None = Field(
+        None, description="wind of the lowest layer along x and y of the telescope, in place of the site's [m/s]"
+    )
+
+    @model_serializer(mode="wrap")
+    def _without_open_wind(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Return the section without the wind where it is the site's, as in hashes from before this key."""
+        content: dict[str, Any] = handler(self)
+        return {key: value for key, value in content.items() if key != "ground_wind_m_s" or value is not None}
 
 
 class PsfConfig(Section):
@@ -346,6 +363,9 @@ class Configuration(Section):
     pointing: PointingConfig | None = Field(
         None, description="for celestial coordinates: {ra_deg: 53.1, dec_deg: -27.8, position_angle_deg: 30}"
     )
+    visit: ListedVisitConfig | None = Field(
+        None, description="visit of a list, for headers: {number: 1001, mid_mjd: 61001.15, snaps: 1}"
+    )
     wavelengths_nm: tuple[Positive, ...] | None = Field(None, description="wavelengths that make up the band [nm]")
     photometry: PhotometryConfig = PhotometryConfig()
     stars: StarsConfig = StarsConfig()
@@ -361,6 +381,12 @@ class Configuration(Section):
     def check(cls, content: dict[str, Any]) -> None:
         """Raise the error of a key that another one has replaced, with the value to write."""
         refuse_parallactic_angle(content)
+
+    @model_serializer(mode="wrap")
+    def _without_open_visit(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Return the configuration without a visit where it is of none, as in hashes from before this key."""
+        content: dict[str, Any] = handler(self)
+        return {key: value for key, value in content.items() if key != "visit" or value is not None}
 
     def as_dict(self) -> dict[str, Any]:
         """Return the configuration as plain lists, mappings and numbers, keys as in the file."""
@@ -435,8 +461,9 @@ def digest(content: Any) -> str:
 def to_yaml(config: Configuration, heading: Sequence[str] = ()) -> str:
     """Return the configuration as a YAML file with a comment to each key."""
     lines = [f"# {line}" for line in heading]
-    sections = [name for name in type(config).model_fields if isinstance(getattr(config, name), Section)]
-    lines += _yaml_lines(config, [n for n in type(config).model_fields if n not in sections], "")
+    stated_names = [name for name in type(config).model_fields if name != "visit" or config.visit is not None]
+    sections = [name for name in stated_names if isinstance(getattr(config, name), Section)]
+    lines += _yaml_lines(config, [n for n in stated_names if n not in sections], "")
     for name in sections:
         section = getattr(config, name)
         lines += ["", f"# {(type(section).__doc__ or '').strip()}", f"{name}:"]

@@ -100,7 +100,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     active = config.active_optics
     if active.states is not None:
         active = active.model_copy(update={"states": _absolute_path(active.states, folder, (), STATE_ENDINGS)})
-    site = load_site(site_name)
+    site = _with_ground_wind(load_site(site_name), atmosphere.ground_wind_m_s)
     stars, light = config.stars, resolved_photometry(config.photometry, telescope, camera, band)
     if stars.catalogue is not None:
         width, seconds, measured = PROVISIONAL_FWHM, atmosphere.exposure_s, band_of(band, light)
@@ -146,6 +146,16 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     check_combinations(resolved, telescope, _pixel_arcsec(resolved.psf, telescope))
     check_screens(resolved, telescope, camera, site)
     return ResolvedConfiguration(resolved, telescope, camera, site)
+
+
+def _with_ground_wind(site: Site, wind: tuple[float, float] | None) -> Site:
+    """Return the site with another wind in its lowest layer, along x and y of the telescope [m/s]."""
+    if wind is None:
+        return site
+    return site.with_layers(
+        wind_speeds=(math.hypot(*wind), *site.wind_speeds[1:]),
+        wind_directions=(math.atan2(wind[1], wind[0]), *site.wind_directions[1:]),
+    )
 
 
 def _reconstruction(fit: ReconstructionConfig, weight_fwhm_arcsec: float) -> ReconstructionConfig:

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from ..core.long_work import claim_folder
-from ..core.products import Stamp, is_whole
+from ..core.products import Card, Stamp, is_whole
 from ..core.version import VERSION
 from ..reconstruction.ccd_product import MODEL_CARD, product_path, write_product
 from .config import load_configuration, to_yaml
 from .experiment import Experiment
+from .listed_visit import visit_cards
 from .simulate.ccd_exposure import CcdExposure
 from .simulate.ccd_model import model_ccd
 
@@ -54,8 +55,13 @@ def stamp_of(experiment: Experiment) -> Stamp:
 
 def write_ccd(experiment: Experiment, folder: Path, exposure: CcdExposure) -> None:
     """Model one CCD and write its product into the folder of a run."""
+    write_product(folder, model_ccd(experiment, exposure), stamp_of(experiment), ccd_cards(experiment, exposure.name))
+
+
+def ccd_cards(experiment: Experiment, ccd: str) -> list[Card]:
+    """Return the cards of the header of a CCD's product that describe the run."""
     config = experiment.config
-    cards = [
+    cards: list[Card] = [
         ("TELESCOP", experiment.telescope.name, "prescription"),
         ("FILTER", config.band, "band"),
         ("EXPTIME", config.atmosphere.exposure_s, "[s] exposure"),
@@ -65,4 +71,4 @@ def write_ccd(experiment: Experiment, folder: Path, exposure: CcdExposure) -> No
     ]
     if config.reconstruction.model == "focal_plane":
         cards.append((MODEL_CARD, "ccd", "model of the columns MODEL_E1 and so on"))
-    write_product(folder, model_ccd(experiment, exposure), stamp_of(experiment), cards)
+    return cards + visit_cards(experiment, ccd)

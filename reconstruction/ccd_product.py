@@ -310,12 +310,14 @@ def to_detector_axes(field: np.ndarray, rotator: float) -> np.ndarray:
     return np.stack([cosine * field[0] + sine * field[1], cosine * field[1] - sine * field[0]])
 
 
-def product_path(folder: Path, ccd: str) -> Path:
-    """Return the path of the product of a CCD."""
-    return folder / f"ccd_{ccd}.fits"
+def product_path(folder: Path, ccd: str, prefix: str = "") -> Path:
+    """Return the path of the product of a CCD; its name may begin with that of a visit."""
+    return folder / f"{prefix}ccd_{ccd}.fits"
 
 
-def write_product(folder: Path, product: CcdProduct, stamp: Stamp, cards: list[tuple[str, Any, str]]) -> None:
+def write_product(
+    folder: Path, product: CcdProduct, stamp: Stamp, cards: list[tuple[str, Any, str]], prefix: str = ""
+) -> None:
     """Write the product of one CCD; `cards` (keyword, value, comment) describe the run: telescope, band, exposure."""
     header = [
         ("CCD", product.name, "name of the CCD"),
@@ -336,7 +338,7 @@ def write_product(folder: Path, product: CcdProduct, stamp: Stamp, cards: list[t
         *product.model.to_hdus(_MODEL),
         *product.noise_free_model.to_hdus(_NOISE_FREE_MODEL),
     ]
-    write_fits(product_path(folder, product.name), hdus, stamp, header)
+    write_fits(product_path(folder, product.name, prefix), hdus, stamp, header)
 
 
 def write_focal_plane_columns(folder: Path, product: CcdProduct) -> None:

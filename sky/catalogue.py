@@ -17,7 +17,14 @@ from ..core.files import write_bytes
 from ..core.products import Columns, table_hdu, write_ecsv, write_fits
 from ..core.table_files import parquet_module, read_columns
 from ..core.units import radians
+from ..models.camera.photometry import BANDS
 from .galaxies import Galaxies
+from .imsim_galaxies import (
+    SIGN_OF_SKY_CATALOGUE,
+    galaxies_of_instance_catalogue,
+    galaxies_of_sky_catalogue,
+    is_instance_catalogue,
+)
 from .pointing import Pointing
 
 #: Kinds of the files that are written, by their endings.
@@ -50,7 +57,9 @@ CONVENTIONS = {
 
 
 @check_arguments
-def read_galaxies(path: str | Path, *, pointing: ArrayLike | None = None, convention: str | None = None) -> Galaxies:
+def read_galaxies(
+    path: str | Path, *, pointing: ArrayLike | None = None, convention: str | None = None, band: str = "r"
+) -> Galaxies:
     """Read galaxies from a table: ECSV, CSV, FITS (its first table) or Parquet.
 
     Columns of a catalogue, in any case; units of the file are honoured, and where it has none these hold:
@@ -64,7 +73,9 @@ def read_galaxies(path: str | Path, *, pointing: ArrayLike | None = None, conven
     ``n``                  Sersic index, 0.3 to 6.2; default 1
     ====================== =======================================================================================
 
-    A table of components, as :func:`write_galaxies` writes it, is recognised by its columns.
+    A table of components, as :func:`write_galaxies` writes it, is recognised by its columns, and so is one of
+    skyCatalogs (``galaxy_*.parquet``, with ``galaxy_flux_*.parquet`` beside it). A file that ends in .txt or .txt.gz is
+    an instance catalogue.
 
     Parameters
     ----------
@@ -75,6 +86,8 @@ def read_galaxies(path: str | Path, *, pointing: ArrayLike | None = None, conven
     convention : {"galsim", "tangent_plane"}, optional
         Sense of a column ``e2``: > 0 from north-west to south-east ("galsim", as of GalSim, TreeCorr, DES, Rubin), or
         from north-east to south-west ("tangent_plane", as tables of components have it). Needed where it is not 0.
+    band : str
+        Band of the fluxes of skyCatalogs, u to y.
 
     Returns
     -------
@@ -92,8 +105,13 @@ def read_galaxies(path: str | Path, *, pointing: ArrayLike | None = None, conven
     path = Path(path)
     if convention is not None:
         check_choice("convention", convention, CONVENTIONS)
+    check_choice("band", band, BANDS)
+    if is_instance_catalogue(path):
+        return galaxies_of_instance_catalogue(path, pointing)
     columns = read_columns(path)
     with error_context(file=path):
+        if set(columns) >= SIGN_OF_SKY_CATALOGUE:
+            return galaxies_of_sky_catalogue(columns, path, pointing, band)
         if {"galaxy", "component_radius"} <= set(columns):
             return _from_components(columns)
         return _from_catalogue(columns, pointing, convention)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, SerializerFunctionWrapHandler, model_serializer
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, error_context
@@ -22,15 +22,20 @@ from ...core.yaml_reader import read_mapping
 from ...imaging.config import GalaxySourceConfig
 from ...imaging.exposure import Exposure
 from ...imaging.galaxies import GalaxySource
-from ...pipeline.config import Configuration, digest, section_yaml, with_options, with_run
+from ...pipeline.config import Configuration, PointingConfig, digest, section_yaml, with_options, with_run
 from ...pipeline.experiment import Experiment
+from ...pipeline.listed_visit import telescope_of_band
 from ...pipeline.resolved_values import require_drawn_stars
-from .plan import Visit, plan_visits
+from ...sky.pointing import Pointing
+from ..night.config import ListSection, read_section
+from .plan import Visit, listed_plan, plan_visits
 
 #: Side of the stamps of the stack [pixel].
 STACK_STAMP = 31
 #: Side of the stamps of a visit [pixel], of which turned axes cut the corners.
 VISIT_STAMP = 49
+#: Largest distance of a listed pointing from the common one [deg], that of dithers.
+_LARGEST_FIELD = 5.0
 #: Raft of the visits where a configuration names no CCDs.
 CENTRAL_RAFT = "R22"
 
@@ -56,6 +61,16 @@ class VisitsSection(Section):
     rotator_limit_deg: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=0, le=180)] = Field(
         90.0, description="largest angle of the rotator of either sense that is drawn [deg]"
     )
+
+    from_list: ListSection | None = Field(
+        None, description="list of visits whose pointings, angles, air and weights are taken: {list: ddf.db, band: r}"
+    )
+
+    @model_serializer(mode="wrap")
+    def _without_list(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Return the section without a list where there is none, as in files from before this key."""
+        content: dict[str, Any] = handler(self)
+        return {key: value for key, value in content.items() if key != "from_list" or value is not None}
 
 
 _ANGLES = {key: VisitsSection.model_fields[key].default for key in ("roll_deg", "rotator_deg", "rotator_limit_deg")}
@@ -123,6 +138,11 @@ class VisitsConfig(Section):
     def plan_of(self, count: int, seed: int) -> tuple[Visit, ...]:
         """Return the first `count` visits."""
         visits = self.visits
+        if visits.from_list is not None:
+            listed = read_section(visits.from_list, self.run)
+            if len(listed) < count:
+                raise ConfigError(f"visits.count = {count}: expected at most the {len(listed)} visits of the list")
+            return listed_plan(listed, _pointing_of(self.run))[:count]
         try:
             return plan_visits(
                 count,
@@ -136,6 +156,50 @@ class VisitsConfig(Section):
         except DomainError as error:
             raise ConfigError(f"visits.{error}") from None
 
+    def with_list(self, section: ListSection, folder: Path | None = None) -> VisitsConfig:
+        """Return the settings of the visits of a list of one field, whose run has their band, pointing and time.
+
+        The common pointing is that of the run, or the middle of the list.
+
+        Raises
+        ------
+        PachonError
+            If the list cannot be read.
+        ConfigError
+            If it has several bands, or pointings more than 5 degrees apart.
+        """
+        section = section.model_copy(update={"list": str(((folder or Path()) / str(section.list)).resolve())})
+        listed = read_section(section, self.run)
+        bands = np.unique(listed.band).tolist()
+        if len(bands) > 1:
+            raise ConfigError(f"{listed.source}: bands {', '.join(bands)}: expected one for a stack, by --band")
+        run = with_options(
+            self.run,
+            band=bands[0],
+            telescope=telescope_of_band(self.run.telescope, bands[0], folder),
+            atmosphere__exposure_s=float(np.median(listed.exposure)),
+        )
+        if run.pointing is None:
+            middle = Pointing(float(listed.ra[0]), float(listed.dec[0]))
+            xi, eta = middle.from_celestial(listed.ra, listed.dec).mean(axis=0)
+            ra, dec = np.rad2deg(middle.to_celestial([xi, eta])[0]).tolist()
+            run = run.model_copy(update={"pointing": PointingConfig(ra_deg=ra, dec_deg=dec)})
+        sky = _pointing_of(run).from_celestial(listed.ra, listed.dec)
+        reach = float(np.rad2deg(np.arctan(np.hypot(*sky.T).max())))
+        if not reach <= _LARGEST_FIELD:
+            raise ConfigError(
+                f"{listed.source}: pointings up to {reach:.1f} deg from the middle: expected one field, at most "
+                f"{_LARGEST_FIELD:g} deg"
+            )
+        visits = self.visits.model_copy(
+            update={
+                "from_list": section.model_copy(update={"digest": listed.digest}),
+                "count": len(listed),
+                "dither_deg": reach,
+            }
+        )
+        return self.model_copy(update={"run": run, "visits": visits})
+
     @property
     def kept(self) -> tuple[int, ...]:
         """Numbers of visits whose stacks are kept, the last one among them."""
@@ -145,6 +209,12 @@ class VisitsConfig(Section):
     def to_yaml(self) -> str:
         """Return the configuration as a YAML file."""
         return section_yaml(self, "All that decides these visits.")
+
+
+def _pointing_of(run: Configuration) -> Pointing:
+    """Return the common pointing."""
+    aim = run.pointing or PointingConfig()
+    return Pointing(float(np.deg2rad(aim.ra_deg)), float(np.deg2rad(aim.dec_deg)))
 
 
 @check_arguments

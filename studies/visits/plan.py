@@ -6,13 +6,15 @@ Positions on the sky are gnomonic: xi towards east and eta towards north of the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ...core.errors import DomainError
 from ...core.random_streams import stream
 from ...models.telescope import Telescope
+from ...sky.pointing import Pointing
+from ...sky.visit_list.visit_list import ListedVisit, VisitList
 from ...wavefront.chief_rays import chief_rays, image_jacobians
 
 
@@ -32,6 +34,10 @@ class Visit:
         xi, eta of the pointing.
     rotator_deg : float or None
         Angle of the camera against the telescope [deg], as `rotator_deg` of a run has it; that of the run if None.
+    listed : ListedVisit or None
+        Visit of a list, with its own air, time and sky; None of one of the run's.
+    star_limits : (float, float) or None
+        Magnitude limits of the stars, bright and faint, of a visit of a list: those of the run, which all visits share.
     """
 
     number: int
@@ -39,6 +45,8 @@ class Visit:
     roll: float = 0.0
     pointing: tuple[float, float] = (0.0, 0.0)
     rotator_deg: float | None = None
+    listed: ListedVisit | None = None
+    star_limits: tuple[float, float] | None = None
 
     def __str__(self) -> str:
         rotator = "" if self.rotator_deg is None else f", rotator {self.rotator_deg:.0f} deg"
@@ -91,6 +99,27 @@ class Visit:
         change = self.matrix[None, :, :2]
         cosines = -(change - along * (along.transpose(0, 2, 1) @ change)) / norm
         return image_jacobians(telescope, self.directions(sky), wavelength, threads) @ cosines[:, :2]
+
+
+def listed_plan(visits: VisitList, center: Pointing) -> tuple[Visit, ...]:
+    """Return the visits of a list about a common pointing, numbered from 0 in their order.
+
+    DomainError if one lies 90 degrees or more from it.
+    """
+    plan = []
+    common = replace(center, position_angle=0.0)
+    sky = common.from_celestial(visits.ra, visits.dec)
+    for number in range(len(visits)):
+        listed = visits[number]
+        if not np.isfinite(sky[number]).all():
+            raise DomainError(f"{listed.label}: expected a pointing within 90 deg of the common one")
+        xi, eta = sky[number].tolist()
+        axes = Pointing(listed.ra, listed.dec, listed.roll).axes @ common.axes.T
+        # Without a roll the matrix carries the pointing to the axis; what is left of the axes is the roll.
+        turn = axes @ Visit(number, 0, 0.0, (xi, eta)).matrix.T
+        roll = float(np.arctan2(turn[1, 0], turn[0, 0]))
+        plan.append(Visit(number, listed.epoch, roll, (xi, eta), float(np.rad2deg(listed.rotator)), listed))
+    return tuple(plan)
 
 
 def plan_visits(

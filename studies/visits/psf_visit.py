@@ -12,6 +12,7 @@ from ...core.errors import DomainError, error_context
 from ...core.progress import Reporter
 from ...core.units import ARCSEC
 from ...models.telescope import Telescope
+from ...pipeline import listed_visit
 from ...pipeline.config import PointingConfig, with_options
 from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_stage import fit_focal_plane_model
@@ -30,6 +31,7 @@ from ...pipeline.simulate.photometry import (
 from ...pipeline.simulate.screen_cover import check_screens
 from ...pipeline.simulate.star_field import StarField, magnitudes_at
 from ...reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
+from ..night.detector_row import noise_columns
 from .plan import Visit
 from .resample import resample_stamps
 from .sky_points import SkyPoints
@@ -78,6 +80,7 @@ class VisitPsfs:
     true: np.ndarray  #: noise-free PSFs, [n, size, size]
     model: np.ndarray  #: those of the model, likewise
     left_out: dict[str, str]  #: CCDs that could not be modelled, and the reasons
+    weight: float | None = None  #: in stacks, an inverse variance; None where all visits have the same
 
 
 class _CcdResult(NamedTuple):
@@ -89,7 +92,12 @@ class _CcdResult(NamedTuple):
 
 
 def visit_experiment(experiment: Experiment, visit: Visit) -> Experiment:
-    """Return the experiment of a visit: own turbulence, residual aberration, noise and, where it has one, rotator."""
+    """Return the experiment of a visit: own turbulence, residual aberration, noise and, where it has one, rotator.
+
+    That of a visit of a list has the list's pointing, angles, air, time and sky too.
+    """
+    if visit.listed is not None:
+        return listed_visit.visit_experiment(experiment.config, visit.listed)
     config = with_options(experiment.config, atmosphere__epoch=visit.epoch, rotator_deg=visit.rotator_deg)
     if config.atmosphere.zenith_position_angle_deg is not None:
         # The zenith stands still on the sky, while the telescope rolls.
@@ -191,7 +199,15 @@ def visit_psfs(
         stamps = resample_stamps(np.concatenate(images), matrix, frame.size, threads=threads)
         return np.asarray(stamps / stamps.sum(axis=(1, 2), keepdims=True, dtype=np.float64).astype(np.float32))
 
-    return VisitPsfs(rows, turned(true), turned(model), simulated.not_modelled)
+    return VisitPsfs(rows, turned(true), turned(model), simulated.not_modelled, _weight_of(experiment, visit))
+
+
+def _weight_of(experiment: Experiment, visit: Visit) -> float | None:
+    """Return the weight of a visit of a list: that of the list, or the inverse variance of a pixel of its sky."""
+    if visit.listed is None:
+        return None
+    weight = visit.listed.weight
+    return weight if np.isfinite(weight) else noise_columns(experiment, 1.0)["weight"]
 
 
 def _star_fields(
@@ -201,7 +217,7 @@ def _star_fields(
     camera, config = experiment.camera, experiment.config
     xy = visit.on_detector(experiment.telescope, points.sky, middle_wavelength(experiment), threads)
     band, seconds = experiment.band, config.atmosphere.exposure_s
-    bright, faint = magnitude_limits(experiment)
+    bright, faint = visit.star_limits or magnitude_limits(experiment)
     fields, index = {}, {}
     # Beyond its field of view a telescope may have no light.
     lit = np.hypot(*xy.T) <= experiment.field_radius_on_detector

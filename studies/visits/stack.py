@@ -33,7 +33,7 @@ VISITS_CARD = "VISITS"
 
 @dataclass(eq=False)
 class PsfSums:
-    """Sums of the PSFs of visits, all of one weight.
+    """Sums of the PSFs of visits, all of one weight or each of its own.
 
     Attributes
     ----------
@@ -42,13 +42,16 @@ class PsfSums:
     count : ndarray of int, shape [n]
         Visits that cover each point.
     true, model : ndarray of float32, shape [n, size, size]
-        Sums of PSFs of unit sum.
+        Sums of PSFs of unit sum, times the weights of their visits.
+    weight : ndarray, shape [n], optional
+        Sums of the weights at each point; None where all visits have the weight 1.
     """
 
     visits: int
     count: np.ndarray
     true: np.ndarray
     model: np.ndarray
+    weight: np.ndarray | None = None
 
     @classmethod
     def empty(cls, n: int, size: int) -> PsfSums:
@@ -57,8 +60,14 @@ class PsfSums:
 
     def add(self, psfs: VisitPsfs) -> None:
         """Add one visit."""
-        self.true[psfs.index] += psfs.true
-        self.model[psfs.index] += psfs.model
+        if psfs.weight is None:
+            self.true[psfs.index] += psfs.true
+            self.model[psfs.index] += psfs.model
+        else:
+            self.weight = np.zeros(len(self.count)) if self.weight is None else self.weight
+            self.true[psfs.index] += np.float32(psfs.weight) * psfs.true
+            self.model[psfs.index] += np.float32(psfs.weight) * psfs.model
+            self.weight[psfs.index] += psfs.weight
         self.count[psfs.index] += 1
         self.visits += 1
 
@@ -66,6 +75,8 @@ class PsfSums:
         """Write the sums, exactly as they are."""
         hdus = [fits.ImageHDU(self.count, name="COUNT"), image_hdu("TRUE", self.true, "sums of the true PSFs")]
         hdus.append(image_hdu("MODEL", self.model, "sums of the PSFs of the models"))
+        if self.weight is not None:
+            hdus.append(fits.ImageHDU(self.weight, name="WEIGHT"))
         write_fits(path, hdus, stamp, [(VISITS_CARD, self.visits, "in the sums")])
 
     @classmethod
@@ -73,7 +84,9 @@ class PsfSums:
         """Read sums; ProductError for those of another configuration, and for a damaged file."""
         hdus = _read_table(path, stamp)
         count = np.array(hdus["COUNT"].data, dtype=np.int32)
-        return cls(hdus[0].header[VISITS_CARD], count, _image_from_hdu(hdus["TRUE"]), _image_from_hdu(hdus["MODEL"]))
+        images = _image_from_hdu(hdus["TRUE"]), _image_from_hdu(hdus["MODEL"])
+        weight = np.array(hdus["WEIGHT"].data, dtype=np.float64) if "WEIGHT" in hdus else None
+        return cls(hdus[0].header[VISITS_CARD], count, *images, weight)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +174,8 @@ class PsfStack(Result):
                 "CCDs around the middle of the field, which all rolls see"
             )
         count = sums.count[rows]
-        true, model = (v[rows] / count[:, None, None].astype(np.float32) for v in (sums.true, sums.model))
+        divisor = count if sums.weight is None else sums.weight[rows]
+        true, model = (v[rows] / divisor[:, None, None].astype(np.float32) for v in (sums.true, sums.model))
         shapes: list[Shapes] = [measure_shapes(images, pixel_scale, weight_fwhm) for images in (true, model)]
         places = sky[rows], sky[rows] @ axes.T * pixel_scale
         columns = {

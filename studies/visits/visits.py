@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from ...pipeline.run_folder import CONFIG_NAME, SUMMARY_NAME
 from .config import STACK_STAMP, VisitsConfig, load_visits_configuration
 from .plan import Visit
 from .plots import correlation_picture, ellipticity_picture
-from .psf_visit import StackFrame, VisitPsfs, check_rotators, visit_experiment, visit_psfs
+from .psf_visit import StackFrame, VisitPsfs, check_rotators, magnitude_limits, visit_experiment, visit_psfs
 from .sky_points import SkyPoints, draw_points
 from .stack import PsfStack, PsfSums
 from .stack_metrics import StackCorrelations, stack_correlations, stack_metrics
@@ -100,6 +100,9 @@ def stack_visits(
     frame = StackFrame.of(experiment, STACK_STAMP)
     points = sky_points_of(experiment, config, frame)
     visits = config.plan(experiment.config.seed)
+    if config.visits.from_list is not None:
+        # A star has one magnitude in all visits.
+        visits = tuple(replace(visit, star_limits=magnitude_limits(experiment)) for visit in visits)
     check_rotators(experiment, visits)
     make_folder(folder)
     _check_room(folder, points, len(config.kept))

@@ -33,6 +33,17 @@ class _Made:
         pachon.save_telescope(self.tel, path)
         return path
 
+    def make_visit_list_file(self):
+        path = self.folder / "visits.csv"
+        path.write_text(
+            "visitId,ra,dec,expMidptMJD,expTime,band,rotTelPos,seeingFwhm500,airmass,night\n"
+            "1,53.1,-27.8,61001.15,30,r,-35,0.72,1.05,5\n2,53.2,-27.9,61001.16,30,r,-35,0.71,1.04,5\n"
+        )
+        return path
+
+    def make_visit_list(self):
+        return pachon.read_visit_list(self.visit_list_file)
+
     def make_lens(self):
         return pachon.load_telescope(ROOT / "tests" / "data" / "zmx" / "lens1.zmx")
 
@@ -426,7 +437,7 @@ def calls(folder):
         "Surface.normal": (tel.surfaces[0].normal, {"x": x, "y": y}),
         "trace": (pachon.trace, {"telescope": tel, "rays": m.rays, "threads": 1, "out": pachon.trace(tel, m.rays)}),
         "read_galaxies": (pachon.read_galaxies, {"path": m.folder / "none.fits", "pointing": (0.0, 0.0),
-                          "convention": "galsim"}),
+                          "convention": "galsim", "band": "r"}),
         "to_sky": (pachon.to_sky, {"shapes": [[0.1, 0.0]], "x": [10.0], "y": [20.0],
                    "wcs": pachon.wcs(m.lsst, "R22_S11", (0.0, 0.0), camera="lsst")}),
         "write_galaxies": (pachon.write_galaxies, {"path": m.folder / "galaxies.ecsv", "galaxies": m.galaxies}),
@@ -451,6 +462,12 @@ def calls(folder):
                          "execution": m.execution, "folder": m.folder / "none"}),
         "null_test": (pachon.null_test, {"folder": m.folder / "none", "tiles": 2, "rings": 10,
                       "execution": m.execution}),
+        "run_night": (pachon.run_night, {"config": pachon.NightConfig(run=m.config), "base": m.folder, "part": (1, 1),
+                      "execution": m.execution, "folder": m.folder / "none"}),
+        "load_night_configuration": (pachon.load_night_configuration, {"path": m.folder / "none.yaml"}),
+        "read_visit_list": (pachon.read_visit_list, {"path": m.visit_list_file, "where": "airmass < 1.4",
+                            "band": "r", "night": 5, "camera": "lsst", "site": "cerro_pachon",
+                            "airmass_law": "opsim"}),
         "load_visits_configuration": (pachon.load_visits_configuration, {"path": m.folder / "none.yaml"}),
         "shim": (pachon.shim, {"experiment": m.experiment, "merit": "fwhm", "parts": "rafts", "threads": 1}),
         "measure_image": (

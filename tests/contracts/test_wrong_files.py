@@ -8,6 +8,7 @@ import base64
 import gzip
 import io
 import os
+import sqlite3
 import warnings
 import zlib
 from pathlib import Path
@@ -79,6 +80,37 @@ def _store(path):
         store._connection.execute("""INSERT INTO points VALUES (0, '{"a": 1.0}', 1)""")
         store._connection.commit()
         store.write(PointResult(0, {"fwhm": 1.0}, None, 0.1, "here"))
+
+
+VISIT_LIST = (
+    b"visitId,ra,dec,expMidptMJD,expTime,band,rotTelPos,seeingFwhm500,altitude,numExposures,skyBrightness\n"
+    b"1,53.1,-27.8,61001.15,30,r,-35,0.72,80.5,1,21.1\n2,53.2,-27.9,61001.16,30,i,-35,0.71,,2,20.2\n"
+)
+INSTANCE_CATALOGUE = b"""# a catalogue
+rightascension 53.25
+declination -27.9
+mjd 61040.0811
+altitude 85.3
+filter 2
+rotskypos 22.4
+rottelpos 10
+nsnap 2
+obshistid 1004
+seeing 0.6
+vistime 32.2
+object 1 53.2 -27.9 20 flat
+"""
+
+
+def _visit_database(path):
+    names, *rows = VISIT_LIST.decode().splitlines()
+    connection = sqlite3.connect(path)
+    with connection:
+        connection.execute(f"CREATE TABLE observations ({names})")
+        for row in rows:
+            values = [value if value in "ri" else float(value) for value in row.split(",")]
+            connection.execute(f"INSERT INTO observations VALUES ({','.join('?' * len(values))})", values)
+    connection.close()
 
 
 def _image(path):
@@ -268,6 +300,9 @@ def _cases(folder):
                    lambda p: pachon.load_images_configuration(p)),
         "visits": (".yaml", b"run: {ccds: [R22_S11]}\nvisits: {count: 3, snapshots: [1, 3]}\n",
                    lambda p: pachon.load_visits_configuration(p).plan(1)),
+        "visit_list": (".csv", VISIT_LIST, pachon.read_visit_list),
+        "instance_catalogue": (".txt", INSTANCE_CATALOGUE, pachon.read_visit_list),
+        "visit_database": (".db", _written(_visit_database, ".db", folder), pachon.read_visit_list),
         "degrees": (".yaml", yaml.safe_dump({"name": "mine", "degrees_of_freedom": [
             {"name": "a", "unit": "um", "of": "M2.dz"}]}).encode(), pachon.load_degrees_of_freedom),
         "heights_ecsv": (".ecsv", _text(_points(), "ascii.ecsv"), lambda p: pachon.FocalPlane.from_file(p)),
@@ -308,7 +343,8 @@ def _cases(folder):
 
 
 NAMES = (
-    "zmx", "seq", "len", "json", "roa", "zar", "agf", "baseline", "site", "images", "visits", "degrees",
+    "zmx", "seq", "len", "json", "roa", "zar", "agf", "baseline", "site", "images", "visits",
+    "visit_list", "instance_catalogue", "visit_database", "degrees",
     "heights_ecsv", "heights_fits", "galaxies_ecsv", "galaxies_fits", "stars", "mosaic", "grid", "image",
     "foreign_image", "psfex",
     "psf_model", "stl", "glb", "gltf", "obj", "ply", "off", "piff", "star_list", "star_list_ecsv",

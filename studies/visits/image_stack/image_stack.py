@@ -80,6 +80,8 @@ class ImageStack:
         if not (visits_folder / CONFIG_NAME).exists():
             raise ProductError(f"{visits_folder}: no visits (no {CONFIG_NAME}); expected the folder of pachon visits")
         visits = load_visits_configuration(visits_folder / CONFIG_NAME)
+        if visits.visits.from_list is not None:
+            raise ProductError(f"{visits_folder} has visits of a list: expected visits of one sky and time")
         experiment, folder = visits.experiment(), visits_folder / FOLDER_NAME
         before = _settings_before(folder)
         if settings is None and before is None:

@@ -1,8 +1,5 @@
-import pickle
-
 import pytest
 
-from pachon.core.workers import Workers
 from pachon.pipeline.config import configuration_of
 from pachon.studies.visits.config import VisitsConfig, VisitsSection
 
@@ -24,19 +21,3 @@ def visits_config():
         return VisitsConfig(run=configuration_of(run, "test"), visits=VisitsSection(**settings))
 
     return config
-
-
-@pytest.fixture(scope="session")
-def backwards():
-    """Workers that are sent pickled jobs, and end them in the opposite order."""
-
-    def make(compute):
-        def results(jobs):
-            sent = [pickle.dumps((compute, job)) for job in jobs]
-            for data in reversed(sent):
-                received, job = pickle.loads(data)
-                yield pickle.loads(pickle.dumps(received(job, 1)))
-
-        return Workers("backwards", 0, results)
-
-    return make

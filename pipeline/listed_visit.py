@@ -1,0 +1,168 @@
+"""Configurations of the visits of a list, and what headers say of them."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..core.errors import ConfigError, PachonError, error_context
+from ..core.products import Card
+from ..models.camera.camera import Camera
+from ..models.io.bundled import BUNDLED
+from ..sky.visit_list.read_list import READOUT
+from ..sky.visit_list.visit_list import ListedVisit, VisitList
+from .config import Configuration, ListedVisitConfig, PointingConfig, configuration_of
+from .experiment import Experiment
+from .resolved_values import resolved_value
+
+#: Names of cameras in headers; others have their own.
+_INSTRUMENTS = {"lsst": "LSSTCam", "comcam": "LSSTComCam", "auxtel": "LATISS", "decam": "DECam", "hsc": "HSC"}
+#: Band in the name of a model, such as lsst_v3.3_r.
+_BAND_OF_NAME = re.compile(r"_([ugrizy])(?=_|$)")
+_SECONDS_A_DAY = 86400.0
+#: Visits of a band of which one must have an experiment: others may lie too low, or have other values out of range.
+_TRIED = 3
+
+
+def telescope_of_band(name: str | None, band: str, folder: Path | None = None) -> str | None:
+    """Return the model of a telescope in a band: the one of its name with that band's letter.
+
+    ConfigError if a name has a band, and there is none with the other.
+    """
+    if name is None:
+        return None
+    path = Path(name)
+    stem = name if name in BUNDLED else path.stem
+    match = list(_BAND_OF_NAME.finditer(stem))[-1:]
+    if not match or match[0][1] == band:
+        return name
+    other = f"{stem[: match[0].start(1)]}{band}{stem[match[0].end(1) :]}"
+    if name in BUNDLED:
+        if other in BUNDLED:
+            return other
+    elif ((folder or Path()) / (sibling := path.with_name(other + path.suffix))).is_file():
+        return str(sibling)
+    raise ConfigError(f"telescope = {name}: has no band {band}; expected visits in its band {match[0][1]}, or {other}")
+
+
+def visit_configuration(config: Configuration, visit: ListedVisit, folder: Path | None = None) -> Configuration:
+    """Return the configuration of a visit: pointing, angles, band, time and air of the list, all else as it is.
+
+    ConfigError if the telescope has not its band, or a value is out of range.
+    """
+    content = config.as_dict()
+    content["band"] = visit.band
+    content["telescope"] = telescope_of_band(config.telescope, visit.band, folder)
+    content["pointing"] = PointingConfig(
+        ra_deg=math.degrees(visit.ra), dec_deg=math.degrees(visit.dec), position_angle_deg=math.degrees(visit.roll)
+    ).model_dump()
+    content["rotator_deg"] = math.degrees(visit.rotator)
+    content["visit"] = ListedVisitConfig(number=visit.visit, mid_mjd=visit.midpoint, snaps=visit.snaps).model_dump()
+    content["atmosphere"] |= {
+        "epoch": visit.epoch,
+        "r0_m": visit.r0,
+        "outer_scale_m": visit.outer_scale,
+        "exposure_s": visit.exposure,
+        "zenith_angle_deg": max(math.degrees(visit.zenith_angle), 0.0),
+        "zenith_position_angle_deg": math.degrees(visit.zenith_position_angle),
+    }
+    if math.isfinite(visit.wind_speed) and math.isfinite(visit.wind_azimuth):
+        content["atmosphere"]["ground_wind_m_s"] = ground_wind(visit)
+    return configuration_of(content, visit.label)
+
+
+def ground_wind(visit: ListedVisit) -> tuple[float, float]:
+    """Return the wind on the ground along x and y of an alt-azimuth telescope [m/s], as it crosses the pupil.
+
+    +y points to the zenith and +z to the sky: a wind towards the azimuth B has, at the altitude h and azimuth A of the
+    pointing, the components -sin(B - A) and -sin(h) cos(B - A) across the line of sight.
+    """
+    towards = visit.wind_azimuth + math.pi - visit.azimuth
+    # Rolled against the vertical, x and y turn with the telescope.
+    turn = visit.roll - visit.zenith_position_angle
+    x, y = -math.sin(towards), -math.sin(visit.altitude) * math.cos(towards)
+    c, s = math.cos(turn), math.sin(turn)
+    return visit.wind_speed * (c * x - s * y), visit.wind_speed * (s * x + c * y)
+
+
+def visit_experiment(config: Configuration, visit: ListedVisit, folder: Path | None = None) -> Experiment:
+    """Return the experiment of a visit of a list, with the photometry of its airmass, sky and snaps.
+
+    What the list says counts more than the configuration. Stars are dimmed by the extinction of the airmass, the sky is
+    not: its brightness is that at the telescope. Snaps are one exposure of their total time, with the read noise of
+    all.
+    """
+    with error_context(subject=visit.label):
+        experiment = Experiment.from_config(visit_configuration(config, visit, folder), folder)
+        settings = experiment.config
+        band = experiment.band
+        airmass = 1.0 / math.sin(visit.altitude)
+        updates = {
+            "zero_point": band.zero_point - band.extinction * (airmass - 1.0),
+            "extinction": band.extinction * airmass,
+            "read_noise_e": band.read_noise * math.sqrt(visit.snaps),
+            "full_well_e": band.full_well * visit.snaps,
+        }
+        if math.isfinite(visit.sky):
+            updates["dark_sky"] = visit.sky
+        photometry = settings.photometry.model_copy(update=updates)
+        settings = settings.model_copy(update={"photometry": photometry})
+        if settings.stars.catalogue is not None:
+            return Experiment.from_config(settings)
+        return replace(experiment, config=settings)
+
+
+def check_bands(config: Configuration, visits: VisitList, folder: Path | None = None) -> None:
+    """Raise the error of a band of a list that the telescope has not: that of its first visit, where three fail."""
+    for band in np.unique(visits.band):
+        of_band = np.flatnonzero(visits.band == band)
+        errors: list[PachonError] = []
+        for index in of_band[:_TRIED]:
+            try:
+                visit_experiment(config, visits[int(index)], folder)
+                break
+            except PachonError as error:
+                errors.append(error)
+        else:
+            raise errors[0].within(subject=f"band {band}, {len(of_band)} visits of {visits.source}")
+
+
+def visit_cards(experiment: Experiment, ccd: str) -> list[Card]:
+    """Return the cards of a header that name instrument, detector and time of a visit; none without a visit."""
+    visit = experiment.config.visit
+    if visit is None:
+        return []
+    exposure = experiment.config.atmosphere.exposure_s
+    start = visit.mid_mjd - 0.5 * (exposure + READOUT * (visit.snaps - 1)) / _SECONDS_A_DAY
+    pointing = resolved_value(experiment.config.pointing)
+    altitude = 0.5 * math.pi - math.radians(experiment.config.atmosphere.zenith_angle_deg)
+    return [
+        ("INSTRUME", instrument_of(experiment.camera), "camera"),
+        ("DETECTOR", experiment.camera.ccd_index(ccd), "number of the CCD in the camera, from 0"),
+        ("VISIT", visit.number, "number of the visit"),
+        ("TIMESYS", "TAI", "of all times"),
+        ("DATE-OBS", _date_of(start), "start of the exposure"),
+        ("MJD-OBS", start, "[d] start of the exposure"),
+        ("DATE-AVG", _date_of(visit.mid_mjd), "middle of the exposure"),
+        ("MJD-AVG", visit.mid_mjd, "[d] middle of the exposure"),
+        ("RA", pointing.ra_deg % 360.0, "[deg] pointing, ICRS"),
+        ("DEC", pointing.dec_deg, "[deg] pointing, ICRS"),
+        ("ROTTELPO", experiment.config.rotator_deg, "[deg] camera against telescope (rotTelPos)"),
+        ("AIRMASS", 1.0 / math.sin(altitude), "secant of the zenith angle"),
+        ("NSNAP", visit.snaps, "snaps of the visit"),
+    ]
+
+
+def instrument_of(camera: Camera) -> str:
+    """Return the name of a camera in headers."""
+    return _INSTRUMENTS.get(camera.name, camera.name)
+
+
+def _date_of(mjd: float) -> str:
+    """Return a modified Julian date as FITS has dates, to a millisecond."""
+    milliseconds = round(mjd * _SECONDS_A_DAY * 1e3)
+    return str(np.datetime64("1858-11-17T00:00:00.000") + np.timedelta64(milliseconds, "ms"))

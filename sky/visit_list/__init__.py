@@ -1,0 +1,1 @@
+"""Lists of visits of schedulers and observatories: files, their columns, and what they say of each visit."""

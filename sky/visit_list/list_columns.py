@@ -1,0 +1,118 @@
+"""Columns of a visit list by quantity, in SI units and radians, and errors of values that cannot be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+
+from ...core.errors import DomainError, ProductError
+from ...core.units import ARCSEC
+from .list_table import ListTable
+from .names import QUANTITIES
+
+
+@dataclass
+class ListColumns:
+    """Columns of a list by quantity, in SI units and radians, with remarks on them."""
+
+    values: dict[str, np.ndarray]
+    source: dict[str, str]  #: names of the columns in the file
+    kind: str  #: of the file, as :class:`ListTable` has it
+    all_names: tuple[str, ...]  #: of the columns of the file
+    remarks: list[str] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, table: ListTable, where: str | None) -> ListColumns:
+        """Return the columns of a table that are known."""
+        source = {
+            key: name
+            for key, quantity in QUANTITIES.items()
+            if (name := next((name for name in quantity.names if name in table.columns), None)) is not None
+        }
+        selected = table.select(list(dict.fromkeys(source.values())), where) if source else {}
+        columns = cls({}, source, table.kind, table.columns)
+        # OpSim 3 has its angles in radians.
+        in_radians = table.kind == "sqlite" and {"expmjd", "obshistid"} <= set(table.columns)
+        if in_radians:
+            columns.remarks.append("angles are in radians, as in databases of OpSim 3")
+        for key, name in source.items():
+            unit = "rad" if in_radians and QUANTITIES[key].unit == "deg" else QUANTITIES[key].unit
+            values = selected[name]
+            columns.values[key] = values if key == "band" else _in_si(values, table.units.get(name), unit, name)
+        return columns
+
+    def __len__(self) -> int:
+        return len(next(iter(self.values.values()), ()))
+
+    def rows(self, mask: np.ndarray) -> ListColumns:
+        """Return the rows of a mask."""
+        values = {key: column[mask] for key, column in self.values.items()}
+        return ListColumns(values, self.source, self.kind, self.all_names, self.remarks)
+
+    def require(self, *keys: str) -> str:
+        """Return the first of some quantities that the list has; ProductError names the columns looked for."""
+        for key in keys:
+            if key in self.values:
+                return key
+        names = ", ".join(name for key in keys for name in QUANTITIES[key].names)
+        raise ProductError(
+            f"no column of the {QUANTITIES[keys[0]].text}: expected one of {names}; "
+            f"columns are {', '.join(self.all_names) or 'none'}",
+            key=QUANTITIES[keys[0]].names[0],
+        )
+
+    def numbers(self, key: str, default: float | None = None) -> np.ndarray:
+        """Return a quantity as numbers, NaN where empty; `default` in place of all empty ones."""
+        if key not in self.values:
+            return np.full(len(self), np.nan if default is None else default)
+        column = self.values[key]
+        return column if default is None else np.where(np.isfinite(column), column, default)
+
+    def complete(self, key: str, valid: Callable[[np.ndarray], np.ndarray], expected: str) -> np.ndarray:
+        """Return a quantity that every visit must have; DomainError names the first that has not, and how many."""
+        numbers = self.numbers(key)
+        with np.errstate(invalid="ignore"):
+            wrong = np.flatnonzero(~(np.isfinite(numbers) & valid(numbers)))
+        if wrong.size:
+            name = self.source.get(key, QUANTITIES[key].names[0])
+            raise self.visit_error(wrong, f"{name} = {_shown(numbers[wrong[0]], QUANTITIES[key].unit)}", expected, name)
+        return numbers
+
+    def visit_error(self, wrong: np.ndarray, value: str, expected: str, name: str) -> DomainError:
+        """Return the error of the first of some visits."""
+        number = self.values["visit"][wrong[0]] if "visit" in self.values else wrong[0] + 1
+        extent = f"{len(wrong)} of {len(self)} visits are so; " if len(wrong) > 1 else ""
+        return DomainError(
+            f"visit {number}: {value}: expected {expected}; {extent}leave them out by a condition (where)", key=name
+        )
+
+
+def _in_si(values: np.ndarray, file_unit: Any, unit: str, name: str) -> np.ndarray:
+    """Return a column in SI units, angles in radians; dates stay days."""
+    if values.dtype.kind == "U":
+        try:
+            values = np.array([float(text) if text.strip() else np.nan for text in values.tolist()])
+        except ValueError:
+            raise DomainError(f"column {name}: expected numbers", key=name) from None
+    if not unit or unit in ("mag", "pixel"):
+        return values
+    default = u.Unit(unit)
+    column_unit = default if file_unit is None else file_unit
+    target = {"angle": u.rad, "time": default, "length": u.m, "speed": u.m / u.s}
+    kind = next(name for name in target if name in default.physical_type)
+    try:
+        return np.asarray((values * column_unit).to_value(target[kind]), dtype=np.float64)
+    except (u.UnitsError, TypeError, AttributeError):
+        raise DomainError(f"column {name} in {file_unit}: expected a unit such as {unit}", key=name) from None
+
+
+def _shown(value: float, unit: str) -> str:
+    """Return a number of a message in the unit of lists."""
+    if not np.isfinite(value):
+        return "nothing"
+    factor = {"deg": np.rad2deg(1.0), "arcsec": 1.0 / ARCSEC}.get(unit, 1.0)
+    return f"{value * factor:.6g} {unit}".strip()

@@ -1,0 +1,182 @@
+"""Files of visit lists as tables of a database, from which rows are selected by an SQL expression.
+
+A database of SQLite is opened for reading only. Other files become a table in memory. So one language selects from all,
+and nothing of an expression is evaluated by Python.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from ...core.errors import ConfigError, ProductError, cut_short, unknown_name
+from ...core.files import read_bytes
+from ...core.table_files import ENDINGS, read_columns
+from .names import HEADER_WORDS
+
+#: Tables of databases that hold visits, the first that is there: of rubin_scheduler, OpSim 4, OpSim 3, ConsDB.
+_TABLES = ("observations", "summaryallprops", "summary", "visit1", "visits")
+_SQLITE = b"SQLite format 3\x00"
+#: Rows that are fetched at once.
+_ROWS = 10_000
+#: Lines before which the header of an instance catalogue must end.
+_HEADER_LINES = 1000
+# What an expression may do: read the columns of the table, and call functions.
+_ALLOWED = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION)
+
+
+@dataclass(frozen=True)
+class ListTable:
+    """Table of visits in a database, with the names of its columns in small letters."""
+
+    connection: sqlite3.Connection
+    name: str
+    columns: tuple[str, ...]
+    units: Mapping[str, Any]  #: of columns that have one
+    kind: str  #: sqlite, catalogue (header of an instance catalogue) or table
+
+    def select(self, columns: Sequence[str], where: str | None) -> dict[str, np.ndarray]:
+        """Return columns of the rows for which an SQL expression holds: numbers, NaN where empty, or texts.
+
+        ConfigError if the expression is no condition on the columns.
+        """
+        names = ", ".join(f'"{column}"' for column in columns)
+        # The expression stands on lines of its own, so that a comment in it ends there.
+        query = f'SELECT {names} FROM "{self.name}"' + ("" if where is None else f" WHERE (\n{where}\n)")
+        selects = 0
+
+        def authorize(action: int, table: str | None, _column: Any, _database: Any, _trigger: Any) -> int:
+            nonlocal selects
+            selects += action == sqlite3.SQLITE_SELECT
+            readable = action != sqlite3.SQLITE_READ or str(table).lower() == self.name.lower()
+            allowed = action in _ALLOWED and readable and selects <= 1
+            return sqlite3.SQLITE_OK if allowed else sqlite3.SQLITE_DENY
+
+        chunks: list[list[np.ndarray]] = []
+        if where is not None:
+            self.connection.set_authorizer(authorize)
+        try:
+            with closing(self.connection.execute(query)) as cursor:
+                while rows := cursor.fetchmany(_ROWS):
+                    chunks.append([_column_array(values) for values in zip(*rows, strict=True)])
+        except (sqlite3.Error, sqlite3.Warning, ValueError) as error:
+            if where is None:
+                raise ProductError(f"cannot be read ({error})") from None
+            text = f"where = {cut_short(where)}: {error}; expected a condition on its columns, in SQL: "
+            raise ConfigError(text + ", ".join(self.columns), key="where") from None
+        finally:
+            self.connection.set_authorizer(None)
+        if not chunks:
+            return {column: np.zeros(0) for column in columns}
+        return {name: _joined([chunk[i] for chunk in chunks]) for i, name in enumerate(columns)}
+
+
+@contextmanager
+def open_list(path: Path) -> Iterator[ListTable]:
+    """Open a file of visits, whatever its format, until the end of the ``with`` block.
+
+    ProductError if it is none, or cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            is_database = stream.read(len(_SQLITE)) == _SQLITE
+    except OSError as error:
+        raise ProductError(f"cannot be read ({error.strerror or error})", file=path) from None
+    if is_database:
+        with closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro", uri=True)) as connection:
+            yield _database_table(connection, path)
+        return
+    is_table = path.suffix.lower() in ENDINGS
+    columns = read_columns(path) if is_table else read_header(path)
+    units = {name: getattr(column, "unit", None) for name, column in columns.items()}
+    with closing(sqlite3.connect(":memory:")) as connection:
+        names = _fill(connection, columns)
+        yield ListTable(connection, "visits", names, units, "table" if is_table else "catalogue")
+
+
+def read_header(path: Path) -> dict[str, np.ndarray]:
+    """Read the header of an instance catalogue: a word and a number a line, before the objects.
+
+    ProductError if the file is none.
+    """
+    endings = ", ".join(ENDINGS)
+    problem = f"no list of visits: expected a database of SQLite, a table ({endings}), or an instance catalogue"
+    header: dict[str, np.ndarray] = {}
+    lines = read_bytes(path, ProductError, max_bytes=None)[: 1 << 16].decode("utf-8", "replace").splitlines()
+    for number, line in enumerate(lines[:_HEADER_LINES], start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        if words[0] in ("object", "includeobj"):
+            break
+        if len(words) != 2 or (not header and words[0].lower() not in HEADER_WORDS):
+            raise ProductError(problem, file=path, place=f"line {number}")
+        try:
+            header[words[0].lower()] = np.array([float(words[1])])
+        except ValueError:
+            header[words[0].lower()] = np.array([words[1]])
+    if not header:
+        raise ProductError(problem, file=path)
+    return header
+
+
+def _database_table(connection: sqlite3.Connection, path: Path) -> ListTable:
+    """Return the table of visits of a database."""
+    try:
+        rows = connection.execute("SELECT name FROM sqlite_master WHERE type IN ('table', 'view')").fetchall()
+        tables = {name.lower(): name for (name,) in rows if not name.startswith("sqlite_")}
+        name = next((tables[key] for key in _TABLES if key in tables), None)
+        if name is None and len(tables) == 1:
+            (name,) = tables.values()
+        if name is None:
+            raise unknown_name("table of visits", "observations", tables or ["none"]).within(file=path)
+        columns = tuple(row[1].lower() for row in connection.execute(f'PRAGMA table_info("{name}")'))
+    except (sqlite3.Error, UnicodeError) as error:
+        raise ProductError(f"cannot be read ({error})", file=path) from None
+    return ListTable(connection, name, columns, {}, "sqlite")
+
+
+def _fill(connection: sqlite3.Connection, columns: Mapping[str, Any]) -> tuple[str, ...]:
+    """Make a table of columns in memory; those with more than one number a row are left out. Return their names."""
+    scalars = {
+        name.replace('"', "'").replace("\0", " "): values for name, values in columns.items() if np.ndim(values) == 1
+    }
+    if scalars:
+        names = ", ".join(f'"{name}"' for name in scalars)
+        marks = ", ".join("?" * len(scalars))
+        connection.execute(f"CREATE TABLE visits ({names})")
+        rows = zip(*(_plain_list(values) for values in scalars.values()), strict=True)
+        connection.executemany(f"INSERT INTO visits VALUES ({marks})", rows)
+    return tuple(scalars)
+
+
+def _plain_list(values: Any) -> list[Any]:
+    """Return a column as numbers and texts of Python, None where it is empty."""
+    plain = np.ma.asarray(values)
+    items = [item.decode("utf-8", "replace") if isinstance(item, bytes) else item for item in plain.tolist()]
+    return [None if isinstance(item, float) and np.isnan(item) else item for item in items]
+
+
+def _column_array(values: Sequence[Any]) -> np.ndarray:
+    """Return the values of a column as numbers, NaN where empty, or as texts, empty where empty."""
+    # NumPy's whole numbers are stored as their bytes by some writers.
+    values = [int.from_bytes(value, "little", signed=True) if isinstance(value, bytes) else value for value in values]
+    if any(isinstance(value, str) for value in values):
+        return np.array(["" if value is None else str(value) for value in values])
+    if all(isinstance(value, int) for value in values):
+        return np.array(values, dtype=np.int64)
+    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+
+
+def _joined(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Return parts of a column as one array: texts where a part is."""
+    if any(part.dtype.kind == "U" for part in parts):
+        parts = [part if part.dtype.kind == "U" else np.where(np.isnan(part), "", part.astype(str)) for part in parts]
+    return np.concatenate(parts)

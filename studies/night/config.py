@@ -1,0 +1,142 @@
+"""Configuration of a night: a run, the list of visits that replaces its pointing and air, and what comes out.
+
+::
+
+    run: {ccds: [R22], stars: {truth: 20}}                  # a run's configuration, or the path of its file
+    visits: {list: baseline.db, where: "night = 5", band: "r,i"}
+    maps: {nside: 1024}
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field
+
+from ...core.arguments import check_arguments
+from ...core.errors import ConfigError, ProductError
+from ...core.schema import Section, Switch, Whole, plain_number, validated
+from ...core.yaml_reader import read_mapping
+from ...pipeline.config import Configuration, digest, section_yaml, with_run
+from ...pipeline.experiment import Experiment
+from ...sky.visit_list.read_list import read_visit_list
+from ...sky.visit_list.visit_list import VisitList
+
+#: Least and most numbers of pixels along a side of a base pixel: the coverage map's, and that of LSST's maps.
+_LEAST_SIDE = 32
+_MOST_SIDE = 32768
+
+
+class ListSection(Section):
+    """List of visits, and which of them are taken."""
+
+    list: str | None = Field(None, description="path of the list: a database, a table, or an instance catalogue")
+    where: str | None = Field(None, description="condition on the columns of the list, in SQL")
+    band: str | None = Field(None, description="bands to take, with commas between")
+    night: Whole | None = Field(None, description="night to take: a date YYYYMMDD, or a number of the column night")
+    airmass_law: Literal["von_karman", "opsim"] = Field(
+        "von_karman", description="seeing away from the zenith: von_karman (with the outer scale), opsim (airmass^0.6)"
+    )
+    digest: str | None = Field(None, description="SHA-256 of the visits, written where a night starts")
+
+
+class MapsSection(Section):
+    """Maps of the sky."""
+
+    nside: Annotated[int, BeforeValidator(plain_number), Field(strict=True, ge=0, le=_MOST_SIDE)] = Field(
+        512, description="HEALPix resolution, a power of 2 from 32; 0 for no maps"
+    )
+
+
+class NightConfig(Section):
+    """Settings of the visits of a list, which determine their products."""
+
+    run: Configuration = Configuration()
+    visits: ListSection = ListSection()
+    maps: MapsSection = MapsSection()
+    models: Switch = Field(True, description="false: no stars and no PSF models, noise-free PSFs alone")
+    products: Switch = Field(False, description="keep stars, PSFs and models of each CCD of each visit as FITS")
+
+    def read_list(self, folder: Path | None = None) -> VisitList:
+        """Read the list; a relative path starts from `folder`.
+
+        Raises
+        ------
+        ConfigError
+            If there is none, or settings do not fit together.
+        PachonError
+            If it cannot be read, or its visits are not those of the digest.
+        """
+        if self.visits.list is None:
+            raise ConfigError("visits.list = null: expected the path of a list of visits", key="visits.list")
+        nside = self.maps.nside
+        if nside and (nside < _LEAST_SIDE or nside & (nside - 1)):
+            raise ConfigError(f"maps.nside = {nside}: expected 0, or a power of 2 from {_LEAST_SIDE}", key="maps.nside")
+        if self.products and not self.models:
+            raise ConfigError("products = true: expected models = true, which they hold", key="products")
+        if self.run.reconstruction.model != "ccd":
+            text = f"run.reconstruction.model = {self.run.reconstruction.model}: expected ccd for visits of a list"
+            raise ConfigError(text, key="run.reconstruction.model")
+        return read_section(self.visits, self.run, folder)
+
+    def started(self, visits: VisitList, experiment: Experiment, folder: Path | None = None) -> NightConfig:
+        """Return the settings with the CCDs of an experiment, an absolute path and the digest of the list."""
+        path = str(((folder or Path()) / str(self.visits.list)).resolve())
+        listed = self.visits.model_copy(update={"list": path, "digest": visits.digest})
+        run = self.run.model_copy(update={"ccds": experiment.config.ccds})
+        return self.model_copy(update={"run": run, "visits": listed})
+
+    def content_digest(self, experiment: Experiment) -> str:
+        """SHA-256 of all settings that affect products, with the files of the run by their content."""
+        content = self.model_dump(mode="json", by_alias=True)
+        content["visits"] = self.visits.digest
+        return digest({"night": content, "run": experiment.config_hash})
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the settings as plain mappings."""
+        return self.model_dump(mode="json", by_alias=True)
+
+    def to_yaml(self) -> str:
+        """Return the settings as a YAML file."""
+        return section_yaml(self, "All that decides this night.")
+
+
+@check_arguments
+def load_night_configuration(path: Path) -> NightConfig:
+    """Read a configuration of a night, and that of the run that it names.
+
+    ConfigError if a file cannot be read, is not YAML, or has an unknown key or a value out of range.
+    """
+    return validated(NightConfig, with_run(read_mapping(path, ConfigError), path), str(path))
+
+
+def read_section(settings: ListSection, run: Configuration, folder: Path | None = None) -> VisitList:
+    """Read the list of a section for the telescope of a run; a relative path starts from `folder`.
+
+    PachonError if it cannot be read, or its visits are not those of the digest.
+    """
+    path = (folder or Path()) / str(settings.list)
+    visits = read_visit_list(
+        path,
+        where=settings.where,
+        band=settings.band,
+        night=settings.night,
+        camera=run.camera or ("comcam" if "comcam" in (run.telescope or "") else "lsst"),
+        site=_site_of(run),
+        airmass_law=settings.airmass_law,
+    )
+    if settings.digest not in (None, visits.digest):
+        raise ProductError("the list has changed: expected the visits of the digest of the configuration", file=path)
+    return visits
+
+
+def _site_of(run: Configuration) -> str:
+    """Return the bundled site of a run's telescope."""
+    from ...models.io.prescription import load_telescope
+
+    if run.atmosphere.site is not None:
+        return run.atmosphere.site
+    if run.telescope is None:
+        return "cerro_pachon"
+    return load_telescope(run.telescope).site or "cerro_pachon"

@@ -1,0 +1,373 @@
+"""Visit lists: angles by spherical trigonometry and astropy, air by Tokovinin's formula, formats by each other."""
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.coordinates import AltAz, EarthLocation, SkyCoord
+from astropy.table import QTable, Table
+from astropy.time import Time
+from astropy.utils import iers
+from visit_rows import COLUMNS, ROWS
+
+from pachon.core.errors import ConfigError, DomainError, ProductError
+from pachon.sky.visit_list.read_list import read_visit_list
+
+ARCSEC = np.pi / 180 / 3600
+PACHON = EarthLocation.from_geodetic(-70.749417 * u.deg, -30.244639 * u.deg, 2663 * u.m)
+
+
+def column(name):
+    return np.array([row[COLUMNS.index(name)] for row in ROWS])
+
+
+@pytest.fixture
+def visits(write_list):
+    return read_visit_list(write_list())
+
+
+@pytest.fixture(autouse=True)
+def offline():
+    with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("auto_max_age", None):
+        yield
+
+
+def bearing(ra, dec, ra2, dec2):
+    """Position angle of the second point at the first, from north through east, by the sine and cosine rules."""
+    return np.arctan2(
+        np.sin(ra2 - ra) * np.cos(dec2),
+        np.sin(dec2) * np.cos(dec) - np.cos(dec2) * np.sin(dec) * np.cos(ra2 - ra),
+    )
+
+
+def test_the_mapping_of_the_example(visits):
+    """Numbers of an independent script (batoid's and imSim's conventions) for these rows."""
+    np.testing.assert_allclose(np.rad2deg(visits.roll), [-110.38, -111.72, 101.84, 122.39, 104.37], atol=0.005)
+    np.testing.assert_allclose(90 - np.rad2deg(visits.altitude), [8.13, 8.35, 19.07, 4.66, 14.56], atol=0.005)
+    np.testing.assert_allclose(visits.r0, [0.1151, 0.1182, 0.0891, 0.1361, 0.0777], atol=5e-5)
+    np.testing.assert_allclose(np.rad2deg(visits.rotator), column("rotTelPos"), atol=1e-12)
+    assert visits.band.tolist() == ["r", "r", "i", "r", "z"]
+    assert visits.snaps.tolist() == [1, 1, 1, 2, 1]
+    assert visits.epoch.tolist() == visits.visit.tolist() == [1001, 1002, 1003, 1004, 1005]
+
+
+def test_the_middle_of_the_exposure_is_that_of_all_snaps(visits):
+    seconds = (visits.midpoint - column("observationStartMJD")) * 86400
+    # Two snaps of 14.6 s, 2 s apart. Modified Julian dates resolve 1e-6 s.
+    np.testing.assert_allclose(seconds, [15, 15, 15, 15.6, 15], atol=1e-5)
+
+
+def test_the_roll_is_the_bearing_of_the_zenith(visits):
+    frame = AltAz(obstime=Time(visits.midpoint, format="mjd", scale="tai"), location=PACHON)
+    zenith = SkyCoord(alt=np.full(5, 90.0) * u.deg, az=np.zeros(5) * u.deg, frame=frame).icrs
+    expected = bearing(visits.ra, visits.dec, zenith.ra.rad, zenith.dec.rad)
+    # Aberration moves the zenith against the pointing by up to 20": 0.07 deg at 4.7 deg from the zenith.
+    np.testing.assert_allclose(np.rad2deg(visits.roll - expected), 0.0, atol=0.1)
+    horizontal = SkyCoord(visits.ra * u.rad, visits.dec * u.rad).transform_to(frame)
+    np.testing.assert_allclose(visits.altitude, horizontal.alt.rad, atol=1e-9)
+    np.testing.assert_allclose(visits.azimuth, horizontal.az.rad, atol=1e-9)
+
+
+def test_steps_towards_the_zenith_rise(visits):
+    """A small step along the roll raises the altitude by as much, and leaves the azimuth; astropy has the last word."""
+    frame = AltAz(obstime=Time(visits.midpoint, format="mjd", scale="tai"), location=PACHON)
+    start = SkyCoord(visits.ra * u.rad, visits.dec * u.rad)
+    step = 60 * u.arcsec
+    higher = start.directional_offset_by(visits.zenith_position_angle * u.rad, step).transform_to(frame)
+    level = start.transform_to(frame)
+    # Aberration scales angles by 1e-4.
+    np.testing.assert_allclose((higher.alt - level.alt).to_value(u.arcsec), 60.0, atol=0.02)
+    np.testing.assert_allclose((higher.az - level.az).to_value(u.arcsec) * np.cos(level.alt.rad), 0.0, atol=0.02)
+
+
+def test_r0_gives_the_seeing_back(visits):
+    r0, scale = visits.r0, 25.0
+    width = 0.9759 * 500e-9 / r0 * np.sqrt(1 - 2.183 * (r0 / scale) ** 0.356) / ARCSEC
+    np.testing.assert_allclose(width, column("seeingFwhm500"), rtol=1e-4)  # 0.9759 has four digits
+
+
+def test_r0_of_seeing_by_opsim(write_list):
+    """OpSim lets seeing grow as airmass^0.6: r0 is that whose long exposure has this width along the line of sight."""
+    visits = read_visit_list(write_list(), airmass_law="opsim")
+    growth = (1 / np.sin(visits.altitude)) ** 0.6
+    along_sight = visits.r0 / growth
+    width = 0.9758634 * 500e-9 / along_sight * np.sqrt(1 - 2.183 * (along_sight / 25.0) ** 0.356) / ARCSEC
+    np.testing.assert_allclose(width, column("seeingFwhm500") * growth, rtol=1e-9)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("r0", "scale"), [(0.08, 25.0), (0.15, 25.0), (0.15, 50.0), (0.25, 20.0)])
+def test_widths_are_those_of_von_karman_profiles(r0, scale):
+    galsim = pytest.importorskip("galsim")
+    from pachon.sky.visit_list.seeing import fried_parameter, seeing_width
+
+    width = float(seeing_width(np.array([r0]), np.array([scale]))[0])
+    # Tokovinin (2002) states 1 % for his formula, GalSim's is exact.
+    assert width / ARCSEC == pytest.approx(galsim.VonKarman(lam=500.0, r0_500=r0, L0=scale).calculateFWHM(), rel=0.015)
+    assert fried_parameter(np.array([width]), np.array([scale]))[0] == pytest.approx(r0, rel=1e-9)
+
+
+def test_a_monitor_measures_r0_itself(write_list):
+    visits = read_visit_list(write_list(drop=("seeingFwhm500",), dimm_seeing=[1.01, 1.0, 1.0, 1.0, 1.0]))
+    assert visits.r0[0] == pytest.approx(0.98 * 500e-9 / (1.01 * ARCSEC))  # 0.1 m, as Tokovinin (2002) has it
+    assert "monitor" in " ".join(visits.remarks)
+
+
+# ---- formats
+
+
+def same_visits(visits, expected, *, tolerance=1e-9):
+    for name in ("visit", "snaps"):
+        np.testing.assert_array_equal(getattr(visits, name), getattr(expected, name))
+    assert visits.band.tolist() == expected.band.tolist()
+    for name in ("ra", "dec", "roll", "rotator", "altitude", "r0", "exposure", "midpoint", "sky"):
+        np.testing.assert_allclose(getattr(visits, name), getattr(expected, name), rtol=tolerance, atol=1e-12)
+
+
+def test_databases_of_schedulers(visits, write_database):
+    new = {name: column(name) for name in COLUMNS}
+    same_visits(read_visit_list(write_database("observations", new, "new.db")), visits)
+    fourth = {("filter" if name == "band" else name): values for name, values in new.items()}
+    same_visits(read_visit_list(write_database("SummaryAllProps", fourth, "fourth.db")), visits)
+
+
+def test_databases_of_opsim_3_have_radians(visits, write_database):
+    names = {
+        "obsHistID": "observationId",
+        "fieldRA": "fieldRA",
+        "fieldDec": "fieldDec",
+        "expMJD": "observationStartMJD",
+        "visitExpTime": "visitExposureTime",
+        "filter": "band",
+        "rotTelPos": "rotTelPos",
+        "rawSeeing": "seeingFwhm500",
+        "filtSkyBrightness": "skyBrightness",
+        "night": "night",
+    }
+    angles = ("fieldRA", "fieldDec", "rotTelPos")
+    columns = {key: np.deg2rad(column(name)) if key in angles else column(name) for key, name in names.items()}
+    old = read_visit_list(write_database("Summary", columns))
+    assert "radians" in old.remarks[0]
+    one_snap = visits.rows(visits.snaps == 1)
+    same_visits(old.rows(visits.snaps == 1), one_snap)
+
+
+def test_columns_of_consdb(visits, write_list):
+    renamed = {
+        "visit_id": column("observationId"),
+        "s_ra": column("fieldRA"),
+        "s_dec": column("fieldDec"),
+        "exp_midpt_mjd": visits.midpoint,
+        "exp_time": column("visitExposureTime"),
+        "physical_filter": [f"{band}_57" for band in column("band")],
+        "physical_rotator_angle": column("rotTelPos"),
+        "zenith_distance": 90 - np.rad2deg(visits.altitude),
+        "seeing_zenith_500nm_median": column("seeingFwhm500") / 0.2 / (2 * np.sqrt(2 * np.log(2))),
+        "wind_speed": [5.0] * 5,
+        "wind_dir": [90.0] * 5,
+    }
+    listed = read_visit_list(write_list(drop=[name for name in COLUMNS if name != "skyBrightness"], **renamed))
+    one_snap = visits.snaps == 1
+    same_visits(listed.rows(one_snap), visits.rows(one_snap))
+    np.testing.assert_allclose(listed.wind_azimuth, np.pi / 2)
+
+
+@pytest.mark.parametrize("ending", [".ecsv", ".fits", ".parquet"])
+def test_tables(visits, tmp_path, ending):
+    path = tmp_path / f"visits{ending}"
+    if ending == ".parquet":
+        parquet = pytest.importorskip("pyarrow.parquet")
+        import pyarrow
+
+        parquet.write_table(pyarrow.table({name: column(name).tolist() for name in COLUMNS}), path)
+    else:
+        table = QTable({name: column(name) for name in COLUMNS})
+        table["fieldRA"] = table["fieldRA"] * u.deg
+        table["fieldDec"] = np.deg2rad(column("fieldDec")) * u.rad
+        table["seeingFwhm500"] = column("seeingFwhm500") * 1000 * u.marcsec
+        table["visitExposureTime"] = column("visitExposureTime") / 60 * u.min
+        Table(table).write(path)
+    same_visits(read_visit_list(path), visits)
+
+
+def test_headers_of_instance_catalogues(visits, tmp_path):
+    path = tmp_path / "instcat.txt"
+    header = {
+        "rightascension": 53.25,
+        "declination": -27.9,
+        "mjd": repr(float(visits.midpoint[3])),
+        "altitude": np.rad2deg(visits.altitude[3]),
+        "azimuth": np.rad2deg(visits.azimuth[3]),
+        "filter": 2,
+        "rotskypos": 0.0,
+        "rottelpos": 10.0,
+        "nsnap": 2,
+        "obshistid": 1004,
+        "seed": 1,
+        "seeing": 0.6,
+        "vistime": 32.2,
+    }
+    lines = ["# made up", *(f"{key} {value}" for key, value in header.items()), "object 1 53.2 -27.9 20 flat"]
+    path.write_text("\n".join(lines) + "\n")
+    visit = read_visit_list(path)[0]
+    expected = visits[3]
+    for name in ("visit", "band", "snaps"):
+        assert getattr(visit, name) == getattr(expected, name)
+    for name in ("ra", "dec", "roll", "rotator", "altitude", "r0", "exposure", "midpoint"):
+        assert getattr(visit, name) == pytest.approx(getattr(expected, name), abs=1e-9)
+
+
+# ---- selection
+
+
+def test_selection(write_list):
+    path = write_list()
+    assert read_visit_list(path, where="seeingFwhm500 < 0.9 and band = 'r'").visit.tolist() == [1001, 1002, 1004]
+    assert read_visit_list(path, band="i,z").visit.tolist() == [1003, 1005]
+    assert read_visit_list(path, night=40).visit.tolist() == [1004]
+    # MJD 61001.15 is 2025-11-22T03:36, the night that began on the 21st.
+    assert read_visit_list(path, night=20251121).visit.tolist() == [1001, 1002]
+    assert read_visit_list(path).day_obs.tolist()[0] == 20251121
+
+
+def test_a_visit_does_not_depend_on_the_others(write_list):
+    all_visits, one = read_visit_list(write_list()), read_visit_list(write_list(), where="observationId = 1004")
+    assert repr(one[0]) == repr(all_visits[3])  # NaN included
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        "nosuch < 1",
+        "seeing <",
+        "1) UNION SELECT * FROM visits WHERE (1",
+        "(SELECT count(*) FROM sqlite_master) > 0",
+        "1; DROP TABLE visits",
+        "load_extension('x')",
+        "__import__('os').system('true')",
+    ],
+)
+def test_a_condition_can_only_read_columns(write_list, where):
+    with pytest.raises(ConfigError, match="expected a condition on its columns"):
+        read_visit_list(write_list(), where=where)
+
+
+def test_a_database_is_not_changed(write_database):
+    path = write_database("observations", {name: column(name) for name in COLUMNS})
+    before = path.read_bytes()
+    read_visit_list(path, where="band = 'r'")
+    with pytest.raises(ConfigError):
+        read_visit_list(path, where="1); DELETE FROM observations; SELECT (1")
+    assert path.read_bytes() == before
+
+
+# ---- the angle of the camera on the sky
+
+
+def test_without_rottelpos_it_follows_from_the_camera(visits, write_list):
+    q = np.rad2deg(visits.zenith_position_angle)
+    lsstcam = write_list("lsstcam.csv", drop=("rotTelPos",), rotSkyPos=(q - column("rotTelPos") - 90) % 360)
+    comcam = write_list("comcam.csv", drop=("rotTelPos",), rotSkyPos=(q - column("rotTelPos")) % 360)
+    for path, camera in ((lsstcam, "lsst"), (comcam, "comcam")):
+        listed = read_visit_list(path, camera=camera)
+        np.testing.assert_allclose(listed.rotator, visits.rotator, atol=1e-9)
+        assert "no rotTelPos" in " ".join(listed.remarks)
+
+
+@pytest.mark.parametrize(
+    ("sign", "offset", "name"), [(-1, -90, "LSSTCam"), (-1, 0, "ComCam"), (1, 0, "imSim's first lists")]
+)
+def test_the_convention_is_named_and_rottelpos_trusted(visits, write_list, sign, offset, name):
+    q = np.rad2deg(visits.zenith_position_angle)
+    # A scheduler's parallactic angle lacks precession, half a degree here.
+    sky = -sign * (q + 0.5) + sign * column("rotTelPos") + offset
+    listed = read_visit_list(write_list(rotSkyPos=sky % 360, paraAngle=q + 0.5))
+    np.testing.assert_allclose(np.rad2deg(listed.rotator), column("rotTelPos"), atol=1e-9)
+    assert any(name in remark and "0.5 deg" in remark and "rotTelPos is taken" in remark for remark in listed.remarks)
+
+
+def test_no_convention_is_said(write_list):
+    listed = read_visit_list(write_list(rotSkyPos=[10, 200, 77, 150, 310]))
+    assert any("no convention" in remark for remark in listed.remarks)
+
+
+def test_altitudes_that_do_not_fit_are_said(visits, write_list):
+    altitude = np.rad2deg(visits.altitude)
+    altitude[1] -= 3.0
+    listed = read_visit_list(write_list(altitude=altitude))
+    assert any("visit 1002 by 3.0 deg" in remark for remark in listed.remarks)
+    np.testing.assert_allclose(np.rad2deg(listed.altitude), altitude)
+    altitude[1] += 3.0
+    assert read_visit_list(write_list(altitude=altitude)).remarks == ()
+
+
+# ---- bad input
+
+
+@pytest.mark.parametrize(
+    ("drop", "looked_for"),
+    [
+        ("fieldRA", "fieldra, ra, s_ra, rightascension"),
+        ("observationStartMJD", "exp_midpt_mjd"),
+        ("visitExposureTime", "visitexposuretime"),
+        ("band", "physical_filter"),
+        ("seeingFwhm500", "seeingfwhm500"),
+        ("rotTelPos", "rottelpos"),
+    ],
+)
+def test_a_column_that_is_needed(write_list, drop, looked_for):
+    with pytest.raises(ProductError, match=looked_for) as error:
+        read_visit_list(write_list(drop=(drop,)))
+    assert "columns are" in str(error.value)
+    assert str(error.value).count("\n") == 0
+
+
+def changed(name, index, value):
+    values = column(name).astype(object)
+    values[index] = value
+    return {name: values.tolist()}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (changed("observationId", 1, 1001), "observationid = 1001: 2 rows, expected each visit once"),
+        (changed("seeingFwhm500", 2, ""), "visit 1003: seeingfwhm500 = nothing: expected a width above 0"),
+        (changed("seeingFwhm500", 2, 0.02), "visit 1003: seeing = 0.02 arcsec: expected at least 0.0401 arcsec"),
+        (changed("band", 4, "w"), "visit 1005: band = w: expected one of u, g, r, i, z, y"),
+        (changed("fieldDec", 0, 70.0), "visit 1001: altitude = -1"),
+        (changed("fieldDec", 0, 95.0), "visit 1001: fielddec = 95 deg: expected -90 to 90 deg"),
+        (changed("visitExposureTime", 0, -3.0), "visit 1001: visitexposuretime = -3 s: expected a time above 0 s"),
+        (changed("observationId", 1, 3.5), "expected whole numbers from 0"),
+    ],
+)
+def test_values_that_cannot_be(write_list, changes, message):
+    with pytest.raises(DomainError) as error:
+        read_visit_list(write_list(**changes))
+    assert message in str(error.value)
+    assert "visits.csv" in str(error.value)
+
+
+def test_small_outer_scales_allow_less(write_list):
+    with pytest.raises(DomainError, match=r"expected at least .* with an outer scale of 1 m"):
+        read_visit_list(write_list(outer_scale=[1.0] * 5))
+
+
+def test_selections_without_a_visit(write_list):
+    for options in ({"where": "band = 'u'"}, {"band": "u"}, {"night": 3}, {"night": 20200101}):
+        with pytest.raises(DomainError, match="no visit"):
+            read_visit_list(write_list(), **options)
+    with pytest.raises(ConfigError, match="expected a date"):
+        read_visit_list(write_list(), night=20251399)
+
+
+def test_files_that_are_no_list(tmp_path, write_database):
+    text = tmp_path / "notes.txt"
+    text.write_text("these are words\n")
+    with pytest.raises(ProductError, match="no list of visits"):
+        read_visit_list(text)
+    with pytest.raises(ProductError, match="cannot be read"):
+        read_visit_list(tmp_path / "none.db")
+    broken = tmp_path / "broken.db"
+    broken.write_bytes(b"SQLite format 3\x00" + bytes(200))
+    with pytest.raises(ProductError, match="cannot be read"):
+        read_visit_list(broken)

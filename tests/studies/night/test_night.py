@@ -1,0 +1,174 @@
+"""Nights of visit lists: what comes out, with what bytes, and what is said of visits that fail."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pachon.core.errors import ConfigError, DomainError, ProductError
+from pachon.core.long_work import Execution
+from pachon.core.products import read_fits
+from pachon.studies.night.night import run_night
+from pachon.studies.night.visit_product import VisitWork
+
+pytestmark = pytest.mark.long
+
+
+def content(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*.*")) if path.is_file()}
+
+
+@pytest.fixture(scope="session")
+def night(night_config, tmp_path_factory):
+    """Configuration, result and files of a night, products of CCDs among them."""
+    config = night_config(products=True, maps={"nside": 1024})
+    folder = tmp_path_factory.mktemp("night")
+    return config, run_night(config, folder, execution=Execution(threads=1)), content(folder)
+
+
+def detector_table(folder):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    return parquet.read_table(folder / "visit_detector.parquet")
+
+
+def test_a_visit_that_fails_is_left_out(night):
+    _, result, _ = night
+    assert list(result.left_out) == [1002]
+    assert "zenith_angle_deg" in result.left_out[1002]
+    assert result.missing == ()
+    summary = json.loads((result.folder / "summary.json").read_text())
+    assert (summary["visits"], summary["finished"], summary["complete"]) == (3, 3, True)
+    assert list(summary["left_out"]) == ["1002"]
+
+
+def test_the_table_has_units_and_the_psf_of_the_products(night):
+    _, result, _ = night
+    table = detector_table(result.folder)
+    assert table.schema.field("psfIxx").metadata[b"unit"] == b"pixel2"
+    rows = table.to_pydict()
+    assert rows["visitId"] == [1001, 1003]
+    assert rows["detector"] == [94, 94]
+    assert rows["band"] == ["r", "i"]
+    for i, visit in enumerate((1001, 1003)):
+        hdus = read_fits(result.folder / "visits" / f"visit_{visit}_ccd_R22_S11.fits")
+        image = hdus["TRUTH_PSF"].data[0].astype(float)  # that in the middle of the CCD
+        assert rows["psfArea"][i] == pytest.approx(image.sum() ** 2 / (image**2).sum(), rel=1e-6)
+        determinant = rows["psfIxx"][i] * rows["psfIyy"][i] - rows["psfIxy"][i] ** 2
+        assert rows["psfSigma"][i] == pytest.approx(determinant**0.25)
+        # Images of the LSST exchange x and y of the focal plane, along which stamps lie.
+        galsim = pytest.importorskip("galsim")
+        moments = galsim.hsm.FindAdaptiveMom(galsim.Image(np.ascontiguousarray(image.T), scale=1.0))
+        assert rows["psfSigma"][i] == pytest.approx(moments.moments_sigma, rel=1e-4)
+        e1 = (rows["psfIxx"][i] - rows["psfIyy"][i]) / (rows["psfIxx"][i] + rows["psfIyy"][i])
+        assert e1 == pytest.approx(moments.observed_shape.e1, abs=1e-4)
+        # The zero point is that of the stars of the file, but for what vignetting changes over the CCD.
+        stars = hdus["STARS"].data
+        measured = np.median(stars["MAG"] + 2.5 * np.log10(stars["ELECTRON"]))
+        assert rows["zeroPoint"][i] == pytest.approx(measured, abs=2e-3)
+        # Stamps have the exact scale, 0.20006", photometry that of SMTN-002, 0.2".
+        assert rows["skyBg"][i] == pytest.approx(hdus[0].header["SKY"], rel=1e-3)
+        assert rows["nPsfStar"][i] == stars["USED"].sum()
+        assert (rows["ra"][i], rows["dec"][i]) == pytest.approx((hdus[0].header["RA"], hdus[0].header["DEC"]))
+        assert hdus[0].header["DETECTOR"] == 94
+
+
+def test_maps_agree_with_world_coordinates_and_shapes_on_the_sky(night):
+    healsparse = pytest.importorskip("healsparse")
+    _, result, _ = night
+    size = healsparse.HealSparseMap.read(str(result.folder / "deepCoadd_psf_size_consolidated_map_weighted_mean_r.hsp"))
+    pixels = size.valid_pixels
+    # 13.65' on a side, pixels of 3.44'.
+    assert len(pixels) == pytest.approx((13.65 / 3.4355) ** 2, abs=6)
+    rows = detector_table(result.folder).to_pydict()
+    np.testing.assert_allclose(size[pixels], rows["psfSigma"][0], rtol=0.05)
+    ra, dec = size.pixels_to_angles(pixels) if hasattr(size, "pixels_to_angles") else size.valid_pixels_pos(lonlat=True)
+    away = np.hypot((ra - rows["ra"][0]) * np.cos(np.deg2rad(dec)), dec - rows["dec"][0])
+    assert np.degrees(np.deg2rad(away.max())) < 0.5 * np.hypot(13.65, 13.65) / 60
+    truth = read_fits(result.folder / "visits" / "visit_1001_ccd_R22_S11.fits")["TRUTH"].data
+    names = {"e1": "G1_SKY", "e2": "G2_SKY"}
+    for name, key in names.items():
+        values = healsparse.HealSparseMap.read(
+            str(result.folder / f"deepCoadd_psf_{name}_consolidated_map_weighted_mean_r.hsp")
+        )
+        # Polynomials of the second order describe the PSF over a CCD to 1e-3.
+        assert values[pixels].mean() == pytest.approx(truth[key].mean(), abs=2e-3)
+
+
+def test_depth_of_a_stack_of_one_is_that_of_the_visit(night):
+    healsparse = pytest.importorskip("healsparse")
+    _, result, _ = night
+    rows = detector_table(result.folder).to_pydict()
+    limit = healsparse.HealSparseMap.read(
+        str(result.folder / "deepCoadd_psf_maglim_consolidated_map_weighted_mean_r.hsp")
+    )
+    # magLim has the noise of the star itself too, and no dark current.
+    assert np.median(limit[limit.valid_pixels]) == pytest.approx(rows["magLim"][0], abs=0.06)
+
+
+def test_workers_parts_and_interruptions_leave_the_same_bytes(night, night_config, tmp_path, backwards, monkeypatch):
+    config, _, files = night
+    run_night(config, tmp_path / "workers", execution=Execution(backwards))
+    assert content(tmp_path / "workers") == files
+    first = run_night(config, tmp_path / "parts", part=(1, 2))
+    assert first.missing == (1002,)
+    assert not first.summary["complete"]
+    run_night(config, tmp_path / "parts", part=(2, 2))
+    assert content(tmp_path / "parts") == files
+
+    compute = VisitWork.compute_here
+
+    def killed(self, reporter, visit, threads, folder):
+        if visit.visit == 1003:
+            raise KeyboardInterrupt
+        return compute(self, reporter, visit, threads, folder)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(VisitWork, "compute_here", killed)
+        with pytest.raises(KeyboardInterrupt):
+            run_night(config, tmp_path / "killed")
+    # The table has grown with the visits.
+    assert detector_table(tmp_path / "killed").to_pydict()["visitId"] == [1001]
+    run_night(config, tmp_path / "killed", execution=Execution(resume=True))
+    assert content(tmp_path / "killed") == files
+
+
+def test_a_list_that_has_changed_is_refused(night, night_config):
+    config, result, _ = night
+    path = config.visits.list
+    with open(path) as stream:
+        text = stream.read()
+    try:
+        with open(path, "w") as stream:
+            stream.write(text.replace("0.72", "0.73"))
+        with pytest.raises(ProductError, match="holds a night of another list"):
+            run_night(config, result.folder, execution=Execution(resume=True))
+    finally:
+        with open(path, "w") as stream:
+            stream.write(text)
+    with pytest.raises(ProductError, match="go on with --resume"):
+        run_night(config, result.folder)
+
+
+def test_bands_that_the_telescope_has_not(night_config, tmp_path):
+    with pytest.raises(ConfigError, match=r"band i, 1 visits of visits.csv: .*has no band i"):
+        run_night(night_config({"telescope": "comcam_r", "ccds": None}), tmp_path / "night")
+    assert not (tmp_path / "night").exists()
+
+
+def test_settings_that_do_not_fit(night_config, tmp_path):
+    for sections, message in (
+        ({"maps": {"nside": 1000}}, "power of 2"),
+        ({"models": False, "products": True}, "expected models = true"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            run_night(night_config(**sections), tmp_path)
+    with pytest.raises(DomainError, match="part = 4/4"):
+        run_night(night_config(), tmp_path, part=(4, 4))
+
+
+def test_psfs_alone(night_config, tmp_path):
+    result = run_night(night_config(models=False, maps={"nside": 0}), tmp_path)
+    rows = detector_table(result.folder).to_pydict()
+    assert np.isnan(rows["modelDeltaE1Rms"]).all()
+    assert np.isfinite(rows["psfSigma"]).all()
+    assert not list(tmp_path.glob("*.hsp"))

@@ -1,0 +1,68 @@
+"""Stacks of the visits of a list: pointings and rolls by spherical geometry, weights by sums restated."""
+
+import numpy as np
+import pytest
+from visit_rows import COLUMNS, ROWS
+
+from pachon.core.errors import ConfigError
+from pachon.core.long_work import Execution
+from pachon.sky.pointing import Pointing
+from pachon.sky.visit_list.read_list import read_visit_list
+from pachon.studies.night.config import ListSection
+from pachon.studies.visits.plan import listed_plan
+from pachon.studies.visits.psf_visit import VisitPsfs
+from pachon.studies.visits.stack import PsfSums
+from pachon.studies.visits.visits import stack_visits
+
+
+@pytest.fixture
+def list_file(tmp_path):
+    path = tmp_path / "visits.csv"
+    path.write_text("\n".join([",".join(COLUMNS), *(",".join(map(str, row)) for row in ROWS)]) + "\n")
+    return path
+
+
+def test_directions_are_those_of_the_pointings(list_file):
+    """The light of points of the sky enters as right ascensions, declinations and position angles say."""
+    visits = read_visit_list(list_file)
+    center = Pointing(*np.deg2rad([53.1, -27.8]))
+    sky = np.array([[0.0, 0.0], [0.01, 0.004], [-0.006, 0.012]])
+    for visit, ra, dec, roll in zip(listed_plan(visits, center), visits.ra, visits.dec, visits.roll, strict=True):
+        aim = Pointing(float(ra), float(dec), float(roll))
+        alpha, delta = center.to_celestial(sky).T
+        source = np.stack([np.cos(delta) * np.cos(alpha), np.cos(delta) * np.sin(alpha), np.sin(delta)], axis=1)
+        np.testing.assert_allclose(visit.directions(sky), -source @ aim.axes.T, atol=1e-12)
+
+
+def test_sums_have_weights():
+    rng = np.random.default_rng(3)
+    images, weights = rng.random((3, 2, 5, 5)), [0.5, 2.0, 1.0]
+    sums = PsfSums.empty(2, 5)
+    for image, weight in zip(images.astype(np.float32), weights, strict=True):
+        sums.add(VisitPsfs(np.arange(2), image, image, {}, weight))
+    mean = np.average(images, axis=0, weights=weights)
+    np.testing.assert_allclose(sums.true / sums.weight[:, None, None], mean, rtol=1e-6)
+
+
+def test_lists_of_several_bands_or_fields_are_no_stack(visits_config, list_file, tmp_path):
+    with pytest.raises(ConfigError, match="bands i, r, z: expected one for a stack"):
+        visits_config().with_list(ListSection(list=str(list_file)))
+    far = tmp_path / "far.csv"
+    far.write_text(list_file.read_text().replace("53.25,-27.9", "73.25,-27.9"))
+    with pytest.raises(ConfigError, match="expected one field"):
+        visits_config().with_list(ListSection(list=str(far), band="r"))
+
+
+@pytest.mark.long
+def test_a_stack_of_a_list(visits_config, list_file, tmp_path):
+    section = ListSection(list=str(list_file), band="r", where="observationId < 1003")
+    config = visits_config(snapshots=(1,)).with_list(section)
+    assert config.visits.count == 2
+    assert config.run.atmosphere.exposure_s == 30.0
+    result = stack_visits(config, tmp_path / "one", execution=Execution(threads=1))
+    # 0.72" and 0.70", 0.5 deg apart: the wider one alone, and with half of the points of the other.
+    assert set(result.stacks) == {1, 2}
+    sizes = [np.median(result.stacks[n].size) / np.deg2rad(1 / 3600) for n in (1, 2)]
+    assert 0.2 < sizes[1] <= sizes[0] < 0.5
+    again = stack_visits(config, tmp_path / "one", execution=Execution(resume=True))
+    np.testing.assert_array_equal(again.stacks[2].true, result.stacks[2].true)
