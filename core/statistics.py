@@ -33,6 +33,19 @@ def robust_rms(values: np.ndarray, axis: int | None = None) -> np.ndarray:
     return RMS_PER_MAD * np.asarray(np.nanmedian(np.abs(deviations), axis=axis))
 
 
+def row_medians(values: np.ndarray) -> np.ndarray:
+    """Return the medians of the rows [n, m] of finite values, [n].
+
+    As :func:`numpy.median`, which looks for NaN and selects three values a row, in half of its time.
+    """
+    count = values.shape[1]
+    middle = count // 2
+    rising = np.partition(values, middle, axis=1)
+    if count % 2:
+        return rising[:, middle]
+    return np.asarray((rising[:, :middle].max(axis=1) + rising[:, middle]) / 2.0)
+
+
 def masked_median(values: np.ndarray, masks: np.ndarray) -> np.ndarray:
     """Return the median along the first axis of values that are neither masked nor NaN; NaN where there are none.
 
