@@ -15,9 +15,9 @@ wp.set_module_options(FORWARD_OPTIONS)
 
 #: Columns of one packet.
 _LANES = 32
-# Variances whose product is taken before its logarithm: each is below 4^12 times the number of stars, so that none
+# Variances whose product is taken before its logarithm: each is at most 4^12 times the 300 stars, so that none
 # overflows.
-_TOGETHER = 16
+_TOGETHER = 30
 _columns = wp.types.vector(_LANES, wp.float64)
 
 
@@ -75,7 +75,10 @@ def sums_of_products(weights: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
     A product of matrices rounds them in a way that depends on the number of positions.
     """
-    count, padded = rows.shape[1], _in_packets(rows)
+    count = rows.shape[1]
+    if not (len(weights) and len(rows)):
+        return np.zeros((len(weights), count))
+    padded = _in_packets(rows)
     sums = np.empty((len(weights), *padded.shape[1:]))
     arrays = [warp_array(weights), warp_array(padded, _columns), warp_array(sums, _columns)]
     launch(add_products, len(weights), arrays, threads=1)
