@@ -29,7 +29,7 @@ import numpy as np
 import scipy.linalg
 
 from ..gaussian_field import inverse_from_cholesky
-from .pixel_kernels import sums_of_products
+from .pixel_sums import sums_of_products
 from .polynomial import term_count
 
 if TYPE_CHECKING:

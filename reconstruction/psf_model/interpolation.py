@@ -18,7 +18,7 @@ from .basis import FittedBasis
 from .checks import check_distinct_positions, check_terms
 from .colour import FittedColour, StarColours
 from .file_parts import ModelParts
-from .pixel_kernels import sums_of_products
+from .pixel_sums import sums_of_products
 from .polynomial import MOST_ORDER, Extent, automatic_orders, design_matrix
 
 # Order of the polynomials that predict outliers and masked pixels where the interpolation has none of its own.

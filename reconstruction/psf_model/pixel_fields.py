@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .covariance import PROCESS_COLUMNS, pair_distances, trend_variances
-from .pixel_kernels import powers_and_variances
+from .pixel_sums import powers_and_variances
 
 # Shape numbers to which pixels respond as to a stretch and a magnification; they come first.
 _SHAPE_NUMBERS = 3

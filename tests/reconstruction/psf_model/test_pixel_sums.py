@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pachon.reconstruction.psf_model.pixel_kernels import powers_and_variances, sums_of_products
+from pachon.reconstruction.psf_model.pixel_sums import powers_and_variances, sums_of_products
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (3, 40, 32), (60, 41, 961), (7, 0, 5), (0, 4, 5)])
