@@ -7,7 +7,9 @@ arrays is reused without these faults.
 from __future__ import annotations
 
 import math
+import mmap
 import threading
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -15,10 +17,28 @@ from numpy.typing import DTypeLike
 
 #: Smallest array that uses the pool [bytes]; the allocator reuses the memory of smaller ones itself.
 _LEAST = 1 << 20
+#: Size of a huge page [bytes].
+_HUGE_PAGE = 1 << 21
 #: Largest total of the unused blocks [bytes].
 MOST = 1 << 28
 #: Largest size of a block over that of the array that uses it.
 _SLACK = 1.25
+
+
+def _mapped(count: int) -> np.ndarray:
+    """Return fresh memory of `count` bytes, in huge pages where the system has them.
+
+    A fault and an entry of the translation buffers then stand for 2 MB in place of 4 kB, and no vector lies across two
+    cache lines.
+    """
+    if count < _HUGE_PAGE or not hasattr(mmap, "MADV_HUGEPAGE"):
+        return np.empty(count, dtype=np.uint8)
+    pages = mmap.mmap(-1, count + _HUGE_PAGE)
+    with suppress(OSError):  # a kernel without huge pages
+        pages.madvise(mmap.MADV_HUGEPAGE)
+    memory = np.frombuffer(pages, dtype=np.uint8)
+    first = -memory.ctypes.data % _HUGE_PAGE
+    return memory[first : first + count]
 
 
 class _MemoryPool:
@@ -39,7 +59,7 @@ class _MemoryPool:
             for i in reversed(range(len(self._free))):
                 if count <= self._free[i].nbytes <= _SLACK * count:
                     return self._free.pop(i)
-        return np.empty(count, dtype=np.uint8)
+        return _mapped(count)
 
     def give(self, block: np.ndarray) -> None:
         """Return a block to the pool, and free the oldest ones beyond its limit."""

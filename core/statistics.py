@@ -33,6 +33,40 @@ def robust_rms(values: np.ndarray, axis: int | None = None) -> np.ndarray:
     return RMS_PER_MAD * np.asarray(np.nanmedian(np.abs(deviations), axis=axis))
 
 
+def row_medians(values: np.ndarray) -> np.ndarray:
+    """Return the medians of the rows [n, m] of finite values, [n].
+
+    As :func:`numpy.median`, which looks for NaN and selects three values a row, in half of its time.
+    """
+    count = values.shape[1]
+    middle = count // 2
+    rising = np.partition(values, middle, axis=1)
+    if count % 2:
+        return rising[:, middle]
+    return np.asarray((rising[:, :middle].max(axis=1) + rising[:, middle]) / 2.0)
+
+
+def sorted_columns(values: np.ndarray) -> np.ndarray:
+    """Return the columns of values [n, k], each in rising order, [k, n]."""
+    return np.sort(np.ascontiguousarray(values.T), axis=1)
+
+
+def column_median(rising: np.ndarray) -> np.ndarray:
+    """Return the medians [k] of :func:`sorted_columns`, as :func:`numpy.median` has them."""
+    count = rising.shape[1]
+    low, high = rising[:, (count - 1) // 2], rising[:, count // 2]
+    return np.asarray(high if count % 2 else (low + high) / 2.0)
+
+
+def column_percentile(rising: np.ndarray, percent: float) -> np.ndarray:
+    """Return a percentile [k] of :func:`sorted_columns`, interpolated as :func:`numpy.percentile` does."""
+    place = (rising.shape[1] - 1) * (percent / 100.0)
+    below = int(place)
+    part, low, high = place - below, rising[:, below], rising[:, min(below + 1, rising.shape[1] - 1)]
+    step = high - low
+    return np.asarray(high - step * (1.0 - part) if part >= 0.5 else low + step * part)
+
+
 def masked_median(values: np.ndarray, masks: np.ndarray) -> np.ndarray:
     """Return the median along the first axis of values that are neither masked nor NaN; NaN where there are none.
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
+from ..core.buffers import empty
 from ..core.units import angle
 from ..models.telescope import Telescope
 from .aiming import entrance_points, require_aimed
@@ -60,7 +61,7 @@ def launch_rays(
     telescope.check_wavelength(wavelength)
     px, py = pupil_points(pupil)
     # Transposed, not copied: the components stay contiguous, as the kernels read them.
-    points = np.stack([px.ravel(), py.ravel()]).T
+    points = np.stack([px.ravel(), py.ravel()], out=empty((2, px.size))).T
     return launch_bundles(telescope, field_direction(tx, ty, projection)[None], wavelength, points)
 
 

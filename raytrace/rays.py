@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any
@@ -10,13 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
-from ..core.buffers import empty
 from ..core.errors import ConfigError, DomainError
 from ..core.point_plots import draw_points
 from ..core.result import Result
 from ..core.units import broadcast_together, metres, radians
 from ..models.telescope import Telescope
 from .kernels import surface as surface_kernels
+from .kernels.packet import whole_packets
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -183,24 +184,23 @@ def require_distant_object(telescope: Telescope) -> None:
 def parallel_rays(telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray) -> Rays:
     """Launch plane waves as :func:`straight_bundles`; an object at a finite distance is a DomainError."""
     require_distant_object(telescope)
-    # Components stay contiguous (structure of arrays), as the kernels read them; without temporary arrays of all rays,
-    # as memory sets the pace.
+    # Components stay contiguous (structure of arrays) and in whole packets, as the kernels read them; without temporary
+    # arrays of all rays, as memory sets the pace.
     v = directions.T[:, :, None]
     x, y = np.moveaxis(pupil if pupil.ndim == 3 else pupil[None], -1, 0)
-    position, direction = empty((2, 3, len(directions), x.shape[1]))
-    back = np.multiply(v[0], x, out=empty((len(directions), x.shape[1])))
+    bundles = len(directions), x.shape[1]
+    position, direction = whole_packets((2, 3), math.prod(bundles))
+    path = whole_packets((), math.prod(bundles))
+    back = path.reshape(bundles)
+    np.multiply(v[0], x, out=back)
     back += v[1] * y
     back += v[2] * telescope.stop_z
     back += telescope.launch_distance
-    for place, point, along in zip(position, (x, y, telescope.stop_z), v, strict=True):
+    components = zip(position, direction, (x, y, telescope.stop_z), v, strict=True)
+    for places, cosines, point, along in components:
+        place = places.reshape(bundles)
         np.multiply(along, back, out=place)
         np.subtract(point, place, out=place)
-    direction[:] = v
-    path = back.reshape(-1)
+        cosines.reshape(bundles)[:] = along
     path[:] = 0.0
-    return Rays(
-        position=position.reshape(3, -1).T,
-        direction=direction.reshape(3, -1).T,
-        path_length=path,
-        wavelength=wavelength,
-    )
+    return Rays(position=position.T, direction=direction.T, path_length=path, wavelength=wavelength)

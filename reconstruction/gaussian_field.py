@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import scipy.linalg
 
@@ -9,7 +11,13 @@ import scipy.linalg
 def inverse_from_cholesky(root: np.ndarray) -> np.ndarray:
     """Return the inverse of a symmetric matrix of given lower Cholesky factor."""
     lower = scipy.linalg.lapack.dpotri(root, lower=1)[0]
-    return np.tril(lower) + np.tril(lower, -1).T
+    return np.ascontiguousarray(np.where(_lower_triangle(len(root)), lower, lower.T))
+
+
+@lru_cache(maxsize=4)
+def _lower_triangle(n: int) -> np.ndarray:
+    """Return the places of the lower triangle with the diagonal, bool [n, n]."""
+    return np.tri(n, dtype=bool)
 
 
 def leave_one_out_residuals(alpha: np.ndarray, inverse: np.ndarray) -> np.ndarray:

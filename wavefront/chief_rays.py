@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -122,30 +124,51 @@ def fields_at(
         raise DomainError(f"positions of shape {target.shape}: expected x, y, shape [n, 2]")
     light = telescope.default_wavelength if wavelength is None else length(wavelength, "wavelength")
     field_angles(np.zeros((1, 2)), projection)  # an unknown projection is an error before anything is traced
-    slopes = _by_axis_scale(telescope, target, light, threads)
+    slopes = _by_axis_scale(telescope, target, light, threads, np.zeros(len(target), dtype=np.int64))
     if slopes is None:
         slopes = _by_newton(telescope, target, light, threads)
     return field_angles(slopes, projection)
 
 
+def fields_of_groups(
+    telescope: Telescope, positions: np.ndarray, counts: Sequence[int], wavelength: float, threads: int | None = None
+) -> np.ndarray:
+    """Return :func:`fields_at` of groups of so many positions each [m], [n, 2], with the same bytes as group by group.
+
+    The search ends when all positions of a group are met, so that a group of its own has a number of steps of its own.
+    """
+    target = np.asarray(positions, dtype=np.float64).reshape(-1, 2)
+    slopes = _by_axis_scale(telescope, target, wavelength, threads, np.repeat(np.arange(len(counts)), counts))
+    if slopes is not None:
+        return field_angles(slopes)
+    groups = np.split(target, np.cumsum(counts)[:-1])
+    return np.concatenate([fields_at(telescope, group, wavelength, threads=threads) for group in groups if len(group)])
+
+
 def _by_axis_scale(
-    telescope: Telescope, target: np.ndarray, wavelength: float, threads: int | None
+    telescope: Telescope, target: np.ndarray, wavelength: float, threads: int | None, group: np.ndarray
 ) -> np.ndarray | None:
-    """Return slopes by iteration with the scales of x and y on the axis; None if it fails (rotated detector)."""
+    """Return slopes by iteration with the scales of x and y on the axis; None if it fails (rotated detector).
+
+    A group [n] of targets ends when all of it are met.
+    """
     corners = np.array([0.0, JACOBIAN_STEP])
     origin, corner = _landing_points(telescope, field_direction(corners, corners, "gnomonic"), wavelength, threads)
     scale = (corner - origin) / JACOBIAN_STEP
     if not scale.all():
         return None
     slopes = (target - origin) / scale
+    searched = np.arange(len(target))
     # The scale is within a per cent everywhere, so each step gains two digits or more.
     for _ in range(_SCALE_STEPS):
-        light = field_direction(slopes[:, 0], slopes[:, 1], "gnomonic")
-        miss = target - _landing_points(telescope, light, wavelength, threads)
-        slopes = slopes + miss / scale
+        light = field_direction(slopes[searched, 0], slopes[searched, 1], "gnomonic")
+        miss = target[searched] - _landing_points(telescope, light, wavelength, threads)
+        slopes[searched] += miss / scale
         if not np.isfinite(miss).all():
             return None
-        if np.abs(miss).max(initial=0.0) < _TOLERANCE:
+        missed = group[searched][~(np.abs(miss).max(axis=1, initial=0.0) < _TOLERANCE)]
+        searched = searched[np.isin(group[searched], missed)]
+        if not len(searched):
             return slopes
     return None
 

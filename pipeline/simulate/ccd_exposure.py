@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -13,7 +13,7 @@ from ...measure.shapes import measure_shapes
 from ...models.camera.camera import Camera
 from ...models.ideal_telescope import ideal_telescope
 from ...models.star_spectrum import blackbody_photons
-from ...wavefront.chief_rays import fields_at
+from ...wavefront.chief_rays import fields_of_groups
 from ...wavefront.psf.engine import center_focal_length
 from ...wavefront.psf.engines import psf_engine
 from ...wavefront.psf.light import Light
@@ -45,6 +45,16 @@ class NoiseFreeStars:
     fields: np.ndarray  #: field angles [rad], [n, 2]
     lit_fraction: np.ndarray  #: part of the entrance pupil whose light arrives, mean over wavelengths, [n]
     offset: np.ndarray  #: place of the reference point from the centre of the middle pixel [pixel], [n, 2]
+
+    def part(self, index: slice) -> NoiseFreeStars:
+        """Return some of the stars."""
+        return replace(
+            self,
+            image=self.image[index],
+            fields=self.fields[index],
+            lit_fraction=self.lit_fraction[index],
+            offset=self.offset[index],
+        )
 
 
 @dataclass(frozen=True)
@@ -82,7 +92,7 @@ def expose_positions(
     DomainError if no light reaches one of them.
     """
     stars = _expose(
-        experiment, positions, threads, progress, room=room, offsets=offsets, along=along, temperatures=temperatures
+        experiment, [positions], threads, progress, room=room, offsets=offsets, along=along, temperatures=temperatures
     )
     return _require_light(stars)
 
@@ -103,30 +113,76 @@ def expose_ccd(
     `progress` is called with the number of PSFs made since the last call.
     """
     positions = ccd_stars(experiment, name, PROVISIONAL_FWHM) if stars is None else stars
-    holdout = expose_centered(experiment, positions.holdout, threads, progress)
-    pixel = positions.observed_pixel * (positions.ccd.pixel_size / experiment.pixel_size)
-    offsets = pixel - np.rint(pixel)
-    kelvin = positions.temperature
+    return expose_ccds(experiment, {name: positions}, centered=centered, threads=threads, progress=progress)[0]
+
+
+def expose_ccds(
+    experiment: Experiment,
+    stars: Mapping[str, StarField],
+    *,
+    centered: bool = False,
+    threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> list[CcdExposure]:
+    """Make the PSFs of the stars of several CCDs as :func:`expose_ccd` does, by one call of the engine for all.
+
+    No byte of a CCD depends on the others: what the engine does once a call is most of the time of a few stars.
+    """
+    fields = list(stars.values())
+    holdout_groups = [field.holdout for field in fields]
+    recenter = partial(_centroids, experiment)
+    holdout = _expose(experiment, holdout_groups, threads, progress, recenter=recenter)
+    groups = [field.observed for field in fields]
+    pixels = [field.observed_pixel * (field.ccd.pixel_size / experiment.pixel_size) for field in fields]
+    offsets = np.concatenate([pixel - np.rint(pixel) for pixel in pixels])
+    kelvin = _temperatures(fields)
+    centered_stars = None
     if centered:
-        observed, centered_stars = _expose_twice(
-            experiment, positions.observed, offsets, threads, progress, temperatures=kelvin
+        observed, centered_stars = _expose_twice(experiment, groups, offsets, threads, progress, temperatures=kelvin)
+    else:
+        observed = _expose(
+            experiment, groups, threads, progress, offsets=offsets, room=_SHIFT_ROOM, temperatures=kelvin
         )
-        return CcdExposure(name, positions, holdout, _require_light(observed), centered_stars)
-    observed = _expose(
-        experiment, positions.observed, threads, progress, offsets=offsets, room=_SHIFT_ROOM, temperatures=kelvin
+    exposures = []
+    of_holdout, of_observed = (_slices(parts) for parts in (holdout_groups, groups))
+    for (name, field), first, second in zip(stars.items(), of_holdout, of_observed, strict=True):
+        exposures.append(
+            CcdExposure(
+                name,
+                field,
+                holdout.part(first),
+                _require_light(observed.part(second)),
+                None if centered_stars is None else centered_stars.part(second),
+            )
+        )
+    return exposures
+
+
+def _slices(groups: Sequence[np.ndarray]) -> list[slice]:
+    """Return the slice of each group in their concatenation."""
+    ends = np.cumsum([len(group) for group in groups]).tolist()
+    return [slice(end - len(group), end) for end, group in zip(ends, groups, strict=True)]
+
+
+def _temperatures(fields: Sequence[StarField]) -> np.ndarray | None:
+    """Return the temperatures of the observed stars of all fields [K], NaN for flat spectra; None where all are."""
+    if all(field.temperature is None for field in fields):
+        return None
+    return np.concatenate(
+        [np.full(len(f.observed), np.nan) if f.temperature is None else f.temperature for f in fields]
     )
-    return CcdExposure(name, positions, holdout, _require_light(observed))
 
 
 def _expose_twice(
     experiment: Experiment,
-    positions: np.ndarray,
+    groups: Sequence[np.ndarray],
     offsets: np.ndarray,
     threads: int | None,
     progress: Callable[[int], None] | None,
     temperatures: np.ndarray | None,
 ) -> tuple[NoiseFreeStars, NoiseFreeStars]:
     """Make the PSFs of observed stars, with the room of their stamps, and the same on the centre of a pixel."""
+    positions = np.concatenate(groups)
     first: list[np.ndarray] = []
 
     def kept_centroid(images: np.ndarray, pixel_scale: float) -> np.ndarray:
@@ -137,7 +193,7 @@ def _expose_twice(
 
     moved = _expose(
         experiment,
-        positions,
+        groups,
         threads,
         progress,
         room=_SHIFT_ROOM,
@@ -165,7 +221,7 @@ def expose_centered(
     # The engine draws them at the position that compensates their shift by the atmosphere. Resampling, as of observed
     # stars, would leave ringing along rows and columns where an image is not quite band-limited.
     recenter = partial(_centroids, experiment)
-    return _expose(experiment, positions, threads, progress, recenter=recenter, along=along)
+    return _expose(experiment, [positions], threads, progress, recenter=recenter, along=along)
 
 
 def _centroids(experiment: Experiment, images: np.ndarray, pixel_scale: float) -> np.ndarray:
@@ -183,7 +239,7 @@ def _require_light(stars: NoiseFreeStars) -> NoiseFreeStars:
 
 def _expose(
     experiment: Experiment,
-    positions: np.ndarray,
+    groups: Sequence[np.ndarray],
     threads: int | None,
     progress: Callable[[int], None] | None = None,
     *,
@@ -195,10 +251,12 @@ def _expose(
 ) -> NoiseFreeStars:
     """Make PSFs at positions on the detector, `offsets` [pixel] from the centre of a pixel, on stamps with `room`.
 
+    Positions are those of groups [m], [n, 2] each, one after the other; no byte of a group depends on the others.
     Stars are blackbodies of `temperatures` [K]; spectra are flat where they are NaN, and by default.
     """
     config, wavelengths = experiment.config, experiment.wavelengths
-    fields = fields_at(experiment.telescope, positions, wavelengths[len(wavelengths) // 2], threads=threads)
+    positions, middle = np.concatenate(groups), float(wavelengths[len(wavelengths) // 2])
+    fields = fields_of_groups(experiment.telescope, positions, [len(group) for group in groups], middle, threads)
     # Stamps are drawn along the axes of the CCD's frame, and exchange x and y where its pixels do.
     transposed = along is not None and experiment.camera.transposed
     if transposed and offsets is not None:

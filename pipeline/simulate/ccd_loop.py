@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -12,9 +13,12 @@ from ...core.progress import Reporter
 from ...core.threads import thread_count
 from ..experiment import Experiment
 from ..resolved_values import least_star_count
-from .ccd_exposure import CcdExposure, expose_ccd
+from .ccd_exposure import CcdExposure, ccd_stars, expose_ccds
+from .photometry import PROVISIONAL_FWHM
 from .star_field import StarField
 
+#: Stars of the CCDs that are exposed together, but for a CCD of more: beyond, what a call costs does not count.
+_STARS_TOGETHER = 500
 _T = TypeVar("_T")
 
 
@@ -38,7 +42,7 @@ def simulate_ccds(
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> SimulatedCcds[_T]:
-    """Expose CCDs one after the other, and model each beside the next exposure.
+    """Expose CCDs, a few at a time, and model them beside the next exposures.
 
     `model` is any reduction of an exposure, such as :func:`~.model_ccd`. It runs on a thread of its own, one CCD at a
     time, in the order of the CCDs; no byte depends on the number of threads. `names` are by default those of the
@@ -70,18 +74,9 @@ def simulate_ccds(
     bar = reporter.stage(title or f"PSFs of {len(names)} CCDs", total=total)
     with bar as stage, ThreadPoolExecutor(1) as modeller:
         pending: list[tuple[str, Future[_T]]] = []
-        for i, name in enumerate(names, start=1):
-            try:
-                stars = None if fields is None else fields[name]
-                exposure = expose_ccd(
-                    experiment, name, stars=stars, centered=centered, threads=threads, progress=stage.advance
-                )
-            except PachonError as error:
-                raise error.within(subject=f"CCD {name}") from None
-            due, pending = pending, [(name, modeller.submit(model, exposure))]
-            if not overlap or i == len(names):
-                due, pending = due + pending, []
-            for ccd, future in due:
+
+        def collect(models: list[tuple[str, Future[_T]]]) -> None:
+            for ccd, future in models:
                 try:
                     simulated.results[ccd] = future.result()
                 except ProductError:
@@ -91,8 +86,64 @@ def simulate_ccds(
                         raise error.within(subject=f"CCD {ccd}") from None
                     simulated.not_modelled[ccd] = error.reason
                     reporter.line(left_out_line(ccd, error.reason))
-            stage.step(name, i, len(names))
+
+        exposed_ccds, groups = 0, _groups(experiment, names, fields)
+        for exposures in _exposures(experiment, groups, centered=centered, threads=threads, progress=stage.advance):
+            collect(pending)
+            pending = [(exposure.name, modeller.submit(model, exposure)) for exposure in exposures]
+            if not overlap:
+                collect(pending)
+                pending = []
+            for exposure in exposures:
+                exposed_ccds += 1
+                stage.step(exposure.name, exposed_ccds, len(names))
+        collect(pending)
     return simulated
+
+
+def _groups(
+    experiment: Experiment, names: Sequence[str], fields: Mapping[str, StarField] | None
+) -> Iterator[dict[str, StarField]]:
+    """Yield the stars of CCDs that are exposed together, by name, as many CCDs as have :data:`_STARS_TOGETHER`."""
+    group: dict[str, StarField] = {}
+    for name in names:
+        stars = ccd_stars(experiment, name, PROVISIONAL_FWHM) if fields is None else fields[name]
+        if group and sum(map(_star_count, group.values())) + _star_count(stars) > _STARS_TOGETHER:
+            yield group
+            group = {}
+        group[name] = stars
+    if group:
+        yield group
+
+
+def _star_count(stars: StarField) -> int:
+    return len(stars.holdout) + len(stars.observed)
+
+
+def _exposures(
+    experiment: Experiment,
+    groups: Iterable[dict[str, StarField]],
+    *,
+    centered: bool,
+    threads: int | None,
+    progress: Callable[[int], None],
+) -> Iterator[list[CcdExposure]]:
+    """Yield the exposures of groups of CCDs; an error starts with the name of the CCD, after the CCDs before it."""
+    for group in groups:
+        together = None
+        if len(group) > 1:
+            # An error is that of one CCD: they are then exposed one by one.
+            with suppress(PachonError):
+                together = expose_ccds(experiment, group, centered=centered, threads=threads, progress=progress)
+        if together is not None:
+            yield together
+            continue
+        for name, stars in group.items():
+            try:
+                alone = expose_ccds(experiment, {name: stars}, centered=centered, threads=threads, progress=progress)
+            except PachonError as error:
+                raise error.within(subject=f"CCD {name}") from None
+            yield alone
 
 
 def check_catalogue(experiment: Experiment, names: Sequence[str], *, strict: bool) -> None:

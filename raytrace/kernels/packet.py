@@ -7,6 +7,7 @@ never depends on its neighbours: cutting a batch differently changes no byte.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -70,17 +71,46 @@ def packet_count(n: int) -> int:
     return -(-n // LANES)
 
 
+def whole_packets(shape: tuple[int, ...], n: int) -> np.ndarray:
+    """Return unset values [*shape, n] in memory that goes on to whole packets, which :func:`to_packets` need not copy.
+
+    Lanes of the last packet without a value hold any.
+    """
+    return empty((*shape, packet_count(n) * LANES))[..., :n]
+
+
 def to_packets(values: np.ndarray) -> np.ndarray:
     """Return values [..., n] as packets [..., n_packet, LANES], the last filled up with copies of the last value.
 
-    The result is a view where ``n`` is a multiple of ``LANES`` and the values are contiguous float64, else a copy.
+    The result is a view of contiguous float64 where ``n`` is a multiple of ``LANES``, or the memory of the values goes
+    on to whole packets (the last of which is then filled up with what is there); else a copy.
     """
-    values = np.ascontiguousarray(values, dtype=np.float64)
     n = values.shape[-1]
+    if n % LANES:
+        packets = _packets_around(values)
+        if packets is not None:
+            return packets
+    values = np.ascontiguousarray(values, dtype=np.float64)
     padding = packet_count(n) * LANES - n
     if padding:
         values = np.concatenate([values, np.repeat(values[..., -1:], padding, axis=-1)], axis=-1)
     return values.reshape(*values.shape[:-1], -1, LANES)
+
+
+def _packets_around(values: np.ndarray) -> np.ndarray | None:
+    """Return the packets [..., n_packet, LANES] that values [..., n] are the first of; None where they are not."""
+    owner, count = values.base, packet_count(values.shape[-1])
+    if not (isinstance(owner, np.ndarray) and owner.flags.c_contiguous and values.dtype == owner.dtype == np.float64):
+        return None
+    shape = (*values.shape[:-1], count * LANES)
+    strides = np.cumprod((values.itemsize, *shape[:0:-1]))[::-1].tolist()
+    if any(have != want for length, have, want in zip(shape, values.strides, strides, strict=True) if length > 1):
+        return None
+    first = (values.__array_interface__["data"][0] - owner.__array_interface__["data"][0]) // values.itemsize
+    room = math.prod(shape)
+    if first < 0 or first + room > owner.size:
+        return None
+    return owner.reshape(-1)[first : first + room].reshape(*shape[:-1], count, LANES)
 
 
 def from_packets(packets: wp.array, n: int) -> np.ndarray:

@@ -22,12 +22,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
 
 from ..gaussian_field import inverse_from_cholesky
+from .pixel_sums import sums_of_products
 from .polynomial import term_count
 
 if TYPE_CHECKING:
@@ -216,10 +218,6 @@ class Posterior:
         """Return the columns, those that are not present as 0 but for the length."""
         return np.where(present | (np.arange(len(present)) == _LENGTH), np.exp(logarithms), 0.0)
 
-    def covariance(self, kernel: np.ndarray) -> np.ndarray:
-        """Return the covariance of the stars under a kernel, [n, n]."""
-        return kernel_covariance(kernel, self.distance, self.terms, self.noise, self.colour_count)
-
     def negative_log_posterior(self, logarithms: np.ndarray, present: np.ndarray) -> tuple[float, np.ndarray]:
         """Return minus the logarithm of the posterior, but for a constant, and its derivatives [n_columns]."""
         kernel = self.kernel(logarithms, present)
@@ -228,11 +226,14 @@ class Posterior:
         # A change dC of the covariance changes the value by half the sum of count C^-1 - C^-1 y y' C^-1 times dC.
         try:
             if kernel[0] > 0.0:
-                root = np.linalg.cholesky(self.covariance(kernel))
+                decay = kernel[0] * np.exp(-self.distance / kernel[1])
+                root = np.linalg.cholesky(
+                    _with_trend_and_noise(decay, kernel, self.terms, self.noise, self.colour_count)
+                )
                 inverse = inverse_from_cholesky(root)
                 solved, inverse_terms = inverse @ self.numbers, inverse @ self.terms
                 precision, log_determinant = np.diagonal(inverse), 2.0 * np.log(np.diagonal(root)).sum()
-                process = (count * inverse - solved @ solved.T) * (kernel[0] * np.exp(-self.distance / kernel[1]))
+                process = (count * inverse - solved @ solved.T) * decay
                 slope[:2] = process.sum(), (process * self.distance).sum() / kernel[1]
             else:
                 smooth = SmoothCovariance.of(kernel, self.terms, self.noise, self.colour_count)
@@ -284,7 +285,8 @@ class SmoothCovariance:
         variances = trend_variances(kernel, terms.shape[1], colour_count)
         scaled = terms[:, variances > 0.0] * np.sqrt(variances[variances > 0.0])
         root = np.linalg.cholesky(np.eye(scaled.shape[1]) + scaled.T @ (scaled / variance[:, None]))
-        half = scipy.linalg.solve_triangular(root, (scaled / variance[:, None]).T, lower=True, check_finite=False)
+        # The call of scipy.linalg.solve_triangular, without what it checks.
+        half = scipy.linalg.lapack.dtrtrs(root.T, (scaled / variance[:, None]).T, lower=0, trans=1)[0]
         return cls(variance, half, float(np.log(variance).sum() + 2.0 * np.log(np.diagonal(root)).sum()))
 
     def solve(self, values: np.ndarray) -> np.ndarray:
@@ -350,23 +352,26 @@ def predict(points: np.ndarray, at: np.ndarray, kernel: np.ndarray, weights: np.
 
     Each place on its own, star after star: no batch size matters.
     """
-    result = np.zeros((len(at), weights.shape[1]))
     if kernel[0] == 0.0:
-        return result
-    for point, alpha in zip(points, weights, strict=True):
-        near = kernel[0] * np.exp(-np.hypot(*(at - point).T) / kernel[1])
-        result += near[:, None] * alpha
-    return result
+        return np.zeros((len(at), weights.shape[1]))
+    near = kernel[0] * np.exp(-pair_distances(at, points) / kernel[1])
+    return sums_of_products(near, weights)
 
 
 def kernel_covariance(
     kernel: np.ndarray, distance: np.ndarray, terms: np.ndarray, noise: np.ndarray, colour_count: int = 0
 ) -> np.ndarray:
     """Return the covariance [n, n] of values at stars of given distances, terms of the trend and noise."""
-    variance, length, floor = kernel[:PROCESS_COLUMNS]
-    covariance = variance * np.exp(-distance / length)
-    covariance += (terms * trend_variances(kernel, terms.shape[1], colour_count)) @ terms.T
-    covariance[np.diag_indices(len(noise))] += noise + floor
+    decay = kernel[0] * np.exp(-distance / kernel[1])
+    return _with_trend_and_noise(decay, kernel, terms, noise, colour_count)
+
+
+def _with_trend_and_noise(
+    decay: np.ndarray, kernel: np.ndarray, terms: np.ndarray, noise: np.ndarray, colour_count: int
+) -> np.ndarray:
+    """Return the covariance of a process [n, n] with that of the trend's terms and of the noise added."""
+    covariance = decay + (terms * trend_variances(kernel, terms.shape[1], colour_count)) @ terms.T
+    covariance.flat[:: len(noise) + 1] += noise + kernel[PROCESS_COLUMNS - 1]
     return np.asarray(covariance)
 
 
@@ -375,9 +380,15 @@ def trend_variances(kernel: np.ndarray, count: int, colour_count: int = 0) -> np
 
     Terms stand by degree, d + 1 of degree d; the last `colour_count` are those of colours.
     """
-    order = order_of(count - colour_count)
-    variances = np.repeat([_CONSTANT, *kernel[PROCESS_COLUMNS : PROCESS_COLUMNS + order]], np.arange(1, order + 2))
+    variances = np.concatenate([[_CONSTANT], kernel[PROCESS_COLUMNS:]])[_degrees(count - colour_count)]
     return np.concatenate([variances, np.full(colour_count, kernel[-1])]) if colour_count else variances
+
+
+@lru_cache(maxsize=16)
+def _degrees(count: int) -> np.ndarray:
+    """Return the degree of each of so many terms of polynomials, [n_terms]."""
+    order = order_of(count)
+    return np.repeat(np.arange(order + 1), np.arange(1, order + 2))
 
 
 def order_of(count: int) -> int:

@@ -18,6 +18,7 @@ from .basis import FittedBasis
 from .checks import check_distinct_positions, check_terms
 from .colour import FittedColour, StarColours
 from .file_parts import ModelParts
+from .pixel_sums import sums_of_products
 from .polynomial import MOST_ORDER, Extent, automatic_orders, design_matrix
 
 # Order of the polynomials that predict outliers and masked pixels where the interpolation has none of its own.
@@ -164,10 +165,7 @@ class FittedInterpolation:
     def at(self, positions: Any) -> np.ndarray:
         """Evaluate the coefficients at positions [m, 2] for the mean colour, [m, k]; no batch size matters."""
         terms = design_matrix(positions, self.extent, self.order)
-        values = np.zeros((len(terms), self.polynomial.shape[1]))
-        for column, row in zip(terms.T, self.polynomial, strict=True):  # no BLAS: its sums depend on the batch
-            values += column[:, None] * row
-        return values
+        return sums_of_products(terms, self.polynomial)
 
     def with_colour(self, positions: Any, colour: np.ndarray | None) -> np.ndarray:
         """Evaluate the coefficients at positions [m, 2] for colours [m] or one, [m, k]; None for the mean."""

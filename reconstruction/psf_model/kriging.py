@@ -14,13 +14,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, Self
 
 import numpy as np
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.statistics import RMS_PER_MAD
+from ...core.statistics import RMS_PER_MAD, row_medians
 from ...core.threads import one_blas_thread
 from .colour import FittedColour
 from .covariance import COLUMNS, Covariances, fit_covariances, krige, krige_mean, predict
@@ -78,7 +79,8 @@ class Kriging(Interpolation):
         mean = stars.basis.mean
         deviations = stars.basis.deviations(stars.coefficients)
         numbers, filters = shape_numbers(mean, deviations)
-        noise = star_noise(stars.images, deviations, mean, filters, stars.gain, stars.masked)
+        sky = sky_of_stars(deviations, mean.shape, stars.masked)
+        noise = star_noise(stars.images, deviations, mean, filters, stars.gain, stars.masked, sky=sky)
         noise = np.maximum(noise, _LEAST_NOISE * (numbers**2).mean(axis=0) + np.finfo(float).tiny)
         places = mapped(stars.positions, stars.extent)
         terms, colour_count = stars.with_colour_terms(), stars.colour_terms.shape[1]
@@ -96,7 +98,7 @@ class Kriging(Interpolation):
             shape_trend, dual = krige_mean(places, shapes, terms, covariances, of_stars, colour_count=colour_count)
             signal = SignalCovariance.of(covariances.kernel, places, terms, colour_count)
             at_stars = terms @ shape_trend + predict(places, places, covariances.kernel, dual)
-            pixel_noise = middle_star_noise(stars.images, deviations, mean, of_stars, stars.gain, stars.masked)
+            pixel_noise = middle_star_noise(stars.images, sky, mean, of_stars, stars.gain)
             fields = fit_pixel_fields(mean, deviations, all_filters, of_stars, pixel_noise, at_stars, signal)
             residual_trend, residual_dual = krige_residuals(fields.split(deviations)[1], fields, signal, of_stars)
             trend, alpha = shape_trend @ fields.response + residual_trend, dual @ fields.response + residual_dual
@@ -263,14 +265,16 @@ def star_noise(
     filters: np.ndarray,
     gain: float | None,
     masked: np.ndarray | None = None,
+    *,
+    sky: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the variance of the noise of the shape numbers of each star, [n, 3].
 
     `images` [n, ny, nx] are in units of `gain` electrons, `deviations` [n, n_pixels] those of the stamps of unit sum
     from the mean [ny, nx]. Without gain there is no photon noise. Pixels in `masked` [n, ny, nx], which are filled and
-    have no noise of their own, are left out of the scatter of the sky.
+    have no noise of their own, are left out of the scatter of the sky; `sky` is that of :func:`sky_of_stars`, if known.
     """
-    sky_variance = _sky_of_stars(deviations, mean.shape, masked)
+    sky_variance = sky_of_stars(deviations, mean.shape, masked) if sky is None else sky
     correlations = _noise_correlations(deviations.reshape(-1, *mean.shape), sky_variance, masked)
     sky_noise = (filters**2).sum(axis=1) * _correlation_factors(correlations, filters, mean.shape)
     noise = sky_variance[:, None] * sky_noise
@@ -288,18 +292,15 @@ def star_noise(
 
 
 def middle_star_noise(
-    images: np.ndarray,
-    deviations: np.ndarray,
-    mean: np.ndarray,
-    noise: np.ndarray,
-    gain: float | None,
-    masked: np.ndarray | None = None,
+    images: np.ndarray, sky: np.ndarray, mean: np.ndarray, noise: np.ndarray, gain: float | None
 ) -> np.ndarray:
-    """Return the variance of the noise of pixels, [n_pixels], of the star of middle `noise` [n]."""
+    """Return the variance of the noise of pixels, [n_pixels], of the star of middle `noise` [n].
+
+    `sky` [n] is that of :func:`sky_of_stars`.
+    """
     star = int(np.argsort(noise, kind="stable")[len(noise) // 2])
-    sky = _sky_of_stars(deviations, mean.shape, masked)[star]
     photons = 0.0 if gain is None else np.maximum(mean.ravel(), 0.0) / (images[star].sum() * gain)
-    return np.asarray(sky + photons + np.zeros(mean.size))
+    return np.asarray(sky[star] + photons + np.zeros(mean.size))
 
 
 def _sky_pixels(shape: tuple[int, ...]) -> np.ndarray:
@@ -308,7 +309,7 @@ def _sky_pixels(shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray(np.hypot(x, y) > _SKY * min(shape)).ravel()
 
 
-def _sky_of_stars(deviations: np.ndarray, shape: tuple[int, ...], masked: np.ndarray | None) -> np.ndarray:
+def sky_of_stars(deviations: np.ndarray, shape: tuple[int, ...], masked: np.ndarray | None) -> np.ndarray:
     """Return the variance of a pixel of sky of each star, [n], from deviations [n, n_pixels]."""
     sky = _sky_pixels(shape)
     outer = None if masked is None else masked.reshape(len(deviations), -1)[:, sky]
@@ -330,10 +331,7 @@ def _noise_correlations(
     # A mean of stars keeps the correlation, their median does not.
     weights = 1.0 / np.maximum(sky_variance, _LEAST_SKY * sky_variance.max())
     pixels = deviations - np.tensordot(weights / weights.sum(), deviations, axes=1)
-    pixels = (
-        pixels
-        / np.maximum(RMS_PER_MAD * np.median(np.abs(pixels[:, sky]), axis=1), np.finfo(float).tiny)[:, None, None]
-    )
+    pixels = pixels / np.maximum(RMS_PER_MAD * row_medians(np.abs(pixels[:, sky])), np.finfo(float).tiny)[:, None, None]
     # Cosmic rays and neighbours would correlate.
     used = (np.abs(pixels) < _CLIP) & sky & (True if masked is None else ~masked)
     pixels = np.where(used, pixels, 0.0)
@@ -375,14 +373,14 @@ def _sky_variance(outer: np.ndarray, masked: np.ndarray | None = None) -> np.nda
     About a mean with equal weights bright stars would have the noise of the faint ones.
     """
     variance = np.ones(len(outer))
-    median: Any = np.median if masked is None else np.nanmedian
+    median: Any = row_medians if masked is None else partial(np.nanmedian, axis=1)
     for _ in range(_SKY_PASSES):
         weights = 1.0 / np.maximum(variance, _LEAST_SKY * variance.max())
         weights /= weights.sum()
         sky_pixels = outer - weights @ outer
         if masked is not None:
             sky_pixels = np.where(masked & ~masked.all(axis=1, keepdims=True), np.nan, sky_pixels)
-        rms = RMS_PER_MAD * median(np.abs(sky_pixels - median(sky_pixels, axis=1)[:, None]), axis=1)
+        rms = RMS_PER_MAD * median(np.abs(sky_pixels - median(sky_pixels)[:, None]))
         # A star takes part in the mean that is subtracted from it.
         variance = rms**2 / np.maximum(1.0 - weights, _LEAST_OWN)
         if not variance.any():  # without noise

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError
-from ...core.statistics import RMS_PER_MAD
+from ...core.statistics import RMS_PER_MAD, column_median, column_percentile, row_medians, sorted_columns
 
 # Standard deviation of the PSF itself within a CCD: this fraction of the geometric mean of the pixel's value and the
 # peak's. The wings may change by more of themselves than the core.
@@ -67,9 +67,10 @@ def find_outliers(images: np.ndarray, clip_sigma: float, max_iterations: int) ->
     rejected = np.zeros(images.shape, dtype=bool)
     for _ in range(max_iterations):
         deviation = np.abs(images / flux[:, None] - mean)
-        middle, high = np.percentile(deviation, (50.0, 80.0), axis=0)
+        rising = sorted_columns(deviation)
+        middle, high = (column_percentile(rising, percent) for percent in (50.0, 80.0))
         over_stars = np.minimum(high / 1.2816, 3.0 * RMS_PER_MAD * middle)
-        over_pixels = RMS_PER_MAD * np.median(deviation, axis=1)
+        over_pixels = RMS_PER_MAD * row_medians(deviation)
         allowance = np.maximum(_PSF_CHANGE * np.sqrt(np.maximum(mean, 0.0) * mean.max()), _FLOOR * mean.max())
         scale = np.sqrt(over_pixels[:, None] ** 2 + over_stars**2 + allowance**2)
         before, rejected = rejected, deviation > clip_sigma * scale
@@ -101,8 +102,8 @@ def restore_predicted(values: np.ndarray, mean: np.ndarray, rejected: np.ndarray
 def _first_guess(images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the median star [n_pixels] and fluxes [n_stars] by the median of each star's bright pixels."""
     total = images.sum(axis=1)
-    median = np.median(images / total[:, None], axis=0)
+    median = column_median(sorted_columns(images / total[:, None]))
     median /= median.sum()
     bright = median > 0.2 * median.max()
-    flux = np.median(images[:, bright] / median[bright], axis=1)
+    flux = row_medians(images[:, bright] / median[bright])
     return median, np.where(flux > 0.0, flux, total)

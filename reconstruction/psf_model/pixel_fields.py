@@ -22,6 +22,7 @@ import numpy as np
 
 from ...core.errors import DomainError
 from .covariance import PROCESS_COLUMNS, pair_distances, trend_variances
+from .pixel_sums import powers_and_variances
 
 # Shape numbers to which pixels respond as to a stretch and a magnification; they come first.
 _SHAPE_NUMBERS = 3
@@ -126,13 +127,10 @@ class Contrasts:
         if not mean_variance > 0.0:
             return 0.0
         squares = (self.axes.T @ values) ** 2
-        spectrum = self.variances[:, None] / mean_variance * relative
         factors = np.concatenate([[0.0], _FACTORS])
-        evidence = np.empty(len(factors))
-        for i, factor in enumerate(factors):
-            variance = 1.0 + factor * spectrum
-            power = np.maximum((squares / variance).sum(axis=0), np.finfo(float).tiny)
-            evidence[i] = -0.5 * (np.log(variance).sum() + len(squares) * np.log(power).sum())
+        power, log_variances = powers_and_variances(squares, self.variances / mean_variance, relative, factors)
+        log_power = np.log(np.maximum(power, np.finfo(float).tiny)).sum(axis=1)
+        evidence = -0.5 * (log_variances + len(squares) * log_power)
         best = int(np.argmax(evidence))
         return float(factors[best]) / mean_variance if evidence[best] > evidence[0] + _LEAST_EVIDENCE else 0.0
 

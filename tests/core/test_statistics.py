@@ -1,7 +1,17 @@
 import numpy as np
 import pytest
 
-from pachon.core.statistics import finite_mean, finite_median, masked_median, rms, robust_rms
+from pachon.core.statistics import (
+    column_median,
+    column_percentile,
+    finite_mean,
+    finite_median,
+    masked_median,
+    rms,
+    robust_rms,
+    row_medians,
+    sorted_columns,
+)
 
 
 def test_values_that_are_not_finite_are_left_out():
@@ -33,3 +43,13 @@ def test_masked_median_is_that_of_the_other_values(count):
     for at in np.ndindex(4, 5):
         good = values[:, *at][~masks[:, *at] & ~np.isnan(values[:, *at])]
         assert np.array_equal(medians[at], np.median(good) if len(good) else np.nan, equal_nan=True)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 12, 40, 41])
+def test_medians_and_percentiles_of_rows_and_columns_have_numpys_bits(count):
+    values = np.round(np.random.default_rng(count).normal(size=(count, 9)), 1)  # with ties
+    rising = sorted_columns(values)
+    assert np.array_equal(column_median(rising), np.median(values, axis=0))
+    assert np.array_equal(row_medians(values.T), np.median(values, axis=0))
+    for percent in (0.0, 13.0, 50.0, 80.0, 100.0):
+        assert np.array_equal(column_percentile(rising, percent), np.percentile(values, percent, axis=0))

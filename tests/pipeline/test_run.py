@@ -85,8 +85,8 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(finished_run, copied, 
         (copied / name).unlink()
     (copied / f".ccd_R24_S12.fits.{_owning_process(ended_process())}.partial").write_bytes(b"SIMPLE")
     done = []
-    real = ccd_loop.expose_ccd
-    monkeypatch.setattr(ccd_loop, "expose_ccd", lambda e, name, **k: done.append(name) or real(e, name, **k))
+    real = ccd_loop.expose_ccds
+    monkeypatch.setattr(ccd_loop, "expose_ccds", lambda e, stars, **k: done.extend(stars) or real(e, stars, **k))
     result = run(tiny(), copied, execution=Execution(resume=True))
     assert done == ["R24_S12"]
     assert result.kept == ("R22_S11",)
@@ -117,19 +117,20 @@ def test_a_damaged_product_is_computed_again(finished_run, copied, tiny, no_repo
 
 
 def test_an_interrupted_run_keeps_the_ccds_that_were_finished(finished_run, tmp_path, monkeypatch, tiny, no_report):
-    real = ccd_loop.expose_ccd
+    real = ccd_loop.expose_ccds
 
-    def interrupted(experiment, name, **options):
-        if name == "R24_S12":
+    def interrupted(experiment, stars, **options):
+        if "R24_S12" in stars:
             raise KeyboardInterrupt
-        return real(experiment, name, **options)
+        return real(experiment, stars, **options)
 
-    monkeypatch.setattr(ccd_loop, "expose_ccd", interrupted)
+    monkeypatch.setattr(ccd_loop, "_STARS_TOGETHER", 1)
+    monkeypatch.setattr(ccd_loop, "expose_ccds", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run(tiny(), tmp_path / "out")
     finished = {"ccd_R22_S11.fits", "config.yaml", "focal_plane.ecsv", "focal_plane.glb"}
     assert {p.name for p in (tmp_path / "out").iterdir()} == finished
-    monkeypatch.setattr(ccd_loop, "expose_ccd", real)
+    monkeypatch.setattr(ccd_loop, "expose_ccds", real)
     assert run(tiny(), tmp_path / "out", execution=Execution(resume=True)).kept == ("R22_S11",)
     assert contents(tmp_path / "out") == contents(finished_run)
 

@@ -15,6 +15,7 @@ are those at 500 nm.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -90,6 +91,7 @@ def _gauss_panels(end: float, panels: int) -> tuple[np.ndarray, np.ndarray]:
     return nodes.ravel(), np.tile(0.5 * width * weight, panels)
 
 
+@lru_cache(maxsize=64)
 def slope_variance(r0: float, outer_scale: float, cutoff: float, lag: float = 0.0) -> float:
     """Return the variance [rad^2] of one component of the slope of the modes with ``|k| <= cutoff`` [rad/m].
 

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -212,6 +213,20 @@ def center_focal_length(
     trace: Callable[..., PupilOptics] = trace_pupils,
 ) -> float:
     """Return the effective focal length at the centre of the field [m], at the middle wavelength."""
+    if trace is trace_pupils:
+        return _traced_focal_length(telescope, tuple(np.asarray(wavelengths, dtype=np.float64).tolist()))
+    return _focal_length_by(trace, telescope, wavelengths, threads)
+
+
+@lru_cache(maxsize=64)
+def _traced_focal_length(telescope: Telescope, wavelengths: tuple[float, ...]) -> float:
+    """Return the focal length of a telescope; cached, since every call of few stars would trace it anew."""
+    return _focal_length_by(trace_pupils, telescope, np.array(wavelengths), 1)
+
+
+def _focal_length_by(
+    trace: Callable[..., PupilOptics], telescope: Telescope, wavelengths: np.ndarray, threads: int | None
+) -> float:
     center = np.zeros((1, 2))
     return float(focal_length(trace(telescope, center, wavelengths, center, threads=threads).jacobian)[0])
 

@@ -27,6 +27,7 @@ import scipy.fft
 import warp as wp
 
 from ...core.arguments import check_arguments
+from ...core.buffers import empty
 from ...core.errors import DomainError
 from ...core.launch import launch
 from ...core.units import require_count
@@ -64,10 +65,14 @@ OVERSAMPLING_STILL = 12
 RAY_DISTANCE = (1.0, 0.25)
 #: The same without an atmosphere [pixels].
 RAY_DISTANCE_STILL = (0.25, 0.125)
-# Most stars of one batch.
-_BATCH = 128
-# Largest memory of the grids of a batch [bytes], which then has fewer stars.
-_BATCH_BYTES = 1 << 25
+# Most stars of one batch, which are traced by one call.
+_BATCH = 256
+# Largest memory of the rays and spectra of a batch [bytes], which then has fewer stars.
+_BATCH_BYTES = 1 << 26
+# Memory of a ray: place, path and status as they are traced, and copies [bytes].
+_RAY_BYTES = 80
+# Largest memory of the fine grids of the stars of a batch that are drawn together [bytes].
+_GRID_BYTES = 1 << 25
 # Samples of the filter against the baseline: linear interpolation is then good to 3e-6.
 _TABLE_SIZE = 4096
 
@@ -151,7 +156,10 @@ class FastRenderer(PsfRenderer):
         else:
             layers = range(inputs.atmosphere.layer_count)
             self._units = np.array([inputs.atmosphere.slope_unit(n) for n in layers], dtype=np.float32)
-        star_bytes = 4 * len(self._channels.wave) * self._grid_size**2
+        grid_bytes = 4 * len(self._channels.wave) * self._grid_size**2
+        self._grid_batch = max(1, _GRID_BYTES // grid_bytes)
+        # Besides its spectrum, each star of a batch has rays.
+        star_bytes = 4 * self._grid_size**2 + _RAY_BYTES * len(self._wavelengths) * len(self._points)
         self.batch = max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
 
     def _place_pupil(self, n_pupil: int) -> None:
@@ -250,34 +258,58 @@ class FastRenderer(PsfRenderer):
         light = optics.lit * self._weights
         if stars.photons is not None:
             light = light * stars.photons[:, :, None]
-        deposit = self._deposit(optics, light)
-        combined = self._combine(self._transforms(deposit, optics, light), optics, stars.offsets)
+        combined = np.empty((len(light), self._grid_size, len(self._kx)), dtype=np.complex64)
+        for first in range(0, len(light), self._grid_batch):
+            part = slice(first, first + self._grid_batch)
+            part_optics = optics.stars(part)
+            spectra = self._transforms(self._deposit(part_optics, light[part]), part_optics, light[part])
+            self._combine(spectra, part_optics, stars.offsets[part], combined[part])
         # A dark star has no light to divide by.
         total = np.where(optics.lit.any(axis=(1, 2)), light.sum(axis=(1, 2)), 1.0) * len(self._schedule.time)
 
         def draw(shift: np.ndarray | None) -> np.ndarray:
-            moved = combined
-            if shift is not None:
-                # A move of the whole star is a ramp of phase; the rays need not be traced nor binned again.
-                ramp = 1j * self._plane.pixel_size * shift[:, :, None]
-                moved = moved * np.exp(ramp[:, 1] * self._ky).astype(np.complex64)[:, :, None]
-                moved *= np.exp(ramp[:, 0] * self._kx).astype(np.complex64)[:, None, :]
-            return self._stamps(moved, total)
+            return self._stamps(combined, total, shift)
 
         return ExposedStars(draw, self._area * optics.lit.mean(axis=2), optics.reference_points)
 
     def _transforms(self, deposit: np.ndarray, optics: PupilOptics, light: np.ndarray) -> np.ndarray:
         """Return the transforms of the binned rays, shape [n_star, n_channel, ky, kx]."""
-        # One transform a star, so that its bytes do not depend on its neighbours.
-        return np.stack(self._map(scipy.fft.rfft2, deposit))
+        shape = (*deposit.shape[:3], len(self._kx))
+        # The kernel that combines them may read a packet on.
+        spectra = empty((math.prod(shape) + LANES,), np.complex64)[:-LANES].reshape(shape)
 
-    def _stamps(self, combined: np.ndarray, light: np.ndarray) -> np.ndarray:
-        """Return the stamps of transforms of the fine grid as fractions of each star's light, [n_star, side, side]."""
-        grid = (self._grid_size, self._grid_size)
-        span = slice(0, self._plane.size * self._oversampling, self._oversampling)
-        stamps = self._map(lambda star: scipy.fft.irfft2(star, s=grid)[span, span].astype(np.float64), combined)
+        def transform(star: int) -> None:
+            # One transform a star, so that its bytes do not depend on its neighbours.
+            spectra[star] = scipy.fft.rfft2(deposit[star])
+
+        self._map(transform, range(len(deposit)))
+        return spectra
+
+    def _stamps(self, combined: np.ndarray, light: np.ndarray, shift: np.ndarray | None = None) -> np.ndarray:
+        """Return the stamps of transforms of the fine grid as fractions of each star's light, [n_star, side, side].
+
+        Stars are moved back by a shift [pixels], shape [n_star, 2], where there is one.
+        """
+        size, step = self._grid_size, self._oversampling
+        span = slice(0, self._plane.size * step, step)
+        stamps = np.empty((len(combined), self._plane.size, self._plane.size))
         # The transform gave light per cell; a pixel, averaged over already, holds so many cells.
-        return np.stack(stamps) * (self._oversampling**2 / light)[:, None, None]
+        scale = self._oversampling**2 / light
+
+        def sample(star: int) -> None:
+            spectrum = combined[star]
+            if shift is not None:
+                # A move of the whole star is a ramp of phase; the rays need not be traced nor binned again.
+                ramp = 1j * self._plane.pixel_size * shift[star, :, None]
+                spectrum = spectrum * np.exp(ramp[1] * self._ky).astype(np.complex64)[:, None]
+                spectrum *= np.exp(ramp[0] * self._kx).astype(np.complex64)
+            # As irfft2, of which only the rows of pixels are needed: its factor is applied at the end.
+            rows = scipy.fft.ifft(spectrum, axis=0, norm="forward")[span]
+            image = scipy.fft.irfft(rows, size, norm="forward")[:, span]
+            stamps[star] = (image * np.float32(1.0 / size**2)).astype(np.float64) * scale[star]
+
+        self._map(sample, range(len(combined)))
+        return stamps
 
     def _deposit(self, optics: PupilOptics, light: np.ndarray) -> np.ndarray:
         """Return the rays of each star, with their light, on the fine grid, [n_star, n_channel, size, size]."""
@@ -305,7 +337,8 @@ class FastRenderer(PsfRenderer):
         landed = np.where(lit, self._channels.displacement(optics), 0.0) / self._cell
         displacement = np.stack([to_packets(landed[..., axis], np.float32) for axis in (0, 1)], axis=-2)
         cells_per_slope = optics.jacobian.reshape(n_star, 4) / self._cell
-        image = np.zeros((n_star, n_channel * self._grid_size**2), dtype=np.float32)
+        image = empty((n_star, n_channel * self._grid_size**2), np.float32)
+        image[:] = 0.0
         launch(
             deposit_rays.plain if self._channels.depths == 1 else deposit_rays.special,
             n_star,
@@ -332,9 +365,9 @@ class FastRenderer(PsfRenderer):
         )
         return image.reshape(n_star, n_channel, self._grid_size, self._grid_size)
 
-    def _combine(self, spectra: np.ndarray, optics: PupilOptics, offsets: np.ndarray) -> np.ndarray:
-        """Return the filtered sum over channels of the transforms of each star, shape [n_star, ky, kx]."""
-        n_star, _, n_row, n_column = spectra.shape
+    def _combine(self, spectra: np.ndarray, optics: PupilOptics, offsets: np.ndarray, combined: np.ndarray) -> None:
+        """Store the filtered sum over channels of the transforms of each star in an array [n_star, ky, kx]."""
+        n_star, _, n_row, _ = spectra.shape
         channels, wave = self._channels, self._channels.wave
         shift = np.einsum("sij,wj->swi", optics.jacobian, self._dispersion)[:, wave]
         # The deposit has its origin in the middle cell; the first pixel of the stamp belongs in the first.
@@ -343,22 +376,21 @@ class FastRenderer(PsfRenderer):
         # Rays of a channel stand for its light; the further diffusion is a product of Gaussians along x and y.
         across = (channels.weight / self._schedule.fraction)[:, None] * channels.spread(self._kx)
         along = channels.spread(self._ky)
-        combined = np.empty((n_star, n_row, n_column), dtype=np.complex64)
+        ramp_x = across * np.exp(-1j * shift[..., :1] * self._kx)
         launch(
             combine_wavelengths,
             n_star * n_row,
             [
-                warp_array(spectra, wp.vec2f),
+                warp_array(spectra.view(np.float32), wp.float32),
                 float(self._kx[1]),
                 warp_array(metric_of(optics.jacobian), wp.float32),
                 warp_array((self._wavelengths / (2.0 * math.pi)).astype(np.float32), wp.float32),
                 warp_array(self._filter, wp.float32),
                 self._filter_step,
-                warp_array(self._detector, wp.float32),
-                warp_array((across * np.exp(-1j * shift[..., :1] * self._kx)).astype(np.complex64), wp.vec2f),
+                warp_array(to_packets(self._detector, np.float32), samples),
+                warp_array(to_packets(np.stack([ramp_x.real, ramp_x.imag], axis=2), np.float32), samples),
                 warp_array((along * np.exp(-1j * shift[..., 1:] * self._ky)).astype(np.complex64), wp.vec2f),
-                warp_array(combined, wp.vec2f),
+                warp_array(combined.view(np.float32), wp.float32),
             ],
             threads=self._threads,
         )
-        return combined

@@ -6,7 +6,7 @@ import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
 from ...raytrace.kernels.kernel_pair import kernel_pair
-from .packet_functions import squared_baseline, tabulated
+from .packet_functions import every_second, squared_baseline, store_complex, tabulated_packet
 from .sample_packets import LANES, indices, samples
 
 wp.set_module_options(FORWARD_OPTIONS)
@@ -149,43 +149,57 @@ def deposit_rays(special: int, module: wp.Module) -> wp.Kernel:
 @wp.kernel
 def combine_wavelengths(
     first: wp.int32,
-    spectra: wp.array4d(dtype=wp.vec2f),
+    spectra: wp.array4d(dtype=wp.float32),
     frequency: wp.float32,
     metric: wp.array2d(dtype=wp.float32),
     baseline: wp.array(dtype=wp.float32),
     table: wp.array2d(dtype=wp.float32),
     table_step: wp.float32,
-    detector: wp.array2d(dtype=wp.float32),
-    ramp_x: wp.array3d(dtype=wp.vec2f),
+    detector: wp.array2d(dtype=samples),
+    ramp_x: wp.array4d(dtype=samples),
     ramp_y: wp.array3d(dtype=wp.vec2f),
-    combined: wp.array3d(dtype=wp.vec2f),
+    combined: wp.array3d(dtype=wp.float32),
 ):
     """Filter the transforms of one star's channels and add them up, one row of frequencies an item.
 
-    Channels are the depths of each wavelength, as many of each.
+    Channels are the depths of each wavelength, as many of each. Columns of frequencies go in packets; the last one may
+    read on into the next row, or up to a packet beyond the end of the spectra, and drops that.
 
-    Arguments: spectra [star, channel, ky, kx]; frequency: step of the frequencies [rad/m]; metric [star, 3]: xx, xy, yy
-    of jacobian @ jacobian.T [m^2/rad^2]; baseline [wave]: wavelength / 2 pi [m]; table [wave, sample]: filter
-    against the baseline in the pupil, at steps of table_step [m]; detector [ky, kx]: real filter of all channels;
-    ramp_x [star, channel, kx], ramp_y [star, channel, ky]: phase factors and weights; combined [star, ky, kx]: the sum.
+    Arguments: spectra [star, channel, ky, 2 kx]: real and imaginary parts side by side; frequency: step of the
+    frequencies [rad/m]; metric [star, 3]: xx, xy, yy of jacobian @ jacobian.T [m^2/rad^2]; baseline [wave]: wavelength
+    / 2 pi [m]; table [wave, sample]: filter against the baseline in the pupil, at steps of table_step [m]; detector
+    [ky, packet]: real filter of all channels; ramp_x [star, channel, 2, packet]: real and imaginary parts of phase
+    factors and weights, and ramp_y [star, channel, ky]; combined [star, ky, 2 kx]: the sum.
     """
     item = first + wp.tid()
     n_row = spectra.shape[2]
+    n_column = combined.shape[2] // 2
     n_depth = spectra.shape[1] // table.shape[0]
     star = item // n_row
     row = item % n_row
     ky = wp.float32(wp.where(2 * row > n_row, row - n_row, row)) * frequency
-    for column in range(spectra.shape[3]):
-        kx = wp.float32(column) * frequency
-        separation = wp.sqrt(squared_baseline(metric, star, kx, ky)) / table_step
-        total = wp.vec2f(0.0, 0.0)
+    last = wp.float32(table.shape[1]) - wp.float32(1.001)
+    for packet in range(detector.shape[1]):
+        start = packet * LANES
+        separation = samples()
+        for i in range(LANES):
+            kx = wp.float32(start + i) * frequency
+            separation[i] = wp.sqrt(squared_baseline(metric, star, kx, ky)) / table_step
+        total_re = samples()
+        total_im = samples()
         for wave in range(table.shape[0]):
-            value = tabulated(table, wave, separation * baseline[wave])
+            value = tabulated_packet(table[wave], last, separation * baseline[wave])
             for light_channel in range(wave * n_depth, (wave + 1) * n_depth):
-                px = ramp_x[star, light_channel, column]
-                py = ramp_y[star, light_channel, row]
-                re = px[0] * py[0] - px[1] * py[1]
-                im = px[0] * py[1] + px[1] * py[0]
-                s = spectra[star, light_channel, row, column]
-                total = total + wp.vec2f(s[0] * re - s[1] * im, s[0] * im + s[1] * re) * value
-        combined[star, row, column] = total * detector[row, column]
+                px = ramp_x[star, light_channel, 0, packet]
+                py = ramp_x[star, light_channel, 1, packet]
+                along = ramp_y[star, light_channel, row]
+                line = spectra[star, light_channel, row]
+                re = every_second(line, 2 * start)
+                im = every_second(line, 2 * start + 1)
+                factor_re = px * along[0] - py * along[1]
+                factor_im = px * along[1] + py * along[0]
+                total_re = total_re + wp.cw_mul(wp.cw_mul(re, factor_re) - wp.cw_mul(im, factor_im), value)
+                total_im = total_im + wp.cw_mul(wp.cw_mul(re, factor_im) + wp.cw_mul(im, factor_re), value)
+        total_re = wp.cw_mul(total_re, detector[row, packet])
+        total_im = wp.cw_mul(total_im, detector[row, packet])
+        store_complex(combined[star, row], 2 * start, n_column - start, total_re, total_im)

@@ -58,3 +58,61 @@ def tabulated(table: wp.array2d(dtype=wp.float32), wave: wp.int32, place: wp.flo
     knot = wp.int32(at)
     before = table[wave, knot]
     return before + (at - wp.float32(knot)) * (table[wave, knot + 1] - before)
+
+
+# Loops in C, which the compiler turns into loads of whole packets; from indexed arrays it takes lane after lane. Each
+# operation is a statement, so that none is contracted.
+@wp.func_native(f"""
+    const float* from = table.data;
+    wp::vec_t<{LANES}, wp::float32> interpolated;
+    for (int i = 0; i < {LANES}; ++i) {{
+        const float at = place.c[i] < last ? place.c[i] : last;
+        const int knot = (int)at;
+        const float before = from[knot];
+        const float step = from[knot + 1] - before;
+        const float beyond = at - (float)knot;
+        const float part = beyond * step;
+        interpolated.c[i] = before + part;
+    }}
+    return interpolated;
+""")
+def tabulated_packet(
+    table: wp.array(dtype=wp.float32),
+    last: wp.float32,
+    place: samples,
+) -> samples:
+    """Linear interpolation in a contiguous table [samples] at the places of a packet, held at the last one."""
+    ...
+
+
+@wp.func_native(f"""
+    const float* from = values.data + first;
+    wp::vec_t<{LANES}, wp::float32> packet;
+    for (int i = 0; i < {LANES}; ++i)
+        packet.c[i] = from[2 * i];
+    return packet;
+""")
+def every_second(values: wp.array(dtype=wp.float32), first: wp.int32) -> samples:
+    """Every second value of a contiguous array from the first: real, or imaginary, parts of complex numbers."""
+    ...
+
+
+@wp.func_native(f"""
+    float* to = values.data + first;
+    if (count >= {LANES}) {{
+        for (int i = 0; i < {LANES}; ++i) {{
+            to[2 * i] = real.c[i];
+            to[2 * i + 1] = imaginary.c[i];
+        }}
+    }} else {{
+        for (int i = 0; i < count; ++i) {{
+            to[2 * i] = real.c[i];
+            to[2 * i + 1] = imaginary.c[i];
+        }}
+    }}
+""")
+def store_complex(
+    values: wp.array(dtype=wp.float32), first: wp.int32, count: wp.int32, real: samples, imaginary: samples
+):
+    """Store the first complex numbers of a packet in a contiguous array, real and imaginary parts side by side."""
+    ...

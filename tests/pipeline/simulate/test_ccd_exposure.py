@@ -1,0 +1,62 @@
+"""Exposures of several CCDs by one call of the engine."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from pachon.core.errors import DomainError
+from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.simulate import ccd_loop
+from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_ccd, expose_ccds
+from pachon.pipeline.simulate.photometry import PROVISIONAL_FWHM
+from pachon.wavefront.chief_rays import fields_at, fields_of_groups
+
+NAMES = ("R22_S11", "R41_S21")
+
+
+@pytest.fixture(scope="module")
+def experiment(tiny):
+    return Experiment.from_config(tiny(ccds=NAMES))
+
+
+@pytest.fixture(scope="module")
+def stars(experiment):
+    return {name: ccd_stars(experiment, name, PROVISIONAL_FWHM) for name in NAMES}
+
+
+@pytest.mark.long
+def test_ccds_exposed_together_have_the_bytes_of_each_alone(experiment, stars):
+    together = expose_ccds(experiment, stars, centered=True, threads=2)
+    assert [exposure.name for exposure in together] == list(NAMES)
+    for exposure in together:
+        alone = expose_ccd(experiment, exposure.name, centered=True, threads=1)
+        for kind in ("holdout", "observed", "centered"):
+            for name, values in vars(getattr(alone, kind)).items():
+                assert np.array_equal(getattr(getattr(exposure, kind), name), values), (kind, name)
+
+
+def test_fields_of_groups_have_the_bytes_of_each_alone(experiment, stars):
+    groups = [stars[name].observed for name in NAMES] + [np.empty((0, 2)), stars[NAMES[0]].holdout[:1]]
+    wavelength = 620e-9
+    together = fields_of_groups(
+        experiment.telescope, np.concatenate(groups), [len(group) for group in groups], wavelength
+    )
+    alone = [fields_at(experiment.telescope, group, wavelength) for group in groups if len(group)]
+    assert np.array_equal(together, np.concatenate(alone))
+
+
+@pytest.mark.long
+def test_an_error_names_its_ccd_after_the_ccds_before_it(experiment, stars):
+    # Far outside the field no light arrives.
+    dark = dataclasses.replace(stars[NAMES[1]], observed=np.full((3, 2), 0.8), magnitude=np.full(3, 18.0))
+    modelled = []
+    with pytest.raises(DomainError, match=f"CCD {NAMES[1]}"):
+        ccd_loop.simulate_ccds(
+            experiment,
+            lambda exposure: modelled.append(exposure.name),
+            NAMES,
+            fields={NAMES[0]: stars[NAMES[0]], NAMES[1]: dark},
+            threads=1,
+        )
+    assert modelled == [NAMES[0]]

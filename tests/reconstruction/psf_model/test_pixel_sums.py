@@ -1,0 +1,33 @@
+"""Sums over stars and powers of pixels, against NumPy."""
+
+import numpy as np
+import pytest
+
+from pachon.reconstruction.psf_model.pixel_sums import powers_and_variances, sums_of_products
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (3, 40, 32), (60, 41, 961), (7, 0, 5), (0, 4, 5)])
+def test_sums_are_added_row_after_row_whatever_the_batch(shape):
+    positions, rows, columns = shape
+    rng = np.random.default_rng(sum(shape))
+    weights, values = rng.normal(size=(positions, rows)), rng.normal(size=(rows, columns))
+    restated = np.zeros((positions, columns))
+    for weight, row in zip(weights.T, values, strict=True):
+        restated += weight[:, None] * row
+    assert np.array_equal(sums_of_products(weights, values), restated)
+    for i in range(min(positions, 3)):
+        assert np.array_equal(sums_of_products(weights[i : i + 1], values), restated[i : i + 1])
+
+
+@pytest.mark.parametrize(("axes", "pixels"), [(1, 1), (39, 961), (299, 40)])
+def test_powers_and_logarithms_of_variances(axes, pixels):
+    rng = np.random.default_rng(axes)
+    squares, spectrum, relative = rng.chisquare(1, (axes, pixels)), rng.uniform(0, 1, axes), rng.uniform(0, 1, pixels)
+    # The largest that there are: all variance along one axis, of the brightest pixel.
+    spectrum[:] *= axes / spectrum.sum()
+    spectrum[0], relative[0] = axes, 1.0
+    factors = np.array([0.0, 1e-3, 1.0, 4.0**12])
+    powers, variances = powers_and_variances(squares, spectrum, relative, factors)
+    restated = 1.0 + factors[:, None, None] * spectrum[:, None] * relative
+    np.testing.assert_allclose(powers, (squares / restated).sum(axis=1), rtol=1e-12)
+    np.testing.assert_allclose(variances, np.log(restated).sum(axis=(1, 2)), rtol=1e-12)
