@@ -240,7 +240,15 @@ class LongExposureRenderer(PsfRenderer):
         if kind == _NEAR:
             optics = self._trace(stars.fields, self._pupil.points, self._threads)
             return self._expose_spokes(optics, self._edges(stars.fields), stars)
-        return MeanRaysRenderer(self._inputs, kind).expose_without_refinement(stars)
+        return self._expose_rays(kind, stars)
+
+    def _expose_rays(self, rays: int, stars: Stars) -> ExposedStars:
+        """Expose stars far from focus by a number of rays."""
+        return MeanRaysRenderer(self._inputs, rays).expose_without_refinement(stars)
+
+    def _exposed_spectra(self, spectrum: np.ndarray, optics: PupilOptics) -> np.ndarray:
+        """Return the transfer functions of stars in one exposure; of this engine the mean ones."""
+        return spectrum
 
     def _expose_lattice(self, stars: Stars) -> ExposedStars:
         """Expose stars by lattices as fine as each needs, or by rays where that is too fine."""
@@ -253,7 +261,7 @@ class LongExposureRenderer(PsfRenderer):
 
         def expose(kind: int, stars: Stars) -> ExposedStars:
             if kind < 0:
-                return MeanRaysRenderer(self._inputs, -kind).expose_without_refinement(stars)
+                return self._expose_rays(-kind, stars)
             lattice = self._lattice.refined(kind)
             step = max(1, self.batch // kind**2)
             parts = (stars[first : first + step] for first in range(0, len(stars), step))
@@ -270,14 +278,15 @@ class LongExposureRenderer(PsfRenderer):
         """Expose stars by the autocorrelation of their lattices, batch by batch."""
         spectra, lit, points, offsets = [], [], [], []
         for lattice, rays, stars in parts:
-            spectra += self._map(
+            transfers = self._map(
                 partial(self._autocorrelation_transfer, lattice, rays, stars.photons), range(len(stars))
             )
+            spectra.append(self._exposed_spectra(np.stack(transfers), rays.optics))
             lit.append(np.repeat(rays.optics.lit.mean(axis=2), len(self._wavelengths), axis=1))
             points.append(rays.optics.reference_points)
             offsets.append(stars.offsets)
         together = (np.concatenate(values) for values in (offsets, lit, points))
-        return self._sampled(np.stack(spectra), *together)
+        return self._sampled(np.concatenate(spectra), *together)
 
     def _autocorrelation_transfer(
         self, lattice: LatticeTransfer, rays: LatticeRays, photons: np.ndarray | None, star: int
@@ -321,7 +330,9 @@ class LongExposureRenderer(PsfRenderer):
         return self._clear_area(edges) / (math.pi * (outer**2 - inner**2))
 
     def _expose_spokes(self, optics: PupilOptics, edges: np.ndarray, stars: Stars) -> ExposedStars:
-        spectrum = self._transform(optics, edges, self._clear_area(edges), stars.photons)
+        spectrum = self._exposed_spectra(
+            self._transform(optics, edges, self._clear_area(edges), stars.photons), optics
+        )
         lit_fraction = np.repeat(self._lit_fraction(edges)[:, None], len(self._wavelengths), axis=1)
         return self._sampled(spectrum, stars.offsets, lit_fraction, optics.reference_points)
 
