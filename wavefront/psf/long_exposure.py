@@ -122,12 +122,10 @@ class LongExposureRenderer(PsfRenderer):
     depths = 2
 
     def __init__(self, inputs: PsfInputs, options: LongExposureEngine) -> None:
-        assert inputs.atmosphere is not None, "the engine needs one"
         super().__init__(inputs)
         self._options = options
-        self._r0, self._outer_scale = inputs.atmosphere.r0, inputs.atmosphere.outer_scale
         #: Side of the periodic image [m].
-        self.period = GRID_MARGIN * self._plane.side
+        self.period = self._period()
         # Baseline of one step of frequency at each wavelength [m].
         self._step = self._wavelengths * self.focal_length / self.period
         # Width of the pupil's ring.
@@ -150,9 +148,15 @@ class LongExposureRenderer(PsfRenderer):
             star_bytes = 2 * 2 * 4 * LANES * self._detector.shape[2] * len(self._pupil.points) * self._channels.depths
         self.batch = max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
 
+    def _period(self) -> float:
+        """Return the side of the periodic image [m]."""
+        return GRID_MARGIN * self._plane.side
+
     def _turbulence(self, baseline: np.ndarray) -> np.ndarray:
         """Return the mean transfer function of the atmosphere at baselines [m], shape [n_wave, n]."""
-        return coherence(structure_function(baseline, self._r0, self._outer_scale), self._wavelengths[:, None])
+        air = self._atmosphere
+        assert air is not None, "the engine needs one"
+        return coherence(structure_function(baseline, air.r0, air.outer_scale), self._wavelengths[:, None])
 
     def _transfer_bounds(self, longest: float) -> np.ndarray:
         """Return the largest transfer of atmosphere and detector at each frequency up to a baseline [m], [n_wave, n].
