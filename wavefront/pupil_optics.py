@@ -51,8 +51,12 @@ class PupilOptics:
 
     def star(self, index: int) -> PupilOptics:
         """Return the optics of one of the stars."""
+        return self.stars(slice(index, index + 1))
+
+    def stars(self, index: slice | np.ndarray) -> PupilOptics:
+        """Return the optics of some of the stars."""
         names = ("displacement", "path", "lit", "jacobian", "reference_points", "reference_cosines", "fields")
-        return replace(self, **{name: getattr(self, name)[index : index + 1] for name in names})
+        return replace(self, **{name: getattr(self, name)[index] for name in names})
 
     @property
     def exit_cosines(self) -> np.ndarray:

@@ -32,6 +32,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
@@ -56,9 +57,6 @@ PUPIL_POINTS = 80
 #: Side of the periodic image over that of the stamp: wings that wrap around make the edge of a stamp of 6 arcsec 1.4
 #: times as bright as it should be, and change ellipticities by 1e-6, the FWHM by 1e-5 and the rms size by 7e-5.
 GRID_MARGIN = 1.25
-# Largest transfer function of atmosphere and detector at a frequency that is left out; with pixels of 10 um all make
-# 2e-6 of the peak of the image.
-_NEGLIGIBLE = 1e-5
 # Largest coherence at a baseline half as long as the pupil's ring is wide, where the strips along its rims are a half
 # of it: on AuxTel, where 0.04 are left, they are wrong by 1e-3 in e.
 _LARGEST_LEFT = 1e-3
@@ -105,6 +103,7 @@ class LongExposureEngine(PsfEngine):
 
     name = "long_exposure"
     needs_atmosphere = True
+    has_turbulence = False
 
     n_pupil: int | None = None
 
@@ -120,6 +119,9 @@ class LongExposureRenderer(PsfRenderer):
     """Renderer of :class:`LongExposureEngine`."""
 
     depths = 2
+    #: Largest transfer function of atmosphere and detector at a frequency that is left out; with pixels of 10 um all
+    #: make 2e-6 of the peak of the image.
+    negligible: ClassVar[float] = 1e-5
 
     def __init__(self, inputs: PsfInputs, options: LongExposureEngine) -> None:
         super().__init__(inputs)
@@ -182,7 +184,7 @@ class LongExposureRenderer(PsfRenderer):
     def _choose_frequencies(self) -> None:
         """Choose the largest frequency of the sums."""
         longest = self._diameter if self._general else self._width
-        strong = np.flatnonzero((self._transfer_bounds(longest) > _NEGLIGIBLE).any(axis=0))
+        strong = np.flatnonzero((self._transfer_bounds(longest) > self.negligible).any(axis=0))
         #: Largest frequency along either axis, in steps of one over the period.
         self._reach = int(strong[-1]) + 1 if strong.size else 1
 
@@ -235,16 +237,15 @@ class LongExposureRenderer(PsfRenderer):
             kinds = np.where(rays > 0, rays, kinds)
         if (kinds == _NEAR).all():
             return self._expose_spokes(optics, edges, stars)
-        return expose_by_kind(kinds, self._expose_kind, stars)
+        near = np.flatnonzero(kinds == _NEAR)
 
-    def _expose_kind(self, kind: int, stars: Stars) -> ExposedStars:
-        """Expose stars of a kind: by strips, by a lattice or, far from focus, by a number of rays."""
-        if kind == _VIGNETTED:
-            return self._expose_lattice(stars)
-        if kind == _NEAR:
-            optics = self._trace(stars.fields, self._pupil.points, self._threads)
-            return self._expose_spokes(optics, self._edges(stars.fields), stars)
-        return self._expose_rays(kind, stars)
+        def expose(kind: int, stars: Stars) -> ExposedStars:
+            """Expose stars of a kind: by strips, by a lattice or, far from focus, by a number of rays."""
+            if kind == _NEAR:
+                return self._expose_spokes(optics.stars(near), edges[near], stars)
+            return self._expose_lattice(stars) if kind == _VIGNETTED else self._expose_rays(kind, stars)
+
+        return expose_by_kind(kinds, expose, stars)
 
     def _expose_rays(self, rays: int, stars: Stars) -> ExposedStars:
         """Expose stars far from focus by a number of rays."""

@@ -27,9 +27,8 @@ def lane_total(values: samples):
 
 
 @wp.func
-def half_plane(
+def weighted_moments(
     star: wp.int32,
-    sign: wp.int32,
     spectrum: wp.array4d(dtype=samples),
     detector: wp.array3d(dtype=samples),
     rows: wp.array(dtype=wp.int32),
@@ -39,37 +38,58 @@ def half_plane(
     yy: wp.float32,
     xy: wp.float32,
 ):
-    """Weighted sums about a centre [turns a step of frequency], of the rows above or below zero."""
+    """Weighted sums about a centre, in radians a step of frequency, under a weight of moments xx, yy, xy.
+
+    Factors of a row follow from those of the row before.
+    """
+    half = wp.float32(0.5)
+    turn_c = wp.cos(center_y)
+    turn_s = wp.sin(center_y)
     zeroth = samples()
     first_x = samples()
     first_y = samples()
     second_xx = samples()
     second_yy = samples()
     second_xy = samples()
-    below = 1 - sign
     for packet in range(rows.shape[0]):
         kx = lane_numbers(packet)
-        for row in range(rows[packet]):
-            ky = wp.float32((1 - 2 * below) * row)
-            # The weight's moments times the frequency.
-            moved_x = xx * kx + samples(xy * ky)
-            moved_y = xy * kx + samples(yy * ky)
-            square = wp.cw_mul(moved_x, kx) + ky * moved_y
-            weight = samples()
-            for i in range(LANES):
-                weight[i] = wp.exp(wp.float32(-0.5) * square[i])
-            cosine, sine = unit_circle(center_x * kx + samples(center_y * ky))
-            light = wp.cw_mul(weight, detector[below, row, packet])
-            re = spectrum[star, 2 * below, row, packet]
-            im = spectrum[star, 2 * below + 1, row, packet]
-            even = wp.cw_mul(light, wp.cw_mul(re, cosine) - wp.cw_mul(im, sine))
-            odd = wp.cw_mul(light, wp.cw_mul(re, sine) + wp.cw_mul(im, cosine))
-            zeroth = zeroth + even
-            first_x = first_x - wp.cw_mul(odd, moved_x)
-            first_y = first_y - wp.cw_mul(odd, moved_y)
-            second_xx = second_xx + wp.cw_mul(even, samples(xx) - wp.cw_mul(moved_x, moved_x))
-            second_yy = second_yy + wp.cw_mul(even, samples(yy) - wp.cw_mul(moved_y, moved_y))
-            second_xy = second_xy + wp.cw_mul(even, samples(xy) - wp.cw_mul(moved_x, moved_y))
+        along = samples()
+        slant = samples()
+        slant_back = samples()
+        for i in range(LANES):
+            along[i] = wp.exp(-half * xx * kx[i] * kx[i])
+            slant[i] = wp.exp(-xy * kx[i])
+            slant_back[i] = wp.exp(xy * kx[i])
+        start_c, start_s = unit_circle((center_x / wp.float32(wp.TAU)) * kx)
+        for below in range(2):
+            sign = wp.float32(1 - 2 * below)
+            turn = turn_s * sign
+            tilt = slant
+            if below == 1:
+                tilt = slant_back
+            weight = along
+            cosine = start_c
+            sine = start_s
+            for row in range(rows[packet]):
+                ky = sign * wp.float32(row)
+                light = wp.exp(-half * yy * ky * ky) * wp.cw_mul(weight, detector[below, row, packet])
+                re = spectrum[star, 2 * below, row, packet]
+                im = spectrum[star, 2 * below + 1, row, packet]
+                even = wp.cw_mul(light, wp.cw_mul(re, cosine) - wp.cw_mul(im, sine))
+                odd = wp.cw_mul(light, wp.cw_mul(re, sine) + wp.cw_mul(im, cosine))
+                # The weight's moments times the frequency.
+                moved_x = xx * kx + samples(xy * ky)
+                moved_y = xy * kx + samples(yy * ky)
+                zeroth = zeroth + even
+                first_x = first_x - wp.cw_mul(odd, moved_x)
+                first_y = first_y - wp.cw_mul(odd, moved_y)
+                second_xx = second_xx + wp.cw_mul(even, samples(xx) - wp.cw_mul(moved_x, moved_x))
+                second_yy = second_yy + wp.cw_mul(even, samples(yy) - wp.cw_mul(moved_y, moved_y))
+                second_xy = second_xy + wp.cw_mul(even, samples(xy) - wp.cw_mul(moved_x, moved_y))
+                weight = wp.cw_mul(weight, tilt)
+                turned = turn_c * cosine - turn * sine
+                sine = turn_c * sine + turn * cosine
+                cosine = turned
     return weighted_sums(
         lane_total(zeroth),
         lane_total(first_x),
@@ -102,7 +122,6 @@ def measure_spectra(
     converged, 2 where moments are not positive, 8 where there is no light.
     """
     star = first + wp.tid()
-    one = wp.float64(1.0)
     zero = wp.float64(0.0)
     x = zero
     y = zero
@@ -110,23 +129,19 @@ def measure_spectra(
     yy = start
     xy = zero
     flag = wp.int32(1)
-    turn = one / wp.float64(wp.TAU)
     for _ in range(most_steps):
         if flag == 1:
-            sums = weighted_sums()
-            for sign in range(2):
-                sums = sums + half_plane(
-                    star,
-                    sign,
-                    spectrum,
-                    detector,
-                    rows,
-                    wp.float32(x * turn),
-                    wp.float32(y * turn),
-                    wp.float32(xx),
-                    wp.float32(yy),
-                    wp.float32(xy),
-                )
+            sums = weighted_moments(
+                star,
+                spectrum,
+                detector,
+                rows,
+                wp.float32(x),
+                wp.float32(y),
+                wp.float32(xx),
+                wp.float32(yy),
+                wp.float32(xy),
+            )
             if not (sums[0] > zero):
                 flag = wp.int32(8)
             else:

@@ -224,6 +224,8 @@ def _renderer(options: LongExposureEngine, inputs: PsfInputs, weight_rms: float)
 class _Moments(LongExposureRenderer):
     """Moments of the long exposure, in place of its stamps."""
 
+    negligible = 1e-4
+
     def __init__(self, inputs: PsfInputs, options: Any, weight_rms: float) -> None:
         self._weight_angle = weight_rms
         super().__init__(inputs, options)

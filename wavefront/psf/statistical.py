@@ -70,7 +70,7 @@ class StatisticalEngine(LongExposureEngine):
     """
 
     name = "statistical"
-    needs_atmosphere = True
+    has_turbulence = True
 
     n_pupil: int | None = None
 
@@ -96,6 +96,9 @@ def check_exposure(exposure: float, start: float = 0.0, key: str = "exposure") -
 
 class StatisticalRenderer(LongExposureRenderer):
     """Renderer of :class:`StatisticalEngine`."""
+
+    # What is left out moves e by 1e-6 and pixels by 3e-5 of the peak, a hundredth of what third moments would.
+    negligible = 1e-4
 
     def __init__(self, inputs: PsfInputs, options: StatisticalEngine) -> None:
         air = inputs.atmosphere
