@@ -15,6 +15,7 @@ import numpy as np
 import scipy.fft
 import warp as wp
 
+from ...core.errors import DomainError
 from ...core.launch import launch
 from ...core.random_streams import stream
 from ...core.warp_arrays import warp_array
@@ -31,7 +32,7 @@ NOLL = range(4, 12)
 _MARGIN = 1.5
 #: Samples in the angle under which the highest layer crosses the pupil, at least, and most samples on a side.
 _SAMPLES = 6.0
-_MOST_SAMPLES = 1024
+_MOST_SAMPLES = 2048
 _LEAST_SAMPLES = 16
 #: Rings and spokes of lags, between which covariances are interpolated.
 _RINGS = 26
@@ -187,9 +188,14 @@ def _spline_gain(size: int) -> np.ndarray:
 
 
 def _grid_size(wanted: float) -> int:
-    """Return an even number of samples with quick transforms, within bounds."""
-    count = min(max(math.ceil(wanted), _LEAST_SAMPLES), _MOST_SAMPLES)
-    return min(2 * scipy.fft.next_fast_len(-(-count // 2), real=True), _MOST_SAMPLES)
+    """Return an even number of samples with quick transforms; DomainError if they are too many."""
+    if wanted > _MOST_SAMPLES:
+        raise DomainError(
+            f"engine = 'statistical': the field under the highest layer is {wanted / _SAMPLES:.0f} pupils wide; expected"
+            f" at most {_MOST_SAMPLES / _SAMPLES:.0f} ('fast' has no such limit)"
+        )
+    count = max(math.ceil(wanted), _LEAST_SAMPLES)
+    return 2 * int(scipy.fft.next_fast_len(-(-count // 2), real=True))
 
 
 def _draw_wavefronts(
@@ -201,11 +207,17 @@ def _draw_wavefronts(
     for n, altitude in enumerate(air.altitudes):
         if altitude > 0.0:
             groups.setdefault(max(grid.side, least / altitude), []).append(n)
-    covariance = mean_wavefront_covariance(air.on_ground(), (0.0, 0.0), NOLL, air.diameter, air.obscuration)[0, :, 0]
-    values, vectors = np.linalg.eigh(covariance)
     normal = stream(seed, "atmosphere", epoch, "mean wavefront").standard_normal(len(NOLL))
-    ground = vectors @ (np.sqrt(np.maximum(values, 0.0)) * normal)
+    ground = _ground_factor(air.on_ground()) @ normal
     return ground, tuple(_wavefront_fields(air, layers, side, seed, epoch) for side, layers in groups.items())
+
+
+@lru_cache(maxsize=4)
+def _ground_factor(air: ExposedAir) -> np.ndarray:
+    """Return a square root of the covariance of Zernikes of layers on the ground [m], [n_noll, n_noll]."""
+    covariance = mean_wavefront_covariance(air, (0.0, 0.0), NOLL, air.diameter, air.obscuration)[0, :, 0]
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int, epoch: int) -> SplineFields:

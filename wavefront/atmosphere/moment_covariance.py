@@ -50,9 +50,8 @@ _DRIFT = 1.4
 _NEAR_DRIFT = 0.5
 # Drift up to which delays count as near zero [m]: peaks of the slopes' covariance are narrower.
 _NEAR = 8.0
-# Fewest and most delays on either side of zero.
+# Fewest delays on either side of zero.
 _LEAST_DELAYS = 64
-_MOST_DELAYS = 2000
 # Steps of the shift of the lattice, in parts of its spacing: of the plastic number (Roberts 2018), which fill a square
 # evenly.
 _PLASTIC = 1.32471795724474602596
@@ -215,9 +214,9 @@ class _Delays:
         """Return those of an exposure: dense near zero, where the slopes of all layers vary most."""
         fastest = max((math.hypot(x, y) for x, y in air.velocities), default=0.0)
         near = min(_NEAR / max(fastest, 1e-9), 0.5 * air.exposure)
-        near_count = max(2, math.ceil(near * fastest / _NEAR_DRIFT))
+        near_count = max(_LEAST_DELAYS // 2, math.ceil(near * fastest / min(_NEAR_DRIFT, air.diameter / 16.0)))
         far = air.exposure - near
-        far_count = min(max(_LEAST_DELAYS, math.ceil(far * fastest / _DRIFT)), _MOST_DELAYS)
+        far_count = max(_LEAST_DELAYS, math.ceil(far * fastest / min(_DRIFT, air.diameter / 4.0)))
         edges = np.concatenate([np.linspace(0.0, near, near_count + 1)[:-1], np.linspace(near, air.exposure, far_count + 1)])
         edges = np.concatenate([-edges[:0:-1], edges])
         time, width = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)

@@ -233,7 +233,7 @@ class LongExposureRenderer(PsfRenderer):
         edges = self._edges(stars.fields)
         kinds = np.where(self._lit_fraction(edges) < _LEAST_LIT, _VIGNETTED, _NEAR)
         if self._options.n_pupil is None:
-            rays = ray_counts(optics, self._plane.pixel_size)
+            rays = self._ray_counts(optics)
             kinds = np.where(rays > 0, rays, kinds)
         if (kinds == _NEAR).all():
             return self._expose_spokes(optics, edges, stars)
@@ -246,6 +246,10 @@ class LongExposureRenderer(PsfRenderer):
             return self._expose_lattice(stars) if kind == _VIGNETTED else self._expose_rays(kind, stars)
 
         return expose_by_kind(kinds, expose, stars)
+
+    def _ray_counts(self, optics: PupilOptics) -> np.ndarray:
+        """Return the number of rays of each star far from focus, 0 near it, shape [n_star] int."""
+        return ray_counts(optics, self._plane.pixel_size)
 
     def _expose_rays(self, rays: int, stars: Stars) -> ExposedStars:
         """Expose stars far from focus by a number of rays."""

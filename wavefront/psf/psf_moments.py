@@ -15,7 +15,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.errors import ConfigError, DomainError, shown
+from ...core.errors import ConfigError, DomainError
 from ...core.launch import launch
 from ...core.point_plots import draw_shapes
 from ...core.result import Result
@@ -26,6 +26,7 @@ from ...models.telescope import Telescope
 from ..aberration import ResidualWavefront
 from ..atmosphere.atmosphere import Atmosphere
 from ..atmosphere.turbulence import fried_parameter
+from ..pupil_optics import PupilOptics
 from ..request import Request
 from .engine import ExposedStars, PsfEngine, PsfInputs, Stars
 from .engines import psf_engine
@@ -35,7 +36,7 @@ from .moment_kernels import ELLIPSE, measure_spectra
 from .psf import psf_inputs
 from .sample_packets import samples
 from .stamps import Stamps
-from .statistical import StatisticalEngine, StatisticalRenderer
+from .statistical import StatisticalEngine, StatisticalRenderer, far_from_focus
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,6 +50,8 @@ _WEIGHTS = 16.0
 _SEEINGS = 8.0
 #: Width of the narrowest weight over that of the first: it decides which frequencies count.
 _NARROWEST = 0.5
+# Pixels of a stamp that is wider than any star.
+_WIDE_STAMP = 4096
 # Most stars of one batch.
 _BATCH = 1024
 _MOST_STEPS = 60
@@ -191,7 +194,9 @@ def _result(
     weighted, adaptive = np.split(values, 2, axis=1)
     e1, e2, size, flags = _shapes(weighted)
     g1, g2, sigma, adaptive_flags = _shapes(adaptive)
-    if inputs.atmosphere is not None:
+    if inputs.atmosphere is None:
+        g1, g2, sigma = (np.full(len(e1), np.nan) for _ in range(3))
+    else:
         flags = flags | adaptive_flags
     good = flags == 0
     x, y = np.where(good, weighted[:, :2].T / inputs.plane.pixel_size, np.nan)
@@ -230,6 +235,8 @@ class _Moments(LongExposureRenderer):
         self._weight_angle = weight_rms
         super().__init__(inputs, options)
         self.batch = min(_BATCH, 4 * self.batch)
+        # No light falls beside a stamp.
+        self._inputs = replace(self._inputs, plane=replace(self._inputs.plane, size=_WIDE_STAMP))
 
     expose = LongExposureRenderer._expose
 
@@ -249,6 +256,9 @@ class _Moments(LongExposureRenderer):
         bounds = super()._transfer_bounds(longest)
         k = 2.0 * math.pi / self.period * np.arange(1, bounds.shape[1] + 1)
         return np.asarray(bounds * np.exp(-0.5 * (_NARROWEST * self._weight * k) ** 2))
+
+    def _ray_counts(self, optics: PupilOptics) -> np.ndarray:
+        return far_from_focus(optics, self.focal_length)
 
     def _expose_rays(self, rays: int, stars: Stars) -> ExposedStars:
         raise DomainError(

@@ -33,6 +33,7 @@ from ..atmosphere.moment_covariance import LEAST_EXPOSURE, ExposedAir, MomentRes
 from ..atmosphere.turbulence import diffraction_otf
 from ..pupil_optics import PupilOptics
 from .engine import ExposedStars, PsfInputs, Stars
+from .far_from_focus import blur_radii
 from .image_plane import square_transfer
 from .long_exposure import LongExposureEngine, LongExposureRenderer
 from .sample_packets import samples
@@ -40,6 +41,9 @@ from .statistical_kernels import blur_spectra
 
 #: FWHM of the weight under which moments of the fourth order have the same effect as the kernel [rad].
 MATCHED_FWHM = 0.7 * ARCSEC
+#: Rms radius of the blur by the optics from which a star counts as far from focus [rad]: that of :data:`.mean_rays.FAR`
+#: on the LSST.
+FAR_ANGLE = 1.0 * ARCSEC
 # Wavenumbers of the response, and the largest in units of one over the weight's rms width.
 _WAVENUMBERS = 512
 _HIGHEST = 6.0
@@ -158,11 +162,19 @@ class StatisticalRenderer(LongExposureRenderer):
         )
         return spectrum
 
+    def _ray_counts(self, optics: PupilOptics) -> np.ndarray:
+        return far_from_focus(optics, self.focal_length)
+
     def _expose_rays(self, rays: int, stars: Stars) -> ExposedStars:
         raise DomainError(
             f"{field_label(stars.fields[0])}: the star is far from focus; expected stars near it with engine = "
             "'statistical' ('fast' and 'long_exposure' draw others)"
         )
+
+
+def far_from_focus(optics: PupilOptics, focal_length: float) -> np.ndarray:
+    """Return which stars are too far from focus for sums over few points of the pupil, shape [n_star] int."""
+    return (blur_radii(optics) > FAR_ANGLE * focal_length).astype(np.int64)
 
 
 @lru_cache(maxsize=8)
