@@ -17,6 +17,7 @@ import json
 import math
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -148,9 +149,7 @@ def compare(options):
             for n in range(options.draws)
         ]
     )
-    noise = 0.5 * np.mean(
-        [half_variograms(by_screens[:, 1], fields, 3.0 * math.sqrt(2.0) / 60.0)], axis=1
-    )[0]
+    noise = 0.5 * np.mean([half_variograms(by_screens[:, 1], fields, 3.0 * math.sqrt(2.0) / 60.0)], axis=1)[0]
     close = 0.5 * half_variograms(drawn[:, 1], fields, 3.0 * math.sqrt(2.0) / 60.0).mean(axis=0)
     noise = 2.0 * (noise - close)
     print(f"{case(options)}: {len(by_screens)} exposures by screens, {len(drawn)} drawn, {len(fields)} stars")
@@ -278,17 +277,16 @@ def times(options):
             air = pachon.Atmosphere.from_site("cerro_pachon", 3, epoch=epoch)
             air.screens("slopes", threads=1)
             arguments = {"focal_plane": plane, "atmosphere": air, "threads": 1}
-            for name, places, call in (
-                ("fast", few, lambda f: pachon.make_psfs(telescope, f, wavelengths, engine="fast", **arguments)),
-                ("statistical, first", fields[:1],
-                 lambda f: pachon.make_psfs(telescope, f, wavelengths, engine="statistical", **arguments)),
-                ("statistical", fields,
-                 lambda f: pachon.make_psfs(telescope, f, wavelengths, engine="statistical", **arguments)),
-                ("moments", fields,
-                 lambda f: pachon.psf_moments(telescope, f, wavelengths, engine="statistical", **arguments)),
-            ):  # fmt: skip
+            by_engine = partial(pachon.make_psfs, telescope, wavelengths=wavelengths, **arguments)
+            shapes_alone = partial(pachon.psf_moments, telescope, wavelengths=wavelengths, **arguments)
+            for name, engine, places, call in (
+                ("fast", "fast", few, by_engine),
+                ("statistical, first", "statistical", fields[:1], by_engine),
+                ("statistical", "statistical", fields, by_engine),
+                ("moments", "statistical", fields, shapes_alone),
+            ):
                 start = time.process_time()
-                call(places)
+                call(places, engine=engine)
                 spent = time.process_time() - start
                 if epoch:
                     seconds[name].append(spent / len(places) if name != "statistical, first" else spent)

@@ -28,8 +28,8 @@ from ..models.site import Site
 from ..models.telescope import Telescope
 from ..raytrace.ideal_lens import require_image
 from ..reconstruction.psf_model.basis import COMPONENTS
-from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.psf.engines import ENGINES
+from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.psf.long_exposure import LongExposureEngine, default_points
 from .alignment_states import ENDINGS as STATE_ENDINGS
 from .alignment_states import with_active_optics_state

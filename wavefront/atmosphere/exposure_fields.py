@@ -191,8 +191,8 @@ def _grid_size(wanted: float) -> int:
     """Return an even number of samples with quick transforms; DomainError if they are too many."""
     if wanted > _MOST_SAMPLES:
         raise DomainError(
-            f"engine = 'statistical': the field under the highest layer is {wanted / _SAMPLES:.0f} pupils wide; expected"
-            f" at most {_MOST_SAMPLES / _SAMPLES:.0f} ('fast' has no such limit)"
+            f"engine = 'statistical': the field under the highest layer is {wanted / _SAMPLES:.0f} pupils wide; "
+            f"expected at most {_MOST_SAMPLES / _SAMPLES:.0f} ('fast' has no such limit)"
         )
     count = max(math.ceil(wanted), _LEAST_SAMPLES)
     return 2 * int(scipy.fft.next_fast_len(-(-count // 2), real=True))

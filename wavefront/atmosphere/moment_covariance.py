@@ -1,8 +1,8 @@
 r"""Covariances over the field of the second moments of the images of one exposure, by turbulence.
 
 The moments of the image of a star about its centroid are means over pupil and exposure of products of slopes,
-:math:`M_{ij} = \langle s_i s_j \rangle - \langle s_i \rangle \langle s_j \rangle`. The slopes s are Gaussian, and so, by
-Wick's theorem, is known the covariance of the moments of two stars a lag d apart:
+:math:`M_{ij} = \langle s_i s_j \rangle - \langle s_i \rangle \langle s_j \rangle`. The slopes s are Gaussian, and
+Wick's theorem gives the covariance of the moments of two stars a lag d apart:
 
 .. math:: \mathrm{cov}(M_{ij}, M'_{kl}) = \langle S_{ik} S_{jl} + S_{il} S_{jk} \rangle, \qquad
           S(u, \tau) = \sum_{layers} w \, S_{vK}(u - H d - V \tau).
@@ -217,7 +217,8 @@ class _Delays:
         near_count = max(_LEAST_DELAYS // 2, math.ceil(near * fastest / min(_NEAR_DRIFT, air.diameter / 16.0)))
         far = air.exposure - near
         far_count = max(_LEAST_DELAYS, math.ceil(far * fastest / min(_DRIFT, air.diameter / 4.0)))
-        edges = np.concatenate([np.linspace(0.0, near, near_count + 1)[:-1], np.linspace(near, air.exposure, far_count + 1)])
+        inner, outer = np.linspace(0.0, near, near_count + 1), np.linspace(near, air.exposure, far_count + 1)
+        edges = np.concatenate([inner[:-1], outer])
         edges = np.concatenate([-edges[:0:-1], edges])
         time, width = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
         weight = (1.0 - np.abs(time) / air.exposure) * width

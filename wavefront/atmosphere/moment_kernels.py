@@ -53,12 +53,12 @@ def average_products(
 
     Arguments: lag [lag, 2] of the stars' field slopes [rad]; delay [s] and its weight [delay]; packet_start [delay + 1]
     of the packets of each delay; baseline [packet, 3] of the pupil: x, y [m], weight of sum 1; altitude, velocity,
-    weight of the layers; isotropic, directed: tables of the slopes' covariance, zero at the end; per_step: one over the
-    step of the tables [1/m]; farthest: distance of a layer's centre from which on none of its baselines is within the
-    tables [m]; common [delay, 12]: the terms of layers on the ground
-    alone; where it is empty, these are computed too; place [lag, layer, 3]: room; squares [lag, 9]: averages of pp, qq, ss, pq, ps, qs, and of fourth powers:
-    a^4 + c^4 - 2 b^4, the same at 45 degrees, (a + c)^4 / 16; terms [lag, delay, 3 or 12]: averages of a, b, c over the
-    baselines, and where there is room what the delay adds to the squares. p = xx - yy, q = 2 xy, s = xx + yy.
+    weight of the layers; table: the slopes' covariance, isotropic and directed, zero at the end; per_step: one over its
+    step [1/m]; farthest: distance of a layer's centre from which on none of its baselines is within the table [m];
+    common [delay, 12]: the terms of layers on the ground alone; where it is empty, these are computed too; place [lag,
+    layer, 3]: room; squares [lag, 9]: averages of pp, qq, ss, pq, ps, qs, and of fourth powers: a^4 + c^4 - 2 b^4, the
+    same at 45 degrees, (a + c)^4 / 16; terms [lag, delay, 3 or 12]: averages of a, b, c over the baselines, and where
+    there is room what the delay adds to the squares. p = xx - yy, q = 2 xy, s = xx + yy.
     """
     item = first + wp.tid()
     n_layer = altitude.shape[0]

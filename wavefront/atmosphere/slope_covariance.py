@@ -1,6 +1,7 @@
 r"""Covariance of the slopes of turbulence, as tables against the distance of two points.
 
-With the spectrum W of the path, the slopes along x and y of two points a distance :math:`\rho` apart have the covariance
+With the spectrum W of the path, the slopes along x and y of two points a distance :math:`\rho` apart have the
+covariance
 
 .. math:: S = \begin{pmatrix} A + B \cos 2\phi & B \sin 2\phi \\ B \sin 2\phi & A - B \cos 2\phi \end{pmatrix}, \quad
           A = \tfrac12 \int k^2 W J_0(k \rho) \, d^2\nu, \quad B = -\tfrac12 \int k^2 W J_2(k \rho) \, d^2\nu,

@@ -339,9 +339,7 @@ class LongExposureRenderer(PsfRenderer):
         return self._clear_area(edges) / (math.pi * (outer**2 - inner**2))
 
     def _expose_spokes(self, optics: PupilOptics, edges: np.ndarray, stars: Stars) -> ExposedStars:
-        spectrum = self._exposed_spectra(
-            self._transform(optics, edges, self._clear_area(edges), stars.photons), optics
-        )
+        spectrum = self._exposed_spectra(self._transform(optics, edges, self._clear_area(edges), stars.photons), optics)
         lit_fraction = np.repeat(self._lit_fraction(edges)[:, None], len(self._wavelengths), axis=1)
         return self._sampled(spectrum, stars.offsets, lit_fraction, optics.reference_points)
 

@@ -153,9 +153,7 @@ def make_psfs(
         falls between the CCDs.
     """
     options, stamps = psf_engine(engine), stamps or Stamps()
-    inputs, stars = psf_inputs(
-        telescope, fields, wavelengths, focal_plane, atmosphere, aberration, stamps, threads
-    )
+    inputs, stars = psf_inputs(telescope, fields, wavelengths, focal_plane, atmosphere, aberration, stamps, threads)
     return _render_stars(options.renderer(inputs), inputs, stars, stamps.recenter, progress)
 
 

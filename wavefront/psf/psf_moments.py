@@ -201,9 +201,7 @@ def _result(
     good = flags == 0
     x, y = np.where(good, weighted[:, :2].T / inputs.plane.pixel_size, np.nan)
     e1, e2, size, g1, g2, sigma = (np.where(good, v, np.nan) for v in (e1, e2, size, g1, g2, sigma))
-    return PsfMoments(
-        fields, e1, e2, size / focal_length, x, y, g1, g2, sigma / focal_length, lit.mean(axis=1), flags
-    )
+    return PsfMoments(fields, e1, e2, size / focal_length, x, y, g1, g2, sigma / focal_length, lit.mean(axis=1), flags)
 
 
 def _shapes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

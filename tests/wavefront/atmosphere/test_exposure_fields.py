@@ -27,7 +27,9 @@ def test_spectra_of_moments_have_the_covariances():
     """
     grid = FieldGrid.of(AIR, FIELD_RADIUS)
     factors, shared = moment_spectrum(AIR, RESPONSE, grid)
-    gain = stencil_gain(2 * np.pi * np.fft.rfftfreq(grid.size), 2 * np.pi * np.fft.fftfreq(grid.size)[:, None], "spline")
+    gain = stencil_gain(
+        2 * np.pi * np.fft.rfftfreq(grid.size), 2 * np.pi * np.fft.fftfreq(grid.size)[:, None], "spline"
+    )
     plain = [[f / gain for f in row] for row in factors]
     steps = np.array([(0, 0), (1, 0), (3, 2), (-2, 7), (12, 0), (0, 25)])
     theory = as_matrices(moment_covariance(AIR, steps * grid.side / grid.size).total(RESPONSE))
