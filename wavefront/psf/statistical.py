@@ -20,6 +20,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
@@ -204,17 +205,17 @@ class _WithAir(ResidualWavefront):
     def of(cls, base: ResidualWavefront | None, air: ExposedAir, drawn: ExposureFields) -> _WithAir:
         return cls(np.zeros(len(NOLL)), air.diameter, air.obscuration, drawn=drawn, base=base)
 
-    def at(self, slopes: np.ndarray) -> np.ndarray:
+    def at(self, slopes: ArrayLike) -> np.ndarray:
         """Return the air's coefficients [m] at field slopes [..., 2], shape [..., n_term]."""
         assert self.drawn is not None
         places = np.asarray(slopes, dtype=np.float64)
         # The wavefront leads where the path is short.
         return -self.drawn.wavefronts_at(places.reshape(-1, 2)).reshape(*places.shape[:-1], -1)
 
-    def opd(self, x: np.ndarray, y: np.ndarray, slopes: np.ndarray = (0.0, 0.0)) -> np.ndarray:
+    def opd(self, x: ArrayLike, y: ArrayLike, slopes: ArrayLike = (0.0, 0.0)) -> np.ndarray:
         total = super().opd(x, y, slopes)
         return total if self.base is None else total + self.base.opd(x, y, slopes)
 
-    def gradient(self, x: np.ndarray, y: np.ndarray, slopes: np.ndarray = (0.0, 0.0)) -> np.ndarray:
+    def gradient(self, x: ArrayLike, y: ArrayLike, slopes: ArrayLike = (0.0, 0.0)) -> np.ndarray:
         total = super().gradient(x, y, slopes)
         return total if self.base is None else total + self.base.gradient(x, y, slopes)
