@@ -281,16 +281,18 @@ def times(options):
     plane = pachon.FocalPlane.from_budget("lsst", seed=1)
     rng = np.random.default_rng(1)
     centers = plane.camera.centers
-    positions = (centers[:, None] + rng.uniform(-0.0195, 0.0195, (len(centers), 60, 2))).reshape(-1, 2)
+    positions = (centers[:, None] + rng.uniform(-0.0195, 0.0195, (len(centers), options.stars, 2))).reshape(-1, 2)
     fields = pachon.fields_at(telescope, positions, threads=1)
-    few = fields[:: len(fields) // 600]
+    few = fields[:: max(1, len(fields) // 200)]
     waves = {1: [620e-9], 5: np.linspace(545e-9, 703e-9, 5)}
     for count, wavelengths in waves.items():
         seconds = {"fast": [], "statistical, first": [], "statistical": [], "moments": []}
-        for epoch in range(4):
-            air = pachon.Atmosphere.from_site("cerro_pachon", 3, epoch=epoch)
-            air.screens("slopes", threads=1)
-            arguments = {"focal_plane": plane, "atmosphere": air, "threads": 1}
+        with_screens = pachon.Atmosphere.from_site("cerro_pachon", 3)
+        with_screens.screens("slopes", threads=1)
+        for epoch in range(1 + options.repeats):
+            # Each epoch has its own winds: nothing of the statistics of another is of use.
+            air = pachon.Atmosphere.from_site("cerro_pachon", 3, epoch=10 * count + epoch)
+            arguments = {"focal_plane": plane, "threads": 1}
             by_engine = partial(pachon.make_psfs, telescope, wavelengths=wavelengths, **arguments)
             shapes_alone = partial(pachon.psf_moments, telescope, wavelengths=wavelengths, **arguments)
             for name, engine, places, call in (
@@ -300,13 +302,13 @@ def times(options):
                 ("moments", "statistical", fields, shapes_alone),
             ):
                 start = time.process_time()
-                call(places, engine=engine)
+                call(places, engine=engine, atmosphere=with_screens if engine == "fast" else air)
                 spent = time.process_time() - start
                 if epoch:
                     seconds[name].append(spent / len(places) if name != "statistical, first" else spent)
-            air.release()
+        with_screens.release()
         star = {name: float(np.median(values)) for name, values in seconds.items()}
-        visit = len(fields)
+        visit = 189 * 60
         print(f"{count} wavelengths, pachon {pachon.__version__}: fast {1e6 * star['fast']:.0f} us a star, statistical"
               f" {1e6 * star['statistical']:.0f}, shapes alone {1e6 * star['moments']:.0f}; fields of an exposure"
               f" {star['statistical, first']:.2f} s; a visit of {visit} stamps"
@@ -327,6 +329,8 @@ if __name__ == "__main__":
     parser.add_argument("--first", type=int, default=0, help="first set of screens")
     parser.add_argument("--count", type=int, default=8, help="sets of screens")
     parser.add_argument("--draws", type=int, default=80, help="exposures of the statistical engine")
+    parser.add_argument("--stars", type=int, default=60, help="stars of a CCD whose times are taken")
+    parser.add_argument("--repeats", type=int, default=3, help="visits whose times are taken")
     parser.add_argument("--picture", type=Path, default=Path("statistical_variogram.png"))
     options = parser.parse_args()
     {"screens": screens, "compare": compare, "plot": plot, "time": times}[options.task](options)
