@@ -35,8 +35,8 @@ _SAMPLES = 6.0
 _MOST_SAMPLES = 2048
 _LEAST_SAMPLES = 16
 #: Rings and spokes of lags, between which covariances are interpolated.
-_RINGS = 26
-_SPOKES = 28
+_RINGS = 22
+_SPOKES = 20
 #: First scale of the rings, in the angle of the pupil at the highest layer.
 _FIRST_RING = 0.3
 #: Side of the grid of a layer over the outer scale or the pupil, at least: longer modes are left out.
@@ -173,7 +173,15 @@ def _cholesky(spectra: np.ndarray, gain: np.ndarray) -> tuple[tuple[np.ndarray, 
     middle = root(qq - second**2)
     mixed = over(qs - second * third, middle, root(ss - third**2))
     last = root(ss - third**2 - mixed**2)
+    # Without negative remainders the variance would be a per cent too large.
+    squares = first**2 + second**2 + third**2 + middle**2 + mixed**2 + last**2
+    gain = gain * np.sqrt(_plane_sum(pp + qq + ss) / max(_plane_sum(squares), 1e-30))
     return (gain * first,), (gain * second, gain * middle), (gain * third, gain * mixed, gain * last)
+
+
+def _plane_sum(half: np.ndarray) -> np.float32:
+    """Return the sum over all frequencies of values at those of a real transform, of an even number of samples."""
+    return np.float32(2.0 * half.sum(dtype=np.float64) - half[:, [0, -1]].sum(dtype=np.float64))
 
 
 def _positive(matrix: np.ndarray) -> np.ndarray:
