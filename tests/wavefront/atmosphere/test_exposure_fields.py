@@ -42,6 +42,7 @@ def test_spectra_of_moments_have_the_covariances():
             assert got == pytest.approx(theory[:, i, j], abs=0.016 * math.sqrt(changing[i] * changing[j]))
 
 
+@pytest.mark.long
 def test_mean_wavefronts_have_their_covariances():
     """Of one high layer, whose field holds many independent pupils, against the quadrature of another module."""
     air = AIR._replace(altitudes=(15_000.0,), weights=(1.0,), velocities=((-4.0, 9.0),))

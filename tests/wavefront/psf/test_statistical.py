@@ -89,6 +89,7 @@ def test_moments_are_those_of_images(lsst, air, engine):
     assert moments.y == pytest.approx(shapes.y, abs=2e-4)
 
 
+@pytest.mark.long
 def test_moments_of_optics_alone(lsst):
     """Against images of the wave engine on fine pixels, without diffusion."""
     defocused = lsst.perturbed("Detector", shift=(0.0, 0.0, 12e-6))
