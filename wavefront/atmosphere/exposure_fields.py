@@ -175,13 +175,13 @@ def _cholesky(spectra: np.ndarray, gain: np.ndarray) -> tuple[tuple[np.ndarray, 
     last = root(ss - third**2 - mixed**2)
     # Without negative remainders the variance would be a per cent too large.
     squares = first**2 + second**2 + third**2 + middle**2 + mixed**2 + last**2
-    gain = gain * np.sqrt(_plane_sum(pp + qq + ss) / max(_plane_sum(squares), 1e-30))
+    gain = gain * np.float32(math.sqrt(max(_plane_sum(pp + qq + ss), 0.0) / max(_plane_sum(squares), 1e-30)))
     return (gain * first,), (gain * second, gain * middle), (gain * third, gain * mixed, gain * last)
 
 
-def _plane_sum(half: np.ndarray) -> np.float32:
+def _plane_sum(half: np.ndarray) -> float:
     """Return the sum over all frequencies of values at those of a real transform, of an even number of samples."""
-    return np.float32(2.0 * half.sum(dtype=np.float64) - half[:, [0, -1]].sum(dtype=np.float64))
+    return float(2.0 * half.sum(dtype=np.float64) - half[:, [0, -1]].sum(dtype=np.float64))
 
 
 def _positive(matrix: np.ndarray) -> np.ndarray:
