@@ -378,7 +378,10 @@ from .wavefront.psf.light import Light as Light
 from .wavefront.psf.long_exposure import LongExposureEngine as LongExposureEngine
 from .wavefront.psf.psf import Psfs as Psfs
 from .wavefront.psf.psf import make_psfs as make_psfs
+from .wavefront.psf.psf_moments import PsfMoments as PsfMoments
+from .wavefront.psf.psf_moments import psf_moments as psf_moments
 from .wavefront.psf.stamps import Stamps as Stamps
+from .wavefront.psf.statistical import StatisticalEngine as StatisticalEngine
 from .wavefront.psf.wave import WaveEngine as WaveEngine
 from .wavefront.pupil_sampling import PupilSampling as PupilSampling
 from .wavefront.pupil_sampling import pupil_sampling as pupil_sampling

@@ -229,11 +229,13 @@ class AtmosphereConfig(Section):
 class PsfConfig(Section):
     """How point-spread functions are made."""
 
-    engine: Literal["fast", "wave", "long_exposure"] = Field(
-        "fast", description="fast (geometric and filters), wave (Fourier optics), long_exposure (mean over turbulence)"
+    engine: Literal["fast", "wave", "long_exposure", "statistical"] = Field(
+        "fast",
+        description="fast (geometric and filters), wave (Fourier optics), long_exposure (mean over turbulence), "
+        "statistical (shapes drawn from theory, without screens; 5 s or more, no image motion, no third moments)",
     )
     n_pupil: Annotated[int, Field(strict=True, ge=10)] | None = Field(
-        None, description="pupil points of the fast and the long_exposure engine"
+        None, description="pupil points of the engines but wave"
     )
     pixel_um: Positive | None = Field(None, description="pixel [um]")
     stamp: Annotated[int, Field(strict=True, ge=7)] | None = Field(None, description="pixels on a side of a stamp, odd")

@@ -8,6 +8,7 @@ from ..models.media.silicon import WAVELENGTH_RANGE as SILICON_RANGE
 from ..models.telescope import Telescope
 from ..reconstruction.psf_model.polynomial import term_count
 from ..wavefront.psf.engines import ENGINES
+from ..wavefront.psf.statistical import StatisticalEngine, check_exposure
 from .config import Configuration, FocalPlaneConfig, StarsConfig
 from .resolved_values import noise_free_components, resolved_value
 from .sensor.brighter_fatter import PIXEL_SIZE as BRIGHTER_FATTER_PIXEL
@@ -36,6 +37,8 @@ def check_combinations(config: Configuration, telescope: Telescope, pixel_arcsec
     _check_focal_plane(config.focal_plane)
     if ENGINES[config.psf.engine].needs_atmosphere and not config.atmosphere.enabled:
         raise ConfigError(f"psf.engine = {config.psf.engine}: expected atmosphere.enabled = true, whose mean it takes")
+    if config.psf.engine == StatisticalEngine.name:
+        check_exposure(config.atmosphere.exposure_s, key="atmosphere.exposure_s")
     if config.atmosphere.time_step_s > config.atmosphere.exposure_s:
         raise ConfigError(
             f"atmosphere.time_step_s = {config.atmosphere.time_step_s:g}: expected at most the exposure, "

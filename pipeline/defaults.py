@@ -28,8 +28,9 @@ from ..models.site import Site
 from ..models.telescope import Telescope
 from ..raytrace.ideal_lens import require_image
 from ..reconstruction.psf_model.basis import COMPONENTS
+from ..wavefront.psf.engines import ENGINES
 from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
-from ..wavefront.psf.long_exposure import default_points
+from ..wavefront.psf.long_exposure import LongExposureEngine, default_points
 from .alignment_states import ENDINGS as STATE_ENDINGS
 from .alignment_states import with_active_optics_state
 from .config import BandName, Configuration, PsfConfig, ReconstructionConfig
@@ -119,7 +120,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
         config.psf,
         (_WITH_ATMOSPHERE if atmosphere.enabled else _OPTICS_ALONE)
         | _stamp_geometry(config, telescope, camera)
-        | ({"n_pupil": default_points(telescope)} if config.psf.engine == "long_exposure" else {}),
+        | ({"n_pupil": default_points(telescope)} if _of_means(config.psf) else {}),
     )
     resolved = config.model_copy(
         update={
@@ -156,6 +157,11 @@ def _with_ground_wind(site: Site, wind: tuple[float, float] | None) -> Site:
         wind_speeds=(math.hypot(*wind), *site.wind_speeds[1:]),
         wind_directions=(math.atan2(wind[1], wind[0]), *site.wind_directions[1:]),
     )
+
+
+def _of_means(psf: PsfConfig) -> bool:
+    """Return whether the engine's images are made of the mean over turbulence."""
+    return issubclass(ENGINES[psf.engine], LongExposureEngine)
 
 
 def _reconstruction(fit: ReconstructionConfig, weight_fwhm_arcsec: float) -> ReconstructionConfig:

@@ -57,7 +57,7 @@ def _no_atmosphere(config: Configuration) -> str | None:
 
 
 def _no_ground_layer(config: Configuration) -> str | None:
-    if not (config.atmosphere.enabled and ENGINES[config.psf.engine].screens):
+    if not (config.atmosphere.enabled and ENGINES[config.psf.engine].has_turbulence):
         return "no star is imaged through turbulence"
     if config.atmosphere.ground_lift_m > 0.0 or load_site(resolved_value(config.atmosphere.site)).altitudes[0] > 0.0:
         return "no layer is on the ground"

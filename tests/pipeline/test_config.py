@@ -99,6 +99,11 @@ def test_numbers_without_a_point_are_numbers(tmp_path):
         ({"telescope": "lsst_v3.3_q"}, ["unknown telescope", "did you mean"]),
         ({"telescope": "paul_baker"}, ["telescope = paul_baker", "a camera"]),
         ({"atmosphere__site": "cerro_pachn"}, ["unknown site", "did you mean cerro_pachon or cerro_tololo?"]),
+        (
+            {"psf__engine": "statistical", "atmosphere__exposure_s": 4.0},
+            ["atmosphere.exposure_s = 4", "at least 5 s", "'statistical'"],
+        ),
+        ({"psf__engine": "statistical", "atmosphere__enabled": False}, ["psf.engine = statistical", "enabled = true"]),
         ({"atmosphere__time_step_s": 20.0}, ["atmosphere.time_step_s = 20", "atmosphere.exposure_s = 15"]),
     ],
 )

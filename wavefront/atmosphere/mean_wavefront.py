@@ -16,6 +16,8 @@ the pupil they fall as 1/T. A single donut cannot separate this wavefront from t
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import jv
@@ -23,6 +25,7 @@ from scipy.special import jv
 from ...core.errors import DomainError
 from ...models.zernike_polynomials import annular_zernikes, noll_to_nm
 from .atmosphere import Atmosphere
+from .moment_covariance import ExposedAir
 from .turbulence import path_spectrum
 
 # Frequencies times the diameter of the pupil: lowest, highest and number, on a logarithmic scale.
@@ -37,13 +40,13 @@ _INDEPENDENT = 5.0
 
 
 def mean_wavefront_covariance(
-    atmosphere: Atmosphere, fields: ArrayLike, noll: ArrayLike, diameter: float, obscuration: float
+    atmosphere: Atmosphere | ExposedAir, fields: ArrayLike, noll: ArrayLike, diameter: float, obscuration: float
 ) -> np.ndarray:
     """Return the covariance of the Zernikes of the mean wavefront of an exposure [m^2].
 
     Parameters
     ----------
-    atmosphere : Atmosphere
+    atmosphere : Atmosphere or ExposedAir
         Layers, winds, Fried parameter, outer scale and exposure time; its screens are not used.
     fields : array_like, shape [n_star, 2]
         Field slopes of the stars (tx, ty) [rad].
@@ -76,7 +79,8 @@ def mean_wavefront_covariance(
     power = area * path_spectrum(frequency, atmosphere.r0, atmosphere.outer_scale)
     n_star, n_noll = len(slopes), len(indices)
     covariance = np.zeros((n_star, n_noll, n_star, n_noll))
-    for altitude, weight, velocity in zip(atmosphere.altitudes, atmosphere.weights, atmosphere.velocities, strict=True):
+    velocities = np.reshape(atmosphere.velocities, (-1, 2))
+    for altitude, weight, velocity in zip(atmosphere.altitudes, atmosphere.weights, velocities, strict=True):
         layer_power = weight * power[:, None] * np.sinc(plane @ (velocity * atmosphere.exposure)) ** 2
         apart = altitude * (slopes[:, None] - slopes)
         covariance_at: dict[tuple[float, float], np.ndarray] = {}
@@ -102,17 +106,32 @@ def _zernike_transforms(
 
     Frequencies are in cycles per radius of the pupil.
     """
-    node, weight = np.polynomial.legendre.leggauss(_RADII)
-    radius = 0.5 * ((1.0 - obscuration) * node + 1.0 + obscuration)
-    weight = weight * (1.0 - obscuration) * radius / (1.0 - obscuration**2)
     out = np.empty((len(frequency), len(angle), len(indices)), dtype=np.complex128)
     for k, j in enumerate(indices):
         _, m = noll_to_nm(int(j))
         order = abs(m)
-        # Along this direction the cosine or the sine of the Zernike is 1.
-        crest = 0.0 if m >= 0 else 0.5 * np.pi / order
-        radial = annular_zernikes(int(j), radius * np.cos(crest), radius * np.sin(crest), obscuration)[-1]
-        wave = jv(order, 2.0 * np.pi * np.outer(frequency, radius))
         around = np.cos(order * angle) if m >= 0 else np.sin(order * angle)
-        out[:, :, k] = 1j**order * (wave @ (weight * radial))[:, None] * around
+        out[:, :, k] = 1j**order * _radial_means(int(j), frequency, obscuration)[:, None] * around
     return out
+
+
+def _radial_means(noll: int, frequency: np.ndarray, obscuration: float) -> np.ndarray:
+    """Return means over the annulus of a Zernike's radial part times a wave's, at cycles per radius of the pupil."""
+    node, weight = np.polynomial.legendre.leggauss(_RADII)
+    radius = 0.5 * ((1.0 - obscuration) * node + 1.0 + obscuration)
+    weight = weight * (1.0 - obscuration) * radius / (1.0 - obscuration**2)
+    _, m = noll_to_nm(noll)
+    order = abs(m)
+    # Along this direction the cosine or the sine of the Zernike is 1.
+    crest = 0.0 if m >= 0 else 0.5 * np.pi / order
+    radial = annular_zernikes(noll, radius * np.cos(crest), radius * np.sin(crest), obscuration)[-1]
+    return np.asarray(jv(order, 2.0 * np.pi * np.outer(frequency, radius)) @ (weight * radial))
+
+
+@lru_cache(maxsize=32)
+def radial_transform(noll: int, highest: float, count: int, obscuration: float) -> np.ndarray:
+    """Return means over the annulus of a Zernike times a plane wave, without their angular part and i^m, [count].
+
+    They are at evenly spaced frequencies from 0 to ``highest`` cycles per diameter of the pupil.
+    """
+    return _radial_means(noll, 0.5 * np.linspace(0.0, highest, count), obscuration)

@@ -111,6 +111,7 @@ class PsfEngine(ABC):
     name: ClassVar[str]  #: in configurations and on the command line
     screens: ClassVar[tuple[str, ...]] = ()  #: kinds of screens that it uses, see :meth:`.Atmosphere.screens`
     needs_atmosphere: ClassVar[bool] = False
+    has_turbulence: ClassVar[bool] = True  #: of the exposure itself, in place of the mean over all
 
     def renderer(self, inputs: PsfInputs) -> PsfRenderer:
         """Return the renderer of the stars of one call; ConfigError if the engine needs an atmosphere."""

@@ -6,10 +6,13 @@ from ...core.errors import check_choice
 from .engine import PsfEngine
 from .fast import FastEngine
 from .long_exposure import LongExposureEngine
+from .statistical import StatisticalEngine
 from .wave import WaveEngine
 
 #: Engines by name: a new one is added here.
-ENGINES: dict[str, type[PsfEngine]] = {engine.name: engine for engine in (FastEngine, WaveEngine, LongExposureEngine)}
+ENGINES: dict[str, type[PsfEngine]] = {
+    engine.name: engine for engine in (FastEngine, WaveEngine, LongExposureEngine, StatisticalEngine)
+}
 
 
 def psf_engine(engine: str | PsfEngine) -> PsfEngine:

@@ -32,6 +32,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
@@ -56,9 +57,6 @@ PUPIL_POINTS = 80
 #: Side of the periodic image over that of the stamp: wings that wrap around make the edge of a stamp of 6 arcsec 1.4
 #: times as bright as it should be, and change ellipticities by 1e-6, the FWHM by 1e-5 and the rms size by 7e-5.
 GRID_MARGIN = 1.25
-# Largest transfer function of atmosphere and detector at a frequency that is left out; with pixels of 10 um all make
-# 2e-6 of the peak of the image.
-_NEGLIGIBLE = 1e-5
 # Largest coherence at a baseline half as long as the pupil's ring is wide, where the strips along its rims are a half
 # of it: on AuxTel, where 0.04 are left, they are wrong by 1e-3 in e.
 _LARGEST_LEFT = 1e-3
@@ -105,6 +103,7 @@ class LongExposureEngine(PsfEngine):
 
     name = "long_exposure"
     needs_atmosphere = True
+    has_turbulence = False
 
     n_pupil: int | None = None
 
@@ -120,14 +119,15 @@ class LongExposureRenderer(PsfRenderer):
     """Renderer of :class:`LongExposureEngine`."""
 
     depths = 2
+    #: Largest transfer function of atmosphere and detector at a frequency that is left out; with pixels of 10 um all
+    #: make 2e-6 of the peak of the image.
+    negligible: ClassVar[float] = 1e-5
 
     def __init__(self, inputs: PsfInputs, options: LongExposureEngine) -> None:
-        assert inputs.atmosphere is not None, "the engine needs one"
         super().__init__(inputs)
         self._options = options
-        self._r0, self._outer_scale = inputs.atmosphere.r0, inputs.atmosphere.outer_scale
         #: Side of the periodic image [m].
-        self.period = GRID_MARGIN * self._plane.side
+        self.period = self._period()
         # Baseline of one step of frequency at each wavelength [m].
         self._step = self._wavelengths * self.focal_length / self.period
         # Width of the pupil's ring.
@@ -150,9 +150,15 @@ class LongExposureRenderer(PsfRenderer):
             star_bytes = 2 * 2 * 4 * LANES * self._detector.shape[2] * len(self._pupil.points) * self._channels.depths
         self.batch = max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
 
+    def _period(self) -> float:
+        """Return the side of the periodic image [m]."""
+        return GRID_MARGIN * self._plane.side
+
     def _turbulence(self, baseline: np.ndarray) -> np.ndarray:
         """Return the mean transfer function of the atmosphere at baselines [m], shape [n_wave, n]."""
-        return coherence(structure_function(baseline, self._r0, self._outer_scale), self._wavelengths[:, None])
+        air = self._atmosphere
+        assert air is not None, "the engine needs one"
+        return coherence(structure_function(baseline, air.r0, air.outer_scale), self._wavelengths[:, None])
 
     def _transfer_bounds(self, longest: float) -> np.ndarray:
         """Return the largest transfer of atmosphere and detector at each frequency up to a baseline [m], [n_wave, n].
@@ -178,7 +184,7 @@ class LongExposureRenderer(PsfRenderer):
     def _choose_frequencies(self) -> None:
         """Choose the largest frequency of the sums."""
         longest = self._diameter if self._general else self._width
-        strong = np.flatnonzero((self._transfer_bounds(longest) > _NEGLIGIBLE).any(axis=0))
+        strong = np.flatnonzero((self._transfer_bounds(longest) > self.negligible).any(axis=0))
         #: Largest frequency along either axis, in steps of one over the period.
         self._reach = int(strong[-1]) + 1 if strong.size else 1
 
@@ -227,20 +233,31 @@ class LongExposureRenderer(PsfRenderer):
         edges = self._edges(stars.fields)
         kinds = np.where(self._lit_fraction(edges) < _LEAST_LIT, _VIGNETTED, _NEAR)
         if self._options.n_pupil is None:
-            rays = ray_counts(optics, self._plane.pixel_size)
+            rays = self._ray_counts(optics)
             kinds = np.where(rays > 0, rays, kinds)
         if (kinds == _NEAR).all():
             return self._expose_spokes(optics, edges, stars)
-        return expose_by_kind(kinds, self._expose_kind, stars)
+        near = np.flatnonzero(kinds == _NEAR)
 
-    def _expose_kind(self, kind: int, stars: Stars) -> ExposedStars:
-        """Expose stars of a kind: by strips, by a lattice or, far from focus, by a number of rays."""
-        if kind == _VIGNETTED:
-            return self._expose_lattice(stars)
-        if kind == _NEAR:
-            optics = self._trace(stars.fields, self._pupil.points, self._threads)
-            return self._expose_spokes(optics, self._edges(stars.fields), stars)
-        return MeanRaysRenderer(self._inputs, kind).expose_without_refinement(stars)
+        def expose(kind: int, stars: Stars) -> ExposedStars:
+            """Expose stars of a kind: by strips, by a lattice or, far from focus, by a number of rays."""
+            if kind == _NEAR:
+                return self._expose_spokes(optics.stars(near), edges[near], stars)
+            return self._expose_lattice(stars) if kind == _VIGNETTED else self._expose_rays(kind, stars)
+
+        return expose_by_kind(kinds, expose, stars)
+
+    def _ray_counts(self, optics: PupilOptics) -> np.ndarray:
+        """Return the number of rays of each star far from focus, 0 near it, shape [n_star] int."""
+        return ray_counts(optics, self._plane.pixel_size)
+
+    def _expose_rays(self, rays: int, stars: Stars) -> ExposedStars:
+        """Expose stars far from focus by a number of rays."""
+        return MeanRaysRenderer(self._inputs, rays).expose_without_refinement(stars)
+
+    def _exposed_spectra(self, spectrum: np.ndarray, optics: PupilOptics) -> np.ndarray:
+        """Return the transfer functions of stars in one exposure; of this engine the mean ones."""
+        return spectrum
 
     def _expose_lattice(self, stars: Stars) -> ExposedStars:
         """Expose stars by lattices as fine as each needs, or by rays where that is too fine."""
@@ -253,7 +270,7 @@ class LongExposureRenderer(PsfRenderer):
 
         def expose(kind: int, stars: Stars) -> ExposedStars:
             if kind < 0:
-                return MeanRaysRenderer(self._inputs, -kind).expose_without_refinement(stars)
+                return self._expose_rays(-kind, stars)
             lattice = self._lattice.refined(kind)
             step = max(1, self.batch // kind**2)
             parts = (stars[first : first + step] for first in range(0, len(stars), step))
@@ -270,14 +287,15 @@ class LongExposureRenderer(PsfRenderer):
         """Expose stars by the autocorrelation of their lattices, batch by batch."""
         spectra, lit, points, offsets = [], [], [], []
         for lattice, rays, stars in parts:
-            spectra += self._map(
+            transfers = self._map(
                 partial(self._autocorrelation_transfer, lattice, rays, stars.photons), range(len(stars))
             )
+            spectra.append(self._exposed_spectra(np.stack(transfers), rays.optics))
             lit.append(np.repeat(rays.optics.lit.mean(axis=2), len(self._wavelengths), axis=1))
             points.append(rays.optics.reference_points)
             offsets.append(stars.offsets)
         together = (np.concatenate(values) for values in (offsets, lit, points))
-        return self._sampled(np.stack(spectra), *together)
+        return self._sampled(np.concatenate(spectra), *together)
 
     def _autocorrelation_transfer(
         self, lattice: LatticeTransfer, rays: LatticeRays, photons: np.ndarray | None, star: int
@@ -321,7 +339,7 @@ class LongExposureRenderer(PsfRenderer):
         return self._clear_area(edges) / (math.pi * (outer**2 - inner**2))
 
     def _expose_spokes(self, optics: PupilOptics, edges: np.ndarray, stars: Stars) -> ExposedStars:
-        spectrum = self._transform(optics, edges, self._clear_area(edges), stars.photons)
+        spectrum = self._exposed_spectra(self._transform(optics, edges, self._clear_area(edges), stars.photons), optics)
         lit_fraction = np.repeat(self._lit_fraction(edges)[:, None], len(self._wavelengths), axis=1)
         return self._sampled(spectrum, stars.offsets, lit_fraction, optics.reference_points)
 

@@ -129,11 +129,12 @@ def make_psfs(
         Wavefront error that active optics leaves; none by default.
     stamps : Stamps, optional
         Pixels, charge diffusion, silicon, jitter, and places of the stars; by default 31 x 31 pixels of 10 um.
-    engine : FastEngine, WaveEngine, LongExposureEngine, or {"fast", "wave", "long_exposure"}
-        The engine with its options, or the name of one with its defaults.
+    engine : FastEngine, WaveEngine, LongExposureEngine, StatisticalEngine, or their names
+        The engine with its options, or "fast", "wave", "long_exposure" or "statistical" with its defaults.
         :class:`FastEngine`: geometric optics with filters. :class:`WaveEngine`: Fourier optics, the slow reference
         engine. :class:`LongExposureEngine`: mean over all turbulence, the quickest for many stars per call; it needs an
-        atmosphere, of which it uses the Fried parameter and the outer scale only.
+        atmosphere, of which it uses the Fried parameter and the outer scale only. :class:`StatisticalEngine`: exposures
+        of 5 s and more whose ellipticities and sizes are drawn from the theory of turbulence; it needs an atmosphere.
     threads : int, optional
         Number of threads; all processors by default.
     progress : callable, optional
@@ -151,7 +152,23 @@ def make_psfs(
         If an argument is outside its range or of the wrong shape, silicon is transparent at a wavelength, or a star
         falls between the CCDs.
     """
-    options, stamps, projection = psf_engine(engine), stamps or Stamps(), "zemax"
+    options, stamps = psf_engine(engine), stamps or Stamps()
+    inputs, stars = psf_inputs(telescope, fields, wavelengths, focal_plane, atmosphere, aberration, stamps, threads)
+    return _render_stars(options.renderer(inputs), inputs, stars, stamps.recenter, progress)
+
+
+def psf_inputs(
+    telescope: Telescope | Request,
+    fields: ArrayLike | None,
+    wavelengths: ArrayLike | Light | None,
+    focal_plane: FocalPlane | None,
+    atmosphere: Atmosphere | None,
+    aberration: ResidualWavefront | None,
+    stamps: Stamps,
+    threads: int | None,
+) -> tuple[PsfInputs, Stars]:
+    """Return the inputs of a renderer and its stars for checked arguments of :func:`make_psfs`."""
+    projection = "zemax"
     if isinstance(telescope, Request):
         lengths = wavelengths.wavelengths if isinstance(wavelengths, Light) else wavelengths
         request = Request.of(telescope, fields, lengths, threads=threads)
@@ -184,7 +201,7 @@ def make_psfs(
         projection=projection,
         threads=threads,
     )
-    return _render_stars(options.renderer(inputs), inputs, Stars(angles, places, photons), stamps.recenter, progress)
+    return inputs, Stars(angles, places, photons)
 
 
 def _render_stars(

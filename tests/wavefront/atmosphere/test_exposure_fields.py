@@ -1,0 +1,91 @@
+"""Fields of an exposure: their spectra have the covariances of the theory, and bytes that the seed alone fixes."""
+
+import math
+
+import numpy as np
+import pytest
+
+from pachon.core.units import ARCMIN, ARCSEC
+from pachon.wavefront.atmosphere import exposure_fields
+from pachon.wavefront.atmosphere.exposure_fields import NOLL, ExposureFields, FieldGrid, SplineFields, moment_spectrum
+from pachon.wavefront.atmosphere.mean_wavefront import mean_wavefront_covariance
+from pachon.wavefront.atmosphere.moment_covariance import ExposedAir, MomentResponse, as_matrices, moment_covariance
+from pachon.wavefront.atmosphere.spline import stencil_gain
+
+AIR = ExposedAir((0.0, 5000.0), (0.6, 0.4), ((3.0, 2.0), (-4.0, 9.0)), 5.0, 0.16, 25.0, 8.75, 4.0, 0.4)
+#: That of an ideal 8.4 m telescope at 620 nm, r0 = 0.16 m, under a weight of 0.7 arcsec [1/rad^2].
+RESPONSE = MomentResponse(2.72 / ARCSEC**2, 2.85 / ARCSEC**2, -44.3 / ARCSEC**2, -29.3 / ARCSEC**2)
+FIELD_RADIUS = math.radians(0.3)
+
+
+@pytest.mark.long
+def test_spectra_of_moments_have_the_covariances():
+    """The transform of the squared Cholesky factors, plus what all stars share, at some lags of the grid.
+
+    Negative remainders that count as zero, and the interpolation between lags: 1.5 % of the variance that changes over
+    the field, the most at no lag.
+    """
+    grid = FieldGrid.of(AIR, FIELD_RADIUS)
+    factors, shared = moment_spectrum(AIR, RESPONSE, grid)
+    gain = stencil_gain(
+        2 * np.pi * np.fft.rfftfreq(grid.size), 2 * np.pi * np.fft.fftfreq(grid.size)[:, None], "spline"
+    )
+    plain = [[f / gain for f in row] for row in factors]
+    steps = np.array([(0, 0), (1, 0), (3, 2), (-2, 7), (12, 0), (0, 25)])
+    theory = as_matrices(moment_covariance(AIR, steps * grid.side / grid.size).total(RESPONSE))
+    changing = np.diag(theory[0] - shared @ shared.T)
+    for i in range(3):
+        for j in range(i + 1):
+            spectrum = sum(plain[i][m] * plain[j][m] for m in range(j + 1))
+            covariance = np.fft.irfft2(spectrum, s=(grid.size, grid.size)) + (shared @ shared.T)[i, j]
+            got = covariance[steps[:, 1] % grid.size, steps[:, 0] % grid.size]
+            assert got == pytest.approx(theory[:, i, j], abs=0.016 * math.sqrt(changing[i] * changing[j]))
+
+
+@pytest.mark.long
+def test_mean_wavefronts_have_their_covariances():
+    """Of one high layer, whose field holds many independent pupils, against the quadrature of another module."""
+    air = AIR._replace(altitudes=(15_000.0,), weights=(1.0,), velocities=((-4.0, 9.0),))
+    grid = FieldGrid(512, 0.05)
+    ground, fields = exposure_fields._draw_wavefronts(air, grid, 3, 0)
+    assert not ground.any()
+    drawn = ExposureFields(np.zeros(3), fields[0], ground, fields)
+    stars = np.random.default_rng(1).uniform(0, 0.05, (20_000, 2))
+    lag = np.array([3.0, 1.0]) / 15_000.0
+    here, there = drawn.wavefronts_at(stars), drawn.wavefronts_at(stars + lag)
+    theory = mean_wavefront_covariance(air, [(0.0, 0.0), lag], NOLL, air.diameter, air.obscuration)
+    sigma = np.sqrt(np.diag(theory[0, :, 0]))
+    scale = np.outer(sigma, sigma)
+    # 750 m of a layer, 8 m across and 50 m along the wind for each independent patch: some 1400, three standard errors.
+    assert here.T @ here / len(stars) / scale == pytest.approx(theory[0, :, 0] / scale, abs=0.12)
+    assert here.T @ there / len(stars) / scale == pytest.approx(theory[0, :, 1] / scale, abs=0.12)
+
+
+def test_ground_layer_is_the_same_for_all_stars():
+    air = AIR.on_ground()
+    ground, fields = exposure_fields._draw_wavefronts(air, FieldGrid(16, 0.01), 3, 0)
+    assert fields == ()
+    draws = np.array([exposure_fields._draw_wavefronts(air, FieldGrid(16, 0.01), s, 0)[0] for s in range(60)])
+    theory = mean_wavefront_covariance(air, (0.0, 0.0), NOLL, air.diameter, air.obscuration)[0, :, 0]
+    # 60 draws: four standard errors of a variance, of eight.
+    assert (draws**2).mean(axis=0) == pytest.approx(np.diag(theory), rel=0.73)
+    assert ground.tobytes() == exposure_fields._draw_wavefronts(air, FieldGrid(16, 0.01), 3, 0)[0].tobytes()
+
+
+def test_splines_pass_through_a_wave():
+    """A wave of 8 samples, with the gain of splines, is met between its samples to the error of cubic splines."""
+    size, side = 64, 1.0
+    x = 2 * np.pi * 8 * np.arange(size) / size
+    gain = stencil_gain(np.array([2 * np.pi * 8 / size]), np.array([[0.0]]), "spline")[0, 0]
+    fields = SplineFields(side, (gain * np.cos(x) * np.ones((1, size, 1))).astype(np.float32))
+    place = np.random.default_rng(0).uniform(-2, 2, (50, 2))
+    assert fields.at(place)[:, 0] == pytest.approx(np.cos(2 * np.pi * 8 * place[:, 0]), abs=5e-3)
+    assert fields.at(place[7:8]).tobytes() == fields.at(place)[7:8].tobytes()
+
+
+def test_one_arcminute_of_lag_is_one_arcminute_of_grid():
+    """The grid is wider than the field, and finer than the pupil at the highest layer."""
+    grid = FieldGrid.of(AIR, FIELD_RADIUS)
+    assert grid.side > 2 * FIELD_RADIUS
+    assert grid.side / grid.size < 0.25 * AIR.diameter / max(AIR.altitudes)
+    assert grid.side / ARCMIN == pytest.approx(54.0)

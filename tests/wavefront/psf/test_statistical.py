@@ -1,0 +1,129 @@
+"""The statistical engine and moments without images: against images, Fourier kernels restated here and refusals."""
+
+import numpy as np
+import pytest
+
+import pachon
+from pachon.core.errors import ConfigError, DomainError
+from pachon.core.units import ARCSEC
+from pachon.models.ideal_telescope import ideal_telescope
+from pachon.wavefront.psf.engines import psf_engine
+from pachon.wavefront.psf.psf import psf_inputs
+from pachon.wavefront.psf.stamps import Stamps
+
+WAVE = [620e-9]
+FIELDS = np.deg2rad([[0.0, 0.0], [0.5, -0.3], [-1.2, 0.8], [0.51, -0.3]])
+
+
+@pytest.fixture(scope="module")
+def air():
+    return pachon.Atmosphere.from_site("cerro_pachon", 4, exposure=10.0)
+
+
+@pytest.fixture(scope="module")
+def drawn(lsst, air):
+    return pachon.make_psfs(lsst, FIELDS, WAVE, atmosphere=air, engine="statistical", threads=1)
+
+
+@pytest.fixture(scope="module")
+def lsst():
+    return pachon.load_telescope("lsst_v3.3_r")
+
+
+@pytest.mark.long
+def test_bytes_do_not_depend_on_threads_and_other_stars(lsst, air, drawn):
+    again = pachon.make_psfs(lsst, FIELDS[[3, 1]], WAVE, atmosphere=air, engine="statistical", threads=2)
+    assert again.image.tobytes() == drawn.image[[3, 1]].tobytes()
+
+
+@pytest.mark.long
+def test_an_exposure_of_ideal_optics_is_the_long_one_under_its_kernel(lsst, air):
+    """Without aberrations nothing is left of the mean wavefront but its own moments, which are taken away again.
+
+    The long exposure is convolved here by a Fourier transform of its stamp, with the moments drawn.
+    """
+    ideal = ideal_telescope(lsst, 1e5)
+    scale = 0.2 * ARCSEC
+    stamps = Stamps(61, scale * ideal.reference_sphere_radius, 0.0)
+    images = [
+        pachon.make_psfs(ideal, FIELDS, WAVE, atmosphere=air, stamps=stamps, engine=e, threads=1).image
+        for e in (pachon.LongExposureEngine(80), "statistical")
+    ]
+    inputs, _ = psf_inputs(ideal, FIELDS, WAVE, None, air, None, stamps, 1)
+    renderer = psf_engine("statistical").renderer(inputs)
+    slopes = np.tan(FIELDS)
+    p, q, s = renderer.drawn.moments_at(slopes).T
+    k = 2 * np.pi * np.fft.fftfreq(61, scale)
+    kx, ky = np.meshgrid(k, k)
+    for star in range(len(FIELDS)):
+        square = 0.5 * ((s + p)[star] * kx**2 + (s - p)[star] * ky**2) + q[star] * kx * ky
+        blurred = np.fft.ifft2(np.fft.fft2(images[0][star].astype(float)) * np.exp(-0.5 * square)).real
+        shapes = pachon.measure_shapes(np.stack([images[0][star], blurred, images[1][star]]), scale, 0.7 * ARCSEC)
+        # The mean wavefront's own third moments, 30 nm of coma: 1e-4. The kernel moves e by some 2e-3.
+        assert shapes.e1[2] == pytest.approx(shapes.e1[1], abs=1.5e-4)
+        assert shapes.e2[2] == pytest.approx(shapes.e2[1], abs=1.5e-4)
+        assert np.log(shapes.size[2] / shapes.size[1]) == pytest.approx(0.0, abs=1.5e-4)
+        assert np.hypot(shapes.e1[2] - shapes.e1[0], shapes.e2[2] - shapes.e2[0]) > 5e-4
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("engine", ["long_exposure", "statistical"])
+def test_moments_are_those_of_images(lsst, air, engine):
+    """Under a round weight and adaptive; what images lack beyond their stamps makes them smaller by 2e-4."""
+    plane = pachon.FocalPlane.from_budget("lsst", seed=1)
+    fields = pachon.fields_at(lsst, [[0.001, 0.002], [0.12, -0.13], [-0.21, 0.08]])
+    psfs = pachon.make_psfs(lsst, fields, WAVE, focal_plane=plane, atmosphere=air, engine=engine, threads=1)
+    shapes = pachon.measure_shapes(psfs.image, psfs.pixel_scale, 0.7 * ARCSEC)
+    adaptive = pachon.adaptive_moments(psfs.image, psfs.pixel_scale)
+    moments = pachon.psf_moments(lsst, fields, WAVE, focal_plane=plane, atmosphere=air, engine=engine, threads=1)
+    assert not moments.flags.any()
+    # Pixels sample the image: 1e-5 of e and 1e-4 of adaptive moments.
+    for name in ("e1", "e2"):
+        assert getattr(moments, name) == pytest.approx(getattr(shapes, name), abs=3e-5)
+    for name in ("g1", "g2"):
+        assert getattr(moments, name) == pytest.approx(getattr(adaptive, name), abs=2e-4)
+    assert moments.size == pytest.approx(shapes.size, rel=4e-4)
+    assert moments.sigma == pytest.approx(adaptive.sigma, rel=6e-4)
+    assert np.allclose(moments.T, adaptive.T, rtol=1.2e-3)
+    assert moments.x == pytest.approx(shapes.x, abs=2e-4)
+    assert moments.y == pytest.approx(shapes.y, abs=2e-4)
+
+
+@pytest.mark.long
+def test_moments_of_optics_alone(lsst):
+    """Against images of the wave engine on fine pixels, without diffusion."""
+    defocused = lsst.perturbed("Detector", shift=(0.0, 0.0, 12e-6))
+    stamps = Stamps(61, 2.5e-6, 0.0)
+    fields = np.deg2rad([[0.0, 0.0], [1.1, 0.6]])
+    psfs = pachon.make_psfs(defocused, fields, WAVE, stamps=stamps, engine="wave", threads=1)
+    shapes = pachon.measure_shapes(psfs.image, psfs.pixel_scale, 0.3 * ARCSEC)
+    moments = pachon.psf_moments(defocused, fields, WAVE, stamps=stamps, threads=1)
+    # Strips along the rims, and what fine stamps of 3 arcsec lack.
+    assert moments.e1 == pytest.approx(shapes.e1, abs=2e-3)
+    assert moments.e2 == pytest.approx(shapes.e2, abs=2e-3)
+    assert moments.size == pytest.approx(shapes.size, rel=0.01)
+    assert np.isnan(moments.g1).all()
+
+
+def test_what_it_cannot_do_is_refused(lsst, air):
+    short = pachon.Atmosphere.from_site("cerro_pachon", 4, exposure=3.0)
+    later = air.at_times(air.times + 10.0)
+    for exposure, words in ((short, "at least 5 s"), (later, "starts at 10 s")):
+        for function in (pachon.make_psfs, pachon.psf_moments):
+            with pytest.raises(DomainError, match=words):
+                function(lsst, FIELDS[:1], WAVE, atmosphere=exposure, engine="statistical")
+    with pytest.raises(ConfigError, match="expected an atmosphere"):
+        pachon.make_psfs(lsst, FIELDS[:1], WAVE, engine="statistical")
+    with pytest.raises(ConfigError, match="expected an atmosphere"):
+        pachon.psf_moments(lsst, FIELDS[:1], WAVE, engine="statistical")
+    with pytest.raises(ConfigError, match="'long_exposure' or 'statistical'"):
+        pachon.psf_moments(lsst, FIELDS[:1], WAVE, atmosphere=air, engine="fast")
+
+
+@pytest.mark.long
+def test_stars_far_from_focus_are_refused(lsst, air):
+    donut = lsst.perturbed("Detector", shift=(0.0, 0.0, 1.5e-3))
+    with pytest.raises(DomainError, match="far from focus"):
+        pachon.make_psfs(donut, FIELDS[:1], WAVE, atmosphere=air, engine="statistical", stamps=Stamps(181))
+    with pytest.raises(DomainError, match="far from focus"):
+        pachon.psf_moments(donut, FIELDS[:1], WAVE, atmosphere=air)

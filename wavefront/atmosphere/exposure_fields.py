@@ -1,0 +1,263 @@
+"""Random fields over the field of view of one exposure: moments of images by turbulence, and the mean wavefront.
+
+Both are Gaussian, and fixed by the seed, the epoch and the air alone: a star has the same values whichever others are
+asked for. They are drawn on periodic grids, wider than the field, and read by cubic splines.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import scipy.fft
+import warp as wp
+
+from ...core.errors import DomainError
+from ...core.launch import launch
+from ...core.random_streams import stream
+from ...core.warp_arrays import warp_array
+from ...models.zernike_polynomials import noll_to_nm
+from .field_kernels import add_wavefronts, pairs, spread_over_grid
+from .mean_wavefront import mean_wavefront_covariance, radial_transform
+from .moment_covariance import PAIRS, ExposedAir, MomentResponse, as_matrices, moment_covariance
+from .spline import spline_weights, stencil_gain
+from .turbulence import path_spectrum
+
+#: Noll indices of the mean wavefront: smaller terms move shapes by less than 1e-4.
+NOLL = range(4, 12)
+#: Side of the periodic grids over the diameter of the field.
+_MARGIN = 1.5
+#: Samples in the angle under which the highest layer crosses the pupil, at least, and most samples on a side.
+_SAMPLES = 6.0
+_MOST_SAMPLES = 2048
+_LEAST_SAMPLES = 16
+#: Rings and spokes of lags, between which covariances are interpolated.
+_RINGS = 22
+_SPOKES = 20
+#: First scale of the rings, in the angle of the pupil at the highest layer.
+_FIRST_RING = 0.3
+#: Side of the grid of a layer over the outer scale or the pupil, at least: longer modes are left out.
+_LAYER_SIDE = 8.0
+#: Largest frequency of Zernikes times the diameter of the pupil, and samples of their tables.
+_HIGHEST = 12.0
+_TABLE = 2048
+
+
+class FieldGrid(NamedTuple):
+    """A periodic square grid over field slopes."""
+
+    size: int  #: samples on a side
+    side: float  #: [rad]
+
+    @classmethod
+    def of(cls, air: ExposedAir, field_radius: float) -> FieldGrid:
+        """Return that for the moments over a field of a radius [rad]."""
+        side = 2.0 * _MARGIN * field_radius
+        highest = max(air.altitudes, default=0.0)
+        wanted = _SAMPLES * side * highest / air.diameter
+        return cls(_grid_size(wanted), side)
+
+
+@dataclass(frozen=True, eq=False)
+class SplineFields:
+    """Periodic fields as coefficients of cubic B-splines."""
+
+    side: float  #: [rad]
+    coefficients: np.ndarray  #: float32, [n_field, size, size]
+
+    def at(self, slopes: np.ndarray) -> np.ndarray:
+        """Return the values at field slopes [n, 2] [rad], [n, n_field]; each place by itself."""
+        size = self.coefficients.shape[1]
+        place = slopes.T * (size / self.side)
+        knot = np.floor(place).astype(np.int64)
+        weight_x, weight_y = spline_weights(place - knot)
+        values = np.zeros((len(self.coefficients), len(slopes)))
+        for j in range(4):
+            for i in range(4):
+                row, column = (knot[1] + j - 1) % size, (knot[0] + i - 1) % size
+                values += weight_y[:, j] * weight_x[:, i] * self.coefficients[:, row, column]
+        return values.T
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureFields:
+    """Drawn fields of one exposure."""
+
+    common: np.ndarray  #: moments that all stars share, p, q, s [rad^2], [3]
+    moments: SplineFields  #: those that change over the field
+    common_wavefront: np.ndarray  #: Zernikes of :data:`NOLL` of the layers on the ground [m]
+    wavefronts: tuple[SplineFields, ...]  #: of the others
+
+    def moments_at(self, slopes: np.ndarray) -> np.ndarray:
+        """Return p = Mxx - Myy, q = 2 Mxy, s = Mxx + Myy beyond their mean [rad^2] at field slopes [n, 2], [n, 3]."""
+        return self.common + self.moments.at(slopes)
+
+    def wavefronts_at(self, slopes: np.ndarray) -> np.ndarray:
+        """Return Zernikes of :data:`NOLL` of the mean path [m] at field slopes [n, 2] [rad], [n, n_noll]."""
+        values = np.repeat(self.common_wavefront[None], len(slopes), axis=0)
+        for fields in self.wavefronts:
+            values += fields.at(slopes)
+        return values
+
+
+@lru_cache(maxsize=2)
+def draw_exposure(
+    air: ExposedAir, response: MomentResponse, field_radius: float, seed: int, epoch: int
+) -> ExposureFields:
+    """Draw the fields of one exposure; those of the last two are stored."""
+    grid = FieldGrid.of(air, field_radius)
+    factors, shared = moment_spectrum(air, response, grid)
+    random = stream(seed, "atmosphere", epoch, "moments")
+    common = shared @ random.standard_normal(3)
+    modes = [scipy.fft.rfft2(random.standard_normal((grid.size, grid.size), dtype=np.float32)) for _ in range(3)]
+    moments = np.empty((3, grid.size, grid.size), dtype=np.float32)
+    for i, row in enumerate(factors):
+        moments[i] = scipy.fft.irfft2(sum(f * m for f, m in zip(row, modes, strict=False)), s=(grid.size, grid.size))
+    ground, wavefronts = _draw_wavefronts(air, grid, seed, epoch)
+    return ExposureFields(common, SplineFields(grid.side, moments), ground, wavefronts)
+
+
+@lru_cache(maxsize=4)
+def moment_spectrum(
+    air: ExposedAir, response: MomentResponse, grid: FieldGrid
+) -> tuple[tuple[tuple[np.ndarray, ...], ...], np.ndarray]:
+    """Return lower Cholesky factors of the spectra of the moments on a grid, and that of what all stars share.
+
+    Factors of row i are i + 1 arrays [size, size // 2 + 1] [rad^2], with the gain of splines; the other is [3, 3].
+    """
+    ends = 0.5 * math.sqrt(2.0) * grid.side
+    highest = max(air.altitudes, default=0.0)
+    unit = _FIRST_RING * air.diameter / highest if highest else ends
+    step = math.log1p(ends / unit) / (_RINGS - 2)
+    radius = unit * np.expm1(step * np.arange(_RINGS))
+    angle = math.pi * np.arange(_SPOKES) / _SPOKES
+    lags = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    polar = moment_covariance(air, lags).total(response).reshape(_RINGS, _SPOKES, 6)
+    # What stars half a period apart share, all stars do.
+    shared = _positive(as_matrices(polar[np.searchsorted(radius, 0.5 * grid.side)].mean(axis=0)))
+    scale = float(polar[0, 0, 2])
+    constant = np.array([shared[i, j] for i, j in PAIRS])
+    covariance = np.empty((6, grid.size, grid.size), dtype=np.float32)
+    launch(
+        spread_over_grid,
+        grid.size // 2 + 1,
+        [
+            warp_array((polar - constant) / scale, pairs),
+            grid.side / grid.size / unit,
+            step,
+            warp_array(covariance, wp.float32),
+        ],
+    )
+    spectra = scipy.fft.rfft2(covariance).real
+    gain = _spline_gain(grid.size) * np.float32(math.sqrt(scale))
+    return _cholesky(spectra, gain), np.linalg.cholesky(shared + 1e-12 * scale * np.eye(3))
+
+
+def _cholesky(spectra: np.ndarray, gain: np.ndarray) -> tuple[tuple[np.ndarray, ...], ...]:
+    """Return lower Cholesky factors of matrices of PAIRS [6, ...], negative remainders taken as zero, times a gain."""
+    pp, qq, ss, pq, ps, qs = spectra
+
+    def over(values: np.ndarray, root: np.ndarray, bound: np.ndarray) -> np.ndarray:
+        quotient = np.divide(values, root, out=np.zeros_like(values), where=root > 0.0)
+        return np.clip(quotient, -bound, bound)
+
+    def root(values: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.maximum(values, 0.0))
+
+    first = root(pp)
+    second = over(pq, first, root(qq))
+    third = over(ps, first, root(ss))
+    middle = root(qq - second**2)
+    mixed = over(qs - second * third, middle, root(ss - third**2))
+    last = root(ss - third**2 - mixed**2)
+    # Without negative remainders the variance would be a per cent too large.
+    squares = first**2 + second**2 + third**2 + middle**2 + mixed**2 + last**2
+    gain = gain * np.float32(math.sqrt(max(_plane_sum(pp + qq + ss), 0.0) / max(_plane_sum(squares), 1e-30)))
+    return (gain * first,), (gain * second, gain * middle), (gain * third, gain * mixed, gain * last)
+
+
+def _plane_sum(half: np.ndarray) -> float:
+    """Return the sum over all frequencies of values at those of a real transform, of an even number of samples."""
+    return float(2.0 * half.sum(dtype=np.float64) - half[:, [0, -1]].sum(dtype=np.float64))
+
+
+def _positive(matrix: np.ndarray) -> np.ndarray:
+    """Return the nearest symmetric matrix without negative eigenvalues."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+def _spline_gain(size: int) -> np.ndarray:
+    kx, ky = 2.0 * np.pi * np.fft.rfftfreq(size), 2.0 * np.pi * np.fft.fftfreq(size)
+    return stencil_gain(kx, ky[:, None], "spline").astype(np.float32)
+
+
+def _grid_size(wanted: float) -> int:
+    """Return an even number of samples with quick transforms; DomainError if they are too many."""
+    if wanted > _MOST_SAMPLES:
+        raise DomainError(
+            f"engine = 'statistical': the field under the highest layer is {wanted / _SAMPLES:.0f} pupils wide; "
+            f"expected at most {_MOST_SAMPLES / _SAMPLES:.0f} ('fast' has no such limit)"
+        )
+    count = max(math.ceil(wanted), _LEAST_SAMPLES)
+    return 2 * int(scipy.fft.next_fast_len(-(-count // 2), real=True))
+
+
+def _draw_wavefronts(
+    air: ExposedAir, grid: FieldGrid, seed: int, epoch: int
+) -> tuple[np.ndarray, tuple[SplineFields, ...]]:
+    """Draw Zernikes of the mean wavefront: of layers on the ground [n_noll] [m], and of the others."""
+    least = _LAYER_SIDE * max(air.outer_scale, air.diameter)
+    groups: dict[float, list[int]] = {}
+    for n, altitude in enumerate(air.altitudes):
+        if altitude > 0.0:
+            groups.setdefault(max(grid.side, least / altitude), []).append(n)
+    normal = stream(seed, "atmosphere", epoch, "mean wavefront").standard_normal(len(NOLL))
+    ground = _ground_factor(air.on_ground()) @ normal
+    return ground, tuple(_wavefront_fields(air, layers, side, seed, epoch) for side, layers in groups.items())
+
+
+@lru_cache(maxsize=4)
+def _ground_factor(air: ExposedAir) -> np.ndarray:
+    """Return a square root of the covariance of Zernikes of layers on the ground [m], [n_noll, n_noll]."""
+    covariance = mean_wavefront_covariance(air, (0.0, 0.0), NOLL, air.diameter, air.obscuration)[0, :, 0]
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int, epoch: int) -> SplineFields:
+    """Draw the fields of some layers on a common grid of a side [rad]."""
+    distance = np.array([air.altitudes[n] for n in layers])
+    size = _grid_size(_SAMPLES * side * distance.max() / air.diameter)
+    noise = np.empty((len(layers), size, size // 2 + 1), dtype=np.complex64)
+    for k, n in enumerate(layers):
+        random = stream(seed, "atmosphere", epoch, n, "mean wavefront")
+        noise[k] = scipy.fft.rfft2(random.standard_normal((size, size), dtype=np.float32))
+    # In microns: powers of path in metres are below the numbers of float32.
+    scale = 1e6 * math.sqrt(float(path_spectrum(0.0, air.r0, air.outer_scale)) * air.outer_scale ** (-11.0 / 3.0))
+    weights = np.array([air.weights[n] for n in layers])
+    drift = air.exposure * np.array([air.velocities[n] for n in layers])
+    radial = np.array([radial_transform(j, _HIGHEST, _TABLE, air.obscuration) for j in NOLL])
+    spectrum = np.empty((len(radial), size, size // 2 + 1), dtype=np.complex64)
+    launch(
+        add_wavefronts,
+        size,
+        [
+            warp_array(noise, wp.vec2f),
+            warp_array(distance, wp.float32),
+            warp_array(drift, wp.float32),
+            warp_array(scale * size * np.sqrt(weights) / (distance * side), wp.float32),
+            1.0 / air.outer_scale,
+            1.0 / side,
+            warp_array(radial, wp.float32),
+            air.diameter * (_TABLE - 1) / _HIGHEST,
+            warp_array([noll_to_nm(j)[1] for j in NOLL], wp.int32),
+            warp_array(spectrum, wp.vec2f),
+        ],
+    )
+    gain = 1e-6 * _spline_gain(size)
+    fields = np.stack([scipy.fft.irfft2(gain * values, s=(size, size)) for values in spectrum])
+    return SplineFields(side, fields.astype(np.float32))

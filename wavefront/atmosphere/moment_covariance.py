@@ -1,0 +1,276 @@
+r"""Covariances over the field of the second moments of the images of one exposure, by turbulence.
+
+The moments of the image of a star about its centroid are means over pupil and exposure of products of slopes,
+:math:`M_{ij} = \langle s_i s_j \rangle - \langle s_i \rangle \langle s_j \rangle`. The slopes s are Gaussian, and
+Wick's theorem gives the covariance of the moments of two stars a lag d apart:
+
+.. math:: \mathrm{cov}(M_{ij}, M'_{kl}) = \langle S_{ik} S_{jl} + S_{il} S_{jk} \rangle, \qquad
+          S(u, \tau) = \sum_{layers} w \, S_{vK}(u - H d - V \tau).
+
+The mean is one over the baselines u of the pupil, with the weight of its autocorrelation, and over the delays
+:math:`\tau` in the exposure T, with the weight :math:`1 - |\tau|/T`. S is squared after the sum over layers: its cross
+terms, of the ground with higher layers, are the largest that change over the field. What the mean slope takes away is
+included but for its change over the pupil, which is some per cent of a tenth.
+
+Moments of the fourth order move ellipticity and size too, by :class:`.MomentResponse`. They are uncorrelated with those
+of the second, add 3 % to the variances, and are included as moments of the second order of the same effect.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple, Self
+
+import numpy as np
+import warp as wp
+
+from ...core.launch import launch
+from ...core.warp_arrays import warp_array
+from .atmosphere import Atmosphere
+from .moment_kernels import LANES, average_products, baselines
+from .slope_covariance import slope_covariance
+from .turbulence import diffraction_otf
+
+#: Components of the moments: p = Mxx - Myy, q = 2 Mxy, s = Mxx + Myy.
+COMPONENTS = ("p", "q", "s")
+#: Row and column of the six covariances of the components, in their order.
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+#: Shortest exposure whose moments are Gaussian [s]: below it few speckles add up.
+LEAST_EXPOSURE = 5.0
+# Spacing of the baselines at each delay [m]: their lattice is shifted from one to the next, so that together they lie
+# much closer.
+_SPACING = 1.4
+# The same at delays near zero [m].
+_NEAR_SPACING = 0.5
+# Largest drift of a layer from one delay to the next [m].
+_DRIFT = 1.4
+# The same near zero [m].
+_NEAR_DRIFT = 0.5
+# Drift up to which delays count as near zero [m]: peaks of the slopes' covariance are narrower.
+_NEAR = 8.0
+# Fewest delays on either side of zero.
+_LEAST_DELAYS = 64
+# Steps of the shift of the lattice, in parts of its spacing: of the plastic number (Roberts 2018), which fill a square
+# evenly.
+_PLASTIC = 1.32471795724474602596
+# Slopes in microradians: the fourth powers of their covariances, in radians, are below the least number of float32.
+_MICRO = 1e-6
+
+
+class ExposedAir(NamedTuple):
+    """All of an exposure on which statistics of its moments depend; hashable, so that they can be stored."""
+
+    altitudes: tuple[float, ...]
+    weights: tuple[float, ...]
+    velocities: tuple[tuple[float, float], ...]
+    exposure: float
+    r0: float
+    outer_scale: float
+    cutoff: float
+    diameter: float
+    obscuration: float
+
+    @classmethod
+    def of(cls, atmosphere: Atmosphere, diameter: float, obscuration: float) -> Self:
+        """Return that of an atmosphere through a pupil of a diameter [m] and linear obscuration."""
+        return cls(
+            tuple(atmosphere.altitudes.tolist()),
+            tuple(atmosphere.weights.tolist()),
+            tuple((x, y) for x, y in atmosphere.velocities.tolist()),
+            atmosphere.exposure,
+            atmosphere.r0,
+            atmosphere.outer_scale,
+            atmosphere.cutoff,
+            diameter,
+            obscuration,
+        )
+
+    def on_ground(self) -> Self:
+        """Return the same with the layers on the ground alone."""
+        ground = [n for n, altitude in enumerate(self.altitudes) if altitude == 0.0]
+        return self._replace(
+            altitudes=(0.0,) * len(ground),
+            weights=tuple(self.weights[n] for n in ground),
+            velocities=tuple(self.velocities[n] for n in ground),
+        )
+
+
+class MomentResponse(NamedTuple):
+    r"""Response of ellipticity and size, under a Gaussian weight, to the moments of a round image.
+
+    With the image's transfer function T and the weight's rms width w, over wavenumbers k on the sky,
+    :math:`J_n = \int T(k) \, e^{-w^2 k^2/2} \, k^{n+1} \, dk`, and Q is the weighted moment along an axis.
+    """
+
+    ellipticity: float  #: de1/dp and de2/dq, of e = (a - b)/(a + b) [1/rad^2]
+    ln_size: float  #: d ln size/ds [1/rad^2]
+    fourth_ellipticity: float  #: response to kx^4 over that to kx^2 of the transfer function, of e [1/rad^2]
+    fourth_size: float  #: response to kx^2 ky^2 over that to s, of ln size [1/rad^2]
+
+    @classmethod
+    def of(cls, wavenumber: np.ndarray, transfer: np.ndarray, weight_rms: float) -> Self:
+        """Return that of a transfer function at equally spaced wavenumbers [rad/rad] and a weight's rms width [rad]."""
+        power = transfer * np.exp(-0.5 * (weight_rms * wavenumber) ** 2)
+        j0, j2, j4, j6 = (float(np.sum(power * wavenumber ** (n + 1))) for n in (0, 2, 4, 6))
+        square = weight_rms**2
+        q = square - 0.5 * square**2 * j2 / j0
+
+        def size(low: float, high: float) -> float:
+            return ((square - q) * low - 0.5 * square**2 * high) / (j0 * q)
+
+        ln_size = -size(j2, j4) / 8.0
+        return cls(square**2 * j4 / (32.0 * q * j0), ln_size, -j6 / j4, size(j4, j6) / 16.0 / ln_size)
+
+    def shapes(self, covariance: np.ndarray) -> np.ndarray:
+        """Return covariances of (e1, e2, ln size) from those of (p, q, s) [rad^4], [..., 3, 3]."""
+        factor = np.array([self.ellipticity, self.ellipticity, self.ln_size])
+        return covariance * factor * factor[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class MomentCovariance:
+    """Covariances of the components of the moments of two stars."""
+
+    second: np.ndarray  #: of :data:`PAIRS` of moments of the second order [rad^4], [n_lag, 6]
+    fourth: np.ndarray  #: of those of the fourth that act as p, q and s, with a response of 1 [rad^8], [n_lag, 3]
+
+    def total(self, response: MomentResponse) -> np.ndarray:
+        """Return covariances of moments with the effect of both orders [rad^4], [n_lag, 6], of :data:`PAIRS`."""
+        factors = np.array([response.fourth_ellipticity, response.fourth_ellipticity, response.fourth_size])
+        out = self.second.copy()
+        out[:, :3] += self.fourth * factors**2
+        return out
+
+
+def as_matrices(pairs: np.ndarray) -> np.ndarray:
+    """Return symmetric matrices [..., 3, 3] of values of :data:`PAIRS` [..., 6]."""
+    out = np.empty((*pairs.shape[:-1], 3, 3))
+    for k, (i, j) in enumerate(PAIRS):
+        out[..., i, j] = out[..., j, i] = pairs[..., k]
+    return out
+
+
+def moment_covariance(air: ExposedAir, lags: np.ndarray, threads: int | None = None) -> MomentCovariance:
+    """Return the covariances of the moments of two stars whose field slopes are lags [n, 2] [rad] apart."""
+    lag, delays = np.asarray(lags, dtype=np.float64).reshape(-1, 2), _Delays.of(air)
+    # All stars share the layers on the ground.
+    _, common = _averages(air.on_ground(), np.zeros((1, 2)), delays, np.zeros((0, 12)), threads)
+    squares, slopes = _averages(air, lag, delays, common[0], threads)
+    second = squares[:, :6] - _by_mean_slope(slopes, delays, air.exposure)
+    # The fourth powers' own factors: 1/6 of p and q, 1 of s.
+    fourth = squares[:, 6:] * np.array([1.0 / 6.0, 1.0 / 6.0, 1.0])
+    return MomentCovariance(second * _MICRO**4, fourth * _MICRO**8)
+
+
+def _averages(
+    air: ExposedAir, lag: np.ndarray, delays: _Delays, common: np.ndarray, threads: int | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return squares [n_lag, 9] and terms [n_lag, n_delay, 3] in microradians, see :func:`.average_products`.
+
+    Without terms in common the terms are all twelve.
+    """
+    table = slope_covariance(air.r0, air.outer_scale, air.cutoff)
+    squares = np.zeros((len(lag), 9))
+    terms = np.zeros((len(lag), len(delays.time), 3 if len(common) else 12))
+    launch(
+        average_products,
+        len(lag),
+        [
+            warp_array(lag),
+            warp_array(delays.time),
+            warp_array(delays.weight),
+            warp_array(delays.packet_start, wp.int32),
+            warp_array(delays.baseline, baselines),
+            warp_array(air.altitudes),
+            warp_array(np.array(air.velocities, dtype=np.float64).reshape(-1, 2)),
+            warp_array(air.weights, wp.float32),
+            warp_array(np.stack([table.isotropic, table.directed], axis=1) / _MICRO**2, wp.vec2f),
+            1.0 / table.step,
+            air.diameter + table.reach,
+            warp_array(common),
+            warp_array(np.zeros((len(lag), len(air.weights), 3)), wp.float32),
+            warp_array(squares),
+            warp_array(terms),
+        ],
+        threads=threads,
+    )
+    return squares, terms
+
+
+@dataclass(frozen=True, eq=False)
+class _Delays:
+    """Delays between two moments of an exposure, and baselines of the pupil for each."""
+
+    time: np.ndarray  #: [s], rising, [n_delay]
+    width: np.ndarray  #: of the interval that each stands for [s], [n_delay]
+    weight: np.ndarray  #: of sum 1, [n_delay]
+    packet_start: np.ndarray  #: first packet of each delay, and the number of packets, [n_delay + 1] int
+    baseline: np.ndarray  #: x, y [m] and weights of sum 1 for each delay, float32, [n_packet, 3, LANES]
+
+    @classmethod
+    def of(cls, air: ExposedAir) -> Self:
+        """Return those of an exposure: dense near zero, where the slopes of all layers vary most."""
+        fastest = max((math.hypot(x, y) for x, y in air.velocities), default=0.0)
+        near = min(_NEAR / max(fastest, 1e-9), 0.5 * air.exposure)
+        near_count = max(_LEAST_DELAYS // 2, math.ceil(near * fastest / min(_NEAR_DRIFT, air.diameter / 16.0)))
+        far = air.exposure - near
+        far_count = max(_LEAST_DELAYS, math.ceil(far * fastest / min(_DRIFT, air.diameter / 4.0)))
+        inner, outer = np.linspace(0.0, near, near_count + 1), np.linspace(near, air.exposure, far_count + 1)
+        edges = np.concatenate([inner[:-1], outer])
+        edges = np.concatenate([-edges[:0:-1], edges])
+        time, width = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
+        weight = (1.0 - np.abs(time) / air.exposure) * width
+        near_by = np.abs(time) < near
+        lattices = [
+            _pupil_baselines(air.diameter, air.obscuration, spacing, len(time)) for spacing in (_SPACING, _NEAR_SPACING)
+        ]
+        sets = [lattices[int(n)][k] for k, n in enumerate(near_by)]
+        start = np.concatenate([[0], np.cumsum([len(points) for points in sets])])
+        return cls(time, width, weight / weight.sum(), start, np.concatenate(sets))
+
+
+@lru_cache(maxsize=8)
+def _pupil_baselines(diameter: float, obscuration: float, spacing: float, count: int) -> np.ndarray:
+    """Return baselines x, y [m] with weights of sum 1, float32, a lattice for each delay [count, n, 3, LANES]."""
+    spacing = min(spacing, diameter / 8.0)
+    reach = math.ceil(diameter / spacing) + 1
+    line = spacing * np.arange(-reach, reach + 1)
+    grid = np.stack(np.meshgrid(line, line)).reshape(2, -1)
+    grid = grid[:, np.hypot(*grid) < diameter + spacing]
+    shift = np.arange(1, count + 1)[:, None] / np.array([_PLASTIC, _PLASTIC**2]) % 1.0 - 0.5
+    packed = np.zeros((count, 3, -(-grid.shape[1] // LANES) * LANES), dtype=np.float32)
+    points = packed[:, :2, : grid.shape[1]]
+    points[:] = grid + spacing * shift[..., None]
+    radius = np.linspace(0.0, 1.2 * diameter + 2.0 * spacing, 1024)
+    weight = np.interp(np.hypot(points[:, 0], points[:, 1]), radius, diffraction_otf(radius, diameter, obscuration))
+    packed[:, 2, : grid.shape[1]] = weight / weight.sum(axis=1, keepdims=True)
+    return np.moveaxis(packed.reshape(count, 3, -1, LANES), 2, 1)
+
+
+def _by_mean_slope(slopes: np.ndarray, delays: _Delays, exposure: float) -> np.ndarray:
+    """Return what the moments' covariances lose by the mean slope, of :data:`PAIRS`, [n_lag, 6].
+
+    ``slopes`` [n_lag, n_delay, 3] are covariances a, b, c of slopes a delay apart, means over the baselines.
+    """
+    total = np.concatenate([np.zeros((len(slopes), 1, 3)), np.cumsum(slopes * delays.width[:, None], axis=1)], axis=1)
+    count = len(delays.time) // 2
+    edges = np.concatenate([[-exposure], np.cumsum(delays.width) - exposure])
+    # A moment t with the mean slope: delays from t - T to t.
+    moment = edges[count:]
+    start = np.searchsorted(edges, moment - exposure).clip(1, len(edges) - 1)
+    part = (moment - exposure - edges[start - 1]) / np.diff(edges)[start - 1]
+    before = total[:, start - 1] + part[:, None] * (total[:, start] - total[:, start - 1])
+    with_mean = (total[:, count:] - before) / exposure
+    width = np.diff(moment)[:, None] / exposure
+    products = _products(0.5 * (with_mean[:, 1:] + with_mean[:, :-1]))
+    mean = (0.5 * (with_mean[:, 1:] + with_mean[:, :-1]) * width).sum(axis=1)
+    return np.asarray(2.0 * (products * width).sum(axis=1) - _products(mean))
+
+
+def _products(slopes: np.ndarray) -> np.ndarray:
+    """Return Wick's products of covariances a, b, c of slopes [..., 3], of :data:`PAIRS`, [..., 6]."""
+    a, b, c = np.moveaxis(slopes, -1, 0)
+    pp, qq, ss = 2.0 * (a * a + c * c - 2.0 * b * b), 4.0 * (a * c + b * b), 2.0 * (a * a + 2.0 * b * b + c * c)
+    return np.stack([pp, qq, ss, 4.0 * b * (a - c), 2.0 * (a * a - c * c), 4.0 * b * (a + c)], axis=-1)

@@ -1,0 +1,306 @@
+"""Moments of point spread functions without images: ellipticities, sizes and centroids of many stars.
+
+Under a Gaussian weight W the moments of an image are sums over its transfer function times that of the weight, which
+leaves only the lowest frequencies: some 300 of them in place of the thousands of an image, whose pixels are not drawn.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
+
+from ...core.arguments import check_arguments
+from ...core.errors import ConfigError, DomainError
+from ...core.launch import launch
+from ...core.point_plots import draw_shapes
+from ...core.result import Result
+from ...core.units import ARCSEC, field_label, positive_angle
+from ...core.warp_arrays import warp_array
+from ...models.camera.focal_plane import FocalPlane
+from ...models.telescope import Telescope
+from ..aberration import ResidualWavefront
+from ..atmosphere.atmosphere import Atmosphere
+from ..atmosphere.turbulence import fried_parameter
+from ..pupil_optics import PupilOptics
+from ..request import Request
+from .engine import ExposedStars, PsfEngine, PsfInputs, Stars
+from .engines import psf_engine
+from .light import Light
+from .long_exposure import LongExposureEngine, LongExposureRenderer
+from .moment_kernels import ELLIPSE, measure_spectra
+from .psf import psf_inputs
+from .sample_packets import samples
+from .stamps import Stamps
+from .statistical import StatisticalEngine, StatisticalRenderer, far_from_focus
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: FWHM of the weight with an atmosphere, and without one [rad] (Jee & Tyson 2011, sec. 3).
+WEIGHT_FWHM = 0.7 * ARCSEC
+WEIGHT_FWHM_ALONE = 0.3 * ARCSEC
+#: Side of the periodic image over the rms width of the weight, and over the FWHM of the seeing, at least.
+_WEIGHTS = 16.0
+_SEEINGS = 8.0
+#: Width of the narrowest weight over that of the first: it decides which frequencies count.
+_NARROWEST = 0.5
+# Pixels of a stamp that is wider than any star.
+_WIDE_STAMP = 4096
+# Most stars of one batch.
+_BATCH = 1024
+_MOST_STEPS = 60
+# Of the centroid, and the square root of moments, as a part of the weight's width: sums are float32.
+_TOLERANCE = 1e-5
+
+
+@dataclass(frozen=True)
+class PsfMoments(Result):
+    """Moments of point spread functions of n stars, along the axes of the detector; NaN where flagged.
+
+    Parameters
+    ----------
+    fields : array, shape [n, 2]
+        Field angles [rad].
+    e1, e2 : array
+        Ellipticity (a - b)/(a + b) under the round weight, as :func:`~pachon.measure_shapes` has it.
+    size : array
+        ``(Q11 Q22 - Q12^2)^(1/4)`` of the moments under the round weight [rad].
+    x, y : array
+        Centroid under it, from the star's reference point [pixel].
+    g1, g2 : array
+        Ellipticity (a - b)/(a + b) of adaptive moments, as :func:`~pachon.adaptive_moments` has it; NaN without an
+        atmosphere.
+    sigma : array
+        Determinant radius of the adaptive moments [rad]; NaN without an atmosphere.
+    lit_fraction : array
+        Lit fraction of the pupil, mean over wavelengths.
+    flags : array of int
+        1 where the iteration has not converged, 2 where moments are not positive, 8 where no light arrives.
+    """
+
+    _table = ("fields", "e1", "e2", "size", "x", "y", "g1", "g2", "sigma", "lit_fraction", "flags")
+
+    fields: np.ndarray
+    e1: np.ndarray
+    e2: np.ndarray
+    size: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    g1: np.ndarray
+    g2: np.ndarray
+    sigma: np.ndarray
+    lit_fraction: np.ndarray
+    flags: np.ndarray
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the ellipticities in their plane, coloured by the size."""
+        return draw_shapes(ax, self.e1, self.e2, self.size / ARCSEC, "weighted rms size [arcsec]")
+
+    @property
+    def T(self) -> np.ndarray:  # noqa: N802
+        """Size Mxx + Myy of the adaptive moments [rad^2]."""
+        square = self.g1**2 + self.g2**2
+        return np.asarray(2.0 * self.sigma**2 * (1.0 + square) / (1.0 - square))
+
+    @property
+    def usable(self) -> np.ndarray:
+        """Stars without a flag, [n] bool."""
+        return self.flags == 0
+
+    def __len__(self) -> int:
+        """Return the number of stars."""
+        return len(self.flags)
+
+
+@check_arguments
+def psf_moments(
+    telescope: Telescope | Request,
+    fields: ArrayLike | None = None,
+    wavelengths: ArrayLike | Light | None = None,
+    *,
+    focal_plane: FocalPlane | None = None,
+    atmosphere: Atmosphere | None = None,
+    aberration: ResidualWavefront | None = None,
+    stamps: Stamps | None = None,
+    engine: str | PsfEngine = "long_exposure",
+    weight_fwhm: ArrayLike | None = None,
+    threads: int | None = None,
+) -> PsfMoments:
+    """Compute moments of point spread functions without their images.
+
+    They are those that :func:`~pachon.measure_shapes` and :func:`~pachon.adaptive_moments` measure on the images of
+    :func:`~pachon.make_psfs`, but for what these images lack: sums over pixels stand for integrals there, and their
+    stamps cut wings off. A star depends on no other.
+
+    Parameters
+    ----------
+    telescope, fields, wavelengths, focal_plane, atmosphere, aberration, threads
+        As in :func:`~pachon.make_psfs`; without an atmosphere the moments are those of the optics alone.
+    stamps : Stamps, optional
+        Pixels, charge diffusion, silicon and jitter; sizes and places do not matter.
+    engine : LongExposureEngine, StatisticalEngine, or {"long_exposure", "statistical"}
+        The mean over all turbulence, or an exposure drawn from its theory.
+    weight_fwhm : float or Quantity, optional
+        FWHM of the round Gaussian weight [rad]; 0.7 arcsec by default, and 0.3 without an atmosphere.
+
+    Returns
+    -------
+    PsfMoments
+
+    Raises
+    ------
+    ConfigError
+        If the engine is another one, or fields or wavelengths are given beside a request.
+    DomainError
+        If an argument is outside its range or of the wrong shape, a star is far from focus or falls between the CCDs.
+    """
+    options = psf_engine(engine)
+    if not isinstance(options, LongExposureEngine):
+        raise ConfigError(
+            f"engine = {options.name!r}: expected 'long_exposure' or 'statistical', whose moments are sums over "
+            "transfer functions (make_psfs and measure_shapes have those of others)",
+            key="engine",
+        )
+    default = WEIGHT_FWHM_ALONE if atmosphere is None else WEIGHT_FWHM
+    fwhm = default if weight_fwhm is None else positive_angle(weight_fwhm, "weight_fwhm")
+    inputs, stars = psf_inputs(
+        telescope, fields, wavelengths, focal_plane, atmosphere, aberration, stamps or Stamps(), threads
+    )
+    renderer = _renderer(options, inputs, fwhm / math.sqrt(8.0 * math.log(2.0)))
+    stars = replace(stars, offsets=np.zeros_like(stars.offsets))
+    parts, lit = [np.zeros((0, _COLUMNS))], [np.zeros((0, len(inputs.wavelengths)))]
+    renderer.prepare(stars.fields)
+    for first in range(0, len(stars), renderer.batch):
+        exposed = renderer.expose(stars[first : first + renderer.batch])
+        parts.append(exposed.draw(None))
+        lit.append(exposed.lit_fraction)
+    return _result(stars.fields, np.concatenate(parts), np.concatenate(lit), inputs, renderer.focal_length)
+
+
+#: Numbers of a star: ellipses and flags of both weights.
+_COLUMNS = 2 * (ELLIPSE + 1)
+
+
+def _result(
+    fields: np.ndarray, values: np.ndarray, lit: np.ndarray, inputs: PsfInputs, focal_length: float
+) -> PsfMoments:
+    """Return moments of ellipses [m] and flags on the detector."""
+    weighted, adaptive = np.split(values, 2, axis=1)
+    e1, e2, size, flags = _shapes(weighted)
+    g1, g2, sigma, adaptive_flags = _shapes(adaptive)
+    if inputs.atmosphere is None:
+        g1, g2, sigma = (np.full(len(e1), np.nan) for _ in range(3))
+    else:
+        flags = flags | adaptive_flags
+    good = flags == 0
+    x, y = np.where(good, weighted[:, :2].T / inputs.plane.pixel_size, np.nan)
+    e1, e2, size, g1, g2, sigma = (np.where(good, v, np.nan) for v in (e1, e2, size, g1, g2, sigma))
+    return PsfMoments(fields, e1, e2, size / focal_length, x, y, g1, g2, sigma / focal_length, lit.mean(axis=1), flags)
+
+
+def _shapes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return both ellipticities, determinant radius and flags of ellipses."""
+    _, _, xx, yy, xy, _, flag = values.T
+    good = flag == 0.0
+    root = np.sqrt(np.where(good, xx * yy - xy**2, np.nan))
+    norm = xx + yy + 2.0 * root
+    return (xx - yy) / norm, 2.0 * xy / norm, np.sqrt(root), flag.astype(np.int64)
+
+
+def _renderer(options: LongExposureEngine, inputs: PsfInputs, weight_rms: float) -> _Moments:
+    """Return the renderer of moments under a weight of an rms width [rad]."""
+    if inputs.atmosphere is None:
+        if isinstance(options, StatisticalEngine):
+            options.renderer(inputs)  # says that it needs an atmosphere
+        return _MomentsOfOptics(inputs, options, weight_rms)
+    if isinstance(options, StatisticalEngine):
+        return _MomentsOfExposure(inputs, options, weight_rms)
+    return _Moments(inputs, options, weight_rms)
+
+
+class _Moments(LongExposureRenderer):
+    """Moments of the long exposure, in place of its stamps."""
+
+    negligible = 1e-4
+
+    def __init__(self, inputs: PsfInputs, options: Any, weight_rms: float) -> None:
+        self._weight_angle = weight_rms
+        super().__init__(inputs, options)
+        self.batch = min(_BATCH, 4 * self.batch)
+        # No light falls beside a stamp.
+        self._inputs = replace(self._inputs, plane=replace(self._inputs.plane, size=_WIDE_STAMP))
+
+    expose = LongExposureRenderer._expose
+
+    @property
+    def _weight(self) -> float:
+        """Rms width of the weight on the detector [m]."""
+        return self._weight_angle * self.focal_length
+
+    def _period(self) -> float:
+        air, width = self._inputs.atmosphere, _WEIGHTS * self._weight_angle
+        if air is not None:
+            longest = float(self._wavelengths.max())
+            width = max(width, _SEEINGS * longest / float(fried_parameter(air.r0, longest)))
+        return max(width * self.focal_length, 8.0 * self._plane.pixel_size)
+
+    def _transfer_bounds(self, longest: float) -> np.ndarray:
+        bounds = super()._transfer_bounds(longest)
+        k = 2.0 * math.pi / self.period * np.arange(1, bounds.shape[1] + 1)
+        return np.asarray(bounds * np.exp(-0.5 * (_NARROWEST * self._weight * k) ** 2))
+
+    def _ray_counts(self, optics: PupilOptics) -> np.ndarray:
+        return far_from_focus(optics, self.focal_length)
+
+    def _expose_rays(self, rays: int, stars: Stars) -> ExposedStars:
+        raise DomainError(
+            f"{field_label(stars.fields[0])}: the star is far from focus; expected stars near it for moments without "
+            "images"
+        )
+
+    def _sampled(self, spectrum: np.ndarray, offsets: np.ndarray, lit: np.ndarray, points: np.ndarray) -> ExposedStars:
+        values = np.concatenate(
+            [self._measure(spectrum, False), self._measure(spectrum, self._inputs.atmosphere is not None)], axis=1
+        )
+        return ExposedStars(lambda shift: values, lit, points)
+
+    def _measure(self, spectrum: np.ndarray, adaptive: bool) -> np.ndarray:
+        """Return ellipses [m] and flags of transfer functions, [n_star, ELLIPSE + 1]."""
+        unit = self.period / (2.0 * math.pi)
+        ellipse, flags = np.zeros((len(spectrum), ELLIPSE)), np.zeros(len(spectrum), dtype=np.int32)
+        launch(
+            measure_spectra,
+            len(spectrum),
+            [
+                warp_array(spectrum, samples),
+                warp_array(self._detector, samples),
+                warp_array(self._rows, wp.int32),
+                (self._weight / unit) ** 2,
+                adaptive,
+                _MOST_STEPS,
+                _TOLERANCE,
+                warp_array(ellipse),
+                warp_array(flags, wp.int32),
+            ],
+            threads=self._threads,
+        )
+        ellipse[:, :2] *= unit
+        ellipse[:, 2:5] *= unit**2
+        return np.concatenate([ellipse, flags[:, None]], axis=1)
+
+
+class _MomentsOfExposure(_Moments, StatisticalRenderer):
+    """Moments of an exposure of the statistical engine."""
+
+
+class _MomentsOfOptics(_Moments):
+    """Moments of the optics alone, under a weight that is wide enough."""
+
+    def _turbulence(self, baseline: np.ndarray) -> np.ndarray:
+        return np.ones((len(self._wavelengths), len(baseline)))
