@@ -111,18 +111,21 @@ def annular_zernike_gradients(jmax: int, x: np.ndarray, y: np.ndarray, obscurati
     for m, top in _radial_degrees(orders).items():
         columns[m] = _radial_coefficients(m, top + 1, float(obscuration))
     z, scale_s = x + 1j * y, 4.0 / (1 - obscuration**2)
+    # (x + iy)^m and its derivative along x, for all terms of one m; the one along y is i times that.
+    powers = {m: (z**m, m * z ** max(m - 1, 0)) for m in columns}
     out = np.empty((jmax, 2, *x.shape))
+    radial: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
     for row, (n, signed) in enumerate(orders):
         m = abs(signed)
-        series = columns[m][:, (n - m) // 2]
-        value = np.polynomial.legendre.legval(nodes, series)
-        # d/dx = 2x d/ds and d/dy = 2y d/ds of the radial part
-        slope = np.polynomial.legendre.legval(nodes, np.polynomial.legendre.legder(series)) * scale_s
-        # (x + iy)^m and its derivative along x; the one along y is i times that.
-        power, change = z**m, m * z ** max(m - 1, 0)
-        along_x, along_y = value * change + slope * x * power, 1j * value * change + slope * y * power
+        power, change = powers[m]
+        if (n, m) not in radial:
+            series = columns[m][:, (n - m) // 2]
+            value = np.polynomial.legendre.legval(nodes, series)
+            # d/dx = 2x d/ds and d/dy = 2y d/ds of the radial part
+            slope = np.polynomial.legendre.legval(nodes, np.polynomial.legendre.legder(series)) * scale_s
+            radial[n, m] = value * change + slope * x * power, 1j * value * change + slope * y * power
         scale = 1.0 if m == 0 else np.sqrt(2.0)
-        for axis, derivative in enumerate((along_x, along_y)):
+        for axis, derivative in enumerate(radial[n, m]):
             out[row, axis] = scale * (derivative.imag if signed < 0 else derivative.real)
     return out
 

@@ -149,6 +149,8 @@ class ImageGrid:
         self._square = 4.0 * (x * x + y * y)
         edge = math.sqrt(abs(float(np.linalg.det(jacobian)))) * math.pi / pixel * scale
         self._edge_exponent = float(seeing.exponent(np.array([edge]))[0])
+        #: Derivatives of the image at the point where they were computed last.
+        self.last: object = None
         self._core: SharpCore | None = None
         if sharp:
             core = pixels.width / pixels.side, blur / pixel, footprint / pixel
@@ -161,6 +163,7 @@ class ImageGrid:
     def with_rims(self, rims: PupilRims) -> ImageGrid:
         """Return the grid for other rims of the pupil."""
         grid = copy(self)
+        grid.last = None
         grid.rim_light = None if self.rim_light is None else self.rim_light.of(rims)
         return grid
 

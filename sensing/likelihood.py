@@ -43,8 +43,13 @@ class Stamp:
     grid: ImageGrid
     rays: LightRays
 
+    def forget(self) -> None:
+        """Free the derivatives of the last linear model."""
+        self.grid.last = None
+
     def release(self) -> None:
         """Free what the model can compute again."""
+        self.forget()
         self.rays.release()
         if self.grid.rim_light is not None:
             self.grid.rim_light.release()
@@ -105,14 +110,37 @@ class Linearized:
     scales: np.ndarray
 
 
-def linearized(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> Linearized | None:
-    """Return the linear model of a stamp about unknowns; None where light has no direction or misses the telescope."""
+@dataclass(frozen=True)
+class _Derivatives:
+    """Image of some rays at unknowns of the star and its wavefront, with its derivatives and their scales."""
+
+    rays: LightRays
+    point: np.ndarray
+    image: tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def _derivatives(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> tuple[np.ndarray, ...] | None:
+    """Return image, derivatives and scales; None where light has no direction or misses the telescope."""
+    last, point = stamp.grid.last, np.concatenate([unknowns, wave])
+    # What follows a fit, such as its errors, begins where that has ended.
+    if isinstance(last, _Derivatives) and last.rays is stamp.rays and np.array_equal(last.point, point):
+        return last.image
     landing = stamp.rays.landing(wave)
     if not np.isfinite(landing).all():
         return None
     response = stamp.rays.response(wave)
     light = _landed(stamp, wave, landing, response)
-    model, columns, scales = stamp.grid.derivatives(unknowns, light, response, stamp.rays.rates)
+    image = stamp.grid.derivatives(unknowns, light, response, stamp.rays.rates)
+    stamp.grid.last = _Derivatives(stamp.rays, point, image)
+    return image
+
+
+def linearized(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> Linearized | None:
+    """Return the linear model of a stamp about unknowns; None where light has no direction or misses the telescope."""
+    derivatives = _derivatives(stamp, unknowns, wave)
+    if derivatives is None:
+        return None
+    model, columns, scales = derivatives
     # A slice where all pixels are used, since that is no copy.
     used = stamp.used if not stamp.used.all() else np.s_[:, :]
     variance = _variance(stamp, model)
@@ -121,6 +149,37 @@ def linearized(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> Lineariz
     scaled = columns[used].reshape(len(root), -1) * root[:, None]
     brightness = unknowns[FLUX] * columns[..., FLUX].astype(np.float64)
     return Linearized(model, variance, brightness, stamp.used, residual, residual * root, scaled, scales)
+
+
+def light_columns(
+    stamp: Stamp, unknowns: np.ndarray, point: Linearized, light: LandedLight, rates: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return derivatives by changes of the light, over the noise, and their scales.
+
+    Parameters
+    ----------
+    stamp : Stamp
+        Pixels and model.
+    unknowns : ndarray
+        Unknowns of the star.
+    point : Linearized
+        Linear model there.
+    light : LandedLight
+        Light that comes and goes.
+    rates : ndarray, shape [n, k]
+        Its fractions by each change; all other light has as much less in proportion.
+
+    Returns
+    -------
+    columns, scales : ndarray, shapes [n_pixel, k], [k]
+        As those of `point`.
+    """
+    response = np.zeros((2, len(rates), 0), dtype=np.float32)
+    columns, scales = stamp.grid.derivatives(unknowns, light, response, rates)[1:]
+    count = rates.shape[1]
+    root = (1.0 / np.sqrt(point.variance[point.used])).astype(np.float32)
+    gained = columns[point.used][:, columns.shape[-1] - count :] * root[:, None]
+    return gained - np.outer(point.columns[:, FLUX], rates.sum(axis=0).astype(np.float32)), scales[-count:]
 
 
 def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> NormalEquations:

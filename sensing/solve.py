@@ -180,6 +180,8 @@ def _linearize(group: Group, joined: np.ndarray, sizes: list[int], pool: Executo
         equations = normal_equations(stamp, joined[bounds[i] : bounds[i + 1]], group.maps[i] @ shared)
         if group.transient:
             stamp.release()
+        elif len(group.stamps) > 1:
+            stamp.forget()
         return equations
 
     apply: Callable[..., object] = map if pool is None else pool.map
