@@ -81,18 +81,29 @@ class ZernikeRays:
         cells: PupilCells,
         noll: np.ndarray,
     ) -> None:
-        self._telescope, self._direction, self._wavelengths = telescope, direction, wavelengths
+        self._direction, self._wavelengths = direction, wavelengths
         self.cells, self._points = cells, cells.points
         self._weights, self.rates = cells.at_wavelengths(wavelength_weights)
-        middle = float(wavelengths[len(wavelengths) // 2])
-        self._chief = chief_landing(telescope, direction, middle)
+        self._middle = float(wavelengths[len(wavelengths) // 2])
         #: Derivatives of the terms along x and y of the plane of the entrance pupil [1/m], [n_term, 2, n_point].
-        self._gradients = _gradients(telescope, direction, middle, cells.points, noll)
-        self._jacobians = [self._jacobian(float(w)) for w in wavelengths]
+        self._gradients = _gradients(telescope, direction, self._middle, cells.points, noll)
+        self._set_telescope(telescope)
+
+    def _set_telescope(self, telescope: Telescope) -> None:
+        """Have the landing points of light through a telescope."""
+        self._telescope = telescope
+        self._chief = chief_landing(telescope, self._direction, self._middle)
+        self._jacobians = [self._jacobian(float(w)) for w in self._wavelengths]
         self._last: tuple[np.ndarray, np.ndarray] | None = None
         self._set_response(self._gradients)
         #: Sides of the image of a cell [m], columns of a matrix.
-        self.footprint = cells.footprint(self._landing(middle, np.zeros((1, 1, 2)))[0])
+        self.footprint = self.cells.footprint(self._landing(self._middle, np.zeros((1, 1, 2)))[0])
+
+    def through(self, telescope: Telescope) -> ZernikeRays:
+        """Return the light of the same cells of the pupil through another telescope of the same entrance pupil."""
+        rays = copy(self)
+        rays._set_telescope(telescope)
+        return rays
 
     def _landing(self, wavelength: float, slopes: np.ndarray) -> np.ndarray:
         """Return detector x and y [m] of rays, [m, n, 2], with direction cosines changed by slopes [m, n or 1, 2]."""
@@ -125,9 +136,8 @@ class ZernikeRays:
 
     def responding_to(self, noll: np.ndarray) -> ZernikeRays:
         """Return the same light for the same unknowns, with the response to other terms that it does not have."""
-        middle = float(self._wavelengths[len(self._wavelengths) // 2])
         rays = copy(self)
-        rays._set_response(_gradients(self._telescope, self._direction, middle, self._points, noll))
+        rays._set_response(_gradients(self._telescope, self._direction, self._middle, self._points, noll))
         return rays
 
     def beside(self, points: np.ndarray, moments: np.ndarray, landing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

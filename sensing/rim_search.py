@@ -20,7 +20,7 @@ _GAIN = 25.0
 #: Least part of the misfit beyond noise that a rim elsewhere explains: where the model lacks other things, or the noise
 #: is larger than given, a rim explains a tenth or two by chance.
 _MISFIT = 0.5
-#: Gain of a score test over these from which on a rim is tried: one that stands far off gains more in the end.
+#: Part of the misfit that a score test gives a rim that is tried: one that stands far off gains more in the end.
 _PROMISING = 0.5
 #: Gain over the largest one from which on other rims are tried, too.
 _LIKELY = 0.4
@@ -82,12 +82,13 @@ def with_moved_rims(
         loss = best.solution.loss / best.stamp.used.sum()
         if loss < noise:
             break
-        threshold = _GAIN + _MISFIT * max(loss - (noise or 1.0), 0.0) * best.stamp.used.sum()
+        misfit = _MISFIT * max(loss - (noise or 1.0), 0.0) * best.stamp.used.sum()
+        threshold = _GAIN + misfit
         bodies, gains = rim_gains(instrument, best)
         free = [body for body in best.light.free_rims.bodies if body.moved]
         moved = {body.members for body in (*free, *failed)}
         gains = np.where([body.members in moved for body in bodies], 0.0, gains)
-        if not gains.max(initial=0.0) > _PROMISING * threshold:
+        if not gains.max(initial=0.0) > _GAIN + _PROMISING * misfit:
             break
         if first is None:
             likely = gains > _LIKELY * gains.max()

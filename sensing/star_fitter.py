@@ -191,6 +191,12 @@ class StarFitter:
         rays = self._of(light, max(sampling.across, shared))
         return self.instrument.stamp(light, pixels, rays, sampling.sharp, reach)
 
+    def mirrored_stamp(self, light: StarLight, start: Start) -> Stamp:
+        """Return the stamp of a star's light on the other side of focus, through the cells of the pupil of a start."""
+        rays, grid = start.stamp.rays, start.stamp.grid
+        assert isinstance(rays, ZernikeRays)
+        return self.instrument.stamp(light, start.pixels, rays.through(light.telescope), grid.sharp, grid.reach)
+
     def sampled_stamp(self, pixels: Pixels, sampling: Sampling, reach: float) -> Stamp:
         """Return the stamp of pixels that are sampled so, with room for light beside it [m]."""
         rays = self._of(self._light, sampling.across)
@@ -348,11 +354,13 @@ class StarFitter:
         shared: np.ndarray | None = None,
         tolerance: float = FINE,
         steps: int = STEPS,
+        hopeless: float = math.inf,
     ) -> Solution:
-        """Return the best unknowns from a start."""
+        """Return the best unknowns from a start; see :func:`~pachon.sensing.solve.solve`."""
         n = self._map.shape[2]
         group = Group((stamp,), self._map, self.precision[:n], self.instrument.known_seeing, prior_mean=self._mean[:n])
-        return solve(group, [star], np.zeros(n) if shared is None else shared, tolerance=tolerance, steps=steps)
+        start = np.zeros(n) if shared is None else shared
+        return solve(group, [star], start, tolerance=tolerance, steps=steps, hopeless=hopeless)
 
 
 def _typical(pull: np.ndarray, model: np.ndarray, used: np.ndarray) -> float:
