@@ -16,7 +16,7 @@ import numpy as np
 
 from ..core.errors import DomainError
 from ..models.telescope import Telescope
-from ..models.zernike_polynomials import annular_zernike_gradients
+from ..models.zernike_polynomials import low_zernike_gradients
 from ..raytrace.aiming import pupil_coordinates
 from ..raytrace.launch import launch_bundles
 from ..raytrace.rays import Rays, RayStatus, parallel_rays
@@ -88,19 +88,19 @@ class ZernikeRays:
         #: Derivatives of the terms along x and y of the plane of the entrance pupil [1/m], [n_term, 2, n_point].
         self._gradients = _gradients(telescope, direction, self._middle, cells.points, noll)
         self._set_telescope(telescope)
+        self._jacobians = [self._jacobian(float(w)) for w in self._wavelengths]
+        self._set_response(self._gradients)
 
     def _set_telescope(self, telescope: Telescope) -> None:
         """Have the landing points of light through a telescope."""
         self._telescope = telescope
         self._chief = chief_landing(telescope, self._direction, self._middle)
-        self._jacobians = [self._jacobian(float(w)) for w in self._wavelengths]
         self._last: tuple[np.ndarray, np.ndarray] | None = None
-        self._set_response(self._gradients)
         #: Sides of the image of a cell [m], columns of a matrix.
         self.footprint = self.cells.footprint(self._landing(self._middle, np.zeros((1, 1, 2)))[0])
 
     def through(self, telescope: Telescope) -> ZernikeRays:
-        """Return the light of the same cells of the pupil through another telescope of the same entrance pupil."""
+        """Return the light of the same cells of the pupil, of the same response, through a telescope out of focus."""
         rays = copy(self)
         rays._set_telescope(telescope)
         return rays
@@ -204,7 +204,7 @@ def _gradients(
     """Return the derivatives of Zernike terms of the pupil by points of its plane [1/m], [n_term, 2, n_point]."""
     radius = 0.5 * telescope.pupil_diameter
     x, y = pupil_coordinates(telescope, direction, wavelength, points).T / radius
-    terms: np.ndarray = annular_zernike_gradients(int(noll.max()), x, y, telescope.pupil_obscuration)[noll - 1] / radius
+    terms = low_zernike_gradients(noll, x, y, telescope.pupil_obscuration) / radius
     if telescope.design_data.aiming == "off":
         return terms
     step = _DIFFERENCE * radius

@@ -253,16 +253,15 @@ def _both_sides(fitter: StarFitter, start: Start, solution: Solution) -> tuple[B
     if len(star) > RATIO:
         return None, None
     noll, count = fitter.instrument.noll, start.stamp.used.sum()
-    light = fitter.instrument.mirrored(fitter.light)
     shared = np.zeros_like(solution.shared)
     even = np.array([noll_to_nm(int(j))[0] % 2 == 0 for j in noll])
     shared[: len(noll)] = np.where(even, -1.0, 1.0) * solution.shared[: len(noll)]
     # Far from both sides alike, it does not matter how far, nor that some other cells of the pupil are lit.
     hopeless = solution.loss + _HOPELESS * CONTRADICTED / _loss_scale(solution.loss / count)
-    mirrored = fitter.mirrored_stamp(light, start)
+    mirrored = fitter.mirrored_stamp(fitter.instrument.mirrored(fitter.light, exact=False), start)
     other = fitter.solve(mirrored, star, shared, COARSE, _MIRRORED_STEPS, hopeless)
     if other.loss < hopeless:
-        mirrored = fitter.stamp(light, start.pixels)
+        mirrored = fitter.stamp(fitter.instrument.mirrored(fitter.light), start.pixels)
         other = fitter.solve(mirrored, other.stars[0], other.shared, COARSE, _MIRRORED_STEPS, hopeless)
     # What no side explains is in units of what is left.
     scale = _loss_scale(min(solution.loss, other.loss) / count)

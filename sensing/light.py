@@ -137,8 +137,11 @@ class Instrument:
         """
         return self._through(self._with_detector(direction, defocus), direction)
 
-    def mirrored(self, light: StarLight) -> StarLight:
-        """Return the light with what a defocus moves where the best focus is as far on the detector's other side."""
+    def mirrored(self, light: StarLight, *, exact: bool = True) -> StarLight:
+        """Return the light with what a defocus moves where the best focus is as far on the detector's other side.
+
+        Diameter, vignetting and rims are those of the light that was given unless they are to be `exact`.
+        """
         telescope, detector = light.telescope, light.telescope.surfaces[-1]
         name, axis = self.model.detector.body(telescope)
         if name != detector.name:
@@ -149,6 +152,8 @@ class Instrument:
             response = (depths[1] - depths[0]) / step
             if abs(response) > _RESPONSE:
                 moved = telescope.perturbed(name, shift=-2.0 * light.depth / response * axis)
+                if not exact:
+                    return replace(light, telescope=moved, depth=-light.depth)
                 # The unknown shifts of rims stay those of the light that was given.
                 return replace(self._through(moved, light.direction), rims=light.rims)
         moved = telescope.perturbed(detector.name, shift=2.0 * light.depth * detector.matrix[:, 2])

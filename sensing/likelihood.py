@@ -13,10 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from .donut_rays import LightRays
-from .image_model import FLUX, ImageGrid, LandedLight
+from .image_model import FLUX, RATIO, STRENGTH, ImageGrid, LandedLight, X, Y
 
 #: Smallest variance of a pixel [electron^2], where model and sky are next to nothing.
 _LEAST_VARIANCE = 1.0
+#: Distance that light has moved by since derivatives of the image were computed [pixels of the fit], up to which these
+#: hold: they are then a few per cent off, and steps of a search as much, which makes 1 nm of errors of 100.
+_STILL = 0.03
+#: The same of images that are sharper than their pixels.
+_STILL_SHARP = 0.015
+#: Relative change of the strength of the turbulence, and of the light of the cells, up to which they do.
+_SAME = 0.02
+#: The limits of searches in coarse pixels over these.
+_COARSE = 4.0
 
 
 @dataclass(frozen=True)
@@ -112,27 +121,45 @@ class Linearized:
 
 @dataclass(frozen=True)
 class _Derivatives:
-    """Image of some rays at unknowns of the star and its wavefront, with its derivatives and their scales."""
+    """Image of some rays at unknowns of the star, with its derivatives and their scales, and where its light landed."""
 
     rays: LightRays
-    point: np.ndarray
+    unknowns: np.ndarray
+    landing: np.ndarray
+    weights: np.ndarray
     image: tuple[np.ndarray, np.ndarray, np.ndarray]
+
+    def holds(self, stamp: Stamp, unknowns: np.ndarray, landing: np.ndarray, weights: np.ndarray) -> bool:
+        """Return whether the derivatives are those of light that lands elsewhere, too, but for a few per cent."""
+        if self.rays is not stamp.rays or len(unknowns) != len(self.unknowns) or len(landing) != len(self.landing):
+            return False
+        if not np.array_equal(self.unknowns[RATIO:], unknowns[RATIO:]):
+            return False
+        grid, (before, after) = stamp.grid, (self.unknowns[STRENGTH], unknowns[STRENGTH])
+        moved = landing - self.landing + grid.pixel / grid.scale * (unknowns[[X, Y]] - self.unknowns[[X, Y]])
+        distance = float(np.sqrt(weights @ (moved**2).sum(axis=1)))
+        looser = _COARSE if grid.coarse else 1.0
+        return bool(
+            distance < looser * (_STILL_SHARP if grid.sharp else _STILL) * grid.pixel
+            and abs(after - before) <= looser * _SAME * before
+            and np.abs(weights - self.weights).sum() < _SAME
+        )
 
 
 def _derivatives(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> tuple[np.ndarray, ...] | None:
     """Return image, derivatives and scales; None where light has no direction or misses the telescope."""
-    last, point = stamp.grid.last, np.concatenate([unknowns, wave])
-    # What follows a fit, such as its errors, begins where that has ended.
-    if isinstance(last, _Derivatives) and last.rays is stamp.rays and np.array_equal(last.point, point):
-        return last.image
-    landing = stamp.rays.landing(wave)
+    last, landing = stamp.grid.last, stamp.rays.landing(wave)
     if not np.isfinite(landing).all():
         return None
+    weights = stamp.rays.weights(wave)
+    if isinstance(last, _Derivatives) and last.holds(stamp, unknowns, landing, weights):
+        image = stamp.grid.image(unknowns, _landed(stamp, wave, landing, None))
+        return image, last.image[1], stamp.grid.scales(unknowns, len(last.image[2]))
     response = stamp.rays.response(wave)
     light = _landed(stamp, wave, landing, response)
-    image = stamp.grid.derivatives(unknowns, light, response, stamp.rays.rates)
-    stamp.grid.last = _Derivatives(stamp.rays, point, image)
-    return image
+    derivatives = stamp.grid.derivatives(unknowns, light, response, stamp.rays.rates)
+    stamp.grid.last = _Derivatives(stamp.rays, unknowns.copy(), landing, weights, derivatives)
+    return derivatives
 
 
 def linearized(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> Linearized | None:

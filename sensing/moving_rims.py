@@ -48,8 +48,8 @@ _FEWEST = 90
 _BESIDE = 0.02
 #: Steps by which places on the pupil are found.
 _STEPS = 8
-#: Step over the radius of the pupil after which they are found.
-_CLOSE = 1e-7
+#: Step over the radius of the pupil after which they are found, to the square of it.
+_CLOSE = 1e-4
 #: Longest piece of a rim, in sides of a cell.
 _LONGEST = 10.0
 #: Fewest pieces of a rim that matter.

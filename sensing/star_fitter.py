@@ -340,11 +340,12 @@ class StarFitter:
         used, star, wave = self.clean.used, solution.stars[0], solution.waves[0]
         used = stamp.used if stamp.used.shape == used.shape else used
         landing, weights = stamp.rays.landing(wave), stamp.rays.weights(wave)
+        regions = np.zeros_like(used) if used.all() else unused_regions(used)
         middle = 0.5 * (np.array(used.shape[::-1]) - 1.0)
         place = np.rint(landing / self.instrument.pixel + star[[X, Y]] + middle)
         outside = ~((place >= 0) & (place < used.shape[::-1])).all(axis=1)
         column, row = np.where(outside[:, None], 0, place).astype(np.int64).T
-        lost, cut = (outside | pixels[row, column] for pixels in (~used, unused_regions(used)))
+        lost, cut = (outside | pixels[row, column] for pixels in (~used, regions))
         return LostLight(float(weights @ lost), float(weights @ cut))
 
     def solve(
