@@ -87,6 +87,8 @@ class StarErrors:
 
 def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
     """Return the errors of a star that was fitted by itself."""
+    if star.errors is not None:
+        return star.errors
     solution, terms = star.solution, instrument.terms
     n_star, n = len(solution.stars[0]), len(terms.requested)
     wavefront = slice(n_star, n_star + n)
@@ -104,6 +106,14 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
     zernikes = solution.shared[:n]
     parts = ErrorParts.of(photons[wavefront, wavefront], residuals[wavefront, wavefront], air, model_floor(zernikes))
     return StarErrors(solution.star_covariance(0) + residuals[:n_star, :n_star], parts)
+
+
+def with_errors(instrument: Instrument, star: StarSolution) -> StarSolution:
+    """Return a star with its errors, its derivatives freed."""
+    star = replace(star, errors=star_errors(instrument, star))
+    star.stamp.forget()
+    star.full.forget()
+    return star
 
 
 def model_floor(zernikes: np.ndarray) -> np.ndarray:
