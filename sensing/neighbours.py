@@ -81,8 +81,8 @@ class NeighbourSearch:
         """
         best = self._pruned(self._extended(single))
         if self._misfit(best) > _MISTAKEN:
-            templates = self._from_templates(np.zeros_like(single.shared))
-            if templates is not None:
+            templates = self._from_templates(np.zeros_like(single.shared), best.loss)
+            if templates is not None and templates.loss < best.loss:
                 trial = self._pruned(self._extended(templates))
                 best = trial if trial.loss < best.loss else best
         if self._misfit(best) > _POOR:
@@ -139,10 +139,10 @@ class NeighbourSearch:
             solution = self.solve(self.stamp, without, solution.shared, COARSE, STEPS)
         return solution
 
-    def _from_templates(self, nothing: np.ndarray) -> Solution | None:
+    def _from_templates(self, nothing: np.ndarray, hopeless: float) -> Solution | None:
         """Return the solution from a start without aberrations, stars where their templates fit best together.
 
-        None where there is one alone, from which the first fit began.
+        None where there is one alone, from which the first fit began. A `hopeless` loss ends it.
         """
         stamp, grid = self.stamp, self.stamp.grid
         variance, weight = stamp.variance + np.maximum(stamp.image, 0.0), stamp.used.astype(np.float64)

@@ -103,11 +103,14 @@ def with_moved_rims(
         gains = np.where([body.members in moved for body in bodies], 0.0, gains)
         if not gains.max(initial=0.0) > _GAIN + _PROMISING * misfit:
             break
+        limit = best.solution.loss - _PROMISING * threshold
         if first is None:
             likely = gains > _LIKELY * gains.max()
-            trials = _each_freed(instrument, best, list(itertools.compress(bodies, likely)), best.solution, solved)
+            trials = _each_freed(
+                instrument, best, list(itertools.compress(bodies, likely)), best.solution, solved, limit
+            )
         else:
-            trials = _each_freed(instrument, best, bodies, first, solved)
+            trials = _each_freed(instrument, best, bodies, first, solved, limit)
         trial = trials[0]
         gain = best.solution.loss - trial.solution.loss
         if gain < threshold:
@@ -134,14 +137,17 @@ def _each_freed(
     bodies: Sequence[RimBody],
     start: Solution,
     solved: RimSolver,
+    limit: float,
 ) -> list[RimFit]:
-    """Return fits with one more of some bodies free, best first: those that lead nowhere end after a few steps."""
+    """Return fits with one more of some bodies free, best first: those that lead nowhere end after a few steps.
+
+    So do those that will not get below a limit of the loss.
+    """
     trials = []
     for body in bodies:
         light = fit.light.with_free_rims(fit.light.free_rims.with_body(body), instrument.middle)
-        trial = solved(light, start, fit.solution.loss)
-        hopeless = trial.solution.loss > fit.solution.loss
-        trials.append(trial if hopeless else _settled(instrument, trial, solved, _FIRST_STEPS))
+        # A rim that stands far off gains little before its shadow is computed where it is first found to stand.
+        trials.append(_settled(instrument, solved(light, start), solved, _FIRST_STEPS, limit))
     trials.sort(key=lambda trial: trial.solution.loss)
     close = [trial for trial in trials if trial.solution.loss < _CLOSE * trials[0].solution.loss]
     finished = [_settled(instrument, trial, solved) for trial in close[:_FINISHED]]
@@ -190,8 +196,13 @@ def rim_gains(instrument: Instrument, fit: RimFit) -> tuple[list[RimBody], np.nd
     return bodies, gains
 
 
-def _settled(instrument: Instrument, best: RimFit, solved: RimSolver, steps: int = _OUTER) -> RimFit:
-    """Return the best fit with the same rims free, their shadows where they are found to stand, after so many steps."""
+def _settled(
+    instrument: Instrument, best: RimFit, solved: RimSolver, steps: int = _OUTER, hopeless: float = np.inf
+) -> RimFit:
+    """Return the best fit with the same rims free, their shadows where they are found to stand, after so many steps.
+
+    Steps end where the loss cannot get below a `hopeless` one.
+    """
     first = len(instrument.noll) + 2 * len(best.light.rims)
     factor = 1.0
     for _ in range(steps):
@@ -199,7 +210,9 @@ def _settled(instrument: Instrument, best: RimFit, solved: RimSolver, steps: int
         if np.all(np.abs(shift) < _SMALL * rims.spreads):
             break
         light = best.light.with_free_rims(rims.moved(shift), instrument.middle)
-        trial = solved(light, best.solution)
+        trial = solved(light, best.solution, hopeless)
+        if trial.solution.loss > hopeless:
+            break
         # Light that a shadow uncovers lies beside the line that stands for it, so that steps may be too long.
         gain = best.solution.loss - trial.solution.loss
         best, factor = (trial, 1.0) if gain > 0.0 else (best, 0.5 * factor)
