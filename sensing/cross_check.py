@@ -79,11 +79,11 @@ def cross_checked(
 
 
 def _noise(errors: ErrorParts) -> np.ndarray:
-    return errors.photons + errors.floor
+    return errors.photons
 
 
 def _lacking(errors: ErrorParts) -> np.ndarray:
-    return errors.residuals + errors.air
+    return errors.residuals + errors.air + errors.floor
 
 
 def _with_repeats(errors: ErrorParts) -> ErrorParts:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,8 +21,6 @@ from .star_fitter import StarSolution
 
 #: Terms up to the eleventh radial degree: what the mean wavefront of the air has beyond is lost in the seeing.
 _AIR_TERMS = 78
-#: Name of the field of the air's wavefront of unknown size.
-_AIR = "air"
 #: Rms of the wavefront of the air of unit strength, Z4 to Z22 together [m].
 _UNIT = 1e-7
 #: Least variance of a term of the air over that of all from Z4 to Z22.
@@ -48,7 +46,8 @@ class ErrorParts:
     air : ndarray
         Mean wavefront of the turbulence of the exposure.
     floor : ndarray
-        Accuracy of the model, and the scatter of the donuts of an exposure about a smooth field beyond all else.
+        Accuracy of the model, terms beyond those fitted, which fall off with the radial degree, and the scatter of the
+        donuts of an exposure about a smooth field beyond all else.
     repeats : ndarray
         No part of the sum: covariance of a donut about the others of its exposure, which have the same errors of the
         model in common. The sum, where there are none to compare.
@@ -90,20 +89,22 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
     solution, terms = star.solution, instrument.terms
     n_star, n = len(solution.stars[0]), len(terms.requested)
     wavefront = slice(n_star, n_star + n)
-    photons, air = solution.covariance, terms.air
-    residuals = np.zeros_like(photons)
+    photons, air, floor = solution.covariance, terms.air, np.zeros_like(terms.air)
+    residuals, lacking = np.zeros_like(photons), solution.star_covariance(0).copy()
     point = linearized(star.stamp, solution.stars[0], solution.waves[0])
     if point is not None and len(solution.shared):
         beside = _TermsBeside(instrument, star, point)
-        power = residual_power(point, photons, _resolution(instrument, star), beside.fields)
+        power = residual_power(point, photons, _resolution(instrument, star), beside.patterns)
         residuals = power.covariance
-        strength = power.strengths.get(_AIR, 0.0)
-        if strength > 0.0:
-            speckles, turbulence = (strength * values for values in beside.air(photons))
-            residuals, air = residuals - speckles, air + turbulence[wavefront, wavefront]
+        lacking += residuals[:n_star, :n_star]
+        floor = beside.unfitted(photons)[wavefront, wavefront]
+        if power.strength > 0.0:
+            speckles, turbulence = (power.strength * values for values in beside.air(photons))
+            lacking, air = lacking + speckles[:n_star, :n_star], air + turbulence[wavefront, wavefront]
     zernikes = solution.shared[:n]
-    parts = ErrorParts.of(photons[wavefront, wavefront], residuals[wavefront, wavefront], air, model_floor(zernikes))
-    return StarErrors(solution.star_covariance(0) + residuals[:n_star, :n_star], parts)
+    floor = floor + model_floor(zernikes)
+    parts = ErrorParts.of(photons[wavefront, wavefront], residuals[wavefront, wavefront], air, floor)
+    return StarErrors(lacking, parts)
 
 
 def model_floor(zernikes: np.ndarray) -> np.ndarray:
@@ -212,9 +213,19 @@ class _TermsBeside:
         beside = slice(n_star + n, n_star + n_fitted + len(self._beyond))
         return np.asarray(point.columns[:, beside] * point.scales[beside].astype(np.float32))
 
-    def fields(self) -> Mapping[str, np.ndarray]:
-        """Return the columns of the fields by name, [n_pixel, m]."""
-        return {_AIR: self._columns @ self._root.astype(np.float32)} if len(self._high) else {}
+    @cached_property
+    def patterns(self) -> np.ndarray | None:
+        """Changes of the image over the noise by independent parts of air of unit size, [n_pixel, m]; None without."""
+        return self._columns @ self._root.astype(np.float32) if len(self._high) else None
+
+    def unfitted(self, covariance: np.ndarray) -> np.ndarray:
+        """Return the covariance of the unknowns by terms that are not fitted, of the rms that telescopes have."""
+        columns = self._columns[:, len(self._instrument.terms.further) :]
+        scaled = self._point.columns.T @ columns
+        moved = (
+            covariance @ (self._point.scales[:, None] * scaled) * self._instrument.terms.spreads_beyond(self._beyond)
+        )
+        return np.asarray(moved @ moved.T)
 
     def air(self, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the covariance of the unknowns by air of unit size: by its further terms, and with its own.
@@ -222,7 +233,7 @@ class _TermsBeside:
         Its own terms are those asked for, which no donut tells from the telescope's.
         """
         n_star, low = len(self._star.solution.stars[0]), self._instrument.terms.requested - 4
-        scaled = self._point.columns.T @ (self._columns @ self._root.astype(np.float32))
+        scaled = self._point.columns.T @ self.patterns
         moved = covariance @ (self._point.scales[:, None] * scaled)
         speckles = moved @ moved.T
         turbulence, wavefront = speckles.copy(), slice(n_star, n_star + len(low))
