@@ -44,8 +44,8 @@ _LIGHT_LENGTH = 0.35
 _SIGNIFICANT = 3.0
 #: The same that a further field must explain.
 _NEEDED = 3.0
-#: The gain of the logarithm of the likelihood by a field of patterns: two standard deviations.
-_SEEN = 2.0
+#: Loss of the logarithm of the likelihood by each size that is fitted.
+_WORTH = 2.0
 #: Logarithms of the rms of a field of patterns between which the likeliest is searched, in units of itself.
 _RMS_LIMITS = (-5.0, 4.0)
 #: Variance of a combination of patterns over the largest one below which it says nothing.
@@ -163,9 +163,10 @@ class _Patterns:
         return cls((beside @ vectors).astype(np.float32), amplitudes, variances[shown])
 
     def sizes(self, power: np.ndarray) -> tuple[float, float]:
-        """Return the likeliest strength of the field, and the surplus of the variance in all combinations alike.
+        """Return the strength of the field, and the surplus of the variance in all combinations alike.
 
-        Other fields have a power [m, m] in the amplitudes.
+        They are means over nothing, either of the two and both, each with the weight of its likelihood. Other fields
+        have a power [m, m] in the amplitudes.
         """
         count = len(self.variances)
         if not count:
@@ -178,15 +179,20 @@ class _Patterns:
             return float(0.5 * (np.log(total) + energies / total).sum())
 
         noise = math.log(max(float(energies.mean()), 1.0))
-        bounds = [_RMS_LIMITS, (0.0, noise + 1.0)]
-        starts = [(0.0, 0.0), (0.0, noise), (_RMS_LIMITS[0], noise)]
-        best = min((minimize(loss, start, method="L-BFGS-B", bounds=bounds) for start in starts), key=lambda b: b.fun)
-        strength, level = float(np.exp(2.0 * best.x[0])), float(np.expm1(best.x[1]))
-        without = loss(np.array([_RMS_LIMITS[0], noise]))
-        if without - best.fun < _SEEN:
-            strength, level = 0.0, math.expm1(noise)
-        alone = min(loss(np.array([rms, 0.0])) for rms in np.linspace(*_RMS_LIMITS, 91))
-        return strength, level if alone - min(best.fun, without) > _SEEN else 0.0
+        none, searched = (_RMS_LIMITS[0], _RMS_LIMITS[0]), _RMS_LIMITS
+        fits = [(loss(np.array([none[0], 0.0])), 0.0, 0.0)]
+        for rms_limits, most in ((searched, 0.0), (none, noise), (searched, noise + 1.0)):
+            starts = [(min(0.0, rms_limits[1]), start) for start in ((0.0, noise) if most else (0.0,))]
+            bounds = [rms_limits, (0.0, most)]
+            best = min(
+                (minimize(loss, start, method="L-BFGS-B", bounds=bounds) for start in starts), key=lambda b: b.fun
+            )
+            count = int(rms_limits is searched) + int(most > 0.0)
+            fits.append((best.fun + count * _WORTH, float(np.exp(2.0 * best.x[0])), float(np.expm1(best.x[1]))))
+        losses, strengths, levels = np.array(fits).T
+        weights = np.exp(losses.min() - losses)
+        weights /= weights.sum()
+        return float(weights @ strengths), float(weights @ levels)
 
 
 class _Squares:
