@@ -115,7 +115,7 @@ class ImageGrid:
         self.shape, self.pixel, self.footprint = shape, pixel, footprint
         #: Pixels of the detector along one of the stamp, and the centre of its stamp from that of this one [pixels].
         self.scale, self.offset = float(pixels.side), np.array(pixels.offset)
-        self.sharp, self.reach = sharp, reach
+        self.sharp, self.reach, self.coarse = sharp, reach, pixels.blur > 0.0
         margin = max(8, math.ceil(reach / pixel))
         self._size = tuple(fft.next_fast_len(n + margin, real=True) for n in shape)
         #: Place of the centre of the stamp on the grid, (y, x) cells.
@@ -149,6 +149,8 @@ class ImageGrid:
         self._square = 4.0 * (x * x + y * y)
         edge = math.sqrt(abs(float(np.linalg.det(jacobian)))) * math.pi / pixel * scale
         self._edge_exponent = float(seeing.exponent(np.array([edge]))[0])
+        #: Derivatives of the image at the point where they were computed last.
+        self.last: object = None
         self._core: SharpCore | None = None
         if sharp:
             core = pixels.width / pixels.side, blur / pixel, footprint / pixel
@@ -161,6 +163,7 @@ class ImageGrid:
     def with_rims(self, rims: PupilRims) -> ImageGrid:
         """Return the grid for other rims of the pupil."""
         grid = copy(self)
+        grid.last = None
         grid.rim_light = None if self.rim_light is None else self.rim_light.of(rims)
         return grid
 
@@ -255,12 +258,16 @@ class ImageGrid:
         """
         columns = self._columns(unknowns, light, response, rates)
         columns[..., [BACKGROUND, SLOPE_X, SLOPE_Y]] = self._plane
-        scales = np.full(columns.shape[-1], unknowns[FLUX])
+        image = unknowns[FLUX] * columns[..., FLUX].astype(np.float64) + self._background(unknowns)
+        return image, columns, self.scales(unknowns, columns.shape[-1])
+
+    def scales(self, unknowns: np.ndarray, count: int) -> np.ndarray:
+        """Return the scales of so many columns; see :meth:`derivatives`."""
+        scales = np.full(count, unknowns[FLUX])
         scales[FLUX] = 1.0
         scales[[BACKGROUND, SLOPE_X, SLOPE_Y]] = self.scale**2
         scales[[X, Y]] /= self.scale
-        image = unknowns[FLUX] * columns[..., FLUX].astype(np.float64) + self._background(unknowns)
-        return image, columns, scales
+        return scales
 
     def _columns(
         self,

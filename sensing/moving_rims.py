@@ -38,6 +38,8 @@ _MOST = 3.0
 _ALIKE = 5e-3
 #: Points across the pupil for the places of the light on the surfaces.
 _SURVEY = 32
+#: Distance from the rays among them within which a rim may bound the light, in sides of their lattice.
+_BETWEEN = 4.0
 #: Side of their lattice over that of the cells.
 _MARGIN = 1.04
 #: Least number of points that determine these places as smooth functions of the pupil.
@@ -46,8 +48,8 @@ _FEWEST = 90
 _BESIDE = 0.02
 #: Steps by which places on the pupil are found.
 _STEPS = 8
-#: Step over the radius of the pupil after which they are found.
-_CLOSE = 1e-7
+#: Step over the radius of the pupil after which they are found, to the square of it.
+_CLOSE = 1e-4
 #: Longest piece of a rim, in sides of a cell.
 _LONGEST = 10.0
 #: Fewest pieces of a rim that matter.
@@ -287,7 +289,9 @@ class PupilShadows:
         """
         numberless = np.zeros((2, 0), dtype=np.int64)
         empty = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, MOTIONS, 2)), np.zeros((0, 2, 2)), *numberless
-        polynomials = self._smooth(surface)
+        regions = simple_regions(self._telescope.surfaces[surface].aperture)
+        numbers = {region: number for region, number in numbers.items() if self._meets_light(surface, regions[region])}
+        polynomials = self._smooth(surface) if numbers else None
         if polynomials is None:
             return empty
         smooth, places = polynomials
@@ -295,7 +299,6 @@ class PupilShadows:
         center, linear = (values[0] for values in smooth.at(self._middle[None], places))
         reach = float(np.hypot(*places.T).max())
         spacing = max(self._cells.side * np.sqrt(abs(float(np.linalg.det(linear)))), 1e-6 * reach)
-        regions = simple_regions(self._telescope.surfaces[surface].aperture)
         rims = [outline(regions[region], spacing, reach) for region in numbers]
         middle, along, motion = (
             np.concatenate(v) for v in zip(*((r.middle, r.end - r.start, r.motion) for r in rims), strict=True)
@@ -314,6 +317,18 @@ class PupilShadows:
         fine = (length > 0.0) & (length < _LONGEST * self._cells.side)
         return tuple(v[fine] for v in (points, along, motion, slope, number, np.full(len(points), surface)))
 
+    def _meets_light(self, surface: int, region: Simple) -> bool:
+        """Return whether a disc's rim is so near to the light on a surface that it may bound it; True for others."""
+        if not isinstance(region, Circle):
+            return True
+        places = self._places(surface, self._ends)[self._ends[-1].status == RayStatus.OK]
+        if not len(places):
+            return True
+        radii = np.hypot(*(places - [region.x, region.y]).T)
+        # Light between the rays of the survey may be there, too.
+        margin = _BETWEEN * float(np.ptp(places, axis=0).max()) / _SURVEY
+        return bool(radii.min() - margin < region.radius < radii.max() + margin)
+
     def _on_pupil(
         self, smooth: PupilPolynomials, places: np.ndarray, start: np.ndarray, target: np.ndarray
     ) -> np.ndarray:
@@ -322,10 +337,12 @@ class PupilShadows:
         with np.errstate(all="ignore"):
             for _ in range(_STEPS):
                 values, jacobian = smooth.at(points, places)
-                determinant = np.linalg.det(jacobian)
+                (xx, xy), (yx, yy) = np.moveaxis(jacobian, 0, -1)
+                x, y = (target - values).T
+                determinant = xx * yy - xy * yx
                 regular = np.abs(determinant) > 1e-12 * np.nanmax(np.abs(determinant), initial=1e-300)
-                safe = np.where(regular[:, None, None], jacobian, np.eye(2))
-                step = np.linalg.solve(safe, (target - values)[..., None])[..., 0]
+                solved = np.stack([yy * x - xy * y, xx * y - yx * x], axis=-1) / determinant[:, None]
+                step = np.where(regular[:, None], solved, target - values)
                 points = points + np.clip(step, -0.3 * self._half, 0.3 * self._half)
                 # Beyond the survey polynomials say nothing.
                 outside = np.hypot(*(points - self._middle).T) > 1.1 * self._half

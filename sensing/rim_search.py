@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from ..wavefront.psf.pupil_rims import PupilRims
-from .donut_rays import ZernikeRays, spread_of
-from .image_model import STRENGTH
+from .donut_rays import ZernikeRays
+from .image_model import STRENGTH, LandedLight
 from .light import Instrument, StarLight
-from .likelihood import Stamp, normal_equations
+from .likelihood import Stamp, light_columns, linearized
 from .moving_rims import PupilShadows, RimBody, line_cells
-from .rim_light import RimsAt
 from .solve import Solution
 
 #: Least gain of twice the logarithm of the likelihood by a rim elsewhere: noise makes one in 1e5 of three motions.
@@ -22,7 +20,7 @@ _GAIN = 25.0
 #: Least part of the misfit beyond noise that a rim elsewhere explains: where the model lacks other things, or the noise
 #: is larger than given, a rim explains a tenth or two by chance.
 _MISFIT = 0.5
-#: Gain of a score test over these from which on a rim is tried: one that stands far off gains more in the end.
+#: Part of the misfit that a score test gives a rim that is tried: one that stands far off gains more in the end.
 _PROMISING = 0.5
 #: Gain over the largest one from which on other rims are tried, too.
 _LIKELY = 0.4
@@ -84,12 +82,13 @@ def with_moved_rims(
         loss = best.solution.loss / best.stamp.used.sum()
         if loss < noise:
             break
-        threshold = _GAIN + _MISFIT * max(loss - (noise or 1.0), 0.0) * best.stamp.used.sum()
+        misfit = _MISFIT * max(loss - (noise or 1.0), 0.0) * best.stamp.used.sum()
+        threshold = _GAIN + misfit
         bodies, gains = rim_gains(instrument, best)
         free = [body for body in best.light.free_rims.bodies if body.moved]
         moved = {body.members for body in (*free, *failed)}
         gains = np.where([body.members in moved for body in bodies], 0.0, gains)
-        if not gains.max(initial=0.0) > _PROMISING * threshold:
+        if not gains.max(initial=0.0) > _GAIN + _PROMISING * misfit:
             break
         if first is None:
             likely = gains > _LIKELY * gains.max()
@@ -139,64 +138,38 @@ def rim_gains(instrument: Instrument, fit: RimFit) -> tuple[list[RimBody], np.nd
     light, (star, wave) = fit.light, (fit.solution.stars[0], fit.solution.waves[0])
     rays = fit.stamp.rays
     assert isinstance(rays, ZernikeRays)
+    point = linearized(fit.stamp, star, wave)
     bodies, lines = PupilShadows(light.telescope, light.direction, instrument.middle, rays.cells).candidates()
-    if not bodies:
+    if not bodies or point is None:
         return [], np.zeros(0)
     free = np.array([body.free for body in bodies])
-    shadows = instrument.rays_of(light, line_cells(rays.cells, lines, free))
     spreads = np.array([body.spreads for body in bodies])[free]
-    stamp = replace(fit.stamp, rays=_RaysWithShadows(rays, shadows, len(wave)))
-    equations = normal_equations(stamp, star, np.concatenate([wave, np.zeros(len(spreads))]))
-    first, last = len(star) + len(wave), len(star) + len(wave) + np.arange(len(spreads))
+    shadows = line_cells(rays.cells, lines, free)
+    _, rates = shadows.at_wavelengths(instrument.wavelength_weights)
+    landing, spread = rays.beside(shadows.points, shadows.moments, rays.landing(wave))
+    shadow_columns, scales = light_columns(
+        fit.stamp, star, point, LandedLight(landing, np.zeros(len(rates)), spread), rates
+    )
+    first = len(star) + len(wave)
     fitted = np.flatnonzero(np.arange(first) != (STRENGTH if instrument.known_seeing else -1))
     precision = np.concatenate([np.zeros(len(star)), instrument.terms.precision, light.shift_precision])
     mean = np.concatenate([np.zeros(first - len(light.shift_mean)), light.shift_mean])
     values = np.concatenate([np.zeros(len(star)), wave])
-    inner = (equations.curvature[:first, :first] + np.diag(precision))[np.ix_(fitted, fitted)]
-    cross = equations.curvature[np.ix_(fitted, last)]
-    slope = (equations.gradient[:first] - precision * (values - mean))[fitted]
+    inner = point.columns.T @ point.columns * np.outer(point.scales, point.scales) + np.diag(precision)
+    inner = inner[np.ix_(fitted, fitted)]
+    cross = (point.columns.T @ shadow_columns * np.outer(point.scales, scales))[fitted]
+    slope = (point.columns.T @ point.pulls * point.scales - precision * (values - mean))[fitted]
     scale = np.sqrt(np.maximum(np.diag(inner), 1e-300))
     projected = np.linalg.lstsq(inner / np.outer(scale, scale), cross / scale[:, None], rcond=1e-12)[0] / scale[:, None]
-    gradient = equations.gradient[last] - projected.T @ slope
-    curvature = equations.curvature[np.ix_(last, last)] - cross.T @ projected + np.diag(spreads**-2.0)
+    gradient = shadow_columns.T @ point.pulls * scales - projected.T @ slope
+    curvature = shadow_columns.T @ shadow_columns * np.outer(scales, scales) - cross.T @ projected
+    curvature += np.diag(spreads**-2.0)
     number = np.nonzero(free)[0]
     gains = np.zeros(len(bodies))
     for k in range(len(bodies)):
         motions = number == k
         gains[k] = gradient[motions] @ np.linalg.solve(curvature[np.ix_(motions, motions)], gradient[motions])
     return bodies, gains
-
-
-class _RaysWithShadows:
-    """Light of a star and the shadows of rims, which have no light: unknowns are those of the light, then motions."""
-
-    def __init__(self, light: ZernikeRays, shadows: ZernikeRays, count: int) -> None:
-        self.cells, self._light, self._shadows, self._count = light.cells, light, shadows, count
-        self._size = len(light.rates)
-        lost = -np.outer(light.weights(np.zeros(count)), shadows.rates.sum(axis=0))
-        still = np.zeros((len(shadows.rates), light.rates.shape[1]))
-        self.rates = np.block([[light.rates, lost], [still, shadows.rates]])
-
-    def weights(self, unknowns: np.ndarray) -> np.ndarray:
-        return np.concatenate([self._light.weights(unknowns[: self._count]), np.zeros(len(self._shadows.rates))])
-
-    def landing(self, unknowns: np.ndarray) -> np.ndarray:
-        return np.concatenate([rays.landing(unknowns[: self._count]) for rays in (self._light, self._shadows)])
-
-    def spread(self, landing: np.ndarray) -> np.ndarray:
-        # The shadows are too few to tell what a cell's image is like: they have the footprint of the light.
-        spread = spread_of(self._shadows.cells, landing[self._size :], self._light.footprint)
-        return np.concatenate([self._light.spread(landing[: self._size]), spread])
-
-    def at_rims(self, rims: PupilRims, landing: np.ndarray, response: np.ndarray | None) -> RimsAt:
-        return self._light.at_rims(rims, landing[: self._size], response)
-
-    def response(self, unknowns: np.ndarray) -> np.ndarray:
-        light = self._light.response(unknowns)
-        return np.concatenate([light, np.zeros((2, len(self._shadows.rates), light.shape[2]), light.dtype)], axis=1)
-
-    def release(self) -> None:
-        self._light.release()
 
 
 def _settled(

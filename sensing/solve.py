@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -109,11 +109,13 @@ def solve(
     *,
     tolerance: float = FINE,
     steps: int = STEPS,
+    hopeless: float = np.inf,
     pool: Executor | None = None,
 ) -> Solution:
     """Maximise the likelihood from a starting point, by so many steps or until one is to gain less than a tolerance.
 
-    A start without a likelihood is returned as it is, with an infinite loss.
+    A start without a likelihood is returned as it is, with an infinite loss. A search that after its first step
+    predicts no loss below a `hopeless` one ends there, with the loss that it predicts.
     """
     joined = np.concatenate([*stars, shared])
     sizes = [len(s) for s in stars]
@@ -121,7 +123,7 @@ def solve(
     held = _held(group, sizes)
     state = _linearize(group, joined, sizes, pool)
     damping, converged, predicted = _DAMPING, False, np.inf
-    for _ in range(steps if np.isfinite(state.loss) else 0):
+    for count in range(steps if np.isfinite(state.loss) else 0):
         step = np.zeros_like(joined)
         free = ~held & ~_pressed(joined, state.gradient, sizes)
         curvature = state.curvature[np.ix_(free, free)]
@@ -133,6 +135,9 @@ def solve(
         trial = _bounded(joined + step, sizes, held)
         if predicted < tolerance * max(1.0, state.loss / pixels):
             joined, converged = trial, True
+            break
+        if count and state.loss - predicted > hopeless:
+            joined, state = trial, replace(state, loss=state.loss - predicted)
             break
         trial_state = _linearize(group, trial, sizes, pool)
         if trial_state.loss < state.loss:
@@ -148,10 +153,10 @@ def solve(
     covariance[free] = np.linalg.pinv(state.curvature[free] / np.outer(scale, scale), hermitian=True)
     covariance[free] /= np.outer(scale, scale)
     bounds = np.cumsum([0, *sizes])
-    found_stars = tuple(joined[a:b] for a, b in itertools.pairwise(bounds))
+    star_unknowns = tuple(joined[a:b] for a, b in itertools.pairwise(bounds))
     best = joined[bounds[-1] :]
     waves = tuple(m @ best for m in group.maps)
-    return Solution(found_stars, best, waves, covariance, state.chi2, state.loss, converged)
+    return Solution(star_unknowns, best, waves, covariance, state.chi2, state.loss, converged)
 
 
 @dataclass(frozen=True)
@@ -180,6 +185,8 @@ def _linearize(group: Group, joined: np.ndarray, sizes: list[int], pool: Executo
         equations = normal_equations(stamp, joined[bounds[i] : bounds[i + 1]], group.maps[i] @ shared)
         if group.transient:
             stamp.release()
+        elif len(group.stamps) > 1:
+            stamp.forget()
         return equations
 
     apply: Callable[..., object] = map if pool is None else pool.map

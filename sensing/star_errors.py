@@ -198,20 +198,17 @@ class _TermsBeside:
         """Derivatives of the model by the terms beside those asked for, over the noise [1/m], [n_pixel, m]."""
         star, terms = self._star, self._instrument.terms
         unknowns, wave = star.solution.stars[0], star.solution.waves[0]
-        n_star, n, n_fitted = len(unknowns), len(terms.requested), len(terms.every)
-        rays = ZernikeRays(
-            star.light.telescope,
-            star.light.direction,
-            self._instrument.wavelengths,
-            self._instrument.wavelength_weights,
-            star.stamp.rays.cells,
-            np.concatenate([terms.every, self._beyond]),
-        )
-        padded_wave = np.concatenate([wave[:n_fitted], np.zeros(len(self._beyond)), wave[n_fitted:]])
-        point = linearized(replace(star.stamp, rays=rays), unknowns, padded_wave)
+        first = len(unknowns) + len(terms.requested)
+        further = slice(first, first + len(terms.further))
+        columns = self._point.columns[:, further] * self._point.scales[further].astype(np.float32)
+        if not len(self._beyond):
+            return columns
+        rays = star.stamp.rays
+        assert isinstance(rays, ZernikeRays)
+        point = linearized(replace(star.stamp, rays=rays.responding_to(self._beyond)), unknowns, wave)
         assert point is not None
-        beside = slice(n_star + n, n_star + n_fitted + len(self._beyond))
-        return np.asarray(point.columns[:, beside] * point.scales[beside].astype(np.float32))
+        beyond = slice(len(unknowns), len(unknowns) + len(self._beyond))
+        return np.concatenate([columns, point.columns[:, beyond] * point.scales[beyond].astype(np.float32)], axis=1)
 
     @cached_property
     def patterns(self) -> np.ndarray | None:

@@ -191,6 +191,12 @@ class StarFitter:
         rays = self._of(light, max(sampling.across, shared))
         return self.instrument.stamp(light, pixels, rays, sampling.sharp, reach)
 
+    def mirrored_stamp(self, light: StarLight, start: Start) -> Stamp:
+        """Return the stamp of a star's light on the other side of focus, through the cells of the pupil of a start."""
+        rays, grid = start.stamp.rays, start.stamp.grid
+        assert isinstance(rays, ZernikeRays)
+        return self.instrument.stamp(light, start.pixels, rays.through(light.telescope), grid.sharp, grid.reach)
+
     def sampled_stamp(self, pixels: Pixels, sampling: Sampling, reach: float) -> Stamp:
         """Return the stamp of pixels that are sampled so, with room for light beside it [m]."""
         rays = self._of(self._light, sampling.across)
@@ -334,11 +340,12 @@ class StarFitter:
         used, star, wave = self.clean.used, solution.stars[0], solution.waves[0]
         used = stamp.used if stamp.used.shape == used.shape else used
         landing, weights = stamp.rays.landing(wave), stamp.rays.weights(wave)
+        regions = np.zeros_like(used) if used.all() else unused_regions(used)
         middle = 0.5 * (np.array(used.shape[::-1]) - 1.0)
         place = np.rint(landing / self.instrument.pixel + star[[X, Y]] + middle)
         outside = ~((place >= 0) & (place < used.shape[::-1])).all(axis=1)
         column, row = np.where(outside[:, None], 0, place).astype(np.int64).T
-        lost, cut = (outside | pixels[row, column] for pixels in (~used, unused_regions(used)))
+        lost, cut = (outside | pixels[row, column] for pixels in (~used, regions))
         return LostLight(float(weights @ lost), float(weights @ cut))
 
     def solve(
@@ -348,11 +355,13 @@ class StarFitter:
         shared: np.ndarray | None = None,
         tolerance: float = FINE,
         steps: int = STEPS,
+        hopeless: float = math.inf,
     ) -> Solution:
-        """Return the best unknowns from a start."""
+        """Return the best unknowns from a start; see :func:`~pachon.sensing.solve.solve`."""
         n = self._map.shape[2]
         group = Group((stamp,), self._map, self.precision[:n], self.instrument.known_seeing, prior_mean=self._mean[:n])
-        return solve(group, [star], np.zeros(n) if shared is None else shared, tolerance=tolerance, steps=steps)
+        start = np.zeros(n) if shared is None else shared
+        return solve(group, [star], start, tolerance=tolerance, steps=steps, hopeless=hopeless)
 
 
 def _typical(pull: np.ndarray, model: np.ndarray, used: np.ndarray) -> float:
