@@ -9,19 +9,19 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from .hierarchy import GROUND
 from .star_errors import ErrorParts
 
 #: Least number of donuts for wavefronts that are linear over the field.
 _FOR_LINEAR = 6
 #: Least number of donuts near each other, whose wavefronts are taken to be the same.
-_FOR_CONSTANT = 3
+_FOR_CONSTANT = 2
 #: Distance of such donuts from the middle one over the radius of the field.
 _NEAR = 0.1
 #: Scatter from which on donuts are not of one exposure of one telescope [m]: air of 8 s at the LSST.
 _MOST_SCATTER = 150e-9
-#: Fraction of the air's wavefront that stars do not share: a third where two thirds of it are in layers at the ground,
-#: which blow over the pupil as quickly as others; all of it where there is nothing at the ground.
-_AIR_OF_ITS_OWN = 0.6
+#: Fraction of the air's variance that stars do not share.
+_AIR_OF_ITS_OWN = 1.0 - GROUND
 #: Standard deviation of the logarithm of the air's variance about that which residuals say.
 _AIR_SPREAD = 1.0
 #: Standard deviations by which the scatter is larger than claimed, to be more than chance.

@@ -43,6 +43,9 @@ _LIGHT_LENGTH = 0.35
 _SIGNIFICANT = 3.0
 #: The same that a further field must explain.
 _NEEDED = 3.0
+#: Degrees of freedom of the distribution (Student's) of amplitudes over their spread: some lie far out, since the
+#: correlations of what the model lacks are known in part.
+_TAILS = 5.0
 #: Loss of the logarithm of the likelihood by each size that is fitted.
 _WORTH = 2.0
 #: Logarithms of the rms of a field of patterns between which the likeliest is searched, in units of itself.
@@ -96,7 +99,11 @@ class Field(Protocol):
 
 
 def residual_power(
-    linearized: Linearized, covariance: np.ndarray, resolution: float, patterns: np.ndarray | None = None
+    linearized: Linearized,
+    covariance: np.ndarray,
+    resolution: float,
+    patterns: np.ndarray | None = None,
+    expected: np.ndarray | None = None,
 ) -> ResidualPower:
     """Return what the residuals of a donut say about the errors of its unknowns.
 
@@ -110,6 +117,8 @@ def residual_power(
         Width of the finest detail of the image [pixels].
     patterns : ndarray, shape [n_pixel, m], optional
         Patterns over the noise, whose squares are the covariance of a further field.
+    expected : ndarray, shape [n_pixel, m], optional
+        The same of what the model is known to lack, within the span of the patterns.
     """
     spreads = np.sqrt(np.diag(covariance))
     scale = np.where(spreads > 0.0, spreads, 1.0)
@@ -130,7 +139,8 @@ def residual_power(
     n, strength = len(root), 0.0
     inner = power[:n, :n]
     if beside is not None:
-        strength, level = beside.sizes(power[n:, n:])
+        known = np.zeros_like(power[n:, n:]) if expected is None else beside.power_of(squares.of(expected))
+        strength, level = beside.sizes(power[n:, n:] + known)
         inner = inner + level * (np.eye(n) + inner)
     return ResidualPower(root, inner, strength)
 
@@ -163,6 +173,11 @@ class _Patterns:
         amplitudes = vectors.T @ (patterns.T @ pulls)
         return cls((beside @ vectors).astype(np.float32), amplitudes, variances[shown])
 
+    def power_of(self, patterns: np.ndarray) -> np.ndarray:
+        """Return the covariance of the amplitudes by a field of patterns [n_pixel, k], shape [m, m]."""
+        amplitudes = self.columns.T @ patterns
+        return np.asarray(amplitudes @ amplitudes.T, dtype=np.float64)
+
     def sizes(self, power: np.ndarray) -> tuple[float, float]:
         """Return the strength of the field, and the surplus of the variance in all combinations alike.
 
@@ -177,7 +192,8 @@ class _Patterns:
 
         def loss(sizes: np.ndarray) -> float:
             total = np.exp(sizes[1]) + np.exp(2.0 * sizes[0]) * variances
-            return float(0.5 * (np.log(total) + energies / total).sum())
+            outlying = (_TAILS + 1.0) * np.log1p(energies / (_TAILS * total))
+            return float(0.5 * (np.log(total) + outlying).sum())
 
         noise = math.log(max(float(energies.mean()), 1.0))
         none, searched = (_RMS_LIMITS[0], _RMS_LIMITS[0]), _RMS_LIMITS

@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from ..wavefront.atmosphere.turbulence import REFERENCE_WAVELENGTH
 from .air_shape import air_shape
 from .donut_rays import ZernikeRays
 from .image_model import STRENGTH
@@ -23,6 +24,8 @@ from .star_fitter import StarSolution
 _AIR_TERMS = 78
 #: Rms of the wavefront of the air of unit strength, Z4 to Z22 together [m].
 _UNIT = 1e-7
+#: Variance of Kolmogorov's wavefront from Z4 on where the diameter of the pupil is Fried's parameter [rad^2].
+_NOLL_FROM_4 = 0.134
 #: Least variance of a term of the air over that of all from Z4 to Z22.
 _LEAST = 1e-9
 #: Full width at half maximum of a Gaussian over its rms.
@@ -78,10 +81,24 @@ class ErrorParts:
 
 @dataclass(frozen=True)
 class StarErrors:
-    """Covariance of the unknowns of a star beside its wavefront, and that of its wavefront by cause."""
+    """Errors of a star that was fitted by itself.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape [n_unknown, n_unknown]
+        Covariance of its unknowns beside its wavefront.
+    parts : ErrorParts
+        That of its wavefront, by cause.
+    of_light : ndarray, shape [n_noll, n_noll]
+        Covariance of the wavefront of its light, the air's low terms among it, but for what stars have in common.
+    figure : ndarray, shape [n_noll, n_noll]
+        What stars have in common: terms of the telescope that are not fitted.
+    """
 
     covariance: np.ndarray
     parts: ErrorParts
+    of_light: np.ndarray
+    figure: np.ndarray
 
 
 def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
@@ -89,22 +106,33 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
     solution, terms = star.solution, instrument.terms
     n_star, n = len(solution.stars[0]), len(terms.requested)
     wavefront = slice(n_star, n_star + n)
-    photons, air, floor = solution.covariance, terms.air, np.zeros_like(terms.air)
+    photons, air, figure, speckled = solution.covariance, terms.air, np.zeros((n, n)), np.zeros((n, n))
     residuals, lacking = np.zeros_like(photons), solution.star_covariance(0).copy()
     point = linearized(star.stamp, solution.stars[0], solution.waves[0])
     if point is not None and len(solution.shared):
         beside = _TermsBeside(instrument, star, point)
-        power = residual_power(point, photons, _resolution(instrument, star), beside.patterns)
+        power = residual_power(point, photons, _resolution(instrument, star), beside.patterns, beside.unfitted)
         residuals = power.covariance
         lacking += residuals[:n_star, :n_star]
-        floor = beside.unfitted(photons)[wavefront, wavefront]
-        if power.strength > 0.0:
-            speckles, turbulence = (power.strength * values for values in beside.air(photons))
+        figure = beside.figure(photons)[wavefront, wavefront]
+        strength = min(power.strength, _most_air(instrument, float(solution.stars[0][STRENGTH])))
+        if strength > 0.0:
+            speckles, turbulence = (strength * values for values in beside.air(photons))
             lacking, air = lacking + speckles[:n_star, :n_star], air + turbulence[wavefront, wavefront]
-    zernikes = solution.shared[:n]
-    floor = floor + model_floor(zernikes)
-    parts = ErrorParts.of(photons[wavefront, wavefront], residuals[wavefront, wavefront], air, floor)
-    return StarErrors(lacking, parts)
+            speckled = speckles[wavefront, wavefront]
+    accuracy = model_floor(solution.shared[:n])
+    parts = ErrorParts.of(photons[wavefront, wavefront], residuals[wavefront, wavefront], air, figure + accuracy)
+    return StarErrors(lacking, parts, parts.photons + parts.residuals + speckled + accuracy, figure)
+
+
+def _most_air(instrument: Instrument, seeing: float) -> float:
+    """Return the variance of the wavefront of turbulence at one moment, in units of that of air of unit size.
+
+    It is that of Kolmogorov's from Z4 on (Noll 1976), for an inverse Fried parameter [1/m]; infinite without seeing.
+    """
+    turbulence = instrument.telescope.pupil_diameter * seeing
+    radians = _NOLL_FROM_4 * turbulence ** (5.0 / 3.0)
+    return radians * (REFERENCE_WAVELENGTH / (2.0 * math.pi * _UNIT)) ** 2 if seeing > 0.0 else math.inf
 
 
 def model_floor(zernikes: np.ndarray) -> np.ndarray:
@@ -215,13 +243,15 @@ class _TermsBeside:
         """Changes of the image over the noise by independent parts of air of unit size, [n_pixel, m]; None without."""
         return self._columns @ self._root.astype(np.float32) if len(self._high) else None
 
-    def unfitted(self, covariance: np.ndarray) -> np.ndarray:
-        """Return the covariance of the unknowns by terms that are not fitted, of the rms that telescopes have."""
+    @property
+    def unfitted(self) -> np.ndarray:
+        """Changes of the image over the noise by terms that are not fitted, of the rms that telescopes have."""
         columns = self._columns[:, len(self._instrument.terms.further) :]
-        scaled = self._point.columns.T @ columns
-        moved = (
-            covariance @ (self._point.scales[:, None] * scaled) * self._instrument.terms.spreads_beyond(self._beyond)
-        )
+        return columns * self._instrument.terms.spreads_beyond(self._beyond).astype(np.float32)
+
+    def figure(self, covariance: np.ndarray) -> np.ndarray:
+        """Return the covariance of the unknowns by terms that are not fitted."""
+        moved = covariance @ (self._point.scales[:, None] * (self._point.columns.T @ self.unfitted))
         return np.asarray(moved @ moved.T)
 
     def air(self, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ from ..wavefront.atmosphere.mean_wavefront import mean_wavefront_covariance
 _LOW_TERMS = 22
 # Terms up to the sixth radial degree, of which misaligned optics have a little.
 _LAST_TERM = 28
-# Rms of terms that are not fitted over that of those two degrees lower: of LSST's mirrors, out of figure.
+# Rms of terms that are not fitted over those two degrees lower: of LSST's mirrors, out of figure.
 _FALL = 0.07
 # Terms up to the eleventh radial degree: what the mean wavefront of the air has beyond is lost in the seeing.
 _AIR_TERMS = 78
@@ -77,8 +77,10 @@ class WavefrontTerms:
     def spreads_beyond(self, noll: np.ndarray) -> np.ndarray:
         """Return the rms of terms that are not fitted [m], less with each degree beyond those that are."""
         highest = _highest_degrees(self.every)
+        # Azimuthal orders beyond those asked for have the degrees of the largest of these.
+        largest = {m % 2: highest[m] for m in sorted(highest, key=abs)}
         degrees = [noll_to_nm(int(j)) for j in noll]
-        steps = np.array([(n - highest.get(m, abs(m))) / 2 for n, m in degrees])
+        steps = np.array([(n - highest.get(m, largest.get(m % 2, abs(m)))) / 2 for n, m in degrees])
         return self.higher_order * _FALL**steps
 
 
