@@ -12,19 +12,25 @@ The strengths :math:`\theta_k \ge 0` are those whose covariance is nearest to :m
 estimation; Rao 1971, J. Multivariate Anal. 1, 257), of as few fields as the residuals ask for. Errors of the unknowns
 have the sandwich covariance :math:`F^{-1} + F^{-1} A^T (\sum_k \theta_k R_k) A F^{-1}`, which is never less than that
 of the noise alone.
+
+A field of few patterns B with a covariance :math:`\theta B B^T`, light that moves as under terms of the wavefront which
+air has, shows in them alone. The strengths of the other fields are then those of residuals without these patterns, and
+:math:`\theta` is the likeliest one by the amplitudes of the patterns, in combinations that are independent: these have
+the variance of the noise and of the other fields, and :math:`\theta w`. Air has most in the few of large w. What has
+as much in all of them, a rim elsewhere for example, is taken for noise of a larger variance, in the unknowns too.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from scipy.linalg import cho_factor, solve_triangular
-from scipy.optimize import nnls
+from scipy.linalg import cho_factor, eigh, solve_triangular
+from scipy.optimize import minimize, nnls
 
 from .likelihood import Linearized
 
@@ -37,6 +43,15 @@ _LIGHT_LENGTH = 0.35
 _SIGNIFICANT = 3.0
 #: The same that a further field must explain.
 _NEEDED = 3.0
+#: Degrees of freedom of the distribution (Student's) of amplitudes over their spread: some lie far out, since the
+#: correlations of what the model lacks are known in part.
+_TAILS = 5.0
+#: Loss of the logarithm of the likelihood by each size that is fitted.
+_WORTH = 2.0
+#: Logarithms of the rms of a field of patterns between which the likeliest is searched, in units of itself.
+_RMS_LIMITS = (-5.0, 4.0)
+#: Variance of a combination of patterns over the largest one below which it says nothing.
+_FAINTEST = 1e-6
 #: Fields whose power in the residuals decides whether there is any beyond that of noise.
 _SCREENED = ("white", "noise_0.8", "brightness", "rims")
 #: Largest number of pixels; beyond, squares of them are summed.
@@ -57,13 +72,13 @@ class ResidualPower:
         Root of the covariance of the unknowns by noise and priors.
     power : ndarray, shape [n, n]
         Power of what the model lacks, in combinations of the unknowns that are independent of unit variance.
-    strengths : dict of float
-        Strengths of the fields by their names.
+    strength : float
+        Strength of the field of patterns, of which the power has nothing.
     """
 
     root: np.ndarray
     power: np.ndarray
-    strengths: Mapping[str, float] = field(default_factory=dict)
+    strength: float = 0.0
 
     @property
     def covariance(self) -> np.ndarray:
@@ -87,7 +102,8 @@ def residual_power(
     linearized: Linearized,
     covariance: np.ndarray,
     resolution: float,
-    further: Callable[[], Mapping[str, np.ndarray]] = dict,
+    patterns: np.ndarray | None = None,
+    expected: np.ndarray | None = None,
 ) -> ResidualPower:
     """Return what the residuals of a donut say about the errors of its unknowns.
 
@@ -99,9 +115,10 @@ def residual_power(
         Covariance of the unknowns by noise and priors, zero for those that are held.
     resolution : float
         Width of the finest detail of the image [pixels].
-    further : callable
-        Further fields by name: columns [n_pixel, m] over the noise, whose squares are their covariances. It is called
-        where the residuals have more power than noise.
+    patterns : ndarray, shape [n_pixel, m], optional
+        Patterns over the noise, whose squares are the covariance of a further field.
+    expected : ndarray, shape [n_pixel, m], optional
+        The same of what the model is known to lack, within the span of the patterns.
     """
     spreads = np.sqrt(np.diag(covariance))
     scale = np.where(spreads > 0.0, spreads, 1.0)
@@ -109,12 +126,90 @@ def residual_power(
     root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     squares = _Squares(linearized.used)
     columns = squares.of(linearized.columns @ (linearized.scales[:, None] * root).astype(np.float32))
-    residuals = _Residuals(squares.of(linearized.pulls.astype(np.float32)[:, None])[:, 0], columns)
+    pulls = squares.of(linearized.pulls.astype(np.float32)[:, None])[:, 0]
+    beside = None if patterns is None else _Patterns.of(squares.of(patterns), columns, pulls)
+    if beside is not None:
+        pulls, columns = pulls - beside.columns @ beside.amplitudes, np.hstack([columns, beside.columns])
+    residuals = _Residuals(pulls, columns)
     fields = _fields(linearized, squares, resolution)
     if max(residuals.excess(fields[name]) for name in _SCREENED) < _SIGNIFICANT:
-        return ResidualPower(root, np.zeros_like(root))
-    fields |= {name: LowRankField(squares.of(patterns)) for name, patterns in further().items()}
-    return ResidualPower(root, *residuals.power(fields))
+        power = np.zeros((columns.shape[1],) * 2)
+    else:
+        power = residuals.power(fields)
+    n, strength = len(root), 0.0
+    inner = power[:n, :n]
+    if beside is not None:
+        known = np.zeros_like(power[n:, n:]) if expected is None else beside.power_of(squares.of(expected))
+        strength, level = beside.sizes(power[n:, n:] + known)
+        inner = inner + level * (np.eye(n) + inner)
+    return ResidualPower(root, inner, strength)
+
+
+@dataclass(frozen=True)
+class _Patterns:
+    """Patterns of residuals that no unknown makes, in independent combinations.
+
+    Attributes
+    ----------
+    columns : ndarray, shape [n_pixel, m]
+        The combinations.
+    amplitudes : ndarray, shape [m]
+        Their amplitudes in the residuals, of unit variance by noise.
+    variances : ndarray, shape [m]
+        Further variances of these by a field of unit strength.
+    """
+
+    columns: np.ndarray
+    amplitudes: np.ndarray
+    variances: np.ndarray
+
+    @classmethod
+    def of(cls, patterns: np.ndarray, columns: np.ndarray, pulls: np.ndarray) -> _Patterns:
+        """Return what patterns [n_pixel, m] have beside the columns of the unknowns, and their amplitudes in pulls."""
+        beside = patterns - columns @ (columns.T @ patterns)
+        variances, vectors = np.linalg.eigh(patterns.T.astype(np.float64) @ beside)
+        shown = variances > _FAINTEST * variances[-1]
+        vectors = vectors[:, shown] / np.sqrt(variances[shown])
+        amplitudes = vectors.T @ (patterns.T @ pulls)
+        return cls((beside @ vectors).astype(np.float32), amplitudes, variances[shown])
+
+    def power_of(self, patterns: np.ndarray) -> np.ndarray:
+        """Return the covariance of the amplitudes by a field of patterns [n_pixel, k], shape [m, m]."""
+        amplitudes = self.columns.T @ patterns
+        return np.asarray(amplitudes @ amplitudes.T, dtype=np.float64)
+
+    def sizes(self, power: np.ndarray) -> tuple[float, float]:
+        """Return the strength of the field, and the surplus of the variance in all combinations alike.
+
+        They are means over nothing, either of the two and both, each with the weight of its likelihood. Other fields
+        have a power [m, m] in the amplitudes.
+        """
+        count = len(self.variances)
+        if not count:
+            return 0.0, 0.0
+        variances, vectors = eigh(np.diag(self.variances), np.eye(count) + power)
+        energies = (vectors.T @ self.amplitudes) ** 2
+
+        def loss(sizes: np.ndarray) -> float:
+            total = np.exp(sizes[1]) + np.exp(2.0 * sizes[0]) * variances
+            outlying = (_TAILS + 1.0) * np.log1p(energies / (_TAILS * total))
+            return float(0.5 * (np.log(total) + outlying).sum())
+
+        noise = math.log(max(float(energies.mean()), 1.0))
+        none, searched = (_RMS_LIMITS[0], _RMS_LIMITS[0]), _RMS_LIMITS
+        fits = [(loss(np.array([none[0], 0.0])), 0.0, 0.0)]
+        for rms_limits, most in ((searched, 0.0), (none, noise), (searched, noise + 1.0)):
+            starts = [(min(0.0, rms_limits[1]), start) for start in ((0.0, noise) if most else (0.0,))]
+            bounds = [rms_limits, (0.0, most)]
+            best = min(
+                (minimize(loss, start, method="L-BFGS-B", bounds=bounds) for start in starts), key=lambda b: b.fun
+            )
+            count = int(rms_limits is searched) + int(most > 0.0)
+            fits.append((best.fun + count * _WORTH, float(np.exp(2.0 * best.x[0])), float(np.expm1(best.x[1]))))
+        losses, strengths, levels = np.array(fits).T
+        weights = np.exp(losses.min() - losses)
+        weights /= weights.sum()
+        return float(weights @ strengths), float(weights @ levels)
 
 
 class _Squares:
@@ -170,9 +265,9 @@ class _Residuals:
         """Return the surplus in a field in standard deviations of noise."""
         return self._surplus(of_field) / np.sqrt(2.0 * of_field.product(of_field))
 
-    def power(self, fields: Mapping[str, Field]) -> tuple[np.ndarray, dict[str, float]]:
-        """Return the power of the fields that the residuals need in the unknowns, [n, n], and their strengths."""
-        listed, names = list(fields.values()), list(fields)
+    def power(self, fields: Mapping[str, Field]) -> np.ndarray:
+        """Return the power of the fields that the residuals need in the unknowns, [n, n]."""
+        listed = list(fields.values())
         of_columns = [self._of_columns(of_field) for of_field in listed]
         inner = [self._columns.T @ values for values in of_columns]
         surplus = np.array([self._surplus(of_field) for of_field in listed])
@@ -183,9 +278,8 @@ class _Residuals:
                 products[a, b] = products[b, a] = listed[a].product(listed[b]) + removed
         freedom = self._pulls.size - float(np.trace(self._columns.T @ self._columns))
         level = max(float(self._pulls @ self._pulls) / max(freedom, 1.0), 1.0)
-        strengths = {k: s for k, s in _needed_strengths(products, surplus, level).items() if s > 0.0}
-        power = sum((s * inner[k] for k, s in strengths.items()), start=np.zeros_like(inner[0]))
-        return power, {names[k]: s for k, s in strengths.items()}
+        strengths = _needed_strengths(products, surplus, level)
+        return sum((s * inner[k] for k, s in strengths.items()), start=np.zeros_like(inner[0]))
 
 
 class WhiteField:
@@ -201,22 +295,6 @@ class WhiteField:
     def product(self, other: Field) -> float:
         """Return the trace of the other field; see :class:`Field`."""
         return other.trace
-
-
-class LowRankField:
-    """Field of few patterns, columns [n_pixel, m]."""
-
-    def __init__(self, columns: np.ndarray) -> None:
-        self._columns = columns.astype(np.float32)
-        self.trace = float((self._columns**2).sum())
-
-    def times(self, columns: np.ndarray) -> np.ndarray:
-        """Return the covariance times columns; see :class:`Field`."""
-        return np.asarray(self._columns @ (self._columns.T @ columns))
-
-    def product(self, other: Field) -> float:
-        """Return the trace of the product of the covariances; see :class:`Field`."""
-        return float((self._columns * other.times(self._columns)).sum())
 
 
 class StationaryField:
