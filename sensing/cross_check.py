@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
+from .hierarchy import GROUND
 from .star_errors import ErrorParts
 
 #: Least number of donuts for wavefronts that are linear over the field.
 _FOR_LINEAR = 6
 #: Least number of donuts near each other, whose wavefronts are taken to be the same.
-_FOR_CONSTANT = 3
+_FOR_CONSTANT = 2
 #: Distance of such donuts from the middle one over the radius of the field.
 _NEAR = 0.1
 #: Scatter from which on donuts are not of one exposure of one telescope [m]: air of 8 s at the LSST.
 _MOST_SCATTER = 150e-9
-#: Fraction of the air's wavefront that stars do not share: two thirds are in the layer at the ground.
-_AIR_OF_ITS_OWN = 1.0 / 3.0
+#: Fraction of the air's variance that stars do not share.
+_AIR_OF_ITS_OWN = 1.0 - GROUND
+#: Standard deviation of the logarithm of the air's variance about that which residuals say.
+_AIR_SPREAD = 1.0
 #: Standard deviations by which the scatter is larger than claimed, to be more than chance.
 _SIGNIFICANT = 2.0
 #: Independent errors of a wavefront: few combinations have most of the variance.
@@ -62,24 +67,47 @@ def cross_checked(
         float(sum(w * np.trace(of(parts[i])) for w, i in zip(free, group, strict=True)))
         for of in (_noise, _lacking, lambda errors: errors.air)
     )
-    excess, freedom = scatter - noise - lacking, count - terms
+    freedom = count - terms
+    if measured_air and in_air > 0.0 and scatter < _MOST_SCATTER**2 * freedom + noise + lacking:
+        others = noise + lacking - in_air
+        # What donuts share of the air is no part of the scatter.
+        scale = _scale_of_air(scatter, others, _AIR_OF_ITS_OWN * in_air, _INDEPENDENT * freedom)
+        air_of_each = [scale * errors.air for errors in parts]
+        checked = [
+            ErrorParts.of(errors.photons, errors.residuals, scaled, errors.floor)
+            for errors, scaled in zip(parts, air_of_each, strict=True)
+        ]
+        lacking = others - noise + scale * _AIR_OF_ITS_OWN * in_air
+    excess = scatter - noise - lacking
     if excess > _MOST_SCATTER**2 * freedom:
-        return checked
+        return list(parts)
     if excess > _SIGNIFICANT * (noise + lacking) * np.sqrt(2.0 / (freedom * _INDEPENDENT)):
         added = excess / freedom * air()
         return [_with_repeats(replace(errors, floor=errors.floor + added)) for errors in checked]
-    unseen = max(scatter - noise, 0.0)
-    share = min(unseen / lacking, 1.0) if lacking > 0.0 else 1.0
-    # What stars do not share of the air is a part of the scatter.
-    calm = min(unseen / (_AIR_OF_ITS_OWN * in_air), 1.0) if measured_air and in_air > 0.0 else 1.0
+    share = min(max(scatter - noise, 0.0) / lacking, 1.0) if lacking > 0.0 else 1.0
     for i in group:
-        repeats = _noise(parts[i]) + share * _lacking(parts[i])
-        checked[i] = replace(parts[i], air=calm * parts[i].air, repeats=repeats)
+        errors = checked[i]
+        own = _lacking(errors) - (1.0 - _AIR_OF_ITS_OWN) * errors.air if measured_air else _lacking(errors)
+        checked[i] = replace(errors, repeats=_noise(errors) + share * own)
     return checked
 
 
+def _scale_of_air(scatter: float, others: float, air: float, freedom: float) -> float:
+    """Return the likeliest variance of the air over that which residuals say, by the scatter of the donuts.
+
+    The scatter has so many degrees of freedom; it is expected to be what all else and the air together make.
+    """
+
+    def loss(logarithm: float) -> float:
+        expected = others + math.exp(logarithm) * air
+        prior = 0.5 * (logarithm / _AIR_SPREAD) ** 2
+        return prior + 0.5 * freedom * (math.log(expected) + scatter / expected)
+
+    return math.exp(float(minimize_scalar(loss, bounds=(-6.0, 6.0), method="bounded").x))
+
+
 def _noise(errors: ErrorParts) -> np.ndarray:
-    return errors.photons + errors.floor
+    return errors.photons
 
 
 def _lacking(errors: ErrorParts) -> np.ndarray:

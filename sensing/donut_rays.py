@@ -10,21 +10,20 @@ are exact for a wavefront of any size. Where rays are aimed, Zernikes are functi
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 
 from ..core.errors import DomainError
 from ..models.telescope import Telescope
-from ..models.zernike_polynomials import annular_zernike_gradients
+from ..models.zernike_polynomials import low_zernike_gradients
 from ..raytrace.aiming import pupil_coordinates
 from ..raytrace.launch import launch_bundles
 from ..raytrace.rays import Rays, RayStatus, parallel_rays
 from ..raytrace.trace import trace
 from ..wavefront.chief_rays import JACOBIAN_STEP
 from ..wavefront.psf.pupil_rims import PupilRims
-from .pupil_cells import PupilCells
+from .pupil_cells import PupilCells, moments_beyond
 from .rim_light import RimsAt
 
 #: Step of the differences by which aimed pupil points follow those of the entrance pupil, in units of its radius.
@@ -82,19 +81,29 @@ class ZernikeRays:
         cells: PupilCells,
         noll: np.ndarray,
     ) -> None:
-        self._telescope, self._direction, self._wavelengths = telescope, direction, wavelengths
+        self._direction, self._wavelengths = direction, wavelengths
         self.cells, self._points = cells, cells.points
         self._weights, self.rates = cells.at_wavelengths(wavelength_weights)
-        middle = float(wavelengths[len(wavelengths) // 2])
-        self._chief = chief_landing(telescope, direction, middle)
+        self._middle = float(wavelengths[len(wavelengths) // 2])
         #: Derivatives of the terms along x and y of the plane of the entrance pupil [1/m], [n_term, 2, n_point].
-        self._gradients = _gradients(telescope, direction, middle, cells.points, noll)
-        self._response = -np.concatenate([self._jacobian_times_gradients(float(w)) for w in wavelengths], axis=1)
-        self._single = self._response.astype(np.float32)
+        self._gradients = _gradients(telescope, direction, self._middle, cells.points, noll)
+        self._set_telescope(telescope)
+        self._jacobians = [self._jacobian(float(w)) for w in self._wavelengths]
+        self._set_response(self._gradients)
+
+    def _set_telescope(self, telescope: Telescope) -> None:
+        """Have the landing points of light through a telescope."""
+        self._telescope = telescope
+        self._chief = chief_landing(telescope, self._direction, self._middle)
         self._last: tuple[np.ndarray, np.ndarray] | None = None
-        self._rims = RimsOfCells(cells, self._response)
         #: Sides of the image of a cell [m], columns of a matrix.
-        self.footprint = cells.footprint(self._landing(middle, np.zeros((1, 1, 2)))[0])
+        self.footprint = self.cells.footprint(self._landing(self._middle, np.zeros((1, 1, 2)))[0])
+
+    def through(self, telescope: Telescope) -> ZernikeRays:
+        """Return the light of the same cells of the pupil, of the same response, through a telescope out of focus."""
+        rays = copy(self)
+        rays._set_telescope(telescope)
+        return rays
 
     def _landing(self, wavelength: float, slopes: np.ndarray) -> np.ndarray:
         """Return detector x and y [m] of rays, [m, n, 2], with direction cosines changed by slopes [m, n or 1, 2]."""
@@ -108,13 +117,49 @@ class ZernikeRays:
             cosines.shape
         )
 
-    def _jacobian_times_gradients(self, wavelength: float) -> np.ndarray:
-        """Return J(p) times the gradients of the terms, shape [2, n_point, n_term]."""
+    def _jacobian(self, wavelength: float) -> np.ndarray:
+        """Return J(p), shape [direction axis, n_point, detector axis]."""
         steps = JACOBIAN_STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
         along = self._landing(wavelength, steps[:, None])
-        jacobian = (along[0::2] - along[1::2]) / (2.0 * JACOBIAN_STEP)  # [direction axis, n_point, detector axis]
-        x, y = np.moveaxis(self._gradients, 1, 0)
-        return np.stack([jacobian[0, :, i, None] * x.T + jacobian[1, :, i, None] * y.T for i in range(2)])
+        return np.asarray((along[0::2] - along[1::2]) / (2.0 * JACOBIAN_STEP))
+
+    def _set_response(self, gradients: np.ndarray) -> None:
+        """Have the response to terms of these gradients [n_term, 2, n_point]."""
+        x, y = np.moveaxis(gradients, 1, 0)
+        products = [
+            np.stack([jacobian[0, :, i, None] * x.T + jacobian[1, :, i, None] * y.T for i in range(2)])
+            for jacobian in self._jacobians
+        ]
+        self._response = -np.concatenate(products, axis=1)
+        self._single = self._response.astype(np.float32)
+        self._rims = RimsOfCells(self.cells, self._response)
+
+    def responding_to(self, noll: np.ndarray) -> ZernikeRays:
+        """Return the same light for the same unknowns, with the response to other terms that it does not have."""
+        rays = copy(self)
+        rays._set_response(_gradients(self._telescope, self._direction, self._middle, self._points, noll))
+        return rays
+
+    def beside(self, points: np.ndarray, moments: np.ndarray, landing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where light through points of the pupil next to the cells lands, and the spread of its image.
+
+        Parameters
+        ----------
+        points : ndarray, shape [m, 2]
+            Points of the plane of the entrance pupil [m].
+        moments : ndarray, shape [m, 2, 2]
+            Second moments of what they stand for [m^2].
+        landing : ndarray, shape [n, 2]
+            Landing points of the light of the cells [m], one wavelength after the other.
+
+        Returns
+        -------
+        landing, spread : ndarray, shapes [n_wave * m, 2] and [n_wave * m, 2, 2]
+            As those of :class:`LightRays`, one wavelength after the other.
+        """
+        smooth = [self.cells.smooth.at(points, places) for places in landing.reshape(-1, len(self.cells), 2)]
+        spreads = [moments_beyond(self.footprint, magnification, moments) for _, magnification in smooth]
+        return np.concatenate([places for places, _ in smooth]), np.concatenate(spreads)
 
     def weights(self, unknowns: np.ndarray) -> np.ndarray:
         """Return fractions of the light; see :class:`LightRays`."""
@@ -142,8 +187,7 @@ class ZernikeRays:
 
     def at_rims(self, rims: PupilRims, landing: np.ndarray, response: np.ndarray | None) -> RimsAt:
         """Return the rims on the detector; see :class:`LightRays`."""
-        at = self._rims.at(rims, landing)
-        return at if response is not None else replace(at, response=at.response[..., :0])
+        return self._rims.at(rims, landing, responding=response is not None)
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the response at zero coefficients, the same to 1e-3 for all; see :class:`LightRays`."""
@@ -160,7 +204,7 @@ def _gradients(
     """Return the derivatives of Zernike terms of the pupil by points of its plane [1/m], [n_term, 2, n_point]."""
     radius = 0.5 * telescope.pupil_diameter
     x, y = pupil_coordinates(telescope, direction, wavelength, points).T / radius
-    terms: np.ndarray = annular_zernike_gradients(int(noll.max()), x, y, telescope.pupil_obscuration)[noll - 1] / radius
+    terms = low_zernike_gradients(noll, x, y, telescope.pupil_obscuration) / radius
     if telescope.design_data.aiming == "off":
         return terms
     step = _DIFFERENCE * radius
@@ -196,10 +240,10 @@ class RimsOfCells:
         self._cells, self._response = cells, response
         self._last: tuple[PupilRims, np.ndarray] | None = None
 
-    def at(self, rims: PupilRims, landing: np.ndarray) -> RimsAt:
+    def at(self, rims: PupilRims, landing: np.ndarray, *, responding: bool = True) -> RimsAt:
         """Return rims at the middle wavelength for landing points of the cells [m], shape [n, 2]."""
         smooth = self._cells.smooth
-        if self._response is None:
+        if self._response is None or not responding:
             return RimsAt(*rims.landing(smooth, self._middle(landing)), np.zeros((2, len(rims.points), 0)))
         if self._last is None or self._last[0] is not rims:
             self._last = rims, np.stack([smooth.at(rims.points, self._middle(axis))[0] for axis in self._response])

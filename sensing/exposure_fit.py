@@ -148,9 +148,10 @@ class ExposureDonuts(WavefrontFit):
         n, count = len(instrument.terms.requested), len(usable.stars)
         zernikes = np.array([star.solution.shared[:n] for star in usable.stars]).reshape(count, n)
         errors = [star_errors(instrument, star) for star in usable.stars]
-        covariance = np.array([star.parts.total for star in errors]).reshape(count, n, n)
+        covariance = np.array([star.of_light for star in errors]).reshape(count, n, n)
+        figure = np.array([star.figure for star in errors]).reshape(count, n, n)
         if count < 2:
-            return FittedStars(_results(usable, errors, zernikes, covariance))
+            return FittedStars(_results(usable, errors, zernikes, np.array([star.parts.total for star in errors])))
         behind = np.array([star.light.depth > 0.0 for star in usable.stars])
         star = self._stars(usable.every_field)[usable.index]
         paired = [len(set(behind[star == number])) > 1 for number in np.unique(star)]
@@ -175,7 +176,7 @@ class ExposureDonuts(WavefrontFit):
         exposure_result = ExposureWavefront(
             instrument.terms.requested,
             hierarchy.total,
-            hierarchy.total_covariance,
+            hierarchy.total_covariance + figure,
             hierarchy.total - hierarchy.telescope,
             0.0 if air is not None else hierarchy.sizes.air,
             hierarchy.sizes.noise,
@@ -183,7 +184,7 @@ class ExposureDonuts(WavefrontFit):
             _notices(hierarchy, sides),
         )
         return FittedStars(
-            _results(usable, errors, hierarchy.telescope, hierarchy.telescope_covariance),
+            _results(usable, errors, hierarchy.telescope, hierarchy.telescope_covariance + figure),
             *double,
             degrees_of_freedom=freedoms,
             exposure=exposure_result,

@@ -13,7 +13,7 @@ from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, SLOPE_X, SLOPE_Y
 from .light import Instrument, StarLight
 from .likelihood import Stamp, model_image
 from .neighbours import NeighbourSearch, explains_more
-from .sides import BothSides, SideFit
+from .sides import CONTRADICTED, BothSides, SideFit
 from .solve import COARSE, FINE, Solution
 from .stamps import Pixels, plane_basis
 from .star_fitter import BRIGHT, SMALLEST_DONUT, StarFitter, StarSolution, Start
@@ -29,6 +29,10 @@ _CUT_OFF = 0.05
 _LOST = 0.55
 #: Steps of the fit on the other side of focus.
 _MIRRORED_STEPS = 8
+#: Flags of a fit whose search need not be done again for a model with diffraction.
+_BESIDE_THE_SEARCH = DonutFlag.AMBIGUOUS_SIDE | DonutFlag.OTHER_SIZE
+#: Loss of the other side beyond that of the given one, over what contradicts it, with which it is not what was given.
+_HOPELESS = 2.0
 #: Least fraction of the variance of the image that the model explains.
 _EXPLAINED = 0.5
 #: Loss a coarse pixel from which on what the model lacks may be a patch of the stamp that is no star, and something of
@@ -82,6 +86,7 @@ def fit_star(
     *,
     wavefront: bool,
     sky_level: float | None = None,
+    begun: StarFit | None = None,
 ) -> StarFit:
     """Fit one star.
 
@@ -96,10 +101,14 @@ def fit_star(
     sky_level : float, optional
         Light of the sky that was taken off, where noise is not known: that of the result is what the fit leaves, in a
         unit in which light has the noise of electrons.
+    begun : StarFit, optional
+        Fit of a model without diffraction, in the same unit, from which this one begins if its search left no question.
     """
     across = light.diameter / instrument.pixel
     donut = across > SMALLEST_DONUT
     fitter = StarFitter(instrument, light, without_bad_pixels(pixels) if donut else pixels, strength, wavefront)
+    if begun is not None and begun.usable is not None and not begun.flags & ~_BESIDE_THE_SEARCH:
+        return _finished(fitter, pixels, begun.usable.solution, begun.sides, sky_level)
     start = fitter.start()
     flags = DonutFlag.OK
     if not start.match.significance >= _FOUND:
@@ -113,10 +122,12 @@ def fit_star(
         search = _masked_search(search.fitter, search)
     if donut and search.misfit > _POOR and not _is_between(_size(search.start.stamp, search.best), _LIKE_DONUTS):
         return StarFit(DonutFlag.NO_DONUT | DonutFlag.OTHER_SIZE)
-    sides = _both_sides(search.fitter, search.start, search.best) if donut and wavefront else None
+    sides, mirrored = None, None
+    if donut and wavefront:
+        sides, mirrored = _both_sides(search.fitter, search.start, search.best)
     explained = _explained(search.start.stamp, search.best)
     # Before rims are free, with which the wrong side of focus fits much.
-    if donut and explained and _other_focus_is_better(search.fitter, search.start, search.best):
+    if donut and explained and _other_focus_is_better(search.fitter, search.start, search.best, mirrored):
         return StarFit(DonutFlag.DEFOCUS_SIGN, sides=sides)
     if fitter.searches_rims:
         search = _search_of_rims(search.fitter, search)
@@ -125,6 +136,14 @@ def fit_star(
         return StarFit(DonutFlag.NO_DONUT)
     if fitter.lost_light(start.stamp, best).any_pixel > _LOST:
         return StarFit(DonutFlag.MOSTLY_LOST)
+    return _finished(fitter, pixels, best, sides, sky_level)
+
+
+def _finished(
+    fitter: StarFitter, pixels: Pixels, best: Solution, sides: BothSides | None, sky_level: float | None
+) -> StarFit:
+    """Return the outcome of a fit of all pixels from the solution of a search."""
+    flags = DonutFlag.OK
     finest = fitter.finest(best)
     if (finest.full.used != pixels.used).any():
         flags |= DonutFlag.CLIPPED
@@ -239,39 +258,51 @@ def _with_neighbours(fitter: StarFitter, start: Start, single: Solution) -> Solu
     ).from_single(single)
 
 
-def _both_sides(fitter: StarFitter, start: Start, solution: Solution) -> BothSides | None:
-    """Return the fits on the side of focus that is given and on the other one; None for blends.
+def _both_sides(fitter: StarFitter, start: Start, solution: Solution) -> tuple[BothSides | None, Solution | None]:
+    """Return the fits on the side of focus that is given and on the other one, and this; None for blends.
 
     About the axis a wavefront W of one side of focus and -W turned by 180 degrees of the other make one image: the
     search starts there.
     """
     star = solution.stars[0]
     if len(star) > RATIO:
-        return None
-    noll = fitter.instrument.noll
-    mirrored = fitter.stamp(fitter.instrument.mirrored(fitter.light), start.pixels)
+        return None, None
+    noll, count = fitter.instrument.noll, start.stamp.used.sum()
     shared = np.zeros_like(solution.shared)
     even = np.array([noll_to_nm(int(j))[0] % 2 == 0 for j in noll])
     shared[: len(noll)] = np.where(even, -1.0, 1.0) * solution.shared[: len(noll)]
-    other = fitter.solve(mirrored, star, shared, COARSE, _MIRRORED_STEPS)
+    # Far from both sides alike, it does not matter how far, nor that some other cells of the pupil are lit.
+    hopeless = solution.loss + _HOPELESS * CONTRADICTED / _loss_scale(solution.loss / count)
+    stamp = fitter.mirrored_stamp(fitter.instrument.mirrored(fitter.light, exact=False), start)
+    mirrored = fitter.solve(stamp, star, shared, COARSE, _MIRRORED_STEPS, hopeless)
+    if mirrored.loss < hopeless:
+        stamp = fitter.stamp(fitter.instrument.mirrored(fitter.light), start.pixels)
+        mirrored = fitter.solve(stamp, mirrored.stars[0], mirrored.shared, COARSE, _MIRRORED_STEPS, hopeless)
     # What no side explains is in units of what is left.
-    least = min(solution.loss, other.loss) / start.stamp.used.sum()
-    scale = 1.0 / max(1.0, least / _MISFIT)
+    scale = _loss_scale(min(solution.loss, mirrored.loss) / count)
     n = len(fitter.instrument.terms.requested)
-    given, turned = (
+    believed_side, mirrored_side = (
         SideFit(scale * side.loss, side.shared[:n], side.shared_covariance[:n, :n] / scale)
-        for side in (solution, other)
+        for side in (solution, mirrored)
     )
-    return BothSides(given, turned, fitter.light.depth)
+    return BothSides(believed_side, mirrored_side, fitter.light.depth), mirrored
 
 
-def _other_focus_is_better(fitter: StarFitter, start: Start, solution: Solution) -> bool:
+def _loss_scale(loss: float) -> float:
+    """Return the factor by which losses count where the better fit leaves a loss a pixel."""
+    return 1.0 / max(1.0, loss / _MISFIT)
+
+
+def _other_focus_is_better(fitter: StarFitter, start: Start, solution: Solution, mirrored: Solution | None) -> bool:
     """Return whether the image fits a detector on the other side of focus better."""
-    if _misfit(start.pixels, start.stamp, solution) < _MISFIT:
+    misfit = _misfit(start.pixels, start.stamp, solution)
+    if misfit < _MISFIT:
         return False
-    mirrored_light = fitter.instrument.mirrored(fitter.light)
-    mirrored = fitter.start_on(start.pixels, fitter.stamp(mirrored_light, start.pixels))
-    return explains_more(fitter.solve(mirrored.stamp, mirrored.unknowns, tolerance=COARSE), solution)
+    if mirrored is None or misfit > _POOR:
+        light = fitter.instrument.mirrored(fitter.light)
+        mirrored_start = fitter.start_on(start.pixels, fitter.stamp(light, start.pixels))
+        mirrored = fitter.solve(mirrored_start.stamp, mirrored_start.unknowns, tolerance=COARSE)
+    return explains_more(mirrored, solution)
 
 
 def _misfit(pixels: Pixels, stamp: Stamp, solution: Solution) -> float:

@@ -11,7 +11,7 @@ from ..core.errors import ConfigError, DomainError
 from ..models.telescope import Telescope
 from ..raytrace.launch import launch_bundles
 from ..raytrace.rays import RayStatus
-from ..raytrace.trace import trace
+from ..raytrace.trace import TraceResult, trace
 from ..wavefront.chief_rays import image_jacobians
 from ..wavefront.psf.light import Light
 from ..wavefront.psf.pupil_rims import PupilRims, pupil_rims
@@ -30,6 +30,8 @@ from .vignetting import MovableRim, cells_with_rims, movable_rims, shift_spread
 
 #: Points across the pupil for the size of an image.
 _SURVEY = 48
+#: The same for the distance to its focus.
+_FEW = 16
 #: Least number of cells across the pupil for the model of an image.
 _FEWEST = 48
 #: Largest number of cells across the pupil that a model takes by itself: 0.5 million of them.
@@ -135,16 +137,23 @@ class Instrument:
         """
         return self._through(self._with_detector(direction, defocus), direction)
 
-    def mirrored(self, light: StarLight) -> StarLight:
-        """Return the light with what a defocus moves where the best focus is as far on the detector's other side."""
+    def mirrored(self, light: StarLight, *, exact: bool = True) -> StarLight:
+        """Return the light with what a defocus moves where the best focus is as far on the detector's other side.
+
+        Diameter, vignetting and rims are those of the light that was given unless they are to be `exact`.
+        """
         telescope, detector = light.telescope, light.telescope.surfaces[-1]
         name, axis = self.model.detector.body(telescope)
         if name != detector.name:
             step = _PROBE * light.depth
-            probe = self._through(telescope.perturbed(name, shift=step * axis), light.direction)
-            response = (probe.depth - light.depth) / step
+            depths = [
+                self._depth(t, light.direction) for t in (telescope, telescope.perturbed(name, shift=step * axis))
+            ]
+            response = (depths[1] - depths[0]) / step
             if abs(response) > _RESPONSE:
                 moved = telescope.perturbed(name, shift=-2.0 * light.depth / response * axis)
+                if not exact:
+                    return replace(light, telescope=moved, depth=-light.depth)
                 # The unknown shifts of rims stay those of the light that was given.
                 return replace(self._through(moved, light.direction), rims=light.rims)
         moved = telescope.perturbed(detector.name, shift=2.0 * light.depth * detector.matrix[:, 2])
@@ -152,18 +161,9 @@ class Instrument:
 
     def _through(self, telescope: Telescope, direction: np.ndarray) -> StarLight:
         """Return the light of a star through a telescope with its detector in place."""
-        along = (np.arange(_SURVEY) - 0.5 * (_SURVEY - 1)) * telescope.pupil_diameter / _SURVEY
-        points = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+        points = _survey(telescope, _SURVEY)
         ends = trace(telescope, launch_bundles(telescope, direction[None], self.middle, points), "all", threads=1)
-        end, lit = ends[-1], ends[-1].status == RayStatus.OK
-        if not lit.any():
-            raise DomainError("no light passes the telescope")
-        detector = telescope.surfaces[-1]
-        place, travel = detector.to_local(end.position[lit])[:, :2], detector.along(end.direction[lit])
-        slopes = travel[:, :2] / travel[:, 2:]
-        place, slopes = (v - v.mean(axis=0) for v in (place, slopes))
-        # The rays are closest to each other where the detector moved by this distance would be.
-        depth = -float((place * slopes).sum() / max((slopes**2).sum(), 1e-300))
+        place, depth = _landing(telescope, ends[-1])
         jacobian = image_jacobians(telescope, direction[None], self.middle, 1)[0]
         # Light passes up to half a cell beyond the outermost points.
         diameter = 2.0 * float(np.hypot(*place.T).max()) * (1.0 + 1.0 / _SURVEY)
@@ -174,6 +174,11 @@ class Instrument:
             return light
         free = rims_of_other_size(telescope, direction, self.middle, _FEWEST, self.model.rims.size)
         return light.with_free_rims(free, self.middle)
+
+    def _depth(self, telescope: Telescope, direction: np.ndarray) -> float:
+        """Return the distance from the detector to the best focus [m], from few rays."""
+        rays = launch_bundles(telescope, direction[None], self.middle, _survey(telescope, _FEW))
+        return _landing(telescope, trace(telescope, rays, threads=1))[1]
 
     def _with_detector(self, direction: np.ndarray, defocus: float) -> Telescope:
         """Return the telescope with a defocus, its detector in the tangent plane of the chief ray's CCD."""
@@ -251,6 +256,24 @@ class Instrument:
             pixels, self.pixel, self.seeing, light.jacobian, blur, rays.footprint, sharp, reach, light.pupil_rims
         )
         return Stamp(pixels.image, pixels.variance, pixels.used, grid, rays)
+
+
+def _survey(telescope: Telescope, across: int) -> np.ndarray:
+    """Return points of a square about the pupil [m], shape [across**2, 2]."""
+    along = (np.arange(across) - 0.5 * (across - 1)) * telescope.pupil_diameter / across
+    return np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+
+
+def _landing(telescope: Telescope, end: TraceResult) -> tuple[np.ndarray, float]:
+    """Return landing points of lit rays from their mean [m], and the distance from there to the best focus [m]."""
+    detector, lit = telescope.surfaces[-1], end.status == RayStatus.OK
+    if not lit.any():
+        raise DomainError("no light passes the telescope")
+    place, travel = detector.to_local(end.position[lit])[:, :2], detector.along(end.direction[lit])
+    slopes = travel[:, :2] / travel[:, 2:]
+    place, slopes = (v - v.mean(axis=0) for v in (place, slopes))
+    # The rays are closest to each other where the detector moved by this distance would be.
+    return place, -float((place * slopes).sum() / max((slopes**2).sum(), 1e-300))
 
 
 @dataclass(frozen=True)

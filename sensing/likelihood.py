@@ -13,10 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from .donut_rays import LightRays
-from .image_model import FLUX, ImageGrid, LandedLight
+from .image_model import FLUX, RATIO, STRENGTH, ImageGrid, LandedLight, X, Y
 
 #: Smallest variance of a pixel [electron^2], where model and sky are next to nothing.
 _LEAST_VARIANCE = 1.0
+#: Distance that light has moved by since derivatives of the image were computed [pixels of the fit], up to which these
+#: hold: they are then a few per cent off, and steps of a search as much, which makes 1 nm of errors of 100.
+_STILL = 0.03
+#: The same of images that are sharper than their pixels.
+_STILL_SHARP = 0.015
+#: Relative change of the strength of the turbulence, and of the light of the cells, up to which they do.
+_SAME = 0.02
+#: The limits of searches in coarse pixels over these.
+_COARSE = 4.0
 
 
 @dataclass(frozen=True)
@@ -43,8 +52,13 @@ class Stamp:
     grid: ImageGrid
     rays: LightRays
 
+    def forget(self) -> None:
+        """Free the derivatives of the last linear model."""
+        self.grid.last = None
+
     def release(self) -> None:
         """Free what the model can compute again."""
+        self.forget()
         self.rays.release()
         if self.grid.rim_light is not None:
             self.grid.rim_light.release()
@@ -105,14 +119,58 @@ class Linearized:
     scales: np.ndarray
 
 
-def linearized(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> Linearized | None:
-    """Return the linear model of a stamp about unknowns; None where light has no direction or misses the telescope."""
-    landing = stamp.rays.landing(wave)
+@dataclass(frozen=True)
+class _Derivatives:
+    """Image at unknowns of a star, its derivatives and their scales, where its light lands, and chi-square a pixel."""
+
+    rays: LightRays
+    unknowns: np.ndarray
+    landing: np.ndarray
+    weights: np.ndarray
+    image: tuple[np.ndarray, np.ndarray, np.ndarray]
+    misfit: float
+
+    def holds(self, stamp: Stamp, unknowns: np.ndarray, landing: np.ndarray, weights: np.ndarray) -> bool:
+        """Return whether the derivatives are those of light that lands elsewhere, too, but for a few per cent."""
+        if self.rays is not stamp.rays or len(unknowns) != len(self.unknowns) or len(landing) != len(self.landing):
+            return False
+        if not np.array_equal(self.unknowns[RATIO:], unknowns[RATIO:]):
+            return False
+        grid, (before, after) = stamp.grid, (self.unknowns[STRENGTH], unknowns[STRENGTH])
+        moved = landing - self.landing + grid.pixel / grid.scale * (unknowns[[X, Y]] - self.unknowns[[X, Y]])
+        distance = float(np.sqrt(np.abs(weights) @ (moved**2).sum(axis=1)))
+        # Where residuals are large, their products with what derivatives are off by are, too.
+        looser = (_COARSE if grid.coarse else 1.0) / max(self.misfit, 1.0)
+        return bool(
+            distance <= looser * (_STILL_SHARP if grid.sharp else _STILL) * grid.pixel
+            and abs(after - before) <= looser * _SAME * before
+            and np.abs(weights - self.weights).sum() <= looser * _SAME
+        )
+
+
+def _derivatives(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> tuple[np.ndarray, ...] | None:
+    """Return image, derivatives and scales; None where light has no direction or misses the telescope."""
+    last, landing = stamp.grid.last, stamp.rays.landing(wave)
     if not np.isfinite(landing).all():
         return None
+    weights = stamp.rays.weights(wave)
+    if isinstance(last, _Derivatives) and last.holds(stamp, unknowns, landing, weights):
+        image = stamp.grid.image(unknowns, _landed(stamp, wave, landing, None))
+        return image, last.image[1], stamp.grid.scales(unknowns, len(last.image[2]))
     response = stamp.rays.response(wave)
     light = _landed(stamp, wave, landing, response)
-    model, columns, scales = stamp.grid.derivatives(unknowns, light, response, stamp.rays.rates)
+    derivatives = stamp.grid.derivatives(unknowns, light, response, stamp.rays.rates)
+    misfit = float((pulls(stamp, derivatives[0])[stamp.used] ** 2).mean()) if stamp.used.any() else 0.0
+    stamp.grid.last = _Derivatives(stamp.rays, unknowns.copy(), landing, weights, derivatives, misfit)
+    return derivatives
+
+
+def linearized(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> Linearized | None:
+    """Return the linear model of a stamp about unknowns; None where light has no direction or misses the telescope."""
+    derivatives = _derivatives(stamp, unknowns, wave)
+    if derivatives is None:
+        return None
+    model, columns, scales = derivatives
     # A slice where all pixels are used, since that is no copy.
     used = stamp.used if not stamp.used.all() else np.s_[:, :]
     variance = _variance(stamp, model)
@@ -121,6 +179,37 @@ def linearized(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> Lineariz
     scaled = columns[used].reshape(len(root), -1) * root[:, None]
     brightness = unknowns[FLUX] * columns[..., FLUX].astype(np.float64)
     return Linearized(model, variance, brightness, stamp.used, residual, residual * root, scaled, scales)
+
+
+def light_columns(
+    stamp: Stamp, unknowns: np.ndarray, point: Linearized, light: LandedLight, rates: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return derivatives by changes of the light, over the noise, and their scales.
+
+    Parameters
+    ----------
+    stamp : Stamp
+        Pixels and model.
+    unknowns : ndarray
+        Unknowns of the star.
+    point : Linearized
+        Linear model there.
+    light : LandedLight
+        Light that comes and goes.
+    rates : ndarray, shape [n, k]
+        Its fractions by each change; all other light has as much less in proportion.
+
+    Returns
+    -------
+    columns, scales : ndarray, shapes [n_pixel, k], [k]
+        As those of `point`.
+    """
+    response = np.zeros((2, len(rates), 0), dtype=np.float32)
+    columns, scales = stamp.grid.derivatives(unknowns, light, response, rates)[1:]
+    count = rates.shape[1]
+    root = (1.0 / np.sqrt(point.variance[point.used])).astype(np.float32)
+    gained = columns[point.used][:, columns.shape[-1] - count :] * root[:, None]
+    return gained - np.outer(point.columns[:, FLUX], rates.sum(axis=0).astype(np.float32)), scales[-count:]
 
 
 def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> NormalEquations:

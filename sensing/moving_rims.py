@@ -38,6 +38,8 @@ _MOST = 3.0
 _ALIKE = 5e-3
 #: Points across the pupil for the places of the light on the surfaces.
 _SURVEY = 32
+#: Distance from the rays among them within which a rim may bound the light, in sides of their lattice.
+_BETWEEN = 4.0
 #: Side of their lattice over that of the cells.
 _MARGIN = 1.04
 #: Least number of points that determine these places as smooth functions of the pupil.
@@ -46,8 +48,8 @@ _FEWEST = 90
 _BESIDE = 0.02
 #: Steps by which places on the pupil are found.
 _STEPS = 8
-#: Step over the radius of the pupil after which they are found.
-_CLOSE = 1e-7
+#: Step over the radius of the pupil after which they are found, to the square of it.
+_CLOSE = 1e-4
 #: Longest piece of a rim, in sides of a cell.
 _LONGEST = 10.0
 #: Fewest pieces of a rim that matter.
@@ -268,8 +270,11 @@ class PupilShadows:
         outward = np.einsum("nmi,ni->nm", shift[bounds], on_surface)
         return RimLines(points[bounds], along[bounds], across, outward, numbers[bounds])
 
-    def _smooth(self, surface: int) -> tuple[PupilPolynomials, np.ndarray] | None:
-        """Return polynomials of the places of the light on a surface, and these [n, 2]; None where too little does."""
+    def _smooth(self, surface: int) -> tuple[PupilPolynomials, np.ndarray, np.ndarray] | None:
+        """Return polynomials of the places of the light on a surface, their coefficients, and these places [n, 2].
+
+        None where too little of the light meets it.
+        """
         places = self._places(surface, self._ends)
         reached = np.isfinite(places).all(axis=1)
         if reached.sum() < _FEWEST:
@@ -277,7 +282,7 @@ class PupilShadows:
         key = reached.tobytes()
         if key not in self._polynomials:
             self._polynomials[key] = PupilPolynomials(self._survey[reached], self._middle, self._half)
-        return self._polynomials[key], places[reached]
+        return self._polynomials[key], self._polynomials[key].fitted(places[reached]), places[reached]
 
     def _shadows(self, surface: int, numbers: dict[int, int]) -> tuple[np.ndarray, ...]:
         """Return the outlines of some regions of a surface on the pupil, lit or not; each region has a number.
@@ -287,15 +292,16 @@ class PupilShadows:
         """
         numberless = np.zeros((2, 0), dtype=np.int64)
         empty = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, MOTIONS, 2)), np.zeros((0, 2, 2)), *numberless
-        polynomials = self._smooth(surface)
+        regions = simple_regions(self._telescope.surfaces[surface].aperture)
+        numbers = {region: number for region, number in numbers.items() if self._meets_light(surface, regions[region])}
+        polynomials = self._smooth(surface) if numbers else None
         if polynomials is None:
             return empty
-        smooth, places = polynomials
+        smooth, coefficients, places = polynomials
         # A linear map from the surface to the pupil is where the search for the places there begins.
-        center, linear = (values[0] for values in smooth.at(self._middle[None], places))
+        center, linear = (values[0] for values in smooth.sums(self._middle[None], coefficients))
         reach = float(np.hypot(*places.T).max())
         spacing = max(self._cells.side * np.sqrt(abs(float(np.linalg.det(linear)))), 1e-6 * reach)
-        regions = simple_regions(self._telescope.surfaces[surface].aperture)
         rims = [outline(regions[region], spacing, reach) for region in numbers]
         middle, along, motion = (
             np.concatenate(v) for v in zip(*((r.middle, r.end - r.start, r.motion) for r in rims), strict=True)
@@ -305,27 +311,41 @@ class PupilShadows:
         if not near.any():
             return empty
         begin = (middle[near] - center) @ np.linalg.pinv(linear).T + self._middle
-        points = self._on_pupil(smooth, places, begin, middle[near])
+        points = self._on_pupil(smooth, coefficients, begin, middle[near])
         reached = np.isfinite(points).all(axis=1)
         points, along, motion, number = points[reached], *(v[near][reached] for v in (along, motion, number))
-        slope = np.linalg.inv(smooth.at(points, places)[1])
+        slope = np.linalg.inv(smooth.sums(points, coefficients)[1])
         along = np.einsum("nij,nj->ni", slope, along)
         length = np.hypot(*along.T)
         fine = (length > 0.0) & (length < _LONGEST * self._cells.side)
         return tuple(v[fine] for v in (points, along, motion, slope, number, np.full(len(points), surface)))
 
+    def _meets_light(self, surface: int, region: Simple) -> bool:
+        """Return whether a disc's rim is so near to the light on a surface that it may bound it; True for others."""
+        if not isinstance(region, Circle):
+            return True
+        places = self._places(surface, self._ends)[self._ends[-1].status == RayStatus.OK]
+        if not len(places):
+            return True
+        radii = np.hypot(*(places - [region.x, region.y]).T)
+        # Light between the rays of the survey may be there, too.
+        margin = _BETWEEN * float(np.ptp(places, axis=0).max()) / _SURVEY
+        return bool(radii.min() - margin < region.radius < radii.max() + margin)
+
     def _on_pupil(
-        self, smooth: PupilPolynomials, places: np.ndarray, start: np.ndarray, target: np.ndarray
+        self, smooth: PupilPolynomials, coefficients: np.ndarray, start: np.ndarray, target: np.ndarray
     ) -> np.ndarray:
         """Return the points of the pupil whose light meets places on a surface [n, 2], by Newton's steps."""
         points = start
         with np.errstate(all="ignore"):
             for _ in range(_STEPS):
-                values, jacobian = smooth.at(points, places)
-                determinant = np.linalg.det(jacobian)
+                values, jacobian = smooth.sums(points, coefficients)
+                (xx, xy), (yx, yy) = np.moveaxis(jacobian, 0, -1)
+                x, y = (target - values).T
+                determinant = xx * yy - xy * yx
                 regular = np.abs(determinant) > 1e-12 * np.nanmax(np.abs(determinant), initial=1e-300)
-                safe = np.where(regular[:, None, None], jacobian, np.eye(2))
-                step = np.linalg.solve(safe, (target - values)[..., None])[..., 0]
+                solved = np.stack([yy * x - xy * y, xx * y - yx * x], axis=-1) / determinant[:, None]
+                step = np.where(regular[:, None], solved, target - values)
                 points = points + np.clip(step, -0.3 * self._half, 0.3 * self._half)
                 # Beyond the survey polynomials say nothing.
                 outside = np.hypot(*(points - self._middle).T) > 1.1 * self._half

@@ -95,13 +95,18 @@ class PupilCells:
 
     def spread(self, landing: np.ndarray, footprint: np.ndarray) -> np.ndarray:
         """Return second moments of the images of the cells minus those of a footprint [m^2], shape [n, 2, 2]."""
-        # Component by component: products of many matrices of two by two take ten times as long.
-        (xx, xy), (yx, yy) = np.moveaxis(self.magnification(landing), 0, -1)
-        (uu, uv), (_, vv) = np.moveaxis(self.moments, 0, -1)
-        across = xx * (yx * uu + yy * uv) + xy * (yx * uv + yy * vv)
-        along = xx * (xx * uu + 2.0 * xy * uv) + xy * xy * vv, yx * (yx * uu + 2.0 * yy * uv) + yy * yy * vv
-        image = np.array([[along[0], across], [across, along[1]]])
-        return np.moveaxis(image, -1, 0) - footprint @ footprint.T / 12.0
+        return moments_beyond(footprint, self.magnification(landing), self.moments)
+
+
+def moments_beyond(footprint: np.ndarray, magnification: np.ndarray, moments: np.ndarray) -> np.ndarray:
+    """Return second moments [m^2] of images by those on the pupil, minus those of a footprint, all [n, 2, 2]."""
+    # Component by component: products of many matrices of two by two take ten times as long.
+    (xx, xy), (yx, yy) = np.moveaxis(magnification, 0, -1)
+    (uu, uv), (_, vv) = np.moveaxis(moments, 0, -1)
+    across = xx * (yx * uu + yy * uv) + xy * (yx * uv + yy * vv)
+    along = xx * (xx * uu + 2.0 * xy * uv) + xy * xy * vv, yx * (yx * uu + 2.0 * yy * uv) + yy * yy * vv
+    image = np.array([[along[0], across], [across, along[1]]])
+    return np.asarray(np.moveaxis(image, -1, 0) - footprint @ footprint.T / 12.0)
 
 
 def pupil_cells(telescope: Telescope, direction: np.ndarray, wavelength: float, across: int) -> PupilCells:

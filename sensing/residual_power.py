@@ -12,19 +12,25 @@ The strengths :math:`\theta_k \ge 0` are those whose covariance is nearest to :m
 estimation; Rao 1971, J. Multivariate Anal. 1, 257), of as few fields as the residuals ask for. Errors of the unknowns
 have the sandwich covariance :math:`F^{-1} + F^{-1} A^T (\sum_k \theta_k R_k) A F^{-1}`, which is never less than that
 of the noise alone.
+
+A field of few patterns B with a covariance :math:`\theta B B^T`, light that moves as under terms of the wavefront which
+air has, shows in them alone. The strengths of the other fields are then those of residuals without these patterns, and
+:math:`\theta` is the likeliest one by the amplitudes of the patterns, in combinations that are independent: these have
+the variance of the noise and of the other fields, and :math:`\theta w`. Air has most in the few of large w. What has
+as much in all of them, a rim elsewhere for example, is taken for noise of a larger variance, in the unknowns too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from scipy import fft
-from scipy.linalg import cho_factor, solve_triangular
-from scipy.optimize import nnls
+from scipy.linalg import cho_factor, eigh, solve_triangular
+from scipy.optimize import minimize, nnls
 
 from .likelihood import Linearized
 
@@ -37,12 +43,25 @@ _LIGHT_LENGTH = 0.35
 _SIGNIFICANT = 3.0
 #: The same that a further field must explain.
 _NEEDED = 3.0
+#: Degrees of freedom of the distribution (Student's) of amplitudes over their spread: some lie far out, since the
+#: correlations of what the model lacks are known in part.
+_TAILS = 5.0
+#: Loss of the logarithm of the likelihood by each size that is fitted.
+_WORTH = 2.0
+#: Logarithms of the rms of a field of patterns between which the likeliest is searched, in units of itself.
+_RMS_LIMITS = (-5.0, 4.0)
+#: Variance of a combination of patterns over the largest one below which it says nothing.
+_FAINTEST = 1e-6
 #: Fields whose power in the residuals decides whether there is any beyond that of noise.
 _SCREENED = ("white", "noise_0.8", "brightness", "rims")
 #: Largest number of pixels; beyond, squares of them are summed.
 _MOST_PIXELS = 17_000
 #: Ridge of the normal equations of the strengths, over their diagonal: fields that differ little share the power.
 _RIDGE = 1e-6
+#: Pixels whose changes by all unknowns are multiplied at once.
+_TOGETHER = 512
+#: Correlation that is none: sums of numbers next to zero are slow.
+_UNCORRELATED = 1e-9
 
 
 @dataclass(frozen=True)
@@ -55,13 +74,13 @@ class ResidualPower:
         Root of the covariance of the unknowns by noise and priors.
     power : ndarray, shape [n, n]
         Power of what the model lacks, in combinations of the unknowns that are independent of unit variance.
-    strengths : dict of float
-        Strengths of the fields by their names.
+    strength : float
+        Strength of the field of patterns, of which the power has nothing.
     """
 
     root: np.ndarray
     power: np.ndarray
-    strengths: Mapping[str, float] = field(default_factory=dict)
+    strength: float = 0.0
 
     @property
     def covariance(self) -> np.ndarray:
@@ -85,7 +104,8 @@ def residual_power(
     linearized: Linearized,
     covariance: np.ndarray,
     resolution: float,
-    further: Callable[[], Mapping[str, np.ndarray]] = dict,
+    patterns: np.ndarray | None = None,
+    expected: np.ndarray | None = None,
 ) -> ResidualPower:
     """Return what the residuals of a donut say about the errors of its unknowns.
 
@@ -97,9 +117,10 @@ def residual_power(
         Covariance of the unknowns by noise and priors, zero for those that are held.
     resolution : float
         Width of the finest detail of the image [pixels].
-    further : callable
-        Further fields by name: columns [n_pixel, m] over the noise, whose squares are their covariances. It is called
-        where the residuals have more power than noise.
+    patterns : ndarray, shape [n_pixel, m], optional
+        Patterns over the noise, whose squares are the covariance of a further field.
+    expected : ndarray, shape [n_pixel, m], optional
+        The same of what the model is known to lack, within the span of the patterns.
     """
     spreads = np.sqrt(np.diag(covariance))
     scale = np.where(spreads > 0.0, spreads, 1.0)
@@ -107,12 +128,90 @@ def residual_power(
     root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     squares = _Squares(linearized.used)
     columns = squares.of(linearized.columns @ (linearized.scales[:, None] * root).astype(np.float32))
-    residuals = _Residuals(squares.of(linearized.pulls.astype(np.float32)[:, None])[:, 0], columns)
+    pulls = squares.of(linearized.pulls.astype(np.float32)[:, None])[:, 0]
+    beside = None if patterns is None else _Patterns.of(squares.of(patterns), columns, pulls)
+    if beside is not None:
+        pulls, columns = pulls - beside.columns @ beside.amplitudes, np.hstack([columns, beside.columns])
+    residuals = _Residuals(pulls, columns)
     fields = _fields(linearized, squares, resolution)
     if max(residuals.excess(fields[name]) for name in _SCREENED) < _SIGNIFICANT:
-        return ResidualPower(root, np.zeros_like(root))
-    fields |= {name: LowRankField(squares.of(patterns)) for name, patterns in further().items()}
-    return ResidualPower(root, *residuals.power(fields))
+        power = np.zeros((columns.shape[1],) * 2)
+    else:
+        power = residuals.power(fields)
+    n, strength = len(root), 0.0
+    inner = power[:n, :n]
+    if beside is not None:
+        known = np.zeros_like(power[n:, n:]) if expected is None else beside.power_of(squares.of(expected))
+        strength, level = beside.sizes(power[n:, n:] + known)
+        inner = inner + level * (np.eye(n) + inner)
+    return ResidualPower(root, inner, strength)
+
+
+@dataclass(frozen=True)
+class _Patterns:
+    """Patterns of residuals that no unknown makes, in independent combinations.
+
+    Attributes
+    ----------
+    columns : ndarray, shape [n_pixel, m]
+        The combinations.
+    amplitudes : ndarray, shape [m]
+        Their amplitudes in the residuals, of unit variance by noise.
+    variances : ndarray, shape [m]
+        Further variances of these by a field of unit strength.
+    """
+
+    columns: np.ndarray
+    amplitudes: np.ndarray
+    variances: np.ndarray
+
+    @classmethod
+    def of(cls, patterns: np.ndarray, columns: np.ndarray, pulls: np.ndarray) -> _Patterns:
+        """Return what patterns [n_pixel, m] have beside the columns of the unknowns, and their amplitudes in pulls."""
+        beside = patterns - columns @ (columns.T @ patterns)
+        variances, vectors = np.linalg.eigh(patterns.T.astype(np.float64) @ beside)
+        shown = variances > _FAINTEST * variances[-1]
+        vectors = vectors[:, shown] / np.sqrt(variances[shown])
+        amplitudes = vectors.T @ (patterns.T @ pulls)
+        return cls((beside @ vectors).astype(np.float32), amplitudes, variances[shown])
+
+    def power_of(self, patterns: np.ndarray) -> np.ndarray:
+        """Return the covariance of the amplitudes by a field of patterns [n_pixel, k], shape [m, m]."""
+        amplitudes = self.columns.T @ patterns
+        return np.asarray(amplitudes @ amplitudes.T, dtype=np.float64)
+
+    def sizes(self, power: np.ndarray) -> tuple[float, float]:
+        """Return the strength of the field, and the surplus of the variance in all combinations alike.
+
+        They are means over nothing, either of the two and both, each with the weight of its likelihood. Other fields
+        have a power [m, m] in the amplitudes.
+        """
+        count = len(self.variances)
+        if not count:
+            return 0.0, 0.0
+        variances, vectors = eigh(np.diag(self.variances), np.eye(count) + power)
+        energies = (vectors.T @ self.amplitudes) ** 2
+
+        def loss(sizes: np.ndarray) -> float:
+            total = np.exp(sizes[1]) + np.exp(2.0 * sizes[0]) * variances
+            outlying = (_TAILS + 1.0) * np.log1p(energies / (_TAILS * total))
+            return float(0.5 * (np.log(total) + outlying).sum())
+
+        noise = math.log(max(float(energies.mean()), 1.0))
+        none, searched = (_RMS_LIMITS[0], _RMS_LIMITS[0]), _RMS_LIMITS
+        fits = [(loss(np.array([none[0], 0.0])), 0.0, 0.0)]
+        for rms_limits, most in ((searched, 0.0), (none, noise), (searched, noise + 1.0)):
+            starts = [(min(0.0, rms_limits[1]), start) for start in ((0.0, noise) if most else (0.0,))]
+            bounds = [rms_limits, (0.0, most)]
+            best = min(
+                (minimize(loss, start, method="L-BFGS-B", bounds=bounds) for start in starts), key=lambda b: b.fun
+            )
+            count = int(rms_limits is searched) + int(most > 0.0)
+            fits.append((best.fun + count * _WORTH, float(np.exp(2.0 * best.x[0])), float(np.expm1(best.x[1]))))
+        losses, strengths, levels = np.array(fits).T
+        weights = np.exp(losses.min() - losses)
+        weights /= weights.sum()
+        return float(weights @ strengths), float(weights @ levels)
 
 
 class _Squares:
@@ -151,32 +250,43 @@ class _Residuals:
 
     def __init__(self, pulls: np.ndarray, columns: np.ndarray) -> None:
         self._pulls, self._columns = pulls, columns
+        self._products: dict[int, tuple[Field, np.ndarray]] = {}
 
-    def _surplus(self, of_field: Field, of_columns: np.ndarray) -> float:
+    def _of_columns(self, field: Field) -> np.ndarray:
+        """Return the covariance of a field times the changes of the image."""
+        if id(field) not in self._products:
+            self._products[id(field)] = field, field.times(self._columns)
+        return self._products[id(field)][1]
+
+    def _surplus(self, of_field: Field) -> float:
         """Return the power of the residuals in a field beyond that of noise."""
         energy = float(self._pulls @ of_field.times(self._pulls[:, None])[:, 0])
-        return energy - of_field.trace + float((self._columns * of_columns).sum())
+        return energy - of_field.trace + float(np.vdot(self._columns, self._of_columns(of_field)))
 
     def excess(self, of_field: Field) -> float:
         """Return the surplus in a field in standard deviations of noise."""
-        return self._surplus(of_field, of_field.times(self._columns)) / np.sqrt(2.0 * of_field.product(of_field))
+        return self._surplus(of_field) / np.sqrt(2.0 * of_field.product(of_field))
 
-    def power(self, fields: Mapping[str, Field]) -> tuple[np.ndarray, dict[str, float]]:
-        """Return the power of the fields that the residuals need in the unknowns, [n, n], and their strengths."""
-        listed, names = list(fields.values()), list(fields)
-        of_columns = [of_field.times(self._columns) for of_field in listed]
+    def power(self, fields: Mapping[str, Field]) -> np.ndarray:
+        """Return the power of the fields that the residuals need in the unknowns, [n, n]."""
+        listed = list(fields.values())
+        of_columns = [self._of_columns(of_field) for of_field in listed]
         inner = [self._columns.T @ values for values in of_columns]
-        surplus = np.array([self._surplus(*pair) for pair in zip(listed, of_columns, strict=True)])
-        products = np.zeros((len(listed), len(listed)))
+        surplus = np.array([self._surplus(of_field) for of_field in listed])
+        of_unknowns = np.stack([values.ravel() for values in inner])
+        products = (of_unknowns @ of_unknowns.T).astype(np.float64)
+        # All pairs at once, by parts that stay in the processor's cache.
+        for first in range(0, len(self._columns), _TOGETHER):
+            of_pixels = np.stack([values[first : first + _TOGETHER].ravel() for values in of_columns])
+            products -= 2.0 * (of_pixels @ of_pixels.T)
         for a in range(len(listed)):
             for b in range(a + 1):
-                removed = float((inner[a] * inner[b]).sum()) - 2.0 * float(np.vdot(of_columns[a], of_columns[b]))
-                products[a, b] = products[b, a] = listed[a].product(listed[b]) + removed
-        freedom = self._pulls.size - float(np.trace(self._columns.T @ self._columns))
+                products[a, b] += listed[a].product(listed[b])
+                products[b, a] = products[a, b]
+        freedom = self._pulls.size - float(np.vdot(self._columns, self._columns))
         level = max(float(self._pulls @ self._pulls) / max(freedom, 1.0), 1.0)
-        strengths = {k: s for k, s in _needed_strengths(products, surplus, level).items() if s > 0.0}
-        power = sum((s * inner[k] for k, s in strengths.items()), start=np.zeros_like(inner[0]))
-        return power, {names[k]: s for k, s in strengths.items()}
+        strengths = _needed_strengths(products, surplus, level)
+        return sum((s * inner[k] for k, s in strengths.items()), start=np.zeros_like(inner[0]))
 
 
 class WhiteField:
@@ -194,22 +304,6 @@ class WhiteField:
         return other.trace
 
 
-class LowRankField:
-    """Field of few patterns, columns [n_pixel, m]."""
-
-    def __init__(self, columns: np.ndarray) -> None:
-        self._columns = columns.astype(np.float32)
-        self.trace = float((self._columns**2).sum())
-
-    def times(self, columns: np.ndarray) -> np.ndarray:
-        """Return the covariance times columns; see :class:`Field`."""
-        return np.asarray(self._columns @ (self._columns.T @ columns))
-
-    def product(self, other: Field) -> float:
-        """Return the trace of the product of the covariances; see :class:`Field`."""
-        return float((self._columns * other.times(self._columns)).sum())
-
-
 class StationaryField:
     """Field that is stationary but for its amplitude, with Gaussian correlations.
 
@@ -224,31 +318,48 @@ class StationaryField:
     """
 
     def __init__(self, used: np.ndarray, amplitude: np.ndarray, length: float) -> None:
-        self._used = used
+        self._used, self._length = used, length
         size = np.sqrt((amplitude[used] ** 2).mean())
         self._amplitude = np.where(used, amplitude, 0.0) / (size if size > 0.0 else 1.0)
-        y, x = (fft.fftfreq(n, 1.0 / n) for n in used.shape)
-        self._correlation = np.exp(-0.5 * (x**2 + y[:, None] ** 2) / length**2)
+        self._even = bool((self._amplitude == 1.0).all())
         self.trace = float((self._amplitude**2).sum())
 
     @cached_property
-    def _spectrum(self) -> np.ndarray:
-        return np.maximum(fft.rfft2(self._correlation).real, 0.0).astype(np.float32)
+    def _correlations(self) -> list[np.ndarray]:
+        """Correlations of rows and of columns, whose product is that of pixels."""
+        return [_gaussian(n, self._length).astype(np.float32) for n in self._used.shape]
 
     def times(self, columns: np.ndarray) -> np.ndarray:
         """Return the covariance times columns; see :class:`Field`."""
-        amplitude = self._amplitude[self._used][:, None].astype(np.float32)
-        images = np.zeros((*self._used.shape, columns.shape[1]), dtype=np.float32)
-        images[self._used] = columns * amplitude
-        spectra = fft.rfft2(images, axes=(0, 1)) * self._spectrum[..., None]
-        return np.asarray(fft.irfft2(spectra, s=self._used.shape, axes=(0, 1))[self._used] * amplitude)
+        # Products of matrices are quicker than transforms: the correlations are separable.
+        every, (rows, along) = bool(self._used.all()), self._correlations
+        amplitude, shape = self._amplitude.astype(np.float32)[..., None], (*self._used.shape, columns.shape[1])
+        if every:
+            images = columns.reshape(shape) if self._even else columns.reshape(shape) * amplitude
+        else:
+            images = np.zeros(shape, dtype=np.float32)
+            images[self._used] = columns * amplitude[self._used]
+        smooth = np.matmul(along, (rows @ images.reshape(shape[0], -1)).reshape(shape))
+        if not self._even:
+            smooth *= amplitude
+        return np.asarray(smooth.reshape(columns.shape) if every else smooth[self._used])
 
     def product(self, other: Field) -> float:
         """Return the trace of the product of the covariances; see :class:`Field`."""
         if not isinstance(other, StationaryField):
             return other.product(self)
-        overlap = fft.irfft2(np.abs(fft.rfft2(self._amplitude * other._amplitude)) ** 2, s=self._used.shape)
-        return float((self._correlation * other._correlation * overlap).sum())
+        # The product of two Gaussians is one.
+        length = 1.0 / math.hypot(1.0 / self._length, 1.0 / other._length)
+        rows, along = (_gaussian(n, length) for n in self._used.shape)
+        amplitude = self._amplitude * other._amplitude
+        return float((amplitude * (rows @ amplitude @ along)).sum())
+
+
+def _gaussian(count: int, length: float) -> np.ndarray:
+    """Return the Gaussian correlations of places on a line, of a length [pixels], shape [n, n]."""
+    places = np.arange(count)
+    correlation = np.exp(-0.5 * ((places[:, None] - places) / length) ** 2)
+    return np.where(correlation > _UNCORRELATED, correlation, 0.0)
 
 
 def _fields(linearized: Linearized, squares: _Squares, resolution: float) -> dict[str, Field]:

@@ -16,12 +16,11 @@ import numpy as np
 from ..wavefront.psf.pupil_rims import pupil_rims
 from .image_model import STRENGTH, LandedLight
 from .light import Instrument
+from .likelihood import linearized
 from .star_fitter import SMALLEST_DONUT, StarSolution
 
 #: Donuts that are asked.
 VOTERS = 3
-#: Smallest variance of a pixel [electron^2].
-_LEAST_VARIANCE = 1.0
 
 
 @dataclass(frozen=True)
@@ -47,17 +46,17 @@ def rim_amplitude(instrument: Instrument, star: StarSolution) -> RimAmplitude | 
     if unknowns[STRENGTH] == 0.0 or light.diameter < SMALLEST_DONUT * instrument.pixel:
         return None
     rims = pupil_rims(light.telescope, light.direction, instrument.middle)
-    landing, response = stamp.rays.landing(wave), stamp.rays.response(wave)
-    landed = LandedLight(landing, stamp.rays.weights(wave), stamp.rays.spread(landing))
-    model, columns, scales = stamp.grid.derivatives(unknowns, landed, response, stamp.rays.rates)
-    waves = LandedLight(landed.landing, landed.weights, landed.spread, stamp.rays.at_rims(rims, landing, None))
-    diffracted = stamp.grid.diffracting(rims).image(unknowns, waves) - model
-    used = stamp.used
-    root = 1.0 / np.sqrt(np.maximum(model + stamp.variance, _LEAST_VARIANCE)[used])
-    derivatives = columns[used].astype(np.float64) * root[:, None] * scales
+    point = linearized(stamp, unknowns, wave)
+    if point is None:
+        return None
+    landing = stamp.rays.landing(wave)
+    at_rims = stamp.rays.at_rims(rims, landing, None)
+    waves = LandedLight(landing, stamp.rays.weights(wave), stamp.rays.spread(landing), at_rims)
+    diffracted = stamp.grid.diffracting(rims).image(unknowns, waves) - point.model
+    derivatives = point.columns * point.scales
     if instrument.known_seeing:
         derivatives[:, STRENGTH] = 0.0
-    light_column, residual = diffracted[used] * root, (stamp.image - model)[used] * root
+    light_column, residual = diffracted[stamp.used] / np.sqrt(point.variance[stamp.used]), point.pulls
     prior = np.zeros(derivatives.shape[1])
     precision = np.concatenate([instrument.terms.precision, light.shift_precision])
     prior[len(unknowns) :] = precision

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
-from ..wavefront.psf.pupil_rims import PupilRims
-from .donut_rays import ZernikeRays, spread_of
-from .image_model import STRENGTH
+from .donut_rays import ZernikeRays
+from .image_model import STRENGTH, LandedLight
 from .light import Instrument, StarLight
-from .likelihood import Stamp, normal_equations
+from .likelihood import Stamp, light_columns, linearized
 from .moving_rims import PupilShadows, RimBody, line_cells
-from .rim_light import RimsAt
 from .solve import Solution
 
 #: Least gain of twice the logarithm of the likelihood by a rim elsewhere: noise makes one in 1e5 of three motions.
@@ -22,7 +21,7 @@ _GAIN = 25.0
 #: Least part of the misfit beyond noise that a rim elsewhere explains: where the model lacks other things, or the noise
 #: is larger than given, a rim explains a tenth or two by chance.
 _MISFIT = 0.5
-#: Gain of a score test over these from which on a rim is tried: one that stands far off gains more in the end.
+#: Part of the misfit that a score test gives a rim that is tried: one that stands far off gains more in the end.
 _PROMISING = 0.5
 #: Gain over the largest one from which on other rims are tried, too.
 _LIKELY = 0.4
@@ -32,6 +31,8 @@ _ALIKE = 9.0
 _MOST_BODIES = 4
 #: Rims that are tried in vain before the search ends.
 _MOST_FAILURES = 2
+#: Gain of a rim from afar over that which is needed, up to which it is not tried from where the fit has got to.
+_SHORT = 0.8
 #: Times that this is done for each rim in the search, and for the best of them.
 _FIRST_STEPS = 2
 _FINISHED = 2
@@ -56,11 +57,21 @@ class RimFit:
     solution: Solution
 
 
+class RimSolver(Protocol):
+    """Fit of the light of a star with other rims."""
+
+    def __call__(self, light: StarLight, start: Solution, hopeless: float = np.inf) -> RimFit:
+        """Return the best fit from the unknowns of a solution, with zeros for shifts.
+
+        A fit that cannot get below a `hopeless` loss ends after its first step.
+        """
+
+
 def with_moved_rims(
     instrument: Instrument,
     best: RimFit,
     noise: float,
-    solved: Callable[[StarLight, Solution], RimFit],
+    solved: RimSolver,
     first: Solution | None = None,
 ) -> RimFit:
     """Return the fit with rims free that the residuals say stand elsewhere.
@@ -73,8 +84,8 @@ def with_moved_rims(
         Best fit with rims where they are believed to be.
     noise : float
         Loss a pixel that noise alone makes.
-    solved : callable
-        Returns the best fit of light with other rims from the unknowns of a solution, with zeros for shifts.
+    solved : RimSolver
+        Fit of light with other rims.
     first : Solution, optional
         Unknowns from which the best fit began: all rims are then tried from these, since the wavefront of a fit whose
         rims are held has taken up where they stand.
@@ -84,22 +95,29 @@ def with_moved_rims(
         loss = best.solution.loss / best.stamp.used.sum()
         if loss < noise:
             break
-        threshold = _GAIN + _MISFIT * max(loss - (noise or 1.0), 0.0) * best.stamp.used.sum()
+        misfit = _MISFIT * max(loss - (noise or 1.0), 0.0) * best.stamp.used.sum()
+        threshold = _GAIN + misfit
         bodies, gains = rim_gains(instrument, best)
         free = [body for body in best.light.free_rims.bodies if body.moved]
         moved = {body.members for body in (*free, *failed)}
         gains = np.where([body.members in moved for body in bodies], 0.0, gains)
-        if not gains.max(initial=0.0) > _PROMISING * threshold:
+        if not gains.max(initial=0.0) > _GAIN + _PROMISING * misfit:
             break
+        limit = best.solution.loss
         if first is None:
             likely = gains > _LIKELY * gains.max()
-            trials = _each_freed(instrument, best, list(itertools.compress(bodies, likely)), best.solution, solved)
+            trials = _each_freed(
+                instrument, best, list(itertools.compress(bodies, likely)), best.solution, solved, limit
+            )
         else:
-            trials = _each_freed(instrument, best, bodies, first, solved)
+            trials = _each_freed(instrument, best, bodies, first, solved, limit)
         trial = trials[0]
-        if best.solution.loss - trial.solution.loss < threshold:
+        gain = best.solution.loss - trial.solution.loss
+        if gain < threshold:
             if first is None:
                 failed += itertools.compress(bodies, likely)
+            elif gain < _SHORT * threshold:
+                break
             first = None
             continue
         first, failed = None, []
@@ -118,13 +136,18 @@ def _each_freed(
     fit: RimFit,
     bodies: Sequence[RimBody],
     start: Solution,
-    solved: Callable[[StarLight, Solution], RimFit],
+    solved: RimSolver,
+    limit: float,
 ) -> list[RimFit]:
-    """Return fits with one more of some bodies free, best first: those that lead nowhere end after a few steps."""
+    """Return fits with one more of some bodies free, best first: those that lead nowhere end after a few steps.
+
+    So do those that will not get below a limit of the loss.
+    """
     trials = []
     for body in bodies:
         light = fit.light.with_free_rims(fit.light.free_rims.with_body(body), instrument.middle)
-        trials.append(_settled(instrument, solved(light, start), solved, _FIRST_STEPS))
+        # A rim that stands far off gains little before its shadow is computed where it is first found to stand.
+        trials.append(_settled(instrument, solved(light, start), solved, _FIRST_STEPS, limit))
     trials.sort(key=lambda trial: trial.solution.loss)
     close = [trial for trial in trials if trial.solution.loss < _CLOSE * trials[0].solution.loss]
     finished = [_settled(instrument, trial, solved) for trial in close[:_FINISHED]]
@@ -139,26 +162,32 @@ def rim_gains(instrument: Instrument, fit: RimFit) -> tuple[list[RimBody], np.nd
     light, (star, wave) = fit.light, (fit.solution.stars[0], fit.solution.waves[0])
     rays = fit.stamp.rays
     assert isinstance(rays, ZernikeRays)
+    point = linearized(fit.stamp, star, wave)
     bodies, lines = PupilShadows(light.telescope, light.direction, instrument.middle, rays.cells).candidates()
-    if not bodies:
+    if not bodies or point is None:
         return [], np.zeros(0)
     free = np.array([body.free for body in bodies])
-    shadows = instrument.rays_of(light, line_cells(rays.cells, lines, free))
     spreads = np.array([body.spreads for body in bodies])[free]
-    stamp = replace(fit.stamp, rays=_RaysWithShadows(rays, shadows, len(wave)))
-    equations = normal_equations(stamp, star, np.concatenate([wave, np.zeros(len(spreads))]))
-    first, last = len(star) + len(wave), len(star) + len(wave) + np.arange(len(spreads))
+    shadows = line_cells(rays.cells, lines, free)
+    _, rates = shadows.at_wavelengths(instrument.wavelength_weights)
+    landing, spread = rays.beside(shadows.points, shadows.moments, rays.landing(wave))
+    shadow_columns, scales = light_columns(
+        fit.stamp, star, point, LandedLight(landing, np.zeros(len(rates)), spread), rates
+    )
+    first = len(star) + len(wave)
     fitted = np.flatnonzero(np.arange(first) != (STRENGTH if instrument.known_seeing else -1))
     precision = np.concatenate([np.zeros(len(star)), instrument.terms.precision, light.shift_precision])
     mean = np.concatenate([np.zeros(first - len(light.shift_mean)), light.shift_mean])
     values = np.concatenate([np.zeros(len(star)), wave])
-    inner = (equations.curvature[:first, :first] + np.diag(precision))[np.ix_(fitted, fitted)]
-    cross = equations.curvature[np.ix_(fitted, last)]
-    slope = (equations.gradient[:first] - precision * (values - mean))[fitted]
+    inner = point.columns.T @ point.columns * np.outer(point.scales, point.scales) + np.diag(precision)
+    inner = inner[np.ix_(fitted, fitted)]
+    cross = (point.columns.T @ shadow_columns * np.outer(point.scales, scales))[fitted]
+    slope = (point.columns.T @ point.pulls * point.scales - precision * (values - mean))[fitted]
     scale = np.sqrt(np.maximum(np.diag(inner), 1e-300))
     projected = np.linalg.lstsq(inner / np.outer(scale, scale), cross / scale[:, None], rcond=1e-12)[0] / scale[:, None]
-    gradient = equations.gradient[last] - projected.T @ slope
-    curvature = equations.curvature[np.ix_(last, last)] - cross.T @ projected + np.diag(spreads**-2.0)
+    gradient = shadow_columns.T @ point.pulls * scales - projected.T @ slope
+    curvature = shadow_columns.T @ shadow_columns * np.outer(scales, scales) - cross.T @ projected
+    curvature += np.diag(spreads**-2.0)
     number = np.nonzero(free)[0]
     gains = np.zeros(len(bodies))
     for k in range(len(bodies)):
@@ -167,42 +196,13 @@ def rim_gains(instrument: Instrument, fit: RimFit) -> tuple[list[RimBody], np.nd
     return bodies, gains
 
 
-class _RaysWithShadows:
-    """Light of a star and the shadows of rims, which have no light: unknowns are those of the light, then motions."""
-
-    def __init__(self, light: ZernikeRays, shadows: ZernikeRays, count: int) -> None:
-        self.cells, self._light, self._shadows, self._count = light.cells, light, shadows, count
-        self._size = len(light.rates)
-        lost = -np.outer(light.weights(np.zeros(count)), shadows.rates.sum(axis=0))
-        still = np.zeros((len(shadows.rates), light.rates.shape[1]))
-        self.rates = np.block([[light.rates, lost], [still, shadows.rates]])
-
-    def weights(self, unknowns: np.ndarray) -> np.ndarray:
-        return np.concatenate([self._light.weights(unknowns[: self._count]), np.zeros(len(self._shadows.rates))])
-
-    def landing(self, unknowns: np.ndarray) -> np.ndarray:
-        return np.concatenate([rays.landing(unknowns[: self._count]) for rays in (self._light, self._shadows)])
-
-    def spread(self, landing: np.ndarray) -> np.ndarray:
-        # The shadows are too few to tell what a cell's image is like: they have the footprint of the light.
-        spread = spread_of(self._shadows.cells, landing[self._size :], self._light.footprint)
-        return np.concatenate([self._light.spread(landing[: self._size]), spread])
-
-    def at_rims(self, rims: PupilRims, landing: np.ndarray, response: np.ndarray | None) -> RimsAt:
-        return self._light.at_rims(rims, landing[: self._size], response)
-
-    def response(self, unknowns: np.ndarray) -> np.ndarray:
-        light = self._light.response(unknowns)
-        return np.concatenate([light, np.zeros((2, len(self._shadows.rates), light.shape[2]), light.dtype)], axis=1)
-
-    def release(self) -> None:
-        self._light.release()
-
-
 def _settled(
-    instrument: Instrument, best: RimFit, solved: Callable[[StarLight, Solution], RimFit], steps: int = _OUTER
+    instrument: Instrument, best: RimFit, solved: RimSolver, steps: int = _OUTER, hopeless: float = np.inf
 ) -> RimFit:
-    """Return the best fit with the same rims free, their shadows where they are found to stand, after so many steps."""
+    """Return the best fit with the same rims free, their shadows where they are found to stand, after so many steps.
+
+    Steps end where the loss cannot get below a `hopeless` one.
+    """
     first = len(instrument.noll) + 2 * len(best.light.rims)
     factor = 1.0
     for _ in range(steps):
@@ -210,7 +210,9 @@ def _settled(
         if np.all(np.abs(shift) < _SMALL * rims.spreads):
             break
         light = best.light.with_free_rims(rims.moved(shift), instrument.middle)
-        trial = solved(light, best.solution)
+        trial = solved(light, best.solution, hopeless)
+        if trial.solution.loss > hopeless:
+            break
         # Light that a shadow uncovers lies beside the line that stands for it, so that steps may be too long.
         gain = best.solution.loss - trial.solution.loss
         best, factor = (trial, 1.0) if gain > 0.0 else (best, 0.5 * factor)

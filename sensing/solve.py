@@ -5,12 +5,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from .image_model import FLUX, STRENGTH, neighbours_of
+from .image_model import EXPONENT_GROWTH, FLUX, STRENGTH, neighbours_of
 from .likelihood import NormalEquations, Stamp, normal_equations
 
 #: A step that is to lower twice the negative logarithm of the likelihood by less, per unit of chi-square a pixel, is
@@ -109,11 +109,13 @@ def solve(
     *,
     tolerance: float = FINE,
     steps: int = STEPS,
+    hopeless: float = np.inf,
     pool: Executor | None = None,
 ) -> Solution:
     """Maximise the likelihood from a starting point, by so many steps or until one is to gain less than a tolerance.
 
-    A start without a likelihood is returned as it is, with an infinite loss.
+    A start without a likelihood is returned as it is, with an infinite loss. A search that after its first step
+    predicts no loss below a `hopeless` one ends there, with the loss that it predicts.
     """
     joined = np.concatenate([*stars, shared])
     sizes = [len(s) for s in stars]
@@ -121,7 +123,7 @@ def solve(
     held = _held(group, sizes)
     state = _linearize(group, joined, sizes, pool)
     damping, converged, predicted = _DAMPING, False, np.inf
-    for _ in range(steps if np.isfinite(state.loss) else 0):
+    for count in range(steps if np.isfinite(state.loss) else 0):
         step = np.zeros_like(joined)
         free = ~held & ~_pressed(joined, state.gradient, sizes)
         curvature = state.curvature[np.ix_(free, free)]
@@ -130,9 +132,12 @@ def solve(
         normalized[np.diag_indices_from(normalized)] = 1.0 + damping
         step[free] = _solved(normalized, state.gradient[free] / scale) / scale
         predicted = float(state.gradient @ step)
-        trial = _bounded(joined + step, sizes, held)
+        trial = _bounded(_stepped(joined, step, sizes), sizes, held)
         if predicted < tolerance * max(1.0, state.loss / pixels):
             joined, converged = trial, True
+            break
+        if count and state.loss - predicted > hopeless:
+            joined, state = trial, replace(state, loss=state.loss - predicted)
             break
         trial_state = _linearize(group, trial, sizes, pool)
         if trial_state.loss < state.loss:
@@ -148,10 +153,10 @@ def solve(
     covariance[free] = np.linalg.pinv(state.curvature[free] / np.outer(scale, scale), hermitian=True)
     covariance[free] /= np.outer(scale, scale)
     bounds = np.cumsum([0, *sizes])
-    found_stars = tuple(joined[a:b] for a, b in itertools.pairwise(bounds))
+    star_unknowns = tuple(joined[a:b] for a, b in itertools.pairwise(bounds))
     best = joined[bounds[-1] :]
     waves = tuple(m @ best for m in group.maps)
-    return Solution(found_stars, best, waves, covariance, state.chi2, state.loss, converged)
+    return Solution(star_unknowns, best, waves, covariance, state.chi2, state.loss, converged)
 
 
 @dataclass(frozen=True)
@@ -180,6 +185,8 @@ def _linearize(group: Group, joined: np.ndarray, sizes: list[int], pool: Executo
         equations = normal_equations(stamp, joined[bounds[i] : bounds[i + 1]], group.maps[i] @ shared)
         if group.transient:
             stamp.release()
+        elif len(group.stamps) > 1:
+            stamp.forget()
         return equations
 
     apply: Callable[..., object] = map if pool is None else pool.map
@@ -216,6 +223,18 @@ def _pressed(joined: np.ndarray, gradient: np.ndarray, sizes: list[int]) -> np.n
         at = first + STRENGTH
         pressed[at] = joined[at] <= _LEAST_STRENGTH and gradient[at] < 0.0
     return pressed
+
+
+def _stepped(joined: np.ndarray, step: np.ndarray, sizes: list[int]) -> np.ndarray:
+    """Return unknowns after a step, that of the turbulence taken in the power of its strength that images go by."""
+    trial = joined + step
+    for first in np.cumsum([0, *sizes[:-1]]):
+        at = first + STRENGTH
+        strength, change = joined[at], step[at]
+        if change != 0.0 and strength > 0.0:
+            power = strength**EXPONENT_GROWTH * (1.0 + EXPONENT_GROWTH * change / strength)
+            trial[at] = max(power, 0.0) ** (1.0 / EXPONENT_GROWTH)
+    return trial
 
 
 def _bounded(joined: np.ndarray, sizes: list[int], held: np.ndarray) -> np.ndarray:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from ..wavefront.atmosphere.turbulence import REFERENCE_WAVELENGTH
 from .air_shape import air_shape
 from .donut_rays import ZernikeRays
 from .image_model import STRENGTH
@@ -21,10 +22,10 @@ from .star_fitter import StarSolution
 
 #: Terms up to the eleventh radial degree: what the mean wavefront of the air has beyond is lost in the seeing.
 _AIR_TERMS = 78
-#: Name of the field of the air's wavefront of unknown size.
-_AIR = "air"
 #: Rms of the wavefront of the air of unit strength, Z4 to Z22 together [m].
 _UNIT = 1e-7
+#: Variance of Kolmogorov's wavefront from Z4 on where the diameter of the pupil is Fried's parameter [rad^2].
+_NOLL_FROM_4 = 0.134
 #: Least variance of a term of the air over that of all from Z4 to Z22.
 _LEAST = 1e-9
 #: Full width at half maximum of a Gaussian over its rms.
@@ -48,7 +49,8 @@ class ErrorParts:
     air : ndarray
         Mean wavefront of the turbulence of the exposure.
     floor : ndarray
-        Accuracy of the model, and the scatter of the donuts of an exposure about a smooth field beyond all else.
+        Accuracy of the model, terms beyond those fitted, which fall off with the radial degree, and the scatter of the
+        donuts of an exposure about a smooth field beyond all else.
     repeats : ndarray
         No part of the sum: covariance of a donut about the others of its exposure, which have the same errors of the
         model in common. The sum, where there are none to compare.
@@ -79,31 +81,68 @@ class ErrorParts:
 
 @dataclass(frozen=True)
 class StarErrors:
-    """Covariance of the unknowns of a star beside its wavefront, and that of its wavefront by cause."""
+    """Errors of a star that was fitted by itself.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape [n_unknown, n_unknown]
+        Covariance of its unknowns beside its wavefront.
+    parts : ErrorParts
+        That of its wavefront, by cause.
+    of_light : ndarray, shape [n_noll, n_noll]
+        Covariance of the wavefront of its light, the air's low terms among it, but for what stars have in common.
+    figure : ndarray, shape [n_noll, n_noll]
+        What stars have in common: terms of the telescope that are not fitted.
+    """
 
     covariance: np.ndarray
     parts: ErrorParts
+    of_light: np.ndarray
+    figure: np.ndarray
 
 
 def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
     """Return the errors of a star that was fitted by itself."""
+    if isinstance(star.errors, StarErrors):
+        return star.errors
     solution, terms = star.solution, instrument.terms
     n_star, n = len(solution.stars[0]), len(terms.requested)
     wavefront = slice(n_star, n_star + n)
-    photons, air = solution.covariance, terms.air
-    residuals = np.zeros_like(photons)
+    photons, air, figure, speckled = solution.covariance, terms.air, np.zeros((n, n)), np.zeros((n, n))
+    residuals, lacking = np.zeros_like(photons), solution.star_covariance(0).copy()
     point = linearized(star.stamp, solution.stars[0], solution.waves[0])
     if point is not None and len(solution.shared):
         beside = _TermsBeside(instrument, star, point)
-        power = residual_power(point, photons, _resolution(instrument, star), beside.fields)
+        power = residual_power(point, photons, _resolution(instrument, star), beside.patterns, beside.unfitted)
         residuals = power.covariance
-        strength = power.strengths.get(_AIR, 0.0)
+        lacking += residuals[:n_star, :n_star]
+        figure = beside.figure(photons)[wavefront, wavefront]
+        strength = min(power.strength, _most_air(instrument, float(solution.stars[0][STRENGTH])))
         if strength > 0.0:
             speckles, turbulence = (strength * values for values in beside.air(photons))
-            residuals, air = residuals - speckles, air + turbulence[wavefront, wavefront]
-    zernikes = solution.shared[:n]
-    parts = ErrorParts.of(photons[wavefront, wavefront], residuals[wavefront, wavefront], air, model_floor(zernikes))
-    return StarErrors(solution.star_covariance(0) + residuals[:n_star, :n_star], parts)
+            lacking, air = lacking + speckles[:n_star, :n_star], air + turbulence[wavefront, wavefront]
+            speckled = speckles[wavefront, wavefront]
+    accuracy = model_floor(solution.shared[:n])
+    parts = ErrorParts.of(photons[wavefront, wavefront], residuals[wavefront, wavefront], air, figure + accuracy)
+    return StarErrors(lacking, parts, parts.photons + parts.residuals + speckled + accuracy, figure)
+
+
+def _most_air(instrument: Instrument, seeing: float) -> float:
+    """Return the variance of the wavefront of turbulence at one moment, in units of that of air of unit size.
+
+    It is that of Kolmogorov's from Z4 on (Noll 1976), for an inverse Fried parameter [1/m]; infinite without seeing.
+    """
+    turbulence = instrument.telescope.pupil_diameter * seeing
+    radians = _NOLL_FROM_4 * turbulence ** (5.0 / 3.0)
+    return radians * (REFERENCE_WAVELENGTH / (2.0 * math.pi * _UNIT)) ** 2 if seeing > 0.0 else math.inf
+
+
+def with_errors(instrument: Instrument, star: StarSolution) -> StarSolution:
+    """Return a star with its errors, its derivatives freed."""
+    star = replace(star, errors=star_errors(instrument, star))
+    star.stamp.forget()
+    star.full.forget()
+    return star
 
 
 def model_floor(zernikes: np.ndarray) -> np.ndarray:
@@ -197,24 +236,33 @@ class _TermsBeside:
         """Derivatives of the model by the terms beside those asked for, over the noise [1/m], [n_pixel, m]."""
         star, terms = self._star, self._instrument.terms
         unknowns, wave = star.solution.stars[0], star.solution.waves[0]
-        n_star, n, n_fitted = len(unknowns), len(terms.requested), len(terms.every)
-        rays = ZernikeRays(
-            star.light.telescope,
-            star.light.direction,
-            self._instrument.wavelengths,
-            self._instrument.wavelength_weights,
-            star.stamp.rays.cells,
-            np.concatenate([terms.every, self._beyond]),
-        )
-        padded_wave = np.concatenate([wave[:n_fitted], np.zeros(len(self._beyond)), wave[n_fitted:]])
-        point = linearized(replace(star.stamp, rays=rays), unknowns, padded_wave)
+        first = len(unknowns) + len(terms.requested)
+        further = slice(first, first + len(terms.further))
+        columns = self._point.columns[:, further] * self._point.scales[further].astype(np.float32)
+        if not len(self._beyond):
+            return columns
+        rays = star.stamp.rays
+        assert isinstance(rays, ZernikeRays)
+        point = linearized(replace(star.stamp, rays=rays.responding_to(self._beyond)), unknowns, wave)
         assert point is not None
-        beside = slice(n_star + n, n_star + n_fitted + len(self._beyond))
-        return np.asarray(point.columns[:, beside] * point.scales[beside].astype(np.float32))
+        beyond = slice(len(unknowns), len(unknowns) + len(self._beyond))
+        return np.concatenate([columns, point.columns[:, beyond] * point.scales[beyond].astype(np.float32)], axis=1)
 
-    def fields(self) -> Mapping[str, np.ndarray]:
-        """Return the columns of the fields by name, [n_pixel, m]."""
-        return {_AIR: self._columns @ self._root.astype(np.float32)} if len(self._high) else {}
+    @cached_property
+    def patterns(self) -> np.ndarray | None:
+        """Changes of the image over the noise by independent parts of air of unit size, [n_pixel, m]; None without."""
+        return self._columns @ self._root.astype(np.float32) if len(self._high) else None
+
+    @property
+    def unfitted(self) -> np.ndarray:
+        """Changes of the image over the noise by terms that are not fitted, of the rms that telescopes have."""
+        columns = self._columns[:, len(self._instrument.terms.further) :]
+        return columns * self._instrument.terms.spreads_beyond(self._beyond).astype(np.float32)
+
+    def figure(self, covariance: np.ndarray) -> np.ndarray:
+        """Return the covariance of the unknowns by terms that are not fitted."""
+        moved = covariance @ (self._point.scales[:, None] * (self._point.columns.T @ self.unfitted))
+        return np.asarray(moved @ moved.T)
 
     def air(self, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the covariance of the unknowns by air of unit size: by its further terms, and with its own.
@@ -222,7 +270,7 @@ class _TermsBeside:
         Its own terms are those asked for, which no donut tells from the telescope's.
         """
         n_star, low = len(self._star.solution.stars[0]), self._instrument.terms.requested - 4
-        scaled = self._point.columns.T @ (self._columns @ self._root.astype(np.float32))
+        scaled = self._point.columns.T @ self.patterns
         moved = covariance @ (self._point.scales[:, None] * scaled)
         speckles = moved @ moved.T
         turbulence, wavefront = speckles.copy(), slice(n_star, n_star + len(low))

@@ -16,7 +16,7 @@ from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, SLOPE_X, SLOPE_Y, S
 from .light import Instrument, Sampling, StarLight
 from .likelihood import Stamp, model_image, pulls
 from .noise import measured_noise
-from .rim_search import RimFit, with_moved_rims
+from .rim_search import RimFit, RimSolver, with_moved_rims
 from .solve import FINE, STEPS, Group, Solution, solve
 from .stamps import Match, Pixels, match_template, measured_variance
 
@@ -58,6 +58,8 @@ class StarSolution:
         Its unknowns.
     model : ndarray
         Best image of all pixels [electrons].
+    errors : StarErrors, optional
+        Errors of the fit by itself, of :mod:`.star_errors`, where they are at hand.
     """
 
     light: StarLight
@@ -65,6 +67,7 @@ class StarSolution:
     full: Stamp
     solution: Solution
     model: np.ndarray
+    errors: object = None
 
 
 @dataclass(frozen=True)
@@ -145,7 +148,7 @@ class StarFitter:
         stamp: Stamp,
         best: Solution,
         noise: float,
-        solved: Callable[[StarLight, Solution], RimFit],
+        solved: RimSolver,
         first: np.ndarray | None = None,
     ) -> tuple[StarFitter, Stamp, Solution]:
         """Return the fit with rims free that the residuals say stand elsewhere, with the stamp of its light."""
@@ -153,17 +156,16 @@ class StarFitter:
         fit = with_moved_rims(self.instrument, RimFit(self._light, stamp, best), noise, solved, begun)
         return self if fit.light is self._light else self.with_light(fit.light), fit.stamp, fit.solution
 
-    def rim_solver(
-        self, tolerance: float, stamp_of: Callable[[StarFitter], Stamp]
-    ) -> Callable[[StarLight, Solution], RimFit]:
+    def rim_solver(self, tolerance: float, stamp_of: Callable[[StarFitter], Stamp]) -> RimSolver:
         """Return the function that fits light with its rims elsewhere, from the unknowns of a solution."""
 
-        def solved(light: StarLight, start: Solution) -> RimFit:
+        def solved(light: StarLight, start: Solution, hopeless: float = math.inf) -> RimFit:
             fitter = self.with_light(light)
             moved_stamp = stamp_of(fitter)
             held = len(light.rims) * 2 + len(self.instrument.noll)
             shared = np.concatenate([start.shared[:held], np.zeros(len(light.free_rims))])
-            return RimFit(light, moved_stamp, fitter.solve(moved_stamp, start.stars[0], shared, tolerance))
+            best = fitter.solve(moved_stamp, start.stars[0], shared, tolerance, hopeless=hopeless)
+            return RimFit(light, moved_stamp, best)
 
         return solved
 
@@ -190,6 +192,12 @@ class StarFitter:
         shared = self._across if self._across < _SHARED * sampling.across else 0
         rays = self._of(light, max(sampling.across, shared))
         return self.instrument.stamp(light, pixels, rays, sampling.sharp, reach)
+
+    def mirrored_stamp(self, light: StarLight, start: Start) -> Stamp:
+        """Return the stamp of a star's light on the other side of focus, through the cells of the pupil of a start."""
+        rays, grid = start.stamp.rays, start.stamp.grid
+        assert isinstance(rays, ZernikeRays)
+        return self.instrument.stamp(light, start.pixels, rays.through(light.telescope), grid.sharp, grid.reach)
 
     def sampled_stamp(self, pixels: Pixels, sampling: Sampling, reach: float) -> Stamp:
         """Return the stamp of pixels that are sampled so, with room for light beside it [m]."""
@@ -336,11 +344,12 @@ class StarFitter:
         used, star, wave = self.clean.used, solution.stars[0], solution.waves[0]
         used = stamp.used if stamp.used.shape == used.shape else used
         landing, weights = stamp.rays.landing(wave), stamp.rays.weights(wave)
+        regions = np.zeros_like(used) if used.all() else unused_regions(used)
         middle = 0.5 * (np.array(used.shape[::-1]) - 1.0)
         place = np.rint(landing / self.instrument.pixel + star[[X, Y]] + middle)
         outside = ~((place >= 0) & (place < used.shape[::-1])).all(axis=1)
         column, row = np.where(outside[:, None], 0, place).astype(np.int64).T
-        lost, cut = (outside | pixels[row, column] for pixels in (~used, unused_regions(used)))
+        lost, cut = (outside | pixels[row, column] for pixels in (~used, regions))
         return LostLight(float(weights @ lost), float(weights @ cut))
 
     def solve(
@@ -350,11 +359,13 @@ class StarFitter:
         shared: np.ndarray | None = None,
         tolerance: float = FINE,
         steps: int = STEPS,
+        hopeless: float = math.inf,
     ) -> Solution:
-        """Return the best unknowns from a start."""
+        """Return the best unknowns from a start; see :func:`~pachon.sensing.solve.solve`."""
         n = self._map.shape[2]
         group = Group((stamp,), self._map, self.precision[:n], self.instrument.known_seeing, prior_mean=self._mean[:n])
-        return solve(group, [star], np.zeros(n) if shared is None else shared, tolerance=tolerance, steps=steps)
+        start = np.zeros(n) if shared is None else shared
+        return solve(group, [star], start, tolerance=tolerance, steps=steps, hopeless=hopeless)
 
 
 def _typical(pull: np.ndarray, model: np.ndarray, used: np.ndarray) -> float:

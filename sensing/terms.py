@@ -15,6 +15,8 @@ from ..wavefront.atmosphere.mean_wavefront import mean_wavefront_covariance
 _LOW_TERMS = 22
 # Terms up to the sixth radial degree, of which misaligned optics have a little.
 _LAST_TERM = 28
+# Rms of terms that are not fitted over those two degrees lower: of LSST's mirrors, out of figure.
+_FALL = 0.07
 # Terms up to the eleventh radial degree: what the mean wavefront of the air has beyond is lost in the seeing.
 _AIR_TERMS = 78
 
@@ -33,12 +35,15 @@ class WavefrontTerms:
         Inverse variances of Gaussian priors about zero [1/m^2]; 0 for the terms asked for.
     air : ndarray, shape [n, n]
         Covariance of the terms asked for in the mean wavefront of the air [m^2].
+    higher_order : float
+        Rms of each term of the next radial degree [m].
     """
 
     requested: np.ndarray
     further: np.ndarray
     precision: np.ndarray
     air: np.ndarray
+    higher_order: float = 0.0
 
     @classmethod
     def of(
@@ -61,12 +66,30 @@ class WavefrontTerms:
             variance = np.concatenate([variance, np.zeros(len(beyond))])
             further = np.concatenate([further, beyond])
             variance = variance + np.diag(covariance)[further - 4]
-        return cls(requested, further, np.concatenate([np.zeros(len(requested)), 1.0 / variance]), added)
+        precision = np.concatenate([np.zeros(len(requested)), 1.0 / variance])
+        return cls(requested, further, precision, added, higher_order)
 
     @property
     def every(self) -> np.ndarray:
         """Noll indices of all terms, shape [n + m]."""
         return np.concatenate([self.requested, self.further])
+
+    def spreads_beyond(self, noll: np.ndarray) -> np.ndarray:
+        """Return the rms of terms that are not fitted [m], less with each degree beyond those that are."""
+        highest = _highest_degrees(self.every)
+        # Azimuthal orders beyond those asked for have the degrees of the largest of these.
+        largest = {m % 2: highest[m] for m in sorted(highest, key=abs)}
+        degrees = [noll_to_nm(int(j)) for j in noll]
+        steps = np.array([(n - highest.get(m, largest.get(m % 2, abs(m)))) / 2 for n, m in degrees])
+        return self.higher_order * _FALL**steps
+
+
+def _highest_degrees(noll: np.ndarray) -> dict[int, int]:
+    """Return the highest radial degree of terms by their azimuthal order."""
+    highest: dict[int, int] = {}
+    for n, m in (noll_to_nm(int(j)) for j in noll):
+        highest[m] = max(highest.get(m, 0), n)
+    return highest
 
 
 def further_terms(noll: np.ndarray, left_out: float, higher_order: float) -> tuple[np.ndarray, np.ndarray]:
@@ -85,9 +108,7 @@ def further_terms(noll: np.ndarray, left_out: float, higher_order: float) -> tup
 
 def next_terms(noll: np.ndarray) -> np.ndarray:
     """Return the Noll indices of the next radial degree at every azimuthal order of some, without these."""
-    highest: dict[int, int] = {}
-    for n, m in map(noll_to_nm, noll):
-        highest[m] = max(highest.get(m, 0), n)
+    highest = _highest_degrees(noll)
     degrees = {(n + 2, m) for m, n in highest.items()}
     last = (max(highest.values()) + 3) * (max(highest.values()) + 4) // 2
     return np.array([j for j in range(1, last + 1) if noll_to_nm(j) in degrees and j not in noll], dtype=np.int64)
