@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -37,7 +38,7 @@ from .inputs import ObservedStar, ObservedStars
 from .light import Instrument, StarLight
 from .likelihood import pulls
 from .model import DonutModel
-from .noise import faint_level, measured_noise, smoothed
+from .noise import PixelNoise, faint_level, measured_noise, smoothed
 from .result import DonutFit
 from .rim_amplitude import VOTERS, RimAmplitude, rim_amplitude, waves_fit_better
 from .rim_table import moved_rims, rim_table
@@ -169,14 +170,16 @@ def fit_donuts(
 
     with one_blas_thread(), ThreadPoolExecutor(thread_count(threads)) as pool:
 
-        def alone(instrument: Instrument, i: int) -> StarFit:
-            return _fit_alone(instrument, observed.star(i), float(shifts[i]), float(strengths[i]), fit.joint)
+        def alone(instrument: Instrument, i: int, by_rays: StarFit | None = None) -> StarFit:
+            star, defocus, strength = observed.star(i), float(shifts[i]), float(strengths[i])
+            return _fit_alone(instrument, star, defocus, strength, fit.joint, by_rays)
 
         def fitted_stars(
-            instrument: Instrument, ready: dict[int, StarFit], report: Callable[[int], None] | None
+            instrument: Instrument, by_rays: dict[int, StarFit], report: Callable[[int], None] | None
         ) -> _Fitted:
             def prepared(i: int) -> StarFit:
-                star = ready.get(i) or alone(instrument, i)
+                ready = by_rays.get(i)
+                star = alone(instrument, i, ready) if ready is None or instrument.model.diffraction else ready
                 if report is not None:
                     report(1)
                 return fit.prepared(instrument, star)
@@ -191,13 +194,12 @@ def fit_donuts(
             )
             return _Fitted(stars, solutions, fit.solved(usable, pool))
 
-        ready: dict[int, StarFit] = {}
+        by_rays: dict[int, StarFit] = {}
         if model.diffraction is None:
-            ready, diffraction = _by_rays(instrument, lambda i: alone(instrument, i), len(observed), pool)
-            ready = {} if diffraction else ready
+            by_rays, diffraction = _by_rays(instrument, lambda i: alone(instrument, i), len(observed), pool)
             model = replace(model, diffraction=diffraction)
             instrument = replace(instrument, model=model)
-        fitted = fitted_stars(instrument, ready, progress)
+        fitted = fitted_stars(instrument, by_rays, progress)
         terms = fit.refined(instrument, fitted.results)
         if terms is not None:
             instrument = Instrument.of(telescope, model, terms)
@@ -243,8 +245,10 @@ def _by_rays(
     return stars, waves_fit_better(amplitudes)
 
 
-def _fit_alone(instrument: Instrument, star: ObservedStar, defocus: float, strength: float, joint: bool) -> StarFit:
-    """Fit one star by itself, or say why not."""
+def _fit_alone(
+    instrument: Instrument, star: ObservedStar, defocus: float, strength: float, joint: bool, by_rays: StarFit | None
+) -> StarFit:
+    """Fit one star by itself, from a fit by rays if there is one, or say why not."""
     if np.hypot(*star.field) > instrument.telescope.field_limit * (1.0 + 1e-12):
         return StarFit(DonutFlag.OUTSIDE_FIELD)
     try:
@@ -256,7 +260,7 @@ def _fit_alone(instrument: Instrument, star: ObservedStar, defocus: float, stren
     saturated = _saturated(np.where(masked, 0.0, star.image), masked, instrument.model.detector.saturation)
     masked = masked | grown(saturated, ~masked)
     wavefront = not joint or light.diameter > SMALLEST_DONUT * instrument.pixel
-    fitted = _fit_with_noise(instrument, light, star, ~masked, strength, wavefront)
+    fitted = _fit_with_noise(instrument, light, star, ~masked, strength, wavefront, by_rays)
     if fitted.flags.usable:
         return replace(fitted, flags=fitted.flags | DonutFlag.CLIPPED) if (saturated | not_finite).any() else fitted
     if saturated.sum() > max(_SEVERAL * star.image.size, 1.0):
@@ -267,23 +271,34 @@ def _fit_alone(instrument: Instrument, star: ObservedStar, defocus: float, stren
 
 
 def _fit_with_noise(
-    instrument: Instrument, light: StarLight, star: ObservedStar, used: np.ndarray, strength: float, wavefront: bool
+    instrument: Instrument,
+    light: StarLight,
+    star: ObservedStar,
+    used: np.ndarray,
+    strength: float,
+    wavefront: bool,
+    by_rays: StarFit | None,
 ) -> StarFit:
     """Fit the used pixels of one star with its known noise, or with noise and sky level that are measured."""
+    fit = partial(fit_star, instrument, light, strength=strength, wavefront=wavefront)
     image = np.where(used, star.image, 0.0)
     if star.known_noise:
-        return fit_star(instrument, light, Pixels(image, star.variance, used), strength, wavefront=wavefront)
+        return fit(Pixels(image, star.variance, used), begun=by_rays)
     smooth = smoothed(image, used)
     level = faint_level(smooth, used)
     image = np.where(used, star.image - level, 0.0)
-    noise = measured_noise(image, smooth - level, used, level)
+    if by_rays is None or by_rays.usable is None:
+        noise = measured_noise(image, smooth - level, used, level)
+    else:
+        noise = PixelNoise(float(by_rays.usable.full.variance.mean()) * by_rays.unit**2, by_rays.unit)
     for _ in range(_NOISE_FITS):
         unit = noise.photon
         pixels = Pixels(image / unit, np.full(image.shape, noise.sky / unit**2), used)
-        fitted = fit_star(instrument, light, pixels, strength, wavefront=wavefront, sky_level=level / unit)
+        fitted = fit(pixels, sky_level=level / unit, begun=by_rays)
         if 1.0 / _NOISE_AGREES < fitted.unit < _NOISE_AGREES:
             break
         noise = replace(noise, sky=noise.sky * fitted.unit, photon=unit * fitted.unit)
+        by_rays = None
     return replace(fitted, unit=unit * fitted.unit, level=level)
 
 

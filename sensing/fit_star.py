@@ -29,6 +29,8 @@ _CUT_OFF = 0.05
 _LOST = 0.55
 #: Steps of the fit on the other side of focus.
 _MIRRORED_STEPS = 8
+#: Flags of a fit whose search need not be done again for a model with diffraction.
+_BESIDE_THE_SEARCH = DonutFlag.AMBIGUOUS_SIDE | DonutFlag.OTHER_SIZE
 #: Loss of the other side beyond that of the given one, over what contradicts it, with which it is not what was given.
 _HOPELESS = 2.0
 #: Least fraction of the variance of the image that the model explains.
@@ -84,6 +86,7 @@ def fit_star(
     *,
     wavefront: bool,
     sky_level: float | None = None,
+    begun: StarFit | None = None,
 ) -> StarFit:
     """Fit one star.
 
@@ -98,10 +101,14 @@ def fit_star(
     sky_level : float, optional
         Light of the sky that was taken off, where noise is not known: that of the result is what the fit leaves, in a
         unit in which light has the noise of electrons.
+    begun : StarFit, optional
+        Fit of a model without diffraction, in the same unit, from which this one begins if its search left no question.
     """
     across = light.diameter / instrument.pixel
     donut = across > SMALLEST_DONUT
     fitter = StarFitter(instrument, light, without_bad_pixels(pixels) if donut else pixels, strength, wavefront)
+    if begun is not None and begun.usable is not None and not begun.flags & ~_BESIDE_THE_SEARCH:
+        return _finished(fitter, pixels, begun.usable.solution, begun.sides, sky_level)
     start = fitter.start()
     flags = DonutFlag.OK
     if not start.match.significance >= _FOUND:
@@ -129,6 +136,14 @@ def fit_star(
         return StarFit(DonutFlag.NO_DONUT)
     if fitter.lost_light(start.stamp, best).any_pixel > _LOST:
         return StarFit(DonutFlag.MOSTLY_LOST)
+    return _finished(fitter, pixels, best, sides, sky_level)
+
+
+def _finished(
+    fitter: StarFitter, pixels: Pixels, best: Solution, sides: BothSides | None, sky_level: float | None
+) -> StarFit:
+    """Return the outcome of a fit of all pixels from the solution of a search."""
+    flags = DonutFlag.OK
     finest = fitter.finest(best)
     if (finest.full.used != pixels.used).any():
         flags |= DonutFlag.CLIPPED
@@ -258,19 +273,19 @@ def _both_sides(fitter: StarFitter, start: Start, solution: Solution) -> tuple[B
     shared[: len(noll)] = np.where(even, -1.0, 1.0) * solution.shared[: len(noll)]
     # Far from both sides alike, it does not matter how far, nor that some other cells of the pupil are lit.
     hopeless = solution.loss + _HOPELESS * CONTRADICTED / _loss_scale(solution.loss / count)
-    mirrored = fitter.mirrored_stamp(fitter.instrument.mirrored(fitter.light, exact=False), start)
-    other = fitter.solve(mirrored, star, shared, COARSE, _MIRRORED_STEPS, hopeless)
-    if other.loss < hopeless:
-        mirrored = fitter.stamp(fitter.instrument.mirrored(fitter.light), start.pixels)
-        other = fitter.solve(mirrored, other.stars[0], other.shared, COARSE, _MIRRORED_STEPS, hopeless)
+    stamp = fitter.mirrored_stamp(fitter.instrument.mirrored(fitter.light, exact=False), start)
+    mirrored = fitter.solve(stamp, star, shared, COARSE, _MIRRORED_STEPS, hopeless)
+    if mirrored.loss < hopeless:
+        stamp = fitter.stamp(fitter.instrument.mirrored(fitter.light), start.pixels)
+        mirrored = fitter.solve(stamp, mirrored.stars[0], mirrored.shared, COARSE, _MIRRORED_STEPS, hopeless)
     # What no side explains is in units of what is left.
-    scale = _loss_scale(min(solution.loss, other.loss) / count)
+    scale = _loss_scale(min(solution.loss, mirrored.loss) / count)
     n = len(fitter.instrument.terms.requested)
-    given, turned = (
+    believed_side, mirrored_side = (
         SideFit(scale * side.loss, side.shared[:n], side.shared_covariance[:n, :n] / scale)
-        for side in (solution, other)
+        for side in (solution, mirrored)
     )
-    return BothSides(given, turned, fitter.light.depth), other
+    return BothSides(believed_side, mirrored_side, fitter.light.depth), mirrored
 
 
 def _loss_scale(loss: float) -> float:
@@ -285,8 +300,8 @@ def _other_focus_is_better(fitter: StarFitter, start: Start, solution: Solution,
         return False
     if mirrored is None or misfit > _POOR:
         light = fitter.instrument.mirrored(fitter.light)
-        other = fitter.start_on(start.pixels, fitter.stamp(light, start.pixels))
-        mirrored = fitter.solve(other.stamp, other.unknowns, tolerance=COARSE)
+        mirrored_start = fitter.start_on(start.pixels, fitter.stamp(light, start.pixels))
+        mirrored = fitter.solve(mirrored_start.stamp, mirrored_start.unknowns, tolerance=COARSE)
     return explains_more(mirrored, solution)
 
 

@@ -190,14 +190,14 @@ class ImageGrid:
         Of sharp images that is what a Gaussian with the air's transfer and slope at Nyquist's frequency, the core,
         leaves: it is smooth.
         """
-        whole = self._filter(strength)
-        growth = -5.0 / 3.0 * self._exponent * strength ** (2.0 / 3.0) * whole
+        transfer = self._filter(strength)
+        growth = -5.0 / 3.0 * self._exponent * strength ** (2.0 / 3.0) * transfer
         if self._has_core(strength):
             edge = self._edge(strength)
             core = self._detector * np.exp(-edge / 6.0 * (1.0 + 5.0 * self._square))
-            whole = whole - core
+            transfer = transfer - core
             growth += edge * _EXPONENT_GROWTH / max(strength, 1e-12) / 6.0 * (1.0 + 5.0 * self._square) * core
-        return whole, growth
+        return transfer, growth
 
     def places(self, unknowns: np.ndarray, landing: np.ndarray) -> np.ndarray:
         """Return places (x, y) of light [n, 2] that lands about the chief ray [m], in pixels from the centre."""
@@ -281,8 +281,8 @@ class ImageGrid:
         parts, sharp = [], self._has_core(strength)
         if not sharp or self._edge(strength) > _NO_AIR or light.at_rims is not None:
             thin = sharp and self._edge(strength) < _THIN_AIR and light.at_rims is None
-            few = response[..., :0] if thin and response is not None else response
-            parts.append(self._pixels(self._spectra(unknowns, light, few, rates)))
+            smooth_response = response[..., :0] if thin and response is not None else response
+            parts.append(self._smooth_columns(unknowns, light, smooth_response, rates))
         if sharp:
             parts.append(self._core_columns(unknowns, light, response, rates))
         if len(parts) == 1:
@@ -293,6 +293,19 @@ class ImageGrid:
         n = len(unknowns)
         columns[..., :n] += smooth[..., :n]
         columns[..., columns.shape[-1] - (smooth.shape[-1] - n) :] += smooth[..., n:]
+        return columns
+
+    def _smooth_columns(
+        self, unknowns: np.ndarray, light: LandedLight, response: np.ndarray | None, rates: np.ndarray | None
+    ) -> np.ndarray:
+        """Return :meth:`_columns` without the core of a sharp image."""
+        if response is None or rates is None:
+            return self._pixels(self._spectra(unknowns, light, response, rates)[0])
+        images, beside = (self._pixels(spectra) for spectra in self._spectra(unknowns, light, response, rates))
+        n = len(unknowns)
+        columns = np.zeros((*self.shape, n + images.shape[-1] - 3), dtype=np.float32)
+        columns[..., [FLUX, X, Y]], columns[..., n:] = images[..., :3], images[..., 3:]
+        columns[..., STRENGTH], columns[..., RATIO:n] = beside[..., 0], beside[..., 1:]
         return columns
 
     def _core_columns(
@@ -313,8 +326,7 @@ class ImageGrid:
             if response is None or rates is None:
                 return [star]
             gradient = deposit.gradient(weights[:, 0])
-            ones = np.ones(len(weights), dtype=np.float32)
-            along = gradient @ np.kron(np.eye(2, dtype=np.float32), ones).T
+            along = gradient @ _both_axes(len(weights))
             growth = np.zeros_like(star)
             if strength > 0.0:
                 stronger, wider = self._gaussian((1.0 + _STRONGER) * strength)
@@ -344,24 +356,23 @@ class ImageGrid:
         light: LandedLight,
         response: np.ndarray | None,
         rates: np.ndarray | None,
-    ) -> np.ndarray:
-        """Return spectra of :meth:`_columns`, without the core of a sharp image."""
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return spectra of the star, its derivatives by place, wavefront and rims, and of those by all else."""
         weights = light.weights.astype(np.float32)[:, None]
         splines = self._splines(self.places(unknowns, light.landing), light.spread / self.pixel**2)
-        star = splines.matrix(0, 0)
-        deposits = [star @ weights]
-        if response is not None and rates is not None:
-            along_x, along_y = splines.matrix(1, 0), splines.matrix(0, 1)
-            moved = response.astype(np.float32, copy=False) * (weights / np.float32(self.pixel))
-            deposits += [along_x @ weights, along_y @ weights, along_x @ moved[0] + along_y @ moved[1]]
-            if rates.shape[1]:
-                deposits.append(star @ rates.astype(np.float32))
-        spectra = fft.rfft2(np.concatenate(deposits, axis=1).reshape(*self._size, -1), axes=(0, 1))
-        whole, growth = (v.astype(np.float32)[..., None] for v in self._on_grid(float(unknowns[STRENGTH])))
+        if response is None or rates is None:
+            deposits = splines.matrix(0, 0) @ weights
+        else:
+            moved = response.astype(np.float32, copy=False).reshape(2 * len(weights), -1) / np.float32(self.pixel)
+            along = splines.gradient(weights[:, 0]) @ np.concatenate([_both_axes(len(weights)), moved], axis=1)
+            lit = splines.matrix(0, 0) @ np.concatenate([weights, rates.astype(np.float32)], axis=1)
+            deposits = np.concatenate([lit[:, :1], along, lit[:, 1:]], axis=1)
+        spectra = fft.rfft2(deposits.reshape(*self._size, -1), axes=(0, 1))
+        transfer, growth = (v.astype(np.float32)[..., None] for v in self._on_grid(float(unknowns[STRENGTH])))
         grown = growth * spectra[..., :1]
-        spectra *= whole
+        spectra *= transfer
         if light.at_rims is not None:
-            air_and_detector = whole[..., 0] if self._core is None else self._filter(float(unknowns[STRENGTH]))
+            air_and_detector = transfer[..., 0] if self._core is None else self._filter(float(unknowns[STRENGTH]))
             self._diffract(spectra, grown, unknowns, light.at_rims, air_and_detector)
         extra, all_stars = [], None
         for ratio, *offset in neighbours_of(unknowns):
@@ -372,10 +383,7 @@ class ImageGrid:
             all_stars = (1.0 if all_stars is None else all_stars) + np.float32(ratio) * shift
         if all_stars is not None:
             spectra, grown = spectra * all_stars, grown * all_stars
-        if response is None:
-            return spectra
-        level, slopes = np.zeros_like(grown), np.zeros_like(spectra[..., :2])
-        return np.concatenate([spectra[..., :3], level, grown, slopes, *extra, spectra[..., 3:]], axis=-1)
+        return spectra, np.concatenate([grown, *extra], axis=-1)
 
     def _diffract(
         self, spectra: np.ndarray, grown: np.ndarray, unknowns: np.ndarray, rims: RimsAt, air_and_detector: np.ndarray
@@ -399,6 +407,11 @@ class ImageGrid:
         for axis in (0, 1):
             spectra[light.where, 1 + axis] -= 1j * (light.wave[:, axis] * self.pixel).astype(np.float32) * diffracted
         spectra[light.where, 3 : 3 + rims.response.shape[2]] += slopes * turn[:, None]
+
+
+def _both_axes(count: int) -> np.ndarray:
+    """Return the sums over so many points of what goes along x and along y, shape [2 * count, 2]."""
+    return np.kron(np.eye(2, dtype=np.float32), np.ones((count, 1), dtype=np.float32))
 
 
 def _variance(edge: float) -> float:

@@ -121,13 +121,14 @@ class Linearized:
 
 @dataclass(frozen=True)
 class _Derivatives:
-    """Image of some rays at unknowns of the star, with its derivatives and their scales, and where its light landed."""
+    """Image at unknowns of a star, its derivatives and their scales, where its light lands, and chi-square a pixel."""
 
     rays: LightRays
     unknowns: np.ndarray
     landing: np.ndarray
     weights: np.ndarray
     image: tuple[np.ndarray, np.ndarray, np.ndarray]
+    misfit: float
 
     def holds(self, stamp: Stamp, unknowns: np.ndarray, landing: np.ndarray, weights: np.ndarray) -> bool:
         """Return whether the derivatives are those of light that lands elsewhere, too, but for a few per cent."""
@@ -137,12 +138,13 @@ class _Derivatives:
             return False
         grid, (before, after) = stamp.grid, (self.unknowns[STRENGTH], unknowns[STRENGTH])
         moved = landing - self.landing + grid.pixel / grid.scale * (unknowns[[X, Y]] - self.unknowns[[X, Y]])
-        distance = float(np.sqrt(weights @ (moved**2).sum(axis=1)))
-        looser = _COARSE if grid.coarse else 1.0
+        distance = float(np.sqrt(np.abs(weights) @ (moved**2).sum(axis=1)))
+        # Where residuals are large, their products with what derivatives are off by are, too.
+        looser = (_COARSE if grid.coarse else 1.0) / max(self.misfit, 1.0)
         return bool(
-            distance < looser * (_STILL_SHARP if grid.sharp else _STILL) * grid.pixel
+            distance <= looser * (_STILL_SHARP if grid.sharp else _STILL) * grid.pixel
             and abs(after - before) <= looser * _SAME * before
-            and np.abs(weights - self.weights).sum() < _SAME
+            and np.abs(weights - self.weights).sum() <= looser * _SAME
         )
 
 
@@ -158,7 +160,8 @@ def _derivatives(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> tuple[
     response = stamp.rays.response(wave)
     light = _landed(stamp, wave, landing, response)
     derivatives = stamp.grid.derivatives(unknowns, light, response, stamp.rays.rates)
-    stamp.grid.last = _Derivatives(stamp.rays, unknowns.copy(), landing, weights, derivatives)
+    misfit = float((pulls(stamp, derivatives[0])[stamp.used] ** 2).mean()) if stamp.used.any() else 0.0
+    stamp.grid.last = _Derivatives(stamp.rays, unknowns.copy(), landing, weights, derivatives, misfit)
     return derivatives
 
 

@@ -270,8 +270,11 @@ class PupilShadows:
         outward = np.einsum("nmi,ni->nm", shift[bounds], on_surface)
         return RimLines(points[bounds], along[bounds], across, outward, numbers[bounds])
 
-    def _smooth(self, surface: int) -> tuple[PupilPolynomials, np.ndarray] | None:
-        """Return polynomials of the places of the light on a surface, and these [n, 2]; None where too little does."""
+    def _smooth(self, surface: int) -> tuple[PupilPolynomials, np.ndarray, np.ndarray] | None:
+        """Return polynomials of the places of the light on a surface, their coefficients, and these places [n, 2].
+
+        None where too little of the light meets it.
+        """
         places = self._places(surface, self._ends)
         reached = np.isfinite(places).all(axis=1)
         if reached.sum() < _FEWEST:
@@ -279,7 +282,7 @@ class PupilShadows:
         key = reached.tobytes()
         if key not in self._polynomials:
             self._polynomials[key] = PupilPolynomials(self._survey[reached], self._middle, self._half)
-        return self._polynomials[key], places[reached]
+        return self._polynomials[key], self._polynomials[key].fitted(places[reached]), places[reached]
 
     def _shadows(self, surface: int, numbers: dict[int, int]) -> tuple[np.ndarray, ...]:
         """Return the outlines of some regions of a surface on the pupil, lit or not; each region has a number.
@@ -294,9 +297,9 @@ class PupilShadows:
         polynomials = self._smooth(surface) if numbers else None
         if polynomials is None:
             return empty
-        smooth, places = polynomials
+        smooth, coefficients, places = polynomials
         # A linear map from the surface to the pupil is where the search for the places there begins.
-        center, linear = (values[0] for values in smooth.at(self._middle[None], places))
+        center, linear = (values[0] for values in smooth.sums(self._middle[None], coefficients))
         reach = float(np.hypot(*places.T).max())
         spacing = max(self._cells.side * np.sqrt(abs(float(np.linalg.det(linear)))), 1e-6 * reach)
         rims = [outline(regions[region], spacing, reach) for region in numbers]
@@ -308,10 +311,10 @@ class PupilShadows:
         if not near.any():
             return empty
         begin = (middle[near] - center) @ np.linalg.pinv(linear).T + self._middle
-        points = self._on_pupil(smooth, places, begin, middle[near])
+        points = self._on_pupil(smooth, coefficients, begin, middle[near])
         reached = np.isfinite(points).all(axis=1)
         points, along, motion, number = points[reached], *(v[near][reached] for v in (along, motion, number))
-        slope = np.linalg.inv(smooth.at(points, places)[1])
+        slope = np.linalg.inv(smooth.sums(points, coefficients)[1])
         along = np.einsum("nij,nj->ni", slope, along)
         length = np.hypot(*along.T)
         fine = (length > 0.0) & (length < _LONGEST * self._cells.side)
@@ -330,13 +333,13 @@ class PupilShadows:
         return bool(radii.min() - margin < region.radius < radii.max() + margin)
 
     def _on_pupil(
-        self, smooth: PupilPolynomials, places: np.ndarray, start: np.ndarray, target: np.ndarray
+        self, smooth: PupilPolynomials, coefficients: np.ndarray, start: np.ndarray, target: np.ndarray
     ) -> np.ndarray:
         """Return the points of the pupil whose light meets places on a surface [n, 2], by Newton's steps."""
         points = start
         with np.errstate(all="ignore"):
             for _ in range(_STEPS):
-                values, jacobian = smooth.at(points, places)
+                values, jacobian = smooth.sums(points, coefficients)
                 (xx, xy), (yx, yy) = np.moveaxis(jacobian, 0, -1)
                 x, y = (target - values).T
                 determinant = xx * yy - xy * yx

@@ -55,7 +55,8 @@ class NeighbourSearch:
     stamp : Stamp
         The stamp, with room for light beside it.
     solve : callable
-        Solution from a start: stamp, unknowns of the star, those of the wavefront, tolerance, most steps.
+        Solution from a start: stamp, unknowns of the star, those of the wavefront, tolerance, most steps, and the loss
+        below which it has to be.
     first : ndarray
         Unknowns of the star where its template fits best.
     template : ndarray, shape [ny, nx]
@@ -67,7 +68,7 @@ class NeighbourSearch:
     """
 
     stamp: Stamp
-    solve: Callable[[Stamp, np.ndarray, np.ndarray, float, int], Solution]
+    solve: Callable[..., Solution]
     first: np.ndarray
     template: np.ndarray
     diameter: float
@@ -80,8 +81,10 @@ class NeighbourSearch:
         """
         best = self._pruned(self._extended(single))
         if self._misfit(best) > _MISTAKEN:
-            trial = self._pruned(self._extended(self._from_templates(np.zeros_like(single.shared))))
-            best = trial if trial.loss < best.loss else best
+            templates = self._from_templates(np.zeros_like(single.shared), best.loss)
+            if templates is not None and templates.loss < best.loss:
+                trial = self._pruned(self._extended(templates))
+                best = trial if trial.loss < best.loss else best
         if self._misfit(best) > _POOR:
             best = self._with_near_neighbour(best)
         if len(best.stars[0]) <= RATIO or not explains_more(best, single):
@@ -136,8 +139,11 @@ class NeighbourSearch:
             solution = self.solve(self.stamp, without, solution.shared, COARSE, STEPS)
         return solution
 
-    def _from_templates(self, nothing: np.ndarray) -> Solution:
-        """Return the solution from a start without aberrations, stars where their templates fit best together."""
+    def _from_templates(self, nothing: np.ndarray, hopeless: float) -> Solution | None:
+        """Return the solution from a start without aberrations, stars where their templates fit best together.
+
+        None where there is one alone, from which the first fit began. A `hopeless` loss ends it.
+        """
         stamp, grid = self.stamp, self.stamp.grid
         variance, weight = stamp.variance + np.maximum(stamp.image, 0.0), stamp.used.astype(np.float64)
         planes = [plane.ravel() for plane in plane_basis(stamp.used)]
@@ -154,12 +160,12 @@ class NeighbourSearch:
             fluxes = values[: len(columns)]
             residual = stamp.image - (matrix @ values).reshape(stamp.image.shape)
         kept = np.flatnonzero(fluxes > _LEAST_RATIO * fluxes.max(initial=0.0))
-        star = self.first.copy()
-        if len(kept):
-            main = kept[0]
-            star[FLUX], star[[X, Y]] = max(fluxes[main], 1.0), places[main]
-            others = [(fluxes[k] / star[FLUX], *(places[k] - places[main])) for k in kept[1:]]
-            star = np.concatenate([star, *others])
+        if len(kept) < 2:
+            return None
+        star, main = self.first.copy(), kept[0]
+        star[FLUX], star[[X, Y]] = max(fluxes[main], 1.0), places[main]
+        others = [(fluxes[k] / star[FLUX], *(places[k] - places[main])) for k in kept[1:]]
+        star = np.concatenate([star, *others])
         return self.solve(stamp, star, nothing, COARSE, STEPS)
 
     def _with_near_neighbour(self, best: Solution) -> Solution:
@@ -182,10 +188,10 @@ class NeighbourSearch:
                 ratios = others[:, :1] * best.stars[0][FLUX] / star[FLUX]
                 places = others[:, 1:] + best.stars[0][[X, Y]] - star[[X, Y]]
                 star = np.concatenate([star, [1.0], offset, np.hstack([ratios, places]).ravel()])
-                trials.append(self.solve(self.stamp, star, nothing, COARSE, _FIRST_STEPS))
+                trials.append(self.solve(self.stamp, star, nothing, COARSE, _FIRST_STEPS, best.loss))
         # After a few steps the places that lead nowhere are known.
         for begun in sorted(trials, key=lambda trial: trial.loss)[:_FINISHED]:
-            trial = self._finished(begun)
+            trial = begun if begun.loss > best.loss else self._finished(begun)
             near = trial.stars[0][RATIO]
             if explains_more(trial, best) and near > _LEAST_RATIO:
                 best = trial

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -30,6 +31,8 @@ _ALIKE = 9.0
 _MOST_BODIES = 4
 #: Rims that are tried in vain before the search ends.
 _MOST_FAILURES = 2
+#: Gain of a rim from afar over that which is needed, up to which it is not tried from where the fit has got to.
+_SHORT = 0.8
 #: Times that this is done for each rim in the search, and for the best of them.
 _FIRST_STEPS = 2
 _FINISHED = 2
@@ -54,11 +57,21 @@ class RimFit:
     solution: Solution
 
 
+class RimSolver(Protocol):
+    """Fit of the light of a star with other rims."""
+
+    def __call__(self, light: StarLight, start: Solution, hopeless: float = np.inf) -> RimFit:
+        """Return the best fit from the unknowns of a solution, with zeros for shifts.
+
+        A fit that cannot get below a `hopeless` loss ends after its first step.
+        """
+
+
 def with_moved_rims(
     instrument: Instrument,
     best: RimFit,
     noise: float,
-    solved: Callable[[StarLight, Solution], RimFit],
+    solved: RimSolver,
     first: Solution | None = None,
 ) -> RimFit:
     """Return the fit with rims free that the residuals say stand elsewhere.
@@ -71,8 +84,8 @@ def with_moved_rims(
         Best fit with rims where they are believed to be.
     noise : float
         Loss a pixel that noise alone makes.
-    solved : callable
-        Returns the best fit of light with other rims from the unknowns of a solution, with zeros for shifts.
+    solved : RimSolver
+        Fit of light with other rims.
     first : Solution, optional
         Unknowns from which the best fit began: all rims are then tried from these, since the wavefront of a fit whose
         rims are held has taken up where they stand.
@@ -90,15 +103,21 @@ def with_moved_rims(
         gains = np.where([body.members in moved for body in bodies], 0.0, gains)
         if not gains.max(initial=0.0) > _GAIN + _PROMISING * misfit:
             break
+        limit = best.solution.loss - _PROMISING * threshold
         if first is None:
             likely = gains > _LIKELY * gains.max()
-            trials = _each_freed(instrument, best, list(itertools.compress(bodies, likely)), best.solution, solved)
+            trials = _each_freed(
+                instrument, best, list(itertools.compress(bodies, likely)), best.solution, solved, limit
+            )
         else:
-            trials = _each_freed(instrument, best, bodies, first, solved)
+            trials = _each_freed(instrument, best, bodies, first, solved, limit)
         trial = trials[0]
-        if best.solution.loss - trial.solution.loss < threshold:
+        gain = best.solution.loss - trial.solution.loss
+        if gain < threshold:
             if first is None:
                 failed += itertools.compress(bodies, likely)
+            elif gain < _SHORT * threshold:
+                break
             first = None
             continue
         first, failed = None, []
@@ -117,13 +136,18 @@ def _each_freed(
     fit: RimFit,
     bodies: Sequence[RimBody],
     start: Solution,
-    solved: Callable[[StarLight, Solution], RimFit],
+    solved: RimSolver,
+    limit: float,
 ) -> list[RimFit]:
-    """Return fits with one more of some bodies free, best first: those that lead nowhere end after a few steps."""
+    """Return fits with one more of some bodies free, best first: those that lead nowhere end after a few steps.
+
+    So do those that will not get below a limit of the loss.
+    """
     trials = []
     for body in bodies:
         light = fit.light.with_free_rims(fit.light.free_rims.with_body(body), instrument.middle)
-        trials.append(_settled(instrument, solved(light, start), solved, _FIRST_STEPS))
+        # A rim that stands far off gains little before its shadow is computed where it is first found to stand.
+        trials.append(_settled(instrument, solved(light, start), solved, _FIRST_STEPS, limit))
     trials.sort(key=lambda trial: trial.solution.loss)
     close = [trial for trial in trials if trial.solution.loss < _CLOSE * trials[0].solution.loss]
     finished = [_settled(instrument, trial, solved) for trial in close[:_FINISHED]]
@@ -173,9 +197,12 @@ def rim_gains(instrument: Instrument, fit: RimFit) -> tuple[list[RimBody], np.nd
 
 
 def _settled(
-    instrument: Instrument, best: RimFit, solved: Callable[[StarLight, Solution], RimFit], steps: int = _OUTER
+    instrument: Instrument, best: RimFit, solved: RimSolver, steps: int = _OUTER, hopeless: float = np.inf
 ) -> RimFit:
-    """Return the best fit with the same rims free, their shadows where they are found to stand, after so many steps."""
+    """Return the best fit with the same rims free, their shadows where they are found to stand, after so many steps.
+
+    Steps end where the loss cannot get below a `hopeless` one.
+    """
     first = len(instrument.noll) + 2 * len(best.light.rims)
     factor = 1.0
     for _ in range(steps):
@@ -183,7 +210,9 @@ def _settled(
         if np.all(np.abs(shift) < _SMALL * rims.spreads):
             break
         light = best.light.with_free_rims(rims.moved(shift), instrument.middle)
-        trial = solved(light, best.solution)
+        trial = solved(light, best.solution, hopeless)
+        if trial.solution.loss > hopeless:
+            break
         # Light that a shadow uncovers lies beside the line that stands for it, so that steps may be too long.
         gain = best.solution.loss - trial.solution.loss
         best, factor = (trial, 1.0) if gain > 0.0 else (best, 0.5 * factor)

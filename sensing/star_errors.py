@@ -103,6 +103,8 @@ class StarErrors:
 
 def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
     """Return the errors of a star that was fitted by itself."""
+    if star.errors is not None:
+        return star.errors
     solution, terms = star.solution, instrument.terms
     n_star, n = len(solution.stars[0]), len(terms.requested)
     wavefront = slice(n_star, n_star + n)
@@ -133,6 +135,14 @@ def _most_air(instrument: Instrument, seeing: float) -> float:
     turbulence = instrument.telescope.pupil_diameter * seeing
     radians = _NOLL_FROM_4 * turbulence ** (5.0 / 3.0)
     return radians * (REFERENCE_WAVELENGTH / (2.0 * math.pi * _UNIT)) ** 2 if seeing > 0.0 else math.inf
+
+
+def with_errors(instrument: Instrument, star: StarSolution) -> StarSolution:
+    """Return a star with its errors, its derivatives freed."""
+    star = replace(star, errors=star_errors(instrument, star))
+    star.stamp.forget()
+    star.full.forget()
+    return star
 
 
 def model_floor(zernikes: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,9 +17,12 @@ from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, SLOPE_X, SLOPE_Y, S
 from .light import Instrument, Sampling, StarLight
 from .likelihood import Stamp, model_image, pulls
 from .noise import measured_noise
-from .rim_search import RimFit, with_moved_rims
+from .rim_search import RimFit, RimSolver, with_moved_rims
 from .solve import FINE, STEPS, Group, Solution, solve
 from .stamps import Match, Pixels, match_template, measured_variance
+
+if TYPE_CHECKING:
+    from .star_errors import StarErrors
 
 #: Images wider than this are donuts [pixels].
 SMALLEST_DONUT = 24.0
@@ -58,6 +62,8 @@ class StarSolution:
         Its unknowns.
     model : ndarray
         Best image of all pixels [electrons].
+    errors : StarErrors, optional
+        Errors of the fit by itself, where they are at hand.
     """
 
     light: StarLight
@@ -65,6 +71,7 @@ class StarSolution:
     full: Stamp
     solution: Solution
     model: np.ndarray
+    errors: StarErrors | None = None
 
 
 @dataclass(frozen=True)
@@ -145,7 +152,7 @@ class StarFitter:
         stamp: Stamp,
         best: Solution,
         noise: float,
-        solved: Callable[[StarLight, Solution], RimFit],
+        solved: RimSolver,
         first: np.ndarray | None = None,
     ) -> tuple[StarFitter, Stamp, Solution]:
         """Return the fit with rims free that the residuals say stand elsewhere, with the stamp of its light."""
@@ -153,17 +160,16 @@ class StarFitter:
         fit = with_moved_rims(self.instrument, RimFit(self._light, stamp, best), noise, solved, begun)
         return self if fit.light is self._light else self.with_light(fit.light), fit.stamp, fit.solution
 
-    def rim_solver(
-        self, tolerance: float, stamp_of: Callable[[StarFitter], Stamp]
-    ) -> Callable[[StarLight, Solution], RimFit]:
+    def rim_solver(self, tolerance: float, stamp_of: Callable[[StarFitter], Stamp]) -> RimSolver:
         """Return the function that fits light with its rims elsewhere, from the unknowns of a solution."""
 
-        def solved(light: StarLight, start: Solution) -> RimFit:
+        def solved(light: StarLight, start: Solution, hopeless: float = math.inf) -> RimFit:
             fitter = self.with_light(light)
             moved_stamp = stamp_of(fitter)
             held = len(light.rims) * 2 + len(self.instrument.noll)
             shared = np.concatenate([start.shared[:held], np.zeros(len(light.free_rims))])
-            return RimFit(light, moved_stamp, fitter.solve(moved_stamp, start.stars[0], shared, tolerance))
+            best = fitter.solve(moved_stamp, start.stars[0], shared, tolerance, hopeless=hopeless)
+            return RimFit(light, moved_stamp, best)
 
         return solved
 

@@ -26,7 +26,7 @@ from .inputs import noll_indices, small_length
 from .light import Instrument
 from .likelihood import Stamp, model_image
 from .solve import Group, Solution, solve
-from .star_errors import ErrorParts, air_of_terms, by_residuals, model_floor, star_errors
+from .star_errors import ErrorParts, air_of_terms, by_residuals, model_floor, star_errors, with_errors
 from .star_fitter import StarSolution
 from .terms import WavefrontTerms
 
@@ -133,8 +133,10 @@ class WavefrontFit(ABC):
         return WavefrontTerms.of(noll_indices(self.noll, "noll", 4))
 
     def prepared(self, instrument: Instrument, star: StarFit) -> StarFit:
-        """Return a star that was fitted by itself, made ready for :meth:`solved`."""
-        return star
+        """Return a star that was fitted by itself, made ready for :meth:`solved`: with its errors if it stays alone."""
+        if self.joint or star.usable is None:
+            return star
+        return replace(star, best=with_errors(instrument, star.usable))
 
     def sided(self, instrument: Instrument, stars: Sequence[StarFit], fields: np.ndarray) -> list[StarFit]:
         """Return the stars with flags by the side of focus that they say together, where they are compared."""

@@ -38,7 +38,7 @@ class PupilPolynomials:
             slopes_x[k], slopes_y[k] = (k / self._radius * powers[k - 1] for powers in (powers_x, powers_y))
         return powers_x[p] * powers_y[q], np.stack([slopes_x[p] * powers_y[q], powers_x[p] * slopes_y[q]])
 
-    def _fitted(self, values: np.ndarray) -> np.ndarray:
+    def fitted(self, values: np.ndarray) -> np.ndarray:
         """Return the coefficients of values [n, k], shape [m, k]."""
         right = self._values @ values
         fitted = self._inverse @ right
@@ -47,11 +47,14 @@ class PupilPolynomials:
 
     def derivatives(self, values: np.ndarray) -> np.ndarray:
         """Return the derivatives of values [n, 2] along the pupil at the points, in single precision, [n, 2, 2]."""
-        fitted = self._fitted(values).astype(np.float32)
+        fitted = self.fitted(values).astype(np.float32)
         return np.moveaxis(np.matmul(fitted.T, self._slopes), 0, -1).transpose(1, 0, 2)
 
     def at(self, points: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return values [n, k] at other points [m, 2], shape [m, k], and their derivatives there, [m, k, 2]."""
+        return self.sums(points, self.fitted(values))
+
+    def sums(self, points: np.ndarray, fitted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return values and derivatives as :meth:`at`, from the coefficients of :meth:`fitted`."""
         terms, slopes = self._terms(points)
-        fitted = self._fitted(values)
         return terms.T @ fitted, np.moveaxis(slopes.transpose(0, 2, 1) @ fitted, 0, -1)
