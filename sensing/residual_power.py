@@ -208,8 +208,12 @@ class _Patterns:
             best = min(
                 (minimize(loss, start, method="L-BFGS-B", bounds=bounds) for start in starts), key=lambda b: b.fun
             )
-            count = int(rms_limits is searched) + int(most > 0.0)
-            fits.append((best.fun + count * _WORTH, float(np.exp(2.0 * best.x[0])), float(np.expm1(best.x[1]))))
+            strength, level = float(np.exp(2.0 * best.x[0])), 0.0
+            if most:
+                # What lies far out is part of it.
+                level = max(float((energies - strength * variances).mean()) - 1.0, 0.0)
+            worth = _WORTH * (int(rms_limits is searched) + int(most > 0.0))
+            fits.append((best.fun + worth, strength, level))
         losses, strengths, levels = np.array(fits).T
         weights = np.exp(losses.min() - losses)
         weights /= weights.sum()
