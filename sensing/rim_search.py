@@ -103,7 +103,7 @@ def with_moved_rims(
         gains = np.where([body.members in moved for body in bodies], 0.0, gains)
         if not gains.max(initial=0.0) > _GAIN + _PROMISING * misfit:
             break
-        limit = best.solution.loss - _PROMISING * threshold
+        limit = best.solution.loss
         if first is None:
             likely = gains > _LIKELY * gains.max()
             trials = _each_freed(

@@ -103,7 +103,7 @@ class StarErrors:
 
 def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
     """Return the errors of a star that was fitted by itself."""
-    if star.errors is not None:
+    if isinstance(star.errors, StarErrors):
         return star.errors
     solution, terms = star.solution, instrument.terms
     n_star, n = len(solution.stars[0]), len(terms.requested)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,9 +19,6 @@ from .noise import measured_noise
 from .rim_search import RimFit, RimSolver, with_moved_rims
 from .solve import FINE, STEPS, Group, Solution, solve
 from .stamps import Match, Pixels, match_template, measured_variance
-
-if TYPE_CHECKING:
-    from .star_errors import StarErrors
 
 #: Images wider than this are donuts [pixels].
 SMALLEST_DONUT = 24.0
@@ -63,7 +59,7 @@ class StarSolution:
     model : ndarray
         Best image of all pixels [electrons].
     errors : StarErrors, optional
-        Errors of the fit by itself, where they are at hand.
+        Errors of the fit by itself, of :mod:`.star_errors`, where they are at hand.
     """
 
     light: StarLight
@@ -71,7 +67,7 @@ class StarSolution:
     full: Stamp
     solution: Solution
     model: np.ndarray
-    errors: StarErrors | None = None
+    errors: object = None
 
 
 @dataclass(frozen=True)
