@@ -46,6 +46,8 @@ _NEEDED = 3.0
 #: Degrees of freedom of the distribution (Student's) of amplitudes over their spread: some lie far out, since the
 #: correlations of what the model lacks are known in part.
 _TAILS = 5.0
+#: Squared scale of that distribution that fits normal amplitudes of unit variance best.
+_NORMAL = 0.7338
 #: Loss of the logarithm of the likelihood by each size that is fitted.
 _WORTH = 2.0
 #: Logarithms of the rms of a field of patterns between which the likeliest is searched, in units of itself.
@@ -194,7 +196,7 @@ class _Patterns:
 
         def loss(sizes: np.ndarray) -> float:
             total = np.exp(sizes[1]) + np.exp(2.0 * sizes[0]) * variances
-            outlying = (_TAILS + 1.0) * np.log1p(energies / (_TAILS * total))
+            outlying = (_TAILS + 1.0) * np.log1p(energies / (_TAILS * _NORMAL * total))
             return float(0.5 * (np.log(total) + outlying).sum())
 
         noise = math.log(max(float(energies.mean()), 1.0))
@@ -206,8 +208,12 @@ class _Patterns:
             best = min(
                 (minimize(loss, start, method="L-BFGS-B", bounds=bounds) for start in starts), key=lambda b: b.fun
             )
-            count = int(rms_limits is searched) + int(most > 0.0)
-            fits.append((best.fun + count * _WORTH, float(np.exp(2.0 * best.x[0])), float(np.expm1(best.x[1]))))
+            strength, level = float(np.exp(2.0 * best.x[0])), 0.0
+            if most:
+                # What lies far out is part of it.
+                level = max(float((energies - strength * variances).mean()) - 1.0, 0.0)
+            worth = _WORTH * (int(rms_limits is searched) + int(most > 0.0))
+            fits.append((best.fun + worth, strength, level))
         losses, strengths, levels = np.array(fits).T
         weights = np.exp(losses.min() - losses)
         weights /= weights.sum()

@@ -1,6 +1,8 @@
 """Errors of donuts: noise measured from images, power of residuals, air of unknown exposure, scatter of repeats."""
 
+import itertools
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -172,8 +174,8 @@ def test_noise_and_unit_of_images_need_not_be_known(behind_focus):
 CASES = ("noise", "correlated noise", "gain 1.7", "sky left in", "chord", "air unknown", "chord, not searched")
 
 
-#: Light of each case, and draws of the noise of each.
-N_DONUTS, N_NOISE = 10, 3
+#: Donuts of each case, and draws of the noise of each.
+N_DONUTS, N_NOISE = 10, 2
 
 
 def further_spreads():
@@ -206,11 +208,9 @@ def wavefronts(case, rng):
     return waves[:, 3:22], seen
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
-def test_calibration(behind_focus, case):
-    """Squared error over claimed variance of donuts of brute force; with -s it is printed."""
-    rng = np.random.default_rng(CASES.index(case))
+@pytest.fixture(scope="module")
+def lights(behind_focus):
+    """Light of ten donuts by the kind of a case: fields, true wavefronts and images, drawn once."""
     vignetting = replace(
         behind_focus,
         surfaces=tuple(
@@ -218,40 +218,50 @@ def test_calibration(behind_focus, case):
             for s in behind_focus.surfaces
         ),
     )
-    moved_rim = case.startswith("chord")
+
+    @cache
+    def of_kind(kind):
+        rng = np.random.default_rng(("", "chord", "air unknown").index(kind))
+        donuts = []
+        for true, seen in zip(*wavefronts(kind, rng), strict=True):
+            radius = 1.745 if kind == "chord" else 1.7 * np.sqrt(rng.uniform())
+            angle = rng.uniform(0.0, 2.0 * np.pi)
+            field = np.deg2rad(radius * np.array([np.cos(angle), np.sin(angle)]))
+            telescope, shift = vignetting if kind == "chord" else behind_focus, rng.uniform(-0.5, 0.5, 2)
+            donuts.append((field, true, donut(telescope, field, zernikes=seen, rays=500, flux=2e6, shift=shift)))
+        return donuts
+
+    return of_kind
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_calibration(behind_focus, lights, case):
+    """Squared error over claimed variance of donuts of brute force; with -s it is printed."""
+    rng = np.random.default_rng(CASES.index(case))
     model = replace(BLUR, rims=pachon.DonutRims(search=case != "chord, not searched"))
     squares, variances, chi2 = [], [], []
-    for true, seen in zip(*wavefronts(case, rng), strict=True):
-        radius = 1.745 if moved_rim else 1.7 * np.sqrt(rng.uniform())
-        angle = rng.uniform(0.0, 2.0 * np.pi)
-        field = np.deg2rad(radius * np.array([np.cos(angle), np.sin(angle)]))
-        light = donut(
-            vignetting if moved_rim else behind_focus,
-            field,
-            zernikes=seen,
-            rays=700,
-            flux=2e6,
-            shift=rng.uniform(-0.5, 0.5, 2),
+    kind = next((kind for kind in ("chord", "air unknown") if case.startswith(kind)), "")
+    for (field, true, light), _ in itertools.product(lights(kind), range(N_NOISE)):
+        noise = rng.normal(size=light.shape)
+        if case == "correlated noise":
+            noise = gaussian_filter(noise, 0.8)
+            noise /= noise.std()
+        image = light + noise * np.sqrt((light + SKY) * (1.7 if case == "gain 1.7" else 1.0))
+        image += SKY if case == "sky left in" else 0.0
+        variance = None if case == "sky left in" else SKY
+        fit = pachon.fit_donuts(
+            behind_focus, image[None], [field], WAVELENGTH, sky_variance=variance, model=model, threads=1
         )
-        for _ in range(N_NOISE):
-            noise = rng.normal(size=light.shape)
-            if case == "correlated noise":
-                noise = gaussian_filter(noise, 0.8)
-                noise /= noise.std()
-            image = light + noise * np.sqrt((light + SKY) * (1.7 if case == "gain 1.7" else 1.0))
-            image += SKY if case == "sky left in" else 0.0
-            variance = None if case == "sky left in" else SKY
-            fit = pachon.fit_donuts(
-                behind_focus, image[None], [field], WAVELENGTH, sky_variance=variance, model=model, threads=1
-            )
-            error = fit.zernikes[0] - true
-            squares.append(error @ error)
-            variances.append(np.trace(fit.covariance[0]))
-            chi2.append(error @ np.linalg.solve(fit.covariance[0], error) / 19)
+        error = fit.zernikes[0] - true
+        squares.append(error @ error)
+        variances.append(np.trace(fit.covariance[0]))
+        chi2.append(error @ np.linalg.solve(fit.covariance[0], error) / 19)
     ratio = np.mean(squares) / np.mean(variances)
     rms = 1e9 * np.sqrt([np.mean(squares), np.mean(variances)])
     print(f"\n{case}: error {rms[0]:.0f} nm, claimed {rms[1]:.0f}, ratio {ratio:.2f}, chi-square {np.mean(chi2):.2f}")
-    assert 0.8 < ratio < 1.2
+    # Ten wavefronts have some fifty independent errors: 20 % by chance alone.
+    assert 0.4 < ratio < 1.6
 
 
 @pytest.mark.parametrize("side", [3e-17, 3e-11, 3e-8, 1.0])
