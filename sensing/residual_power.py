@@ -43,11 +43,6 @@ _LIGHT_LENGTH = 0.35
 _SIGNIFICANT = 3.0
 #: The same that a further field must explain.
 _NEEDED = 3.0
-#: Degrees of freedom of the distribution (Student's) of amplitudes over their spread: some lie far out, since the
-#: correlations of what the model lacks are known in part.
-_TAILS = 5.0
-#: Squared scale of that distribution that fits normal amplitudes of unit variance best.
-_NORMAL = 0.7338
 #: Loss of the logarithm of the likelihood by each size that is fitted.
 _WORTH = 2.0
 #: Logarithms of the rms of a field of patterns between which the likeliest is searched, in units of itself.
@@ -196,8 +191,7 @@ class _Patterns:
 
         def loss(sizes: np.ndarray) -> float:
             total = np.exp(sizes[1]) + np.exp(2.0 * sizes[0]) * variances
-            outlying = (_TAILS + 1.0) * np.log1p(energies / (_TAILS * _NORMAL * total))
-            return float(0.5 * (np.log(total) + outlying).sum())
+            return float(0.5 * (np.log(total) + energies / total).sum())
 
         noise = math.log(max(float(energies.mean()), 1.0))
         none, searched = (_RMS_LIMITS[0], _RMS_LIMITS[0]), _RMS_LIMITS

@@ -117,7 +117,8 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
         residuals = power.covariance
         lacking += residuals[:n_star, :n_star]
         figure = beside.figure(photons)[wavefront, wavefront]
-        strength = min(power.strength, _most_air(instrument, float(solution.stars[0][STRENGTH])))
+        known_air = instrument.model.air.atmosphere is not None
+        strength = 0.0 if known_air else min(power.strength, _most_air(instrument, float(solution.stars[0][STRENGTH])))
         if strength > 0.0:
             speckles, turbulence = (strength * values for values in beside.air(photons))
             lacking, air = lacking + speckles[:n_star, :n_star], air + turbulence[wavefront, wavefront]
