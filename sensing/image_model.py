@@ -35,7 +35,7 @@ NEIGHBOUR = ("ratio", "offset_x", "offset_y")
 MOST_NEIGHBOURS = 5
 FLUX, X, Y, BACKGROUND, STRENGTH, SLOPE_X, SLOPE_Y, RATIO = range(8)
 #: Power of the strength of the turbulence that the exponent of its transfer function goes by.
-EXPONENT_GROWTH = 5.0 / 3.0
+_EXPONENT_GROWTH = 5.0 / 3.0
 #: Relative step of the difference that the core follows the strength of the turbulence by.
 _STRONGER = 1e-2
 #: Exponent of the air at Nyquist's frequency beyond which an image has no core.
@@ -196,7 +196,7 @@ class ImageGrid:
             edge = self._edge(strength)
             core = self._detector * np.exp(-edge / 6.0 * (1.0 + 5.0 * self._square))
             transfer = transfer - core
-            growth += edge * EXPONENT_GROWTH / max(strength, 1e-12) / 6.0 * (1.0 + 5.0 * self._square) * core
+            growth += edge * _EXPONENT_GROWTH / max(strength, 1e-12) / 6.0 * (1.0 + 5.0 * self._square) * core
         return transfer, growth
 
     def places(self, unknowns: np.ndarray, landing: np.ndarray) -> np.ndarray:

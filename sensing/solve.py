@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from .image_model import EXPONENT_GROWTH, FLUX, STRENGTH, neighbours_of
+from .image_model import FLUX, STRENGTH, neighbours_of
 from .likelihood import NormalEquations, Stamp, normal_equations
 
 #: A step that is to lower twice the negative logarithm of the likelihood by less, per unit of chi-square a pixel, is
@@ -132,7 +132,7 @@ def solve(
         normalized[np.diag_indices_from(normalized)] = 1.0 + damping
         step[free] = _solved(normalized, state.gradient[free] / scale) / scale
         predicted = float(state.gradient @ step)
-        trial = _bounded(_stepped(joined, step, sizes), sizes, held)
+        trial = _bounded(joined + step, sizes, held)
         if predicted < tolerance * max(1.0, state.loss / pixels):
             joined, converged = trial, True
             break
@@ -223,18 +223,6 @@ def _pressed(joined: np.ndarray, gradient: np.ndarray, sizes: list[int]) -> np.n
         at = first + STRENGTH
         pressed[at] = joined[at] <= _LEAST_STRENGTH and gradient[at] < 0.0
     return pressed
-
-
-def _stepped(joined: np.ndarray, step: np.ndarray, sizes: list[int]) -> np.ndarray:
-    """Return unknowns after a step, that of the turbulence taken in the power of its strength that images go by."""
-    trial = joined + step
-    for first in np.cumsum([0, *sizes[:-1]]):
-        at = first + STRENGTH
-        strength, change = joined[at], step[at]
-        if change != 0.0 and strength > 0.0:
-            power = strength**EXPONENT_GROWTH * (1.0 + EXPONENT_GROWTH * change / strength)
-            trial[at] = max(power, 0.0) ** (1.0 / EXPONENT_GROWTH)
-    return trial
 
 
 def _bounded(joined: np.ndarray, sizes: list[int], held: np.ndarray) -> np.ndarray:

@@ -75,12 +75,16 @@ class WavefrontTerms:
         return np.concatenate([self.requested, self.further])
 
     def spreads_beyond(self, noll: np.ndarray) -> np.ndarray:
-        """Return the rms of terms that are not fitted [m], less with each degree beyond those that are."""
+        """Return the rms of terms that are not fitted [m].
+
+        Beyond Z22, of which telescopes have as much as of any before, it falls with each degree beyond those fitted.
+        """
         highest = _highest_degrees(self.every)
         # Azimuthal orders beyond those asked for have the degrees of the largest of these.
         largest = {m % 2: highest[m] for m in sorted(highest, key=abs)}
         degrees = [noll_to_nm(int(j)) for j in noll]
         steps = np.array([(n - highest.get(m, largest.get(m % 2, abs(m)))) / 2 for n, m in degrees])
+        steps = np.where(np.asarray(noll) <= _LOW_TERMS, 0.0, np.maximum(steps, 0.0))
         return self.higher_order * _FALL**steps
 
 
