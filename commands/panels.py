@@ -22,6 +22,7 @@ def sort_into_panels(app: typer.Typer) -> None:
     panel_of = {name: panel for panel, names in PANELS.items() for name in names.split()}
     for group in app.registered_groups:
         if group.typer_instance is not None:
-            commands = (*group.typer_instance.registered_commands, *group.typer_instance.registered_groups)
-            for command in commands:
+            for command in group.typer_instance.registered_commands:
                 command.rich_help_panel = panel_of[str(command.name)]
+            for inner in group.typer_instance.registered_groups:
+                inner.rich_help_panel = panel_of[str(inner.name)]

@@ -304,8 +304,9 @@ def test_too_little_memory_is_one_line(capsys, monkeypatch):
 @pytest.mark.long
 def test_ctrl_c_ends_with_130_and_resume_goes_on(finished_run, settings_file, tmp_path):
     folder = tmp_path / "out"
-    # Eighteen CCDs: plenty of time between the first product and the last.
-    command = [sys.executable, "-c", "import sys; from pachon.commands.cli import main; sys.exit(main())"]
+    # Eighteen CCDs, each exposed by itself: plenty of time between the first product and the last.
+    alone = "from pachon.pipeline.simulate import ccd_loop; ccd_loop._STARS_TOGETHER = 1"
+    command = [sys.executable, "-c", f"import sys; {alone}; from pachon.commands.cli import main; sys.exit(main())"]
     arguments = ["run", str(settings_file), "--out", str(folder), "--ccds", "R22,R23", "--threads", "1"]
     with subprocess.Popen([*command, *arguments], stderr=subprocess.PIPE, text=True) as process:
         deadline = time.monotonic() + 120.0

@@ -128,7 +128,7 @@ def outcome(function, arguments):
         with bounded(MEMORY_OF_CALL, SECONDS), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             result = function(**arguments)
-            spoilt = {name for name, array in numbers_of(result) if not np.isfinite(array).all()}
+            spoilt = {name or "result" for name, array in numbers_of(result) if not np.isfinite(array).all()}
             return "finite", inspect.getdoc(type(result)) or "", spoilt, flags_of(result)
     except PachonError as error:
         text = str(error)
