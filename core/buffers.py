@@ -33,7 +33,11 @@ def _mapped(count: int) -> np.ndarray:
     """
     if count < _HUGE_PAGE or not hasattr(mmap, "MADV_HUGEPAGE"):
         return np.empty(count, dtype=np.uint8)
-    pages = mmap.mmap(-1, count + _HUGE_PAGE)
+    try:
+        pages = mmap.mmap(-1, count + _HUGE_PAGE)
+    except OSError:
+        # Too little memory is NumPy's to say.
+        return np.empty(count, dtype=np.uint8)
     with suppress(OSError):  # a kernel without huge pages
         pages.madvise(mmap.MADV_HUGEPAGE)
     memory = np.frombuffer(pages, dtype=np.uint8)

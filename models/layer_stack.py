@@ -30,6 +30,8 @@ _HIGHEST_INDEX = 100.0
 _LOWEST_INDEX = 1e-3
 #: Vacuum wavelengths of stacks of films [m]: X-rays to radio waves.
 _WAVELENGTHS = (1e-12, 1.0)
+#: Cosine of the angle of incidence below which nothing is transmitted.
+_GRAZING = 1e-100
 #: Rounding of the cosines of rays beyond 1.
 _ROUNDING = 1e-9
 
@@ -153,7 +155,7 @@ class LayerStack:
 
     @check_arguments
     def efficiency(self, wavelength: float, cosine: ArrayLike, n1: float, n2: float) -> np.ndarray:
-        """Return the transmission of unpolarised light, 0 where reflection is total.
+        """Return the transmission of unpolarised light, 0 where reflection is total, NaN where the cosine is.
 
         Parameters
         ----------
@@ -172,6 +174,8 @@ class LayerStack:
         require_within(wavelength, "wavelength", *_WAVELENGTHS, "metres")
         first = cosines_at(cosine, n1, n2).astype(np.complex128)
         order = 1 if n1 <= n2 else -1
+        grazing = np.abs(first) < _GRAZING
+        first[grazing] = 1.0
         films = list(zip(self.indices, self.thicknesses, strict=True))[::order]
         # Beyond the angle of total reflection cosines are imaginary.
         behind, *inside = (np.sqrt(1.0 - (n1 / n) ** 2 * (1.0 - first**2)) for n in (n2, *(n for n, _ in films)))
@@ -187,4 +191,4 @@ class LayerStack:
                     1j * admittance * np.sin(phase) * b + np.cos(phase) * c,
                 )
             transmission += 0.5 * 4.0 * entry.real * end.real / np.abs(entry * b + c) ** 2
-        return transmission
+        return np.where(grazing, 0.0, transmission)

@@ -37,6 +37,10 @@ COOLEST = 2000.0
 HOTTEST = 50000.0
 #: Second radiation constant, h c / k [m K].
 _RADIATION = 1.438776877e-2
+#: Shortest wavelength of a spectrum [m].
+_SHORTEST = 1e-9
+#: Longest wavelength of a spectrum [m].
+_LONGEST = 1e-3
 _STEPS = 400
 
 
@@ -128,8 +132,8 @@ def effective_colour(wavelengths: ArrayLike, photons: ArrayLike, kind: str = "wa
     """
     check_choice("kind", kind, KINDS)
     waves = np.atleast_1d(metres(wavelengths, "wavelengths"))
-    if waves.ndim != 1 or not (np.isfinite(waves) & (waves > 0.0)).all():
-        raise DomainError("wavelengths: expected one or more positive lengths in metres")
+    if waves.ndim != 1 or not ((waves >= _SHORTEST) & (waves <= _LONGEST)).all():
+        raise DomainError(f"wavelengths: expected one or more lengths of {_SHORTEST:g} to {_LONGEST:g} m")
     spectra = np.atleast_2d(pure_numbers(photons, "photons"))
     if spectra.ndim != 2 or spectra.shape[1] != len(waves):
         raise DomainError(f"photons have shape {np.shape(photons)}: expected [{len(waves)}] or [n, {len(waves)}]")

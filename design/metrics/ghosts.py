@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 _RAYS_PER_CELL = 40
 #: Least number of rays of a star.
 _LEAST_RAYS = 400
+#: Most rays of a ghost: a gigabyte.
+_MOST_RAYS = 400_000
 #: Rays of a star in the first trace, which finds the brightest ghosts.
 _FIRST_RAYS = 4000
 #: Rays of a ghost below which its area, and so its irradiance, is unknown.
@@ -263,7 +265,7 @@ def ghosts(
     DomainError
         If a number is out of range, no surface can make a ghost, or the star itself does not reach the detector.
     """
-    n_pupil = require_count(n_pupil, "n_pupil", _LEAST_RAYS)
+    n_pupil = require_count(n_pupil, "n_pupil", _LEAST_RAYS, _MOST_RAYS)
     brightest = None if brightest is None else require_count(brightest, "brightest", 1)
     star_field: Any = None if field is None else [field]
     request = Request.of(

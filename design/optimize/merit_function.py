@@ -9,10 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.errors import ConfigError, check_choice, shown
+from ...core.errors import ConfigError, DomainError, check_choice, shown
 from ...models.telescope import Telescope
 from ..metrics.spots import REFERENCES, spot_diagram
 from .merit import Beams, Merit, SpotMerit, WavefrontMerit
+
+#: Most rays of a goal: beyond, an array shows one number very often.
+_MOST_RAYS = 10**9
 
 
 @runtime_checkable
@@ -81,6 +84,13 @@ class WavefrontError:
     name: ClassVar[str] = "wavefront"
 
     goal: ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        if self.goal is not None and (np.ndim(self.goal) != 3 or np.size(self.goal) > _MOST_RAYS):
+            raise DomainError(
+                f"goal has shape {np.shape(self.goal)}: expected [n_field, n_wave, n_pupil], at most {_MOST_RAYS} rays",
+                key="goal",
+            )
 
     @property
     def of_one_telescope(self) -> bool:

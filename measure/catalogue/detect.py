@@ -35,6 +35,8 @@ _FWHM_SIDE = 25
 _FWHM_BATCH = 2048
 # Room of SEP for pixels above the threshold, as a fraction of the image: its own does not grow with one.
 _PIXEL_ROOM = 0.2
+#: Most levels of brightness by which blends are taken apart: SEP goes through all of them for every object.
+_MOST_LEVELS = 1024
 # Room of SEP for pieces of one blend.
 _PIECES = 8192
 
@@ -126,8 +128,8 @@ def _sep_options(
 ) -> dict[str, Any]:
     """Return the arguments of SEP's extraction."""
     options: dict[str, Any] = {"thresh": require_positive(threshold, "threshold", "standard deviations")}
-    for name, value in (("min_area", min_area), ("deblend_levels", deblend_levels)):
-        require_count(value, name, 1, 2**31 - 1)
+    require_count(min_area, "min_area", 1, 2**31 - 1)
+    require_count(deblend_levels, "deblend_levels", 1, _MOST_LEVELS)
     if not 0.0 <= deblend_contrast <= 1.0:
         raise DomainError(f"deblend_contrast = {deblend_contrast}: expected a number from 0 to 1")
     if kernel is not None:

@@ -37,13 +37,13 @@ from ...core.point_plots import draw_shapes
 from ...core.random_streams import stream
 from ...core.result import Result
 from ...core.threads import one_blas_thread, thread_count
-from ...core.units import positive_angle, real_array, require_positive, require_seed, require_within
+from ...core.units import positive_angle, real_array, require_positive, require_seed
 from ..catalogue.pixel_checks import check_pixels
 from .estimator import CONSTANT, LEAST_SIDE, checked_psfs, smooth_step
 from .functionals import FUNCTIONALS, Frequencies, noise_covariance, psf_frequencies, renoising, weight_transforms
 from .noise import CorrelatedNoise, noise_power
 from .shear_shapes import ShearShapes
-from .weight import weight_sigma
+from .weight import weight_width
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,8 +54,6 @@ CELL = 256
 # Least pixels around a cell to which the weights divided by the PSF reach, and to half of which the covariance of the
 # noise is summed.
 _MARGIN = 32
-#: Widths of the weight that are measured with [pixels].
-_WIDTHS = (0.1, 100.0)
 # Neighbours (dx, dy) in the order of a rotation by 90 degrees.
 _NEIGHBOURS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 # Half of the range of v/(M0 + C) in which the weight rises, times the square of the width of the weight [pixel^2]. Of a
@@ -188,7 +186,7 @@ def detect_shear(
     pixels, _, ignored = check_pixels(image, 1.0, mask)
     psfs = checked_psfs(psf_images)
     scale = positive_angle(pixel_scale, "pixel_scale")
-    width = require_within(weight_sigma(sigma, psfs, scale) / scale, "sigma / pixel_scale", *_WIDTHS, "pixels")
+    width = weight_width(sigma, psfs, scale)
     if not isinstance(noise, CorrelatedNoise):
         require_positive(noise, "noise")
     limit = require_positive(min_snr, "min_snr")

@@ -20,7 +20,7 @@ from .functionals import FUNCTIONALS, noise_covariance, psf_frequencies, renoisi
 from .noise import CorrelatedNoise, noise_power
 from .shear_kernels import deconvolved_functionals, weight_values
 from .shear_shapes import ShearShapes
-from .weight import weight_sigma
+from .weight import weight_width
 
 #: C of e = M1/(M0 + C), in standard errors of M0: keeps noise of faint galaxies from dividing by zero.
 CONSTANT = 4.0
@@ -92,7 +92,7 @@ class ShearEstimator:
     ) -> None:
         psfs = checked_psfs(psf_images)
         scale = positive_angle(pixel_scale, "pixel_scale")
-        width = weight_sigma(sigma, psfs, scale) / scale
+        width = weight_width(sigma, psfs, scale)
         require_side(require_count(side, "side", 1, MOST_SIDE), width)
         self._side = int(side)
         self._frequencies, inverse = psf_frequencies(psfs, self._side, width)

@@ -28,7 +28,7 @@ class SigmaClipping:
     Parameters
     ----------
     sigma : float
-        Pixels that deviate by more standard deviations are rejected (:func:`find_outliers`).
+        Pixels that deviate by more standard deviations are rejected (:func:`find_outliers`); none where it is infinite.
     max_iterations : int
         Most passes of the rejection.
     replacement : str

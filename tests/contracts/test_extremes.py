@@ -34,8 +34,12 @@ SIZES = (0.0, 5e-324, *(10.0**-power for power in reversed(POWERS)), *(10.0**pow
 COUNTS = (0, -1, 2**15, -(2**15), 10**6, 2**31, -(2**31), 2**32, 2**63 - 1, -(2**63))
 #: Factors of the valid value.
 FACTORS = (1e-12, 1e-9, 1e-6, 1e-3, -1.0, 1e3, 1e6, 1e9, 1e12)
-#: Values that make sense, of which the call takes many seconds: all glasses of a catalogue.
-ENDURING = {("choose_glasses", "nearest", f"{count}") for count in (2**15, 10**6)}
+#: Values that make sense, of which the call takes many seconds: all glasses of a catalogue, a hundred square degrees.
+ENDURING = {
+    ("choose_glasses", "nearest", f"{2**15}"),
+    ("choose_glasses", "nearest", f"{10**6}"),
+    ("draw_galaxies", "region", "times 1000"),
+}
 #: Depth to which results are searched.
 DEPTH = 4
 #: Words in the names of attributes that say which results hold.

@@ -150,9 +150,10 @@ class Atmosphere(LayerScreens):
             raise DomainError(f"ground_lift = {ground_lift!r}: expected a height of 0 m or more")
         height = line_of_sight(np.array(site.altitudes), ground_lift, zenith)
         exposure = require_positive(exposure, "exposure", "seconds")
-        steps = max(1, math.ceil(exposure / require_positive(time_step, "time_step", "seconds") - 1e-9))
-        if steps > _MOST_STEPS:
+        ratio = exposure / require_positive(time_step, "time_step", "seconds")
+        if ratio > _MOST_STEPS:
             raise DomainError(f"time_step = {time_step!r}: expected at most {_MOST_STEPS} steps in {exposure:g} s")
+        steps = max(1, math.ceil(ratio - 1e-9))
         speed, length = np.array(site.wind_speeds), float(screens.screen_length)
         check_drift(height, speed, exposure, length)
         direction = wind_directions(site, seed, epoch)

@@ -19,7 +19,7 @@ from ...core.errors import ConfigError, DomainError
 from ...core.launch import launch
 from ...core.point_plots import draw_shapes
 from ...core.result import Result
-from ...core.units import ARCSEC, field_label, positive_angle
+from ...core.units import ARCSEC, angle, field_label, require_within
 from ...core.warp_arrays import warp_array
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
@@ -48,6 +48,8 @@ WEIGHT_FWHM_ALONE = 0.3 * ARCSEC
 #: Side of the periodic image over the rms width of the weight, and over the FWHM of the seeing, at least.
 _WEIGHTS = 16.0
 _SEEINGS = 8.0
+#: Narrowest and widest FWHM of the weight [rad].
+_WEIGHT_FWHMS = (0.02 * ARCSEC, 20.0 * ARCSEC)
 #: Width of the narrowest weight over that of the first: it decides which frequencies count.
 _NARROWEST = 0.5
 # Pixels of a stamp that is wider than any star.
@@ -168,7 +170,8 @@ def psf_moments(
             key="engine",
         )
     default = WEIGHT_FWHM_ALONE if atmosphere is None else WEIGHT_FWHM
-    fwhm = default if weight_fwhm is None else positive_angle(weight_fwhm, "weight_fwhm")
+    fwhm = angle(default if weight_fwhm is None else weight_fwhm, "weight_fwhm")
+    require_within(fwhm, "weight_fwhm", *_WEIGHT_FWHMS, "radians")
     inputs, stars = psf_inputs(
         telescope, fields, wavelengths, focal_plane, atmosphere, aberration, stamps or Stamps(), threads
     )
