@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+#: Most stars on a sensor: all of them are traced together.
+_MOST = 100_000
 # Least distance of stars from the rims of a sensor [m]: donuts are 0.6 mm wide to either side.
 _MARGIN = 2e-3
 
@@ -113,10 +115,10 @@ def corner_stars(
     ConfigError
         If the kind or the heights are unknown.
     DomainError
-        If ``n`` is not a whole number of at least 1, the wavelength is not positive, or a sensor lies outside the
+        If ``n`` is not a whole number from 1 to 100 000, the wavelength is not positive, or a sensor lies outside the
         field of the telescope.
     """
-    n = require_count(n, "n", 1)
+    n = require_count(n, "n", 1, _MOST)
     light = telescope.default_wavelength if wavelength is None else length(wavelength, "wavelength")
     plane = corner_focal_plane(kind, heights)
     camera = plane.camera
