@@ -154,7 +154,7 @@ FINE = {
 }
 
 
-#: Values that make sense, of which the call takes many seconds: a whole report.
+#: Values that make sense, of which the call takes seconds: a whole report, images without sky.
 LONG = {("design_report", "fields", "zero"), ("check_orientation", "sky_variance", "zero")}
 
 
