@@ -38,6 +38,19 @@ def test_import_is_silent_and_loads_no_warp():
 
 
 @pytest.mark.long
+def test_a_model_of_own_stars_is_silent(tmp_path):
+    """The first array of Warp, of whatever part, must not start it with its warning that there is no CUDA driver."""
+    code = (
+        "import numpy as np, pachon; rng = np.random.default_rng(1); y, x = np.mgrid[-8:9, -8:9];"
+        "stars = 1e4 * np.exp(-(x * x + y * y) / 8.0) + rng.normal(size=(12, 17, 17));"
+        "print(pachon.PsfModel.fit(stars, rng.uniform(0.0, 1.0, (12, 2))))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stderr == ""
+    assert done.returncode == 0
+
+
+@pytest.mark.long
 def test_tracing_is_silent():
     code = (
         "import pachon; t = pachon.load_telescope('lsst_v3.3_r');"
