@@ -55,7 +55,7 @@ def open_fits(
 
 
 def unpacked_bytes(path: Path, data: bytes, error: type[PachonError]) -> bytes:
-    """Return the content of a FITS file, unpacked within the limits of :func:`open_fits` where it is compressed."""
+    """Return the content of a file, unpacked within the limits of :func:`open_fits` where it is compressed."""
     stream = _unpacked(path, io.BytesIO(data), error)
     return data if stream is None else stream.getvalue()
 

@@ -13,7 +13,7 @@ from ..core.errors import ConfigError, PachonError, error_context
 from ..core.products import Card
 from ..models.camera.camera import Camera
 from ..models.io.bundled import BUNDLED
-from ..sky.visit_list.read_list import READOUT
+from ..sky.visit_list.read_list import half_of_visit
 from ..sky.visit_list.visit_list import ListedVisit, VisitList
 from .config import Configuration, ListedVisitConfig, PointingConfig, configuration_of
 from .experiment import Experiment
@@ -137,7 +137,7 @@ def visit_cards(experiment: Experiment, ccd: str) -> list[Card]:
     if visit is None:
         return []
     exposure = experiment.config.atmosphere.exposure_s
-    start = visit.mid_mjd - 0.5 * (exposure + READOUT * (visit.snaps - 1)) / _SECONDS_A_DAY
+    start = visit.mid_mjd - float(half_of_visit(exposure, visit.snaps))
     pointing = resolved_value(experiment.config.pointing)
     altitude = 0.5 * math.pi - math.radians(experiment.config.atmosphere.zenith_angle_deg)
     return [

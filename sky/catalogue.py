@@ -25,7 +25,7 @@ from .imsim_galaxies import (
     galaxies_of_sky_catalogue,
     is_instance_catalogue,
 )
-from .pointing import Pointing
+from .pointing import tangent_plane
 
 #: Kinds of the files that are written, by their endings.
 FORMATS = {".ecsv": "ECSV", ".fits": "FITS", ".fit": "FITS", ".parquet": "Parquet"}
@@ -149,32 +149,6 @@ def write_galaxies(path: str | Path, galaxies: Galaxies) -> None:
         write_bytes(path, data.getvalue())
 
 
-def tangent_plane(ra: Any, dec: Any, pointing: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Project positions on the plane that touches the sky at the pointing.
-
-    Parameters
-    ----------
-    ra, dec : ndarray or Quantity
-        Right ascensions and declinations [rad].
-    pointing : (float, float) or Quantity
-        Those of the pointing [rad].
-
-    Returns
-    -------
-    xi, eta : ndarray
-        Gnomonic coordinates towards east and north [rad] (Calabretta & Greisen 2002, sec. 5.1.3).
-
-    Raises
-    ------
-    DomainError
-        If a position is 90 degrees or more from the pointing.
-    """
-    sky = Pointing.of(pointing).from_celestial(ra, dec)
-    if not np.isfinite(sky).all():
-        raise DomainError("ra, dec: expected positions within 90 deg of the pointing")
-    return sky[..., 0], sky[..., 1]
-
-
 def _column_values(
     columns: dict[str, Column | np.ndarray], name: str, unit: u.UnitBase | None = None, default: float | None = None
 ) -> np.ndarray:
@@ -209,8 +183,6 @@ def _from_catalogue(columns: dict[str, Column | np.ndarray], pointing: Any, conv
         xi, eta = (_column_values(columns, name, u.rad) for name in ("xi", "eta"))
     elif "ra" in columns or "dec" in columns:
         ra, dec = (_column_values(columns, name, u.deg) for name in ("ra", "dec"))
-        if pointing is None:
-            raise DomainError("ra, dec: expected pointing=(right ascension, declination)", key="pointing")
         xi, eta = tangent_plane(ra, dec, pointing)
     else:
         column_names = ", ".join(columns) or "none"

@@ -6,7 +6,6 @@ sqrt(a b). Lensing is GalSim's: a reduced shear gamma/(1 - kappa), and radii lar
 
 from __future__ import annotations
 
-import gzip
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,11 +14,12 @@ import numpy as np
 
 from ..core.errors import DomainError, ProductError, error_context
 from ..core.files import parsing, read_bytes
+from ..core.fits_files import unpacked_bytes
 from ..core.table_files import read_columns
 from ..core.units import ARCSEC
 from ..models.camera.photometry import BANDS, LSST
 from .galaxies import Galaxies
-from .pointing import Pointing
+from .pointing import tangent_plane
 from .sersic import GREATEST_INDEX, LEAST_INDEX
 
 #: Columns by which a table is known as one of skyCatalogs.
@@ -58,7 +58,7 @@ def galaxies_of_sky_catalogue(columns: Mapping[str, Any], path: Path, pointing: 
     flux = _fluxes(columns, path, band)
     rows = np.flatnonzero(flux > 0.0)
     bulge = _bulge_fraction(columns, len(flux))
-    xi, eta = _tangent_plane(np.deg2rad(number["ra"][rows]), np.deg2rad(number["dec"][rows]), pointing)
+    xi, eta = tangent_plane(np.deg2rad(number["ra"][rows]), np.deg2rad(number["dec"][rows]), pointing)
     shear = number["shear_1"] + 1j * number["shear_2"], number["convergence"]
     parts: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
     for name in _COMPONENTS:
@@ -137,7 +137,7 @@ def galaxies_of_instance_catalogue(path: Path, pointing: Any) -> Galaxies:
     ellipticity = (1.0 - ratio) / (1.0 + ratio) * np.exp(2j * (0.5 * np.pi - np.deg2rad(angle)))
     # phosim's shear has the other sign of gamma2.
     radius, e = _lensed(np.sqrt(a * b) * ARCSEC, ellipticity, gamma1 - 1j * gamma2, kappa)
-    xi, eta = _tangent_plane(np.deg2rad(ra), np.deg2rad(dec), pointing)
+    xi, eta = tangent_plane(np.deg2rad(ra), np.deg2rad(dec), pointing)
     magnified = magnitude - 2.5 * np.log10(_magnification(gamma1 - 1j * gamma2, kappa))
     sersic = np.where(knots > 0.0, 1.0, np.clip(index, LEAST_INDEX, GREATEST_INDEX))
     return Galaxies.single(xi, eta, magnified, radius, e1=e.real, e2=-e.imag, sersic=sersic)
@@ -153,16 +153,6 @@ def _lensed(
 
 def _magnification(gamma: np.ndarray, kappa: np.ndarray) -> np.ndarray:
     return np.asarray(1.0 / ((1.0 - kappa) ** 2 - np.abs(gamma) ** 2))
-
-
-def _tangent_plane(ra: np.ndarray, dec: np.ndarray, pointing: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return xi and eta of positions [rad]; DomainError without a pointing, or far from it."""
-    if pointing is None:
-        raise DomainError("ra, dec: expected pointing=(right ascension, declination)", key="pointing")
-    sky = Pointing.of(pointing).from_celestial(ra, dec)
-    if not np.isfinite(sky).all():
-        raise DomainError("ra, dec: expected positions within 90 deg of the pointing")
-    return sky[..., 0], sky[..., 1]
 
 
 def _numbers(columns: Mapping[str, Any], name: str) -> np.ndarray:
@@ -218,7 +208,7 @@ def _object_lines(path: Path, opened: frozenset[Path]) -> Iterator[tuple[Path, i
         raise ProductError("includes itself", file=path)
     data = read_bytes(path, ProductError)
     with parsing(path, "damaged or no text", ProductError):
-        text = (gzip.decompress(data) if path.suffix == ".gz" else data).decode()
+        text = unpacked_bytes(path, data, ProductError).decode()
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if words[:1] == ["includeobj"] and len(words) == 2:

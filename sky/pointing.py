@@ -121,3 +121,31 @@ def _angle_pairs(values: ArrayLike, name: str) -> np.ndarray:
     if pairs.ndim != 2 or pairs.shape[1] != 2:
         raise DomainError(f"{name} has shape {np.shape(values)}: expected [n, 2]")
     return pairs
+
+
+def tangent_plane(ra: Any, dec: Any, pointing: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Project positions on the plane that touches the sky at the pointing.
+
+    Parameters
+    ----------
+    ra, dec : ndarray or Quantity
+        Right ascensions and declinations [rad].
+    pointing : (float, float) or Quantity, optional
+        Those of the pointing [rad].
+
+    Returns
+    -------
+    xi, eta : ndarray
+        Gnomonic coordinates towards east and north [rad] (Calabretta & Greisen 2002, sec. 5.1.3).
+
+    Raises
+    ------
+    DomainError
+        If there is no pointing, or a position is 90 degrees or more from it.
+    """
+    if pointing is None:
+        raise DomainError("ra, dec: expected pointing=(right ascension, declination)", key="pointing")
+    sky = Pointing.of(pointing).from_celestial(ra, dec)
+    if not np.isfinite(sky).all():
+        raise DomainError("ra, dec: expected positions within 90 deg of the pointing")
+    return sky[..., 0], sky[..., 1]

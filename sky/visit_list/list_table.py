@@ -17,7 +17,6 @@ from urllib.parse import quote
 import numpy as np
 
 from ...core.errors import ConfigError, ProductError, cut_short, unknown_name
-from ...core.files import read_bytes
 from ...core.table_files import ENDINGS, read_columns
 from .names import HEADER_WORDS
 
@@ -26,7 +25,8 @@ _TABLES = ("observations", "summaryallprops", "summary", "visit1", "visits")
 _SQLITE = b"SQLite format 3\x00"
 #: Rows that are fetched at once.
 _ROWS = 10_000
-#: Lines before which the header of an instance catalogue must end.
+#: Bytes and lines before which the header of an instance catalogue must end: its objects may be gigabytes.
+_HEADER_BYTES = 1 << 16
 _HEADER_LINES = 1000
 # What an expression may do: read the columns of the table, and call functions.
 _ALLOWED = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION)
@@ -109,7 +109,8 @@ def read_header(path: Path) -> dict[str, np.ndarray]:
     endings = ", ".join(ENDINGS)
     problem = f"no list of visits: expected a database of SQLite, a table ({endings}), or an instance catalogue"
     header: dict[str, np.ndarray] = {}
-    lines = read_bytes(path, ProductError, max_bytes=None)[: 1 << 16].decode("utf-8", "replace").splitlines()
+    with path.open("rb") as file:
+        lines = file.read(_HEADER_BYTES).decode("utf-8", "replace").splitlines()
     for number, line in enumerate(lines[:_HEADER_LINES], start=1):
         words = line.split()
         if not words or words[0].startswith("#"):

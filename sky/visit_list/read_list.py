@@ -10,14 +10,15 @@ import numpy as np
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, check_choice, error_context
+from ...core.statistics import FWHM_PER_RMS
 from ...core.units import ARCSEC
 from ...models.io.site_file import load_site
 from .list_columns import ListColumns
 from .list_table import open_list
 from .rotation import rotator_angles
-from .seeing import MONITOR_WIDTH, WAVELENGTH, fried_parameter
+from .seeing import MONITOR_WIDTH, WAVELENGTH, fried_parameter, is_allowed
 from .sky_angles import Location, SkyAngles, location_of, sky_angles
-from .visit_list import VisitList
+from .visit_list import VisitList, night_dates
 
 #: Laws by which seeing grows away from the zenith.
 AIRMASS_LAWS = ("von_karman", "opsim")
@@ -33,7 +34,6 @@ _FIRST_DATE = 10_000_000
 _BANDS = "ugrizy"
 # Angle of an LSST pixel, in which ConsDB has widths [rad].
 _CONSDB_PIXEL = 0.2 * ARCSEC
-_FWHM_PER_RMS = 2.0 * np.sqrt(2.0 * np.log(2.0))
 _SECONDS_A_DAY = 86400.0
 
 
@@ -182,7 +182,12 @@ def _midpoints(columns: ListColumns, exposure: np.ndarray, snaps: np.ndarray) ->
     days = columns.complete(key, lambda day: (day > 0.0) & (day < 1e6), "a modified Julian date")
     if key == "midpoint":
         return days
-    return days + 0.5 * (exposure + READOUT * (snaps - 1)) / _SECONDS_A_DAY
+    return days + half_of_visit(exposure, snaps)
+
+
+def half_of_visit(exposure: float | np.ndarray, snaps: int | np.ndarray) -> np.ndarray:
+    """Return the time from the start of a visit to its middle [d], of the time [s] and number of its snaps."""
+    return np.asarray(0.5 * (exposure + READOUT * (snaps - 1)) / _SECONDS_A_DAY)
 
 
 def _bands(columns: ListColumns) -> np.ndarray:
@@ -228,7 +233,7 @@ def _selection(columns: ListColumns, band: str | None, night: int | None) -> np.
     days = columns.numbers(columns.require("midpoint", "start"))
     # Half an exposure at noon does not matter.
     with np.errstate(invalid="ignore"):
-        dates = np.datetime64("1858-11-17") + np.floor(np.nan_to_num(days) - 0.5).astype("timedelta64[D]")
+        dates = night_dates(np.nan_to_num(days))
     text = str(night)
     try:
         date = np.datetime64(f"{text[:4]}-{text[4:6]}-{text[6:]}")
@@ -281,27 +286,14 @@ def _fried_parameters(
         return MONITOR_WIDTH * WAVELENGTH / seeing
     if key == "psf_seeing":
         columns.remarks.append(f"{columns.source[key]} has the telescope in it, which is then in twice")
-        seeing = seeing * (_CONSDB_PIXEL * _FWHM_PER_RMS)
+        seeing = seeing * (_CONSDB_PIXEL * FWHM_PER_RMS)
     if np.median(seeing) > 30.0 * ARCSEC or np.median(seeing) < 0.02 * ARCSEC:
         raise DomainError(f"column {columns.source[key]}: expected widths in arcsec", key=columns.source[key])
     growth = (1.0 / np.sin(altitude)) ** 0.6 if airmass_law == "opsim" else np.ones(len(columns))
     try:
         along_sight = fried_parameter(seeing * growth, outer_scale)
     except DomainError as error:
-        wrong = _unallowed(seeing * growth, outer_scale)
+        wrong = np.flatnonzero(~is_allowed(seeing * growth, outer_scale))
         value, _, expected = error.problem.partition(": expected ")
         raise columns.visit_error(wrong, value, expected, columns.source[key]) from None
     return along_sight * growth
-
-
-def _unallowed(seeing: np.ndarray, outer_scale: np.ndarray) -> np.ndarray:
-    """Return the visits whose seeing the outer scale does not allow."""
-
-    def fails(width: float, scale: float) -> bool:
-        try:
-            fried_parameter(np.array([width]), np.array([scale]))
-        except DomainError:
-            return True
-        return False
-
-    return np.flatnonzero([fails(width, scale) for width, scale in zip(seeing, outer_scale, strict=True)])

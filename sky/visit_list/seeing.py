@@ -30,16 +30,22 @@ def seeing_width(r0: np.ndarray, outer_scale: np.ndarray) -> np.ndarray:
     return np.asarray(KOLMOGOROV_WIDTH * WAVELENGTH / r0 * np.sqrt(np.maximum(1.0 - loss, 0.0)))
 
 
+def is_allowed(fwhm: np.ndarray, outer_scale: np.ndarray) -> np.ndarray:
+    """Return whether turbulence with an outer scale [m] can have a seeing at 500 nm [rad]."""
+    least = seeing_width(LARGEST_RATIO * outer_scale, outer_scale)
+    return np.asarray((fwhm >= least) & (fwhm < seeing_width(np.array(_SMALLEST), outer_scale)))
+
+
 def fried_parameter(fwhm: np.ndarray, outer_scale: np.ndarray) -> np.ndarray:
     """Return the Fried parameters at 500 nm [m] of seeing at 500 nm [rad], shape [n]: :func:`seeing_width` solved.
 
     DomainError if a seeing is better than the outer scale allows.
     """
     fwhm, outer_scale = np.broadcast_arrays(np.asarray(fwhm, dtype=np.float64), outer_scale)
+    wrong = np.flatnonzero(~is_allowed(fwhm, outer_scale))
     high = LARGEST_RATIO * outer_scale
-    least = seeing_width(high, outer_scale)
-    wrong = np.flatnonzero(~((fwhm >= least) & (fwhm < seeing_width(np.array(_SMALLEST), outer_scale))))
     if wrong.size:
+        least = seeing_width(high, outer_scale)
         raise DomainError(
             f"seeing = {fwhm[wrong[0]] / ARCSEC:.3g} arcsec: expected at least {least[wrong[0]] / ARCSEC:.3g} arcsec "
             f"with an outer scale of {outer_scale[wrong[0]]:g} m (r0 at most a twentieth of it, Tokovinin 2002)"

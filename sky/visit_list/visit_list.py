@@ -20,6 +20,11 @@ if TYPE_CHECKING:
 DAY_START = 0.5
 
 
+def night_dates(mjd: np.ndarray) -> np.ndarray:
+    """Return the dates of the nights of times [MJD, TAI], as NumPy has dates."""
+    return np.asarray(np.datetime64("1858-11-17") + np.floor(mjd - DAY_START).astype("timedelta64[D]"))
+
+
 @dataclass(frozen=True)
 class ListedVisit:
     """One visit of a list; NaN where the list leaves a number open.
@@ -188,8 +193,7 @@ class VisitList(Result):
     @property
     def day_obs(self) -> np.ndarray:
         """Night of each visit, as a number YYYYMMDD: the date of TAI less twelve hours."""
-        days = np.datetime64("1858-11-17") + np.floor(self.midpoint - DAY_START).astype("timedelta64[D]")
-        return np.array([int(str(day).replace("-", "")) for day in days], dtype=np.int64)
+        return np.array([int(str(date).replace("-", "")) for date in night_dates(self.midpoint)], dtype=np.int64)
 
     @property
     def digest(self) -> str:

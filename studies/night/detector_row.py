@@ -11,8 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...core.statistics import FWHM_PER_RMS, finite_median, rms
 from ...core.units import ARCSEC
 from ...measure.adaptive_moments import adaptive_moments
+from ...measure.rho_statistics import trace_of_moments
 from ...models.camera.camera import Camera
 from ...models.camera.photometry import BANDS
 from ...pipeline.experiment import Experiment
@@ -58,11 +60,10 @@ MODEL_COLUMNS = tuple(name for name in COLUMNS if name.startswith(("nPsfStar", "
 #: Geometric FWHM of nominal seeing [arcsec] by band, for effTime (SMTN-002, table 2).
 _NOMINAL_FWHM = {"u": 0.81, "g": 0.77, "r": 0.73, "i": 0.71, "z": 0.69, "y": 0.68}
 #: S/N of the limiting magnitude.
-_LIMIT_SNR = 5.0
+LIMIT_SNR = 5.0
 #: AB magnitude of 1 nJy.
-_NANOJANSKY = 31.4
-_FWHM_PER_RMS = 2.0 * math.sqrt(2.0 * math.log(2.0))
-#: Standard deviation of a normal distribution over its median absolute deviation.
+NANOJANSKY = 31.4
+#: Standard deviation of a normal distribution over its median absolute deviation, to the digits that LSST's has.
 _NORMAL_MAD = 1.4826022185056018
 
 
@@ -91,7 +92,7 @@ def moments_along_pixels(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Ixx, Iyy, Ixy along the pixels of a CCD of shapes along the axes of the focal plane."""
     square = g1**2 + g2**2
-    mean = sigma**2 * (1.0 + square) / (1.0 - square)
+    mean = 0.5 * trace_of_moments(sigma, g1, g2)
     e1, e2 = 2.0 * g1 / (1.0 + square), 2.0 * g2 / (1.0 + square)
     tensor = np.array([[mean * (1.0 + e1), mean * e2], [mean * e2, mean * (1.0 - e1)]])
     axes = camera.along_pixels(ccd, np.eye(2)).T  # columns: x and y of the focal plane along the pixels
@@ -105,7 +106,7 @@ def noise_columns(experiment: Experiment, lit_fraction: float) -> dict[str, floa
     sky = sky_electrons_per_pixel(band, seconds)
     variance = sky + instrument_noise(band, seconds) ** 2
     zero_point = band.zero_point + 2.5 * math.log10(seconds * lit_fraction / band.gain)
-    nanojansky = 10.0 ** (0.4 * (_NANOJANSKY - zero_point))  # of 1 adu
+    nanojansky = 10.0 ** (0.4 * (NANOJANSKY - zero_point))  # of 1 adu
     return {
         "skyBg": sky / band.gain,
         "skyNoise": math.sqrt(variance) / band.gain,
@@ -118,14 +119,14 @@ def limiting_magnitude(experiment: Experiment, area: float, sky: float, zero_poi
     """Return the magnitude of S/N 5 by effective area [pixel^2], sky [adu] and zero point (SMTN-002)."""
     band = experiment.band
     background = (sky * band.gain + band.read_noise**2) * area  # electrons
-    counts = 0.5 * _LIMIT_SNR**2 + math.sqrt(0.25 * _LIMIT_SNR**4 + _LIMIT_SNR**2 * background)
+    counts = 0.5 * LIMIT_SNR**2 + math.sqrt(0.25 * LIMIT_SNR**4 + LIMIT_SNR**2 * background)
     return zero_point - 2.5 * math.log10(counts / band.gain)
 
 
 def effective_time(experiment: Experiment, sigma: float, sky: float, zero_point: float, airmass: float) -> float:
     """Return the effective exposure time [s] by rms width [pixel], sky [adu] and zero point."""
     band, seconds = experiment.band, experiment.config.atmosphere.exposure_s
-    nominal_sigma = _NOMINAL_FWHM[band.name] / _FWHM_PER_RMS / (band.pixel_scale / ARCSEC)
+    nominal_sigma = _NOMINAL_FWHM[band.name] / FWHM_PER_RMS / (band.pixel_scale / ARCSEC)
     # The configuration of a visit has the extinction of its airmass in both.
     extinction = band.extinction / airmass
     nominal_zero_point = band.zero_point + extinction * (airmass - 1.0) - 2.5 * math.log10(band.gain)
@@ -155,13 +156,8 @@ def model_columns(experiment: Experiment, product: CcdProduct | None) -> dict[st
 
     columns: dict[str, float] = {"nPsfStar": float(stars.used.sum())}
     for name, values in zip(("E1", "E2", "Size"), differences(stars, stars.used), strict=True):
-        finite = values[np.isfinite(values)]
-        median = float(np.median(finite)) if len(finite) else math.nan
-        columns[f"psfStarDelta{name}Median"] = median
-        columns[f"psfStarDelta{name}Scatter"] = (
-            float(_NORMAL_MAD * np.median(np.abs(finite - median))) if len(finite) else math.nan
-        )
+        columns[f"psfStarDelta{name}Median"] = median = finite_median(values)
+        columns[f"psfStarDelta{name}Scatter"] = _NORMAL_MAD * finite_median(np.abs(values - median))
     for name, values in zip(("E1", "E2", "Size"), differences(places, np.arange(len(places.sigma))), strict=True):
-        finite = values[np.isfinite(values)]
-        columns[f"modelDelta{name}Rms"] = float(np.sqrt(np.mean(finite**2))) if len(finite) else math.nan
+        columns[f"modelDelta{name}Rms"] = rms(values)
     return columns

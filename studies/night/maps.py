@@ -12,14 +12,11 @@ import numpy as np
 
 from ...core.files import write_bytes
 from ...core.products import Stamp
+from .detector_row import LIMIT_SNR, NANOJANSKY
 from .visit_product import VisitProduct
 
 #: Resolution of the coverage of a map, that of LSST's.
 _COVERAGE = 32
-#: S/N of the limiting magnitude of the stack.
-_LIMIT_SNR = 5.0
-#: AB magnitude of 1 nJy.
-_NANOJANSKY = 31.4
 #: Sums that are kept of each pixel.
 _SUMS = ("time", "count", "weight", "sigma", "g1", "g2", "area", "midpoint")
 
@@ -39,11 +36,6 @@ class NightMaps:
 
     nside: int
     bands: dict[str, BandSums] = field(default_factory=dict)
-
-    @classmethod
-    def empty(cls, nside: int) -> NightMaps:
-        """Return the maps of no visit."""
-        return cls(nside)
 
     def add(self, product: VisitProduct) -> None:
         """Add the pixels of a visit, with the weights, times and epochs of their CCDs."""
@@ -86,7 +78,7 @@ def _quantities(band: BandSums, nside: int) -> dict[str, tuple[Any, str]]:
     at = {name: _values(sums, index) for name, sums in band.sums.items()}
     area = at["area"] / at["weight"]
     # The noise of a PSF's flux: the stack has the sum of the inverse variances.
-    limit = _NANOJANSKY - 2.5 * np.log10(_LIMIT_SNR * np.sqrt(area / at["weight"]))
+    limit = NANOJANSKY - 2.5 * np.log10(LIMIT_SNR * np.sqrt(area / at["weight"]))
     columns = {
         "exposure_time_consolidated_map_sum": (at["time"], "s"),
         "n_exposure_consolidated_map_sum": (at["count"], ""),

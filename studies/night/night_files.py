@@ -11,6 +11,7 @@ import numpy as np
 
 from ...core.files import write_bytes, write_json
 from ...core.products import Columns, Stamp, write_ecsv
+from ...core.statistics import rms
 from ...pipeline.experiment import Experiment
 from ...pipeline.listed_visit import instrument_of
 from ...pipeline.run_folder import SUMMARY_NAME
@@ -56,7 +57,7 @@ def write_night(
     tables: list[dict[str, np.ndarray]] = []
     left_out: dict[int, str] = {}
     left_out_ccds: dict[str, dict[str, str]] = {}
-    maps = NightMaps.empty(config.maps.nside) if config.maps.nside else None
+    maps = NightMaps(config.maps.nside) if config.maps.nside else None
     count = 0
     for product in products:
         count += 1
@@ -153,6 +154,6 @@ def _band_metrics(columns: dict[str, np.ndarray]) -> dict[str, dict[str, float]]
         for name in ("modelDeltaE1Rms", "modelDeltaE2Rms", "modelDeltaSizeRms"):
             values = columns[name][rows_of_band]
             if np.isfinite(values).any():
-                numbers[f"rms_{name.removesuffix('Rms')}"] = float(np.sqrt(np.nanmean(values**2)))
+                numbers[f"rms_{name.removesuffix('Rms')}"] = rms(values)
         metrics[band] = numbers
     return metrics

@@ -5,6 +5,7 @@ import gzip
 import numpy as np
 import pytest
 
+from pachon.core import fits_files
 from pachon.core.errors import DomainError, ProductError
 from pachon.core.units import ARCSEC
 from pachon.sky.catalogue import read_galaxies
@@ -132,3 +133,12 @@ def test_instance_catalogues_that_cannot_be(instance_catalogue, tmp_path):
     (tmp_path / "short.txt").write_text("object 7 53.01 -27.81 21.5 sed 0.3 0 0 0 0 0 sersic2d 0.9\n")
     with pytest.raises(ProductError, match="line 1"):
         read_galaxies(tmp_path / "short.txt", pointing=POINTING)
+
+
+def test_a_catalogue_that_unpacks_to_far_more_is_refused(tmp_path, monkeypatch):
+    """A few bytes can stand for gigabytes: the limit is that of all compressed files."""
+    monkeypatch.setattr(fits_files, "_UNPACKED", 2**20)
+    path = tmp_path / "gal.txt.gz"
+    path.write_bytes(gzip.compress(b"# nothing\n" * 400_000))
+    with pytest.raises(ProductError, match=r"gal\.txt\.gz: compressed file of .* unpacks to more than 1\.0 MB"):
+        read_galaxies(path, pointing=POINTING)

@@ -1,4 +1,4 @@
-"""Kernels of the statistics of exposures: products of slope covariances, and transforms of the mean wavefront."""
+"""Kernel of the statistics of exposures: products of slope covariances."""
 
 from __future__ import annotations
 
