@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError, ProductError
+from ...core.errors import DomainError, ProductError, error_context
 from ...core.files import make_folder, write_bytes, write_json
 from ...core.long_work import Execution
 from ...core.products import Stamp, column, read_fits, table_hdu, write_fits
@@ -84,7 +84,8 @@ def null_test(
     if not (folder / CONFIG_NAME).exists():
         raise ProductError(f"{folder}: no visits (no {CONFIG_NAME}); expected the folder of pachon visits")
     config = load_visits_configuration(folder / CONFIG_NAME)
-    experiment = config.experiment()
+    with error_context(file=folder / CONFIG_NAME):
+        experiment = config.experiment()
     frame = StackFrame.of(experiment, STACK_STAMP)
     cell, scale = cell_of(experiment, frame), pixel_scale_of(frame)
     seed = experiment.config.seed

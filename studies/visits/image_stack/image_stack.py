@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ....core.errors import ConfigError, ProductError
+from ....core.errors import ConfigError, ProductError, error_context
 from ....core.products import Stamp
 from ....imaging.exposure import Exposure
 from ....imaging.image_file import CcdImage
@@ -82,7 +82,9 @@ class ImageStack:
         visits = load_visits_configuration(visits_folder / CONFIG_NAME)
         if visits.visits.from_list is not None:
             raise ProductError(f"{visits_folder} has visits of a list: expected visits of one sky and time")
-        experiment, folder = visits.experiment(), visits_folder / FOLDER_NAME
+        with error_context(file=visits_folder / CONFIG_NAME):
+            experiment = visits.experiment()
+        folder = visits_folder / FOLDER_NAME
         before = _settings_before(folder)
         if settings is None and before is None:
             raise ProductError(f"{visits_folder}: no images; expected the folder of pachon stack-images")

@@ -290,3 +290,13 @@ def test_a_tile_with_numbers_that_are_not_finite_is_refused(tmp_path):
                 read_shapes(path, stamp)
         else:
             np.testing.assert_array_equal(read_shapes(path, stamp).usable, usable)
+
+
+@pytest.mark.parametrize("command", ["null-test", "stack-images"])
+def test_a_damaged_configuration_of_the_visits_is_named(tmp_path, capsys, command):
+    """A bit of a word that changed: the file is as valid as before, and what it says is not."""
+    path = tmp_path / "config.yaml"
+    path.write_text("run: {atmosphere: {site: gerro_pachon}}\n")
+    assert main([command, str(tmp_path), "--quiet"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"pachon: error: {path}: run: unknown site 'gerro_pachon'")
