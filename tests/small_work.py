@@ -259,6 +259,7 @@ WORK = {
                     products="*_galaxies.fits"),
     "null-test": Work(f"null-test {{out}} --tiles 1 --rings 10 {ON_ONE}", _write_visits, start="visits",
                       products="galaxies/*.fits"),
+    "visits": Work(f"visits {{here}}/visits.yaml --out {{out}} {ON_ONE}", _write(visits=VISITS)),
     "stack-images": Work(f"stack-images {{out}} --side 256 --faintest 24 --no-measure {ON_ONE}", _write_visits,
                          start="visits"),
     "shim": Work(

@@ -13,8 +13,8 @@ from ...core.progress import Reporter
 from ...measure.correlation import Correlation
 from ...pipeline.config import Configuration, digest, with_options
 from ...pipeline.experiment import Experiment
-from ...pipeline.run import REPORT_NAME, run
-from ...pipeline.run_folder import finished_ccds, stamp_of
+from ...pipeline.run import run
+from ...pipeline.run_folder import stamp_of
 from ...pipeline.summary import correlations, run_metrics
 from ...reconstruction.ccd_product import CcdProduct, product_path, read_product
 from ..visits.config import VisitsConfig
@@ -192,7 +192,7 @@ class Bench:
 
     @cached_property
     def pipeline(self) -> PipelineRun:
-        """Run of the pipeline: read from its folder, after a run where CCDs or the report are missing."""
+        """Run of the pipeline, which goes on from what its folder has."""
         folder = self.folder / "run"
         options = {
             "ccds": self.scale.ccds,
@@ -205,9 +205,8 @@ class Bench:
         }
         experiment = Experiment.from_config(with_options(Configuration(), **options))
         names = experiment.config.ccds or ()
-        # A run that was killed may have all CCDs, but no report, which it writes last.
-        if len(finished_ccds(folder, experiment)) < len(names) or not (folder / REPORT_NAME).exists():
-            run(experiment.config, folder, strict=True, execution=self._resumed)
+        # What is whole stays; a run that was killed, or whose files are damaged, is made whole.
+        run(experiment.config, folder, strict=True, execution=self._resumed)
         stamp = stamp_of(experiment)
         products = [read_product(product_path(folder, name), stamp, holdout_images=False) for name in names]
         correlated = correlations(products)
