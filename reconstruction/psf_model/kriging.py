@@ -7,7 +7,7 @@ the ellipticity and the size. The pixels follow these numbers, and vary by what 
 (:mod:`~.psf_model.pixel_fields`). The noise of a star is that of its outer pixels and of its photons.
 
 Nothing is left to choose: on constant, linear and quadratic fields this comes near to the best of the polynomials, with
-the best weights, and on turbulent ones it is better (docs/psf_models.md).
+the best weights, and on turbulent ones it is better (docs/howto/psf_models.md).
 """
 
 from __future__ import annotations
