@@ -120,3 +120,12 @@ def test_every_page_is_in_the_index():
     folders = "|".join(FOLDERS)
     listed = re.findall(rf"<((?:{folders})/(?!api_|commands)\w+)>$", INDEX, flags=re.M)
     assert sorted(listed) == sorted(path.relative_to(DOCS).with_suffix("").as_posix() for path in PATHS.values())
+
+
+@pytest.mark.parametrize("name", [name for name, path in PATHS.items() if path.parent.name != "evidence"])
+def test_sentences_are_short(name):
+    text = re.sub(r"```.*?```", "", PAGES[name], flags=re.S)
+    # Code, tables, headings and pictures are no sentences.
+    text = "\n".join(line for line in text.splitlines() if not re.match(r"^( {4}|\||#|!\[)", line))
+    sentences = re.split(r"(?<=[.!?])\s+|\n\s*\n|\n[*-] ", text)
+    assert [s for s in sentences if len(re.findall(r"[A-Za-z][\w'-]*", s)) > 35] == []
