@@ -172,7 +172,9 @@ def picture_kind(picture: Path | None) -> str:
 
 def check_table(table: Path | None) -> None:
     """Check the ending of a table's name, before anything is computed."""
+    if table is None:
+        return
     from ..core.table_files import FORMATS
 
-    if table is not None and table.suffix.lower() not in FORMATS:
+    if table.suffix.lower() not in FORMATS:
         raise ConfigError(f"--table = {table}: expected a name that ends in {', '.join(FORMATS)}")
