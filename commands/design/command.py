@@ -185,9 +185,8 @@ def design_command(
                 raise error if option is None else error.renamed(f"--{option.replace('_', '-')}") from None
             outcome = result if isinstance(result, Outcome) else Outcome(result)
             path = picture or Path(f"{outcome.stem or f'{name}_{shared.stem}'}.png")
-            if no_picture or (as_json and picture is None):
-                path = None
-            _deliver(outcome, outcome.table or rows, path, kind, table, as_json)
+            drawn = not no_picture and (picture is not None or not as_json)
+            _deliver(outcome, outcome.table or rows, path if drawn else None, kind, table, as_json)
 
         # Typer reads the options of a command from its signature.
         command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
