@@ -409,7 +409,7 @@ def _area_above(fine: np.ndarray, level: float) -> float:
     inside = fine > level
     # No slope is steeper than the largest differences: most pixels are neither border nor in need of a gradient.
     steepest = [float(np.abs(np.diff(fine, axis=axis)).max()) for axis in (0, 1)]
-    rows, columns = np.nonzero(np.abs(fine - level) <= 0.5 * np.hypot(*steepest))
+    rows, columns = np.nonzero(np.abs(fine - level) <= 0.5 * np.hypot(steepest[0], steepest[1]))
     gy = _difference_along(fine, rows, columns, 0)
     gx = _difference_along(fine, rows, columns, 1)
     slope, height = np.hypot(gx, gy), fine[rows, columns] - level
