@@ -195,6 +195,9 @@ def _parameter_check(function: Callable[..., Any], name: str) -> _Check | None:
 def _annotation_check(kind: Any) -> _Check | None:
     """Return the check of an annotation; None where any value will do."""
     origin = get_origin(kind) or kind
+    # From NumPy 2.5 on Python 3.12 these are aliases (PEP 695), before it the types that the aliases stand for.
+    if kind == ArrayLike:
+        return _real_array
     if origin in (Union, types.UnionType):
         arms = list(get_args(kind))
         if str in arms and any(arm is Path or get_origin(arm) is os.PathLike for arm in arms):
@@ -213,7 +216,7 @@ def _annotation_check(kind: Any) -> _Check | None:
         return _mapping_check(get_args(kind))
     if origin in _PLAIN_CLASSES:
         return _class_check(*_PLAIN_CLASSES[origin])
-    if origin is np.ndarray:
+    if origin is np.ndarray or origin is NDArray:
         return _boolean_array if kind == NDArray[np.bool_] else _unitless_array
     if origin is Path:
         return lambda name, value: Path(_valid_path(name, value))

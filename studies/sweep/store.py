@@ -102,10 +102,15 @@ class SweepStore:
         self.path, self.kind = path, kind
         with self.sqlite_errors():
             self._connection = sqlite3.connect(path, timeout=30.0)
-            about = dict(self._connection.execute("SELECT key, value FROM about"))
-        if about.get("format") != str(FORMAT):
-            reason = "; those of 1 name the CCDs of the LSST as in a mirror (docs/howto/camera.md): make it again"
-            raise ProductError(f"store of format {about.get('format')}: expected {FORMAT}{reason}", file=path)
+        try:
+            with self.sqlite_errors():
+                about = dict(self._connection.execute("SELECT key, value FROM about"))
+            if about.get("format") != str(FORMAT):
+                reason = "; those of 1 name the CCDs of the LSST as in a mirror (docs/howto/camera.md): make it again"
+                raise ProductError(f"store of format {about.get('format')}: expected {FORMAT}{reason}", file=path)
+        except PachonError:
+            self._connection.close()
+            raise
         self.about = about
 
     def __enter__(self) -> SweepStore:

@@ -75,7 +75,7 @@ def test_masks_are_boolean_or_ones_and_zeros():
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
-        ("number", True, "a number"), ("number", np.timedelta64(1), "a number"), ("number", 1 * u.m, "a number"),
+        ("number", True, "a number"), ("number", np.timedelta64(1, "s"), "a number"), ("number", 1 * u.m, "a number"),
         ("number", "1", "a number"), ("count", 1.0, "a whole number"), ("values", "abc", "real numbers"),
         ("values", [True, False], "real numbers"), ("values", np.array([1 + 1j]), "real numbers"),
         ("values", np.array(["2026-01-01"], dtype="M8[D]"), "real numbers"), ("values", [[1.0], [1.0, 2.0]], "real"),

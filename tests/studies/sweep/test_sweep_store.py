@@ -1,5 +1,6 @@
 import json
 import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -70,7 +71,8 @@ def test_stores_that_are_none_are_refused(tmp_path):
     (tmp_path / "text.db").write_text("this is no database, but long enough to be taken for one" * 50)
     with pytest.raises(ProductError, match="damaged, or no store of a sweep"):
         SweepStore(tmp_path / "text.db")
-    sqlite3.connect(tmp_path / "empty.db").execute("CREATE TABLE t (x)")
+    with closing(sqlite3.connect(tmp_path / "empty.db")) as connection:
+        connection.execute("CREATE TABLE t (x)")
     with pytest.raises(ProductError, match="damaged, or no store of a sweep"):
         SweepStore(tmp_path / "empty.db")
 
