@@ -66,6 +66,8 @@ def observe_stamps(
 
 # Area of a masked pixel that must fall on another one to mask it, too: it holds a tenth of the value filled in.
 _OVERLAP = 0.1
+# Images that are shifted at once: the memory used does not grow with their number.
+_SHIFTED_TOGETHER = 128
 
 
 def center_stamps(
@@ -130,13 +132,15 @@ def center_stamps(
     if masked.any():
         stack = fill_symmetric(stack, bad, offsets[:, 0], offsets[:, 1])
     result = np.full((count, size, size), np.nan)
-    for i, image in enumerate(stack):
-        if not np.all(np.isfinite(offsets[i])):
-            continue
-        stamp = fourier_shift(image, *(middle - offsets[i]))[rows, columns]
-        total = stamp.sum() if normalize else 1.0
-        if total > 0.0:
-            result[i] = stamp / total
+    placed = np.flatnonzero(np.isfinite(offsets).all(axis=1))
+    for first in range(0, len(placed), _SHIFTED_TOGETHER):
+        indices = placed[first : first + _SHIFTED_TOGETHER]
+        shifted = fourier_shifts(stack[indices], *(middle - offsets[indices]).T)
+        for i, image in zip(indices, shifted, strict=True):
+            stamp = image[rows, columns]
+            total = stamp.sum() if normalize else 1.0
+            if total > 0.0:
+                result[i] = stamp / total
     if masked.any():
         result[masked] = np.where(
             center_masks(bad[masked], offsets[masked, 0], offsets[masked, 1], size), np.nan, result[masked]
@@ -205,7 +209,7 @@ def fourier_shift(image: np.ndarray, dx: float, dy: float) -> np.ndarray:
 
 
 def fourier_shifts(images: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
-    """Return images [n, ny, nx] each moved as by :func:`fourier_shift`, dx and dy [n], to rounding: all at once."""
+    """Return images [n, ny, nx] each moved as by :func:`fourier_shift`, dx and dy [n], all at once."""
     ny, nx = images.shape[1:]
     phase_x = np.exp(-2j * np.pi * fft.rfftfreq(nx) * dx[:, None])
     phase_y = np.exp(-2j * np.pi * fft.fftfreq(ny) * dy[:, None])

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.random_streams import stream
+from ...core.statistics import finite_median
 from ...core.units import positive_angle, real_array, require_seed
 from ...measure.pixel_masks import fill_symmetric
 from ...measure.shapes import Shapes, fwhm, measure_shapes
@@ -145,8 +146,7 @@ def fit_own_stars(
         flags = np.where(lost, StarFlag.MASKED, flags)
         snr = _signal_to_noise(centred, rms, gain)
         used = ((flags == 0) | (apart & ((flags & ~_MASKABLE) == 0))) & (snr >= min_snr)
-        masks = center_masks(bad[inner], first.x, first.y, size)
-        return _CentredStars(first, centred, masks, shapes, flags, snr, used, defects, apart)
+        return _CentredStars(first, centred, shapes, flags, snr, used, defects, apart)
 
     def fit(chosen: np.ndarray, **further_options: Any) -> PsfModel:
         span = as_extent(extent, places[stars.used])
@@ -158,15 +158,15 @@ def fit_own_stars(
             **({"gain": gain} | model_options | further_options),
         )
 
-    def fit_again(model: PsfModel | None) -> PsfModel:
-        """Fit the used stars, by the covariances of an earlier model of nearly the same ones."""
+    def fit_again(model: PsfModel | None, *, refined: bool = False) -> PsfModel:
+        """Fit the used stars by the covariances of an earlier model of nearly the same ones, or searched from there."""
         interpolation = None if model is None else model.interpolation
         if not isinstance(interpolation, kriging.FittedKriging):
             return fit(np.flatnonzero(stars.used))
-        same_covariances = kriging.KrigingOfCovariances(
-            order=interpolation.order, covariances=interpolation.covariances
+        earlier_covariances = kriging.KrigingOfCovariances(
+            order=interpolation.order, covariances=interpolation.covariances, refined=refined
         )
-        return fit(np.flatnonzero(stars.used), interpolation=same_covariances)
+        return fit(np.flatnonzero(stars.used), interpolation=earlier_covariances)
 
     def colours_of(chosen: np.ndarray) -> np.ndarray | None:
         return None if colours is None else colours[chosen]
@@ -190,16 +190,24 @@ def fit_own_stars(
     wide = measure_shapes(filled, scale, 0.25 * side * scale)
     inner = inner_pixels(images.shape[1:], size, wide)
     images, filled = images[inner], filled[inner]
-    weight = float(np.nanmedian(fwhm(filled[wide.usable], scale))) if wide.usable.any() else np.nan
+    widths = np.full(len(images), np.nan)
+    widths[wide.usable] = fwhm(filled[wide.usable], scale)
+    weight = finite_median(widths)
     if not np.isfinite(weight):
         raise DomainError(f"none of {len(images)} stamps has a star in its middle")
+
+    def width_of(complete: np.ndarray, filled: np.ndarray) -> float:
+        """Return the median width of complete stars; only those with bad pixels differ from the stars before."""
+        changed = complete & bad.any(axis=(1, 2))
+        widths[changed] = fwhm(filled[changed], scale)
+        return finite_median(widths[complete])
 
     def fill() -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         filled, median_star, lost = fill_by_median_star(images, bad[inner], scale, weight)
         complete = wide.usable & ~lost
         if not complete.any():
             require_stars(complete, np.where(lost, StarFlag.MASKED, StarFlag.UNUSABLE), FEWEST_STARS)
-        return filled, median_star, lost, float(np.nanmedian(fwhm(filled[complete], scale)))
+        return filled, median_star, lost, width_of(complete, filled)
 
     if bad.any():
         filled, median_star, lost, weight = fill()
@@ -212,10 +220,10 @@ def fit_own_stars(
         filled, median_star, lost, weight = fill()
         stars = select(filled, lost, stars)
     _require_used(stars, min_snr, gain)
+    filling_model: PsfModel | None = None
     if bad.any():
         masked = np.asarray(bad.any(axis=(1, 2)))
         complete = wide.usable & ~lost
-        filling_model: PsfModel | None = None
         for _ in range(_MODEL_PASSES):
             filling_model = fit_again(filling_model)
             psfs = filling_model.at(places[masked], colour=colours_of(masked))
@@ -228,7 +236,7 @@ def fit_own_stars(
                 stars.first.y[masked],
                 sigma,
             )
-            weight = float(np.nanmedian(fwhm(filled[complete], scale)))
+            weight = width_of(complete, filled)
             stars = select(filled, lost, stars)
             _require_used(stars, min_snr, gain)
     used = stars.used
@@ -237,8 +245,9 @@ def fit_own_stars(
         stream(require_seed(seed), "held-out stars").permutation(len(used_indices)), min(FOLDS, len(used_indices))
     )
     good = stars.images[used]
-    weightless = stars.masks[used] if stars.masks[used].any() else None
-    model = fit(used_indices)
+    used_masks = center_masks(bad[inner][used], stars.first.x[used], stars.first.y[used], size)
+    weightless = used_masks if used_masks.any() else None
+    model = fit_again(filling_model, refined=True)
     predicted = predict(model)
     psf = predicted.mean(axis=0)
     stamps_used = good / good.sum(axis=(1, 2), keepdims=True)
@@ -258,7 +267,7 @@ def fit_own_stars(
         held_out,
         stamps_used,
         predicted,
-        stars.masks[used],
+        used_masks,
         *sigmas,
         scale,
         weight,
@@ -272,7 +281,6 @@ class _CentredStars:
 
     first: Shapes  #: of the stamps before they are centred
     images: np.ndarray  #: [n, size, size]
-    masks: np.ndarray  #: pixels without weight, bool [n, size, size]
     shapes: Shapes  #: of the centred stars
     flags: np.ndarray  #: :class:`~.StarFlag` bits, [n]
     snr: np.ndarray  #: [n]

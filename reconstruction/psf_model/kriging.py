@@ -119,14 +119,18 @@ class KrigingOfCovariances(Kriging):
     """Kriging by covariances that other stars of the CCD have shown: the search for them is most of a fit's time."""
 
     covariances: Covariances | None = None
+    refined: bool = False  #: whether to search from there, rather than to take them as they are
 
     def covariances_of(
         self, places: np.ndarray, numbers: np.ndarray, noise: np.ndarray, terms: np.ndarray, colour_count: int
     ) -> Covariances:
-        """Return the covariances, or those that the stars show where there are none."""
-        if self.covariances is not None and self.covariances.coloured == (colour_count > 0):
+        """Return the covariances, or those that the stars show where there are none or they are to be refined."""
+        same_kind = self.covariances is not None and self.covariances.coloured == (colour_count > 0)
+        if same_kind and not self.refined and self.covariances is not None:
             return self.covariances
-        return super().covariances_of(places, numbers, noise, terms, colour_count)
+        return fit_covariances(
+            places, numbers, noise, terms, colour_count=colour_count, earlier=self.covariances if same_kind else None
+        )
 
 
 @dataclass(frozen=True, eq=False)
