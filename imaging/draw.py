@@ -41,7 +41,7 @@ _NODES = 7
 
 
 class Sources(Protocol):
-    """Galaxies that can be drawn, such as :class:`pachon.Galaxies`."""
+    """Galaxies that can be drawn, such as :class:`pachon.sky.Galaxies`."""
 
     @property
     def xi(self) -> np.ndarray:
@@ -71,7 +71,7 @@ class Sources(Protocol):
 
 
 class SkyPixels(Protocol):
-    """World coordinates of a CCD, such as :class:`pachon.CcdWcs`."""
+    """World coordinates of a CCD, such as :class:`pachon.imaging.CcdWcs`."""
 
     @property
     def shape(self) -> tuple[int, int]:

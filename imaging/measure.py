@@ -241,8 +241,8 @@ def measure_image(
     image : CcdImage
         Image, such as one of ``pachon images`` or of :func:`~pachon.load_image`.
     psf : PsfModel, FocalPlanePsf, PiffPsf or PsfexPsf, optional
-        Model of the PSF: of all CCDs, such as one fitted to :func:`~pachon.focal_plane_stars` of the images of the
-        exposure, or of this one, its positions pixels of the image. By default one is fitted to the stars of the
+        Model of the PSF: of all CCDs, such as one fitted to :func:`~pachon.imaging.focal_plane_stars` of the images of
+        the exposure, or of this one, its positions pixels of the image. By default one is fitted to the stars of the
         image. With a model stars are left out of the galaxies where there are any.
     recipe : str or Recipe, optional
         Kind of the model of the CCD, as of :meth:`~pachon.PsfModel.fit`: by default every pixel by kriging, which needs

@@ -38,7 +38,8 @@ def launch_rays(
     projection : str
         Meaning of the field angles.
     aiming : {"off", "paraxial", "real"}, optional
-        Ray aiming at the stop, see :class:`~pachon.DesignData`; as the design data of the telescope say by default.
+        Ray aiming at the stop, see :class:`~pachon.models.DesignData`; by default as the design data of the telescope
+        say.
 
     Returns
     -------

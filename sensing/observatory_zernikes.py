@@ -51,7 +51,7 @@ _MOTIONS = ("dx", "dy", "dz", "rx", "ry", "rz")
 
 
 class FittedWavefronts(Protocol):
-    """Wavefronts of n donuts in the telescope frame [m]; see :class:`~pachon.DonutFit`."""
+    """Wavefronts of n donuts in the telescope frame [m]; see :class:`~pachon.sensing.DonutFit`."""
 
     @property
     def zernikes(self) -> np.ndarray:

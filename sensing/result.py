@@ -131,7 +131,7 @@ class DonutFit(Result):
     diffraction : bool
         Whether the model has light diffracted at the rims of the pupil.
     exposure : ExposureWavefront or None
-        Wavefronts of the light of the donuts, air and both sides of focus, of :class:`~pachon.ExposureDonuts`.
+        Wavefronts of the light of the donuts, air and both sides of focus, of :class:`~pachon.sensing.ExposureDonuts`.
     """
 
     zernikes: np.ndarray

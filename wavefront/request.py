@@ -52,7 +52,7 @@ class Request:
     primary : float, optional
         Wavelength that reference points belong to [m], where it is one of `wavelengths`; else the one in their middle.
     vignetting : ndarray, shape [n_field, 5], optional
-        Vignetting factors of the fields, which change their pupil points, see :class:`~pachon.DesignData`.
+        Vignetting factors of the fields, which change their pupil points, see :class:`~pachon.models.DesignData`.
     stated_weights : ndarray, shape [n_field], optional
         Weights of the fields that the design data state.
     """
@@ -200,7 +200,7 @@ class Request:
 
     @property
     def wavelength(self) -> float:
-        """The only wavelength [m]; several of them are a :class:`~pachon.DomainError`."""
+        """The only wavelength [m]; several of them are a :class:`~pachon.errors.DomainError`."""
         if len(self.wavelengths) != 1:
             raise DomainError(f"wavelength: {len(self.wavelengths)} wavelengths are given; expected one")
         return float(self.wavelengths[0])

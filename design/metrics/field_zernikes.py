@@ -18,7 +18,7 @@ from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, ORANGE, figure_at, figure_of, styled
 from ...core.result import Result
 from ...core.units import angle, field_label, require_count
-from ...models.fringe_zernikes import FRINGE_NAMES, FRINGE_TERMS, fringe_zernikes
+from ...models.fringe_indices import FRINGE_NAMES, FRINGE_TERMS, fringe_zernikes
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import NOLL_NAMES, annular_zernikes
 from ...wavefront.pupil_optics import trace_pupils
