@@ -11,18 +11,17 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import fft
 
 from ..core.arguments import check_arguments
-from ..core.errors import check_choice
 from ..core.threads import one_blas_thread, thread_count
 from .psf_field import PsfField
 
-WAYS = ("direct", "eigen")
+DrawingWay = Literal["direct", "eigen"]
 #: Pixels along a side of the grid of a galaxy.
 SIZES = (32, 48, 64, 96, 128, 192, 256, 384, 512)
 #: Largest light of a galaxy beyond its grid, where it wraps round, in rms of the noise of a pixel.
@@ -121,7 +120,7 @@ def draw_galaxies(
     *,
     window: Window | None = None,
     noise: float | np.ndarray = 1.0,
-    way: str = "direct",
+    way: DrawingWay = "direct",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> np.ndarray:
@@ -159,7 +158,6 @@ def draw_galaxies(
     ConfigError
         If there is no such way.
     """
-    check_choice("way", way, WAYS)
     area = Window(0, 0, wcs.shape[1], wcs.shape[0]) if window is None else window
     if way == "direct":
         return _draw_direct(galaxies, electrons, psf, wcs, area, noise, threads, progress)

@@ -26,7 +26,7 @@ from ..measure.shear.shear_shapes import ShearShapes, mean_shear
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ..reconstruction.piff.psf import PiffPsf
 from ..reconstruction.psf_model.model import PsfModel
-from ..reconstruction.psf_model.recipe import Recipe
+from ..reconstruction.psf_model.recipe import Recipe, RecipeName
 from ..reconstruction.psfex import PsfexPsf
 from ..sky.sky_shapes import STEP, SkyShapes, along_sky, jacobians_on_sky
 from .image_file import CcdImage
@@ -228,7 +228,7 @@ def measure_image(
     image: CcdImage,
     *,
     psf: PsfModel | FocalPlanePsf | PiffPsf | PsfexPsf | None = None,
-    recipe: str | Recipe | None = None,
+    recipe: RecipeName | Recipe | None = None,
     stars: ArrayLike | None = None,
     colours: ObjectColours | None = None,
     min_snr: float = 30.0,

@@ -158,7 +158,7 @@ def trace(
 def trace(
     telescope: Telescope,
     rays: Rays,
-    surfaces: str = "last",
+    surfaces: Literal["last", "all"] = "last",
     *,
     focal_plane: FocalPlane | None = None,
     threads: int | None = None,

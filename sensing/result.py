@@ -14,11 +14,12 @@ from ..core.result import Result
 from ..core.units import arcseconds
 from ..design.drawing import field_colors
 from ..design.metrics.field_zernikes import name_terms
+from ..raytrace.rays import Projection
 from .degrees import FreedomEstimate
 from .exposure import ExposureWavefront
 from .flags import DonutFlag
-from .frames import DonutFrames
-from .observatory_zernikes import ObservatoryZernikes, observatory_zernikes
+from .frames import DonutFrames, FrameName
+from .observatory_zernikes import ObservatoryZernikes, ZernikeConvention, observatory_zernikes
 from .rim_table import rim_table
 from .star_errors import ErrorParts
 
@@ -163,7 +164,7 @@ class DonutFit(Result):
     double_zernikes: np.ndarray | None = None
     double_zernike_covariance: np.ndarray | None = None
     degrees_of_freedom: FreedomEstimate | None = None
-    projection: str = "zemax"
+    projection: Projection = "zemax"
     rims: QTable = field(default_factory=lambda: rim_table({}))
     diffraction: bool = False
     exposure: ExposureWavefront | None = None
@@ -204,8 +205,8 @@ class DonutFit(Result):
 
     def zernikes_in(
         self,
-        convention: str = "pachon",
-        frame: str = "OCS",
+        convention: ZernikeConvention = "pachon",
+        frame: FrameName = "OCS",
         *,
         frames: DonutFrames | None = None,
         design: Telescope | None = None,
