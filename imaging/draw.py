@@ -11,13 +11,14 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import fft
 
 from ..core.arguments import check_arguments
+from ..core.errors import check_choice
 from ..core.threads import one_blas_thread, thread_count
 from .psf_field import PsfField
 
@@ -158,6 +159,7 @@ def draw_galaxies(
     ConfigError
         If there is no such way.
     """
+    check_choice("way", way, get_args(DrawingWay))
     area = Window(0, 0, wcs.shape[1], wcs.shape[0]) if window is None else window
     if way == "direct":
         return _draw_direct(galaxies, electrons, psf, wcs, area, noise, threads, progress)

@@ -16,7 +16,7 @@ from ..pipeline.experiment import Experiment
 from ..pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
 from ..pipeline.simulate.photometry import effective_fwhm
 from ..reconstruction.psf_model.interpolation import Interpolation
-from ..reconstruction.psf_model.recipe import InterpolationName
+from ..reconstruction.psf_model.recipe import InterpolationKey
 from .draw import SIZES, DrawingWay, SkyPixels, Sources, Window, add_stamps, draw_galaxies
 from .exposure import Exposure, expose
 from .image_file import CcdImage
@@ -91,7 +91,7 @@ def draw_ccd(
     pointing: Any = (0.0, 0.0),
     window: Window | None = None,
     way: DrawingWay = "direct",
-    interpolation: InterpolationName | Interpolation = "polynomial",
+    interpolation: InterpolationKey | Interpolation = "polynomial",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> CcdScene:

@@ -12,7 +12,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from ..core.arguments import check_arguments
+from ..core.arguments import check_prescription
 from ..core.errors import PrescriptionError
 from .links import Pickup, Solve, check_links
 
@@ -33,7 +33,7 @@ AIMING: tuple[Aiming, ...] = get_args(Aiming)
 _FACTORS = 5
 
 
-@check_arguments
+@check_prescription
 @dataclass(frozen=True)
 class DesignData:
     """Aperture, fields, wavelengths, stop and environment that a lens file states; empty for most telescopes.

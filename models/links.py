@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from ..core.arguments import check_arguments
+from ..core.arguments import check_prescription
 from ..core.errors import PrescriptionError
 
 #: What a pickup may take over.
@@ -18,7 +18,7 @@ SolveKind = Literal["marginal_height", "chief_height", "edge_thickness"]
 SOLVED: tuple[SolveKind, ...] = get_args(SolveKind)
 
 
-@check_arguments
+@check_prescription
 @dataclass(frozen=True)
 class Pickup:
     """Value of a surface that follows that of another: ``scale`` times that value plus ``offset``.
@@ -62,7 +62,7 @@ class Pickup:
         return f"pickup {self.surface}.{self.quantity}"
 
 
-@check_arguments
+@check_prescription
 @dataclass(frozen=True)
 class Solve:
     """Thickness behind a surface that is solved for.

@@ -194,8 +194,6 @@ def trace(
     DomainError
         If the telescope does not cover the wavelength, or ``out`` is no result of as many rays of one trace.
     """
-    if surfaces not in ("last", "all"):
-        raise ConfigError(f"surfaces = {surfaces!r}: expected 'last' or 'all'")
     n = len(rays)
     n_stored = len(telescope.surfaces) if surfaces == "all" else 1
     if out is not None:

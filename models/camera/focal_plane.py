@@ -98,7 +98,9 @@ class FocalPlane(HeightMap):
         Raises
         ------
         UnknownNameError
-            If the camera, a term or the budget does not exist.
+            If the camera or a term does not exist.
+        ConfigError
+            If there is no such budget.
         DomainError
             If the seed is not a whole number of zero or more.
         """

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.arguments import check_arguments
+from ...core.arguments import check_prescription
 from ...core.errors import PrescriptionError
 from .medium import Medium, wavelengths_within
 
@@ -28,7 +28,7 @@ GAS_CONSTANT = 8.314510
 WATER_MOLAR_MASS = 0.018015
 
 
-@check_arguments
+@check_prescription
 @dataclass(frozen=True)
 class Air(Medium):
     """Moist air as a medium.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.arguments import check_arguments
+from ...core.arguments import check_prescription
 from ...core.errors import PrescriptionError
 from .medium import Medium, medium_label, wavelengths_within
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Interpolation = Literal["monotone", "linear"]
 
 
-@check_arguments
+@check_prescription
 @dataclass(frozen=True)
 class TabulatedIndex(Medium):
     """Medium whose index is interpolated from a table.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, TypedDict, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, TypeVar, get_args
 
 import numpy as np
 
@@ -38,13 +38,19 @@ WEIGHTS: tuple[WeightsName, ...] = get_args(WeightsName)
 
 
 RecipeName = Literal["kriging", "paper"]
+if TYPE_CHECKING:
+    BasisKey: TypeAlias = BasisName
+    InterpolationKey: TypeAlias = InterpolationName
+else:
+    # At run time names are looked up in the tables, which say what replaced a retired one.
+    BasisKey = InterpolationKey = str
 
 
 class RecipeKeys(TypedDict, total=False):
     """Keys of a recipe that :meth:`~.PsfModel.fit` changes alone; None changes nothing."""
 
-    basis: BasisName | Basis | None
-    interpolation: InterpolationName | Interpolation | None
+    basis: BasisKey | Basis | None
+    interpolation: InterpolationKey | Interpolation | None
     n_components: int | Literal["auto"] | None
     order: int | Literal["auto"] | None
     scale: float | None
@@ -102,8 +108,8 @@ class Recipe:
     def changed(
         self,
         *,
-        basis: BasisName | Basis | None = None,
-        interpolation: InterpolationName | Interpolation | None = None,
+        basis: BasisKey | Basis | None = None,
+        interpolation: InterpolationKey | Interpolation | None = None,
         weights: WeightsName | None = None,
         n_components: Any = None,
         scale: float | None = None,

@@ -357,7 +357,7 @@ def test_a_wrong_checksum_is_damage(field, tmp_path):
 def test_settings():
     for settings, text in (
         ({"gain": 0.0}, "gain = 0"),
-        ({"weight_kind": "sigma"}, "weight_kind = sigma: expected one of weight, variance, rms"),
+        ({"weight_kind": "sigma"}, "weight_kind = 'sigma': expected one of weight, variance, rms"),
         ({"zero_point": np.nan}, "zero_point = nan"),
         ({"pixel_scale": -1.0}, "pixel_scale"),
     ):
