@@ -53,10 +53,10 @@ def check_arguments(target: Target, word_error: type[PachonError] = ConfigError)
 
     A value of the wrong kind is a DomainError, or a ConfigError (`word_error`) where one of several words is expected;
     it names argument, value and what was expected. Checked are numbers, texts, paths, functions, classes, and sequences
-    and mappings of them. Arguments annotated as arrays take real numbers: no boolean values, texts, times, complex numbers
-    or objects. Masked ones become NaN; quantities keep their unit. Those annotated as boolean arrays take True and
-    False, and 1 and 0. A quantity where plain numbers are expected is converted to the unit in square brackets of the
-    docstring.
+    and mappings of them. Arguments annotated as arrays take real numbers: no boolean values, texts, times, complex
+    numbers or objects. Masked ones become NaN; quantities keep their unit. Those annotated as boolean arrays take True
+    and False, and 1 and 0. A quantity where plain numbers are expected is converted to the unit in square brackets of
+    the docstring.
 
     Keyword arguments annotated as ``**options: Unpack[SomeTypedDict]`` are checked, and shown in the signature, as if
     each key of the TypedDict were a parameter.
