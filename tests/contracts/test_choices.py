@@ -54,7 +54,7 @@ CHOICES = {(f"{owner.__qualname__}", name): (owner, name, words) for owner, name
 def test_annotations_have_the_words_of_the_docstrings(key):
     owner, name, words = CHOICES[key]
     holders = owner.__mro__ if inspect.isclass(owner) else [inspect.unwrap(owner)]
-    holder = next(h for h in holders if name in h.__dict__.get("__annotations__", h.__annotations__))
+    holder = next(h for h in holders if name in inspect.get_annotations(h))
     alone = SimpleNamespace(__annotations__={name: holder.__annotations__[name]})
     annotations = typing.get_type_hints(alone, vars(sys.modules[holder.__module__]))
     # "sky" is a frame of hexapods too; DVCS, which has no z, is refused by the function itself.
