@@ -10,9 +10,10 @@ import numpy as np
 
 from ..core.arguments import check_arguments, removed_arguments
 from ..core.errors import ConfigError, DomainError, shown
-from ..core.products import Stamp, card_text
+from ..core.products import Card, Stamp, card_text
 from ..core.units import ARCSEC
 from ..pipeline.experiment import Experiment
+from ..pipeline.listed_visit import observation_cards
 from ..pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
 from ..pipeline.simulate.photometry import effective_fwhm
 from ..reconstruction.psf_model.interpolation import Interpolation
@@ -48,6 +49,7 @@ class CcdScene:
     telescope: str
     seed: int
     epoch: int
+    cards: tuple[Card, ...] = ()  #: of instrument and time
 
     @check_arguments
     def exposed(self, exposure: Exposure | None = None, *, threads: int | None = None) -> CcdImage:
@@ -75,6 +77,8 @@ class CcdScene:
             ("CCDX0", self.window.x, "CCD column of the first pixel, from 0"),
             ("CCDY0", self.window.y, "CCD row of the first pixel, from 0"),
         ):
+            header[key] = (value, comment)
+        for key, value, comment in self.cards:
             header[key] = (value, comment)
         objects = self.objects if ratio == 1.0 else self.objects | {"FLUX": self.objects["FLUX"] * ratio}
         return CcdImage(self.name, ccd_image.image, ccd_image.variance, ccd_image.mask, header, objects)
@@ -203,6 +207,7 @@ def draw_ccd(
         experiment.telescope.name,
         config.seed,
         config.atmosphere.epoch,
+        tuple(observation_cards(experiment, ccd)),
     )
 
 
