@@ -47,8 +47,10 @@ from .optimize.geometry_operands import SagAt as SagAt
 from .optimize.geometry_operands import TotalLength as TotalLength
 from .optimize.glass_choice import GlassChoice as GlassChoice
 from .optimize.glass_choice import choose_glasses as choose_glasses
+from .optimize.merit import Beams as Beams
 from .optimize.merit_function import SpotSize as SpotSize
 from .optimize.merit_function import WavefrontError as WavefrontError
+from .optimize.optimize import wavefronts as wavefronts
 from .optimize.optimize_file import load_optimization as load_optimization
 from .optimize.optimum import Optimum as Optimum
 from .optimize.ray_operands import ExitAngle as ExitAngle

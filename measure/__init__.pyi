@@ -28,5 +28,6 @@ from .shear.shear_shapes import ShearBias as ShearBias
 from .shear.shear_shapes import ShearShapes as ShearShapes
 from .shear.shear_shapes import mean_shear as mean_shear
 from .shear.shear_shapes import shear_bias as shear_bias
+from .stamps import center_stamps as center_stamps
 from .star_selection import StarFlag as StarFlag
 from .star_selection import flag_stars as flag_stars

@@ -14,6 +14,7 @@ from . import testing as testing
 from . import wavefront as wavefront
 from .core.errors import PachonError as PachonError
 from .core.long_work import Execution as Execution
+from .core.workers import process_workers as process_workers
 from .design.analyses.field_curvature import field_curvature as field_curvature
 from .design.analyses.ray_fans import ray_fans as ray_fans
 from .design.analyses.strehl import strehl as strehl

@@ -16,6 +16,7 @@ from .shimming.shim import shim as shim
 from .sweep.file import load_sweep as load_sweep
 from .sweep.table import SweepTable as SweepTable
 from .sweep.table import load_sweep_table as load_sweep_table
+from .tolerance.file import ToleranceFile as ToleranceFile
 from .tolerance.file import load_tolerances as load_tolerances
 from .tolerance.result import ToleranceStudy as ToleranceStudy
 from .validation import Validation as Validation

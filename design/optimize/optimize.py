@@ -153,10 +153,21 @@ def _check_effects(problem: DesignProblem, effect: np.ndarray) -> None:
             raise DomainError(f"variable {variable.address} has no effect on the merit: leave it out")
 
 
+@check_arguments
 def wavefronts(telescope: Telescope, rays: Beams) -> np.ndarray:
-    """Return the wavefronts of a telescope [m], shape [n_field, n_wave, n_pupil], NaN where not lit.
+    """Return the wavefronts of a telescope along the rays of a merit.
 
-    Rays are those of :meth:`Beams.of` for the arguments of :func:`optimize`.
+    Parameters
+    ----------
+    telescope : Telescope
+        Telescope that the rays are traced through, such as a misaligned one.
+    rays : Beams
+        Rays of :meth:`Beams.of` for the arguments of :func:`optimize`.
+
+    Returns
+    -------
+    ndarray, shape [n_field, n_wave, n_pupil]
+        Wavefronts [m] as a goal of :class:`WavefrontError`; NaN where not lit.
     """
     columns = ParameterColumns.at(following_stop(telescope), ())
 
