@@ -6,7 +6,7 @@ RUN is the folder of `pachon run --all`: its observed stars and its noise-free P
 those of e1, e2 and ln size at the holdout positions:
 
 - the models of the CCDs in the products (the paper's cubic by default), and linear polynomials of all pixels with
-  softened weights, the best of docs/psf_study.md;
+  softened weights, the best of docs/evidence/psf_study.md;
 - pachon without telescope, and with the telescope but without heights; with those of other exposures if they are given.
 
 With the times of the fits, which run one after the other on all threads.

@@ -6,9 +6,9 @@ The Kalman filter of ``pachon align`` is given e1, e2 and ln(size) (weight of 0.
 Zernikes of eight corner donuts. Moments depend on the state in second order, so that their derivatives are taken at
 states drawn from the filter's own covariance. The errors of the moments are photon noise (0.51 over S/N), a mean over
 the field that is free, and turbulence: two exponentials of the distance with half of the variance each, of 3' and 16'
-(e1, e2: 5.0e-6 and 7.1e-6 in 15 s, ln(size) 1.6e-5; see docs/focal_plane_psf.md), which falls as one over the exposure
-time. Printed is the wavefront over the field that the filter expects after one correction from twice the tolerances,
-and in the long run.
+(e1, e2: 5.0e-6 and 7.1e-6 in 15 s, ln(size) 1.6e-5; see docs/explanation/focal_plane_psf.md), which falls as one over
+the exposure time. Printed is the wavefront over the field that the filter expects after one correction from twice the
+tolerances, and in the long run.
 """
 
 from __future__ import annotations

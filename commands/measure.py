@@ -105,7 +105,7 @@ def measure_command(
     without objects, or with fewer than three stars, are reported and left out.
 
     Images are those of pachon images, LSST, HSC, DES, or any with world coordinates and a gain, in one extension or
-    many, compressed or not; docs/measuring.md says what is read, and what the options stand for.
+    many, compressed or not; docs/howto/measuring.md says what is read, and what the options stand for.
 
     **Examples**
 

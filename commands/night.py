@@ -71,10 +71,9 @@ def listed_visit(
 ) -> ListedVisit:
     """Return the visit of a number of a list, or the only one of a selection."""
     from ..core.errors import DomainError
-    from ..studies.night.config import ListSection, NightConfig
+    from ..studies.night.config import ListSection, read_section
 
-    section = ListSection(list=str(path), where=where, band=band, night=night)
-    visits = NightConfig(run=config, visits=section).read_list()
+    visits = read_section(ListSection(list=str(path), where=where, band=band, night=night), config)
     for remark in visits.remarks:
         print_line(f"pachon: {path.name}: {remark}", error=True)
     if number is not None:

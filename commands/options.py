@@ -57,6 +57,11 @@ Picture = Annotated[
     Path | None,
     Option("--picture", "-o", help="Picture to write, .png, .pdf or .svg; by default named after command and model."),
 ]
+NoPicture = Annotated[bool, Option("--no-picture", help="Draw no picture.")]
+TableFile = Annotated[
+    Path | None,
+    Option("--table", metavar="FILE", help="Table to write, with units: .ecsv, .csv, .fits or .parquet."),
+]
 StarX = Annotated[str, Option("--x", help="Column of x; names of SExtractor and LSST are known.")]
 StarY = Annotated[str, Option("--y", help="Column of y.")]
 StarStamp = Annotated[str, Option("--stamp", help="Column of the stamps [ny, nx].")]
@@ -170,3 +175,13 @@ def picture_kind(picture: Path | None) -> str:
     if kind not in ("png", "pdf", "svg"):
         raise ConfigError(f"--picture = {picture}: expected a name that ends in .png, .pdf or .svg")
     return kind
+
+
+def check_table(table: Path | None) -> None:
+    """Check the ending of a table's name, before anything is computed."""
+    if table is None:
+        return
+    from ..core.table_files import FORMATS
+
+    if table.suffix.lower() not in FORMATS:
+        raise ConfigError(f"--table = {table}: expected a name that ends in {', '.join(FORMATS)}")

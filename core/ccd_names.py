@@ -30,7 +30,7 @@ def refuse_mirrored_names(
     name = next((str(name) for name in names if _RUBIN.fullmatch(str(name))), None)
     if name is not None:
         raise error(
-            f"names CCDs of the LSST, such as {name}, as in a mirror (docs/camera.md): expected version "
+            f"names CCDs of the LSST, such as {name}, as in a mirror (docs/howto/camera.md): expected version "
             f"{NAMES_VERSION} of the names, found {1 if version is None else version}; make the file again",
             file=file,
         )

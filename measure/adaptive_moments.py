@@ -350,7 +350,9 @@ def _covariance(pixels: np.ndarray, counted: np.ndarray, variance: np.ndarray, e
     jacobian /= light[:, :1, :1]  # numbers about 1
     determined = np.abs(np.linalg.det(jacobian)) > _LEAST_DETERMINANT
     inverse = np.linalg.inv(np.where(determined[:, None, None], jacobian, np.eye(6)))
-    covariance = inverse @ (noise[at] / light[:, :1, :1] ** 2) @ inverse.transpose(0, 2, 1)
+    # The layout of noise[at] in memory depends on the number of images, and with it the order in which BLAS adds.
+    of_equations = np.ascontiguousarray(noise[at] / light[:, :1, :1] ** 2)
+    covariance = inverse @ of_equations @ inverse.transpose(0, 2, 1)
     # From M^-1 dx and M^-1 dM M^-1, in units of `unit`, to dx and dM; from ln a to the logarithm of the flux a |M|^1/2.
     shape = np.stack([[xx[:, 0, 0], xy[:, 0, 0]], [xy[:, 0, 0], yy[:, 0, 0]]]).transpose(2, 0, 1) / unit**2
     p, q, r = shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1]

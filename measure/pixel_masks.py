@@ -120,10 +120,10 @@ def fill_symmetric(images: np.ndarray, bad: np.ndarray, x: Any = 0.0, y: Any = 0
     filled = np.where(bad, 0.0, images)
     count, ny, nx = images.shape
     centers = np.stack([np.broadcast_to(np.nan_to_num(center), (count,)) for center in (y, x)], axis=1)
-    for i in np.flatnonzero(bad.any(axis=(1, 2))):
+    masked = np.flatnonzero(bad.any(axis=(1, 2)))
+    for i, near_good in zip(masked, _near_means(filled[masked], bad[masked]), strict=True):
         rows, columns = np.nonzero(bad[i])
         opposite = np.stack([ny - 1 + 2.0 * centers[i, 0] - rows, nx - 1 + 2.0 * centers[i, 1] - columns])
-        near_good = _near_mean(filled[i], bad[i])
         inside = ((opposite >= 0.0) & (opposite <= np.array([[ny - 1], [nx - 1]]))).all(axis=0)
         badness = ndimage.map_coordinates(bad[i].astype(np.float64), opposite, order=1, mode="nearest")
         paired = inside & (badness < _OVERLAP)
@@ -140,11 +140,12 @@ def fill_symmetric(images: np.ndarray, bad: np.ndarray, x: Any = 0.0, y: Any = 0
     return filled
 
 
-def _near_mean(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
-    """Return an image [ny, nx] whose bad pixels hold the mean of good ones near them, zero where there are none."""
+def _near_means(images: np.ndarray, bad: np.ndarray) -> np.ndarray:
+    """Return images [n, ny, nx] whose bad pixels hold the mean of good ones near them, zero where there are none."""
+    along_both = (0.0, _NEIGHBOURHOOD, _NEIGHBOURHOOD)
     weight, light = (
-        ndimage.gaussian_filter(values, _NEIGHBOURHOOD, mode="constant")
-        for values in ((~bad).astype(np.float64), np.where(bad, 0.0, image))
+        ndimage.gaussian_filter(values, along_both, mode="constant")
+        for values in ((~bad).astype(np.float64), np.where(bad, 0.0, images))
     )
     near = bad & (weight > _LEAST_NEIGHBOURS)
-    return np.where(near, light / np.where(near, weight, 1.0), np.where(bad, 0.0, image))
+    return np.where(near, light / np.where(near, weight, 1.0), np.where(bad, 0.0, images))

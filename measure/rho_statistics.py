@@ -16,7 +16,8 @@ as Jarvis et al. (2016, MNRAS 460, 2245, sec. 3.4) write them. The statistics ar
 Theirs are of moments under an elliptical weight that adapts to the image, e = (a - b)/(a + b) and T = Q11 + Q22: those
 of :func:`~pachon.adaptive_moments`, its g1, g2 and sigma in place of e1, e2 and size. Of
 :func:`~pachon.measure_shapes`, under a round weight of 0.7", e and dT/T of PSFs of 0.56" are about half as large, so
-that rho1 and rho2 are about a quarter (1/3.86), rho4 and rho5 an eighth, rho3 a seventeenth (docs/conventions.md).
+that rho1 and rho2 are about a quarter (1/3.86), rho4 and rho5 an eighth, rho3 a seventeenth
+(docs/explanation/conventions.md).
 """
 
 from __future__ import annotations

@@ -406,13 +406,26 @@ def _interpolated_peak(fine: np.ndarray) -> float:
 
 def _area_above(fine: np.ndarray, level: float) -> float:
     """Return the area above a level [fine pixel^2], border pixels counted in part as if the image were plane there."""
-    gy, gx = np.gradient(fine)
-    slope = np.hypot(gx, gy)
     inside = fine > level
-    border = np.abs(fine - level) < 0.5 * slope
+    # No slope is steeper than the largest differences: most pixels are neither border nor in need of a gradient.
+    steepest = [float(np.abs(np.diff(fine, axis=axis)).max()) for axis in (0, 1)]
+    rows, columns = np.nonzero(np.abs(fine - level) <= 0.5 * np.hypot(steepest[0], steepest[1]))
+    gy = _difference_along(fine, rows, columns, 0)
+    gx = _difference_along(fine, rows, columns, 1)
+    slope, height = np.hypot(gx, gy), fine[rows, columns] - level
+    border = np.abs(height) < 0.5 * slope
     covered = inside.astype(np.float64)
-    covered[border] = 0.5 + (fine[border] - level) / slope[border]
+    covered[rows[border], columns[border]] = 0.5 + height[border] / slope[border]
     return float(covered.sum())
+
+
+def _difference_along(fine: np.ndarray, rows: np.ndarray, columns: np.ndarray, axis: int) -> np.ndarray:
+    """Return the derivative of an image along an axis at some pixels, as :func:`numpy.gradient` has it."""
+    last = fine.shape[axis] - 1
+    place = (rows, columns)[axis]
+    low, high = np.maximum(place - 1, 0), np.minimum(place + 1, last)
+    before, after = (fine[low, columns], fine[high, columns]) if axis == 0 else (fine[rows, low], fine[rows, high])
+    return np.asarray((after - before) / (high - low))
 
 
 def stamp_cube(images: ArrayLike) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
 
 import numpy as np
@@ -167,11 +167,17 @@ def flag_stars(
     flags[usable & ~(scales > 0.0)] = StarFlag.UNUSABLE
     usable &= scales > 0.0
     lack = 1.0 - images[:, core].sum(axis=1) / (scales * star[core].sum())
-    for i in np.flatnonzero(usable):
+    usable_indices = np.flatnonzero(usable)
+    light = scales[usable, None, None] * star
+    residuals = images[usable] - light
+    photon_variances = rms[usable, None, None] ** 2 + np.maximum(light, 0.0) / gain
+    variances = photon_variances + (scales[usable, None, None] * allowance) ** 2
+    sharp_pixels = _sharp_pixels(residuals, variances, fraction, threshold)
+    matched_filter = MatchedFilter.of(star)
+    for i, residual, photons, variance, struck in zip(
+        usable_indices, residuals, photon_variances, variances, sharp_pixels, strict=True
+    ):
         flux = scales[i]
-        residual = images[i] - flux * star
-        photons = rms[i] ** 2 + np.maximum(flux * star, 0.0) / gain
-        variance = photons + (flux * allowance) ** 2
         if saturation is not None:
             masks[i] = images[i] >= saturation
         unsure = np.hypot(
@@ -181,12 +187,11 @@ def flag_stars(
             flags[i] |= StarFlag.SATURATED
             masks[i] |= core
             continue  # whatever else its residual shows is the lost core
-        struck = _sharp_pixels(residual, variance, fraction, threshold)
         if struck.any():
             flags[i] |= StarFlag.COSMIC_RAY
             masks[i] = struck
             residual = np.where(struck, 0.0, residual)
-        neighbours = _neighbour_pixels(residual, variance, photons, star, threshold)
+        neighbours = _neighbour_pixels(residual, variance, photons, matched_filter, threshold)
         if neighbours is not None:
             flags[i] |= StarFlag.NEIGHBOUR
             masks[i] |= neighbours
@@ -208,20 +213,20 @@ def _scale_error(variance: np.ndarray, star: np.ndarray, wings: np.ndarray) -> f
     return float(np.sqrt(0.5 * np.pi * (variance[wings] / star[wings] ** 2).mean() / wings.sum()))
 
 
-def _sharp_pixels(residual: np.ndarray, variance: np.ndarray, fraction: float, threshold: float) -> np.ndarray:
-    """Return the pixels of cosmic rays: sharp ones, and bright ones beside them."""
-    neighbourhood = np.ones((3, 3))
-    around = ndimage.convolve(
-        residual, neighbourhood, mode="nearest"
-    )  # extended beyond the edge, which is no sharp pixel
-    around_variance = ndimage.convolve(variance, neighbourhood, mode="nearest")
-    excess = residual - fraction * around
-    error = np.sqrt((1.0 - 2.0 * fraction) * variance + fraction**2 * around_variance)
+def _sharp_pixels(residuals: np.ndarray, variances: np.ndarray, fraction: float, threshold: float) -> np.ndarray:
+    """Return the pixels of cosmic rays, bool [n, ny, nx]: sharp ones, and bright ones beside them."""
+    neighbourhood = np.ones((1, 3, 3))
+    around, around_variance = (
+        ndimage.convolve(values, neighbourhood, mode="nearest")  # extended beyond the edge, which is no sharp pixel
+        for values in (residuals, variances)
+    )
+    excess = residuals - fraction * around
+    error = np.sqrt((1.0 - 2.0 * fraction) * variances + fraction**2 * around_variance)
     sharp = excess > threshold * error
-    if not sharp.any():
-        return sharp
-    bright = residual > 0.5 * threshold * np.sqrt(variance)
-    return sharp | ndimage.binary_dilation(sharp, neighbourhood, iterations=-1, mask=bright | sharp)
+    for i in np.flatnonzero(sharp.any(axis=(1, 2))):
+        bright = residuals[i] > 0.5 * threshold * np.sqrt(variances[i])
+        sharp[i] |= ndimage.binary_dilation(sharp[i], neighbourhood[0], iterations=-1, mask=bright | sharp[i])
+    return np.asarray(sharp)
 
 
 def _scales(wings: np.ndarray, star: np.ndarray, bad: np.ndarray) -> np.ndarray:
@@ -235,19 +240,52 @@ def _scales(wings: np.ndarray, star: np.ndarray, bad: np.ndarray) -> np.ndarray:
     return scales
 
 
+@dataclass(frozen=True, eq=False)
+class MatchedFilter:
+    """Sums over pixels of an image times a star of the same shape whose peak stands on each pixel."""
+
+    star: np.ndarray  #: [ny, nx]
+    peak: tuple[int, ...]  #: its brightest pixel
+    padded: list[int]  #: shape of the transforms
+    transforms: tuple[np.ndarray, np.ndarray]  #: of the star and of its square
+    norm: np.ndarray  #: sums of the square of the star, as far as it lies on the stamp
+
+    @classmethod
+    def of(cls, star: np.ndarray) -> MatchedFilter:
+        """Return the filter of a star."""
+        peak = tuple(int(at) for at in np.unravel_index(star.argmax(), star.shape))
+        padded = [fft.next_fast_len(2 * n - 1, real=True) for n in star.shape]
+        star_transform, square_transform = (fft.rfft2(image[::-1, ::-1], padded) for image in (star, star**2))
+        filter_without_norm = cls(star, peak, padded, (star_transform, square_transform), np.zeros(star.shape))
+        return replace(filter_without_norm, norm=filter_without_norm.squares(np.ones(star.shape)))
+
+    def light(self, image: np.ndarray) -> np.ndarray:
+        """Return the sums with the star."""
+        return self._correlate(image, self.transforms[0])
+
+    def squares(self, image: np.ndarray) -> np.ndarray:
+        """Return the sums with the square of the star."""
+        return self._correlate(image, self.transforms[1])
+
+    def _correlate(self, image: np.ndarray, transform: np.ndarray) -> np.ndarray:
+        product = fft.irfft2(fft.rfft2(image, self.padded) * transform, self.padded)
+        rows, columns = (slice(n - 1 - at, 2 * n - 1 - at) for n, at in zip(image.shape, self.peak, strict=True))
+        return np.asarray(product[rows, columns])
+
+
 def _neighbour_pixels(
-    residual: np.ndarray, variance: np.ndarray, photons: np.ndarray, star: np.ndarray, threshold: float
+    residual: np.ndarray, variance: np.ndarray, photons: np.ndarray, matched_filter: MatchedFilter, threshold: float
 ) -> np.ndarray | None:
     """Return the pixels of neighbours [ny, nx] bool, one after the other by significance; None without any.
 
     `variance` has the allowance for the PSF's variation in it, `photons` noise alone.
     """
-    peak = np.unravel_index(star.argmax(), star.shape)
-    squares, norm = _correlate(variance, star**2, peak), _correlate(np.ones(star.shape), star**2, peak)
+    star, peak, norm = matched_filter.star, matched_filter.peak, matched_filter.norm
+    squares = matched_filter.squares(variance)
     rms, neighbours = np.sqrt(photons), np.zeros(star.shape, dtype=bool)
     remaining, scaled_again = residual, False
     for _ in range(_MOST_NEIGHBOURS):
-        light = _correlate(remaining, star, peak)
+        light = matched_filter.light(remaining)
         significance = light / np.sqrt(squares)
         place = np.unravel_index(significance.argmax(), star.shape)
         if not significance[place] > threshold:
@@ -269,14 +307,6 @@ def _neighbour_pixels(
         neighbours |= pixels
         remaining = np.where(neighbours, 0.0, residual)
     return neighbours if neighbours.any() else None
-
-
-def _correlate(image: np.ndarray, star: np.ndarray, peak: tuple[np.intp, ...]) -> np.ndarray:
-    """Return sums over pixels of image times a star of the same shape whose peak stands on each pixel."""
-    full = tuple(fft.next_fast_len(2 * n - 1, real=True) for n in image.shape)
-    product = fft.irfft2(fft.rfft2(image, full) * fft.rfft2(star[::-1, ::-1], full), full)
-    rows, columns = (slice(n - 1 - int(at), 2 * n - 1 - int(at)) for n, at in zip(image.shape, peak, strict=True))
-    return np.asarray(product[rows, columns])
 
 
 def _stamp_cube(stamps: ArrayLike) -> np.ndarray:

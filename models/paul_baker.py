@@ -2,7 +2,8 @@
 
 A concave paraboloid M1 and a convex M2 that shares its focus make the light parallel again, in a beam narrower by
 ``m = R2 / R1``. A concave sphere M3, with its centre of curvature at the vertex of M2, brings it to a focus half-way
-between M3 and M2. With positive radii and focal length ``f`` four Seidel sums vanish (see docs/paul_baker.md)::
+between M3 and M2. With positive radii and focal length ``f`` four Seidel sums vanish (see
+docs/explanation/paul_baker.md)::
 
     f1 = f (1 - m),   R1 = 2 f1,   R2 = m R1,   R3 = R1 R2 / (R1 - R2) = 2 f1 m / (1 - m)
     k1 = -1,          k2 = -1 + (R2/R3)^3,      k3 = 0
@@ -44,7 +45,7 @@ def paul_baker(
 ) -> Telescope:
     """Design a flat-field Paul-Baker telescope with no third-order aberration but distortion.
 
-    The derivation is in docs/paul_baker.md. Third order is all that is corrected: the fifth-order spherical
+    The derivation is in docs/explanation/paul_baker.md. Third order is all that is corrected: the fifth-order spherical
     aberration that is left goes as ``focal_ratio**-5``.
 
     Parameters
@@ -92,7 +93,7 @@ def paul_baker(
     bare = Telescope(
         name="paul_baker",
         description=f"Classical three-mirror Paul-Baker telescope with a flat field, {diameter:g} m, f/{focal_ratio:g}",
-        source="derived from the third-order conditions; derivation in docs/paul_baker.md",
+        source="derived from the third-order conditions; derivation in docs/explanation/paul_baker.md",
         version="1",
         surfaces=(
             mirror("M1", Conic(r1, -1.0), 0.0),

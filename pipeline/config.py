@@ -272,7 +272,7 @@ def refuse_parallactic_angle(content: dict[str, Any]) -> None:
     value = f"{(90.0 + roll - angle) % 360.0:g}" if numbers else "90 less the angle at no roll"
     raise problem(
         f".{_RETIRED_ANGLE} = {shown(angle)}: expected zenith_position_angle_deg: {value} (from north through east); "
-        "files with the old key also name CCDs of the LSST as in a mirror: see docs/camera.md",
+        "files with the old key also name CCDs of the LSST as in a mirror: see docs/howto/camera.md",
         "atmosphere",
     )
 

@@ -56,6 +56,9 @@ class Study(Protocol):
     def plot(self) -> Figure:
         """Draw the picture."""
 
+    def write(self, path: str | Path) -> None:
+        """Write the numbers as a table with units."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -171,8 +174,9 @@ def design_command(
         name = compute.__name__.replace("_", "-")
         parameters, option_names = _parameters(compute, band, picture)
 
-        def command(picture: Path | None, as_json: bool, **values: Any) -> None:
+        def command(picture: Path | None, no_picture: bool, table: Path | None, as_json: bool, **values: Any) -> None:
             kind = options.picture_kind(picture)
+            options.check_table(table)
             import_modules(_NEEDED)
             shared = SharedOptions(**{f.name: values[f.name] for f in fields(SharedOptions) if f.name in values})
             try:
@@ -182,7 +186,8 @@ def design_command(
                 raise error if option is None else error.renamed(f"--{option.replace('_', '-')}") from None
             outcome = result if isinstance(result, Outcome) else Outcome(result)
             path = picture or Path(f"{outcome.stem or f'{name}_{shared.stem}'}.png")
-            _deliver(outcome, outcome.table or rows, path, kind, as_json)
+            drawn = not no_picture and (picture is not None or not as_json)
+            _deliver(outcome, outcome.table or rows, path if drawn else None, kind, table, as_json)
 
         # Typer reads the options of a command from its signature.
         command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -210,6 +215,8 @@ def _parameters(compute: Callable[..., Any], band: bool, picture: Any) -> tuple[
         "lenient": (options.Lenient, False),
         "configuration": (options.Configuration, None),
         "picture": (picture, None),
+        "no_picture": (options.NoPicture, False),
+        "table": (options.TableFile, None),
         "threads": (options.Threads, None),
         "as_json": (options.Json, False),
     }
@@ -219,16 +226,25 @@ def _parameters(compute: Callable[..., Any], band: bool, picture: Any) -> tuple[
     return parameters, [p.name for p in command_parameters]
 
 
-def _deliver(outcome: Outcome, table: Callable[[Any], Rows], path: Path, kind: str, as_json: bool) -> None:
-    """Save the picture, and print the metrics as JSON or as a table."""
+def _deliver(
+    outcome: Outcome, rows: Callable[[Any], Rows], picture: Path | None, kind: str, table: Path | None, as_json: bool
+) -> None:
+    """Save picture and table where they have paths, and print the metrics as JSON or as a table."""
     from ...core.files import write_bytes
     from ...core.plotting import picture_bytes
 
-    write_bytes(path, picture_bytes(outcome.result.plot(), kind))
+    written = {}
+    if picture is not None:
+        write_bytes(picture, picture_bytes(outcome.result.plot(), kind))
+        written["picture"] = str(picture)
+    if table is not None:
+        outcome.result.write(table)
+        written["table"] = str(table)
     if as_json:
-        print_json({**outcome.result.summary(), "picture": str(path)})
+        print_json({**outcome.result.summary(), **written})
         return
-    table(outcome.result).show()
+    rows(outcome.result).show()
     for note in outcome.notes:
         print_line(note)
-    print_line(f"picture: {path.resolve()}")
+    for name, path in written.items():
+        print_line(f"{name}: {Path(path).resolve()}")

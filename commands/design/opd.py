@@ -62,6 +62,10 @@ class FittedOpd:
             "residual_rms_nm": fit.residual_rms * 1e9,
         }
 
+    def write(self, path: str | Path) -> None:
+        """Write the Zernike terms as a table with units."""
+        self.fit.write(path)
+
     def plot(self) -> Figure:
         """Draw the map and the terms."""
         return self.opd.plot(self.fit, self.telescope.name)

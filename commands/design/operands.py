@@ -65,7 +65,8 @@ def _list_names(as_json: bool) -> None:
         print_json({"operands": [dict(zip(headings, row, strict=True)) for row in rows]})
         return
     caption = (
-        "In files {kind: EFFL, target: 50}, or min and max. Keys with * are needed. More kinds: docs/optimisation.md."
+        "In files {kind: EFFL, target: 50}, or min and max. Keys with * are needed. "
+        "More kinds: docs/howto/optimisation.md."
     )
     Rows(headings, rows, caption, left=4).show()
 

@@ -158,7 +158,7 @@ def optimize(
     """Optimise a telescope over chosen variables, compensators among them, with exact derivatives.
 
     A file has operands (focal length, distortion, edges, angles...), several configurations, bounds with units, glasses
-    to choose from the catalogue and random restarts; see docs/optimisation.md.
+    to choose from the catalogue and random restarts; see docs/howto/optimisation.md.
 
     **Examples**
 

@@ -11,7 +11,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, shown
 from ...core.units import field_label
 from ...models.paraxial import following_stop
@@ -31,7 +30,6 @@ from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
 _RINGS = 6
 
 
-@check_arguments
 @dataclass(frozen=True)
 class Beams:
     """Rays of a merit, and weights of a mean square over fields, shape [n_field]; they sum to 1."""

@@ -10,7 +10,7 @@ A file names its source, and has a table of CCDs::
       - {name: A1, x_mm: -16.9, y_mm: 0.0}
       - {name: A2, x_mm: 16.9, y_mm: 0.0, rotation_deg: 180, raft: A, dz_um: 12, rx_urad: 50}
 
-docs/camera.md has all keys.
+docs/howto/camera.md has all keys.
 """
 
 from __future__ import annotations

@@ -24,7 +24,8 @@ _NOTES: dict[Callable[..., Telescope], str] = {
     "out; Diagonal is its shadow.",
     schmidt.schmidt: "The plate stands at the centre of curvature of M1; its shape makes the first Seidel sum zero, "
     "with the neutral zone at 0.866 of its radius. The shadow of the detector is left out.",
-    paul_baker: "Spherical aberration, coma, astigmatism and Petzval sum of third order are zero (docs/paul_baker.md).",
+    paul_baker: "Spherical aberration, coma, astigmatism and Petzval sum of third order are zero "
+    "(docs/explanation/paul_baker.md).",
     lenses.singlet: "Bent so that third-order coma is zero with the stop at its front.",
     lenses.doublet: "Axial colour between the lines F and C and third-order spherical aberration are zero.",
     lenses.triplet: "Third-order aberrations and both colours are zero, but for a Petzval sum of 0.35 of the power.",

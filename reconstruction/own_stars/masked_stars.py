@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import DomainError
-from ...core.statistics import masked_median, robust_rms
+from ...core.statistics import RMS_PER_MAD, finite_row_medians, masked_median, robust_rms
 from ...measure.masked_moments import MOST_MASKED
 from ...measure.pixel_masks import bad_pixels, copied_pixels, fill_symmetric
 from ...measure.shapes import Shapes, measure_shapes
@@ -53,8 +53,8 @@ def sky_of_stamps(images: np.ndarray, bad: np.ndarray, radius: float) -> tuple[n
     sky = np.where(bad[:, outside], np.nan, images[:, outside])
     sparse = (~bad[:, outside]).sum(axis=1) < min(_FEWEST_SKY, outside.sum())
     level, rms = np.full((2, len(images)), np.nan)
-    level[~sparse] = np.nanmedian(sky[~sparse], axis=1)
-    rms[~sparse] = robust_rms(sky[~sparse], axis=1)
+    level[~sparse] = finite_row_medians(sky[~sparse])
+    rms[~sparse] = RMS_PER_MAD * finite_row_medians(np.abs(sky[~sparse] - level[~sparse, None]))
     for i in np.flatnonzero(sparse & ~bad.all(axis=(1, 2))):
         far = ~bad[i] & (distance >= np.quantile(distance[~bad[i]], 1.0 - _OUTERMOST))
         level[i] = np.median(images[i][far])

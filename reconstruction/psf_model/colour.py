@@ -3,8 +3,8 @@
 A spectrum S within a band makes the PSF that is the mean of those of its wavelengths, each by its photons. As far as
 these are linear in the wavelength, it is that of the mean wavelength alone: with the mean wavelength of each star as
 its colour, a model of stars holds for any other spectrum, such as a galaxy's. What that leaves is of second order: the
-light that air spreads has its own variance in each spectrum (docs/colour.md). Colours of two bands, and temperatures,
-are as good as their relation to the mean wavelength is linear.
+light that air spreads has its own variance in each spectrum (docs/explanation/colour.md). Colours of two bands,
+and temperatures, are as good as their relation to the mean wavelength is linear.
 """
 
 from __future__ import annotations

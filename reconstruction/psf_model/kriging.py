@@ -7,21 +7,20 @@ the ellipticity and the size. The pixels follow these numbers, and vary by what 
 (:mod:`~.psf_model.pixel_fields`). The noise of a star is that of its outer pixels and of its photons.
 
 Nothing is left to choose: on constant, linear and quadratic fields this comes near to the best of the polynomials, with
-the best weights, and on turbulent ones it is better (docs/psf_models.md).
+the best weights, and on turbulent ones it is better (docs/howto/psf_models.md).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Literal, Self
 
 import numpy as np
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.statistics import RMS_PER_MAD, row_medians
+from ...core.statistics import RMS_PER_MAD, finite_row_medians, row_medians
 from ...core.threads import one_blas_thread
 from .colour import FittedColour
 from .covariance import COLUMNS, Covariances, fit_covariances, krige, krige_mean, predict
@@ -373,7 +372,7 @@ def _sky_variance(outer: np.ndarray, masked: np.ndarray | None = None) -> np.nda
     About a mean with equal weights bright stars would have the noise of the faint ones.
     """
     variance = np.ones(len(outer))
-    median: Any = row_medians if masked is None else partial(np.nanmedian, axis=1)
+    median: Any = row_medians if masked is None else finite_row_medians
     for _ in range(_SKY_PASSES):
         weights = 1.0 / np.maximum(variance, _LEAST_SKY * variance.max())
         weights /= weights.sum()

@@ -153,7 +153,7 @@ class Recipe:
         return None if snr is None else snr_weights(self.weights, snr)
 
 
-#: The recipe where nothing is said: the best that knows nothing of the PSF (docs/psf_models.md).
+#: The recipe where nothing is said: the best that knows nothing of the PSF (docs/howto/psf_models.md).
 DEFAULT = Recipe(Pixels(), Kriging())
 #: Recipes by name; ``paper`` is that of Jee & Tyson 2011, sec. 3.
 RECIPES: Mapping[str, Recipe] = {"kriging": DEFAULT, "paper": Recipe(PrincipalComponents(), Polynomial())}

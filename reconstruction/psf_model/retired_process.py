@@ -1,7 +1,7 @@
 """Gaussian processes of each component in files of earlier versions, which kriging has replaced: read and evaluated.
 
 Each component has a squared-exponential kernel of its own over a polynomial trend, which is not shrunk. On noise-free
-PSFs and on noisy stars :class:`~.kriging.Kriging` predicts shapes better (docs/psf_models.md).
+PSFs and on noisy stars :class:`~.kriging.Kriging` predicts shapes better (docs/howto/psf_models.md).
 """
 
 from __future__ import annotations

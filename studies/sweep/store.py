@@ -104,7 +104,7 @@ class SweepStore:
             self._connection = sqlite3.connect(path, timeout=30.0)
             about = dict(self._connection.execute("SELECT key, value FROM about"))
         if about.get("format") != str(FORMAT):
-            reason = "; those of 1 name the CCDs of the LSST as in a mirror (docs/camera.md): make it again"
+            reason = "; those of 1 name the CCDs of the LSST as in a mirror (docs/howto/camera.md): make it again"
             raise ProductError(f"store of format {about.get('format')}: expected {FORMAT}{reason}", file=path)
         self.about = about
 

@@ -37,8 +37,8 @@ def check(capsys, folder, command):
     options, words = COMMANDS[command]
     assert main([command, "paul_baker", *options, "--json"]) == 0
     metrics = json.loads(capsys.readouterr().out)
-    assert (metrics["telescope"], metrics["picture"]) == ("paul_baker", f"{command}_paul_baker.png")
-    assert (folder / metrics["picture"]).read_bytes().startswith(b"\x89PNG")
+    assert metrics["telescope"] == "paul_baker"
+    assert list(folder.iterdir()) == []
     assert main([command, "paul_baker", *options, "-o", "picture.svg"]) == 0
     out = capsys.readouterr().out
     assert words in out

@@ -13,6 +13,7 @@ import time
 
 import pytest
 
+import pachon
 from pachon.commands import cli
 from pachon.commands.cli import main
 from pachon.commands.imports import import_modules
@@ -54,7 +55,7 @@ def test_a_group_alone_prints_its_help_and_no_error(capsys, group):
 
 def test_version(capsys):
     assert main(["--version"]) == 0
-    assert capsys.readouterr().out == "pachon 0.1.0\n"
+    assert capsys.readouterr().out == f"pachon {pachon.__version__}\n"
 
 
 @pytest.mark.long

@@ -5,7 +5,9 @@ import json
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import QTable
 
+import pachon
 from pachon.commands.cli import main
 
 MAGIC = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}
@@ -40,14 +42,47 @@ def model_of(command):
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", COMMANDS)
-def test_json_is_the_only_output_and_the_picture_has_its_name(capsys, in_folder, command):
+def test_json_is_the_only_output_and_writes_no_picture(capsys, in_folder, command):
     model, wavelength = model_of(command)
-    assert main([command, model, *COMMANDS[command][0], "--json"]) == 0
+    assert main([command, model, *COMMANDS[command][0], "--json", "--table", "numbers.ecsv"]) == 0
     metrics = json.loads(capsys.readouterr().out)
     assert metrics[MODEL_KEY.get(command, "telescope")] == model
     assert metrics.get("wavelength_nm", wavelength) in (wavelength, [wavelength])
-    assert metrics["picture"] == STEM.get(command, f"{command}_{{}}").format(model, wavelength) + ".png"
-    assert (in_folder / metrics["picture"]).read_bytes().startswith(MAGIC["png"])
+    assert "picture" not in metrics
+    assert list(in_folder.glob("*.png")) == []
+    assert len(QTable.read(in_folder / "numbers.ecsv")) > 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_picture_has_its_name(capsys, in_folder, command):
+    model, wavelength = model_of(command)
+    assert main([command, model, *COMMANDS[command][0]]) == 0
+    name = STEM.get(command, f"{command}_{{}}").format(model, wavelength) + ".png"
+    assert capsys.readouterr().out.splitlines()[-1] == f"picture: {in_folder / name}"
+    assert (in_folder / name).read_bytes().startswith(MAGIC["png"])
+
+
+@pytest.mark.parametrize("table", ["numbers.txt", "numbers"])
+def test_the_ending_of_a_table_is_checked_first(capsys, in_folder, table):
+    assert main(["spots", "paul_baker", "--table", table]) == 2
+    assert (
+        capsys.readouterr().err
+        == f"pachon: error: --table = {table}: expected a name that ends in .ecsv, .csv, .fits, .parquet\n"
+    )
+
+
+def test_tables_of_spots_have_their_numbers_and_no_picture(capsys, in_folder):
+    for ending in ("csv", "fits"):
+        options = ["spots", "paul_baker", "--field-deg", "0.3", "--no-picture", "--table", f"spots.{ending}"]
+        assert main(options) == 0
+        assert capsys.readouterr().out.splitlines()[-1] == f"table: {in_folder / f'spots.{ending}'}"
+    spots = pachon.spots(pachon.paul_baker(), [np.deg2rad([0.3, 0.0])])
+    assert QTable.read(in_folder / "spots.csv")["rms_radius [m]"][0] == pytest.approx(spots.rms_radius.item())
+    assert QTable.read(in_folder / "spots.fits")["rms_radius"][0].to_value("m") == pytest.approx(
+        spots.rms_radius.item()
+    )
+    assert sorted(path.name for path in in_folder.iterdir()) == ["spots.csv", "spots.fits"]
 
 
 @pytest.mark.long
@@ -116,6 +151,7 @@ def test_maps_and_double_zernikes(capsys, in_folder):
     assert main(["zernikes", "paul_baker", "--jmax", "6", "--double", "6", "--json"]) == 0
     metrics = json.loads(capsys.readouterr().out)
     assert np.shape(metrics["double_zernike_nm"]) == (6, 6)
+    assert main(["zernikes", "paul_baker", "--jmax", "6", "--double", "6"]) == 0
     assert (in_folder / "double_zernikes_paul_baker.png").exists()
 
 

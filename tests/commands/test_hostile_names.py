@@ -118,7 +118,7 @@ def test_everyday_names_with_a_slash_draw(folder, capsys):
     pachon.save_telescope(lens("Newton f/5"), "newton.yaml")
     pachon.save_telescope(lens("Newton f:5"), "other.yaml")
     for file in ("newton.yaml", "other.yaml"):
-        assert main(["draw", file, "--json"]) == 0
+        assert main(["draw", file]) == 0
     # Two names, two files.
     assert len(list(folder.glob("draw_Newton f_5-*.png"))) == 2
 

@@ -23,7 +23,7 @@ def in_a_folder(tmp_path, monkeypatch):
 
 def test_the_matrix_is_printed_and_saved(tmp_path, capsys):
     chosen = ["--parameters", "M2.dz,M3.radius", "--field-deg", "0", "--field-deg", "0.3,0.2", "--zernikes", "11"]
-    assert main(["sensitivity", "paul_baker", *chosen, "--json"]) == 0
+    assert main(["sensitivity", "paul_baker", *chosen, "--json", "--picture", "matrix.png"]) == 0
     printed = json.loads(capsys.readouterr().out)
     expected = sensitivity(
         pachon.load_telescope("paul_baker"), ["M2.dz", "M3.radius"], np.deg2rad([[0, 0], [0.3, 0.2]]), n_zernike=11
@@ -34,7 +34,7 @@ def test_the_matrix_is_printed_and_saved(tmp_path, capsys):
     assert np.array_equal(hdus["MATRIX"].data, expected.matrix)
     assert list(hdus["PARAMETERS"].data["ADDRESS"]) == ["M2.dz", "M3.radius"]
     assert np.allclose(hdus["FIELDS"].data["X"], [0.0, 0.3])
-    assert (tmp_path / "sensitivity_paul_baker.png").stat().st_size > 1000
+    assert (tmp_path / "matrix.png").stat().st_size > 1000
 
 
 def test_tables(tmp_path, capsys):

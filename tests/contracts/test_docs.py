@@ -13,7 +13,11 @@ from pachon.models.io.bundled import DATA
 from pachon.reconstruction.psf_model.model import PsfModel
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGES = {path.name: path.read_text(encoding="utf-8") for path in sorted(DOCS.glob("*.md"))}
+#: Folders of pages, by what a reader needs; the gallery has tests of its own.
+FOLDERS = ("tutorials", "howto", "explanation", "evidence", "reference")
+PATHS = {path.name: path for folder in FOLDERS for path in sorted((DOCS / folder).glob("*.md"))}
+PAGES = {name: path.read_text(encoding="utf-8") for name, path in PATHS.items()}
+INDEX = (DOCS / "index.md").read_text(encoding="utf-8")
 BLOCK = re.compile(r"```python\n(.*?)```", flags=re.S)
 LENSES = Path(__file__).parents[1] / "data" / "zmx"
 OPTILAND = Path(__file__).parents[1] / "data" / "lensfiles" / "cooke_triplet.json"
@@ -92,7 +96,7 @@ def test_the_page_of_the_focal_plane_model_runs_on_a_run(tmp_path, monkeypatch, 
 @pytest.mark.parametrize("name", PAGES)
 def test_pictures_and_links_are_there(name):
     for target in re.findall(r"\]\(([^)#:]+)\)", PAGES[name]):
-        assert (DOCS / target).exists(), target
+        assert (PATHS[name].parent / target).exists(), target
 
 
 @pytest.mark.parametrize("name", PAGES)
@@ -113,5 +117,15 @@ def test_the_page_of_psf_models_names_what_the_model_has():
 
 
 def test_every_page_is_in_the_index():
-    listed = re.findall(r"<(\w+)>$", PAGES["index.md"], flags=re.M)
-    assert sorted(listed) == sorted(Path(name).stem for name in PAGES if name != "index.md")
+    folders = "|".join(FOLDERS)
+    listed = re.findall(rf"<((?:{folders})/(?!api_|commands)\w+)>$", INDEX, flags=re.M)
+    assert sorted(listed) == sorted(path.relative_to(DOCS).with_suffix("").as_posix() for path in PATHS.values())
+
+
+@pytest.mark.parametrize("name", [name for name, path in PATHS.items() if path.parent.name != "evidence"])
+def test_sentences_are_short(name):
+    text = re.sub(r"```.*?```", "", PAGES[name], flags=re.S)
+    # Code, tables, headings and pictures are no sentences.
+    text = "\n".join(line for line in text.splitlines() if not re.match(r"^( {4}|\||#|!\[)", line))
+    sentences = re.split(r"(?<=[.!?])\s+|\n\s*\n|\n[*-] ", text)
+    assert [s for s in sentences if len(re.findall(r"[A-Za-z][\w'-]*", s)) > 35] == []

@@ -93,7 +93,7 @@ def test_pages_show_options_as_they_are_typed(pages, monkeypatch):
     assert runpy.run_path(str(DOCS / "conf.py"))["smartquotes"] is False
 
 
-@pytest.mark.parametrize("path", [*DOCS.glob("*.md"), *GALLERY], ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", [*DOCS.rglob("*.md")], ids=lambda path: path.stem)
 def test_links_within_the_pages_lead_somewhere(path):
     text = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.S)
     for target, anchor in re.findall(r"\]\((?!https?:)([^)#\s]*)#([^)\s]+)\)", text):

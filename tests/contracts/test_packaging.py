@@ -1,10 +1,15 @@
 """Files beside the package: citation and version agree, workflows are valid YAML."""
 
 import re
+import runpy
+import subprocess
+import tarfile
 import tomllib
+import zipfile
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from packaging.requirements import Requirement
@@ -43,14 +48,14 @@ def test_workflows_run_what_is_there():
         steps = [step for job in jobs for step in job.get("steps", [])]
         assert steps
         for command in (step["run"] for step in steps if step.get("run", "").startswith((".ci/", "pytest"))):
-            target = command.split()[-1] if command.startswith("pytest") else command
+            target = command.split()[-1] if command.startswith("pytest") else command.split()[0]
             assert (ROOT / target).exists(), command
     read_the_docs = yaml.safe_load((ROOT / ".readthedocs.yaml").read_text(encoding="utf-8"))
     assert (ROOT / read_the_docs["sphinx"]["configuration"]).is_file()
 
 
 def test_the_install_page_lists_the_extras():
-    page = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "howto" / "install.md").read_text(encoding="utf-8")
     table = page[page.index("## Extras") : page.index("## Without a network")]
     rows = re.findall(r"^\| (`.+?) \|", table, flags=re.M)[1:]
     listed = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
@@ -101,16 +106,48 @@ def test_nothing_is_claimed_below_what_was_found_to_work(name, lowest):
     assert all(_bound(r) >= Version(lowest) for r in requirements)
 
 
-def test_the_lowest_versions_are_tested_by_the_documented_commands():
+def test_both_ends_of_the_dependencies_are_tested_by_the_documented_script():
     page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    section = page[page.index("**Lowest versions.**") :]
-    documented = [line.strip() for line in re.findall(r"^ {4}(.+)$", section, flags=re.M)[:3]]
-    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "test.yml").read_text(encoding="utf-8"))
-    steps = workflow["jobs"]["lowest"]["steps"]
-    assert "\n".join(step["run"] for step in steps if "run" in step).splitlines() == documented
-    assert any("--resolution lowest-direct" in line for line in documented)
-    python = next(step["with"]["python-version"] for step in steps if "python-version" in step.get("with", {}))
-    assert PROJECT["project"]["requires-python"] == f">={python}"
+    script = (ROOT / ".ci" / "versions").read_text(encoding="utf-8")
+    job = yaml.safe_load((ROOT / ".github" / "workflows" / "test.yml").read_text(encoding="utf-8"))["jobs"]["versions"]
+    pythons = {ends["versions"]: ends["python"] for ends in job["strategy"]["matrix"]["include"]}
+    newest = max((c.rpartition(" ")[2] for c in PROJECT["project"]["classifiers"] if ":: 3." in c), key=Version)
+    assert pythons == {"lowest": PROJECT["project"]["requires-python"].removeprefix(">="), "newest": newest}
+    for end, resolution in (("lowest", "lowest-direct"), ("newest", "highest")):
+        assert f"    .ci/versions {end}" in page
+        assert f"{end}) python=python{pythons[end]} resolution={resolution} " in script
+    assert ".ci/versions ${{ matrix.versions }}" in [step.get("run") for step in job["steps"]]
+    assert subprocess.run([ROOT / ".ci" / "versions", "oldest"], capture_output=True).returncode == 2
+
+
+def test_archives_that_lack_a_file_or_have_one_too_many_are_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    check = runpy.run_path(str(ROOT / ".ci" / "check_archives.py"))
+    tracked, info = ["core/version.py", "pachon/__init__.py", "tests/x.py", "docs/images/big.png"], "pachon-1.dist-info"
+    whole = ["pachon/core/version.py", "pachon/__init__.py"]
+    whole += [f"{info}/{name}" for name in ("METADATA", "RECORD", "entry_points.txt", "licenses/LICENSE")]
+    for names, problems in (
+        (whole, []),
+        (whole[1:], ["lacks pachon/core/version.py"]),
+        (whole[:-1], ["lacks licenses/LICENSE of its metadata"]),
+        ([*whole, "pachon/tests/x.py"], ["has pachon/tests/x.py, which is not tracked"]),
+    ):
+        with zipfile.ZipFile(tmp_path / "a.whl", "w") as wheel:
+            for name in names:
+                wheel.writestr(name, "")
+        assert check["wheel_problems"](tmp_path / "a.whl", tracked) == [f"a.whl: {p}" for p in problems]
+    (tmp_path / "noise").write_bytes(np.random.default_rng(1).bytes(5_100_000))
+    for names, problems in (
+        (["a"], ["a.tar.gz: lacks b"]),
+        (["a", "b", "c"], ["a.tar.gz: has c, which is not tracked"]),
+    ):
+        with tarfile.open(tmp_path / "a.tar.gz", "w:gz", compresslevel=1) as source:
+            for name in names:
+                source.addfile(tarfile.TarInfo(f"pachon-1/{name}"))
+        assert check["source_problems"](tmp_path / "a.tar.gz", ["a", "b", "docs/images/big.png"]) == problems
+    with tarfile.open(tmp_path / "a.tar.gz", "w:gz", compresslevel=1) as source:
+        source.add(tmp_path / "noise", "pachon-1/a")
+    assert "expected at most 5000000" in check["source_problems"](tmp_path / "a.tar.gz", ["a"])[0]
 
 
 def test_releases_are_built_from_pinned_and_hashed_packages():
@@ -124,8 +161,15 @@ def test_releases_are_built_from_pinned_and_hashed_packages():
     assert {line for line in asked if line and not line.startswith("#")} <= set(pinned)
     assert all(pinned[requirement.name] >= _bound(requirement) for requirement in REQUIREMENTS["build"])
     workflow = (ROOT / ".github" / "workflows" / "build.yml").read_text(encoding="utf-8")
-    assert "--require-hashes -r .github/requirements/build.txt" in workflow
-    assert "build --no-isolation" in workflow
+    script = (ROOT / ".ci" / "archives").read_text(encoding="utf-8")
+    assert "run: .ci/archives" in workflow
+    for step in (
+        "--require-hashes -r .github/requirements/build.txt",
+        "build --no-isolation",
+        "twine",
+        "check_archives",
+    ):
+        assert step in script
 
 
 def test_the_recipe_for_conda_asks_for_what_the_package_asks_for():
@@ -140,3 +184,8 @@ def test_the_source_archive_keeps_the_pictures_of_the_readme():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     kept = {line[1:] for line in PROJECT["tool"]["hatch"]["build"]["targets"]["sdist"]["exclude"] if line[0] == "!"}
     assert set(re.findall(r"\((docs/images/\S+?)\)", readme)) == kept
+
+
+def test_the_newest_section_of_the_changelog_is_that_of_the_version():
+    headings = re.findall(r"^## (.+)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), flags=re.M)
+    assert re.fullmatch(r"\[" + re.escape(VERSION) + r"\] - (unreleased|\d{4}-\d{2}-\d{2})", headings[0])

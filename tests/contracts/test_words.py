@@ -57,7 +57,7 @@ def test_constants_stand_one_a_line():
     assert packed == []
 
 
-@pytest.mark.parametrize("page", ["docs/architecture.md", "docs/images/architecture.svg"])
+@pytest.mark.parametrize("page", ["docs/explanation/architecture.md", "docs/images/architecture.svg"])
 def test_files_of_the_architecture_exist(page):
     text = (ROOT / page).read_text(encoding="utf-8")
     named = set(re.findall(r"[a-z_/]+\.py\b", text))

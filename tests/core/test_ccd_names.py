@@ -13,7 +13,9 @@ from pachon.studies.baseline.baseline import bundled_baselines
 from pachon.studies.baseline.file import read_baseline
 from pachon.studies.sweep.store import SweepStore
 
-WORDS = f"in a mirror .docs/camera.md.: expected version {NAMES_VERSION} of the names, found 1; make the file again"
+WORDS = (
+    f"in a mirror .docs/howto/camera.md.: expected version {NAMES_VERSION} of the names, found 1; make the file again"
+)
 
 
 @pytest.mark.parametrize("name", ["R22_S12", "R01_S00", "R00_SW1", "R44_SG0"])

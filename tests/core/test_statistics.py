@@ -6,6 +6,7 @@ from pachon.core.statistics import (
     column_percentile,
     finite_mean,
     finite_median,
+    finite_row_medians,
     masked_median,
     rms,
     robust_rms,
@@ -53,3 +54,12 @@ def test_medians_and_percentiles_of_rows_and_columns_have_numpys_bits(count):
     assert np.array_equal(row_medians(values.T), np.median(values, axis=0))
     for percent in (0.0, 13.0, 50.0, 80.0, 100.0):
         assert np.array_equal(column_percentile(rising, percent), np.percentile(values, percent, axis=0))
+
+
+def test_medians_of_the_finite_values_of_rows():
+    rng = np.random.default_rng(5)
+    values = rng.normal(size=(9, 20))
+    values[rng.random(values.shape) < np.linspace(0.0, 1.0, 9)[:, None]] = np.nan
+    assert np.array_equal(finite_row_medians(values[:8]), np.nanmedian(values[:8], axis=1))
+    assert np.isnan(values[8]).all()
+    assert np.isnan(finite_row_medians(values)[8])

@@ -4,6 +4,7 @@ from astropy import units as u
 from scipy import optimize
 
 from pachon.core.errors import DomainError
+from pachon.measure import shapes
 from pachon.measure.shapes import ShapeFlag, fwhm, measure_shapes
 
 ARCSEC = np.pi / 180.0 / 3600.0
@@ -219,3 +220,15 @@ def test_bad_arguments():
         measure_shapes(image, PIXEL, WEIGHT, tolerance=0.0)
     with pytest.raises(DomainError, match="upsampling"):
         fwhm(image, PIXEL, upsampling=1)
+
+
+def test_area_above_a_level_takes_the_slope_of_every_pixel():
+    rng = np.random.default_rng(8)
+    y, x = np.indices((40, 33))
+    for noise in (0.0, 0.02, 0.5):
+        image = np.exp(-0.5 * ((x - 15.0) ** 2 + (y - 21.0) ** 2) / 36.0) + noise * rng.normal(size=x.shape)
+        slope = np.hypot(*np.gradient(image)[::-1])
+        border = np.abs(image - 0.5) < 0.5 * slope
+        covered = (image > 0.5).astype(float)
+        covered[border] = 0.5 + (image[border] - 0.5) / slope[border]
+        assert shapes._area_above(image, 0.5) == covered.sum()

@@ -3,7 +3,7 @@ import pytest
 
 from pachon.core.errors import DomainError
 from pachon.measure.stamps import observe_stamps
-from pachon.measure.star_selection import StarFlag, _correlate, flag_stars
+from pachon.measure.star_selection import MatchedFilter, StarFlag, flag_stars
 from pachon.pipeline.simulate.star_defects import add_defects
 from pachon.reconstruction.psf_model.model import PsfModel
 
@@ -168,4 +168,4 @@ def test_the_matched_filter_is_the_sum_over_pixels():
                 place = tuple(a + p - q for a, p, q in zip(at, pixel, peak, strict=True))
                 if all(0 <= i < n for i, n in zip(place, shape, strict=True)):
                     expected[at] += star[pixel] * image[place]
-        np.testing.assert_allclose(_correlate(image, star, peak), expected, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(MatchedFilter.of(star).light(image), expected, rtol=0, atol=1e-12)

@@ -34,7 +34,8 @@ def test_a_layer_may_have_a_wind_direction(tmp_path):
 
 
 def test_the_site_file_of_the_docs_has_every_key(tmp_path):
-    block = re.search(r"```yaml\n(# my_site.yaml.*?)```", (DOCS / "running.md").read_text(), flags=re.S).group(1)
+    page = (DOCS / "howto" / "running.md").read_text()
+    block = re.search(r"```yaml\n(# my_site.yaml.*?)```", page, flags=re.S).group(1)
     path = tmp_path / "my_site.yaml"
     path.write_text(block)
     site = load_site(path)

@@ -49,13 +49,13 @@ def test_wavefront_of_a_donut_is_that_of_batoid():
         for optic in (behind, true)
     )
     assert np.linalg.norm(after - before) > 60e-9
-    # Rims of 700 rays across, and 3e-3 of the wavefront (docs/donuts.md).
+    # Rims of 700 rays across, and 3e-3 of the wavefront (docs/explanation/donuts.md).
     assert np.linalg.norm(fit.zernikes[0] - (after - before)) < 6e-9
 
 
 @pytest.mark.long
 def test_a_moved_camera_is_not_a_moved_detector():
-    """The wavefront that a fit under the wrong body takes for the telescope's (docs/donuts.md)."""
+    """The wavefront that a fit under the wrong body takes for the telescope's (docs/explanation/donuts.md)."""
     telescope, optic = pachon.load_telescope("lsst_v3.3_r"), batoid.Optic.fromYaml("LSST_r.yaml")
     fields = np.deg2rad([0.0, 0.5, 1.0, 1.5, 1.75])
     shift = (0.0, 0.0, 1.5e-3)

@@ -17,7 +17,7 @@ def benchmarks(monkeypatch):
 
 
 def assert_close(found):
-    """A nanometre of rays, 1e-3 waves of OPD are asked for; what is found is far below them (docs/validation.md)."""
+    """A nanometre of rays, 1e-3 waves of OPD are asked for; the results are far below (docs/evidence/validation.md)."""
     assert found.ray < 1e-12
     assert found.spot < 1e-12
     assert found.focus < 5e-9

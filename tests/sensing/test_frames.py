@@ -33,7 +33,7 @@ def test_axes_are_those_that_the_table_of_frames_says():
     np.testing.assert_allclose(at.axes("CCS"), [[c, s, 0], [-s, c, 0], [0, 0, 1]], atol=1e-15)
     np.testing.assert_allclose(at.axes("DVCS")[:2], [[-s, c, 0], [c, s, 0]], atol=1e-15)
     np.testing.assert_array_equal(at.axes("ZCS"), np.diag([-1.0, 1.0, -1.0]))
-    # xi = X cos rho + Y sin rho, eta = -X sin rho + Y cos rho (docs/conventions.md).
+    # xi = X cos rho + Y sin rho, eta = -X sin rho + Y cos rho (docs/explanation/conventions.md).
     x, y = 0.3, -0.2
     rho = np.deg2rad(10.0)
     xi, eta = x * np.cos(rho) + y * np.sin(rho), -x * np.sin(rho) + y * np.cos(rho)

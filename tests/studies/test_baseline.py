@@ -382,7 +382,7 @@ def first_figure(content):
     ("change", "words"),
     [
         (lambda c: c.update(format="other"), ["format = 'other'", "pachon baseline"]),
-        (lambda c: c.update(version=5), ["version = 5", "expected 3 or 4", "pachon 0.1.0"]),
+        (lambda c: c.update(version=5), ["version = 5", "expected 3 or 4", f"pachon {pachon.__version__}"]),
         (lambda c: first_figure(c).update(limit={}), ["limit", "expected max or min"]),
         (lambda c: first_figure(c).update(limit={"most": 1}), ["limit", "most"]),
         (lambda c: c.update(model="lsst_v3.3_q"), ["lsst_v3.3_q"]),

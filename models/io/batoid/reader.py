@@ -5,7 +5,7 @@ their order. The frame is batoid's global one, which is ours: +z towards the sky
 groups, whose motions pivot about their own origins, as in batoid.
 
 What batoid has no place for stands under the key ``pachon`` beside ``opticalSystem``, or has a default. An unknown key
-is an error, or with `lenient` a warning; the page docs/batoid.md has the tables.
+is an error, or with `lenient` a warning; the page docs/howto/batoid.md has the tables.
 """
 
 from __future__ import annotations

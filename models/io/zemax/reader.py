@@ -2,7 +2,7 @@
 
 Coordinate breaks become positions and rotations of the surfaces behind them, and nothing else remains of them. A line
 that is not understood is an error that names file, surface and keyword, or with `lenient` a warning; keywords that have
-no effect on rays are listed in `file`. The page docs/zemax.md has the tables.
+no effect on rays are listed in `file`. The page docs/reference/zemax.md has the tables.
 """
 
 from __future__ import annotations

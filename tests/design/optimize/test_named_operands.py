@@ -369,7 +369,7 @@ def test_numbers_that_a_telescope_does_not_have(biconvex, name, numbers, words):
 
 
 def test_the_page_lists_every_name():
-    page = (Path(__file__).parents[3] / "docs" / "operands.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "reference" / "operands.md").read_text(encoding="utf-8")
     listed = re.findall(r"`([A-Z]{2,4})`", page.partition("## What is not there")[0])
     assert sorted(set(listed)) == sorted(NAMES)
 

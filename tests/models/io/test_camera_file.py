@@ -42,7 +42,7 @@ def test_a_file_is_read_with_its_units(file):
 
 
 def test_the_file_of_the_docs_has_every_key(tmp_path):
-    page = (Path(__file__).parents[3] / "docs" / "camera.md").read_text()
+    page = (Path(__file__).parents[3] / "docs" / "howto" / "camera.md").read_text()
     path = tmp_path / "my_camera.yaml"
     path.write_text(re.search(r"```yaml\n(# my_camera.yaml.*?)```", page, flags=re.S).group(1))
     camera = load_camera(path)

@@ -225,7 +225,7 @@ def test_bad_tolerances(arguments, words):
 
 
 def test_the_page_runs(tmp_path, monkeypatch, capsys):
-    page = (Path(__file__).parents[3] / "docs" / "perturbations.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "howto" / "perturbations.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     names = {}
     for block in re.findall(r"```python\n(.*?)```", page, flags=re.S):

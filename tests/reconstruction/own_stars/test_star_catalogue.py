@@ -207,7 +207,7 @@ def test_the_example_of_the_documentation_runs(tmp_path, monkeypatch):
     stamps[3, 4:8, 20] += 5000.0
     catalogue(tmp_path / "my_stars.fits", stamps, positions)
     monkeypatch.chdir(tmp_path)
-    page = (Path(__file__).parents[3] / "docs" / "psf_models.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "howto" / "psf_models.md").read_text(encoding="utf-8")
     names = {}
     for block in re.findall(r"```python\n(.*?)```", page, flags=re.S):
         exec(compile(block, "psf_models.md", "exec"), names)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.io import fits
 
 from pachon.core.errors import ConfigError, ProductError
 from pachon.reconstruction.psf_model import file
@@ -81,13 +82,20 @@ def test_the_call_of_python_is_the_recipe():
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_files_of_earlier_versions_are_read_as_they_were(path, tmp_path):
+def test_files_of_earlier_versions_are_read_as_they_were(path, tmp_path, monkeypatch):
     model, expected = PsfModel.read(path), np.load(path.with_suffix(".npz"))
     basis, interpolation = path.stem.split("_")
     assert (model.basis.name, model.interpolation.name) == (basis, interpolation.replace("weights", "polynomial"))
     assert model.at(expected["places"]).tobytes() == expected["images"].tobytes()
-    # Rounding of the peak, 0.1.
-    np.testing.assert_allclose(model.leave_one_out(), expected["left_out"], rtol=0.0, atol=1e-15)
+    # Rounding of the peak, 0.1. Kriging solves with the covariance, and the rounding of solvers (LAPACK's differ by its
+    # version) grows by its condition number, 2e5: 4e-12 at most.
+    peak, tolerance = np.abs(expected["left_out"]).max(), 1e-15
+    if interpolation == "kriging":
+        tolerance = np.finfo(float).eps * np.linalg.cond(covariance_of(model)).max() * peak
+        assert tolerance < 1e-10 * peak
+    np.testing.assert_allclose(model.leave_one_out(), expected["left_out"], rtol=0.0, atol=tolerance)
+    # The file is the same again, but for the version that wrote it.
+    monkeypatch.setattr("pachon.reconstruction.psf_model.model.CREATOR", fits.getheader(path).cards["CREATOR"])
     model.write(tmp_path / "again.fits")
     assert (tmp_path / "again.fits").read_bytes() == path.read_bytes()
 

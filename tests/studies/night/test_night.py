@@ -1,10 +1,12 @@
 """Nights of visit lists: what comes out, with what bytes, and what is said of visits that fail."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pachon.commands.night import listed_visit
 from pachon.core.errors import ConfigError, DomainError, ProductError
 from pachon.core.long_work import Execution
 from pachon.core.products import read_fits
@@ -172,3 +174,11 @@ def test_psfs_alone(night_config, tmp_path):
     assert np.isnan(rows["modelDeltaE1Rms"]).all()
     assert np.isfinite(rows["psfSigma"]).all()
     assert not list(tmp_path.glob("*.hsp"))
+
+
+def test_a_single_visit_may_have_a_model_of_the_focal_plane(night_config):
+    # Visits of a whole night are modelled CCD by CCD; that is no limit of a run of one of them.
+    night = night_config(run={"reconstruction": {"model": "focal_plane"}})
+    with pytest.raises(ConfigError, match="expected ccd for visits of a list"):
+        night.read_list()
+    assert listed_visit(night.run, Path(night.visits.list), 1003, None, None, None).visit == 1003

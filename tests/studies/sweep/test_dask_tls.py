@@ -1,4 +1,4 @@
-"""A sweep on a Dask cluster over TLS with certificates of one's own, as docs/security.md describes it."""
+"""A sweep on a Dask cluster over TLS with certificates of one's own, as docs/reference/security.md describes it."""
 
 import os
 import shutil
