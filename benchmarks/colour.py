@@ -18,9 +18,9 @@ import numpy as np
 from scipy import fft
 
 import pachon
+from pachon.measure import ShearEstimator
 from pachon.measure.rho_statistics import trace_of_moments
-from pachon.measure.shear.estimator import ShearEstimator
-from pachon.models.io.site_file import load_site
+from pachon.models import load_site
 from pachon.wavefront.atmosphere.refraction import dispersion_shift
 
 ARCSEC = np.pi / 648000

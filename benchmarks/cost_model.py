@@ -24,8 +24,8 @@ from pathlib import Path
 import numpy as np
 
 import pachon
-from pachon.pipeline.config import Configuration, with_options
-from pachon.pipeline.experiment import Experiment
+from pachon import Configuration, Experiment
+from pachon.pipeline.config import with_options
 from pachon.pipeline.run_folder import stamp_of, write_ccd
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd
 from pachon.pipeline.simulate.ccd_loop import simulate_ccds

@@ -20,7 +20,7 @@ import numpy as np
 import pachon
 from pachon.core.files import write_bytes
 from pachon.core.plotting import BLUE, ORANGE, picture_bytes, styled
-from pachon.studies.alignment.config import AlignConfig
+from pachon.studies import AlignConfig
 from pachon.studies.alignment.scene import AlignmentScene
 
 STARS = int(sys.argv[1]) if len(sys.argv) > 1 else 40

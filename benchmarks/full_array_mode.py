@@ -23,7 +23,7 @@ import pachon
 from pachon.core.files import write_bytes
 from pachon.core.plotting import picture_bytes
 from pachon.pipeline.simulate.donuts import STAMP_SIZE
-from pachon.studies.alignment.config import AlignConfig
+from pachon.studies import AlignConfig
 from pachon.studies.alignment.scene import AlignmentScene
 
 COUNT = int(sys.argv[1]) if len(sys.argv) > 1 else 189

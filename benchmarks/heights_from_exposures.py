@@ -25,16 +25,15 @@ import numpy as np
 from astropy.table import Table
 
 import pachon
+from pachon import Configuration, Experiment, FocalPlaneStars
 from pachon.core.units import ARCSEC
-from pachon.models.camera.camera import Camera
-from pachon.pipeline.config import Configuration
-from pachon.pipeline.experiment import Experiment
+from pachon.models import Camera
 from pachon.pipeline.focal_plane_stage import instrument_of
 from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
 from pachon.pipeline.simulate.ccd_observation import observe_ccd
 from pachon.reconstruction.focal_plane_psf.covariance import Places
 from pachon.reconstruction.focal_plane_psf.heights import STATIC_DEGREE, HeightPrior
-from pachon.reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
+from pachon.reconstruction.focal_plane_psf.stars import CcdStars
 
 matplotlib.use("Agg")
 RAFTS = ("R22", "R23", "R33")

@@ -17,8 +17,9 @@ import galsim
 import numpy as np
 
 import pachon
+from pachon import Window, draw_galaxies
 from pachon.core.units import ARCSEC
-from pachon.imaging.draw import Window, add_stamps, draw_galaxies, grid_sizes
+from pachon.imaging.draw import add_stamps, grid_sizes
 from pachon.imaging.scene import galaxies_near
 from pachon.pipeline.simulate.ccd_exposure import expose_positions
 

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import fft
 
 import pachon
-from pachon.measure.shear.estimator import ShearEstimator
+from pachon.measure import ShearEstimator
 
 ARCSEC = np.pi / 648000
 SCALE = 0.2 * ARCSEC

@@ -14,8 +14,8 @@ import time
 import numpy as np
 
 import pachon
+from pachon import fields_at
 from pachon.core.units import ARCSEC
-from pachon.wavefront.chief_rays import fields_at
 
 SILICON = pachon.models.Silicon()
 #: Blackbodies of a cool and a hot star [K].

@@ -12,8 +12,7 @@ import argparse
 import numpy as np
 
 import pachon
-from pachon.core.errors import PachonError
-from pachon.measure.shapes import measure_shapes
+from pachon import PachonError, measure_shapes
 from pachon.reconstruction.psf_model.polynomial import design_matrix
 
 SIZE, PLACES, SKY, AMPLITUDE = 21, 150, 22.0, 0.006

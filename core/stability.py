@@ -1,6 +1,6 @@
 """What of the public names is promised: sub-packages with public names, provisional names, removed names.
 
-``docs/reference/api_policy.md`` says what *stable* and *provisional* mean, and how long old spellings go on working.
+``docs/reference/public_names.md`` says what *stable* and *provisional* mean, and how long old spellings go on working.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ def test_provisional_names_are_public():
 
 
 def test_the_policy_page_explains_the_marks():
-    page = next((ROOT / "docs").rglob("api_policy.md")).read_text(encoding="utf-8")
+    page = next((ROOT / "docs").rglob("public_names.md")).read_text(encoding="utf-8")
     for word in ("*stable*", "*provisional*", "DeprecationWarning", "core/stability.py"):
         assert word in page
 
