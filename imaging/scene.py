@@ -78,8 +78,7 @@ class CcdScene:
             ("CCDY0", self.window.y, "CCD row of the first pixel, from 0"),
         ):
             header[key] = (value, comment)
-        for key, value, comment in self.cards:
-            header[key] = (value, comment)
+        header.extend(self.cards, update=True)
         objects = self.objects if ratio == 1.0 else self.objects | {"FLUX": self.objects["FLUX"] * ratio}
         return CcdImage(self.name, ccd_image.image, ccd_image.variance, ccd_image.mask, header, objects)
 
