@@ -23,9 +23,9 @@ import numpy as np
 from atmosphere_vs_galsim import SITE, ellipticity, long_paraboloid, pachon_stars, through_screens
 
 import pachon
+from pachon import Atmosphere
 from pachon.core.random_streams import stream
 from pachon.core.units import ARCMIN, ARCSEC
-from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 
 EXPOSURES = (1.0, 5.0, 15.0, 60.0)
 LIFTS = (0.0, 200.0)

@@ -32,14 +32,12 @@ import numpy as np
 import scipy.fft
 
 import pachon
+from pachon import Atmosphere, ScreenSampling, Telescope
 from pachon.core.random_streams import stream
 from pachon.core.units import ARCMIN, ARCSEC
 from pachon.measure.shapes import fwhm
 from pachon.models.ideal_telescope import ideal_telescope
-from pachon.models.telescope import Telescope
-from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.layer_screens import SLOPE_LAG
-from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
 
 SITE, WAVELENGTH = "cerro_pachon", 620e-9
 PIXEL, STAMP, WEIGHT_FWHM = 0.1 * ARCSEC, 61, 0.7 * ARCSEC

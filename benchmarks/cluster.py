@@ -15,12 +15,11 @@ from pathlib import Path
 
 import distributed
 
+from pachon import Configuration, Experiment, PachonError
 from pachon.core.dask_cluster import dask_workers, local_cluster
-from pachon.core.errors import PachonError
 from pachon.core.long_work import Job, JobComputation, JobResult
 from pachon.pipeline.ccd_worker import compute_ccd
-from pachon.pipeline.config import Configuration, with_options
-from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.config import with_options
 
 JOBS = int(sys.argv[1]) if len(sys.argv) > 1 else 400
 #: Size of the product of a CCD with 800 noise-free and 40 observed stars [byte].

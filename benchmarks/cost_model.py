@@ -24,8 +24,8 @@ from pathlib import Path
 import numpy as np
 
 import pachon
-from pachon.pipeline.config import Configuration, with_options
-from pachon.pipeline.experiment import Experiment
+from pachon import Configuration, Experiment
+from pachon.pipeline.config import with_options
 from pachon.pipeline.run_folder import stamp_of, write_ccd
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd
 from pachon.pipeline.simulate.ccd_loop import simulate_ccds
@@ -35,7 +35,7 @@ from pachon.raytrace.rays import field_direction
 from pachon.reconstruction.ccd_product import product_path, write_product
 
 LAYERS = {
-    n: pachon.load_site("cerro_pachon").with_layers(a, w, s)
+    n: pachon.models.load_site("cerro_pachon").with_layers(a, w, s)
     for n, a, w, s in (
         (1, [5000.0], [1.0], [10.0]),
         (3, [0.0, 5000.0, 15000.0], [0.5, 0.3, 0.2], [5.0, 10.0, 20.0]),

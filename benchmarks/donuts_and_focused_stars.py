@@ -20,7 +20,7 @@ import numpy as np
 import pachon
 from pachon.core.files import write_bytes
 from pachon.core.plotting import BLUE, ORANGE, picture_bytes, styled
-from pachon.studies.alignment.config import AlignConfig
+from pachon.studies import AlignConfig
 from pachon.studies.alignment.scene import AlignmentScene
 
 STARS = int(sys.argv[1]) if len(sys.argv) > 1 else 40
@@ -74,7 +74,7 @@ def main() -> None:
             model=pachon.DonutModel(
                 detector=pachon.DonutDetector(diffusion=DIFFUSION, defocus=defocus[:count]), diffraction=True
             ),
-            fit=pachon.TelescopeFreedoms(freedoms, prior=PRIOR * tolerances),
+            fit=pachon.sensing.TelescopeFreedoms(freedoms, prior=PRIOR * tolerances),
         )
         spent = time.process_time() - start
         found = fit.degrees_of_freedom

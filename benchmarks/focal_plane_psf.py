@@ -25,16 +25,13 @@ import treecorr
 from astropy.io import fits
 
 import pachon
+from pachon import Experiment, FocalPlaneStars, PsfModel, measure_shapes
 from pachon.core.units import ARCMIN
-from pachon.measure.shapes import measure_shapes
 from pachon.pipeline.config import configuration_of
-from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.focal_plane_stage import fit_focal_plane_model
 from pachon.pipeline.run_folder import SUMMARY_NAME
 from pachon.reconstruction.ccd_product import CcdProduct, read_product
-from pachon.reconstruction.focal_plane_psf.stars import FocalPlaneStars
 from pachon.reconstruction.psf_model.checks import snr_weights
-from pachon.reconstruction.psf_model.model import PsfModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +122,7 @@ def main() -> None:
         ("telescope, heights unknown", True, None),
     ]
     if options.heights:
-        known = pachon.StaticHeights.read(options.heights)
+        known = pachon.reconstruction.StaticHeights.read(options.heights)
         cases.append((f"heights from {known.exposures} exposures", True, known))
     cases.append(("heights as drawn (the limit)", True, experiment.focal_plane))
     for label, telescope, heights in cases:

@@ -23,7 +23,7 @@ import numpy as np
 
 import pachon
 from pachon.core.units import ARCMIN
-from pachon.reconstruction.focal_plane_psf.response import Instrument
+from pachon.reconstruction import Instrument
 
 matplotlib.use("Agg")
 # Noise of e and of ln size times the signal-to-noise ratio.

@@ -29,7 +29,7 @@ from focal_plane_psf import RunStars
 from psf_model_vs_piff import draw_piff, fit_piff, piff_stars, residuals
 
 import pachon
-from pachon.measure.shapes import measure_shapes
+from pachon import measure_shapes
 from pachon.pipeline.focal_plane_stage import fit_focal_plane_model
 
 # Angle on the sky of a metre of the detector, nearly: Piff's coordinates are arcsec.

@@ -23,7 +23,7 @@ import pachon
 from pachon.core.files import write_bytes
 from pachon.core.plotting import picture_bytes
 from pachon.pipeline.simulate.donuts import STAMP_SIZE
-from pachon.studies.alignment.config import AlignConfig
+from pachon.studies import AlignConfig
 from pachon.studies.alignment.scene import AlignmentScene
 
 COUNT = int(sys.argv[1]) if len(sys.argv) > 1 else 189
@@ -80,7 +80,7 @@ def main() -> None:
             ),
             diffraction=True,
         ),
-        fit=pachon.TelescopeFreedoms(freedoms, prior=prior),
+        fit=pachon.sensing.TelescopeFreedoms(freedoms, prior=prior),
     )
     fitted = time.process_time() - start
     found = fit.degrees_of_freedom
@@ -106,7 +106,7 @@ def main() -> None:
         write_bytes(Path(PICTURE), picture_bytes(_picture(fields, fit, scene, true), "png"))
 
 
-def _picture(fields: np.ndarray, fit: pachon.DonutFit, scene: AlignmentScene, true: pachon.Telescope):
+def _picture(fields: np.ndarray, fit: pachon.sensing.DonutFit, scene: AlignmentScene, true: pachon.Telescope):
     """Draw Z4 to Z8 over the field as found, and found minus true."""
     from pachon.core.plotting import styled
 

@@ -14,11 +14,12 @@ import numpy as np
 import treecorr
 
 import pachon
+from pachon import measure_shapes
 from pachon.core.units import ARCMIN, ARCSEC
-from pachon.measure.shapes import fwhm, measure_shapes
-from pachon.models.camera.silicon import Silicon
+from pachon.measure.shapes import fwhm
+from pachon.models import Silicon
+from pachon.reconstruction import Instrument
 from pachon.reconstruction.focal_plane_psf.height_series import level_plane
-from pachon.reconstruction.focal_plane_psf.response import Instrument
 
 _HEIGHTS = np.arange(-30.0, 31.0, 5.0)
 _OFF_FOCUS = (5.0, 10.0, 15.0, 20.0)

@@ -25,16 +25,15 @@ import numpy as np
 from astropy.table import Table
 
 import pachon
+from pachon import Configuration, Experiment, FocalPlaneStars
 from pachon.core.units import ARCSEC
-from pachon.models.camera.camera import Camera
-from pachon.pipeline.config import Configuration
-from pachon.pipeline.experiment import Experiment
+from pachon.models import Camera
 from pachon.pipeline.focal_plane_stage import instrument_of
 from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
 from pachon.pipeline.simulate.ccd_observation import observe_ccd
 from pachon.reconstruction.focal_plane_psf.covariance import Places
 from pachon.reconstruction.focal_plane_psf.heights import STATIC_DEGREE, HeightPrior
-from pachon.reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
+from pachon.reconstruction.focal_plane_psf.stars import CcdStars
 
 matplotlib.use("Agg")
 RAFTS = ("R22", "R23", "R33")
@@ -173,12 +172,12 @@ def one_row(
     experiment, camera = experiment_of(heights, 0), three_rafts()
     budget = "simulated" if heights == "budget" else None
     start = time.perf_counter()
-    found = pachon.fit_static_heights(
+    found = pachon.reconstruction.fit_static_heights(
         paths,
         instrument_of(experiment),
         camera=camera,
         # The mean of the air near the ground over an exposure is a wavefront as well.
-        prior=pachon.OpticsPrior(budget, float(np.hypot(ALIGNMENT_UM, 0.1)) * 1e-6),
+        prior=pachon.reconstruction.OpticsPrior(budget, float(np.hypot(ALIGNMENT_UM, 0.1)) * 1e-6),
         folder=folder,
         steps=steps,
         threads=threads,

@@ -25,13 +25,12 @@ import matplotlib
 import numpy as np
 
 import pachon
+from pachon import Experiment, FocalPlaneStars
 from pachon.pipeline.config import configuration_of
-from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.focal_plane_stage import fit_focal_plane_model, instrument_of
 from pachon.pipeline.run_folder import SUMMARY_NAME
 from pachon.reconstruction.ccd_product import read_product
 from pachon.reconstruction.focal_plane_psf.response import height_response
-from pachon.reconstruction.focal_plane_psf.stars import FocalPlaneStars
 
 matplotlib.use("Agg")
 _BINS = 10

@@ -17,8 +17,9 @@ import galsim
 import numpy as np
 
 import pachon
+from pachon import Window, draw_galaxies
 from pachon.core.units import ARCSEC
-from pachon.imaging.draw import Window, add_stamps, draw_galaxies, grid_sizes
+from pachon.imaging.draw import add_stamps, grid_sizes
 from pachon.imaging.scene import galaxies_near
 from pachon.pipeline.simulate.ccd_exposure import expose_positions
 
@@ -90,7 +91,7 @@ def main() -> None:
     print(f"pachon {pachon.__version__}, GalSim {galsim.__version__}, NumPy {np.__version__}; one thread each")
     experiment = pachon.Experiment.from_config(pachon.Configuration(**RUN))
     with experiment.screens():
-        psf = pachon.PsfField.of_run(experiment, CCD)
+        psf = pachon.imaging.PsfField.of_run(experiment, CCD)
         places = np.random.default_rng(2).uniform(100.0, 3990.0, (arguments.stars, 2))
         camera = experiment.camera
         positions = (places - 2047.5) * camera.pixel_size + camera.centers[camera.ccd_index(CCD)]

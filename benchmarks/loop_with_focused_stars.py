@@ -19,7 +19,7 @@ import numpy as np
 
 import pachon
 from pachon.core.units import ARCSEC
-from pachon.studies.alignment.config import AlignConfig
+from pachon.studies import AlignConfig
 from pachon.studies.alignment.estimator import estimate_state
 from pachon.studies.alignment.scene import NOLL, AlignmentScene
 from pachon.wavefront.pupil_sampling import spiral_annulus

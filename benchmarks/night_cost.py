@@ -14,9 +14,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from pachon.core.long_work import Execution
-from pachon.studies.night.config import NightConfig
-from pachon.studies.night.night import run_night
+from pachon import Execution
+from pachon.studies import NightConfig, run_night
 
 #: Visits of a night, and of ten years of the LSST.
 NIGHT = 850

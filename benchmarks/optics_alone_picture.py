@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pachon import Configuration, Experiment, adaptive_moments, measure_shapes
 from pachon.core.files import write_bytes
 from pachon.core.plotting import new_figure, png_bytes, styled
-from pachon.measure.adaptive_moments import adaptive_moments
 from pachon.measure.focal_plane_axes import (
     draw_field_circle,
     draw_key_whisker,
@@ -32,9 +32,8 @@ from pachon.measure.focal_plane_axes import (
     key_ellipticity,
     whiskers,
 )
-from pachon.measure.shapes import measure_shapes
-from pachon.pipeline.config import Configuration, load_configuration, with_options
-from pachon.pipeline.experiment import Experiment
+from pachon.pipeline import load_configuration
+from pachon.pipeline.config import with_options
 from pachon.pipeline.report.focal_plane_plots import draw_heights, height_range
 from pachon.pipeline.simulate.ccd_exposure import expose_positions, holdout_positions
 from pachon.studies.shimming.shim import Motion, moved_whole

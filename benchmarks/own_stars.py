@@ -18,9 +18,9 @@ import galsim
 import numpy as np
 
 import pachon
-from pachon.core.errors import PachonError
+from pachon import PachonError
 from pachon.core.units import ARCSEC
-from pachon.measure.stamps import center_stamps
+from pachon.measure import center_stamps
 from pachon.reconstruction.psf_model import kriging
 from pachon.reconstruction.psf_model.polynomial import design_matrix
 

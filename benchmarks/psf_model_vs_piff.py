@@ -21,8 +21,8 @@ import piff
 from threadpoolctl import threadpool_limits
 
 import pachon
+from pachon import measure_shapes
 from pachon.core.units import ARCSEC
-from pachon.measure.shapes import measure_shapes
 from pachon.reconstruction.ccd_product import read_product
 
 PIXEL = 10.0e-6  # side of a pixel [m]

@@ -35,9 +35,8 @@ from atmosphere_vs_galsim import (
 )
 
 import pachon
+from pachon import Atmosphere, ScreenSampling
 from pachon.core.units import ARCSEC
-from pachon.wavefront.atmosphere.atmosphere import Atmosphere
-from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
 from pachon.wavefront.psf.fast import PUPIL_POINTS
 
 PIXEL, STAMP, STARS = 0.2 * ARCSEC, 31, 64

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import pachon
-from pachon.wavefront.request import Request
+from pachon import Request
 
 RAYS, ROUNDS = 1_000_000, 3
 

@@ -16,8 +16,7 @@ import galsim
 import numpy as np
 
 import pachon
-from pachon.wavefront.atmosphere.atmosphere import Atmosphere
-from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
+from pachon import Atmosphere, ScreenSampling
 
 WAVELENGTH = 620.0
 

@@ -14,9 +14,10 @@ from dataclasses import replace
 import numpy as np
 
 import pachon
-from pachon.design.optimize.sensitivity import field_rings, sensitivity
+from pachon import sensitivity
+from pachon.design.optimize.sensitivity import field_rings
+from pachon.models import annular_zernikes
 from pachon.models.parameters.parameters import apply, with_shape_terms
-from pachon.models.zernike_polynomials import annular_zernikes
 from pachon.raytrace.rays import field_direction, parallel_rays
 
 THREADS = int(sys.argv[1]) if len(sys.argv) > 1 else 1

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 import pachon
-from pachon.core.workers import process_workers
-from pachon.studies.sweep.file import load_sweep
+from pachon import process_workers
+from pachon.studies import load_sweep
 from pachon.studies.sweep.point import PointMeasurement
 from pachon.studies.sweep.store import SweepStore, create_store
 from pachon.studies.sweep.sweep import numbered_points

@@ -20,7 +20,7 @@ import batoid
 import numpy as np
 
 import pachon
-from pachon.models.shapes.grid import GridSag
+from pachon.models import GridSag
 
 RAYS = int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000
 ROUNDS = 7

@@ -15,12 +15,12 @@ from contextlib import contextmanager
 import numpy as np
 
 import pachon
+from pachon import Experiment, PsfModel
 from pachon.pipeline.config import with_options
-from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.simulate import ccd_exposure
-from pachon.reconstruction.psf_model.model import PsfModel
+from pachon.studies import VisitsConfig
 from pachon.studies.visits import psf_visit
-from pachon.studies.visits.config import STACK_STAMP, VisitsConfig
+from pachon.studies.visits.config import STACK_STAMP
 from pachon.studies.visits.visits import sky_points_of
 from pachon.wavefront.psf.engine import PsfRenderer
 from pachon.wavefront.psf.fast import FastRenderer

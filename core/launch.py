@@ -24,6 +24,8 @@ wp.config.log_level = wp.LOG_ERROR
 
 #: Notices of the library: compilations at level INFO, a cache that cannot be written as a warning. Commands show both.
 LOGGER = logging.getLogger("pachon")
+# Without a handler of the user's, Python would print the warning.
+LOGGER.addHandler(logging.NullHandler())
 
 #: Compiler flags of every kernel module: full-width SIMD where the processor has it, and a stack on which no such
 #: vector lies across two cache lines, which is worth a tenth of the time.

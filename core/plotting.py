@@ -55,11 +55,12 @@ def styled() -> AbstractContextManager[None]:
 
 
 def new_figure(width: float, height: float, layout: Literal["constrained", "compressed"] = "constrained") -> Figure:
-    """Return an empty figure of a size in inches that belongs to no window and no global state."""
+    """Return an empty figure of a size in inches that belongs to no window and no global state; notebooks show it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout=layout, facecolor="white")
+    from .figure import ShownFigure
+
+    figure = ShownFigure(figsize=(width, height), layout=layout, facecolor="white", to_png=picture_bytes)
     FigureCanvasAgg(figure)
     return figure
 

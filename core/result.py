@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from html import escape
 from pathlib import Path
@@ -17,6 +18,8 @@ from .notebook import html_picture
 # astropy takes a third of a second to import: only where a table is made.
 if TYPE_CHECKING:
     from astropy.table import QTable
+
+    from .products import Card
 
 #: Rows of a table in HTML.
 _ROWS = 8
@@ -75,6 +78,10 @@ class Result:
         }
         return {**self._meta(), "rows": len(table), **medians}
 
+    def _image_cards(self) -> Sequence[Card]:
+        """Return the cards of the headers of images in FITS files, beside unit and description."""
+        return ()
+
     def _described(self, name: str) -> Description:
         description = described(type(self), name)
         return description if description.text else described(self._row_type, name)
@@ -117,7 +124,7 @@ class Result:
         if Path(path).suffix.lower() in (".csv", ".parquet"):
             table = flat_table(table)
         images = {name: (np.asarray(getattr(self, name)), *self._described(name)) for name in self._images}
-        write_table(Path(path), table, images)
+        write_table(Path(path), table, images, self._image_cards())
 
     def _repr_html_(self) -> str:
         """Return the first rows of the table and the picture, as notebooks show them."""

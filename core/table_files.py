@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -16,7 +16,7 @@ from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
 
 from .errors import ConfigError, PachonError, ProductError
 from .files import parsing, read_bytes, text_lines, write_bytes
-from .products import card_text
+from .products import Card, card_text
 
 #: Formats of astropy, or Parquet, by the ending of the file.
 FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits", ".parquet": "parquet"}
@@ -60,10 +60,13 @@ def parquet_module(path: Path, error: type[PachonError]) -> Any:
     return parquet
 
 
-def write_table(path: Path, table: Table, images: Mapping[str, Described] = MappingProxyType({})) -> None:
+def write_table(
+    path: Path, table: Table, images: Mapping[str, Described] = MappingProxyType({}), cards: Sequence[Card] = ()
+) -> None:
     """Write a table in the format of the file's ending; Parquet takes the columns alone, and needs ``pyarrow``.
 
-    Images, arrays with unit and description by name, become extensions of FITS files; others leave them out.
+    Images, arrays with unit and description by name, become extensions of FITS files, with the cards; others leave them
+    out.
 
     Raises
     ------
@@ -74,10 +77,10 @@ def write_table(path: Path, table: Table, images: Mapping[str, Described] = Mapp
     """
     if path.suffix.lower() not in FORMATS:
         raise ConfigError(f"expected a file that ends in {', '.join(FORMATS)}", file=path)
-    write_bytes(path, _encoded(table, FORMATS[path.suffix.lower()], path, images))
+    write_bytes(path, _encoded(table, FORMATS[path.suffix.lower()], path, images, cards))
 
 
-def _encoded(table: Table, kind: str, path: Path, images: Mapping[str, Described]) -> bytes:
+def _encoded(table: Table, kind: str, path: Path, images: Mapping[str, Described], cards: Sequence[Card]) -> bytes:
     if kind.startswith("ascii"):
         text = io.StringIO()
         table.write(text, format=kind)
@@ -96,6 +99,8 @@ def _encoded(table: Table, kind: str, path: Path, images: Mapping[str, Described
             if unit:
                 hdu.header["BUNIT"] = unit
             hdu.header["COMMENT"] = card_text(meaning)
+            for key, value, comment in cards:
+                hdu.header[key] = (value, comment)
             hdus.append(hdu)
         file_data = io.BytesIO()
         hdus.writeto(file_data)

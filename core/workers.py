@@ -19,8 +19,13 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Any
 
+from .arguments import check_arguments
 from .errors import ProductError
 from .threads import thread_count
+from .units import require_count
+
+#: Most processes of one machine.
+_MOST_PROCESSES = 10_000
 
 #: Picklable function that does one job on a number of threads and returns its result.
 Compute = Callable[[Any, int], Any]
@@ -55,11 +60,25 @@ def serial_worker(compute: Compute, threads: int | None = None) -> Workers:
     return Workers(f"this process, {count} threads", 1, lambda jobs: (compute(job, count) for job in jobs))
 
 
+@check_arguments
 def process_workers(compute: Compute, count: int, threads: int | None = None) -> Workers:
-    """Return processes of this machine that share its processors, or a number of threads, evenly.
+    """Return processes of this machine that share its processors evenly.
 
-    `compute` is a function of a module, or a picklable object.
+    Parameters
+    ----------
+    compute : callable
+        Function of a module, or picklable object, of a job and its number of threads, as :class:`Execution` hands on.
+    count : int
+        Number of processes.
+    threads : int, optional
+        Number of threads of all processes together; all processors by default.
+
+    Raises
+    ------
+    DomainError
+        If a number is less than 1.
     """
+    count = require_count(count, "count", 1, _MOST_PROCESSES)
     threads_per_process = max(1, thread_count(threads) // count)
 
     def results(jobs: Iterable[Any]) -> Generator[Any, None, None]:

@@ -11,7 +11,6 @@ from ..core.errors import ConfigError, PachonError, error_context
 from ..core.files import write_bytes
 from ..core.products import Stamp
 from ..pipeline.experiment import Experiment
-from ..pipeline.listed_visit import visit_cards
 from ..pipeline.screen_cache import with_cached_screens
 from ..sky.pointing import Pointing
 from .config import ImagesConfig
@@ -70,8 +69,6 @@ def draw_image(
     except PachonError as error:
         raise error.within(subject=f"CCD {name}") from None
     image = stamped(scene.exposed(threads=threads), stamp_of(config, experiment))
-    for key, value, comment in visit_cards(experiment, name):
-        image.header[key] = (value, comment)
     if config.image.preview:
         write_bytes(path.with_suffix(".png"), preview_png(image))
     if config.image.cutouts:

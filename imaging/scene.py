@@ -10,13 +10,15 @@ import numpy as np
 
 from ..core.arguments import check_arguments, removed_arguments
 from ..core.errors import ConfigError, DomainError, shown
-from ..core.products import Stamp, card_text
+from ..core.products import Card, Stamp, card_text
 from ..core.units import ARCSEC
 from ..pipeline.experiment import Experiment
+from ..pipeline.listed_visit import observation_cards
 from ..pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
 from ..pipeline.simulate.photometry import effective_fwhm
 from ..reconstruction.psf_model.interpolation import Interpolation
-from .draw import SIZES, SkyPixels, Sources, Window, add_stamps, draw_galaxies
+from ..reconstruction.psf_model.recipe import InterpolationKey
+from .draw import SIZES, DrawingWay, SkyPixels, Sources, Window, add_stamps, draw_galaxies
 from .exposure import Exposure, expose
 from .image_file import CcdImage
 from .psf_field import PsfField, to_pixel
@@ -47,6 +49,7 @@ class CcdScene:
     telescope: str
     seed: int
     epoch: int
+    cards: tuple[Card, ...] = ()  #: of instrument and time
 
     @check_arguments
     def exposed(self, exposure: Exposure | None = None, *, threads: int | None = None) -> CcdImage:
@@ -75,6 +78,7 @@ class CcdScene:
             ("CCDY0", self.window.y, "CCD row of the first pixel, from 0"),
         ):
             header[key] = (value, comment)
+        header.extend(self.cards, update=True)
         objects = self.objects if ratio == 1.0 else self.objects | {"FLUX": self.objects["FLUX"] * ratio}
         return CcdImage(self.name, ccd_image.image, ccd_image.variance, ccd_image.mask, header, objects)
 
@@ -89,8 +93,8 @@ def draw_ccd(
     exposure: Exposure | None = None,
     pointing: Any = (0.0, 0.0),
     window: Window | None = None,
-    way: str = "direct",
-    interpolation: str | Interpolation = "polynomial",
+    way: DrawingWay = "direct",
+    interpolation: InterpolationKey | Interpolation = "polynomial",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> CcdScene:
@@ -202,6 +206,7 @@ def draw_ccd(
         experiment.telescope.name,
         config.seed,
         config.atmosphere.epoch,
+        tuple(observation_cards(experiment, ccd)),
     )
 
 

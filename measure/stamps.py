@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
-from ..core.units import real_array
+from ..core.units import pure_numbers, real_array
 from .pixel_masks import fill_symmetric, weightless_pixels
 
 
@@ -70,6 +71,7 @@ _OVERLAP = 0.1
 _SHIFTED_TOGETHER = 128
 
 
+@check_arguments
 def center_stamps(
     images: ArrayLike,
     x: ArrayLike,
@@ -121,8 +123,9 @@ def center_stamps(
         raise DomainError(f"size = {size}: expected an odd number of pixels")
     if size > min(ny, nx):
         raise DomainError(f"size = {size}: expected at most {min(ny, nx)}, the size of the images")
+    centroids = [pure_numbers(v, name) for v, name in ((x, "x"), (y, "y"))]
     try:
-        offsets = np.stack([np.broadcast_to(np.asarray(v, dtype=np.float64), (count,)) for v in (x, y)], axis=1)
+        offsets = np.stack([np.broadcast_to(values, (count,)) for values in centroids], axis=1)
     except ValueError as error:
         raise DomainError(f"x and y have shapes {np.shape(x)} and {np.shape(y)}: expected {count} centroids") from error
     rows, columns = _middle_pixels(size, (ny, nx))

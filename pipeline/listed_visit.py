@@ -24,6 +24,8 @@ _INSTRUMENTS = {"lsst": "LSSTCam", "comcam": "LSSTComCam", "auxtel": "LATISS", "
 #: Band in the name of a model, such as lsst_v3.3_r.
 _BAND_OF_NAME = re.compile(r"_([ugrizy])(?=_|$)")
 _SECONDS_A_DAY = 86400.0
+#: Modified Julian date of the epoch J2000.
+_J2000 = 51544.5
 #: Visits of a band of which one must have an experiment: others may lie too low, or have other values out of range.
 _TRIED = 3
 
@@ -154,6 +156,24 @@ def visit_cards(experiment: Experiment, ccd: str) -> list[Card]:
         ("ROTTELPO", experiment.config.rotator_deg, "[deg] camera against telescope (rotTelPos)"),
         ("AIRMASS", 1.0 / math.sin(altitude), "secant of the zenith angle"),
         ("NSNAP", visit.snaps, "snaps of the visit"),
+    ]
+
+
+def observation_cards(experiment: Experiment, ccd: str) -> list[Card]:
+    """Return :func:`visit_cards`; without a visit those of instrument and detector, and a nominal date.
+
+    The date is the epoch J2000, at which positions of catalogues need no proper motion.
+    """
+    exposure = experiment.config.atmosphere.exposure_s
+    comment = "nominal: of no visit"
+    return visit_cards(experiment, ccd) or [
+        ("INSTRUME", instrument_of(experiment.camera), "camera"),
+        ("DETECTOR", experiment.camera.ccd_index(ccd), "number of the CCD in the camera, from 0"),
+        ("TIMESYS", "TAI", "of all times"),
+        ("DATE-OBS", _date_of(_J2000), comment),
+        ("MJD-OBS", _J2000, f"[d] {comment}"),
+        ("DATE-AVG", _date_of(_J2000 + 0.5 * exposure / _SECONDS_A_DAY), comment),
+        ("MJD-AVG", _J2000 + 0.5 * exposure / _SECONDS_A_DAY, f"[d] {comment}"),
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from ..core.products import Card
+
 
 @dataclass(frozen=True)
 class _PupilMaps(Result):
@@ -34,6 +37,22 @@ class _PupilMaps(Result):
     def waves(self) -> np.ndarray:
         """OPD in waves."""
         return self.value / self.wavelength
+
+    def _image_cards(self) -> Sequence[Card]:
+        """Return the distance of the points of a square grid as poppy reads it, and the wavelength."""
+        wavelength = ("WAVELEN", self.wavelength, "[m] vacuum wavelength")
+        if self.x.ndim != 2 or min(self.x.shape) < 2:
+            return (wavelength,)
+        step = float((self.x[0, -1] - self.x[0, 0]) / (self.x.shape[1] - 1))
+        if not (np.allclose(np.diff(self.x, axis=1), step) and np.allclose(np.diff(self.y, axis=0), step)):
+            return (wavelength,)
+        comment = "[m/pixel] entrance pupil"
+        return (
+            wavelength,
+            ("PUPLSCAL", step, comment),
+            ("PIXELSCL", step, comment),
+            ("PIXUNIT", "meter", "of PIXELSCL"),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +123,7 @@ class OpdMap(_PupilMaps):
         """Draw the map in nanometres and waves, with and without piston and tilt, and Zernike terms as bars.
 
         The title contains the ``name`` of the telescope. A map that is not on a square grid or has no lit point raises
-        :class:`~pachon.DomainError`.
+        :class:`~pachon.errors.DomainError`.
         """
         if self.value.ndim != 2 or self.value.shape[0] != self.value.shape[1]:
             raise DomainError(f"opd of shape {self.value.shape}: expected one on a square grid to draw")

@@ -18,7 +18,7 @@ from .configuration import DesignConfiguration, configurations
 from .design_task import DesignTask
 from .jacobian import ParameterColumns
 from .merit import Beams, Merit
-from .merit_function import MeritFunction, merit_function
+from .merit_function import MeritFunction, MeritName, merit_function
 from .operand import Operand
 from .optimum import Optimum
 from .problem import DesignProblem
@@ -46,7 +46,7 @@ _REPLACED = {
 def optimize(
     telescope: Telescope | DesignConfiguration | Sequence[Telescope | DesignConfiguration],
     variables: Iterable[str | Parameter],
-    merit: str | MeritFunction | Merit = "spots",
+    merit: MeritName | MeritFunction | Merit = "spots",
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
@@ -153,10 +153,21 @@ def _check_effects(problem: DesignProblem, effect: np.ndarray) -> None:
             raise DomainError(f"variable {variable.address} has no effect on the merit: leave it out")
 
 
+@check_arguments
 def wavefronts(telescope: Telescope, rays: Beams) -> np.ndarray:
-    """Return the wavefronts of a telescope [m], shape [n_field, n_wave, n_pupil], NaN where not lit.
+    """Return the wavefronts of a telescope along the rays of a merit.
 
-    Rays are those of :meth:`Beams.of` for the arguments of :func:`optimize`.
+    Parameters
+    ----------
+    telescope : Telescope
+        Telescope that the rays are traced through, such as a misaligned one.
+    rays : Beams
+        Rays of :meth:`Beams.of` for the arguments of :func:`optimize`.
+
+    Returns
+    -------
+    ndarray, shape [n_field, n_wave, n_pupil]
+        Wavefronts [m] as a goal of :class:`WavefrontError`; NaN where not lit.
     """
     columns = ParameterColumns.at(following_stop(telescope), ())
 

@@ -23,8 +23,8 @@ SHARE = 45
 SHARE_OF_COSTLY = 450
 COSTLY = ("check_orientation", "choose_glasses", "fit_donuts", "shim")
 #: Packages of public functions, each a part of the long run.
-PACKAGES = ("models", "raytrace", "wavefront", "design", "sky", "sensing", "measure", "reconstruction", "pipeline",
-            "imaging", "studies", "testing")  # fmt: skip
+PACKAGES = ("core", "models", "raytrace", "wavefront", "design", "sky", "sensing", "measure", "reconstruction",
+            "pipeline", "imaging", "studies", "testing")  # fmt: skip
 #: Processor time of a call [s].
 SECONDS = 10.0
 #: Sizes of numbers, with both signs.

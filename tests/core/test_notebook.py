@@ -1,8 +1,11 @@
 """HTML of telescopes and cameras, and what it says where there is no picture."""
 
 import base64
+import pickle
 import re
+import struct
 
+import numpy as np
 import pytest
 
 import pachon
@@ -32,3 +35,26 @@ def test_a_picture_that_cannot_be_drawn_is_a_line():
         raise DomainError("no <light>")
 
     assert html_picture(draw, "Telescope") == "<p>No picture: no &lt;light&gt;</p>"
+
+
+@pytest.fixture
+def figure():
+    return pachon.spots(pachon.paul_baker(), n_pupil=3).plot()
+
+
+def test_figures_are_shown_without_a_backend_of_the_notebook(figure):
+    """IPython asks each object for ``_repr_png_`` where no formatter of its type is registered."""
+    shown = figure._repr_png_()
+    assert shown.startswith(b"\x89PNG")
+    wide, high = struct.unpack(">II", shown[16:24])
+    np.testing.assert_allclose((wide, high), 100 * figure.get_size_inches(), atol=1.0)
+
+
+def test_figures_can_be_pickled(figure):
+    assert pickle.loads(pickle.dumps(figure))._repr_png_().startswith(b"\x89PNG")
+
+
+def test_ipython_shows_a_figure_as_a_picture(figure):
+    formatters = pytest.importorskip("IPython.core.formatters")
+    data, _ = formatters.DisplayFormatter().format(figure)
+    assert data["image/png"].startswith(b"\x89PNG")

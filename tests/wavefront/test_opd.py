@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.io import fits
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError
@@ -209,3 +210,31 @@ def test_the_opd_does_not_jump_where_the_exit_pupil_goes_to_infinity(tmp_path):
         np.ptp(pachon.wavefront_opd(replace(mirror, reference_sphere_radius=0.1), field, 550e-9, pupil).value) / 550e-9
     )
     assert abs(short - waves[np.inf]) > 0.1
+
+
+def test_fits_files_have_the_pixel_scale_that_poppy_reads(lsst_r, tmp_path):
+    opd = pachon.wavefront_opd(lsst_r, (0.0, 0.01), 620e-9, grid=32)
+    opd.write(tmp_path / "opd.fits")
+    with fits.open(tmp_path / "opd.fits") as hdus:
+        for name in ("VALUE", "LIT"):
+            header = hdus[name].header
+            # Points of the grid are pixels of the pupil.
+            assert header["PUPLSCAL"] == header["PIXELSCL"] == pytest.approx(opd.x[0, 1] - opd.x[0, 0], rel=1e-12)
+            assert (header["PIXUNIT"], header["WAVELEN"]) == ("meter", 620e-9)
+        assert hdus["VALUE"].header["BUNIT"] == "m"
+        poppy = pytest.importorskip("poppy")
+        light, path = (
+            fits.PrimaryHDU(np.nan_to_num(hdus[n].data.astype(float)), hdus[n].header) for n in ("LIT", "VALUE")
+        )
+        optic = poppy.FITSOpticalElement(transmission=fits.HDUList([light]), opd=fits.HDUList([path]))
+    assert optic.pixelscale.to_value("m/pix") == pytest.approx(lsst_r.pupil_diameter / 31, rel=0.05)
+    assert optic.planetype.name == "pupil"
+
+
+def test_points_that_are_no_grid_have_no_pixel_scale(lsst_r, tmp_path):
+    pachon.wavefront_opd(lsst_r, (0.0, 0.0), 620e-9, pupil=([3.0, 3.1, 3.3], [0.0, 0.1, 0.0])).write(
+        tmp_path / "a.fits"
+    )
+    with fits.open(tmp_path / "a.fits") as hdus:
+        assert "PIXELSCL" not in hdus["VALUE"].header
+        assert hdus["VALUE"].header["WAVELEN"] == 620e-9
