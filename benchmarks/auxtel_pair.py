@@ -40,7 +40,7 @@ def read(folder: Path) -> np.ndarray:
     return images - np.median(images[:, border], axis=1)[:, None, None]
 
 
-def fit_pachon(images: np.ndarray, last: int) -> pachon.DonutFit:
+def fit_pachon(images: np.ndarray, last: int) -> pachon.sensing.DonutFit:
     """Fit each image by pachon."""
     detector = pachon.DonutDetector(PIXEL, defocus=SHIFTS, moved="M2")
     return pachon.fit_donuts(
@@ -50,7 +50,7 @@ def fit_pachon(images: np.ndarray, last: int) -> pachon.DonutFit:
         WAVELENGTH,
         sky_variance=VARIANCE,
         model=pachon.DonutModel(detector=detector, neighbours=False),
-        fit=pachon.SingleDonuts(range(4, last + 1), higher_order=10e-9),
+        fit=pachon.sensing.SingleDonuts(range(4, last + 1), higher_order=10e-9),
         threads=1,
     )
 

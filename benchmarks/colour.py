@@ -157,7 +157,7 @@ def study(band, zenith_degrees, field_degrees, draws, silicon):
     for label, images in (
         ("without colours", plain.at(places)),
         ("with colours", model.at(places, colour=asked)),
-        ("with spectra", pachon.psf_of_spectrum(model, places, light_of(spectra, waves, zenith), SCALE)),
+        ("with spectra", pachon.reconstruction.psf_of_spectrum(model, places, light_of(spectra, waves, zenith), SCALE)),
     ):
         parts = np.split(errors(true, images), ends, axis=1)
         for kind, values in zip(kinds, parts, strict=True):
@@ -174,7 +174,10 @@ def study(band, zenith_degrees, field_degrees, draws, silicon):
         for label, images in (
             ("without colours", pachon.PsfModel.fit(drawn, fields).at(places[2:])),
             ("with colours", fitted.at(places[2:], colour=asked[2:])),
-            ("with spectra", pachon.psf_of_spectrum(fitted, places[2:], light_of(spectra[2:], waves, zenith), SCALE)),
+            (
+                "with spectra",
+                pachon.reconstruction.psf_of_spectrum(fitted, places[2:], light_of(spectra[2:], waves, zenith), SCALE),
+            ),
         ):
             trace, g = shapes(images)
             squares[label].append([((trace / true_trace - 1.0) ** 2).mean(), ((g - true_g) ** 2).mean()])
@@ -191,7 +194,7 @@ def main():
     parser.add_argument("--draws", type=int, default=20, help="draws of the noise of stars")
     parser.add_argument("--without-silicon", action="store_true", help="all light turns into charge at the surface")
     arguments = parser.parse_args()
-    silicon = None if arguments.without_silicon else pachon.Silicon()
+    silicon = None if arguments.without_silicon else pachon.models.Silicon()
     field = [float(value) for value in arguments.field.split(",")]
     print(f"pachon {pachon.__version__}")
     for band in "ri":

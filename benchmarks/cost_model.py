@@ -35,7 +35,7 @@ from pachon.raytrace.rays import field_direction
 from pachon.reconstruction.ccd_product import product_path, write_product
 
 LAYERS = {
-    n: pachon.load_site("cerro_pachon").with_layers(a, w, s)
+    n: pachon.models.load_site("cerro_pachon").with_layers(a, w, s)
     for n, a, w, s in (
         (1, [5000.0], [1.0], [10.0]),
         (3, [0.0, 5000.0, 15000.0], [0.5, 0.3, 0.2], [5.0, 10.0, 20.0]),

@@ -80,7 +80,7 @@ def fit_pachon(donuts: DonutSet, moved: str, which: slice = slice(None), fit=Non
         sky_variance=donuts.sky,
         moved=moved,
         model=pachon.DonutModel(detector=pachon.DonutDetector(PIXEL, defocus=donuts.defocus)),
-        fit=fit or pachon.SingleDonuts(NOLL, higher_order=10e-9),
+        fit=fit or pachon.sensing.SingleDonuts(NOLL, higher_order=10e-9),
         projection="postel",
         threads=1,
     ).zernikes
@@ -203,8 +203,8 @@ def main() -> None:
             print(f"  danish takes {np.median(ratios):.1f} times as long (median of {count})")
         if options.no_joint:
             continue
-        joint = {"field terms": pachon.FieldTerms([1, 2, 3], NOLL), "degrees of freedom": None}
-        joint["degrees of freedom"] = pachon.TelescopeFreedoms(freedoms, noll=NOLL)
+        joint = {"field terms": pachon.sensing.FieldTerms([1, 2, 3], NOLL), "degrees of freedom": None}
+        joint["degrees of freedom"] = pachon.sensing.TelescopeFreedoms(freedoms, noll=NOLL)
         for label, fit in joint.items():
             report(f"pachon, {label}", *_with_truth(timed(fit_pachon, donuts, moved, slice(None), fit), donuts))
         if peer is not None:

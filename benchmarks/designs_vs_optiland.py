@@ -155,7 +155,7 @@ def contrast_differences(telescope, optic, field, relative, *, summed):
         try:
             ours = pachon.mtf(telescope, field, telescope.default_wavelength, n_pupil=n_pupil)
             break
-        except pachon.DomainError:
+        except pachon.errors.DomainError:
             continue  # its spots are too wide for so few points
     else:
         return math.nan, math.nan

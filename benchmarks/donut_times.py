@@ -88,7 +88,7 @@ def waves(count: int) -> Donut:
     return Donut(believed, image, FIELD, 10e-6, difference(true, believed, FIELD))
 
 
-def fit(donut: Donut, model: pachon.DonutModel) -> pachon.DonutFit:
+def fit(donut: Donut, model: pachon.DonutModel) -> pachon.sensing.DonutFit:
     """Fit a donut on one thread."""
     return pachon.fit_donuts(
         donut.believed, donut.image[None], [donut.field], WAVELENGTH, sky_variance=SKY, model=model, threads=1

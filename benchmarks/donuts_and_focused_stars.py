@@ -74,7 +74,7 @@ def main() -> None:
             model=pachon.DonutModel(
                 detector=pachon.DonutDetector(diffusion=DIFFUSION, defocus=defocus[:count]), diffraction=True
             ),
-            fit=pachon.TelescopeFreedoms(freedoms, prior=PRIOR * tolerances),
+            fit=pachon.sensing.TelescopeFreedoms(freedoms, prior=PRIOR * tolerances),
         )
         spent = time.process_time() - start
         found = fit.degrees_of_freedom

@@ -133,7 +133,7 @@ def make_case(number: int, options: argparse.Namespace) -> Case:
     return Case(image, field, height, wavefront[NOLL], (zernikes(behind, field, "ta") - reference)[NOLL], reference)
 
 
-def fit_pachon(case: Case) -> pachon.DonutFit:
+def fit_pachon(case: Case) -> pachon.sensing.DonutFit:
     """Fit a donut by pachon on one thread."""
     telescope = pachon.load_telescope("lsst_v3.3_r").perturbed("Detector", shift=(0.0, 0.0, case.height))
     variance = SKY + READ_NOISE**2

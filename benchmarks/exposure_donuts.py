@@ -28,10 +28,10 @@ def main() -> None:
     freedoms = pachon.load_degrees_of_freedom("lsst")
     telescope = pachon.load_telescope("lsst_v3.3_i").perturbed("Camera", shift=(0.0, 0.0, 1.5e-3))
     fits = {
-        "each alone": pachon.SingleDonuts(higher_order=10e-9),
-        "field terms": pachon.FieldTerms([1, 2, 3], higher_order=10e-9),
-        "exposure": pachon.ExposureDonuts(),
-        "exposure, degrees of freedom": pachon.ExposureDonuts(freedoms=freedoms),
+        "each alone": pachon.sensing.SingleDonuts(higher_order=10e-9),
+        "field terms": pachon.sensing.FieldTerms([1, 2, 3], higher_order=10e-9),
+        "exposure": pachon.sensing.ExposureDonuts(),
+        "exposure, degrees of freedom": pachon.sensing.ExposureDonuts(freedoms=freedoms),
     }
     for kind, outer_scale in (("kolm", np.inf), ("atm", 25.0)):
         header, *donuts = pickle.loads((folder / f"test_{kind}_donuts.pkl").read_bytes())

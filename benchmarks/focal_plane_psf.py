@@ -125,7 +125,7 @@ def main() -> None:
         ("telescope, heights unknown", True, None),
     ]
     if options.heights:
-        known = pachon.StaticHeights.read(options.heights)
+        known = pachon.reconstruction.StaticHeights.read(options.heights)
         cases.append((f"heights from {known.exposures} exposures", True, known))
     cases.append(("heights as drawn (the limit)", True, experiment.focal_plane))
     for label, telescope, heights in cases:

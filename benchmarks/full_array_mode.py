@@ -80,7 +80,7 @@ def main() -> None:
             ),
             diffraction=True,
         ),
-        fit=pachon.TelescopeFreedoms(freedoms, prior=prior),
+        fit=pachon.sensing.TelescopeFreedoms(freedoms, prior=prior),
     )
     fitted = time.process_time() - start
     found = fit.degrees_of_freedom
@@ -106,7 +106,7 @@ def main() -> None:
         write_bytes(Path(PICTURE), picture_bytes(_picture(fields, fit, scene, true), "png"))
 
 
-def _picture(fields: np.ndarray, fit: pachon.DonutFit, scene: AlignmentScene, true: pachon.Telescope):
+def _picture(fields: np.ndarray, fit: pachon.sensing.DonutFit, scene: AlignmentScene, true: pachon.Telescope):
     """Draw Z4 to Z8 over the field as found, and found minus true."""
     from pachon.core.plotting import styled
 

@@ -60,7 +60,7 @@ def main() -> None:
     print(f"pachon {pachon.__version__}, GalSim {galsim.__version__}, NumPy {np.__version__}, {os.cpu_count()} cores")
     print(f"{arguments.galaxies} stamps of {arguments.side} x {arguments.side} pixels, load {os.getloadavg()[0]:.1f}")
     start = time.perf_counter()
-    pachon.fit_galaxy_stamps(stamps[:8], variance, psf)
+    pachon.measure.fit_galaxy_stamps(stamps[:8], variance, psf)
     print(f"first call, with the compilation where it was not cached: {time.perf_counter() - start:.1f} s")
     own_psfs = np.repeat(psf[None], len(stamps), axis=0)
     few = stamps[: max(200, arguments.galaxies // 10)]
@@ -68,10 +68,10 @@ def main() -> None:
         rates = {}
         for threads in (1, arguments.threads):
             start = time.perf_counter()
-            fits = pachon.fit_galaxy_stamps(stamps, variance, psf, threads=threads)
+            fits = pachon.measure.fit_galaxy_stamps(stamps, variance, psf, threads=threads)
             rates[threads] = len(stamps) / (time.perf_counter() - start)
         start = time.perf_counter()
-        pachon.fit_galaxy_stamps(stamps, variance, own_psfs, threads=arguments.threads)
+        pachon.measure.fit_galaxy_stamps(stamps, variance, own_psfs, threads=arguments.threads)
         own = len(stamps) / (time.perf_counter() - start)
         start = time.perf_counter()
         measured = regauss(few, psf, variance)

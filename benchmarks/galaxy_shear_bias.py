@@ -46,10 +46,12 @@ def make_rings(
     return stamps, shears
 
 
-def calibrate(stamps: np.ndarray, shears: np.ndarray, variance: float, psf: np.ndarray) -> pachon.ShearCalibration:
-    fits = pachon.fit_galaxy_stamps(stamps.reshape(-1, *stamps.shape[2:]), variance, psf)
+def calibrate(
+    stamps: np.ndarray, shears: np.ndarray, variance: float, psf: np.ndarray
+) -> pachon.measure.ShearCalibration:
+    fits = pachon.measure.fit_galaxy_stamps(stamps.reshape(-1, *stamps.shape[2:]), variance, psf)
     e1, e2 = (np.where(fits.good, e, np.nan).reshape(stamps.shape[:2]) for e in (fits.e1, fits.e2))
-    return pachon.shear_calibration(e1, e2, shears.real, shears.imag)
+    return pachon.measure.shear_calibration(e1, e2, shears.real, shears.imag)
 
 
 def image_of(psf) -> np.ndarray:
@@ -58,7 +60,7 @@ def image_of(psf) -> np.ndarray:
     return image / image.sum()
 
 
-def show(label: str, found: pachon.ShearCalibration) -> None:
+def show(label: str, found: pachon.measure.ShearCalibration) -> None:
     (m1, m2), (e1, e2) = found.m, found.m_error
     (c1, c2), (d1, _) = found.c, found.c_error
     print(
@@ -87,14 +89,15 @@ def main() -> None:
         # S/N of the light in the best aperture, the image itself. All shears share their noise, which leaves m.
         sigma = float(np.sqrt((stamps**2).sum(axis=(2, 3)).mean())) / snr
         noise = rng.normal(0.0, sigma, (arguments.realisations, 1, *stamps.shape[1:]))
-        fits = pachon.fit_galaxy_stamps((stamps + noise).reshape(-1, *stamps.shape[2:]), sigma**2, psf)
+        fits = pachon.measure.fit_galaxy_stamps((stamps + noise).reshape(-1, *stamps.shape[2:]), sigma**2, psf)
         e1, e2 = (
             np.where(fits.good, e, np.nan).reshape(arguments.realisations, *stamps.shape[:2])
             for e in (fits.e1, fits.e2)
         )
         whole = np.isfinite(e1 + e2).all(axis=(1, 2))
         each = [
-            pachon.shear_calibration(a, b, shears.real, shears.imag) for a, b in zip(e1[whole], e2[whole], strict=True)
+            pachon.measure.shear_calibration(a, b, shears.real, shears.imag)
+            for a, b in zip(e1[whole], e2[whole], strict=True)
         ]
         m = np.array([found.m for found in each])
         (m1, m2), (error1, error2) = m.mean(axis=0), m.std(axis=0) / np.sqrt(len(m))

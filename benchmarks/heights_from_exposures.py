@@ -173,12 +173,12 @@ def one_row(
     experiment, camera = experiment_of(heights, 0), three_rafts()
     budget = "simulated" if heights == "budget" else None
     start = time.perf_counter()
-    found = pachon.fit_static_heights(
+    found = pachon.reconstruction.fit_static_heights(
         paths,
         instrument_of(experiment),
         camera=camera,
         # The mean of the air near the ground over an exposure is a wavefront as well.
-        prior=pachon.OpticsPrior(budget, float(np.hypot(ALIGNMENT_UM, 0.1)) * 1e-6),
+        prior=pachon.reconstruction.OpticsPrior(budget, float(np.hypot(ALIGNMENT_UM, 0.1)) * 1e-6),
         folder=folder,
         steps=steps,
         threads=threads,

@@ -90,7 +90,7 @@ def main() -> None:
     print(f"pachon {pachon.__version__}, GalSim {galsim.__version__}, NumPy {np.__version__}; one thread each")
     experiment = pachon.Experiment.from_config(pachon.Configuration(**RUN))
     with experiment.screens():
-        psf = pachon.PsfField.of_run(experiment, CCD)
+        psf = pachon.imaging.PsfField.of_run(experiment, CCD)
         places = np.random.default_rng(2).uniform(100.0, 3990.0, (arguments.stars, 2))
         camera = experiment.camera
         positions = (places - 2047.5) * camera.pixel_size + camera.centers[camera.ccd_index(CCD)]

@@ -59,9 +59,9 @@ def ours(telescope, variables, focal_length):
         variables,
         "spots",
         wavelengths=telescope.default_wavelength,
-        targets=[pachon.FocalLength(1e-3 * focal_length)],
+        targets=[pachon.design.FocalLength(1e-3 * focal_length)],
         n_pupil=RINGS,
-        solver=pachon.LeastSquares(tolerance=TOLERANCE, max_steps=STEPS),
+        solver=pachon.design.LeastSquares(tolerance=TOLERANCE, max_steps=STEPS),
         threads=1,
     )
     return time.process_time() - before, optimum.telescope

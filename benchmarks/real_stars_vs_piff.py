@@ -50,13 +50,13 @@ class Stars:
         first = pachon.measure_shapes(filled, scale, self.weight_fwhm)
         size = self.side - 4 - (self.side + 1) % 2
         centred = pachon.measure.stamps.center_stamps(filled, first.x, first.y, size, normalize=False)
-        selection = pachon.flag_stars(centred, rms, gain=gain)
+        selection = pachon.measure.flag_stars(centred, rms, gain=gain)
         bad |= decenter_masks(selection.masks, first.x, first.y, images.shape[1:])
         level, self.rms = sky_of_stamps(stamps, bad, 0.4 * self.side)
         self.bad, self.images = bad, np.where(bad, np.nan, stamps - level[:, None, None])
         self.shapes = pachon.measure_shapes(self.images, scale, self.weight_fwhm)
 
-    def fit_ours(self, train: np.ndarray, size: int) -> pachon.OwnStars:
+    def fit_ours(self, train: np.ndarray, size: int) -> pachon.reconstruction.OwnStars:
         return pachon.fit_own_stars(
             self.images[train], self.positions[train], self.scale, size=size, gain=self.gain, min_snr=1.0
         )

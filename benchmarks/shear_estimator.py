@@ -91,7 +91,7 @@ class PixelNoise:
 
 def show_bias(arguments, psfs: np.ndarray, exposure: pachon.Exposure) -> None:
     pixel_noise = PixelNoise(exposure.noise_rms, arguments.noise.startswith("resampled"))
-    correlated = pachon.CorrelatedNoise(pixel_noise.rms, pixel_noise.correlation)
+    correlated = pachon.measure.CorrelatedNoise(pixel_noise.rms, pixel_noise.correlation)
     noise = correlated if arguments.noise == "resampled" else pixel_noise.rms
     estimator = ShearEstimator(psfs, SCALE, noise)
     amplitude = np.sqrt(estimator.covariance[:, 0, 0]).mean() / pixel_noise.rms
@@ -188,7 +188,7 @@ def show_speed(psfs: np.ndarray, exposure: pachon.Exposure) -> None:
         return count
 
     def gaussians():
-        pachon.fit_galaxy_stamps(stamps[:256], rms**2, psfs, psf_index=psf_index[:256], threads=1)
+        pachon.measure.fit_galaxy_stamps(stamps[:256], rms**2, psfs, psf_index=psf_index[:256], threads=1)
         return 256
 
     def regauss():

@@ -91,7 +91,7 @@ def main() -> None:
                     if arguments.realisations:
                         seed = arguments.seed + 1000 * number + k
                         image = clean + (-1) ** k * noise * rng.standard_normal(clean.shape)
-                    found = pachon.detect_shear(
+                    found = pachon.measure.detect_shear(
                         image, psf, SCALE, noise, seed=seed,
                         min_snr=arguments.min_snr, threads=1,
                     )  # fmt: skip
@@ -109,7 +109,7 @@ def show(arguments, parts: dict, labels: dict, heading: str, peaks: float) -> No
     patch, minus_patch = (np.concatenate(labels[sign]) for sign in (1, -1))
     image_of_patch = np.union1d(patch, minus_patch) // arguments.discs
     directions = arguments.shear * np.eye(2)[image_of_patch % 2]
-    bias = pachon.shear_bias(plus, minus, *directions.T, patch=patch, minus_patch=minus_patch)
+    bias = pachon.measure.shear_bias(plus, minus, *directions.T, patch=patch, minus_patch=minus_patch)
     print(f"{heading}, {peaks:.0f} peaks above S/N {arguments.min_snr:g}, g = {arguments.shear}")
     print(f"m = {bias.m.mean():+.4f} +- {0.5 * np.hypot(*bias.m_error):.4f}; {bias}", flush=True)
 

@@ -17,7 +17,7 @@ import pachon
 from pachon.core.units import ARCSEC
 from pachon.wavefront.chief_rays import fields_at
 
-SILICON = pachon.Silicon()
+SILICON = pachon.models.Silicon()
 #: Blackbodies of a cool and a hot star [K].
 STARS = {"3500 K": 3500.0, "10000 K": 10000.0}
 WEIGHT = 0.7 * ARCSEC
@@ -48,7 +48,7 @@ def absorption():
         print(
             f"{nanometres:10d} {SILICON.index(light):7.3f} {1e6 * SILICON.absorption_length(light):11.2f}"
             f" {SILICON.absorbed(light):9.3f} {1e6 * mean:11.2f} {1e6 * rms:6.2f}"
-            f" {1e6 * pachon.focus_height(model, SILICON, light):16.2f}"
+            f" {1e6 * pachon.wavefront.focus_height(model, SILICON, light):16.2f}"
         )
 
 
@@ -70,7 +70,7 @@ def colours():
     for band in "rzy":
         telescope = pachon.load_telescope(f"lsst_v3.3_{band}")
         middle = 0.5 * sum(telescope.band)
-        height = pachon.focus_height(telescope, SILICON, middle)
+        height = pachon.wavefront.focus_height(telescope, SILICON, middle)
         refocused = telescope.perturbed("Detector", shift=(0.0, 0.0, height))
         kept = {}
         for model, name, silicon in (

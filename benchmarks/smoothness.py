@@ -19,7 +19,10 @@ from pachon.reconstruction.psf_model.polynomial import design_matrix
 SIZE, PLACES, SKY, AMPLITUDE = 21, 150, 22.0, 0.006
 EXTENT = (-1.0, 1.0, -1.0, 1.0)
 KINDS = {"constant": (0, 0.0), "linear": (1, 0.0), "quadratic": (2, 0.0), "turbulent": (0, 2.0)}
-RECIPES = {n: pachon.Recipe(pachon.Pixels(), pachon.Polynomial(n), "noise") for n in (0, 1, 2)}
+RECIPES = {
+    n: pachon.reconstruction.Recipe(pachon.reconstruction.Pixels(), pachon.reconstruction.Polynomial(n), "noise")
+    for n in (0, 1, 2)
+}
 
 
 def psfs(e1, e2, width):

@@ -55,7 +55,7 @@ def star_fields(telescope):
 
 def atmosphere(seed, options):
     """Return the exposure of a seed with the winds of the set, whatever the seed."""
-    site = pachon.load_site("cerro_pachon")
+    site = pachon.models.load_site("cerro_pachon")
     directions = [2.0 * math.pi * layer_random(options.winds, 0, n, "wind", 1)[0] for n in range(len(site.altitudes))]
     return pachon.Atmosphere.from_site(
         site.with_layers(wind_directions=directions), 1000 * options.winds + seed, exposure=options.exposure
@@ -65,7 +65,7 @@ def atmosphere(seed, options):
 def expose(options, telescope, fields, air, engine):
     """Return the PSFs of an exposure."""
     stamps = pachon.Stamps.of_camera("decam" if options.telescope == "decam" else "lsst")
-    aberration = pachon.ResidualWavefront.draw(telescope, RMS, 1, 0)
+    aberration = pachon.wavefront.ResidualWavefront.draw(telescope, RMS, 1, 0)
     return pachon.make_psfs(
         telescope,
         fields,

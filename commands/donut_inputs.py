@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ..models.telescope import Telescope
-    from ..sensing.frames import DonutFrames
+    from ..raytrace.rays import Projection
+    from ..sensing.frames import DonutFrames, FrameName
     from ..sensing.stamp_files import DonutStamps
     from ..sensing.stamp_headers import HeaderValues
 
@@ -49,9 +50,9 @@ class FrameOptions:
     rotator_deg: float | None
     parallactic_deg: float | None
     stamp_axes: str | None
-    field_frame: str
+    field_frame: FrameName
     field_deg: str | None
-    projection: str
+    projection: Projection
 
     def frames(self, header: HeaderValues) -> DonutFrames:
         """Return angles and axes, those of headers where no option gives them."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from typer import Argument, Option
@@ -27,7 +27,9 @@ from .options import GlassCatalogues, Json, Lenient, Projection, Quiet, Threads,
 from .tables import Rows, print_json
 
 if TYPE_CHECKING:
-    from ..sensing.observatory_zernikes import BodyMotions, ObservatoryZernikes
+    from ..raytrace.rays import Projection as FieldProjection
+    from ..sensing.frames import FrameName
+    from ..sensing.observatory_zernikes import BodyMotions, ObservatoryZernikes, ZernikeConvention
     from ..sensing.result import DonutFit
     from ..sensing.stamp_headers import HeaderValues
     from ..sensing.wavefront_fits import WavefrontFit
@@ -303,9 +305,12 @@ def donuts_command(
         ("--field-frame", field_frame, FRAMES),
     ):
         check_choice(option, name, names)
+    field_projection, output_frame = cast("FieldProjection", projection), cast("FrameName", frame)
     files_read = StampFiles.read(files, positions, stamp, mask, variance)
     header = files_read.header()
-    options = FrameOptions(rotator_deg, parallactic_deg, stamp_axes, field_frame, field_deg, projection)
+    options = FrameOptions(
+        rotator_deg, parallactic_deg, stamp_axes, cast("FrameName", field_frame), field_deg, field_projection
+    )
     frames = options.frames(header)
     if "sky" in (frame, field_frame) and frames.parallactic_angle is None:
         raise ConfigError("frame sky without a parallactic angle: expected --parallactic-deg")
@@ -354,7 +359,7 @@ def donuts_command(
             model=model,
             fit=wavefront,
             mask=inputs.masks if any(m.any() for m in inputs.masks) else None,
-            projection=projection,
+            projection=field_projection,
             threads=threads,
             progress=stage.advance,
         )
@@ -370,16 +375,18 @@ def donuts_command(
                 sky_variance=None if sky is None else [sky[i] for i in usable],
                 model=replace(model, detector=replace(model.detector, defocus=shifts)),
                 mask=[inputs.masks[i] for i in usable],
-                projection=projection,
+                projection=field_projection,
                 threads=threads,
             )
     if orientation is not None and orientation.doubtful:
         fit = replace(fit, flags=fit.flags | fit.usable * int(DonutFlag.ORIENTATION))
         print_warning(orientation_text(orientation, inputs))
-    converted = fit.zernikes_in(convention, frame, frames=frames)
+    converted = fit.zernikes_in(cast("ZernikeConvention", convention), output_frame, frames=frames)
     motions = None
     if fit.degrees_of_freedom is not None:
-        motions = hexapod_corrections(fit.degrees_of_freedom, frame="OCS" if frame == "DVCS" else frame, frames=frames)
+        motions = hexapod_corrections(
+            fit.degrees_of_freedom, frame="OCS" if output_frame == "DVCS" else output_frame, frames=frames
+        )
     _write(fit, converted, out, picture, kind)
     if as_json:
         print_json(fit.summary() | observatory_summary(frames, converted, motions, orientation))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from typer import Argument, Option
@@ -12,6 +12,10 @@ from typer import Argument, Option
 from ..core.terminal import print_line
 from .options import Json
 from .tables import print_json
+
+if TYPE_CHECKING:
+    from ..models.starting_designs.new import DesignKind
+    from ..studies.validation import SchemaKind
 
 app = typer.Typer()
 
@@ -56,7 +60,7 @@ def new_command(
         "primary_f_number": primary_f_number,
         "back_focus": back_focus_mm and back_focus_mm * 1e-3,
     }
-    telescope, text = new_prescription(kind, **options)
+    telescope, text = new_prescription(cast("DesignKind", kind), **options)
     write_bytes(path, text.encode())
     print_line(f"{telescope.description}: written to {path}")
 
@@ -111,4 +115,4 @@ def schema_command(
 
     from ..studies.validation import file_schema
 
-    print_line(json.dumps(file_schema(kind), indent=1))
+    print_line(json.dumps(file_schema(cast("SchemaKind", kind)), indent=1))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from typer import Argument, Option
@@ -25,6 +25,9 @@ from .options import (
 )
 from .tables import Rows, print_json
 from .workers import Processes, long_work
+
+if TYPE_CHECKING:
+    from ..imaging.image_formats.load import WeightName
 
 app = typer.Typer()
 
@@ -143,7 +146,7 @@ def measure_command(
         raise ConfigError("--recipe and its options are of models of a CCD: expected none with --psf")
     settings = ImageSettings(
         weight=weight,
-        weight_kind=weight_kind,
+        weight_kind=cast("WeightName", weight_kind),
         mask=mask,
         gain=gain,
         zero_point=zero_point,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 from typer import Argument, Option
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from ..models.telescope import Telescope
     from ..reconstruction.psf_model.recipe import Recipe as PsfRecipe
+    from ..reconstruction.psf_model.recipe import RecipeName
 
 Config = Annotated[Path | None, Argument(metavar="CONFIG.yaml", help="Configuration; all has a default.")]
 Ccds = Annotated[str | None, Option(help="CCDs, separated by commas: R22_S11,R22_S12.")]
@@ -102,8 +103,14 @@ def recipe_of_options(
 
     if all(value is None for value in (recipe, basis, interpolation, components, weights, order)):
         return None
+    # Another name is refused there.
     return PsfRecipe.of(
-        recipe, basis=basis, interpolation=interpolation, n_components=components, weights=weights, order=order
+        cast("RecipeName | None", recipe),
+        basis=basis,
+        interpolation=interpolation,
+        n_components=components,
+        weights=weights,
+        order=order,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from typer import Option
@@ -13,6 +13,9 @@ from .inputs import configured_experiment
 from .interrupt import interruptible
 from .options import Ccds, Config, Json, Quiet, Raft, Threads, one_name_list
 from .tables import Rows, print_json
+
+if TYPE_CHECKING:
+    from ..studies.shimming.shim import ShimmedParts, ShimMerit
 
 app = typer.Typer()
 _CAPTION = (
@@ -59,7 +62,13 @@ def shim_command(
     experiment = configured_experiment(config, ccds=names, focal_plane__heights=heights, psf__engine="long_exposure")
     make_folder(out)
     with interruptible(quiet) as reporter:
-        shims = shim(experiment, merit=merit, parts=parts, threads=threads, reporter=reporter)
+        shims = shim(
+            experiment,
+            merit=cast("ShimMerit", merit),
+            parts=cast("ShimmedParts", parts),
+            threads=threads,
+            reporter=reporter,
+        )
     write_shims(shims, out, experiment)
     if as_json:
         print_json(shim_metrics(shims))

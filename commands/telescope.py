@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from typer import Argument, Option
@@ -14,6 +14,9 @@ from .imports import import_modules
 from .inputs import load_model, warnings_shown
 from .options import Configuration, GlassCatalogues, Json, Lenient, Model
 from .tables import Rows, plain_table, print_json, wide_console
+
+if TYPE_CHECKING:
+    from ..models.io.prescription import LensFormat
 
 app = typer.Typer()
 #: Endings of files whose light travels along +z, ours along -z: their radii have the opposite signs.
@@ -114,5 +117,5 @@ def convert_command(
 
     telescope = load_model(model, lenient, glass_catalogue or (), configuration)
     with warnings_shown(PrescriptionWarning):
-        save_telescope(telescope, out, format=format, lenient=lenient)
+        save_telescope(telescope, out, format=cast("LensFormat", format), lenient=lenient)
     print_line(f"{telescope.name}: {len(telescope.surfaces)} surfaces written to {out}")

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .docstrings import described
-from .errors import ConfigError, DomainError, PachonError, shown
+from .errors import ConfigError, DomainError, PachonError, PrescriptionError, nearest, shown
 from .units import has_unit, in_unit, is_quantity, real_numbers
 
 Target = TypeVar("Target", bound=Callable[..., Any])
@@ -29,22 +29,34 @@ _ARRAY_ARMS = frozenset(get_args(ArrayLike)) or frozenset({ArrayLike})
 
 
 class _MismatchError(Exception):
-    """Value that an annotation does not allow."""
+    """Value that an annotation does not allow; `words` are those of which one is expected."""
 
-    def __init__(self, name: str, value: Any, expected: str, error: type[PachonError] = DomainError) -> None:
+    def __init__(self, name: str, value: Any, expected: str, words: Sequence[str] = ()) -> None:
         super().__init__(name)
-        self.name, self.value, self.expected, self.error = name, value, expected, error
+        self.name, self.value, self.expected, self.words = name, value, expected, tuple(words)
+
+    def as_error(self, word_error: type[PachonError]) -> PachonError:
+        """Return the error of pachon: of its kind for words, with the nearest of them, else a DomainError."""
+        text = f"{self.name} = {shown(self.value)}: expected {self.expected}"
+        hint = nearest(self.value, self.words) if isinstance(self.value, str) else ""
+        kind = word_error if self.words else DomainError
+        return kind(f"{text}; {hint}" if hint else text, key=self.name)
 
 
-def check_arguments(target: Target) -> Target:
+def check_prescription(target: Target) -> Target:
+    """Check arguments as :func:`check_arguments` does; a word that is none of several is a PrescriptionError."""
+    return check_arguments(target, PrescriptionError)
+
+
+def check_arguments(target: Target, word_error: type[PachonError] = ConfigError) -> Target:
     """Check the arguments of a function, or of constructor and public methods of a class, by their annotations.
 
-    A value of the wrong kind is a DomainError, or a ConfigError where one of several words is expected; it names
-    argument, value and what was expected. Checked are numbers, texts, paths, functions, classes, and sequences and
-    mappings of them. Arguments annotated as arrays take real numbers: no boolean values, texts, times, complex numbers
-    or objects. Masked ones become NaN; quantities keep their unit. Those annotated as boolean arrays take True and
-    False, and 1 and 0. A quantity where plain numbers are expected is converted to the unit in square brackets of the
-    docstring.
+    A value of the wrong kind is a DomainError, or a ConfigError (`word_error`) where one of several words is expected;
+    it names argument, value and what was expected. Checked are numbers, texts, paths, functions, classes, and sequences
+    and mappings of them. Arguments annotated as arrays take real numbers: no boolean values, texts, times, complex
+    numbers or objects. Masked ones become NaN; quantities keep their unit. Those annotated as boolean arrays take True
+    and False, and 1 and 0. A quantity where plain numbers are expected is converted to the unit in square brackets of
+    the docstring.
 
     Keyword arguments annotated as ``**options: Unpack[SomeTypedDict]`` are checked, and shown in the signature, as if
     each key of the TypedDict were a parameter.
@@ -54,14 +66,14 @@ def check_arguments(target: Target) -> Target:
     are checked by the function itself.
     """
     if not inspect.isclass(target):
-        return cast(Target, _checked(target, target))
+        return cast(Target, _checked(target, target, word_error))
     for name, member in list(vars(target).items()):
         if name.startswith("_") and name != "__init__":
             continue
         if isinstance(member, (classmethod, staticmethod)):
-            setattr(target, name, type(member)(_checked(member.__func__, member)))
+            setattr(target, name, type(member)(_checked(member.__func__, member, word_error)))
         elif inspect.isfunction(member):
-            setattr(target, name, _checked(member, target if name == "__init__" else member))
+            setattr(target, name, _checked(member, target if name == "__init__" else member, word_error))
     return target
 
 
@@ -78,7 +90,7 @@ def removed_arguments(**replacements: str) -> Callable[[Target], Target]:
     return decorate
 
 
-def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any]:
+def _checked(function: Callable[..., Any], documented: Any, word_error: type[PachonError]) -> Callable[..., Any]:
     if not set(inspect.get_annotations(function)) - {"return"}:
         return function
 
@@ -120,8 +132,7 @@ def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any
                     at = [*parameter_checks].index(name)
                     args = (*args[:at], _plain_numbers(args[at], unit, name), *args[at + 1 :])
                 return checked(*args, **options)
-            text = f"{problem.name} = {shown(problem.value)}: expected {problem.expected}"
-            raise problem.error(text, key=problem.name) from None
+            raise problem.as_error(word_error) from None
         try:
             return function(*checked_args, **options)
         except MemoryError as problem:
@@ -299,7 +310,9 @@ def _valid_path(name: str, value: Any) -> str | os.PathLike[str]:
 def _word_check(words: tuple[Any, ...]) -> _Check:
     def check(name: str, value: Any) -> Any:
         if not (isinstance(value, str) and value in words):
-            raise _MismatchError(name, value, f"one of {', '.join(words)}" if len(words) > 1 else words[0], ConfigError)
+            named_words = [word for word in words if word]
+            expected = f"one of {', '.join(named_words)}" if len(named_words) > 1 else named_words[0]
+            raise _MismatchError(name, value, expected, named_words)
         return value
 
     return check
@@ -319,8 +332,8 @@ def _union_check(checks: list[_Check], optional: bool) -> _Check:
         inner = next((p for p in problems if p.name != name), None)
         several = list(dict.fromkeys(p.expected for p in problems))
         expected = " or ".join(several) if len(several) < 4 else f"one of {', '.join(several)}"
-        error = next((p.error for p in problems if p.error is not DomainError), DomainError)
-        raise inner or _MismatchError(name, value, expected, error)
+        words = [word for p in problems for word in p.words]
+        raise inner or _MismatchError(name, value, expected, words)
 
     return check
 

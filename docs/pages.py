@@ -8,13 +8,13 @@ import functools
 import importlib
 import inspect
 import io
+import operator
 import os
 import re
 from pathlib import Path
 from textwrap import dedent
 
 ROOT = Path(__file__).parents[1]
-STUB = ROOT / "pachon" / "__init__.pyi"
 BLOCK = re.compile(r"```python\n(.*?)```\n", flags=re.S)
 #: Classes of others whose members are not listed.
 _FOREIGN = "tuple, IntEnum, int, Exception, BaseModel"
@@ -42,23 +42,34 @@ LAYERS = {
 
 
 def public_names() -> dict[str, list[str]]:
-    """Return the public names of each layer, in the order of the stub."""
+    """Return the public names of each layer, such as "design.throughput": those of pachon itself come first."""
     found: dict[str, list[str]] = {layer: [] for layer in LAYERS}
-    for node in ast.parse(STUB.read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.ImportFrom):
-            names = [alias.asname or alias.name for alias in node.names]
-            found[(node.module or "").partition(".")[0]] += names
+    for name in _listed("pachon"):
+        found[name[0].partition(".")[0]].append(name[1])
+    for layer in LAYERS:
+        if (ROOT / layer / "__init__.pyi").is_file() and layer:
+            found[layer] += [f"{layer}.{name}" for _, name in _listed(layer)]
+    found["core"] += [f"errors.{name}" for name in importlib.import_module("pachon.errors").__all__]
+    found["testing"] += [f"testing.{name}" for name in importlib.import_module("pachon.testing").__all__]
     return found
+
+
+def _listed(folder: str) -> list[tuple[str, str]]:
+    """Return module and name of each line of a stub; of its modules, GalSim's alone."""
+    tree = ast.parse((ROOT / folder / "__init__.pyi").read_text(encoding="utf-8"))
+    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+    pairs = [(node.module or "", alias.asname or alias.name) for node in imports for alias in node.names]
+    return [(module, name) for module, name in pairs if module or name == "galsim"]
 
 
 def api_page(layer: str) -> str:
     """Return the reference of a layer's public names as MyST with directives of autodoc."""
-    import pachon
+    from pachon.core.stability import stability
 
     title, text = LAYERS[layer]
     parts = [f"# {title}\n\n{text}\n"]
     for name in public_names()[layer]:
-        value = getattr(pachon, name)
+        value = operator.attrgetter(name)(importlib.import_module("pachon"))
         if inspect.ismodule(value):
             kind, options = "automodule", "   :members:\n"
         elif inspect.isclass(value):
@@ -68,7 +79,9 @@ def api_page(layer: str) -> str:
             )
         else:
             kind, options = "autofunction", ""
-        parts.append(f"## {name}\n\n```{{eval-rst}}\n.. {kind}:: pachon.{name}\n{options}```\n")
+        mark = "*provisional*: its form may still change.\n\n" if stability(f"pachon.{name}") == "provisional" else ""
+        directive = f"```{{eval-rst}}\n.. {kind}:: pachon.{name}\n{options}```\n"
+        parts.append(f"## {name.rpartition('.')[2]}\n\n{mark}{directive}")
     return "\n".join(parts)
 
 
@@ -159,17 +172,17 @@ def _write_references(app: object) -> None:
 
 def _public_reference(app: object, environment: object, node: object, content: object) -> object:
     """Return the link to a public name that a docstring names by its module, as in ``wavefront.opd.wavefront_opd``."""
-    name = node.get("reftarget", "").rpartition(".")[2]
-    if node.get("refdomain") != "py" or f"pachon.{name}" == node["reftarget"] or name not in _all_public():
+    target = _all_public().get(node.get("reftarget", "").rpartition(".")[2])
+    if node.get("refdomain") != "py" or target is None or target == node["reftarget"]:
         return None
     domain = environment.get_domain("py")
-    kind = node["reftype"]
-    return domain.resolve_xref(environment, node["refdoc"], app.builder, kind, f"pachon.{name}", node, content)
+    return domain.resolve_xref(environment, node["refdoc"], app.builder, node["reftype"], target, node, content)
 
 
 @functools.cache
-def _all_public() -> frozenset[str]:
-    return frozenset(name for names in public_names().values() for name in names)
+def _all_public() -> dict[str, str]:
+    """Return the full spelling of each public name by its last part."""
+    return {name.rpartition(".")[2]: f"pachon.{name}" for names in public_names().values() for name in names}
 
 
 def _attributes_as_parameters(*event: object) -> None:

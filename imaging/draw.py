@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +22,7 @@ from ..core.errors import check_choice
 from ..core.threads import one_blas_thread, thread_count
 from .psf_field import PsfField
 
-WAYS = ("direct", "eigen")
+DrawingWay = Literal["direct", "eigen"]
 #: Pixels along a side of the grid of a galaxy.
 SIZES = (32, 48, 64, 96, 128, 192, 256, 384, 512)
 #: Largest light of a galaxy beyond its grid, where it wraps round, in rms of the noise of a pixel.
@@ -41,7 +41,7 @@ _NODES = 7
 
 
 class Sources(Protocol):
-    """Galaxies that can be drawn, such as :class:`pachon.Galaxies`."""
+    """Galaxies that can be drawn, such as :class:`pachon.sky.Galaxies`."""
 
     @property
     def xi(self) -> np.ndarray:
@@ -71,7 +71,7 @@ class Sources(Protocol):
 
 
 class SkyPixels(Protocol):
-    """World coordinates of a CCD, such as :class:`pachon.CcdWcs`."""
+    """World coordinates of a CCD, such as :class:`pachon.imaging.CcdWcs`."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -121,7 +121,7 @@ def draw_galaxies(
     *,
     window: Window | None = None,
     noise: float | np.ndarray = 1.0,
-    way: str = "direct",
+    way: DrawingWay = "direct",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> np.ndarray:
@@ -159,7 +159,7 @@ def draw_galaxies(
     ConfigError
         If there is no such way.
     """
-    check_choice("way", way, WAYS)
+    check_choice("way", way, get_args(DrawingWay))
     area = Window(0, 0, wcs.shape[1], wcs.shape[0]) if window is None else window
     if way == "direct":
         return _draw_direct(galaxies, electrons, psf, wcs, area, noise, threads, progress)

@@ -14,7 +14,7 @@ from ..core.errors import DomainError
 from ..core.random_streams import stream
 from ..core.threads import thread_count
 from ..core.units import pure_numbers, require_positive
-from ..models.camera.photometry import DARK_CURRENT, FULL_WELL, PIXEL_SCALE, READ_NOISE, Band
+from ..models.camera.photometry import DARK_CURRENT, FULL_WELL, PIXEL_SCALE, READ_NOISE, Band, BandName
 from ..pipeline.experiment import Experiment
 from ..pipeline.simulate.photometry import band_named, sky_electrons_per_pixel
 
@@ -61,7 +61,7 @@ class Exposure:
         Zero point, sky and extinction; by default those of the LSST in the band.
     """
 
-    band: str = "r"
+    band: BandName = "r"
     time: float = 15.0
     exposures: int = 1
     gain: float = 1.0

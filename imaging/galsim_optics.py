@@ -22,7 +22,7 @@ from ..models.camera.silicon import Silicon
 from ..models.media.silicon import absorption_length, silicon_index
 from ..models.telescope import Telescope
 from ..raytrace.photons import LandedPhotons, PhotonBeam, land_photons
-from ..raytrace.rays import field_angles, field_direction
+from ..raytrace.rays import Projection, field_angles, field_direction
 from ..sky.pointing import Pointing
 
 
@@ -80,7 +80,7 @@ class PachonOptics(galsim.PhotonOp):
         sky_pos: galsim.CelestialCoord | None = None,
         pointing: ArrayLike = (0.0, 0.0),
         position_angle: ArrayLike = 0.0,
-        projection: str = "zemax",
+        projection: Projection = "zemax",
         focal_plane: FocalPlane | None = None,
         ccd: str | None = None,
         image_pos: galsim.PositionD | None = None,

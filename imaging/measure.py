@@ -26,7 +26,7 @@ from ..measure.shear.shear_shapes import ShearShapes, mean_shear
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ..reconstruction.piff.psf import PiffPsf
 from ..reconstruction.psf_model.model import PsfModel
-from ..reconstruction.psf_model.recipe import Recipe
+from ..reconstruction.psf_model.recipe import Recipe, RecipeName
 from ..reconstruction.psfex import PsfexPsf
 from ..sky.sky_shapes import STEP, SkyShapes, along_sky, jacobians_on_sky
 from .image_file import CcdImage
@@ -228,7 +228,7 @@ def measure_image(
     image: CcdImage,
     *,
     psf: PsfModel | FocalPlanePsf | PiffPsf | PsfexPsf | None = None,
-    recipe: str | Recipe | None = None,
+    recipe: RecipeName | Recipe | None = None,
     stars: ArrayLike | None = None,
     colours: ObjectColours | None = None,
     min_snr: float = 30.0,
@@ -241,8 +241,8 @@ def measure_image(
     image : CcdImage
         Image, such as one of ``pachon images`` or of :func:`~pachon.load_image`.
     psf : PsfModel, FocalPlanePsf, PiffPsf or PsfexPsf, optional
-        Model of the PSF: of all CCDs, such as one fitted to :func:`~pachon.focal_plane_stars` of the images of the
-        exposure, or of this one, its positions pixels of the image. By default one is fitted to the stars of the
+        Model of the PSF: of all CCDs, such as one fitted to :func:`~pachon.imaging.focal_plane_stars` of the images of
+        the exposure, or of this one, its positions pixels of the image. By default one is fitted to the stars of the
         image. With a model stars are left out of the galaxies where there are any.
     recipe : str or Recipe, optional
         Kind of the model of the CCD, as of :meth:`~pachon.PsfModel.fit`: by default every pixel by kriging, which needs

@@ -18,7 +18,7 @@ from ..pipeline.simulate.ccd_exposure import expose_positions, holdout_positions
 from ..reconstruction.psf_model.interpolation import Interpolation
 from ..reconstruction.psf_model.model import PsfModel
 from ..reconstruction.psf_model.polynomial import design_matrix
-from ..reconstruction.psf_model.recipe import Recipe
+from ..reconstruction.psf_model.recipe import InterpolationKey, Recipe
 
 #: Pixels around a CCD that the PSF is extrapolated to, for galaxies whose light reaches the CCD.
 RIM = 40
@@ -48,7 +48,7 @@ class PsfField:
         lit_fraction: ArrayLike | None = None,
         n_components: int | None = None,
         order: int = 4,
-        interpolation: str | Interpolation = "polynomial",
+        interpolation: InterpolationKey | Interpolation = "polynomial",
     ) -> PsfField:
         """Fit noise-free PSFs on one CCD.
 
@@ -90,7 +90,7 @@ class PsfField:
         experiment: Experiment,
         ccd: str,
         *,
-        interpolation: str | Interpolation = "polynomial",
+        interpolation: InterpolationKey | Interpolation = "polynomial",
         threads: int | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> PsfField:

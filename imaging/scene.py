@@ -16,7 +16,8 @@ from ..pipeline.experiment import Experiment
 from ..pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
 from ..pipeline.simulate.photometry import effective_fwhm
 from ..reconstruction.psf_model.interpolation import Interpolation
-from .draw import SIZES, SkyPixels, Sources, Window, add_stamps, draw_galaxies
+from ..reconstruction.psf_model.recipe import InterpolationKey
+from .draw import SIZES, DrawingWay, SkyPixels, Sources, Window, add_stamps, draw_galaxies
 from .exposure import Exposure, expose
 from .image_file import CcdImage
 from .psf_field import PsfField, to_pixel
@@ -89,8 +90,8 @@ def draw_ccd(
     exposure: Exposure | None = None,
     pointing: Any = (0.0, 0.0),
     window: Window | None = None,
-    way: str = "direct",
-    interpolation: str | Interpolation = "polynomial",
+    way: DrawingWay = "direct",
+    interpolation: InterpolationKey | Interpolation = "polynomial",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> CcdScene:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+SeparationRange = Literal["short", "long"]
 #: Ranges of separation over which xi+ is averaged [arcmin]; Jee & Tyson 2011 give a residual below 1e-7 for the long.
-SEPARATION_RANGES = {"short": (0.0, 10.0), "long": (10.0, 180.0)}
+SEPARATION_RANGES: dict[SeparationRange, tuple[float, float]] = {"short": (0.0, 10.0), "long": (10.0, 180.0)}
 EXACT_LIMIT = 10_000
 """Largest number of stars whose pairs are counted exactly by default: a second on one core."""
 #: Largest ellipticity, or product of one and a size, that is correlated.
@@ -147,14 +148,14 @@ class Correlation(Result):
         }
 
     @check_arguments
-    def within(self, separations: str) -> np.ndarray:
+    def within(self, separations: SeparationRange) -> np.ndarray:
         """Return the bins of a range of :data:`SEPARATION_RANGES`, the upper end excluded, [n_bins] bool."""
         check_choice("separations", separations, SEPARATION_RANGES)
         low, high = SEPARATION_RANGES[separations]
         return (self.r_arcmin >= low) & (self.r_arcmin < high)
 
     @check_arguments
-    def mean_xi_plus(self, separations: str) -> float:
+    def mean_xi_plus(self, separations: SeparationRange) -> float:
         """Return the mean of xi+ over the pairs of a range of separations.
 
         Parameters
@@ -170,16 +171,16 @@ class Correlation(Result):
         return float(self._mean_over_pairs(separations, self.n_pairs, self.xi_plus))
 
     @check_arguments
-    def leave_one_out_mean_xi_plus(self, separations: str) -> np.ndarray:
+    def leave_one_out_mean_xi_plus(self, separations: SeparationRange) -> np.ndarray:
         """Return :meth:`mean_xi_plus` without each patch in turn, [n_patches]."""
         return self._mean_over_pairs(separations, self.leave_one_out_pairs, self.leave_one_out_plus)
 
     @check_arguments
-    def error_mean_xi_plus(self, separations: str) -> float:
+    def error_mean_xi_plus(self, separations: SeparationRange) -> float:
         """Return the jackknife error of :meth:`mean_xi_plus`; NaN without patches."""
         return float(jackknife_error(self.leave_one_out_mean_xi_plus(separations))) if self.n_patches else np.nan
 
-    def _mean_over_pairs(self, separations: str, pairs: np.ndarray, xi: np.ndarray) -> np.ndarray:
+    def _mean_over_pairs(self, separations: SeparationRange, pairs: np.ndarray, xi: np.ndarray) -> np.ndarray:
         """Return the mean of xi [..., n_bins] over the pairs [..., n_bins] of a range."""
         inside = self.within(separations)
         counts, values = pairs[..., inside], xi[..., inside]

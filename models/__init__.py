@@ -1,1 +1,5 @@
 """Physical models: telescopes, surfaces, media, cameras, sites and their files. NumPy only, no Warp."""
+
+from ..core.deprecation import public_names as _public_names
+
+__getattr__, __dir__, __all__ = _public_names(__name__, __file__)

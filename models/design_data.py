@@ -8,28 +8,32 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 
-from ..core.arguments import check_arguments
+from ..core.arguments import check_prescription
 from ..core.errors import PrescriptionError
 from .links import Pickup, Solve, check_links
 
+LengthUnit = Literal["m", "cm", "mm", "in"]
 #: Units that a lens file counts lengths in [m].
-LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
+LENGTH_UNITS: dict[LengthUnit, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 #: What the size of the beam is stated as. The value of `entrance_pupil` is its diameter [m], that of `stop` the
 #: semi-diameter of the stop [m]; the others are pure numbers.
-APERTURES = ("entrance_pupil", "f_number", "working_f_number", "object_na", "stop")
+BeamAperture = Literal["entrance_pupil", "f_number", "working_f_number", "object_na", "stop"]
 #: What field points are stated as; angles in radians, the others in metres.
-FIELD_TYPES = ("angle", "object_height", "paraxial_image_height", "real_image_height")
+FieldType = Literal["angle", "object_height", "paraxial_image_height", "real_image_height"]
+FIELD_TYPES: tuple[FieldType, ...] = get_args(FieldType)
 #: Which rays are launched: those through the paraxial entrance pupil, or those that fill the stop, whose radius is that
 #: of the paraxial or of the real marginal ray.
-AIMING = ("off", "paraxial", "real")
+Aiming = Literal["off", "paraxial", "real"]
+AIMING: tuple[Aiming, ...] = get_args(Aiming)
 #: Numbers of a row of vignetting factors: decentres and compressions along x and y, and an angle.
 _FACTORS = 5
 
 
-@check_arguments
+@check_prescription
 @dataclass(frozen=True)
 class DesignData:
     """Aperture, fields, wavelengths, stop and environment that a lens file states; empty for most telescopes.
@@ -83,12 +87,12 @@ class DesignData:
         If a value is not as expected.
     """
 
-    length_unit: str = "m"
-    aperture: str | None = None
+    length_unit: LengthUnit = "m"
+    aperture: BeamAperture | None = None
     aperture_value: float | None = None
     stop: str | None = None
-    aiming: str = "off"
-    field_type: str = "angle"
+    aiming: Aiming = "off"
+    field_type: FieldType = "angle"
     fields: tuple[tuple[float, float], ...] = ()
     field_weights: tuple[float, ...] = ()
     vignetting: tuple[tuple[float, float, float, float, float], ...] = ()
@@ -103,14 +107,6 @@ class DesignData:
     remake_vignetting: bool = False
 
     def __post_init__(self) -> None:
-        for key, choices in (
-            ("length_unit", tuple(LENGTH_UNITS)),
-            ("aiming", AIMING),
-            ("field_type", FIELD_TYPES),
-            ("aperture", (None, *APERTURES)),
-        ):
-            if getattr(self, key) not in choices:
-                _refuse(f"{key} = {getattr(self, key)!r}: expected one of {', '.join(filter(None, choices))}")
         value = self.aperture_value
         if (self.aperture is None) != (value is None) or (value is not None and not 0 < value < math.inf):
             _refuse(f"aperture_value = {value!r}: expected a positive number, with the aperture that it belongs to")

@@ -193,7 +193,7 @@ def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> Fi
     ----------
     telescope : Telescope
         Prescription; its surfaces must share one axis, which flat mirrors may fold. Of others
-        :func:`~pachon.parabasal_optics` has focal lengths and pupils in two planes.
+        :func:`~pachon.models.parabasal_optics` has focal lengths and pupils in two planes.
     wavelength : float or Quantity, optional
         Vacuum wavelength [m]; the telescope's default where not given.
 

@@ -5,16 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal, get_args
 
-from ..core.arguments import check_arguments
+from ..core.arguments import check_prescription
 from ..core.errors import PrescriptionError
 
-#: What a pickup may take over, and what a solve may ask for.
-PICKED = ("radius", "conic", "thickness", "glass")
-SOLVED = ("marginal_height", "chief_height", "edge_thickness")
+#: What a pickup may take over.
+PickedQuantity = Literal["radius", "conic", "thickness", "glass"]
+PICKED: tuple[PickedQuantity, ...] = get_args(PickedQuantity)
+#: What a solve may ask for.
+SolveKind = Literal["marginal_height", "chief_height", "edge_thickness"]
+SOLVED: tuple[SolveKind, ...] = get_args(SolveKind)
 
 
-@check_arguments
+@check_prescription
 @dataclass(frozen=True)
 class Pickup:
     """Value of a surface that follows that of another: ``scale`` times that value plus ``offset``.
@@ -39,14 +43,12 @@ class Pickup:
     """
 
     surface: str
-    quantity: str
+    quantity: PickedQuantity
     source: str
     scale: float = 1.0
     offset: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.quantity not in PICKED:
-            _refuse(f"pickup of {self.surface}: {self.quantity!r}: expected one of {', '.join(PICKED)}")
         if self.surface == self.source:
             _refuse(f"{self.address}: expected another surface than {self.source} itself")
         if not (math.isfinite(self.scale) and self.scale and math.isfinite(self.offset)):
@@ -60,7 +62,7 @@ class Pickup:
         return f"pickup {self.surface}.{self.quantity}"
 
 
-@check_arguments
+@check_prescription
 @dataclass(frozen=True)
 class Solve:
     """Thickness behind a surface that is solved for.
@@ -85,13 +87,11 @@ class Solve:
     """
 
     surface: str
-    kind: str
+    kind: SolveKind
     value: float = 0.0
     radius: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.kind not in SOLVED:
-            _refuse(f"solve of {self.surface}: {self.kind!r}: expected one of {', '.join(SOLVED)}")
         if not (math.isfinite(self.value) and math.isfinite(self.radius)):
             _refuse(f"{self.address}: value = {self.value!r}, radius = {self.radius!r}: expected finite numbers")
         if (self.kind == "edge_thickness") != (self.radius > 0):

@@ -9,24 +9,26 @@ molecular bands of cool stars and lines are not in it.
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
-from ..core.errors import DomainError, check_choice
+from ..core.errors import DomainError
 from ..core.units import metres, pure_numbers
 
+ColorBands = Literal["g_r", "g_i", "r_i", "bp_rp"]
 #: Pivot wavelengths of two bands [m], and what is to be subtracted from the colour to have AB magnitudes: SDSS
 #: (Fukugita et al. 1996) and Gaia EDR3 (Riello et al. 2021, Table 3 and sec. 8.2).
-COLORS: dict[str, tuple[float, float, float]] = {
+COLORS: dict[ColorBands, tuple[float, float, float]] = {
     "g_r": (468.6e-9, 616.6e-9, 0.0),
     "g_i": (468.6e-9, 748.0e-9, 0.0),
     "r_i": (616.6e-9, 748.0e-9, 0.0),
     "bp_rp": (511.0e-9, 776.9e-9, 0.3406),
 }
 #: Kinds of the colours of PSF models: mean wavelength in the band, or colours of two bands.
-KINDS = ("wavelength", *COLORS)
+ColorKind = Literal["wavelength", "g_r", "g_i", "r_i", "bp_rp"]
 #: Names of columns of temperatures in catalogues, in lower case, in order of preference.
 TEMPERATURE_COLUMNS = ("teff", "teff_gspphot", "temperature")
 #: Catalogues have -99, -999 and the like for colours that are missing; no colour of stars is so low in any unit.
@@ -80,7 +82,7 @@ def blackbody_photons(temperature: ArrayLike, wavelengths: ArrayLike) -> np.ndar
 
 
 @check_arguments
-def color_temperature(color: ArrayLike, bands: str = "g_r") -> np.ndarray:
+def color_temperature(color: ArrayLike, bands: ColorBands = "g_r") -> np.ndarray:
     """Return the temperatures of blackbodies of given colours [K].
 
     Parameters
@@ -95,14 +97,13 @@ def color_temperature(color: ArrayLike, bands: str = "g_r") -> np.ndarray:
     ndarray
         Between 2000 and 50 000 K: redder and bluer stars are taken as the coolest and the hottest.
     """
-    check_choice("bands", bands, COLORS)
     log_kelvin = _log_temperatures()
     ab_colors = pure_numbers(color, "color") - COLORS[bands][2]
     return np.asarray(np.exp(np.interp(ab_colors, _ab_colors(log_kelvin, bands), log_kelvin)))
 
 
 @check_arguments
-def effective_colour(wavelengths: ArrayLike, photons: ArrayLike, kind: str = "wavelength") -> np.ndarray:
+def effective_colour(wavelengths: ArrayLike, photons: ArrayLike, kind: ColorKind = "wavelength") -> np.ndarray:
     """Return the colours of spectra within a band, as PSF models take them.
 
     The PSF of a spectrum is the mean of those of its wavelengths, each by its photons: as far as these are linear in
@@ -130,7 +131,6 @@ def effective_colour(wavelengths: ArrayLike, photons: ArrayLike, kind: str = "wa
     DomainError
         If shapes differ, numbers of photons are negative, or a spectrum has none.
     """
-    check_choice("kind", kind, KINDS)
     waves = np.atleast_1d(metres(wavelengths, "wavelengths"))
     if waves.ndim != 1 or not ((waves >= _SHORTEST) & (waves <= _LONGEST)).all():
         raise DomainError(f"wavelengths: expected one or more lengths of {_SHORTEST:g} to {_LONGEST:g} m")
@@ -148,7 +148,7 @@ def effective_colour(wavelengths: ArrayLike, photons: ArrayLike, kind: str = "wa
     return blackbody_color(np.exp(np.interp(mean, (blackbodies * waves).mean(axis=1), log_kelvin)), kind)
 
 
-def blackbody_color(temperature: np.ndarray, bands: str) -> np.ndarray:
+def blackbody_color(temperature: np.ndarray, bands: ColorBands) -> np.ndarray:
     """Return the colours [mag] of blackbodies of temperatures [K], as :func:`color_temperature` takes them."""
     return _ab_colors(np.log(temperature), bands) + COLORS[bands][2]
 
@@ -171,7 +171,7 @@ def _log_temperatures() -> np.ndarray:
     return np.linspace(math.log(HOTTEST), math.log(COOLEST), _STEPS)
 
 
-def _ab_colors(log_kelvin: np.ndarray, bands: str) -> np.ndarray:
+def _ab_colors(log_kelvin: np.ndarray, bands: ColorBands) -> np.ndarray:
     """Return the colours of blackbodies by the logarithms of their temperatures [K], AB magnitudes."""
     first, second, _ = COLORS[bands]
     inverse = _RADIATION * np.exp(-log_kelvin)

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
+__all__ = ["PachonOptics", "galsim_wcs", "psf_object"]
+
 try:
     import galsim as _galsim  # noqa: F401 - is it there?
 except ModuleNotFoundError:

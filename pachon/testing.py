@@ -10,6 +10,8 @@ from .core.arguments import check_arguments
 if TYPE_CHECKING:
     from .models.telescope import Telescope
 
+__all__ = ["assert_matches_baseline"]
+
 
 @check_arguments
 def assert_matches_baseline(

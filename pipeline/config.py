@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
 from pydantic import BeforeValidator, Field, SerializerFunctionWrapHandler, model_serializer
@@ -32,16 +32,11 @@ from ..core.schema import (
     validated,
 )
 from ..core.yaml_reader import read_mapping
-from ..reconstruction.psf_model.recipe import BASES, INTERPOLATIONS, RECIPES, Recipe, names_of
+from ..models.camera.photometry import BandName
+from ..reconstruction.psf_model.recipe import INTERPOLATIONS, BasisName, InterpolationName, Recipe, RecipeName, names_of
 from ..reconstruction.psf_model.retired_process import GaussianProcess
+from ..wavefront.psf.engines import EngineName
 
-BandName = Literal["u", "g", "r", "i", "z", "y"]
-if TYPE_CHECKING:
-    RecipeName: TypeAlias = str
-    BasisName: TypeAlias = str
-    InterpolationName: TypeAlias = str
-else:
-    RecipeName, BasisName, InterpolationName = (Literal[tuple(table)] for table in (RECIPES, BASES, INTERPOLATIONS))
 _Model = TypeVar("_Model", bound=Section)
 #: Values of the height budget that a resolved configuration has without their being given.
 _CAMERAS_OWN = {"budget": "simulated"}
@@ -229,7 +224,7 @@ class AtmosphereConfig(Section):
 class PsfConfig(Section):
     """How point-spread functions are made."""
 
-    engine: Literal["fast", "wave", "long_exposure", "statistical"] = Field(
+    engine: EngineName = Field(
         "fast",
         description="fast (geometric and filters), wave (Fourier optics), long_exposure (mean over turbulence), "
         "statistical (shapes drawn from theory, without screens; 5 s or more, no image motion, no third moments)",

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from astropy import units as u
@@ -16,7 +16,7 @@ from ..core.errors import ConfigError, ProductError, error_context
 from ..core.table_files import read_columns
 from ..core.units import metres, pure_numbers, radians
 from ..models.camera.camera import Camera
-from ..models.star_spectrum import COOLEST, HOTTEST, TEMPERATURE_COLUMNS, color_temperature
+from ..models.star_spectrum import COOLEST, HOTTEST, TEMPERATURE_COLUMNS, ColorBands, color_temperature
 from ..models.telescope import Telescope
 from ..raytrace.rays import LOST, field_direction
 from ..sky.pointing import Pointing
@@ -39,7 +39,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "r_i": ("r_i", "r-i"),
 }
 #: Columns with the spectrum of a star; the first one present is used.
-_SPECTRA = ("teff", "bp_rp", "g_r", "g_i", "r_i")
+_SPECTRA: tuple[Literal["teff"] | ColorBands, ...] = ("teff", "bp_rp", "g_r", "g_i", "r_i")
 #: Pairs of columns with positions, and their default unit; the first pair present is used.
 _PLACES = ((("ra", "dec"), u.deg), (("field_x", "field_y"), u.deg), (("x", "y"), u.m))
 #: Columns of colours of unknown bands, which are not used.
@@ -229,7 +229,7 @@ def _read_rows(path: Path, columns: dict[str, str], band: str) -> _Rows:
     return _Rows(pair[0], places, magnitude, kelvin, spectrum, unused)
 
 
-def _star_temperatures(values: np.ndarray, kind: str) -> np.ndarray:
+def _star_temperatures(values: np.ndarray, kind: Literal["teff"] | ColorBands) -> np.ndarray:
     """Return the temperatures [K] of a column of temperatures or colours, NaN where a row has none."""
     temperatures = values if kind == "teff" else color_temperature(values, kind)
     temperatures = np.where(np.isfinite(temperatures) & (temperatures > 0.0), temperatures, np.nan)

@@ -8,9 +8,10 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.buffers import empty
 from ..core.units import angle
+from ..models.design_data import Aiming
 from ..models.telescope import Telescope
 from .aiming import entrance_points, require_aimed
-from .rays import Rays, check_wavelength, field_direction, pupil_points, straight_bundles
+from .rays import Projection, Rays, check_wavelength, field_direction, pupil_points, straight_bundles
 
 
 @check_arguments
@@ -19,8 +20,8 @@ def launch_rays(
     field: tuple[ArrayLike, ArrayLike],
     wavelength: ArrayLike,
     pupil: tuple[ArrayLike, ArrayLike],
-    projection: str = "zemax",
-    aiming: str | None = None,
+    projection: Projection = "zemax",
+    aiming: Aiming | None = None,
 ) -> Rays:
     """Launch a plane wave from one field point through given points of the entrance pupil.
 
@@ -38,7 +39,8 @@ def launch_rays(
     projection : str
         Meaning of the field angles.
     aiming : {"off", "paraxial", "real"}, optional
-        Ray aiming at the stop, see :class:`~pachon.DesignData`; as the design data of the telescope say by default.
+        Ray aiming at the stop, see :class:`~pachon.models.DesignData`; by default as the design data of the telescope
+        say.
 
     Returns
     -------

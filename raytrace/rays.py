@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,10 +46,12 @@ class RayStatus(IntEnum):
 LOST = (RayStatus.MISSED, RayStatus.TOTAL_REFLECTION, RayStatus.NOT_CONVERGED, RayStatus.EVANESCENT)
 
 
-PROJECTIONS = ("zemax", "gnomonic", "postel")
+#: Meanings of field angles: see :func:`field_direction`.
+Projection = Literal["zemax", "gnomonic", "postel"]
+PROJECTIONS: tuple[Projection, ...] = get_args(Projection)
 
 
-def field_direction(tx: Any, ty: Any, projection: str = "zemax") -> np.ndarray:
+def field_direction(tx: Any, ty: Any, projection: Projection = "zemax") -> np.ndarray:
     """Return the unit vector along which light from a field point travels, telescope frame, shape [..., 3].
 
     Field angles (tx, ty) [rad] are those of the light's own travel v, with vz < 0 (towards the primary): the source on
@@ -72,7 +74,7 @@ def field_direction(tx: Any, ty: Any, projection: str = "zemax") -> np.ndarray:
     return np.stack([-sx * down, -sy * down, down], axis=-1)
 
 
-def field_angles(slopes: np.ndarray, projection: str = "zemax") -> np.ndarray:
+def field_angles(slopes: np.ndarray, projection: Projection = "zemax") -> np.ndarray:
     """Return the field angles [rad] of light of slopes (vx, vy)/|vz|, both [n, 2]: the inverse of `field_direction`."""
     if projection == "zemax":
         return np.arctan(slopes)

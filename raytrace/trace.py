@@ -158,7 +158,7 @@ def trace(
 def trace(
     telescope: Telescope,
     rays: Rays,
-    surfaces: str = "last",
+    surfaces: Literal["last", "all"] = "last",
     *,
     focal_plane: FocalPlane | None = None,
     threads: int | None = None,
@@ -194,8 +194,6 @@ def trace(
     DomainError
         If the telescope does not cover the wavelength, or ``out`` is no result of as many rays of one trace.
     """
-    if surfaces not in ("last", "all"):
-        raise ConfigError(f"surfaces = {surfaces!r}: expected 'last' or 'all'")
     n = len(rays)
     n_stored = len(telescope.surfaces) if surfaces == "all" else 1
     if out is not None:

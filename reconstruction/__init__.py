@@ -1,1 +1,5 @@
 """PSF models: bases, interpolations and recipes; the whole focal plane; own stars; files of Piff."""
+
+from ..core.deprecation import public_names as _public_names
+
+__getattr__, __dir__, __all__ = _public_names(__name__, __file__)

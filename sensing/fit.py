@@ -16,6 +16,7 @@ from ..core.errors import ConfigError, DomainError
 from ..core.threads import one_blas_thread, thread_count
 from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ..models.telescope import Telescope
+from ..raytrace.rays import Projection
 from ..wavefront.psf.light import Light
 from .bad_pixels import grown
 from .fit_star import StarFit, fit_star
@@ -95,7 +96,7 @@ def fit_donuts(
     model: DonutModel | None = None,
     fit: WavefrontFit | None = None,
     mask: NDArray[np.bool_] | Sequence[NDArray[np.bool_]] | None = None,
-    projection: str = "zemax",
+    projection: Projection = "zemax",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> DonutFit:

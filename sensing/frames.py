@@ -23,18 +23,21 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
-from ..core.errors import ConfigError, DomainError, check_choice, shown
+from ..core.errors import ConfigError, DomainError, shown
 from ..core.units import radians
 from ..models.telescope import Telescope
 from ..models.zernike_polynomials import noll_to_nm
+from ..raytrace.rays import Projection
 
 #: Frames by name.
-FRAMES = ("OCS", "CCS", "DVCS", "ZCS", "sky")
+FrameName = Literal["OCS", "CCS", "DVCS", "ZCS", "sky"]
+FRAMES: tuple[FrameName, ...] = get_args(FrameName)
 #: Axes of stamps that have names of their own: those of the camera and those of images of the LSST.
 _NAMED_AXES = {"CCS": "x,y", "DVCS": "y,x"}
 #: Unit vectors along the axes of the camera that stamps may run along.
@@ -82,7 +85,7 @@ class DonutFrames:
                 object.__setattr__(self, name, float(angle))
         stamp_matrix(self.stamp_axes)
 
-    def axes(self, frame: str) -> np.ndarray:
+    def axes(self, frame: FrameName) -> np.ndarray:
         """Return unit vectors along x, y, z of a frame in the telescope frame, one a row, shape [3, 3].
 
         Parameters
@@ -95,7 +98,6 @@ class DonutFrames:
         ConfigError
             If the frame is unknown, or is that of the sky without a parallactic angle.
         """
-        check_choice("frame", frame, FRAMES)
         if frame == "ZCS":
             return _ZCS.copy()
         if frame == "OCS":
@@ -108,7 +110,7 @@ class DonutFrames:
         camera = _turned(self._angle("rotator"))
         return camera if frame == "CCS" else camera[[1, 0, 2]]
 
-    def fields_in(self, fields: ArrayLike, frame: str, *, projection: str = "zemax") -> np.ndarray:
+    def fields_in(self, fields: ArrayLike, frame: FrameName, *, projection: Projection = "zemax") -> np.ndarray:
         """Return field angles of the telescope frame in another frame.
 
         Parameters
@@ -127,7 +129,9 @@ class DonutFrames:
         """
         return _along(self.axes(frame)[:2, :2], fields, projection)
 
-    def fields_of_telescope(self, fields: ArrayLike, frame: str, *, projection: str = "zemax") -> np.ndarray:
+    def fields_of_telescope(
+        self, fields: ArrayLike, frame: FrameName, *, projection: Projection = "zemax"
+    ) -> np.ndarray:
         """Return field angles in the telescope frame; the inverse of :meth:`fields_in`, with its arguments.
 
         Parameters
@@ -250,9 +254,8 @@ def _turned(angle: float) -> np.ndarray:
     return np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _along(matrix: np.ndarray, fields: ArrayLike, projection: str) -> np.ndarray:
+def _along(matrix: np.ndarray, fields: ArrayLike, projection: Projection) -> np.ndarray:
     """Return field angles times a matrix, in the plane where their projection is linear."""
-    check_choice("projection", projection, ("zemax", "gnomonic", "postel"))
     angles = np.atleast_2d(radians(fields, "fields"))
     if angles.ndim != 2 or angles.shape[1] != 2:
         raise DomainError(f"fields of shape {angles.shape}: expected [n, 2]")

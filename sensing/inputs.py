@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import DomainError, shown
 from ..core.units import length, pure_numbers, radians, require_positive
-from ..raytrace.rays import field_direction
+from ..raytrace.rays import Projection, field_direction
 
 #: Largest spread or wavefront [m].
 _MOST_LENGTH = 1e-3
@@ -66,7 +66,7 @@ class ObservedStars:
     shapes: list[tuple[int, int]]
     fields: np.ndarray
     directions: np.ndarray
-    projection: str
+    projection: Projection
     known_noise: bool
 
     @classmethod
@@ -76,7 +76,7 @@ class ObservedStars:
         fields: ArrayLike,
         sky_variance: ArrayLike | None,
         mask: NDArray[np.bool_] | Sequence[NDArray[np.bool_]] | None,
-        projection: str,
+        projection: Projection,
     ) -> ObservedStars:
         """Return the arguments of a fit as arrays, or raise DomainError for one that is malformed."""
         stack, shapes = padded(images, "images", np.float64, np.nan)

@@ -18,7 +18,7 @@ image (``DonutEngine.cc``, ``Zernike.cc``), so that its pupil is not turned to t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 from astropy import units as u
@@ -26,15 +26,16 @@ from astropy.table import QTable
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
-from ..core.errors import ConfigError, DomainError, check_choice
+from ..core.errors import ConfigError, DomainError
 from ..core.plotting import axes_at, plain_text, styled
 from ..core.result import Result
 from ..core.units import ARCSEC, length
 from ..design.metrics.field_zernikes import name_terms, wavefront_zernikes
 from ..models.telescope import Telescope
 from ..models.zernike_polynomials import annular_zernikes, noll_to_nm
+from ..raytrace.rays import Projection
 from .degrees import FreedomEstimate
-from .frames import DonutFrames, zernike_matrix
+from .frames import DonutFrames, FrameName, zernike_matrix
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,8 +43,9 @@ if TYPE_CHECKING:
 
 #: Wavelength of the waves that Donut counts by default [m].
 DONUT_WAVELENGTH = 700e-9
+ZernikeConvention = Literal["pachon", "ts_wep", "donut"]
 #: Names of the units of conventions, as astropy has them; waves are pure numbers.
-_UNITS = {"pachon": "m", "ts_wep": "um", "donut": ""}
+_UNITS: dict[ZernikeConvention, str] = {"pachon": "m", "ts_wep": "um", "donut": ""}
 #: Names of conventions.
 CONVENTIONS = tuple(_UNITS)
 #: Parameters of rigid-body motions, in the order of shifts and turns.
@@ -51,7 +53,7 @@ _MOTIONS = ("dx", "dy", "dz", "rx", "ry", "rz")
 
 
 class FittedWavefronts(Protocol):
-    """Wavefronts of n donuts in the telescope frame [m]; see :class:`~pachon.DonutFit`."""
+    """Wavefronts of n donuts in the telescope frame [m]; see :class:`~pachon.sensing.DonutFit`."""
 
     @property
     def zernikes(self) -> np.ndarray:
@@ -78,7 +80,7 @@ class FittedWavefronts(Protocol):
         """Inner over outer radius of the annulus."""
 
     @property
-    def projection(self) -> str:
+    def projection(self) -> Projection:
         """Meaning of the field angles."""
 
 
@@ -108,8 +110,8 @@ class ObservatoryZernikes(Result):
         Field angles of the light's own travel along the axes of the frame [rad].
     """
 
-    convention: str
-    frame: str
+    convention: ZernikeConvention
+    frame: FrameName
     unit: str
     wave: float
     obscuration: float
@@ -180,14 +182,13 @@ class ObservatoryZernikes(Result):
 
 def observatory_zernikes(
     fit: FittedWavefronts,
-    convention: str,
-    frame: str,
+    convention: ZernikeConvention,
+    frame: FrameName,
     frames: DonutFrames,
     design: Telescope | None,
     wave: ArrayLike | None,
 ) -> ObservatoryZernikes:
     """Return the wavefronts of a fit in a convention and frame; see :meth:`DonutFit.zernikes_in`."""
-    check_choice("convention", convention, CONVENTIONS)
     if wave is not None and convention != "donut":
         raise ConfigError(f"wave and convention = {convention!r} are both given: expected waves of donut alone")
     waves = (DONUT_WAVELENGTH if wave is None else length(wave, "wave")) if convention == "donut" else np.nan
@@ -251,7 +252,7 @@ class BodyMotions(Result):
 
     _table = ("body", "shift", "shift_error", "tilt", "tilt_error")
 
-    frame: str
+    frame: FrameName
     body: np.ndarray
     shift: np.ndarray
     shift_error: np.ndarray
@@ -277,7 +278,7 @@ class BodyMotions(Result):
 
 @check_arguments
 def hexapod_corrections(
-    degrees_of_freedom: FreedomEstimate, *, frame: str = "OCS", frames: DonutFrames | None = None
+    degrees_of_freedom: FreedomEstimate, *, frame: FrameName = "OCS", frames: DonutFrames | None = None
 ) -> BodyMotions:
     """Return the motions of hexapods that undo the fitted ones.
 

@@ -18,6 +18,7 @@ from ..core.arguments import check_arguments
 from ..core.plotting import BLUE, axes_at, styled
 from ..core.result import Result
 from ..models.telescope import Telescope
+from ..raytrace.rays import Projection
 from ..wavefront.psf.light import Light
 from .fit import fit_donuts
 from .frames import along_camera, stamp_matrix
@@ -123,7 +124,7 @@ def check_orientation(
     sky_variance: ArrayLike | None = None,
     model: DonutModel | None = None,
     mask: NDArray[np.bool_] | Sequence[NDArray[np.bool_]] | None = None,
-    projection: str = "zemax",
+    projection: Projection = "zemax",
     donuts: int = 3,
     threads: int | None = None,
 ) -> OrientationCheck:

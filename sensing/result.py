@@ -14,11 +14,12 @@ from ..core.result import Result
 from ..core.units import arcseconds
 from ..design.drawing import field_colors
 from ..design.metrics.field_zernikes import name_terms
+from ..raytrace.rays import Projection
 from .degrees import FreedomEstimate
 from .exposure import ExposureWavefront
 from .flags import DonutFlag
-from .frames import DonutFrames
-from .observatory_zernikes import ObservatoryZernikes, observatory_zernikes
+from .frames import DonutFrames, FrameName
+from .observatory_zernikes import ObservatoryZernikes, ZernikeConvention, observatory_zernikes
 from .rim_table import rim_table
 from .star_errors import ErrorParts
 
@@ -131,7 +132,7 @@ class DonutFit(Result):
     diffraction : bool
         Whether the model has light diffracted at the rims of the pupil.
     exposure : ExposureWavefront or None
-        Wavefronts of the light of the donuts, air and both sides of focus, of :class:`~pachon.ExposureDonuts`.
+        Wavefronts of the light of the donuts, air and both sides of focus, of :class:`~pachon.sensing.ExposureDonuts`.
     """
 
     zernikes: np.ndarray
@@ -163,7 +164,7 @@ class DonutFit(Result):
     double_zernikes: np.ndarray | None = None
     double_zernike_covariance: np.ndarray | None = None
     degrees_of_freedom: FreedomEstimate | None = None
-    projection: str = "zemax"
+    projection: Projection = "zemax"
     rims: QTable = field(default_factory=lambda: rim_table({}))
     diffraction: bool = False
     exposure: ExposureWavefront | None = None
@@ -204,8 +205,8 @@ class DonutFit(Result):
 
     def zernikes_in(
         self,
-        convention: str = "pachon",
-        frame: str = "OCS",
+        convention: ZernikeConvention = "pachon",
+        frame: FrameName = "OCS",
         *,
         frames: DonutFrames | None = None,
         design: Telescope | None = None,

@@ -13,6 +13,7 @@ from ..models.camera.camera import Camera
 from ..models.camera.cameras import load_camera
 from ..models.camera.corner_rafts import WAVEFRONT_OFFSET
 from ..models.telescope import Telescope
+from ..raytrace.rays import Projection
 from ..wavefront.chief_rays import fields_at
 from .stamp_files import DonutStamps
 
@@ -52,7 +53,7 @@ def on_camera(stamps: DonutStamps) -> bool:
     return on_detectors and bool(np.isfinite(stamps.pixels).all())
 
 
-def stamp_places(stamps: DonutStamps, telescope: Telescope, file: Path, projection: str) -> StampPlaces:
+def stamp_places(stamps: DonutStamps, telescope: Telescope, file: Path, projection: Projection) -> StampPlaces:
     """Return fields, axes and heights of stamps on the CCDs of their camera.
 
     Parameters

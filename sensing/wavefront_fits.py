@@ -16,6 +16,7 @@ from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError
 from ..models.telescope import Telescope
 from ..models.zernike_polynomials import annular_zernikes
+from ..raytrace.rays import Projection
 from ..wavefront.atmosphere.atmosphere import Atmosphere
 from .cross_check import cross_checked
 from .degrees import FreedomEstimate
@@ -57,7 +58,7 @@ class UsableStars:
     instrument: Instrument
     stars: Sequence[StarSolution]
     fields: np.ndarray
-    projection: str
+    projection: Projection
     every_field: np.ndarray
     index: np.ndarray
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from astropy import units as u
@@ -12,12 +12,12 @@ from astropy.table import Column
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
-from ..core.errors import DomainError, ProductError, check_choice, error_context
+from ..core.errors import DomainError, ProductError, error_context
 from ..core.files import write_bytes
 from ..core.products import Columns, table_hdu, write_ecsv, write_fits
 from ..core.table_files import parquet_module, read_columns
 from ..core.units import radians
-from ..models.camera.photometry import BANDS
+from ..models.camera.photometry import BandName
 from .galaxies import Galaxies
 from .imsim_galaxies import (
     SIGN_OF_SKY_CATALOGUE,
@@ -49,8 +49,9 @@ _PER_COMPONENT = {
 }
 
 
+EllipticityConvention = Literal["galsim", "tangent_plane"]
 #: Conventions of e2: the sign that turns it into ours, > 0 along xi = eta, and what it means.
-CONVENTIONS = {
+CONVENTIONS: dict[EllipticityConvention, tuple[float, str]] = {
     "galsim": (-1.0, "e2 > 0 from north-west to south-east, as of GalSim, TreeCorr, DES and Rubin"),
     "tangent_plane": (1.0, "e2 > 0 from north-east to south-west, along xi = eta"),
 }
@@ -58,7 +59,11 @@ CONVENTIONS = {
 
 @check_arguments
 def read_galaxies(
-    path: str | Path, *, pointing: ArrayLike | None = None, convention: str | None = None, band: str = "r"
+    path: str | Path,
+    *,
+    pointing: ArrayLike | None = None,
+    convention: EllipticityConvention | None = None,
+    band: BandName = "r",
 ) -> Galaxies:
     """Read galaxies from a table: ECSV, CSV, FITS (its first table) or Parquet.
 
@@ -103,9 +108,6 @@ def read_galaxies(
         If a value is none of a galaxy, or the convention of ``e2`` is not given.
     """
     path = Path(path)
-    if convention is not None:
-        check_choice("convention", convention, CONVENTIONS)
-    check_choice("band", band, BANDS)
     if is_instance_catalogue(path):
         return galaxies_of_instance_catalogue(path, pointing)
     columns = read_columns(path)
@@ -177,7 +179,9 @@ def _column_values(
     return radians(u.Quantity(numbers, column_unit or unit), key)
 
 
-def _from_catalogue(columns: dict[str, Column | np.ndarray], pointing: Any, convention: str | None = None) -> Galaxies:
+def _from_catalogue(
+    columns: dict[str, Column | np.ndarray], pointing: Any, convention: EllipticityConvention | None = None
+) -> Galaxies:
     """Return galaxies of one component from the columns of a catalogue."""
     if "xi" in columns or "eta" in columns:
         xi, eta = (_column_values(columns, name, u.rad) for name in ("xi", "eta"))
@@ -205,7 +209,7 @@ def _from_catalogue(columns: dict[str, Column | np.ndarray], pointing: Any, conv
     return Galaxies.single(xi, eta, magnitude, radius, e1=e1, e2=e2, sersic=sersic)
 
 
-def _sign_of(convention: str | None) -> float:
+def _sign_of(convention: EllipticityConvention | None) -> float:
     """Return the sign that turns e2 of a convention into ours, or raise DomainError where none is given."""
     if convention is None:
         choices = ", or ".join(f"{name} ({meaning})" for name, (_, meaning) in CONVENTIONS.items())

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel
 
@@ -20,7 +20,6 @@ from ..core.errors import (
     PrescriptionError,
     PrescriptionNote,
     PrescriptionWarning,
-    check_choice,
 )
 from ..core.json_schema import json_schema
 from ..core.schema import problems_of
@@ -48,7 +47,7 @@ _YAML, _TABLES = (".yaml", ".yml"), (".csv", ".ecsv", ".fits", ".fit", ".fz", ".
 class FileKind:
     """A kind of YAML file: its model, its errors, and its loader for checks across keys."""
 
-    name: str
+    name: SchemaKind
     model: type[BaseModel]
     load: Callable[[Path], Any]
     error: type[PachonError] = ConfigError
@@ -64,6 +63,19 @@ def _load_tolerances(path: Path) -> None:
     load_tolerances(path, "telescope")
 
 
+SchemaKind = Literal[
+    "prescription",
+    "run",
+    "sweep",
+    "images",
+    "visits",
+    "align",
+    "site",
+    "coatings",
+    "tolerances",
+    "optimization",
+    "degrees_of_freedom",
+]
 #: In the order in which they are chosen where a file could be of two kinds.
 KINDS = (
     FileKind("prescription", Prescription, load_telescope, PrescriptionError),
@@ -142,7 +154,7 @@ def validate_file(path: str | os.PathLike[str]) -> Validation:
 
 
 @check_arguments
-def file_schema(kind: str) -> dict[str, Any]:
+def file_schema(kind: SchemaKind) -> dict[str, Any]:
     """Return the JSON schema of a kind of YAML file, for editors.
 
     Parameters
@@ -156,7 +168,6 @@ def file_schema(kind: str) -> dict[str, Any]:
     ConfigError
         If there is no such kind.
     """
-    check_choice("kind", kind, [k.name for k in KINDS])
     (file_kind,) = (k for k in KINDS if k.name == kind)
     return json_schema(file_kind.model, f"pachon {kind}")
 

@@ -192,7 +192,7 @@ def _static_heights(here, out, resume):
                         values=shapes + 1e-3 * rng.standard_normal(shapes.shape)) for _ in range(2)
     ]  # fmt: skip
     out.mkdir(exist_ok=True)
-    heights = pachon.fit_static_heights(
+    heights = pachon.reconstruction.fit_static_heights(
         exposures, instrument, camera=camera, prior=OpticsPrior(alignment_rms=0.0), steps=1, folder=out, threads=1
     )
     heights.write(out / "heights.fits")

@@ -1,1 +1,5 @@
 """Phase: optical path differences, Zernikes, reference spheres."""
+
+from ..core.deprecation import public_names as _public_names
+
+__getattr__, __dir__, __all__ = _public_names(__name__, __file__)

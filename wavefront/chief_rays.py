@@ -14,7 +14,7 @@ from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..raytrace.ideal_lens import image_points
 from ..raytrace.launch import launch_bundles
-from ..raytrace.rays import LOST, Rays, RayStatus, field_angles, field_direction, require_distant_object
+from ..raytrace.rays import LOST, Projection, Rays, RayStatus, field_angles, field_direction, require_distant_object
 from ..raytrace.trace import TraceResult, trace
 from .request import Request
 
@@ -93,7 +93,7 @@ def fields_at(
     positions: ArrayLike,
     wavelength: ArrayLike | None = None,
     *,
-    projection: str = "zemax",
+    projection: Projection = "zemax",
     threads: int | None = None,
 ) -> np.ndarray:
     """Return the field angles whose chief rays meet given points of the detector.

@@ -12,7 +12,7 @@ from ..core.arguments import check_arguments
 from ..core.point_plots import draw_points
 from ..core.result import Result
 from ..core.units import length, require_count
-from ..models.camera.corner_rafts import corner_focal_plane
+from ..models.camera.corner_rafts import CornerHeights, CornerKind, corner_focal_plane
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from .chief_rays import fields_at
@@ -85,8 +85,8 @@ class CornerStars(Result):
 def corner_stars(
     telescope: Telescope,
     *,
-    kind: str = "wavefront",
-    heights: str = "nominal",
+    kind: CornerKind = "wavefront",
+    heights: CornerHeights = "nominal",
     n: int = 1,
     wavelength: ArrayLike | None = None,
 ) -> CornerStars:

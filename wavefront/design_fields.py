@@ -11,7 +11,7 @@ from ..models.paraxial import stop_image
 from ..models.telescope import Telescope
 from ..raytrace.aiming import entrance_points
 from ..raytrace.landing import derivatives, determinants, find_points, solve_2x2
-from ..raytrace.rays import field_angles, field_direction, straight_bundles
+from ..raytrace.rays import Projection, field_angles, field_direction, straight_bundles
 from ..raytrace.trace import trace
 
 #: Step of the slopes for the scale on the axis.
@@ -20,7 +20,7 @@ _SLOPE = 1e-4
 _STEPS = 10
 
 
-def design_fields(telescope: Telescope, projection: str = "zemax") -> np.ndarray:
+def design_fields(telescope: Telescope, projection: Projection = "zemax") -> np.ndarray:
     """Return the field angles [rad], shape [n, 2], of the fields that the design data of a telescope state.
 
     Of an object height it is the angle of the ray to the middle of the entrance pupil; of a paraxial image height that

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +16,7 @@ from ..models.camera.silicon import Silicon
 from ..models.telescope import Telescope
 from ..raytrace.ideal_lens import image_direction, image_points, require_image
 from ..raytrace.pack.surfaces import refractive_indices
-from ..raytrace.rays import RayStatus, pupil_points
+from ..raytrace.rays import Projection, RayStatus, pupil_points
 from ..raytrace.trace import TraceResult, trace
 from .chief_rays import image_jacobians, reference_rays
 from .opd_map import OpdMap, OpdMaps
@@ -25,6 +26,8 @@ from .pupil_sampling import CHIEF_RAY
 from .reference_sphere import path_to_plane, path_to_sphere
 from .request import Request
 
+#: Zero of the OPD: at the chief ray, or in the mean over the lit pupil.
+OpdReference = Literal["chief", "mean"]
 #: What replaces the radius of the sphere in a call.
 _SPHERE = "telescope=replace(telescope, reference_sphere_radius=...)"
 #: What a call of many fields cannot do without.
@@ -40,10 +43,10 @@ def wavefront_opd(
     pupil: tuple[ArrayLike, ArrayLike] | None = None,
     *,
     grid: int | None = None,
-    reference: str = "chief",
+    reference: OpdReference = "chief",
     focal_plane: FocalPlane | None = None,
     silicon: Silicon | None = None,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
 ) -> OpdMap:
     """Return the optical path difference over the entrance pupil.
@@ -90,8 +93,6 @@ def wavefront_opd(
         If field or wavelength lie outside what the telescope covers, silicon is transparent, or no reference point
         exists.
     """
-    if reference not in ("chief", "mean"):
-        raise ConfigError(f"reference = {reference!r}: expected 'chief' or 'mean'")
     request = Request.of(telescope, field, wavelength, sampling=CHIEF_RAY, projection=projection, threads=threads)
     telescope, threads = request.telescope, request.threads
     if len(request.fields) != 1:
@@ -140,7 +141,7 @@ def wavefront_opds(
     grid: int | None = None,
     focal_plane: FocalPlane | None = None,
     silicon: Silicon | None = None,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> OpdMaps:

@@ -104,7 +104,7 @@ class OpdMap(_PupilMaps):
         """Draw the map in nanometres and waves, with and without piston and tilt, and Zernike terms as bars.
 
         The title contains the ``name`` of the telescope. A map that is not on a square grid or has no lit point raises
-        :class:`~pachon.DomainError`.
+        :class:`~pachon.errors.DomainError`.
         """
         if self.value.ndim != 2 or self.value.shape[0] != self.value.shape[1]:
             raise DomainError(f"opd of shape {self.value.shape}: expected one on a square grid to draw")

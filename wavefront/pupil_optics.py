@@ -20,7 +20,7 @@ from ..raytrace.ideal_lens import require_image
 from ..raytrace.kernels.packet import LANES, lane_flags, lanes, packet_count, ray_packets, to_packets
 from ..raytrace.kernels.pupil import trace_pupils as trace_pupils_kernel
 from ..raytrace.pack.surfaces import indices_and_wavelength, pack_surfaces
-from ..raytrace.rays import RayStatus, require_distant_object
+from ..raytrace.rays import Projection, RayStatus, require_distant_object
 from ..raytrace.trace import trace
 from .aberration import ResidualWavefront
 from .chief_rays import image_jacobians, reference_rays
@@ -76,7 +76,7 @@ def trace_pupils(
     focal_plane: FocalPlane | None = None,
     aberration: ResidualWavefront | None = None,
     vignetting: np.ndarray | None = None,
-    projection: str = "zemax",
+    projection: Projection = "zemax",
     threads: int | None = None,
 ) -> PupilOptics:
     """Trace the same pupil points for many stars at several wavelengths to the CCD of each star.

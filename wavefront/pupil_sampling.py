@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from ..core.arguments import check_arguments
-from ..core.errors import DomainError, check_choice
+from ..core.errors import DomainError
 from ..core.units import MOST, require_count
 from ..models.telescope import Telescope
 
+SamplingName = Literal["gauss", "rings", "spiral", "square"]
 #: Default ``n_pupil``: points along the radius (gauss, rings), in all (spiral) or along the diameter (square).
-_DEFAULT_N_PUPIL = {"gauss": 20, "rings": 24, "spiral": 2000, "square": 64}
+_DEFAULT_N_PUPIL: dict[SamplingName, int] = {"gauss": 20, "rings": 24, "spiral": 2000, "square": 64}
 
 
 @check_arguments
@@ -124,7 +126,7 @@ def square_annulus(radius: float, obscuration: float, across: int) -> PupilSampl
 
 @check_arguments
 def pupil_sampling(
-    telescope: Telescope, sampling: str | PupilSampling = "gauss", n_pupil: int | None = None
+    telescope: Telescope, sampling: SamplingName | PupilSampling = "gauss", n_pupil: int | None = None
 ) -> PupilSampling:
     """Return points of a telescope's entrance pupil.
 
@@ -145,7 +147,6 @@ def pupil_sampling(
     """
     if isinstance(sampling, PupilSampling):
         return sampling
-    check_choice("sampling", sampling, _DEFAULT_N_PUPIL)
     radius, obscuration = 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration
     default = _DEFAULT_N_PUPIL[sampling]
     # On a spiral the number of points, else of those along a radius or side.

@@ -18,11 +18,11 @@ from ..models.telescope import Telescope
 from ..raytrace.aiming import AimedPoints, pupil_coordinates
 from ..raytrace.launch import aimed_points
 from ..raytrace.pack.surfaces import refractive_indices
-from ..raytrace.rays import Rays, RayStatus, field_direction, straight_bundles
+from ..raytrace.rays import Projection, Rays, RayStatus, field_direction, straight_bundles
 from ..raytrace.trace import trace
 from .bundles import Bundles
 from .design_fields import design_fields
-from .pupil_sampling import PupilSampling, pupil_sampling
+from .pupil_sampling import PupilSampling, SamplingName, pupil_sampling
 from .vignetting_factors import made_factors
 
 #: Rays in one part of a request: 15 float64 numbers each, so some 60 MB.
@@ -52,7 +52,7 @@ class Request:
     primary : float, optional
         Wavelength that reference points belong to [m], where it is one of `wavelengths`; else the one in their middle.
     vignetting : ndarray, shape [n_field, 5], optional
-        Vignetting factors of the fields, which change their pupil points, see :class:`~pachon.DesignData`.
+        Vignetting factors of the fields, which change their pupil points, see :class:`~pachon.models.DesignData`.
     stated_weights : ndarray, shape [n_field], optional
         Weights of the fields that the design data state.
     """
@@ -62,7 +62,7 @@ class Request:
     wavelengths: np.ndarray
     weights: np.ndarray
     pupil: PupilSampling
-    projection: str
+    projection: Projection
     threads: int | None
     primary: float | None = None
     vignetting: np.ndarray | None = None
@@ -84,9 +84,9 @@ class Request:
         wavelengths: ArrayLike | None = None,
         *,
         wavelength_weights: ArrayLike | None = None,
-        sampling: str | PupilSampling | None = None,
+        sampling: SamplingName | PupilSampling | None = None,
         n_pupil: int | None = None,
-        projection: str | None = None,
+        projection: Projection | None = None,
         threads: int | None = None,
         one_wavelength: bool = False,
         default_fields: Callable[[Telescope], ArrayLike] | None = None,
@@ -158,7 +158,7 @@ class Request:
         _ = request.directions  # an unknown projection is an error of the request, not of its first use
         return request
 
-    def _with(self, sampling: str | PupilSampling | None, n_pupil: int | None, threads: int | None) -> Request:
+    def _with(self, sampling: SamplingName | PupilSampling | None, n_pupil: int | None, threads: int | None) -> Request:
         """Return the request with other pupil points and threads, where given."""
         changes: dict[str, Any] = {} if threads is None else {"threads": threads}
         if sampling is not None or n_pupil is not None:
@@ -200,7 +200,7 @@ class Request:
 
     @property
     def wavelength(self) -> float:
-        """The only wavelength [m]; several of them are a :class:`~pachon.DomainError`."""
+        """The only wavelength [m]; several of them are a :class:`~pachon.errors.DomainError`."""
         if len(self.wavelengths) != 1:
             raise DomainError(f"wavelength: {len(self.wavelengths)} wavelengths are given; expected one")
         return float(self.wavelengths[0])
@@ -308,7 +308,7 @@ class Request:
 
 
 @check_arguments
-def field_points(telescope: Telescope, fields: ArrayLike | None = None, projection: str = "zemax") -> np.ndarray:
+def field_points(telescope: Telescope, fields: ArrayLike | None = None, projection: Projection = "zemax") -> np.ndarray:
     """Return field angles [rad], shape [n, 2], that the telescope covers.
 
     Parameters

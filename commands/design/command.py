@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ...models.telescope import Telescope
+    from ...raytrace.rays import Projection
     from ...wavefront.request import Request
 
 app = typer.Typer()
@@ -72,7 +73,7 @@ class Outcome:
 class TraceOptions(TypedDict):
     """Keyword arguments of every function that traces."""
 
-    projection: str
+    projection: Projection
     threads: int | None
 
 
@@ -84,7 +85,7 @@ class SharedOptions:
     field_deg: Sequence[str] | str | None = None
     wavelength_nm: float | Sequence[float] | None = None
     across_band: int | None = None
-    projection: str = "zemax"
+    projection: Projection = "zemax"
     aiming: str | None = None
     glass_catalogue: Sequence[Path] | None = None
     lenient: bool = False

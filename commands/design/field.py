@@ -15,6 +15,7 @@ from .command import Outcome, SharedOptions, design_command
 if TYPE_CHECKING:
     from ...design.metrics.distortion import Distortion
     from ...design.metrics.footprint import Footprint
+    from ...design.metrics.spots import SpotReference
     from ...design.metrics.vignetting import Vignetting
 
 #: Number of rays that takes longer than two seconds to trace.
@@ -37,7 +38,7 @@ def distortion(
     """
     from ...design.metrics.distortion import distortion as compute
 
-    reference = "centroid" if centroid else "chief"
+    reference: SpotReference = "centroid" if centroid else "chief"
     return Outcome(compute(*shared.first_arguments, reference=reference, **shared.trace_options), _distortion_rows)
 
 

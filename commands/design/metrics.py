@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 from typer import Option
 
@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from ...design.metrics.field_zernikes import DoubleZernikes, FieldZernikes
+    from ...design.metrics.field_zernikes import DoubleZernikes, FieldZernikes, FittedPupil, ZernikeOrdering
+    from ...wavefront.pupil_sampling import SamplingName
 
 
 @design_command(
@@ -49,7 +50,9 @@ def spots(
     """
     from ...design.metrics.spots import spots as compute
 
-    return compute(*shared.first_arguments, sampling=sampling, n_pupil=rays, **shared.trace_options)
+    return compute(
+        *shared.first_arguments, sampling=cast("SamplingName", sampling), n_pupil=rays, **shared.trace_options
+    )
 
 
 def _largest(strehl: np.ndarray) -> np.ndarray:
@@ -134,13 +137,19 @@ def zernikes(
             Request.of(telescope, None, shared.wavelength, one_wavelength=True, **shared.trace_options),
             jmax=jmax,
             kmax=double,
-            pupil=pupil,
+            pupil=cast("FittedPupil", pupil),
         )
         return Outcome(terms, _double_rows, stem=f"double_zernikes_{shared.stem}")
     fields = field_disc(telescope) if over_field else shared.fields
-    ordering = "fringe" if fringe else "noll"
+    ordering: ZernikeOrdering = "fringe" if fringe else "noll"
     coefficients = wavefront_zernikes(
-        telescope, fields, shared.wavelength, jmax=jmax, pupil=pupil, ordering=ordering, **shared.trace_options
+        telescope,
+        fields,
+        shared.wavelength,
+        jmax=jmax,
+        pupil=cast("FittedPupil", pupil),
+        ordering=ordering,
+        **shared.trace_options,
     )
     return Outcome(coefficients, _map_rows if over_field else _rows)
 
@@ -160,7 +169,7 @@ def _map_rows(result: FieldZernikes) -> Rows:
     return _terms(result.summary(), ["mean", "rms", "least", "largest"], values)
 
 
-def term_labels(count: int, ordering: str = "noll") -> list[str]:
+def term_labels(count: int, ordering: ZernikeOrdering = "noll") -> list[str]:
     """Return the indices of the first terms, with their names where they have one."""
     from ...design.metrics.field_zernikes import term_label
 

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 from typer import Option
 
@@ -22,6 +22,7 @@ from .command import Outcome, SharedOptions, design_command
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from ...design.optimize.merit_function import MeritName
     from ...design.optimize.operand import Operand
     from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
     from ...models.parameters.parameters import Parameter
@@ -184,7 +185,7 @@ def optimize(
         result = compute(
             DesignConfiguration(*shared.first_arguments, projection=shared.projection),
             name_list(variables or "", "--variables"),
-            merit or "spots",
+            cast("MeritName", merit or "spots"),
             bounds=dict(_bounds(text) for text in bounds or ()),
             targets=() if focal_length is None else (FocalLength(focal_length),),
             threads=shared.threads,

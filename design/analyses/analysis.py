@@ -15,6 +15,7 @@ from ...core.errors import DomainError
 from ...core.plotting import axes_at, figure_at, styled
 from ...core.products import described_table
 from ...models.telescope import Telescope
+from ...raytrace.rays import Projection
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
 from ..result import FieldResult
@@ -111,7 +112,7 @@ def line_request(
     telescope: Telescope | Request,
     fields: ArrayLike | None,
     wavelengths: ArrayLike | None,
-    projection: str | None,
+    projection: Projection | None,
     threads: int | None,
 ) -> Request:
     """Return the request of curves along the field, with chief rays as pupil points."""

@@ -14,6 +14,7 @@ from ...core.errors import DomainError
 from ...core.plotting import BLUE, GREY, ORANGE, RED
 from ...core.units import pure_numbers
 from ...models.telescope import Telescope
+from ...raytrace.rays import Projection
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
@@ -156,7 +157,7 @@ def lateral_color(
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
 ) -> LateralColor:
     """Trace lateral colour along the field.

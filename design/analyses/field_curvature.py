@@ -20,7 +20,7 @@ from ...core.errors import DomainError
 from ...core.plotting import BLUE
 from ...core.units import field_label
 from ...models.telescope import Telescope
-from ...raytrace.rays import RayStatus
+from ...raytrace.rays import Projection, RayStatus
 from ...wavefront.bundles import Bundles
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
@@ -115,7 +115,7 @@ def field_curvature(
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
 ) -> FieldCurvature:
     """Trace tangential and sagittal foci, and distortion.

@@ -24,7 +24,7 @@ from ...core.plotting import BLUE, GREY, ORANGE
 from ...core.units import require_count
 from ...models.telescope import Telescope
 from ...raytrace.ideal_lens import require_image
-from ...raytrace.rays import object_points
+from ...raytrace.rays import Projection, object_points
 from ...wavefront.request import Request
 from ..drawing import finish_axes
 from .analysis import Analysis, Columns, field_line
@@ -113,7 +113,7 @@ def relative_illumination(
     *,
     coatings: Coatings | str | os.PathLike[str] | None = None,
     n_pupil: int = 2000,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
 ) -> RelativeIllumination:
     """Trace the relative illumination of the detector.

@@ -15,6 +15,7 @@ from ...core.plotting import BLUE
 from ...core.units import length, require_count, require_within
 from ...models.telescope import Telescope
 from ...raytrace.ideal_lens import require_image
+from ...raytrace.rays import Projection
 from ...wavefront.bundles import Bundles
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
@@ -191,7 +192,7 @@ def ray_fans(
     wavelengths: ArrayLike | None = None,
     *,
     n_points: int = 65,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
 ) -> RayFans:
     """Trace ray fans, tangential and sagittal.
@@ -223,7 +224,7 @@ def opd_fans(
     *,
     n_points: int = 65,
     sphere_radius: ArrayLike | None = None,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
 ) -> OpdFans:
     """Trace OPD fans, tangential and sagittal.
@@ -263,7 +264,7 @@ def _traced(
     fields: ArrayLike | None,
     wavelengths: ArrayLike | None,
     n_points: int,
-    projection: str | None,
+    projection: Projection | None,
     threads: int | None,
 ) -> tuple[Request, np.ndarray, np.ndarray, list[Bundles]]:
     """Return request, pupil coordinates [n], axes of the fans and bundles of both fans, tangential first."""

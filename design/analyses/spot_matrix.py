@@ -14,8 +14,9 @@ from ...core.errors import DomainError
 from ...core.plotting import BLUE
 from ...core.units import metres, require_count
 from ...models.telescope import Telescope
+from ...raytrace.rays import Projection
 from ...wavefront.bundles import Bundles
-from ...wavefront.pupil_sampling import PupilSampling
+from ...wavefront.pupil_sampling import PupilSampling, SamplingName
 from ...wavefront.request import Request
 from .. import drawing
 from ..metrics.principal_rays import principal_rays_of
@@ -51,7 +52,7 @@ class SpotMatrix(Analysis):
         Radius of the first dark ring at the middle wavelength [m].
     """
 
-    against: str
+    against: Literal["focus", "wavelength"]
     columns: np.ndarray
     displacement: np.ndarray
     weight: np.ndarray
@@ -130,9 +131,9 @@ def spot_matrix(
     *,
     against: Literal["focus", "wavelength"] = "focus",
     defocus: ArrayLike | None = None,
-    sampling: str | PupilSampling = "rings",
+    sampling: SamplingName | PupilSampling = "rings",
     n_pupil: int | None = 10,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
 ) -> SpotMatrix:
     """Trace spots of each field against the focus, or against the wavelength.

@@ -13,7 +13,8 @@ from ...core.arguments import check_arguments
 from ...core.plotting import BLUE
 from ...core.threads import one_blas_thread
 from ...models.telescope import Telescope
-from ...wavefront.pupil_sampling import PupilSampling
+from ...raytrace.rays import Projection
+from ...wavefront.pupil_sampling import PupilSampling, SamplingName
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
 from ..images.diffraction import fft_psf
@@ -99,9 +100,9 @@ def strehl(
     wavelengths: ArrayLike | None = None,
     *,
     from_psf: bool = True,
-    sampling: str | PupilSampling | None = None,
+    sampling: SamplingName | PupilSampling | None = None,
     n_pupil: int | None = None,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
 ) -> StrehlRatios:
     """Compute Strehl ratios from wavefronts and diffraction images.

@@ -20,7 +20,7 @@ from ...core.units import angle as one_angle
 from ...core.units import arcseconds, length, pure_numbers, require_count, require_positive
 from ...models.telescope import Telescope
 from ...raytrace.launch import launch_bundles
-from ...raytrace.rays import RayStatus, field_direction
+from ...raytrace.rays import Projection, RayStatus, field_direction
 from ...raytrace.trace import trace
 from ...wavefront.request import RAYS_AT_ONCE, Request
 from ..metrics.principal_rays import principal_rays_of
@@ -153,7 +153,7 @@ def target_image(
     n_rays: int = 400,
     pixel: ArrayLike | None = None,
     pixels: int | None = None,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
 ) -> TargetImage:
     """Trace the geometric image of a target.

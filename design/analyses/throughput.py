@@ -22,9 +22,9 @@ from ...models.layer_stack import LayerStack
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
 from ...raytrace.pack.surfaces import refractive_indices
-from ...raytrace.rays import RayStatus
+from ...raytrace.rays import Projection, RayStatus
 from ...raytrace.trace import TraceResult, trace
-from ...wavefront.pupil_sampling import PupilSampling
+from ...wavefront.pupil_sampling import PupilSampling, SamplingName
 from ...wavefront.request import Request
 from ..drawing import field_colors, finish_axes
 from .analysis import Analysis, Columns, band_wavelengths
@@ -106,9 +106,9 @@ def throughput(
     wavelengths: ArrayLike | None = None,
     *,
     coatings: Coatings | str | os.PathLike[str] | None = None,
-    sampling: str | PupilSampling | None = None,
+    sampling: SamplingName | PupilSampling | None = None,
     n_pupil: int | None = None,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
 ) -> Throughput:
     """Trace the throughput with reflection losses, coatings and absorption.

@@ -16,16 +16,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments, removed_arguments
-from ...core.errors import DomainError, check_choice
+from ...core.errors import DomainError
 from ...core.memory import require_bytes
 from ...core.threads import one_blas_thread
 from ...core.units import field_label, length, require_count, require_within
 from ...models.telescope import Telescope
-from ...wavefront.pupil_sampling import PupilSampling, pupil_sampling
+from ...wavefront.pupil_sampling import PupilSampling, SamplingName, pupil_sampling
 from ...wavefront.request import Request, relative_weights
 from ..metrics.principal_rays import principal_rays_of
-from ..metrics.spots import REFERENCES, spot_diagram
-from .diffraction_psf import DiffractionPsf, pixel_axis
+from ..metrics.spots import SpotReference, spot_diagram
+from .diffraction_psf import DiffractionMethod, DiffractionPsf, pixel_axis
 from .wavelets import WaveletLattice, Wavelets, lattice_wavelets, range_of_cosines, spot_reach, traced_wavelets
 
 #: What replaces arguments that a request has.
@@ -66,7 +66,7 @@ def fft_psf(
     pixel: ArrayLike | None = None,
     pixels: int = _PIXELS,
     n_pupil: int | None = None,
-    reference: str = "centroid",
+    reference: SpotReference = "centroid",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> DiffractionPsf:
@@ -138,9 +138,9 @@ def huygens_psf(
     *,
     pixel: ArrayLike | None = None,
     pixels: int = _PIXELS,
-    sampling: str | PupilSampling = "square",
+    sampling: SamplingName | PupilSampling = "square",
     n_pupil: int | None = None,
-    reference: str = "centroid",
+    reference: SpotReference = "centroid",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> DiffractionPsf:
@@ -202,8 +202,7 @@ def wavelet_sum(wavelets: Wavelets, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 class _Plan:
     """Common inputs of both sums, and the reduction of irradiances to images."""
 
-    def __init__(self, request: Request, pixel: ArrayLike | None, pixels: int, reference: str) -> None:
-        check_choice("reference", reference, REFERENCES)
+    def __init__(self, request: Request, pixel: ArrayLike | None, pixels: int, reference: SpotReference) -> None:
         self.request, self.pixels = request, require_count(pixels, "pixels", 3, 4096)
         # The middle of the images weighs all wavelengths alike.
         alike, pupil = relative_weights(None, len(request.wavelengths)), pupil_sampling(request.telescope)
@@ -225,7 +224,7 @@ class _Plan:
     @one_blas_thread()
     def image(
         self,
-        method: str,
+        method: DiffractionMethod,
         waves: Callable[[Request, float, np.ndarray], tuple[Wavelets, _Sum]],
         n_pupil: int,
         progress: Callable[[int], None] | None,

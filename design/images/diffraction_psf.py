@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from scipy.ndimage import zoom
@@ -24,6 +24,10 @@ _FINER = 4
 _DECADES = 4.0
 #: Images whose cuts are drawn.
 _CUTS = 5
+
+
+#: Fourier sum over a lattice of cosines, or sum of Huygens' wavelets.
+DiffractionMethod = Literal["fft", "huygens"]
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,7 @@ class DiffractionPsf(FieldResult):
     _images = ("image",)
     _on_image = ("fwhm", "rms_radius", "airy_radius", "centroid", "reference_point", "plate_scale", "pixel", "axis")
 
-    method: str
+    method: DiffractionMethod
     image: np.ndarray
     pixel: float
     reference_point: np.ndarray

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import zoom
 
 from ...core.arguments import check_arguments, removed_arguments
-from ...core.errors import ConfigError, DomainError, check_choice, shown
+from ...core.errors import ConfigError, DomainError, shown
 from ...core.plotting import BLUE, ORANGE, RED, figure_at, styled
 from ...core.units import arcseconds, metres, pure_numbers, require_count
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
 from ..drawing import FEW, field_colors, finish_axes, second_scale
-from ..metrics.spots import SpotDiagram, spots
+from ..metrics.spots import SpotDiagram, SpotReference, spots
 from ..result import FieldResult
 from .diffraction import DiffractionPsf, fft_psf
 
@@ -35,7 +35,7 @@ _FINER = 3
 _RADII = 301
 #: Pixels on a side of the diffraction images.
 _PIXELS = 256
-KINDS = ("diffraction", "geometric")
+EnergyKind = Literal["diffraction", "geometric"]
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class EncircledEnergy(FieldResult):
 
     _on_image = ("radius", "plate_scale")
 
-    kind: str
+    kind: EnergyKind
     radius: np.ndarray
     fraction: np.ndarray
     plate_scale: np.ndarray
@@ -112,9 +112,9 @@ def encircled_energy(
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
-    kind: str | None = None,
+    kind: EnergyKind | None = None,
     radii: ArrayLike | None = None,
-    reference: str | None = None,
+    reference: SpotReference | None = None,
     n_pupil: int | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
@@ -174,7 +174,6 @@ def encircled_energy(
         return _of_images(telescope, circle_radii)
     kind = "diffraction" if kind is None else kind
     reference = "centroid" if reference is None else reference
-    check_choice("kind", kind, KINDS)
     request = Request.of(telescope, fields, wavelengths, threads=threads)
     if kind == "geometric":
         return _of_spots(spots(request, sampling="spiral", n_pupil=n_pupil, reference=reference), circle_radii)

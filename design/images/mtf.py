@@ -26,6 +26,7 @@ from ...core.plotting import BLUE, RED, figure_at, styled
 from ...core.threads import one_blas_thread
 from ...core.units import MOST, arcseconds, require_count
 from ...models.telescope import Telescope
+from ...raytrace.rays import Projection
 from ...wavefront.request import Request
 from ..drawing import finish_axes, grid_shape, legend_below, panels_of, second_scale
 from ..metrics.principal_rays import PrincipalRays, principal_rays_of
@@ -162,7 +163,7 @@ def mtf(
     *,
     wavelength_weights: ArrayLike | None = None,
     n_pupil: int | None = None,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Mtf:

@@ -13,6 +13,7 @@ from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, figure_at, plain_t
 from ...core.result import Result
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
+from ...raytrace.rays import Projection
 from ...wavefront.request import Request
 from ..drawing import field_text, legend_below
 from .sections import Lens, drawn_radii, even_edges, find_lenses, ray_paths, stop_rims, surface_section
@@ -171,7 +172,7 @@ def layout(
     fields: ArrayLike | None = None,
     wavelength: ArrayLike | None = None,
     *,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
 ) -> Layout:
     """Lay a telescope out for drawing.

@@ -10,15 +10,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError, check_choice
+from ...core.errors import DomainError
 from ...core.plotting import BLUE, ORANGE, RED, figure_at, styled
 from ...core.units import field_label
 from ...models.telescope import Telescope
-from ...wavefront.pupil_sampling import PupilSampling
+from ...raytrace.rays import Projection
+from ...wavefront.pupil_sampling import PupilSampling, SamplingName
 from ...wavefront.request import Request
 from ..drawing import finish_axes
 from ..result import FieldResult
-from .spots import REFERENCES, spot_diagram
+from .spots import SpotReference, spot_diagram
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -55,7 +56,7 @@ class Distortion(FieldResult):
 
     _on_image = ("position", "predicted", "shift")
 
-    reference: str
+    reference: SpotReference
     position: np.ndarray
     predicted: np.ndarray
     center: np.ndarray
@@ -129,10 +130,10 @@ def distortion(
     fields: ArrayLike | None = None,
     wavelength: ArrayLike | None = None,
     *,
-    reference: str = "chief",
-    sampling: str | PupilSampling | None = None,
+    reference: SpotReference = "chief",
+    sampling: SamplingName | PupilSampling | None = None,
     n_pupil: int | None = None,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
 ) -> Distortion:
     """Compare landing points with a scaled picture of the sky.
@@ -152,7 +153,6 @@ def distortion(
     DomainError
         If there are too few fields, or a star does not reach the detector.
     """
-    check_choice("reference", reference, REFERENCES)
     request = Request.of(
         telescope,
         fields,
@@ -201,7 +201,7 @@ def field_lattice(telescope: Telescope, across: int) -> np.ndarray:
     return np.stack([x[inside], y[inside]], axis=-1)
 
 
-def _landing(request: Request, reference: str) -> np.ndarray:
+def _landing(request: Request, reference: SpotReference) -> np.ndarray:
     if reference == "chief":
         return request.bundles(request.wavelength, np.zeros((1, 2))).chief_landing()
     return np.concatenate([spot_diagram(batch).reference_point for _, batch in request.parts()])

@@ -8,21 +8,22 @@ So ``a_kj`` is in metres, and the squares of all sum up to the mean square wavef
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments, removed_arguments
-from ...core.errors import DomainError, check_choice
+from ...core.errors import DomainError
 from ...core.plotting import BLUE, ORANGE, figure_at, figure_of, styled
 from ...core.result import Result
 from ...core.units import angle, field_label, require_count
-from ...models.fringe_zernikes import FRINGE_NAMES, FRINGE_TERMS, fringe_zernikes
+from ...models.fringe_indices import FRINGE_NAMES, FRINGE_TERMS, fringe_zernikes
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import NOLL_NAMES, annular_zernikes
+from ...raytrace.rays import Projection
 from ...wavefront.pupil_optics import trace_pupils
-from ...wavefront.pupil_sampling import PupilSampling, gauss_annulus
+from ...wavefront.pupil_sampling import PupilSampling, SamplingName, gauss_annulus
 from ...wavefront.request import Request, field_points
 from ..drawing import FEW, draw_field_map, field_colors, panels_of, spread_in_field
 from ..result import FieldResult
@@ -31,8 +32,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PUPILS = ("full", "lit")
-ORDERINGS = ("noll", "fringe")
+FittedPupil = Literal["full", "lit"]
+#: Fitted points: the whole annulus, or where light passes.
+ZernikeOrdering = Literal["noll", "fringe"]
 #: Maps of single terms in one plot.
 _MAPS = 8
 
@@ -61,8 +63,8 @@ class FieldZernikes(FieldResult):
     coefficients: np.ndarray
     residual_rms: np.ndarray
     obscuration: float
-    pupil: str
-    ordering: str = "noll"
+    pupil: FittedPupil
+    ordering: ZernikeOrdering = "noll"
 
     @property
     def rms(self) -> np.ndarray:
@@ -202,11 +204,11 @@ def wavefront_zernikes(
     wavelength: ArrayLike | None = None,
     *,
     jmax: int = 28,
-    pupil: str = "full",
-    ordering: str = "noll",
-    sampling: str | PupilSampling | None = None,
+    pupil: FittedPupil = "full",
+    ordering: ZernikeOrdering = "noll",
+    sampling: SamplingName | PupilSampling | None = None,
     n_pupil: int | None = None,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
 ) -> FieldZernikes:
     """Fit annular Zernikes to the wavefronts of several field points.
@@ -234,8 +236,6 @@ def wavefront_zernikes(
     DomainError
         If there are fewer points than terms, or rays of the full annulus do not reach the detector.
     """
-    check_choice("pupil", pupil, PUPILS)
-    check_choice("ordering", ordering, ORDERINGS)
     request = Request.of(
         telescope,
         fields,
@@ -293,8 +293,8 @@ def double_zernikes(
     kmax: int = 22,
     rings: int = 8,
     field_radius: ArrayLike | None = None,
-    pupil: str = "full",
-    sampling: str | PupilSampling | None = None,
+    pupil: FittedPupil = "full",
+    sampling: SamplingName | PupilSampling | None = None,
     n_pupil: int | None = None,
     threads: int | None = None,
 ) -> DoubleZernikes:
@@ -338,7 +338,7 @@ def double_zernikes(
 
 
 def _fit(
-    terms: np.ndarray, value: np.ndarray, used: np.ndarray, weights: np.ndarray, fields: np.ndarray, pupil: str
+    terms: np.ndarray, value: np.ndarray, used: np.ndarray, weights: np.ndarray, fields: np.ndarray, pupil: FittedPupil
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit terms [n_pupil, jmax] to wavefronts [n_field, n_pupil] by weighted least squares over the points used."""
     root = np.sqrt(weights)
@@ -365,13 +365,13 @@ def _fit(
     return coefficients, np.sqrt((residual**2 @ weights) / (used @ weights))
 
 
-def term_label(j: int, ordering: str = "noll") -> str:
+def term_label(j: int, ordering: ZernikeOrdering = "noll") -> str:
     """Return index and name of a term."""
     names = NOLL_NAMES if ordering == "noll" else FRINGE_NAMES
     return f"{j} {names.get(j, '')}".strip()
 
 
-def name_terms(axes: Axes, j: np.ndarray, ordering: str = "noll") -> None:
+def name_terms(axes: Axes, j: np.ndarray, ordering: ZernikeOrdering = "noll") -> None:
     """Label an axis of indices of terms."""
     axes.axhline(0.0, color="0.3", linewidth=0.7)
     if len(j) <= 45:

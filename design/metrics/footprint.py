@@ -14,9 +14,9 @@ from ...core.errors import DomainError
 from ...core.plotting import RED, plain_text, styled
 from ...models.surface import Surface
 from ...models.telescope import Telescope
-from ...raytrace.rays import RayStatus
+from ...raytrace.rays import Projection, RayStatus
 from ...raytrace.trace import trace
-from ...wavefront.pupil_sampling import PupilSampling
+from ...wavefront.pupil_sampling import PupilSampling, SamplingName
 from ...wavefront.request import Request
 from ..drawing import FEW, Color, field_colors, panel_grid
 from ..result import FieldResult
@@ -132,9 +132,9 @@ def footprint(
     fields: ArrayLike | None = None,
     wavelength: ArrayLike | None = None,
     *,
-    sampling: str | PupilSampling = "rings",
+    sampling: SamplingName | PupilSampling = "rings",
     n_pupil: int | None = None,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
 ) -> Footprint:
     """Trace the footprints of field points on surfaces.

@@ -25,6 +25,7 @@ from ...core.threads import thread_count
 from ...core.units import field_label, require_count
 from ...models.telescope import Telescope
 from ...raytrace.ideal_lens import require_image
+from ...raytrace.rays import Projection
 from ...wavefront.pupil_sampling import pupil_sampling
 from ...wavefront.request import Request
 from ..analyses.coatings import Coatings
@@ -234,7 +235,7 @@ def ghosts(
     reflectivity: float | Mapping[str, float] | Reflectivity | None = None,
     n_pupil: int = 40000,
     brightest: int | None = None,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Ghosts:

@@ -21,7 +21,7 @@ from ...core.units import field_label
 from ...models.telescope import Telescope
 from ...raytrace.ideal_lens import image_points
 from ...raytrace.launch import launch_bundles
-from ...raytrace.rays import RayStatus, field_direction
+from ...raytrace.rays import Projection, RayStatus, field_direction
 from ...raytrace.trace import trace
 from ...wavefront.chief_rays import JACOBIAN_STEP
 from ...wavefront.pupil_sampling import pupil_sampling
@@ -164,7 +164,7 @@ def principal_rays(
     fields: ArrayLike | None = None,
     wavelength: ArrayLike | None = None,
     *,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
 ) -> PrincipalRays:
     """Trace chief and marginal rays; find exit pupil, focal ratio, plate scale.

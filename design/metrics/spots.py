@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError, check_choice
+from ...core.errors import DomainError
 from ...core.plotting import BLUE, RED, styled
 from ...core.units import arcseconds
 from ...models.telescope import Telescope
-from ...wavefront.pupil_sampling import PupilSampling
+from ...raytrace.rays import Projection
+from ...wavefront.pupil_sampling import PupilSampling, SamplingName
 from ...wavefront.request import Request
 from .. import drawing
 from ..result import FieldResult
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-REFERENCES = ("centroid", "chief")
+#: Origin of spots: centroid of the light, or landing point of the chief ray.
+SpotReference = Literal["centroid", "chief"]
 #: Half-width of the frame at most, in radii of 80 % of the rays: stray rays would hide the spots.
 _FARTHEST = 5.0
 #: Dots in one panel beyond which only every second, third... ray is drawn.
@@ -184,10 +186,10 @@ def spots(
     wavelengths: ArrayLike | None = None,
     *,
     wavelength_weights: ArrayLike | None = None,
-    sampling: str | PupilSampling | None = None,
+    sampling: SamplingName | PupilSampling | None = None,
     n_pupil: int | None = None,
-    reference: str = "centroid",
-    projection: str | None = None,
+    reference: SpotReference = "centroid",
+    projection: Projection | None = None,
     threads: int | None = None,
 ) -> SpotDiagram:
     """Trace spot diagrams.
@@ -204,7 +206,6 @@ def spots(
     ConfigError
         If the reference is unknown.
     """
-    check_choice("reference", reference, REFERENCES)
     request = Request.of(
         telescope,
         fields,
@@ -218,7 +219,7 @@ def spots(
     return spot_diagram(request, reference)
 
 
-def spot_diagram(request: Request, reference: str = "centroid") -> SpotDiagram:
+def spot_diagram(request: Request, reference: SpotReference = "centroid") -> SpotDiagram:
     """Return the spot diagram of a request."""
     bundles = [request.bundles(float(w)) for w in request.wavelengths]
     principal = principal_rays_of(request)

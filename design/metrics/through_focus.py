@@ -20,8 +20,9 @@ from ...core.threads import one_blas_thread
 from ...core.units import field_label, metres
 from ...models.telescope import Telescope
 from ...raytrace.ideal_lens import require_image
+from ...raytrace.rays import Projection
 from ...wavefront.bundles import Bundles
-from ...wavefront.pupil_sampling import PupilSampling
+from ...wavefront.pupil_sampling import PupilSampling, SamplingName
 from ...wavefront.request import Request
 from ..drawing import FEW, field_colors, finish_axes, legend_below
 from ..result import FieldResult
@@ -122,9 +123,9 @@ def through_focus(
     defocus: ArrayLike | None = None,
     *,
     wavelength_weights: ArrayLike | None = None,
-    sampling: str | PupilSampling | None = None,
+    sampling: SamplingName | PupilSampling | None = None,
     n_pupil: int | None = None,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
 ) -> ThroughFocus:
     """Measure spots and wavefronts against the height of the detector.

@@ -14,6 +14,7 @@ from ...core.errors import DomainError
 from ...core.plotting import BLUE, figure_at, figure_of, styled
 from ...core.units import require_count
 from ...models.telescope import Telescope
+from ...raytrace.rays import Projection
 from ...wavefront.request import Request
 from ..drawing import draw_field_map, finish_axes, spread_in_field
 from ..result import FieldResult
@@ -89,7 +90,7 @@ def vignetting(
     wavelength: ArrayLike | None = None,
     *,
     n_pupil: int = 16384,
-    projection: str | None = None,
+    projection: Projection | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Vignetting:

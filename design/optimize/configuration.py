@@ -13,7 +13,8 @@ from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError
 from ...models.parameters.parameters import resolved
 from ...models.telescope import Telescope
-from ...wavefront.pupil_sampling import PupilSampling
+from ...raytrace.rays import Projection
+from ...wavefront.pupil_sampling import PupilSampling, SamplingName
 from .merit import Beams
 from .operand import Operand
 
@@ -46,9 +47,9 @@ class DesignConfiguration:
     wavelength_weights: ArrayLike | None = None
     weight: float = 1.0
     operands: Sequence[Operand] = ()
-    sampling: str | PupilSampling = "gauss"
+    sampling: SamplingName | PupilSampling = "gauss"
     n_pupil: int | None = None
-    projection: str = "zemax"
+    projection: Projection = "zemax"
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.weight) and self.weight > 0):

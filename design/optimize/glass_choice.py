@@ -18,7 +18,7 @@ from ...models.media.medium import LINE_D, Medium, abbe_number
 from ...models.parameters.parameters import Parameter
 from ...models.telescope import VACUUM, Telescope
 from .configuration import DesignConfiguration
-from .merit_function import MeritFunction
+from .merit_function import MeritFunction, MeritName
 from .operand import Operand
 from .optimize import optimize
 from .optimum import Optimum
@@ -108,7 +108,7 @@ def choose_glasses(
     telescope: Telescope | DesignConfiguration,
     variables: Iterable[str | Parameter],
     glasses: Iterable[str],
-    merit: str | MeritFunction = "spots",
+    merit: MeritName | MeritFunction = "spots",
     *,
     catalogue: GlassCatalogue | None = None,
     nearest: int = 4,

@@ -20,7 +20,7 @@ from ...raytrace.adjoint.forward_pass import forward_pass
 from ...raytrace.ideal_lens import image_points, require_image
 from ...raytrace.rays import Rays, RayStatus, straight_bundles
 from ...raytrace.trace import trace
-from ...wavefront.pupil_sampling import PupilSampling
+from ...wavefront.pupil_sampling import PupilSampling, SamplingName
 from ...wavefront.request import Request, relative_weights
 from .aimed_rays import AimedRays
 from .jacobian import ParameterColumns
@@ -45,7 +45,7 @@ class Beams:
         wavelengths: ArrayLike | None = None,
         *,
         field_weights: ArrayLike | None = None,
-        sampling: str | PupilSampling = "gauss",
+        sampling: SamplingName | PupilSampling = "gauss",
         n_pupil: int | None = None,
         **options: Any,
     ) -> Beams:

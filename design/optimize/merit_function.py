@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.errors import ConfigError, DomainError, check_choice, shown
+from ...core.errors import ConfigError, DomainError, shown
 from ...models.telescope import Telescope
-from ..metrics.spots import REFERENCES, spot_diagram
+from ..metrics.spots import SpotReference, spot_diagram
 from .merit import Beams, Merit, SpotMerit, WavefrontMerit
 
+MeritName = Literal["spots", "wavefront"]
 #: Most rays of a goal: beyond, an array shows one number very often.
 _MOST_RAYS = 10**9
 
@@ -51,10 +52,7 @@ class SpotSize:
     name: ClassVar[str] = "spots"
     of_one_telescope: ClassVar[bool] = False
 
-    reference: str = "centroid"
-
-    def __post_init__(self) -> None:
-        check_choice("reference", self.reference, REFERENCES)
+    reference: SpotReference = "centroid"
 
     def of(self, telescope: Telescope, beams: Beams) -> Merit:
         """Return the merit of rays that are lit in a telescope."""
@@ -127,7 +125,7 @@ class _BoundMerit:
         return float(np.linalg.norm(self.merit.residuals(telescope)))
 
 
-def merit_function(merit: str | MeritFunction | Merit) -> MeritFunction:
+def merit_function(merit: MeritName | MeritFunction | Merit) -> MeritFunction:
     """Return the merit function of a name or an object; ConfigError for another."""
     if isinstance(merit, str):
         for function in (SpotSize(), WavefrontError()):

@@ -18,7 +18,7 @@ from .configuration import DesignConfiguration, configurations
 from .design_task import DesignTask
 from .jacobian import ParameterColumns
 from .merit import Beams, Merit
-from .merit_function import MeritFunction, merit_function
+from .merit_function import MeritFunction, MeritName, merit_function
 from .operand import Operand
 from .optimum import Optimum
 from .problem import DesignProblem
@@ -46,7 +46,7 @@ _REPLACED = {
 def optimize(
     telescope: Telescope | DesignConfiguration | Sequence[Telescope | DesignConfiguration],
     variables: Iterable[str | Parameter],
-    merit: str | MeritFunction | Merit = "spots",
+    merit: MeritName | MeritFunction | Merit = "spots",
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,

@@ -40,6 +40,7 @@ from ...models.io.glass_catalogue import GlassCatalogue
 from ...models.io.prescription import load_telescope
 from ...models.parameters.changes import ANGLES, LENGTHS, parse_change
 from ...models.telescope import Telescope
+from ...raytrace.rays import Projection
 from .configuration import DesignConfiguration
 from .merit_function import SpotSize, WavefrontError
 from .operand import OPERANDS, GoalOperand, Operand
@@ -254,7 +255,7 @@ def load_optimization(path: str | os.PathLike[str]) -> OptimizeFile:
 
 
 def optimization_arguments(
-    file: OptimizeFile, telescope: Telescope, path: Path, projection: str = "zemax"
+    file: OptimizeFile, telescope: Telescope, path: Path, projection: Projection = "zemax"
 ) -> dict[str, Any]:
     """Return the arguments of :func:`~.optimize.optimize` for a file and the telescope of its command.
 

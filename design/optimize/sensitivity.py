@@ -19,8 +19,8 @@ from ...models.parameters.parameters import Parameter, ParameterVector, Variable
 from ...models.paraxial import following_stop
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import MOST_TERMS, annular_zernikes
-from ...raytrace.rays import RayStatus
-from ...wavefront.pupil_sampling import PupilSampling
+from ...raytrace.rays import Projection, RayStatus
+from ...wavefront.pupil_sampling import PupilSampling, SamplingName
 from ...wavefront.request import Request
 from ..result import FieldResult
 from .jacobian import ParameterColumns
@@ -164,9 +164,9 @@ def sensitivity(
     wavelength: ArrayLike | None = None,
     *,
     n_zernike: int = 28,
-    sampling: str | PupilSampling = "gauss",
+    sampling: SamplingName | PupilSampling = "gauss",
     n_pupil: int | None = None,
-    projection: str = "zemax",
+    projection: Projection = "zemax",
     threads: int | None = None,
 ) -> Sensitivity:
     """Return exact derivatives of Zernike coefficients at every field point.

@@ -10,7 +10,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError, check_choice
+from ...core.errors import DomainError
 from ...models.telescope import Telescope
 from ...raytrace.adjoint.backward_pass import image_gradient
 from ...wavefront.pupil_sampling import CHIEF_RAY
@@ -183,12 +183,11 @@ class ChiefRay(_ExactOperand):
     """
 
     field: tuple[float, float]
-    axis: str = "y"
+    axis: Literal["x", "y"] = "y"
     wavelength: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_choice("axis", self.axis, ("x", "y"))
 
     def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
         field = np.array([angles_of(self.field)])

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments, removed_arguments
-from ...core.errors import ConfigError, check_choice
+from ...core.errors import ConfigError
 from ...core.plotting import BLUE, GREY, RED, figure_at, plain_text, styled
 from ...core.result import Result, Values
 from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MERITS = ("wavefront", "spots")
-METHODS = ("linear", "quadratic", "traced")
+TracedMerit = Literal["wavefront", "spots"]
+MonteCarloMethod = Literal["linear", "quadratic", "traced"]
 _PERCENTILES = (50, 80, 90, 95)
 _REQUEST = "a Request in place of the telescope, Request.of(telescope, fields, wavelengths, ...)"
 #: Arguments of :func:`monte_carlo` that a request holds.
@@ -71,7 +71,7 @@ class MonteCarlo(Result):
 
     telescope: str
     criterion: Criterion
-    method: str
+    method: MonteCarloMethod
     tolerances: tuple[Tolerance, ...]
     compensators: tuple[str, ...]
     units: tuple[str, ...]
@@ -86,7 +86,7 @@ class MonteCarlo(Result):
     def of(
         cls,
         toleranced: TolerancedMerit,
-        method: str,
+        method: MonteCarloMethod,
         deviations: np.ndarray,
         traced: np.ndarray | None,
         nominal: float,
@@ -198,13 +198,13 @@ class MonteCarlo(Result):
 def monte_carlo(
     telescope: Telescope | Request,
     tolerances: Iterable[Tolerance],
-    merit: str = "wavefront",
+    merit: TracedMerit = "wavefront",
     n: int = 100,
     seed: int = 0,
     *,
     degrees_of_freedom: DegreesOfFreedom | None = None,
     compensators: Iterable[str] = (),
-    method: str = "linear",
+    method: MonteCarloMethod = "linear",
     fields: ArrayLike | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> MonteCarlo:
@@ -244,8 +244,6 @@ def monte_carlo(
     UnknownNameError, DomainError
         If a name does not exist, a number is out of range, or no light arrives.
     """
-    check_choice("merit", merit, MERITS)
-    check_choice("method", method, METHODS)
     tolerances, compensators = tuple(tolerances), tuple(compensators)
     deviations = draw(tolerances, seed, n)
     names = [t.name for t in tolerances] + list(compensators)

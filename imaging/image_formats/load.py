@@ -6,13 +6,14 @@ import math
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from astropy.io import fits
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.errors import ConfigError, DomainError, ProductError
+from ...core.errors import DomainError, ProductError
 from ...core.units import ARCSEC, positive_angle, require_positive
 from ..image_file import CcdImage
 from .fits_parts import FitsPart, FitsParts
@@ -32,6 +33,7 @@ from .world_cards import world_cards
 #: Bits of the mask of an image of another program.
 SATURATED_BIT = 1
 BAD_BIT = 2
+WeightName = Literal["weight", "variance", "rms"]
 #: Cards of the observation that stay as they are.
 _KEPT = ("OBJECT", "TELESCOP", "INSTRUME", "DATE-OBS", "MJD-OBS", "CCDNUM")
 #: Bytes of a pixel, its variance and its mask.
@@ -64,7 +66,7 @@ class ImageSettings:
     """
 
     weight: str | Path | None = None
-    weight_kind: str = "weight"
+    weight_kind: WeightName = "weight"
     mask: str | Path | None = None
     gain: float | None = None
     zero_point: float | None = None
@@ -72,9 +74,6 @@ class ImageSettings:
     saturation: float | None = None
 
     def __post_init__(self) -> None:
-        if self.weight_kind not in {kind.value for kind in WeightKind}:
-            expected = ", ".join(kind.value for kind in WeightKind)
-            raise ConfigError(f"weight_kind = {self.weight_kind}: expected one of {expected}", key="weight_kind")
         for name in ("gain", "saturation"):
             if getattr(self, name) is not None:
                 require_positive(getattr(self, name), name)

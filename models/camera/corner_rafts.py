@@ -6,11 +6,12 @@ focus, and ``SW1`` in front of it. Positions and heights are in the telescope fr
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
 from ...core.arguments import check_arguments
-from ...core.errors import check_choice
-from ..io.heights.zernike_table import AS_MEASURED, bundled_heights
+from ..io.heights.zernike_table import bundled_heights
 from .camera import Camera
 from .cameras import load_camera
 from .ccd_surfaces import CcdSurfaces
@@ -19,11 +20,14 @@ from .focal_plane import FocalPlane
 #: Distance of the halves of a wavefront sensor from the focus [m].
 WAVEFRONT_OFFSET = 1.5e-3
 #: Cameras of the corner rafts, by the kind of their sensors.
-_CAMERAS = {"wavefront": "lsst_wavefront", "guider": "lsst_guider"}
+CornerKind = Literal["wavefront", "guider"]
+CornerHeights = Literal["nominal", "lsstcam"]
+#: Heights of the sensors: nominal ones, or those of a camera as built.
+_CAMERAS: dict[CornerKind, str] = {"wavefront": "lsst_wavefront", "guider": "lsst_guider"}
 
 
 @check_arguments
-def corner_focal_plane(kind: str = "wavefront", heights: str = "nominal") -> FocalPlane:
+def corner_focal_plane(kind: CornerKind = "wavefront", heights: CornerHeights = "nominal") -> FocalPlane:
     """Return the focal plane of the sensors in the corners of the LSST camera.
 
     Parameters
@@ -39,8 +43,6 @@ def corner_focal_plane(kind: str = "wavefront", heights: str = "nominal") -> Foc
     ConfigError
         If the kind or the heights are unknown.
     """
-    check_choice("kind", kind, _CAMERAS)
-    check_choice("heights", heights, ("nominal", *AS_MEASURED))
     camera = load_camera(_CAMERAS[kind])
     if heights != "nominal":
         return FocalPlane(camera, *bundled_heights(heights).on(camera))

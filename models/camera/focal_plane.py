@@ -21,7 +21,7 @@ from ...core.units import metres, plane_points, radians, require_count
 from .camera import Camera
 from .cameras import load_camera
 from .ccd_surfaces import CcdSurfaces
-from .height_budget import HeightBudget, chosen_terms, draw_heights, load_budget
+from .height_budget import BudgetName, HeightBudget, chosen_terms, draw_heights, load_budget
 from .height_fit import fit_heights, table_column
 from .height_map import HeightMap
 
@@ -80,7 +80,7 @@ class FocalPlane(HeightMap):
         *,
         seed: int,
         terms: str | Iterable[str] | None = None,
-        budget: str | HeightBudget = "simulated",
+        budget: BudgetName | HeightBudget = "simulated",
     ) -> FocalPlane:
         """Draw heights from the budget of Jee & Tyson 2011, Table 1.
 
@@ -98,7 +98,9 @@ class FocalPlane(HeightMap):
         Raises
         ------
         UnknownNameError
-            If the camera, a term or the budget does not exist.
+            If the camera or a term does not exist.
+        ConfigError
+            If there is no such budget.
         DomainError
             If the seed is not a whole number of zero or more.
         """

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 
@@ -72,10 +73,11 @@ class HeightBudget:
 
 SPECIFICATION = HeightBudget(10e-6, 4.8e-6, 4e-6, 2.5e-4, 4e-6)
 SIMULATED = HeightBudget(10e-6, 6.5e-6, 10e-6, 2.5e-4, 5e-6)
-BUDGETS = {"specification": SPECIFICATION, "simulated": SIMULATED}
+BudgetName = Literal["specification", "simulated"]
+BUDGETS: dict[BudgetName, HeightBudget] = {"specification": SPECIFICATION, "simulated": SIMULATED}
 
 
-def load_budget(name: str) -> HeightBudget:
+def load_budget(name: BudgetName) -> HeightBudget:
     """Return a column of Table 1, "specification" or "simulated"; another name is an UnknownNameError."""
     if name not in BUDGETS:
         raise unknown_name("height budget", name, BUDGETS)

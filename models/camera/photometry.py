@@ -7,6 +7,7 @@ magnitudes and SNR", throughputs v1.9, airmass 1).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -30,11 +31,14 @@ _OTHER_TELESCOPE = 0.1
 _AB_PHOTONS = 3631e-26 / 6.62607015e-34
 
 
+BandName = Literal["u", "g", "r", "i", "z", "y"]
+
+
 @dataclass(frozen=True)
 class Band:
     """One filter of a camera at the zenith under a dark sky, and the noise of its pixels; by default the LSST's."""
 
-    name: str  #: ``u`` to ``y``
+    name: BandName  #: ``u`` to ``y``
     zero_point: float  #: AB magnitude of one electron a second, atmosphere at airmass 1 included
     dark_sky: float  #: brightness [AB mag/arcsec^2]
     extinction: float  #: loss in the atmosphere, ``kAtm`` [mag/airmass]
@@ -48,7 +52,7 @@ class Band:
     source: str = "SMTN-002"  #: where the numbers are from
 
 
-BANDS = {
+BANDS: dict[str, Band] = {
     band.name: band
     for band in (
         Band("u", 26.52, 23.05, 0.47, 366e-9, (349e-9, 396e-9)),
@@ -108,7 +112,7 @@ class CameraPhotometry:
         Zero points are scaled to the area of another telescope than the camera's own, if it differs by more than 10 %.
         UnknownNameError if the camera has measured bands, and not this one.
         """
-        measured_bands = {band.name: band for band in self.bands}
+        measured_bands: dict[str, Band] = {band.name: band for band in self.bands}
         if measured_bands and name not in measured_bands:
             raise unknown_name(f"band of {camera}", name, measured_bands)
         camera_band = measured_bands.get(name) or estimated_band(name, area, wavelengths, self.throughput)

@@ -27,7 +27,7 @@ from ...core.files import content_hash
 from ...core.schema import Count, Fraction, NotNegative, Positive, Real, Section, Switch, validated
 from ...core.yaml_reader import read_mapping
 from ..camera.camera import Camera
-from ..camera.photometry import DARK_CURRENT, FULL_WELL, LSST, READ_NOISE, THROUGHPUT, Band, CameraPhotometry
+from ..camera.photometry import DARK_CURRENT, FULL_WELL, LSST, READ_NOISE, THROUGHPUT, Band, BandName, CameraPhotometry
 from .yaml.values import ROWS, OptionalText, Text
 
 #: Pixels along x and y of a CCD.
@@ -57,7 +57,7 @@ class BandSection(Section):
     extinction: NotNegative
     effective_nm: Positive
 
-    def band(self, name: str, source: str) -> Band:
+    def band(self, name: BandName, source: str) -> Band:
         """Return the band."""
         wavelength = self.effective_nm / 1e9
         return Band(
@@ -75,7 +75,7 @@ class PhotometrySection(Section):
     full_well_e: Positive = FULL_WELL
     gain: Positive = 1.0
     area_m2: Positive | None = None
-    bands: dict[Literal["u", "g", "r", "i", "z", "y"], BandSection] = Field(default_factory=dict)
+    bands: dict[BandName, BandSection] = Field(default_factory=dict)
 
     def photometry(self) -> CameraPhotometry:
         """Return the photometry of the camera."""

@@ -33,7 +33,7 @@ from dataclasses import replace
 from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError, check_choice, unknown_name
@@ -56,6 +56,8 @@ _READERS = {
     ".json": "optiland.reader:read_optiland_file",
     ".roa": "rayoptics.reader:read_rayoptics_file",
 }
+#: Formats that telescopes are written in; empty for that of the ending.
+LensFormat = Literal["", "pachon", "batoid", "zemax", "codev", "oslo", "optiland", "rayoptics"]
 #: Writers of lens files of one text, by their formats.
 _WRITERS = {
     "codev": "codev.writer:telescope_to_codev",
@@ -64,7 +66,7 @@ _WRITERS = {
     "rayoptics": "rayoptics.writer:telescope_to_rayoptics",
 }
 #: Endings of files that a telescope is written to, and their formats.
-WRITTEN = {
+WRITTEN: dict[str, LensFormat] = {
     ".yaml": "pachon", ".yml": "pachon", ".zmx": "zemax", ".seq": "codev", ".len": "oslo", ".json": "optiland",
     ".roa": "rayoptics",
 }  # fmt: skip
@@ -204,7 +206,7 @@ def _bundled(name: str) -> Telescope:
 
 @check_arguments
 def save_telescope(
-    telescope: Telescope, path: str | os.PathLike[str], *, format: str = "", lenient: bool = False
+    telescope: Telescope, path: str | os.PathLike[str], *, format: LensFormat = "", lenient: bool = False
 ) -> None:
     """Write a prescription file: YAML, ours or batoid's, or a lens file of another program.
 
@@ -235,7 +237,7 @@ def save_telescope(
 
 
 def prescription_files(
-    telescope: Telescope, path: str | os.PathLike[str], *, format: str = "", lenient: bool = False
+    telescope: Telescope, path: str | os.PathLike[str], *, format: LensFormat = "", lenient: bool = False
 ) -> dict[Path, str]:
     """Return the texts of the files that :func:`save_telescope` writes, by their paths; errors are its own."""
     target = Path(path)

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.arguments import check_arguments
+from ...core.arguments import check_prescription
 from ...core.errors import PrescriptionError
 from .medium import Medium, wavelengths_within
 
+AirFormula = Literal["ciddor", "filippenko"]
 #: Ciddor's equations hold from the ultraviolet to 1.7 um, Filippenko's to 2 um.
-WAVELENGTH_RANGES = {"ciddor": (0.23e-6, 1.7e-6), "filippenko": (0.2e-6, 2.0e-6)}
+WAVELENGTH_RANGES: dict[AirFormula, tuple[float, float]] = {"ciddor": (0.23e-6, 1.7e-6), "filippenko": (0.2e-6, 2.0e-6)}
 STANDARD_ATMOSPHERE = 101325.0
 #: Pascal in a millimetre of mercury, of which 760 are a standard atmosphere.
 MMHG = STANDARD_ATMOSPHERE / 760.0
@@ -26,7 +28,7 @@ GAS_CONSTANT = 8.314510
 WATER_MOLAR_MASS = 0.018015
 
 
-@check_arguments
+@check_prescription
 @dataclass(frozen=True)
 class Air(Medium):
     """Moist air as a medium.
@@ -51,12 +53,10 @@ class Air(Medium):
     temperature: float = 288.15
     water_vapour: float = 0.0
     co2_ppm: float = 450.0
-    formula: str = "ciddor"
+    formula: AirFormula = "ciddor"
     name: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
-        if self.formula not in WAVELENGTH_RANGES:
-            raise PrescriptionError(f"formula = {self.formula!r}: expected one of {', '.join(WAVELENGTH_RANGES)}")
         if not 0 <= self.pressure <= 1e7:
             raise PrescriptionError(f"pressure = {self.pressure!r} Pa: expected 0 to 1e7")
         if not 0 < self.temperature <= 1000:

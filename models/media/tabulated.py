@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.arguments import check_arguments
+from ...core.arguments import check_prescription
 from ...core.errors import PrescriptionError
 from .medium import Medium, medium_label, wavelengths_within
 
@@ -17,10 +17,10 @@ from .medium import Medium, medium_label, wavelengths_within
 if TYPE_CHECKING:
     from scipy.interpolate import PchipInterpolator
 
-INTERPOLATIONS = ("monotone", "linear")
+Interpolation = Literal["monotone", "linear"]
 
 
-@check_arguments
+@check_prescription
 @dataclass(frozen=True)
 class TabulatedIndex(Medium):
     """Medium whose index is interpolated from a table.
@@ -40,7 +40,7 @@ class TabulatedIndex(Medium):
 
     wavelengths: tuple[float, ...]
     indices: tuple[float, ...]
-    interpolation: str = "monotone"
+    interpolation: Interpolation = "monotone"
     name: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
@@ -49,10 +49,6 @@ class TabulatedIndex(Medium):
             raise PrescriptionError(f"wavelengths = {_ends(w)}: expected at least two positive numbers, rising")
         if n.shape != w.shape or not (np.all(np.isfinite(n)) and np.all(n > 0)):
             raise PrescriptionError(f"indices = {_ends(n)}: expected {len(w)} positive numbers, one a wavelength")
-        if self.interpolation not in INTERPOLATIONS:
-            raise PrescriptionError(
-                f"interpolation = {self.interpolation!r}: expected one of {', '.join(INTERPOLATIONS)}"
-            )
 
     @cached_property
     def _cubic(self) -> PchipInterpolator:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError, check_choice
+from ...core.errors import DomainError
 from ..digits import with_few_digits
 from ..io.yaml.comments import with_comments
 from ..io.yaml.writer import telescope_to_yaml
@@ -30,8 +30,20 @@ _NOTES: dict[Callable[..., Telescope], str] = {
     lenses.doublet: "Axial colour between the lines F and C and third-order spherical aberration are zero.",
     lenses.triplet: "Third-order aberrations and both colours are zero, but for a Petzval sum of 0.35 of the power.",
 }
+DesignKind = Literal[
+    "ritchey-chretien",
+    "cassegrain",
+    "dall-kirkham",
+    "gregorian",
+    "newtonian",
+    "schmidt",
+    "three-mirror",
+    "singlet",
+    "doublet",
+    "triplet",
+]
 #: Function of each kind.
-KINDS: dict[str, Callable[..., Telescope]] = {
+KINDS: dict[DesignKind, Callable[..., Telescope]] = {
     **{kind: partial(two_mirror.two_mirror, kind) for kind in two_mirror.KINDS},
     "newtonian": two_mirror.newtonian,
     "schmidt": schmidt.schmidt,
@@ -44,7 +56,7 @@ KINDS: dict[str, Callable[..., Telescope]] = {
 
 @check_arguments
 def new_telescope(
-    kind: str,
+    kind: DesignKind,
     *,
     diameter: float | None = None,
     f_number: float | None = None,
@@ -77,7 +89,6 @@ def new_telescope(
     DomainError
         If a number is out of range, or does not belong to the kind.
     """
-    check_choice("kind", kind, KINDS)
     options: dict[str, Any] = {"diameter": diameter, "field_radius": field_radius}
     options["focal_ratio" if kind == "three-mirror" else "f_number"] = f_number
     for name, value in (("primary_f_number", primary_f_number), ("back_focus", back_focus)):
@@ -89,7 +100,7 @@ def new_telescope(
     return KINDS[kind](**{name: value for name, value in options.items() if value is not None})
 
 
-def new_prescription(kind: str, **options: Any) -> tuple[Telescope, str]:
+def new_prescription(kind: DesignKind, **options: Any) -> tuple[Telescope, str]:
     """Return a new telescope and the text of its prescription file, with comments; arguments as `new_telescope`."""
     telescope = with_few_digits(new_telescope(kind, **options))
     make = KINDS[kind]

@@ -17,18 +17,21 @@ BSD-style), there of a pixel of 10 um with 100 000 electrons, averaged over the 
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError, check_choice
+from ...core.errors import DomainError
 from ...core.units import pure_numbers
 from .pixel_boundaries import collect, with_rim, without_rim
 
 #: Side of the pixels that the coefficients belong to [m].
 PIXEL_SIZE = 10e-6
+SensorVendor = Literal["itl", "e2v"]
 #: Displacement of a boundary towards the charge [1e-9 pixel per electron], along x (serial) and along y (parallel):
 #: rows by the distance of the charge along the boundary, columns by that across it, 0 for the pixels at the boundary.
-COEFFICIENTS = {
+COEFFICIENTS: dict[SensorVendor, tuple[np.ndarray, np.ndarray]] = {
     "itl": (
         np.array(
             [
@@ -69,7 +72,7 @@ COEFFICIENTS = {
 _REACH = 4
 
 
-def boundary_shifts(charge: np.ndarray, sensor: str) -> tuple[np.ndarray, np.ndarray]:
+def boundary_shifts(charge: np.ndarray, sensor: SensorVendor) -> tuple[np.ndarray, np.ndarray]:
     """Return the displacements of the boundaries of pixels with a given charge.
 
     Parameters
@@ -99,7 +102,9 @@ def _shifts(charge: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
 
 
 @check_arguments
-def brighter_fatter(images: np.ndarray, electrons: np.ndarray, *, sensor: str = "itl", sky: float = 0.0) -> np.ndarray:
+def brighter_fatter(
+    images: np.ndarray, electrons: np.ndarray, *, sensor: SensorVendor = "itl", sky: float = 0.0
+) -> np.ndarray:
     """Return images of stars as a CCD collects them under the brighter-fatter effect.
 
     Parameters
@@ -128,7 +133,6 @@ def brighter_fatter(images: np.ndarray, electrons: np.ndarray, *, sensor: str = 
     DomainError
         If shapes do not fit, electrons are not positive, or the sky is negative.
     """
-    check_choice("sensor", sensor, COEFFICIENTS)
     stamps = pure_numbers(images, "images")
     counts = pure_numbers(electrons, "electrons")
     if stamps.ndim != 3 or counts.shape != stamps.shape[:1]:

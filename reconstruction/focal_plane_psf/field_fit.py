@@ -12,7 +12,7 @@ from ...core.threads import one_blas_thread
 from ...models.camera.camera import Camera
 from ...models.camera.cameras import load_camera
 from ...models.camera.focal_plane import FocalPlane
-from ...models.camera.height_budget import HeightBudget
+from ...models.camera.height_budget import BudgetName, HeightBudget
 from ...models.telescope import Telescope
 from .field import ShapeField
 from .fit import SHAPES, ExposureFit, ShapeData
@@ -118,7 +118,7 @@ def mosaic_of(
 
 
 def height_prior(
-    mosaic: Mosaic, plane: FocalPlane | StaticHeights | None, budget: str | HeightBudget | None
+    mosaic: Mosaic, plane: FocalPlane | StaticHeights | None, budget: BudgetName | HeightBudget | None
 ) -> HeightPrior:
     """Return the prior of heights that are known, learnt from other exposures, drawn from a budget, or free."""
     assert mosaic.camera is not None

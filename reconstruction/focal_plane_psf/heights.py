@@ -15,7 +15,7 @@ from numpy.polynomial.legendre import legvander
 
 from ...models.camera.camera import Camera
 from ...models.camera.focal_plane import FocalPlane
-from ...models.camera.height_budget import HeightBudget, load_budget
+from ...models.camera.height_budget import BudgetName, HeightBudget, load_budget
 from .covariance import Places
 
 #: Largest total degree within a CCD, for one exposure.
@@ -57,7 +57,9 @@ class HeightPrior:
     mean: FocalPlane | None = None
 
     @classmethod
-    def from_budget(cls, camera: Camera, budget: str | HeightBudget = "simulated", degree: int = DEGREE) -> HeightPrior:
+    def from_budget(
+        cls, camera: Camera, budget: BudgetName | HeightBudget = "simulated", degree: int = DEGREE
+    ) -> HeightPrior:
         """Return the prior with the covariance of focal planes drawn from a budget of heights."""
         budget = load_budget(budget) if isinstance(budget, str) else budget
         unplaced = replace(camera, placement=None)

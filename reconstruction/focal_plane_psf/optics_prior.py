@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...models.camera.height_budget import HeightBudget
+from ...models.camera.height_budget import BudgetName, HeightBudget
 
 
 @check_arguments
@@ -29,7 +29,7 @@ class OpticsPrior:
         If the rms is negative or not finite.
     """
 
-    budget: str | HeightBudget | None = "simulated"
+    budget: BudgetName | HeightBudget | None = "simulated"
     alignment_rms: float = 0.2e-6
 
     def __post_init__(self) -> None:

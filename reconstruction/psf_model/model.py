@@ -27,7 +27,7 @@ from .file import model_hdus, read_model
 from .fit import ModelFit, fit_stars
 from .outliers import SigmaClipping
 from .polynomial import Extent, as_positions
-from .recipe import Recipe, RecipeKeys
+from .recipe import Recipe, RecipeKeys, RecipeName
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,7 +42,7 @@ _SHOWN = 5
 class ModelOptions(RecipeKeys, total=False):
     """Options of :meth:`PsfModel.fit` that hold for any stars of a CCD."""
 
-    recipe: str | Recipe | None
+    recipe: RecipeName | Recipe | None
     weights: Literal["noise"] | None
     clipping: SigmaClipping | None
     extent: ArrayLike | None
@@ -86,7 +86,7 @@ class PsfModel(ModelFit, Result):
         stamps: ArrayLike,
         positions: ArrayLike,
         *,
-        recipe: str | Recipe | None = None,
+        recipe: RecipeName | Recipe | None = None,
         weights: ArrayLike | Literal["noise"] | None = None,
         masks: NDArray[np.bool_] | None = None,
         extent: ArrayLike | None = None,

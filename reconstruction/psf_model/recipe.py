@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, TypedDict, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, TypeVar, get_args
 
 import numpy as np
 
@@ -21,23 +22,35 @@ from .shapelets import Shapelets
 
 _Kind = TypeVar("_Kind", Basis, Interpolation)
 
+BasisName = Literal["pca", "pixels", "shapelets"]
 #: Kinds of bases and interpolations by name. A new kind is its file and its entry here.
-BASES: dict[str, type[Basis]] = {kind.name: kind for kind in (PrincipalComponents, Pixels, Shapelets)}
-INTERPOLATIONS: dict[str, type[Interpolation]] = {kind.name: kind for kind in (Polynomial, Kriging)}
+BASES: Mapping[str, type[Basis]] = {"pca": PrincipalComponents, "pixels": Pixels, "shapelets": Shapelets}
+InterpolationName = Literal["polynomial", "kriging"]
+INTERPOLATIONS: Mapping[str, type[Interpolation]] = {"polynomial": Polynomial, "kriging": Kriging}
 #: Interpolations in FITS files, retired ones too.
 FITTED_INTERPOLATIONS: tuple[type[FittedInterpolation], ...] = (
     *(kind.fitted for kind in INTERPOLATIONS.values()),
     FittedGaussianProcess,
 )
 #: Names of weights of the stars: equal, by S/N (:func:`~.checks.snr_weights`), or by noise (:mod:`~.shape_noise`).
-WEIGHTS = ("equal", "snr", "softened", "noise")
+WeightsName = Literal["equal", "snr", "softened", "noise"]
+WEIGHTS: tuple[WeightsName, ...] = get_args(WeightsName)
+
+
+RecipeName = Literal["kriging", "paper"]
+if TYPE_CHECKING:
+    BasisKey: TypeAlias = BasisName
+    InterpolationKey: TypeAlias = InterpolationName
+else:
+    # At run time names are looked up in the tables, which say what replaced a retired one.
+    BasisKey = InterpolationKey = str
 
 
 class RecipeKeys(TypedDict, total=False):
     """Keys of a recipe that :meth:`~.PsfModel.fit` changes alone; None changes nothing."""
 
-    basis: str | Basis | None
-    interpolation: str | Interpolation | None
+    basis: BasisKey | Basis | None
+    interpolation: InterpolationKey | Interpolation | None
     n_components: int | Literal["auto"] | None
     order: int | Literal["auto"] | None
     scale: float | None
@@ -61,7 +74,7 @@ class Recipe:
 
     basis: Basis
     interpolation: Interpolation
-    weights: str = "equal"
+    weights: WeightsName = "equal"
     colour: ColourTerm | None = field(default_factory=ColourTerm)
 
     def __post_init__(self) -> None:
@@ -78,7 +91,7 @@ class Recipe:
             )
 
     @classmethod
-    def of(cls, recipe: str | Recipe | None = None, **keys: Any) -> Recipe:
+    def of(cls, recipe: RecipeName | Recipe | None = None, **keys: Any) -> Recipe:
         """Return a recipe or the one of a name, by default :data:`DEFAULT`, with some of its keys changed.
 
         With `n_components` but neither recipe nor basis it is the paper's, since pixels have none to choose. Keys are
@@ -95,9 +108,9 @@ class Recipe:
     def changed(
         self,
         *,
-        basis: str | Basis | None = None,
-        interpolation: str | Interpolation | None = None,
-        weights: str | None = None,
+        basis: BasisKey | Basis | None = None,
+        interpolation: InterpolationKey | Interpolation | None = None,
+        weights: WeightsName | None = None,
         n_components: Any = None,
         scale: float | None = None,
         order: Any = None,
@@ -143,10 +156,10 @@ class Recipe:
 #: The recipe where nothing is said: the best that knows nothing of the PSF (docs/howto/psf_models.md).
 DEFAULT = Recipe(Pixels(), Kriging())
 #: Recipes by name; ``paper`` is that of Jee & Tyson 2011, sec. 3.
-RECIPES = {"kriging": DEFAULT, "paper": Recipe(PrincipalComponents(), Polynomial())}
+RECIPES: Mapping[str, Recipe] = {"kriging": DEFAULT, "paper": Recipe(PrincipalComponents(), Polynomial())}
 
 
-def _of_kind(present: _Kind, key: str, name: str | _Kind | None, table: dict[str, type[_Kind]]) -> _Kind:
+def _of_kind(present: _Kind, key: str, name: str | _Kind | None, table: Mapping[Any, type[_Kind]]) -> _Kind:
     """Return what is present where it is of that name, else the kind of the name with its own options."""
     if name is None or name == present.name:
         return present
@@ -157,7 +170,7 @@ def _of_kind(present: _Kind, key: str, name: str | _Kind | None, table: dict[str
     return table[name]()
 
 
-def names_of(table: dict[str, Any], name: object = None) -> str:
+def names_of(table: Mapping[Any, Any], name: object = None) -> str:
     """Return the names of a table in words, with what replaced a retired one."""
     replaced = ", which replaced gp" if name == FittedGaussianProcess.kind.name else ""
     return f"one of {', '.join(table)}{replaced}"

@@ -19,7 +19,7 @@ from ...wavefront.atmosphere.mean_wavefront import mean_wavefront_covariance
 from ...wavefront.atmosphere.screen_sampling import ScreenSampling
 from ...wavefront.corner_stars import CornerStars, corner_stars
 from ...wavefront.request import wavelength_points
-from .config import AlignConfig
+from .config import AlignConfig, Heights
 from .field_quality import FieldQuality
 
 #: Noll indices of the wavefront of a donut: bending modes reach Z23, and what is not fitted moves what is.
@@ -72,7 +72,7 @@ class AlignmentScene:
             screens=ScreenSampling(screen_length=max(1300.0, 25.0 * air.exposure_s)),
         )
 
-        def on_sensors(heights: str) -> CornerStars:
+        def on_sensors(heights: Heights) -> CornerStars:
             return corner_stars(telescope, heights=heights, n=donuts.per_sensor)
 
         believed = donuts.heights if donuts.believed_heights is None else donuts.believed_heights

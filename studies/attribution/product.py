@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import cast
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 
 from ...core.plotting import new_figure, png_bytes, styled
-from ...measure.correlation import SEPARATION_RANGES, Correlation
+from ...measure.correlation import SEPARATION_RANGES, Correlation, SeparationRange
 from ...measure.correlation_plots import correlation_columns, log_axes
 from ...measure.focal_plane_axes import AWAY, RESIDUAL, TRUTH
 from ...pipeline.config import Configuration
@@ -60,7 +61,7 @@ def _metric_description(key: str) -> str:
         if key.startswith(start):
             return words + _metric_description(key.removeprefix(start))
     if key.startswith("xi_plus_"):
-        low, high = SEPARATION_RANGES[key.rpartition("_")[2]]
+        low, high = SEPARATION_RANGES[cast("SeparationRange", key.rpartition("_")[2])]
         kind = key.removeprefix("xi_plus_").rpartition("_")[0]
         ellipticity = "g" if kind.startswith("g_") else "the weighted e"
         kind = kind.removeprefix("g_").replace("_ccd", " of the CCDs' own models")

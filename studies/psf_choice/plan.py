@@ -6,13 +6,14 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import cast
 
 from ...core.errors import ConfigError
 from ...pipeline.config import Configuration
 from ...reconstruction.psf_model.basis import COMPONENTS
 from ...reconstruction.psf_model.polynomial import term_count
 from ...reconstruction.psf_model.polynomial_fit import Polynomial
-from ...reconstruction.psf_model.recipe import BASES, DEFAULT, INTERPOLATIONS, Recipe
+from ...reconstruction.psf_model.recipe import BASES, DEFAULT, INTERPOLATIONS, Recipe, WeightsName
 
 #: Weights of the stars in the polynomials, as of a recipe (equal in the paper).
 POLYNOMIALS = ("equal", "snr", "softened")
@@ -66,7 +67,7 @@ class Case:
         basis = BASES[self.basis]() if not self.components else BASES[self.basis](self.components)
         if self.interpolation in PROCESSES:
             return Recipe(basis, INTERPOLATIONS[self.interpolation]())
-        return Recipe(basis, Polynomial(self.order), self.interpolation)
+        return Recipe(basis, Polynomial(self.order), cast("WeightsName", self.interpolation))
 
     def __str__(self) -> str:
         if self.interpolation in FOCAL_PLANE:

@@ -24,7 +24,7 @@ from ...measure.focal_plane_axes import (
 from ...measure.shapes import measure_shapes
 from ...models.camera.camera import Camera
 from ...models.camera.focal_plane import FocalPlane
-from ...models.camera.height_budget import SIMULATED, SPECIFICATION, TERMS
+from ...models.camera.height_budget import SIMULATED, SPECIFICATION, TERMS, BudgetName
 from ...pipeline.report.focal_plane_plots import draw_heights, height_range, heights_plot
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.psf import make_psfs
@@ -120,7 +120,7 @@ def height_budget(bench: Bench) -> Reproduced:
     )
 
 
-def drawn_heights(camera: Camera, seed: int, budget: str) -> np.ndarray:
+def drawn_heights(camera: Camera, seed: int, budget: BudgetName) -> np.ndarray:
     """Return the drawn peak to valley of each term: four in um, the tilt (fourth) in 1e-4 rad.
 
     The potato chip is that of the median CCD; pistons and tilts are over all rafts or CCDs.

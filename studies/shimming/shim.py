@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 import scipy.optimize
 
 from ...core.arguments import check_arguments
-from ...core.errors import ConfigError, DomainError, check_choice
+from ...core.errors import ConfigError, DomainError
 from ...core.plotting import figure_at, styled
 from ...core.progress import Reporter
 from ...core.result import Result
@@ -36,8 +36,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MERITS = ("fwhm", "ellipticity", "xi")
-PARTS = ("rafts", "ccds")
+ShimMerit = Literal["fwhm", "ellipticity", "xi"]
+MERITS: tuple[ShimMerit, ...] = get_args(ShimMerit)
+ShimmedParts = Literal["rafts", "ccds"]
+PARTS: tuple[ShimmedParts, ...] = get_args(ShimmedParts)
 #: States of the focal plane: as it is, focused as a whole, shimmed, and an ideal plane in focus.
 STATES = ("as built", "focused", "shimmed", "plane")
 # Nodes along the side of a CCD in the fit, by merit. Pairs of 3 x 3 nodes have too few separations: what they leave
@@ -104,8 +106,8 @@ class Shims(Result):
 
     _row_type = Motion
 
-    merit: str
-    parts: str
+    merit: ShimMerit
+    parts: ShimmedParts
     focus: Motion
     motions: dict[str, Motion]
     fitted: dict[str, StateMetrics]
@@ -131,8 +133,8 @@ class Shims(Result):
 def shim(
     experiment: Experiment,
     *,
-    merit: str = "fwhm",
-    parts: str = "rafts",
+    merit: ShimMerit = "fwhm",
+    parts: ShimmedParts = "rafts",
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> Shims:
@@ -159,8 +161,6 @@ def shim(
     DomainError
         If a PSF has no width within the range of the heights, or places are too many for the pairs of "xi".
     """
-    check_choice("merit", merit, MERITS)
-    check_choice("parts", parts, PARTS)
     if experiment.config.psf.engine != "long_exposure":
         raise ConfigError(
             f"psf.engine = {experiment.config.psf.engine}: expected long_exposure, whose PSFs have no noise"
@@ -248,7 +248,9 @@ def shimmed_configuration(config: Configuration, shims: Shims) -> Configuration:
     return config.model_copy(update={"focal_plane": config.focal_plane.model_copy(update={"moved": moved})})
 
 
-def _parts_with_places(plane: FocalPlane, places: Places, parts: str) -> Sequence[tuple[str, np.ndarray, np.ndarray]]:
+def _parts_with_places(
+    plane: FocalPlane, places: Places, parts: ShimmedParts
+) -> Sequence[tuple[str, np.ndarray, np.ndarray]]:
     """Return name, centre [m] and rows of the places of each part that has some."""
     camera = plane.camera
     if parts == "ccds":
@@ -273,7 +275,7 @@ def _best_motions(
     places: Places,
     heights: np.ndarray,
     parts: Sequence[tuple[np.ndarray, np.ndarray]],
-    merit: str,
+    merit: ShimMerit,
     pairs: PairSum | None,
 ) -> list[Motion]:
     """Return the motions of parts, given by centre and rows of their places, that minimise the merit function."""

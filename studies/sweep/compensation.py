@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...design.optimize.merit import Beams, SpotMerit
+from ...design.optimize.merit_function import MeritName
 from ...design.optimize.optimize import optimize
 from ...design.optimize.solver import LeastSquares
 from ...models.parameters.changes import parse_change
@@ -56,7 +57,7 @@ def compensated(
 def solved_compensators(
     telescope: Telescope,
     names: Sequence[str],
-    merit: SpotMerit | str,
+    merit: SpotMerit | MeritName,
     fields: np.ndarray | None,
     wavelengths: ArrayLike | None,
     threads: int | None,

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from pachon import FocalPlane, height_statistics
+from pachon import FocalPlane
 from pachon.commands.cli import main
+from pachon.models import height_statistics
 
 
 @pytest.mark.long

@@ -84,7 +84,7 @@ def test_what_cannot_be_written_is_refused_before_the_optimisation(tmp_path, cap
     pachon.save_telescope(lens, tmp_path / "other.yaml")
     (tmp_path / "two.yaml").write_text("variables: [M2.conic]\nconfigurations: [{telescope: other.yaml}]\n")
     first, third = (lens.surface(name).shape.parameters.get("conic", 0.0) for name in ("M1", "M3"))
-    follower = pachon.Pickup("M3", "conic", "M1", 1.0, third - first)
+    follower = pachon.models.Pickup("M3", "conic", "M1", 1.0, third - first)
     pachon.save_telescope(lens.with_design(pickups=(follower,)), tmp_path / "linked.yaml")
     linked = [str(tmp_path / "linked.yaml"), "--variables", "M2.conic"]
     for given, words in (
@@ -117,7 +117,7 @@ def test_a_stop_inside_is_filled_and_it_is_said(capsys):
 @pytest.mark.long
 def test_an_operand_that_is_not_held_is_said(tmp_path, capsys):
     lens = pachon.load_telescope("paul_baker")
-    least = 1e3 * pachon.TotalLength(minimum=0.0).measure(lens) + 10.0
+    least = 1e3 * pachon.design.TotalLength(minimum=0.0).measure(lens) + 10.0
     (tmp_path / "opt.yaml").write_text(
         f"variables: [Detector.dz]\nbounds: {{Detector.dz_mm: [-1, 1]}}\nfields_deg: [[0, 0]]\nn_pupil: 2\n"
         f"operands: [{{kind: total_length_mm, min: {least!r}}}]\n"

@@ -155,7 +155,7 @@ def test_errors_of_the_content_name_the_file(capsys, in_folder, written, command
 
 def test_an_optimum_that_its_format_cannot_hold_is_not_lost(capsys, written, in_folder):
     """The format is found out before, unless the optimisation makes what it has no place for, here a glass."""
-    telescope = pachon.doublet(diameter=0.02, f_number=10.0)
+    telescope = pachon.models.doublet(diameter=0.02, f_number=10.0)
     pachon.save_telescope(telescope, "lens.yaml")
     name = telescope.surfaces[0].name
     config = written("opt.yaml", f"variables: [{name}.n]\nfields_deg: [[0, 0]]\nn_pupil: 2\nmax_steps: 2\n")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from astropy import units as u
 from public_calls import calls
+from public_names import public_objects
 
 import pachon
 from pachon.core.docstrings import described
@@ -32,7 +33,7 @@ def table(tmp_path_factory):
 
 def owner(label, function):
     """Object with the docstring of a call: the class of a constructor, or the function."""
-    return getattr(pachon, label, function)
+    return public_objects().get(label, function)
 
 
 def test_plain_numbers_may_be_quantities(table):
@@ -66,12 +67,14 @@ def test_lengths_and_angles_say_their_unit(table):
 
 
 def test_units_of_arguments_in_docstrings():
-    assert described(pachon.Circle, "x").unit == "m"
+    assert described(pachon.models.Circle, "x").unit == "m"
     assert described(pachon.paul_baker, "field_radius").unit == "rad"
-    assert described(pachon.Biconic, "radius_x").unit == "m"
-    assert described(pachon.Weather, "pressure_mmhg").unit == ""
-    assert described(pachon.EvenAsphere, "coefficients").unit == ""
-    assert pachon.Circle(250.0 * u.mm, x=1.0 * u.cm) == pachon.Circle(0.25, 0.01, 0.0)
-    assert pachon.Polygon([[0, 0], [1, 0], [0, 1]] * u.km) == pachon.Polygon(((0.0, 0.0), (1e3, 0.0), (0.0, 1e3)))
-    with pytest.raises(pachon.DomainError, match=r"^conic = 1\.0 m: expected a number"):
+    assert described(pachon.models.Biconic, "radius_x").unit == "m"
+    assert described(pachon.models.Weather, "pressure_mmhg").unit == ""
+    assert described(pachon.models.EvenAsphere, "coefficients").unit == ""
+    assert pachon.models.Circle(250.0 * u.mm, x=1.0 * u.cm) == pachon.models.Circle(0.25, 0.01, 0.0)
+    assert pachon.models.Polygon([[0, 0], [1, 0], [0, 1]] * u.km) == pachon.models.Polygon(
+        ((0.0, 0.0), (1e3, 0.0), (0.0, 1e3))
+    )
+    with pytest.raises(pachon.errors.DomainError, match=r"^conic = 1\.0 m: expected a number"):
         pachon.Conic(5.0, 1.0 * u.m)

@@ -9,6 +9,7 @@ import public_calls
 import pytest
 from astropy.table import QTable
 from matplotlib.figure import Figure
+from public_names import public_objects
 
 import pachon
 from pachon.core.plotting import picture_bytes
@@ -21,7 +22,7 @@ from pachon.studies.shimming.shim import Motion
 # What is tested is made once for the file, in seconds.
 pytestmark = pytest.mark.long
 
-PUBLIC = {name: getattr(pachon, name) for name in pachon.__all__}
+PUBLIC = public_objects()
 #: A focal plane has a table of its own, which :meth:`from_heights` reads back.
 OWN_TABLES = {"FocalPlane"}
 KINDS = {name for name, kind in PUBLIC.items() if inspect.isclass(kind) and issubclass(kind, Result)}
@@ -38,19 +39,21 @@ def _made_by_hand(made):
     loose = Deviation("spot", "um", 1.0, 0.1, 1.2, None)
     lost = Deviation("opd", "nm", 1.0, 0.1, None, "batoid", "no light")
     return [
-        pachon.BaselineCheck("a.json", "lsst", (lost, loose), ()),
-        pachon.SweepTable(
+        pachon.studies.BaselineCheck("a.json", "lsst", (lost, loose), ()),
+        pachon.studies.SweepTable(
             "s", np.arange(3), np.arange(3), {"M2.dz_um": three}, {"median_fwhm": three}, np.array(["", "", "x"]), three
         ),
-        pachon.Shims(**shims, focus=Motion(), motions={"R22": Motion(1e-6)}, focal_plane=made.plane),
-        pachon.Alignment(**aligned, **visits, expected=three, donuts=np.arange(3)),
-        pachon.PsfStack(visits=2, star=three > 0, count=np.arange(3), true=stamps, model=stamps, **stack),
-        pachon.StaticHeights(made.plane, np.zeros((189, 2, 2)), 4),
+        pachon.studies.Shims(**shims, focus=Motion(), motions={"R22": Motion(1e-6)}, focal_plane=made.plane),
+        pachon.studies.Alignment(**aligned, **visits, expected=three, donuts=np.arange(3)),
+        pachon.studies.PsfStack(visits=2, star=three > 0, count=np.arange(3), true=stamps, model=stamps, **stack),
+        pachon.reconstruction.StaticHeights(made.plane, np.zeros((189, 2, 2)), 4),
         pachon.FocalPlanePsf(None, three == 0, shapes, {}, np.nan, (), 3e-6, 1e-6, 21),
         dataclasses.replace(made.ccd_image, objects=dict.fromkeys(OBJECT_COLUMNS, three)),
-        pachon.ExposureWavefront(np.arange(4, 7), np.eye(3), np.ones((3, 3, 3)), np.eye(3), 1e-7, 1.0, None, ("a",)),
-        pachon.FreedomEstimate(made.dofs, three[:1], np.eye(1), np.ones(1)),
-        pachon.ObservatoryZernikes(
+        pachon.sensing.ExposureWavefront(
+            np.arange(4, 7), np.eye(3), np.ones((3, 3, 3)), np.eye(3), 1e-7, 1.0, None, ("a",)
+        ),
+        pachon.sensing.FreedomEstimate(made.dofs, three[:1], np.eye(1), np.ones(1)),
+        pachon.sensing.ObservatoryZernikes(
             convention="ts_wep",
             frame="CCS",
             unit="um",
@@ -62,9 +65,9 @@ def _made_by_hand(made):
             fields=np.zeros((1, 2)),
         ),
         pachon.trace(made.tel, made.rays),
-        pachon.height_statistics(made.plane)["all"],
-        pachon.Yield.of(np.array([1.0, 2.0, np.nan]), 1.5),
-        pachon.GalaxyStamps(np.full(2, 22.0), np.full(2, 1e-6), (), np.zeros((2, 2)), np.eye(2), 1e-7, 1e9, 1e-6),
+        pachon.models.height_statistics(made.plane)["all"],
+        pachon.design.Yield.of(np.array([1.0, 2.0, np.nan]), 1.5),
+        pachon.sky.GalaxyStamps(np.full(2, 22.0), np.full(2, 1e-6), (), np.zeros((2, 2)), np.eye(2), 1e-7, 1e9, 1e-6),
     ]
 
 
@@ -234,10 +237,10 @@ def test_bytes_are_equal_for_equal_results(results, tmp_path):
 def test_wrong_places_for_pictures_are_refused(results):
     loose = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
     for wrong in ("figure", 5, loose):
-        with pytest.raises(pachon.DomainError, match=r"^ax = .*: expected Axes of a grid"):
+        with pytest.raises(pachon.errors.DomainError, match=r"^ax = .*: expected Axes of a grid"):
             results["SpotDiagram"].plot(ax=wrong)
 
 
 def test_unknown_files_are_refused(results, tmp_path):
-    with pytest.raises(pachon.ConfigError, match=r"spots\.txt: expected a file that ends in \.ecsv"):
+    with pytest.raises(pachon.errors.ConfigError, match=r"spots\.txt: expected a file that ends in \.ecsv"):
         results["SpotDiagram"].write(tmp_path / "spots.txt")

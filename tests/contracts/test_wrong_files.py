@@ -117,7 +117,7 @@ def _image(path):
     pixels = RNG.normal(size=(16, 16))
     objects = {key: np.zeros(2) for key in OBJECT_COLUMNS}
     mask = np.zeros(pixels.shape, int)
-    pachon.CcdImage("R22_S11", pixels, np.ones_like(pixels), mask, fits.Header(), objects).write(path)
+    pachon.imaging.CcdImage("R22_S11", pixels, np.ones_like(pixels), mask, fits.Header(), objects).write(path)
 
 
 def _foreign_image():
@@ -141,7 +141,7 @@ def _psfex():
 
 def _use_store(path):
     try:
-        pachon.load_sweep_table(path)
+        pachon.studies.load_sweep_table(path)
     finally:
         # What an export saves of a damaged store.
         list(readable_rows(path))
@@ -206,7 +206,7 @@ def _use_donut_table(path):
 
 
 def _use_optimization(path):
-    optimization_arguments(pachon.load_optimization(path), pachon.load_telescope(LENS), path)
+    optimization_arguments(pachon.design.load_optimization(path), pachon.load_telescope(LENS), path)
 
 
 STARS = Table({"ra": [53.1, 53.2], "dec": [-27.8, -27.9], "mag": [18.0, 19.5]})
@@ -232,8 +232,8 @@ surfaces: {M1: silver}
 glasses:
   silica: {thickness_mm: 25, wavelength_nm: [350, 1000], efficiency: [0.995, 0.999]}
 """
-GRID = pachon.GridSag(np.arange(5.0), np.arange(5.0), np.zeros((5, 5)))
-GALAXIES = pachon.Galaxies.single([0.0, 1e-5], [0.0, 1e-5], [22.0, 23.0], [2e-6, 3e-6])
+GRID = pachon.models.GridSag(np.arange(5.0), np.arange(5.0), np.zeros((5, 5)))
+GALAXIES = pachon.sky.Galaxies.single([0.0, 1e-5], [0.0, 1e-5], [22.0, 23.0], [2e-6, 3e-6])
 LENS = ROOT / "tests/data/zmx/lens1.zmx"
 SEQ = b"""RDM;LEN
 TITLE 'singlet'
@@ -292,31 +292,31 @@ def _cases(folder):
                  lambda p: pachon.load_telescope(p, lenient=True)),
         "roa": (".roa", (LENSES / "tilts.roa").read_bytes(), lambda p: pachon.load_telescope(p, lenient=True)),
         "zar": (".zar", _archive(), lambda p: pachon.load_telescope(p, lenient=True)),
-        "agf": (".agf", next(DATA.glob("*.agf")).read_bytes(), pachon.GlassCatalogue.read),
+        "agf": (".agf", next(DATA.glob("*.agf")).read_bytes(), pachon.models.GlassCatalogue.read),
         "baseline": (".json", (ROOT / "studies/baseline/bundled/lsst_v3.3_r.baseline.json").read_bytes(),
-                     pachon.read_baseline),
-        "site": (".yaml", (DATA / "cerro_pachon.yaml").read_bytes(), pachon.load_site),
+                     pachon.studies.read_baseline),
+        "site": (".yaml", (DATA / "cerro_pachon.yaml").read_bytes(), pachon.models.load_site),
         "images": (".yaml", b"run: {ccds: [R22_S11], seed: 3}\nimage: {exposures: 2}\n",
-                   lambda p: pachon.load_images_configuration(p)),
+                   lambda p: pachon.imaging.load_images_configuration(p)),
         "visits": (".yaml", b"run: {ccds: [R22_S11]}\nvisits: {count: 3, snapshots: [1, 3]}\n",
-                   lambda p: pachon.load_visits_configuration(p).plan(1)),
-        "visit_list": (".csv", VISIT_LIST, pachon.read_visit_list),
-        "instance_catalogue": (".txt", INSTANCE_CATALOGUE, pachon.read_visit_list),
-        "visit_database": (".db", _written(_visit_database, ".db", folder), pachon.read_visit_list),
+                   lambda p: pachon.studies.load_visits_configuration(p).plan(1)),
+        "visit_list": (".csv", VISIT_LIST, pachon.sky.read_visit_list),
+        "instance_catalogue": (".txt", INSTANCE_CATALOGUE, pachon.sky.read_visit_list),
+        "visit_database": (".db", _written(_visit_database, ".db", folder), pachon.sky.read_visit_list),
         "degrees": (".yaml", yaml.safe_dump({"name": "mine", "degrees_of_freedom": [
             {"name": "a", "unit": "um", "of": "M2.dz"}]}).encode(), pachon.load_degrees_of_freedom),
         "heights_ecsv": (".ecsv", _text(_points(), "ascii.ecsv"), lambda p: pachon.FocalPlane.from_file(p)),
         "heights_fits": (".fits", _fits(fits.table_to_hdu(_points())), lambda p: pachon.FocalPlane.from_file(p)),
-        "galaxies_ecsv": (".ecsv", _written(lambda p: pachon.write_galaxies(p, GALAXIES), ".ecsv", folder),
-                          pachon.read_galaxies),
-        "galaxies_fits": (".fits", _written(lambda p: pachon.write_galaxies(p, GALAXIES), ".fits", folder),
-                          pachon.read_galaxies),
+        "galaxies_ecsv": (".ecsv", _written(lambda p: pachon.sky.write_galaxies(p, GALAXIES), ".ecsv", folder),
+                          pachon.sky.read_galaxies),
+        "galaxies_fits": (".fits", _written(lambda p: pachon.sky.write_galaxies(p, GALAXIES), ".fits", folder),
+                          pachon.sky.read_galaxies),
         "stars": (".fits", _fits(fits.table_to_hdu(_stars())), pachon.load_stars),
         "mosaic": (".fits", _fits(_mosaic()), lambda p: read_mosaic(p, 25.0)),
         "grid": (".fits", _written(lambda p: write_grid(GRID, p), ".fits", folder), read_grid),
-        "image": (".fits", _written(_image, ".fits", folder), pachon.CcdImage.read),
+        "image": (".fits", _written(_image, ".fits", folder), pachon.imaging.CcdImage.read),
         "foreign_image": (".fits", _foreign_image(), pachon.load_image),
-        "psfex": (".psf", _psfex(), pachon.load_psfex),
+        "psfex": (".psf", _psfex(), pachon.reconstruction.load_psfex),
         "psf_model": (".fits", _written(_psf_model, ".fits", folder), pachon.PsfModel.read),
         "stl": (".stl", _mesh("stl"), lambda p: load_mesh(p, merged=True)),
         "glb": (".glb", _mesh("glb"), lambda p: load_mesh(p, merged=False)),
@@ -329,11 +329,11 @@ def _cases(folder):
         "star_list_ecsv": (".ecsv", _text(STARS, "ascii.ecsv"), _use_stars),
         "star_list_fits": (".fits", _fits(fits.table_to_hdu(STARS)), _use_stars),
         "camera": (".yaml", (DATA / "camera_comcam.yaml").read_bytes(), pachon.load_camera),
-        "tolerances": (".yaml", TOLERANCES, lambda p: pachon.load_tolerances(p, "paul_baker")),
+        "tolerances": (".yaml", TOLERANCES, lambda p: pachon.studies.load_tolerances(p, "paul_baker")),
         "optimization": (".yaml", OPTIMIZATION, _use_optimization),
-        "align": (".yaml", b"visits: 3\nseed: 2\n", pachon.load_align_configuration),
+        "align": (".yaml", b"visits: 3\nseed: 2\n", pachon.studies.load_align_configuration),
         "image_stack": (".yaml", b"tiles: 2\nside: 128\n", load_image_stack_configuration),
-        "coatings": (".yaml", COATINGS, pachon.Coatings.read),
+        "coatings": (".yaml", COATINGS, pachon.design.Coatings.read),
         "states": (".ecsv", _text(STATES, "ascii.ecsv"),
                    lambda p: with_active_optics_state(pachon.load_telescope("lsst_v3.3_r"), str(p), 3)),
         "donuts": (".fits", _donuts(), _use_donuts),
@@ -435,7 +435,7 @@ def test_files_as_they_are_are_read(name, cases, tmp_path):
     (tmp_path / f"file{suffix}").write_bytes(data)
     with warnings.catch_warnings():
         # Some CCDs have no heights.
-        warnings.simplefilter("ignore", pachon.HeightWarning)
+        warnings.simplefilter("ignore", pachon.errors.HeightWarning)
         function(tmp_path / f"file{suffix}")
 
 

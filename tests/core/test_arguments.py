@@ -194,9 +194,9 @@ def test_masked_stars_and_pixels():
 
 
 def test_checked_classes_stay_themselves():
-    circle = pachon.Circle(1.0)
+    circle = pachon.models.Circle(1.0)
     assert pickle.loads(pickle.dumps(circle)) == circle
-    assert pachon.Circle.__init__.__doc__ == circle.__init__.__doc__
+    assert pachon.models.Circle.__init__.__doc__ == circle.__init__.__doc__
     assert pachon.trace.__name__ == "trace"
     assert "telescope" in pachon.trace.__wrapped__.__annotations__
 
@@ -215,7 +215,7 @@ def test_many_threads_may_make_the_first_call():
 
 
 def test_a_name_in_place_of_a_telescope_is_told_what_loads_it():
-    with pytest.raises(pachon.DomainError) as caught:
+    with pytest.raises(pachon.errors.DomainError) as caught:
         pachon.spots("lsst_v3.3_r")
     assert (
         str(caught.value) == "telescope = 'lsst_v3.3_r': expected a Telescope, as of pachon.load_telescope or a Request"

@@ -61,12 +61,12 @@ def bomb(tmp_path_factory):
 
 
 READERS = {
-    "grid": pachon.read_grid,
+    "grid": pachon.models.read_grid,
     "mosaic": read_mosaic,
     "heights": lambda path: read_heights(path, pachon.lsst_camera()),
-    "psfex": pachon.load_psfex,
+    "psfex": pachon.reconstruction.load_psfex,
     "piff": pachon.load_piff,
-    "image": pachon.CcdImage.read,
+    "image": pachon.imaging.CcdImage.read,
     "foreign image": pachon.load_image,
 }
 

@@ -81,7 +81,7 @@ def test_defocus_is_that_of_the_closed_form():
     # To the next orders: the aperture over the focal length, squared, and the motion over the focal length.
     assert diagram.geometric_radius[0] < radius * vergence
     assert diagram.rms_radius[0] == pytest.approx(radius * vergence / np.sqrt(2.0), rel=2e-3)
-    fans = pachon.opd_fans(telescope, [[0.0, 0.0]], threads=1)
+    fans = pachon.design.opd_fans(telescope, [[0.0, 0.0]], threads=1)
     assert fans.peak_to_valley[0, 0] == pytest.approx(0.5 * radius**2 * vergence, rel=2e-3)
     # Light that still converges behind the telescope: the rim of the wavefront leads.
     assert abs(fans.value[0, 0, 0, 0] - fans.value[0, 0, 0, 32]) == pytest.approx(fans.peak_to_valley[0, 0], rel=1e-9)
@@ -121,7 +121,7 @@ def test_what_needs_an_image_is_refused():
     for name, call in {
         "a focus": lambda: pachon.through_focus(telescope),
         "a PSF": lambda: pachon.make_psfs(telescope, [[0.0, 0.0]], [LIGHT]),
-        "a relative illumination": lambda: pachon.relative_illumination(telescope),
+        "a relative illumination": lambda: pachon.design.relative_illumination(telescope),
         "a map of ghosts": lambda: pachon.ghosts(telescope),
         "a focal plane": lambda: pachon.wavefront_opd(
             telescope, (0.0, 0.0), LIGHT, focal_plane=pachon.FocalPlane.flat("lsst")
@@ -129,7 +129,7 @@ def test_what_needs_an_image_is_refused():
     }.items():
         with pytest.raises(DomainError, match=f"expander is afocal, its light parallel: {name} needs an image"):
             call()
-    for call in (pachon.field_curvature, pachon.chromatic_focus, pachon.spot_matrix):
+    for call in (pachon.field_curvature, pachon.design.chromatic_focus, pachon.design.spot_matrix):
         with pytest.raises(DomainError, match="expected one with a focus; its light is parallel"):
             call(telescope)
     # A telescope that is not said to be afocal keeps its own error.

@@ -58,7 +58,7 @@ def test_wavefronts_refer_to_plane_waves_and_pupils_have_any_size(size):
     assert found.radius == np.inf
     many = pachon.wavefront_opds(telescope, [field], LIGHT, (x, y), threads=1)
     assert many.value[0] == pytest.approx(found.value, abs=1e-15 * max(size, 4.0))
-    fans = pachon.opd_fans(telescope, [field], n_points=5, threads=1)
+    fans = pachon.design.opd_fans(telescope, [field], n_points=5, threads=1)
     assert np.isfinite(fans.value).all()
     diagram = pachon.spots(telescope, [[0.0, 0.0]], threads=1)
     # To the next order: the aperture over the focal length, squared.
@@ -206,8 +206,8 @@ def test_an_expander_out_of_adjustment_is_optimised(merit, tmp_path):
 def test_operands_hold_angles():
     telescope = expander(moved=1e-4)
     with pytest.raises(DomainError, match=r"expected one with a focus.*AMAG"):
-        pachon.FocalLength(value=4.9).measure(expander())
-    magnification = pachon.ImageScale(value=4.9)
+        pachon.design.FocalLength(value=4.9).measure(expander())
+    magnification = pachon.design.ImageScale(value=4.9)
     assert magnification.measure(expander()) == pytest.approx(LONG / SHORT, rel=1e-6)
     found = pachon.optimize(
         telescope, ["M2.dz", "M2.curvature"], "spots", [[0.0, 0.0]], targets=[magnification], threads=1
@@ -220,18 +220,20 @@ def test_configurations_of_afocal_telescopes_are_optimised_together():
     pair = [expander(moved=1e-4), replace(expander(moved=1e-4), name="narrow", pupil_diameter=0.5 * WIDTH)]
     found = pachon.optimize(pair, ["M2.dz"], "wavefront", [[0.0, 0.0]], threads=1)
     assert [t.surface("M2").vertex[2] for t in found.telescopes] == pytest.approx([LONG - SHORT] * 2, abs=1e-10)
-    target = pachon.Target(lambda t: first_order(t).angular_magnification, value=4.9, weight=1.0)
+    target = pachon.design.Target(lambda t: first_order(t).angular_magnification, value=4.9, weight=1.0)
     found = pachon.optimize(pair[0], ["M2.curvature"], "spots", [[0.0, 0.0]], targets=[target], threads=1)
     assert found.operands[0].end != found.operands[0].start
 
 
 def test_colours_side_by_side_in_microradians():
-    matrix = pachon.spot_matrix(expander(moved=1e-5), [[0.0, 0.0]], [4e-7, 6e-7], against="wavelength", threads=1)
+    matrix = pachon.design.spot_matrix(
+        expander(moved=1e-5), [[0.0, 0.0]], [4e-7, 6e-7], against="wavelength", threads=1
+    )
     spots = pachon.spots(expander(moved=1e-5), [[0.0, 0.0]], 4e-7, sampling="rings", n_pupil=10, threads=1)
     assert matrix.rms_radius == pytest.approx(np.full((1, 2), spots.rms_radius[0]), rel=1e-9)
     assert str(matrix.to_table()["rms_radius"].unit) == "urad"
     matrix.plot()
-    color = pachon.lateral_color(lenses(), threads=1)
+    color = pachon.design.lateral_color(lenses(), threads=1)
     assert color.shift == pytest.approx(0.0, abs=1e-15)
     assert "spread_urad" in color.summary()
     color.plot()

@@ -71,7 +71,7 @@ def test_the_prescription_is_in_the_signs_of_lens_design(paraboloid):
 
 
 def test_a_lens_has_its_glass(paraboloid):
-    rows = prescription_rows(pachon.doublet(), 587.5618e-9, {})
+    rows = prescription_rows(pachon.models.doublet(), 587.5618e-9, {})
     assert [row[4] for row in rows] == ["N-BK7", "F2", "", ""]
     assert float(rows[0][5]) == pytest.approx(1.5168, abs=1e-4)
     assert float(rows[0][2]) > 0 > float(rows[1][2])
@@ -109,8 +109,10 @@ def test_analyses_of_one_wavelength_take_the_primary_one_of_a_lens_file(request)
     lens = pachon.load_telescope(request.config.rootpath / "tests/data/zmx/lens1.zmx")
     assert len(lens.design_data.wavelengths) == 3
     primary = lens.default_wavelength
-    assert np.array_equal(pachon.seidel_diagram(lens).coefficients, pachon.seidel_diagram(lens, primary).coefficients)
-    found, given = (pachon.relative_illumination(lens, wavelength=w, n_pupil=256) for w in (None, primary))
+    assert np.array_equal(
+        pachon.design.seidel_diagram(lens).coefficients, pachon.design.seidel_diagram(lens, primary).coefficients
+    )
+    found, given = (pachon.design.relative_illumination(lens, wavelength=w, n_pupil=256) for w in (None, primary))
     assert np.array_equal(found.solid_angle, given.solid_angle)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pachon.core.errors import DomainError, UnknownNameError
+from pachon.core.errors import ConfigError, DomainError
 from pachon.imaging.exposure import SATURATED, Exposure, expose
 
 SCENE = np.full((300, 400), 250.0, dtype=np.float32)
@@ -92,5 +92,5 @@ def test_bad_settings_are_named(options, text):
 
 
 def test_an_unknown_band_is_named():
-    with pytest.raises(UnknownNameError, match="'v'"):
+    with pytest.raises(ConfigError, match="band = 'v': expected one of u, g, r, i, z, y"):
         Exposure(band="v")

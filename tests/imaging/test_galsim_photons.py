@@ -346,7 +346,7 @@ def test_without_galsim_one_line_says_what_to_install():
         "import sys; sys.modules['galsim'] = None\n"
         "import pachon\n"
         "try: pachon.galsim.PachonOptics\n"
-        "except pachon.ConfigError as error: print(error)"
+        "except pachon.errors.ConfigError as error: print(error)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "pachon.galsim.PachonOptics needs GalSim: pip install 'pachon[galsim]'\n"

@@ -29,7 +29,7 @@ def contents(folder):
 
 @pytest.mark.long
 def test_workers_write_the_bytes_of_one_process(tmp_path, monkeypatch):
-    config = pachon.ImagesConfig.model_validate(SETTINGS)
+    config = pachon.imaging.ImagesConfig.model_validate(SETTINGS)
     alone = pachon.simulate_images(config, tmp_path / "one")
     shared = pachon.simulate_images(config, tmp_path / "two", execution=Execution(workers=serial_worker))
     assert contents(tmp_path / "two") == contents(tmp_path / "one")

@@ -64,7 +64,7 @@ def test_objects_have_the_colour_of_the_nearest_entry(field):
     with pytest.raises(ProductError, match=r"column 'name' has type .*: expected a number in every row"):
         read_object_colours(folder / "c.fits", "name", image)
     with pytest.raises(DomainError, match=r"positions have shape \(3, 2\), values \(2,\): expected \[k, 2\] and \[k\]"):
-        pachon.ObjectColours(np.zeros((3, 2)), np.zeros(2))
+        pachon.imaging.ObjectColours(np.zeros((3, 2)), np.zeros(2))
 
 
 @pytest.mark.long

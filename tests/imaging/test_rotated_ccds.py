@@ -11,7 +11,7 @@ ANGLES = (0.0, 90.0, 30.0)
 
 
 def camera(angle):
-    return pachon.Camera(
+    return pachon.models.Camera(
         "one", ("A",), (), np.array([-1]), np.array([[0.06, -0.09]]), np.array([3000, 1000]), 10e-6,
         rotation_deg=np.array([angle]),
     )  # fmt: skip

@@ -276,4 +276,4 @@ def test_a_run_without_atmosphere_is_refused(tiny):
 
 def test_public_names():
     assert pachon.draw_ccd is draw_ccd
-    assert pachon.CcdImage is CcdImage
+    assert pachon.imaging.CcdImage is CcdImage

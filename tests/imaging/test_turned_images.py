@@ -22,7 +22,7 @@ PLACES = np.array([[400.0, 300.0], [1500.0, 900.0]])
 
 def on_camera(run, angle):
     """The run with one CCD of 2000 x 1200 pixels, turned, 0.7 deg from the axis, with a tilt and a ripple."""
-    camera = pachon.Camera(
+    camera = pachon.models.Camera(
         "turned", ("A",), (), np.array([-1]), np.array([[0.08, -0.09]]), np.array([2000, 1200]), 10e-6,
         rotation_deg=np.array([angle]),
     )  # fmt: skip

@@ -120,7 +120,7 @@ def test_a_telescope_without_distortion_needs_no_sip(lsst_r):
 
     # A long paraboloid: its distortion of a tangent projection is below a milliarcsecond on a small CCD on the axis.
     ideal = ideal_telescope(lsst_r, 1e5)
-    small = pachon.Camera(
+    small = pachon.models.Camera(
         "small", ("A_0",), ("A",), np.array([0]), np.zeros((1, 2)), np.array([512, 512]), 10e-6 * 1e5 / 1.23
     )
     wcs = ccd_wcs(ideal, small, "A_0")
@@ -145,7 +145,7 @@ def test_at_no_roll_east_lies_towards_smaller_y_and_north_towards_smaller_x(lsst
 
 
 def test_pixels_of_a_camera_that_is_not_transposed_are_a_mirror_image(lsst_r):
-    square = pachon.Camera("square", ("A",), (), np.array([-1]), np.zeros((1, 2)), np.array([400, 400]), 10e-6)
+    square = pachon.models.Camera("square", ("A",), (), np.array([-1]), np.zeros((1, 2)), np.array([400, 400]), 10e-6)
     cd = ccd_wcs(lsst_r, square, "A").cd / ARCSEC
     assert np.allclose(cd, [[-0.2, 0.0], [0.0, -0.2]], atol=1e-3)
 

@@ -152,10 +152,12 @@ def test_failures_are_flagged():
     images[6] = 1e-320
     m = pachon.adaptive_moments(images, SCALE, weight=np.ones((21, 21)))
     assert (m.flags != 0).all()
-    assert m.flags[:3].tolist() == [pachon.MomentFlag.NO_FLUX] * 3
+    assert m.flags[:3].tolist() == [pachon.measure.MomentFlag.NO_FLUX] * 3
     assert np.isnan([getattr(m, name) for name in NUMBERS]).all()
     mask = np.hypot(x, y) < 3.0
-    assert pachon.adaptive_moments(gaussian(21, 3.0, 0.0, 3.0), SCALE, mask).flags[0] == pachon.MomentFlag.MASKED
+    assert (
+        pachon.adaptive_moments(gaussian(21, 3.0, 0.0, 3.0), SCALE, mask).flags[0] == pachon.measure.MomentFlag.MASKED
+    )
     assert len(pachon.adaptive_moments(np.empty((0, 21, 21)), SCALE)) == 0
     # Five pixels of a star of one pixel's width do not determine six numbers.
     few = np.zeros((5, 5))

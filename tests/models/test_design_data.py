@@ -36,7 +36,7 @@ DATA = Path(__file__).parents[1] / "data" / "zmx"
     ],
 )  # fmt: skip
 def test_wrong_data_are_refused_in_one_line(wrong, expected):
-    with pytest.raises(PrescriptionError, match=f"design data: {expected}"):
+    with pytest.raises(PrescriptionError, match=rf"^(design data: )?{expected}"):
         DesignData(**wrong)
 
 
@@ -86,7 +86,7 @@ def thin_lens(telescope):
 def test_the_pupil_of_a_file_is_the_one_that_its_stop_makes(name, aperture):
     telescope = load_telescope(DATA / f"{name}.zmx")
     assert telescope.design_data.aperture == aperture
-    floated = pachon.with_floating_pupil(telescope)
+    floated = pachon.models.with_floating_pupil(telescope)
     assert floated.stop_z == pytest.approx(telescope.stop_z, abs=1e-16)
     assert floated.pupil_diameter == pytest.approx(telescope.pupil_diameter, rel=1e-14)
 
@@ -96,13 +96,15 @@ def test_a_pupil_floats_with_the_lens():
     telescope = load_telescope(DATA / "lens1.zmx")
     focal = pachon.first_order(telescope).focal_length
     by_ratio = telescope.with_design(aperture="f_number", aperture_value=3.0)
-    weaker = pachon.with_floating_pupil(thin_lens(by_ratio))
+    weaker = pachon.models.with_floating_pupil(thin_lens(by_ratio))
     assert pachon.first_order(weaker).f_number == pytest.approx(3.0, rel=1e-13)
     assert weaker.pupil_diameter > 1.3 * focal / 3.0
     # The reverse: the semi-diameter that this pupil makes on the stop makes this pupil.
     radius = 0.5 * telescope.pupil_diameter * stop_image(telescope).stop_scale
     by_stop = telescope.with_design(aperture="stop", aperture_value=radius)
-    assert pachon.with_floating_pupil(by_stop).pupil_diameter == pytest.approx(telescope.pupil_diameter, rel=1e-14)
+    assert pachon.models.with_floating_pupil(by_stop).pupil_diameter == pytest.approx(
+        telescope.pupil_diameter, rel=1e-14
+    )
 
 
 def test_a_working_focal_ratio_is_that_of_the_cone_to_the_image():
@@ -125,14 +127,14 @@ def test_a_working_focal_ratio_is_that_of_the_cone_to_the_image():
         design_data=DesignData(stop="front", aperture="working_f_number", aperture_value=10.0),
     )  # fmt: skip
     # Half the angle of the cone is the radius over the distance: 1 / (2 u) = 10.
-    assert pachon.with_floating_pupil(lens).pupil_diameter == pytest.approx(2.0 * focal / 10.0, rel=1e-7)
+    assert pachon.models.with_floating_pupil(lens).pupil_diameter == pytest.approx(2.0 * focal / 10.0, rel=1e-7)
 
 
 def test_a_floating_pupil_needs_its_data():
     telescope = load_telescope(DATA / "lens1.zmx")
     with pytest.raises(DomainError, match="lens1: expected an aperture in its design data"):
-        pachon.with_floating_pupil(telescope.with_design(aperture=None, aperture_value=None))
+        pachon.models.with_floating_pupil(telescope.with_design(aperture=None, aperture_value=None))
     with pytest.raises(DomainError, match=r"paul_baker: expected a surface that is the stop \(design data: stop\)"):
-        pachon.with_floating_pupil(pachon.load_telescope("paul_baker"))
+        pachon.models.with_floating_pupil(pachon.load_telescope("paul_baker"))
     with pytest.raises(DomainError, match="surface S3 of HoO-V2C18Ex46: expected one on the axis"):
-        pachon.with_floating_pupil(load_telescope(DATA / "HoO-V2C18Ex46.zmx"))
+        pachon.models.with_floating_pupil(load_telescope(DATA / "HoO-V2C18Ex46.zmx"))

@@ -159,7 +159,7 @@ def test_real_rays_near_the_chief_ray(make):
 def test_telescopes_off_their_axis_are_close_to_principal_rays(name):
     telescope = pachon.load_telescope(name)
     optics = parabasal_optics(telescope)
-    rays = pachon.principal_rays(telescope, [(0.0, 0.0)], telescope.default_wavelength)
+    rays = pachon.design.principal_rays(telescope, [(0.0, 0.0)], telescope.default_wavelength)
     # Real rays at 1 % of the pupil, and plate scales on a detector that is out of focus.
     assert optics.focal_length == pytest.approx(1.0 / rays.plate_scale[0], rel=1e-4)
     distance = optics.exit_pupil_distance - optics.detector_distance

@@ -42,14 +42,14 @@ def test_temperatures_of_colors_of_broad_bands(bands, widths, kelvin):
     first, second, _ = COLORS[bands]
     color = ab_magnitude(kelvin, first, widths[0]) - ab_magnitude(kelvin, second, widths[1])
     # Bands have a width: 3 % of the temperature.
-    assert pachon.color_temperature(color, bands) == pytest.approx(kelvin, rel=0.03)
+    assert pachon.models.color_temperature(color, bands) == pytest.approx(kelvin, rel=0.03)
 
 
 def test_the_sun_and_extremes():
     # g - r 0.44 (Willmer 2018) and BP - RP 0.818 (Casagrande & VandenBerg 2018); its colour temperature is near 5900 K.
-    assert pachon.color_temperature(0.44, "g_r") == pytest.approx(5772.0, rel=0.08)
-    assert pachon.color_temperature(0.818, "bp_rp") == pytest.approx(5772.0, rel=0.03)
-    np.testing.assert_allclose(pachon.color_temperature([-3.0, 9.0, np.nan]), [HOTTEST, COOLEST, np.nan])
+    assert pachon.models.color_temperature(0.44, "g_r") == pytest.approx(5772.0, rel=0.08)
+    assert pachon.models.color_temperature(0.818, "bp_rp") == pytest.approx(5772.0, rel=0.03)
+    np.testing.assert_allclose(pachon.models.color_temperature([-3.0, 9.0, np.nan]), [HOTTEST, COOLEST, np.nan])
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_the_sun_and_extremes():
     [
         (lambda: pachon.blackbody_photons([5000.0, -1.0], WAVES), "temperature: expected .* above 0"),
         (lambda: pachon.blackbody_photons(5000.0, [0.0]), "wavelengths: expected one or more positive"),
-        (lambda: pachon.color_temperature(0.4, "u_g"), "bands = 'u_g'|bands"),
+        (lambda: pachon.models.color_temperature(0.4, "u_g"), "bands = 'u_g'|bands"),
     ],
 )
 def test_bad_input_is_one_line(call, words):
@@ -76,7 +76,7 @@ def test_effective_colours_are_mean_wavelengths_and_those_of_blackbodies():
     for kind in COLORS:
         colours = pachon.effective_colour(waves, photons, kind)
         # The table of temperatures has steps of 0.8 %.
-        np.testing.assert_allclose(pachon.color_temperature(colours, kind), kelvin, rtol=2e-4)
+        np.testing.assert_allclose(pachon.models.color_temperature(colours, kind), kelvin, rtol=2e-4)
 
 
 def test_spectra_without_light_have_no_colour():
@@ -87,7 +87,7 @@ def test_spectra_without_light_have_no_colour():
         ([2.0, -1.0], "photons: expected numbers from 0"),
         ([2.0, np.nan], "photons: expected numbers from 0"),
     ):
-        with pytest.raises(pachon.DomainError, match=match):
+        with pytest.raises(pachon.errors.DomainError, match=match):
             pachon.effective_colour(waves, photons)
     with pytest.raises(pachon.PachonError, match="kind = 'z_y'"):
         pachon.effective_colour(waves, [1.0, 1.0], "z_y")

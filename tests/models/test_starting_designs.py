@@ -74,7 +74,7 @@ def test_the_petzval_sum_of_the_triplet():
 def test_hubble():
     # 2.4 m, f/24, primary f/2.3, focus 1.4998 m behind it. Its numbers as in hubble.len of OSLO's user guide
     # (Sinclair Optics 1997).
-    telescope = pachon.two_mirror("ritchey-chretien", 2.4, 24.0, primary_f_number=2.3, back_focus=1.4998)
+    telescope = pachon.models.two_mirror("ritchey-chretien", 2.4, 24.0, primary_f_number=2.3, back_focus=1.4998)
     m1, m2, _ = telescope.surfaces
     assert (m1.shape.radius, m2.shape.radius) == pytest.approx((11.04, 1.358), rel=1e-3)
     assert (m1.shape.conic, m2.shape.conic) == pytest.approx((-1.002299, -1.4960), rel=1e-3)
@@ -82,7 +82,7 @@ def test_hubble():
 
 
 def test_the_schmidt_is_best_on_its_sphere():
-    telescope = pachon.schmidt(0.5, 2.5)
+    telescope = pachon.models.schmidt(0.5, 2.5)
     on_sphere = pachon.spots(telescope, sampling="rings", n_pupil=8)
     # The same spots over the field, but for the obliquity of the plate.
     assert on_sphere.rms_radius == pytest.approx(on_sphere.rms_radius[0], rel=0.1)

@@ -160,7 +160,7 @@ def test_a_telescope_of_public_names_focuses_the_axis():
     """A paraboloid of radius 4 m has its focus 2 m above the vertex."""
     vacuum = pachon.ConstantIndex(1.0)
     mirror = pachon.Surface(
-        "M1", pachon.Interaction.MIRROR, pachon.Conic(4.0, -1.0), (0, 0, 0), vacuum, pachon.Circle(0.5)
+        "M1", pachon.Interaction.MIRROR, pachon.Conic(4.0, -1.0), (0, 0, 0), vacuum, pachon.models.Circle(0.5)
     )
     detector = pachon.Surface("D", pachon.Interaction.DETECTOR, pachon.Plane(), (0, 0, 2), vacuum)
     telescope = pachon.Telescope(
@@ -178,7 +178,7 @@ def test_a_telescope_of_public_names_focuses_the_axis():
     )
     assert pachon.first_order(telescope).focal_length == pytest.approx(2.0, rel=1e-15)
     result = pachon.trace(telescope, pachon.launch_rays(telescope, (0, 0), 5e-7, ([0.1, -0.3], [0.2, 0.0])))
-    assert isinstance(result, pachon.TraceResult)
+    assert isinstance(result, pachon.raytrace.TraceResult)
     # Rounding of 5 m.
     assert np.allclose(result.position, [0.0, 0.0, 2.0], atol=1e-14)
 
@@ -195,7 +195,7 @@ def test_a_telescope_of_public_names_focuses_the_axis():
 def test_arguments_of_a_surface_of_another_kind_are_refused(wrong, message):
     vacuum = pachon.ConstantIndex(1.0)
     right = {"shape": pachon.Plane(), "medium_after": vacuum, "interaction": pachon.Interaction.MIRROR}
-    with pytest.raises(pachon.DomainError, match=message):
+    with pytest.raises(pachon.errors.DomainError, match=message):
         pachon.Surface(name="M1", vertex=(0.0, 0.0, 0.0), **right | wrong)
 
 

@@ -68,7 +68,7 @@ def by_anacal(stamps, offsets, noise, noise_stamps):
 
 
 def by_functionals(stamps, offsets, noise, seed):
-    estimator = pachon.ShearEstimator(moffat(), SCALE * ARCSEC, noise)
+    estimator = pachon.measure.ShearEstimator(moffat(), SCALE * ARCSEC, noise)
     shapes = estimator.ellipticity_and_response(estimator.moments(stamps, offsets + 0.5), seed=seed)
     return shapes.e1, shapes.r11
 

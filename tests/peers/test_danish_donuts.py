@@ -51,16 +51,18 @@ def errors(donuts, moved, fit):
 
 
 def test_one_by_one(donuts):
-    single = errors(donuts, "Camera", pachon.SingleDonuts(NOLL, higher_order=10e-9))
+    single = errors(donuts, "Camera", pachon.sensing.SingleDonuts(NOLL, higher_order=10e-9))
     median, danish_worst = {"kolm": (75.0, 129.0), "atm": (155.0, 683.0)}[donuts[0]]
     assert np.median(single) < median
     assert single.max() < danish_worst
     # Another body is not what these images are of.
-    wrong = errors(donuts, "Detector", pachon.SingleDonuts(NOLL, higher_order=10e-9))
+    wrong = errors(donuts, "Detector", pachon.sensing.SingleDonuts(NOLL, higher_order=10e-9))
     assert np.median(wrong) > 1.5 * np.median(single)
 
 
 def test_degrees_of_freedom_of_all_ten(donuts):
-    joint = errors(donuts, "Camera", pachon.TelescopeFreedoms(pachon.load_degrees_of_freedom("lsst"), noll=NOLL))
+    joint = errors(
+        donuts, "Camera", pachon.sensing.TelescopeFreedoms(pachon.load_degrees_of_freedom("lsst"), noll=NOLL)
+    )
     assert np.median(joint) < {"kolm": 60.0, "atm": 105.0}[donuts[0]]
     assert joint.max() < {"kolm": 100.0, "atm": 309.0}[donuts[0]]

@@ -93,9 +93,9 @@ def test_motions_in_zcs_are_those_of_batoid_rubin():
         "Camera.ry",
     ]
     values = 5.0 * np.array([2e-5, -3e-5, 1e-5, 5e-6, 8e-6, -4e-5, 1e-5, -5e-6, 1e-5, -6e-6])
-    freedoms = pachon.DegreesOfFreedom.of_parameters(telescope, names)
-    estimate = pachon.FreedomEstimate(freedoms, values, np.eye(10), np.ones(10))
-    corrections = pachon.hexapod_corrections(estimate, frame="ZCS")
+    freedoms = pachon.models.DegreesOfFreedom.of_parameters(telescope, names)
+    estimate = pachon.sensing.FreedomEstimate(freedoms, values, np.eye(10), np.ones(10))
+    corrections = pachon.sensing.hexapod_corrections(estimate, frame="ZCS")
     optic = batoid.Optic.fromYaml("LSST_r.yaml")
     for body, shift, tilt in zip(("M2", "LSSTCamera"), -corrections.shift, -corrections.tilt, strict=True):
         optic = optic.withGloballyShiftedOptic(body, np.array([-shift[0], shift[1], -shift[2]]) * 1e-6)

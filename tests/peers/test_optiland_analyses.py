@@ -114,7 +114,7 @@ def test_fans_curvature_and_distortion(name):
     for i, place in enumerate(places):
         height = float(np.linalg.norm(mine.surfaces[-1].to_local(chief(mine, place))[:2]))
         radius = float(np.copysign(np.hypot(distance, height), distance))
-        waves = pachon.opd_fans(mine, [place], n_points=17, sphere_radius=radius).waves[0, 0]
+        waves = pachon.design.opd_fans(mine, [place], n_points=17, sphere_radius=radius).waves[0, 0]
         found = np.asarray(opd.get_data(opd.fields[i], opd.wavelengths[0]).opd)
         x, y = np.asarray(opd.distribution.x), np.asarray(opd.distribution.y)
         for fan, along, across in ((0, y, x), (1, x, y)):
@@ -137,14 +137,16 @@ def test_seidel_sums(name):
     optic, mine = theirs(*SYSTEMS[name]), ours(*SYSTEMS[name])
     # Theirs are in mm and of the other sign.
     expected = -1e-3 * np.asarray(optic.aberrations.seidels()).ravel() / np.array([8, 2, 2, 4, 2])
-    assert pachon.seidel_diagram(mine).coefficients[:, :5].sum(axis=0) == pytest.approx(expected, rel=1e-9, abs=1e-18)
+    assert pachon.design.seidel_diagram(mine).coefficients[:, :5].sum(axis=0) == pytest.approx(
+        expected, rel=1e-9, abs=1e-18
+    )
 
 
 @pytest.mark.slow
 def test_fringe_zernikes():
     zernike = pytest.importorskip("optiland.zernike")
     radius, angle = np.random.default_rng(3).uniform([0.0, -np.pi], [1.0, np.pi], (20, 2)).T
-    mine = pachon.fringe_zernikes(36, radius * np.cos(angle), radius * np.sin(angle))
+    mine = pachon.models.fringe_zernikes(36, radius * np.cos(angle), radius * np.sin(angle))
     for j in range(36):
         one = zernike.ZernikeFringe(coeffs=np.eye(36)[j])
         assert mine[j] == pytest.approx(np.asarray(one.poly(radius, angle)), abs=1e-10), j + 1

@@ -174,6 +174,6 @@ def test_what_optiland_cannot_hold_is_refused(tmp_path):
         (telecentric.with_design(stop=None), "a telecentric object space needs its stop"),
         (shifted, "compressions alone"),
     ):
-        with pytest.raises(pachon.PrescriptionError, match=words):
+        with pytest.raises(pachon.errors.PrescriptionError, match=words):
             pachon.save_telescope(telescope, tmp_path / "ours.json")
     assert not list(tmp_path.iterdir())

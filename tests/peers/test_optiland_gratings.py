@@ -57,12 +57,12 @@ def landing_points(telescope, path, points, field):
 
 
 PLANE = [
-    ("MIRROR", (12.0, -7.0, 20.0), pachon.Grating(2, 300.0, 0.4), VACUUM),
-    ("MIRROR", (35.0, 5.0, 0.0), pachon.Grating(1, 1200.0, 0.0), VACUUM),
-    ("REFRACT", (5.0, 3.0, 0.0), pachon.Grating(-1, 600.0, -0.7), VACUUM),
-    ("REFRACT", (5.0, 3.0, 0.0), pachon.Grating(3, 100.0, 1.3), ConstantIndex(1.6)),
+    ("MIRROR", (12.0, -7.0, 20.0), pachon.models.Grating(2, 300.0, 0.4), VACUUM),
+    ("MIRROR", (35.0, 5.0, 0.0), pachon.models.Grating(1, 1200.0, 0.0), VACUUM),
+    ("REFRACT", (5.0, 3.0, 0.0), pachon.models.Grating(-1, 600.0, -0.7), VACUUM),
+    ("REFRACT", (5.0, 3.0, 0.0), pachon.models.Grating(3, 100.0, 1.3), ConstantIndex(1.6)),
     # An echelle in conical incidence.
-    ("MIRROR", (0.0, 6.0, 0.0), pachon.Grating(40, 31.6, 0.0), VACUUM),
+    ("MIRROR", (0.0, 6.0, 0.0), pachon.models.Grating(40, 31.6, 0.0), VACUUM),
 ]
 
 
@@ -85,7 +85,7 @@ CURVED = [
 @pytest.mark.parametrize(("interaction", "shape", "after"), CURVED)
 def test_curved_gratings_in_their_plane_of_symmetry(interaction, shape, after, tmp_path):
     """Elsewhere optiland divides the period by the length of a vector along the surface, and not across the grooves."""
-    telescope = spectrograph(interaction, shape, pachon.Grating(1, 300.0), tilt=(7.0, 0.0, 0.0), after=after)
+    telescope = spectrograph(interaction, shape, pachon.models.Grating(1, 300.0), tilt=(7.0, 0.0, 0.0), after=after)
     y = np.linspace(-0.012, 0.012, 9)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

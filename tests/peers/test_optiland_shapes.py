@@ -24,7 +24,7 @@ def test_qbfs_terms(conic):
     terms = (0.02, 0.01, -0.004, 0.002, 0.001)
     config = ForbesSurfaceConfig(200.0, conic, 20.0, dict(enumerate(terms)))
     peer = ForbesQNormalSlopeGeometry(CoordinateSystem(), config, ForbesSolverConfig())
-    shape = pachon.QbfsAsphere(0.2, conic, 0.02, tuple(1e-3 * a for a in terms))
+    shape = pachon.models.QbfsAsphere(0.2, conic, 0.02, tuple(1e-3 * a for a in terms))
     assert np.abs(peer.sag(X, Y) * 1e-3 - shape.sag(1e-3 * X, 1e-3 * Y)).max() < 1e-17
 
 
@@ -33,6 +33,6 @@ def test_toroids_with_powers():
     from optiland.geometries.toroidal import ToroidalGeometry
 
     peer = ToroidalGeometry(CoordinateSystem(), 300.0, -200.0, 0.4, [2e-4, -3e-8, 1e-13])
-    shape = pachon.Toroid(0.3, -0.2, 0.4, (0.2, -30.0, 100.0))
+    shape = pachon.models.Toroid(0.3, -0.2, 0.4, (0.2, -30.0, 100.0))
     # It is the difference of two radii there.
     assert np.abs(peer.sag(X, Y) * 1e-3 - shape.sag(1e-3 * X, 1e-3 * Y)).max() < 2e-16

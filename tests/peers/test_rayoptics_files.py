@@ -197,10 +197,10 @@ def test_rays_of_a_file(name):
 
 
 GRATINGS = [
-    (Interaction.MIRROR, (12.0, -7.0, 20.0), pachon.Grating(2, 300.0, 0.4), 0.0),
-    (Interaction.MIRROR, (0.0, 6.0, 0.0), pachon.Grating(-40, 31.6), 0.0),
-    (Interaction.REFRACT, (5.0, 3.0, 0.0), pachon.Grating(-1, 600.0, -0.7), 0.0),
-    (Interaction.REFRACT, (5.0, 3.0, 0.0), pachon.Grating(3, 100.0, 1.3), 1.6),
+    (Interaction.MIRROR, (12.0, -7.0, 20.0), pachon.models.Grating(2, 300.0, 0.4), 0.0),
+    (Interaction.MIRROR, (0.0, 6.0, 0.0), pachon.models.Grating(-40, 31.6), 0.0),
+    (Interaction.REFRACT, (5.0, 3.0, 0.0), pachon.models.Grating(-1, 600.0, -0.7), 0.0),
+    (Interaction.REFRACT, (5.0, 3.0, 0.0), pachon.models.Grating(3, 100.0, 1.3), 1.6),
 ]
 
 

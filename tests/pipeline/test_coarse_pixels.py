@@ -9,8 +9,8 @@ from astropy import units as u
 from astropy.io import fits
 
 import pachon
-from pachon import ConfigError, DomainError
 from pachon.core.long_work import Execution
+from pachon.errors import ConfigError, DomainError
 from pachon.pipeline.config import configuration_of
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.run import run

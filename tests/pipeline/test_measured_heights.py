@@ -59,7 +59,7 @@ def test_configurations_without_measured_heights_keep_their_hash():
     assert measured.config_hash != experiment.config_hash
 
 
-@pytest.mark.filterwarnings("ignore::pachon.HeightWarning")
+@pytest.mark.filterwarnings("ignore::pachon.errors.HeightWarning")
 def test_a_file_lies_beside_the_configuration_and_counts_by_its_content(tmp_path):
     hashes, stamps = [], []
     for folder, height in (("a", 1), ("b", 1), ("c", 2)):
@@ -75,7 +75,7 @@ def test_a_file_lies_beside_the_configuration_and_counts_by_its_content(tmp_path
     assert stamps[0] == stamps[1] != stamps[2]
 
 
-@pytest.mark.filterwarnings("ignore::pachon.HeightWarning")
+@pytest.mark.filterwarnings("ignore::pachon.errors.HeightWarning")
 def test_a_sweep_reads_heights_beside_it_and_counts_them_by_content(tmp_path):
     path = tmp_path / "sweep.yaml"
     path.write_text(
@@ -95,7 +95,7 @@ def test_a_sweep_reads_heights_beside_it_and_counts_them_by_content(tmp_path):
     assert load_sweep(path).digest != before
 
 
-@pytest.mark.filterwarnings("ignore::pachon.HeightWarning")
+@pytest.mark.filterwarnings("ignore::pachon.errors.HeightWarning")
 @pytest.mark.parametrize(
     ("section", "parts"),
     [

@@ -142,7 +142,7 @@ def test_colours_are_temperatures(tmp_path, telescope, places):
     assert found.text.endswith("90 on the ccds, 1 without colour; spectra from column g_r")
     for i, name in enumerate(CCDS):
         order = np.argsort(places[i::3, 0])
-        expected = pachon.color_temperature(np.ma.filled(colors[i::3], np.nan)[order], "g_r")
+        expected = pachon.models.color_temperature(np.ma.filled(colors[i::3], np.nan)[order], "g_r")
         np.testing.assert_array_equal(found.temperatures(name), expected)
     # A temperature counts before a colour; a column may be mapped, and must be there then.
     table["teff"] = np.linspace(3000.0, 9000.0, len(places))
@@ -394,7 +394,7 @@ def test_a_whole_run_of_a_catalogue_goes_on_and_has_a_model_of_the_focal_plane(t
 
 @pytest.mark.long
 def test_images_have_the_stars_of_the_catalogue(catalogue, sky, places):
-    images = pachon.ImagesConfig(
+    images = pachon.imaging.ImagesConfig(
         run=Configuration(
             ccds=("R22_S11",),
             rotator_deg=np.rad2deg(0.2),
@@ -409,7 +409,7 @@ def test_images_have_the_stars_of_the_catalogue(catalogue, sky, places):
         scene = pachon.draw_ccd(
             experiment,
             "R22_S11",
-            pachon.Galaxies.single([], [], [], []),
+            pachon.sky.Galaxies.single([], [], [], []),
             pointing=AIM,
             window=pachon.Window(1500, 1500, 1200, 1200),
         )
@@ -419,11 +419,11 @@ def test_images_have_the_stars_of_the_catalogue(catalogue, sky, places):
     # The WCS is good to 3e-4 arcsec.
     assert distance.max() * 3600.0 < 3e-4
     with pytest.raises(PachonError, match=r"run\.pointing: expected none"):
-        pachon.ImagesConfig(run=Configuration(pointing=POINTING)).experiment()
+        pachon.imaging.ImagesConfig(run=Configuration(pointing=POINTING)).experiment()
 
 
 def test_studies_that_draw_their_stars_take_no_catalogue(config):
     with pytest.raises(PachonError, match=r"stars\.catalogue = .*: expected none, these stars are drawn"):
         study_experiment(config, make_plan(config))
     with pytest.raises(PachonError, match=r"run\.stars\.catalogue = .*: expected none"):
-        pachon.VisitsConfig(run=config).experiment()
+        pachon.studies.VisitsConfig(run=config).experiment()

@@ -55,7 +55,7 @@ def test_mesh_agrees_to_the_facet_error(lsst_r, focal_plane, bundles):
     for rays in bundles:
         flat = pachon.trace(lsst_r, rays)
         exact = pachon.trace(lsst_r, rays, focal_plane=focal_plane)
-        landing = pachon.land_on_mesh(lsst_r.surfaces[-1], mesh, flat.position, flat.direction)
+        landing = pachon.raytrace.land_on_mesh(lsst_r.surfaces[-1], mesh, flat.position, flat.direction)
         on = (exact.ccd >= 0) & (landing.facet >= 0)
         assert on.mean() > 0.9
         # Measured along z, where the bound holds; 1e-3 for the slope of the surface under an oblique ray.
@@ -74,7 +74,7 @@ def test_finer_mesh_converges_as_the_square_of_its_cells(lsst_r, focal_plane, bu
         for rays in bundles[:8]:
             flat = pachon.trace(lsst_r, rays)
             exact = pachon.trace(lsst_r, rays, focal_plane=focal_plane)
-            landing = pachon.land_on_mesh(lsst_r.surfaces[-1], mesh, flat.position, flat.direction)
+            landing = pachon.raytrace.land_on_mesh(lsst_r.surfaces[-1], mesh, flat.position, flat.direction)
             on = (exact.ccd >= 0) & (landing.facet >= 0)
             off.append(np.abs(landing.position - exact.position)[on, 2])
         errors.append(np.sqrt(np.mean(np.concatenate(off) ** 2)))

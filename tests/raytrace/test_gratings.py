@@ -54,8 +54,8 @@ SHAPES = {
     "plane": pachon.Plane(),
     "sphere": pachon.Sphere(-0.4),
     "conic": pachon.Conic(0.3, -1.7),
-    "asphere": pachon.EvenAsphere(-0.5, 0.4, (12.0, -300.0)),
-    "toroid": pachon.Toroid(-0.6, -0.4, 0.3),
+    "asphere": pachon.models.EvenAsphere(-0.5, 0.4, (12.0, -300.0)),
+    "toroid": pachon.models.Toroid(-0.6, -0.4, 0.3),
 }
 #: Ways through a grating: interaction, media before and behind.
 WAYS = {
@@ -74,7 +74,7 @@ def test_the_grating_equation_in_vectors(shape, way, order):
     """Tangential components of n d grow by m wavelength lines times those of the unit vector across the grooves."""
     interaction, before, after = WAYS[way]
     turn = axes(8.0, -5.0, 20.0)
-    grating = pachon.Grating(order, 150.0, 0.4)
+    grating = pachon.models.Grating(order, 150.0, 0.4)
     surface = grated(SHAPES[shape], grating, interaction=interaction, after=after, rotation=turn)
     start = rays()
     end = pachon.trace(telescope(surface, medium_before=before), start)
@@ -98,7 +98,7 @@ def test_the_grating_equation_in_vectors(shape, way, order):
 
 def test_order_zero_reflects_and_refracts():
     for interaction, after in (("MIRROR", AIR), ("REFRACT", GLASS)):
-        surface = grated(pachon.Sphere(-0.4), pachon.Grating(0, 1200.0), interaction=interaction, after=after)
+        surface = grated(pachon.Sphere(-0.4), pachon.models.Grating(0, 1200.0), interaction=interaction, after=after)
         start = rays()
         ruled, plain = (pachon.trace(telescope(s), start) for s in (surface, replace(surface, grating=None)))
         assert np.abs(ruled.direction - plain.direction).max() < 1e-15
@@ -108,7 +108,7 @@ def test_order_zero_reflects_and_refracts():
 
 def test_an_order_that_does_not_exist_has_a_status_of_its_own():
     """sin b = sin a + m wavelength lines: beyond one, no light leaves."""
-    surface = grated(pachon.Plane(), pachon.Grating(2, 1200.0))
+    surface = grated(pachon.Plane(), pachon.models.Grating(2, 1200.0))
     detector = pachon.Surface("D", pachon.Interaction.DETECTOR, pachon.Plane(), (0.0, 0.0, 0.5), AIR)
     start = rays()
     sine = start.direction[:, 1] + 2 * WAVELENGTH * 1.2e6
@@ -128,14 +128,14 @@ def test_an_order_that_does_not_exist_has_a_status_of_its_own():
 def test_beyond_the_critical_angle_an_order_leaves_the_glass():
     """Totally reflected light of order 0 has orders that pass: sin b = n sin a - wavelength lines."""
     turn = axes(50.0, 0.0, 0.0)
-    surface = grated(pachon.Plane(), pachon.Grating(-1, 600.0), interaction="REFRACT", rotation=turn)
+    surface = grated(pachon.Plane(), pachon.models.Grating(-1, 600.0), interaction="REFRACT", rotation=turn)
     ray = pachon.Rays(np.array([[0.0, 0.0, 0.3]]), np.array([[0.0, 0.0, -1.0]]), np.zeros(1), WAVELENGTH)
     glass = telescope(replace(surface, grating=None), medium_before=GLASS)
     assert pachon.trace(glass, ray).status[0] == pachon.RayStatus.TOTAL_REFLECTION
     end = pachon.trace(telescope(surface, medium_before=GLASS), ray)
     incidence = (ray.direction @ np.array(turn))[0, 1]
     sign = np.sign(incidence)
-    surface = replace(surface, grating=pachon.Grating(-int(sign), 600.0))
+    surface = replace(surface, grating=pachon.models.Grating(-int(sign), 600.0))
     end = pachon.trace(telescope(surface, medium_before=GLASS), ray)
     assert end.status[0] == pachon.RayStatus.OK
     expected = GLASS.n * incidence - sign * WAVELENGTH * 6e5
@@ -149,12 +149,12 @@ def spectrograph():
         "front", pachon.Interaction.REFRACT, pachon.Sphere(0.8), (0.0, 0.0, 0.2), GLASS, rotation=axes(3.0, 1.0, 0.0)
     )
     back = pachon.Surface(
-        "back", pachon.Interaction.REFRACT, pachon.EvenAsphere(-0.7, 0.2, (1.0,)), (0.0, 0.0, 0.19), AIR,
-        rotation=axes(-2.0, 4.0, 9.0), grating=pachon.Grating(-1, 90.0, 1.2),
+        "back", pachon.Interaction.REFRACT, pachon.models.EvenAsphere(-0.7, 0.2, (1.0,)), (0.0, 0.0, 0.19), AIR,
+        rotation=axes(-2.0, 4.0, 9.0), grating=pachon.models.Grating(-1, 90.0, 1.2),
     )  # fmt: skip
     mirror = pachon.Surface(
-        "mirror", pachon.Interaction.MIRROR, pachon.Toroid(0.9, 0.7, -0.4), (0.0, 0.0, 0.0), AIR,
-        rotation=axes(12.0, -6.0, 5.0), grating=pachon.Grating(2, 120.0, -0.3),
+        "mirror", pachon.Interaction.MIRROR, pachon.models.Toroid(0.9, 0.7, -0.4), (0.0, 0.0, 0.0), AIR,
+        rotation=axes(12.0, -6.0, 5.0), grating=pachon.models.Grating(2, 120.0, -0.3),
     )  # fmt: skip
     first = telescope(lens, back, mirror)
     ray = pachon.Rays(np.array([[0.0, 0.0, 0.4]]), np.array([[0.0, 0.0, -1.0]]), np.zeros(1), WAVELENGTH)
@@ -230,7 +230,7 @@ def test_derivatives_by_sags(spectrograph, responses):
             expected = by_sag[:, 0] * value + by_sag[:, 1] * dx + by_sag[:, 2] * dy
 
             def changed(h, i=i, j=j, name=name):
-                return outputs(spectrograph.with_deformation(name, pachon.XYPolynomial(((i, j, h),))), start)
+                return outputs(spectrograph.with_deformation(name, pachon.models.XYPolynomial(((i, j, h),))), start)
 
             numeric = slope(changed, 1e-6)
             assert np.abs(expected - numeric).max() < 1e-9 * max(1.0, np.abs(numeric).max())
@@ -294,6 +294,8 @@ def test_landing_derivatives_are_those_of_paths(spectrograph, responses):
 
 def test_gratings_are_of_mirrors_and_lenses():
     with pytest.raises(PrescriptionError, match="grating: expected a mirror or a lens surface"):
-        pachon.Surface("D", pachon.Interaction.DETECTOR, pachon.Plane(), (0, 0, 0), AIR, grating=pachon.Grating(1, 1.0))
+        pachon.Surface(
+            "D", pachon.Interaction.DETECTOR, pachon.Plane(), (0, 0, 0), AIR, grating=pachon.models.Grating(1, 1.0)
+        )
     with pytest.raises(PrescriptionError, match="lines_per_mm = 0"):
-        pachon.Grating(1, 0.0)
+        pachon.models.Grating(1, 0.0)

@@ -12,24 +12,24 @@ from pachon.models.media.medium import ConstantIndex
 RNG = np.random.default_rng(8)
 X, Y = np.linspace(-1.0, 1.0, 41), np.linspace(-1.1, 1.1, 31)
 HEIGHTS = 0.01 * np.sin(3 * X) * np.cos(2 * Y)[:, None]
-ZERNIKES = pachon.ZernikeSag(tuple(1e-3 * RNG.normal(size=15)), 1.0, 0.4)
+ZERNIKES = pachon.models.ZernikeSag(tuple(1e-3 * RNG.normal(size=15)), 1.0, 0.4)
 TETRAHEDRON = np.array([[-2.0, -2.0, 0.1], [2.0, -2.0, -0.1], [0.0, 2.5, 0.2], [0.1, 0.0, 0.3]])
 SHAPES = {
     "plane": pachon.Plane(),
     "sphere": pachon.Sphere(-4.0),
     "conic": pachon.Conic(5.0, -1.3),
-    "even asphere": pachon.EvenAsphere(5.0, 0.3, (1e-3, 2e-4, -1e-5)),
-    "odd asphere": pachon.OddAsphere(5.0, -0.4, (1e-3, 1e-2, 3e-3)),
-    "biconic": pachon.Biconic(4.0, -6.0, -0.3, 0.8),
-    "toroid": pachon.Toroid(4.0, 6.0, -0.7),
-    "xy polynomial": pachon.XYPolynomial(((1, 0, 1e-3), (2, 1, 3e-3), (0, 5, -1e-3))),
+    "even asphere": pachon.models.EvenAsphere(5.0, 0.3, (1e-3, 2e-4, -1e-5)),
+    "odd asphere": pachon.models.OddAsphere(5.0, -0.4, (1e-3, 1e-2, 3e-3)),
+    "biconic": pachon.models.Biconic(4.0, -6.0, -0.3, 0.8),
+    "toroid": pachon.models.Toroid(4.0, 6.0, -0.7),
+    "xy polynomial": pachon.models.XYPolynomial(((1, 0, 1e-3), (2, 1, 3e-3), (0, 5, -1e-3))),
     "zernikes": ZERNIKES,
-    "grid": pachon.GridSag(X, Y, HEIGHTS),
-    "grid modes": pachon.GridModes(
-        {"a": pachon.GridSag(X, Y, HEIGHTS), "b": pachon.GridSag(X, Y, HEIGHTS**2)}, {"a": 0.5, "b": 3.0}
+    "grid": pachon.models.GridSag(X, Y, HEIGHTS),
+    "grid modes": pachon.models.GridModes(
+        {"a": pachon.models.GridSag(X, Y, HEIGHTS), "b": pachon.models.GridSag(X, Y, HEIGHTS**2)}, {"a": 0.5, "b": 3.0}
     ),
-    "mesh": pachon.MeshSurface(TETRAHEDRON, np.array([[0, 1, 3], [1, 2, 3], [2, 0, 3]])),
-    "sum": pachon.Sum((pachon.Sphere(4.0), ZERNIKES)),
+    "mesh": pachon.models.MeshSurface(TETRAHEDRON, np.array([[0, 1, 3], [1, 2, 3], [2, 0, 3]])),
+    "sum": pachon.models.Sum((pachon.Sphere(4.0), ZERNIKES)),
 }
 VERTEX = np.array([0.1, -0.05, 0.2])
 TURN = Rotation.from_euler("xyz", [0.1, -0.05, 0.3]).as_matrix()
@@ -181,7 +181,12 @@ def test_statuses_outlive_later_surfaces():
     down = np.tile([0.0, 0.0, -1.0], (3, 1))
     rays = pachon.Rays(np.stack([x, 0 * x, 0 * x + 2.0], axis=-1), down, np.zeros(3), 5e-7)
     sphere = pachon.Surface(
-        "S", pachon.Interaction.MIRROR, pachon.Sphere(2.0), (0.0, 0.0, 0.0), ConstantIndex(1.0), pachon.Circle(0.5)
+        "S",
+        pachon.Interaction.MIRROR,
+        pachon.Sphere(2.0),
+        (0.0, 0.0, 0.0),
+        ConstantIndex(1.0),
+        pachon.models.Circle(0.5),
     )
     status = pachon.RayStatus
     first = pachon.intersect(sphere, rays)
@@ -195,7 +200,7 @@ def test_statuses_outlive_later_surfaces():
 
 
 def test_a_phase_screen_is_met_at_its_plane():
-    screen = placed(pachon.GridSag(X, Y, HEIGHTS), pachon.Interaction.PHASE)
+    screen = placed(pachon.models.GridSag(X, Y, HEIGHTS), pachon.Interaction.PHASE)
     rays = rays_down()
     assert np.allclose(local(pachon.intersect(screen, rays))[:, 2], 0.0, atol=3e-15)
     assert np.all(screen.sag(X, 0 * X) == 0.0)

@@ -26,7 +26,7 @@ def random_shape(rng):
         return pachon.Conic(radius, k), lambda x, y: conic(1.0 / radius, x * x + y * y)
     if kind == "asphere":
         a, b = rng.uniform(-20.0, 20.0), rng.uniform(-500.0, 500.0)
-        shape = pachon.EvenAsphere(radius, k, (a, b))
+        shape = pachon.models.EvenAsphere(radius, k, (a, b))
         return shape, lambda x, y: conic(1.0 / radius, x * x + y * y) + (x * x + y * y) ** 2 * (a + b * (x * x + y * y))
     if kind == "toroid":
         across = rng.choice([-1.0, 1.0]) * rng.uniform(0.2, 1.0)
@@ -37,9 +37,9 @@ def random_shape(rng):
             side = np.sign(across)
             return across - side * np.sqrt((across - g) ** 2 - x * x)
 
-        return pachon.Toroid(across, radius, k, (a,)), toroid
+        return pachon.models.Toroid(across, radius, k, (a,)), toroid
     terms = ((1, 1, rng.uniform(-1, 1)), (3, 0, rng.uniform(-5, 5)), (2, 2, rng.uniform(-50, 50)))
-    return pachon.XYPolynomial(terms), lambda x, y: sum(a * x**i * y**j for i, j, a in terms)
+    return pachon.models.XYPolynomial(terms), lambda x, y: sum(a * x**i * y**j for i, j, a in terms)
 
 
 def normals(sag, x, y):
@@ -106,9 +106,15 @@ def random_system(seed):
         shape, sag = random_shape(rng)
         after, thin, grating = medium, None, None
         if kind == "THIN_LENS":
-            shape, sag, thin = pachon.Plane(), lambda x, y: 0.0 * x, pachon.ThinLens(float(rng.uniform(0.3, 1.0)))
+            shape, sag, thin = (
+                pachon.Plane(),
+                lambda x, y: 0.0 * x,
+                pachon.models.ThinLens(float(rng.uniform(0.3, 1.0))),
+            )
         elif rng.uniform() < 0.6:
-            grating = pachon.Grating(int(rng.integers(-3, 4)), float(rng.uniform(20, 300)), float(rng.uniform(-3, 3)))
+            grating = pachon.models.Grating(
+                int(rng.integers(-3, 4)), float(rng.uniform(20, 300)), float(rng.uniform(-3, 3))
+            )
         if kind == "REFRACT":
             after = ConstantIndex(float(rng.choice([1.0, 1.33, 1.5, 1.8])))
         surface = pachon.Surface(

@@ -40,7 +40,7 @@ def rowland(defocus=0.0):
     reach = RADIUS * np.sqrt(1.0 - sine**2) + defocus
     ruled = pachon.Surface(
         "grating", pachon.Interaction.MIRROR, pachon.Sphere(RADIUS), (0.0, 0.0, 0.0), VACUUM,
-        rotation=tuple(map(tuple, turn.tolist())), grating=pachon.Grating(1, 1e-3 * LINES),
+        rotation=tuple(map(tuple, turn.tolist())), grating=pachon.models.Grating(1, 1e-3 * LINES),
     )  # fmt: skip
     # The detector across the light, its z axis along it.
     x = np.array([1.0, 0.0, 0.0])
@@ -138,7 +138,7 @@ def czerny_turner():
     normal = turned(-up, np.radians(25.0))
     ruled = pachon.Surface(
         "grating", pachon.Interaction.MIRROR, pachon.Plane(), tuple(place.tolist()), VACUUM, rotation=frame(normal),
-        grating=pachon.Grating(1, 600.0),
+        grating=pachon.models.Grating(1, 600.0),
     )  # fmt: skip
     incoming = ruled.along(up)
     sine = incoming[1] + WAVELENGTH * 6e5
@@ -203,7 +203,7 @@ def test_an_echelle_in_conical_incidence(order):
     wavelength = 2.0 * np.sin(BLAZE) * np.cos(GAMMA) / (abs(order) * ECHELLE)
     ruled = pachon.Surface(
         "echelle", pachon.Interaction.MIRROR, pachon.Plane(), (0.0, 0.0, 0.0), VACUUM,
-        rotation=axes(-np.degrees(BLAZE), 0.0, 0.0), grating=pachon.Grating(order, 1e-3 * ECHELLE),
+        rotation=axes(-np.degrees(BLAZE), 0.0, 0.0), grating=pachon.models.Grating(order, 1e-3 * ECHELLE),
     )  # fmt: skip
     telescope = spectrograph(ruled, field_limit=0.3)
     direction = np.array([[np.sin(GAMMA), 0.0, -np.cos(GAMMA)]])
@@ -224,7 +224,7 @@ def test_repeated_and_chromatic_traces_are_those_of_one_wavelength():
     """Aimed at a stop behind the grating, and photons of a wavelength each."""
     ruled = pachon.Surface(
         "grating", pachon.Interaction.MIRROR, pachon.Sphere(1.0), (0.0, 0.0, 0.0), VACUUM,
-        rotation=axes(10.0, 0.0, 0.0), grating=pachon.Grating(1, 300.0),
+        rotation=axes(10.0, 0.0, 0.0), grating=pachon.models.Grating(1, 300.0),
     )  # fmt: skip
     sine = WAVELENGTH * 3e5 - np.sin(np.radians(10.0))
     leaving = ruled.matrix @ [0.0, sine, np.sqrt(1.0 - sine**2)]
@@ -260,8 +260,8 @@ def test_repeated_and_chromatic_traces_are_those_of_one_wavelength():
 def test_a_lost_order_is_dark_and_does_not_spoil_others():
     telescope, _ = rowland()
     ruled, screen = telescope.surfaces
-    steep = replace(telescope, surfaces=(replace(ruled, grating=pachon.Grating(2, 1400.0)), screen))
-    with pytest.raises(pachon.DomainError, match="order 2 of the grating grating does not exist at 900 nm"):
+    steep = replace(telescope, surfaces=(replace(ruled, grating=pachon.models.Grating(2, 1400.0)), screen))
+    with pytest.raises(pachon.errors.DomainError, match="order 2 of the grating grating does not exist at 900 nm"):
         pachon.wavefront_opd(steep, (0.0, 0.0), 900e-9, grid=16)
     end = pachon.trace(steep, pachon.launch_rays(steep, (0.0, 0.0), 900e-9, ([0.0], [0.0])))
     assert end.status[0] == pachon.RayStatus.EVANESCENT
@@ -291,7 +291,7 @@ def test_sensitivities_by_grooves():
 def test_an_optimisation_finds_the_lines_of_a_grating():
     """Lines and their direction are those that bring the light back to the middle of the detector."""
     telescope, _ = rowland()
-    ruled = replace(telescope.surfaces[0], grating=pachon.Grating(1, 1197.0, 0.002))
+    ruled = replace(telescope.surfaces[0], grating=pachon.models.Grating(1, 1197.0, 0.002))
     start = replace(telescope, surfaces=(ruled, *telescope.surfaces[1:]))
     names = ["grating.lines_per_mm", "grating.groove_angle"]
     targets = [ChiefRay((0.0, 0.0), axis, value=0.0, weight=100.0) for axis in ("x", "y")]

@@ -32,7 +32,7 @@ def telescope(*surfaces, medium_before=AIR):
 def lens(focal_length, distance=np.inf, *, after=AIR, vertex=(0.0, 0.0, 0.0), rotation=IDENTITY, name="L"):
     return pachon.Surface(
         name, pachon.Interaction.THIN_LENS, pachon.Plane(), vertex, after, rotation=rotation,
-        thin_lens=pachon.ThinLens(focal_length, distance),
+        thin_lens=pachon.models.ThinLens(focal_length, distance),
     )  # fmt: skip
 
 
@@ -133,4 +133,4 @@ def test_thin_lenses_are_planes_with_a_lens():
     with pytest.raises(PrescriptionError, match="shape Sphere: expected a plane of a thin lens"):
         replace(lens(0.1), shape=pachon.Sphere(1.0))
     with pytest.raises(PrescriptionError, match=r"focal_length = 0\.0"):
-        pachon.ThinLens(0.0)
+        pachon.models.ThinLens(0.0)

@@ -311,7 +311,7 @@ def test_bad_launches_name_the_argument(lsst_r, change, error, words):
 
 def test_unknown_choice_of_surfaces(lsst_r):
     rays = pachon.launch_rays(lsst_r, (0, 0), 620e-9, ([3.0], [0.0]))
-    with pytest.raises(ConfigError, match="'last' or 'all'"):
+    with pytest.raises(ConfigError, match="surfaces = 'first': expected one of last, all"):
         pachon.trace(lsst_r, rays, surfaces="first")
 
 

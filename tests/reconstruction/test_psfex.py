@@ -32,7 +32,7 @@ def test_stamps_are_those_of_galsim(tmp_path, sampling):
     galsim = pytest.importorskip("galsim")
     des = pytest.importorskip("galsim.des")
     path = write_model(tmp_path / "a.psf", sampling)
-    model, peer = pachon.load_psfex(path), des.DES_PSFEx(str(path))
+    model, peer = pachon.reconstruction.load_psfex(path), des.DES_PSFEx(str(path))
     for place in ((100.0, 300.0), (1900.0, 3000.0)):
         image = peer.getPSF(galsim.PositionD(*place)).drawImage(nx=25, ny=25, scale=1.0, method="no_pixel").array
         # Single precision, and GalSim's Fourier transforms.
@@ -52,15 +52,15 @@ def test_stamps_are_those_of_galsim(tmp_path, sampling):
 )
 def test_what_is_no_model_of_pixels_is_one_line(tmp_path, cards, text):
     with pytest.raises(ProductError, match=rf"a\.psf: {text}"):
-        pachon.load_psfex(write_model(tmp_path / "a.psf", **cards))
+        pachon.reconstruction.load_psfex(write_model(tmp_path / "a.psf", **cards))
 
 
 def test_files_that_are_no_models(tmp_path):
     with pytest.raises(ProductError, match="no such file"):
-        pachon.load_psfex(tmp_path / "none.psf")
+        pachon.reconstruction.load_psfex(tmp_path / "none.psf")
     fits.PrimaryHDU(np.zeros((3, 3))).writeto(tmp_path / "a.psf")
     with pytest.raises(ProductError, match="no model of PSFEx"):
-        pachon.load_psfex(tmp_path / "a.psf")
+        pachon.reconstruction.load_psfex(tmp_path / "a.psf")
     (tmp_path / "a.psf").write_bytes(b"text")
     with pytest.raises(ProductError, match="damaged or no FITS file of PSFEx"):
-        pachon.load_psfex(tmp_path / "a.psf")
+        pachon.reconstruction.load_psfex(tmp_path / "a.psf")

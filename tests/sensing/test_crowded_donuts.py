@@ -113,7 +113,7 @@ def test_crowded_stars_are_as_good_as_alone(behind_focus):
         if images is crowded:
             companions = np.isfinite(fit.companions[:, :, 0]).sum(axis=1)
             # Of five some that hardly reach the stamp may be missed, which the fit says.
-            missed = np.array([bool(flags & pachon.DonutFlag.POOR_FIT) for flags in fit.flags])
+            missed = np.array([bool(flags & pachon.sensing.DonutFlag.POOR_FIT) for flags in fit.flags])
             assert ((companions >= bright) | missed).all(), (companions, bright)
     print("crowded, alone: median, worst [nm]", *[(np.median(e).round(1), e.max().round(1)) for e in errors])
     assert np.median(errors[0]) < 1.5 * np.median(errors[1])
@@ -122,7 +122,7 @@ def test_crowded_stars_are_as_good_as_alone(behind_focus):
 
 def bad_stamps(clean, canvas):
     """Stamps by name, with the flags that they have for sure, and whether there are results."""
-    rng, flag = np.random.default_rng(5), pachon.DonutFlag
+    rng, flag = np.random.default_rng(5), pachon.sensing.DonutFlag
     base = noisy(clean, SKY, 3)
     scattered = rng.random((4, *base.shape)) < np.array([0.01, 0.05, 0.1, 0.2])[:, None, None]
     trail = 2000.0 * np.exp(-0.5 * ((0.6 * X + 0.8 * Y) / 1.5) ** 2)
@@ -204,7 +204,7 @@ def test_bad_stamps_are_flagged_with_their_reason_and_the_others_go_on(behind_fo
 def test_pixels_of_another_size_are_said(behind_focus, clean, pixel):
     fit = fitted(behind_focus, [noisy(clean, SKY, 3)], pixel_size=pixel * 1e-6)
     assert fit.reasons[0]
-    assert not fit.usable[0] or pachon.DonutFlag.OTHER_SIZE & int(fit.flags[0])
+    assert not fit.usable[0] or pachon.sensing.DonutFlag.OTHER_SIZE & int(fit.flags[0])
 
 
 @pytest.mark.slow

@@ -239,7 +239,7 @@ def lights(behind_focus):
 def test_calibration(behind_focus, lights, case):
     """Squared error over claimed variance of donuts of brute force; with -s it is printed."""
     rng = np.random.default_rng(CASES.index(case))
-    model = replace(BLUR, rims=pachon.DonutRims(search=case != "chord, not searched"))
+    model = replace(BLUR, rims=pachon.sensing.DonutRims(search=case != "chord, not searched"))
     squares, variances, chi2 = [], [], []
     kind = next((kind for kind in ("chord", "air unknown") if case.startswith(kind)), "")
     for (field, true, light), _ in itertools.product(lights(kind), range(N_NOISE)):

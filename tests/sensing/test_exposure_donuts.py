@@ -48,10 +48,10 @@ def test_pairs_share_one_wavefront(focused, pairs, truth):
         pachon.fit_donuts(
             focused, pairs, np.tile(FIELDS, (2, 1)), WAVELENGTH, model=of_sides(1, 1, -1, -1), fit=fit, **OPTIONS
         )
-        for fit in (pachon.SingleDonuts(higher_order=10e-9), pachon.ExposureDonuts())
+        for fit in (pachon.sensing.SingleDonuts(higher_order=10e-9), pachon.sensing.ExposureDonuts())
     )
     # Alone, a donut near the axis fits both sides of focus; together they tell.
-    ambiguous = pachon.DonutFlag.AMBIGUOUS_SIDE
+    ambiguous = pachon.sensing.DonutFlag.AMBIGUOUS_SIDE
     assert [bool(flag & ambiguous) for flag in single.flags] == [True, False, True, False]
     assert not (joint.flags & ambiguous).any()
     assert joint.usable.all()
@@ -73,12 +73,12 @@ def test_pairs_share_one_wavefront(focused, pairs, truth):
 def test_a_wrong_side_is_said_by_all_donuts_together(focused, pairs):
     """The star beyond 0.8 degrees knows the side; the one near the axis would fit either."""
     behind = {"images": pairs[:2], "fields": FIELDS, "wavelength": WAVELENGTH, "model": of_sides(-1, -1)}
-    wrong = pachon.DonutFlag.DEFOCUS_SIGN
-    alone = pachon.fit_donuts(focused, fit=pachon.SingleDonuts(), **behind, **OPTIONS)
-    assert alone.flags[0] & pachon.DonutFlag.AMBIGUOUS_SIDE
+    wrong = pachon.sensing.DonutFlag.DEFOCUS_SIGN
+    alone = pachon.fit_donuts(focused, fit=pachon.sensing.SingleDonuts(), **behind, **OPTIONS)
+    assert alone.flags[0] & pachon.sensing.DonutFlag.AMBIGUOUS_SIDE
     assert alone.usable.tolist() == [True, False]
     assert alone.flags[1] == wrong
-    together = pachon.fit_donuts(focused, fit=pachon.ExposureDonuts(), **behind, **OPTIONS)
+    together = pachon.fit_donuts(focused, fit=pachon.sensing.ExposureDonuts(), **behind, **OPTIONS)
     assert together.flags.tolist() == [wrong, wrong]
     assert np.isnan(together.zernikes).all()
 
@@ -90,6 +90,6 @@ def test_stars_have_a_number_each(focused):
             np.zeros((2, 9, 9)),
             FIELDS,
             WAVELENGTH,
-            fit=pachon.ExposureDonuts(stars=[1, 2, 3]),
+            fit=pachon.sensing.ExposureDonuts(stars=[1, 2, 3]),
             model=of_sides(1, -1),
         )

@@ -133,7 +133,7 @@ def test_errors_have_the_terms_that_are_left_out(behind_focus, wave, clean):
     options = {"sky_variance": 500.0, "model": KNOWN_BLUR, **OPTIONS}
     honest, bare = (
         pachon.fit_donuts(behind_focus, clean[None], [FIELD], WAVELENGTH, fit=fit, **options)
-        for fit in (pachon.SingleDonuts(range(4, 9), left_out=rms) for rms in (200e-9, 0.0))
+        for fit in (pachon.sensing.SingleDonuts(range(4, 9), left_out=rms) for rms in (200e-9, 0.0))
     )
 
     def chi2(fit, covariance):
@@ -161,7 +161,7 @@ def test_missing_terms_do_no_harm_where_they_are_expected(behind_focus):
             WAVELENGTH,
             sky_variance=500.0,
             model=KNOWN_BLUR,
-            fit=pachon.SingleDonuts(higher_order=rms),
+            fit=pachon.sensing.SingleDonuts(higher_order=rms),
             **OPTIONS,
         )
         for rms in (0.0, 50e-9)
@@ -190,7 +190,7 @@ def test_higher_terms_of_the_air_are_fitted_and_its_own_are_an_error(behind_focu
             model=replace(
                 KNOWN_BLUR,
                 air=pachon.DonutAir(fwhm=0.0, atmosphere=turbulence),
-                rims=pachon.DonutRims(search=False),
+                rims=pachon.sensing.DonutRims(search=False),
             ),
             **options,
         )
@@ -238,7 +238,7 @@ def test_second_stars_are_not_searched_for_where_there_are_none(behind_focus, wa
             [FIELD],
             WAVELENGTH,
             sky_variance=500.0,
-            model=pachon.DonutModel(neighbours=neighbours, rims=pachon.DonutRims(search=False)),
+            model=pachon.DonutModel(neighbours=neighbours, rims=pachon.sensing.DonutRims(search=False)),
             noll=range(4, 12),
             **OPTIONS,
         )
@@ -247,7 +247,7 @@ def test_second_stars_are_not_searched_for_where_there_are_none(behind_focus, wa
     assert fits[0].companions[0, 0, 0] == pytest.approx(0.3, abs=0.03)
     assert np.isnan(fits[1].companions).all()
     # What one star does not explain: a second of 30 % of the light, a hundred times the noise.
-    assert not fits[1].flags[0] & pachon.DonutFlag.BLENDED
+    assert not fits[1].flags[0] & pachon.sensing.DonutFlag.BLENDED
 
 
 @pytest.mark.long
@@ -291,7 +291,7 @@ def test_bad_donuts_are_flagged_and_others_go_on(focused, behind_focus, clean):
         model=pachon.DonutModel(detector=pachon.DonutDetector(saturation=2.0 * clean.max())),
         **OPTIONS,
     )
-    flag = pachon.DonutFlag
+    flag = pachon.sensing.DonutFlag
     assert fit.flags[1:7].tolist() == [
         flag.NOT_FINITE,
         flag.NO_DONUT,
@@ -333,7 +333,7 @@ def test_empty_stamps_are_flagged_and_the_others_go_on(behind_focus, clean):
     ]
     images = [noisy(clean, 500.0, 3), *(image for image, _ in stamps)]
     variance = np.array([500.0, *(claimed for _, claimed in stamps)])
-    options = {"fit": pachon.SingleDonuts(range(4, 12), left_out=0.0), **OPTIONS}
+    options = {"fit": pachon.sensing.SingleDonuts(range(4, 12), left_out=0.0), **OPTIONS}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         fit = pachon.fit_donuts(
@@ -352,7 +352,7 @@ def test_empty_stamps_are_flagged_and_the_others_go_on(behind_focus, clean):
 def test_faint_donuts_are_found_whether_the_sky_is_left_in_or_not(behind_focus, clean):
     # Of 5e4 electrons on some 1800 pixels: a signal of 50 times the noise of the sky there.
     images = [noisy(0.01 * clean, 500.0, seed) + left for seed in range(2) for left in (0.0, 500.0)]
-    options = {"sky_variance": 500.0, "fit": pachon.SingleDonuts(range(4, 9), left_out=0.0), **OPTIONS}
+    options = {"sky_variance": 500.0, "fit": pachon.sensing.SingleDonuts(range(4, 9), left_out=0.0), **OPTIONS}
     fit = pachon.fit_donuts(behind_focus, images, [FIELD] * 4, WAVELENGTH, **options)
     assert fit.usable.all()
     np.testing.assert_allclose(fit.flux, 5e4, atol=5.0 * fit.flux_error.max())
@@ -388,31 +388,32 @@ def test_a_wavefront_that_explains_the_wrong_side_of_focus_is_not_believed(focus
             WAVELENGTH,
             model=pachon.DonutModel(detector=pachon.DonutDetector(defocus=height)),
             sky_variance=1200.0,
-            fit=pachon.SingleDonuts(higher_order=10e-9),
+            fit=pachon.sensing.SingleDonuts(higher_order=10e-9),
             **OPTIONS,
         )
         for height in (1.5e-3, -1.5e-3)
     )
     assert behind.usable.all()
-    assert front.flags.tolist() == [pachon.DonutFlag.DEFOCUS_SIGN]
+    assert front.flags.tolist() == [pachon.sensing.DonutFlag.DEFOCUS_SIGN]
 
 
 @pytest.mark.long
 def test_a_flat_top_is_saturated_without_a_level(behind_focus, clean):
     image = np.minimum(noisy(clean, 500.0, 4), 0.5 * clean.max())
     fit = pachon.fit_donuts(behind_focus, image[None], [FIELD], WAVELENGTH, sky_variance=500.0, **OPTIONS)
-    assert fit.flags.tolist() == [pachon.DonutFlag.SATURATED]
+    assert fit.flags.tolist() == [pachon.sensing.DonutFlag.SATURATED]
 
 
 def test_no_light_passes_a_closed_telescope(behind_focus, clean):
     closed = replace(
         behind_focus,
         surfaces=tuple(
-            replace(s, aperture=pachon.Annulus(1.0, 1.0001)) if s.name == "M1" else s for s in behind_focus.surfaces
+            replace(s, aperture=pachon.models.Annulus(1.0, 1.0001)) if s.name == "M1" else s
+            for s in behind_focus.surfaces
         ),
     )
     fit = pachon.fit_donuts(closed, clean[None], [FIELD], WAVELENGTH, **OPTIONS)
-    assert fit.flags.tolist() == [pachon.DonutFlag.NO_LIGHT]
+    assert fit.flags.tolist() == [pachon.sensing.DonutFlag.NO_LIGHT]
 
 
 @pytest.mark.slow
@@ -438,7 +439,7 @@ def test_degrees_of_freedom_of_all_donuts_together(focused):
         WAVELENGTH,
         sky_variance=500.0,
         model=pachon.DonutModel(detector=pachon.DonutDetector(defocus=defocus)),
-        fit=pachon.TelescopeFreedoms(freedoms, prior=prior),
+        fit=pachon.sensing.TelescopeFreedoms(freedoms, prior=prior),
         **OPTIONS,
     )
     estimate = fit.degrees_of_freedom
@@ -477,7 +478,7 @@ def test_double_zernikes_and_stars_in_focus(focused):
         WAVELENGTH,
         sky_variance=500.0,
         model=replace(KNOWN_BLUR, detector=pachon.DonutDetector(diffusion=PIXEL, defocus=defocus)),
-        fit=pachon.FieldTerms([1, 2, 3], noll=range(4, 12)),
+        fit=pachon.sensing.FieldTerms([1, 2, 3], noll=range(4, 12)),
         **OPTIONS,
     )
     assert fit.double_zernikes.shape == (3, 8)
@@ -525,18 +526,18 @@ def test_tables_summaries_and_pictures(behind_focus, clean):
         ({"pixel_size": 0.0}, "pixel_size"),
         ({"model": pachon.DonutModel(air=pachon.DonutAir(fwhm=[1e-6, 1e-6]))}, "fwhm of shape"),
         ({"model": pachon.DonutModel(detector=pachon.DonutDetector(defocus=[1e-3, 1e-3]))}, "defocus of shape"),
-        ({"noll": None, "fit": pachon.FieldTerms([1, 2, 3])}, "field_noll: 3 terms for 1"),
+        ({"noll": None, "fit": pachon.sensing.FieldTerms([1, 2, 3])}, "field_noll: 3 terms for 1"),
         (
             {
                 "noll": None,
-                "fit": pachon.FieldTerms([1]),
+                "fit": pachon.sensing.FieldTerms([1]),
                 "model": pachon.DonutModel(
                     air=pachon.DonutAir(atmosphere=pachon.Atmosphere.from_site("cerro_pachon", 3))
                 ),
             },
             "atmosphere: expected fits",
         ),
-        ({"fit": pachon.SingleDonuts()}, "noll and fit are both given"),
+        ({"fit": pachon.sensing.SingleDonuts()}, "noll and fit are both given"),
         ({"model": pachon.DonutModel(light=pachon.Light(WAVELENGTH))}, "wavelength and the light of the model"),
         (
             {"wavelength": pachon.Light([WAVELENGTH], dispersion=[(0.0, 1e-6)])},
@@ -575,10 +576,10 @@ def test_bad_arguments(behind_focus, clean, changes, text):
         (pachon.DonutDetector, {"defocus": 1.0}, "defocus: expected at most"),
         (pachon.DonutDetector, {"saturation": -1.0}, "saturation"),
         (pachon.DonutModel, {"n_pupil": 3}, "n_pupil"),
-        (pachon.SingleDonuts, {"higher_order": -1.0}, "higher_order"),
-        (pachon.SingleDonuts, {"left_out": 1.0}, "left_out"),
-        (pachon.SingleDonuts, {"noll": [4, 4]}, "noll = "),
-        (pachon.FieldTerms, {"field_noll": [0, 1]}, "field_noll = "),
+        (pachon.sensing.SingleDonuts, {"higher_order": -1.0}, "higher_order"),
+        (pachon.sensing.SingleDonuts, {"left_out": 1.0}, "left_out"),
+        (pachon.sensing.SingleDonuts, {"noll": [4, 4]}, "noll = "),
+        (pachon.sensing.FieldTerms, {"field_noll": [0, 1]}, "field_noll = "),
     ],
 )
 def test_bad_options(kind, changes, text):

@@ -12,7 +12,7 @@ from pachon.sensing.observatory_zernikes import reexpansion
 from pachon.sensing.stamp_headers import parallactic_angle
 
 ALL = ("x,y", "y,x", "-x,y", "x,-y", "-y,x", "y,-x", "-x,-y", "-y,-x")
-FRAMES_AT = pachon.DonutFrames(rotator=0.4, parallactic_angle=-2.0)
+FRAMES_AT = pachon.sensing.DonutFrames(rotator=0.4, parallactic_angle=-2.0)
 
 
 @pytest.mark.parametrize("frame", FRAMES)
@@ -28,7 +28,7 @@ def test_a_wavefront_map_is_the_same_along_the_axes_of_a_frame(frame):
 
 
 def test_axes_are_those_that_the_table_of_frames_says():
-    at = pachon.DonutFrames(rotator=np.deg2rad(30.0), parallactic_angle=np.deg2rad(10.0))
+    at = pachon.sensing.DonutFrames(rotator=np.deg2rad(30.0), parallactic_angle=np.deg2rad(10.0))
     c, s = np.cos(np.deg2rad(30.0)), 0.5
     np.testing.assert_allclose(at.axes("CCS"), [[c, s, 0], [-s, c, 0], [0, 0, 1]], atol=1e-15)
     np.testing.assert_allclose(at.axes("DVCS")[:2], [[-s, c, 0], [c, s, 0]], atol=1e-15)
@@ -46,7 +46,7 @@ def test_turns_are_those_of_galsim_as_lsst_uses_them():
     ccs = np.random.default_rng(2).normal(size=25)
     # donut_viz, aggregate_visit.py: zk_OCS = zk_CCS @ zernikeRotMatrix(jmax, -rtp)[4:, 4:].
     ocs = ccs @ zernike.zernikeRotMatrix(28, -rtp)[4:, 4:]
-    matrix = zernike_matrix(np.arange(4, 29), pachon.DonutFrames(rotator=rtp).axes("CCS")[:2, :2])
+    matrix = zernike_matrix(np.arange(4, 29), pachon.sensing.DonutFrames(rotator=rtp).axes("CCS")[:2, :2])
     np.testing.assert_allclose(matrix @ ocs, ccs, atol=1e-12)
 
 
@@ -73,7 +73,7 @@ def test_fields_come_back_and_dvcs_is_the_transpose(projection):
 
 
 def test_fields_turn_with_the_positions_of_a_rotated_camera(focused):
-    at = pachon.DonutFrames(rotator=0.5)
+    at = pachon.sensing.DonutFrames(rotator=0.5)
     positions = np.array([(0.2, 0.1), (-0.05, 0.28)])
     # A camera that is turned sees what one at rest sees along turned axes: the LSST is symmetric about its axis.
     found = at.fields_in(pachon.fields_at(at.telescope(focused), positions), "CCS")
@@ -167,7 +167,7 @@ def test_donut_of_decam_leans_as_the_inverse_transform_of_its_pupil():
 @pytest.fixture(scope="module")
 def rotated_fit(focused, behind_focus):
     """A donut of a decentred M2, drawn with a turned camera and stored as LSST stores it, read back."""
-    at = pachon.DonutFrames(rotator=np.deg2rad(25.0), stamp_axes="DVCS")
+    at = pachon.sensing.DonutFrames(rotator=np.deg2rad(25.0), stamp_axes="DVCS")
     believed = at.telescope(behind_focus)
     true = believed.perturbed("M2", shift=(2e-4, -1e-4, 0.0))
     field = np.deg2rad([(0.6, 0.8)])
@@ -216,23 +216,27 @@ def test_results_in_conventions_keep_map_and_errors(rotated_fit, focused):
 
 def estimate(telescope, values):
     names = ["M2.dx", "M2.dy", "M2.dz", "M2.rx", "M2.ry", "Camera.dx", "Camera.rx"]
-    freedoms = pachon.DegreesOfFreedom.of_parameters(telescope, names)
+    freedoms = pachon.models.DegreesOfFreedom.of_parameters(telescope, names)
     n = len(names)
-    return pachon.FreedomEstimate(freedoms, np.asarray(values), np.diag(np.arange(1.0, n + 1.0)) * 1e-14, np.ones(n))
+    return pachon.sensing.FreedomEstimate(
+        freedoms, np.asarray(values), np.diag(np.arange(1.0, n + 1.0)) * 1e-14, np.ones(n)
+    )
 
 
 def test_corrections_undo_the_motions_in_every_frame(focused):
     values = np.array([1e-5, 2e-5, 3e-5, 1e-5, -2e-5, 4e-5, 5e-6])
     fitted = estimate(focused, values)
-    ocs = pachon.hexapod_corrections(fitted)
+    ocs = pachon.sensing.hexapod_corrections(fitted)
     assert ocs.body.tolist() == ["M2", "Camera"]
     np.testing.assert_allclose(ocs.shift[0], [-10.0, -20.0, -30.0])
     np.testing.assert_allclose(ocs.tilt[0], -np.rad2deg([1e-5, -2e-5, 0.0]) * 3600.0)
     np.testing.assert_allclose(ocs.shift_error[0], np.sqrt([1.0, 2.0, 3.0]) * 0.1)
-    zemax = pachon.hexapod_corrections(fitted, frame="ZCS")
+    zemax = pachon.sensing.hexapod_corrections(fitted, frame="ZCS")
     np.testing.assert_allclose(zemax.shift, ocs.shift * (-1.0, 1.0, -1.0))
     np.testing.assert_allclose(zemax.tilt, ocs.tilt * (-1.0, 1.0, -1.0))
-    turned = pachon.hexapod_corrections(fitted, frame="CCS", frames=pachon.DonutFrames(rotator=0.5 * np.pi))
+    turned = pachon.sensing.hexapod_corrections(
+        fitted, frame="CCS", frames=pachon.sensing.DonutFrames(rotator=0.5 * np.pi)
+    )
     # Camera's x lies along the telescope's y, its y along -x.
     np.testing.assert_allclose(turned.shift[0], [-20.0, 10.0, -30.0], atol=1e-9)
 
@@ -240,13 +244,17 @@ def test_corrections_undo_the_motions_in_every_frame(focused):
 @pytest.mark.parametrize(
     ("call", "error", "part"),
     [
-        (lambda: pachon.DonutFrames(stamp_axes="x,x"), ConfigError, "stamp_axes = 'x,x': expected DVCS, CCS, or axes"),
-        (lambda: pachon.DonutFrames(stamp_axes="x"), ConfigError, "stamp_axes = 'x'"),
-        (lambda: pachon.DonutFrames(rotator=np.nan), DomainError, "rotator = nan: expected one finite angle"),
-        (lambda: pachon.DonutFrames().axes("XCS"), ConfigError, "OCS"),
-        (lambda: pachon.DonutFrames().axes("sky"), ConfigError, "without a parallactic angle"),
+        (
+            lambda: pachon.sensing.DonutFrames(stamp_axes="x,x"),
+            ConfigError,
+            "stamp_axes = 'x,x': expected DVCS, CCS, or axes",
+        ),
+        (lambda: pachon.sensing.DonutFrames(stamp_axes="x"), ConfigError, "stamp_axes = 'x'"),
+        (lambda: pachon.sensing.DonutFrames(rotator=np.nan), DomainError, "rotator = nan: expected one finite angle"),
+        (lambda: pachon.sensing.DonutFrames().axes("XCS"), ConfigError, "OCS"),
+        (lambda: pachon.sensing.DonutFrames().axes("sky"), ConfigError, "without a parallactic angle"),
         (lambda: zernike_matrix([4, 5], FRAMES_AT.axes("CCS")[:2, :2]), DomainError, "Z5 mixes with its partner"),
-        (lambda: pachon.DonutFrames().fields_in([1.0, 2.0, 3.0], "OCS"), DomainError, "expected [n, 2]"),
+        (lambda: pachon.sensing.DonutFrames().fields_in([1.0, 2.0, 3.0], "OCS"), DomainError, "expected [n, 2]"),
     ],
 )
 def test_bad_frames_are_one_line(call, error, part):
@@ -258,8 +266,8 @@ def test_bad_frames_are_one_line(call, error, part):
 
 def test_corrections_of_bad_frames_are_one_line(focused):
     with pytest.raises(ConfigError, match="DVCS is one of images"):
-        pachon.hexapod_corrections(estimate(focused, np.zeros(7)), frame="DVCS")
-    bending = pachon.DegreesOfFreedom.of_parameters(focused, ["M1.radius"])
-    radius = pachon.FreedomEstimate(bending, np.zeros(1), np.eye(1), np.ones(1))
+        pachon.sensing.hexapod_corrections(estimate(focused, np.zeros(7)), frame="DVCS")
+    bending = pachon.models.DegreesOfFreedom.of_parameters(focused, ["M1.radius"])
+    radius = pachon.sensing.FreedomEstimate(bending, np.zeros(1), np.eye(1), np.ones(1))
     with pytest.raises(DomainError, match="no degree of freedom moves a body"):
-        pachon.hexapod_corrections(radius)
+        pachon.sensing.hexapod_corrections(radius)

@@ -34,7 +34,7 @@ def test_joint_fits_find_a_misaligned_telescope(focused):
         WAVELENGTH,
         sky_variance=400.0,
         model=diffracted(np.repeat([DEFOCUS, -DEFOCUS], len(FIELDS))),
-        fit=pachon.TelescopeFreedoms(freedoms, prior=5.0 * size),
+        fit=pachon.sensing.TelescopeFreedoms(freedoms, prior=5.0 * size),
     )
     # Rims that stand where an earlier step had them, and no derivatives of their places, left 30 to 60 nm of coma.
     before, after = (
@@ -65,7 +65,7 @@ def test_rims_near_the_image_move_with_the_telescope(focused):
         WAVELENGTH,
         sky_variance=400.0,
         model=diffracted(DEFOCUS),
-        fit=pachon.TelescopeFreedoms(freedoms, prior=5.0 * size),
+        fit=pachon.sensing.TelescopeFreedoms(freedoms, prior=5.0 * size),
     )
     # Rims that follow from one outer iteration to the next, without derivatives, left 3e-2 a pixel, and M2 and camera
     # off by 370 times the claimed variance.

@@ -65,7 +65,7 @@ def test_both_sides_of_a_moved_body_have_one_wavefront(focused, body, rays, erro
         donut(focused.perturbed(body, shift=(0.0, 0.0, side * 1.5e-3)), FIELD, zernikes=zernikes, rays=rays)
         for side in SIDES
     ]
-    common = {"sky_variance": 1000.0, "fit": pachon.SingleDonuts(range(4, 16), higher_order=0.0), "threads": 1}
+    common = {"sky_variance": 1000.0, "fit": pachon.sensing.SingleDonuts(range(4, 16), higher_order=0.0), "threads": 1}
     fit = pachon.fit_donuts(
         focused, images, [FIELD] * 2, WAVELENGTH, model=model_of("Detector", 1.5e-3 * SIDES), moved=body, **common
     )
@@ -186,7 +186,7 @@ def test_joint_fits_of_both_sides_of_a_moved_body(focused, body):
     ]
     common = {"sky_variance": 500.0, "model": model_of(body, defocus), "threads": 1}
     fit = pachon.fit_donuts(
-        focused, images, fields, WAVELENGTH, fit=pachon.TelescopeFreedoms(freedoms, prior=prior), **common
+        focused, images, fields, WAVELENGTH, fit=pachon.sensing.TelescopeFreedoms(freedoms, prior=prior), **common
     )
     estimate = fit.degrees_of_freedom
     error = estimate.values - values
@@ -217,7 +217,7 @@ def test_field_terms_of_both_sides_of_a_moved_camera(focused):
         WAVELENGTH,
         sky_variance=500.0,
         model=model_of("Camera", defocus),
-        fit=pachon.FieldTerms([1, 2, 3], noll=range(4, 12)),
+        fit=pachon.sensing.FieldTerms([1, 2, 3], noll=range(4, 12)),
         threads=1,
     )
     error = (fit.double_zernikes - double[:, 3:]).ravel()

@@ -42,11 +42,11 @@ def other_spider(turn=0.0, shift=0.0, thicker=1.0):
     """Change of apertures: long rectangles turned about the axis [rad], shifted along x [m] and thicker."""
 
     def vanes(region):
-        if isinstance(region, pachon.Complement):
-            return pachon.Complement(vanes(region.part))
-        if isinstance(region, pachon.Union):
-            return pachon.Union(tuple(map(vanes, region.parts)))
-        if not isinstance(region, pachon.Rectangle) or region.width != 0.05:
+        if isinstance(region, pachon.models.Complement):
+            return pachon.models.Complement(vanes(region.part))
+        if isinstance(region, pachon.models.Union):
+            return pachon.models.Union(tuple(map(vanes, region.parts)))
+        if not isinstance(region, pachon.models.Rectangle) or region.width != 0.05:
             return region
         place = np.exp(1j * turn) * (region.x + 1j * region.y) + shift
         return replace(region, width=0.05 * thicker, x=place.real, y=place.imag, angle=region.angle + turn)
@@ -57,10 +57,20 @@ def other_spider(turn=0.0, shift=0.0, thicker=1.0):
 @pytest.mark.parametrize(
     "aperture",
     [
-        pachon.Circle(1.0, 0.1, 0.2),
-        pachon.Complement(pachon.Annulus(0.3, 1.0)),
-        pachon.Union((pachon.Rectangle(0.2, 3.0, 0.3, 0.1, 0.2), pachon.Polygon(((0.5, 0.5), (1.5, 0.5), (1.0, 1.2))))),
-        pachon.Intersection((pachon.Ellipse(1.0, 0.5, angle=0.3), pachon.Complement(pachon.Vane(0.3, 0.2, -0.1, 0.7)))),
+        pachon.models.Circle(1.0, 0.1, 0.2),
+        pachon.models.Complement(pachon.models.Annulus(0.3, 1.0)),
+        pachon.models.Union(
+            (
+                pachon.models.Rectangle(0.2, 3.0, 0.3, 0.1, 0.2),
+                pachon.models.Polygon(((0.5, 0.5), (1.5, 0.5), (1.0, 1.2))),
+            )
+        ),
+        pachon.models.Intersection(
+            (
+                pachon.models.Ellipse(1.0, 0.5, angle=0.3),
+                pachon.models.Complement(pachon.models.Vane(0.3, 0.2, -0.1, 0.7)),
+            )
+        ),
     ],
 )
 def test_apertures_that_are_turned_and_shifted_pass_such_points(aperture):
@@ -72,8 +82,8 @@ def test_apertures_that_are_turned_and_shifted_pass_such_points(aperture):
 
 
 def test_the_hole_of_a_ring_moves_alone():
-    ring = pachon.Annulus(0.5, 1.0)
-    assert moved_aperture(ring, {1: RimMotion(growth=0.1)}) == pachon.Annulus(0.6, 1.0)
+    ring = pachon.models.Annulus(0.5, 1.0)
+    assert moved_aperture(ring, {1: RimMotion(growth=0.1)}) == pachon.models.Annulus(0.6, 1.0)
     off_centre = moved_aperture(ring, {1: RimMotion(x=0.1)})
     np.testing.assert_array_equal(off_centre.contains([0.95, -0.45, 0.55], [0.0] * 3), [True, True, False])
 
@@ -186,7 +196,7 @@ def test_larger_hole(behind_focus, wave):
 @pytest.mark.parametrize("degrees", [0.5, 1.5])
 def test_hole_of_a_size_that_is_not_trusted(behind_focus, wave, degrees):
     """Hole of M1 larger by 1 %: claimed errors are those made."""
-    model = replace(MODEL, rims=pachon.DonutRims(search=False, size=0.01))
+    model = replace(MODEL, rims=pachon.sensing.DonutRims(search=False, size=0.01))
     changes = {"M1": lambda ring: replace(ring, inner=1.01 * ring.inner)}
     field = field_at(degrees)
     image = noisy(donut(with_apertures(behind_focus, changes), field, zernikes=wave, rays=700), 1000.0, 5)
@@ -207,4 +217,4 @@ def test_spider_turned_and_thicker(obstructed, wave):
 
 def test_sizes_of_rims_are_checked():
     with pytest.raises(DomainError, match=r"size = -0\.1: expected 0 to 0\.1"):
-        pachon.DonutRims(size=-0.1)
+        pachon.sensing.DonutRims(size=-0.1)

@@ -84,10 +84,12 @@ def test_shifted_rims_are_not_taken_for_wavefront(behind_focus):
 @pytest.mark.parametrize(
     "aperture",
     [
-        pachon.Circle(1.0, 0.1, 0.2),
-        pachon.Complement(pachon.Annulus(0.3, 1.0)),
-        pachon.Union((pachon.Rectangle(0.2, 3.0), pachon.Polygon(((0.5, 0.5), (1.5, 0.5), (1.0, 1.2))))),
-        pachon.Intersection((pachon.Circle(1.0), pachon.Vane(0.3, 0.2, -0.1, 0.7))),
+        pachon.models.Circle(1.0, 0.1, 0.2),
+        pachon.models.Complement(pachon.models.Annulus(0.3, 1.0)),
+        pachon.models.Union(
+            (pachon.models.Rectangle(0.2, 3.0), pachon.models.Polygon(((0.5, 0.5), (1.5, 0.5), (1.0, 1.2))))
+        ),
+        pachon.models.Intersection((pachon.models.Circle(1.0), pachon.models.Vane(0.3, 0.2, -0.1, 0.7))),
     ],
 )
 def test_shifted_apertures_pass_shifted_points(aperture):

@@ -221,7 +221,7 @@ def wide_field(focused):
     fields = np.deg2rad([(0.8, 1.1), (-1.2, 0.4)])
     images = [noisy(donut(true, f, flux=2e6, rays=200), 300.0, k) for k, f in enumerate(fields)]
     model = pachon.DonutModel(detector=pachon.DonutDetector(pixel_size=20e-6))
-    return lambda stamps: pachon.check_orientation(
+    return lambda stamps: pachon.sensing.check_orientation(
         tel, stamps, fields, 622e-9, sky_variance=300.0, model=model, threads=1
     ), images
 
@@ -254,6 +254,6 @@ def test_donuts_near_the_axis_tell_nothing(focused):
     fields = np.deg2rad([(0.06, 0.08), (-0.09, 0.03), (0.02, -0.1)])
     images = [noisy(donut(tel, f, flux=2e6), 300.0, k) for k, f in enumerate(fields)]
     model = pachon.DonutModel(detector=pachon.DonutDetector(pixel_size=20e-6))
-    check = pachon.check_orientation(tel, images, fields, 622e-9, sky_variance=300.0, model=model, threads=1)
+    check = pachon.sensing.check_orientation(tel, images, fields, 622e-9, sky_variance=300.0, model=model, threads=1)
     assert not check.doubtful
     assert not check.decided

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pachon import load_telescope, make_baseline, read_baseline, spots, write_baseline
+from pachon import load_telescope, make_baseline, spots
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError
+from pachon.studies import read_baseline, write_baseline
 from pachon.studies.baseline.baseline import check_baseline
 from pachon.studies.baseline.check import BROKEN, MISSING, BaselineCheck, Deviation
 from pachon.studies.baseline.file import Limit, baseline_text

@@ -124,19 +124,19 @@ def test_schemas_take_what_the_validators_take():
         ("sweep", "studies/sweep/examples/table1.yaml"),
         ("site", "models/data/cerro_pachon.yaml"),
     ):
-        schema = jsonschema.Draft202012Validator(pachon.file_schema(kind))
+        schema = jsonschema.Draft202012Validator(pachon.studies.file_schema(kind))
         content = yaml.safe_load((ROOT / name).read_text())
         assert list(schema.iter_errors(content)) == []
         assert list(schema.iter_errors({**content, "colour": "red"})) != []
-    bad = jsonschema.Draft202012Validator(pachon.file_schema("prescription"))
+    bad = jsonschema.Draft202012Validator(pachon.studies.file_schema("prescription"))
     assert len(list(bad.iter_errors(yaml.safe_load(BAD)))) >= 3
 
 
 @pytest.mark.long
 def test_schemas_of_every_kind_name_its_keys():
     for kind in KINDS:
-        schema = pachon.file_schema(kind.name)
+        schema = pachon.studies.file_schema(kind.name)
         found = schema["properties"] if "properties" in schema else schema["$defs"][kind.model.__name__]["properties"]
         assert set(found) == {field.alias or name for name, field in kind.model.model_fields.items()}
     with pytest.raises(ConfigError, match="kind = 'x'"):
-        pachon.file_schema("x")
+        pachon.studies.file_schema("x")

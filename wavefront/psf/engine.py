@@ -16,7 +16,7 @@ from ...core.threads import thread_count
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.silicon import Silicon
 from ...models.telescope import Telescope
-from ...raytrace.rays import field_direction
+from ...raytrace.rays import Projection, field_direction
 from ..aberration import ResidualWavefront
 from ..atmosphere.atmosphere import Atmosphere
 from ..pupil_optics import PupilOptics, trace_pupils
@@ -44,7 +44,7 @@ class PsfInputs:
     atmosphere: Atmosphere | None = None
     aberration: ResidualWavefront | None = None
     silicon: Silicon | None = None
-    projection: str = "zemax"
+    projection: Projection = "zemax"
     threads: int | None = None
     trace: Callable[..., PupilOptics] = trace_pupils
 

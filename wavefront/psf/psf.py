@@ -16,11 +16,12 @@ from ...core.result import Result
 from ...core.units import ARCSEC, metres, pure_numbers, radians
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
+from ...raytrace.rays import Projection
 from ..aberration import ResidualWavefront
 from ..atmosphere.atmosphere import Atmosphere
 from ..request import Request
 from .engine import PsfEngine, PsfInputs, PsfRenderer, Recenter, Stars, center_focal_length
-from .engines import psf_engine
+from .engines import EngineName, psf_engine
 from .light import Light
 from .stamps import Stamps
 
@@ -103,7 +104,7 @@ def make_psfs(
     atmosphere: Atmosphere | None = None,
     aberration: ResidualWavefront | None = None,
     stamps: Stamps | None = None,
-    engine: str | PsfEngine = "fast",
+    engine: EngineName | PsfEngine = "fast",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Psfs:
@@ -168,7 +169,7 @@ def psf_inputs(
     threads: int | None,
 ) -> tuple[PsfInputs, Stars]:
     """Return the inputs of a renderer and its stars for checked arguments of :func:`make_psfs`."""
-    projection = "zemax"
+    projection: Projection = "zemax"
     if isinstance(telescope, Request):
         lengths = wavelengths.wavelengths if isinstance(wavelengths, Light) else wavelengths
         request = Request.of(telescope, fields, lengths, threads=threads)

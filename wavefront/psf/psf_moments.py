@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import warp as wp
@@ -130,7 +130,7 @@ def psf_moments(
     atmosphere: Atmosphere | None = None,
     aberration: ResidualWavefront | None = None,
     stamps: Stamps | None = None,
-    engine: str | PsfEngine = "long_exposure",
+    engine: Literal["long_exposure", "statistical"] | PsfEngine = "long_exposure",
     weight_fwhm: ArrayLike | None = None,
     threads: int | None = None,
 ) -> PsfMoments:

@@ -24,6 +24,7 @@ import numpy as np
 from ....core.errors import PrescriptionError
 from ....core.files import text_lines
 from ...aperture import Aperture, Circle, Complement
+from ...design_data import BeamAperture
 from ...media.medium import Medium
 from ...media.tabulated import TabulatedIndex
 from ...rotation import rotation_matrix
@@ -360,8 +361,9 @@ class _Reader:
             if key in system:
                 value = system[key].number(0)
                 # The f-number is that of the image space at the conjugates of the lens.
-                focal_ratio = "working_f_number" if math.isfinite(lens.object_distance) else "f_number"
-                kind = {"EPD": "entrance_pupil", "NAO": "object_na"}.get(key, focal_ratio)
+                focal_ratio: BeamAperture = "working_f_number" if math.isfinite(lens.object_distance) else "f_number"
+                kinds: dict[str, BeamAperture] = {"EPD": "entrance_pupil", "NAO": "object_na"}
+                kind = kinds.get(key, focal_ratio)
                 lens.state_aperture(system[key], kind, value * lens.unit if key == "EPD" else value)
         # Chief rays pass the middle of the stop.
         lens.state(Source(str(self.path)), aiming="paraxial")

@@ -18,7 +18,7 @@ import numpy as np
 
 from ....core.errors import PrescriptionError
 from ...aperture import Aperture
-from ...design_data import LENGTH_UNITS, DesignData
+from ...design_data import LENGTH_UNITS, BeamAperture, DesignData
 from ...grating import Grating
 from ...links import Pickup, Solve
 from ...media.air import STANDARD_ATMOSPHERE, ZERO_CELSIUS
@@ -92,7 +92,7 @@ class LensSurface:
 class StatedAperture:
     """Size of the beam as a file states it: kind and value as in DesignData."""
 
-    kind: str
+    kind: BeamAperture
     value: float
     source: Source
 
@@ -144,7 +144,7 @@ class LensDescription:
         name = next(name for name, size in LENGTH_UNITS.items() if size == unit)
         self.design = replace(self.design, length_unit=name)
 
-    def state_aperture(self, source: Source, kind: str, value: float) -> None:
+    def state_aperture(self, source: Source, kind: BeamAperture, value: float) -> None:
         """Add a size of the beam, as in DesignData."""
         self.apertures.append(StatedAperture(kind, value, source))
 

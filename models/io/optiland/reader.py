@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ...aperture import Aperture, Complement
+from ...design_data import BeamAperture
 from ...telescope import VACUUM
 from ...thin_lens import ThinLens
 from ..json_items import JsonObject
@@ -33,7 +34,12 @@ THIN_LENS_MODEL = "ThinLensInteractionModel"
 #: Keys of the file without effect on the paths of rays.
 IGNORED = ("version", "pickups", "solves")
 #: Apertures by their types; the size of the stop is its diameter.
-APERTURES = {"EPD": "entrance_pupil", "imageFNO": "f_number", "objectNA": "object_na", "float_by_stop_size": "stop"}
+APERTURES: dict[str, BeamAperture] = {
+    "EPD": "entrance_pupil",
+    "imageFNO": "f_number",
+    "objectNA": "object_na",
+    "float_by_stop_size": "stop",
+}
 FIELD_TYPES = {
     "AngleField": "angle", "ObjectHeightField": "object_height", "ParaxialImageHeightField": "paraxial_image_height",
     "RealImageHeightField": "real_image_height",

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ...aperture import Aperture, Complement
+from ...design_data import BeamAperture
 from ...rotation import rotation_matrix
 from ...telescope import VACUUM
 from ..json_items import JsonObject
@@ -30,7 +31,7 @@ from .shapes import shape_of
 FORMAT = Format("ray-optics", "pupil", "wavelengths", "stop_surface")
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "inches": 0.0254}
 #: Apertures by space and kind of the pupil; the f-number is that of the image space.
-PUPILS = {
+PUPILS: dict[tuple[str, str], BeamAperture] = {
     ("object", "epd"): "entrance_pupil", ("object", "NA"): "object_na", ("image", "f/#"): "f_number",
     ("image", "NA"): "f_number",
 }  # fmt: skip

@@ -30,7 +30,7 @@ import math
 import numpy as np
 
 from ....core.errors import PrescriptionError
-from ...fringe_zernikes import FRINGE_TERMS, noll_from_fringe
+from ...fringe_indices import FRINGE_TERMS, noll_from_fringe
 from ...grating import Grating
 from ...shapes.freeform import Biconic, OddAsphere, Toroid
 from ...shapes.grid import GridSag

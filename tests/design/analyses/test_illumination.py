@@ -16,7 +16,7 @@ DATA = Path(__file__).parents[2] / "data" / "zmx"
 def test_a_small_stop_at_the_mirror_gives_the_fourth_power_of_the_cosine(paraboloid):
     # The image is f tan(theta), without distortion: cos^4. At f/100 to the square of the aperture.
     fields = np.stack([np.zeros(3), np.deg2rad([0.0, 1.0, 2.0])], axis=-1)
-    result = pachon.relative_illumination(paraboloid(2.0, 100.0), fields, n_pupil=64)
+    result = pachon.design.relative_illumination(paraboloid(2.0, 100.0), fields, n_pupil=64)
     assert result.relative == pytest.approx(np.cos(fields[:, 1]) ** 4, abs=2e-5)
     assert result.f_number == pytest.approx(100.0, rel=1e-4)
 
@@ -38,7 +38,7 @@ def test_the_solid_angle_is_that_of_the_rays_that_meet_at_a_point(singlet):
         assert np.abs(miss).max() < 1e-9
         x, y = ends[0].direction[:, :2].T
         area = 0.5 * abs((x[:-1] * y[1:] - x[1:] * y[:-1]).sum())
-        result = pachon.relative_illumination(telescope, [(0.0, angle)], w, n_pupil=500)
+        result = pachon.design.relative_illumination(telescope, [(0.0, angle)], w, n_pupil=500)
         # The polygon of 360 sides: 5e-5; 500 points at equal areas: 1e-4; at 0.2 rad the rays of one field land some
         # 0.1 mm apart, and over that the irradiance changes by 4e-4.
         assert result.solid_angle[0] == pytest.approx(area, rel=2e-4 if angle == 0.0 else 8e-4)
@@ -55,7 +55,7 @@ def test_parallel_chief_rays_of_a_near_object():
     # A lens for lithography, telecentric on both sides, whose rays meet to some micrometres: its cone of light itself.
     telescope = pachon.load_telescope(DATA / "US05831776-1.zmx")
     assert telescope.design_data.telecentric
-    result = pachon.relative_illumination(telescope, n_pupil=2000)
+    result = pachon.design.relative_illumination(telescope, n_pupil=2000)
     turn = np.linspace(0.0, 2.0 * np.pi, 721)
     rim = 0.5 * telescope.pupil_diameter * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     request = pachon.Request.of(telescope, result.fields, result.wavelength)
@@ -69,7 +69,7 @@ def test_parallel_chief_rays_of_a_near_object():
 def test_vignetting_counts(paraboloid):
     telescope = paraboloid(2.0, 10.0, baffle=(1.0, 0.05))
     # A baffle of half the radius lets a quarter of the light through; on the axis relative to itself.
-    result = pachon.relative_illumination(telescope, [(0.0, 0.0)], n_pupil=4000)
+    result = pachon.design.relative_illumination(telescope, [(0.0, 0.0)], n_pupil=4000)
     assert result.lit_fraction[0] == pytest.approx(0.25, abs=5e-3)
     assert result.relative[0] == 1.0
 
@@ -77,17 +77,18 @@ def test_vignetting_counts(paraboloid):
 def test_coatings_take_their_part_of_the_light(paraboloid, singlet):
     # The same efficiency for every ray is nothing relative to the axis, and a factor of the solid angle.
     telescope, fields = paraboloid(2.0, 10.0), [(0.0, 0.01)]
-    silver = pachon.Coatings({telescope.surface_names[0]: pachon.Coating((3e-7, 2e-6), (0.9, 0.9))})
-    plain = pachon.relative_illumination(telescope, fields, n_pupil=100)
-    coated = pachon.relative_illumination(telescope, fields, coatings=silver, n_pupil=100)
+    silver = pachon.design.Coatings({telescope.surface_names[0]: pachon.models.Coating((3e-7, 2e-6), (0.9, 0.9))})
+    plain = pachon.design.relative_illumination(telescope, fields, n_pupil=100)
+    coated = pachon.design.relative_illumination(telescope, fields, coatings=silver, n_pupil=100)
     assert coated.solid_angle == pytest.approx(0.9 * plain.solid_angle, rel=1e-14)
     assert coated.relative == pytest.approx(plain.relative, rel=1e-14)
     # Bare surfaces: the throughput, each ray by the solid angle of its own; 3 mm wide they are alike to 1e-4.
     lens, w, fields = singlet(3e-3, stop_z=0.01), 587e-9, [(0.0, 0.0), (0.0, 0.2)]
     plain, bare = (
-        pachon.relative_illumination(lens, fields, w, coatings=c, n_pupil=500) for c in (None, pachon.Coatings())
+        pachon.design.relative_illumination(lens, fields, w, coatings=c, n_pupil=500)
+        for c in (None, pachon.design.Coatings())
     )
-    passed = pachon.throughput(lens, fields, w, sampling="spiral", n_pupil=500).value[:, 0]
+    passed = pachon.design.throughput(lens, fields, w, sampling="spiral", n_pupil=500).value[:, 0]
     assert bare.solid_angle / plain.solid_angle == pytest.approx(passed, rel=1e-4)
     assert passed[0] > passed[1] + 1e-5
 
@@ -135,11 +136,11 @@ SURF 6
 def test_rays_aimed_at_the_stop_are_the_light_that_it_lets_through(tmp_path):
     (tmp_path / "lens.zmx").write_text(RETROFOCUS)
     lens, fields = pachon.load_telescope(tmp_path / "lens.zmx"), np.deg2rad([[0.0, 30.0]])
-    aimed = pachon.relative_illumination(lens.with_design(aiming="real"), fields, n_pupil=1000)
+    aimed = pachon.design.relative_illumination(lens.with_design(aiming="real"), fields, n_pupil=1000)
     # Without aiming: a beam twice as wide, and the stop as an aperture.
     stop = tuple(replace(s, aperture=Circle(1e-3)) if s.name == "S3" else s for s in lens.surfaces)
     wide = replace(lens, surfaces=stop, pupil_diameter=3 * lens.pupil_diameter, design_data=DesignData())
-    clipped = pachon.relative_illumination(wide, fields, n_pupil=40000)
+    clipped = pachon.design.relative_illumination(wide, fields, n_pupil=40000)
     print(
         aimed,
         aimed.solid_angle,

@@ -53,7 +53,7 @@ def test_films_at_an_angle_are_the_sum_of_their_waves(angle):
     # The way back is the same, and no film is bare glass.
     inside = np.cos(np.arcsin(np.sin(angle) / GLASS))
     assert stack.efficiency(LIGHT, inside, GLASS, 1.0) == pytest.approx(1.0 - expected, rel=1e-12)
-    bare = pachon.fresnel_transmission(np.cos(angle), 1.0, GLASS)
+    bare = pachon.design.fresnel_transmission(np.cos(angle), 1.0, GLASS)
     assert LayerStack((), ()).efficiency(LIGHT, np.cos(angle), 1.0, GLASS) == pytest.approx(bare, rel=1e-12)
 
 
@@ -73,12 +73,12 @@ def test_a_file_of_films_and_angles(afocal, tmp_path):
     path, plate, angle = tmp_path / "coatings.yaml", afocal(fold=False), np.deg2rad(5.0)
     path.write_text(FILE)
     plate = replace(plate, field_limit=0.5)
-    found = pachon.throughput(plate, [(0.0, angle)], 600e-9, coatings=path, n_pupil=3)
+    found = pachon.design.throughput(plate, [(0.0, angle)], 600e-9, coatings=path, n_pupil=3)
     front = LayerStack((1.38,), (99.6377e-9,)).efficiency(600e-9, np.cos(angle), 1.0, 1.5)
     # Half-way between the wavelengths and between the first two angles, those of the side of air.
     assert found.value[0, 0] == pytest.approx(front * (0.9 - 0.05), rel=1e-12)
     with pytest.raises(DomainError, match=r"coating of back: rays of 1\d\.\d+ deg: expected a table that reaches them"):
-        pachon.throughput(plate, [(0.0, np.deg2rad(25.0))], 600e-9, coatings=path, n_pupil=3)
+        pachon.design.throughput(plate, [(0.0, np.deg2rad(25.0))], 600e-9, coatings=path, n_pupil=3)
 
 
 @pytest.mark.parametrize(
@@ -100,9 +100,11 @@ def test_bad_coatings_are_said(tmp_path, text, said):
 
 def test_films_stand_on_lens_surfaces(afocal):
     with pytest.raises(ConfigError, match="coating of fold: layers are those of lens surfaces; expected a table"):
-        pachon.throughput(afocal(fold=True), coatings=Coatings({"fold": QUARTER}))
+        pachon.design.throughput(afocal(fold=True), coatings=Coatings({"fold": QUARTER}))
     table = CoatingTable((4e-7, 8e-7), (0.0, 1.0), ((0.9, 0.5), (0.9, 0.5)))
-    found = pachon.throughput(afocal(fold=True), [(0.0, 0.0)], 5e-7, coatings=Coatings({"fold": table}), n_pupil=3)
+    found = pachon.design.throughput(
+        afocal(fold=True), [(0.0, 0.0)], 5e-7, coatings=Coatings({"fold": table}), n_pupil=3
+    )
     assert found.value[0, 0] == pytest.approx(0.9, rel=1e-12)
 
 

@@ -14,12 +14,12 @@ def test_fans_of_a_defocused_paraboloid_in_closed_form(paraboloid):
     for fan in fans.along[0, 0]:
         assert fan == pytest.approx(expected, abs=1e-15)
     # All rays are in phase at the focus; from there to the sphere about the detector by the theorem of cosines.
-    opd = pachon.opd_fans(telescope, [[0.0, 0.0]], n_points=9, sphere_radius=1.5)
+    opd = pachon.design.opd_fans(telescope, [[0.0, 0.0]], n_points=9, sphere_radius=1.5)
     cosine = (f - p**2 / (4 * f)) / (f + p**2 / (4 * f))
     path = shift * cosine + np.sqrt(1.5**2 - shift**2 * (1 - cosine**2))
     # Paths of some 10 m, rounded.
     assert opd.value[0, 0, 0] == pytest.approx(shift + 1.5 - path, abs=2e-14)
-    before = pachon.opd_fans(telescope, [[0.0, 0.0]], n_points=9, sphere_radius=-1.5)
+    before = pachon.design.opd_fans(telescope, [[0.0, 0.0]], n_points=9, sphere_radius=-1.5)
     path = shift * cosine - np.sqrt(1.5**2 - shift**2 * (1 - cosine**2))
     assert before.value[0, 0, 1] == pytest.approx(shift - 1.5 - path, abs=2e-14)
 
@@ -55,7 +55,7 @@ def test_blocked_rays_are_marked(paraboloid):
 
 def test_opd_fans_are_those_of_the_map(lsst_r):
     field = np.deg2rad((0.4, 1.2))
-    fans = pachon.opd_fans(lsst_r, [field], 622e-9, n_points=7)
+    fans = pachon.design.opd_fans(lsst_r, [field], 622e-9, n_points=7)
     slopes = np.tan(field)
     axis = slopes / np.hypot(*slopes)
     points = 4.18 * fans.pupil[:, None] * axis

@@ -26,10 +26,10 @@ def test_the_image_may_be_left_out(paraboloid):
 
 def test_parallel_light_is_refused_in_one_line(afocal):
     telescope, place = afocal(fold=False), [(0.0, 0.0)]
-    for analyse in (pachon.field_curvature, pachon.spot_matrix, pachon.strehl):
+    for analyse in (pachon.field_curvature, pachon.design.spot_matrix, pachon.strehl):
         with pytest.raises(DomainError, match=r"focus|parallel|image"):
             analyse(telescope, place)
     with pytest.raises(DomainError, match="its light is parallel"):
-        pachon.target_image(telescope)
+        pachon.design.target_image(telescope)
     # Chief rays have landing points all the same.
-    assert np.isnan(pachon.lateral_color(telescope, place).airy_radius).all()
+    assert np.isnan(pachon.design.lateral_color(telescope, place).airy_radius).all()

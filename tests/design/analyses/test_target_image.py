@@ -12,7 +12,7 @@ def test_contrast_of_a_wave_through_a_blur_disc(paraboloid):
     n, side = 48, 4e-6
     x = np.arange(n)
     target = np.tile(1.0 + np.cos(2.0 * np.pi * x / period), (n, 1))
-    image = pachon.target_image(telescope, target, width=n * side / f, n_rays=100, pixel=side, pixels=n)
+    image = pachon.design.target_image(telescope, target, width=n * side / f, n_rays=100, pixel=side, pixels=n)
     inside = image.image[8:40, 8:40]
     wave = np.exp(2j * np.pi * np.arange(32) / period)
     contrast = 2.0 * abs((inside * wave).sum()) / inside.sum()
@@ -28,7 +28,7 @@ def test_the_image_lies_where_the_rays_land_and_keeps_the_light(paraboloid):
     telescope = paraboloid(2.0, 20.0)
     target = np.zeros((9, 9))
     target[6, 1] = 3.0  # up and left on the sky of field angles
-    result = pachon.target_image(telescope, target, width=9e-5, n_rays=50)
+    result = pachon.design.target_image(telescope, target, width=9e-5, n_rays=50)
     row, column = np.unravel_index(np.argmax(result.image), result.image.shape)
     rays = pachon.launch_rays(telescope, (-3e-5, 2e-5), 5e-7, ([0.0], [0.0]))
     landing = pachon.trace(telescope, rays).position[0, :2]
@@ -39,7 +39,7 @@ def test_the_image_lies_where_the_rays_land_and_keeps_the_light(paraboloid):
 
 
 def test_bars_are_as_wide_as_their_gaps():
-    target = pachon.bar_target(100, bars=3)
+    target = pachon.design.bar_target(100, bars=3)
     row = target[50]
     edges = np.flatnonzero(np.diff(row))
     assert set(row) == {0.0, 1.0}
@@ -50,6 +50,6 @@ def test_bars_are_as_wide_as_their_gaps():
 def test_bad_targets(paraboloid):
     for target, problem in ((np.zeros((4, 4)), "some light"), (np.ones(4), "shape"), (-np.ones((3, 3)), "negative")):
         with pytest.raises(DomainError, match=problem):
-            pachon.target_image(paraboloid(), target)
+            pachon.design.target_image(paraboloid(), target)
     with pytest.raises(DomainError, match="bars = 9"):
-        pachon.bar_target(64, bars=9)
+        pachon.design.bar_target(64, bars=9)

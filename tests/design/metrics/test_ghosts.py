@@ -245,7 +245,7 @@ def test_obstructions_lie_on_their_stretch_of_the_path(with_plate):
         [[[0.0, -1.0, 1.0], [1.0, -1.0, 1.0], [0.0, 1.0, 1.0]], [[1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [0.0, 1.0, 1.0]]]
     )
     rays = pachon.launch_rays(with_plate, (0.0, 0.0), 5e-7, np.random.default_rng(1).uniform(-0.03, 0.03, (2, 400)))
-    blocked = with_plate.with_obstructions(pachon.Obstruction("wall", wall, ("front",)))
+    blocked = with_plate.with_obstructions(pachon.models.Obstruction("wall", wall, ("front",)))
     bare = (None, 0.1, Coatings(), rays.wavelength)
     lights = [GhostTrace(t, rays, Reflectivities(t, *bare), None) for t in (with_plate, blocked)]
     free, half = (len(light.star().weight) for light in lights)

@@ -61,7 +61,7 @@ def test_sensitivities_are_differences_of_wavefronts_of_aimed_rays(wide, kind):
     x, y = points.T / (0.5 * telescope.pupil_diameter)
     # Annular Zernikes are those of the disk here: no obscuration.
     assert telescope.pupil_obscuration == 0.0
-    terms = pachon.annular_zernikes(11, x, y, 0.0)
+    terms = pachon.models.annular_zernikes(11, x, y, 0.0)
     root = np.sqrt(np.where(lit, found.request.pupil.weights, 0.0))
     for i, (address, step) in enumerate(steps.items()):
         sides = {}
@@ -126,7 +126,7 @@ def test_an_optimum_keeps_its_stop(wide, tmp_path):
     names = [s.name for s in wide.surfaces if s.interaction == Interaction.REFRACT and s.shape != Plane()]
     before = [name for name in names if name < wide.design_data.stop] or names
     found = pachon.optimize(
-        wide, [f"{before[0]}.curvature"], **where, n_pupil=6, solver=pachon.LeastSquares(max_steps=3)
+        wide, [f"{before[0]}.curvature"], **where, n_pupil=6, solver=pachon.design.LeastSquares(max_steps=3)
     )
     after = found.telescope
     assert after.design_data.stop == wide.design_data.stop

@@ -30,7 +30,9 @@ def doublet(lens):
 
 def test_an_achromatic_doublet(doublet):
     """Powers of thin lenses in contact: V1 / (V1 - V2) and -V2 / (V1 - V2) of the whole."""
-    found = optimize(doublet, ACHROMAT, "spots", [[0.0, 0.0]], [D, F, C], targets=[pachon.FocalLength(0.1)], n_pupil=3)
+    found = optimize(
+        doublet, ACHROMAT, "spots", [[0.0, 0.0]], [D, F, C], targets=[pachon.design.FocalLength(0.1)], n_pupil=3
+    )
     crown, flint = (found.telescope.surface(name).medium_after for name in ("S1", "S2"))
     first, second, third = (-found.telescope.surface(name).shape.curvature for name in ("S1", "S2", "S3"))
     v1, v2 = abbe_number(crown), abbe_number(flint)
@@ -45,19 +47,19 @@ def test_an_achromatic_doublet(doublet):
 
 def test_two_numbers(doublet):
     """The rms of the spots leaves penalties out, the other number holds them."""
-    target = pachon.FocalLength(0.2, weight=1.0)
+    target = pachon.design.FocalLength(0.2, weight=1.0)
     found = optimize(
         doublet,
         ["S1.curvature"],
         "spots",
         [[0.0, 0.0]],
         targets=[target],
-        solver=pachon.LeastSquares(max_steps=1),
+        solver=pachon.design.LeastSquares(max_steps=1),
         n_pupil=3,
     )
     alone = SpotMerit(doublet, Beams.of(doublet, [[0.0, 0.0]], n_pupil=3)).residuals(doublet)
     assert found.merits[0] == pytest.approx(np.linalg.norm(alone), rel=1e-12)
-    penalty = 0.2 - pachon.FocalLength(0.2).measure(doublet)
+    penalty = 0.2 - pachon.design.FocalLength(0.2).measure(doublet)
     assert found.history[0] == pytest.approx(np.hypot(found.merits[0], penalty), rel=1e-12)
     assert found.summary()["rms_start_m"] == found.merits[0]
 
@@ -65,8 +67,10 @@ def test_two_numbers(doublet):
 def test_a_radius_passes_through_a_plane(lens):
     """The best shape is bent the other way than the start; as a radius it would have to pass through infinity."""
     start = lens([(60.0, 4.0, "N-BK7"), (400.0, 100.0, "")], pupil=5.0, field_deg=0.5)
-    found = optimize(start, ["S2.radius"], "spots", [[0.0, 0.0]], targets=[pachon.FocalLength(0.065)], n_pupil=3)
-    curvature = optimize(start, ["S2.curvature"], "spots", [[0.0, 0.0]], targets=[pachon.FocalLength(0.065)], n_pupil=3)
+    found = optimize(start, ["S2.radius"], "spots", [[0.0, 0.0]], targets=[pachon.design.FocalLength(0.065)], n_pupil=3)
+    curvature = optimize(
+        start, ["S2.curvature"], "spots", [[0.0, 0.0]], targets=[pachon.design.FocalLength(0.065)], n_pupil=3
+    )
     assert found.start_values[0] == pytest.approx(-0.4)
     assert found.values[0] > 0
     assert found.values[0] == pytest.approx(1.0 / curvature.values[0], rel=1e-9)
@@ -80,10 +84,16 @@ def test_a_radius_passes_through_a_plane(lens):
 def test_limits_that_nobody_stated(lens):
     """Curvatures stay below one over the clear radius, thicknesses above zero."""
     start = lens([(20.0, 4.0, "N-BK7"), (-20.0, 15.0, "")], pupil=16.0, field_deg=0.5)
-    pull = [pachon.FocalLength(2e-3, weight=100.0)]
+    pull = [pachon.design.FocalLength(2e-3, weight=100.0)]
     variables = ["S1.radius", "S2.radius", "S1.thickness"]
     found = optimize(
-        start, variables, "spots", [[0.0, 0.0]], targets=pull, n_pupil=2, solver=pachon.LeastSquares(max_steps=15)
+        start,
+        variables,
+        "spots",
+        [[0.0, 0.0]],
+        targets=pull,
+        n_pupil=2,
+        solver=pachon.design.LeastSquares(max_steps=15),
     )
     assert np.all(np.abs(found.values[:2]) >= 8e-3)
     assert found.values[2] >= 0.0
@@ -154,15 +164,15 @@ def test_a_triplet_from_a_poor_start(lens):
     variables = [f"S{i}.curvature" for i in range(1, 7)] + [f"S{i}.thickness" for i in (1, 2, 4, 5, 6)]
     operands = [
         # The focal length of the start is seven times that wanted: with a weight of 1 it decides where the search goes.
-        pachon.FocalLength(pachon.FocalLength(1.0).measure(reference.telescope), weight=0.3),
-        pachon.CenterThickness("S1", minimum=1e-3, maximum=6e-3),
-        pachon.CenterThickness("S5", minimum=1e-3, maximum=3e-3),
-        *(pachon.EdgeThickness(name, minimum=0.5e-3) for name in ("S1", "S5")),
-        *(pachon.EdgeThickness(name, minimum=0.1e-3) for name in ("S2", "S4")),
-        pachon.TotalLength(maximum=35e-3),
+        pachon.design.FocalLength(pachon.design.FocalLength(1.0).measure(reference.telescope), weight=0.3),
+        pachon.design.CenterThickness("S1", minimum=1e-3, maximum=6e-3),
+        pachon.design.CenterThickness("S5", minimum=1e-3, maximum=3e-3),
+        *(pachon.design.EdgeThickness(name, minimum=0.5e-3) for name in ("S1", "S5")),
+        *(pachon.design.EdgeThickness(name, minimum=0.1e-3) for name in ("S2", "S4")),
+        pachon.design.TotalLength(maximum=35e-3),
     ]
     found = optimize(
-        poor, variables, "spots", fields, [F, D, C], targets=operands, solver=pachon.LeastSquares(max_steps=300)
+        poor, variables, "spots", fields, [F, D, C], targets=operands, solver=pachon.design.LeastSquares(max_steps=300)
     )
     assert found.merits[0] > 2e-3
     assert found.merits[1] <= reference.merits[1]
@@ -189,7 +199,7 @@ def test_a_corrector_of_another_glass():
         changed.append(replace(design, surfaces=surfaces))
     variables = [f"{name}.curvature" for name in lenses]
     variables += ["L1_exit.thickness", "L2_exit.thickness", "M3.thickness", "Detector.dz", "L2_exit.conic"]
-    found = optimize(changed, variables, "spots", fields, n_pupil=4, solver=pachon.LeastSquares(max_steps=80))
+    found = optimize(changed, variables, "spots", fields, n_pupil=4, solver=pachon.design.LeastSquares(max_steps=80))
     before = optimize(designs, ["Detector.dz"], "spots", fields, n_pupil=4)
     # In the beginning the images are lost; in the end they are as they were within a few tens of per cent.
     assert found.merits[0] > 50 * before.merits[1]
@@ -208,8 +218,11 @@ def zoom(doublet):
 
 def test_configurations_share_variables_and_have_their_own(zoom):
     first, second = zoom
-    targets = [pachon.FocalLength(0.1)]
-    both = [first, pachon.DesignConfiguration(second, weight=3.0, operands=[pachon.TotalLength(maximum=0.2)])]
+    targets = [pachon.design.FocalLength(0.1)]
+    both = [
+        first,
+        pachon.design.DesignConfiguration(second, weight=3.0, operands=[pachon.design.TotalLength(maximum=0.2)]),
+    ]
     variables = ["S1.curvature", "S2.curvature", "near:S3.thickness"]
     found = optimize(both, variables, "spots", [[0.0, 0.0]], targets=targets, n_pupil=3)
     assert found.addresses == ("S1.curvature", "S2.curvature", "near:S3.thickness")
@@ -230,10 +243,12 @@ def test_configurations_share_variables_and_have_their_own(zoom):
 
 
 def test_restarts_keep_the_best_and_depend_on_the_seed_alone(doublet):
-    how = dict(merit="spots", fields=[[0.0, 0.0]], targets=[pachon.FocalLength(0.1)], n_pupil=2)
+    how = dict(merit="spots", fields=[[0.0, 0.0]], targets=[pachon.design.FocalLength(0.1)], n_pupil=2)
     # Goals held beyond their weights are those of the best end, after the restarts: left to the weights.
-    alone = optimize(doublet, ACHROMAT, solver=pachon.LeastSquares(max_steps=4, constraint_tolerance=np.inf), **how)
-    solver = pachon.LeastSquares(max_steps=4, restarts=2, seed=3, spread=0.5, constraint_tolerance=np.inf)
+    alone = optimize(
+        doublet, ACHROMAT, solver=pachon.design.LeastSquares(max_steps=4, constraint_tolerance=np.inf), **how
+    )
+    solver = pachon.design.LeastSquares(max_steps=4, restarts=2, seed=3, spread=0.5, constraint_tolerance=np.inf)
     found, again = (optimize(doublet, ACHROMAT, solver=solver, **how) for _ in range(2))
     assert np.array_equal(found.changes, again.changes)
     assert found.history[-1] <= alone.history[-1]
@@ -247,12 +262,12 @@ def test_glasses_of_a_catalogue(lens):
     how = dict(
         fields=[[0.0, 0.0]],
         wavelengths=[D, F, C],
-        targets=[pachon.FocalLength(0.1)],
+        targets=[pachon.design.FocalLength(0.1)],
         n_pupil=3,
-        solver=pachon.LeastSquares(max_steps=60),
+        solver=pachon.design.LeastSquares(max_steps=60),
     )
     plain = optimize(start, ACHROMAT, "spots", **how)
-    found = pachon.choose_glasses(start, ACHROMAT, ["N-BAK4"], nearest=3, **how)
+    found = pachon.design.choose_glasses(start, ACHROMAT, ["N-BAK4"], nearest=3, **how)
     assert len(found.trials) == 3
     assert found.optimum.telescope.surface("S2").medium_after.name == found.glasses["N-BAK4"]
     assert found.glasses["N-BAK4"] in GlassCatalogue.bundled()
@@ -260,10 +275,10 @@ def test_glasses_of_a_catalogue(lens):
     assert found.optimum.merits[1] < 0.5 * plain.merits[1]
     assert found.optimum.start_telescopes == (start,)
     assert found.optimum.values == pytest.approx(found.optimum.start_values + found.optimum.changes)
-    assert found.optimum.operands[0].start == pytest.approx(pachon.FocalLength(0.1).measure(start), rel=1e-12)
+    assert found.optimum.operands[0].start == pytest.approx(pachon.design.FocalLength(0.1).measure(start), rel=1e-12)
     assert found.summary()["glasses"] == found.glasses
     with pytest.raises(UnknownNameError, match=r"N-FK5.*N-BAK4"):
-        pachon.choose_glasses(start, ACHROMAT, ["N-FK5"], **how)
+        pachon.design.choose_glasses(start, ACHROMAT, ["N-FK5"], **how)
 
 
 @pytest.mark.parametrize(
@@ -274,7 +289,12 @@ def test_glasses_of_a_catalogue(lens):
         ([], {}, ConfigError, "variables"),
         (["S1.curvature", "S1.curvature"], {}, ConfigError, "more than once"),
         (["S1.radius"], {"bounds": {"S1.radius": (-1.0, 1.0)}}, DomainError, "one sign"),
-        (["S1.curvature"], {"merit": pachon.WavefrontError(np.zeros((1, 1, 1)))}, ConfigError, "2 configurations"),
+        (
+            ["S1.curvature"],
+            {"merit": pachon.design.WavefrontError(np.zeros((1, 1, 1)))},
+            ConfigError,
+            "2 configurations",
+        ),
     ],
 )
 def test_wrong_configurations(zoom, variables, options, error, words):

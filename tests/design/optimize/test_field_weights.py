@@ -78,11 +78,13 @@ def test_parts_of_a_request_keep_their_weights(lens):
 
 def test_pictures_before_and_after_have_the_vignetting_factors_of_the_file():
     """Some of the fields of a merit, each with its own factors: the spots that `pachon spots` has."""
-    lens = pachon.triplet(diameter=0.01, f_number=5.0)
+    lens = pachon.models.triplet(diameter=0.01, f_number=5.0)
     rows = ((0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.1, 0.0, 0.3, 0.0), (0.0, 0.2, 0.1, 0.4, 0.0))
     lens = lens.with_design(fields=((0.0, 0.0), (0.0, 0.1), (0.0, 0.2)), field_weights=(), vignetting=rows)
     whole = pachon.spots(lens, sampling="rings", n_pupil=4)
-    found = pachon.optimize(lens, [f"{lens.surfaces[-1].name}.dz"], n_pupil=2, solver=pachon.LeastSquares(max_steps=2))
+    found = pachon.optimize(
+        lens, [f"{lens.surfaces[-1].name}.dz"], n_pupil=2, solver=pachon.design.LeastSquares(max_steps=2)
+    )
     some, none = with_fields(lens, found.fields[0][1:], found.vignetting[0][1:])
     assert none is None
     drawn = pachon.spots(some, sampling="rings", n_pupil=4)

@@ -19,7 +19,7 @@ def singlet(lens):
 
 def optimized(telescope, variables, targets, **solver):
     return pachon.optimize(
-        telescope, variables, "spots", FIELD, targets=targets, n_pupil=2, solver=pachon.LeastSquares(**solver)
+        telescope, variables, "spots", FIELD, targets=targets, n_pupil=2, solver=pachon.design.LeastSquares(**solver)
     )
 
 
@@ -27,8 +27,8 @@ def optimized(telescope, variables, targets, **solver):
 def test_a_weak_limit_is_held_exactly(singlet):
     """The spots would have the glass thicker; a weight of 1e-3 alone leaves it above its limit."""
     free = ["S1.curvature", "S2.thickness", "S1.thickness"]
-    focal = pachon.FocalLength(0.05)
-    most = pachon.CenterThickness("S1", maximum=8e-3, weight=1e-3)
+    focal = pachon.design.FocalLength(0.05)
+    most = pachon.design.CenterThickness("S1", maximum=8e-3, weight=1e-3)
     by_weight = optimized(singlet, free, [focal, most], constraint_tolerance=np.inf)
     held = optimized(singlet, free, [focal, most])
     assert thickness(by_weight.telescope, 0) > 8.01e-3
@@ -45,7 +45,7 @@ def test_a_weak_limit_is_held_exactly(singlet):
 @pytest.mark.long
 def test_operands_that_no_lens_has_are_said(singlet):
     """Both mean one number: what weights make of them stays, and neither is held."""
-    both = [pachon.CenterThickness("S1", value=6e-3), pachon.TotalLength("S1", "S2", maximum=5e-3)]
+    both = [pachon.design.CenterThickness("S1", value=6e-3), pachon.design.TotalLength("S1", "S2", maximum=5e-3)]
     one = optimized(singlet, ["S2.thickness", "S1.thickness"], both)
     plain = optimized(singlet, ["S2.thickness", "S1.thickness"], both, constraint_tolerance=np.inf)
     assert one.operands_not_held == one.operands
@@ -70,4 +70,4 @@ def test_a_merit_that_is_not_that_of_the_lens_is_an_error(singlet, monkeypatch):
 @pytest.mark.parametrize("tolerance", [0.0, -1.0, np.nan])
 def test_a_tolerance_is_positive(tolerance):
     with pytest.raises(DomainError, match="constraint_tolerance"):
-        pachon.LeastSquares(constraint_tolerance=tolerance)
+        pachon.design.LeastSquares(constraint_tolerance=tolerance)

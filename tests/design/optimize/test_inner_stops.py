@@ -76,9 +76,9 @@ def test_the_reported_merit_is_that_of_every_saved_file(name, tmp_path):
     variables = [*(f"{s.name}.radius" for s in curved(start)[:8]), f"{start.surfaces[-2].name}.thickness"]
     # Field angles of a near object, and so scales by them, change with the pupil.
     far = np.isinf(start.object_distance)
-    targets = [pachon.FocalLength(pachon.FocalLength(1.0).measure(following_stop(start)))] if far else []
+    targets = [pachon.design.FocalLength(pachon.design.FocalLength(1.0).measure(following_stop(start)))] if far else []
     optimum = pachon.optimize(
-        start, variables, targets=targets, solver=pachon.LeastSquares(max_steps=15, tolerance=1e-4)
+        start, variables, targets=targets, solver=pachon.design.LeastSquares(max_steps=15, tolerance=1e-4)
     )
     assert optimum.merits[0] == pytest.approx(rms_of_spots(start), rel=1e-2)
     assert optimum.is_better
@@ -103,7 +103,7 @@ def test_the_reported_merit_is_that_of_every_saved_file(name, tmp_path):
 def test_a_stop_stays_on_its_surface_in_every_format(name, tmp_path):
     start = load(name)
     first = curved(start)[0].name
-    for lens in (start, pachon.apply_changes(start, {f"{first}.curvature": 1.0, f"{first}.dz_um": 20.0})):
+    for lens in (start, pachon.models.apply_changes(start, {f"{first}.curvature": 1.0, f"{first}.dz_um": 20.0})):
         for ending in WRITTEN:
             path = tmp_path / f"lens{ending}"
             problem = written(lens, path)
@@ -149,9 +149,9 @@ def test_exact_derivatives_are_differences_of_lenses_with_pupils_of_their_own(na
 def test_positions_of_a_zoom_lens_have_a_pupil_each(tmp_path):
     """Radii are shared, a thickness in front of the stop is that of one position."""
     near = load("lensfiles/stop_inside.zmx")
-    far = replace(pachon.apply_changes(near, {"S2.thickness_mm": 2.0}), name="far")
+    far = replace(pachon.models.apply_changes(near, {"S2.thickness_mm": 2.0}), name="far")
     variables = ["S1.radius", "S6.radius", "stop_inside:S2.thickness", "far:S6.thickness", "stop_inside:S6.thickness"]
-    found = pachon.optimize([near, far], variables, n_pupil=4, solver=pachon.LeastSquares(max_steps=8))
+    found = pachon.optimize([near, far], variables, n_pupil=4, solver=pachon.design.LeastSquares(max_steps=8))
     squares, planes = [], []
     for position in found.telescopes:
         path = tmp_path / f"{position.name}.zmx"

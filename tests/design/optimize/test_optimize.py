@@ -69,8 +69,8 @@ def test_a_misaligned_lsst_is_recovered_from_its_wavefronts(lsst_r):
         tolerance = np.array([5e-4, 5e-4, 5e-5, 1e-4, 1e-4] * 2)
         truth = np.random.default_rng(seed).normal(size=10) * tolerance
         measured = wavefronts(apply(lsst_r, dict(zip(HEXAPODS, truth, strict=True))), Beams.of(lsst_r, fields))
-        merit = pachon.WavefrontError(measured)
-        found = optimize(lsst_r, HEXAPODS, merit, fields, solver=pachon.LeastSquares(tolerance=1e-14))
+        merit = pachon.design.WavefrontError(measured)
+        found = optimize(lsst_r, HEXAPODS, merit, fields, solver=pachon.design.LeastSquares(tolerance=1e-14))
         # Wavefronts are good to 1e-14 m; the motion that shows least makes 2e-4 m of wavefront per m.
         assert np.abs(found.changes - truth).max() < 1e-9
         assert found.history[0] > 1e-7
@@ -173,7 +173,7 @@ def test_a_variable_without_effect_is_named(paul_baker, variable, merit):
         (dict(variables=["M9.dz"]), UnknownNameError, "M9"),
         (dict(bounds={"M1.conic": (0, 1)}), ConfigError, "M1.conic"),
         (dict(bounds={"Detector.dz": (1e-3, 2e-3)}), DomainError, "Detector.dz"),
-        (dict(merit=pachon.WavefrontError(np.zeros((3, 1, 5)))), DomainError, "goal of shape"),
+        (dict(merit=pachon.design.WavefrontError(np.zeros((3, 1, 5)))), DomainError, "goal of shape"),
         (dict(field_weights=[1.0, 2.0]), ConfigError, "field_weights: .* expected it in a DesignConfiguration"),
         (dict(sampling="rings"), ConfigError, "sampling: no argument of optimize; expected it in a DesignConf"),
         (dict(goal=np.zeros((3, 1, 5))), ConfigError, r"goal: .* expected merit=WavefrontError\(goal\)"),
@@ -189,19 +189,22 @@ def test_bad_arguments(paul_baker, change, error, words):
 
 def test_bad_options(paul_baker):
     with pytest.raises(ConfigError, match="reference = 'mean': expected one of centroid, chief"):
-        pachon.SpotSize("mean")
+        pachon.design.SpotSize("mean")
     with pytest.raises(DomainError, match="restarts"):
-        pachon.LeastSquares(restarts=-1)
+        pachon.design.LeastSquares(restarts=-1)
     with pytest.raises(DomainError, match="field_weights"):
-        optimize(pachon.DesignConfiguration(paul_baker, FIELDS, field_weights=[1.0, 2.0]), ["Detector.dz"])
+        optimize(pachon.design.DesignConfiguration(paul_baker, FIELDS, field_weights=[1.0, 2.0]), ["Detector.dz"])
 
 
 def test_what_is_the_default_may_be_said(paul_baker):
     """Names and objects, defaults said or not: the same numbers."""
     plain = optimize(paul_baker, ["Detector.dz", "M2.dx"], "spots", FIELDS)
-    state = pachon.DesignConfiguration(paul_baker, FIELDS, sampling="gauss", n_pupil=6, projection="zemax")
+    state = pachon.design.DesignConfiguration(paul_baker, FIELDS, sampling="gauss", n_pupil=6, projection="zemax")
     said = optimize(
-        state, ["Detector.dz", "M2.dx"], pachon.SpotSize("centroid"), solver=pachon.LeastSquares(1e-10, 200)
+        state,
+        ["Detector.dz", "M2.dx"],
+        pachon.design.SpotSize("centroid"),
+        solver=pachon.design.LeastSquares(1e-10, 200),
     )
     for name in ("changes", "merits", "history", "covariance", "remeasured"):
         assert np.array_equal(getattr(said, name), getattr(plain, name))

@@ -50,14 +50,14 @@ def test_units(arguments):
     assert np.asarray(found["telescope"].fields)[1] == pytest.approx([0.0, twelve])
     assert found["telescope"].wavelengths == pytest.approx([486.1e-9, 587.6e-9])
     focal, distortion, angle, edge, mtf, spot = found["telescope"].operands
-    assert focal == pachon.FocalLength(0.025, weight=2.0)
+    assert focal == pachon.design.FocalLength(0.025, weight=2.0)
     assert (distortion.field, distortion.minimum, distortion.maximum) == ((0.0, pytest.approx(twelve)), -0.01, 0.01)
     assert angle.maximum == pytest.approx(np.pi / 4)
     assert (angle.surface, angle.pupil, angle.wavelength) == ("S3", (0.0, 1.0), pytest.approx(500e-9))
     assert (edge.radius, edge.minimum) == (pytest.approx(4e-3), pytest.approx(5e-4))
     assert (mtf.frequency, mtf.angle, mtf.minimum) == (pytest.approx(4e4), pytest.approx(np.pi / 2), 0.5)
     assert (spot.wavelengths, spot.n_pupil, spot.maximum) == ((pytest.approx(5e-7),), 3, pytest.approx(5e-6))
-    result = optimize(**{**found, "solver": pachon.LeastSquares(max_steps=1), "n_pupil": 2})
+    result = optimize(**{**found, "solver": pachon.design.LeastSquares(max_steps=1), "n_pupil": 2})
     assert len(result.operands) == 6
 
 
@@ -78,7 +78,7 @@ def test_configurations(arguments, tmp_path, triplet):
     assert second.weight == 2.0
     assert np.asarray(second.fields)[0, 1] == pytest.approx(np.deg2rad(5.0))
     assert found["bounds"] == {"near:S7.thickness": pytest.approx((15e-3, 25e-3))}
-    result = optimize(**{**found, "solver": pachon.LeastSquares(max_steps=2), "n_pupil": 2})
+    result = optimize(**{**found, "solver": pachon.design.LeastSquares(max_steps=2), "n_pupil": 2})
     assert [(o.configuration, o.operand.kind) for o in result.operands] == [("near", "f_number")]
 
 

@@ -64,9 +64,9 @@ def optimum(lens):
         VARIABLES,
         "spots",
         bounds=BOUNDS,
-        targets=[pachon.FocalLength(0.05)],
+        targets=[pachon.design.FocalLength(0.05)],
         n_pupil=RINGS,
-        solver=pachon.LeastSquares(tolerance=1e-3),
+        solver=pachon.design.LeastSquares(tolerance=1e-3),
     )
 
 
@@ -94,7 +94,7 @@ def test_what_is_reported_is_what_the_saved_lens_does(lens, optimum, tmp_path, e
 def test_the_result_has_the_aiming_of_the_file(lens, optimum):
     after = optimum.telescope
     assert (lens.design_data.aiming, after.design_data.aiming) == ("off", "off")
-    assert pachon.with_floating_pupil(after).stop_z == pytest.approx(after.stop_z, abs=1e-16)
+    assert pachon.models.with_floating_pupil(after).stop_z == pytest.approx(after.stop_z, abs=1e-16)
     assert not np.isclose(after.stop_z, lens.stop_z, rtol=0, atol=5e-4)
     assert after.pupil_diameter == lens.pupil_diameter
     assert optimum.filled_stops == ("S4",)
@@ -111,8 +111,10 @@ def test_the_result_has_the_aiming_of_the_file(lens, optimum):
 @pytest.mark.long
 def test_a_lens_that_got_worse_is_not_called_better(lens):
     """A focal length that spoils the spots."""
-    target = pachon.FocalLength(0.055, weight=10.0)
-    worse = pachon.optimize(lens, ["S1.radius"], targets=[target], n_pupil=2, solver=pachon.LeastSquares(max_steps=5))
+    target = pachon.design.FocalLength(0.055, weight=10.0)
+    worse = pachon.optimize(
+        lens, ["S1.radius"], targets=[target], n_pupil=2, solver=pachon.design.LeastSquares(max_steps=5)
+    )
     assert worse.merits[1] > worse.merits[0]
     assert worse.remeasured[1, 0] == pytest.approx(filled_spots(worse.telescope, 2), rel=1e-9)
     assert not worse.is_better
@@ -224,7 +226,7 @@ TYPED_CHANGES = ((2, "DISZ 6.0", "DISZ 7.0"), (1, "CURV 0.0461", "CURV 0.0441"))
 def test_the_pupil_of_a_changed_lens_is_that_of_its_file(typed, aperture):
     """A stated diameter stays; that of a stated stop follows."""
     start = typed(STATED, aperture=aperture)
-    changed = pachon.apply_changes(start, CHANGES)
+    changed = pachon.models.apply_changes(start, CHANGES)
     expected = typed(STATED, *TYPED_CHANGES, aperture=aperture)
     assert changed.design_data == start.design_data
     assert changed.stop_z == pytest.approx(expected.stop_z, abs=1e-15)
@@ -236,7 +238,7 @@ def test_the_pupil_of_a_changed_lens_is_that_of_its_file(typed, aperture):
 
 
 def test_changes_at_zero_change_nothing(lens):
-    assert pachon.apply_changes(lens, {"S2.thickness_mm": 0.0, "S1.dy_um": 0.0}) == lens
+    assert pachon.models.apply_changes(lens, {"S2.thickness_mm": 0.0, "S1.dy_um": 0.0}) == lens
 
 
 @pytest.mark.parametrize("aiming", ["off", "paraxial", "real"])
@@ -245,7 +247,7 @@ def test_edges_are_held_where_the_light_goes_in_the_lens_as_it_is(typed, aiming)
     start, expected = (t.with_design(aiming=aiming) for t in (typed(), typed(*TYPED_CHANGES)))
     changed = apply(start, {"S2.thickness": 1e-3, "S1.curvature": 2.0})
     for surface in ("S1", "S5"):
-        edge = pachon.EdgeThickness(surface, minimum=0.0)
+        edge = pachon.design.EdgeThickness(surface, minimum=0.0)
         assert edge.measure(changed) == pytest.approx(edge.measure(expected), abs=1e-15)
         # Light through the pupil where it was.
         frozen = footprints(changed, changed.field_radius)[[int(surface[1]) - 1, int(surface[1])]].max()
@@ -258,11 +260,11 @@ def test_an_edge_is_held_on_the_optimum_as_it_is_saved(lens, tmp_path):
     how = dict(
         bounds={"S2.thickness": BOUNDS["S2.thickness"]},
         n_pupil=2,
-        solver=pachon.LeastSquares(tolerance=1e-4, max_steps=40),
+        solver=pachon.design.LeastSquares(tolerance=1e-4, max_steps=40),
     )
     free = pachon.optimize(lens, ["S1.radius", "S2.thickness", "S6.thickness"], **how).telescope
-    least = pachon.EdgeThickness("S1", minimum=1.0).measure(free) + 2e-4
-    edge = pachon.EdgeThickness("S1", minimum=least, weight=10.0)
+    least = pachon.design.EdgeThickness("S1", minimum=1.0).measure(free) + 2e-4
+    edge = pachon.design.EdgeThickness("S1", minimum=least, weight=10.0)
     held = pachon.optimize(lens, ["S1.radius", "S2.thickness", "S6.thickness"], targets=[edge], **how)
     pachon.save_telescope(held.telescope, tmp_path / "held.zmx")
     saved = edge.measure(pachon.load_telescope(tmp_path / "held.zmx"))
@@ -273,7 +275,7 @@ def test_an_edge_is_held_on_the_optimum_as_it_is_saved(lens, tmp_path):
 def test_a_focal_ratio_follows_a_stop_of_stated_size(typed):
     """With a stop of one size the pupil follows it: the focal ratio is that of first order, its derivatives too."""
     start = following_stop(typed(STATED, aperture="FLOA"))
-    ratio, focal = pachon.FNumber(5.0), pachon.FocalLength(0.05)
+    ratio, focal = pachon.design.FNumber(5.0), pachon.design.FocalLength(0.05)
     names, values = ["S1.curvature", "S2.thickness", "S6.curvature"], np.array([2.0, 1e-3, 0.0])
     parameters = parse_parameters(names, start)
     columns = ParameterColumns.at(start, parameters, values)
@@ -281,9 +283,9 @@ def test_a_focal_ratio_follows_a_stop_of_stated_size(typed):
 
     def first_order_ratio(change, place):
         changes = dict(zip(parameters, values + change * (np.arange(3) == place), strict=True))
-        return first_order(pachon.with_floating_pupil(apply(start, changes))).f_number
+        return first_order(pachon.models.with_floating_pupil(apply(start, changes))).f_number
 
-    diameter = pachon.with_floating_pupil(columns.telescope).pupil_diameter
+    diameter = pachon.models.with_floating_pupil(columns.telescope).pupil_diameter
     assert number == pytest.approx(focal.measure(columns.telescope) / diameter, rel=1e-12)
     assert number == pytest.approx(first_order_ratio(0.0, 0), rel=1e-11)
     assert diameter != pytest.approx(start.pupil_diameter, rel=1e-2)
@@ -301,7 +303,9 @@ def test_a_near_object_keeps_its_cone_of_light(tmp_path):
     relay = pachon.load_telescope(LENSES / "lenses" / "relay.zmx")
     relay = relay.with_design(field_type="object_height", fields=((0.0, 0.0), (0.0, 0.004)), field_weights=())
     assert relay.design_data.aiming == "off"
-    found = pachon.optimize(relay, ["A1.curvature", "A3.thickness"], n_pupil=2, solver=pachon.LeastSquares(max_steps=4))
+    found = pachon.optimize(
+        relay, ["A1.curvature", "A3.thickness"], n_pupil=2, solver=pachon.design.LeastSquares(max_steps=4)
+    )
     assert found.remeasured[1, 0] == pytest.approx(found.merits[1], rel=1e-9)
     before, after = relay, found.telescope
     slopes = [0.5 * t.pupil_diameter / (t.object_distance - t.stop_z) for t in (before, after)]
@@ -318,7 +322,7 @@ def test_telescopes_without_a_stop_inside_stay_as_they_are(name):
     telescope = pachon.load_telescope(str(LENSES / name) if name.endswith("zmx") else name)
     assert following_stop(telescope) is telescope
     first = telescope.surface_names[0]
-    assert pachon.apply_changes(telescope, {f"{first}.dz_m": 5e-5}) == apply(telescope, {f"{first}.dz": 5e-5})
+    assert pachon.models.apply_changes(telescope, {f"{first}.dz_m": 5e-5}) == apply(telescope, {f"{first}.dz": 5e-5})
 
 
 @pytest.mark.long
@@ -347,7 +351,7 @@ SIDEWAYS = {"S1.dy_mm": 0.2, "S2.rx_mrad": 3.0, "S3.dx_um": 100.0, "S2.thickness
 
 
 def test_a_pupil_moves_sideways_with_the_image_of_its_stop(lens, tmp_path):
-    changed = pachon.apply_changes(lens, SIDEWAYS)
+    changed = pachon.models.apply_changes(lens, SIDEWAYS)
     assert changed.design_data.aiming == "off"
     assert np.hypot(*changed.pupil_center) > 5e-5
     assert np.abs(at_stop(changed, (0.0, 0.0))).max() < 1e-15
@@ -359,7 +363,7 @@ def test_a_pupil_moves_sideways_with_the_image_of_its_stop(lens, tmp_path):
     pachon.save_telescope(changed, tmp_path / "changed.yaml")
     assert pachon.load_telescope(tmp_path / "changed.yaml").pupil_center == pytest.approx(changed.pupil_center)
     # Small changes have small effects: rays are launched as before.
-    little = pachon.apply_changes(lens, {"S1.dy_um": 1e-3})
+    little = pachon.models.apply_changes(lens, {"S1.dy_um": 1e-3})
     assert pachon.spots(little, n_pupil=2).rms_radius == pytest.approx(
         pachon.spots(lens, n_pupil=2).rms_radius, rel=1e-5
     )
@@ -367,8 +371,8 @@ def test_a_pupil_moves_sideways_with_the_image_of_its_stop(lens, tmp_path):
 
 def test_a_pupil_follows_degrees_of_freedom_and_temperature(lens):
     """Warmer, by what a stop of the same image would be: the pupil of the lens computed anew."""
-    warm = pachon.DegreesOfFreedom((pachon.thermal(lens, 2e-4),)).apply(lens, [50.0])
-    assert warm.stop_z == pytest.approx(pachon.with_floating_pupil(warm).stop_z, abs=1e-16)
+    warm = pachon.models.DegreesOfFreedom((pachon.models.thermal(lens, 2e-4),)).apply(lens, [50.0])
+    assert warm.stop_z == pytest.approx(pachon.models.with_floating_pupil(warm).stop_z, abs=1e-16)
     # All lengths grow by one per cent, but for that of the first vertex at the origin.
     assert warm.stop_z == pytest.approx(1.01 * lens.stop_z, rel=1e-4)
     vector = pachon.sensitivity(lens, ["S1.dy"], [0.0, 0.0], n_pupil=3, n_zernike=4).parameters
@@ -388,7 +392,7 @@ def test_a_fold_mirror_changes_nothing_of_the_pupil(typed, tmp_path):
     (tmp_path / "folded.zmx").write_text(text)
     folded = pachon.load_telescope(tmp_path / "folded.zmx")
     changes = {"S1.curvature": 0.5}
-    for one, other in ((straight, folded), tuple(pachon.apply_changes(t, changes) for t in (straight, folded))):
+    for one, other in ((straight, folded), tuple(pachon.models.apply_changes(t, changes) for t in (straight, folded))):
         assert other.stop_z == pytest.approx(one.stop_z, abs=1e-15)
         assert other.pupil_diameter == one.pupil_diameter
         points = np.deg2rad([[0.0, 0.0], [0.0, 2.0]])

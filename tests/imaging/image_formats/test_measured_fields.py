@@ -220,7 +220,9 @@ def test_a_psf_model_from_a_file(image, field, catalogue, tmp_path, capsys):
     assert np.abs(np.mean(table["e1"][good] - field.shear[truth, 0])) < 0.02
     # Without stars, too.
     empty = draw_field(0, 20, seed=4, side=250)
-    alone = pachon.measure_image(loaded(empty, tmp_path, "b.fits"), psf=pachon.load_psfex(tmp_path / "a.psf"))
+    alone = pachon.measure_image(
+        loaded(empty, tmp_path, "b.fits"), psf=pachon.reconstruction.load_psfex(tmp_path / "a.psf")
+    )
     assert len(alone.stars) == 0
     # Half of the light of a Gaussian is within 1.18 rms.
     assert alone.stars.half_light_radius == pytest.approx(1.1774 * (PSF[0] * PSF[2] - PSF[1] ** 2) ** 0.25, rel=0.03)

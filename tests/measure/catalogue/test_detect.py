@@ -34,7 +34,7 @@ def found():
 
 
 def test_positions_fluxes_and_sizes_of_gaussians(found):
-    index = pachon.match_positions(found.x, found.y, *PLACES.T, 1.0)
+    index = pachon.measure.match_positions(found.x, found.y, *PLACES.T, 1.0)
     assert sorted(index) == [0, 1, 2, 3, 4]
     true = PLACES[index]
     # Errors of a centroid are 2 sigma / S/N or so: 0.2 pixels at worst.
@@ -60,7 +60,7 @@ def test_flux_errors_are_those_of_the_aperture():
 
 def c_values(catalogue, name):
     """Values in the order of the places."""
-    index = pachon.match_positions(*PLACES.T, catalogue.x, catalogue.y, 1.0)
+    index = pachon.measure.match_positions(*PLACES.T, catalogue.x, catalogue.y, 1.0)
     return getattr(catalogue, name)[index]
 
 
@@ -95,15 +95,15 @@ def test_flags_and_neighbours():
     mask[38:43, 119:122] = 2
     mask[128:133, 35:38] = 1
     found = pachon.detect_objects(image, VARIANCE, mask, saturated=2, background_size=None)
-    flags = [int(c_flag) for c_flag in found.flags[pachon.match_positions(*places.T, found.x, found.y, 2.0)]]
+    flags = [int(c_flag) for c_flag in found.flags[pachon.measure.match_positions(*places.T, found.x, found.y, 2.0)]]
     assert flags[0] == ObjectFlag.EDGE
     assert flags[1] & flags[2] & ObjectFlag.BLENDED
     assert flags[3] == ObjectFlag.SATURATED
     assert flags[4] == ObjectFlag.MASKED
     # The neighbour's light is none of the width: with it, the area above half the peak would be twice as large.
-    pair = pachon.match_positions(*places[1:3].T, found.x, found.y, 2.0)
+    pair = pachon.measure.match_positions(*places[1:3].T, found.x, found.y, 2.0)
     np.testing.assert_allclose(found.fwhm[pair], np.sqrt(8.0 * np.log(2.0)) * SIGMA, rtol=0.05)
-    near = found.neighbour_distance[pachon.match_positions([80.0, 120.0], [80.0, 40.0], found.x, found.y, 2.0)]
+    near = found.neighbour_distance[pachon.measure.match_positions([80.0, 120.0], [80.0, 40.0], found.x, found.y, 2.0)]
     # Each piece of a blend has some of the other's light.
     assert near[0] == pytest.approx(8.0, abs=0.4)
     assert near[1] == pytest.approx(np.hypot(32.0, 40.0), abs=0.1)
@@ -131,7 +131,7 @@ def test_a_kernel_finds_fainter_objects():
     at = np.arange(-4, 5)
     kernel = np.exp(-0.5 * (at[:, None] ** 2 + at**2) / SIGMA**2)
     plain, matched = (
-        (pachon.match_positions(c.x, c.y, *places.T, 2.0) >= 0).sum()
+        (pachon.measure.match_positions(c.x, c.y, *places.T, 2.0) >= 0).sum()
         for c in (
             pachon.detect_objects(image, VARIANCE, background_size=None, kernel=k, threshold=4.0, min_area=3)
             for k in (None, kernel)
@@ -180,11 +180,11 @@ def test_tables(found, tmp_path, ending):
 )
 def test_bad_input_is_one_clear_line(change, message):
     good = {"image": image_of(), "variance": VARIANCE}
-    with pytest.raises(pachon.DomainError, match=message) as caught:
+    with pytest.raises(pachon.errors.DomainError, match=message) as caught:
         pachon.detect_objects(**(good | change))
     assert "\n" not in str(caught.value)
 
 
 def test_zero_points_are_finite(found):
-    with pytest.raises(pachon.DomainError, match="zero_point = nan"):
+    with pytest.raises(pachon.errors.DomainError, match="zero_point = nan"):
         found.table(np.nan)

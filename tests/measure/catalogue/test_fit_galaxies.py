@@ -39,7 +39,7 @@ def same(one, other):
 def test_gaussians_are_recovered(gaussians, psf):
     # GalSim's own accuracy, and the PSF cut off at 16 pixels, are 1e-6.
     stamps, true = gaussians
-    fits = pachon.fit_galaxy_stamps(stamps, 1.0, psf)
+    fits = pachon.measure.fit_galaxy_stamps(stamps, 1.0, psf)
     assert fits.good.all()
     for name, values in true.items():
         scale = values if name in ("flux", "size") else 1.0
@@ -49,7 +49,7 @@ def test_gaussians_are_recovered(gaussians, psf):
 @pytest.mark.parametrize("side", [31, 33, 45])
 def test_stamps_of_any_side(render, psf, side):
     stamp = render(galsim.Gaussian(sigma=1.5, flux=3.0).shear(g1=0.1, g2=0.3), side, 0.2, -0.1)
-    fits = pachon.fit_galaxy_stamps(stamp[None], 1.0, psf)
+    fits = pachon.measure.fit_galaxy_stamps(stamp[None], 1.0, psf)
     found = [fits.flux, fits.x, fits.y, fits.size, fits.e1, fits.e2]
     np.testing.assert_allclose(np.ravel(found), [3.0, 0.2, -0.1, 1.5, 0.1, 0.3], rtol=0, atol=1e-5)
 
@@ -59,7 +59,7 @@ def test_without_psf_the_adaptive_moments_of_galsim():
     profile = galsim.Gaussian(sigma=2.1, flux=7.0).shear(g1=0.15, g2=-0.2).shift(0.3, 0.1)
     image = profile.drawImage(nx=32, ny=32, scale=1.0, method="no_pixel", dtype=float)
     moments = galsim.hsm.FindAdaptiveMom(image)
-    fits = pachon.fit_galaxy_stamps(image.array[None], 1.0, np.ones((1, 1)))
+    fits = pachon.measure.fit_galaxy_stamps(image.array[None], 1.0, np.ones((1, 1)))
     shape = moments.observed_shape
     found = [fits.e1[0], fits.e2[0], fits.size[0], fits.flux[0]]
     expected = [shape.g1, shape.g2, moments.moments_sigma, moments.moments_amp]
@@ -93,7 +93,7 @@ def test_the_minimum_is_that_of_a_brute_force_fit(profile, galaxy, render, psf):
         model = flux * (to_pixels @ spectrum @ to_pixels.T).real
         return ((stamp - model) / np.sqrt(variance))[~masked[0]]
 
-    fits = pachon.fit_galaxy_stamps(stamps, np.broadcast_to(variance, stamps.shape), psf, mask=masked)
+    fits = pachon.measure.fit_galaxy_stamps(stamps, np.broadcast_to(variance, stamps.shape), psf, mask=masked)
     assert fits.good.all()
     start = [*(TRUE[name] for name in ("flux", "x", "y")), np.log(TRUE["size"]), TRUE["e1"], TRUE["e2"]]
     for i, stamp in enumerate(stamps):
@@ -108,7 +108,7 @@ def test_the_minimum_is_that_of_a_brute_force_fit(profile, galaxy, render, psf):
 def test_errors_are_the_scatter_of_noise_realisations(galaxy, psf):
     # Standard deviations of 1000 are known to 2.2 %; the Fisher matrix is that of large S/N.
     noise = 1.0
-    fits = pachon.fit_galaxy_stamps(with_noise(galaxy, 1000, noise, 7), noise**2, psf)
+    fits = pachon.measure.fit_galaxy_stamps(with_noise(galaxy, 1000, noise, 7), noise**2, psf)
     assert fits.good.all()
     assert 60.0 < np.median(fits.snr) < 100.0
     for name in ("flux", "x", "y", "size", "e1", "e2"):
@@ -119,10 +119,10 @@ def test_errors_are_the_scatter_of_noise_realisations(galaxy, psf):
 
 def test_same_bytes_on_any_threads_and_in_any_part(galaxy, psf):
     stamps = with_noise(galaxy, 37, 8.0, 8)
-    whole = pachon.fit_galaxy_stamps(stamps, 64.0, psf, threads=1)
-    assert same(whole, pachon.fit_galaxy_stamps(stamps, 64.0, psf, threads=3))
+    whole = pachon.measure.fit_galaxy_stamps(stamps, 64.0, psf, threads=1)
+    assert same(whole, pachon.measure.fit_galaxy_stamps(stamps, 64.0, psf, threads=3))
     for i in (0, 17, 36):
-        alone = pachon.fit_galaxy_stamps(stamps[i : i + 1], 64.0, np.stack([psf]), threads=2)
+        alone = pachon.measure.fit_galaxy_stamps(stamps[i : i + 1], 64.0, np.stack([psf]), threads=2)
         part = {name: getattr(whole, name)[i : i + 1] for name in ("flux", "moments", "covariance", "chi2")}
         for name, values in part.items():
             assert np.array_equal(getattr(alone, name), values), name
@@ -130,8 +130,8 @@ def test_same_bytes_on_any_threads_and_in_any_part(galaxy, psf):
 
 def test_unit_of_the_image_does_not_matter(galaxy, psf):
     stamps = with_noise(galaxy, 5, 5.0, 9)
-    one = pachon.fit_galaxy_stamps(stamps, 25.0, psf)
-    other = pachon.fit_galaxy_stamps(1e-3 * stamps, 25e-6, psf)
+    one = pachon.measure.fit_galaxy_stamps(stamps, 25.0, psf)
+    other = pachon.measure.fit_galaxy_stamps(1e-3 * stamps, 25e-6, psf)
     np.testing.assert_allclose(other.flux, 1e-3 * one.flux, rtol=1e-9)
     np.testing.assert_allclose(other.e1, one.e1, rtol=0, atol=1e-9)
     assert np.array_equal(other.evaluations, one.evaluations)
@@ -139,7 +139,7 @@ def test_unit_of_the_image_does_not_matter(galaxy, psf):
 
 def test_point_like_galaxies_have_covariances_about_zero(render, psf):
     star = render(galsim.DeltaFunction(flux=3000.0))
-    fits = pachon.fit_galaxy_stamps(with_noise(star, 200, 2.0, 10), 4.0, psf)
+    fits = pachon.measure.fit_galaxy_stamps(with_noise(star, 200, 2.0, 10), 4.0, psf)
     assert not (fits.flags & GalaxyFlag.NOT_CONVERGED).any()
     error = fits.moments.std(axis=0) / np.sqrt(200)
     assert (np.abs(fits.moments.mean(axis=0)) < 3.5 * error).all()
@@ -205,10 +205,10 @@ def test_a_psf_for_each_galaxy(render, psf):
     profile = galsim.Gaussian(sigma=1.8, flux=5.0).shear(g1=0.2, g2=0.1)
     stamp = render(profile)
     # The whole image rotated by 90 degrees: PSF and ellipticity rotate with it.
-    fits = pachon.fit_galaxy_stamps([stamp, np.rot90(stamp)], 1.0, [psf, turned])
+    fits = pachon.measure.fit_galaxy_stamps([stamp, np.rot90(stamp)], 1.0, [psf, turned])
     np.testing.assert_allclose(fits.e1, [0.2, -0.2], rtol=0, atol=1e-5)
     np.testing.assert_allclose(fits.e2, [0.1, -0.1], rtol=0, atol=1e-5)
-    both = pachon.fit_galaxy_stamps([stamp, np.rot90(stamp)], 1.0, [turned, psf], psf_index=[1, 0])
+    both = pachon.measure.fit_galaxy_stamps([stamp, np.rot90(stamp)], 1.0, [turned, psf], psf_index=[1, 0])
     assert same(both, fits)
 
 
@@ -216,14 +216,14 @@ def test_faint_galaxies_converge(galaxy, psf):
     # S/N of 8: steps with the Fisher matrix alone took 13.9 models, and left half of the galaxies unfinished after 12.
     noise = 9.0
     stamps = with_noise(galaxy, 400, noise, 12)
-    fits = pachon.fit_galaxy_stamps(stamps, noise**2, psf)
+    fits = pachon.measure.fit_galaxy_stamps(stamps, noise**2, psf)
     assert 6.0 < np.median(fits.snr) < 10.0
     assert (fits.flags & GalaxyFlag.NOT_CONVERGED == 0).all()
     assert fits.evaluations.mean() < 11.0
-    short = pachon.fit_galaxy_stamps(stamps, noise**2, psf, solver=LevenbergMarquardt(max_evaluations=12))
+    short = pachon.measure.fit_galaxy_stamps(stamps, noise**2, psf, solver=LevenbergMarquardt(max_evaluations=12))
     assert (short.flags & GalaxyFlag.NOT_CONVERGED > 0).mean() < 0.1
     # The same minima as from many steps more.
-    long = pachon.fit_galaxy_stamps(stamps, noise**2, psf, solver=LevenbergMarquardt(300, 1e-8))
+    long = pachon.measure.fit_galaxy_stamps(stamps, noise**2, psf, solver=LevenbergMarquardt(300, 1e-8))
     both = fits.good & long.good
     lower = fits.chi2[both] - long.chi2[both]
     assert np.median(np.abs(lower)) < 1e-6
@@ -233,14 +233,14 @@ def test_faint_galaxies_converge(galaxy, psf):
 def test_fits_begin_near_earlier_ones(galaxy, psf):
     stamps = with_noise(galaxy, 50, 4.0, 13)
     other = np.rot90(psf).copy()
-    first = pachon.fit_galaxy_stamps(stamps, 16.0, other)
-    cold, warm = (pachon.fit_galaxy_stamps(stamps, 16.0, psf, start=start) for start in (None, first))
+    first = pachon.measure.fit_galaxy_stamps(stamps, 16.0, other)
+    cold, warm = (pachon.measure.fit_galaxy_stamps(stamps, 16.0, psf, start=start) for start in (None, first))
     assert warm.evaluations.sum() < 0.9 * cold.evaluations.sum()
     both = cold.good & warm.good
     assert both.mean() > 0.9
     np.testing.assert_allclose(warm.e1[both], cold.e1[both], rtol=0, atol=1e-4)
-    with pytest.raises(pachon.DomainError, match="start: 50 fits of 3 galaxies"):
-        pachon.fit_galaxy_stamps(stamps[:3], 16.0, psf, start=first)
+    with pytest.raises(pachon.errors.DomainError, match="start: 50 fits of 3 galaxies"):
+        pachon.measure.fit_galaxy_stamps(stamps[:3], 16.0, psf, start=first)
 
 
 def test_flags(galaxy, psf):
@@ -269,32 +269,32 @@ def test_flags(galaxy, psf):
     # An image sharper than the PSF allows: the bound is reached.
     point = np.zeros((1, 32, 32))
     point[0, 15, 15] = 10.0
-    assert pachon.fit_galaxy_stamps(point, 1.0, psf).flags[0] & GalaxyFlag.AT_BOUNDS
+    assert pachon.measure.fit_galaxy_stamps(point, 1.0, psf).flags[0] & GalaxyFlag.AT_BOUNDS
 
 
 def test_masked_pixels_may_hold_anything(galaxy, psf):
     stamps, mask = galaxy[None].copy(), np.zeros((1, 32, 32), dtype=bool)
     mask[0, 4, 5:8] = True
     variance = np.ones(stamps.shape)
-    before = pachon.fit_galaxy_stamps(stamps, variance, psf, mask=mask)
+    before = pachon.measure.fit_galaxy_stamps(stamps, variance, psf, mask=mask)
     stamps[mask], variance[mask] = [np.nan, np.inf, 1e30], [-1.0, np.nan, 0.0]
-    assert same(before, pachon.fit_galaxy_stamps(stamps, variance, psf, mask=mask))
+    assert same(before, pachon.measure.fit_galaxy_stamps(stamps, variance, psf, mask=mask))
 
 
 def test_usable_galaxies_are_large_and_well_measured(galaxy, psf):
     stamps = np.concatenate([with_noise(galaxy, 2, 1.0, 12), with_noise(galaxy, 2, 60.0, 13)])
-    fits = pachon.fit_galaxy_stamps(stamps, np.repeat([1.0, 3600.0], 2)[:, None, None] * np.ones((32, 32)), psf)
+    fits = pachon.measure.fit_galaxy_stamps(stamps, np.repeat([1.0, 3600.0], 2)[:, None, None] * np.ones((32, 32)), psf)
     error = np.sqrt(0.5 * (fits.e1_error**2 + fits.e2_error**2))
     assert (error[:2] < 0.2).all()
     assert not (error[2:] < 0.2).any()
-    usable = pachon.usable_galaxies(fits, [2.5, 2.3, 2.5, 2.5], [1.9, 2.0, 2.1])  # 1.2 times 2.0 is 2.4
+    usable = pachon.measure.usable_galaxies(fits, [2.5, 2.3, 2.5, 2.5], [1.9, 2.0, 2.1])  # 1.2 times 2.0 is 2.4
     assert usable.tolist() == [True, False, False, False]
-    assert pachon.usable_galaxies(fits, [2.5] * 4, 2.0, least_ratio=1.3).sum() == 0
-    assert pachon.usable_galaxies(fits, [np.nan] * 4, 2.0).sum() == 0
+    assert pachon.measure.usable_galaxies(fits, [2.5] * 4, 2.0, least_ratio=1.3).sum() == 0
+    assert pachon.measure.usable_galaxies(fits, [np.nan] * 4, 2.0).sum() == 0
 
 
 def test_tables_have_units_and_descriptions(galaxy, psf, tmp_path):
-    fits = pachon.fit_galaxy_stamps(with_noise(galaxy, 3, 1.0, 14), 1.0, psf)
+    fits = pachon.measure.fit_galaxy_stamps(with_noise(galaxy, 3, 1.0, 14), 1.0, psf)
     write_table(tmp_path / "fits.ecsv", fits.table())
     table = Table.read(tmp_path / "fits.ecsv", format="ascii.ecsv")
     assert table["size"].unit == "pix"
@@ -326,7 +326,7 @@ def test_pixels_without_weight_have_no_say(psf):
         fits = pachon.fit_galaxies(other_image, other_variance, **options)
         assert fits.moments.tobytes() == masked.moments.tobytes()
         assert fits.pixels == masked.pixels
-        stamps = pachon.fit_galaxy_stamps(other_image[None], other_variance[None], psf)
+        stamps = pachon.measure.fit_galaxy_stamps(other_image[None], other_variance[None], psf)
         assert stamps.pixels[0] == (~bad).sum()
     complete = pachon.fit_galaxies(image, variance, **options)
     assert abs(masked.e1[0] - complete.e1[0]) < complete.e1_error[0]
@@ -360,7 +360,7 @@ DOT = np.ones((1, 1))
 )
 def test_bad_input_is_one_clear_line(change, message):
     good = {"image": IMAGE, "variance": np.ones((40, 50)), "x": [9.0], "y": [8.0], "psf_images": DOT}
-    with pytest.raises(pachon.DomainError, match=message) as caught:
+    with pytest.raises(pachon.errors.DomainError, match=message) as caught:
         pachon.fit_galaxies(**(good | {"half_light_radius": 2.0} | change))
     assert "\n" not in str(caught.value)
 
@@ -375,5 +375,5 @@ def test_bad_input_is_one_clear_line(change, message):
 )
 def test_bad_limits_of_usable_galaxies(arguments, message):
     none = pachon.fit_galaxies(IMAGE, np.ones((40, 50)), [], [], DOT, half_light_radius=1.0)
-    with pytest.raises(pachon.DomainError, match=message):
-        pachon.usable_galaxies(none, *arguments)
+    with pytest.raises(pachon.errors.DomainError, match=message):
+        pachon.measure.usable_galaxies(none, *arguments)

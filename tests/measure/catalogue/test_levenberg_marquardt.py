@@ -57,10 +57,10 @@ def test_chi_square_never_rises(psf):
     [({"max_evaluations": 0}, "max_evaluations = 0"), ({"tolerance": -1.0}, "tolerance = -1")],
 )
 def test_a_solver_that_never_ends_is_refused(options, message):
-    with pytest.raises(pachon.DomainError, match=message):
+    with pytest.raises(pachon.errors.DomainError, match=message):
         LevenbergMarquardt(**options)
 
 
 def test_options_of_before_are_told_where_they_are():
-    with pytest.raises(pachon.ConfigError, match=r"expected solver=LevenbergMarquardt\(max_evaluations=...\)"):
-        pachon.fit_galaxy_stamps(np.zeros((1, 9, 9)), 1.0, np.ones((1, 1)), max_evaluations=2)
+    with pytest.raises(pachon.errors.ConfigError, match=r"expected solver=LevenbergMarquardt\(max_evaluations=...\)"):
+        pachon.measure.fit_galaxy_stamps(np.zeros((1, 9, 9)), 1.0, np.ones((1, 1)), max_evaluations=2)

@@ -124,14 +124,14 @@ def test_completeness_counts_stars_that_are_bright_enough():
 def test_no_locus_is_one_clear_line():
     objects, _ = catalogue(n_stars=5, n_galaxies=3)
     with pytest.raises(
-        pachon.DomainError, match=r"no stellar locus: \d bright objects without flags, expected at least 10"
+        pachon.errors.DomainError, match=r"no stellar locus: \d bright objects without flags, expected at least 10"
     ):
         pachon.select_stars(objects, IMAGE)
     galaxies, _ = catalogue(n_stars=0)
     message = (
         r"no stellar locus: \d+ of \d+ bright objects within 8 % of a half-light radius of [\d.]+ pixels, expected"
     )
-    with pytest.raises(pachon.DomainError, match=message):
+    with pytest.raises(pachon.errors.DomainError, match=message):
         pachon.select_stars(galaxies, IMAGE)
 
 
@@ -147,23 +147,25 @@ def test_no_locus_is_one_clear_line():
 )
 def test_bad_options(options, message):
     objects, _ = catalogue()
-    with pytest.raises(pachon.DomainError, match=message):
+    with pytest.raises(pachon.errors.DomainError, match=message):
         pachon.select_stars(**({"objects": objects, "image": IMAGE} | options))
 
 
 def test_bad_searches_of_the_locus():
     objects, _ = catalogue()
-    with pytest.raises(pachon.DomainError, match=r"^bright_snr = -1"):
-        pachon.LocusSearch(bright_snr=-1.0)
-    with pytest.raises(pachon.DomainError, match=r"^radius_range = 0"):
-        pachon.LocusSearch(radius_range=(0.0, 3.0))
-    with pytest.raises(pachon.ConfigError, match=r"^min_stars: no argument of .*; expected locus=LocusSearch\(min_s"):
+    with pytest.raises(pachon.errors.DomainError, match=r"^bright_snr = -1"):
+        pachon.measure.LocusSearch(bright_snr=-1.0)
+    with pytest.raises(pachon.errors.DomainError, match=r"^radius_range = 0"):
+        pachon.measure.LocusSearch(radius_range=(0.0, 3.0))
+    with pytest.raises(
+        pachon.errors.ConfigError, match=r"^min_stars: no argument of .*; expected locus=LocusSearch\(min_s"
+    ):
         pachon.select_stars(objects, IMAGE, min_stars=3)
 
 
 def test_truth_of_another_shape():
     objects, star = catalogue()
-    with pytest.raises(pachon.DomainError, match="is_star has shape"):
+    with pytest.raises(pachon.errors.DomainError, match="is_star has shape"):
         pachon.select_stars(objects, IMAGE).purity(star[1:])
 
 
@@ -190,7 +192,7 @@ def starry():
 
 def test_stars_of_an_image(starry):
     _, objects, stars, places, is_star = starry
-    match = pachon.match_positions(objects.x, objects.y, *places.T, 1.5)
+    match = pachon.measure.match_positions(objects.x, objects.y, *places.T, 1.5)
     truth = (match >= 0) & is_star[match]
     assert truth.sum() == 36
     assert stars.completeness(truth) > 0.9

@@ -54,7 +54,7 @@ def test_the_maps_are_the_functionals_of_stamps(gaussian, psf_covariances, psfs)
     image = gaussian(GALAXY + psf_covariances[0], SIDE, 0.8, 0.1)
     maps = detector.maps(image, 0)
     at = detector.functionals(maps, np.array([MIDDLE]), np.array([MIDDLE]))[0]
-    estimator = pachon.ShearEstimator(psfs[0], SCALE, 1.0)
+    estimator = pachon.measure.ShearEstimator(psfs[0], SCALE, 1.0)
     stamp = image[MIDDLE - 32 : MIDDLE + 32, MIDDLE - 32 : MIDDLE + 32]
     np.testing.assert_allclose(at[:6], estimator.moments(stamp[None], [[0.5, 0.5]])[0], atol=3e-6)
     right = estimator.moments(stamp[None], [[1.5, 0.5]])[0]
@@ -111,16 +111,16 @@ def test_blends_are_in_the_response(gaussian, psf_covariances, psfs):
     g, noise = 0.01, 1e-3
     found = {
         sign: [
-            pachon.detect_shear(
+            pachon.measure.detect_shear(
                 blended_pairs(gaussian, psf_covariances[0], turn, sign * g), psfs[0], SCALE, noise, min_snr=5.0
             )
             for turn in (0.0, 0.5 * np.pi)
         ]
         for sign in (1.0, -1.0)
     }
-    plus, minus = (pachon.ShearShapes.joined([peaks.shapes for peaks in found[sign]]) for sign in (1.0, -1.0))
+    plus, minus = (pachon.measure.ShearShapes.joined([peaks.shapes for peaks in found[sign]]) for sign in (1.0, -1.0))
     cell = [np.concatenate([peaks.y // 56 for peaks in found[sign]]).astype(int) for sign in (1.0, -1.0)]
-    bias = pachon.shear_bias(plus, minus, g, 0.0, patch=cell[0], minus_patch=cell[1])
+    bias = pachon.measure.shear_bias(plus, minus, g, 0.0, patch=cell[0], minus_patch=cell[1])
     assert bias.m_error[0] < 0.02
     assert abs(bias.m[0]) < 3.0 * bias.m_error[0]
     # Pixels about a peak share its weight.
@@ -131,12 +131,12 @@ def test_blends_are_in_the_response(gaussian, psf_covariances, psfs):
 def test_no_byte_depends_on_threads_and_masked_peaks_are_left_out(gaussian, psf_covariances, psfs):
     rng = np.random.default_rng(4)
     image = blended_pairs(gaussian, psf_covariances[0], 0.0, 0j, cells=6) + 1e-3 * rng.standard_normal((336, 336))
-    one, two = (pachon.detect_shear(image, psfs[0], SCALE, 1e-3, seed=1, threads=n) for n in (1, 2))
+    one, two = (pachon.measure.detect_shear(image, psfs[0], SCALE, 1e-3, seed=1, threads=n) for n in (1, 2))
     for name in ("x", "y", "e1", "weight"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
     mask = np.zeros(image.shape, dtype=int)
     mask[100:180, 100:180] = 1
-    masked = pachon.detect_shear(np.where(mask, np.nan, image), psfs[0], SCALE, 1e-3, mask=mask, seed=1)
+    masked = pachon.measure.detect_shear(np.where(mask, np.nan, image), psfs[0], SCALE, 1e-3, mask=mask, seed=1)
     assert 0 < len(masked) < len(one)
     # Four widths of the weight of 2.6 pixels.
     near = (masked.x > 89) & (masked.x < 191) & (masked.y > 89) & (masked.y < 191)
@@ -153,9 +153,9 @@ def test_psfs_of_parts_of_an_image(gaussian, psf_covariances, psfs):
     halves = [blended_pairs(gaussian, c, 0.0, 0j, cells=8) for c in psf_covariances]
     image = np.concatenate([halves[0][:, :256], halves[1][:, 256:]], axis=1)
     places = [[100.0, 200.0], [400.0, 200.0]]
-    found = pachon.detect_shear(image, psfs, SCALE, noise, psf_positions=places)
+    found = pachon.measure.detect_shear(image, psfs, SCALE, noise, psf_positions=places)
     for k, inside in enumerate((found.x < 220, found.x > 290)):
-        alone = pachon.detect_shear(halves[k], psfs[k], SCALE, noise)
+        alone = pachon.measure.detect_shear(halves[k], psfs[k], SCALE, noise)
         rows = (alone.x < 220) if k == 0 else (alone.x > 290)
         np.testing.assert_array_equal(found.x[inside], alone.x[rows])
         np.testing.assert_allclose(found.e1[inside], alone.e1[rows], atol=1e-6)
@@ -165,8 +165,8 @@ def test_pixels_that_are_not_finite_are_those_of_the_mask(psfs):
     image = np.random.default_rng(3).normal(0.0, 1.0, (100, 100))
     masked = np.zeros((100, 100), dtype=bool)
     masked[40:44, 50:53] = True
-    by_mask = pachon.detect_shear(image, psfs[0], SCALE, 1.0, mask=masked, seed=1)
-    by_value = pachon.detect_shear(np.where(masked, np.nan, image), psfs[0], SCALE, 1.0, seed=1)
+    by_mask = pachon.measure.detect_shear(image, psfs[0], SCALE, 1.0, mask=masked, seed=1)
+    by_value = pachon.measure.detect_shear(np.where(masked, np.nan, image), psfs[0], SCALE, 1.0, seed=1)
     assert by_value.x.tobytes() == by_mask.x.tobytes()
     assert by_value.shapes.e1.tobytes() == by_mask.shapes.e1.tobytes()
 
@@ -182,6 +182,6 @@ def test_bad_input_is_one_line(psfs):
         ((image, psfs[0], SCALE, 1.0), {"sigma": 1.2 * SCALE}, "too wide for a weight of sigma = 1.20 pixels"),
     ):
         with pytest.raises(DomainError, match=message) as problem:
-            pachon.detect_shear(*arguments, **options)
+            pachon.measure.detect_shear(*arguments, **options)
         assert "\n" not in str(problem.value)
-    assert len(pachon.detect_shear(image, psfs[0], SCALE, 1.0)) == 0
+    assert len(pachon.measure.detect_shear(image, psfs[0], SCALE, 1.0)) == 0

@@ -31,7 +31,7 @@ def sheared(covariance, g1, g2):
 
 
 def test_functionals_of_gaussians_under_elliptical_psfs(gaussian, psf_covariances, psfs):
-    estimator = pachon.ShearEstimator(psfs, SCALE, 1.0)
+    estimator = pachon.measure.ShearEstimator(psfs, SCALE, 1.0)
     rng = np.random.default_rng(1)
     offsets, psf_index = rng.uniform(-1.0, 1.0, (6, 2)), np.arange(6) % 2
     stamps = [
@@ -43,13 +43,13 @@ def test_functionals_of_gaussians_under_elliptical_psfs(gaussian, psf_covariance
 
 
 def test_stamps_of_any_sampling_and_an_odd_side(gaussian, psf_covariances, psfs):
-    estimator = pachon.ShearEstimator(psfs[0], SCALE, 1.0, side=45)
+    estimator = pachon.measure.ShearEstimator(psfs[0], SCALE, 1.0, side=45)
     stamps = gaussian(GALAXY + psf_covariances[0], 45, 0.3, 0.1)[None]
     np.testing.assert_allclose(estimator.moments(stamps, [[0.3, 0.1]])[0], functionals_of_gaussian(GALAXY), atol=3e-6)
 
 
 def test_functionals_are_linear_and_no_byte_depends_on_threads_or_batches(psfs):
-    estimator = pachon.ShearEstimator(psfs, SCALE, 1.0)
+    estimator = pachon.measure.ShearEstimator(psfs, SCALE, 1.0)
     rng = np.random.default_rng(2)
     one, two = rng.standard_normal((2, 300, SIDE, SIDE))
     offsets, psf_index = rng.uniform(-0.5, 0.5, (300, 2)), rng.integers(0, 2, 300)
@@ -68,8 +68,8 @@ def test_responses_are_the_derivatives_of_drawn_galaxies(gaussian, psf_covarianc
     stamps = np.stack([gaussian(g + psf_covariances[0]) for g in galaxies])
     moment = functionals_of_gaussian(GALAXY)[0]
     # With a limit, the S/N is in the middle of the range in which the weight rises.
-    noise = moment / 22.0 / np.sqrt(pachon.ShearEstimator(psfs[0], SCALE, 1.0).covariance[0, 0, 0])
-    estimator = pachon.ShearEstimator(psfs[0], SCALE, noise)
+    noise = moment / 22.0 / np.sqrt(pachon.measure.ShearEstimator(psfs[0], SCALE, 1.0).covariance[0, 0, 0])
+    estimator = pachon.measure.ShearEstimator(psfs[0], SCALE, noise)
     moments = estimator.moments(stamps, np.zeros((5, 2)))
     shapes = estimator.ellipticity_and_response(moments, min_snr=min_snr)
     assert shapes.snr[0] == pytest.approx(22.0, rel=1e-4)
@@ -80,7 +80,7 @@ def test_responses_are_the_derivatives_of_drawn_galaxies(gaussian, psf_covarianc
 
 
 def test_a_point_source_has_no_response(psfs):
-    estimator = pachon.ShearEstimator(psfs[0], SCALE, 1e-3)
+    estimator = pachon.measure.ShearEstimator(psfs[0], SCALE, 1e-3)
     stamp = np.zeros((1, SIDE, SIDE))
     stamp[0, 17:48, 17:48] = psfs[0]
     shapes = estimator.ellipticity_and_response(estimator.moments(stamp, [[0.5, 0.5]]))
@@ -90,7 +90,7 @@ def test_a_point_source_has_no_response(psfs):
 @pytest.mark.long
 def test_the_covariance_of_the_noise_is_that_of_drawn_noise(psfs):
     noise, n = 3.0, 6000
-    estimator = pachon.ShearEstimator(psfs[0], SCALE, noise, side=40)
+    estimator = pachon.measure.ShearEstimator(psfs[0], SCALE, noise, side=40)
     rng = np.random.default_rng(3)
     stamps = noise * rng.standard_normal((n, 40, 40), np.float32)
     drawn = np.cov(estimator.moments(stamps, rng.uniform(-0.5, 0.5, (n, 2))).T)
@@ -101,7 +101,7 @@ def test_the_covariance_of_the_noise_is_that_of_drawn_noise(psfs):
 
 
 def test_added_noise_is_rotated_and_independent_of_that_of_the_derivatives(psfs):
-    covariance = pachon.ShearEstimator(psfs, SCALE, 2.0).covariance
+    covariance = pachon.measure.ShearEstimator(psfs, SCALE, 2.0).covariance
     measured, derivatives, turn = np.arange(3), np.arange(1, 6), np.diag([1.0, -1.0, -1.0])
     for c, added, subtracted in zip(covariance, *renoising(covariance, measured, derivatives, turn), strict=True):
         scale = np.sqrt(np.diag(c))
@@ -122,8 +122,8 @@ def test_noise_and_selection_do_not_bias_the_shear(gaussian, psf_covariances, ps
     angles = np.pi * np.arange(10) / 10
     turns = [np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) for a in angles]
     noise = functionals_of_gaussian(GALAXY)[0] / 6.0
-    estimator = pachon.ShearEstimator(psfs[1], SCALE, noise)
-    estimator = pachon.ShearEstimator(psfs[1], SCALE, noise**2 / np.sqrt(estimator.covariance[0, 0, 0]))
+    estimator = pachon.measure.ShearEstimator(psfs[1], SCALE, noise)
+    estimator = pachon.measure.ShearEstimator(psfs[1], SCALE, noise**2 / np.sqrt(estimator.covariance[0, 0, 0]))
     flux = rng.uniform(0.5, 2.0, n)
     galaxy = rng.integers(0, 10, n)
     drawn_noise = rng.standard_normal((n, 6)) @ np.linalg.cholesky(estimator.covariance[0]).T
@@ -137,7 +137,7 @@ def test_noise_and_selection_do_not_bias_the_shear(gaussian, psf_covariances, ps
             for k, s in enumerate((1.0, -1.0))
         ]
         sums.append(type(parts[0])(*(np.stack([getattr(p, c) for p in parts], 1).mean(1) for c in parts[0]._table)))
-    bias = pachon.shear_bias(*sums, g, 0.0)
+    bias = pachon.measure.shear_bias(*sums, g, 0.0)
     assert bias.m_error[0] < 4e-3
     assert abs(bias.m[0]) < 4.0 * bias.m_error[0] + 2.0 * g**2
     assert (np.abs(bias.c) < 4.0 * bias.c_error).all()
@@ -148,7 +148,7 @@ def test_noise_and_selection_do_not_bias_the_shear(gaussian, psf_covariances, ps
             np.stack([functionals_of_gaussian(sheared(t @ GALAXY @ t.T, s * g, 0.0)) for t in turns]) for s in (1, -1)
         )
     ]
-    assert abs(pachon.shear_bias(*wrong, g, 0.0).m[0]) > 0.03
+    assert abs(pachon.measure.shear_bias(*wrong, g, 0.0).m[0]) > 0.03
 
 
 def test_bad_input_is_one_line(gaussian, psfs):
@@ -171,9 +171,9 @@ def test_bad_input_is_one_line(gaussian, psfs):
     for change, message in cases:
         arguments = {"psf_images": psfs, "pixel_scale": SCALE, "noise": 1.0} | change
         with pytest.raises(DomainError, match=message) as problem:
-            pachon.ShearEstimator(**arguments)
+            pachon.measure.ShearEstimator(**arguments)
         assert "\n" not in str(problem.value)
-    estimator = pachon.ShearEstimator(psfs, SCALE, 1.0)
+    estimator = pachon.measure.ShearEstimator(psfs, SCALE, 1.0)
     stamps, offsets = np.zeros((2, SIDE, SIDE)), np.zeros((2, 2))
     for arguments, message in (
         ((stamps, offsets, None), "psf_index: expected the PSF of each galaxy, as there are 2"),

@@ -151,7 +151,7 @@ def test_itl_ccds_are_bowls(rows):
 
 
 def test_corner_sensors_stand_on_either_side_of_the_focus(rows):
-    sensors = {s.name: s for s in pachon.corner_sensors("lsstcam")}
+    sensors = {s.name: s for s in pachon.models.corner_sensors("lsstcam")}
     assert len(sensors) == 16
     assert {s.raft for s in sensors.values()} == {"R00", "R04", "R40", "R44"}
     for name, sensor in sensors.items():
@@ -179,7 +179,7 @@ def test_corner_sensors_stand_on_either_side_of_the_focus(rows):
 def test_corner_sensors_have_the_zernikes_of_the_file(rows):
     galsim = pytest.importorskip("galsim")
     rng = np.random.default_rng(6)
-    for sensor in pachon.corner_sensors():
+    for sensor in pachon.models.corner_sensors():
         x0, y0, *_, radius, zernikes = rows[sensor.name]
         x, y = points_within(rows[sensor.name], rng, 40)
         expected = -1e-3 * galsim.zernike.Zernike([0.0, *zernikes[1:]], radius)(x - x0, y - y0)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from pachon import Camera, PachonError, load_camera
+from pachon import PachonError, load_camera
+from pachon.models import Camera
 from pachon.models.camera.lsst import lsst_camera
 
 PIXEL = 15e-6

@@ -13,7 +13,7 @@ KINDS = ("wavefront", "guider")
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_sensors_stand_where_metrology_has_them(kind):
-    measured = {s.name: s.center for s in pachon.corner_sensors("lsstcam") if s.kind == kind}
+    measured = {s.name: s.center for s in pachon.models.corner_sensors("lsstcam") if s.kind == kind}
     camera = corner_focal_plane(kind).camera
     assert sorted(camera.ccd_names) == sorted(measured)
     assert list(camera.ccd_names) == sorted(camera.ccd_names)
@@ -45,7 +45,7 @@ def test_measured_heights_are_those_of_each_sensor(kind):
     plane = corner_focal_plane(kind, "lsstcam")
     assert plane.measured.all()
     rng = np.random.default_rng(3)
-    for sensor in pachon.corner_sensors("lsstcam"):
+    for sensor in pachon.models.corner_sensors("lsstcam"):
         if sensor.kind == kind:
             # Within the squares and the measured part.
             reach = np.minimum((0.5 * plane.camera.shortest_side), np.array(sensor.half_size)) - 0.5e-3

@@ -4,7 +4,7 @@ import trimesh
 from astropy import units as u
 from astropy.table import Table
 
-from pachon.core.errors import DomainError, UnknownNameError
+from pachon.core.errors import ConfigError, DomainError, UnknownNameError
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.camera.height_budget import SIMULATED, SPECIFICATION, TERMS, HeightBudget
 from pachon.models.camera.lsst import lsst_camera
@@ -288,7 +288,7 @@ def test_bad_tables_are_refused(table, expected):
 def test_bad_arguments_are_refused():
     with pytest.raises(UnknownNameError, match="unknown height term 'potato': did you mean potato_chip"):
         FocalPlane.from_budget("lsst", seed=1, terms=["potato"])
-    with pytest.raises(UnknownNameError, match="unknown height budget 'simulation': did you mean simulated"):
+    with pytest.raises(ConfigError, match=r"budget = 'simulation': expected .*; did you mean simulated"):
         FocalPlane.from_budget("lsst", seed=1, budget="simulation")
     with pytest.raises(UnknownNameError, match="unknown camera"):
         FocalPlane.from_budget("lst", seed=1)

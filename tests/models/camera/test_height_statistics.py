@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pachon import FocalPlane, height_statistics
+from pachon import FocalPlane
+from pachon.models import height_statistics
 from pachon.models.camera.camera import Camera
 from pachon.models.camera.ccd_surfaces import CcdSurfaces
 from pachon.models.camera.lsst import lsst_camera

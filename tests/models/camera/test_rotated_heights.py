@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from pachon import Camera, FocalPlane, height_statistics
+from pachon import FocalPlane
+from pachon.models import Camera, height_statistics
 from pachon.models.camera.ccd_surfaces import CcdSurfaces
 from pachon.models.shapes.shape import Plane
 from pachon.models.surface import Interaction, Surface

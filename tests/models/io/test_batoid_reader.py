@@ -180,7 +180,7 @@ def test_lenient_does_not_take_what_it_cannot_trace(loaded):
         (lambda t: t.with_shape("M1", Biconic(9.0, 8.0)), "lsst_v3.3_r: surface M1: shape Biconic: expected"),
         (lambda t: replace(t, object_distance=100.0), "object_distance = 100.0"),
         (lambda t: replace(t, surfaces=t.surfaces[:-1], groups={}, group_frames={}), "needs a detector"),
-        (lambda t: t.with_obstructions(pachon.Obstruction("top", np.eye(3)[None])), "obstruction top"),
+        (lambda t: t.with_obstructions(pachon.models.Obstruction("top", np.eye(3)[None])), "obstruction top"),
         (
             lambda t: replace(
                 t,

@@ -91,7 +91,7 @@ def test_no_character_but_line_ends_divides_lines(tmp_path, character):
     # A name has no control characters; the comment is no line of its own, whatever becomes of it.
     try:
         telescope = pachon.load_telescope(written(tmp_path, lens, "lens.zmx"))
-    except pachon.PrescriptionError as error:
+    except pachon.errors.PrescriptionError as error:
         pytest.fail(str(error))
     assert len(telescope.surfaces) == 3
     codev = f"RDM;LEN ! a{character}XXX b\nEPD 5\nWL 550\nSO 0 1e13\nS 100 3 NBK7\n  STO\nS 0 50\nSI 0 0\nGO\n"
@@ -133,7 +133,7 @@ def test_one_bad_catalogue_does_not_block_the_others(tmp_path, monkeypatch):
     texts = [str(w.message) for w in caught]
     for part in ("nowhere: expected an AGF file", "a.agf: expected a glass catalogue", "b.agf: not a text file"):
         assert any(part in text for text in texts), part
-    with pytest.warns(PrescriptionNote), pytest.raises(pachon.PrescriptionError, match="in no catalogue"):
+    with pytest.warns(PrescriptionNote), pytest.raises(pachon.errors.PrescriptionError, match="in no catalogue"):
         pachon.load_telescope(written(tmp_path, LENS.format(glass="NOGLASS"), "none.zmx"))
     # A lens of bundled glasses does not ask for them.
     with warnings.catch_warnings():
@@ -166,5 +166,5 @@ def test_an_index_of_at_most_one(tmp_path, glass, index):
 def test_a_wavelength_that_a_glass_does_not_cover_names_it(tmp_path):
     lens = LENS.format(glass="B270").replace("WAVM 1 0.55 1", "WAVM 1 1.55 1")
     assert pachon.load_telescope(written(tmp_path, lens, "lens.zmx")).wavelength_range[1] == pytest.approx(2.5e-6)
-    with pytest.raises(pachon.DomainError, match=r"2600 nm: expected 334 to 2500 nm for glass B270"):
+    with pytest.raises(pachon.errors.DomainError, match=r"2600 nm: expected 334 to 2500 nm for glass B270"):
         GlassCatalogue.bundled()["B270"].index(2.6e-6)

@@ -37,7 +37,7 @@ def lens(tmp_path):
 
 
 def test_they_are_read_and_written_exactly(lens, tmp_path):
-    assert lens.surface("S1").coating == pachon.LayerStack((1.38,), (99.6e-9,), "quarter")
+    assert lens.surface("S1").coating == pachon.models.LayerStack((1.38,), (99.6e-9,), "quarter")
     assert lens.surface("S2").coating.efficiencies == (0.99, 0.97)
     assert lens.surface("Image").coating.angles == pytest.approx((0.0, np.deg2rad(40.0)))
     for format in ("pachon", "batoid"):
@@ -49,20 +49,20 @@ def test_they_are_read_and_written_exactly(lens, tmp_path):
 
 
 def test_throughput_and_ghosts_take_them(lens):
-    found = pachon.throughput(lens, [(0.0, 0.0)], [500e-9])
-    same = pachon.throughput(
-        lens, [(0.0, 0.0)], [500e-9], coatings=pachon.Coatings({s.name: s.coating for s in lens.surfaces})
+    found = pachon.design.throughput(lens, [(0.0, 0.0)], [500e-9])
+    same = pachon.design.throughput(
+        lens, [(0.0, 0.0)], [500e-9], coatings=pachon.design.Coatings({s.name: s.coating for s in lens.surfaces})
     )
     assert found.value == pytest.approx(same.value, rel=1e-14)
     # On the axis: a film with r = (n - m^2) / (n + m^2) at its own wavelength, then both tables; rays are not steep.
-    at_film = pachon.throughput(lens, [(0.0, 0.0)], [4 * 1.38 * 99.6e-9]).value
+    at_film = pachon.design.throughput(lens, [(0.0, 0.0)], [4 * 1.38 * 99.6e-9]).value
     film = 1.0 - ((1.5 - 1.38**2) / (1.5 + 1.38**2)) ** 2
     mean = 4 * 1.38 * 99.6
     tables = (0.99 - 0.02 * (mean - 400) / 400) * (0.9 - 0.2 * (mean - 400) / 400)
     assert at_film == pytest.approx(film * tables, rel=2e-3)
     # One that is given takes the place of the surface's own.
-    given = pachon.Coatings({"S1": pachon.Coating((4e-7, 8e-7), (0.5, 0.5))})
-    other = pachon.throughput(lens, [(0.0, 0.0)], [4 * 1.38 * 99.6e-9], coatings=given)
+    given = pachon.design.Coatings({"S1": pachon.models.Coating((4e-7, 8e-7), (0.5, 0.5))})
+    other = pachon.design.throughput(lens, [(0.0, 0.0)], [4 * 1.38 * 99.6e-9], coatings=given)
     assert other.value == pytest.approx(at_film * 0.5 / film, rel=1e-3)
     ghost = pachon.ghosts(lens, field=(0.0, 0.0), wavelength=550e-9)
     bare = pachon.ghosts(lens.with_coatings({}), field=(0.0, 0.0), wavelength=550e-9)

@@ -147,7 +147,9 @@ def test_a_pupil_of_another_origin_is_written_as_a_plane(tmp_path):
 
     telescope = lens(tmp_path)
     other = replace(telescope, stop_z=telescope.stop_z + 0.01).with_design(aiming="off")
-    with pytest.warns(pachon.PrescriptionWarning, match="do not make the pupil; a plane in front carries the stop$"):
+    with pytest.warns(
+        pachon.errors.PrescriptionWarning, match="do not make the pupil; a plane in front carries the stop$"
+    ):
         save_telescope(other, tmp_path / "again.zmx")
     again = load_telescope(tmp_path / "again.zmx")
     assert again.stop_z == pytest.approx(other.stop_z, abs=1e-16)
@@ -166,11 +168,11 @@ def rays_of(telescope, field):
 @pytest.mark.parametrize("aperture", ["ENPD 2", "FNUM 3 0", "FLOA"])
 def test_a_changed_lens_whose_rays_are_aimed_keeps_stop_and_aiming(tmp_path, aperture, ending):
     """A change moves the image of the stop and makes the focal ratio untrue; the rays of the file are the same."""
-    telescope = pachon.apply_changes(
+    telescope = pachon.models.apply_changes(
         lens(tmp_path, aperture=aperture).with_design(vignetting=(), aiming="real"),
         {"front.radius_mm": 20.0, "front.n": 0.03, "front.abbe": -4.0},
     )
-    with pytest.warns(pachon.PrescriptionWarning, match="a formula is fitted, within"):
+    with pytest.warns(pachon.errors.PrescriptionWarning, match="a formula is fitted, within"):
         save_telescope(telescope, tmp_path / f"again.{ending}")
     again = load_telescope(tmp_path / f"again.{ending}")
     assert (again.design_data.stop, again.design_data.aiming) == ("iris", "real")
@@ -211,7 +213,7 @@ def test_an_aimed_stop_of_a_near_object_is_kept(tmp_path, aperture, ending):
 def test_an_aimed_stop_that_cannot_be_written_is_a_warning(tmp_path):
     """Field angles of a near object are those at the pupil, which must not move then."""
     telescope = lens(tmp_path, kind=0, distance="100").perturbed("front", shift=(0.0, 0.0, 1e-3))
-    with pytest.warns(pachon.PrescriptionWarning, match="stop = iris, aiming = real: .* rays are not aimed"):
+    with pytest.warns(pachon.errors.PrescriptionWarning, match="stop = iris, aiming = real: .* rays are not aimed"):
         save_telescope(telescope.with_design(aiming="real"), tmp_path / "again.zmx")
 
 

@@ -27,13 +27,14 @@ def spectrograph(curved=True):
     surfaces = [
         pachon.Surface("front", pachon.Interaction.REFRACT, pachon.Plane(), (0.0, 0.0, 0.3), glass),
         pachon.Surface("back", pachon.Interaction.REFRACT, pachon.Plane(), (0.0, 0.0, 0.295), VACUUM,
-                       grating=pachon.Grating(-1, 90.0, 0.25)),
+                       grating=pachon.models.Grating(-1, 90.0, 0.25)),
         pachon.Surface("air", pachon.Interaction.REFRACT, pachon.Plane(), (0.0, 0.0, 0.25), VACUUM,
-                       pachon.Circle(0.05), axes(2.0, -3.0, 0.0), grating=pachon.Grating(1, 60.0)),
+                       pachon.models.Circle(0.05), axes(2.0, -3.0, 0.0), grating=pachon.models.Grating(1, 60.0)),
         pachon.Surface("ruled", pachon.Interaction.MIRROR, shape, (0.001, -0.002, 0.0), VACUUM,
-                       pachon.Circle(0.06), axes(12.0, -6.0, 5.0), grating=pachon.Grating(2, 123.4, -0.35)),
+                       pachon.models.Circle(0.06), axes(12.0, -6.0, 5.0),
+                       grating=pachon.models.Grating(2, 123.4, -0.35)),
         pachon.Surface("second", pachon.Interaction.MIRROR, pachon.Plane(), (0.09, -0.13, 0.25), VACUUM,
-                       rotation=axes(8.0, -4.0, 0.0), grating=pachon.Grating(-3, 77.0, 2.9)),
+                       rotation=axes(8.0, -4.0, 0.0), grating=pachon.models.Grating(-3, 77.0, 2.9)),
         pachon.Surface("Detector", pachon.Interaction.DETECTOR, pachon.Plane(), (0.2, -0.2, -0.1), VACUUM),
     ]  # fmt: skip
     return pachon.Telescope(
@@ -96,7 +97,7 @@ def test_the_order_of_zemax(tmp_path, angle, expected):
     """Direction cosines along x, y, z of the file, from optiland's tests of this plate (checked with Zemax there)."""
     path = zemax_file(tmp_path, "  TYPE DGRATING", "  CURV 0.0", "  PARM 1 0.2", "  PARM 2 -1", angle=angle)
     telescope = pachon.load_telescope(path)
-    assert telescope.surfaces[1].grating == pachon.Grating(-1, 200.0)
+    assert telescope.surfaces[1].grating == pachon.models.Grating(-1, 200.0)
     field = telescope.design_data.fields[0]
     end = pachon.trace(telescope, pachon.launch_rays(telescope, field, 587e-9, ([0.0], [0.0]), projection="zemax"))
     x, y, z = end.direction[0]
@@ -206,7 +207,7 @@ def test_formats_without_gratings_say_so(tmp_path):
         with pytest.raises(PrescriptionError, match="surface ruled: grating on Conic: a ray-optics file has"):
             pachon.save_telescope(telescope, tmp_path / "lens.roa")
         ruled = telescope.surface("ruled")
-        square = replace(ruled, aperture=pachon.Rectangle(0.1, 0.1))
+        square = replace(ruled, aperture=pachon.models.Rectangle(0.1, 0.1))
         odd = replace(telescope, surfaces=tuple(square if s is ruled else s for s in telescope.surfaces))
         with pytest.raises(PrescriptionError, match="surface ruled: grating: a Zemax file has grooves along x"):
             pachon.save_telescope(odd, tmp_path / "lens.zmx")

@@ -34,7 +34,7 @@ def sag_of(raw, x, y, half, turns):
 
 @pytest.mark.parametrize("turns", [-1, 0, 1, 2])
 def test_maps_lie_as_stated(figure, turns):
-    grid = pachon.read_hdf5_map(figure, 4.18, unit=0.5e-6, quarter_turns=turns)
+    grid = pachon.models.read_hdf5_map(figure, 4.18, unit=0.5e-6, quarter_turns=turns)
     for x in grid.x:
         for y in grid.y:
             expected = 0.5e-6 * sag_of(RAW, x, y, 4.18, turns)
@@ -43,7 +43,7 @@ def test_maps_lie_as_stated(figure, turns):
 
 def test_the_recipe_for_batoid_rubin_is_a_turn(figure):
     # Its own conversion takes rot90 of the dataset, rows along y from below.
-    grid = pachon.read_hdf5_map(figure, 418 * u.cm, unit=0.5 * u.um, quarter_turns=-1)
+    grid = pachon.models.read_hdf5_map(figure, 418 * u.cm, unit=0.5 * u.um, quarter_turns=-1)
     np.testing.assert_allclose(grid.values, 0.5e-6 * np.rot90(RAW), rtol=1e-14)
     assert (grid.x[0], grid.x[-1]) == (-4.18, 4.18)
 
@@ -54,7 +54,7 @@ def test_outside_the_mirror_the_sag_is_zero(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["group/map"] = holes
         file["other"] = RAW
-    assert pachon.read_hdf5_map(tmp_path / "a.h5", 1.0, dataset="group/map").values[0, 0] == 0.0
+    assert pachon.models.read_hdf5_map(tmp_path / "a.h5", 1.0, dataset="group/map").values[0, 0] == 0.0
 
 
 def test_figures_are_degrees_of_freedom(figure, tmp_path):
@@ -67,7 +67,7 @@ def test_figures_are_degrees_of_freedom(figure, tmp_path):
     )
     telescope = pachon.load_telescope("lsst_v3.3_r")
     changed = pachon.load_degrees_of_freedom(path).apply(telescope, [2.0])
-    grid = pachon.read_hdf5_map(figure, 1.8, unit=0.5e-6, quarter_turns=-1)
+    grid = pachon.models.read_hdf5_map(figure, 1.8, unit=0.5e-6, quarter_turns=-1)
     x, y = np.array([0.3, -1.0]), np.array([1.2, 0.4])
     added = changed.surface("M2").shape.sag(x, y) - telescope.surface("M2").shape.sag(x, y)
     # Two of it; sags of 0.1 m are given to 2e-17 m.
@@ -99,13 +99,13 @@ def test_what_is_wrong_is_one_line(figure, tmp_path, monkeypatch):
         (tmp_path / "external.h5", {}, "dataset '/a' lies in another file, which is not read"),
     ]
     for path, options, message in cases:
-        with pytest.raises(pachon.PrescriptionError, match=message) as caught:
-            pachon.read_hdf5_map(path, 1.0, **options)
+        with pytest.raises(pachon.errors.PrescriptionError, match=message) as caught:
+            pachon.models.read_hdf5_map(path, 1.0, **options)
         assert str(path) in str(caught.value)
         assert "\n" not in str(caught.value)
     for wrong in ({"half_width": 0.0}, {"half_width": 1 * u.s}, {"half_width": 1.0, "unit": 0.0}):
-        with pytest.raises(pachon.DomainError):
-            pachon.read_hdf5_map(figure, **wrong)
+        with pytest.raises(pachon.errors.DomainError):
+            pachon.models.read_hdf5_map(figure, **wrong)
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(pachon.PrescriptionError, match=r"m1\.h5: HDF5 needs the package h5py"):
-        pachon.read_hdf5_map(figure, 1.0)
+    with pytest.raises(pachon.errors.PrescriptionError, match=r"m1\.h5: HDF5 needs the package h5py"):
+        pachon.models.read_hdf5_map(figure, 1.0)

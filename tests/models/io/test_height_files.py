@@ -9,8 +9,9 @@ from astropy.io import fits
 from astropy.table import Table
 
 import pachon
-from pachon import FocalPlane, HeightWarning
+from pachon import FocalPlane
 from pachon.core.errors import DomainError, PachonError, PrescriptionError, UnknownNameError
+from pachon.errors import HeightWarning
 from pachon.models.camera.camera import Camera
 from pachon.models.camera.lsst import lsst_camera
 

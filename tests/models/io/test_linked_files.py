@@ -50,11 +50,11 @@ SURF 5
   DISZ 0
 """
 PICKUPS = (
-    pachon.Pickup("S3", "radius", "S2", -1.0),
-    pachon.Pickup("S3", "thickness", "S1"),
-    pachon.Pickup("S3", "glass", "S1"),
+    pachon.models.Pickup("S3", "radius", "S2", -1.0),
+    pachon.models.Pickup("S3", "thickness", "S1"),
+    pachon.models.Pickup("S3", "glass", "S1"),
     # The factor is one of the curvature, so half of it one of the radius.
-    pachon.Pickup("S4", "radius", "S1", -0.5),
+    pachon.models.Pickup("S4", "radius", "S1", -0.5),
 )
 
 
@@ -66,8 +66,8 @@ def loaded(folder, text):
 def test_pickups_and_solves_of_zemax_live_on(tmp_path):
     lens = loaded(tmp_path, SYMMETRIC)
     assert lens.design_data.pickups == PICKUPS
-    assert lens.design_data.solves == (pachon.Solve("S4", "marginal_height"),)
-    changed = pachon.apply_changes(lens, {"S1.radius_mm": 1.0, "S1.thickness_mm": 0.5})
+    assert lens.design_data.solves == (pachon.models.Solve("S4", "marginal_height"),)
+    changed = pachon.models.apply_changes(lens, {"S1.radius_mm": 1.0, "S1.thickness_mm": 0.5})
     assert changed.surface("S4").shape.radius == pytest.approx(-0.5 * changed.surface("S1").shape.radius, rel=1e-14)
     assert changed.surfaces[-1].vertex[2] == pytest.approx(pachon.first_order(changed).focus_z, abs=1e-15)
     # The same lens with the linked values typed by hand.
@@ -89,7 +89,7 @@ def test_they_are_written_back(tmp_path, name):
     lens = loaded(tmp_path, SYMMETRIC)
     # A radius with a factor has no place in a Zemax file that every program would read alike.
     kept = PICKUPS if name.endswith("yaml") else PICKUPS[:3]
-    offset = pachon.Pickup("S3", "thickness", "S1", 2.0, -4e-3)
+    offset = pachon.models.Pickup("S3", "thickness", "S1", 2.0, -4e-3)
     lens = lens.with_design(pickups=(PICKUPS[0], offset, *PICKUPS[2:]))
     if name.endswith("yaml"):
         pachon.save_telescope(lens, tmp_path / name)
@@ -106,8 +106,11 @@ def test_they_are_written_back(tmp_path, name):
 
 def test_all_kinds_in_yaml_with_units(tmp_path):
     lens = pachon.load_telescope(LENS)
-    solves = (pachon.Solve("S1", "edge_thickness", 1e-3, radius=4e-3), pachon.Solve("S7", "chief_height", 4e-3))
-    lens = lens.with_design(pickups=(pachon.Pickup("S6", "conic", "S1", -1.0, 0.0),), solves=solves)
+    solves = (
+        pachon.models.Solve("S1", "edge_thickness", 1e-3, radius=4e-3),
+        pachon.models.Solve("S7", "chief_height", 4e-3),
+    )
+    lens = lens.with_design(pickups=(pachon.models.Pickup("S6", "conic", "S1", -1.0, 0.0),), solves=solves)
     pachon.save_telescope(lens, tmp_path / "lens.yaml")
     assert pachon.load_telescope(tmp_path / "lens.yaml").design_data == lens.design_data
 
@@ -165,8 +168,11 @@ def test_files_of_batoid_keep_links_and_design_data(tmp_path):
 def test_every_link_is_written_to_zemax_or_named(tmp_path):
     lens = loaded(tmp_path, SYMMETRIC)
     links = {
-        "pickups": (pachon.Pickup("S4", "conic", "S1"), pachon.Pickup("S4", "glass", "S2")),
-        "solves": (pachon.Solve("S3", "edge_thickness", 3.9e-3, radius=1e-3), pachon.Solve("S4", "chief_height", 1.0)),
+        "pickups": (pachon.models.Pickup("S4", "conic", "S1"), pachon.models.Pickup("S4", "glass", "S2")),
+        "solves": (
+            pachon.models.Solve("S3", "edge_thickness", 3.9e-3, radius=1e-3),
+            pachon.models.Solve("S4", "chief_height", 1.0),
+        ),
     }
     with pytest.raises(PrescriptionError) as found:
         pachon.save_telescope(lens.with_design(**links), tmp_path / "no.zmx")
@@ -174,7 +180,7 @@ def test_every_link_is_written_to_zemax_or_named(tmp_path):
         assert link.address in str(found.value)
     # Tilted, its thickness stands in the lines of coordinate breaks.
     tilted = lens.perturbed("S3", tilt=(1e-3, 0.0, 0.0)).with_design(
-        pickups=(), solves=(pachon.Solve("S3", "marginal_height"),)
+        pickups=(), solves=(pachon.models.Solve("S3", "marginal_height"),)
     )
     with pytest.raises(PrescriptionError, match=r"solve S3.marginal_height: a Zemax file has no place"):
         pachon.save_telescope(tilted, tmp_path / "no.zmx")
@@ -187,7 +193,7 @@ def test_thickness_behind_a_mirror_is_of_the_other_sign_in_zemax(tmp_path):
         "SURF 3\n  TYPE STANDARD\n  CURV -0.01\n  GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0\n  DISZ -29\n  PZUP 2 -1 1 0\n"
         "SURF 4\n  TYPE STANDARD\n  CURV 0.0\n  DISZ 0\n"
     )
-    expected = (pachon.Pickup("S3", "thickness", "S2", 1.0, -1e-3),)
+    expected = (pachon.models.Pickup("S3", "thickness", "S2", 1.0, -1e-3),)
     mirror = loaded(tmp_path, text)
     assert mirror.design_data.pickups == expected
     pachon.save_telescope(mirror, tmp_path / "again.zmx")

@@ -12,9 +12,9 @@ from pachon.models.media.medium import ConstantIndex
 from pachon.models.telescope import VACUUM
 
 SHAPES = {
-    "toroid": pachon.Toroid(0.3, -0.2, 0.4, (0.2, -30.0, 100.0)),
-    "qbfs": pachon.QbfsAsphere(0.2, 0.0, 0.02, (2e-5, -1e-5, 0.0, 3e-6)),
-    "flat qbfs": pachon.QbfsAsphere(np.inf, 0.0, 0.02, (2e-5, -1e-5)),
+    "toroid": pachon.models.Toroid(0.3, -0.2, 0.4, (0.2, -30.0, 100.0)),
+    "qbfs": pachon.models.QbfsAsphere(0.2, 0.0, 0.02, (2e-5, -1e-5, 0.0, 3e-6)),
+    "flat qbfs": pachon.models.QbfsAsphere(np.inf, 0.0, 0.02, (2e-5, -1e-5)),
 }
 
 
@@ -65,7 +65,7 @@ def test_qbfs_terms_of_optiland(tmp_path):
             front["geometry"] = items | {"cs": front["geometry"]["cs"]}
             path.write_text(json.dumps(content))
             shape = pachon.load_telescope(path).surfaces[0].shape
-            assert shape == pachon.QbfsAsphere(-0.2, -0.5, 0.02, (-2e-5, 0.0, 1e-5))
+            assert shape == pachon.models.QbfsAsphere(-0.2, -0.5, 0.02, (-2e-5, 0.0, 1e-5))
         front["geometry"]["surface_config"] = config | {"terms": {"0": 0.02, "x": -0.01}}
         path.write_text(json.dumps(content))
         with pytest.raises(PrescriptionError, match=r"terms = .*expected orders from 0 to 40"):

@@ -34,7 +34,7 @@ IMAGE = ["TYPE STANDARD", "CURV 0.0", "DISZ 0"]
 def test_a_paraxial_lens_of_zemax(tmp_path):
     """All light of a field comes to f times its tangent, with equal paths."""
     telescope = pachon.load_telescope(zemax_file(tmp_path, paraxial(80.0, 80.0, "STOP"), IMAGE))
-    assert telescope.surfaces[0].thin_lens == pachon.ThinLens(0.08)
+    assert telescope.surfaces[0].thin_lens == pachon.models.ThinLens(0.08)
     assert first_order(telescope).focal_length == pytest.approx(0.08, rel=1e-14)
     assert not seidel_sums(telescope).contributions.any()
     for field in telescope.design_data.fields:

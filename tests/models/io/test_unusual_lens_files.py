@@ -20,7 +20,7 @@ def test_a_file_in_windows_own_characters(tmp_path):
 def test_a_glass_of_negative_thickness_is_said(tmp_path):
     path = tmp_path / "lens.zmx"
     path.write_text((LENSES / "singlet.zmx").read_text().replace("DISZ 5\n", "DISZ -5\n"))
-    with pytest.warns(pachon.PrescriptionWarning, match=r"lens.zmx: surface front: N-BK7 of thickness -5 mm"):
+    with pytest.warns(pachon.errors.PrescriptionWarning, match=r"lens.zmx: surface front: N-BK7 of thickness -5 mm"):
         pachon.load_telescope(path)
     (problem,) = pachon.validate_file(path).problems
     assert "N-BK7 of thickness -5 mm: expected from 0" in str(problem)

@@ -95,7 +95,9 @@ def test_no_message_has_a_keyword_of_another_format(tmp_path, ending):
                 pachon.load_telescope(path)
             except pachon.PachonError as error:
                 messages.append((str(error), text))
-        messages += [(str(w.message), text) for w in caught if issubclass(w.category, pachon.PrescriptionWarning)]
+        messages += [
+            (str(w.message), text) for w in caught if issubclass(w.category, pachon.errors.PrescriptionWarning)
+        ]
     assert len(messages) > 15
     for message, text in messages:
         assert message.startswith(str(path))

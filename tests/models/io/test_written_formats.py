@@ -189,7 +189,7 @@ STOP_INSIDE = ROOT / "tests" / "data" / "lensfiles" / "stop_inside.zmx"
 )
 def test_a_changed_lens_keeps_its_stop_inside(tmp_path, ending, change):
     telescope = pachon.load_telescope(STOP_INSIDE)
-    changed = pachon.apply_changes(telescope, change)
+    changed = pachon.models.apply_changes(telescope, change)
     path = tmp_path / f"lens{ending}"
     read = again(changed, path)
     assert "pachon entrance pupil" not in path.read_text()

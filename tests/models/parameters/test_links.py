@@ -23,8 +23,8 @@ def lens():
 
 def linked(lens, *links):
     return lens.with_design(
-        pickups=tuple(one for one in links if isinstance(one, pachon.Pickup)),
-        solves=tuple(one for one in links if isinstance(one, pachon.Solve)),
+        pickups=tuple(one for one in links if isinstance(one, pachon.models.Pickup)),
+        solves=tuple(one for one in links if isinstance(one, pachon.models.Solve)),
     )
 
 
@@ -49,11 +49,13 @@ def test_values_follow_as_if_typed_by_hand(lens):
     radii = {n: lens.surface(n).shape.radius for n in ("S1", "S7")}
     telescope = linked(
         lens,
-        pachon.Pickup("S7", "radius", "S1", scale=radii["S7"] / radii["S1"]),
-        pachon.Pickup("S4", "radius", "S7", scale=2.0, offset=lens.surface("S4").shape.radius - 2 * radii["S7"]),
-        pachon.Pickup("S6", "conic", "S1", scale=-1.0),
-        pachon.Pickup("S6", "thickness", "S1", scale=0.5, offset=thickness(lens, "S6") - 0.5 * thickness(lens, "S1")),
-        pachon.Pickup("S6", "glass", "S1"),
+        pachon.models.Pickup("S7", "radius", "S1", scale=radii["S7"] / radii["S1"]),
+        pachon.models.Pickup("S4", "radius", "S7", scale=2.0, offset=lens.surface("S4").shape.radius - 2 * radii["S7"]),
+        pachon.models.Pickup("S6", "conic", "S1", scale=-1.0),
+        pachon.models.Pickup(
+            "S6", "thickness", "S1", scale=0.5, offset=thickness(lens, "S6") - 0.5 * thickness(lens, "S1")
+        ),
+        pachon.models.Pickup("S6", "glass", "S1"),
     )
     changed = apply(telescope, {"S1.radius": 2e-4, "S1.conic": 0.1, "S1.thickness": 1e-4, "S1.n": 1e-3, "S3.n": 2e-3})
     by_hand = {
@@ -84,14 +86,14 @@ def test_values_follow_as_if_typed_by_hand(lens):
 
 
 def test_the_back_focus_is_solved_for(lens):
-    telescope = linked(lens, pachon.Solve("S7", "marginal_height"))
+    telescope = linked(lens, pachon.models.Solve("S7", "marginal_height"))
     for change in ({"S1.radius": 3e-4}, {"S2.thickness": 2e-4}, {"S3.n": 1e-3}, {"S3.radius": 1e-4, "S7.conic": 0.2}):
         changed = apply(telescope, change)
         # The image stands in the paraxial focus of the same lens with any back focus.
         focus = pachon.first_order(apply(lens, change)).focus_z
         assert changed.surfaces[-1].vertex[2] == pytest.approx(focus, abs=1e-15)
     # The height of 0.1 mm: a ray through the rim of the pupil falls by it in proportion to the distance.
-    high = apply(linked(lens, pachon.Solve("S7", "marginal_height", 1e-4)), {"S1.thickness": 1e-4})
+    high = apply(linked(lens, pachon.models.Solve("S7", "marginal_height", 1e-4)), {"S1.thickness": 1e-4})
     optics = pachon.first_order(high)
     before_focus = high.surfaces[-1].vertex[2] - optics.focus_z
     assert before_focus == pytest.approx(1e-4 * 2 * optics.f_number, rel=1e-9)
@@ -101,17 +103,17 @@ def test_the_back_focus_is_solved_for(lens):
 
 
 def test_an_edge_and_a_chief_ray_are_solved_for(lens):
-    edge = apply(linked(lens, pachon.Solve("S1", "edge_thickness", 8e-4, radius=4e-3)), {"S1.radius": 2e-4})
+    edge = apply(linked(lens, pachon.models.Solve("S1", "edge_thickness", 8e-4, radius=4e-3)), {"S1.radius": 2e-4})
     first, second = edge.surface("S1"), edge.surface("S2")
     there = [float(s.shape.sag(0.0, 4e-3)) + s.vertex[2] for s in (first, second)]
     assert there[0] - there[1] == pytest.approx(8e-4, rel=1e-12)
     # The chief ray leaves the exit pupil with a slope by Lagrange's invariant: the diameters of the pupils.
-    chief = apply(linked(lens, pachon.Solve("S7", "chief_height", 5e-3)), {"S1.thickness": 1e-5})
+    chief = apply(linked(lens, pachon.models.Solve("S7", "chief_height", 5e-3)), {"S1.thickness": 1e-5})
     optics = pachon.first_order(chief)
     slope = np.tan(lens.field_radius) * optics.entrance_pupil_diameter / optics.exit_pupil_diameter
     assert optics.exit_pupil_z - chief.surfaces[-1].vertex[2] == pytest.approx(5e-3 / slope, rel=1e-12)
     with pytest.raises(DomainError, match=r"solve S1.edge_thickness: expected surfaces that reach"):
-        apply(linked(lens, pachon.Solve("S1", "edge_thickness", 8e-4, radius=1.0)), {"S1.radius": 2e-4})
+        apply(linked(lens, pachon.models.Solve("S1", "edge_thickness", 8e-4, radius=1.0)), {"S1.radius": 2e-4})
 
 
 @pytest.mark.long
@@ -119,10 +121,10 @@ def test_derivatives_are_those_of_differences(lens):
     radii = {n: lens.surface(n).shape.radius for n in ("S1", "S7")}
     telescope = linked(
         lens,
-        pachon.Pickup("S7", "radius", "S1", offset=radii["S7"] - radii["S1"]),
-        pachon.Pickup("S6", "glass", "S1"),
-        pachon.Solve("S7", "marginal_height"),
-        pachon.Solve("S3", "edge_thickness", 2e-3, radius=2e-3),
+        pachon.models.Pickup("S7", "radius", "S1", offset=radii["S7"] - radii["S1"]),
+        pachon.models.Pickup("S6", "glass", "S1"),
+        pachon.models.Solve("S7", "marginal_height"),
+        pachon.models.Solve("S3", "edge_thickness", 2e-3, radius=2e-3),
     )
     merit = SpotMerit(telescope, Beams.of(telescope, FIELDS, n_pupil=2))
     names = ("S1.radius", "S3.radius", "S1.n", "S2.thickness", "S3.dy")
@@ -144,17 +146,17 @@ def test_derivatives_are_those_of_differences(lens):
 
 @pytest.mark.long
 def test_an_optimum_keeps_the_links(lens):
-    telescope = linked(lens, pachon.Solve("S7", "marginal_height"))
+    telescope = linked(lens, pachon.models.Solve("S7", "marginal_height"))
     # The image of the file is out of focus: the solve is met from the start.
     shifted = telescope.perturbed("Image", shift=(0, 0, -1e-3))
     optimum = pachon.optimize(
-        shifted, ["S1.radius", "S4.radius"], "spots", FIELDS, n_pupil=2, solver=pachon.LeastSquares(max_steps=3)
+        shifted, ["S1.radius", "S4.radius"], "spots", FIELDS, n_pupil=2, solver=pachon.design.LeastSquares(max_steps=3)
     )
     found, start = optimum.telescope, optimum.start_telescopes[0]
     assert start.surfaces[-1].vertex[2] == pytest.approx(pachon.first_order(start).focus_z, abs=1e-15)
     stated = telescope.with_design(aperture="f_number", aperture_value=pachon.first_order(lens).f_number)
     bent = pachon.optimize(
-        stated, ["S1.radius"], "spots", FIELDS, n_pupil=2, solver=pachon.LeastSquares(max_steps=3)
+        stated, ["S1.radius"], "spots", FIELDS, n_pupil=2, solver=pachon.design.LeastSquares(max_steps=3)
     ).telescope.design_data
     assert (bent.aperture, bent.aperture_value) == ("entrance_pupil", lens.pupil_diameter)
     assert found.surface("S1") != lens.surface("S1")
@@ -178,7 +180,7 @@ def test_an_optimum_keeps_the_links(lens):
 )
 def test_wrong_pickups_are_one_line(lens, links, words):
     with pytest.raises(PrescriptionError, match=words):
-        linked(lens, *(pachon.Pickup(*one) for one in links))
+        linked(lens, *(pachon.models.Pickup(*one) for one in links))
 
 
 @pytest.mark.parametrize(
@@ -192,4 +194,4 @@ def test_wrong_pickups_are_one_line(lens, links, words):
 )
 def test_wrong_solves_are_one_line(lens, solve, words):
     with pytest.raises(PrescriptionError, match=words):
-        linked(lens, pachon.Solve(*solve))
+        linked(lens, pachon.models.Solve(*solve))

@@ -63,12 +63,15 @@ def test_what_follows_other_values_is_shown():
     lens = load_telescope(Path(__file__).parents[2] / "data" / "zmx" / "lens1.zmx")
     lens = lens.with_design(
         pickups=(
-            pachon.Pickup("S7", "radius", "S1", -1.0),
-            pachon.Pickup("S6", "thickness", "S1", 2.0, -1e-3),
-            pachon.Pickup("S6", "conic", "S1", offset=0.5),
-            pachon.Pickup("S6", "glass", "S1"),
+            pachon.models.Pickup("S7", "radius", "S1", -1.0),
+            pachon.models.Pickup("S6", "thickness", "S1", 2.0, -1e-3),
+            pachon.models.Pickup("S6", "conic", "S1", offset=0.5),
+            pachon.models.Pickup("S6", "glass", "S1"),
         ),
-        solves=(pachon.Solve("S7", "marginal_height"), pachon.Solve("S3", "edge_thickness", 1e-3, radius=4e-3)),
+        solves=(
+            pachon.models.Solve("S7", "marginal_height"),
+            pachon.models.Solve("S3", "edge_thickness", 1e-3, radius=4e-3),
+        ),
     )
     assert [text for name, text in figure_rows(describe(lens)) if name == "follows"] == [
         "S7 radius: -1 times that of S1",

@@ -81,4 +81,4 @@ def test_the_sky_under_a_star_is_pushed_away_too(star):
 )
 def test_bad_arguments(star, options, error, words):
     with pytest.raises(error, match=words):
-        pachon.brighter_fatter(star[None], **({"electrons": [1e5]} | options))
+        pachon.pipeline.brighter_fatter(star[None], **({"electrons": [1e5]} | options))

@@ -100,10 +100,10 @@ def test_effects_add_up_and_none_leaves_the_stamps(star):
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: pachon.TreeRings(1e-7, 0.0, (0.0, 0.0)),
-        lambda: pachon.TreeRings(np.nan, 1e-3, (0.0, 0.0)),
-        lambda: pachon.EdgeRolloff(1e-6, -1.0, HALF),
-        lambda: pachon.EdgeRolloff(np.inf, 1e-5, HALF),
+        lambda: pachon.pipeline.TreeRings(1e-7, 0.0, (0.0, 0.0)),
+        lambda: pachon.pipeline.TreeRings(np.nan, 1e-3, (0.0, 0.0)),
+        lambda: pachon.pipeline.EdgeRolloff(1e-6, -1.0, HALF),
+        lambda: pachon.pipeline.EdgeRolloff(np.inf, 1e-5, HALF),
     ],
 )
 def test_bad_numbers(make):

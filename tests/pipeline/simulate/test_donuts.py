@@ -38,10 +38,10 @@ def test_the_same_seed_draws_the_same_stars_whatever_follows():
 
 def test_second_stars_and_cosmic_rays_are_flagged_and_bright():
     clean = draw(electrons=1e6, seed=2, read_noise=0.0)
-    blended = draw(electrons=1e6, seed=2, read_noise=0.0, defects=pachon.StarDefects(second_stars=1.0))
-    struck = draw(electrons=1e6, seed=2, read_noise=0.0, defects=pachon.StarDefects(cosmic_rays=1.0))
-    assert (blended.defects == pachon.StarFlag.NEIGHBOUR).all()
-    assert (struck.defects == pachon.StarFlag.COSMIC_RAY).all()
+    blended = draw(electrons=1e6, seed=2, read_noise=0.0, defects=pachon.pipeline.StarDefects(second_stars=1.0))
+    struck = draw(electrons=1e6, seed=2, read_noise=0.0, defects=pachon.pipeline.StarDefects(cosmic_rays=1.0))
+    assert (blended.defects == pachon.measure.StarFlag.NEIGHBOUR).all()
+    assert (struck.defects == pachon.measure.StarFlag.COSMIC_RAY).all()
     added = (blended.images - clean.images).sum(axis=(1, 2))
     assert (added > 0.03e6).all()  # of 0.1e6 and more, a part may fall beside the stamp
     assert ((struck.images - clean.images).max(axis=(1, 2)) >= 500.0).all()
@@ -51,7 +51,7 @@ def test_second_stars_and_cosmic_rays_are_flagged_and_bright():
 @pytest.mark.parametrize("name", ["second_stars", "cosmic_rays"])
 def test_defects_are_fractions_of_the_stars(name):
     with pytest.raises(DomainError, match=f"{name} = 1.5: expected a fraction from 0 to 1"):
-        pachon.StarDefects(**{name: 1.5})
+        pachon.pipeline.StarDefects(**{name: 1.5})
     with pytest.raises(
         ConfigError, match=rf"{name}: no argument of draw_donuts; expected defects=StarDefects\({name}="
     ):

@@ -7,9 +7,10 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-from pachon import PsfModel, color_temperature, fit_own_stars, load_stars
+from pachon import PsfModel, fit_own_stars, load_stars
 from pachon.commands.cli import main
 from pachon.core.errors import DomainError, ProductError
+from pachon.models import color_temperature
 from pachon.models.star_spectrum import psf_colours
 
 PIXEL = np.deg2rad(0.2 / 3600.0)

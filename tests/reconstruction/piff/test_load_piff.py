@@ -143,7 +143,7 @@ def test_too_few_stars_have_no_world_coordinates():
 
 
 def test_small_scale_structure_of_world_coordinates_is_told():
-    with pytest.warns(pachon.WcsWarning, match=r"few\.piff: world coordinates with errors of .* %, and so"):
+    with pytest.warns(pachon.errors.WcsWarning, match=r"few\.piff: world coordinates with errors of .* %, and so"):
         world = StarWorld.fit(FewStars(60, noise=2e-4), None)
     # A scatter of 0.1 % of the scale, the largest of sixty and the error of the fit itself.
     assert 0.002 < world.error < 0.02
@@ -208,14 +208,16 @@ def test_the_format_of_old_files_is_named(tmp_path):
 @pytest.mark.skipif(not DES.exists(), reason="no DES model")
 @pytest.mark.filterwarnings("error")
 def test_a_model_of_des_has_the_error_of_its_world_coordinates_said():
-    with pytest.warns(pachon.WcsWarning, match=r"piff-model\.fits: world coordinates .* errors of 0\.4 %, and so"):
+    with pytest.warns(
+        pachon.errors.WcsWarning, match=r"piff-model\.fits: world coordinates .* errors of 0\.4 %, and so"
+    ):
         psf = pachon.load_piff(DES)
     assert psf.draw(1000.0, 2000.0).sum() == pytest.approx(1.0, abs=0.02)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not DES.exists(), reason="no DES model")
-@pytest.mark.filterwarnings("ignore::pachon.WcsWarning")
+@pytest.mark.filterwarnings("ignore::pachon.errors.WcsWarning")
 def test_a_model_of_des_is_within_half_a_percent_of_piff():
     """Piff draws each star with the Jacobian and the place that the file has for it: its WCS needs pixmappy."""
     piff, galsim = pytest.importorskip("piff"), pytest.importorskip("galsim")

@@ -37,7 +37,7 @@ def stars(psf):
 
 @pytest.fixture(scope="module")
 def found(psf, stars):
-    return pachon.compare_with_piff(psf, *stars[:2], size=21, bins=4)
+    return pachon.reconstruction.compare_with_piff(psf, *stars[:2], size=21, bins=4)
 
 
 @pytest.mark.long
@@ -101,4 +101,4 @@ def test_the_command_writes_tables_and_prints_json(stars, found, tmp_path, capsy
 
 def test_a_missing_chip_is_named(stars):
     with pytest.raises(DomainError, match="chip = None: expected one of 1, 2"):
-        pachon.compare_with_piff(pachon.load_piff(DATA / "grid_chips.piff"), *stars[:2])
+        pachon.reconstruction.compare_with_piff(pachon.load_piff(DATA / "grid_chips.piff"), *stars[:2])

@@ -173,7 +173,10 @@ def test_the_slope_of_the_posterior_with_colours_is_its_change():
             assert slope[column] == pytest.approx((above - below) / 2e-5, abs=1e-7 * abs(value))
 
 
-@pytest.mark.parametrize("recipe", [KRIGING, POLYNOMIAL, pachon.Recipe(pachon.PrincipalComponents(6), Polynomial(1))])
+@pytest.mark.parametrize(
+    "recipe",
+    [KRIGING, POLYNOMIAL, pachon.reconstruction.Recipe(pachon.reconstruction.PrincipalComponents(6), Polynomial(1))],
+)
 def test_files_keep_the_colour_and_batches_do_not_matter(recipe, tmp_path):
     images, places, colour = stars(6)
     colour[[3, 8]] = np.nan

@@ -41,7 +41,7 @@ def made(telescope, fields, photons, zenith_angle):
         light_of(photons, zenith_angle),
         atmosphere=pachon.Atmosphere.from_site("cerro_pachon", seed=1, zenith_angle=zenith_angle),
         engine="long_exposure",
-        stamps=pachon.Stamps(31, silicon=pachon.Silicon(), recenter=centroids),
+        stamps=pachon.Stamps(31, silicon=pachon.models.Silicon(), recenter=centroids),
         threads=1,
     )
     images = np.asarray(psfs.image, dtype=float)
@@ -95,7 +95,7 @@ def test_the_psf_of_a_galaxy_is_that_of_its_effective_colour(lsst_r, field, zeni
         assert rms(predicted[1:] - truth[1:]) < 0.6 * rms(plain[1:] - truth[1:])
     if kind == "wavelength":
         # The light that the air spreads is known for each spectrum.
-        whole = pachon.psf_of_spectrum(model, places, light_of(spectra, angle), PIXEL)
+        whole = pachon.reconstruction.psf_of_spectrum(model, places, light_of(spectra, angle), PIXEL)
         np.testing.assert_allclose(whole.sum(axis=(1, 2)), 1.0, atol=1e-12)
         assert rms(shapes(whole)[0] / truth[0] - 1.0) < 0.06 * rms(plain[0] / truth[0] - 1.0)
         if zenith_angle:
@@ -127,18 +127,18 @@ def test_the_spread_of_a_spectrum_is_its_own_covariance():
     photons = pachon.blackbody_photons(kelvin, WAVES)
     stars = np.stack([gaussian(np.array([3.0, 3.0, 0.0]) + spread(p)) for p in photons])
     places = rng.uniform(-1.0, 1.0, (40, 2))
-    recipe = pachon.Recipe(pachon.Pixels(), pachon.Polynomial(0))
+    recipe = pachon.reconstruction.Recipe(pachon.reconstruction.Pixels(), pachon.reconstruction.Polynomial(0))
     colour = pachon.effective_colour(WAVES, photons)
     model = pachon.PsfModel.fit(stars, places, recipe=recipe, gain=None, clipping=None, colour=colour)
     lines = np.where(np.isin(np.arange(24), [3, 20]), 1.0, 1e-9)
-    drawn = pachon.psf_of_spectrum(model, [0.2, 0.1], pachon.Light(WAVES, lines, shift), PIXEL)[0]
+    drawn = pachon.reconstruction.psf_of_spectrum(model, [0.2, 0.1], pachon.Light(WAVES, lines, shift), PIXEL)[0]
     expected = gaussian(np.array([3.0, 3.0, 0.0]) + spread(lines))
     # The spectrum changes a star by 6 % of the peak; stars are linear in the colour to a thousandth of it.
     assert np.abs(expected - stars[0]).max() > 0.05 * expected.max()
     np.testing.assert_allclose(drawn, expected, atol=2e-3 * expected.max())
-    plain = pachon.psf_of_spectrum(model, [0.2, 0.1], pachon.Light(WAVES, lines), PIXEL)
+    plain = pachon.reconstruction.psf_of_spectrum(model, [0.2, 0.1], pachon.Light(WAVES, lines), PIXEL)
     np.testing.assert_array_equal(plain, model.at([0.2, 0.1], colour=pachon.effective_colour(WAVES, lines)))
-    call = partial(pachon.psf_of_spectrum, pixel_scale=PIXEL)
+    call = partial(pachon.reconstruction.psf_of_spectrum, pixel_scale=PIXEL)
     without = pachon.PsfModel.fit(stars, places, recipe=recipe, gain=None, clipping=None)
     in_magnitudes = pachon.PsfModel.fit(
         stars, places, recipe=recipe, gain=None, clipping=None, colour=pachon.effective_colour(WAVES, photons, "g_i")

@@ -24,7 +24,7 @@ CONTENT = {
 def table_of(tmp_path, **changes):
     sweep = read_sweep({**CONTENT, **changes}, "test")
     run_sweep(sweep, tmp_path / "lens.sweep")
-    return pachon.load_sweep_table(tmp_path / "lens.sweep")
+    return pachon.studies.load_sweep_table(tmp_path / "lens.sweep")
 
 
 def test_points_against_telescopes_made_by_hand(tmp_path):

@@ -158,7 +158,7 @@ def test_the_sweep_is_kept_as_people_wrote_it(store):
 def test_a_store_is_loaded_as_a_table(store):
     for number in (5, 2):
         store.write(result(number))
-    table = pachon.load_sweep_table(store.path)
+    table = pachon.studies.load_sweep_table(store.path)
     assert table.number.tolist() == [2, 5]
     assert table.parameters["b"].tolist() == [0.1 * 2, 0.1 * 5]
     assert table.metrics["xi_nm"].tolist() == [0.1 * 2 + 0.2, 0.1 * 5 + 0.2]

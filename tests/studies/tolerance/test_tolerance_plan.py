@@ -220,8 +220,8 @@ def test_a_compensator_without_effect(triplet):
 
 
 def test_what_follows_other_values_has_no_tolerance_of_its_own(triplet):
-    pickups = (pachon.Pickup("S7", "radius", "S1"), pachon.Pickup("S6", "glass", "S1"))
-    solves = (pachon.Solve("S4", "edge_thickness", 1e-3, radius=1e-3),)
+    pickups = (pachon.models.Pickup("S7", "radius", "S1"), pachon.models.Pickup("S6", "glass", "S1"))
+    solves = (pachon.models.Solve("S4", "edge_thickness", 1e-3, radius=1e-3),)
     linked = triplet.with_design(pickups=pickups, solves=solves)
     content = {
         "surfaces": {"radius_percent": 0.1},

@@ -148,7 +148,7 @@ def test_weak_turbulence_keeps_long_baselines(polynomial_pupil):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("silicon", [None, pachon.Silicon()])
+@pytest.mark.parametrize("silicon", [None, pachon.models.Silicon()])
 def test_lattice_and_strips_agree(silicon, monkeypatch):
     """Five wavelengths, dispersed; the reference star of each way is the same telescope by the other."""
     telescope = defocused("lsst_v3.3_y", 8e-6)

@@ -232,7 +232,7 @@ def test_configurations_offer_every_engine():
     ("options", "error", "named"),
     [
         ({"engine": "exact"}, ConfigError, "engine = 'exact': expected one of fast, wave"),
-        ({"engine": 3}, DomainError, "engine = 3: expected a text or a PsfEngine"),
+        ({"engine": 3}, ConfigError, "engine = 3: expected one of fast, .* or a PsfEngine"),
         ({"pupil_spacing": 0.1}, ConfigError, r"pupil_spacing: .* expected engine=WaveEngine\(pupil_spacing=\.\.\.\)$"),
         ({"stamp_size": 41}, ConfigError, r"stamp_size: .* expected stamps=Stamps\(size=\.\.\.\)$"),
         ({"stamps": 41}, DomainError, "stamps = 41: expected a Stamps"),

@@ -9,7 +9,7 @@ from pachon.wavefront.psf.psf import make_psfs
 from pachon.wavefront.psf.stamps import Stamps
 
 ARCSEC = np.pi / 180 / 3600
-WEATHER = pachon.load_site("cerro_pachon").weather
+WEATHER = pachon.models.load_site("cerro_pachon").weather
 WAVES = np.array([560e-9, 625e-9, 690e-9])
 
 

@@ -1,0 +1,10 @@
+from .config import ImagesConfig as ImagesConfig
+from .config import load_images_configuration as load_images_configuration
+from .image_file import CcdImage as CcdImage
+from .image_formats.load import ImageSettings as ImageSettings
+from .image_stars import focal_plane_stars as focal_plane_stars
+from .measure import ImageCatalogue as ImageCatalogue
+from .object_colours import ObjectColours as ObjectColours
+from .psf_field import PsfField as PsfField
+from .scene import CcdScene as CcdScene
+from .wcs import CcdWcs as CcdWcs

@@ -1,0 +1,15 @@
+from .degrees import FreedomEstimate as FreedomEstimate
+from .exposure import ExposureWavefront as ExposureWavefront
+from .exposure_fit import ExposureDonuts as ExposureDonuts
+from .flags import DonutFlag as DonutFlag
+from .frames import DonutFrames as DonutFrames
+from .freedom_fit import TelescopeFreedoms as TelescopeFreedoms
+from .model import DonutRims as DonutRims
+from .observatory_zernikes import BodyMotions as BodyMotions
+from .observatory_zernikes import ObservatoryZernikes as ObservatoryZernikes
+from .observatory_zernikes import hexapod_corrections as hexapod_corrections
+from .orientation import OrientationCheck as OrientationCheck
+from .orientation import check_orientation as check_orientation
+from .result import DonutFit as DonutFit
+from .wavefront_fits import FieldTerms as FieldTerms
+from .wavefront_fits import SingleDonuts as SingleDonuts

@@ -1,0 +1,11 @@
+from .aberration import ResidualWavefront as ResidualWavefront
+from .corner_stars import CornerStars as CornerStars
+from .opd_map import OpdMap as OpdMap
+from .opd_map import OpdMaps as OpdMaps
+from .opd_map import ZernikeFit as ZernikeFit
+from .psf.psf import Psfs as Psfs
+from .psf.psf_moments import PsfMoments as PsfMoments
+from .pupil_sampling import PupilSampling as PupilSampling
+from .request import field_points as field_points
+from .silicon_focus import focus_height as focus_height
+from .vignetting_factors import with_vignetting_factors as with_vignetting_factors
