@@ -43,7 +43,7 @@ app = typer.Typer(
 #: The files of commands, in the order of the help.
 _FILES = (
     *("run", "images", "visits", "stack_images", "reproduce", "diagnostics", "measure", "model", "study", "design"),
-    *("tolerance", "sweep", "baseline", "camera", "shim", "donuts", "align", "telescope", "files"),
+    *("tolerance", "sweep", "baseline", "camera", "shim", "donuts", "align", "telescope", "files", "config"),
 )
 _GROUPS = [import_module(f".{name}", __package__) for name in _FILES]
 _INTERRUPTED = 130
