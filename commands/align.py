@@ -30,9 +30,7 @@ def align_command(
     ] = None,
     believed_heights: Annotated[
         str | None,
-        choice(
-            ("nominal", "lsstcam"), help="Heights that the estimate takes them to have; by default the true ones."
-        ),
+        choice(("nominal", "lsstcam"), help="Heights that the estimate takes them to have; by default the true ones."),
     ] = None,
     gain: Annotated[
         float | None, Option(help="Fraction of the estimated state that is corrected; 1 by default.")

@@ -19,7 +19,9 @@ Names = Callable[[Any], Iterable[str]]
 _LONGEST = 38
 
 
-def choice(words: Sequence[str], *declarations: str, help: str, kind: Callable[..., Any] = Option, **settings: Any) -> Any:
+def choice(
+    words: Sequence[str], *declarations: str, help: str, kind: Callable[..., Any] = Option, **settings: Any
+) -> Any:
     """Return an option, or argument by `kind`, whose value is one of some words.
 
     Help shows the words in the place of the value or, where they are many, behind its text.
@@ -38,7 +40,15 @@ def choice(words: Sequence[str], *declarations: str, help: str, kind: Callable[.
     return kind(*declarations, help=help, autocompletion=completion(lambda ctx: words), **settings)
 
 
-def names(source: Names, *declarations: str, help: str, metavar: str, kind: Callable[..., Any] = Option, listed: bool = False, **settings: Any) -> Any:
+def names(
+    source: Names,
+    *declarations: str,
+    help: str,
+    metavar: str,
+    kind: Callable[..., Any] = Option,
+    listed: bool = False,
+    **settings: Any,
+) -> Any:
     """Return an option, or argument by `kind`, whose value is a name that shells complete, or text of another form.
 
     With `listed` the value is a list of names with commas between.

@@ -94,11 +94,18 @@ def heights(ctx: Any) -> Iterable[str]:
     return (*AS_MEASURED, *files(*HEIGHTS)(ctx))
 
 
+def degrees_of_freedom(ctx: Any) -> Iterable[str]:
+    """Return the bundled degrees of freedom, and files."""
+    from ..models.parameters.degrees_of_freedom_file import BUNDLED
+
+    return (*BUNDLED, *files(*YAML)(ctx))
+
+
 def sites(ctx: Any) -> Iterable[str]:
     """Return the bundled sites."""
     from ..models.io.site_file import BUNDLED
 
-    return BUNDLED
+    return (*BUNDLED, *files(*YAML)(ctx))
 
 
 @_quiet

@@ -43,6 +43,7 @@ KINDS = {
     "sweep": Kind("studies.sweep.file", "SweepFile", "sweep", "parameters that vary, and what is measured"),
     "align": Kind("studies.alignment.config", "AlignConfig", "align", "errors, donuts and control of the loop"),
     "tolerances": Kind("studies.tolerance.file", "ToleranceFile", "tolerance", "tolerances, merit and Monte Carlo"),
+    "donuts": Kind("pipeline.simulate.donut_file", "DonutScene", "donuts --simulate", "stars, air and noise of donuts"),
     "optimization": Kind(
         "design.optimize.optimize_file", "OptimizeFile", "optimize --config", "variables, operands and glasses"
     ),
@@ -97,7 +98,6 @@ def keys_of(text: str) -> tuple[str, list[KeyDescription]]:
         If there is no such key; with the nearest.
     """
     from ..core.key_descriptions import describe_keys
-
     from .stored_names import stored_names
 
     first, _, inner_key = text.partition(".")
@@ -172,7 +172,7 @@ def _show_key(kind: str, description: KeyDescription) -> None:
     ]
     if (text := example(description)) is not None:
         command = KINDS[kind].commands.partition(",")[0]
-        value = f"'{text}'" if set(text) & set(" {}[]()*?$&;\"") else text
+        value = f"'{text}'" if set(text) & set(' {}[]()*?$&;"') else text
         rows += [("in a file", _yaml_line(text)), ("in a command", f"pachon {command} --set {value}")]
     table = plain_table(show_header=False)
     for name, text in rows:
@@ -194,4 +194,3 @@ def _yaml_line(text: str) -> str:
     key, _, value = text.partition("=")
     *sections, last = key.split(".")
     return "".join(f"{name}: {{" for name in sections) + f"{last}: {value}" + "}" * len(sections)
-

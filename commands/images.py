@@ -104,7 +104,9 @@ def images_command(
     if visit_list is None:
         require_list(("--visit", visit), ("--where", where), ("--band", band), ("--night", night))
     else:
-        images_config = images_config.of_visit(listed_visit(images_config.run, visit_list, visit, where, band, night), folder)
+        images_config = images_config.of_visit(
+            listed_visit(images_config.run, visit_list, visit, where, band, night), folder
+        )
     experiment = images_config.experiment(folder)
     hint = f"finished CCDs are in {out}, and --resume goes on from there"
     with long_work(

@@ -131,12 +131,12 @@ Recipe = Annotated[
         help="Model of the CCD: kriging (of pixels, default), paper (20 eigen-PSFs, cubic polynomials).",
     ),
 ]
-Basis = Annotated[str | None, choice(("pixels", "pca", "shapelets"), help="Of the recipe: what stars are described in.")]
+Basis = Annotated[
+    str | None, choice(("pixels", "pca", "shapelets"), help="Of the recipe: what stars are described in.")
+]
 Interpolation = Annotated[str | None, choice(("kriging", "polynomial"), help="Of the recipe, between the stars.")]
 Components = Annotated[int | None, Option(min=1, help="Components of pca and shapelets.")]
-Weights = Annotated[
-    str | None, choice(("equal", "snr", "softened", "noise"), help="Of the stars in polynomials.")
-]
+Weights = Annotated[str | None, choice(("equal", "snr", "softened", "noise"), help="Of the stars in polynomials.")]
 Order = Annotated[int | None, Option(min=0, max=6, help="Of polynomials over the image, or of the trend in kriging.")]
 Threads = Annotated[int | None, Option(min=1, help="Threads; all processors by default. No byte depends on it.")]
 Quiet = Annotated[bool, Option("--quiet", help="No progress, no table.")]

@@ -158,7 +158,9 @@ def sweep_status(store: Store, as_json: Json = False) -> None:
 @sweep_app.command("export")
 def sweep_export(
     store: Store,
-    out: Annotated[Path | None, Option("--out", "-o", "--table", help="Table to write, .ecsv, .csv, .fits or .parquet.")] = None,
+    out: Annotated[
+        Path | None, Option("--out", "-o", "--table", help="Table to write, .ecsv, .csv, .fits or .parquet.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Write the points of a store as a table; of a damaged store those that can still be read.

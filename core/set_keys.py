@@ -60,7 +60,7 @@ def key_and_value(text: str) -> tuple[str, Any]:
 
 
 def key_path(model: type[BaseModel], key: str) -> list[str]:
-    """Return the parts of a dotted key: names in mappings, such as M2.dz_um in changes.M2.dz_um, have dots of their own."""
+    """Return the parts of a dotted key; names in mappings have dots of their own, as M2.dz_um in changes.M2.dz_um."""
     first, dot, inner_key = key.partition(".")
     field = next((f for name, f in model.model_fields.items() if (f.alias or name) == first), None)
     if not dot or field is None:

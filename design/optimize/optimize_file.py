@@ -221,9 +221,13 @@ class OptimizeFile(StateSection):
     bounds: dict[str, Pair] = Field(
         default_factory=dict, description="lowest and highest value of variables: {M1.conic: [-1.1, -0.9]}"
     )
-    merit: Literal["spots", "wavefront"] = Field("spots", description="what is minimised: size of spots, or error of the wavefront")
+    merit: Literal["spots", "wavefront"] = Field(
+        "spots", description="what is minimised: size of spots, or error of the wavefront"
+    )
     reference: Literal["centroid", "chief"] = Field("centroid", description="middle of the spots")
-    configurations: tuple[ConfigurationSection, ...] = Field((), description="further telescopes that share the variables")
+    configurations: tuple[ConfigurationSection, ...] = Field(
+        (), description="further telescopes that share the variables"
+    )
     glasses: tuple[str, ...] = Field((), description="media for which glasses of the catalogue are tried")
     nearest_glasses: Count = Field(4, description="glasses that are tried for each medium")
     glass_catalogue: str | None = Field(None, description="maker, or file of glasses (.agf)")
