@@ -32,7 +32,7 @@ def choice(
         words_text = settings.pop("metavar", "WORD")
 
     def check(ctx: Any, param: Any, value: Any) -> Any:
-        for word in [value] if isinstance(value, str) else value or ():
+        for word in () if value == param.default else [value] if isinstance(value, str) else value or ():
             check_choice(_option_name(param), word, words)
         return value
 
@@ -68,5 +68,5 @@ def completion(source: Names, *, listed: bool = False) -> Callable[[Any, str], l
 
 
 def _option_name(param: Any) -> str:
-    """Return the longest name of an option, or that of an argument in capitals."""
-    return str(max(param.opts, key=len)) if param.param_type_name == "option" else str(param.name).upper()
+    """Return the longest name of an option, or the name of an argument."""
+    return str(max(param.opts, key=len)) if param.param_type_name == "option" else str(param.name)

@@ -24,7 +24,7 @@ def current_names() -> dict[str, Any]:
     from ..design.optimize.operand_names import NAMES
     from ..studies.attribution.causes import CAUSES
     from ..studies.reproduce.reproduce import FIGURES
-    from .config import KINDS, model_of
+    from .config_kinds import KINDS, model_of
 
     words = {"true or false": ("true", "false")}
     return {
