@@ -69,7 +69,7 @@ def align_command(
     from ..pipeline.config import with_options
     from ..studies.alignment.config import AlignConfig, load_align_configuration
     from ..studies.alignment.loop import align
-    from ..studies.alignment.product import alignment_summary, write_alignment
+    from ..studies.alignment.product import alignment_summary, verdict, write_alignment
 
     base = with_set_keys(AlignConfig() if config is None else load_align_configuration(config), settings or ())
     align_config = with_options(
@@ -90,6 +90,7 @@ def align_command(
         print_json(summary)
         return
     if not quiet:
+        print_line(verdict(summary))
         _show(summary)
     print_line(f"alignment: {out.resolve()}")
 
@@ -136,7 +137,3 @@ def _show(summary: dict[str, Any]) -> None:
         "rms e [1e-3]",
     )
     Rows(headings, rows, _CAPTION).show()
-    first = summary["first_visit_within_1.2_floors"]
-    print_line(
-        "not within 1.2 times the floor" if first is None else f"within 1.2 times the floor from visit {first} on"
-    )

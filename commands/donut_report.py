@@ -93,6 +93,7 @@ def show_fit(fit: DonutFit, converted: ObservatoryZernikes, motions: BodyMotions
     """Print the table of a fit, that of hexapod corrections, and remarks."""
     import numpy as np
 
+    print_line(fit_verdict(fit))
     scale, unit, form = {"pachon": (1e9, "nm", ".0f"), "ts_wep": (1.0, "um", ".3f")}.get(
         converted.convention, (1.0, "waves", ".3f")
     )
@@ -122,6 +123,21 @@ def show_fit(fit: DonutFit, converted: ObservatoryZernikes, motions: BodyMotions
         Rows(*motion_rows(motions), left=1).show()
     for line in _remarks(fit):
         print_line(line)
+
+
+def fit_verdict(fit: DonutFit) -> str:
+    """Return the result of a fit in one sentence."""
+    import numpy as np
+
+    usable = np.flatnonzero(fit.usable)
+    if not usable.size:
+        return f"None of {len(fit)} donuts can be used: the reasons stand beside them."
+    terms = np.atleast_2d(fit.zernikes[usable])
+    rms = 1e9 * np.median(np.linalg.norm(terms, axis=1))
+    largest = int(np.argmax(np.abs(np.median(terms, axis=0))))
+    size = 1e9 * np.median(terms, axis=0)[largest]
+    count = f"{usable.size} of {len(fit)} donuts" if len(fit) > 1 else "The donut"
+    return f"{count}: the wavefront is off by {rms:.0f} nm rms (median), most in Z{fit.noll[largest]} ({size:+.0f} nm)."
 
 
 def _remarks(fit: DonutFit) -> list[str]:

@@ -138,9 +138,11 @@ def _show_run(result: RunResult, report: Path, seconds: float) -> None:
         headline,
         models_rows,
         per_ccd,
+        verdict,
     )
 
     console = wide_console()
+    console.print(f"{verdict(result.summary)}\n", highlight=False)
     headlines = plain_table(show_header=False)
     for name, value in headline(result.summary):
         headlines.add_row(name, value)

@@ -10,6 +10,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError
+from ..core.terminal import print_line
 from ..core.threads import thread_count
 from . import completion
 from .choices import names
@@ -90,23 +91,28 @@ def sweep_run(
         quiet, resumed, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
     ) as execution:
         outcome = _run(path, store, settings or (), execution)
+    if not (as_json or quiet):
+        print_line(outcome.pop("verdict") or "No point could be computed.")
     _show(outcome, as_json, quiet)
 
 
 def _run(path: Path, store: Path, settings: Sequence[str], execution: Execution) -> dict[str, Any]:
     """Compute the points that are missing, write the report, and return the counts."""
+    from ..studies.sweep.analysis import summary, verdict
     from ..studies.sweep.file import load_sweep
     from ..studies.sweep.report import write_report
     from ..studies.sweep.store import SweepStore
     from ..studies.sweep.sweep import run_sweep
+    from ..studies.sweep.table import read_table
 
     outcome = run_sweep(load_sweep(path, settings), store, folder=path.parent, execution=execution)
-    report = None
+    report = sentence = None
     if outcome.failed < outcome.points:
         with execution.reporter.stage("report"), SweepStore(store) as opened:
             report = str(write_report(opened, _report_folder(store)))
+            sentence = verdict(summary(read_table(opened), opened.sweep))
     counts = {key: getattr(outcome, key) for key in ("points", "kept", "computed", "failed")}
-    return {"store": str(store), **counts, "report": report}
+    return {"verdict": sentence, "store": str(store), **counts, "report": report}
 
 
 def _example(name: str) -> Path:

@@ -71,6 +71,7 @@ def tolerance_command(
     from ..models.paraxial import following_stop
     from ..studies.tolerance.file import load_tolerances, with_settings
     from ..studies.tolerance.product import tolerance_summary, write_tolerances
+    from ..studies.tolerance.report import verdict
     from ..studies.tolerance.study import run_tolerances
 
     telescope = load_model(model, lenient, glass_catalogue or ())
@@ -92,6 +93,7 @@ def tolerance_command(
         print_json({**summary, "folder": str(folder)})
         return
     if not quiet:
+        print_line(verdict(summary))
         _show(summary)
         if following_stop(telescope) is not telescope:
             print_line(f"rays fill the stop {telescope.design_data.stop}, as with aiming: real")
