@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer import Argument, Option
+from typer import Option
 
 from ..core.terminal import print_line
-from .options import Json, Quiet, Threads
+from .choices import choice
+from .options import Config, Json, Quiet, Threads, set_option
 from .tables import Rows, print_json
 from .workers import long_work
 
@@ -22,11 +23,14 @@ _CAPTION = (
 
 @app.command("align")
 def align_command(
-    config: Annotated[Path | None, Argument(metavar="CONFIG.yaml", help="Configuration; all has a default.")] = None,
+    config: Config = None,
     visits: Annotated[int | None, Option("--visits", "-n", min=1, help="Number of visits; 20 by default.")] = None,
-    heights: Annotated[str | None, Option(help="Heights of the wavefront sensors: nominal or lsstcam.")] = None,
+    heights: Annotated[
+        str | None, choice(("nominal", "lsstcam"), help="Heights of the wavefront sensors: nominal, or as built.")
+    ] = None,
     believed_heights: Annotated[
-        str | None, Option(help="Heights that the estimate takes them to have; by default the true ones.")
+        str | None,
+        choice(("nominal", "lsstcam"), help="Heights that the estimate takes them to have; by default the true ones."),
     ] = None,
     gain: Annotated[
         float | None, Option(help="Fraction of the estimated state that is corrected; 1 by default.")
@@ -34,6 +38,7 @@ def align_command(
     seed: Annotated[int | None, Option(help="Seed of all random numbers.")] = None,
     out: Annotated[Path, Option("--out", "-o", help="Folder to write to.")] = Path("pachon_align"),
     resume: Annotated[bool, Option("--resume", help="Go on with the visits in the folder.")] = False,
+    settings: Annotated[list[str] | None, set_option("align")] = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -51,7 +56,7 @@ def align_command(
     - `pachon align`: 20 visits, two minutes
     - `pachon align -n 100 --heights lsstcam --believed-heights nominal -o ignored`: sensors as built, taken as nominal
     - `pachon align -n 200 --resume -o ignored`: a hundred visits more
-    - `pachon align my_loop.yaml`
+    - `pachon align my_loop.yaml --set air.r0_m=0.12`: any key of `pachon config align`
 
     my_loop.yaml may read
 
@@ -60,13 +65,14 @@ def align_command(
         donuts: {electrons: 1e6, second_stars: 0.14}
         control: {gain: 0.7}
     """
+    from ..core.set_keys import with_set_keys
     from ..pipeline.config import with_options
     from ..studies.alignment.config import AlignConfig, load_align_configuration
     from ..studies.alignment.loop import align
-    from ..studies.alignment.product import alignment_summary, write_alignment
+    from ..studies.alignment.product import alignment_summary, verdict, write_alignment
 
-    base = AlignConfig() if config is None else load_align_configuration(config)
-    settings = with_options(
+    base = with_set_keys(AlignConfig() if config is None else load_align_configuration(config), settings or ())
+    align_config = with_options(
         base,
         visits=visits,
         donuts__heights=heights,
@@ -77,13 +83,14 @@ def align_command(
     folder = None if config is None else config.parent
     hint = f"finished visits are in {out}, and --resume goes on from there"
     with long_work(quiet, hint, threads=threads, resume=resume) as execution:
-        alignment = align(settings, folder=folder, store=out, execution=execution)
+        alignment = align(align_config, folder=folder, store=out, execution=execution)
     write_alignment(alignment, out)
     summary = alignment_summary(alignment)
     if as_json:
         print_json(summary)
         return
     if not quiet:
+        print_line(verdict(summary))
         _show(summary)
     print_line(f"alignment: {out.resolve()}")
 
@@ -130,7 +137,3 @@ def _show(summary: dict[str, Any]) -> None:
         "rms e [1e-3]",
     )
     Rows(headings, rows, _CAPTION).show()
-    first = summary["first_visit_within_1.2_floors"]
-    print_line(
-        "not within 1.2 times the floor" if first is None else f"within 1.2 times the floor from visit {first} on"
-    )

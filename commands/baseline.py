@@ -10,6 +10,8 @@ from typer import Argument, Option
 
 from ..core.errors import ConfigError
 from ..core.terminal import print_line, print_warning
+from . import completion
+from .choices import names
 from .help_group import HelpGroup
 from .interrupt import interruptible
 from .options import FieldsDeg, Json, Model, Quiet, Threads, WavelengthsNm, field_list, name_list
@@ -46,7 +48,13 @@ def baseline_save(
     field_deg: FieldsDeg = None,
     wavelength_nm: WavelengthsNm = None,
     ccds: Annotated[
-        str | None, Option(metavar="NAMES", help="CCDs for PSFs, with commas; the first is modelled.")
+        str | None,
+        names(
+            completion.ccds,
+            listed=True,
+            metavar="CCD,...",
+            help="CCDs for PSFs, with commas; the first is modelled.",
+        ),
     ] = None,
     tolerance: Annotated[
         list[str] | None,
@@ -133,10 +141,11 @@ def _warn_broken(names: list[str]) -> None:
 
 @app.command("check")
 def check_command(
-    files: Annotated[
-        list[Path] | None, Argument(metavar="[FILE]...", help="Baselines; the bundled by default.")
+    files: Annotated[list[Path] | None, Argument(metavar="FILE", help="Baselines; the bundled by default.")] = None,
+    model: Annotated[
+        str | None,
+        names(completion.models, metavar="MODEL", help="Telescope in place of the baseline's own: bundled, or a path."),
     ] = None,
-    model: Annotated[str | None, Option(help="Telescope in place of the baseline's own: bundled, or a path.")] = None,
     config: Annotated[Path | None, Option(metavar="RUN.yaml", help="Run configuration in place of its own.")] = None,
     everything: Annotated[bool, Option("--all", help="Show all metrics, not the worst alone.")] = False,
     threads: Threads = None,

@@ -2,35 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 from typer import Argument
 
 from ..core.file_names import file_name
 from ..core.terminal import print_line
+from . import completion
+from .choices import names
 from .inputs import configured_experiment, warnings_shown
-from .options import Json, Picture, picture_kind
+from .options import Json, NoPicture, Picture, TableFile, check_table, picture_kind
 from .tables import Rows, print_json
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from ..models.camera.camera import Camera
     from ..models.camera.focal_plane import FocalPlane
 
 app = typer.Typer()
+#: Table, content of the JSON, and function that draws the picture.
+_Content: TypeAlias = "tuple[Rows, dict[str, Any], Callable[[], Figure]]"
 
 
 @app.command("camera")
 def camera_command(
     heights: Annotated[
         str,
-        Argument(
-            metavar="CAMERA | HEIGHTS",
+        names(
+            completion.either(completion.cameras, completion.files(*completion.YAML, *completion.HEIGHTS)),
+            metavar="CAMERA|HEIGHTS",
             help="Bundled camera, or camera file (.yaml); lsstcam, or heights (.ecsv, .fits); or a configuration.",
+            kind=Argument,
         ),
     ] = "lsstcam",
     picture: Picture = None,
+    no_picture: NoPicture = False,
+    table: TableFile = None,
     as_json: Json = False,
 ) -> None:
     """List and draw the CCDs of a camera; or show statistics of their heights, by vendor, and draw a map of them.
@@ -45,33 +56,28 @@ def camera_command(
     - `pachon camera metrology.fits --picture heights.pdf`
     - `pachon camera pachon_run/config.yaml --json`
     """
-    from dataclasses import asdict
-
     from ..core.files import write_bytes
     from ..core.plotting import picture_bytes
-    from ..models.camera.height_statistics import height_statistics
-    from ..pipeline.report.tables import HEIGHT_CAPTION, HEIGHT_COLUMNS, height_rows
 
     kind = picture_kind(picture)
+    check_table(table)
+    drawn = not no_picture and (picture is not None or not as_json)
     camera = _listed_camera(heights)
-    if camera is not None:
-        _show_camera(camera, picture, kind, as_json)
-        return
-    plane = _focal_plane(heights)
-    statistics = height_statistics(plane)
+    rows, content, draw = _listed(camera) if camera is not None else _heights(heights)
+    name = file_name(camera.name if camera is not None else Path(heights).stem)
+    files = {}
+    if drawn:
+        files["picture"] = picture or Path(f"camera_{name}.png")
+        write_bytes(files["picture"], picture_bytes(draw(), kind))
+    if table is not None:
+        files["table"] = table
+        rows.write(table)
     if as_json:
-        metrics = {name: asdict(group) for name, group in statistics.items()}
-        residual = None if plane.residual is None else dict(zip(plane.names, plane.residual, strict=True))
-        print_json({"heights": heights, "statistics_m": metrics, "fit_residual_m": residual})
-        if picture is None:
-            return
-    from ..pipeline.report.height_plots import vendor_heights_plot
-
-    path = Path(f"camera_{file_name(Path(heights).stem)}.png") if picture is None else picture
-    write_bytes(path, picture_bytes(vendor_heights_plot(plane, f"CCD heights: {Path(heights).stem}"), kind))
-    if not as_json:
-        Rows(HEIGHT_COLUMNS, height_rows(statistics), HEIGHT_CAPTION).show()
-        print_line(f"picture: {path.resolve()}")
+        print_json(content)
+        return
+    rows.show()
+    for what, path in files.items():
+        print_line(f"{what}: {path.resolve()}")
 
 
 def _listed_camera(name: str) -> Camera | None:
@@ -90,24 +96,34 @@ def _listed_camera(name: str) -> Camera | None:
     return None
 
 
-def _show_camera(camera: Camera, picture: Path | None, kind: str, as_json: bool) -> None:
-    """Print the CCDs of a camera, and draw them."""
-    from ..core.files import write_bytes
-    from ..core.plotting import picture_bytes
+def _listed(camera: Camera) -> _Content:
+    """Return the CCDs of a camera as a table and for JSON, and the function that draws them."""
     from ..pipeline.report.camera_plot import camera_plot
     from ..pipeline.report.tables import CAMERA_CAPTION, CAMERA_COLUMNS, camera_rows
 
     rows = camera_rows(camera)
-    if as_json:
-        ccds = [dict(zip(CAMERA_COLUMNS, row, strict=True)) for row in rows]
-        print_json({"camera": camera.name, "pixel_um": round(camera.pixel_size * 1e6, 9), "ccds": ccds})
-        if picture is None:
-            return
-    path = Path(f"camera_{file_name(camera.name)}.png") if picture is None else picture
-    write_bytes(path, picture_bytes(camera_plot(camera), kind))
-    if not as_json:
-        Rows(CAMERA_COLUMNS, [[str(cell) for cell in row] for row in rows], CAMERA_CAPTION).show()
-        print_line(f"picture: {path.resolve()}")
+    ccds = [dict(zip(CAMERA_COLUMNS, row, strict=True)) for row in rows]
+    content = {"camera": camera.name, "pixel_um": round(camera.pixel_size * 1e6, 9), "ccds": ccds}
+    table = Rows(CAMERA_COLUMNS, [[str(cell) for cell in row] for row in rows], CAMERA_CAPTION)
+    return table, content, lambda: camera_plot(camera)
+
+
+def _heights(heights: str) -> _Content:
+    """Return the statistics of heights as a table and for JSON, and the function that draws a map."""
+    from dataclasses import asdict
+
+    from ..models.camera.height_statistics import height_statistics
+    from ..pipeline.report.height_plots import vendor_heights_plot
+    from ..pipeline.report.tables import HEIGHT_CAPTION, HEIGHT_COLUMNS, height_rows
+
+    plane = _focal_plane(heights)
+    statistics = height_statistics(plane)
+    residual = None if plane.residual is None else dict(zip(plane.names, plane.residual, strict=True))
+    metrics = {name: asdict(group) for name, group in statistics.items()}
+    content = {"heights": heights, "statistics_m": metrics, "fit_residual_m": residual}
+    title = f"CCD heights: {Path(heights).stem}"
+    table = Rows(HEIGHT_COLUMNS, height_rows(statistics), HEIGHT_CAPTION)
+    return table, content, lambda: vendor_heights_plot(plane, title)
 
 
 def _focal_plane(heights: str) -> FocalPlane:

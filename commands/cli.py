@@ -27,7 +27,7 @@ from ..core.terminal import print_line
 from ..core.version import VERSION
 from .help_group import HelpGroup
 from .interrupt import InterruptedRunError
-from .panels import sort_into_panels
+from .panels import plain_help, sort_into_panels
 from .targets import with_checked_targets
 
 # The error of bad arguments is a class of typer or of click, depending on the version of typer.
@@ -43,7 +43,7 @@ app = typer.Typer(
 #: The files of commands, in the order of the help.
 _FILES = (
     *("run", "images", "visits", "stack_images", "reproduce", "diagnostics", "measure", "model", "study", "design"),
-    *("tolerance", "sweep", "baseline", "camera", "shim", "donuts", "align", "telescope", "files"),
+    *("tolerance", "sweep", "baseline", "camera", "shim", "donuts", "align", "telescope", "files", "config"),
 )
 _GROUPS = [import_module(f".{name}", __package__) for name in _FILES]
 _INTERRUPTED = 130
@@ -57,9 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _show_all_characters()
     command_line = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        status = _app_with(command_line[0] if command_line else "")(
-            args=command_line, prog_name="pachon", standalone_mode=False
-        )
+        first = command_line[0] if command_line else _completed_command()
+        status = _app_with(first)(args=command_line, prog_name="pachon", standalone_mode=False)
         sys.stdout.flush()
         if status == _INTERRUPTED:
             return _fail("interrupted", _INTERRUPTED)
@@ -97,6 +96,16 @@ def _app_with(first: str) -> typer.Typer:
     command_app = copy(app)
     command_app.registered_commands, command_app.registered_groups = commands, groups
     return command_app
+
+
+def _completed_command() -> str:
+    """Return the command whose options or values a shell asks to complete; empty where it asks for something else."""
+    if "_PACHON_COMPLETE" not in os.environ:
+        return ""
+    typed = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS") or ""
+    words = typed.split()
+    # The command itself is completed as long as no space is behind it.
+    return words[1] if len(words) > 2 or (len(words) == 2 and typed[-1].isspace()) else ""
 
 
 def _usage_text(error: Any) -> str:
@@ -160,6 +169,7 @@ def _common(
 for _group in _GROUPS:
     app.add_typer(_group.app)
 sort_into_panels(app)
+plain_help(app)
 with_checked_targets(app)
 
 

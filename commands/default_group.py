@@ -9,8 +9,10 @@ from typing import Any
 
 from typer.core import TyperGroup
 
+from .plain_help import PlainHelp
 
-class DefaultGroup(TyperGroup):
+
+class DefaultGroup(PlainHelp, TyperGroup):
     """A group whose first command may be left out: ``pachon sweep FILE`` is ``pachon sweep run FILE``.
 
     The help of the group shows the options of that command too, and options may stand before the name of a command.

@@ -9,6 +9,8 @@ import typer
 from typer import Argument, Option
 
 from ..core.terminal import print_line
+from . import completion
+from .choices import names
 from .inputs import configured_experiment, warnings_shown
 from .interrupt import interruptible
 from .options import (
@@ -20,6 +22,7 @@ from .options import (
     ObservedStars,
     Quiet,
     Raft,
+    Settings,
     StarImages,
     StarStamp,
     StarX,
@@ -122,15 +125,19 @@ def attribute_command(
     raft: Raft = None,
     causes: Annotated[
         str | None,
-        Option(
+        names(
+            completion.causes,
+            listed=True,
+            metavar="CAUSE,...",
             help="Causes to switch off, separated by commas, of global, raft, ccd, tilt, potato_chip, heights, "
-            "active_optics, optics, atmosphere, ground_layer, diffusion, noise; all that are on by default."
+            "active_optics, optics, atmosphere, ground_layer, diffusion, noise; all that are on by default.",
         ),
     ] = None,
     average: Annotated[bool, Option("--average", help="Average over all turbulence; quick.")] = False,
     out: Annotated[Path, Option("--out", "-o", help="Folder to write to.")] = Path("pachon_attribution"),
     truth_stars: TruthStars = None,
     observed_stars: ObservedStars = None,
+    settings: Settings = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -151,10 +158,10 @@ def attribute_command(
     from ..studies.attribution.causes import checked_causes
     from ..studies.attribution.product import write_attribution
 
-    names = one_name_list(ccds=ccds, raft=raft)
+    ccd_names = one_name_list(ccds=ccds, raft=raft)
     engine = "long_exposure" if average else None
     resolved = configured_experiment(
-        config, ccds=names, stars__truth=truth_stars, stars__observed=observed_stars, psf__engine=engine
+        config, settings, ccds=ccd_names, stars__truth=truth_stars, stars__observed=observed_stars, psf__engine=engine
     ).config
     cause_names = checked_causes(resolved, None if causes is None else name_list(causes, "--causes"))
     make_folder(out)

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from ..sensing.stamp_files import DonutStamps
     from ..sensing.stamp_headers import HeaderValues
 
+#: Frames of field angles and of results.
+FRAME_NAMES = ("OCS", "CCS", "DVCS", "ZCS", "sky")
 #: Telescope where neither option nor header names one.
 DEFAULT_TELESCOPE = "lsst_v3.3_r"
 #: Side of a pixel where neither option nor header says it [um].

@@ -5,11 +5,20 @@ from __future__ import annotations
 from math import degrees
 from typing import TYPE_CHECKING, Any
 
+from ..core.terminal import print_line
+from .tables import Rows
+
 if TYPE_CHECKING:
     from ..sensing.frames import DonutFrames
     from ..sensing.observatory_zernikes import BodyMotions, ObservatoryZernikes
     from ..sensing.orientation import OrientationCheck
+    from ..sensing.result import DonutFit
     from .donut_inputs import DonutInputs
+
+_CAPTION = (
+    "Wavefront beyond the telescope's own: root of the summed squares of the Zernikes, and its error; the largest "
+    "terms. Positive where the wavefront leads."
+)
 
 
 def orientation_text(check: OrientationCheck, inputs: DonutInputs) -> str:
@@ -78,3 +87,78 @@ def motion_rows(motions: BodyMotions) -> tuple[tuple[str, ...], list[tuple[str, 
         rows,
         f"Hexapod corrections, which undo the motions fitted, along and about axes of {motions.frame}.",
     )
+
+
+def show_fit(fit: DonutFit, converted: ObservatoryZernikes, motions: BodyMotions | None) -> None:
+    """Print the table of a fit, that of hexapod corrections, and remarks."""
+    import numpy as np
+
+    print_line(fit_verdict(fit))
+    scale, unit, form = {"pachon": (1e9, "nm", ".0f"), "ts_wep": (1.0, "um", ".3f")}.get(
+        converted.convention, (1.0, "waves", ".3f")
+    )
+    rows = []
+    for i, (x, y) in enumerate(np.rad2deg(converted.fields)):
+        if not fit.usable[i]:
+            rows.append((f"{x:.4g}, {y:.4g}", fit.reasons[i], *[""] * 5))
+            continue
+        values, error = converted.values[i] * scale, converted.errors[i] * scale
+        largest = ", ".join(f"Z{fit.noll[k]} {values[k]:+{form}}" for k in np.argsort(-np.abs(values))[:3])
+        seeing = np.rad2deg(fit.fwhm[i]) * 3600.0
+        quality = fit.chi2[i] / fit.n_pixels[i]
+        sizes = f"{np.linalg.norm(values):{form}}", f"{np.linalg.norm(error):{form}}"
+        rows.append((f"{x:.4g}, {y:.4g}", fit.reasons[i] or "ok", *sizes, largest, f"{seeing:.2f}", f"{quality:.2f}"))
+    headings = (
+        "field [deg]",
+        "flags",
+        f"rms [{unit}]",
+        f"error [{unit}]",
+        f"largest [{unit}]",
+        'FWHM ["]',
+        "chi2 a pixel",
+    )
+    caption = f"{_CAPTION} Frame {converted.frame}, convention {converted.convention}."
+    Rows(headings, rows, caption, left=2).show()
+    if motions is not None:
+        Rows(*motion_rows(motions), left=1).show()
+    for line in _remarks(fit):
+        print_line(line)
+
+
+def fit_verdict(fit: DonutFit) -> str:
+    """Return the result of a fit in one sentence."""
+    import numpy as np
+
+    usable = np.flatnonzero(fit.usable)
+    if not usable.size:
+        return f"None of {len(fit)} donuts can be used: the reasons stand beside them."
+    terms = np.atleast_2d(fit.zernikes[usable])
+    rms = 1e9 * np.median(np.linalg.norm(terms, axis=1))
+    largest = int(np.argmax(np.abs(np.median(terms, axis=0))))
+    size = 1e9 * np.median(terms, axis=0)[largest]
+    count = f"{usable.size} of {len(fit)} donuts" if len(fit) > 1 else "The donut"
+    return f"{count}: the wavefront is off by {rms:.0f} nm rms (median), most in Z{fit.noll[largest]} ({size:+.0f} nm)."
+
+
+def _remarks(fit: DonutFit) -> list[str]:
+    """Return what is to be said of all donuts together, in sentences."""
+    from ..sensing.flags import DonutFlag
+
+    remarks, exposure = [], fit.exposure
+    wrong, ambiguous = (
+        int(sum(bool(flag & bit) for flag in fit.flags)) for bit in (DonutFlag.DEFOCUS_SIGN, DonutFlag.AMBIGUOUS_SIDE)
+    )
+    if wrong:
+        remarks.append(f"{wrong} of {len(fit)} donuts fit the other side of focus: the sign of their defocus is wrong.")
+    if ambiguous:
+        remarks.append(
+            f"{ambiguous} of {len(fit)} donuts fit both sides of focus: results are those of the side given."
+        )
+    if exposure is not None:
+        remarks.append(
+            f"{int(fit.usable.sum())} donuts are fitted as of one telescope (--each-alone: each by itself). By their "
+            f"scatter the air has {1e9 * exposure.air_rms:.0f} nm rms, which the errors include, and the fits "
+            f"{exposure.noise_scale:.2g} times the variance that they claim."
+        )
+        remarks += [notice[0].upper() + notice[1:] + "." for notice in exposure.notices]
+    return remarks

@@ -10,26 +10,29 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 from typer import Argument, Option
 
-from ..core.errors import ConfigError, check_choice
+from ..core.errors import ConfigError
 from ..core.terminal import print_line, print_warning
+from . import completion
+from .choices import choice, names
 from .donut_inputs import (
     DEFAULT_PIXEL_UM,
     DEFAULT_TELESCOPE,
+    FRAME_NAMES,
     FrameOptions,
     StampFiles,
     donut_inputs,
 )
-from .donut_report import motion_rows, observatory_summary, orientation_text
+from .donut_report import observatory_summary, orientation_text, show_fit
 from .donut_simulation import simulate_file
 from .inputs import load_model
 from .interrupt import interruptible
 from .options import GlassCatalogues, Json, Lenient, Projection, Quiet, Threads, picture_kind, wavelength_list
-from .tables import Rows, print_json
+from .tables import print_json
 
 if TYPE_CHECKING:
     from ..raytrace.rays import Projection as FieldProjection
     from ..sensing.frames import FrameName
-    from ..sensing.observatory_zernikes import BodyMotions, ObservatoryZernikes, ZernikeConvention
+    from ..sensing.observatory_zernikes import ObservatoryZernikes, ZernikeConvention
     from ..sensing.result import DonutFit
     from ..sensing.stamp_headers import HeaderValues
     from ..sensing.wavefront_fits import WavefrontFit
@@ -48,20 +51,17 @@ _OFF_AXIS = 0.25
 #: Donuts that are enough for a check of orientation wherever they stand.
 _SEVERAL = 3
 
-_CAPTION = (
-    "Wavefront beyond the telescope's own: root of the summed squares of the Zernikes, and its error; the largest "
-    "terms. Positive where the wavefront leads."
-)
-
 
 @app.command("donuts")
 def donuts_command(
     files: Annotated[list[Path], Argument(metavar="FILE.fits ...", help="Stamps of donuts, or images of CCDs.")],
     telescope: Annotated[
         str | None,
-        Option(
+        names(
+            completion.models,
             "--telescope",
             "-t",
+            metavar="MODEL",
             help="Bundled model, or path; that of the headers' camera and band, or lsst_v3.3_r.",
             rich_help_panel=_TELESCOPE,
         ),
@@ -75,7 +75,9 @@ def donuts_command(
     ] = 0.0,
     moved: Annotated[
         str | None,
-        Option(
+        names(
+            completion.words("Detector", "Camera", "M2"),
+            metavar="NAME",
             help="Surface or group that defocus moves: Detector, Camera, M2, ...; the file's or its camera's own.",
             rich_help_panel=_TELESCOPE,
         ),
@@ -142,12 +144,20 @@ def donuts_command(
         ),
     ] = None,
     site: Annotated[
-        str, Option(help="Site whose turbulence and winds --exposure-s is about.", rich_help_panel=_FIT)
+        str,
+        names(
+            completion.sites,
+            metavar="SITE|FILE",
+            help="Site whose turbulence and winds --exposure-s is about.",
+            rich_help_panel=_FIT,
+        ),
     ] = "cerro_pachon",
     degrees_of_freedom: Annotated[
         str | None,
-        Option(
-            help="Fit degrees of freedom to all donuts: lsst, or a YAML file; prints hexapod corrections.",
+        names(
+            completion.degrees_of_freedom,
+            metavar="lsst|FILE",
+            help="Fit degrees of freedom to all donuts; prints hexapod corrections.",
             rich_help_panel=_FIT,
         ),
     ] = None,
@@ -171,7 +181,8 @@ def donuts_command(
     ] = None,
     stamp_axes: Annotated[
         str | None,
-        Option(
+        names(
+            completion.words("DVCS", "x,y", "y,x", "-x,y", "x,-y", "-x,-y"),
             metavar="X,Y",
             help="Axes of the camera along columns and rows of stamps: x,y, -y,x...; DVCS (LSST's images, y,x). "
             "By default those of the headers' detector, or x,y.",
@@ -193,14 +204,15 @@ def donuts_command(
         ),
     ] = None,
     field_frame: Annotated[
-        str, Option(help="Frame of field angles given: OCS, CCS, DVCS, ZCS, sky.", rich_help_panel=_FRAMES)
+        str, choice(FRAME_NAMES, help="Frame of field angles given.", rich_help_panel=_FRAMES)
     ] = "OCS",
     frame: Annotated[
-        str, Option(help="Frame of results: OCS (telescope), CCS, DVCS, ZCS, sky.", rich_help_panel=_FRAMES)
+        str, choice(FRAME_NAMES, help="Frame of results; OCS is the telescope's.", rich_help_panel=_FRAMES)
     ] = "OCS",
     convention: Annotated[
         str,
-        Option(
+        choice(
+            ("pachon", "ts_wep", "donut"),
             help="Zernikes of results: pachon (nm), ts_wep (um), donut (DECam's, circular, waves of 700 nm).",
             rich_help_panel=_FRAMES,
         ),
@@ -224,7 +236,8 @@ def donuts_command(
     ] = None,
     settings: Annotated[
         list[str] | None,
-        Option(
+        names(
+            completion.key_values("donuts"),
             "--set",
             metavar="KEY=VALUE",
             help="Of --simulate: stars, layout (random, corners), sides (1, 2), seeing_arcsec, electrons, sky, "
@@ -233,12 +246,14 @@ def donuts_command(
         ),
     ] = None,
     out: Annotated[
-        Path | None, Option("--out", "-o", help="Table: .ecsv, .fits, .csv or .parquet.", rich_help_panel=_OUTPUT)
+        Path | None,
+        Option("--out", "-o", "--table", help="Table: .ecsv, .fits, .csv or .parquet.", rich_help_panel=_OUTPUT),
     ] = None,
     picture: Annotated[
         Path | None,
-        Option(help="Picture of the first six donuts: .png, .pdf or .svg.", rich_help_panel=_OUTPUT),
+        Option(help="Picture of the first six donuts: .png, .pdf or .svg; none by default.", rich_help_panel=_OUTPUT),
     ] = None,
+    no_picture: Annotated[bool, Option("--no-picture", help="Draw no picture.", rich_help_panel=_OUTPUT)] = False,
     glass_catalogue: GlassCatalogues = None,
     lenient: Lenient = False,
     threads: Threads = None,
@@ -274,10 +289,9 @@ def donuts_command(
     from ..sensing.exposure_fit import ExposureDonuts
     from ..sensing.fit import fit_donuts
     from ..sensing.flags import DonutFlag
-    from ..sensing.frames import FRAMES
     from ..sensing.freedom_fit import TelescopeFreedoms
     from ..sensing.model import DETECTOR, DonutAir, DonutDetector, DonutModel
-    from ..sensing.observatory_zernikes import CONVENTIONS, hexapod_corrections
+    from ..sensing.observatory_zernikes import hexapod_corrections
     from ..sensing.orientation import check_orientation
     from ..sensing.wavefront_fits import SingleDonuts
     from ..wavefront.atmosphere.atmosphere import Atmosphere
@@ -298,13 +312,8 @@ def donuts_command(
         return
     if perturb or settings:
         raise ConfigError("--perturb, --set: expected them with --simulate alone")
+    picture = None if no_picture else picture
     kind = _output_kind(out, picture)
-    for option, name, names in (
-        ("--convention", convention, CONVENTIONS),
-        ("--frame", frame, FRAMES),
-        ("--field-frame", field_frame, FRAMES),
-    ):
-        check_choice(option, name, names)
     field_projection, output_frame = cast("FieldProjection", projection), cast("FrameName", frame)
     files_read = StampFiles.read(files, positions, stamp, mask, variance)
     header = files_read.header()
@@ -391,7 +400,7 @@ def donuts_command(
     if as_json:
         print_json(fit.summary() | observatory_summary(frames, converted, motions, orientation))
     elif not quiet:
-        _show(fit, converted, motions)
+        show_fit(fit, converted, motions)
 
 
 def _electrons(gain: float | None, header: HeaderValues) -> float:
@@ -434,61 +443,3 @@ def _write(fit: DonutFit, converted: ObservatoryZernikes, table: Path | None, pi
         write_table(table, fit.to_table() if plain else converted.in_table(fit.to_table()))
     if picture is not None:
         write_bytes(picture, picture_bytes(fit.plot(), kind))
-
-
-def _show(fit: DonutFit, converted: ObservatoryZernikes, motions: BodyMotions | None) -> None:
-    import numpy as np
-
-    scale, unit, form = {"pachon": (1e9, "nm", ".0f"), "ts_wep": (1.0, "um", ".3f")}.get(
-        converted.convention, (1.0, "waves", ".3f")
-    )
-    rows = []
-    for i, (x, y) in enumerate(np.rad2deg(converted.fields)):
-        if not fit.usable[i]:
-            rows.append((f"{x:.4g}, {y:.4g}", fit.reasons[i], *[""] * 5))
-            continue
-        values, error = converted.values[i] * scale, converted.errors[i] * scale
-        largest = ", ".join(f"Z{fit.noll[k]} {values[k]:+{form}}" for k in np.argsort(-np.abs(values))[:3])
-        seeing = np.rad2deg(fit.fwhm[i]) * 3600.0
-        quality = fit.chi2[i] / fit.n_pixels[i]
-        sizes = f"{np.linalg.norm(values):{form}}", f"{np.linalg.norm(error):{form}}"
-        rows.append((f"{x:.4g}, {y:.4g}", fit.reasons[i] or "ok", *sizes, largest, f"{seeing:.2f}", f"{quality:.2f}"))
-    headings = (
-        "field [deg]",
-        "flags",
-        f"rms [{unit}]",
-        f"error [{unit}]",
-        f"largest [{unit}]",
-        'FWHM ["]',
-        "chi2 a pixel",
-    )
-    caption = f"{_CAPTION} Frame {converted.frame}, convention {converted.convention}."
-    Rows(headings, rows, caption, left=2).show()
-    if motions is not None:
-        Rows(*motion_rows(motions), left=1).show()
-    for line in _remarks(fit):
-        print_line(line)
-
-
-def _remarks(fit: DonutFit) -> list[str]:
-    """Return what is to be said of all donuts together, in sentences."""
-    from ..sensing.flags import DonutFlag
-
-    remarks, exposure = [], fit.exposure
-    wrong, ambiguous = (
-        int(sum(bool(flag & bit) for flag in fit.flags)) for bit in (DonutFlag.DEFOCUS_SIGN, DonutFlag.AMBIGUOUS_SIDE)
-    )
-    if wrong:
-        remarks.append(f"{wrong} of {len(fit)} donuts fit the other side of focus: the sign of their defocus is wrong.")
-    if ambiguous:
-        remarks.append(
-            f"{ambiguous} of {len(fit)} donuts fit both sides of focus: results are those of the side given."
-        )
-    if exposure is not None:
-        remarks.append(
-            f"{int(fit.usable.sum())} donuts are fitted as of one telescope (--each-alone: each by itself). By their "
-            f"scatter the air has {1e9 * exposure.air_rms:.0f} nm rms, which the errors include, and the fits "
-            f"{exposure.noise_scale:.2g} times the variance that they claim."
-        )
-        remarks += [notice[0].upper() + notice[1:] + "." for notice in exposure.notices]
-    return remarks

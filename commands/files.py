@@ -10,6 +10,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.terminal import print_line
+from .choices import choice
 from .options import Json
 from .tables import print_json
 
@@ -24,9 +25,14 @@ app = typer.Typer()
 def new_command(
     kind: Annotated[
         str,
-        Argument(
-            help="ritchey-chretien, cassegrain, dall-kirkham, gregorian, newtonian, schmidt, three-mirror, singlet, "
-            "doublet or triplet."
+        choice(
+            (
+                *("ritchey-chretien", "cassegrain", "dall-kirkham", "gregorian", "newtonian", "schmidt"),
+                *("three-mirror", "singlet", "doublet", "triplet"),
+            ),
+            metavar="KIND",
+            help="Kind of telescope or lens.",
+            kind=Argument,
         ),
     ],
     out: Annotated[
@@ -99,9 +105,14 @@ def validate_command(
 def schema_command(
     kind: Annotated[
         str,
-        Argument(
-            help="prescription, run, sweep, images, visits, align, site, coatings, tolerances, optimization or "
-            "degrees_of_freedom."
+        choice(
+            (
+                *("prescription", "run", "sweep", "images", "visits", "align", "site", "coatings", "tolerances"),
+                *("optimization", "degrees_of_freedom"),
+            ),
+            metavar="KIND",
+            help="Kind of file.",
+            kind=Argument,
         ),
     ],
 ) -> None:

@@ -7,9 +7,10 @@ from typing import Any
 from typer.core import TyperGroup
 
 from ..core.terminal import print_line
+from .plain_help import PlainHelp
 
 
-class HelpGroup(TyperGroup):
+class HelpGroup(PlainHelp, TyperGroup):
     """A group whose name alone prints its help, with status 2: no command was named.
 
     click does so since 8.2 by an error without a text, and before with status 0.

@@ -6,15 +6,17 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from typer import Argument, Option
+from typer import Option
 
 from ..core.terminal import print_line
+from .choices import choice
 from .night import Bands, ListFile, Night, VisitNumber, Where, listed_visit, require_list
-from .options import AllCcds, Ccds, Json, Quiet, Raft, Threads, chosen_ccds
+from .options import AllCcds, Ccds, Config, Json, Quiet, Raft, Threads, chosen_ccds, set_option
 from .tables import Rows, print_json
 from .workers import DaskWorkers, Processes, Scheduler, long_work
 
 app = typer.Typer()
+ImagesSettings = Annotated[list[str] | None, set_option("images")]
 
 #: Settings of --quick: the mean over all turbulence, the middle of a CCD, galaxies that a few minutes would show.
 _QUICK = {"run__psf__engine": "long_exposure", "galaxies__faintest": 26.0, "image__side": 1024}
@@ -22,14 +24,18 @@ _QUICK = {"run__psf__engine": "long_exposure", "galaxies__faintest": 26.0, "imag
 
 @app.command("images")
 def images_command(
-    config: Annotated[Path | None, Argument(metavar="CONFIG.yaml", help="Configuration; all has a default.")] = None,
+    config: Config = None,
     ccds: Ccds = None,
     raft: Raft = None,
     all_ccds: AllCcds = False,
     out: Annotated[Path, Option("--out", "-o", help="Folder of the images.")] = Path("pachon_images"),
     exposures: Annotated[int | None, Option(min=1, help="Exposures of the run's time that are summed.")] = None,
     way: Annotated[
-        str | None, Option(help="direct: each galaxy under its own PSF; eigen: the image, component by component.")
+        str | None,
+        choice(
+            ("direct", "eigen"),
+            help="direct: each galaxy under its own PSF; eigen: the image, component by component.",
+        ),
     ] = None,
     noise: Annotated[bool | None, Option("--noise/--no-noise", help="With noise, or the expected image.")] = None,
     faintest: Annotated[float | None, Option(help="Faintest galaxy [AB mag].")] = None,
@@ -46,6 +52,7 @@ def images_command(
     processes: Processes = None,
     scheduler: Scheduler = None,
     workers: DaskWorkers = None,
+    settings: ImagesSettings = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -63,6 +70,7 @@ def images_command(
     - `pachon images --ccds R22_S11`: one whole CCD, a minute on two cores
     - `pachon images --all --faintest 27 -o field --processes 2`: the whole focal plane, 31 GB
     - `pachon images --ccds R22_S11 --exposures 400 -o deep`: 400 exposures of 15 s
+    - `pachon images --ccds R22_S11 --set run.band=i --set image.sky_mag=20.8`: any key of `pachon config images`
     - `pachon images --ccds R22_S11 --no-noise --way eigen -o expected`
     - `pachon images my_images.yaml -o field --resume`: go on where it was stopped
     - `pachon images --list baseline.db --visit 1004 --ccds R22_S11 -o visit1004`: a visit of a scheduler's list
@@ -75,11 +83,15 @@ def images_command(
         galaxies: {faintest: 27}               # or {catalogue: galaxies.ecsv}
         image: {exposures: 100, gain: 1.6, sky_mag: 20.8}
     """
-    from ..imaging.config import ImagesConfig, load_images_configuration
+    from ..core.set_keys import with_set_keys
+    from ..imaging.config import ImagesConfig, load_images_configuration, with_files
     from ..imaging.simulate import simulate_images
     from ..pipeline.config import with_options
 
+    folder = None if config is None else config.parent
     base = ImagesConfig() if config is None else load_images_configuration(config)
+    if settings:
+        base = with_files(with_set_keys(base, settings), folder or Path())
     options = {
         "run__ccds": chosen_ccds(ccds, raft, all_ccds),
         "run__seed": seed,
@@ -88,18 +100,19 @@ def images_command(
         "image__noise": noise,
         "galaxies__faintest": faintest,
     }
-    settings = with_options(with_options(base, **(_QUICK if quick else {})), **options)
-    folder = None if config is None else config.parent
+    images_config = with_options(with_options(base, **(_QUICK if quick else {})), **options)
     if visit_list is None:
         require_list(("--visit", visit), ("--where", where), ("--band", band), ("--night", night))
     else:
-        settings = settings.of_visit(listed_visit(settings.run, visit_list, visit, where, band, night), folder)
-    experiment = settings.experiment(folder)
+        images_config = images_config.of_visit(
+            listed_visit(images_config.run, visit_list, visit, where, band, night), folder
+        )
+    experiment = images_config.experiment(folder)
     hint = f"finished CCDs are in {out}, and --resume goes on from there"
     with long_work(
         quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
     ) as execution:
-        result = simulate_images(settings, out, experiment=experiment, execution=execution)
+        result = simulate_images(images_config, out, experiment=experiment, execution=execution)
     images = {name: str(path.resolve()) for name, path in result.images.items()}
     if as_json:
         print_json({"images": images, "objects": result.objects, "kept": list(result.kept)})

@@ -16,16 +16,20 @@ if TYPE_CHECKING:
     from ..pipeline.experiment import Experiment
 
 
-def configured_experiment(config: Path | None, *, paper_model: bool = False, **options: object) -> Experiment:
-    """Return the experiment of a configuration file and of options by key, None where not given.
+def configured_experiment(
+    config: Path | None, set_texts: Sequence[str] | None = None, *, paper_model: bool = False, **options: object
+) -> Experiment:
+    """Return the experiment of a configuration file, of values of `--set`, and of options by key, None where not given.
 
     With `paper_model` the PSF model is that of Jee & Tyson 2011 where the file names none.
     """
+    from ..core.set_keys import with_set_keys
     from ..pipeline.config import Configuration, load_configuration, with_options
     from ..pipeline.defaults import with_paper_model
     from ..pipeline.experiment import Experiment
 
-    base = Configuration() if config is None else load_configuration(config)
+    file = Configuration() if config is None else load_configuration(config)
+    base = with_set_keys(file, set_texts or ())
     if paper_model:
         base = with_paper_model(base)
     settings = with_options(base, **options)
@@ -33,7 +37,7 @@ def configured_experiment(config: Path | None, *, paper_model: bool = False, **o
         with warnings_shown(HeightWarning):
             return Experiment.from_config(settings, None if config is None else config.parent)
     except PachonError as error:
-        if config is None or settings is not base:
+        if config is None or settings is not base or set_texts:
             raise  # an option may be at fault, not the file
         raise error.within(file=config) from None
 

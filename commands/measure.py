@@ -9,6 +9,8 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError
+from . import completion
+from .choices import choice, names
 from .inputs import load_model
 from .options import (
     Basis,
@@ -35,7 +37,6 @@ _CAPTION = "Completeness and purity of the stars; magnitude at which half of the
 _HEADINGS = ("image", "objects", "stars", "usable", "per arcmin²", "complete, pure", "half [mag]", "purity")
 #: Columns of images without the truth.
 _COLUMNS = 5
-_MODELS = ("ccd", "focal_plane")
 
 
 @app.command("measure")
@@ -45,12 +46,14 @@ def measure_command(
         Path | None, Option("--out", "-o", help="Folder of the catalogues; by default that of each.")
     ] = None,
     model: Annotated[
-        str, Option(help="PSF model: ccd, one of each image, or focal_plane, one of the stars of all images.")
+        str, choice(("ccd", "focal_plane"), help="PSF model: one of each image, or one of the stars of all images.")
     ] = "ccd",
     telescope: Annotated[
         str | None,
-        Option(
-            help="Telescope of the focal-plane model: name or file. By default images.yaml beside the images has it."
+        names(
+            completion.models,
+            metavar="MODEL",
+            help="Telescope of the focal-plane model: name or file. By default images.yaml beside the images has it.",
         ),
     ] = None,
     recipe: Recipe = None,
@@ -77,7 +80,11 @@ def measure_command(
     ] = None,
     weight: Annotated[str | None, Option(help="FITS file of the noise of the pixels, or {stem}....")] = None,
     weight_kind: Annotated[
-        str, Option(help="What it holds: weight (inverse variance on any scale), variance, rms.")
+        str,
+        choice(
+            ("weight", "variance", "rms"),
+            help="What it holds; a weight is an inverse variance on any scale.",
+        ),
     ] = "weight",
     mask: Annotated[str | None, Option(help="FITS file of the mask, or {stem}....")] = None,
     gain: Annotated[float | None, Option(help="Electrons in a unit of the image, where the header has none.")] = None,
@@ -124,8 +131,6 @@ def measure_command(
     from ..imaging.image_formats.load import ImageSettings
     from ..imaging.measure_files import MeasureOptions, images_among, measure_files
 
-    if model not in _MODELS:
-        raise ConfigError(f"--model = {model!r}: expected one of {', '.join(_MODELS)}")
     if model != "ccd" and psf is not None:
         raise ConfigError("--psf: expected with --model ccd alone")
     if model == "ccd" and telescope is not None:

@@ -17,6 +17,7 @@ from .options import (
     Interpolation,
     Json,
     MinSnr,
+    NoPicture,
     Order,
     Quiet,
     Recipe,
@@ -27,6 +28,8 @@ from .options import (
     StarX,
     StarY,
     Weights,
+    check_table,
+    picture_kind,
     recipe_of_options,
 )
 from .tables import Rows, print_json
@@ -60,6 +63,13 @@ def model_command(
     components: Components = None,
     weights: Weights = None,
     order: Order = None,
+    picture: Annotated[
+        Path | None, Option("--picture", help="Picture to write, .png, .pdf or .svg; beside the model by default.")
+    ] = None,
+    no_picture: NoPicture = False,
+    table: Annotated[
+        Path | None, Option("--table", help="Table of all stars to write; beside the model, .ecsv, by default.")
+    ] = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -67,8 +77,8 @@ def model_command(
 
     Stars are centred; pixels without weight, neighbours and cosmic rays apart from a core are masked; stars with
     saturated cores, or too little that is not masked, are left out. The model is kriging of pixels, as smooth as the
-    stars say, or that of the options. It leaves the model, STARS_psf.fits; a picture beside it, .png; and all stars
-    with their shapes and what the model made without them predicts, .ecsv.
+    stars say, or that of the options. It leaves the model, STARS_psf.fits; a picture beside it, .png (with `--json`
+    where `--picture` names it); and all stars with their shapes and what the model made without them predicts, .ecsv.
 
     **Examples**
 
@@ -79,13 +89,15 @@ def model_command(
     - `pachon model stars.ecsv --images stamps.fits --x X --y Y -o psf.fits`
     """
     from ..core.files import write_bytes
-    from ..core.plotting import png_bytes
+    from ..core.plotting import picture_bytes
     from ..core.table_files import write_table
     from ..core.units import ARCSEC
     from ..models.star_spectrum import psf_colours
     from ..reconstruction.own_stars.own_stars import fit_own_stars
     from ..reconstruction.own_stars.star_catalogue import load_stars
 
+    kind = picture_kind(picture)
+    check_table(table)
     chosen_recipe = recipe_of_options(recipe, basis, interpolation, components, weights, order)
     options: dict[str, Any] = {} if chosen_recipe is None else {"recipe": chosen_recipe}
     path = stars.with_name(f"{stars.stem}_psf.fits") if out is None else out
@@ -106,8 +118,10 @@ def model_command(
             **options,
         )
         result.model.write(path)
-        write_bytes(path.with_suffix(".png"), png_bytes(result.plot(stars.name)))
-        write_table(path.with_suffix(".ecsv"), result.table())
+        picture_path = picture or (None if as_json else path.with_suffix(".png"))
+        if picture_path is not None and not no_picture:
+            write_bytes(picture_path, picture_bytes(result.plot(stars.name), kind))
+        write_table(table or path.with_suffix(".ecsv"), result.table())
     summary_of_stars = result.summary()
     if as_json:
         print_json({"model": str(path), **summary_of_stars})
@@ -124,7 +138,9 @@ def model_command(
             ("... of which noise of the stars", f"{100 * summary_of_stars['rms_e_noise']:.2f} %"),
             ("rms of size less the model, held out", f"{100 * summary_of_stars['rms_size_held_out']:.2f} %"),
             ("... of which noise of the stars", f"{100 * summary_of_stars['rms_size_noise']:.2f} %"),
-            ("model, picture, stars", f"{path}, .png, .ecsv"),
+            ("model", str(path)),
+            *([] if no_picture else [("picture", str(picture_path))]),
+            ("stars", str(table or path.with_suffix(".ecsv"))),
         ]
         if colour_column is not None:
             rows.insert(1, ("dependence on colour", _colour_text(colour_column, result.model.colour)))

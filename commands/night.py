@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +10,8 @@ from typer import Option
 
 from ..core.errors import ConfigError
 from ..core.terminal import print_line
+from . import completion
+from .choices import names
 from .tables import Rows, print_json
 
 if TYPE_CHECKING:
@@ -22,8 +25,17 @@ ListFile = Annotated[
     Path | None,
     Option("--list", metavar="FILE", help="List of visits: a database of a scheduler, a table, or a catalogue."),
 ]
-Where = Annotated[str | None, Option(help="Of a list: condition on its columns, in SQL.")]
-Bands = Annotated[str | None, Option("--band", help="Of a list: bands to take, as r,i.")]
+Where = Annotated[str | None, Option(metavar="CONDITION", help="Of a list: condition on its columns, in SQL.")]
+Bands = Annotated[
+    str | None,
+    names(
+        completion.words("u", "g", "r", "i", "z", "y"),
+        "--band",
+        listed=True,
+        metavar="BAND,...",
+        help="Of a list: bands to take, as r,i.",
+    ),
+]
 Night = Annotated[int | None, Option(min=0, help="Of a list: night to take, YYYYMMDD or its number.")]
 VisitNumber = Annotated[int | None, Option("--visit", min=0, help="Of a list: number of the visit.")]
 
@@ -57,13 +69,14 @@ def names_list(config: Path) -> bool:
     return isinstance(visits, dict) and "list" in visits
 
 
-def night_settings(config: Path | None, **options: object) -> NightConfig:
-    """Return the settings of a night from a file and options by key, None where not given."""
+def night_settings(config: Path | None, set_texts: Sequence[str] | None, **options: object) -> NightConfig:
+    """Return the settings of a night from a file, values of `--set` and options by key, None where not given."""
+    from ..core.set_keys import with_set_keys
     from ..pipeline.config import with_options
     from ..studies.night.config import NightConfig, load_night_configuration
 
     base = NightConfig() if config is None else load_night_configuration(config)
-    return with_options(base, **options)
+    return with_options(with_set_keys(base, set_texts or ()), **options)
 
 
 def listed_visit(

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 from typer import Argument, Option
 
 from ..core.errors import ConfigError
+from . import completion
+from .choices import choice, names
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,13 +19,54 @@ if TYPE_CHECKING:
     from ..reconstruction.psf_model.recipe import Recipe as PsfRecipe
     from ..reconstruction.psf_model.recipe import RecipeName
 
-Config = Annotated[Path | None, Argument(metavar="CONFIG.yaml", help="Configuration; all has a default.")]
-Ccds = Annotated[str | None, Option(help="CCDs, separated by commas: R22_S11,R22_S12.")]
-Raft = Annotated[str | None, Option(help="All CCDs of rafts: R22 or R22,R23.")]
+
+def set_option(kind: str) -> Any:
+    """Return the option `--set`, for the keys of a kind of configuration."""
+    return names(
+        completion.key_values(kind),
+        "--set",
+        metavar="KEY=VALUE",
+        help=f"Value of a key of the configuration, once for each. `pachon config {kind}` explains all keys.",
+    )
+
+
+#: Words of options that several commands have.
+BANDS = ("u", "g", "r", "i", "z", "y")
+PROJECTIONS = ("zemax", "gnomonic", "postel")
+Config = Annotated[
+    Path | None,
+    names(
+        completion.files(*completion.YAML),
+        metavar="CONFIG.yaml",
+        help="Configuration; all has a default.",
+        kind=Argument,
+    ),
+]
+Settings = Annotated[list[str] | None, set_option("run")]
+Ccds = Annotated[
+    str | None,
+    names(
+        completion.ccds,
+        listed=True,
+        metavar="CCD,...",
+        help="CCDs, separated by commas: R22_S11,R22_S12.",
+    ),
+]
+Raft = Annotated[
+    str | None, names(completion.rafts, listed=True, metavar="RAFT,...", help="All CCDs of rafts: R22 or R22,R23.")
+]
 AllCcds = Annotated[bool, Option("--all", help="All CCDs of the camera.")]
 TruthStars = Annotated[int | None, Option(help="Noise-free PSFs on each CCD.")]
 ObservedStars = Annotated[int | None, Option(help="Observed stars on each CCD.")]
-Model = Annotated[str, Argument(help="Bundled model, or path of a prescription.")]
+Model = Annotated[
+    str,
+    names(
+        completion.models,
+        metavar="MODEL",
+        help="Bundled model (pachon info lists them), or path of a prescription.",
+        kind=Argument,
+    ),
+]
 Lenient = Annotated[bool, Option("--lenient", help="Lens or batoid file: warn about unknown parts, go on.")]
 Configuration = Annotated[
     int | None,
@@ -34,7 +77,11 @@ GlassCatalogues = Annotated[
     Option("--glass-catalogue", metavar="FILE.agf", help="Glass catalogue of a lens file, once for each."),
 ]
 Aiming = Annotated[
-    str | None, Option(help="Rays fill the entrance pupil (off), or the stop (paraxial, real); as the file says.")
+    str | None,
+    choice(
+        ("off", "paraxial", "real"),
+        help="Rays fill the entrance pupil (off), or the stop (paraxial, real); as the file says.",
+    ),
 ]
 WavelengthNm = Annotated[float | None, Option("--wavelength-nm", help="Wavelength [nm]; the model's own by default.")]
 FieldsDeg = Annotated[
@@ -52,10 +99,10 @@ WavelengthsNm = Annotated[
 AcrossBand = Annotated[
     int | None, Option("--across-band", min=2, max=99, metavar="N", help="In their place: wavelengths across the band.")
 ]
-Projection = Annotated[str, Option(help="Meaning of the field angles: zemax, gnomonic or postel.")]
+Projection = Annotated[str, choice(PROJECTIONS, help="Meaning of the field angles.")]
 Picture = Annotated[
     Path | None,
-    Option("--picture", "-o", help="Picture to write, .png, .pdf or .svg; by default named after command and model."),
+    Option("--picture", help="Picture to write, .png, .pdf or .svg; by default named after command and model."),
 ]
 NoPicture = Annotated[bool, Option("--no-picture", help="Draw no picture.")]
 TableFile = Annotated[
@@ -78,12 +125,18 @@ StarImages = Annotated[Path | None, Option("--images", help="FITS cube of the st
 MinSnr = Annotated[float, Option(help="Least S/N of a star.")]
 Gain = Annotated[float, Option(help="Electrons in a unit of the stamps.")]
 Recipe = Annotated[
-    str | None, Option(help="Model of the CCD: kriging (of pixels, default), paper (20 eigen-PSFs, cubic polynomials).")
+    str | None,
+    choice(
+        ("kriging", "paper"),
+        help="Model of the CCD: kriging (of pixels, default), paper (20 eigen-PSFs, cubic polynomials).",
+    ),
 ]
-Basis = Annotated[str | None, Option(help="Of the recipe: pixels, pca, shapelets.")]
-Interpolation = Annotated[str | None, Option(help="Of the recipe, between the stars: kriging, polynomial.")]
+Basis = Annotated[
+    str | None, choice(("pixels", "pca", "shapelets"), help="Of the recipe: what stars are described in.")
+]
+Interpolation = Annotated[str | None, choice(("kriging", "polynomial"), help="Of the recipe, between the stars.")]
 Components = Annotated[int | None, Option(min=1, help="Components of pca and shapelets.")]
-Weights = Annotated[str | None, Option(help="Of the stars in polynomials: equal, snr, softened, noise.")]
+Weights = Annotated[str | None, choice(("equal", "snr", "softened", "noise"), help="Of the stars in polynomials.")]
 Order = Annotated[int | None, Option(min=0, max=6, help="Of polynomials over the image, or of the trend in kriging.")]
 Threads = Annotated[int | None, Option(min=1, help="Threads; all processors by default. No byte depends on it.")]
 Quiet = Annotated[bool, Option("--quiet", help="No progress, no table.")]

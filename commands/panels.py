@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import typer
 
+from .plain_help import PlainCommand
+
 #: Commands of each panel, in the order of the help.
 PANELS = {
     "Runs and images": "run images visits null-test stack-images reproduce diagnose attribute",
@@ -13,8 +15,17 @@ PANELS = {
     "design-report",
     "Optimise, tolerance, sweep": "optimize operands sensitivity tolerance sweep baseline check",
     "Camera and alignment": "camera shim donuts align",
-    "Files": "info convert new validate schema",
+    "Files": "info convert new validate schema config",
 }
+
+
+def plain_help(app: typer.Typer) -> None:
+    """Let all commands in the groups of an app write help without Python's types."""
+    for command in app.registered_commands:
+        command.cls = PlainCommand
+    for group in app.registered_groups:
+        if group.typer_instance is not None:
+            plain_help(group.typer_instance)
 
 
 def sort_into_panels(app: typer.Typer) -> None:

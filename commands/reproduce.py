@@ -10,6 +10,8 @@ from rich.table import Table
 from typer import Argument, Option
 
 from ..core.terminal import print_line
+from . import completion
+from .choices import choice, names
 from .options import Json, Quiet, Threads
 from .tables import print_json, wide_console
 from .workers import DaskWorkers, Processes, Scheduler, long_work
@@ -20,10 +22,20 @@ app = typer.Typer()
 @app.command("reproduce")
 def reproduce_command(
     figures: Annotated[
-        list[str] | None, Argument(metavar="fig1 ... fig18 | table1 | all", help="Figures; all by default.")
+        list[str] | None,
+        names(
+            completion.figures,
+            metavar="FIGURE",
+            help="Figures fig1 ... fig18, table1, or all, the default.",
+            kind=Argument,
+        ),
     ] = None,
     scale: Annotated[
-        str, Option(help="small (two minutes) or paper (189 CCDs: an hour; with 100 visits, half a day).")
+        str,
+        choice(
+            ("small", "paper"),
+            help="small (two minutes), or paper (189 CCDs: an hour; with 100 visits, half a day).",
+        ),
     ] = "small",
     out: Annotated[Path, Option("--out", "-o", help="Folder of the figures.")] = Path("pachon_figures"),
     seed: Annotated[int, Option(min=0, help="Seed of all random numbers.")] = 1,

@@ -21,7 +21,7 @@ from .night import (
     part_of,
     require_list,
 )
-from .options import AllCcds, Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, chosen_ccds
+from .options import AllCcds, Ccds, Config, Json, ObservedStars, Quiet, Raft, Settings, Threads, TruthStars, chosen_ccds
 from .tables import Rows, plain_table, print_json, wide_console
 from .workers import DaskWorkers, Processes, Scheduler, long_work
 
@@ -54,6 +54,7 @@ def run_command(
     night: Night = None,
     truth_stars: TruthStars = None,
     observed_stars: ObservedStars = None,
+    settings: Settings = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -70,12 +71,14 @@ def run_command(
     - `pachon run`: the default, under a minute on two cores
     - `pachon run --raft R22 --out central_raft --seed 7`
     - `pachon run --ccds R22_S11,R24_S12 --truth-stars 400`
+    - `pachon run --set psf.engine=wave --set atmosphere.exposure_s=30`: any key; `pachon config run` explains all
     - `pachon run pachon_run/config.yaml --out again`: the same bytes
     - `pachon run --all --out full --resume`: go on where a run was stopped
     - `pachon run --all --out full --scheduler tcp://login1:8786`: on a Dask cluster
     - `pachon run --all --out full --part 3/8`: one of eight jobs of a batch system, with one folder for all
     - `pachon run --list baseline.db --visit 1004 --out visit1004`: a visit of a scheduler's list
     """
+    from ..core.set_keys import with_set_keys
     from ..pipeline.config import Configuration, load_configuration, with_options
     from ..pipeline.run import run
     from ..pipeline.simulate.ccd_loop import left_out_line
@@ -84,11 +87,11 @@ def run_command(
     if visit_list is None:
         require_list(("--visit", visit), ("--where", where), ("--band", band), ("--night", night))
         experiment = configured_experiment(
-            config, ccds=names, seed=seed, stars__truth=truth_stars, stars__observed=observed_stars
+            config, settings, ccds=names, seed=seed, stars__truth=truth_stars, stars__observed=observed_stars
         )
     else:
         base = with_options(
-            Configuration() if config is None else load_configuration(config),
+            with_set_keys(Configuration() if config is None else load_configuration(config), settings or ()),
             ccds=names,
             seed=seed,
             stars__truth=truth_stars,
@@ -135,9 +138,11 @@ def _show_run(result: RunResult, report: Path, seconds: float) -> None:
         headline,
         models_rows,
         per_ccd,
+        verdict,
     )
 
     console = wide_console()
+    console.print(f"{verdict(result.summary)}\n", highlight=False)
     headlines = plain_table(show_header=False)
     for name, value in headline(result.summary):
         headlines.add_row(name, value)

@@ -9,9 +9,11 @@ import typer
 from typer import Option
 
 from ..core.terminal import print_line
+from . import completion
+from .choices import choice, names
 from .inputs import configured_experiment
 from .interrupt import interruptible
-from .options import Ccds, Config, Json, Quiet, Raft, Threads, one_name_list
+from .options import Ccds, Config, Json, Quiet, Raft, Settings, Threads, one_name_list
 from .tables import Rows, print_json
 
 if TYPE_CHECKING:
@@ -31,13 +33,25 @@ def shim_command(
     ccds: Ccds = None,
     raft: Raft = None,
     heights: Annotated[
-        str | None, Option(help="Measured heights: lsstcam, or an ECSV or FITS file; those of the configuration.")
+        str | None,
+        names(
+            completion.heights,
+            metavar="lsstcam|FILE",
+            help="Measured heights: as built, or an ECSV or FITS file; those of the configuration.",
+        ),
     ] = None,
     merit: Annotated[
-        str, Option("--minimise", "--merit", help="fwhm (mean), ellipticity (rms of g) or xi (its correlation, rms).")
+        str,
+        choice(
+            ("fwhm", "ellipticity", "xi"),
+            "--minimise",
+            "--merit",
+            help="Mean FWHM, rms of g, or rms of its correlation.",
+        ),
     ] = "fwhm",
-    parts: Annotated[str, Option(help="rafts or ccds.")] = "rafts",
+    parts: Annotated[str, choice(("rafts", "ccds"), help="What moves.")] = "rafts",
     out: Annotated[Path, Option("--out", "-o", help="Folder to write to.")] = Path("pachon_shims"),
+    settings: Settings = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -58,8 +72,10 @@ def shim_command(
     from ..studies.shimming.product import shim_metrics, write_shims
     from ..studies.shimming.shim import STATES, shim
 
-    names = one_name_list(ccds=ccds, raft=raft) or ("all",)
-    experiment = configured_experiment(config, ccds=names, focal_plane__heights=heights, psf__engine="long_exposure")
+    ccd_names = one_name_list(ccds=ccds, raft=raft) or ("all",)
+    experiment = configured_experiment(
+        config, settings, ccds=ccd_names, focal_plane__heights=heights, psf__engine="long_exposure"
+    )
     make_folder(out)
     with interruptible(quiet) as reporter:
         shims = shim(

@@ -10,9 +10,11 @@ from typer import Option
 
 from ..core.errors import ConfigError
 from ..core.terminal import print_line
+from . import completion
+from .choices import names
 from .inputs import configured_experiment
 from .interrupt import interruptible
-from .options import Config, Json, Quiet, Threads, TruthStars, name_list, one_name_list
+from .options import Config, Json, Quiet, Settings, Threads, TruthStars, name_list, one_name_list
 from .tables import Rows, print_json, wide_console
 
 if TYPE_CHECKING:
@@ -40,11 +42,19 @@ _CAPTION = (
 @app.command("study")
 def study_command(
     config: Config = None,
-    ccds: Annotated[str | None, Option(help="CCDs, separated by commas; by default nine across the field.")] = None,
-    stars: Annotated[str, Option(help="Stars of a CCD.")] = "10,20,40,80,160",
-    orders: Annotated[str, Option(help="Orders of the polynomials.")] = "1,2,3,4,5,6",
-    components: Annotated[str, Option(help="Components of the basis.")] = "5,10,20,40",
-    snr: Annotated[str, Option(help="S/N of the faintest star.")] = "30,100,300",
+    ccds: Annotated[
+        str | None,
+        names(
+            completion.ccds,
+            listed=True,
+            metavar="CCD,...",
+            help="CCDs, separated by commas; by default nine across the field.",
+        ),
+    ] = None,
+    stars: Annotated[str, Option(metavar="N,...", help="Stars of a CCD.")] = "10,20,40,80,160",
+    orders: Annotated[str, Option(metavar="N,...", help="Orders of the polynomials.")] = "1,2,3,4,5,6",
+    components: Annotated[str, Option(metavar="N,...", help="Components of the basis.")] = "5,10,20,40",
+    snr: Annotated[str, Option(metavar="SNR,...", help="S/N of the faintest star.")] = "30,100,300",
     focal_plane: Annotated[
         bool,
         Option("--focal-plane", help="Also fit the model of the whole focal plane, with and without the telescope."),
@@ -52,6 +62,7 @@ def study_command(
     draws: Annotated[int, Option(min=1, help="Draws of the noise.")] = 4,
     out: Annotated[Path, Option("--out", "-o", help="Folder to write to.")] = Path("pachon_study"),
     truth_stars: TruthStars = None,
+    settings: Settings = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -77,11 +88,11 @@ def study_command(
     from ..studies.psf_choice.product import study_summary, write_study
     from ..studies.psf_choice.study import STUDY_CCDS, study, study_experiment
 
-    names = STUDY_CCDS if config is None and ccds is None else one_name_list(ccds=ccds)
+    ccd_names = STUDY_CCDS if config is None and ccds is None else one_name_list(ccds=ccds)
     model = "focal_plane" if focal_plane else None
     # Around polynomials, which have the order, components and weights to study.
     resolved = configured_experiment(
-        config, paper_model=True, ccds=names, stars__truth=truth_stars, reconstruction__model=model
+        config, settings, paper_model=True, ccds=ccd_names, stars__truth=truth_stars, reconstruction__model=model
     ).config
     plan = make_plan(
         resolved,
@@ -134,9 +145,9 @@ def _show(result: Study) -> None:
 
 
 def _numbers(text: str, option: str, kind: type[_Number]) -> tuple[_Number, ...]:
-    names = name_list(text, option)
+    number_texts = name_list(text, option)
     try:
-        return tuple(kind(name) for name in names)
+        return tuple(kind(number_text) for number_text in number_texts)
     except ValueError:
         expected = "whole numbers" if kind is int else "numbers"
         raise ConfigError(f"{option} = {text!r}: expected {expected} separated by commas, such as 20,40") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,9 +10,12 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError
+from ..core.terminal import print_line
 from ..core.threads import thread_count
+from . import completion
+from .choices import names
 from .default_group import DefaultGroup
-from .options import Json, Quiet, Threads
+from .options import Json, Quiet, Threads, set_option
 from .tables import Rows, print_json
 from .workers import DaskWorkers, Processes, Scheduler, long_work
 
@@ -22,7 +26,10 @@ app = typer.Typer()
 sweep_app = typer.Typer(cls=DefaultGroup, subcommand_metavar="| COMMAND [ARGS]...")
 app.add_typer(sweep_app, name="sweep")
 
-Store = Annotated[Path, Argument(metavar="STORE", help="Store of a sweep, SWEEP.sweep.")]
+Store = Annotated[
+    Path,
+    names(completion.files(".sweep"), metavar="STORE", help="Store of a sweep, SWEEP.sweep.", kind=Argument),
+]
 
 
 @sweep_app.callback()
@@ -45,13 +52,20 @@ def sweep_group() -> None:
 
 @sweep_app.command("run")
 def sweep_run(
-    sweep: Annotated[Path | None, Argument(metavar="SWEEP.yaml", help="Sweep to run.")] = None,
+    sweep: Annotated[
+        Path | None,
+        names(completion.files(*completion.YAML), metavar="SWEEP.yaml", help="Sweep to run.", kind=Argument),
+    ] = None,
     out: Annotated[Path | None, Option("--out", "-o", help="Store to write; SWEEP.sweep by default.")] = None,
     resume: Annotated[bool, Option("--resume", help="Compute only the points that are missing.")] = False,
     processes: Processes = None,
     scheduler: Scheduler = None,
     workers: DaskWorkers = None,
-    example: Annotated[str | None, Option(metavar="NAME", help="Run a bundled sweep: table1 or table1_small.")] = None,
+    example: Annotated[
+        str | None,
+        names(completion.words("table1", "table1_small"), metavar="table1|table1_small", help="Run a bundled sweep."),
+    ] = None,
+    settings: Annotated[list[str] | None, set_option("sweep")] = None,
     threads: Threads = None,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -64,6 +78,7 @@ def sweep_run(
 
     - `pachon sweep heights.yaml --processes 4`
     - `pachon sweep heights.yaml --resume`
+    - `pachon sweep heights.yaml --set design.points=9 -o fine.sweep`: any key of `pachon config sweep`
     """
     if (sweep is None) == (example is None):
         raise ConfigError("pachon sweep: expected a sweep file, or --example NAME")
@@ -75,24 +90,29 @@ def sweep_run(
     with long_work(
         quiet, resumed, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
     ) as execution:
-        outcome = _run(path, store, execution)
+        outcome = _run(path, store, settings or (), execution)
+    if not (as_json or quiet):
+        print_line(outcome.pop("verdict") or "No point could be computed.")
     _show(outcome, as_json, quiet)
 
 
-def _run(path: Path, store: Path, execution: Execution) -> dict[str, Any]:
+def _run(path: Path, store: Path, settings: Sequence[str], execution: Execution) -> dict[str, Any]:
     """Compute the points that are missing, write the report, and return the counts."""
+    from ..studies.sweep.analysis import summary, verdict
     from ..studies.sweep.file import load_sweep
     from ..studies.sweep.report import write_report
     from ..studies.sweep.store import SweepStore
     from ..studies.sweep.sweep import run_sweep
+    from ..studies.sweep.table import read_table
 
-    outcome = run_sweep(load_sweep(path), store, folder=path.parent, execution=execution)
-    report = None
+    outcome = run_sweep(load_sweep(path, settings), store, folder=path.parent, execution=execution)
+    report = sentence = None
     if outcome.failed < outcome.points:
         with execution.reporter.stage("report"), SweepStore(store) as opened:
             report = str(write_report(opened, _report_folder(store)))
+            sentence = verdict(summary(read_table(opened), opened.sweep))
     counts = {key: getattr(outcome, key) for key in ("points", "kept", "computed", "failed")}
-    return {"store": str(store), **counts, "report": report}
+    return {"verdict": sentence, "store": str(store), **counts, "report": report}
 
 
 def _example(name: str) -> Path:
@@ -101,9 +121,9 @@ def _example(name: str) -> Path:
     from ..core.files import write_bytes
     from ..studies.sweep.file import EXAMPLES
 
-    names = sorted(path.stem for path in EXAMPLES.glob("*.yaml"))
-    if name not in names:
-        raise unknown_name("example", name, names)
+    examples = sorted(path.stem for path in EXAMPLES.glob("*.yaml"))
+    if name not in examples:
+        raise unknown_name("example", name, examples)
     path = Path(f"{name}.yaml")
     if not path.exists():
         write_bytes(path, (EXAMPLES / path.name).read_bytes())
@@ -144,7 +164,9 @@ def sweep_status(store: Store, as_json: Json = False) -> None:
 @sweep_app.command("export")
 def sweep_export(
     store: Store,
-    out: Annotated[Path | None, Option("--out", "-o", help="Table to write, .ecsv, .csv, .fits or .parquet.")] = None,
+    out: Annotated[
+        Path | None, Option("--out", "-o", "--table", help="Table to write, .ecsv, .csv, .fits or .parquet.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Write the points of a store as a table; of a damaged store those that can still be read.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.cells import cell_len
@@ -81,6 +82,25 @@ class Rows:
         console.print(table)
         if self.caption:
             console.print(self.caption, style="dim", width=100)
+
+    def write(self, path: Path) -> None:
+        """Write the table: .ecsv, .csv, .fits or .parquet; columns of numbers as numbers."""
+        from astropy.table import Table as AstropyTable
+
+        from ..core.table_files import write_table
+
+        table = AstropyTable()
+        for name, *cells in zip(self.headings, *self.rows, strict=True):
+            table[name or "name"] = _plain_column(cells)
+        write_table(path, table)
+
+
+def _plain_column(cells: list[str]) -> list[float] | list[str]:
+    """Return the cells of a column as numbers, NaN for dashes and empty ones, or as text where they are none."""
+    try:
+        return [math.nan if cell in ("", "-") else float(cell) for cell in cells]
+    except ValueError:
+        return list(cells)
 
 
 def numbers_of(summary: dict[str, Any]) -> dict[str, Any]:

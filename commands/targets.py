@@ -10,7 +10,7 @@ from typing import Any
 import typer
 
 #: Parameters of commands that are files or folders to write, and whether they are always files.
-TARGETS = {"out": False, "picture": True, "glb": True, "fits": True}
+TARGETS = {"out": False, "picture": True, "table": True}
 
 
 def with_checked_targets(app: typer.Typer) -> typer.Typer:

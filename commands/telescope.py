@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
-from typer import Argument, Option
+from typer import Argument
 
 from ..core.errors import PrescriptionWarning
 from ..core.terminal import print_line
+from . import completion
+from .choices import choice, names
 from .imports import import_modules
 from .inputs import load_model, warnings_shown
-from .options import Configuration, GlassCatalogues, Json, Lenient, Model
+from .options import Configuration, GlassCatalogues, Json, Lenient, Model, TableFile, check_table
 from .tables import Rows, plain_table, print_json, wide_console
 
 if TYPE_CHECKING:
@@ -25,10 +28,14 @@ _ALONG_Z = (".zmx", ".zar", ".seq", ".len", ".json", ".roa")
 
 @app.command("info")
 def info_command(
-    model: Annotated[str | None, Argument(help="Bundled model, or path of a prescription.")] = None,
+    model: Annotated[
+        str | None,
+        names(completion.models, metavar="MODEL", help="Bundled model, or path of a prescription.", kind=Argument),
+    ] = None,
     glass_catalogue: GlassCatalogues = None,
     lenient: Lenient = False,
     configuration: Configuration = None,
+    table: TableFile = None,
     as_json: Json = False,
 ) -> None:
     """Show the lens table and the first-order properties of a telescope; without a model, list the bundled ones.
@@ -42,25 +49,31 @@ def info_command(
     - `pachon info lsst_v3.3_r`
     - `pachon info my_telescope.yaml --json`
     """
+    check_table(table)
     console = wide_console()
     if model is None:
         from ..models.io.bundled import bundled_models
 
         models = bundled_models()
+        if table is not None:
+            Rows(("model", "description"), [(m["name"], m["description"]) for m in models], left=2).write(table)
         if as_json:
             print_json({"models": models})
             return
-        table = plain_table()
-        table.add_column("model", no_wrap=True)
-        table.add_column("description")
+        listed_models = plain_table()
+        listed_models.add_column("model", no_wrap=True)
+        listed_models.add_column("description")
         for entry in models:
-            table.add_row(entry["name"], entry["description"])
-        console.print(table)
+            listed_models.add_row(entry["name"], entry["description"])
+        console.print(listed_models)
         return
     import_modules(("pachon.models.io.prescription", "pachon.pipeline.report.info"))
     from ..pipeline.report.info import coefficient_lines, describe, figure_rows, surface_columns, surface_rows
 
     description = describe(load_model(model, lenient, glass_catalogue or (), configuration))
+    lens_table = Rows(surface_columns(description), surface_rows(description), left=2)
+    if table is not None:
+        lens_table.write(table)
     if as_json:
         print_json(description)
         return
@@ -71,7 +84,7 @@ def info_command(
     caption = "In brackets: what a surface is made or drawn to; it stops no light. " if drawn else ""
     if model.lower().endswith(_ALONG_Z):
         caption += "Radii are positive towards +z, to the object: the file has the opposite signs."
-    Rows(surface_columns(description), surface_rows(description), caption.strip(), left=2).show()
+    replace(lens_table, caption=caption.strip()).show()
     for line in coefficient_lines(description):
         console.print(line, highlight=False)
     console.print()
@@ -88,7 +101,12 @@ def convert_command(
         Path, Argument(metavar="OUT", help="File to write: .yaml (ours), .zmx, .seq, .len, .json (optiland), .roa.")
     ],
     format: Annotated[
-        str, Option(help="pachon, batoid, zemax, codev, oslo, optiland or rayoptics; else by the name.")
+        str,
+        choice(
+            ("pachon", "batoid", "zemax", "codev", "oslo", "optiland", "rayoptics"),
+            metavar="FORMAT",
+            help="Format, where the name does not tell it.",
+        ),
     ] = "",
     glass_catalogue: GlassCatalogues = None,
     lenient: Lenient = False,

@@ -10,8 +10,10 @@ from typer import Argument, Option
 
 from ..core.file_names import file_name
 from ..core.terminal import print_line
+from . import completion
+from .choices import choice, names
 from .inputs import errors_of, load_model
-from .options import GlassCatalogues, Json, Lenient, Model, Quiet, Threads
+from .options import GlassCatalogues, Json, Lenient, Model, Quiet, Threads, set_option
 from .tables import Rows, number_texts, print_json
 from .workers import DaskWorkers, Processes, Scheduler, long_work
 
@@ -23,11 +25,21 @@ _SHOWN = 12
 @app.command("tolerance")
 def tolerance_command(
     model: Model,
-    tolerances: Annotated[Path, Argument(metavar="TOL.yaml", help="Tolerances, compensators, merit, requirement.")],
+    tolerances: Annotated[
+        Path,
+        names(
+            completion.files(*completion.YAML),
+            metavar="TOL.yaml",
+            help="Tolerances, compensators, merit, requirement.",
+            kind=Argument,
+        ),
+    ],
     out: Annotated[
         Path | None, Option("--out", "-o", help="Folder to write to; by default tolerance_ and the model.")
     ] = None,
-    method: Annotated[str | None, Option(help="Monte Carlo: linear, quadratic or traced, as in the file.")] = None,
+    method: Annotated[
+        str | None, choice(("linear", "quadratic", "traced"), help="Method of the Monte Carlo, as in the file.")
+    ] = None,
     draws: Annotated[int | None, Option("--draws", "-n", min=1, help="Telescopes to draw, as in the file.")] = None,
     seed: Annotated[int | None, Option(help="Seed of the draws, as in the file.")] = None,
     resume: Annotated[bool, Option("--resume", help="Compute only what is missing in the folder.")] = False,
@@ -36,6 +48,7 @@ def tolerance_command(
     processes: Processes = None,
     scheduler: Scheduler = None,
     workers: DaskWorkers = None,
+    settings: Annotated[list[str] | None, set_option("tolerances")] = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -50,6 +63,7 @@ def tolerance_command(
 
     - `pachon tolerance triplet.zmx tol.yaml`
     - `pachon tolerance triplet.zmx tol.yaml --method linear -n 100000 -o many`
+    - `pachon tolerance triplet.zmx tol.yaml --set requirement=9`: any key of `pachon config tolerances`
     - `pachon tolerance lsst_v3.3_r tol.yaml --processes 4`, and after an interruption `--resume`
     """
     from ..core.files import make_folder
@@ -57,11 +71,12 @@ def tolerance_command(
     from ..models.paraxial import following_stop
     from ..studies.tolerance.file import load_tolerances, with_settings
     from ..studies.tolerance.product import tolerance_summary, write_tolerances
+    from ..studies.tolerance.report import verdict
     from ..studies.tolerance.study import run_tolerances
 
     telescope = load_model(model, lenient, glass_catalogue or ())
     source = model if model in BUNDLED else str(Path(model).resolve())
-    file = with_settings(load_tolerances(tolerances, source), method=method, draws=draws, seed=seed)
+    file = with_settings(load_tolerances(tolerances, source, settings or ()), method=method, draws=draws, seed=seed)
     folder = out or Path(f"tolerance_{file_name(telescope.name)}")
     make_folder(folder)
     resumed = f"go on with: pachon tolerance {model} {tolerances} -o {folder} --resume"
@@ -78,6 +93,7 @@ def tolerance_command(
         print_json({**summary, "folder": str(folder)})
         return
     if not quiet:
+        print_line(verdict(summary))
         _show(summary)
         if following_stop(telescope) is not telescope:
             print_line(f"rays fill the stop {telescope.design_data.stop}, as with aiming: real")

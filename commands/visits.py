@@ -10,8 +10,10 @@ from typer import Argument, Option
 
 from ..core.errors import ConfigError
 from ..core.terminal import print_line
+from . import completion
+from .choices import names
 from .night import Bands, ListFile, Night, Where, names_list, night_settings, part_of, require_list, show_night
-from .options import AllCcds, Ccds, Json, Quiet, Raft, Threads, chosen_ccds
+from .options import AllCcds, Ccds, Config, Json, Quiet, Raft, Threads, chosen_ccds, set_option
 from .tables import Rows, print_json
 from .workers import DaskWorkers, Processes, Scheduler, long_work
 
@@ -36,17 +38,27 @@ _SHEAR_CAPTION = (
 
 @app.command("visits")
 def visits_command(
-    config: Annotated[Path | None, Argument(metavar="CONFIG.yaml", help="Configuration; all has a default.")] = None,
+    config: Config = None,
     ccds: Ccds = None,
     raft: Raft = None,
     all_ccds: AllCcds = False,
     count: Annotated[int | None, Option("--count", "-n", min=1, help="Visits; 10 by default.")] = None,
     dither_deg: Annotated[float | None, Option(help="Radius of the disc of the pointings [deg].")] = None,
     roll: Annotated[
-        str | None, Option(help="Position angles of the telescope [deg]: random, or one for each visit, as 0,90.")
+        str | None,
+        names(
+            completion.words("random"),
+            metavar="random|DEG,...",
+            help="Position angles of the telescope: random, or one for each visit, as 0,90.",
+        ),
     ] = None,
     rotator: Annotated[
-        str | None, Option(help="Angles of the camera against the telescope [deg]: random, or one for each visit.")
+        str | None,
+        names(
+            completion.words("random"),
+            metavar="random|DEG,...",
+            help="Angles of the camera against the telescope: random, or one for each visit.",
+        ),
     ] = None,
     out: Annotated[Path, Option("--out", "-o", help="Folder of the stacks.")] = Path("pachon_visits"),
     visit_list: ListFile = None,
@@ -69,6 +81,7 @@ def visits_command(
     processes: Processes = None,
     scheduler: Scheduler = None,
     workers: DaskWorkers = None,
+    settings: Annotated[list[str] | None, set_option("visits")] = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -88,7 +101,7 @@ def visits_command(
     - `pachon visits --all -n 200 -o full --resume --processes 2`: a hundred more, two visits side by side
     - `pachon visits --rotator random`: the camera turned against the telescope too, by up to 90 degrees
     - `pachon visits -n 2 --roll 0,0 --rotator 0,45`: a telescope that stands still on the sky, its camera turned
-    - `pachon visits my_visits.yaml`
+    - `pachon visits my_visits.yaml --set run.band=i`: any key of `pachon config visits`
     - `pachon visits --list baseline.db --where "night = 5" --band r,i --all -o night5`: the visits of a scheduler, each
       with its own pointing, angles, band, time and air; a table of PSF and depth, and maps of the sky
     - `pachon visits --list ddf.db --band r --stack -o ddf`, `pachon null-test ddf`: the visits to one field, stacked
@@ -102,12 +115,13 @@ def visits_command(
           reconstruction: {model: focal_plane}
         visits: {count: 30, dither_deg: 0.3}
     """
+    from ..core.set_keys import with_set_keys
     from ..pipeline.config import with_options
     from ..studies.night.config import ListSection
     from ..studies.visits.config import VisitsConfig, load_visits_configuration
     from ..studies.visits.visits import stack_visits
 
-    names = chosen_ccds(ccds, raft, all_ccds)
+    ccd_names = chosen_ccds(ccds, raft, all_ccds)
     if stack:
         require_list(("--stack", None if visit_list is not None else stack))
         excluded: dict[str, object] = {
@@ -125,7 +139,8 @@ def visits_command(
             raise ConfigError(f"{stated[0]} with a list: expected none, visits of a list have their own")
         night_config = night_settings(
             config,
-            run__ccds=names,
+            settings,
+            run__ccds=ccd_names,
             run__seed=seed,
             visits__list=None if visit_list is None else str(visit_list.resolve()),
             visits__where=where,
@@ -147,10 +162,10 @@ def visits_command(
             *(("--where", where), ("--band", band), ("--night", night), ("--nside", nside), ("--part", part)),
             *(("--products", products or None), ("--models", models)),
         )
-    base = VisitsConfig() if config is None else load_visits_configuration(config)
-    settings = with_options(
+    base = with_set_keys(VisitsConfig() if config is None else load_visits_configuration(config), settings or ())
+    visits_config = with_options(
         base,
-        run__ccds=names,
+        run__ccds=ccd_names,
         run__seed=seed,
         visits__count=count,
         visits__dither_deg=dither_deg,
@@ -159,13 +174,13 @@ def visits_command(
     )
     if stack:
         section = ListSection(list=str(visit_list), where=where, band=band, night=night)
-        settings = settings.with_list(section)
-    experiment = settings.experiment(None if config is None else config.parent)
+        visits_config = visits_config.with_list(section)
+    experiment = visits_config.experiment(None if config is None else config.parent)
     hint = f"finished visits are in {out}, and --resume goes on from there"
     with long_work(
         quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
     ) as execution:
-        result = stack_visits(settings, out, experiment=experiment, execution=execution)
+        result = stack_visits(visits_config, out, experiment=experiment, execution=execution)
     if as_json:
         print_json(result.summary)
     elif not quiet:

@@ -172,7 +172,9 @@ def error_context(**context: Any) -> Iterator[None]:
 def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
     """Raise a ConfigError if an argument is not one of the choices."""
     if value not in (allowed := tuple(choices)):
-        raise ConfigError(f"{name} = {shown(value)}: expected one of {', '.join(allowed)}")
+        hint = nearest(value, allowed, n=1)
+        expected_text = f"expected one of {', '.join(allowed)}" + (f"; {hint}" if hint else "")
+        raise ConfigError(f"{name} = {shown(value)}: {expected_text}")
 
 
 def check_unique(kind: str, names: Sequence[str]) -> None:

@@ -216,6 +216,16 @@ def read_mapping(
     return content
 
 
+def read_value(text: str) -> Any:
+    """Return the value that a YAML text stands for, such as that of an option; ValueError with the reason if none."""
+    try:
+        return _StrictLoader(text, MAX_BYTES).get_single_data()
+    except yaml.MarkedYAMLError as problem:
+        raise ValueError(_short_reason(problem.problem or problem.context)) from None
+    except (yaml.YAMLError, ValueError, ArithmeticError, LookupError, AttributeError) as problem:
+        raise ValueError(_short_reason(problem)) from None
+
+
 def loaded(text: str, *, max_bytes: int = MAX_BYTES) -> Any:
     """Return the content of a YAML text that this program has written, with :class:`WrittenFloat`."""
     return _StrictLoader(text, max_bytes, exact=True).get_single_data()

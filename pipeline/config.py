@@ -45,6 +45,11 @@ _RETIRED_ANGLE = "parallactic_angle_deg"
 _Declination = Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=-90, le=90)]
 
 
+def _listed(value: Any) -> Any:
+    """Return a text as a list of it, and other values unchanged."""
+    return [value] if isinstance(value, str) else value
+
+
 class StarsConfig(Section):
     """How many stars stand on a CCD, and how bright they are."""
 
@@ -351,7 +356,7 @@ class Configuration(Section):
     camera: str | None = Field(
         None, description="bundled camera, or path of a camera file, in place of the telescope's own"
     )
-    ccds: tuple[str, ...] | None = Field(None, description="CCDs to compute")
+    ccds: Annotated[tuple[str, ...] | None, BeforeValidator(_listed)] = Field(None, description="CCDs to compute")
     seed: Whole = Field(1, description="seed of all random numbers")
     changes: dict[str, Real] = Field(
         default_factory=dict, description="changes of the prescription: {M2.dz_um: 10, Camera.rx_urad: 5, M1.Z5_nm: 20}"
@@ -392,8 +397,6 @@ class Configuration(Section):
 
 def configuration_of(content: dict[str, Any], source: str) -> Configuration:
     """Return the configuration of plain mappings; ConfigError names `source`, the key and the allowed values."""
-    if isinstance(content.get("ccds"), str):
-        content = {**content, "ccds": [content["ccds"]]}
     return validated(Configuration, content, source)
 
 
@@ -420,8 +423,6 @@ def with_run(content: dict[str, Any], path: Path) -> dict[str, Any]:
     run = content.get("run", {})
     if isinstance(run, str):
         run = read_mapping(path.parent / run, ConfigError)
-    if isinstance(run, dict) and isinstance(run.get("ccds"), str):
-        run = {**run, "ccds": [run["ccds"]]}
     return {**content, "run": run}
 
 

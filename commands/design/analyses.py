@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 from typer import Option
 
 from ...core.errors import ConfigError
+from ..choices import choice
 from ..tables import FIELD, Column, Rows, number_texts
 from .command import Outcome, SharedOptions, Study, design_command
 
@@ -30,7 +31,7 @@ def fans(shared: SharedOptions, points: Points = 65) -> Study:
     **Examples**
 
     - `pachon fans my_lens.zmx`
-    - `pachon fans lsst_v3.3_r --across-band 3 --field-deg 0 --field-deg 1.2 -o fans.pdf`
+    - `pachon fans lsst_v3.3_r --across-band 3 --field-deg 0 --field-deg 1.2 --picture fans.pdf`
     """
     from ...design.analyses.ray_fans import ray_fans
 
@@ -168,7 +169,7 @@ def _matrix_heading(summary: dict[str, Any]) -> str:
 )
 def spot_matrix(
     shared: SharedOptions,
-    against: Annotated[str, Option(help="Columns: focus or wavelength.")] = "focus",
+    against: Annotated[str, choice(("focus", "wavelength"), help="What changes from column to column.")] = "focus",
     range_um: Annotated[
         tuple[float, float] | None, Option(metavar="LOW HIGH", help="Heights of the detector [um].")
     ] = None,

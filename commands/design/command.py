@@ -149,14 +149,13 @@ def design_command(
     caption: str | Callable[[dict[str, Any]], str] = "",
     left: int = 1,
     band: bool = False,
-    picture: Any = options.Picture,
     most: int | None = None,
 ) -> Callable[[Callable[..., Study | Outcome]], Callable[..., Study | Outcome]]:
     """Make a command of a function, with the columns of its table, and add it to :data:`app`.
 
     The caption is a text, with fields of the summary in braces, or a function of the summary; `left` is the number of
-    columns of names. With `band` the command takes several wavelengths or the pass band, not one wavelength. `picture`
-    is the annotated type of the option that names the picture. Of a longer table `most` rows are shown.
+    columns of names. With `band` the command takes several wavelengths or the pass band, not one wavelength. Of a
+    longer table `most` rows are shown.
     """
 
     def rows(result: Study) -> Rows:
@@ -172,7 +171,7 @@ def design_command(
 
     def build(compute: Callable[..., Study | Outcome]) -> Callable[..., Study | Outcome]:
         name = compute.__name__.replace("_", "-")
-        parameters, option_names = _parameters(compute, band, picture)
+        parameters, option_names = _parameters(compute, band)
 
         def command(picture: Path | None, no_picture: bool, table: Path | None, as_json: bool, **values: Any) -> None:
             kind = options.picture_kind(picture)
@@ -199,7 +198,7 @@ def design_command(
     return build
 
 
-def _parameters(compute: Callable[..., Any], band: bool, picture: Any) -> tuple[list[inspect.Parameter], list[str]]:
+def _parameters(compute: Callable[..., Any], band: bool) -> tuple[list[inspect.Parameter], list[str]]:
     """Return the parameters of a command, shared and own, and the names of its own."""
     _, *command_parameters = inspect.signature(compute, eval_str=True).parameters.values()
     single = {"wavelength_nm": (options.WavelengthNm, None)}
@@ -214,7 +213,7 @@ def _parameters(compute: Callable[..., Any], band: bool, picture: Any) -> tuple[
         "glass_catalogue": (options.GlassCatalogues, None),
         "lenient": (options.Lenient, False),
         "configuration": (options.Configuration, None),
-        "picture": (picture, None),
+        "picture": (options.Picture, None),
         "no_picture": (options.NoPicture, False),
         "table": (options.TableFile, None),
         "threads": (options.Threads, None),

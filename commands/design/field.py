@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Option
 
 from ...core.errors import ConfigError
+from .. import completion
+from ..choices import names
 from ..tables import Column, Rows, field_headings, number_texts
 from .command import Outcome, SharedOptions, design_command
 
@@ -102,7 +104,10 @@ def _vignetting_rows(result: Vignetting) -> Rows:
 @design_command()
 def footprint(
     shared: SharedOptions,
-    surface: Annotated[list[str] | None, Option(help="Name of a surface, once for each; all by default.")] = None,
+    surface: Annotated[
+        list[str] | None,
+        names(completion.surfaces, metavar="NAME", help="Name of a surface, once for each; all by default."),
+    ] = None,
 ) -> Outcome:
     """Draw the footprints of beams on surfaces, over the clear apertures, and the light that each surface blocks.
 
@@ -141,7 +146,9 @@ def _footprint_rows(result: Footprint) -> Rows:
 )
 def draw(
     shared: SharedOptions,
-    glb: Annotated[Path | None, Option(help="Write the telescope and its rays in three dimensions, .glb.")] = None,
+    out: Annotated[
+        Path | None, Option("--out", "-o", help="Telescope and rays in three dimensions to write, .glb.")
+    ] = None,
 ) -> Outcome:
     """Draw a telescope: its section with rays of some fields, and a model in three dimensions.
 
@@ -150,20 +157,20 @@ def draw(
     **Examples**
 
     - `pachon draw lsst_v3.3_r`
-    - `pachon draw lsst_v3.3_r_obstructed -o lsst.pdf --glb lsst.glb`
+    - `pachon draw lsst_v3.3_r_obstructed --picture lsst.pdf -o lsst.glb`
     - `pachon draw my_lens.zmx --field-deg 0 --field-deg 10`
     """
     from ...core.files import write_bytes
     from ...core.units import field_label
     from ...design.layout.layout import layout
 
-    if glb is not None and glb.suffix.lower() != ".glb":
-        raise ConfigError(f"--glb = {str(glb)!r}: expected a name that ends in .glb")
+    if out is not None and out.suffix.lower() != ".glb":
+        raise ConfigError(f"--out = {str(out)!r}: expected a name that ends in .glb; the picture is --picture")
     result = layout(*shared.first_arguments, **shared.trace_options)
     notes = [f"{field_label(result.fields[i])}: no ray arrives, so none is drawn" for i in result.dark]
     if notes and shared.telescope.design_data.stop and shared.telescope.design_data.aiming == "off":
         notes.append("the rays of these fields may miss the stop: --aiming paraxial aims them at it")
-    if glb is not None:
-        write_bytes(glb, result.glb())
-        notes.append(f"model: {glb.resolve()}")
+    if out is not None:
+        write_bytes(out, result.glb())
+        notes.append(f"model: {out.resolve()}")
     return Outcome(result, notes=notes)

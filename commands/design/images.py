@@ -46,7 +46,7 @@ def psf(
     pixel_um: Annotated[float | None, Option(help="Distance of pixels [um]; λf/5 or more by default.")] = None,
     pixels: Annotated[int, Option(min=16, max=4096, help="Pixels on a side.")] = 128,
     pupil_points: PupilPoints = None,
-    fits: Annotated[Path | None, Option(help="FITS file to write the images to, [field, y, x].")] = None,
+    out: Annotated[Path | None, Option("--out", "-o", help="FITS file of the images to write, [field, y, x].")] = None,
 ) -> Study:
     """Make diffraction images of the telescope alone: Strehl ratio, FWHM, and the images themselves.
 
@@ -55,7 +55,7 @@ def psf(
     **Examples**
 
     - `pachon psf lsst_v3.3_i`: five fields from the axis to the edge
-    - `pachon psf lsst_v3.3_i --across-band 5 --field-deg 1.4 --fits psf.fits`
+    - `pachon psf lsst_v3.3_i --across-band 5 --field-deg 1.4 -o psf.fits`
     - `pachon psf paul_baker --field-deg 0 --huygens --json`
     """
     from ...core.products import image_hdu, write_fits
@@ -67,13 +67,13 @@ def psf(
     pixel = None if pixel_um is None else pixel_um * 1e-6
     with shared.stage("diffraction images", shared.images) as progress:
         result = compute(shared.request, pixel=pixel, pixels=pixels, n_pupil=pupil_points, progress=progress)
-    if fits is not None:
+    if out is not None:
         cards = [
             ("MODEL", result.telescope, "telescope"),
             ("METHOD", result.method, "fft or huygens"),
             ("PIXEL", result.pixel * 1e6, "[um] distance of pixel centres"),
         ]
-        write_fits(fits, [image_hdu("PSF", result.image, "part of the light in each pixel")], None, cards)
+        write_fits(out, [image_hdu("PSF", result.image, "part of the light in each pixel")], None, cards)
     return result
 
 
@@ -133,7 +133,7 @@ def mtf(
     **Examples**
 
     - `pachon mtf lsst_v3.3_r`
-    - `pachon mtf my_lens.zmx --across-band 5 --field-deg 0 --field-deg 10 -o mtf.pdf`
+    - `pachon mtf my_lens.zmx --across-band 5 --field-deg 0 --field-deg 10 --picture mtf.pdf`
     """
     from ...design.images.mtf import mtf as compute
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 from typer import Option
 
 from ...core.errors import ConfigError
+from ..choices import choice
 from ..tables import FIELD, Column, Rows, field_headings, number_texts, numbers_of
 from .command import Outcome, SharedOptions, Study, design_command
 
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 )
 def spots(
     shared: SharedOptions,
-    sampling: Annotated[str, Option(help="Sampling of the pupil: gauss, rings, spiral or square.")] = "gauss",
+    sampling: Annotated[str, choice(("gauss", "rings", "spiral", "square"), help="Sampling of the pupil.")] = "gauss",
     rays: Annotated[
         int | None, Option(min=1, help="Rays along the radius (gauss, rings), in all (spiral), across.")
     ] = None,
@@ -45,7 +46,7 @@ def spots(
     **Examples**
 
     - `pachon spots lsst_v3.3_r`: five fields from the axis to the edge
-    - `pachon spots lsst_v3.3_r --across-band 5 -o spots.pdf`: the whole band in colours
+    - `pachon spots lsst_v3.3_r --across-band 5 --picture spots.pdf`: the whole band in colours
     - `pachon spots my_telescope.yaml --field-deg 0 --field-deg 0.3,0.4 --wavelength-nm 656.3 --json`
     """
     from ...design.metrics.spots import spots as compute
@@ -107,7 +108,9 @@ def focus(
 def zernikes(
     shared: SharedOptions,
     jmax: Annotated[int, Option(min=4, max=500, help="Highest index in the pupil.")] = 28,
-    pupil: Annotated[str, Option(help="full: the whole annulus, orthogonal; lit: where light passes.")] = "full",
+    pupil: Annotated[
+        str, choice(("full", "lit"), help="full: the whole annulus, orthogonal; lit: where light passes.")
+    ] = "full",
     over_field: Annotated[bool, Option("--map", help="Maps over the field of view.")] = False,
     double: Annotated[
         int | None, Option(min=1, max=200, metavar="KMAX", help="Double Zernikes, terms in the field.")

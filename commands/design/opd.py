@@ -20,16 +20,6 @@ if TYPE_CHECKING:
     from ...wavefront.opd import OpdMap
     from ...wavefront.zernike import ZernikeFit
 
-OpdPicture = Annotated[
-    Path | None,
-    Option(
-        "--picture",
-        "--out",
-        "-o",
-        help="Picture to write, .png, .pdf or .svg; by default named after the model and field.",
-    ),
-]
-
 
 @dataclass(frozen=True)
 class FittedOpd:
@@ -80,7 +70,6 @@ class FittedOpd:
         f"{s['rms_nm']:.2f} nm = {s['rms_waves']:.4f} waves, peak to valley {s['peak_to_valley_nm']:.1f} nm; rms "
         f"without tilt {s['rms_without_tilt_nm']:.2f} nm; rms residual of the terms {s['residual_rms_nm']:.3f} nm."
     ),
-    picture=OpdPicture,
 )
 def opd(
     shared: SharedOptions,
@@ -102,7 +91,7 @@ def opd(
     **Examples**
 
     - `pachon opd lsst_v3.3_r --field-deg 0,1.225 --wavelength-nm 622`
-    - `pachon opd paul_baker --field-deg 0.3,0.3 --zernikes 11 --out coma.png`
+    - `pachon opd paul_baker --field-deg 0.3,0.3 --zernikes 11 --picture coma.png`
     - `pachon opd my_telescope.yaml --json`: metrics only, on standard output
     """
     import numpy as np

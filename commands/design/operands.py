@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from typer import Argument, Option
+from typer import Argument
 
 from ...core.errors import ConfigError, PachonError, error_context
+from .. import completion
+from ..choices import names
 from ..inputs import load_model
-from ..options import GlassCatalogues, Json, Lenient
+from ..options import GlassCatalogues, Json, Lenient, TableFile, check_table
 from ..tables import Rows, print_json
 from .command import app
 
@@ -19,13 +22,21 @@ if TYPE_CHECKING:
 
 @app.command("operands")
 def operands_command(
-    model: Annotated[str | None, Argument(metavar="[MODEL]", help="Bundled telescope or file, to measure.")] = None,
+    model: Annotated[
+        str | None,
+        names(completion.models, metavar="MODEL", help="Bundled telescope or file, to measure.", kind=Argument),
+    ] = None,
     operand: Annotated[
         list[str] | None,
-        Option(metavar="TEXT", help="Operand to measure, its keys as in files: MNEG, 'REAY surface=S3 field_deg=0,9'."),
+        names(
+            completion.operands,
+            metavar="OPERAND",
+            help="Operand to measure, its keys as in files: MNEG, 'REAY surface=S3 field_deg=0,9'.",
+        ),
     ] = None,
     glass_catalogue: GlassCatalogues = None,
     lenient: Lenient = False,
+    table: TableFile = None,
     as_json: Json = False,
 ) -> None:
     """List the operands of optimisations by their names in Zemax and CODE V; of a telescope with their numbers.
@@ -38,37 +49,46 @@ def operands_command(
     - `pachon operands my_lens.zmx`: focal lengths, pupils, Seidel sums, lengths...
     - `pachon operands my_lens.zmx --operand MNCG --operand "MTFA field_deg=0,9 frequency_per_mm=20"`
     """
+    check_table(table)
     if model is None:
         if operand:
             raise ConfigError("--operand is given without MODEL: expected the telescope that it is measured of")
-        _list_names(as_json)
+        _deliver(_list_names(), table, as_json)
         return
     telescope = load_model(model, lenient, glass_catalogue or ())
     measured = _numbers(telescope, operand or [])
-    if as_json:
-        print_json({"telescope": telescope.name, "operands": measured})
-        return
     rows = [
         [row["operand"], row["definition"], row["unit"], "" if row["number"] is None else f"{row['number']:.9g}"]
         for row in measured
     ]
-    Rows(["operand", "definition", "unit", telescope.name], rows, left=3).show()
+    named_rows = Rows(["operand", "definition", "unit", telescope.name], rows, left=3)
+    _deliver((named_rows, {"telescope": telescope.name, "operands": measured}), table, as_json)
 
 
-def _list_names(as_json: bool) -> None:
+def _deliver(content: tuple[Rows, dict[str, Any]], table: Path | None, as_json: bool) -> None:
+    """Write the table where it has a path, and print it, or the content of the JSON."""
+    rows, json_content = content
+    if table is not None:
+        rows.write(table)
+    if as_json:
+        print_json(json_content)
+    else:
+        rows.show()
+
+
+def _list_names() -> tuple[Rows, dict[str, Any]]:
+    """Return the names of operands, as a table and for JSON."""
     from ...design.optimize.operand_names import NAMES
     from ...design.optimize.optimize_file import file_keys
 
     headings = ("operand", "unit", "keys", "definition")
     rows = [(name, entry.unit, ", ".join(file_keys(entry)), entry.definition) for name, entry in NAMES.items()]
-    if as_json:
-        print_json({"operands": [dict(zip(headings, row, strict=True)) for row in rows]})
-        return
     caption = (
         "In files {kind: EFFL, target: 50}, or min and max. Keys with * are needed. "
         "More kinds: docs/howto/optimisation.md."
     )
-    Rows(headings, rows, caption, left=4).show()
+    json_content = {"operands": [dict(zip(headings, row, strict=True)) for row in rows]}
+    return Rows(headings, rows, caption, left=4), json_content
 
 
 def _numbers(telescope: Telescope, texts: list[str]) -> list[dict[str, Any]]:

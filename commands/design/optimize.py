@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
@@ -14,8 +14,10 @@ from typer import Option
 
 from ...core.errors import ConfigError, PrescriptionError, PrescriptionWarning
 from ...core.file_names import file_name
+from .. import completion
+from ..choices import choice, names
 from ..inputs import errors_of, warnings_shown
-from ..options import name_list
+from ..options import name_list, set_option
 from ..tables import Column
 from .command import Outcome, SharedOptions, design_command
 
@@ -48,14 +50,25 @@ def sensitivity(
     shared: SharedOptions,
     parameters: Annotated[
         str | None,
-        Option(help=f"{_ADDRESSES}. By default five motions of every mirror and group but the first mirror."),
+        names(
+            completion.addresses,
+            listed=True,
+            metavar="ADDRESS,...",
+            help=f"{_ADDRESSES}. By default five motions of every mirror and group but the first mirror.",
+        ),
     ] = None,
     degrees_of_freedom: Annotated[
         str | None,
-        Option(metavar="NAME|FILE", help="In place of parameters: named degrees of freedom, lsst or a .yaml of them."),
+        names(
+            completion.degrees_of_freedom,
+            metavar="lsst|FILE",
+            help="In place of parameters: named degrees of freedom, or a .yaml of them.",
+        ),
     ] = None,
     zernikes: Annotated[int, Option(min=4, max=500, help="Highest Noll index.")] = 28,
-    out: Annotated[Path | None, Option(help="Matrix to write, .fits or .ecsv; named after the model.")] = None,
+    out: Annotated[
+        Path | None, Option("--out", "-o", help="Matrix to write, .fits or .ecsv; named after the model.")
+    ] = None,
 ) -> Outcome:
     """Compute and save the sensitivity matrix: derivatives of Zernike terms, field by field, to degrees of freedom.
 
@@ -142,18 +155,39 @@ def _of_variables(name: str) -> Callable[[Any], list[float]]:
 )
 def optimize(
     shared: SharedOptions,
-    variables: Annotated[str | None, Option(help=f"{_ADDRESSES}, L1.thickness, silica.abbe.")] = None,
-    merit: Annotated[str | None, Option(help="Merit function to minimise: spots (by default) or wavefront.")] = None,
+    variables: Annotated[
+        str | None,
+        names(
+            completion.addresses,
+            listed=True,
+            metavar="ADDRESS,...",
+            help=f"{_ADDRESSES}, L1.thickness, silica.abbe.",
+        ),
+    ] = None,
+    merit: Annotated[
+        str | None, choice(("spots", "wavefront"), help="Merit function to minimise, spots by default.")
+    ] = None,
     focal_length: Annotated[float | None, Option(help="Paraxial focal length to be held [m].")] = None,
     bounds: Annotated[
         list[str] | None,
-        Option(metavar="ADDRESS=LOW:HIGH", help="Limits of a variable; of a motion those of its change."),
+        names(
+            completion.addresses,
+            metavar="ADDRESS=LOW:HIGH",
+            help="Limits of a variable; of a motion those of its change.",
+        ),
     ] = None,
     config: Annotated[
         Path | None,
-        Option(metavar="FILE.yaml", help="In place of these: variables, operands, configurations, glasses."),
+        names(
+            completion.files(*completion.YAML),
+            metavar="FILE.yaml",
+            help="In place of these: variables, operands, configurations, glasses.",
+        ),
     ] = None,
-    out: Annotated[Path | None, Option(help="Prescription to write; by default named after the model.")] = None,
+    settings: Annotated[list[str] | None, set_option("optimization")] = None,
+    out: Annotated[
+        Path | None, Option("--out", "-o", help="Prescription to write; by default named after the model.")
+    ] = None,
 ) -> Outcome:
     """Optimise a telescope over chosen variables, compensators among them, with exact derivatives.
 
@@ -164,7 +198,7 @@ def optimize(
 
     - `pachon optimize lsst_v3.3_r --variables Camera.dz,M2.dz`
     - `pachon optimize paul_baker --variables M1.conic,M2.conic --merit wavefront --bounds M1.conic=-1.1:-0.9`
-    - `pachon optimize triplet.zmx --config opt.yaml --out better.yaml`
+    - `pachon optimize triplet.zmx --config opt.yaml --set restarts=4 --out better.yaml`
     """
     from ...design.optimize.targets import FocalLength
     from ...models.digits import with_optimised_digits
@@ -176,7 +210,9 @@ def optimize(
         for name, value in (("merit", merit), ("focal-length", focal_length), ("bounds", bounds)):
             if value is not None:
                 raise ConfigError(f"--{name} is given beside --config: expected it in the file")
-        result = _from_file(shared, config, out)
+        result = _from_file(shared, config, out, settings or ())
+    elif settings:
+        raise ConfigError("--set is given without --config: expected the file whose keys it sets")
     else:
         from ...design.optimize.configuration import DesignConfiguration
         from ...design.optimize.optimize import optimize as compute
@@ -225,7 +261,7 @@ def _check_out(shared: SharedOptions, out: Path | None, *, several: bool = False
         prescription_files(shared.telescope, out, lenient=shared.lenient)
 
 
-def _from_file(shared: SharedOptions, path: Path, out: Path | None) -> Any:
+def _from_file(shared: SharedOptions, path: Path, out: Path | None, settings: Sequence[str]) -> Any:
     """Return the optimum of a file, or the choice of glasses that it asks for."""
     from ...design.optimize.glass_choice import choose_glasses
     from ...design.optimize.optimize import optimize as compute
@@ -233,7 +269,7 @@ def _from_file(shared: SharedOptions, path: Path, out: Path | None) -> Any:
 
     if shared.fields is not None or shared.wavelength is not None:
         raise ConfigError("--field-deg or --wavelength-nm is given beside --config: expected them in the file")
-    file = load_optimization(path)
+    file = load_optimization(path, settings)
     _check_out(shared, out, several=bool(file.configurations))
     arguments = optimization_arguments(file, shared.telescope, path, shared.projection)
     if file.glasses and file.configurations:

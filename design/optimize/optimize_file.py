@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -35,6 +36,7 @@ from pydantic import Field
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, error_context, unknown_name
 from ...core.schema import Count, Positive, Real, Section, Whole, validated
+from ...core.set_keys import set_key_errors, set_keys
 from ...core.yaml_reader import as_number, read_mapping
 from ...models.io.glass_catalogue import GlassCatalogue
 from ...models.io.prescription import load_telescope
@@ -68,23 +70,23 @@ Waves = Annotated[tuple[Positive, ...], Field(min_length=1)]
 class OperandSection(Section):
     """An operand: kind with unit, target or limits, weight, and the fields of its kind."""
 
-    kind: str
-    target: Real | None = None
-    min: Real | None = None
-    max: Real | None = None
-    weight: Positive = 1.0
-    surface: str | None = None
-    first: str | None = None
-    last: str | None = None
-    axis: Literal["x", "y"] | None = None
-    pupil: Pair | None = None
-    n_pupil: Count | None = None
-    field_deg: Pair | None = None
-    wavelength_nm: Positive | None = None
-    wavelengths_nm: Waves | None = None
-    radius_mm: Positive | None = None
-    frequency_per_mm: Positive | None = None
-    angle_deg: Real | None = None
+    kind: str = Field(description="name of the operand, such as EFFL, MNEG or focal_length: pachon operands lists them")
+    target: Real | None = Field(None, description="value to reach, in place of min and max")
+    min: Real | None = Field(None, description="lowest value allowed")
+    max: Real | None = Field(None, description="highest value allowed")
+    weight: Positive = Field(1.0, description="weight in the merit function")
+    surface: str | None = Field(None, description="surface that is meant")
+    first: str | None = Field(None, description="first surface of a range")
+    last: str | None = Field(None, description="last surface of a range")
+    axis: Literal["x", "y"] | None = Field(None, description="axis that is meant")
+    pupil: Pair | None = Field(None, description="place in the pupil, x and y in its radii")
+    n_pupil: Count | None = Field(None, description="pupil points along the radius")
+    field_deg: Pair | None = Field(None, description="field angles x and y [deg]")
+    wavelength_nm: Positive | None = Field(None, description="wavelength [nm]")
+    wavelengths_nm: Waves | None = Field(None, description="wavelengths [nm]")
+    radius_mm: Positive | None = Field(None, description="distance from the vertex of the surface [mm]")
+    frequency_per_mm: Positive | None = Field(None, description="spatial frequency [1/mm]")
+    angle_deg: Real | None = Field(None, description="angle [deg]")
 
     def operand(self) -> Operand:
         """Return the operand; ConfigError or DomainError where its numbers do not fit together."""
@@ -178,11 +180,11 @@ def _scaled(value: Any, unit: float) -> Any:
 class StateSection(Section):
     """Fields, wavelengths and operands of a configuration."""
 
-    fields_deg: Pairs | None = None
-    field_weights: tuple[Real, ...] | None = None
-    wavelengths_nm: Waves | None = None
-    wavelength_weights: tuple[Real, ...] | None = None
-    operands: tuple[OperandSection, ...] = ()
+    fields_deg: Pairs | None = Field(None, description="field angles x and y [deg]; the telescope's own by default")
+    field_weights: tuple[Real, ...] | None = Field(None, description="weights of the fields")
+    wavelengths_nm: Waves | None = Field(None, description="wavelengths [nm]; the telescope's own by default")
+    wavelength_weights: tuple[Real, ...] | None = Field(None, description="weights of the wavelengths")
+    operands: tuple[OperandSection, ...] = Field((), description="values to hold or to reach besides the merit")
 
     def rays(self) -> dict[str, Any]:
         """Return fields, wavelengths and their weights as arguments."""
@@ -205,27 +207,35 @@ class StateSection(Section):
 class ConfigurationSection(StateSection):
     """A further telescope that shares the variables."""
 
-    telescope: str
-    configuration: Count | None = None
-    weight: Positive = 1.0
+    telescope: str = Field(description="name or file of the further telescope, whose variables are the same")
+    configuration: Count | None = Field(None, description="number of the configuration of a Zemax file")
+    weight: Positive = Field(1.0, description="weight in the merit function")
 
 
 class OptimizeFile(StateSection):
     """Content of a file of an optimisation."""
 
-    variables: Annotated[tuple[str, ...], Field(min_length=1)]
-    bounds: dict[str, Pair] = Field(default_factory=dict)
-    merit: Literal["spots", "wavefront"] = "spots"
-    reference: Literal["centroid", "chief"] = "centroid"
-    configurations: tuple[ConfigurationSection, ...] = ()
-    glasses: tuple[str, ...] = ()
-    nearest_glasses: Count = 4
-    glass_catalogue: str | None = None
-    n_pupil: Count | None = None
-    max_steps: Count = 200
-    restarts: Whole = 0
-    spread: Positive = 0.3
-    seed: Whole = 0
+    variables: Annotated[tuple[str, ...], Field(min_length=1)] = Field(
+        description="addresses of what may change, such as M2.dz, L1.thickness, Camera.*"
+    )
+    bounds: dict[str, Pair] = Field(
+        default_factory=dict, description="lowest and highest value of variables: {M1.conic: [-1.1, -0.9]}"
+    )
+    merit: Literal["spots", "wavefront"] = Field(
+        "spots", description="what is minimised: size of spots, or error of the wavefront"
+    )
+    reference: Literal["centroid", "chief"] = Field("centroid", description="middle of the spots")
+    configurations: tuple[ConfigurationSection, ...] = Field(
+        (), description="further telescopes that share the variables"
+    )
+    glasses: tuple[str, ...] = Field((), description="media for which glasses of the catalogue are tried")
+    nearest_glasses: Count = Field(4, description="glasses that are tried for each medium")
+    glass_catalogue: str | None = Field(None, description="maker, or file of glasses (.agf)")
+    n_pupil: Count | None = Field(None, description="pupil points along the radius")
+    max_steps: Count = Field(200, description="most steps of a start")
+    restarts: Whole = Field(0, description="random starts beside the first")
+    spread: Positive = Field(0.3, description="random change of a variable at a start, a fraction of its value")
+    seed: Whole = Field(0, description="seed of the random starts")
 
 
 def catalogue_of(file: OptimizeFile, path: Path) -> GlassCatalogue | None:
@@ -242,8 +252,8 @@ def catalogue_of(file: OptimizeFile, path: Path) -> GlassCatalogue | None:
 
 
 @check_arguments
-def load_optimization(path: str | os.PathLike[str]) -> OptimizeFile:
-    """Read the file of an optimisation.
+def load_optimization(path: str | os.PathLike[str], settings: Sequence[str] = ()) -> OptimizeFile:
+    """Read the file of an optimisation, with other values of some keys: ``key=value`` each.
 
     Raises
     ------
@@ -251,7 +261,9 @@ def load_optimization(path: str | os.PathLike[str]) -> OptimizeFile:
         If the file cannot be read, or is malformed: one line with file, key, value and what was expected.
     """
     path = Path(path)
-    return validated(OptimizeFile, read_mapping(path, ConfigError), str(path))
+    content = set_keys(OptimizeFile, read_mapping(path, ConfigError), settings)
+    with set_key_errors(settings):
+        return validated(OptimizeFile, content, str(path))
 
 
 def optimization_arguments(

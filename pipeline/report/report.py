@@ -18,10 +18,13 @@ from .tables import (
     headline,
     models_rows,
     per_ccd,
+    verdict,
 )
 
 #: Templates of the reports of runs and sweeps.
 TEMPLATES = Path(__file__).parent / "templates"
+#: Title of the picture that opens the report of a run.
+_OPENING = "Whiskers over the field"
 
 
 def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequence[Picture]) -> str:
@@ -32,6 +35,8 @@ def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequ
         config=experiment.config,
         telescope=experiment.telescope,
         summary=summary,
+        verdict=verdict(summary),
+        opening=_opening(pictures),
         headline=headline(summary),
         moments_note=MOMENTS_NOTE,
         caption=PER_CCD_CAPTION,
@@ -44,6 +49,11 @@ def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequ
         configuration=to_yaml(experiment.config),
         model=_model_words(experiment.config.reconstruction),
     )
+
+
+def _opening(pictures: Sequence[Picture]) -> int:
+    """Return the place of the picture that opens the report, from 1: that of the PSFs and of their model."""
+    return next((i for i, picture in enumerate(pictures, 1) if picture.title == _OPENING), 1)
 
 
 def _model_words(fit: ReconstructionConfig) -> str:

@@ -59,6 +59,18 @@ def headline(summary: dict[str, Any]) -> list[tuple[str, str]]:
     return rows
 
 
+def verdict(summary: dict[str, Any]) -> str:
+    """Return the result of a run in one sentence."""
+    metrics = summary["all"]
+    where = "On one CCD" if metrics["ccds"] == 1 else f"On {metrics['ccds']} CCDs"
+    return (
+        f'{where} the PSF is {metrics["fwhm_arcsec"]:.2f}" wide with a mean ellipticity |g| of '
+        f"{_percent(metrics['mean_g_truth'])}; where no star is, its model errs by "
+        f"{_percent(metrics['rms_residual_g_away'])} in g, against {_percent(metrics['rms_scatter_g'])} of a constant "
+        "PSF on each CCD."
+    )
+
+
 #: Which ellipticity is which, for readers of the metrics.
 MOMENTS_NOTE = (
     "g = (a - b)/(a + b) and T = Mxx + Myy are of adaptive moments, as of DES, HSC and Rubin; weighted e = (a - "

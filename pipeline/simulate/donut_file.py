@@ -19,9 +19,9 @@ from pydantic import Field
 from ...core.errors import ConfigError
 from ...core.products import write_hdus
 from ...core.random_streams import stream
-from ...core.schema import Count, NotNegative, Positive, Section, Whole, validated
+from ...core.schema import Count, NotNegative, Positive, Section, Whole
+from ...core.set_keys import with_set_keys
 from ...core.units import ARCSEC
-from ...core.yaml_reader import as_number
 from ...design.metrics.field_zernikes import wavefront_zernikes
 from ...models.camera.photometry import READ_NOISE
 from ...models.parameters.parameters import Parameter, apply
@@ -61,15 +61,7 @@ class DonutScene(Section):
     @classmethod
     def of(cls, settings: Sequence[str]) -> DonutScene:
         """Return the scene of texts such as ``stars=8``; ConfigError for one that is malformed."""
-        content: dict[str, object] = {}
-        for text in settings:
-            key, equals, value = text.partition("=")
-            if not equals:
-                raise ConfigError(f"--set = {text!r}: expected key=value, with a key of {', '.join(cls.keys())}")
-            number = as_number(value.strip())
-            whole = number is not None and float(number).is_integer() and "." not in value and "e" not in value.lower()
-            content[key.strip()] = value.strip() if number is None else int(number) if whole else number
-        return validated(cls, content, "--set")
+        return with_set_keys(cls(), settings)
 
 
 @dataclass(frozen=True, eq=False)

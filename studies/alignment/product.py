@@ -59,6 +59,16 @@ def alignment_summary(alignment: Alignment) -> dict[str, Any]:
     }
 
 
+def verdict(summary: dict[str, Any]) -> str:
+    """Return the result of a loop in one sentence."""
+    first = summary["first_visit_within_1.2_floors"]
+    late = f"in late visits misalignment adds {summary['late_added_nm']:.0f} nm"
+    floor = f"of which the telescope cannot correct {summary['floor_added_nm']:.0f} nm"
+    if first is None:
+        return f"Not aligned: {late}, {floor}, and no visit is within {CONVERGED:g} times the floor."
+    return f"Aligned from visit {first} on: {late}, {floor}."
+
+
 def write_alignment(alignment: Alignment, folder: Path) -> tuple[str, ...]:
     """Write the files of a loop into an existing folder, and return their names."""
     config = alignment.scene.config

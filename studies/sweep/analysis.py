@@ -199,6 +199,25 @@ def summary(table: SweepTable, sweep: SweepFile) -> dict[str, Any]:
     }
 
 
+def verdict(summary: dict[str, Any]) -> str:
+    """Return the result of a sweep in one sentence: the parameter that matters most for its first metric."""
+    metrics = {metric: entry for metric, entry in summary["metrics"].items() if entry["range"] is not None}
+    # Correlations first, as in the pictures.
+    for metric in sorted(metrics, key=lambda name: (not name.startswith("xi"), name)):
+        for key, text in (
+            ("largest_change", "{first} matters most for {metric}, which it changes by {size:+.3g} over its range"),
+            ("rank_correlation", "{first} matters most for {metric}, with a rank correlation of {size:+.2f}"),
+        ):
+            effects = {name: size for name, size in metrics[metric][key].items() if np.isfinite(size)}
+            ordered = sorted(effects, key=lambda name: -abs(effects[name]))
+            if not ordered or effects[ordered[0]] == 0.0:
+                continue
+            sentence = text.format(first=ordered[0], metric=metric, size=effects[ordered[0]])
+            second = f"; next is {ordered[1]} with {effects[ordered[1]]:+.2g}" if len(ordered) > 1 else ""
+            return f"{sentence}{second}."
+    return f"{summary['points']} points are computed; no parameter changes a metric."
+
+
 def _is_numeric(table: SweepTable, name: str) -> bool:
     return all(isinstance(v, (int, float, np.number)) and not isinstance(v, bool) for v in table.parameters[name])
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -29,6 +29,7 @@ from pydantic import Field, PrivateAttr
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, error_context
 from ...core.schema import Count, Real, Section, Whole, checked, plain_number, validated
+from ...core.set_keys import set_key_errors, set_keys
 from ...core.yaml_reader import read_mapping
 from ...models.io.prescription import prescription_digest
 from ...pipeline.config import digest
@@ -131,12 +132,16 @@ class SweepFile(Section):
 
 
 @check_arguments
-def load_sweep(path: str | os.PathLike[str]) -> SweepFile:
-    """Read a sweep file and the configuration that it names; ConfigError of one line with file, key and value."""
+def load_sweep(path: str | os.PathLike[str], settings: Sequence[str] = ()) -> SweepFile:
+    """Read a sweep file and the configuration that it names; ConfigError of one line with file, key and value.
+
+    `settings` are other values of some keys: ``key=value`` each, dots between sections.
+    """
     path = Path(path)
     content = read_mapping(path, ConfigError)
     if isinstance(content.get("base"), str):
         content["base"] = read_mapping(path.parent / content["base"], ConfigError)
+    content = set_keys(SweepFile, content, settings)
     folder = path.parent
     content["design"] = _with_path(content.get("design", {}), "file", folder)
     base = _with_path(_with_path(content.get("base", {}), "telescope", folder), "camera", folder)
@@ -144,7 +149,8 @@ def load_sweep(path: str | os.PathLike[str]) -> SweepFile:
         if isinstance(base, dict) and section in base:
             base = {**base, section: _with_path(base[section], key, folder)}
     content["base"] = base
-    sweep = read_sweep(content, str(path))
+    with set_key_errors(settings):
+        sweep = read_sweep(content, str(path))
     sweep._folder = folder
     return sweep
 

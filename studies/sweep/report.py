@@ -13,7 +13,7 @@ from ...core.files import make_folder, write_bytes, write_json
 from ...core.page import Picture, render, with_digits, with_error
 from ...pipeline.report.report import TEMPLATES
 from . import plots
-from .analysis import Budget, Curve, allowances, budget, curves, rank_correlations, summary
+from .analysis import Budget, Curve, allowances, budget, curves, rank_correlations, summary, verdict
 from .file import SweepFile
 from .store import SweepStore
 from .table import SweepTable, described_metric, described_parameter, read_table
@@ -40,6 +40,7 @@ def write_report(store: SweepStore, folder: Path) -> Path:
         "sweep.html",
         sweep=sweep,
         summary=metrics,
+        verdict=verdict(metrics),
         pictures=[picture for _, picture in pictures],
         pachon=store.about["pachon"],
         points=len(store.points()),

@@ -25,6 +25,7 @@ or, where it is a group of the telescope, as that.
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -33,6 +34,7 @@ from pydantic import Field
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, error_context
 from ...core.schema import Count, NotNegative, Positive, Real, Section, Whole, validated
+from ...core.set_keys import set_key_errors, set_keys
 from ...core.yaml_reader import read_mapping
 from ...models.io.prescription import prescription_digest
 from ...pipeline.config import digest
@@ -55,27 +57,27 @@ class ToleranceSection(Section):
 class SurfaceTolerances(Section):
     """Tolerances of every mirror and lens surface."""
 
-    radius_percent: Positive | None = None
-    decentre_um: Positive | None = None
-    tilt_arcmin: Positive | None = None
-    irregularity_nm: Positive | None = None
+    radius_percent: Positive | None = Field(None, description="radius of curvature [%]")
+    decentre_um: Positive | None = Field(None, description="decentre along x and y [um]")
+    tilt_arcmin: Positive | None = Field(None, description="tilt about x and y [arcmin]")
+    irregularity_nm: Positive | None = Field(None, description="rms of the irregularity of the surface [nm]")
 
 
 class ElementTolerances(Section):
     """Tolerances of every element: piece of glass or cemented group."""
 
-    thickness_um: Positive | None = None
-    decentre_um: Positive | None = None
-    tilt_arcmin: Positive | None = None
-    wedge_arcmin: Positive | None = None
-    index: Positive | None = None
-    abbe_percent: Positive | None = None
+    thickness_um: Positive | None = Field(None, description="thickness at the centre [um]")
+    decentre_um: Positive | None = Field(None, description="decentre along x and y [um]")
+    tilt_arcmin: Positive | None = Field(None, description="tilt about x and y [arcmin]")
+    wedge_arcmin: Positive | None = Field(None, description="tilt of the second surface against the first [arcmin]")
+    index: Positive | None = Field(None, description="index of refraction")
+    abbe_percent: Positive | None = Field(None, description="Abbe number [%]")
 
 
 class GapTolerances(Section):
     """Tolerances of every space between mirrors and elements, but that in front of the detector."""
 
-    thickness_um: Positive | None = None
+    thickness_um: Positive | None = Field(None, description="thickness [um]")
 
 
 class ToleranceFile(Section):
@@ -111,8 +113,12 @@ class ToleranceFile(Section):
 
 
 @check_arguments
-def load_tolerances(path: str | os.PathLike[str], telescope: str | None = None) -> ToleranceFile:
+def load_tolerances(
+    path: str | os.PathLike[str], telescope: str | None = None, settings: Sequence[str] = ()
+) -> ToleranceFile:
     """Read a file of tolerances, of another telescope where its name or path is given.
+
+    `settings` are other values of some keys: ``key=value`` each, dots between sections.
 
     Raises
     ------
@@ -120,7 +126,9 @@ def load_tolerances(path: str | os.PathLike[str], telescope: str | None = None) 
         If the file cannot be read, or is malformed: one line with file, key, value and what was expected.
     """
     path = Path(path)
-    file = validated(ToleranceFile, read_mapping(path, ConfigError), str(path))
+    content = set_keys(ToleranceFile, read_mapping(path, ConfigError), settings)
+    with set_key_errors(settings):
+        file = validated(ToleranceFile, content, str(path))
     with error_context(file=path):
         telescope_name = file.telescope if telescope is None else telescope
         if not telescope_name:

@@ -53,6 +53,7 @@ def tolerance_page(
         Path(__file__).parent / "templates",
         "tolerance.html",
         summary=summary,
+        verdict=verdict(summary),
         title=title,
         unit=study.criterion.unit,
         definition=study.criterion.definition,
@@ -64,6 +65,21 @@ def tolerance_page(
         compensators=_compensators(study),
         seed=file.seed,
         pachon=VERSION,
+    )
+
+
+def verdict(summary: dict[str, Any]) -> str:
+    """Return the result of a study in one sentence."""
+    unit = f" {summary['unit']}" if summary["unit"] else ""
+    worst = summary["worst_offenders"]
+    costliest = f"; {worst[0]['name']} costs most" if worst else ""
+    if "yield" in summary:
+        met = f"{100 * summary['yield']['fraction']:.1f} % of {summary['draws']} drawn telescopes"
+        return f"{met} meet the requirement of {summary['requirement']:g}{unit}{costliest}."
+    reached = f"{summary['reached_by_50_percent']:.4g}", f"{summary['reached_by_95_percent']:.4g}{unit}"
+    return (
+        f"Half of {summary['draws']} drawn telescopes reach {reached[0]}, 95 % of them {reached[1]}, of "
+        f"{summary['nominal']:.4g}{unit} as designed{costliest}."
     )
 
 

@@ -39,7 +39,7 @@ def check(capsys, folder, command):
     metrics = json.loads(capsys.readouterr().out)
     assert metrics["telescope"] == "paul_baker"
     assert list(folder.iterdir()) == []
-    assert main([command, "paul_baker", *options, "-o", "picture.svg"]) == 0
+    assert main([command, "paul_baker", *options, "--picture", "picture.svg"]) == 0
     out = capsys.readouterr().out
     assert words in out
     assert out.splitlines()[-1] == f"picture: {folder / 'picture.svg'}"

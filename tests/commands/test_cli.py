@@ -79,7 +79,10 @@ def test_version(capsys):
         (["opd", "lsst_v3.3_r", "--field-deg", "1,"], ["--field-deg = '1,'", "two numbers", "0,1.2", "one along +y"]),
         (["opd", "lsst_v3.3_r", "--field-deg", "0,9"], ["deg", "expected within"]),
         (["opd", "lsst_v3.3_r", "--wavelength-nm", "2000"], ["wavelength = 2000 nm", "expected 300 to 1200"]),
-        (["opd", "lsst_v3.3_r", "--grid", "16", "--out", "no/such/folder.png"], ["no/such/folder.png", "No such file"]),
+        (
+            ["opd", "lsst_v3.3_r", "--grid", "16", "--picture", "no/such/folder.png"],
+            ["no/such/folder.png", "No such file"],
+        ),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(capsys, in_folder, arguments, parts):
@@ -179,7 +182,7 @@ def test_help_loads_nothing_that_computes():
             ["info", "lsst_v3.3_r"],
             ["warp", "trimesh", "scipy.interpolate", "astropy.table", "matplotlib"],
         ),
-        (["spots", "hsc", "-o", "spots.png"], ["trimesh", "scipy.interpolate", "scipy.sparse", "astropy.table"]),
+        (["spots", "hsc", "--picture", "spots.png"], ["trimesh", "scipy.interpolate", "scipy.sparse", "astropy.table"]),
     ],
 )
 @pytest.mark.long

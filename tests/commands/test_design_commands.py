@@ -89,7 +89,7 @@ def test_tables_of_spots_have_their_numbers_and_no_picture(capsys, in_folder):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_table_and_the_path_of_the_picture(capsys, in_folder, command):
     options, words = COMMANDS[command]
-    assert main([command, model_of(command)[0], *options, "-o", "picture.svg"]) == 0
+    assert main([command, model_of(command)[0], *options, "--picture", "picture.svg"]) == 0
     out = capsys.readouterr().out
     assert out.splitlines()[-1] == f"picture: {in_folder / 'picture.svg'}"
     assert (in_folder / "picture.svg").read_bytes().startswith(MAGIC["svg"])
@@ -111,7 +111,7 @@ def test_help_has_examples(capsys, command):
 @pytest.mark.long
 def test_spots_across_the_band_and_over_fields(capsys, in_folder):
     fields = ["--field-deg", "0", "--field-deg", "0.3,0.4"]
-    assert main(["spots", "lsst_v3.3_r", *fields, "--across-band", "3", "--json", "-o", "s.pdf"]) == 0
+    assert main(["spots", "lsst_v3.3_r", *fields, "--across-band", "3", "--json", "--picture", "s.pdf"]) == 0
     metrics = json.loads(capsys.readouterr().out)
     assert metrics["field_deg"] == [[0.0, 0.0], [0.3, 0.4]]
     assert metrics["wavelength_nm"] == pytest.approx([545, 624, 703])
@@ -131,7 +131,7 @@ def test_equal_commands_leave_equal_bytes(in_folder, capsys):
                         "rings",
                         "--rays",
                         "6",
-                        "-o",
+                        "--picture",
                         f"{name}.{kind}",
                         "--threads",
                         "1",
@@ -146,7 +146,7 @@ def test_equal_commands_leave_equal_bytes(in_folder, capsys):
 
 @pytest.mark.long
 def test_maps_and_double_zernikes(capsys, in_folder):
-    assert main(["zernikes", "paul_baker", "--jmax", "6", "--map", "-o", "map.png"]) == 0
+    assert main(["zernikes", "paul_baker", "--jmax", "6", "--map", "--picture", "map.png"]) == 0
     assert "4 defocus" in capsys.readouterr().out
     assert main(["zernikes", "paul_baker", "--jmax", "6", "--double", "6", "--json"]) == 0
     metrics = json.loads(capsys.readouterr().out)
@@ -197,8 +197,8 @@ def test_coatings(capsys, in_folder):
         (["spots", "lsst_v3.3_r", "--field-deg", "a,b"], ("--field-deg = 'a,b'", "two numbers in degrees")),
         (["spots", "lsst_v3.3_r", "--field-deg", "9"], ("field = (0, 9) deg", "2.5 deg")),
         (["spots", "lsst_v3.3_r", "--wavelength-nm", "600", "--across-band", "3"], ("expected one of them",)),
-        (["spots", "lsst_v3.3_r", "-o", "spots.gif"], ("--picture = spots.gif", ".png, .pdf or .svg")),
-        (["spots", "lsst_v3.3_r", "-o", "nowhere/spots.png"], ("cannot write nowhere/spots.png",)),
+        (["spots", "lsst_v3.3_r", "--picture", "spots.gif"], ("--picture = spots.gif", ".png, .pdf or .svg")),
+        (["spots", "lsst_v3.3_r", "--picture", "nowhere/spots.png"], ("cannot write nowhere/spots.png",)),
         (["spots", "lsst_v3.3_r", "--sampling", "dots"], ("sampling = 'dots'", "gauss, rings, spiral, square")),
         (["focus", "lsst_v3.3_r", "--range-um", "5", "-5"], ("--range-um = 5 -5", "the lower height first")),
         (["zernikes", "lsst_v3.3_r", "--map", "--double", "6"], ("--field-deg, --map and --double",)),
@@ -219,7 +219,7 @@ def test_coatings(capsys, in_folder):
         ),
         (["psf", "lsst_v3.3_r", "--field-deg", "0", "--pupil-points", "16"], ("--pupil-points = 16: the pattern",)),
         (["mtf", "lsst_v3.3_r", "--field-deg", "1.7", "--pupil-points", "16"], ("--pupil-points = 16: too few",)),
-        (["ee", "lsst_v3.3_r", "-o", "ee.xyz"], ("ee.xyz",)),
+        (["ee", "lsst_v3.3_r", "--picture", "ee.xyz"], ("ee.xyz",)),
         (["mtf", "no_such_telescope"], ("no_such_telescope",)),
     ],
 )

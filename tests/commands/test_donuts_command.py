@@ -104,7 +104,7 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
         (["new.fits", "--simulate", "--perturb", "M2.dx"], "--perturb = 'M2.dx': expected a parameter and its change"),
         (["new.fits", "--simulate", "--perturb", "M2.dx=1arcsec"], "--perturb = 'M2.dx=1arcsec': expected a size in m"),
         (["new.fits", "--simulate", "--set", "star=2"], "--set: unknown key star = 2"),
-        (["new.fits", "--simulate", "--set", "stars"], "--set = 'stars': expected key=value"),
+        (["new.fits", "--simulate", "--set", "stars"], "--set 'stars': expected KEY=VALUE"),
         (["new.txt", "--simulate"], "new.txt: --simulate: expected one FILE.fits"),
         (["plain.fits", "--frame", "XYZ"], "--frame = 'XYZ': expected"),
         (["plain.fits", "--field-frame", "ocs"], "--field-frame = 'ocs': expected"),

@@ -181,7 +181,7 @@ def test_the_run_may_be_a_file(settings, tmp_path, capsys):
         ({"galaxies__mosaic": "none.fits"}, [], "galaxies.mosaic = none.fits: no such file"),
         ({"pointing__dec_deg": 91.0}, [], "pointing.dec_deg = 91"),
         ({}, ["--ccds", "R22_S44"], "R22_S44"),
-        ({}, ["--way", "fast"], 'image.way = "fast"'),
+        ({}, ["--way", "fast"], "--way = 'fast'"),
         ({"run__atmosphere": {"enabled": False}, "run__psf": {}}, [], "atmosphere.enabled = false"),
     ],
 )

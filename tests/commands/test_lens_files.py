@@ -25,7 +25,7 @@ def without_pictures(monkeypatch):
 
 
 def metrics(capsys, *arguments):
-    assert main([*arguments, "--json", "-o", "picture.png"]) == 0
+    assert main([*arguments, "--json", "--picture", "picture.png"]) == 0
     return json.loads(capsys.readouterr().out)
 
 
@@ -35,7 +35,7 @@ def test_a_wide_angle_lens_has_all_its_fields(in_folder, capsys):
     assert np.array(found["field_deg"]) == pytest.approx(np.array([[0, 0], [0, 35], [0, 50]]), abs=1e-12)
     assert np.isfinite(found["rms_radius_um"]).all()
     # Without aiming no light of the last field passes, and that is said.
-    assert main(["spots", WIDE, *FEW, "--aiming", "off", "-o", "picture.png"]) == 2
+    assert main(["spots", WIDE, *FEW, "--aiming", "off", "--picture", "picture.png"]) == 2
     assert "field = (0, 50) deg: the chief ray does not reach the detector" in capsys.readouterr().err
 
 
@@ -56,7 +56,7 @@ def test_objects_at_a_finite_distance_are_in_millimetres(in_folder, capsys):
     # 4 to 1: the file's image heights are 0, 8 and 12 mm.
     assert np.array(found["object_mm"])[:, 1] == pytest.approx([0.0, -32.0, -48.0], abs=0.02)
     assert not any("arcsec" in key for key in found)
-    assert main(["rays", FINITE, "-o", "picture.png"]) == 0
+    assert main(["rays", FINITE, "--picture", "picture.png"]) == 0
     out = capsys.readouterr().out
     assert "object [mm]" in out
     assert "arcsec" not in out
@@ -78,7 +78,7 @@ def test_catalogues_and_lenience_wherever_a_model_is_opened(in_folder, capsys, c
         text.replace("N-SK16 1 0", "N-MINE 0 0").replace("  STOP\n", "  STOP\n  NEWK 3\n"), encoding="utf-8"
     )
     catalogue.write_text("NM N-MINE 1 0 1.6 60\nCD 2.56\nLD 0.4 1.0\n", encoding="utf-8")
-    options = [] if command == "info" else [*FEW, "-o", "picture.png"]
+    options = [] if command == "info" else [*FEW, "--picture", "picture.png"]
     assert main([command, str(lens), *options, "--glass-catalogue", str(catalogue)]) == 2
     assert "NEWK" in capsys.readouterr().err
     assert main([command, str(lens), *options, "--lenient", "--glass-catalogue", str(catalogue)]) == 0
@@ -90,7 +90,7 @@ def test_catalogues_and_lenience_wherever_a_model_is_opened(in_folder, capsys, c
 @pytest.mark.long
 def test_draw_says_which_fields_are_lost(in_folder, capsys):
     assert layout(load_telescope(WIDE)).dark == []
-    assert main(["draw", WIDE, "-o", "picture.svg", "--aiming", "off"]) == 0
+    assert main(["draw", WIDE, "--picture", "picture.svg", "--aiming", "off"]) == 0
     out = capsys.readouterr().out
     assert "field = (0, 50) deg: no ray arrives, so none is drawn" in out
     assert "--aiming paraxial" in out
@@ -138,7 +138,7 @@ def test_a_name_that_cannot_be_read_is_not_written(in_folder, capsys):
 
 @pytest.mark.long
 def test_a_long_table_of_ghosts_says_what_it_leaves_out(in_folder, capsys):
-    options = ["--rays", "400", "--field-deg", "1", "-o", "picture.png"]
+    options = ["--rays", "400", "--field-deg", "1", "--picture", "picture.png"]
     assert main(["ghosts", LENS, *options]) == 0
     out = capsys.readouterr().out
     rows = [line for line in out.splitlines() if line.startswith(("S", "Image")) and "e-" in line]

@@ -1,0 +1,163 @@
+"""The command ``pachon config``: keys of configurations, explained."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from typer import Argument
+
+from ..core.errors import UnknownNameError, nearest, shown
+from ..core.terminal import print_line
+from . import completion
+from .choices import names
+from .config_examples import EXAMPLES
+from .config_kinds import KINDS, model_of
+from .options import Json
+from .tables import Rows, plain_table, print_json, wide_console
+
+if TYPE_CHECKING:
+    from ..core.key_descriptions import KeyDescription
+
+app = typer.Typer()
+
+
+@app.command("config")
+def config_command(
+    key: Annotated[
+        str | None,
+        names(completion.config_keys, metavar="KEY", help="Kind, section or key: run.psf.engine.", kind=Argument),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Explain the keys of configurations: type, default, choices, meaning, and an example to copy.
+
+    A key is set in a YAML file, or by `--set KEY=VALUE` of the commands that take the configuration. Keys without a
+    kind are those of a run. Without a key the kinds are listed.
+
+    **Examples**
+
+    - `pachon config`: the kinds of configurations, and the commands that take them
+    - `pachon config run.reconstruction.model`: one key
+    - `pachon config run.atmosphere`: a section
+    - `pachon config sweep --json`
+    """
+    if key is None:
+        _show_kinds(as_json)
+        return
+    kind, descriptions = keys_of(key)
+    if as_json:
+        summaries = [description.summary() | {"example": example(description)} for description in descriptions]
+        print_json({"kind": kind, "keys": summaries})
+    elif len(descriptions) == 1:
+        _show_key(kind, descriptions[0])
+    else:
+        _show_keys(kind, descriptions)
+
+
+def keys_of(text: str) -> tuple[str, list[KeyDescription]]:
+    """Return the kind that a text names, and the keys of it that are meant: all, a section, or one.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such key; with the nearest.
+    """
+    from ..core.key_descriptions import describe_keys
+    from .stored_names import stored_names
+
+    first, _, inner_key = text.partition(".")
+    holders = [kind for kind, keys in stored_names()["keys"].items() if text in keys]
+    kind, key = (first, inner_key) if first in KINDS else ((holders or [*KINDS])[0], text)
+    descriptions = describe_keys(model_of(kind))
+    exact = [d for d in descriptions if d.key == key]
+    within = [d for d in descriptions if not key or d.key.startswith((f"{key}.", f"{key}[]."))]
+    if exact or within:
+        return kind, [*exact, *within]
+    raise UnknownNameError(f"unknown key {shown(text)}: {_nearest_keys(kind, key, [d.key for d in descriptions])}")
+
+
+def _nearest_keys(kind: str, key: str, keys: list[str]) -> str:
+    """Return the keys that are likely to be meant: those nearest, or of the same last word."""
+    last = key.rpartition(".")[2]
+    alike = [name for name in keys if name.rpartition(".")[2] == last][:3]
+    if alike:
+        return f"did you mean {' or '.join(f'{kind}.{name}' for name in alike)}?"
+    sections = {name.rpartition(".")[0] for name in keys} - {""}
+    if hint := nearest(key, [*keys, *sections, *KINDS]):
+        return hint
+    last_words = {name.rpartition(".")[2]: name for name in keys}
+    if hint := nearest(last, last_words, n=1):
+        return f"did you mean {kind}.{last_words[hint.removeprefix('did you mean ').rstrip('?')]}?"
+    return f"expected a key of {kind}, which pachon config {kind} lists, or one of {', '.join(KINDS)}"
+
+
+def example(description: KeyDescription) -> str | None:
+    """Return a value of a key, as ``key=value``; None of keys in lists and of the file's own names."""
+    if "[]" in description.key or ".NAME" in description.key:
+        return None
+    last = description.key.rpartition(".")[2]
+    other_words = [word for word in description.choices if word != description.default]
+    value = EXAMPLES.get(description.key, EXAMPLES.get(last, description.default))
+    if other_words:
+        value = other_words[0]
+    elif isinstance(description.default, bool):
+        value = not description.default
+    return f"{description.key}={value if isinstance(value, str) else json.dumps(value)}"
+
+
+def _show_kinds(as_json: bool) -> None:
+    if as_json:
+        print_json({"kinds": {kind: {"commands": k.commands.split(", "), "text": k.text} for kind, k in KINDS.items()}})
+        return
+    rows = [(kind, entry.commands, entry.text) for kind, entry in KINDS.items()]
+    Rows(("kind", "commands", "decides"), rows, "pachon config KIND lists its keys.", left=3).show()
+
+
+def _show_keys(kind: str, descriptions: list[KeyDescription]) -> None:
+    table = plain_table()
+    table.add_column("key", no_wrap=True)
+    table.add_column("default", max_width=24)
+    table.add_column("values", max_width=30)
+    table.add_column("meaning")
+    for description in descriptions:
+        values = ", ".join(description.choices) or description.type
+        table.add_row(description.key, _default_text(description), values, description.description)
+    wide_console().print(table)
+    print_line(f"{len(descriptions)} keys of {kind}; a dash: open, as the meaning says. One key: pachon config KEY")
+
+
+def _show_key(kind: str, description: KeyDescription) -> None:
+    rows: list[tuple[str, str]] = [
+        ("key", f"{kind}.{description.key}"),
+        ("meaning", description.description),
+        ("type", "" if description.choices else description.type),
+        ("choices", ", ".join(description.choices)),
+        ("default", _default_text(description)),
+        ("commands", KINDS[kind].commands),
+    ]
+    if (text := example(description)) is not None:
+        command = KINDS[kind].commands.partition(",")[0]
+        value = f"'{text}'" if set(text) & set(' {}[]()*?$&;"') else text
+        rows += [("in a file", _yaml_line(text)), ("in a command", f"pachon {command} --set {value}")]
+    table = plain_table(show_header=False)
+    for name, text in rows:
+        if text:
+            table.add_row(name, text)
+    wide_console().print(table, highlight=False)
+
+
+def _default_text(description: KeyDescription) -> str:
+    """Return the default as YAML has it; a dash where it is open."""
+    if description.required:
+        return "has to be given"
+    default = description.default
+    return "-" if default is None else default if isinstance(default, str) else json.dumps(default)
+
+
+def _yaml_line(text: str) -> str:
+    """Return ``a.b=value`` as a line of YAML: ``a: {b: value}``."""
+    key, _, value = text.partition("=")
+    *sections, last = key.split(".")
+    return "".join(f"{name}: {{" for name in sections) + f"{last}: {value}" + "}" * len(sections)
