@@ -15,7 +15,10 @@ from pachon.reconstruction.psf_model.model import PsfModel
 DOCS = Path(__file__).parents[2] / "docs"
 #: Folders of pages, by what a reader needs; the gallery has tests of its own.
 FOLDERS = ("tutorials", "howto", "explanation", "evidence", "reference")
-PATHS = {path.name: path for folder in FOLDERS for path in sorted((DOCS / folder).glob("*.md"))}
+PATHS = {path.name: path for folder in FOLDERS[:3] for path in sorted((DOCS / folder).glob("*.md"))}
+PATHS |= {path.name: path for path in sorted((DOCS / "reference").glob("*.md"))}
+#: Pages of evidence have the names of the pages whose numbers they hold.
+PATHS |= {f"evidence/{path.name}": path for path in sorted((DOCS / "evidence").glob("*.md"))}
 PAGES = {name: path.read_text(encoding="utf-8") for name, path in PATHS.items()}
 INDEX = (DOCS / "index.md").read_text(encoding="utf-8")
 BLOCK = re.compile(r"```python\n(.*?)```", flags=re.S)
