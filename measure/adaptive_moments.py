@@ -126,12 +126,12 @@ class AdaptiveMoments(Result):
 
     @property
     def T(self) -> np.ndarray:  # noqa: N802
-        """Size Mxx + Myy = a^2 + b^2 = 2 sigma^2 (1 + |g|^2)/(1 - |g|^2) [rad^2]."""
+        """Size ``Mxx + Myy = a^2 + b^2 = 2 sigma^2 (1 + |g|^2)/(1 - |g|^2)`` [rad^2]."""
         return trace_of_moments(self.sigma, self.g1, self.g2)
 
     @property
     def e1(self) -> np.ndarray:
-        """Distortion (a^2 - b^2)/(a^2 + b^2) = 2 g/(1 + |g|^2) along x: HSM's ``observed_shape.e1``, the SRD's e."""
+        """Distortion ``(a^2 - b^2)/(a^2 + b^2) = 2 g/(1 + |g|^2)`` along x: HSM's ``observed_shape.e1``, the SRD's e."""
         return np.asarray(2.0 * self.g1 / (1.0 + self.g1**2 + self.g2**2))
 
     @property

@@ -1,8 +1,10 @@
-# Modulation transfer
+"""
+Modulation transfer
+===================
 
 Contrast of a sinusoidal pattern against its frequency, with the diffraction limit of the same pupil.
+"""
 
-```python
 import numpy as np
 
 import pachon
@@ -13,6 +15,6 @@ half = mtf.frequency_at(0.5) * 1e-3
 print("contrast of 50 % at [cycles/mm], tangential and sagittal:")
 print(np.round(half, 1))
 mtf.plot().savefig("mtf.png")
-```
 
-The command: `pachon mtf paul_baker`.
+# %%
+# The command: ``pachon mtf paul_baker``.

@@ -1,8 +1,11 @@
-# Distortion and plate scale
+"""
+Distortion and plate scale
+==========================
 
-Where stars land, against a scaled picture of the sky; and the world coordinates of one CCD made of the same chief rays.
+Where stars land, against a scaled picture of the sky; and the world coordinates of one CCD made of the same chief
+rays.
+"""
 
-```python
 import numpy as np
 
 import pachon
@@ -15,6 +18,6 @@ print("distortion against the scale on the axis [%]:", np.round(distortion.perce
 wcs = pachon.ccd_wcs(telescope, pachon.lsst_camera(), "R22_S11", pointing=np.deg2rad([53.1, -27.8]))
 print(f"WCS of R22_S11: largest error {wcs.error * 206264.8 * 1e3:.4f} mas")
 distortion.plot().savefig("distortion.png")
-```
 
-More: [images and world coordinates](../howto/images.md).
+# %%
+# More: :doc:`images and world coordinates <../howto/images>`.

@@ -1,9 +1,11 @@
-# An image of the sky, at two depths
+"""
+An image of the sky, at two depths
+==================================
 
-A hundred arc seconds of one CCD: galaxies like those of the Ultra Deep Field under optics, CCD heights and the mean over all turbulence, in 15 s
-and in 6000 s. The stretch is asinh.
+A hundred arc seconds of one CCD: galaxies like those of the Ultra Deep Field under optics, CCD heights and the mean
+over all turbulence, in 15 s and in 6000 s. The stretch is asinh.
+"""
 
-```python
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -30,6 +32,6 @@ for part, exposures in zip(figure.subfigures(1, 2), (1, 400), strict=True):
     print(f"{exposures} exposures: {len(image.objects['MAG'])} objects, brightest pixel {peak:.0f} rms above the sky")
 figure.savefig("sky_image.png")
 image.write("image.fits")
-```
 
-More: [images of CCDs](../howto/images.md).
+# %%
+# More: :doc:`images of CCDs <../howto/images>`.

@@ -1,8 +1,10 @@
-# Stars through optics and air
+"""
+Stars through optics and air
+============================
 
 PSFs on real CCD heights with the mean over all turbulence, and their shapes.
+"""
 
-```python
 import numpy as np
 
 import pachon
@@ -16,6 +18,6 @@ shapes = pachon.measure_shapes(psfs.image, psfs.pixel_scale, weight_fwhm=np.deg2
 print(psfs)
 print("e1:", np.round(shapes.e1, 4), " e2:", np.round(shapes.e2, 4))
 psfs.plot().savefig("psfs.png")
-```
 
-Engines and their limits: [atmosphere and PSF engines](../explanation/psf_engines.md).
+# %%
+# Engines and their limits: :doc:`atmosphere and PSF engines <../explanation/psf_engines>`.

@@ -1,8 +1,11 @@
-# One surface
+"""
+One surface
+===========
 
-Rays through single surfaces, without a telescope: the focus of a sphere and of a paraboloid, and Snell's law at a lens.
+Rays through single surfaces, without a telescope: the focus of a sphere and of a paraboloid, and Snell's law at a
+lens.
+"""
 
-```python
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -30,7 +33,7 @@ normal = lens.normal(*glass.position[:, :2].T)
 sines = [n * np.linalg.norm(np.cross(v, normal), axis=1) for n, v in ((1.0, down), (1.5, glass.direction))]
 print("n sin(angle) before:", sines[0][:4].round(6))
 print("n sin(angle) after: ", sines[1][:4].round(6))
-```
 
-These functions take a [surface](../reference/prescriptions.md) at its place, or a shape with its vertex at the origin, and run the kernel that
-traces telescopes. A result goes into the next call, and its rays keep their status.
+# %%
+# These functions take a :doc:`surface <../reference/prescriptions>` at its place, or a shape with its vertex at the
+# origin, and run the kernel that traces telescopes. A result goes into the next call, and its rays keep their status.

@@ -1,8 +1,11 @@
-# A misaligned mirror
+"""
+A misaligned mirror
+===================
 
-Moving M2 sideways makes coma that is the same all over the field, and astigmatism that grows with it. `perturbed` returns a new telescope.
+Moving M2 sideways makes coma that is the same all over the field, and astigmatism that grows with it. ``perturbed``
+returns a new telescope.
+"""
 
-```python
 import numpy as np
 
 import pachon
@@ -16,6 +19,6 @@ change = (after.coefficients - before.coefficients) * 1e9
 print("coma Z8 [nm] by field:", np.round(change[:, 7], 2))
 print("astigmatism Z5 [nm] by field:", np.round(change[:, 4], 3))
 after.plot().savefig("misaligned.png")
-```
 
-More: [perturbations and degrees of freedom](../howto/perturbations.md).
+# %%
+# More: :doc:`perturbations and degrees of freedom <../howto/perturbations>`.

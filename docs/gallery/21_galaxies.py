@@ -1,8 +1,10 @@
-# Galaxies of a patch of sky
+"""
+Galaxies of a patch of sky
+==========================
 
 Galaxies drawn with the counts of the LSST Science Book, lensed, and written as a table.
+"""
 
-```python
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -19,6 +21,6 @@ axes = figure.subplots()
 axes.hist(galaxies.magnitude, bins=np.arange(18, 25.5, 0.5), log=True)
 axes.set(xlabel="magnitude", ylabel="galaxies in 0.01 square degrees")
 figure.savefig("galaxies.png")
-```
 
-More: [galaxies](../howto/galaxies.md).
+# %%
+# More: :doc:`galaxies <../howto/galaxies>`.

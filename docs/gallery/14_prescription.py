@@ -1,8 +1,11 @@
-# A prescription of your own
+"""
+A prescription of your own
+==========================
 
-A Newtonian written down surface by surface, checked against the thin-mirror formulas, saved as YAML and as a Zemax file.
+A Newtonian written down surface by surface, checked against the thin-mirror formulas, saved as YAML and as a Zemax
+file.
+"""
 
-```python
 from pathlib import Path
 
 import pachon
@@ -30,6 +33,6 @@ print(f"spherical aberration {seidel.total[0]:.1e} m, coma {seidel.total[1]:.2e}
 pachon.save_telescope(telescope, "newton.zmx")
 print(pachon.load_telescope("newton.zmx"))
 pachon.layout(telescope).plot().savefig("newton.png")
-```
 
-Every key: [the YAML format](../reference/prescriptions.md).
+# %%
+# Every key: :doc:`the YAML format <../reference/prescriptions>`.

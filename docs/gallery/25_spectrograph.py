@@ -1,8 +1,10 @@
-# A spectrograph
+"""
+A spectrograph
+==============
 
 A concave grating with its entrance slit on the Rowland circle: where wavelengths land and how sharp their lines are.
+"""
 
-```python
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -39,7 +41,9 @@ for nm in (480, 490, 500, 510, 520):
     axes.plot(landed[:, 1], landed[:, 0], ".", markersize=2)
     print(f"{nm} nm at {landed[:, 1].mean():+.3f} mm, {1e3 * landed[:, 1].std():.2f} um rms")
 figure.savefig("spectrograph.png")
-```
 
-A `grating` in a [prescription](../reference/prescriptions.md#gratings) is an order, a number of grooves and their direction. Rays obey the grating equation in vectors, and paths grow by a wavelength
-and order for each groove, so wavefronts, spots and derivatives work as for any mirror. The lines are long along the slit: a sphere in oblique light is astigmatic.
+# %%
+# A ``grating`` in a :doc:`prescription <../reference/prescriptions>` is an order, a number of grooves and their
+# direction. Rays obey the grating equation in vectors, and paths grow by a wavelength and order for each groove, so
+# wavefronts, spots and derivatives work as for any mirror. The lines are long along the slit: a sphere in oblique
+# light is astigmatic.

@@ -1,8 +1,10 @@
-# A PSF model from noisy stars
+"""
+A PSF model from noisy stars
+============================
 
 Forty stars whose width and ellipticity change over the CCD; the model predicts the PSF between them.
+"""
 
-```python
 import numpy as np
 
 import pachon
@@ -28,6 +30,6 @@ predicted = model.at([(0.5, -0.5)])[0]
 print(model)
 print(f"rms error between the stars: {np.std(predicted - truth / truth.sum()) / predicted.max():.1e} of the peak")
 pachon.PsfModel.fit(stamps, places, n_components=3, order=2).plot().savefig("psf_model.png")
-```
 
-Choices, measured: [PSF models](../howto/psf_models.md).
+# %%
+# Choices, measured: :doc:`PSF models <../howto/psf_models>`.

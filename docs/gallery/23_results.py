@@ -1,8 +1,11 @@
-# What every result can do
+"""
+What every result can do
+========================
 
-One line of text, a summary for JSON, a table with units, files, a picture where you want it; notebooks show table and picture by themselves.
+One line of text, a summary for JSON, a table with units, files, a picture where you want it; notebooks show table and
+picture by themselves.
+"""
 
-```python
 import json
 
 import numpy as np
@@ -23,6 +26,6 @@ left, right = figure.subfigures(1, 2)
 spots.plot(ax=left)
 light.plot(ax=right)
 figure.savefig("results.png")
-```
 
-The rules: [results](../explanation/conventions.md#results).
+# %%
+# The rules: :doc:`results <../explanation/conventions>`.

@@ -1,8 +1,11 @@
-# Wavefronts from donuts
+"""
+Wavefronts from donuts
+======================
 
-A star 1.5 mm out of focus through a misaligned telescope: the fit returns what the telescope has beyond the one believed in.
+A star 1.5 mm out of focus through a misaligned telescope: the fit returns what the telescope has beyond the one
+believed in.
+"""
 
-```python
 import numpy as np
 
 import pachon
@@ -20,6 +23,6 @@ for k, j in enumerate(fit.noll[:5]):
     expected = (after - before)[j - 1] * 1e9
     print(f"Z{j}: {fit.zernikes[0, k] * 1e9:+7.1f} +- {fit.errors[0, k] * 1e9:4.1f} nm, in truth {expected:+7.1f} nm")
 fit.plot().savefig("donuts.png")
-```
 
-More: [donuts](../explanation/donuts.md).
+# %%
+# More: :doc:`donuts <../explanation/donuts>`.

@@ -1,8 +1,10 @@
-# Refocus by optimisation
+"""
+Refocus by optimisation
+=======================
 
 M2 is displaced by 50 um; the camera's focus and two motions compensate, with exact derivatives.
+"""
 
-```python
 import numpy as np
 
 import pachon
@@ -14,6 +16,6 @@ print(found)
 for name, change, error in zip(found.to_table()["address"], found.changes, found.uncertainty, strict=True):
     print(f"{name:10s} {change:+.4g} +- {error:.1g}")
 found.plot().savefig("optimum.png")
-```
 
-The command: `pachon optimize lsst_v3.3_r --variables Camera.dz,Camera.dx`.
+# %%
+# The command: ``pachon optimize lsst_v3.3_r --variables Camera.dz,Camera.dx``.

@@ -1,8 +1,10 @@
-# Ghosts of a bright star
+"""
+Ghosts of a bright star
+=======================
 
 Every pair of reflections at glass surfaces and the detector, brightest irradiance first.
+"""
 
-```python
 import numpy as np
 
 import pachon
@@ -12,6 +14,6 @@ ghosts = pachon.ghosts(telescope, np.deg2rad([0.0, 0.7]), reflectivity=0.01, n_p
 print(ghosts.to_table()["first", "second", "flux", "diameter"][:4])
 print(f"all ghosts: {100 * ghosts.flux:.2f} % of the star's light")
 ghosts.plot().savefig("ghosts.png")
-```
 
-The command: `pachon ghosts lsst_v3.3_r`.
+# %%
+# The command: ``pachon ghosts lsst_v3.3_r``.

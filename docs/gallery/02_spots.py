@@ -1,8 +1,11 @@
-# Spot diagrams
+"""
+Spot diagrams
+=============
 
-Sizes of spots at three fields of the Paul-Baker telescope, all units attached: a result becomes an astropy table with `to_table()`.
+Sizes of spots at three fields of the Paul-Baker telescope, all units attached: a result becomes an astropy table with
+``to_table()``.
+"""
 
-```python
 import astropy.units as u
 import numpy as np
 
@@ -15,6 +18,6 @@ table = spots.to_table()
 print(table["rms_radius"].to(u.nm))
 print(table["rms_radius"].info.description)
 spots.plot().savefig("spots.png")
-```
 
-The command: `pachon spots paul_baker --json`.
+# %%
+# The command: ``pachon spots paul_baker --json``.

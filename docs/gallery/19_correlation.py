@@ -1,8 +1,10 @@
-# Ellipticity correlations
+"""
+Ellipticity correlations
+========================
 
 A shear field of one spatial wave, sampled at random places: the correlation function shows its scale.
+"""
 
-```python
 import numpy as np
 
 import pachon
@@ -15,6 +17,6 @@ found = pachon.shear_correlation(x, y, e1, e2, bins=pachon.SeparationBins(3e-4, 
 print(f"xi+ at {found.r_arcmin[0]:.1f} arcmin: {found.xi_plus[0]:.2e} +- {found.error_plus[0]:.0e}")
 print(f"expected at small separations: 0.03^2/2 = {0.03**2 / 2:.2e}")
 found.plot().savefig("correlation.png")
-```
 
-More: [diagnostics](../howto/diagnostics.md).
+# %%
+# More: :doc:`diagnostics <../howto/diagnostics>`.

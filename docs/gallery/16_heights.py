@@ -1,8 +1,10 @@
-# Heights of a focal plane
+"""
+Heights of a focal plane
+========================
 
 The heights of 189 CCDs, drawn from the budget of Jee & Tyson (2011), Table 1, beside those of LSSTCam as built.
+"""
 
-```python
 from matplotlib.figure import Figure
 
 import pachon
@@ -15,6 +17,6 @@ for plane, axes in zip((drawn, built), figure.subplots(1, 2), strict=True):
     print(f"{plane}: rms {summary['rms_height_um']:.2f} um, peak to valley {summary['peak_to_valley_um']:.1f} um")
     plane.plot(ax=axes)
 figure.savefig("heights.png")
-```
 
-More: [the camera as built](../howto/camera.md).
+# %%
+# More: :doc:`the camera as built <../howto/camera>`.

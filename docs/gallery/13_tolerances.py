@@ -1,8 +1,10 @@
-# Tolerances by Monte Carlo
+"""
+Tolerances by Monte Carlo
+=========================
 
 Thousands of telescopes drawn within tolerances, each refocused, from one sensitivity matrix.
+"""
 
-```python
 import numpy as np
 
 import pachon
@@ -20,6 +22,6 @@ drawn = pachon.monte_carlo(
 )
 print(f"as designed {drawn.nominal * 1e9:.1f} nm; 95 % of the telescopes below {drawn.at_most(0.95) * 1e9:.0f} nm")
 drawn.plot().savefig("tolerances.png")
-```
 
-More: [perturbations and tolerances](../howto/perturbations.md).
+# %%
+# More: :doc:`perturbations and tolerances <../howto/perturbations>`.

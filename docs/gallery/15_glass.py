@@ -1,8 +1,10 @@
-# Glass and air
+"""
+Glass and air
+=============
 
 Refractive indices by the formulas of glass catalogues and by Ciddor's air, with units as they come.
+"""
 
-```python
 import astropy.units as u
 import numpy as np
 from matplotlib.figure import Figure
@@ -19,6 +21,6 @@ axes = figure.subplots()
 axes.plot(waves.value, silica.index(waves))
 axes.set(xlabel="wavelength [nm]", ylabel="refractive index", title="fused silica (Malitson 1965)")
 figure.savefig("glass.png")
-```
 
-AGF catalogues are read by `GlassCatalogue.read`.
+# %%
+# AGF catalogues are read by ``GlassCatalogue.read``.

@@ -1,8 +1,10 @@
-# Vignetting, and which surface blocks
+"""
+Vignetting, and which surface blocks
+====================================
 
 The lit fraction of the pupil against field, and the footprints of the beams on two surfaces.
+"""
 
-```python
 import numpy as np
 
 import pachon
@@ -14,6 +16,6 @@ print("light relative to the axis:", np.round(light.relative, 3), "+-", np.round
 beams = pachon.footprint(telescope, ["M2", "Filter_entrance"], fields[[0, 2, 4]])
 print(beams.to_table()["name", "blocked_fraction"])
 beams.plot().savefig("footprint.png")
-```
 
-The commands: `pachon vignetting`, `pachon footprint`.
+# %%
+# The commands: ``pachon vignetting``, ``pachon footprint``.

@@ -1,8 +1,10 @@
-# A wavefront and its Zernike terms
+"""
+A wavefront and its Zernike terms
+=================================
 
 The optical path difference of one field point over the entrance pupil, and its annular Zernike terms in Noll's order.
+"""
 
-```python
 import numpy as np
 
 import pachon
@@ -14,6 +16,6 @@ print(opd)
 for j in (4, 7, 11):
     print(f"Z{j:<2d} {fit.coefficients[j - 1] * 1e9:8.2f} nm")
 opd.plot(fit, name=telescope.name).savefig("wavefront.png")
-```
 
-Signs and frames: [conventions](../explanation/conventions.md).
+# %%
+# Signs and frames: :doc:`conventions <../explanation/conventions>`.

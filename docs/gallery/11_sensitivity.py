@@ -1,8 +1,11 @@
-# Sensitivity to degrees of freedom
+"""
+Sensitivity to degrees of freedom
+=================================
 
-The exact derivative of every Zernike term at every field by every parameter, in one call; the singular values say which combinations can be told apart.
+The exact derivative of every Zernike term at every field by every parameter, in one call; the singular values say
+which combinations can be told apart.
+"""
 
-```python
 import numpy as np
 
 import pachon
@@ -16,6 +19,6 @@ for name, rms in zip(motions, matrix.rms, strict=True):
 values, modes = matrix.modes()
 print("singular values:", np.round(values, 4))
 matrix.plot().savefig("sensitivity.png")
-```
 
-More: [derivatives](../explanation/derivatives.md).
+# %%
+# More: :doc:`derivatives <../explanation/derivatives>`.
