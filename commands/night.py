@@ -119,6 +119,7 @@ def show_night(
 ) -> None:
     """Compute the visits of a list, and show what came out."""
     from ..studies.night.night import run_night
+    from ..studies.night.report import REPORT_NAME, verdict
 
     result = run_night(settings, out, base=base, part=part, execution=execution)
     if quiet:  # the reporter has printed nothing
@@ -129,6 +130,7 @@ def show_night(
         return
     if quiet:
         return
+    print_line(verdict(result.summary))
     columns = {
         "psfSigma [pixel]": ("median_psfSigma", ".3f"),
         "psfArea [pixel²]": ("median_psfArea", ".1f"),
@@ -151,3 +153,4 @@ def show_night(
     if result.left_out:
         print_line(f"{len(result.left_out)} visits are left out, summary.json has the reasons")
     print_line(f"night: {out.resolve()}")
+    print_line(f"report: {(out / REPORT_NAME).resolve()}")

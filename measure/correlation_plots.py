@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,6 +21,14 @@ _RHO_STYLES = {
     "rho4": (PURPLE, "v", "$\\rho_4 = \\langle\\delta e^* (e\\,\\delta T/T)\\rangle$"),
     "rho5": (GREY, "o", "$\\rho_5 = \\langle e^* (e\\,\\delta T/T)\\rangle$"),
 }
+
+
+class Separated(Protocol):
+    """What has separations, and xi+ or xi- with errors at them: ``xi_plus`` and ``error_plus``."""
+
+    @property
+    def r_arcmin(self) -> np.ndarray:  # noqa: D102 - described by what has it
+        ...
 
 
 def correlation_columns(correlated: Mapping[str, Correlation]) -> dict[str, tuple[np.ndarray, str, str]]:
@@ -75,7 +84,7 @@ def log_axes(axes: Axes, title: str) -> None:
     axes.grid(True, which="major", color="0.9", linewidth=0.6)
 
 
-def draw_correlation(axes: Axes, correlation: Correlation, sign: str, color: str, marker: str, label: str) -> None:
+def draw_correlation(axes: Axes, correlation: Separated, sign: str, color: str, marker: str, label: str) -> None:
     """Draw one correlation of a sign, ``plus`` or ``minus``, with error bars: negative values with open symbols."""
     r = correlation.r_arcmin
     xi, error = getattr(correlation, f"xi_{sign}"), getattr(correlation, f"error_{sign}")

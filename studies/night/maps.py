@@ -65,6 +65,13 @@ class NightMaps:
         _update(band.first, index, np.fmin(_values(band.first, index), midpoint))
         _update(band.last, index, np.fmax(_values(band.last, index), midpoint))
 
+    def pictured(self, name: str) -> tuple[Any, Any, Any]:
+        """Return the maps of a band that people look at: rms width of the PSF [pixel], limiting magnitude, visits."""
+        content = _quantities(self.bands[name], self.nside)
+        keys = ("psf_size", "psf_maglim", "n_exposure")
+        maps = [next(entry[0] for key, entry in content.items() if key.startswith(start)) for start in keys]
+        return maps[0], maps[1], maps[2]
+
     def write(self, folder: Path, stamp: Stamp) -> None:
         """Write the maps of all bands, each whole or not at all."""
         for name, band in self.bands.items():

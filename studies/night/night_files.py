@@ -17,13 +17,16 @@ from ...pipeline.listed_visit import instrument_of
 from ...pipeline.run_folder import SUMMARY_NAME
 from ...sky.visit_list.visit_list import VisitList
 from . import detector_row as rows
+from . import residual_correlation as xi
 from .config import NightConfig
 from .maps import NightMaps
+from .report import REPORT_NAME, night_page
 from .visit_product import VisitProduct
 
 #: Names of the tables without their endings.
 DETECTOR_TABLE = "visit_detector"
 VISIT_TABLE = "visit"
+CORRELATION_TABLE = "correlation"
 #: Columns of the table of visits: unit, description.
 _VISIT_COLUMNS = {
     "visitId": ("", "number of the visit"),
@@ -55,6 +58,7 @@ def write_night(
 ) -> tuple[dict[int, str], dict[str, Any]]:
     """Write tables, maps and summary of finished visits; return those that have failed, and the summary."""
     tables: list[dict[str, np.ndarray]] = []
+    correlated: dict[str, list[dict[str, np.ndarray]]] = {}
     left_out: dict[int, str] = {}
     left_out_ccds: dict[str, dict[str, str]] = {}
     maps = NightMaps(config.maps.nside) if config.maps.nside else None
@@ -74,6 +78,8 @@ def write_night(
                 **product.detectors,
             }
         )
+        if product.correlation:
+            correlated.setdefault(product.band, []).append(product.correlation)
         if maps is not None:
             maps.add(product)
     columns = {name: np.concatenate([table[name] for table in tables]) for name in rows.COLUMNS} if tables else {}
@@ -84,6 +90,10 @@ def write_night(
     write_named_table(folder / VISIT_TABLE, _visit_columns(visits), {"what": "visits of the list", **stamp.meta()})
     if maps is not None:
         maps.write(folder, stamp)
+    means = {band: xi.mean_correlations(correlated[band]) for band in sorted(correlated)}
+    if means:
+        meta = {"what": "correlation of g at places of the same visit, mean over visits", **stamp.meta()}
+        write_named_table(folder / CORRELATION_TABLE, xi.correlation_columns(means), meta)
     summary = {
         **stamp.meta(),
         "configuration": config.as_dict(),
@@ -94,9 +104,13 @@ def write_night(
         "left_out": {str(visit): reason for visit, reason in left_out.items()},
         "left_out_ccds": left_out_ccds,
         "remarks": list(visits.remarks),
-        "bands": _band_metrics(columns),
+        "bands": _band_metrics(columns, correlated),
+        "correlation_g": {
+            band: {kind: mean.as_dict() for kind, mean in kinds.items()} for band, kinds in means.items()
+        },
     }
     write_json(folder / SUMMARY_NAME, summary)
+    write_bytes(folder / REPORT_NAME, night_page(summary, visits, columns, maps, means).encode())
     return left_out, summary
 
 
@@ -141,8 +155,10 @@ def _visit_columns(visits: VisitList) -> Columns:
     return {name: (values[name], *_VISIT_COLUMNS[name]) for name in _VISIT_COLUMNS}
 
 
-def _band_metrics(columns: dict[str, np.ndarray]) -> dict[str, dict[str, float]]:
-    """Return medians of each band, and the rms of what the models leave."""
+def _band_metrics(
+    columns: dict[str, np.ndarray], correlated: dict[str, list[dict[str, np.ndarray]]]
+) -> dict[str, dict[str, float]]:
+    """Return medians of each band, rms and xi+ of what the models leave."""
     metrics: dict[str, dict[str, float]] = {}
     for band in np.unique(columns["band"]).tolist() if columns else ():
         rows_of_band = columns["band"] == band
@@ -155,5 +171,5 @@ def _band_metrics(columns: dict[str, np.ndarray]) -> dict[str, dict[str, float]]
             values = columns[name][rows_of_band]
             if np.isfinite(values).any():
                 numbers[f"rms_{name.removesuffix('Rms')}"] = rms(values)
-        metrics[band] = numbers
+        metrics[band] = numbers | xi.range_means(correlated.get(band, []))
     return metrics

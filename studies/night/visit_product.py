@@ -24,6 +24,7 @@ from ...pipeline.simulate.star_field import StarField
 from ...reconstruction.ccd_product import write_product
 from ...sky.visit_list.visit_list import ListedVisit
 from . import detector_row as rows
+from . import residual_correlation as xi
 from .config import NightConfig
 from .sky_pixels import covered_pixels, interpolated
 
@@ -47,6 +48,7 @@ class VisitProduct:
     band: str
     detectors: dict[str, np.ndarray]  #: columns but for visit and band, empty where the visit has failed
     pixels: dict[str, np.ndarray]  #: columns of :data:`PIXEL_COLUMNS`
+    correlation: dict[str, np.ndarray]  #: columns of :data:`.residual_correlation.COLUMNS`, or nothing
     left_out: dict[str, str]  #: CCDs without a PSF model, each with the reason
     reason: str = ""  #: why the visit has failed
 
@@ -55,7 +57,9 @@ class VisitProduct:
         # Descriptions, which the table of the night has, are too long for cards.
         detectors: Columns = {name: (self.detectors[name], rows.COLUMNS[name][0], "") for name in self.detectors}
         pixels: Columns = {name: (self.pixels[name], PIXEL_COLUMNS[name][0], "") for name in self.pixels}
-        hdus = [table_hdu(name, table) for name, table in (("DETECTORS", detectors), ("PIXELS", pixels)) if table]
+        correlation: Columns = {name: (self.correlation[name], xi.COLUMNS[name][0], "") for name in self.correlation}
+        tables = (("DETECTORS", detectors), ("PIXELS", pixels), ("XI", correlation))
+        hdus = [table_hdu(name, table) for name, table in tables if table]
         cards = [
             ("VISIT", self.visit, "number of the visit"),
             ("BAND", self.band, "band"),
@@ -75,6 +79,7 @@ class VisitProduct:
             header["BAND"],
             tables.get("DETECTORS", {}),
             tables.get("PIXELS", {}),
+            tables.get("XI", {}),
             json.loads(header["LEFTOUT"]),
             header["REASON"],
         )
@@ -102,7 +107,7 @@ class VisitWork:
         except ProductError:
             raise
         except PachonError as error:
-            product = VisitProduct(visit.visit, visit.band, {}, {}, {}, _one_line(error, visit))
+            product = VisitProduct(visit.visit, visit.band, {}, {}, {}, {}, _one_line(error, visit))
         product.write(folder / product_name(visit.visit), self.stamp)
         return product.reason
 
@@ -113,6 +118,7 @@ class VisitWork:
         names = resolved_value(experiment.config.ccds)
         detectors: dict[str, dict[str, float]] = {}
         places: dict[int, rows.PlaceShapes] = {}
+        ellipticities: dict[str, xi.PlaceEllipticities] = {}
 
         def reduced(exposure: CcdExposure) -> None:
             ccd = experiment.camera.ccd_index(exposure.name)
@@ -127,6 +133,9 @@ class VisitWork:
                 experiment, product
             )
             places[ccd] = shapes
+            truth = np.stack([shapes.g1, shapes.g2])
+            away = np.full_like(truth, np.nan) if product is None else np.stack(product.ellipticity("away", "g"))
+            ellipticities[exposure.name] = xi.PlaceEllipticities(shapes.xy, truth, away)
 
         with experiment.screens(threads, reporter):
             simulated = simulate_ccds(
@@ -146,7 +155,8 @@ class VisitWork:
         columns = {key: np.array([detectors[name][key] for name in order]) for key in _ROW_COLUMNS}
         columns["detector"] = columns["detector"].astype(np.int64)
         pixels = _pixels(experiment, places, self.config.maps.nside) if self.config.maps.nside else {}
-        return VisitProduct(visit.visit, visit.band, columns, pixels, simulated.not_modelled)
+        correlation = xi.correlate_visit(experiment, [ellipticities[name] for name in order])
+        return VisitProduct(visit.visit, visit.band, columns, pixels, correlation, simulated.not_modelled)
 
 
 def product_name(visit: int) -> str:

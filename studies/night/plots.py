@@ -1,0 +1,110 @@
+"""Pictures of a night: maps of the sky, and correlation of the PSF and of what its models leave."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from ...core.plotting import BLUE, RED, new_figure, png_bytes, styled
+from ...measure.correlation_plots import draw_correlation, log_axes
+from .maps import NightMaps
+from .residual_correlation import MeanCorrelation
+
+_LABELS = {"truth": (BLUE, "o", "noise-free PSFs"), "away": (RED, "D", "less the models, where no star is")}
+_TITLES = ("rms width of the PSF [pixel]", "limiting magnitude (AB, S/N 5)", "visits")
+_COLOURS = ("viridis", "cividis", "magma")
+#: Place of the number of visits among the titles, which begins at zero.
+_COUNTED = 2
+#: Points of the grid on which a map is drawn, along its longer side.
+_GRID = 480
+#: Widest part of the sky [deg] that is drawn in a plane; a wider one by Hammer's equal-area projection.
+_WIDEST_PLANE = 60.0
+_MARGIN = 0.04
+
+
+def maps_plot(maps: NightMaps) -> bytes:
+    """Draw PSF width, depth and number of visits of each band; north is up, east at the left."""
+    bands = sorted(maps.bands)
+    with styled():
+        figure = new_figure(12.5, 3.9 * len(bands))
+        grids = [_Grid(maps.pictured(band)[0]) for band in bands]
+        for row, (band, grid) in enumerate(zip(bands, grids, strict=True)):
+            for column, (content, title, colours) in enumerate(
+                zip(maps.pictured(band), _TITLES, _COLOURS, strict=True)
+            ):
+                axes = figure.add_subplot(len(bands), 3, 3 * row + column + 1, projection=grid.projection)
+                values = grid.values(content)
+                least = 0.0 if column == _COUNTED else None
+                image = axes.pcolormesh(*grid.mesh, values, cmap=colours, vmin=least, rasterized=True)
+                figure.colorbar(image, ax=axes, shrink=0.7)
+                axes.set_title(f"{band}: {title}", loc="left", fontsize=9)
+                grid.label(axes)
+        return png_bytes(figure)
+
+
+def correlations_plot(means: Mapping[str, Mapping[str, MeanCorrelation]]) -> bytes:
+    """Draw xi+ of g of each band against separation: filled symbols positive, open ones negative."""
+    with styled():
+        figure = new_figure(max(5.6, 4.2 * len(means)), 4.2)
+        panels = figure.subplots(1, len(means), sharex=True, sharey=True, squeeze=False)[0]
+        for axes, (band, kinds) in zip(panels, means.items(), strict=True):
+            for kind, correlation in kinds.items():
+                draw_correlation(axes, correlation, "plus", *_LABELS[kind])
+            visits = max(correlation.visits for correlation in kinds.values())
+            log_axes(axes, f"{band}, {visits} visit{'s' if visits > 1 else ''}")
+            axes.set_xlabel("separation [arcmin]")
+        panels[0].set_ylabel("$|\\xi_+|$ of g, mean over visits")
+        panels[0].legend(loc="best")
+        return png_bytes(figure)
+
+
+class _Grid:
+    """Points of the sky at which the maps of a band are drawn."""
+
+    def __init__(self, content: Any) -> None:
+        ra, dec = content.valid_pixels_pos(lonlat=True)
+        # About the mean direction, so that no field is cut at 0 h.
+        east, north = np.deg2rad(ra), np.deg2rad(dec)
+        mean_y, mean_x = (np.cos(north) * np.sin(east)).mean(), (np.cos(north) * np.cos(east)).mean()
+        self.ra = float(np.rad2deg(np.arctan2(mean_y, mean_x)) % 360.0)
+        offset = (np.asarray(ra) - self.ra + 180.0) % 360.0 - 180.0
+        low, high = float(np.min(dec)), float(np.max(dec))
+        self.whole_sky = max(float(np.ptp(offset)) * np.cos(np.deg2rad(0.5 * (low + high))), high - low) > _WIDEST_PLANE
+        if self.whole_sky:
+            self._offset, self._dec = np.linspace(-180.0, 180.0, 2 * _GRID), np.linspace(-90.0, 90.0, _GRID)
+        else:
+            margin = max(_MARGIN * (high - low), 0.02)
+            across = margin / max(np.cos(np.deg2rad(0.5 * (low + high))), 0.02)
+            self._offset = np.linspace(offset.min() - across, offset.max() + across, _GRID)
+            self._dec = np.linspace(max(low - margin, -90.0), min(high + margin, 90.0), _GRID)
+
+    @property
+    def projection(self) -> str | None:
+        return "hammer" if self.whole_sky else None
+
+    @property
+    def mesh(self) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinates of the axes: east is at the left."""
+        if self.whole_sky:
+            return np.deg2rad(-self._offset), np.deg2rad(self._dec)
+        return self.ra + self._offset, self._dec
+
+    def values(self, content: Any) -> np.ndarray:
+        """Return a map at the points, masked where it has nothing."""
+        offset, dec = np.meshgrid(self._offset, self._dec)
+        values = np.asarray(content.get_values_pos((self.ra + offset) % 360.0, dec, lonlat=True), dtype=np.float64)
+        return np.ma.masked_where(~np.isfinite(values) | (values == content.sentinel), values)
+
+    def label(self, axes: Axes) -> None:
+        """Name the axes, and turn them as the sky is seen."""
+        axes.grid(True, color="0.85", linewidth=0.5)
+        if self.whole_sky:
+            hours = [(self.ra - offset) % 360.0 for offset in range(-150, 151, 30)]
+            axes.set_xticklabels([f"{value:.0f}°" for value in hours], fontsize=6)
+            return
+        axes.set(xlabel="right ascension [deg]", ylabel="declination [deg]")
+        axes.set_xlim(self.ra + self._offset[-1], self.ra + self._offset[0])
+        axes.set_aspect(1.0 / max(np.cos(np.deg2rad(self._dec.mean())), 0.02))
