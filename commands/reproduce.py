@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 from rich.table import Table
@@ -15,6 +15,9 @@ from .choices import choice, names
 from .options import Json, Quiet, Threads
 from .tables import print_json, wide_console
 from .workers import DaskWorkers, Processes, Scheduler, long_work
+
+if TYPE_CHECKING:
+    from ..wavefront.psf.engines import EngineName
 
 app = typer.Typer()
 
@@ -37,6 +40,10 @@ def reproduce_command(
             help="small (two minutes), or paper (189 CCDs: an hour; with 100 visits, half a day).",
         ),
     ] = "small",
+    engine: Annotated[
+        str,
+        choice(("fast", "statistical"), help="PSFs of the run and of the visits: through screens, or without them."),
+    ] = "fast",
     out: Annotated[Path, Option("--out", "-o", help="Folder of the figures.")] = Path("pachon_figures"),
     seed: Annotated[int, Option(min=0, help="Seed of all random numbers.")] = 1,
     processes: Processes = None,
@@ -58,12 +65,15 @@ def reproduce_command(
     - `pachon reproduce fig3 table1 --out figures`
     - `pachon reproduce all --scale paper --out paper_figures`
     - `pachon reproduce fig15 fig16 --scale paper --processes 2`: visits side by side
+    - `pachon reproduce fig14 --scale paper --engine statistical`: a survey's engine, without screens
     """
     from ..studies.reproduce.reproduce import reproduce_at
 
     hint = f"finished parts are in {out}, and are used by the next call"
     with long_work(quiet, hint, threads=threads, processes=processes, scheduler=scheduler, dask=workers) as execution:
-        summary = reproduce_at(figures or ("all",), scale, out, seed=seed, execution=execution)
+        summary = reproduce_at(
+            figures or ("all",), scale, out, seed=seed, engine=cast("EngineName", engine), execution=execution
+        )
     if as_json:
         print_json(summary)
     elif not quiet:

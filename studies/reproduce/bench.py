@@ -17,6 +17,7 @@ from ...pipeline.run import run
 from ...pipeline.run_folder import stamp_of
 from ...pipeline.summary import correlations, run_metrics
 from ...reconstruction.ccd_product import CcdProduct, product_path, read_product
+from ...wavefront.psf.engines import EngineName
 from ..visits.config import VisitsConfig
 from ..visits.null_result import NullTest
 from ..visits.null_test import null_test
@@ -139,6 +140,7 @@ class Bench:
     folder: Path
     seed: int = 1
     execution: Execution = field(default_factory=Execution)
+    engine: EngineName = "fast"  #: of the PSFs of the run and of the visits
 
     @property
     def threads(self) -> int | None:
@@ -157,7 +159,8 @@ class Bench:
     @cached_property
     def stamp(self) -> Stamp:
         """Origin, for the headers of FITS files."""
-        return Stamp(digest({**asdict(self.scale), "seed": self.seed}), self.seed)
+        other_engine = {} if self.engine == "fast" else {"engine": self.engine}
+        return Stamp(digest({**asdict(self.scale), "seed": self.seed, **other_engine}), self.seed)
 
     @cached_property
     def optics(self) -> Experiment:
@@ -174,6 +177,7 @@ class Bench:
         options = {
             "run__ccds": self.scale.visit_ccds,
             "run__seed": self.seed,
+            "run__psf__engine": self.engine,
             "run__atmosphere__screen_size": self.scale.screen_size,
             "run__atmosphere__time_step_s": self.scale.time_step,
             "run__reconstruction__recipe": "paper",
@@ -197,6 +201,7 @@ class Bench:
         options = {
             "ccds": self.scale.ccds,
             "seed": self.seed,
+            "psf__engine": self.engine,
             "stars__truth": self.scale.truth,
             "stars__observed": self.scale.observed,
             "atmosphere__screen_size": self.scale.screen_size,

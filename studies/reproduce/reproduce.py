@@ -10,6 +10,7 @@ from ...core.errors import unknown_name
 from ...core.files import make_folder, write_json
 from ...core.long_work import Execution
 from ...core.version import VERSION
+from ...wavefront.psf.engines import EngineName
 from . import atmosphere, focal_plane, optics, reconstruction, screens, visits
 from .bench import SCALES, Bench, Scale
 from .figure import Figure
@@ -79,20 +80,30 @@ def reproduce(names: Iterable[str], bench: Bench) -> dict[str, Any]:
             "measured": result.measured,
             "files": files,
         }
-    summary = {"pachon": VERSION, "scale": bench.scale.name, "seed": bench.seed, "figures": figure_summaries}
+    origin = {"pachon": VERSION, "scale": bench.scale.name, "seed": bench.seed, "engine": bench.engine}
+    summary = {**origin, "figures": figure_summaries}
     if len(figure_summaries) == len(FIGURES):
         write_json(bench.folder / "summary.json", summary)
     return summary
 
 
 def reproduce_at(
-    names: Iterable[str], scale: str, folder: Path, *, seed: int = 1, execution: Execution | None = None
+    names: Iterable[str],
+    scale: str,
+    folder: Path,
+    *,
+    seed: int = 1,
+    engine: EngineName = "fast",
+    execution: Execution | None = None,
 ) -> dict[str, Any]:
-    """Reproduce figures at a scale given by name, after a line with the expected time: see :func:`reproduce`."""
+    """Reproduce figures at a scale given by name, after a line with the expected time: see :func:`reproduce`.
+
+    `engine` makes the PSFs of the run and of the visits, Figs. 9 and 11 to 18.
+    """
     figure_names = chosen_figures(names)
     if scale not in SCALES:
         raise unknown_name("scale", scale, SCALES)
-    bench = Bench(SCALES[scale], folder, seed, execution or Execution())
+    bench = Bench(SCALES[scale], folder, seed, execution or Execution(), engine)
     minutes = expected_minutes(figure_names, bench.scale)
     long = f"about {minutes:.0f} minutes" if minutes >= 1.5 else f"about {max(60.0 * minutes, 1.0):.0f} s"
     bench.reporter.line(f"{len(figure_names)} figures at the scale {scale}: {long} on two cores")

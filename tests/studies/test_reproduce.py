@@ -399,6 +399,21 @@ def test_data_have_the_same_bytes_on_any_number_of_threads(made, tmp_path):
     assert not (tmp_path / "summary.json").exists()
 
 
+def test_the_engine_is_that_of_the_run_and_of_the_visits_and_stands_in_the_origin(tmp_path, monkeypatch):
+    configs = {}
+    monkeypatch.setattr(
+        "pachon.studies.reproduce.bench.stack_visits", lambda config, *_, **__: configs.update(visits=config.run)
+    )
+    monkeypatch.setattr("pachon.studies.reproduce.bench.run", lambda config, *_, **__: configs.update(run=config))
+    monkeypatch.setattr("pachon.studies.reproduce.bench.read_product", lambda *_, **__: None)
+    monkeypatch.setattr("pachon.studies.reproduce.bench.correlations", lambda *_: {})
+    monkeypatch.setattr("pachon.studies.reproduce.bench.run_metrics", lambda *_: {})
+    bench, other = (Bench(TINY, tmp_path, engine=engine) for engine in ("fast", "statistical"))
+    assert bench.stamp != other.stamp
+    _ = other.stack, other.pipeline
+    assert [configs[name].psf.engine for name in ("visits", "run")] == ["statistical", "statistical"]
+
+
 def test_figures_come_in_the_order_of_the_paper_each_once():
     assert chosen_figures(["table1", "fig3", "fig3", "fig1"]) == ("fig1", "fig3", "table1")
     assert chosen_figures(["fig3", "all"]) == tuple(FIGURES)
@@ -412,6 +427,7 @@ def test_figures_come_in_the_order_of_the_paper_each_once():
         (["fig21"], ["'fig21'", "did you mean", "fig2"]),
         (["tabel1"], ["'tabel1'", "did you mean table1?"]),
         (["fig3", "--scale", "papr"], ["'papr'", "did you mean paper?"]),
+        (["fig14", "--engine", "statistic"], ["'statistic'", "did you mean statistical?"]),
         (["fig3", "--seed", "-1"], ["--seed"]),
         (["fig3", "--threads", "0"], ["--threads"]),
     ],
