@@ -102,7 +102,11 @@ AcrossBand = Annotated[
 Projection = Annotated[str, choice(PROJECTIONS, help="Meaning of the field angles.")]
 Picture = Annotated[
     Path | None,
-    Option("--picture", help="Picture to write, .png, .pdf or .svg; by default named after command and model."),
+    Option(
+        "--picture",
+        metavar="FILE",
+        help="Picture to write, .png, .pdf or .svg; by default named after command and model.",
+    ),
 ]
 NoPicture = Annotated[bool, Option("--no-picture", help="Draw no picture.")]
 TableFile = Annotated[

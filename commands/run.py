@@ -21,8 +21,21 @@ from .night import (
     part_of,
     require_list,
 )
-from .options import AllCcds, Ccds, Config, Json, ObservedStars, Quiet, Raft, Settings, Threads, TruthStars, chosen_ccds
-from .tables import Rows, plain_table, print_json, wide_console
+from .options import (
+    AllCcds,
+    Ccds,
+    Config,
+    Json,
+    ObservedStars,
+    Quiet,
+    Raft,
+    Settings,
+    TableFile,
+    Threads,
+    TruthStars,
+    chosen_ccds,
+)
+from .tables import Rows, plain_table, print_json, wide_console, write_rows
 from .workers import DaskWorkers, Processes, Scheduler, long_work
 
 if TYPE_CHECKING:
@@ -54,6 +67,7 @@ def run_command(
     night: Night = None,
     truth_stars: TruthStars = None,
     observed_stars: ObservedStars = None,
+    table: TableFile = None,
     settings: Settings = None,
     threads: Threads = None,
     quiet: Quiet = False,
