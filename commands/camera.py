@@ -14,7 +14,7 @@ from ..core.terminal import print_line
 from . import completion
 from .choices import names
 from .inputs import configured_experiment, warnings_shown
-from .options import Json, NoPicture, Picture, TableFile, check_table, picture_kind
+from .options import Json, NoPicture, Picture, TableFile, picture_kind
 from .tables import Rows, print_json
 
 if TYPE_CHECKING:
@@ -60,7 +60,6 @@ def camera_command(
     from ..core.plotting import picture_bytes
 
     kind = picture_kind(picture)
-    check_table(table)
     drawn = not no_picture and (picture is not None or not as_json)
     camera = _listed_camera(heights)
     rows, content, draw = _listed(camera) if camera is not None else _heights(heights)

@@ -14,13 +14,15 @@ from . import completion
 from .choices import names
 from .config_examples import EXAMPLES
 from .config_kinds import KINDS, model_of
-from .options import Json
-from .tables import Rows, plain_table, print_json, wide_console
+from .options import Json, TableFile
+from .tables import Rows, plain_table, print_json, wide_console, write_rows
 
 if TYPE_CHECKING:
     from ..core.key_descriptions import KeyDescription
 
 app = typer.Typer()
+#: Columns of the table of keys.
+_HEADINGS = ("key", "default", "values", "meaning")
 
 
 @app.command("config")
@@ -29,6 +31,7 @@ def config_command(
         str | None,
         names(completion.config_keys, metavar="KEY", help="Kind, section or key: run.psf.engine.", kind=Argument),
     ] = None,
+    table: TableFile = None,
     as_json: Json = False,
 ) -> None:
     """Explain the keys of configurations: type, default, choices, meaning, and an example to copy.
@@ -44,9 +47,16 @@ def config_command(
     - `pachon config sweep --json`
     """
     if key is None:
-        _show_kinds(as_json)
+        kinds = _kind_rows()
+        write_rows(kinds, table)
+        if as_json:
+            entries = {kind: {"commands": k.commands.split(", "), "text": k.text} for kind, k in KINDS.items()}
+            print_json({"kinds": entries})
+        else:
+            kinds.show()
         return
     kind, descriptions = keys_of(key)
+    write_rows(Rows(_HEADINGS, [_key_cells(description) for description in descriptions]), table)
     if as_json:
         summaries = [description.summary() | {"example": example(description)} for description in descriptions]
         print_json({"kind": kind, "keys": summaries})
@@ -107,23 +117,24 @@ def example(description: KeyDescription) -> str | None:
     return f"{description.key}={value if isinstance(value, str) else json.dumps(value)}"
 
 
-def _show_kinds(as_json: bool) -> None:
-    if as_json:
-        print_json({"kinds": {kind: {"commands": k.commands.split(", "), "text": k.text} for kind, k in KINDS.items()}})
-        return
+def _kind_rows() -> Rows:
+    """Return the kinds of configurations."""
     rows = [(kind, entry.commands, entry.text) for kind, entry in KINDS.items()]
-    Rows(("kind", "commands", "decides"), rows, "pachon config KIND lists its keys.", left=3).show()
+    return Rows(("kind", "commands", "decides"), rows, "pachon config KIND lists its keys.", left=3)
+
+
+def _key_cells(description: KeyDescription) -> tuple[str, ...]:
+    """Return key, default, values and meaning of a key."""
+    values = ", ".join(description.choices) or description.type
+    return description.key, _default_text(description), values, description.description
 
 
 def _show_keys(kind: str, descriptions: list[KeyDescription]) -> None:
     table = plain_table()
-    table.add_column("key", no_wrap=True)
-    table.add_column("default", max_width=24)
-    table.add_column("values", max_width=30)
-    table.add_column("meaning")
+    for name, width in zip(_HEADINGS, (None, 24, 30, None), strict=True):
+        table.add_column(name, max_width=width, no_wrap=name == "key")
     for description in descriptions:
-        values = ", ".join(description.choices) or description.type
-        table.add_row(description.key, _default_text(description), values, description.description)
+        table.add_row(*_key_cells(description))
     wide_console().print(table)
     print_line(f"{len(descriptions)} keys of {kind}; a dash: open, as the meaning says. One key: pachon config KEY")
 

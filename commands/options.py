@@ -234,10 +234,8 @@ def picture_kind(picture: Path | None) -> str:
     return kind
 
 
-def check_table(table: Path | None) -> None:
-    """Check the ending of a table's name, before anything is computed."""
-    if table is None:
-        return
+def check_table(table: Path) -> None:
+    """Check the ending of a table's name."""
     from ..core.table_files import FORMATS
 
     if table.suffix.lower() not in FORMATS:

@@ -36,10 +36,10 @@ def range_text(values: Any, form: str, unit: str = "") -> str:
 def images_verdict(objects: Mapping[str, int], images: int) -> str:
     """Return what a set of images holds, by the objects on those that were drawn."""
     kept = images - len(objects)
-    drawn = f"{counted(len(objects), 'image')} with {counted(sum(objects.values()), 'star or galaxy', 'stars and galaxies')}"
     if not objects:
-        return f"All of {counted(kept, 'image')} were there already."
-    return f"{drawn}{f'; {kept} were there already' if kept else ''}."
+        return f"No image is drawn: {counted(kept, 'image was', 'images were')} there already."
+    sources = counted(sum(objects.values()), "star or galaxy", "stars and galaxies")
+    return f"{counted(len(objects), 'image')} with {sources}{f'; {kept} were there already' if kept else ''}."
 
 
 def visits_verdict(stacks: Mapping[str, Figures]) -> str:
@@ -63,9 +63,9 @@ def null_verdict(stacks: Mapping[str, Figures]) -> str:
     galaxies = f"In the stack of {counted(int(last), 'visit')}, {figures['usable']} galaxies"
     change, noise = figures["xi_plus_difference_long"], figures["shot_noise_xi_plus"]
     if not math.isfinite(change):
-        return f"{galaxies} are usable, but no pairs are farther apart than 10': what the PSF models do is not measured."
+        return f"{galaxies}: no pairs are farther apart than 10', where the effect of PSF models is measured."
     return (
-        f"{galaxies}: their PSF models add ξ+ = {change:.1e} beyond 10', beside a shot noise of {noise:.1e} over all "
+        f"{galaxies}: the PSF models add ξ+ = {change:.1e} beyond 10', beside a shot noise of {noise:.1e} over all "
         "separations."
     )
 
@@ -87,10 +87,8 @@ def measure_verdict(measured: Mapping[str, Figures], left_out: int) -> str:
     if not measured:
         return f"No image could be measured; {counted(left_out, 'image is', 'images are')} left out."
     stars, galaxies = (sum(figures[key] for figures in measured.values()) for key in ("stars", "usable"))
-    return (
-        f"{counted(len(measured), 'image')}: a PSF from {counted(stars, 'star')}, and {counted(galaxies, 'galaxy', 'galaxies')} "
-        f"usable for shear{lost}."
-    )
+    usable = counted(galaxies, "galaxy", "galaxies")
+    return f"{counted(len(measured), 'image')}: {counted(stars, 'star')}, and {usable} usable for shear{lost}."
 
 
 def model_verdict(figures: Figures) -> str:
@@ -112,9 +110,10 @@ def diagnose_verdict(overall: Figures, missing: int) -> str:
     name = "g" if math.isfinite(overall.get("rms_g_away", math.nan)) else "e"
     residual, scatter = (overall.get(f"rms_{key}", math.nan) for key in (f"{name}_away", f"scatter_{name}"))
     words = "g" if name == "g" else "weighted e"
+    where = f"Over {counted(overall['ccds'], 'CCD')}"
     return (
-        f"Over {counted(overall['ccds'], 'CCD')} the PSF model errs by {percent_text(residual)} rms in {words} where no "
-        f"star is, against {percent_text(scatter)} of a constant PSF on each{lost}."
+        f"{where} the PSF model errs by {percent_text(residual)} rms in {words} where no star is, against "
+        f"{percent_text(scatter)} of a constant PSF on each{lost}."
     )
 
 
@@ -162,10 +161,8 @@ def night_verdict(bands: Mapping[str, Figures], left_out: int) -> str:
     lost = f"; {counted(left_out, 'visit is', 'visits are')} left out" if left_out else ""
     if not bands:
         return f"No visit could be computed{lost}."
-    depths = [
-        f"{band} {figures['median_magLim']:.2f}" if math.isfinite(figures.get("median_magLim", math.nan)) else f"{band} -"
-        for band, figures in bands.items()
-    ]
+    limits = {band: figures.get("median_magLim", math.nan) for band, figures in bands.items()}
+    depths = [f"{band} {limit:.2f}" if math.isfinite(limit) else f"{band} unknown" for band, limit in limits.items()]
     count = int(sum(figures["detectors"] for figures in bands.values()))
     return f"{counted(count, 'CCD image')}; median limiting magnitudes (S/N 5): {', '.join(depths)}{lost}."
 

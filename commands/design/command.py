@@ -175,7 +175,6 @@ def design_command(
 
         def command(picture: Path | None, no_picture: bool, table: Path | None, as_json: bool, **values: Any) -> None:
             kind = options.picture_kind(picture)
-            options.check_table(table)
             import_modules(_NEEDED)
             shared = SharedOptions(**{f.name: values[f.name] for f in fields(SharedOptions) if f.name in values})
             try:
