@@ -24,6 +24,7 @@ class Column(NamedTuple):
     values: str | Callable[[Any], Any]  #: key of the result's summary, or function from the result to a value per row
     form: str = ""  #: format of the numbers; of pairs that of each
     scale: float = 1.0  #: factor from the value to the unit of the heading
+    subject: str = ""  #: what its numbers are, in a verdict; empty of columns that give none
 
     def title(self, summary: dict[str, Any]) -> str:
         """Return the heading."""
@@ -34,9 +35,21 @@ class Column(NamedTuple):
 
     def texts(self, result: Any, summary: dict[str, Any]) -> list[str]:
         """Return the cells of the column."""
+        return number_texts(self.numbers(result, summary), self.form)
+
+    def numbers(self, result: Any, summary: dict[str, Any]) -> Any:
+        """Return the values of the column in the unit of the heading."""
         key = self.key(summary)
         values = key(result) if callable(key) else summary[key]
-        return number_texts(values if self.scale == 1.0 else self.scale * values, self.form)
+        return values if self.scale == 1.0 else self.scale * values
+
+    def verdict(self, result: Any, summary: dict[str, Any]) -> str:
+        """Return the range of the numbers in one sentence."""
+        unit = re.search(r"\[([^][]+)\]", self.title(summary))
+        numbers = self.numbers(result, summary)
+        values = range_text(numbers, self.form, unit[1] if unit else "")
+        over = f" over {len(numbers)} fields" if len(numbers) > 1 else ""
+        return f"{self.subject} is {values}{over}."
 
     def key(self, summary: dict[str, Any]) -> Any:
         """Return the values: their function or key, that of angles where the image is at infinity; None if absent."""
@@ -59,6 +72,18 @@ def field_headings(result: Any) -> list[str]:
     """Return the field points of a result as headings of columns."""
     (name, values) = list(result.field_items().items())[-1]
     return [f"{text}°" if name == "field_deg" else f"{text} mm" for text in number_texts(values, ".4g")]
+
+
+def range_text(values: Any, form: str, unit: str = "") -> str:
+    """Return the range of the finite numbers among some; a word where there are none."""
+    import numpy as np
+
+    numbers = np.asarray(values, dtype=np.float64)
+    finite = numbers[np.isfinite(numbers)]
+    if not finite.size:
+        return "unknown"
+    low, high = number_texts((finite.min(), finite.max()), form)
+    return f"{low if low == high else f'{low} to {high}'}{f' {unit}' if unit else ''}"
 
 
 #: Signs in headings, and their spelling in ASCII.

@@ -17,20 +17,7 @@ def counted(count: int, noun: str, plural: str = "") -> str:
 
 def percent_text(fraction: float) -> str:
     """Return a fraction in per cent; words where there is none."""
-    return f"{100 * fraction:.2g} %" if math.isfinite(fraction) else "an unknown part"
-
-
-def range_text(values: Any, form: str, unit: str = "") -> str:
-    """Return the range of the finite numbers among some; words where there are none."""
-    import numpy as np
-
-    numbers = np.asarray(values, dtype=np.float64)
-    finite = numbers[np.isfinite(numbers)]
-    if not finite.size:
-        return "unknown"
-    unit_text = f" {unit}" if unit and unit != "%" else f"{unit and ' %'}"
-    low, high = (format(v + 0.0, form) for v in (finite.min(), finite.max()))
-    return f"{low}{unit_text}" if low == high else f"{low} to {high}{unit_text}"
+    return f"{100 * fraction:.2g} %" if math.isfinite(fraction) else "an unknown amount"
 
 
 def images_verdict(objects: Mapping[str, int], images: int) -> str:
@@ -39,7 +26,8 @@ def images_verdict(objects: Mapping[str, int], images: int) -> str:
     if not objects:
         return f"No image is drawn: {counted(kept, 'image was', 'images were')} there already."
     sources = counted(sum(objects.values()), "star or galaxy", "stars and galaxies")
-    return f"{counted(len(objects), 'image')} with {sources}{f'; {kept} were there already' if kept else ''}."
+    earlier = f"; {counted(kept, 'image was', 'images were')} there already" if kept else ""
+    return f"{counted(len(objects), 'image')} with {sources}{earlier}."
 
 
 def visits_verdict(stacks: Mapping[str, Figures]) -> str:

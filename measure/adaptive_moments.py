@@ -131,7 +131,7 @@ class AdaptiveMoments(Result):
 
     @property
     def e1(self) -> np.ndarray:
-        """Distortion ``(a^2 - b^2)/(a^2 + b^2) = 2 g/(1 + |g|^2)`` along x: HSM's ``observed_shape.e1``, the SRD's e."""
+        """Distortion ``(a^2 - b^2)/(a^2 + b^2) = 2 g/(1 + |g|^2)`` along x: HSM's ``observed_shape.e1``."""
         return np.asarray(2.0 * self.g1 / (1.0 + self.g1**2 + self.g2**2))
 
     @property

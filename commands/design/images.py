@@ -14,6 +14,8 @@ from .command import SharedOptions, Study, design_command
 
 #: Pairs of surfaces whose ghosts take longer than ten seconds.
 _MANY_PAIRS = 200
+#: What a radius of encircled energy stands for in the verdict: one is enough.
+_SUBJECTS = {(80, "µm"): "The radius of 80 % of the light"}
 PupilPoints = Annotated[
     int | None, Option(min=16, max=4096, help="Lattice points across the pupil; enough by default.")
 ]
@@ -31,7 +33,7 @@ def _pixels_text(s: dict[str, Any]) -> str:
 
 @design_command(
     FIELD,
-    Column("Strehl", "strehl", ".4f"),
+    Column("Strehl", "strehl", ".4f", subject="The Strehl ratio"),
     Column("FWHM [µm]", "fwhm_um", ".3f"),
     Column("FWHM [arcsec]", "fwhm_arcsec", ".4f"),
     Column("Airy [µm]", "airy_radius_um", ".3f"),
@@ -80,7 +82,9 @@ def psf(
 @design_command(
     FIELD,
     *(
-        Column(f"{fraction} % [{unit}]", f"ee{fraction}_radius_{key}", form)
+        Column(
+            f"{fraction} % [{unit}]", f"ee{fraction}_radius_{key}", form, subject=_SUBJECTS.get((fraction, unit), "")
+        )
         for fraction in (50, 80, 90)
         for unit, key, form in (("µm", "um", ".3f"), ("arcsec", "arcsec", ".4f"))
     ),
@@ -114,7 +118,7 @@ def ee(
 
 @design_command(
     FIELD,
-    Column("50 % [cycles/mm]", "half_contrast_cycles_per_mm", ".2f"),
+    Column("50 % [cycles/mm]", "half_contrast_cycles_per_mm", ".2f", subject="The frequency of half contrast"),
     Column("50 % [cycles/arcsec]", "half_contrast_cycles_per_arcsec", ".3f"),
     Column("cut-off [cycles/mm]", "cutoff_cycles_per_mm", ".1f"),
     Column("f/", "f_number", ".4f"),
@@ -152,8 +156,9 @@ def mtf(
     Column("focus [mm]", "focus_mm", ".2f"),
     caption=lambda s: (
         "Light and peak over the light of the star's own image; magnitudes below the star's own. Focus: height "
-        f"above the detector. All ghosts together hold {100 * s['total_flux']:.3g} % of the star's light."
+        "above the detector."
     ),
+    verdict=lambda s: f"All ghosts together hold {100 * s['total_flux']:.3g} % of the star's light.",
     left=2,
     most=20,
 )
