@@ -216,9 +216,13 @@ def verdict(summary: dict[str, Any]) -> str:
             effects = {name: size for name, size in metrics[metric][key].items() if np.isfinite(size) and size}
             if not effects:
                 continue
-            (first, size), *others = sorted(effects.items(), key=lambda item: -abs(item[1]))
+            (first, size), *smaller_effects = sorted(effects.items(), key=lambda item: -abs(item[1]))
             of_unit = f" {unit}" if unit and key == "largest_change" else ""
-            second = f"; next is {others[0][0]} with {others[0][1]:+{form}}{of_unit}" if others else ""
+            second = (
+                f"; next is {smaller_effects[0][0]} with {smaller_effects[0][1]:+{form}}{of_unit}"
+                if smaller_effects
+                else ""
+            )
             matters = "matters most for" if len(metrics[metric][key]) > 1 else "is the one parameter of"
             return f"{first} {matters} {metric}, {words} {size:+{form}}{of_unit}{second}.{lost}"
     return f"No parameter changes a metric over the {summary['points']} computed points.{lost}"

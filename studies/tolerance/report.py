@@ -84,8 +84,8 @@ def verdict(summary: dict[str, Any]) -> str:
         return f"{met} {verb} the requirement of {summary['requirement']:g}{unit}{dark}{costliest}."
     if lost == draws:
         return f"No light arrives in any of {telescopes}{costliest}."
-    half, most = (summary[f"reached_by_{percent}_percent"] for percent in (50, 95))
-    texts = [f"{value:.4g}{unit}" if math.isfinite(value) else "no light" for value in (half, most)]
+    median, high = (summary[f"reached_by_{percent}_percent"] for percent in (50, 95))
+    texts = [f"{value:.4g}{unit}" if math.isfinite(value) else "no light" for value in (median, high)]
     return (
         f"Of {telescopes}, half reach {texts[0]} and 95 % {texts[1]}, where the design has "
         f"{summary['nominal']:.4g}{unit}{dark}{costliest}."

@@ -33,8 +33,8 @@ def run_summary(ccds=9, lost=(), **changes):
     [
         (
             run_summary(),
-            'On 9 CCDs the PSF is 0.684" wide with a mean ellipticity |g| of 2.30 %; where no star is, its "
-            "model errs by 0.40 % in g, against 0.90 % of a constant PSF on each CCD.",
+            'On 9 CCDs the PSF is 0.684" wide with a mean ellipticity |g| of 2.30 %; where no star is, its model errs '
+            "by 0.40 % in g, against 0.90 % of a constant PSF on each CCD.",
         ),
         (
             run_summary(1, ("R22_S11",)),
