@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Argument
 
-from ..core.errors import UnknownNameError, nearest, shown
+from ..core.errors import UnknownNameError, shown
 from ..core.terminal import print_line
 from . import completion
 from .choices import names
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
     from ..core.key_descriptions import KeyDescription
 
 app = typer.Typer()
+#: Least likeness of whole keys, as difflib has it: their kinds and sections are alike often.
+_NEAR = 0.85
 #: Columns of the table of keys.
 _HEADINGS = ("key", "default", "values", "meaning")
 
@@ -58,7 +62,7 @@ def config_command(
     kind, descriptions = keys_of(key)
     write_rows(Rows(_HEADINGS, [_key_cells(description) for description in descriptions]), table)
     if as_json:
-        summaries = [description.summary() | {"example": example(description)} for description in descriptions]
+        summaries = [d.summary() | {"unit": unit_of(d), "example": example(d)} for d in descriptions]
         print_json({"kind": kind, "keys": summaries})
     elif len(descriptions) == 1:
         _show_key(kind, descriptions[0])
@@ -85,21 +89,32 @@ def keys_of(text: str) -> tuple[str, list[KeyDescription]]:
     within = [d for d in descriptions if not key or d.key.startswith((f"{key}.", f"{key}[]."))]
     if exact or within:
         return kind, [*exact, *within]
-    raise UnknownNameError(f"unknown key {shown(text)}: {_nearest_keys(kind, key, [d.key for d in descriptions])}")
+    kinds = [kind] if first in KINDS else [*KINDS]
+    names: dict[str, str] = {}
+    for name in kinds:
+        for listed_key in stored_names()["keys"][name]:
+            # Keys of the run within another file are those of runs.
+            if len(kinds) == 1 or not listed_key.startswith("run."):
+                names.setdefault(listed_key, f"{name}.{listed_key}")
+    raise UnknownNameError(f"unknown key {shown(text)}: {_nearest_keys(kinds[0], key, names)}")
 
 
-def _nearest_keys(kind: str, key: str, keys: list[str]) -> str:
-    """Return the keys that are likely to be meant: those nearest, or of the same last word."""
-    last = key.rpartition(".")[2]
-    alike = [name for name in keys if name.rpartition(".")[2] == last][:3]
-    if alike:
-        return f"did you mean {' or '.join(f'{kind}.{name}' for name in alike)}?"
-    sections = {name.rpartition(".")[0] for name in keys} - {""}
-    if hint := nearest(key, [*keys, *sections, *KINDS]):
-        return hint
-    last_words = {name.rpartition(".")[2]: name for name in keys}
-    if hint := nearest(last, last_words, n=1):
-        return f"did you mean {kind}.{last_words[hint.removeprefix('did you mean ').rstrip('?')]}?"
+def _nearest_keys(kind: str, key: str, names: dict[str, str]) -> str:
+    """Return the keys that are likely to be meant: those nearest, of the same last word, or with the word in theirs."""
+    sections = {path.rpartition(".")[0]: name.rpartition(".")[0] for path, name in names.items() if "." in path}
+    paths = sections | names
+    near = get_close_matches(key.lower(), paths, n=2, cutoff=_NEAR)
+    word = key.rpartition(".")[2].lower()
+    last_words = {path: path.rpartition(".")[2].lower() for path in names}
+    if not near:
+        near = [path for path, last in last_words.items() if last == word]
+    if not near:
+        near = [path for path, last in last_words.items() if word and word in last]
+    if not near:
+        similar = get_close_matches(word, set(last_words.values()), n=1)
+        near = [path for path, last in last_words.items() if last in similar]
+    if near:
+        return f"did you mean {' or '.join(paths[path] for path in near[:3])}?"
     return f"expected a key of {kind}, which pachon config {kind} lists, or one of {', '.join(KINDS)}"
 
 
@@ -115,6 +130,12 @@ def example(description: KeyDescription) -> str | None:
     elif isinstance(description.default, bool):
         value = not description.default
     return f"{description.key}={value if isinstance(value, str) else json.dumps(value)}"
+
+
+def unit_of(description: KeyDescription) -> str:
+    """Return the unit of a key, which its meaning has in brackets; empty where there is none."""
+    match = re.search(r"\[((?:1/)?[A-Za-z%][^][]*)\]", description.description)
+    return match[1] if match else ""
 
 
 def _kind_rows() -> Rows:
@@ -144,6 +165,7 @@ def _show_key(kind: str, description: KeyDescription) -> None:
         ("key", f"{kind}.{description.key}"),
         ("meaning", description.description),
         ("type", "" if description.choices else description.type),
+        ("unit", unit_of(description)),
         ("choices", ", ".join(description.choices)),
         ("default", _default_text(description)),
         ("commands", KINDS[kind].commands),

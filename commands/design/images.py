@@ -9,6 +9,8 @@ from typer import Option
 
 from ...core.errors import ConfigError
 from ...core.terminal import print_line
+from .. import completion
+from ..choices import names
 from ..tables import FIELD, Column
 from .command import SharedOptions, Study, design_command
 
@@ -63,6 +65,8 @@ def psf(
     from ...core.products import image_hdu, write_fits
     from ...design.images.diffraction import fft_psf, huygens_psf
 
+    if out is not None and out.suffix.lower() not in (".fits", ".fit"):
+        raise ConfigError(f"--out = {str(out)!r}: expected a name that ends in .fits; the picture is --picture")
     if huygens and pupil_points is not None:
         raise ConfigError("--huygens and --pupil-points: expected one of them")
     compute = huygens_psf if huygens else fft_psf
@@ -173,8 +177,10 @@ def ghosts(
     ] = None,
     reflectivity: Annotated[
         list[str] | None,
-        Option(
-            metavar="R | NAME=R", help="Of the lens surfaces, one for all or by name; by default that of bare glass."
+        names(
+            completion.coated_surfaces,
+            metavar="R | NAME=R",
+            help="Of the lens surfaces, one for all or by name; by default that of bare glass.",
         ),
     ] = None,
     detector_reflectivity: Annotated[float, Option(min=0.0, max=1.0, help="Of the detector.")] = 0.15,

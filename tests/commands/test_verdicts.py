@@ -177,7 +177,7 @@ STACKS = {
         (
             verdicts.visits_verdict({"1": {"rms_g": NAN, "rms_residual_g_places": NAN}}),
             "In one visit the PSF has an rms ellipticity |g| of an unknown amount; where no star is, its model errs by "
-            "an unknown part.",
+            "an unknown amount.",
         ),
         (
             verdicts.null_verdict({"1": {"usable": 7, "xi_plus_difference_long": NAN, "shot_noise_xi_plus": 1e-4}}),
