@@ -130,7 +130,7 @@ class Rows:
             for suffix, values in _plain_columns(cells).items():
                 column = _unused(name + suffix, table.colnames)
                 table[column] = values
-                if unit and not isinstance(values[0], str):
+                if unit and not any(isinstance(value, str) for value in values):
                     table[column].unit = unit
         write_table(path, flat_table(table) if path.suffix.lower() in (".csv", ".parquet") else table)
 

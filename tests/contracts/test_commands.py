@@ -6,6 +6,7 @@ Commands whose product is a folder (runs, images, visits, studies) have their pi
 import ast
 import inspect
 import re
+import typing
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,24 @@ import typer
 
 from pachon.commands import cli, config_kinds
 from pachon.commands.cli import main
+from pachon.design.analyses.spot_matrix import spot_matrix
+from pachon.design.metrics.field_zernikes import FittedPupil
+from pachon.design.optimize.merit_function import MeritName
+from pachon.imaging.config import ImageConfig
+from pachon.imaging.image_formats.load import WeightName
+from pachon.models.camera.corner_rafts import CornerHeights
+from pachon.models.camera.photometry import BandName
+from pachon.models.design_data import Aiming
+from pachon.models.io.prescription import LensFormat
+from pachon.models.starting_designs.new import DesignKind
+from pachon.raytrace.rays import Projection
+from pachon.reconstruction.psf_model.recipe import BasisName, InterpolationName, RecipeName, WeightsName
+from pachon.sensing.frames import FrameName
+from pachon.sensing.observatory_zernikes import ZernikeConvention
+from pachon.studies.shimming.shim import ShimmedParts, ShimMerit
+from pachon.studies.tolerance.file import ToleranceFile
+from pachon.studies.validation import SchemaKind
+from pachon.wavefront.pupil_sampling import SamplingName
 
 ROOT = typer.main.get_command(cli.app)
 #: Words for one thing: of each line a command has at most the first.
@@ -32,6 +51,13 @@ SYNONYMS = (
 BY_FILE = {"baseline save", "check"}
 #: Arguments and options that are configurations.
 CONFIGURATIONS = {"config", "tolerances", "sweep"}
+
+
+@pytest.fixture
+def in_folder(tmp_path, monkeypatch):
+    """An empty current folder."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
 
 
 def leaves(command, path=()):
@@ -158,3 +184,76 @@ def test_help_has_no_types_of_python(name, capsys):
     assert main([*name.split(), "--help"]) == 0
     text = capsys.readouterr().out
     assert not re.search(r"<[a-z]|\bPATH\b|\[Path\]|\bINTEGER\b|\bFLOAT\b", text)
+
+
+@pytest.mark.parametrize(
+    ("path", "option", "words"),
+    [
+        ("spots", "--sampling", SamplingName),
+        ("spots", "--projection", Projection),
+        ("spots", "--aiming", Aiming),
+        ("zernikes", "--pupil", FittedPupil),
+        ("spot-matrix", "--against", inspect.signature(spot_matrix, eval_str=True).parameters["against"].annotation),
+        ("optimize", "--merit", MeritName),
+        ("convert", "--format", LensFormat),
+        ("donuts", "--frame", FrameName),
+        ("donuts", "--field-frame", FrameName),
+        ("donuts", "--convention", ZernikeConvention),
+        ("new", "kind", DesignKind),
+        ("schema", "kind", SchemaKind),
+        ("shim", "--minimise", ShimMerit),
+        ("shim", "--parts", ShimmedParts),
+        ("align", "--heights", CornerHeights),
+        ("align", "--believed-heights", CornerHeights),
+        ("model", "--recipe", RecipeName),
+        ("model", "--basis", BasisName),
+        ("model", "--interpolation", InterpolationName),
+        ("model", "--weights", WeightsName),
+        ("measure", "--weight-kind", WeightName),
+        ("images", "--way", ImageConfig.model_fields["way"].annotation),
+        ("tolerance", "--method", ToleranceFile.model_fields["method"].annotation),
+        ("run", "--band", BandName),
+    ],
+)
+def test_choices_are_the_words_of_the_functions_that_take_them(path, option, words):
+    """Options state them once more, since the modules that compute are slow to import."""
+    command = COMMANDS[path]
+    parameter = next(p for p in command.params if option in (*p.opts, p.name))
+    context = command.make_context(command.name, [], resilient_parsing=True)
+    assert {item.value for item in parameter.shell_complete(context, "")} == {*typing.get_args(words)} - {""}
+    if not parameter.metavar.isupper():
+        assert set(parameter.metavar.split("|")) == {*typing.get_args(words)}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["spots", "paul_baker", "-o", "a.png"], "pachon spots -o: it names data, of which this command writes none: "),
+        (
+            ["opd", "paul_baker", "--out", "a.png"],
+            "expected --picture FILE for the picture, --table FILE for the numbers",
+        ),
+        (["camera", "hsc", "-o", "a.png"], "expected --picture FILE"),
+        (["draw", "paul_baker", "-o", "a.png"], "expected a name that ends in .glb; the picture is --picture"),
+        (["psf", "paul_baker", "-o", "a.png"], "expected a name that ends in .fits; the picture is --picture"),
+        (["run", "--table", "a.txt"], "--table = a.txt: expected a name that ends in .ecsv, .csv, .fits, .parquet"),
+        (["spots", "paul_baker", "--sampling", "ring"], "did you mean rings?"),
+        (["spots", "paul_baker", "--pictur", "a.png"], "--picture"),
+    ],
+)
+def test_options_that_are_gone_or_wrong_say_what_to_write(arguments, words, in_folder, capsys):
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert words in error
+    assert list(in_folder.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "arguments", ["paul_baker b.yaml", "paul_baker -o b.yaml", "--out b.yaml paul_baker", "--out=b.yaml paul_baker"]
+)
+def test_an_argument_out_may_be_given_as_the_option(arguments, in_folder):
+    assert main(["convert", *arguments.split()]) == 0
+    assert (in_folder / "b.yaml").exists()
+    assert main(["new", *arguments.replace("b.yaml", "c.yaml").replace("paul_baker", "singlet").split()]) == 0
+    assert (in_folder / "c.yaml").exists()
