@@ -18,6 +18,7 @@ from .completion import YAML
 from .inputs import configured_experiment, warnings_shown
 from .options import Json, NoPicture, Picture, Settings, TableFile, picture_kind
 from .tables import Rows, print_json
+from .verdicts import counted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -111,7 +112,9 @@ def _listed(camera: Camera) -> _Content:
     rows = camera_rows(camera)
     ccds = [dict(zip(CAMERA_COLUMNS, row, strict=True)) for row in rows]
     content = {"camera": camera.name, "pixel_um": round(camera.pixel_size * 1e6, 9), "ccds": ccds}
-    table = Rows(CAMERA_COLUMNS, [[str(cell) for cell in row] for row in rows], CAMERA_CAPTION)
+    side = f"{camera.pixel_size * 1e6:.4g} µm"
+    verdict = f"{camera.name} has {counted(len(camera), 'CCD')} with pixels of {side}."
+    table = Rows(CAMERA_COLUMNS, [[str(cell) for cell in row] for row in rows], CAMERA_CAPTION, verdict=verdict)
     return table, content, lambda: camera_plot(camera)
 
 
@@ -129,7 +132,12 @@ def _heights(heights: str, settings: Sequence[str]) -> _Content:
     metrics = {name: asdict(group) for name, group in statistics.items()}
     content = {"heights": heights, "statistics_m": metrics, "fit_residual_m": residual}
     title = f"CCD heights: {Path(heights).stem}"
-    table = Rows(HEIGHT_COLUMNS, height_rows(statistics), HEIGHT_CAPTION)
+    together = statistics["all"]
+    verdict = (
+        f"The heights of {counted(together.n_ccd, 'CCD')} have {1e6 * together.rms:.3g} µm rms; 95 % of them lie "
+        f"within {1e6 * together.width95:.3g} µm."
+    )
+    table = Rows(HEIGHT_COLUMNS, height_rows(statistics), HEIGHT_CAPTION, verdict=verdict)
     return table, content, lambda: vendor_heights_plot(plane, title)
 
 

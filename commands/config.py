@@ -63,7 +63,7 @@ def config_command(
     write_rows(Rows(_HEADINGS, [_key_cells(description) for description in descriptions]), table)
     if as_json:
         summaries = [d.summary() | {"unit": unit_of(d), "example": example(d)} for d in descriptions]
-        print_json({"kind": kind, "keys": summaries})
+        print_json({"kind": kind, "commands": KINDS[kind].commands.split(", "), "keys": summaries})
     elif len(descriptions) == 1:
         _show_key(kind, descriptions[0])
     else:
@@ -157,7 +157,8 @@ def _show_keys(kind: str, descriptions: list[KeyDescription]) -> None:
     for description in descriptions:
         table.add_row(*_key_cells(description))
     wide_console().print(table)
-    print_line(f"{len(descriptions)} keys of {kind}; a dash: open, as the meaning says. One key: pachon config KEY")
+    print_line(f"{len(descriptions)} keys of {kind}, set by pachon {KINDS[kind].commands}")
+    print_line("A dash: open, as the meaning says. One key: pachon config KEY")
 
 
 def _show_key(kind: str, description: KeyDescription) -> None:
