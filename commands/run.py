@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Option
 
-from ..core.terminal import print_line
+from ..core.terminal import print_line, print_warning
 from .inputs import configuration, configured_experiment
 from .night import (
     Bands,
@@ -122,6 +122,8 @@ def run_command(
             print_line(f"pachon: {warning}", error=True)
     if result.report:
         write_rows(_ccd_rows(result), table)
+    elif table is not None:
+        print_warning(f"{table} is not written: {len(result.missing)} CCDs of other parts are missing")
     if as_json:
         part_summary = {"missing": list(result.missing), "not_modelled": result.not_modelled}
         print_json(result.summary if result.report else part_summary)
